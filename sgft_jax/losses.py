@@ -1,0 +1,56 @@
+"""Losses and targets of one transition; the caller vmaps and averages once."""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from sgft_jax.types import Array
+
+
+def td_target(reward: Array, discount: Array, next_q: Array, next_log_prob: Array, *, alpha: Array) -> Array:
+    """Soft TD target r + discount (min_i Q_i(s', a') - alpha log pi(a'|s')), a constant for gradients.
+
+    reward, discount, next_log_prob: []; next_q: [members]. The discount is gamma (1 - terminated), or 0 at the end of a
+    segment.
+    Source: SAC (Haarnoja et al. 2018).
+    """
+    chex.assert_rank([reward, discount, next_q, next_log_prob], [0, 0, 1, 0])
+    chex.assert_type([reward, discount, next_q, next_log_prob], float)
+    return jax.lax.stop_gradient(reward + discount * (jnp.min(next_q) - alpha * next_log_prob))
+
+
+def critic_loss(q: Array, target: Array) -> Array:
+    """Sum over members of the squared TD error. q: [members]; target: []."""
+    chex.assert_rank([q, target], [1, 0])
+    return jnp.sum((q - target) ** 2)
+
+
+def actor_loss(log_prob: Array, q: Array, *, alpha: Array) -> Array:
+    """Soft policy loss alpha log pi(a|s) - min_i Q_i(s, a) for a reparameterised a. log_prob: []; q: [members]."""
+    chex.assert_rank([log_prob, q], [0, 1])
+    return alpha * log_prob - jnp.min(q)
+
+
+def temperature_loss(log_alpha: Array, log_prob: Array, *, target_entropy: Array) -> Array:
+    """Loss alpha (-log pi(a|s) - target entropy); alpha rises while the policy is too certain. All [], nats."""
+    chex.assert_rank([log_alpha, log_prob], 0)
+    return jnp.exp(log_alpha) * jax.lax.stop_gradient(-log_prob - target_entropy)
+
+
+def value_loss(value: Array, q: Array) -> Array:
+    """(V(s) - min_i Q_i(s, a))^2 with a ~ pi and Q constant, without entropy term. value: []; q: [members].
+
+    Source: SGFT Appendix C; the minimiser is the value of pi itself, which is what shaping needs.
+    """
+    chex.assert_rank([value, q], [0, 1])
+    return (value - jax.lax.stop_gradient(jnp.min(q))) ** 2
+
+
+def dynamics_loss(prediction: Array, delta: Array) -> Array:
+    """Mean over entries of the squared error in the change of the normalised observation. Both [obs_dim].
+
+    Source: SGFT Appendix C, with the mean in place of the sum so that tasks of any size read alike.
+    """
+    chex.assert_rank([prediction, delta], 1)
+    chex.assert_equal_shape([prediction, delta])
+    return jnp.mean((prediction - delta) ** 2)

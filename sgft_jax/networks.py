@@ -1,0 +1,153 @@
+"""Network bodies as pure `init` / `apply` pairs for one example, and the tanh-Gaussian policy distribution."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+from sgft_jax.types import Array, Key, PyTree, UserError
+
+LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0  # O-5
+
+_ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"relu": nn.relu, "tanh": nn.tanh, "silu": nn.silu, "elu": nn.elu}
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """The body shared by all networks of a run.
+
+    hidden: widths of the hidden layers.
+    layer_norm: LayerNorm after each linear layer of critic and value, before the activation (RLPD).
+    actor_layer_norm: the same in the actor. activation: relu, tanh, silu or elu.
+    """
+
+    hidden: tuple[int, ...] = (512, 512)
+    layer_norm: bool = False
+    actor_layer_norm: bool = False
+    activation: str = "relu"
+
+    def __post_init__(self) -> None:
+        if self.activation not in _ACTIVATIONS:
+            raise UserError(f"network activation {self.activation!r}: choose one of {', '.join(_ACTIVATIONS)}")
+
+
+class Network(NamedTuple):
+    """init(key) -> params; apply(params, *inputs) -> outputs for one example."""
+
+    init: Callable[[Key], PyTree]
+    apply: Callable[..., Array]
+
+
+class MLP(nn.Module):
+    """Linear layers with optional LayerNorm before each activation, and a linear output layer."""
+
+    hidden: tuple[int, ...]
+    outputs: int
+    layer_norm: bool
+    activation: str
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        """x: [inputs] -> [outputs]."""
+        for width in self.hidden:
+            x = nn.Dense(width)(x)
+            if self.layer_norm:
+                x = nn.LayerNorm()(x)
+            x = _ACTIVATIONS[self.activation](x)
+        return nn.Dense(self.outputs)(x)
+
+
+def _mlp(inputs: int, outputs: int, config: NetworkConfig, *, layer_norm: bool) -> Network:
+    body = MLP(config.hidden, outputs, layer_norm, config.activation)
+
+    def init(key: Key) -> PyTree:
+        return body.init(key, jnp.zeros(inputs))["params"]
+
+    def apply(params: PyTree, *parts: Array) -> Array:
+        return body.apply({"params": params}, jnp.concatenate(parts))
+
+    return Network(init, apply)
+
+
+def _ensemble(member: Network, members: int) -> Network:
+    """Stack `members` parameter sets on a leading axis; apply sends one input through all of them."""
+
+    def init(key: Key) -> PyTree:
+        return jax.vmap(member.init)(jax.random.split(key, members))
+
+    def apply(params: PyTree, *parts: Array) -> Array:
+        return jax.vmap(lambda p: member.apply(p, *parts))(params)
+
+    return Network(init, apply)
+
+
+def make_actor(obs_dim: int, act_dim: int, config: NetworkConfig) -> Network:
+    """apply(params, obs [obs_dim]) -> [2, act_dim]: pre-tanh mean and clipped log standard deviation."""
+    body = _mlp(obs_dim, 2 * act_dim, config, layer_norm=config.actor_layer_norm)
+
+    def apply(params: PyTree, obs: Array) -> Array:
+        mean, log_std = jnp.split(body.apply(params, obs), 2)
+        return jnp.stack([mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX)])
+
+    return Network(body.init, apply)
+
+
+def make_critic(obs_dim: int, act_dim: int, config: NetworkConfig, *, members: int = 2) -> Network:
+    """apply(params, obs [obs_dim], action [act_dim]) -> [members] values."""
+    body = _ensemble(_mlp(obs_dim + act_dim, 1, config, layer_norm=config.layer_norm), members)
+    return Network(body.init, lambda params, obs, action: body.apply(params, obs, action)[:, 0])
+
+
+def make_value(obs_dim: int, config: NetworkConfig) -> Network:
+    """apply(params, obs [obs_dim]) -> []."""
+    body = _mlp(obs_dim, 1, config, layer_norm=config.layer_norm)
+    return Network(body.init, lambda params, obs: body.apply(params, obs)[0])
+
+
+def make_dynamics(obs_dim: int, act_dim: int, config: NetworkConfig, *, members: int = 5) -> Network:
+    """apply(params, obs [obs_dim], action [act_dim]) -> [members, obs_dim] change of the normalised observation.
+
+    The number of members applied is the leading axis of `params`, so any slice of the ensemble is one too.
+    """
+    return _ensemble(_mlp(obs_dim + act_dim, obs_dim, config, layer_norm=False), members)
+
+
+def tanh_gaussian_sample(moments: Array, key: Key) -> tuple[Array, Array]:
+    """Draw a = tanh(u), u ~ N(mean, std), with gradients through the draw.
+
+    moments: [2, act_dim] mean and log-std. Returns action [act_dim] in [-1, 1] and log pi(a) [].
+    """
+    mean, log_std = moments
+    u = mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+    return jnp.tanh(u), tanh_gaussian_log_prob(moments, u)
+
+
+def tanh_gaussian_log_prob(moments: Array, u: Array) -> Array:
+    """Log density of a = tanh(u), given u [act_dim] because atanh(a) has lost its digits near the bounds.
+
+    log(1 - tanh(u)^2) is computed as 2 (log 2 - u - softplus(-2u)), which does not round to log(0).
+    """
+    mean, log_std = moments
+    normal = -0.5 * ((u - mean) * jnp.exp(-log_std)) ** 2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
+    squash = 2 * (jnp.log(2.0) - u - jax.nn.softplus(-2 * u))
+    return jnp.sum(normal - squash)
+
+
+def tanh_gaussian_mode(moments: Array) -> Array:
+    """The evaluation action tanh(mean) [act_dim] (O-13)."""
+    return jnp.tanh(moments[0])
+
+
+def pad_first_layer(params: PyTree, obs_dim: int, extra: int) -> PyTree:
+    """Let a network read `extra` more observation entries after the first `obs_dim` without changing its output.
+
+    The new rows of the first kernel are zero, so whatever the new entries hold, the function stays the same at first
+    and the rows still receive gradients. Works for stacked parameters (kernel [..., inputs, width]).
+    """
+    kernel = params["Dense_0"]["kernel"]
+    rows = jnp.zeros((*kernel.shape[:-2], extra, kernel.shape[-1]), kernel.dtype)
+    padded = jnp.concatenate([kernel[..., :obs_dim, :], rows, kernel[..., obs_dim:, :]], axis=-2)
+    return {**params, "Dense_0": {**params["Dense_0"], "kernel": padded}}

@@ -1,0 +1,38 @@
+"""One Adam per network: a network that is not stepped cannot move, not even by momentum."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from sgft_jax.types import Array, PyTree
+
+
+class Fit(NamedTuple):
+    """A network in training: its `params` and the optimiser's `moments`."""
+
+    params: PyTree
+    moments: PyTree
+
+
+def adam(max_grad_norm: float | None = None) -> optax.GradientTransformation:
+    """Adam without a learning rate, which `step` takes as a number so that it can be a vmapped leaf."""
+    clip = optax.identity() if max_grad_norm is None else optax.clip_by_global_norm(max_grad_norm)
+    return optax.chain(clip, optax.scale_by_adam())
+
+
+def start(optimiser: optax.GradientTransformation, params: PyTree) -> Fit:
+    """Fresh moments for `params`."""
+    return Fit(params, optimiser.init(params))
+
+
+def step(optimiser: optax.GradientTransformation, fit: Fit, grads: PyTree, rate: Array) -> Fit:
+    """One descent step. rate: [] learning rate."""
+    updates, moments = optimiser.update(grads, fit.moments, fit.params)
+    return Fit(jax.tree.map(lambda p, u: p - rate * u, fit.params, updates), moments)
+
+
+def keep_unless(moves: Array, new: PyTree, old: PyTree) -> PyTree:
+    """`new` where the scalar `moves` is true, else `old` with the same bits."""
+    return jax.tree.map(lambda n, o: jnp.where(moves, n, o), new, old)

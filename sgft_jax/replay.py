@@ -1,0 +1,46 @@
+"""A ring buffer on the device. Pure functions of a state that the caller donates; one buffer, vmapped over seeds."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sgft_jax.types import Array, Key, Transition, UserError
+
+
+class ReplayState(NamedTuple):
+    """data: rows on a leading [capacity] axis; position: [] int32 next row to write; size: [] int32 rows held."""
+
+    data: Transition
+    position: Array
+    size: Array
+
+
+def init(example: Transition, capacity: int) -> ReplayState:
+    """An empty buffer for transitions shaped like `example` (one transition, no batch axis)."""
+    if capacity < 1:
+        raise UserError(f"replay capacity {capacity}: must be at least 1")
+    data = jax.tree.map(lambda x: jnp.zeros((capacity, *jnp.shape(x)), jnp.asarray(x).dtype), example)
+    return ReplayState(data, jnp.int32(0), jnp.int32(0))
+
+
+def add_batch(state: ReplayState, batch: Transition, valid: Array | None = None) -> ReplayState:
+    """Append the valid rows, overwriting the oldest. batch: [n, ...] with n <= capacity; valid: [n] bool, default all.
+
+    Invalid rows get an index beyond the end, where the scatter drops them: they take no space and are never sampled.
+    """
+    capacity, n = state.data.reward.shape[0], batch.reward.shape[0]
+    if n > capacity:
+        raise UserError(f"replay: {n} transitions at once do not fit a capacity of {capacity}; raise the capacity")
+    valid = jnp.ones(n, bool) if valid is None else valid
+    rank = jnp.cumsum(valid, dtype=jnp.int32) - 1
+    rows = jnp.where(valid, (state.position + rank) % capacity, capacity)
+    count = jnp.sum(valid, dtype=jnp.int32)
+    data = jax.tree.map(lambda d, x: d.at[rows].set(x.astype(d.dtype), mode="drop"), state.data, batch)
+    return ReplayState(data, (state.position + count) % capacity, jnp.minimum(state.size + count, capacity))
+
+
+def sample(state: ReplayState, key: Key, n: int) -> Transition:
+    """Draw n rows uniformly with replacement from what is held; zeros while the buffer is empty."""
+    rows = jax.random.randint(key, (n,), 0, jnp.maximum(state.size, 1))
+    return jax.tree.map(lambda d: d[rows], state.data)

@@ -1,0 +1,175 @@
+"""SGFT as three batch transforms, and the table of methods they compose into.
+
+A transform is `(imagination, batch, key) -> batch` on a batch [B, ...] of real transitions. Compose in the order
+branch, shape, shorten: branching needs plain observations, shaping the whole discount.
+Source: SGFT (Yin et al., ICLR 2025).
+"""
+
+import difflib
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sgft_jax.types import Array, BatchTransform, Imagination, Key, Transition, UserError
+
+
+def shaped_reward(imagination: Imagination, row: Transition) -> Array:
+    """Shaped reward [] r + discount V(s') - V(s) of one transition. The discount makes V(terminal) count as 0."""
+    return row.reward + row.discount * imagination.value(row.next_obs) - imagination.value(row.obs)
+
+
+def shape(imagination: Imagination, batch: Transition, key: Key) -> Transition:
+    """Replace every reward by the shaped one. Source: SGFT Algorithm 1; `key` is not used."""
+    del key
+    return batch._replace(reward=jax.vmap(lambda row: shaped_reward(imagination, row))(batch))
+
+
+def append_steps_to_go(obs: Array, steps_to_go: Array, horizon: int) -> Array:
+    """Observation [obs_dim] with one_hot(k) [horizon] appended, zeros for k = 0; unchanged for horizon 1."""
+    if horizon == 1:
+        return obs
+    return jnp.concatenate([obs, jax.nn.one_hot(steps_to_go - 1, horizon, dtype=obs.dtype)])
+
+
+def shorten(horizon: int) -> BatchTransform:
+    """End every segment after `horizon` steps: no bootstrap at k = 1, and observations that tell the steps to go.
+
+    Rows without a segment (k = 0) get k ~ Uniform{1..H}: a real transition is as good a step of any segment. A learner
+    becomes conditioned on k without knowing: next observations carry k - 1. Source: SGFT section 3, O-12.
+    """
+    _check_positive("horizon", horizon)
+
+    def transform(imagination: Imagination, batch: Transition, key: Key) -> Transition:
+        del imagination
+        drawn = jax.random.randint(key, batch.steps_to_go.shape, 1, horizon + 1)
+        k = jnp.where(batch.steps_to_go == 0, drawn, batch.steps_to_go)
+        append = jax.vmap(append_steps_to_go, (0, 0, None))
+        return batch._replace(
+            obs=append(batch.obs, k, horizon),
+            next_obs=append(batch.next_obs, k - 1, horizon),
+            discount=jnp.where(k == 1, 0.0, batch.discount),
+            steps_to_go=k,
+        )
+
+    return transform
+
+
+def branch(horizon: int, branches: int, *, segments: bool = True) -> BatchTransform:
+    """Append `branches` imagined rollouts of `horizon` steps from every real observation, after the real rows.
+
+    B rows become B (1 + branches * horizon). segments: number the imagined steps H..1, else leave them 0 for methods
+    with an infinite horizon. Past an imagined termination a rollout repeats its last transition: every row stays valid.
+    Source: SGFT Algorithm 2; MBPO (Janner et al. 2019).
+    """
+    _check_positive("horizon", horizon)
+    _check_positive("branches", branches)
+
+    def rollout(imagination: Imagination, row: Transition, key: Key) -> Transition:
+        """One branch from row.obs: transitions with a leading axis [horizon]."""
+
+        def step(
+            carry: tuple[Transition, Array], inputs: tuple[Array, Key]
+        ) -> tuple[tuple[Transition, Array], Transition]:
+            last, alive = carry
+            new, terminated = _imagine(imagination, last.next_obs, *inputs)
+            last = jax.tree.map(lambda n, o: jnp.where(alive, n, o).astype(o.dtype), new, last)
+            return (last, alive & ~terminated), last
+
+        k = jnp.arange(horizon, 0, -1, dtype=jnp.int32) if segments else jnp.zeros(horizon, jnp.int32)
+        start = row._replace(next_obs=row.obs)  # only its next_obs is read: the first step is always alive
+        return jax.lax.scan(step, (start, jnp.bool_(True)), (k, jax.random.split(key, horizon)))[1]
+
+    def transform(imagination: Imagination, batch: Transition, key: Key) -> Transition:
+        keys = jax.random.split(key, (batch.reward.shape[0], branches))
+        from_row = jax.vmap(lambda row, key: rollout(imagination, row, key), (None, 0))
+        imagined = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), jax.vmap(from_row)(batch, keys))
+        return jax.tree.map(lambda real, new: jnp.concatenate([real, new]), batch, imagined)
+
+    return transform
+
+
+def _imagine(imagination: Imagination, obs: Array, k: Array, key: Key) -> tuple[Transition, Array]:
+    """One imagined transition from obs with k steps to go, and whether it terminates."""
+    key_policy, key_dynamics = jax.random.split(key)
+    action = imagination.policy(obs, k, key_policy)
+    next_obs = imagination.dynamics(obs, action, key_dynamics)
+    terminated = imagination.terminated(obs, action, next_obs)
+    discount = jnp.where(terminated, 0.0, imagination.gamma)
+    reward = imagination.reward(obs, action, next_obs)
+    return Transition(obs, action, reward, discount, next_obs, jnp.bool_(False), k), terminated
+
+
+def compose(*transforms: BatchTransform) -> BatchTransform:
+    """Apply transforms from left to right, each with its own key."""
+
+    def transform(imagination: Imagination, batch: Transition, key: Key) -> Transition:
+        for one, sub in zip(transforms, jax.random.split(key, len(transforms) + 1), strict=False):
+            batch = one(imagination, batch, sub)
+        return batch
+
+    return transform
+
+
+class Method(NamedTuple):
+    """One row of the comparison.
+
+    transforms(horizon, branches) -> the batch transforms in order.
+    finite_horizon: the agent is told the steps to go (for horizon > 1). reset_critic: default at transfer.
+    uses_value, uses_dynamics: what it takes from the prior besides the agent. shaped: rewards are r_bar.
+    """
+
+    name: str
+    transforms: Callable[[int, int], tuple[BatchTransform, ...]]
+    finite_horizon: bool
+    reset_critic: bool
+    uses_value: bool
+    uses_dynamics: bool
+    description: str
+    source: str
+
+
+def _method(name: str, parts: str, *, reset_critic: bool, description: str, source: str) -> Method:
+    finite = "shorten" in parts
+
+    def transforms(horizon: int, branches: int) -> tuple[BatchTransform, ...]:
+        built: dict[str, Callable[[], BatchTransform]] = {
+            "branch": lambda: branch(horizon, branches, segments=finite),
+            "shape": lambda: shape,
+            "shorten": lambda: shorten(horizon),
+        }
+        return tuple(built[part]() for part in parts.split())
+
+    return Method(name, transforms, finite, reset_critic, "shape" in parts, "branch" in parts, description, source)
+
+
+METHODS: dict[str, Method] = {
+    m.name: m
+    for m in (
+        _method("sac", "", reset_critic=False, description="task reward, critic kept", source="Haarnoja 2018"),
+        _method("sac-reset", "", reset_critic=True, description="task reward, new critic", source="Haarnoja 2018"),
+        _method("pbrs", "shape", reset_critic=True, description="shaped reward, infinite horizon", source="Ng 1999"),
+        _method("mbpo", "branch", reset_critic=False, description="SAC with model branches", source="Janner 2019"),
+        _method(
+            "pbrs-branch", "branch shape", reset_critic=True,
+            description="shaped reward and branches, infinite horizon: SGFT-SAC without shortening", source="SGFT 2025",
+        ),
+        _method("sgft", "shape shorten", reset_critic=True, description="model-free SGFT", source="SGFT 2025"),
+        _method("sgft-sac", "branch shape shorten", reset_critic=True, description="SGFT-SAC", source="SGFT 2025"),
+    )
+}  # fmt: skip
+
+
+def get_method(name: str) -> Method:
+    """The method of that name; UserError lists what exists and guesses what was meant."""
+    if name in METHODS:
+        return METHODS[name]
+    close = difflib.get_close_matches(name, METHODS, n=1)
+    hint = f"did you mean {close[0]!r}? " if close else ""
+    raise UserError(f"unknown method {name!r}: {hint}methods: {', '.join(METHODS)}")
+
+
+def _check_positive(name: str, value: int) -> None:
+    if value < 1:
+        raise UserError(f"{name} is {value}: must be at least 1")
