@@ -31,7 +31,7 @@ def update(
     batch: Transition,
     key: Key,
     *,
-    rate: Array,
+    rate: Array | float,
 ) -> tuple[optim.Fit, Metrics]:
     """One step of every member on its own Bayesian bootstrap of the batch [B, ...].
 

@@ -59,8 +59,7 @@ class FinetuneConfig:
                 raise UserError(f"fine-tuning option {name} is {getattr(self, name)}: must be at least 1")
 
 
-@struct.dataclass
-class FinetuneState:
+class FinetuneState(struct.PyTreeNode):
     """learner: the agent; dynamics: the ensemble in training; value, normalizer: frozen parts of the prior; replay."""
 
     learner: PyTree

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from sgft_jax.types import Array
 
 
-def td_target(reward: Array, discount: Array, next_q: Array, next_log_prob: Array, *, alpha: Array) -> Array:
+def td_target(reward: Array, discount: Array, next_q: Array, next_log_prob: Array, *, alpha: Array | float) -> Array:
     """Soft TD target r + discount (min_i Q_i(s', a') - alpha log pi(a'|s')), a constant for gradients.
 
     reward, discount, next_log_prob: []; next_q: [members]. The discount is gamma (1 - terminated), or 0 at the end of a
@@ -25,13 +25,13 @@ def critic_loss(q: Array, target: Array) -> Array:
     return jnp.sum((q - target) ** 2)
 
 
-def actor_loss(log_prob: Array, q: Array, *, alpha: Array) -> Array:
+def actor_loss(log_prob: Array, q: Array, *, alpha: Array | float) -> Array:
     """Soft policy loss alpha log pi(a|s) - min_i Q_i(s, a) for a reparameterised a. log_prob: []; q: [members]."""
     chex.assert_rank([log_prob, q], [0, 1])
     return alpha * log_prob - jnp.min(q)
 
 
-def temperature_loss(log_alpha: Array, log_prob: Array, *, target_entropy: Array) -> Array:
+def temperature_loss(log_alpha: Array, log_prob: Array, *, target_entropy: Array | float) -> Array:
     """Loss alpha (-log pi(a|s) - target entropy); alpha rises while the policy is too certain. All [], nats."""
     chex.assert_rank([log_alpha, log_prob], 0)
     return jnp.exp(log_alpha) * jax.lax.stop_gradient(-log_prob - target_entropy)

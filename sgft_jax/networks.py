@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -67,7 +67,7 @@ def _mlp(inputs: int, outputs: int, config: NetworkConfig, *, layer_norm: bool) 
         return body.init(key, jnp.zeros(inputs))["params"]
 
     def apply(params: PyTree, *parts: Array) -> Array:
-        return body.apply({"params": params}, jnp.concatenate(parts))
+        return cast(Array, body.apply({"params": params}, jnp.concatenate(parts)))
 
     return Network(init, apply)
 

@@ -1,5 +1,7 @@
 """Observation statistics of the random-action data set, fixed once training starts."""
 
+from typing import cast
+
 import jax
 import jax.numpy as jnp
 from brax.training.acme import running_statistics
@@ -29,7 +31,8 @@ def update(statistics: Statistics, obs: Array, valid: Array | None = None) -> St
 
 def finish(statistics: Statistics, *, std_floor: float = STD_FLOOR) -> Normalizer:
     """The fixed normaliser of these statistics, with std at least `std_floor` (raw units)."""
-    return Normalizer(statistics.mean, jnp.maximum(statistics.std, std_floor))
+    mean, std = cast(Array, statistics.mean), cast(Array, statistics.std)
+    return Normalizer(mean, jnp.maximum(std, std_floor))
 
 
 def identity(obs_dim: int) -> Normalizer:

@@ -27,7 +27,7 @@ def start(optimiser: optax.GradientTransformation, params: PyTree) -> Fit:
     return Fit(params, optimiser.init(params))
 
 
-def step(optimiser: optax.GradientTransformation, fit: Fit, grads: PyTree, rate: Array) -> Fit:
+def step(optimiser: optax.GradientTransformation, fit: Fit, grads: PyTree, rate: Array | float) -> Fit:
     """One descent step. rate: [] learning rate."""
     updates, moments = optimiser.update(grads, fit.moments, fit.params)
     return Fit(jax.tree.map(lambda p, u: p - rate * u, fit.params, updates), moments)

@@ -85,16 +85,15 @@ class SACHyper(NamedTuple):
     actor_ramp: float | Array = 0.0
 
 
-@struct.dataclass
-class SACState:
-    """An agent in training. `value` and `dynamics` are None where the configuration has no use for them."""
+class SACState(struct.PyTreeNode):
+    """An agent in training; `value` and `dynamics` are an `optim.Fit`, or None where the configuration has no use."""
 
     actor: optim.Fit
     critic: optim.Fit
     target_critic: PyTree
     log_alpha: optim.Fit
-    value: optim.Fit | None
-    dynamics: optim.Fit | None
+    value: PyTree
+    dynamics: PyTree
     normalizer: Normalizer
     hyper: SACHyper
     step: Array
