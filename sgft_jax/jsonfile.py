@@ -1,0 +1,64 @@
+"""Impure: reads and writes small JSON files, atomically and without the numbers that JSON does not know."""
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sgft_jax.types import UserError
+
+
+def jsonable(value: Any) -> Any:
+    """Plain JSON data: arrays become lists, array scalars numbers, paths strings; non-finite floats "nan", "inf", "-inf".
+
+    Those strings keep the file valid JSON for every reader and, unlike null, still tell divergence from a missing value;
+    Python's `float` turns them back. Raises TypeError for anything else.
+    """
+    if isinstance(value, Mapping):
+        return {str(k): jsonable(v) for k, v in value.items()}
+    if hasattr(value, "_asdict"):
+        return jsonable(value._asdict())
+    if isinstance(value, (list, tuple)):
+        return [jsonable(v) for v in value]
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    if value is None or isinstance(value, (bool, int, str)):
+        return value
+    if hasattr(value, "dtype"):
+        return jsonable(_widened(np.asarray(value)).tolist())
+    raise TypeError(f"a {type(value).__name__} cannot be written as JSON")
+
+
+def _widened(array: np.ndarray) -> np.ndarray:
+    """float32 0.1 as 0.1 rather than 0.10000000149: the shortest decimal that reads back as the same float32."""
+    if array.dtype == np.float32:
+        return np.vectorize(lambda x: float(str(x)), otypes=[np.float64])(array) if array.size else array
+    return array.astype(np.float64) if array.dtype.kind == "V" else array  # bfloat16
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write `value` under a temporary name, flush it to disk, rename it to `path`."""
+    path = Path(path)
+    temporary = path.with_name(f".tmp-{path.name}")
+    with open(temporary, "w") as file:
+        json.dump(jsonable(value), file, indent=1, allow_nan=False)
+        file.write("\n")
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file; raises UserError if it is missing or is not JSON."""
+    try:
+        return json.loads(Path(path).read_text())
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except ValueError as error:
+        raise UserError(f"{path}: not valid JSON ({error})") from error
