@@ -1,0 +1,49 @@
+"""The same episodes through C MuJoCo: the reference for MJX, for finer time steps, and the model a renderer draws.
+
+Impure: C MuJoCo steps in place.
+"""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from envs.franka.task import CONTROL_DT, RAMP, Scene
+from envs.physics import PhysicsState
+from sgft_jax.types import Array
+
+
+def play(
+    scene: Scene, theta: dict[str, float], start: PhysicsState, actions: Sequence[Array] | Array, *, refine: int = 1, iterations: int = 0
+) -> list[PhysicsState]:
+    """Plays `actions` [T, act_dim] from `start` with C MuJoCo; returns the T states after each control step.
+
+    theta: domain parameters by name. refine: divides the time step. iterations: solver iterations, 0 = the scene's own.
+    """
+    spec = scene.build(theta)
+    spec.option.timestep = CONTROL_DT / (scene.substeps * refine)
+    if iterations:
+        spec.option.iterations, spec.option.ls_iterations = iterations, 50
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    params = jnp.asarray(list(theta.values()), jnp.float32)
+    target, event = jax.jit(scene.target), jax.jit(scene.event)
+    states, state = [], start
+    for action in actions:
+        command = np.asarray(target(state.qpos, action))
+        after = _control_step(model, data, state, command, scene.substeps * refine)
+        state = event(params, after)
+        states.append(state)
+    return states
+
+
+def _control_step(model: mujoco.MjModel, data: mujoco.MjData, state: PhysicsState, command: np.ndarray, substeps: int) -> PhysicsState:
+    data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = state.qpos, state.qvel, state.warmstart
+    previous = np.asarray(state.ctrl)
+    for i in range(substeps):
+        progress = min((i + 1) * model.opt.timestep / RAMP, 1.0)
+        data.ctrl[:] = previous + progress * (command - previous)
+        mujoco.mj_step(model, data)
+    return PhysicsState(*(jnp.asarray(x, jnp.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)))

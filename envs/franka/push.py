@@ -1,0 +1,215 @@
+"""Pushing: slide a puck to the edge of the table, not over it. Paper section 6.2; sgft.md section 9.
+
+The table frame has its origin 0.2 m in front of the robot's base (O-25); observations and rewards live in it. The object's range of the paper's Table 2, [0, 0.3] m, starts at 0.15 m here: nearer to the base the
+gripper cannot point down behind it. Two
+fingertips, 4 cm apart, cradle the puck; they move in a plane just above the table. A flat puck tips over the edge when
+its centre passes it, so falling is an event on the centre's position: from then on the puck lies out of reach and the
+camera reports it 3 cm past the edge. Reward and success thus are functions of the observation alone.
+"""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from envs.base import Entry, Env, Parameter
+from envs.franka import arm, kinematics
+from envs.franka.kinematics import DOWN, Pose
+from envs.franka.arm import NO_CONTACT
+from envs.franka.task import Scene, at_rest, clip_joints, make_env, new_spec
+from envs.physics import PhysicsState
+from sgft_jax.types import Array, Key
+
+SUBSTEPS = 40
+STEP = 0.05  # m per control step at |action| = 1 (O-19)
+TABLE_ORIGIN = 0.20  # m, x of the table frame in the base frame
+EDGE = 0.55  # m, table frame
+TOLERANCE = 0.025  # m short of the edge counts as reached
+BEHIND = 0.035  # m: where the reward wants the hand, behind the puck
+HEIGHT = 0.02  # m above the table: the plane in which the fingertips move
+FINGER_RADIUS, FINGER_GAP = 0.008, 0.04  # m
+PUCK_RADIUS, PUCK_HALF_HEIGHT = 0.032, 0.015  # m
+WORKSPACE = np.array([[0.08, -0.35], [0.56, 0.35]])  # m, xy of the hand, table frame
+FALLEN_AT, SEEN_AT = 1.5, EDGE + 0.03  # m, table frame: where a fallen puck lies, where the camera saw it last
+NV = arm.N_JOINTS + 4  # puck: x, y, z, yaw
+
+PARAMETERS = (
+    Parameter("object_x", "m", 0.22, 0.15, 0.30),
+    Parameter("object_y", "m", 0.0, -0.25, 0.25),
+    Parameter("object_mass", "kg", 0.15, 0.15, 0.15),
+    Parameter("table_friction", "", 0.35, 0.35, 0.35),
+    Parameter("finger_friction", "", 0.5, 0.5, 0.5),
+    Parameter("servo_stiffness", "", 1.0, 1.0, 1.0),
+)
+
+
+def build(theta: dict[str, float]) -> mujoco.MjSpec:
+    """The scene for one theta. The puck's start is part of the state, not of the model."""
+    spec = new_spec(substeps=SUBSTEPS, iterations=4, ls_iterations=6)
+    link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
+    for side in (-1, 1):
+        _add_finger(link, side)
+    spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1], rgba=[0, 0, 0, 0], **NO_CONTACT)
+    _add_scenery(spec)
+    _add_puck(spec, theta["object_mass"])
+    _add_pair(spec, "table", "puck_base", theta["table_friction"], spin=theta["table_friction"] * PUCK_RADIUS * 2 / 3)
+    for side in ("left", "right"):
+        _add_pair(spec, f"finger_{side}", "puck_side", theta["finger_friction"])
+    return spec
+
+
+def observe(params: Array, state: PhysicsState) -> Array:
+    """[4] m, table frame: hand xy, puck xy."""
+    hand = kinematics.forward(state.qpos[: arm.N_JOINTS]).position[:2]
+    puck = state.qpos[arm.N_JOINTS : arm.N_JOINTS + 2]
+    origin = jnp.array([TABLE_ORIGIN, 0.0])
+    puck = (puck - origin).at[0].min(SEEN_AT)
+    return jnp.concatenate([hand - origin, puck])
+
+
+def reward(obs: Array, action: Array, next_obs: Array) -> Array:
+    """[]: minus the hand's distance from its place behind the puck, minus the puck's from the edge, plus 1 when it is
+    within 2.5 cm of it, minus 1 when it fell. The paper prints the bonus with the wrong sign of inequality."""
+    hand, puck = next_obs[:2], next_obs[2:4]
+    hand_distance = jnp.linalg.norm(hand - puck + jnp.array([BEHIND, 0.0]))
+    edge_distance = jnp.abs(puck[0] - EDGE)
+    return -hand_distance - edge_distance + (edge_distance <= TOLERANCE) - fallen(next_obs)
+
+
+def fallen(obs: Array) -> Array:
+    """[] 1.0 if the puck's centre has passed the edge of the table (O-21), else 0.0."""
+    return (obs[2] > EDGE).astype(jnp.float32)
+
+
+def success(obs: Array) -> Array:
+    """[] bool: the puck is within 2.5 cm of the edge and still on the table (O-23)."""
+    return (obs[2] >= EDGE - TOLERANCE) & (obs[2] <= EDGE)
+
+
+def initial(params: Array, key: Key) -> PhysicsState:
+    """The hand at a random place near the base, the puck where theta says."""
+    start = jax.random.uniform(key, (2,), minval=jnp.array([0.09, -0.15]), maxval=jnp.array([0.11, 0.15]))
+    joints = kinematics.solve(jnp.asarray(_ready(), jnp.float32), _pose(start), iterations=6, posture=0.05)
+    puck = jnp.concatenate([params[:2] + jnp.array([TABLE_ORIGIN, 0.0]), jnp.zeros(2)])
+    return at_rest(joints, puck, NV)
+
+
+def target(qpos: Array, action: Array) -> Array:
+    """[7] joint targets that move the hand by `action` * 5 cm from where it is, in the plane and inside the workspace."""
+    joints = qpos[: arm.N_JOINTS]
+    here = kinematics.forward(joints).position[:2] - jnp.array([TABLE_ORIGIN, 0.0])
+    goal = jnp.clip(here + STEP * action, jnp.asarray(WORKSPACE[0]), jnp.asarray(WORKSPACE[1]))
+    return clip_joints(kinematics.solve(joints, _pose(goal), iterations=3, posture=0.05))
+
+
+def event(params: Array, state: PhysicsState) -> PhysicsState:
+    """A puck whose centre passed the edge falls: it comes to rest out of reach, for good."""
+    i = arm.N_JOINTS
+    gone = state.qpos[i] - TABLE_ORIGIN > EDGE
+    lying = jnp.array([TABLE_ORIGIN + FALLEN_AT, 0.0, 0.0, 0.0])
+    qpos = jnp.where(gone, state.qpos.at[i:].set(lying), state.qpos)
+    qvel = jnp.where(gone, state.qvel.at[i:].set(0.0), state.qvel)
+    return state._replace(qpos=qpos, qvel=qvel)
+
+
+SCENE = Scene(
+    name="push",
+    observation=(Entry("hand_xy", "m", 2), Entry("puck_xy", "m", 2)),
+    action=(Entry("hand_xy_step", "5 cm", 2),),
+    parameters=PARAMETERS,
+    episode_length=40,
+    substeps=SUBSTEPS,
+    success_anytime=False,
+    cartesian=True,
+    build=build,
+    initial=initial,
+    target=target,
+    observe=observe,
+    reward=reward,
+    success=success,
+    event=event,
+)
+
+
+def make() -> Env:
+    """The pushing task."""
+    return make_env(SCENE)
+
+
+def _pose(xy: Array) -> Pose:
+    return Pose(jnp.concatenate([xy + jnp.array([TABLE_ORIGIN, 0.0]), jnp.array([HEIGHT])]), jnp.asarray(DOWN, jnp.float32))
+
+
+def _ready() -> np.ndarray:
+    """Joint angles with the hand in the start area: where the inverse kinematics of a reset begins."""
+    return np.array([0.0, 0.247, 0.0, -2.966, 0.0, 3.213, np.pi / 4])
+
+
+def _add_finger(link: mujoco.MjsBody, side: int) -> None:
+    yaw = arm.HAND_YAW
+    offset = side * FINGER_GAP / 2  # along the hand's y axis
+    x, y = -np.sin(yaw) * offset, np.cos(yaw) * offset
+    name = "left" if side < 0 else "right"
+    link.add_geom(
+        name=f"finger_{name}",
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        pos=[x, y, arm.TCP],
+        size=[FINGER_RADIUS, 0, 0],
+        mass=0.015,
+        rgba=[0.1, 0.1, 0.12, 1],
+        **NO_CONTACT,
+    )
+    link.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        fromto=[x, y, arm.FLANGE + 0.07, x, y, arm.TCP],
+        size=[FINGER_RADIUS, 0, 0],
+        mass=0,
+        rgba=[0.1, 0.1, 0.12, 1],
+        **NO_CONTACT,
+    )
+
+
+def _add_puck(spec: mujoco.MjSpec, mass: float) -> None:
+    """A disc that slides and spins but does not tilt: flat on the table, dry friction is isotropic and one contact with
+    torsional friction stands for the whole face."""
+    body = spec.worldbody.add_body(name="puck", pos=[0, 0, PUCK_HALF_HEIGHT])
+    for axis in np.eye(3):
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+    body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=[PUCK_RADIUS, PUCK_HALF_HEIGHT, 0],
+        mass=mass,
+        rgba=[0.85, 0.25, 0.2, 1],
+        **NO_CONTACT,
+    )
+    invisible = {"mass": 0, "rgba": [0, 0, 0, 0], **NO_CONTACT}
+    foot = PUCK_HALF_HEIGHT / 2
+    body.add_geom(
+        name="puck_base", type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=[0, 0, foot - PUCK_HALF_HEIGHT], size=[foot, 0, 0], **invisible
+    )
+    # The side as the fingers feel it: a sphere against a vertical capsule is exact in every backend, a sphere against a
+    # cylinder is not.
+    body.add_geom(
+        name="puck_side", type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[PUCK_RADIUS, PUCK_HALF_HEIGHT, 0], **invisible
+    )
+
+
+def _add_pair(spec: mujoco.MjSpec, geom1: str, geom2: str, friction: float, *, spin: float = 0.0) -> None:
+    """spin: m, torsional friction; 2/3 of friction times radius is a disc under uniform pressure."""
+    friction_5d = [friction, friction, spin, 1e-4, 1e-4]
+    pair = spec.add_pair(geomname1=geom1, geomname2=geom2, condim=4 if spin else 3, friction=friction_5d)
+    if not spin:
+        # Rubber fingertips: the contact stiffens over 3 mm instead of at once. Newton's method then converges in 4
+        # iterations on every contact we have seen; hard fingertips need more than 6 and throw the puck if they get fewer.
+        pair.solimp = [0.0, 0.95, 0.003, 0.5, 2.0]
+
+
+def _add_scenery(spec: mujoco.MjSpec) -> None:
+    half = (TABLE_ORIGIN + EDGE + 0.25) / 2
+    wood, line = [0.78, 0.66, 0.5, 1], [0.95, 0.85, 0.2, 1]
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    world = spec.worldbody
+    world.add_geom(type=box, pos=[half - 0.25, 0, -0.02], size=[half, 0.6, 0.0199], rgba=wood, **NO_CONTACT)
+    x = TABLE_ORIGIN + EDGE - TOLERANCE / 2
+    world.add_geom(type=box, pos=[x, 0, 0], size=[TOLERANCE / 2, 0.6, 0.0005], rgba=line, **NO_CONTACT)

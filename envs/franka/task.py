@@ -1,0 +1,203 @@
+"""What all Franka tasks share: effects on commands and sensors, the 5 Hz control period, and the Env assembled from parts."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from envs import physics
+from envs.base import Effects, Entry, Env, EnvState, Parameter, World
+from envs.franka import arm
+from envs.physics import PhysicsState
+from sgft_jax.types import Array, Key, UserError
+
+CONTROL_DT = 0.2  # s, 5 Hz as in the paper
+RAMP = 0.1  # s: the servo's target moves linearly to its new value, then rests, so the arm has settled at the next step
+OBS_NOISE, OBS_NOISE_PROB = 0.004, 0.3  # raw units; sgft.md 8.2 and O-6
+MAX_SPEED = 50.0  # m/s or rad/s: ten times what any joint or object reaches, so beyond it the physics has exploded
+
+
+class Scene(NamedTuple):
+    """The parts in which Franka tasks differ. Vectors are for one world; `params` is World.params.
+
+    build(params by name) -> MjSpec: the whole scene for one theta.
+    initial(params, key) -> PhysicsState: a fresh random start.
+    target(qpos, action) -> [7] joint targets in rad for an action in [-1, 1] (effects already applied).
+    observe(params, state) -> [obs_dim] without measurement error.
+    substeps: physics steps per control period. cartesian: the first two action entries are x and y of the base frame.
+    event(params, state) -> state: what happens between control steps (a fallen object stays down); default nothing.
+    """
+
+    name: str
+    observation: tuple[Entry, ...]
+    action: tuple[Entry, ...]
+    parameters: tuple[Parameter, ...]
+    episode_length: int
+    substeps: int
+    success_anytime: bool
+    cartesian: bool
+    build: Callable[[dict[str, float]], mujoco.MjSpec]
+    initial: Callable[[Array, Key], PhysicsState]
+    target: Callable[[Array, Array], Array]
+    observe: Callable[[Array, PhysicsState], Array]
+    reward: Callable[[Array, Array, Array], Array]
+    success: Callable[[Array], Array]
+    event: Callable[[Array, PhysicsState], PhysicsState] = lambda params, state: state
+
+
+def new_spec(*, substeps: int, iterations: int, ls_iterations: int) -> mujoco.MjSpec:
+    """An empty scene with the solver settings all tasks share; contacts only where a task declares a pair."""
+    spec = mujoco.MjSpec()
+    option = spec.option
+    option.timestep = CONTROL_DT / substeps
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    option.iterations, option.ls_iterations = iterations, ls_iterations
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    spec.worldbody.add_light(pos=[0.6, -0.6, 2.0], dir=[-0.1, 0.3, -1.0], castshadow=True)
+    return spec
+
+
+def make_env(scene: Scene) -> Env:
+    """Assembles the Env of a scene: worlds, resets, steps."""
+    nominal = {p.name: p.nominal for p in scene.parameters}
+    simulator = physics.make_simulator(scene.build(nominal))
+    obs_dim, act_dim = sum(e.size for e in scene.observation), sum(e.size for e in scene.action)
+
+    def stack_worlds(params: np.ndarray, effects: Effects) -> World:
+        specs = (scene.build(dict(zip(nominal, map(float, row), strict=True))) for row in params)
+        fields = physics.compile_worlds(simulator, specs)
+        repeat = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(params), *x.shape)), effects)
+        return World(jnp.asarray(params, jnp.float32), {k: jnp.asarray(v) for k, v in fields.items()}, repeat)
+
+    def sample_worlds(key: Key, n: int) -> World:
+        low, high = (np.array([getattr(p, end) for p in scene.parameters]) for end in ("low", "high"))
+        uniform = np.asarray(jax.random.uniform(key, (n, len(low))))
+        return stack_worlds(low + (high - low) * uniform, training_effects(obs_dim, act_dim))
+
+    def make_world(params: dict[str, float], effects: dict[str, float | list[float]]) -> World:
+        unknown = sorted(set(params) - set(nominal))
+        if unknown:
+            raise UserError(f"{scene.name} has no domain parameter '{unknown[0]}'; it has: {', '.join(nominal)}")
+        if effects.get("action_rotation") and not scene.cartesian:
+            raise UserError(f"effect 'action_rotation' needs Cartesian actions; {scene.name} commands joints")
+        row = np.array([list({**nominal, **params}.values())])
+        world = stack_worlds(row, make_effects(effects, obs_dim, act_dim))
+        return jax.tree.map(lambda x: x[0], world)
+
+    def reset(world: World, key: Key) -> EnvState:
+        key_start, key_noise = jax.random.split(key)
+        state = scene.initial(world.params, key_start)
+        true_obs = scene.observe(world.params, state)
+        no = jnp.zeros((), bool)
+        zero = jnp.zeros((), jnp.float32)
+        obs = measure(world.effects, true_obs, key_noise)
+        return EnvState(state, obs, true_obs, zero, no, no, no, no, jnp.zeros((), jnp.int32))
+
+    def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
+        key_latency, key_noise = jax.random.split(key)
+        target = scene.target(state.physics.qpos, distort(world.effects, action))
+        control = _ramp(world.effects, state.physics.ctrl, target, simulator.host.opt.timestep, key_latency)
+        after = physics.advance(simulator, world.model, state.physics, control, substeps=scene.substeps)
+        after = scene.event(world.params, after)
+        true_obs = scene.observe(world.params, after)
+        time = state.time + 1
+        return EnvState(
+            physics=after,
+            obs=measure(world.effects, true_obs, key_noise),
+            true_obs=true_obs,
+            reward=scene.reward(state.true_obs, action, true_obs),
+            terminated=jnp.zeros((), bool),
+            truncated=time >= scene.episode_length,
+            success=_succeeded(scene, state.success, true_obs),
+            invalid=physics.exploded(after, max_speed=MAX_SPEED),
+            time=time,
+        )
+
+    return Env(
+        name=scene.name,
+        observation=scene.observation,
+        action=scene.action,
+        parameters=scene.parameters,
+        episode_length=scene.episode_length,
+        control_dt=CONTROL_DT,
+        success_anytime=scene.success_anytime,
+        sample_worlds=sample_worlds,
+        make_world=make_world,
+        reset=reset,
+        step=step,
+        reward=scene.reward,
+        terminated=lambda obs, action, next_obs: jnp.zeros((), bool),
+        success=scene.success,
+    )
+
+
+def training_effects(obs_dim: int, act_dim: int) -> Effects:
+    """The effects of the simulator: exact commands, occasional sensor noise."""
+    return make_effects({"obs_noise": OBS_NOISE, "obs_noise_prob": OBS_NOISE_PROB}, obs_dim, act_dim)
+
+
+def make_effects(values: dict[str, float | list[float]], obs_dim: int, act_dim: int) -> Effects:
+    """Effects from named values; what is not named has no effect. Scalars fill vectors.
+
+    Raises UserError for unknown names, wrong lengths and negative latencies or noise.
+    """
+    shapes = Effects((act_dim,), (), (), (), (), (), (obs_dim,))._asdict()
+    unknown = sorted(set(values) - set(shapes))
+    if unknown:
+        raise UserError(f"no effect is called '{unknown[0]}'; there are: {', '.join(shapes)}")
+    defaults = {"action_scale": 1.0, "obs_noise_prob": 1.0}
+    arrays = {}
+    for name, shape in shapes.items():
+        value = np.asarray(values.get(name, defaults.get(name, 0.0)), np.float32)
+        if value.shape not in ((), shape):
+            raise UserError(f"effect '{name}' needs {shape[0] if shape else 'one'} value(s), got {value.size}")
+        if name in ("latency", "latency_jitter", "obs_noise", "obs_noise_prob") and value < 0:
+            raise UserError(f"effect '{name}' must not be negative, got {value}")
+        arrays[name] = jnp.asarray(np.broadcast_to(value, shape))
+    return Effects(**arrays)
+
+
+def distort(effects: Effects, action: Array) -> Array:
+    """The action as the robot understands it: rotated in the xy plane if Cartesian, scaled. [act_dim] -> [act_dim]."""
+    c, s = jnp.cos(effects.action_rotation), jnp.sin(effects.action_rotation)
+    turned = jnp.stack([c * action[0] - s * action[1], s * action[0] + c * action[1]])
+    return effects.action_scale * action.at[:2].set(turned)
+
+
+def measure(effects: Effects, true_obs: Array, key: Key) -> Array:
+    """The observation as the sensors report it: biased, and sometimes noisy as a whole vector (O-6)."""
+    key_gate, key_noise = jax.random.split(key)
+    noisy = jax.random.bernoulli(key_gate, effects.obs_noise_prob)
+    noise = effects.obs_noise * jax.random.normal(key_noise, true_obs.shape)
+    return true_obs + effects.obs_bias + jnp.where(noisy, noise, 0.0)
+
+
+def at_rest(joints: Array, others: Array, nv: int) -> PhysicsState:
+    """A motionless state: arm at `joints` [7], the other coordinates at `others`, servo target where the arm is."""
+    return PhysicsState(jnp.concatenate([joints, others]), jnp.zeros(nv), jnp.zeros(nv), joints)
+
+
+def _ramp(effects: Effects, previous: Array, target: Array, dt: float, key: Key) -> Callable[[Array], Array]:
+    jitter = jax.random.uniform(key, minval=-1.0, maxval=1.0) * effects.latency_jitter
+    start = jnp.maximum(effects.latency + jitter, 0.0)
+
+    def control(i: Array) -> Array:
+        progress = jnp.clip(((i + 1) * dt - start) / RAMP, 0.0, 1.0)
+        return previous + progress * (target - previous)
+
+    return control
+
+
+def _succeeded(scene: Scene, before: Array, obs: Array) -> Array:
+    now = scene.success(obs)
+    return before | now if scene.success_anytime else now
+
+
+def clip_joints(q: Array) -> Array:
+    """Joint targets inside the position limits."""
+    return jnp.clip(q, jnp.asarray(arm.Q_MIN, jnp.float32), jnp.asarray(arm.Q_MAX, jnp.float32))

@@ -1,0 +1,114 @@
+"""From a specification per domain parameter to stacked MJX worlds, and from control targets to the next state.
+
+Domain parameters reach MuJoCo in one place, `compile_worlds`: every theta is compiled on the host by MuJoCo's own
+compiler, and the fields in which the compiled models differ are stacked. That is exact for everything (sizes, masses
+and all constants derived from them), because no derived field is ever recomputed by hand.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+
+from sgft_jax.types import Array, UserError
+
+# Fields that only matter to a renderer: they may differ between worlds without being simulated.
+_COSMETIC = ("geom_rgba", "mat_", "light_", "cam_")
+_MEAN_INERTIA = "stat.meaninertia"
+_STRUCTURE = ("body_parentid", "jnt_type", "geom_type", "geom_bodyid", "actuator_trnid", "pair_geom1", "pair_geom2", "pair_dim")
+
+
+class PhysicsState(NamedTuple):
+    """All that a MuJoCo step needs to continue exactly: everything else is recomputed from it.
+
+    qpos: [nq], qvel: [nv], warmstart: [nv] last acceleration, where the constraint solver starts. ctrl: [nu] last command.
+    """
+
+    qpos: Array
+    qvel: Array
+    warmstart: Array
+    ctrl: Array
+
+
+class Simulator(NamedTuple):
+    """A compiled scene: `model` is the nominal MJX model, `blank` the data a step starts from, `host` MuJoCo's model."""
+
+    model: mjx.Model
+    blank: mjx.Data
+    host: mujoco.MjModel
+
+
+def make_simulator(spec: mujoco.MjSpec) -> Simulator:
+    """Compiles the nominal scene."""
+    host = spec.compile()
+    return Simulator(mjx.put_model(host, impl="jax"), mjx.make_data(host, impl="jax"), host)
+
+
+def compile_worlds(simulator: Simulator, specs: Iterable[mujoco.MjSpec]) -> dict[str, np.ndarray]:
+    """Compiles one model per spec and stacks the fields that differ from the nominal model: name -> [n, ...].
+
+    Raises UserError when a spec changes the structure of the scene (number or types of elements), which a compiled
+    program cannot follow.
+    """
+    names = [k for k, v in vars(simulator.model).items() if isinstance(v, jax.Array) and not k.startswith(_COSMETIC)]
+    reference = _read(simulator.host, names)
+    models = []
+    for spec in specs:
+        host = spec.compile()
+        _check_structure(simulator.host, host)
+        models.append(_read(host, names))
+    changed = [k for k in reference if any(not np.array_equal(reference[k], fields[k]) for fields in models)]
+    return {k: np.stack([fields[k] for fields in models]) for k in changed}
+
+
+def with_fields(model: mjx.Model, fields: dict[str, Array]) -> mjx.Model:
+    """The model of one world: the nominal one with the fields of that world."""
+    fields = dict(fields)
+    mean_inertia = fields.pop(_MEAN_INERTIA, model.stat.meaninertia)
+    return model.replace(stat=model.stat.replace(meaninertia=mean_inertia), **fields)
+
+
+def advance(
+    simulator: Simulator, fields: dict[str, Array], state: PhysicsState, control: Callable[[Array], Array], *, substeps: int
+) -> PhysicsState:
+    """Runs `substeps` steps; `control(i)` gives the command [nu] of substep i.
+
+    Between substeps only the minimal state is carried: it keeps the loop's memory traffic small.
+    Matrix products run in full float32: TF32 is not enough for contact dynamics.
+    """
+    model = with_fields(simulator.model, fields)
+
+    def substep(state: PhysicsState, i: Array) -> tuple[PhysicsState, None]:
+        ctrl = control(i)
+        data = simulator.blank.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl)
+        data = mjx.step(model, data)
+        return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, ctrl), None
+
+    with jax.default_matmul_precision("highest"):
+        return jax.lax.scan(substep, state, jnp.arange(substeps))[0]
+
+
+def exploded(state: PhysicsState, *, max_speed: float) -> Array:
+    """[] bool: the state is not finite, or something moves faster than `max_speed` (m/s or rad/s)."""
+    speed = jnp.abs(state.qvel).max()
+    return ~(jnp.isfinite(state.qpos).all() & (speed < max_speed))  # NaN speeds compare false
+
+
+def _read(host: mujoco.MjModel, names: list[str]) -> dict[str, np.ndarray]:
+    """Fields of a compiled model in the precision MJX keeps them in."""
+    fields = {name: np.array(getattr(host, name)) for name in names}
+    fields[_MEAN_INERTIA] = np.array(host.stat.meaninertia)
+    return {k: v.astype(np.float32) if v.dtype == np.float64 else v for k, v in fields.items()}
+
+
+def _check_structure(nominal: mujoco.MjModel, host: mujoco.MjModel) -> None:
+    for name in _STRUCTURE:
+        if not np.array_equal(getattr(nominal, name), getattr(host, name)):
+            raise UserError(f"domain parameters change '{name}' of the scene; they may change values, not its structure")
+    for name in ("dof_frictionloss", "tendon_frictionloss"):  # MJX allocates constraint rows for non-zero ones only
+        if not np.array_equal(getattr(nominal, name) > 0, getattr(host, name) > 0):
+            raise UserError(f"'{name}' must be positive for the same elements in the nominal and in every other model")
