@@ -36,10 +36,10 @@ def jsonable(value: Any) -> Any:
 
 
 def _widened(array: np.ndarray) -> np.ndarray:
-    """float32 0.1 as 0.1 rather than 0.10000000149: the shortest decimal that reads back as the same float32."""
+    """float64 for what JSON would spell oddly: float32 0.1 stays 0.1 instead of becoming 0.10000000149."""
     if array.dtype == np.float32:
-        return np.vectorize(lambda x: float(str(x)), otypes=[np.float64])(array) if array.size else array
-    return array.astype(np.float64) if array.dtype.kind == "V" else array  # bfloat16
+        return np.array([float(str(x)) for x in array.reshape(-1)]).reshape(array.shape)
+    return array.astype(np.float64) if array.dtype.kind == "V" else array  # V: bfloat16
 
 
 def write_json(path: Path, value: Any) -> None:
