@@ -19,7 +19,16 @@ from sgft_jax.types import Array, UserError
 # Fields that only matter to a renderer: they may differ between worlds without being simulated.
 _COSMETIC = ("geom_rgba", "mat_", "light_", "cam_")
 _MEAN_INERTIA = "stat.meaninertia"
-_STRUCTURE = ("body_parentid", "jnt_type", "geom_type", "geom_bodyid", "actuator_trnid", "pair_geom1", "pair_geom2", "pair_dim")
+_STRUCTURE = (
+    "body_parentid",
+    "jnt_type",
+    "geom_type",
+    "geom_bodyid",
+    "actuator_trnid",
+    "pair_geom1",
+    "pair_geom2",
+    "pair_dim",
+)
 
 
 class PhysicsState(NamedTuple):
@@ -73,7 +82,12 @@ def with_fields(model: mjx.Model, fields: dict[str, Array]) -> mjx.Model:
 
 
 def advance(
-    simulator: Simulator, fields: dict[str, Array], state: PhysicsState, control: Callable[[Array], Array], *, substeps: int
+    simulator: Simulator,
+    fields: dict[str, Array],
+    state: PhysicsState,
+    control: Callable[[Array], Array],
+    *,
+    substeps: int,
 ) -> PhysicsState:
     """Runs `substeps` steps; `control(i)` gives the command [nu] of substep i.
 
@@ -108,7 +122,9 @@ def _read(host: mujoco.MjModel, names: list[str]) -> dict[str, np.ndarray]:
 def _check_structure(nominal: mujoco.MjModel, host: mujoco.MjModel) -> None:
     for name in _STRUCTURE:
         if not np.array_equal(getattr(nominal, name), getattr(host, name)):
-            raise UserError(f"domain parameters change '{name}' of the scene; they may change values, not its structure")
+            raise UserError(
+                f"domain parameters change '{name}' of the scene; they may change values, not its structure"
+            )
     for name in ("dof_frictionloss", "tendon_frictionloss"):  # MJX allocates constraint rows for non-zero ones only
         if not np.array_equal(getattr(nominal, name) > 0, getattr(host, name) > 0):
             raise UserError(f"'{name}' must be positive for the same elements in the nominal and in every other model")

@@ -72,10 +72,13 @@ def _add_link(parent: mujoco.MjsBody, i: int) -> mujoco.MjsBody:
         name=f"link{i + 1}",
         pos=[a, -np.sin(alpha) * d, np.cos(alpha) * d],
         quat=[np.cos(alpha / 2), np.sin(alpha / 2), 0, 0],
-        gravcomp=1.0,
     )
     body.add_joint(
-        name=f"joint{i + 1}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1], armature=ARMATURE[i], damping=JOINT_DAMPING
+        name=f"joint{i + 1}",
+        type=mujoco.mjtJoint.mjJNT_HINGE,
+        axis=[0, 0, 1],
+        armature=ARMATURE[i],
+        damping=JOINT_DAMPING,
     )
     start, end, radius = _SHAPES[i]
     _add_visual(body, start, end, radius, _WHITE if i % 2 else _GREY, mass=LINK_MASS[i])
@@ -84,7 +87,12 @@ def _add_link(parent: mujoco.MjsBody, i: int) -> mujoco.MjsBody:
 
 def _add_visual(body: mujoco.MjsBody, start, end, radius: float, rgba, mass: float = 0.0) -> None:  # noqa: ANN001
     body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[*start, *end], size=[radius, 0, 0], mass=mass, rgba=rgba, **NO_CONTACT
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        fromto=[*start, *end],
+        size=[radius, 0, 0],
+        mass=mass,
+        rgba=rgba,
+        **NO_CONTACT,
     )
 
 

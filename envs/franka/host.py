@@ -16,7 +16,13 @@ from sgft_jax.types import Array
 
 
 def play(
-    scene: Scene, theta: dict[str, float], start: PhysicsState, actions: Sequence[Array] | Array, *, refine: int = 1, iterations: int = 0
+    scene: Scene,
+    theta: dict[str, float],
+    start: PhysicsState,
+    actions: Sequence[Array] | Array,
+    *,
+    refine: int = 1,
+    iterations: int = 0,
 ) -> list[PhysicsState]:
     """Plays `actions` [T, act_dim] from `start` with C MuJoCo; returns the T states after each control step.
 
@@ -39,7 +45,9 @@ def play(
     return states
 
 
-def _control_step(model: mujoco.MjModel, data: mujoco.MjData, state: PhysicsState, command: np.ndarray, substeps: int) -> PhysicsState:
+def _control_step(
+    model: mujoco.MjModel, data: mujoco.MjData, state: PhysicsState, command: np.ndarray, substeps: int
+) -> PhysicsState:
     data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = state.qpos, state.qvel, state.warmstart
     previous = np.asarray(state.ctrl)
     for i in range(substeps):

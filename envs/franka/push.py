@@ -31,6 +31,7 @@ FINGER_RADIUS, FINGER_GAP = 0.008, 0.04  # m
 PUCK_RADIUS, PUCK_HALF_HEIGHT = 0.032, 0.015  # m
 WORKSPACE = np.array([[0.08, -0.35], [0.56, 0.35]])  # m, xy of the hand, table frame
 FALLEN_AT, SEEN_AT = 1.5, EDGE + 0.03  # m, table frame: where a fallen puck lies, where the camera saw it last
+GRAVITY = 9.81  # m/s^2
 NV = arm.N_JOINTS + 4  # puck: x, y, z, yaw
 
 PARAMETERS = (
@@ -49,7 +50,9 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
     for side in (-1, 1):
         _add_finger(link, side)
-    spec.worldbody.add_geom(name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1], rgba=[0, 0, 0, 0], **NO_CONTACT)
+    spec.worldbody.add_geom(
+        name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1], rgba=[0, 0, 0, 0], **NO_CONTACT
+    )
     _add_scenery(spec)
     _add_puck(spec, theta["object_mass"])
     _add_pair(spec, "table", "puck_base", theta["table_friction"], spin=theta["table_friction"] * PUCK_RADIUS * 2 / 3)
@@ -137,7 +140,9 @@ def make() -> Env:
 
 
 def _pose(xy: Array) -> Pose:
-    return Pose(jnp.concatenate([xy + jnp.array([TABLE_ORIGIN, 0.0]), jnp.array([HEIGHT])]), jnp.asarray(DOWN, jnp.float32))
+    return Pose(
+        jnp.concatenate([xy + jnp.array([TABLE_ORIGIN, 0.0]), jnp.array([HEIGHT])]), jnp.asarray(DOWN, jnp.float32)
+    )
 
 
 def _ready() -> np.ndarray:
@@ -170,11 +175,12 @@ def _add_finger(link: mujoco.MjsBody, side: int) -> None:
 
 
 def _add_puck(spec: mujoco.MjSpec, mass: float) -> None:
-    """A disc that slides and spins but does not tilt: flat on the table, dry friction is isotropic and one contact with
-    torsional friction stands for the whole face."""
+    """A disc that slides and spins but does not tilt: one contact with torsional friction stands for its whole face."""
     body = spec.worldbody.add_body(name="puck", pos=[0, 0, PUCK_HALF_HEIGHT])
-    for axis in np.eye(3):
+    for axis in np.eye(3)[:2]:
         body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+    # Weight, in a scene without gravity: a spring of 1 N/m whose rest length is mass * g away.
+    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], stiffness=1.0, springref=-mass * GRAVITY)
     body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
     body.add_geom(
         type=mujoco.mjtGeom.mjGEOM_CYLINDER,
@@ -186,7 +192,11 @@ def _add_puck(spec: mujoco.MjSpec, mass: float) -> None:
     invisible = {"mass": 0, "rgba": [0, 0, 0, 0], **NO_CONTACT}
     foot = PUCK_HALF_HEIGHT / 2
     body.add_geom(
-        name="puck_base", type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=[0, 0, foot - PUCK_HALF_HEIGHT], size=[foot, 0, 0], **invisible
+        name="puck_base",
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        pos=[0, 0, foot - PUCK_HALF_HEIGHT],
+        size=[foot, 0, 0],
+        **invisible,
     )
     # The side as the fingers feel it: a sphere against a vertical capsule is exact in every backend, a sphere against a
     # cylinder is not.
