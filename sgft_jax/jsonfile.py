@@ -13,10 +13,10 @@ from sgft_jax.types import UserError
 
 
 def jsonable(value: Any) -> Any:
-    """Plain JSON data: arrays become lists, array scalars numbers, paths strings; non-finite floats "nan", "inf", "-inf".
+    """Plain JSON data: arrays become lists, array scalars numbers, paths strings, infinities and nan their names.
 
-    Those strings keep the file valid JSON for every reader and, unlike null, still tell divergence from a missing value;
-    Python's `float` turns them back. Raises TypeError for anything else.
+    Those strings keep the file valid JSON for every reader and, unlike null, still tell divergence from a missing
+    value; Python's `float` turns them back. Raises TypeError for anything else.
     """
     if isinstance(value, Mapping):
         return {str(k): jsonable(v) for k, v in value.items()}

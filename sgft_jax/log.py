@@ -24,8 +24,8 @@ class MetricsLog:
     """Append-only `metrics.jsonl` and `eval.jsonl` of one run, mirrored to TensorBoard event files in `tensorboard/`.
 
     A line is {"step": ..., **values}; non-finite numbers are the strings "nan", "inf" and "-inf" (see `jsonfile`).
-    Lines reach the operating system one by one, so a killed process loses none. `position()` goes into the checkpoint and
-    `truncate(position)` undoes what was written after it: an interrupted and resumed run leaves the lines of an
+    Lines reach the operating system one by one, so a killed process loses none. `position()` goes into the checkpoint
+    and `truncate(position)` undoes what was written after it: an interrupted and resumed run leaves the lines of an
     uninterrupted one.
     """
 

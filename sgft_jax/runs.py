@@ -1,0 +1,178 @@
+"""Impure: the life of a run folder: made once, resumed or replaced on request, with its configuration and origin."""
+
+import dataclasses
+import fcntl
+import importlib.metadata
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import weakref
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from sgft_jax.config import config_from_json, config_to_json, differences
+from sgft_jax.jsonfile import read_json, write_json
+from sgft_jax.types import UserError
+
+CONFIG, PROVENANCE = "config.json", "provenance.json"
+_LOCK = ".lock"
+_MARK = "sgft_jax"
+_PACKAGES = ("sgft-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
+
+
+class Lock:
+    """An exclusive lock on a folder, held until `release()`, collection or the end of the process, however it ends.
+
+    Raises UserError if another process, or another Run of this one, holds it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        handle = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+        self.release = weakref.finalize(self, os.close, handle)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.release()
+            raise UserError(f"{folder}: another process is writing to it") from None
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """An open run folder, locked against other processes; `resumed`: it holds an earlier start of the same run."""
+
+    folder: Path
+    resumed: bool
+    lock: Lock = dataclasses.field(repr=False)
+
+    @property
+    def prior(self) -> Path:
+        """Where pretraining saves its prior."""
+        return self.folder / "prior"
+
+    def made(self, name: str) -> Path:
+        """The sub-folder `name` (`figures`, `videos`), created if needed."""
+        path = self.folder / name
+        path.mkdir(exist_ok=True)
+        return path
+
+    def close(self) -> None:
+        """Let other processes open the folder."""
+        self.lock.release()
+
+
+def open_run(
+    folder: Path,
+    *,
+    kind: str,
+    config: Any,
+    resume: bool = False,
+    overwrite: bool = False,
+    volatile: tuple[str, ...] = ("resume", "overwrite"),
+    say: Callable[[str], None] = print,
+) -> Run:
+    """Create or reopen a run folder, say where it is, and record configuration and provenance in it.
+
+    kind: what writes there ("pretrain", "finetune"). config: a frozen dataclass. volatile: dotted names of fields that
+    may differ on a resume. Raises UserError if the folder holds something already and neither `resume` nor `overwrite`
+    is set, if it is not a run folder, if the stored configuration differs, or if another process has it open.
+    """
+    folder = Path(folder)
+    if resume and overwrite:
+        raise UserError("--resume and --overwrite exclude each other: keep the run or replace it")
+    say(f"run folder: {folder}")
+    # A process killed while it made the folder leaves hidden files at most: nothing started yet.
+    existing = folder.exists() and any(not p.name.startswith(".") for p in folder.iterdir())
+    if existing:
+        _check_ours(folder, resume=resume, overwrite=overwrite)
+    elif resume and not folder.exists():
+        raise UserError(f"{folder}: nothing to resume there; leave --resume out to start it")
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = Lock(folder)
+    resolved = config_to_json(config)
+    if existing and resume:
+        _check_same(folder, kind, resolved, volatile)
+    elif existing:
+        _empty(folder)
+    if not (existing and resume):
+        write_json(folder / CONFIG, {_MARK: importlib.metadata.version("sgft-jax"), "kind": kind, "config": resolved})
+    starts = read_json(folder / PROVENANCE)["starts"] if (folder / PROVENANCE).exists() else []
+    write_json(folder / PROVENANCE, {"starts": [*starts, provenance()]})
+    return Run(folder=folder, resumed=existing and resume, lock=lock)
+
+
+def read_config[T](folder: Path, cls: type[T]) -> T:
+    """The configuration a run was started with; raises UserError if the folder is no run or the fields do not fit."""
+    return config_from_json(cls, _stored(Path(folder))["config"])
+
+
+def provenance() -> dict[str, Any]:
+    """Where results come from: command, time, code, versions, device. Names no host and no user."""
+    import jax
+
+    device = jax.devices()[0]
+    return {
+        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "git": _git_state(Path(__file__).parent.parent),
+        "python": platform.python_version(),
+        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
+        "device": {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()},
+    }
+
+
+def _git_state(root: Path) -> dict[str, Any] | None:
+    """Commit, whether files differ from it, and by how much; None outside a git checkout of this project."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(root), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    if not (root / ".git").exists():
+        return None
+    try:
+        changed = git("diff", "HEAD", "--stat")
+        return {"commit": git("rev-parse", "HEAD"), "dirty": bool(changed), "changed": changed.splitlines()}
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+# ---------------------------------------------------------------- the folder
+
+
+def _check_ours(folder: Path, *, resume: bool, overwrite: bool) -> None:
+    if not (resume or overwrite):
+        raise UserError(f"{folder}: exists already; continue it with --resume or replace it with --overwrite")
+    stored = _stored(folder) if (folder / CONFIG).exists() else {}
+    if _MARK not in stored:
+        raise UserError(f"{folder}: is not a run folder (it has no {CONFIG} of ours); choose another one")
+
+
+def _stored(folder: Path) -> dict[str, Any]:
+    stored = read_json(folder / CONFIG)
+    if not isinstance(stored, dict) or not {_MARK, "kind", "config"} <= set(stored):
+        raise UserError(f"{folder / CONFIG}: was not written by this project")
+    return stored
+
+
+def _check_same(folder: Path, kind: str, wanted: dict[str, Any], volatile: tuple[str, ...]) -> None:
+    stored = _stored(folder)
+    if stored["kind"] != kind:
+        raise UserError(f"{folder}: is a {stored['kind']} run, not a {kind} run")
+    differing = [d for d in differences(stored["config"], wanted) if d[0] not in volatile]
+    if differing:
+        listed = "; ".join(f"{name} was {old!r}, now {new!r}" for name, old, new in differing)
+        raise UserError(f"{folder}: cannot resume with another configuration: {listed}")
+
+
+def _empty(folder: Path) -> None:
+    """Delete the content of a folder that `_check_ours` accepted, its mark last; links are removed, never followed."""
+    for path in sorted(folder.iterdir(), key=lambda p: p.name == CONFIG):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        elif path.name != _LOCK:
+            path.unlink()
