@@ -105,5 +105,5 @@ def _scalar(hint: Any, value: Any, where: str) -> Any:
 
 def _checked(fits: bool, hint: Any, value: Any, where: str) -> Any:
     if not fits:
-        raise UserError(f"{where}: expected {getattr(hint, '__name__', hint)}, got {value!r}")
+        raise UserError(f"{where}: expected {hint.__name__ if isinstance(hint, type) else hint}, got {value!r}")
     return value

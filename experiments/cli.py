@@ -1,0 +1,145 @@
+"""Impure: what every command shares: parsing, error messages, exit codes, caches, quiet logs. Imports nothing heavy."""
+
+import contextlib
+import difflib
+import importlib
+import io
+import logging
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+import tyro
+
+USER_ERROR, INTERRUPTED = 2, 130
+_CACHE_VARIABLE = "SGFT_CACHE_DIR"
+_RENDER_PROBE = "import mujoco; c = mujoco.GLContext(16, 16); c.make_current(); c.free()"
+
+
+def run_main[T](
+    main: Callable[[T], None], config_type: type[T], description: str, *, argv: Sequence[str] | None = None
+) -> None:
+    """Parse the command line into `config_type` and call `main` with it.
+
+    Exits with code 2 and one line `error: ...` on stderr for anything the user can mend (`UserError`, unknown options
+    or choices), with 130 after an interrupt. Other exceptions are bugs and keep their traceback.
+    """
+    config = parse(config_type, description, argv)
+    set_up()
+    try:
+        main(config)
+    except KeyboardInterrupt:
+        print("\ninterrupted; the same command with --resume continues from the last checkpoint", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+    except Exception as error:
+        from sgft_jax.types import UserError
+
+        if not isinstance(error, UserError):
+            raise
+        fail(str(error))
+
+
+def parse[T](config_type: type[T], description: str, argv: Sequence[str] | None = None) -> T:
+    """A frozen dataclass from the command line; a bad one ends the process with one line and code 2."""
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(complaint):
+            return tyro.cli(config_type, description=description, args=argv)
+    except SystemExit as stopped:
+        if stopped.code not in (None, 0):
+            fail(one_line(complaint.getvalue()))
+        raise
+
+
+def fail(message: str) -> NoReturn:
+    """End the process as every user error does."""
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(USER_ERROR)
+
+
+def one_line(boxed: str) -> str:
+    """The gist of tyro's framed complaint: its first paragraph, with the closest match where it offers some."""
+    lines = [line.strip("│ \t") for line in boxed.splitlines() if line.strip() and line[0] not in "╭╰"]
+    rules = [i for i, line in enumerate(lines) if set(line) == {"─"}]
+    message = " ".join(lines[: rules[0]] if rules else lines) or "bad command line"
+    if match := re.search(r"invalid choice '(.*?)' for argument '(.*?)'\. Expected one of \((.*)\)", message):
+        value, option, listed = match.groups()
+        return unknown(option, value, re.findall(r"'(.*?)'", listed))
+    if (match := re.search(r"Perhaps you meant:\s*(--\S+)", " ".join(lines))) and len(rules) > 1:
+        return f"{message}; did you mean {match.group(1).rstrip(',')}?"
+    return message
+
+
+def choose[V](kind: str, name: str, options: dict[str, V]) -> V:
+    """`options[name]`; raises UserError with the closest match and the list of what exists."""
+    if name in options:
+        return options[name]
+    from sgft_jax.types import UserError
+
+    raise UserError(unknown(kind, name, options))
+
+
+def unknown(kind: str, name: str, options: Iterable[str]) -> str:
+    """What to tell someone who asked for a `kind` called `name` where only `options` exist."""
+    listed = sorted(options)
+    close = difflib.get_close_matches(name, listed, n=1)
+    hint = f", did you mean {close[0]!r}?" if close else "."
+    return f"{kind}: there is no {name!r}{hint} Choose from: {', '.join(listed)}"
+
+
+def set_up() -> None:
+    """Compilation cache, GPU flags and quiet logs; before JAX starts. What the user has set stays."""
+    if cache := cache_folder():
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "1")
+    # Lets XLA use Triton for any matrix product; without effect on a CPU.
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_gpu_triton_gemm_any" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_triton_gemm_any=true".strip()
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # the C++ logs of XLA
+    for name in ("absl", "jax", "orbax", "tensorboardX"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+
+
+def cache_folder() -> Path | None:
+    """Where compiled programs are kept: $SGFT_CACHE_DIR, by default ~/.cache/sgft_jax/jax; None if it is "off"."""
+    chosen = os.environ.get(_CACHE_VARIABLE, "")
+    if chosen.lower() in ("off", "none", "0"):
+        return None
+    return Path(chosen) if chosen else Path.home() / ".cache" / "sgft_jax" / "jax"
+
+
+def select_renderer() -> str | None:
+    """Make MuJoCo able to render without a screen by setting MUJOCO_GL; None on success, else one line why not.
+
+    Call it only if pictures are wanted: it tries egl and osmesa, each in a process of its own, because a failed attempt
+    cannot be undone. A value that the user has set is tried alone.
+    """
+    chosen = os.environ.get("MUJOCO_GL")
+    reasons = []
+    for backend in [chosen] if chosen else ["egl", "osmesa"]:
+        reason = _probe(backend)
+        if reason is None:
+            os.environ["MUJOCO_GL"] = backend
+            if module := sys.modules.get("mujoco.rendering.classic.gl_context"):
+                importlib.reload(module)  # MuJoCo was imported already and has read the old value
+            return None
+        reasons.append(f"{backend}: {reason}")
+    return f"MuJoCo cannot render here ({'; '.join(reasons)}); install libegl1 or libosmesa6"
+
+
+def _probe(backend: str) -> str | None:
+    """None if MuJoCo makes an off-screen context with this backend, else the last line it said."""
+    command, environment = [sys.executable, "-c", _RENDER_PROBE], {**os.environ, "MUJOCO_GL": backend}
+    try:
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    except subprocess.TimeoutExpired:
+        return "no answer within 60 s"
+    if done.returncode == 0:
+        return None
+    said = [line for line in done.stderr.splitlines() if line.strip()]
+    return said[-1].strip()[:120] if said else f"exit code {done.returncode}"
