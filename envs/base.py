@@ -82,8 +82,9 @@ class EnvState(NamedTuple):
 class Env(NamedTuple):
     """A task. All functions are for one world and one example; nothing is batched inside.
 
-    sample_worlds(key, n) -> World stacked [n]: fresh domain parameters, compiled on the host (not jittable).
-    make_world(params: dict[str, float], effects: dict) -> World: one fixed world, e.g. a gap (not jittable).
+    sample_worlds(key, n, params=..., effects=...) -> World stacked [n], compiled on the host (not jittable). Domain
+        parameters are drawn from their training ranges unless `params` names a value or a range [low, high]; `effects`
+        names what else differs from the simulator. Raises UserError for unknown names.
     reset(world, key) -> EnvState; step(world, state, action, key) -> EnvState.
     reward, terminated: functions of (obs, action, next_obs), true for imagined transitions too.
     success: function of one observation; `success_anytime` tells whether it counts at any step or only at the last.
@@ -97,7 +98,6 @@ class Env(NamedTuple):
     control_dt: float
     success_anytime: bool
     sample_worlds: Callable[..., World]
-    make_world: Callable[..., World]
     reset: Callable[[World, Key], EnvState]
     step: Callable[[World, EnvState, Array, Key], EnvState]
     reward: Callable[[Array, Array, Array], Array]

@@ -1,6 +1,6 @@
 """What all Franka tasks share: effects on commands and sensors, the 5 Hz control period, and the Env assembled from parts."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -16,7 +16,8 @@ from sgft_jax.types import Array, Key, UserError
 
 CONTROL_DT = 0.2  # s, 5 Hz as in the paper
 RAMP = 0.1  # s: the servo's target moves linearly to its new value, then rests, so the arm has settled at the next step
-OBS_NOISE, OBS_NOISE_PROB = 0.004, 0.3  # raw units; sgft.md 8.2 and O-6
+# The simulator's own effects: exact commands, occasional sensor noise in raw units (paper, Appendix C).
+TRAINING = {"obs_noise": 0.004, "obs_noise_prob": 0.3}
 MAX_SPEED = 50.0  # m/s or rad/s: ten times what any joint or object reaches, so beyond it the physics has exploded
 
 
@@ -77,20 +78,15 @@ def make_env(scene: Scene) -> Env:
         repeat = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(params), *x.shape)), effects)
         return World(jnp.asarray(params, jnp.float32), {k: jnp.asarray(v) for k, v in fields.items()}, repeat)
 
-    def sample_worlds(key: Key, n: int) -> World:
-        low, high = (np.array([getattr(p, end) for p in scene.parameters]) for end in ("low", "high"))
-        uniform = np.asarray(jax.random.uniform(key, (n, len(low))))
-        return stack_worlds(low + (high - low) * uniform, training_effects(obs_dim, act_dim))
-
-    def make_world(params: dict[str, float], effects: dict[str, float | list[float]]) -> World:
-        unknown = sorted(set(params) - set(nominal))
-        if unknown:
-            raise UserError(f"{scene.name} has no domain parameter '{unknown[0]}'; it has: {', '.join(nominal)}")
-        if effects.get("action_rotation") and not scene.cartesian:
+    def sample_worlds(
+        key: Key, n: int, *, params: Mapping[str, float | Sequence[float]] | None = None, effects: Mapping | None = None
+    ) -> World:
+        ranges = _ranges(scene, params or {})
+        if effects and effects.get("action_rotation") and not scene.cartesian:
             raise UserError(f"effect 'action_rotation' needs Cartesian actions; {scene.name} commands joints")
-        row = np.array([list({**nominal, **params}.values())])
-        world = stack_worlds(row, make_effects(effects, obs_dim, act_dim))
-        return jax.tree.map(lambda x: x[0], world)
+        low, high = ranges.T
+        uniform = np.asarray(jax.random.uniform(key, (n, len(low))), np.float64)
+        return stack_worlds(low + (high - low) * uniform, make_effects({**TRAINING, **(effects or {})}, obs_dim, act_dim))
 
     def reset(world: World, key: Key) -> EnvState:
         key_start, key_noise = jax.random.split(key)
@@ -130,7 +126,6 @@ def make_env(scene: Scene) -> Env:
         control_dt=CONTROL_DT,
         success_anytime=scene.success_anytime,
         sample_worlds=sample_worlds,
-        make_world=make_world,
         reset=reset,
         step=step,
         reward=scene.reward,
@@ -139,12 +134,20 @@ def make_env(scene: Scene) -> Env:
     )
 
 
-def training_effects(obs_dim: int, act_dim: int) -> Effects:
-    """The effects of the simulator: exact commands, occasional sensor noise."""
-    return make_effects({"obs_noise": OBS_NOISE, "obs_noise_prob": OBS_NOISE_PROB}, obs_dim, act_dim)
+def _ranges(scene: Scene, chosen: Mapping[str, float | Sequence[float]]) -> np.ndarray:
+    """[n_params, 2] low and high of every parameter: the training range unless `chosen` says a value or another range."""
+    ranges = {p.name: (p.low, p.high) for p in scene.parameters}
+    for name, value in chosen.items():
+        if name not in ranges:
+            raise UserError(f"{scene.name} has no domain parameter '{name}'; it has: {', '.join(ranges)}")
+        pair = np.broadcast_to(np.asarray(value, np.float64), (2,)) if np.size(value) in (1, 2) else None
+        if pair is None or pair[0] > pair[1] or not np.isfinite(pair).all():
+            raise UserError(f"parameter '{name}' needs a value or a range [low, high], got {value}")
+        ranges[name] = (float(pair[0]), float(pair[1]))
+    return np.array(list(ranges.values()))
 
 
-def make_effects(values: dict[str, float | list[float]], obs_dim: int, act_dim: int) -> Effects:
+def make_effects(values: Mapping[str, float | Sequence[float]], obs_dim: int, act_dim: int) -> Effects:
     """Effects from named values; what is not named has no effect. Scalars fill vectors.
 
     Raises UserError for unknown names, wrong lengths and negative latencies or noise.

@@ -1,0 +1,210 @@
+"""Insertion: put a table leg into its hole in a table top. Paper section 6.2; sgft.md sections 9, 15.4, O-22, O-26, O-31.
+
+Everything is measured in the robot's base frame; z = 0 is the surface on which the table top lies. The leg is held
+rigidly, so it is part of the last link, and it points down: the hand translates by steps and keeps its orientation.
+
+Contacts live in configuration space: a round peg of radius r that stays upright inside a square opening of half-width
+R moves exactly as a small ball in an opening of half-width R - r + ball. So two balls on the peg's axis collide with
+four boxes around the narrowed opening, and the drawn leg and hole have their true sizes. The balls' radius is the
+rounding of the leg's tip: it decides how far off the hole the leg may be and still slide in. Each ball costs 16
+constraint rows; a leg with its own shape against a ring of 12 to 16 boxes costs over a hundred and behaves alike.
+"""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from envs.base import Entry, Env, Parameter
+from envs.franka import arm, kinematics
+from envs.franka.arm import NO_CONTACT
+from envs.franka.kinematics import DOWN, Pose
+from envs.franka.task import Scene, at_rest, clip_joints, make_env, new_spec
+from envs.physics import PhysicsState
+from sgft_jax.types import Array, Key
+
+SUBSTEPS = 40
+STEP = 0.02  # m per control step at |action| = 1 (O-19)
+TOLERANCE = 0.01  # m per axis
+PART_HALF = np.array([0.08775, 0.08775, 0.016875])  # m, half sizes of the table top, scaled by 1.08
+TOP = 2 * PART_HALF[2]  # m, height of the table top's upper face
+HOLE_OFFSET = np.array([0.06075, 0.06075])  # m, hole in the frame of the table top
+HOLE_NOMINAL = np.array([0.50, 0.0])  # m, base frame, of an unmoved table top
+DEPTH = 0.025  # m: how deep the tip is when the leg is assembled
+LEG_LENGTH, LEG_HALF_WIDTH = 0.0875, 0.015  # m
+GRASP = 0.06  # m from the tool centre point down to the leg's tip
+TIP_ROUNDING = 0.003  # m
+UPPER_BALL = 0.018  # m above the tip's ball: it enters the hole's mouth when the leg is nearly assembled
+WORKSPACE = np.array([[0.30, -0.30, TOP - DEPTH], [0.70, 0.30, 0.25]])  # m, of the leg's tip, base frame
+START_LOW, START_HIGH = np.array([-0.05, -0.05, 0.05]), np.array([0.05, 0.05, 0.10])  # m, from the nominal hole's mouth
+NV = arm.N_JOINTS
+
+PARAMETERS = (
+    Parameter("part_x", "m", 0.0, -0.05, 0.05),
+    Parameter("part_y", "m", 0.0, -0.05, 0.05),
+    Parameter("part_rotation", "rad", 0.0, -np.pi / 12, np.pi / 12),
+    Parameter("part_friction", "", 0.15, 0.14, 0.16),
+    Parameter("hole_radius", "m", 0.012, 0.012, 0.012),
+    Parameter("peg_radius", "m", 0.0115, 0.0115, 0.0115),
+    Parameter("servo_stiffness", "", 0.25, 0.25, 0.25),
+)
+
+
+def build(theta: dict[str, float]) -> mujoco.MjSpec:
+    """The scene for one theta. The table top is fixed to the table."""
+    spec = new_spec(substeps=SUBSTEPS, iterations=4, ls_iterations=6)
+    link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
+    _add_leg(link)
+    _add_fingers(link)
+    _add_part(spec, theta)
+    for ball in ("tip", "shaft"):
+        for wall in range(4):
+            _add_pair(spec, ball, f"wall{wall}", theta["part_friction"])
+    return spec
+
+
+def observe(params: Array, state: PhysicsState) -> Array:
+    """[9] m, base frame: tool centre point, the leg's tip, where the tip is when the leg is assembled (O-22)."""
+    joints = state.qpos[: arm.N_JOINTS]
+    tip = kinematics.forward(joints, jnp.array([0.0, 0.0, arm.TCP + GRASP])).position
+    return jnp.concatenate([kinematics.forward(joints).position, tip, assembled(params)])
+
+
+def assembled(params: Array) -> Array:
+    """[3] m, base frame: the place of the leg's tip when it is fully in the hole."""
+    c, s = jnp.cos(params[2]), jnp.sin(params[2])
+    offset = jnp.asarray(HOLE_OFFSET, jnp.float32)
+    turned = jnp.stack([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]])
+    xy = jnp.asarray(HOLE_NOMINAL, jnp.float32) - offset + params[:2] + turned
+    return jnp.concatenate([xy, jnp.array([TOP - DEPTH])])
+
+
+def reward(obs: Array, action: Array, next_obs: Array) -> Array:
+    """[]: 1 when the leg is within 1 cm of its place on each axis, minus 100 times its squared distance, which counts
+    up to 10 cm per axis. The paper swaps its y and z distances, harmless because the sum is symmetric."""
+    distance = jnp.clip(jnp.abs(next_obs[3:6] - next_obs[6:9]), 0.0, 0.1)
+    return success(next_obs) - 100.0 * (distance**2).sum()
+
+
+def success(obs: Array) -> Array:
+    """[] bool: the leg is within 1 cm of its place on each axis."""
+    return (jnp.abs(obs[3:6] - obs[6:9]) < TOLERANCE).all()
+
+
+def initial(params: Array, key: Key) -> PhysicsState:
+    """The leg above the table top, at a random place around the nominal hole."""
+    offset = jax.random.uniform(key, (3,), minval=jnp.asarray(START_LOW), maxval=jnp.asarray(START_HIGH))
+    tip = jnp.concatenate([jnp.asarray(HOLE_NOMINAL, jnp.float32), jnp.array([TOP])]) + offset
+    joints = kinematics.solve(jnp.asarray(_ready(), jnp.float32), _pose(tip), iterations=6, posture=0.05)
+    return at_rest(joints, jnp.zeros(0), NV)
+
+
+def target(qpos: Array, action: Array) -> Array:
+    """[7] joint targets that move the tip by `action` * 2 cm from where it is, inside the workspace, and set it upright."""
+    joints = qpos[: arm.N_JOINTS]
+    here = kinematics.forward(joints).position - jnp.array([0.0, 0.0, GRASP])
+    goal = jnp.clip(here + STEP * action, jnp.asarray(WORKSPACE[0]), jnp.asarray(WORKSPACE[1]))
+    return clip_joints(kinematics.solve(joints, _pose(goal), iterations=3, posture=0.05))
+
+
+SCENE = Scene(
+    name="insert",
+    observation=(Entry("hand_xyz", "m", 3), Entry("leg_xyz", "m", 3), Entry("hole_xyz", "m", 3)),
+    action=(Entry("hand_xyz_step", "2 cm", 3),),
+    parameters=PARAMETERS,
+    episode_length=40,
+    substeps=SUBSTEPS,
+    success_anytime=True,
+    cartesian=True,
+    build=build,
+    initial=initial,
+    target=target,
+    observe=observe,
+    reward=reward,
+    success=success,
+)
+
+
+def make() -> Env:
+    """The insertion task."""
+    return make_env(SCENE)
+
+
+def _pose(tip: Array) -> Pose:
+    """Pose of the hand that holds the leg upright with its tip at `tip` [3]."""
+    return Pose(tip + jnp.array([0.0, 0.0, GRASP]), jnp.asarray(DOWN, jnp.float32))
+
+
+def _ready() -> np.ndarray:
+    """Joint angles with the hand over the table top: where the inverse kinematics of a reset begins."""
+    return np.array([0.0, 0.2, 0.0, -2.39, 0.0, 2.6, np.pi / 4])
+
+
+def _add_leg(link: mujoco.MjsBody) -> None:
+    tip = arm.TCP + GRASP
+    for name, height in (("tip", 0.0), ("shaft", UPPER_BALL)):
+        link.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            pos=[0, 0, tip - TIP_ROUNDING - height],
+            size=[TIP_ROUNDING, 0, 0],
+            mass=0,
+            rgba=[0, 0, 0, 0],
+            **NO_CONTACT,
+        )
+    link.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=[0, 0, tip - LEG_LENGTH / 2],
+        quat=arm.tool_quaternion(),
+        size=[LEG_HALF_WIDTH, LEG_HALF_WIDTH, LEG_LENGTH / 2],
+        mass=0.023,
+        rgba=[0.9, 0.88, 0.82, 1],
+        **NO_CONTACT,
+    )
+
+
+def _add_fingers(link: mujoco.MjsBody) -> None:
+    yaw = arm.HAND_YAW
+    for side in (-1, 1):
+        offset = side * (LEG_HALF_WIDTH + 0.006)
+        link.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[-np.sin(yaw) * offset, np.cos(yaw) * offset, arm.TCP - 0.015],
+            quat=arm.tool_quaternion(),
+            size=[0.009, 0.006, 0.025],
+            mass=0.015,
+            rgba=[0.1, 0.1, 0.12, 1],
+            **NO_CONTACT,
+        )
+
+
+def _add_part(spec: mujoco.MjSpec, theta: dict[str, float]) -> None:
+    """The table top: a body at the hole, turned with the part, whose four walls leave a square opening."""
+    c, s = np.cos(theta["part_rotation"]), np.sin(theta["part_rotation"])
+    turned = np.array([[c, -s], [s, c]]) @ HOLE_OFFSET
+    xy = HOLE_NOMINAL - HOLE_OFFSET + [theta["part_x"], theta["part_y"]] + turned
+    half_angle = theta["part_rotation"] / 2
+    hole = spec.worldbody.add_body(
+        name="hole", pos=[*xy, PART_HALF[2]], quat=[np.cos(half_angle), 0, 0, np.sin(half_angle)]
+    )
+    opening = theta["hole_radius"] - theta["peg_radius"] + TIP_ROUNDING
+    half = np.array([0.10, 0.10 + opening, PART_HALF[2]])
+    for i in range(4):  # each wall covers one side and one corner of the opening, like blades of a pinwheel
+        turn = i * np.pi / 2
+        x, y = opening + half[0], half[0]
+        c, s = np.cos(turn), np.sin(turn)
+        hole.add_geom(
+            name=f"wall{i}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[c * x - s * y, s * x + c * y, 0],
+            quat=[np.cos(turn / 2), 0, 0, np.sin(turn / 2)],
+            size=half,
+            rgba=[0.5, 0.5, 0.5, 0.3],
+            **NO_CONTACT,
+        )
+
+
+def _add_pair(spec: mujoco.MjSpec, ball: str, wall: str, friction: float) -> None:
+    pair = spec.add_pair(geomname1=ball, geomname2=wall, condim=3, friction=[friction, friction, 0.0, 1e-4, 1e-4])
+    # The contact stiffens over 0.2 mm, well inside the 0.5 mm of clearance.
+    pair.solimp = [0.0, 0.95, 0.0002, 0.5, 2.0]

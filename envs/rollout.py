@@ -1,0 +1,121 @@
+"""Running environments: a fleet that resets itself, and whole episodes for evaluation and for the real system."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from envs.base import Env, EnvState, World
+from sgft_jax.types import Array, Key, PyTree, Transition
+
+# policy(carry, obs, key) -> (action, carry), for one environment
+Policy = Callable[[PyTree, Array, Key], tuple[Array, PyTree]]
+
+
+class Fleet(NamedTuple):
+    """n environments in flight. index: [n] which world of the pool each one lives in. state: EnvState [n]."""
+
+    index: Array
+    state: EnvState
+
+
+class Episode(NamedTuple):
+    """One whole episode of T control steps.
+
+    transitions: [T]; `valid`: [T] bool, False from the first step with exploded physics on (such rows hold zeros).
+    total_reward: [] undiscounted, of the task, never reshaped. success, exploded: [] bool.
+    start: the initial EnvState; qpos: [T, nq] after each step, for rendering.
+    """
+
+    transitions: Transition
+    valid: Array
+    total_reward: Array
+    success: Array
+    exploded: Array
+    start: EnvState
+    qpos: Array
+
+
+def pick(pool: World, index: Array) -> World:
+    """The worlds of a pool at `index` (any shape)."""
+    return jax.tree.map(lambda x: x[index], pool)
+
+
+def pool_size(pool: World) -> int:
+    """Number of worlds in a pool."""
+    return pool.params.shape[0]
+
+
+def launch(env: Env, pool: World, key: Key, n: int) -> Fleet:
+    """n environments, each in a random world of the pool, freshly reset."""
+    key_world, key_reset = jax.random.split(key)
+    index = jax.random.randint(key_world, (n,), 0, pool_size(pool))
+    return Fleet(index, jax.vmap(env.reset)(pick(pool, index), jax.random.split(key_reset, n)))
+
+
+def step_fleet(
+    env: Env, pool: World, fleet: Fleet, actions: Array, key: Key, *, gamma: float | Array
+) -> tuple[Fleet, Transition, Array, EnvState]:
+    """One step of every environment, then a fresh random world and start for those whose episode ended.
+
+    Returns the new fleet, the transitions [n] with the true successor also at an episode's end, which of them are valid
+    [n], and the states the step led to before any reset (rewards, success, explosions).
+    """
+    n = fleet.index.shape[0]
+    key_step, key_reset = jax.random.split(key)
+    after = jax.vmap(env.step)(pick(pool, fleet.index), fleet.state, actions, jax.random.split(key_step, n))
+    valid = ~after.invalid
+    transitions = _transitions(fleet.state, actions, after, gamma=gamma)
+    done = after.terminated | after.truncated | after.invalid
+    # Fixed-length episodes end together, so most steps skip the (inverse kinematics of the) resets altogether.
+    fleet = jax.lax.cond(
+        done.any(),
+        lambda: _select(done, launch(env, pool, key_reset, n), Fleet(fleet.index, after)),
+        lambda: Fleet(fleet.index, after),
+    )
+    return fleet, transitions, valid, after
+
+
+def play_episode(env: Env, pool: World, policy: Policy, carry: PyTree, key: Key, *, gamma: float | Array) -> Episode:
+    """One episode of `env.episode_length` steps in a random world of the pool; nothing is batched: vmap over keys."""
+    key_world, key_reset, key_steps = jax.random.split(key, 3)
+    world = pick(pool, jax.random.randint(key_world, (), 0, pool_size(pool)))
+    start = env.reset(world, key_reset)
+
+    def step(loop: tuple[EnvState, PyTree, Array], key: Key) -> tuple[tuple[EnvState, PyTree, Array], tuple]:
+        state, carry, over = loop
+        key_act, key_env = jax.random.split(key)
+        action, carry = policy(carry, state.obs, key_act)
+        after = env.step(world, state, action, key_env)
+        valid = ~(over | after.invalid)
+        row = jax.tree.map(lambda x: x[0], _transitions(*jax.tree.map(lambda x: x[None], (state, action, after)), gamma=gamma))
+        over = over | after.terminated | after.invalid
+        return (after, carry, over), (row, valid, after.success & ~after.invalid, after.invalid, after.physics.qpos)
+
+    (_, _, _), (rows, valid, success, invalid, qpos) = jax.lax.scan(
+        step, (start, carry, jnp.zeros((), bool)), jax.random.split(key_steps, env.episode_length)
+    )
+    total = jnp.where(valid, rows.reward, 0.0).sum()
+    last_valid = jnp.maximum(valid.sum() - 1, 0)
+    exploded = invalid.any()
+    return Episode(rows, valid, total, success[last_valid] & ~exploded, exploded, start, qpos)
+
+
+def _transitions(before: EnvState, actions: Array, after: EnvState, *, gamma: float | Array) -> Transition:
+    """Rows [n] of experience; exploded rows are zeroed, so that no NaN can travel further even if a mask is forgotten."""
+    clean = lambda x: jnp.where(after.invalid.reshape(-1, *[1] * (x.ndim - 1)), jnp.zeros_like(x), x)  # noqa: E731
+    rows = Transition(
+        obs=before.obs,
+        action=actions,
+        reward=after.reward,
+        discount=gamma * (1.0 - after.terminated.astype(jnp.float32)),
+        next_obs=after.obs,
+        truncated=after.truncated,
+        steps_to_go=jnp.zeros(after.time.shape, jnp.int32),
+    )
+    return jax.tree.map(clean, rows)
+
+
+def _select(mask: Array, new: PyTree, old: PyTree) -> PyTree:
+    return jax.tree.map(lambda a, b: jnp.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)
