@@ -1,0 +1,220 @@
+"""Impure: writes figures as PNG files: learning curves, and what pretraining left behind.
+
+Functions take plain arrays and return the path they wrote. Colours are the Okabe-Ito palette (safe for colour-blind
+readers); a method keeps its colour from figure to figure as long as the order of the methods stays.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from sgft_jax.stats import iqm_interval
+
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_INK, _FAINT = "#333333", "#B0B0B0"
+_FONT = {"size": 10, "color": _INK}
+
+
+def learning_curves(
+    path: Path,
+    curves: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    *,
+    title: str,
+    zero_shot: float | None = None,
+    rollout_length: int | None = None,
+    control_dt: float | None = None,
+    quantity: str = "success rate",
+) -> Path:
+    """Success against real transitions, one line per method: IQM over seeds with its 95 % bootstrap band.
+
+    curves: {method: (transitions [n_evaluations], success [n_seeds, n_evaluations])}. zero_shot: success of the policy
+    before fine-tuning, drawn dashed. rollout_length (steps) and control_dt (s) add an axis on top in rollouts and
+    minutes of robot time.
+    """
+    figure, (axes,) = _figure(7.2, 4.0, columns=1)
+    ends = []
+    for (name, (transitions, success)), color in zip(curves.items(), _colors(len(curves)), strict=True):
+        x = np.asarray(transitions)
+        band = iqm_interval(success)
+        if np.isfinite(band.low).all():
+            axes.fill_between(x, band.low, band.high, color=color, alpha=0.18, linewidth=0)
+        axes.plot(x, band.estimate, color=color, linewidth=2, marker="o", markersize=3, clip_on=False)
+        ends.append((float(x[-1]), float(band.estimate[-1]), name, color))
+    if zero_shot is not None:
+        axes.axhline(zero_shot, color=_INK, linewidth=1.2, linestyle=(0, (4, 3)), zorder=1.5)
+        ends.append((max(x for x, *_ in ends), zero_shot, "zero-shot", _INK))
+    axes.set_xlim(0, max(x for x, *_ in ends))
+    axes.set_ylim(-0.03, 1.03)
+    axes.set_xlabel("real transitions", **_FONT)
+    axes.set_ylabel(quantity, **_FONT)
+    _label_ends(axes, ends)
+    _thousands(axes)
+    if rollout_length is not None and control_dt is not None:
+        _robot_axis(axes, rollout_length, control_dt)
+    seeds = sorted({np.asarray(s).shape[0] for _, s in curves.values()})
+    counts = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
+    figure.suptitle(title, x=0.01, ha="left", size=12, weight="bold", color=_INK)
+    note = f"interquartile mean of {counts} seed{'s' * (seeds[-1] > 1)}" + ", 95 % bootstrap band" * (seeds[-1] > 1)
+    figure.text(0.99, 0.012, note, ha="right", size=8, color="#777777")
+    return _save(figure, path)
+
+
+def pretraining(
+    path: Path,
+    *,
+    title: str,
+    steps: ArrayLike,
+    success: ArrayLike,
+    returns: ArrayLike,
+    value: ArrayLike,
+    monte_carlo: ArrayLike,
+    dynamics_error: ArrayLike,
+    baseline_error: ArrayLike | None = None,
+) -> Path:
+    """Four panels: success and return while training, V_sim against what happened, model error by horizon.
+
+    steps, success, returns: [n_evaluations], steps in env steps. value, monte_carlo: [n] V_sim of a state and the
+    discounted return that followed. dynamics_error: [horizon] mean normalised error of the model's open-loop prediction
+    1, 2, ... steps ahead; baseline_error: the same for predicting that nothing changes.
+    """
+    figure, panels = _figure(12.0, 3.2, columns=4)
+    for axes, values, name in zip(panels, (success, returns), ("success rate", "return"), strict=False):
+        axes.plot(np.asarray(steps) / 1e6, np.asarray(values), color=PALETTE[0], linewidth=2)
+        axes.set_title(name, **_FONT, loc="left")
+        axes.set_xlabel("env steps (millions)", **_FONT)
+        axes.set_xlim(left=0)
+    panels[0].set_ylim(-0.03, 1.03)
+    _value_panel(panels[2], np.asarray(value), np.asarray(monte_carlo))
+    _dynamics_panel(panels[3], np.asarray(dynamics_error), baseline_error)
+    figure.suptitle(title, x=0.005, ha="left", size=12, weight="bold", color=_INK)
+    return _save(figure, path)
+
+
+def _value_panel(axes: Axes, value: np.ndarray, monte_carlo: np.ndarray) -> None:
+    both = np.concatenate([value, monte_carlo])
+    margin = 0.05 * (np.ptp(both) or 1.0)
+    limits = (both.min() - margin, both.max() + margin)
+    axes.plot(limits, limits, color=_FAINT, linewidth=1, zorder=0)
+    axes.scatter(monte_carlo, value, s=6, color=PALETTE[0], alpha=min(1.0, 60 / len(value) ** 0.75), linewidths=0)
+    axes.set_xlim(*limits)
+    axes.set_ylim(*limits)
+    axes.set_title("V_sim against discounted return", **_FONT, loc="left")
+    axes.set_xlabel("return that followed", **_FONT)
+    bias, error = float((value - monte_carlo).mean()), float(np.sqrt(((value - monte_carlo) ** 2).mean()))
+    axes.text(0.04, 0.95, f"bias {bias:+.2g}\nRMSE {error:.2g}", transform=axes.transAxes, va="top", size=9, color=_INK)
+
+
+def _dynamics_panel(axes: Axes, error: np.ndarray, baseline: ArrayLike | None) -> None:
+    horizon = np.arange(1, len(error) + 1)
+    axes.plot(horizon, error, color=PALETTE[0], linewidth=2, marker="o", markersize=3)
+    if baseline is not None:
+        axes.plot(horizon, np.asarray(baseline), color=_FAINT, linewidth=2)
+        end = (len(error), float(np.asarray(baseline)[-1]))
+        axes.annotate(
+            "if nothing moved", end, (-14, 0), textcoords="offset points", ha="right", size=9, color="#777777"
+        )
+    axes.set_ylim(bottom=0)
+    axes.set_title("model error, standard deviations", **_FONT, loc="left")
+    axes.set_xlabel("steps ahead", **_FONT)
+
+
+# ---------------------------------------------------------------- the look
+
+
+def _figure(width: float, height: float, *, columns: int) -> tuple[Figure, Sequence[Axes]]:
+    """A figure without pyplot (no global state, no window), axes without frame."""
+    figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = [figure.add_subplot(1, columns, i + 1) for i in range(columns)]
+    for axes in panels:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.spines[["left", "bottom"]].set_color(_FAINT)
+        axes.tick_params(colors=_INK, labelsize=9, color=_FAINT)
+        axes.grid(axis="y", color="#ECECEC", linewidth=0.8)
+        axes.set_axisbelow(True)
+    return figure, panels
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, facecolor="white")
+    return path
+
+
+def _colors(count: int) -> list[str]:
+    return [PALETTE[i % len(PALETTE)] for i in range(count)]
+
+
+def _label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]]) -> None:
+    """Write each line's name to the right of its end, moved apart vertically where ends are close."""
+    heights = _spread([y for _, y, *_ in ends], gap=0.06)
+    for (x, y, name, color), height in zip(ends, heights, strict=True):
+        leader = {"arrowstyle": "-", "color": color, "linewidth": 0.8, "shrinkA": 0, "shrinkB": 2}
+        axes.annotate(
+            name,
+            (x, y),
+            xytext=(1.03, height),
+            textcoords=axes.get_yaxis_transform(),
+            arrowprops=leader if abs(height - y) > 0.01 else None,
+            color=color,
+            size=10,
+            va="center",
+            annotation_clip=False,
+        )
+
+
+def _spread(values: Sequence[float], *, gap: float, top: float = 1.0) -> list[float]:
+    """The values moved at least `gap` apart and below `top`; a crowd stays centred on its mean where there is room."""
+    order = np.argsort(values, kind="stable")
+    crowds: list[list[float]] = []
+    for value in np.asarray(values, np.float64)[order]:
+        crowds.append([float(value)])
+        while len(crowds) > 1 and _bottom(crowds[-1], gap) - _top(crowds[-2], gap) < gap:
+            crowds[-2:] = [crowds[-2] + crowds[-1]]
+    placed = np.concatenate([_bottom(crowd, gap) + gap * np.arange(len(crowd)) for crowd in crowds])
+    ceiling = top
+    for i in reversed(range(len(placed))):
+        placed[i] = min(placed[i], ceiling)
+        ceiling = placed[i] - gap
+    result = np.empty_like(placed)
+    result[order] = placed
+    return result.tolist()
+
+
+def _bottom(crowd: list[float], gap: float) -> float:
+    return sum(crowd) / len(crowd) - gap * (len(crowd) - 1) / 2
+
+
+def _top(crowd: list[float], gap: float) -> float:
+    return sum(crowd) / len(crowd) + gap * (len(crowd) - 1) / 2
+
+
+def _thousands(axes: Axes) -> None:
+    axes.xaxis.set_major_formatter(lambda x, _: f"{x:,.0f}")
+
+
+def _robot_axis(axes: Axes, rollout_length: int, control_dt: float) -> None:
+    """A second x axis on top: rollouts, with the minutes of robot time they take."""
+
+    def rollouts(n: ArrayLike) -> ArrayLike:
+        return np.asarray(n) / rollout_length
+
+    def transitions(n: ArrayLike) -> ArrayLike:
+        return np.asarray(n) * rollout_length
+
+    top = axes.secondary_xaxis("top", functions=(rollouts, transitions))
+    minutes = rollout_length * control_dt / 60
+    top.xaxis.set_major_formatter(lambda r, _: f"{r:,.0f}\n{_minutes(r * minutes)}" if r else "0")
+    top.set_xlabel("rollouts, robot time", **_FONT)
+    top.tick_params(colors=_INK, labelsize=9, color=_FAINT)
+    top.spines["top"].set_color(_FAINT)
+
+
+def _minutes(minutes: float) -> str:
+    return f"{minutes:,.0f} min" if minutes >= 10 else f"{minutes:.1f} min"
