@@ -1,0 +1,245 @@
+"""Hammering: drive a nail into a board with three joints of the arm. Paper section 6.1; sgft.md sections 9 to 11.
+
+Everything happens in the arm's vertical plane y = 0. The gripper points down and holds the hammer close to its head, on
+the side of the base, so that the striking face is almost below joint 6: the weak wrist (12 Nm) then carries over 250 N.
+"Nail z" of the paper's Table 1 is read as the height of the nail's head at the start, the board lies 2 * half height
+below. Nail height means the underside of the head: it touches the board at 0. A head driven deeper sinks in until
+the hammer itself meets the board.
+"""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from envs.base import Entry, Env, Parameter
+from envs.franka import arm, kinematics
+from envs.franka.arm import NO_CONTACT
+from envs.franka.kinematics import DOWN, Pose
+from envs.franka.task import Scene, at_rest, clip_joints, make_env, new_spec
+from envs.physics import PhysicsState
+from sgft_jax.types import Array, Key
+
+SUBSTEPS = 50
+STEP = 0.2  # rad per control step at |action| = 1 (O-19)
+JOINTS = np.array([1, 3, 5])  # joints 2, 4 and 6: parallel axes, one vertical plane (O-18)
+TOLERANCE = 0.005  # m above the board counts as driven home (O-23)
+HEAD_BACK = 0.045  # m from the gripper's centre to the hammer's axis, towards the base
+FACE = 0.035  # m from the gripper's centre down to the striking face
+FACE_RADIUS = 0.018  # m: the face is a sphere, so its contact does not depend on the hammer's tilt
+START_LOW, START_HIGH = np.array([0.31, 0.69, -0.08]), np.array([0.37, 0.72, 0.08])  # face x, z in m, pitch in rad
+Q_READY = np.array([0.0, -0.2, 0.0, -0.9, 0.0, 0.7, np.pi / 4])  # near every start, for the inverse kinematics
+STEEL = 7850.0  # kg/m^3
+REACTION_TIME = 0.002  # s, see `_add_nail`
+SOLREF, SOLIMP = [0.012, 1.0], [0.0, 0.95, 0.003, 0.5, 2.0]
+NAIL_DEPTH = 0.3  # m: the nail's contact geom reaches this far below the head
+NV = arm.N_JOINTS + 1
+
+PARAMETERS = (
+    Parameter("nail_x", "m", 0.35, 0.30, 0.40),
+    Parameter("nail_z", "m", 0.60, 0.55, 0.65),
+    Parameter("nail_damping", "N s/m", 1000.0, 250.0, 2500.0),
+    Parameter("nail_half_height", "m", 0.04, 0.02, 0.06),
+    Parameter("nail_radius", "m", 0.01, 0.005, 0.015),
+    Parameter("head_radius", "m", 0.035, 0.03, 0.04),
+    Parameter("head_thickness", "m", 0.005, 0.001, 0.01),
+    Parameter("hammer_mass", "kg", 0.05, 0.015, 0.15),
+    Parameter("nail_friction", "N", 0.1, 0.1, 0.1),
+    Parameter("servo_stiffness", "", 1.0, 1.0, 1.0),
+)
+_INDEX = {p.name: i for i, p in enumerate(PARAMETERS)}
+
+
+def build(theta: dict[str, float]) -> mujoco.MjSpec:
+    """The scene for one theta."""
+    spec = new_spec(substeps=SUBSTEPS, iterations=4, ls_iterations=6)
+    link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
+    _add_hammer(link, theta["hammer_mass"])
+    board = theta["nail_z"] - 2 * theta["nail_half_height"]
+    _add_board(spec, theta["nail_x"], board)
+    _add_nail(spec, theta, board)
+    for other in ("nail", "board"):
+        # Frictionless: one constraint row instead of four, and the face cannot drag the nail.
+        spec.add_pair(geomname1="face", geomname2=other, condim=1, solref=SOLREF, solimp=SOLIMP)
+    return spec
+
+
+def observe(params: Array, state: PhysicsState) -> Array:
+    """[12]: face xyz (m), q of joints 2, 4, 6 (rad), their velocities (rad/s), nail z (m), goal xz (m)."""
+    joints, velocities = state.qpos[JOINTS], state.qvel[JOINTS]
+    goal = jnp.stack([params[_INDEX["nail_x"]], _board(params)])
+    nail = goal[1:] + state.qpos[arm.N_JOINTS :]
+    return jnp.concatenate([_face(state.qpos[: arm.N_JOINTS]), joints, velocities, nail, goal])
+
+
+def reward(obs: Array, action: Array, next_obs: Array) -> Array:
+    """[]: minus ten times the height (m) by which the nail still stands out of the board (O-20)."""
+    return -10.0 * jnp.maximum(0.0, _exposed(next_obs))
+
+
+def success(obs: Array) -> Array:
+    """[] bool: the nail stands out by at most 5 mm."""
+    return _exposed(obs) <= TOLERANCE
+
+
+def initial(params: Array, key: Key) -> PhysicsState:
+    """The hammer somewhere above every nail, slightly tilted; the nail standing."""
+    x, z, pitch = jax.random.uniform(key, (3,), minval=jnp.array(START_LOW), maxval=jnp.array(START_HIGH))
+    c, s = jnp.cos(pitch), jnp.sin(pitch)
+    turn = jnp.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]) @ jnp.asarray(DOWN, jnp.float32)
+    grip = jnp.stack([x, jnp.zeros(()), z]) - turn @ jnp.array([-HEAD_BACK, 0.0, FACE])
+    joints = kinematics.solve(jnp.asarray(Q_READY, jnp.float32), Pose(grip, turn), iterations=8)
+    nail = 2 * params[_INDEX["nail_half_height"]]
+    return at_rest(_hold(joints), nail[None], NV)
+
+
+def target(qpos: Array, action: Array) -> Array:
+    """[7] joint targets: joints 2, 4, 6 move by `action` * 0.2 rad from where they are, the others hold still.
+
+    Nothing keeps the hammer above the board (O-24) but the board itself.
+    """
+    joints = qpos[: arm.N_JOINTS]
+    return clip_joints(_hold(joints.at[JOINTS].add(STEP * action)))
+
+
+SCENE = Scene(
+    name="hammer",
+    observation=(
+        Entry("face_xyz", "m", 3),
+        Entry("joint_angles", "rad", 3),
+        Entry("joint_velocities", "rad/s", 3),
+        Entry("nail_z", "m", 1),
+        Entry("goal_xz", "m", 2),
+    ),
+    action=(Entry("joint_steps", "0.2 rad", 3),),
+    parameters=PARAMETERS,
+    episode_length=50,
+    substeps=SUBSTEPS,
+    success_anytime=False,
+    cartesian=False,
+    build=build,
+    initial=initial,
+    target=target,
+    observe=observe,
+    reward=reward,
+    success=success,
+)
+
+
+def make() -> Env:
+    """The hammering task."""
+    return make_env(SCENE)
+
+
+def tool() -> np.ndarray:
+    """[3] m: the centre of the striking face in the frame of the last link."""
+    return np.array([*_across(-HEAD_BACK, 0.0), arm.TCP + FACE])
+
+
+def _face(joints: Array) -> Array:
+    return kinematics.forward(joints, jnp.asarray(tool(), jnp.float32)).position
+
+
+def _exposed(obs: Array) -> Array:
+    return obs[9] - obs[11]
+
+
+def _board(params: Array) -> Array:
+    return params[_INDEX["nail_z"]] - 2 * params[_INDEX["nail_half_height"]]
+
+
+def _hold(joints: Array) -> Array:
+    """Joints 2, 4, 6 as they are, the others at rest."""
+    moving = np.isin(np.arange(arm.N_JOINTS), JOINTS)
+    return jnp.where(moving, joints, jnp.asarray(Q_READY, jnp.float32))
+
+
+def _across(x: float, y: float) -> tuple[float, float]:
+    """Xy in the frame of the hand -> xy in the frame of the last link."""
+    c, s = np.cos(arm.HAND_YAW), np.sin(arm.HAND_YAW)
+    return c * x - s * y, s * x + c * y
+
+
+def _add_hammer(link: mujoco.MjsBody, mass: float) -> None:
+    wood, steel, dark = [0.72, 0.52, 0.3, 1], [0.45, 0.47, 0.5, 1], [0.1, 0.1, 0.12, 1]
+    axis, tip = arm.TCP, arm.TCP + FACE
+    head = _across(-HEAD_BACK, 0.0)
+    link.add_geom(
+        name="face",
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        pos=[*head, tip - FACE_RADIUS],
+        size=[FACE_RADIUS, 0, 0],
+        mass=mass,
+        rgba=steel,
+        **NO_CONTACT,
+    )
+    _add_rod(link, (*head, axis - 0.045), (*head, tip - FACE_RADIUS), 0.0165, steel)
+    _add_rod(link, (*_across(-HEAD_BACK, 0), axis), (*_across(0.13, 0), axis), 0.011, wood)
+    for side in (-1, 1):
+        y = side * 0.019
+        _add_rod(link, (*_across(0, y), arm.FLANGE + 0.07), (*_across(0, y), axis), 0.008, dark)
+
+
+def _add_rod(body: mujoco.MjsBody, start, end, radius: float, rgba: list[float]) -> None:  # noqa: ANN001
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        fromto=[*start, *end],
+        size=[radius, 0, 0],
+        mass=0,
+        rgba=rgba,
+        **NO_CONTACT,
+    )
+
+
+def _add_nail(spec: mujoco.MjSpec, theta: dict[str, float], board: float) -> None:
+    """A nail on a vertical slide; its coordinate is the height of the head's underside above the board.
+
+    MuJoCo's contact solver does not see implicit damping: a nail of 0.05 kg in 2500 N s/m would be a feather to it, and
+    the hammer would sink through the head. Inertia of damping * 2 ms repairs that. The travel per blow does not
+    change, it is momentum / damping, only its first few milliseconds.
+    """
+    half, radius, head = theta["nail_half_height"], theta["nail_radius"], theta["head_radius"]
+    thickness, damping = theta["head_thickness"], theta["nail_damping"]
+    steel = [0.7, 0.72, 0.75, 1]
+    body = spec.worldbody.add_body(name="nail", pos=[theta["nail_x"], 0, board])
+    body.add_joint(
+        name="nail",
+        type=mujoco.mjtJoint.mjJNT_SLIDE,
+        axis=[0, 0, 1],
+        damping=damping,
+        frictionloss=theta["nail_friction"],
+        armature=damping * REACTION_TIME,
+    )
+    cylinder = mujoco.mjtGeom.mjGEOM_CYLINDER
+    body.add_geom(type=cylinder, pos=[0, 0, -half], size=[radius, half, 0], density=STEEL, rgba=steel, **NO_CONTACT)
+    body.add_geom(
+        type=cylinder,
+        pos=[0, 0, thickness / 2],
+        size=[head, thickness / 2, 0],
+        density=STEEL,
+        rgba=steel,
+        **NO_CONTACT,
+    )
+    # What the hammer feels: a block as wide as the head that reaches far down, so a fast hammer cannot pass a thin head
+    # or lift it from below.
+    body.add_geom(
+        name="nail",
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=[0, 0, thickness - NAIL_DEPTH / 2],
+        size=[head, head, NAIL_DEPTH / 2],
+        mass=0,
+        rgba=[0, 0, 0, 0],
+        **NO_CONTACT,
+    )
+
+
+def _add_board(spec: mujoco.MjSpec, x: float, height: float) -> None:
+    """The board stops the hammer at its height everywhere (a plane); what is drawn is a block on a stand."""
+    world, box = spec.worldbody, mujoco.mjtGeom.mjGEOM_BOX
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    world.add_geom(name="board", type=plane, pos=[0, 0, height], size=[2, 2, 0.1], rgba=[0, 0, 0, 0], **NO_CONTACT)
+    world.add_geom(
+        type=box, pos=[x, 0, height - 0.03], size=[0.1, 0.16, 0.0299], rgba=[0.78, 0.62, 0.42, 1], **NO_CONTACT
+    )
+    stand = (height - 0.06) / 2
+    world.add_geom(type=box, pos=[x, 0, stand], size=[0.05, 0.09, stand], rgba=[0.35, 0.37, 0.4, 1], **NO_CONTACT)
