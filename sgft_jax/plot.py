@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from sgft_jax.stats import iqm_interval
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-_INK, _FAINT = "#333333", "#B0B0B0"
+_INK, _GREY, _FAINT = "#333333", "#777777", "#B0B0B0"
 _FONT = {"size": 10, "color": _INK}
 
 
@@ -60,7 +60,7 @@ def learning_curves(
     counts = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
     figure.suptitle(title, x=0.01, ha="left", size=12, weight="bold", color=_INK)
     note = f"interquartile mean of {counts} seed{'s' * (seeds[-1] > 1)}" + ", 95 % bootstrap band" * (seeds[-1] > 1)
-    figure.text(0.99, 0.012, note, ha="right", size=8, color="#777777")
+    figure.text(0.99, 0.012, note, ha="right", size=8, color=_GREY)
     return _save(figure, path)
 
 
@@ -115,9 +115,7 @@ def _dynamics_panel(axes: Axes, error: np.ndarray, baseline: ArrayLike | None) -
     if baseline is not None:
         axes.plot(horizon, np.asarray(baseline), color=_FAINT, linewidth=2)
         end = (len(error), float(np.asarray(baseline)[-1]))
-        axes.annotate(
-            "if nothing moved", end, (-14, 0), textcoords="offset points", ha="right", size=9, color="#777777"
-        )
+        axes.annotate("if nothing moved", end, (-14, 0), textcoords="offset points", ha="right", size=9, color=_GREY)
     axes.set_ylim(bottom=0)
     axes.set_title("model error, standard deviations", **_FONT, loc="left")
     axes.set_xlabel("steps ahead", **_FONT)
@@ -155,7 +153,7 @@ def _label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]]) -> No
     """Write each line's name to the right of its end, moved apart vertically where ends are close."""
     heights = _spread([y for _, y, *_ in ends], gap=0.06)
     for (x, y, name, color), height in zip(ends, heights, strict=True):
-        leader = {"arrowstyle": "-", "color": color, "linewidth": 0.8, "shrinkA": 0, "shrinkB": 2}
+        leader = {"arrowstyle": "-", "color": color, "linewidth": 0.8, "shrinkA": 2, "relpos": (0, 0.5)}
         axes.annotate(
             name,
             (x, y),
