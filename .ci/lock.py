@@ -1,30 +1,31 @@
-"""Impure: prints `name==version` of everything that this project and its dev extra need, as installed here."""
+"""Impure: prints `name==version` of everything that pyproject.toml asks for, dev extra included, as installed here."""
 
 import importlib.metadata
 import re
+import tomllib
+from pathlib import Path
 
 from packaging.requirements import Requirement
 
-PROJECT, EXTRA = "sgft-jax", "dev"
+PYPROJECT = Path(__file__).parent.parent / "pyproject.toml"
 
 
-def closure(root: str, extra: str) -> dict[str, str]:
-    """{name: version} of all direct and indirect dependencies whose markers hold on this machine."""
+def closure(wanted: list[str]) -> dict[str, str]:
+    """{name: version} of these requirements and of all that they need in turn on this machine."""
     versions: dict[str, str] = {}
     seen: set[tuple[str, str]] = set()
-    waiting = [(root, ""), (root, extra)]
+    waiting = [(line, "") for line in wanted]
     while waiting:
-        name, wanted = waiting.pop()
-        if (name, wanted) in seen:
+        line, extra = waiting.pop()
+        requirement = Requirement(line)
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": extra}):
             continue
-        seen.add((name, wanted))
-        package = importlib.metadata.distribution(name)
-        versions[_canonical(name)] = package.version
-        for line in package.requires or []:
-            requirement = Requirement(line)
-            if requirement.marker is None or requirement.marker.evaluate({"extra": wanted}):
-                waiting += [(requirement.name, e) for e in ("", *requirement.extras)]
-    del versions[root]
+        package = importlib.metadata.distribution(requirement.name)
+        versions[_canonical(requirement.name)] = package.version
+        for own in {"", *requirement.extras}:
+            if (requirement.name, own) not in seen:
+                seen.add((requirement.name, own))
+                waiting += [(needed, own) for needed in package.requires or []]
     return versions
 
 
@@ -33,6 +34,7 @@ def _canonical(name: str) -> str:
 
 
 if __name__ == "__main__":
+    project = tomllib.loads(PYPROJECT.read_text())["project"]
     print("# Exact versions this project is tested with; `make lock` writes this file, `make setup` installs from it.")
-    for name, version in sorted(closure(PROJECT, EXTRA).items()):
+    for name, version in sorted(closure(project["dependencies"] + project["optional-dependencies"]["dev"]).items()):
         print(f"{name}=={version}")
