@@ -20,7 +20,7 @@ from envs.franka.task import Scene, at_rest, clip_joints, make_env, new_spec
 from envs.physics import PhysicsState
 from sgft_jax.types import Array, Key
 
-SUBSTEPS = 50
+SUBSTEPS = 40
 STEP = 0.2  # rad per control step at |action| = 1 (O-19)
 JOINTS = np.array([1, 3, 5])  # joints 2, 4 and 6: parallel axes, one vertical plane (O-18)
 TOLERANCE = 0.005  # m above the board counts as driven home (O-23)
@@ -52,7 +52,7 @@ _INDEX = {p.name: i for i, p in enumerate(PARAMETERS)}
 
 def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The scene for one theta."""
-    spec = new_spec(substeps=SUBSTEPS, iterations=4, ls_iterations=6)
+    spec = new_spec(substeps=SUBSTEPS, iterations=2, ls_iterations=4)
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
     _add_hammer(link, theta["hammer_mass"])
     board = theta["nail_z"] - 2 * theta["nail_half_height"]
