@@ -105,7 +105,7 @@ def compose(*transforms: BatchTransform) -> BatchTransform:
     """Apply transforms from left to right, each with its own key."""
 
     def transform(imagination: Imagination, batch: Transition, key: Key) -> Transition:
-        for one, sub in zip(transforms, jax.random.split(key, len(transforms) + 1), strict=False):
+        for one, sub in zip(transforms, jax.random.split(key, max(len(transforms), 1)), strict=False):
             batch = one(imagination, batch, sub)
         return batch
 
