@@ -20,7 +20,7 @@ from envs.franka.task import Scene, at_rest, clip_joints, make_env, new_spec
 from envs.physics import PhysicsState
 from sgft_jax.types import Array, Key
 
-SUBSTEPS = 40
+SUBSTEPS = 32
 STEP = 0.2  # rad per control step at |action| = 1 (O-19)
 JOINTS = np.array([1, 3, 5])  # joints 2, 4 and 6: parallel axes, one vertical plane (O-18)
 TOLERANCE = 0.005  # m above the board counts as driven home (O-23)
@@ -31,7 +31,7 @@ START_LOW, START_HIGH = np.array([0.31, 0.69, -0.08]), np.array([0.37, 0.72, 0.0
 Q_READY = np.array([0.0, -0.2, 0.0, -0.9, 0.0, 0.7, np.pi / 4])  # near every start, for the inverse kinematics
 STEEL = 7850.0  # kg/m^3
 REACTION_TIME = 0.002  # s, see `_add_nail`
-SOLREF, SOLIMP = [0.012, 1.0], [0.0, 0.95, 0.003, 0.5, 2.0]
+SOLREF, SOLIMP = [0.0125, 1.0], [0.0, 0.95, 0.003, 0.5, 2.0]
 NAIL_DEPTH = 0.3  # m: the nail's contact geom reaches this far below the head
 NV = arm.N_JOINTS + 1
 
