@@ -7,6 +7,7 @@ complete new one. A prior is such a folder plus a readable `prior.json`. Nothing
 
 import datetime
 import importlib.metadata
+import itertools
 import shutil
 import zlib
 from collections.abc import Callable, Mapping
@@ -144,11 +145,8 @@ def load_prior(
         raise UserError(f"{folder}: not a prior: it has no observation statistics")
     statistics = Normalizer(**tree.pop("normalizer"))
     if statistics.mean.shape != (card["obs_dim"],):
-        raise UserError(
-            f"{folder}: {_CARD} says obs_dim={card['obs_dim']}, its statistics have {statistics.mean.shape}"
-        )
-    networks = {name: tree.get(name, {}) for name in ("actor", "critic", "value", "dynamics")}
-    return Prior(**networks, normalizer=statistics), card
+        raise UserError(f"{folder}: {_CARD} says obs_dim={card['obs_dim']}, the statistics have {len(statistics.mean)}")
+    return Prior(**{name: tree.get(name, {}) for name in _NETWORKS}, normalizer=statistics), card
 
 
 def _is_nested_dict(tree: PyTree) -> bool:
@@ -291,12 +289,20 @@ def _swap(temporary: Path, final: Path) -> None:
 
 
 def _prune(root: Path, *, newest: int, keep: int) -> None:
-    """Delete all but the `keep` newest steps up to `newest`; what goes is renamed first, so no torn folder can stay."""
-    staying = sorted(s for s in _steps(root) if s <= newest)[-max(keep, 1) :]
-    for step in set(_steps(root)) - set(staying):
+    """Delete all but the `keep` newest complete steps up to `newest`; what goes is renamed first, lest it stay torn."""
+    candidates = (s for s in sorted(_steps(root), reverse=True) if s <= newest and _is_complete(root / str(s)))
+    staying = set(itertools.islice(candidates, max(keep, 1)))
+    for step in set(_steps(root)) - staying:
         doomed = root / f"{_TEMPORARY}old-{step}"
         (root / str(step)).rename(doomed)
         shutil.rmtree(doomed)
+
+
+def _is_complete(where: Path) -> bool:
+    try:
+        return bool(_manifest(where))
+    except UserError:
+        return False
 
 
 def _steps(root: Path) -> list[int]:
