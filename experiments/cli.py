@@ -63,15 +63,26 @@ def fail(message: str) -> NoReturn:
 
 def one_line(boxed: str) -> str:
     """The gist of tyro's framed complaint: its first paragraph, with the closest match where it offers some."""
-    lines = [line.strip("│ \t") for line in boxed.splitlines() if line.strip() and line[0] not in "╭╰"]
-    rules = [i for i, line in enumerate(lines) if set(line) == {"─"}]
-    message = " ".join(lines[: rules[0]] if rules else lines) or "bad command line"
+    paragraphs = _paragraphs(boxed)
+    message = paragraphs[0] if paragraphs else "bad command line"
     if match := re.search(r"invalid choice '(.*?)' for argument '(.*?)'\. Expected one of \((.*)\)", message):
         value, option, listed = match.groups()
         return unknown(option, value, re.findall(r"'(.*?)'", listed))
-    if (match := re.search(r"Perhaps you meant:\s*(--\S+)", " ".join(lines))) and len(rules) > 1:
-        return f"{message}; did you mean {match.group(1).rstrip(',')}?"
+    if match := re.search(r"Perhaps you meant:\s*(--[\w.-]+)", " ".join(paragraphs)):
+        return f"{message}; did you mean {match.group(1)}?"
     return message
+
+
+def _paragraphs(boxed: str) -> list[str]:
+    """Tyro's complaint, each part on one line and without title and frame, which is not drawn where stdout is ASCII."""
+    lines = [line.strip("│ \t") for line in boxed.splitlines() if line.strip() and line[0] not in "╭╰"]
+    parts = [[]]
+    for line in lines:
+        if set(line) <= set("─-"):
+            parts.append([])
+        else:
+            parts[-1].append(line)
+    return [" ".join(part) for part in (parts if boxed.startswith("╭") else parts[1:])]
 
 
 def choose[V](kind: str, name: str, options: dict[str, V]) -> V:

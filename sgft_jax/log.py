@@ -61,9 +61,7 @@ class MetricsLog:
             path, size = self._folder / name, position.get(name, 0)
             have = path.stat().st_size if path.exists() else 0
             if have < size:
-                raise UserError(
-                    f"{path}: has {have} bytes, the checkpoint remembers {size}: the log was cut or replaced"
-                )
+                raise UserError(f"{path}: cut or replaced: it has {have} bytes, the checkpoint remembers {size}")
             if have > size:
                 os.truncate(path, size)
 
@@ -195,7 +193,7 @@ class RealLog:
 
     def _load(self, number: int) -> dict[str, np.ndarray]:
         try:
-            with np.load(self._path(number), allow_pickle=False) as stored:
+            with open(self._path(number), "rb") as file, np.load(file, allow_pickle=False) as stored:
                 return {name: stored[name] for name in stored.files}
         except Exception as error:  # numpy raises half a dozen types for a damaged archive
             raise UserError(f"{self._path(number)}: damaged: {error}") from error

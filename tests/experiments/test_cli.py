@@ -1,0 +1,186 @@
+import dataclasses
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Literal
+
+import pytest
+
+from experiments import cli
+from sgft_jax.types import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class Inner:
+    learning_rate: float = 1e-3
+    """Step size."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    task: Literal["hammer", "push", "insert"] = "hammer"
+    """What to do."""
+    steps: int = 3
+    inner: Inner = dataclasses.field(default_factory=Inner)
+
+
+@pytest.fixture(autouse=True)
+def _own_environment(monkeypatch):
+    """`set_up` writes to the environment: give it a copy."""
+    monkeypatch.setattr(os, "environ", os.environ.copy())
+
+
+def run(main, *argv):
+    cli.run_main(main, Config, "Train.", argv=argv)
+
+
+def test_main_gets_the_parsed_configuration():
+    seen = []
+    run(seen.append, "--task", "push", "--inner.learning-rate", "0.5")
+    assert seen == [Config("push", 3, Inner(0.5))]
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["--task", "hamer"], "--task: there is no 'hamer', did you mean 'hammer'? Choose from: hammer, insert, push"),
+        (["--task", "zzz"], "--task: there is no 'zzz'. Choose from: hammer, insert, push"),
+        (["--step", "3"], "did you mean --steps?"),
+        (["--steps", "many"], "Error parsing --steps: invalid literal for int() with base 10: 'many'"),
+        (["--steps"], "Missing value for argument '--steps'"),
+        (["push"], "Unrecognized options: push"),
+    ],
+)
+def test_a_bad_command_line_is_one_line_and_code_2(argv, words, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        run(lambda _: pytest.fail("must not start"), *argv)
+    out, err = capsys.readouterr()
+    assert stopped.value.code == 2 and out == ""
+    assert err.startswith("error: ") and err.count("\n") == 1 and words in err
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "ascii"])
+def test_complaints_read_the_same_with_and_without_a_frame(encoding):
+    program = (
+        "import dataclasses; from experiments import cli\n"
+        "@dataclasses.dataclass(frozen=True)\nclass C:\n    steps: int = 1\n"
+        "cli.run_main(print, C, 'd', argv=['--step', '3'])\n"
+    )
+    environment = {**os.environ, "PYTHONIOENCODING": encoding}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == "error: Unrecognized options: --step, 3; did you mean --steps?\n"
+
+
+def test_a_user_error_is_one_line_and_code_2(capsys):
+    def main(config):
+        raise UserError(f"runs/x: no prior for {config.task}")
+
+    with pytest.raises(SystemExit) as stopped:
+        run(main)
+    assert stopped.value.code == 2
+    assert capsys.readouterr().err == "error: runs/x: no prior for hammer\n"
+
+
+def test_a_bug_keeps_its_traceback():
+    def main(config):
+        raise ZeroDivisionError("bug")
+
+    with pytest.raises(ZeroDivisionError):
+        run(main)
+
+
+def test_an_interrupt_tells_how_to_go_on(capsys):
+    def main(config):
+        raise KeyboardInterrupt
+
+    with pytest.raises(SystemExit) as stopped:
+        run(main)
+    assert stopped.value.code == 130
+    assert "--resume continues" in capsys.readouterr().err
+
+
+def test_help_is_complete_and_code_0(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        run(print, "--help")
+    assert stopped.value.code == 0
+    shown = capsys.readouterr().out
+    assert "Train." in shown and "What to do." in shown and "--inner.learning-rate" in shown
+
+
+def test_help_does_not_start_jax():
+    """A command whose main imports the heavy modules must answer --help without them."""
+    program = (
+        "import dataclasses, sys; from experiments import cli\n"
+        "@dataclasses.dataclass(frozen=True)\nclass C:\n    x: int = 1\n"
+        "try: cli.run_main(print, C, 'd', argv=['--help'])\n"
+        "except SystemExit: sys.exit(any(m in sys.modules for m in ('jax', 'mujoco', 'matplotlib')))\n"
+    )
+    begun = time.monotonic()
+    done = subprocess.run([sys.executable, "-c", program], env=dict(os.environ), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert time.monotonic() - begun < 10  # 0.1 s on an idle machine
+
+
+def test_choose():
+    options = {"sac": 1, "sgft-sac": 2, "pbrs": 3}
+    assert cli.choose("method", "pbrs", options) == 3
+    with pytest.raises(UserError) as refused:
+        cli.choose("method", "sgft", options)
+    assert str(refused.value) == "method: there is no 'sgft', did you mean 'sgft-sac'? Choose from: pbrs, sac, sgft-sac"
+
+
+# ---------------------------------------------------------------- the environment of a run
+
+
+def test_set_up_keeps_what_the_user_has_set():
+    os.environ.update(XLA_FLAGS="--xla_gpu_triton_gemm_any=false", JAX_COMPILATION_CACHE_DIR="/mine")
+    cli.set_up()
+    assert os.environ["XLA_FLAGS"] == "--xla_gpu_triton_gemm_any=false"
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == "/mine"
+
+
+def test_set_up_adds_the_gpu_flag_once():
+    os.environ["XLA_FLAGS"] = "--xla_force_host_platform_device_count=2"
+    cli.set_up()
+    cli.set_up()
+    assert os.environ["XLA_FLAGS"] == "--xla_force_host_platform_device_count=2 --xla_gpu_triton_gemm_any=true"
+
+
+@pytest.mark.parametrize(
+    ("value", "folder"),
+    [("", Path.home() / ".cache" / "sgft_jax" / "jax"), ("/tmp/c", Path("/tmp/c")), ("off", None), ("0", None)],
+)
+def test_cache_folder(value, folder):
+    os.environ["SGFT_CACHE_DIR"] = value
+    assert cli.cache_folder() == folder
+
+
+def test_no_cache_when_switched_off():
+    os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
+    os.environ["SGFT_CACHE_DIR"] = "off"
+    cli.set_up()
+    assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
+
+
+def test_the_first_backend_that_renders_is_taken(monkeypatch):
+    os.environ.pop("MUJOCO_GL", None)
+    monkeypatch.setattr(cli, "_probe", {"egl": "no driver", "osmesa": None}.get)
+    monkeypatch.setattr(cli.importlib, "reload", lambda module: module)
+    assert cli.select_renderer() is None
+    assert os.environ["MUJOCO_GL"] == "osmesa"
+
+
+def test_no_renderer_is_one_line_with_the_reasons(monkeypatch):
+    os.environ.pop("MUJOCO_GL", None)
+    monkeypatch.setattr(cli, "_probe", {"egl": "no driver", "osmesa": "no library"}.get)
+    reason = cli.select_renderer()
+    assert "egl: no driver; osmesa: no library" in reason and "\n" not in reason
+    assert "MUJOCO_GL" not in os.environ
+
+
+def test_the_users_backend_is_tried_alone_and_for_real():
+    os.environ["MUJOCO_GL"] = "disable"
+    assert cli.select_renderer().startswith("MuJoCo cannot render here (disable: AttributeError")

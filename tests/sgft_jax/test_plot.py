@@ -1,0 +1,63 @@
+import matplotlib.image
+import numpy as np
+import pytest
+
+from sgft_jax import plot
+
+X = np.arange(0, 2001, 500)
+
+
+def scores(seeds):
+    return np.clip(np.random.default_rng(0).uniform(0.2, 1.0, (seeds, len(X))), 0, 1)
+
+
+def test_learning_curves_draw_every_method(tmp_path):
+    curves = {"SGFT-SAC": (X, scores(5)), "SAC": (X, scores(5) / 2)}
+    path = plot.learning_curves(
+        tmp_path / "figures" / "curves.png", curves, title="Hammer", zero_shot=0.2, rollout_length=100, control_dt=0.05
+    )
+    image = matplotlib.image.imread(path)
+    assert image.shape[:2] == (600, 1080)  # 7.2 x 4 inches at 150 dpi: readable at the width of a README
+    for color in plot.PALETTE[:2]:
+        wanted = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+        assert (np.abs(image[..., :3] - wanted).max(-1) < 0.01).sum() > 200
+
+
+def test_one_seed_draws_a_line_without_a_band(tmp_path):
+    assert plot.learning_curves(tmp_path / "one.png", {"SAC": (X, scores(1))}, title="Push").exists()
+
+
+@pytest.mark.parametrize("n", [1, 200])
+def test_pretraining_panels(tmp_path, n):
+    returns = np.linspace(0, 5, n)
+    path = plot.pretraining(
+        tmp_path / "pretraining.png",
+        title="Pretraining",
+        steps=np.arange(10) * 1e5,
+        success=np.linspace(0, 1, 10),
+        returns=np.linspace(0, 50, 10),
+        value=returns,
+        monte_carlo=returns,
+        dynamics_error=[0.1, 0.2, 0.3],
+        baseline_error=[0.2, 0.5, 0.9],
+    )
+    assert matplotlib.image.imread(path).shape[:2] == (480, 1800)
+
+
+@pytest.mark.parametrize(
+    ("values", "placed"),
+    [
+        ([0.1, 0.5, 0.9], [0.1, 0.5, 0.9]),  # room enough: nothing moves
+        ([0.5, 0.5], [0.55, 0.45][::-1]),  # a pair parts around its mean
+        ([0.5, 0.45, 0.9], [0.525, 0.425, 0.9]),  # mean 0.475 -+ 0.05, order kept
+        ([1.0, 1.0, 1.0], [0.8, 0.9, 1.0]),  # the top is the top
+        ([0.3, 0.35, 0.42], [0.25667, 0.35667, 0.45667]),  # a crowd grows: mean 0.35667
+    ],
+)
+def test_labels_part(values, placed):
+    np.testing.assert_allclose(plot._spread(values, gap=0.1), placed, atol=1e-4)
+
+
+@pytest.mark.parametrize(("minutes", "text"), [(1.66, "1.7 min"), (120.4, "120 min"), (1500, "1,500 min")])
+def test_minutes(minutes, text):
+    assert plot._minutes(minutes) == text
