@@ -77,8 +77,13 @@ def step_fleet(
     return fleet, transitions, valid, after
 
 
-def play_episode(env: Env, pool: World, policy: Policy, carry: PyTree, key: Key, *, gamma: float | Array) -> Episode:
-    """One episode of `env.episode_length` steps in a random world of the pool; nothing is batched: vmap over keys."""
+def play_episode(
+    env: Env, pool: World, policy: Policy, carry: PyTree, key: Key, *, gamma: float | Array, length: int | None = None
+) -> Episode:
+    """One episode in a random world of the pool; nothing is batched: vmap over keys.
+
+    length: control steps, default `env.episode_length`; a longer one looks past the time limit.
+    """
     key_world, key_reset, key_steps = jax.random.split(key, 3)
     world = pick(pool, jax.random.randint(key_world, (), 0, pool_size(pool)))
     start = env.reset(world, key_reset)
@@ -94,7 +99,7 @@ def play_episode(env: Env, pool: World, policy: Policy, carry: PyTree, key: Key,
         return (after, carry, over), (row, valid, after.success & ~after.invalid, after.invalid, after.physics.qpos)
 
     (_, _, _), (rows, valid, success, invalid, qpos) = jax.lax.scan(
-        step, (start, carry, jnp.zeros((), bool)), jax.random.split(key_steps, env.episode_length)
+        step, (start, carry, jnp.zeros((), bool)), jax.random.split(key_steps, length or env.episode_length)
     )
     total = jnp.where(valid, rows.reward, 0.0).sum()
     last_valid = jnp.maximum(valid.sum() - 1, 0)

@@ -1,0 +1,44 @@
+"""Success and return of a policy on a pool of worlds: one batch of whole episodes. Pure."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from envs.base import Env, World
+from envs.rollout import Episode, play_episode
+from sgft_jax.networks import NetworkConfig, make_actor, tanh_gaussian_mode, tanh_gaussian_sample
+from sgft_jax.normalizer import normalize
+from sgft_jax.types import Array, Key, Metrics, Prior
+
+Act = Callable[[Array, Key], Array]
+
+
+def play_episodes(env: Env, pool: World, act: Act, key: Key, n: int, *, gamma: float, length: int | None = None) -> Episode:
+    """n episodes [n, ...] of `act(obs, key) -> action`, each in a random world of the pool.
+
+    The same key gives the same worlds, starts and noise to every policy: differences between policies are paired.
+    """
+    policy = lambda carry, obs, key: (act(obs, key), carry)  # noqa: E731
+    one = lambda key: play_episode(env, pool, policy, (), key, gamma=gamma, length=length)  # noqa: E731
+    return jax.vmap(one)(jax.random.split(key, n))
+
+
+def score(episodes: Episode) -> Metrics:
+    """Mean success, return and share of exploded episodes."""
+    return {
+        "success": episodes.success.mean(),
+        "return": episodes.total_reward.mean(),
+        "exploded": episodes.exploded.astype(jnp.float32).mean(),
+    }
+
+
+def prior_policy(env: Env, prior: Prior, network: NetworkConfig, *, explore: bool) -> Act:
+    """pi_sim as a function of (obs, key): the mean action, or a sample to explore."""
+    actor = make_actor(env.obs_dim, env.act_dim, network)
+
+    def act(obs: Array, key: Key) -> Array:
+        moments = actor.apply(prior.actor, normalize(prior.normalizer, obs))
+        return tanh_gaussian_sample(moments, key)[0] if explore else tanh_gaussian_mode(moments)
+
+    return act

@@ -1,0 +1,91 @@
+"""Named settings of pretraining. A preset never changes meaning; a new idea is a new preset."""
+
+from dataclasses import dataclass, field
+
+from sgft_jax.networks import NetworkConfig
+
+
+@dataclass(frozen=True)
+class PretrainConfig:
+    """Everything that decides the result of pretraining, apart from task and seeds."""
+
+    n_envs: int = 4096
+    """Environments stepped together."""
+    worlds: int = 2048
+    """Domain parameter vectors compiled; each episode lives in a random one."""
+    env_steps: int = 8_000_000
+    """Environment steps of training, after the random-action data."""
+    random_transitions: int = 500_000
+    """Random-action transitions: observation statistics and part of every batch."""
+    random_fraction: float = 0.5
+    """Share of each batch that comes from the random-action data (paper: 0.5)."""
+    updates_per_step: int = 16
+    """Gradient steps per step of all environments."""
+    batch_size: int = 4096
+    replay_capacity: int = 1_000_000
+    gamma: float = 0.99
+    lr: float = 3e-4
+    """Adam learning rate of every network."""
+    tau: float = 0.005
+    """Averaging rate of the target critic."""
+    alpha: float = 1.0
+    """Initial temperature; it follows the target entropy."""
+    entropy_per_dim: float = -1.0
+    """Target entropy per action dimension, nats."""
+    policy_delay: int = 1
+    """Critic updates per actor update."""
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    ensemble_size: int = 5
+    chunk_steps: int = 50
+    """Steps of all environments per compiled chunk: between chunks we log, evaluate and checkpoint."""
+    eval_every: int = 4
+    """Chunks between evaluations."""
+    eval_episodes: int = 256
+    checkpoint_every: int = 8
+    """Chunks between checkpoints."""
+
+
+_NORMED = NetworkConfig(hidden=(256, 256), layer_norm=True)
+
+PRESETS: dict[str, PretrainConfig] = {
+    # The paper's numbers (Appendix C): one update of batch 256 per environment step, 2 x 512 units, alpha from 1.
+    "paper": PretrainConfig(
+        n_envs=64,
+        env_steps=5_000_000,
+        random_transitions=25_000_000,
+        updates_per_step=64,
+        batch_size=256,
+        replay_capacity=5_000_000,
+        chunk_steps=200,
+    ),
+    # What pays on one GPU today: thousands of environments, large batches, layer-normed critics, fast targets.
+    "fast": PretrainConfig(
+        random_fraction=0.1,
+        gamma=0.97,
+        lr=5e-4,
+        tau=0.02,
+        alpha=0.1,
+        network=_NORMED,
+    ),
+    # Two CPU cores, three minutes: narrow networks, few large updates.
+    "cpu": PretrainConfig(
+        n_envs=128,
+        worlds=128,
+        env_steps=100_000,
+        random_transitions=10_240,
+        random_fraction=0.1,
+        updates_per_step=8,
+        batch_size=512,
+        replay_capacity=100_000,
+        gamma=0.95,
+        lr=1e-3,
+        tau=0.02,
+        alpha=0.1,
+        network=NetworkConfig(hidden=(64, 64), layer_norm=True),
+        ensemble_size=3,
+        chunk_steps=40,
+        eval_every=5,
+        eval_episodes=64,
+        checkpoint_every=10,
+    ),
+}

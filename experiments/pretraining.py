@@ -1,0 +1,161 @@
+"""Massive SAC in simulation as pure functions: random data, then chunks of (step all environments, insert, update)."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from envs.base import Env, EnvState, World
+from envs.rollout import Fleet, launch, step_fleet
+from experiments.presets import PretrainConfig
+from sgft_jax import normalizer, replay
+from sgft_jax.sac import SACConfig, SACHyper, SACState, make_sac
+from sgft_jax.types import Array, Key, Learner, Metrics, Transition, UserError
+
+
+class PretrainState(NamedTuple):
+    """Everything that changes while pretraining. steps: [] int32, vector steps (of all environments) so far."""
+
+    learner: SACState
+    replay: replay.ReplayState
+    fleet: Fleet
+    key: Key
+    steps: Array
+
+
+class Pretrainer(NamedTuple):
+    """Pretraining of one seed as pure functions; vmap over seeds (and over pools of worlds).
+
+    collect_random(pool, key) -> a replay of random-action transitions, full but for exploded steps.
+    init(pool, random, key) -> PretrainState.
+    chunk(pool, random, state) -> (state, metrics): `config.chunk_steps` steps of all environments with their updates.
+    """
+
+    learner: Learner
+    collect_random: Callable[[World, Key], replay.ReplayState]
+    init: Callable[[World, replay.ReplayState, Key], PretrainState]
+    chunk: Callable[[World, replay.ReplayState, PretrainState], tuple[PretrainState, Metrics]]
+
+
+def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
+    """Builds the pure functions; raises UserError for sizes that do not fit together."""
+    _check(config)
+    learner = make_sac(sac_config(env, config), sac_hyper(config))
+    step = lambda pool, fleet, actions, key: step_fleet(env, pool, fleet, actions, key, gamma=config.gamma)  # noqa: E731
+
+    def collect_random(pool: World, key: Key) -> replay.ReplayState:
+        key_launch, key_steps = jax.random.split(key)
+
+        def random_step(
+            carry: tuple[Fleet, replay.ReplayState], key: Key
+        ) -> tuple[tuple[Fleet, replay.ReplayState], None]:
+            fleet, buffer = carry
+            key_action, key_step = jax.random.split(key)
+            actions = jax.random.uniform(key_action, (config.n_envs, env.act_dim), minval=-1.0, maxval=1.0)
+            fleet, rows, valid, _ = step(pool, fleet, actions, key_step)
+            return (fleet, replay.add_batch(buffer, rows, valid)), None
+
+        n_steps = config.random_transitions // config.n_envs
+        buffer = replay.init(_example(env), n_steps * config.n_envs)
+        start = (launch(env, pool, key_launch, config.n_envs), buffer)
+        return jax.lax.scan(random_step, start, jax.random.split(key_steps, n_steps))[0][1]
+
+    def init(pool: World, random: replay.ReplayState, key: Key) -> PretrainState:
+        key_learner, key_fleet, key_run = jax.random.split(key, 3)
+        held = jnp.arange(random.data.reward.shape[0]) < random.size
+        statistics = normalizer.update(normalizer.init(env.obs_dim), random.data.obs, held)
+        agent = learner.init(key_learner).replace(normalizer=normalizer.finish(statistics))
+        fleet = launch(env, pool, key_fleet, config.n_envs)
+        return PretrainState(agent, replay.init(_example(env), config.replay_capacity), fleet, key_run, jnp.int32(0))
+
+    def sample(random: replay.ReplayState, buffer: replay.ReplayState, key: Key) -> Transition:
+        """[updates, batch] rows, drawn at once; each batch holds its share of random-action rows."""
+        key_random, key_replay = jax.random.split(key)
+        updates, n_random = config.updates_per_step, round(config.random_fraction * config.batch_size)
+        draw = lambda source, key, n: jax.tree.map(  # noqa: E731
+            lambda x: x.reshape(updates, n, *x.shape[1:]), replay.sample(source, key, updates * n)
+        )
+        old, new = draw(random, key_random, n_random), draw(buffer, key_replay, config.batch_size - n_random)
+        return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), old, new)
+
+    def vector_step(pool: World, random: replay.ReplayState, state: PretrainState) -> tuple[PretrainState, Metrics]:
+        keys = jax.random.split(state.key, 5)
+        act = lambda obs, key: learner.act(state.learner, (), obs, key, explore=True)[0]  # noqa: E731
+        actions = jax.vmap(act)(state.fleet.state.obs, jax.random.split(keys[1], config.n_envs))
+        fleet, rows, valid, after = step(pool, state.fleet, actions, keys[2])
+        buffer = replay.add_batch(state.replay, rows, valid)
+        batches = sample(random, buffer, keys[3])
+        agent, metrics = jax.lax.scan(
+            lambda agent, x: learner.update(agent, *x),
+            state.learner,
+            (batches, jax.random.split(keys[4], config.updates_per_step)),
+        )
+        metrics = {k: v.mean() for k, v in metrics.items()} | _fleet_metrics(after, rows, valid)
+        return PretrainState(agent, buffer, fleet, keys[0], state.steps + 1), metrics
+
+    def chunk(pool: World, random: replay.ReplayState, state: PretrainState) -> tuple[PretrainState, Metrics]:
+        state, metrics = jax.lax.scan(
+            lambda s, _: vector_step(pool, random, s), state, None, length=config.chunk_steps
+        )
+        ended = jnp.maximum(metrics.pop("ended").sum(), 1.0)
+        succeeded = metrics.pop("succeeded").sum()
+        return state, {k: v.mean() for k, v in metrics.items()} | {"train/success": succeeded / ended}
+
+    return Pretrainer(learner, collect_random, init, chunk)
+
+
+def sac_config(env: Env, config: PretrainConfig) -> SACConfig:
+    """The structure of the agent that pretraining trains."""
+    return SACConfig(
+        env.obs_dim,
+        env.act_dim,
+        network=config.network,
+        ensemble_size=config.ensemble_size,
+        policy_delay=config.policy_delay,
+    )
+
+
+def sac_hyper(config: PretrainConfig) -> SACHyper:
+    """Its numbers: one learning rate for all networks, as in the paper."""
+    return SACHyper(
+        lr_actor=config.lr,
+        lr_critic=config.lr,
+        lr_value=config.lr,
+        lr_dynamics=config.lr,
+        lr_alpha=config.lr,
+        tau=config.tau,
+        alpha=config.alpha,
+        entropy_per_dim=config.entropy_per_dim,
+    )
+
+
+def replay_bytes(env: Env, config: PretrainConfig) -> int:
+    """Bytes of the random-action data and the replay of one seed on the device."""
+    row = sum(x.nbytes for x in jax.tree.leaves(_example(env)))
+    return row * (config.random_transitions + config.replay_capacity)
+
+
+def _fleet_metrics(after: EnvState, rows: Transition, valid: Array) -> Metrics:
+    ended = (after.truncated | after.terminated) & valid
+    return {
+        "train/reward": rows.reward.mean(),
+        "train/exploded": 1.0 - valid.mean(),
+        "ended": ended.sum().astype(jnp.float32),
+        "succeeded": (ended & after.success).sum().astype(jnp.float32),
+    }
+
+
+def _example(env: Env) -> Transition:
+    """A transition of zeros with the dtypes that are stored."""
+    obs, zero = jnp.zeros(env.obs_dim), jnp.float32(0)
+    return Transition(obs, jnp.zeros(env.act_dim), zero, zero, obs, jnp.bool_(False), jnp.int32(0))
+
+
+def _check(config: PretrainConfig) -> None:
+    if config.random_transitions < config.n_envs:
+        raise UserError(f"random_transitions={config.random_transitions} is less than one step of n_envs={config.n_envs}")
+    if config.replay_capacity < config.n_envs:
+        raise UserError(f"replay_capacity={config.replay_capacity} cannot hold one step of n_envs={config.n_envs}")
+    if not 0 <= config.random_fraction < 1:
+        raise UserError(f"random_fraction={config.random_fraction} must be in [0, 1)")
