@@ -105,7 +105,7 @@ def initial(params: Array, key: Key) -> PhysicsState:
 
 
 def target(qpos: Array, action: Array) -> Array:
-    """[7] joint targets that move the tip by `action` * 2 cm from where it is, inside the workspace, and set it upright.
+    """[7] joint targets that move the tip by `action` * 2 cm, inside the workspace, and set the leg upright.
 
     Steps relative to the tip, not the hand: with a caught tip the hand would walk away and the leg would topple.
     """
@@ -218,7 +218,7 @@ def _add_part(spec: mujoco.MjSpec, theta: dict[str, float]) -> None:
 
 def _add_pair(spec: mujoco.MjSpec, ball: str, wall: str, friction: float) -> None:
     pair = spec.add_pair(geomname1=ball, geomname2=wall, condim=3, friction=[friction, friction, 0.0, 1e-4, 1e-4])
-    # The contact stiffens over 0.5 mm behind the surface, so the opening keeps its size for a leg that does not press, and
-    # 100 N sink in by 0.4 mm. Newton's method then converges in 4 iterations; over 0.2 mm it needs 20, and with 4 the leg
-    # sinks in by 3 mm.
+    # The contact stiffens over 0.5 mm behind the surface, so the opening keeps its size for a leg that does not press,
+    # and 100 N sink in by 0.4 mm. Newton's method then converges in 4 iterations; over 0.2 mm it needs 20, and with 4
+    # the leg sinks in by 3 mm.
     pair.solimp = [0.0, 0.9, 0.0005, 0.5, 2.0]
