@@ -62,7 +62,7 @@ def forward(q: Array, tool: Array | None = None) -> Pose:
 def jacobian(q: Array, tool: Array | None = None) -> Array:
     """[6, 7] geometric Jacobian in the base frame: rows are m/s and rad/s of the tool per rad/s of each joint."""
     pose, axes, origins = _chain(q, _tool(tool))
-    return jnp.concatenate([jnp.cross(axes, pose.position - origins).T, axes.T])
+    return jnp.concatenate([jnp.cross(axes, pose.position[None] - origins).T, axes.T])
 
 
 def solve(q: Array, target: Pose, *, iterations: int, damping: float = 0.02, posture: float = 0.0) -> Array:
@@ -76,7 +76,7 @@ def solve(q: Array, target: Pose, *, iterations: int, damping: float = 0.02, pos
 
     def improve(q: Array, _: None) -> tuple[Array, None]:
         pose, axes, origins = _chain(q, _tool(None))
-        jac = jnp.concatenate([jnp.cross(axes, pose.position - origins).T, axes.T])
+        jac = jnp.concatenate([jnp.cross(axes, pose.position[None] - origins).T, axes.T])
         error = jnp.concatenate([target.position - pose.position, rotation_error(pose.rotation, target.rotation)])
         rest = posture * (jnp.asarray(arm.Q_HOME, jnp.float32) - q)
         gram = jac @ jac.T + damping**2 * jnp.eye(6)
