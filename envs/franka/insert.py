@@ -1,13 +1,14 @@
 """Insertion: put a table leg into its hole in a table top. Paper section 6.2; sgft.md sections 9 and 15.4.
 
-Everything is measured in the robot's base frame; z = 0 is the surface on which the table top lies. The leg is held
-rigidly, so it is part of the last link, and it points down: the hand translates by steps and keeps its orientation.
+Everything is measured in the robot's base frame. The table top lies in the bench with its upper face level with the
+bench, z = 0, so there is one surface with one hole. The leg is held rigidly, so it is part of the last link, and it
+points down: its tip translates by steps while the hand keeps its orientation.
 
 Contacts live in configuration space: a round peg of radius r that stays upright inside a square opening of half-width
 R moves exactly as a small ball in an opening of half-width R - r + ball. So two balls on the peg's axis collide with
 four boxes around the narrowed opening, and the drawn leg and hole have their true sizes. The balls' radius is the
 rounding of the leg's tip: it decides how far off the hole the leg may be and still slide in. Each ball costs 16
-constraint rows; a leg with its own shape against a ring of 12 to 16 boxes costs over a hundred and behaves alike.
+constraint rows; a leg of its own shape against a ring of 12 to 16 boxes (O-31) would cost over a hundred.
 """
 
 import jax
@@ -26,16 +27,18 @@ from sgft_jax.types import Array, Key
 SUBSTEPS = 40
 STEP = 0.02  # m per control step at |action| = 1 (O-19)
 TOLERANCE = 0.01  # m per axis
-PART_HALF = np.array([0.08775, 0.08775, 0.016875])  # m, half sizes of the table top, scaled by 1.08
-TOP = 2 * PART_HALF[2]  # m, height of the table top's upper face
+PART_HALF = 0.08775  # m, half the side of the table top, scaled by 1.08
 HOLE_OFFSET = np.array([0.06075, 0.06075])  # m, hole in the frame of the table top
 HOLE_NOMINAL = np.array([0.50, 0.0])  # m, base frame, of an unmoved table top
 DEPTH = 0.025  # m: how deep the tip is when the leg is assembled
-LEG_LENGTH, LEG_HALF_WIDTH = 0.0875, 0.015  # m
+LEG_LENGTH, LEG_HALF_WIDTH, LEG_MASS = 0.0875, 0.015, 0.023  # m, m, kg
+LEG_COLOUR = [0.93, 0.80, 0.60, 1]
+FINGER_HALF = np.array([0.009, 0.006, 0.025])  # m
+WALL_HALF = np.array([0.2, 0.2, 0.05])  # m: large enough for the workspace
 GRASP = 0.06  # m from the tool centre point down to the leg's tip
 TIP_ROUNDING = 0.003  # m
 UPPER_BALL = 0.018  # m above the tip's ball: it enters the hole's mouth when the leg is nearly assembled
-WORKSPACE = np.array([[0.30, -0.30, TOP - DEPTH], [0.70, 0.30, 0.25]])  # m, of the leg's tip, base frame
+WORKSPACE = np.array([[0.30, -0.30, -DEPTH], [0.70, 0.30, 0.25]])  # m, of the leg's tip, base frame
 START_LOW, START_HIGH = np.array([-0.05, -0.05, 0.05]), np.array([0.05, 0.05, 0.10])  # m, from the nominal hole's mouth
 # s, servo damping over stiffness, more than the other tasks': the joints of a soft servo lag unequally, and a straight
 # descent of 2 cm then bends sideways by 2 mm (1/20 s), 1.3 mm (1/16 s) or 1 mm (1/12 s, which reaches only 17 mm).
@@ -59,7 +62,7 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
     for servo in spec.actuators:
         servo.biasprm[2] = servo.biasprm[1] * DAMPING_TIME
-    _add_leg(link)
+    _add_leg(link, theta["peg_radius"])
     _add_fingers(link)
     _add_part(spec, theta)
     for ball in ("tip", "shaft"):
@@ -80,7 +83,7 @@ def assembled(params: Array) -> Array:
     offset = jnp.asarray(HOLE_OFFSET, jnp.float32)
     turned = jnp.stack([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]])
     xy = jnp.asarray(HOLE_NOMINAL, jnp.float32) - offset + params[:2] + turned
-    return jnp.concatenate([xy, jnp.array([TOP - DEPTH])])
+    return jnp.concatenate([xy, jnp.array([-DEPTH])])
 
 
 def reward(obs: Array, action: Array, next_obs: Array) -> Array:
@@ -99,7 +102,7 @@ def success(obs: Array) -> Array:
 def initial(params: Array, key: Key) -> PhysicsState:
     """The leg above the table top, at a random place around the nominal hole."""
     offset = jax.random.uniform(key, (3,), minval=jnp.asarray(START_LOW), maxval=jnp.asarray(START_HIGH))
-    tip = jnp.concatenate([jnp.asarray(HOLE_NOMINAL, jnp.float32), jnp.array([TOP])]) + offset
+    tip = jnp.concatenate([jnp.asarray(HOLE_NOMINAL, jnp.float32), jnp.zeros(1)]) + offset
     joints = kinematics.solve(jnp.asarray(_ready(), jnp.float32), _pose(tip), iterations=6, posture=0.05)
     return at_rest(joints, jnp.zeros(0), NV)
 
@@ -152,38 +155,32 @@ def _ready() -> np.ndarray:
     return np.array([0.0, 0.2, 0.0, -2.39, 0.0, 2.6, np.pi / 4])
 
 
-def _add_leg(link: mujoco.MjsBody) -> None:
+def _add_leg(link: mujoco.MjsBody, peg_radius: float) -> None:
+    """A square leg that ends in a round peg, and the two balls that feel the hole."""
     tip = arm.TCP + GRASP
-    for name, height in (("tip", 0.0), ("shaft", UPPER_BALL)):
-        link.add_geom(
-            name=name,
-            type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            pos=[0, 0, tip - TIP_ROUNDING - height],
-            size=[TIP_ROUNDING, 0, 0],
-            mass=0,
-            rgba=[0, 0, 0, 0],
-            **NO_CONTACT,
-        )
+    look = {"rgba": LEG_COLOUR, "quat": arm.tool_quaternion(), **NO_CONTACT}
+    box, cylinder, sphere = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE
+    half = (LEG_LENGTH - DEPTH) / 2
     link.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=[0, 0, tip - LEG_LENGTH / 2],
-        quat=arm.tool_quaternion(),
-        size=[LEG_HALF_WIDTH, LEG_HALF_WIDTH, LEG_LENGTH / 2],
-        mass=0.023,
-        rgba=[0.9, 0.88, 0.82, 1],
-        **NO_CONTACT,
+        type=box, pos=[0, 0, tip - DEPTH - half], size=[LEG_HALF_WIDTH, LEG_HALF_WIDTH, half], mass=LEG_MASS, **look
     )
+    link.add_geom(type=cylinder, pos=[0, 0, tip - DEPTH / 2], size=[peg_radius, DEPTH / 2, 0], mass=0, **look)
+    for name, height in (("tip", 0.0), ("shaft", UPPER_BALL)):
+        pos = [0, 0, tip - TIP_ROUNDING - height]
+        link.add_geom(
+            name=name, type=sphere, pos=pos, size=[TIP_ROUNDING, 0, 0], mass=0, rgba=[0, 0, 0, 0], **NO_CONTACT
+        )
 
 
 def _add_fingers(link: mujoco.MjsBody) -> None:
     yaw = arm.HAND_YAW
     for side in (-1, 1):
-        offset = side * (LEG_HALF_WIDTH + 0.006)
+        offset = side * (LEG_HALF_WIDTH + FINGER_HALF[1])
         link.add_geom(
             type=mujoco.mjtGeom.mjGEOM_BOX,
             pos=[-np.sin(yaw) * offset, np.cos(yaw) * offset, arm.TCP - 0.015],
             quat=arm.tool_quaternion(),
-            size=[0.009, 0.006, 0.025],
+            size=FINGER_HALF,
             mass=0.015,
             rgba=[0.1, 0.1, 0.12, 1],
             **NO_CONTACT,
@@ -192,28 +189,36 @@ def _add_fingers(link: mujoco.MjsBody) -> None:
 
 def _add_part(spec: mujoco.MjSpec, theta: dict[str, float]) -> None:
     """The table top: a body at the hole, turned with the part, whose four walls leave a square opening."""
-    c, s = np.cos(theta["part_rotation"]), np.sin(theta["part_rotation"])
-    turned = np.array([[c, -s], [s, c]]) @ HOLE_OFFSET
-    xy = HOLE_NOMINAL - HOLE_OFFSET + [theta["part_x"], theta["part_y"]] + turned
-    half_angle = theta["part_rotation"] / 2
-    hole = spec.worldbody.add_body(
-        name="hole", pos=[*xy, PART_HALF[2]], quat=[np.cos(half_angle), 0, 0, np.sin(half_angle)]
-    )
+    angle = theta["part_rotation"]
+    c, s = np.cos(angle), np.sin(angle)
+    xy = HOLE_NOMINAL - HOLE_OFFSET + [theta["part_x"], theta["part_y"]] + np.array([[c, -s], [s, c]]) @ HOLE_OFFSET
+    hole = spec.worldbody.add_body(name="hole", pos=[*xy, 0], quat=[np.cos(angle / 2), 0, 0, np.sin(angle / 2)])
     opening = theta["hole_radius"] - theta["peg_radius"] + TIP_ROUNDING
-    half = np.array([0.10, 0.10 + opening, PART_HALF[2]])
-    for i in range(4):  # each wall covers one side and one corner of the opening, like blades of a pinwheel
-        turn = i * np.pi / 2
-        x, y = opening + half[0], half[0]
-        c, s = np.cos(turn), np.sin(turn)
+    x, y = WALL_HALF[0] + opening, WALL_HALF[1] - opening
+    for i in range(4):  # each wall covers one side and one corner of the opening, like the blades of a pinwheel
+        c, s = np.cos(i * np.pi / 2), np.sin(i * np.pi / 2)
         hole.add_geom(
             name=f"wall{i}",
             type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=[c * x - s * y, s * x + c * y, 0],
-            quat=[np.cos(turn / 2), 0, 0, np.sin(turn / 2)],
-            size=half,
-            rgba=[0.5, 0.5, 0.5, 0.3],
+            pos=[c * x - s * y, s * x + c * y, -WALL_HALF[2]],
+            quat=[np.cos(i * np.pi / 4), 0, 0, np.sin(i * np.pi / 4)],
+            size=WALL_HALF,
+            rgba=[0, 0, 0, 0],
+            mass=0,
             **NO_CONTACT,
         )
+    _add_scenery(spec, hole, theta["hole_radius"])
+
+
+def _add_scenery(spec: mujoco.MjSpec, hole: mujoco.MjsBody, hole_radius: float) -> None:
+    """What a viewer sees: the bench 4 mm below the surface of contact, the table top and its hole just below it."""
+    box, cylinder = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
+    bench, part, dark = [0.62, 0.64, 0.66, 1], [0.80, 0.62, 0.42, 1], [0.05, 0.04, 0.04, 1]
+    spec.worldbody.add_geom(type=box, pos=[0.4, 0, -0.024], size=[0.65, 0.6, 0.02], rgba=bench, **NO_CONTACT)
+    look = {"mass": 0, **NO_CONTACT}
+    size = [PART_HALF, PART_HALF, 0.01]
+    hole.add_geom(type=box, pos=[*-HOLE_OFFSET, -0.0105], size=size, rgba=part, **look)
+    hole.add_geom(type=cylinder, pos=[0, 0, -0.0052], size=[hole_radius, 0.005, 0], rgba=dark, **look)
 
 
 def _add_pair(spec: mujoco.MjSpec, ball: str, wall: str, friction: float) -> None:
