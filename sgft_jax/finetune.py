@@ -26,8 +26,10 @@ class FinetuneConfig:
     reset_critic: None = the method's default. A kept critic under a shaped reward is read as Q_sim(s, a) - V_sim(s),
         its exact meaning in simulation.
     critic_warmup: critic-only updates at the start, when the critic is new: its first gradients are noise, and would
-        drag a good actor away before a single real reward is understood. 0 = as printed.
-    actor_ramp: updates over which the actor's learning rate then rises from 0.
+        drag a good actor away before a single real reward is understood. 0 = as printed in the paper.
+    actor_ramp: updates over which the actor's learning rate then rises from 0, for the same reason. On a point mass
+        (tests, 6 seeds, gap of 25 degrees) warm-up or ramp cut the worst loss of return from 0.03 to 0.01; the kept
+        critic had 0.01 without either.
     train_dynamics: keep fitting the ensemble, on real transitions only.
     actor_real_only: the actor learns from the real rows, the critic from all (O-11).
     lr_*: Adam learning rates. tau: target averaging rate. max_grad_norm: None = no clipping.
@@ -42,8 +44,8 @@ class FinetuneConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     critic_network: NetworkConfig | None = None
     reset_critic: bool | None = None
-    critic_warmup: int = 500
-    actor_ramp: int = 0
+    critic_warmup: int = 200
+    actor_ramp: int = 200
     train_dynamics: bool = True
     actor_real_only: bool = True
     lr_actor: float = 3e-4
@@ -131,13 +133,13 @@ def make_finetuner(
     told = config.horizon if method.finite_horizon else 1  # what the agent is told about the steps to go
 
     def init(prior: Prior, key: Key) -> FinetuneState:
-        example = _example(obs_dim, act_dim)
+        own = jax.tree.map(jnp.copy, prior)  # the caller may donate the state; the prior must survive it
         return FinetuneState(
             learner=warm_start(prior, key),
-            dynamics=optim.start(optimiser, prior.dynamics),
-            value=prior.value,
-            normalizer=prior.normalizer,
-            replay=replay.init(example, config.replay_capacity),
+            dynamics=optim.start(optimiser, own.dynamics),
+            value=own.value,
+            normalizer=own.normalizer,
+            replay=replay.init(_example(obs_dim, act_dim), config.replay_capacity),
         )
 
     def policy(agent: PyTree, obs: Array, k: Array, key: Key, *, explore: bool) -> Array:

@@ -199,8 +199,12 @@ def _critic_of(config: SACConfig, parts: _Parts, state: SACState) -> Callable[[P
     """The critic (params, obs, action) -> [members], relative to the frozen value where a baseline is asked for."""
     if not config.critic_baseline:
         return parts.critic.apply
-    frozen = state.value.params
-    return lambda params, obs, action: parts.critic.apply(params, obs, action) - parts.value.apply(frozen, obs)
+
+    def relative(params: PyTree, obs: Array, action: Array) -> Array:
+        with jax.default_matmul_precision("highest"):  # as in value.predict: the difference of two large numbers
+            return parts.critic.apply(params, obs, action) - parts.value.apply(state.value.params, obs)
+
+    return relative
 
 
 def _update_critic(
@@ -288,6 +292,7 @@ def fine_tune_state(config: SACConfig, hyper: SACHyper, prior: Prior, key: Key, 
     """
     parts, extra = _parts(config), config.extra_obs
     check_prior(config, prior, critic=not reset_critic)
+    prior = jax.tree.map(jnp.copy, prior)  # the caller may donate the state; the prior must survive it
 
     def pad(params: PyTree) -> PyTree:
         return pad_first_layer(params, config.obs_dim, extra)
