@@ -30,6 +30,7 @@ TOLERANCE = 0.01  # m per axis
 PART_HALF = 0.08775  # m, half the side of the table top, scaled by 1.08
 HOLE_OFFSET = np.array([0.06075, 0.06075])  # m, hole in the frame of the table top
 HOLE_NOMINAL = np.array([0.50, 0.0])  # m, base frame, of an unmoved table top
+TOP = 0.0  # m, base frame: the upper face of the table top and the bench
 DEPTH = 0.025  # m: how deep the tip is when the leg is assembled
 LEG_LENGTH, LEG_HALF_WIDTH, LEG_MASS = 0.0875, 0.015, 0.023  # m, m, kg
 LEG_COLOUR = [0.93, 0.80, 0.60, 1]
@@ -38,7 +39,7 @@ WALL_HALF = np.array([0.2, 0.2, 0.05])  # m: large enough for the workspace
 GRASP = 0.06  # m from the tool centre point down to the leg's tip
 TIP_ROUNDING = 0.003  # m
 UPPER_BALL = 0.018  # m above the tip's ball: it enters the hole's mouth when the leg is nearly assembled
-WORKSPACE = np.array([[0.30, -0.30, -DEPTH], [0.70, 0.30, 0.25]])  # m, of the leg's tip, base frame
+WORKSPACE = np.array([[0.30, -0.30, TOP - DEPTH], [0.70, 0.30, 0.25]])  # m, of the leg's tip, base frame
 START_LOW, START_HIGH = np.array([-0.05, -0.05, 0.05]), np.array([0.05, 0.05, 0.10])  # m, from the nominal hole's mouth
 # s, servo damping over stiffness, more than the other tasks': the joints of a soft servo lag unequally, and a straight
 # descent of 2 cm then bends sideways by 2 mm (1/20 s), 1.3 mm (1/16 s) or 1 mm (1/12 s, which reaches only 17 mm).
@@ -83,7 +84,7 @@ def assembled(params: Array) -> Array:
     offset = jnp.asarray(HOLE_OFFSET, jnp.float32)
     turned = jnp.stack([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1]])
     xy = jnp.asarray(HOLE_NOMINAL, jnp.float32) - offset + params[:2] + turned
-    return jnp.concatenate([xy, jnp.array([-DEPTH])])
+    return jnp.concatenate([xy, jnp.array([TOP - DEPTH])])
 
 
 def reward(obs: Array, action: Array, next_obs: Array) -> Array:
@@ -102,7 +103,7 @@ def success(obs: Array) -> Array:
 def initial(params: Array, key: Key) -> PhysicsState:
     """The leg above the table top, at a random place around the nominal hole."""
     offset = jax.random.uniform(key, (3,), minval=jnp.asarray(START_LOW), maxval=jnp.asarray(START_HIGH))
-    tip = jnp.concatenate([jnp.asarray(HOLE_NOMINAL, jnp.float32), jnp.zeros(1)]) + offset
+    tip = jnp.concatenate([jnp.asarray(HOLE_NOMINAL, jnp.float32), jnp.array([TOP])]) + offset
     joints = kinematics.solve(jnp.asarray(_ready(), jnp.float32), _pose(tip), iterations=6, posture=0.05)
     return at_rest(joints, jnp.zeros(0), NV)
 
@@ -192,7 +193,7 @@ def _add_part(spec: mujoco.MjSpec, theta: dict[str, float]) -> None:
     angle = theta["part_rotation"]
     c, s = np.cos(angle), np.sin(angle)
     xy = HOLE_NOMINAL - HOLE_OFFSET + [theta["part_x"], theta["part_y"]] + np.array([[c, -s], [s, c]]) @ HOLE_OFFSET
-    hole = spec.worldbody.add_body(name="hole", pos=[*xy, 0], quat=[np.cos(angle / 2), 0, 0, np.sin(angle / 2)])
+    hole = spec.worldbody.add_body(name="hole", pos=[*xy, TOP], quat=[np.cos(angle / 2), 0, 0, np.sin(angle / 2)])
     opening = theta["hole_radius"] - theta["peg_radius"] + TIP_ROUNDING
     x, y = WALL_HALF[0] + opening, WALL_HALF[1] - opening
     for i in range(4):  # each wall covers one side and one corner of the opening, like the blades of a pinwheel
