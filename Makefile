@@ -40,7 +40,7 @@ type: $(PY) ## static types
 	$(PY) -m pyright
 
 test: $(PY) ## the fast tests
-	$(PY) -m pytest -q -n $(JOBS) --dist loadfile -m "not slow and not gpu" $(ARGS)
+	$(PY) -m pytest -q -n $(JOBS) --dist loadfile -m "not slow" $(ARGS)
 
 test-all: $(PY) ## every test that this machine can run
 	$(PY) -m pytest -q -n $(JOBS) --dist loadfile $(ARGS)

@@ -71,9 +71,9 @@ def transitions_to(transitions: ArrayLike, success: ArrayLike, threshold: float)
 
 
 def first_dip(success: ArrayLike) -> float:
-    """How far fine-tuning fell below where it started: zero-shot success minus the lowest of the curve, at least 0.
+    """How far fine-tuning fell below where it started: zero-shot success minus the lowest of the curve.
 
-    success: [n_evaluations], the zero-shot evaluation first.
+    success: [n_evaluations], the zero-shot evaluation first. Never negative, as the curve contains its start.
     """
     success = np.asarray(success, np.float64)
-    return float(max(success[0] - success.min(), 0.0))
+    return float(success[0] - success.min())
