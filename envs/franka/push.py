@@ -20,7 +20,7 @@ from envs.franka.task import Scene, at_rest, clip_joints, make_env, new_spec
 from envs.physics import PhysicsState
 from sgft_jax.types import Array, Key
 
-SUBSTEPS = 25
+SUBSTEPS = 40
 STEP = 0.05  # m per control step at |action| = 1 (O-19)
 TABLE_ORIGIN = 0.20  # m, x of the table frame in the base frame
 EDGE = 0.55  # m, table frame
@@ -46,7 +46,7 @@ PARAMETERS = (
 
 def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The scene for one theta. The puck's start is part of the state, not of the model."""
-    spec = new_spec(substeps=SUBSTEPS, iterations=5, ls_iterations=6)
+    spec = new_spec(substeps=SUBSTEPS, iterations=4, ls_iterations=6)
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
     for side in (-1, 1):
         _add_finger(link, side)
