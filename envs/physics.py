@@ -5,7 +5,7 @@ compiler, and the fields in which the compiled models differ are stacked. That i
 and all constants derived from them), because no derived field is ever recomputed by hand.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -57,21 +57,32 @@ def make_simulator(spec: mujoco.MjSpec) -> Simulator:
     return Simulator(mjx.put_model(host, impl="jax"), mjx.make_data(host, impl="jax"), host)
 
 
-def compile_worlds(simulator: Simulator, specs: Iterable[mujoco.MjSpec]) -> dict[str, np.ndarray]:
-    """Compiles one model per spec and stacks the fields that differ from the nominal model: name -> [n, ...].
+def varying_fields(simulator: Simulator, specs: Iterable[mujoco.MjSpec]) -> tuple[str, ...]:
+    """Names of the simulated fields in which any of the specs differs from the nominal scene.
+
+    Found once per task from perturbed specs, so that all worlds of a task are pytrees of one structure: programs
+    compiled for one gap serve every other, and gaps can be vmapped over.
+    """
+    names = [k for k, v in vars(simulator.model).items() if isinstance(v, jax.Array) and not k.startswith(_COSMETIC)]
+    reference = _read(simulator.host, names)
+    others = [_read(spec.compile(), names) for spec in specs]
+    return tuple(k for k in reference if any(not np.array_equal(reference[k], fields[k]) for fields in others))
+
+
+def compile_worlds(
+    simulator: Simulator, specs: Iterable[mujoco.MjSpec], names: tuple[str, ...]
+) -> dict[str, np.ndarray]:
+    """Compiles one model per spec and stacks the fields `names` (see `varying_fields`): name -> [n, ...].
 
     Raises UserError when a spec changes the structure of the scene (number or types of elements), which a compiled
     program cannot follow.
     """
-    names = [k for k, v in vars(simulator.model).items() if isinstance(v, jax.Array) and not k.startswith(_COSMETIC)]
-    reference = _read(simulator.host, names)
     models = []
     for spec in specs:
         host = spec.compile()
         _check_structure(simulator.host, host)
         models.append(_read(host, names))
-    changed = [k for k in reference if any(not np.array_equal(reference[k], fields[k]) for fields in models)]
-    return {k: np.stack([fields[k] for fields in models]) for k in changed}
+    return {k: np.stack([fields[k] for fields in models]) for k in names}
 
 
 def with_fields(model: mjx.Model, fields: dict[str, Array]) -> mjx.Model:
@@ -112,9 +123,9 @@ def exploded(state: PhysicsState, *, max_speed: float) -> Array:
     return ~(jnp.isfinite(state.qpos).all() & (speed < max_speed))  # NaN speeds compare false
 
 
-def _read(host: mujoco.MjModel, names: list[str]) -> dict[str, np.ndarray]:
-    """Fields of a compiled model in the precision MJX keeps them in."""
-    fields = {name: np.array(getattr(host, name)) for name in names}
+def _read(host: mujoco.MjModel, names: Sequence[str]) -> dict[str, np.ndarray]:
+    """Fields of a compiled model in the precision MJX keeps them in, and the mean inertia that scales its solver."""
+    fields = {name: np.array(getattr(host, name)) for name in names if name != _MEAN_INERTIA}
     fields[_MEAN_INERTIA] = np.array(host.stat.meaninertia)
     return {k: v.astype(np.float32) if v.dtype == np.float64 else v for k, v in fields.items()}
 

@@ -1,6 +1,6 @@
 """What all Franka tasks share: effects on commands and sensors, the 5 Hz control period, and the Env assembled from parts."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -70,13 +70,14 @@ def make_env(scene: Scene) -> Env:
     """Assembles the Env of a scene: worlds, resets, steps."""
     nominal = {p.name: p.nominal for p in scene.parameters}
     simulator = physics.make_simulator(scene.build(nominal))
+    fields = physics.varying_fields(simulator, _perturbed(scene, nominal))
     obs_dim, act_dim = sum(e.size for e in scene.observation), sum(e.size for e in scene.action)
 
     def stack_worlds(params: np.ndarray, effects: Effects) -> World:
         specs = (scene.build(dict(zip(nominal, map(float, row), strict=True))) for row in params)
-        fields = physics.compile_worlds(simulator, specs)
+        stacked = physics.compile_worlds(simulator, specs, fields)
         repeat = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(params), *x.shape)), effects)
-        return World(jnp.asarray(params, jnp.float32), {k: jnp.asarray(v) for k, v in fields.items()}, repeat)
+        return World(jnp.asarray(params, jnp.float32), {k: jnp.asarray(v) for k, v in stacked.items()}, repeat)
 
     def sample_worlds(
         key: Key, n: int, *, params: Mapping[str, float | Sequence[float]] | None = None, effects: Mapping | None = None
@@ -132,6 +133,12 @@ def make_env(scene: Scene) -> Env:
         terminated=lambda obs, action, next_obs: jnp.zeros((), bool),
         success=scene.success,
     )
+
+
+def _perturbed(scene: Scene, nominal: dict[str, float]) -> Iterator[mujoco.MjSpec]:
+    """Scenes with one domain parameter off its nominal value each, by little enough to stay buildable."""
+    for name, value in nominal.items():
+        yield scene.build({**nominal, name: value * 1.01 if value else 0.01})
 
 
 def _ranges(scene: Scene, chosen: Mapping[str, float | Sequence[float]]) -> np.ndarray:
