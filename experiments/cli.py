@@ -21,14 +21,19 @@ _RENDER_PROBE = "import mujoco; c = mujoco.GLContext(16, 16); c.make_current(); 
 
 
 def run_main[T](
-    main: Callable[[T], None], config_type: type[T], description: str, *, argv: Sequence[str] | None = None
+    main: Callable[[T], object],
+    config_type: type[T],
+    description: str,
+    *,
+    argv: Sequence[str] | None = None,
+    default: T | None = None,
 ) -> None:
-    """Parse the command line into `config_type` and call `main` with it.
+    """Parse the command line into `config_type`, starting from `default`, and call `main` with it.
 
     Exits with code 2 and one line `error: ...` on stderr for anything the user can mend (`UserError`, unknown options
     or choices), with 130 after an interrupt. Other exceptions are bugs and keep their traceback.
     """
-    config = parse(config_type, description, argv)
+    config = parse(config_type, description, argv, default=default)
     set_up()
     try:
         main(config)
@@ -43,12 +48,14 @@ def run_main[T](
         fail(str(error))
 
 
-def parse[T](config_type: type[T], description: str, argv: Sequence[str] | None = None) -> T:
+def parse[T](
+    config_type: type[T], description: str, argv: Sequence[str] | None = None, *, default: T | None = None
+) -> T:
     """A frozen dataclass from the command line; a bad one ends the process with one line and code 2."""
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(config_type, description=description, args=argv)
+            return tyro.cli(config_type, description=description, args=argv, default=default)
     except SystemExit as stopped:
         if stopped.code not in (None, 0):
             fail(one_line(complaint.getvalue()))
@@ -107,6 +114,8 @@ def set_up() -> None:
     if cache := cache_folder():
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "1")
+        if (jax := sys.modules.get("jax")) and jax.config.jax_compilation_cache_dir is None:
+            jax.config.update("jax_compilation_cache_dir", str(cache))  # it was imported before the environment was set
     # Lets XLA use Triton for any matrix product; without effect on a CPU.
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_gpu_triton_gemm_any" not in flags:

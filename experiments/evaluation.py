@@ -1,6 +1,7 @@
 """Success and return of a policy on a pool of worlds: one batch of whole episodes. Pure."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +15,10 @@ from sgft_jax.types import Array, Key, Metrics, Prior
 Act = Callable[[Array, Key], Array]
 
 
-def play_episodes(env: Env, pool: World, act: Act, key: Key, n: int, *, gamma: float, length: int | None = None) -> Episode:
-    """n episodes [n, ...] of `act(obs, key) -> action`, each in a random world of the pool.
+def play_episodes(
+    env: Env, pool: World, act: Act, key: Key, n: int, *, gamma: float, length: int | None = None
+) -> Episode:
+    """N episodes [n, ...] of `act(obs, key) -> action`, each in a random world of the pool.
 
     The same key gives the same worlds, starts and noise to every policy: differences between policies are paired.
     """
@@ -42,3 +45,18 @@ def prior_policy(env: Env, prior: Prior, network: NetworkConfig, *, explore: boo
         return tanh_gaussian_sample(moments, key)[0] if explore else tanh_gaussian_mode(moments)
 
     return act
+
+
+class Best(NamedTuple):
+    """The best policy seen so far with all that belongs to it. success, total: [] of its evaluation; steps: [] int32."""
+
+    prior: Prior
+    success: Array
+    total: Array
+    steps: Array
+
+
+def keep_better(old: Best, new: Best) -> Best:
+    """The one with the higher success, then the higher return; the old one if they tie."""
+    better = (new.success > old.success) | ((new.success == old.success) & (new.total > old.total))
+    return jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)

@@ -1,0 +1,137 @@
+"""Impure: what the commands that train and evaluate share: seeds, worlds and priors by name, a stopwatch."""
+
+import contextlib
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from envs import gaps
+from envs.base import Env, World
+from envs.gaps import Gap
+from sgft_jax import checkpoint
+from sgft_jax.config import config_from_json, differences
+from sgft_jax.networks import NetworkConfig
+from sgft_jax.types import Key, Prior, PyTree, UserError
+
+SIM = "sim"
+
+
+def option(argv: Sequence[str], name: str, default: str) -> str:
+    """The value of one option, looked up before the command line is parsed: it decides the defaults of the others."""
+    value = default
+    for i, word in enumerate(argv):
+        if word.startswith(f"{name}="):
+            value = word.partition("=")[2]
+        elif word == name and i + 1 < len(argv):
+            value = argv[i + 1]
+    return value
+
+
+def seed_list(first: int, count: int) -> list[int]:
+    """`count` seeds from `first` on; raises UserError for none."""
+    if count < 1 or first < 0:
+        raise UserError(f"--seed {first} --seeds {count}: seeds are counted from 0 and there must be at least one")
+    return list(range(first, first + count))
+
+
+def seeds_name(seeds: Sequence[int]) -> str:
+    """The folder of a run with these seeds: `seed-3`, or `seeds-0-9`."""
+    return f"seed-{seeds[0]}" if len(seeds) == 1 else f"seeds-{seeds[0]}-{seeds[-1]}"
+
+
+def seed_keys(seeds: Sequence[int], purpose: int) -> Key:
+    """Keys [n_seeds] that depend on nothing but the seed and a number that stands for the purpose."""
+    return jnp.stack([jax.random.fold_in(jax.random.key(seed), purpose) for seed in seeds])
+
+
+def stack(trees: Sequence[PyTree]) -> PyTree:
+    """Equal pytrees stacked on a new leading axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def member(tree: PyTree, i: int) -> PyTree:
+    """The i-th of stacked pytrees."""
+    return jax.tree.map(lambda x: x[i], tree)
+
+
+def load_gap(env: Env, real: str | None, overrides: Sequence[str]) -> Gap | None:
+    """The gap that `--real` and `--set` describe; None for the simulator itself."""
+    if real is None or real == SIM:
+        if overrides:
+            raise UserError(f"--set {overrides[0]}: changes a real system; name one with --real")
+        return None
+    return gaps.load(env, real, overrides)
+
+
+def training_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:
+    """Worlds to learn in: the training domain, or the real system of a gap."""
+    return env.sample_worlds(key, n) if gap is None else gaps.worlds(env, gap, key, n)
+
+
+def exam_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:
+    """Worlds to evaluate in: the training domain without sensor noise, or the real system as its gap describes it."""
+    return env.sample_worlds(key, n, effects={"obs_noise": 0.0}) if gap is None else gaps.worlds(env, gap, key, n)
+
+
+def find_priors(prior: Path | None, *, out: Path, env: Env, preset: str) -> tuple[list[Prior], dict[str, Any]]:
+    """The priors in a folder (one prior, or `prior/seed-*` of a run), and the card of the first.
+
+    prior: None looks for all seeds of `<out>/pretrain/<task>/<preset>`. Raises UserError if there is none, or if they
+    are of another task or differ in their networks.
+    """
+    home = out / "pretrain" / env.name / preset
+    folders = sorted(home.glob("*/prior/seed-*"), key=_seed_number) if prior is None else _prior_folders(prior)
+    if not folders:
+        raise UserError(
+            f"{prior or home}: holds no prior; make one with: "
+            f"python -m experiments.pretrain --task {env.name} --preset {preset}"
+        )
+    sizes = {"task": env.name, "obs_dim": env.obs_dim, "act_dim": env.act_dim}
+    priors, cards = zip(*(checkpoint.load_prior(folder, **sizes) for folder in folders), strict=True)
+    for folder, card in zip(folders, cards, strict=True):
+        if odd := [key for key in ("network", "gamma", "ensemble_size") if differences(cards[0][key], card[key])]:
+            raise UserError(f"{folder}: differs from {folders[0]} in {', '.join(odd)}; choose one with --prior")
+    return list(priors), cards[0]
+
+
+def network_of(card: dict[str, Any]) -> NetworkConfig:
+    """The networks of a prior."""
+    return config_from_json(NetworkConfig, card["network"], where="network.")
+
+
+def _prior_folders(folder: Path) -> list[Path]:
+    """The folder itself if it is a prior, else the `seed-*` folders in it or in its `prior/` or `policy/`."""
+    if (folder / "prior.json").exists():
+        return [folder]
+    found = [
+        p for sub in (".", "prior", "policy") for p in (folder / sub).glob("seed-*") if (p / "prior.json").exists()
+    ]
+    return sorted(found, key=_seed_number)
+
+
+def _seed_number(folder: Path) -> int:
+    return int(folder.name.removeprefix("seed-"))
+
+
+class Clock:
+    """Wall-clock seconds per phase; what a checkpoint remembers of an earlier start counts too."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextlib.contextmanager
+    def __call__(self, phase: str) -> Iterator[None]:
+        """Count the time inside the `with` block, which must wait for its own results."""
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[phase] = self.seconds.get(phase, 0.0) + time.perf_counter() - begun
+
+    def record(self) -> dict[str, float]:
+        """{"time/<phase>_s": seconds}."""
+        return {f"time/{phase}_s": round(seconds, 3) for phase, seconds in self.seconds.items()}

@@ -1,0 +1,342 @@
+"""Pretrain in randomised simulation (or on a "real" system): leaves one prior per seed.
+
+The prior of a seed is the agent at its best evaluation (success, then return) on held-out worlds; the numbers in its
+card and in summary.json come from fresh episodes in other held-out worlds, so the choice does not flatter them.
+"""
+
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from envs.base import Env, World
+from envs.gaps import Gap
+from experiments import cli, common
+from experiments.evaluation import Best, keep_better, play_episodes, prior_policy, score
+from experiments.presets import PRESETS, PretrainConfig
+from experiments.pretraining import PretrainState, make_pretrainer, replay_bytes
+from experiments.report import Report, make_report
+from sgft_jax import checkpoint, plot, runs, stats, value
+from sgft_jax.config import config_to_json
+from sgft_jax.log import MetricsLog, RunProgress, read_jsonl, write_summary
+from sgft_jax.replay import ReplayState
+from sgft_jax.sac import extract_prior
+from sgft_jax.types import Metrics, PyTree
+
+DEFAULT_PRESET = "fast"
+_WORLDS, _RANDOM, _START, _REPORT = range(4)  # purposes, folded into a seed's key
+_EXAM_SEED, _REPORT_SEED = 2**31, 2**31 + 1  # held-out worlds and episodes, the same for every run
+REPORT_EPISODES = 256  # a success rate then has a 95 % interval of +-6 points at worst
+
+
+@dataclass(frozen=True)
+class PretrainArgs:
+    """One run of pretraining."""
+
+    task: str = "push"
+    """push, hammer or insert."""
+    preset: str = DEFAULT_PRESET
+    """Named settings, see experiments/presets.py; --config.* changes single ones."""
+    config: PretrainConfig = field(default_factory=lambda: PRESETS[DEFAULT_PRESET])
+    """The settings themselves."""
+    seed: int = 0
+    """First seed."""
+    seeds: int = 1
+    """Number of seeds, trained together."""
+    real: str | None = None
+    """Train on a "real" system instead of the simulator's domain: the name of a gap, or a .toml/.json file."""
+    set: tuple[str, ...] = ()
+    """Changes to that system, e.g. --set latency=0.05 action_scale=[1,0.5]."""
+    video: bool = True
+    """Render an episode of the first prior, where MuJoCo can render."""
+    out: Path = Path("runs")
+    """Parent of all run folders."""
+    resume: bool = False
+    """Continue from the last checkpoint."""
+    overwrite: bool = False
+    """Replace an earlier run of the same name."""
+
+
+class Saved(NamedTuple):
+    """What a checkpoint holds, with a leading seeds axis: the run itself and the best policy so far."""
+
+    run: PretrainState
+    best: Best
+
+
+class Program(NamedTuple):
+    """Jitted functions over a leading seeds axis. `chunk` consumes the state it is given.
+
+    collect(pools, keys) -> random-action data; begin(pools, random, keys) -> Saved; chunk(pools, random, run) ->
+    (run, metrics); examine(saved) -> (the better of old and current policy, scores); report(pools, priors, keys).
+    """
+
+    collect: Callable[..., ReplayState]
+    begin: Callable[..., Saved]
+    chunk: Any
+    examine: Callable[[Saved], tuple[Best, Metrics]]
+    report: Callable[..., Report]
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line. The preset is looked up first, because it gives the other options their defaults."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    preset = common.option(argv, "--preset", DEFAULT_PRESET)
+    default = PretrainArgs(preset=preset, config=PRESETS.get(preset, PRESETS[DEFAULT_PRESET]))
+    cli.run_main(pretrain, PretrainArgs, __doc__ or "", argv=argv, default=default)
+
+
+def pretrain(args: PretrainArgs) -> dict[str, Any]:
+    """One run from (or back) to disk; returns its summary."""
+    cli.choose("--preset", args.preset, PRESETS)
+    cli.choose("--task", args.task, envs.TASKS)
+    seeds = common.seed_list(args.seed, args.seeds)
+    env = envs.make(args.task)
+    gap = common.load_gap(env, args.real, args.set)
+    make_pretrainer(env, args.config)  # sizes that do not fit together are reported before anything is written
+    run = runs.open_run(
+        run_folder(args, gap),
+        kind="pretrain",
+        config=args,
+        resume=args.resume,
+        overwrite=args.overwrite,
+        volatile=("resume", "overwrite", "video", "out"),
+    )
+    need = args.seeds * replay_bytes(env, args.config)
+    print(f"replay and random-action data: {need / 2**30:.2f} GiB on the device for {args.seeds} seed(s)")
+    summary = _Run(args, env, gap, seeds, run.folder).work()
+    run.close()
+    return summary
+
+
+def run_folder(args: PretrainArgs, gap: Gap | None) -> Path:
+    """Where the run of these arguments lives; the seeds of one call share a folder."""
+    where = args.preset if gap is None else f"{args.preset}-on-{gap.name}"
+    return args.out / "pretrain" / args.task / where / common.seeds_name(common.seed_list(args.seed, args.seeds))
+
+
+def make_program(env: Env, config: PretrainConfig, gap: Gap | None) -> Program:
+    """The functions of a run; samples the held-out worlds."""
+    trainer = make_pretrainer(env, config)
+    exam_key, report_key = jax.random.key(_EXAM_SEED), jax.random.key(_REPORT_SEED)
+    exam = common.exam_worlds(env, gap, exam_key, config.eval_episodes)
+    final = common.exam_worlds(env, gap, report_key, REPORT_EPISODES)
+    episodes_key = jax.random.fold_in(exam_key, 1)
+
+    def begin(pool: World, random: ReplayState, key: jax.Array) -> Saved:
+        run = trainer.init(pool, random, key)
+        return Saved(run, Best(extract_prior(run.learner), jnp.float32(-1.0), jnp.float32(-jnp.inf), jnp.int32(0)))
+
+    def examine(saved: Saved) -> tuple[Best, Metrics]:
+        prior = extract_prior(saved.run.learner)
+        act = prior_policy(env, prior, config.network, explore=False)
+        scores = score(play_episodes(env, exam, act, episodes_key, config.eval_episodes, gamma=config.gamma))
+        now = Best(prior, scores["success"], scores["return"], saved.run.steps)
+        return keep_better(saved.best, now), scores
+
+    def report(pool: World, prior: PyTree, key: jax.Array) -> Report:
+        sizes = {"episodes": REPORT_EPISODES, "trajectories": config.eval_episodes}
+        return make_report(env, config.network, prior, pool, final, key, gamma=config.gamma, **sizes)
+
+    return Program(
+        collect=jax.jit(jax.vmap(trainer.collect_random)),
+        begin=jax.jit(jax.vmap(begin)),
+        chunk=jax.jit(jax.vmap(trainer.chunk), donate_argnums=2),
+        examine=jax.jit(jax.vmap(examine)),
+        report=jax.jit(jax.vmap(report)),
+    )
+
+
+class _Run:
+    """The impure part: what happens between compiled calls."""
+
+    def __init__(self, args: PretrainArgs, env: Env, gap: Gap | None, seeds: list[int], folder: Path) -> None:
+        self.args, self.env, self.gap, self.seeds, self.folder = args, env, gap, seeds, folder
+        self.config = args.config
+        self.clock, self.log = common.Clock(), MetricsLog(folder)
+        self.expect = {"kind": "pretrain", "task": args.task, "seeds": seeds}
+        self.chunk_env_steps = self.config.n_envs * self.config.chunk_steps
+        self.chunks = math.ceil(self.config.env_steps / self.chunk_env_steps)
+
+    def work(self) -> dict[str, Any]:
+        """Everything, in order."""
+        with self.clock("worlds"):
+            keys = common.seed_keys(self.seeds, _WORLDS)
+            pools = [common.training_worlds(self.env, self.gap, key, self.config.worlds) for key in keys]
+            self.pools = common.stack(pools)
+            self.program = make_program(self.env, self.config, self.gap)
+        self.random = self._random()
+        saved, done = self._start()
+        saved = self._train(saved, done)
+        summary = self._hand_over(saved)
+        self.log.close()
+        return summary
+
+    def _random(self) -> ReplayState:
+        """The random-action data: collected once, then read from disk."""
+        collect = lambda: self.program.collect(self.pools, common.seed_keys(self.seeds, _RANDOM))  # noqa: E731
+        folder = self.folder / "random"
+        if checkpoint.latest(folder) is not None:
+            return checkpoint.restore(folder, jax.eval_shape(collect), expect=self.expect)[0]
+        with self.clock("random"):
+            random = jax.block_until_ready(collect())
+        checkpoint.save(folder, 0, random, meta=self.expect)
+        return random
+
+    def _start(self) -> tuple[Saved, int]:
+        """The state to continue from and the chunks behind it: a checkpoint's, or a fresh one."""
+        begin = lambda: self.program.begin(self.pools, self.random, common.seed_keys(self.seeds, _START))  # noqa: E731
+        if checkpoint.latest(self.folder) is None:
+            self.log.truncate({})
+            return begin(), 0
+        saved, meta = checkpoint.restore(self.folder, jax.eval_shape(begin), expect=self.expect)
+        self.log.truncate(meta["position"])
+        self.clock.seconds = meta["seconds"]
+        return saved, meta["chunks"]
+
+    def _train(self, saved: Saved, done: int) -> Saved:
+        """Chunk after chunk, with evaluations and checkpoints between them."""
+        if done == 0:
+            saved, _ = self._examine(saved, 0)
+        if done == self.chunks:
+            return saved
+        with self.clock("compile"):
+            chunk = self.program.chunk.lower(self.pools, self.random, saved.run).compile()
+        title, total = f"pretrain {self.env.name}", self.chunks * self.chunk_env_steps
+        with RunProgress(title, total=total, unit="env steps", done=done * self.chunk_env_steps) as progress:
+            while done < self.chunks:
+                with self.clock("train"):
+                    run, metrics = chunk(self.pools, self.random, saved.run)
+                    metrics = {name: np.asarray(x) for name, x in metrics.items()}
+                saved, done = saved._replace(run=run), done + 1
+                self.log.metrics(done * self.chunk_env_steps, metrics)
+                shown = {name: float(metrics[name].mean()) for name in ("train/success", "train/reward")}
+                if done % self.config.eval_every == 0 or done == self.chunks:
+                    saved, scores = self._examine(saved, done)
+                    shown |= {"success": float(scores["success"].mean()), "return": float(scores["return"].mean())}
+                if done % self.config.checkpoint_every == 0 or done == self.chunks:
+                    self._checkpoint(saved, done)
+                progress.advance(self.chunk_env_steps, shown)
+        return saved
+
+    def _examine(self, saved: Saved, done: int) -> tuple[Saved, Metrics]:
+        with self.clock("evaluate"):
+            best, scores = self.program.examine(saved)
+            scores = {name: np.asarray(x) for name, x in scores.items()}
+        self.log.eval(done * self.chunk_env_steps, scores)
+        return saved._replace(best=best), scores
+
+    def _checkpoint(self, saved: Saved, done: int) -> None:
+        meta = {**self.expect, "chunks": done, "position": self.log.position(), "seconds": self.clock.seconds}
+        with self.clock("checkpoint"):
+            checkpoint.save(self.folder, done, saved, meta=meta)
+
+    # ------------------------------------------------------------ what stays
+
+    def _hand_over(self, saved: Saved) -> dict[str, Any]:
+        """Priors with their cards, report, figures, summary, closing words."""
+        with self.clock("report"):
+            keys = common.seed_keys(self.seeds, _REPORT)
+            report = jax.tree.map(np.asarray, self.program.report(self.pools, saved.best.prior, keys))
+        results = []
+        for i, seed in enumerate(self.seeds):
+            one, best = common.member(report, i), common.member(saved.best, i)
+            found = {"seed": seed, **summarise(one), **self._chosen(best)}
+            self._save_report(seed, one, i)
+            checkpoint.save_prior(self.folder / "prior" / f"seed-{seed}", best.prior, self._card(found))
+            results.append(found)
+        summary = {
+            "task": self.env.name,
+            "preset": self.args.preset,
+            "gap": None if self.gap is None else self.gap._asdict(),
+            "env_steps": self.chunks * self.chunk_env_steps,
+            "updates": self.chunks * self.config.chunk_steps * self.config.updates_per_step,
+            "seeds": results,
+            **self.clock.record(),
+        }
+        write_summary(self.folder, summary)
+        self._say(results)
+        return summary
+
+    def _chosen(self, best: Best) -> dict[str, float]:
+        """Which evaluation the prior is from, and what that evaluation said."""
+        steps = int(best.steps) * self.config.n_envs
+        return {"best/env_steps": steps, "best/success": float(best.success), "best/return": float(best.total)}
+
+    def _card(self, found: dict[str, Any]) -> dict[str, Any]:
+        """What a prior says of itself: the keys are described in docs/formats.md."""
+        env, config = self.env, self.config
+        return {
+            "task": env.name,
+            "obs_dim": env.obs_dim,
+            "act_dim": env.act_dim,
+            "network": config_to_json(config.network),
+            "ensemble_size": config.ensemble_size,
+            "gamma": config.gamma,
+            "observation": [e._asdict() for e in env.observation],
+            "action": [e._asdict() for e in env.action],
+            "control_dt": env.control_dt,
+            "episode_length": env.episode_length,
+            "domain": [p._asdict() for p in env.parameters],
+            "gap": None if self.gap is None else self.gap._asdict(),
+            "preset": self.args.preset,
+            "config": config_to_json(config),
+            "chosen": "the best evaluation on held-out worlds: success, then return",
+            "metrics": found,
+            "provenance": runs.provenance(),
+        }
+
+    def _save_report(self, seed: int, report: Report, i: int) -> None:
+        """The arrays behind the figure, and the figure."""
+        curve = read_jsonl(self.folder / "eval.jsonl")
+        folder = self.folder / "report"
+        folder.mkdir(exist_ok=True)
+        np.savez(folder / f"seed-{seed}.npz", allow_pickle=False, **report._asdict())
+        plot.pretraining(
+            self.folder / "figures" / f"seed-{seed}.png",
+            title=f"pretraining {self.env.name}, preset {self.args.preset}, seed {seed}",
+            steps=[line["step"] for line in curve],
+            success=[line["success"][i] for line in curve],
+            returns=[line["return"][i] for line in curve],
+            value=report.values[report.counts][:: max(1, report.counts.sum() // 2000)],
+            monte_carlo=report.returns[report.counts][:: max(1, report.counts.sum() // 2000)],
+            dynamics_error=report.model_error,
+            baseline_error=report.still_error,
+        )
+
+    def _say(self, results: list[dict[str, Any]]) -> None:
+        for found in results:
+            low, high = found["success/interval"]
+            print(
+                f"seed {found['seed']}: success {found['success']:.3f} [{low:.3f}, {high:.3f}] in {REPORT_EPISODES} "
+                f"fresh episodes; V_sim explains {found['value/explained_variance']:.2f} of the variance of returns, "
+                f"rank correlation {found['value/rank_correlation']:.2f}"
+            )
+        print(f"results: {self.folder}  (prior/, summary.json, figures/)")
+        print(f"next: python -m experiments.finetune --task {self.env.name} --prior {self.folder}")
+
+
+def summarise(report: Report) -> dict[str, Any]:
+    """The numbers of one report (NumPy): what stands in summary.json and on the card."""
+    interval = stats.success_interval(int(report.success.sum()), len(report.success))
+    quality = value.report(jnp.asarray(report.values[report.counts]), jnp.asarray(report.returns[report.counts]))
+    return {
+        "success": float(report.success.mean()),
+        "success/interval": [float(interval.low), float(interval.high)],
+        "return": float(report.total.mean()),
+        "exploded": float(report.exploded.mean()),
+        **{name: float(x) for name, x in quality.items()},
+        "dynamics/error": report.model_error.tolist(),
+        "dynamics/error_if_nothing_moved": report.still_error.tolist(),
+    }
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,100 @@
+"""What a prior is worth: V_sim against returns, the model against trajectories, success in simulation. Pure."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from envs.base import Env, World
+from envs.rollout import Episode
+from experiments.evaluation import play_episodes, prior_policy
+from sgft_jax import dynamics, value
+from sgft_jax.networks import NetworkConfig, make_dynamics, make_value
+from sgft_jax.types import Array, Key, Prior
+
+HORIZON = 10  # steps ahead that the model is judged at: twice the longest branches worth imagining
+
+
+class Report(NamedTuple):
+    """Measurements of one prior.
+
+    success, total, exploded: [episodes] of the mean action in the exam worlds.
+    values, returns: [episodes * episode_length] V_sim of the states that the exploring policy visits in the training
+    worlds, and the discounted returns that followed; counts: the same shape, bool, False in exploded episodes.
+    model_error, still_error: [horizon] RMS error, in standard deviations of the observation, of the model's open-loop
+    prediction 1, 2, ... steps ahead, and of predicting that nothing changes.
+    """
+
+    success: Array
+    total: Array
+    exploded: Array
+    values: Array
+    returns: Array
+    counts: Array
+    model_error: Array
+    still_error: Array
+
+
+def make_report(
+    env: Env,
+    network: NetworkConfig,
+    prior: Prior,
+    training: World,
+    exam: World,
+    key: Key,
+    *,
+    gamma: float,
+    episodes: int,
+    trajectories: int,
+) -> Report:
+    """Measures one prior on fresh episodes. training: the worlds it learned in; exam: worlds for `success`.
+
+    Trajectories run ceil(3 / (1 - gamma)) steps past the time limit, where 5 % of the discounted weight is left, and
+    V_sim of the last state stands for the rest.
+    """
+    key_exam, key_explore = jax.random.split(key)
+    mean = prior_policy(env, prior, network, explore=False)
+    graded = play_episodes(env, exam, mean, key_exam, episodes, gamma=gamma)
+    length = env.episode_length + math.ceil(3 / (1 - gamma))
+    explore = prior_policy(env, prior, network, explore=True)
+    played = play_episodes(env, training, explore, key_explore, trajectories, gamma=gamma, length=length)
+    values, returns = jax.vmap(lambda e: _values(env, network, prior, e))(played)
+    counts = jnp.broadcast_to(~played.exploded[:, None], values.shape)
+    model, still = jax.vmap(lambda e: _model_errors(env, network, prior, e))(played)
+    ended = ~played.exploded[:, None]
+    average = lambda x: jnp.where(ended, x, 0.0).sum(0) / jnp.maximum(ended.sum(), 1)  # noqa: E731
+    return Report(
+        success=graded.success,
+        total=graded.total_reward,
+        exploded=graded.exploded,
+        values=values.reshape(-1),
+        returns=returns.reshape(-1),
+        counts=counts.reshape(-1),
+        model_error=average(model),
+        still_error=average(still),
+    )
+
+
+def _values(env: Env, network: NetworkConfig, prior: Prior, episode: Episode) -> tuple[Array, Array]:
+    """V_sim and Monte-Carlo returns [episode_length] of one episode."""
+    rows, net = episode.transitions, make_value(env.obs_dim, network)
+    predict = lambda obs: value.predict(net, prior.value, prior.normalizer, obs)  # noqa: E731
+    returns = value.discounted_returns(rows.reward, rows.discount, predict(rows.next_obs[-1]))
+    return jax.vmap(predict)(rows.obs[: env.episode_length]), returns[: env.episode_length]
+
+
+def _model_errors(env: Env, network: NetworkConfig, prior: Prior, episode: Episode) -> tuple[Array, Array]:
+    """Errors [horizon] of the model and of standing still, averaged over the windows that fit into one episode."""
+    horizon = min(HORIZON, env.episode_length)
+    starts = jnp.arange(0, env.episode_length - horizon + 1, horizon)
+    net = make_dynamics(env.obs_dim, env.act_dim, network)
+
+    def window(start: Array) -> tuple[Array, Array]:
+        cut = lambda x: jax.lax.dynamic_slice_in_dim(x, start, horizon)  # noqa: E731
+        rows = episode.transitions
+        obs = jnp.concatenate([rows.obs[start][None], cut(rows.next_obs)])
+        still = jax.vmap(lambda o: jnp.sqrt(jnp.mean(((obs[0] - o) / prior.normalizer.std) ** 2)))(obs[1:])
+        return dynamics.rollout_error(net, prior.dynamics, prior.normalizer, obs, cut(rows.action)), still
+
+    return jax.tree.map(lambda x: x.mean(0), jax.vmap(window)(starts))

@@ -1,0 +1,96 @@
+"""A point mass on a plane that is pushed to the origin: an Env without a physics engine, learned in seconds."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.base import Entry, Env, EnvState, Parameter, World
+from envs.franka.task import distort, make_effects, measure
+from sgft_jax.types import Array, Key, UserError
+
+DT, FORCE, TOLERANCE = 0.1, 4.0, 0.15  # s, N at full action, m
+PARAMETERS = (Parameter("mass", "kg", 1.0, 0.8, 1.2), Parameter("friction", "1/s", 4.0, 3.5, 4.5))
+TRAINING = {"obs_noise": 0.005, "obs_noise_prob": 0.3}
+
+
+class Point(NamedTuple):
+    """qpos: [2] m. qvel: [2] m/s. ctrl: [2] the last command, in force until the latency has passed."""
+
+    qpos: Array
+    qvel: Array
+    ctrl: Array
+
+
+def make() -> Env:
+    """The toy task, 20 steps of 0.1 s."""
+    return Env(
+        name="toy",
+        observation=(Entry("xy", "m", 2), Entry("velocity", "m/s", 2)),
+        action=(Entry("force", "4 N", 2),),
+        parameters=PARAMETERS,
+        episode_length=20,
+        control_dt=DT,
+        success_anytime=False,
+        sample_worlds=sample_worlds,
+        reset=reset,
+        step=step,
+        reward=reward,
+        terminated=lambda obs, action, next_obs: jnp.zeros((), bool),
+        success=success,
+    )
+
+
+def sample_worlds(key: Key, n: int, *, params: Mapping | None = None, effects: Mapping | None = None) -> World:
+    ranges = {p.name: (p.low, p.high) for p in PARAMETERS}
+    for name, value in (params or {}).items():
+        if name not in ranges:
+            raise UserError(f"toy has no domain parameter '{name}'")
+        ranges[name] = tuple(np.broadcast_to(np.asarray(value, float), (2,)))
+    low, high = np.array(list(ranges.values()), np.float32).T
+    theta = jax.random.uniform(key, (n, 2), minval=jnp.asarray(low)[None], maxval=jnp.asarray(high)[None])
+    given = make_effects({**TRAINING, **(effects or {})}, 4, 2)
+    return World(theta, {}, jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *x.shape)), given))
+
+
+def reset(world: World, key: Key) -> EnvState:
+    key_start, key_noise = jax.random.split(key)
+    start = jax.random.uniform(key_start, (2,), minval=-0.8, maxval=0.8)
+    no, rest = jnp.zeros((), bool), jnp.zeros(2)
+    obs = jnp.concatenate([start, rest])
+    measured = measure(world.effects, obs, key_noise)
+    return EnvState(Point(start, rest, rest), measured, obs, jnp.float32(0), no, no, no, no, jnp.int32(0))
+
+
+def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
+    mass, friction = world.params
+    command = distort(world.effects, action)
+    late = jnp.clip(world.effects.latency / DT, 0.0, 1.0)
+    force = FORCE * (late * state.physics.ctrl + (1 - late) * command)
+    velocity = state.physics.qvel + DT * (force / mass - friction * state.physics.qvel)
+    position = state.physics.qpos + DT * velocity
+    obs = jnp.concatenate([position, velocity])
+    no, time = jnp.zeros((), bool), state.time + 1
+    return EnvState(
+        physics=Point(position, velocity, command),
+        obs=measure(world.effects, obs, key),
+        true_obs=obs,
+        reward=reward(state.true_obs, action, obs),
+        terminated=no,
+        truncated=time >= 20,
+        success=success(obs),
+        invalid=~jnp.isfinite(obs).all(),
+        time=time,
+    )
+
+
+def reward(obs: Array, action: Array, next_obs: Array) -> Array:
+    """Minus the distance from the origin, plus a bonus of 1 within the tolerance."""
+    distance = jnp.linalg.norm(next_obs[:2])
+    return -distance + (distance <= TOLERANCE)
+
+
+def success(obs: Array) -> Array:
+    return jnp.linalg.norm(obs[:2]) <= TOLERANCE
