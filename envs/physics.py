@@ -110,11 +110,27 @@ def advance(
     def substep(state: PhysicsState, i: Array) -> tuple[PhysicsState, None]:
         ctrl = control(i)
         data = simulator.blank.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl)
-        data = mjx.step(model, data)
+        data = mjx.step(_hold_saturated(model, data), data)
         return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, ctrl), None
 
     with jax.default_matmul_precision("highest"):
         return jax.lax.scan(substep, state, jnp.arange(substeps))[0]
+
+
+def _hold_saturated(model: mjx.Model, data: mjx.Data) -> mjx.Model:
+    """The model for one step, in which servos at their force limit are constant forces.
+
+    The implicit integrator counts a servo's damping in the inertia. C MuJoCo leaves out servos at their limit, MJX does
+    not: a saturated wrist of the hammering arm, 0.1 kg m^2, then moved as if it had 0.7. For servos on joints, gear 1.
+    """
+    joint = model.actuator_trnid[:, 0]
+    position, velocity = data.qpos[model.jnt_qposadr[joint]], data.qvel[model.jnt_dofadr[joint]]
+    gain, bias = model.actuator_gainprm, model.actuator_biasprm
+    force = gain[:, 0] * data.ctrl + bias[:, 0] + bias[:, 1] * position + bias[:, 2] * velocity
+    low, high = model.actuator_forcerange.T
+    held = (model.actuator_forcelimited & ((force <= low) | (force >= high)))[:, None]
+    constant = jnp.zeros_like(bias).at[:, 0].set(jnp.clip(force, low, high))
+    return model.replace(actuator_gainprm=jnp.where(held, 0.0, gain), actuator_biasprm=jnp.where(held, constant, bias))
 
 
 def exploded(state: PhysicsState, *, max_speed: float) -> Array:
