@@ -2,7 +2,7 @@
 
 import contextlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +56,17 @@ def stack(trees: Sequence[PyTree]) -> PyTree:
 def member(tree: PyTree, i: int) -> PyTree:
     """The i-th of stacked pytrees."""
     return jax.tree.map(lambda x: x[i], tree)
+
+
+def over_seeds(function: Callable[..., PyTree], seeds: int) -> Callable[..., PyTree]:
+    """`function` of one seed for arguments and results with a leading seeds axis.
+
+    A single seed is not vmapped, because vmap would make a `cond` (resets, only where an episode ended) compute both of
+    its branches at every step.
+    """
+    if seeds > 1:
+        return jax.vmap(function)
+    return lambda *args: jax.tree.map(lambda x: x[None], function(*member(args, 0)))
 
 
 def load_gap(env: Env, real: str | None, overrides: Sequence[str]) -> Gap | None:

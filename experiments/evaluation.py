@@ -48,7 +48,10 @@ def prior_policy(env: Env, prior: Prior, network: NetworkConfig, *, explore: boo
 
 
 class Best(NamedTuple):
-    """The best policy seen so far with all that belongs to it. success, total: [] of its evaluation; steps: [] int32."""
+    """The best policy so far with all that belongs to it.
+
+    success, total: [] of its evaluation. steps: [] int32, when that was.
+    """
 
     prior: Prior
     success: Array

@@ -122,8 +122,8 @@ def run_folder(args: PretrainArgs, gap: Gap | None) -> Path:
     return args.out / "pretrain" / args.task / where / common.seeds_name(common.seed_list(args.seed, args.seeds))
 
 
-def make_program(env: Env, config: PretrainConfig, gap: Gap | None) -> Program:
-    """The functions of a run; samples the held-out worlds."""
+def make_program(env: Env, config: PretrainConfig, gap: Gap | None, *, seeds: int) -> Program:
+    """The functions of a run of that many seeds; samples the held-out worlds."""
     trainer = make_pretrainer(env, config)
     exam_key, report_key = jax.random.key(_EXAM_SEED), jax.random.key(_REPORT_SEED)
     exam = common.exam_worlds(env, gap, exam_key, config.eval_episodes)
@@ -146,11 +146,11 @@ def make_program(env: Env, config: PretrainConfig, gap: Gap | None) -> Program:
         return make_report(env, config.network, prior, pool, final, key, gamma=config.gamma, **sizes)
 
     return Program(
-        collect=jax.jit(jax.vmap(trainer.collect_random)),
-        begin=jax.jit(jax.vmap(begin)),
-        chunk=jax.jit(jax.vmap(trainer.chunk), donate_argnums=2),
-        examine=jax.jit(jax.vmap(examine)),
-        report=jax.jit(jax.vmap(report)),
+        collect=jax.jit(common.over_seeds(trainer.collect_random, seeds)),
+        begin=jax.jit(common.over_seeds(begin, seeds)),
+        chunk=jax.jit(common.over_seeds(trainer.chunk, seeds), donate_argnums=2),
+        examine=jax.jit(common.over_seeds(examine, seeds)),
+        report=jax.jit(common.over_seeds(report, seeds)),
     )
 
 
@@ -171,7 +171,7 @@ class _Run:
             keys = common.seed_keys(self.seeds, _WORLDS)
             pools = [common.training_worlds(self.env, self.gap, key, self.config.worlds) for key in keys]
             self.pools = common.stack(pools)
-            self.program = make_program(self.env, self.config, self.gap)
+            self.program = make_program(self.env, self.config, self.gap, seeds=len(self.seeds))
         self.random = self._random()
         saved, done = self._start()
         saved = self._train(saved, done)
