@@ -26,9 +26,10 @@ class Gap(NamedTuple):
 
 
 def presets(task: str) -> dict[str, Gap]:
-    """The gaps that come with a task, by name."""
-    text = (resources.files("envs") / "gaps" / f"{task}.toml").read_text()
-    return {name: _parse(name, table, where=f"{task}.toml [{name}]") for name, table in tomllib.loads(text).items()}
+    """The gaps that come with a task, by name; none if it has no file of them."""
+    file = resources.files("envs") / "gaps" / f"{task}.toml"
+    tables = tomllib.loads(file.read_text()) if file.is_file() else {}
+    return {name: _parse(name, table, where=f"{task}.toml [{name}]") for name, table in tables.items()}
 
 
 def load(env: Env, source: str, overrides: Sequence[str] = ()) -> Gap:
@@ -41,7 +42,9 @@ def load(env: Env, source: str, overrides: Sequence[str] = ()) -> Gap:
     else:
         known = presets(env.name)
         if source not in known:
-            raise UserError(f"{env.name} has no gap '{source}'; it has: {', '.join(known)}, or give a .toml or .json file")
+            raise UserError(
+                f"{env.name} has no gap '{source}'; it has: {', '.join(known) or 'none'}; or give a .toml or .json file"
+            )
         gap = known[source]
     for text in overrides:
         gap = _override(env, gap, text)

@@ -89,18 +89,34 @@ def exam_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:
 
 
 def find_priors(prior: Path | None, *, out: Path, env: Env, preset: str) -> tuple[list[Prior], dict[str, Any]]:
-    """The priors in a folder (one prior, or `prior/seed-*` of a run), and the card of the first.
+    """The priors of `prior_folders`, loaded, and the card of the first.
 
-    prior: None looks for all seeds of `<out>/pretrain/<task>/<preset>`. Raises UserError if there is none, or if they
-    are of another task or differ in their networks.
+    Raises UserError if one is of another task or differs from the first in its networks.
     """
-    home = out / "pretrain" / env.name / preset
-    folders = sorted(home.glob("*/prior/seed-*"), key=_seed_number) if prior is None else _prior_folders(prior)
-    if not folders:
-        raise UserError(
-            f"{prior or home}: holds no prior; make one with: "
-            f"python -m experiments.pretrain --task {env.name} --preset {preset}"
-        )
+    return load_priors(prior_folders(prior, out=out, task=env.name, preset=preset), env)
+
+
+def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str) -> list[Path]:
+    """Where priors are: `prior` itself if it is one, else the `seed-*` folders in it, in its `prior/` or its `policy/`.
+
+    prior: None looks for all seeds of `<out>/pretrain/<task>/<preset>`. `policy/` is what fine-tuning leaves, in the
+    same form. Raises UserError if there is none.
+    """
+    home = out / "pretrain" / task / preset
+    if prior is None:
+        cards = list(home.glob("*/prior/seed-*/prior.json"))
+    elif (prior / "prior.json").exists():
+        cards = [prior / "prior.json"]
+    else:
+        cards = [card for sub in (".", "prior", "policy") for card in (prior / sub).glob("seed-*/prior.json")]
+    if not cards:
+        command = f"python -m experiments.pretrain --task {task} --preset {preset}"
+        raise UserError(f"{prior or home}: holds no prior; make one with: {command}")
+    return sorted((card.parent for card in cards), key=_seed_number)
+
+
+def load_priors(folders: Sequence[Path], env: Env) -> tuple[list[Prior], dict[str, Any]]:
+    """The priors in these folders and the card of the first; raises UserError where they do not fit together."""
     sizes = {"task": env.name, "obs_dim": env.obs_dim, "act_dim": env.act_dim}
     priors, cards = zip(*(checkpoint.load_prior(folder, **sizes) for folder in folders), strict=True)
     for folder, card in zip(folders, cards, strict=True):
@@ -114,18 +130,9 @@ def network_of(card: dict[str, Any]) -> NetworkConfig:
     return config_from_json(NetworkConfig, card["network"], where="network.")
 
 
-def _prior_folders(folder: Path) -> list[Path]:
-    """The folder itself if it is a prior, else the `seed-*` folders in it or in its `prior/` or `policy/`."""
-    if (folder / "prior.json").exists():
-        return [folder]
-    found = [
-        p for sub in (".", "prior", "policy") for p in (folder / sub).glob("seed-*") if (p / "prior.json").exists()
-    ]
-    return sorted(found, key=_seed_number)
-
-
-def _seed_number(folder: Path) -> int:
-    return int(folder.name.removeprefix("seed-"))
+def _seed_number(folder: Path) -> tuple[int, str]:
+    number = folder.name.removeprefix("seed-")
+    return (int(number) if number.isdigit() else 0, str(folder))
 
 
 class Clock:

@@ -1,0 +1,102 @@
+"""Evaluate a prior, or what fine-tuning has saved, in simulation or on a "real" system."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import envs
+from experiments import cli, common
+from experiments.evaluation import play_episodes, prior_policy
+from sgft_jax import stats
+from sgft_jax.jsonfile import read_json
+from sgft_jax.types import Prior, UserError
+
+_SEED = 2**31 + 2  # held out from training and from the choice of the prior
+
+
+@dataclass(frozen=True)
+class EvaluateArgs:
+    """One evaluation of the mean action, every policy in the same episodes."""
+
+    prior: Path | None = None
+    """Folder of a prior, or of several (prior/seed-*); default: those of <out>/pretrain/<task>/<preset>."""
+    run: Path | None = None
+    """Folder of a fine-tuning run instead: its final policies."""
+    task: str | None = None
+    """push, hammer or insert; default: the task of the prior."""
+    preset: str = "fast"
+    """Pretraining preset whose priors to take where neither --prior nor --run is given."""
+    real: str = common.SIM
+    """Where: sim (the training domain without sensor noise), the name of a gap, or a .toml/.json file."""
+    set: tuple[str, ...] = ()
+    """Changes to the real system, e.g. --set latency=0.05 action_scale=[1,0.5]."""
+    episodes: int = 200
+    """Episodes per policy."""
+    seed: int = 0
+    """Another seed draws other worlds and episodes."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+    out: Path = Path("runs")
+    """Parent of all run folders."""
+
+
+def main(args: EvaluateArgs) -> None:
+    """Evaluates and prints."""
+    found = evaluate(args)
+    if args.json:
+        print(json.dumps(found))
+        return
+    for one in found["policies"]:
+        low, high = one["success/interval"]
+        print(
+            f"{one['policy']}: success {one['success']:.3f} [{low:.3f}, {high:.3f}], return {one['return']:.3f}, "
+            f"exploded {one['exploded']:.3f}  ({found['episodes']} episodes of {found['task']}, {found['where']})"
+        )
+
+
+def evaluate(args: EvaluateArgs) -> dict[str, Any]:
+    """Success with its 95 % Wilson interval, mean return and share of exploded episodes of every policy."""
+    if args.prior is not None and args.run is not None:
+        raise UserError("--prior and --run exclude each other: name what to evaluate once")
+    if args.episodes < 1:
+        raise UserError(f"--episodes is {args.episodes}: must be at least 1")
+    if args.prior is None and args.run is None and args.task is None:
+        raise UserError("nothing to evaluate: name a folder with --prior or --run, or a task with --task")
+    if args.task is not None:
+        cli.choose("--task", args.task, envs.TASKS)
+    folders = common.prior_folders(args.run or args.prior, out=args.out, task=args.task or "push", preset=args.preset)
+    env = envs.make(args.task or read_json(folders[0] / "prior.json")["task"])
+    gap = common.load_gap(env, args.real, args.set)
+    priors, card = common.load_priors(folders, env)
+    network, gamma = common.network_of(card), card["gamma"]
+    key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_SEED), args.seed))
+    worlds = common.exam_worlds(env, gap, key_worlds, args.episodes)
+
+    def play(prior: Prior) -> tuple[jax.Array, jax.Array, jax.Array]:
+        act = prior_policy(env, prior, network, explore=False)
+        episodes = play_episodes(env, worlds, act, key_episodes, args.episodes, gamma=gamma)
+        return episodes.success, episodes.total_reward, episodes.exploded
+
+    played = jax.jit(jax.vmap(play))(common.stack(priors))
+    rows = zip(*(np.asarray(x) for x in played), strict=True)
+    policies = [{"policy": str(f), **_describe(*row)} for f, row in zip(folders, rows, strict=True)]
+    where = "in simulation" if gap is None else f"on the {gap.name} real system"
+    return {"task": env.name, "where": where, "episodes": args.episodes, "policies": policies}
+
+
+def _describe(success: np.ndarray, total: np.ndarray, exploded: np.ndarray) -> dict[str, Any]:
+    interval = stats.success_interval(int(success.sum()), len(success))
+    return {
+        "success": float(success.mean()),
+        "success/interval": [float(interval.low), float(interval.high)],
+        "return": float(total.mean()),
+        "exploded": float(exploded.mean()),
+    }
+
+
+if __name__ == "__main__":
+    cli.run_main(main, EvaluateArgs, __doc__ or "")
