@@ -33,7 +33,7 @@ def presets(task: str) -> dict[str, Gap]:
 
 
 def load(env: Env, source: str, overrides: Sequence[str] = ()) -> Gap:
-    """A gap from a preset name or a .toml/.json file, changed by overrides like "latency=0.05" or "action_scale=[1,0.5]".
+    """A gap from a preset name or a .toml/.json file, changed by overrides such as "latency=0.05".
 
     A file holds two tables, `params` and `effects`, either may be missing. Raises UserError naming file and key.
     """
