@@ -1,0 +1,41 @@
+"""What the tests of environments share."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+
+from envs.base import Env, World
+from envs.franka import hammer, insert, push
+
+SCENES = {"push": push.SCENE, "hammer": hammer.SCENE, "insert": insert.SCENE}
+EXACT = {"obs_noise": 0.0}  # effects that leave commands and measurements alone
+
+
+class Bench(NamedTuple):
+    """An environment, some worlds [n] of it, and its functions, compiled at their first call."""
+
+    env: Env
+    worlds: World
+    reset: Callable
+    step: Callable
+    step_batch: Callable
+
+
+def bench(env: Env, worlds: World) -> Bench:
+    return Bench(env, worlds, jax.jit(env.reset), jax.jit(_lenient(env.step)), jax.jit(jax.vmap(_lenient(env.step))))
+
+
+def _lenient(function: Callable) -> Callable:
+    """MJX broadcasts matrices against vectors."""
+
+    def call(*args):
+        with jax.numpy_rank_promotion("allow"):
+            return function(*args)
+
+    return call
+
+
+def member(tree, i: int):
+    """The i-th of a stacked pytree."""
+    return jax.tree.map(lambda x: x[i], tree)

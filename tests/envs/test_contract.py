@@ -1,0 +1,72 @@
+"""What every environment promises to learners and rollouts."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from franka_bench import SCENES, member
+
+from envs.franka import task
+from envs.franka.task import make_env
+
+KEYS = jax.random.split(jax.random.key(3), 4)
+ACTIONS = jnp.array([[1.0, 0.0], [0.3, -1.0], [-0.5, 0.5], [1.0, 1.0]])
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_description_fits_observations(name):
+    env = make_env(SCENES[name])
+    world = member(env.sample_worlds(jax.random.key(0), 1), 0)
+    state = env.reset(world, jax.random.key(1))
+    assert state.obs.shape == (env.obs_dim,) == (sum(e.size for e in env.observation),)
+    assert env.act_dim == {"push": 2, "hammer": 3, "insert": 3}[name]
+    assert np.isfinite(state.obs).all() and not state.success
+    assert env.reward(state.obs, jnp.zeros(env.act_dim), state.obs).shape == ()
+
+
+def test_resets_are_fresh_and_repeatable(pushing):
+    world = member(pushing.worlds, 0)
+    first, again, other = (pushing.reset(world, jax.random.key(k)).obs for k in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert abs(first[1] - other[1]) > 1e-3  # another start
+
+
+def test_step_of_a_batch_is_the_steps_of_its_members(pushing, started):
+    batch = pushing.step_batch(pushing.worlds, started, ACTIONS, KEYS)
+    for i in range(4):
+        alone = pushing.step(member(pushing.worlds, i), member(started, i), ACTIONS[i], KEYS[i])
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=2e-4, rtol=1e-3), member(batch, i), alone)
+    moved = batch.true_obs[:, :2] - started.true_obs[:, :2]
+    np.testing.assert_allclose(moved[0], [0.05, 0.0], atol=0.003)  # one full step, 5 cm; the rest obey as well
+    assert (jnp.sign(moved[1:]) == jnp.sign(ACTIONS[1:])).all()
+
+
+def test_reward_is_a_function_of_true_observations(pushing, started):
+    after = pushing.step_batch(pushing.worlds, started, ACTIONS, KEYS)
+    wanted = jax.vmap(pushing.env.reward)(started.true_obs, ACTIONS, after.true_obs)
+    np.testing.assert_allclose(after.reward, wanted, atol=1e-6)
+
+
+def test_time_limit_truncates_and_never_terminates(pushing, started):
+    late = started._replace(time=jnp.array([0, 37, 38, 39], jnp.int32))
+    after = pushing.step_batch(pushing.worlds, late, ACTIONS, KEYS)
+    assert after.truncated.tolist() == [False, False, False, True]  # 40 steps
+    assert not after.terminated.any()
+    assert after.time.tolist() == [1, 38, 39, 40]
+
+
+def test_exploded_physics_is_flagged(pushing, started):
+    velocity = started.physics.qvel.at[1, 0].set(jnp.nan).at[2, 8].set(1e7).at[3, 7].set(jnp.inf)
+    broken = started._replace(physics=started.physics._replace(qvel=velocity))
+    after = pushing.step_batch(pushing.worlds, broken, ACTIONS, KEYS)
+    assert after.invalid.tolist() == [False, True, True, True]
+
+
+def test_success_counts_at_the_end_or_at_any_time():
+    insert, push = SCENES["insert"], SCENES["push"]
+    there, away = jnp.zeros(9), jnp.zeros(9).at[3].set(0.02)
+    yes, no = jnp.array(True), jnp.array(False)
+    assert task._succeeded(insert, no, there) and task._succeeded(insert, yes, away)
+    assert not task._succeeded(insert, no, away)
+    at_edge, short = jnp.array([0.5, 0.0, 0.54, 0.0]), jnp.array([0.5, 0.0, 0.5, 0.0])
+    assert task._succeeded(push, no, at_edge) and not task._succeeded(push, yes, short)
