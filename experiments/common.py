@@ -58,15 +58,15 @@ def member(tree: PyTree, i: int) -> PyTree:
     return jax.tree.map(lambda x: x[i], tree)
 
 
-def over_seeds(function: Callable[..., PyTree], seeds: int) -> Callable[..., PyTree]:
-    """`function` of one seed for arguments and results with a leading seeds axis.
+def over_seeds(function: Callable[..., PyTree], seeds: int, *, shared: int = 0) -> Callable[..., PyTree]:
+    """`function` of one seed for arguments and results with a leading seeds axis; the first `shared` have none.
 
     A single seed is not vmapped, because vmap would make a `cond` (resets, only where an episode ended) compute both of
     its branches at every step.
     """
     if seeds > 1:
-        return jax.vmap(function)
-    return lambda *args: jax.tree.map(lambda x: x[None], function(*member(args, 0)))
+        return lambda *args: jax.vmap(function, [None] * shared + [0] * (len(args) - shared))(*args)
+    return lambda *args: jax.tree.map(lambda x: x[None], function(*args[:shared], *member(args[shared:], 0)))
 
 
 def load_gap(env: Env, real: str | None, overrides: Sequence[str]) -> Gap | None:

@@ -1,5 +1,6 @@
 """Evaluate a prior, or what fine-tuning has saved, in simulation or on a "real" system."""
 
+import functools
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,10 +11,9 @@ import numpy as np
 
 import envs
 from experiments import cli, common
-from experiments.evaluation import play_episodes, prior_policy
-from sgft_jax import stats
+from experiments.evaluation import describe, grade
 from sgft_jax.jsonfile import read_json
-from sgft_jax.types import Prior, UserError
+from sgft_jax.types import UserError
 
 _SEED = 2**31 + 2  # held out from training and from the choice of the prior
 
@@ -76,26 +76,11 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_SEED), args.seed))
     worlds = common.exam_worlds(env, gap, key_worlds, args.episodes)
 
-    def play(prior: Prior) -> tuple[jax.Array, jax.Array, jax.Array]:
-        act = prior_policy(env, prior, network, explore=False)
-        episodes = play_episodes(env, worlds, act, key_episodes, args.episodes, gamma=gamma)
-        return episodes.success, episodes.total_reward, episodes.exploded
-
-    played = jax.jit(jax.vmap(play))(common.stack(priors))
-    rows = zip(*(np.asarray(x) for x in played), strict=True)
-    policies = [{"policy": str(f), **_describe(*row)} for f, row in zip(folders, rows, strict=True)]
+    graded = functools.partial(grade, env, network, worlds, key_episodes, gamma=gamma, episodes=args.episodes)
+    outcome = jax.tree.map(np.asarray, jax.jit(jax.vmap(graded))(common.stack(priors)))
+    policies = [{"policy": str(f), **describe(common.member(outcome, i))} for i, f in enumerate(folders)]
     where = "in simulation" if gap is None else f"on the {gap.name} real system"
     return {"task": env.name, "where": where, "episodes": args.episodes, "policies": policies}
-
-
-def _describe(success: np.ndarray, total: np.ndarray, exploded: np.ndarray) -> dict[str, Any]:
-    interval = stats.success_interval(int(success.sum()), len(success))
-    return {
-        "success": float(success.mean()),
-        "success/interval": [float(interval.low), float(interval.high)],
-        "return": float(total.mean()),
-        "exploded": float(exploded.mean()),
-    }
 
 
 if __name__ == "__main__":

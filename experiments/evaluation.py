@@ -1,13 +1,14 @@
 """Success and return of a policy on a pool of worlds: one batch of whole episodes. Pure."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from envs.base import Env, World
 from envs.rollout import Episode, play_episode
+from sgft_jax import stats
 from sgft_jax.networks import NetworkConfig, make_actor, tanh_gaussian_mode, tanh_gaussian_sample
 from sgft_jax.normalizer import normalize
 from sgft_jax.types import Array, Key, Metrics, Prior
@@ -27,7 +28,15 @@ def play_episodes(
     return jax.vmap(one)(jax.random.split(key, n))
 
 
-def score(episodes: Episode) -> Metrics:
+class Outcome(NamedTuple):
+    """How episodes ended: the fields of `Episode` of these names, [n]."""
+
+    success: Array
+    total_reward: Array
+    exploded: Array
+
+
+def score(episodes: Episode | Outcome) -> Metrics:
     """Mean success, return and share of exploded episodes."""
     return {
         "success": episodes.success.mean(),
@@ -45,6 +54,27 @@ def prior_policy(env: Env, prior: Prior, network: NetworkConfig, *, explore: boo
         return tanh_gaussian_sample(moments, key)[0] if explore else tanh_gaussian_mode(moments)
 
     return act
+
+
+def grade(
+    env: Env, network: NetworkConfig, pool: World, key: Key, prior: Prior, *, gamma: float, episodes: int
+) -> Outcome:
+    """That many episodes of the mean action."""
+    act = prior_policy(env, prior, network, explore=False)
+    played = play_episodes(env, pool, act, key, episodes, gamma=gamma)
+    return Outcome(played.success, played.total_reward, played.exploded)
+
+
+def describe(outcome: Outcome) -> dict[str, Any]:
+    """The numbers of one policy's episodes (NumPy arrays) as JSON data, success with its 95 % Wilson interval."""
+    interval = stats.success_interval(int(outcome.success.sum()), len(outcome.success))
+    return {
+        "episodes": len(outcome.success),
+        "success": float(interval.estimate),
+        "success/interval": [float(interval.low), float(interval.high)],
+        "return": float(outcome.total_reward.mean()),
+        "exploded": float(outcome.exploded.mean()),
+    }
 
 
 class Best(NamedTuple):

@@ -4,6 +4,7 @@ The prior of a seed is the agent at its best evaluation (success, then return) o
 card and in summary.json come from fresh episodes in other held-out worlds, so the choice does not flatter them.
 """
 
+import functools
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -19,21 +20,21 @@ import envs
 from envs.base import Env, World
 from envs.gaps import Gap
 from experiments import cli, common
-from experiments.evaluation import Best, keep_better, play_episodes, prior_policy, score
+from experiments.evaluation import Best, Outcome, describe, grade, keep_better, score
 from experiments.presets import PRESETS, PretrainConfig
 from experiments.pretraining import PretrainState, make_pretrainer, replay_bytes
 from experiments.report import Report, make_report
-from sgft_jax import checkpoint, plot, runs, stats, value
+from sgft_jax import checkpoint, plot, runs, value
 from sgft_jax.config import config_to_json
 from sgft_jax.log import MetricsLog, RunProgress, read_jsonl, write_summary
 from sgft_jax.replay import ReplayState
 from sgft_jax.sac import extract_prior
-from sgft_jax.types import Metrics, PyTree
+from sgft_jax.types import Key, Metrics, Prior
 
 DEFAULT_PRESET = "fast"
 _WORLDS, _RANDOM, _START, _REPORT = range(4)  # purposes, folded into a seed's key
 _EXAM_SEED, _REPORT_SEED = 2**31, 2**31 + 1  # held-out worlds and episodes, the same for every run
-REPORT_EPISODES = 256  # a success rate then has a 95 % interval of +-6 points at worst
+REPORT_EPISODES = 256  # at least: a success rate then has a 95 % interval of +-6 points at worst
 
 
 @dataclass(frozen=True)
@@ -72,16 +73,18 @@ class Saved(NamedTuple):
 
 
 class Program(NamedTuple):
-    """Jitted functions over a leading seeds axis. `chunk` consumes the state it is given.
+    """Jitted functions over a leading seeds axis; `chunk` consumes the state it is given.
 
-    collect(pools, keys) -> random-action data; begin(pools, random, keys) -> Saved; chunk(pools, random, run) ->
-    (run, metrics); examine(saved) -> (the better of old and current policy, scores); report(pools, priors, keys).
+    collect(pools, keys) -> random-action data. begin(pools, random, keys) -> Saved.
+    chunk(pools, random, run) -> (run, metrics). grade(pool, key, priors) -> Outcome [seeds, eval_episodes].
+    better(old, new) -> Best. report(pools, priors, keys) -> Report.
     """
 
     collect: Callable[..., ReplayState]
     begin: Callable[..., Saved]
     chunk: Any
-    examine: Callable[[Saved], tuple[Best, Metrics]]
+    grade: Callable[..., Outcome]
+    better: Callable[[Best, Best], Best]
     report: Callable[..., Report]
 
 
@@ -111,9 +114,10 @@ def pretrain(args: PretrainArgs) -> dict[str, Any]:
     )
     need = args.seeds * replay_bytes(env, args.config)
     print(f"replay and random-action data: {need / 2**30:.2f} GiB on the device for {args.seeds} seed(s)")
-    summary = _Run(args, env, gap, seeds, run.folder).work()
-    run.close()
-    return summary
+    try:
+        return _Run(args, env, gap, seeds, run.folder).work()
+    finally:
+        run.close()
 
 
 def run_folder(args: PretrainArgs, gap: Gap | None) -> Path:
@@ -122,34 +126,22 @@ def run_folder(args: PretrainArgs, gap: Gap | None) -> Path:
     return args.out / "pretrain" / args.task / where / common.seeds_name(common.seed_list(args.seed, args.seeds))
 
 
-def make_program(env: Env, config: PretrainConfig, gap: Gap | None, *, seeds: int) -> Program:
-    """The functions of a run of that many seeds; samples the held-out worlds."""
-    trainer = make_pretrainer(env, config)
-    exam_key, report_key = jax.random.key(_EXAM_SEED), jax.random.key(_REPORT_SEED)
-    exam = common.exam_worlds(env, gap, exam_key, config.eval_episodes)
-    final = common.exam_worlds(env, gap, report_key, REPORT_EPISODES)
-    episodes_key = jax.random.fold_in(exam_key, 1)
+def make_program(env: Env, config: PretrainConfig, *, seeds: int) -> Program:
+    """The functions of a run of that many seeds."""
+    trainer, network, gamma = make_pretrainer(env, config), config.network, config.gamma
 
-    def begin(pool: World, random: ReplayState, key: jax.Array) -> Saved:
+    def begin(pool: World, random: ReplayState, key: Key) -> Saved:
         run = trainer.init(pool, random, key)
         return Saved(run, Best(extract_prior(run.learner), jnp.float32(-1.0), jnp.float32(-jnp.inf), jnp.int32(0)))
 
-    def examine(saved: Saved) -> tuple[Best, Metrics]:
-        prior = extract_prior(saved.run.learner)
-        act = prior_policy(env, prior, config.network, explore=False)
-        scores = score(play_episodes(env, exam, act, episodes_key, config.eval_episodes, gamma=config.gamma))
-        now = Best(prior, scores["success"], scores["return"], saved.run.steps)
-        return keep_better(saved.best, now), scores
-
-    def report(pool: World, prior: PyTree, key: jax.Array) -> Report:
-        sizes = {"episodes": REPORT_EPISODES, "trajectories": config.eval_episodes}
-        return make_report(env, config.network, prior, pool, final, key, gamma=config.gamma, **sizes)
-
+    graded = functools.partial(grade, env, network, gamma=gamma, episodes=config.eval_episodes)
+    report = functools.partial(make_report, env, network, gamma=gamma, trajectories=config.eval_episodes)
     return Program(
         collect=jax.jit(common.over_seeds(trainer.collect_random, seeds)),
         begin=jax.jit(common.over_seeds(begin, seeds)),
         chunk=jax.jit(common.over_seeds(trainer.chunk, seeds), donate_argnums=2),
-        examine=jax.jit(common.over_seeds(examine, seeds)),
+        grade=jax.jit(common.over_seeds(graded, seeds, shared=2)),
+        better=jax.jit(jax.vmap(keep_better)),
         report=jax.jit(common.over_seeds(report, seeds)),
     )
 
@@ -171,7 +163,8 @@ class _Run:
             keys = common.seed_keys(self.seeds, _WORLDS)
             pools = [common.training_worlds(self.env, self.gap, key, self.config.worlds) for key in keys]
             self.pools = common.stack(pools)
-            self.program = make_program(self.env, self.config, self.gap, seeds=len(self.seeds))
+            self.exam, self.final = (self._exam_worlds(seed) for seed in (_EXAM_SEED, _REPORT_SEED))
+        self.program = make_program(self.env, self.config, seeds=len(self.seeds))
         self.random = self._random()
         saved, done = self._start()
         saved = self._train(saved, done)
@@ -227,11 +220,24 @@ class _Run:
         return saved
 
     def _examine(self, saved: Saved, done: int) -> tuple[Saved, Metrics]:
+        """Every evaluation plays the same episodes in the same held-out worlds."""
+        prior = extract_prior(saved.run.learner)
         with self.clock("evaluate"):
-            best, scores = self.program.examine(saved)
-            scores = {name: np.asarray(x) for name, x in scores.items()}
+            outcome = self.program.grade(self.exam, jax.random.fold_in(jax.random.key(_EXAM_SEED), 1), prior)
+            scores = {name: np.asarray(x) for name, x in jax.vmap(score)(outcome).items()}
         self.log.eval(done * self.chunk_env_steps, scores)
-        return saved._replace(best=best), scores
+        now = Best(prior, jnp.asarray(scores["success"]), jnp.asarray(scores["return"]), saved.run.steps)
+        return saved._replace(best=self.program.better(saved.best, now)), scores
+
+    def _final_exam(self, prior: Prior) -> Outcome:
+        """[seeds, >= REPORT_EPISODES] new episodes in worlds that neither training nor the choice has seen."""
+        rounds = math.ceil(REPORT_EPISODES / self.config.eval_episodes)
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(_REPORT_SEED), 1), rounds)
+        outcomes = [self.program.grade(self.final, key, prior) for key in keys]
+        return jax.tree.map(lambda *x: np.concatenate(x, axis=1), *outcomes)
+
+    def _exam_worlds(self, seed: int) -> World:
+        return common.exam_worlds(self.env, self.gap, jax.random.key(seed), self.config.eval_episodes)
 
     def _checkpoint(self, saved: Saved, done: int) -> None:
         meta = {**self.expect, "chunks": done, "position": self.log.position(), "seconds": self.clock.seconds}
@@ -245,10 +251,11 @@ class _Run:
         with self.clock("report"):
             keys = common.seed_keys(self.seeds, _REPORT)
             report = jax.tree.map(np.asarray, self.program.report(self.pools, saved.best.prior, keys))
+            outcome = self._final_exam(saved.best.prior)
         results = []
         for i, seed in enumerate(self.seeds):
             one, best = common.member(report, i), common.member(saved.best, i)
-            found = {"seed": seed, **summarise(one), **self._chosen(best)}
+            found = {"seed": seed, **summarise(common.member(outcome, i), one), **self._chosen(best)}
             self._save_report(seed, one, i)
             checkpoint.save_prior(self.folder / "prior" / f"seed-{seed}", best.prior, self._card(found))
             results.append(found)
@@ -315,7 +322,7 @@ class _Run:
         for found in results:
             low, high = found["success/interval"]
             print(
-                f"seed {found['seed']}: success {found['success']:.3f} [{low:.3f}, {high:.3f}] in {REPORT_EPISODES} "
+                f"seed {found['seed']}: success {found['success']:.3f} [{low:.3f}, {high:.3f}] in {found['episodes']} "
                 f"fresh episodes; V_sim explains {found['value/explained_variance']:.2f} of the variance of returns, "
                 f"rank correlation {found['value/rank_correlation']:.2f}"
             )
@@ -323,15 +330,11 @@ class _Run:
         print(f"next: python -m experiments.finetune --task {self.env.name} --prior {self.folder}")
 
 
-def summarise(report: Report) -> dict[str, Any]:
-    """The numbers of one report (NumPy): what stands in summary.json and on the card."""
-    interval = stats.success_interval(int(report.success.sum()), len(report.success))
+def summarise(outcome: Outcome, report: Report) -> dict[str, Any]:
+    """The numbers of one prior (from NumPy arrays): what stands in summary.json and on the card."""
     quality = value.report(jnp.asarray(report.values[report.counts]), jnp.asarray(report.returns[report.counts]))
     return {
-        "success": float(report.success.mean()),
-        "success/interval": [float(interval.low), float(interval.high)],
-        "return": float(report.total.mean()),
-        "exploded": float(report.exploded.mean()),
+        **describe(outcome),
         **{name: float(x) for name, x in quality.items()},
         "dynamics/error": report.model_error.tolist(),
         "dynamics/error_if_nothing_moved": report.still_error.tolist(),

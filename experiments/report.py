@@ -1,4 +1,4 @@
-"""What a prior is worth: V_sim against returns, the model against trajectories, success in simulation. Pure."""
+"""What a prior is worth to fine-tuning: V_sim against returns, the model against trajectories. Pure."""
 
 import math
 from typing import NamedTuple
@@ -19,16 +19,12 @@ HORIZON = 10  # steps ahead that the model is judged at: twice the longest branc
 class Report(NamedTuple):
     """Measurements of one prior.
 
-    success, total, exploded: [episodes] of the mean action in the exam worlds.
-    values, returns: [episodes * episode_length] V_sim of the states that the exploring policy visits in the training
-    worlds, and the discounted returns that followed; counts: the same shape, bool, False in exploded episodes.
+    values, returns: [trajectories * episode_length] V_sim of the states that the exploring policy visits, and the
+    discounted returns that followed. counts: the same shape, bool, False in exploded episodes.
     model_error, still_error: [horizon] RMS error, in standard deviations of the observation, of the model's open-loop
     prediction 1, 2, ... steps ahead, and of predicting that nothing changes.
     """
 
-    success: Array
-    total: Array
-    exploded: Array
     values: Array
     returns: Array
     counts: Array
@@ -37,40 +33,24 @@ class Report(NamedTuple):
 
 
 def make_report(
-    env: Env,
-    network: NetworkConfig,
-    prior: Prior,
-    training: World,
-    exam: World,
-    key: Key,
-    *,
-    gamma: float,
-    episodes: int,
-    trajectories: int,
+    env: Env, network: NetworkConfig, pool: World, prior: Prior, key: Key, *, gamma: float, trajectories: int
 ) -> Report:
-    """Measures one prior on fresh episodes. training: the worlds it learned in; exam: worlds for `success`.
+    """Measures one prior on that many fresh trajectories of its exploring policy in the worlds it has learned in.
 
     Trajectories run ceil(3 / (1 - gamma)) steps past the time limit, where 5 % of the discounted weight is left, and
     V_sim of the last state stands for the rest.
     """
-    key_exam, key_explore = jax.random.split(key)
-    mean = prior_policy(env, prior, network, explore=False)
-    graded = play_episodes(env, exam, mean, key_exam, episodes, gamma=gamma)
     length = env.episode_length + math.ceil(3 / (1 - gamma))
     explore = prior_policy(env, prior, network, explore=True)
-    played = play_episodes(env, training, explore, key_explore, trajectories, gamma=gamma, length=length)
+    played = play_episodes(env, pool, explore, key, trajectories, gamma=gamma, length=length)
     values, returns = jax.vmap(lambda e: _values(env, network, prior, e))(played)
-    counts = jnp.broadcast_to(~played.exploded[:, None], values.shape)
     model, still = jax.vmap(lambda e: _model_errors(env, network, prior, e))(played)
-    ended = ~played.exploded[:, None]
-    average = lambda x: jnp.where(ended, x, 0.0).sum(0) / jnp.maximum(ended.sum(), 1)  # noqa: E731
+    whole = ~played.exploded[:, None]
+    average = lambda x: jnp.where(whole, x, 0.0).sum(0) / jnp.maximum(whole.sum(), 1)  # noqa: E731
     return Report(
-        success=graded.success,
-        total=graded.total_reward,
-        exploded=graded.exploded,
         values=values.reshape(-1),
         returns=returns.reshape(-1),
-        counts=counts.reshape(-1),
+        counts=jnp.broadcast_to(whole, values.shape).reshape(-1),
         model_error=average(model),
         still_error=average(still),
     )

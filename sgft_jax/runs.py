@@ -95,7 +95,11 @@ def open_run(
     lock = Lock(folder)
     resolved = config_to_json(config)
     if existing and resume:
-        _check_same(folder, kind, resolved, volatile)
+        try:
+            _check_same(folder, kind, resolved, volatile)
+        except UserError:
+            lock.release()  # the traceback would keep it alive
+            raise
     elif existing:
         _empty(folder)
     if not (existing and resume):

@@ -1,0 +1,188 @@
+"""The pretraining command end to end, on a point mass: train, kill, resume, and what it leaves behind."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from experiments import pretrain
+from experiments.common import network_of
+from experiments.evaluation import Best, keep_better
+from experiments.presets import PRESETS
+from sgft_jax import checkpoint
+from sgft_jax.log import read_jsonl
+from sgft_jax.types import Normalizer, Prior
+
+TESTS = Path(__file__).parent.parent
+OPTIONS = """--task toy --preset cpu --no-video --config.n-envs 32 --config.worlds 16 --config.env-steps 10240
+    --config.random-transitions 1024 --config.replay-capacity 8192 --config.batch-size 128 --config.chunk-steps 40
+    --config.updates-per-step 8 --config.network.hidden 32 32 --config.gamma 0.9 --config.eval-every 2
+    --config.checkpoint-every 3"""
+TINY = OPTIONS.split()  # 8 chunks of 1,280 env steps; evaluations after 0, 2, 4, 6, 8 and checkpoints after 3, 6, 8
+PROGRAM = """
+import os, signal, sys
+import envs
+envs.TASKS["toy"] = "toy"
+from experiments import pretrain
+from sgft_jax.log import MetricsLog
+write, left = MetricsLog.metrics, int(sys.argv[1])
+def metrics(self, *args):
+    global left
+    left -= 1
+    if left < 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    write(self, *args)
+MetricsLog.metrics = metrics
+pretrain.main(sys.argv[2:])
+"""
+
+
+@pytest.fixture(autouse=True)
+def _toy(monkeypatch):
+    monkeypatch.setitem(envs.TASKS, "toy", "toy")
+    monkeypatch.setattr(os, "environ", os.environ.copy())
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    return tmp_path_factory.mktemp("runs")
+
+
+@pytest.fixture(scope="module")
+def finished(out):
+    """Two seeds, start to end, in this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(envs.TASKS, "toy", "toy")
+        patch.setattr(os, "environ", os.environ.copy())
+        pretrain.main([*TINY, "--seeds", "2", "--out", str(out)])
+    return out / "pretrain/toy/cpu/seeds-0-1"
+
+
+def complaint(argv, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        pretrain.main(argv)
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and error.startswith("error: ") and error.count("\n") == 1
+    return error
+
+
+def test_sac_learns_the_toy_task_and_leaves_a_prior_per_seed(finished):
+    summary = json.loads((finished / "summary.json").read_text())
+    assert summary["env_steps"] == 10_240  # 8 chunks * 40 steps * 32 environments
+    assert summary["updates"] == 2_560  # 8 * 40 * 8
+    for seed, found in zip((0, 1), summary["seeds"], strict=True):
+        assert found["seed"] == seed and found["success"] > 0.9
+        assert found["success/interval"][0] <= found["success"] <= found["success/interval"][1]
+        prior, card = checkpoint.load_prior(finished / "prior" / f"seed-{seed}", task="toy", obs_dim=4, act_dim=2)
+        assert card["metrics"] == found and card["config"]["n_envs"] == 32
+        assert network_of(card).hidden == (32, 32)
+        assert prior.actor["Dense_0"]["kernel"].shape == (4, 32)
+        assert (finished / "figures" / f"seed-{seed}.png").stat().st_size > 10_000
+
+
+def test_the_prior_is_the_best_evaluation(finished):
+    curve = read_jsonl(finished / "eval.jsonl")
+    assert [line["step"] for line in curve] == [0, 2_560, 5_120, 7_680, 10_240]
+    for i, found in enumerate(json.loads((finished / "summary.json").read_text())["seeds"]):
+        best = max(curve, key=lambda line: (line["success"][i], line["return"][i]))
+        assert found["best/env_steps"] == best["step"]
+        assert found["best/success"] == pytest.approx(best["success"][i])
+        assert found["best/return"] == pytest.approx(best["return"][i])
+
+
+def test_value_and_model_are_worth_something(finished):
+    """On an almost noise-free point mass both must be good; the bias is what 2,560 updates have not yet caught up."""
+    for found in json.loads((finished / "summary.json").read_text())["seeds"]:
+        assert found["value/explained_variance"] > 0.7
+        assert found["value/rank_correlation"] > 0.4
+        assert abs(found["value/bias"]) < 1.5  # returns are up to 1 / (1 - 0.9) = 10
+        assert len(found["dynamics/error"]) == 10
+        assert max(found["dynamics/error"]) < 0.5 * min(found["dynamics/error_if_nothing_moved"])
+    arrays = np.load(finished / "report/seed-0.npz", allow_pickle=False)
+    assert arrays["values"].shape == arrays["returns"].shape == (64 * 20,)  # evaluation episodes * their length
+
+
+def test_killed_and_resumed_is_bit_for_bit_uninterrupted(finished, tmp_path):
+    def start(metrics_before_death, *more):
+        command = [sys.executable, "-c", PROGRAM, str(metrics_before_death), *TINY, "--seeds", "2", *more]
+        paths = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}", "SGFT_CACHE_DIR": str(TESTS.parent / ".cache/jax")}
+        command += ["--out", str(tmp_path)]
+        done = subprocess.run(command, env={**os.environ, **paths}, capture_output=True, text=True, timeout=300)
+        return done.returncode, done.stderr
+
+    cut = tmp_path / "pretrain/toy/cpu/seeds-0-1"
+    assert start(1)[0] == -signal.SIGKILL  # before the first checkpoint
+    assert not (cut / "checkpoints").exists() and len(read_jsonl(cut / "metrics.jsonl")) == 1
+    assert start(5, "--resume")[0] == -signal.SIGKILL  # after five chunks, two beyond the checkpoint
+    assert len(read_jsonl(cut / "metrics.jsonl")) == 5 and checkpoint.latest(cut) == 3
+    assert start(99, "--resume") == (0, "")
+    for name in ("metrics.jsonl", "eval.jsonl"):
+        assert (cut / name).read_bytes() == (finished / name).read_bytes()
+    found, wanted = (json.loads((run / "summary.json").read_text())["seeds"] for run in (cut, finished))
+    assert found == wanted
+    priors = [checkpoint.load_prior(run / "prior/seed-1")[0] for run in (cut, finished)]
+    jax.tree.map(np.testing.assert_array_equal, *priors)
+
+
+def test_a_finished_run_is_neither_repeated_nor_changed(finished, out, capsys):
+    argv = [*TINY, "--seeds", "2", "--out", str(out)]
+    assert "exists already" in complaint(argv, capsys)
+    assert "config.tau was 0.02, now 0.1" in complaint([*argv, "--resume", "--config.tau", "0.1"], capsys)
+    before = (finished / "metrics.jsonl").read_bytes()
+    pretrain.main([*argv, "--resume"])
+    assert (finished / "metrics.jsonl").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["--task", "toi"], "--task: there is no 'toi', did you mean 'toy'? Choose from: hammer, insert, push, toy"),
+        (["--preset", "fats"], "--preset: there is no 'fats', did you mean 'fast'? Choose from: cpu, fast, paper"),
+        (["--config.gama", "0.9"], "did you mean --config.gamma?"),
+        (["--task", "toy", "--seeds", "0"], "there must be at least one"),
+        (["--task", "toy", "--real", "mild"], "toy has no gap 'mild'"),
+        (["--task", "toy", "--set", "latency=0.1"], "name one with --real"),
+        (["--task", "toy", "--config.replay-capacity", "9"], "replay_capacity=9 cannot hold one step"),
+        (["--task", "toy", "--resume"], "nothing to resume there"),
+    ],
+)
+def test_a_bad_command_is_one_line_and_code_2(argv, words, capsys, tmp_path):
+    assert words in complaint([*argv, "--out", str(tmp_path)], capsys)
+    assert not list(tmp_path.iterdir())
+
+
+def test_presets_give_the_defaults_that_single_options_change(monkeypatch):
+    seen = []
+    monkeypatch.setattr(pretrain, "pretrain", seen.append)
+    pretrain.main(["--preset=paper", "--config.gamma", "0.5"])
+    assert seen[0].preset == "paper" and seen[0].config.gamma == 0.5
+    assert seen[0].config.n_envs == PRESETS["paper"].n_envs != PRESETS["fast"].n_envs
+
+
+def test_training_on_the_real_system_has_its_own_folder(tmp_path):
+    gap = tmp_path / "strange.toml"
+    gap.write_text("[params]\nmass = 2.0\nfriction = 4.0\n[effects]\naction_scale = 0.5\n")
+    argv = [*TINY, "--config.env-steps", "1280", "--real", str(gap), "--set", "mass=3", "--out", str(tmp_path)]
+    pretrain.main(argv)
+    (card,) = tmp_path.glob("pretrain/toy/cpu-on-strange+mass=3/seed-0/prior/seed-0/prior.json")
+    assert json.loads(card.read_text())["gap"]["params"] == {"mass": 3, "friction": 4.0}
+
+
+def test_better_is_more_success_then_more_return():
+    def best(success, total, steps):
+        params = {"w": jnp.full(2, float(steps))}
+        prior = Prior(params, {}, {}, {}, Normalizer(jnp.zeros(1), jnp.ones(1)))
+        return Best(prior, jnp.float32(success), jnp.float32(total), jnp.int32(steps))
+
+    old = best(0.5, 3.0, 1)
+    for success, total, steps in [(0.6, -9.0, 2), (0.5, 3.1, 2), (0.5, 3.0, 1), (0.5, 2.9, 1), (0.4, 9.0, 1)]:
+        kept = keep_better(old, best(success, total, 2))
+        assert kept.steps == steps and kept.prior.actor["w"].tolist() == [steps, steps]
