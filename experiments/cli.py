@@ -11,7 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, cast
 
 import tyro
 
@@ -55,7 +55,7 @@ def parse[T](
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stderr(complaint):
-            return tyro.cli(config_type, description=description, args=argv, default=default)
+            return cast(T, tyro.cli(config_type, description=description, args=argv, default=default))
     except SystemExit as stopped:
         if stopped.code not in (None, 0):
             fail(one_line(complaint.getvalue()))

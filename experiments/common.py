@@ -1,6 +1,7 @@
 """Impure: what the commands that train and evaluate share: seeds, worlds and priors by name, a stopwatch."""
 
 import contextlib
+import importlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -8,14 +9,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+import envs
 from envs import gaps
 from envs.base import Env, World
 from envs.gaps import Gap
+from experiments import cli
 from sgft_jax import checkpoint
 from sgft_jax.config import config_from_json, differences
 from sgft_jax.networks import NetworkConfig
-from sgft_jax.types import Key, Prior, PyTree, UserError
+from sgft_jax.types import Array, Key, Prior, PyTree, UserError
 
 SIM = "sim"
 
@@ -133,6 +137,23 @@ def network_of(card: dict[str, Any]) -> NetworkConfig:
 def _seed_number(folder: Path) -> tuple[int, str]:
     number = folder.name.removeprefix("seed-")
     return (int(number) if number.isdigit() else 0, str(folder))
+
+
+def film(task: str, theta: Array, qpos: np.ndarray, path: Path) -> str:
+    """Renders an episode, qpos [T + 1, nq], in a world with domain parameters theta; says in one line how it went."""
+    scene = getattr(importlib.import_module(envs.TASKS[task]), "SCENE", None)
+    if scene is None:
+        return f"no video: {task} has no scene to draw"
+    if reason := cli.select_renderer():
+        return f"no video: {reason}"
+    from envs.franka.render import render_episode
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        render_episode(scene, np.asarray(theta).tolist(), qpos, path)
+    except UserError as error:
+        return f"no video: {error}"
+    return f"video: {path}"
 
 
 class Clock:

@@ -29,11 +29,12 @@ def play_episodes(
 
 
 class Outcome(NamedTuple):
-    """How episodes ended: the fields of `Episode` of these names, [n]."""
+    """How episodes went: the fields of `Episode` of these names, [n]; qpos: [n, T + 1, nq], the start included."""
 
     success: Array
     total_reward: Array
     exploded: Array
+    qpos: Array
 
 
 def score(episodes: Episode | Outcome) -> Metrics:
@@ -62,7 +63,8 @@ def grade(
     """That many episodes of the mean action."""
     act = prior_policy(env, prior, network, explore=False)
     played = play_episodes(env, pool, act, key, episodes, gamma=gamma)
-    return Outcome(played.success, played.total_reward, played.exploded)
+    qpos = jnp.concatenate([played.start.physics.qpos[:, None], played.qpos], axis=1)
+    return Outcome(played.success, played.total_reward, played.exploded, qpos)
 
 
 def describe(outcome: Outcome) -> dict[str, Any]:

@@ -19,6 +19,7 @@ import numpy as np
 import envs
 from envs.base import Env, World
 from envs.gaps import Gap
+from envs.rollout import pick, pool_size
 from experiments import cli, common
 from experiments.evaluation import Best, Outcome, describe, grade, keep_better, score
 from experiments.presets import PRESETS, PretrainConfig
@@ -26,10 +27,10 @@ from experiments.pretraining import PretrainState, make_pretrainer, replay_bytes
 from experiments.report import Report, make_report
 from sgft_jax import checkpoint, plot, runs, value
 from sgft_jax.config import config_to_json
-from sgft_jax.log import MetricsLog, RunProgress, read_jsonl, write_summary
+from sgft_jax.log import EVAL, MetricsLog, RunProgress, read_jsonl, write_summary
 from sgft_jax.replay import ReplayState
 from sgft_jax.sac import extract_prior
-from sgft_jax.types import Key, Metrics, Prior
+from sgft_jax.types import Key, Prior
 
 DEFAULT_PRESET = "fast"
 _WORLDS, _RANDOM, _START, _REPORT = range(4)  # purposes, folded into a seed's key
@@ -146,6 +147,29 @@ def make_program(env: Env, config: PretrainConfig, *, seeds: int) -> Program:
     )
 
 
+def prior_card(args: PretrainArgs, env: Env, gap: Gap | None, found: dict[str, Any]) -> dict[str, Any]:
+    """What a prior says of itself; `found` are its numbers."""
+    return {
+        "task": env.name,
+        "obs_dim": env.obs_dim,
+        "act_dim": env.act_dim,
+        "network": config_to_json(args.config.network),
+        "ensemble_size": args.config.ensemble_size,
+        "gamma": args.config.gamma,
+        "observation": [e._asdict() for e in env.observation],
+        "action": [e._asdict() for e in env.action],
+        "control_dt": env.control_dt,
+        "episode_length": env.episode_length,
+        "domain": [p._asdict() for p in env.parameters],
+        "gap": None if gap is None else gap._asdict(),
+        "preset": args.preset,
+        "config": config_to_json(args.config),
+        "chosen": "the best evaluation on held-out worlds: success, then return",
+        "metrics": found,
+        "provenance": runs.provenance(),
+    }
+
+
 class _Run:
     """The impure part: what happens between compiled calls."""
 
@@ -219,7 +243,7 @@ class _Run:
                 progress.advance(self.chunk_env_steps, shown)
         return saved
 
-    def _examine(self, saved: Saved, done: int) -> tuple[Saved, Metrics]:
+    def _examine(self, saved: Saved, done: int) -> tuple[Saved, dict[str, np.ndarray]]:
         """Every evaluation plays the same episodes in the same held-out worlds."""
         prior = extract_prior(saved.run.learner)
         with self.clock("evaluate"):
@@ -257,7 +281,9 @@ class _Run:
             one, best = common.member(report, i), common.member(saved.best, i)
             found = {"seed": seed, **summarise(common.member(outcome, i), one), **self._chosen(best)}
             self._save_report(seed, one, i)
-            checkpoint.save_prior(self.folder / "prior" / f"seed-{seed}", best.prior, self._card(found))
+            checkpoint.save_prior(
+                self.folder / "prior" / f"seed-{seed}", best.prior, prior_card(self.args, self.env, self.gap, found)
+            )
             results.append(found)
         summary = {
             "task": self.env.name,
@@ -269,51 +295,36 @@ class _Run:
             **self.clock.record(),
         }
         write_summary(self.folder, summary)
+        if self.args.video:
+            print(self._film(saved.best.prior))
         self._say(results)
         return summary
+
+    def _film(self, prior: Prior) -> str:
+        """The first seed's prior in one of the worlds of the final exam; the program is that of the exam."""
+        one = pick(self.final, jnp.zeros(pool_size(self.final), int))
+        qpos = np.asarray(self.program.grade(one, jax.random.key(_REPORT_SEED), prior).qpos[0, 0])
+        return common.film(self.env.name, one.params[0], qpos, self.folder / "videos" / f"seed-{self.seeds[0]}.mp4")
 
     def _chosen(self, best: Best) -> dict[str, float]:
         """Which evaluation the prior is from, and what that evaluation said."""
         steps = int(best.steps) * self.config.n_envs
         return {"best/env_steps": steps, "best/success": float(best.success), "best/return": float(best.total)}
 
-    def _card(self, found: dict[str, Any]) -> dict[str, Any]:
-        """What a prior says of itself: the keys are described in docs/formats.md."""
-        env, config = self.env, self.config
-        return {
-            "task": env.name,
-            "obs_dim": env.obs_dim,
-            "act_dim": env.act_dim,
-            "network": config_to_json(config.network),
-            "ensemble_size": config.ensemble_size,
-            "gamma": config.gamma,
-            "observation": [e._asdict() for e in env.observation],
-            "action": [e._asdict() for e in env.action],
-            "control_dt": env.control_dt,
-            "episode_length": env.episode_length,
-            "domain": [p._asdict() for p in env.parameters],
-            "gap": None if self.gap is None else self.gap._asdict(),
-            "preset": self.args.preset,
-            "config": config_to_json(config),
-            "chosen": "the best evaluation on held-out worlds: success, then return",
-            "metrics": found,
-            "provenance": runs.provenance(),
-        }
-
     def _save_report(self, seed: int, report: Report, i: int) -> None:
         """The arrays behind the figure, and the figure."""
-        curve = read_jsonl(self.folder / "eval.jsonl")
-        folder = self.folder / "report"
-        folder.mkdir(exist_ok=True)
-        np.savez(folder / f"seed-{seed}.npz", allow_pickle=False, **report._asdict())
+        curve = read_jsonl(self.folder / EVAL)
+        some = np.flatnonzero(report.counts)[:: max(1, report.counts.sum() // 2000)]  # points that a figure can show
+        (self.folder / "report").mkdir(exist_ok=True)
+        np.savez(self.folder / "report" / f"seed-{seed}.npz", allow_pickle=False, **report._asdict())
         plot.pretraining(
             self.folder / "figures" / f"seed-{seed}.png",
             title=f"pretraining {self.env.name}, preset {self.args.preset}, seed {seed}",
             steps=[line["step"] for line in curve],
             success=[line["success"][i] for line in curve],
             returns=[line["return"][i] for line in curve],
-            value=report.values[report.counts][:: max(1, report.counts.sum() // 2000)],
-            monte_carlo=report.returns[report.counts][:: max(1, report.counts.sum() // 2000)],
+            value=report.values[some],
+            monte_carlo=report.returns[some],
             dynamics_error=report.model_error,
             baseline_error=report.still_error,
         )

@@ -18,7 +18,7 @@ from experiments.common import network_of
 from experiments.evaluation import Best, keep_better
 from experiments.presets import PRESETS
 from sgft_jax import checkpoint
-from sgft_jax.log import read_jsonl
+from sgft_jax.log import MetricsLog, read_jsonl
 from sgft_jax.types import Normalizer, Prior
 
 TESTS = Path(__file__).parent.parent
@@ -33,16 +33,25 @@ import envs
 envs.TASKS["toy"] = "toy"
 from experiments import pretrain
 from sgft_jax.log import MetricsLog
-write, left = MetricsLog.metrics, int(sys.argv[1])
+write = MetricsLog.metrics
 def metrics(self, *args):
-    global left
-    left -= 1
-    if left < 0:
-        os.kill(os.getpid(), signal.SIGKILL)
     write(self, *args)
+    os.kill(os.getpid(), signal.SIGKILL)
 MetricsLog.metrics = metrics
-pretrain.main(sys.argv[2:])
+pretrain.main(sys.argv[1:])
 """
+
+
+def interrupted(write, *, after):
+    """`write`, but the user presses Ctrl-C at the call after `after` ones."""
+    left = iter(range(after))
+
+    def metrics(*args):
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        write(*args)
+
+    return metrics
 
 
 @pytest.fixture(autouse=True)
@@ -110,20 +119,22 @@ def test_value_and_model_are_worth_something(finished):
     assert arrays["values"].shape == arrays["returns"].shape == (64 * 20,)  # evaluation episodes * their length
 
 
-def test_killed_and_resumed_is_bit_for_bit_uninterrupted(finished, tmp_path):
-    def start(metrics_before_death, *more):
-        command = [sys.executable, "-c", PROGRAM, str(metrics_before_death), *TINY, "--seeds", "2", *more]
-        paths = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}", "SGFT_CACHE_DIR": str(TESTS.parent / ".cache/jax")}
-        command += ["--out", str(tmp_path)]
-        done = subprocess.run(command, env={**os.environ, **paths}, capture_output=True, text=True, timeout=300)
-        return done.returncode, done.stderr
-
+def test_killed_and_resumed_is_bit_for_bit_uninterrupted(finished, tmp_path, monkeypatch):
+    argv = [*TINY, "--seeds", "2", "--out", str(tmp_path)]
     cut = tmp_path / "pretrain/toy/cpu/seeds-0-1"
-    assert start(1)[0] == -signal.SIGKILL  # before the first checkpoint
+
+    paths = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}", "SGFT_CACHE_DIR": str(TESTS.parent / ".cache/jax")}
+    killed = subprocess.run([sys.executable, "-c", PROGRAM, *argv], env={**os.environ, **paths}, timeout=300)
+    assert killed.returncode == -signal.SIGKILL  # after one chunk, before the first checkpoint
     assert not (cut / "checkpoints").exists() and len(read_jsonl(cut / "metrics.jsonl")) == 1
-    assert start(5, "--resume")[0] == -signal.SIGKILL  # after five chunks, two beyond the checkpoint
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as stopped:
+        patch.setattr(MetricsLog, "metrics", interrupted(MetricsLog.metrics, after=5))
+        pretrain.main([*argv, "--resume"])
+    assert stopped.value.code == 130
     assert len(read_jsonl(cut / "metrics.jsonl")) == 5 and checkpoint.latest(cut) == 3
-    assert start(99, "--resume") == (0, "")
+
+    pretrain.main([*argv, "--resume"])
     for name in ("metrics.jsonl", "eval.jsonl"):
         assert (cut / name).read_bytes() == (finished / name).read_bytes()
     found, wanted = (json.loads((run / "summary.json").read_text())["seeds"] for run in (cut, finished))
