@@ -70,8 +70,8 @@ def finetune(args: FinetuneArgs) -> dict[str, Any]:
 
     import envs
     from envs import gaps
-    from experiments.common import find_priors, network_of
-    from experiments.finetuning import make_program, stack
+    from experiments.common import find_priors, network_of, stack
+    from experiments.finetuning import make_program
     from sgft_jax import runs
     from sgft_jax.finetune import make_finetuner
     from sgft_jax.log import MetricsLog, RealLog, RunProgress
@@ -98,7 +98,7 @@ def finetune(args: FinetuneArgs) -> dict[str, Any]:
     program = make_program(env, tuner, gamma=config.gamma)
     seeds = jnp.arange(args.seed, args.seed + args.seeds, dtype=jnp.uint32)
     loop = _Loop(args, env, program, pool, seeds, run.folder, MetricsLog(run.folder), RealLog(run.folder))
-    state, done = loop.start(lambda: program.init(stack(priors, args.seeds), seeds))
+    state, done = loop.start(lambda: program.init(stack([priors[i % len(priors)] for i in range(args.seeds)]), seeds))
     with RunProgress(f"{args.method} on {args.task}/{gap.name}", total=args.rollouts, unit="rollouts", done=done) as bar:
         while done < args.rollouts:
             state, done = loop.advance(state, done, bar)

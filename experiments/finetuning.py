@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 
 from envs.base import Env, World
 from envs.rollout import Episode
@@ -70,7 +69,3 @@ def _over_seeds(function: Callable, axes: tuple[int | None, ...]) -> Callable:
 def _key(seed: Array, purpose: int, rollout: Array | int) -> Key:
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), purpose), rollout)
 
-
-def stack(trees: list[Prior], n: int) -> Prior:
-    """n priors on a leading axis, taking the given ones in turn."""
-    return jax.tree.map(lambda *x: jnp.stack([x[i % len(x)] for i in range(n)]), *trees)

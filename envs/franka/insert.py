@@ -215,7 +215,7 @@ def _add_scenery(spec: mujoco.MjSpec, hole: mujoco.MjsBody, hole_radius: float) 
     """What a viewer sees: the bench 4 mm below the surface of contact, the table top and its hole just below it."""
     box, cylinder = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
     bench, part, dark = [0.62, 0.64, 0.66, 1], [0.80, 0.62, 0.42, 1], [0.05, 0.04, 0.04, 1]
-    spec.worldbody.add_geom(type=box, pos=[0.4, 0, -0.024], size=[0.65, 0.6, 0.02], rgba=bench, **NO_CONTACT)
+    spec.worldbody.add_geom(type=box, pos=[0.3, 0, -0.024], size=[0.5, 0.45, 0.02], rgba=bench, **NO_CONTACT)
     look = {"mass": 0, **NO_CONTACT}
     size = [PART_HALF, PART_HALF, 0.01]
     hole.add_geom(type=box, pos=[*-HOLE_OFFSET, -0.0105], size=size, rgba=part, **look)

@@ -1,0 +1,67 @@
+"""What finished runs say: learning curves read from disk, and their summary with intervals. Reads files."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sgft_jax.log import EVAL, read_jsonl
+from sgft_jax.stats import first_dip, iqm_interval, transitions_to
+from sgft_jax.types import UserError
+
+
+class Curve(NamedTuple):
+    """Evaluations of one fine-tuning run on the real system; the first one is zero-shot.
+
+    rollouts, transitions: [n]. robot_minutes: [n] at the control rate, resets excluded. success, returns: [seeds, n],
+    the task's own, never reshaped.
+    """
+
+    rollouts: np.ndarray
+    transitions: np.ndarray
+    robot_minutes: np.ndarray
+    success: np.ndarray
+    returns: np.ndarray
+
+
+def read_curve(folder: Path) -> Curve:
+    """The learning curve of a fine-tuning run; raises UserError if it holds no evaluation yet."""
+    records = read_jsonl(folder / EVAL)
+    if not records:
+        raise UserError(f"{folder / EVAL}: holds no evaluation yet")
+    column = lambda name: np.array([r[name] for r in records])  # noqa: E731
+    return Curve(column("rollouts"), column("step"), column("robot_minutes"), column("success").T, column("return").T)
+
+
+def describe_run(curve: Curve) -> dict[str, Any]:
+    """The figures of a run for machines.
+
+    zero_shot, final: success and return, interquartile mean over seeds with its 95 % bootstrap interval, and mean.
+    dip: how far success of a seed, and of the mean over seeds, ever fell below zero-shot.
+    to_90: real transitions of each seed until an evaluation first shows 90 % success (null = never), and the same for
+    the mean curve.
+    """
+    mean = curve.success.mean(0)
+    to_90 = [transitions_to(curve.transitions, s, 0.9) for s in curve.success]
+    return {
+        "zero_shot": _point(curve, 0),
+        "final": _point(curve, -1),
+        "dip": {"mean": first_dip(mean), "worst_seed": max(first_dip(s) for s in curve.success)},
+        "to_90": {"seeds": to_90, "mean_curve": transitions_to(curve.transitions, mean, 0.9)},
+        "seeds": int(curve.success.shape[0]),
+    }
+
+
+def _point(curve: Curve, i: int) -> dict[str, Any]:
+    return {
+        "rollouts": int(curve.rollouts[i]),
+        "transitions": int(curve.transitions[i]),
+        "robot_minutes": float(curve.robot_minutes[i]),
+        "success": _interval(curve.success[:, i]),
+        "return": _interval(curve.returns[:, i]),
+    }
+
+
+def _interval(values: np.ndarray) -> dict[str, float]:
+    band = iqm_interval(values)
+    return {"iqm": float(band.estimate), "low": float(band.low), "high": float(band.high), "mean": float(values.mean())}
