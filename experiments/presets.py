@@ -60,11 +60,15 @@ PRESETS: dict[str, PretrainConfig] = {
     ),
     # What pays on one GPU today: thousands of environments, large batches, layer-normed critics, fast targets.
     "fast": PretrainConfig(
+        n_envs=2048,
+        env_steps=4_000_000,
+        random_transitions=200_000,
         random_fraction=0.1,
         gamma=0.97,
         lr=5e-4,
         tau=0.02,
         alpha=0.1,
+        entropy_per_dim=-2.0,
         network=_NORMED,
     ),
     # Two CPU cores, three minutes: narrow networks, few large updates.

@@ -103,7 +103,7 @@ def open_run(
     elif existing:
         _empty(folder)
     if not (existing and resume):
-        write_json(folder / CONFIG, {_MARK: importlib.metadata.version("sgft-jax"), "kind": kind, "config": resolved})
+        write_json(folder / CONFIG, {_MARK: _version("sgft-jax"), "kind": kind, "config": resolved})
     starts = read_json(folder / PROVENANCE)["starts"] if (folder / PROVENANCE).exists() else []
     write_json(folder / PROVENANCE, {"starts": [*starts, provenance()]})
     return Run(folder=folder, resumed=existing and resume, lock=lock)
@@ -124,9 +124,17 @@ def provenance() -> dict[str, Any]:
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "git": _git_state(Path(__file__).parent.parent),
         "python": platform.python_version(),
-        "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
+        "versions": {name: _version(name) for name in _PACKAGES},
         "device": {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()},
     }
+
+
+def _version(package: str) -> str:
+    """Its version; a source tree on the path is not an installed package, and runs all the same."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
 
 
 def _git_state(root: Path) -> dict[str, Any] | None:
