@@ -1,0 +1,97 @@
+"""Pictures: frames between control steps, and real files where MuJoCo can render."""
+
+import subprocess
+
+import imageio_ffmpeg
+import jax
+import mediapy
+import mujoco
+import numpy as np
+import pytest
+
+from envs.franka import hammer, insert, push, render
+from experiments.cli import select_renderer
+from sgft_jax.types import UserError
+
+SCENES = {"push": push.SCENE, "hammer": hammer.SCENE, "insert": insert.SCENE}
+
+
+def nominal(scene):
+    return {p.name: p.nominal for p in scene.parameters}
+
+
+def still(scene, steps):
+    """qpos [steps + 1, nq] of a scene that waits at its start."""
+    params = np.array(list(nominal(scene).values()), np.float32)
+    return np.tile(scene.initial(params, jax.random.key(0)).qpos, (steps + 1, 1))
+
+
+def frames_of(path, height, width):
+    """[frames, height, width, 3] of a video."""
+    raw = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    done = subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path), *raw], capture_output=True, check=True)
+    return np.frombuffer(done.stdout, np.uint8).reshape(-1, height, width, 3)
+
+
+@pytest.fixture
+def renderer(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    if reason := select_renderer():
+        pytest.skip(reason)
+
+
+def test_smooth_is_linear_and_keeps_jumps():
+    # 0.2 s at 10 frames a second: one frame in between. The second coordinate jumps by 0.9 m.
+    frames = render.smooth(np.array([[0.0, 0.0], [0.1, 0.9], [0.3, 0.9]]), fps=10)
+    np.testing.assert_allclose(frames, [[0, 0], [0.05, 0], [0.1, 0.9], [0.2, 0.9], [0.3, 0.9]], atol=1e-12)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_dressing_leaves_motion_alone(name):
+    """The drawn model has the joints and the solid geoms of the simulated one."""
+    scene = SCENES[name]
+    plain, drawn = (
+        scene.build(nominal(scene)).compile(),
+        render.dressed(scene.build(nominal(scene)), render.VIEWS[name]),
+    )
+    drawn = drawn.compile()
+    assert drawn.nq == plain.nq and drawn.npair == plain.npair
+    data, plain_data = mujoco.MjData(drawn), mujoco.MjData(plain)
+    data.qpos[:] = plain_data.qpos[:] = still(scene, 0)[0]
+    for model, d in ((drawn, data), (plain, plain_data)):
+        mujoco.mj_forward(model, d)
+    np.testing.assert_allclose(data.body("link7").xpos, plain_data.body("link7").xpos, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_pictures_show_the_robot(renderer, tmp_path, name):
+    scene = SCENES[name]
+    render.render_episode(scene, nominal(scene), still(scene, 1), tmp_path / "sub" / "episode.mp4")
+    picture = mediapy.read_image(tmp_path / "sub" / "episode.png")
+    assert picture.shape == (*render.SIZE, 3)
+    assert picture.std() > 20  # neither black nor blank
+    assert (
+        len(frames_of(tmp_path / "sub" / "episode.mp4", *render.SIZE)) == 5
+    )  # 0.2 s at 20 frames a second, ends included
+
+
+def test_side_by_side_waits_for_the_longer_episode(renderer, tmp_path):
+    scene, path = push.SCENE, tmp_path / "both.mp4"
+    thetas, episodes = [nominal(scene), list(nominal(scene).values())], [still(scene, 1), still(scene, 2)]
+    render.render_side_by_side(scene, thetas, episodes, ["before", "after " * 40], path)
+    height, width = render.SIZE
+    video = frames_of(path, height + render.CAPTION, 2 * width)
+    assert len(video) == 9
+    assert video[0, : render.CAPTION].max() > 150  # the captions
+
+
+def test_no_renderer_is_one_line(monkeypatch, tmp_path):
+    def broken(*args):
+        raise RuntimeError("no display\nlong story")
+
+    monkeypatch.setattr(mujoco, "Renderer", broken)
+    with pytest.raises(
+        UserError, match=r"^MuJoCo cannot render here \(no display\); install libegl1 or libosmesa6 and"
+    ) as e:
+        render.render_episode(push.SCENE, nominal(push.SCENE), still(push.SCENE, 1), tmp_path / "x.mp4")
+    assert "\n" not in str(e.value)
