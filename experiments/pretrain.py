@@ -24,8 +24,8 @@ from experiments import cli, common
 from experiments.evaluation import Best, Outcome, describe, grade, keep_better, score
 from experiments.presets import PRESETS, PretrainConfig
 from experiments.pretraining import PretrainState, make_pretrainer, replay_bytes
-from experiments.report import Report, make_report
-from sgft_jax import checkpoint, plot, runs, value
+from experiments.report import Report, make_report, numbers
+from sgft_jax import checkpoint, plot, runs
 from sgft_jax.config import config_to_json
 from sgft_jax.log import EVAL, MetricsLog, RunProgress, read_jsonl, write_summary
 from sgft_jax.replay import ReplayState
@@ -212,7 +212,8 @@ class _Run:
         begin = lambda: self.program.begin(self.pools, self.random, common.seed_keys(self.seeds, _START))  # noqa: E731
         if checkpoint.latest(self.folder) is None:
             self.log.truncate({})
-            return begin(), 0
+            with self.clock("start"):
+                return jax.block_until_ready(begin()), 0
         saved, meta = checkpoint.restore(self.folder, jax.eval_shape(begin), expect=self.expect)
         self.log.truncate(meta["position"])
         self.clock.seconds = meta["seconds"]
@@ -279,7 +280,7 @@ class _Run:
         results = []
         for i, seed in enumerate(self.seeds):
             one, best = common.member(report, i), common.member(saved.best, i)
-            found = {"seed": seed, **summarise(common.member(outcome, i), one), **self._chosen(best)}
+            found = {"seed": seed, **describe(common.member(outcome, i)), **numbers(one), **self._chosen(best)}
             self._save_report(seed, one, i)
             checkpoint.save_prior(
                 self.folder / "prior" / f"seed-{seed}", best.prior, prior_card(self.args, self.env, self.gap, found)
@@ -317,6 +318,8 @@ class _Run:
         some = np.flatnonzero(report.counts)[:: max(1, report.counts.sum() // 2000)]  # points that a figure can show
         (self.folder / "report").mkdir(exist_ok=True)
         np.savez(self.folder / "report" / f"seed-{seed}.npz", allow_pickle=False, **report._asdict())
+        if not some.size:
+            return  # every trajectory exploded: there is nothing to draw
         plot.pretraining(
             self.folder / "figures" / f"seed-{seed}.png",
             title=f"pretraining {self.env.name}, preset {self.args.preset}, seed {seed}",
@@ -339,17 +342,6 @@ class _Run:
             )
         print(f"results: {self.folder}  (prior/, summary.json, figures/)")
         print(f"next: python -m experiments.finetune --task {self.env.name} --prior {self.folder}")
-
-
-def summarise(outcome: Outcome, report: Report) -> dict[str, Any]:
-    """The numbers of one prior (from NumPy arrays): what stands in summary.json and on the card."""
-    quality = value.report(jnp.asarray(report.values[report.counts]), jnp.asarray(report.returns[report.counts]))
-    return {
-        **describe(outcome),
-        **{name: float(x) for name, x in quality.items()},
-        "dynamics/error": report.model_error.tolist(),
-        "dynamics/error_if_nothing_moved": report.still_error.tolist(),
-    }
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """What a prior is worth to fine-tuning: V_sim against returns, the model against trajectories. Pure."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -54,6 +54,16 @@ def make_report(
         model_error=average(model),
         still_error=average(still),
     )
+
+
+def numbers(report: Report) -> dict[str, Any]:
+    """A report (NumPy arrays) as JSON data: what stands in summary.json and on the card."""
+    quality = value.report(jnp.asarray(report.values[report.counts]), jnp.asarray(report.returns[report.counts]))
+    return {
+        **{name: float(x) for name, x in quality.items()},
+        "dynamics/error": report.model_error.tolist(),
+        "dynamics/error_if_nothing_moved": report.still_error.tolist(),
+    }
 
 
 def _values(env: Env, network: NetworkConfig, prior: Prior, episode: Episode) -> tuple[Array, Array]:

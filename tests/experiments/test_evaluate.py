@@ -1,0 +1,71 @@
+import json
+
+import pytest
+from test_common import save_prior
+
+import envs
+from experiments import cli, evaluate
+
+
+@pytest.fixture(autouse=True)
+def _toy(monkeypatch):
+    monkeypatch.setitem(envs.TASKS, "toy", "toy")
+    monkeypatch.setattr(cli, "set_up", lambda: None)  # the tests have their own cache and environment
+
+
+@pytest.fixture
+def run(tmp_path):
+    """What fine-tuning leaves: two policies."""
+    for seed in (0, 1):
+        save_prior(tmp_path / "run/policy" / f"seed-{seed}", seed)
+    return tmp_path / "run"
+
+
+def call(*argv):
+    cli.run_main(evaluate.main, evaluate.EvaluateArgs, "Evaluate.", argv=[str(a) for a in argv])
+
+
+def test_success_with_its_interval_as_json(run, capsys):
+    call("--run", run, "--episodes", 20, "--json")
+    found = json.loads(capsys.readouterr().out)
+    assert (found["task"], found["where"]) == ("toy", "in simulation")
+    assert [p["policy"] for p in found["policies"]] == [str(run / "policy" / f"seed-{i}") for i in (0, 1)]
+    for policy in found["policies"]:
+        low, high = policy["success/interval"]
+        assert policy["episodes"] == 20 and low <= policy["success"] <= high and policy["exploded"] == 0
+        # Wilson at 0 of 20, z = 1.96: upper end z^2 / (n + z^2) = 3.84 / 23.84 = 0.161
+        assert policy["success"] > 0 or high == pytest.approx(0.161, abs=5e-4)
+
+
+def test_episodes_are_the_same_every_time_and_others_on_request(run, capsys):
+    def returns(*more):
+        call("--prior", run / "policy/seed-0", "--episodes", 10, "--json", *more)
+        return json.loads(capsys.readouterr().out)["policies"][0]["return"]
+
+    first = returns()
+    assert returns() == first != returns("--seed", 1)
+
+
+def test_a_line_per_policy_on_the_real_system(run, capsys):
+    (run / "slow.toml").write_text("[params]\nmass = 9.0\nfriction = 4.0\n")
+    call("--run", run, "--episodes", 10, "--real", run / "slow.toml")
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 2 and all("(10 episodes of toy, on the slow real system)" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        ([], "name a folder with --prior or --run"),
+        (["--prior", "a", "--run", "b"], "exclude each other"),
+        (["--task", "toi"], "did you mean 'toy'?"),
+        (["--task", "toy", "--out", "nowhere"], "nowhere/pretrain/toy/fast: holds no prior"),
+        (["--prior", "nowhere"], "nowhere: holds no prior"),
+        (["--task", "toy", "--episodes", "0"], "must be at least 1"),
+    ],
+)
+def test_a_bad_command_is_one_line_and_code_2(argv, words, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        call(*argv)
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and words in error and error.count("\n") == 1
