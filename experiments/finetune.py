@@ -1,14 +1,31 @@
 """Fine-tune a pretrained policy on a "real" system and draw its learning curve."""
 
+import json
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from experiments.cli import run_main
-from sgft_jax.finetune import FinetuneConfig
+import envs
+from envs import gaps
+from envs.base import Env
+from envs.gaps import Gap
+from envs.rollout import Episode
+from experiments import cli, common
+from experiments.finetuning import make_program
+from experiments.presets import PRESETS
+from experiments.results import describe_run, read_curve
+from experiments.video import before_and_after
+from sgft_jax import checkpoint, plot, runs
+from sgft_jax.finetune import FinetuneConfig, FinetuneState, make_finetuner
+from sgft_jax.log import MetricsLog, RealLog, RunProgress, write_summary
+from sgft_jax.sgft import Method, get_method
+from sgft_jax.types import Prior, PyTree, UserError
 
 
 @dataclass(frozen=True)
@@ -32,11 +49,11 @@ class FinetuneArgs:
     seeds: int = 10
     """Number of seeds; seed i starts from prior i modulo the number of priors."""
     rollouts: int = 100
-    """Real rollouts per seed, the initial ones included."""
+    """Real rollouts per seed, the initial ones included; may grow with --resume."""
     initial_rollouts: int = 20
     """Rollouts of the simulator's policy that fill the buffer before learning starts."""
     utd: float = 2.0
-    """Updates per real transition (O-1)."""
+    """Updates per real transition."""
     eval_every: int = 5
     """Rollouts between evaluations."""
     eval_episodes: int = 50
@@ -46,10 +63,13 @@ class FinetuneArgs:
     options: FinetuneConfig = field(default_factory=FinetuneConfig)
     """Method options; `network` and `gamma` always are the prior's."""
     video: bool = True
-    """Render an episode before and after fine-tuning, side by side."""
+    """Render an episode before and after fine-tuning side by side, where MuJoCo can render."""
     out: Path = Path("runs")
+    """Parent of all run folders."""
     resume: bool = False
+    """Continue from the last checkpoint."""
     overwrite: bool = False
+    """Replace an earlier run of the same name."""
 
 
 def main(args: FinetuneArgs) -> None:
@@ -57,203 +77,196 @@ def main(args: FinetuneArgs) -> None:
     finetune(args)
 
 
-def run_folder(args: FinetuneArgs) -> Path:
-    """Where the run of these arguments lives."""
-    real = "_".join([Path(args.real).stem, *(s.replace("/", "") for s in args.set)])
-    return args.out / "finetune" / args.task / real / args.method / f"seeds-{args.seed}-{args.seed + args.seeds - 1}"
-
-
 def finetune(args: FinetuneArgs) -> dict[str, Any]:
     """One fine-tuning run from (or back) to disk; returns its summary."""
-    import jax
-    import jax.numpy as jnp
-
-    import envs
-    from envs import gaps
-    from experiments.common import find_priors, network_of, stack
-    from experiments.finetuning import make_program
-    from sgft_jax import runs
-    from sgft_jax.finetune import make_finetuner
-    from sgft_jax.log import MetricsLog, RealLog, RunProgress
-    from sgft_jax.sgft import get_method
-
-    _check(args)
-    method = get_method(args.method)
+    method, seeds = _check(args)
     env = envs.make(args.task)
     gap = gaps.load(env, args.real, args.set)
-    priors, card = find_priors(args.prior, out=args.out, env=env, preset=args.preset)
-    config = replace(args.options, network=network_of(card), gamma=card["gamma"])
+    priors, card = common.find_priors(args.prior, out=args.out, env=env, preset=args.preset)
     run = runs.open_run(
         run_folder(args),
         kind="finetune",
         config=args,
         resume=args.resume,
         overwrite=args.overwrite,
-        volatile=("resume", "overwrite", "rollouts", "video"),
+        volatile=("resume", "overwrite", "rollouts", "video", "out"),
     )
-    pool = gaps.worlds(env, gap, jax.random.key(0))
-    tuner = make_finetuner(
-        method, config, obs_dim=env.obs_dim, act_dim=env.act_dim, reward=env.reward, terminated=env.terminated
-    )
-    program = make_program(env, tuner, gamma=config.gamma)
-    seeds = jnp.arange(args.seed, args.seed + args.seeds, dtype=jnp.uint32)
-    loop = _Loop(args, env, program, pool, seeds, run.folder, MetricsLog(run.folder), RealLog(run.folder))
-    state, done = loop.start(lambda: program.init(stack([priors[i % len(priors)] for i in range(args.seeds)]), seeds))
-    with RunProgress(f"{args.method} on {args.task}/{gap.name}", total=args.rollouts, unit="rollouts", done=done) as bar:
-        while done < args.rollouts:
-            state, done = loop.advance(state, done, bar)
-    loop.log.close()
-    loop.save_policies(state, card)
-    summary = loop.summarise(state, gap)
-    loop.show(state, tuner, priors, card, gap)
-    run.close()
-    return summary
+    try:
+        own = [priors[seed % len(priors)] for seed in seeds]
+        return _Run(args, env, gap, method, seeds, run.folder).work(common.stack(own), card)
+    finally:
+        run.close()
 
 
-class _Loop:
-    """The impure part of a run: what happens between compiled calls, in order, on disk before in memory."""
+def run_folder(args: FinetuneArgs) -> Path:
+    """Where the run of these arguments lives; the seeds of one call share a folder."""
+    real = "_".join([Path(args.real).stem, *(change.replace("/", "") for change in args.set)])
+    seeds = common.seeds_name(common.seed_list(args.seed, args.seeds))
+    return args.out / "finetune" / args.task / real / args.method / seeds
 
-    def __init__(self, args, env, program, pool, seeds, folder, log, real) -> None:  # noqa: ANN001
-        self.args, self.env, self.program, self.pool, self.seeds = args, env, program, pool, seeds
-        self.folder, self.log, self.real = folder, log, real
-        self.expect = {"kind": "finetune", "task": args.task, "method": args.method, "seeds": args.seeds}
 
-    def start(self, make):  # noqa: ANN001, ANN201
-        """The state to continue from and its rollout count: a checkpoint's, or a fresh one with its zero-shot score."""
-        import jax
+class _Run:
+    """The impure part: what happens between compiled calls, on disk before in memory."""
 
-        from sgft_jax import checkpoint
+    def __init__(self, args: FinetuneArgs, env: Env, gap: Gap, method: Method, seeds: list[int], folder: Path) -> None:
+        self.args, self.env, self.gap, self.method, self.seeds, self.folder = args, env, gap, method, seeds, folder
+        self.pool = gaps.worlds(env, gap, jax.random.key(0))
+        self.numbers = jnp.array(seeds, jnp.uint32)
+        self.log, self.real = MetricsLog(folder), RealLog(folder)
+        self.expect = {"kind": "finetune", "task": args.task, "method": args.method, "seeds": seeds}
 
-        if self.args.resume and checkpoint.latest(self.folder) is not None:
-            state, meta = checkpoint.restore(self.folder, jax.eval_shape(make), expect=self.expect)
-            self.log.truncate(meta["position"])
-            self.real.truncate(meta["stored"])
-            return state, meta["rollouts"]
-        self.log.truncate({})
-        self.real.truncate(0)
-        state = make()
-        self._evaluate(state, 0)
-        return state, 0
+    def work(self, priors: Prior, card: dict[str, Any]) -> dict[str, Any]:
+        """Everything, in order. priors: [seeds]."""
+        env = self.env
+        config = replace(self.args.options, network=common.network_of(card), gamma=card["gamma"])
+        self.tuner = make_finetuner(
+            self.method, config, obs_dim=env.obs_dim, act_dim=env.act_dim, reward=env.reward, terminated=env.terminated
+        )
+        self.program = make_program(env, self.tuner, gamma=config.gamma)
+        make = lambda: self.program.init(priors, self.numbers)  # noqa: E731
+        state, done = self._start(make)
+        state = self._train(state, done)
+        self.log.close()
+        self._save_policies(state, card)
+        summary = self._summarise()
+        if self.args.video:
+            print(self._film(make(), state, summary["final"]["rollouts"]))
+        print(f"results: {self.folder}  (policy/, real/, summary.json, figures/)")
+        print("next: python -m experiments.figures")
+        return summary
 
-    def advance(self, state, done: int, bar):  # noqa: ANN001, ANN201
-        """Some real rollouts, then learning from them: the initial ones together, later ones one by one."""
-        args = self.args
-        n = args.initial_rollouts if done == 0 else 1
+    def _start(self, make: Callable[[], FinetuneState]) -> tuple[FinetuneState, int]:
+        """The state to continue from and the rollouts behind it: a checkpoint's, or a fresh one scored zero-shot."""
+        if checkpoint.latest(self.folder) is None:
+            self.log.truncate({})
+            self.real.truncate(0)
+            state = make()
+            self._evaluate(state, 0)
+            return state, 0
+        state, meta = checkpoint.restore(self.folder, jax.eval_shape(make), expect=self.expect)
+        self.log.truncate(meta["position"])
+        self.real.truncate(meta["stored"])
+        return state, meta["rollouts"]
+
+    def _train(self, state: FinetuneState, done: int) -> FinetuneState:
+        title = f"{self.args.method} on {self.args.task}/{self.gap.name}"
+        with RunProgress(title, total=self.args.rollouts, unit="rollouts", done=done) as progress:
+            while done < self.args.rollouts:
+                n = self.args.initial_rollouts if done == 0 else 1
+                state, shown = self._advance(state, done, n)
+                done += n
+                progress.advance(n, shown)
+        return state
+
+    def _advance(self, state: FinetuneState, done: int, n: int) -> tuple[FinetuneState, dict[str, float]]:
+        """N real rollouts, then learning from them; later, where one is due, an evaluation and a checkpoint."""
+        args, first = self.args, done == 0
         started = time.perf_counter()
-        episodes = self.program.collect(state, self.pool, self.seeds, done, n)
+        episodes = self.program.collect(state, self.pool, self.numbers, done, n)
         self._store(episodes, n)
         collected = time.perf_counter()
         updates = max(round(args.utd * n * self.env.episode_length), 1)
-        state, metrics = self.program.learn(state, episodes, self.seeds, done, updates)
-        metrics = {k: np.asarray(v) for k, v in metrics.items()}
+        state, metrics = self.program.learn(state, episodes, self.numbers, done, updates)
+        real = {
+            "real/return": np.asarray(episodes.total_reward).mean(1),
+            "real/success": np.asarray(episodes.success).mean(1),
+            "real/exploded": np.asarray(episodes.exploded).mean(1),
+        }
         done += n
-        own = {"real/return": np.asarray(episodes.total_reward).mean(1), "real/success": np.asarray(episodes.success).mean(1)}
-        own["real/exploded"] = np.asarray(episodes.exploded).mean(1)
-        self.log.metrics(self._transitions(done), {"rollouts": done, **own, **metrics})
-        success = None
-        if done % args.eval_every == 0 or done >= args.rollouts or n > 1:
-            success = self._evaluate(state, done)
-        if done % args.checkpoint_every == 0 or done >= args.rollouts or n > 1:
-            self._checkpoint(state, done)
+        self.log.metrics(self._transitions(done), {"rollouts": done, **real, **metrics})
         learned = time.perf_counter()
-        bar.advance(n, {"real success": own["real/success"].mean(), **({"success": success} if success is not None else {})})
+        shown = {"real success": float(real["real/success"].mean())}
+        last = done >= args.rollouts
+        if first or last or done % args.eval_every == 0:
+            shown["success"] = self._evaluate(state, done)
+        if first or last or done % args.checkpoint_every == 0:
+            self._checkpoint(state, done)
         self._time(done, collected - started, learned - collected)
-        return state, done
+        return state, shown
 
     def _transitions(self, rollouts: int) -> int:
         return rollouts * self.env.episode_length
 
-    def _store(self, episodes, n: int) -> None:  # noqa: ANN001
-        """Every real transition reaches the disk before a learner sees it: one file a rollout, arrays [seeds, T, ...]."""
+    def _store(self, episodes: Episode, n: int) -> None:
+        """Real transitions reach the disk before a learner sees them: one file a rollout, arrays [seeds, T, ...]."""
         arrays = {**episodes.transitions._asdict(), "valid": episodes.valid, "qpos": episodes.qpos}
-        arrays = {k: np.asarray(v) for k, v in arrays.items()}
+        arrays = {name: np.asarray(x) for name, x in arrays.items()}
         for i in range(n):
-            self.real.append({k: v[:, i] for k, v in arrays.items()})
+            self.real.append({name: x[:, i] for name, x in arrays.items()})
 
-    def _evaluate(self, state, done: int) -> float:  # noqa: ANN001
-        scores = {k: np.asarray(v) for k, v in self.program.evaluate(state, self.pool, self.seeds, self.args.eval_episodes).items()}
+    def _evaluate(self, state: FinetuneState, done: int) -> float:
+        scores = self.program.evaluate(state, self.pool, self.numbers, self.args.eval_episodes)
         minutes = self._transitions(done) * self.env.control_dt / 60
         self.log.eval(self._transitions(done), {"rollouts": done, "robot_minutes": minutes, **scores})
         return float(scores["success"].mean())
 
-    def _checkpoint(self, state, done: int) -> None:  # noqa: ANN001
-        from sgft_jax import checkpoint
-
+    def _checkpoint(self, state: FinetuneState, done: int) -> None:
         meta = {**self.expect, "rollouts": done, "stored": len(self.real), "position": self.log.position()}
         checkpoint.save(self.folder, done, state, meta=meta)
 
     def _time(self, done: int, collect_s: float, learn_s: float) -> None:
-        import json
-
+        """Apart from the metrics, which must not depend on the clock."""
+        line = {"rollouts": done, "time/collect_s": round(collect_s, 3), "time/learn_s": round(learn_s, 3)}
         with open(self.folder / "timing.jsonl", "a") as file:
-            file.write(json.dumps({"rollouts": done, "time/collect_s": collect_s, "time/learn_and_evaluate_s": learn_s}) + "\n")
+            file.write(json.dumps(line) + "\n")
 
-    def save_policies(self, state, card: dict[str, Any]) -> None:  # noqa: ANN001
+    # ------------------------------------------------------------ what stays
+
+    def _save_policies(self, state: FinetuneState, card: dict[str, Any]) -> None:
         """The fine-tuned policies in the form of priors: policy/seed-<k>."""
-        import jax
-
-        from sgft_jax import checkpoint
-        from sgft_jax.types import Prior
-
-        if self.args.options.horizon > 1:
-            return  # a steps-to-go conditioned actor is not a plain policy; the checkpoint holds it
-        for i, seed in enumerate(range(self.args.seed, self.args.seed + self.args.seeds)):
-            one = jax.tree.map(lambda x, i=i: x[i], state)
+        if self.method.finite_horizon and self.args.options.horizon > 1:
+            print("no policy/: an actor that is told its steps to go is not a plain policy; the checkpoint holds it")
+            return
+        for i, seed in enumerate(self.seeds):
+            one: Any = common.member(state, i)
             agent = one.learner
             tuned = Prior(agent.actor.params, agent.critic.params, one.value, one.dynamics.params, one.normalizer)
-            facts = {**card, "finetuned": {"method": self.args.method, "real": self.args.real, "seed": seed}}
-            checkpoint.save_prior(self.folder / "policy" / f"seed-{seed}", tuned, facts)
+            facts = {"method": self.args.method, "gap": self.gap._asdict(), "seed": seed}
+            checkpoint.save_prior(self.folder / "policy" / f"seed-{seed}", tuned, {**card, "finetuned": facts})
 
-    def summarise(self, state, gap) -> dict[str, Any]:  # noqa: ANN001
-        """summary.json, the learning-curve figure and the closing lines."""
-        from experiments.results import describe_run, read_curve
-        from sgft_jax.log import write_summary
-        from sgft_jax.plot import learning_curves
-
-        curve = read_curve(self.folder)
-        summary = describe_run(curve) | {"task": self.args.task, "method": self.args.method, "gap": gap._asdict()}
+    def _summarise(self) -> dict[str, Any]:
+        """summary.json, the learning curve and the closing words."""
+        args, curve = self.args, read_curve(self.folder)
+        about = {"task": args.task, "method": args.method, "gap": self.gap._asdict()}
+        summary = about | describe_run(curve)
         write_summary(self.folder, summary)
-        figure = learning_curves(
-            self._figures() / "success.png",
-            {self.args.method: (curve.transitions, curve.success)},
-            title=f"{self.args.task} on the {gap.name} real system",
+        plot.learning_curves(
+            self.folder / "figures" / "success.png",
+            {args.method: (curve.transitions, curve.success)},
+            title=f"{args.task} on the {self.gap.name} real system",
             zero_shot=float(curve.success[:, 0].mean()),
             rollout_length=self.env.episode_length,
             control_dt=self.env.control_dt,
         )
-        zero, final = summary["zero_shot"]["success"], summary["final"]["success"]
+        zero, final = (summary[when]["success"] for when in ("zero_shot", "final"))
+        band = f" [{final['low']:.2f}, {final['high']:.2f}]" if len(self.seeds) > 1 else ""
         print(
-            f"success {zero['iqm']:.2f} zero-shot -> {final['iqm']:.2f} [{final['low']:.2f}, {final['high']:.2f}] after "
-            f"{summary['final']['rollouts']} rollouts; deepest dip {summary['dip']['mean']:.3f}; figure {figure}"
+            f"success {zero['iqm']:.2f} zero-shot -> {final['iqm']:.2f}{band} after {summary['final']['rollouts']} "
+            f"rollouts; deepest dip {summary['dip']['mean']:.3f}"
         )
         return summary
 
-    def _figures(self) -> Path:
-        path = self.folder / "figures"
-        path.mkdir(exist_ok=True)
-        return path
-
-    def show(self, state, tuner, priors, card, gap) -> None:  # noqa: ANN001
-        """A video of one real episode before and after, where MuJoCo can render."""
-        if not self.args.video:
-            return
-        from experiments.video import before_and_after
-
-        message = before_and_after(self, state, tuner, priors[0], card)
-        print(message)
+    def _film(self, before: FinetuneState, after: FinetuneState, rollouts: int) -> str:
+        """The first seed's policy, told by its agent, which at the start is that of the simulator."""
+        states: PyTree = common.stack([common.member(before, 0), common.member(after, 0)])
+        act = lambda state, obs, key: self.tuner.act(state, obs, key, explore=False)  # noqa: E731
+        path = self.folder / "videos" / f"seed-{self.seeds[0]}.mp4"
+        return before_and_after(self.env, self.pool, act, states, path, rollouts=rollouts)
 
 
-def _check(args: FinetuneArgs) -> None:
-    from sgft_jax.types import UserError
-
-    for name in ("seeds", "rollouts", "initial_rollouts", "eval_every", "eval_episodes", "checkpoint_every"):
+def _check(args: FinetuneArgs) -> tuple[Method, list[int]]:
+    """The method and the seeds; raises UserError for what is wrong in the arguments alone."""
+    cli.choose("--task", args.task, envs.TASKS)
+    cli.choose("--preset", args.preset, PRESETS)
+    for name in ("rollouts", "initial_rollouts", "eval_every", "eval_episodes", "checkpoint_every"):
         if getattr(args, name) < 1:
             raise UserError(f"--{name.replace('_', '-')} is {getattr(args, name)}: must be at least 1")
     if args.initial_rollouts > args.rollouts:
         raise UserError(f"--initial-rollouts {args.initial_rollouts} is more than --rollouts {args.rollouts}")
     if args.utd <= 0:
         raise UserError(f"--utd is {args.utd}: must be positive")
+    return get_method(args.method), common.seed_list(args.seed, args.seeds)
 
 
 if __name__ == "__main__":
-    run_main(main, FinetuneArgs, __doc__ or "")
+    cli.run_main(main, FinetuneArgs, __doc__ or "")

@@ -1,0 +1,249 @@
+"""The fine-tuning command end to end, on a point mass whose force is turned by 30 degrees in reality."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import toy
+from test_common import save_prior
+
+import envs
+from experiments import cli, evaluate, finetune, finetuning, video
+from sgft_jax import checkpoint
+from sgft_jax.log import RealLog, read_jsonl
+from sgft_jax.types import UserError
+
+TESTS = Path(__file__).parent.parent
+GAP = "[params]\nmass = 2.0\nfriction = 4.0\n[effects]\naction_rotation = 0.52\n"
+OPTIONS = """--task toy --rollouts 5 --initial-rollouts 2 --eval-every 2 --eval-episodes 8 --checkpoint-every 2
+    --utd 0.5 --options.batch-size 16 --options.branches 2 --options.critic-warmup 0 --options.actor-ramp 0
+    --options.replay-capacity 256 --no-video"""
+PROGRAM = """
+import os, signal, sys
+import envs
+envs.TASKS["toy"] = "toy"
+from experiments import cli, finetune
+from sgft_jax.log import MetricsLog
+write = MetricsLog.metrics
+def metrics(self, step, values):
+    write(self, step, values)
+    if values["rollouts"] == 5:
+        os.kill(os.getpid(), signal.SIGKILL)
+MetricsLog.metrics = metrics
+cli.run_main(finetune.main, finetune.FinetuneArgs, "", argv=sys.argv[1:])
+"""
+
+
+@pytest.fixture(autouse=True)
+def _toy(monkeypatch):
+    monkeypatch.setitem(envs.TASKS, "toy", "toy")
+    monkeypatch.setattr(os, "environ", os.environ.copy())
+    monkeypatch.setattr(cli, "set_up", lambda: None)  # the tests have their own cache and environment
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """Two untrained priors and a gap."""
+    home = tmp_path_factory.mktemp("runs")
+    for seed in (0, 1):
+        save_prior(home / f"pretrain/toy/fast/seeds-0-1/prior/seed-{seed}", seed)
+    (home / "turned.toml").write_text(GAP)
+    return home
+
+
+def argv(home, method="sgft-sac", *more, seeds=2, out=None):
+    given = ["--method", method, "--seeds", seeds, "--out", out or home, "--real", home / "turned.toml"]
+    given += ["--prior", home / "pretrain/toy/fast/seeds-0-1"]
+    return [*OPTIONS.split(), *map(str, given), *more]
+
+
+def call(arguments):
+    cli.run_main(finetune.main, finetune.FinetuneArgs, "Fine-tune.", argv=arguments)
+
+
+def run(home, method):
+    """A finished run of two seeds, made once for all tests of the module."""
+    folder = home / "finetune/toy/turned" / method / "seeds-0-1"
+    if not folder.exists():
+        call(argv(home, method))
+    return folder
+
+
+def complaint(arguments, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        call(arguments)
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and error.startswith("error: ") and error.count("\n") == 1
+    return error
+
+
+@pytest.mark.parametrize("method", ["sgft-sac", "sac"])
+def test_a_run_leaves_curve_summary_policies_and_every_rollout(home, method):
+    folder = run(home, method)
+    curve = read_jsonl(folder / "eval.jsonl")
+    assert [line["rollouts"] for line in curve] == [0, 2, 4, 5]
+    assert [line["step"] for line in curve] == [0, 40, 80, 100]  # 20 steps a rollout
+    assert curve[2]["robot_minutes"] == pytest.approx(4 * 20 * 0.1 / 60)
+    assert [line["rollouts"] for line in read_jsonl(folder / "metrics.jsonl")] == [2, 3, 4, 5]
+    assert all(len(line["success"]) == 2 for line in curve)
+    summary = json.loads((folder / "summary.json").read_text())
+    assert set(summary) == {"task", "method", "gap", "zero_shot", "final", "dip", "to_90", "seeds"}
+    assert summary["gap"]["effects"] == {"action_rotation": 0.52} and summary["final"]["transitions"] == 100
+    rollouts = RealLog(folder).load()
+    assert len(rollouts) == 5 and rollouts[0]["obs"].shape == (2, 20, 4) and rollouts[0]["valid"].all()
+    assert (folder / "figures/success.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("method", ["sgft-sac", "sac"])
+def test_value_and_statistics_of_the_prior_stay_frozen_and_its_actor_moves(home, method):
+    for seed in (0, 1):
+        before, _ = checkpoint.load_prior(home / f"pretrain/toy/fast/seeds-0-1/prior/seed-{seed}")
+        after, card = checkpoint.load_prior(run(home, method) / f"policy/seed-{seed}", task="toy")
+        jax.tree.map(np.testing.assert_array_equal, (before.value, before.normalizer), (after.value, after.normalizer))
+        assert not np.array_equal(before.actor["Dense_0"]["kernel"], after.actor["Dense_0"]["kernel"])
+        assert card["finetuned"]["method"] == method and card["finetuned"]["seed"] == seed
+
+
+def test_the_policies_are_what_the_run_evaluated(home, capsys):
+    found = evaluate.evaluate(evaluate.EvaluateArgs(run=run(home, "sac"), real=str(home / "turned.toml"), episodes=30))
+    assert [Path(p["policy"]).name for p in found["policies"]] == ["seed-0", "seed-1"]
+    final = read_jsonl(run(home, "sac") / "eval.jsonl")[-1]["return"]
+    assert [p["return"] for p in found["policies"]] == pytest.approx(final, abs=6.0)  # other episodes, 30 and 8
+
+
+def test_all_methods_meet_the_same_real_starts(home):
+    ours, theirs = (RealLog(run(home, method)).load() for method in ("sgft-sac", "sac"))
+    for i, (a, b) in enumerate(zip(ours, theirs, strict=True)):
+        np.testing.assert_array_equal(a["obs"][:, 0], b["obs"][:, 0])
+        assert np.array_equal(a["action"], b["action"]) == (i < 2)  # the initial rollouts are those of the prior
+    assert len({rollout["obs"][seed, 0].tobytes() for rollout in ours for seed in (0, 1)}) == 10
+
+
+def test_seeds_together_are_seeds_one_by_one(home, tmp_path):
+    both = read_jsonl(run(home, "sgft-sac") / "eval.jsonl")
+    for seed in (0, 1):
+        call(argv(home, "sgft-sac", "--seed", str(seed), seeds=1, out=tmp_path))
+        alone = read_jsonl(tmp_path / f"finetune/toy/turned/sgft-sac/seed-{seed}/eval.jsonl")
+        for a, b in zip(both, alone, strict=True):
+            assert a["return"][seed] == pytest.approx(b["return"][0], abs=0.02)
+    assert max(abs(line["return"][0] - line["return"][1]) for line in both) > 0.1
+
+
+@pytest.mark.parametrize("method", ["sgft-sac", "sac"])
+def test_killed_and_resumed_is_bit_for_bit_uninterrupted(home, tmp_path, method):
+    """SIGKILL after the rollout that follows the checkpoint at 4, whose line and rollout are on disk already."""
+    paths = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}", "SGFT_CACHE_DIR": str(TESTS.parent / ".cache/jax")}
+    arguments = argv(home, method, out=tmp_path)
+    killed = subprocess.run([sys.executable, "-c", PROGRAM, *arguments], env={**os.environ, **paths}, timeout=300)
+    cut = tmp_path / "finetune/toy/turned" / method / "seeds-0-1"
+    assert killed.returncode == -signal.SIGKILL and checkpoint.latest(cut) == 4
+    assert len(read_jsonl(cut / "metrics.jsonl")) == 4 and len(RealLog(cut)) == 5
+
+    call([*arguments, "--resume"])
+    for name in ("metrics.jsonl", "eval.jsonl", "summary.json"):
+        assert (cut / name).read_bytes() == (run(home, method) / name).read_bytes()
+    assert len(RealLog(cut)) == 5
+    assert len(list(cut.glob("real/superseded-0/*.npz"))) == 1  # what the robot did is kept
+
+
+def test_more_rollouts_continue_a_finished_run(home, tmp_path):
+    call(argv(home, "sac", "--rollouts", "4", out=tmp_path))
+    call(argv(home, "sac", "--rollouts", "5", "--resume", out=tmp_path))
+    grown = tmp_path / "finetune/toy/turned/sac/seeds-0-1"
+    assert (grown / "eval.jsonl").read_bytes() == (run(home, "sac") / "eval.jsonl").read_bytes()
+
+
+def test_a_rollout_is_on_disk_before_learning_from_it(home, tmp_path, monkeypatch):
+    def crash(*_):
+        raise RuntimeError("the learner died")
+
+    make = finetuning.make_program
+    monkeypatch.setattr(finetune, "make_program", lambda *a, **k: make(*a, **k)._replace(learn=crash))
+    with pytest.raises(RuntimeError, match="the learner died"):
+        call(argv(home, "sac", out=tmp_path))
+    real = RealLog(tmp_path / "finetune/toy/turned/sac/seeds-0-1").load()
+    assert len(real) == 2 and np.isfinite(real[1]["reward"]).all()
+
+
+def test_an_actor_that_knows_its_horizon_is_not_saved_as_a_plain_policy(home, tmp_path, capsys):
+    call(argv(home, "sgft", "--options.horizon", "2", out=tmp_path))
+    assert "no policy/" in capsys.readouterr().out
+    assert not (tmp_path / "finetune/toy/turned/sgft/seeds-0-1/policy").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--method", "sgft-sca"], "did you mean 'sgft-sac'?"),
+        (["--task", "toi"], "did you mean 'toy'?"),
+        (["--preset", "fats"], "did you mean 'fast'?"),
+        (["--real", "mild"], "toy has no gap 'mild'"),
+        (["--real", "nowhere.toml"], "nowhere.toml: No such file"),
+        (["--set", "latensy=1"], "toy has no domain parameter 'latensy'"),
+        (["--set", "latency"], "'latency' does not set anything"),
+        (["--prior", "nowhere"], "nowhere: holds no prior; make one with"),
+        (["--rolouts", "5"], "did you mean --rollouts?"),
+        (["--rollouts", "1"], "--initial-rollouts 2 is more than --rollouts 1"),
+        (["--eval-every", "0"], "--eval-every is 0: must be at least 1"),
+        (["--utd", "-1"], "--utd is -1.0: must be positive"),
+        (["--seeds", "0"], "there must be at least one"),
+        (["--resume"], "nothing to resume there"),
+    ],
+)
+def test_a_bad_command_is_one_line_and_code_2(home, tmp_path, more, words, capsys):
+    assert words in complaint([*argv(home, out=tmp_path), *more], capsys)
+    assert not list(tmp_path.iterdir())
+
+
+def test_another_configuration_does_not_continue_a_run(home, capsys):
+    run(home, "sac")
+    capsys.readouterr()
+    assert "exists already" in complaint(argv(home, "sac"), capsys)
+    assert "utd was 0.5, now 1.0" in complaint(argv(home, "sac", "--resume", "--utd", "1"), capsys)
+
+
+# ------------------------------------------------------------ video
+
+
+def states(*actions):
+    return np.array(actions, np.float32)
+
+
+def film(path, monkeypatch, scene=None, reason=None):
+    monkeypatch.setattr(toy, "SCENE", scene, raising=False)
+    monkeypatch.setattr(cli, "select_renderer", lambda: reason)
+    env = toy.make()
+    pool = env.sample_worlds(jax.random.key(0), 3)
+    act = lambda state, obs, key: state * -obs[:2]  # noqa: E731  (a spring of that stiffness)
+    return video.before_and_after(env, pool, act, states(0.0, 1.0), path / "v/e.mp4", rollouts=7), pool
+
+
+def test_no_scene_no_renderer_or_a_broken_one_is_a_notice(tmp_path, monkeypatch):
+    assert film(tmp_path, monkeypatch)[0] == "no video: toy has no scene to draw"
+    scene = object()
+    assert film(tmp_path, monkeypatch, scene, "no library")[0] == "no video: no library"
+    for error in (UserError("no graphics"), RuntimeError("no encoder\nat all")):
+        monkeypatch.setattr(
+            "envs.franka.render.render_side_by_side", lambda *_, error=error: (_ for _ in ()).throw(error)
+        )
+        assert film(tmp_path, monkeypatch, scene)[0] == f"no video: {str(error).splitlines()[0]}"
+
+
+def test_both_policies_are_filmed_from_one_start_in_one_world(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr("envs.franka.render.render_side_by_side", lambda *given: seen.append(given))
+    said, pool = film(tmp_path, monkeypatch, object())
+    _, thetas, (before, after), captions, path = seen[0]
+    assert said == f"video: {path}" and path.parent.exists()
+    assert thetas[0] == thetas[1] == np.asarray(pool.params[0]).tolist()
+    assert before.shape == after.shape == (21, 2)
+    np.testing.assert_array_equal(before[0], after[0])
+    np.testing.assert_array_equal(before, np.tile(before[0], (21, 1)))  # without force it stays where it is
+    assert np.linalg.norm(after[-1]) < np.linalg.norm(after[0])
+    assert captions[0].startswith("simulator's policy: ") and captions[1] == "after 7 real rollouts: success"
