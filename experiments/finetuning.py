@@ -62,7 +62,7 @@ def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
 
 
 def _over_seeds(function: Callable, axes: tuple[int | None, ...]) -> Callable:
-    """vmap over all arguments but the last, which is a static number."""
+    """Maps over all arguments but the last, which is a static number."""
     return lambda *args: jax.vmap(lambda *a: function(*a, args[-1]), axes)(*args[:-1])
 
 
