@@ -1,0 +1,232 @@
+"""Measure what gaps do: success of the simulator's policies on each real system, and of a policy trained right there.
+
+A gap is worth studying only if pretraining alone does not bridge it and a policy that does exists: it is admissible if
+zero-shot success is at most 40 % and training on the real system itself reaches 95 %.
+"""
+
+import functools
+import math
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from envs import gaps
+from envs.base import Env, World
+from envs.gaps import Gap
+from envs.rollout import pool_size
+from experiments import cli, common
+from experiments.evaluation import Best, Outcome, describe, grade, score
+from experiments.presets import PRESETS, PretrainConfig
+from experiments.pretrain import DEFAULT_PRESET, Saved, make_program
+from experiments.pretraining import PretrainState, make_pretrainer, replay_bytes
+from sgft_jax.log import MetricsLog, RunProgress, write_summary
+from sgft_jax.networks import NetworkConfig
+from sgft_jax.sac import extract_prior
+from sgft_jax.stats import iqm_interval
+from sgft_jax.types import Key, Metrics, Prior, UserError
+
+ZERO_SHOT_AT_MOST, TRAINED_AT_LEAST = 0.40, 0.95
+_RANDOM, _START = range(4, 6)  # purposes, folded into a seed's key
+_EXAM_SEED, _REPORT_SEED = 2**31 + 4, 2**31 + 5  # held-out worlds and episodes
+
+
+@dataclass(frozen=True)
+class GapsArgs:
+    """One table: a line per gap of a task."""
+
+    task: str = "push"
+    """push, hammer or insert."""
+    presets: tuple[str, ...] = ()
+    """Gaps to measure, by name or as .toml/.json files; default: all that come with the task."""
+    prior: Path | None = None
+    """Folder of a prior, or of several (prior/seed-*); default: those of <out>/pretrain/<task>/<preset>."""
+    preset: str = DEFAULT_PRESET
+    """Pretraining preset of the priors, and of the training on the real systems; --config.* changes the latter."""
+    config: PretrainConfig = field(default_factory=lambda: PRESETS[DEFAULT_PRESET])
+    """The settings themselves."""
+    train: bool = True
+    """Also train on every real system, all of them in one program; --no-train measures zero-shot success only."""
+    seed: int = 0
+    """First seed of that training."""
+    seeds: int = 1
+    """Policies trained per gap."""
+    episodes: int = 256
+    """Evaluation episodes per policy and gap, at least 200."""
+    out: Path = Path("runs")
+    """Parent of all run folders; the summary goes to <out>/gaps/<task>/summary.json."""
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line. The preset is looked up first, because it gives the other options their defaults."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    preset = common.option(argv, "--preset", DEFAULT_PRESET)
+    default = GapsArgs(preset=preset, config=PRESETS.get(preset, PRESETS[DEFAULT_PRESET]))
+    cli.run_main(measure, GapsArgs, __doc__ or "", argv=argv, default=default)
+
+
+def measure(args: GapsArgs) -> dict[str, Any]:
+    """Measures, prints a table, writes and returns the summary."""
+    cli.choose("--task", args.task, envs.TASKS)
+    cli.choose("--preset", args.preset, PRESETS)
+    if args.episodes < 200:
+        raise UserError(f"--episodes is {args.episodes}: a success rate needs at least 200 to tell 40 % from 50 %")
+    seeds = common.seed_list(args.seed, args.seeds)
+    env = envs.make(args.task)
+    found = [gaps.load(env, name) for name in args.presets or gaps.presets(args.task)]
+    if not found:
+        raise UserError(f"{args.task} comes with no gaps; name .toml or .json files with --presets")
+    if args.train:
+        make_pretrainer(env, args.config)  # sizes that do not fit together are reported before the long part
+    folder = args.out / "gaps" / args.task
+    folders = common.prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
+    priors, card = common.load_priors(folders, env)
+    here = _zero_shot(env, found, common.stack(priors), card, args.episodes)
+    there = _train(env, args, found, seeds, folder) if args.train else None
+    lines = [_line(gap, here[i], None if there is None else there[i]) for i, gap in enumerate(found)]
+    summary = {
+        "task": args.task,
+        "preset": args.preset,
+        "priors": [str(prior) for prior in folders],
+        "limits": {"zero_shot_at_most": ZERO_SHOT_AT_MOST, "trained_at_least": TRAINED_AT_LEAST},
+        "gaps": lines,
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    path = write_summary(folder, summary)
+    print("\n".join(table(lines)))
+    print(f"summary: {path}")
+    return summary
+
+
+def pools_of(env: Env, found: Sequence[Gap], key: Key, n: int) -> World:
+    """The real systems as pools of one size, [gaps, n]; [gaps, 1] where nothing varies in any of them."""
+    pools = [gaps.worlds(env, gap, key, n) for gap in found]
+    size = max(map(pool_size, pools))
+    repeat = lambda x: jnp.repeat(x, size // x.shape[0], axis=0)  # noqa: E731
+    return common.stack([jax.tree.map(repeat, pool) for pool in pools])
+
+
+def admissible(zero_shot: float, trained: float | None) -> bool | None:
+    """Whether a gap is neither bridged by pretraining alone nor impossible; None = training has not been measured."""
+    if zero_shot > ZERO_SHOT_AT_MOST:
+        return False
+    return None if trained is None else trained >= TRAINED_AT_LEAST
+
+
+def table(lines: Sequence[dict[str, Any]]) -> list[str]:
+    """The measurements for people, in per cent with 95 % intervals."""
+    rows = [("gap", "zero-shot %", "trained on real %", "admissible")]
+    for line in lines:
+        answer = {True: "yes", False: "no", None: "not known"}[line["admissible"]]
+        rows.append((line["gap"]["name"], _percent(line["zero_shot"]), _percent(line["trained"]), answer))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def _percent(found: dict[str, Any] | None) -> str:
+    if found is None:
+        return "-"
+    low, high = found["interval"]
+    return f"{100 * found['success']:.0f} [{100 * low:.0f}, {100 * high:.0f}]"
+
+
+def _line(gap: Gap, zero_shot: Outcome, trained: Outcome | None) -> dict[str, Any]:
+    zero, best = _rate(zero_shot), None if trained is None else _rate(trained)
+    verdict = admissible(zero["success"], None if best is None else best["success"])
+    return {"gap": gap._asdict(), "zero_shot": zero, "trained": best, "admissible": verdict}
+
+
+def _rate(outcome: Outcome) -> dict[str, Any]:
+    """Success of policies, [policies, episodes]: of one with its Wilson interval, of several as IQM over them."""
+    each = [describe(common.member(outcome, i)) for i in range(len(outcome.success))]
+    if len(each) == 1:
+        return {"success": each[0]["success"], "interval": each[0]["success/interval"], "policies": each}
+    band = iqm_interval(np.array([one["success"] for one in each]))
+    return {"success": float(band.estimate), "interval": [float(band.low), float(band.high)], "policies": each}
+
+
+def _zero_shot(env: Env, found: Sequence[Gap], priors: Prior, card: dict[str, Any], episodes: int) -> list[Outcome]:
+    """For each gap, the episodes of the priors [priors, episodes]; every policy plays the same ones."""
+    pools = pools_of(env, found, jax.random.key(_REPORT_SEED), episodes)
+    key = jax.random.fold_in(jax.random.key(_REPORT_SEED), 1)
+    graded = _grader(env, common.network_of(card), gamma=card["gamma"], episodes=episodes)
+    over_priors = jax.vmap(graded, (None, None, 0))
+    outcome = jax.tree.map(np.asarray, jax.jit(jax.vmap(over_priors, (None, 0, None)))(key, pools, priors))
+    return [common.member(outcome, i) for i in range(len(found))]
+
+
+def _grader(env: Env, network: NetworkConfig, *, gamma: float, episodes: int) -> Callable[[Key, World, Prior], Outcome]:
+    """(key, pool, prior) -> Outcome [episodes]."""
+    return lambda key, pool, prior: grade(env, network, pool, key, prior, gamma=gamma, episodes=episodes)
+
+
+# ------------------------------------------------------------ training on the real systems
+
+
+def _train(env: Env, args: GapsArgs, found: Sequence[Gap], seeds: list[int], folder: Path) -> list[Outcome]:
+    """For each gap, the episodes [seeds, episodes] of policies trained there and chosen by evaluations there.
+
+    All gaps and seeds are members [gaps * seeds] of one program: the real systems of a task differ in numbers alone.
+    """
+    config, count = args.config, len(found) * len(seeds)
+    print(f"replay and random-action data: {count * replay_bytes(env, config) / 2**30:.2f} GiB for {count} policies")
+
+    def members(seed: int, n: int) -> World:
+        """Worlds [gaps * seeds, n]; all seeds of a gap live in the same ones."""
+        pools = pools_of(env, found, jax.random.key(seed), n)
+        return jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), pools)
+
+    def examiner(seed: int, episodes: int) -> Callable[[Prior], Outcome]:
+        """Priors [gaps * seeds] -> Outcome [gaps * seeds, episodes], the same episodes every time."""
+        graded = _grader(env, config.network, gamma=config.gamma, episodes=episodes)
+        program = jax.jit(common.over_seeds(graded, count, shared=1))
+        return functools.partial(program, jax.random.fold_in(jax.random.key(seed), 1), members(seed, episodes))
+
+    program = make_program(env, config, seeds=count)
+    pools = members(seeds[0], config.worlds)
+    random_keys, start_keys = (jnp.tile(common.seed_keys(seeds, purpose), len(found)) for purpose in (_RANDOM, _START))
+    random = program.collect(pools, random_keys)
+    saved = program.begin(pools, random, start_keys)
+    chunk = functools.partial(program.chunk, pools, random)
+    best = _best(saved, chunk, examiner(_EXAM_SEED, config.eval_episodes), program.better, config, folder)
+    outcome = jax.tree.map(np.asarray, examiner(_REPORT_SEED, args.episodes)(best))
+    return [jax.tree.map(lambda x, i=i: x[i * len(seeds) :][: len(seeds)], outcome) for i in range(len(found))]
+
+
+def _best(
+    saved: Saved,
+    chunk: Callable[[PretrainState], tuple[PretrainState, Metrics]],
+    examine: Callable[[Prior], Outcome],
+    better: Callable[[Best, Best], Best],
+    config: PretrainConfig,
+    folder: Path,
+) -> Prior:
+    """Trains to the end, with a line in eval.jsonl per evaluation; the policies at their best evaluation."""
+    size = config.n_envs * config.chunk_steps
+    chunks = math.ceil(config.env_steps / size)
+    log, (run, best) = MetricsLog(folder), saved
+    log.truncate({})
+    with RunProgress("train on the real systems", total=chunks * size, unit="env steps") as progress:
+        for done in range(1, chunks + 1):
+            run, metrics = chunk(run)
+            log.metrics(done * size, metrics)
+            shown = {"train/success": float(metrics["train/success"].mean())}
+            if done % config.eval_every == 0 or done == chunks:
+                prior = extract_prior(run.learner)
+                scores = jax.vmap(score)(examine(prior))
+                log.eval(done * size, scores)
+                best = better(best, Best(prior, scores["success"], scores["return"], run.steps))
+                shown["success"] = float(scores["success"].mean())
+            progress.advance(size, shown)
+    log.close()
+    return best.prior
+
+
+if __name__ == "__main__":
+    main()
