@@ -88,15 +88,18 @@ def measure(args: GapsArgs) -> dict[str, Any]:
     folders = common.prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
     priors, card = common.load_priors(folders, env)
     here = _zero_shot(env, found, common.stack(priors), card, args.episodes)
-    there = _train(env, args, found, seeds, folder) if args.train else None
-    lines = [_line(gap, here[i], None if there is None else there[i]) for i, gap in enumerate(found)]
-    summary = {
-        "task": args.task,
-        "preset": args.preset,
-        "priors": [str(prior) for prior in folders],
-        "limits": {"zero_shot_at_most": ZERO_SHOT_AT_MOST, "trained_at_least": TRAINED_AT_LEAST},
-        "gaps": lines,
-    }
+    about = {"task": args.task, "preset": args.preset, "priors": [str(prior) for prior in folders]}
+    summary = _report(folder, about, [_line(gap, here[i], None) for i, gap in enumerate(found)])
+    if args.train:  # the long part: what is known already is on disk
+        there = _train(env, args, found, seeds, folder)
+        summary = _report(folder, about, [_line(gap, here[i], there[i]) for i, gap in enumerate(found)])
+    return summary
+
+
+def _report(folder: Path, about: dict[str, Any], lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """Writes the summary, which is returned, and prints the table."""
+    limits = {"zero_shot_at_most": ZERO_SHOT_AT_MOST, "trained_at_least": TRAINED_AT_LEAST}
+    summary = {**about, "limits": limits, "gaps": lines}
     folder.mkdir(parents=True, exist_ok=True)
     path = write_summary(folder, summary)
     print("\n".join(table(lines)))

@@ -1,0 +1,97 @@
+"""Figures and tables from run folders made by hand."""
+
+import json
+
+import numpy as np
+import pytest
+
+import envs
+from experiments import cli, figures
+from experiments.results import read_curve
+
+
+@pytest.fixture(autouse=True)
+def _cheap(monkeypatch):
+    monkeypatch.setitem(envs.TASKS, "toy", "toy")
+    monkeypatch.setattr(cli, "set_up", lambda: None)
+
+
+def save(out, method, success, *, rollouts, real="default", seeds="seeds-0-1", wanted=None):
+    """A run of task toy: success [evaluations][seeds] after so many rollouts of 20 steps of 0.1 s."""
+    folder = out / "finetune/toy" / real / method / seeds
+    folder.mkdir(parents=True)
+    with open(folder / "eval.jsonl", "w") as file:
+        for n, each in zip(rollouts, success, strict=True):
+            line = {"step": 20 * n, "rollouts": n, "robot_minutes": n * 20 * 0.1 / 60}
+            file.write(json.dumps({**line, "success": each, "return": each}) + "\n")
+    config = {"rollouts": wanted or rollouts[-1]}
+    (folder / "config.json").write_text(json.dumps({"sgft_jax": "0", "kind": "finetune", "config": config}))
+    return folder
+
+
+def call(*argv):
+    cli.run_main(figures.main, figures.FiguresArgs, "Draw.", argv=[str(a) for a in argv])
+
+
+def test_a_row_says_what_the_curve_says(tmp_path):
+    success = [[0.2, 0.4], [0.1, 0.1], [0.8, 1.0], [1.0, 1.0]]
+    curve = read_curve(save(tmp_path, "sac", success, rollouts=[0, 20, 50, 100]))
+    # Means 0.3, 0.1, 0.9, 1.0: dip 0.3 - 0.1 = 20 points; 90 % first at 50 rollouts = 1,000 transitions;
+    # 100 rollouts of 2 s are 3.3 min. Two seeds: the bootstrap interval reaches from one to the other.
+    cells = ["sac", "2", "30 [20, 40]", "10 [10, 10]", "90 [80, 100]", "100 [100, 100]", "1,000", "20", "3.3"]
+    assert figures.row("sac", curve) == cells and len(cells) == len(figures.COLUMNS)
+
+
+def test_budgets_not_reached_or_not_evaluated_stay_empty(tmp_path):
+    folder = save(tmp_path, "sac", [[0.5], [0.6], [0.7]], rollouts=[0, 19, 50], seeds="seed-0")
+    assert figures.row("sac", read_curve(folder)) == ["sac", "1", "50", "-", "70", "-", "never", "0", "1.7"]
+
+
+def test_one_figure_and_one_table_per_real_system(tmp_path, capsys, monkeypatch):
+    drawn = {}
+    monkeypatch.setattr(
+        figures.plot, "learning_curves", lambda path, curves, **more: drawn.update({path: (curves, more)}) or path
+    )
+    rising, flat = [[0.2, 0.3], [0.9, 1.0]], [[0.2, 0.3], [0.2, 0.2]]
+    for method, success in (("sac", flat), ("sgft-sac", rising)):
+        save(tmp_path, method, success, rollouts=[0, 20])
+    save(tmp_path, "sgft-sac", rising, rollouts=[0, 20], real="hard+latency=0.1", wanted=100)
+    save(tmp_path, "sgft-sac", [[0.2], [0.9]], rollouts=[0, 20], real="hard+latency=0.1", seeds="seed-0")
+    (tmp_path / "finetune/toy/default/mbpo/seed-0").mkdir(parents=True)
+    (tmp_path / "finetune/toy/default/mbpo/seed-0/eval.jsonl").touch()
+    call("--out", tmp_path, "--task", "toy")
+
+    text = (tmp_path / "figures/results.md").read_text()
+    assert text in capsys.readouterr().out
+    assert list(drawn) == [tmp_path / f"figures/toy-{real}.png" for real in ("default", "hard+latency=0.1")]
+    curves, more = drawn[tmp_path / "figures/toy-default.png"]
+    assert list(curves) == ["sgft-sac", "sac"]
+    assert more["zero_shot"] == 0.25 and more["rollout_length"] == 20 and more["control_dt"] == pytest.approx(0.1)
+    np.testing.assert_array_equal(curves["sac"][1], np.transpose(flat))
+    assert text.index("| sgft-sac | 2 |") < text.index("| sac | 2 |") and "![toy on the default real system]" in text
+    for missing in (
+        "- toy/default: pbrs: no run",
+        "holds no evaluation yet",
+        "- toy/hard+latency=0.1: sgft-sac: seed-0 left out, seeds-0-1 has more seeds or rollouts",
+        "- toy/hard+latency=0.1: sgft-sac: unfinished, 20 of 100 rollouts",
+    ):
+        assert missing in text
+
+
+def test_real_figures_are_drawn_and_untouched_gaps_are_named(tmp_path, capsys):
+    save(tmp_path, "sgft-sac", [[0.2, 0.3], [0.9, 1.0]], rollouts=[0, 20])
+    call("--out", tmp_path)
+    assert (tmp_path / "figures/toy-default.png").stat().st_size > 10_000
+    assert "- push/default: no run" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [(["--task", "toi"], "did you mean 'toy'?"), ([], "holds no evaluated run to draw; make one with")],
+)
+def test_a_bad_command_is_one_line_and_code_2(argv, words, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        call(*argv, "--out", tmp_path)
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and words in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
