@@ -68,4 +68,3 @@ def _over_seeds(function: Callable, axes: tuple[int | None, ...]) -> Callable:
 
 def _key(seed: Array, purpose: int, rollout: Array | int) -> Key:
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), purpose), rollout)
-
