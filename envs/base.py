@@ -28,7 +28,8 @@ class Effects(NamedTuple):
     """What no simulator parameter can express: how commands reach the robot and how its state is measured.
 
     action_scale: [act_dim] multiplies the commanded action.
-    action_rotation: [] rad, rotates the xy part of Cartesian commands (miscalibrated base frame); joint commands ignore it.
+    action_rotation: [] rad, rotates the xy part of Cartesian commands (a miscalibrated base frame). Tasks that command
+        joints refuse it.
     latency: [] s, how long the previous command stays in force at the start of each control period.
     latency_jitter: [] s, half-width of the uniform spread of the latency, redrawn at every step.
     obs_noise: [] raw units, std of Gaussian sensor noise.

@@ -92,7 +92,7 @@ def _override(env: Env, gap: Gap, text: str) -> Gap:
         parsed = json.loads(value)
     except ValueError:
         parsed = None
-    if not equals or not _is_value(parsed):
+    if not equals or parsed is None or not _is_value(parsed):
         raise UserError(f"'{text}' does not set anything; write name=number or name=[number,number]")
     changed = Gap(f"{gap.name}+{name}={value}", dict(gap.params), dict(gap.effects))
     (changed.effects if name in Effects._fields else changed.params)[name] = parsed

@@ -34,7 +34,8 @@ _STRUCTURE = (
 class PhysicsState(NamedTuple):
     """All that a MuJoCo step needs to continue exactly: everything else is recomputed from it.
 
-    qpos: [nq], qvel: [nv], warmstart: [nv] last acceleration, where the constraint solver starts. ctrl: [nu] last command.
+    qpos: [nq], qvel: [nv], warmstart: [nv] last acceleration, where the constraint solver starts.
+    ctrl: [nu] last command.
     """
 
     qpos: Array
@@ -44,7 +45,7 @@ class PhysicsState(NamedTuple):
 
 
 class Simulator(NamedTuple):
-    """A compiled scene: `model` is the nominal MJX model, `blank` the data a step starts from, `host` MuJoCo's model."""
+    """A compiled scene. model: the nominal MJX model; blank: the data a step starts from; host: MuJoCo's model."""
 
     model: mjx.Model
     blank: mjx.Data

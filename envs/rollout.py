@@ -48,7 +48,7 @@ def pool_size(pool: World) -> int:
 
 
 def launch(env: Env, pool: World, key: Key, n: int) -> Fleet:
-    """n environments, each in a random world of the pool, freshly reset."""
+    """N environments, each in a random world of the pool, freshly reset."""
     key_world, key_reset = jax.random.split(key)
     index = jax.random.randint(key_world, (n,), 0, pool_size(pool))
     return Fleet(index, jax.vmap(env.reset)(pick(pool, index), jax.random.split(key_reset, n)))
@@ -94,7 +94,8 @@ def play_episode(
         action, carry = policy(carry, state.obs, key_act)
         after = env.step(world, state, action, key_env)
         valid = ~(over | after.invalid)
-        row = jax.tree.map(lambda x: x[0], _transitions(*jax.tree.map(lambda x: x[None], (state, action, after)), gamma=gamma))
+        one = jax.tree.map(lambda x: x[None], (state, action, after))
+        row = jax.tree.map(lambda x: x[0], _transitions(*one, gamma=gamma))
         over = over | after.terminated | after.invalid
         return (after, carry, over), (row, valid, after.success & ~after.invalid, after.invalid, after.physics.qpos)
 
@@ -108,7 +109,7 @@ def play_episode(
 
 
 def _transitions(before: EnvState, actions: Array, after: EnvState, *, gamma: float | Array) -> Transition:
-    """Rows [n] of experience; exploded rows are zeroed, so that no NaN can travel further even if a mask is forgotten."""
+    """Rows [n] of experience; exploded rows are zeroed: no NaN can travel further even if a mask is forgotten."""
     clean = lambda x: jnp.where(after.invalid.reshape(-1, *[1] * (x.ndim - 1)), jnp.zeros_like(x), x)  # noqa: E731
     rows = Transition(
         obs=before.obs,

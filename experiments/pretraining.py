@@ -73,9 +73,11 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         """[updates, batch] rows, drawn at once; each batch holds its share of random-action rows."""
         key_random, key_replay = jax.random.split(key)
         updates, n_random = config.updates_per_step, round(config.random_fraction * config.batch_size)
-        draw = lambda source, key, n: jax.tree.map(  # noqa: E731
-            lambda x: x.reshape(updates, n, *x.shape[1:]), replay.sample(source, key, updates * n)
-        )
+
+        def draw(source: replay.ReplayState, key: Key, n: int) -> Transition:
+            rows = replay.sample(source, key, updates * n)
+            return jax.tree.map(lambda x: x.reshape(updates, n, *x.shape[1:]), rows)
+
         old, new = draw(random, key_random, n_random), draw(buffer, key_replay, config.batch_size - n_random)
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), old, new)
 
@@ -95,9 +97,7 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         return PretrainState(agent, buffer, fleet, keys[0], state.steps + 1), metrics
 
     def chunk(pool: World, random: replay.ReplayState, state: PretrainState) -> tuple[PretrainState, Metrics]:
-        state, metrics = jax.lax.scan(
-            lambda s, _: vector_step(pool, random, s), state, None, length=config.chunk_steps
-        )
+        state, metrics = jax.lax.scan(lambda s, _: vector_step(pool, random, s), state, None, length=config.chunk_steps)
         ended = jnp.maximum(metrics.pop("ended").sum(), 1.0)
         succeeded = metrics.pop("succeeded").sum()
         return state, {k: v.mean() for k, v in metrics.items()} | {"train/success": succeeded / ended}
@@ -153,9 +153,10 @@ def _example(env: Env) -> Transition:
 
 
 def _check(config: PretrainConfig) -> None:
+    one_step = f"one step of n_envs={config.n_envs}"
     if config.random_transitions < config.n_envs:
-        raise UserError(f"random_transitions={config.random_transitions} is less than one step of n_envs={config.n_envs}")
+        raise UserError(f"random_transitions={config.random_transitions} is less than {one_step}")
     if config.replay_capacity < config.n_envs:
-        raise UserError(f"replay_capacity={config.replay_capacity} cannot hold one step of n_envs={config.n_envs}")
+        raise UserError(f"replay_capacity={config.replay_capacity} cannot hold {one_step}")
     if not 0 <= config.random_fraction < 1:
         raise UserError(f"random_fraction={config.random_fraction} must be in [0, 1)")

@@ -1,9 +1,10 @@
 """A Franka Research 3 arm of primitive geoms, from public kinematic, limit and inertial facts.
 
 Kinematics: modified Denavit-Hartenberg table of the manufacturer. Limits: the manufacturer's position limits (the
-narrower box of constant velocity limits cannot point the gripper down closer than 0.3 m to the base). Link inertias follow from capsules of the published link masses; reflected motor inertia (armature)
-dominates the wrist. The arm touches nothing: only a task's tool has contacts, declared pair by pair, so that the
-simulator's contact buffers stay small.
+narrower box of constant velocity limits cannot point the gripper down closer than 0.3 m to the base). Link inertias
+follow from capsules of the published link masses; reflected motor inertia (armature) dominates the wrist. The arm
+touches nothing: only a task's tool has contacts, declared pair by pair, so that the simulator's contact buffers stay
+small.
 """
 
 import mujoco

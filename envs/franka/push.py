@@ -1,10 +1,10 @@
 """Pushing: slide a puck to the edge of the table, not over it. Paper section 6.2; sgft.md section 9.
 
-The table frame has its origin 0.2 m in front of the robot's base (O-25); observations and rewards live in it. The object's range of the paper's Table 2, [0, 0.3] m, starts at 0.15 m here: nearer to the base the
-gripper cannot point down behind it. Two
-fingertips, 4 cm apart, cradle the puck; they move in a plane just above the table. A flat puck tips over the edge when
-its centre passes it, so falling is an event on the centre's position: from then on the puck lies out of reach and the
-camera reports it 3 cm past the edge. Reward and success thus are functions of the observation alone.
+The table frame has its origin 0.2 m in front of the robot's base (O-25); observations and rewards live in it. The
+object's range of the paper's Table 2, [0, 0.3] m, starts at 0.15 m here: nearer to the base the gripper cannot point
+down behind it. Two fingertips, 4 cm apart, cradle the puck; they move in a plane just above the table. A flat puck tips
+over the edge when its centre passes it, so falling is an event on the centre's position: from then on the puck lies out
+of reach and the camera reports it 3 cm past the edge. Reward and success thus are functions of the observation alone.
 """
 
 import jax
@@ -14,8 +14,8 @@ import numpy as np
 
 from envs.base import Entry, Env, Parameter
 from envs.franka import arm, kinematics
-from envs.franka.kinematics import DOWN, Pose
 from envs.franka.arm import NO_CONTACT
+from envs.franka.kinematics import DOWN, Pose
 from envs.franka.task import Scene, at_rest, clip_joints, make_env, new_spec
 from envs.physics import PhysicsState
 from sgft_jax.types import Array, Key
@@ -72,7 +72,8 @@ def observe(params: Array, state: PhysicsState) -> Array:
 
 def reward(obs: Array, action: Array, next_obs: Array) -> Array:
     """[]: minus the hand's distance from its place behind the puck, minus the puck's from the edge, plus 1 when it is
-    within 2.5 cm of it, minus 1 when it fell. The paper prints the bonus with the wrong sign of inequality."""
+    within 2.5 cm of it, minus 1 when it fell. The paper prints the bonus with the wrong sign of inequality.
+    """
     hand, puck = next_obs[:2], next_obs[2:4]
     hand_distance = jnp.linalg.norm(hand - puck + jnp.array([BEHIND, 0.0]))
     edge_distance = jnp.abs(puck[0] - EDGE)
@@ -98,7 +99,7 @@ def initial(params: Array, key: Key) -> PhysicsState:
 
 
 def target(qpos: Array, action: Array) -> Array:
-    """[7] joint targets that move the hand by `action` * 5 cm from where it is, in the plane and inside the workspace."""
+    """[7] joint targets that move the hand by `action` * 5 cm from where it is, in its plane and workspace."""
     joints = qpos[: arm.N_JOINTS]
     here = kinematics.forward(joints).position[:2] - jnp.array([TABLE_ORIGIN, 0.0])
     goal = jnp.clip(here + STEP * action, jnp.asarray(WORKSPACE[0]), jnp.asarray(WORKSPACE[1]))
@@ -211,7 +212,7 @@ def _add_pair(spec: mujoco.MjSpec, geom1: str, geom2: str, friction: float, *, s
     pair = spec.add_pair(geomname1=geom1, geomname2=geom2, condim=4 if spin else 3, friction=friction_5d)
     if not spin:
         # Rubber fingertips: the contact stiffens over 3 mm instead of at once. Newton's method then converges in 4
-        # iterations on every contact we have seen; hard fingertips need more than 6 and throw the puck if they get fewer.
+        # iterations on every contact we have seen; hard fingertips need more than 6 and throw the puck with fewer.
         pair.solimp = [0.0, 0.95, 0.003, 0.5, 2.0]
 
 

@@ -1,4 +1,4 @@
-"""What all Franka tasks share: effects on commands and sensors, the 5 Hz control period, and the Env assembled from parts."""
+"""What all Franka tasks share: effects on commands and sensors, the 5 Hz control period, the Env made from parts."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -58,8 +58,8 @@ def new_spec(*, substeps: int, iterations: int, ls_iterations: int) -> mujoco.Mj
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     option.iterations, option.ls_iterations = iterations, ls_iterations
-    # The robot compensates its own weight, which is the same as none, and MuJoCo's per-body compensation costs a quarter
-    # of the simulation speed. A task gives weight to the objects that need it, see `push`.
+    # The robot compensates its own weight, which is the same as none, and MuJoCo's per-body compensation costs a
+    # quarter of the simulation speed. A task gives weight to the objects that need it, see `push`.
     option.gravity = np.zeros(3)
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     spec.worldbody.add_light(pos=[0.6, -0.6, 2.0], dir=[-0.1, 0.3, -1.0], castshadow=True)
@@ -87,7 +87,8 @@ def make_env(scene: Scene) -> Env:
             raise UserError(f"effect 'action_rotation' needs Cartesian actions; {scene.name} commands joints")
         low, high = ranges.T
         uniform = np.asarray(jax.random.uniform(key, (n, len(low))), np.float64)
-        return stack_worlds(low + (high - low) * uniform, make_effects({**TRAINING, **(effects or {})}, obs_dim, act_dim))
+        own = make_effects({**TRAINING, **(effects or {})}, obs_dim, act_dim)
+        return stack_worlds(low + (high - low) * uniform, own)
 
     def reset(world: World, key: Key) -> EnvState:
         key_start, key_noise = jax.random.split(key)
@@ -142,7 +143,7 @@ def _perturbed(scene: Scene, nominal: dict[str, float]) -> Iterator[mujoco.MjSpe
 
 
 def _ranges(scene: Scene, chosen: Mapping[str, float | Sequence[float]]) -> np.ndarray:
-    """[n_params, 2] low and high of every parameter: the training range unless `chosen` says a value or another range."""
+    """[n_params, 2] low and high of every parameter: the training range unless `chosen` says a value or a range."""
     ranges = {p.name: (p.low, p.high) for p in scene.parameters}
     for name, value in chosen.items():
         if name not in ranges:
@@ -159,7 +160,8 @@ def make_effects(values: Mapping[str, float | Sequence[float]], obs_dim: int, ac
 
     Raises UserError for unknown names, wrong lengths and negative latencies or noise.
     """
-    shapes = Effects((act_dim,), (), (), (), (), (), (obs_dim,))._asdict()
+    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(Effects._fields, ())
+    shapes |= {"action_scale": (act_dim,), "obs_bias": (obs_dim,)}
     unknown = sorted(set(values) - set(shapes))
     if unknown:
         raise UserError(f"no effect is called '{unknown[0]}'; there are: {', '.join(shapes)}")
