@@ -33,6 +33,8 @@ class FinetuneConfig:
     train_dynamics: keep fitting the ensemble, on real transitions only.
     actor_real_only: the actor learns from the real rows, the critic from all (O-11).
     lr_*: Adam learning rates. tau: target averaging rate. max_grad_norm: None = no clipping.
+    clip_shaped: bound on |r_bar|. V_sim falls off a cliff where a task can be lost for good (a puck over the edge): one such
+        row outweighs a thousand others in a squared error, and the sign is all a policy needs of it. None = as printed.
     replay_capacity: transitions; 20,000 hold 400 episodes of 50 steps, more than an hour of a real robot.
     """
 
@@ -48,11 +50,12 @@ class FinetuneConfig:
     actor_ramp: int = 200
     train_dynamics: bool = True
     actor_real_only: bool = True
-    lr_actor: float = 3e-4
+    lr_actor: float = 1e-4
     lr_critic: float = 3e-4
     lr_dynamics: float = 3e-4
     tau: float = 0.005
     max_grad_norm: float | None = None
+    clip_shaped: float | None = 2.0
     replay_capacity: int = 20_000
 
     def __post_init__(self) -> None:
@@ -174,6 +177,8 @@ def make_finetuner(
             )
             state = state.replace(dynamics=fit)
         batch = transform(imagine(state, keys[2]), real, keys[3])
+        if method.uses_value and config.clip_shaped is not None:
+            batch = batch._replace(reward=jnp.clip(batch.reward, -config.clip_shaped, config.clip_shaped))
         agent, more = learner.update(state.learner, batch, keys[4])
         metrics |= more | {"batch/reward_mean": jnp.mean(batch.reward), "batch/reward_std": jnp.std(batch.reward)}
         return state.replace(learner=agent), metrics

@@ -155,8 +155,8 @@ METHODS: dict[str, Method] = {
             "pbrs-branch", "branch shape", reset_critic=True,
             description="shaped reward and branches, infinite horizon: SGFT-SAC without shortening", source="SGFT 2025",
         ),
-        _method("sgft", "shape shorten", reset_critic=True, description="model-free SGFT", source="SGFT 2025"),
-        _method("sgft-sac", "branch shape shorten", reset_critic=True, description="SGFT-SAC", source="SGFT 2025"),
+        _method("sgft", "shape shorten", reset_critic=False, description="model-free SGFT", source="SGFT 2025"),
+        _method("sgft-sac", "branch shape shorten", reset_critic=False, description="SGFT-SAC", source="SGFT 2025"),
     )
 }  # fmt: skip
 
