@@ -178,6 +178,7 @@ def test_presets_give_the_defaults_that_single_options_change(monkeypatch):
     assert seen[0].config.n_envs == PRESETS["paper"].n_envs != PRESETS["fast"].n_envs
 
 
+@pytest.mark.slow
 def test_training_on_the_real_system_has_its_own_folder(tmp_path):
     gap = tmp_path / "strange.toml"
     gap.write_text("[params]\nmass = 2.0\nfriction = 4.0\n[effects]\naction_scale = 0.5\n")
