@@ -179,7 +179,7 @@ def _write(where: Path, tree: PyTree, facts: dict[str, Any]) -> None:
     where.mkdir(parents=True, exist_ok=True)
     # Orbax refuses arrays without elements; their shape in the manifest says all there is to say.
     if stored := {slot: x for slot, x in arrays.items() if x.size}:
-        ocp.save(str(where / _STATE), stored)
+        ocp.save(str((where / _STATE).absolute()), stored)
     impls = {_slot(i): str(jax.random.key_impl(x)) for i, (_, x) in enumerate(flat) if leaves[i].kind == "key"}
     files = {str(f.relative_to(where)): _fingerprint(f) for f in sorted(where.glob(f"{_STATE}/**/*")) if f.is_file()}
     manifest = {
@@ -202,7 +202,7 @@ def _read(where: Path, manifest: dict[str, Any]) -> list[Any]:
     stored: dict[str, np.ndarray] = {}
     if manifest["files"]:
         try:
-            stored = ocp.load(str(where / _STATE))
+            stored = ocp.load(str((where / _STATE).absolute()))
         except Exception as error:
             raise UserError(f"{where}: Orbax cannot read it: {str(error).splitlines()[0]}") from error
     return [

@@ -33,8 +33,8 @@ class FinetuneConfig:
     train_dynamics: keep fitting the ensemble, on real transitions only.
     actor_real_only: the actor learns from the real rows, the critic from all (O-11).
     lr_*: Adam learning rates. tau: target averaging rate. max_grad_norm: None = no clipping.
-    clip_shaped: bound on |r_bar|. V_sim falls off a cliff where a task can be lost for good (a puck over the edge): one such
-        row outweighs a thousand others in a squared error, and the sign is all a policy needs of it. None = as printed.
+    clip_shaped: bound on |r_bar|. V_sim falls off a cliff where a task can be lost for good (a puck over the edge): one
+        such row outweighs a thousand others in a squared error, and its sign is all a policy needs. None = as printed.
     replay_capacity: transitions; 20,000 hold 400 episodes of 50 steps, more than an hour of a real robot.
     """
 
