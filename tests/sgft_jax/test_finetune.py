@@ -77,13 +77,23 @@ def test_what_moves_and_what_is_frozen(prior, name, horizon):
 
 
 def test_frozen_dynamics_and_warm_up_keep_their_bits(prior):
-    tuner = make("sgft-sac", horizon=2, train_dynamics=False, critic_warmup=3)
+    tuner = make("sgft-sac", horizon=2, train_dynamics=False, critic_warmup=3, reset_critic=True)
     state = started(tuner, prior)
     warm, _ = tuner.learn(state, jax.random.key(1), 3)
     assert equal(state.learner.actor, warm.learner.actor) and equal(state.dynamics, warm.dynamics)
     assert not equal(state.learner.critic, warm.learner.critic)
     moved, _ = tuner.learn(warm, jax.random.key(2), 3)
     assert not equal(warm.learner.actor, moved.learner.actor)
+
+
+@pytest.mark.parametrize(
+    ("name", "clip", "bounded"), [("sgft", 0.01, True), ("sgft", None, False), ("sac", 0.01, False)]
+)
+def test_shaped_rewards_are_bounded_and_the_tasks_own_are_not(prior, name, clip, bounded):
+    tuner = make(name, clip_shaped=clip)
+    _, metrics = tuner.learn(started(tuner, prior), jax.random.key(1), 3)
+    assert (metrics["batch/reward_mean"] >= -0.01) == bounded  # the task's rewards are about -0.8
+    assert (metrics["batch/reward_std"] <= 0.02) == bounded
 
 
 @pytest.mark.parametrize("compiled", [False, True])

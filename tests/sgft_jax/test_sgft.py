@@ -214,8 +214,8 @@ def test_composition_runs_left_to_right_with_separate_keys(key):
         ("pbrs", True, False, True, False),
         ("mbpo", False, True, False, False),
         ("pbrs-branch", True, True, True, False),
-        ("sgft", True, False, True, True),
-        ("sgft-sac", True, True, True, True),
+        ("sgft", True, False, False, True),
+        ("sgft-sac", True, True, False, True),
     ],
 )
 def test_method_table(name, value, dynamics, reset, finite):
