@@ -85,6 +85,7 @@ PRESETS: dict[str, PretrainConfig] = {
         lr=1e-3,
         tau=0.02,
         alpha=0.1,
+        entropy_per_dim=-2.0,
         network=NetworkConfig(hidden=(64, 64), layer_norm=True),
         ensemble_size=3,
         chunk_steps=40,
