@@ -57,7 +57,7 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
             return (fleet, replay.add_batch(buffer, rows, valid)), None
 
         n_steps = config.random_transitions // config.n_envs
-        buffer = replay.init(_example(env), n_steps * config.n_envs)
+        buffer = replay.init(replay.blank(env.obs_dim, env.act_dim), n_steps * config.n_envs)
         start = (launch(env, pool, key_launch, config.n_envs), buffer)
         return jax.lax.scan(random_step, start, jax.random.split(key_steps, n_steps))[0][1]
 
@@ -67,7 +67,8 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         statistics = normalizer.update(normalizer.init(env.obs_dim), random.data.obs, held)
         agent = learner.init(key_learner).replace(normalizer=normalizer.finish(statistics))
         fleet = launch(env, pool, key_fleet, config.n_envs)
-        return PretrainState(agent, replay.init(_example(env), config.replay_capacity), fleet, key_run, jnp.int32(0))
+        buffer = replay.init(replay.blank(env.obs_dim, env.act_dim), config.replay_capacity)
+        return PretrainState(agent, buffer, fleet, key_run, jnp.int32(0))
 
     def sample(random: replay.ReplayState, buffer: replay.ReplayState, key: Key) -> Transition:
         """[updates, batch] rows, drawn at once; each batch holds its share of random-action rows."""
@@ -132,7 +133,7 @@ def sac_hyper(config: PretrainConfig) -> SACHyper:
 
 def replay_bytes(env: Env, config: PretrainConfig) -> int:
     """Bytes of the random-action data and the replay of one seed on the device."""
-    row = sum(x.nbytes for x in jax.tree.leaves(_example(env)))
+    row = sum(x.nbytes for x in jax.tree.leaves(replay.blank(env.obs_dim, env.act_dim)))
     return row * (config.random_transitions + config.replay_capacity)
 
 
@@ -144,12 +145,6 @@ def _fleet_metrics(after: EnvState, rows: Transition, valid: Array) -> Metrics:
         "ended": ended.sum().astype(jnp.float32),
         "succeeded": (ended & after.success).sum().astype(jnp.float32),
     }
-
-
-def _example(env: Env) -> Transition:
-    """A transition of zeros with the dtypes that are stored."""
-    obs, zero = jnp.zeros(env.obs_dim), jnp.float32(0)
-    return Transition(obs, jnp.zeros(env.act_dim), zero, zero, obs, jnp.bool_(False), jnp.int32(0))
 
 
 def _check(config: PretrainConfig) -> None:

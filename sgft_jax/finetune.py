@@ -142,7 +142,7 @@ def make_finetuner(
             dynamics=optim.start(optimiser, own.dynamics),
             value=own.value,
             normalizer=own.normalizer,
-            replay=replay.init(_example(obs_dim, act_dim), config.replay_capacity),
+            replay=replay.init(replay.blank(obs_dim, act_dim), config.replay_capacity),
         )
 
     def policy(agent: PyTree, obs: Array, k: Array, key: Key, *, explore: bool) -> Array:
@@ -188,9 +188,3 @@ def make_finetuner(
         return state, jax.tree.map(jnp.mean, metrics)
 
     return Finetuner(init, act, observe, learn)
-
-
-def _example(obs_dim: int, act_dim: int) -> Transition:
-    """A transition of zeros with the dtypes that are stored."""
-    obs, zero = jnp.zeros(obs_dim), jnp.float32(0)
-    return Transition(obs, jnp.zeros(act_dim), zero, zero, obs, jnp.bool_(False), jnp.int32(0))

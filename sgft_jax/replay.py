@@ -16,6 +16,12 @@ class ReplayState(NamedTuple):
     size: Array
 
 
+def blank(obs_dim: int, act_dim: int) -> Transition:
+    """A transition of zeros with the dtypes that are stored: the example that `init` needs."""
+    obs, zero = jnp.zeros(obs_dim), jnp.float32(0)
+    return Transition(obs, jnp.zeros(act_dim), zero, zero, obs, jnp.bool_(False), jnp.int32(0))
+
+
 def init(example: Transition, capacity: int) -> ReplayState:
     """An empty buffer for transitions shaped like `example` (one transition, no batch axis)."""
     if capacity < 1:
