@@ -66,7 +66,7 @@ def step_fleet(
     key_step, key_reset = jax.random.split(key)
     after = jax.vmap(env.step)(pick(pool, fleet.index), fleet.state, actions, jax.random.split(key_step, n))
     valid = ~after.invalid
-    transitions = _transitions(fleet.state, actions, after, gamma=gamma)
+    transitions = jax.vmap(lambda *step: _transition(*step, gamma=gamma))(fleet.state, actions, after)
     done = after.terminated | after.truncated | after.invalid
     # Fixed-length episodes end together, so most steps skip the (inverse kinematics of the) resets altogether.
     fleet = jax.lax.cond(
@@ -94,8 +94,7 @@ def play_episode(
         action, carry = policy(carry, state.obs, key_act)
         after = env.step(world, state, action, key_env)
         valid = ~(over | after.invalid)
-        one = jax.tree.map(lambda x: x[None], (state, action, after))
-        row = jax.tree.map(lambda x: x[0], _transitions(*one, gamma=gamma))
+        row = _transition(state, action, after, gamma=gamma)
         over = over | after.terminated | after.invalid
         return (after, carry, over), (row, valid, after.success & ~after.invalid, after.invalid, after.physics.qpos)
 
@@ -108,19 +107,18 @@ def play_episode(
     return Episode(rows, valid, total, success[last_valid] & ~exploded, exploded, start, qpos)
 
 
-def _transitions(before: EnvState, actions: Array, after: EnvState, *, gamma: float | Array) -> Transition:
-    """Rows [n] of experience; exploded rows are zeroed: no NaN can travel further even if a mask is forgotten."""
-    clean = lambda x: jnp.where(after.invalid.reshape(-1, *[1] * (x.ndim - 1)), jnp.zeros_like(x), x)  # noqa: E731
-    rows = Transition(
+def _transition(before: EnvState, action: Array, after: EnvState, *, gamma: float | Array) -> Transition:
+    """One row of experience; zeros if the physics exploded: no NaN can travel further even if a mask is forgotten."""
+    row = Transition(
         obs=before.obs,
-        action=actions,
+        action=action,
         reward=after.reward,
         discount=gamma * (1.0 - after.terminated.astype(jnp.float32)),
         next_obs=after.obs,
         truncated=after.truncated,
-        steps_to_go=jnp.zeros(after.time.shape, jnp.int32),
+        steps_to_go=jnp.zeros((), jnp.int32),
     )
-    return jax.tree.map(clean, rows)
+    return jax.tree.map(lambda x: jnp.where(after.invalid, jnp.zeros_like(x), x), row)
 
 
 def _select(mask: Array, new: PyTree, old: PyTree) -> PyTree:
