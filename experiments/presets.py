@@ -25,7 +25,9 @@ class PretrainConfig:
     replay_capacity: int = 1_000_000
     gamma: float = 0.99
     lr: float = 3e-4
-    """Adam learning rate of every network."""
+    """Adam learning rate of every network, at the start."""
+    lr_end: float = 1.0
+    """Share of it that is left at the end; it falls linearly. A falling rate settles V_sim and the last policies."""
     tau: float = 0.005
     """Averaging rate of the target critic."""
     alpha: float = 1.0
@@ -66,6 +68,7 @@ PRESETS: dict[str, PretrainConfig] = {
         random_fraction=0.1,
         gamma=0.97,
         lr=5e-4,
+        lr_end=0.05,
         tau=0.02,
         alpha=0.1,
         entropy_per_dim=-2.0,

@@ -91,7 +91,7 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         batches = sample(random, buffer, keys[3])
         agent, metrics = jax.lax.scan(
             lambda agent, x: learner.update(agent, *x),
-            state.learner,
+            state.learner.replace(hyper=sac_hyper(config, progress=state.steps / (config.env_steps / config.n_envs))),
             (batches, jax.random.split(keys[4], config.updates_per_step)),
         )
         metrics = {k: v.mean() for k, v in metrics.items()} | _fleet_metrics(after, rows, valid)
@@ -117,18 +117,20 @@ def sac_config(env: Env, config: PretrainConfig) -> SACConfig:
     )
 
 
-def sac_hyper(config: PretrainConfig) -> SACHyper:
-    """Its numbers: one learning rate for all networks, as in the paper."""
-    return SACHyper(
-        lr_actor=config.lr,
-        lr_critic=config.lr,
-        lr_value=config.lr,
-        lr_dynamics=config.lr,
-        lr_alpha=config.lr,
+def sac_hyper(config: PretrainConfig, *, progress: float | Array = 0.0) -> SACHyper:
+    """Its numbers at `progress` [] from 0 to 1: one learning rate for all networks, as in the paper."""
+    rate = config.lr * (1.0 - (1.0 - config.lr_end) * jnp.minimum(progress, 1.0))
+    hyper = SACHyper(
+        lr_actor=rate,
+        lr_critic=rate,
+        lr_value=rate,
+        lr_dynamics=rate,
+        lr_alpha=rate,
         tau=config.tau,
         alpha=config.alpha,
         entropy_per_dim=config.entropy_per_dim,
     )
+    return jax.tree.map(jnp.float32, hyper)
 
 
 def replay_bytes(env: Env, config: PretrainConfig) -> int:
