@@ -2,8 +2,9 @@
 
 MJX computes a kinematic chain level by level. XLA fuses a level into every later level that reads it and so computes it
 again and again, exponentially often in the length of the chain: on a CPU a 7-joint arm then spends most of its step
-in `mjx.kinematics`. An optimisation barrier after each level ends that. The numbers are unchanged; `python -m
-experiments.accuracy` and the parity tests run with it. For mujoco-mjx 3.17, whose internals this touches.
+in `mjx.kinematics`. An optimisation barrier after each level ends that: 50 to 26 microseconds a physics step of
+pushing on one core. On a GPU the fused kernels are the better ones (0.29 against 0.35 microseconds on an H200), so the
+barriers stay away there. For mujoco-mjx 3.17, whose internals this touches.
 """
 
 from collections.abc import Callable
@@ -13,12 +14,13 @@ from mujoco.mjx._src import scan
 
 from sgft_jax.types import PyTree
 
-_map_level = scan._nvmap  # noqa: SLF001
+_map_level = scan._nvmap
 
 
 def _fenced(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
     level = _map_level(function, *args)
-    return level if level is None else jax.lax.optimization_barrier(level)
+    fence = level is not None and jax.default_backend() == "cpu"
+    return jax.lax.optimization_barrier(level) if fence else level
 
 
-scan._nvmap = _fenced  # noqa: SLF001
+scan._nvmap = _fenced

@@ -15,7 +15,6 @@ import numpy as np
 from mujoco import mjx
 
 import envs.fences  # noqa: F401 - a repair of mjx, before its first use
-
 from sgft_jax.types import Array, UserError
 
 # Fields that only matter to a renderer: they may differ between worlds without being simulated.

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from envs.base import Env, World
 from envs.rollout import Episode
@@ -19,7 +20,7 @@ _INIT, _COLLECT, _LEARN, _EVALUATE = range(4)  # purposes, folded into a seed's 
 
 
 class Program(NamedTuple):
-    """Jitted functions over a leading seeds axis S. The state given to `learn` is donated.
+    """Compiled functions over a leading seeds axis S. The state given to `learn` is donated.
 
     init(priors [S], seeds [S]) -> state [S].
     collect(state, pool, seeds, rollout, n) -> Episode [S, n]: exploring episodes on the real system; n is static.
@@ -39,9 +40,12 @@ def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
     def init(prior: Prior, seed: Array) -> FinetuneState:
         return tuner.init(prior, _key(seed, _INIT, 0))
 
-    def collect(state: FinetuneState, pool: World, seed: Array, rollout: Array, n: int) -> Episode:
-        act = lambda obs, key: tuner.act(state, obs, key, explore=True)  # noqa: E731
-        return play_episodes(env, pool, act, _key(seed, _COLLECT, rollout), n, gamma=gamma)
+    def play(state: FinetuneState, pool: World, key: Key, explore: Array, n: int) -> Episode:
+        def act(obs: Array, key: Key) -> Array:
+            sample, mode = (tuner.act(state, obs, key, explore=choice) for choice in (True, False))
+            return jnp.where(explore, sample, mode)
+
+        return play_episodes(env, pool, act, key, n, gamma=gamma)
 
     def learn(
         state: FinetuneState, episodes: Episode, seed: Array, rollout: Array, updates: int
@@ -49,15 +53,21 @@ def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
         rows, valid = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (episodes.transitions, episodes.valid))
         return tuner.learn(tuner.observe(state, rows, valid), _key(seed, _LEARN, rollout), updates)
 
-    def evaluate(state: FinetuneState, pool: World, seed: Array, n: int) -> Metrics:
-        act = lambda obs, key: tuner.act(state, obs, key, explore=False)  # noqa: E731
-        return score(play_episodes(env, pool, act, _key(seed, _EVALUATE, 0), n, gamma=gamma))
+    # One program explores and evaluates: compiling the physics takes longer than many an experiment on a small machine.
+    played = jax.jit(_over_seeds(play, (0, None, 0, None)), static_argnums=4)
+    keys = jax.jit(jax.vmap(_key, (0, None, None)))
+
+    def collect(state: FinetuneState, pool: World, seeds: Array, rollout: int, n: int) -> Episode:
+        return played(state, pool, keys(seeds, _COLLECT, rollout), True, n)
+
+    def evaluate(state: FinetuneState, pool: World, seeds: Array, n: int) -> Metrics:
+        return jax.vmap(score)(played(state, pool, keys(seeds, _EVALUATE, 0), False, n))
 
     return Program(
         init=jax.jit(jax.vmap(init)),
-        collect=jax.jit(_over_seeds(collect, (0, None, 0, None)), static_argnums=4),
+        collect=collect,
         learn=jax.jit(_over_seeds(learn, (0, 0, 0, None)), static_argnums=4, donate_argnums=0),
-        evaluate=jax.jit(_over_seeds(evaluate, (0, None, 0)), static_argnums=3),
+        evaluate=evaluate,
     )
 
 
@@ -66,5 +76,5 @@ def _over_seeds(function: Callable, axes: tuple[int | None, ...]) -> Callable:
     return lambda *args: jax.vmap(lambda *a: function(*a, args[-1]), axes)(*args[:-1])
 
 
-def _key(seed: Array, purpose: int, rollout: Array | int) -> Key:
+def _key(seed: Array, purpose: int | Array, rollout: int | Array) -> Key:
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), purpose), rollout)

@@ -19,6 +19,9 @@ class PretrainConfig:
     """Random-action transitions: observation statistics and part of every batch."""
     random_fraction: float = 0.5
     """Share of each batch that comes from the random-action data (paper: 0.5)."""
+    random_ladder: float = 0.0
+    """Environment i of n acts uniformly at random in a share i / (n - 1) * random_ladder of its steps (0 = never), so
+    that V_sim knows what lies beside the policy's own path: a real system leads there."""
     updates_per_step: int = 16
     """Gradient steps per step of all environments."""
     batch_size: int = 4096
@@ -60,16 +63,20 @@ PRESETS: dict[str, PretrainConfig] = {
         replay_capacity=5_000_000,
         chunk_steps=200,
     ),
-    # What pays on one GPU today: thousands of environments, large batches, layer-normed critics, fast targets.
+    # What pays on one GPU today: learning needs some 30,000 updates whatever the number of environments, so enough of
+    # both to keep the device busy; layer-normed critics, fast targets, a falling learning rate.
     "fast": PretrainConfig(
-        n_envs=2048,
-        env_steps=4_000_000,
-        random_transitions=200_000,
+        n_envs=1024,
+        env_steps=1_500_000,
+        random_transitions=102_400,
         random_fraction=0.1,
+        random_ladder=1.0,
+        updates_per_step=32,
+        batch_size=1024,
         gamma=0.97,
         lr=5e-4,
         lr_end=0.05,
-        tau=0.02,
+        tau=0.01,
         alpha=0.1,
         entropy_per_dim=-2.0,
         network=_NORMED,

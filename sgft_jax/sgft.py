@@ -56,8 +56,11 @@ def shorten(horizon: int) -> BatchTransform:
     return transform
 
 
-def branch(horizon: int, branches: int, *, segments: bool = True) -> BatchTransform:
+def branch(horizon: int, branches: int, *, noise: float | Array = 0.0, segments: bool = True) -> BatchTransform:
     """Append `branches` imagined rollouts of `horizon` steps from every real observation, after the real rows.
+
+    noise: std of Gaussian noise on the policy's imagined actions, in units of the action's range [-1, 1]. The policy's
+    own actions say nothing about better ones; a model can be asked about any.
 
     B rows become B (1 + branches * horizon). segments: number the imagined steps H..1, else leave them 0 for methods
     with an infinite horizon. Past an imagined termination a rollout repeats its last transition: every row stays valid.
@@ -73,7 +76,7 @@ def branch(horizon: int, branches: int, *, segments: bool = True) -> BatchTransf
             carry: tuple[Transition, Array], inputs: tuple[Array, Key]
         ) -> tuple[tuple[Transition, Array], Transition]:
             last, alive = carry
-            new, terminated = _imagine(imagination, last.next_obs, *inputs)
+            new, terminated = _imagine(imagination, last.next_obs, *inputs, noise=noise)
             last = jax.tree.map(lambda n, o: jnp.where(alive, n, o).astype(o.dtype), new, last)
             return (last, alive & ~terminated), last
 
@@ -90,10 +93,13 @@ def branch(horizon: int, branches: int, *, segments: bool = True) -> BatchTransf
     return transform
 
 
-def _imagine(imagination: Imagination, obs: Array, k: Array, key: Key) -> tuple[Transition, Array]:
+def _imagine(
+    imagination: Imagination, obs: Array, k: Array, key: Key, *, noise: float | Array
+) -> tuple[Transition, Array]:
     """One imagined transition from obs with k steps to go, and whether it terminates."""
-    key_policy, key_dynamics = jax.random.split(key)
+    key_policy, key_noise, key_dynamics = jax.random.split(key, 3)
     action = imagination.policy(obs, k, key_policy)
+    action = jnp.clip(action + noise * jax.random.normal(key_noise, action.shape), -1.0, 1.0)
     next_obs = imagination.dynamics(obs, action, key_dynamics)
     terminated = imagination.terminated(obs, action, next_obs)
     discount = jnp.where(terminated, 0.0, imagination.gamma)
@@ -115,13 +121,13 @@ def compose(*transforms: BatchTransform) -> BatchTransform:
 class Method(NamedTuple):
     """One row of the comparison.
 
-    transforms(horizon, branches) -> the batch transforms in order.
+    transforms(horizon, branches, noise) -> the batch transforms in order; for branches and noise see `branch`.
     finite_horizon: the agent is told the steps to go (for horizon > 1). reset_critic: default at transfer.
     uses_value, uses_dynamics: what it takes from the prior besides the agent. shaped: rewards are r_bar.
     """
 
     name: str
-    transforms: Callable[[int, int], tuple[BatchTransform, ...]]
+    transforms: Callable[[int, int, float | Array], tuple[BatchTransform, ...]]
     finite_horizon: bool
     reset_critic: bool
     uses_value: bool
@@ -133,9 +139,9 @@ class Method(NamedTuple):
 def _method(name: str, parts: str, *, reset_critic: bool, description: str, source: str) -> Method:
     finite = "shorten" in parts
 
-    def transforms(horizon: int, branches: int) -> tuple[BatchTransform, ...]:
+    def transforms(horizon: int, branches: int, noise: float | Array) -> tuple[BatchTransform, ...]:
         built: dict[str, Callable[[], BatchTransform]] = {
-            "branch": lambda: branch(horizon, branches, segments=finite),
+            "branch": lambda: branch(horizon, branches, noise=noise, segments=finite),
             "shape": lambda: shape,
             "shorten": lambda: shorten(horizon),
         }

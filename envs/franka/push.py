@@ -4,7 +4,8 @@ The table frame has its origin 0.2 m in front of the robot's base (O-25); observ
 object's range of the paper's Table 2, [0, 0.3] m, starts at 0.15 m here: nearer to the base the gripper cannot point
 down behind it. Two fingertips, 4 cm apart, cradle the puck; they move in a plane just above the table. A flat puck tips
 over the edge when its centre passes it, so falling is an event on the centre's position: from then on the puck lies out
-of reach and the camera reports it 3 cm past the edge. Reward and success thus are functions of the observation alone.
+of reach and the camera reports it 3 cm past the edge, where it fell. Reward and success thus are functions of the
+observation alone.
 """
 
 import jax
@@ -110,7 +111,7 @@ def event(params: Array, state: PhysicsState) -> PhysicsState:
     """A puck whose centre passed the edge falls: it comes to rest out of reach, for good."""
     i = arm.N_JOINTS
     gone = state.qpos[i] - TABLE_ORIGIN > EDGE
-    lying = jnp.array([TABLE_ORIGIN + FALLEN_AT, 0.0, 0.0, 0.0])
+    lying = jnp.array([TABLE_ORIGIN + FALLEN_AT, 0.0, 0.0, 0.0]).at[1].set(state.qpos[i + 1])
     qpos = jnp.where(gone, state.qpos.at[i:].set(lying), state.qpos)
     qvel = jnp.where(gone, state.qvel.at[i:].set(0.0), state.qvel)
     return state._replace(qpos=qpos, qvel=qvel)

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -17,6 +18,7 @@ from experiments import pretrain
 from experiments.common import network_of
 from experiments.evaluation import Best, keep_better
 from experiments.presets import PRESETS
+from experiments.pretraining import make_pretrainer, sac_hyper
 from sgft_jax import checkpoint
 from sgft_jax.log import MetricsLog, read_jsonl
 from sgft_jax.types import Normalizer, Prior
@@ -198,3 +200,24 @@ def test_better_is_more_success_then_more_return():
     for success, total, steps in [(0.6, -9.0, 2), (0.5, 3.1, 2), (0.5, 3.0, 1), (0.5, 2.9, 1), (0.4, 9.0, 1)]:
         kept = keep_better(old, best(success, total, 2))
         assert kept.steps == steps and kept.prior.actor["w"].tolist() == [steps, steps]
+
+
+def test_the_learning_rate_falls_linearly_to_its_end():
+    config = replace(PRESETS["cpu"], lr=1e-3, lr_end=0.1)
+    rates = [float(sac_hyper(config, progress=progress).lr_critic) for progress in (0.0, 0.5, 1.0, 1.2)]
+    np.testing.assert_allclose(rates, [1e-3, 5.5e-4, 1e-4, 1e-4], rtol=1e-5)
+
+
+def test_random_actions_grow_along_the_fleet(key):
+    """With a full ladder the last environment explores at random, the first never: its data are those of no ladder."""
+    env, config = envs.make("toy"), replace(PRESETS["cpu"], n_envs=3, chunk_steps=10, random_transitions=30, worlds=4)
+    pool = env.sample_worlds(key, config.worlds)
+
+    def actions(ladder):
+        trainer = make_pretrainer(env, replace(config, random_ladder=ladder, updates_per_step=1, batch_size=4))
+        random = trainer.collect_random(pool, key)
+        state = trainer.init(pool, random, key)
+        return trainer.chunk(pool, random, state)[0].replay.data.action[:3]
+
+    plain, full = actions(0.0), actions(1.0)
+    assert jnp.array_equal(plain[0], full[0]) and not jnp.array_equal(plain[2], full[2])

@@ -171,18 +171,29 @@ def test_after_an_imagined_termination_the_terminal_row_repeats(key):
 
 def test_branches_draw_their_own_actions_and_know_the_steps_to_go(key):
     noisy = imagination(
-        policy=lambda obs, k, key: k + 0.1 * jax.random.uniform(key, (1,)),
+        policy=lambda obs, k, key: (k + 0.1 * jax.random.uniform(key, (1,))) / 10,
         terminated=lambda obs, action, next_obs: jnp.bool_(False),
     )
     out = sgft.branch(3, 4)(noisy, batch_of([0, 0], [0, 0], [0, 0]), key)
     imagined = out.action[2:, 0]
     assert len(set(imagined.tolist())) == 24
-    assert jnp.array_equal(jnp.floor(imagined), jnp.tile(jnp.array([3.0, 2.0, 1.0]), 8))
+    assert jnp.array_equal(jnp.floor(10 * imagined), jnp.tile(jnp.array([3.0, 2.0, 1.0]), 8))
+
+
+def test_branch_noise_spreads_the_imagined_actions_within_their_range(key):
+    rest, zeros = imagination(policy=lambda obs, k, key: jnp.zeros(1)), np.zeros(40)
+    quiet, spread, wide = (
+        sgft.branch(1, 50, noise=noise)(rest, batch_of(zeros, zeros, zeros), key).action[40:, 0]
+        for noise in (0, 0.3, 5)
+    )
+    assert jnp.all(quiet == 0)
+    assert abs(spread.std() - 0.3) < 0.02 and abs(spread.mean()) < 0.02  # 2,000 draws
+    assert jnp.abs(wide).max() == 1.0 and 0.7 < (jnp.abs(wide) == 1.0).mean() < 0.95
 
 
 def test_batch_accounting_of_the_paper(key):
     zeros = np.zeros(256)
-    transform = sgft.compose(*sgft.METHODS["sgft-sac"].transforms(1, 5))
+    transform = sgft.compose(*sgft.METHODS["sgft-sac"].transforms(1, 5, 0.0))
     out = transform(imagination(), batch_of(zeros, zeros, zeros), key)
     assert out.reward.shape == (1536,) and jnp.all(out.discount == 0)
 
@@ -227,7 +238,7 @@ def test_method_table(name, value, dynamics, reset, finite):
 @pytest.mark.parametrize("name", sgft.METHODS)
 def test_only_finite_horizons_cut_the_bootstrap(name, key):
     method = sgft.METHODS[name]
-    out = sgft.compose(*method.transforms(1, 2))(imagination(), batch_of([0, 1], [1, 2], [0, 0]), key)
+    out = sgft.compose(*method.transforms(1, 2, 0.0))(imagination(), batch_of([0, 1], [1, 2], [0, 0]), key)
     assert out.reward.shape == ((6,) if method.uses_dynamics else (2,))
     assert jnp.all(out.discount == (0 if method.finite_horizon else jnp.float32(GAMMA)))
 
