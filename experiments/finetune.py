@@ -52,7 +52,7 @@ class FinetuneArgs:
     """Real rollouts per seed, the initial ones included; may grow with --resume."""
     initial_rollouts: int = 20
     """Rollouts of the simulator's policy that fill the buffer before learning starts."""
-    utd: float = 2.0
+    utd: float = 8.0
     """Updates per real transition."""
     eval_every: int = 5
     """Rollouts between evaluations."""
@@ -119,6 +119,8 @@ class _Run:
         """Everything, in order. priors: [seeds]."""
         env = self.env
         config = replace(self.args.options, network=common.network_of(card), gamma=card["gamma"])
+        if config.critic_warmup is None:
+            config = replace(config, critic_warmup=self._updates(self.args.initial_rollouts))
         self.tuner = make_finetuner(
             self.method, config, obs_dim=env.obs_dim, act_dim=env.act_dim, reward=env.reward, terminated=env.terminated
         )
@@ -165,8 +167,7 @@ class _Run:
         episodes = self.program.collect(state, self.pool, self.numbers, done, n)
         self._store(episodes, n)
         collected = time.perf_counter()
-        updates = max(round(args.utd * n * self.env.episode_length), 1)
-        state, metrics = self.program.learn(state, episodes, self.numbers, done, updates)
+        state, metrics = self.program.learn(state, episodes, self.numbers, done, self._updates(n))
         real = {
             "real/return": np.asarray(episodes.total_reward).mean(1),
             "real/success": np.asarray(episodes.success).mean(1),
@@ -183,6 +184,9 @@ class _Run:
             self._checkpoint(state, done)
         self._time(done, collected - started, learned - collected)
         return state, shown
+
+    def _updates(self, rollouts: int) -> int:
+        return max(round(self.args.utd * self._transitions(rollouts)), 1)
 
     def _transitions(self, rollouts: int) -> int:
         return rollouts * self.env.episode_length

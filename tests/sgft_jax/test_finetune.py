@@ -115,8 +115,9 @@ def test_a_donated_state_leaves_the_prior_alone(prior, key, compiled):
     assert equal(before, plain.init(prior, key).learner)
 
 
-def test_kept_critics_need_no_warm_up(prior):
-    assert make("sac", critic_warmup=500).init(prior, jax.random.key(0)).learner.hyper.actor_start == 0
+@pytest.mark.parametrize(("warmup", "start"), [(None, 0), (0, 0), (500, 500)])
+def test_the_actor_waits_for_the_warm_up(prior, warmup, start):
+    assert make("sac", critic_warmup=warmup).init(prior, jax.random.key(0)).learner.hyper.actor_start == start
 
 
 @pytest.mark.parametrize("horizon", [1, 3])
