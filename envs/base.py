@@ -30,6 +30,7 @@ class Effects(NamedTuple):
     action_scale: [act_dim] multiplies the commanded action.
     action_rotation: [] rad, rotates the xy part of Cartesian commands (a miscalibrated base frame). Tasks that command
         joints refuse it.
+    action_bias: [act_dim] added to the command in units of its range, a drift: weight or encoders badly compensated.
     latency: [] s, how long the previous command stays in force at the start of each control period.
     latency_jitter: [] s, half-width of the uniform spread of the latency, redrawn at every step.
     obs_noise: [] raw units, std of Gaussian sensor noise.
@@ -39,6 +40,7 @@ class Effects(NamedTuple):
 
     action_scale: Array
     action_rotation: Array
+    action_bias: Array
     latency: Array
     latency_jitter: Array
     obs_noise: Array

@@ -24,7 +24,7 @@ class DemoArgs:
     """The real system, as in fine-tuning."""
     env_steps: int | None = None
     """Environment steps of pretraining, default: those of preset `cpu`."""
-    seeds: int = 4
+    seeds: int = 3
     """Fine-tuning seeds per method."""
     rollouts: int = 40
     """Real rollouts per seed, the 20 initial ones included."""
@@ -41,8 +41,9 @@ def main(args: DemoArgs) -> None:
     config = config if args.env_steps is None else replace(config, env_steps=args.env_steps)
     shared = {"task": args.task, "preset": "cpu", "out": args.out, "overwrite": True}
     pretrain(PretrainArgs(config=config, video=False, **shared))
-    # Smaller batches and one update per transition: what two cores can do; both methods get the same.
+    # Smaller batches and fewer updates: what two cores can do; both methods get the same.
     options = FinetuneConfig(batch_size=64)
+    initial = min(20, args.rollouts)
     for method in METHODS:
         finetune(
             FinetuneArgs(
@@ -50,10 +51,10 @@ def main(args: DemoArgs) -> None:
                 method=method,
                 seeds=args.seeds,
                 rollouts=args.rollouts,
-                initial_rollouts=min(20, args.rollouts),
-                utd=1.0,
+                initial_rollouts=initial,
+                utd=4.0,
                 eval_every=10,
-                eval_episodes=16,
+                eval_episodes=initial,  # the program that plays the initial rollouts serves again
                 options=options,
                 video=args.video and method == METHODS[0],
                 **shared,

@@ -35,7 +35,6 @@ from sgft_jax.types import Key, Prior
 DEFAULT_PRESET = "fast"
 _WORLDS, _RANDOM, _START, _REPORT = range(4)  # purposes, folded into a seed's key
 _EXAM_SEED, _REPORT_SEED = 2**31, 2**31 + 1  # held-out worlds and episodes, the same for every run
-REPORT_EPISODES = 256  # at least: a success rate then has a 95 % interval of +-6 points at worst
 
 
 @dataclass(frozen=True)
@@ -255,8 +254,8 @@ class _Run:
         return saved._replace(best=self.program.better(saved.best, now)), scores
 
     def _final_exam(self, prior: Prior) -> Outcome:
-        """[seeds, >= REPORT_EPISODES] new episodes in worlds that neither training nor the choice has seen."""
-        rounds = math.ceil(REPORT_EPISODES / self.config.eval_episodes)
+        """[seeds, >= report_episodes] new episodes in worlds that neither training nor the choice has seen."""
+        rounds = math.ceil(self.config.report_episodes / self.config.eval_episodes)
         keys = jax.random.split(jax.random.fold_in(jax.random.key(_REPORT_SEED), 1), rounds)
         outcomes = [self.program.grade(self.final, key, prior) for key in keys]
         return jax.tree.map(lambda *x: np.concatenate(x, axis=1), *outcomes)

@@ -161,7 +161,7 @@ def make_effects(values: Mapping[str, float | Sequence[float]], obs_dim: int, ac
     Raises UserError for unknown names, wrong lengths and negative latencies or noise.
     """
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(Effects._fields, ())
-    shapes |= {"action_scale": (act_dim,), "obs_bias": (obs_dim,)}
+    shapes |= {"action_scale": (act_dim,), "action_bias": (act_dim,), "obs_bias": (obs_dim,)}
     unknown = sorted(set(values) - set(shapes))
     if unknown:
         raise UserError(f"no effect is called '{unknown[0]}'; there are: {', '.join(shapes)}")
@@ -178,10 +178,10 @@ def make_effects(values: Mapping[str, float | Sequence[float]], obs_dim: int, ac
 
 
 def distort(effects: Effects, action: Array) -> Array:
-    """The action as the robot understands it: rotated in the xy plane if Cartesian, scaled. [act_dim] -> [act_dim]."""
+    """The action [act_dim] as the robot understands it: rotated in the xy plane if Cartesian, scaled, offset."""
     c, s = jnp.cos(effects.action_rotation), jnp.sin(effects.action_rotation)
     turned = jnp.stack([c * action[0] - s * action[1], s * action[0] + c * action[1]])
-    return effects.action_scale * action.at[:2].set(turned)
+    return effects.action_scale * action.at[:2].set(turned) + effects.action_bias
 
 
 def measure(effects: Effects, true_obs: Array, key: Key) -> Array:

@@ -21,10 +21,10 @@ def test_no_effects_change_nothing():
     np.testing.assert_array_equal(task.measure(none, jnp.arange(3.0), KEY), [0, 1, 2])
 
 
-def test_commands_are_turned_then_scaled():
-    quarter = effects(action_rotation=np.pi / 2, action_scale=[0.5, 2.0])
-    # x -> y and y -> -x, then scaled: (0.4, 0.2) -> (-0.2, 0.4) -> (-0.1, 0.8)
-    np.testing.assert_allclose(task.distort(quarter, jnp.array([0.4, 0.2])), [-0.1, 0.8], atol=1e-6)
+def test_commands_are_turned_then_scaled_then_offset():
+    quarter = effects(action_rotation=np.pi / 2, action_scale=[0.5, 2.0], action_bias=[0.0, 0.3])
+    # x -> y and y -> -x, then scaled and offset: (0.4, 0.2) -> (-0.2, 0.4) -> (-0.1, 0.8) -> (-0.1, 1.1)
+    np.testing.assert_allclose(task.distort(quarter, jnp.array([0.4, 0.2])), [-0.1, 1.1], atol=1e-6)
 
 
 def test_rotation_leaves_z_alone():
