@@ -13,10 +13,11 @@ import numpy as np
 
 import envs
 from envs import gaps
-from envs.base import Env
+from envs.base import Env, World
 from envs.gaps import Gap
 from envs.rollout import Episode
 from experiments import cli, common
+from experiments.evaluation import score
 from experiments.finetuning import make_program
 from experiments.presets import PRESETS
 from experiments.results import describe_run, read_curve
@@ -25,7 +26,7 @@ from sgft_jax import checkpoint, plot, runs
 from sgft_jax.finetune import FinetuneConfig, FinetuneState, make_finetuner
 from sgft_jax.log import MetricsLog, RealLog, RunProgress, write_summary
 from sgft_jax.sgft import Method, get_method
-from sgft_jax.types import Prior, PyTree, UserError
+from sgft_jax.types import Prior, UserError
 
 
 @dataclass(frozen=True)
@@ -199,10 +200,13 @@ class _Run:
             self.real.append({name: x[:, i] for name, x in arrays.items()})
 
     def _evaluate(self, state: FinetuneState, done: int) -> float:
-        scores = self.program.evaluate(state, self.pool, self.numbers, self.args.eval_episodes)
+        scores = jax.vmap(score)(self._examine(state, self.pool))
         minutes = self._transitions(done) * self.env.control_dt / 60
         self.log.eval(self._transitions(done), {"rollouts": done, "robot_minutes": minutes, **scores})
         return float(scores["success"].mean())
+
+    def _examine(self, state: FinetuneState, pool: World) -> Episode:
+        return self.program.evaluate(state, pool, self.numbers, self.args.eval_episodes)
 
     def _checkpoint(self, state: FinetuneState, done: int) -> None:
         meta = {**self.expect, "rollouts": done, "stored": len(self.real), "position": self.log.position()}
@@ -251,11 +255,11 @@ class _Run:
         return summary
 
     def _film(self, before: FinetuneState, after: FinetuneState, rollouts: int) -> str:
-        """The first seed's policy, told by its agent, which at the start is that of the simulator."""
-        states: PyTree = common.stack([common.member(before, 0), common.member(after, 0)])
-        act = lambda state, obs, key: self.tuner.act(state, obs, key, explore=False)  # noqa: E731
+        """The first episode of the first seed's evaluation, by its agent at the start and now, in the first world."""
+        first = lambda episodes: jax.tree.map(lambda x: np.asarray(x[0, 0]), episodes)  # noqa: E731  seed, episode
+        play = lambda pool: [first(self._examine(state, pool)) for state in (before, after)]  # noqa: E731
         path = self.folder / "videos" / f"seed-{self.seeds[0]}.mp4"
-        return before_and_after(self.env, self.pool, act, states, path, rollouts=rollouts)
+        return before_and_after(self.env, self.pool, play, path, rollouts=rollouts)
 
 
 def _check(args: FinetuneArgs) -> tuple[Method, list[int]]:

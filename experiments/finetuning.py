@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from envs.base import Env, World
 from envs.rollout import Episode
-from experiments.evaluation import play_episodes, score
+from experiments.evaluation import play_episodes
 from sgft_jax.finetune import Finetuner, FinetuneState
 from sgft_jax.types import Array, Key, Metrics, Prior
 
@@ -25,13 +25,13 @@ class Program(NamedTuple):
     init(priors [S], seeds [S]) -> state [S].
     collect(state, pool, seeds, rollout, n) -> Episode [S, n]: exploring episodes on the real system; n is static.
     learn(state, episodes, seeds, rollout, updates) -> (state, metrics [S]): store them, then `updates` steps (static).
-    evaluate(state, pool, seeds, n) -> metrics [S]: n episodes (static) with the mean action, the same ones every time.
+    evaluate(state, pool, seeds, n) -> Episode [S, n]: with the mean action, the same ones every time; n is static.
     """
 
     init: Callable[[Prior, Array], FinetuneState]
     collect: Callable[[FinetuneState, World, Array, int, int], Episode]
     learn: Callable[[FinetuneState, Episode, Array, int, int], tuple[FinetuneState, Metrics]]
-    evaluate: Callable[[FinetuneState, World, Array, int], Metrics]
+    evaluate: Callable[[FinetuneState, World, Array, int], Episode]
 
 
 def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
@@ -60,8 +60,8 @@ def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
     def collect(state: FinetuneState, pool: World, seeds: Array, rollout: int, n: int) -> Episode:
         return played(state, pool, keys(seeds, _COLLECT, rollout), True, n)
 
-    def evaluate(state: FinetuneState, pool: World, seeds: Array, n: int) -> Metrics:
-        return jax.vmap(score)(played(state, pool, keys(seeds, _EVALUATE, 0), False, n))
+    def evaluate(state: FinetuneState, pool: World, seeds: Array, n: int) -> Episode:
+        return played(state, pool, keys(seeds, _EVALUATE, 0), False, n)
 
     return Program(
         init=jax.jit(jax.vmap(init)),

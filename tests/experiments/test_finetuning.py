@@ -15,6 +15,7 @@ from test_common import save_prior
 
 import envs
 from experiments import cli, evaluate, finetune, finetuning, video
+from experiments.evaluation import play_episodes
 from sgft_jax import checkpoint
 from sgft_jax.log import RealLog, read_jsonl
 from sgft_jax.types import UserError
@@ -212,17 +213,18 @@ def test_another_configuration_does_not_continue_a_run(home, capsys):
 # ------------------------------------------------------------ video
 
 
-def states(*actions):
-    return np.array(actions, np.float32)
-
-
 def film(path, monkeypatch, scene=None, reason=None):
     monkeypatch.setattr(toy, "SCENE", scene, raising=False)
     monkeypatch.setattr(cli, "select_renderer", lambda: reason)
     env = toy.make()
     pool = env.sample_worlds(jax.random.key(0), 3)
-    act = lambda state, obs, key: state * -obs[:2]  # noqa: E731  (a spring of that stiffness)
-    return video.before_and_after(env, pool, act, states(0.0, 1.0), path / "v/e.mp4", rollouts=7), pool
+
+    def play(pool):
+        springs = [lambda obs, key, stiffness=stiffness: stiffness * -obs[:2] for stiffness in (0.0, 1.0)]
+        played = [play_episodes(env, pool, spring, jax.random.key(1), 1, gamma=1.0) for spring in springs]
+        return [jax.tree.map(lambda x: x[0], episodes) for episodes in played]
+
+    return video.before_and_after(env, pool, play, path / "v/e.mp4", rollouts=7), pool
 
 
 def test_no_scene_no_renderer_or_a_broken_one_is_a_notice(tmp_path, monkeypatch):
