@@ -122,10 +122,10 @@ class _Run:
         config = replace(self.args.options, network=common.network_of(card), gamma=card["gamma"])
         if config.critic_warmup is None:
             config = replace(config, critic_warmup=self._updates(self.args.initial_rollouts))
-        self.tuner = make_finetuner(
+        tuner = make_finetuner(
             self.method, config, obs_dim=env.obs_dim, act_dim=env.act_dim, reward=env.reward, terminated=env.terminated
         )
-        self.program = make_program(env, self.tuner, gamma=config.gamma)
+        self.program = make_program(env, tuner, gamma=config.gamma)
         make = lambda: self.program.init(priors, self.numbers)  # noqa: E731
         state, done = self._start(make)
         state = self._train(state, done)
