@@ -69,10 +69,10 @@ PRESETS: dict[str, PretrainConfig] = {
     # both to keep the device busy; layer-normed critics, fast targets, a falling learning rate.
     "fast": PretrainConfig(
         n_envs=1024,
-        env_steps=1_500_000,
+        env_steps=2_500_000,
         random_transitions=102_400,
         random_fraction=0.1,
-        random_ladder=1.0,
+        random_ladder=0.6,
         updates_per_step=32,
         batch_size=1024,
         gamma=0.97,
