@@ -5,6 +5,7 @@ compiler, and the fields in which the compiled models differ are stacked. That i
 and all constants derived from them), because no derived field is ever recomputed by hand.
 """
 
+import os
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
@@ -15,11 +16,13 @@ import numpy as np
 from mujoco import mjx
 
 import envs.fences  # noqa: F401 - a repair of mjx, before its first use
+from envs.native import Advance, make_advance
 from sgft_jax.types import Array, UserError
 
 # Fields that only matter to a renderer: they may differ between worlds without being simulated.
 _COSMETIC = ("geom_rgba", "mat_", "light_", "cam_")
 _MEAN_INERTIA = "stat.meaninertia"
+IMPL_VARIABLE, IMPLS = "SGFT_IMPL", ("auto", "jax", "c")
 _STRUCTURE = (
     "body_parentid",
     "jnt_type",
@@ -46,17 +49,40 @@ class PhysicsState(NamedTuple):
 
 
 class Simulator(NamedTuple):
-    """A compiled scene. model: the nominal MJX model; blank: the data a step starts from; host: MuJoCo's model."""
+    """A compiled scene. model: the nominal MJX model; blank: the data a step starts from; host: MuJoCo's model.
+
+    native: MuJoCo's C engine for the worlds of this scene, or None where MJX steps them.
+    """
 
     model: mjx.Model
     blank: mjx.Data
     host: mujoco.MjModel
+    native: Advance | None = None
 
 
 def make_simulator(spec: mujoco.MjSpec) -> Simulator:
-    """Compiles the nominal scene."""
+    """Compiles the nominal scene, to be stepped by MJX."""
     host = spec.compile()
     return Simulator(mjx.put_model(host, impl="jax"), mjx.make_data(host, impl="jax"), host)
+
+
+def with_impl(simulator: Simulator, fields: tuple[str, ...], impl: str) -> Simulator:
+    """The simulator stepped by "jax" (MJX) or by "c" (MuJoCo itself), for worlds that differ in `fields`."""
+    return simulator._replace(native=make_advance(simulator.host, fields, _MEAN_INERTIA) if impl == "c" else None)
+
+
+def choose_impl(wanted: str | None = None) -> str:
+    """Who steps the physics: "jax" (MJX) or "c" (MuJoCo's own engine).
+
+    wanted: one of them, or "auto", which is "c" where JAX computes on CPUs; default $SGFT_IMPL, or "auto". Raises
+    UserError for anything else.
+    """
+    impl = wanted or os.environ.get(IMPL_VARIABLE) or "auto"
+    if impl not in IMPLS:
+        raise UserError(f"{IMPL_VARIABLE}: there is no {impl!r}. Choose from: {', '.join(IMPLS)}")
+    if impl == "auto":
+        return "c" if jax.default_backend() == "cpu" else "jax"
+    return impl
 
 
 def varying_fields(simulator: Simulator, specs: Iterable[mujoco.MjSpec]) -> tuple[str, ...]:
@@ -104,9 +130,11 @@ def advance(
 ) -> PhysicsState:
     """Runs `substeps` steps; `control(i)` gives the command [nu] of substep i.
 
-    Between substeps only the minimal state is carried: it keeps the loop's memory traffic small.
+    MJX: between substeps only the minimal state is carried: it keeps the loop's memory traffic small.
     Matrix products run in full float32: TF32 is not enough for contact dynamics.
     """
+    if simulator.native is not None:
+        return simulator.native(fields, state, jax.vmap(control)(jnp.arange(substeps)))
     model = with_fields(simulator.model, fields)
 
     def substep(state: PhysicsState, i: Array) -> tuple[PhysicsState, None]:

@@ -40,9 +40,9 @@ def main(args: DemoArgs) -> None:
     config = PRESETS["cpu"]
     config = config if args.env_steps is None else replace(config, env_steps=args.env_steps)
     shared = {"task": args.task, "preset": "cpu", "out": args.out, "overwrite": True}
-    pretrain(PretrainArgs(config=config, video=False, **shared))
+    pretrain(PretrainArgs(config=config, report=False, video=False, **shared))
     # Smaller batches and fewer, larger updates: what two cores can do; both methods get the same.
-    options = FinetuneConfig(batch_size=64, lr_actor=3e-4, actor_ramp=300)
+    options = FinetuneConfig(batch_size=64, branches=2, lr_actor=3e-4, actor_ramp=300)
     initial = min(20, args.rollouts)
     for method in METHODS:
         finetune(

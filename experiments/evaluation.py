@@ -16,16 +16,14 @@ from sgft_jax.types import Array, Key, Metrics, Prior
 Act = Callable[[Array, Key], Array]
 
 
-def play_episodes(
-    env: Env, pool: World, act: Act, key: Key, n: int, *, gamma: float, length: int | None = None
-) -> Episode:
-    """N episodes [n, ...] of `act(obs, key) -> action`, each in a random world of the pool.
+def play_episodes(env: Env, pool: World, act: Act, keys: Key, *, gamma: float, length: int | None = None) -> Episode:
+    """Episodes [n, ...] of `act(obs, key) -> action`, one per key [n], each in a random world of the pool.
 
-    The same key gives the same worlds, starts and noise to every policy: differences between policies are paired.
+    A key gives the same world, start and noise to every policy: differences between policies are paired.
     """
     policy = lambda carry, obs, key: (act(obs, key), carry)  # noqa: E731
     one = lambda key: play_episode(env, pool, policy, (), key, gamma=gamma, length=length)  # noqa: E731
-    return jax.vmap(one)(jax.random.split(key, n))
+    return jax.vmap(one)(keys)
 
 
 class Outcome(NamedTuple):
@@ -62,7 +60,7 @@ def grade(
 ) -> Outcome:
     """That many episodes of the mean action."""
     act = prior_policy(env, prior, network, explore=False)
-    played = play_episodes(env, pool, act, key, episodes, gamma=gamma)
+    played = play_episodes(env, pool, act, jax.random.split(key, episodes), gamma=gamma)
     qpos = jnp.concatenate([played.start.physics.qpos[:, None], played.qpos], axis=1)
     return Outcome(played.success, played.total_reward, played.exploded, qpos)
 

@@ -22,7 +22,7 @@ from sgft_jax.types import UserError
 BUDGETS = (20, 50, 100)  # rollouts at which the table compares
 ORDER = tuple(reversed(METHODS))  # SGFT first, so that it keeps its colour whatever else there is
 COLUMNS = (
-    "method", "seeds", "zero-shot", *(f"{n} rollouts" for n in BUDGETS),
+    "method", "seeds", "zero-shot", *(f"{n} rollouts" for n in BUDGETS), "at the end (rollouts)",
     "transitions to 90 %", "deepest dip", "robot minutes",
 )  # fmt: skip
 _LEGEND = (
@@ -73,7 +73,8 @@ def figures(args: FiguresArgs) -> Path:
     target.mkdir(parents=True, exist_ok=True)
     sections = [_section(c, draw(c, target / f"{c.task}-{c.real}.png")) for c in drawn]
     missing = [f"- {c.task}/{c.real}: {note}" for c in comparisons for note in c.notes]
-    missing += [f"- {name}: no run" for name in _untouched(args.task, {(c.task, c.real) for c in comparisons})]
+    if untouched := _untouched(args.task, {(c.task, c.real) for c in comparisons}):
+        missing.append(f"- no run on {', '.join(untouched)}")
     if missing:
         sections.append("\n".join(["## Missing", "", *missing]))
     text = "\n\n".join(["# Fine-tuning results", _LEGEND, *sections])
@@ -86,12 +87,13 @@ def read_comparison(folder: Path) -> Comparison:
     """What the runs of <out>/finetune/<task>/<real>/<method>/<seeds>/ say."""
     curves: dict[str, Curve] = {}
     notes = []
+    runs = {method: sorted(folder.glob(f"{method}/*/{EVAL}")) for method in ORDER}
+    if absent := [method for method in ORDER if not runs[method]]:
+        notes.append(f"no run of {', '.join(absent)}")
     for method in ORDER:
-        runs = sorted(folder.glob(f"{method}/*/{EVAL}"))
-        if not runs:
-            notes.append(f"{method}: no run")
+        if not runs[method]:
             continue
-        curve, more = _choose(method, [run.parent for run in runs])
+        curve, more = _choose(method, [run.parent for run in runs[method]])
         notes += more
         if curve is not None:
             curves[method] = curve
@@ -119,6 +121,7 @@ def row(method: str, curve: Curve) -> list[str]:
         str(curve.success.shape[0]),
         _percent(curve.success[:, 0]),
         *(_at(curve, rollouts) for rollouts in BUDGETS),
+        f"{_percent(curve.success[:, -1])} ({curve.rollouts[-1]})",
         "never" if to_90 is None else f"{to_90:,}",
         f"{100 * facts['dip']['mean']:.0f}",
         f"{curve.robot_minutes[-1]:.1f}",

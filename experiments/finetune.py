@@ -13,7 +13,7 @@ import numpy as np
 
 import envs
 from envs import gaps
-from envs.base import Env, World
+from envs.base import Env
 from envs.gaps import Gap
 from envs.rollout import Episode
 from experiments import cli, common
@@ -26,7 +26,7 @@ from sgft_jax import checkpoint, plot, runs
 from sgft_jax.finetune import FinetuneConfig, FinetuneState, make_finetuner
 from sgft_jax.log import MetricsLog, RealLog, RunProgress, write_summary
 from sgft_jax.sgft import Method, get_method
-from sgft_jax.types import Prior, UserError
+from sgft_jax.types import Metrics, Prior, UserError
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,7 @@ class _Run:
         env = self.env
         config = replace(self.args.options, network=common.network_of(card), gamma=card["gamma"])
         if config.critic_warmup is None:
-            config = replace(config, critic_warmup=self._updates(self.args.initial_rollouts))
+            config = replace(config, critic_warmup=self.args.initial_rollouts * self._updates_per_rollout())
         tuner = make_finetuner(
             self.method, config, obs_dim=env.obs_dim, act_dim=env.act_dim, reward=env.reward, terminated=env.terminated
         )
@@ -168,7 +168,7 @@ class _Run:
         episodes = self.program.collect(state, self.pool, self.numbers, done, n)
         self._store(episodes, n)
         collected = time.perf_counter()
-        state, metrics = self.program.learn(state, episodes, self.numbers, done, self._updates(n))
+        state, metrics = self._learn(self.program.store(state, episodes), done, n)
         real = {
             "real/return": np.asarray(episodes.total_reward).mean(1),
             "real/success": np.asarray(episodes.success).mean(1),
@@ -186,8 +186,16 @@ class _Run:
         self._time(done, collected - started, learned - collected)
         return state, shown
 
-    def _updates(self, rollouts: int) -> int:
-        return max(round(self.args.utd * self._transitions(rollouts)), 1)
+    def _learn(self, state: FinetuneState, done: int, n: int) -> tuple[FinetuneState, Metrics]:
+        """The updates that N rollouts allow, in N equal parts, so that one compiled program serves any number."""
+        parts = []
+        for rollout in range(done, done + n):
+            state, metrics = self.program.learn(state, self.numbers, rollout, self._updates_per_rollout())
+            parts.append(metrics)
+        return state, {name: np.mean([part[name] for part in parts], axis=0) for name in parts[0]}
+
+    def _updates_per_rollout(self) -> int:
+        return max(round(self.args.utd * self._transitions(1)), 1)
 
     def _transitions(self, rollouts: int) -> int:
         return rollouts * self.env.episode_length
@@ -200,13 +208,10 @@ class _Run:
             self.real.append({name: x[:, i] for name, x in arrays.items()})
 
     def _evaluate(self, state: FinetuneState, done: int) -> float:
-        scores = jax.vmap(score)(self._examine(state, self.pool))
+        scores = jax.vmap(score)(self.program.evaluate(state, self.pool, self.numbers, self.args.eval_episodes))
         minutes = self._transitions(done) * self.env.control_dt / 60
         self.log.eval(self._transitions(done), {"rollouts": done, "robot_minutes": minutes, **scores})
         return float(scores["success"].mean())
-
-    def _examine(self, state: FinetuneState, pool: World) -> Episode:
-        return self.program.evaluate(state, pool, self.numbers, self.args.eval_episodes)
 
     def _checkpoint(self, state: FinetuneState, done: int) -> None:
         meta = {**self.expect, "rollouts": done, "stored": len(self.real), "position": self.log.position()}
@@ -257,7 +262,7 @@ class _Run:
     def _film(self, before: FinetuneState, after: FinetuneState, rollouts: int) -> str:
         """The first episode of the first seed's evaluation, by its agent at the start and now, in the first world."""
         first = lambda episodes: jax.tree.map(lambda x: np.asarray(x[0, 0]), episodes)  # noqa: E731  seed, episode
-        play = lambda pool: [first(self._examine(state, pool)) for state in (before, after)]  # noqa: E731
+        play = lambda pool: [first(self.program.evaluate(s, pool, self.numbers, 1)) for s in (before, after)]  # noqa: E731
         path = self.folder / "videos" / f"seed-{self.seeds[0]}.mp4"
         return before_and_after(self.env, self.pool, play, path, rollouts=rollouts)
 

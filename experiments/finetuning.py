@@ -1,4 +1,4 @@
-"""Fine-tuning of many seeds on one real system as jitted functions: collect, learn, evaluate. Pure.
+"""Fine-tuning of many seeds on one real system as jitted functions: collect, store, learn, evaluate. Pure.
 
 Every random draw of a run follows from (seed, purpose, rollout number), so no key is carried along, a resumed run draws
 what an uninterrupted one would have drawn, and all methods meet the same real starts.
@@ -20,17 +20,19 @@ _INIT, _COLLECT, _LEARN, _EVALUATE = range(4)  # purposes, folded into a seed's 
 
 
 class Program(NamedTuple):
-    """Compiled functions over a leading seeds axis S. The state given to `learn` is donated.
+    """Compiled functions over a leading seeds axis S. The state given to `store` and `learn` is donated.
 
     init(priors [S], seeds [S]) -> state [S].
-    collect(state, pool, seeds, rollout, n) -> Episode [S, n]: exploring episodes on the real system; n is static.
-    learn(state, episodes, seeds, rollout, updates) -> (state, metrics [S]): store them, then `updates` steps (static).
-    evaluate(state, pool, seeds, n) -> Episode [S, n]: with the mean action, the same ones every time; n is static.
+    collect(state, pool, seeds, rollout, n) -> Episode [S, n]: exploring episodes on the real system.
+    store(state, episodes) -> state.
+    learn(state, seeds, rollout, updates) -> (state, metrics [S]): that many updates (static) after that rollout.
+    evaluate(state, pool, seeds, n) -> Episode [S, n]: with the mean action; the first n of a fixed series of episodes.
     """
 
     init: Callable[[Prior, Array], FinetuneState]
     collect: Callable[[FinetuneState, World, Array, int, int], Episode]
-    learn: Callable[[FinetuneState, Episode, Array, int, int], tuple[FinetuneState, Metrics]]
+    store: Callable[[FinetuneState, Episode], FinetuneState]
+    learn: Callable[[FinetuneState, Array, int, int], tuple[FinetuneState, Metrics]]
     evaluate: Callable[[FinetuneState, World, Array, int], Episode]
 
 
@@ -40,41 +42,44 @@ def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
     def init(prior: Prior, seed: Array) -> FinetuneState:
         return tuner.init(prior, _key(seed, _INIT, 0))
 
-    def play(state: FinetuneState, pool: World, key: Key, explore: Array, n: int) -> Episode:
+    def play(state: FinetuneState, pool: World, keys: Key, explore: Array) -> Episode:
         def act(obs: Array, key: Key) -> Array:
             sample, mode = (tuner.act(state, obs, key, explore=choice) for choice in (True, False))
             return jnp.where(explore, sample, mode)
 
-        return play_episodes(env, pool, act, key, n, gamma=gamma)
+        return play_episodes(env, pool, act, keys, gamma=gamma)
 
-    def learn(
-        state: FinetuneState, episodes: Episode, seed: Array, rollout: Array, updates: int
-    ) -> tuple[FinetuneState, Metrics]:
+    def store(state: FinetuneState, episodes: Episode) -> FinetuneState:
         rows, valid = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (episodes.transitions, episodes.valid))
-        return tuner.learn(tuner.observe(state, rows, valid), _key(seed, _LEARN, rollout), updates)
+        return tuner.observe(state, rows, valid)
 
-    # One program explores and evaluates: compiling the physics takes longer than many an experiment on a small machine.
-    played = jax.jit(_over_seeds(play, (0, None, 0, None)), static_argnums=4)
-    keys = jax.jit(jax.vmap(_key, (0, None, None)))
+    def learn(state: FinetuneState, seeds: Array, rollout: Array, updates: int) -> tuple[FinetuneState, Metrics]:
+        one = lambda state, seed: tuner.learn(state, _key(seed, _LEARN, rollout), updates)  # noqa: E731
+        return jax.vmap(one)(state, seeds)
+
+    # One program explores and evaluates: compiling MJX takes longer than many an experiment on a small machine.
+    played = jax.jit(jax.vmap(play, (0, None, 0, None)))
+    keys = jax.jit(jax.vmap(_episode_keys, (0, None, None, None)), static_argnums=3)
 
     def collect(state: FinetuneState, pool: World, seeds: Array, rollout: int, n: int) -> Episode:
-        return played(state, pool, keys(seeds, _COLLECT, rollout), True, n)
+        return played(state, pool, keys(seeds, _COLLECT, rollout, n), True)
 
     def evaluate(state: FinetuneState, pool: World, seeds: Array, n: int) -> Episode:
-        return played(state, pool, keys(seeds, _EVALUATE, 0), False, n)
+        return played(state, pool, keys(seeds, _EVALUATE, 0, n), False)
 
     return Program(
         init=jax.jit(jax.vmap(init)),
         collect=collect,
-        learn=jax.jit(_over_seeds(learn, (0, 0, 0, None)), static_argnums=4, donate_argnums=0),
+        store=jax.jit(jax.vmap(store), donate_argnums=0),
+        learn=jax.jit(learn, static_argnums=3, donate_argnums=0),
         evaluate=evaluate,
     )
 
 
-def _over_seeds(function: Callable, axes: tuple[int | None, ...]) -> Callable:
-    """Maps over all arguments but the last, which is a static number."""
-    return lambda *args: jax.vmap(lambda *a: function(*a, args[-1]), axes)(*args[:-1])
-
-
 def _key(seed: Array, purpose: int | Array, rollout: int | Array) -> Key:
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), purpose), rollout)
+
+
+def _episode_keys(seed: Array, purpose: Array, rollout: Array, n: int) -> Key:
+    """Keys [n]; the first ones are the same for every n."""
+    return jax.vmap(lambda i: jax.random.fold_in(_key(seed, purpose, rollout), i))(jnp.arange(n))

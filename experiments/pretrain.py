@@ -55,6 +55,8 @@ class PretrainArgs:
     """Train on a "real" system instead of the simulator's domain: the name of a gap, or a .toml/.json file."""
     set: tuple[str, ...] = ()
     """Changes to that system, e.g. --set latency=0.05 action_scale=[1,0.5]."""
+    report: bool = True
+    """Also measure V_sim against returns and the models against the simulator: numbers on the card, a figure."""
     video: bool = True
     """Render an episode of the first prior, where MuJoCo can render."""
     out: Path = Path("runs")
@@ -110,7 +112,7 @@ def pretrain(args: PretrainArgs) -> dict[str, Any]:
         config=args,
         resume=args.resume,
         overwrite=args.overwrite,
-        volatile=("resume", "overwrite", "video", "out"),
+        volatile=("resume", "overwrite", "report", "video", "out"),
     )
     need = args.seeds * replay_bytes(env, args.config)
     print(f"replay and random-action data: {need / 2**30:.2f} GiB on the device for {args.seeds} seed(s)")
@@ -273,14 +275,15 @@ class _Run:
     def _hand_over(self, saved: Saved) -> dict[str, Any]:
         """Priors with their cards, report, figures, summary, closing words."""
         with self.clock("report"):
-            keys = common.seed_keys(self.seeds, _REPORT)
-            report = jax.tree.map(np.asarray, self.program.report(self.pools, saved.best.prior, keys))
+            report = self._report(saved.best.prior) if self.args.report else None
             outcome = self._final_exam(saved.best.prior)
         results = []
         for i, seed in enumerate(self.seeds):
-            one, best = common.member(report, i), common.member(saved.best, i)
-            found = {"seed": seed, **describe(common.member(outcome, i)), **numbers(one), **self._chosen(best)}
-            self._save_report(seed, one, i)
+            best = common.member(saved.best, i)
+            found = {"seed": seed, **describe(common.member(outcome, i)), **self._chosen(best)}
+            if report is not None:
+                found |= numbers(common.member(report, i))
+                self._save_report(seed, common.member(report, i), i)
             checkpoint.save_prior(
                 self.folder / "prior" / f"seed-{seed}", best.prior, prior_card(self.args, self.env, self.gap, found)
             )
@@ -299,6 +302,11 @@ class _Run:
             print(self._film(saved.best.prior))
         self._say(results)
         return summary
+
+    def _report(self, priors: Prior) -> Report:
+        """[seeds] measurements, as NumPy arrays."""
+        keys = common.seed_keys(self.seeds, _REPORT)
+        return jax.tree.map(np.asarray, self.program.report(self.pools, priors, keys))
 
     def _film(self, prior: Prior) -> str:
         """The first seed's prior in one of the worlds of the final exam; the program is that of the exam."""
@@ -334,11 +342,14 @@ class _Run:
     def _say(self, results: list[dict[str, Any]]) -> None:
         for found in results:
             low, high = found["success/interval"]
-            print(
+            line = (
                 f"seed {found['seed']}: success {found['success']:.3f} [{low:.3f}, {high:.3f}] in {found['episodes']} "
-                f"fresh episodes; V_sim explains {found['value/explained_variance']:.2f} of the variance of returns, "
-                f"rank correlation {found['value/rank_correlation']:.2f}"
             )
+            line += "fresh episodes"
+            if "value/explained_variance" in found:
+                line += f"; V_sim explains {found['value/explained_variance']:.2f} of the variance of returns, "
+                line += f"rank correlation {found['value/rank_correlation']:.2f}"
+            print(line)
         print(f"results: {self.folder}  (prior/, summary.json, figures/)")
         print(f"next: python -m experiments.finetune --task {self.env.name} --prior {self.folder}")
 

@@ -42,7 +42,7 @@ def make_report(
     """
     length = env.episode_length + math.ceil(3 / (1 - gamma))
     explore = prior_policy(env, prior, network, explore=True)
-    played = play_episodes(env, pool, explore, key, trajectories, gamma=gamma, length=length)
+    played = play_episodes(env, pool, explore, jax.random.split(key, trajectories), gamma=gamma, length=length)
     values, returns = jax.vmap(lambda e: _values(env, network, prior, e))(played)
     model, still = jax.vmap(lambda e: _model_errors(env, network, prior, e))(played)
     whole = ~played.exploded[:, None]

@@ -1,9 +1,10 @@
-"""CPU, two host devices, strict promotion: set before JAX starts."""
+"""CPU, MJX, two host devices, strict promotion: set before JAX starts."""
 
 import os
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MUJOCO_GL", "disable")
+os.environ["SGFT_IMPL"] = "jax"  # MJX, what GPUs run; tests/envs/test_native.py is about the other one
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
 
 import jax

@@ -66,11 +66,12 @@ def new_spec(*, substeps: int, iterations: int, ls_iterations: int) -> mujoco.Mj
     return spec
 
 
-def make_env(scene: Scene) -> Env:
-    """Assembles the Env of a scene: worlds, resets, steps."""
+def make_env(scene: Scene, impl: str | None = None) -> Env:
+    """Assembles the Env of a scene: worlds, resets, steps. impl: who steps the physics, see `physics.choose_impl`."""
     nominal = {p.name: p.nominal for p in scene.parameters}
     simulator = physics.make_simulator(scene.build(nominal))
     fields = physics.varying_fields(simulator, _perturbed(scene, nominal))
+    simulator = physics.with_impl(simulator, fields, physics.choose_impl(impl))
     obs_dim, act_dim = sum(e.size for e in scene.observation), sum(e.size for e in scene.action)
 
     def stack_worlds(params: np.ndarray, effects: Effects) -> World:

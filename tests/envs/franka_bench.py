@@ -39,3 +39,11 @@ def _lenient(function: Callable) -> Callable:
 def member(tree, i: int):
     """The i-th of a stacked pytree."""
     return jax.tree.map(lambda x: x[i], tree)
+
+
+def theta_of(scene, rng):
+    """Every parameter varied: inside its range, or by up to 10 % where training keeps it fixed."""
+    ranges = {
+        p.name: (p.low, p.high) if p.low < p.high else (0.9 * p.nominal, 1.1 * p.nominal) for p in scene.parameters
+    }
+    return {name: float(rng.uniform(*span)) for name, span in ranges.items()}

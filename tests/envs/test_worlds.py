@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from franka_bench import SCENES
+from franka_bench import SCENES, theta_of
 from mujoco import mjx
 
 from envs import physics
@@ -28,14 +28,6 @@ def differing(left, right, path=""):
         same = left.dtype == right.dtype and np.array_equal(left, right, equal_nan=left.dtype.kind == "f")
         return [] if same else [path]
     return [] if left == right else [path]
-
-
-def theta_of(scene, rng):
-    """Every parameter varied: inside its range, or by up to 10 % where training keeps it fixed."""
-    ranges = {
-        p.name: (p.low, p.high) if p.low < p.high else (0.9 * p.nominal, 1.1 * p.nominal) for p in scene.parameters
-    }
-    return {name: float(rng.uniform(*span)) for name, span in ranges.items()}
 
 
 def nominal(scene):

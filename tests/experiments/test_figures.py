@@ -38,7 +38,18 @@ def test_a_row_says_what_the_curve_says(tmp_path):
     curve = read_curve(save(tmp_path, "sac", success, rollouts=[0, 20, 50, 100]))
     # Means 0.3, 0.1, 0.9, 1.0: dip 0.3 - 0.1 = 20 points; 90 % first at 50 rollouts = 1,000 transitions;
     # 100 rollouts of 2 s are 3.3 min. Two seeds: the bootstrap interval reaches from one to the other.
-    cells = ["sac", "2", "30 [20, 40]", "10 [10, 10]", "90 [80, 100]", "100 [100, 100]", "1,000", "20", "3.3"]
+    cells = [
+        "sac",
+        "2",
+        "30 [20, 40]",
+        "10 [10, 10]",
+        "90 [80, 100]",
+        "100 [100, 100]",
+        "100 [100, 100] (100)",
+        "1,000",
+        "20",
+        "3.3",
+    ]
     assert figures.row("sac", curve) == cells and len(cells) == len(figures.COLUMNS)
 
 
@@ -70,7 +81,7 @@ def test_one_figure_and_one_table_per_real_system(tmp_path, capsys, monkeypatch)
     np.testing.assert_array_equal(curves["sac"][1], np.transpose(flat))
     assert text.index("| sgft-sac | 2 |") < text.index("| sac | 2 |") and "![toy on the default real system]" in text
     for missing in (
-        "- toy/default: pbrs: no run",
+        "- toy/default: no run of sgft, pbrs-branch, pbrs, sac-reset",
         "holds no evaluation yet",
         "- toy/hard+latency=0.1: sgft-sac: seed-0 left out, seeds-0-1 has more seeds or rollouts",
         "- toy/hard+latency=0.1: sgft-sac: unfinished, 20 of 100 rollouts",
@@ -82,7 +93,7 @@ def test_real_figures_are_drawn_and_untouched_gaps_are_named(tmp_path, capsys):
     save(tmp_path, "sgft-sac", [[0.2, 0.3], [0.9, 1.0]], rollouts=[0, 20])
     call("--out", tmp_path)
     assert (tmp_path / "figures/toy-default.png").stat().st_size > 10_000
-    assert "- push/default: no run" in capsys.readouterr().out
+    assert "- no run on push/mild, push/default, push/hard, hammer/mild" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

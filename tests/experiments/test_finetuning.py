@@ -221,7 +221,9 @@ def film(path, monkeypatch, scene=None, reason=None):
 
     def play(pool):
         springs = [lambda obs, key, stiffness=stiffness: stiffness * -obs[:2] for stiffness in (0.0, 1.0)]
-        played = [play_episodes(env, pool, spring, jax.random.key(1), 1, gamma=1.0) for spring in springs]
+        played = [
+            play_episodes(env, pool, spring, jax.random.split(jax.random.key(1), 1), gamma=1.0) for spring in springs
+        ]
         return [jax.tree.map(lambda x: x[0], episodes) for episodes in played]
 
     return video.before_and_after(env, pool, play, path / "v/e.mp4", rollouts=7), pool
