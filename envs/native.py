@@ -1,12 +1,13 @@
 """MuJoCo's C engine behind `jax.pure_callback`: the same steps as MJX's, on the host. Impure inside, pure outside.
 
-On a CPU, XLA's program of an MJX step takes several times as long as C MuJoCo, and seconds to compile; see
-docs/physics.md for how closely the two agree. Worlds are stepped by as many threads as there are cores.
+On a CPU, XLA's program of an MJX step takes two to three times as long as C MuJoCo's, and many seconds to compile. The
+worlds of a batch are shared among as many threads as there are cores.
 """
 
 import concurrent.futures
 import copy
 import os
+import threading
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -20,7 +21,7 @@ Advance = Callable[[dict[str, Array], PyTree, Array], PyTree]
 
 
 class _Slot(NamedTuple):
-    """What one world is stepped in. views: name of a field -> the array inside `model`."""
+    """What a thread steps worlds in, one after another. views: name of a field -> the array inside `model`."""
 
     model: mujoco.MjModel
     data: mujoco.MjData
@@ -37,8 +38,10 @@ def make_advance(host: mujoco.MjModel, fields: tuple[str, ...], mean_inertia: st
     nominal = copy.deepcopy(host)
     nominal.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     arrays = tuple(name for name in fields if name != mean_inertia)
+    cores = os.cpu_count() or 1
+    threads = concurrent.futures.ThreadPoolExecutor(cores)
     slots: list[_Slot] = []
-    threads = concurrent.futures.ThreadPoolExecutor(os.cpu_count())
+    lock = threading.Lock()  # XLA may run two programs at once
 
     def new_slot() -> _Slot:
         model = copy.deepcopy(nominal)
@@ -49,19 +52,19 @@ def make_advance(host: mujoco.MjModel, fields: tuple[str, ...], mean_inertia: st
         lead = state.qpos.shape[:-1]
         flat = lambda x: x.reshape(-1, *x.shape[len(lead) :])  # noqa: E731
         values, state, controls = jax.tree.map(flat, (values, state, controls))
-        slots.extend(new_slot() for _ in range(len(controls) - len(slots)))
         after = jax.tree.map(np.empty_like, state)
 
-        def run(worlds: range) -> None:
-            for i in worlds:
-                _enter(slots[i], {name: x[i] for name, x in values.items()}, mean_inertia)
-                _steps(slots[i], jax.tree.map(lambda x, i=i: x[i], state), controls[i])
-                data = slots[i].data
-                after.qpos[i], after.qvel[i], after.warmstart[i] = data.qpos, data.qvel, data.qacc_warmstart
-                after.ctrl[i] = controls[i, -1]
+        def run(k: int) -> None:
+            slot = slots[k]
+            for i in range(k, len(controls), cores):
+                _enter(slot, {name: x[i] for name, x in values.items()}, mean_inertia)
+                _steps(slot, jax.tree.map(lambda x, i=i: x[i], state), controls[i])
+                after.qpos[i], after.qvel[i] = slot.data.qpos, slot.data.qvel
+                after.warmstart[i], after.ctrl[i] = slot.data.qacc_warmstart, controls[i, -1]
 
-        count = min(os.cpu_count() or 1, len(controls))
-        list(threads.map(run, [range(k, len(controls), count) for k in range(count)]))
+        with lock:
+            slots.extend(new_slot() for _ in range(cores - len(slots)))
+            list(threads.map(run, range(min(cores, len(controls)))))
         return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), after)
 
     def advance(values: dict[str, Array], state: PyTree, controls: Array) -> PyTree:

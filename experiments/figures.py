@@ -107,7 +107,7 @@ def draw(comparison: Comparison, path: Path) -> Path:
         path,
         {method: (curve.transitions, curve.success) for method, curve in comparison.curves.items()},
         title=f"{comparison.task} on the {comparison.real} real system",
-        zero_shot=float(first.success[:, 0].mean()),
+        zero_shot=float(iqm_interval(first.success[:, 0]).estimate),
         **_robot_time(comparison.curves),
     )
 

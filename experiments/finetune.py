@@ -13,7 +13,7 @@ import numpy as np
 
 import envs
 from envs import gaps
-from envs.base import Env
+from envs.base import Env, World
 from envs.gaps import Gap
 from envs.rollout import Episode
 from experiments import cli, common
@@ -26,7 +26,8 @@ from sgft_jax import checkpoint, plot, runs
 from sgft_jax.finetune import FinetuneConfig, FinetuneState, make_finetuner
 from sgft_jax.log import MetricsLog, RealLog, RunProgress, write_summary
 from sgft_jax.sgft import Method, get_method
-from sgft_jax.types import Metrics, Prior, UserError
+from sgft_jax.stats import iqm_interval
+from sgft_jax.types import Prior, UserError
 
 
 @dataclass(frozen=True)
@@ -186,7 +187,7 @@ class _Run:
         self._time(done, collected - started, learned - collected)
         return state, shown
 
-    def _learn(self, state: FinetuneState, done: int, n: int) -> tuple[FinetuneState, Metrics]:
+    def _learn(self, state: FinetuneState, done: int, n: int) -> tuple[FinetuneState, dict[str, np.ndarray]]:
         """The updates that N rollouts allow, in N equal parts, so that one compiled program serves any number."""
         parts = []
         for rollout in range(done, done + n):
@@ -247,7 +248,7 @@ class _Run:
             self.folder / "figures" / "success.png",
             {args.method: (curve.transitions, curve.success)},
             title=f"{args.task} on the {self.gap.name} real system",
-            zero_shot=float(curve.success[:, 0].mean()),
+            zero_shot=float(iqm_interval(curve.success[:, 0]).estimate),
             rollout_length=self.env.episode_length,
             control_dt=self.env.control_dt,
         )
@@ -260,9 +261,18 @@ class _Run:
         return summary
 
     def _film(self, before: FinetuneState, after: FinetuneState, rollouts: int) -> str:
-        """The first episode of the first seed's evaluation, by its agent at the start and now, in the first world."""
-        first = lambda episodes: jax.tree.map(lambda x: np.asarray(x[0, 0]), episodes)  # noqa: E731  seed, episode
-        play = lambda pool: [first(self.program.evaluate(s, pool, self.numbers, 1)) for s in (before, after)]  # noqa: E731
+        """An evaluation episode of the first seed, in the first world, by its agent at the start and now.
+
+        The first one that only the tuned agent solves: what fine-tuning is about. Without one, the first.
+        """
+
+        def play(pool: World) -> list[Episode]:
+            n = self.args.eval_episodes
+            both = [self.program.evaluate(state, pool, self.numbers, n) for state in (before, after)]
+            old, new = (np.asarray(episodes.success[0]) for episodes in both)
+            chosen = int(np.argmax(new & ~old))
+            return [jax.tree.map(lambda x: np.asarray(x[0, chosen]), episodes) for episodes in both]
+
         path = self.folder / "videos" / f"seed-{self.seeds[0]}.mp4"
         return before_and_after(self.env, self.pool, play, path, rollouts=rollouts)
 

@@ -83,8 +83,8 @@ PRESETS: dict[str, PretrainConfig] = {
         entropy_per_dim=-2.0,
         network=_NORMED,
     ),
-    # Two CPU cores, three minutes: the physics is as fast with 32 environments as with hundreds, so one small update
-    # per environment step, which learns pushing from 40,000 steps (30,000 are too few).
+    # Two CPU cores, under three minutes, most of which go into the updates: one small update per environment step
+    # learns pushing from 40,000 steps; 30,000 updates are too few, with 60,000 steps too.
     "cpu": PretrainConfig(
         n_envs=32,
         worlds=32,

@@ -150,8 +150,11 @@ def _colors(count: int) -> list[str]:
 
 
 def _label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]]) -> None:
-    """Write each line's name to the right of its end, moved apart vertically where ends are close."""
-    heights = _spread([y for _, y, *_ in ends], gap=0.06)
+    """Write each line's name to the right of its end, moved apart vertically where ends are close.
+
+    A line that ends early gets no leader, which would look like a part of it.
+    """
+    heights, border = _spread([y for _, y, *_ in ends], gap=0.06), max(x for x, *_ in ends)
     for (x, y, name, color), height in zip(ends, heights, strict=True):
         leader = {"arrowstyle": "-", "color": color, "linewidth": 0.8, "shrinkA": 2, "relpos": (0, 0.5)}
         axes.annotate(
@@ -159,7 +162,7 @@ def _label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]]) -> No
             (x, y),
             xytext=(1.03, height),
             textcoords=axes.get_yaxis_transform(),
-            arrowprops=leader if abs(height - y) > 0.01 else None,
+            arrowprops=leader if abs(height - y) > 0.01 and x == border else None,
             color=color,
             size=10,
             va="center",

@@ -55,7 +55,7 @@ def test_a_row_says_what_the_curve_says(tmp_path):
 
 def test_budgets_not_reached_or_not_evaluated_stay_empty(tmp_path):
     folder = save(tmp_path, "sac", [[0.5], [0.6], [0.7]], rollouts=[0, 19, 50], seeds="seed-0")
-    assert figures.row("sac", read_curve(folder)) == ["sac", "1", "50", "-", "70", "-", "never", "0", "1.7"]
+    assert figures.row("sac", read_curve(folder)) == ["sac", "1", "50", "-", "70", "-", "70 (50)", "never", "0", "1.7"]
 
 
 def test_one_figure_and_one_table_per_real_system(tmp_path, capsys, monkeypatch):
