@@ -52,7 +52,7 @@ def main(args: DemoArgs) -> None:
                 seeds=args.seeds,
                 rollouts=args.rollouts,
                 initial_rollouts=initial,
-                utd=4.0,
+                utd=3.0,
                 eval_every=10,
                 eval_episodes=initial,  # the program that plays the initial rollouts serves again
                 options=options,

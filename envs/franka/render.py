@@ -15,7 +15,7 @@ from envs.franka.task import CONTROL_DT, Scene
 from sgft_jax.types import UserError
 
 FPS = 10  # a graphics library without a graphics card needs 0.2 s a frame
-SIZE = 480, 640  # height, width in pixels
+SIZE = 360, 480  # height, width in pixels
 CAPTION = 44  # pixels, height of the strip above a captioned video
 JUMP = 0.5  # m or rad in one control step: an event, such as a puck that fell, and nothing to draw in between
 SUPERSAMPLING = 2  # drawn so many times larger, then averaged: smooth edges on every backend
