@@ -1,8 +1,13 @@
 """The whole method at a small scale on a CPU: pretrain, meet a "real" system, fine-tune with and without SGFT."""
 
+import contextlib
+import multiprocessing
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
+
+import jax
 
 from experiments import cli
 from experiments.figures import FiguresArgs, figures
@@ -10,6 +15,7 @@ from experiments.finetune import FinetuneArgs, finetune
 from experiments.presets import PRESETS
 from experiments.pretrain import PretrainArgs, pretrain
 from sgft_jax.finetune import FinetuneConfig
+from sgft_jax.types import UserError
 
 METHODS = ("sgft-sac", "sac")
 
@@ -41,28 +47,51 @@ def main(args: DemoArgs) -> None:
     config = config if args.env_steps is None else replace(config, env_steps=args.env_steps)
     shared = {"task": args.task, "preset": "cpu", "out": args.out, "overwrite": True}
     pretrain(PretrainArgs(config=config, report=False, video=False, **shared))
-    # Smaller batches and fewer, larger updates: what two cores can do; both methods get the same.
-    options = FinetuneConfig(batch_size=64, branches=2, lr_actor=3e-4, actor_ramp=300)
-    initial = min(20, args.rollouts)
-    for method in METHODS:
-        finetune(
-            FinetuneArgs(
-                real=args.real,
-                method=method,
-                seeds=args.seeds,
-                rollouts=args.rollouts,
-                initial_rollouts=initial,
-                utd=3.0,
-                eval_every=10,
-                eval_episodes=initial,  # the program that plays the initial rollouts serves again
-                options=options,
-                video=args.video and method == METHODS[0],
-                **shared,
-            )
-        )
+    _finetune_both(*(_finetune_args(args, method, shared) for method in METHODS))
     print(figures(FiguresArgs(task=args.task, out=args.out)).read_text())
     folder = args.out / "finetune" / args.task / Path(args.real).stem
     print(f"{time.monotonic() - started:.0f} s in all; curves, video and every real rollout: {folder}")
+
+
+def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> FinetuneArgs:
+    """Smaller batches and fewer, larger updates than on a GPU: what two cores can do; all methods get the same."""
+    initial = min(20, args.rollouts)
+    return FinetuneArgs(
+        real=args.real,
+        method=method,
+        seeds=args.seeds,
+        rollouts=args.rollouts,
+        initial_rollouts=initial,
+        utd=3.0,
+        eval_every=10,
+        eval_episodes=initial,  # the program that plays the initial rollouts serves again
+        options=FinetuneConfig(batch_size=64, branches=2, lr_actor=3e-4, actor_ramp=300),
+        video=args.video and method == METHODS[0],
+        **shared,
+    )
+
+
+def _finetune_both(shown: FinetuneArgs, other: FinetuneArgs) -> None:
+    """One run here, on a CPU the other beside it in a process of its own: a run keeps little more than a core busy."""
+    if jax.default_backend() != "cpu":
+        finetune(shown)
+        finetune(other)
+        return
+    log = other.out / f"{other.method}.log"
+    beside = multiprocessing.get_context("spawn").Process(target=_logged, args=(other, log), daemon=True)
+    beside.start()
+    try:
+        finetune(shown)
+        beside.join()
+    finally:
+        beside.kill()  # it has ended, unless the run above has failed
+    if beside.exitcode:
+        raise UserError(f"fine-tuning with {other.method} failed, see {log}")
+
+
+def _logged(args: FinetuneArgs, log: Path) -> None:
+    with open(log, "w") as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
+        finetune(args)
 
 
 if __name__ == "__main__":

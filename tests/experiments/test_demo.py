@@ -1,9 +1,36 @@
 """The demo from pretraining to the table, on a point mass."""
 
+from types import SimpleNamespace
+
 import pytest
 
 import envs
 from experiments import demo
+from sgft_jax.types import UserError
+
+
+class Beside:
+    """A process that does its work when it is started; a real one would not know the point mass."""
+
+    exitcode = 0
+
+    def __init__(self, target, args, daemon):
+        assert daemon  # it must not outlive the demo
+        self.work = lambda: target(*args)
+
+    def start(self):
+        self.work()
+
+    def join(self):
+        pass
+
+    def kill(self):
+        pass
+
+
+@pytest.fixture(autouse=True)
+def _one_process(monkeypatch):
+    monkeypatch.setattr(demo.multiprocessing, "get_context", lambda method: SimpleNamespace(Process=Beside))
 
 
 @pytest.mark.slow
@@ -19,3 +46,12 @@ def test_demo_compares_both_methods_from_one_prior(tmp_path, monkeypatch, capsys
     for method in demo.METHODS:
         run = out / "finetune" / "toy" / "turned" / method / "seeds-0-1"
         assert (run / "summary.json").exists() and len(list((run / "real").glob("*.npz"))) == 3
+    assert "zero-shot" in (out / "sac.log").read_text()
+
+
+def test_a_failure_beside_is_reported(tmp_path, monkeypatch):
+    monkeypatch.setattr(demo, "finetune", lambda args: None)
+    monkeypatch.setattr(Beside, "exitcode", 1)
+    shown, other = (demo.FinetuneArgs(method=method, out=tmp_path) for method in demo.METHODS)
+    with pytest.raises(UserError, match=r"fine-tuning with sac failed, see .*sac\.log"):
+        demo._finetune_both(shown, other)
