@@ -8,6 +8,7 @@ import concurrent.futures
 import copy
 import os
 import threading
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -35,17 +36,19 @@ def make_advance(host: mujoco.MjModel, fields: tuple[str, ...], mean_inertia: st
     warmstart and ctrl. Under `vmap` all worlds reach the host together. States that MuJoCo would reset, because they
     explode, come back as they are: not finite.
     """
+    mujoco.set_mju_user_warning(_warn)
     nominal = copy.deepcopy(host)
     nominal.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     arrays = tuple(name for name in fields if name != mean_inertia)
     cores = os.cpu_count() or 1
     threads = concurrent.futures.ThreadPoolExecutor(cores)
-    slots: list[_Slot] = []
     lock = threading.Lock()  # XLA may run two programs at once
 
     def new_slot() -> _Slot:
         model = copy.deepcopy(nominal)
         return _Slot(model, mujoco.MjData(model), {name: getattr(model, name) for name in arrays})
+
+    slots = [new_slot() for _ in range(cores)]
 
     def on_host(values: dict[str, Any], state: Any, controls: Any) -> Any:
         values, state, controls = jax.tree.map(np.asarray, (values, state, controls))
@@ -63,7 +66,6 @@ def make_advance(host: mujoco.MjModel, fields: tuple[str, ...], mean_inertia: st
                 after.warmstart[i], after.ctrl[i] = slot.data.qacc_warmstart, controls[i, -1]
 
         with lock:
-            slots.extend(new_slot() for _ in range(cores - len(slots)))
             list(threads.map(run, range(min(cores, len(controls)))))
         return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), after)
 
@@ -72,6 +74,12 @@ def make_advance(host: mujoco.MjModel, fields: tuple[str, ...], mean_inertia: st
         return jax.pure_callback(on_host, shape, values, state, controls, vmap_method="broadcast_all")
 
     return advance
+
+
+def _warn(message: str) -> None:
+    """Instead of a log file in the working directory. What is unstable is told by the state itself."""
+    if "unstable" not in message:
+        warnings.warn(message, RuntimeWarning, stacklevel=2)
 
 
 def _enter(slot: _Slot, values: dict[str, np.ndarray], mean_inertia: str) -> None:

@@ -56,7 +56,8 @@ def test_any_batching_gives_the_same(rig):
     np.testing.assert_allclose(nested, jnp.stack([alone, alone[::-1]]), atol=1e-5)
 
 
-def test_an_explosion_is_reported_not_reset():
+def test_an_explosion_is_reported_not_reset(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     scene = SCENES["push"]
     env = make_env(scene, impl="c")
     worlds = env.sample_worlds(jax.random.key(0), 2, effects=EXACT)
@@ -66,6 +67,7 @@ def test_an_explosion_is_reported_not_reset():
         worlds, states._replace(physics=broken), jnp.zeros((2, env.act_dim)), jax.random.split(jax.random.key(2), 2)
     )
     assert after.invalid.tolist() == [True, False]
+    assert not list(tmp_path.iterdir())  # MuJoCo would log its warning there
 
 
 def test_who_steps_the_physics(monkeypatch):
