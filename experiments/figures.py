@@ -90,9 +90,7 @@ def read_comparison(folder: Path) -> Comparison:
     runs = {method: sorted(folder.glob(f"{method}/*/{EVAL}")) for method in ORDER}
     if absent := [method for method in ORDER if not runs[method]]:
         notes.append(f"no run of {', '.join(absent)}")
-    for method in ORDER:
-        if not runs[method]:
-            continue
+    for method in [method for method in ORDER if runs[method]]:
         curve, more = _choose(method, [run.parent for run in runs[method]])
         notes += more
         if curve is not None:

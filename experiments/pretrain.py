@@ -342,10 +342,8 @@ class _Run:
     def _say(self, results: list[dict[str, Any]]) -> None:
         for found in results:
             low, high = found["success/interval"]
-            line = (
-                f"seed {found['seed']}: success {found['success']:.3f} [{low:.3f}, {high:.3f}] in {found['episodes']} "
-            )
-            line += "fresh episodes"
+            success = f"{found['success']:.3f} [{low:.3f}, {high:.3f}]"
+            line = f"seed {found['seed']}: success {success} in {found['episodes']} fresh episodes"
             if "value/explained_variance" in found:
                 line += f"; V_sim explains {found['value/explained_variance']:.2f} of the variance of returns, "
                 line += f"rank correlation {found['value/rank_correlation']:.2f}"
