@@ -1,7 +1,6 @@
 """Impure: what every command shares: parsing, error messages, exit codes, caches, quiet logs. Imports nothing heavy."""
 
 import contextlib
-import difflib
 import importlib
 import io
 import logging
@@ -9,7 +8,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn, cast
 
@@ -71,6 +70,8 @@ def fail(message: str) -> NoReturn:
 def one_line(boxed: str) -> str:
     """The gist of tyro's framed complaint: its first paragraph, with the closest match where it offers some."""
     paragraphs = _paragraphs(boxed)
+    from sgft_jax.types import unknown
+
     message = paragraphs[0] if paragraphs else "bad command line"
     if match := re.search(r"invalid choice '(.*?)' for argument '(.*?)'\. Expected one of \((.*)\)", message):
         value, option, listed = match.groups()
@@ -96,17 +97,9 @@ def choose[V](kind: str, name: str, options: dict[str, V]) -> V:
     """`options[name]`; raises UserError with the closest match and the list of what exists."""
     if name in options:
         return options[name]
-    from sgft_jax.types import UserError
+    from sgft_jax.types import UserError, unknown
 
     raise UserError(unknown(kind, name, options))
-
-
-def unknown(kind: str, name: str, options: Iterable[str]) -> str:
-    """What to tell someone who asked for a `kind` called `name` where only `options` exist."""
-    listed = sorted(options)
-    close = difflib.get_close_matches(name, listed, n=1)
-    hint = f", did you mean {close[0]!r}?" if close else "."
-    return f"{kind}: there is no {name!r}{hint} Choose from: {', '.join(listed)}"
 
 
 def set_up() -> None:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from envs.base import Env, World
 from envs.rollout import Episode, play_episode
 from sgft_jax import stats
-from sgft_jax.networks import NetworkConfig, make_actor, tanh_gaussian_mode, tanh_gaussian_sample
+from sgft_jax.networks import NetworkConfig, make_actor, tanh_gaussian_action
 from sgft_jax.normalizer import normalize
 from sgft_jax.types import Array, Key, Metrics, Prior
 
@@ -50,7 +50,7 @@ def prior_policy(env: Env, prior: Prior, network: NetworkConfig, *, explore: boo
 
     def act(obs: Array, key: Key) -> Array:
         moments = actor.apply(prior.actor, normalize(prior.normalizer, obs))
-        return tanh_gaussian_sample(moments, key)[0] if explore else tanh_gaussian_mode(moments)
+        return tanh_gaussian_action(moments, key, explore=explore)
 
     return act
 
@@ -89,7 +89,10 @@ class Best(NamedTuple):
     steps: Array
 
 
-def keep_better(old: Best, new: Best) -> Best:
-    """The one with the higher success, then the higher return; the old one if they tie."""
+def keep_better(old: Best, new: Best, since: float | Array) -> Best:
+    """The one with the higher success, then the higher return; the old one if they tie, or the new one in any case if
+    the old one is from before `since` [] steps.
+    """
     better = (new.success > old.success) | ((new.success == old.success) & (new.total > old.total))
+    better |= old.steps < since
     return jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)

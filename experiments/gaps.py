@@ -206,7 +206,7 @@ def _best(
     saved: Saved,
     chunk: Callable[[PretrainState], tuple[PretrainState, Metrics]],
     examine: Callable[[Prior], Outcome],
-    better: Callable[[Best, Best], Best],
+    better: Callable[[Best, Best, float], Best],
     config: PretrainConfig,
     folder: Path,
 ) -> Prior:
@@ -224,7 +224,7 @@ def _best(
                 prior = extract_prior(run.learner)
                 scores = jax.vmap(score)(examine(prior))
                 log.eval(done * size, scores)
-                best = better(best, Best(prior, scores["success"], scores["return"], run.steps))
+                best = better(best, Best(prior, scores["success"], scores["return"], run.steps), 0.0)
                 shown["success"] = float(scores["success"].mean())
             progress.advance(size, shown)
     log.close()

@@ -45,6 +45,9 @@ class PretrainConfig:
     """Steps of all environments per compiled chunk: between chunks we log, evaluate and checkpoint."""
     eval_every: int = 4
     """Chunks between evaluations."""
+    choose_from: float = 0.75
+    """Share of training after which evaluations compete to give the prior. On the way there a critic may promise twice
+    what can be had while its policy already succeeds: a good policy with a useless V_sim."""
     eval_episodes: int = 256
     report_episodes: int = 256
     """At least that many fresh episodes judge the prior; 256 give a 95 % interval of +-6 points at worst."""
@@ -80,7 +83,6 @@ PRESETS: dict[str, PretrainConfig] = {
         lr_end=0.05,
         tau=0.01,
         alpha=0.1,
-        entropy_per_dim=-2.0,
         network=_NORMED,
     ),
     # Two CPU cores, under three minutes, most of which go into the updates: one small update per environment step

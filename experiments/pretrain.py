@@ -1,7 +1,8 @@
 """Pretrain in randomised simulation (or on a "real" system): leaves one prior per seed.
 
-The prior of a seed is the agent at its best evaluation (success, then return) on held-out worlds; the numbers in its
-card and in summary.json come from fresh episodes in other held-out worlds, so the choice does not flatter them.
+The prior of a seed is the agent at the best of its late evaluations (success, then return) on held-out worlds; the
+numbers in its card and in summary.json come from fresh episodes in other held-out worlds, so the choice does not
+flatter them.
 """
 
 import functools
@@ -79,14 +80,14 @@ class Program(NamedTuple):
 
     collect(pools, keys) -> random-action data. begin(pools, random, keys) -> Saved.
     chunk(pools, random, run) -> (run, metrics). grade(pool, key, priors) -> Outcome [seeds, eval_episodes].
-    better(old, new) -> Best. report(pools, priors, keys) -> Report.
+    better(old, new, since) -> Best. report(pools, priors, keys) -> Report.
     """
 
     collect: Callable[..., ReplayState]
     begin: Callable[..., Saved]
     chunk: Any
     grade: Callable[..., Outcome]
-    better: Callable[[Best, Best], Best]
+    better: Callable[[Best, Best, float], Best]
     report: Callable[..., Report]
 
 
@@ -143,7 +144,7 @@ def make_program(env: Env, config: PretrainConfig, *, seeds: int) -> Program:
         begin=jax.jit(common.over_seeds(begin, seeds)),
         chunk=jax.jit(common.over_seeds(trainer.chunk, seeds), donate_argnums=2),
         grade=jax.jit(common.over_seeds(graded, seeds, shared=2)),
-        better=jax.jit(jax.vmap(keep_better)),
+        better=jax.jit(jax.vmap(keep_better, (0, 0, None))),
         report=jax.jit(common.over_seeds(report, seeds)),
     )
 
@@ -165,7 +166,8 @@ def prior_card(args: PretrainArgs, env: Env, gap: Gap | None, found: dict[str, A
         "gap": None if gap is None else gap._asdict(),
         "preset": args.preset,
         "config": config_to_json(args.config),
-        "chosen": "the best evaluation on held-out worlds: success, then return",
+        "chosen": f"the best evaluation on held-out worlds after {args.config.choose_from:.0%} of training: success, "
+        "then return",
         "metrics": found,
         "provenance": runs.provenance(),
     }
@@ -253,7 +255,8 @@ class _Run:
             scores = {name: np.asarray(x) for name, x in jax.vmap(score)(outcome).items()}
         self.log.eval(done * self.chunk_env_steps, scores)
         now = Best(prior, jnp.asarray(scores["success"]), jnp.asarray(scores["return"]), saved.run.steps)
-        return saved._replace(best=self.program.better(saved.best, now)), scores
+        since = self.config.choose_from * self.chunks * self.config.chunk_steps
+        return saved._replace(best=self.program.better(saved.best, now, since)), scores
 
     def _final_exam(self, prior: Prior) -> Outcome:
         """[seeds, >= report_episodes] new episodes in worlds that neither training nor the choice has seen."""

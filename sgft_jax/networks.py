@@ -141,6 +141,11 @@ def tanh_gaussian_mode(moments: Array) -> Array:
     return jnp.tanh(moments[0])
 
 
+def tanh_gaussian_action(moments: Array, key: Key, *, explore: bool) -> Array:
+    """[act_dim]: a draw to explore, else the mode."""
+    return tanh_gaussian_sample(moments, key)[0] if explore else tanh_gaussian_mode(moments)
+
+
 def pad_first_layer(params: PyTree, obs_dim: int, extra: int) -> PyTree:
     """Let a network read `extra` more observation entries after the first `obs_dim` without changing its output.
 

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from sgft_jax.config import config_from_json, config_to_json, differences
+from sgft_jax.config import config_to_json, differences
 from sgft_jax.jsonfile import read_json, write_json
 from sgft_jax.types import UserError
 
@@ -107,11 +107,6 @@ def open_run(
     starts = read_json(folder / PROVENANCE)["starts"] if (folder / PROVENANCE).exists() else []
     write_json(folder / PROVENANCE, {"starts": [*starts, provenance()]})
     return Run(folder=folder, resumed=existing and resume, lock=lock)
-
-
-def read_config[T](folder: Path, cls: type[T]) -> T:
-    """The configuration a run was started with; raises UserError if the folder is no run or the fields do not fit."""
-    return config_from_json(cls, _stored(Path(folder))["config"])
 
 
 def provenance() -> dict[str, Any]:

@@ -22,7 +22,7 @@ from sgft_jax.networks import (
     make_dynamics,
     make_value,
     pad_first_layer,
-    tanh_gaussian_mode,
+    tanh_gaussian_action,
     tanh_gaussian_sample,
 )
 from sgft_jax.types import Array, Key, Learner, Metrics, Normalizer, Prior, PyTree, Transition, UserError
@@ -133,7 +133,7 @@ def make_sac(config: SACConfig, hyper: SACHyper | None = None) -> Learner:
 
     def act(state: SACState, carry: tuple[()], obs: Array, key: Key, *, explore: bool) -> tuple[Array, tuple[()]]:
         moments = parts.actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
-        return tanh_gaussian_sample(moments, key)[0] if explore else tanh_gaussian_mode(moments), carry
+        return tanh_gaussian_action(moments, key, explore=explore), carry
 
     def update(state: SACState, batch: Transition, key: Key) -> tuple[SACState, Metrics]:
         return _update(config, parts, state, batch, key)

@@ -5,14 +5,13 @@ branch, shape, shorten: branching needs plain observations, shaping the whole di
 Source: SGFT (Yin et al., ICLR 2025).
 """
 
-import difflib
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.types import Array, BatchTransform, Imagination, Key, Transition, UserError
+from sgft_jax.types import Array, BatchTransform, Imagination, Key, Transition, UserError, unknown
 
 
 def shaped_reward(imagination: Imagination, row: Transition) -> Array:
@@ -171,9 +170,7 @@ def get_method(name: str) -> Method:
     """The method of that name; UserError lists what exists and guesses what was meant."""
     if name in METHODS:
         return METHODS[name]
-    close = difflib.get_close_matches(name, METHODS, n=1)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    raise UserError(f"unknown method {name!r}: {hint}methods: {', '.join(METHODS)}")
+    raise UserError(unknown("method", name, METHODS))
 
 
 def _check_positive(name: str, value: int) -> None:

@@ -1,6 +1,7 @@
 """The nouns every other module speaks: transitions, learners, priors. Imports nothing of ours."""
 
-from collections.abc import Callable
+import difflib
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +15,14 @@ Metrics = dict[str, Array]
 
 class UserError(Exception):
     """Bad input: one line that names the file, key or option and says how to fix it. Entry points exit with code 2."""
+
+
+def unknown(kind: str, name: str, options: Iterable[str]) -> str:
+    """What to tell someone who asked for a `kind` called `name` where only `options` exist."""
+    listed = sorted(options)
+    close = difflib.get_close_matches(name, listed, n=1)
+    hint = f", did you mean {close[0]!r}?" if close else "."
+    return f"{kind}: there is no {name!r}{hint} Choose from: {', '.join(listed)}"
 
 
 class Transition(NamedTuple):

@@ -4,7 +4,7 @@ import os
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MUJOCO_GL", "disable")
-os.environ["SGFT_IMPL"] = "jax"  # MJX, what GPUs run; tests/envs/test_native.py is about the other one
+os.environ["SGFT_IMPL"] = "jax"  # MJX's own code; tests/envs/test_engines.py is about the others
 os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
 
 import jax

@@ -69,14 +69,14 @@ def new_spec(*, substeps: int, iterations: int, ls_iterations: int) -> mujoco.Mj
 def make_env(scene: Scene, impl: str | None = None) -> Env:
     """Assembles the Env of a scene: worlds, resets, steps. impl: who steps the physics, see `physics.choose_impl`."""
     nominal = {p.name: p.nominal for p in scene.parameters}
-    simulator = physics.make_simulator(scene.build(nominal))
-    fields = physics.varying_fields(simulator, _perturbed(scene, nominal))
-    simulator = physics.with_impl(simulator, fields, physics.choose_impl(impl))
+    host = scene.build(nominal).compile()
+    fields = physics.varying_fields(host, _perturbed(scene, nominal))
+    engine = physics.make_engine(host, fields, physics.choose_impl(impl))
     obs_dim, act_dim = sum(e.size for e in scene.observation), sum(e.size for e in scene.action)
 
     def stack_worlds(params: np.ndarray, effects: Effects) -> World:
         specs = (scene.build(dict(zip(nominal, map(float, row), strict=True))) for row in params)
-        stacked = physics.compile_worlds(simulator, specs, fields)
+        stacked = physics.compile_worlds(host, specs, fields)
         repeat = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(params), *x.shape)), effects)
         return World(jnp.asarray(params, jnp.float32), {k: jnp.asarray(v) for k, v in stacked.items()}, repeat)
 
@@ -103,9 +103,9 @@ def make_env(scene: Scene, impl: str | None = None) -> Env:
     def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
         key_latency, key_noise = jax.random.split(key)
         target = scene.target(state.physics.qpos, distort(world.effects, action))
-        control = _ramp(world.effects, state.physics.ctrl, target, simulator.host.opt.timestep, key_latency)
-        after = physics.advance(simulator, world.model, state.physics, control, substeps=scene.substeps)
-        after = scene.event(world.params, after)
+        control = _ramp(world.effects, state.physics.ctrl, target, host.opt.timestep, key_latency)
+        controls = jax.vmap(control)(jnp.arange(scene.substeps))
+        after = scene.event(world.params, engine(world.model, state.physics, controls))
         true_obs = scene.observe(world.params, after)
         time = state.time + 1
         return EnvState(

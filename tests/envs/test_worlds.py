@@ -6,7 +6,7 @@ import pytest
 from franka_bench import SCENES, theta_of
 from mujoco import mjx
 
-from envs import physics
+from envs import engine_jax, physics
 from envs.franka.task import make_env
 from sgft_jax.types import UserError
 
@@ -38,12 +38,12 @@ def nominal(scene):
 def test_worlds_are_what_mujoco_compiles(name):
     scene, rng = SCENES[name], np.random.default_rng(0)
     thetas = [theta_of(scene, rng) for _ in range(3)]
-    env, simulator = make_env(scene), physics.make_simulator(scene.build(nominal(scene)))
+    env, base = make_env(scene), mjx.put_model(scene.build(nominal(scene)).compile(), impl="jax")
     for theta in thetas:
         fields = env.sample_worlds(jax.random.key(0), 1, params=theta).model
         host = scene.build(theta).compile()
         wanted = mjx.put_model(host, impl="jax")
-        world = physics.with_fields(simulator.model, {k: v[0] for k, v in fields.items()})
+        world = engine_jax.with_fields(base, {k: v[0] for k, v in fields.items()})
         assert set(differing(world, wanted)) <= UNUSED
         assert world.stat.meaninertia == np.float32(host.stat.meaninertia)
 
@@ -52,19 +52,19 @@ def test_worlds_are_what_mujoco_compiles(name):
 def test_parameters_reach_the_model(name):
     """Each domain parameter that is not part of the start changes some field of the model."""
     scene = SCENES[name]
-    simulator = physics.make_simulator(scene.build(nominal(scene)))
+    host = scene.build(nominal(scene)).compile()
     changed = {k: scene.build(nominal(scene) | {k: 1.1 * v + 0.01}) for k, v in nominal(scene).items()}
-    ignored = {k for k, spec in changed.items() if not physics.varying_fields(simulator, [spec])}
+    ignored = {k for k, spec in changed.items() if not physics.varying_fields(host, [spec])}
     assert ignored == ({"object_x", "object_y"} if name == "push" else set())
 
 
 def test_structure_must_not_change():
     scene = SCENES["push"]
-    simulator = physics.make_simulator(scene.build(nominal(scene)))
+    host = scene.build(nominal(scene)).compile()
     spec = scene.build(nominal(scene))
     spec.worldbody.add_geom(size=[0.1, 0, 0])
     with pytest.raises(UserError, match="not its structure"):
-        physics.compile_worlds(simulator, [spec], ("body_mass",))
+        physics.compile_worlds(host, [spec], ("body_mass",))
 
 
 def test_unknown_parameters_are_named():

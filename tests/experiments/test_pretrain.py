@@ -198,8 +198,9 @@ def test_better_is_more_success_then_more_return():
 
     old = best(0.5, 3.0, 1)
     for success, total, steps in [(0.6, -9.0, 2), (0.5, 3.1, 2), (0.5, 3.0, 1), (0.5, 2.9, 1), (0.4, 9.0, 1)]:
-        kept = keep_better(old, best(success, total, 2))
+        kept = keep_better(old, best(success, total, 2), 0.0)
         assert kept.steps == steps and kept.prior.actor["w"].tolist() == [steps, steps]
+    assert keep_better(old, best(0.1, 0.0, 2), 1.5).steps == 2, "an early evaluation does not compete"
 
 
 def test_the_learning_rate_falls_linearly_to_its_end():

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from sgft_jax.runs import open_run, provenance, read_config
+from sgft_jax.runs import open_run, provenance
 from sgft_jax.types import UserError
 
 
@@ -34,7 +34,6 @@ def test_a_new_run_says_where_it_is_and_records_itself(tmp_path):
     run = open_run(tmp_path / "runs" / "x", kind="pretrain", config=Config(), say=heard.append)
     assert heard == [f"run folder: {tmp_path / 'runs' / 'x'}"]
     assert not run.resumed
-    assert read_config(run.folder, Config) == Config()
     stored = json.loads((run.folder / "config.json").read_text())
     assert stored["kind"] == "pretrain" and stored["config"]["inner"] == {"lr": 0.001, "layers": [2, 3]}
     (first,) = json.loads((run.folder / "provenance.json").read_text())["starts"]
@@ -90,7 +89,7 @@ def test_overwrite_empties_a_run_and_nothing_else(tmp_path):
     (run.folder / "link").symlink_to(precious)
     start(tmp_path / "x", Config(task="push"), overwrite=True)
     assert sorted(p.name for p in run.folder.iterdir()) == [".lock", "config.json", "provenance.json"]
-    assert read_config(run.folder, Config).task == "push"
+    assert json.loads((run.folder / "config.json").read_text())["config"]["task"] == "push"
     assert len(json.loads((run.folder / "provenance.json").read_text())["starts"]) == 1
     assert (precious / "data").read_text() == "keep"
 

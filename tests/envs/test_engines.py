@@ -74,6 +74,6 @@ def test_who_steps_the_physics(monkeypatch):
     monkeypatch.setenv(physics.IMPL_VARIABLE, "auto")
     assert physics.choose_impl() == "c"  # the tests run on a CPU
     assert physics.choose_impl("jax") == "jax"
-    monkeypatch.setenv(physics.IMPL_VARIABLE, "warp")
-    with pytest.raises(UserError, match=r"SGFT_IMPL: there is no 'warp'\. Choose from: auto, jax, c"):
+    monkeypatch.setenv(physics.IMPL_VARIABLE, "wrap")
+    with pytest.raises(UserError, match=r"SGFT_IMPL: .* 'wrap', did you mean 'warp'\? Choose from: auto, c, jax, warp"):
         physics.choose_impl()

@@ -1,4 +1,4 @@
-"""MuJoCo's C engine behind `jax.pure_callback`: the same steps as MJX's, on the host. Impure inside, pure outside.
+"""MuJoCo's C engine behind `jax.pure_callback`, as the engine of a scene. Impure inside, pure outside.
 
 On a CPU, XLA's program of an MJX step takes two to three times as long as C MuJoCo's, and many seconds to compile. The
 worlds of a batch are shared among as many threads as there are cores.
@@ -9,16 +9,14 @@ import copy
 import os
 import threading
 import warnings
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import mujoco
 import numpy as np
 
+from envs.engine_jax import MEAN_INERTIA, Advance
 from sgft_jax.types import Array, PyTree
-
-Advance = Callable[[dict[str, Array], PyTree, Array], PyTree]
 
 
 class _Slot(NamedTuple):
@@ -29,17 +27,16 @@ class _Slot(NamedTuple):
     views: dict[str, np.ndarray]
 
 
-def make_advance(host: mujoco.MjModel, fields: tuple[str, ...], mean_inertia: str) -> Advance:
-    """(fields of one world, its state, controls [substeps, nu]) -> the state after these steps.
+def make_advance(host: mujoco.MjModel, fields: tuple[str, ...]) -> Advance:
+    """The engine of a compiled scene; fields: names that a world may set in the model.
 
-    fields: names that a world may set in the model, `mean_inertia` among them. The state is a NamedTuple of qpos, qvel,
-    warmstart and ctrl. Under `vmap` all worlds reach the host together. States that MuJoCo would reset, because they
-    explode, come back as they are: not finite.
+    Under `vmap` all worlds reach the host together. States that MuJoCo would reset, because they explode, come back as
+    they are: not finite.
     """
     mujoco.set_mju_user_warning(_warn)
     nominal = copy.deepcopy(host)
     nominal.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    arrays = tuple(name for name in fields if name != mean_inertia)
+    arrays = tuple(name for name in fields if name != MEAN_INERTIA)
     cores = os.cpu_count() or 1
     threads = concurrent.futures.ThreadPoolExecutor(cores)
     lock = threading.Lock()  # XLA may run two programs at once
@@ -60,7 +57,7 @@ def make_advance(host: mujoco.MjModel, fields: tuple[str, ...], mean_inertia: st
         def run(k: int) -> None:
             slot = slots[k]
             for i in range(k, len(controls), cores):
-                _enter(slot, {name: x[i] for name, x in values.items()}, mean_inertia)
+                _enter(slot, {name: x[i] for name, x in values.items()})
                 _steps(slot, jax.tree.map(lambda x, i=i: x[i], state), controls[i])
                 after.qpos[i], after.qvel[i] = slot.data.qpos, slot.data.qvel
                 after.warmstart[i], after.ctrl[i] = slot.data.qacc_warmstart, controls[i, -1]
@@ -82,10 +79,10 @@ def _warn(message: str) -> None:
         warnings.warn(message, RuntimeWarning, stacklevel=2)
 
 
-def _enter(slot: _Slot, values: dict[str, np.ndarray], mean_inertia: str) -> None:
+def _enter(slot: _Slot, values: dict[str, np.ndarray]) -> None:
     """Make the slot's model that of one world."""
     for name, value in values.items():
-        if name == mean_inertia:
+        if name == MEAN_INERTIA:
             slot.model.stat.meaninertia = float(value)
         else:
             slot.views[name][...] = value
