@@ -1,6 +1,8 @@
 """Tasks: pure functions of an explicit world. `make(name)` builds one."""
 
 import importlib
+from types import ModuleType
+from typing import Any
 
 from envs.base import Env
 from sgft_jax.types import UserError, unknown
@@ -8,8 +10,20 @@ from sgft_jax.types import UserError, unknown
 TASKS = {"push": "envs.franka.push", "hammer": "envs.franka.hammer", "insert": "envs.franka.insert"}
 
 
-def make(name: str) -> Env:
-    """The task of that name, compiled; raises UserError with the closest match for an unknown one."""
+def make(name: str, impl: str | None = None) -> Env:
+    """The task of that name, compiled; impl: who steps its physics, see `physics.choose_impl`.
+
+    Raises UserError with the closest match for an unknown task.
+    """
+    return _module(name).make(impl)
+
+
+def scene(name: str) -> Any:
+    """The parts that the task of that name is made of."""
+    return _module(name).SCENE
+
+
+def _module(name: str) -> ModuleType:
     if name not in TASKS:
         raise UserError(unknown("task", name, TASKS))
-    return importlib.import_module(TASKS[name]).make()
+    return importlib.import_module(TASKS[name])

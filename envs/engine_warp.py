@@ -58,7 +58,7 @@ def make_advance(host: mujoco.MjModel) -> Advance:
     @jax.custom_batching.custom_vmap
     def batch(values: dict[str, Array], state: Any, controls: Array) -> Any:
         """Worlds [n]."""
-        data = _room_for(blank, len(controls))
+        data = room_for(blank, len(controls))
         return jax.vmap(lambda *world: run(data, *world))(values, state, controls)
 
     @batch.def_vmap
@@ -105,7 +105,7 @@ def _settings(model: mjx.Model) -> mjx.Model:
     return model.replace(opt=option.replace(iterations=iterations, _impl=option._impl.replace(warn_overflow=0)))
 
 
-def _room_for(data: mjx.Data, worlds: int) -> mjx.Data:
+def room_for(data: mjx.Data, worlds: int) -> mjx.Data:
     """Data [] of one world whose shared list of contacts is long enough for that many worlds."""
     own = data._impl
     lists = {name: x for name, x in vars(own).items() if name.startswith("contact__") and x.shape[0]}

@@ -126,9 +126,9 @@ SCENE = Scene(
 )
 
 
-def make() -> Env:
+def make(impl: str | None = None) -> Env:
     """The hammering task."""
-    return make_env(SCENE)
+    return make_env(SCENE, impl)
 
 
 def tool() -> np.ndarray:

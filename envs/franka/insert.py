@@ -136,9 +136,9 @@ SCENE = Scene(
 )
 
 
-def make() -> Env:
+def make(impl: str | None = None) -> Env:
     """The insertion task."""
-    return make_env(SCENE)
+    return make_env(SCENE, impl)
 
 
 def _tip(joints: Array) -> Array:
