@@ -57,15 +57,14 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...], impl: str) -> Adv
 def choose_impl(wanted: str | None = None) -> str:
     """Who steps the physics: "jax" (MJX's own code), "warp" (MJX with MuJoCo Warp) or "c" (MuJoCo's own engine).
 
-    wanted: one of them, or "auto": "c" where JAX computes on CPUs, "warp" on NVIDIA GPUs if it is installed, else
-        "jax". Default: $SGFT_IMPL, or "auto". Raises UserError for anything else.
+    wanted: one of them, or "auto": "c" where JAX computes on CPUs, else "jax", because insertion is slow in Warp as yet
+        (docs/performance.md). Default: $SGFT_IMPL, or "auto". Raises UserError for anything else.
     """
     impl = wanted or os.environ.get(IMPL_VARIABLE) or "auto"
     if impl not in IMPLS:
         raise UserError(unknown(IMPL_VARIABLE, impl, IMPLS))
     if impl == "auto":
-        backend = jax.default_backend()
-        return "c" if backend == "cpu" else "warp" if backend in ("gpu", "cuda") and engine_warp.available() else "jax"
+        return "c" if jax.default_backend() == "cpu" else "jax"
     return impl
 
 

@@ -24,7 +24,7 @@ from envs.rollout import Fleet, launch, step_fleet
 from experiments import cli
 from sgft_jax import runs
 from sgft_jax.log import write_summary
-from sgft_jax.types import Array, Key, PyTree
+from sgft_jax.types import Array, Key, PyTree, UserError
 
 POOL = 256  # domain parameter vectors, so that a batch really differs from world to world
 
@@ -51,6 +51,13 @@ def main(config: BenchmarkConfig) -> list[dict[str, Any]]:
     """Measures, prints a table, writes the numbers and returns them."""
     for task in config.tasks:
         cli.choose("--tasks", task, envs.TASKS)
+    for name, least in (
+        ("worlds", min(config.worlds)),
+        ("control-steps", config.control_steps),
+        ("repeats", config.repeats),
+    ):
+        if least < 1:
+            raise UserError(f"--{name} is {least}: must be at least 1")
     impls = [physics.choose_impl(impl) for impl in config.impls]
     lines = []
     for task in config.tasks:

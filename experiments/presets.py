@@ -102,7 +102,6 @@ PRESETS: dict[str, PretrainConfig] = {
         lr_end=0.1,
         tau=0.02,
         alpha=0.1,
-        entropy_per_dim=-2.0,
         network=NetworkConfig(hidden=(96, 96), layer_norm=True),
         ensemble_size=3,
         chunk_steps=100,

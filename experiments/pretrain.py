@@ -349,7 +349,7 @@ class _Run:
             line = f"seed {found['seed']}: success {success} in {found['episodes']} fresh episodes"
             if "value/explained_variance" in found:
                 line += f"; V_sim explains {found['value/explained_variance']:.2f} of the variance of returns, "
-                line += f"rank correlation {found['value/rank_correlation']:.2f}"
+                line += f"rank correlation {found['value/rank_correlation']:.2f}, bias {found['value/bias']:+.2f}"
             print(line)
         print(f"results: {self.folder}  (prior/, summary.json, figures/)")
         print(f"next: python -m experiments.finetune --task {self.env.name} --prior {self.folder}")
