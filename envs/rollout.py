@@ -25,7 +25,8 @@ class Episode(NamedTuple):
 
     transitions: [T]; `valid`: [T] bool, False from the first step with exploded physics on (such rows hold zeros).
     total_reward: [] undiscounted, of the task, never reshaped. success, exploded: [] bool.
-    start: the initial EnvState; qpos: [T, nq] after each step, for rendering.
+    world: [] int32, where it took place in the pool. start: the initial EnvState; qpos: [T, nq] after each step, for
+    rendering.
     """
 
     transitions: Transition
@@ -33,6 +34,7 @@ class Episode(NamedTuple):
     total_reward: Array
     success: Array
     exploded: Array
+    world: Array
     start: EnvState
     qpos: Array
 
@@ -85,7 +87,8 @@ def play_episode(
     length: control steps, default `env.episode_length`; a longer one looks past the time limit.
     """
     key_world, key_reset, key_steps = jax.random.split(key, 3)
-    world = pick(pool, jax.random.randint(key_world, (), 0, pool_size(pool)))
+    index = jax.random.randint(key_world, (), 0, pool_size(pool))
+    world = pick(pool, index)
     start = env.reset(world, key_reset)
 
     def step(loop: tuple[EnvState, PyTree, Array], key: Key) -> tuple[tuple[EnvState, PyTree, Array], tuple]:
@@ -104,7 +107,7 @@ def play_episode(
     total = jnp.where(valid, rows.reward, 0.0).sum()
     last_valid = jnp.maximum(valid.sum() - 1, 0)
     exploded = invalid.any()
-    return Episode(rows, valid, total, success[last_valid] & ~exploded, exploded, start, qpos)
+    return Episode(rows, valid, total, success[last_valid] & ~exploded, exploded, index, start, qpos)
 
 
 def _transition(before: EnvState, action: Array, after: EnvState, *, gamma: float | Array) -> Transition:

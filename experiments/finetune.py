@@ -13,7 +13,7 @@ import numpy as np
 
 import envs
 from envs import gaps
-from envs.base import Env, World
+from envs.base import Env
 from envs.gaps import Gap
 from envs.rollout import Episode
 from experiments import cli, common
@@ -261,14 +261,14 @@ class _Run:
         return summary
 
     def _film(self, before: FinetuneState, after: FinetuneState, rollouts: int) -> str:
-        """An evaluation episode of the first seed, in the first world, by its agent at the start and now.
+        """An evaluation episode of the first seed by its agent at the start and now.
 
         The first one that only the tuned agent solves: what fine-tuning is about. Without one, the first.
         """
 
-        def play(pool: World) -> list[Episode]:
+        def play() -> list[Episode]:
             n = self.args.eval_episodes
-            both = [self.program.evaluate(state, pool, self.numbers, n) for state in (before, after)]
+            both = [self.program.evaluate(state, self.pool, self.numbers, n) for state in (before, after)]
             old, new = (np.asarray(episodes.success[0]) for episodes in both)
             chosen = int(np.argmax(new & ~old))
             return [jax.tree.map(lambda x: np.asarray(x[0, chosen]), episodes) for episodes in both]

@@ -4,23 +4,19 @@ import importlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 
 import envs
 from envs.base import Env, World
-from envs.rollout import Episode, pick, pool_size
+from envs.rollout import Episode
 from experiments import cli
 
 
-def before_and_after(
-    env: Env, pool: World, play: Callable[[World], Sequence[Episode]], path: Path, *, rollouts: int
-) -> str:
+def before_and_after(env: Env, pool: World, play: Callable[[], Sequence[Episode]], path: Path, *, rollouts: int) -> str:
     """Films the same start in the same real world twice and says in one line where, or why there is no video.
 
-    play(pool) -> one episode before and one after `rollouts` real rollouts; the pool it is given holds one world only,
-    as often as `pool` holds worlds. Never raises for want of a scene, a graphics library or an encoder: a run does not
-    fail for a picture.
+    play() -> one episode in a world of `pool` before and the same after `rollouts` real rollouts. Never raises for want
+    of a scene, a graphics library or an encoder: a run does not fail for a picture.
     """
     scene = getattr(importlib.import_module(envs.TASKS[env.name]), "SCENE", None)
     if scene is None:
@@ -29,13 +25,13 @@ def before_and_after(
         return f"no video: {reason}"
     from envs.franka.render import render_side_by_side
 
-    episodes = play(pick(pool, jnp.zeros(pool_size(pool), int)))
+    episodes = play()
     qpos = [np.concatenate([episode.start.physics.qpos[None], episode.qpos]) for episode in episodes]
     captions = [
         f"{name}: {'success' if episode.success else 'failure'}"
         for name, episode in zip(("simulator's policy", f"after {rollouts} real rollouts"), episodes, strict=True)
     ]
-    theta = np.asarray(pool.params[0]).tolist()
+    theta = np.asarray(pool.params[episodes[0].world]).tolist()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         render_side_by_side(scene, [theta, theta], qpos, captions, path)

@@ -49,6 +49,7 @@ def test_hammering():
     assert (nail[:, 0] - nail[:, -1]).max() > 1e-3  # some blow drove a nail
 
 
+@pytest.mark.slow
 def test_lost_contacts_are_explosions(monkeypatch):
     """With room for fewer constraint rows than a blow needs, the state is not finite instead of silently wrong."""
     monkeypatch.setattr(engine_warp, "budget", lambda host: (2, 1))

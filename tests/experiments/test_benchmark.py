@@ -23,14 +23,15 @@ def test_the_fastest_call_counts_without_the_first(monkeypatch):
 
 
 def test_numbers_reach_the_disk(tmp_path, capsys):
-    config = BenchmarkConfig(tasks=("hammer",), worlds=(2, 3), impls=("c",), control_steps=2, repeats=1, out=tmp_path)
+    config = BenchmarkConfig(tasks=("hammer",), worlds=(2,), impls=("c",), control_steps=2, repeats=1, out=tmp_path)
     lines = main(config)
-    assert [line["worlds"] for line in lines] == [2, 3] and all(line["env_per_s"] > 0 for line in lines)
+    assert [line["worlds"] for line in lines] == [2] and all(line["env_per_s"] > 0 for line in lines)
     stored = json.loads((tmp_path / "benchmark" / "summary.json").read_text())
     assert stored["physics"] == lines and stored["provenance"]["versions"]["mujoco"]
     assert "hammer" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_bare_steps_are_those_of_mjx(key):
     """Worlds differ by their commands, and time passes as asked for."""
     host = hammer.build({p.name: p.nominal for p in hammer.PARAMETERS}).compile()

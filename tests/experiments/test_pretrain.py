@@ -216,9 +216,12 @@ def test_random_actions_grow_along_the_fleet(key):
 
     def actions(ladder):
         trainer = make_pretrainer(env, replace(config, random_ladder=ladder, updates_per_step=1, batch_size=4))
-        random = trainer.collect_random(pool, key)
-        state = trainer.init(pool, random, key)
-        return trainer.chunk(pool, random, state)[0].replay.data.action[:3]
+
+        def run(key):
+            random = trainer.collect_random(pool, key)
+            return trainer.chunk(pool, random, trainer.init(pool, random, key))[0].replay.data.action[:3]
+
+        return jax.jit(run)(key)
 
     plain, full = actions(0.0), actions(1.0)
     assert jnp.array_equal(plain[0], full[0]) and not jnp.array_equal(plain[2], full[2])
