@@ -11,7 +11,7 @@ FLAGS = $(call flag,TASK,task) $(call flag,PRESET,preset) $(call flag,METHOD,met
 	$(call flag,PRIOR,prior) $(call flag,SEED,seed) $(call flag,SEEDS,seeds) $(ARGS)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup lint type test test-all demo gaps pretrain finetune evaluate figures lock clean
+.PHONY: help setup lint type test test-all demo bench gaps pretrain finetune evaluate figures lock clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -47,6 +47,9 @@ test-all: $(PY) ## every test that this machine can run
 
 demo: $(PY) ## the whole method in minutes on a CPU
 	$(PY) -m experiments.demo $(FLAGS)
+
+bench: $(PY) ## speeds next to their references
+	$(PY) -m experiments.benchmark $(ARGS)
 
 gaps: $(PY) ## the named differences between simulation and "real" system
 	$(PY) -m experiments.gaps $(FLAGS)

@@ -10,7 +10,7 @@ from sgft_jax.types import UserError, unknown
 TASKS = {"push": "envs.franka.push", "hammer": "envs.franka.hammer", "insert": "envs.franka.insert"}
 
 
-def make(name: str, impl: str | None = None) -> Env:
+def make(name: str, impl: str = "auto") -> Env:
     """The task of that name, compiled; impl: who steps its physics, see `physics.choose_impl`.
 
     Raises UserError with the closest match for an unknown task.

@@ -91,6 +91,7 @@ class Env(NamedTuple):
     reset(world, key) -> EnvState; step(world, state, action, key) -> EnvState.
     reward, terminated: functions of (obs, action, next_obs), true for imagined transitions too.
     success: function of one observation; `success_anytime` tells whether it counts at any step or only at the last.
+    impl: who steps the physics.
     """
 
     name: str
@@ -106,6 +107,7 @@ class Env(NamedTuple):
     reward: Callable[[Array, Array, Array], Array]
     terminated: Callable[[Array, Array, Array], Array]
     success: Callable[[Array], Array]
+    impl: str = "jax"
 
     @property
     def obs_dim(self) -> int:

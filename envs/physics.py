@@ -7,7 +7,7 @@ and all constants derived from them), because no derived field is ever recompute
 
 import os
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,8 @@ from sgft_jax.types import Array, UserError, unknown
 
 # Fields that only matter to a renderer: they may differ between worlds without being simulated.
 _COSMETIC = ("geom_rgba", "mat_", "light_", "cam_")
-IMPL_VARIABLE, IMPLS = "SGFT_IMPL", ("auto", "jax", "warp", "c")
+Impl = Literal["auto", "jax", "warp", "c"]  # see `choose_impl`
+IMPL_VARIABLE = "SGFT_IMPL"
 _STRUCTURE = (
     "body_parentid",
     "jnt_type",
@@ -54,15 +55,15 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...], impl: str) -> Adv
     return {"jax": engine_jax, "warp": engine_warp}[impl].make_advance(host)
 
 
-def choose_impl(wanted: str | None = None) -> str:
+def choose_impl(wanted: str = "auto") -> str:
     """Who steps the physics: "jax" (MJX's own code), "warp" (MJX with MuJoCo Warp) or "c" (MuJoCo's own engine).
 
-    wanted: one of them, or "auto": "c" where JAX computes on CPUs, else "jax", because insertion is slow in Warp as yet
-        (docs/performance.md). Default: $SGFT_IMPL, or "auto". Raises UserError for anything else.
+    wanted: one of them, or "auto": what $SGFT_IMPL says, or else "c" where JAX computes on CPUs and "jax" elsewhere,
+        because insertion is slow in Warp as yet (docs/performance.md). Raises UserError for anything else.
     """
-    impl = wanted or os.environ.get(IMPL_VARIABLE) or "auto"
-    if impl not in IMPLS:
-        raise UserError(unknown(IMPL_VARIABLE, impl, IMPLS))
+    impl = os.environ.get(IMPL_VARIABLE) or "auto" if wanted == "auto" else wanted
+    if impl not in get_args(Impl):
+        raise UserError(unknown(IMPL_VARIABLE if wanted == "auto" else "impl", impl, get_args(Impl)))
     if impl == "auto":
         return "c" if jax.default_backend() == "cpu" else "jax"
     return impl

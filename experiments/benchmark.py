@@ -1,12 +1,14 @@
-"""Measure speed, each number next to its reference from the same run: physics of whole environments against bare MJX.
+"""Measure speed, each number next to its reference from the same run.
 
-`bare`: nothing but `mjx.step` on the nominal scene under random commands, the state carried along. `env`: the step that
-training takes, with its own domain parameters in every world, controller, observation, reward and automatic reset.
+physics: the step that training takes, with its own domain parameters in every world, controller, observation, reward
+and automatic reset, against nothing but `mjx.step` on the nominal scene under random commands, the state carried along.
+updates: SAC updates of pretraining, with all its networks, against the same update written by hand in bare JAX.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,57 +22,88 @@ from rich.table import Table
 import envs
 from envs import engine_warp, physics
 from envs.base import Env
+from envs.physics import Impl
 from envs.rollout import Fleet, launch, step_fleet
-from experiments import cli
-from sgft_jax import runs
+from experiments import bench_updates, cli
+from sgft_jax import replay, runs
 from sgft_jax.log import write_summary
-from sgft_jax.types import Array, Key, PyTree, UserError
+from sgft_jax.networks import NetworkConfig
+from sgft_jax.sac import SACConfig, SACHyper, make_sac
+from sgft_jax.types import Array, Key, PyTree, Transition, UserError
 
 POOL = 256  # domain parameter vectors, so that a batch really differs from world to world
+OBS_DIM, ACT_DIM, MEMBERS = 12, 3, 5  # sizes of the updates: those of hammering
 
 
 @dataclass(frozen=True)
 class BenchmarkConfig:
     """What to measure."""
 
+    parts: tuple[Literal["physics", "updates"], ...] = ("physics", "updates")
+    """Kinds of measurements."""
     tasks: tuple[str, ...] = ("push", "hammer", "insert")
     """Scenes."""
     worlds: tuple[int, ...] = (1024,)
     """Worlds stepped together."""
-    impls: tuple[Literal["auto", "jax", "warp", "c"], ...] = ("auto",)
+    impls: tuple[Impl, ...] = ("auto",)
     """Engines of physics."""
     control_steps: int = 10
     """Control steps (of 0.2 s) per timed call."""
+    batches: tuple[int, ...] = (256,)
+    """Batch sizes of the updates."""
+    seeds: tuple[int, ...] = (1,)
+    """Agents updated together."""
+    width: int = 256
+    """Units of both hidden layers of every network; critics and values have LayerNorm."""
+    updates: int = 200
+    """Updates per timed call."""
     repeats: int = 3
     """Timed calls; the fastest counts."""
     out: Path = Path("runs")
     """The numbers go to <out>/benchmark/summary.json."""
 
 
-def main(config: BenchmarkConfig) -> list[dict[str, Any]]:
-    """Measures, prints a table, writes the numbers and returns them."""
+def main(config: BenchmarkConfig) -> dict[str, list[dict[str, Any]]]:
+    """Measures, prints tables, writes the numbers and returns them by kind of measurement."""
+    _check(config)
+    measured = {}
+    for part, measure in {"physics": _physics, "updates": _updates}.items():
+        if part in config.parts:
+            measured[part] = []
+            for line in measure(config):
+                measured[part].append(line)
+                print("  ".join(f"{name} {_text(x)}" for name, x in line.items()), flush=True)
+    folder = config.out / "benchmark"
+    folder.mkdir(parents=True, exist_ok=True)
+    path = write_summary(folder, {"provenance": runs.provenance(), **measured})
+    for part, lines in measured.items():
+        Console().print(table(part, lines))
+    print(f"numbers: {path}")
+    return measured
+
+
+def _check(config: BenchmarkConfig) -> None:
     for task in config.tasks:
         cli.choose("--tasks", task, envs.TASKS)
-    for name, least in (
-        ("worlds", min(config.worlds)),
-        ("control-steps", config.control_steps),
-        ("repeats", config.repeats),
-    ):
+    for name in ("worlds", "control_steps", "batches", "seeds", "width", "updates", "repeats"):
+        value = getattr(config, name)
+        least = min(value, default=0) if isinstance(value, tuple) else value
         if least < 1:
-            raise UserError(f"--{name} is {least}: must be at least 1")
+            raise UserError(f"--{name.replace('_', '-')} is {least}: must be at least 1")
+
+
+def _physics(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
     impls = [physics.choose_impl(impl) for impl in config.impls]
-    lines = []
     for task in config.tasks:
         for impl in impls:
             for n in config.worlds:
-                lines.append(physics_speed(task, impl, n, config))
-                print("  ".join(f"{name} {_text(x)}" for name, x in lines[-1].items()), flush=True)
-    folder = config.out / "benchmark"
-    folder.mkdir(parents=True, exist_ok=True)
-    path = write_summary(folder, {"provenance": runs.provenance(), "physics": lines})
-    Console().print(table(lines))
-    print(f"numbers: {path}")
-    return lines
+                yield physics_speed(task, impl, n, config)
+
+
+def _updates(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    for batch in config.batches:
+        for seeds in config.seeds:
+            yield update_speed(batch, seeds, config)
 
 
 def physics_speed(task: str, impl: str, worlds: int, config: BenchmarkConfig) -> dict[str, Any]:
@@ -143,20 +176,105 @@ def bare_steps(
     return jax.jit(jax.vmap(run), donate_argnums=0), start
 
 
-def table(lines: list[dict[str, Any]]) -> Table:
-    """The lines as a table; physics steps in millions per second."""
-    made = Table(title="physics, million steps per second")
-    for name in ("task", "engine", "worlds", "environment", "bare mjx.step", "ratio"):
-        made.add_column(name, justify="left" if name in ("task", "engine") else "right")
+def update_speed(batch: int, seeds: int, config: BenchmarkConfig) -> dict[str, Any]:
+    """SAC updates per second over all seeds: of the library, and of the hand-written one with its cost."""
+    network = NetworkConfig(hidden=(config.width, config.width), layer_norm=True)
+    keys, count = jax.random.split(jax.random.key(0), seeds), seeds * config.updates
+    own = count / fastest(*library_updates(network, batch, keys, config.updates), config.repeats)
+    run, start = bare_updates(network, batch, keys, config.updates)
+    bare = count / fastest(run, start, config.repeats)
+    flops = multiplications(network) * 2 * batch
+    return {
+        "batch": batch, "seeds": seeds, "width": config.width,
+        "updates_per_s": own, "bare_per_s": bare, "updates/bare": own / bare,
+        "gflop_per_update": flops / 1e9, "tflop_per_s": own * flops / 1e12,
+    }  # fmt: skip
+
+
+def rows(key: Key, batch: int) -> Transition:
+    """A batch of made-up transitions."""
+    blank = replay.blank(OBS_DIM, ACT_DIM)
+    obs, next_obs = jax.random.normal(key, (2, batch, OBS_DIM))
+    full = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *x.shape)), blank)
+    return full._replace(obs=obs, next_obs=next_obs, discount=full.discount + 0.97)
+
+
+def library_updates(network: NetworkConfig, batch: int, keys: Key, n: int) -> tuple[Callable[[PyTree], PyTree], PyTree]:
+    """(n updates of every seed, agents and keys [seeds])."""
+    learner = make_sac(SACConfig(OBS_DIM, ACT_DIM, network=network, ensemble_size=MEMBERS))
+
+    def run(state: tuple[PyTree, Key]) -> tuple[PyTree, Key]:
+        agent, key = state
+        key, own = jax.random.split(key)
+        data = rows(key, batch)
+        return jax.lax.scan(lambda s, k: (learner.update(s, data, k)[0], None), agent, jax.random.split(own, n))[0], key
+
+    return jax.jit(jax.vmap(run), donate_argnums=0), (jax.vmap(learner.init)(keys), jnp.copy(keys))
+
+
+def bare_updates(network: NetworkConfig, batch: int, keys: Key, n: int) -> tuple[Callable[[PyTree], PyTree], PyTree]:
+    """The same by hand."""
+    hyper = SACHyper()
+
+    def run(state: tuple[bench_updates.Bare, Key]) -> tuple[bench_updates.Bare, Key]:
+        agent, key = state
+        key, own = jax.random.split(key)
+        data = rows(key, batch)
+
+        def step(agent: bench_updates.Bare, key: Key) -> tuple[bench_updates.Bare, None]:
+            noise = bench_updates.draw(key, batch, ACT_DIM, MEMBERS)
+            return bench_updates.update(agent, data, noise, hyper), None
+
+        return jax.lax.scan(step, agent, jax.random.split(own, n))[0], key
+
+    fresh = lambda key: bench_updates.init(key, network, OBS_DIM, ACT_DIM, members=MEMBERS, alpha=1.0)  # noqa: E731
+    return jax.jit(jax.vmap(run), donate_argnums=0), (jax.vmap(fresh)(keys), jnp.copy(keys))
+
+
+def multiplications(network: NetworkConfig) -> int:
+    """Multiplications of the matrix products that one row of a batch causes in an update, gradients included.
+
+    A forward pass through kernels of K weights takes K, the gradient by these weights K, the gradient by the inputs of
+    the layers K, less the first kernel where nobody asks for the gradient by the network's input.
+    """
+
+    def sizes(inputs: int, outputs: int) -> tuple[int, int]:
+        widths = [inputs, *network.hidden, outputs]
+        kernels = [n * m for n, m in pairwise(widths)]
+        return sum(kernels), sum(kernels) - kernels[0]
+
+    def trained(inputs: int, outputs: int) -> int:
+        all_kernels, later = sizes(inputs, outputs)
+        return 2 * all_kernels + later
+
+    actor, critic = sizes(OBS_DIM, 2 * ACT_DIM)[0], sizes(OBS_DIM + ACT_DIM, 1)
+    through = 2 * (2 * critic[0])  # twin critics forward, then back to the action
+    return (
+        actor + 2 * critic[0]  # targets
+        + 2 * trained(OBS_DIM + ACT_DIM, 1)
+        + trained(OBS_DIM, 2 * ACT_DIM) + through
+        + trained(OBS_DIM, 1)
+        + MEMBERS * trained(OBS_DIM + ACT_DIM, OBS_DIM)
+    )  # fmt: skip
+
+
+def table(part: str, lines: list[dict[str, Any]]) -> Table:
+    """The lines of one kind as a table."""
+    title = {"physics": "physics steps per second", "updates": "SAC updates per second"}[part]
+    made = Table(title=title)
+    names = list(dict.fromkeys(name for line in lines for name in line))
+    for name in names:
+        heading = name.replace("_", " ").replace("/", " / ")
+        made.add_column(heading, justify="left" if name in ("task", "impl") else "right")
     for line in lines:
-        bare = f"{line['bare_per_s'] / 1e6:.2f}" if "bare_per_s" in line else "-"
-        ratio = f"{line['env/bare']:.2f}" if "env/bare" in line else "-"
-        made.add_row(line["task"], line["impl"], f"{line['worlds']:,}", f"{line['env_per_s'] / 1e6:.3f}", bare, ratio)
+        made.add_row(*(_text(line[name]) if name in line else "-" for name in names))
     return made
 
 
 def _text(x: Any) -> str:
-    return f"{x:.4g}" if isinstance(x, float) else str(x)
+    if isinstance(x, float):
+        return f"{x:,.0f}" if x >= 1000 else f"{x:.3g}"
+    return f"{x:,}" if isinstance(x, int) else str(x)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 import envs
+from envs.physics import Impl
 from experiments import cli, common
 from experiments.evaluation import describe, grade
 from sgft_jax.jsonfile import read_json
@@ -34,6 +35,9 @@ class EvaluateArgs:
     """Where: sim (the training domain without sensor noise), the name of a gap, or a .toml/.json file."""
     set: tuple[str, ...] = ()
     """Changes to the real system, e.g. --set latency=0.05 action_scale=[1,0.5]."""
+    impl: Impl = "auto"
+    """Who steps the physics: MJX's own code, MJX with MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c
+    on a CPU and jax elsewhere."""
     episodes: int = 200
     """Episodes per policy."""
     seed: int = 0
@@ -69,7 +73,7 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     if args.task is not None:
         cli.choose("--task", args.task, envs.TASKS)
     folders = common.prior_folders(args.run or args.prior, out=args.out, task=args.task or "push", preset=args.preset)
-    env = envs.make(args.task or read_json(folders[0] / "prior.json")["task"])
+    env = envs.make(args.task or read_json(folders[0] / "prior.json")["task"], args.impl)
     gap = common.load_gap(env, args.real, args.set)
     priors, card = common.load_priors(folders, env)
     network, gamma = common.network_of(card), card["gamma"]
@@ -80,7 +84,7 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     outcome = jax.tree.map(np.asarray, jax.jit(jax.vmap(graded))(common.stack(priors)))
     policies = [{"policy": str(f), **describe(common.member(outcome, i))} for i, f in enumerate(folders)]
     where = "in simulation" if gap is None else f"on the {gap.name} real system"
-    return {"task": env.name, "where": where, "episodes": args.episodes, "policies": policies}
+    return {"task": env.name, "impl": env.impl, "where": where, "episodes": args.episodes, "policies": policies}
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ import envs
 from envs import gaps
 from envs.base import Env
 from envs.gaps import Gap
+from envs.physics import Impl
 from envs.rollout import Episode
 from experiments import cli, common
 from experiments.evaluation import score
@@ -64,6 +65,9 @@ class FinetuneArgs:
     """Rollouts between checkpoints."""
     options: FinetuneConfig = field(default_factory=FinetuneConfig)
     """Method options; `network` and `gamma` always are the prior's."""
+    impl: Impl = "auto"
+    """Who steps the physics: MJX's own code, MJX with MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c
+    on a CPU and jax elsewhere."""
     video: bool = True
     """Render an episode before and after fine-tuning side by side, where MuJoCo can render."""
     out: Path = Path("runs")
@@ -82,7 +86,7 @@ def main(args: FinetuneArgs) -> None:
 def finetune(args: FinetuneArgs) -> dict[str, Any]:
     """One fine-tuning run from (or back) to disk; returns its summary."""
     method, seeds = _check(args)
-    env = envs.make(args.task)
+    env = envs.make(args.task, args.impl)
     gap = gaps.load(env, args.real, args.set)
     priors, card = common.find_priors(args.prior, out=args.out, env=env, preset=args.preset)
     run = runs.open_run(
@@ -241,7 +245,7 @@ class _Run:
     def _summarise(self) -> dict[str, Any]:
         """summary.json, the learning curve and the closing words."""
         args, curve = self.args, read_curve(self.folder)
-        about = {"task": args.task, "method": args.method, "gap": self.gap._asdict()}
+        about = {"task": args.task, "method": args.method, "impl": self.env.impl, "gap": self.gap._asdict()}
         summary = about | describe_run(curve)
         write_summary(self.folder, summary)
         plot.learning_curves(

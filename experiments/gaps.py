@@ -20,6 +20,7 @@ import envs
 from envs import gaps
 from envs.base import Env, World
 from envs.gaps import Gap
+from envs.physics import Impl
 from envs.rollout import pool_size
 from experiments import cli, common
 from experiments.evaluation import Best, Outcome, describe, grade, score
@@ -57,6 +58,9 @@ class GapsArgs:
     """First seed of that training."""
     seeds: int = 1
     """Policies trained per gap."""
+    impl: Impl = "auto"
+    """Who steps the physics: MJX's own code, MJX with MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c
+    on a CPU and jax elsewhere."""
     episodes: int = 256
     """Evaluation episodes per policy and gap, at least 200."""
     out: Path = Path("runs")
@@ -78,7 +82,7 @@ def measure(args: GapsArgs) -> dict[str, Any]:
     if args.episodes < 200:
         raise UserError(f"--episodes is {args.episodes}: a success rate needs at least 200 to tell 40 % from 50 %")
     seeds = common.seed_list(args.seed, args.seeds)
-    env = envs.make(args.task)
+    env = envs.make(args.task, args.impl)
     found = [gaps.load(env, name) for name in args.presets or gaps.presets(args.task)]
     if not found:
         raise UserError(f"{args.task} comes with no gaps; name .toml or .json files with --presets")
@@ -88,7 +92,7 @@ def measure(args: GapsArgs) -> dict[str, Any]:
     folders = common.prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
     priors, card = common.load_priors(folders, env)
     here = _zero_shot(env, found, common.stack(priors), card, args.episodes)
-    about = {"task": args.task, "preset": args.preset, "priors": [str(prior) for prior in folders]}
+    about = {"task": args.task, "impl": env.impl, "preset": args.preset, "priors": [str(prior) for prior in folders]}
     summary = _report(folder, about, [_line(gap, here[i], None) for i, gap in enumerate(found)])
     if args.train:  # the long part: what is known already is on disk
         there = _train(env, args, found, seeds, folder)

@@ -20,6 +20,7 @@ import numpy as np
 import envs
 from envs.base import Env, World
 from envs.gaps import Gap
+from envs.physics import Impl
 from envs.rollout import pick, pool_size
 from experiments import cli, common
 from experiments.evaluation import Best, Outcome, describe, grade, keep_better, score
@@ -56,6 +57,9 @@ class PretrainArgs:
     """Train on a "real" system instead of the simulator's domain: the name of a gap, or a .toml/.json file."""
     set: tuple[str, ...] = ()
     """Changes to that system, e.g. --set latency=0.05 action_scale=[1,0.5]."""
+    impl: Impl = "auto"
+    """Who steps the physics: MJX's own code, MJX with MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c
+    on a CPU and jax elsewhere."""
     report: bool = True
     """Also measure V_sim against returns and the models against the simulator: numbers on the card, a figure."""
     video: bool = True
@@ -104,7 +108,7 @@ def pretrain(args: PretrainArgs) -> dict[str, Any]:
     cli.choose("--preset", args.preset, PRESETS)
     cli.choose("--task", args.task, envs.TASKS)
     seeds = common.seed_list(args.seed, args.seeds)
-    env = envs.make(args.task)
+    env = envs.make(args.task, args.impl)
     gap = common.load_gap(env, args.real, args.set)
     make_pretrainer(env, args.config)  # sizes that do not fit together are reported before anything is written
     run = runs.open_run(
@@ -165,6 +169,7 @@ def prior_card(args: PretrainArgs, env: Env, gap: Gap | None, found: dict[str, A
         "domain": [p._asdict() for p in env.parameters],
         "gap": None if gap is None else gap._asdict(),
         "preset": args.preset,
+        "impl": env.impl,
         "config": config_to_json(args.config),
         "chosen": f"the best evaluation on held-out worlds after {args.config.choose_from:.0%} of training: success, "
         "then return",
@@ -294,6 +299,7 @@ class _Run:
         summary = {
             "task": self.env.name,
             "preset": self.args.preset,
+            "impl": self.env.impl,
             "gap": None if self.gap is None else self.gap._asdict(),
             "env_steps": self.chunks * self.chunk_env_steps,
             "updates": self.chunks * self.config.chunk_steps * self.config.updates_per_step,

@@ -24,7 +24,7 @@ class Point(NamedTuple):
     ctrl: Array
 
 
-def make(impl: str | None = None) -> Env:
+def make(impl: str = "auto") -> Env:
     """The toy task, 20 steps of 0.1 s."""
     return Env(
         name="toy",

@@ -126,7 +126,7 @@ SCENE = Scene(
 )
 
 
-def make(impl: str | None = None) -> Env:
+def make(impl: str = "auto") -> Env:
     """The hammering task."""
     return make_env(SCENE, impl)
 

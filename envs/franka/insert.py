@@ -136,7 +136,7 @@ SCENE = Scene(
 )
 
 
-def make(impl: str | None = None) -> Env:
+def make(impl: str = "auto") -> Env:
     """The insertion task."""
     return make_env(SCENE, impl)
 

@@ -66,12 +66,13 @@ def new_spec(*, substeps: int, iterations: int, ls_iterations: int) -> mujoco.Mj
     return spec
 
 
-def make_env(scene: Scene, impl: str | None = None) -> Env:
+def make_env(scene: Scene, impl: str = "auto") -> Env:
     """Assembles the Env of a scene: worlds, resets, steps. impl: who steps the physics, see `physics.choose_impl`."""
     nominal = {p.name: p.nominal for p in scene.parameters}
     host = scene.build(nominal).compile()
     fields = physics.varying_fields(host, _perturbed(scene, nominal))
-    engine = physics.make_engine(host, fields, physics.choose_impl(impl))
+    impl = physics.choose_impl(impl)
+    engine = physics.make_engine(host, fields, impl)
     obs_dim, act_dim = sum(e.size for e in scene.observation), sum(e.size for e in scene.action)
 
     def stack_worlds(params: np.ndarray, effects: Effects) -> World:
@@ -134,6 +135,7 @@ def make_env(scene: Scene, impl: str | None = None) -> Env:
         reward=scene.reward,
         terminated=lambda obs, action, next_obs: jnp.zeros((), bool),
         success=scene.success,
+        impl=impl,
     )
 
 

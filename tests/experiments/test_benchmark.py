@@ -23,11 +23,18 @@ def test_the_fastest_call_counts_without_the_first(monkeypatch):
 
 
 def test_numbers_reach_the_disk(tmp_path, capsys):
-    config = BenchmarkConfig(tasks=("hammer",), worlds=(2,), impls=("c",), control_steps=2, repeats=1, out=tmp_path)
-    lines = main(config)
-    assert [line["worlds"] for line in lines] == [2] and all(line["env_per_s"] > 0 for line in lines)
+    config = BenchmarkConfig(
+        tasks=("hammer",), worlds=(2,), impls=("c",), control_steps=2, repeats=1, width=8, batches=(4,), updates=2,
+        out=tmp_path,
+    )  # fmt: skip
+    with jax.numpy_rank_promotion("allow"):  # the hand-written update broadcasts ensembles against batches
+        measured = main(config)
+    (physics,), (updates,) = measured["physics"], measured["updates"]
+    assert physics["worlds"] == 2 and physics["env_per_s"] > 0
+    assert updates["updates/bare"] == pytest.approx(updates["updates_per_s"] / updates["bare_per_s"])
     stored = json.loads((tmp_path / "benchmark" / "summary.json").read_text())
-    assert stored["physics"] == lines and stored["provenance"]["versions"]["mujoco"]
+    assert stored["physics"] == [physics] and stored["updates"] == [updates]
+    assert stored["provenance"]["versions"]["mujoco"]
     assert "hammer" in capsys.readouterr().out
 
 
@@ -49,6 +56,7 @@ def test_bare_steps_are_those_of_mjx(key):
         ({"tasks": ("hamer",)}, "--tasks: there is no 'hamer', did you mean 'hammer'?"),
         ({"worlds": (4, 0)}, "--worlds is 0"),
         ({"repeats": 0}, "--repeats is 0"),
+        ({"batches": ()}, "--batches is 0"),
     ],
 )
 def test_bad_input(change, complaint, tmp_path, monkeypatch):

@@ -1,0 +1,66 @@
+"""The hand-written update is the library's: the same parameters from the same batch and the same random numbers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments import bench_updates
+from experiments.benchmark import ACT_DIM, MEMBERS, OBS_DIM, multiplications, rows
+from sgft_jax.networks import NetworkConfig
+from sgft_jax.sac import SACConfig, SACHyper, make_sac
+
+NETWORK, BATCH = NetworkConfig(hidden=(16, 16), layer_norm=True), 8
+HYPER = SACHyper(tau=0.1, alpha=0.3)
+
+
+def layers(params):
+    """Flax parameters of one network (or of a stacked ensemble) as the reference keeps them."""
+    made = []
+    for i in range(3):
+        norm = params.get(f"LayerNorm_{i}")
+        dense = params[f"Dense_{i}"]
+        made.append((dense["kernel"], dense["bias"], *((norm["scale"], norm["bias"]) if norm else ())))
+    return made
+
+
+def noise_of(key):
+    """The numbers that `sgft_jax.sac` draws from this key."""
+    key_target, key_actor, key_dynamics = jax.random.split(key, 3)
+    normal = lambda key: jax.random.normal(key, (ACT_DIM,))  # noqa: E731
+    target, actor = (jax.vmap(normal)(jax.random.split(k, BATCH)) for k in (key_target, key_actor))
+    return bench_updates.Noise(target, actor, jax.random.exponential(key_dynamics, (BATCH, MEMBERS)))
+
+
+def test_it_is_the_update_of_the_library(key):
+    learner = make_sac(SACConfig(OBS_DIM, ACT_DIM, network=NETWORK, ensemble_size=MEMBERS), HYPER)
+    state = learner.init(key)
+    parts = {name: bench_updates.trained(layers(getattr(state, name).params)) for name in ("actor", "critic", "value")}
+    bare = bench_updates.Bare(
+        **parts,
+        target=layers(state.target_critic),
+        log_alpha=bench_updates.trained(state.log_alpha.params),
+        dynamics=bench_updates.trained(layers(state.dynamics.params)),
+    )
+    update, by_hand = jax.jit(learner.update), jax.jit(bench_updates.update)
+    for step in range(3):
+        key_rows, key_step = jax.random.split(jax.random.fold_in(key, step))
+        batch = rows(key_rows, BATCH)._replace(reward=jnp.arange(8.0), action=jnp.full((BATCH, ACT_DIM), 0.3))
+        state, _ = update(state, batch, key_step)
+        with jax.numpy_rank_promotion("allow"):
+            bare = by_hand(bare, batch, noise_of(key_step), HYPER)
+    pairs = [(layers(getattr(state, name).params), getattr(bare, name).params) for name in (*parts, "dynamics")]
+    pairs += [(layers(state.target_critic), bare.target), (state.log_alpha.params, bare.log_alpha.params)]
+    for wanted, seen in pairs:
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), wanted, seen)
+    moved = np.abs(layers(state.actor.params)[0][0] - layers(learner.init(key).actor.params)[0][0]).max()
+    assert moved > 3e-4  # further than the tolerance, so the comparison says something
+
+
+def test_multiplications_are_those_of_xla(key):
+    """XLA counts two operations per multiplication and what is beside matrix products: little where layers are wide."""
+    wide = NetworkConfig(hidden=(128, 128), layer_norm=True)
+    agent = bench_updates.init(key, wide, OBS_DIM, ACT_DIM, members=MEMBERS, alpha=1.0)
+    batch, noise = rows(key, 64), bench_updates.draw(key, 64, ACT_DIM, MEMBERS)
+    with jax.numpy_rank_promotion("allow"):
+        cost = jax.jit(bench_updates.update).lower(agent, batch, noise, HYPER).compile().cost_analysis()
+    assert 0.8 < 2 * 64 * multiplications(wide) / cost["flops"] <= 1.0
