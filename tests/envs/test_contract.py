@@ -35,7 +35,10 @@ def test_step_of_a_batch_is_the_steps_of_its_members(pushing, started):
     batch = pushing.step_batch(pushing.worlds, started, ACTIONS, KEYS)
     for i in range(4):
         alone = pushing.step(member(pushing.worlds, i), member(started, i), ACTIONS[i], KEYS[i])
-        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=2e-4, rtol=1e-3), member(batch, i), alone)
+        pair = [state._replace(physics=state.physics._asdict()) for state in (member(batch, i), alone)]
+        accelerations = [state.physics.pop("warmstart") for state in pair]  # tens of rad/s^2
+        np.testing.assert_allclose(*accelerations, atol=5e-3)
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=2e-4, rtol=1e-3), *pair)
     moved = batch.true_obs[:, :2] - started.true_obs[:, :2]
     np.testing.assert_allclose(moved[0], [0.05, 0.0], atol=0.003)  # one full step, 5 cm; the rest obey as well
     assert (jnp.sign(moved[1:]) == jnp.sign(ACTIONS[1:])).all()
