@@ -19,8 +19,8 @@ def make(name: str, impl: str = "auto") -> Env:
 
 
 def scene(name: str) -> Any:
-    """The parts that the task of that name is made of."""
-    return _module(name).SCENE
+    """The parts that the task of that name is made of; None for a task that is not simulated by MuJoCo."""
+    return getattr(_module(name), "SCENE", None)
 
 
 def _module(name: str) -> ModuleType:

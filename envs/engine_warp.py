@@ -21,13 +21,12 @@ from sgft_jax.types import Array, PyTree, UserError
 # converged to a micrometre. Worlds stop once they have, so more cost little.
 _MORE_ITERATIONS = 4
 _POSES = ("xpos", "xquat", "xmat", "xipos", "ximat", "geom_xpos", "geom_xmat")
-MISSING = "SGFT_IMPL=warp needs the package warp-lang: install sgft-jax[warp]"
 
 
 def make_advance(host: mujoco.MjModel) -> Advance:
     """The engine of a compiled scene; for one world, vmap over worlds. Raises UserError where Warp is not installed."""
     if not available():
-        raise UserError(MISSING)
+        raise UserError("the engine warp needs the package warp-lang: install sgft-jax[warp]")
     lost = _set_up()
     contacts, rows = budget(host)
     nominal = _settings(mjx.put_model(host, impl="warp"))

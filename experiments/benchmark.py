@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -180,9 +180,10 @@ def update_speed(batch: int, seeds: int, config: BenchmarkConfig) -> dict[str, A
     """SAC updates per second over all seeds: of the library, and of the hand-written one with its cost."""
     network = NetworkConfig(hidden=(config.width, config.width), layer_norm=True)
     keys, count = jax.random.split(jax.random.key(0), seeds), seeds * config.updates
-    own = count / fastest(*library_updates(network, batch, keys, config.updates), config.repeats)
-    run, start = bare_updates(network, batch, keys, config.updates)
-    bare = count / fastest(run, start, config.repeats)
+    own, bare = (
+        count / fastest(*repeated(*agent, batch, keys, config.updates), config.repeats)
+        for agent in (library_agent(network), bare_agent(network, batch))
+    )
     flops = multiplications(network) * 2 * batch
     return {
         "batch": batch, "seeds": seeds, "width": config.width,
@@ -199,36 +200,44 @@ def rows(key: Key, batch: int) -> Transition:
     return full._replace(obs=obs, next_obs=next_obs, discount=full.discount + 0.97)
 
 
-def library_updates(network: NetworkConfig, batch: int, keys: Key, n: int) -> tuple[Callable[[PyTree], PyTree], PyTree]:
-    """(n updates of every seed, agents and keys [seeds])."""
+class Agent(NamedTuple):
+    """update(state, batch, key) -> state; init(key) -> state."""
+
+    update: Callable[[PyTree, Transition, Key], PyTree]
+    init: Callable[[Key], PyTree]
+
+
+def library_agent(network: NetworkConfig) -> Agent:
+    """SAC as pretraining uses it."""
     learner = make_sac(SACConfig(OBS_DIM, ACT_DIM, network=network, ensemble_size=MEMBERS))
+    return Agent(lambda state, batch, key: learner.update(state, batch, key)[0], learner.init)
+
+
+def bare_agent(network: NetworkConfig, batch: int) -> Agent:
+    """The same by hand, for batches of that size."""
+    hyper = SACHyper()
+
+    def update(state: bench_updates.Bare, rows: Transition, key: Key) -> bench_updates.Bare:
+        return bench_updates.update(state, rows, bench_updates.draw(key, batch, ACT_DIM, MEMBERS), hyper)
+
+    def init(key: Key) -> bench_updates.Bare:
+        return bench_updates.init(key, network, OBS_DIM, ACT_DIM, members=MEMBERS, alpha=1.0)
+
+    return Agent(update, init)
+
+
+def repeated(
+    update: Callable[[PyTree, Transition, Key], PyTree], init: Callable[[Key], PyTree], batch: int, keys: Key, n: int
+) -> tuple[Callable[[PyTree], PyTree], PyTree]:
+    """(n updates of every seed, agents and keys [seeds])."""
 
     def run(state: tuple[PyTree, Key]) -> tuple[PyTree, Key]:
         agent, key = state
         key, own = jax.random.split(key)
         data = rows(key, batch)
-        return jax.lax.scan(lambda s, k: (learner.update(s, data, k)[0], None), agent, jax.random.split(own, n))[0], key
+        return jax.lax.scan(lambda s, k: (update(s, data, k), None), agent, jax.random.split(own, n))[0], key
 
-    return jax.jit(jax.vmap(run), donate_argnums=0), (jax.vmap(learner.init)(keys), jnp.copy(keys))
-
-
-def bare_updates(network: NetworkConfig, batch: int, keys: Key, n: int) -> tuple[Callable[[PyTree], PyTree], PyTree]:
-    """The same by hand."""
-    hyper = SACHyper()
-
-    def run(state: tuple[bench_updates.Bare, Key]) -> tuple[bench_updates.Bare, Key]:
-        agent, key = state
-        key, own = jax.random.split(key)
-        data = rows(key, batch)
-
-        def step(agent: bench_updates.Bare, key: Key) -> tuple[bench_updates.Bare, None]:
-            noise = bench_updates.draw(key, batch, ACT_DIM, MEMBERS)
-            return bench_updates.update(agent, data, noise, hyper), None
-
-        return jax.lax.scan(step, agent, jax.random.split(own, n))[0], key
-
-    fresh = lambda key: bench_updates.init(key, network, OBS_DIM, ACT_DIM, members=MEMBERS, alpha=1.0)  # noqa: E731
-    return jax.jit(jax.vmap(run), donate_argnums=0), (jax.vmap(fresh)(keys), jnp.copy(keys))
+    return jax.jit(jax.vmap(run), donate_argnums=0), (jax.vmap(init)(keys), jnp.copy(keys))
 
 
 def multiplications(network: NetworkConfig) -> int:

@@ -1,7 +1,6 @@
 """Impure: what the commands that train and evaluate share: seeds, worlds and priors by name, a stopwatch."""
 
 import contextlib
-import importlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -141,7 +140,7 @@ def _seed_number(folder: Path) -> tuple[int, str]:
 
 def film(task: str, theta: Array, qpos: np.ndarray, path: Path) -> str:
     """Renders an episode, qpos [T + 1, nq], in a world with domain parameters theta; says in one line how it went."""
-    scene = getattr(importlib.import_module(envs.TASKS[task]), "SCENE", None)
+    scene = envs.scene(task)
     if scene is None:
         return f"no video: {task} has no scene to draw"
     if reason := cli.select_renderer():

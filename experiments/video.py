@@ -1,6 +1,5 @@
 """Impure: one real episode of a policy before and after fine-tuning, rendered side by side."""
 
-import importlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -18,7 +17,7 @@ def before_and_after(env: Env, pool: World, play: Callable[[], Sequence[Episode]
     play() -> one episode in a world of `pool` before and the same after `rollouts` real rollouts. Never raises for want
     of a scene, a graphics library or an encoder: a run does not fail for a picture.
     """
-    scene = getattr(importlib.import_module(envs.TASKS[env.name]), "SCENE", None)
+    scene = envs.scene(env.name)
     if scene is None:
         return f"no video: {env.name} has no scene to draw"
     if reason := cli.select_renderer():

@@ -136,18 +136,19 @@ def test_seeds_together_are_seeds_one_by_one(home, tmp_path):
     assert max(abs(line["return"][0] - line["return"][1]) for line in both) > 0.1
 
 
-def test_killed_and_resumed_is_bit_for_bit_uninterrupted(home, tmp_path):
+@pytest.mark.parametrize("method", ["sgft-sac", pytest.param("sac", marks=pytest.mark.slow)])
+def test_killed_and_resumed_is_bit_for_bit_uninterrupted(home, tmp_path, method):
     """SIGKILL after the rollout that follows the checkpoint at 4, whose line and rollout are on disk already."""
     paths = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}", "SGFT_CACHE_DIR": str(TESTS.parent / ".cache/jax")}
-    arguments = argv(home, "sgft-sac", out=tmp_path)
+    arguments = argv(home, method, out=tmp_path)
     killed = subprocess.run([sys.executable, "-c", PROGRAM, *arguments], env={**os.environ, **paths}, timeout=300)
-    cut = tmp_path / "finetune/toy/turned/sgft-sac/seeds-0-1"
+    cut = tmp_path / "finetune/toy/turned" / method / "seeds-0-1"
     assert killed.returncode == -signal.SIGKILL and checkpoint.latest(cut) == 4
     assert len(read_jsonl(cut / "metrics.jsonl")) == 4 and len(RealLog(cut)) == 5
 
     call([*arguments, "--resume"])
     for name in ("metrics.jsonl", "eval.jsonl", "summary.json"):
-        assert (cut / name).read_bytes() == (run(home, "sgft-sac") / name).read_bytes()
+        assert (cut / name).read_bytes() == (run(home, method) / name).read_bytes()
     assert len(RealLog(cut)) == 5
     assert len(list(cut.glob("real/superseded-0/*.npz"))) == 1  # what the robot did is kept
 
