@@ -9,6 +9,8 @@ from sgft_jax.log import EVAL, read_jsonl
 from sgft_jax.stats import first_dip, iqm_interval, transitions_to
 from sgft_jax.types import UserError
 
+LEVELS = (90, 98)  # per cent of success: nearly always, and as good as always
+
 
 class Curve(NamedTuple):
     """Evaluations of one fine-tuning run on the real system; the first one is zero-shot.
@@ -38,18 +40,22 @@ def describe_run(curve: Curve) -> dict[str, Any]:
 
     zero_shot, final: success and return, interquartile mean over seeds with its 95 % bootstrap interval, and mean.
     dip: how far success of a seed, and of the mean over seeds, ever fell below zero-shot.
-    to_90: real transitions of each seed until an evaluation first shows 90 % success (null = never), and the same for
-    the mean curve.
+    to_90, to_98: real transitions of each seed until an evaluation first shows that success in per cent (null = never),
+    and the same for the mean curve.
     """
     mean = curve.success.mean(0)
-    to_90 = [transitions_to(curve.transitions, s, 0.9) for s in curve.success]
     return {
         "zero_shot": _point(curve, 0),
         "final": _point(curve, -1),
         "dip": {"mean": first_dip(mean), "worst_seed": max(first_dip(s) for s in curve.success)},
-        "to_90": {"seeds": to_90, "mean_curve": transitions_to(curve.transitions, mean, 0.9)},
+        **{f"to_{percent}": _transitions(curve, percent / 100) for percent in LEVELS},
         "seeds": int(curve.success.shape[0]),
     }
+
+
+def _transitions(curve: Curve, level: float) -> dict[str, Any]:
+    first = lambda success: transitions_to(curve.transitions, success, level)  # noqa: E731
+    return {"seeds": [first(s) for s in curve.success], "mean_curve": first(curve.success.mean(0))}
 
 
 def _point(curve: Curve, i: int) -> dict[str, Any]:

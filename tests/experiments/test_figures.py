@@ -36,7 +36,7 @@ def call(*argv):
 def test_a_row_says_what_the_curve_says(tmp_path):
     success = [[0.2, 0.4], [0.1, 0.1], [0.8, 1.0], [1.0, 1.0]]
     curve = read_curve(save(tmp_path, "sac", success, rollouts=[0, 20, 50, 100]))
-    # Means 0.3, 0.1, 0.9, 1.0: dip 0.3 - 0.1 = 20 points; 90 % first at 50 rollouts = 1,000 transitions;
+    # Means 0.3, 0.1, 0.9, 1.0: dip 0.3 - 0.1 = 20 points; 90 % first at 50 rollouts = 1,000 transitions, 98 % at 2,000;
     # 100 rollouts of 2 s are 3.3 min. Two seeds: the bootstrap interval reaches from one to the other.
     cells = [
         "sac",
@@ -47,6 +47,7 @@ def test_a_row_says_what_the_curve_says(tmp_path):
         "100 [100, 100]",
         "100 [100, 100] (100)",
         "1,000",
+        "2,000",
         "20",
         "3.3",
     ]
@@ -55,7 +56,11 @@ def test_a_row_says_what_the_curve_says(tmp_path):
 
 def test_budgets_not_reached_or_not_evaluated_stay_empty(tmp_path):
     folder = save(tmp_path, "sac", [[0.5], [0.6], [0.7]], rollouts=[0, 19, 50], seeds="seed-0")
-    assert figures.row("sac", read_curve(folder)) == ["sac", "1", "50", "-", "70", "-", "70 (50)", "never", "0", "1.7"]
+    ended = "> 1,000"
+    assert figures.row("sac", read_curve(folder)) == [
+        *("sac", "1", "50", "-", "70", "-", "70 (50)"),
+        *(ended, ended, "0", "1.7"),
+    ]
 
 
 def test_one_figure_and_one_table_per_real_system(tmp_path, capsys, monkeypatch):
