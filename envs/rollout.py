@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from envs.base import Env, EnvState, World
+from sgft_jax.mesh import split_vmap
 from sgft_jax.types import Array, Key, PyTree, Transition
 
 # policy(carry, obs, key) -> (action, carry), for one environment
@@ -53,7 +54,7 @@ def launch(env: Env, pool: World, key: Key, n: int) -> Fleet:
     """N environments, each in a random world of the pool, freshly reset."""
     key_world, key_reset = jax.random.split(key)
     index = jax.random.randint(key_world, (n,), 0, pool_size(pool))
-    return Fleet(index, jax.vmap(env.reset)(pick(pool, index), jax.random.split(key_reset, n)))
+    return Fleet(index, split_vmap(env.reset)(pick(pool, index), jax.random.split(key_reset, n)))
 
 
 def step_fleet(
@@ -66,7 +67,7 @@ def step_fleet(
     """
     n = fleet.index.shape[0]
     key_step, key_reset = jax.random.split(key)
-    after = jax.vmap(env.step)(pick(pool, fleet.index), fleet.state, actions, jax.random.split(key_step, n))
+    after = split_vmap(env.step)(pick(pool, fleet.index), fleet.state, actions, jax.random.split(key_step, n))
     valid = ~after.invalid
     transitions = jax.vmap(lambda *step: _transition(*step, gamma=gamma))(fleet.state, actions, after)
     done = after.terminated | after.truncated | after.invalid

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from envs.base import Env, World
 from envs.rollout import Episode, play_episode
 from sgft_jax import stats
+from sgft_jax.mesh import split_vmap
 from sgft_jax.networks import NetworkConfig, make_actor, tanh_gaussian_action
 from sgft_jax.normalizer import normalize
 from sgft_jax.types import Array, Key, Metrics, Prior
@@ -23,7 +24,7 @@ def play_episodes(env: Env, pool: World, act: Act, keys: Key, *, gamma: float, l
     """
     policy = lambda carry, obs, key: (act(obs, key), carry)  # noqa: E731
     one = lambda key: play_episode(env, pool, policy, (), key, gamma=gamma, length=length)  # noqa: E731
-    return jax.vmap(one)(keys)
+    return split_vmap(one)(keys)
 
 
 class Outcome(NamedTuple):

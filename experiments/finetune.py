@@ -23,7 +23,7 @@ from experiments.finetuning import make_program
 from experiments.presets import PRESETS
 from experiments.results import describe_run, read_curve
 from experiments.video import before_and_after
-from sgft_jax import checkpoint, plot, runs
+from sgft_jax import checkpoint, mesh, plot, runs
 from sgft_jax.finetune import FinetuneConfig, FinetuneState, make_finetuner
 from sgft_jax.log import MetricsLog, RealLog, RunProgress, write_summary
 from sgft_jax.sgft import Method, get_method
@@ -68,6 +68,8 @@ class FinetuneArgs:
     impl: Impl = "auto"
     """Who steps the physics: MJX's own code, MJX with MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c
     on a CPU and jax elsewhere."""
+    devices: int = 1
+    """Devices that share the seeds; 0: all there are."""
     video: bool = True
     """Render an episode before and after fine-tuning side by side, where MuJoCo can render."""
     out: Path = Path("runs")
@@ -86,6 +88,7 @@ def main(args: FinetuneArgs) -> None:
 def finetune(args: FinetuneArgs) -> dict[str, Any]:
     """One fine-tuning run from (or back) to disk; returns its summary."""
     method, seeds = _check(args)
+    devices = mesh.devices(args.devices, {"--seeds": args.seeds})
     env = envs.make(args.task, args.impl)
     gap = gaps.load(env, args.real, args.set)
     priors, card = common.find_priors(args.prior, out=args.out, env=env, preset=args.preset)
@@ -95,11 +98,12 @@ def finetune(args: FinetuneArgs) -> dict[str, Any]:
         config=args,
         resume=args.resume,
         overwrite=args.overwrite,
-        volatile=("resume", "overwrite", "rollouts", "video", "out"),
+        volatile=("resume", "overwrite", "rollouts", "devices", "video", "out"),
     )
     try:
         own = [priors[seed % len(priors)] for seed in seeds]
-        return _Run(args, env, gap, method, seeds, run.folder).work(common.stack(own), card)
+        with mesh.use(devices):
+            return _Run(args, env, gap, method, seeds, run.folder).work(common.stack(own), card)
     finally:
         run.close()
 

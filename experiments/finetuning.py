@@ -14,13 +14,15 @@ from envs.base import Env, World
 from envs.rollout import Episode
 from experiments.evaluation import play_episodes
 from sgft_jax.finetune import Finetuner, FinetuneState
+from sgft_jax.mesh import split_vmap
 from sgft_jax.types import Array, Key, Metrics, Prior
 
 _INIT, _COLLECT, _LEARN, _EVALUATE = range(4)  # purposes, folded into a seed's key
 
 
 class Program(NamedTuple):
-    """Compiled functions over a leading seeds axis S. The state given to `store` and `learn` is donated.
+    """Compiled functions over a leading seeds axis S, which the devices of a mesh share. The state given to `store` and
+    `learn` is donated.
 
     init(priors [S], seeds [S]) -> state [S].
     collect(state, pool, seeds, rollout, n) -> Episode [S, n]: exploring episodes on the real system.
@@ -55,10 +57,10 @@ def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
 
     def learn(state: FinetuneState, seeds: Array, rollout: Array, updates: int) -> tuple[FinetuneState, Metrics]:
         one = lambda state, seed: tuner.learn(state, _key(seed, _LEARN, rollout), updates)  # noqa: E731
-        return jax.vmap(one)(state, seeds)
+        return split_vmap(one)(state, seeds)
 
     # One program explores and evaluates: compiling MJX takes longer than many an experiment on a small machine.
-    played = jax.jit(jax.vmap(play, (0, None, 0, None)))
+    played = jax.jit(split_vmap(play, (0, None, 0, None)))
     keys = jax.jit(jax.vmap(_episode_keys, (0, None, None, None)), static_argnums=3)
 
     def collect(state: FinetuneState, pool: World, seeds: Array, rollout: int, n: int) -> Episode:
@@ -68,9 +70,9 @@ def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
         return played(state, pool, keys(seeds, _EVALUATE, 0, n), False)
 
     return Program(
-        init=jax.jit(jax.vmap(init)),
+        init=jax.jit(split_vmap(init)),
         collect=collect,
-        store=jax.jit(jax.vmap(store), donate_argnums=0),
+        store=jax.jit(split_vmap(store), donate_argnums=0),
         learn=jax.jit(learn, static_argnums=3, donate_argnums=0),
         evaluate=evaluate,
     )

@@ -25,9 +25,9 @@ from envs.rollout import pick, pool_size
 from experiments import cli, common
 from experiments.evaluation import Best, Outcome, describe, grade, keep_better, score
 from experiments.presets import PRESETS, PretrainConfig
-from experiments.pretraining import PretrainState, make_pretrainer, replay_bytes
+from experiments.pretraining import PretrainState, make_pretrainer, replay_bytes, spread, spread_replay
 from experiments.report import Report, make_report, numbers
-from sgft_jax import checkpoint, plot, runs
+from sgft_jax import checkpoint, mesh, plot, runs
 from sgft_jax.config import config_to_json
 from sgft_jax.log import EVAL, MetricsLog, RunProgress, read_jsonl, write_summary
 from sgft_jax.replay import ReplayState
@@ -36,6 +36,7 @@ from sgft_jax.types import Key, Prior
 
 DEFAULT_PRESET = "fast"
 _WORLDS, _RANDOM, _START, _REPORT = range(4)  # purposes, folded into a seed's key
+_CUT = ("n_envs", "replay_capacity", "batch_size")  # sizes that devices share
 _EXAM_SEED, _REPORT_SEED = 2**31, 2**31 + 1  # held-out worlds and episodes, the same for every run
 
 
@@ -60,6 +61,9 @@ class PretrainArgs:
     impl: Impl = "auto"
     """Who steps the physics: MJX's own code, MJX with MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c
     on a CPU and jax elsewhere."""
+    devices: int = 1
+    """Devices that share the environments, the replay and every batch; 0: all there are. Results stay the same but for
+    rounding, and a run may be resumed on another number."""
     report: bool = True
     """Also measure V_sim against returns and the models against the simulator: numbers on the card, a figure."""
     video: bool = True
@@ -80,15 +84,18 @@ class Saved(NamedTuple):
 
 
 class Program(NamedTuple):
-    """Jitted functions over a leading seeds axis; `chunk` consumes the state it is given.
+    """Jitted functions over a leading seeds axis; `chunk` consumes the state it is given, the `spread` ones do, too.
 
     collect(pools, keys) -> random-action data. begin(pools, random, keys) -> Saved.
+    spread_random(random), spread(saved): what was read from disk, laid out over the devices.
     chunk(pools, random, run) -> (run, metrics). grade(pool, key, priors) -> Outcome [seeds, eval_episodes].
     better(old, new, since) -> Best. report(pools, priors, keys) -> Report.
     """
 
     collect: Callable[..., ReplayState]
     begin: Callable[..., Saved]
+    spread_random: Callable[[ReplayState], ReplayState]
+    spread: Callable[[Saved], Saved]
     chunk: Any
     grade: Callable[..., Outcome]
     better: Callable[[Best, Best, float], Best]
@@ -111,18 +118,20 @@ def pretrain(args: PretrainArgs) -> dict[str, Any]:
     env = envs.make(args.task, args.impl)
     gap = common.load_gap(env, args.real, args.set)
     make_pretrainer(env, args.config)  # sizes that do not fit together are reported before anything is written
+    devices = mesh.devices(args.devices, {f"--config.{n.replace('_', '-')}": getattr(args.config, n) for n in _CUT})
     run = runs.open_run(
         run_folder(args, gap),
         kind="pretrain",
         config=args,
         resume=args.resume,
         overwrite=args.overwrite,
-        volatile=("resume", "overwrite", "report", "video", "out"),
+        volatile=("resume", "overwrite", "devices", "report", "video", "out"),
     )
-    need = args.seeds * replay_bytes(env, args.config)
-    print(f"replay and random-action data: {need / 2**30:.2f} GiB on the device for {args.seeds} seed(s)")
+    need = args.seeds * replay_bytes(env, args.config) / devices
+    print(f"replay and random-action data: {need / 2**30:.2f} GiB on each device for {args.seeds} seed(s)")
     try:
-        return _Run(args, env, gap, seeds, run.folder).work()
+        with mesh.use(devices):
+            return _Run(args, env, gap, seeds, run.folder).work()
     finally:
         run.close()
 
@@ -146,6 +155,8 @@ def make_program(env: Env, config: PretrainConfig, *, seeds: int) -> Program:
     return Program(
         collect=jax.jit(common.over_seeds(trainer.collect_random, seeds)),
         begin=jax.jit(common.over_seeds(begin, seeds)),
+        spread_random=jax.jit(common.over_seeds(spread_replay, seeds), donate_argnums=0),
+        spread=jax.jit(common.over_seeds(lambda x: x._replace(run=spread(x.run)), seeds), donate_argnums=0),
         chunk=jax.jit(common.over_seeds(trainer.chunk, seeds), donate_argnums=2),
         grade=jax.jit(common.over_seeds(graded, seeds, shared=2)),
         better=jax.jit(jax.vmap(keep_better, (0, 0, None))),
@@ -209,7 +220,9 @@ class _Run:
         collect = lambda: self.program.collect(self.pools, common.seed_keys(self.seeds, _RANDOM))  # noqa: E731
         folder = self.folder / "random"
         if checkpoint.latest(folder) is not None:
-            return checkpoint.restore(folder, jax.eval_shape(collect), expect=self.expect)[0]
+            return self.program.spread_random(
+                checkpoint.restore(folder, jax.eval_shape(collect), expect=self.expect)[0]
+            )
         with self.clock("random"):
             random = jax.block_until_ready(collect())
         checkpoint.save(folder, 0, random, meta=self.expect)
@@ -225,7 +238,7 @@ class _Run:
         saved, meta = checkpoint.restore(self.folder, jax.eval_shape(begin), expect=self.expect)
         self.log.truncate(meta["position"])
         self.clock.seconds = meta["seconds"]
-        return saved, meta["chunks"]
+        return self.program.spread(saved), meta["chunks"]
 
     def _train(self, saved: Saved, done: int) -> Saved:
         """Chunk after chunk, with evaluations and checkpoints between them."""

@@ -10,6 +10,7 @@ from envs.base import Env, EnvState, World
 from envs.rollout import Fleet, launch, step_fleet
 from experiments.presets import PretrainConfig
 from sgft_jax import normalizer, replay
+from sgft_jax.mesh import split, whole
 from sgft_jax.sac import SACConfig, SACHyper, SACState, make_sac
 from sgft_jax.types import Array, Key, Learner, Metrics, Transition, UserError
 
@@ -56,7 +57,7 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
             fleet, buffer = carry
             key_action, key_step = jax.random.split(key)
             fleet, rows, valid, _ = step(pool, fleet, uniform_actions(key_action), key_step)
-            return (fleet, replay.add_batch(buffer, rows, valid)), None
+            return (split(fleet), spread_replay(replay.add_batch(buffer, rows, valid))), None
 
         n_steps = config.random_transitions // config.n_envs
         buffer = replay.init(replay.blank(env.obs_dim, env.act_dim), n_steps * config.n_envs)
@@ -70,7 +71,7 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         agent = learner.init(key_learner).replace(normalizer=normalizer.finish(statistics))
         fleet = launch(env, pool, key_fleet, config.n_envs)
         buffer = replay.init(replay.blank(env.obs_dim, env.act_dim), config.replay_capacity)
-        return PretrainState(agent, buffer, fleet, key_run, jnp.int32(0))
+        return spread(PretrainState(agent, buffer, fleet, key_run, jnp.int32(0)))
 
     def sample(random: replay.ReplayState, buffer: replay.ReplayState, key: Key) -> Transition:
         """[updates, batch] rows, drawn at once; each batch holds its share of random-action rows."""
@@ -100,14 +101,14 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         actions = explore(state.learner, state.fleet.state.obs, keys[1])
         fleet, rows, valid, after = step(pool, state.fleet, actions, keys[2])
         buffer = replay.add_batch(state.replay, rows, valid)
-        batches = sample(random, buffer, keys[3])
+        batches = split(sample(random, buffer, keys[3]), axis=1)
         agent, metrics = jax.lax.scan(
             lambda agent, x: learner.update(agent, *x),
             state.learner.replace(hyper=sac_hyper(config, progress=state.steps / (config.env_steps / config.n_envs))),
             (batches, jax.random.split(keys[4], config.updates_per_step)),
         )
         metrics = {k: v.mean() for k, v in metrics.items()} | _fleet_metrics(after, rows, valid)
-        return PretrainState(agent, buffer, fleet, keys[0], state.steps + 1), metrics
+        return spread(PretrainState(agent, buffer, fleet, keys[0], state.steps + 1)), metrics
 
     def chunk(pool: World, random: replay.ReplayState, state: PretrainState) -> tuple[PretrainState, Metrics]:
         state, metrics = jax.lax.scan(lambda s, _: vector_step(pool, random, s), state, None, length=config.chunk_steps)
@@ -116,6 +117,17 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         return state, {k: v.mean() for k, v in metrics.items()} | {"train/success": succeeded / ended}
 
     return Pretrainer(learner, collect_random, init, chunk)
+
+
+def spread(state: PretrainState) -> PretrainState:
+    """Environments and experience in pieces on the devices of a mesh, the agent whole on each of them."""
+    own = state._replace(replay=spread_replay(state.replay), fleet=split(state.fleet))
+    return own._replace(learner=whole(state.learner), key=whole(state.key), steps=whole(state.steps))
+
+
+def spread_replay(state: replay.ReplayState) -> replay.ReplayState:
+    """The same for experience alone."""
+    return replay.ReplayState(split(state.data), whole(state.position), whole(state.size))
 
 
 def sac_config(env: Env, config: PretrainConfig) -> SACConfig:

@@ -59,7 +59,9 @@ def home(tmp_path_factory):
 
 
 def argv(home, method="sgft-sac", *more, seeds=2, out=None):
-    given = ["--method", method, "--seeds", seeds, "--out", out or home, "--real", home / "turned.toml"]
+    """Two seeds have a device each."""
+    given = ["--method", method, "--seeds", seeds, "--devices", seeds]
+    given += ["--out", out or home, "--real", home / "turned.toml"]
     given += ["--prior", home / "pretrain/toy/fast/seeds-0-1"]
     return [*OPTIONS.split(), *map(str, given), *more]
 

@@ -1,0 +1,84 @@
+"""Work spread over devices by JAX's own sharding.
+
+Programs are written as for one device. Whoever runs them on several activates a mesh (`use`), and the marks below,
+which do nothing without one, say what is cut into pieces: `split` an axis that XLA may partition, `split_vmap` a batch
+whose function XLA cannot look into (physics by kernels or callbacks) or need not (independent seeds). Random numbers
+follow from keys alone, so results do not depend on the mesh, but for the order of floating-point sums.
+"""
+
+import contextlib
+from collections.abc import Callable, Mapping
+
+import jax
+from jax.sharding import AxisType, PartitionSpec
+
+from sgft_jax.types import Array, PyTree, UserError
+
+DATA = "data"  # the mesh's only axis
+
+
+def devices(wanted: int, sizes: Mapping[str, int]) -> int:
+    """How many devices `wanted` means; 0 stands for all there are.
+
+    sizes: what will be cut into as many equal pieces, by the name of the option. Raises UserError if there are fewer
+    devices or if a size is not a multiple of their number.
+    """
+    there = jax.device_count()
+    if not 0 <= wanted <= there:
+        raise UserError(f"--devices {wanted}: JAX sees {there} {jax.default_backend()} device(s)")
+    n = wanted or there
+    for name, size in sizes.items():
+        if size % n:
+            raise UserError(f"{name} is {size}: not a multiple of the {n} devices; change it or --devices")
+    return n
+
+
+def use(n: int) -> contextlib.AbstractContextManager:
+    """The first n devices, for what is traced and run in a `with` block; n = 1 leaves everything as it is."""
+    if n == 1:
+        return contextlib.nullcontext()
+    mesh = jax.make_mesh((n,), (DATA,), axis_types=(AxisType.Auto,), devices=jax.devices()[:n])
+    return jax.set_mesh(mesh)
+
+
+def pieces() -> int:
+    """Into how many pieces the marks cut here: 1 without a mesh, and inside a piece."""
+    mesh = jax.sharding.get_abstract_mesh()
+    return 1 if mesh.empty or DATA in mesh.manual_axes else mesh.shape[DATA]
+
+
+def split(tree: PyTree, axis: int = 0) -> PyTree:
+    """The same values, that axis of every leaf cut into one piece per device."""
+    return _constrain(tree, PartitionSpec(*[None] * axis, DATA))
+
+
+def whole(tree: PyTree) -> PyTree:
+    """The same values, all of them on every device."""
+    return _constrain(tree, PartitionSpec())
+
+
+def split_vmap[R](function: Callable[..., R], in_axes: int | tuple[int | None, ...] = 0) -> Callable[..., R]:
+    """`jax.vmap` over leading axes (0; None = shared), each device doing its piece of the batch alone.
+
+    A batch that cannot be cut into equal pieces is done by every device as a whole.
+    """
+    batched = jax.vmap(function, in_axes)
+
+    def run(*args: PyTree) -> R:
+        axes = in_axes if isinstance(in_axes, tuple) else (in_axes,) * len(args)
+        n = pieces()
+        if n == 1 or _length(args, axes) % n:
+            return batched(*args)
+        specs = tuple(PartitionSpec() if axis is None else PartitionSpec(DATA) for axis in axes)
+        return jax.shard_map(batched, in_specs=specs, out_specs=PartitionSpec(DATA), check_vma=False)(*args)
+
+    return run
+
+
+def _length(args: tuple[PyTree, ...], axes: tuple[int | None, ...]) -> int:
+    leaves: list[Array] = jax.tree.leaves([arg for arg, axis in zip(args, axes, strict=True) if axis == 0])
+    return leaves[0].shape[0]
+
+
+def _constrain(tree: PyTree, spec: PartitionSpec) -> PyTree:
+    return tree if pieces() == 1 else jax.lax.with_sharding_constraint(tree, spec)

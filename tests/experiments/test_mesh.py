@@ -1,0 +1,104 @@
+"""Programs on two devices (of the host, see conftest) compute what they compute on one."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toy
+from jax.sharding import PartitionSpec
+
+import envs
+from envs import engine_c
+from envs.physics import PhysicsState
+from experiments import cli, pretrain
+from experiments.common import seed_keys, stack
+from experiments.presets import PretrainConfig
+from sgft_jax import mesh
+from sgft_jax.networks import NetworkConfig
+from sgft_jax.types import UserError
+
+CONFIG = PretrainConfig(
+    n_envs=16, worlds=8, random_transitions=64, replay_capacity=128, batch_size=32, updates_per_step=2, chunk_steps=24,
+    random_ladder=0.5, gamma=0.9, network=NetworkConfig(hidden=(16, 16)), ensemble_size=2,
+)  # fmt: skip
+CUT = PartitionSpec(None, mesh.DATA)  # [seeds, ...]
+
+
+@functools.cache
+def pretrained(devices):
+    """Random data, the start, the state after a chunk in which episodes end, and its metrics."""
+    env = toy.make()
+    program = pretrain.make_program(env, CONFIG, seeds=1)
+    pools = stack([env.sample_worlds(jax.random.key(0), CONFIG.worlds)])
+    with mesh.use(devices):
+        random = program.collect(pools, seed_keys([0], 1))
+        saved = program.begin(pools, random, seed_keys([0], 2))
+        run, metrics = program.chunk(pools, random, jax.tree.map(jnp.copy, saved.run))
+    return random, saved, run, metrics
+
+
+def agree(one, two, **tolerance):
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(one), jax.tree.leaves(two), strict=True):
+        a, b = (jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x for x in (a, b))
+        np.testing.assert_allclose(a, b, err_msg=jax.tree_util.keystr(path), **tolerance)
+
+
+def test_pretraining_is_the_same_on_any_number_of_devices():
+    one, two = pretrained(1), pretrained(2)
+    agree(one[:2], two[:2], rtol=1e-5, atol=1e-5)  # random data and start
+    agree(one[2:], two[2:], rtol=2e-2, atol=2e-3)  # 48 updates amplify the rounding of sums
+
+
+def test_environments_and_experience_are_cut_and_the_agent_is_whole():
+    random, saved, run, _ = pretrained(2)
+    for tree in (random.data, saved.run.replay.data, saved.run.fleet, run.replay.data, run.fleet):
+        assert {x.sharding.spec for x in jax.tree.leaves(tree)} == {CUT}
+    assert all(
+        x.sharding.is_fully_replicated for tree in (saved.run.learner, run.learner) for x in jax.tree.leaves(tree)
+    )
+
+
+def test_what_one_device_left_two_continue():
+    """A checkpoint holds whole arrays; `spread` lays them out."""
+    random, saved, *_ = pretrained(1)
+    program = pretrain.make_program(toy.make(), CONFIG, seeds=1)
+    with mesh.use(2):
+        laid_out = program.spread(jax.tree.map(jnp.copy, saved))
+        data = program.spread_random(jax.tree.map(jnp.copy, random)).data
+    agree(saved, laid_out)
+    assert laid_out.run.replay.data.reward.sharding.spec == data.reward.sharding.spec == CUT
+
+
+def test_physics_that_xla_cannot_look_into_steps_in_pieces():
+    """C MuJoCo behind a callback: each device calls it for its own worlds."""
+    scene = envs.scene("hammer")
+    host = scene.build({p.name: p.nominal for p in scene.parameters}).compile()
+    advance = engine_c.make_advance(host, ())
+    step = mesh.split_vmap(lambda state, controls: advance({}, state, controls))
+    rest = jnp.asarray(host.qpos0, jnp.float32)
+    start = PhysicsState(rest, jnp.zeros(host.nv), jnp.zeros(host.nv), rest[: host.nu])
+    states = jax.tree.map(lambda x: jnp.repeat(x[None], 4, axis=0), start)
+    controls = 0.1 * jax.random.normal(jax.random.key(0), (4, 8, host.nu))
+
+    one = jax.jit(step)(states, controls)
+    with mesh.use(2):
+        two = jax.jit(step)(states, controls)
+    agree(one, two, rtol=0)
+    assert two.qpos.sharding.spec == PartitionSpec(mesh.DATA)
+    assert np.abs(two.qvel).max() > 0.1 and len(np.unique(two.qpos[:, 0])) == 4
+
+
+def test_numbers_of_devices_that_do_not_fit(monkeypatch, capsys):
+    assert mesh.devices(0, {"a": 6}) == jax.device_count() == 2
+    with pytest.raises(UserError, match="--devices 3: JAX sees 2 cpu device"):
+        mesh.devices(3, {})
+    with pytest.raises(UserError, match="--seeds is 5: not a multiple of the 2 devices"):
+        mesh.devices(2, {"--seeds": 5})
+    monkeypatch.setitem(envs.TASKS, "toy", "toy")
+    monkeypatch.setattr(cli, "set_up", lambda: None)
+    with pytest.raises(SystemExit) as stopped:
+        pretrain.main(["--task", "toy", "--preset", "cpu", "--config.n-envs", "33", "--devices", "2"])
+    assert stopped.value.code == 2
+    assert capsys.readouterr().err.startswith("error: --config.n-envs is 33: not a multiple of the 2 devices")
