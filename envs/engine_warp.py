@@ -1,4 +1,4 @@
-"""MuJoCo Warp as the engine of a scene: MJX by kernels for NVIDIA GPUs. They run on CPUs too, slowly.
+"""MuJoCo Warp as the engine of a scene: kernels for NVIDIA GPUs. They run on CPUs too, slowly.
 
 Warp steps all worlds of a batch at once and keeps the contacts of all of them in one list, whose length has to be known
 before. Our scenes declare every pair of geoms that may touch: the lengths below are exact bounds, which MJX's own
@@ -27,38 +27,36 @@ def make_advance(host: mujoco.MjModel) -> Advance:
     """The engine of a compiled scene; for one world, vmap over worlds. Raises UserError where Warp is not installed."""
     if not available():
         raise UserError("the engine warp needs the package warp-lang: install sgft-jax[warp]")
-    lost = _set_up()
+    from envs import warp_worlds
+
     contacts, rows = budget(host)
-    nominal = _settings(mjx.put_model(host, impl="warp"))
+    iterations = host.opt.iterations + _MORE_ITERATIONS
     still, at_rest = mjx.put_model(host, impl="jax"), mjx.make_data(host, impl="jax")
-    blank = mjx.make_data(host, impl="warp", naconmax=contacts, njmax=rows)
+    calls: dict[tuple[str, ...], Any] = {}
+
+    def call(layout: tuple[str, ...]) -> Any:
+        """Worlds that differ in the same fields share buffers and graphs."""
+        if layout not in calls:
+            calls[layout] = warp_worlds.make_call(host, layout, contacts=contacts, rows=rows, iterations=iterations)
+        return calls[layout]
 
     def placed(values: dict[str, Array], qpos: Array) -> dict[str, Array]:
-        """Where everything is. Warp leaves what is fixed to the world where it was when `blank` was made."""
+        """Where everything is. Warp leaves what is fixed to the world where it was when its data were made."""
         with jax.default_matmul_precision("highest"):
             data = mjx.kinematics(with_fields(still, values), at_rest.replace(qpos=qpos))
         return {name: getattr(data, name) for name in _POSES}
 
-    def run(data: mjx.Data, values: dict[str, Array], state: Any, controls: Array) -> Any:
-        """One world of a batch whose lists `data` holds."""
-        model = with_fields(nominal, values)
-        poses = placed(values, state.qpos)
-        data = data.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, **poses)
-
-        def substep(carry: tuple[mjx.Data, Array], ctrl: Array) -> tuple[tuple[mjx.Data, Array], None]:
-            data, overflow = carry
-            data = mjx.step(model, data.replace(ctrl=ctrl))
-            return (data, overflow | (data._impl.overflow & lost)), None
-
-        (data, overflow), _ = jax.lax.scan(substep, (data, jnp.int32(0)), controls)
-        qpos = jnp.where(overflow == 0, data.qpos, jnp.nan)
-        return state._replace(qpos=qpos, qvel=data.qvel, warmstart=data.qacc_warmstart, ctrl=controls[-1])
-
     @jax.custom_batching.custom_vmap
     def batch(values: dict[str, Array], state: Any, controls: Array) -> Any:
         """Worlds [n]."""
-        data = room_for(blank, len(controls))
-        return jax.vmap(lambda *world: run(data, *world))(values, state, controls)
+        n = len(controls)
+        parts = {"qpos": state.qpos, "qvel": state.qvel, "qacc_warmstart": state.warmstart}
+        parts |= jax.vmap(placed)(values, state.qpos)
+        parts |= {name: x for name, x in values.items() if warp_worlds.reads(name)}
+        packed = jnp.concatenate([x.reshape(n, -1) for x in parts.values()], axis=1)
+        after = call(tuple(parts))(packed, controls)
+        qpos, qvel, warmstart = jnp.split(after, [host.nq, host.nq + host.nv], axis=1)
+        return state._replace(qpos=qpos, qvel=qvel, warmstart=warmstart, ctrl=controls[:, -1])
 
     @batch.def_vmap
     def _(size: int, batched: PyTree, *args: PyTree) -> tuple[Any, Any]:
@@ -84,30 +82,3 @@ def budget(host: mujoco.MjModel) -> tuple[int, int]:
     """The most contacts and constraint rows that one world of this scene can have."""
     layout = mjx.make_data(host, impl="jax")._impl
     return layout.contact.dist.shape[0], layout.efc_J.shape[0]
-
-
-def _set_up() -> int:
-    """Silences Warp's report on every kernel it loads. Returns the bits of its overflow mask that mean lost contacts or
-    constraints: all but a solver that used up its iterations, which is how we run it.
-    """
-    import warp
-    from mujoco.mjx.third_party.mujoco_warp import OverflowType
-
-    warp.config.log_level = warp.LOG_WARNING
-    return int(OverflowType.ALL & ~(OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS))
-
-
-def _settings(model: mjx.Model) -> mjx.Model:
-    """Without messages printed from inside kernels, which would stall the GPU, and with more solver iterations."""
-    option = model.opt
-    iterations = option.iterations + _MORE_ITERATIONS
-    return model.replace(opt=option.replace(iterations=iterations, _impl=option._impl.replace(warn_overflow=0)))
-
-
-def room_for(data: mjx.Data, worlds: int) -> mjx.Data:
-    """Data [] of one world whose shared list of contacts is long enough for that many worlds."""
-    own = data._impl
-    lists = {name: x for name, x in vars(own).items() if name.startswith("contact__") and x.shape[0]}
-    longer = {name: jnp.broadcast_to(x[:1], (worlds * x.shape[0], *x.shape[1:])) for name, x in lists.items()}
-    sizes = {name: worlds * getattr(own, name) for name in ("naconmax", "naccdmax")}
-    return data.replace(_impl=own.replace(**longer, **sizes))

@@ -165,7 +165,7 @@ def bare_steps(
     def run(state: tuple[Array, Array, Key]) -> tuple[Array, Array, Key]:
         qpos, qvel, key = state
         key, own = jax.random.split(key)
-        data = engine_warp.room_for(blank, worlds) if impl == "warp" else blank
+        data = room_for(blank, worlds) if impl == "warp" else blank
         data = data.replace(qpos=qpos, qvel=qvel)
         with jax.default_matmul_precision("highest"):
             data = jax.lax.scan(period, data, jax.random.split(own, control_steps))[0]
@@ -174,6 +174,15 @@ def bare_steps(
     repeat = lambda x: jnp.repeat(jnp.asarray(x)[None], worlds, axis=0)  # noqa: E731
     start = repeat(blank.qpos), repeat(blank.qvel), jax.random.split(jax.random.key(2), worlds)
     return jax.jit(jax.vmap(run), donate_argnums=0), start
+
+
+def room_for(data: mjx.Data, worlds: int) -> mjx.Data:
+    """Data [] of one world for `impl="warp"`, its list of contacts, which all worlds share, long enough for so many."""
+    own = data._impl
+    lists = {name: x for name, x in vars(own).items() if name.startswith("contact__") and x.shape[0]}
+    longer = {name: jnp.broadcast_to(x[:1], (worlds * x.shape[0], *x.shape[1:])) for name, x in lists.items()}
+    sizes = {name: worlds * getattr(own, name) for name in ("naconmax", "naccdmax")}
+    return data.replace(_impl=own.replace(**longer, **sizes))
 
 
 def update_speed(batch: int, seeds: int, config: BenchmarkConfig) -> dict[str, Any]:

@@ -1,0 +1,141 @@
+"""A batch of worlds inside MuJoCo Warp, and the call from JAX that steps them. Imports Warp, which is optional.
+
+MJX's own binding hands all of MuJoCo's data, some 500 arrays, to Warp and back at every physics step. Here the worlds
+stay with Warp: JAX passes what distinguishes them and their states once per control period, as one array of floats,
+and gets states back. On a GPU a physics step is one CUDA graph, captured once per number of worlds; its buffers are
+the worlds' own, so it never has to be captured again.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import mujoco
+import warp as wp
+from mujoco.mjx.third_party import mujoco_warp as mjw
+
+from sgft_jax.types import Array, UserError
+
+wp.config.log_level = wp.LOG_WARNING  # no report on every kernel it loads
+
+# Lost contacts and constraints; a solver that used up its iterations is how we run it.
+_LOSSES = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS))
+
+
+def reads(name: str) -> bool:
+    """Whether that field of a model means anything to Warp."""
+    return name in mjw.Model.__dataclass_fields__
+
+
+class Worlds:
+    """n worlds of a scene on one device. What is in `layout` is set by `load`, everything else is the scene's.
+
+    layout: names of fields of Warp's data or model, in the order in which they lie in a row of floats.
+    """
+
+    def __init__(
+        self, host: mujoco.MjModel, layout: Sequence[str], n: int, *, contacts: int, rows: int, iterations: int
+    ) -> None:
+        self.model, self.graph = mjw.put_model(host), None
+        self.model.opt.iterations = iterations
+        self.model.opt.warn_overflow = False  # messages printed from inside kernels would stall the GPU
+        self.data = mjw.make_data(host, nworld=n, naconmax=n * contacts, njmax=rows)
+        self.lost = wp.zeros(n, dtype=int)
+        self.places = []
+        start = 0
+        for name in layout:
+            floats = self._own(name, n)
+            self.places.append((floats, start, start + floats.shape[1]))
+            start += floats.shape[1]
+
+    def load(self, packed: wp.array) -> None:
+        """packed: [n, floats] as `layout` says."""
+        for floats, start, stop in self.places:
+            wp.copy(floats, packed[:, start:stop])
+        self.lost.zero_()
+
+    def step(self, ctrl: wp.array) -> None:
+        """One physics step under commands [n, nu]."""
+        wp.copy(self.data.ctrl, ctrl)
+        if self.graph is None:
+            self._step()
+        else:
+            wp.capture_launch(self.graph)
+
+    def capture(self) -> None:
+        """Makes a graph of the step, and in doing so steps once: everything it needs must have been loaded before."""
+        self._step()
+        with wp.ScopedCapture() as capture:
+            self._step()
+        self.graph = capture.graph
+
+    def unload(self, out: wp.array) -> None:
+        """out: [n, nq + 2 nv] positions, velocities and accelerations; NaN where contacts were lost."""
+        data = self.data
+        wp.launch(_unload, out.shape, inputs=[data.qpos, data.qvel, data.qacc_warmstart, self.lost], outputs=[out])
+
+    def _step(self) -> None:
+        mjw.step(self.model, self.data)
+        wp.launch(_note, self.lost.shape, inputs=[self.data.overflow, _LOSSES], outputs=[self.lost])
+
+    def _own(self, name: str, n: int) -> wp.array:
+        """The field of that name as floats [n, ...]; a field of the model gets room for n values of its own first."""
+        array: Any = getattr(self.data, name, None)
+        if array is None:
+            shared = getattr(self.model, name)
+            if shared.shape[0] != 1:
+                raise UserError(f"MuJoCo Warp has one '{name}' for all worlds: it cannot be a domain parameter")
+            array = wp.empty((n, *shared.shape[1:]), dtype=shared.dtype)
+            setattr(self.model, name, array)
+        count = math.prod(array.shape[1:]) * wp.types.type_size_in_bytes(array.dtype) // 4
+        return wp.array(ptr=array.ptr, shape=(n, count), dtype=float, device=array.device)
+
+
+def make_call(
+    host: mujoco.MjModel, layout: Sequence[str], *, contacts: int, rows: int, iterations: int
+) -> Callable[[Array, Array], Array]:
+    """(packed [n, floats], controls [n, substeps, nu]) -> [n, nq + 2 nv], see `Worlds`: a JAX function of a batch."""
+    kept: dict[tuple[str, int], Worlds] = {}
+
+    def run(packed: wp.array2d[float], controls: wp.array3d[float], out: wp.array2d[float]) -> None:
+        n, device = packed.shape[0], packed.device
+        if (key := (device.alias, n)) not in kept:
+            kept[key] = worlds = Worlds(host, layout, n, contacts=contacts, rows=rows, iterations=iterations)
+            if device.is_cuda:
+                worlds.load(packed)
+                worlds.capture()
+        worlds = kept[key]
+        worlds.load(packed)
+        for i in range(controls.shape[1]):
+            worlds.step(controls[:, i])
+        worlds.unload(out)
+
+    call = wp.jax_callable(run, graph_mode=wp.JaxCallableGraphMode.NONE, vmap_method=None)
+    states = host.nq + 2 * host.nv
+    return lambda packed, controls: call(packed, controls, output_dims=(packed.shape[0], states))[0]
+
+
+@wp.kernel
+def _note(overflow: wp.array[int], mask: int, lost: wp.array[int]) -> None:
+    i = wp.tid()
+    lost[i] = lost[i] | (overflow[i] & mask)
+
+
+@wp.kernel
+def _unload(
+    qpos: wp.array2d[float],
+    qvel: wp.array2d[float],
+    acceleration: wp.array2d[float],
+    lost: wp.array[int],
+    out: wp.array2d[float],
+) -> None:
+    i, j = wp.tid()
+    nq, nv = qpos.shape[1], qvel.shape[1]
+    if lost[i] != 0:
+        out[i, j] = wp.nan
+    elif j < nq:
+        out[i, j] = qpos[i, j]
+    elif j < nq + nv:
+        out[i, j] = qvel[i, j - nq]
+    else:
+        out[i, j] = acceleration[i, j - nq - nv]
