@@ -26,7 +26,7 @@ from experiments import cli, common
 from experiments.evaluation import Best, Outcome, describe, grade, score
 from experiments.presets import PRESETS, PretrainConfig
 from experiments.pretrain import DEFAULT_PRESET, Saved, make_program
-from experiments.pretraining import PretrainState, make_pretrainer, replay_bytes
+from experiments.pretraining import PretrainState, make_pretrainer, memory
 from sgft_jax.log import MetricsLog, RunProgress, write_summary
 from sgft_jax.networks import NetworkConfig
 from sgft_jax.sac import extract_prior
@@ -182,7 +182,7 @@ def _train(env: Env, args: GapsArgs, found: Sequence[Gap], seeds: list[int], fol
     All gaps and seeds are members [gaps * seeds] of one program: the real systems of a task differ in numbers alone.
     """
     config, count = args.config, len(found) * len(seeds)
-    print(f"replay and random-action data: {count * replay_bytes(env, config) / 2**30:.2f} GiB for {count} policies")
+    common.reserve(memory(env, config), copies=count)
 
     def members(seed: int, n: int) -> World:
         """Worlds [gaps * seeds, n]; all seeds of a gap live in the same ones."""

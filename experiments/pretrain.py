@@ -25,7 +25,7 @@ from envs.rollout import pick, pool_size
 from experiments import cli, common
 from experiments.evaluation import Best, Outcome, describe, grade, keep_better, score
 from experiments.presets import PRESETS, PretrainConfig
-from experiments.pretraining import PretrainState, make_pretrainer, replay_bytes, spread, spread_replay
+from experiments.pretraining import PretrainState, make_pretrainer, memory, spread, spread_replay
 from experiments.report import Report, make_report, numbers
 from sgft_jax import checkpoint, mesh, plot, runs
 from sgft_jax.config import config_to_json
@@ -117,8 +117,9 @@ def pretrain(args: PretrainArgs) -> dict[str, Any]:
     seeds = common.seed_list(args.seed, args.seeds)
     env = envs.make(args.task, args.impl)
     gap = common.load_gap(env, args.real, args.set)
-    make_pretrainer(env, args.config)  # sizes that do not fit together are reported before anything is written
+    make_pretrainer(env, args.config)  # what does not fit is reported before anything is written
     devices = mesh.devices(args.devices, {f"--config.{n.replace('_', '-')}": getattr(args.config, n) for n in _CUT})
+    common.reserve(memory(env, args.config), copies=args.seeds, devices=devices)
     run = runs.open_run(
         run_folder(args, gap),
         kind="pretrain",
@@ -127,8 +128,6 @@ def pretrain(args: PretrainArgs) -> dict[str, Any]:
         overwrite=args.overwrite,
         volatile=("resume", "overwrite", "devices", "report", "video", "out"),
     )
-    need = args.seeds * replay_bytes(env, args.config) / devices
-    print(f"replay and random-action data: {need / 2**30:.2f} GiB on each device for {args.seeds} seed(s)")
     try:
         with mesh.use(devices):
             return _Run(args, env, gap, seeds, run.folder).work()

@@ -157,10 +157,12 @@ def sac_hyper(config: PretrainConfig, *, progress: float | Array = 0.0) -> SACHy
     return jax.tree.map(jnp.float32, hyper)
 
 
-def replay_bytes(env: Env, config: PretrainConfig) -> int:
-    """Bytes of the random-action data and the replay of one seed on the device."""
+def memory(env: Env, config: PretrainConfig) -> dict[str, int]:
+    """Bytes of experience that one seed keeps on its devices, by the setting that decides them."""
     row = sum(x.nbytes for x in jax.tree.leaves(replay.blank(env.obs_dim, env.act_dim)))
-    return row * (config.random_transitions + config.replay_capacity)
+    drawn = config.updates_per_step * config.batch_size
+    rows = {"random_transitions": config.random_transitions, "replay_capacity": config.replay_capacity}
+    return {name: row * n for name, n in {**rows, "batch_size": 2 * drawn}.items()}  # drawn, then put together
 
 
 def _fleet_metrics(after: EnvState, rows: Transition, valid: Array) -> Metrics:

@@ -116,3 +116,16 @@ def test_clock_adds_up():
             time.sleep(0.02)
     times = clock.record()
     assert 10.02 <= times["time/train_s"] < 11 and 0.02 <= times["time/evaluate_s"] < 1
+
+
+def test_a_budget_that_does_not_fit_names_the_largest_part(monkeypatch, capsys):
+    parts = {"random_transitions": 2**30, "replay_capacity": 3 * 2**30}
+    monkeypatch.setattr(common, "free_memory", lambda: 5 * 2**30)
+    common.reserve(parts, copies=2, devices=2)  # 4 GiB each
+    assert capsys.readouterr().out == (
+        "experience: 4.00 GiB of 5.00 GiB free on each device (random_transitions 1.00 GiB, replay_capacity 3.00 GiB)\n"
+    )
+    with pytest.raises(UserError, match=r"8\.00 GiB of 5\.00 GiB free on each device: lower --config\.replay-capacity"):
+        common.reserve(parts, copies=2)
+    monkeypatch.setattr(common, "free_memory", lambda: None)
+    common.reserve(parts, copies=2)  # nobody knows: the run may try
