@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from envs.base import Env, World
 from envs.rollout import Episode, play_episode
 from sgft_jax import stats
-from sgft_jax.mesh import split_vmap
+from sgft_jax.mesh import split_vmap, whole
 from sgft_jax.networks import NetworkConfig, make_actor, tanh_gaussian_action
 from sgft_jax.normalizer import normalize
 from sgft_jax.types import Array, Key, Metrics, Prior
@@ -63,7 +63,7 @@ def grade(
     act = prior_policy(env, prior, network, explore=False)
     played = play_episodes(env, pool, act, jax.random.split(key, episodes), gamma=gamma)
     qpos = jnp.concatenate([played.start.physics.qpos[:, None], played.qpos], axis=1)
-    return Outcome(played.success, played.total_reward, played.exploded, qpos)
+    return whole(Outcome(played.success, played.total_reward, played.exploded, qpos))
 
 
 def describe(outcome: Outcome) -> dict[str, Any]:

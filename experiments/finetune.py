@@ -68,8 +68,8 @@ class FinetuneArgs:
     impl: Impl = "auto"
     """Who steps the physics: MJX's own code, MJX with MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c
     on a CPU and jax elsewhere."""
-    devices: int = 1
-    """Devices that share the seeds; 0: all there are."""
+    devices: int | None = None
+    """Devices that share the seeds; 0: all there are; default: one."""
     video: bool = True
     """Render an episode before and after fine-tuning side by side, where MuJoCo can render."""
     out: Path = Path("runs")

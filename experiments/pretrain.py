@@ -22,7 +22,7 @@ from envs.base import Env, World
 from envs.gaps import Gap
 from envs.physics import Impl
 from envs.rollout import pick, pool_size
-from experiments import cli, common
+from experiments import cli, common, hosts
 from experiments.evaluation import Best, Outcome, describe, grade, keep_better, score
 from experiments.presets import PRESETS, PretrainConfig
 from experiments.pretraining import PretrainState, make_pretrainer, memory, spread, spread_replay
@@ -61,9 +61,12 @@ class PretrainArgs:
     impl: Impl = "auto"
     """Who steps the physics: MJX's own code, MJX with MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c
     on a CPU and jax elsewhere."""
-    devices: int = 1
-    """Devices that share the environments, the replay and every batch; 0: all there are. Results stay the same but for
-    rounding, and a run may be resumed on another number."""
+    devices: int | None = None
+    """Devices that share the environments, the replay and every batch; 0: all there are; default: one, or all of
+    several hosts. Results stay the same but for rounding, and a run may be resumed on another number."""
+    hosts: str | None = None
+    """Several hosts together, which see the same files: `auto` asks the cluster (SLURM, Open MPI, Kubernetes),
+    ADDRESS:PORT,COUNT,INDEX says where the first one listens, how many there are, and which one this is."""
     report: bool = True
     """Also measure V_sim against returns and the models against the simulator: numbers on the card, a figure."""
     video: bool = True
@@ -115,24 +118,26 @@ def pretrain(args: PretrainArgs) -> dict[str, Any]:
     cli.choose("--preset", args.preset, PRESETS)
     cli.choose("--task", args.task, envs.TASKS)
     seeds = common.seed_list(args.seed, args.seeds)
+    hosts.join(args.hosts)
     env = envs.make(args.task, args.impl)
     gap = common.load_gap(env, args.real, args.set)
     make_pretrainer(env, args.config)  # what does not fit is reported before anything is written
     devices = mesh.devices(args.devices, {f"--config.{n.replace('_', '-')}": getattr(args.config, n) for n in _CUT})
     common.reserve(memory(env, args.config), copies=args.seeds, devices=devices)
-    run = runs.open_run(
-        run_folder(args, gap),
-        kind="pretrain",
-        config=args,
-        resume=args.resume,
-        overwrite=args.overwrite,
-        volatile=("resume", "overwrite", "devices", "report", "video", "out"),
-    )
-    try:
-        with mesh.use(devices):
-            return _Run(args, env, gap, seeds, run.folder).work()
-    finally:
-        run.close()
+    home = run_folder(args, gap)
+    with hosts.own(home) as folder, mesh.use(devices):
+        run = runs.open_run(
+            folder,
+            kind="pretrain",
+            config=args,
+            resume=args.resume,
+            overwrite=args.overwrite,
+            volatile=("resume", "overwrite", "devices", "hosts", "report", "video", "out"),
+        )
+        try:
+            return _Run(args, env, gap, seeds, run.folder, home).work()
+        finally:
+            run.close()
 
 
 def run_folder(args: PretrainArgs, gap: Gap | None) -> Path:
@@ -189,11 +194,16 @@ def prior_card(args: PretrainArgs, env: Env, gap: Gap | None, found: dict[str, A
 
 
 class _Run:
-    """The impure part: what happens between compiled calls."""
+    """The impure part: what happens between compiled calls.
 
-    def __init__(self, args: PretrainArgs, env: Env, gap: Gap | None, seeds: list[int], folder: Path) -> None:
+    folder, home: for logs, and for checkpoints and priors; they differ on all but the first of several hosts.
+    """
+
+    def __init__(
+        self, args: PretrainArgs, env: Env, gap: Gap | None, seeds: list[int], folder: Path, home: Path
+    ) -> None:
         self.args, self.env, self.gap, self.seeds, self.folder = args, env, gap, seeds, folder
-        self.config = args.config
+        self.home, self.config = home, args.config
         self.clock, self.log = common.Clock(), MetricsLog(folder)
         self.expect = {"kind": "pretrain", "task": args.task, "seeds": seeds}
         self.chunk_env_steps = self.config.n_envs * self.config.chunk_steps
@@ -217,24 +227,24 @@ class _Run:
     def _random(self) -> ReplayState:
         """The random-action data: collected once, then read from disk."""
         collect = lambda: self.program.collect(self.pools, common.seed_keys(self.seeds, _RANDOM))  # noqa: E731
-        folder = self.folder / "random"
+        folder = self.home / "random"
         if checkpoint.latest(folder) is not None:
             return self.program.spread_random(
                 checkpoint.restore(folder, jax.eval_shape(collect), expect=self.expect)[0]
             )
         with self.clock("random"):
             random = jax.block_until_ready(collect())
-        checkpoint.save(folder, 0, random, meta=self.expect)
+        checkpoint.save(folder, 0, mesh.local(random), meta=self.expect)
         return random
 
     def _start(self) -> tuple[Saved, int]:
         """The state to continue from and the chunks behind it: a checkpoint's, or a fresh one."""
         begin = lambda: self.program.begin(self.pools, self.random, common.seed_keys(self.seeds, _START))  # noqa: E731
-        if checkpoint.latest(self.folder) is None:
+        if checkpoint.latest(self.home) is None:
             self.log.truncate({})
             with self.clock("start"):
                 return jax.block_until_ready(begin()), 0
-        saved, meta = checkpoint.restore(self.folder, jax.eval_shape(begin), expect=self.expect)
+        saved, meta = checkpoint.restore(self.home, jax.eval_shape(begin), expect=self.expect)
         self.log.truncate(meta["position"])
         self.clock.seconds = meta["seconds"]
         return self.program.spread(saved), meta["chunks"]
@@ -288,7 +298,7 @@ class _Run:
     def _checkpoint(self, saved: Saved, done: int) -> None:
         meta = {**self.expect, "chunks": done, "position": self.log.position(), "seconds": self.clock.seconds}
         with self.clock("checkpoint"):
-            checkpoint.save(self.folder, done, saved, meta=meta)
+            checkpoint.save(self.home, done, mesh.local(saved), meta=meta)
 
     # ------------------------------------------------------------ what stays
 
@@ -305,7 +315,7 @@ class _Run:
                 found |= numbers(common.member(report, i))
                 self._save_report(seed, common.member(report, i), i)
             checkpoint.save_prior(
-                self.folder / "prior" / f"seed-{seed}", best.prior, prior_card(self.args, self.env, self.gap, found)
+                self.home / "prior" / f"seed-{seed}", best.prior, prior_card(self.args, self.env, self.gap, found)
             )
             results.append(found)
         summary = {

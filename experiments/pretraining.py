@@ -114,7 +114,7 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         state, metrics = jax.lax.scan(lambda s, _: vector_step(pool, random, s), state, None, length=config.chunk_steps)
         ended = jnp.maximum(metrics.pop("ended").sum(), 1.0)
         succeeded = metrics.pop("succeeded").sum()
-        return state, {k: v.mean() for k, v in metrics.items()} | {"train/success": succeeded / ended}
+        return state, whole({k: v.mean() for k, v in metrics.items()} | {"train/success": succeeded / ended})
 
     return Pretrainer(learner, collect_random, init, chunk)
 

@@ -10,6 +10,7 @@ from envs.base import Env, World
 from envs.rollout import Episode
 from experiments.evaluation import play_episodes, prior_policy
 from sgft_jax import dynamics, value
+from sgft_jax.mesh import whole
 from sgft_jax.networks import NetworkConfig, make_dynamics, make_value
 from sgft_jax.types import Array, Key, Prior
 
@@ -45,15 +46,16 @@ def make_report(
     played = play_episodes(env, pool, explore, jax.random.split(key, trajectories), gamma=gamma, length=length)
     values, returns = jax.vmap(lambda e: _values(env, network, prior, e))(played)
     model, still = jax.vmap(lambda e: _model_errors(env, network, prior, e))(played)
-    whole = ~played.exploded[:, None]
-    average = lambda x: jnp.where(whole, x, 0.0).sum(0) / jnp.maximum(whole.sum(), 1)  # noqa: E731
-    return Report(
+    intact = ~played.exploded[:, None]
+    average = lambda x: jnp.where(intact, x, 0.0).sum(0) / jnp.maximum(intact.sum(), 1)  # noqa: E731
+    report = Report(
         values=values.reshape(-1),
         returns=returns.reshape(-1),
-        counts=jnp.broadcast_to(whole, values.shape).reshape(-1),
+        counts=jnp.broadcast_to(intact, values.shape).reshape(-1),
         model_error=average(model),
         still_error=average(still),
     )
+    return whole(report)
 
 
 def numbers(report: Report) -> dict[str, Any]:

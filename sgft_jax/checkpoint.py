@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 from orbax.checkpoint import v1 as ocp
 
 from sgft_jax.jsonfile import jsonable, read_json, write_json
@@ -47,18 +48,23 @@ class Leaf(NamedTuple):
 def save(folder: Path, step: int, state: PyTree, *, meta: Mapping[str, Any], keep: int = 2) -> Path:
     """Write `<folder>/checkpoints/<step>/` and return it; blocks until the files are there.
 
-    state: any pytree of jax or numpy arrays, typed keys and Python numbers. meta: JSON-able facts (`kind`, `task`, log
-    positions, counters), handed back by `restore`. keep: complete checkpoints that stay, this one included. Checkpoints
-    of a later step belong to a future that a resume has abandoned, and are removed too.
+    Several hosts save together, each all of it. state: any pytree of jax or numpy arrays, typed keys and Python
+    numbers. meta: JSON-able facts (`kind`, `task`, log positions, counters), handed back by `restore`. keep: complete
+    checkpoints that stay, this one included. Checkpoints of a later step belong to a future that a resume has
+    abandoned, and are removed too.
     """
     root = Path(folder) / _CHECKPOINTS
-    root.mkdir(parents=True, exist_ok=True)
-    for leftover in root.glob(f"{_TEMPORARY}*"):
-        shutil.rmtree(leftover)
     temporary = root / f"{_TEMPORARY}{step}"
+    if _first():
+        root.mkdir(parents=True, exist_ok=True)
+        for leftover in root.glob(f"{_TEMPORARY}*"):
+            shutil.rmtree(leftover)
+        temporary.mkdir()
     _write(temporary, state, {"step": step, "meta": dict(meta)})
-    _swap(temporary, root / str(step))
-    _prune(root, newest=step, keep=keep)
+    if _first():
+        _swap(temporary, root / str(step))
+        _prune(root, newest=step, keep=keep)
+    _meet()
     return root / str(step)
 
 
@@ -118,11 +124,14 @@ def save_prior(folder: Path, prior: Prior, card: Mapping[str, Any]) -> Path:
         raise TypeError("prior parameters must be nested dicts of arrays")
     folder = Path(folder)
     temporary = folder.with_name(f"{_TEMPORARY}{folder.name}")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir(parents=True)
-    write_json(temporary / _CARD, card)
+    if _first():
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir(parents=True)
+        write_json(temporary / _CARD, card)
     _write(temporary, tree, {})
-    _swap(temporary, folder)
+    if _first():
+        _swap(temporary, folder)
+    _meet()
     return folder
 
 
@@ -172,14 +181,16 @@ def _nest(paths: list[str], leaves: list[Any]) -> dict[str, Any]:
 
 
 def _write(where: Path, tree: PyTree, facts: dict[str, Any]) -> None:
-    """Put the tree into `where/state/` and, last, the manifest that makes it count."""
+    """Put the tree into `where/state/` and, last, the manifest that makes it count. `where` exists."""
     flat = jax.tree_util.tree_leaves_with_path(tree)
     leaves = [_describe(path, leaf) for path, leaf in flat]
     arrays = {_slot(i): _to_numpy(leaf) for i, (_, leaf) in enumerate(flat)}
-    where.mkdir(parents=True, exist_ok=True)
+    _meet()
     # Orbax refuses arrays without elements; their shape in the manifest says all there is to say.
     if stored := {slot: x for slot, x in arrays.items() if x.size}:
         ocp.save(str((where / _STATE).absolute()), stored)
+    if not _first():
+        return
     impls = {_slot(i): str(jax.random.key_impl(x)) for i, (_, x) in enumerate(flat) if leaves[i].kind == "key"}
     files = {str(f.relative_to(where)): _fingerprint(f) for f in sorted(where.glob(f"{_STATE}/**/*")) if f.is_file()}
     manifest = {
@@ -209,6 +220,16 @@ def _read(where: Path, manifest: dict[str, Any]) -> list[Any]:
         _from_numpy(leaf, stored.get(_slot(i)), impl=manifest["key_impls"].get(_slot(i)))
         for i, leaf in enumerate(_leaves(manifest))
     ]
+
+
+def _first() -> bool:
+    """Of several hosts, which save together, the first one looks after the files."""
+    return jax.process_index() == 0
+
+
+def _meet() -> None:
+    """Waits for the other hosts."""
+    multihost_utils.sync_global_devices("checkpoint")
 
 
 def _manifest(where: Path) -> dict[str, Any]:

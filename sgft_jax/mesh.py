@@ -10,6 +10,8 @@ import contextlib
 from collections.abc import Callable, Mapping
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jax.sharding import AxisType, PartitionSpec
 
 from sgft_jax.types import Array, PyTree, UserError
@@ -17,16 +19,18 @@ from sgft_jax.types import Array, PyTree, UserError
 DATA = "data"  # the mesh's only axis
 
 
-def devices(wanted: int, sizes: Mapping[str, int]) -> int:
-    """How many devices `wanted` means; 0 stands for all there are.
+def devices(wanted: int | None, sizes: Mapping[str, int]) -> int:
+    """How many devices `wanted` means: None is one, or all if there are several hosts, 0 all there are.
 
     sizes: what will be cut into as many equal pieces, by the name of the option. Raises UserError if there are fewer
-    devices or if a size is not a multiple of their number.
+    devices, if a size is not a multiple of their number, or if some of several hosts would have nothing to do.
     """
-    there = jax.device_count()
-    if not 0 <= wanted <= there:
-        raise UserError(f"--devices {wanted}: JAX sees {there} {jax.default_backend()} device(s)")
-    n = wanted or there
+    there, hosts = jax.device_count(), jax.process_count()
+    n = (1 if hosts == 1 else there) if wanted is None else wanted or there
+    if not 1 <= n <= there:
+        raise UserError(f"--devices {n}: JAX sees {there} {jax.default_backend()} device(s)")
+    if hosts > 1 and n < there:
+        raise UserError(f"--devices {n}: {hosts} hosts work with all their {there} devices; leave it out")
     for name, size in sizes.items():
         if size % n:
             raise UserError(f"{name} is {size}: not a multiple of the {n} devices; change it or --devices")
@@ -57,6 +61,13 @@ def whole(tree: PyTree) -> PyTree:
     return _constrain(tree, PartitionSpec())
 
 
+def local(tree: PyTree) -> PyTree:
+    """Whole copies of arrays that the devices of several hosts may share, on this host alone; every host must ask."""
+    if jax.process_count() == 1:
+        return tree
+    return jax.tree.map(_copy, jax.jit(whole)(tree))
+
+
 def split_vmap[R](function: Callable[..., R], in_axes: int | tuple[int | None, ...] = 0) -> Callable[..., R]:
     """`jax.vmap` over leading axes (0; None = shared), each device doing its piece of the batch alone.
 
@@ -73,6 +84,12 @@ def split_vmap[R](function: Callable[..., R], in_axes: int | tuple[int | None, .
         return jax.shard_map(batched, in_specs=specs, out_specs=PartitionSpec(DATA), check_vma=False)(*args)
 
     return run
+
+
+def _copy(x: Array) -> Array:
+    if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(_copy(jax.random.key_data(x)), impl=jax.random.key_impl(x))
+    return jnp.asarray(np.asarray(x))
 
 
 def _length(args: tuple[PyTree, ...], axes: tuple[int | None, ...]) -> int:

@@ -1,0 +1,63 @@
+"""Impure: one run on several hosts. All of them run the same program, each on its own devices; the first one writes it
+down. The others write, too, but to a folder that goes when they do, so that hardly anybody need know of them.
+"""
+
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+from jax.experimental import multihost_utils
+
+from sgft_jax.types import UserError
+
+_TOGETHER = ("checkpoints", "random", "prior")
+_FORM = "'auto' or ADDRESS:PORT,COUNT,INDEX"
+
+
+def join(hosts: str | None) -> None:
+    """Meets the other hosts, before JAX is used for anything; None: there are no others.
+
+    hosts: `auto` asks the cluster that started this process (SLURM, Open MPI, Kubernetes, as JAX detects them);
+    `ADDRESS:PORT,COUNT,INDEX` says where the first host listens, how many there are, and which one this is. Raises
+    UserError for anything else, and if there is no cluster to ask.
+    """
+    if hosts is None or jax.distributed.is_initialized():
+        return
+    if hosts == "auto":
+        try:
+            jax.distributed.initialize()
+        except (RuntimeError, ValueError) as error:
+            raise UserError(f"--hosts auto: {str(error).splitlines()[0]}") from error
+        return
+    address, *numbers = hosts.split(",")
+    if ":" not in address or len(numbers) != 2 or not all(n.isdigit() for n in numbers):
+        raise UserError(f"--hosts {hosts}: must be {_FORM}")
+    count, index = map(int, numbers)
+    if index >= count:
+        raise UserError(f"--hosts {hosts}: index {index} of {count} hosts; they are counted from 0")
+    jax.distributed.initialize(address, count, index)
+
+
+@contextlib.contextmanager
+def own(folder: Path) -> Iterator[Path]:
+    """Where this host writes the run of that folder: there on the first host, elsewhere and silently on the others.
+
+    They begin with a copy of its logs, so that all can resume. Checkpoints and priors are not for here: hosts save and
+    read them together, in the folder itself, so the file system must be one that all hosts share.
+    """
+    if jax.process_count() == 1:
+        yield folder
+        return
+    with contextlib.ExitStack() as stack:
+        mine = folder
+        if jax.process_index():
+            stack.enter_context(contextlib.redirect_stdout(stack.enter_context(open(os.devnull, "w"))))
+            mine = Path(stack.enter_context(tempfile.TemporaryDirectory())) / folder.name
+            if folder.exists():
+                shutil.copytree(folder, mine, ignore=shutil.ignore_patterns(*_TOGETHER))
+        multihost_utils.sync_global_devices("copied")  # from here on the first host may change its folder
+        yield mine
