@@ -123,9 +123,9 @@ def pretrain(args: PretrainArgs) -> dict[str, Any]:
     gap = common.load_gap(env, args.real, args.set)
     make_pretrainer(env, args.config)  # what does not fit is reported before anything is written
     devices = mesh.devices(args.devices, {f"--config.{n.replace('_', '-')}": getattr(args.config, n) for n in _CUT})
-    common.reserve(memory(env, args.config), copies=args.seeds, devices=devices)
     home = run_folder(args, gap)
     with hosts.own(home) as folder, mesh.use(devices):
+        common.reserve(memory(env, args.config), copies=args.seeds, devices=devices)
         run = runs.open_run(
             folder,
             kind="pretrain",

@@ -31,6 +31,7 @@ def test_resets_are_fresh_and_repeatable(pushing):
     assert abs(first[1] - other[1]) > 1e-3  # another start
 
 
+@pytest.mark.slow
 def test_step_of_a_batch_is_the_steps_of_its_members(pushing, started):
     batch = pushing.step_batch(pushing.worlds, started, ACTIONS, KEYS)
     for i in range(4):

@@ -27,16 +27,20 @@ CUT = PartitionSpec(None, mesh.DATA)  # [seeds, ...]
 
 
 @functools.cache
-def pretrained(devices):
-    """Random data, the start, the state after a chunk in which episodes end, and its metrics."""
-    env = toy.make()
-    program = pretrain.make_program(env, CONFIG, seeds=1)
-    pools = stack([env.sample_worlds(jax.random.key(0), CONFIG.worlds)])
+def begun(devices):
+    """Random data and the start of a run."""
     with mesh.use(devices):
-        random = program.collect(pools, seed_keys([0], 1))
-        saved = program.begin(pools, random, seed_keys([0], 2))
-        run, metrics = program.chunk(pools, random, jax.tree.map(jnp.copy, saved.run))
-    return random, saved, run, metrics
+        random = program().collect(pools(), seed_keys([0], 1))
+        return random, program().begin(pools(), random, seed_keys([0], 2))
+
+
+@functools.cache
+def program():
+    return pretrain.make_program(toy.make(), CONFIG, seeds=1)
+
+
+def pools():
+    return stack([toy.make().sample_worlds(jax.random.key(0), CONFIG.worlds)])
 
 
 def agree(one, two, **tolerance):
@@ -45,28 +49,41 @@ def agree(one, two, **tolerance):
         np.testing.assert_allclose(a, b, err_msg=jax.tree_util.keystr(path), **tolerance)
 
 
-def test_pretraining_is_the_same_on_any_number_of_devices():
-    one, two = pretrained(1), pretrained(2)
-    agree(one[:2], two[:2], rtol=1e-5, atol=1e-5)  # random data and start
-    agree(one[2:], two[2:], rtol=2e-2, atol=2e-3)  # 48 updates amplify the rounding of sums
+def test_a_run_begins_alike_on_any_number_of_devices():
+    """The random-action data are 4 steps of all environments, so their physics is compared, too."""
+    agree(begun(1), begun(2), rtol=1e-5, atol=1e-5)
 
 
 def test_environments_and_experience_are_cut_and_the_agent_is_whole():
-    random, saved, run, _ = pretrained(2)
-    for tree in (random.data, saved.run.replay.data, saved.run.fleet, run.replay.data, run.fleet):
+    random, saved = begun(2)
+    for tree in (random.data, saved.run.replay.data, saved.run.fleet):
         assert {x.sharding.spec for x in jax.tree.leaves(tree)} == {CUT}
-    assert all(
-        x.sharding.is_fully_replicated for tree in (saved.run.learner, run.learner) for x in jax.tree.leaves(tree)
-    )
+    assert all(x.sharding.is_fully_replicated for x in jax.tree.leaves((saved.run.learner, saved.best)))
+
+
+@pytest.mark.slow
+def test_training_is_the_same_on_any_number_of_devices():
+    """One chunk, in which episodes end; test_hosts.py has the same on two hosts."""
+
+    def trained(devices):
+        random, saved = begun(devices)
+        with mesh.use(devices):
+            return program().chunk(pools(), random, jax.tree.map(jnp.copy, saved.run))
+
+    one, two = trained(1), trained(2)
+    agree(one, two, rtol=2e-2, atol=2e-3)  # 48 updates amplify the rounding of sums
+    run, metrics = two
+    for tree in (run.replay.data, run.fleet):
+        assert {x.sharding.spec for x in jax.tree.leaves(tree)} == {CUT}
+    assert all(x.sharding.is_fully_replicated for x in jax.tree.leaves((run.learner, metrics)))
 
 
 def test_what_one_device_left_two_continue():
     """A checkpoint holds whole arrays; `spread` lays them out."""
-    random, saved, *_ = pretrained(1)
-    program = pretrain.make_program(toy.make(), CONFIG, seeds=1)
+    random, saved = begun(1)
     with mesh.use(2):
-        laid_out = program.spread(jax.tree.map(jnp.copy, saved))
-        data = program.spread_random(jax.tree.map(jnp.copy, random)).data
+        laid_out = program().spread(jax.tree.map(jnp.copy, saved))
+        data = program().spread_random(jax.tree.map(jnp.copy, random)).data
     agree(saved, laid_out)
     assert laid_out.run.replay.data.reward.sharding.spec == data.reward.sharding.spec == CUT
 
