@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from experiments import bench_updates
 from experiments.benchmark import ACT_DIM, MEMBERS, OBS_DIM, multiplications, rows
@@ -56,6 +57,7 @@ def test_it_is_the_update_of_the_library(key):
     assert moved > 3e-4  # further than the tolerance, so the comparison says something
 
 
+@pytest.mark.slow
 def test_multiplications_are_those_of_xla(key):
     """XLA counts two operations per multiplication and what is beside matrix products: little where layers are wide."""
     wide = NetworkConfig(hidden=(128, 128), layer_norm=True)

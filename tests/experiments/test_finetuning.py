@@ -155,6 +155,7 @@ def test_killed_and_resumed_is_bit_for_bit_uninterrupted(home, tmp_path, method)
     assert len(list(cut.glob("real/superseded-0/*.npz"))) == 1  # what the robot did is kept
 
 
+@pytest.mark.slow
 def test_more_rollouts_continue_a_finished_run(home, tmp_path):
     call(argv(home, "sac", "--rollouts", "4", out=tmp_path))
     call(argv(home, "sac", "--rollouts", "5", "--resume", out=tmp_path))

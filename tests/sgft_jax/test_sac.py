@@ -210,6 +210,7 @@ def test_update_traces_once(key):
         state, _ = update(state, probe(jax.random.fold_in(key, step)), jax.random.fold_in(key, step))
 
 
+@pytest.mark.slow
 def test_vmap_over_seeds_equals_a_loop(key):
     keys, batch = jax.random.split(key, 2), probe(key)
 
