@@ -59,7 +59,8 @@ def choose_impl(wanted: str = "auto") -> str:
     """Who steps the physics: "jax" (MJX's own code), "warp" (MJX with MuJoCo Warp) or "c" (MuJoCo's own engine).
 
     wanted: one of them, or "auto": what $SGFT_IMPL says, or else "c" where JAX computes on CPUs and "jax" elsewhere,
-        because insertion is slow in Warp as yet (docs/performance.md). Raises UserError for anything else.
+        because Warp's own worlds have not been measured on a GPU yet (docs/performance.md). Raises UserError for
+        anything else.
     """
     impl = os.environ.get(IMPL_VARIABLE) or "auto" if wanted == "auto" else wanted
     if impl not in get_args(Impl):

@@ -10,12 +10,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import jax
-from jax.experimental import multihost_utils
 
+from sgft_jax import mesh
 from sgft_jax.types import UserError
 
 _TOGETHER = ("checkpoints", "random", "prior")
-_FORM = "'auto' or ADDRESS:PORT,COUNT,INDEX"
 
 
 def join(hosts: str | None) -> None:
@@ -35,7 +34,7 @@ def join(hosts: str | None) -> None:
         return
     address, *numbers = hosts.split(",")
     if ":" not in address or len(numbers) != 2 or not all(n.isdigit() for n in numbers):
-        raise UserError(f"--hosts {hosts}: must be {_FORM}")
+        raise UserError(f"--hosts {hosts}: must be 'auto' or ADDRESS:PORT,COUNT,INDEX")
     count, index = map(int, numbers)
     if index >= count:
         raise UserError(f"--hosts {hosts}: index {index} of {count} hosts; they are counted from 0")
@@ -59,5 +58,5 @@ def own(folder: Path) -> Iterator[Path]:
             mine = Path(stack.enter_context(tempfile.TemporaryDirectory())) / folder.name
             if folder.exists():
                 shutil.copytree(folder, mine, ignore=shutil.ignore_patterns(*_TOGETHER))
-        multihost_utils.sync_global_devices("copied")  # from here on the first host may change its folder
+        mesh.meet()  # from here on the first host may change its folder
         yield mine

@@ -134,6 +134,7 @@ def pretrain(args: PretrainArgs) -> dict[str, Any]:
             overwrite=args.overwrite,
             volatile=("resume", "overwrite", "devices", "hosts", "report", "video", "out"),
         )
+        mesh.meet()  # nobody looks for checkpoints before the first host has emptied a folder that is to be replaced
         try:
             return _Run(args, env, gap, seeds, run.folder, home).work()
         finally:

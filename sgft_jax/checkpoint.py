@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental import multihost_utils
 from orbax.checkpoint import v1 as ocp
 
+from sgft_jax import mesh
 from sgft_jax.jsonfile import jsonable, read_json, write_json
 from sgft_jax.types import Normalizer, Prior, PyTree, UserError
 
@@ -64,7 +64,7 @@ def save(folder: Path, step: int, state: PyTree, *, meta: Mapping[str, Any], kee
     if _first():
         _swap(temporary, root / str(step))
         _prune(root, newest=step, keep=keep)
-    _meet()
+    mesh.meet()
     return root / str(step)
 
 
@@ -131,7 +131,7 @@ def save_prior(folder: Path, prior: Prior, card: Mapping[str, Any]) -> Path:
     _write(temporary, tree, {})
     if _first():
         _swap(temporary, folder)
-    _meet()
+    mesh.meet()
     return folder
 
 
@@ -185,7 +185,7 @@ def _write(where: Path, tree: PyTree, facts: dict[str, Any]) -> None:
     flat = jax.tree_util.tree_leaves_with_path(tree)
     leaves = [_describe(path, leaf) for path, leaf in flat]
     arrays = {_slot(i): _to_numpy(leaf) for i, (_, leaf) in enumerate(flat)}
-    _meet()
+    mesh.meet()
     # Orbax refuses arrays without elements; their shape in the manifest says all there is to say.
     if stored := {slot: x for slot, x in arrays.items() if x.size}:
         ocp.save(str((where / _STATE).absolute()), stored)
@@ -225,11 +225,6 @@ def _read(where: Path, manifest: dict[str, Any]) -> list[Any]:
 def _first() -> bool:
     """Of several hosts, which save together, the first one looks after the files."""
     return jax.process_index() == 0
-
-
-def _meet() -> None:
-    """Waits for the other hosts."""
-    multihost_utils.sync_global_devices("checkpoint")
 
 
 def _manifest(where: Path) -> dict[str, Any]:

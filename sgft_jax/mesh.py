@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import AxisType, PartitionSpec
 
 from sgft_jax.types import Array, PyTree, UserError
@@ -66,6 +67,11 @@ def local(tree: PyTree) -> PyTree:
     if jax.process_count() == 1:
         return tree
     return jax.tree.map(_copy, jax.jit(whole)(tree))
+
+
+def meet() -> None:
+    """Waits for the other hosts, if there are any."""
+    multihost_utils.sync_global_devices("meet")
 
 
 def split_vmap[R](function: Callable[..., R], in_axes: int | tuple[int | None, ...] = 0) -> Callable[..., R]:
