@@ -56,18 +56,20 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...], impl: str) -> Adv
 
 
 def choose_impl(wanted: str = "auto") -> str:
-    """Who steps the physics: "jax" (MJX's own code), "warp" (MJX with MuJoCo Warp) or "c" (MuJoCo's own engine).
+    """Who steps the physics: "jax" (MJX's own code), "warp" (MuJoCo Warp) or "c" (MuJoCo's own engine).
 
-    wanted: one of them, or "auto": what $SGFT_IMPL says, or else "c" where JAX computes on CPUs and "jax" elsewhere,
-        because Warp's own worlds have not been measured on a GPU yet (docs/performance.md). Raises UserError for
+    wanted: one of them, or "auto": what $SGFT_IMPL says, or else the fastest (docs/performance.md), which is "c" where
+        JAX computes on CPUs, "warp" on NVIDIA GPUs where it is installed, "jax" elsewhere. Raises UserError for
         anything else.
     """
     impl = os.environ.get(IMPL_VARIABLE) or "auto" if wanted == "auto" else wanted
     if impl not in get_args(Impl):
         raise UserError(unknown(IMPL_VARIABLE if wanted == "auto" else "impl", impl, get_args(Impl)))
-    if impl == "auto":
-        return "c" if jax.default_backend() == "cpu" else "jax"
-    return impl
+    if impl != "auto":
+        return impl
+    if jax.default_backend() == "cpu":
+        return "c"
+    return "warp" if jax.default_backend() == "gpu" and engine_warp.available() else "jax"
 
 
 def varying_fields(nominal: mujoco.MjModel, specs: Iterable[mujoco.MjSpec]) -> tuple[str, ...]:

@@ -64,7 +64,7 @@ def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> Finet
         initial_rollouts=initial,
         utd=3.0,
         eval_every=10,
-        eval_episodes=initial,  # the program that plays the initial rollouts serves again
+        eval_episodes=20,
         options=FinetuneConfig(batch_size=64, branches=2, lr_actor=3e-4, actor_ramp=300),
         video=args.video and method == METHODS[0],
         **shared,

@@ -36,8 +36,8 @@ class EvaluateArgs:
     set: tuple[str, ...] = ()
     """Changes to the real system, e.g. --set latency=0.05 action_scale=[1,0.5]."""
     impl: Impl = "auto"
-    """Who steps the physics: MJX's own code, MJX with MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c
-    on a CPU and jax elsewhere."""
+    """Who steps the physics: MJX's own code, MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c on a CPU,
+    warp on an NVIDIA GPU where it is installed, jax elsewhere."""
     episodes: int = 200
     """Episodes per policy."""
     seed: int = 0

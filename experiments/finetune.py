@@ -66,8 +66,8 @@ class FinetuneArgs:
     options: FinetuneConfig = field(default_factory=FinetuneConfig)
     """Method options; `network` and `gamma` always are the prior's."""
     impl: Impl = "auto"
-    """Who steps the physics: MJX's own code, MJX with MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c
-    on a CPU and jax elsewhere."""
+    """Who steps the physics: MJX's own code, MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c on a CPU,
+    warp on an NVIDIA GPU where it is installed, jax elsewhere."""
     devices: int | None = None
     """Devices that share the seeds; 0: all there are; default: one."""
     video: bool = True
@@ -131,10 +131,10 @@ class _Run:
         config = replace(self.args.options, network=common.network_of(card), gamma=card["gamma"])
         if config.critic_warmup is None:
             config = replace(config, critic_warmup=self.args.initial_rollouts * self._updates_per_rollout())
-        tuner = make_finetuner(
+        self.tuner = make_finetuner(
             self.method, config, obs_dim=env.obs_dim, act_dim=env.act_dim, reward=env.reward, terminated=env.terminated
         )
-        self.program = make_program(env, tuner, gamma=config.gamma)
+        self.program = make_program(env, self.tuner, gamma=config.gamma)
         make = lambda: self.program.init(priors, self.numbers)  # noqa: E731
         state, done = self._start(make)
         state = self._train(state, done)
@@ -236,13 +236,8 @@ class _Run:
 
     def _save_policies(self, state: FinetuneState, card: dict[str, Any]) -> None:
         """The fine-tuned policies in the form of priors: policy/seed-<k>."""
-        if self.method.finite_horizon and self.args.options.horizon > 1:
-            print("no policy/: an actor that is told its steps to go is not a plain policy; the checkpoint holds it")
-            return
         for i, seed in enumerate(self.seeds):
-            one: Any = common.member(state, i)
-            agent = one.learner
-            tuned = Prior(agent.actor.params, agent.critic.params, one.value, one.dynamics.params, one.normalizer)
+            tuned = self.tuner.export(common.member(state, i))
             facts = {"method": self.args.method, "gap": self.gap._asdict(), "seed": seed}
             checkpoint.save_prior(self.folder / "policy" / f"seed-{seed}", tuned, {**card, "finetuned": facts})
 

@@ -64,7 +64,10 @@ def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
     keys = jax.jit(jax.vmap(_episode_keys, (0, None, None, None)), static_argnums=3)
 
     def collect(state: FinetuneState, pool: World, seeds: Array, rollout: int, n: int) -> Episode:
-        return played(state, pool, keys(seeds, _COLLECT, rollout, n), True)
+        """One after another, as on a robot: a program for n at once would be used for the initial rollouts alone."""
+        each = jnp.split(keys(seeds, _COLLECT, rollout, n), n, axis=1)
+        episodes = [played(state, pool, key, True) for key in each]
+        return jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *episodes)
 
     def evaluate(state: FinetuneState, pool: World, seeds: Array, n: int) -> Episode:
         return played(state, pool, keys(seeds, _EVALUATE, 0, n), False)

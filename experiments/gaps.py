@@ -59,8 +59,8 @@ class GapsArgs:
     seeds: int = 1
     """Policies trained per gap."""
     impl: Impl = "auto"
-    """Who steps the physics: MJX's own code, MJX with MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c
-    on a CPU and jax elsewhere."""
+    """Who steps the physics: MJX's own code, MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c on a CPU,
+    warp on an NVIDIA GPU where it is installed, jax elsewhere."""
     episodes: int = 256
     """Evaluation episodes per policy and gap, at least 200."""
     out: Path = Path("runs")

@@ -59,8 +59,8 @@ class PretrainArgs:
     set: tuple[str, ...] = ()
     """Changes to that system, e.g. --set latency=0.05 action_scale=[1,0.5]."""
     impl: Impl = "auto"
-    """Who steps the physics: MJX's own code, MJX with MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c
-    on a CPU and jax elsewhere."""
+    """Who steps the physics: MJX's own code, MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c on a CPU,
+    warp on an NVIDIA GPU where it is installed, jax elsewhere."""
     devices: int | None = None
     """Devices that share the environments, the replay and every batch; 0: all there are; default: one, or all of
     several hosts. Results stay the same but for rounding, and a run may be resumed on another number."""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from sgft_jax import dynamics, optim, replay, value
-from sgft_jax.networks import NetworkConfig, make_dynamics, make_value
+from sgft_jax.networks import NetworkConfig, fix_first_layer, make_dynamics, make_value
 from sgft_jax.sac import SACConfig, SACHyper, fine_tune_state, make_sac
 from sgft_jax.sgft import Method, append_steps_to_go, compose
 from sgft_jax.types import Array, Imagination, Key, Learner, Metrics, Normalizer, Prior, PyTree, Transition, UserError
@@ -85,12 +85,14 @@ class Finetuner(NamedTuple):
     act(state, obs [obs_dim], key, *, explore) -> action [act_dim].
     observe(state, transitions [T, ...], valid [T]) -> state: fill the replay buffer.
     learn(state, key, n_updates) -> (state, metrics averaged over the updates); `n_updates` is static.
+    export(state) -> the agent in the form of a prior: actor and critic as they act, with the whole horizon to go.
     """
 
     init: Callable[[Prior, Key], FinetuneState]
     act: Callable[..., Array]
     observe: Callable[[FinetuneState, Transition, Array], FinetuneState]
     learn: Callable[[FinetuneState, Key, int], tuple[FinetuneState, Metrics]]
+    export: Callable[[FinetuneState], Prior]
 
 
 def sac_agent(
@@ -191,4 +193,10 @@ def make_finetuner(
         state, metrics = jax.lax.scan(update, state, jax.random.split(key, n_updates))
         return state, jax.tree.map(jnp.mean, metrics)
 
-    return Finetuner(init, act, observe, learn)
+    def export(state: FinetuneState) -> Prior:
+        agent = state.learner
+        extra = append_steps_to_go(jnp.zeros(0), jnp.int32(config.horizon), told)
+        actor, critic = (fix_first_layer(fit.params, obs_dim, extra) for fit in (agent.actor, agent.critic))
+        return Prior(actor, critic, state.value, state.dynamics.params, state.normalizer)
+
+    return Finetuner(init, act, observe, learn, export)

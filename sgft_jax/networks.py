@@ -156,3 +156,14 @@ def pad_first_layer(params: PyTree, obs_dim: int, extra: int) -> PyTree:
     rows = jnp.zeros((*kernel.shape[:-2], extra, kernel.shape[-1]), kernel.dtype)
     padded = jnp.concatenate([kernel[..., :obs_dim, :], rows, kernel[..., obs_dim:, :]], axis=-2)
     return {**params, "Dense_0": {**params["Dense_0"], "kernel": padded}}
+
+
+def fix_first_layer(params: PyTree, obs_dim: int, extra: Array) -> PyTree:
+    """The inverse of `pad_first_layer`: a network that reads `obs_dim` entries, the ones after them fixed to `extra`.
+
+    extra: [entries]. What these contribute goes into the first bias. Works for stacked parameters, too.
+    """
+    layer = params["Dense_0"]
+    kept, fixed, rest = jnp.split(layer["kernel"], [obs_dim, obs_dim + len(extra)], axis=-2)
+    bias = layer["bias"] + jnp.einsum("i,...ij->...j", extra, fixed)
+    return {**params, "Dense_0": {"kernel": jnp.concatenate([kept, rest], axis=-2), "bias": bias}}

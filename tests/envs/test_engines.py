@@ -73,6 +73,10 @@ def test_an_explosion_is_reported_not_reset(tmp_path, monkeypatch):
 def test_who_steps_the_physics(monkeypatch):
     monkeypatch.setenv(physics.IMPL_VARIABLE, "auto")
     assert physics.choose_impl() == "c"  # the tests run on a CPU
+    for backend, installed, chosen in (("gpu", True, "warp"), ("gpu", False, "jax"), ("tpu", True, "jax")):
+        monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
+        monkeypatch.setattr(physics.engine_warp, "available", lambda installed=installed: installed)
+        assert physics.choose_impl() == chosen
     assert physics.choose_impl("jax") == "jax" and make_env(SCENES["hammer"], "c").impl == "c"
     monkeypatch.setenv(physics.IMPL_VARIABLE, "wrap")
     with pytest.raises(UserError, match=r"SGFT_IMPL: .* 'wrap', did you mean 'warp'\? Choose from: auto, c, jax, warp"):

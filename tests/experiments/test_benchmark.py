@@ -2,6 +2,7 @@
 
 import json
 import time
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 
 from envs.franka import hammer
-from experiments import benchmark
-from experiments.benchmark import BenchmarkConfig, bare_steps, fastest, main
+from envs.physics import PhysicsState
+from experiments.bench import other_sac, physics, training, updates
+from experiments.bench.timing import fastest, measure
+from experiments.benchmark import BenchmarkConfig, main
 from sgft_jax.types import UserError
 
 
@@ -18,8 +21,13 @@ def test_the_fastest_call_counts_without_the_first(monkeypatch):
     times = iter([10.0, 10.5, 20.0, 20.25, 30.0, 31.0])
     monkeypatch.setattr(time, "perf_counter", lambda: next(times))
     calls = []
-    assert fastest(lambda state: calls.append(state) or state + 1, 0, repeats=3) == 0.25
-    assert calls == [0, 1, 2, 3]  # the first call compiles; each call goes on from the one before
+    assert fastest(lambda: calls.append(1), repeats=3) == 0.25 and len(calls) == 4
+
+
+def test_memory_is_that_of_the_compiled_program():
+    timing = measure(lambda x: x + 1.0, (jnp.zeros(250_000),), repeats=1)
+    assert timing.memory_mb == pytest.approx(2.0, rel=0.01)  # a megabyte in, one out
+    assert timing.compile_s > 0 and timing.seconds > 0
 
 
 def test_numbers_reach_the_disk(tmp_path, capsys):
@@ -29,25 +37,101 @@ def test_numbers_reach_the_disk(tmp_path, capsys):
     )  # fmt: skip
     with jax.numpy_rank_promotion("allow"):  # the hand-written update broadcasts ensembles against batches
         measured = main(config)
-    (physics,), (updates,) = measured["physics"], measured["updates"]
-    assert physics["worlds"] == 2 and physics["env_per_s"] > 0
-    assert updates["updates/bare"] == pytest.approx(updates["updates_per_s"] / updates["bare_per_s"])
+    (line,), (full,), (plain,) = (measured[part] for part in ("physics", "updates", "plain"))
+    assert line["worlds"] == 2 and line["env/bare"] == pytest.approx(line["env_per_s"] / line["bare_per_s"])
+    assert full["updates/bare"] == pytest.approx(full["updates_per_s"] / full["bare_per_s"])
+    assert full["gb_per_update"] > 1e-6 and plain["updates_per_s"] > 0
     stored = json.loads((tmp_path / "benchmark" / "summary.json").read_text())
-    assert stored["physics"] == [physics] and stored["updates"] == [updates]
+    assert stored["physics"] == [line] and stored["updates"] == [full] and stored["plain"] == [plain]
     assert stored["provenance"]["versions"]["mujoco"]
     assert "hammer" in capsys.readouterr().out
 
 
+def test_engines_alone_repeat_the_commands_they_are_given(monkeypatch):
+    """MuJoCo's rollout from that state under these commands ends where single steps do; MJX's too, in a slow test."""
+    host, window, expected = _window()
+    seen = []
+    rollout = physics.mujoco.rollout.Rollout.rollout
+    monkeypatch.setattr(
+        physics.mujoco.rollout.Rollout, "rollout", lambda *a, **k: seen.append(rollout(*a, **k)) or seen[-1]
+    )
+    assert physics._c_alone(host, window, 3, repeats=1) > 0
+    state = seen[-1][0]
+    assert state.shape[1] == 6  # two control periods of three steps
+    np.testing.assert_allclose(state[:, -1, 1 : 1 + host.nq], expected, atol=1e-6)
+
+
 @pytest.mark.slow
-def test_bare_steps_are_those_of_mjx(key):
-    """Worlds differ by their commands, and time passes as asked for."""
-    host = hammer.build({p.name: p.nominal for p in hammer.PARAMETERS}).compile()
-    run, start = bare_steps(host, "jax", worlds=2, control_steps=1, substeps=3)
-    before = np.array(start[0])
+def test_mjx_alone_repeats_the_commands_it_is_given(monkeypatch):
+    host, window, expected = _window()
+    seen = []
+    monkeypatch.setattr(physics, "measure", lambda run, given, repeats: seen.append(jax.jit(run)(*given)))
     with jax.numpy_rank_promotion("allow"):
-        qpos, qvel, _ = run(start)
-    assert jnp.isfinite(qpos).all() and np.abs(qpos - before).max() > 1e-4
-    assert np.abs(qvel[0] - qvel[1]).max() > 1e-3
+        physics._mjx_alone(host, "jax", window, 3, 1)
+    np.testing.assert_allclose(seen[0][0], expected, atol=1e-5)
+
+
+def _window():
+    """(Hammering's scene, two worlds of it moved gently, so that no servo saturates, where C MuJoCo takes them)."""
+    host = hammer.build({p.name: p.nominal for p in hammer.PARAMETERS}).compile()
+    arm = np.asarray(hammer.initial(jnp.array([p.nominal for p in hammer.PARAMETERS]), jax.random.key(0)).qpos)
+    commands = arm[: host.nu] + 0.003 * np.array([[[1.0], [-1.0]], [[2.0], [0.5]]])
+    ends = []
+    for world in range(2):
+        data = physics.mujoco.MjData(host)
+        data.qpos[:] = arm
+        for ctrl in commands[:, world]:
+            data.ctrl[:] = ctrl
+            physics.mujoco.mj_step(host, data, 3)
+        ends.append(data.qpos.copy())
+    two = lambda x: jnp.broadcast_to(jnp.asarray(x, jnp.float32), (2, len(x)))  # noqa: E731
+    start = PhysicsState(two(arm), two(np.zeros(host.nv)), two(np.zeros(host.nv)), two(arm[: host.nu]))
+    return host, physics.Window(start, jnp.asarray(commands, jnp.float32)), np.stack(ends)
+
+
+def test_another_librarys_agent_gets_the_sizes_and_a_full_replay(monkeypatch):
+    """The library is played by a stand-in: it needs not be installed."""
+
+    class Agent:
+        def __init__(self, policy, env, *, batch_size, buffer_size, policy_kwargs):
+            self.asked = (policy, env.observation_space, env.action_space, batch_size, buffer_size, policy_kwargs)
+            self.rows = []
+            self.replay_buffer = SimpleNamespace(add=lambda *row: self.rows.append(row))
+            agents.append(self)
+
+        def set_logger(self, logger):
+            assert logger == "silent"
+
+        def train(self, *, gradient_steps, batch_size):
+            return gradient_steps, batch_size
+
+    agents: list[Agent] = []
+    box = SimpleNamespace(Box=lambda low, high, shape, dtype: shape)
+    modules = {
+        "gymnasium": SimpleNamespace(Env=object, spaces=box),
+        "sbx": SimpleNamespace(SAC=Agent),
+        "stable_baselines3.common.logger": SimpleNamespace(configure=lambda folder, formats: "silent"),
+    }
+    monkeypatch.setattr(other_sac.importlib, "import_module", modules.__getitem__)
+    train = other_sac.make("sbx", batch=4, width=8, obs_dim=3, act_dim=2, capacity=5)
+    assert agents[0].asked == ("MlpPolicy", (3,), (2,), 4, 5, {"net_arch": [8, 8]}) and len(agents[0].rows) == 5
+    assert train(7) == (7, 4)
+
+
+def test_whole_commands_run_twice_in_folders_that_vanish(monkeypatch):
+    folders = []
+
+    def pretrain(args):
+        assert args.config.env_steps == 77 and args.out.is_dir()
+        folders.append(args.out)
+        times = {f"time/{part}_s": 1.0 for part in ("worlds", "random", "train", "evaluate", "report")}
+        seeds = [{"success": s, "value/explained_variance": v} for s, v in ((1.0, 0.5), (0.9, 0.7))]
+        return {"impl": "c", "env_steps": 80, "seeds": seeds, **times}
+
+    monkeypatch.setattr(training, "pretrain", pretrain)
+    found = training.pretraining("push", "c", 2, preset="cpu", env_steps=77)
+    assert len(set(folders)) == 2 and not any(folder.exists() for folder in folders)
+    assert found["success"] == 0.9 and found["explained_variance"] == 0.5 and found["env_steps"] == 80
 
 
 @pytest.mark.parametrize(
@@ -57,9 +141,14 @@ def test_bare_steps_are_those_of_mjx(key):
         ({"worlds": (4, 0)}, "--worlds is 0"),
         ({"repeats": 0}, "--repeats is 0"),
         ({"batches": ()}, "--batches is 0"),
+        ({"control_steps": 30}, "--control-steps 30 is more than half an episode of push"),
+        ({"parts": ("finetune",)}, "--parts finetune needs --prior FOLDER"),
+        ({"preset": "fats"}, "--preset: there is no 'fats', did you mean 'fast'?"),
     ],
 )
 def test_bad_input(change, complaint, tmp_path, monkeypatch):
-    monkeypatch.setattr(benchmark, "physics_speed", lambda *_: pytest.fail("measured"))
+    for module in (physics, updates):
+        monkeypatch.setattr(module, "speed", lambda *_, **__: pytest.fail("measured"))
     with pytest.raises(UserError, match=complaint.replace("?", r"\?")):
         main(BenchmarkConfig(out=tmp_path, **change))
+    assert not (tmp_path / "benchmark").exists()

@@ -175,13 +175,6 @@ def test_a_rollout_is_on_disk_before_learning_from_it(home, tmp_path, monkeypatc
     assert len(real) == 2 and np.isfinite(real[1]["reward"]).all()
 
 
-@pytest.mark.slow
-def test_an_actor_that_knows_its_horizon_is_not_saved_as_a_plain_policy(home, tmp_path, capsys):
-    call(argv(home, "sgft", "--options.horizon", "2", out=tmp_path))
-    assert "no policy/" in capsys.readouterr().out
-    assert not (tmp_path / "finetune/toy/turned/sgft/seeds-0-1/policy").exists()
-
-
 @pytest.mark.parametrize(
     ("more", "words"),
     [

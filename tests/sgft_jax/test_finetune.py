@@ -129,6 +129,18 @@ def test_the_first_action_is_the_simulators(prior, key, horizon):
     np.testing.assert_allclose(got, jnp.tanh(moments[0]), rtol=1e-5)
 
 
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_what_is_exported_acts_like_the_agent(prior, key, horizon):
+    tuner = make("sgft-sac", horizon=horizon)
+    state, _ = tuner.learn(started(tuner, prior), key, 3)
+    plain, obs = tuner.export(state), jnp.array([0.3, -0.8])
+    assert jax.tree.map(jnp.shape, plain) == jax.tree.map(jnp.shape, prior)
+    moments = networks.make_actor(2, 2, NET).apply(plain.actor, normalizer.normalize(plain.normalizer, obs))
+    expected = tuner.act(state, obs, key, explore=False)
+    np.testing.assert_allclose(networks.tanh_gaussian_mode(moments), expected, rtol=1e-5)
+    assert not np.allclose(expected, tuner.act(tuner.init(prior, key), obs, key, explore=False), rtol=1e-3)
+
+
 def test_invalid_transitions_do_no_harm(prior, key):
     tuner = make("sgft-sac")
     state = tuner.init(prior, key)

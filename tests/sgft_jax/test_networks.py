@@ -83,6 +83,15 @@ def test_padding_leaves_the_function_alone(key, extra):
     )
 
 
+def test_fixed_entries_need_not_be_told(key):
+    obs, action, extra = jnp.arange(3.0), jnp.array([0.2, -0.4]), jnp.array([0.0, 1.0])
+    small, big = networks.make_critic(3, 2, TINY), networks.make_critic(5, 2, TINY)
+    params = big.init(key)
+    fixed = networks.fix_first_layer(params, 3, extra)
+    expected = big.apply(params, jnp.concatenate([obs, extra]), action)
+    np.testing.assert_allclose(small.apply(fixed, obs, action), expected, rtol=1e-5)
+
+
 def test_padded_rows_can_learn(key):
     value = networks.make_value(4, TINY)
     padded = networks.pad_first_layer(networks.make_value(3, TINY).init(key), 3, 1)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import bench_updates
-from experiments.benchmark import ACT_DIM, MEMBERS, OBS_DIM, multiplications, rows
+from experiments.bench import bare_sac
+from experiments.bench.updates import ACT_DIM, MEMBERS, OBS_DIM, multiplications, rows
 from sgft_jax.networks import NetworkConfig
 from sgft_jax.sac import SACConfig, SACHyper, make_sac
 
@@ -29,20 +29,20 @@ def noise_of(key):
     key_target, key_actor, key_dynamics = jax.random.split(key, 3)
     normal = lambda key: jax.random.normal(key, (ACT_DIM,))  # noqa: E731
     target, actor = (jax.vmap(normal)(jax.random.split(k, BATCH)) for k in (key_target, key_actor))
-    return bench_updates.Noise(target, actor, jax.random.exponential(key_dynamics, (BATCH, MEMBERS)))
+    return bare_sac.Noise(target, actor, jax.random.exponential(key_dynamics, (BATCH, MEMBERS)))
 
 
 def test_it_is_the_update_of_the_library(key):
     learner = make_sac(SACConfig(OBS_DIM, ACT_DIM, network=NETWORK, ensemble_size=MEMBERS), HYPER)
     state = learner.init(key)
-    parts = {name: bench_updates.trained(layers(getattr(state, name).params)) for name in ("actor", "critic", "value")}
-    bare = bench_updates.Bare(
+    parts = {name: bare_sac.trained(layers(getattr(state, name).params)) for name in ("actor", "critic", "value")}
+    bare = bare_sac.Bare(
         **parts,
         target=layers(state.target_critic),
-        log_alpha=bench_updates.trained(state.log_alpha.params),
-        dynamics=bench_updates.trained(layers(state.dynamics.params)),
+        log_alpha=bare_sac.trained(state.log_alpha.params),
+        dynamics=bare_sac.trained(layers(state.dynamics.params)),
     )
-    update, by_hand = jax.jit(learner.update), jax.jit(bench_updates.update)
+    update, by_hand = jax.jit(learner.update), jax.jit(bare_sac.update)
     for step in range(3):
         key_rows, key_step = jax.random.split(jax.random.fold_in(key, step))
         batch = rows(key_rows, BATCH)._replace(reward=jnp.arange(8.0), action=jnp.full((BATCH, ACT_DIM), 0.3))
@@ -61,8 +61,8 @@ def test_it_is_the_update_of_the_library(key):
 def test_multiplications_are_those_of_xla(key):
     """XLA counts two operations per multiplication and what is beside matrix products: little where layers are wide."""
     wide = NetworkConfig(hidden=(128, 128), layer_norm=True)
-    agent = bench_updates.init(key, wide, OBS_DIM, ACT_DIM, members=MEMBERS, alpha=1.0)
-    batch, noise = rows(key, 64), bench_updates.draw(key, 64, ACT_DIM, MEMBERS)
+    agent = bare_sac.init(key, wide, OBS_DIM, ACT_DIM, members=MEMBERS, alpha=1.0)
+    batch, noise = rows(key, 64), bare_sac.draw(key, 64, ACT_DIM, MEMBERS)
     with jax.numpy_rank_promotion("allow"):
-        cost = jax.jit(bench_updates.update).lower(agent, batch, noise, HYPER).compile().cost_analysis()
+        cost = jax.jit(bare_sac.update).lower(agent, batch, noise, HYPER).compile().cost_analysis()
     assert 0.8 < 2 * 64 * multiplications(wide) / cost["flops"] <= 1.0

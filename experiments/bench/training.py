@@ -1,0 +1,64 @@
+"""Wall clock of the whole commands: pretraining with what it leaves, fine-tuning by number of seeds.
+
+Every command runs twice in folders that are thrown away. The second time its programs come from JAX's compilation
+cache, so the difference is what compiling costs, if the cache did not hold them before.
+"""
+
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from envs.physics import Impl
+from experiments.finetune import FinetuneArgs, finetune, run_folder
+from experiments.presets import PRESETS
+from experiments.pretrain import PretrainArgs, pretrain
+from sgft_jax.log import read_jsonl
+
+
+def pretraining(task: str, impl: Impl, seeds: int, *, preset: str, env_steps: int | None) -> dict[str, Any]:
+    """Seconds from nothing to priors, and the worst seed's success and explained variance of V_sim."""
+    config = PRESETS[preset] if env_steps is None else replace(PRESETS[preset], env_steps=env_steps)
+
+    def run(out: Path) -> dict[str, Any]:
+        return pretrain(
+            PretrainArgs(task=task, preset=preset, config=config, seeds=seeds, impl=impl, video=False, out=out)
+        )
+
+    first_s, (summary, seconds) = _twice(run)
+    return {
+        "task": task, "impl": summary["impl"], "seeds": seeds, "env_steps": summary["env_steps"],
+        "seconds": seconds, "first_run_s": first_s,
+        "success": min(seed["success"] for seed in summary["seeds"]),
+        "explained_variance": min(seed["value/explained_variance"] for seed in summary["seeds"]),
+        **{f"{part}_s": summary[f"time/{part}_s"] for part in ("worlds", "random", "train", "evaluate", "report")},
+    }  # fmt: skip
+
+
+def fine_tuning(task: str, impl: Impl, seeds: int, *, prior: Path, rollouts: int) -> dict[str, Any]:
+    """Seconds of SGFT-SAC from that prior, its curve included, and the median rollout's by what it does."""
+
+    def run(out: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+        args = FinetuneArgs(task=task, seeds=seeds, rollouts=rollouts, prior=prior, impl=impl, video=False, out=out)
+        return finetune(args), read_jsonl(run_folder(args) / "timing.jsonl")
+
+    first_s, ((summary, timing), seconds) = _twice(run)
+    parts = {part: statistics.median(line[f"time/{part}"] for line in timing[1:]) for part in ("collect_s", "learn_s")}
+    return {
+        "task": task, "impl": summary["impl"], "seeds": seeds, "rollouts": rollouts,
+        "seconds": seconds, "first_run_s": first_s, **parts,
+    }  # fmt: skip
+
+
+def _twice(run: Callable[[Path], Any]) -> tuple[float, tuple[Any, float]]:
+    """(Seconds of the first run, (what the second returned, its seconds))."""
+    done = []
+    for _ in range(2):
+        with tempfile.TemporaryDirectory() as out:
+            start = time.perf_counter()
+            found = run(Path(out))
+            done.append((found, time.perf_counter() - start))
+    return done[0][1], done[1]

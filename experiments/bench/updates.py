@@ -1,0 +1,142 @@
+"""Speed of SAC updates next to the same arithmetic by hand, and next to other libraries where they are installed."""
+
+import importlib.util
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from experiments.bench import bare_sac, other_sac
+from experiments.bench.timing import Timing, fastest, measure
+from sgft_jax import replay
+from sgft_jax.networks import NetworkConfig
+from sgft_jax.sac import SACConfig, SACHyper, make_sac
+from sgft_jax.types import Key, PyTree, Transition
+
+OBS_DIM, ACT_DIM, MEMBERS = 12, 3, 5  # sizes of the updates, a manipulation task's
+REPLAY = 100_000  # rows that batches of plain SAC are drawn from
+
+
+class Agent(NamedTuple):
+    """update(state, batch, key) -> state; init(key) -> state."""
+
+    update: Callable[[PyTree, Transition, Key], PyTree]
+    init: Callable[[Key], PyTree]
+
+
+def speed(batch: int, seeds: int, *, width: int, updates: int, repeats: int) -> dict[str, Any]:
+    """Updates of pretraining per second over all seeds: of the library, and of the hand-written one.
+
+    gflop: of the matrix products alone. gb: bytes that the compiled update reads and writes, as XLA counts them.
+    """
+    network = NetworkConfig(hidden=(width, width), layer_norm=True)
+    keys, count = jax.random.split(jax.random.key(0), seeds), seeds * updates
+    library, bare = (
+        _repeated(agent, batch, keys, updates, repeats) for agent in (_library(network), _by_hand(network, batch))
+    )
+    flops, moved = multiplications(network) * 2 * batch, _bytes(_library(network), batch, keys)
+    per_s = count / library.seconds
+    return {
+        "batch": batch, "seeds": seeds, "width": width,
+        "updates_per_s": per_s, "bare_per_s": count / bare.seconds, "updates/bare": bare.seconds / library.seconds,
+        "gflop_per_update": flops / 1e9, "tflop_per_s": per_s * flops / 1e12,
+        "gb_per_update": moved / 1e9, "tb_per_s": per_s * moved / 1e12,
+        "compile_s": library.compile_s, "memory_mb": library.memory_mb,
+    }  # fmt: skip
+
+
+def plain_speed(batch: int, *, width: int, updates: int, repeats: int) -> dict[str, Any]:
+    """Updates per second of plain SAC, drawing its batches included: ours, and of libraries that are installed."""
+    network = NetworkConfig(hidden=(width, width))
+    learner = make_sac(SACConfig(OBS_DIM, ACT_DIM, network=network, train_value=False, train_dynamics=False))
+    buffer = replay.add_batch(replay.init(replay.blank(OBS_DIM, ACT_DIM), REPLAY), rows(jax.random.key(0), REPLAY))
+
+    def run(agent: PyTree, buffer: replay.ReplayState, key: Key) -> PyTree:
+        def update(agent: PyTree, key: Key) -> tuple[PyTree, None]:
+            key_draw, key_update = jax.random.split(key)
+            return learner.update(agent, replay.sample(buffer, key_draw, batch), key_update)[0], None
+
+        return jax.lax.scan(update, agent, jax.random.split(key, updates))[0]
+
+    own = measure(run, (learner.init(jax.random.key(1)), buffer, jax.random.key(2)), repeats=repeats)
+    found = {"batch": batch, "width": width, "updates_per_s": updates / own.seconds}
+    for name in other_sac.LIBRARIES:
+        if importlib.util.find_spec(name):
+            train = other_sac.make(name, batch, width, OBS_DIM, ACT_DIM, REPLAY)
+            per_s = updates / fastest(lambda train=train: train(updates), repeats=repeats)
+            found |= {f"{name}_per_s": per_s, f"updates/{name}": found["updates_per_s"] / per_s}
+    return found | {"compile_s": own.compile_s}
+
+
+def rows(key: Key, batch: int) -> Transition:
+    """A batch of made-up transitions."""
+    blank = replay.blank(OBS_DIM, ACT_DIM)
+    obs, next_obs = jax.random.normal(key, (2, batch, OBS_DIM))
+    full = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *x.shape)), blank)
+    return full._replace(obs=obs, next_obs=next_obs, discount=full.discount + 0.97)
+
+
+def _library(network: NetworkConfig) -> Agent:
+    """SAC as pretraining uses it."""
+    learner = make_sac(SACConfig(OBS_DIM, ACT_DIM, network=network, ensemble_size=MEMBERS))
+    return Agent(lambda state, batch, key: learner.update(state, batch, key)[0], learner.init)
+
+
+def _by_hand(network: NetworkConfig, batch: int) -> Agent:
+    """The same in bare JAX, for batches of that size."""
+    hyper = SACHyper()
+
+    def update(state: bare_sac.Bare, rows: Transition, key: Key) -> bare_sac.Bare:
+        return bare_sac.update(state, rows, bare_sac.draw(key, batch, ACT_DIM, MEMBERS), hyper)
+
+    def init(key: Key) -> bare_sac.Bare:
+        return bare_sac.init(key, network, OBS_DIM, ACT_DIM, members=MEMBERS, alpha=1.0)
+
+    return Agent(update, init)
+
+
+def _repeated(agent: Agent, batch: int, keys: Key, n: int, repeats: int) -> Timing:
+    """N updates of every seed."""
+
+    def run(state: PyTree, key: Key) -> PyTree:
+        data = rows(key, batch)
+        return jax.lax.scan(lambda s, k: (agent.update(s, data, k), None), state, jax.random.split(key, n))[0]
+
+    return measure(jax.vmap(run), (jax.jit(jax.vmap(agent.init))(keys), keys), repeats=repeats)
+
+
+def _bytes(agent: Agent, batch: int, keys: Key) -> float:
+    """What one update of one seed moves, by XLA's count of its compiled program for all seeds."""
+    made = jax.jit(jax.vmap(agent.init))(keys)
+    data = jax.vmap(lambda key: rows(key, batch))(keys)
+    cost: Any = jax.jit(jax.vmap(agent.update)).lower(made, data, keys).compile().cost_analysis()
+    return float(cost["bytes accessed"]) / len(keys)
+
+
+def multiplications(network: NetworkConfig) -> int:
+    """Multiplications of the matrix products that one row of a batch causes in an update, gradients included.
+
+    A forward pass through kernels of K weights takes K, the gradient by these weights K, the gradient by the inputs of
+    the layers K, less the first kernel where nobody asks for the gradient by the network's input.
+    """
+
+    def sizes(inputs: int, outputs: int) -> tuple[int, int]:
+        widths = [inputs, *network.hidden, outputs]
+        kernels = [n * m for n, m in pairwise(widths)]
+        return sum(kernels), sum(kernels) - kernels[0]
+
+    def trained(inputs: int, outputs: int) -> int:
+        all_kernels, later = sizes(inputs, outputs)
+        return 2 * all_kernels + later
+
+    actor, critic = sizes(OBS_DIM, 2 * ACT_DIM)[0], sizes(OBS_DIM + ACT_DIM, 1)
+    through = 2 * (2 * critic[0])  # twin critics forward, then back to the action
+    return (
+        actor + 2 * critic[0]  # targets
+        + 2 * trained(OBS_DIM + ACT_DIM, 1)
+        + trained(OBS_DIM, 2 * ACT_DIM) + through
+        + trained(OBS_DIM, 1)
+        + MEMBERS * trained(OBS_DIM + ACT_DIM, OBS_DIM)
+    )  # fmt: skip
