@@ -32,8 +32,8 @@ class DemoArgs:
     """Environment steps of pretraining, default: those of preset `cpu`."""
     seeds: int = 3
     """Fine-tuning seeds per method."""
-    rollouts: int = 40
-    """Real rollouts per seed, the 20 initial ones included."""
+    rollouts: int = 30
+    """Real rollouts per seed, the 5 initial ones included."""
     video: bool = True
     """Render an episode before and after fine-tuning, where MuJoCo can render."""
     out: Path = Path("runs/demo")
@@ -55,15 +55,14 @@ def main(args: DemoArgs) -> None:
 
 def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> FinetuneArgs:
     """Smaller batches and fewer, larger updates than on a GPU: what two cores can do; all methods get the same."""
-    initial = min(20, args.rollouts)
     return FinetuneArgs(
         real=args.real,
         method=method,
         seeds=args.seeds,
         rollouts=args.rollouts,
-        initial_rollouts=initial,
-        utd=3.0,
-        eval_every=10,
+        initial_rollouts=min(5, args.rollouts),
+        utd=4.0,
+        eval_every=5,
         eval_episodes=20,
         options=FinetuneConfig(batch_size=64, branches=2, lr_actor=3e-4, actor_ramp=300),
         video=args.video and method == METHODS[0],

@@ -19,7 +19,7 @@ from sgft_jax.sgft import METHODS
 from sgft_jax.stats import iqm_interval
 from sgft_jax.types import UserError
 
-BUDGETS = (20, 50, 100)  # rollouts at which the table compares
+BUDGETS = (10, 20, 50, 100)  # rollouts at which the table compares
 ORDER = tuple(reversed(METHODS))  # SGFT first, so that it keeps its colour whatever else there is
 COLUMNS = (
     "method", "seeds", "zero-shot", *(f"{n} rollouts" for n in BUDGETS), "at the end (rollouts)",
@@ -43,7 +43,9 @@ class FiguresArgs:
 
 
 class Comparison(NamedTuple):
-    """All methods on one real system. curves: by method, in the order of `ORDER`. notes: what is missing or odd."""
+    """All methods on one real system. curves: by method, in the order of `ORDER`, each followed by its variants. notes:
+    what is missing or odd.
+    """
 
     task: str
     real: str
@@ -84,18 +86,24 @@ def figures(args: FiguresArgs) -> Path:
 
 
 def read_comparison(folder: Path) -> Comparison:
-    """What the runs of <out>/finetune/<task>/<real>/<method>/<seeds>/ say."""
+    """What the runs of <out>/finetune/<task>/<real>/<method>[_<variant>]/<seeds>/ say."""
     curves: dict[str, Curve] = {}
     notes = []
-    runs = {method: sorted(folder.glob(f"{method}/*/{EVAL}")) for method in ORDER}
+    runs = {name: sorted(folder.glob(f"{name}/*/{EVAL}")) for name in _names(folder)}
     if absent := [method for method in ORDER if not runs[method]]:
         notes.append(f"no run of {', '.join(absent)}")
-    for method in [method for method in ORDER if runs[method]]:
-        curve, more = _choose(method, [run.parent for run in runs[method]])
+    for name in [name for name in runs if runs[name]]:
+        curve, more = _choose(name, [run.parent for run in runs[name]])
         notes += more
         if curve is not None:
-            curves[method] = curve
+            curves[name] = curve
     return Comparison(folder.parent.name, folder.name, curves, notes)
+
+
+def _names(folder: Path) -> list[str]:
+    """All methods, each with the variants of it that have a folder."""
+    variants = {method: sorted(path.name for path in folder.glob(f"{method}_*")) for method in ORDER}
+    return [name for method in ORDER for name in (method, *variants[method])]
 
 
 def draw(comparison: Comparison, path: Path) -> Path:

@@ -1,6 +1,7 @@
 """Fine-tune a pretrained policy on a "real" system and draw its learning curve."""
 
 import json
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -53,8 +54,9 @@ class FinetuneArgs:
     """Number of seeds; seed i starts from prior i modulo the number of priors."""
     rollouts: int = 100
     """Real rollouts per seed, the initial ones included; may grow with --resume."""
-    initial_rollouts: int = 20
-    """Rollouts of the simulator's policy that fill the buffer before learning starts."""
+    initial_rollouts: int = 5
+    """Rollouts of the simulator's policy that fill the buffer before learning starts. The paper has 20; after 5
+    SGFT-SAC needs a third of the transitions to get as far (docs/results.md)."""
     utd: float = 8.0
     """Updates per real transition."""
     eval_every: int = 5
@@ -65,6 +67,8 @@ class FinetuneArgs:
     """Rollouts between checkpoints."""
     options: FinetuneConfig = field(default_factory=FinetuneConfig)
     """Method options; `network` and `gamma` always are the prior's."""
+    variant: str = ""
+    """A word for these options: the run gets a folder of its own beside the method's, and a curve in the figures."""
     impl: Impl = "auto"
     """Who steps the physics: MJX's own code, MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c on a CPU,
     warp on an NVIDIA GPU where it is installed, jax elsewhere."""
@@ -112,7 +116,8 @@ def run_folder(args: FinetuneArgs) -> Path:
     """Where the run of these arguments lives; the seeds of one call share a folder."""
     real = "_".join([Path(args.real).stem, *(change.replace("/", "") for change in args.set)])
     seeds = common.seeds_name(common.seed_list(args.seed, args.seeds))
-    return args.out / "finetune" / args.task / real / args.method / seeds
+    method = "_".join(filter(None, [args.method, args.variant]))
+    return args.out / "finetune" / args.task / real / method / seeds
 
 
 class _Run:
@@ -289,6 +294,8 @@ def _check(args: FinetuneArgs) -> tuple[Method, list[int]]:
             raise UserError(f"--{name.replace('_', '-')} is {getattr(args, name)}: must be at least 1")
     if args.initial_rollouts > args.rollouts:
         raise UserError(f"--initial-rollouts {args.initial_rollouts} is more than --rollouts {args.rollouts}")
+    if not re.fullmatch(r"[\w.-]*", args.variant):
+        raise UserError(f"--variant {args.variant!r}: letters, digits, '.', '_' and '-' only, it names a folder")
     if args.utd <= 0:
         raise UserError(f"--utd is {args.utd}: must be positive")
     return get_method(args.method), common.seed_list(args.seed, args.seeds)

@@ -19,7 +19,9 @@ from sgft_jax.types import Array, Imagination, Key, Learner, Metrics, Normalizer
 class FinetuneConfig:
     """Options of fine-tuning; the defaults are the paper's where it states them (Appendix C), else argued here.
 
-    horizon, branches: H and the model branches per sampled real state. batch_size: real transitions per update.
+    horizon, branches: H and the model branches per sampled real state. With H = 1, the paper's, the agent never takes a
+        step that costs V_sim now and pays later: on hammering, where strokes do, some seeds end up hovering. H = 4 with
+        2 branches has none of these (docs/results.md). batch_size: real transitions per update.
     branch_noise: std of the noise on imagined actions. The paper draws them from the policy alone (0). On pushing, 20
         rollouts and 6,000 updates, the best of 16 actions by the critic then has r_bar -0.34 in the mean, with noise
         0.5 -0.20; by the model itself -0.15, by the truth -0.07, the policy's own -0.71.

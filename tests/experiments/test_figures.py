@@ -42,6 +42,7 @@ def test_a_row_says_what_the_curve_says(tmp_path):
         "sac",
         "2",
         "30 [20, 40]",
+        "-",
         "10 [10, 10]",
         "90 [80, 100]",
         "100 [100, 100]",
@@ -58,7 +59,7 @@ def test_budgets_not_reached_or_not_evaluated_stay_empty(tmp_path):
     folder = save(tmp_path, "sac", [[0.5], [0.6], [0.7]], rollouts=[0, 19, 50], seeds="seed-0")
     ended = "> 1,000"
     assert figures.row("sac", read_curve(folder)) == [
-        *("sac", "1", "50", "-", "70", "-", "70 (50)"),
+        *("sac", "1", "50", "-", "-", "70", "-", "70 (50)"),
         *(ended, ended, "0", "1.7"),
     ]
 
@@ -69,7 +70,7 @@ def test_one_figure_and_one_table_per_real_system(tmp_path, capsys, monkeypatch)
         figures.plot, "learning_curves", lambda path, curves, **more: drawn.update({path: (curves, more)}) or path
     )
     rising, flat = [[0.2, 0.3], [0.9, 1.0]], [[0.2, 0.3], [0.2, 0.2]]
-    for method, success in (("sac", flat), ("sgft-sac", rising)):
+    for method, success in (("sac", flat), ("sgft-sac", rising), ("sgft-sac_horizon-4", rising)):
         save(tmp_path, method, success, rollouts=[0, 20])
     save(tmp_path, "sgft-sac", rising, rollouts=[0, 20], real="hard+latency=0.1", wanted=100)
     save(tmp_path, "sgft-sac", [[0.2], [0.9]], rollouts=[0, 20], real="hard+latency=0.1", seeds="seed-0")
@@ -81,7 +82,7 @@ def test_one_figure_and_one_table_per_real_system(tmp_path, capsys, monkeypatch)
     assert text in capsys.readouterr().out
     assert list(drawn) == [tmp_path / f"figures/toy-{real}.png" for real in ("default", "hard+latency=0.1")]
     curves, more = drawn[tmp_path / "figures/toy-default.png"]
-    assert list(curves) == ["sgft-sac", "sac"]
+    assert list(curves) == ["sgft-sac", "sgft-sac_horizon-4", "sac"]
     assert more["zero_shot"] == 0.25 and more["rollout_length"] == 20 and more["control_dt"] == pytest.approx(0.1)
     np.testing.assert_array_equal(curves["sac"][1], np.transpose(flat))
     assert text.index("| sgft-sac | 2 |") < text.index("| sac | 2 |") and "![toy on the default real system]" in text

@@ -163,6 +163,11 @@ def test_more_rollouts_continue_a_finished_run(home, tmp_path):
     assert (grown / "eval.jsonl").read_bytes() == (run(home, "sac") / "eval.jsonl").read_bytes()
 
 
+def test_a_variant_has_a_folder_beside_its_method():
+    args = finetune.FinetuneArgs(task="push", seeds=2, variant="horizon-4")
+    assert finetune.run_folder(args) == Path("runs/finetune/push/default/sgft-sac_horizon-4/seeds-0-1")
+
+
 def test_a_rollout_is_on_disk_before_learning_from_it(home, tmp_path, monkeypatch):
     def crash(*_):
         raise RuntimeError("the learner died")
@@ -190,6 +195,7 @@ def test_a_rollout_is_on_disk_before_learning_from_it(home, tmp_path, monkeypatc
         (["--rollouts", "1"], "--initial-rollouts 2 is more than --rollouts 1"),
         (["--eval-every", "0"], "--eval-every is 0: must be at least 1"),
         (["--utd", "-1"], "--utd is -1.0: must be positive"),
+        (["--variant", "a/b"], "--variant 'a/b': letters"),
         (["--seeds", "0"], "there must be at least one"),
         (["--resume"], "nothing to resume there"),
     ],
