@@ -4,13 +4,26 @@ None of them is needed to use this repository; the benchmark measures those that
 """
 
 import importlib
+import importlib.util
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 
 LIBRARIES = ("stable_baselines3", "sbx")  # on PyTorch; the same interface on JAX
+
+
+def importable() -> Iterator[str]:
+    """Those that are here; says why one that is installed cannot be used, as when it was made for another JAX."""
+    for library in LIBRARIES:
+        if importlib.util.find_spec(library):
+            try:
+                importlib.import_module(library)
+            except Exception as error:  # whatever somebody else's package stumbles over
+                print(f"{library} is installed but left out: {type(error).__name__}: {error}")
+            else:
+                yield library
 
 
 def make(library: str, batch: int, width: int, obs_dim: int, act_dim: int, capacity: int) -> Callable[[int], Any]:

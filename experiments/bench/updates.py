@@ -1,6 +1,5 @@
 """Speed of SAC updates next to the same arithmetic by hand, and next to other libraries where they are installed."""
 
-import importlib.util
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -62,11 +61,10 @@ def plain_speed(batch: int, *, width: int, updates: int, repeats: int) -> dict[s
 
     own = measure(run, (learner.init(jax.random.key(1)), buffer, jax.random.key(2)), repeats=repeats)
     found = {"batch": batch, "width": width, "updates_per_s": updates / own.seconds}
-    for name in other_sac.LIBRARIES:
-        if importlib.util.find_spec(name):
-            train = other_sac.make(name, batch, width, OBS_DIM, ACT_DIM, REPLAY)
-            per_s = updates / fastest(lambda train=train: train(updates), repeats=repeats)
-            found |= {f"{name}_per_s": per_s, f"updates/{name}": found["updates_per_s"] / per_s}
+    for name in other_sac.importable():
+        train = other_sac.make(name, batch, width, OBS_DIM, ACT_DIM, REPLAY)
+        per_s = updates / fastest(lambda train=train: train(updates), repeats=repeats)
+        found |= {f"{name}_per_s": per_s, f"updates/{name}": found["updates_per_s"] / per_s}
     return found | {"compile_s": own.compile_s}
 
 

@@ -118,6 +118,17 @@ def test_another_librarys_agent_gets_the_sizes_and_a_full_replay(monkeypatch):
     assert train(7) == (7, 4)
 
 
+def test_a_library_that_does_not_import_is_left_out_with_a_word(monkeypatch, capsys):
+    def load(name):
+        if name == "sbx":
+            raise AttributeError("no pytype_aval_mappings")
+
+    monkeypatch.setattr(other_sac.importlib.util, "find_spec", lambda name: name)
+    monkeypatch.setattr(other_sac.importlib, "import_module", load)
+    assert list(other_sac.importable()) == ["stable_baselines3"]
+    assert capsys.readouterr().out == "sbx is installed but left out: AttributeError: no pytype_aval_mappings\n"
+
+
 def test_whole_commands_run_twice_in_folders_that_vanish(monkeypatch):
     folders = []
 
