@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import jax
 import mujoco
+import mujoco.rollout
 import numpy as np
 
 from envs.engine_jax import MEAN_INERTIA, Advance
@@ -22,6 +23,7 @@ from sgft_jax.types import Array, PyTree
 class _Slot(NamedTuple):
     """What a thread steps worlds in, one after another. views: name of a field -> the array inside `model`."""
 
+    rollout: mujoco.rollout.Rollout
     model: mujoco.MjModel
     data: mujoco.MjData
     views: dict[str, np.ndarray]
@@ -43,7 +45,8 @@ def make_advance(host: mujoco.MjModel, fields: tuple[str, ...]) -> Advance:
 
     def new_slot() -> _Slot:
         model = copy.deepcopy(nominal)
-        return _Slot(model, mujoco.MjData(model), {name: getattr(model, name) for name in arrays})
+        views = {name: getattr(model, name) for name in arrays}
+        return _Slot(mujoco.rollout.Rollout(nthread=0), model, mujoco.MjData(model), views)
 
     slots = [new_slot() for _ in range(cores)]
 
@@ -89,14 +92,13 @@ def _enter(slot: _Slot, values: dict[str, np.ndarray]) -> None:
 
 
 def _steps(slot: _Slot, state: Any, controls: np.ndarray) -> None:
-    """All steps under `controls` [substeps, nu]; those at its end where it no longer changes in one call."""
+    """All steps under `controls` [substeps, nu], in one call that leaves Python's lock to the other threads."""
     model, data = slot.model, slot.data
     mujoco.mj_resetData(model, data)
-    data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = state.qpos, state.qvel, state.warmstart
-    changes = np.flatnonzero((controls[1:] != controls[:-1]).any(axis=1))
-    settled = int(changes[-1]) + 1 if changes.size else 0
-    for control in controls[:settled]:
-        data.ctrl[:] = control
-        mujoco.mj_step(model, data)
-    data.ctrl[:] = controls[-1]
-    mujoco.mj_step(model, data, len(controls) - settled)
+    start = np.concatenate([[0.0], state.qpos, state.qvel])  # time comes first
+    rolled = np.empty((1, len(controls), len(start)))
+    slot.rollout.rollout(
+        [model], [data], start[None], controls[None].astype(np.float64), skip_checks=True, nstep=len(controls),
+        initial_warmstart=state.warmstart[None].astype(np.float64), state=rolled,
+        sensordata=np.empty((1, len(controls), model.nsensordata)),
+    )  # fmt: skip

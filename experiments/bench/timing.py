@@ -7,21 +7,36 @@ from typing import Any, NamedTuple
 import jax
 
 
+class Compiled(NamedTuple):
+    """call(*arguments), which waits for its results. compile_s: of tracing and compiling. memory_mb: megabytes that XLA
+    sets aside for one call: arguments, results, temporaries; Warp's own worlds are not in it.
+    """
+
+    call: Callable[..., Any]
+    compile_s: float
+    memory_mb: float
+
+
 class Timing(NamedTuple):
-    """seconds: of the fastest call. compile_s: of tracing and compiling. memory_mb: see `compiled_memory`."""
+    """seconds: of the fastest call; the rest as in `Compiled`."""
 
     seconds: float
     compile_s: float
     memory_mb: float
 
 
-def measure(function: Callable[..., Any], arguments: Sequence[Any], *, repeats: int) -> Timing:
-    """Times jax.jit(function)(*arguments), the same work in every call."""
+def ahead(function: Callable[..., Any], arguments: Sequence[Any]) -> Compiled:
+    """The function compiled for arguments like these."""
     start = time.perf_counter()
     compiled = jax.jit(function).lower(*arguments).compile()
     compile_s = time.perf_counter() - start
-    call = lambda: jax.block_until_ready(compiled(*arguments))  # noqa: E731
-    return Timing(fastest(call, repeats=repeats), compile_s, compiled_memory(compiled))
+    return Compiled(lambda *given: jax.block_until_ready(compiled(*given)), compile_s, _memory(compiled))
+
+
+def measure(function: Callable[..., Any], arguments: Sequence[Any], *, repeats: int) -> Timing:
+    """Times jax.jit(function)(*arguments), the same work in every call."""
+    made = ahead(function, arguments)
+    return Timing(fastest(lambda: made.call(*arguments), repeats=repeats), made.compile_s, made.memory_mb)
 
 
 def fastest(call: Callable[[], Any], *, repeats: int) -> float:
@@ -35,8 +50,7 @@ def fastest(call: Callable[[], Any], *, repeats: int) -> float:
     return min(times)
 
 
-def compiled_memory(compiled: Any) -> float:
-    """Megabytes that XLA sets aside for one call: arguments, results, temporaries. Warp's own worlds are not in it."""
+def _memory(compiled: Any) -> float:
     sizes = compiled.memory_analysis()
     total = sizes.argument_size_in_bytes + sizes.output_size_in_bytes + sizes.temp_size_in_bytes
     return (total - sizes.alias_size_in_bytes) / 1e6
