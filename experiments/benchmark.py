@@ -10,7 +10,7 @@ pretrain, finetune: seconds of the whole commands, with what the time goes into.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
@@ -20,7 +20,7 @@ from envs.physics import Impl, choose_impl
 from experiments import cli
 from experiments.bench import physics, training, updates
 from experiments.presets import PRESETS
-from sgft_jax import runs
+from sgft_jax import plot, runs
 from sgft_jax.log import write_summary
 from sgft_jax.types import UserError
 
@@ -58,7 +58,7 @@ class BenchmarkConfig:
     rollouts: int = 30
     """Of finetune."""
     out: Path = Path("runs")
-    """The numbers go to <out>/benchmark/summary.json."""
+    """The numbers go to <out>/benchmark/summary.json, figures beside them."""
 
 
 def main(config: BenchmarkConfig) -> dict[str, list[dict[str, Any]]]:
@@ -75,6 +75,8 @@ def main(config: BenchmarkConfig) -> dict[str, list[dict[str, Any]]]:
     path = write_summary(folder, {"provenance": runs.provenance(), **measured})
     for part, lines in measured.items():
         Console().print(table(part, lines))
+        if figure := draw(part, lines, folder / f"{part}.png"):
+            print(f"figure: {figure}")
     print(f"numbers: {path}")
     return measured
 
@@ -126,6 +128,48 @@ def _finetune(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
             for seeds in config.seeds:
                 assert config.prior is not None  # checked before
                 yield training.fine_tuning(task, impl, seeds, prior=config.prior, rollouts=config.rollouts)
+
+
+class Growth(NamedTuple):
+    """What a figure shows of a part. sizes: columns of which the one with the most values becomes the x axis; the other
+    ones and `by` tell lines apart. y: the column drawn. reference: the column drawn dashed.
+    """
+
+    sizes: tuple[str, ...]
+    y: str
+    by: tuple[str, ...] = ()
+    reference: str | None = None
+
+
+_GROWTH = {
+    "physics": Growth(("worlds",), "env_per_s", ("task", "impl"), "bare_per_s"),
+    "updates": Growth(("batch", "seeds"), "updates_per_s", reference="bare_per_s"),
+    "plain": Growth(("batch",), "updates_per_s"),
+    "pretrain": Growth(("seeds",), "seconds", ("task", "impl")),
+    "finetune": Growth(("seeds",), "seconds", ("task", "impl")),
+}
+
+
+def draw(part: str, lines: list[dict[str, Any]], path: Path) -> Path | None:
+    """How a part grows with worlds, batch or seeds; no figure of a single size."""
+    growth = _GROWTH[part]
+    x = max(growth.sizes, key=lambda name: len({line[name] for line in lines}))
+    if len({line[x] for line in lines}) < 2:
+        return None
+    apart = [*growth.by, *(name for name in growth.sizes if name != x)]
+
+    def curves(column: str) -> dict[str, tuple[list[float], list[float]]]:
+        found: dict[str, tuple[list[float], list[float]]] = {}
+        for line in sorted(lines, key=lambda line: line[x]):
+            words = [str(line[name]) if name in growth.by else f"{name} {line[name]:,}" for name in apart]
+            xs, ys = found.setdefault(", ".join(words) or "sgft_jax", ([], []))
+            xs.append(line[x])
+            ys.append(line[column])
+        return found
+
+    references = curves(growth.reference) if growth.reference else {}
+    y = growth.y.replace("_per_s", " per second")
+    return plot.scaling(path, curves(growth.y), references, title=_TITLES[part], x=x, y=y)
 
 
 _PARTS = {"physics": _physics, "updates": _updates, "plain": _plain, "pretrain": _pretrain, "finetune": _finetune}

@@ -1,4 +1,4 @@
-"""Impure: writes figures as PNG files: learning curves, and what pretraining left behind.
+"""Impure: writes figures as PNG files: learning curves, what pretraining left behind, how costs grow.
 
 Functions take plain arrays and return the path they wrote. Colours are the Okabe-Ito palette (safe for colour-blind
 readers); a method keeps its colour from figure to figure as long as the order of the methods stays.
@@ -61,6 +61,38 @@ def learning_curves(
     figure.suptitle(title, x=0.01, ha="left", size=12, weight="bold", color=_INK)
     note = f"interquartile mean of {counts} seed{'s' * (seeds[-1] > 1)}" + ", 95 % bootstrap band" * (seeds[-1] > 1)
     figure.text(0.99, 0.012, note, ha="right", size=8, color=_GREY)
+    return _save(figure, path)
+
+
+def scaling(
+    path: Path,
+    lines: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    references: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    *,
+    title: str,
+    x: str,
+    y: str,
+) -> Path:
+    """How a quantity grows with a size, both on logarithmic axes.
+
+    lines: {name: (sizes [n], values [n])}. references: the same for some of these names, drawn dashed in their colour.
+    """
+    figure, (axes,) = _figure(6.4, 4.0, columns=1)
+    for (name, points), color in zip(lines.items(), _colors(len(lines)), strict=True):
+        axes.plot(*map(np.asarray, points), color=color, linewidth=2, marker="o", markersize=4, label=name)
+        if name in references:
+            axes.plot(*map(np.asarray, references[name]), color=color, linewidth=1.2, linestyle=(0, (4, 3)))
+    axes.set_xscale("log", base=2)
+    axes.set_yscale("log")
+    sizes = sorted({float(size) for points in lines.values() for size in np.asarray(points[0])})
+    axes.set_xticks(sizes, [f"{size:,.0f}" for size in sizes])
+    axes.minorticks_off()
+    axes.set_xlabel(x, **_FONT)
+    axes.set_ylabel(y, **_FONT)
+    axes.legend(frameon=False, fontsize=9, labelcolor=_INK)
+    figure.suptitle(title, x=0.01, ha="left", size=12, weight="bold", color=_INK)
+    if references:
+        figure.text(0.99, 0.012, "dashed: the reference", ha="right", size=8, color=_GREY)
     return _save(figure, path)
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from envs.franka import hammer
 from envs.physics import PhysicsState
+from experiments import benchmark
 from experiments.bench import other_sac, physics, training, updates
 from experiments.bench.timing import fastest, measure
 from experiments.benchmark import BenchmarkConfig, main
@@ -143,6 +144,19 @@ def test_whole_commands_run_twice_in_folders_that_vanish(monkeypatch):
     found = training.pretraining("push", "c", 2, preset="cpu", env_steps=77)
     assert len(set(folders)) == 2 and not any(folder.exists() for folder in folders)
     assert found["success"] == 0.9 and found["explained_variance"] == 0.5 and found["env_steps"] == 80
+
+
+def test_figures_show_how_costs_grow(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(benchmark.plot, "scaling", lambda path, *curves, **words: drawn.append((curves, words)) or path)
+    line = lambda batch, seeds: {"batch": batch, "seeds": seeds, "updates_per_s": 10.0 * seeds, "bare_per_s": 5.0}  # noqa: E731
+    assert benchmark.draw("updates", [line(4, 1)], tmp_path / "one.png") is None
+    lines = [line(batch, seeds) for seeds in (8, 1, 2) for batch in (4, 16)]
+    assert benchmark.draw("updates", lines, tmp_path / "two.png") == tmp_path / "two.png"
+    (curves, references), words = drawn[0]
+    assert curves == {f"batch {batch}": ([1, 2, 8], [10.0, 20.0, 80.0]) for batch in (4, 16)}
+    assert references["batch 16"] == ([1, 2, 8], [5.0] * 3)
+    assert words["x"] == "seeds" and words["y"] == "updates per second"
 
 
 @pytest.mark.parametrize(

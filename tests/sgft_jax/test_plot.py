@@ -27,6 +27,15 @@ def test_one_seed_draws_a_line_without_a_band(tmp_path):
     assert plot.learning_curves(tmp_path / "one.png", {"SAC": (X, scores(1))}, title="Push").exists()
 
 
+def test_scaling_draws_lines_and_their_references(tmp_path):
+    lines = {"push": ([32, 512], [5e4, 9e4]), "insert": ([32, 512], [6e4, 2e5])}
+    path = plot.scaling(tmp_path / "s.png", lines, {"push": ([32, 512], [1e5, 2e5])}, title="t", x="worlds", y="steps")
+    image = matplotlib.image.imread(path)
+    for color in plot.PALETTE[:2]:
+        wanted = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+        assert (np.abs(image[..., :3] - wanted).max(-1) < 0.01).sum() > 200
+
+
 @pytest.mark.parametrize("n", [1, 200])
 def test_pretraining_panels(tmp_path, n):
     returns = np.linspace(0, 5, n)
