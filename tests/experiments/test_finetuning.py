@@ -130,11 +130,10 @@ def test_all_methods_meet_the_same_real_starts(home):
 
 def test_seeds_together_are_seeds_one_by_one(home, tmp_path):
     both = read_jsonl(run(home, "sgft-sac") / "eval.jsonl")
-    for seed in (0, 1):
-        call(argv(home, "sgft-sac", "--seed", str(seed), seeds=1, out=tmp_path))
-        alone = read_jsonl(tmp_path / f"finetune/toy/turned/sgft-sac/seed-{seed}/eval.jsonl")
-        for a, b in zip(both, alone, strict=True):
-            assert a["return"][seed] == pytest.approx(b["return"][0], abs=0.02)
+    call(argv(home, "sgft-sac", "--seed", "1", seeds=1, out=tmp_path))
+    alone = read_jsonl(tmp_path / "finetune/toy/turned/sgft-sac/seed-1/eval.jsonl")
+    for a, b in zip(both, alone, strict=True):
+        assert a["return"][1] == pytest.approx(b["return"][0], abs=0.02)
     assert max(abs(line["return"][0] - line["return"][1]) for line in both) > 0.1
 
 
