@@ -32,7 +32,7 @@ class DemoArgs:
     """Environment steps of pretraining, default: those of preset `cpu`."""
     seeds: int = 3
     """Fine-tuning seeds per method."""
-    rollouts: int = 30
+    rollouts: int = 20
     """Real rollouts per seed, the 5 initial ones included."""
     video: bool = True
     """Render an episode before and after fine-tuning, where MuJoCo can render."""

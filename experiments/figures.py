@@ -1,6 +1,6 @@
 """Draw the figures again from the fine-tuning runs on disk, and put all methods of a real system in one table."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,12 +19,8 @@ from sgft_jax.sgft import METHODS
 from sgft_jax.stats import iqm_interval
 from sgft_jax.types import UserError
 
-BUDGETS = (10, 20, 50, 100)  # rollouts at which the table compares
+BUDGETS = (10, 20, 50, 100)  # rollouts at which the table compares, as far as a run got
 ORDER = tuple(reversed(METHODS))  # SGFT first, so that it keeps its colour whatever else there is
-COLUMNS = (
-    "method", "seeds", "zero-shot", *(f"{n} rollouts" for n in BUDGETS), "at the end (rollouts)",
-    *(f"transitions to {level} %" for level in LEVELS), "deepest dip", "robot minutes",
-)  # fmt: skip
 _LEGEND = (
     "Success on the real system: interquartile mean over seeds with its 95 % bootstrap interval, in per cent. "
     "Transitions to 90 or 98 %: when the mean over seeds first got there; > where the run ended before. Deepest dip: "
@@ -118,15 +114,23 @@ def draw(comparison: Comparison, path: Path) -> Path:
     )
 
 
-def row(method: str, curve: Curve) -> list[str]:
-    """The cells of one method, as `COLUMNS` names them."""
+def columns(budgets: Sequence[int]) -> list[str]:
+    """The names of the cells in a `row`."""
+    return [
+        "method", "seeds", "zero-shot", *(f"{n} rollouts" for n in budgets), "at the end (rollouts)",
+        *(f"transitions to {level} %" for level in LEVELS), "deepest dip", "robot minutes",
+    ]  # fmt: skip
+
+
+def row(method: str, curve: Curve, budgets: Sequence[int]) -> list[str]:
+    """The cells of one method, with its success after so many rollouts."""
     facts = describe_run(curve)
     reached = [facts[f"to_{level}"]["mean_curve"] for level in LEVELS]
     return [
         method,
         str(curve.success.shape[0]),
         _percent(curve.success[:, 0]),
-        *(_at(curve, rollouts) for rollouts in BUDGETS),
+        *(_at(curve, rollouts) for rollouts in budgets),
         f"{_percent(curve.success[:, -1])} ({curve.rollouts[-1]})",
         *(f"> {curve.transitions[-1]:,}" if n is None else f"{n:,}" for n in reached),
         f"{100 * facts['dip']['mean']:.0f}",
@@ -186,7 +190,10 @@ def _robot_time(curves: Mapping[str, Curve]) -> dict[str, Any]:
 
 def _section(comparison: Comparison, figure: Path) -> str:
     title = f"{comparison.task} on the {comparison.real} real system"
-    lines = [COLUMNS, ["---"] * len(COLUMNS), *(row(*item) for item in comparison.curves.items())]
+    longest = max(curve.rollouts[-1] for curve in comparison.curves.values())
+    budgets = [n for n in BUDGETS if n <= longest]
+    head = columns(budgets)
+    lines = [head, ["---"] * len(head), *(row(*item, budgets) for item in comparison.curves.items())]
     table = ["| " + " | ".join(cells) + " |" for cells in lines]
     return "\n".join([f"## {title}", "", *table, "", f"![{title}]({figure.name})"])
 

@@ -52,14 +52,14 @@ def test_a_row_says_what_the_curve_says(tmp_path):
         "20",
         "3.3",
     ]
-    assert figures.row("sac", curve) == cells and len(cells) == len(figures.COLUMNS)
+    assert figures.row("sac", curve, figures.BUDGETS) == cells and len(cells) == len(figures.columns(figures.BUDGETS))
 
 
 def test_budgets_not_reached_or_not_evaluated_stay_empty(tmp_path):
     folder = save(tmp_path, "sac", [[0.5], [0.6], [0.7]], rollouts=[0, 19, 50], seeds="seed-0")
     ended = "> 1,000"
-    assert figures.row("sac", read_curve(folder)) == [
-        *("sac", "1", "50", "-", "-", "70", "-", "70 (50)"),
+    assert figures.row("sac", read_curve(folder), (10, 50, 100)) == [
+        *("sac", "1", "50", "-", "70", "-", "70 (50)"),
         *(ended, ended, "0", "1.7"),
     ]
 
@@ -85,6 +85,7 @@ def test_one_figure_and_one_table_per_real_system(tmp_path, capsys, monkeypatch)
     assert list(curves) == ["sgft-sac", "sgft-sac_horizon-4", "sac"]
     assert more["zero_shot"] == 0.25 and more["rollout_length"] == 20 and more["control_dt"] == pytest.approx(0.1)
     np.testing.assert_array_equal(curves["sac"][1], np.transpose(flat))
+    assert "| 20 rollouts |" in text and "50 rollouts" not in text  # no run got there
     assert text.index("| sgft-sac | 2 |") < text.index("| sac | 2 |") and "![toy on the default real system]" in text
     for missing in (
         "- toy/default: no run of sgft, pbrs-branch, pbrs, sac-reset",
