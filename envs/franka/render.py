@@ -14,7 +14,8 @@ from envs.franka.arm import NO_CONTACT
 from envs.franka.task import CONTROL_DT, Scene
 from sgft_jax.types import UserError
 
-FPS = 10  # a graphics library without a graphics card needs 0.2 s a frame
+FPS = 10
+SPEED = 2  # times the robot's: a graphics library without a graphics card needs 0.2 s a frame
 SIZE = 360, 480  # height, width in pixels
 CAPTION = 44  # pixels, height of the strip above a captioned video
 JUMP = 0.5  # m or rad in one control step: an event, such as a puck that fell, and nothing to draw in between
@@ -83,7 +84,7 @@ def render_side_by_side(
     _write(path, frames, picture_at)
 
 
-def smooth(qpos: np.ndarray, *, fps: int = FPS) -> np.ndarray:
+def smooth(qpos: np.ndarray, *, fps: int) -> np.ndarray:
     """[frames, nq]: qpos [T + 1, nq] at control steps, linear in between; jumps stay jumps."""
     steps = round(CONTROL_DT * fps)
     index = np.arange(steps * (len(qpos) - 1) + 1) / steps
@@ -103,7 +104,7 @@ def _frames(scene: Scene, theta: Mapping[str, float] | Sequence[float], qpos: np
     camera = _camera(view)
     renderer = _renderer(model)
     try:
-        for row in smooth(np.asarray(qpos)):
+        for row in smooth(np.asarray(qpos), fps=FPS // SPEED):
             data.qpos[:] = row
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, camera)
