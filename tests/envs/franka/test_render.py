@@ -71,7 +71,7 @@ def test_pictures_show_the_robot(renderer, tmp_path, name):
     assert picture.shape == (*render.SIZE, 3)
     assert picture.std() > 20  # neither black nor blank
     frames = frames_of(tmp_path / "sub" / "episode.mp4", *render.SIZE)
-    assert len(frames) == 3  # 0.2 s at 10 frames a second, ends included
+    assert len(frames) == 2  # 0.2 s at twice the speed and 10 frames a second, ends included
 
 
 def test_side_by_side_waits_for_the_longer_episode(renderer, tmp_path):
@@ -80,7 +80,7 @@ def test_side_by_side_waits_for_the_longer_episode(renderer, tmp_path):
     render.render_side_by_side(scene, thetas, episodes, ["before", "after " * 40], path)
     height, width = render.SIZE
     video = frames_of(path, height + render.CAPTION, 2 * width)
-    assert len(video) == 5
+    assert len(video) == 3
     assert video[0, : render.CAPTION].max() > 150  # the captions
 
 
