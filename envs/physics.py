@@ -67,9 +67,8 @@ def choose_impl(wanted: str = "auto") -> str:
         raise UserError(unknown(IMPL_VARIABLE if wanted == "auto" else "impl", impl, get_args(Impl)))
     if impl != "auto":
         return impl
-    if jax.default_backend() == "cpu":
-        return "c"
-    return "warp" if jax.default_backend() == "gpu" and engine_warp.available() else "jax"
+    fastest = {"cpu": "c", "gpu": "warp" if engine_warp.available() else "jax"}
+    return fastest.get(jax.default_backend(), "jax")
 
 
 def varying_fields(nominal: mujoco.MjModel, specs: Iterable[mujoco.MjSpec]) -> tuple[str, ...]:

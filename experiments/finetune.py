@@ -56,7 +56,7 @@ class FinetuneArgs:
     """Real rollouts per seed, the initial ones included; may grow with --resume."""
     initial_rollouts: int = 5
     """Rollouts of the simulator's policy that fill the buffer before learning starts. The paper has 20; after 5
-    SGFT-SAC needs a third of the transitions to get as far (docs/results.md)."""
+    SGFT-SAC needs less than half of the transitions to get to 90 % (docs/results.md)."""
     utd: float = 8.0
     """Updates per real transition."""
     eval_every: int = 5
