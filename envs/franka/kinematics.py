@@ -20,17 +20,18 @@ class Pose(NamedTuple):
     rotation: Array
 
 
-def _joint_transform(i: int, q: Array) -> tuple[Array, Array]:
-    ca, sa = float(np.cos(arm.DH_ALPHA[i])), float(np.sin(arm.DH_ALPHA[i]))
-    c, s = jnp.cos(q), jnp.sin(q)
-    rotation = jnp.stack(
-        [
-            jnp.stack([c, -s, jnp.zeros_like(c)]),
-            jnp.stack([ca * s, ca * c, jnp.full_like(c, -sa)]),
-            jnp.stack([sa * s, sa * c, jnp.full_like(c, ca)]),
-        ]
-    )
-    return jnp.array([arm.DH_A[i], -sa * arm.DH_D[i], ca * arm.DH_D[i]]), rotation
+def _joint_bases() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """[7, 4, 4] each: the transform of joint i is the first + cos(q_i) * the second + sin(q_i) * the third."""
+    fixed, cosine, sine = np.zeros((3, arm.N_JOINTS, 4, 4), np.float32)
+    for i, (a, d, alpha) in enumerate(zip(arm.DH_A, arm.DH_D, arm.DH_ALPHA, strict=True)):
+        ca, sa = np.cos(alpha), np.sin(alpha)
+        fixed[i] = [[0, 0, 0, a], [0, 0, -sa, -sa * d], [0, 0, ca, ca * d], [0, 0, 0, 1]]
+        cosine[i, :3, :2] = [[1, 0], [0, ca], [0, sa]]
+        sine[i, :3, :2] = [[0, -1], [ca, 0], [sa, 0]]
+    return fixed, cosine, sine
+
+
+_FIXED, _COSINE, _SINE = _joint_bases()
 
 
 def _hand_frame() -> np.ndarray:
@@ -39,16 +40,19 @@ def _hand_frame() -> np.ndarray:
 
 
 def _chain(q: Array, tool: Array) -> tuple[Pose, Array, Array]:
-    """Pose of the tool and, per joint, its axis and a point on it: [7, 3], [7, 3]."""
-    position, rotation = jnp.zeros(3), jnp.eye(3)
-    axes, origins = [], []
-    for i in range(arm.N_JOINTS):
-        offset, turn = _joint_transform(i, q[i])
-        position, rotation = position + rotation @ offset, rotation @ turn
-        axes.append(rotation[:, 2])
-        origins.append(position)
+    """Pose of the tool and, per joint, its axis and a point on it: [7, 3], [7, 3].
+
+    Products of 4 x 4 matrices as sums, which XLA fuses into one kernel, where it would call a library for each `@`.
+    """
+    turn = q[:, None, None]
+    joints = _FIXED + jnp.cos(turn) * _COSINE + jnp.sin(turn) * _SINE
+    frames = [joints[0]]
+    for i in range(1, arm.N_JOINTS):
+        frames.append((frames[-1][:, :, None] * joints[i][None]).sum(1))
+    chain = jnp.stack(frames)
+    rotation, position = chain[-1, :3, :3], chain[-1, :3, 3]
     pose = Pose(position + rotation @ tool, rotation @ jnp.asarray(_hand_frame(), jnp.float32))
-    return pose, jnp.stack(axes), jnp.stack(origins)
+    return pose, chain[:, :3, 2], chain[:, :3, 3]
 
 
 def forward(q: Array, tool: Array | None = None) -> Pose:
@@ -80,7 +84,7 @@ def solve(q: Array, target: Pose, *, iterations: int, damping: float = 0.02, pos
         error = jnp.concatenate([target.position - pose.position, rotation_error(pose.rotation, target.rotation)])
         rest = posture * (jnp.asarray(arm.Q_HOME, jnp.float32) - q)
         gram = jac @ jac.T + damping**2 * jnp.eye(6)
-        step = rest + jac.T @ jnp.linalg.solve(gram, error - jac @ rest)
+        step = rest + jac.T @ jax.scipy.linalg.solve(gram, error - jac @ rest, assume_a="pos")
         limits = jnp.asarray(arm.Q_MIN, jnp.float32), jnp.asarray(arm.Q_MAX, jnp.float32)
         return jnp.clip(q + jnp.clip(step, -0.5, 0.5), *limits), None
 
