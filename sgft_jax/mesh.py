@@ -42,6 +42,10 @@ def use(n: int) -> contextlib.AbstractContextManager:
     """The first n devices, for what is traced and run in a `with` block; n = 1 leaves everything as it is."""
     if n == 1:
         return contextlib.nullcontext()
+    if jax.default_backend() == "gpu":
+        # With jaxlib 0.11.2, Shardy crashes (segmentation fault in its importer) on programs that step environments, for
+        # GPUs alone; its predecessor GSPMD compiles them.
+        jax.config.update("jax_use_shardy_partitioner", False)
     mesh = jax.make_mesh((n,), (DATA,), axis_types=(AxisType.Auto,), devices=jax.devices()[:n])
     return jax.set_mesh(mesh)
 
@@ -90,6 +94,29 @@ def split_vmap[R](function: Callable[..., R], in_axes: int | tuple[int | None, .
         return jax.shard_map(batched, in_specs=specs, out_specs=PartitionSpec(DATA), check_vma=False)(*args)
 
     return run
+
+
+def set_rows(data: PyTree, rows: Array, batch: PyTree) -> PyTree:
+    """`data` with `batch` [n, ...] in its rows [n]; rows beyond the end are dropped.
+
+    Each device writes what falls into its own piece. XLA's partitioner would do the same row by row on GPUs, in a loop
+    that takes longer than the physics of a step.
+    """
+    n, length = pieces(), jax.tree.leaves(data)[0].shape[0]
+    if n == 1 or length % n:
+        return _set_rows(data, rows, batch)
+
+    def own(data: PyTree, rows: Array, batch: PyTree) -> PyTree:
+        here = rows - jax.lax.axis_index(DATA) * (length // n)
+        mine = (here >= 0) & (here < length // n)
+        return _set_rows(data, jnp.where(mine, here, length // n), batch)
+
+    specs = PartitionSpec(DATA), PartitionSpec(), PartitionSpec()
+    return jax.shard_map(own, in_specs=specs, out_specs=PartitionSpec(DATA), check_vma=False)(data, rows, batch)
+
+
+def _set_rows(data: PyTree, rows: Array, batch: PyTree) -> PyTree:
+    return jax.tree.map(lambda d, x: d.at[rows].set(x.astype(d.dtype), mode="drop"), data, batch)
 
 
 def _copy(x: Array) -> Array:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from sgft_jax.mesh import set_rows
 from sgft_jax.types import Array, Key, Transition, UserError
 
 
@@ -33,7 +34,7 @@ def init(example: Transition, capacity: int) -> ReplayState:
 def add_batch(state: ReplayState, batch: Transition, valid: Array | None = None) -> ReplayState:
     """Append the valid rows, overwriting the oldest. batch: [n, ...] with n <= capacity; valid: [n] bool, default all.
 
-    Invalid rows get an index beyond the end, where the scatter drops them: they take no space and are never sampled.
+    Invalid rows get an index beyond the end, where they are dropped: they take no space and are never sampled.
     """
     capacity, n = state.data.reward.shape[0], batch.reward.shape[0]
     if n > capacity:
@@ -42,7 +43,7 @@ def add_batch(state: ReplayState, batch: Transition, valid: Array | None = None)
     rank = jnp.cumsum(valid, dtype=jnp.int32) - 1
     rows = jnp.where(valid, (state.position + rank) % capacity, capacity)
     count = jnp.sum(valid, dtype=jnp.int32)
-    data = jax.tree.map(lambda d, x: d.at[rows].set(x.astype(d.dtype), mode="drop"), state.data, batch)
+    data = set_rows(state.data, rows, batch)
     return ReplayState(data, (state.position + count) % capacity, jnp.minimum(state.size + count, capacity))
 
 
