@@ -85,6 +85,8 @@ def _play(env: Env, pool: World, fleet: Fleet, key: Key, *, control_steps: int) 
 def _mjx_alone(host: mujoco.MjModel, impl: str, window: Window, substeps: int, repeats: int) -> Timing:
     """`mjx.step` and nothing else."""
     model = mjx.put_model(host, impl=impl)
+    if impl == "warp":
+        model = model.tree_replace({"opt._impl.warn_overflow": 0})  # messages from inside kernels would slow it
     contacts, rows = engine_warp.budget(host)
     blank = mjx.make_data(host, impl=impl, **({"naconmax": contacts, "njmax": rows} if impl == "warp" else {}))
     n = window.commands.shape[1]

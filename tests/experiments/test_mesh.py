@@ -15,7 +15,8 @@ from envs.physics import PhysicsState
 from experiments import cli, pretrain
 from experiments.common import seed_keys, stack
 from experiments.presets import PretrainConfig
-from sgft_jax import mesh
+from experiments.pretraining import spread_replay
+from sgft_jax import mesh, replay
 from sgft_jax.networks import NetworkConfig
 from sgft_jax.types import UserError
 
@@ -76,6 +77,24 @@ def test_training_is_the_same_on_any_number_of_devices():
     for tree in (run.replay.data, run.fleet):
         assert {x.sharding.spec for x in jax.tree.leaves(tree)} == {CUT}
     assert all(x.sharding.is_fully_replicated for x in jax.tree.leaves((run.learner, metrics)))
+
+
+@pytest.mark.parametrize("capacity", [8, 9])
+def test_each_device_writes_the_rows_of_its_own_piece(capacity):
+    """Round the corner, an invalid row among them; 9 rows cannot be cut."""
+    empty = replay.init(replay.blank(2, 1), capacity)
+    rows = jax.tree.map(lambda x: jnp.broadcast_to(x, (6, *x.shape)), replay.blank(2, 1))
+    rows = rows._replace(reward=jnp.arange(1.0, 7.0))
+    valid = jnp.array([True, True, False, True, True, True])
+
+    def fill(state):
+        return replay.add_batch(replay.add_batch(state, rows, valid), rows, valid)
+
+    one = jax.jit(fill)(empty)
+    with mesh.use(2):
+        two = jax.jit(fill)(jax.jit(spread_replay)(empty) if capacity == 8 else empty)
+    agree(one, two, rtol=0)
+    assert one.data.reward.tolist() == {8: [5, 6, 4, 5, 6, 1, 2, 4], 9: [6, 2, 4, 5, 6, 1, 2, 4, 5]}[capacity]
 
 
 def test_what_one_device_left_two_continue():
