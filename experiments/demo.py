@@ -11,7 +11,7 @@ import jax
 
 from experiments import cli
 from experiments.figures import FiguresArgs, figures
-from experiments.finetune import FinetuneArgs, finetune
+from experiments.finetune import FinetuneArgs, finetune, run_folder
 from experiments.presets import PRESETS
 from experiments.pretrain import PretrainArgs, pretrain
 from sgft_jax.finetune import FinetuneConfig
@@ -77,7 +77,8 @@ def _finetune_both(shown: FinetuneArgs, other: FinetuneArgs) -> None:
         finetune(other)
         return
     log = other.out / f"{other.method}.log"
-    beside = multiprocessing.get_context("spawn").Process(target=_logged, args=(other, log), daemon=True)
+    context = multiprocessing.get_context("spawn")
+    beside = context.Process(target=_logged, args=(other, log, run_folder(shown) / "real"), daemon=True)
     beside.start()
     try:
         finetune(shown)
@@ -88,7 +89,11 @@ def _finetune_both(shown: FinetuneArgs, other: FinetuneArgs) -> None:
         raise UserError(f"fine-tuning with {other.method} failed, see {log}")
 
 
-def _logged(args: FinetuneArgs, log: Path) -> None:
+def _logged(args: FinetuneArgs, log: Path, shown: Path) -> None:
+    """Begins when the run beside has its first real rollouts: what plays and evaluates is compiled and cached then."""
+    main = multiprocessing.parent_process()
+    while main is not None and main.is_alive() and not list(shown.glob("*")):
+        time.sleep(0.1)
     with open(log, "w") as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
         finetune(args)
 

@@ -105,7 +105,7 @@ PRESETS: dict[str, PretrainConfig] = {
         network=NetworkConfig(hidden=(96, 96), layer_norm=True),
         ensemble_size=3,
         chunk_steps=100,
-        eval_every=3,
+        eval_every=1,
         eval_episodes=32,
         report_episodes=64,
     ),
