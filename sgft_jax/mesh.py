@@ -43,8 +43,8 @@ def use(n: int) -> contextlib.AbstractContextManager:
     if n == 1:
         return contextlib.nullcontext()
     if jax.default_backend() == "gpu":
-        # With jaxlib 0.11.2, Shardy crashes (segmentation fault in its importer) on programs that step environments, for
-        # GPUs alone; its predecessor GSPMD compiles them.
+        # Shardy of jaxlib 0.11.2 crashes (a segmentation fault, before it partitions) on programs that step
+        # environments, for GPUs alone; its predecessor GSPMD compiles them.
         jax.config.update("jax_use_shardy_partitioner", False)
     mesh = jax.make_mesh((n,), (DATA,), axis_types=(AxisType.Auto,), devices=jax.devices()[:n])
     return jax.set_mesh(mesh)
