@@ -47,6 +47,7 @@ def call(home, *more):
     return json.loads((home / "gaps/toy/summary.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_gap_is_admissible_if_it_is_open_and_can_be_learned(home, capsys):
     turned, stuck = call(home)["gaps"]
     assert [turned["gap"]["name"], stuck["gap"]["name"]] == ["turned", "stuck"]
