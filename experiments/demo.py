@@ -92,7 +92,9 @@ def _finetune_both(shown: FinetuneArgs, other: FinetuneArgs) -> None:
 def _logged(args: FinetuneArgs, log: Path, shown: Path) -> None:
     """Begins when the run beside has its first real rollouts: what plays and evaluates is compiled and cached then."""
     main = multiprocessing.parent_process()
-    while main is not None and main.is_alive() and not list(shown.glob("*")):
+    while not any(shown.glob("*")):
+        if main is not None and not main.is_alive():
+            return  # nobody waits for this run any more
         time.sleep(0.1)
     with open(log, "w") as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
         finetune(args)

@@ -99,8 +99,8 @@ def split_vmap[R](function: Callable[..., R], in_axes: int | tuple[int | None, .
 def set_rows(data: PyTree, rows: Array, batch: PyTree) -> PyTree:
     """`data` with `batch` [n, ...] in its rows [n]; rows beyond the end are dropped.
 
-    Each device writes what falls into its own piece. XLA's partitioner would do the same row by row on GPUs, in a loop
-    that takes longer than the physics of a step.
+    Each device writes what falls into its own piece. Left to XLA's partitioner, a step on two GPUs had a loop with as
+    many turns as rows, which took longer than the physics (docs/performance.md).
     """
     n, length = pieces(), jax.tree.leaves(data)[0].shape[0]
     if n == 1 or length % n:
