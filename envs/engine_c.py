@@ -1,11 +1,16 @@
-"""MuJoCo's C engine behind `jax.pure_callback`, as the engine of a scene. Impure inside, pure outside.
+"""MuJoCo's C engine behind a callback, as the engine of a scene. Impure inside, pure outside.
 
 On a CPU, XLA's program of an MJX step takes two to three times as long as C MuJoCo's, and many seconds to compile. The
 worlds of a batch are shared among as many threads as there are cores.
+
+On a CPU the callback works on XLA's own buffers. `jax.pure_callback`, which serves the other platforms, first makes
+JAX arrays of its arguments, and the copies wait for threads that may all be busy with programs that wait for them
+(https://github.com/jax-ml/jax/issues/24255).
 """
 
 import concurrent.futures
 import copy
+import functools
 import os
 import threading
 import warnings
@@ -15,6 +20,7 @@ import jax
 import mujoco
 import mujoco.rollout
 import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
 
 from envs.engine_jax import MEAN_INERTIA, Advance
 from sgft_jax.types import Array, PyTree
@@ -69,9 +75,14 @@ def make_advance(host: mujoco.MjModel, fields: tuple[str, ...]) -> Advance:
             list(threads.map(run, range(min(cores, len(controls)))))
         return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), after)
 
+    def in_place(context: Any, after: Any, *args: Any) -> None:
+        jax.tree.map(lambda out, x: np.copyto(np.asarray(out), x), after, on_host(*args))
+
     def advance(values: dict[str, Array], state: PyTree, controls: Array) -> PyTree:
         shape = jax.eval_shape(lambda: state)
-        return jax.pure_callback(on_host, shape, values, state, controls, vmap_method="broadcast_all")
+        on_cpu = buffer_callback(in_place, shape, vmap_method="broadcast_all")
+        elsewhere = functools.partial(jax.pure_callback, on_host, shape, vmap_method="broadcast_all")
+        return jax.lax.platform_dependent(values, state, controls, cpu=on_cpu, default=elsewhere)
 
     return advance
 

@@ -10,7 +10,7 @@ from sgft_jax.types import UserError
 
 
 class Beside:
-    """A process that does its work when it is started; a real one would not know the point mass."""
+    """A process that does its work when it is waited for; a real one would not know the point mass."""
 
     exitcode = 0
 
@@ -19,22 +19,29 @@ class Beside:
         self.work = lambda: target(*args)
 
     def start(self):
-        self.work()
+        pass
 
     def join(self):
-        pass
+        self.work()
 
     def kill(self):
         pass
 
 
-@pytest.fixture(autouse=True)
-def _one_process(monkeypatch):
-    monkeypatch.setattr(demo.multiprocessing, "get_context", lambda method: SimpleNamespace(Process=Beside))
+class Failed(Beside):
+    exitcode = 1
+
+    def join(self):
+        pass
+
+
+def beside(monkeypatch, process):
+    monkeypatch.setattr(demo.multiprocessing, "get_context", lambda method: SimpleNamespace(Process=process))
 
 
 @pytest.mark.slow
 def test_demo_compares_both_methods_from_one_prior(tmp_path, monkeypatch, capsys):
+    beside(monkeypatch, Beside)
     monkeypatch.setitem(envs.TASKS, "toy", "toy")
     gap = tmp_path / "turned.toml"
     gap.write_text("[params]\nmass = 2.0\n[effects]\naction_rotation = 0.52\n")
@@ -51,7 +58,7 @@ def test_demo_compares_both_methods_from_one_prior(tmp_path, monkeypatch, capsys
 
 def test_a_failure_beside_is_reported(tmp_path, monkeypatch):
     monkeypatch.setattr(demo, "finetune", lambda args: None)
-    monkeypatch.setattr(Beside, "exitcode", 1)
+    beside(monkeypatch, Failed)
     shown, other = (demo.FinetuneArgs(method=method, out=tmp_path) for method in demo.METHODS)
     with pytest.raises(UserError, match=r"fine-tuning with sac failed, see .*sac\.log"):
         demo._finetune_both(shown, other)
