@@ -14,8 +14,8 @@ from experiments.results import LEVELS, Curve, describe_run, read_curve
 from sgft_jax import plot
 from sgft_jax.jsonfile import read_json
 from sgft_jax.log import EVAL
+from sgft_jax.methods import METHODS
 from sgft_jax.runs import CONFIG
-from sgft_jax.sgft import METHODS
 from sgft_jax.stats import iqm_interval
 from sgft_jax.types import UserError
 

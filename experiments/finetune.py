@@ -2,8 +2,9 @@
 
 import json
 import re
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,16 +21,22 @@ from envs.physics import Impl
 from envs.rollout import Episode
 from experiments import cli, common
 from experiments.evaluation import score
-from experiments.finetuning import make_program
+from experiments.finetuning import Program, Simulation, make_program, simulate
 from experiments.presets import PRESETS
 from experiments.results import describe_run, read_curve
 from experiments.video import before_and_after
 from sgft_jax import checkpoint, mesh, plot, runs
-from sgft_jax.finetune import FinetuneConfig, FinetuneState, make_finetuner
+from sgft_jax.finetune import Finetuner, FinetuneState, make_finetuner
 from sgft_jax.log import MetricsLog, RealLog, RunProgress, write_summary
-from sgft_jax.sgft import Method, get_method
+from sgft_jax.methods import METHODS, FinetuneConfig, Method, finetune_config, get_method
+from sgft_jax.replay import ReplayState
 from sgft_jax.stats import iqm_interval
-from sgft_jax.types import Prior, UserError
+from sgft_jax.types import Array, Key, Prior, UserError
+
+DEFAULT_METHOD = "sgft-sac"
+_SIMULATED_WORLDS = 256
+_SIMULATION = 2**31  # seed of what happens in them, the same for every run
+_OFFLINE_PART = 10_000  # updates between two signs of life
 
 
 @dataclass(frozen=True)
@@ -38,8 +45,8 @@ class FinetuneArgs:
 
     task: str = "push"
     """push, hammer or insert."""
-    method: str = "sgft-sac"
-    """sgft-sac, sgft, sac, sac-reset, pbrs, pbrs-branch or mbpo."""
+    method: str = DEFAULT_METHOD
+    """How it learns; the table is at the top. The defaults below are those of the method that is chosen."""
     real: str = "default"
     """The real system: mild, default, hard, or a .toml/.json file with tables `params` and `effects`."""
     set: tuple[str, ...] = ()
@@ -84,9 +91,25 @@ class FinetuneArgs:
     """Replace an earlier run of the same name."""
 
 
-def main(args: FinetuneArgs) -> None:
-    """Runs, or continues, one fine-tuning experiment."""
-    finetune(args)
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line. The method is looked up first, because it gives the other options their defaults."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    name = common.option(argv, "--method", DEFAULT_METHOD)
+    default = arguments(name) if name in METHODS else FinetuneArgs(method=name)
+    cli.run_main(finetune, FinetuneArgs, f"{__doc__}\n\n{_table()}", argv=argv, default=default)
+
+
+def arguments(method: str, **changes: Any) -> FinetuneArgs:
+    """The arguments with which a method runs unless told otherwise, and any changes to these."""
+    chosen = get_method(method)
+    own = {"method": method, "utd": chosen.utd, "options": finetune_config(chosen)}
+    return FinetuneArgs(**{**own, **changes})
+
+
+def _table() -> str:
+    """The methods in a line each."""
+    width = max(map(len, METHODS))
+    return "methods:\n" + "\n".join(f"  {m.name:{width}}  {m.description} ({m.source})" for m in METHODS.values())
 
 
 def finetune(args: FinetuneArgs) -> dict[str, Any]:
@@ -105,9 +128,8 @@ def finetune(args: FinetuneArgs) -> dict[str, Any]:
         volatile=("resume", "overwrite", "rollouts", "devices", "video", "out"),
     )
     try:
-        own = [priors[seed % len(priors)] for seed in seeds]
         with mesh.use(devices):
-            return _Run(args, env, gap, method, seeds, run.folder).work(common.stack(own), card)
+            return _Run(args, env, gap, method, seeds, run.folder).work(common.stack(priors), card)
     finally:
         run.close()
 
@@ -131,39 +153,84 @@ class _Run:
         self.expect = {"kind": "finetune", "task": args.task, "method": args.method, "seeds": seeds}
 
     def work(self, priors: Prior, card: dict[str, Any]) -> dict[str, Any]:
-        """Everything, in order. priors: [seeds]."""
-        env = self.env
-        config = replace(self.args.options, network=common.network_of(card), gamma=card["gamma"])
+        """Everything, in order. priors: [P]; seed i starts from prior i modulo P."""
+        args = self.args
+        config = replace(args.options, network=common.network_of(card), gamma=card["gamma"])
         if config.critic_warmup is None:
-            config = replace(config, critic_warmup=self.args.initial_rollouts * self._updates_per_rollout())
-        self.tuner = make_finetuner(
-            self.method, config, obs_dim=env.obs_dim, act_dim=env.act_dim, reward=env.reward, terminated=env.terminated
-        )
-        self.program = make_program(env, self.tuner, gamma=config.gamma)
-        make = lambda: self.program.init(priors, self.numbers)  # noqa: E731
-        state, done = self._start(make)
+            config = replace(config, critic_warmup=args.initial_rollouts * self._updates_per_rollout())
+        self.simulation = self._simulate(config, priors) if config.simulated_share else None
+        if self.method.agent == "iql" and config.reward_scale is None:
+            config = replace(config, reward_scale=self._reward_scale())
+        self.tuner, self.program = self._programs(self.method, config)
+        # the simulator's policy for methods that start from nothing; its critic is never used
+        pilot = get_method("sac-reset")
+        self.pilot = self._programs(pilot, config)[1] if self.method.fresh else self.program
+
+        own = jax.tree.map(lambda x: x[self._prior_of(priors)], priors)
+        self.untuned = lambda: self.pilot.init(own, self.numbers)
+        state, done = self._start(lambda: self.program.init(own, self.numbers), config)
         state = self._train(state, done)
         self.log.close()
         self._save_policies(state, card)
         summary = self._summarise()
-        if self.args.video:
-            print(self._film(make(), state, summary["final"]["rollouts"]))
+        if args.video:
+            print(self._film(state, summary["final"]["rollouts"]))
         print(f"results: {self.folder}  (policy/, real/, summary.json, figures/)")
         print("next: python -m experiments.figures")
         return summary
 
-    def _start(self, make: Callable[[], FinetuneState]) -> tuple[FinetuneState, int]:
+    def _programs(self, method: Method, config: FinetuneConfig) -> tuple[Finetuner, Program]:
+        env = self.env
+        sizes = {"obs_dim": env.obs_dim, "act_dim": env.act_dim}
+        tuner = make_finetuner(method, config, **sizes, reward=env.reward, terminated=env.terminated)
+        return tuner, make_program(env, tuner, gamma=config.gamma)
+
+    def _prior_of(self, priors: Prior) -> Array:
+        """[S] for every seed an index into priors [P]."""
+        return self.numbers % jax.tree.leaves(priors)[0].shape[0]
+
+    def _simulate(self, config: FinetuneConfig, priors: Prior) -> Simulation:
+        """What every simulator's policy does in its training domain; the same for all methods and after a resume."""
+        worlds = self.env.sample_worlds(jax.random.key(_SIMULATION), _SIMULATED_WORLDS)
+        sizes = {"transitions": config.simulated_transitions, "ladder": config.simulated_ladder, "gamma": config.gamma}
+
+        def one(prior: Prior, key: Key) -> tuple[ReplayState, Array]:
+            return simulate(self.env, config.network, worlds, prior, key, **sizes)
+
+        keys = jax.random.split(jax.random.key(_SIMULATION), jax.tree.leaves(priors)[0].shape[0])
+        buffers, returns = jax.jit(jax.vmap(one))(priors, keys)
+        print(f"simulated: {returns.size} episodes, returns from {returns.min():.1f} to {returns.max():.1f}")
+        return Simulation(buffers, self._prior_of(priors), returns)
+
+    def _reward_scale(self) -> float:
+        """IQL's authors scale rewards so that the returns of the data span the length of an episode."""
+        assert self.simulation is not None
+        returns = self.simulation.returns
+        return self.env.episode_length / max(float(returns.max() - returns.min()), 1e-6)
+
+    def _start(self, make: Callable[[], FinetuneState], config: FinetuneConfig) -> tuple[FinetuneState, int]:
         """The state to continue from and the rollouts behind it: a checkpoint's, or a fresh one scored zero-shot."""
         if checkpoint.latest(self.folder) is None:
             self.log.truncate({})
             self.real.truncate(0)
-            state = make()
+            state = self._offline(make(), config.offline_updates)
             self._evaluate(state, 0)
             return state, 0
         state, meta = checkpoint.restore(self.folder, jax.eval_shape(make), expect=self.expect)
         self.log.truncate(meta["position"])
         self.real.truncate(meta["stored"])
         return state, meta["rollouts"]
+
+    def _offline(self, state: FinetuneState, updates: int) -> FinetuneState:
+        """Learning from the simulator's transitions alone."""
+        if not updates:
+            return state
+        n = min(updates, _OFFLINE_PART)
+        with RunProgress(f"{self.args.method} offline", total=updates // n * n, unit="updates") as progress:
+            for part in range(updates // n):
+                state, metrics = self.program.offline(state, self.numbers, part, n, self.simulation)
+                progress.advance(n, {"critic loss": float(metrics["critic/loss"].mean())})
+        return state
 
     def _train(self, state: FinetuneState, done: int) -> FinetuneState:
         title = f"{self.args.method} on {self.args.task}/{self.gap.name}"
@@ -179,7 +246,7 @@ class _Run:
         """N real rollouts, then learning from them; later, where one is due, an evaluation and a checkpoint."""
         args, first = self.args, done == 0
         started = time.perf_counter()
-        episodes = self.program.collect(state, self.pool, self.numbers, done, n)
+        episodes = self._collect(state, done, n)
         self._store(episodes, n)
         collected = time.perf_counter()
         state, metrics = self._learn(self.program.store(state, episodes), done, n)
@@ -200,11 +267,18 @@ class _Run:
         self._time(done, collected - started, learned - collected)
         return state, shown
 
+    def _collect(self, state: FinetuneState, done: int, n: int) -> Episode:
+        """The initial rollouts are the simulator's policy's, whatever the method: the same for all."""
+        program, state = (self.program, state) if done else (self.pilot, self.untuned())
+        return program.collect(state, self.pool, self.numbers, done, n)
+
     def _learn(self, state: FinetuneState, done: int, n: int) -> tuple[FinetuneState, dict[str, np.ndarray]]:
         """The updates that N rollouts allow, in N equal parts, so that one compiled program serves any number."""
         parts = []
         for rollout in range(done, done + n):
-            state, metrics = self.program.learn(state, self.numbers, rollout, self._updates_per_rollout())
+            state, metrics = self.program.learn(
+                state, self.numbers, rollout, self._updates_per_rollout(), self.simulation
+            )
             parts.append(metrics)
         return state, {name: np.mean([part[name] for part in parts], axis=0) for name in parts[0]}
 
@@ -268,15 +342,16 @@ class _Run:
         )
         return summary
 
-    def _film(self, before: FinetuneState, after: FinetuneState, rollouts: int) -> str:
-        """An evaluation episode of the first seed by its agent at the start and now.
+    def _film(self, tuned: FinetuneState, rollouts: int) -> str:
+        """An evaluation episode of the first seed by the simulator's policy and by the agent as it is now.
 
         The first one that only the tuned agent solves: what fine-tuning is about. Without one, the first.
         """
 
         def play() -> list[Episode]:
             n = self.args.eval_episodes
-            both = [self.program.evaluate(state, self.pool, self.numbers, n) for state in (before, after)]
+            players = ((self.pilot, self.untuned()), (self.program, tuned))
+            both = [program.evaluate(state, self.pool, self.numbers, n) for program, state in players]
             old, new = (np.asarray(episodes.success[0]) for episodes in both)
             chosen = int(np.argmax(new & ~old))
             return [jax.tree.map(lambda x: np.asarray(x[0, chosen]), episodes) for episodes in both]
@@ -302,4 +377,4 @@ def _check(args: FinetuneArgs) -> tuple[Method, list[int]]:
 
 
 if __name__ == "__main__":
-    cli.run_main(main, FinetuneArgs, __doc__ or "")
+    main()

@@ -4,20 +4,35 @@ Every random draw of a run follows from (seed, purpose, rollout number), so no k
 what an uninterrupted one would have drawn, and all methods meet the same real starts.
 """
 
+import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from envs.base import Env, World
-from envs.rollout import Episode
-from experiments.evaluation import play_episodes
-from sgft_jax.finetune import Finetuner, FinetuneState
+from envs.rollout import Episode, play_episode
+from experiments.evaluation import play_episodes, prior_policy
+from sgft_jax import replay
+from sgft_jax.finetune import Finetuner, FinetuneState, Simulated
 from sgft_jax.mesh import split_vmap
-from sgft_jax.types import Array, Key, Metrics, Prior
+from sgft_jax.networks import NetworkConfig
+from sgft_jax.types import Array, Key, Metrics, Prior, Transition
 
-_INIT, _COLLECT, _LEARN, _EVALUATE = range(4)  # purposes, folded into a seed's key
+_INIT, _COLLECT, _LEARN, _EVALUATE, _OFFLINE = range(5)  # purposes, folded into a seed's key
+_AT_ONCE = 1024  # simulated episodes played together
+
+
+class Simulation(NamedTuple):
+    """What the simulator's policies did in simulation.
+
+    replay: [P], one per prior. which: [S], the prior of each seed. returns: [P, episodes] of the task, undiscounted.
+    """
+
+    replay: replay.ReplayState
+    which: Array
+    returns: Array
 
 
 class Program(NamedTuple):
@@ -27,14 +42,17 @@ class Program(NamedTuple):
     init(priors [S], seeds [S]) -> state [S].
     collect(state, pool, seeds, rollout, n) -> Episode [S, n]: exploring episodes on the real system.
     store(state, episodes) -> state.
-    learn(state, seeds, rollout, updates) -> (state, metrics [S]): that many updates (static) after that rollout.
+    learn(state, seeds, rollout, updates, simulation) -> (state, metrics [S]): that many updates (static) after that
+        rollout; simulation: None for methods that do without.
+    offline(state, seeds, part, updates, simulation) -> (state, metrics [S]): the same on the simulation alone.
     evaluate(state, pool, seeds, n) -> Episode [S, n]: with the mean action; the first n of a fixed series of episodes.
     """
 
     init: Callable[[Prior, Array], FinetuneState]
     collect: Callable[[FinetuneState, World, Array, int, int], Episode]
     store: Callable[[FinetuneState, Episode], FinetuneState]
-    learn: Callable[[FinetuneState, Array, int, int], tuple[FinetuneState, Metrics]]
+    learn: Callable[[FinetuneState, Array, int, int, Simulation | None], tuple[FinetuneState, Metrics]]
+    offline: Callable[[FinetuneState, Array, int, int, Simulation | None], tuple[FinetuneState, Metrics]]
     evaluate: Callable[[FinetuneState, World, Array, int], Episode]
 
 
@@ -52,12 +70,17 @@ def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
         return play_episodes(env, pool, act, keys, gamma=gamma)
 
     def store(state: FinetuneState, episodes: Episode) -> FinetuneState:
-        rows, valid = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (episodes.transitions, episodes.valid))
-        return tuner.observe(state, rows, valid)
+        return tuner.observe(state, *_rows(episodes))
 
-    def learn(state: FinetuneState, seeds: Array, rollout: Array, updates: int) -> tuple[FinetuneState, Metrics]:
-        one = lambda state, seed: tuner.learn(state, _key(seed, _LEARN, rollout), updates)  # noqa: E731
-        return split_vmap(one)(state, seeds)
+    def learn(
+        purpose: int, state: FinetuneState, seeds: Array, part: Array, updates: int, simulation: Simulation | None
+    ) -> tuple[FinetuneState, Metrics]:
+        def one(state: FinetuneState, seed: Array, which: Array, buffers: Any) -> tuple[FinetuneState, Metrics]:
+            source = None if buffers is None else _rows_of(buffers, which)
+            return tuner.learn(state, _key(seed, purpose, part), updates, source, offline=purpose == _OFFLINE)
+
+        which, buffers = (seeds, None) if simulation is None else (simulation.which, simulation.replay)
+        return split_vmap(one, (0, 0, 0, None))(state, seeds, which, buffers)
 
     # One program explores and evaluates: compiling MJX takes longer than many an experiment on a small machine.
     played = jax.jit(split_vmap(play, (0, None, 0, None)))
@@ -76,9 +99,65 @@ def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
         init=jax.jit(split_vmap(init)),
         collect=collect,
         store=jax.jit(split_vmap(store), donate_argnums=0),
-        learn=jax.jit(learn, static_argnums=3, donate_argnums=0),
+        learn=jax.jit(functools.partial(learn, _LEARN), static_argnums=3, donate_argnums=0),
+        offline=jax.jit(functools.partial(learn, _OFFLINE), static_argnums=3, donate_argnums=0),
         evaluate=evaluate,
     )
+
+
+def simulate(
+    env: Env,
+    network: NetworkConfig,
+    pool: World,
+    prior: Prior,
+    key: Key,
+    *,
+    gamma: float,
+    transitions: int,
+    ladder: float,
+) -> tuple[replay.ReplayState, Array]:
+    """Whole episodes of an exploring simulator's policy in simulated worlds, at least that many transitions.
+
+    ladder: in the i-th of n episodes a share i / (n - 1) * ladder of the actions is uniformly random, as along the
+    fleet of pretraining. Returns a replay of just their size (without exploded steps) and their returns [n].
+    """
+    n = -(-transitions // env.episode_length)
+    at_once = min(n, _AT_ONCE)
+    parts = -(-n // at_once)
+    own = prior_policy(env, prior, network, explore=True)
+
+    def policy(share: Array, obs: Array, key: Key) -> tuple[Array, Array]:
+        key_policy, key_replace, key_random = jax.random.split(key, 3)
+        random = jax.random.uniform(key_random, (env.act_dim,), minval=-1.0, maxval=1.0)
+        return jnp.where(jax.random.uniform(key_replace) < share, random, own(obs, key_policy)), share
+
+    def play(key: Key, share: Array) -> Episode:
+        return play_episode(env, pool, policy, share, key, gamma=gamma)
+
+    def part(buffer: replay.ReplayState, inputs: tuple[Key, Array]) -> tuple[replay.ReplayState, Array]:
+        key, shares = inputs
+        episodes = jax.vmap(play)(jax.random.split(key, at_once), shares)
+        return replay.add_batch(buffer, *_rows(episodes)), episodes.total_reward
+
+    empty = replay.init(replay.blank(env.obs_dim, env.act_dim), parts * at_once * env.episode_length)
+    shares = jnp.linspace(0.0, ladder, parts * at_once).reshape(parts, at_once)
+    buffer, returns = jax.lax.scan(part, empty, (jax.random.split(key, parts), shares))
+    return buffer, returns.reshape(-1)
+
+
+def _rows(episodes: Episode) -> tuple[Transition, Array]:
+    """The transitions of episodes [n] in one row, and which of them are valid."""
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (episodes.transitions, episodes.valid))
+
+
+def _rows_of(buffers: replay.ReplayState, which: Array) -> Simulated:
+    """Draws from one of several buffers [P], without a copy of the one."""
+
+    def draw(key: Key, n: int) -> Transition:
+        rows = jax.random.randint(key, (n,), 0, jnp.maximum(buffers.size[which], 1))
+        return jax.tree.map(lambda x: x[which, rows], buffers.data)
+
+    return draw
 
 
 def _key(seed: Array, purpose: int | Array, rollout: int | Array) -> Key:

@@ -7,9 +7,10 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that 
     import mujoco.mjx as _mjx  # noqa: F401
 
 from sgft_jax.finetune import FinetuneConfig, Finetuner, FinetuneState, make_finetuner
+from sgft_jax.methods import METHODS, Method, get_method
 from sgft_jax.networks import NetworkConfig
 from sgft_jax.sac import SACConfig, SACHyper, SACState, extract_prior, fine_tune_state, make_sac
-from sgft_jax.sgft import METHODS, Method, branch, compose, get_method, shape, shorten
+from sgft_jax.sgft import branch, compose, shape, shorten
 from sgft_jax.types import Imagination, Learner, Normalizer, Prior, Transition, UserError
 
 __all__ = [

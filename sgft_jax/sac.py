@@ -39,9 +39,13 @@ class SACConfig:
     network: body of all networks; critic_network: body of the critic alone, default the same.
     tune_alpha: follow the target entropy; False keeps the temperature at `SACHyper.alpha`.
     train_value, train_dynamics, ensemble_size: the extra networks of pretraining.
+    train_critic: False keeps the critic as it is (a frozen-critic actor-critic).
+    critics: members of the critic ensemble. target_critics: a target is the minimum over so many random ones of them,
+        None = all (REDQ, RLPD). actor_mean: the actor follows the members' mean, not their minimum (RLPD).
+    entropy_in_target: count the entropy of the next action in the target, as SAC does.
     critic_baseline: Q(s, a) = net(s, a) - V(s) with V frozen: what a kept critic means under shaped rewards.
     actor_batch: leading rows of the batch that the actor learns from, None = all (O-11).
-    policy_delay: critic updates per actor update. max_grad_norm: per network, None = no clipping.
+    policy_delay: critic updates per update of actor and temperature. max_grad_norm: per network, None = no clipping.
     """
 
     obs_dim: int
@@ -53,6 +57,11 @@ class SACConfig:
     train_value: bool = True
     train_dynamics: bool = True
     ensemble_size: int = 5
+    train_critic: bool = True
+    critics: int = 2
+    target_critics: int | None = None
+    actor_mean: bool = False
+    entropy_in_target: bool = True
     critic_baseline: bool = False
     actor_batch: int | None = None
     policy_delay: int = 1
@@ -61,8 +70,13 @@ class SACConfig:
     def __post_init__(self) -> None:
         if self.critic_baseline and self.train_value:
             raise UserError("SAC option critic_baseline needs a frozen value network: set train_value to False")
-        if self.policy_delay < 1:
-            raise UserError(f"SAC option policy_delay is {self.policy_delay}: must be at least 1")
+        for name in ("policy_delay", "critics"):
+            if getattr(self, name) < 1:
+                raise UserError(f"SAC option {name} is {getattr(self, name)}: must be at least 1")
+        if self.target_critics is not None and not 1 <= self.target_critics <= self.critics:
+            raise UserError(
+                f"SAC option target_critics is {self.target_critics}: must be 1 to {self.critics} (critics)"
+            )
 
 
 class SACHyper(NamedTuple):
@@ -113,7 +127,7 @@ def _parts(config: SACConfig) -> _Parts:
     obs_dim, act_dim, body = config.obs_dim + config.extra_obs, config.act_dim, config.network
     return _Parts(
         actor=make_actor(obs_dim, act_dim, body),
-        critic=make_critic(obs_dim, act_dim, config.critic_network or body),
+        critic=make_critic(obs_dim, act_dim, config.critic_network or body, members=config.critics),
         value=make_value(obs_dim, body),
         dynamics=make_dynamics(obs_dim, act_dim, body, members=config.ensemble_size),
         optimiser=optim.adam(config.max_grad_norm),
@@ -176,7 +190,9 @@ def _update(config: SACConfig, parts: _Parts, state: SACState, batch: Transition
     normal = jax.vmap(normalizer.normalize, (None, 0))
     batch = batch._replace(obs=normal(state.normalizer, batch.obs), next_obs=normal(state.normalizer, batch.next_obs))
 
-    state, metrics = _update_critic(config, parts, state, batch, key_target)
+    metrics: Metrics = {}
+    if config.train_critic:
+        state, metrics = _update_critic(config, parts, state, batch, key_target)
     obs = batch.obs[: config.actor_batch]
     state, q, log_prob, more = _update_actor(config, parts, state, obs, key_actor)
     metrics |= more
@@ -212,9 +228,12 @@ def _update_critic(
 ) -> tuple[SACState, Metrics]:
     critic, alpha = _critic_of(config, parts, state), jnp.exp(state.log_alpha.params)
 
+    counted = _target_members(config, key)
+
     def target(row: Transition, key: Key) -> Array:
         action, log_prob = tanh_gaussian_sample(parts.actor.apply(state.actor.params, row.next_obs), key)
-        next_q = critic(state.target_critic, row.next_obs, action)
+        next_q = critic(state.target_critic, row.next_obs, action)[counted]
+        log_prob = log_prob if config.entropy_in_target else jnp.zeros_like(log_prob)
         return losses.td_target(row.reward, row.discount, next_q, log_prob, alpha=alpha)
 
     targets = jax.vmap(target)(batch, jax.random.split(key, batch.reward.shape[0]))
@@ -230,6 +249,13 @@ def _update_critic(
     return state.replace(critic=fit, target_critic=average), metrics
 
 
+def _target_members(config: SACConfig, key: Key) -> Array | slice:
+    """Which members of the critic a target is the minimum of: the same ones for the whole batch."""
+    if config.target_critics is None:
+        return slice(None)
+    return jax.random.permutation(jax.random.fold_in(key, config.critics), config.critics)[: config.target_critics]
+
+
 def _update_actor(
     config: SACConfig, parts: _Parts, state: SACState, obs: Array, key: Key
 ) -> tuple[SACState, Array, Array, Metrics]:
@@ -240,7 +266,8 @@ def _update_actor(
     def one(params: PyTree, obs: Array, key: Key) -> tuple[Array, Array, Array]:
         action, log_prob = tanh_gaussian_sample(parts.actor.apply(params, obs), key)
         q = critic(state.critic.params, obs, action)
-        return losses.actor_loss(log_prob, q, alpha=alpha), q, log_prob
+        followed = jnp.mean(q, keepdims=True) if config.actor_mean else q
+        return losses.actor_loss(log_prob, followed, alpha=alpha), q, log_prob
 
     def loss(params: PyTree) -> tuple[Array, tuple[Array, Array]]:
         each, q, log_prob = jax.vmap(one, (None, 0, 0))(params, obs, keys)
@@ -249,7 +276,7 @@ def _update_actor(
     (value, (q, log_prob)), grads = jax.value_and_grad(loss, has_aux=True)(state.actor.params)
     hyper, since = state.hyper, state.step - state.hyper.actor_start
     rate = hyper.lr_actor * jnp.clip((since + 1) / jnp.maximum(hyper.actor_ramp, 1.0), 0.0, 1.0)
-    moves = (since >= 0) & (state.step % config.policy_delay == 0)
+    moves = (since >= 0) & _policy_turn(config, state)
     fit = optim.keep_unless(moves, optim.step(parts.optimiser, state.actor, grads, rate), state.actor)
     return state.replace(actor=fit), q, log_prob, {"actor/loss": value, "actor/entropy": -jnp.mean(log_prob)}
 
@@ -261,7 +288,13 @@ def _update_temperature(config: SACConfig, parts: _Parts, state: SACState, log_p
         return jnp.mean(jax.vmap(lambda lp: losses.temperature_loss(log_alpha, lp, target_entropy=target))(log_prob))
 
     fit = optim.step(parts.optimiser, state.log_alpha, jax.grad(loss)(state.log_alpha.params), state.hyper.lr_alpha)
-    return state.replace(log_alpha=fit._replace(params=jnp.maximum(fit.params, LOG_ALPHA_MIN)))
+    fit = fit._replace(params=jnp.maximum(fit.params, LOG_ALPHA_MIN))
+    return state.replace(log_alpha=optim.keep_unless(_policy_turn(config, state), fit, state.log_alpha))
+
+
+def _policy_turn(config: SACConfig, state: SACState) -> Array:
+    """Whether this update is one of those that move actor and temperature."""
+    return state.step % config.policy_delay == 0
 
 
 def _update_value(parts: _Parts, state: SACState, obs: Array, q: Array) -> tuple[SACState, Metrics]:
@@ -306,7 +339,8 @@ def fine_tune_state(config: SACConfig, hyper: SACHyper, prior: Prior, key: Key, 
 
 def check_prior(config: SACConfig, prior: Prior, *, critic: bool) -> None:
     """Raise UserError where a network of the prior is not the one that `config` describes."""
-    plain = SACConfig(config.obs_dim, config.act_dim, network=config.network, critic_network=config.critic_network)
+    body = {"network": config.network, "critic_network": config.critic_network, "critics": config.critics}
+    plain = SACConfig(config.obs_dim, config.act_dim, **body)
     parts = _parts(plain)
     names = ["actor", "value", *(["critic"] if critic else [])]
     for name in names:

@@ -1,17 +1,14 @@
-"""SGFT as three batch transforms, and the table of methods they compose into.
+"""SGFT as three batch transforms; `methods.py` has the table of methods that they compose into.
 
 A transform is `(imagination, batch, key) -> batch` on a batch [B, ...] of real transitions. Compose in the order
 branch, shape, shorten: branching needs plain observations, shaping the whole discount.
 Source: SGFT (Yin et al., ICLR 2025).
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.types import Array, BatchTransform, Imagination, Key, Transition, UserError, unknown
+from sgft_jax.types import Array, BatchTransform, Imagination, Key, Transition, UserError
 
 
 def shaped_reward(imagination: Imagination, row: Transition) -> Array:
@@ -115,62 +112,6 @@ def compose(*transforms: BatchTransform) -> BatchTransform:
         return batch
 
     return transform
-
-
-class Method(NamedTuple):
-    """One row of the comparison.
-
-    transforms(horizon, branches, noise) -> the batch transforms in order; for branches and noise see `branch`.
-    finite_horizon: the agent is told the steps to go (for horizon > 1). reset_critic: default at transfer.
-    uses_value, uses_dynamics: what it takes from the prior besides the agent. shaped: rewards are r_bar.
-    """
-
-    name: str
-    transforms: Callable[[int, int, float | Array], tuple[BatchTransform, ...]]
-    finite_horizon: bool
-    reset_critic: bool
-    uses_value: bool
-    uses_dynamics: bool
-    description: str
-    source: str
-
-
-def _method(name: str, parts: str, *, reset_critic: bool, description: str, source: str) -> Method:
-    finite = "shorten" in parts
-
-    def transforms(horizon: int, branches: int, noise: float | Array) -> tuple[BatchTransform, ...]:
-        built: dict[str, Callable[[], BatchTransform]] = {
-            "branch": lambda: branch(horizon, branches, noise=noise, segments=finite),
-            "shape": lambda: shape,
-            "shorten": lambda: shorten(horizon),
-        }
-        return tuple(built[part]() for part in parts.split())
-
-    return Method(name, transforms, finite, reset_critic, "shape" in parts, "branch" in parts, description, source)
-
-
-METHODS: dict[str, Method] = {
-    m.name: m
-    for m in (
-        _method("sac", "", reset_critic=False, description="task reward, critic kept", source="Haarnoja 2018"),
-        _method("sac-reset", "", reset_critic=True, description="task reward, new critic", source="Haarnoja 2018"),
-        _method("pbrs", "shape", reset_critic=True, description="shaped reward, infinite horizon", source="Ng 1999"),
-        _method("mbpo", "branch", reset_critic=False, description="SAC with model branches", source="Janner 2019"),
-        _method(
-            "pbrs-branch", "branch shape", reset_critic=True,
-            description="shaped reward and branches, infinite horizon: SGFT-SAC without shortening", source="SGFT 2025",
-        ),
-        _method("sgft", "shape shorten", reset_critic=False, description="model-free SGFT", source="SGFT 2025"),
-        _method("sgft-sac", "branch shape shorten", reset_critic=False, description="SGFT-SAC", source="SGFT 2025"),
-    )
-}  # fmt: skip
-
-
-def get_method(name: str) -> Method:
-    """The method of that name; UserError lists what exists and guesses what was meant."""
-    if name in METHODS:
-        return METHODS[name]
-    raise UserError(unknown("method", name, METHODS))
 
 
 def _check_positive(name: str, value: int) -> None:

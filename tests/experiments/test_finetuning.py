@@ -29,7 +29,7 @@ PROGRAM = """
 import os, signal, sys
 import envs
 envs.TASKS["toy"] = "toy"
-from experiments import cli, finetune
+from experiments import finetune
 from sgft_jax.log import MetricsLog
 write = MetricsLog.metrics
 def metrics(self, step, values):
@@ -37,7 +37,7 @@ def metrics(self, step, values):
     if values["rollouts"] == 5:
         os.kill(os.getpid(), signal.SIGKILL)
 MetricsLog.metrics = metrics
-cli.run_main(finetune.main, finetune.FinetuneArgs, "", argv=sys.argv[1:])
+finetune.main(sys.argv[1:])
 """
 
 
@@ -67,7 +67,7 @@ def argv(home, method="sgft-sac", *more, seeds=2, out=None):
 
 
 def call(arguments):
-    cli.run_main(finetune.main, finetune.FinetuneArgs, "Fine-tune.", argv=arguments)
+    finetune.main(arguments)
 
 
 def run(home, method):
@@ -101,6 +101,19 @@ def test_a_run_leaves_curve_summary_policies_and_every_rollout(home, method):
     rollouts = RealLog(folder).load()
     assert len(rollouts) == 5 and rollouts[0]["obs"].shape == (2, 20, 4) and rollouts[0]["valid"].all()
     assert (folder / "figures/success.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("method", [pytest.param("rlpd", marks=pytest.mark.slow), "iql"])
+def test_methods_that_learn_from_the_simulator_too(home, method, capsys):
+    """They start from nothing, so the simulator's policy makes the initial rollouts: those of any other method."""
+    run(home, "sac")
+    offline = ["--options.offline-updates", "20"] if method == "iql" else []
+    call(argv(home, method, "--options.simulated-transitions", "390", *offline))
+    assert "simulated: 40 episodes, returns from -" in capsys.readouterr().out  # 20 steps each, two priors
+    mine, others = (RealLog(home / f"finetune/toy/turned/{name}/seeds-0-1").load() for name in (method, "sac"))
+    for i in range(2):
+        np.testing.assert_allclose(mine[i]["obs"], others[i]["obs"], atol=1e-5)
+    assert not np.allclose(mine[2]["obs"], others[2]["obs"], atol=1e-2)
 
 
 @pytest.mark.parametrize("method", ["sgft-sac", "sac"])

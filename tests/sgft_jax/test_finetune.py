@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax import finetune, networks, normalizer, sac, sgft
+from sgft_jax import agents, finetune, methods, networks, normalizer, sac
 from sgft_jax.types import Transition, UserError
 
 NET = networks.NetworkConfig(hidden=(16,))
@@ -32,9 +32,10 @@ def make(name, **options):
     """A small fine-tuner; `learn` is compiled once per combination of method and options."""
     config = dataclasses.replace(SMALL, **options)
     tuner = finetune.make_finetuner(
-        sgft.get_method(name), config, obs_dim=2, act_dim=2, reward=reward, terminated=never
+        methods.get_method(name), config, obs_dim=2, act_dim=2, reward=reward, terminated=never
     )
-    return tuner._replace(init=jax.jit(tuner.init), learn=jax.jit(tuner.learn, static_argnums=2))
+    learn = jax.jit(tuner.learn, static_argnums=(2, 3), static_argnames="offline")
+    return tuner._replace(init=jax.jit(tuner.init), learn=learn)
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +73,7 @@ def test_what_moves_and_what_is_frozen(prior, name, horizon):
     assert equal(state.value, new.value) and equal(prior.value, new.value)
     assert equal(state.normalizer, new.normalizer) and equal(state.replay, new.replay)
     assert equal(state.learner.normalizer, new.learner.normalizer)
-    assert equal(state.dynamics, new.dynamics) != sgft.get_method(name).uses_dynamics
+    assert equal(state.dynamics, new.dynamics) != methods.get_method(name).uses_dynamics
     assert all(jnp.isfinite(m) and m.shape == () for m in metrics.values())
 
 
@@ -99,7 +100,7 @@ def test_shaped_rewards_are_bounded_and_the_tasks_own_are_not(prior, name, clip,
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_donated_state_leaves_the_prior_alone(prior, key, compiled):
     plain = finetune.make_finetuner(
-        sgft.METHODS["sgft"],
+        methods.METHODS["sgft"],
         dataclasses.replace(SMALL, reset_critic=False),
         obs_dim=2,
         act_dim=2,
@@ -154,17 +155,17 @@ def test_invalid_transitions_do_no_harm(prior, key):
 def test_horizon_one_learner_sees_the_papers_batch(prior, key, monkeypatch):
     """256 real rows become 1536, rewards are r_bar, nothing bootstraps, and the actor reads the 256."""
     seen = {}
-    real_make = finetune.make_sac
+    real_make = agents.make_sac
 
     def spy(config, hyper):
         learner = real_make(config, hyper)
         seen["config"] = config
         return learner._replace(update=lambda s, b, k: (seen.update(batch=b), learner.update(s, b, k))[1])
 
-    monkeypatch.setattr(finetune, "make_sac", spy)
+    monkeypatch.setattr(agents, "make_sac", spy)
     paper = finetune.FinetuneConfig(network=NET, replay_capacity=64)
     tuner = finetune.make_finetuner(
-        sgft.METHODS["sgft-sac"], paper, obs_dim=2, act_dim=2, reward=reward, terminated=never
+        methods.METHODS["sgft-sac"], paper, obs_dim=2, act_dim=2, reward=reward, terminated=never
     )
     jax.eval_shape(lambda state: tuner.learn(state, key, 1), started(tuner, prior))
     assert seen["batch"].obs.shape == (1536, 2) and seen["config"].actor_batch == 256
@@ -181,7 +182,9 @@ def test_vmap_over_seeds_equals_a_loop(prior):
 
 
 def test_learn_traces_once(prior):
-    plain = finetune.make_finetuner(sgft.METHODS["sgft"], SMALL, obs_dim=2, act_dim=2, reward=reward, terminated=never)
+    plain = finetune.make_finetuner(
+        methods.METHODS["sgft"], SMALL, obs_dim=2, act_dim=2, reward=reward, terminated=never
+    )
     learn = jax.jit(chex.assert_max_traces(plain.learn, n=1), static_argnums=2)
     state = started(plain, prior)
     for seed in range(3):
@@ -190,15 +193,73 @@ def test_learn_traces_once(prior):
 
 def test_keys_are_used_once(prior):
     """Without branches: JAX's checker takes a vmapped scan over split keys for a reuse."""
-    plain = finetune.make_finetuner(sgft.METHODS["sgft"], SMALL, obs_dim=2, act_dim=2, reward=reward, terminated=never)
+    plain = finetune.make_finetuner(
+        methods.METHODS["sgft"], SMALL, obs_dim=2, act_dim=2, reward=reward, terminated=never
+    )
     state = started(plain, prior)
     with jax.debug_key_reuse(True):
         jax.jit(plain.learn, static_argnums=2)(state, jax.random.key(3), 2)
 
 
-def test_sizes_must_be_positive():
-    with pytest.raises(UserError, match="horizon is 0"):
-        finetune.FinetuneConfig(horizon=0)
+# --- data of the simulator ------------------------------------------------------------------------------------------
+
+
+def simulated(key, n):
+    """Rows that cannot be mistaken for real ones."""
+    return transitions(key, n)._replace(reward=jnp.full(n, 100.0))
+
+
+def test_the_share_of_simulated_rows():
+    rows = [transitions(jax.random.key(seed), 8) for seed in (0, 1)]
+    for share, n in ((0.0, 0), (0.5, 4), (0.8, 6), (1.0, 8)):
+        mixed = finetune.mix(*rows, share)
+        assert equal(jax.tree.map(lambda x, n=n: x[:n], mixed), jax.tree.map(lambda x, n=n: x[:n], rows[1]))
+        assert equal(jax.tree.map(lambda x, n=n: x[n:], mixed), jax.tree.map(lambda x, n=n: x[n:], rows[0]))
+
+
+def test_the_share_falls_with_the_updates(prior):
+    tuner = make("sac-online", simulated_share=0.5, simulated_share_end=0.0, simulated_anneal=4)
+    _, metrics = tuner.learn(started(tuner, prior), jax.random.key(1), 8, simulated)
+    # of 8 rows 4, 3, 2, 1, 0, ... are simulated: 10 of 64, and the real rewards are about -0.8
+    assert metrics["batch/reward_mean"] == pytest.approx(100 * 10 / 64 - 0.8 * 54 / 64, abs=0.3)
+
+
+def test_offline_means_simulated_rows_alone(prior):
+    tuner = make("iql", simulated_share=0.5)
+    state = tuner.init(prior, jax.random.key(0))  # nothing real yet
+    _, metrics = tuner.learn(state, jax.random.key(1), 2, simulated, offline=True)
+    assert metrics["batch/reward_mean"] == 100
+    with pytest.raises(UserError, match="rlpd needs transitions of the simulator"):
+        make("rlpd", simulated_share=0.5).learn(state, jax.random.key(1), 1)
+
+
+@pytest.mark.parametrize("name", ["rlpd", "iql"])
+def test_a_fresh_agent_takes_the_statistics_alone(prior, name):
+    moved = prior.replace(normalizer=normalizer.Normalizer(jnp.array([1.0, 2.0]), jnp.array([3.0, 4.0])))
+    state = make(name, simulated_share=0.5, critic_network=None).init(moved, jax.random.key(0))
+    assert equal(state.learner.normalizer, moved.normalizer)
+    own = state.learner.actor.params
+    own = own["mean"] if name == "iql" else own
+    assert not jnp.array_equal(own["Dense_0"]["kernel"], prior.actor["Dense_0"]["kernel"])
+
+
+@pytest.mark.parametrize("name", ["rlpd", "iql"])
+def test_a_fresh_agent_is_exported_as_it_acts(prior, name):
+    tuner = make(name, simulated_share=0.5, critic_network=None, policy_delay=1)
+    state, _ = tuner.learn(started(tuner, prior), jax.random.key(1), 3, simulated)
+    plain, obs = tuner.export(state), jnp.array([0.3, -0.8])
+    assert jax.tree.map(jnp.shape, plain) == jax.tree.map(jnp.shape, prior)
+    moments = networks.make_actor(2, 2, NET).apply(plain.actor, normalizer.normalize(plain.normalizer, obs))
+    expected = tuner.act(state, obs, jax.random.key(0), explore=False)
+    np.testing.assert_allclose(networks.tanh_gaussian_mode(moments), expected, rtol=1e-5)
+
+
+def test_a_frozen_critic_stays_and_moves_the_actor(prior):
+    tuner = make("frozen-critic", train_critic=False)
+    state = started(tuner, prior)
+    new, metrics = tuner.learn(state, jax.random.key(1), 3)
+    assert equal(state.learner.critic, new.learner.critic) and equal(prior.critic, new.learner.critic.params)
+    assert not equal(state.learner.actor, new.learner.actor) and "critic/loss" not in metrics
 
 
 # --- it works -------------------------------------------------------------------------------------------------------

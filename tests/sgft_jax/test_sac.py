@@ -182,6 +182,50 @@ def test_policy_delay(key):
     assert equal(first.actor, second.actor) and not equal(start.actor, first.actor)
 
 
+def ensemble(**options):
+    """Four critics that say 0, 1, 2 and 3 everywhere, as a state, and the learner."""
+    config = sac.SACConfig(1, 1, network=NET, critics=4, train_value=False, train_dynamics=False, **options)
+    learner = sac.make_sac(config, sac.SACHyper(alpha=0.5))
+    state = learner.init(jax.random.key(0))
+    said = jax.tree.map(jnp.zeros_like, state.critic.params)
+    said["Dense_1"]["bias"] = jnp.arange(4.0)[:, None]
+    return state.replace(critic=state.critic._replace(params=said), target_critic=said), jax.jit(learner.update)
+
+
+def test_targets_are_the_minimum_of_some_members(key):
+    """Of two random members of four: 0, 1 or 2, and every one of them now and then; of all: 0."""
+    batch = probe(key, discount=lambda s: jnp.ones_like(s), reward=lambda s, a: jnp.zeros_like(s))
+    for chosen, expected in ((2, {0, 1, 2}), (4, {0}), (None, {0})):
+        state, update = ensemble(target_critics=chosen, entropy_in_target=False)
+        seen = [update(state, batch, jax.random.key(i))[1]["critic/target_mean"] for i in range(20)]
+        assert {int(x) for x in seen} == expected and all(float(x).is_integer() for x in seen)
+
+
+def test_entropy_in_the_target(key):
+    batch = probe(key, discount=lambda s: jnp.ones_like(s), reward=lambda s, a: jnp.zeros_like(s))
+    with_entropy, without = (ensemble(entropy_in_target=e) for e in (True, False))
+    metrics = [update(state, batch, key)[1] for state, update in (with_entropy, without)]
+    assert metrics[1]["critic/target_mean"] == 0
+    assert metrics[0]["critic/target_mean"] == pytest.approx(0.5 * float(metrics[0]["actor/entropy"]), abs=0.15)
+
+
+def test_the_actor_follows_the_minimum_or_the_mean(key):
+    for mean, q in ((False, 0.0), (True, 1.5)):
+        state, update = ensemble(actor_mean=mean)
+        kept = state.replace(hyper=state.hyper._replace(lr_critic=jnp.float32(0)))
+        metrics = update(kept, probe(key), key)[1]
+        assert metrics["actor/loss"] == pytest.approx(-0.5 * float(metrics["actor/entropy"]) - q, abs=1e-4)
+
+
+def test_the_temperature_waits_with_the_actor(key):
+    config = sac.SACConfig(1, 1, network=NET, policy_delay=2, train_value=False, train_dynamics=False)
+    learner = sac.make_sac(config)
+    update = jax.jit(learner.update)
+    first, _ = update(learner.init(key), probe(key), key)
+    second, _ = update(first, probe(key), key)
+    assert first.log_alpha.params != 0 and equal(first.log_alpha, second.log_alpha)
+
+
 def test_actor_learns_from_the_leading_rows_only(key):
     config = sac.SACConfig(1, 1, network=NET, actor_batch=4, train_value=False, train_dynamics=False)
     learner = sac.make_sac(config)

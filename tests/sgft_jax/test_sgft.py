@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax import losses, sgft
+from sgft_jax import losses, methods, sgft
 from sgft_jax.types import Imagination, Transition, UserError
 
 GAMMA = 0.9
@@ -193,7 +193,7 @@ def test_branch_noise_spreads_the_imagined_actions_within_their_range(key):
 
 def test_batch_accounting_of_the_paper(key):
     zeros = np.zeros(256)
-    transform = sgft.compose(*sgft.METHODS["sgft-sac"].transforms(1, 5, 0.0))
+    transform = sgft.compose(*methods.METHODS["sgft-sac"].transforms(1, 5, 0.0))
     out = transform(imagination(), batch_of(zeros, zeros, zeros), key)
     assert out.reward.shape == (1536,) and jnp.all(out.discount == 0)
 
@@ -217,35 +217,12 @@ def test_composition_runs_left_to_right_with_separate_keys(key):
     assert sgft.compose()(imagination(), raw, key) is raw
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "dynamics", "reset", "finite"),
-    [
-        ("sac", False, False, False, False),
-        ("sac-reset", False, False, True, False),
-        ("pbrs", True, False, True, False),
-        ("mbpo", False, True, False, False),
-        ("pbrs-branch", True, True, True, False),
-        ("sgft", True, False, False, True),
-        ("sgft-sac", True, True, False, True),
-    ],
-)
-def test_method_table(name, value, dynamics, reset, finite):
-    m = sgft.get_method(name)
-    assert (m.uses_value, m.uses_dynamics, m.reset_critic, m.finite_horizon) == (value, dynamics, reset, finite)
-    assert m.description and m.source
-
-
-@pytest.mark.parametrize("name", sgft.METHODS)
+@pytest.mark.parametrize("name", methods.METHODS)
 def test_only_finite_horizons_cut_the_bootstrap(name, key):
-    method = sgft.METHODS[name]
+    method = methods.METHODS[name]
     out = sgft.compose(*method.transforms(1, 2, 0.0))(imagination(), batch_of([0, 1], [1, 2], [0, 0]), key)
     assert out.reward.shape == ((6,) if method.uses_dynamics else (2,))
     assert jnp.all(out.discount == (0 if method.finite_horizon else jnp.float32(GAMMA)))
-
-
-def test_unknown_method_is_answered_with_the_closest():
-    with pytest.raises(UserError, match=r"'sgft-sca'.*did you mean 'sgft-sac'.*pbrs"):
-        sgft.get_method("sgft-sca")
 
 
 @pytest.mark.parametrize("make", [lambda: sgft.shorten(0), lambda: sgft.branch(0, 5), lambda: sgft.branch(1, 0)])

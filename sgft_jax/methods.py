@@ -1,0 +1,200 @@
+"""The table of fine-tuning methods: which learner, which batch transforms, which rows, and the authors' settings."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple
+
+from sgft_jax.networks import NetworkConfig
+from sgft_jax.sgft import branch, shape, shorten
+from sgft_jax.types import Array, BatchTransform, UserError, unknown
+
+AgentName = Literal["sac", "iql"]
+
+
+@dataclass(frozen=True)
+class FinetuneConfig:
+    """Options of fine-tuning; the defaults are the paper's where it states them (Appendix C), else argued here.
+
+    horizon, branches: H and the model branches per sampled real state. With H = 1, the paper's, the agent never takes a
+        step that costs V_sim now and pays later: on hammering, where strokes do, some seeds end up hovering. H = 4 with
+        2 branches has none of these (docs/results.md). batch_size: real transitions per update.
+    branch_noise: std of the noise on imagined actions. The paper draws them from the policy alone (0). On pushing, 20
+        rollouts and 6,000 updates, the best of 16 actions by the critic then has r_bar -0.34 in the mean, with noise
+        0.5 -0.20; by the model itself -0.15, by the truth -0.07, the policy's own -0.71.
+    gamma: discount factor of imagined transitions; real ones carry theirs.
+    alpha: temperature, fixed unless `tune_alpha` lets it follow a target entropy of `entropy_per_dim` nats per action
+        dimension. network: must be the prior's.
+    critic_network: body of a new critic. LayerNorm tames extrapolation on little data (RLPD); default as the prior's.
+    critics, target_critics, actor_mean, policy_delay, train_critic: see `SACConfig`. A kept critic has two members.
+    reset_critic: None = the method's default. A kept critic under a shaped reward is read as Q_sim(s, a) - V_sim(s),
+        its exact meaning in simulation.
+    critic_warmup: critic-only updates at the start. The first data are the simulator's policy's own: they do not say
+        what another action would do, and on pushing an actor that learned from them lost 12 points of success before it
+        gained 60. None = as many as follow the initial rollouts (0 where nobody knows how many those are); 0 = as
+        printed in the paper.
+    actor_ramp: updates over which the actor's learning rate then rises from 0, for the same reason.
+    train_dynamics: keep fitting the ensemble, on real transitions only.
+    actor_real_only: the actor learns from the real rows, the critic from all (O-11).
+    lr_*: Adam learning rates. tau: target averaging rate. max_grad_norm: None = no clipping.
+    simulated_share: share of each batch that is drawn from the simulator's transitions instead of the real ones; it
+        goes linearly to `simulated_share_end` (None = stays) over `simulated_anneal` updates.
+    simulated_transitions: how many of them there are: whole episodes of the prior's policy in the training domain,
+        more and more of its actions replaced by random ones from the first episode to the last, up to a share of
+        `simulated_ladder`, as where the fleet of pretraining ends.
+    offline_updates: updates on the simulator's transitions alone, before the first real rollout.
+    expectile, beta, reward_scale: IQL's; see `IQLHyper`. reward_scale None = episode length / (best - worst return) of
+        the simulator's episodes, as the authors scale theirs.
+    clip_shaped: bound on |r_bar|. V_sim falls off a cliff where a task can be lost for good (a puck over the edge): one
+        such row outweighs a thousand others in a squared error, and its sign is all a policy needs. None = as printed.
+    replay_capacity: transitions; 20,000 hold 400 episodes of 50 steps, more than an hour of a real robot.
+    """
+
+    horizon: int = 1
+    branches: int = 5
+    branch_noise: float = 0.5
+    batch_size: int = 256
+    gamma: float = 0.99
+    alpha: float = 0.01
+    tune_alpha: bool = False
+    entropy_per_dim: float = -1.0
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    critic_network: NetworkConfig | None = None
+    critics: int = 2
+    target_critics: int | None = None
+    actor_mean: bool = False
+    policy_delay: int = 1
+    train_critic: bool = True
+    reset_critic: bool | None = None
+    critic_warmup: int | None = None
+    actor_ramp: int = 1000
+    train_dynamics: bool = True
+    actor_real_only: bool = True
+    lr_actor: float = 1e-4
+    lr_critic: float = 3e-4
+    lr_dynamics: float = 3e-4
+    tau: float = 0.005
+    max_grad_norm: float | None = None
+    clip_shaped: float | None = 2.0
+    replay_capacity: int = 20_000
+    simulated_share: float = 0.0
+    simulated_share_end: float | None = None
+    simulated_anneal: int = 10_000
+    simulated_transitions: int = 200_000
+    simulated_ladder: float = 0.6
+    offline_updates: int = 0
+    expectile: float = 0.7
+    beta: float = 3.0
+    reward_scale: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("horizon", "branches", "batch_size", "replay_capacity", "simulated_anneal"):
+            if getattr(self, name) < 1:
+                raise UserError(f"fine-tuning option {name} is {getattr(self, name)}: must be at least 1")
+        for name in ("simulated_share", "simulated_share_end", "simulated_ladder"):
+            if not 0 <= (getattr(self, name) or 0.0) <= 1:
+                raise UserError(f"fine-tuning option {name} is {getattr(self, name)}: must be a share from 0 to 1")
+        if self.offline_updates and not self.simulated_share:
+            raise UserError("fine-tuning option offline_updates needs the simulator's transitions: set simulated_share")
+
+
+class Method(NamedTuple):
+    """One row of the comparison.
+
+    transforms(horizon, branches, noise) -> the batch transforms in order; for branches and noise see `branch`.
+    finite_horizon: the agent is told the steps to go (for horizon > 1). reset_critic: default at transfer.
+    uses_value, uses_dynamics: what it takes from the prior besides the agent. shaped: rewards are r_bar.
+    agent: the learner. fresh: it starts from nothing, and the simulator's policy only makes the initial rollouts.
+    simulated: it learns from transitions of the simulator, too.
+    utd: updates per real transition. options: where its `FinetuneConfig` differs from the defaults, by field.
+    """
+
+    name: str
+    description: str
+    source: str
+    transforms: Callable[[int, int, float | Array], tuple[BatchTransform, ...]]
+    finite_horizon: bool
+    uses_value: bool
+    uses_dynamics: bool
+    reset_critic: bool
+    agent: AgentName
+    fresh: bool
+    utd: float
+    options: Mapping[str, Any]
+
+    @property
+    def simulated(self) -> bool:
+        """Whether it needs transitions of the simulator, with its own options."""
+        return self.options.get("simulated_share", 0.0) > 0
+
+
+def _method(
+    name: str,
+    parts: str,
+    description: str,
+    source: str,
+    *,
+    reset_critic: bool = False,
+    agent: AgentName = "sac",
+    fresh: bool = False,
+    utd: float = 8.0,
+    **options: Any,
+) -> Method:
+    finite = "shorten" in parts
+
+    def transforms(horizon: int, branches: int, noise: float | Array) -> tuple[BatchTransform, ...]:
+        built: dict[str, Callable[[], BatchTransform]] = {
+            "branch": lambda: branch(horizon, branches, noise=noise, segments=finite),
+            "shape": lambda: shape,
+            "shorten": lambda: shorten(horizon),
+        }
+        return tuple(built[part]() for part in parts.split())
+
+    uses = ("shape" in parts, "branch" in parts)
+    return Method(name, description, source, transforms, finite, *uses, reset_critic, agent, fresh, utd, options)
+
+
+METHODS: dict[str, Method] = {
+    m.name: m
+    for m in (
+        _method("sac", "", "task reward, critic kept", "Haarnoja 2018"),
+        _method("sac-reset", "", "task reward, new critic", "Haarnoja 2018", reset_critic=True),
+        _method("pbrs", "shape", "shaped reward, infinite horizon", "Ng 1999", reset_critic=True),
+        _method("mbpo", "branch", "SAC with model branches", "Janner 2019"),
+        _method(
+            "pbrs-branch", "branch shape",
+            "shaped reward and branches, infinite horizon: SGFT-SAC without shortening", "SGFT 2025", reset_critic=True,
+        ),
+        _method("frozen-critic", "", "the actor alone learns, from the simulator's critic", "SGFT 2025, reviews",
+                train_critic=False, critic_warmup=0),
+        _method(
+            "sac-online", "", "SAC from kept networks and simulator data, many critic updates a slow actor update",
+            "As 2026", utd=5.0, lr_actor=1e-5, policy_delay=20, actor_mean=True, simulated_share=0.5,
+            simulated_share_end=0.0, simulated_anneal=10_000, critic_warmup=0, actor_ramp=0,
+        ),
+        _method(
+            "rlpd", "", "from scratch; ten normalised critics, half of each batch from the simulator", "Ball 2023",
+            fresh=True, utd=20.0, lr_actor=3e-4, policy_delay=20, critics=10, target_critics=2, actor_mean=True,
+            critic_network=NetworkConfig(hidden=(256, 256), layer_norm=True), tune_alpha=True, alpha=1.0,
+            entropy_per_dim=-0.5, simulated_share=0.5, critic_warmup=0, actor_ramp=0,
+        ),
+        _method(
+            "iql", "", "in-sample learning: offline from the simulator, then online", "Kostrikov 2022",
+            agent="iql", fresh=True, lr_actor=3e-4, simulated_share=0.5, simulated_transitions=1_000_000,
+            offline_updates=500_000, critic_warmup=0, actor_ramp=0,
+        ),
+        _method("sgft", "shape shorten", "model-free SGFT", "SGFT 2025"),
+        _method("sgft-sac", "branch shape shorten", "SGFT-SAC", "SGFT 2025"),
+    )
+}  # fmt: skip
+
+
+def get_method(name: str) -> Method:
+    """The method of that name; UserError lists what exists and guesses what was meant."""
+    if name in METHODS:
+        return METHODS[name]
+    raise UserError(unknown("method", name, METHODS))
+
+
+def finetune_config(method: Method, **changes: Any) -> FinetuneConfig:
+    """The options that a method's authors use, where ours have them, and any changes to these."""
+    return FinetuneConfig(**{**method.options, **changes})

@@ -1,0 +1,61 @@
+"""The table of methods, and the settings that make one."""
+
+import pytest
+
+from sgft_jax import methods
+from sgft_jax.types import UserError
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "dynamics", "reset", "finite"),
+    [
+        ("sac", False, False, False, False),
+        ("sac-reset", False, False, True, False),
+        ("pbrs", True, False, True, False),
+        ("mbpo", False, True, False, False),
+        ("pbrs-branch", True, True, True, False),
+        ("sgft", True, False, False, True),
+        ("sgft-sac", True, True, False, True),
+        ("frozen-critic", False, False, False, False),
+        ("sac-online", False, False, False, False),
+        ("rlpd", False, False, False, False),
+        ("iql", False, False, False, False),
+    ],
+)
+def test_method_table(name, value, dynamics, reset, finite):
+    m = methods.get_method(name)
+    assert (m.uses_value, m.uses_dynamics, m.reset_critic, m.finite_horizon) == (value, dynamics, reset, finite)
+    assert m.description and m.source
+
+
+def test_the_table_is_complete():
+    """The rows above are all there are."""
+    (tested,) = (mark.args[1] for mark in test_method_table.pytestmark)
+    assert {row[0] for row in tested} == set(methods.METHODS)
+    assert {m.name for m in methods.METHODS.values() if m.simulated} == {"sac-online", "rlpd", "iql"}
+    assert {m.name for m in methods.METHODS.values() if m.fresh} == {"rlpd", "iql"}
+
+
+def test_a_methods_own_options_and_changes_to_them():
+    rlpd = methods.finetune_config(methods.METHODS["rlpd"], target_critics=1)
+    assert (rlpd.critics, rlpd.target_critics, rlpd.policy_delay, rlpd.simulated_share) == (10, 1, 20, 0.5)
+    assert methods.METHODS["rlpd"].utd == 20
+    assert methods.finetune_config(methods.METHODS["sgft-sac"]) == methods.FinetuneConfig()
+
+
+def test_unknown_method_is_answered_with_the_closest():
+    with pytest.raises(UserError, match=r"'sgft-sca'.*did you mean 'sgft-sac'.*pbrs"):
+        methods.get_method("sgft-sca")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"horizon": 0}, "horizon is 0: must be at least 1"),
+        ({"simulated_share": 1.5}, "simulated_share is 1.5: must be a share from 0 to 1"),
+        ({"offline_updates": 10}, "offline_updates needs the simulator's transitions"),
+    ],
+)
+def test_impossible_options_are_refused(options, words):
+    with pytest.raises(UserError, match=words):
+        methods.FinetuneConfig(**options)
