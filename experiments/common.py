@@ -16,10 +16,11 @@ from envs import gaps
 from envs.base import Env, World
 from envs.gaps import Gap
 from experiments import cli
+from experiments.algorithms import algorithm_of
 from sgft_jax import checkpoint
 from sgft_jax.config import config_from_json, differences
 from sgft_jax.networks import NetworkConfig
-from sgft_jax.types import Array, Key, Prior, PyTree, UserError
+from sgft_jax.types import Array, Key, PyTree, UserError
 
 SIM = "sim"
 
@@ -119,7 +120,7 @@ def exam_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:
     return env.sample_worlds(key, n, effects={"obs_noise": 0.0}) if gap is None else gaps.worlds(env, gap, key, n)
 
 
-def find_priors(prior: Path | None, *, out: Path, env: Env, preset: str) -> tuple[list[Prior], dict[str, Any]]:
+def find_priors(prior: Path | None, *, out: Path, env: Env, preset: str) -> tuple[list[PyTree], dict[str, Any]]:
     """The priors of `prior_folders`, loaded, and the card of the first.
 
     Raises UserError if one is of another task or differs from the first in its networks.
@@ -146,12 +147,15 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str) -> l
     return sorted((card.parent for card in cards), key=_seed_number)
 
 
-def load_priors(folders: Sequence[Path], env: Env) -> tuple[list[Prior], dict[str, Any]]:
+def load_priors(folders: Sequence[Path], env: Env) -> tuple[list[PyTree], dict[str, Any]]:
     """The priors in these folders and the card of the first; raises UserError where they do not fit together."""
     sizes = {"task": env.name, "obs_dim": env.obs_dim, "act_dim": env.act_dim}
     priors, cards = zip(*(checkpoint.load_prior(folder, **sizes) for folder in folders), strict=True)
     for folder, card in zip(folders, cards, strict=True):
-        if odd := [key for key in ("network", "gamma", "ensemble_size") if differences(cards[0][key], card[key])]:
+        odd = [key for key in ("network", "gamma", "ensemble_size") if differences(cards[0][key], card[key])]
+        if algorithm_of(card) != algorithm_of(cards[0]):
+            odd.append("algorithm")
+        if odd:
             raise UserError(f"{folder}: differs from {folders[0]} in {', '.join(odd)}; choose one with --prior")
     return list(priors), cards[0]
 

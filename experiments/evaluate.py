@@ -12,6 +12,7 @@ import numpy as np
 import envs
 from envs.physics import Impl
 from experiments import cli, common
+from experiments.algorithms import make_player
 from experiments.evaluation import describe, grade
 from sgft_jax.jsonfile import read_json
 from sgft_jax.types import UserError
@@ -76,11 +77,11 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     env = envs.make(args.task or read_json(folders[0] / "prior.json")["task"], args.impl)
     gap = common.load_gap(env, args.real, args.set)
     priors, card = common.load_priors(folders, env)
-    network, gamma = common.network_of(card), card["gamma"]
+    player, gamma = make_player(card), card["gamma"]
     key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_SEED), args.seed))
     worlds = common.exam_worlds(env, gap, key_worlds, args.episodes)
 
-    graded = functools.partial(grade, env, network, worlds, key_episodes, gamma=gamma, episodes=args.episodes)
+    graded = functools.partial(grade, env, player, worlds, key_episodes, gamma=gamma, episodes=args.episodes)
     outcome = jax.tree.map(np.asarray, jax.jit(jax.vmap(graded))(common.stack(priors)))
     policies = [{"policy": str(f), **describe(common.member(outcome, i))} for i, f in enumerate(folders)]
     where = "in simulation" if gap is None else f"on the {gap.name} real system"

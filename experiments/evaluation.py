@@ -1,29 +1,26 @@
 """Success and return of a policy on a pool of worlds: one batch of whole episodes. Pure."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from envs.base import Env, World
-from envs.rollout import Episode, play_episode
+from envs.rollout import Episode, Policy, play_episode
 from sgft_jax import stats
 from sgft_jax.mesh import split_vmap, whole
-from sgft_jax.networks import NetworkConfig, make_actor, tanh_gaussian_action
-from sgft_jax.normalizer import normalize
-from sgft_jax.types import Array, Key, Metrics, Prior
-
-Act = Callable[[Array, Key], Array]
+from sgft_jax.players import Player
+from sgft_jax.types import Array, Key, Metrics, PyTree
 
 
-def play_episodes(env: Env, pool: World, act: Act, keys: Key, *, gamma: float, length: int | None = None) -> Episode:
-    """Episodes [n, ...] of `act(obs, key) -> action`, one per key [n], each in a random world of the pool.
+def play_episodes(
+    env: Env, pool: World, policy: Policy, carry: PyTree, keys: Key, *, gamma: float, length: int | None = None
+) -> Episode:
+    """Episodes [n, ...] of `policy(carry, obs, key) -> (action, carry)`, one per key [n], each in a random world.
 
     A key gives the same world, start and noise to every policy: differences between policies are paired.
     """
-    policy = lambda carry, obs, key: (act(obs, key), carry)  # noqa: E731
-    one = lambda key: play_episode(env, pool, policy, (), key, gamma=gamma, length=length)  # noqa: E731
+    one = lambda key: play_episode(env, pool, policy, carry, key, gamma=gamma, length=length)  # noqa: E731
     return split_vmap(one)(keys)
 
 
@@ -45,23 +42,16 @@ def score(episodes: Episode | Outcome) -> Metrics:
     }
 
 
-def prior_policy(env: Env, prior: Prior, network: NetworkConfig, *, explore: bool) -> Act:
-    """pi_sim as a function of (obs, key): the mean action, or a sample to explore."""
-    actor = make_actor(env.obs_dim, env.act_dim, network)
-
-    def act(obs: Array, key: Key) -> Array:
-        moments = actor.apply(prior.actor, normalize(prior.normalizer, obs))
-        return tanh_gaussian_action(moments, key, explore=explore)
-
-    return act
+def prior_policy(player: Player, prior: PyTree, *, explore: bool) -> Policy:
+    """pi_sim: what it takes for best, or, to explore, a sample."""
+    return lambda carry, obs, key: player.act(prior, carry, obs, key, explore=explore)
 
 
-def grade(
-    env: Env, network: NetworkConfig, pool: World, key: Key, prior: Prior, *, gamma: float, episodes: int
-) -> Outcome:
-    """That many episodes of the mean action."""
-    act = prior_policy(env, prior, network, explore=False)
-    played = play_episodes(env, pool, act, jax.random.split(key, episodes), gamma=gamma)
+def grade(env: Env, player: Player, pool: World, key: Key, prior: PyTree, *, gamma: float, episodes: int) -> Outcome:
+    """That many episodes of what the prior takes for best."""
+    policy = prior_policy(player, prior, explore=False)
+    keys = jax.random.split(key, episodes)
+    played = play_episodes(env, pool, policy, player.init_carry(), keys, gamma=gamma)
     qpos = jnp.concatenate([played.start.physics.qpos[:, None], played.qpos], axis=1)
     return whole(Outcome(played.success, played.total_reward, played.exploded, qpos))
 
@@ -84,7 +74,7 @@ class Best(NamedTuple):
     success, total: [] of its evaluation. steps: [] int32, when that was.
     """
 
-    prior: Prior
+    prior: PyTree
     success: Array
     total: Array
     steps: Array

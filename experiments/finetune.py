@@ -20,20 +20,22 @@ from envs.gaps import Gap
 from envs.physics import Impl
 from envs.rollout import Episode
 from experiments import cli, common
+from experiments.algorithms import algorithm_of, make_player
 from experiments.evaluation import score
 from experiments.finetuning import Program, Simulation, make_program, simulate
 from experiments.presets import PRESETS
 from experiments.results import describe_run, read_curve
 from experiments.video import before_and_after
 from sgft_jax import checkpoint, mesh, plot, runs
-from sgft_jax.finetune import Finetuner, FinetuneState, make_finetuner
+from sgft_jax.finetune import Finetuner, make_finetuner
 from sgft_jax.log import MetricsLog, RealLog, RunProgress, write_summary
 from sgft_jax.methods import METHODS, FinetuneConfig, Method, finetune_config, get_method
+from sgft_jax.players import Player
 from sgft_jax.replay import ReplayState
 from sgft_jax.stats import iqm_interval
-from sgft_jax.types import Array, Key, Prior, UserError
+from sgft_jax.types import Array, Key, PyTree, UserError
 
-DEFAULT_METHOD = "sgft-sac"
+DEFAULT_METHOD, DEFAULT_PRESET = "sgft-sac", "fast"
 _SIMULATED_WORLDS = 256
 _SIMULATION = 2**31  # seed of what happens in them, the same for every run
 _OFFLINE_PART = 10_000  # updates between two signs of life
@@ -51,7 +53,7 @@ class FinetuneArgs:
     """The real system: mild, default, hard, or a .toml/.json file with tables `params` and `effects`."""
     set: tuple[str, ...] = ()
     """Changes to it, e.g. --set latency=0.05 action_scale=[1,0.5]."""
-    preset: str = "fast"
+    preset: str = DEFAULT_PRESET
     """Pretraining preset whose priors to start from."""
     prior: Path | None = None
     """Folder of a prior, or of several (prior/seed-*); default: those of <out>/pretrain/<task>/<preset>."""
@@ -103,6 +105,8 @@ def arguments(method: str, **changes: Any) -> FinetuneArgs:
     """The arguments with which a method runs unless told otherwise, and any changes to these."""
     chosen = get_method(method)
     own = {"method": method, "utd": chosen.utd, "options": finetune_config(chosen)}
+    if chosen.prior == "tdmpc2":
+        own["preset"] = "tdmpc2"
     return FinetuneArgs(**{**own, **changes})
 
 
@@ -119,6 +123,7 @@ def finetune(args: FinetuneArgs) -> dict[str, Any]:
     env = envs.make(args.task, args.impl)
     gap = gaps.load(env, args.real, args.set)
     priors, card = common.find_priors(args.prior, out=args.out, env=env, preset=args.preset)
+    _check_prior(args, method, card)
     run = runs.open_run(
         run_folder(args),
         kind="finetune",
@@ -152,19 +157,17 @@ class _Run:
         self.log, self.real = MetricsLog(folder), RealLog(folder)
         self.expect = {"kind": "finetune", "task": args.task, "method": args.method, "seeds": seeds}
 
-    def work(self, priors: Prior, card: dict[str, Any]) -> dict[str, Any]:
+    def work(self, priors: PyTree, card: dict[str, Any]) -> dict[str, Any]:
         """Everything, in order. priors: [P]; seed i starts from prior i modulo P."""
         args = self.args
-        config = replace(args.options, network=common.network_of(card), gamma=card["gamma"])
+        config = self._options(card)
         if config.critic_warmup is None:
             config = replace(config, critic_warmup=args.initial_rollouts * self._updates_per_rollout())
-        self.simulation = self._simulate(config, priors) if config.simulated_share else None
+        self.simulation = self._simulate(config, priors, make_player(card)) if config.simulated_share else None
         if self.method.agent == "iql" and config.reward_scale is None:
             config = replace(config, reward_scale=self._reward_scale())
         self.tuner, self.program = self._programs(self.method, config)
-        # the simulator's policy for methods that start from nothing; its critic is never used
-        pilot = get_method("sac-reset")
-        self.pilot = self._programs(pilot, config)[1] if self.method.fresh else self.program
+        self.pilot = self._programs(self.method.pilot, config)[1] if self.method.fresh else self.program
 
         own = jax.tree.map(lambda x: x[self._prior_of(priors)], priors)
         self.untuned = lambda: self.pilot.init(own, self.numbers)
@@ -179,23 +182,30 @@ class _Run:
         print("next: python -m experiments.figures")
         return summary
 
+    def _options(self, card: dict[str, Any]) -> FinetuneConfig:
+        """Those of the command line, with what must be as the prior has it."""
+        own = {"gamma": card["gamma"]}
+        if algorithm_of(card) == "tdmpc2":
+            return replace(self.args.options, size=card["config"]["size"], **own)
+        return replace(self.args.options, network=common.network_of(card), **own)
+
     def _programs(self, method: Method, config: FinetuneConfig) -> tuple[Finetuner, Program]:
         env = self.env
         sizes = {"obs_dim": env.obs_dim, "act_dim": env.act_dim}
         tuner = make_finetuner(method, config, **sizes, reward=env.reward, terminated=env.terminated)
         return tuner, make_program(env, tuner, gamma=config.gamma)
 
-    def _prior_of(self, priors: Prior) -> Array:
+    def _prior_of(self, priors: PyTree) -> Array:
         """[S] for every seed an index into priors [P]."""
         return self.numbers % jax.tree.leaves(priors)[0].shape[0]
 
-    def _simulate(self, config: FinetuneConfig, priors: Prior) -> Simulation:
+    def _simulate(self, config: FinetuneConfig, priors: PyTree, player: Player) -> Simulation:
         """What every simulator's policy does in its training domain; the same for all methods and after a resume."""
         worlds = self.env.sample_worlds(jax.random.key(_SIMULATION), _SIMULATED_WORLDS)
         sizes = {"transitions": config.simulated_transitions, "ladder": config.simulated_ladder, "gamma": config.gamma}
 
-        def one(prior: Prior, key: Key) -> tuple[ReplayState, Array]:
-            return simulate(self.env, config.network, worlds, prior, key, **sizes)
+        def one(prior: PyTree, key: Key) -> tuple[ReplayState, Array]:
+            return simulate(self.env, player, worlds, prior, key, **sizes)
 
         keys = jax.random.split(jax.random.key(_SIMULATION), jax.tree.leaves(priors)[0].shape[0])
         buffers, returns = jax.jit(jax.vmap(one))(priors, keys)
@@ -208,7 +218,7 @@ class _Run:
         returns = self.simulation.returns
         return self.env.episode_length / max(float(returns.max() - returns.min()), 1e-6)
 
-    def _start(self, make: Callable[[], FinetuneState], config: FinetuneConfig) -> tuple[FinetuneState, int]:
+    def _start(self, make: Callable[[], PyTree], config: FinetuneConfig) -> tuple[PyTree, int]:
         """The state to continue from and the rollouts behind it: a checkpoint's, or a fresh one scored zero-shot."""
         if checkpoint.latest(self.folder) is None:
             self.log.truncate({})
@@ -221,7 +231,7 @@ class _Run:
         self.real.truncate(meta["stored"])
         return state, meta["rollouts"]
 
-    def _offline(self, state: FinetuneState, updates: int) -> FinetuneState:
+    def _offline(self, state: PyTree, updates: int) -> PyTree:
         """Learning from the simulator's transitions alone."""
         if not updates:
             return state
@@ -232,7 +242,7 @@ class _Run:
                 progress.advance(n, {"critic loss": float(metrics["critic/loss"].mean())})
         return state
 
-    def _train(self, state: FinetuneState, done: int) -> FinetuneState:
+    def _train(self, state: PyTree, done: int) -> PyTree:
         title = f"{self.args.method} on {self.args.task}/{self.gap.name}"
         with RunProgress(title, total=self.args.rollouts, unit="rollouts", done=done) as progress:
             while done < self.args.rollouts:
@@ -242,7 +252,7 @@ class _Run:
                 progress.advance(n, shown)
         return state
 
-    def _advance(self, state: FinetuneState, done: int, n: int) -> tuple[FinetuneState, dict[str, float]]:
+    def _advance(self, state: PyTree, done: int, n: int) -> tuple[PyTree, dict[str, float]]:
         """N real rollouts, then learning from them; later, where one is due, an evaluation and a checkpoint."""
         args, first = self.args, done == 0
         started = time.perf_counter()
@@ -267,12 +277,12 @@ class _Run:
         self._time(done, collected - started, learned - collected)
         return state, shown
 
-    def _collect(self, state: FinetuneState, done: int, n: int) -> Episode:
+    def _collect(self, state: PyTree, done: int, n: int) -> Episode:
         """The initial rollouts are the simulator's policy's, whatever the method: the same for all."""
         program, state = (self.program, state) if done else (self.pilot, self.untuned())
         return program.collect(state, self.pool, self.numbers, done, n)
 
-    def _learn(self, state: FinetuneState, done: int, n: int) -> tuple[FinetuneState, dict[str, np.ndarray]]:
+    def _learn(self, state: PyTree, done: int, n: int) -> tuple[PyTree, dict[str, np.ndarray]]:
         """The updates that N rollouts allow, in N equal parts, so that one compiled program serves any number."""
         parts = []
         for rollout in range(done, done + n):
@@ -295,13 +305,13 @@ class _Run:
         for i in range(n):
             self.real.append({name: x[:, i] for name, x in arrays.items()})
 
-    def _evaluate(self, state: FinetuneState, done: int) -> float:
+    def _evaluate(self, state: PyTree, done: int) -> float:
         scores = jax.vmap(score)(self.program.evaluate(state, self.pool, self.numbers, self.args.eval_episodes))
         minutes = self._transitions(done) * self.env.control_dt / 60
         self.log.eval(self._transitions(done), {"rollouts": done, "robot_minutes": minutes, **scores})
         return float(scores["success"].mean())
 
-    def _checkpoint(self, state: FinetuneState, done: int) -> None:
+    def _checkpoint(self, state: PyTree, done: int) -> None:
         meta = {**self.expect, "rollouts": done, "stored": len(self.real), "position": self.log.position()}
         checkpoint.save(self.folder, done, state, meta=meta)
 
@@ -313,7 +323,7 @@ class _Run:
 
     # ------------------------------------------------------------ what stays
 
-    def _save_policies(self, state: FinetuneState, card: dict[str, Any]) -> None:
+    def _save_policies(self, state: PyTree, card: dict[str, Any]) -> None:
         """The fine-tuned policies in the form of priors: policy/seed-<k>."""
         for i, seed in enumerate(self.seeds):
             tuned = self.tuner.export(common.member(state, i))
@@ -342,7 +352,7 @@ class _Run:
         )
         return summary
 
-    def _film(self, tuned: FinetuneState, rollouts: int) -> str:
+    def _film(self, tuned: PyTree, rollouts: int) -> str:
         """An evaluation episode of the first seed by the simulator's policy and by the agent as it is now.
 
         The first one that only the tuned agent solves: what fine-tuning is about. Without one, the first.
@@ -358,6 +368,16 @@ class _Run:
 
         path = self.folder / "videos" / f"seed-{self.seeds[0]}.mp4"
         return before_and_after(self.env, self.pool, play, path, rollouts=rollouts)
+
+
+def _check_prior(args: FinetuneArgs, method: Method, card: dict[str, Any]) -> None:
+    """Raises UserError for a prior of another algorithm than the method needs."""
+    if algorithm_of(card) != method.prior:
+        preset = "tdmpc2" if method.prior == "tdmpc2" else DEFAULT_PRESET
+        raise UserError(
+            f"--method {method.name} needs a prior of {method.prior}, not of {algorithm_of(card)}; make one with: "
+            f"python -m experiments.pretrain --task {args.task} --preset {preset}"
+        )
 
 
 def _check(args: FinetuneArgs) -> tuple[Method, list[int]]:

@@ -15,10 +15,10 @@ from envs.base import Env, World
 from envs.rollout import Episode, play_episode
 from experiments.evaluation import play_episodes, prior_policy
 from sgft_jax import replay
-from sgft_jax.finetune import Finetuner, FinetuneState, Simulated
+from sgft_jax.finetune import Finetuner, Simulated
 from sgft_jax.mesh import split_vmap
-from sgft_jax.networks import NetworkConfig
-from sgft_jax.types import Array, Key, Metrics, Prior, Transition
+from sgft_jax.players import Player
+from sgft_jax.types import Array, Key, Metrics, PyTree, Transition
 
 _INIT, _COLLECT, _LEARN, _EVALUATE, _OFFLINE = range(5)  # purposes, folded into a seed's key
 _AT_ONCE = 1024  # simulated episodes played together
@@ -48,34 +48,33 @@ class Program(NamedTuple):
     evaluate(state, pool, seeds, n) -> Episode [S, n]: with the mean action; the first n of a fixed series of episodes.
     """
 
-    init: Callable[[Prior, Array], FinetuneState]
-    collect: Callable[[FinetuneState, World, Array, int, int], Episode]
-    store: Callable[[FinetuneState, Episode], FinetuneState]
-    learn: Callable[[FinetuneState, Array, int, int, Simulation | None], tuple[FinetuneState, Metrics]]
-    offline: Callable[[FinetuneState, Array, int, int, Simulation | None], tuple[FinetuneState, Metrics]]
-    evaluate: Callable[[FinetuneState, World, Array, int], Episode]
+    init: Callable[[PyTree, Array], PyTree]
+    collect: Callable[[PyTree, World, Array, int, int], Episode]
+    store: Callable[[PyTree, Episode], PyTree]
+    learn: Callable[[PyTree, Array, int, int, Simulation | None], tuple[PyTree, Metrics]]
+    offline: Callable[[PyTree, Array, int, int, Simulation | None], tuple[PyTree, Metrics]]
+    evaluate: Callable[[PyTree, World, Array, int], Episode]
 
 
 def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
     """The program of one method on one task."""
 
-    def init(prior: Prior, seed: Array) -> FinetuneState:
+    def init(prior: PyTree, seed: Array) -> PyTree:
         return tuner.init(prior, _key(seed, _INIT, 0))
 
-    def play(state: FinetuneState, pool: World, keys: Key, explore: Array) -> Episode:
-        def act(obs: Array, key: Key) -> Array:
-            sample, mode = (tuner.act(state, obs, key, explore=choice) for choice in (True, False))
-            return jnp.where(explore, sample, mode)
+    def play(state: PyTree, pool: World, keys: Key, explore: Array) -> Episode:
+        policy = lambda carry, obs, key: tuner.act(state, carry, obs, key, explore=explore)  # noqa: E731
+        return play_episodes(env, pool, policy, tuner.init_carry(), keys, gamma=gamma)
 
-        return play_episodes(env, pool, act, keys, gamma=gamma)
-
-    def store(state: FinetuneState, episodes: Episode) -> FinetuneState:
-        return tuner.observe(state, *_rows(episodes))
+    def store(state: PyTree, episodes: Episode) -> PyTree:
+        """One episode after another: some learners need to know where each ends."""
+        one = lambda state, episode: (tuner.observe(state, *episode), None)  # noqa: E731
+        return jax.lax.scan(one, state, (episodes.transitions, episodes.valid))[0]
 
     def learn(
-        purpose: int, state: FinetuneState, seeds: Array, part: Array, updates: int, simulation: Simulation | None
-    ) -> tuple[FinetuneState, Metrics]:
-        def one(state: FinetuneState, seed: Array, which: Array, buffers: Any) -> tuple[FinetuneState, Metrics]:
+        purpose: int, state: PyTree, seeds: Array, part: Array, updates: int, simulation: Simulation | None
+    ) -> tuple[PyTree, Metrics]:
+        def one(state: PyTree, seed: Array, which: Array, buffers: Any) -> tuple[PyTree, Metrics]:
             source = None if buffers is None else _rows_of(buffers, which)
             return tuner.learn(state, _key(seed, purpose, part), updates, source, offline=purpose == _OFFLINE)
 
@@ -86,13 +85,13 @@ def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
     played = jax.jit(split_vmap(play, (0, None, 0, None)))
     keys = jax.jit(jax.vmap(_episode_keys, (0, None, None, None)), static_argnums=3)
 
-    def collect(state: FinetuneState, pool: World, seeds: Array, rollout: int, n: int) -> Episode:
+    def collect(state: PyTree, pool: World, seeds: Array, rollout: int, n: int) -> Episode:
         """One after another, as on a robot: a program for n at once would be used for the initial rollouts alone."""
         each = jnp.split(keys(seeds, _COLLECT, rollout, n), n, axis=1)
         episodes = [played(state, pool, key, True) for key in each]
         return jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *episodes)
 
-    def evaluate(state: FinetuneState, pool: World, seeds: Array, n: int) -> Episode:
+    def evaluate(state: PyTree, pool: World, seeds: Array, n: int) -> Episode:
         return played(state, pool, keys(seeds, _EVALUATE, 0, n), False)
 
     return Program(
@@ -107,9 +106,9 @@ def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
 
 def simulate(
     env: Env,
-    network: NetworkConfig,
+    player: Player,
     pool: World,
-    prior: Prior,
+    prior: PyTree,
     key: Key,
     *,
     gamma: float,
@@ -124,30 +123,27 @@ def simulate(
     n = -(-transitions // env.episode_length)
     at_once = min(n, _AT_ONCE)
     parts = -(-n // at_once)
-    own = prior_policy(env, prior, network, explore=True)
-
-    def policy(share: Array, obs: Array, key: Key) -> tuple[Array, Array]:
-        key_policy, key_replace, key_random = jax.random.split(key, 3)
-        random = jax.random.uniform(key_random, (env.act_dim,), minval=-1.0, maxval=1.0)
-        return jnp.where(jax.random.uniform(key_replace) < share, random, own(obs, key_policy)), share
+    own = prior_policy(player, prior, explore=True)
 
     def play(key: Key, share: Array) -> Episode:
-        return play_episode(env, pool, policy, share, key, gamma=gamma)
+        def policy(carry: PyTree, obs: Array, key: Key) -> tuple[Array, PyTree]:
+            key_policy, key_replace, key_random = jax.random.split(key, 3)
+            action, carry = own(carry, obs, key_policy)
+            random = jax.random.uniform(key_random, (env.act_dim,), minval=-1.0, maxval=1.0)
+            return jnp.where(jax.random.uniform(key_replace) < share, random, action), carry
+
+        return play_episode(env, pool, policy, player.init_carry(), key, gamma=gamma)
 
     def part(buffer: replay.ReplayState, inputs: tuple[Key, Array]) -> tuple[replay.ReplayState, Array]:
         key, shares = inputs
         episodes = jax.vmap(play)(jax.random.split(key, at_once), shares)
-        return replay.add_batch(buffer, *_rows(episodes)), episodes.total_reward
+        rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (episodes.transitions, episodes.valid))
+        return replay.add_batch(buffer, *rows), episodes.total_reward
 
     empty = replay.init(replay.blank(env.obs_dim, env.act_dim), parts * at_once * env.episode_length)
     shares = jnp.linspace(0.0, ladder, parts * at_once).reshape(parts, at_once)
     buffer, returns = jax.lax.scan(part, empty, (jax.random.split(key, parts), shares))
     return buffer, returns.reshape(-1)
-
-
-def _rows(episodes: Episode) -> tuple[Transition, Array]:
-    """The transitions of episodes [n] in one row, and which of them are valid."""
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (episodes.transitions, episodes.valid))
 
 
 def _rows_of(buffers: replay.ReplayState, which: Array) -> Simulated:

@@ -23,15 +23,14 @@ from envs.gaps import Gap
 from envs.physics import Impl
 from envs.rollout import pool_size
 from experiments import cli, common
+from experiments.algorithms import describe_use, make_player
 from experiments.evaluation import Best, Outcome, describe, grade, score
 from experiments.presets import PRESETS, PretrainConfig
-from experiments.pretrain import DEFAULT_PRESET, Saved, make_program
+from experiments.pretrain import DEFAULT_PRESET, Program, Saved, make_program
 from experiments.pretraining import PretrainState, make_pretrainer, memory
 from sgft_jax.log import MetricsLog, RunProgress, write_summary
-from sgft_jax.networks import NetworkConfig
-from sgft_jax.sac import extract_prior
 from sgft_jax.stats import iqm_interval
-from sgft_jax.types import Key, Metrics, Prior, UserError
+from sgft_jax.types import Key, Metrics, PyTree, UserError
 
 ZERO_SHOT_AT_MOST, TRAINED_AT_LEAST = 0.40, 0.95
 _RANDOM, _START = range(4, 6)  # purposes, folded into a seed's key
@@ -158,19 +157,20 @@ def _rate(outcome: Outcome) -> dict[str, Any]:
     return {"success": float(band.estimate), "interval": [float(band.low), float(band.high)], "policies": each}
 
 
-def _zero_shot(env: Env, found: Sequence[Gap], priors: Prior, card: dict[str, Any], episodes: int) -> list[Outcome]:
+def _zero_shot(env: Env, found: Sequence[Gap], priors: PyTree, card: dict[str, Any], episodes: int) -> list[Outcome]:
     """For each gap, the episodes of the priors [priors, episodes]; every policy plays the same ones."""
     pools = pools_of(env, found, jax.random.key(_REPORT_SEED), episodes)
     key = jax.random.fold_in(jax.random.key(_REPORT_SEED), 1)
-    graded = _grader(env, common.network_of(card), gamma=card["gamma"], episodes=episodes)
+    graded = _grader(env, card, episodes=episodes)
     over_priors = jax.vmap(graded, (None, None, 0))
     outcome = jax.tree.map(np.asarray, jax.jit(jax.vmap(over_priors, (None, 0, None)))(key, pools, priors))
     return [common.member(outcome, i) for i in range(len(found))]
 
 
-def _grader(env: Env, network: NetworkConfig, *, gamma: float, episodes: int) -> Callable[[Key, World, Prior], Outcome]:
+def _grader(env: Env, card: dict[str, Any], *, episodes: int) -> Callable[[Key, World, PyTree], Outcome]:
     """(key, pool, prior) -> Outcome [episodes]."""
-    return lambda key, pool, prior: grade(env, network, pool, key, prior, gamma=gamma, episodes=episodes)
+    player, gamma = make_player(card), card["gamma"]
+    return lambda key, pool, prior: grade(env, player, pool, key, prior, gamma=gamma, episodes=episodes)
 
 
 # ------------------------------------------------------------ training on the real systems
@@ -189,9 +189,9 @@ def _train(env: Env, args: GapsArgs, found: Sequence[Gap], seeds: list[int], fol
         pools = pools_of(env, found, jax.random.key(seed), n)
         return jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), pools)
 
-    def examiner(seed: int, episodes: int) -> Callable[[Prior], Outcome]:
+    def examiner(seed: int, episodes: int) -> Callable[[PyTree], Outcome]:
         """Priors [gaps * seeds] -> Outcome [gaps * seeds, episodes], the same episodes every time."""
-        graded = _grader(env, config.network, gamma=config.gamma, episodes=episodes)
+        graded = _grader(env, describe_use(env, config), episodes=episodes)
         program = jax.jit(common.over_seeds(graded, count, shared=1))
         return functools.partial(program, jax.random.fold_in(jax.random.key(seed), 1), members(seed, episodes))
 
@@ -201,7 +201,7 @@ def _train(env: Env, args: GapsArgs, found: Sequence[Gap], seeds: list[int], fol
     random = program.collect(pools, random_keys)
     saved = program.begin(pools, random, start_keys)
     chunk = functools.partial(program.chunk, pools, random)
-    best = _best(saved, chunk, examiner(_EXAM_SEED, config.eval_episodes), program.better, config, folder)
+    best = _best(saved, chunk, examiner(_EXAM_SEED, config.eval_episodes), program, config, folder)
     outcome = jax.tree.map(np.asarray, examiner(_REPORT_SEED, args.episodes)(best))
     return [jax.tree.map(lambda x, i=i: x[i * len(seeds) :][: len(seeds)], outcome) for i in range(len(found))]
 
@@ -209,11 +209,11 @@ def _train(env: Env, args: GapsArgs, found: Sequence[Gap], seeds: list[int], fol
 def _best(
     saved: Saved,
     chunk: Callable[[PretrainState], tuple[PretrainState, Metrics]],
-    examine: Callable[[Prior], Outcome],
-    better: Callable[[Best, Best, float], Best],
+    examine: Callable[[PyTree], Outcome],
+    program: Program,
     config: PretrainConfig,
     folder: Path,
-) -> Prior:
+) -> PyTree:
     """Trains to the end, with a line in eval.jsonl per evaluation; the policies at their best evaluation."""
     size = config.n_envs * config.chunk_steps
     chunks = math.ceil(config.env_steps / size)
@@ -225,10 +225,10 @@ def _best(
             log.metrics(done * size, metrics)
             shown = {"train/success": float(metrics["train/success"].mean())}
             if done % config.eval_every == 0 or done == chunks:
-                prior = extract_prior(run.learner)
+                prior = program.extract(run.learner)
                 scores = jax.vmap(score)(examine(prior))
                 log.eval(done * size, scores)
-                best = better(best, Best(prior, scores["success"], scores["return"], run.steps), 0.0)
+                best = program.better(best, Best(prior, scores["success"], scores["return"], run.steps), 0.0)
                 shown["success"] = float(scores["success"].mean())
             progress.advance(size, shown)
     log.close()

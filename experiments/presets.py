@@ -1,6 +1,7 @@
 """Named settings of pretraining. A preset never changes meaning; a new idea is a new preset."""
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from sgft_jax.networks import NetworkConfig
 
@@ -9,6 +10,8 @@ from sgft_jax.networks import NetworkConfig
 class PretrainConfig:
     """Everything that decides the result of pretraining, apart from task and seeds."""
 
+    algorithm: Literal["sac", "tdmpc2"] = "sac"
+    """What trains: SAC, whose V_sim and models SGFT-SAC needs, or TD-MPC2 for the methods that plan."""
     n_envs: int = 4096
     """Environments stepped together."""
     worlds: int = 2048
@@ -41,6 +44,12 @@ class PretrainConfig:
     """Critic updates per actor update."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     ensemble_size: int = 5
+    size: str = "5M"
+    """TD-MPC2's networks by their published number of parameters: 1M, 5M, 19M, 48M or 317M."""
+    horizon: int = 3
+    """Steps of TD-MPC2's plans and training windows; a batch holds `batch_size` windows."""
+    plan_samples: int = 512
+    """Sequences that a plan tries in each of its iterations; plans are made in evaluations alone."""
     chunk_steps: int = 50
     """Steps of all environments per compiled chunk: between chunks we log, evaluate and checkpoint."""
     eval_every: int = 4
@@ -84,6 +93,25 @@ PRESETS: dict[str, PretrainConfig] = {
         tau=0.01,
         alpha=0.1,
         network=_NORMED,
+    ),
+    # TD-MPC2 in many environments at once, for the methods that plan. Its own numbers but for what massive collection
+    # asks for: larger batches, and the discount factor and the exploration of `fast`.
+    "tdmpc2": PretrainConfig(
+        algorithm="tdmpc2",
+        n_envs=512,
+        env_steps=1_024_000,
+        random_transitions=51_200,
+        random_fraction=0.1,
+        random_ladder=0.6,
+        updates_per_step=16,
+        batch_size=512,
+        replay_capacity=512_000,
+        gamma=0.97,
+        lr=3e-4,
+        lr_end=0.1,
+        tau=0.01,
+        eval_every=10,
+        eval_episodes=128,
     ),
     # Two CPU cores, under three minutes, most of which go into the updates: one small update per environment step
     # learns pushing from 40,000 steps; 30,000 updates are too few, with 60,000 steps too.

@@ -23,16 +23,14 @@ from envs.gaps import Gap
 from envs.physics import Impl
 from envs.rollout import pick, pool_size
 from experiments import cli, common, hosts
+from experiments.algorithms import describe_use, make_player
 from experiments.evaluation import Best, Outcome, describe, grade, keep_better, score
 from experiments.presets import PRESETS, PretrainConfig
 from experiments.pretraining import PretrainState, make_pretrainer, memory, spread, spread_replay
 from experiments.report import Report, make_report, numbers
 from sgft_jax import checkpoint, mesh, plot, runs
-from sgft_jax.config import config_to_json
 from sgft_jax.log import EVAL, MetricsLog, RunProgress, read_jsonl, write_summary
-from sgft_jax.replay import ReplayState
-from sgft_jax.sac import extract_prior
-from sgft_jax.types import Key, Prior
+from sgft_jax.types import Key, PyTree
 
 DEFAULT_PRESET = "fast"
 _WORLDS, _RANDOM, _START, _REPORT = range(4)  # purposes, folded into a seed's key
@@ -92,17 +90,18 @@ class Program(NamedTuple):
     collect(pools, keys) -> random-action data. begin(pools, random, keys) -> Saved.
     spread_random(random), spread(saved): what was read from disk, laid out over the devices.
     chunk(pools, random, run) -> (run, metrics). grade(pool, key, priors) -> Outcome [seeds, eval_episodes].
-    better(old, new, since) -> Best. report(pools, priors, keys) -> Report.
+    better(old, new, since) -> Best. report(pools, priors, keys) -> Report. extract(agents) -> priors.
     """
 
-    collect: Callable[..., ReplayState]
+    collect: Callable[..., PyTree]
     begin: Callable[..., Saved]
-    spread_random: Callable[[ReplayState], ReplayState]
+    spread_random: Callable[[PyTree], PyTree]
     spread: Callable[[Saved], Saved]
     chunk: Any
     grade: Callable[..., Outcome]
     better: Callable[[Best, Best, float], Best]
     report: Callable[..., Report]
+    extract: Callable[[PyTree], PyTree]
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -149,14 +148,15 @@ def run_folder(args: PretrainArgs, gap: Gap | None) -> Path:
 
 def make_program(env: Env, config: PretrainConfig, *, seeds: int) -> Program:
     """The functions of a run of that many seeds."""
-    trainer, network, gamma = make_pretrainer(env, config), config.network, config.gamma
+    trainer, player, gamma = make_pretrainer(env, config), make_player(describe_use(env, config)), config.gamma
+    extract = trainer.algorithm.extract
 
-    def begin(pool: World, random: ReplayState, key: Key) -> Saved:
+    def begin(pool: World, random: PyTree, key: Key) -> Saved:
         run = trainer.init(pool, random, key)
-        return Saved(run, Best(extract_prior(run.learner), jnp.float32(-1.0), jnp.float32(-jnp.inf), jnp.int32(0)))
+        return Saved(run, Best(extract(run.learner), jnp.float32(-1.0), jnp.float32(-jnp.inf), jnp.int32(0)))
 
-    graded = functools.partial(grade, env, network, gamma=gamma, episodes=config.eval_episodes)
-    report = functools.partial(make_report, env, network, gamma=gamma, trajectories=config.eval_episodes)
+    graded = functools.partial(grade, env, player, gamma=gamma, episodes=config.eval_episodes)
+    report = functools.partial(make_report, env, player, gamma=gamma, trajectories=config.eval_episodes)
     return Program(
         collect=jax.jit(common.over_seeds(trainer.collect_random, seeds)),
         begin=jax.jit(common.over_seeds(begin, seeds)),
@@ -166,6 +166,7 @@ def make_program(env: Env, config: PretrainConfig, *, seeds: int) -> Program:
         grade=jax.jit(common.over_seeds(graded, seeds, shared=2)),
         better=jax.jit(jax.vmap(keep_better, (0, 0, None))),
         report=jax.jit(common.over_seeds(report, seeds)),
+        extract=extract,
     )
 
 
@@ -173,11 +174,7 @@ def prior_card(args: PretrainArgs, env: Env, gap: Gap | None, found: dict[str, A
     """What a prior says of itself; `found` are its numbers."""
     return {
         "task": env.name,
-        "obs_dim": env.obs_dim,
-        "act_dim": env.act_dim,
-        "network": config_to_json(args.config.network),
-        "ensemble_size": args.config.ensemble_size,
-        "gamma": args.config.gamma,
+        **describe_use(env, args.config),
         "observation": [e._asdict() for e in env.observation],
         "action": [e._asdict() for e in env.action],
         "control_dt": env.control_dt,
@@ -186,7 +183,6 @@ def prior_card(args: PretrainArgs, env: Env, gap: Gap | None, found: dict[str, A
         "gap": None if gap is None else gap._asdict(),
         "preset": args.preset,
         "impl": env.impl,
-        "config": config_to_json(args.config),
         "chosen": f"the best evaluation on held-out worlds after {args.config.choose_from:.0%} of training: success, "
         "then return",
         "metrics": found,
@@ -225,7 +221,7 @@ class _Run:
         self.log.close()
         return summary
 
-    def _random(self) -> ReplayState:
+    def _random(self) -> PyTree:
         """The random-action data: collected once, then read from disk."""
         collect = lambda: self.program.collect(self.pools, common.seed_keys(self.seeds, _RANDOM))  # noqa: E731
         folder = self.home / "random"
@@ -277,7 +273,7 @@ class _Run:
 
     def _examine(self, saved: Saved, done: int) -> tuple[Saved, dict[str, np.ndarray]]:
         """Every evaluation plays the same episodes in the same held-out worlds."""
-        prior = extract_prior(saved.run.learner)
+        prior = self.program.extract(saved.run.learner)
         with self.clock("evaluate"):
             outcome = self.program.grade(self.exam, jax.random.fold_in(jax.random.key(_EXAM_SEED), 1), prior)
             scores = {name: np.asarray(x) for name, x in jax.vmap(score)(outcome).items()}
@@ -286,7 +282,7 @@ class _Run:
         since = self.config.choose_from * self.chunks * self.config.chunk_steps
         return saved._replace(best=self.program.better(saved.best, now, since)), scores
 
-    def _final_exam(self, prior: Prior) -> Outcome:
+    def _final_exam(self, prior: PyTree) -> Outcome:
         """[seeds, >= report_episodes] new episodes in worlds that neither training nor the choice has seen."""
         rounds = math.ceil(self.config.report_episodes / self.config.eval_episodes)
         keys = jax.random.split(jax.random.fold_in(jax.random.key(_REPORT_SEED), 1), rounds)
@@ -335,12 +331,12 @@ class _Run:
         self._say(results)
         return summary
 
-    def _report(self, priors: Prior) -> Report:
+    def _report(self, priors: PyTree) -> Report:
         """[seeds] measurements, as NumPy arrays."""
         keys = common.seed_keys(self.seeds, _REPORT)
         return jax.tree.map(np.asarray, self.program.report(self.pools, priors, keys))
 
-    def _film(self, prior: Prior) -> str:
+    def _film(self, prior: PyTree) -> str:
         """The first seed's prior in one of the worlds of the final exam; the program is that of the exam."""
         one = pick(self.final, jnp.zeros(pool_size(self.final), int))
         qpos = np.asarray(self.program.grade(one, jax.random.key(_REPORT_SEED), prior).qpos[0, 0])
@@ -381,7 +377,8 @@ class _Run:
                 line += f"rank correlation {found['value/rank_correlation']:.2f}, bias {found['value/bias']:+.2f}"
             print(line)
         print(f"results: {self.folder}  (prior/, summary.json, figures/)")
-        print(f"next: python -m experiments.finetune --task {self.env.name} --prior {self.folder}")
+        method = " --method sgft-tdmpc2" if self.config.algorithm == "tdmpc2" else ""
+        print(f"next: python -m experiments.finetune --task {self.env.name}{method} --prior {self.folder}")
 
 
 if __name__ == "__main__":

@@ -1,25 +1,28 @@
-"""Massive SAC in simulation as pure functions: random data, then chunks of (step all environments, insert, update)."""
+"""Massive training in simulation as pure functions: random data, then chunks of (step all, insert, update)."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from envs.base import Env, EnvState, World
 from envs.rollout import Fleet, launch, step_fleet
+from experiments.algorithms import Algorithm, make_algorithm
 from experiments.presets import PretrainConfig
 from sgft_jax import normalizer, replay
 from sgft_jax.mesh import split, whole
-from sgft_jax.sac import SACConfig, SACHyper, SACState, make_sac
-from sgft_jax.types import Array, Key, Learner, Metrics, Transition, UserError
+from sgft_jax.types import Array, Key, Metrics, PyTree, Transition, UserError
 
 
 class PretrainState(NamedTuple):
-    """Everything that changes while pretraining. steps: [] int32, vector steps (of all environments) so far."""
+    """Everything that changes while pretraining: agent, experience, environments.
 
-    learner: SACState
-    replay: replay.ReplayState
+    steps: [] int32, vector steps (of all environments) so far.
+    """
+
+    learner: Any
+    replay: Any
     fleet: Fleet
     key: Key
     steps: Array
@@ -28,95 +31,91 @@ class PretrainState(NamedTuple):
 class Pretrainer(NamedTuple):
     """Pretraining of one seed as pure functions; vmap over seeds (and over pools of worlds).
 
-    collect_random(pool, key) -> a replay of random-action transitions, full but for exploded steps.
+    collect_random(pool, key) -> random-action experience, full but for exploded steps.
     init(pool, random, key) -> PretrainState.
     chunk(pool, random, state) -> (state, metrics): `config.chunk_steps` steps of all environments with their updates.
     """
 
-    learner: Learner
-    collect_random: Callable[[World, Key], replay.ReplayState]
-    init: Callable[[World, replay.ReplayState, Key], PretrainState]
-    chunk: Callable[[World, replay.ReplayState, PretrainState], tuple[PretrainState, Metrics]]
+    algorithm: Algorithm
+    collect_random: Callable[[World, Key], PyTree]
+    init: Callable[[World, PyTree, Key], PretrainState]
+    chunk: Callable[[World, PyTree, PretrainState], tuple[PretrainState, Metrics]]
 
 
 def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
     """Builds the pure functions; raises UserError for sizes that do not fit together."""
     _check(config)
-    learner = make_sac(sac_config(env, config), sac_hyper(config))
+    algorithm = make_algorithm(env, config)
+    learner = algorithm.learner
     step = lambda pool, fleet, actions, key: step_fleet(env, pool, fleet, actions, key, gamma=config.gamma)  # noqa: E731
 
     def uniform_actions(key: Key) -> Array:
         return jax.random.uniform(key, (config.n_envs, env.act_dim), minval=-1.0, maxval=1.0)
 
-    def collect_random(pool: World, key: Key) -> replay.ReplayState:
+    def collect_random(pool: World, key: Key) -> PyTree:
         key_launch, key_steps = jax.random.split(key)
 
-        def random_step(
-            carry: tuple[Fleet, replay.ReplayState], key: Key
-        ) -> tuple[tuple[Fleet, replay.ReplayState], None]:
+        def random_step(carry: tuple[Fleet, PyTree], key: Key) -> tuple[tuple[Fleet, PyTree], None]:
             fleet, buffer = carry
             key_action, key_step = jax.random.split(key)
-            fleet, rows, valid, _ = step(pool, fleet, uniform_actions(key_action), key_step)
-            return (split(fleet), spread_replay(replay.add_batch(buffer, rows, valid))), None
+            fleet, rows, valid, after = step(pool, fleet, uniform_actions(key_action), key_step)
+            return (split(fleet), spread_replay(algorithm.add(buffer, rows, valid, _ended(after)))), None
 
         n_steps = config.random_transitions // config.n_envs
-        buffer = replay.init(replay.blank(env.obs_dim, env.act_dim), n_steps * config.n_envs)
-        start = (launch(env, pool, key_launch, config.n_envs), buffer)
+        start = (launch(env, pool, key_launch, config.n_envs), algorithm.empty(n_steps))
         return jax.lax.scan(random_step, start, jax.random.split(key_steps, n_steps))[0][1]
 
-    def init(pool: World, random: replay.ReplayState, key: Key) -> PretrainState:
+    def init(pool: World, random: Any, key: Key) -> PretrainState:
         key_learner, key_fleet, key_run = jax.random.split(key, 3)
-        held = jnp.arange(random.data.reward.shape[0]) < random.size
-        statistics = normalizer.update(normalizer.init(env.obs_dim), random.data.obs, held)
+        statistics = normalizer.update(normalizer.init(env.obs_dim), random.data.obs, algorithm.held(random))
         agent = learner.init(key_learner).replace(normalizer=normalizer.finish(statistics))
         fleet = launch(env, pool, key_fleet, config.n_envs)
-        buffer = replay.init(replay.blank(env.obs_dim, env.act_dim), config.replay_capacity)
+        buffer = algorithm.empty(config.replay_capacity // config.n_envs)
         return spread(PretrainState(agent, buffer, fleet, key_run, jnp.int32(0)))
 
-    def sample(random: replay.ReplayState, buffer: replay.ReplayState, key: Key) -> Transition:
+    def sample(random: PyTree, buffer: PyTree, key: Key) -> PyTree:
         """[updates, batch] rows, drawn at once; each batch holds its share of random-action rows."""
         key_random, key_replay = jax.random.split(key)
         updates, n_random = config.updates_per_step, round(config.random_fraction * config.batch_size)
 
-        def draw(source: replay.ReplayState, key: Key, n: int) -> Transition:
-            rows = replay.sample(source, key, updates * n)
+        def draw(source: PyTree, key: Key, n: int) -> PyTree:
+            rows = algorithm.sample(source, key, updates * n)
             return jax.tree.map(lambda x: x.reshape(updates, n, *x.shape[1:]), rows)
 
         old, new = draw(random, key_random, n_random), draw(buffer, key_replay, config.batch_size - n_random)
         return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), old, new)
 
-    def explore(agent: SACState, obs: Array, key: Key) -> Array:
+    def explore(agent: PyTree, obs: Array, key: Key) -> Array:
         """[n_envs, act_dim]: the policy's actions, more and more of them replaced by random ones along the fleet."""
         key_policy, key_replace, key_random = jax.random.split(key, 3)
-        act = lambda obs, key: learner.act(agent, (), obs, key, explore=True)[0]  # noqa: E731
-        actions = jax.vmap(act)(obs, jax.random.split(key_policy, config.n_envs))
+        actions = jax.vmap(algorithm.act, (None, 0, 0))(agent, obs, jax.random.split(key_policy, config.n_envs))
         if not config.random_ladder:
             return actions
         share = jnp.linspace(0.0, config.random_ladder, config.n_envs)
         replaced = jax.random.uniform(key_replace, (config.n_envs,)) < share
         return jnp.where(replaced[:, None], uniform_actions(key_random), actions)
 
-    def vector_step(pool: World, random: replay.ReplayState, state: PretrainState) -> tuple[PretrainState, Metrics]:
+    def vector_step(pool: World, random: PyTree, state: PretrainState) -> tuple[PretrainState, Metrics]:
         keys = jax.random.split(state.key, 5)
         actions = explore(state.learner, state.fleet.state.obs, keys[1])
         fleet, rows, valid, after = step(pool, state.fleet, actions, keys[2])
-        buffer = replay.add_batch(state.replay, rows, valid)
+        buffer = algorithm.add(state.replay, rows, valid, _ended(after))
         batches = split(sample(random, buffer, keys[3]), axis=1)
         agent, metrics = jax.lax.scan(
             lambda agent, x: learner.update(agent, *x),
-            state.learner.replace(hyper=sac_hyper(config, progress=state.steps / (config.env_steps / config.n_envs))),
+            state.learner.replace(hyper=algorithm.hyper(state.steps / (config.env_steps / config.n_envs))),
             (batches, jax.random.split(keys[4], config.updates_per_step)),
         )
         metrics = {k: v.mean() for k, v in metrics.items()} | _fleet_metrics(after, rows, valid)
         return spread(PretrainState(agent, buffer, fleet, keys[0], state.steps + 1)), metrics
 
-    def chunk(pool: World, random: replay.ReplayState, state: PretrainState) -> tuple[PretrainState, Metrics]:
+    def chunk(pool: World, random: PyTree, state: PretrainState) -> tuple[PretrainState, Metrics]:
         state, metrics = jax.lax.scan(lambda s, _: vector_step(pool, random, s), state, None, length=config.chunk_steps)
         ended = jnp.maximum(metrics.pop("ended").sum(), 1.0)
         succeeded = metrics.pop("succeeded").sum()
         return state, whole({k: v.mean() for k, v in metrics.items()} | {"train/success": succeeded / ended})
 
-    return Pretrainer(learner, collect_random, init, chunk)
+    return Pretrainer(algorithm, collect_random, init, chunk)
 
 
 def spread(state: PretrainState) -> PretrainState:
@@ -125,36 +124,9 @@ def spread(state: PretrainState) -> PretrainState:
     return own._replace(learner=whole(state.learner), key=whole(state.key), steps=whole(state.steps))
 
 
-def spread_replay(state: replay.ReplayState) -> replay.ReplayState:
-    """The same for experience alone."""
-    return replay.ReplayState(split(state.data), whole(state.position), whole(state.size))
-
-
-def sac_config(env: Env, config: PretrainConfig) -> SACConfig:
-    """The structure of the agent that pretraining trains."""
-    return SACConfig(
-        env.obs_dim,
-        env.act_dim,
-        network=config.network,
-        ensemble_size=config.ensemble_size,
-        policy_delay=config.policy_delay,
-    )
-
-
-def sac_hyper(config: PretrainConfig, *, progress: float | Array = 0.0) -> SACHyper:
-    """Its numbers at `progress` [] from 0 to 1: one learning rate for all networks, as in the paper."""
-    rate = config.lr * (1.0 - (1.0 - config.lr_end) * jnp.minimum(progress, 1.0))
-    hyper = SACHyper(
-        lr_actor=rate,
-        lr_critic=rate,
-        lr_value=rate,
-        lr_dynamics=rate,
-        lr_alpha=rate,
-        tau=config.tau,
-        alpha=config.alpha,
-        entropy_per_dim=config.entropy_per_dim,
-    )
-    return jax.tree.map(jnp.float32, hyper)
+def spread_replay(experience: PyTree) -> PyTree:
+    """The same for experience alone: its rows in pieces, its counters whole."""
+    return jax.tree.map(lambda x: split(x) if x.ndim else whole(x), experience)
 
 
 def memory(env: Env, config: PretrainConfig) -> dict[str, int]:
@@ -166,13 +138,18 @@ def memory(env: Env, config: PretrainConfig) -> dict[str, int]:
 
 
 def _fleet_metrics(after: EnvState, rows: Transition, valid: Array) -> Metrics:
-    ended = (after.truncated | after.terminated) & valid
+    ended = _ended(after) & valid
     return {
         "train/reward": rows.reward.mean(),
         "train/exploded": 1.0 - valid.mean(),
         "ended": ended.sum().astype(jnp.float32),
         "succeeded": (ended & after.success).sum().astype(jnp.float32),
     }
+
+
+def _ended(after: EnvState) -> Array:
+    """[n_envs] whether a step was the last of its episode."""
+    return after.truncated | after.terminated
 
 
 def _check(config: PretrainConfig) -> None:

@@ -5,6 +5,7 @@ name, its manifest last, and then renamed: a process killed at any moment leaves
 complete new one. A prior is such a folder plus a readable `prior.json`. Nothing here ever unpickles anything.
 """
 
+import dataclasses
 import datetime
 import importlib.metadata
 import itertools
@@ -21,12 +22,13 @@ from orbax.checkpoint import v1 as ocp
 
 from sgft_jax import mesh
 from sgft_jax.jsonfile import jsonable, read_json, write_json
+from sgft_jax.tdmpc2 import TDMPC2Prior
 from sgft_jax.types import Normalizer, Prior, PyTree, UserError
 
 FORMAT = 1
 _CHECKPOINTS, _MANIFEST, _STATE, _CARD, _TEMPORARY = "checkpoints", "manifest.json", "state", "prior.json", ".tmp-"
 _PACKAGES = ("jax", "flax", "optax", "orbax-checkpoint", "numpy")
-_NETWORKS = ("actor", "critic", "value", "dynamics")
+_KINDS = {"sac": Prior, "tdmpc2": TDMPC2Prior}
 _PYTHON = {"int": int, "float": float, "bool": bool}
 
 
@@ -109,17 +111,18 @@ def restore(
 # ---------------------------------------------------------------- priors
 
 
-def save_prior(folder: Path, prior: Prior, card: Mapping[str, Any]) -> Path:
+def save_prior(folder: Path, prior: Prior | TDMPC2Prior, card: Mapping[str, Any]) -> Path:
     """Write a prior to `folder`, replacing the one that may be there, and return the folder.
 
-    card: readable JSON-able facts; `task`, `obs_dim` and `act_dim` are checked on loading, the rest (network
-    configuration, gamma, observation entries, domain, config, provenance, metrics) is for the reader. Parameters must
+    card: readable JSON-able facts; `task`, `obs_dim` and `act_dim` are checked on loading, `algorithm` (sac, unless it
+    says otherwise) tells what kind of prior it is, the rest (network configuration, gamma, observation entries, domain,
+    config, provenance, metrics) is for the reader. Parameters must
     be nested dicts of arrays, so that a prior can be read without any code that describes its networks.
     Raises ValueError or TypeError otherwise.
     """
     if missing := {"task", "obs_dim", "act_dim"} - set(card):
         raise ValueError(f"the prior's card lacks {sorted(missing)}")
-    tree = {name: getattr(prior, name) for name in _NETWORKS} | {"normalizer": prior.normalizer._asdict()}
+    tree = vars(prior) | {"normalizer": prior.normalizer._asdict()}
     if not _is_nested_dict(tree):
         raise TypeError("prior parameters must be nested dicts of arrays")
     folder = Path(folder)
@@ -137,8 +140,10 @@ def save_prior(folder: Path, prior: Prior, card: Mapping[str, Any]) -> Path:
 
 def load_prior(
     folder: Path, *, task: str | None = None, obs_dim: int | None = None, act_dim: int | None = None
-) -> tuple[Prior, dict[str, Any]]:
+) -> tuple[Any, dict[str, Any]]:
     """Read (prior, card) from a prior folder, or from the run folder that holds one as `prior/`.
+
+    The prior is a `Prior` or a `TDMPC2Prior`, as the card's `algorithm` says.
 
     Raises UserError if it is missing, torn, or of another task or other observation or action sizes than asked for.
     """
@@ -147,6 +152,9 @@ def load_prior(
         folder = folder / "prior"
     manifest = _manifest(folder)
     card = read_json(folder / _CARD)
+    kind = _KINDS.get(card.get("algorithm", "sac"))
+    if kind is None:
+        raise UserError(f"{folder}: {_CARD} says algorithm={card['algorithm']!r}: choose one of {', '.join(_KINDS)}")
     asked = {"task": task, "obs_dim": obs_dim, "act_dim": act_dim}
     _check_meta(folder, card, {k: v for k, v in asked.items() if v is not None})
     tree = _nest([leaf.path for leaf in _leaves(manifest)], _read(folder, manifest))
@@ -155,7 +163,8 @@ def load_prior(
     statistics = Normalizer(**tree.pop("normalizer"))
     if statistics.mean.shape != (card["obs_dim"],):
         raise UserError(f"{folder}: {_CARD} says obs_dim={card['obs_dim']}, the statistics have {len(statistics.mean)}")
-    return Prior(**{name: tree.get(name, {}) for name in _NETWORKS}, normalizer=statistics), card
+    names = [field.name for field in dataclasses.fields(kind) if field.name != "normalizer"]
+    return kind(**{name: tree.get(name, {}) for name in names}, normalizer=statistics), card
 
 
 def _is_nested_dict(tree: PyTree) -> bool:

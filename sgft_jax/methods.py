@@ -8,7 +8,7 @@ from sgft_jax.networks import NetworkConfig
 from sgft_jax.sgft import branch, shape, shorten
 from sgft_jax.types import Array, BatchTransform, UserError, unknown
 
-AgentName = Literal["sac", "iql"]
+AgentName = Literal["sac", "iql", "tdmpc2"]
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,10 @@ class FinetuneConfig:
     alpha: temperature, fixed unless `tune_alpha` lets it follow a target entropy of `entropy_per_dim` nats per action
         dimension. network: must be the prior's.
     critic_network: body of a new critic. LayerNorm tames extrapolation on little data (RLPD); default as the prior's.
+    size: of TD-MPC2's networks; must be the prior's. For it `horizon` is the length of plans and training windows,
+        `lr_critic` the rate of all networks, and `train_critic` False makes it SGFT-TDMPC-2: encoder, critic and the
+        policy in V_sim stay the simulator's; train_encoder is the ablation that lets the encoder learn.
+    plan_samples: sequences that a plan tries in each of its iterations.
     critics, target_critics, actor_mean, policy_delay, train_critic: see `SACConfig`. A kept critic has two members.
     reset_critic: None = the method's default. A kept critic under a shaped reward is read as Q_sim(s, a) - V_sim(s),
         its exact meaning in simulation.
@@ -64,6 +68,9 @@ class FinetuneConfig:
     actor_mean: bool = False
     policy_delay: int = 1
     train_critic: bool = True
+    size: str = "5M"
+    plan_samples: int = 512
+    train_encoder: bool = False
     reset_critic: bool | None = None
     critic_warmup: int | None = None
     actor_ramp: int = 1000
@@ -120,6 +127,16 @@ class Method(NamedTuple):
     fresh: bool
     utd: float
     options: Mapping[str, Any]
+
+    @property
+    def prior(self) -> str:
+        """The algorithm of the priors it starts from: sac or tdmpc2."""
+        return "tdmpc2" if self.agent == "tdmpc2" else "sac"
+
+    @property
+    def pilot(self) -> "Method":
+        """The method whose agent is the simulator's policy until it learns; what critic it has does not matter."""
+        return METHODS["tdmpc2" if self.agent == "tdmpc2" else "sac-reset"]
 
     @property
     def simulated(self) -> bool:
@@ -181,6 +198,18 @@ METHODS: dict[str, Method] = {
             "iql", "", "in-sample learning: offline from the simulator, then online", "Kostrikov 2022",
             agent="iql", fresh=True, lr_actor=3e-4, simulated_share=0.5, simulated_transitions=1_000_000,
             offline_updates=500_000, critic_warmup=0, actor_ramp=0,
+        ),
+        _method(
+            "tdmpc2", "", "plans with the simulator's world model, and all of it learns", "Hansen 2024",
+            agent="tdmpc2", utd=1.0, horizon=4, tau=0.01,
+        ),
+        _method(
+            "sgft-tdmpc2-code", "shape", "SGFT as its released code has it: TD-MPC2 from scratch, shaped rewards",
+            "SGFT 2025, code", agent="tdmpc2", fresh=True, utd=1.0, horizon=3, tau=0.01,
+        ),
+        _method(
+            "sgft-tdmpc2", "", "SGFT-TDMPC-2: plans of H steps that end in a frozen V_sim", "SGFT 2025",
+            agent="tdmpc2", utd=1.0, horizon=4, tau=0.01, train_critic=False,
         ),
         _method("sgft", "shape shorten", "model-free SGFT", "SGFT 2025"),
         _method("sgft-sac", "branch shape shorten", "SGFT-SAC", "SGFT 2025"),

@@ -108,13 +108,14 @@ def pretraining(
     dynamics_error: ArrayLike,
     baseline_error: ArrayLike | None = None,
 ) -> Path:
-    """Four panels: success and return while training, V_sim against what happened, model error by horizon.
+    """Panels: success and return while training, V_sim against what happened, model error by horizon if there is one.
 
     steps, success, returns: [n_evaluations], steps in env steps. value, monte_carlo: [n] V_sim of a state and the
     discounted return that followed. dynamics_error: [horizon] mean normalised error of the model's open-loop prediction
     1, 2, ... steps ahead; baseline_error: the same for predicting that nothing changes.
     """
-    figure, panels = _figure(12.0, 3.2, columns=4)
+    columns = 4 if np.size(dynamics_error) else 3
+    figure, panels = _figure(3.0 * columns, 3.2, columns=columns)
     for axes, values, name in zip(panels, (success, returns), ("success rate", "return"), strict=False):
         axes.plot(np.asarray(steps) / 1e6, np.asarray(values), color=PALETTE[0], linewidth=2)
         axes.set_title(name, **_FONT, loc="left")
@@ -122,7 +123,8 @@ def pretraining(
         axes.set_xlim(left=0)
     panels[0].set_ylim(-0.03, 1.03)
     _value_panel(panels[2], np.asarray(value), np.asarray(monte_carlo))
-    _dynamics_panel(panels[3], np.asarray(dynamics_error), baseline_error)
+    if columns == 4:
+        _dynamics_panel(panels[3], np.asarray(dynamics_error), baseline_error)
     figure.suptitle(title, x=0.005, ha="left", size=12, weight="bold", color=_INK)
     return _save(figure, path)
 

@@ -52,13 +52,14 @@ class Learner(NamedTuple):
     init(key) -> state
     init_carry() -> carry: what the policy remembers between steps; () for an MLP.
     act(state, carry, obs, key, *, explore) -> (action, carry): one observation; `explore` is static.
-    update(state, batch, key) -> (state, metrics): one gradient step of every trained network on a `[B, ...]` batch.
+    update(state, batch, key) -> (state, metrics): one gradient step of every trained network on a `[B, ...]` batch of
+        transitions, or of what the learner says it needs.
     """
 
     init: Callable[[Key], PyTree]
     init_carry: Callable[[], PyTree]
     act: Callable[..., tuple[Array, PyTree]]
-    update: Callable[[PyTree, Transition, Key], tuple[PyTree, Metrics]]
+    update: Callable[[PyTree, Any, Key], tuple[PyTree, Metrics]]
 
 
 class Normalizer(NamedTuple):

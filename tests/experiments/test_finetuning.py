@@ -234,10 +234,9 @@ def film(path, monkeypatch, scene=None, reason=None):
     pool = env.sample_worlds(jax.random.key(0), 3)
 
     def play():
-        springs = [lambda obs, key, stiffness=stiffness: stiffness * -obs[:2] for stiffness in (0.0, 1.0)]
-        played = [
-            play_episodes(env, pool, spring, jax.random.split(jax.random.key(4), 1), gamma=1.0) for spring in springs
-        ]
+        springs = [lambda carry, obs, key, k=k: (k * -obs[:2], carry) for k in (0.0, 1.0)]
+        keys = jax.random.split(jax.random.key(4), 1)
+        played = [play_episodes(env, pool, spring, (), keys, gamma=1.0) for spring in springs]
         return [jax.tree.map(lambda x: x[0], episodes) for episodes in played]
 
     return video.before_and_after(env, pool, play, path / "v/e.mp4", rollouts=7), pool

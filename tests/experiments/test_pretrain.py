@@ -15,10 +15,11 @@ import pytest
 
 import envs
 from experiments import pretrain
+from experiments.algorithms import sac_hyper
 from experiments.common import network_of
 from experiments.evaluation import Best, keep_better
 from experiments.presets import PRESETS
-from experiments.pretraining import make_pretrainer, sac_hyper
+from experiments.pretraining import make_pretrainer
 from sgft_jax import checkpoint
 from sgft_jax.log import MetricsLog, read_jsonl
 from sgft_jax.networks import NetworkConfig

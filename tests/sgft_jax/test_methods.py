@@ -20,6 +20,9 @@ from sgft_jax.types import UserError
         ("sac-online", False, False, False, False),
         ("rlpd", False, False, False, False),
         ("iql", False, False, False, False),
+        ("tdmpc2", False, False, False, False),
+        ("sgft-tdmpc2", False, False, False, False),
+        ("sgft-tdmpc2-code", True, False, False, False),
     ],
 )
 def test_method_table(name, value, dynamics, reset, finite):
@@ -33,7 +36,11 @@ def test_the_table_is_complete():
     (tested,) = (mark.args[1] for mark in test_method_table.pytestmark)
     assert {row[0] for row in tested} == set(methods.METHODS)
     assert {m.name for m in methods.METHODS.values() if m.simulated} == {"sac-online", "rlpd", "iql"}
-    assert {m.name for m in methods.METHODS.values() if m.fresh} == {"rlpd", "iql"}
+    assert {m.name for m in methods.METHODS.values() if m.fresh} == {"rlpd", "iql", "sgft-tdmpc2-code"}
+    assert {m.name for m in methods.METHODS.values() if m.prior == "tdmpc2"} == {
+        "tdmpc2", "sgft-tdmpc2", "sgft-tdmpc2-code",
+    }  # fmt: skip
+    assert all(m.pilot.prior == m.prior and not m.pilot.fresh for m in methods.METHODS.values())
 
 
 def test_a_methods_own_options_and_changes_to_them():

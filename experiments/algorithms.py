@@ -1,0 +1,142 @@
+"""What pretraining asks of an algorithm, and the two there are: SAC and TD-MPC2. Pure."""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from envs.base import Env
+from experiments.presets import PretrainConfig
+from sgft_jax import replay, sac, sequences, tdmpc2
+from sgft_jax.config import config_from_json, config_to_json
+from sgft_jax.networks import NetworkConfig
+from sgft_jax.players import Player, sac_player, tdmpc2_player
+from sgft_jax.types import Array, Key, Learner, PyTree, Transition, UserError
+
+
+class Algorithm(NamedTuple):
+    """A learner and its experience as pretraining uses them.
+
+    hyper(progress [] from 0 to 1) -> its numbers.
+    act(agent, obs, key) -> an exploring action [act_dim], cheap enough for thousands of environments.
+    extract(agent) -> what it hands to fine-tuning.
+    empty(steps) -> experience for that many steps of all environments.
+    add(experience, rows [n_envs], valid [n_envs], last [n_envs]) -> the same with one step more; valid: not exploded;
+        last: of its episode.
+    held(experience) -> [capacity] bool. sample(experience, key, n) -> a batch [n, ...] of what the learner learns from.
+    """
+
+    learner: Learner
+    hyper: Callable[[float | Array], Any]
+    act: Callable[[PyTree, Array, Key], Array]
+    extract: Callable[[Any], PyTree]
+    empty: Callable[[int], PyTree]
+    add: Callable[[PyTree, Transition, Array, Array], PyTree]
+    held: Callable[[PyTree], Array]
+    sample: Callable[[PyTree, Key, int], PyTree]
+
+
+def make_algorithm(env: Env, config: PretrainConfig) -> Algorithm:
+    """The one that `config.algorithm` names."""
+    return {"sac": _sac, "tdmpc2": _tdmpc2}[config.algorithm](env, config)
+
+
+def make_player(card: Mapping[str, Any]) -> Player:
+    """How the prior with this card acts and judges; raises UserError for one of an algorithm unknown here."""
+    obs_dim, act_dim = card["obs_dim"], card["act_dim"]
+    match algorithm_of(card):
+        case "sac":
+            return sac_player(obs_dim, act_dim, config_from_json(NetworkConfig, card["network"], where="network."))
+        case "tdmpc2":
+            own = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
+            structure = tdmpc2.named_config(obs_dim, act_dim, **own)
+            return tdmpc2_player(structure, tdmpc2.TDMPC2Hyper(gamma=card["gamma"]))
+        case other:
+            raise UserError(f"the prior's card names the algorithm {other!r}, this version knows sac and tdmpc2")
+
+
+def describe_use(env: Env, config: PretrainConfig) -> dict[str, Any]:
+    """What the card of a prior says of how to use it."""
+    return {
+        "algorithm": config.algorithm,
+        "obs_dim": env.obs_dim,
+        "act_dim": env.act_dim,
+        "network": config_to_json(config.network),
+        "ensemble_size": config.ensemble_size,
+        "gamma": config.gamma,
+        "config": config_to_json(config),
+    }
+
+
+def algorithm_of(card: Mapping[str, Any]) -> str:
+    """Which algorithm a prior is from; the first priors did not say, they were all SAC's."""
+    return card.get("algorithm", "sac")
+
+
+def _rate(config: PretrainConfig, progress: float | Array) -> float | Array:
+    return config.lr * (1.0 - (1.0 - config.lr_end) * jnp.minimum(progress, 1.0))
+
+
+# --- SAC --------------------------------------------------------------------------------------------------------------
+
+
+def _sac(env: Env, config: PretrainConfig) -> Algorithm:
+    structure = sac.SACConfig(
+        env.obs_dim,
+        env.act_dim,
+        network=config.network,
+        ensemble_size=config.ensemble_size,
+        policy_delay=config.policy_delay,
+    )
+    learner = sac.make_sac(structure, sac_hyper(config))
+    return Algorithm(
+        learner=learner,
+        hyper=lambda progress: sac_hyper(config, progress=progress),
+        act=lambda agent, obs, key: learner.act(agent, (), obs, key, explore=True)[0],
+        extract=sac.extract_prior,
+        empty=lambda steps: replay.init(replay.blank(env.obs_dim, env.act_dim), steps * config.n_envs),
+        add=lambda experience, rows, valid, last: replay.add_batch(experience, rows, valid),
+        held=lambda experience: jnp.arange(experience.data.reward.shape[0]) < experience.size,
+        sample=replay.sample,
+    )
+
+
+def sac_hyper(config: PretrainConfig, *, progress: float | Array = 0.0) -> sac.SACHyper:
+    """The numbers of SAC at `progress` [] from 0 to 1: one learning rate for all networks, as in the paper."""
+    rate = _rate(config, progress)
+    hyper = sac.SACHyper(
+        lr_actor=rate,
+        lr_critic=rate,
+        lr_value=rate,
+        lr_dynamics=rate,
+        lr_alpha=rate,
+        tau=config.tau,
+        alpha=config.alpha,
+        entropy_per_dim=config.entropy_per_dim,
+    )
+    return jax.tree.map(jnp.float32, hyper)
+
+
+# --- TD-MPC2 ----------------------------------------------------------------------------------------------------------
+
+
+def _tdmpc2(env: Env, config: PretrainConfig) -> Algorithm:
+    own = {name: getattr(config, name) for name in ("horizon", "size", "plan_samples")}
+    structure = tdmpc2.named_config(env.obs_dim, env.act_dim, **own)
+
+    def hyper(progress: float | Array) -> tdmpc2.TDMPC2Hyper:
+        numbers = tdmpc2.TDMPC2Hyper(lr=_rate(config, progress), tau=config.tau, gamma=config.gamma)
+        return jax.tree.map(jnp.float32, numbers)
+
+    return Algorithm(
+        learner=tdmpc2.make_tdmpc2(structure, hyper(0.0)),
+        hyper=hyper,
+        # The policy alone: a plan costs some ten thousand evaluations of the model, the policy one.
+        act=lambda agent, obs, key: tdmpc2.policy_action(structure, agent, obs, key, explore=True),
+        extract=tdmpc2.extract_prior,
+        empty=lambda steps: sequences.init(replay.blank(env.obs_dim, env.act_dim), steps, config.n_envs),
+        add=sequences.add,
+        held=lambda experience: experience.valid,
+        sample=lambda experience, key, n: sequences.sample(experience, key, n, config.horizon),
+    )

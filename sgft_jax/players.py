@@ -1,0 +1,62 @@
+"""How the parameters of a prior act and judge, whichever algorithm they come from."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+
+from sgft_jax import dynamics, tdmpc2, value
+from sgft_jax.networks import NetworkConfig, make_actor, make_dynamics, make_value, tanh_gaussian_action
+from sgft_jax.normalizer import normalize
+from sgft_jax.types import Array, Key, Prior, PyTree
+
+
+class Player(NamedTuple):
+    """Functions of a prior's parameters, for one example.
+
+    init_carry() -> what it remembers from step to step of an episode.
+    act(prior, carry, obs, key, *, explore) -> (action, carry); `explore` is static.
+    value(prior, obs) -> []: V_sim, deterministic.
+    model_error(prior, obs [T + 1, obs_dim], actions [T, act_dim]) -> [T]: how far its model drifts from a trajectory,
+        in standard deviations of the observation; None where the model does not predict observations.
+    """
+
+    init_carry: Callable[[], PyTree]
+    act: Callable[..., tuple[Array, PyTree]]
+    value: Callable[[Any, Array], Array]
+    model_error: Callable[[Any, Array, Array], Array] | None
+
+
+def sac_player(obs_dim: int, act_dim: int, network: NetworkConfig) -> Player:
+    """Actor, V_sim and dynamics ensemble of a `Prior`."""
+    actor, judge, model = (
+        make_actor(obs_dim, act_dim, network), make_value(obs_dim, network), make_dynamics(obs_dim, act_dim, network)
+    )  # fmt: skip
+
+    def act(prior: Prior, carry: PyTree, obs: Array, key: Key, *, explore: bool) -> tuple[Array, PyTree]:
+        moments = actor.apply(prior.actor, normalize(prior.normalizer, obs))
+        return tanh_gaussian_action(moments, key, explore=explore), carry
+
+    return Player(
+        init_carry=lambda: (),
+        act=act,
+        value=lambda prior, obs: value.predict(judge, prior.value, prior.normalizer, obs),
+        model_error=lambda prior, obs, actions: dynamics.rollout_error(
+            model, prior.dynamics, prior.normalizer, obs, actions
+        ),
+    )
+
+
+def tdmpc2_player(config: tdmpc2.TDMPC2Config, hyper: tdmpc2.TDMPC2Hyper) -> Player:
+    """The planner and the value of a `TDMPC2Prior`."""
+    learner = tdmpc2.make_tdmpc2(config, hyper)
+
+    def state(prior: tdmpc2.TDMPC2Prior) -> tdmpc2.TDMPC2State:
+        return tdmpc2.fine_tune_state(config, hyper, prior, jax.random.key(0))
+
+    return Player(
+        init_carry=learner.init_carry,
+        act=lambda prior, *step, explore: learner.act(state(prior), *step, explore=explore),
+        value=lambda prior, obs: tdmpc2.value_of(config, state(prior), obs),
+        model_error=None,
+    )

@@ -1,0 +1,120 @@
+"""A ring of time slots on the device, for learners that roll a model along consecutive transitions.
+
+A slot holds one step of every environment, also of those whose physics exploded, so that the successor of a row is
+found one slot further. Pure functions of a state that the caller donates; one buffer, vmapped over seeds.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from sgft_jax.mesh import set_rows
+from sgft_jax.types import Array, Key, Transition, UserError
+
+
+class Sequences(NamedTuple):
+    """Windows of consecutive transitions of one episode.
+
+    rows: [B, H, ...]; `next_obs` of step t is `obs` of step t + 1 where both are valid.
+    valid: [B, H] bool, True for the leading steps that belong to the window and False from the first on that does not.
+        Invalid rows must be finite; `sample` makes them zeros.
+    """
+
+    rows: Transition
+    valid: Array
+
+
+class SequenceState(struct.PyTreeNode):
+    """A ring of `slots` time slots for `n_envs` environments; row = slot * n_envs + environment.
+
+    data: rows on a leading [slots * n_envs] axis. valid: which hold a transition that may be learned from.
+    last: which end an episode. position: [] int32 next slot to write. size: [] int32 slots held.
+    """
+
+    data: Transition
+    valid: Array
+    last: Array
+    position: Array
+    size: Array
+    n_envs: int = struct.field(pytree_node=False)
+
+    @property
+    def slots(self) -> int:
+        """Time slots there are."""
+        return self.valid.shape[-1] // self.n_envs
+
+
+def init(example: Transition, slots: int, n_envs: int = 1) -> SequenceState:
+    """An empty ring for transitions shaped like `example` (one transition, no batch axis)."""
+    if slots < 1 or n_envs < 1:
+        raise UserError(f"sequence ring of {slots} slots for {n_envs} environments: both must be at least 1")
+    rows = slots * n_envs
+    data = jax.tree.map(lambda x: jnp.zeros((rows, *jnp.shape(x)), jnp.asarray(x).dtype), example)
+    no = jnp.zeros(rows, bool)
+    return SequenceState(data, no, jnp.copy(no), jnp.int32(0), jnp.int32(0), n_envs)
+
+
+def add(state: SequenceState, rows: Transition, valid: Array, last: Array) -> SequenceState:
+    """Write one step of every environment over the oldest slot.
+
+    rows: [n_envs, ...]. valid: [n_envs] bool, not exploded. last: [n_envs] bool, terminated or truncated here: the
+    environment's next row begins another episode.
+    """
+    if valid.shape[0] != state.n_envs:
+        raise UserError(f"sequence ring: one step of {valid.shape[0]} environments, but it is for {state.n_envs}")
+    index = state.position * state.n_envs + jnp.arange(state.n_envs)
+    return _write(state, index, rows, valid, last, jnp.int32(1))
+
+
+def add_episode(state: SequenceState, rows: Transition, valid: Array) -> SequenceState:
+    """Write one whole episode into a ring of one environment.
+
+    rows: [T, ...] with T <= slots. valid: [T] bool; invalid rows take no space, and the row before them ends what came
+    before, as does the last one.
+    """
+    steps, slots = valid.shape[0], state.slots
+    if state.n_envs != 1:
+        raise UserError(f"sequence ring: an episode needs a ring of 1 environment, this one is for {state.n_envs}")
+    if steps > slots:
+        raise UserError(f"sequence ring: an episode of {steps} steps does not fit {slots} slots; raise the capacity")
+    rank = jnp.cumsum(valid, dtype=jnp.int32) - 1
+    index = jnp.where(valid, (state.position + rank) % slots, slots)
+    last = valid & ~jnp.concatenate([valid[1:], jnp.zeros(1, bool)])
+    return _write(state, index, rows, valid, last, jnp.sum(valid, dtype=jnp.int32))
+
+
+def _write(
+    state: SequenceState, index: Array, rows: Transition, valid: Array, last: Array, steps: Array
+) -> SequenceState:
+    data, valid, last = set_rows((state.data, state.valid, state.last), index, (rows, valid, last))
+    position, size = (state.position + steps) % state.slots, jnp.minimum(state.size + steps, state.slots)
+    return state.replace(data=data, valid=valid, last=last, position=position, size=size)
+
+
+def sample(state: SequenceState, key: Key, n: int, length: int) -> Sequences:
+    """Draw n windows of up to `length` steps, each starting at a valid row drawn uniformly with replacement.
+
+    A window is cut, by its mask, before an invalid row, after the last row of an episode and at the newest slot. Were
+    windows redrawn until they fit, the last rows of an episode, where it is won or lost, would come up less often and
+    with the small weights of late steps, and rows of an episode shorter than `length` never. Masked, every stored row
+    is as often the first of a window as any other.
+    Nothing is valid while the ring is empty. Draw the windows of several updates at once: counting the valid rows
+    visits the whole ring.
+    """
+    count = jnp.cumsum(state.valid, dtype=jnp.int32)
+    nth = jax.random.randint(key, (n,), 0, jnp.maximum(count[-1], 1))
+    start = jnp.minimum(jnp.searchsorted(count, nth, side="right"), count.shape[0] - 1)
+    return jax.vmap(lambda row: _window(state, row, length))(start)
+
+
+def _window(state: SequenceState, start: Array, length: int) -> Sequences:
+    """The window [length, ...] that begins at row `start` []."""
+    slot, env = start // state.n_envs, start % state.n_envs
+    age, steps = (slot - state.position + state.size) % state.slots, jnp.arange(length)  # age: slots after the oldest
+    index = (slot + steps) % state.slots * state.n_envs + env
+    follows = jnp.concatenate([jnp.ones(1, bool), ~state.last[index][:-1]])
+    valid = jnp.cumprod((age + steps < state.size) & state.valid[index] & follows).astype(bool)
+    blank = lambda x: jnp.where(jnp.expand_dims(valid, tuple(range(1, x.ndim))), x, jnp.zeros_like(x))  # noqa: E731
+    return Sequences(jax.tree.map(lambda d: blank(d[index]), state.data), valid)
