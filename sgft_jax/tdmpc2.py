@@ -199,7 +199,10 @@ class _Body(nn.Module):
             if layer == 0:
                 x = nn.Dropout(self.dropout, deterministic=not train)(x)
             x = mish(nn.LayerNorm(epsilon=1e-5)(x))
-        x = nn.Dense(self.outputs, kernel_init=nn.initializers.zeros if self.zero else weights)(x)
+        # Zeros that XLA cannot know to be zeros: in a program that makes constant ones and uses them (init and update in
+        # one jit), jaxlib 0.12.0 for CPUs reads memory that nobody wrote, and losses are NaN at times.
+        last = nn.initializers.normal(0.0) if self.zero else weights
+        x = nn.Dense(self.outputs, kernel_init=last)(x)
         if self.simnorm_group is None:
             return x
         return simnorm(nn.LayerNorm(epsilon=1e-5)(x), self.simnorm_group)

@@ -27,14 +27,15 @@ def make(name):
     tuner = finetune.make_finetuner(
         methods.get_method(name), config, obs_dim=2, act_dim=2, reward=lambda *x: 0.0, terminated=lambda *x: False
     )
-    return tuner._replace(learn=jax.jit(tuner.learn, static_argnums=2), act=jax.jit(tuner.act))
+    compiled = {name: jax.jit(getattr(tuner, name)) for name in ("init", "observe", "act")}
+    return tuner._replace(learn=jax.jit(tuner.learn, static_argnums=2), **compiled)
 
 
 @pytest.fixture
 def prior():
     """Of an agent whose critic has an opinion: heads are zero before they learn."""
     config = tdmpc2.named_config(2, 2, size="tiny", plan_samples=24, horizon=LENGTH)
-    state = tdmpc2.make_tdmpc2(config).init(jax.random.key(7))
+    state = jax.jit(tdmpc2.make_tdmpc2(config).init)(jax.random.key(7))
     prior = tdmpc2.extract_prior(state)
     last = prior.critic["Dense_2"]
     loud = {**last, "kernel": 0.5 * jax.random.normal(jax.random.key(8), last["kernel"].shape)}

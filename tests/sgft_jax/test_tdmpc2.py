@@ -47,7 +47,7 @@ def windows(key, horizon=2):
     obs = jax.random.normal(keys[0], (ROWS, horizon + 1, 2))
     action = jax.random.uniform(keys[1], (ROWS, horizon, 1), minval=-1)
     reward = jax.random.normal(keys[2], (ROWS, horizon))
-    discount = 0.9 * jax.random.bernoulli(keys[3], 0.8, (ROWS, horizon))
+    discount = jnp.float32(0.9) * jax.random.bernoulli(keys[3], 0.8, (ROWS, horizon))
     no = jnp.zeros((ROWS, horizon), bool)
     valid = jnp.ones((ROWS, horizon), bool).at[-ROWS // 4 :, -1].set(False)
     rows = Transition(obs[:, :-1], action, reward, discount, obs[:, 1:], no, no.astype(jnp.int32))
@@ -472,7 +472,7 @@ def probe(key, *, ends):
     at = jnp.stack([first, jnp.ones(ROWS)], axis=1)
     obs, last = jnp.stack([at, jnp.zeros_like(at)], axis=2), at > 0
     action = jax.random.uniform(key, (ROWS, 2, 1), minval=-1)
-    discount = jnp.where(last & ends, 0.0, 0.8)
+    discount = jnp.where(last & ends, jnp.float32(0.0), 0.8)
     following = jnp.tile(jnp.array([1.0, 0.0]), (ROWS, 2, 1))
     rows = Transition(obs, action, jnp.maximum(at, 0.0), discount, following, last, last.astype(jnp.int32))
     return Sequences(rows, jnp.stack([jnp.ones(ROWS, bool), first < 0], axis=1))  # all rows at state 1 are the last
@@ -548,5 +548,4 @@ def test_learns_to_push_a_cart(key):
     state = train(PLAIN, INIT(key), functools.partial(draw, ring), key_train, 1000)
     planned = play(lambda memory, obs, key: LEARNERS[PLAIN].act(state, memory, obs, key, explore=False))
     alone = play(lambda memory, obs, key: (tdmpc2.policy_action(PLAIN, state, obs, key, explore=False), memory))
-    print(random, planned, alone)
-    assert random < 2 and planned > 8.5 and alone > 8.0
+    assert random < 2 and planned > 8.8 and alone > 8.6

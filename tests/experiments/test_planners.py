@@ -1,0 +1,96 @@
+"""TD-MPC2 through the commands: pretraining, priors, fine-tuning and evaluation on a point mass."""
+
+import json
+import os
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toy
+from test_common import save_prior
+
+import envs
+from experiments import cli, evaluate, finetune, pretrain
+from experiments.algorithms import make_player
+from experiments.evaluation import grade
+from sgft_jax import checkpoint, tdmpc2
+from sgft_jax.log import read_jsonl
+
+PRETRAIN = """--task toy --preset tdmpc2 --no-video --config.size tiny --config.plan-samples 24 --config.n-envs 16
+    --config.worlds 8 --config.env-steps 640 --config.random-transitions 160 --config.replay-capacity 320
+    --config.batch-size 16 --config.updates-per-step 1 --config.chunk-steps 20 --config.eval-every 1
+    --config.checkpoint-every 1 --config.eval-episodes 8 --config.report-episodes 8 --config.gamma 0.9"""
+FINETUNE = """--task toy --no-video --seeds 2 --rollouts 4 --initial-rollouts 2 --eval-every 1 --eval-episodes 4
+    --checkpoint-every 1 --options.plan-samples 24 --options.batch-size 16 --options.replay-capacity 256"""
+
+
+@pytest.fixture(autouse=True)
+def _toy(monkeypatch):
+    monkeypatch.setitem(envs.TASKS, "toy", "toy")
+    monkeypatch.setitem(tdmpc2.SIZES, "tiny", tdmpc2.Size(8, 8, 8, 2, 2))
+    monkeypatch.setattr(os, "environ", os.environ.copy())
+    monkeypatch.setattr(cli, "set_up", lambda: None)
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    return tmp_path_factory.mktemp("runs")
+
+
+def started(home):
+    """A pretraining run, made once for all tests of the module."""
+    run = home / "pretrain/toy/tdmpc2/seed-0"
+    if not run.exists():
+        pretrain.main([*PRETRAIN.split(), "--out", str(home)])
+    return run
+
+
+@pytest.mark.slow
+def test_a_prior_of_td_mpc2_plays_as_its_card_says(home):
+    run = started(home)
+    prior, card = checkpoint.load_prior(run / "prior/seed-0", task="toy")
+    assert isinstance(prior, tdmpc2.TDMPC2Prior) and card["algorithm"] == "tdmpc2"
+    assert "value/explained_variance" in card["metrics"] and "dynamics/error" not in card["metrics"]
+    assert (run / "figures/seed-0.png").stat().st_size > 10_000
+    env, player = toy.make(), make_player(card)
+    outcome = grade(
+        env, player, env.sample_worlds(jax.random.key(0), 4), jax.random.key(1), prior, gamma=0.9, episodes=4
+    )
+    found = evaluate.evaluate(evaluate.EvaluateArgs(prior=run, episodes=4))
+    assert np.isfinite(outcome.total_reward).all() and found["policies"][0]["exploded"] == 0
+    assert jnp.isfinite(player.value(prior, jnp.zeros(4)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["tdmpc2", "sgft-tdmpc2", "sgft-tdmpc2-code"])
+def test_fine_tuning_and_its_continuation(home, method):
+    """Two runs of 3 rollouts, one of which stops after 2 and is resumed: the same bits."""
+    run = started(home)
+    gap = home / "heavy.toml"
+    gap.write_text("[params]\nmass = 2.0\n")
+    arguments = [*FINETUNE.split(), "--method", method, "--prior", str(run), "--real", str(gap)]
+    whole, parts = home / f"{method}-whole", home / f"{method}-parts"
+    finetune.main([*arguments, "--out", str(whole)])
+    finetune.main([*arguments, "--out", str(parts), "--rollouts", "3"])
+    finetune.main([*arguments, "--out", str(parts), "--resume"])
+    folders = [out / f"finetune/toy/heavy/{method}/seeds-0-1" for out in (whole, parts)]
+    curves = [[read_jsonl(folder / name)[-1] for name in ("eval.jsonl", "metrics.jsonl")] for folder in folders]
+    assert curves[0] == curves[1]
+    assert json.loads((folders[0] / "summary.json").read_text())["final"]["rollouts"] == 4
+    assert checkpoint.load_prior(folders[0] / "policy/seed-1", task="toy")[1]["finetuned"]["method"] == method
+
+
+def test_methods_refuse_the_other_algorithms_priors(tmp_path, capsys):
+    save_prior(tmp_path / "seed-0", 0)
+    gap = tmp_path / "heavy.toml"
+    gap.write_text("[params]\nmass = 2.0\n")
+    common = ["--task", "toy", "--real", str(gap), "--prior", str(tmp_path), "--out", str(tmp_path)]
+    with pytest.raises(SystemExit) as stopped:
+        finetune.main(["--method", "sgft-tdmpc2", *common])
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert (
+        error.startswith("error: --method sgft-tdmpc2 needs a prior of tdmpc2, not of sac") and error.count("\n") == 1
+    )
+    assert "--preset tdmpc2" in error
