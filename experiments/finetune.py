@@ -27,13 +27,13 @@ from experiments.presets import PRESETS
 from experiments.results import describe_run, read_curve
 from experiments.video import before_and_after
 from sgft_jax import checkpoint, mesh, plot, runs
-from sgft_jax.finetune import Finetuner, make_finetuner
+from sgft_jax.finetune import make_finetuner
 from sgft_jax.log import MetricsLog, RealLog, RunProgress, write_summary
 from sgft_jax.methods import METHODS, FinetuneConfig, Method, finetune_config, get_method
 from sgft_jax.players import Player
 from sgft_jax.replay import ReplayState
 from sgft_jax.stats import iqm_interval
-from sgft_jax.types import Array, Key, PyTree, UserError
+from sgft_jax.types import Array, Finetuner, Key, PyTree, UserError
 
 DEFAULT_METHOD, DEFAULT_PRESET = "sgft-sac", "fast"
 _SIMULATED_WORLDS = 256

@@ -15,10 +15,9 @@ from envs.base import Env, World
 from envs.rollout import Episode, play_episode
 from experiments.evaluation import play_episodes, prior_policy
 from sgft_jax import replay
-from sgft_jax.finetune import Finetuner, Simulated
 from sgft_jax.mesh import split_vmap
 from sgft_jax.players import Player
-from sgft_jax.types import Array, Key, Metrics, PyTree, Transition
+from sgft_jax.types import Array, Finetuner, Key, Metrics, PyTree, Simulated, Transition
 
 _INIT, _COLLECT, _LEARN, _EVALUATE, _OFFLINE = range(5)  # purposes, folded into a seed's key
 _AT_ONCE = 1024  # simulated episodes played together

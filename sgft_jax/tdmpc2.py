@@ -199,8 +199,8 @@ class _Body(nn.Module):
             if layer == 0:
                 x = nn.Dropout(self.dropout, deterministic=not train)(x)
             x = mish(nn.LayerNorm(epsilon=1e-5)(x))
-        # Zeros that XLA cannot know to be zeros: in a program that makes constant ones and uses them (init and update in
-        # one jit), jaxlib 0.12.0 for CPUs reads memory that nobody wrote, and losses are NaN at times.
+        # Zeros that XLA cannot know to be zeros: in a program that makes constant ones and uses them (init and update
+        # in one jit), jaxlib 0.12.0 for CPUs reads memory that nobody wrote, and losses are NaN at times.
         last = nn.initializers.normal(0.0) if self.zero else weights
         x = nn.Dense(self.outputs, kernel_init=last)(x)
         if self.simnorm_group is None:
@@ -344,20 +344,20 @@ def _plan(
 ) -> tuple[Array, Array]:
     key_policy, key_score, key_search = jax.random.split(key, 3)
     z = _encode(parts, state, obs)
-    propose = lambda key: _proposal(config, parts, state, z, key)  # noqa: E731
-    proposals = jax.vmap(propose)(jax.random.split(key_policy, config.policy_samples))
+    keys = jax.random.split(key_policy, (config.horizon, config.policy_samples))
+    proposals = jax.vmap(lambda keys: _proposal(parts, state, z, keys), in_axes=1)(keys)
     score = _score(config, parts, state, z, key_score)
     return mppi.plan(config.planner, state.hyper.planner, score, proposals, previous, key_search, explore=explore)
 
 
-def _proposal(config: TDMPC2Config, parts: _Parts, state: TDMPC2State, z: Array, key: Key) -> Array:
-    """Actions [H, act_dim] of the policy as the model sees the future."""
+def _proposal(parts: _Parts, state: TDMPC2State, z: Array, keys: Key) -> Array:
+    """Actions [H, act_dim] of the policy as the model sees the future; one of the keys [H] a step."""
 
     def step(z: Array, key: Key) -> tuple[Array, Array]:
         action = tanh_gaussian_action(parts.policy.apply(state.policy.params, z), key, explore=True)
         return parts.dynamics.apply(state.dynamics.params, z, action), action
 
-    return jax.lax.scan(step, z, jax.random.split(key, config.horizon))[1]
+    return jax.lax.scan(step, z, keys)[1]
 
 
 def _score(config: TDMPC2Config, parts: _Parts, state: TDMPC2State, z: Array, key: Key) -> Callable[[Array], Array]:

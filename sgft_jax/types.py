@@ -1,4 +1,4 @@
-"""The nouns every other module speaks: transitions, learners, priors. Imports nothing of ours."""
+"""The nouns every other module speaks: transitions, learners, priors, fine-tuners. Imports nothing of ours."""
 
 import difflib
 from collections.abc import Callable, Iterable
@@ -105,3 +105,28 @@ class Imagination(NamedTuple):
 
 
 BatchTransform = Callable[[Imagination, Transition, Key], Transition]
+
+
+Simulated = Callable[[Key, int], Transition]
+"""(key, n) -> n transitions of the simulator, [n, ...]."""
+
+
+class Finetuner(NamedTuple):
+    """Fine-tuning of one agent as pure functions.
+
+    init(prior, key) -> state.
+    init_carry() -> what it remembers from step to step of an episode.
+    act(state, carry, obs [obs_dim], key, *, explore) -> (action [act_dim], carry); explore: [] bool, may be traced.
+    observe(state, transitions [T, ...], valid [T]) -> state: keep the rows of one episode, in order.
+    learn(state, key, n_updates, simulated=None, *, offline=False) -> (state, metrics averaged over the updates);
+        `n_updates` is static. simulated(key, n) -> n transitions of the simulator, for methods that ask for them;
+        offline: learn from these alone (static).
+    export(state) -> the agent in the form of a prior: actor and critic as they act, with the whole horizon to go.
+    """
+
+    init: Callable[[Any, Key], Any]
+    init_carry: Callable[[], PyTree]
+    act: Callable[..., tuple[Array, PyTree]]
+    observe: Callable[[Any, Transition, Array], Any]
+    learn: Callable[..., tuple[Any, Metrics]]
+    export: Callable[[Any], PyTree]

@@ -15,6 +15,7 @@ import pytest
 
 import envs
 from envs import gaps
+from sgft_jax.methods import METHODS
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -75,6 +76,12 @@ def test_make_flags_are_options_of_the_commands():
 def test_links_lead_to_files(page):
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text()):
         assert target.startswith("https://") or (page.parent / target).exists(), target
+
+
+def test_the_page_of_methods_lists_them_all():
+    rows = re.findall(r"^\| `([\w-]+)` \|", (ROOT / "docs/methods.md").read_text(), re.M)
+    assert sorted(rows) == sorted(METHODS)
+    assert all(name in help_of("experiments.finetune") for name in METHODS)
 
 
 def test_the_gap_in_the_readme_loads(tmp_path, key):

@@ -36,7 +36,7 @@ def test_finds_the_optimum_of_a_quadratic(key):
 def test_actions_stay_in_the_box(key):
     best = jnp.full((3, 2), 1.5)
     action, mean = run(lambda s: -4 * jnp.sum((s - best) ** 2), explore=True)(key)
-    np.testing.assert_allclose(mean, 1.0, atol=1e-3)
+    np.testing.assert_allclose(mean, 1.0, atol=0.02)
     assert jnp.all(action <= 1.0)
 
 
