@@ -45,6 +45,7 @@ def test_updates_are_compared_with_the_hand_written_ones(tmp_path):
     assert line["gb_per_update"] > 1e-6 and line["gflop_per_update"] > 0
 
 
+@pytest.mark.slow
 def test_numbers_reach_the_disk(tmp_path, capsys):
     measured = main(replace(SMALL, parts=("physics", "plain"), out=tmp_path))
     (line,), (plain,) = measured["physics"], measured["plain"]

@@ -103,7 +103,8 @@ def test_a_run_leaves_curve_summary_policies_and_every_rollout(home, method):
     assert (folder / "figures/success.png").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("method", [pytest.param("rlpd", marks=pytest.mark.slow), "iql"])
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["rlpd", "iql"])
 def test_methods_that_learn_from_the_simulator_too(home, method, capsys):
     """They start from nothing, so the simulator's policy makes the initial rollouts: those of any other method."""
     run(home, "sac")

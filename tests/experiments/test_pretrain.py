@@ -215,6 +215,7 @@ def test_the_learning_rate_falls_linearly_to_its_end():
     np.testing.assert_allclose(rates, [1e-3, 5.5e-4, 1e-4, 1e-4], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_random_actions_grow_along_the_fleet(key):
     """A policy always says 1: the first environment obeys, the last acts at random, the middle one does both."""
     config = replace(

@@ -248,7 +248,7 @@ def test_a_fresh_agent_takes_the_statistics_alone(prior, name):
     assert not jnp.array_equal(own["Dense_0"]["kernel"], prior.actor["Dense_0"]["kernel"])
 
 
-@pytest.mark.parametrize("name", ["rlpd", "iql"])
+@pytest.mark.parametrize("name", [pytest.param("rlpd", marks=pytest.mark.slow), "iql"])
 def test_a_fresh_agent_is_exported_as_it_acts(prior, name):
     tuner = make(name, simulated_share=0.5, critic_network=None, policy_delay=1)
     state, _ = tuner.learn(started(tuner, prior), jax.random.key(1), 3, simulated)
@@ -317,6 +317,7 @@ def pretrain(key):
     return sac.extract_prior(jax.lax.scan(update, state, jax.random.split(keys[2], 1500))[0])
 
 
+@pytest.mark.slow
 def test_sgft_recovers_from_a_turned_command_frame(key):
     """Commands turned by 70 degrees: the simulator's policy circles; 15 real episodes bring it back to the goal."""
     real = rotated(np.deg2rad(70))

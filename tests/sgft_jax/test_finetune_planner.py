@@ -76,6 +76,7 @@ def test_what_learns_and_what_stays(prior, name):
     assert equal(before.normalizer, after.normalizer) and equal(after.policy, new.learner.policy.params)
 
 
+@pytest.mark.slow
 def test_the_released_code_learns_a_new_agent_from_shaped_rewards(prior):
     tuner, state = started("sgft-tdmpc2-code", prior)
     assert not equal(state.learner.dynamics.params, prior.dynamics) and equal(state.judge, prior)

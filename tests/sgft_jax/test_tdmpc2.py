@@ -240,7 +240,7 @@ def test_losses_against_a_loop(key):
     assert metrics["critic/target_mean"] == pytest.approx(float(target), rel=1e-3)
 
 
-@pytest.mark.parametrize("config", [PLAIN, SGFT])
+@pytest.mark.parametrize("config", [PLAIN, pytest.param(SGFT, marks=pytest.mark.slow)])
 def test_invalid_rows_do_not_matter(config, key):
     state, batch = shaken(config, key), windows(key)
     noise = windows(jax.random.key(9)).rows
@@ -265,7 +265,7 @@ def test_scale_follows_the_range_of_values(key):
 # --- plans ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("config", [PLAIN, SGFT])
+@pytest.mark.parametrize("config", [pytest.param(PLAIN, marks=pytest.mark.slow), SGFT])
 def test_score_of_a_plan_against_a_loop(config, key):
     state, parts = shaken(config, key), PARTS
     state = state.replace(hyper=state.hyper._replace(gamma=jnp.float32(0.5)))
@@ -527,6 +527,7 @@ def episode(policy, key):
     return jax.lax.scan(step, (begin, jnp.zeros((2, 1))), jax.random.split(key, STEPS))[1]
 
 
+@pytest.mark.slow
 def test_learns_to_push_a_cart(key):
     """From random episodes alone, through the ring, to a planner and a policy that are near the best return, 9.1."""
     key_data, key_train, key_play = jax.random.split(key, 3)
