@@ -75,7 +75,7 @@ class FinetuneArgs:
     checkpoint_every: int = 10
     """Rollouts between checkpoints."""
     options: FinetuneConfig = field(default_factory=FinetuneConfig)
-    """Method options; `network` and `gamma` always are the prior's."""
+    """Method options; `network`, `size` and `gamma` always are the prior's."""
     variant: str = ""
     """A word for these options: the run gets a folder of its own beside the method's, and a curve in the figures."""
     impl: Impl = "auto"

@@ -109,9 +109,8 @@ class Method(NamedTuple):
 
     transforms(horizon, branches, noise) -> the batch transforms in order; for branches and noise see `branch`.
     finite_horizon: the agent is told the steps to go (for horizon > 1). reset_critic: default at transfer.
-    uses_value, uses_dynamics: what it takes from the prior besides the agent. shaped: rewards are r_bar.
+    uses_value, uses_dynamics: what it takes from the prior besides the agent.
     agent: the learner. fresh: it starts from nothing, and the simulator's policy only makes the initial rollouts.
-    simulated: it learns from transitions of the simulator, too.
     utd: updates per real transition. options: where its `FinetuneConfig` differs from the defaults, by field.
     """
 

@@ -142,6 +142,7 @@ def test_all_methods_meet_the_same_real_starts(home):
     assert len({rollout["obs"][seed, 0].tobytes() for rollout in ours for seed in (0, 1)}) == 10
 
 
+@pytest.mark.slow
 def test_seeds_together_are_seeds_one_by_one(home, tmp_path):
     both = read_jsonl(run(home, "sgft-sac") / "eval.jsonl")
     call(argv(home, "sgft-sac", "--seed", "1", seeds=1, out=tmp_path))

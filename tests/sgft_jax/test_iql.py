@@ -326,6 +326,7 @@ def test_act_draws_around_the_mode_within_bounds(key):
     assert np.min(wide) == -1 and np.max(wide) == 1
 
 
+@pytest.mark.slow
 def test_vmap_over_seeds_and_numbers_equals_a_loop(key):
     keys, batch = jax.random.split(key, 2), batch_of(key)
     numbers = ({"expectile": 0.5, "lr_critic": 0.0}, {"expectile": 0.9, "lr_critic": 1e-2})

@@ -1,0 +1,87 @@
+"""The grid of runs: what is missing runs, what is finished stays, what cannot run does not stop the rest."""
+
+import json
+
+import pytest
+
+import envs
+from experiments import cli, compare
+from sgft_jax.types import UserError
+
+GRID = {"tasks": ("push", "insert"), "methods": ("sgft-sac", "rlpd"), "seeds": 2, "rollouts": 10}
+
+
+@pytest.fixture
+def ran(monkeypatch):
+    """Runs that only leave their folder; those of `rlpd` on insert lack something."""
+    seen = []
+
+    def finetune(args):
+        seen.append(args)
+        if (args.task, args.method) == ("insert", "rlpd"):
+            raise UserError("holds no prior")
+        leave(args, args.rollouts)
+
+    monkeypatch.setattr(compare, "finetune", finetune)
+    monkeypatch.setattr(cli, "set_up", lambda: None)
+    return seen
+
+
+def leave(args, rollouts):
+    folder = compare.run_folder(args)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "config.json").write_text("{}")
+    if rollouts:
+        (folder / "summary.json").write_text(json.dumps({"final": {"rollouts": rollouts}}))
+
+
+def names(runs):
+    return [(run.task, run.method, run.resume) for run in runs]
+
+
+def test_what_is_missing_runs_and_what_is_finished_stays(tmp_path, ran, capsys):
+    args = compare.CompareArgs(out=tmp_path, **GRID)
+    first, second = (cell.args for cell in compare.cells(args)[:2])
+    leave(first, 10)
+    leave(second, 0)  # killed before its end
+    failed = compare.compare(args)
+    assert names(ran) == [("push", "rlpd", True), ("insert", "sgft-sac", False), ("insert", "rlpd", False)]
+    assert failed == ["insert/default: rlpd: holds no prior"]
+    assert "finished   push/default: sgft-sac, 10 rollouts\nunfinished push/default: rlpd\n" in capsys.readouterr().out
+    ran.clear()
+    compare.compare(compare.CompareArgs(out=tmp_path, **{**GRID, "rollouts": 20}))
+    assert names(ran)[0] == ("push", "sgft-sac", True)  # more rollouts were asked for
+
+
+def test_every_method_runs_with_its_own_settings(tmp_path, ran):
+    compare.compare(compare.CompareArgs(out=tmp_path, **GRID))
+    sgft, rlpd = ran[:2]
+    assert (sgft.utd, rlpd.utd) == (8, 20) and (sgft.options.critics, rlpd.options.critics) == (2, 10)
+    assert {run.rollouts for run in ran} == {10} and not any(run.video for run in ran)
+
+
+def test_the_clock_stops_before_a_cell_not_in_it(tmp_path, ran, capsys):
+    assert compare.compare(compare.CompareArgs(out=tmp_path, minutes=0.0, **GRID)) == []
+    assert ran == [] and "stopped after 0 minutes" in capsys.readouterr().out
+
+
+def test_dry_lists_and_runs_nothing(tmp_path, ran, capsys):
+    compare.main(compare.CompareArgs(out=tmp_path, dry=True, **GRID))
+    assert ran == [] and capsys.readouterr().out.count("missing") == 4
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["--methods", "sgft-sca"], "did you mean 'sgft-sac'"),
+        (["--tasks", "pull"], "--tasks: there is no 'pull'"),
+        (["--seeds", "0"], "at least one"),
+        (["--reals"], "--reals: name at least one"),
+    ],
+)
+def test_bad_input(argv, words, tmp_path, ran, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        cli.run_main(compare.main, compare.CompareArgs, "Compare.", argv=[*argv, "--out", str(tmp_path)])
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and error.startswith("error: ") and error.count("\n") == 1 and words in error
+    assert envs.TASKS and ran == []
