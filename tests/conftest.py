@@ -5,7 +5,7 @@ import os
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MUJOCO_GL", "disable")
 os.environ["SGFT_IMPL"] = "jax"  # MJX's own code; tests/envs/test_engines.py is about the others
-# Compiling is most of what the tests do: without optimisation it takes half of the time.
+# Compiling is most of what the tests do; what they compile runs for moments.
 os.environ["XLA_FLAGS"] = " ".join(
     [
         os.environ.get("XLA_FLAGS", ""),

@@ -32,6 +32,7 @@ def noise_of(key):
     return bare_sac.Noise(target, actor, jax.random.exponential(key_dynamics, (BATCH, MEMBERS)))
 
 
+@pytest.mark.slow
 def test_it_is_the_update_of_the_library(key):
     learner = make_sac(SACConfig(OBS_DIM, ACT_DIM, network=NETWORK, ensemble_size=MEMBERS), HYPER)
     state = learner.init(key)

@@ -29,7 +29,7 @@ TESTS = Path(__file__).parent.parent
 OPTIONS = """--task toy --preset cpu --no-video --config.n-envs 32 --config.worlds 16 --config.env-steps 10240
     --config.random-transitions 1024 --config.replay-capacity 8192 --config.batch-size 128 --config.chunk-steps 40
     --config.updates-per-step 8 --config.network.hidden 32 32 --config.gamma 0.9 --config.eval-every 2
-    --config.checkpoint-every 3 --config.eval-episodes 64 --config.lr 1e-3 --config.tau 0.02 --devices 2"""
+    --config.checkpoint-every 3 --config.eval-episodes 64 --config.lr 1e-3 --config.tau 0.02"""
 TINY = OPTIONS.split()  # 8 chunks of 1,280 env steps; evaluations after 0, 2, 4, 6, 8 and checkpoints after 3, 6, 8
 PROGRAM = """
 import os, signal, sys

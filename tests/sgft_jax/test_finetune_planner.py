@@ -61,7 +61,7 @@ def test_the_rows_of_an_episode_stay_in_order(prior):
     assert np.flatnonzero(state.replay.last).tolist() == [4, T - 2]  # the exploded step cuts the episode
 
 
-@pytest.mark.parametrize("name", ["tdmpc2", "sgft-tdmpc2"])
+@pytest.mark.parametrize("name", [pytest.param("tdmpc2", marks=pytest.mark.slow), "sgft-tdmpc2"])
 def test_what_learns_and_what_stays(prior, name):
     tuner, state = started(name, prior)
     new, metrics = tuner.learn(state, jax.random.key(1), 2)

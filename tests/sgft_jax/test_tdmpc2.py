@@ -477,7 +477,9 @@ def probe(key, *, ends):
     return Sequences(rows, jnp.stack([jnp.ones(ROWS, bool), first < 0], axis=1))  # all rows at state 1 are the last
 
 
-@pytest.mark.parametrize(("ends", "values"), [(True, (0.8, 1.0)), (False, (4.0, 5.0))])
+@pytest.mark.parametrize(
+    ("ends", "values"), [pytest.param(True, (0.8, 1.0), marks=pytest.mark.slow), (False, (4.0, 5.0))]
+)
 def test_probe_values_of_two_states(ends, values, key):
     """Worth of state 1: 1 if it ends there; 1 / (1 - 0.8) if a time limit cuts it, which all rows at state 1 say."""
     state = train(PLAIN, INIT(key), jax.jit(functools.partial(probe, ends=ends)), key, 600)
