@@ -8,11 +8,11 @@ import jax.numpy as jnp
 
 from envs.base import Env
 from experiments.presets import PretrainConfig
-from sgft_jax import replay, sac, sequences, tdmpc2
+from sgft_jax import checkpoint, replay, sac, sequences, tdmpc2
 from sgft_jax.config import config_from_json, config_to_json
 from sgft_jax.networks import NetworkConfig
 from sgft_jax.players import Player, sac_player, tdmpc2_player
-from sgft_jax.types import Array, Key, Learner, PyTree, Transition, UserError
+from sgft_jax.types import Array, Key, Learner, PyTree, Transition
 
 
 class Algorithm(NamedTuple):
@@ -21,7 +21,7 @@ class Algorithm(NamedTuple):
     hyper(progress [] from 0 to 1) -> its numbers.
     act(agent, obs, key) -> an exploring action [act_dim], cheap enough for thousands of environments.
     extract(agent) -> what it hands to fine-tuning.
-    empty(steps) -> experience for that many steps of all environments.
+    empty(transitions) -> experience with room for that many; one that keeps time slots takes the slots that fit.
     add(experience, rows [n_envs], valid [n_envs], last [n_envs]) -> the same with one step more; valid: not exploded;
         last: of its episode.
     held(experience) -> [capacity] bool. sample(experience, key, n) -> a batch [n, ...] of what the learner learns from.
@@ -43,17 +43,13 @@ def make_algorithm(env: Env, config: PretrainConfig) -> Algorithm:
 
 
 def make_player(card: Mapping[str, Any]) -> Player:
-    """How the prior with this card acts and judges; raises UserError for one of an algorithm unknown here."""
+    """How the prior with this card acts and judges."""
     obs_dim, act_dim = card["obs_dim"], card["act_dim"]
-    match algorithm_of(card):
-        case "sac":
-            return sac_player(obs_dim, act_dim, config_from_json(NetworkConfig, card["network"], where="network."))
-        case "tdmpc2":
-            own = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
-            structure = tdmpc2.named_config(obs_dim, act_dim, **own)
-            return tdmpc2_player(structure, tdmpc2.TDMPC2Hyper(gamma=card["gamma"]))
-        case other:
-            raise UserError(f"the prior's card names the algorithm {other!r}, this version knows sac and tdmpc2")
+    if checkpoint.algorithm_of(card) == "sac":
+        return sac_player(obs_dim, act_dim, network_of(card))
+    own = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
+    structure = tdmpc2.named_config(obs_dim, act_dim, **own)
+    return tdmpc2_player(structure, tdmpc2.TDMPC2Hyper(gamma=card["gamma"]))
 
 
 def describe_use(env: Env, config: PretrainConfig) -> dict[str, Any]:
@@ -69,9 +65,9 @@ def describe_use(env: Env, config: PretrainConfig) -> dict[str, Any]:
     }
 
 
-def algorithm_of(card: Mapping[str, Any]) -> str:
-    """Which algorithm a prior is from; the first priors did not say, they were all SAC's."""
-    return card.get("algorithm", "sac")
+def network_of(card: Mapping[str, Any]) -> NetworkConfig:
+    """The networks of a prior of SAC."""
+    return config_from_json(NetworkConfig, card["network"], where="network.")
 
 
 def _rate(config: PretrainConfig, progress: float | Array) -> float | Array:
@@ -95,7 +91,7 @@ def _sac(env: Env, config: PretrainConfig) -> Algorithm:
         hyper=lambda progress: sac_hyper(config, progress=progress),
         act=lambda agent, obs, key: learner.act(agent, (), obs, key, explore=True)[0],
         extract=sac.extract_prior,
-        empty=lambda steps: replay.init(replay.blank(env.obs_dim, env.act_dim), steps * config.n_envs),
+        empty=lambda transitions: replay.init(replay.blank(env.obs_dim, env.act_dim), transitions),
         add=lambda experience, rows, valid, last: replay.add_batch(experience, rows, valid),
         held=lambda experience: jnp.arange(experience.data.reward.shape[0]) < experience.size,
         sample=replay.sample,
@@ -135,7 +131,9 @@ def _tdmpc2(env: Env, config: PretrainConfig) -> Algorithm:
         # The policy alone: a plan costs some ten thousand evaluations of the model, the policy one.
         act=lambda agent, obs, key: tdmpc2.policy_action(structure, agent, obs, key, explore=True),
         extract=tdmpc2.extract_prior,
-        empty=lambda steps: sequences.init(replay.blank(env.obs_dim, env.act_dim), steps, config.n_envs),
+        empty=lambda transitions: sequences.init(
+            replay.blank(env.obs_dim, env.act_dim), transitions // config.n_envs, config.n_envs
+        ),
         add=sequences.add,
         held=lambda experience: experience.valid,
         sample=lambda experience, key, n: sequences.sample(experience, key, n, config.horizon),

@@ -16,10 +16,8 @@ from envs import gaps
 from envs.base import Env, World
 from envs.gaps import Gap
 from experiments import cli
-from experiments.algorithms import algorithm_of
 from sgft_jax import checkpoint
-from sgft_jax.config import config_from_json, differences
-from sgft_jax.networks import NetworkConfig
+from sgft_jax.config import differences
 from sgft_jax.types import Array, Key, PyTree, UserError
 
 SIM = "sim"
@@ -153,16 +151,11 @@ def load_priors(folders: Sequence[Path], env: Env) -> tuple[list[PyTree], dict[s
     priors, cards = zip(*(checkpoint.load_prior(folder, **sizes) for folder in folders), strict=True)
     for folder, card in zip(folders, cards, strict=True):
         odd = [key for key in ("network", "gamma", "ensemble_size") if differences(cards[0][key], card[key])]
-        if algorithm_of(card) != algorithm_of(cards[0]):
+        if checkpoint.algorithm_of(card) != checkpoint.algorithm_of(cards[0]):
             odd.append("algorithm")
         if odd:
             raise UserError(f"{folder}: differs from {folders[0]} in {', '.join(odd)}; choose one with --prior")
     return list(priors), cards[0]
-
-
-def network_of(card: dict[str, Any]) -> NetworkConfig:
-    """The networks of a prior."""
-    return config_from_json(NetworkConfig, card["network"], where="network.")
 
 
 def _seed_number(folder: Path) -> tuple[int, str]:

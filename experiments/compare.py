@@ -69,6 +69,8 @@ class Cell(NamedTuple):
 def main(args: CompareArgs) -> None:
     """Runs what is missing, then draws; raises UserError in the end if some cells could not run."""
     failed = compare(args)
+    if args.dry:
+        return
     if any(cell.done for cell in cells(args)):
         print(figures(FiguresArgs(out=args.out)).read_text())
     if failed:

@@ -20,7 +20,7 @@ from envs.gaps import Gap
 from envs.physics import Impl
 from envs.rollout import Episode
 from experiments import cli, common
-from experiments.algorithms import algorithm_of, make_player
+from experiments.algorithms import make_player, network_of
 from experiments.evaluation import score
 from experiments.finetuning import Program, Simulation, make_program, simulate
 from experiments.presets import PRESETS
@@ -104,10 +104,13 @@ def main(argv: Sequence[str] | None = None) -> None:
 def arguments(method: str, **changes: Any) -> FinetuneArgs:
     """The arguments with which a method runs unless told otherwise, and any changes to these."""
     chosen = get_method(method)
-    own = {"method": method, "utd": chosen.utd, "options": finetune_config(chosen)}
-    if chosen.prior == "tdmpc2":
-        own["preset"] = "tdmpc2"
+    own = {"method": method, "utd": chosen.utd, "options": finetune_config(chosen), "preset": _preset(chosen)}
     return FinetuneArgs(**{**own, **changes})
+
+
+def _preset(method: Method) -> str:
+    """The preset that makes the priors a method needs."""
+    return "tdmpc2" if method.prior == "tdmpc2" else DEFAULT_PRESET
 
 
 def _table() -> str:
@@ -185,9 +188,9 @@ class _Run:
     def _options(self, card: dict[str, Any]) -> FinetuneConfig:
         """Those of the command line, with what must be as the prior has it."""
         own = {"gamma": card["gamma"]}
-        if algorithm_of(card) == "tdmpc2":
+        if checkpoint.algorithm_of(card) == "tdmpc2":
             return replace(self.args.options, size=card["config"]["size"], **own)
-        return replace(self.args.options, network=common.network_of(card), **own)
+        return replace(self.args.options, network=network_of(card), **own)
 
     def _programs(self, method: Method, config: FinetuneConfig) -> tuple[Finetuner, Program]:
         env = self.env
@@ -372,11 +375,10 @@ class _Run:
 
 def _check_prior(args: FinetuneArgs, method: Method, card: dict[str, Any]) -> None:
     """Raises UserError for a prior of another algorithm than the method needs."""
-    if algorithm_of(card) != method.prior:
-        preset = "tdmpc2" if method.prior == "tdmpc2" else DEFAULT_PRESET
+    if checkpoint.algorithm_of(card) != method.prior:
         raise UserError(
-            f"--method {method.name} needs a prior of {method.prior}, not of {algorithm_of(card)}; make one with: "
-            f"python -m experiments.pretrain --task {args.task} --preset {preset}"
+            f"--method {method.name} needs a prior of {method.prior}, not of {checkpoint.algorithm_of(card)}; "
+            f"make one with: python -m experiments.pretrain --task {args.task} --preset {_preset(method)}"
         )
 
 

@@ -62,7 +62,7 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
             return (split(fleet), spread_replay(algorithm.add(buffer, rows, valid, _ended(after)))), None
 
         n_steps = config.random_transitions // config.n_envs
-        start = (launch(env, pool, key_launch, config.n_envs), algorithm.empty(n_steps))
+        start = (launch(env, pool, key_launch, config.n_envs), algorithm.empty(n_steps * config.n_envs))
         return jax.lax.scan(random_step, start, jax.random.split(key_steps, n_steps))[0][1]
 
     def init(pool: World, random: Any, key: Key) -> PretrainState:
@@ -70,7 +70,7 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         statistics = normalizer.update(normalizer.init(env.obs_dim), random.data.obs, algorithm.held(random))
         agent = learner.init(key_learner).replace(normalizer=normalizer.finish(statistics))
         fleet = launch(env, pool, key_fleet, config.n_envs)
-        buffer = algorithm.empty(config.replay_capacity // config.n_envs)
+        buffer = algorithm.empty(config.replay_capacity)
         return spread(PretrainState(agent, buffer, fleet, key_run, jnp.int32(0)))
 
     def sample(random: PyTree, buffer: PyTree, key: Key) -> PyTree:

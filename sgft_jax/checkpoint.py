@@ -152,7 +152,7 @@ def load_prior(
         folder = folder / "prior"
     manifest = _manifest(folder)
     card = read_json(folder / _CARD)
-    kind = _KINDS.get(card.get("algorithm", "sac"))
+    kind = _KINDS.get(algorithm_of(card))
     if kind is None:
         raise UserError(f"{folder}: {_CARD} says algorithm={card['algorithm']!r}: choose one of {', '.join(_KINDS)}")
     asked = {"task": task, "obs_dim": obs_dim, "act_dim": act_dim}
@@ -165,6 +165,11 @@ def load_prior(
         raise UserError(f"{folder}: {_CARD} says obs_dim={card['obs_dim']}, the statistics have {len(statistics.mean)}")
     names = [field.name for field in dataclasses.fields(kind) if field.name != "normalizer"]
     return kind(**{name: tree.get(name, {}) for name in names}, normalizer=statistics), card
+
+
+def algorithm_of(card: Mapping[str, Any]) -> str:
+    """Which algorithm a prior is from; the first priors did not say, they were all SAC's."""
+    return card.get("algorithm", "sac")
 
 
 def _is_nested_dict(tree: PyTree) -> bool:

@@ -56,19 +56,6 @@ def make_finetuner(
     """Fine-tuning by `method`. reward, terminated: the task as functions of one (obs, action, next_obs)."""
     if method.agent == "tdmpc2":
         return make_planner(method, config, obs_dim=obs_dim, act_dim=act_dim)
-    return _policy(method, config, obs_dim=obs_dim, act_dim=act_dim, reward=reward, terminated=terminated)
-
-
-def _policy(
-    method: Method,
-    config: FinetuneConfig,
-    *,
-    obs_dim: int,
-    act_dim: int,
-    reward: Callable[[Array, Array, Array], Array],
-    terminated: Callable[[Array, Array, Array], Array],
-) -> Finetuner:
-    """Of an agent that acts by its policy."""
     agent = make_agent(method, config, obs_dim=obs_dim, act_dim=act_dim)
     learner = agent.learner
     value_network = make_value(obs_dim, config.network)

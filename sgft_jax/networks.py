@@ -167,3 +167,16 @@ def fix_first_layer(params: PyTree, obs_dim: int, extra: Array) -> PyTree:
     kept, fixed, rest = jnp.split(layer["kernel"], [obs_dim, obs_dim + len(extra)], axis=-2)
     bias = layer["bias"] + jnp.einsum("i,...ij->...j", extra, fixed)
     return {**params, "Dense_0": {"kernel": jnp.concatenate([kept, rest], axis=-2), "bias": bias}}
+
+
+def check_params(name: str, network: Network, params: PyTree, owner: str) -> None:
+    """Raise UserError where the parameters of a prior are not those of `network`; owner: whose they ought to be."""
+    expected = jax.eval_shape(network.init, jax.random.key(0))
+    wanted, got = _shapes(expected), _shapes(params)
+    if wanted != got:
+        where = next(k for k in sorted(wanted | got) if wanted.get(k) != got.get(k))
+        raise UserError(f"prior {name}{where} has shape {got.get(where)}, expected {wanted.get(where)} for {owner}")
+
+
+def _shapes(params: PyTree) -> dict[str, tuple[int, ...]]:
+    return {jax.tree_util.keystr(path): leaf.shape for path, leaf in jax.tree_util.tree_leaves_with_path(params)}

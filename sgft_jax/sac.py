@@ -17,6 +17,7 @@ from sgft_jax import dynamics, losses, normalizer, optim
 from sgft_jax.networks import (
     Network,
     NetworkConfig,
+    check_params,
     make_actor,
     make_critic,
     make_dynamics,
@@ -342,18 +343,6 @@ def check_prior(config: SACConfig, prior: Prior, *, critic: bool) -> None:
     body = {"network": config.network, "critic_network": config.critic_network, "critics": config.critics}
     plain = SACConfig(config.obs_dim, config.act_dim, **body)
     parts = _parts(plain)
-    names = ["actor", "value", *(["critic"] if critic else [])]
-    for name in names:
-        expected = jax.eval_shape(getattr(parts, name).init, jax.random.key(0))
-        wanted, got = _shapes(expected), _shapes(getattr(prior, name))
-        if wanted != got:
-            where = next(k for k in sorted(wanted | got) if wanted.get(k) != got.get(k))
-            raise UserError(
-                f"prior {name}{where} has shape {got.get(where)}, expected {wanted.get(where)} for obs_dim "
-                f"{config.obs_dim}, act_dim {config.act_dim}, hidden {config.network.hidden}: use the prior's own task "
-                "and network"
-            )
-
-
-def _shapes(params: PyTree) -> dict[str, tuple[int, ...]]:
-    return {jax.tree_util.keystr(path): leaf.shape for path, leaf in jax.tree_util.tree_leaves_with_path(params)}
+    owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, hidden {config.network.hidden}"
+    for name in ("actor", "value", *(["critic"] if critic else [])):
+        check_params(name, getattr(parts, name), getattr(prior, name), f"{owner}: use the prior's own task and network")

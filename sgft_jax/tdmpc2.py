@@ -16,7 +16,7 @@ from flax import linen as nn
 from flax import struct
 
 from sgft_jax import mppi, normalizer, optim, twohot
-from sgft_jax.networks import Network, tanh_gaussian_action
+from sgft_jax.networks import Network, check_params, tanh_gaussian_action
 from sgft_jax.sequences import Sequences
 from sgft_jax.types import Array, Key, Learner, Metrics, Normalizer, PyTree, Transition, UserError, unknown
 
@@ -615,16 +615,6 @@ def fine_tune_state(config: TDMPC2Config, hyper: TDMPC2Hyper, prior_params: TDMP
 def check_prior(config: TDMPC2Config, prior: TDMPC2Prior) -> None:
     """Raise UserError where a network of the prior is not the one that `config` describes."""
     parts = _parts(config)
+    owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, {config.size}"
     for name in _NETWORKS:
-        wanted = _shapes(jax.eval_shape(getattr(parts, name).init, jax.random.key(0)))
-        got = _shapes(getattr(prior, name))
-        if wanted != got:
-            where = next(k for k in sorted(wanted | got) if wanted.get(k) != got.get(k))
-            raise UserError(
-                f"prior {name}{where} has shape {got.get(where)}, expected {wanted.get(where)} for obs_dim "
-                f"{config.obs_dim}, act_dim {config.act_dim}, {config.size}: use the prior's own task and size"
-            )
-
-
-def _shapes(params: PyTree) -> dict[str, tuple[int, ...]]:
-    return {jax.tree_util.keystr(path): leaf.shape for path, leaf in jax.tree_util.tree_leaves_with_path(params)}
+        check_params(name, getattr(parts, name), getattr(prior, name), f"{owner}: use the prior's own task and size")

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import toy
 
-from experiments import common
+from experiments import algorithms, common
 from sgft_jax import checkpoint
 from sgft_jax.config import config_to_json
 from sgft_jax.networks import NetworkConfig
@@ -78,7 +78,7 @@ def test_priors_are_found_in_order(tmp_path):
     expected = {n: save_prior(home / run / "prior" / f"seed-{n}", n) for run, n in (("a", 10), ("a", 9), ("b", 2))}
     find = lambda prior: common.find_priors(prior, out=tmp_path, env=toy.make(), preset="fast")  # noqa: E731
     found, card = find(None)
-    assert card["seed"] == 2 and common.network_of(card) == NETWORK
+    assert card["seed"] == 2 and algorithms.network_of(card) == NETWORK
     for prior, n in zip(found, (2, 9, 10), strict=True):
         jax.tree.map(np.testing.assert_array_equal, prior.actor, expected[n].actor)
     assert [len(find(home / p)[0]) for p in ("a", "a/prior", "a/prior/seed-9")] == [2, 2, 1]

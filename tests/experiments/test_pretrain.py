@@ -15,8 +15,7 @@ import pytest
 
 import envs
 from experiments import pretrain
-from experiments.algorithms import sac_hyper
-from experiments.common import network_of
+from experiments.algorithms import network_of, sac_hyper
 from experiments.evaluation import Best, keep_better
 from experiments.presets import PRESETS
 from experiments.pretraining import make_pretrainer
