@@ -24,7 +24,7 @@ def make_advance(host: mujoco.MjModel) -> Advance:
     Between substeps only the minimal state is carried: it keeps the loop's memory traffic small. Matrix products run in
     full float32: TF32 is not enough for contact dynamics.
     """
-    nominal, blank = mjx.put_model(host, impl="jax"), mjx.make_data(host, impl="jax")
+    nominal, blank = put(host)
 
     def advance(fields: dict[str, Array], state: Any, controls: Array) -> Any:
         model = with_fields(nominal, fields)
@@ -38,6 +38,15 @@ def make_advance(host: mujoco.MjModel) -> Advance:
             return jax.lax.scan(substep, state, controls)[0]
 
     return advance
+
+
+def put(host: mujoco.MjModel) -> tuple[mjx.Model, mjx.Data]:
+    """A compiled scene and its blank data for MJX's own code, on a device of this process.
+
+    Left to itself MJX takes the first device of all, which may be another host's: programs cannot hold its arrays.
+    """
+    device = jax.local_devices()[0]
+    return mjx.put_model(host, device=device, impl="jax"), mjx.make_data(host, device=device, impl="jax")
 
 
 def with_fields(model: mjx.Model, fields: dict[str, Array]) -> mjx.Model:

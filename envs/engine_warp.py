@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import mujoco
 from mujoco import mjx
 
-from envs.engine_jax import Advance, with_fields
+from envs.engine_jax import Advance, put, with_fields
 from sgft_jax.types import Array, PyTree, UserError
 
 # Newton iterations beyond the scene's. After the hardest pushes on the puck, one control step in a hundred, 4 of them
@@ -31,7 +31,7 @@ def make_advance(host: mujoco.MjModel) -> Advance:
 
     contacts, rows = budget(host)
     iterations = host.opt.iterations + _MORE_ITERATIONS
-    still, at_rest = mjx.put_model(host, impl="jax"), mjx.make_data(host, impl="jax")
+    still, at_rest = put(host)
     calls: dict[tuple[str, ...], Any] = {}
 
     def call(layout: tuple[str, ...]) -> Any:
@@ -80,5 +80,5 @@ def available() -> bool:
 
 def budget(host: mujoco.MjModel) -> tuple[int, int]:
     """The most contacts and constraint rows that one world of this scene can have."""
-    layout = mjx.make_data(host, impl="jax")._impl
+    layout = put(host)[1]._impl
     return layout.contact.dist.shape[0], layout.efc_J.shape[0]

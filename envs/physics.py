@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
 from envs import engine_c, engine_jax, engine_warp
 from envs.engine_jax import MEAN_INERTIA, Advance
@@ -77,7 +76,7 @@ def varying_fields(nominal: mujoco.MjModel, specs: Iterable[mujoco.MjSpec]) -> t
     Found once per task from perturbed specs, so that all worlds of a task are pytrees of one structure: programs
     compiled for one gap serve every other, and gaps can be vmapped over.
     """
-    model = mjx.put_model(nominal, impl="jax")
+    model, _ = engine_jax.put(nominal)
     names = [k for k, v in vars(model).items() if isinstance(v, jax.Array) and not k.startswith(_COSMETIC)]
     reference = _read(nominal, names)
     others = [_read(spec.compile(), names) for spec in specs]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from franka_bench import EXACT, SCENES, member, theta_of
 
-from envs import physics
+from envs import engine_jax, physics
 from envs.franka import host
 from envs.franka.task import make_env
 from sgft_jax.types import UserError
@@ -81,3 +81,13 @@ def test_who_steps_the_physics(monkeypatch):
     monkeypatch.setenv(physics.IMPL_VARIABLE, "wrap")
     with pytest.raises(UserError, match=r"SGFT_IMPL: .* 'wrap', did you mean 'warp'\? Choose from: auto, c, jax, warp"):
         physics.choose_impl()
+
+
+def test_scenes_are_put_on_a_device_of_this_process(monkeypatch):
+    mine = jax.devices()[-1]
+    assert mine != jax.devices()[0]
+    monkeypatch.setattr(jax, "local_devices", lambda: [mine])
+    scene = SCENES["push"]
+    spec = scene.build({p.name: p.nominal for p in scene.parameters})
+    placed = [x.devices() for x in jax.tree.leaves(engine_jax.put(spec.compile())) if isinstance(x, jax.Array)]
+    assert len(placed) > 50 and all(devices == {mine} for devices in placed)
