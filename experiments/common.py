@@ -57,14 +57,14 @@ def stack(trees: Sequence[PyTree]) -> PyTree:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
-def member(tree: PyTree, i: int) -> PyTree:
+def member(tree: PyTree, i: int | Array) -> PyTree:
     """The i-th of stacked pytrees."""
     return jax.tree.map(lambda x: x[i], tree)
 
 
-def part(tree: PyTree, i: int, n: int) -> PyTree:
+def part(tree: PyTree, i: int | Array, n: int) -> PyTree:
     """The i-th n of stacked pytrees."""
-    return jax.tree.map(lambda x: x[i * n : (i + 1) * n], tree)
+    return jax.tree.map(lambda x: x.reshape(-1, n, *x.shape[1:])[i], tree)
 
 
 def over_seeds(function: Callable[..., PyTree], seeds: int, *, shared: int = 0) -> Callable[..., PyTree]:

@@ -87,7 +87,7 @@ class _Run:
 
     def work(self, records: list[Record], priors: PyTree, card: dict[str, Any]) -> list[dict[str, Any]]:
         """Everything, in order; returns the summaries. priors: [P]; seed i starts from prior i modulo P."""
-        args, self.records = self.args, records
+        args, self.records, done = self.args, records, _common_rollouts(records)
         config = self._options(card)
         if config.critic_warmup is None:
             config = replace(config, critic_warmup=args.initial_rollouts * self._updates_per_rollout())
@@ -97,9 +97,9 @@ class _Run:
         self.tuner, self.program = self._programs(self.method, config)
         self.pilot = self._programs(self.method.pilot, config)[1] if self.method.fresh else self.program
 
-        own = jax.tree.map(lambda x: x[self._prior_of(priors)], priors)
+        own = jax.jit(lambda priors: jax.tree.map(lambda x: x[self._prior_of(priors)], priors))(priors)
         self.untuned = lambda: self.pilot.init(own, self.numbers)
-        state, done = self._start(lambda: self.program.init(own, self.numbers), config)
+        state = self._start(lambda: self.program.init(own, self.numbers), done, config.offline_updates)
         return self._finish(self._train(state, done), card)
 
     def _options(self, card: dict[str, Any]) -> FinetuneConfig:
@@ -138,26 +138,25 @@ class _Run:
         returns = self.simulation.returns
         return self.env.episode_length / max(float(returns.max() - returns.min()), 1e-6)
 
-    def _start(self, make: Callable[[], PyTree], config: FinetuneConfig) -> tuple[PyTree, int]:
-        """The state to continue from and the rollouts behind it: of checkpoints, or a fresh one scored zero-shot."""
-        done = _common_rollouts(self.records)
+    def _start(self, make: Callable[[], PyTree], done: int, offline_updates: int) -> PyTree:
+        """The state after so many rollouts: of checkpoints, or a fresh one, which learns offline and is scored."""
         if done == 0:
             for record in self.records:
                 record.clear()
-            state = self._offline(make(), config.offline_updates)
+            state = self._offline(make(), offline_updates)
             self._evaluate(state, 0)
-            return state, 0
-        like = jax.eval_shape(lambda: self._of(0, make()))
-        states = [record.restore(like, done) for record in self.records]
-        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *states), done
-
-    def _of(self, i: int, members: PyTree) -> PyTree:
-        """What belongs to the i-th real system in a pytree over all members: [S]."""
-        return common.part(members, i, len(self.seeds))
+            return state
+        like = jax.eval_shape(lambda: common.part(make(), 0, len(self.seeds)))
+        return _join([record.restore(like, done) for record in self.records])
 
     def _each(self, members: PyTree) -> Iterator[tuple[Record, PyTree]]:
         """Every real system's record and, [S], what belongs to it in a pytree over all members."""
-        return ((record, self._of(i, members)) for i, record in enumerate(self.records))
+        return ((record, common.part(members, i, len(self.seeds))) for i, record in enumerate(self.records))
+
+    def _each_state(self, state: PyTree) -> Iterator[tuple[Record, PyTree]]:
+        """The same for a state, of whose many arrays one program cuts out one real system's at a time."""
+        for i, record in enumerate(self.records):
+            yield record, state if len(self.records) == 1 else _part(state, i, len(self.seeds))
 
     def _offline(self, state: PyTree, updates: int) -> PyTree:
         """Learning from the simulator's transitions alone."""
@@ -241,21 +240,22 @@ class _Run:
         return float(scores["success"].mean())
 
     def _checkpoint(self, state: PyTree, done: int) -> None:
-        for record, own in self._each(state):
+        for record, own in self._each_state(state):
             record.checkpoint(own, done)
 
     # ------------------------------------------------------------ what stays
 
     def _finish(self, state: PyTree, card: dict[str, Any]) -> list[dict[str, Any]]:
         """Policies, summaries, figures and films."""
+        export = jax.jit(lambda state, i: self.tuner.export(common.member(state, i)))
         summaries, play = [], functools.cache(lambda: self._before_and_after(state))
-        for i, (record, own) in enumerate(self._each(state)):
-            record.save_policies(self.tuner.export, own, card)
+        for i, (record, own) in enumerate(self._each_state(state)):
+            record.save_policies(export, own, card)
             summary = record.summarise()
             summaries.append(summary)
             if self.args.video:
-                pool, mine = common.member(self.reals.pools, i), lambda i=i: [self._of(i, played) for played in play()]
-                print(record.film(pool, mine, summary["final"]["rollouts"]))
+                mine = lambda i=i: [common.part(played, i, len(self.seeds)) for played in play()]  # noqa: E731
+                print(record.film(common.member(self.reals.pools, i), mine, summary["final"]["rollouts"]))
             print(f"results: {record.folder}  (policy/, real/, summary.json, figures/)")
         print("next: python -m experiments.figures")
         return summaries
@@ -264,6 +264,15 @@ class _Run:
         """The evaluation episodes [M, n] of the simulator's policy and of the agent as it is now."""
         players, n = ((self.pilot, self.untuned()), (self.program, tuned)), self.args.eval_episodes
         return [program.evaluate(state, self.reals, self.numbers, n) for program, state in players]
+
+
+_part = jax.jit(common.part, static_argnums=2)
+
+
+@jax.jit
+def _join(states: list[PyTree]) -> PyTree:
+    """The states of all members from those of each real system."""
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *states)
 
 
 def _common_rollouts(records: list[Record]) -> int:

@@ -69,12 +69,13 @@ class Record:
         with open(self.folder / "timing.jsonl", "a") as file:
             file.write(json.dumps(line) + "\n")
 
-    def save_policies(self, export: Callable[[PyTree], Prior], state: PyTree, card: Mapping[str, Any]) -> None:
-        """The fine-tuned policies in the form of priors: policy/seed-<k>."""
+    def save_policies(self, export: Callable[[PyTree, int], Prior], state: PyTree, card: Mapping[str, Any]) -> None:
+        """The fine-tuned policies in the form of priors: policy/seed-<k>. export(state, i) -> that of the i-th seed."""
         for i, seed in enumerate(self.seeds):
             facts = {"method": self.method, "gap": self.gap._asdict(), "seed": seed}
-            tuned = export(member(state, i))
-            checkpoint.save_prior(self.folder / "policy" / f"seed-{seed}", tuned, {**card, "finetuned": facts})
+            checkpoint.save_prior(
+                self.folder / "policy" / f"seed-{seed}", export(state, i), {**card, "finetuned": facts}
+            )
 
     def summarise(self) -> dict[str, Any]:
         """summary.json, the learning curve and the closing words; the log ends here."""
