@@ -19,7 +19,7 @@ help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo
 	@echo "  make pretrain TASK=hammer PRESET=fast SEED=0"
-	@echo "  make finetune TASK=hammer METHOD=sgft-sac REAL=default SEEDS=10"
+	@echo "  make finetune TASK=hammer METHOD=sgft-sac REAL='mild default' SEEDS=10"
 	@echo "  Anything else goes through ARGS, e.g. make pretrain TASK=hammer ARGS='--resume'; ARGS=--help lists it."
 
 setup: ## create .venv with the locked versions (EXTRAS=dev,cuda for an NVIDIA GPU)
