@@ -7,7 +7,9 @@ PY := .venv/bin/python
 
 # Flags for the variables that were set, and for no others: the commands keep their own defaults.
 flag = $(if $($(1)),--$(2) '$($(1))')
-FLAGS = $(call flag,TASK,task) $(call flag,PRESET,preset) $(call flag,METHOD,method) $(call flag,REAL,real) \
+# The same where a variable may hold several words.
+flag-words = $(if $($(1)),--$(2) $(foreach word,$($(1)),'$(word)'))
+FLAGS = $(call flag,TASK,task) $(call flag,PRESET,preset) $(call flag,METHOD,method) $(call flag-words,REAL,real) \
 	$(call flag,PRIOR,prior) $(call flag,SEED,seed) $(call flag,SEEDS,seeds) $(ARGS)
 
 .DEFAULT_GOAL := help
@@ -17,7 +19,7 @@ help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo
 	@echo "  make pretrain TASK=hammer PRESET=fast SEED=0"
-	@echo "  make finetune TASK=hammer METHOD=sgft-sac REAL=default SEEDS=10"
+	@echo "  make finetune TASK=hammer METHOD=sgft-sac REAL='mild default' SEEDS=10"
 	@echo "  Anything else goes through ARGS, e.g. make pretrain TASK=hammer ARGS='--resume'; ARGS=--help lists it."
 
 setup: ## create .venv with the locked versions (EXTRAS=dev,cuda for an NVIDIA GPU)

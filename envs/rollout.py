@@ -40,14 +40,14 @@ class Episode(NamedTuple):
     qpos: Array
 
 
-def pick(pool: World, index: Array) -> World:
-    """The worlds of a pool at `index` (any shape)."""
+def pick(pool: World, index: Array | tuple[Array, Array]) -> World:
+    """The worlds of a pool at `index` (any shape); of several stacked pools, those at (pool, index)."""
     return jax.tree.map(lambda x: x[index], pool)
 
 
 def pool_size(pool: World) -> int:
-    """Number of worlds in a pool."""
-    return pool.params.shape[0]
+    """Number of worlds in a pool, or in each of several stacked ones."""
+    return pool.params.shape[-2]
 
 
 def launch(env: Env, pool: World, key: Key, n: int) -> Fleet:
@@ -81,15 +81,25 @@ def step_fleet(
 
 
 def play_episode(
-    env: Env, pool: World, policy: Policy, carry: PyTree, key: Key, *, gamma: float | Array, length: int | None = None
+    env: Env,
+    pool: World,
+    policy: Policy,
+    carry: PyTree,
+    key: Key,
+    *,
+    gamma: float | Array,
+    length: int | None = None,
+    which: Array | None = None,
 ) -> Episode:
     """One episode in a random world of the pool; nothing is batched: vmap over keys.
 
-    length: control steps, default `env.episode_length`; a longer one looks past the time limit.
+    length: control steps, default `env.episode_length`; a longer one looks past the time limit. which: [] which one of
+    several pools stacked to [pools, worlds]; the episode is that of this pool alone.
     """
     key_world, key_reset, key_steps = jax.random.split(key, 3)
     index = jax.random.randint(key_world, (), 0, pool_size(pool))
-    world = pick(pool, index)
+    # Of stacked pools, too, the one world is gathered: under vmap an episode costs a copy of a world, never of a pool.
+    world = pick(pool, index if which is None else (which, index))
     start = env.reset(world, key_reset)
 
     def step(loop: tuple[EnvState, PyTree, Array], key: Key) -> tuple[tuple[EnvState, PyTree, Array], tuple]:

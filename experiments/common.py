@@ -15,6 +15,7 @@ import envs
 from envs import gaps
 from envs.base import Env, World
 from envs.gaps import Gap
+from envs.rollout import pool_size
 from experiments import cli
 from sgft_jax import checkpoint
 from sgft_jax.config import differences
@@ -56,9 +57,14 @@ def stack(trees: Sequence[PyTree]) -> PyTree:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
-def member(tree: PyTree, i: int) -> PyTree:
+def member(tree: PyTree, i: int | Array) -> PyTree:
     """The i-th of stacked pytrees."""
     return jax.tree.map(lambda x: x[i], tree)
+
+
+def part(tree: PyTree, i: int | Array, n: int) -> PyTree:
+    """The i-th n of stacked pytrees."""
+    return jax.tree.map(lambda x: x.reshape(-1, n, *x.shape[1:])[i], tree)
 
 
 def over_seeds(function: Callable[..., PyTree], seeds: int, *, shared: int = 0) -> Callable[..., PyTree]:
@@ -111,6 +117,14 @@ def load_gap(env: Env, real: str | None, overrides: Sequence[str]) -> Gap | None
 def training_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:
     """Worlds to learn in: the training domain, or the real system of a gap."""
     return env.sample_worlds(key, n) if gap is None else gaps.worlds(env, gap, key, n)
+
+
+def real_worlds(env: Env, found: Sequence[Gap], key: Key, n: int = 256) -> World:
+    """The real systems of gaps as pools of one size, [gaps, n]; [gaps, 1] where nothing varies in any of them."""
+    pools = [gaps.worlds(env, gap, key, n) for gap in found]
+    size = max(map(pool_size, pools))
+    repeat = lambda x: jnp.repeat(x, size // x.shape[0], axis=0)  # noqa: E731
+    return stack([jax.tree.map(repeat, pool) for pool in pools])
 
 
 def exam_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:

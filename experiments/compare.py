@@ -1,26 +1,28 @@
 """Run every method on every task and real system, cell by cell, and draw what there is.
 
 A cell is one fine-tuning run of all seeds, with the method's own defaults. Cells that are finished are left alone,
-begun ones go on where they stopped: the same command, given again, does what is missing.
+begun ones go on where they stopped: the same command, given again, does what is missing. The real systems of a task
+that a method has got equally far on are stepped together in one program.
 """
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import envs
 from envs.physics import Impl
 from experiments import cli, common
 from experiments.figures import FiguresArgs, figures
-from experiments.finetune import FinetuneArgs, arguments, finetune, run_folder
+from experiments.finetune import finetune
+from experiments.finetune_args import FinetuneArgs, arguments, run_folder
+from sgft_jax import checkpoint
 from sgft_jax.jsonfile import read_json
+from sgft_jax.log import SUMMARY
 from sgft_jax.methods import METHODS, get_method
 from sgft_jax.runs import CONFIG
 from sgft_jax.types import UserError
-
-_SUMMARY = "summary.json"
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,8 @@ class CompareArgs:
     """Rollouts of the simulator's policy, the same for all methods."""
     eval_every: int = 5
     """Rollouts between evaluations."""
+    together: bool = True
+    """Step the real systems of a task together; --no-together: one after another, in less memory but more time."""
     minutes: float | None = None
     """Begin no new cell after so many minutes."""
     dry: bool = False
@@ -56,14 +60,15 @@ class CompareArgs:
 
 
 class Cell(NamedTuple):
-    """One run. state: of its folder; done: its real rollouts so far, as far as a summary tells."""
+    """One run, on one real system. state: of its folder; done: the real rollouts from which it would go on."""
 
     args: FinetuneArgs
     state: Literal["missing", "unfinished", "finished"]
     done: int
 
     def __str__(self) -> str:
-        return f"{self.args.task}/{Path(self.args.real).stem}: {self.args.method}"
+        (real,) = self.args.real
+        return f"{self.args.task}/{Path(real).stem}: {self.args.method}"
 
 
 def main(args: CompareArgs) -> None:
@@ -85,36 +90,62 @@ def compare(args: CompareArgs) -> list[str]:
         print(f"{cell.state:10} {cell}" + (f", {cell.done} rollouts" if cell.done else ""))
     if args.dry:
         return []
-    for cell in [cell for cell in grid if cell.state != "finished"]:
+    for batch in _batches(grid, together=args.together):
         if args.minutes is not None and time.monotonic() - started > 60 * args.minutes:
             print(f"stopped after {args.minutes:g} minutes; the same command goes on")
             break
-        print(f"--- {cell}")
-        try:
-            finetune(replace(cell.args, resume=cell.state == "unfinished"))
-        except UserError as error:  # the other cells may have what this one lacks
-            print(f"error: {error}")
-            failed.append(f"{cell}: {error}")
+        failed += _run(batch)
     return failed
+
+
+def _batches(grid: Sequence[Cell], *, together: bool) -> list[list[Cell]]:
+    """The cells that are not finished, in their order; those that one call can do follow their first one."""
+    batches: dict[Any, list[Cell]] = {}
+    for cell in [cell for cell in grid if cell.state != "finished"]:
+        apart = () if together else cell.args.real
+        batches.setdefault((cell.args.task, cell.args.method, cell.state, cell.done, apart), []).append(cell)
+    return list(batches.values())
+
+
+def _run(batch: Sequence[Cell]) -> list[str]:
+    """Runs cells that differ in their real systems alone; returns a line for each that could not run."""
+    print(f"--- {', '.join(map(str, batch))}")
+    first = batch[0]
+    reals = tuple(real for cell in batch for real in cell.args.real)
+    try:
+        finetune(replace(first.args, real=reals, resume=first.state == "unfinished"))
+    except UserError as error:
+        print(f"error: {error}")
+        if len(batch) == 1:
+            return [f"{first}: {error}"]
+        # The others may have what one of them lacks; how far each has got is looked up again.
+        return [line for cell in batch for line in _run([_cell(cell.args)])]
+    return []
 
 
 def cells(args: CompareArgs) -> list[Cell]:
     """The grid, methods innermost, so that every task and real system is compared early."""
     _check(args)
-    return [_cell(args, task, real, method) for task in args.tasks for real in args.reals for method in args.methods]
+    grid = [(task, real, method) for task in args.tasks for real in args.reals for method in args.methods]
+    return [_cell(_arguments(args, *names)) for names in grid]
 
 
-def _cell(args: CompareArgs, task: str, real: str, method: str) -> Cell:
-    run = arguments(
-        method, task=task, real=real, seed=args.seed, seeds=args.seeds, rollouts=args.rollouts,
+def _arguments(args: CompareArgs, task: str, real: str, method: str) -> FinetuneArgs:
+    return arguments(
+        method, task=task, real=(real,), seed=args.seed, seeds=args.seeds, rollouts=args.rollouts,
         initial_rollouts=args.initial_rollouts, eval_every=args.eval_every, impl=args.impl, devices=args.devices,
         video=False, out=args.out,
     )  # fmt: skip
-    folder = run_folder(run)
+
+
+def _cell(run: FinetuneArgs) -> Cell:
+    """How far the run on the one real system of these arguments has got."""
+    folder = run_folder(run, *run.real)
     if not (folder / CONFIG).exists():
         return Cell(run, "missing", 0)
-    done = read_json(folder / _SUMMARY)["final"]["rollouts"] if (folder / _SUMMARY).exists() else 0
-    return Cell(run, "finished" if done >= args.rollouts else "unfinished", done)
+    summed_up = read_json(folder / SUMMARY)["final"]["rollouts"] if (folder / SUMMARY).exists() else 0
+    state = "finished" if summed_up >= run.rollouts else "unfinished"
+    return Cell(run, state, checkpoint.latest(folder, say=lambda _: None) or 0)
 
 
 def _check(args: CompareArgs) -> None:

@@ -11,7 +11,8 @@ import jax
 
 from experiments import cli
 from experiments.figures import FiguresArgs, figures
-from experiments.finetune import FinetuneArgs, finetune, run_folder
+from experiments.finetune import finetune
+from experiments.finetune_args import FinetuneArgs, run_folder
 from experiments.presets import PRESETS
 from experiments.pretrain import PretrainArgs, pretrain
 from sgft_jax.finetune import FinetuneConfig
@@ -56,7 +57,7 @@ def main(args: DemoArgs) -> None:
 def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> FinetuneArgs:
     """Smaller batches and fewer, larger updates than on a GPU: what two cores can do; all methods get the same."""
     return FinetuneArgs(
-        real=args.real,
+        real=(args.real,),
         method=method,
         seeds=args.seeds,
         rollouts=args.rollouts,
@@ -78,7 +79,7 @@ def _finetune_both(shown: FinetuneArgs, other: FinetuneArgs) -> None:
         return
     log = other.out / f"{other.method}.log"
     context = multiprocessing.get_context("spawn")
-    beside = context.Process(target=_logged, args=(other, log, run_folder(shown) / "real"), daemon=True)
+    beside = context.Process(target=_logged, args=(other, log, run_folder(shown, *shown.real) / "real"), daemon=True)
     beside.start()
     try:
         finetune(shown)

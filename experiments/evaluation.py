@@ -14,13 +14,22 @@ from sgft_jax.types import Array, Key, Metrics, PyTree
 
 
 def play_episodes(
-    env: Env, pool: World, policy: Policy, carry: PyTree, keys: Key, *, gamma: float, length: int | None = None
+    env: Env,
+    pool: World,
+    policy: Policy,
+    carry: PyTree,
+    keys: Key,
+    *,
+    gamma: float,
+    length: int | None = None,
+    which: Array | None = None,
 ) -> Episode:
     """Episodes [n, ...] of `policy(carry, obs, key) -> (action, carry)`, one per key [n], each in a random world.
 
-    A key gives the same world, start and noise to every policy: differences between policies are paired.
+    A key gives the same world, start and noise to every policy: differences between policies are paired. length, which:
+    as for `play_episode`.
     """
-    one = lambda key: play_episode(env, pool, policy, carry, key, gamma=gamma, length=length)  # noqa: E731
+    one = lambda key: play_episode(env, pool, policy, carry, key, gamma=gamma, length=length, which=which)  # noqa: E731
     return split_vmap(one)(keys)
 
 

@@ -1,7 +1,8 @@
-"""Fine-tuning of many seeds on one real system as jitted functions: collect, store, learn, evaluate. Pure.
+"""Fine-tuning of many seeds on several real systems as jitted functions: collect, store, learn, evaluate. Pure.
 
 Every random draw of a run follows from (seed, purpose, rollout number), so no key is carried along, a resumed run draws
-what an uninterrupted one would have drawn, and all methods meet the same real starts.
+what an uninterrupted one would have drawn, all methods meet the same real starts, and a real system gives the same
+whether it is stepped alone or together with others.
 """
 
 import functools
@@ -26,7 +27,7 @@ _AT_ONCE = 1024  # simulated episodes played together
 class Simulation(NamedTuple):
     """What the simulator's policies did in simulation.
 
-    replay: [P], one per prior. which: [S], the prior of each seed. returns: [P, episodes] of the task, undiscounted.
+    replay: [P], one per prior. which: [M], the prior of each member. returns: [P, episodes] of the task, undiscounted.
     """
 
     replay: replay.ReplayState
@@ -34,25 +35,32 @@ class Simulation(NamedTuple):
     returns: Array
 
 
-class Program(NamedTuple):
-    """Compiled functions over a leading seeds axis S, which the devices of a mesh share. The state given to `store` and
-    `learn` is donated.
+class Reals(NamedTuple):
+    """The real systems. pools: worlds [G, W], a pool of each. which: [M], the real system of each member."""
 
-    init(priors [S], seeds [S]) -> state [S].
-    collect(state, pool, seeds, rollout, n) -> Episode [S, n]: exploring episodes on the real system.
+    pools: World
+    which: Array
+
+
+class Program(NamedTuple):
+    """Compiled functions over a leading axis of members M, each a seed on a real system, which the devices of a mesh
+    share. The state given to `store` and `learn` is donated.
+
+    init(priors [M], seeds [M]) -> state [M].
+    collect(state, reals, seeds, rollout, n) -> Episode [M, n]: exploring episodes on the real systems.
     store(state, episodes) -> state.
-    learn(state, seeds, rollout, updates, simulation) -> (state, metrics [S]): that many updates (static) after that
+    learn(state, seeds, rollout, updates, simulation) -> (state, metrics [M]): that many updates (static) after that
         rollout; simulation: None for methods that do without.
-    offline(state, seeds, part, updates, simulation) -> (state, metrics [S]): the same on the simulation alone.
-    evaluate(state, pool, seeds, n) -> Episode [S, n]: with the mean action; the first n of a fixed series of episodes.
+    offline(state, seeds, part, updates, simulation) -> (state, metrics [M]): the same on the simulation alone.
+    evaluate(state, reals, seeds, n) -> Episode [M, n]: with the mean action; the first n of a fixed series of episodes.
     """
 
     init: Callable[[PyTree, Array], PyTree]
-    collect: Callable[[PyTree, World, Array, int, int], Episode]
+    collect: Callable[[PyTree, Reals, Array, int, int], Episode]
     store: Callable[[PyTree, Episode], PyTree]
     learn: Callable[[PyTree, Array, int, int, Simulation | None], tuple[PyTree, Metrics]]
     offline: Callable[[PyTree, Array, int, int, Simulation | None], tuple[PyTree, Metrics]]
-    evaluate: Callable[[PyTree, World, Array, int], Episode]
+    evaluate: Callable[[PyTree, Reals, Array, int], Episode]
 
 
 def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
@@ -61,9 +69,9 @@ def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
     def init(prior: PyTree, seed: Array) -> PyTree:
         return tuner.init(prior, _key(seed, _INIT, 0))
 
-    def play(state: PyTree, pool: World, keys: Key, explore: Array) -> Episode:
+    def play(state: PyTree, pools: World, which: Array, keys: Key, explore: Array) -> Episode:
         policy = lambda carry, obs, key: tuner.act(state, carry, obs, key, explore=explore)  # noqa: E731
-        return play_episodes(env, pool, policy, tuner.init_carry(), keys, gamma=gamma)
+        return play_episodes(env, pools, policy, tuner.init_carry(), keys, gamma=gamma, which=which)
 
     def store(state: PyTree, episodes: Episode) -> PyTree:
         """One episode after another: some learners need to know where each ends."""
@@ -81,17 +89,17 @@ def make_program(env: Env, tuner: Finetuner, *, gamma: float) -> Program:
         return split_vmap(one, (0, 0, 0, None))(state, seeds, which, buffers)
 
     # One program explores and evaluates: compiling MJX takes longer than many an experiment on a small machine.
-    played = jax.jit(split_vmap(play, (0, None, 0, None)))
+    played = jax.jit(split_vmap(play, (0, None, 0, 0, None)))
     keys = jax.jit(jax.vmap(_episode_keys, (0, None, None, None)), static_argnums=3)
 
-    def collect(state: PyTree, pool: World, seeds: Array, rollout: int, n: int) -> Episode:
+    def collect(state: PyTree, reals: Reals, seeds: Array, rollout: int, n: int) -> Episode:
         """One after another, as on a robot: a program for n at once would be used for the initial rollouts alone."""
         each = jnp.split(keys(seeds, _COLLECT, rollout, n), n, axis=1)
-        episodes = [played(state, pool, key, True) for key in each]
+        episodes = [played(state, *reals, key, True) for key in each]
         return jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *episodes)
 
-    def evaluate(state: PyTree, pool: World, seeds: Array, n: int) -> Episode:
-        return played(state, pool, keys(seeds, _EVALUATE, 0, n), False)
+    def evaluate(state: PyTree, reals: Reals, seeds: Array, n: int) -> Episode:
+        return played(state, *reals, keys(seeds, _EVALUATE, 0, n), False)
 
     return Program(
         init=jax.jit(split_vmap(init)),

@@ -21,7 +21,6 @@ from envs import gaps
 from envs.base import Env, World
 from envs.gaps import Gap
 from envs.physics import Impl
-from envs.rollout import pool_size
 from experiments import cli, common
 from experiments.algorithms import describe_use, make_player
 from experiments.evaluation import Best, Outcome, describe, grade, score
@@ -110,14 +109,6 @@ def _report(folder: Path, about: dict[str, Any], lines: list[dict[str, Any]]) ->
     return summary
 
 
-def pools_of(env: Env, found: Sequence[Gap], key: Key, n: int) -> World:
-    """The real systems as pools of one size, [gaps, n]; [gaps, 1] where nothing varies in any of them."""
-    pools = [gaps.worlds(env, gap, key, n) for gap in found]
-    size = max(map(pool_size, pools))
-    repeat = lambda x: jnp.repeat(x, size // x.shape[0], axis=0)  # noqa: E731
-    return common.stack([jax.tree.map(repeat, pool) for pool in pools])
-
-
 def admissible(zero_shot: float, trained: float | None) -> bool | None:
     """Whether a gap is neither bridged by pretraining alone nor impossible; None = training has not been measured."""
     if zero_shot > ZERO_SHOT_AT_MOST:
@@ -159,7 +150,7 @@ def _rate(outcome: Outcome) -> dict[str, Any]:
 
 def _zero_shot(env: Env, found: Sequence[Gap], priors: PyTree, card: dict[str, Any], episodes: int) -> list[Outcome]:
     """For each gap, the episodes of the priors [priors, episodes]; every policy plays the same ones."""
-    pools = pools_of(env, found, jax.random.key(_REPORT_SEED), episodes)
+    pools = common.real_worlds(env, found, jax.random.key(_REPORT_SEED), episodes)
     key = jax.random.fold_in(jax.random.key(_REPORT_SEED), 1)
     graded = _grader(env, card, episodes=episodes)
     over_priors = jax.vmap(graded, (None, None, 0))
@@ -186,7 +177,7 @@ def _train(env: Env, args: GapsArgs, found: Sequence[Gap], seeds: list[int], fol
 
     def members(seed: int, n: int) -> World:
         """Worlds [gaps * seeds, n]; all seeds of a gap live in the same ones."""
-        pools = pools_of(env, found, jax.random.key(seed), n)
+        pools = common.real_worlds(env, found, jax.random.key(seed), n)
         return jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), pools)
 
     def examiner(seed: int, episodes: int) -> Callable[[PyTree], Outcome]:
@@ -203,7 +194,7 @@ def _train(env: Env, args: GapsArgs, found: Sequence[Gap], seeds: list[int], fol
     chunk = functools.partial(program.chunk, pools, random)
     best = _best(saved, chunk, examiner(_EXAM_SEED, config.eval_episodes), program, config, folder)
     outcome = jax.tree.map(np.asarray, examiner(_REPORT_SEED, args.episodes)(best))
-    return [jax.tree.map(lambda x, i=i: x[i * len(seeds) :][: len(seeds)], outcome) for i in range(len(found))]
+    return [common.part(outcome, i, len(seeds)) for i in range(len(found))]
 
 
 def _best(

@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -81,32 +81,42 @@ def open_run(
     may differ on a resume. Raises UserError if the folder holds something already and neither `resume` nor `overwrite`
     is set, if it is not a run folder, if the stored configuration differs, or if another process has it open.
     """
-    folder = Path(folder)
+    configs = {Path(folder): config_to_json(config)}
+    return open_runs(configs, kind=kind, resume=resume, overwrite=overwrite, volatile=volatile, say=say)[0]
+
+
+def open_runs(
+    configs: Mapping[Path, Mapping[str, Any]],
+    *,
+    kind: str,
+    resume: bool = False,
+    overwrite: bool = False,
+    volatile: tuple[str, ...] = ("resume", "overwrite"),
+    say: Callable[[str], None] = print,
+) -> list[Run]:
+    """`open_run` for several folders with the configuration of each as JSON data: all of them or none.
+
+    What is wrong with one of them is found before anything is written to any.
+    """
     if resume and overwrite:
         raise UserError("--resume and --overwrite exclude each other: keep the run or replace it")
-    say(f"run folder: {folder}")
-    # A process killed while it made the folder leaves hidden files at most: nothing started yet.
-    existing = folder.exists() and any(not p.name.startswith(".") for p in folder.iterdir())
-    if existing:
-        _check_ours(folder, resume=resume, overwrite=overwrite)
-    elif resume and not folder.exists():
-        raise UserError(f"{folder}: nothing to resume there; leave --resume out to start it")
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = Lock(folder)
-    resolved = config_to_json(config)
-    if existing and resume:
-        try:
-            _check_same(folder, kind, resolved, volatile)
-        except UserError:
-            lock.release()  # the traceback would keep it alive
-            raise
-    elif existing:
-        _empty(folder)
-    if not (existing and resume):
-        write_json(folder / CONFIG, {_MARK: _version("sgft-jax"), "kind": kind, "config": resolved})
-    starts = read_json(folder / PROVENANCE)["starts"] if (folder / PROVENANCE).exists() else []
-    write_json(folder / PROVENANCE, {"starts": [*starts, provenance()]})
-    return Run(folder=folder, resumed=existing and resume, lock=lock)
+    existing = [_exists(folder, resume=resume, overwrite=overwrite, say=say) for folder in configs]
+    runs: list[Run] = []
+    try:
+        for (folder, config), there in zip(configs.items(), existing, strict=True):
+            folder.mkdir(parents=True, exist_ok=True)
+            runs.append(Run(folder, resumed=there and resume, lock=Lock(folder)))
+            if there and resume:
+                _check_same(folder, kind, config, volatile)
+    except UserError:
+        for run in runs:
+            run.close()  # the traceback would keep the locks alive
+        raise
+    for run, config, there in zip(runs, configs.values(), existing, strict=True):
+        if there and overwrite:
+            _empty(run.folder)
+        _record(run, kind, config)
+    return runs
 
 
 def provenance() -> dict[str, Any]:
@@ -151,6 +161,27 @@ def _git_state(root: Path) -> dict[str, Any] | None:
 # ---------------------------------------------------------------- the folder
 
 
+def _exists(folder: Path, *, resume: bool, overwrite: bool, say: Callable[[str], None]) -> bool:
+    """Whether the folder holds a run already; raises UserError if that is not what was asked for."""
+    say(f"run folder: {folder}")
+    # A process killed while it made the folder leaves hidden files at most: nothing started yet.
+    existing = folder.exists() and any(not p.name.startswith(".") for p in folder.iterdir())
+    if existing:
+        _check_ours(folder, resume=resume, overwrite=overwrite)
+    elif resume and not folder.exists():
+        raise UserError(f"{folder}: nothing to resume there; leave --resume out to start it")
+    return existing
+
+
+def _record(run: Run, kind: str, config: Mapping[str, Any]) -> None:
+    """Write down the start, and the configuration if it is the first one."""
+    if not run.resumed:
+        write_json(run.folder / CONFIG, {_MARK: _version("sgft-jax"), "kind": kind, "config": config})
+    path = run.folder / PROVENANCE
+    starts = read_json(path)["starts"] if path.exists() else []
+    write_json(path, {"starts": [*starts, provenance()]})
+
+
 def _check_ours(folder: Path, *, resume: bool, overwrite: bool) -> None:
     if not (resume or overwrite):
         raise UserError(f"{folder}: exists already; continue it with --resume or replace it with --overwrite")
@@ -166,7 +197,7 @@ def _stored(folder: Path) -> dict[str, Any]:
     return stored
 
 
-def _check_same(folder: Path, kind: str, wanted: dict[str, Any], volatile: tuple[str, ...]) -> None:
+def _check_same(folder: Path, kind: str, wanted: Mapping[str, Any], volatile: tuple[str, ...]) -> None:
     stored = _stored(folder)
     if stored["kind"] != kind:
         raise UserError(f"{folder}: is a {stored['kind']} run, not a {kind} run")

@@ -49,7 +49,7 @@ def test_make_targets_and_variables_exist(words):
     targets = [word for word in words[1:] if "=" not in word]
     assert targets and all(re.search(rf"^{target}:.* ## ", MAKEFILE, re.M) for target in targets)
     for variable in (word.partition("=")[0] for word in words[1:] if "=" in word):
-        assert re.search(rf"\$[({{](call flag,)?{variable}\b", MAKEFILE), variable
+        assert re.search(rf"\$[({{](call [\w-]+,)?{variable}\b", MAKEFILE), variable
 
 
 @pytest.mark.parametrize("module", MODULES)

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from envs.physics import Impl
-from experiments.finetune import FinetuneArgs, finetune, run_folder
+from experiments.finetune import finetune
+from experiments.finetune_args import FinetuneArgs, run_folder
 from experiments.presets import PRESETS
 from experiments.pretrain import PretrainArgs, pretrain
 from sgft_jax.log import read_jsonl
@@ -43,7 +44,8 @@ def fine_tuning(task: str, impl: Impl, seeds: int, *, prior: Path, rollouts: int
 
     def run(out: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         args = FinetuneArgs(task=task, seeds=seeds, rollouts=rollouts, prior=prior, impl=impl, video=False, out=out)
-        return finetune(args), read_jsonl(run_folder(args) / "timing.jsonl")
+        (summary,) = finetune(args)
+        return summary, read_jsonl(run_folder(args, *args.real) / "timing.jsonl")
 
     first_s, ((summary, timing), seconds) = _twice(run)
     parts = {part: statistics.median(line[f"time/{part}"] for line in timing[1:]) for part in ("collect_s", "learn_s")}

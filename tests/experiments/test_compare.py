@@ -1,11 +1,13 @@
 """The grid of runs: what is missing runs, what is finished stays, what cannot run does not stop the rest."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
 import envs
 from experiments import cli, compare
+from sgft_jax import checkpoint
 from sgft_jax.types import UserError
 
 GRID = {"tasks": ("push", "insert"), "methods": ("sgft-sac", "rlpd"), "seeds": 2, "rollouts": 10}
@@ -18,20 +20,23 @@ def ran(monkeypatch):
 
     def finetune(args):
         seen.append(args)
-        if (args.task, args.method) == ("insert", "rlpd"):
+        if (args.task, args.method) == ("insert", "rlpd") or "lacking" in args.real:
             raise UserError("holds no prior")
-        leave(args, args.rollouts)
+        for real in args.real:
+            leave(replace(args, real=(real,)), args.rollouts)
 
     monkeypatch.setattr(compare, "finetune", finetune)
     monkeypatch.setattr(cli, "set_up", lambda: None)
     return seen
 
 
-def leave(args, rollouts):
-    folder = compare.run_folder(args)
+def leave(args, rollouts, *, killed=False):
+    folder = compare.run_folder(args, *args.real)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.json").write_text("{}")
     if rollouts:
+        checkpoint.save(folder, rollouts, {}, meta={})
+    if rollouts and not killed:
         (folder / "summary.json").write_text(json.dumps({"final": {"rollouts": rollouts}}))
 
 
@@ -51,6 +56,33 @@ def test_what_is_missing_runs_and_what_is_finished_stays(tmp_path, ran, capsys):
     ran.clear()
     compare.compare(compare.CompareArgs(out=tmp_path, **{**GRID, "rollouts": 20}))
     assert names(ran)[0] == ("push", "sgft-sac", True)  # more rollouts were asked for
+
+
+def test_real_systems_that_got_equally_far_go_on_together(tmp_path, ran, capsys):
+    """Of five, one is finished, two were killed after 6 rollouts, one after 8, one has not begun."""
+    reals = ("mild", "default", "hard", "soft", "new")
+    grid = {**GRID, "tasks": ("push",), "methods": ("sac",), "reals": reals, "out": tmp_path}
+    for cell, done in zip(compare.cells(compare.CompareArgs(**grid)), (10, 6, 8, 6), strict=False):
+        leave(cell.args, done, killed=done < 10)
+    compare.compare(compare.CompareArgs(**grid))
+    assert [(run.real, run.resume) for run in ran] == [
+        (("default", "soft"), True),
+        (("hard",), True),
+        (("new",), False),
+    ]
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[:2] == ["finished   push/mild: sac, 10 rollouts", "unfinished push/default: sac, 6 rollouts"]
+    assert printed[5] == "--- push/default: sac, push/soft: sac"
+    ran.clear()
+    compare.compare(compare.CompareArgs(**{**grid, "rollouts": 20, "together": False}))
+    assert [run.real for run in ran] == [(real,) for real in reals]
+
+
+def test_what_one_real_system_lacks_does_not_stop_the_others(tmp_path, ran):
+    args = compare.CompareArgs(tasks=("push",), methods=("sac",), reals=("mild", "lacking", "hard"), out=tmp_path)
+    assert compare.compare(args) == ["push/lacking: sac: holds no prior"]
+    assert [run.real for run in ran] == [args.reals, ("mild",), ("lacking",), ("hard",)]
+    assert [cell.state for cell in compare.cells(args)] == ["finished", "missing", "finished"]
 
 
 def test_every_method_runs_with_its_own_settings(tmp_path, ran):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from test_common import save_prior
 import envs
 from experiments import cli, evaluate, finetune, finetuning, video
 from experiments.evaluation import play_episodes
-from sgft_jax import checkpoint
+from sgft_jax import checkpoint, runs
 from sgft_jax.log import RealLog, read_jsonl
 from sgft_jax.types import UserError
 
@@ -55,13 +56,14 @@ def home(tmp_path_factory):
     for seed in (0, 1):
         save_prior(home / f"pretrain/toy/fast/seeds-0-1/prior/seed-{seed}", seed)
     (home / "turned.toml").write_text(GAP)
+    (home / "heavy.toml").write_text("[params]\nmass = [1.5, 2.5]\n")  # its worlds vary, those of the other do not
     return home
 
 
-def argv(home, method="sgft-sac", *more, seeds=2, out=None):
+def argv(home, method="sgft-sac", *more, seeds=2, out=None, reals=("turned",)):
     """Two seeds have a device each."""
     given = ["--method", method, "--seeds", seeds, "--devices", seeds]
-    given += ["--out", out or home, "--real", home / "turned.toml"]
+    given += ["--out", out or home, "--real", *(home / f"{real}.toml" for real in reals)]
     given += ["--prior", home / "pretrain/toy/fast/seeds-0-1"]
     return [*OPTIONS.split(), *map(str, given), *more]
 
@@ -179,7 +181,7 @@ def test_more_rollouts_continue_a_finished_run(home, tmp_path):
 
 def test_a_variant_has_a_folder_beside_its_method():
     args = finetune.FinetuneArgs(task="push", seeds=2, variant="horizon-4")
-    assert finetune.run_folder(args) == Path("runs/finetune/push/default/sgft-sac_horizon-4/seeds-0-1")
+    assert finetune.run_folder(args, "default") == Path("runs/finetune/push/default/sgft-sac_horizon-4/seeds-0-1")
 
 
 def test_a_rollout_is_on_disk_before_learning_from_it(home, tmp_path, monkeypatch):
@@ -211,6 +213,9 @@ def test_a_rollout_is_on_disk_before_learning_from_it(home, tmp_path, monkeypatc
         (["--utd", "-1"], "--utd is -1.0: must be positive"),
         (["--variant", "a/b"], "--variant 'a/b': letters"),
         (["--seeds", "0"], "there must be at least one"),
+        (["--real"], "--real: name at least one"),
+        (["--real", "mild", "else/mild.toml"], "two of them would share the folder"),
+        (["--real", "a.toml", "b.toml", "c.toml", "--seeds", "1"], "times --seeds is 3: not a multiple of the 2"),
         (["--resume"], "nothing to resume there"),
     ],
 )
@@ -224,6 +229,63 @@ def test_another_configuration_does_not_continue_a_run(home, capsys):
     capsys.readouterr()
     assert "exists already" in complaint(argv(home, "sac"), capsys)
     assert "utd was 0.5, now 1.0" in complaint(argv(home, "sac", "--resume", "--utd", "1"), capsys)
+
+
+# ------------------------------------------------------------ several real systems
+
+
+def files(folder):
+    """What a run leaves, but for checkpoints and names that are drawn by chance or tell the time."""
+    paths = (str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+    return sorted(path for path in paths if "/d/" not in path and not path.startswith(("tensorboard/", "checkpoints/")))
+
+
+def agree(one, two, upto):
+    """The same starts and rollouts, and, up to the rounding of updates, metrics and evaluations."""
+    for a, b in zip(RealLog(one).load()[:upto], RealLog(two).load()[:upto], strict=True):
+        np.testing.assert_array_equal(a["obs"][:, 0], b["obs"][:, 0])
+        np.testing.assert_allclose(a["qpos"], b["qpos"], atol=1e-3)
+    for name in ("metrics.jsonl", "eval.jsonl"):
+        lines = ([line for line in read_jsonl(run / name) if line["rollouts"] <= upto] for run in (one, two))
+        for a, b in zip(*lines, strict=True):
+            assert a.keys() == b.keys()
+            for key in a:
+                assert a[key] == pytest.approx(b[key], rel=1e-3, abs=1e-3), key
+
+
+def test_real_systems_together_are_what_each_is_alone(home, tmp_path, capsys):
+    both = [tmp_path / f"finetune/toy/{real}/sac/seeds-0-1" for real in ("heavy", "turned")]
+    alone = run(home, "sac")
+    arguments = argv(home, "sac", "--rollouts", "4", reals=("heavy", "turned"), out=tmp_path)
+    call(arguments)
+    assert files(both[0]) == files(both[1]) == [path for path in files(alone) if path != "real/rollout-000004.npz"]
+    agree(both[1], alone, upto=4)
+    heavy, turned = (read_jsonl(folder / "eval.jsonl")[-1]["return"] for folder in both)
+    assert heavy != pytest.approx(turned, abs=0.05)
+    told = [json.loads((folder / "config.json").read_text())["config"]["real"] for folder in (*both, alone)]
+    assert told == [str(home / "heavy.toml"), *[str(home / "turned.toml")] * 2]
+    card = checkpoint.load_prior(both[0] / "policy/seed-1")[1]["finetuned"]
+    assert (card["gap"]["name"], card["seed"]) == ("heavy", 1)
+
+    shutil.rmtree(both[1] / "checkpoints/4")
+    error = complaint([*arguments, "--resume"], capsys)
+    assert f"{both[0]} is at rollout 4, {both[1]} is at rollout 2: they cannot go on together" in error
+    runs.Lock(both[0])  # they are free again
+
+
+@pytest.mark.slow
+def test_runs_go_on_together_or_alone_whichever_way_they_began(home, tmp_path):
+    """Together for 3 rollouts, alone for the fourth, together for the last."""
+    reals = ("heavy", "turned")
+    call(argv(home, "sgft-sac", "--rollouts", "3", reals=reals, out=tmp_path))
+    for real in reals:
+        call(argv(home, "sgft-sac", "--rollouts", "4", "--resume", reals=(real,), out=tmp_path))
+    call(argv(home, "sgft-sac", "--resume", reals=reals, out=tmp_path))
+    heavy, turned = (tmp_path / f"finetune/toy/{real}/sgft-sac/seeds-0-1" for real in reals)
+    assert [line["rollouts"] for line in read_jsonl(heavy / "eval.jsonl")] == [0, 2, 3, 4, 5]  # 3 was an end once
+    curve = turned / "eval.jsonl"
+    curve.write_text("".join(line for line in curve.read_text().splitlines(True) if '"rollouts": 3' not in line))
+    agree(turned, run(home, "sgft-sac"), upto=5)
 
 
 # ------------------------------------------------------------ video

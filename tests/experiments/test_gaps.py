@@ -3,14 +3,10 @@
 import json
 import os
 
-import jax
-import numpy as np
 import pytest
-import toy
 from test_common import save_prior
 
 import envs
-from envs.gaps import Gap
 from experiments import cli, gaps
 
 FILES = {
@@ -77,15 +73,6 @@ def test_without_training_the_answer_is_open(home, capsys):
 )
 def test_the_limits(zero_shot, trained, answer):
     assert gaps.admissible(zero_shot, trained) is answer
-
-
-def test_pools_of_different_size_are_brought_to_one():
-    env, fixed = toy.make(), Gap("fixed", {"mass": 2.0, "friction": 4.0}, {"latency": 0.05})
-    pools = gaps.pools_of(env, [fixed, Gap("ranges", {"mass": [3.0, 4.0]}, {})], jax.random.key(0), 5)
-    np.testing.assert_array_equal(pools.params[0], [[2.0, 4.0]] * 5)
-    assert pools.params.shape == (2, 5, 2) and len(np.unique(pools.params[1, :, 0])) == 5
-    np.testing.assert_allclose(pools.effects.latency, [[0.05] * 5, [0.0] * 5])
-    assert gaps.pools_of(env, [fixed, fixed], jax.random.key(0), 5).params.shape == (2, 1, 2)
 
 
 @pytest.mark.parametrize(

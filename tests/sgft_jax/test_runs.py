@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from sgft_jax.runs import open_run, provenance
+from sgft_jax.runs import Lock, open_run, open_runs, provenance
 from sgft_jax.types import UserError
 
 
@@ -65,6 +65,24 @@ def test_resume_names_every_field_that_differs(tmp_path):
     start(tmp_path / "x", other, resume=True, volatile=("task", "inner.layers"))
     with pytest.raises(UserError, match="is a pretrain run, not a finetune run"):
         open_run(tmp_path / "x", kind="finetune", config=Config(), resume=True, say=lambda _: None)
+
+
+def test_of_several_runs_all_open_or_none(tmp_path):
+    old, new = tmp_path / "old", tmp_path / "new"
+    start(old)
+    both = {folder: {"task": folder.name} for folder in (new, old)}
+    for options, words in (({}, "old: exists already"), ({"resume": True}, "new: nothing to resume there")):
+        with pytest.raises(UserError, match=words):
+            open_runs(both, kind="pretrain", say=lambda _: None, **options)
+        assert not new.exists()
+    held = Lock(old)
+    with pytest.raises(UserError, match="old: another process is writing to it"):
+        open_runs(both, kind="pretrain", overwrite=True, say=lambda _: None)
+    held.release()
+    assert [path.name for path in new.iterdir()] == [".lock"]  # not begun, and not locked any more
+    first, second = open_runs(both, kind="pretrain", overwrite=True, say=lambda _: None)
+    assert json.loads((first.folder / "config.json").read_text())["config"] == {"task": "new"}
+    assert (first.folder, second.folder) == (new, old) and not (first.resumed or second.resumed)
 
 
 def test_resume_of_nothing(tmp_path):
