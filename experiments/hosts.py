@@ -16,6 +16,7 @@ from pathlib import Path
 
 import jax
 
+from experiments.cli import USER_ERROR
 from sgft_jax import mesh
 from sgft_jax.types import UserError
 
@@ -115,7 +116,9 @@ def own(folder: Path) -> Iterator[Path]:
         try:
             yield mine
         except UserError:
-            raise  # the same on all hosts
+            if jax.process_index():
+                sys.exit(USER_ERROR)  # the first host says the same of the folder that is meant
+            raise
         except Exception:
             traceback.print_exc()
             os._exit(1)  # an orderly exit would wait minutes for the other hosts, which wait for this one
