@@ -63,7 +63,7 @@ class LearningCurveArgs:
     eval_episodes: int = 10
     """Episodes per evaluation and seed."""
     minutes: float | None = None
-    """Stop after the first episode that ends later than this; --resume goes on from there."""
+    """Stop after the first episode that ends later than this, with an evaluation; --resume goes on from there."""
     impl: Impl = "auto"
     """Who steps the physics: c (MuJoCo's C engine), warp or jax (both MJX)."""
     resume: bool = False
@@ -162,11 +162,10 @@ class _Run:
         state, metrics = self.program.store(state, episodes), {}
         for part in range(done, done + n):  # one compiled program serves the first episodes and all later ones
             state, metrics = self.program.learn(state, self.numbers, part, length, None)
-        metrics = {name: np.asarray(x) for name, x in metrics.items()}
-        seconds = {"time/collect_s": collected - started, "time/learn_s": time.perf_counter() - collected}
         done += n
-        self.log.metrics(done * length, {"return": returns, **metrics, **seconds})
-        shown = {"return": float(returns.mean())}
+        self.log.metrics(done * length, {"return": returns, **{name: np.asarray(x) for name, x in metrics.items()}})
+        seconds = {"collect s": collected - started, "learn s": time.perf_counter() - collected}
+        shown = {"return": float(returns.mean()), **seconds}
         if done % self.args.eval_every == 0 or done >= self.episodes or self._late():
             shown["evaluation"] = self._evaluate(state, done)
             meta = {**self.expect, "episodes": done, "position": self.log.position()}

@@ -11,6 +11,7 @@ import numpy as np
 
 from envs import physics
 from envs.base import Effects, Entry, Env, EnvState, Parameter, World
+from envs.engine_jax import Advance
 from envs.franka import arm
 from envs.physics import PhysicsState
 from sgft_jax.types import Array, Key, UserError
@@ -34,6 +35,7 @@ class Scene(NamedTuple):
     event(params, state) -> state: what happens between control steps (a fallen object stays down); default nothing.
     control_dt, ramp: s, the control period, and how long a new control takes to replace the old one.
     training: the simulator's own effects.
+    advance: an engine of its own in place of MJX's JAX code, for scenes whose motion someone wrote down.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Scene(NamedTuple):
     control_dt: float = CONTROL_DT
     ramp: float = RAMP
     training: Mapping[str, float] = MappingProxyType(TRAINING)
+    advance: Advance | None = None
 
 
 def new_spec(*, substeps: int, iterations: int, ls_iterations: int) -> mujoco.MjSpec:
@@ -79,7 +82,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
     host = scene.build(nominal).compile()
     fields = physics.varying_fields(host, _perturbed(scene, nominal))
     impl = physics.choose_impl(impl)
-    engine = physics.make_engine(host, fields, impl)
+    engine = scene.advance if impl == "jax" and scene.advance else physics.make_engine(host, fields, impl)
     obs_dim, act_dim = sum(e.size for e in scene.observation), sum(e.size for e in scene.action)
 
     def stack_worlds(params: np.ndarray, effects: Effects) -> World:
