@@ -64,8 +64,8 @@ class LearningCurveArgs:
     """Episodes per evaluation and seed."""
     minutes: float | None = None
     """Stop after the first episode that ends later than this, with an evaluation; --resume goes on from there."""
-    impl: Impl = "auto"
-    """Who steps the physics: c (MuJoCo's C engine), warp or jax (both MJX)."""
+    impl: Impl = "jax"
+    """Who steps the physics: jax (the cart's motion in closed form), MuJoCo's C engine, or MuJoCo Warp."""
     resume: bool = False
     """Continue from the last checkpoint."""
     overwrite: bool = False
