@@ -117,7 +117,7 @@ class _Run:
         nominal = {p.name: p.nominal for p in env.parameters}
         self.pool = env.sample_worlds(jax.random.key(0), 1, params=nominal, effects={"obs_noise": 0.0})
         self.numbers = jnp.array(seeds, jnp.uint32)
-        self.log, self.started = MetricsLog(folder), time.monotonic()
+        self.log, self.started = MetricsLog(folder, tensorboard=False), time.monotonic()
         self.expect = {"kind": "learning_curve", "task": env.name, "seeds": seeds}
 
     def work(self) -> None:
