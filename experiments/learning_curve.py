@@ -118,6 +118,7 @@ class _Run:
         self.pool = env.sample_worlds(jax.random.key(0), 1, params=nominal, effects={"obs_noise": 0.0})
         self.numbers = jnp.array(seeds, jnp.uint32)
         self.log, self.started = MetricsLog(folder, tensorboard=False), time.monotonic()
+        self.late = False
         self.expect = {"kind": "learning_curve", "task": env.name, "seeds": seeds}
 
     def work(self) -> None:
@@ -126,7 +127,7 @@ class _Run:
         length = self.env.episode_length
         total, title = self.episodes * length, f"TD-MPC2 {self.args.size} on {self.env.name}"
         with RunProgress(title, total=total, unit="steps", done=done * length) as progress:
-            while done < self.episodes and not (done and self._late()):
+            while done < self.episodes and not self.late:
                 n = 1 if done else self.random_episodes
                 state, shown = self._advance(state, done, n)
                 done += n
@@ -166,7 +167,9 @@ class _Run:
         self.log.metrics(done * length, {"return": returns, **{name: np.asarray(x) for name, x in metrics.items()}})
         seconds = {"collect s": collected - started, "learn s": time.perf_counter() - collected}
         shown = {"return": float(returns.mean()), **seconds}
-        if done % self.args.eval_every == 0 or done >= self.episodes or self._late():
+        minutes = self.args.minutes
+        self.late = minutes is not None and time.monotonic() - self.started > 60 * minutes
+        if done % self.args.eval_every == 0 or done >= self.episodes or self.late:
             shown["evaluation"] = self._evaluate(state, done)
             meta = {**self.expect, "episodes": done, "position": self.log.position()}
             checkpoint.save(self.folder, done, state, meta=meta)
@@ -177,10 +180,6 @@ class _Run:
         scores = jax.vmap(score)(played)
         self.log.eval(done * self.env.episode_length, scores)
         return float(scores["return"].mean())
-
-    def _late(self) -> bool:
-        minutes = self.args.minutes
-        return minutes is not None and time.monotonic() - self.started > 60 * minutes
 
 
 def random_episodes(env: Env, pool: World, keys: Key, *, gamma: float, n: int) -> Episode:
