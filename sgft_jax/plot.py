@@ -29,12 +29,13 @@ def learning_curves(
     rollout_length: int | None = None,
     control_dt: float | None = None,
     quantity: str = "success rate",
+    over: str = "real transitions",
 ) -> Path:
     """Success against real transitions, one line per method: IQM over seeds with its 95 % bootstrap band.
 
     curves: {method: (transitions [n_evaluations], success [n_seeds, n_evaluations])}. zero_shot: success of the policy
     before fine-tuning, drawn dashed. rollout_length (steps) and control_dt (s) add an axis on top in rollouts and
-    minutes of robot time.
+    minutes of robot time. quantity, over: names of the axes; what takes success's place is from 0 to 1, too.
     """
     figure, (axes,) = _figure(7.2, 4.0, columns=1)
     ends = []
@@ -50,7 +51,7 @@ def learning_curves(
         ends.append((max(x for x, *_ in ends), zero_shot, "zero-shot", _INK))
     axes.set_xlim(0, max(x for x, *_ in ends))
     axes.set_ylim(-0.03, 1.03)
-    axes.set_xlabel("real transitions", **_FONT)
+    axes.set_xlabel(over, **_FONT)
     axes.set_ylabel(quantity, **_FONT)
     _label_ends(axes, ends)
     _thousands(axes)

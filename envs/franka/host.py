@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.franka.task import CONTROL_DT, RAMP, Scene
+from envs.franka.task import Scene
 from envs.physics import PhysicsState
 from sgft_jax.types import Array
 
@@ -29,7 +29,7 @@ def play(
     theta: domain parameters by name. refine: divides the time step. iterations: solver iterations, 0 = the scene's own.
     """
     spec = scene.build(theta)
-    spec.option.timestep = CONTROL_DT / (scene.substeps * refine)
+    spec.option.timestep = scene.control_dt / (scene.substeps * refine)
     if iterations:
         spec.option.iterations, spec.option.ls_iterations = iterations, 50
     model = spec.compile()
@@ -39,19 +39,19 @@ def play(
     states, state = [], start
     for action in actions:
         command = np.asarray(target(state.qpos, action))
-        after = _control_step(model, data, state, command, scene.substeps * refine)
+        after = _control_step(model, data, state, command, scene.substeps * refine, scene.ramp)
         state = event(params, after)
         states.append(state)
     return states
 
 
 def _control_step(
-    model: mujoco.MjModel, data: mujoco.MjData, state: PhysicsState, command: np.ndarray, substeps: int
+    model: mujoco.MjModel, data: mujoco.MjData, state: PhysicsState, command: np.ndarray, substeps: int, ramp: float
 ) -> PhysicsState:
     data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = state.qpos, state.qvel, state.warmstart
     previous = np.asarray(state.ctrl)
     for i in range(substeps):
-        progress = min((i + 1) * model.opt.timestep / RAMP, 1.0)
+        progress = min((i + 1) * model.opt.timestep / ramp, 1.0)
         data.ctrl[:] = previous + progress * (command - previous)
         mujoco.mj_step(model, data)
     return PhysicsState(*(jnp.asarray(x, jnp.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)))

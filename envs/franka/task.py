@@ -1,6 +1,7 @@
-"""What all Franka tasks share: effects on commands and sensors, the 5 Hz control period, the Env made from parts."""
+"""What tasks in MuJoCo share: effects on commands and sensors, the Env made from parts; Franka's are the defaults."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
@@ -10,6 +11,7 @@ import numpy as np
 
 from envs import physics
 from envs.base import Effects, Entry, Env, EnvState, Parameter, World
+from envs.engine_jax import Advance
 from envs.franka import arm
 from envs.physics import PhysicsState
 from sgft_jax.types import Array, Key, UserError
@@ -22,14 +24,18 @@ MAX_SPEED = 50.0  # m/s or rad/s: ten times what any joint or object reaches, so
 
 
 class Scene(NamedTuple):
-    """The parts in which Franka tasks differ. Vectors are for one world; `params` is World.params.
+    """The parts in which tasks differ. Vectors are for one world; `params` is World.params.
 
     build(params by name) -> MjSpec: the whole scene for one theta.
     initial(params, key) -> PhysicsState: a fresh random start.
-    target(qpos, action) -> [7] joint targets in rad for an action in [-1, 1] (effects already applied).
+    target(qpos, action) -> [nu] controls, for Franka joint targets in rad, for an action in [-1, 1] (effects already
+        applied).
     observe(params, state) -> [obs_dim] without measurement error.
     substeps: physics steps per control period. cartesian: the first two action entries are x and y of the base frame.
     event(params, state) -> state: what happens between control steps (a fallen object stays down); default nothing.
+    control_dt, ramp: s, the control period, and how long a new control takes to replace the old one.
+    training: the simulator's own effects.
+    advance: an engine of its own in place of MJX's JAX code, for scenes whose motion someone wrote down.
     """
 
     name: str
@@ -47,6 +53,10 @@ class Scene(NamedTuple):
     reward: Callable[[Array, Array, Array], Array]
     success: Callable[[Array], Array]
     event: Callable[[Array, PhysicsState], PhysicsState] = lambda params, state: state
+    control_dt: float = CONTROL_DT
+    ramp: float = RAMP
+    training: Mapping[str, float] = MappingProxyType(TRAINING)
+    advance: Advance | None = None
 
 
 def new_spec(*, substeps: int, iterations: int, ls_iterations: int) -> mujoco.MjSpec:
@@ -72,7 +82,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
     host = scene.build(nominal).compile()
     fields = physics.varying_fields(host, _perturbed(scene, nominal))
     impl = physics.choose_impl(impl)
-    engine = physics.make_engine(host, fields, impl)
+    engine = scene.advance if impl == "jax" and scene.advance else physics.make_engine(host, fields, impl)
     obs_dim, act_dim = sum(e.size for e in scene.observation), sum(e.size for e in scene.action)
 
     def stack_worlds(params: np.ndarray, effects: Effects) -> World:
@@ -89,7 +99,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
             raise UserError(f"effect 'action_rotation' needs Cartesian actions; {scene.name} commands joints")
         low, high = ranges.T
         uniform = np.asarray(jax.random.uniform(key, (n, len(low))), np.float64)
-        own = make_effects({**TRAINING, **(effects or {})}, obs_dim, act_dim)
+        own = make_effects({**scene.training, **(effects or {})}, obs_dim, act_dim)
         return stack_worlds(low + (high - low) * uniform, own)
 
     def reset(world: World, key: Key) -> EnvState:
@@ -104,7 +114,8 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
     def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
         key_latency, key_noise = jax.random.split(key)
         target = scene.target(state.physics.qpos, distort(world.effects, action))
-        control = _ramp(world.effects, state.physics.ctrl, target, host.opt.timestep, key_latency)
+        previous, dt = state.physics.ctrl, scene.control_dt / scene.substeps
+        control = _ramp(world.effects, previous, target, dt, key_latency, ramp=scene.ramp)
         controls = jax.vmap(control)(jnp.arange(scene.substeps))
         after = scene.event(world.params, engine(world.model, state.physics, controls))
         true_obs = scene.observe(world.params, after)
@@ -127,7 +138,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
         action=scene.action,
         parameters=scene.parameters,
         episode_length=scene.episode_length,
-        control_dt=CONTROL_DT,
+        control_dt=scene.control_dt,
         success_anytime=scene.success_anytime,
         sample_worlds=sample_worlds,
         reset=reset,
@@ -182,9 +193,10 @@ def make_effects(values: Mapping[str, float | Sequence[float]], obs_dim: int, ac
 
 def distort(effects: Effects, action: Array) -> Array:
     """The action [act_dim] as the robot understands it: rotated in the xy plane if Cartesian, scaled, offset."""
-    c, s = jnp.cos(effects.action_rotation), jnp.sin(effects.action_rotation)
-    turned = jnp.stack([c * action[0] - s * action[1], s * action[0] + c * action[1]])
-    return effects.action_scale * action.at[:2].set(turned) + effects.action_bias
+    if len(action) > 1:
+        c, s = jnp.cos(effects.action_rotation), jnp.sin(effects.action_rotation)
+        action = action.at[:2].set(jnp.stack([c * action[0] - s * action[1], s * action[0] + c * action[1]]))
+    return effects.action_scale * action + effects.action_bias
 
 
 def measure(effects: Effects, true_obs: Array, key: Key) -> Array:
@@ -200,12 +212,14 @@ def at_rest(joints: Array, others: Array, nv: int) -> PhysicsState:
     return PhysicsState(jnp.concatenate([joints, others]), jnp.zeros(nv), jnp.zeros(nv), joints)
 
 
-def _ramp(effects: Effects, previous: Array, target: Array, dt: float, key: Key) -> Callable[[Array], Array]:
+def _ramp(
+    effects: Effects, previous: Array, target: Array, dt: float, key: Key, *, ramp: float = RAMP
+) -> Callable[[Array], Array]:
     jitter = jax.random.uniform(key, minval=-1.0, maxval=1.0) * effects.latency_jitter
     start = jnp.maximum(effects.latency + jitter, 0.0)
 
     def control(i: Array) -> Array:
-        progress = jnp.clip(((i + 1) * dt - start) / RAMP, 0.0, 1.0)
+        progress = jnp.clip(((i + 1) * dt - start) / ramp, 0.0, 1.0)
         return previous + progress * (target - previous)
 
     return control
