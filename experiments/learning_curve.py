@@ -20,7 +20,7 @@ from envs.physics import Impl
 from envs.rollout import Episode
 from experiments import cli, common
 from experiments.evaluation import play_episodes, score
-from experiments.finetuning import make_program
+from experiments.finetuning import Reals, make_program
 from sgft_jax import checkpoint, normalizer, plot, runs, tdmpc2
 from sgft_jax.finetune_planner import make_planner
 from sgft_jax.log import EVAL, MetricsLog, RunProgress, read_jsonl, write_summary
@@ -116,6 +116,7 @@ class _Run:
         self.collect_random = jax.jit(functools.partial(random_episodes, env, gamma=gamma, n=self.random_episodes))
         nominal = {p.name: p.nominal for p in env.parameters}
         self.pool = env.sample_worlds(jax.random.key(0), 1, params=nominal, effects={"obs_noise": 0.0})
+        self.reals = Reals(jax.tree.map(lambda x: x[None], self.pool), jnp.zeros(len(seeds), int))
         self.numbers = jnp.array(seeds, jnp.uint32)
         self.log, self.started = MetricsLog(folder, tensorboard=False), time.monotonic()
         self.late = False
@@ -155,7 +156,7 @@ class _Run:
         """The first N episodes, which are random, or one more, and as many updates as they have steps."""
         length, started = self.env.episode_length, time.perf_counter()
         if done:
-            episodes = self.program.collect(state, self.pool, self.numbers, done, 1)
+            episodes = self.program.collect(state, self.reals, self.numbers, done, 1)
         else:
             episodes = self.collect_random(self.pool, common.seed_keys(self.seeds, _RANDOM))
         returns = np.asarray(episodes.total_reward).mean(1)
@@ -176,7 +177,7 @@ class _Run:
         return state, shown
 
     def _evaluate(self, state: PyTree, done: int) -> float:
-        played = self.program.evaluate(state, self.pool, self.numbers, self.args.eval_episodes)
+        played = self.program.evaluate(state, self.reals, self.numbers, self.args.eval_episodes)
         scores = jax.vmap(score)(played)
         self.log.eval(done * self.env.episode_length, scores)
         return float(scores["return"].mean())
