@@ -63,9 +63,8 @@ class PretrainArgs:
     """Devices that share the environments, the replay and every batch; 0: all there are; default: one, or all of
     several hosts. Results stay the same but for rounding, and a run may be resumed on another number."""
     hosts: str | None = None
-    """Several processes together, which see the same files: local:COUNT starts one for each of so many GPUs of this
-    machine, `auto` asks the cluster (SLURM, Open MPI, Kubernetes), ADDRESS:PORT,COUNT,INDEX says where the first one
-    listens, how many there are, and which one this is."""
+    """Several hosts together, which see the same files: `auto` asks the cluster (SLURM, Open MPI, Kubernetes),
+    ADDRESS:PORT,COUNT,INDEX says where the first one listens, how many there are, and which one this is."""
     report: bool = True
     """Also measure V_sim against returns and the models against the simulator: numbers on the card, a figure."""
     video: bool = True
@@ -110,16 +109,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     argv = list(sys.argv[1:] if argv is None else argv)
     preset = common.option(argv, "--preset", DEFAULT_PRESET)
     default = PretrainArgs(preset=preset, config=PRESETS.get(preset, PRESETS[DEFAULT_PRESET]))
-    local = common.option(argv, "--hosts", "").startswith(hosts.LOCAL)
-    work = (lambda args: _on_every_gpu(args, argv)) if local else pretrain
-    cli.run_main(work, PretrainArgs, __doc__ or "", argv=argv, default=default)
-
-
-def _on_every_gpu(args: PretrainArgs, argv: Sequence[str]) -> None:
-    """The command line again, in a process for each GPU."""
-    assert args.hosts is not None  # it says how many
-    if code := hosts.run_local(args.hosts, argv, ("-m", "experiments.pretrain")):
-        sys.exit(code)
+    cli.run_main(pretrain, PretrainArgs, __doc__ or "", argv=argv, default=default)
 
 
 def pretrain(args: PretrainArgs) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.mesh import set_rows
+from sgft_jax.mesh import running_count, set_rows
 from sgft_jax.types import Array, Key, Transition, UserError
 
 
@@ -40,7 +40,7 @@ def add_batch(state: ReplayState, batch: Transition, valid: Array | None = None)
     if n > capacity:
         raise UserError(f"replay: {n} transitions at once do not fit a capacity of {capacity}; raise the capacity")
     valid = jnp.ones(n, bool) if valid is None else valid
-    rank = jnp.cumsum(valid, dtype=jnp.int32) - 1
+    rank = running_count(valid) - 1
     rows = jnp.where(valid, (state.position + rank) % capacity, capacity)
     count = jnp.sum(valid, dtype=jnp.int32)
     data = set_rows(state.data, rows, batch)

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from sgft_jax.mesh import set_rows
+from sgft_jax.mesh import running_count, set_rows
 from sgft_jax.types import Array, Key, Transition, UserError
 
 
@@ -79,7 +79,7 @@ def add_episode(state: SequenceState, rows: Transition, valid: Array) -> Sequenc
         raise UserError(f"sequence ring: an episode needs a ring of 1 environment, this one is for {state.n_envs}")
     if steps > slots:
         raise UserError(f"sequence ring: an episode of {steps} steps does not fit {slots} slots; raise the capacity")
-    rank = jnp.cumsum(valid, dtype=jnp.int32) - 1
+    rank = running_count(valid) - 1
     index = jnp.where(valid, (state.position + rank) % slots, slots)
     last = valid & ~jnp.concatenate([valid[1:], jnp.zeros(1, bool)])
     return _write(state, index, rows, valid, last, jnp.sum(valid, dtype=jnp.int32))
@@ -103,7 +103,7 @@ def sample(state: SequenceState, key: Key, n: int, length: int) -> Sequences:
     Nothing is valid while the ring is empty. Draw the windows of several updates at once: counting the valid rows
     visits the whole ring.
     """
-    count = jnp.cumsum(state.valid, dtype=jnp.int32)
+    count = running_count(state.valid)
     nth = jax.random.randint(key, (n,), 0, jnp.maximum(count[-1], 1))
     start = jnp.minimum(jnp.searchsorted(count, nth, side="right"), count.shape[0] - 1)
     return jax.vmap(lambda row: _window(state, row, length))(start)

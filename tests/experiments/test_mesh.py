@@ -97,6 +97,15 @@ def test_each_device_writes_the_rows_of_its_own_piece(capacity):
     assert one.data.reward.tolist() == {8: [5, 6, 4, 5, 6, 1, 2, 4], 9: [6, 2, 4, 5, 6, 1, 2, 4, 5]}[capacity]
 
 
+def test_rows_are_counted_whole():
+    mask = jnp.arange(16) % 3 > 0
+    with mesh.use(2):
+        program = jax.jit(lambda mask: mesh.running_count(mesh.split(mask))).lower(mask).compile()
+        counted = program(mask)
+    assert counted.tolist() == np.cumsum(mask).tolist()
+    assert counted.sharding.is_fully_replicated and "all-gather" in program.as_text()
+
+
 def test_what_one_device_left_two_continue():
     """A checkpoint holds whole arrays; `spread` lays them out."""
     random, saved = begun(1)
