@@ -140,22 +140,26 @@ def find_priors(prior: Path | None, *, out: Path, env: Env, preset: str) -> tupl
     return load_priors(prior_folders(prior, out=out, task=env.name, preset=preset), env)
 
 
+def prior_home(out: Path, task: str, preset: str) -> Path:
+    """Where the runs of pretraining are that leave the priors of a task."""
+    return out / "pretrain" / task / preset
+
+
 def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str) -> list[Path]:
-    """Where priors are: `prior` itself if it is one, else the `seed-*` folders in it, in its `prior/` or its `policy/`.
+    """Where priors are: `prior` itself if it is one, else the `seed-*` folders in it, in its `prior/` or its `policy/`,
+    or in the `prior/` of the runs in it.
 
     prior: None looks for all seeds of `<out>/pretrain/<task>/<preset>`. `policy/` is what fine-tuning leaves, in the
     same form. Raises UserError if there is none.
     """
-    home = out / "pretrain" / task / preset
-    if prior is None:
-        cards = list(home.glob("*/prior/seed-*/prior.json"))
-    elif (prior / "prior.json").exists():
-        cards = [prior / "prior.json"]
+    home = prior or prior_home(out, task, preset)
+    if (home / "prior.json").exists():
+        cards = [home / "prior.json"]
     else:
-        cards = [card for sub in (".", "prior", "policy") for card in (prior / sub).glob("seed-*/prior.json")]
+        cards = [card for sub in ("", "prior/", "policy/", "*/prior/") for card in home.glob(f"{sub}seed-*/prior.json")]
     if not cards:
         command = f"python -m experiments.pretrain --task {task} --preset {preset}"
-        raise UserError(f"{prior or home}: holds no prior; make one with: {command}")
+        raise UserError(f"{home}: holds no prior; make one with: {command}")
     return sorted((card.parent for card in cards), key=_seed_number)
 
 

@@ -1,74 +1,27 @@
 """Run every method on every task and real system, cell by cell, and draw what there is.
 
-A cell is one fine-tuning run of all seeds, with the method's own defaults. Cells that are finished are left alone,
-begun ones go on where they stopped: the same command, given again, does what is missing. The real systems of a task
-that a method has got equally far on are stepped together in one program.
+A cell is one fine-tuning run of all seeds, with the method's own defaults or, with --tuned, the options that
+`experiments.tune` chose. Cells that are finished are left alone, begun ones go on where they stopped: the same command,
+given again, does what is missing. The real systems of a task that a method has got equally far on are stepped together
+in one program.
 """
 
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass
 
-import envs
-from envs.physics import Impl
-from experiments import cli, common
+from experiments import cli, grid, tuned
 from experiments.figures import FiguresArgs, figures
-from experiments.finetune import finetune
-from experiments.finetune_args import FinetuneArgs, arguments, run_folder
-from sgft_jax import checkpoint
-from sgft_jax.jsonfile import read_json
-from sgft_jax.log import SUMMARY
-from sgft_jax.methods import METHODS, get_method
-from sgft_jax.runs import CONFIG
+from experiments.finetune_args import FinetuneArgs
+from experiments.grid import Cell, GridArgs
 from sgft_jax.types import UserError
 
 
 @dataclass(frozen=True)
-class CompareArgs:
+class CompareArgs(GridArgs):
     """A grid of fine-tuning runs; everything not named here is as `experiments.finetune` has it."""
 
-    tasks: tuple[str, ...] = tuple(envs.TASKS)
-    """Tasks."""
-    methods: tuple[str, ...] = tuple(reversed(METHODS))
-    """Methods, in the order in which they run."""
-    reals: tuple[str, ...] = ("default",)
-    """Real systems of every task: mild, default, hard, or .toml/.json files."""
-    seed: int = 0
-    """First seed."""
-    seeds: int = 10
-    """Seeds of each cell, all in one program."""
-    rollouts: int = 100
-    """Real rollouts per seed, the initial ones included; may grow later."""
-    initial_rollouts: int = 5
-    """Rollouts of the simulator's policy, the same for all methods."""
-    eval_every: int = 5
-    """Rollouts between evaluations."""
-    together: bool = True
-    """Step the real systems of a task together; --no-together: one after another, in less memory but more time."""
-    minutes: float | None = None
-    """Begin no new cell after so many minutes."""
-    dry: bool = False
-    """Only list the cells and what is missing."""
-    impl: Impl = "auto"
-    """Who steps the physics, as in fine-tuning."""
-    devices: int | None = None
-    """Devices that share the seeds; 0: all there are; default: one."""
-    out: Path = Path("runs")
-    """Parent of all run folders."""
-
-
-class Cell(NamedTuple):
-    """One run, on one real system. state: of its folder; done: the real rollouts from which it would go on."""
-
-    args: FinetuneArgs
-    state: Literal["missing", "unfinished", "finished"]
-    done: int
-
-    def __str__(self) -> str:
-        (real,) = self.args.real
-        return f"{self.args.task}/{Path(real).stem}: {self.args.method}"
+    tuned: bool = False
+    """Start from the options that `experiments.tune` chose for each task and method; the runs are a variant of their
+    own, `tuned`, beside those with the defaults."""
 
 
 def main(args: CompareArgs) -> None:
@@ -84,83 +37,25 @@ def main(args: CompareArgs) -> None:
 
 def compare(args: CompareArgs) -> list[str]:
     """Works through the cells in order; returns a line for each that could not run."""
-    started, failed = time.monotonic(), []
-    grid = cells(args)
-    for cell in grid:
-        print(f"{cell.state:10} {cell}" + (f", {cell.done} rollouts" if cell.done else ""))
-    if args.dry:
-        return []
-    for batch in _batches(grid, together=args.together):
-        if args.minutes is not None and time.monotonic() - started > 60 * args.minutes:
-            print(f"stopped after {args.minutes:g} minutes; the same command goes on")
-            break
-        failed += _run(batch)
-    return failed
-
-
-def _batches(grid: Sequence[Cell], *, together: bool) -> list[list[Cell]]:
-    """The cells that are not finished, in their order; those that one call can do follow their first one."""
-    batches: dict[Any, list[Cell]] = {}
-    for cell in [cell for cell in grid if cell.state != "finished"]:
-        apart = () if together else cell.args.real
-        batches.setdefault((cell.args.task, cell.args.method, cell.state, cell.done, apart), []).append(cell)
-    return list(batches.values())
-
-
-def _run(batch: Sequence[Cell]) -> list[str]:
-    """Runs cells that differ in their real systems alone; returns a line for each that could not run."""
-    print(f"--- {', '.join(map(str, batch))}")
-    first = batch[0]
-    reals = tuple(real for cell in batch for real in cell.args.real)
-    try:
-        finetune(replace(first.args, real=reals, resume=first.state == "unfinished"))
-    except UserError as error:
-        print(f"error: {error}")
-        if len(batch) == 1:
-            return [f"{first}: {error}"]
-        # The others may have what one of them lacks; how far each has got is looked up again.
-        return [line for cell in batch for line in _run([_cell(cell.args)])]
-    return []
+    found = cells(args)
+    if args.tuned:
+        grid.check_begun(found)  # tuning may have chosen again since
+    return grid.work(found, args)
 
 
 def cells(args: CompareArgs) -> list[Cell]:
     """The grid, methods innermost, so that every task and real system is compared early."""
-    _check(args)
-    grid = [(task, real, method) for task in args.tasks for real in args.reals for method in args.methods]
-    return [_cell(_arguments(args, *names)) for names in grid]
+    grid.check(args)
+    if args.tuned:
+        for task in args.tasks:
+            tuned.check_fair(args.out, task, args.methods, args.reals)
+    names = [(task, real, method) for task in args.tasks for real in args.reals for method in args.methods]
+    return [grid.look_up(_run_of(args, *each)) for each in names]
 
 
-def _arguments(args: CompareArgs, task: str, real: str, method: str) -> FinetuneArgs:
-    return arguments(
-        method, task=task, real=(real,), seed=args.seed, seeds=args.seeds, rollouts=args.rollouts,
-        initial_rollouts=args.initial_rollouts, eval_every=args.eval_every, impl=args.impl, devices=args.devices,
-        video=False, out=args.out,
-    )  # fmt: skip
-
-
-def _cell(run: FinetuneArgs) -> Cell:
-    """How far the run on the one real system of these arguments has got."""
-    folder = run_folder(run, *run.real)
-    if not (folder / CONFIG).exists():
-        return Cell(run, "missing", 0)
-    summed_up = read_json(folder / SUMMARY)["final"]["rollouts"] if (folder / SUMMARY).exists() else 0
-    state = "finished" if summed_up >= run.rollouts else "unfinished"
-    return Cell(run, state, checkpoint.latest(folder, say=lambda _: None) or 0)
-
-
-def _check(args: CompareArgs) -> None:
-    for name, given in (("tasks", args.tasks), ("methods", args.methods), ("reals", args.reals)):
-        _some(name, given)
-    for task in args.tasks:
-        cli.choose("--tasks", task, envs.TASKS)
-    for method in args.methods:
-        get_method(method)
-    common.seed_list(args.seed, args.seeds)
-
-
-def _some(name: str, given: Sequence[str]) -> None:
-    if not given:
-        raise UserError(f"--{name}: name at least one")
+def _run_of(args: CompareArgs, task: str, real: str, method: str) -> FinetuneArgs:
+    run = grid.run_of(args, task, real, method)
+    return tuned.apply(run) if args.tuned else run
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,10 +17,10 @@ from envs import gaps
 from envs.base import Env
 from envs.gaps import Gap
 from envs.rollout import Episode
-from experiments import cli, common
+from experiments import cli, common, tuned
 from experiments.algorithms import make_player, network_of
 from experiments.evaluation import score
-from experiments.finetune_args import DEFAULT_METHOD, FinetuneArgs, arguments, check, check_prior, run_folder
+from experiments.finetune_args import DEFAULT_METHOD, VOLATILE, FinetuneArgs, arguments, check, check_prior, run_folder
 from experiments.finetune_record import Record
 from experiments.finetuning import Program, Reals, Simulation, make_program, simulate
 from sgft_jax import checkpoint, mesh, runs
@@ -41,7 +42,18 @@ def main(argv: Sequence[str] | None = None) -> None:
     argv = list(sys.argv[1:] if argv is None else argv)
     name = common.option(argv, "--method", DEFAULT_METHOD)
     default = arguments(name) if name in METHODS else FinetuneArgs(method=name)
+    if "--tuned" in argv and name in METHODS:
+        default = _tuned(default, argv)
     cli.run_main(finetune, FinetuneArgs, f"{__doc__}\n\n{_table()}", argv=argv, default=default)
+
+
+def _tuned(default: FinetuneArgs, argv: Sequence[str]) -> FinetuneArgs:
+    """The defaults with the options that tuning chose for the task."""
+    task, out = common.option(argv, "--task", default.task), common.option(argv, "--out", str(default.out))
+    try:
+        return tuned.apply(replace(default, task=task, out=Path(out)))
+    except UserError as error:
+        cli.fail(str(error))
 
 
 def _table() -> str:
@@ -61,8 +73,7 @@ def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:
     check_prior(args, method, card)
     # Every folder is that of a run on its real system alone: either kind of run continues the other.
     folders = {run_folder(args, real): config_to_json(args) | {"real": real} for real in args.real}
-    volatile = ("resume", "overwrite", "rollouts", "devices", "video", "out")
-    opened = runs.open_runs(folders, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=volatile)
+    opened = runs.open_runs(folders, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE)
     try:
         with mesh.use(devices):
             records = [Record(run.folder, env, gap, method.name, seeds) for run, gap in zip(opened, found, strict=True)]

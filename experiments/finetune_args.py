@@ -1,7 +1,8 @@
 """What fine-tuning is told: its options, what can be wrong with them, and the folders that follow from them."""
 
 import re
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from sgft_jax.methods import FinetuneConfig, Method, finetune_config, get_method
 from sgft_jax.types import UserError
 
 DEFAULT_METHOD, DEFAULT_PRESET = "sgft-sac", "fast"
+VOLATILE = ("resume", "overwrite", "rollouts", "devices", "video", "out", "tuned")  # may differ when a run goes on
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class FinetuneArgs:
     preset: str = DEFAULT_PRESET
     """Pretraining preset whose priors to start from."""
     prior: Path | None = None
-    """Folder of a prior, or of several (prior/seed-*); default: those of <out>/pretrain/<task>/<preset>."""
+    """Folder of a prior, of several (prior/seed-*) or of runs; default: <out>/pretrain/<task>/<preset>."""
     seed: int = 0
     """First seed."""
     seeds: int = 10
@@ -52,6 +54,9 @@ class FinetuneArgs:
     """Rollouts between checkpoints."""
     options: FinetuneConfig = field(default_factory=FinetuneConfig)
     """Method options; `network`, `size` and `gamma` always are the prior's."""
+    tuned: bool = False
+    """Begin with what `experiments.tune` chose for this task and method, in place of the defaults below: the variant
+    `tuned`."""
     variant: str = ""
     """A word for these options: the run gets a folder of its own beside the method's, and a curve in the figures."""
     impl: Impl = "auto"
@@ -76,6 +81,12 @@ def arguments(method: str, **changes: Any) -> FinetuneArgs:
     return FinetuneArgs(**{**own, **changes})
 
 
+def with_settings(args: FinetuneArgs, settings: Mapping[str, Any]) -> FinetuneArgs:
+    """The arguments with other values for some of the options that a method's space names."""
+    options = {name: value for name, value in settings.items() if name != "utd"}
+    return replace(args, utd=settings.get("utd", args.utd), options=replace(args.options, **options))
+
+
 def _preset(method: Method) -> str:
     """The preset that makes the priors a method needs."""
     return "tdmpc2" if method.prior == "tdmpc2" else DEFAULT_PRESET
@@ -85,8 +96,12 @@ def run_folder(args: FinetuneArgs, real: str) -> Path:
     """Where the run on that real system lives; the seeds of one call share a folder."""
     system = "_".join([Path(real).stem, *(change.replace("/", "") for change in args.set)])
     seeds = common.seeds_name(common.seed_list(args.seed, args.seeds))
-    method = "_".join(filter(None, [args.method, args.variant]))
-    return args.out / "finetune" / args.task / system / method / seeds
+    return args.out / "finetune" / args.task / system / label(args) / seeds
+
+
+def label(args: FinetuneArgs) -> str:
+    """The method with its variant, as folders and figures name it."""
+    return "_".join(filter(None, [args.method, args.variant]))
 
 
 def check(args: FinetuneArgs) -> tuple[Method, list[int]]:

@@ -10,6 +10,22 @@ from sgft_jax.types import Array, BatchTransform, UserError, unknown
 
 AgentName = Literal["sac", "iql", "tdmpc2"]
 
+# What tuning chooses from. Of every method the five options that its authors name as sensitive, or that our own
+# measurements do (`FinetuneConfig` says where), with three values each: the spaces are equally large, so that the same
+# number of trials searches the same share of each. The default is among the three; the others are published ones of
+# close relatives, or lie a factor of two to three away. Nothing that decides what a method is can be chosen.
+_UTD = (2.0, 8.0, 20.0)  # from an update or two per step to RLPD's and MBPO's twenty
+_RATES = {"lr_actor": (3e-5, 1e-4, 3e-4), "lr_critic": (1e-4, 3e-4, 1e-3)}
+_WARMUP = (None, 0, 5_000)  # as long as argued here, as printed in the paper, longer
+_SHARE = (0.25, 0.5, 0.75)
+_PLAIN_SPACE = {"utd": _UTD, **_RATES, "alpha": (0.003, 0.01, 0.03), "critic_warmup": _WARMUP}
+_SEGMENT_SPACE = {"utd": _UTD, **_RATES, "horizon": (1, 2, 4), "critic_warmup": _WARMUP}
+_BRANCH_SPACE = {"utd": _UTD, **_RATES, "horizon": (1, 2, 4), "branches": (2, 5, 10)}
+_PLANNER_SPACE = {
+    "utd": (1.0, 2.0, 4.0), "lr_critic": (1e-4, 3e-4, 1e-3), "horizon": (2, 3, 4), "batch_size": (128, 256, 512),
+    "plan_samples": (256, 512, 1024),
+}  # fmt: skip
+
 
 @dataclass(frozen=True)
 class FinetuneConfig:
@@ -112,6 +128,7 @@ class Method(NamedTuple):
     uses_value, uses_dynamics: what it takes from the prior besides the agent.
     agent: the learner. fresh: it starts from nothing, and the simulator's policy only makes the initial rollouts.
     utd: updates per real transition. options: where its `FinetuneConfig` differs from the defaults, by field.
+    space: what tuning may choose (experiments/tune.py): values for `utd` and for fields of `FinetuneConfig`.
     """
 
     name: str
@@ -126,6 +143,7 @@ class Method(NamedTuple):
     fresh: bool
     utd: float
     options: Mapping[str, Any]
+    space: Mapping[str, tuple[Any, ...]]
 
     @property
     def prior(self) -> str:
@@ -153,6 +171,7 @@ def _method(
     agent: AgentName = "sac",
     fresh: bool = False,
     utd: float = 8.0,
+    space: Mapping[str, tuple[Any, ...]],
     **options: Any,
 ) -> Method:
     finite = "shorten" in parts
@@ -166,52 +185,65 @@ def _method(
         return tuple(built[part]() for part in parts.split())
 
     uses = ("shape" in parts, "branch" in parts)
-    return Method(name, description, source, transforms, finite, *uses, reset_critic, agent, fresh, utd, options)
+    return Method(name, description, source, transforms, finite, *uses, reset_critic, agent, fresh, utd, options, space)
 
 
 METHODS: dict[str, Method] = {
     m.name: m
     for m in (
-        _method("sac", "", "task reward, critic kept", "Haarnoja 2018"),
-        _method("sac-reset", "", "task reward, new critic", "Haarnoja 2018", reset_critic=True),
-        _method("pbrs", "shape", "shaped reward, infinite horizon", "Ng 1999", reset_critic=True),
-        _method("mbpo", "branch", "SAC with model branches", "Janner 2019"),
+        _method("sac", "", "task reward, critic kept", "Haarnoja 2018", space=_PLAIN_SPACE),
+        _method("sac-reset", "", "task reward, new critic", "Haarnoja 2018", reset_critic=True, space=_PLAIN_SPACE),
+        _method(
+            "pbrs", "shape", "shaped reward, infinite horizon", "Ng 1999", reset_critic=True, space=_PLAIN_SPACE,
+        ),
+        _method("mbpo", "branch", "SAC with model branches", "Janner 2019", space=_BRANCH_SPACE),
         _method(
             "pbrs-branch", "branch shape",
             "shaped reward and branches, infinite horizon: SGFT-SAC without shortening", "SGFT 2025", reset_critic=True,
+            space=_BRANCH_SPACE,
         ),
-        _method("frozen-critic", "", "the actor alone learns, from the simulator's critic", "SGFT 2025, reviews",
-                train_critic=False, critic_warmup=0),
+        _method(
+            "frozen-critic", "", "the actor alone learns, from the simulator's critic", "SGFT 2025, reviews",
+            train_critic=False, critic_warmup=0,
+            space={"utd": _UTD, "lr_actor": _RATES["lr_actor"], "alpha": _PLAIN_SPACE["alpha"],
+                   "actor_ramp": (0, 1_000, 5_000), "batch_size": (128, 256, 512)},
+        ),
         _method(
             "sac-online", "", "SAC from kept networks and simulator data, many critic updates a slow actor update",
             "As 2026", utd=5.0, lr_actor=1e-5, policy_delay=20, actor_mean=True, simulated_share=0.5,
             simulated_share_end=0.0, simulated_anneal=10_000, critic_warmup=0, actor_ramp=0,
+            space={"utd": (2.0, 5.0, 10.0), "lr_actor": (1e-5, 3e-5, 1e-4), "lr_critic": _RATES["lr_critic"],
+                   "policy_delay": (5, 10, 20), "simulated_share": _SHARE},
         ),
         _method(
             "rlpd", "", "from scratch; ten normalised critics, half of each batch from the simulator", "Ball 2023",
             fresh=True, utd=20.0, lr_actor=3e-4, policy_delay=20, critics=10, target_critics=2, actor_mean=True,
             critic_network=NetworkConfig(hidden=(256, 256), layer_norm=True), tune_alpha=True, alpha=1.0,
             entropy_per_dim=-0.5, simulated_share=0.5, critic_warmup=0, actor_ramp=0,
+            space={"utd": (10.0, 20.0, 40.0), "lr_actor": (1e-4, 3e-4, 1e-3), "lr_critic": _RATES["lr_critic"],
+                   "target_critics": (1, 2, 10), "simulated_share": _SHARE},
         ),
         _method(
             "iql", "", "in-sample learning: offline from the simulator, then online", "Kostrikov 2022",
             agent="iql", fresh=True, lr_actor=3e-4, simulated_share=0.5, simulated_transitions=1_000_000,
             offline_updates=500_000, critic_warmup=0, actor_ramp=0,
+            space={"utd": _UTD, "lr_actor": (1e-4, 3e-4, 1e-3), "expectile": (0.7, 0.8, 0.9), "beta": (1.0, 3.0, 10.0),
+                   "simulated_share": _SHARE},
         ),
         _method(
             "tdmpc2", "", "plans with the simulator's world model, and all of it learns", "Hansen 2024",
-            agent="tdmpc2", utd=1.0, horizon=4, tau=0.01,
+            agent="tdmpc2", utd=1.0, horizon=4, tau=0.01, space=_PLANNER_SPACE,
         ),
         _method(
             "sgft-tdmpc2-code", "shape", "SGFT as its released code has it: TD-MPC2 from scratch, shaped rewards",
-            "SGFT 2025, code", agent="tdmpc2", fresh=True, utd=1.0, horizon=3, tau=0.01,
+            "SGFT 2025, code", agent="tdmpc2", fresh=True, utd=1.0, horizon=3, tau=0.01, space=_PLANNER_SPACE,
         ),
         _method(
             "sgft-tdmpc2", "", "SGFT-TDMPC-2: plans of H steps that end in a frozen V_sim", "SGFT 2025",
-            agent="tdmpc2", utd=1.0, horizon=4, tau=0.01, train_critic=False,
+            agent="tdmpc2", utd=1.0, horizon=4, tau=0.01, train_critic=False, space=_PLANNER_SPACE,
         ),
-        _method("sgft", "shape shorten", "model-free SGFT", "SGFT 2025"),
-        _method("sgft-sac", "branch shape shorten", "SGFT-SAC", "SGFT 2025"),
+        _method("sgft", "shape shorten", "model-free SGFT", "SGFT 2025", space=_SEGMENT_SPACE),
+        _method("sgft-sac", "branch shape shorten", "SGFT-SAC", "SGFT 2025", space=_BRANCH_SPACE),
     )
 }  # fmt: skip
 
@@ -226,3 +258,9 @@ def get_method(name: str) -> Method:
 def finetune_config(method: Method, **changes: Any) -> FinetuneConfig:
     """The options that a method's authors use, where ours have them, and any changes to these."""
     return FinetuneConfig(**{**method.options, **changes})
+
+
+def default_settings(method: Method) -> dict[str, Any]:
+    """What the options of a method's space are unless told otherwise."""
+    own = finetune_config(method)
+    return {name: method.utd if name == "utd" else getattr(own, name) for name in method.space}

@@ -107,7 +107,7 @@ def open_runs(
             folder.mkdir(parents=True, exist_ok=True)
             runs.append(Run(folder, resumed=there and resume, lock=Lock(folder)))
             if there and resume:
-                _check_same(folder, kind, config, volatile)
+                check_same(folder, kind, config, volatile)
     except UserError:
         for run in runs:
             run.close()  # the traceback would keep the locks alive
@@ -197,7 +197,11 @@ def _stored(folder: Path) -> dict[str, Any]:
     return stored
 
 
-def _check_same(folder: Path, kind: str, wanted: Mapping[str, Any], volatile: tuple[str, ...]) -> None:
+def check_same(folder: Path, kind: str, wanted: Mapping[str, Any], volatile: tuple[str, ...]) -> None:
+    """Raises UserError, which names the differences, unless a run folder is of that kind and configuration.
+
+    wanted: JSON data. volatile: dotted names that may differ.
+    """
     stored = _stored(folder)
     if stored["kind"] != kind:
         raise UserError(f"{folder}: is a {stored['kind']} run, not a {kind} run")

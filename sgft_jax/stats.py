@@ -70,6 +70,15 @@ def transitions_to(transitions: ArrayLike, success: ArrayLike, threshold: float)
     return int(np.asarray(transitions)[np.argmax(reached)]) if reached.any() else None
 
 
+def area_under(transitions: ArrayLike, success: ArrayLike) -> np.ndarray:
+    """Mean success over the real transitions of a curve, from 0 to 1: its area by trapezoids over its length.
+
+    transitions: [n], increasing, n > 1. success: [..., n]. Returns [...]: high where learning is early and lasts.
+    """
+    transitions = np.asarray(transitions, np.float64)
+    return np.trapezoid(np.asarray(success, np.float64), transitions) / (transitions[-1] - transitions[0])
+
+
 def first_dip(success: ArrayLike) -> float:
     """How far fine-tuning fell below where it started: zero-shot success minus the lowest of the curve.
 

@@ -15,7 +15,7 @@ import pytest
 
 import envs
 from envs import gaps
-from sgft_jax.methods import METHODS
+from sgft_jax.methods import METHODS, default_settings
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -82,6 +82,25 @@ def test_the_page_of_methods_lists_them_all():
     rows = re.findall(r"^\| `([\w-]+)` \|", (ROOT / "docs/methods.md").read_text(), re.M)
     assert sorted(rows) == sorted(METHODS)
     assert all(name in help_of("experiments.finetune") for name in METHODS)
+
+
+def test_the_page_of_methods_shows_what_tuning_chooses_from():
+    """Each line as it follows from the table of methods, defaults in bold."""
+
+    def line(method):
+        default = default_settings(method)
+        shown = {name: [_shown(value, value == default[name]) for value in each] for name, each in method.space.items()}
+        return "; ".join(f"`{name}` {', '.join(each)}" for name, each in shown.items())
+
+    rows = re.findall(r"^\| ([\w, -]+) \| (`utd` .*) \|$", (ROOT / "docs/methods.md").read_text(), re.M)
+    assert {name: text for names, text in rows for name in names.split(", ")} == {
+        method.name: line(method) for method in METHODS.values()
+    }
+
+
+def _shown(value, default):
+    text = "None" if value is None else f"{value:g}"
+    return f"**{text}**" if default else text
 
 
 def test_the_gap_in_the_readme_loads(tmp_path, key):

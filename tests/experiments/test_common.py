@@ -82,7 +82,7 @@ def test_priors_are_found_in_order(tmp_path):
     assert card["seed"] == 2 and algorithms.network_of(card) == NETWORK
     for prior, n in zip(found, (2, 9, 10), strict=True):
         jax.tree.map(np.testing.assert_array_equal, prior.actor, expected[n].actor)
-    assert [len(find(home / p)[0]) for p in ("a", "a/prior", "a/prior/seed-9")] == [2, 2, 1]
+    assert [len(find(home / p)[0]) for p in ("", "a", "a/prior", "a/prior/seed-9")] == [3, 2, 2, 1]
 
 
 def test_what_is_wrong_with_priors_is_said(tmp_path):

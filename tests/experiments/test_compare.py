@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 import envs
-from experiments import cli, compare
+from experiments import cli, compare, grid
 from sgft_jax import checkpoint
 from sgft_jax.types import UserError
 
@@ -25,13 +25,13 @@ def ran(monkeypatch):
         for real in args.real:
             leave(replace(args, real=(real,)), args.rollouts)
 
-    monkeypatch.setattr(compare, "finetune", finetune)
+    monkeypatch.setattr(grid, "finetune", finetune)
     monkeypatch.setattr(cli, "set_up", lambda: None)
     return seen
 
 
 def leave(args, rollouts, *, killed=False):
-    folder = compare.run_folder(args, *args.real)
+    folder = grid.run_folder(args, *args.real)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "config.json").write_text("{}")
     if rollouts:

@@ -1,8 +1,10 @@
 """The table of methods, and the settings that make one."""
 
 import pytest
+import toy
 
 from sgft_jax import methods
+from sgft_jax.finetune import make_finetuner
 from sgft_jax.types import UserError
 
 
@@ -48,6 +50,18 @@ def test_a_methods_own_options_and_changes_to_them():
     assert (rlpd.critics, rlpd.target_critics, rlpd.policy_delay, rlpd.simulated_share) == (10, 1, 20, 0.5)
     assert methods.METHODS["rlpd"].utd == 20
     assert methods.finetune_config(methods.METHODS["sgft-sac"]) == methods.FinetuneConfig()
+
+
+@pytest.mark.parametrize("method", methods.METHODS.values(), ids=lambda method: method.name)
+def test_what_tuning_chooses_from(method):
+    """Spaces are of one size and hold the default, and with every value of theirs there is a learner."""
+    default = methods.default_settings(method)
+    assert len(method.space) == 5 and all(len(set(values)) == 3 for values in method.space.values())
+    assert all(default[name] in values for name, values in method.space.items())
+    assert all(utd > 0 for utd in method.space["utd"])
+    for name, value in [(name, value) for name, values in method.space.items() if name != "utd" for value in values]:
+        config = methods.finetune_config(method, **{name: value})
+        make_finetuner(method, config, obs_dim=4, act_dim=2, reward=toy.reward, terminated=toy.success)
 
 
 def test_unknown_method_is_answered_with_the_closest():

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats as scipy_stats
 
-from sgft_jax.stats import first_dip, iqm, iqm_interval, success_interval, transitions_to
+from sgft_jax.stats import area_under, first_dip, iqm, iqm_interval, success_interval, transitions_to
 
 
 def test_iqm_by_hand():
@@ -78,6 +78,12 @@ def test_transitions_to():
     assert transitions_to(transitions, [0.1, 0.7, 0.5, 0.9], 0.8) == 1500
     assert transitions_to(transitions, [0.1, 0.7, 0.5, 0.9], 0.05) == 0
     assert transitions_to(transitions, [0.1, 0.7, 0.5, 0.9], 0.95) is None
+
+
+def test_area_under_a_curve():
+    """0 to 1 within 10, then 1 until 40: (10 / 2 + 30) / 40 = 0.875; a constant is its own mean."""
+    assert area_under([0, 10, 40], [0.0, 1.0, 1.0]) == pytest.approx(0.875)
+    np.testing.assert_allclose(area_under([100, 110, 140], [[0.0, 1.0, 1.0], [0.3, 0.3, 0.3]]), [0.875, 0.3])
 
 
 def test_first_dip():

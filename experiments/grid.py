@@ -1,0 +1,150 @@
+"""A grid of fine-tuning runs on disk: how far each has got, and doing what is missing."""
+
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import envs
+from envs.physics import Impl
+from experiments import cli, common
+from experiments.finetune import finetune
+from experiments.finetune_args import VOLATILE, FinetuneArgs, arguments, label, run_folder
+from sgft_jax import checkpoint
+from sgft_jax.config import config_to_json
+from sgft_jax.jsonfile import read_json
+from sgft_jax.log import SUMMARY
+from sgft_jax.methods import METHODS, get_method
+from sgft_jax.runs import CONFIG, check_same
+from sgft_jax.types import UserError
+
+
+@dataclass(frozen=True)
+class GridArgs:
+    """A grid of fine-tuning runs; everything not named here is as `experiments.finetune` has it."""
+
+    tasks: tuple[str, ...] = tuple(envs.TASKS)
+    """Tasks."""
+    methods: tuple[str, ...] = tuple(reversed(METHODS))
+    """Methods, in the order in which they run."""
+    reals: tuple[str, ...] = ("default",)
+    """Real systems of every task: mild, default, hard, or .toml/.json files."""
+    seed: int = 0
+    """First seed."""
+    seeds: int = 10
+    """Seeds of each run, all in one program."""
+    rollouts: int = 100
+    """Real rollouts per seed, the initial ones included; may grow later."""
+    initial_rollouts: int = 5
+    """Rollouts of the simulator's policy, the same for all methods."""
+    eval_every: int = 5
+    """Rollouts between evaluations."""
+    together: bool = True
+    """Step the real systems of a task together; --no-together: one after another, in less memory but more time."""
+    minutes: float | None = None
+    """Begin no new run after so many minutes."""
+    dry: bool = False
+    """Only list the runs and what is missing."""
+    impl: Impl = "auto"
+    """Who steps the physics, as in fine-tuning."""
+    devices: int | None = None
+    """Devices that share the seeds; 0: all there are; default: one."""
+    out: Path = Path("runs")
+    """Parent of all run folders."""
+
+
+class Cell(NamedTuple):
+    """One run, on one real system. state: of its folder; done: the real rollouts from which it would go on."""
+
+    args: FinetuneArgs
+    state: Literal["missing", "unfinished", "finished"]
+    done: int
+
+    def __str__(self) -> str:
+        (real,) = self.args.real
+        return f"{self.args.task}/{Path(real).stem}: {label(self.args)}"
+
+    @property
+    def folder(self) -> Path:
+        """Where it is on disk."""
+        return run_folder(self.args, *self.args.real)
+
+
+def check(args: GridArgs) -> None:
+    """Raises UserError for what is wrong in the arguments alone."""
+    for name, given in (("tasks", args.tasks), ("methods", args.methods), ("reals", args.reals)):
+        if not given:
+            raise UserError(f"--{name}: name at least one")
+    for task in args.tasks:
+        cli.choose("--tasks", task, envs.TASKS)
+    for method in args.methods:
+        get_method(method)
+    common.seed_list(args.seed, args.seeds)
+
+
+def run_of(args: GridArgs, task: str, real: str, method: str) -> FinetuneArgs:
+    """The run of one cell, with the method's own defaults."""
+    return arguments(
+        method, task=task, real=(real,), seed=args.seed, seeds=args.seeds, rollouts=args.rollouts,
+        initial_rollouts=args.initial_rollouts, eval_every=args.eval_every, impl=args.impl, devices=args.devices,
+        video=False, out=args.out,
+    )  # fmt: skip
+
+
+def look_up(run: FinetuneArgs) -> Cell:
+    """How far the run on the one real system of these arguments has got."""
+    folder = run_folder(run, *run.real)
+    if not (folder / CONFIG).exists():
+        return Cell(run, "missing", 0)
+    summed_up = read_json(folder / SUMMARY)["final"]["rollouts"] if (folder / SUMMARY).exists() else 0
+    state = "finished" if summed_up >= run.rollouts else "unfinished"
+    return Cell(run, state, checkpoint.latest(folder, say=lambda _: None) or 0)
+
+
+def check_begun(cells: Iterable[Cell]) -> None:
+    """Raises UserError if a run on disk was made with other options than its cell has now."""
+    for cell in cells:
+        if cell.state != "missing":
+            (real,) = cell.args.real
+            check_same(cell.folder, "finetune", config_to_json(cell.args) | {"real": real}, VOLATILE)
+
+
+def work(cells: Sequence[Cell], args: GridArgs) -> list[str]:
+    """Lists the cells, then runs those that are missing, in order; returns a line for each that could not run."""
+    started, failed = time.monotonic(), []
+    for cell in cells:
+        print(f"{cell.state:10} {cell}" + (f", {cell.done} rollouts" if cell.done else ""))
+    if args.dry:
+        return []
+    for batch in _batches(cells, together=args.together):
+        if args.minutes is not None and time.monotonic() - started > 60 * args.minutes:
+            print(f"stopped after {args.minutes:g} minutes; the same command goes on")
+            break
+        failed += _run(batch)
+    return failed
+
+
+def _batches(cells: Sequence[Cell], *, together: bool) -> list[list[Cell]]:
+    """The cells that are not finished, in their order; those that one call can do follow their first one."""
+    batches: dict[Any, list[Cell]] = {}
+    for cell in [cell for cell in cells if cell.state != "finished"]:
+        real = () if together else cell.args.real
+        batches.setdefault((replace(cell.args, real=real), cell.state, cell.done), []).append(cell)
+    return list(batches.values())
+
+
+def _run(batch: Sequence[Cell]) -> list[str]:
+    """Runs cells that differ in their real systems alone; returns a line for each that could not run."""
+    print(f"--- {', '.join(map(str, batch))}")
+    first = batch[0]
+    reals = tuple(real for cell in batch for real in cell.args.real)
+    try:
+        finetune(replace(first.args, real=reals, resume=first.state == "unfinished"))
+    except UserError as error:
+        print(f"error: {error}")
+        if len(batch) == 1:
+            return [f"{first}: {error}"]
+        # The others may have what one of them lacks; how far each has got is looked up again.
+        return [line for cell in batch for line in _run([look_up(cell.args)])]
+    return []

@@ -1,0 +1,68 @@
+"""The options that tuning has chosen, one file for a task and method: read, written, and put into a run's arguments."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+from experiments.finetune_args import FinetuneArgs, with_settings
+from sgft_jax.jsonfile import read_json, write_json
+from sgft_jax.methods import FinetuneConfig
+from sgft_jax.types import UserError
+
+VARIANT = "tuned"
+_OPTIONS = {"utd", *(field.name for field in fields(FinetuneConfig))}
+
+
+def path_of(out: Path, task: str, method: str) -> Path:
+    """<out>/tuned/<task>/<method>.json, described in docs/formats.md."""
+    return out / VARIANT / task / f"{method}.json"
+
+
+def write(out: Path, task: str, method: str, result: Mapping[str, Any]) -> Path:
+    """Writes what tuning has found and returns where."""
+    path = path_of(out, task, method)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, result)
+    return path
+
+
+def read(out: Path, task: str, method: str) -> dict[str, Any]:
+    """What tuning has found; raises UserError, which names the command, if there is no such file."""
+    _require(out, task, [method])
+    path = path_of(out, task, method)
+    result = read_json(path)
+    if not isinstance(result, dict) or not {"budget", "options"} <= set(result):
+        raise UserError(f"{path}: was not written by experiments.tune")
+    if unknown := sorted(set(result["options"]) - _OPTIONS):
+        raise UserError(f"{path}: there is no option {unknown[0]!r}; tune again with: {_command(task, [method])}")
+    return result
+
+
+def _require(out: Path, task: str, methods: Iterable[str]) -> None:
+    if absent := [method for method in methods if not path_of(out, task, method).exists()]:
+        folder, again = path_of(out, task, "").parent, _command(task, absent)
+        raise UserError(f"--tuned: {folder} holds no options for {', '.join(absent)}; choose them with: {again}")
+
+
+def _command(task: str, methods: Iterable[str]) -> str:
+    return f"python -m experiments.tune --tasks {task} --methods {' '.join(methods)}"
+
+
+def apply(run: FinetuneArgs) -> FinetuneArgs:
+    """The run with the options that tuning has chosen for its task and method, as a variant of its own."""
+    return replace(with_settings(run, read(run.out, run.task, run.method)["options"]), variant=VARIANT)
+
+
+def check_fair(out: Path, task: str, methods: Sequence[str], reals: Sequence[str]) -> None:
+    """Raises UserError unless all methods were tuned with the same budget, and on none of the real systems `reals`."""
+    _require(out, task, methods)
+    budgets = {method: read(out, task, method)["budget"] for method in methods}
+    first, *others = budgets
+    for other in others:
+        if odd := [key for key, value in budgets[first].items() if budgets[other].get(key) != value]:
+            listed = ", ".join(f"{key} {budgets[first][key]} and {budgets[other].get(key)}" for key in odd)
+            again = _command(task, budgets)
+            raise UserError(f"--tuned: {first} and {other} had different budgets ({listed}); tune again with: {again}")
+    if seen := sorted({Path(real).stem for real in reals} & set(budgets[first]["reals"])):
+        raise UserError(f"--reals {seen[0]}: the options were tuned there; compare on another, or tune on another")

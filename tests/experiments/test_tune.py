@@ -1,0 +1,263 @@
+"""Tuning: the same budget for every method, on another real system, chosen by area under the curve, and used."""
+
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_common import save_prior
+
+import envs
+from experiments import cli, compare, finetune, grid, tune, tuned
+from experiments.finetune_args import arguments, run_folder
+from sgft_jax import checkpoint
+from sgft_jax.config import config_to_json
+from sgft_jax.methods import METHODS, default_settings
+from sgft_jax.types import UserError
+
+STEPS = 20  # of an episode
+
+
+@pytest.fixture(autouse=True)
+def _toy(monkeypatch):
+    monkeypatch.setitem(envs.TASKS, "toy", "toy")
+    monkeypatch.setattr(os, "environ", os.environ.copy())
+    monkeypatch.setattr(cli, "set_up", lambda: None)  # the tests have their own cache and environment
+
+
+@pytest.fixture
+def ran(monkeypatch):
+    """Runs that only leave what is read; later trials are better, the fourth (number 3) lacks something at first."""
+    seen = []
+
+    def run(args):
+        seen.append(args)
+        if args.variant == "trial-3" and len(seen) < 5:
+            raise UserError("lacks something")
+        for real in args.real:
+            number = int(args.variant.removeprefix("trial-")) if "trial" in args.variant else 0
+            leave(replace(args, real=(real,)), [[0.0, 0.0], [0.1 * number, 0.1 * number], [0.5, 0.5]])
+
+    monkeypatch.setattr(grid, "finetune", run)
+    return seen
+
+
+def leave(args, success, *, rollouts=(0, 5, 10)):
+    """A finished run: success [evaluations][seeds] after so many rollouts."""
+    folder = run_folder(args, *args.real)
+    folder.mkdir(parents=True, exist_ok=True)
+    config = {"sgft_jax": "0", "kind": "finetune", "config": config_to_json(args) | {"real": args.real[0]}}
+    (folder / "config.json").write_text(json.dumps(config))
+    final = {"final": {"rollouts": rollouts[-1]}, "gap": {"name": args.real[0]}}
+    (folder / "summary.json").write_text(json.dumps(final))
+    with open(folder / "eval.jsonl", "w") as file:
+        for n, each in zip(rollouts, success, strict=True):
+            line = {"step": STEPS * n, "rollouts": n, "robot_minutes": n / 30, "success": each, "return": each}
+            file.write(json.dumps(line) + "\n")
+    return folder
+
+
+def budget(out, **changes):
+    given = {"tasks": ("toy",), "methods": ("sac",), "trials": 4, "seeds": 2, "rollouts": 10, "out": out}
+    return tune.TuneArgs(**{**given, **changes})
+
+
+def written(out, method="sac"):
+    return json.loads((out / f"tuned/toy/{method}.json").read_text())
+
+
+# ------------------------------------------------------------ drawing and scoring
+
+
+def test_a_draw_begins_with_the_default_and_repeats_nothing():
+    space, default = {"a": (1, 2, 3), "b": (None, 5)}, {"a": 2, "b": None}
+    six = tune.draw(space, default, 6, key=(0, 1))
+    assert six[0] == default and sorted(map(str, six)) == sorted(
+        str({"a": a, "b": b}) for a in (1, 2, 3) for b in (None, 5)
+    )
+    assert tune.draw(space, default, 3, key=(0, 1)) == six[:3] and tune.draw(space, default, 1, key=(0, 1)) == [default]
+    assert any(tune.draw(space, default, 6, key=(k, 1)) != six for k in range(3))
+
+
+def test_tasks_methods_and_seeds_have_draws_of_their_own(tmp_path):
+    def drawn(method, **changes):
+        return [trial.settings for trial in tune.trials(budget(tmp_path, **changes), "toy", method)]
+
+    assert drawn("sac") == drawn("sac", rollouts=20, seeds=5, trials=4) == drawn("sac", trials=9)[:4]
+    assert drawn("sac")[1:] != drawn("sac-reset")[1:] and drawn("sac")[1:] != drawn("sac", seed=7)[1:]
+    assert drawn("rlpd")[0] == default_settings(METHODS["rlpd"])
+
+
+def test_a_score_is_the_area_up_to_the_budget(tmp_path):
+    """Rollouts 0, 5, 10, 20: 0, 1, 1 of one seed has (5/2 + 5) / 10 = 0.75, 0, 0, 0.4 of the other 0.2 5 / 10 = 0.1."""
+    (_, trial) = tune.trials(budget(tmp_path, trials=2), "toy", "sac")
+    assert tune.score(trial, 10) is None
+    leave(trial.cells[0].args, [[0, 0], [1, 0], [1, 0.4], [0, 0]], rollouts=(0, 5, 10, 20))
+    (_, trial) = tune.trials(budget(tmp_path, trials=2), "toy", "sac")
+    found = tune.score(trial, 10)
+    assert found.areas == {"mild": pytest.approx([0.75, 0.1])}
+    assert found.area == pytest.approx(0.425) and found.final == pytest.approx(0.7)
+
+
+def test_ties_go_to_the_higher_end_then_to_the_earlier_trial():
+    scores = [tune.Score(area, final, {}) for area, final in ((0.5, 0.6), (0.5, 0.8), (0.5, 0.8), (0.4, 1.0))]
+    assert tune.best(scores) == 1 and tune.best(scores[::3]) == 0
+
+
+# ------------------------------------------------------------ the command
+
+
+def test_every_trial_is_a_run_apart_from_the_comparison(tmp_path, ran):
+    tune.tune(budget(tmp_path, trials=3, reals=("mild", "soft")))
+    first, second, _ = ran
+    assert [run.variant for run in ran] == ["trial-0", "trial-1", "trial-2"]
+    assert {(run.seed, run.seeds, run.rollouts, run.real, run.resume) for run in ran} == {
+        (100, 2, 10, ("mild", "soft"), False)
+    }
+    assert first.out == tmp_path / "tune" and first.prior == tmp_path / "pretrain/toy/fast"
+    assert (first.utd, first.options) == (8.0, arguments("sac").options)
+    expected = tune.trials(budget(tmp_path), "toy", "sac")[1].settings
+    assert {"utd": second.utd, **{k: getattr(second.options, k) for k in expected if k != "utd"}} == expected
+    assert not (tmp_path / "finetune").exists()
+    assert written(tmp_path)["budget"]["reals"] == ["mild", "soft"] and len(written(tmp_path)["gaps"]) == 2
+
+
+def test_what_fails_does_not_stop_the_rest_and_the_command_goes_on(tmp_path, ran, capsys):
+    with pytest.raises(UserError, match=r"1 of the trials did not run: toy/mild: sac_trial-3: lacks something"):
+        tune.main(budget(tmp_path))
+    assert len(ran) == 4 and not (tmp_path / "tuned").exists()
+    assert "toy/sac: 3 of 4 trials are finished; nothing is chosen" in capsys.readouterr().out
+    tune.main(budget(tmp_path))
+    assert [run.variant for run in ran[4:]] == ["trial-3"]
+    # Areas: (0.05 k 5 + (0.05 k + 0.25) 5) / 10 = 0.05 k + 0.125 of trial k.
+    result = written(tmp_path)
+    assert (result["trial"], result["options"]) == (3, result["trials"][3]["options"])
+    assert [trial["area"] for trial in result["trials"]] == pytest.approx([0.125, 0.175, 0.225, 0.275])
+    assert result["budget"] == {
+        "trials": 4, "reals": ["mild"], "seeds": [100, 101], "rollouts": 10, "initial_rollouts": 5, "eval_every": 5,
+    }  # fmt: skip
+    assert result["gaps"] == [{"name": "mild"}] and result["provenance"]["versions"]
+    assert "--tuned --tasks toy --methods sac" in capsys.readouterr().out
+    tune.main(budget(tmp_path, trials=6))
+    assert [run.variant for run in ran[5:]] == ["trial-4", "trial-5"] and written(tmp_path)["trial"] == 5
+
+
+def test_trials_of_other_options_are_refused(tmp_path, ran):
+    (trial,) = tune.trials(budget(tmp_path, trials=1), "toy", "sac")
+    leave(replace(trial.cells[0].args, utd=3.0), [[0, 0], [0, 0], [0, 0]])
+    with pytest.raises(UserError, match=r"trial-0.*another configuration: utd was 3\.0, now 8\.0"):
+        tune.tune(budget(tmp_path))
+    assert ran == []
+
+
+def test_dry_and_the_clock_run_nothing(tmp_path, ran, capsys):
+    tune.main(budget(tmp_path, dry=True))
+    assert capsys.readouterr().out.count("missing") == 4
+    tune.main(budget(tmp_path, minutes=0.0))
+    assert "stopped after 0 minutes" in capsys.readouterr().out and ran == [] and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        (["--trials", "0"], "--trials is 0: must be at least 1"),
+        (["--trials", "244"], "--trials is 244: sgft-sac has only 243 different ones"),
+        (["--methods", "sgft-sca"], "did you mean 'sgft-sac'"),
+    ],
+)
+def test_bad_input(argv, words, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        cli.run_main(tune.main, tune.TuneArgs, "Tune.", argv=[*argv, "--out", str(tmp_path)])
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and words in error and error.count("\n") == 1
+
+
+# ------------------------------------------------------------ what uses it
+
+
+def choose(out, method, **changes):
+    """A file as tuning leaves it."""
+    facts = {"trials": 8, "reals": ["mild"], "rollouts": 40} | changes
+    options = {"utd": 2.0, "lr_actor": 3e-4, "critic_warmup": None}
+    return tuned.write(out, "toy", method, {"budget": facts, "options": options})
+
+
+def grid_of(out, **changes):
+    given = {"tasks": ("toy",), "methods": ("sac", "sgft-sac"), "tuned": True, "rollouts": 10, "out": out}
+    return compare.CompareArgs(**{**given, **changes})
+
+
+def test_a_comparison_of_tuned_methods(tmp_path, ran):
+    for method in ("sac", "sgft-sac"):
+        choose(tmp_path, method)
+    assert compare.compare(grid_of(tmp_path)) == []
+    assert {(run.utd, run.options.lr_actor, run.options.critic_warmup) for run in ran} == {(2.0, 3e-4, None)}
+    assert (tmp_path / "finetune/toy/default/sac_tuned/seeds-0-9").is_dir()
+    assert [str(cell) for cell in compare.cells(grid_of(tmp_path))] == [
+        "toy/default: sac_tuned",
+        "toy/default: sgft-sac_tuned",
+    ]
+    tuned.write(
+        tmp_path, "toy", "sac", {"budget": tuned.read(tmp_path, "toy", "sac")["budget"], "options": {"utd": 20}}
+    )
+    with pytest.raises(UserError, match=r"sac_tuned.*utd was 2\.0, now 20"):  # tuned again since
+        compare.compare(grid_of(tmp_path))
+
+
+def test_a_tuned_comparison_must_be_fair(tmp_path, ran):
+    command = r"python -m experiments.tune --tasks toy --methods"
+    with pytest.raises(UserError, match=rf"tuned/toy holds no options for sac, sgft-sac; .*{command} sac sgft-sac$"):
+        compare.compare(grid_of(tmp_path))
+    choose(tmp_path, "sac")
+    choose(tmp_path, "sgft-sac", trials=16)
+    with pytest.raises(UserError, match=rf"sac and sgft-sac had different budgets \(trials 8 and 16\); .*{command}"):
+        compare.compare(grid_of(tmp_path))
+    with pytest.raises(UserError, match=r"--reals mild: the options were tuned there"):
+        compare.compare(grid_of(tmp_path, methods=("sac",), reals=("default", "mild")))
+    path = tuned.write(tmp_path, "toy", "sac", {"budget": {}, "options": {"speed": 1}})
+    with pytest.raises(UserError, match=rf"{path}: there is no option 'speed'; .*{command} sac"):
+        tuned.read(tmp_path, "toy", "sac")
+    path.write_text("[]")
+    with pytest.raises(UserError, match=r"was not written by experiments\.tune"):
+        tuned.read(tmp_path, "toy", "sac")
+    assert ran == []
+
+
+def test_finetune_begins_with_tuned_options_and_takes_changes(tmp_path, monkeypatch, capsys):
+    seen = []
+    monkeypatch.setattr(finetune, "finetune", seen.append)
+    choose(tmp_path, "sac")
+    words = ["--task", "toy", "--method", "sac", "--out", str(tmp_path), "--tuned"]
+    finetune.main([*words, "--utd", "4"])
+    (run,) = seen
+    assert (run.variant, run.utd, run.options.lr_actor, run.task) == ("tuned", 4.0, 3e-4, "toy")
+    with pytest.raises(SystemExit) as stopped:
+        finetune.main([*words, "--method", "rlpd"])
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and error.count("\n") == 1 and "--tasks toy --methods rlpd" in error
+
+
+@pytest.mark.slow
+def test_tuned_runs_on_a_point_mass(tmp_path, monkeypatch):
+    """Two real trials, then a run with what they chose: the path from a prior to the file and back."""
+    for run, seed in (("a", 0), ("b", 1)):
+        save_prior(tmp_path / f"pretrain/toy/fast/{run}/prior/seed-{seed}", seed)
+    for name, mass in (("heavy", 2.0), ("light", 0.5)):
+        (tmp_path / f"{name}.toml").write_text(f"[params]\nmass = {mass}\n")
+    space = {"utd": (0.1, 0.2), "batch_size": (8,)}
+    method = METHODS["sac"]._replace(space=space, utd=0.1, options={"batch_size": 8, "replay_capacity": 128})
+    monkeypatch.setitem(METHODS, "sac", method)
+    sizes = {"tasks": ("toy",), "methods": ("sac",), "initial_rollouts": 1, "rollouts": 2, "eval_every": 1, "seeds": 2}
+    tune.main(tune.TuneArgs(trials=2, reals=(str(tmp_path / "heavy.toml"),), out=tmp_path, **sizes))
+    result = written(tmp_path)
+    assert {trial["options"]["utd"] for trial in result["trials"]} == {0.1, 0.2} and result["gaps"][0][
+        "name"
+    ] == "heavy"
+    assert all(np.shape(trial["areas"]["heavy"]) == (2,) for trial in result["trials"])
+    real = str(tmp_path / "light.toml")
+    compare.main(compare.CompareArgs(tuned=True, reals=(real,), out=tmp_path, **sizes))
+    (cell,) = compare.cells(compare.CompareArgs(tuned=True, reals=(real,), out=tmp_path, **sizes))
+    assert cell.state == "finished" and checkpoint.latest(cell.folder) == 2
+    assert json.loads((cell.folder / "config.json").read_text())["config"]["utd"] == result["options"]["utd"]
+    assert "| sac_tuned | 2 |" in (tmp_path / "figures/results.md").read_text()
