@@ -10,7 +10,7 @@ import numpy as np
 import envs
 from envs import gaps
 from experiments import cli
-from experiments.results import LEVELS, Curve, describe_run, read_curve
+from experiments.results import LEVELS, Curve, area, describe_run, read_curve
 from sgft_jax import plot
 from sgft_jax.jsonfile import read_json
 from sgft_jax.log import EVAL
@@ -21,10 +21,12 @@ from sgft_jax.types import UserError
 
 BUDGETS = (10, 20, 50, 100)  # rollouts at which the table compares, as far as a run got
 ORDER = tuple(reversed(METHODS))  # SGFT first, so that it keeps its colour whatever else there is
+_SAME = 0.05  # of success: evaluations of one policy in two programs differ by as much, on a GPU
 _LEGEND = (
     "Success on the real system: interquartile mean over seeds with its 95 % bootstrap interval, in per cent. "
     "Transitions to 90 or 98 %: when the mean over seeds first got there; > where the run ended before. Deepest dip: "
-    "how far that mean ever fell below zero-shot, in percentage points. Robot minutes: of the run, without resets."
+    "how far that mean ever fell below zero-shot, in percentage points. Area: mean success over the real transitions up "
+    "to where the shortest run of the table ends. Robot minutes: of the run, without resets."
 )
 
 
@@ -103,27 +105,31 @@ def _names(folder: Path) -> list[str]:
 
 
 def draw(comparison: Comparison, path: Path) -> Path:
-    """Learning curves of all methods on one real system."""
-    first = next(iter(comparison.curves.values()))
+    """Learning curves of all methods on one real system.
+
+    Methods that plan start from priors of their own: zero-shot is a line where that of all is about the same.
+    """
+    starts = [float(iqm_interval(curve.success[:, 0]).estimate) for curve in comparison.curves.values()]
     return plot.learning_curves(
         path,
         {method: (curve.transitions, curve.success) for method, curve in comparison.curves.items()},
         title=f"{comparison.task} on the {comparison.real} real system",
-        zero_shot=float(iqm_interval(first.success[:, 0]).estimate),
+        zero_shot=starts[0] if max(starts) - min(starts) < _SAME else None,
         **_robot_time(comparison.curves),
     )
 
 
-def columns(budgets: Sequence[int]) -> list[str]:
+def columns(budgets: Sequence[int], common: int) -> list[str]:
     """The names of the cells in a `row`."""
     return [
         "method", "seeds", "zero-shot", *(f"{n} rollouts" for n in budgets), "at the end (rollouts)",
-        *(f"transitions to {level} %" for level in LEVELS), "deepest dip", "robot minutes",
+        *(f"transitions to {level} %" for level in LEVELS), f"area to {common} rollouts", "deepest dip",
+        "robot minutes",
     ]  # fmt: skip
 
 
-def row(method: str, curve: Curve, budgets: Sequence[int]) -> list[str]:
-    """The cells of one method, with its success after so many rollouts."""
+def row(method: str, curve: Curve, budgets: Sequence[int], common: int) -> list[str]:
+    """The cells of one method, with its success after so many rollouts. common: rollouts that all methods got to."""
     facts = describe_run(curve)
     reached = [facts[f"to_{level}"]["mean_curve"] for level in LEVELS]
     return [
@@ -133,6 +139,7 @@ def row(method: str, curve: Curve, budgets: Sequence[int]) -> list[str]:
         *(_at(curve, rollouts) for rollouts in budgets),
         f"{_percent(curve.success[:, -1])} ({curve.rollouts[-1]})",
         *(f"> {curve.transitions[-1]:,}" if n is None else f"{n:,}" for n in reached),
+        _percent(area(curve, common)) if common else "-",
         f"{100 * facts['dip']['mean']:.0f}",
         f"{curve.robot_minutes[-1]:.1f}",
     ]
@@ -190,10 +197,10 @@ def _robot_time(curves: Mapping[str, Curve]) -> dict[str, Any]:
 
 def _section(comparison: Comparison, figure: Path) -> str:
     title = f"{comparison.task} on the {comparison.real} real system"
-    longest = max(curve.rollouts[-1] for curve in comparison.curves.values())
-    budgets = [n for n in BUDGETS if n <= longest]
-    head = columns(budgets)
-    lines = [head, ["---"] * len(head), *(row(*item, budgets) for item in comparison.curves.items())]
+    lengths = [int(curve.rollouts[-1]) for curve in comparison.curves.values()]
+    budgets = [n for n in BUDGETS if n <= max(lengths)]
+    head = columns(budgets, min(lengths))
+    lines = [head, ["---"] * len(head), *(row(*item, budgets, min(lengths)) for item in comparison.curves.items())]
     table = ["| " + " | ".join(cells) + " |" for cells in lines]
     return "\n".join([f"## {title}", "", *table, "", f"![{title}]({figure.name})"])
 

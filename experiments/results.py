@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sgft_jax.log import EVAL, read_jsonl
-from sgft_jax.stats import first_dip, iqm_interval, transitions_to
+from sgft_jax.stats import area_under, first_dip, iqm_interval, transitions_to
 from sgft_jax.types import UserError
 
 LEVELS = (90, 98)  # per cent of success: nearly always, and as good as always
@@ -33,6 +33,12 @@ def read_curve(folder: Path) -> Curve:
         raise UserError(f"{folder / EVAL}: holds no evaluation yet")
     column = lambda name: np.array([r[name] for r in records])  # noqa: E731
     return Curve(column("rollouts"), column("step"), column("robot_minutes"), column("success").T, column("return").T)
+
+
+def area(curve: Curve, rollouts: int) -> np.ndarray:
+    """[seeds] mean success from zero-shot to the last evaluation after at most so many rollouts, from 0 to 1."""
+    inside = curve.rollouts <= rollouts
+    return area_under(curve.transitions[inside], curve.success[:, inside])
 
 
 def describe_run(curve: Curve) -> dict[str, Any]:

@@ -21,12 +21,11 @@ from rich.table import Table
 from experiments import cli, common, grid, tuned
 from experiments.finetune_args import with_settings
 from experiments.grid import Cell, GridArgs
-from experiments.results import read_curve
+from experiments.results import area, read_curve
 from sgft_jax import runs
 from sgft_jax.jsonfile import read_json
 from sgft_jax.log import SUMMARY
 from sgft_jax.methods import default_settings, get_method
-from sgft_jax.stats import area_under
 from sgft_jax.types import UserError
 
 FOLDER = "tune"  # the trials have a tree of their own, which figures of the comparison do not look into
@@ -123,10 +122,8 @@ def score(trial: Trial, rollouts: int) -> Score | None:
     areas, finals = {}, []
     for cell in trial.cells:
         curve = read_curve(cell.folder)
-        inside = curve.rollouts <= rollouts
-        success = curve.success[:, inside]
-        areas[_name(*cell.args.real)] = area_under(curve.transitions[inside], success).tolist()
-        finals.append(success[:, -1].mean())
+        areas[_name(*cell.args.real)] = area(curve, rollouts).tolist()
+        finals.append(curve.success[:, curve.rollouts <= rollouts][:, -1].mean())
     return Score(float(np.mean(list(areas.values()))), float(np.mean(finals)), areas)
 
 

@@ -1,11 +1,13 @@
 """Impure: writes figures as PNG files: learning curves, what pretraining left behind, how costs grow.
 
 Functions take plain arrays and return the path they wrote. Colours are the Okabe-Ito palette (safe for colour-blind
-readers); a method keeps its colour from figure to figure as long as the order of the methods stays.
+readers), from the eighth line on dashed, then dotted; a method keeps its colour from figure to figure as long as the
+order of the methods stays.
 """
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -16,6 +18,7 @@ from numpy.typing import ArrayLike
 from sgft_jax.stats import iqm_interval
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)))  # (0, (drawn, left out)) in widths of the line
 _INK, _GREY, _FAINT = "#333333", "#777777", "#B0B0B0"
 _FONT = {"size": 10, "color": _INK}
 
@@ -39,12 +42,12 @@ def learning_curves(
     """
     figure, (axes,) = _figure(7.2, 4.0, columns=1)
     ends = []
-    for (name, (transitions, success)), color in zip(curves.items(), _colors(len(curves)), strict=True):
-        x = np.asarray(transitions)
+    for (name, (transitions, success)), look in zip(curves.items(), _looks(len(curves)), strict=True):
+        x, color = np.asarray(transitions), look["color"]
         band = iqm_interval(success)
         if np.isfinite(band.low).all():
             axes.fill_between(x, band.low, band.high, color=color, alpha=0.18, linewidth=0)
-        axes.plot(x, band.estimate, color=color, linewidth=2, marker="o", markersize=3, clip_on=False)
+        axes.plot(x, band.estimate, **look, linewidth=2, marker="o", markersize=3, clip_on=False)
         ends.append((float(x[-1]), float(band.estimate[-1]), name, color))
     if zero_shot is not None:
         axes.axhline(zero_shot, color=_INK, linewidth=1.2, linestyle=(0, (4, 3)), zorder=1.5)
@@ -79,10 +82,10 @@ def scaling(
     lines: {name: (sizes [n], values [n])}. references: the same for some of these names, drawn dashed in their colour.
     """
     figure, (axes,) = _figure(6.4, 4.0, columns=1)
-    for (name, points), color in zip(lines.items(), _colors(len(lines)), strict=True):
-        axes.plot(*map(np.asarray, points), color=color, linewidth=2, marker="o", markersize=4, label=name)
+    for (name, points), look in zip(lines.items(), _looks(len(lines)), strict=True):
+        axes.plot(*map(np.asarray, points), **look, linewidth=2, marker="o", markersize=4, label=name)
         if name in references:
-            axes.plot(*map(np.asarray, references[name]), color=color, linewidth=1.2, linestyle=(0, (4, 3)))
+            axes.plot(*map(np.asarray, references[name]), color=look["color"], linewidth=1.2, linestyle=(0, (4, 3)))
     axes.set_xscale("log", base=2)
     axes.set_yscale("log")
     sizes = sorted({float(size) for points in lines.values() for size in np.asarray(points[0])})
@@ -180,8 +183,10 @@ def _save(figure: Figure, path: Path) -> Path:
     return path
 
 
-def _colors(count: int) -> list[str]:
-    return [PALETTE[i % len(PALETTE)] for i in range(count)]
+def _looks(count: int) -> list[dict[str, Any]]:
+    """Colour and dashes of so many lines, all different."""
+    n = len(PALETTE)
+    return [{"color": PALETTE[i % n], "linestyle": _DASHES[i // n % len(_DASHES)]} for i in range(count)]
 
 
 def _label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]]) -> None:

@@ -49,18 +49,21 @@ def test_a_row_says_what_the_curve_says(tmp_path):
         "100 [100, 100] (100)",
         "1,000",
         "2,000",
+        "38 [33, 43]",
         "20",
         "3.3",
     ]
-    assert figures.row("sac", curve, figures.BUDGETS) == cells and len(cells) == len(figures.columns(figures.BUDGETS))
+    # Areas to 50 rollouts: 20 * (0.2 + 0.1) / 2 + 30 * (0.1 + 0.8) / 2 = 16.5 of 50 or 33 %; 5 + 16.5 = 21.5, 43 %.
+    assert figures.row("sac", curve, figures.BUDGETS, 50) == cells
+    assert len(cells) == len(figures.columns(figures.BUDGETS, 50))
 
 
 def test_budgets_not_reached_or_not_evaluated_stay_empty(tmp_path):
     folder = save(tmp_path, "sac", [[0.5], [0.6], [0.7]], rollouts=[0, 19, 50], seeds="seed-0")
     ended = "> 1,000"
-    assert figures.row("sac", read_curve(folder), (10, 50, 100)) == [
+    assert figures.row("sac", read_curve(folder), (10, 50, 100), 0) == [
         *("sac", "1", "50", "-", "70", "-", "70 (50)"),
-        *(ended, ended, "0", "1.7"),
+        *(ended, ended, "-", "0", "1.7"),
     ]
 
 
@@ -114,3 +117,15 @@ def test_a_bad_command_is_one_line_and_code_2(argv, words, tmp_path, capsys):
     error = capsys.readouterr().err
     assert stopped.value.code == 2 and words in error and error.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_zero_shot_is_a_line_where_all_start_alike(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        figures.plot, "learning_curves", lambda path, *_, zero_shot, **__: drawn.append(zero_shot) or path
+    )
+    save(tmp_path, "sac", [[0.3, 0.3], [0.9, 1.0]], rollouts=[0, 20])
+    call("--out", tmp_path)
+    save(tmp_path, "tdmpc2", [[0.0, 0.0], [0.9, 1.0]], rollouts=[0, 20])
+    call("--out", tmp_path)
+    assert drawn == [0.3, None]

@@ -23,6 +23,11 @@ def test_learning_curves_draw_every_method(tmp_path):
         assert (np.abs(image[..., :3] - wanted).max(-1) < 0.01).sum() > 200
 
 
+def test_as_many_lines_as_methods_look_different():
+    looks = [tuple(look.values()) for look in plot._looks(20)]
+    assert len(set(looks)) == 20 and looks[0] == (plot.PALETTE[0], "-")
+
+
 def test_one_seed_draws_a_line_without_a_band(tmp_path):
     assert plot.learning_curves(tmp_path / "one.png", {"SAC": (X, scores(1))}, title="Push").exists()
 
