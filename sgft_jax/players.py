@@ -17,13 +17,16 @@ class Player(NamedTuple):
     init_carry() -> what it remembers from step to step of an episode.
     act(prior, carry, obs, key, *, explore) -> (action, carry); `explore` is static.
     value(prior, obs) -> []: V_sim, deterministic.
+    predict(prior, obs, action, key) -> [obs_dim] what a random member of its model says comes next; None where the
+        model does not predict observations.
     model_error(prior, obs [T + 1, obs_dim], actions [T, act_dim]) -> [T]: how far its model drifts from a trajectory,
-        in standard deviations of the observation; None where the model does not predict observations.
+        in standard deviations of the observation; None likewise.
     """
 
     init_carry: Callable[[], PyTree]
     act: Callable[..., tuple[Array, PyTree]]
     value: Callable[[Any, Array], Array]
+    predict: Callable[[Any, Array, Array, Key], Array] | None
     model_error: Callable[[Any, Array, Array], Array] | None
 
 
@@ -41,6 +44,9 @@ def sac_player(obs_dim: int, act_dim: int, network: NetworkConfig) -> Player:
         init_carry=lambda: (),
         act=act,
         value=lambda prior, obs: value.predict(judge, prior.value, prior.normalizer, obs),
+        predict=lambda prior, obs, action, key: dynamics.predict(
+            model, dynamics.draw_member(prior.dynamics, key), prior.normalizer, obs, action
+        )[0],
         model_error=lambda prior, obs, actions: dynamics.rollout_error(
             model, prior.dynamics, prior.normalizer, obs, actions
         ),
@@ -58,5 +64,6 @@ def tdmpc2_player(config: tdmpc2.TDMPC2Config, hyper: tdmpc2.TDMPC2Hyper) -> Pla
         init_carry=learner.init_carry,
         act=lambda prior, *step, explore: learner.act(state(prior), *step, explore=explore),
         value=lambda prior, obs: tdmpc2.value_of(config, state(prior), obs),
+        predict=None,
         model_error=None,
     )

@@ -133,6 +133,46 @@ def pretraining(
     return _save(figure, path)
 
 
+def landscape(
+    path: Path,
+    x: ArrayLike,
+    y: ArrayLike,
+    value: ArrayLike,
+    real: ArrayLike,
+    simulated: ArrayLike,
+    imagined: ArrayLike,
+    *,
+    title: str,
+    axes: tuple[str, str],
+) -> Path:
+    """A value function over a plane, a real and a simulated path in it, and the branches imagined along the real one.
+
+    x, y: [G] increasing; value: [G, G], rows along y. real, simulated: [T + 1, 2]. imagined: [T, branches, H + 1, 2]. axes: the
+    words at the two axes.
+    """
+    figure, (panel,) = _figure(6.0, 5.0, columns=1)
+    across, up, heights = np.asarray(x), np.asarray(y), np.asarray(value)
+    least = float(np.percentile(heights, 35))  # a cliff at the edge of a table would take all the colours
+    mesh = panel.pcolormesh(across, up, heights, cmap="cividis", shading="gouraud", vmin=least)
+    figure.colorbar(mesh, ax=panel, label="V_sim", extend="min")
+    branches = np.asarray(imagined)
+    for i, one in enumerate(branches.reshape(-1, *branches.shape[2:])):
+        panel.plot(*one.T, color="white", linewidth=0.5, alpha=0.7, label=None if i else "imagined")
+    for path_, name, color in ((simulated, "simulated", PALETTE[5]), (real, "real", PALETTE[1])):
+        places = np.asarray(path_)
+        panel.plot(*places.T, color=color, linewidth=2, marker="o", markersize=3, label=name)
+    panel.plot(*np.asarray(real)[0], color=_INK, marker="o", markersize=7, linestyle="", label="start")
+    panel.grid(visible=False)
+    panel.set_aspect("equal")
+    panel.set_xlim(across[0], across[-1])
+    panel.set_ylim(up[0], up[-1])
+    panel.set_xlabel(axes[0], **_FONT)
+    panel.set_ylabel(axes[1], **_FONT)
+    panel.legend(fontsize=8, facecolor=_FAINT, labelcolor=_INK, framealpha=0.8, edgecolor="none")
+    figure.suptitle(title, x=0.01, ha="left", size=11, weight="bold", color=_INK)
+    return _save(figure, path)
+
+
 def _value_panel(axes: Axes, value: np.ndarray, monte_carlo: np.ndarray) -> None:
     both = np.concatenate([value, monte_carlo])
     margin = 0.05 * (np.ptp(both) or 1.0)
