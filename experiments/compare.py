@@ -152,7 +152,7 @@ def _check(args: CompareArgs) -> None:
     for name, given in (("tasks", args.tasks), ("methods", args.methods), ("reals", args.reals)):
         _some(name, given)
     for task in args.tasks:
-        cli.choose("--tasks", task, envs.TASKS)
+        envs.name_of(task)
     for method in args.methods:
         get_method(method)
     common.seed_list(args.seed, args.seeds)

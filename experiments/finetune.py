@@ -40,7 +40,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     """The command line. The method is looked up first, because it gives the other options their defaults."""
     argv = list(sys.argv[1:] if argv is None else argv)
     name = common.option(argv, "--method", DEFAULT_METHOD)
-    default = arguments(name) if name in METHODS else FinetuneArgs(method=name)
+    try:
+        default = arguments(name)
+    except UserError as error:
+        cli.fail(str(error))
     cli.run_main(finetune, FinetuneArgs, f"{__doc__}\n\n{_table()}", argv=argv, default=default)
 
 

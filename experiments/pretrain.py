@@ -43,7 +43,7 @@ class PretrainArgs:
     """One run of pretraining."""
 
     task: str = "push"
-    """push, hammer or insert."""
+    """push, hammer or insert; or a Python file with a task of your own (docs/extending.md)."""
     preset: str = DEFAULT_PRESET
     """Named settings, see experiments/presets.py; --config.* changes single ones."""
     config: PretrainConfig = field(default_factory=lambda: PRESETS[DEFAULT_PRESET])
@@ -125,7 +125,7 @@ def _on_every_gpu(args: PretrainArgs, argv: Sequence[str]) -> None:
 def pretrain(args: PretrainArgs) -> dict[str, Any]:
     """One run from (or back) to disk; returns its summary."""
     cli.choose("--preset", args.preset, PRESETS)
-    cli.choose("--task", args.task, envs.TASKS)
+    envs.name_of(args.task)  # complains if there is none
     seeds = common.seed_list(args.seed, args.seeds)
     hosts.join(args.hosts)
     env = envs.make(args.task, args.impl)
@@ -153,7 +153,7 @@ def pretrain(args: PretrainArgs) -> dict[str, Any]:
 def run_folder(args: PretrainArgs, gap: Gap | None) -> Path:
     """Where the run of these arguments lives; the seeds of one call share a folder."""
     where = args.preset if gap is None else f"{args.preset}-on-{gap.name}"
-    return args.out / "pretrain" / args.task / where / common.seeds_name(common.seed_list(args.seed, args.seeds))
+    return args.out / "pretrain" / envs.name_of(args.task) / where / common.seeds_name(common.seed_list(args.seed, args.seeds))
 
 
 def make_program(env: Env, config: PretrainConfig, *, seeds: int) -> Program:
@@ -212,7 +212,7 @@ class _Run:
         self.args, self.env, self.gap, self.seeds, self.folder = args, env, gap, seeds, folder
         self.home, self.config = home, args.config
         self.clock, self.log = common.Clock(), MetricsLog(folder)
-        self.expect = {"kind": "pretrain", "task": args.task, "seeds": seeds}
+        self.expect = {"kind": "pretrain", "task": env.name, "seeds": seeds}
         self.chunk_env_steps = self.config.n_envs * self.config.chunk_steps
         self.chunks = math.ceil(self.config.env_steps / self.chunk_env_steps)
 

@@ -182,9 +182,10 @@ def make_effects(values: Mapping[str, float | Sequence[float]], obs_dim: int, ac
 
 def distort(effects: Effects, action: Array) -> Array:
     """The action [act_dim] as the robot understands it: rotated in the xy plane if Cartesian, scaled, offset."""
-    c, s = jnp.cos(effects.action_rotation), jnp.sin(effects.action_rotation)
-    turned = jnp.stack([c * action[0] - s * action[1], s * action[0] + c * action[1]])
-    return effects.action_scale * action.at[:2].set(turned) + effects.action_bias
+    if len(action) > 1:
+        c, s = jnp.cos(effects.action_rotation), jnp.sin(effects.action_rotation)
+        action = action.at[:2].set(jnp.stack([c * action[0] - s * action[1], s * action[0] + c * action[1]]))
+    return effects.action_scale * action + effects.action_bias
 
 
 def measure(effects: Effects, true_obs: Array, key: Key) -> Array:
