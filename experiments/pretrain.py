@@ -153,7 +153,8 @@ def pretrain(args: PretrainArgs) -> dict[str, Any]:
 def run_folder(args: PretrainArgs, gap: Gap | None) -> Path:
     """Where the run of these arguments lives; the seeds of one call share a folder."""
     where = args.preset if gap is None else f"{args.preset}-on-{gap.name}"
-    return args.out / "pretrain" / envs.name_of(args.task) / where / common.seeds_name(common.seed_list(args.seed, args.seeds))
+    seeds = common.seeds_name(common.seed_list(args.seed, args.seeds))
+    return args.out / "pretrain" / envs.name_of(args.task) / where / seeds
 
 
 def make_program(env: Env, config: PretrainConfig, *, seeds: int) -> Program:
@@ -388,7 +389,7 @@ class _Run:
             print(line)
         print(f"results: {self.folder}  (prior/, summary.json, figures/)")
         method = " --method sgft-tdmpc2" if self.config.algorithm == "tdmpc2" else ""
-        print(f"next: python -m experiments.finetune --task {self.env.name}{method} --prior {self.folder}")
+        print(f"next: python -m experiments.finetune --task {self.args.task}{method} --prior {self.folder}")
 
 
 if __name__ == "__main__":

@@ -231,7 +231,7 @@ def get_method(name: str) -> Method:
     if not isinstance(method, Method):
         raise UserError(f"method {name}: METHOD is a {type(method).__name__}, not a sgft_jax.Method")
     if method.name in METHODS or not re.fullmatch(r"[\w-]+", method.name):
-        raise UserError(f"method {name}: call it something else than {method.name!r}, which is taken or names no folder")
+        raise UserError(f"method {name}: the name {method.name!r} is taken or names no folder; choose another")
     return method
 
 

@@ -51,7 +51,7 @@ def finetune(env: envs.Env, robot: Any, prior: Prior, card: dict, *, rollouts: i
             row = Transition(*step[:2], env.reward(*step), discount, step[2], np.bool_(t == len(keys)), np.int32(0))
             rows, obs = [*rows, row], after
         episode = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rows)  # [T, ...]; put it on disk first
-        state, metrics = learn(tuner.observe(state, episode, jnp.ones(len(rows), bool)), key_learn, updates)
+        state, _ = learn(tuner.observe(state, episode, jnp.ones(len(rows), bool)), key_learn, updates)
         print(f"rollout {n + 1}: return {episode.reward.sum():.2f}, success {bool(env.success(obs))}")
     return tuner.export(state)
 

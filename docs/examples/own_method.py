@@ -1,4 +1,4 @@
-"""A method of your own: SGFT-SAC whose shaped rewards are bent, not clipped, so that the larger one stays the larger."""
+"""A method of your own: SGFT-SAC whose shaped rewards are bent, not clipped: the larger one stays the larger."""
 
 import jax
 import jax.numpy as jnp
