@@ -39,7 +39,11 @@ def finetune(env: envs.Env, robot: Any, prior: Prior, card: dict, *, rollouts: i
     config = finetune_config(method, network=network, gamma=card["gamma"], critic_warmup=5 * updates)
     task = {"obs_dim": env.obs_dim, "act_dim": env.act_dim, "reward": env.reward, "terminated": env.terminated}
     tuner = make_finetuner(method, config, **task)
-    act, learn, state = jax.jit(tuner.act), jax.jit(tuner.learn, static_argnums=2), tuner.init(prior, jax.random.key(0))
+    act, learn, state = (
+        jax.jit(tuner.act),
+        jax.jit(tuner.learn, static_argnums=2),
+        jax.jit(tuner.init)(prior, jax.random.key(0)),
+    )
     for n in range(rollouts):
         key_learn, *keys = jax.random.split(jax.random.key(n), 1 + env.episode_length)
         rows, obs, carry = [], robot.reset(), tuner.init_carry()

@@ -37,7 +37,8 @@ METHOD = sgft_jax.get_method("sgft-sac")._replace(  # what `--method docs/exampl
 def main() -> None:
     """Twenty updates on random data of a point on a line, without any command: the library alone."""
     network = sgft_jax.NetworkConfig(hidden=(16,))
-    prior = sgft_jax.extract_prior(sgft_jax.make_sac(sgft_jax.SACConfig(1, 1, network=network)).init(jax.random.key(0)))
+    agent = sgft_jax.make_sac(sgft_jax.SACConfig(1, 1, network=network))
+    prior = sgft_jax.extract_prior(jax.jit(agent.init)(jax.random.key(0)))
     config = sgft_jax.finetune_config(METHOD, network=network, batch_size=16, replay_capacity=64, critic_warmup=0)
     tuner = sgft_jax.make_finetuner(
         METHOD, config, obs_dim=1, act_dim=1,
@@ -47,7 +48,7 @@ def main() -> None:
     obs, action = jax.random.uniform(jax.random.key(1), (2, 32, 1), minval=-1)
     zero, next_obs = jnp.zeros(32), obs + 0.1 * action
     rows = Transition(obs, action, -jnp.abs(next_obs[:, 0]), zero + 0.9, next_obs, zero > 0, zero.astype(jnp.int32))
-    state = tuner.observe(tuner.init(prior, jax.random.key(2)), rows, jnp.ones(32, bool))
+    state = tuner.observe(jax.jit(tuner.init)(prior, jax.random.key(2)), rows, jnp.ones(32, bool))
     state, metrics = jax.jit(tuner.learn, static_argnums=2)(state, jax.random.key(3), 20)
     print(f"mean shaped reward {metrics['batch/reward_mean']:.3f}, critic loss {metrics['critic/loss']:.3f}")
 
