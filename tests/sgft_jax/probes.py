@@ -119,7 +119,7 @@ def _sac(**options: Any):
         q = critic.apply(state.critic.params, obs, jnp.zeros(1))
         return q if state.value is None else jnp.append(q, judge.apply(state.value.params, obs))
 
-    case = counted(learner, feed=lambda batch: batch, values=values, mode=None, steps=600)
+    case = counted(learner, feed=lambda batch: batch, values=values, mode=None, steps=400)
     return case._replace(mode=_mode(case))
 
 
@@ -135,7 +135,7 @@ def _iql():
         q = critic.apply(state.critic.params, obs, jnp.zeros(1))
         return jnp.append(q, judge.apply(state.value.params, obs))
 
-    case = counted(learner, feed=lambda batch: batch, values=values, mode=None, steps=600)
+    case = counted(learner, feed=lambda batch: batch, values=values, mode=None, steps=400)
     return case._replace(mode=_mode(case))
 
 
