@@ -179,7 +179,7 @@ MAKERS = {
         critic_network=dataclasses.replace(NET, layer_norm=True),
     ),
     "iql": _iql,
-    "tdmpc2": lambda: _tdmpc2(PLAIN, 600),
+    "tdmpc2": lambda: _tdmpc2(PLAIN, 800),
     "sgft-tdmpc2": lambda: _tdmpc2(dataclasses.replace(PLAIN, sgft=True), 1000),
 }  # fmt: skip
 

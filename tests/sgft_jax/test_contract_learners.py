@@ -104,8 +104,10 @@ def test_probe(name, probe, key):
             assert bits((state.critic, state.encoder)) == bits((start.critic, start.encoder))
         else:
             np.testing.assert_allclose(case.values(state, probes.obs_of(s)), value, atol=0.1 * max(1, abs(value)))
+    # An action that is 0.2 off costs 0.04 of reward: about what the bins of a planner's heads resolve.
+    near = 0.25 if name in PLANNERS else 0.15
     for s, action in known.actions.items():
-        assert case.mode(state, probes.obs_of(s))[0] == pytest.approx(action, abs=0.15)
+        assert case.mode(state, probes.obs_of(s))[0] == pytest.approx(action, abs=near)
 
 
 # --- methods --------------------------------------------------------------------------------------------------------
