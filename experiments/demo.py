@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 
+import envs
 from experiments import cli
 from experiments.figures import FiguresArgs, figures
 from experiments.finetune import finetune
@@ -50,7 +51,7 @@ def main(args: DemoArgs) -> None:
     pretrain(PretrainArgs(config=config, report=False, video=False, **shared))
     _finetune_both(*(_finetune_args(args, method, shared) for method in METHODS))
     print(figures(FiguresArgs(task=args.task, out=args.out)).read_text())
-    folder = args.out / "finetune" / args.task / Path(args.real).stem
+    folder = args.out / "finetune" / envs.name_of(args.task) / Path(args.real).stem
     print(f"{time.monotonic() - started:.0f} s in all; curves, video and every real rollout: {folder}")
 
 

@@ -71,9 +71,8 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
         raise UserError(f"--episodes is {args.episodes}: must be at least 1")
     if args.prior is None and args.run is None and args.task is None:
         raise UserError("nothing to evaluate: name a folder with --prior or --run, or a task with --task")
-    if args.task is not None:
-        cli.choose("--task", args.task, envs.TASKS)
-    folders = common.prior_folders(args.run or args.prior, out=args.out, task=args.task or "push", preset=args.preset)
+    task = envs.name_of(args.task or "push")
+    folders = common.prior_folders(args.run or args.prior, out=args.out, task=task, preset=args.preset)
     env = envs.make(args.task or read_json(folders[0] / "prior.json")["task"], args.impl)
     gap = common.load_gap(env, args.real, args.set)
     priors, card = common.load_priors(folders, env)

@@ -60,10 +60,9 @@ def main(args: FiguresArgs) -> None:
 
 def figures(args: FiguresArgs) -> Path:
     """One figure per real system and results.md, whose path is returned; raises UserError if there is no run."""
-    if args.task is not None:
-        cli.choose("--task", args.task, envs.TASKS)
+    task = None if args.task is None else envs.name_of(args.task)
     home = args.out / "finetune"
-    folders = sorted(p for p in home.glob(f"{args.task or '*'}/*") if p.is_dir())
+    folders = sorted(p for p in home.glob(f"{task or '*'}/*") if p.is_dir())
     comparisons = [read_comparison(folder) for folder in folders]
     drawn = [c for c in comparisons if c.curves]
     if not drawn:
@@ -73,7 +72,7 @@ def figures(args: FiguresArgs) -> Path:
     target.mkdir(parents=True, exist_ok=True)
     sections = [_section(c, draw(c, target / f"{c.task}-{c.real}.png")) for c in drawn]
     missing = [f"- {c.task}/{c.real}: {note}" for c in comparisons for note in c.notes]
-    if untouched := _untouched(args.task, {(c.task, c.real) for c in comparisons}):
+    if untouched := _untouched(task, {(c.task, c.real) for c in comparisons}):
         missing.append(f"- no run on {', '.join(untouched)}")
     if missing:
         sections.append("\n".join(["## Missing", "", *missing]))
@@ -99,9 +98,10 @@ def read_comparison(folder: Path) -> Comparison:
 
 
 def _names(folder: Path) -> list[str]:
-    """All methods, each with the variants of it that have a folder."""
-    variants = {method: sorted(path.name for path in folder.glob(f"{method}_*")) for method in ORDER}
-    return [name for method in ORDER for name in (method, *variants[method])]
+    """All methods, each with the variants of it that have a folder; then the folders of people's own methods."""
+    there = sorted(path.name for path in folder.iterdir() if path.is_dir())
+    names = [name for method in ORDER for name in (method, *(n for n in there if n.startswith(f"{method}_")))]
+    return names + [name for name in there if name not in names]
 
 
 def draw(comparison: Comparison, path: Path) -> Path:

@@ -41,19 +41,19 @@ def main(argv: Sequence[str] | None = None) -> None:
     """The command line. The method is looked up first, because it gives the other options their defaults."""
     argv = list(sys.argv[1:] if argv is None else argv)
     name = common.option(argv, "--method", DEFAULT_METHOD)
-    default = arguments(name) if name in METHODS else FinetuneArgs(method=name)
-    if "--tuned" in argv and name in METHODS:
-        default = _tuned(default, argv)
+    try:
+        default = arguments(name)
+        if "--tuned" in argv:
+            default = _tuned(default, argv)
+    except UserError as error:
+        cli.fail(str(error))
     cli.run_main(finetune, FinetuneArgs, f"{__doc__}\n\n{_table()}", argv=argv, default=default)
 
 
 def _tuned(default: FinetuneArgs, argv: Sequence[str]) -> FinetuneArgs:
     """The defaults with the options that tuning chose for the task."""
     task, out = common.option(argv, "--task", default.task), common.option(argv, "--out", str(default.out))
-    try:
-        return tuned.apply(replace(default, task=task, out=Path(out)))
-    except UserError as error:
-        cli.fail(str(error))
+    return tuned.apply(replace(default, task=task, out=Path(out)))
 
 
 def _table() -> str:

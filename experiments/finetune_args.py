@@ -23,9 +23,10 @@ class FinetuneArgs:
     """Fine-tuning of several seeds on one or more real systems at once, all in one compiled program."""
 
     task: str = "push"
-    """push, hammer or insert."""
+    """push, hammer or insert; or a Python file with a task of your own (docs/extending.md)."""
     method: str = DEFAULT_METHOD
-    """How it learns; the table is at the top. The defaults below are those of the method that is chosen."""
+    """How it learns; the table is at the top. Or a Python file with a method of your own (docs/extending.md). The
+    defaults below are those of the method that is chosen."""
     real: tuple[str, ...] = ("default",)
     """The real system: mild, default, hard, or a .toml/.json file with tables `params` and `effects`. Several are
     stepped together in one program, which takes little longer; each has a run folder of its own."""
@@ -96,17 +97,17 @@ def run_folder(args: FinetuneArgs, real: str) -> Path:
     """Where the run on that real system lives; the seeds of one call share a folder."""
     system = "_".join([Path(real).stem, *(change.replace("/", "") for change in args.set)])
     seeds = common.seeds_name(common.seed_list(args.seed, args.seeds))
-    return args.out / "finetune" / args.task / system / label(args) / seeds
+    return args.out / "finetune" / envs.name_of(args.task) / system / label(args) / seeds
 
 
 def label(args: FinetuneArgs) -> str:
     """The method with its variant, as folders and figures name it."""
-    return "_".join(filter(None, [args.method, args.variant]))
+    return "_".join(filter(None, [get_method(args.method).name, args.variant]))
 
 
 def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
     """The method and the seeds; raises UserError for what is wrong in the arguments alone."""
-    cli.choose("--task", args.task, envs.TASKS)
+    envs.name_of(args.task)  # complains if there is none
     cli.choose("--preset", args.preset, PRESETS)
     for name in ("rollouts", "initial_rollouts", "eval_every", "eval_episodes", "checkpoint_every"):
         if getattr(args, name) < 1:

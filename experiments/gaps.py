@@ -41,7 +41,7 @@ class GapsArgs:
     """One table: a line per gap of a task."""
 
     task: str = "push"
-    """push, hammer or insert."""
+    """push, hammer or insert; or a Python file with a task of your own (docs/extending.md)."""
     presets: tuple[str, ...] = ()
     """Gaps to measure, by name or as .toml/.json files; default: all that come with the task."""
     prior: Path | None = None
@@ -75,22 +75,22 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def measure(args: GapsArgs) -> dict[str, Any]:
     """Measures, prints a table, writes and returns the summary."""
-    cli.choose("--task", args.task, envs.TASKS)
+    task = envs.name_of(args.task)
     cli.choose("--preset", args.preset, PRESETS)
     if args.episodes < 200:
         raise UserError(f"--episodes is {args.episodes}: a success rate needs at least 200 to tell 40 % from 50 %")
     seeds = common.seed_list(args.seed, args.seeds)
     env = envs.make(args.task, args.impl)
-    found = [gaps.load(env, name) for name in args.presets or gaps.presets(args.task)]
+    found = [gaps.load(env, name) for name in args.presets or gaps.presets(task)]
     if not found:
-        raise UserError(f"{args.task} comes with no gaps; name .toml or .json files with --presets")
+        raise UserError(f"{task} comes with no gaps; name .toml or .json files with --presets")
     if args.train:
         make_pretrainer(env, args.config)  # sizes that do not fit together are reported before the long part
-    folder = args.out / "gaps" / args.task
-    folders = common.prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
+    folder = args.out / "gaps" / task
+    folders = common.prior_folders(args.prior, out=args.out, task=task, preset=args.preset)
     priors, card = common.load_priors(folders, env)
     here = _zero_shot(env, found, common.stack(priors), card, args.episodes)
-    about = {"task": args.task, "impl": env.impl, "preset": args.preset, "priors": [str(prior) for prior in folders]}
+    about = {"task": task, "impl": env.impl, "preset": args.preset, "priors": [str(prior) for prior in folders]}
     summary = _report(folder, about, [_line(gap, here[i], None) for i, gap in enumerate(found)])
     if args.train:  # the long part: what is known already is on disk
         there = _train(env, args, found, seeds, folder)

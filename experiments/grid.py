@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import envs
 from envs.physics import Impl
-from experiments import cli, common
+from experiments import common
 from experiments.finetune import finetune
 from experiments.finetune_args import VOLATILE, FinetuneArgs, arguments, label, run_folder
 from sgft_jax import checkpoint
@@ -63,7 +63,7 @@ class Cell(NamedTuple):
 
     def __str__(self) -> str:
         (real,) = self.args.real
-        return f"{self.args.task}/{Path(real).stem}: {label(self.args)}"
+        return f"{envs.name_of(self.args.task)}/{Path(real).stem}: {label(self.args)}"
 
     @property
     def folder(self) -> Path:
@@ -77,7 +77,7 @@ def check(args: GridArgs) -> None:
         if not given:
             raise UserError(f"--{name}: name at least one")
     for task in args.tasks:
-        cli.choose("--tasks", task, envs.TASKS)
+        envs.name_of(task)
     for method in args.methods:
         get_method(method)
     common.seed_list(args.seed, args.seeds)

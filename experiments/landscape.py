@@ -83,7 +83,6 @@ def main(args: LandscapeArgs) -> None:
 
 def landscape(args: LandscapeArgs) -> Path:
     """The figure; raises UserError for a prior without models of the next observation."""
-    cli.choose("--task", args.task, envs.TASKS)
     for name in ("horizon", "branches"):
         if getattr(args, name) < 1:
             raise UserError(f"--{name} is {getattr(args, name)}: must be at least 1")
@@ -96,8 +95,8 @@ def landscape(args: LandscapeArgs) -> Path:
     if player.predict is None:
         raise UserError(f"a prior of {card['algorithm']} has no model of the next observation; choose one of SAC")
     drawn = survey(args, env, player, priors[args.index], start, gamma=card["gamma"])
-    path = args.out / "figures" / f"landscape-{args.task}-{Path(args.real).stem}.png"
-    title = f"{args.task} on the {Path(args.real).stem} real system: V_sim by {entry.name}"
+    path = args.out / "figures" / f"landscape-{env.name}-{Path(args.real).stem}.png"
+    title = f"{env.name} on the {Path(args.real).stem} real system: V_sim by {entry.name}"
     return plot.landscape(path, *drawn, title=title, axes=(f"x ({entry.unit})", f"y ({entry.unit})"))
 
 

@@ -43,7 +43,7 @@ class PretrainArgs:
     """One run of pretraining."""
 
     task: str = "push"
-    """push, hammer or insert."""
+    """push, hammer or insert; or a Python file with a task of your own (docs/extending.md)."""
     preset: str = DEFAULT_PRESET
     """Named settings, see experiments/presets.py; --config.* changes single ones."""
     config: PretrainConfig = field(default_factory=lambda: PRESETS[DEFAULT_PRESET])
@@ -115,7 +115,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 def pretrain(args: PretrainArgs) -> dict[str, Any]:
     """One run from (or back) to disk; returns its summary."""
     cli.choose("--preset", args.preset, PRESETS)
-    cli.choose("--task", args.task, envs.TASKS)
+    envs.name_of(args.task)  # complains if there is none
     seeds = common.seed_list(args.seed, args.seeds)
     hosts.join(args.hosts)
     env = envs.make(args.task, args.impl)
@@ -143,7 +143,8 @@ def pretrain(args: PretrainArgs) -> dict[str, Any]:
 def run_folder(args: PretrainArgs, gap: Gap | None) -> Path:
     """Where the run of these arguments lives; the seeds of one call share a folder."""
     where = args.preset if gap is None else f"{args.preset}-on-{gap.name}"
-    return args.out / "pretrain" / args.task / where / common.seeds_name(common.seed_list(args.seed, args.seeds))
+    seeds = common.seeds_name(common.seed_list(args.seed, args.seeds))
+    return args.out / "pretrain" / envs.name_of(args.task) / where / seeds
 
 
 def make_program(env: Env, config: PretrainConfig, *, seeds: int) -> Program:
@@ -202,7 +203,7 @@ class _Run:
         self.args, self.env, self.gap, self.seeds, self.folder = args, env, gap, seeds, folder
         self.home, self.config = home, args.config
         self.clock, self.log = common.Clock(), MetricsLog(folder)
-        self.expect = {"kind": "pretrain", "task": args.task, "seeds": seeds}
+        self.expect = {"kind": "pretrain", "task": env.name, "seeds": seeds}
         self.chunk_env_steps = self.config.n_envs * self.config.chunk_steps
         self.chunks = math.ceil(self.config.env_steps / self.chunk_env_steps)
 
@@ -378,7 +379,7 @@ class _Run:
             print(line)
         print(f"results: {self.folder}  (prior/, summary.json, figures/)")
         method = " --method sgft-tdmpc2" if self.config.algorithm == "tdmpc2" else ""
-        print(f"next: python -m experiments.finetune --task {self.env.name}{method} --prior {self.folder}")
+        print(f"next: python -m experiments.finetune --task {self.args.task}{method} --prior {self.folder}")
 
 
 if __name__ == "__main__":

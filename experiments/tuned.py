@@ -5,9 +5,10 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+import envs
 from experiments.finetune_args import FinetuneArgs, with_settings
 from sgft_jax.jsonfile import read_json, write_json
-from sgft_jax.methods import FinetuneConfig
+from sgft_jax.methods import FinetuneConfig, get_method
 from sgft_jax.types import UserError
 
 VARIANT = "tuned"
@@ -16,7 +17,11 @@ _OPTIONS = {"utd", *(field.name for field in fields(FinetuneConfig))}
 
 def path_of(out: Path, task: str, method: str) -> Path:
     """<out>/tuned/<task>/<method>.json, described in docs/formats.md."""
-    return out / VARIANT / task / f"{method}.json"
+    return _home(out, task) / f"{get_method(method).name}.json"
+
+
+def _home(out: Path, task: str) -> Path:
+    return out / VARIANT / envs.name_of(task)
 
 
 def write(out: Path, task: str, method: str, result: Mapping[str, Any]) -> Path:
@@ -41,7 +46,7 @@ def read(out: Path, task: str, method: str) -> dict[str, Any]:
 
 def _require(out: Path, task: str, methods: Iterable[str]) -> None:
     if absent := [method for method in methods if not path_of(out, task, method).exists()]:
-        folder, again = path_of(out, task, "").parent, _command(task, absent)
+        folder, again = _home(out, task), _command(task, absent)
         raise UserError(f"--tuned: {folder} holds no options for {', '.join(absent)}; choose them with: {again}")
 
 

@@ -1,4 +1,7 @@
-"""Simulation-Guided Fine-Tuning in JAX: learners, batch transforms and priors as pure functions of pytrees."""
+"""Simulation-Guided Fine-Tuning in JAX: learners, batch transforms and priors as pure functions of pytrees.
+
+docs/api.md lists what is here. Tasks, worlds and episodes are in the package `envs`.
+"""
 
 import contextlib
 import io
@@ -6,18 +9,23 @@ import io
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that the optional Warp backend is absent
     import mujoco.mjx as _mjx  # noqa: F401
 
+from sgft_jax import checkpoint, normalizer, replay, sequences
+from sgft_jax.agents import Agent, make_agent
 from sgft_jax.finetune import FinetuneState, make_finetuner
 from sgft_jax.iql import IQLConfig, IQLHyper, IQLState, make_iql
 from sgft_jax.methods import METHODS, FinetuneConfig, Method, finetune_config, get_method
 from sgft_jax.networks import NetworkConfig
+from sgft_jax.players import Player, sac_player, tdmpc2_player
 from sgft_jax.sac import SACConfig, SACHyper, SACState, extract_prior, fine_tune_state, make_sac
 from sgft_jax.sequences import Sequences
-from sgft_jax.sgft import branch, compose, shape, shorten
+from sgft_jax.sgft import branch, compose, shape, shaped_reward, shorten
 from sgft_jax.tdmpc2 import TDMPC2Config, TDMPC2Hyper, TDMPC2Prior, TDMPC2State, make_tdmpc2
-from sgft_jax.types import Finetuner, Imagination, Learner, Normalizer, Prior, Transition, UserError
+from sgft_jax.types import BatchTransform, Finetuner, Imagination, Learner, Normalizer, Prior, Transition, UserError
 
 __all__ = [
     "METHODS",
+    "Agent",
+    "BatchTransform",
     "FinetuneConfig",
     "FinetuneState",
     "Finetuner",
@@ -29,6 +37,7 @@ __all__ = [
     "Method",
     "NetworkConfig",
     "Normalizer",
+    "Player",
     "Prior",
     "SACConfig",
     "SACHyper",
@@ -41,15 +50,23 @@ __all__ = [
     "Transition",
     "UserError",
     "branch",
+    "checkpoint",
     "compose",
     "extract_prior",
     "fine_tune_state",
     "finetune_config",
     "get_method",
+    "make_agent",
     "make_finetuner",
     "make_iql",
     "make_sac",
     "make_tdmpc2",
+    "normalizer",
+    "replay",
+    "sac_player",
+    "sequences",
     "shape",
+    "shaped_reward",
     "shorten",
+    "tdmpc2_player",
 ]

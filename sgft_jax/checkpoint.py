@@ -32,7 +32,7 @@ _KINDS = {"sac": Prior, "tdmpc2": TDMPC2Prior}
 _PYTHON = {"int": int, "float": float, "bool": bool}
 
 
-class Leaf(NamedTuple):
+class _Leaf(NamedTuple):
     """What the manifest says of one leaf; `kind` is one of jax, numpy, key, int, float, bool."""
 
     path: str
@@ -262,24 +262,24 @@ def _manifest(where: Path) -> dict[str, Any]:
     return manifest
 
 
-def _leaves(manifest: dict[str, Any]) -> list[Leaf]:
-    return [Leaf(path, kind, tuple(shape), dtype) for path, kind, shape, dtype in manifest["leaves"]]
+def _leaves(manifest: dict[str, Any]) -> list[_Leaf]:
+    return [_Leaf(path, kind, tuple(shape), dtype) for path, kind, shape, dtype in manifest["leaves"]]
 
 
 def _slot(index: int) -> str:
     return f"leaf_{index:05d}"
 
 
-def _describe(path: tuple[Any, ...], leaf: Any) -> Leaf:
+def _describe(path: tuple[Any, ...], leaf: Any) -> _Leaf:
     name = jax.tree_util.keystr(path, simple=True, separator="/")
     if isinstance(leaf, (bool, int, float)):
-        return Leaf(name, type(leaf).__name__, (), type(leaf).__name__)
+        return _Leaf(name, type(leaf).__name__, (), type(leaf).__name__)
     if not hasattr(leaf, "dtype"):
         raise TypeError(f"cannot checkpoint {name}: a {type(leaf).__name__} is not an array or a number")
     if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-        return Leaf(name, "key", tuple(leaf.shape), str(leaf.dtype))
+        return _Leaf(name, "key", tuple(leaf.shape), str(leaf.dtype))
     kind = "numpy" if isinstance(leaf, (np.ndarray, np.generic)) else "jax"
-    return Leaf(name, kind, tuple(leaf.shape), str(leaf.dtype))
+    return _Leaf(name, kind, tuple(leaf.shape), str(leaf.dtype))
 
 
 def _to_numpy(leaf: Any) -> np.ndarray:
@@ -287,7 +287,7 @@ def _to_numpy(leaf: Any) -> np.ndarray:
     return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
 
 
-def _from_numpy(leaf: Leaf, stored: Any, *, impl: str | None) -> Any:
+def _from_numpy(leaf: _Leaf, stored: Any, *, impl: str | None) -> Any:
     if leaf.kind == "key":
         return jax.random.wrap_key_data(jnp.array(stored), impl=impl)
     if leaf.kind in _PYTHON:
@@ -346,7 +346,7 @@ def _check_meta(where: Path, saved: Mapping[str, Any], expect: Mapping[str, Any]
         raise UserError(f"{where}: does not fit: it was saved with {', '.join(differing)}")
 
 
-def _check_leaves(where: Path, saved: list[Leaf], wanted: list[Leaf]) -> None:
+def _check_leaves(where: Path, saved: list[_Leaf], wanted: list[_Leaf]) -> None:
     """Raise UserError naming the first leaf that differs."""
     for have, want in zip(saved, wanted, strict=False):
         if not _same(have, want):
@@ -357,7 +357,7 @@ def _check_leaves(where: Path, saved: list[Leaf], wanted: list[Leaf]) -> None:
         raise UserError(f"{where}: does not fit: {counts}, the first odd one is {odd}")
 
 
-def _same(saved: Leaf, wanted: Leaf) -> bool:
+def _same(saved: _Leaf, wanted: _Leaf) -> bool:
     """Equal path, shape and dtype; a Python number also fits the abstract scalar that `jax.eval_shape` makes of it."""
     if saved.kind in _PYTHON and wanted.kind not in _PYTHON:
         return saved.path == wanted.path and wanted.shape == () and wanted.dtype.startswith(saved.kind)

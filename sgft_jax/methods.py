@@ -1,9 +1,11 @@
 """The table of fine-tuning methods: which learner, which batch transforms, which rows, and the authors' settings."""
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
+from sgft_jax import extend
 from sgft_jax.networks import NetworkConfig
 from sgft_jax.sgft import branch, shape, shorten
 from sgft_jax.types import Array, BatchTransform, UserError, unknown
@@ -249,10 +251,20 @@ METHODS: dict[str, Method] = {
 
 
 def get_method(name: str) -> Method:
-    """The method of that name; UserError lists what exists and guesses what was meant."""
+    """The method of that name, or the `METHOD` of a Python file or module of your own (docs/extending.md).
+
+    UserError lists what exists and guesses what was meant, or says what is wrong with the file.
+    """
     if name in METHODS:
         return METHODS[name]
-    raise UserError(unknown("method", name, METHODS))
+    if not extend.is_source(name):
+        raise UserError(f"{unknown('method', name, METHODS)}; or name a file, e.g. my_{name}.py")
+    method = extend.load("method", name, "METHOD").METHOD
+    if not isinstance(method, Method):
+        raise UserError(f"method {name}: METHOD is a {type(method).__name__}, not a sgft_jax.Method")
+    if method.name in METHODS or not re.fullmatch(r"[\w-]+", method.name):
+        raise UserError(f"method {name}: the name {method.name!r} is taken or names no folder; choose another")
+    return method
 
 
 def finetune_config(method: Method, **changes: Any) -> FinetuneConfig:

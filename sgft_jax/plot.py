@@ -147,8 +147,8 @@ def landscape(
 ) -> Path:
     """A value function over a plane, a real and a simulated path in it, and the branches imagined along the real one.
 
-    x, y: [G] increasing; value: [G, G], rows along y. real, simulated: [T + 1, 2]. imagined: [T, branches, H + 1, 2]. axes: the
-    words at the two axes.
+    x, y: [G] increasing; value: [G, G], rows along y. real, simulated: [T + 1, 2]. imagined: [T, branches, H + 1, 2].
+    axes: the words at the two axes.
     """
     figure, (panel,) = _figure(6.0, 5.0, columns=1)
     across, up, heights = np.asarray(x), np.asarray(y), np.asarray(value)

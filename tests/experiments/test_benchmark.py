@@ -171,7 +171,7 @@ def test_figures_show_how_costs_grow(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        ({"tasks": ("hamer",)}, "--tasks: there is no 'hamer', did you mean 'hammer'?"),
+        ({"tasks": ("hamer",)}, "task: there is no 'hamer', did you mean 'hammer'?"),
         ({"worlds": (4, 0)}, "--worlds is 0"),
         ({"repeats": 0}, "--repeats is 0"),
         ({"batches": ()}, "--batches is 0"),

@@ -106,7 +106,7 @@ def test_dry_lists_and_runs_nothing(tmp_path, ran, capsys):
     ("argv", "words"),
     [
         (["--methods", "sgft-sca"], "did you mean 'sgft-sac'"),
-        (["--tasks", "pull"], "--tasks: there is no 'pull'"),
+        (["--tasks", "pull"], "task: there is no 'pull'"),
         (["--seeds", "0"], "at least one"),
         (["--reals"], "--reals: name at least one"),
     ],

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -174,26 +173,6 @@ def test_horizon_one_learner_sees_the_papers_batch(prior, key, monkeypatch):
     )
     jax.eval_shape(lambda state: tuner.learn(state, key, 1), started(tuner, prior))
     assert seen["batch"].obs.shape == (1536, 2) and seen["config"].actor_batch == 256
-
-
-def test_vmap_over_seeds_equals_a_loop(prior):
-    tuner = make("sgft-sac", horizon=1)
-    states, keys = [started(tuner, prior, seed) for seed in range(2)], jax.random.split(jax.random.key(5), 2)
-    alone = [tuner.learn(state, key, 3)[0] for state, key in zip(states, keys, strict=True)]
-    together, _ = jax.vmap(lambda s, k: tuner.learn(s, k, 3))(jax.tree.map(lambda *x: jnp.stack(x), *states), keys)
-    for i, one in enumerate(alone):
-        chex.assert_trees_all_close(jax.tree.map(lambda x, i=i: x[i], together), one, atol=1e-4)
-    assert not equal(alone[0].learner.actor, alone[1].learner.actor)
-
-
-def test_learn_traces_once(prior):
-    plain = finetune.make_finetuner(
-        methods.METHODS["sgft"], SMALL, obs_dim=2, act_dim=2, reward=reward, terminated=never
-    )
-    learn = jax.jit(chex.assert_max_traces(plain.learn, n=1), static_argnums=2)
-    state = started(plain, prior)
-    for seed in range(3):
-        state, _ = learn(state, jax.random.key(seed), 3)
 
 
 def test_keys_are_used_once(prior):

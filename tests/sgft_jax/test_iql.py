@@ -1,4 +1,4 @@
-"""IQL's losses by hand, problems with known answers, and the contract every learner keeps."""
+"""IQL: losses by hand, problems whose answers tell it from other methods. See also test_contract_learners.py."""
 
 import chex
 import jax
@@ -103,7 +103,7 @@ def train(batch, hyper, key):
     return state, jax.tree.map(lambda m: m[-1], metrics)
 
 
-def rows(obs, action, reward, discount, *, next_obs=None, truncated=None):
+def rows(obs, action, reward, discount, *, next_obs=None):
     """[ROWS] numbers, or one for all, as a batch."""
     obs, action, reward, discount = (jnp.broadcast_to(f(x), ROWS) for x in (obs, action, reward, discount))
     return Transition(
@@ -112,7 +112,7 @@ def rows(obs, action, reward, discount, *, next_obs=None, truncated=None):
         reward=reward,
         discount=discount,
         next_obs=(obs if next_obs is None else jnp.broadcast_to(f(next_obs), ROWS))[:, None],
-        truncated=jnp.zeros(ROWS, bool) if truncated is None else truncated,
+        truncated=jnp.zeros(ROWS, bool),
         steps_to_go=jnp.zeros(ROWS, jnp.int32),
     )
 
@@ -173,17 +173,6 @@ def test_probe_actions_outside_the_data_are_never_used(key):
     assert v_of(state, 1.0) == pytest.approx(-1.0, abs=0.1)
     np.testing.assert_allclose(q_of(state, 0.0, -0.5), -0.9, atol=0.1)
     assert policy_of(state, 1.0)[0] == pytest.approx(np.average(tried, weights=np.exp(12 * tried)), abs=0.05)
-
-
-def test_probe_time_limit_does_not_end_an_endless_reward(key):
-    """Every row at state 1 is the last of its episode: cut by a time limit it is worth 1 / (1 - 0.8), terminated 1."""
-    cut = rows(HALF, 0.3, 1.0, 0.8, truncated=HALF == 1)
-    ended = rows(HALF, 0.3, 1.0, jnp.where(HALF == 1, 0.0, 0.8))
-    for batch, last in ((cut, 5.0), (ended, 1.0)):
-        state, _ = train(batch, FAST, key)
-        np.testing.assert_allclose(q_of(state, 0.0, 0.3), 5.0, rtol=0.05)
-        np.testing.assert_allclose(q_of(state, 1.0, 0.3), last, rtol=0.1)
-        assert v_of(state, 1.0) == pytest.approx(last, rel=0.1)
 
 
 # --- contract -------------------------------------------------------------------------------------------------------
@@ -324,18 +313,6 @@ def test_act_draws_around_the_mode_within_bounds(key):
     np.testing.assert_allclose(np.mean(narrow, axis=0), mode, atol=5e-3)
     np.testing.assert_allclose(np.std(narrow, axis=0), np.exp(-3), rtol=0.05)
     assert np.min(wide) == -1 and np.max(wide) == 1
-
-
-@pytest.mark.slow
-def test_vmap_over_seeds_and_numbers_equals_a_loop(key):
-    keys, batch = jax.random.split(key, 2), batch_of(key)
-    numbers = ({"expectile": 0.5, "lr_critic": 0.0}, {"expectile": 0.9, "lr_critic": 1e-2})
-    states = [with_hyper(SMALL.init(k), **n) for k, n in zip(keys, numbers, strict=True)]
-    both = jax.jit(jax.vmap(SMALL.update, (0, None, 0)))(jax.tree.map(lambda *x: np.stack(x), *states), batch, keys)
-    for i, state in enumerate(states):
-        new, metrics = jax.tree.map(lambda x, i=i: x[i], both)
-        chex.assert_trees_all_close((new, metrics), SMALL.update(state, batch, keys[i]), atol=1e-5)
-        assert equal(state.critic.params, new.critic.params) == (i == 0)
 
 
 def test_update_is_traced_once_whatever_the_numbers(key):

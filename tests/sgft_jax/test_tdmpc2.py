@@ -1,4 +1,4 @@
-"""TD-MPC2: losses and plans against loops, probe problems with known answers, the contract, and what SGFT freezes."""
+"""TD-MPC2: losses and plans against loops, what learns, what SGFT freezes. See also test_contract_learners.py."""
 
 import dataclasses
 import functools
@@ -9,30 +9,22 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from probes import PLAIN, ROWS, SIZE, case
 
 from sgft_jax import normalizer, optim, sequences, tdmpc2, twohot
 from sgft_jax.sequences import Sequences
 from sgft_jax.types import Transition, UserError
 
-SIZE = tdmpc2.Size(encoder=24, mlp=24, latent=16, members=3)
-PLAIN = tdmpc2.TDMPC2Config(
-    2, 1, horizon=2, size=SIZE, simnorm_group=4, dropout=0.0, samples=32, elites=6, policy_samples=4, iterations=4
-)
 SGFT = dataclasses.replace(PLAIN, sgft=True)
 MOVING = dataclasses.replace(SGFT, train_encoder=True)
 NETWORKS = ("encoder", "dynamics", "reward", "policy", "critic")
-ROWS = 32
 
-# Compiling is all that takes time here: one size of everything for all tests, which also shows that nothing retraces.
+# Compiling is all that takes time here: one size of everything for all tests, and the programs of the contract tests.
 LEARNERS = {config: tdmpc2.make_tdmpc2(config) for config in (PLAIN, SGFT, MOVING)}
 INIT = jax.jit(LEARNERS[PLAIN].init)
-ONCE = (  # chex tells functions apart by their source
-    lambda *args: LEARNERS[PLAIN].update(*args),
-    lambda *args: LEARNERS[SGFT].update(*args),
-    lambda *args: LEARNERS[MOVING].update(*args),
-)
-UPDATE = {c: jax.jit(chex.assert_max_traces(f, n=1)) for c, f in zip(LEARNERS, ONCE, strict=True)}
-ACT = jax.jit(chex.assert_max_traces(lambda *args: LEARNERS[PLAIN].act(*args, explore=True), n=1))
+UPDATE = {PLAIN: case("tdmpc2").learner.update, SGFT: case("sgft-tdmpc2").learner.update}
+UPDATE[MOVING] = jax.jit(LEARNERS[MOVING].update)
+ACT = jax.jit(functools.partial(LEARNERS[PLAIN].act, explore=True))
 VALUE = jax.jit(tdmpc2.value_of, static_argnums=0)
 PARTS = tdmpc2._parts(PLAIN)
 PARTS = PARTS._replace(**{n: getattr(PARTS, n)._replace(apply=jax.jit(getattr(PARTS, n).apply)) for n in NETWORKS})
@@ -366,23 +358,6 @@ def test_learning_rates(key):
         assert jnp.abs(moved - old).max() == pytest.approx(rate, rel=2e-2), name
 
 
-def run(key):
-    """An update and a plan of one seed. Moments are not 0: a first step would make rounding errors as long as any."""
-    key_state, key_windows, key_update, key_act = jax.random.split(key, 4)
-    learner, state = LEARNERS[PLAIN], shaken(PLAIN, key_state)
-    state, _ = learner.update(state, windows(key_windows), key_update)
-    return state, learner.act(state, learner.init_carry(), jnp.ones(2), key_act, explore=True)
-
-
-@pytest.mark.slow
-def test_vmap_over_seeds_equals_a_loop(key):
-    keys = jax.random.split(key, 2)
-    both, alone = jax.jit(jax.vmap(run))(keys), jax.jit(run)
-    for i in range(2):
-        for (a, b), atol in zip(zip(both, alone(keys[i]), strict=True), (1e-4, 1e-2), strict=True):  # agent, plan
-            chex.assert_trees_all_close(jax.tree.map(lambda x, i=i: x[i], a), b, atol=atol)
-
-
 @pytest.mark.slow
 def test_hyperparameters_vmap(key):
     state, rates = shaken(PLAIN, key), jnp.array([0.0, 1e-2])
@@ -451,7 +426,7 @@ def test_impossible_options_are_refused(key):
     assert [tdmpc2.TDMPC2Config(1, n).planner.iterations for n in (19, 20)] == [6, 8]
 
 
-# --- probe problems -------------------------------------------------------------------------------------------------
+# --- a task ---------------------------------------------------------------------------------------------------------
 
 FAST = tdmpc2.TDMPC2Hyper(lr=3e-3, tau=0.2, encoder_lr_scale=1.0)
 
@@ -464,45 +439,6 @@ def train(config, state, draw, key, steps):
         state, _ = UPDATE[config](state, draw(keys[step, 0]), keys[step, 1])
     return state
 
-
-def probe(key, *, ends):
-    """State -1 pays 0 and leads to state 1, which pays 1 and goes on to itself; `ends`: it terminates instead."""
-    first = jnp.tile(jnp.array([-1.0, 1.0]), ROWS // 2)
-    at = jnp.stack([first, jnp.ones(ROWS)], axis=1)
-    obs, last = jnp.stack([at, jnp.zeros_like(at)], axis=2), at > 0
-    action = jax.random.uniform(key, (ROWS, 2, 1), minval=-1)
-    discount = jnp.where(last & ends, jnp.float32(0.0), 0.8)
-    following = jnp.tile(jnp.array([1.0, 0.0]), (ROWS, 2, 1))
-    rows = Transition(obs, action, jnp.maximum(at, 0.0), discount, following, last, last.astype(jnp.int32))
-    return Sequences(rows, jnp.stack([jnp.ones(ROWS, bool), first < 0], axis=1))  # all rows at state 1 are the last
-
-
-@pytest.mark.parametrize(
-    ("ends", "values"), [pytest.param(True, (0.8, 1.0), marks=pytest.mark.slow), (False, (4.0, 5.0))]
-)
-def test_probe_values_of_two_states(ends, values, key):
-    """Worth of state 1: 1 if it ends there; 1 / (1 - 0.8) if a time limit cuts it, which all rows at state 1 say."""
-    state = train(PLAIN, INIT(key), jax.jit(functools.partial(probe, ends=ends)), key, 600)
-    got = [float(VALUE(PLAIN, state, jnp.array([s, 0.0]))) for s in (-1.0, 1.0)]
-    np.testing.assert_allclose(got, values, rtol=0.1)
-
-
-@pytest.mark.parametrize("config", [PLAIN, SGFT])
-def test_probe_action_decides(config, key):
-    """Reward 1 - (a - 0.5)^2: the critic teaches the policy; with SGFT, where V_sim is 0, the reward head does."""
-
-    @jax.jit
-    def draw(key):
-        batch = probe(key, ends=True)
-        rows = batch.rows._replace(reward=1 - (batch.rows.action[..., 0] - 0.5) ** 2)
-        return Sequences(rows, batch.valid.at[:, 1].set(False))
-
-    state = train(config, start(config, key), draw, key, 400)
-    mode = tdmpc2.policy_action(config, state, jnp.array([1.0, 0.0]), key, explore=False)
-    assert mode[0] == pytest.approx(0.5, abs=0.15)
-
-
-# --- a task ---------------------------------------------------------------------------------------------------------
 
 STEPS = 10
 

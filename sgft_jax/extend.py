@@ -1,0 +1,55 @@
+"""Impure: tasks and methods of the user's own, named by a Python file or a module instead of a name of ours."""
+
+import importlib
+import importlib.util
+import sys
+from pathlib import Path
+from types import ModuleType
+
+from sgft_jax.types import UserError
+
+
+def is_source(name: str) -> bool:
+    """Whether a name means a file (`path/to/mine.py`) or a module (`package.mine`): ours have no dots."""
+    return "." in name
+
+
+def name_of(source: str) -> str:
+    """`mine` for `path/to/mine.py` and for `package.mine`; a name without dots is its own."""
+    return Path(source).stem if source.endswith(".py") else source.rpartition(".")[2]
+
+
+def load(kind: str, source: str, attribute: str) -> ModuleType:
+    """The module of a file or of a dotted name, executed once per process; it must define `attribute`.
+
+    kind: what it should hold, for messages. Raises UserError if there is no such file or module, if it is no Python, or
+    if it lacks the attribute. Whatever else goes wrong while it runs is its author's and keeps its traceback.
+    """
+    try:
+        module = _from_file(Path(source)) if source.endswith(".py") else importlib.import_module(source)
+    except OSError as error:
+        raise UserError(f"{kind} {source}: {error.strerror}") from None
+    except SyntaxError as error:
+        raise UserError(f"{kind} {source}: {error.msg} in line {error.lineno}") from None
+    except ModuleNotFoundError as error:
+        if source != error.name and not source.startswith(f"{error.name}."):
+            raise  # it is there, what it imports is not
+        raise UserError(f"{kind} {source}: there is no module {error.name!r}; a file is named with its .py") from None
+    if not hasattr(module, attribute):
+        raise UserError(f"{kind} {source}: does not define `{attribute}`; see docs/extending.md")
+    return module
+
+
+def _from_file(path: Path) -> ModuleType:
+    name = str(path.resolve())  # no other module can be called that
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None  # as for any name that ends in .py
+    sys.modules[name] = module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module

@@ -1,0 +1,190 @@
+"""Problems with known answers, each of which isolates one fault, and the learners that must solve them, all tiny.
+
+Everything has two observation entries, one action entry and ROWS rows, so that a learner's update is compiled once for
+all tests of a module. The first observation entry is the state s of a problem, the other is 0.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sgft_jax import iql, networks, sac, tdmpc2
+from sgft_jax.sequences import Sequences
+from sgft_jax.types import Learner, Transition
+
+ROWS = 32
+NET = networks.NetworkConfig(hidden=(32,))
+
+
+class Probe(NamedTuple):
+    """A world of a few states in which actions change nothing but the reward.
+
+    states: s of the rows, equally likely. reward(s, a); discount(s); following(s) -> the next s. cut: s whose rows are
+    the last of an episode by its time limit. values: s -> V; actions: s -> the best action.
+    """
+
+    states: tuple[float, ...]
+    reward: Callable = lambda s, a: jnp.ones_like(s)
+    discount: Callable = jnp.zeros_like
+    following: Callable = lambda s: s
+    cut: float | None = None
+    values: Mapping[float, float] = MappingProxyType({})
+    actions: Mapping[float, float] = MappingProxyType({})
+
+
+PROBES = {
+    "constant reward": Probe((0.0,), values={0.0: 1.0}),
+    "reward seen in the observation": Probe((-1.0, 1.0), lambda s, a: s, values={-1.0: -1.0, 1.0: 1.0}),
+    # 0 pays nothing and leads to 1, which pays 1 and ends
+    "reward one step later": Probe(
+        (0.0, 1.0), lambda s, a: s, lambda s: 0.8 * (s == 0), jnp.ones_like, values={0.0: 0.8, 1.0: 1.0}
+    ),
+    # 1 / (1 - 0.8): a time limit ends an episode, not what could still be had
+    "time limit": Probe((0.0, 1.0), discount=lambda s: 0.8 + 0 * s, cut=1.0, values={0.0: 5.0, 1.0: 5.0}),
+    "termination": Probe((0.0, 1.0), discount=lambda s: 0.8 * (s == 0), values={0.0: 5.0, 1.0: 1.0}),
+    "action decides": Probe((0.0,), lambda s, a: 1 - (a - 0.5) ** 2, actions={0.0: 0.5}),
+    "state and action decide": Probe((-1.0, 1.0), lambda s, a: 1 - (a - 0.6 * s) ** 2, actions={-1.0: -0.6, 1.0: 0.6}),
+}
+
+
+def obs_of(s):
+    """The observation [2] of state s."""
+    return jnp.array([s, 0.0], jnp.float32)
+
+
+def rows(probe, key):
+    """[ROWS] transitions of random states and actions."""
+    key_state, key_action = jax.random.split(key)
+    s = jax.random.choice(key_state, jnp.array(probe.states), (ROWS,))
+    action = jax.random.uniform(key_action, (ROWS, 1), minval=-1)
+    wide = lambda s: jnp.stack([s, jnp.zeros(ROWS)], axis=1)  # noqa: E731
+    reward, discount = (jnp.asarray(x, jnp.float32) for x in (probe.reward(s, action[:, 0]), probe.discount(s)))
+    cut = jnp.zeros(ROWS, bool) if probe.cut is None else s == probe.cut
+    return Transition(wide(s), action, reward, discount, wide(probe.following(s)), cut, jnp.zeros(ROWS, jnp.int32))
+
+
+def windows(batch):
+    """The same rows as windows of two steps, of which the second does not belong to them."""
+    twice = jax.tree.map(lambda x: jnp.stack([x, jnp.zeros_like(x)], axis=1), batch)
+    return Sequences(twice, jnp.stack([jnp.ones(ROWS, bool), jnp.zeros(ROWS, bool)], axis=1))
+
+
+class Case(NamedTuple):
+    """A learner as all tests of a module share it: compiled, and its `update` counted by `traces` (a list of one).
+
+    start(key) -> state. feed(transitions) -> the batch it wants. values(state, obs) -> all its estimates of V(obs), or
+    None where its V is frozen. mode(state, obs) -> the action [1] that its policy takes for best. steps: updates to
+    solve a probe.
+    """
+
+    learner: Learner
+    start: Callable
+    feed: Callable
+    values: Callable | None
+    mode: Callable
+    steps: int
+    traces: list[int]
+
+
+def counted(learner, **case):
+    """A Case of a learner."""
+    traces = [0]
+
+    def update(state, batch, key):
+        traces[0] += 1
+        return learner.update(state, batch, key)
+
+    act = jax.jit(learner.act, static_argnames="explore")
+    compiled = learner._replace(init=jax.jit(learner.init), update=jax.jit(update), act=act)
+    return Case(**{"learner": compiled, "start": compiled.init, "traces": traces, **case})
+
+
+# alpha 1e-4: entropy changes the answers by less than their tolerance
+SAC_HYPER = sac.SACHyper(lr_actor=3e-3, lr_critic=1e-2, lr_value=1e-2, lr_dynamics=1e-2, tau=0.1, alpha=1e-4)
+
+
+def _sac(**options: Any):
+    config = sac.SACConfig(2, 1, network=NET, tune_alpha=False, **options)
+    learner = sac.make_sac(config, SAC_HYPER)
+    critic = networks.make_critic(2, 1, config.critic_network or NET, members=config.critics)
+    judge = networks.make_value(2, NET)
+
+    @jax.jit
+    def values(state, obs):
+        q = critic.apply(state.critic.params, obs, jnp.zeros(1))
+        return q if state.value is None else jnp.append(q, judge.apply(state.value.params, obs))
+
+    case = counted(learner, feed=lambda batch: batch, values=values, mode=None, steps=400)
+    return case._replace(mode=_mode(case))
+
+
+def _iql():
+    # beta 20: the policy is close to the best of the data's actions
+    learner = iql.make_iql(
+        iql.IQLConfig(2, 1, network=NET), iql.IQLHyper(lr_actor=3e-3, lr_critic=1e-2, lr_value=1e-2, tau=0.1, beta=20.0)
+    )
+    critic, judge = networks.make_critic(2, 1, NET), networks.make_value(2, NET)
+
+    @jax.jit
+    def values(state, obs):
+        q = critic.apply(state.critic.params, obs, jnp.zeros(1))
+        return jnp.append(q, judge.apply(state.value.params, obs))
+
+    case = counted(learner, feed=lambda batch: batch, values=values, mode=None, steps=400)
+    return case._replace(mode=_mode(case))
+
+
+def _mode(case):
+    key = jax.random.key(0)
+    return lambda state, obs: case.learner.act(state, case.learner.init_carry(), obs, key, explore=False)[0]
+
+
+SIZE = tdmpc2.Size(encoder=24, mlp=24, latent=16, members=3)
+PLAIN = tdmpc2.TDMPC2Config(
+    2, 1, horizon=2, size=SIZE, simnorm_group=4, dropout=0.0, samples=32, elites=6, policy_samples=4, iterations=4
+)
+PLANNER_HYPER = tdmpc2.TDMPC2Hyper(lr=3e-3, tau=0.2, encoder_lr_scale=1.0)
+
+
+def _tdmpc2(config, steps):
+    learner = tdmpc2.make_tdmpc2(config, PLANNER_HYPER)
+    first = tdmpc2.make_tdmpc2(PLAIN, PLANNER_HYPER).init
+
+    def start(key):
+        state = first(key)
+        return tdmpc2.fine_tune_state(config, PLANNER_HYPER, tdmpc2.extract_prior(state), key) if config.sgft else state
+
+    value = jax.jit(functools.partial(tdmpc2.value_of, config))
+    policy = jax.jit(functools.partial(tdmpc2.policy_action, config), static_argnames="explore")
+    return counted(
+        learner,
+        start=jax.jit(start),
+        feed=windows,
+        values=None if config.sgft else value,
+        mode=lambda state, obs: policy(state, obs, jax.random.key(0), explore=False),
+        steps=steps,
+    )
+
+
+MAKERS = {
+    "sac": lambda: _sac(ensemble_size=2),
+    # RLPD's: ten normalised critics, targets from two of them, the actor follows their mean
+    "sac, ten critics": lambda: _sac(
+        critics=10, target_critics=2, actor_mean=True, train_value=False, train_dynamics=False,
+        critic_network=dataclasses.replace(NET, layer_norm=True),
+    ),
+    "iql": _iql,
+    "tdmpc2": lambda: _tdmpc2(PLAIN, 800),
+    "sgft-tdmpc2": lambda: _tdmpc2(dataclasses.replace(PLAIN, sgft=True), 1000),
+}  # fmt: skip
+
+
+@functools.cache
+def case(name):
+    """The learner of that name, compiled once."""
+    return MAKERS[name]()

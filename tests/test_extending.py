@@ -1,0 +1,196 @@
+"""The examples of docs/extending.md run, and what is wrong with a file of one's own is said in one line."""
+
+import contextlib
+import io
+import os
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from envs import gaps
+from experiments import cli, figures, finetune, pretrain
+from sgft_jax import NetworkConfig, Transition, UserError, checkpoint, extend, get_method, sac
+from sgft_jax.config import config_to_json
+
+ROOT = Path(__file__).parent.parent
+EXAMPLES = ROOT / "docs/examples"
+TASK, METHOD, GAP = (str(EXAMPLES / name) for name in ("own_task.py", "own_method.py", "own_gap.toml"))
+NETWORK = NetworkConfig(hidden=(8,))
+
+
+@pytest.fixture(autouse=True)
+def _own(monkeypatch):
+    monkeypatch.setattr(envs, "TASKS", dict(envs.TASKS))
+    monkeypatch.setattr(os, "environ", {**os.environ, "SGFT_IMPL": "c"})  # nothing to compile
+    monkeypatch.setattr(cli, "set_up", lambda: None)
+
+
+@pytest.fixture(scope="module")
+def prior(tmp_path_factory):
+    """An untrained prior of the example's task, with its card."""
+    home = tmp_path_factory.mktemp("runs")
+    agent = sac.make_sac(sac.SACConfig(3, 1, network=NETWORK, ensemble_size=2))
+    card = {"task": "own_task", "obs_dim": 3, "act_dim": 1, "network": config_to_json(NETWORK), "gamma": 0.9}
+    folder = home / "pretrain/own_task/fast/seed-0/prior/seed-0"
+    checkpoint.save_prior(
+        folder, sac.extract_prior(jax.jit(agent.init)(jax.random.key(0))), {**card, "ensemble_size": 2, "seed": 0}
+    )
+    return folder
+
+
+def test_examples_are_short_and_explained():
+    page = (ROOT / "docs/extending.md").read_text()
+    for path in EXAMPLES.iterdir():
+        if path.is_file():
+            assert len(path.read_text().splitlines()) < 75 and f"(examples/{path.name})" in page
+
+
+# --- a task ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_task_can_be_solved_and_overshot(key):
+    """A careful hand stops the puck at the mark; one that pushes as fast as it can throws it past."""
+    env = envs.make(TASK)
+    pool = env.sample_worlds(key, 4)
+
+    def careful(carry, obs, key):
+        return jnp.clip(3 * (0.3 - obs[1:2]), -1, 1), carry
+
+    def hasty(carry, obs, key):
+        return jnp.ones(1), carry
+
+    for policy, expected in ((careful, 1.0), (hasty, 0.0)):
+        play = jax.jit(jax.vmap(lambda key, p=policy: envs.play_episode(env, pool, p, (), key, gamma=0.9)))
+        episodes = play(jax.random.split(key, 4))
+        assert episodes.success.mean() == expected and not episodes.exploded.any()
+
+
+def test_worlds_differ_in_what_the_parameters_say(key):
+    env = envs.make(TASK)
+    worlds = env.sample_worlds(key, 3)
+    np.testing.assert_allclose(worlds.model["dof_frictionloss"][:, 1], worlds.params[:, 1], rtol=1e-6)
+    np.testing.assert_allclose(worlds.model["body_mass"][:, 2], worlds.params[:, 0], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_commands_take_the_file(prior, tmp_path):
+    """Pretraining of a moment; where it leaves what, and what it says comes next."""
+    options = """--preset cpu --no-video --no-report --config.n-envs 4 --config.worlds 2 --config.env-steps 60
+        --config.random-transitions 64 --config.batch-size 16 --config.chunk-steps 15 --config.updates-per-step 1
+        --config.replay-capacity 128 --config.network.hidden 8 --config.eval-episodes 4 --config.ensemble-size 1"""
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        pretrain.main(["--task", TASK, *options.split(), "--out", str(tmp_path)])
+    assert (tmp_path / "pretrain/own_task/cpu/seed-0/prior/seed-0/prior.json").exists()
+    assert f"--task {TASK}" in said.getvalue()
+
+
+# --- a method -------------------------------------------------------------------------------------------------------
+
+
+def test_the_transform_by_hand(key):
+    method = get_method(METHOD)
+    assert method.name == "sgft-bent" and len(method.transforms(1, 5, 0.5)) == 4
+    zero = jnp.zeros(3)
+    batch = Transition(zero, zero, jnp.array([0.01, -100.0, 2.0]), zero, zero, zero > 0, zero.astype(jnp.int32))
+    bent = method.transforms(1, 5, 0.5)[2](None, batch, key)
+    np.testing.assert_allclose(bent.reward, [0.01, -2.0, 2 * np.tanh(1.0)], rtol=1e-4)  # tanh(1) = 0.76
+
+
+def test_the_method_runs_alone(capsys):
+    extend.load("method", METHOD, "METHOD").main()
+    assert re.search(r"mean shaped reward -?\d\.\d+, critic loss \d", capsys.readouterr().out)
+
+
+def test_the_method_and_the_gap_run_in_a_command_and_are_drawn(prior, tmp_path):
+    options = """--rollouts 2 --initial-rollouts 1 --seeds 1 --utd 0.2 --eval-every 1 --eval-episodes 2 --no-video
+        --options.batch-size 8 --options.branches 1"""
+    given = ["--task", TASK, "--method", METHOD, "--real", GAP, "--prior", str(prior), "--out", str(tmp_path)]
+    finetune.main([*given, *options.split()])
+    run = tmp_path / "finetune/own_task/own_gap/sgft-bent/seed-0"
+    assert '"clip_shaped": null' in (run / "config.json").read_text() and (run / "policy/seed-0/prior.json").exists()
+    assert "| sgft-bent | 1 |" in figures.figures(figures.FiguresArgs(task=TASK, out=tmp_path)).read_text()
+
+
+# --- a real system --------------------------------------------------------------------------------------------------
+
+
+def test_the_gap_is_outside_the_training_range(key):
+    env = envs.make(TASK)
+    gap = gaps.load(env, GAP)
+    ranges = {p.name: (p.low, p.high) for p in env.parameters}
+    assert gap.params["rail_friction"] < ranges["rail_friction"][0]
+    worlds = gaps.worlds(env, gap, key, n=3)
+    np.testing.assert_allclose(worlds.params[:, 1], 0.25)
+    assert len(np.unique(worlds.params[:, 0])) == 3 and (worlds.effects.action_scale == 1.25).all()
+
+
+def test_a_pretended_robot_teaches_a_policy(prior, capsys):
+    example = extend.load("example", str(EXAMPLES / "own_gap.py"), "finetune")
+    env = envs.make(TASK)
+    before, card = checkpoint.load_prior(prior, task="own_task")
+    robot = example.PretendedRobot(env, gaps.load(env, GAP))
+    start = robot.reset()
+    assert start.shape == (3,) and robot.step(np.ones(1))[0] > start[0]
+    after = example.finetune(env, robot, before, card, rollouts=6, updates=2)  # the actor waits for five
+    assert len(re.findall(r"rollout \d: return -?\d+\.\d+, success (?:True|False)", capsys.readouterr().out)) == 6
+    assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, before)
+    changed = jax.tree.map(lambda a, b: bool((a != b).any()), after.actor, before.actor)
+    assert any(jax.tree.leaves(changed))
+
+
+# --- what can be wrong ----------------------------------------------------------------------------------------------
+
+OWN = "from envs.franka import push\nmake = push.make\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("gone.py", None, "gone.py: No such file or directory"),
+        ("torn.py", "def make(:\n", "torn.py: invalid syntax in line 1"),
+        ("empty.py", "", "empty.py: does not define `make`; see docs/extending.md"),
+        ("other.py", OWN, "its Env is called 'push'; call it 'other', like the file"),
+        ("push.py", OWN, "the name 'push' is taken by envs.franka.push; rename the file"),
+    ],
+)
+def test_a_bad_task_is_one_line(tmp_path, name, text, words):
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    with pytest.raises(UserError, match=re.escape(words)) as refused:
+        envs.make(str(tmp_path / name))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "does not define `METHOD`"),
+        ("METHOD = 3\n", "METHOD is a int, not a sgft_jax.Method"),
+        ("import sgft_jax\nMETHOD = sgft_jax.get_method('sac')\n", "the name 'sac' is taken"),
+        ("import sgft_jax\nMETHOD = sgft_jax.get_method('sac')._replace(name='a/b')\n", "'a/b' is taken or names no"),
+    ],
+)
+def test_a_bad_method_is_one_line_and_code_2(tmp_path, capsys, text, words):
+    (tmp_path / "mine.py").write_text(text)
+    with pytest.raises(SystemExit) as stopped:
+        finetune.main(["--method", str(tmp_path / "mine.py")])
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and words in error and error.count("\n") == 1
+
+
+def test_modules_are_found_and_their_own_faults_are_not_hidden(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "own_package").mkdir()
+    (tmp_path / "own_package/broken.py").write_text("import a_module_that_is_not_there\n")
+    assert extend.load("task", "envs.franka.push", "make").make is not None
+    with pytest.raises(UserError, match=r"no module 'own_package.gone'; a file is named with its .py"):
+        extend.load("task", "own_package.gone", "make")
+    for source in ("own_package.broken", str(tmp_path / "own_package/broken.py")):
+        with pytest.raises(ModuleNotFoundError, match="a_module_that_is_not_there"):
+            extend.load("task", source, "make")
