@@ -18,6 +18,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+import envs
 from experiments import cli, common, grid, tuned
 from experiments.finetune_args import with_settings
 from experiments.grid import Cell, GridArgs
@@ -110,7 +111,7 @@ def trials(args: TuneArgs, task: str, method: str) -> list[Trial]:
 
 def _look_up(args: TuneArgs, task: str, real: str, method: str, number: int, settings: dict[str, Any]) -> Cell:
     run = grid.run_of(args, task, real, method)
-    priors = common.prior_home(args.out, task, run.preset)
+    priors = common.prior_home(args.out, envs.name_of(task), run.preset)
     run = replace(run, prior=priors, variant=f"trial-{number}", out=args.out / FOLDER)
     return grid.look_up(with_settings(run, settings))
 
