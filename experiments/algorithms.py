@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from envs.base import Env
 from experiments.presets import PretrainConfig
-from sgft_jax import checkpoint, replay, sac, sequences, tdmpc2
+from sgft_jax import checkpoint, replay, sac, sequences, tdmpc2, tdmpc2_model
 from sgft_jax.config import config_from_json, config_to_json
 from sgft_jax.networks import NetworkConfig
 from sgft_jax.players import Player, sac_player, tdmpc2_player
@@ -48,7 +48,7 @@ def make_player(card: Mapping[str, Any]) -> Player:
     if checkpoint.algorithm_of(card) == "sac":
         return sac_player(obs_dim, act_dim, network_of(card))
     own = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
-    structure = tdmpc2.named_config(obs_dim, act_dim, **own)
+    structure = tdmpc2_model.named_config(obs_dim, act_dim, **own)
     return tdmpc2_player(structure, tdmpc2.TDMPC2Hyper(gamma=card["gamma"]))
 
 
@@ -119,7 +119,7 @@ def sac_hyper(config: PretrainConfig, *, progress: float | Array = 0.0) -> sac.S
 
 def _tdmpc2(env: Env, config: PretrainConfig) -> Algorithm:
     own = {name: getattr(config, name) for name in ("horizon", "size", "plan_samples")}
-    structure = tdmpc2.named_config(env.obs_dim, env.act_dim, **own)
+    structure = tdmpc2_model.named_config(env.obs_dim, env.act_dim, **own)
 
     def hyper(progress: float | Array) -> tdmpc2.TDMPC2Hyper:
         numbers = tdmpc2.TDMPC2Hyper(lr=_rate(config, progress), tau=config.tau, gamma=config.gamma)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from sgft_jax import replay, sequences, tdmpc2
+from sgft_jax import replay, sequences, tdmpc2, tdmpc2_model
 from sgft_jax.methods import FinetuneConfig, Method
 from sgft_jax.types import Array, Finetuner, Key, Metrics, PyTree, Simulated, Transition
 
@@ -24,7 +24,7 @@ def make_planner(method: Method, config: FinetuneConfig, *, obs_dim: int, act_di
 
     The latter shapes every reward by the value of the simulator's agent, drawn anew each time, and learns a new agent.
     """
-    structure = tdmpc2.named_config(
+    structure = tdmpc2_model.named_config(
         obs_dim, act_dim, size=config.size, horizon=config.horizon, plan_samples=config.plan_samples,
         sgft=not config.train_critic, train_encoder=config.train_encoder,
     )  # fmt: skip
@@ -48,7 +48,7 @@ def make_planner(method: Method, config: FinetuneConfig, *, obs_dim: int, act_di
 
     def shaped(judge: tdmpc2.TDMPC2State, row: Transition, key: Key) -> Array:
         now, then = (
-            tdmpc2.value_sample(structure, judge, obs, k)
+            tdmpc2_model.value_sample(structure, judge, obs, k)
             for obs, k in zip((row.obs, row.next_obs), jax.random.split(key), strict=True)
         )
         return row.reward + row.discount * then - now

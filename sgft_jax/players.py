@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from sgft_jax import dynamics, tdmpc2, value
+from sgft_jax import dynamics, tdmpc2, tdmpc2_model, value
 from sgft_jax.networks import NetworkConfig, make_actor, make_dynamics, make_value, tanh_gaussian_action
 from sgft_jax.normalizer import normalize
 from sgft_jax.types import Array, Key, Prior, PyTree
@@ -63,7 +63,7 @@ def tdmpc2_player(config: tdmpc2.TDMPC2Config, hyper: tdmpc2.TDMPC2Hyper) -> Pla
     return Player(
         init_carry=learner.init_carry,
         act=lambda prior, *step, explore: learner.act(state(prior), *step, explore=explore),
-        value=lambda prior, obs: tdmpc2.value_of(config, state(prior), obs),
+        value=lambda prior, obs: tdmpc2_model.value_of(config, state(prior), obs),
         predict=None,
         model_error=None,
     )

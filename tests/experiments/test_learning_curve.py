@@ -8,7 +8,7 @@ import toy
 
 from experiments import cli, learning_curve
 from experiments.learning_curve import LearningCurveArgs, main
-from sgft_jax import tdmpc2
+from sgft_jax import tdmpc2_model
 from sgft_jax.log import MetricsLog, read_jsonl
 from sgft_jax.types import UserError
 
@@ -21,7 +21,7 @@ SMALL = {
 @pytest.fixture(autouse=True)
 def _toy(monkeypatch):
     monkeypatch.setattr(learning_curve.cartpole, "make", toy.make)
-    monkeypatch.setitem(tdmpc2.SIZES, "tiny", tdmpc2.Size(8, 8, 8, 2, 2))
+    monkeypatch.setitem(tdmpc2_model.SIZES, "tiny", tdmpc2_model.Size(8, 8, 8, 2, 2))
     monkeypatch.setattr(cli, "set_up", lambda: None)
 
 

@@ -14,7 +14,7 @@ import envs
 from experiments import cli, evaluate, finetune, pretrain
 from experiments.algorithms import make_player
 from experiments.evaluation import grade
-from sgft_jax import checkpoint, tdmpc2
+from sgft_jax import checkpoint, tdmpc2, tdmpc2_model
 from sgft_jax.log import read_jsonl
 
 PRETRAIN = """--task toy --preset tdmpc2 --no-video --config.size tiny --config.plan-samples 24 --config.n-envs 16
@@ -28,7 +28,7 @@ FINETUNE = """--task toy --no-video --seeds 2 --rollouts 4 --initial-rollouts 2 
 @pytest.fixture(autouse=True)
 def _toy(monkeypatch):
     monkeypatch.setitem(envs.TASKS, "toy", "toy")
-    monkeypatch.setitem(tdmpc2.SIZES, "tiny", tdmpc2.Size(8, 8, 8, 2, 2))
+    monkeypatch.setitem(tdmpc2_model.SIZES, "tiny", tdmpc2_model.Size(8, 8, 8, 2, 2))
     monkeypatch.setattr(os, "environ", os.environ.copy())
     monkeypatch.setattr(cli, "set_up", lambda: None)
 

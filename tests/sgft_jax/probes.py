@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sgft_jax import iql, networks, sac, tdmpc2
+from sgft_jax import iql, networks, sac, tdmpc2, tdmpc2_model
 from sgft_jax.sequences import Sequences
 from sgft_jax.types import Learner, Transition
 
@@ -144,7 +144,7 @@ def _mode(case):
     return lambda state, obs: case.learner.act(state, case.learner.init_carry(), obs, key, explore=False)[0]
 
 
-SIZE = tdmpc2.Size(encoder=24, mlp=24, latent=16, members=3)
+SIZE = tdmpc2_model.Size(encoder=24, mlp=24, latent=16, members=3)
 PLAIN = tdmpc2.TDMPC2Config(
     2, 1, horizon=2, size=SIZE, simnorm_group=4, dropout=0.0, samples=32, elites=6, policy_samples=4, iterations=4
 )
@@ -159,7 +159,7 @@ def _tdmpc2(config, steps):
         state = first(key)
         return tdmpc2.fine_tune_state(config, PLANNER_HYPER, tdmpc2.extract_prior(state), key) if config.sgft else state
 
-    value = jax.jit(functools.partial(tdmpc2.value_of, config))
+    value = jax.jit(functools.partial(tdmpc2_model.value_of, config))
     policy = jax.jit(functools.partial(tdmpc2.policy_action, config), static_argnames="explore")
     return counted(
         learner,

@@ -10,7 +10,7 @@ import probes
 import pytest
 from probes import MAKERS, PROBES
 
-from sgft_jax import checkpoint, finetune, methods, networks, sac, tdmpc2
+from sgft_jax import checkpoint, finetune, methods, networks, sac, tdmpc2, tdmpc2_model
 from sgft_jax.types import Transition
 
 PLANNERS = {"tdmpc2", "sgft-tdmpc2"}
@@ -122,7 +122,7 @@ FAST_METHODS = {"sgft-sac"}
 
 @pytest.fixture(autouse=True)
 def _size(monkeypatch):
-    monkeypatch.setitem(tdmpc2.SIZES, "probe", tdmpc2.Size(encoder=8, mlp=8, latent=8, members=2))
+    monkeypatch.setitem(tdmpc2_model.SIZES, "probe", tdmpc2_model.Size(encoder=8, mlp=8, latent=8, members=2))
 
 
 def episode(key, n=T):
@@ -148,7 +148,7 @@ def tuner(name):
         return plain.learn(state, key, 2, episode)
 
     if method.agent == "tdmpc2":
-        shape = tdmpc2.named_config(1, 1, size="probe", plan_samples=24, horizon=2)
+        shape = tdmpc2_model.named_config(1, 1, size="probe", plan_samples=24, horizon=2)
         prior = tdmpc2.extract_prior(jax.jit(tdmpc2.make_tdmpc2(shape).init)(jax.random.key(7)))
     else:
         agent = sac.SACConfig(1, 1, network=SMALL["network"], ensemble_size=2)

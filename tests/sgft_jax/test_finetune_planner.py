@@ -7,16 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax import finetune, methods, tdmpc2
+from sgft_jax import finetune, methods, tdmpc2, tdmpc2_model
 from sgft_jax.types import Normalizer, Transition
 
 T, LENGTH = 12, 2
-TINY = tdmpc2.Size(encoder=8, mlp=8, latent=8, encoder_layers=2, members=3)
+TINY = tdmpc2_model.Size(encoder=8, mlp=8, latent=8, encoder_layers=2, members=3)
 
 
 @pytest.fixture(autouse=True)
 def _tiny(monkeypatch):
-    monkeypatch.setitem(tdmpc2.SIZES, "tiny", TINY)
+    monkeypatch.setitem(tdmpc2_model.SIZES, "tiny", TINY)
 
 
 @functools.cache
@@ -34,7 +34,7 @@ def make(name):
 @pytest.fixture
 def prior():
     """Of an agent whose critic has an opinion: heads are zero before they learn."""
-    config = tdmpc2.named_config(2, 2, size="tiny", plan_samples=24, horizon=LENGTH)
+    config = tdmpc2_model.named_config(2, 2, size="tiny", plan_samples=24, horizon=LENGTH)
     state = jax.jit(tdmpc2.make_tdmpc2(config).init)(jax.random.key(7))
     prior = tdmpc2.extract_prior(state)
     last = prior.critic["Dense_2"]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from probes import PLAIN, ROWS, SIZE, case
 
-from sgft_jax import normalizer, optim, sequences, tdmpc2, twohot
+from sgft_jax import normalizer, optim, sequences, tdmpc2, tdmpc2_model, twohot
 from sgft_jax.sequences import Sequences
 from sgft_jax.types import Transition, UserError
 
@@ -25,8 +25,8 @@ INIT = jax.jit(LEARNERS[PLAIN].init)
 UPDATE = {PLAIN: case("tdmpc2").learner.update, SGFT: case("sgft-tdmpc2").learner.update}
 UPDATE[MOVING] = jax.jit(LEARNERS[MOVING].update)
 ACT = jax.jit(functools.partial(LEARNERS[PLAIN].act, explore=True))
-VALUE = jax.jit(tdmpc2.value_of, static_argnums=0)
-PARTS = tdmpc2._parts(PLAIN)
+VALUE = jax.jit(tdmpc2_model.value_of, static_argnums=0)
+PARTS = tdmpc2_model.make_parts(PLAIN)
 PARTS = PARTS._replace(**{n: getattr(PARTS, n)._replace(apply=jax.jit(getattr(PARTS, n).apply)) for n in NETWORKS})
 HYPER = tdmpc2.TDMPC2Hyper()
 DECODE = jax.jit(jax.vmap(lambda logits: twohot.decode(logits, PLAIN.bins)))
@@ -74,13 +74,13 @@ def equal(a, b):
 
 def test_mish_by_hand():
     x = jnp.array([-30.0, -1.0, 0.0, 1.0, 30.0])
-    np.testing.assert_allclose(tdmpc2.mish(x), x * jnp.tanh(jax.nn.softplus(x)), rtol=1e-5, atol=1e-9)
-    assert jax.grad(tdmpc2.mish)(30.0) == 1.0 and tdmpc2.mish(jnp.float32(1e6)) == 1e6
+    np.testing.assert_allclose(tdmpc2_model.mish(x), x * jnp.tanh(jax.nn.softplus(x)), rtol=1e-5, atol=1e-9)
+    assert jax.grad(tdmpc2_model.mish)(30.0) == 1.0 and tdmpc2_model.mish(jnp.float32(1e6)) == 1e6
 
 
 def test_simnorm_by_hand():
     x = jnp.log(jnp.array([1.0, 3.0, 2.0, 2.0]))
-    np.testing.assert_allclose(tdmpc2.simnorm(x, 2), [0.25, 0.75, 0.5, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(tdmpc2_model.simnorm(x, 2), [0.25, 0.75, 0.5, 0.5], rtol=1e-6)
 
 
 def test_latents_are_groups_that_sum_to_one(key):
@@ -93,10 +93,10 @@ def test_latents_are_groups_that_sum_to_one(key):
     assert not jnp.allclose(z, ahead)
 
 
-@pytest.mark.parametrize("name", tdmpc2.SIZES)
+@pytest.mark.parametrize("name", tdmpc2_model.SIZES)
 def test_published_sizes(name):
     """Parameters of a walker (24 observations, 6 actions) without the target critic, in millions."""
-    config = tdmpc2.TDMPC2Config(24, 6, size=tdmpc2.SIZES[name])
+    config = tdmpc2.TDMPC2Config(24, 6, size=tdmpc2_model.SIZES[name])
     state = jax.eval_shape(tdmpc2.make_tdmpc2(config).init, jax.random.key(0))
     count = sum(x.size for part in NETWORKS for x in jax.tree.leaves(getattr(state, part).params))
     assert count / 1e6 == pytest.approx(float(name.removesuffix("M")), rel=0.25 if name == "1M" else 0.06)
@@ -122,7 +122,7 @@ def test_policy_spread_is_bounded(key):
 
 def test_dropout_acts_in_training_alone(key):
     config = dataclasses.replace(PLAIN, dropout=0.5)
-    parts, state = tdmpc2._parts(config), shaken(PLAIN, key)
+    parts, state = tdmpc2_model.make_parts(config), shaken(PLAIN, key)
     q = lambda key: parts.critic.apply(state.critic.params, jnp.full(16, 0.25), jnp.ones(1), key=key)  # noqa: E731
     a, b = q(jax.random.key(1)), q(jax.random.key(2))
     assert jnp.array_equal(q(None), q(None)) and not jnp.allclose(a, b) and not jnp.allclose(a, q(None))
@@ -147,7 +147,7 @@ def test_sampled_value_is_the_lower_of_two_heads(key):
     z = parts.encoder.apply(state.encoder.params, jnp.array([0.25, 5.0]))
     mode = jnp.tanh(parts.policy.apply(state.policy.params, z)[0])
     q = sorted(q_by_hand(state.critic.params, z, mode).tolist())
-    draw = jax.jit(jax.vmap(lambda k: tdmpc2.value_sample(PLAIN, state, obs, k)))
+    draw = jax.jit(jax.vmap(lambda k: tdmpc2_model.value_sample(PLAIN, state, obs, k)))
     values = draw(jax.random.split(key, 300))
     # of three heads the lowest is in 2 of 3 pairs, the highest is never the lower one
     assert jnp.mean(jnp.isclose(values, q[0], rtol=1e-2)) == pytest.approx(2 / 3, abs=0.1)
@@ -225,7 +225,7 @@ def test_losses_against_a_loop(key):
     counts = jnp.zeros(ROWS, bool).at[jnp.array([0, ROWS - 1])].set(True)
     batch = batch._replace(valid=batch.valid & counts[:, None])
     _, metrics = UPDATE[PLAIN](state, batch, key)
-    heads = tdmpc2._two_heads(PLAIN, jax.random.split(jax.random.split(key)[0], 3)[0])  # as the update draws them
+    heads = tdmpc2_model.two_heads(PLAIN, jax.random.split(jax.random.split(key)[0], 3)[0])  # as the update draws them
     losses, target = model_losses_by_hand(PLAIN, state, batch, heads)
     names = ("consistency", "reward", "value")
     np.testing.assert_allclose([metrics[f"model/{n}_loss"] for n in names], losses, rtol=1e-3)
@@ -273,7 +273,7 @@ def test_score_of_a_plan_against_a_loop(config, key):
     else:
         mean, log_std = parts.policy.apply(state.policy.params, z)
         action = jnp.tanh(mean + jnp.exp(log_std) * jax.random.normal(key_action, (1,)))
-        end = q_by_hand(state.critic.params, z, action)[tdmpc2._two_heads(config, key_heads)].mean()
+        end = q_by_hand(state.critic.params, z, action)[tdmpc2_model.two_heads(config, key_heads)].mean()
     first = parts.encoder.apply(state.encoder.params, jnp.ones(2))
     score = tdmpc2._score(config, parts, state, first, key)(plan)
     assert score == pytest.approx(float(total + 0.25 * end), rel=1e-4)
