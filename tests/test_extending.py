@@ -107,6 +107,7 @@ def test_the_method_runs_alone(capsys):
     assert re.search(r"mean shaped reward -?\d\.\d+, critic loss \d", capsys.readouterr().out)
 
 
+@pytest.mark.slow
 def test_the_method_and_the_gap_run_in_a_command_and_are_drawn(prior, tmp_path):
     options = """--rollouts 2 --initial-rollouts 1 --seeds 1 --utd 0.2 --eval-every 1 --eval-episodes 2 --no-video
         --options.batch-size 8 --options.branches 1"""

@@ -88,7 +88,7 @@ def complaint(arguments, capsys):
     return error
 
 
-@pytest.mark.parametrize("method", ["sgft-sac", "sac"])
+@pytest.mark.parametrize("method", ["sgft-sac", pytest.param("sac", marks=pytest.mark.slow)])
 def test_a_run_leaves_curve_summary_policies_and_every_rollout(home, method):
     folder = run(home, method)
     curve = read_jsonl(folder / "eval.jsonl")
