@@ -23,7 +23,7 @@ class FinetuneArgs:
     """Fine-tuning of several seeds on one or more real systems at once, all in one compiled program."""
 
     task: str = "push"
-    """push, hammer or insert."""
+    """push, push-towel, push-ball, hammer or insert."""
     method: str = DEFAULT_METHOD
     """How it learns; the table is at the top. The defaults below are those of the method that is chosen."""
     real: tuple[str, ...] = ("default",)

@@ -25,7 +25,7 @@ SLACK = 1.04  # length of a thread over that of its mesh
 CREASE = 0.006  # m: how high points lie at the start, at most, as in a towel that was dropped
 FELT = 0.005  # m: fingers feel the cloth between two points, which a finger would slip through
 # N/m by how many meshes a spring spans; explicit springs are stable here up to 30 N/m at 5 ms. Damping: s.
-STIFFNESS = {(1, 0): 16.0, (0, 1): 16.0, (1, 1): 1.0, (1, -1): 1.0, (2, 0): 0.03, (0, 2): 0.03}
+STIFFNESS = {(1, 0): 20.0, (0, 1): 20.0, (1, 1): 3.0, (1, -1): 3.0, (2, 0): 0.1, (0, 2): 0.1}
 DAMPING_TIME = 0.003
 ITERATIONS = 4
 _GRID = (np.arange(N) - (N - 1) / 2) * MESH
