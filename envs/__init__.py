@@ -19,9 +19,9 @@ TASKS = {
 def make(name: str, impl: str = "auto", scene: str = "") -> Env:
     """The task of that name, compiled; impl: who steps its physics, see `physics.choose_impl`.
 
-    scene: that of a real system which is more than the simulated one with other numbers; "" for the latter. Observations,
-    actions, parameters, reward and success are the same in all scenes of a task. Raises UserError with the closest match
-    for an unknown task or scene.
+    scene: that of a real system which is more than the simulated one with other numbers; "" for the latter. What is
+    observed, commanded and rewarded, and the parameters, are the same in all scenes of a task. Raises UserError with
+    the closest match for an unknown task or scene.
     """
     module = _module(name)
     return module.make(impl, _real(name, scene)) if scene else module.make(impl)

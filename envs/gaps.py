@@ -37,8 +37,8 @@ def presets(task: str) -> dict[str, Gap]:
 def load(env: Env, source: str, overrides: Sequence[str] = ()) -> Gap:
     """A gap from a preset name or a .toml/.json file, changed by overrides such as "latency=0.05".
 
-    A file holds two tables, `params` and `effects`, and the name of a `scene`; all may be missing. Raises UserError naming
-    file and key.
+    A file holds two tables, `params` and `effects`, and the name of a `scene`; all may be missing. Raises UserError
+    naming file and key.
     """
     if source.endswith((".toml", ".json")):
         gap = _from_file(Path(source))
@@ -75,8 +75,12 @@ def _from_file(path: Path) -> Gap:
 
 def _parse(name: str, table: Any, *, where: str) -> Gap:
     if not isinstance(table, dict) or set(table) - {"params", "effects", "scene"}:
-        odd = sorted(set(table) - {"params", "effects", "scene"})[0] if isinstance(table, dict) else type(table).__name__
-        raise UserError(f"{where}: unexpected '{odd}'; a gap has two tables, 'params' and 'effects', and may name a 'scene'")
+        odd = (
+            sorted(set(table) - {"params", "effects", "scene"})[0] if isinstance(table, dict) else type(table).__name__
+        )
+        raise UserError(
+            f"{where}: unexpected '{odd}'; a gap has two tables, 'params' and 'effects', and may name a 'scene'"
+        )
     scene = table.get("scene", "")
     if not isinstance(scene, str):
         raise UserError(f"{where}: 'scene' must be a name, got {scene!r}")

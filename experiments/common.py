@@ -122,7 +122,7 @@ def real_env(env: Env, found: Sequence[Gap]) -> Env:
     scenes = {gap.scene: gap.name for gap in found}
     if len(scenes) > 1:
         (one, first), (other, second) = sorted(scenes.items())[:2]
-        said = f"{first} is in {f"scene '{one}'" if one else "the simulated scene"} and {second} in scene '{other}'"
+        said = f"{first} is in {f"scene '{one}'" if one else 'the simulated scene'} and {second} in scene '{other}'"
         raise UserError(f"{said}: real systems of different scenes cannot share a program, run them one at a time")
     scene = "".join(scenes)
     return envs.make(env.name, env.impl, scene) if scene else env

@@ -77,7 +77,9 @@ def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:
     opened = runs.open_runs(folders, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE)
     try:
         with mesh.use(devices):
-            records = [Record(run.folder, system, gap, method.name, seeds) for run, gap in zip(opened, found, strict=True)]
+            records = [
+                Record(run.folder, system, gap, method.name, seeds) for run, gap in zip(opened, found, strict=True)
+            ]
             return _Run(args, env, system, found, method, seeds).work(records, common.stack(priors), card)
     finally:
         for run in opened:

@@ -20,8 +20,8 @@ RADIUS = 0.05  # m
 PAD = 0.013  # m, radius of the pads: their neighbours are 0.02 m away
 CORE = 0.65  # of the radius
 SHELL = 0.5  # of the mass: the pads
-STIFFNESS = 40.0  # N/m of one pad; explicit springs are stable here up to 190 N/m at 5 ms
-DAMPING = 0.3  # N s/m of one pad
+STIFFNESS = 30.0  # N/m of one pad; explicit springs are stable here up to 190 N/m at 5 ms
+DAMPING = 0.8  # N s/m of one pad: it comes back slowly, so the ball stops soon after the hand
 HEIGHT = 0.075  # m: the hand passes over the ball
 SINKS = 0.008  # m: how far the ball flattens under its weight
 ITERATIONS = 4
@@ -33,7 +33,9 @@ def _sphere(splits: int) -> tuple[np.ndarray, np.ndarray]:
     corners = [(a, b * golden) for a in (-1, 1) for b in (-1, 1)]
     points = np.array([np.roll([0.0, a, b], k) for k in range(3) for a, b in corners])
     near = np.linalg.norm(points[:, None] - points, axis=-1) < 2.1
-    apart = [(i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[i, k]]
+    apart = [
+        (i, j, k) for i in range(12) for j in range(i) for k in range(j) if near[i, j] and near[j, k] and near[i, k]
+    ]
     faces = np.array([f if np.linalg.det(points[list(f)]) > 0 else f[::-1] for f in apart])
     for _ in range(splits):
         middles = [(points[faces[:, i]] + points[faces[:, (i + 1) % 3]]) / 2 for i in range(3)]

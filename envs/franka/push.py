@@ -34,8 +34,8 @@ PUCK_RADIUS, PUCK_HALF_HEIGHT = 0.032, 0.015  # m
 WORKSPACE = np.array([[0.08, -0.35], [0.56, 0.35]])  # m, xy of the hand, table frame
 FALLEN_AT, SEEN_AT = 1.5, EDGE + 0.03  # m, table frame: where a fallen puck lies, where the camera saw it last
 GRAVITY = 9.81  # m/s^2
-# Rubber fingertips: the contact stiffens over 3 mm instead of at once. Newton's method then converges in 4 iterations on
-# every contact we have seen; hard fingertips need more than 6 and throw the puck with fewer.
+# Rubber fingertips: the contact stiffens over 3 mm instead of at once. Newton's method then converges in 4 iterations
+# on every contact we have seen; hard fingertips need more than 6 and throw the puck with fewer.
 RUBBER = (0.0, 0.95, 0.003, 0.5, 2.0)
 NV = arm.N_JOINTS + 4  # puck: x, y, z, yaw
 

@@ -39,7 +39,7 @@ def stage(theta: dict[str, float], *, height: float, iterations: int) -> mujoco.
     height: m, of the hand's tool centre point; the fingers reach down from there to just above the table.
     """
     spec = new_spec(substeps=push.SUBSTEPS, iterations=iterations, ls_iterations=iterations + 2)
-    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # a point or a pad touches nothing but its neighbours
     spec.option.gravity = [0, 0, -push.GRAVITY]
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
     for side, name in push.FINGERS.items():

@@ -43,7 +43,12 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
             body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
         size, mass = [RADIUS, 0, 0], theta["object_mass"] / len(POINTS)
         body.add_geom(
-            name=_name(i), type=mujoco.mjtGeom.mjGEOM_SPHERE, size=size, mass=mass, rgba=[0.8, 0.3, 0.25, 1], **NO_CONTACT
+            name=_name(i),
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=size,
+            mass=mass,
+            rgba=[0.8, 0.3, 0.25, 1],
+            **NO_CONTACT,
         )
         body.add_site(name=_name(i), rgba=[0] * 4)
         soft.touch(spec, _name(i), theta, fingers=FELT)
@@ -78,7 +83,14 @@ def dress(spec: mujoco.MjSpec) -> None:
     bones = [(_name(i), place) for i, place in enumerate(POINTS)]
     soft.add_material(spec, "towel", (4.0, 0.01), ((0.80, 0.27, 0.22), (0.95, 0.93, 0.9)))
     soft.add_skin(
-        spec, twice(weights @ POINTS), faces, twice(weights), bones, texture=twice(texture), material="towel", inflate=0.004
+        spec,
+        twice(weights @ POINTS),
+        faces,
+        twice(weights),
+        bones,
+        texture=twice(texture),
+        material="towel",
+        inflate=0.004,
     )
     for tendon in spec.tendons:
         tendon.rgba = [0] * 4

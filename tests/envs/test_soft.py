@@ -29,7 +29,7 @@ class Way(NamedTuple):
     goal: float
 
 
-WAYS = {"push-towel": Way(0.06, 0.3, 0.03, 0.529), "push-ball": Way(0.075, 0.08, 0.015, 0.535)}
+WAYS = {"push-towel": Way(0.06, 0.3, 0.03, 0.529), "push-ball": Way(0.075, 0.15, 0.015, 0.535)}
 
 
 def push_softly(way, obs):
@@ -65,7 +65,7 @@ def played(rig, act, i=0, steps=40) -> list[EnvState]:
 
 
 def shape(rig, state):
-    """What makes up the object's form, m: the towel's points around their middle, or how far the ball's pads stick out."""
+    """What makes up the object's form, m: the towel's points around their middle, or how far its pads stick out."""
     free = np.asarray(state.physics.qpos)[arm.N_JOINTS :]
     if rig.env.scene == "ball":
         return free[7:]
@@ -149,7 +149,7 @@ def test_a_gap_names_its_scene(tmp_path):
     own.write_text("params = { table_friction = 0.7 }\n")
     plain = gaps.load(env, str(own))
     assert common.real_env(env, [plain]) is env and common.real_env(env, []) is env
-    with pytest.raises(UserError, match="own is in the simulated scene and .* in scene 'towel': .* one at a time"):
+    with pytest.raises(UserError, match=r"own is in the simulated scene and .* in scene 'towel': .* one at a time"):
         common.real_env(env, [plain, gap])
     own.write_text("scene = 3\n")
     with pytest.raises(UserError, match="'scene' must be a name, got 3"):
