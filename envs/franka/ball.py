@@ -22,6 +22,9 @@ CORE = 0.65  # of the radius
 SHELL = 0.5  # of the mass: the pads
 STIFFNESS = 30.0  # N/m of one pad; explicit springs are stable here up to 190 N/m at 5 ms
 DAMPING = 0.8  # N s/m of one pad: it comes back slowly, so the ball stops soon after the hand
+# kg of one pad. The solver of contacts does not know of dampers: a pad that is lighter than damping times time step
+# chatters on the table for ever.
+ARMATURE = 0.004
 HEIGHT = 0.075  # m: the hand passes over the ball
 SINKS = 0.008  # m: how far the ball flattens under its weight
 ITERATIONS = 4
@@ -62,7 +65,8 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     soft.touch(spec, "core", theta)
     for i, direction in enumerate(DIRECTIONS):
         pad = core.add_body(name=_name(i), pos=direction * (RADIUS - PAD))
-        pad.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=direction, stiffness=STIFFNESS, damping=DAMPING)
+        joint = pad.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=direction, stiffness=STIFFNESS, damping=DAMPING)
+        joint.armature = ARMATURE
         pad.add_geom(name=_name(i), size=[PAD, 0, 0], mass=SHELL * theta["object_mass"] / len(DIRECTIONS), **look)
         soft.touch(spec, _name(i), theta)
     return spec
