@@ -11,7 +11,13 @@ from envs.rollout import Episode, Fleet, launch, play_episode, step_fleet
 from sgft_jax import extend
 from sgft_jax.types import UserError, unknown
 
-TASKS = {"push": "envs.franka.push", "hammer": "envs.franka.hammer", "insert": "envs.franka.insert"}
+TASKS = {
+    "push": "envs.franka.push",
+    "push-towel": "envs.franka.towel",
+    "push-ball": "envs.franka.ball",
+    "hammer": "envs.franka.hammer",
+    "insert": "envs.franka.insert",
+}
 
 __all__ = [
     "TASKS",
@@ -35,21 +41,24 @@ __all__ = [
 ]
 
 
-def make(task: str, impl: str = "auto") -> Env:
+def make(task: str, impl: str = "auto", scene: str = "") -> Env:
     """The task of that name, file or module, compiled; impl: who steps its physics, see `physics.choose_impl`.
 
     A file or module of your own must define `make(impl) -> Env`, with the file's name as the Env's name
-    (docs/extending.md). Raises UserError with the closest match for an unknown task.
+    (docs/extending.md). scene: that of a real system which is more than the simulated one with other numbers; "" for
+    the latter. What is observed, commanded and rewarded, and the parameters, are the same in all scenes of a task.
+    Raises UserError with the closest match for an unknown task or scene.
     """
-    env = _module(task).make(impl)
+    module = _module(task)
+    env = module.make(impl, _real(task, scene)) if scene else module.make(impl)
     if env.name != name_of(task):
         raise UserError(f"task {task}: its Env is called {env.name!r}; call it {name_of(task)!r}, like the file")
     return env
 
 
-def scene(task: str) -> Any:
-    """The parts that the task is made of (`franka.task.Scene`); None for one that is not simulated by MuJoCo."""
-    return getattr(_module(task), "SCENE", None)
+def scene(task: str, real: str = "") -> Any:
+    """The parts of a scene of that task (`franka.task.Scene`), see `make`; None for one not simulated by MuJoCo."""
+    return _real(task, real) if real else getattr(_module(task), "SCENE", None)
 
 
 def name_of(task: str) -> str:
@@ -70,3 +79,10 @@ def _module(task: str) -> ModuleType:
     if TASKS.setdefault(name, module.__name__) != module.__name__:
         raise UserError(f"task {task}: the name {name!r} is taken by {TASKS[name]}; rename the file")
     return module
+
+
+def _real(task: str, scene: str) -> Any:
+    scenes = getattr(_module(task), "REAL", {})
+    if scene not in scenes:
+        raise UserError(f"{task}: {unknown('scene', scene, scenes)}" if scenes else f"{task} has no scene '{scene}'")
+    return scenes[scene]

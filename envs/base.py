@@ -91,7 +91,7 @@ class Env(NamedTuple):
     reset(world, key) -> EnvState; step(world, state, action, key) -> EnvState.
     reward, terminated: functions of (obs, action, next_obs), true for imagined transitions too.
     success: function of one observation; `success_anytime` tells whether it counts at any step or only at the last.
-    impl: who steps the physics.
+    impl: who steps the physics. scene: the name of a real system's own scene, "" for the one to pretrain in.
     """
 
     name: str
@@ -108,6 +108,7 @@ class Env(NamedTuple):
     terminated: Callable[[Array, Array, Array], Array]
     success: Callable[[Array], Array]
     impl: str = "jax"
+    scene: str = ""
 
     @property
     def obs_dim(self) -> int:

@@ -2,6 +2,7 @@
 
 A gap names only what differs; everything else stays as in training. `params` fixes domain parameters (or gives them
 another range), also outside the training range; `effects` distorts commands and measurements, see `envs.base.Effects`.
+`scene` names another scene than the simulated one, see `envs.make`: a towel where the simulator has a puck.
 """
 
 import json
@@ -23,6 +24,7 @@ class Gap(NamedTuple):
     name: str
     params: dict[str, Value]
     effects: dict[str, Value]
+    scene: str = ""
 
 
 def presets(task: str) -> dict[str, Gap]:
@@ -35,7 +37,8 @@ def presets(task: str) -> dict[str, Gap]:
 def load(env: Env, source: str, overrides: Sequence[str] = ()) -> Gap:
     """A gap from a preset name or a .toml/.json file, changed by overrides such as "latency=0.05".
 
-    A file holds two tables, `params` and `effects`, either may be missing. Raises UserError naming file and key.
+    A file holds two tables, `params` and `effects`, and the name of a `scene`; all may be missing. Raises UserError
+    naming file and key.
     """
     if source.endswith((".toml", ".json")):
         gap = _from_file(Path(source))
@@ -71,14 +74,21 @@ def _from_file(path: Path) -> Gap:
 
 
 def _parse(name: str, table: Any, *, where: str) -> Gap:
-    if not isinstance(table, dict) or set(table) - {"params", "effects"}:
-        odd = sorted(set(table) - {"params", "effects"})[0] if isinstance(table, dict) else type(table).__name__
-        raise UserError(f"{where}: unexpected '{odd}'; a gap has two tables, 'params' and 'effects'")
-    for section in table.values():
+    if not isinstance(table, dict) or set(table) - {"params", "effects", "scene"}:
+        odd = (
+            sorted(set(table) - {"params", "effects", "scene"})[0] if isinstance(table, dict) else type(table).__name__
+        )
+        raise UserError(
+            f"{where}: unexpected '{odd}'; a gap has two tables, 'params' and 'effects', and may name a 'scene'"
+        )
+    scene = table.get("scene", "")
+    if not isinstance(scene, str):
+        raise UserError(f"{where}: 'scene' must be a name, got {scene!r}")
+    for section in (table.get(name, {}) for name in ("params", "effects")):
         for key, value in section.items() if isinstance(section, dict) else [("params/effects", section)]:
             if not _is_value(value):
                 raise UserError(f"{where}: '{key}' must be a number or a list of numbers, got {value!r}")
-    return Gap(name, table.get("params", {}), table.get("effects", {}))
+    return Gap(name, table.get("params", {}), table.get("effects", {}), scene)
 
 
 def _is_value(value: Any) -> bool:
@@ -94,7 +104,7 @@ def _override(env: Env, gap: Gap, text: str) -> Gap:
         parsed = None
     if not equals or parsed is None or not _is_value(parsed):
         raise UserError(f"'{text}' does not set anything; write name=number or name=[number,number]")
-    changed = Gap(f"{gap.name}+{name}={value}", dict(gap.params), dict(gap.effects))
+    changed = Gap(f"{gap.name}+{name}={value}", dict(gap.params), dict(gap.effects), gap.scene)
     (changed.effects if name in Effects._fields else changed.params)[name] = parsed
     return changed
 

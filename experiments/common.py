@@ -114,6 +114,20 @@ def load_gap(env: Env, real: str | None, overrides: Sequence[str]) -> Gap | None
     return gaps.load(env, real, overrides)
 
 
+def real_env(env: Env, found: Sequence[Gap]) -> Env:
+    """The Env of these real systems: that of the simulator, or of the other scene that they name.
+
+    Raises UserError where they name several, which no one program can step.
+    """
+    scenes = {gap.scene: gap.name for gap in found}
+    if len(scenes) > 1:
+        (one, first), (other, second) = sorted(scenes.items())[:2]
+        said = f"{first} is in {f"scene '{one}'" if one else 'the simulated scene'} and {second} in scene '{other}'"
+        raise UserError(f"{said}: real systems of different scenes cannot share a program, run them one at a time")
+    scene = "".join(scenes)
+    return envs.make(env.name, env.impl, scene) if scene else env
+
+
 def training_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:
     """Worlds to learn in: the training domain, or the real system of a gap."""
     return env.sample_worlds(key, n) if gap is None else gaps.worlds(env, gap, key, n)
@@ -181,11 +195,11 @@ def _seed_number(folder: Path) -> tuple[int, str]:
     return (int(number) if number.isdigit() else 0, str(folder))
 
 
-def film(task: str, theta: Array, qpos: np.ndarray, path: Path) -> str:
+def film(env: Env, theta: Array, qpos: np.ndarray, path: Path) -> str:
     """Renders an episode, qpos [T + 1, nq], in a world with domain parameters theta; says in one line how it went."""
-    scene = envs.scene(task)
+    scene = envs.scene(env.name, env.scene)
     if scene is None:
-        return f"no video: {task} has no scene to draw"
+        return f"no video: {env.name} has no scene to draw"
     if reason := cli.select_renderer():
         return f"no video: {reason}"
     from envs.franka.render import render_episode

@@ -27,7 +27,7 @@ class DemoArgs:
     """A few minutes of the whole pipeline; everything lands in one folder."""
 
     task: str = "push"
-    """push, hammer or insert."""
+    """push, push-towel, push-ball, hammer or insert."""
     real: str = "default"
     """The real system, as in fine-tuning."""
     env_steps: int | None = None

@@ -29,7 +29,7 @@ class EvaluateArgs:
     run: Path | None = None
     """Folder of a fine-tuning run instead: its final policies."""
     task: str | None = None
-    """push, hammer or insert; default: the task of the prior."""
+    """push, push-towel, push-ball, hammer or insert; default: the task of the prior."""
     preset: str = "fast"
     """Pretraining preset whose priors to take where neither --prior nor --run is given."""
     real: str = common.SIM
@@ -76,6 +76,7 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     env = envs.make(args.task or read_json(folders[0] / "prior.json")["task"], args.impl)
     gap = common.load_gap(env, args.real, args.set)
     priors, card = common.load_priors(folders, env)
+    env = common.real_env(env, [gap] if gap else [])
     player, gamma = make_player(card), card["gamma"]
     key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_SEED), args.seed))
     worlds = common.exam_worlds(env, gap, key_worlds, args.episodes)

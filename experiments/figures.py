@@ -35,7 +35,7 @@ class FiguresArgs:
     """Reads <out>/finetune, writes <out>/figures."""
 
     task: str | None = None
-    """push, hammer or insert; default: every task that has runs."""
+    """push, push-towel, push-ball, hammer or insert; default: every task that has runs."""
     out: Path = Path("runs")
     """Parent of all run folders."""
 

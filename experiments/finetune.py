@@ -69,6 +69,7 @@ def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:
     devices = mesh.devices(args.devices, {members: len(args.real) * args.seeds})
     env = envs.make(args.task, args.impl)
     found = [gaps.load(env, real, args.set) for real in args.real]
+    system = common.real_env(env, found)
     priors, card = common.find_priors(args.prior, out=args.out, env=env, preset=args.preset)
     check_prior(args, method, card)
     # Every folder is that of a run on its real system alone: either kind of run continues the other.
@@ -76,8 +77,10 @@ def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:
     opened = runs.open_runs(folders, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE)
     try:
         with mesh.use(devices):
-            records = [Record(run.folder, env, gap, method.name, seeds) for run, gap in zip(opened, found, strict=True)]
-            return _Run(args, env, found, method, seeds).work(records, common.stack(priors), card)
+            records = [
+                Record(run.folder, system, gap, method.name, seeds) for run, gap in zip(opened, found, strict=True)
+            ]
+            return _Run(args, env, system, found, method, seeds).work(records, common.stack(priors), card)
     finally:
         for run in opened:
             run.close()
@@ -90,10 +93,12 @@ class _Run:
     for more worlds. Members [M = G * S] are the seeds of the first real system, then those of the next.
     """
 
-    def __init__(self, args: FinetuneArgs, env: Env, found: list[Gap], method: Method, seeds: list[int]) -> None:
-        self.args, self.env, self.found, self.method, self.seeds = args, env, found, method, seeds
+    def __init__(
+        self, args: FinetuneArgs, env: Env, real: Env, found: list[Gap], method: Method, seeds: list[int]
+    ) -> None:
+        self.args, self.env, self.real, self.found, self.method, self.seeds = args, env, real, found, method, seeds
         which = jnp.repeat(jnp.arange(len(found)), len(seeds))
-        self.reals = Reals(common.real_worlds(env, found, jax.random.key(0)), which)
+        self.reals = Reals(common.real_worlds(real, found, jax.random.key(0)), which)
         self.numbers = jnp.tile(jnp.array(seeds, jnp.uint32), len(found))
 
     def work(self, records: list[Record], priors: PyTree, card: dict[str, Any]) -> list[dict[str, Any]]:
@@ -124,7 +129,7 @@ class _Run:
         env = self.env
         sizes = {"obs_dim": env.obs_dim, "act_dim": env.act_dim}
         tuner = make_finetuner(method, config, **sizes, reward=env.reward, terminated=env.terminated)
-        return tuner, make_program(env, tuner, gamma=config.gamma)
+        return tuner, make_program(self.real, tuner, gamma=config.gamma)
 
     def _prior_of(self, priors: PyTree) -> Array:
         """[M] for every member an index into priors [P]."""

@@ -23,7 +23,7 @@ class FinetuneArgs:
     """Fine-tuning of several seeds on one or more real systems at once, all in one compiled program."""
 
     task: str = "push"
-    """push, hammer or insert; or a Python file with a task of your own (docs/extending.md)."""
+    """push, push-towel, push-ball, hammer or insert; or a Python file with a task of your own (docs/extending.md)."""
     method: str = DEFAULT_METHOD
     """How it learns; the table is at the top. Or a Python file with a method of your own (docs/extending.md). The
     defaults below are those of the method that is chosen."""

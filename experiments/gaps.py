@@ -41,7 +41,7 @@ class GapsArgs:
     """One table: a line per gap of a task."""
 
     task: str = "push"
-    """push, hammer or insert; or a Python file with a task of your own (docs/extending.md)."""
+    """push, push-towel, push-ball, hammer or insert; or a Python file with a task of your own (docs/extending.md)."""
     presets: tuple[str, ...] = ()
     """Gaps to measure, by name or as .toml/.json files; default: all that come with the task."""
     prior: Path | None = None
@@ -84,6 +84,7 @@ def measure(args: GapsArgs) -> dict[str, Any]:
     found = [gaps.load(env, name) for name in args.presets or gaps.presets(task)]
     if not found:
         raise UserError(f"{task} comes with no gaps; name .toml or .json files with --presets")
+    env = common.real_env(env, found)
     if args.train:
         make_pretrainer(env, args.config)  # sizes that do not fit together are reported before the long part
     folder = args.out / "gaps" / task

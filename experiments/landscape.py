@@ -15,6 +15,7 @@ import numpy as np
 
 import envs
 from envs.base import Entry, Env
+from envs.gaps import Gap
 from envs.physics import Impl
 from envs.rollout import play_episode
 from experiments import cli, common
@@ -112,12 +113,14 @@ def find_entry(env: Env, name: str | None) -> tuple[int, Entry]:
 def survey(args: LandscapeArgs, env: Env, player: Player, prior: Prior, start: int, *, gamma: float) -> Landscape:
     """Plays, imagines and evaluates V_sim; `start`: of the object's place in the observation."""
     gap = common.load_gap(env, args.real, args.set)
+    system = env if gap is None else common.real_env(env, [gap])
     key = jax.random.fold_in(jax.random.key(args.seed), 0)
-    play = jax.jit(lambda pool: _observations(env, player, prior, pool, key, gamma=gamma))
-    real, simulated = (
-        play(common.exam_worlds(env, where, jax.random.key(args.seed), 1))
-        for where in (gap, None)
-    )  # fmt: skip
+
+    def play(env: Env, gap: Gap | None) -> Array:
+        world = common.exam_worlds(env, gap, jax.random.key(args.seed), 1)
+        return jax.jit(lambda world: _observations(env, player, prior, world, key, gamma=gamma))(world)
+
+    real, simulated = play(system, gap), play(env, None)
     branches = imagine(
         env, player, prior, real[:-1], jax.random.fold_in(key, 1),
         horizon=args.horizon, branches=args.branches, noise=args.branch_noise, gamma=gamma,

@@ -43,7 +43,7 @@ class PretrainArgs:
     """One run of pretraining."""
 
     task: str = "push"
-    """push, hammer or insert; or a Python file with a task of your own (docs/extending.md)."""
+    """push, push-towel, push-ball, hammer or insert; or a Python file with a task of your own (docs/extending.md)."""
     preset: str = DEFAULT_PRESET
     """Named settings, see experiments/presets.py; --config.* changes single ones."""
     config: PretrainConfig = field(default_factory=lambda: PRESETS[DEFAULT_PRESET])
@@ -120,6 +120,7 @@ def pretrain(args: PretrainArgs) -> dict[str, Any]:
     hosts.join(args.hosts)
     env = envs.make(args.task, args.impl)
     gap = common.load_gap(env, args.real, args.set)
+    env = common.real_env(env, [gap] if gap else [])
     make_pretrainer(env, args.config)  # what does not fit is reported before anything is written
     devices = mesh.devices(args.devices, {f"--config.{n.replace('_', '-')}": getattr(args.config, n) for n in _CUT})
     home = run_folder(args, gap)
@@ -341,7 +342,7 @@ class _Run:
         """The first seed's prior in one of the worlds of the final exam; the program is that of the exam."""
         one = pick(self.final, jnp.zeros(pool_size(self.final), int))
         qpos = np.asarray(self.program.grade(one, jax.random.key(_REPORT_SEED), prior).qpos[0, 0])
-        return common.film(self.env.name, one.params[0], qpos, self.folder / "videos" / f"seed-{self.seeds[0]}.mp4")
+        return common.film(self.env, one.params[0], qpos, self.folder / "videos" / f"seed-{self.seeds[0]}.mp4")
 
     def _chosen(self, best: Best) -> dict[str, float]:
         """Which evaluation the prior is from, and what that evaluation said."""

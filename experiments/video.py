@@ -17,7 +17,7 @@ def before_and_after(env: Env, pool: World, play: Callable[[], Sequence[Episode]
     play() -> one episode in a world of `pool` before and the same after `rollouts` real rollouts. Never raises for want
     of a scene, a graphics library or an encoder: a run does not fail for a picture.
     """
-    scene = envs.scene(env.name)
+    scene = envs.scene(env.name, env.scene)
     if scene is None:
         return f"no video: {env.name} has no scene to draw"
     if reason := cli.select_renderer():

@@ -29,10 +29,14 @@ TOLERANCE = 0.025  # m short of the edge counts as reached
 BEHIND = 0.035  # m: where the reward wants the hand, behind the puck
 HEIGHT = 0.02  # m above the table: the plane in which the fingertips move
 FINGER_RADIUS, FINGER_GAP = 0.008, 0.04  # m
+FINGERS = {-1: "finger_left", 1: "finger_right"}
 PUCK_RADIUS, PUCK_HALF_HEIGHT = 0.032, 0.015  # m
 WORKSPACE = np.array([[0.08, -0.35], [0.56, 0.35]])  # m, xy of the hand, table frame
 FALLEN_AT, SEEN_AT = 1.5, EDGE + 0.03  # m, table frame: where a fallen puck lies, where the camera saw it last
 GRAVITY = 9.81  # m/s^2
+# Rubber fingertips: the contact stiffens over 3 mm instead of at once. Newton's method then converges in 4 iterations
+# on every contact we have seen; hard fingertips need more than 6 and throw the puck with fewer.
+RUBBER = (0.0, 0.95, 0.003, 0.5, 2.0)
 NV = arm.N_JOINTS + 4  # puck: x, y, z, yaw
 
 PARAMETERS = (
@@ -49,26 +53,29 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The scene for one theta. The puck's start is part of the state, not of the model."""
     spec = new_spec(substeps=SUBSTEPS, iterations=4, ls_iterations=6)
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
-    for side in (-1, 1):
+    for side in FINGERS:
         _add_finger(link, side)
     spec.worldbody.add_geom(
         name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1], rgba=[0, 0, 0, 0], **NO_CONTACT
     )
-    _add_scenery(spec)
+    add_scenery(spec)
     _add_puck(spec, theta["object_mass"])
     _add_pair(spec, "table", "puck_base", theta["table_friction"], spin=theta["table_friction"] * PUCK_RADIUS * 2 / 3)
-    for side in ("left", "right"):
-        _add_pair(spec, f"finger_{side}", "puck_side", theta["finger_friction"])
+    for finger in FINGERS.values():
+        _add_pair(spec, finger, "puck_side", theta["finger_friction"])
     return spec
 
 
 def observe(params: Array, state: PhysicsState) -> Array:
     """[4] m, table frame: hand xy, puck xy."""
-    hand = kinematics.forward(state.qpos[: arm.N_JOINTS]).position[:2]
-    puck = state.qpos[arm.N_JOINTS : arm.N_JOINTS + 2]
+    return seen(state.qpos, state.qpos[arm.N_JOINTS : arm.N_JOINTS + 2])
+
+
+def seen(qpos: Array, place: Array) -> Array:
+    """[4] m, table frame: hand xy and the xy of an object that lies at `place` [2] of the base frame."""
     origin = jnp.array([TABLE_ORIGIN, 0.0])
-    puck = (puck - origin).at[0].min(SEEN_AT)
-    return jnp.concatenate([hand - origin, puck])
+    hand = kinematics.forward(qpos[: arm.N_JOINTS]).position[:2]
+    return jnp.concatenate([hand - origin, (place - origin).at[0].min(SEEN_AT)])
 
 
 def reward(obs: Array, action: Array, next_obs: Array) -> Array:
@@ -93,18 +100,22 @@ def success(obs: Array) -> Array:
 
 def initial(params: Array, key: Key) -> PhysicsState:
     """The hand at a random place near the base, the puck where theta says."""
-    start = jax.random.uniform(key, (2,), minval=jnp.array([0.09, -0.15]), maxval=jnp.array([0.11, 0.15]))
-    joints = kinematics.solve(jnp.asarray(_ready(), jnp.float32), _pose(start), iterations=6, posture=0.05)
     puck = jnp.concatenate([params[:2] + jnp.array([TABLE_ORIGIN, 0.0]), jnp.zeros(2)])
-    return at_rest(joints, puck, NV)
+    return at_rest(ready(key), puck, NV)
 
 
-def target(qpos: Array, action: Array) -> Array:
+def ready(key: Key, height: float = HEIGHT) -> Array:
+    """[7] joint angles with the hand at a random place near the base, `height` m above the table."""
+    start = jax.random.uniform(key, (2,), minval=jnp.array([0.09, -0.15]), maxval=jnp.array([0.11, 0.15]))
+    return kinematics.solve(jnp.asarray(_folded(), jnp.float32), _pose(start, height), iterations=6, posture=0.05)
+
+
+def target(qpos: Array, action: Array, height: float = HEIGHT) -> Array:
     """[7] joint targets that move the hand by `action` * 5 cm from where it is, in its plane and workspace."""
     joints = qpos[: arm.N_JOINTS]
     here = kinematics.forward(joints).position[:2] - jnp.array([TABLE_ORIGIN, 0.0])
     goal = jnp.clip(here + STEP * action, jnp.asarray(WORKSPACE[0]), jnp.asarray(WORKSPACE[1]))
-    return clip_joints(kinematics.solve(joints, _pose(goal), iterations=3, posture=0.05))
+    return clip_joints(kinematics.solve(joints, _pose(goal, height), iterations=3, posture=0.05))
 
 
 def event(params: Array, state: PhysicsState) -> PhysicsState:
@@ -141,24 +152,27 @@ def make(impl: str = "auto") -> Env:
     return make_env(SCENE, impl)
 
 
-def _pose(xy: Array) -> Pose:
+def _pose(xy: Array, height: float) -> Pose:
     return Pose(
-        jnp.concatenate([xy + jnp.array([TABLE_ORIGIN, 0.0]), jnp.array([HEIGHT])]), jnp.asarray(DOWN, jnp.float32)
+        jnp.concatenate([xy + jnp.array([TABLE_ORIGIN, 0.0]), jnp.array([height])]), jnp.asarray(DOWN, jnp.float32)
     )
 
 
-def _ready() -> np.ndarray:
+def _folded() -> np.ndarray:
     """Joint angles with the hand in the start area: where the inverse kinematics of a reset begins."""
     return np.array([0.0, 0.247, 0.0, -2.966, 0.0, 3.213, np.pi / 4])
 
 
-def _add_finger(link: mujoco.MjsBody, side: int) -> None:
-    yaw = arm.HAND_YAW
+def finger_xy(side: int) -> tuple[float, float]:
+    """Where a fingertip is in the frame of the last link, m; side: -1 left, 1 right."""
     offset = side * FINGER_GAP / 2  # along the hand's y axis
-    x, y = -np.sin(yaw) * offset, np.cos(yaw) * offset
-    name = "left" if side < 0 else "right"
+    return -np.sin(arm.HAND_YAW) * offset, np.cos(arm.HAND_YAW) * offset
+
+
+def _add_finger(link: mujoco.MjsBody, side: int) -> None:
+    x, y = finger_xy(side)
     link.add_geom(
-        name=f"finger_{name}",
+        name=FINGERS[side],
         type=mujoco.mjtGeom.mjGEOM_SPHERE,
         pos=[x, y, arm.TCP],
         size=[FINGER_RADIUS, 0, 0],
@@ -212,12 +226,11 @@ def _add_pair(spec: mujoco.MjSpec, geom1: str, geom2: str, friction: float, *, s
     friction_5d = [friction, friction, spin, 1e-4, 1e-4]
     pair = spec.add_pair(geomname1=geom1, geomname2=geom2, condim=4 if spin else 3, friction=friction_5d)
     if not spin:
-        # Rubber fingertips: the contact stiffens over 3 mm instead of at once. Newton's method then converges in 4
-        # iterations on every contact we have seen; hard fingertips need more than 6 and throw the puck with fewer.
-        pair.solimp = [0.0, 0.95, 0.003, 0.5, 2.0]
+        pair.solimp = RUBBER
 
 
-def _add_scenery(spec: mujoco.MjSpec) -> None:
+def add_scenery(spec: mujoco.MjSpec) -> None:
+    """What only a viewer sees of the table: its top, which ends at the edge, and the line of the goal."""
     half = (TABLE_ORIGIN + EDGE + 0.25) / 2
     wood, line = [0.78, 0.66, 0.5, 1], [0.95, 0.85, 0.2, 1]
     box = mujoco.mjtGeom.mjGEOM_BOX

@@ -45,6 +45,8 @@ class View(NamedTuple):
 DEFAULT_VIEW = View((0.35, 0.0, 0.25), 1.8, 140.0, -22.0)
 VIEWS = {
     "push": View((0.36, 0.0, 0.12), 1.6, 140.0, -27.0, -0.75, _corners(-0.2, 0.7, 0.55)),
+    "push-towel": View((0.55, 0.0, 0.02), 0.62, 162.0, -38.0, -0.75, _corners(-0.2, 0.7, 0.55)),
+    "push-ball": View((0.54, 0.0, 0.05), 0.72, 150.0, -26.0, -0.75, _corners(-0.2, 0.7, 0.55)),
     "hammer": View((0.22, 0.0, 0.44), 1.4, 122.0, -14.0),
     "insert": View((0.46, 0.0, 0.09), 0.7, 135.0, -24.0, -0.75, _corners(-0.15, 0.75, 0.4)),
 }
@@ -99,7 +101,9 @@ def _frames(scene: Scene, theta: Mapping[str, float] | Sequence[float], qpos: np
     values = theta.values() if isinstance(theta, Mapping) else theta
     by_name = dict(zip([p.name for p in scene.parameters], map(float, values), strict=True))
     view = VIEWS.get(scene.name, DEFAULT_VIEW)
-    model = dressed(scene.build(by_name), view).compile()
+    spec = scene.build(by_name)
+    scene.dress(spec)
+    model = dressed(spec, view).compile()
     data = mujoco.MjData(model)
     camera = _camera(view)
     renderer = _renderer(model)

@@ -36,6 +36,8 @@ class Scene(NamedTuple):
     control_dt, ramp: s, the control period, and how long a new control takes to replace the old one.
     training: the simulator's own effects.
     advance: an engine of its own in place of MJX's JAX code, for scenes whose motion someone wrote down.
+    variant: for a real system that is not the simulated scene with other numbers, the name of its scene.
+    dress(spec): adds what only a viewer sees, in place.
     """
 
     name: str
@@ -57,6 +59,8 @@ class Scene(NamedTuple):
     ramp: float = RAMP
     training: Mapping[str, float] = MappingProxyType(TRAINING)
     advance: Advance | None = None
+    variant: str = ""
+    dress: Callable[[mujoco.MjSpec], None] = lambda spec: None
 
 
 def new_spec(*, substeps: int, iterations: int, ls_iterations: int) -> mujoco.MjSpec:
@@ -147,6 +151,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
         terminated=lambda obs, action, next_obs: jnp.zeros((), bool),
         success=scene.success,
         impl=impl,
+        scene=scene.variant,
     )
 
 

@@ -1,0 +1,152 @@
+"""What the deformable objects of the pushing tasks share: a stage with gravity and a table that ends, and its events.
+
+Their simulator is `push` with a rigid puck, as in the paper (section 6.2); cloth and ball are other scenes of the same
+task, with its observations, actions, parameters, reward and success. The place of an object is what a camera would
+report of it: the mean of a cloth's points, the middle of a ball. Objects are bodies on joints and springs, which all
+engines step alike; MJX has no flexes (docs/physics.md).
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from envs.base import Parameter
+from envs.franka import arm, push
+from envs.franka.arm import NO_CONTACT
+from envs.franka.task import Scene, new_spec
+from envs.physics import PhysicsState
+from sgft_jax.types import Array
+
+TABLE = "table"
+TIP = 0.009  # m above the table: the middle of the round ends of the fingertips
+NEAREST_FARTHEST = 0.20, 0.30  # m, table frame: where objects lie at the start, clear of the hand
+_THICK = 0.1  # m, half of the table's: nothing passes through
+
+
+def simulated(name: str, *, mass: float) -> Scene:
+    """The scene to pretrain in: pushing a puck of that mass, kg, which leaves room for the larger real object."""
+    own = {"object_x": (0.25, *NEAREST_FARTHEST), "object_mass": (mass, mass, mass)}
+    parameters = tuple(Parameter(p.name, p.unit, *own.get(p.name, p[2:])) for p in push.PARAMETERS)
+    return push.SCENE._replace(name=name, parameters=parameters)
+
+
+def stage(theta: dict[str, float], *, height: float, iterations: int) -> mujoco.MjSpec:
+    """Arm, fingers, a table with a physical edge, and gravity, which the arm compensates.
+
+    height: m, of the hand's tool centre point; the fingers reach down from there to just above the table.
+    """
+    spec = new_spec(substeps=push.SUBSTEPS, iterations=iterations, ls_iterations=iterations + 2)
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # a point or a pad touches nothing but its neighbours
+    spec.option.gravity = [0, 0, -push.GRAVITY]
+    link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
+    for side, name in push.FINGERS.items():
+        x, y = push.finger_xy(side)
+        link.add_geom(
+            name=name,
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            fromto=[x, y, arm.FLANGE + 0.07, x, y, arm.TCP + height - TIP],
+            size=[push.FINGER_RADIUS, 0, 0],
+            mass=0.015,
+            rgba=[0.1, 0.1, 0.12, 1],
+            **NO_CONTACT,
+        )
+    for body in spec.bodies:
+        body.gravcomp = float(body.name.startswith("link"))
+    half = (push.TABLE_ORIGIN + push.EDGE + 0.25) / 2
+    box, size = mujoco.mjtGeom.mjGEOM_BOX, [half, 0.6, _THICK]
+    spec.worldbody.add_geom(name=TABLE, type=box, pos=[half - 0.25, 0, -_THICK], size=size, rgba=[0] * 4, **NO_CONTACT)
+    push.add_scenery(spec)
+    return spec
+
+
+def touch(spec: mujoco.MjSpec, geom: str, theta: dict[str, float], *, fingers: float = 0.0) -> None:
+    """Lets a geom of the object touch table and fingers; fingers: m, the distance at which it feels them already."""
+    friction = [theta["table_friction"]] * 2 + [0.0, 0.0, 0.0]
+    spec.add_pair(geomname1=TABLE, geomname2=geom, condim=3, friction=friction)
+    friction = [theta["finger_friction"]] * 2 + [0.0, 0.0, 0.0]
+    for finger in push.FINGERS.values():
+        pair = spec.add_pair(geomname1=finger, geomname2=geom, condim=3, friction=friction, margin=fingers)
+        pair.solimp = push.RUBBER
+
+
+def real_scene(
+    simulated: Scene,
+    variant: str,
+    *,
+    height: float,
+    build: Callable[[dict[str, float]], mujoco.MjSpec],
+    initial: Callable[..., PhysicsState],
+    place: Callable[[Array], Array],
+    lie: Callable[[Array], Array],
+    dress: Callable[[mujoco.MjSpec], None],
+) -> Scene:
+    """The real counterpart of a simulated scene.
+
+    place(qpos) -> [2] m, xy of the object in the base frame. lie(xy) -> [nq - 7] its coordinates, undeformed, at xy of
+    the base frame. dress(spec): adds the skin that a viewer sees. height: m, of the hand above the table.
+    """
+
+    def event(params: Array, state: PhysicsState) -> PhysicsState:
+        """An object whose middle passed the edge falls, as the puck does."""
+        xy = place(state.qpos)
+        lying = lie(jnp.stack([jnp.asarray(push.TABLE_ORIGIN + push.FALLEN_AT), xy[1]]))
+        gone = xy[0] - push.TABLE_ORIGIN > push.EDGE
+        n = arm.N_JOINTS
+        qpos = jnp.where(gone, state.qpos.at[n:].set(lying), state.qpos)
+        return state._replace(qpos=qpos, qvel=jnp.where(gone, state.qvel.at[n:].set(0.0), state.qvel))
+
+    return simulated._replace(
+        variant=variant,
+        build=build,
+        initial=initial,
+        target=functools.partial(push.target, height=height),
+        observe=lambda params, state: push.seen(state.qpos, place(state.qpos)),
+        event=event,
+        dress=dress,
+    )
+
+
+def add_skin(
+    spec: mujoco.MjSpec,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    weights: np.ndarray,
+    bones: Sequence[tuple[str, np.ndarray]],
+    *,
+    texture: np.ndarray,
+    material: str,
+    inflate: float = 0.0,
+) -> None:
+    """A surface that follows the bodies of an object, in place of their geoms and springs: for the eye only.
+
+    vertices: [v, 3] m at rest. faces: [f, 3]. weights: [v, bones], rows sum to 1. bones: body name and place [3] at
+    rest. texture: [v, 2]. inflate: m, along the normals.
+    """
+    names = {name for name, _ in bones}
+    for body in spec.bodies:
+        for geom in body.geoms if body.name in names else ():
+            geom.rgba = [0] * 4
+    moved = [np.flatnonzero(column) for column in weights.T]
+    spec.add_skin(
+        vert=vertices.ravel().tolist(),
+        face=faces.ravel().tolist(),
+        texcoord=texture.ravel().tolist(),
+        bodyname=[name for name, _ in bones],
+        bindpos=np.concatenate([place for _, place in bones]).tolist(),
+        bindquat=np.tile([1.0, 0.0, 0.0, 0.0], len(bones)).tolist(),
+        vertid=[index.tolist() for index in moved],
+        vertweight=[weights[index, i].tolist() for i, index in enumerate(moved)],
+        material=material,
+        inflate=inflate,
+    )
+
+
+def add_material(spec: mujoco.MjSpec, name: str, repeat: Sequence[float], rgb: Sequence[Sequence[float]]) -> None:
+    """A material of that name: a checkerboard of two colours, `repeat` [2] times across and along."""
+    look = {"type": mujoco.mjtTexture.mjTEXTURE_2D, "builtin": mujoco.mjtBuiltin.mjBUILTIN_CHECKER}
+    spec.add_texture(name=name, rgb1=list(rgb[0]), rgb2=list(rgb[1]), width=128, height=128, **look)
+    material = spec.add_material(name=name, texrepeat=list(repeat), specular=0.1, shininess=0.1)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name

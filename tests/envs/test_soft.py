@@ -1,0 +1,177 @@
+"""Towel and ball: real scenes of pushing with the interface of the simulated one, which deform and come to rest."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from franka_bench import EXACT, Bench, bench, member
+
+import envs
+from envs import gaps
+from envs.base import EnvState
+from envs.franka import arm, ball, push, towel
+from experiments import common
+from sgft_jax.types import UserError
+
+KEY = jax.random.key(0)
+NAMES = {"push-towel": "towel", "push-ball": "ball"}
+
+
+class Way(NamedTuple):
+    """How to push an object to the edge: at which distance the hand touches it; the share of the way that it asks for
+    in a step, and the most, m; where the object should stop, m."""
+
+    reach: float
+    gain: float
+    most: float
+    goal: float
+
+
+WAYS = {"push-towel": Way(0.06, 0.3, 0.03, 0.529), "push-ball": Way(0.075, 0.15, 0.015, 0.535)}
+
+
+def push_softly(way, obs):
+    """[2]: line up with the object and push it along, the slower the nearer to the edge."""
+    off = obs[2:] - obs[:2]
+    come = jnp.where(jnp.abs(off[1]) < 0.01, jnp.minimum(off[0] - way.reach + 0.005, push.STEP), 0.0)
+    along = jnp.clip(way.gain * (way.goal - obs[2]), -0.02, way.most)
+    return jnp.clip(jnp.stack([jnp.where(off[0] > way.reach, come, along), off[1]]) / push.STEP, -1.0, 1.0)
+
+
+def push_hard(obs):
+    """[2]: what brings a puck to the edge, see `accuracy.push_puck`."""
+    off = obs[2:] - obs[:2]
+    ahead = jnp.where(jnp.abs(off[1]) > 0.01, 0.0, push.EDGE - push.TOLERANCE / 2 - obs[2])
+    return jnp.clip(jnp.stack([ahead, off[1]]) / push.STEP, -1.0, 1.0)
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def real(request) -> Bench:
+    """Four worlds of the default real system on MuJoCo's C engine, with exact sensors."""
+    env = envs.make(request.param, "c", NAMES[request.param])
+    gap = gaps.load(env, "default")
+    return bench(env, env.sample_worlds(jax.random.key(7), 4, params=gap.params, effects=EXACT))
+
+
+def played(rig, act, i=0, steps=40) -> list[EnvState]:
+    """An episode in one world: [steps + 1] states."""
+    world = member(rig.worlds, i)
+    states = [rig.reset(world, jax.random.key(i))]
+    for _ in range(steps):
+        states.append(rig.step(world, states[-1], act(states[-1].true_obs), KEY))
+    return states
+
+
+def shape(rig, state):
+    """What makes up the object's form, m: the towel's points around their middle, or how far its pads stick out."""
+    free = np.asarray(state.physics.qpos)[arm.N_JOINTS :]
+    if rig.env.scene == "ball":
+        return free[7:]
+    points = free.reshape(-1, 3) + towel.POINTS
+    return points - points.mean(0)
+
+
+def test_real_and_simulated_systems_are_one_task(real):
+    simulated = envs.make(real.env.name, "c")
+    for name in ("name", "observation", "action", "parameters", "episode_length", "control_dt", "success_anytime"):
+        assert getattr(simulated, name) == getattr(real.env, name)
+    assert (simulated.scene, real.env.scene) == ("", NAMES[simulated.name])
+    assert simulated.reward is real.env.reward and simulated.success is real.env.success
+    theta = np.asarray(real.worlds.params)
+    states = jax.vmap(real.env.reset)(real.worlds, jax.random.split(KEY, 4))
+    np.testing.assert_allclose(states.obs[:, 2:], theta[:, :2], atol=1e-6)  # the object lies where theta says
+    np.testing.assert_array_equal(states.reward, 0.0)
+    assert not states.success.any()
+
+
+def test_left_alone_it_comes_to_rest(real):
+    states = played(real, lambda obs: jnp.zeros(2), steps=20)
+    assert not any(state.invalid for state in states)
+    moved = np.asarray(states[-1].true_obs[2:] - states[0].true_obs[2:])
+    assert np.abs(moved).max() < 0.002
+    assert np.abs(states[-1].physics.qvel[arm.N_JOINTS :]).max() < 0.05  # m/s and rad/s
+
+
+def test_pushed_it_deforms_and_follows(real):
+    states = played(real, lambda obs: push_softly(WAYS[real.env.name]._replace(gain=1.0), obs), steps=14)
+    assert states[-1].true_obs[2] - states[0].true_obs[2] > 0.03
+    at_rest = shape(real, states[1])
+    change = max(np.abs(shape(real, state) - at_rest).max() for state in states[2:])
+    assert 0.003 < change < 0.2
+    assert max(np.abs(state.physics.qvel).max() for state in states) < 20.0
+
+
+def test_past_the_edge_it_lies_out_of_reach(real):
+    world = member(real.worlds, 0)
+    state = real.reset(world, KEY)
+    n = arm.N_JOINTS
+    beyond = jnp.array([push.TABLE_ORIGIN + push.EDGE + 0.04, 0.1])
+    place = {"towel": jnp.tile(jnp.append(beyond, 0.0), towel.N**2), "ball": state.physics.qpos[n:].at[:2].set(beyond)}
+    there = state.physics._replace(qpos=state.physics.qpos.at[n:].set(place[real.env.scene]))
+    for _ in range(3):
+        state = real.step(world, state._replace(physics=there), jnp.zeros(2), KEY)
+        np.testing.assert_allclose(state.true_obs[2:], [push.SEEN_AT, 0.1], atol=0.01)
+        assert not state.success and not state.invalid
+        there = state.physics
+
+
+def test_the_sphere_is_one():
+    for splits, points in ((0, 12), (1, 42), (3, 642)):
+        vertices, faces = ball._sphere(splits)
+        assert vertices.shape == (points, 3) and faces.shape == (2 * points - 4, 3)
+        np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), 1.0)
+        a, b, c = vertices[faces.T]
+        assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), a) > 0).all()  # all faces look outwards
+
+
+def test_splines_run_through_the_points():
+    weights = towel._spline(fine=4)
+    np.testing.assert_allclose(weights.sum(1), 1.0)
+    np.testing.assert_allclose(weights[::4], np.eye(towel.N), atol=1e-12)
+    np.testing.assert_allclose(weights @ np.arange(towel.N), np.arange(0, towel.N - 0.9, 0.25), atol=1e-12)
+
+
+def test_scenes_by_name():
+    with pytest.raises(UserError, match="push has no scene 'towel'"):
+        envs.scene("push", "towel")
+    with pytest.raises(UserError, match=r"push-towel: scene: there is no 'towl', did you mean 'towel'\?"):
+        envs.make("push-towel", "c", "towl")
+
+
+def test_a_gap_names_its_scene(tmp_path):
+    env = envs.make("push-towel", "c")
+    own = tmp_path / "own.toml"
+    own.write_text('scene = "towel"\nparams = { table_friction = 0.7 }\n')
+    gap = gaps.load(env, str(own), ["object_x=0.25"])
+    assert gap.scene == "towel" and common.real_env(env, [gap]).scene == "towel"
+    own.write_text("params = { table_friction = 0.7 }\n")
+    plain = gaps.load(env, str(own))
+    assert common.real_env(env, [plain]) is env and common.real_env(env, []) is env
+    with pytest.raises(UserError, match=r"own is in the simulated scene and .* in scene 'towel': .* one at a time"):
+        common.real_env(env, [plain, gap])
+    own.write_text("scene = 3\n")
+    with pytest.raises(UserError, match="'scene' must be a name, got 3"):
+        gaps.load(env, str(own))
+
+
+@pytest.mark.slow
+def test_soft_pushes_succeed_where_those_for_a_puck_do_not(real):
+    way = WAYS[real.env.name]
+    soft = [played(real, lambda obs: push_softly(way, obs), i)[-1] for i in range(4)]
+    assert sum(bool(state.success) for state in soft) >= 3  # a ball on the goal line may still tip over the edge
+    hard = [played(real, push_hard, i)[-1] for i in range(4)]
+    assert sum(bool(state.success) for state in hard) <= 2
+    assert max(float(state.true_obs[2]) for state in hard) > push.EDGE
+
+
+@pytest.mark.slow
+def test_mjx_steps_it_as_mujoco_does(real):
+    """From states of a push, one control period: 1 mm in what the learner sees, a few mm in what touches."""
+    states = played(real, lambda obs: push_softly(WAYS[real.env.name], obs), steps=12)
+    mjx = bench(envs.make(real.env.name, "jax", real.env.scene), real.worlds)
+    for before, after in zip(states[:-1:3], states[1::3], strict=False):
+        action = push_softly(WAYS[real.env.name], before.true_obs)
+        seen = mjx.step(member(real.worlds, 0), before, action, KEY)
+        np.testing.assert_allclose(seen.true_obs, after.true_obs, atol=1e-3)
