@@ -104,7 +104,7 @@ def test_real_figures_are_drawn_and_untouched_gaps_are_named(tmp_path, capsys):
     save(tmp_path, "sgft-sac", [[0.2, 0.3], [0.9, 1.0]], rollouts=[0, 20])
     call("--out", tmp_path)
     assert (tmp_path / "figures/toy-default.png").stat().st_size > 10_000
-    assert "- no run on push/mild, push/default, push/hard, hammer/mild" in capsys.readouterr().out
+    assert "- no run on push/mild, push/default, push/hard, push-towel/default" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

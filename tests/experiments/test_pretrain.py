@@ -158,7 +158,10 @@ def test_a_finished_run_is_neither_repeated_nor_changed(finished, out, capsys):
 @pytest.mark.parametrize(
     ("argv", "words"),
     [
-        (["--task", "toi"], "task: there is no 'toi', did you mean 'toy'? Choose from: hammer, insert, push, toy"),
+        (
+            ["--task", "toi"],
+            "task: there is no 'toi', did you mean 'toy'? Choose from: hammer, insert, push, push-ball,",
+        ),
         (["--preset", "fats"], "--preset: there is no 'fats', did you mean 'fast'? Choose from: cpu, fast, paper"),
         (["--config.gama", "0.9"], "did you mean --config.gamma?"),
         (["--task", "toy", "--seeds", "0"], "there must be at least one"),
