@@ -30,14 +30,14 @@ def make_advance(host: mujoco.MjModel) -> Advance:
     from envs import warp_worlds
 
     contacts, rows = budget(host)
-    iterations = host.opt.iterations + _MORE_ITERATIONS
     still, at_rest = put(host)
     calls: dict[tuple[str, ...], Any] = {}
 
     def call(layout: tuple[str, ...]) -> Any:
         """Worlds that differ in the same fields share buffers and graphs."""
         if layout not in calls:
-            calls[layout] = warp_worlds.make_call(host, layout, contacts=contacts, rows=rows, iterations=iterations)
+            size = {"contacts": contacts, "rows": rows, "iterations": iterations(host)}
+            calls[layout] = warp_worlds.make_call(host, layout, **size)
         return calls[layout]
 
     def placed(values: dict[str, Array], qpos: Array) -> dict[str, Array]:
@@ -76,6 +76,11 @@ def make_advance(host: mujoco.MjModel) -> Advance:
 def available() -> bool:
     """Whether MuJoCo Warp can be used here."""
     return mjx.warp.WARP_INSTALLED
+
+
+def iterations(host: mujoco.MjModel) -> int:
+    """How often Warp's solver may iterate in this scene."""
+    return host.opt.iterations + _MORE_ITERATIONS
 
 
 def budget(host: mujoco.MjModel) -> tuple[int, int]:

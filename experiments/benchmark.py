@@ -5,9 +5,11 @@ and automatic reset, against the bare engine under it, which repeats the same ph
 updates: SAC updates of pretraining, with all its networks, against the same update written by hand in bare JAX.
 plain: updates of plain SAC, against Stable-Baselines3 and SBX where they are installed.
 pretrain, finetune: seconds of the whole commands, with what the time goes into.
+devices: pretraining on several devices with as many times the environments and batches (weak scaling), against as many
+times one device.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -24,23 +26,25 @@ from sgft_jax import plot, runs
 from sgft_jax.log import write_summary
 from sgft_jax.types import UserError
 
+type Part = Literal["physics", "updates", "plain", "pretrain", "finetune", "devices"]
+
 
 @dataclass(frozen=True)
 class BenchmarkConfig:
     """What to measure."""
 
-    parts: tuple[Literal["physics", "updates", "plain", "pretrain", "finetune"], ...] = ("physics", "updates", "plain")
+    parts: tuple[Part, ...] = ("physics", "updates", "plain")
     """Kinds of measurements."""
     tasks: tuple[str, ...] = ("push", "hammer", "insert")
-    """Tasks, of physics, pretrain and finetune."""
+    """Tasks, of physics, pretrain, finetune and devices."""
     worlds: tuple[int, ...] = (1024,)
-    """Worlds stepped together."""
+    """Worlds stepped together; in devices, by each device."""
     impls: tuple[Impl, ...] = ("auto",)
     """Engines of physics."""
     control_steps: int = 10
     """Control steps (of 0.2 s) per timed call; at most half an episode."""
     batches: tuple[int, ...] = (256,)
-    """Batch sizes of the updates."""
+    """Batch sizes of the updates; in devices, of each device."""
     seeds: tuple[int, ...] = (1,)
     """Agents updated, pretrained or fine-tuned together."""
     width: int = 256
@@ -50,9 +54,11 @@ class BenchmarkConfig:
     repeats: int = 3
     """Timed calls; the fastest counts."""
     preset: str = "fast"
-    """Of pretrain."""
+    """Of pretrain and devices."""
     env_steps: int | None = None
-    """Of pretrain; default: the preset's."""
+    """Of pretrain, and of each device in devices; default: the preset's."""
+    devices: tuple[int, ...] = (1,)
+    """Numbers of devices, the first of which is what the others are compared with."""
     prior: Path | None = None
     """Folder of the priors that finetune starts from."""
     rollouts: int = 30
@@ -87,7 +93,7 @@ def _check(config: BenchmarkConfig) -> None:
         envs.name_of(task)
         if "physics" in config.parts and 2 * config.control_steps > envs.scene(task).episode_length:
             raise UserError(f"--control-steps {config.control_steps} is more than half an episode of {task}")
-    for name in ("worlds", "control_steps", "batches", "seeds", "width", "updates", "repeats"):
+    for name in ("worlds", "control_steps", "batches", "seeds", "width", "updates", "repeats", "devices"):
         value = getattr(config, name)
         least = min(value, default=0) if isinstance(value, tuple) else value
         if least < 1:
@@ -130,6 +136,15 @@ def _finetune(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
                 yield training.fine_tuning(task, impl, seeds, prior=config.prior, rollouts=config.rollouts)
 
 
+def _devices(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    for task in config.tasks:
+        for impl in config.impls:
+            for worlds in config.worlds:
+                for batch in config.batches:
+                    size = {"worlds": worlds, "batch": batch, "preset": config.preset, "env_steps": config.env_steps}
+                    yield from training.weak_scaling(task, impl, config.devices, **size)
+
+
 class Growth(NamedTuple):
     """What a figure shows of a part. sizes: columns of which the one with the most values becomes the x axis; the other
     ones and `by` tell lines apart. y: the column drawn. reference: the column drawn dashed.
@@ -147,6 +162,7 @@ _GROWTH = {
     "plain": Growth(("batch",), "updates_per_s"),
     "pretrain": Growth(("seeds",), "seconds", ("task", "impl")),
     "finetune": Growth(("seeds",), "seconds", ("task", "impl")),
+    "devices": Growth(("devices", "worlds", "batch"), "env_per_s", ("task", "impl"), "ideal_per_s"),
 }
 
 
@@ -172,13 +188,21 @@ def draw(part: str, lines: list[dict[str, Any]], path: Path) -> Path | None:
     return plot.scaling(path, curves(growth.y), references, title=_TITLES[part], x=x, y=y)
 
 
-_PARTS = {"physics": _physics, "updates": _updates, "plain": _plain, "pretrain": _pretrain, "finetune": _finetune}
+_PARTS: dict[Part, Callable[[BenchmarkConfig], Iterator[dict[str, Any]]]] = {
+    "physics": _physics,
+    "updates": _updates,
+    "plain": _plain,
+    "pretrain": _pretrain,
+    "finetune": _finetune,
+    "devices": _devices,
+}
 _TITLES = {
     "physics": "physics steps per second",
     "updates": "updates of pretraining per second",
     "plain": "updates of plain SAC per second",
     "pretrain": "pretraining",
     "finetune": "fine-tuning with SGFT-SAC",
+    "devices": "environment steps of pretraining per second",
 }
 
 

@@ -1,13 +1,13 @@
-"""Wall clock of the whole commands: pretraining with what it leaves, fine-tuning by number of seeds.
+"""Wall clock of the whole commands: pretraining with what it leaves and over devices, fine-tuning by number of seeds.
 
-Every command runs twice in folders that are thrown away. The second time its programs come from JAX's compilation
-cache, so the difference is what compiling costs, if the cache did not hold them before.
+All of them run in folders that are thrown away. What is timed as a whole runs twice: the second time its programs come
+from JAX's compilation cache, so the difference is what compiling costs, if the cache did not hold them before.
 """
 
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,8 @@ from experiments.finetune_args import FinetuneArgs, run_folder
 from experiments.presets import PRESETS
 from experiments.pretrain import PretrainArgs, pretrain
 from sgft_jax.log import read_jsonl
+
+_NEVER = 10**9  # chunks between what training is not slowed by
 
 
 def pretraining(task: str, impl: Impl, seeds: int, *, preset: str, env_steps: int | None) -> dict[str, Any]:
@@ -37,6 +39,34 @@ def pretraining(task: str, impl: Impl, seeds: int, *, preset: str, env_steps: in
         "explained_variance": min(seed["value/explained_variance"] for seed in summary["seeds"]),
         **{f"{part}_s": summary[f"time/{part}_s"] for part in ("worlds", "random", "train", "evaluate", "report")},
     }  # fmt: skip
+
+
+def weak_scaling(
+    task: str, impl: Impl, devices: Sequence[int], *, worlds: int, batch: int, preset: str, env_steps: int | None
+) -> Iterator[dict[str, Any]]:
+    """Environment steps per second while training, compilation and evaluations left out, for each number of devices.
+
+    worlds, batch, env_steps: for each device, as are the replay and the random-action data of the preset. ideal_per_s:
+    as many times the first number's speed; the ratio of both is `env/ideal`.
+    """
+    base = PRESETS[preset]
+    alone = 0.0  # environment steps per second of one device
+    for n in devices:
+        config = replace(
+            base, n_envs=n * worlds, batch_size=n * batch, env_steps=n * (env_steps or base.env_steps),
+            replay_capacity=n * base.replay_capacity, random_transitions=n * max(base.random_transitions, worlds),
+            eval_every=_NEVER, checkpoint_every=_NEVER,
+        )  # fmt: skip
+        with tempfile.TemporaryDirectory() as out:
+            args = PretrainArgs(task=task, preset=preset, config=config, impl=impl, devices=n, report=False)
+            summary = pretrain(replace(args, video=False, out=Path(out)))
+        env_per_s = summary["env_steps"] / summary["time/train_s"]
+        alone = alone or env_per_s / n
+        yield {
+            "task": task, "impl": summary["impl"], "devices": n, "worlds": worlds, "batch": batch,
+            "env_per_s": env_per_s, "ideal_per_s": n * alone, "env/ideal": env_per_s / (n * alone),
+            "compile_s": summary["time/compile_s"],
+        }  # fmt: skip
 
 
 def fine_tuning(task: str, impl: Impl, seeds: int, *, prior: Path, rollouts: int) -> dict[str, Any]:

@@ -155,6 +155,32 @@ def test_whole_commands_run_twice_in_folders_that_vanish(monkeypatch):
     assert found["success"] == 0.9 and found["explained_variance"] == 0.5 and found["env_steps"] == 80
 
 
+def test_devices_get_their_shares_and_are_compared_with_as_many_times_one(monkeypatch):
+    asked = []
+
+    def pretrain(args):
+        asked.append(args)
+        speed = {1: 100.0, 2: 180.0, 4: 300.0}[args.devices]
+        steps = args.config.env_steps
+        return {"impl": "c", "env_steps": steps, "time/train_s": steps / speed, "time/compile_s": 1.0}
+
+    monkeypatch.setattr(training, "pretrain", pretrain)
+    size = {"worlds": 64, "batch": 32, "preset": "cpu", "env_steps": 640}
+    found = list(training.weak_scaling("push", "c", (1, 2, 4), **size))
+    assert [line["env/ideal"] for line in found] == pytest.approx([1.0, 0.9, 0.75])
+    assert [line["ideal_per_s"] for line in found] == pytest.approx([100.0, 200.0, 400.0])
+    assert [(args.config.n_envs, args.config.batch_size, args.config.env_steps) for args in asked] == [
+        (64, 32, 640), (128, 64, 1280), (256, 128, 2560),
+    ]  # fmt: skip
+    assert asked[1].config.replay_capacity == 2 * training.PRESETS["cpu"].replay_capacity
+
+
+@pytest.mark.slow
+def test_one_device_trains_and_is_its_own_ideal(tmp_path):
+    (line,) = main(replace(SMALL, parts=("devices",), preset="cpu", env_steps=200, out=tmp_path))["devices"]
+    assert line["env_per_s"] > 0 and line["env/ideal"] == 1.0
+
+
 def test_figures_show_how_costs_grow(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(benchmark.plot, "scaling", lambda path, *curves, **words: drawn.append((curves, words)) or path)
@@ -174,6 +200,7 @@ def test_figures_show_how_costs_grow(tmp_path, monkeypatch):
         ({"tasks": ("hamer",)}, "task: there is no 'hamer', did you mean 'hammer'?"),
         ({"worlds": (4, 0)}, "--worlds is 0"),
         ({"repeats": 0}, "--repeats is 0"),
+        ({"parts": ("devices",), "devices": (2, 0)}, "--devices is 0"),
         ({"batches": ()}, "--batches is 0"),
         ({"control_steps": 30}, "--control-steps 30 is more than half an episode of push"),
         ({"parts": ("finetune",)}, "--parts finetune needs --prior FOLDER"),
