@@ -58,7 +58,7 @@ class BenchmarkConfig:
     env_steps: int | None = None
     """Of pretrain, and of each device in devices; default: the preset's."""
     devices: tuple[int, ...] = (1,)
-    """Numbers of devices, the first of which is what the others are compared with."""
+    """Numbers of devices; the smallest is what the others are compared with."""
     prior: Path | None = None
     """Folder of the priors that finetune starts from."""
     rollouts: int = 30

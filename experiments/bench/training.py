@@ -7,7 +7,7 @@ from JAX's compilation cache, so the difference is what compiling costs, if the 
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -43,14 +43,14 @@ def pretraining(task: str, impl: Impl, seeds: int, *, preset: str, env_steps: in
 
 def weak_scaling(
     task: str, impl: Impl, devices: Sequence[int], *, worlds: int, batch: int, preset: str, env_steps: int | None
-) -> Iterator[dict[str, Any]]:
+) -> list[dict[str, Any]]:
     """Environment steps per second while training, compilation and evaluations left out, for each number of devices.
 
     worlds, batch, env_steps: for each device, as are the replay and the random-action data of the preset. ideal_per_s:
-    as many times the first number's speed; the ratio of both is `env/ideal`.
+    as many times the speed of the smallest number; the ratio of both is `env/ideal`.
     """
     base = PRESETS[preset]
-    alone = 0.0  # environment steps per second of one device
+    found = {}
     for n in devices:
         config = replace(
             base, n_envs=n * worlds, batch_size=n * batch, env_steps=n * (env_steps or base.env_steps),
@@ -59,14 +59,17 @@ def weak_scaling(
         )  # fmt: skip
         with tempfile.TemporaryDirectory() as out:
             args = PretrainArgs(task=task, preset=preset, config=config, impl=impl, devices=n, report=False)
-            summary = pretrain(replace(args, video=False, out=Path(out)))
-        env_per_s = summary["env_steps"] / summary["time/train_s"]
-        alone = alone or env_per_s / n
-        yield {
-            "task": task, "impl": summary["impl"], "devices": n, "worlds": worlds, "batch": batch,
-            "env_per_s": env_per_s, "ideal_per_s": n * alone, "env/ideal": env_per_s / (n * alone),
-            "compile_s": summary["time/compile_s"],
-        }  # fmt: skip
+            found[n] = pretrain(replace(args, video=False, out=Path(out)))
+    speed = {n: summary["env_steps"] / summary["time/train_s"] for n, summary in found.items()}
+    alone = speed[min(speed)] / min(speed)
+    return [
+        {
+            "task": task, "impl": found[n]["impl"], "devices": n, "worlds": worlds, "batch": batch,
+            "env_per_s": speed[n], "ideal_per_s": n * alone, "env/ideal": speed[n] / (n * alone),
+            "compile_s": found[n]["time/compile_s"],
+        }
+        for n in sorted(speed)
+    ]  # fmt: skip
 
 
 def fine_tuning(task: str, impl: Impl, seeds: int, *, prior: Path, rollouts: int) -> dict[str, Any]:

@@ -166,13 +166,13 @@ def test_devices_get_their_shares_and_are_compared_with_as_many_times_one(monkey
 
     monkeypatch.setattr(training, "pretrain", pretrain)
     size = {"worlds": 64, "batch": 32, "preset": "cpu", "env_steps": 640}
-    found = list(training.weak_scaling("push", "c", (1, 2, 4), **size))
+    found = training.weak_scaling("push", "c", (4, 1, 2), **size)
     assert [line["env/ideal"] for line in found] == pytest.approx([1.0, 0.9, 0.75])
     assert [line["ideal_per_s"] for line in found] == pytest.approx([100.0, 200.0, 400.0])
     assert [(args.config.n_envs, args.config.batch_size, args.config.env_steps) for args in asked] == [
-        (64, 32, 640), (128, 64, 1280), (256, 128, 2560),
+        (256, 128, 2560), (64, 32, 640), (128, 64, 1280),
     ]  # fmt: skip
-    assert asked[1].config.replay_capacity == 2 * training.PRESETS["cpu"].replay_capacity
+    assert asked[2].config.replay_capacity == 2 * training.PRESETS["cpu"].replay_capacity
 
 
 @pytest.mark.slow
