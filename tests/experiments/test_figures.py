@@ -1,12 +1,11 @@
 """Figures and tables from run folders made by hand."""
 
-import json
-
 import numpy as np
 import pytest
+from runs_by_hand import save
 
 import envs
-from experiments import cli, figures
+from experiments import cli, figures, tables
 from experiments.results import read_curve
 
 
@@ -14,19 +13,6 @@ from experiments.results import read_curve
 def _cheap(monkeypatch):
     monkeypatch.setitem(envs.TASKS, "toy", "toy")
     monkeypatch.setattr(cli, "set_up", lambda: None)
-
-
-def save(out, method, success, *, rollouts, real="default", seeds="seeds-0-1", wanted=None):
-    """A run of task toy: success [evaluations][seeds] after so many rollouts of 20 steps of 0.1 s."""
-    folder = out / "finetune/toy" / real / method / seeds
-    folder.mkdir(parents=True)
-    with open(folder / "eval.jsonl", "w") as file:
-        for n, each in zip(rollouts, success, strict=True):
-            line = {"step": 20 * n, "rollouts": n, "robot_minutes": n * 20 * 0.1 / 60}
-            file.write(json.dumps({**line, "success": each, "return": each}) + "\n")
-    config = {"rollouts": wanted or rollouts[-1]}
-    (folder / "config.json").write_text(json.dumps({"sgft_jax": "0", "kind": "finetune", "config": config}))
-    return folder
 
 
 def call(*argv):
@@ -54,14 +40,14 @@ def test_a_row_says_what_the_curve_says(tmp_path):
         "3.3",
     ]
     # Areas to 50 rollouts: 20 * (0.2 + 0.1) / 2 + 30 * (0.1 + 0.8) / 2 = 16.5 of 50 or 33 %; 5 + 16.5 = 21.5, 43 %.
-    assert figures.row("sac", curve, figures.BUDGETS, 50) == cells
-    assert len(cells) == len(figures.columns(figures.BUDGETS, 50))
+    assert tables.row("sac", curve, tables.BUDGETS, 50) == cells
+    assert len(cells) == len(tables.columns(tables.BUDGETS, 50))
 
 
 def test_budgets_not_reached_or_not_evaluated_stay_empty(tmp_path):
     folder = save(tmp_path, "sac", [[0.5], [0.6], [0.7]], rollouts=[0, 19, 50], seeds="seed-0")
     ended = "> 1,000"
-    assert figures.row("sac", read_curve(folder), (10, 50, 100), 0) == [
+    assert tables.row("sac", read_curve(folder), (10, 50, 100), 0) == [
         *("sac", "1", "50", "-", "70", "-", "70 (50)"),
         *(ended, ended, "-", "0", "1.7"),
     ]
