@@ -11,7 +11,7 @@ import numpy as np
 
 from envs import gaps
 from experiments import tables
-from experiments.comparison import DEFAULT, ORDER, Comparison, is_sgft, on_default, split
+from experiments.comparison import DEFAULT, ORDER, Comparison, Part, is_sgft, on_default, split
 from experiments.finetune_args import arguments
 from experiments.results import LEVELS, Curve, reached
 from sgft_jax import plot
@@ -28,13 +28,6 @@ _TRANSFORMS_LEGEND = (
     "Shortening without shaping is none of them: a return over H steps without a value at its end is blind to all that "
     "comes later."
 )
-
-
-class Part(NamedTuple):
-    """Sections of the results, and a line for each thing that lacks runs."""
-
-    sections: list[str]
-    missing: list[str]
 
 
 # ---------------------------------------------------------------- branch, shape, shorten

@@ -28,6 +28,13 @@ class Comparison(NamedTuple):
     notes: list[str]
 
 
+class Part(NamedTuple):
+    """Sections of the results, and a line for each thing that lacks runs."""
+
+    sections: list[str]
+    missing: list[str]
+
+
 def read_comparison(folder: Path) -> Comparison:
     """What the runs of <out>/finetune/<task>/<real>/<method>[_<variant>]/<seeds>/ say."""
     curves: dict[str, Curve] = {}

@@ -55,15 +55,15 @@ def figures(args: FiguresArgs) -> Path:
     target.mkdir(parents=True, exist_ok=True)
     order = colour_order(names_of(drawn))
     singles = [_section(c, draw(c, target / f"{c.task}-{c.real}.png", order)) for c in drawn]
-    above = overview.sections(drawn, target, order)
+    above = overview.overview(drawn, target, order)
     below = [
         ablations.transforms(drawn),
         ablations.horizons(drawn, target),
         ablations.severity(drawn, target, order),
     ]
-    sections = [*above, *singles, *(text for part in below for text in part.sections)]
+    sections = [*above.sections, *singles, *(text for part in below for text in part.sections)]
     missing = [f"- {c.task}/{c.real}: {note}" for c in comparisons for note in c.notes]
-    missing += [f"- {note}" for part in below for note in part.missing]
+    missing += [f"- {note}" for part in (above, *below) for note in part.missing]
     if untouched := _untouched(task, {(c.task, c.real) for c in comparisons}):
         missing.append(f"- no run on {', '.join(untouched)}")
     if missing:

@@ -3,12 +3,11 @@
 The figure is that of Figure 4 of the SGFT paper.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from experiments import tables
-from experiments.comparison import Comparison, is_sgft, names_of, on_default, split
+from experiments.comparison import DEFAULT, Comparison, Part, is_sgft, names_of, on_default, split
 from experiments.results import LEVELS, Curve, left_behind, reached
 from sgft_jax import plot
 from sgft_jax.methods import METHODS
@@ -25,20 +24,25 @@ _TIMES = (
 )
 
 
-def sections(comparisons: Sequence[Comparison], target: Path, order: Sequence[str]) -> list[str]:
-    """Figure and tables of all tasks; none where nothing ran on the default real system.
+def overview(comparisons: Sequence[Comparison], target: Path, order: Sequence[str]) -> Part:
+    """Figure and tables of all tasks with runs on the default real system.
 
     target: the folder of the figures. order: of the methods in all figures, which gives them their colours.
     """
     tasks = on_default(comparisons)
     if not tasks:
-        return []
+        return Part([], [f"all tasks: no run on a real system {DEFAULT}"])
     texts = ["## All tasks"]
     for variant, panels in _panels(tasks).items():
         title = "Fine-tuning on the default real systems" + (f", {variant}" if variant else "")
         path = target / ("_".join(filter(None, ["overview", variant])) + ".png")
         texts.append(f"![{title}]({_draw(panels, path, title, order).name})")
-    return [*texts, _LEGEND, _table(tasks), *_comparison(tasks)]
+    best = {task: best_other(comparison.curves) for task, comparison in tasks.items()}
+    own = [name for name in names_of(tasks.values()) if is_sgft(name)]
+    texts += [_LEGEND, _table(tasks)]
+    if not own or not any(best.values()):
+        return Part(texts, [f"all tasks: how many times fewer takes {DEFAULT} runs of SGFT and of another method"])
+    return Part([*texts, _TIMES, _comparison(tasks, best, own)], [])
 
 
 def times_fewer(other: Curve, own: Curve) -> str:
@@ -47,10 +51,10 @@ def times_fewer(other: Curve, own: Curve) -> str:
     ends = [int(curve.transitions[-1]) if n is None else n for curve, n in zip((other, own), needs, strict=True)]
     if needs == [None, None] or 0 in ends:
         return tables.NONE
-    times = ends[0] / ends[1]
+    tenths, own_end = 10 * ends[0], ends[1]
     if needs[0] is None:
-        return f"> {math.floor(10 * times) / 10:.1f}"  # a bound must stay one when it is rounded
-    return f"< {math.ceil(10 * times) / 10:.1f}" if needs[1] is None else f"{times:.1f}"
+        return f"> {tenths // own_end / 10:.1f}"  # a bound must stay one when it is rounded
+    return f"< {-(-tenths // own_end) / 10:.1f}" if needs[1] is None else f"{tenths / own_end / 10:.1f}"
 
 
 def best_other(curves: Mapping[str, Curve]) -> str | None:
@@ -105,12 +109,8 @@ def _table(tasks: Mapping[str, Comparison]) -> str:
     return tables.markdown(["method", *tasks], [[name, *(cell(c, name) for c in tasks.values())] for name in names])
 
 
-def _comparison(tasks: Mapping[str, Comparison]) -> list[str]:
-    """SGFT in rows against the best other method of each task; nothing where one side is absent."""
-    best = {task: best_other(c.curves) for task, c in tasks.items()}
-    own = [name for name in names_of(tasks.values()) if is_sgft(name)]
-    if not own or not any(best.values()):
-        return []
+def _comparison(tasks: Mapping[str, Comparison], best: Mapping[str, str | None], own: Sequence[str]) -> str:
+    """The methods `own` in rows against the best other method of each task."""
 
     def cell(task: str, name: str) -> str:
         other, curves = best[task], tasks[task].curves
@@ -123,4 +123,4 @@ def _comparison(tasks: Mapping[str, Comparison]) -> list[str]:
         ["best that is not SGFT", *(against(*each) for each in best.items())],
         *([name, *(cell(task, name) for task in tasks)] for name in own),
     ]
-    return [_TIMES, tables.markdown(["", *tasks], rows)]
+    return tables.markdown(["", *tasks], rows)

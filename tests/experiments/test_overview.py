@@ -13,9 +13,13 @@ def read(out):
     return [read_comparison(folder) for folder in sorted(out.glob("finetune/*/*"))]
 
 
-def sections(out):
+def part(out):
     found = read(out)
-    return "\n\n".join(overview.sections(found, out, colour_order(names_of(found))))
+    return overview.overview(found, out, colour_order(names_of(found)))
+
+
+def sections(out):
+    return "\n\n".join(part(out).sections)
 
 
 def test_which_methods_are_sgft():
@@ -30,6 +34,7 @@ def test_which_methods_are_sgft():
         ((60, 100), (20, 100), "3.0"),  # 1,200 and 400 transitions
         ((None, 100), (30, 100), "> 3.3"),  # at least 2,000 / 600: a lower bound is rounded down
         ((20, 100), (None, 60), "< 0.4"),  # at most 400 / 1,200: an upper bound is rounded up
+        ((70, 100), (None, 100), "< 0.7"),  # exactly
         ((None, 100), (None, 60), "-"),
         ((0, 100), (20, 100), "-"),  # nothing was to be learned
     ],
@@ -86,4 +91,10 @@ def test_what_is_drawn_in_the_overview(tmp_path, monkeypatch):
 
 def test_no_overview_without_runs_on_the_default_real_systems(tmp_path):
     save(tmp_path, "sac", real="hard", **rising(20))
-    assert sections(tmp_path) == ""
+    assert part(tmp_path) == ([], ["all tasks: no run on a real system default"])
+
+
+def test_no_ratio_without_both_sides(tmp_path):
+    save(tmp_path, "sgft-sac", **rising(20))
+    texts, missing = part(tmp_path)
+    assert "times as many" not in "".join(texts) and "takes default runs of SGFT and of another" in missing[0]
