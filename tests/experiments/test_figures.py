@@ -74,12 +74,17 @@ def test_one_figure_and_one_table_per_real_system(tmp_path, capsys, monkeypatch)
     assert list(curves) == ["sgft-sac", "sgft-sac_horizon-4", "sac"]
     assert more["zero_shot"] == 0.25 and more["rollout_length"] == 20 and more["control_dt"] == pytest.approx(0.1)
     np.testing.assert_array_equal(curves["sac"][1], np.transpose(flat))
+    # Colours in both figures: the variant, which another figure lacks, must not move those of the methods.
+    assert all(more["order"] == ["sgft-sac", "sac", "sgft-sac_horizon-4"] for _, more in drawn.values())
+    titles = ["## All tasks", "## toy on the default", "## toy on the hard", "## The three transforms", "## Missing"]
+    assert sorted(titles, key=text.index) == titles and "## The horizon" not in text
     assert "| 20 rollouts |" in text and "50 rollouts" not in text  # no run got there
     assert text.index("| sgft-sac | 2 |") < text.index("| sac | 2 |") and "![toy on the default real system]" in text
     for missing in (
         "- toy/default: no run of sgft, sgft-tdmpc2, sgft-tdmpc2-code, tdmpc2, iql, rlpd, sac-online, frozen-critic, "
         "pbrs-branch, pbrs, sac-reset",
         "holds no evaluation yet",
+        "- toy/default: no two horizons of sgft-sac",
         "- toy/hard+latency=0.1: sgft-sac: seed-0 left out, seeds-0-1 has more seeds or rollouts",
         "- toy/hard+latency=0.1: sgft-sac: unfinished, 20 of 100 rollouts",
     ):
