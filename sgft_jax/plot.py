@@ -133,10 +133,11 @@ def severity(
             if band is not None and np.isfinite(band.low):
                 left.plot([at, at], [band.low, band.high], color=look["color"], linewidth=weight / 2)
         left.plot(x, height, **look, linewidth=weight, marker="o", markersize=4, clip_on=False)
-        enough = [(at, point[0]) for at, point in zip(x, needed[name], strict=True) if point and point[1]]
-        bounds = [(at, point[0]) for at, point in zip(x, needed[name], strict=True) if point and not point[1]]
-        right.plot(*np.reshape(enough, (-1, 2)).T, **look, linewidth=weight, marker="o", markersize=4)
-        right.plot(*np.reshape(bounds, (-1, 2)).T, color=look["color"], marker="^", mfc="white", linestyle="")
+        counts = np.array([np.nan if point is None else point[0] for point in needed[name]])
+        enough = np.array([point is not None and point[1] for point in needed[name]])
+        # nan, not left out: no line may lead past a gap where the method did not get there.
+        right.plot(x, np.where(enough, counts, np.nan), **look, linewidth=weight, marker="o", markersize=4)
+        right.plot(x[~enough], counts[~enough], color=look["color"], marker="^", mfc="white", linestyle="")
     left.set_ylim(-0.03, 1.03)
     right.set_ylim(bottom=0)
     right.yaxis.set_major_formatter(lambda n, _: f"{n:,.0f}")

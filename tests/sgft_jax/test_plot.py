@@ -104,3 +104,18 @@ def test_panels_share_a_legend(tmp_path, tasks, methods):
     assert image.shape[1] == {1: 960, 2: 1170, 5: 1560}[tasks]
     assert all(pixels(image, color) > 100 for color in plot.PALETTE[: min(methods, 7)])
     assert (image[[0, -1]] > 0.99).all() and (image[:, [0, -1]] > 0.99).all()  # nothing is cut off at the border
+
+
+def test_no_line_leads_past_a_gap_where_a_method_failed(tmp_path):
+    """500, more than 900 and 500 transitions: two points and a triangle, without the line of 500, 500 and 500."""
+    gaps, unknown = ["mild", "default", "hard"], [None] * 3
+
+    def blue(middle):
+        path = plot.severity(
+            tmp_path / "severity.png", gaps, {"SAC": unknown}, {"SAC": [(500, True), middle, (500, True)]},
+            title="Push", success="success", transitions="transitions", order=["SAC"],
+        )  # fmt: skip
+        return pixels(matplotlib.image.imread(path), plot.PALETTE[0])
+
+    through, past, none = blue((500, True)), blue((900, False)), blue(None)
+    assert past < through - 200 and none < past
