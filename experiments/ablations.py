@@ -19,6 +19,12 @@ from sgft_jax.config import config_to_json
 from sgft_jax.methods import METHODS, Method, finetune_config
 
 HORIZON_METHOD = "sgft-sac"
+_BESIDE = (
+    "preset",
+    "prior",
+    "initial_rollouts",
+    "utd",
+)  # settings beside the options, equal where horizons are compared
 AFTER = 20  # rollouts at which severities are drawn: enough for SGFT on push, not for SAC (docs/results.md)
 _OTHER_KINDS = ("camera",)  # gaps that are not the others made worse: that one breaks what V_sim sees
 # A method takes the models from the prior exactly if it branches, V_sim exactly if it shapes.
@@ -93,7 +99,7 @@ def horizons(comparisons: Sequence[Comparison], target: Path) -> Part:
         if len({setting.horizon for setting in found}) > 1:
             tasks[task] = {setting: found[setting] for setting in sorted(found)}
         else:
-            missing.append(f"{task}/{DEFAULT}: no two horizons of {HORIZON_METHOD} (--variant, --options.horizon)")
+            missing.append(f"{task}/{DEFAULT}: no two horizons of {HORIZON_METHOD} with all else equal")
     if not tasks:
         return Part([], missing)
     path = plot.curve_panels(
@@ -124,16 +130,16 @@ def by_horizon(comparison: Comparison) -> dict[Setting, tuple[str, Curve]]:
     found: dict[Setting, tuple[str, Curve]] = {}
     for name, curve in comparison.curves.items():
         config = comparison.configs[name]
-        if split(name)[0] == HORIZON_METHOD and "options" in config and _settings(config) == _settings(usual):
+        if split(name)[0] == HORIZON_METHOD and "options" in config and _alike(config, usual):
             setting = Setting(config["options"]["horizon"], config["options"]["branches"])
             found.setdefault(setting, (name, curve))
     return found
 
 
-def _settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What must be the same to compare horizons."""
-    options = {name: value for name, value in config["options"].items() if name not in Setting._fields}
-    return {name: config.get(name) for name in ("preset", "prior", "initial_rollouts", "utd")} | options
+def _alike(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two runs differ in horizon and branches alone, of all that both versions of the program knew."""
+    first, second = ({**c["options"], **{name: c.get(name) for name in _BESIDE}} for c in (one, other))
+    return all(first[name] == second[name] for name in first.keys() & second.keys() - set(Setting._fields))
 
 
 # ---------------------------------------------------------------- severity of the gap

@@ -146,9 +146,8 @@ def severity(
         axes.set_xticks(range(len(gaps)), gaps)
         axes.set_title(words, **_FONT, loc="left")
     note = _seeds_note([score for each in scores.values() for score in each if score is not None], "interval")
-    _legend_below(
-        figure, {n: looks[n] for n in order if n in scores}, thick, f"{note}; triangle: so many were not enough"
-    )
+    note = "; ".join(filter(None, [note, "triangle: so many were not enough"]))
+    _legend_below(figure, {name: looks[name] for name in order if name in scores}, thick, note)
     figure.suptitle(title, x=0.01, ha="left", size=12, weight="bold", color=_INK)
     return _save(figure, path)
 

@@ -70,7 +70,7 @@ def test_nothing_but_the_horizon_differs(tmp_path, monkeypatch):
     assert drawn["order"] == ["H = 1", "H = 2", "H = 4, 2 branches"]
     assert "| push | H = 2 | sgft-sac_h2 | 2 | > 1,000 | > 1,000 | 75 [50, 100] (50) | 1 of 2 |" in text
     assert "| push | H = 4, 2 branches | sgft-sac_h4 | 2 | 800 | 800 | 100 [100, 100] (100) | 0 of 2 |" in text
-    assert missing == ["insert/default: no two horizons of sgft-sac (--variant, --options.horizon)"]
+    assert missing == ["insert/default: no two horizons of sgft-sac with all else equal"]
 
 
 def test_horizons_without_a_run_of_the_default_one(tmp_path):
@@ -78,6 +78,16 @@ def test_horizons_without_a_run_of_the_default_one(tmp_path):
         save(tmp_path, f"sgft-sac_horizon-{horizon}", horizon=horizon, **rising(20))
     (text,), missing = ablations.horizons(read(tmp_path), tmp_path)
     assert "| toy | H = 2 |" in text and not missing and (tmp_path / "horizon.png").stat().st_size > 10_000
+
+
+def test_an_older_run_lacks_options_that_came_later(tmp_path):
+    older = save(tmp_path, "sgft-sac", **rising(20)) / "config.json"
+    config = json.loads(older.read_text())
+    del config["config"]["options"]["train_encoder"]
+    older.write_text(json.dumps(config))
+    save(tmp_path, "sgft-sac_h4", horizon=4, **rising(20))
+    sections, _ = ablations.horizons(read(tmp_path), tmp_path)
+    assert "| toy | H = 1 |" in sections[0] and "| toy | H = 4 |" in sections[0]
 
 
 def test_a_run_without_its_configuration_has_no_horizon(tmp_path):
