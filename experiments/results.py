@@ -35,6 +35,16 @@ def read_curve(folder: Path) -> Curve:
     return Curve(column("rollouts"), column("step"), column("robot_minutes"), column("success").T, column("return").T)
 
 
+def reached(curve: Curve, percent: int) -> int | None:
+    """Real transitions until the mean over seeds first shows that success; None = never."""
+    return transitions_to(curve.transitions, curve.success.mean(0), percent / 100)
+
+
+def left_behind(curve: Curve) -> int:
+    """Seeds that end below the first of `LEVELS`: a mean over seeds hides them, an interquartile one even more."""
+    return int((curve.success[:, -1] < LEVELS[0] / 100).sum())
+
+
 def area(curve: Curve, rollouts: int) -> np.ndarray:
     """[seeds] mean success from zero-shot to the last evaluation after at most so many rollouts, from 0 to 1."""
     inside = curve.rollouts <= rollouts
@@ -54,14 +64,14 @@ def describe_run(curve: Curve) -> dict[str, Any]:
         "zero_shot": _point(curve, 0),
         "final": _point(curve, -1),
         "dip": {"mean": first_dip(mean), "worst_seed": max(first_dip(s) for s in curve.success)},
-        **{f"to_{percent}": _transitions(curve, percent / 100) for percent in LEVELS},
+        **{f"to_{percent}": _transitions(curve, percent) for percent in LEVELS},
         "seeds": int(curve.success.shape[0]),
     }
 
 
-def _transitions(curve: Curve, level: float) -> dict[str, Any]:
-    first = lambda success: transitions_to(curve.transitions, success, level)  # noqa: E731
-    return {"seeds": [first(s) for s in curve.success], "mean_curve": first(curve.success.mean(0))}
+def _transitions(curve: Curve, percent: int) -> dict[str, Any]:
+    seeds = [transitions_to(curve.transitions, success, percent / 100) for success in curve.success]
+    return {"seeds": seeds, "mean_curve": reached(curve, percent)}
 
 
 def _point(curve: Curve, i: int) -> dict[str, Any]:

@@ -2,10 +2,11 @@
 
 Functions take plain arrays and return the path they wrote. Colours are the Okabe-Ito palette (safe for colour-blind
 readers), from the eighth line on dashed, then dotted; a method keeps its colour from figure to figure as long as the
-order of the methods stays.
+order of the methods stays (`order`, where a figure shows some of them).
 """
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
 from sgft_jax.stats import iqm_interval
@@ -21,6 +23,7 @@ PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 _DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)))  # (0, (drawn, left out)) in widths of the line
 _INK, _GREY, _FAINT = "#333333", "#777777", "#B0B0B0"
 _FONT = {"size": 10, "color": _INK}
+_THIN, _THICK = 1.4, 2.4  # where one legend serves many lines
 
 
 def learning_curves(
@@ -33,22 +36,21 @@ def learning_curves(
     control_dt: float | None = None,
     quantity: str = "success rate",
     over: str = "real transitions",
+    order: Sequence[str] | None = None,
 ) -> Path:
     """Success against real transitions, one line per method: IQM over seeds with its 95 % bootstrap band.
 
     curves: {method: (transitions [n_evaluations], success [n_seeds, n_evaluations])}. zero_shot: success of the policy
     before fine-tuning, drawn dashed. rollout_length (steps) and control_dt (s) add an axis on top in rollouts and
-    minutes of robot time. quantity, over: names of the axes; what takes success's place is from 0 to 1, too.
+    minutes of robot time. quantity, over: names of the axes; what takes success's place is from 0 to 1, too. order: of
+    all methods, these and those of other figures, which decides colours; default: that of curves.
     """
     figure, (axes,) = _figure(7.2, 4.0, columns=1)
-    ends = []
-    for (name, (transitions, success)), look in zip(curves.items(), _looks(len(curves)), strict=True):
-        x, color = np.asarray(transitions), look["color"]
-        band = iqm_interval(success)
-        if np.isfinite(band.low).all():
-            axes.fill_between(x, band.low, band.high, color=color, alpha=0.18, linewidth=0)
-        axes.plot(x, band.estimate, **look, linewidth=2, marker="o", markersize=3, clip_on=False)
-        ends.append((float(x[-1]), float(band.estimate[-1]), name, color))
+    ends, looks = [], _looks_of(order or list(curves))
+    for name, (transitions, success) in curves.items():
+        style = {**looks[name], "linewidth": 2, "shade": _shade(len(curves)), "marker": "o", "markersize": 3}
+        last = _draw_curve(axes, np.asarray(transitions), success, style)
+        ends.append((float(np.asarray(transitions)[-1]), last, name, looks[name]["color"]))
     if zero_shot is not None:
         axes.axhline(zero_shot, color=_INK, linewidth=1.2, linestyle=(0, (4, 3)), zorder=1.5)
         ends.append((max(x for x, *_ in ends), zero_shot, "zero-shot", _INK))
@@ -60,11 +62,93 @@ def learning_curves(
     _thousands(axes)
     if rollout_length is not None and control_dt is not None:
         _robot_axis(axes, rollout_length, control_dt)
-    seeds = sorted({np.asarray(s).shape[0] for _, s in curves.values()})
-    counts = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
     figure.suptitle(title, x=0.01, ha="left", size=12, weight="bold", color=_INK)
-    note = f"interquartile mean of {counts} seed{'s' * (seeds[-1] > 1)}" + ", 95 % bootstrap band" * (seeds[-1] > 1)
-    figure.text(0.99, 0.012, note, ha="right", size=8, color=_GREY)
+    figure.text(0.99, 0.012, _seeds_note([s for _, s in curves.values()]), ha="right", size=8, color=_GREY)
+    return _save(figure, path)
+
+
+def curve_panels(
+    path: Path,
+    panels: Mapping[str, Mapping[str, tuple[ArrayLike, ArrayLike]]],
+    *,
+    title: str,
+    over: Mapping[str, str],
+    order: Sequence[str],
+    thick: Collection[str] = (),
+) -> Path:
+    """Learning curves of several tasks next to each other, with one legend: IQM over seeds, 95 % bootstrap band.
+
+    panels: {task: curves as those of `learning_curves`}. over: name of each panel's x axis. order: as there, and of the
+    legend. thick: methods that stand out, drawn last and with stronger bands.
+    """
+    width, columns = _grid(len(panels))
+    figure, grid = _figure(width, 2.7 * math.ceil(len(panels) / columns), columns=columns, count=len(panels))
+    looks = _looks_of(order)
+    for axes, (task, curves) in zip(grid, panels.items(), strict=True):
+        for name in sorted(curves, key=lambda name: name in thick):
+            x, success = curves[name]
+            shade = 0.18 if name in thick else _shade(len(curves))
+            style = {**looks[name], "linewidth": _THICK if name in thick else _THIN, "shade": shade}
+            _draw_curve(axes, np.asarray(x), success, style)
+        axes.set_title(task, **_FONT, loc="left")
+        axes.set_xlim(0, max(float(np.asarray(x)[-1]) for x, _ in curves.values()))
+        axes.set_ylim(-0.03, 1.03)
+        axes.set_xlabel(over[task], **{**_FONT, "size": 9})
+        _thousands(axes)
+    for axes in grid[::columns]:
+        axes.set_ylabel("success rate", **_FONT)
+    shown = {name for curves in panels.values() for name in curves}
+    note = _seeds_note([success for curves in panels.values() for _, success in curves.values()])
+    _legend_below(figure, {name: looks[name] for name in order if name in shown}, thick, note)
+    figure.suptitle(title, x=0.01, ha="left", size=12, weight="bold", color=_INK)
+    return _save(figure, path)
+
+
+def severity(
+    path: Path,
+    gaps: Sequence[str],
+    scores: Mapping[str, Sequence[ArrayLike | None]],
+    needed: Mapping[str, Sequence[tuple[int, bool] | None]],
+    *,
+    title: str,
+    success: str,
+    transitions: str,
+    order: Sequence[str],
+    thick: Collection[str] = (),
+) -> Path:
+    """Methods on gaps that get harder: success, IQM over seeds with its 95 % interval, and what it took to get there.
+
+    scores: {method: success [n_seeds] on each gap}. needed: {method: real transitions on each gap, and whether they
+    were enough}, an open triangle where not. None where there is no run. success, transitions: names of the two axes.
+    order, thick: as for `curve_panels`.
+    """
+    figure, (left, right) = _figure(7.8, 3.2, columns=2)
+    looks, shift = _looks_of(order), _shifts(len(scores))
+    for (name, each), dx in zip(scores.items(), shift, strict=True):
+        look, weight = looks[name], _THICK if name in thick else _THIN
+        bands = [None if score is None else iqm_interval(score) for score in each]
+        x = np.arange(len(gaps)) + dx
+        height = np.array([np.nan if band is None else float(band.estimate) for band in bands])
+        for at, band in zip(x, bands, strict=True):
+            if band is not None and np.isfinite(band.low):
+                left.plot([at, at], [band.low, band.high], color=look["color"], linewidth=weight / 2)
+        left.plot(x, height, **look, linewidth=weight, marker="o", markersize=4, clip_on=False)
+        counts = np.array([np.nan if point is None else point[0] for point in needed[name]])
+        enough = np.array([point is not None and point[1] for point in needed[name]])
+        # nan, not left out: no line may lead past a gap where the method did not get there.
+        right.plot(x, np.where(enough, counts, np.nan), **look, linewidth=weight, marker="o", markersize=4)
+        right.plot(x[~enough], counts[~enough], color=look["color"], marker="^", mfc="white", linestyle="")
+    left.set_ylim(-0.03, 1.03)
+    right.set_ylim(bottom=0)
+    right.yaxis.set_major_formatter(lambda n, _: f"{n:,.0f}")
+    for axes, words in ((left, success), (right, transitions)):
+        axes.set_xlim(-0.5, len(gaps) - 0.5)
+        axes.set_xticks(range(len(gaps)), gaps)
+        axes.set_title(words, **_FONT, loc="left")
+    note = _seeds_note([score for each in scores.values() for score in each if score is not None], "interval")
+    note = "; ".join(filter(None, [note, "triangle: so many were not enough"]))
+    _legend_below(figure, {name: looks[name] for name in order if name in scores}, thick, note)
+    figure.suptitle(title, x=0.01, ha="left", size=12, weight="bold", color=_INK)
     return _save(figure, path)
 
 
@@ -202,11 +286,12 @@ def _dynamics_panel(axes: Axes, error: np.ndarray, baseline: ArrayLike | None) -
 # ---------------------------------------------------------------- the look
 
 
-def _figure(width: float, height: float, *, columns: int) -> tuple[Figure, Sequence[Axes]]:
-    """A figure without pyplot (no global state, no window), axes without frame."""
+def _figure(width: float, height: float, *, columns: int, count: int | None = None) -> tuple[Figure, Sequence[Axes]]:
+    """A figure without pyplot (no global state, no window), axes without frame. count: of panels; default one row."""
     figure = Figure(figsize=(width, height), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
-    panels = [figure.add_subplot(1, columns, i + 1) for i in range(columns)]
+    count = count or columns
+    panels = [figure.add_subplot(math.ceil(count / columns), columns, i + 1) for i in range(count)]
     for axes in panels:
         axes.spines[["top", "right"]].set_visible(False)
         axes.spines[["left", "bottom"]].set_color(_FAINT)
@@ -223,10 +308,39 @@ def _save(figure: Figure, path: Path) -> Path:
     return path
 
 
+def _draw_curve(axes: Axes, x: np.ndarray, success: ArrayLike, style: Mapping[str, Any]) -> float:
+    """IQM over seeds [n_seeds, n] with its band, `shade` of the style opaque; returns where the line ends."""
+    band = iqm_interval(success)
+    line = {key: value for key, value in style.items() if key != "shade"}
+    if np.isfinite(band.low).all():
+        axes.fill_between(x, band.low, band.high, color=style["color"], alpha=style["shade"], linewidth=0)
+    axes.plot(x, band.estimate, **line, clip_on=False)
+    return float(band.estimate[-1])
+
+
+def _shade(curves: int) -> float:
+    """How opaque the bands of so many curves are: all of them together must not hide the lines."""
+    return 0.18 if curves <= len(PALETTE) else 0.06
+
+
+def _seeds_note(successes: Sequence[ArrayLike], what: str = "band") -> str:
+    """What the lines and bands of these results [n_seeds, ...] are."""
+    seeds = sorted({np.asarray(success).shape[0] for success in successes})
+    if not seeds:
+        return ""
+    counts = str(seeds[0]) if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]}"
+    several = seeds[-1] > 1
+    return f"interquartile mean of {counts} seed{'s' * several}" + f", 95 % bootstrap {what}" * several
+
+
 def _looks(count: int) -> list[dict[str, Any]]:
     """Colour and dashes of so many lines, all different."""
     n = len(PALETTE)
     return [{"color": PALETTE[i % n], "linestyle": _DASHES[i // n % len(_DASHES)]} for i in range(count)]
+
+
+def _looks_of(order: Sequence[str]) -> dict[str, dict[str, Any]]:
+    return dict(zip(order, _looks(len(order)), strict=True))
 
 
 def _label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]]) -> None:
@@ -248,6 +362,31 @@ def _label_ends(axes: Axes, ends: Sequence[tuple[float, float, str, str]]) -> No
             va="center",
             annotation_clip=False,
         )
+
+
+def _grid(count: int) -> tuple[float, int]:
+    """Width (inches) of a figure of so many panels, and in how many columns they stand: three at most."""
+    columns = min(count, 2 if count == 4 else 3)
+    return {1: 6.4, 2: 7.8, 3: 10.4}[columns], columns
+
+
+def _shifts(count: int) -> np.ndarray:
+    """How far to the side each of so many points at one place goes, so that they do not hide one another."""
+    return np.linspace(-0.5, 0.5, count) * min(0.6, 0.12 * (count - 1)) if count > 1 else np.zeros(1)
+
+
+def _legend_below(figure: Figure, looks: Mapping[str, Mapping[str, Any]], thick: Collection[str], note: str) -> None:
+    """One legend for all panels, row by row in the order of the looks, under a note; the figure grows by its height."""
+    width, height = figure.get_size_inches()
+    columns = max(1, min(len(looks), int(width / (0.085 * max(map(len, looks)) + 0.65))))
+    figure.set_size_inches(width, height + 0.2 * math.ceil(len(looks) / columns) + 0.3)
+    names = [name for i in range(columns) for name in list(looks)[i::columns]]  # matplotlib fills column by column
+    lines = [Line2D([], [], **looks[name], linewidth=_THICK if name in thick else _THIN) for name in names]
+    legend = figure.legend(
+        lines, names, loc="outside lower center", ncols=columns, frameon=False, fontsize=9, labelcolor=_INK,
+        handlelength=3, title=note, title_fontproperties={"size": 8},
+    )  # fmt: skip
+    legend.get_title().set_color(_GREY)
 
 
 def _spread(values: Sequence[float], *, gap: float, top: float = 1.0) -> list[float]:

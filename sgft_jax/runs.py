@@ -5,12 +5,13 @@ import fcntl
 import importlib.metadata
 import os
 import platform
+import re
 import shlex
 import shutil
 import subprocess
 import sys
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from sgft_jax.jsonfile import read_json, write_json
 from sgft_jax.types import UserError
 
 CONFIG, PROVENANCE = "config.json", "provenance.json"
+ROOT = Path(__file__).parent.parent  # of the repository, in a checkout
 _LOCK = ".lock"
 _MARK = "sgft_jax"
 _PACKAGES = ("sgft-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
@@ -120,18 +122,33 @@ def open_runs(
 
 
 def provenance() -> dict[str, Any]:
-    """Where results come from: command, time, code, versions, device. Names no host and no user."""
+    """Where results come from: command, time, code, versions, device. Names no host, no user and no home folder."""
     import jax
 
     device = jax.devices()[0]
+    words = [plain_path(word, [Path.cwd(), ROOT]) for word in sys.argv[1:]]
     return {
-        "command": shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": shlex.join([Path(sys.argv[0]).name, *words]),
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "git": _git_state(Path(__file__).parent.parent),
+        "git": _git_state(ROOT),
         "python": platform.python_version(),
         "versions": {name: _version(name) for name in _PACKAGES},
         "device": {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()},
     }
+
+
+def plain_path(word: str, bases: Sequence[Path]) -> str:
+    """A word of a command line, or any text, without the folders of the machine that it was written on.
+
+    An absolute path, alone or behind `option=`, becomes relative to the first of the folders `bases` that it lies in;
+    of one that lies in none `.../` and the last name are left. Everything else stays as it is.
+    """
+    found = re.fullmatch(r"([\w.-]+=)?(~?/.*)", word, re.DOTALL)
+    if found is None:
+        return word
+    option, path = found[1] or "", Path(found[2])
+    inside = [path.relative_to(base) for base in bases if path.is_relative_to(base)]
+    return option + (str(inside[0]) if inside else f".../{path.name}")
 
 
 def _version(package: str) -> str:

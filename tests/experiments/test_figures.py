@@ -1,12 +1,11 @@
 """Figures and tables from run folders made by hand."""
 
-import json
-
 import numpy as np
 import pytest
+from runs_by_hand import save
 
 import envs
-from experiments import cli, figures
+from experiments import cli, figures, tables
 from experiments.results import read_curve
 
 
@@ -14,19 +13,6 @@ from experiments.results import read_curve
 def _cheap(monkeypatch):
     monkeypatch.setitem(envs.TASKS, "toy", "toy")
     monkeypatch.setattr(cli, "set_up", lambda: None)
-
-
-def save(out, method, success, *, rollouts, real="default", seeds="seeds-0-1", wanted=None):
-    """A run of task toy: success [evaluations][seeds] after so many rollouts of 20 steps of 0.1 s."""
-    folder = out / "finetune/toy" / real / method / seeds
-    folder.mkdir(parents=True)
-    with open(folder / "eval.jsonl", "w") as file:
-        for n, each in zip(rollouts, success, strict=True):
-            line = {"step": 20 * n, "rollouts": n, "robot_minutes": n * 20 * 0.1 / 60}
-            file.write(json.dumps({**line, "success": each, "return": each}) + "\n")
-    config = {"rollouts": wanted or rollouts[-1]}
-    (folder / "config.json").write_text(json.dumps({"sgft_jax": "0", "kind": "finetune", "config": config}))
-    return folder
 
 
 def call(*argv):
@@ -54,14 +40,14 @@ def test_a_row_says_what_the_curve_says(tmp_path):
         "3.3",
     ]
     # Areas to 50 rollouts: 20 * (0.2 + 0.1) / 2 + 30 * (0.1 + 0.8) / 2 = 16.5 of 50 or 33 %; 5 + 16.5 = 21.5, 43 %.
-    assert figures.row("sac", curve, figures.BUDGETS, 50) == cells
-    assert len(cells) == len(figures.columns(figures.BUDGETS, 50))
+    assert tables.row("sac", curve, tables.BUDGETS, 50) == cells
+    assert len(cells) == len(tables.columns(tables.BUDGETS, 50))
 
 
 def test_budgets_not_reached_or_not_evaluated_stay_empty(tmp_path):
     folder = save(tmp_path, "sac", [[0.5], [0.6], [0.7]], rollouts=[0, 19, 50], seeds="seed-0")
     ended = "> 1,000"
-    assert figures.row("sac", read_curve(folder), (10, 50, 100), 0) == [
+    assert tables.row("sac", read_curve(folder), (10, 50, 100), 0) == [
         *("sac", "1", "50", "-", "70", "-", "70 (50)"),
         *(ended, ended, "-", "0", "1.7"),
     ]
@@ -88,12 +74,17 @@ def test_one_figure_and_one_table_per_real_system(tmp_path, capsys, monkeypatch)
     assert list(curves) == ["sgft-sac", "sgft-sac_horizon-4", "sac"]
     assert more["zero_shot"] == 0.25 and more["rollout_length"] == 20 and more["control_dt"] == pytest.approx(0.1)
     np.testing.assert_array_equal(curves["sac"][1], np.transpose(flat))
+    # Colours in both figures: the variant, which another figure lacks, must not move those of the methods.
+    assert all(more["order"] == ["sgft-sac", "sac", "sgft-sac_horizon-4"] for _, more in drawn.values())
+    titles = ["## All tasks", "## toy on the default", "## toy on the hard", "## The three transforms", "## Missing"]
+    assert sorted(titles, key=text.index) == titles and "## The horizon" not in text
     assert "| 20 rollouts |" in text and "50 rollouts" not in text  # no run got there
     assert text.index("| sgft-sac | 2 |") < text.index("| sac | 2 |") and "![toy on the default real system]" in text
     for missing in (
         "- toy/default: no run of sgft, sgft-tdmpc2, sgft-tdmpc2-code, tdmpc2, iql, rlpd, sac-online, frozen-critic, "
         "pbrs-branch, pbrs, sac-reset",
         "holds no evaluation yet",
+        "- toy/default: no two horizons of sgft-sac",
         "- toy/hard+latency=0.1: sgft-sac: seed-0 left out, seeds-0-1 has more seeds or rollouts",
         "- toy/hard+latency=0.1: sgft-sac: unfinished, 20 of 100 rollouts",
     ):

@@ -11,6 +11,12 @@ def scores(seeds):
     return np.clip(np.random.default_rng(0).uniform(0.2, 1.0, (seeds, len(X))), 0, 1)
 
 
+def pixels(image, color):
+    """How many have about that colour."""
+    wanted = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    return (np.abs(image[..., :3] - wanted).max(-1) < 0.01).sum()
+
+
 def test_learning_curves_draw_every_method(tmp_path):
     curves = {"SGFT-SAC": (X, scores(5)), "SAC": (X, scores(5) / 2)}
     path = plot.learning_curves(
@@ -19,8 +25,7 @@ def test_learning_curves_draw_every_method(tmp_path):
     image = matplotlib.image.imread(path)
     assert image.shape[:2] == (600, 1080)  # 7.2 x 4 inches at 150 dpi: readable at the width of a README
     for color in plot.PALETTE[:2]:
-        wanted = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
-        assert (np.abs(image[..., :3] - wanted).max(-1) < 0.01).sum() > 200
+        assert pixels(image, color) > 200
 
 
 def test_as_many_lines_as_methods_look_different():
@@ -37,8 +42,7 @@ def test_scaling_draws_lines_and_their_references(tmp_path):
     path = plot.scaling(tmp_path / "s.png", lines, {"push": ([32, 512], [1e5, 2e5])}, title="t", x="worlds", y="steps")
     image = matplotlib.image.imread(path)
     for color in plot.PALETTE[:2]:
-        wanted = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
-        assert (np.abs(image[..., :3] - wanted).max(-1) < 0.01).sum() > 200
+        assert pixels(image, color) > 200
 
 
 @pytest.mark.parametrize("n", [1, 200])
@@ -75,3 +79,43 @@ def test_labels_part(values, placed):
 @pytest.mark.parametrize(("minutes", "text"), [(1.66, "1.7 min"), (120.4, "120 min"), (1500, "1,500 min")])
 def test_minutes(minutes, text):
     assert plot._minutes(minutes) == text
+
+
+def test_a_method_keeps_its_colour_where_others_are_absent(tmp_path):
+    order = ["SGFT-SAC", "IQL", "SAC"]
+    path = plot.learning_curves(tmp_path / "one.png", {"SAC": (X, scores(3))}, title="Push", order=order)
+    image = matplotlib.image.imread(path)
+    assert pixels(image, plot.PALETTE[2]) > 200 and not pixels(image, plot.PALETTE[0])
+
+
+@pytest.mark.parametrize(("tasks", "methods"), [(1, 2), (2, 3), (5, 14)])
+def test_panels_share_a_legend(tmp_path, tasks, methods):
+    """As wide for 14 methods as for 2; only the legend makes it higher."""
+    names = [f"method-{i}" for i in range(methods)]
+    path = plot.curve_panels(
+        tmp_path / "panels.png",
+        {f"task {i}": {name: (X, scores(3) / (2 + j)) for j, name in enumerate(names[i:])} for i in range(tasks)},
+        title="All tasks",
+        over={f"task {i}": "rollouts" for i in range(tasks)},
+        order=[*names, "absent"],
+        thick=names[:1],
+    )
+    image = matplotlib.image.imread(path)
+    assert image.shape[1] == {1: 960, 2: 1170, 5: 1560}[tasks]
+    assert all(pixels(image, color) > 100 for color in plot.PALETTE[: min(methods, 7)])
+    assert (image[[0, -1]] > 0.99).all() and (image[:, [0, -1]] > 0.99).all()  # nothing is cut off at the border
+
+
+def test_no_line_leads_past_a_gap_where_a_method_failed(tmp_path):
+    """500, more than 900 and 500 transitions: two points and a triangle, without the line of 500, 500 and 500."""
+    gaps, unknown = ["mild", "default", "hard"], [None] * 3
+
+    def blue(middle):
+        path = plot.severity(
+            tmp_path / "severity.png", gaps, {"SAC": unknown}, {"SAC": [(500, True), middle, (500, True)]},
+            title="Push", success="success", transitions="transitions", order=["SAC"],
+        )  # fmt: skip
+        return pixels(matplotlib.image.imread(path), plot.PALETTE[0])
+
+    through, past, none = blue((500, True)), blue((900, False)), blue(None)
+    assert past < through - 200 and none < past

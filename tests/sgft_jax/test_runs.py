@@ -3,10 +3,12 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from sgft_jax.runs import Lock, open_run, open_runs, provenance
+from sgft_jax import runs
+from sgft_jax.runs import Lock, open_run, open_runs, plain_path, provenance
 from sgft_jax.types import UserError
 
 
@@ -156,9 +158,30 @@ def test_a_forgotten_run_frees_its_folder(tmp_path):
 
 
 def test_provenance_names_no_host_and_no_folder(monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["/home/someone/project/experiments/pretrain.py", "--task", "a b"])
+    monkeypatch.setattr(runs, "ROOT", Path("/home/someone/project"))
+    argv = ["/home/someone/project/experiments/pretrain.py", "--task", "a b", "--out=/home/someone/project/runs"]
+    monkeypatch.setattr(sys, "argv", [*argv, "--prior", "/scratch/someone/a/prior"])
+    monkeypatch.setattr(Path, "cwd", lambda: Path("/home/someone/project/docs"))
     record = provenance()
-    assert record["command"] == "pretrain.py --task 'a b'"
-    assert os.uname().nodename not in json.dumps(record)
+    assert record["command"] == "pretrain.py --task 'a b' --out=runs --prior .../prior"
+    assert os.uname().nodename not in json.dumps(record) and "someone" not in json.dumps(record)
     if record["git"] is not None:
         assert len(record["git"]["commit"]) == 40 and record["git"]["dirty"] == bool(record["git"]["changed"])
+
+
+@pytest.mark.parametrize(
+    ("word", "plain"),
+    [
+        ("/home/me/project/runs/a", "runs/a"),
+        ("/home/me/project", "."),
+        ("--out=/home/me/runs", "--out=.../runs"),
+        ("table=/data/x/my table.toml", "table=.../my table.toml"),
+        ("~/runs", ".../runs"),
+        ("/home/me/projects/runs", ".../runs"),  # begins alike, lies elsewhere
+        ("runs/a", "runs/a"),
+        ("action_scale=[1,0.5]", "action_scale=[1,0.5]"),
+        ("1/2", "1/2"),
+    ],
+)
+def test_paths_lose_the_folders_of_their_machine(word, plain):
+    assert plain_path(word, [Path("/home/me/project")]) == plain

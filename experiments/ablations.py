@@ -1,0 +1,206 @@
+"""What the parts of SGFT do and how far it carries, from runs on disk: transforms, horizon, severity of the gap.
+
+The horizon is that of Figure 5 of the SGFT paper.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from envs import gaps
+from experiments import tables
+from experiments.comparison import DEFAULT, ORDER, Comparison, Part, is_sgft, on_default, split
+from experiments.finetune_args import arguments
+from experiments.results import LEVELS, Curve, reached
+from sgft_jax import plot
+from sgft_jax.config import config_to_json
+from sgft_jax.methods import METHODS, Method, finetune_config
+
+HORIZON_METHOD = "sgft-sac"
+_BESIDE = (
+    "preset",
+    "prior",
+    "initial_rollouts",
+    "utd",
+)  # settings beside the options, equal where horizons are compared
+AFTER = 20  # rollouts at which severities are drawn: enough for SGFT on push, not for SAC (docs/results.md)
+_OTHER_KINDS = ("camera",)  # gaps that are not the others made worse: that one breaks what V_sim sees
+# A method takes the models from the prior exactly if it branches, V_sim exactly if it shapes.
+_TRANSFORMS = {"branch": "uses_dynamics", "shape": "uses_value", "shorten": "finite_horizon"}
+_TRANSFORMS_LEGEND = (
+    "The methods that are SAC but for the transforms of its batches and for the critic that they begin with. "
+    "Shortening without shaping is none of them: a return over H steps without a value at its end is blind to all that "
+    "comes later."
+)
+
+
+# ---------------------------------------------------------------- branch, shape, shorten
+
+
+def transforms(comparisons: Sequence[Comparison]) -> Part:
+    """A table per task with runs of at least two of the methods on the default real system."""
+    grid = [name for name in ORDER if _is_sac(METHODS[name])]
+    texts, missing = [], []
+    for task, comparison in on_default(comparisons).items():
+        curves = {name: comparison.curves[name] for name in grid if name in comparison.curves}
+        if len(curves) < 2:
+            missing.append(f"{task}/{DEFAULT}: no table of transforms, which takes two of {', '.join(grid)}")
+        else:
+            texts.append(f"### Transforms on {task}\n\n{_transforms_table(curves)}")
+    return Part([f"## The three transforms\n\n{_TRANSFORMS_LEGEND}", *texts] if texts else [], missing)
+
+
+def marks(method: Method) -> list[str]:
+    """A check mark or nothing for each transform: branch, shape, shorten."""
+    return ["✓" if getattr(method, has) else "" for has in _TRANSFORMS.values()]
+
+
+def _is_sac(method: Method) -> bool:
+    """Whether nothing but its transforms and its first critic make a method differ from SAC."""
+    return method.agent == "sac" and not method.options and not method.fresh
+
+
+def _transforms_table(curves: Mapping[str, Curve]) -> str:
+    common = min(int(curve.rollouts[-1]) for curve in curves.values())
+    head = ["method", *_TRANSFORMS, "critic", "seeds", f"transitions to {LEVELS[0]} %", "at the end (rollouts)",
+            f"area to {common} rollouts", "seeds behind"]  # fmt: skip
+    rows = [
+        [
+            name, *marks(METHODS[name]), "new" if METHODS[name].reset_critic else "kept", tables.seeds(curve),
+            tables.transitions(curve, LEVELS[0]), tables.end(curve), tables.area_to(curve, common),
+            tables.behind(curve),
+        ]
+        for name, curve in curves.items()
+    ]  # fmt: skip
+    return tables.markdown(head, rows)
+
+
+# ---------------------------------------------------------------- horizon
+
+
+class Setting(NamedTuple):
+    """What an ablation of the horizon may change; sorts by the horizon. More steps leave room for fewer branches."""
+
+    horizon: int
+    branches: int
+
+    def __str__(self) -> str:
+        usual = finetune_config(METHODS[HORIZON_METHOD]).branches
+        return f"H = {self.horizon}" + (f", {self.branches} branches" if self.branches != usual else "")
+
+
+def horizons(comparisons: Sequence[Comparison], target: Path) -> Part:
+    """A panel per task that has runs of SGFT-SAC with several horizons on the default real system, and one table."""
+    tasks, missing = {}, []
+    for task, comparison in on_default(comparisons).items():
+        found = by_horizon(comparison)
+        if len({setting.horizon for setting in found}) > 1:
+            tasks[task] = {setting: found[setting] for setting in sorted(found)}
+        else:
+            missing.append(f"{task}/{DEFAULT}: no two horizons of {HORIZON_METHOD} with all else equal")
+    if not tasks:
+        return Part([], missing)
+    path = plot.curve_panels(
+        target / "horizon.png",
+        {t: {str(s): (x.rollouts, x.success) for s, (_, x) in found.items()} for t, found in tasks.items()},
+        over={task: tables.rollouts_axis(x for _, x in found.values()) for task, found in tasks.items()},
+        title=f"{HORIZON_METHOD} by its horizon",
+        order=[str(setting) for setting in sorted({setting for found in tasks.values() for setting in found})],
+    )
+    head = ["task", "horizon", "run", "seeds", *(f"transitions to {level} %" for level in LEVELS),
+            "at the end (rollouts)", "seeds behind"]  # fmt: skip
+    rows = [
+        [
+            task, str(setting), name, tables.seeds(curve), *(tables.transitions(curve, level) for level in LEVELS),
+            tables.end(curve), tables.behind(curve),
+        ]
+        for task, found in tasks.items()
+        for setting, (name, curve) in found.items()
+    ]  # fmt: skip
+    return Part([f"## The horizon\n\n![The horizon]({path.name})\n\n{tables.markdown(head, rows)}"], missing)
+
+
+def by_horizon(comparison: Comparison) -> dict[Setting, tuple[str, Curve]]:
+    """Name and curve of each run of SGFT-SAC that differs from the one without a variant, or else from the defaults, in
+    horizon and branches alone; of several with one setting the first.
+    """
+    usual = comparison.configs.get(HORIZON_METHOD) or config_to_json(arguments(HORIZON_METHOD))
+    found: dict[Setting, tuple[str, Curve]] = {}
+    for name, curve in comparison.curves.items():
+        config = comparison.configs[name]
+        if split(name)[0] == HORIZON_METHOD and "options" in config and _alike(config, usual):
+            setting = Setting(config["options"]["horizon"], config["options"]["branches"])
+            found.setdefault(setting, (name, curve))
+    return found
+
+
+def _alike(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two runs differ in horizon and branches alone, of all that both versions of the program knew."""
+    first, second = ({**c["options"], **{name: c.get(name) for name in _BESIDE}} for c in (one, other))
+    return all(first[name] == second[name] for name in first.keys() & second.keys() - set(Setting._fields))
+
+
+# ---------------------------------------------------------------- severity of the gap
+
+
+def severity(comparisons: Sequence[Comparison], target: Path, order: Sequence[str]) -> Part:
+    """A figure and a table per task for the methods that ran on several of its gaps, in the order of their file."""
+    texts, missing = [], []
+    for task in dict.fromkeys(c.task for c in comparisons):
+        scale = [name for name in gaps.presets(task) if name not in _OTHER_KINDS]
+        ran = {c.real: c.curves for c in comparisons if c.task == task and c.real in scale}
+        steps = [real for real in scale if real in ran]
+        lines = {n: {real: ran[real][n] for real in steps if n in ran[real]} for n in order}
+        lines = {name: curves for name, curves in lines.items() if len(curves) > 1}
+        if lines:
+            texts.append(_severity_section(task, steps, lines, target, order))
+        elif len(scale) > 1:
+            missing.append(f"{task}: no method has run on more than one gap of {', '.join(scale)}")
+    return Part(["## How hard the gap is", *texts] if texts else [], missing)
+
+
+def _severity_section(
+    task: str, steps: Sequence[str], lines: Mapping[str, Mapping[str, Curve]], target: Path, order: Sequence[str]
+) -> str:
+    title = f"{task} by severity of the gap"
+    path = plot.severity(
+        target / f"severity-{task}.png",
+        steps,
+        {name: [_after(curves.get(real)) for real in steps] for name, curves in lines.items()},
+        {name: [_needed(curves.get(real)) for real in steps] for name, curves in lines.items()},
+        title=title,
+        success=f"success after {AFTER} rollouts",
+        transitions=f"real transitions to {LEVELS[0]} %",
+        order=order,
+        thick=[name for name in order if is_sgft(name)],
+    )
+    longest = max(int(curve.rollouts[-1]) for curves in lines.values() for curve in curves.values())
+    budgets = [n for n in tables.BUDGETS if n <= longest]
+    head = ["method", "gap", "seeds", "zero-shot", *(f"{n} rollouts" for n in budgets),
+            f"transitions to {LEVELS[0]} %", "seeds behind"]  # fmt: skip
+    rows = [
+        [
+            name, real, tables.seeds(curve), tables.percent(curve.success[:, 0]),
+            *(tables.at(curve, n) for n in budgets), tables.transitions(curve, LEVELS[0]), tables.behind(curve),
+        ]
+        for name, curves in lines.items()
+        for real, curve in curves.items()
+    ]  # fmt: skip
+    return f"### {title}\n\n![{title}]({path.name})\n\n{tables.markdown(head, rows)}"
+
+
+def _after(curve: Curve | None) -> np.ndarray | None:
+    """Success [seeds] at the last evaluation after at most `AFTER` rollouts; None for a run that did not get there."""
+    if curve is None or curve.rollouts[-1] < AFTER:
+        return None
+    return curve.success[:, np.flatnonzero(curve.rollouts <= AFTER)[-1]]
+
+
+def _needed(curve: Curve | None) -> tuple[int, bool] | None:
+    """Transitions to 90 % or, with False, those that were not enough; None without a run."""
+    if curve is None:
+        return None
+    n = reached(curve, LEVELS[0])
+    return (int(curve.transitions[-1]), False) if n is None else (n, True)

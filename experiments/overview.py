@@ -1,0 +1,126 @@
+"""All tasks at once: every method's learning curve on the default real system, and who needs how many times fewer.
+
+The figure is that of Figure 4 of the SGFT paper.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from experiments import tables
+from experiments.comparison import DEFAULT, Comparison, Part, is_sgft, names_of, on_default, split
+from experiments.results import LEVELS, Curve, left_behind, reached
+from sgft_jax import plot
+from sgft_jax.methods import METHODS
+
+_LEVEL = LEVELS[0]
+_LEGEND = (
+    f"Real transitions until the mean over seeds is at {_LEVEL} %; > where the run ended before; in brackets the seeds "
+    f"that end below {_LEVEL} %, if there are any."
+)
+_TIMES = (
+    "How many times as many transitions the best method that is not SGFT needs: the one that got there, or ended "
+    "without, after the fewest. > where it ended without, < where SGFT did, - where both did or nothing was to be "
+    "learned. SGFT is what shapes rewards and shortens the horizon, or plans H steps that end in a frozen V_sim."
+)
+
+
+def overview(comparisons: Sequence[Comparison], target: Path, order: Sequence[str]) -> Part:
+    """Figure and tables of all tasks with runs on the default real system.
+
+    target: the folder of the figures. order: of the methods in all figures, which gives them their colours.
+    """
+    tasks = on_default(comparisons)
+    if not tasks:
+        return Part([], [f"all tasks: no run on a real system {DEFAULT}"])
+    texts = ["## All tasks"]
+    for variant, panels in _panels(tasks).items():
+        title = "Fine-tuning on the default real systems" + (f", {variant}" if variant else "")
+        path = target / ("_".join(filter(None, ["overview", variant])) + ".png")
+        texts.append(f"![{title}]({_draw(panels, path, title, order).name})")
+    best = {task: best_other(comparison.curves) for task, comparison in tasks.items()}
+    own = [name for name in names_of(tasks.values()) if is_sgft(name)]
+    texts += [_LEGEND, _table(tasks)]
+    if not own or not any(best.values()):
+        return Part(texts, [f"all tasks: how many times fewer takes {DEFAULT} runs of SGFT and of another method"])
+    return Part([*texts, _TIMES, _comparison(tasks, best, own)], [])
+
+
+def times_fewer(other: Curve, own: Curve) -> str:
+    """How many times as many transitions to 90 % one run needs as another, "> 3.2" if at least; "-" if none can say."""
+    needs = [reached(curve, _LEVEL) for curve in (other, own)]
+    ends = [int(curve.transitions[-1]) if n is None else n for curve, n in zip((other, own), needs, strict=True)]
+    if needs == [None, None] or 0 in ends:
+        return tables.NONE
+    tenths, own_end = 10 * ends[0], ends[1]
+    if needs[0] is None:
+        return f"> {tenths // own_end / 10:.1f}"  # a bound must stay one when it is rounded
+    return f"< {-(-tenths // own_end) / 10:.1f}" if needs[1] is None else f"{tenths / own_end / 10:.1f}"
+
+
+def best_other(curves: Mapping[str, Curve]) -> str | None:
+    """Of the methods that are not SGFT the one that got to 90 %, or ended without, after the fewest transitions.
+
+    One that ended early bounds what is known of the best. A method of one's own is nobody's baseline.
+    """
+    others = [n for n, c in curves.items() if split(n)[0] in METHODS and not is_sgft(n) and c.transitions[-1] > 0]
+
+    def needs(name: str) -> tuple[int, bool]:
+        n = reached(curves[name], _LEVEL)
+        return (int(curves[name].transitions[-1]), True) if n is None else (n, False)
+
+    return min(others, key=needs, default=None)
+
+
+def _panels(tasks: Mapping[str, Comparison]) -> dict[str, dict[str, dict[str, Curve]]]:
+    """[variant][task][name]: the methods themselves, and variants that several methods have, such as `tuned`."""
+    methods: dict[str, set[str]] = {"": set()}
+    for name in names_of(tasks.values()):
+        method, variant = split(name)
+        methods.setdefault(variant, set()).add(method)
+    found = {}
+    for variant in [v for v, those in methods.items() if len(those) > bool(v)]:
+        panels = {t: {n: x for n, x in c.curves.items() if split(n)[1] == variant} for t, c in tasks.items()}
+        found[variant] = {task: curves for task, curves in panels.items() if curves}
+    return found
+
+
+def _draw(panels: Mapping[str, Mapping[str, Curve]], path: Path, title: str, order: Sequence[str]) -> Path:
+    """Over rollouts, as in the paper: episodes of the tasks differ in length, and what a robot does is episodes."""
+    return plot.curve_panels(
+        path,
+        {task: {name: (x.rollouts, x.success) for name, x in curves.items()} for task, curves in panels.items()},
+        over={task: tables.rollouts_axis(curves.values()) for task, curves in panels.items()},
+        title=title,
+        order=order,
+        thick=[name for name in order if is_sgft(name)],
+    )
+
+
+def _table(tasks: Mapping[str, Comparison]) -> str:
+    """Rows of methods, columns of tasks."""
+
+    def cell(comparison: Comparison, name: str) -> str:
+        if name not in comparison.curves:
+            return tables.NONE
+        curve = comparison.curves[name]
+        return tables.transitions(curve, _LEVEL) + (f" ({tables.behind(curve)})" if left_behind(curve) else "")
+
+    names = names_of(tasks.values())
+    return tables.markdown(["method", *tasks], [[name, *(cell(c, name) for c in tasks.values())] for name in names])
+
+
+def _comparison(tasks: Mapping[str, Comparison], best: Mapping[str, str | None], own: Sequence[str]) -> str:
+    """The methods `own` in rows against the best other method of each task."""
+
+    def cell(task: str, name: str) -> str:
+        other, curves = best[task], tasks[task].curves
+        return times_fewer(curves[other], curves[name]) if other and name in curves else tables.NONE
+
+    def against(task: str, name: str | None) -> str:
+        return f"{name}: {tables.transitions(tasks[task].curves[name], _LEVEL)}" if name else tables.NONE
+
+    rows = [
+        ["best that is not SGFT", *(against(*each) for each in best.items())],
+        *([name, *(cell(task, name) for task in tasks)] for name in own),
+    ]
+    return tables.markdown(["", *tasks], rows)

@@ -1,0 +1,85 @@
+"""Tables in Markdown, and how the numbers of a learning curve are written in them. Pure functions."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from experiments.results import LEVELS, Curve, area, describe_run, left_behind, reached
+from sgft_jax.stats import iqm_interval
+
+BUDGETS = (10, 20, 50, 100)  # rollouts at which tables compare, as far as a run got
+NONE = "-"
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table of these cells."""
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, ["---"] * len(head), *rows))
+
+
+def columns(budgets: Sequence[int], common: int) -> list[str]:
+    """The names of the cells in a `row`."""
+    return [
+        "method", "seeds", "zero-shot", *(f"{n} rollouts" for n in budgets), "at the end (rollouts)",
+        *(f"transitions to {level} %" for level in LEVELS), f"area to {common} rollouts", "deepest dip",
+        "robot minutes",
+    ]  # fmt: skip
+
+
+def row(method: str, curve: Curve, budgets: Sequence[int], common: int) -> list[str]:
+    """The cells of one method, with its success after so many rollouts. common: rollouts that all methods got to."""
+    return [
+        method,
+        seeds(curve),
+        percent(curve.success[:, 0]),
+        *(at(curve, rollouts) for rollouts in budgets),
+        end(curve),
+        *(transitions(curve, level) for level in LEVELS),
+        area_to(curve, common),
+        f"{100 * describe_run(curve)['dip']['mean']:.0f}",
+        f"{curve.robot_minutes[-1]:.1f}",
+    ]
+
+
+def seeds(curve: Curve) -> str:
+    """How many there are."""
+    return str(curve.success.shape[0])
+
+
+def percent(success: np.ndarray) -> str:
+    """Interquartile mean over seeds [seeds] with its 95 % interval, in per cent."""
+    band = iqm_interval(success)
+    interval = f" [{100 * band.low:.0f}, {100 * band.high:.0f}]" if len(success) > 1 else ""
+    return f"{100 * band.estimate:.0f}{interval}"
+
+
+def at(curve: Curve, rollouts: int) -> str:
+    """Success at the evaluation after exactly so many rollouts."""
+    (index,) = np.nonzero(curve.rollouts == rollouts)
+    return percent(curve.success[:, index[-1]]) if index.size else NONE
+
+
+def end(curve: Curve) -> str:
+    """Success at the last evaluation, and after how many rollouts that was."""
+    return f"{percent(curve.success[:, -1])} ({curve.rollouts[-1]})"
+
+
+def transitions(curve: Curve, level: int) -> str:
+    """Real transitions until the mean over seeds is at so many per cent, or how many were not enough."""
+    n = reached(curve, level)
+    return f"> {curve.transitions[-1]:,}" if n is None else f"{n:,}"
+
+
+def area_to(curve: Curve, rollouts: int) -> str:
+    """Mean success over the real transitions up to so many rollouts."""
+    return percent(area(curve, rollouts)) if rollouts else NONE
+
+
+def behind(curve: Curve) -> str:
+    """Seeds that end below 90 %, of how many."""
+    return f"{left_behind(curve)} of {seeds(curve)}"
+
+
+def rollouts_axis(curves: Iterable[Curve]) -> str:
+    """The words at an axis of rollouts: how much robot time the longest of these runs took."""
+    longest = max(curves, key=lambda curve: curve.rollouts[-1])
+    return f"rollouts ({longest.rollouts[-1]}: {longest.robot_minutes[-1]:.1f} min of robot time)"
