@@ -147,22 +147,25 @@ def _devices(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
 
 class Growth(NamedTuple):
     """What a figure shows of a part. sizes: columns of which the one with the most values becomes the x axis; the other
-    ones and `by` tell lines apart. y: the column drawn. reference: the column drawn dashed.
+    ones and `by` tell lines apart. y: the column drawn, called `label`. reference: the column drawn dashed.
     """
 
     sizes: tuple[str, ...]
     y: str
+    label: str
     by: tuple[str, ...] = ()
     reference: str | None = None
 
 
 _GROWTH = {
-    "physics": Growth(("worlds",), "env_per_s", ("task", "impl"), "bare_per_s"),
-    "updates": Growth(("batch", "seeds"), "updates_per_s", reference="bare_per_s"),
-    "plain": Growth(("batch",), "updates_per_s"),
-    "pretrain": Growth(("seeds",), "seconds", ("task", "impl")),
-    "finetune": Growth(("seeds",), "seconds", ("task", "impl")),
-    "devices": Growth(("devices", "worlds", "batch"), "env_per_s", ("task", "impl"), "ideal_per_s"),
+    "physics": Growth(("worlds",), "env_per_s", "physics steps per second", ("task", "impl"), "bare_per_s"),
+    "updates": Growth(("batch", "seeds"), "updates_per_s", "updates per second", reference="bare_per_s"),
+    "plain": Growth(("batch",), "updates_per_s", "updates per second"),
+    "pretrain": Growth(("seeds",), "seconds", "seconds", ("task", "impl")),
+    "finetune": Growth(("seeds",), "seconds", "seconds", ("task", "impl")),
+    "devices": Growth(
+        ("devices", "worlds", "batch"), "env_per_s", "environment steps per second", ("task", "impl"), "ideal_per_s"
+    ),
 }
 
 
@@ -184,8 +187,7 @@ def draw(part: str, lines: list[dict[str, Any]], path: Path) -> Path | None:
         return found
 
     references = curves(growth.reference) if growth.reference else {}
-    y = growth.y.replace("_per_s", " per second")
-    return plot.scaling(path, curves(growth.y), references, title=_TITLES[part], x=x, y=y)
+    return plot.scaling(path, curves(growth.y), references, title=_TITLES[part], x=x, y=growth.label)
 
 
 _PARTS: dict[Part, Callable[[BenchmarkConfig], Iterator[dict[str, Any]]]] = {
@@ -197,12 +199,12 @@ _PARTS: dict[Part, Callable[[BenchmarkConfig], Iterator[dict[str, Any]]]] = {
     "devices": _devices,
 }
 _TITLES = {
-    "physics": "physics steps per second",
-    "updates": "updates of pretraining per second",
-    "plain": "updates of plain SAC per second",
+    "physics": "environments",
+    "updates": "updates of pretraining",
+    "plain": "updates of plain SAC",
     "pretrain": "pretraining",
     "finetune": "fine-tuning with SGFT-SAC",
-    "devices": "environment steps of pretraining per second",
+    "devices": "pretraining on several devices",
 }
 
 

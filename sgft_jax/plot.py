@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import EngFormatter, LogLocator
 from numpy.typing import ArrayLike
 
 from sgft_jax.stats import iqm_interval
@@ -175,6 +176,11 @@ def scaling(
     sizes = sorted({float(size) for points in lines.values() for size in np.asarray(points[0])})
     axes.set_xticks(sizes, [f"{size:,.0f}" for size in sizes])
     axes.minorticks_off()
+    low, high = axes.get_ylim()
+    axes.yaxis.set_major_locator(
+        LogLocator(subs=(1, 2, 5) if high < 30 * low else (1,))
+    )  # a decade has ticks of its own
+    axes.yaxis.set_major_formatter(EngFormatter(sep=" "))
     axes.set_xlabel(x, **_FONT)
     axes.set_ylabel(y, **_FONT)
     axes.legend(frameon=False, fontsize=9, labelcolor=_INK)
