@@ -69,7 +69,7 @@ def step_fleet(
     key_step, key_reset = jax.random.split(key)
     after = split_vmap(env.step)(pick(pool, fleet.index), fleet.state, actions, jax.random.split(key_step, n))
     valid = ~after.invalid
-    transitions = jax.vmap(lambda *step: _transition(*step, gamma=gamma))(fleet.state, actions, after)
+    transitions = split_vmap(lambda *step: _transition(*step, gamma=gamma))(fleet.state, actions, after)
     done = after.terminated | after.truncated | after.invalid
     # Fixed-length episodes end together, so most steps skip the (inverse kinematics of the) resets altogether.
     fleet = jax.lax.cond(

@@ -74,7 +74,7 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         return spread(PretrainState(agent, buffer, fleet, key_run, jnp.int32(0)))
 
     def sample(random: PyTree, buffer: PyTree, key: Key) -> PyTree:
-        """[updates, batch] rows, drawn at once; each batch holds its share of random-action rows."""
+        """[updates, batch] rows, drawn at once, batches in pieces; each holds its share of random-action rows."""
         key_random, key_replay = jax.random.split(key)
         updates, n_random = config.updates_per_step, round(config.random_fraction * config.batch_size)
 
@@ -83,7 +83,8 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
             return jax.tree.map(lambda x: x.reshape(updates, n, *x.shape[1:]), rows)
 
         old, new = draw(random, key_random, n_random), draw(buffer, key_replay, config.batch_size - n_random)
-        return jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), old, new)
+        both = jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), old, new)
+        return split(whole(both), axis=1)  # put together in pieces, they would travel between devices twice more
 
     def explore(agent: PyTree, obs: Array, key: Key) -> Array:
         """[n_envs, act_dim]: the policy's actions, more and more of them replaced by random ones along the fleet."""
@@ -100,7 +101,7 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         actions = explore(state.learner, state.fleet.state.obs, keys[1])
         fleet, rows, valid, after = step(pool, state.fleet, actions, keys[2])
         buffer = algorithm.add(state.replay, rows, valid, _ended(after))
-        batches = split(sample(random, buffer, keys[3]), axis=1)
+        batches = sample(random, buffer, keys[3])
         agent, metrics = jax.lax.scan(
             lambda agent, x: learner.update(agent, *x),
             state.learner.replace(hyper=algorithm.hyper(state.steps / (config.env_steps / config.n_envs))),

@@ -40,11 +40,10 @@ def add_batch(state: ReplayState, batch: Transition, valid: Array | None = None)
     if n > capacity:
         raise UserError(f"replay: {n} transitions at once do not fit a capacity of {capacity}; raise the capacity")
     valid = jnp.ones(n, bool) if valid is None else valid
-    rank = running_count(valid) - 1
-    rows = jnp.where(valid, (state.position + rank) % capacity, capacity)
-    count = jnp.sum(valid, dtype=jnp.int32)
+    count = running_count(valid)
+    rows = jnp.where(valid, (state.position + count - 1) % capacity, capacity)
     data = set_rows(state.data, rows, batch)
-    return ReplayState(data, (state.position + count) % capacity, jnp.minimum(state.size + count, capacity))
+    return ReplayState(data, (state.position + count[-1]) % capacity, jnp.minimum(state.size + count[-1], capacity))
 
 
 def sample(state: ReplayState, key: Key, n: int) -> Transition:

@@ -79,10 +79,10 @@ def add_episode(state: SequenceState, rows: Transition, valid: Array) -> Sequenc
         raise UserError(f"sequence ring: an episode needs a ring of 1 environment, this one is for {state.n_envs}")
     if steps > slots:
         raise UserError(f"sequence ring: an episode of {steps} steps does not fit {slots} slots; raise the capacity")
-    rank = running_count(valid) - 1
-    index = jnp.where(valid, (state.position + rank) % slots, slots)
+    count = running_count(valid)
+    index = jnp.where(valid, (state.position + count - 1) % slots, slots)
     last = valid & ~jnp.concatenate([valid[1:], jnp.zeros(1, bool)])
-    return _write(state, index, rows, valid, last, jnp.sum(valid, dtype=jnp.int32))
+    return _write(state, index, rows, valid, last, count[-1])
 
 
 def _write(

@@ -1,6 +1,8 @@
 """Programs on two devices (of the host, see conftest) compute what they compute on one."""
 
+import collections
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -77,6 +79,19 @@ def test_training_is_the_same_on_any_number_of_devices():
     for tree in (run.replay.data, run.fleet):
         assert {x.sharding.spec for x in jax.tree.leaves(tree)} == {CUT}
     assert all(x.sharding.is_fully_replicated for x in jax.tree.leaves((run.learner, metrics)))
+
+
+def test_little_travels_between_devices():
+    """A step of all environments: what they saw once to all, drawn rows summed, two sums of gradients an update."""
+    random, saved = begun(2)
+    with mesh.use(2):
+        text = program().chunk.lower(pools(), random, saved.run).compile().as_text()
+    kinds = "all-reduce|all-gather|all-to-all|collective-permute"
+    found = collections.Counter(re.findall(rf" ({kinds})(?:-start)?\(", text))
+    assert found["all-to-all"] == found["collective-permute"] == 0
+    assert found["all-reduce"] <= 6  # two of gradients, drawn rows, has an episode ended, two of metrics
+    leaves = len(jax.tree.leaves(replay.blank(1, 1)))
+    assert found["all-gather"] <= leaves + 2  # the rows, which of them are valid, and the ladder, once a chunk
 
 
 @pytest.mark.parametrize("capacity", [8, 9])
