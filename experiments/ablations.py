@@ -19,12 +19,8 @@ from sgft_jax.config import config_to_json
 from sgft_jax.methods import METHODS, Method, finetune_config
 
 HORIZON_METHOD = "sgft-sac"
-_BESIDE = (
-    "preset",
-    "prior",
-    "initial_rollouts",
-    "utd",
-)  # settings beside the options, equal where horizons are compared
+# Settings beside the options that are equal where horizons are compared.
+_BESIDE = ("preset", "prior", "initial_rollouts", "utd")
 AFTER = 20  # rollouts at which severities are drawn: enough for SGFT on push, not for SAC (docs/results.md)
 _OTHER_KINDS = ("camera",)  # gaps that are not the others made worse: that one breaks what V_sim sees
 # A method takes the models from the prior exactly if it branches, V_sim exactly if it shapes.
