@@ -4,6 +4,7 @@ physics: the step that training takes, with its own domain parameters in every w
 and automatic reset, against the bare engine under it, which repeats the same physics.
 updates: SAC updates of pretraining, with all its networks, against the same update written by hand in bare JAX.
 plain: updates of plain SAC, against Stable-Baselines3 and SBX where they are installed.
+values: V_sim of priors and the rewards that it shapes in each precision, against float32.
 pretrain, finetune: seconds of the whole commands, with what the time goes into.
 devices: pretraining on several devices with as many times the environments and batches (weak scaling), against as many
 times one device.
@@ -20,13 +21,14 @@ from rich.table import Table
 import envs
 from envs.physics import Impl, choose_impl
 from experiments import cli
-from experiments.bench import physics, training, updates
+from experiments.bench import physics, training, updates, values
 from experiments.presets import PRESETS
 from sgft_jax import plot, runs
 from sgft_jax.log import write_summary
+from sgft_jax.networks import Precision
 from sgft_jax.types import UserError
 
-type Part = Literal["physics", "updates", "plain", "pretrain", "finetune", "devices"]
+type Part = Literal["physics", "updates", "plain", "values", "pretrain", "finetune", "devices"]
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class BenchmarkConfig:
     parts: tuple[Part, ...] = ("physics", "updates", "plain")
     """Kinds of measurements."""
     tasks: tuple[str, ...] = ("push", "hammer", "insert")
-    """Tasks, of physics, pretrain, finetune and devices."""
+    """Tasks, of all but updates and plain."""
     worlds: tuple[int, ...] = (1024,)
     """Worlds stepped together; in devices, by each device."""
     impls: tuple[Impl, ...] = ("auto",)
@@ -47,6 +49,8 @@ class BenchmarkConfig:
     """Batch sizes of the updates; in devices, of each device."""
     seeds: tuple[int, ...] = (1,)
     """Agents updated, pretrained or fine-tuned together."""
+    precisions: tuple[Precision, ...] = ("default",)
+    """Precisions of matrix products on GPUs, of updates and values."""
     width: int = 256
     """Units of both hidden layers of the updates' networks; critics and values of pretraining have LayerNorm."""
     updates: int = 200
@@ -60,7 +64,7 @@ class BenchmarkConfig:
     devices: tuple[int, ...] = (1,)
     """Numbers of devices; the smallest is what the others are compared with."""
     prior: Path | None = None
-    """Folder of the priors that finetune starts from."""
+    """Folder of the priors that finetune starts from and values evaluates."""
     rollouts: int = 30
     """Of finetune."""
     out: Path = Path("runs")
@@ -98,8 +102,9 @@ def _check(config: BenchmarkConfig) -> None:
         least = min(value, default=0) if isinstance(value, tuple) else value
         if least < 1:
             raise UserError(f"--{name.replace('_', '-')} is {least}: must be at least 1")
-    if "finetune" in config.parts and config.prior is None:
-        raise UserError("--parts finetune needs --prior FOLDER, as made by python -m experiments.pretrain")
+    for part in ("finetune", "values"):
+        if part in config.parts and config.prior is None:
+            raise UserError(f"--parts {part} needs --prior FOLDER, as made by python -m experiments.pretrain")
 
 
 def _physics(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
@@ -111,14 +116,22 @@ def _physics(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
 
 def _updates(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
     size = {"width": config.width, "updates": config.updates, "repeats": config.repeats}
-    for batch in config.batches:
-        for seeds in config.seeds:
-            yield updates.speed(batch, seeds, **size)
+    for exact in config.precisions:
+        for batch in config.batches:
+            for seeds in config.seeds:
+                yield updates.speed(batch, seeds, exact=exact, **size)
 
 
 def _plain(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
     for batch in config.batches:
         yield updates.plain_speed(batch, width=config.width, updates=config.updates, repeats=config.repeats)
+
+
+def _values(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    for task in config.tasks:
+        for impl in config.impls:
+            assert config.prior is not None  # checked before
+            yield from values.errors(task, impl, config.prior, config.precisions)
 
 
 def _pretrain(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
@@ -159,7 +172,7 @@ class Growth(NamedTuple):
 
 _GROWTH = {
     "physics": Growth(("worlds",), "env_per_s", "physics steps per second", ("task", "impl"), "bare_per_s"),
-    "updates": Growth(("batch", "seeds"), "updates_per_s", "updates per second", reference="bare_per_s"),
+    "updates": Growth(("batch", "seeds"), "updates_per_s", "updates per second", ("precision",), "bare_per_s"),
     "plain": Growth(("batch",), "updates_per_s", "updates per second"),
     "pretrain": Growth(("seeds",), "seconds", "seconds", ("task", "impl")),
     "finetune": Growth(("seeds",), "seconds", "seconds", ("task", "impl")),
@@ -170,7 +183,9 @@ _GROWTH = {
 
 
 def draw(part: str, lines: list[dict[str, Any]], path: Path) -> Path | None:
-    """How a part grows with worlds, batch or seeds; no figure of a single size."""
+    """How a part grows with worlds, batch, seeds or devices; no figure of a single size."""
+    if part not in _GROWTH:
+        return None
     growth = _GROWTH[part]
     x = max(growth.sizes, key=lambda name: len({line[name] for line in lines}))
     if len({line[x] for line in lines}) < 2:
@@ -194,6 +209,7 @@ _PARTS: dict[Part, Callable[[BenchmarkConfig], Iterator[dict[str, Any]]]] = {
     "physics": _physics,
     "updates": _updates,
     "plain": _plain,
+    "values": _values,
     "pretrain": _pretrain,
     "finetune": _finetune,
     "devices": _devices,
@@ -202,6 +218,7 @@ _TITLES = {
     "physics": "environments",
     "updates": "updates of pretraining",
     "plain": "updates of plain SAC",
+    "values": "V_sim by precision",
     "pretrain": "pretraining",
     "finetune": "fine-tuning with SGFT-SAC",
     "devices": "pretraining on several devices",

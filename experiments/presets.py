@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from sgft_jax.networks import NetworkConfig
+from sgft_jax.networks import NetworkConfig, Precision
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,8 @@ class PretrainConfig:
     policy_delay: int = 1
     """Critic updates per actor update."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
+    precision: Precision = "default"
+    """Of the updates' matrix products on GPUs. V_sim is evaluated in float32 whatever it was trained in."""
     ensemble_size: int = 5
     size: str = "5M"
     """TD-MPC2's networks by their published number of parameters: 1M, 5M, 19M, 48M or 317M."""

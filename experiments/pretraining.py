@@ -12,6 +12,7 @@ from experiments.algorithms import Algorithm, make_algorithm
 from experiments.presets import PretrainConfig
 from sgft_jax import normalizer, replay
 from sgft_jax.mesh import split, whole
+from sgft_jax.networks import precision
 from sgft_jax.types import Array, Key, Metrics, PyTree, Transition, UserError
 
 
@@ -102,11 +103,13 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         fleet, rows, valid, after = step(pool, state.fleet, actions, keys[2])
         buffer = algorithm.add(state.replay, rows, valid, _ended(after))
         batches = sample(random, buffer, keys[3])
-        agent, metrics = jax.lax.scan(
-            lambda agent, x: learner.update(agent, *x),
-            state.learner.replace(hyper=algorithm.hyper(state.steps / (config.env_steps / config.n_envs))),
-            (batches, jax.random.split(keys[4], config.updates_per_step)),
-        )
+        learner_now = state.learner.replace(hyper=algorithm.hyper(state.steps / (config.env_steps / config.n_envs)))
+        with precision(config.precision):
+            agent, metrics = jax.lax.scan(
+                lambda agent, x: learner.update(agent, *x),
+                learner_now,
+                (batches, jax.random.split(keys[4], config.updates_per_step)),
+            )
         metrics = {k: v.mean() for k, v in metrics.items()} | _fleet_metrics(after, rows, valid)
         return spread(PretrainState(agent, buffer, fleet, keys[0], state.steps + 1)), metrics
 

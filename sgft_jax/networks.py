@@ -1,8 +1,9 @@
 """Network bodies as pure `init` / `apply` pairs for one example, and the tanh-Gaussian policy distribution."""
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, cast
+from typing import Literal, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,18 @@ from sgft_jax.types import Array, Key, PyTree, UserError
 LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0  # O-5
 
 _ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"relu": nn.relu, "tanh": nn.tanh, "silu": nn.silu, "elu": nn.elu}
+
+type Precision = Literal["default", "float32", "bfloat16"]
+_MATMUL: dict[Precision, str] = {"default": "default", "float32": "highest", "bfloat16": "BF16_BF16_F32"}
+
+
+def precision(name: Precision) -> contextlib.AbstractContextManager:
+    """How exactly the matrix products that are traced in a `with` block read their inputs; sums always are float32.
+
+    default: what JAX does, TF32 with 10 bits of mantissa on GPUs that have it. float32: all 23 bits. bfloat16: 7 bits.
+    CPUs compute in float32 whatever is asked for.
+    """
+    return jax.default_matmul_precision(_MATMUL[name])
 
 
 @dataclass(frozen=True)

@@ -3,18 +3,21 @@
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.networks import Network
+from sgft_jax.networks import Network, Precision, precision
 from sgft_jax.normalizer import normalize
 from sgft_jax.types import Array, Metrics, Normalizer, PyTree
 
 
-def predict(network: Network, params: PyTree, normalizer: Normalizer, obs: Array) -> Array:
+def predict(
+    network: Network, params: PyTree, normalizer: Normalizer, obs: Array, *, exact: Precision = "float32"
+) -> Array:
     """V(obs) []. obs: [obs_dim] raw units.
 
     Full float32 on every device: the shaped reward is the small difference of two large values, and the ten mantissa
-    bits of a GPU's default matrix products would drown it.
+    bits of a GPU's default matrix products are too few for it (docs/performance.md). exact: another precision, to
+    measure that.
     """
-    with jax.default_matmul_precision("highest"):
+    with precision(exact):
         return network.apply(params, normalize(normalizer, obs))
 
 

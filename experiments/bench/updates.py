@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from experiments.bench import bare_sac, other_sac
 from experiments.bench.timing import Timing, fastest, measure
 from sgft_jax import replay
-from sgft_jax.networks import NetworkConfig
+from sgft_jax.networks import NetworkConfig, Precision, precision
 from sgft_jax.sac import SACConfig, SACHyper, make_sac
 from sgft_jax.types import Key, PyTree, Transition
 
@@ -25,20 +25,23 @@ class Agent(NamedTuple):
     init: Callable[[Key], PyTree]
 
 
-def speed(batch: int, seeds: int, *, width: int, updates: int, repeats: int) -> dict[str, Any]:
+def speed(
+    batch: int, seeds: int, *, width: int, updates: int, repeats: int, exact: Precision = "default"
+) -> dict[str, Any]:
     """Updates of pretraining per second over all seeds: of the library, and of the hand-written one.
 
     gflop: of the matrix products alone. gb: bytes that the compiled update reads and writes, as XLA counts them.
     """
     network = NetworkConfig(hidden=(width, width), layer_norm=True)
     keys, count = jax.random.split(jax.random.key(0), seeds), seeds * updates
-    library, bare = (
-        _repeated(agent, batch, keys, updates, repeats) for agent in (_library(network), _by_hand(network, batch))
-    )
+    with precision(exact):
+        library, bare = (
+            _repeated(agent, batch, keys, updates, repeats) for agent in (_library(network), _by_hand(network, batch))
+        )
     flops, moved = multiplications(network) * 2 * batch, _bytes(_library(network), batch, keys)
     per_s = count / library.seconds
     return {
-        "batch": batch, "seeds": seeds, "width": width,
+        "batch": batch, "seeds": seeds, "width": width, "precision": exact,
         "updates_per_s": per_s, "bare_per_s": count / bare.seconds, "updates/bare": bare.seconds / library.seconds,
         "gflop_per_update": flops / 1e9, "tflop_per_s": per_s * flops / 1e12,
         "gb_per_update": moved / 1e9, "tb_per_s": per_s * moved / 1e12,
