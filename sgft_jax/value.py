@@ -14,8 +14,8 @@ def predict(
     """V(obs) []. obs: [obs_dim] raw units.
 
     Full float32 on every device: the shaped reward is the small difference of two large values, and the ten mantissa
-    bits of a GPU's default matrix products are too few for it (docs/performance.md). exact: another precision, to
-    measure that.
+    bits of a GPU's default matrix products would drown it. exact: another precision, to measure that
+    (`experiments.benchmark --parts values`).
     """
     with precision(exact):
         return network.apply(params, normalize(normalizer, obs))
