@@ -27,7 +27,7 @@ from sgft_jax import checkpoint, mesh, runs
 from sgft_jax.config import config_to_json
 from sgft_jax.finetune import make_finetuner
 from sgft_jax.log import RunProgress
-from sgft_jax.methods import METHODS, FinetuneConfig, Method
+from sgft_jax.methods import METHODS, FinetuneConfig, Method, policy_delay
 from sgft_jax.players import Player
 from sgft_jax.replay import ReplayState
 from sgft_jax.types import Array, Finetuner, Key, PyTree, UserError
@@ -103,10 +103,8 @@ class _Run:
 
     def work(self, records: list[Record], priors: PyTree, card: dict[str, Any]) -> list[dict[str, Any]]:
         """Everything, in order; returns the summaries. priors: [P]; seed i starts from prior i modulo P."""
-        args, self.records, done = self.args, records, _common_rollouts(records)
+        self.records, done = records, _common_rollouts(records)
         config = self._options(card)
-        if config.critic_warmup is None:
-            config = replace(config, critic_warmup=args.initial_rollouts * self._updates_per_rollout())
         self.simulation = self._simulate(config, priors, make_player(card)) if config.simulated_share else None
         if self.method.agent == "iql" and config.reward_scale is None:
             config = replace(config, reward_scale=self._reward_scale())
@@ -119,11 +117,14 @@ class _Run:
         return self._finish(self._train(state, done), card)
 
     def _options(self, card: dict[str, Any]) -> FinetuneConfig:
-        """Those of the command line, with what must be as the prior has it."""
-        own = {"gamma": card["gamma"]}
+        """Those of the command line, with what must be as the prior has it and what follows from `--utd`."""
+        options = self.args.options
+        own = {"gamma": card["gamma"], "policy_delay": policy_delay(options, self.args.utd)}
+        if options.critic_warmup is None:
+            own["critic_warmup"] = self.args.initial_rollouts * self._updates_per_rollout()
         if checkpoint.algorithm_of(card) == "tdmpc2":
-            return replace(self.args.options, size=card["config"]["size"], **own)
-        return replace(self.args.options, network=network_of(card), **own)
+            return replace(options, size=card["config"]["size"], **own)
+        return replace(options, network=network_of(card), **own)
 
     def _programs(self, method: Method, config: FinetuneConfig) -> tuple[Finetuner, Program]:
         env = self.env

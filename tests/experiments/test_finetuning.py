@@ -139,6 +139,16 @@ def test_methods_that_learn_from_the_simulator_too(home, method, capsys):
     assert not np.allclose(mine[2]["obs"], others[2]["obs"], atol=1e-2)
 
 
+def test_the_actor_of_rlpd_follows_the_number_of_updates(home, tmp_path, monkeypatch):
+    def stop(method, config, **_):
+        raise RuntimeError(f"an actor update in {config.policy_delay}")
+
+    monkeypatch.setattr(finetune, "make_finetuner", stop)
+    for utd in (10, 40):
+        with pytest.raises(RuntimeError, match=f"in {utd}$"):
+            call(argv(home, "rlpd", "--utd", str(utd), "--options.simulated-share", "0", out=tmp_path / str(utd)))
+
+
 @pytest.mark.parametrize("method", ["sgft-sac", "sac"])
 def test_value_and_statistics_of_the_prior_stay_frozen_and_its_actor_moves(home, method):
     for seed in (0, 1):
