@@ -27,14 +27,14 @@ from sgft_jax import checkpoint, mesh, runs
 from sgft_jax.config import config_to_json
 from sgft_jax.finetune import make_finetuner
 from sgft_jax.log import RunProgress
-from sgft_jax.methods import METHODS, FinetuneConfig, Method
+from sgft_jax.methods import METHODS, FinetuneConfig, Method, policy_delay
 from sgft_jax.players import Player
 from sgft_jax.replay import ReplayState
 from sgft_jax.types import Array, Finetuner, Key, PyTree, UserError
 
 _SIMULATED_WORLDS = 256
 _SIMULATION = 2**31  # seed of what happens in them, the same for every run
-_OFFLINE_PART = 10_000  # updates between two signs of life
+_OFFLINE_PART = 10_000  # updates between two checkpoints, which are signs of life, too
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -103,10 +103,8 @@ class _Run:
 
     def work(self, records: list[Record], priors: PyTree, card: dict[str, Any]) -> list[dict[str, Any]]:
         """Everything, in order; returns the summaries. priors: [P]; seed i starts from prior i modulo P."""
-        args, self.records, done = self.args, records, _common_rollouts(records)
+        self.records, done = records, _common_rollouts(records)
         config = self._options(card)
-        if config.critic_warmup is None:
-            config = replace(config, critic_warmup=args.initial_rollouts * self._updates_per_rollout())
         self.simulation = self._simulate(config, priors, make_player(card)) if config.simulated_share else None
         if self.method.agent == "iql" and config.reward_scale is None:
             config = replace(config, reward_scale=self._reward_scale())
@@ -119,11 +117,14 @@ class _Run:
         return self._finish(self._train(state, done), card)
 
     def _options(self, card: dict[str, Any]) -> FinetuneConfig:
-        """Those of the command line, with what must be as the prior has it."""
-        own = {"gamma": card["gamma"]}
+        """Those of the command line, with what must be as the prior has it and what follows from `--utd`."""
+        options = self.args.options
+        own = {"gamma": card["gamma"], "policy_delay": policy_delay(options, self.args.utd)}
+        if options.critic_warmup is None:
+            own["critic_warmup"] = self.args.initial_rollouts * self._updates_per_rollout()
         if checkpoint.algorithm_of(card) == "tdmpc2":
-            return replace(self.args.options, size=card["config"]["size"], **own)
-        return replace(self.args.options, network=network_of(card), **own)
+            return replace(options, size=card["config"]["size"], **own)
+        return replace(options, network=network_of(card), **own)
 
     def _programs(self, method: Method, config: FinetuneConfig) -> tuple[Finetuner, Program]:
         env = self.env
@@ -159,11 +160,14 @@ class _Run:
         if done == 0:
             for record in self.records:
                 record.clear()
-            state = self._offline(make(), offline_updates)
+            state = self._offline(make, offline_updates)
             self._evaluate(state, 0)
             return state
-        like = jax.eval_shape(lambda: common.part(make(), 0, len(self.seeds)))
-        return _join([record.restore(like, done) for record in self.records])
+        return _join([record.restore(self._like(make), done) for record in self.records])
+
+    def _like(self, make: Callable[[], PyTree]) -> PyTree:
+        """Shapes of the state [S] of one real system."""
+        return jax.eval_shape(lambda: common.part(make(), 0, len(self.seeds)))
 
     def _each(self, members: PyTree) -> Iterator[tuple[Record, PyTree]]:
         """Every real system's record and, [S], what belongs to it in a pytree over all members."""
@@ -174,14 +178,20 @@ class _Run:
         for i, record in enumerate(self.records):
             yield record, state if len(self.records) == 1 else _part(state, i, len(self.seeds))
 
-    def _offline(self, state: PyTree, updates: int) -> PyTree:
-        """Learning from the simulator's transitions alone."""
+    def _offline(self, make: Callable[[], PyTree], updates: int) -> PyTree:
+        """A fresh state that has learned from the simulator's transitions alone; goes on where an earlier start was."""
         if not updates:
-            return state
+            return make()
         n = min(updates, _OFFLINE_PART)
-        with RunProgress(f"{self.args.method} offline", total=updates // n * n, unit="updates") as progress:
-            for part in range(updates // n):
+        # No real system has had a part in the states yet: that of the one that got furthest is that of all.
+        first = max(self.records, key=Record.offline)
+        done = first.offline()
+        state = _join([first.restore_offline(self._like(make), done)] * len(self.records)) if done else make()
+        with RunProgress(f"{self.args.method} offline", total=updates // n * n, unit="updates", done=done) as progress:
+            for part in range(done // n, updates // n):
                 state, metrics = self.program.offline(state, self.numbers, part, n, self.simulation)
+                for record, own in self._each_state(state):
+                    record.checkpoint_offline(own, (part + 1) * n)
                 progress.advance(n, {"critic loss": float(metrics["critic/loss"].mean())})
         return state
 

@@ -1,6 +1,7 @@
 """Impure: what a fine-tuning run leaves on disk for one real system, whether that is stepped alone or with others."""
 
 import json
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from sgft_jax import checkpoint, plot
 from sgft_jax.log import MetricsLog, RealLog, write_summary
 from sgft_jax.stats import iqm_interval
 from sgft_jax.types import Array, Metrics, Prior, PyTree
+
+OFFLINE = "offline"  # checkpoints of learning before the first real rollout: those of the run count rollouts
 
 
 class Record:
@@ -44,6 +47,18 @@ class Record:
         self.real.truncate(meta["stored"])
         return state
 
+    def offline(self) -> int:
+        """Updates of the offline phase behind its last checkpoint; 0 without one."""
+        return checkpoint.latest(self.folder / OFFLINE) or 0
+
+    def restore_offline(self, like: PyTree, updates: int) -> PyTree:
+        """The state of the checkpoint after so many of them."""
+        return checkpoint.restore(self.folder / OFFLINE, like, step=updates, expect=self.expect)[0]
+
+    def checkpoint_offline(self, state: PyTree, updates: int) -> None:
+        """The state after so many of them."""
+        checkpoint.save(self.folder / OFFLINE, updates, state, meta=self.expect)
+
     def store(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Real rollouts, arrays [S, rollouts, T, ...]: one file each, of arrays [S, T, ...]."""
         for i in range(arrays["reward"].shape[1]):
@@ -59,9 +74,10 @@ class Record:
         self.log.eval(self._transitions(done), {"rollouts": done, "robot_minutes": minutes, **scores})
 
     def checkpoint(self, state: PyTree, done: int) -> None:
-        """The state, and how long the logs are."""
+        """The state, and how long the logs are. The offline phase is not gone back to."""
         meta = {**self.expect, "rollouts": done, "stored": len(self.real), "position": self.log.position()}
         checkpoint.save(self.folder, done, state, meta=meta)
+        shutil.rmtree(self.folder / OFFLINE, ignore_errors=True)
 
     def time(self, done: int, collect_s: float, learn_s: float) -> None:
         """Apart from the metrics, which must not depend on the clock."""

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from sgft_jax import normalizer
 from sgft_jax.iql import IQLConfig, IQLHyper, IQLState, make_iql
-from sgft_jax.methods import FinetuneConfig, Method
+from sgft_jax.methods import FinetuneConfig, Method, policy_delay
 from sgft_jax.networks import fix_first_layer
 from sgft_jax.sac import SACConfig, SACHyper, SACState, fine_tune_state, make_sac
 from sgft_jax.sgft import append_steps_to_go
@@ -48,7 +48,7 @@ def _sac(method: Method, config: FinetuneConfig, obs_dim: int, act_dim: int) -> 
         actor_mean=config.actor_mean,
         critic_baseline=method.uses_value and not reset,
         actor_batch=config.batch_size if config.actor_real_only else None,
-        policy_delay=config.policy_delay,
+        policy_delay=policy_delay(config, method.utd),
         max_grad_norm=config.max_grad_norm,
     )
     hyper = SACHyper(

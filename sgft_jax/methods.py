@@ -48,6 +48,7 @@ class FinetuneConfig:
         policy in V_sim stay the simulator's; train_encoder is the ablation that lets the encoder learn.
     plan_samples: sequences that a plan tries in each of its iterations.
     critics, target_critics, actor_mean, policy_delay, train_critic: see `SACConfig`. A kept critic has two members.
+        policy_delay None = the updates of a real transition (`utd`): the actor moves once for each, as in RLPD.
     reset_critic: None = the method's default. A kept critic under a shaped reward is read as Q_sim(s, a) - V_sim(s),
         its exact meaning in simulation.
     critic_warmup: critic-only updates at the start. The first data are the simulator's policy's own: they do not say
@@ -84,7 +85,7 @@ class FinetuneConfig:
     critics: int = 2
     target_critics: int | None = None
     actor_mean: bool = False
-    policy_delay: int = 1
+    policy_delay: int | None = 1
     train_critic: bool = True
     size: str = "5M"
     plan_samples: int = 512
@@ -219,7 +220,7 @@ METHODS: dict[str, Method] = {
         ),
         _method(
             "rlpd", "", "from scratch; ten normalised critics, half of each batch from the simulator", "Ball 2023",
-            fresh=True, utd=20.0, lr_actor=3e-4, policy_delay=20, critics=10, target_critics=2, actor_mean=True,
+            fresh=True, utd=20.0, lr_actor=3e-4, policy_delay=None, critics=10, target_critics=2, actor_mean=True,
             critic_network=NetworkConfig(hidden=(256, 256), layer_norm=True), tune_alpha=True, alpha=1.0,
             entropy_per_dim=-0.5, simulated_share=0.5, critic_warmup=0, actor_ramp=0,
             space={"utd": (10.0, 20.0, 40.0), "lr_actor": (1e-4, 3e-4, 1e-3), "lr_critic": _RATES["lr_critic"],
@@ -270,6 +271,11 @@ def get_method(name: str) -> Method:
 def finetune_config(method: Method, **changes: Any) -> FinetuneConfig:
     """The options that a method's authors use, where ours have them, and any changes to these."""
     return FinetuneConfig(**{**method.options, **changes})
+
+
+def policy_delay(config: FinetuneConfig, utd: float) -> int:
+    """Critic updates per update of the actor where there are `utd` updates per real transition."""
+    return max(round(utd), 1) if config.policy_delay is None else config.policy_delay
 
 
 def default_settings(method: Method) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from sgft_jax.tdmpc2_model import (
     TDMPC2Prior,
     TDMPC2State,
     encode,
+    heads_of,
     make_parts,
     q_values,
     reward_of,
@@ -76,16 +77,14 @@ def _score(config: TDMPC2Config, parts: Parts, state: TDMPC2State, z: Array, key
     of a plan, where the original draws for each: they then compare by their actions, not by their luck.
     """
     key_heads, key_action = jax.random.split(key)
-    heads, gamma = two_heads(config, key_heads), state.hyper.gamma
+    critic, gamma = heads_of(state.critic.params, two_heads(config, key_heads)), state.hyper.gamma
     noise = jax.random.normal(key_action, (config.act_dim,))
 
     def final(z: Array) -> Array:
         if config.sgft:
             return v_sim(config, parts, state, z)
         mean, log_std = parts.policy.apply(state.policy.params, z)
-        return jnp.mean(
-            q_values(config, parts, state.critic.params, z, jnp.tanh(mean + jnp.exp(log_std) * noise))[heads]
-        )
+        return jnp.mean(q_values(config, parts, critic, z, jnp.tanh(mean + jnp.exp(log_std) * noise)))
 
     def step(carry: tuple[Array, Array], action: Array) -> tuple[tuple[Array, Array], Array]:
         z, weight = carry
@@ -93,8 +92,10 @@ def _score(config: TDMPC2Config, parts: Parts, state: TDMPC2State, z: Array, key
         return (parts.dynamics.apply(state.dynamics.params, z, action), weight * gamma), reward
 
     def score(actions: Array) -> Array:
-        (last, weight), rewards = jax.lax.scan(step, (z, jnp.float32(1)), actions)
-        return jnp.sum(rewards) + weight * final(last)
+        # The first step by itself: all candidates share its latent, which a loop would have to carry for each.
+        ahead, first = step((z, jnp.float32(1)), actions[0])
+        (last, weight), rewards = jax.lax.scan(step, ahead, actions[1:])
+        return first + jnp.sum(rewards) + weight * final(last)
 
     return score
 
@@ -124,15 +125,13 @@ def _update_model(
 ) -> tuple[TDMPC2State, Array, Metrics]:
     """Also returns the latents [B, H + 1, latent] rolled out by the model as it was."""
     key_heads, key_action, key_dropout = jax.random.split(key, 3)
-    heads, hyper = two_heads(config, key_heads), state.hyper
+    judges, hyper = heads_of(state.target_critic, two_heads(config, key_heads)), state.hyper
 
     def target(row: Transition, key: Key) -> tuple[Array, Array]:
         # The successor's latent is encoded, while losses are taken at rolled-out ones.
         ahead = parts.encoder.apply(state.encoder.params, row.next_obs)
         action = tanh_gaussian_action(parts.policy.apply(state.policy.params, ahead), key, explore=True)
-        return ahead, row.reward + row.discount * jnp.min(
-            q_values(config, parts, state.target_critic, ahead, action)[heads]
-        )
+        return ahead, row.reward + row.discount * jnp.min(q_values(config, parts, judges, ahead, action))
 
     keys = jax.random.split(key_action, batch.valid.shape)
     ahead, q_target = jax.vmap(jax.vmap(target))(batch.rows, keys)
@@ -178,7 +177,8 @@ def _window_losses(
         return twohot.cross_entropy(logits, x, config.bins)
 
     def value(z: Array, action: Array, target: Array, key: Key) -> Array:
-        logits = parts.critic.apply(params["critic"], z, action, key=key)
+        keys = jax.random.split(key, config.size.members)
+        logits = parts.critic.apply(params["critic"], z, action, keys=keys)
         return jnp.mean(jax.vmap(classify, (0, None))(logits, target))
 
     first = parts.encoder.apply(params["encoder"], rows.obs[0])
@@ -244,7 +244,8 @@ def _promise(
 ) -> Array:
     """What the policy maximises []: Q by two random heads, or one step of the model to V_sim."""
     if not config.sgft:
-        return jnp.mean(q_values(config, parts, state.critic.params, z, action, dropout)[heads])
+        keys = jax.random.split(dropout, config.size.members)[heads]
+        return jnp.mean(q_values(config, parts, heads_of(state.critic.params, heads), z, action, keys))
     ahead = parts.dynamics.apply(state.dynamics.params, z, action)
     return reward_of(config, parts, state, z, action) + state.hyper.gamma * v_sim(config, parts, state, ahead)
 

@@ -4,6 +4,7 @@ Structure (shapes, what learns) is static in `TDMPC2Config`; every number is a l
 that they vmap like seeds do. Source: Hansen et al. 2024; SGFT section 8.4.
 """
 
+import itertools
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, cast
 
@@ -177,6 +178,26 @@ def mish(x: Array) -> Array:
     return x * (w / (w + 2))
 
 
+class _Dense(nn.Module):
+    """A linear layer of several vectors, as of one that holds them all.
+
+    Each has its own product: rows that share a vector then share its product, and widths such as 512 + 2 would keep
+    GPUs from their fast matrix products.
+    """
+
+    width: int
+    weights: nn.initializers.Initializer
+
+    @nn.compact
+    def __call__(self, *parts: Array) -> Array:
+        """parts: [inputs] each -> [width]."""
+        sizes = [len(part) for part in parts]
+        kernel = self.param("kernel", self.weights, (sum(sizes), self.width))
+        bias = self.param("bias", nn.initializers.zeros, (self.width,))
+        rows = jnp.split(kernel, list(itertools.accumulate(sizes[:-1])))
+        return sum((part @ own for part, own in zip(parts, rows, strict=True)), bias)
+
+
 class _Body(nn.Module):
     """Linear, dropout (first layer), LayerNorm, Mish; at the end linear alone, or linear, LayerNorm, SimNorm."""
 
@@ -187,19 +208,19 @@ class _Body(nn.Module):
     zero: bool = False
 
     @nn.compact
-    def __call__(self, x: Array, *, train: bool) -> Array:
-        """x: [inputs] -> [outputs]."""
+    def __call__(self, *parts: Array, train: bool) -> Array:
+        """parts: [inputs] each -> [outputs]."""
         # Published as a truncated normal whose bounds, +-2, are 100 standard deviations away.
         weights = nn.initializers.normal(0.02)
         for layer, width in enumerate(self.hidden):
-            x = nn.Dense(width, kernel_init=weights)(x)
+            x = _Dense(width, weights, name=f"Dense_{layer}")(*parts)
             if layer == 0:
                 x = nn.Dropout(self.dropout, deterministic=not train)(x)
-            x = mish(nn.LayerNorm(epsilon=1e-5)(x))
+            parts = (mish(nn.LayerNorm(epsilon=1e-5)(x)),)
         # Zeros that XLA cannot know to be zeros: in a program that makes constant ones and uses them (init and update
         # in one jit), jaxlib 0.12.0 for CPUs reads memory that nobody wrote, and losses are NaN at times.
         last = nn.initializers.normal(0.0) if self.zero else weights
-        x = nn.Dense(self.outputs, kernel_init=last)(x)
+        x = _Dense(self.outputs, last, name=f"Dense_{len(self.hidden)}")(*parts)
         if self.simnorm_group is None:
             return x
         return simnorm(nn.LayerNorm(epsilon=1e-5)(x), self.simnorm_group)
@@ -209,8 +230,8 @@ class Parts(NamedTuple):
     """The networks, each for one example, and the optimisers that a configuration describes.
 
     encoder(obs) -> z [latent]; dynamics(z, action) -> z; reward(z, action) -> [bins] logits;
-    policy(z) -> [2, act_dim] pre-tanh mean and log-std; critic(z, action, key=None) -> [members, bins] logits, with
-    dropout where there is a key.
+    policy(z) -> [2, act_dim] pre-tanh mean and log-std; critic(z, action, keys=None) -> [members, bins] logits, with
+    dropout where there are keys, one for each member. Any slice of the critic's parameters is one, too.
     """
 
     encoder: Network
@@ -251,7 +272,7 @@ def _network(body: _Body, inputs: int) -> Network:
 
     def apply(params: PyTree, *parts: Array, key: Key | None = None) -> Array:
         rngs = None if key is None else {"dropout": key}
-        return cast(Array, body.apply({"params": params}, jnp.concatenate(parts), train=key is not None, rngs=rngs))
+        return cast(Array, body.apply({"params": params}, *parts, train=key is not None, rngs=rngs))
 
     return Network(init, apply)
 
@@ -260,8 +281,7 @@ def _ensemble(member: Network, members: int) -> Network:
     def init(key: Key) -> PyTree:
         return jax.vmap(member.init)(jax.random.split(key, members))
 
-    def apply(params: PyTree, *parts: Array, key: Key | None = None) -> Array:
-        keys = None if key is None else jax.random.split(key, members)
+    def apply(params: PyTree, *parts: Array, keys: Key | None = None) -> Array:
         return jax.vmap(lambda p, k: member.apply(p, *parts, key=k))(params, keys)
 
     return Network(init, apply)
@@ -271,15 +291,20 @@ def _ensemble(member: Network, members: int) -> Network:
 
 
 def q_values(
-    config: TDMPC2Config, parts: Parts, params: PyTree, z: Array, action: Array, key: Key | None = None
+    config: TDMPC2Config, parts: Parts, params: PyTree, z: Array, action: Array, keys: Key | None = None
 ) -> Array:
-    """Q [members] of every head, decoded."""
-    return jax.vmap(lambda logits: twohot.decode(logits, config.bins))(parts.critic.apply(params, z, action, key=key))
+    """Q [heads] of every head that `params` hold, decoded; keys: [heads] of their dropout."""
+    return jax.vmap(lambda logits: twohot.decode(logits, config.bins))(parts.critic.apply(params, z, action, keys=keys))
 
 
 def two_heads(config: TDMPC2Config, key: Key) -> Array:
     """Two different heads of the critic at random: their indices [2]."""
     return jax.lax.top_k(jax.random.uniform(key, (config.size.members,)), 2)[1]
+
+
+def heads_of(params: PyTree, heads: Array) -> PyTree:
+    """The parameters of some heads [n] of a critic: the others then cost nothing."""
+    return jax.tree.map(lambda x: x[heads], params)
 
 
 def reward_of(config: TDMPC2Config, parts: Parts, state: TDMPC2State, z: Array, action: Array) -> Array:
@@ -312,7 +337,8 @@ def value_of(config: TDMPC2Config, state: TDMPC2State, obs: Array) -> Array:
 def value_sample(config: TDMPC2Config, state: TDMPC2State, obs: Array, key: Key) -> Array:
     """V_sim(obs) [] as SGFT's released code has it: the lower of 2 random heads at an action drawn from the policy.
 
-    Differs from call to call, so the potentials of consecutive shaped rewards do not cancel.
+    Differs from call to call, so the potentials of consecutive shaped rewards do not cancel. All heads are evaluated:
+    it is one value for each draw, and copying the parameters of two heads would take longer.
     """
     parts = make_parts(config)
     key_heads, key_action = jax.random.split(key)

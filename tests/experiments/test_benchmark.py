@@ -113,7 +113,7 @@ def test_another_librarys_agent_gets_the_sizes_and_a_full_replay(monkeypatch):
             agents.append(self)
 
         def set_logger(self, logger):
-            assert logger == "silent"
+            assert logger == ("in", None)  # no folder, no formats: nothing is left behind
 
         def train(self, *, gradient_steps, batch_size):
             return gradient_steps, batch_size
@@ -123,7 +123,7 @@ def test_another_librarys_agent_gets_the_sizes_and_a_full_replay(monkeypatch):
     modules = {
         "gymnasium": SimpleNamespace(Env=object, spaces=box),
         "sbx": SimpleNamespace(SAC=Agent),
-        "stable_baselines3.common.logger": SimpleNamespace(configure=lambda folder, formats: "silent"),
+        "stable_baselines3.common.logger": SimpleNamespace(Logger=lambda folder, formats: ("in", folder, *formats)),
     }
     monkeypatch.setattr(other_sac.importlib, "import_module", modules.__getitem__)
     train = other_sac.make("sbx", batch=4, width=8, obs_dim=3, act_dim=2, capacity=5)

@@ -26,18 +26,31 @@ GAP = "[params]\nmass = 2.0\nfriction = 4.0\n[effects]\naction_rotation = 0.52\n
 OPTIONS = """--task toy --rollouts 5 --initial-rollouts 2 --eval-every 2 --eval-episodes 8 --checkpoint-every 2
     --utd 0.5 --options.batch-size 16 --options.branches 2 --options.critic-warmup 0 --options.actor-ramp 0
     --options.replay-capacity 256 --no-video"""
-PROGRAM = """
+START = """
 import os, signal, sys
 import envs
 envs.TASKS["toy"] = "toy"
 from experiments import finetune
+from experiments.finetune_record import Record
 from sgft_jax.log import MetricsLog
+"""
+PROGRAM = f"""{START}
 write = MetricsLog.metrics
 def metrics(self, step, values):
     write(self, step, values)
     if values["rollouts"] == 5:
         os.kill(os.getpid(), signal.SIGKILL)
 MetricsLog.metrics = metrics
+finetune.main(sys.argv[1:])
+"""
+OFFLINE = f"""{START}
+finetune._OFFLINE_PART = 10
+write = Record.checkpoint_offline
+def checkpoint_offline(self, state, updates):
+    write(self, state, updates)
+    if updates == 20:
+        os.kill(os.getpid(), signal.SIGKILL)
+Record.checkpoint_offline = checkpoint_offline
 finetune.main(sys.argv[1:])
 """
 
@@ -80,6 +93,13 @@ def run(home, method):
     return folder
 
 
+def killed(program, arguments):
+    """Runs a program in a process of its own, which kills itself."""
+    paths = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}", "SGFT_CACHE_DIR": str(TESTS.parent / ".cache/jax")}
+    done = subprocess.run([sys.executable, "-c", program, *arguments], env={**os.environ, **paths}, timeout=300)
+    assert done.returncode == -signal.SIGKILL
+
+
 def complaint(arguments, capsys):
     with pytest.raises(SystemExit) as stopped:
         call(arguments)
@@ -117,6 +137,16 @@ def test_methods_that_learn_from_the_simulator_too(home, method, capsys):
     for i in range(2):
         np.testing.assert_allclose(mine[i]["obs"], others[i]["obs"], atol=1e-5)
     assert not np.allclose(mine[2]["obs"], others[2]["obs"], atol=1e-2)
+
+
+def test_the_actor_of_rlpd_follows_the_number_of_updates(home, tmp_path, monkeypatch):
+    def stop(method, config, **_):
+        raise RuntimeError(f"an actor update in {config.policy_delay}")
+
+    monkeypatch.setattr(finetune, "make_finetuner", stop)
+    for utd in (10, 40):
+        with pytest.raises(RuntimeError, match=f"in {utd}$"):
+            call(argv(home, "rlpd", "--utd", str(utd), "--options.simulated-share", "0", out=tmp_path / str(utd)))
 
 
 @pytest.mark.parametrize("method", ["sgft-sac", "sac"])
@@ -157,11 +187,10 @@ def test_seeds_together_are_seeds_one_by_one(home, tmp_path):
 @pytest.mark.parametrize("method", ["sgft-sac", pytest.param("sac", marks=pytest.mark.slow)])
 def test_killed_and_resumed_is_bit_for_bit_uninterrupted(home, tmp_path, method):
     """SIGKILL after the rollout that follows the checkpoint at 4, whose line and rollout are on disk already."""
-    paths = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}", "SGFT_CACHE_DIR": str(TESTS.parent / ".cache/jax")}
     arguments = argv(home, method, out=tmp_path)
-    killed = subprocess.run([sys.executable, "-c", PROGRAM, *arguments], env={**os.environ, **paths}, timeout=300)
+    killed(PROGRAM, arguments)
     cut = tmp_path / "finetune/toy/turned" / method / "seeds-0-1"
-    assert killed.returncode == -signal.SIGKILL and checkpoint.latest(cut) == 4
+    assert checkpoint.latest(cut) == 4
     assert len(read_jsonl(cut / "metrics.jsonl")) == 4 and len(RealLog(cut)) == 5
 
     call([*arguments, "--resume"])
@@ -169,6 +198,28 @@ def test_killed_and_resumed_is_bit_for_bit_uninterrupted(home, tmp_path, method)
         assert (cut / name).read_bytes() == (run(home, method) / name).read_bytes()
     assert len(RealLog(cut)) == 5
     assert len(list(cut.glob("real/superseded-0/*.npz"))) == 1  # what the robot did is kept
+
+
+@pytest.mark.slow
+def test_killed_in_the_offline_phase_and_resumed_is_bit_for_bit_uninterrupted(home, tmp_path, monkeypatch, capsys):
+    """SIGKILL when one of two real systems has a checkpoint after 20 of 40 updates, the other only after 10."""
+    monkeypatch.setattr(finetune, "_OFFLINE_PART", 10)
+    more = ["--rollouts", "2", "--options.offline-updates", "40", "--options.simulated-transitions", "390"]
+    whole, parts = (argv(home, "iql", *more, out=tmp_path / o, reals=("turned", "heavy")) for o in ("whole", "parts"))
+    call(whole)
+    killed(OFFLINE, parts)
+    folders = [tmp_path / f"parts/finetune/toy/{real}/iql/seeds-0-1" for real in ("turned", "heavy")]
+    assert [checkpoint.latest(folder / "offline") for folder in folders] == [20, 10]
+
+    capsys.readouterr()
+    call([*parts, "--resume"])
+    said = capsys.readouterr().out
+    assert "30/40 updates" in said and "20/40 updates" not in said
+    for folder in folders:
+        for name in ("metrics.jsonl", "eval.jsonl", "summary.json"):
+            other = tmp_path / "whole" / folder.relative_to(tmp_path / "parts") / name
+            assert (folder / name).read_bytes() == other.read_bytes()
+        assert not (folder / "offline").exists()  # the first checkpoint of the run takes its place
 
 
 @pytest.mark.slow

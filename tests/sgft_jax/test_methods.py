@@ -47,8 +47,14 @@ def test_the_table_is_complete():
 
 def test_a_methods_own_options_and_changes_to_them():
     rlpd = methods.finetune_config(methods.METHODS["rlpd"], target_critics=1)
-    assert (rlpd.critics, rlpd.target_critics, rlpd.policy_delay, rlpd.simulated_share) == (10, 1, 20, 0.5)
+    assert (rlpd.critics, rlpd.target_critics, rlpd.policy_delay, rlpd.simulated_share) == (10, 1, None, 0.5)
     assert methods.METHODS["rlpd"].utd == 20
+
+
+def test_the_actor_moves_once_per_real_transition_if_nothing_else_is_said():
+    rlpd, online = (methods.finetune_config(methods.METHODS[name]) for name in ("rlpd", "sac-online"))
+    assert [methods.policy_delay(rlpd, utd) for utd in (40.0, 20.0, 0.5)] == [40, 20, 1]
+    assert [methods.policy_delay(online, utd) for utd in (2.0, 5.0)] == [20, 20]
     assert methods.finetune_config(methods.METHODS["sgft-sac"]) == methods.FinetuneConfig()
 
 

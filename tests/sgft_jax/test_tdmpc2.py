@@ -83,6 +83,13 @@ def test_simnorm_by_hand():
     np.testing.assert_allclose(tdmpc2_model.simnorm(x, 2), [0.25, 0.75, 0.5, 0.5], rtol=1e-6)
 
 
+def test_a_layer_of_two_vectors_is_one_of_both(key):
+    layer, x = tdmpc2_model._Dense(3, jax.nn.initializers.normal(1.0)), jnp.arange(5.0)
+    kernel = layer.init(key, x)["params"]["kernel"]
+    params = {"params": {"kernel": kernel, "bias": jnp.array([1.0, 2.0, 3.0])}}
+    np.testing.assert_allclose(layer.apply(params, x[:2], x[2:]), x @ kernel + jnp.array([1.0, 2.0, 3.0]), rtol=1e-5)
+
+
 def test_latents_are_groups_that_sum_to_one(key):
     state, parts = shaken(PLAIN, key), PARTS
     z = parts.encoder.apply(state.encoder.params, jnp.array([3.0, -2.0]))
@@ -123,8 +130,8 @@ def test_policy_spread_is_bounded(key):
 def test_dropout_acts_in_training_alone(key):
     config = dataclasses.replace(PLAIN, dropout=0.5)
     parts, state = tdmpc2_model.make_parts(config), shaken(PLAIN, key)
-    q = lambda key: parts.critic.apply(state.critic.params, jnp.full(16, 0.25), jnp.ones(1), key=key)  # noqa: E731
-    a, b = q(jax.random.key(1)), q(jax.random.key(2))
+    q = lambda keys: parts.critic.apply(state.critic.params, jnp.full(16, 0.25), jnp.ones(1), keys=keys)  # noqa: E731
+    a, b = (q(jax.random.split(jax.random.key(i), PLAIN.size.members)) for i in (1, 2))
     assert jnp.array_equal(q(None), q(None)) and not jnp.allclose(a, b) and not jnp.allclose(a, q(None))
 
 
@@ -152,6 +159,20 @@ def test_sampled_value_is_the_lower_of_two_heads(key):
     # of three heads the lowest is in 2 of 3 pairs, the highest is never the lower one
     assert jnp.mean(jnp.isclose(values, q[0], rtol=1e-2)) == pytest.approx(2 / 3, abs=0.1)
     assert jnp.mean(jnp.isclose(values, q[1], rtol=1e-2)) == pytest.approx(1 / 3, abs=0.1)
+
+
+@pytest.mark.parametrize("trained", [False, True])
+def test_drawn_heads_are_those_of_the_whole_critic(key, trained):
+    """Evaluated alone, with their own parameters and dropout, two heads say what they say among all."""
+    config = dataclasses.replace(PLAIN, dropout=0.5)
+    parts, params = tdmpc2_model.make_parts(config), shaken(PLAIN, key).critic.params
+    heads = tdmpc2_model.two_heads(config, key)
+    keys = jax.random.split(key, config.size.members) if trained else None
+    q = lambda params, keys: tdmpc2_model.q_values(config, parts, params, jnp.full(16, 0.25), jnp.ones(1), keys)  # noqa: E731
+    every = q(params, keys)
+    drawn = q(tdmpc2_model.heads_of(params, heads), keys if keys is None else keys[heads])
+    np.testing.assert_allclose(drawn, every[heads], rtol=1e-6)
+    assert len(set(np.round(every, 3).tolist())) == 3
 
 
 # --- losses ---------------------------------------------------------------------------------------------------------
@@ -277,6 +298,17 @@ def test_score_of_a_plan_against_a_loop(config, key):
     first = parts.encoder.apply(state.encoder.params, jnp.ones(2))
     score = tdmpc2._score(config, parts, state, first, key)(plan)
     assert score == pytest.approx(float(total + 0.25 * end), rel=1e-4)
+
+
+def test_a_plan_costs_two_heads_whatever_their_number(key):
+    def flops(members):
+        config = dataclasses.replace(PLAIN, size=dataclasses.replace(SIZE, members=members))
+        learner = tdmpc2.make_tdmpc2(config)
+        state = jax.eval_shape(learner.init, key)
+        act = jax.jit(functools.partial(learner.act, explore=False))
+        return act.lower(state, learner.init_carry(), jnp.ones(2), key).cost_analysis()["flops"]
+
+    assert flops(9) == pytest.approx(flops(3), rel=0.01)
 
 
 def test_sgft_policy_is_promised_one_step_and_v_sim(key):
