@@ -16,7 +16,7 @@ from sgft_jax.config import config_to_json
 from sgft_jax.jsonfile import read_json
 from sgft_jax.log import SUMMARY
 from sgft_jax.methods import METHODS, get_method
-from sgft_jax.runs import CONFIG, check_same
+from sgft_jax.runs import CONFIG, InUseError, check_same, in_use
 from sgft_jax.types import UserError
 
 
@@ -111,7 +111,10 @@ def check_begun(cells: Iterable[Cell]) -> None:
 
 
 def work(cells: Sequence[Cell], args: GridArgs) -> list[str]:
-    """Lists the cells, then runs those that are missing, in order; returns a line for each that could not run."""
+    """Lists the cells, then runs those that are missing, in order; returns a line for each that could not run.
+
+    Several processes may work on one grid: what another one has finished or is at is left to it.
+    """
     started, failed = time.monotonic(), []
     for cell in cells:
         print(f"{cell.state:10} {cell}" + (f", {cell.done} rollouts" if cell.done else ""))
@@ -121,8 +124,17 @@ def work(cells: Sequence[Cell], args: GridArgs) -> list[str]:
         if args.minutes is not None and time.monotonic() - started > 60 * args.minutes:
             print(f"stopped after {args.minutes:g} minutes; the same command goes on")
             break
-        failed += _run(batch)
+        now = [look_up(cell.args) for cell in batch]  # others may have got further since
+        theirs = [cell for cell in now if in_use(cell.folder)]
+        for cell in theirs:
+            _leave(cell)
+        for group in _batches([cell for cell in now if cell not in theirs], together=args.together):
+            failed += _run(group)
     return failed
+
+
+def _leave(cell: Cell) -> None:
+    print(f"left to another process: {cell}")
 
 
 def _batches(cells: Sequence[Cell], *, together: bool) -> list[list[Cell]]:
@@ -142,6 +154,9 @@ def _run(batch: Sequence[Cell]) -> list[str]:
     try:
         finetune(replace(first.args, real=reals, resume=first.state == "unfinished"))
     except UserError as error:
+        if len(batch) == 1 and isinstance(error, InUseError):
+            _leave(first)
+            return []
         print(f"error: {error}")
         if len(batch) == 1:
             return [f"{first}: {error}"]

@@ -27,10 +27,14 @@ _MARK = "sgft_jax"
 _PACKAGES = ("sgft-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
+class InUseError(UserError):
+    """Another process has the run folder open."""
+
+
 class Lock:
     """An exclusive lock on a folder, held until `release()`, collection or the end of the process, however it ends.
 
-    Raises UserError if another process, or another Run of this one, holds it.
+    Raises InUseError if another process, or another Run of this one, holds it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -40,7 +44,18 @@ class Lock:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self.release()
-            raise UserError(f"{folder}: another process is writing to it") from None
+            raise InUseError(f"{folder}: another process is writing to it") from None
+
+
+def in_use(folder: Path) -> bool:
+    """Whether somebody holds the lock of a run folder."""
+    if not (folder / _LOCK).exists():
+        return False
+    try:
+        Lock(folder).release()
+    except InUseError:
+        return True
+    return False
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,6 +8,7 @@ import pytest
 import envs
 from experiments import cli, compare, grid
 from sgft_jax import checkpoint
+from sgft_jax.runs import Lock
 from sgft_jax.types import UserError
 
 GRID = {"tasks": ("push", "insert"), "methods": ("sgft-sac", "rlpd"), "seeds": 2, "rollouts": 10}
@@ -83,6 +84,33 @@ def test_what_one_real_system_lacks_does_not_stop_the_others(tmp_path, ran):
     assert compare.compare(args) == ["push/lacking: sac: holds no prior"]
     assert [run.real for run in ran] == [args.reals, ("mild",), ("lacking",), ("hard",)]
     assert [cell.state for cell in compare.cells(args)] == ["finished", "missing", "finished"]
+
+
+def test_several_processes_share_a_grid(tmp_path, ran, capsys, monkeypatch):
+    """Of four cells one is another's from the start, one is opened in this moment, one is finished meanwhile."""
+    args = compare.CompareArgs(out=tmp_path, **{**GRID, "methods": ("sgft-sac", "sac")})
+    busy, opened, mine, done = compare.cells(args)
+    leave(busy.args, 4, killed=True)
+    held = [Lock(busy.folder)]
+    run = grid.finetune
+
+    def finetune(args):
+        if args == opened.args:
+            opened.folder.mkdir(parents=True)
+            held.append(Lock(opened.folder))
+            Lock(opened.folder)
+        run(args)
+        leave(done.args, 10)
+
+    monkeypatch.setattr(grid, "finetune", finetune)
+    assert compare.compare(args) == []
+    assert names(ran) == [("insert", "sgft-sac", False)] and ran == [mine.args]
+    printed = capsys.readouterr().out
+    assert all(f"left to another process: {cell}\n" in printed for cell in (busy, opened)) and "error" not in printed
+    held.clear()
+    monkeypatch.setattr(grid, "finetune", run)
+    compare.compare(args)
+    assert names(ran)[1:] == [("push", "sgft-sac", True), ("push", "sac", False)]
 
 
 def test_every_method_runs_with_its_own_settings(tmp_path, ran):
