@@ -10,7 +10,8 @@ from typing import Any
 import jax
 
 import envs
-from experiments import cli
+from experiments import cli, tables
+from experiments.comparison import Comparison, read_comparison
 from experiments.figures import FiguresArgs, figures
 from experiments.finetune import finetune
 from experiments.finetune_args import FinetuneArgs, run_folder
@@ -49,10 +50,24 @@ def main(args: DemoArgs) -> None:
     config = config if args.env_steps is None else replace(config, env_steps=args.env_steps)
     shared = {"task": args.task, "preset": "cpu", "out": args.out, "overwrite": True}
     pretrain(PretrainArgs(config=config, report=False, video=False, **shared))
-    _finetune_both(*(_finetune_args(args, method, shared) for method in METHODS))
-    print(figures(FiguresArgs(task=args.task, out=args.out)).read_text())
-    folder = args.out / "finetune" / envs.name_of(args.task) / Path(args.real).stem
+    both = [_finetune_args(args, method, shared) for method in METHODS]
+    _finetune_both(*both)
+    results = figures(FiguresArgs(task=args.task, out=args.out))
+    folder = run_folder(both[0], args.real).parent.parent
+    print(f"\n{outcome(read_comparison(folder))}\n")
+    print(f"figure: {results.parent / f'{envs.name_of(args.task)}-{folder.name}.png'}, tables: {results}")
     print(f"{time.monotonic() - started:.0f} s in all; curves, video and every real rollout: {folder}")
+
+
+def outcome(comparison: Comparison) -> str:
+    """What came of it in a few lines: success of both methods, which are evaluated after as many rollouts."""
+    points = next(iter(comparison.curves.values())).rollouts
+    head = ["method", *(f"{n} rollouts" if n else "zero-shot" for n in points)]
+    rows = [[name, *map(tables.percent, curve.success.T)] for name, curve in comparison.curves.items()]
+    return (
+        f"Success on the {comparison.real} real system of {comparison.task} in per cent, interquartile mean over seeds "
+        f"with its 95 % interval:\n\n{tables.markdown(head, rows)}"
+    )
 
 
 def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> FinetuneArgs:

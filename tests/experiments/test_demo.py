@@ -3,9 +3,11 @@
 from types import SimpleNamespace
 
 import pytest
+from runs_by_hand import save
 
 import envs
 from experiments import demo
+from experiments.comparison import read_comparison
 from sgft_jax.types import UserError
 
 
@@ -54,6 +56,18 @@ def test_demo_compares_both_methods_from_one_prior(tmp_path, monkeypatch, capsys
         run = out / "finetune" / "toy" / "turned" / method / "seeds-0-1"
         assert (run / "summary.json").exists() and len(list((run / "real").glob("*.npz"))) == 3
     assert "zero-shot" in (out / "sac.log").read_text()
+
+
+def test_the_outcome_is_said_in_a_few_lines(tmp_path):
+    for method, end in (("sgft-sac", 0.9), ("sac", 0.2)):
+        save(tmp_path, method, [[0.0, 0.0], [end, end]], rollouts=[0, 5])
+    said = demo.outcome(read_comparison(tmp_path / "finetune/toy/default")).splitlines()
+    assert said[2:] == [
+        "| method | zero-shot | 5 rollouts |",
+        "| --- | --- | --- |",
+        "| sgft-sac | 0 [0, 0] | 90 [90, 90] |",
+        "| sac | 0 [0, 0] | 20 [20, 20] |",
+    ]
 
 
 def test_a_failure_beside_is_reported(tmp_path, monkeypatch):
