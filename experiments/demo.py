@@ -31,9 +31,8 @@ class DemoArgs:
     """push, push-towel, push-ball, hammer or insert."""
     real: str = "default"
     """The real system, as in fine-tuning."""
-    env_steps: int = 57_600
-    """Environment steps of pretraining. Half as many again as preset `cpu` has: fine-tuning starts lower, as a policy
-    that is surer of itself does on another system, and ends higher (docs/results.md)."""
+    env_steps: int | None = None
+    """Environment steps of pretraining, default: those of preset `cpu`."""
     seeds: int = 3
     """Fine-tuning seeds per method."""
     rollouts: int = 20
@@ -47,7 +46,8 @@ class DemoArgs:
 def main(args: DemoArgs) -> None:
     """Pretrains once, fine-tunes with each method from the same prior on the same real starts, and compares."""
     started = time.monotonic()
-    config = replace(PRESETS["cpu"], env_steps=args.env_steps)
+    config = PRESETS["cpu"]
+    config = config if args.env_steps is None else replace(config, env_steps=args.env_steps)
     shared = {"task": args.task, "preset": "cpu", "out": args.out, "overwrite": True}
     pretrain(PretrainArgs(config=config, report=False, video=False, **shared))
     both = [_finetune_args(args, method, shared) for method in METHODS]
