@@ -113,7 +113,7 @@ def find_entry(env: Env, name: str | None) -> tuple[int, Entry]:
 def survey(args: LandscapeArgs, env: Env, player: Player, prior: Prior, start: int, *, gamma: float) -> Landscape:
     """Plays, imagines and evaluates V_sim; `start`: of the object's place in the observation."""
     gap = common.load_gap(env, args.real, args.set)
-    system = env if gap is None else common.real_env(env, [gap])
+    system = common.real_env(env, [gap] if gap else [])
     key = jax.random.fold_in(jax.random.key(args.seed), 0)
 
     def play(env: Env, gap: Gap | None) -> Array:

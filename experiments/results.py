@@ -45,6 +45,11 @@ def left_behind(curve: Curve) -> int:
     return int((curve.success[:, -1] < LEVELS[0] / 100).sum())
 
 
+def dip(curve: Curve) -> float:
+    """How far success of the mean over seeds ever fell below zero-shot, from 0 to 1."""
+    return first_dip(curve.success.mean(0))
+
+
 def area(curve: Curve, rollouts: int) -> np.ndarray:
     """[seeds] mean success from zero-shot to the last evaluation after at most so many rollouts, from 0 to 1."""
     inside = curve.rollouts <= rollouts
@@ -59,11 +64,10 @@ def describe_run(curve: Curve) -> dict[str, Any]:
     to_90, to_98: real transitions of each seed until an evaluation first shows that success in per cent (null = never),
     and the same for the mean curve.
     """
-    mean = curve.success.mean(0)
     return {
         "zero_shot": _point(curve, 0),
         "final": _point(curve, -1),
-        "dip": {"mean": first_dip(mean), "worst_seed": max(first_dip(s) for s in curve.success)},
+        "dip": {"mean": dip(curve), "worst_seed": max(first_dip(s) for s in curve.success)},
         **{f"to_{percent}": _transitions(curve, percent) for percent in LEVELS},
         "seeds": int(curve.success.shape[0]),
     }

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from experiments.results import LEVELS, Curve, area, describe_run, left_behind, reached
+from experiments.results import LEVELS, Curve, area, dip, left_behind, reached
 from sgft_jax.stats import iqm_interval
 
 BUDGETS = (10, 20, 50, 100)  # rollouts at which tables compare, as far as a run got
@@ -35,7 +35,7 @@ def row(method: str, curve: Curve, budgets: Sequence[int], common: int) -> list[
         end(curve),
         *(transitions(curve, level) for level in LEVELS),
         area_to(curve, common),
-        f"{100 * describe_run(curve)['dip']['mean']:.0f}",
+        f"{100 * dip(curve):.0f}",
         f"{curve.robot_minutes[-1]:.1f}",
     ]
 

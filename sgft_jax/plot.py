@@ -49,8 +49,8 @@ def learning_curves(
     figure, (axes,) = _figure(7.2, 4.0, columns=1)
     ends, looks = [], _looks_of(order or list(curves))
     for name, (transitions, success) in curves.items():
-        style = {**looks[name], "linewidth": 2, "shade": _shade(len(curves)), "marker": "o", "markersize": 3}
-        last = _draw_curve(axes, np.asarray(transitions), success, style)
+        style = {**looks[name], "linewidth": 2, "marker": "o", "markersize": 3}
+        last = _draw_curve(axes, np.asarray(transitions), success, style, shade=_shade(len(curves)))
         ends.append((float(np.asarray(transitions)[-1]), last, name, looks[name]["color"]))
     if zero_shot is not None:
         axes.axhline(zero_shot, color=_INK, linewidth=1.2, linestyle=(0, (4, 3)), zorder=1.5)
@@ -89,8 +89,8 @@ def curve_panels(
         for name in sorted(curves, key=lambda name: name in thick):
             x, success = curves[name]
             shade = 0.18 if name in thick else _shade(len(curves))
-            style = {**looks[name], "linewidth": _THICK if name in thick else _THIN, "shade": shade}
-            _draw_curve(axes, np.asarray(x), success, style)
+            style = {**looks[name], "linewidth": _THICK if name in thick else _THIN}
+            _draw_curve(axes, np.asarray(x), success, style, shade=shade)
         axes.set_title(task, **_FONT, loc="left")
         axes.set_xlim(0, max(float(np.asarray(x)[-1]) for x, _ in curves.values()))
         axes.set_ylim(-0.03, 1.03)
@@ -177,9 +177,8 @@ def scaling(
     axes.set_xticks(sizes, [f"{size:,.0f}" for size in sizes])
     axes.minorticks_off()
     low, high = axes.get_ylim()
-    axes.yaxis.set_major_locator(
-        LogLocator(subs=(1, 2, 5) if high < 30 * low else (1,))
-    )  # a decade has ticks of its own
+    steps = (1, 2, 5) if high < 30 * low else (1,)  # a single decade would have one tick, or none
+    axes.yaxis.set_major_locator(LogLocator(subs=steps))
     axes.yaxis.set_major_formatter(EngFormatter(sep=" "))
     axes.set_xlabel(x, **_FONT)
     axes.set_ylabel(y, **_FONT)
@@ -314,13 +313,12 @@ def _save(figure: Figure, path: Path) -> Path:
     return path
 
 
-def _draw_curve(axes: Axes, x: np.ndarray, success: ArrayLike, style: Mapping[str, Any]) -> float:
-    """IQM over seeds [n_seeds, n] with its band, `shade` of the style opaque; returns where the line ends."""
+def _draw_curve(axes: Axes, x: np.ndarray, success: ArrayLike, style: Mapping[str, Any], *, shade: float) -> float:
+    """IQM over seeds [n_seeds, n] with its band, so opaque; style: of the line. Returns where the line ends."""
     band = iqm_interval(success)
-    line = {key: value for key, value in style.items() if key != "shade"}
     if np.isfinite(band.low).all():
-        axes.fill_between(x, band.low, band.high, color=style["color"], alpha=style["shade"], linewidth=0)
-    axes.plot(x, band.estimate, **line, clip_on=False)
+        axes.fill_between(x, band.low, band.high, color=style["color"], alpha=shade, linewidth=0)
+    axes.plot(x, band.estimate, **style, clip_on=False)
     return float(band.estimate[-1])
 
 

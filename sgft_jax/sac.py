@@ -23,6 +23,7 @@ from sgft_jax.networks import (
     make_dynamics,
     make_value,
     pad_first_layer,
+    precision,
     tanh_gaussian_action,
     tanh_gaussian_sample,
 )
@@ -218,7 +219,7 @@ def _critic_of(config: SACConfig, parts: _Parts, state: SACState) -> Callable[[P
         return parts.critic.apply
 
     def relative(params: PyTree, obs: Array, action: Array) -> Array:
-        with jax.default_matmul_precision("highest"):  # as in value.predict: the difference of two large numbers
+        with precision("float32"):  # as in value.predict: the difference of two large numbers
             return parts.critic.apply(params, obs, action) - parts.value.apply(state.value.params, obs)
 
     return relative

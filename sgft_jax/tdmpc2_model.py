@@ -15,7 +15,7 @@ from flax import linen as nn
 from flax import struct
 
 from sgft_jax import mppi, normalizer, optim, twohot
-from sgft_jax.networks import Network, tanh_gaussian_action
+from sgft_jax.networks import Network, precision, tanh_gaussian_action
 from sgft_jax.types import Array, Key, Normalizer, PyTree, UserError, unknown
 
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
@@ -330,7 +330,7 @@ def value_of(config: TDMPC2Config, state: TDMPC2State, obs: Array) -> Array:
     Full float32 on every device, as in `value.predict`: who shapes rewards takes small differences of it.
     """
     parts = make_parts(config)
-    with jax.default_matmul_precision("highest"):
+    with precision("float32"):
         return v_sim(config, parts, state, encode(parts, state, obs))
 
 
@@ -343,7 +343,7 @@ def value_sample(config: TDMPC2Config, state: TDMPC2State, obs: Array, key: Key)
     parts = make_parts(config)
     key_heads, key_action = jax.random.split(key)
     policy = state.policy.params if state.anchor is None else state.anchor
-    with jax.default_matmul_precision("highest"):
+    with precision("float32"):
         z = encode(parts, state, obs)
         action = tanh_gaussian_action(parts.policy.apply(policy, z), key_action, explore=True)
         return jnp.min(q_values(config, parts, state.critic.params, z, action)[two_heads(config, key_heads)])

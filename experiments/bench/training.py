@@ -58,8 +58,12 @@ def weak_scaling(
             eval_every=_NEVER, checkpoint_every=_NEVER,
         )  # fmt: skip
         with tempfile.TemporaryDirectory() as out:
-            args = PretrainArgs(task=task, preset=preset, config=config, impl=impl, devices=n, report=False)
-            found[n] = pretrain(replace(args, video=False, out=Path(out)))
+            found[n] = pretrain(
+                PretrainArgs(
+                    task=task, preset=preset, config=config, impl=impl, devices=n,
+                    report=False, video=False, out=Path(out),
+                )
+            )  # fmt: skip
     speed = {n: summary["env_steps"] / summary["time/train_s"] for n, summary in found.items()}
     alone = speed[min(speed)] / min(speed)
     return [

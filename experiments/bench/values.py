@@ -27,16 +27,16 @@ def errors(task: str, impl: Impl, prior: Path, precisions: Sequence[Precision]) 
     V_sim as a network of its own.
     """
     env = envs.make(task, impl)
-    priors, card = common.load_priors(common.prior_folders(prior, out=Path(), task=env.name, preset=""), env)
+    priors, card = common.find_priors(prior, out=prior, env=env, preset="")
     if not isinstance(priors[0], Prior):
         raise UserError(f"{prior}: a prior of {card['algorithm']}; precisions are compared for those of SAC")
     player, network = make_player(card), make_value(env.obs_dim, network_of(card))
-    pool, keys = common.training_worlds(env, None, jax.random.key(0), EPISODES), jax.random.key(1)
+    pool = common.training_worlds(env, None, jax.random.key(0), EPISODES)
+    keys = jax.random.split(jax.random.key(1), EPISODES)
 
     def play(prior: Prior) -> tuple[Transition, Array]:
         policy = prior_policy(player, prior, explore=True)
-        keys_play = jax.random.split(keys, EPISODES)
-        played = play_episodes(env, pool, policy, player.init_carry(), keys_play, gamma=card["gamma"])
+        played = play_episodes(env, pool, policy, player.init_carry(), keys, gamma=card["gamma"])
         return played.transitions, played.valid
 
     def judge(prior: Prior, rows: Transition, exact: Precision) -> tuple[Array, Array]:
@@ -45,14 +45,15 @@ def errors(task: str, impl: Impl, prior: Path, precisions: Sequence[Precision]) 
         before = value(rows.obs)
         return before, rows.reward + rows.discount * value(rows.next_obs) - before
 
+    played, judged = jax.jit(play), jax.jit(judge, static_argnums=2)
     found = []
-    for seed, prior_now in enumerate(priors):
-        rows, valid = jax.jit(play)(prior_now)
-        exact = [x[valid] for x in jax.jit(judge, static_argnums=2)(prior_now, rows, "float32")]
+    for number, own in enumerate(priors):
+        rows, valid = played(own)
+        reference = [x[valid] for x in judged(own, rows, "float32")]
         for name in precisions:
-            rough = [x[valid] for x in jax.jit(judge, static_argnums=2)(prior_now, rows, name)]
-            line: dict[str, Any] = {"task": task, "prior": seed, "precision": name}
-            for what, a, b in zip(("value", "shaped"), rough, exact, strict=True):
+            line: dict[str, Any] = {"task": task, "prior": number, "precision": name}
+            rough = [x[valid] for x in judged(own, rows, name)]
+            for what, a, b in zip(("value", "shaped"), rough, reference, strict=True):
                 line |= {f"{what}_error": float(jnp.sqrt(jnp.mean((a - b) ** 2))), f"{what}_std": float(jnp.std(b))}
             found.append(line)
     return found
