@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import EngFormatter, LogLocator
+from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator
 from numpy.typing import ArrayLike
 
 from sgft_jax.stats import iqm_interval
@@ -420,6 +420,8 @@ def _top(crowd: list[float], gap: float) -> float:
 
 
 def _thousands(axes: Axes) -> None:
+    """Counts along x: ticks at whole numbers, which no rounding of their labels moves."""
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.xaxis.set_major_formatter(lambda x, _: f"{x:,.0f}")
 
 
@@ -434,6 +436,7 @@ def _robot_axis(axes: Axes, rollout_length: int, control_dt: float) -> None:
 
     top = axes.secondary_xaxis("top", functions=(rollouts, transitions))
     minutes = rollout_length * control_dt / 60
+    top.xaxis.set_major_locator(MaxNLocator(integer=True))
     top.xaxis.set_major_formatter(lambda r, _: f"{r:,.0f}\n{_minutes(r * minutes)}" if r else "0")
     top.set_xlabel("rollouts, robot time", **_FONT)
     top.tick_params(colors=_INK, labelsize=9, color=_FAINT)

@@ -37,6 +37,15 @@ def test_one_seed_draws_a_line_without_a_band(tmp_path):
     assert plot.learning_curves(tmp_path / "one.png", {"SAC": (X, scores(1))}, title="Push").exists()
 
 
+def test_counts_have_ticks_at_whole_numbers_only():
+    """Ticks at 2.5 rollouts were labelled 2, and those at 7.5 labelled 8."""
+    _, (axes,) = plot._figure(7.2, 4.0, columns=1)
+    axes.set_xlim(0, 20)
+    plot._thousands(axes)
+    ticks = axes.get_xticks()
+    assert len(ticks) > 3 and (ticks == np.round(ticks)).all()
+
+
 def test_scaling_draws_lines_and_their_references(tmp_path):
     lines = {"push": ([32, 512], [5e4, 9e4]), "insert": ([32, 512], [6e4, 2e5])}
     path = plot.scaling(tmp_path / "s.png", lines, {"push": ([32, 512], [1e5, 2e5])}, title="t", x="worlds", y="steps")
