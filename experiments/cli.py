@@ -6,15 +6,16 @@ import io
 import logging
 import os
 import re
+import select
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn, cast
 
 import tyro
 
-USER_ERROR, INTERRUPTED = 2, 130
+BROKEN_PIPE, USER_ERROR, INTERRUPTED = 1, 2, 130
 _CACHE_VARIABLE = "SGFT_CACHE_DIR"
 _RENDER_PROBE = "import mujoco; c = mujoco.GLContext(16, 16); c.make_current(); c.free()"
 
@@ -30,21 +31,42 @@ def run_main[T](
     """Parse the command line into `config_type`, starting from `default`, and call `main` with it.
 
     Exits with code 2 and one line `error: ...` on stderr for anything the user can mend (`UserError`, unknown options
-    or choices), with 130 after an interrupt. Other exceptions are bugs and keep their traceback.
+    or choices), with 130 after an interrupt, with 1 and no word where nobody reads its output any more, as after
+    `| head`. Other exceptions are bugs and keep their traceback.
     """
-    config = parse(config_type, description, argv, default=default)
-    set_up()
-    try:
-        main(config)
-    except KeyboardInterrupt:
-        print("\ninterrupted; the same command with --resume continues from the last checkpoint", file=sys.stderr)
-        sys.exit(INTERRUPTED)
-    except Exception as error:
-        from sgft_jax.types import UserError
+    with _may_lose_its_reader():
+        config = parse(config_type, description, argv, default=default)
+        set_up()
+        try:
+            main(config)
+        except KeyboardInterrupt:
+            print("\ninterrupted; the same command with --resume continues from the last checkpoint", file=sys.stderr)
+            sys.exit(INTERRUPTED)
+        except Exception as error:
+            from sgft_jax.types import UserError
 
-        if not isinstance(error, UserError):
+            if not isinstance(error, UserError):
+                raise
+            fail(str(error))
+
+
+@contextlib.contextmanager
+def _may_lose_its_reader() -> Iterator[None]:
+    """Ends the process without a traceback if stdout is a pipe that is read no more."""
+    try:
+        try:
+            yield
+        except SystemExit:
+            sys.stdout.flush()  # what Python would do when it exits, where nobody could catch it
             raise
-        fail(str(error))
+        sys.stdout.flush()
+    except BrokenPipeError:
+        poll = select.poll()
+        poll.register(sys.stdout, 0)
+        if not poll.poll(0):
+            raise  # it was another pipe: that to a program which writes videos, say
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the rest, which is flushed at the exit
+        sys.exit(BROKEN_PIPE)
 
 
 def parse[T](

@@ -72,6 +72,14 @@ def split(name: str) -> tuple[str, str]:
     return (method, variant) if method in METHODS else (name, "")
 
 
+def same_seeds(comparison: Comparison, one: str, other: str) -> bool:
+    """Whether two runs are known to have the same seeds: equally many, from the same first one on."""
+    first, second = (
+        (comparison.configs[name].get("seed"), comparison.curves[name].success.shape[0]) for name in (one, other)
+    )
+    return first == second and first[0] is not None
+
+
 def is_sgft(name: str) -> bool:
     """Whether a method with or without variant is SGFT: it shapes rewards and shortens the horizon, or it plans H steps
     that end in a frozen V_sim, which is both at once.

@@ -17,10 +17,10 @@ from sgft_jax.types import UserError
 _SAME = 0.05  # of success: evaluations of one policy in two programs differ by as much, on a GPU
 _LEGEND = (
     "Success on the real system: interquartile mean over seeds with its 95 % bootstrap interval, in per cent. "
-    "Transitions to 90 or 98 %: when the mean over seeds first got there; > where the run ended before. Deepest dip: "
-    "how far that mean ever fell below zero-shot, in percentage points. Area: mean success over real transitions up "
-    "to where the shortest run of the table ends. Seeds behind: those that end below 90 %. Robot minutes: of the run, "
-    "without resets."
+    "Transitions to 90 or 98 %: when the mean over seeds first got there, with its 95 % interval; > where the "
+    "run ended before. Deepest dip: how far that mean ever fell below zero-shot, in percentage points. Area: mean "
+    "success over real transitions up to where the shortest run of the table ends. Seeds behind: those that end below "
+    "90 %. Robot minutes: of the run, without resets."
 )
 
 

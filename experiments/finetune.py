@@ -190,6 +190,8 @@ class _Run:
         with RunProgress(f"{self.args.method} offline", total=updates // n * n, unit="updates", done=done) as progress:
             for part in range(done // n, updates // n):
                 state, metrics = self.program.offline(state, self.numbers, part, n, self.simulation)
+                # Equal copies: one would do for all, but any of the folders may be resumed alone, moved or removed, and
+                # half a million updates must not go with another's. They last until the first checkpoint of the run.
                 for record, own in self._each_state(state):
                     record.checkpoint_offline(own, (part + 1) * n)
                 progress.advance(n, {"critic loss": float(metrics["critic/loss"].mean())})

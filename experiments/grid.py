@@ -154,12 +154,13 @@ def _run(batch: Sequence[Cell]) -> list[str]:
     try:
         finetune(replace(first.args, real=reals, resume=first.state == "unfinished"))
     except UserError as error:
-        if len(batch) == 1 and isinstance(error, InUseError):
+        if len(batch) > 1:
+            print(f"error: {error}")
+            # The others may have what one of them lacks; how far each has got is looked up again.
+            return [line for cell in batch for line in _run([look_up(cell.args)])]
+        if isinstance(error, InUseError):
             _leave(first)
             return []
         print(f"error: {error}")
-        if len(batch) == 1:
-            return [f"{first}: {error}"]
-        # The others may have what one of them lacks; how far each has got is looked up again.
-        return [line for cell in batch for line in _run([look_up(cell.args)])]
+        return [f"{first}: {error}"]
     return []

@@ -7,20 +7,23 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from experiments import tables
-from experiments.comparison import DEFAULT, Comparison, Part, is_sgft, names_of, on_default, split
+from experiments.comparison import DEFAULT, Comparison, Part, is_sgft, names_of, on_default, same_seeds, split
 from experiments.results import LEVELS, Curve, left_behind, reached
 from sgft_jax import plot
 from sgft_jax.methods import METHODS
+from sgft_jax.stats import ratio_interval
 
 _LEVEL = LEVELS[0]
 _LEGEND = (
-    f"Real transitions until the mean over seeds is at {_LEVEL} %; > where the run ended before; in brackets the seeds "
-    f"that end below {_LEVEL} %, if there are any."
+    f"Real transitions until the mean over seeds is at {_LEVEL} %, with its 95 % bootstrap interval; > where the run "
+    f"ended before; in parentheses the seeds that end below {_LEVEL} %, if there are any."
 )
 _TIMES = (
     "How many times as many transitions the best method that is not SGFT needs: the one that got there, or ended "
     "without, after the fewest. > where it ended without, < where SGFT did, - where both did or nothing was to be "
-    "learned. SGFT is what shapes rewards and shortens the horizon, or plans H steps that end in a frozen V_sim."
+    "learned. The 95 % bootstrap interval draws the seeds of both methods together where they are the same, and takes "
+    "for granted which method is best. SGFT is what shapes rewards and shortens the horizon, or plans H steps that end "
+    "in a frozen V_sim."
 )
 
 
@@ -45,16 +48,17 @@ def overview(comparisons: Sequence[Comparison], target: Path, order: Sequence[st
     return Part([*texts, _TIMES, _comparison(tasks, best, own)], [])
 
 
-def times_fewer(other: Curve, own: Curve) -> str:
-    """How many times as many transitions to 90 % one run needs as another, "> 3.2" if at least; "-" if none can say."""
-    needs = [reached(curve, _LEVEL) for curve in (other, own)]
-    ends = [int(curve.transitions[-1]) if n is None else n for curve, n in zip((other, own), needs, strict=True)]
-    if needs == [None, None] or 0 in ends:
-        return tables.NONE
-    tenths, own_end = 10 * ends[0], ends[1]
-    if needs[0] is None:
-        return f"> {tenths // own_end / 10:.1f}"  # a bound must stay one when it is rounded
-    return f"< {-(-tenths // own_end) / 10:.1f}" if needs[1] is None else f"{tenths / own_end / 10:.1f}"
+def times_fewer(comparison: Comparison, other: str, own: str) -> str:
+    """How many times as many transitions to 90 % one run needs as another, with its interval: "5.2 [3.9, > 7.1]".
+
+    "> 3.2" if at least so many, "-" if none can say.
+    """
+    curves = comparison.curves
+    above, below = ((curve.transitions, curve.success) for curve in (curves[other], curves[own]))
+    # Seed i starts from the same prior and meets the same real starts in every method, so what makes it easy or hard
+    # does so for both, and resampling it together keeps that out of the spread of the ratio.
+    paired = same_seeds(comparison, other, own)
+    return tables.censored(ratio_interval(above, below, _LEVEL / 100, paired=paired), digits=1)
 
 
 def best_other(curves: Mapping[str, Curve]) -> str | None:
@@ -113,8 +117,8 @@ def _comparison(tasks: Mapping[str, Comparison], best: Mapping[str, str | None],
     """The methods `own` in rows against the best other method of each task."""
 
     def cell(task: str, name: str) -> str:
-        other, curves = best[task], tasks[task].curves
-        return times_fewer(curves[other], curves[name]) if other and name in curves else tables.NONE
+        other, comparison = best[task], tasks[task]
+        return times_fewer(comparison, other, name) if other and name in comparison.curves else tables.NONE
 
     def against(task: str, name: str | None) -> str:
         return f"{name}: {tables.transitions(tasks[task].curves[name], _LEVEL)}" if name else tables.NONE

@@ -1,11 +1,12 @@
 """Tables in Markdown, and how the numbers of a learning curve are written in them. Pure functions."""
 
+import math
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from experiments.results import LEVELS, Curve, area, dip, left_behind, reached
-from sgft_jax.stats import iqm_interval
+from experiments.results import LEVELS, Curve, area, dip, left_behind
+from sgft_jax.stats import Censored, iqm_interval, transitions_interval
 
 BUDGETS = (10, 20, 50, 100)  # rollouts at which tables compare, as far as a run got
 NONE = "-"
@@ -65,8 +66,34 @@ def end(curve: Curve) -> str:
 
 def transitions(curve: Curve, level: int) -> str:
     """Real transitions until the mean over seeds is at so many per cent, or how many were not enough."""
-    n = reached(curve, level)
-    return f"> {curve.transitions[-1]:,}" if n is None else f"{n:,}"
+    return censored(transitions_interval(curve.transitions, curve.success, level / 100), digits=0)
+
+
+def censored(found: Censored, *, digits: int) -> str:
+    """An estimate with its interval; each number a bound, "> 4.1" or "< 0.4", where runs ended too early to tell it.
+
+    Of an interval known to lie between two others it is the one that encloses both. "-" where nothing can be said; a
+    bound stands alone where all resamples give the same.
+    """
+    estimate, low, high = ((float(least), float(most)) for least, most in zip(*found, strict=True))
+    shown = _bound(*estimate, estimate[0], digits)
+    if shown == NONE or math.isnan(low[0]):
+        return shown
+    ends = _bound(*low, low[0], digits), _bound(*high, high[1], digits)
+    alone = estimate[0] < estimate[1] and ends == (shown, shown)
+    return shown if alone else f"{shown} [{', '.join(ends)}]"
+
+
+def _bound(least: float, most: float, number: float, digits: int) -> str:
+    """What is known of a number that is at least and at most so much; `number` if both are."""
+    if least == 0 and math.isinf(most):
+        return NONE
+    unit = 10**digits
+    if math.isinf(most):  # a bound must stay one when it is rounded, and 0.7 * 10 not be a little more than 7
+        return f"> {math.floor(round(least * unit, 6)) / unit:,.{digits}f}"
+    if least == 0 < most:
+        return f"< {math.ceil(round(most * unit, 6)) / unit:,.{digits}f}"
+    return f"{number:,.{digits}f}"
 
 
 def area_to(curve: Curve, rollouts: int) -> str:

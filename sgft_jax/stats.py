@@ -9,6 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
+# A mean over seeds that is 0.9 in exact arithmetic is often a little less in floating point.
+_ROUNDING = 1e-9
+
 
 class Interval(NamedTuple):
     """An estimate with its confidence bounds; floats or arrays of one shape."""
@@ -16,6 +19,17 @@ class Interval(NamedTuple):
     estimate: np.ndarray
     low: np.ndarray
     high: np.ndarray
+
+
+class Censored(NamedTuple):
+    """A statistic of runs of which some may have ended before they could tell.
+
+    least, most: what it is if all that was not seen is as small as it can be, and as large; equal where it is known. A
+    lower bound has most = inf, an upper bound least = 0, and of nothing at all is known [0, inf].
+    """
+
+    least: Interval
+    most: Interval
 
 
 def iqm(scores: ArrayLike, *, axis: int = 0) -> np.ndarray:
@@ -66,8 +80,88 @@ def transitions_to(transitions: ArrayLike, success: ArrayLike, threshold: float)
 
     transitions, success: [n_evaluations], in order; later drops below the threshold do not count against it.
     """
-    reached = np.asarray(success, np.float64) >= threshold
+    reached = np.asarray(success, np.float64) >= threshold - _ROUNDING
     return int(np.asarray(transitions)[np.argmax(reached)]) if reached.any() else None
+
+
+def transitions_interval(
+    transitions: ArrayLike,
+    success: ArrayLike,
+    threshold: float,
+    *,
+    level: float = 0.95,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> Censored:
+    """`transitions_to` of the mean over seeds, with its percentile-bootstrap interval over seeds.
+
+    transitions: [n_evaluations], in order. success: [n_seeds, n_evaluations]. A mean that never gets there needs at
+    least the last of `transitions`, at most inf. Bounds are evaluations, not points between them; of one seed, nan.
+    """
+    success = np.asarray(success, np.float64)
+    weights = _resampled(np.random.default_rng(seed), success.shape[0], resamples)
+    needs = _needs(transitions, success, threshold, weights)
+    return Censored(*(_percentiles(each, level, seeds=success.shape[0]) for each in needs))
+
+
+def ratio_interval(
+    numerator: tuple[ArrayLike, ArrayLike],
+    denominator: tuple[ArrayLike, ArrayLike],
+    threshold: float,
+    *,
+    paired: bool,
+    level: float = 0.95,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> Censored:
+    """The transitions of one method over those of another, as of `transitions_interval`, with its interval.
+
+    numerator, denominator: (transitions [n], success [n_seeds, n]) of either. paired: they have the same seeds, which
+    are resampled together, else each has its own. Raises ValueError if paired ones differ in number.
+
+    A resample in which the numerator never gets to the threshold says how large the ratio is at least, one in which the
+    denominator never does how large at most. If neither does the ratio may be anything from 0 to inf, and so it is
+    taken if one is there from the start, where nothing was to be learned. Such resamples stay: without them only those
+    of fast seeds would count. So `least.low` and `most.high` enclose the interval that longer runs would have given.
+    """
+    seeds = [np.shape(success)[0] for _, success in (numerator, denominator)]
+    if paired and seeds[0] != seeds[1]:
+        raise ValueError(f"paired methods need the same seeds, not {seeds[0]} and {seeds[1]} of them")
+    rng = np.random.default_rng(seed)
+    weights = _resampled(rng, seeds[0], resamples)
+    above_least, above_most = _needs(*numerator, threshold, weights)
+    own = weights if paired else _resampled(rng, seeds[1], resamples)
+    below_least, below_most = _needs(*denominator, threshold, own)
+    tells = (above_least > 0) & (below_least > 0)
+    ratios = (
+        np.divide(above_least, below_most, out=np.zeros_like(above_least), where=tells),
+        np.divide(above_most, below_least, out=np.full_like(above_most, np.inf), where=tells),
+    )
+    return Censored(*(_percentiles(each, level, seeds=min(seeds)) for each in ratios))
+
+
+def _resampled(rng: np.random.Generator, seeds: int, resamples: int) -> np.ndarray:
+    """[1 + resamples, seeds] how often each seed is drawn: once in the first row, which is that of the estimate."""
+    return np.vstack([np.ones(seeds), rng.multinomial(seeds, np.full(seeds, 1 / seeds), size=resamples)])
+
+
+def _needs(
+    transitions: ArrayLike, success: ArrayLike, threshold: float, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the most transitions until the mean is at the threshold, [resamples] each."""
+    transitions, success = np.asarray(transitions, np.float64), np.asarray(success, np.float64)
+    reached = weights @ success / success.shape[0] >= threshold - _ROUNDING
+    least = np.where(reached.any(1), transitions[np.argmax(reached, axis=1)], transitions[-1])
+    return least, np.where(reached.any(1), least, np.inf)
+
+
+def _percentiles(values: np.ndarray, level: float, *, seeds: int) -> Interval:
+    """The first value with percentiles of the others, which are values themselves: nothing lies halfway to inf."""
+    if seeds == 1:
+        return Interval(values[0], np.asarray(np.nan), np.asarray(np.nan))
+    ordered = np.sort(values[1:])
+    outside = int(len(ordered) * (1 - level) / 2)
+    return Interval(values[0], ordered[outside], ordered[-1 - outside])
 
 
 def area_under(transitions: ArrayLike, success: ArrayLike) -> np.ndarray:

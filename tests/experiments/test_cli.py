@@ -102,6 +102,40 @@ def test_an_interrupt_tells_how_to_go_on(capsys):
     assert "--resume continues" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("main", "argv", "read", "code", "words"),
+    [
+        ("print", ["--help"], False, 1, ""),
+        ("lambda _: print('word')", [], False, 1, ""),  # stays in Python's buffer until the end
+        ("lambda _: [print('line') for _ in range(10_000)]", [], False, 1, ""),
+        ("lambda _: print('word') or 1 / 0", [], False, 120, "ZeroDivisionError: division by zero"),
+        ("lambda _: os.write(other, b'word')", [], True, 1, "BrokenPipeError: [Errno 32] Broken pipe"),
+    ],
+)
+def test_who_reads_the_output_may_leave(main, argv, read, code, words):
+    """No word then; what else goes wrong, another pipe without a reader too, keeps its traceback.
+
+    120 is Python's own code where it cannot print what is left.
+    """
+    program = (
+        "import dataclasses, os; from experiments import cli\n"
+        "@dataclasses.dataclass(frozen=True)\nclass C:\n    x: int = 1\n"
+        "reader, other = os.pipe(); os.close(reader)\n"
+        f"cli.run_main({main}, C, 'd', argv={argv})\n"
+    )
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    reader, writer = os.pipe()
+    if not read:
+        os.close(reader)
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment, stdout=writer, stderr=subprocess.PIPE, text=True
+    )
+    os.close(writer)
+    if read:
+        os.close(reader)
+    assert done.returncode == code and words in done.stderr and bool(done.stderr) == bool(words)
+
+
 def test_help_is_complete_and_code_0(capsys):
     with pytest.raises(SystemExit) as stopped:
         run(print, "--help")

@@ -7,6 +7,7 @@ from runs_by_hand import save
 import envs
 from experiments import cli, figures, tables
 from experiments.results import read_curve
+from sgft_jax.stats import Censored, Interval
 
 
 @pytest.fixture(autouse=True)
@@ -23,7 +24,8 @@ def test_a_row_says_what_the_curve_says(tmp_path):
     success = [[0.2, 0.4], [0.1, 0.1], [0.8, 1.0], [1.0, 1.0]]
     curve = read_curve(save(tmp_path, "sac", success, rollouts=[0, 20, 50, 100]))
     # Means 0.3, 0.1, 0.9, 1.0: dip 0.3 - 0.1 = 20 points; 90 % first at 50 rollouts = 1,000 transitions, 98 % at 2,000;
-    # 100 rollouts of 2 s are 3.3 min. Two seeds: the bootstrap interval reaches from one to the other.
+    # 100 rollouts of 2 s are 3.3 min. Two seeds: the bootstrap interval reaches from one to the other, of which one is
+    # at both levels after 1,000 and one after 2,000.
     cells = [
         "sac",
         "2",
@@ -33,8 +35,8 @@ def test_a_row_says_what_the_curve_says(tmp_path):
         "90 [80, 100]",
         "100 [100, 100]",
         "100 [100, 100] (100)",
-        "1,000",
-        "2,000",
+        "1,000 [1,000, 2,000]",
+        "2,000 [1,000, 2,000]",
         "38 [33, 43]",
         "20",
         "3.3",
@@ -51,6 +53,28 @@ def test_budgets_not_reached_or_not_evaluated_stay_empty(tmp_path):
         *("sac", "1", "50", "-", "70", "-", "70 (50)"),
         *(ended, ended, "-", "0", "1.7"),
     ]
+
+
+@pytest.mark.parametrize(
+    ("least", "most", "digits", "text"),
+    [
+        ((800, 720, 1200), (800, 720, 1200), 0, "800 [720, 1,200]"),
+        ((800, 720, 4000), (800, 720, np.inf), 0, "800 [720, > 4,000]"),
+        ((4000, 3200, 4000), (np.inf, 3200, np.inf), 0, "> 4,000 [3,200, > 4,000]"),
+        ((4000, 4000, 4000), (np.inf, np.inf, np.inf), 0, "> 4,000"),
+        ((400, 400, 400), (400, 400, 400), 0, "400 [400, 400]"),
+        ((800, np.nan, np.nan), (800, np.nan, np.nan), 0, "800"),
+        ((5.2, 3.91, 7.06), (5.2, 3.91, 7.06), 1, "5.2 [3.9, 7.1]"),
+        ((4.19, 2.29, 6.09), (np.inf, np.inf, np.inf), 1, "> 4.1 [> 2.2, > 6.0]"),  # rounded down
+        ((0, 0, 0), (0.31, 0.11, 0.5), 1, "< 0.4 [< 0.2, < 0.5]"),  # rounded up
+        ((5.2, 0, 6.0), (5.2, 0.7, np.inf), 1, "5.2 [< 0.7, > 6.0]"),
+        ((5.2, 3.0, 6.0), (5.2, 3.5, 7.0), 1, "5.2 [3.0, 7.0]"),  # the ends that enclose all there can be
+        ((5.2, 0, 0), (5.2, np.inf, np.inf), 1, "5.2 [-, -]"),
+        ((0, 0, 1), (np.inf, 1, np.inf), 1, "-"),
+    ],
+)
+def test_how_an_interval_is_written(least, most, digits, text):
+    assert tables.censored(Censored(Interval(*least), Interval(*most)), digits=digits) == text
 
 
 def test_one_figure_and_one_table_per_real_system(tmp_path, capsys, monkeypatch):

@@ -5,7 +5,6 @@ from runs_by_hand import rising, save
 
 from experiments import overview
 from experiments.comparison import colour_order, is_sgft, names_of, read_comparison, split
-from experiments.results import read_curve
 from sgft_jax.methods import METHODS
 
 
@@ -31,7 +30,7 @@ def test_which_methods_are_sgft():
 @pytest.mark.parametrize(
     ("other", "own", "text"),
     [
-        ((60, 100), (20, 100), "3.0"),  # 1,200 and 400 transitions
+        ((60, 100), (20, 100), "3.0 [3.0, 3.0]"),  # 1,200 and 400 transitions
         ((None, 100), (30, 100), "> 3.3"),  # at least 2,000 / 600: a lower bound is rounded down
         ((20, 100), (None, 60), "< 0.4"),  # at most 400 / 1,200: an upper bound is rounded up
         ((70, 100), (None, 100), "< 0.7"),  # exactly
@@ -40,10 +39,27 @@ def test_which_methods_are_sgft():
     ],
 )
 def test_how_many_times_fewer(tmp_path, other, own, text):
-    curves = [
-        read_curve(save(tmp_path, name, **rising(at, to=to))) for name, (at, to) in (("sac", other), ("sgft-sac", own))
-    ]
-    assert overview.times_fewer(*curves) == text
+    for name, (at, to) in (("sac", other), ("sgft-sac", own)):
+        save(tmp_path, name, **rising(at, to=to))
+    assert overview.times_fewer(*read(tmp_path), "sac", "sgft-sac") == text
+
+
+def test_the_same_seeds_are_drawn_together(tmp_path):
+    """Of either run the first seed gets there three times as early as the second one; SAC takes twice as long."""
+    success = [[0, 0], [1, 0], [1, 1]]
+    other = save(tmp_path, "sac", success, rollouts=[0, 20, 60]) / "config.json"
+    config = save(tmp_path, "sgft-sac", success, rollouts=[0, 10, 30]) / "config.json"
+    written = config.read_text()
+    assert overview.times_fewer(*read(tmp_path), "sac", "sgft-sac") == "2.0 [2.0, 2.0]"
+    config.write_text(written.replace('"seed": 0', '"seed": 2'))
+    assert overview.times_fewer(*read(tmp_path), "sac", "sgft-sac") == "2.0 [0.7, 6.0]"
+    config.unlink()
+    other.unlink()  # of which seeds, nobody knows
+    assert overview.times_fewer(*read(tmp_path), "sac", "sgft-sac") == "2.0 [0.7, 6.0]"
+    config.write_text(written)
+    other.write_text(written)
+    save(tmp_path, "pbrs", [[0] * 3, [1] * 3], rollouts=[0, 30], seeds="seeds-0-2")
+    assert overview.times_fewer(*read(tmp_path), "pbrs", "sgft-sac") == "1.0 [1.0, 3.0]"
 
 
 def test_the_best_other_method_may_be_one_that_ended_early(tmp_path):
@@ -66,8 +82,9 @@ def test_tasks_are_columns_and_seeds_left_behind_are_counted(tmp_path):
     save(tmp_path, "sac", task="hammer", real="hard", **rising(40))
     text = sections(tmp_path)
     assert "| method | insert | push |" in text  # hammer was not run on the default real system
-    assert "| sgft-sac | 1,000 (1 of 2) | 400 |" in text and "| sac | - | 800 |" in text
-    assert "| best that is not SGFT | - | sac: 800 |" in text and "| sgft-sac | - | 2.0 |" in text
+    assert "| sgft-sac | 1,000 [1,000, > 2,000] (1 of 2) | 400 [400, 400] |" in text
+    assert "| sac | - | 800 [800, 800] |" in text
+    assert "| best that is not SGFT | - | sac: 800 [800, 800] |" in text and "| sgft-sac | - | 2.0 [2.0, 2.0] |" in text
 
 
 def test_what_is_drawn_in_the_overview(tmp_path, monkeypatch):
