@@ -1,10 +1,11 @@
 """Impure: writes figures as PNG files: learning curves, what pretraining left behind, how costs grow.
 
 Functions take plain arrays and return the path they wrote. Colours are the Okabe-Ito palette (safe for colour-blind
-readers), from the eighth line on dashed, then dotted; a method keeps its colour from figure to figure as long as the
-order of the methods stays (`order`, where a figure shows some of them).
+readers), from the eighth line on dashed, then dotted; the first line shares its colour with none. A method keeps its
+colour from figure to figure as long as the order of the methods stays (`order`, where a figure shows some of them).
 """
 
+import itertools
 import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
@@ -21,7 +22,7 @@ from numpy.typing import ArrayLike
 from sgft_jax.stats import iqm_interval
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-_DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)))  # (0, (drawn, left out)) in widths of the line
+_DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (5, 1.2, 1.2, 1.2)))  # (0, (drawn, left out)) in widths of the line
 _INK, _GREY, _FAINT = "#333333", "#777777", "#B0B0B0"
 _FONT = {"size": 10, "color": _INK}
 _THIN, _THICK = 1.4, 2.4  # where one legend serves many lines
@@ -338,9 +339,11 @@ def _seeds_note(successes: Sequence[ArrayLike], what: str = "band") -> str:
 
 
 def _looks(count: int) -> list[dict[str, Any]]:
-    """Colour and dashes of so many lines, all different."""
-    n = len(PALETTE)
-    return [{"color": PALETTE[i % n], "linestyle": _DASHES[i // n % len(_DASHES)]} for i in range(count)]
+    """Colour and dashes of so many lines, all different; the first, which a figure is about, has a colour to itself."""
+    first, *others = PALETTE
+    laps = itertools.cycle((color, dash) for dash in _DASHES for color in others)
+    looks = itertools.islice(itertools.chain([(first, _DASHES[0])], laps), count)
+    return [{"color": color, "linestyle": dash} for color, dash in looks]
 
 
 def _looks_of(order: Sequence[str]) -> dict[str, dict[str, Any]]:

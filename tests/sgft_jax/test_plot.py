@@ -31,6 +31,7 @@ def test_learning_curves_draw_every_method(tmp_path):
 def test_as_many_lines_as_methods_look_different():
     looks = [tuple(look.values()) for look in plot._looks(20)]
     assert len(set(looks)) == 20 and looks[0] == (plot.PALETTE[0], "-")
+    assert all(color != plot.PALETTE[0] for color, _ in looks[1:])  # that of the method which a figure is about
 
 
 def test_one_seed_draws_a_line_without_a_band(tmp_path):
