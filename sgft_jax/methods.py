@@ -222,8 +222,8 @@ METHODS: dict[str, Method] = {
             "rlpd", "", "from scratch; ten normalised critics, half of each batch from the simulator", "Ball 2023",
             fresh=True, utd=20.0, lr_actor=3e-4, policy_delay=None, critics=10, target_critics=2, actor_mean=True,
             critic_network=NetworkConfig(hidden=(256, 256), layer_norm=True),
-            # The temperature begins at the default's 0.01, as on real robots (SERL, Luo et al. 2024). RLPD itself begins
-            # at 1, which a few thousand updates do not bring down: pushing ended at 0.4, and at no success.
+            # The temperature begins at the default's 0.01, as on real robots (SERL, Luo et al. 2024). From RLPD's own 1
+            # a few thousand updates do not bring it down: pushing ended at 0.4, and at no success.
             tune_alpha=True, entropy_per_dim=-0.5, simulated_share=0.5, critic_warmup=0, actor_ramp=0,
             space={"utd": (10.0, 20.0, 40.0), "lr_actor": (1e-4, 3e-4, 1e-3), "lr_critic": _RATES["lr_critic"],
                    "target_critics": (1, 2, 10), "simulated_share": _SHARE},
