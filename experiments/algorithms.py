@@ -10,8 +10,9 @@ from envs.base import Env
 from experiments.presets import PretrainConfig
 from sgft_jax import checkpoint, replay, sac, sequences, tdmpc2, tdmpc2_model
 from sgft_jax.config import config_from_json, config_to_json
+from sgft_jax.mpc import MPCConfig
 from sgft_jax.networks import NetworkConfig
-from sgft_jax.players import Player, sac_player, tdmpc2_player
+from sgft_jax.players import Player, mpc_player, sac_player, tdmpc2_player
 from sgft_jax.types import Array, Key, Learner, PyTree, Transition
 
 
@@ -42,9 +43,12 @@ def make_algorithm(env: Env, config: PretrainConfig) -> Algorithm:
     return {"sac": _sac, "tdmpc2": _tdmpc2}[config.algorithm](env, config)
 
 
-def make_player(card: Mapping[str, Any]) -> Player:
-    """How the prior with this card acts and judges."""
+def make_player(card: Mapping[str, Any], env: Env) -> Player:
+    """How the prior with this card acts and judges. env: its task, which plans ask for rewards."""
     obs_dim, act_dim = card["obs_dim"], card["act_dim"]
+    if plan := card.get("plan"):
+        config = MPCConfig(obs_dim, act_dim, network_of(card), **plan, gamma=card["gamma"])
+        return mpc_player(config, reward=env.reward, terminated=env.terminated)
     if checkpoint.algorithm_of(card) == "sac":
         return sac_player(obs_dim, act_dim, network_of(card))
     own = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}

@@ -183,6 +183,7 @@ def load_priors(folders: Sequence[Path], env: Env) -> tuple[list[PyTree], dict[s
     priors, cards = zip(*(checkpoint.load_prior(folder, **sizes) for folder in folders), strict=True)
     for folder, card in zip(folders, cards, strict=True):
         odd = [key for key in ("network", "gamma", "ensemble_size") if differences(cards[0][key], card[key])]
+        odd += ["plan"] if card.get("plan") != cards[0].get("plan") else []
         if checkpoint.algorithm_of(card) != checkpoint.algorithm_of(cards[0]):
             odd.append("algorithm")
         if odd:

@@ -88,7 +88,7 @@ def is_sgft(name: str) -> bool:
     if method is None:
         return False
     plans = method.agent == "tdmpc2" and not finetune_config(method).train_critic
-    return plans or (method.uses_value and method.finite_horizon)
+    return plans or method.agent == "mpc" or (method.uses_value and method.finite_horizon)
 
 
 def _names(folder: Path) -> list[str]:

@@ -77,7 +77,7 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     gap = common.load_gap(env, args.real, args.set)
     priors, card = common.load_priors(folders, env)
     env = common.real_env(env, [gap] if gap else [])
-    player, gamma = make_player(card), card["gamma"]
+    player, gamma = make_player(card, env), card["gamma"]
     key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_SEED), args.seed))
     worlds = common.exam_worlds(env, gap, key_worlds, args.episodes)
 

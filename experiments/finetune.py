@@ -28,7 +28,6 @@ from sgft_jax.config import config_to_json
 from sgft_jax.finetune import make_finetuner
 from sgft_jax.log import RunProgress
 from sgft_jax.methods import METHODS, FinetuneConfig, Method, policy_delay
-from sgft_jax.players import Player
 from sgft_jax.replay import ReplayState
 from sgft_jax.types import Array, Finetuner, Key, PyTree, UserError
 
@@ -105,7 +104,7 @@ class _Run:
         """Everything, in order; returns the summaries. priors: [P]; seed i starts from prior i modulo P."""
         self.records, done = records, _common_rollouts(records)
         config = self._options(card)
-        self.simulation = self._simulate(config, priors, make_player(card)) if config.simulated_share else None
+        self.simulation = self._simulate(config, priors, card) if config.simulated_share else None
         if self.method.agent == "iql" and config.reward_scale is None:
             config = replace(config, reward_scale=self._reward_scale())
         self.tuner, self.program = self._programs(self.method, config)
@@ -114,7 +113,7 @@ class _Run:
         own = jax.jit(lambda priors: jax.tree.map(lambda x: x[self._prior_of(priors)], priors))(priors)
         self.untuned = lambda: self.pilot.init(own, self.numbers)
         state = self._start(lambda: self.program.init(own, self.numbers), done, config.offline_updates)
-        return self._finish(self._train(state, done), card)
+        return self._finish(self._train(state, done), self._card(card, config))
 
     def _options(self, card: dict[str, Any]) -> FinetuneConfig:
         """Those of the command line, with what must be as the prior has it and what follows from `--utd`."""
@@ -126,6 +125,12 @@ class _Run:
             return replace(options, size=card["config"]["size"], **own)
         return replace(options, network=network_of(card), **own)
 
+    def _card(self, card: dict[str, Any], config: FinetuneConfig) -> dict[str, Any]:
+        """What a reader of the fine-tuned policies needs: the prior's card, and how they plan, if they do."""
+        own = {name: value for name, value in card.items() if name != "plan"}
+        plan = {"horizon": config.horizon, "samples": config.plan_samples, "noise": config.branch_noise}
+        return own | ({"plan": plan} if self.method.agent == "mpc" else {})
+
     def _programs(self, method: Method, config: FinetuneConfig) -> tuple[Finetuner, Program]:
         env = self.env
         sizes = {"obs_dim": env.obs_dim, "act_dim": env.act_dim}
@@ -136,9 +141,10 @@ class _Run:
         """[M] for every member an index into priors [P]."""
         return self.numbers % jax.tree.leaves(priors)[0].shape[0]
 
-    def _simulate(self, config: FinetuneConfig, priors: PyTree, player: Player) -> Simulation:
+    def _simulate(self, config: FinetuneConfig, priors: PyTree, card: dict[str, Any]) -> Simulation:
         """What every simulator's policy does in its training domain; the same for all methods and after a resume."""
         worlds = self.env.sample_worlds(jax.random.key(_SIMULATION), _SIMULATED_WORLDS)
+        player = make_player(card, self.env)
         sizes = {"transitions": config.simulated_transitions, "ladder": config.simulated_ladder, "gamma": config.gamma}
 
         def one(prior: PyTree, key: Key) -> tuple[ReplayState, Array]:

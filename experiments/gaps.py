@@ -161,7 +161,7 @@ def _zero_shot(env: Env, found: Sequence[Gap], priors: PyTree, card: dict[str, A
 
 def _grader(env: Env, card: dict[str, Any], *, episodes: int) -> Callable[[Key, World, PyTree], Outcome]:
     """(key, pool, prior) -> Outcome [episodes]."""
-    player, gamma = make_player(card), card["gamma"]
+    player, gamma = make_player(card, env), card["gamma"]
     return lambda key, pool, prior: grade(env, player, pool, key, prior, gamma=gamma, episodes=episodes)
 
 

@@ -92,7 +92,7 @@ def landscape(args: LandscapeArgs) -> Path:
     priors, card = common.find_priors(args.prior, out=args.out, env=env, preset=args.preset)
     if not 0 <= args.index < len(priors):
         raise UserError(f"--index {args.index}: there are {len(priors)} priors, counted from 0")
-    player = make_player(card)
+    player = make_player(card, env)
     if player.predict is None:
         raise UserError(f"a prior of {card['algorithm']} has no model of the next observation; choose one of SAC")
     drawn = survey(args, env, player, priors[args.index], start, gamma=card["gamma"])

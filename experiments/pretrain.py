@@ -150,7 +150,7 @@ def run_folder(args: PretrainArgs, gap: Gap | None) -> Path:
 
 def make_program(env: Env, config: PretrainConfig, *, seeds: int) -> Program:
     """The functions of a run of that many seeds."""
-    trainer, player, gamma = make_pretrainer(env, config), make_player(describe_use(env, config)), config.gamma
+    trainer, player, gamma = make_pretrainer(env, config), make_player(describe_use(env, config), env), config.gamma
     extract = trainer.algorithm.extract
 
     def begin(pool: World, random: PyTree, key: Key) -> Saved:

@@ -14,8 +14,9 @@ from sgft_jax.agents import Agent, make_agent
 from sgft_jax.finetune import FinetuneState, make_finetuner
 from sgft_jax.iql import IQLConfig, IQLHyper, IQLState, make_iql
 from sgft_jax.methods import METHODS, FinetuneConfig, Method, finetune_config, get_method
+from sgft_jax.mpc import MPCConfig
 from sgft_jax.networks import NetworkConfig
-from sgft_jax.players import Player, sac_player, tdmpc2_player
+from sgft_jax.players import Player, mpc_player, sac_player, tdmpc2_player
 from sgft_jax.sac import SACConfig, SACHyper, SACState, extract_prior, fine_tune_state, make_sac
 from sgft_jax.sequences import Sequences
 from sgft_jax.sgft import branch, compose, shape, shaped_reward, shorten
@@ -34,6 +35,7 @@ __all__ = [
     "IQLState",
     "Imagination",
     "Learner",
+    "MPCConfig",
     "Method",
     "NetworkConfig",
     "Normalizer",
@@ -61,6 +63,7 @@ __all__ = [
     "make_iql",
     "make_sac",
     "make_tdmpc2",
+    "mpc_player",
     "normalizer",
     "replay",
     "sac_player",

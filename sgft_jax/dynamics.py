@@ -16,6 +16,12 @@ def predict(network: Network, params: PyTree, normalizer: Normalizer, obs: Array
     return jax.vmap(lambda d: obs + normalizer.std * d)(change)
 
 
+def predict_each(network: Network, params: PyTree, normalizer: Normalizer, obs: Array, action: Array) -> Array:
+    """Successors of members that each are somewhere else. obs: [members, obs_dim] raw; action: [act_dim] of all."""
+    own = lambda p, o: predict(network, jax.tree.map(lambda x: x[None], p), normalizer, o, action)[0]  # noqa: E731
+    return jax.vmap(own)(params, obs)
+
+
 def draw_member(params: PyTree, key: Key) -> PyTree:
     """The parameters of one random member, still with a leading axis (of 1)."""
     members = jax.tree.leaves(params)[0].shape[0]
@@ -60,13 +66,10 @@ def rollout_error(network: Network, params: PyTree, normalizer: Normalizer, obs:
     in standard deviations of the observation.
     """
     members = jax.tree.leaves(params)[0].shape[0]
-    step = jax.vmap(
-        lambda p, o, a: predict(network, jax.tree.map(lambda x: x[None], p), normalizer, o, a)[0], (0, 0, None)
-    )
 
     def advance(imagined: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
         action, true_obs = inputs
-        imagined = step(params, imagined, action)
+        imagined = predict_each(network, params, normalizer, imagined, action)
         error = jax.vmap(lambda o: (o - true_obs) / normalizer.std)(imagined)
         return imagined, jnp.sqrt(jnp.mean(error**2))
 

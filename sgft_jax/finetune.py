@@ -8,6 +8,7 @@ from flax import struct
 
 from sgft_jax import dynamics, optim, replay, value
 from sgft_jax.agents import make_agent
+from sgft_jax.finetune_mpc import make_mpc
 from sgft_jax.finetune_planner import make_planner
 from sgft_jax.methods import FinetuneConfig, Method
 from sgft_jax.networks import make_dynamics, make_value
@@ -56,6 +57,8 @@ def make_finetuner(
     """Fine-tuning by `method`. reward, terminated: the task as functions of one (obs, action, next_obs)."""
     if method.agent == "tdmpc2":
         return make_planner(method, config, obs_dim=obs_dim, act_dim=act_dim)
+    if method.agent == "mpc":
+        return make_mpc(config, obs_dim=obs_dim, act_dim=act_dim, reward=reward, terminated=terminated)
     agent = make_agent(method, config, obs_dim=obs_dim, act_dim=act_dim)
     learner = agent.learner
     value_network = make_value(obs_dim, config.network)

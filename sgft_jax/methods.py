@@ -10,7 +10,7 @@ from sgft_jax.networks import NetworkConfig
 from sgft_jax.sgft import branch, shape, shorten
 from sgft_jax.types import Array, BatchTransform, UserError, unknown
 
-AgentName = Literal["sac", "iql", "tdmpc2"]
+AgentName = Literal["sac", "iql", "tdmpc2", "mpc"]
 
 # What tuning chooses from. Of every method the five options that its authors name as sensitive, or that our own
 # measurements do (`FinetuneConfig` says where), with three values each: the spaces are equally large, so that the same
@@ -23,6 +23,10 @@ _SHARE = (0.25, 0.5, 0.75)
 _PLAIN_SPACE = {"utd": _UTD, **_RATES, "alpha": (0.003, 0.01, 0.03), "critic_warmup": _WARMUP}
 _SEGMENT_SPACE = {"utd": _UTD, **_RATES, "horizon": (1, 2, 4), "critic_warmup": _WARMUP}
 _BRANCH_SPACE = {"utd": _UTD, **_RATES, "horizon": (1, 2, 4), "branches": (2, 5, 10)}
+_MODEL_SPACE = {
+    "utd": _UTD, "lr_dynamics": (1e-4, 3e-4, 1e-3), "horizon": (1, 2, 4), "branch_noise": (0.25, 0.5, 1.0),
+    "plan_samples": (64, 128, 256),
+}  # fmt: skip
 _PLANNER_SPACE = {
     "utd": (1.0, 2.0, 4.0), "lr_critic": (1e-4, 3e-4, 1e-3), "horizon": (2, 3, 4), "batch_size": (128, 256, 512),
     "plan_samples": (256, 512, 1024),
@@ -46,7 +50,8 @@ class FinetuneConfig:
     size: of TD-MPC2's networks; must be the prior's. For it `horizon` is the length of plans and training windows,
         `lr_critic` the rate of all networks, and `train_critic` False makes it SGFT-TDMPC-2: encoder, critic and the
         policy in V_sim stay the simulator's; train_encoder is the ablation that lets the encoder learn.
-    plan_samples: sequences that a plan tries in each of its iterations.
+    plan_samples: sequences that a plan tries in each of its iterations. The planner on SAC's priors, `sgft-mpc`, has
+        H = `horizon` too, and `branch_noise` on what the policy proposes.
     critics, target_critics, actor_mean, policy_delay, train_critic: see `SACConfig`. A kept critic has two members.
         policy_delay None = the updates of a real transition (`utd`): the actor moves once for each, as in RLPD.
     reset_critic: None = the method's default. A kept critic under a shaped reward is read as Q_sim(s, a) - V_sim(s),
@@ -177,7 +182,7 @@ def _method(
     space: Mapping[str, tuple[Any, ...]],
     **options: Any,
 ) -> Method:
-    finite = "shorten" in parts
+    finite, plans = "shorten" in parts, agent == "mpc"
 
     def transforms(horizon: int, branches: int, noise: float | Array) -> tuple[BatchTransform, ...]:
         built: dict[str, Callable[[], BatchTransform]] = {
@@ -187,7 +192,7 @@ def _method(
         }
         return tuple(built[part]() for part in parts.split())
 
-    uses = ("shape" in parts, "branch" in parts)
+    uses = ("shape" in parts or plans, "branch" in parts or plans)
     return Method(name, description, source, transforms, finite, *uses, reset_critic, agent, fresh, utd, options, space)
 
 
@@ -246,6 +251,10 @@ METHODS: dict[str, Method] = {
         _method(
             "sgft-tdmpc2", "", "SGFT-TDMPC-2: plans of H steps that end in a frozen V_sim", "SGFT 2025",
             agent="tdmpc2", utd=1.0, horizon=4, tau=0.01, train_critic=False, space=_PLANNER_SPACE,
+        ),
+        _method(
+            "sgft-mpc", "", "MPC-SGFT: plans of H steps by SAC's prior's models, which learn, that end in V_sim",
+            "SGFT 2025", agent="mpc", plan_samples=128, space=_MODEL_SPACE,
         ),
         _method("sgft", "shape shorten", "model-free SGFT", "SGFT 2025", space=_SEGMENT_SPACE),
         _method("sgft-sac", "branch shape shorten", "SGFT-SAC", "SGFT 2025", space=_BRANCH_SPACE),

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from sgft_jax import dynamics, tdmpc2, tdmpc2_model, value
+from sgft_jax import dynamics, mpc, tdmpc2, tdmpc2_model, value
 from sgft_jax.networks import NetworkConfig, make_actor, make_dynamics, make_value, tanh_gaussian_action
 from sgft_jax.normalizer import normalize
 from sgft_jax.types import Array, Key, Prior, PyTree
@@ -50,6 +50,18 @@ def sac_player(obs_dim: int, act_dim: int, network: NetworkConfig) -> Player:
         model_error=lambda prior, obs, actions: dynamics.rollout_error(
             model, prior.dynamics, prior.normalizer, obs, actions
         ),
+    )
+
+
+def mpc_player(
+    config: mpc.MPCConfig,
+    *,
+    reward: Callable[[Array, Array, Array], Array],
+    terminated: Callable[[Array, Array, Array], Array],
+) -> Player:
+    """The same `Prior`, acting by plans. reward, terminated: the task as functions of one (obs, action, next_obs)."""
+    return sac_player(config.obs_dim, config.act_dim, config.network)._replace(
+        init_carry=lambda: mpc.init_carry(config), act=mpc.make_act(config, reward=reward, terminated=terminated)
     )
 
 

@@ -30,7 +30,7 @@ def errors(task: str, impl: Impl, prior: Path, precisions: Sequence[Precision]) 
     priors, card = common.find_priors(prior, out=prior, env=env, preset="")
     if not isinstance(priors[0], Prior):
         raise UserError(f"{prior}: a prior of {card['algorithm']}; precisions are compared for those of SAC")
-    player, network = make_player(card), make_value(env.obs_dim, network_of(card))
+    player, network = make_player(card, env), make_value(env.obs_dim, network_of(card))
     pool = common.training_worlds(env, None, jax.random.key(0), EPISODES)
     keys = jax.random.split(jax.random.key(1), EPISODES)
 

@@ -53,7 +53,8 @@ def test_a_prior_of_td_mpc2_plays_as_its_card_says(home):
     assert isinstance(prior, tdmpc2.TDMPC2Prior) and card["algorithm"] == "tdmpc2"
     assert "value/explained_variance" in card["metrics"] and "dynamics/error" not in card["metrics"]
     assert (run / "figures/seed-0.png").stat().st_size > 10_000
-    env, player = toy.make(), make_player(card)
+    env = toy.make()
+    player = make_player(card, env)
     outcome = grade(
         env, player, env.sample_worlds(jax.random.key(0), 4), jax.random.key(1), prior, gamma=0.9, episodes=4
     )

@@ -1,0 +1,75 @@
+"""Fine-tuning of one agent that plans with SAC's prior: the dynamics ensemble learns, V_sim and the policy stay."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from sgft_jax import dynamics, mpc, optim, replay
+from sgft_jax.methods import FinetuneConfig
+from sgft_jax.networks import make_dynamics
+from sgft_jax.types import Array, Finetuner, Key, Metrics, Prior, PyTree, Simulated, Transition
+
+
+class MPCState(struct.PyTreeNode):
+    """prior: the simulator's, frozen but for its models; dynamics: these in training; replay."""
+
+    prior: Prior
+    dynamics: optim.Fit
+    replay: replay.ReplayState
+
+
+def mpc_config(config: FinetuneConfig, *, obs_dim: int, act_dim: int) -> mpc.MPCConfig:
+    """The planner that these options describe."""
+    return mpc.MPCConfig(
+        obs_dim, act_dim, config.network, config.horizon, config.plan_samples, config.branch_noise, config.gamma
+    )
+
+
+def make_mpc(
+    config: FinetuneConfig,
+    *,
+    obs_dim: int,
+    act_dim: int,
+    reward: Callable[[Array, Array, Array], Array],
+    terminated: Callable[[Array, Array, Array], Array],
+) -> Finetuner:
+    """MPC-SGFT. reward, terminated: as for `finetune.make_finetuner`. Source: SGFT Algorithm 3."""
+    planner = mpc_config(config, obs_dim=obs_dim, act_dim=act_dim)
+    plan = mpc.make_act(planner, reward=reward, terminated=terminated)
+    model = make_dynamics(obs_dim, act_dim, config.network)
+    optimiser = optim.adam(config.max_grad_norm)
+
+    def init(prior: Prior, key: Key) -> MPCState:
+        del key
+        own = jax.tree.map(jnp.copy, prior)  # the caller may donate the state; the prior must survive it
+        empty = replay.init(replay.blank(obs_dim, act_dim), config.replay_capacity)
+        return MPCState(replace(own, dynamics=None), optim.start(optimiser, own.dynamics), empty)
+
+    def export(state: MPCState) -> Prior:
+        return replace(state.prior, dynamics=state.dynamics.params)
+
+    def act(state: MPCState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
+        return plan(export(state), carry, obs, key, explore=explore)
+
+    def observe(state: MPCState, transitions: Transition, valid: Array) -> MPCState:
+        return state.replace(replay=replay.add_batch(state.replay, transitions, valid))
+
+    def update(state: MPCState, key: Key) -> tuple[MPCState, Metrics]:
+        key_rows, key_fit = jax.random.split(key)
+        rows = replay.sample(state.replay, key_rows, config.batch_size)
+        fit, metrics = dynamics.update(
+            model, optimiser, state.dynamics, state.prior.normalizer, rows, key_fit, rate=config.lr_dynamics
+        )
+        return state.replace(dynamics=fit), metrics
+
+    def learn(
+        state: MPCState, key: Key, n_updates: int, simulated: Simulated | None = None, *, offline: bool = False
+    ) -> tuple[MPCState, Metrics]:
+        del simulated, offline  # the models learn from real rows alone
+        state, metrics = jax.lax.scan(update, state, jax.random.split(key, n_updates))
+        return state, jax.tree.map(jnp.mean, metrics)
+
+    return Finetuner(init, lambda: mpc.init_carry(planner), act, observe, learn, export)
