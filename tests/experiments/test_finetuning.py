@@ -16,9 +16,11 @@ from test_common import save_prior
 
 import envs
 from experiments import cli, evaluate, finetune, finetuning, video
+from experiments.algorithms import make_player
 from experiments.evaluation import play_episodes
 from sgft_jax import checkpoint, runs
 from sgft_jax.log import RealLog, read_jsonl
+from sgft_jax.methods import FinetuneConfig, get_method
 from sgft_jax.types import UserError
 
 TESTS = Path(__file__).parent.parent
@@ -164,6 +166,24 @@ def test_the_policies_are_what_the_run_evaluated(home, capsys):
     assert [Path(p["policy"]).name for p in found["policies"]] == ["seed-0", "seed-1"]
     final = read_jsonl(run(home, "sac") / "eval.jsonl")[-1]["return"]
     assert [p["return"] for p in found["policies"]] == pytest.approx(final, abs=6.0)  # other episodes, 30 and 8
+
+
+def test_a_planner_leaves_priors_that_plan(home):
+    """The card says how, until a method that does not plan goes on from there."""
+    run(home, "sgft-mpc")
+    folder = run(home, "sgft-mpc") / "policy/seed-1"
+    prior, card = checkpoint.load_prior(folder, task="toy")
+    assert card["plan"] == {"horizon": 1, "samples": 128, "noise": 0.5}
+    env, before = toy.make(), checkpoint.load_prior(home / "pretrain/toy/fast/seeds-0-1/prior/seed-1")[0]
+    key, obs = jax.random.key(0), np.array([0.5, -0.5, 0.1, 0.0], np.float32)
+    plans, plain = (make_player({**card, "plan": plan}, env) for plan in (card["plan"], None))
+    planned, reflex = (p.act(prior, p.init_carry(), obs, key, explore=False)[0] for p in (plans, plain))
+    assert not np.allclose(planned, reflex, atol=0.01)
+    jax.tree.map(np.testing.assert_array_equal, (before.actor, before.value), (prior.actor, prior.value))
+    assert not np.array_equal(*(p.dynamics["Dense_0"]["kernel"] for p in (before, prior)))
+    reader = finetune._Run.__new__(finetune._Run)
+    reader.method = get_method("sac")
+    assert "plan" not in reader._card(card, FinetuneConfig())
 
 
 def test_all_methods_meet_the_same_real_starts(home):
