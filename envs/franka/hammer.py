@@ -5,6 +5,9 @@ the side of the base, so that the striking face is almost below joint 6: the wea
 "Nail z" of the paper's Table 1 is read as the height of the nail's head at the start, the board lies 2 * half height
 below. Nail height means the underside of the head: it touches the board at 0. A head driven deeper sinks in until
 the hammer itself meets the board.
+
+The face meets the nail and the board; handle and wrist meet the board too, a plane, and what lies between them stays
+above it with them. The elbow starts beside high boards, below their height: for it the board is a block with an edge.
 """
 
 import jax
@@ -32,7 +35,19 @@ Q_READY = np.array([0.0, -0.2, 0.0, -0.9, 0.0, 0.7, np.pi / 4])  # near every st
 STEEL = 7850.0  # kg/m^3
 REACTION_TIME = 0.002  # s, see `_add_nail`
 SOLREF, SOLIMP = [0.0125, 1.0], [0.0, 0.95, 0.003, 0.5, 2.0]
-NAIL_DEPTH = 0.3  # m: the nail's contact geom reaches this far below the head
+DEPTH = 0.3  # m: the contact geoms of the nail and of the board's edge reach this far down
+HANDLE, HANDLE_RADIUS = 0.13, 0.011  # m from the gripper's centre to the end of the handle, away from the base
+# Two spheres on the axis of link 4, wider than its capsule: neither between them nor next to them does the board's edge
+# get deeper than 1 cm into the drawn arm. The capsule itself would do as well, but costs MJX's own code far more time.
+ELBOW = {"elbow": (-0.006, 0.009, 0.0), "forearm": (-0.054, 0.081, 0.0)}  # m, frame of link 4
+ELBOW_RADIUS = 0.065  # m
+EDGE = 0.075  # m from the nail to the board's edges: the elbow of some starts would touch a wider board
+PAIRS = (
+    ("face", "nail"),
+    *((name, "board") for name in ("face", "handle", "wrist")),
+    *((name, "block") for name in ELBOW),
+)
+INVISIBLE = [0, 0, 0, 0]
 NV = arm.N_JOINTS + 1
 
 PARAMETERS = (
@@ -55,12 +70,15 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     spec = new_spec(substeps=SUBSTEPS, iterations=2, ls_iterations=4)
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
     _add_hammer(link, theta["hammer_mass"])
+    spec.body("link6").geoms[0].name = "wrist"  # the link's capsule, as drawn
+    for name, center in ELBOW.items():
+        _add_sphere(spec.body("link4"), name, center, ELBOW_RADIUS, INVISIBLE)
     board = theta["nail_z"] - 2 * theta["nail_half_height"]
     _add_board(spec, theta["nail_x"], board)
     _add_nail(spec, theta, board)
-    for other in ("nail", "board"):
+    for moving, still in PAIRS:
         # Frictionless: one constraint row instead of four, and the face cannot drag the nail.
-        spec.add_pair(geomname1="face", geomname2=other, condim=1, solref=SOLREF, solimp=SOLIMP)
+        spec.add_pair(geomname1=moving, geomname2=still, condim=1, solref=SOLREF, solimp=SOLIMP)
     return spec
 
 
@@ -164,20 +182,26 @@ def _add_hammer(link: mujoco.MjsBody, mass: float) -> None:
     wood, steel, dark = [0.72, 0.52, 0.3, 1], [0.45, 0.47, 0.5, 1], [0.1, 0.1, 0.12, 1]
     axis, tip = arm.TCP, arm.TCP + FACE
     head = _across(-HEAD_BACK, 0.0)
-    link.add_geom(
-        name="face",
-        type=mujoco.mjtGeom.mjGEOM_SPHERE,
-        pos=[*head, tip - FACE_RADIUS],
-        size=[FACE_RADIUS, 0, 0],
-        mass=mass,
-        rgba=steel,
-        **NO_CONTACT,
-    )
+    _add_sphere(link, "face", (*head, tip - FACE_RADIUS), FACE_RADIUS, steel, mass=mass)
+    end = (*_across(HANDLE, 0.0), axis)
+    _add_sphere(link, "handle", end, HANDLE_RADIUS, wood)
     _add_rod(link, (*head, axis - 0.045), (*head, tip - FACE_RADIUS), 0.0165, steel)
-    _add_rod(link, (*_across(-HEAD_BACK, 0), axis), (*_across(0.13, 0), axis), 0.011, wood)
+    _add_rod(link, (*_across(-HEAD_BACK, 0), axis), end, HANDLE_RADIUS, wood)
     for side in (-1, 1):
         y = side * 0.019
         _add_rod(link, (*_across(0, y), arm.FLANGE + 0.07), (*_across(0, y), axis), 0.008, dark)
+
+
+def _add_sphere(body: mujoco.MjsBody, name: str, center, radius: float, rgba, mass: float = 0.0) -> None:  # noqa: ANN001
+    body.add_geom(
+        name=name,
+        type=mujoco.mjtGeom.mjGEOM_SPHERE,
+        pos=center,
+        size=[radius, 0, 0],
+        mass=mass,
+        rgba=rgba,
+        **NO_CONTACT,
+    )
 
 
 def _add_rod(body: mujoco.MjsBody, start, end, radius: float, rgba: list[float]) -> None:  # noqa: ANN001
@@ -225,21 +249,25 @@ def _add_nail(spec: mujoco.MjSpec, theta: dict[str, float], board: float) -> Non
     body.add_geom(
         name="nail",
         type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=[0, 0, thickness - NAIL_DEPTH / 2],
-        size=[head, head, NAIL_DEPTH / 2],
+        pos=[0, 0, thickness - DEPTH / 2],
+        size=[head, head, DEPTH / 2],
         mass=0,
-        rgba=[0, 0, 0, 0],
+        rgba=INVISIBLE,
         **NO_CONTACT,
     )
 
 
 def _add_board(spec: mujoco.MjSpec, x: float, height: float) -> None:
-    """The board stops the hammer at its height everywhere (a plane); what is drawn is a block on a stand."""
-    world, box = spec.worldbody, mujoco.mjtGeom.mjGEOM_BOX
-    plane = mujoco.mjtGeom.mjGEOM_PLANE
-    world.add_geom(name="board", type=plane, pos=[0, 0, height], size=[2, 2, 0.1], rgba=[0, 0, 0, 0], **NO_CONTACT)
-    world.add_geom(
-        type=box, pos=[x, 0, height - 0.03], size=[0.1, 0.16, 0.0299], rgba=[0.78, 0.62, 0.42, 1], **NO_CONTACT
-    )
+    """The board stops hammer and wrist at its height everywhere (a plane), and the elbow from its edge on (a block).
+
+    What is drawn is a board on a stand.
+    """
+    world, box, plane = spec.worldbody, mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_PLANE
+    hidden = {"rgba": INVISIBLE, **NO_CONTACT}
+    world.add_geom(name="board", type=plane, pos=[0, 0, height], size=[2, 2, 0.1], **hidden)
+    center = [x - EDGE + 1, 0, height - DEPTH / 2]
+    world.add_geom(name="block", type=box, pos=center, size=[1, 1, DEPTH / 2], **hidden)
+    wood, dark = [0.78, 0.62, 0.42, 1], [0.35, 0.37, 0.4, 1]
+    world.add_geom(type=box, pos=[x, 0, height - 0.03], size=[EDGE, 0.16, 0.0299], rgba=wood, **NO_CONTACT)
     stand = (height - 0.06) / 2
-    world.add_geom(type=box, pos=[x, 0, stand], size=[0.05, 0.09, stand], rgba=[0.35, 0.37, 0.4, 1], **NO_CONTACT)
+    world.add_geom(type=box, pos=[x, 0, stand], size=[0.05, 0.09, stand], rgba=dark, **NO_CONTACT)

@@ -5,8 +5,11 @@ would amplify rounding errors (a puck between two fingertips: a hundredfold in t
 plays a whole episode in MJX and must end alike.
 """
 
+import itertools
+
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from franka_bench import EXACT, SCENES, bench, member
@@ -81,6 +84,33 @@ def test_hammering():
         assert wanted[0, 9] - wanted[-1, 9] > 0.01  # the nail went in
         np.testing.assert_allclose(repeat_in_mjx(rig, world, start, steps), wanted[1:], atol=5e-4)
         np.testing.assert_allclose(play_in_mjx(rig, world, start)[-1, 9], wanted[-1, 9], atol=1e-4)
+
+
+def touched(model, states):
+    """Names of the geoms of the arm that touch something in any of the states."""
+    data, names = mujoco.MjData(model), set()
+    for state in states:
+        data.qpos[:] = state.qpos
+        mujoco.mj_forward(model, data)
+        names |= {model.geom(g).name for g in data.contact.geom.flat if model.geom_bodyid[g]}
+    return names
+
+
+@pytest.mark.slow
+def test_arm_on_the_board():
+    """Every combination of saturated commands, which press hammer, wrist and elbow on the board: 0.1 mrad."""
+    rig, scene = slow_rig("hammer"), SCENES["hammer"]
+    world = member(rig.worlds, 0)
+    start = rig.reset(world, KEY)
+    theta = dict(zip([p.name for p in rig.env.parameters], map(float, world.params), strict=True))
+    names = set()
+    for signs in itertools.product((-1.0, 1.0), repeat=3):
+        action = jnp.array(signs)
+        states = [start.physics, *host.play(scene, theta, start.physics, [action] * 12)]
+        names |= touched(scene.build(theta).compile(), states)
+        seen = [rig.step(world, start._replace(physics=s), action, KEY).physics.qpos for s in states[:-1]]
+        np.testing.assert_allclose(seen, [s.qpos for s in states[1:]], atol=1e-4)
+    assert names >= {"face", "handle", "wrist", "elbow"}
 
 
 def grope(params, state, t):

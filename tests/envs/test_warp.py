@@ -1,5 +1,7 @@
 """MuJoCo Warp, here on the CPU, against C MuJoCo: one control period from each state of hammering episodes."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,6 +49,20 @@ def test_hammering():
     assert error[..., :7].max() < 2e-4 and error[..., 7].max() < 2e-5
     nail = np.asarray(states.physics.qpos)[..., 7]
     assert (nail[:, 0] - nail[:, -1]).max() > 1e-3  # some blow drove a nail
+
+
+def test_arm_on_the_board():
+    """0.1 mrad after 0.2 s under saturated commands that press hammer, wrist and elbow on the board."""
+    c, warp = (make_env(SCENES["hammer"], impl=impl) for impl in ("c", "warp"))
+    actions = jnp.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    worlds = c.sample_worlds(jax.random.key(3), len(actions), effects=EXACT)
+    keys = jax.random.split(jax.random.key(0), len(actions))
+    state = jax.vmap(c.reset)(worlds, keys)
+    steps = [jax.jit(jax.vmap(env.step)) for env in (c, warp)]
+    for _ in range(12):
+        after, seen = (step(worlds, state, actions, keys) for step in steps)
+        np.testing.assert_allclose(seen.physics.qpos, after.physics.qpos, atol=1e-4)
+        state = after
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """Hammering in C MuJoCo: rewards by hand, starts, a script that drives the nail home, time-step accuracy."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -22,6 +24,29 @@ def corners():
 
 def start(theta, seed=0):
     return hammer.initial(as_params(theta), jax.random.key(seed))
+
+
+def touching(model, qpos):
+    """Number of contacts of a scene at rest."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    return data.ncon
+
+
+def drawn(model, bodies):
+    """Ids of the visible geoms of some bodies."""
+    ids = {model.body(name).id for name in bodies}
+    return [g for g in range(model.ngeom) if model.geom_bodyid[g] in ids and model.geom_rgba[g, 3] > 0]
+
+
+def depth(model, qpos, geoms, obstacles):
+    """How far the deepest of `geoms` is inside any of `obstacles`, m; negative: how far the nearest is away."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    pairs = itertools.product(geoms, obstacles)
+    return -min(mujoco.mj_geomDistance(model, data, *pair, 1.0, None) for pair in pairs)
 
 
 def heights(theta, states):
@@ -133,6 +158,28 @@ def test_board_stops_the_hammer_beside_the_nail():
     assert faces[:, 2].min() < 0.57  # it did come down to the board at 0.56 m
     assert faces[:, 2].min() > 0.56 - 0.02  # O-24
     np.testing.assert_allclose(heights(theta, states), 0.04, atol=1e-6)  # and the nail was left alone
+
+
+def test_starts_touch_nothing():
+    """The high boards closest to the elbow, and of many starts those that lean forward the most."""
+    high = NOMINAL | {"nail_x": 0.3, "nail_z": 0.65, "nail_half_height": 0.02}
+    for theta in [high, *corners()]:
+        params, model = as_params(theta), hammer.build(theta).compile()
+        states = jax.vmap(lambda key, p=params: hammer.initial(p, key))(jax.random.split(jax.random.key(9), 2000))
+        leaning = np.argsort(-np.asarray(states.qpos[:, 1]))[:50]
+        assert not any(touching(model, states.qpos[i]) for i in leaning)
+
+
+@pytest.mark.parametrize("theta", corners())
+def test_arm_stays_out_of_the_board(theta):
+    """Whatever all joints are told for 3 s: hammer, hand and wrist stay above its height, the arm outside of it."""
+    model = hammer.build(theta).compile()
+    hand, limbs = drawn(model, ["link6", "link7"]), drawn(model, ["link3", "link4", "link5"])
+    board = [g for g in drawn(model, ["world"]) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX]
+    for signs in itertools.product((-1.0, 1.0), repeat=3):
+        for state in host.play(hammer.SCENE, theta, start(theta), jnp.tile(jnp.array(signs), (15, 1))):
+            assert depth(model, state.qpos, hand, [model.geom("board").id]) < 0.015
+            assert depth(model, state.qpos, hand + limbs, board) < 0.015
 
 
 def test_random_saturated_actions_never_explode():
