@@ -133,7 +133,7 @@ class Method(NamedTuple):
 
     transforms(horizon, branches, noise) -> the batch transforms in order; for branches and noise see `branch`.
     finite_horizon: the agent is told the steps to go (for horizon > 1). reset_critic: default at transfer.
-    uses_value, uses_dynamics: what it takes from the prior besides the agent.
+    uses_value, uses_dynamics: what its transforms take from the prior besides the agent.
     agent: the learner. fresh: it starts from nothing, and the simulator's policy only makes the initial rollouts.
     utd: updates per real transition. options: where its `FinetuneConfig` differs from the defaults, by field.
     space: what tuning may choose (experiments/tune.py): values for `utd` and for fields of `FinetuneConfig`.
@@ -182,7 +182,7 @@ def _method(
     space: Mapping[str, tuple[Any, ...]],
     **options: Any,
 ) -> Method:
-    finite, plans = "shorten" in parts, agent == "mpc"
+    finite = "shorten" in parts
 
     def transforms(horizon: int, branches: int, noise: float | Array) -> tuple[BatchTransform, ...]:
         built: dict[str, Callable[[], BatchTransform]] = {
@@ -192,7 +192,7 @@ def _method(
         }
         return tuple(built[part]() for part in parts.split())
 
-    uses = ("shape" in parts or plans, "branch" in parts or plans)
+    uses = ("shape" in parts, "branch" in parts)
     return Method(name, description, source, transforms, finite, *uses, reset_critic, agent, fresh, utd, options, space)
 
 

@@ -25,7 +25,7 @@ from sgft_jax.types import UserError
         ("tdmpc2", False, False, False, False),
         ("sgft-tdmpc2", False, False, False, False),
         ("sgft-tdmpc2-code", True, False, False, False),
-        ("sgft-mpc", True, True, False, False),
+        ("sgft-mpc", False, False, False, False),
     ],
 )
 def test_method_table(name, value, dynamics, reset, finite):
