@@ -15,9 +15,9 @@ from sgft_jax.networks import NetworkConfig, make_actor, make_dynamics, make_val
 from sgft_jax.normalizer import normalize
 from sgft_jax.types import Array, Key, Prior, PyTree, UserError
 
-_ITERATIONS = 3  # of the search: more changed nothing for plans as short as these
+_ITERATIONS = 3  # of the search: half of TD-MPC2's, for plans a quarter as long
 _PROPOSALS, _ELITES = 4, 8  # one of so many samples is the policy's, and an elite
-# Per unit of reward, of which all tasks have about one a step: actions that differ by less than a tenth compete.
+# TD-MPC2 averages over elites that differ by some units of return; here a plan is a step or a few, a tenth is a lot.
 _SEARCH = mppi.MPPIHyper(temperature=20.0, std_min=0.05, std_max=1.0)
 
 
