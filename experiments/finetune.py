@@ -241,7 +241,7 @@ class _Run:
         return state, shown
 
     def _collect(self, state: PyTree, done: int, n: int) -> Episode:
-        """The initial rollouts are the simulator's policy's, whatever the method: the same for all."""
+        """The initial rollouts are the simulator's policy's, the same for all methods that do not plan."""
         program, state = (self.program, state) if done else (self.pilot, self.untuned())
         return program.collect(state, self.reals, self.numbers, done, n)
 

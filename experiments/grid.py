@@ -37,7 +37,7 @@ class GridArgs:
     rollouts: int = 100
     """Real rollouts per seed, the initial ones included; may grow later."""
     initial_rollouts: int = 5
-    """Rollouts of the simulator's policy, the same for all methods."""
+    """Rollouts of the simulator's policy, the same for all methods that do not plan."""
     eval_every: int = 5
     """Rollouts between evaluations."""
     together: bool = True

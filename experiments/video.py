@@ -28,7 +28,7 @@ def before_and_after(env: Env, pool: World, play: Callable[[], Sequence[Episode]
     qpos = [np.concatenate([episode.start.physics.qpos[None], episode.qpos]) for episode in episodes]
     captions = [
         f"{name}: {'success' if episode.success else 'failure'}"
-        for name, episode in zip(("simulator's policy", f"after {rollouts} real rollouts"), episodes, strict=True)
+        for name, episode in zip(("before fine-tuning", f"after {rollouts} real rollouts"), episodes, strict=True)
     ]
     theta = np.asarray(pool.params[episodes[0].world]).tolist()
     try:

@@ -400,4 +400,4 @@ def test_both_policies_are_filmed_from_one_start_in_one_world(tmp_path, monkeypa
     np.testing.assert_array_equal(before[0], after[0])
     np.testing.assert_array_equal(before, np.tile(before[0], (21, 1)))  # without force it stays where it is
     assert np.linalg.norm(after[-1]) < np.linalg.norm(after[0])
-    assert captions[0].startswith("simulator's policy: ") and captions[1] == "after 7 real rollouts: success"
+    assert captions[0].startswith("before fine-tuning: ") and captions[1] == "after 7 real rollouts: success"
