@@ -52,7 +52,10 @@ def make_mpc(
         return replace(state.prior, dynamics=state.dynamics.params)
 
     def act(state: MPCState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
-        return plan(export(state), carry, obs, key, explore=explore)
+        key_plan, key_noise = jax.random.split(key)
+        action, carry = plan(export(state), carry, obs, key_plan, explore=explore)
+        noise = config.explore_noise * jax.random.normal(key_noise, action.shape)
+        return jnp.clip(action + jnp.where(explore, noise, 0.0), -1.0, 1.0), carry
 
     def observe(state: MPCState, transitions: Transition, valid: Array) -> MPCState:
         return state.replace(replay=replay.add_batch(state.replay, transitions, valid))

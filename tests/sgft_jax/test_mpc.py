@@ -141,15 +141,23 @@ def test_the_models_learn_and_all_else_stays():
     np.testing.assert_allclose(predicted, -0.2, atol=0.05)  # every member
 
 
+def test_real_actions_are_spread_and_the_best_one_is_not():
+    """By 0.4, which the bounds of actions cut a little, beside the 0.05 of the search."""
+    state, obs = tuner().init(prior(), jax.random.key(0)), jnp.array([0.3])
+    act = jax.vmap(
+        lambda key, explore: tuner().act(state, tuner().init_carry(), obs, key, explore=explore)[0], (0, None)
+    )
+    best, spread = (act(jax.random.split(jax.random.key(5), 200), explore) for explore in (False, True))
+    assert best.std() < 0.2 and 0.25 < (spread - best).std() < 0.5 and jnp.abs(spread).max() <= 1
+
+
 def test_what_fine_tuning_leaves_acts_as_the_agent_did():
     """A player made of the same options, with the parameters that were exported."""
     state = tuner().init(prior(), jax.random.key(0))
     config = mpc.MPCConfig(1, 1, NET, samples=24, gamma=0.9)
     player = mpc_player(config, reward=lambda obs, action, after: -jnp.abs(after[0]), terminated=never)
-    for explore in (False, True):
-        own = tuner().act(state, tuner().init_carry(), jnp.array([0.3]), jax.random.key(4), explore=explore)
-        again = player.act(
-            tuner().export(state), player.init_carry(), jnp.array([0.3]), jax.random.key(4), explore=explore
-        )
-        np.testing.assert_allclose(own[0], again[0], atol=1e-5)
+    key, obs = jax.random.key(4), jnp.array([0.3])
+    own = tuner().act(state, tuner().init_carry(), obs, key, explore=False)
+    again = player.act(tuner().export(state), player.init_carry(), obs, jax.random.split(key)[0], explore=False)
+    np.testing.assert_allclose(own[0], again[0], atol=1e-5)
     assert jnp.isfinite(player.value(prior(), jnp.array([0.3])))
