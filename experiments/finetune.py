@@ -26,6 +26,7 @@ from experiments.finetuning import Program, Reals, Simulation, make_program, sim
 from sgft_jax import checkpoint, mesh, runs
 from sgft_jax.config import config_to_json
 from sgft_jax.finetune import make_finetuner
+from sgft_jax.finetune_mpc import plan_options
 from sgft_jax.log import RunProgress
 from sgft_jax.methods import METHODS, FinetuneConfig, Method, policy_delay
 from sgft_jax.replay import ReplayState
@@ -128,8 +129,7 @@ class _Run:
     def _card(self, card: dict[str, Any], config: FinetuneConfig) -> dict[str, Any]:
         """What a reader of the fine-tuned policies needs: the prior's card, and how they plan, if they do."""
         own = {name: value for name, value in card.items() if name != "plan"}
-        plan = {"horizon": config.horizon, "samples": config.plan_samples, "noise": config.branch_noise}
-        return own | ({"plan": plan} if self.method.agent == "mpc" else {})
+        return own | ({"plan": plan_options(config)} if self.method.agent == "mpc" else {})
 
     def _programs(self, method: Method, config: FinetuneConfig) -> tuple[Finetuner, Program]:
         env = self.env

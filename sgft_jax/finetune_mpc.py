@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ from flax import struct
 
 from sgft_jax import dynamics, mpc, optim, replay
 from sgft_jax.methods import FinetuneConfig
-from sgft_jax.networks import make_dynamics
+from sgft_jax.networks import add_noise, make_dynamics
 from sgft_jax.types import Array, Finetuner, Key, Metrics, Prior, PyTree, Simulated, Transition
 
 
@@ -21,11 +22,9 @@ class MPCState(struct.PyTreeNode):
     replay: replay.ReplayState
 
 
-def mpc_config(config: FinetuneConfig, *, obs_dim: int, act_dim: int) -> mpc.MPCConfig:
-    """The planner that these options describe."""
-    return mpc.MPCConfig(
-        obs_dim, act_dim, config.network, config.horizon, config.plan_samples, config.branch_noise, config.gamma
-    )
+def plan_options(config: FinetuneConfig) -> dict[str, Any]:
+    """Those that make an `MPCConfig` of a prior's networks and discount factor; a fine-tuned prior's card has them."""
+    return {"horizon": config.horizon, "samples": config.plan_samples, "noise": config.branch_noise}
 
 
 def make_mpc(
@@ -37,7 +36,7 @@ def make_mpc(
     terminated: Callable[[Array, Array, Array], Array],
 ) -> Finetuner:
     """MPC-SGFT. reward, terminated: as for `finetune.make_finetuner`. Source: SGFT Algorithm 3."""
-    planner = mpc_config(config, obs_dim=obs_dim, act_dim=act_dim)
+    planner = mpc.MPCConfig(obs_dim, act_dim, config.network, **plan_options(config), gamma=config.gamma)
     plan = mpc.make_act(planner, reward=reward, terminated=terminated)
     model = make_dynamics(obs_dim, act_dim, config.network)
     optimiser = optim.adam(config.max_grad_norm)
@@ -54,8 +53,7 @@ def make_mpc(
     def act(state: MPCState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         key_plan, key_noise = jax.random.split(key)
         action, carry = plan(export(state), carry, obs, key_plan, explore=explore)
-        noise = config.explore_noise * jax.random.normal(key_noise, action.shape)
-        return jnp.clip(action + jnp.where(explore, noise, 0.0), -1.0, 1.0), carry
+        return add_noise(action, jnp.where(explore, config.explore_noise, 0.0), key_noise), carry
 
     def observe(state: MPCState, transitions: Transition, valid: Array) -> MPCState:
         return state.replace(replay=replay.add_batch(state.replay, transitions, valid))

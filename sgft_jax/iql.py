@@ -15,7 +15,7 @@ import optax
 from flax import struct
 
 from sgft_jax import losses, normalizer, optim
-from sgft_jax.networks import LOG_STD_MAX, LOG_STD_MIN, MLP, Network, NetworkConfig, make_critic, make_value
+from sgft_jax.networks import LOG_STD_MAX, LOG_STD_MIN, MLP, Network, NetworkConfig, add_noise, make_critic, make_value
 from sgft_jax.types import Array, Key, Learner, Metrics, Normalizer, PyTree, Transition
 
 ACTION_MAX = 1 - 1e-5  # a mean that ends in tanh never reaches 1: it would chase such an action forever
@@ -100,7 +100,7 @@ def gaussian_log_prob(moments: Array, action: Array) -> Array:
 def gaussian_action(moments: Array, key: Key, *, explore: bool) -> Array:
     """[act_dim] in [-1, 1]: a draw, clipped, to explore, else the mean. moments: [2, act_dim] mean and log-std."""
     mean, log_std = moments
-    return jnp.clip(mean + jnp.exp(log_std) * jax.random.normal(key, mean.shape), -1, 1) if explore else mean
+    return add_noise(mean, jnp.exp(log_std), key) if explore else mean
 
 
 # --- losses of one transition -----------------------------------------------------------------------------------------

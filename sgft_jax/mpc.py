@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from sgft_jax import dynamics, mppi, value
-from sgft_jax.networks import NetworkConfig, make_actor, make_dynamics, make_value, tanh_gaussian_action
+from sgft_jax.networks import NetworkConfig, add_noise, make_actor, make_dynamics, make_value, tanh_gaussian_action
 from sgft_jax.normalizer import normalize
 from sgft_jax.types import Array, Key, Prior, PyTree, UserError
 
@@ -63,7 +63,7 @@ def make_act(
     actor = make_actor(config.obs_dim, config.act_dim, config.network)
     judge = make_value(config.obs_dim, config.network)
     model = make_dynamics(config.obs_dim, config.act_dim, config.network)
-    search = mppi.MPPIConfig(config.samples, max(config.samples // _ELITES, 1), _ITERATIONS)
+    search = mppi.MPPIConfig(config.samples, config.samples // _ELITES, _ITERATIONS)
 
     def score(prior: Prior, obs: Array, sequence: Array) -> Array:
         members = jax.tree.leaves(prior.dynamics)[0].shape[0]
@@ -87,7 +87,7 @@ def make_act(
             key_policy, key_noise = jax.random.split(key)
             moments = actor.apply(prior.actor, normalize(prior.normalizer, obs))
             action = tanh_gaussian_action(moments, key_policy, explore=True)
-            action = jnp.clip(action + config.noise * jax.random.normal(key_noise, action.shape), -1.0, 1.0)
+            action = add_noise(action, config.noise, key_noise)
             return dynamics.predict(model, member, prior.normalizer, obs, action)[0], action
 
         return jax.lax.scan(step, obs, jax.random.split(key, config.horizon))[1]

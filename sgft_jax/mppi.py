@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from sgft_jax.networks import add_noise
 from sgft_jax.types import Array, Key, UserError
 
 
@@ -90,8 +91,7 @@ def plan(
     )
     found, _ = jax.lax.scan(refine, start, jax.random.split(key_search, config.iterations))
     action = found.elites[jax.random.categorical(key_pick, found.logits), 0]
-    noise = found.std[0] * jax.random.normal(key_noise, action.shape)
-    return jnp.clip(action + jnp.where(explore, noise, 0.0), -1.0, 1.0), found.mean
+    return add_noise(action, jnp.where(explore, found.std[0], 0.0), key_noise), found.mean
 
 
 def _fit(elites: Array, logits: Array, hyper: MPPIHyper) -> _Search:

@@ -154,6 +154,11 @@ def tanh_gaussian_mode(moments: Array) -> Array:
     return jnp.tanh(moments[0])
 
 
+def add_noise(action: Array, std: Array | float, key: Key) -> Array:
+    """An action [act_dim] in [-1, 1] with Gaussian noise, cut off at the bounds. std: [] or [act_dim]."""
+    return jnp.clip(action + std * jax.random.normal(key, action.shape), -1.0, 1.0)
+
+
 def tanh_gaussian_action(moments: Array, key: Key, *, explore: bool) -> Array:
     """[act_dim]: a draw to explore, else the mode."""
     return tanh_gaussian_sample(moments, key)[0] if explore else tanh_gaussian_mode(moments)

@@ -8,6 +8,7 @@ Source: SGFT (Yin et al., ICLR 2025).
 import jax
 import jax.numpy as jnp
 
+from sgft_jax.networks import add_noise
 from sgft_jax.types import Array, BatchTransform, Imagination, Key, Transition, UserError
 
 
@@ -95,7 +96,7 @@ def _imagine(
     """One imagined transition from obs with k steps to go, and whether it terminates."""
     key_policy, key_noise, key_dynamics = jax.random.split(key, 3)
     action = imagination.policy(obs, k, key_policy)
-    action = jnp.clip(action + noise * jax.random.normal(key_noise, action.shape), -1.0, 1.0)
+    action = add_noise(action, noise, key_noise)
     next_obs = imagination.dynamics(obs, action, key_dynamics)
     terminated = imagination.terminated(obs, action, next_obs)
     discount = jnp.where(terminated, 0.0, imagination.gamma)
