@@ -1,7 +1,7 @@
 """Pushing a soft ball: a rigid puck in simulation, in reality a ball that rolls, gives way and flattens.
 
 The ball is a core from which pads stick out in all directions, each on a radial slide with a spring and a damper: the
-skin gives way where it is pressed and pushes back, and rolling costs energy. The core touches fingers and table too,
+skin gives way where it is pressed and comes back slowly, and rolling costs energy. The core touches fingers and table too,
 once the pads have given way by a third of the radius.
 """
 
@@ -16,20 +16,22 @@ from envs.franka.task import Scene, at_rest, make_env
 from envs.physics import PhysicsState
 from sgft_jax.types import Array, Key
 
-RADIUS = 0.05  # m
-PAD = 0.013  # m, radius of the pads: their neighbours are 0.02 m away
+RADIUS = 0.035  # m
+PAD = 0.0095  # m, radius of the pads: their neighbours are 0.014 m away
 CORE = 0.65  # of the radius
 SHELL = 0.5  # of the mass: the pads
 # N/m of one pad. Pads swing out up to 1,100 N/m at 5 ms, their armature included, but a ball on the table comes to rest
 # only up to 130.
-STIFFNESS = 30.0
-DAMPING = 0.8  # N s/m of one pad: it comes back slowly, so the ball stops soon after the hand
+STIFFNESS = 40.0
+DAMPING = 2.0  # N s/m of one pad: it comes back in 0.1 s, so the ball stops soon after the hand
+ROLLING = 0.004  # m, of the pads on the table: resistance to rolling
 # kg of one pad. The solver of contacts does not know of dampers: a pad that is lighter than damping times time step
 # chatters on the table for ever.
-ARMATURE = 0.004
+ARMATURE = 0.01
 HEIGHT = 0.075  # m: the hand passes over the ball
-SINKS = 0.008  # m: how far the ball flattens under its weight
-ITERATIONS = 4
+SINKS = 0.0055  # m: how far the ball flattens under its weight
+ITERATIONS = 8
+GRIP = 10.0
 
 
 def _sphere(splits: int) -> tuple[np.ndarray, np.ndarray]:
@@ -59,7 +61,7 @@ NV = arm.N_JOINTS + 6 + len(DIRECTIONS)
 
 def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The real scene for one theta. Coordinates: the core's pose, then of every pad how far it sticks out, m."""
-    spec = soft.stage(theta, height=HEIGHT, iterations=ITERATIONS)
+    spec = soft.stage(theta, height=HEIGHT, iterations=ITERATIONS, grip=GRIP)
     core = spec.worldbody.add_body(name="ball", pos=[0, 0, RADIUS])
     core.add_freejoint()
     look = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "rgba": [0.95, 0.75, 0.2, 1], **NO_CONTACT}
@@ -70,7 +72,7 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
         joint = pad.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=direction, stiffness=STIFFNESS, damping=DAMPING)
         joint.armature = ARMATURE
         pad.add_geom(name=_name(i), size=[PAD, 0, 0], mass=SHELL * theta["object_mass"] / len(DIRECTIONS), **look)
-        soft.touch(spec, _name(i), theta)
+        soft.touch(spec, _name(i), theta, rolling=ROLLING)
     return spec
 
 

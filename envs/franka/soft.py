@@ -1,7 +1,7 @@
 """What the deformable objects of the pushing tasks share: a stage with gravity and a table that ends, and its events.
 
-Their simulator is `push` with a rigid puck, as in the paper (section 6.2); cloth and ball are other scenes of the same
-task, with its observations, actions, parameters, reward and success. The place of an object is what a camera would
+Their simulator is `push` with a rigid puck, as in the paper (section 6.2), of the object's size; cloth and ball are
+other scenes of the same task, with its observations, actions, parameters, reward and success. The place of an object is what a camera would
 report of it: the mean of a cloth's points, the middle of a ball. Objects are bodies on joints and springs, which all
 engines step alike; MJX has no flexes (docs/physics.md).
 """
@@ -33,14 +33,16 @@ def simulated(name: str, *, mass: float) -> Scene:
     return push.SCENE._replace(name=name, parameters=parameters)
 
 
-def stage(theta: dict[str, float], *, height: float, iterations: int) -> mujoco.MjSpec:
+def stage(theta: dict[str, float], *, height: float, iterations: int, grip: float = 1.0) -> mujoco.MjSpec:
     """Arm, fingers, a table with a physical edge, and gravity, which the arm compensates.
 
-    height: m, of the hand's tool centre point; the fingers reach down from there to just above the table.
+    height: m, of the hand's tool centre point; the fingers reach down from there to just above the table. grip: how
+    much stiffer friction is than the contact it belongs to; objects on springs creep over the table at 1.
     """
     spec = new_spec(substeps=push.SUBSTEPS, iterations=iterations, ls_iterations=iterations + 2)
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # a point or a pad touches nothing but its neighbours
     spec.option.gravity = [0, 0, -push.GRAVITY]
+    spec.option.impratio = grip
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
     for side, name in push.FINGERS.items():
         x, y = push.finger_xy(side)
@@ -62,10 +64,15 @@ def stage(theta: dict[str, float], *, height: float, iterations: int) -> mujoco.
     return spec
 
 
-def touch(spec: mujoco.MjSpec, geom: str, theta: dict[str, float], *, fingers: float = 0.0) -> None:
-    """Lets a geom of the object touch table and fingers; fingers: m, the distance at which it feels them already."""
-    friction = [theta["table_friction"]] * 2 + [0.0, 0.0, 0.0]
-    spec.add_pair(geomname1=TABLE, geomname2=geom, condim=3, friction=friction)
+def touch(
+    spec: mujoco.MjSpec, geom: str, theta: dict[str, float], *, fingers: float = 0.0, rolling: float = 0.0
+) -> None:
+    """Lets a geom of the object touch table and fingers.
+
+    fingers: m, the distance at which it feels them already. rolling: m, its resistance to rolling on the table.
+    """
+    friction = [theta["table_friction"]] * 2 + [0.001 if rolling else 0.0, rolling, rolling]
+    spec.add_pair(geomname1=TABLE, geomname2=geom, condim=6 if rolling else 3, friction=friction)
     friction = [theta["finger_friction"]] * 2 + [0.0, 0.0, 0.0]
     for finger in push.FINGERS.values():
         pair = spec.add_pair(geomname1=finger, geomname2=geom, condim=3, friction=friction, margin=fingers)
