@@ -19,8 +19,9 @@ _LEGEND = (
     f"ended before; in parentheses the seeds that end below {_LEVEL} %, if there are any."
 )
 _TIMES = (
-    "How many times as many transitions the best method that is not SGFT needs: the one that got there, or ended "
-    "without, after the fewest. > where it ended without, < where SGFT did, - where both did or nothing was to be "
+    "How many times as many transitions the best method that is not SGFT needs: the one that got there after the "
+    "fewest or, if none did, ended after the fewest. Runs that ended before it got there are named: nobody knows what "
+    "they would have needed. > where it ended without, < where SGFT did, - where both did or nothing was to be "
     "learned. The 95 % bootstrap interval draws the seeds of both methods together where they are the same, and takes "
     "for granted which method is best. SGFT is what shapes rewards and shortens the horizon, or plans H steps that end "
     "in a frozen V_sim."
@@ -62,17 +63,22 @@ def times_fewer(comparison: Comparison, other: str, own: str) -> str:
 
 
 def best_other(curves: Mapping[str, Curve]) -> str | None:
-    """Of the methods that are not SGFT the one that got to 90 %, or ended without, after the fewest transitions.
+    """Of the methods that are not SGFT the one that got to 90 % or, if none did, ended after the fewest transitions."""
+    ended = {name: int(curves[name].transitions[-1]) for name in _others(curves)}
+    there = {name: n for name in ended if (n := reached(curves[name], _LEVEL)) is not None}
+    needs = there or ended
+    return min(needs, key=needs.__getitem__, default=None)
 
-    One that ended early bounds what is known of the best. A method of one's own is nobody's baseline.
-    """
-    others = [n for n, c in curves.items() if split(n)[0] in METHODS and not is_sgft(n) and c.transitions[-1] > 0]
 
-    def needs(name: str) -> tuple[int, bool]:
-        n = reached(curves[name], _LEVEL)
-        return (int(curves[name].transitions[-1]), True) if n is None else (n, False)
+def ended_before(curves: Mapping[str, Curve], best: str) -> list[str]:
+    """Methods that are not SGFT and ended, without 90 %, before the best of them got there: it may not be the best."""
+    there = reached(curves[best], _LEVEL)
+    return [n for n in _others(curves) if there is not None and curves[n].transitions[-1] < there]
 
-    return min(others, key=needs, default=None)
+
+def _others(curves: Mapping[str, Curve]) -> list[str]:
+    """Methods that are not SGFT and learned at all. A method of one's own is nobody's baseline."""
+    return [n for n, c in curves.items() if split(n)[0] in METHODS and not is_sgft(n) and c.transitions[-1] > 0]
 
 
 def _panels(tasks: Mapping[str, Comparison]) -> dict[str, dict[str, dict[str, Curve]]]:
@@ -121,7 +127,11 @@ def _comparison(tasks: Mapping[str, Comparison], best: Mapping[str, str | None],
         return times_fewer(comparison, other, name) if other and name in comparison.curves else tables.NONE
 
     def against(task: str, name: str | None) -> str:
-        return f"{name}: {tables.transitions(tasks[task].curves[name], _LEVEL)}" if name else tables.NONE
+        if not name:
+            return tables.NONE
+        curves = tasks[task].curves
+        early = ", ".join(f"{n} at {int(curves[n].transitions[-1]):,}" for n in ended_before(curves, name))
+        return f"{name}: {tables.transitions(curves[name], _LEVEL)}" + (f"; ended before: {early}" if early else "")
 
     rows = [
         ["best that is not SGFT", *(against(*each) for each in best.items())],

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from envs.base import Env, World
 from envs.franka import hammer, insert, push
@@ -47,3 +48,10 @@ def theta_of(scene, rng):
         p.name: (p.low, p.high) if p.low < p.high else (0.9 * p.nominal, 1.1 * p.nominal) for p in scene.parameters
     }
     return {name: float(rng.uniform(*span)) for name, span in ranges.items()}
+
+
+def push_hard(obs):
+    """[2]: what brings a puck to the edge, see `accuracy.push_puck`."""
+    off = obs[2:] - obs[:2]
+    ahead = jnp.where(jnp.abs(off[1]) > 0.01, 0.0, push.EDGE - push.TOLERANCE / 2 - obs[2])
+    return jnp.clip(jnp.stack([ahead, off[1]]) / push.STEP, -1.0, 1.0)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from franka_bench import EXACT, Bench, bench, member
+from franka_bench import EXACT, Bench, bench, member, push_hard
 
 import envs
 from envs import gaps
@@ -38,13 +38,6 @@ def push_softly(way, obs):
     come = jnp.where(jnp.abs(off[1]) < 0.01, jnp.minimum(off[0] - way.reach + 0.005, push.STEP), 0.0)
     along = jnp.clip(way.gain * (way.goal - obs[2]), -0.02, way.most)
     return jnp.clip(jnp.stack([jnp.where(off[0] > way.reach, come, along), off[1]]) / push.STEP, -1.0, 1.0)
-
-
-def push_hard(obs):
-    """[2]: what brings a puck to the edge, see `accuracy.push_puck`."""
-    off = obs[2:] - obs[:2]
-    ahead = jnp.where(jnp.abs(off[1]) > 0.01, 0.0, push.EDGE - push.TOLERANCE / 2 - obs[2])
-    return jnp.clip(jnp.stack([ahead, off[1]]) / push.STEP, -1.0, 1.0)
 
 
 @pytest.fixture(scope="module", params=NAMES)

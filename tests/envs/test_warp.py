@@ -1,24 +1,27 @@
-"""MuJoCo Warp, here on the CPU, against C MuJoCo: one control period from each state of hammering episodes."""
+"""MuJoCo Warp, here on the CPU, against C MuJoCo: one control period from each state of scripted episodes."""
 
 import itertools
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
-from franka_bench import EXACT, SCENES, theta_of
+from franka_bench import EXACT, SCENES, push_hard, theta_of
 
-from envs import engine_warp
-from envs.franka.task import make_env
+from envs import engine_c, engine_warp
+from envs.franka import arm, ball, push, towel
+from envs.franka.task import at_rest, make_env
 from experiments.accuracy import PROBES
 
 pytest.importorskip("warp")
 WORLDS, STEPS = 3, 24
+DEFORMABLES = {"towel": towel.REAL["towel"], "ball": ball.REAL["ball"]}
 
 
-def in_random_worlds(env, rng):
-    """[WORLDS], every parameter varied, so that the board stands elsewhere in each."""
-    thetas = [theta_of(SCENES["hammer"], rng) for _ in range(WORLDS)]
+def in_random_worlds(env, scene, rng):
+    """[WORLDS], every parameter varied, so that the board of hammer stands elsewhere in each."""
+    thetas = [theta_of(scene, rng) for _ in range(WORLDS)]
     pools = [env.sample_worlds(jax.random.key(0), 1, params=theta, effects=EXACT) for theta in thetas]
     return jax.tree.map(lambda *x: jnp.concatenate(x), *pools)
 
@@ -36,10 +39,22 @@ def hammer(env, world, key):
     return actions, jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), start, later)
 
 
+def converging(scene):
+    """The scene with a solver that C MuJoCo does not stop after 4 iterations. Warp's goes on, too."""
+
+    def build(theta):
+        spec = scene.build(theta)
+        spec.option.iterations = spec.option.ls_iterations = 50
+        return spec
+
+    return scene._replace(build=build)
+
+
 def test_hammering():
     """0.2 mrad and 0.01 mm after 0.2 s with blows on nail and board and saturated servos; all worlds in one batch."""
     c, warp = (make_env(SCENES["hammer"], impl=impl) for impl in ("c", "warp"))
-    worlds, keys = in_random_worlds(c, np.random.default_rng(3)), jax.random.split(jax.random.key(1), WORLDS)
+    worlds = in_random_worlds(c, SCENES["hammer"], np.random.default_rng(3))
+    keys = jax.random.split(jax.random.key(1), WORLDS)
     actions, states = jax.jit(jax.vmap(lambda *x: hammer(c, *x)))(worlds, keys)
     before, after = (jax.tree.map(lambda x, s=s: x[:, s], states) for s in (slice(0, -1), slice(1, None)))
     over_time = jax.vmap(warp.step, (None, 0, 0, None))
@@ -65,12 +80,66 @@ def test_arm_on_the_board():
         state = after
 
 
+@pytest.mark.parametrize(
+    ("name", "usual", "worst"), [("towel", (5e-6, 5e-5), (1.5e-3, 2e-2)), ("ball", (2e-6, 2e-5), (5e-4, 1e-2))]
+)
+def test_pushing_what_deforms(name, usual, worst):
+    """After 0.2 s in which a hard push moves it: what is observed, m, and any coordinate, m and rad, in half of the
+    periods and in all. A towel of which a point moves by a micrometre ends elsewhere by up to 1.4 mm and 18 mm."""
+    c, warp = make_env(converging(DEFORMABLES[name]), impl="c"), make_env(DEFORMABLES[name], impl="warp")
+    worlds, key = in_random_worlds(c, DEFORMABLES[name], np.random.default_rng(3)), jax.random.key(1)
+    states = [jax.jit(jax.vmap(c.reset))(worlds, jax.random.split(key, WORLDS))]
+    step, acted = jax.jit(jax.vmap(c.step, (0, 0, 0, None))), []
+    for _ in range(STEPS):
+        acted.append(jax.vmap(push_hard)(states[-1].true_obs))
+        states.append(step(worlds, states[-1], acted[-1], key))
+    episodes = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    place = np.asarray(episodes.true_obs)[..., 2:]
+    moving = np.argwhere(np.abs(np.diff(place, axis=0)).max(-1) > 1e-3)
+    t, i = np.random.default_rng(0).permutation(moving)[:10].T
+    assert len(t) == 10 and set(i) == set(range(WORLDS))
+    before, after = (jax.tree.map(lambda x, s=s: x[s, i], episodes) for s in (t, t + 1))
+    own = jax.tree.map(lambda x: x[i], worlds)
+    seen = jax.jit(jax.vmap(warp.step, (0, 0, 0, None)))(own, before, jnp.stack(acted)[t, i], key)
+    assert not seen.invalid.any()
+    observed = np.abs(seen.true_obs - after.true_obs).max(1)
+    anything = np.abs(seen.physics.qpos - after.physics.qpos).max(1)
+    assert np.median(observed) < usual[0] and np.median(anything) < usual[1]
+    assert observed.max() < worst[0] and anything.max() < worst[1]
+
+
+@pytest.mark.parametrize(("name", "contacts"), [("towel", 72), ("ball", 129)])
+def test_more_contacts_than_pushes_ever_make(name, contacts):
+    """All of the towel bundled up at a fingertip, or all pads drawn in between both and pressed on the table: 5 ms."""
+    scene = converging(DEFORMABLES[name])
+    host = scene.build({p.name: p.nominal for p in scene.parameters}).compile()
+    start, data = scene.initial(jnp.array([0.25, 0.0]), jax.random.key(0)), mujoco.MjData(host)
+    n = arm.N_JOINTS
+    data.qpos[:n] = start.qpos[:n]
+    mujoco.mj_kinematics(host, data)
+    left, right = (data.geom(finger).xpos[:2] for finger in push.FINGERS.values())
+    if name == "towel":
+        points = np.append(0.7 * left + 0.3 * right, 0.006) + 0.05 * towel.POINTS * [1, 1, 0]
+        data.qpos[n:] = (points - towel.POINTS).ravel()
+    else:
+        data.qpos[n:] = [*(left + right) / 2, 0.01, 1, 0, 0, 0, *np.full(len(ball.DIRECTIONS), ball.PAD - ball.RADIUS)]
+    mujoco.mj_forward(host, data)
+    assert data.ncon == contacts and data.nefc == 4 * contacts
+    assert engine_warp.budget(host) == (host.npair, 4 * host.npair)  # spheres touch a thing once
+    state = at_rest(start.qpos[:n], jnp.asarray(data.qpos[n:], jnp.float32), host.nv)
+    controls = jnp.broadcast_to(state.ctrl, (1, *state.ctrl.shape))
+    engines = engine_c.make_advance(host, ()), engine_warp.make_advance(host)
+    wanted, seen = (jax.jit(advance)({}, state, controls) for advance in engines)
+    assert np.abs(wanted.qvel).max() > 1.0  # m/s
+    np.testing.assert_allclose(seen.qvel, wanted.qvel, atol=1e-3)
+
+
 @pytest.mark.slow
 def test_lost_contacts_are_explosions(monkeypatch):
     """With room for fewer constraint rows than a blow needs, the state is not finite instead of silently wrong."""
     monkeypatch.setattr(engine_warp, "budget", lambda host: (2, 1))
     env = make_env(SCENES["hammer"], impl="warp")
-    worlds = in_random_worlds(env, np.random.default_rng(3))
+    worlds = in_random_worlds(env, SCENES["hammer"], np.random.default_rng(3))
     world = jax.tree.map(lambda x: x[0], worlds)
     _, states = jax.jit(lambda key: hammer(env, world, key))(jax.random.key(1))
     assert states.invalid.any() and not states.invalid[0]

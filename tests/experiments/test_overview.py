@@ -62,15 +62,23 @@ def test_the_same_seeds_are_drawn_together(tmp_path):
     assert overview.times_fewer(*read(tmp_path), "pbrs", "sgft-sac") == "1.0 [1.0, 3.0]"
 
 
-def test_the_best_other_method_may_be_one_that_ended_early(tmp_path):
-    """Nobody knows what it would have needed: it bounds what SGFT is compared with."""
+def test_the_best_other_method_got_there_and_those_that_ended_before_are_named(tmp_path):
+    """Nobody knows what a run that was ended early would have needed."""
     for name, reached, to in (("sac", 50, 100), ("pbrs", 80, 100), ("sgft-sac", 20, 100), ("my-own", 10, 100)):
         save(tmp_path, name, **rising(reached, to=to))
-    assert overview.best_other(read(tmp_path)[0].curves) == "sac"
     save(tmp_path, "rlpd", **rising(None, to=40))
+    save(tmp_path, "mbpo", **rising(None, to=60))
     save(tmp_path, "iql", **rising(None, to=0))  # only zero-shot: says nothing
-    (comparison,) = read(tmp_path)
-    assert overview.best_other(comparison.curves) == "rlpd"
+    assert overview.best_other(read(tmp_path)[0].curves) == "sac"
+    text = sections(tmp_path)
+    assert "| best that is not SGFT | sac: 1,000 [1,000, 1,000]; ended before: rlpd at 800 |" in text
+    assert "| sgft-sac | 2.5 [2.5, 2.5] |" in text
+
+
+def test_where_no_other_method_got_there_the_shortest_run_bounds_the_ratio(tmp_path):
+    save(tmp_path, "sgft-sac", **rising(20))
+    save(tmp_path, "rlpd", **rising(None, to=40))
+    save(tmp_path, "sac", **rising(None, to=80))
     text = sections(tmp_path)
     assert "| best that is not SGFT | rlpd: > 800 |" in text and "| sgft-sac | > 2.0 |" in text
 
