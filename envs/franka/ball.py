@@ -1,8 +1,8 @@
 """Pushing a soft ball: a rigid puck in simulation, in reality a ball that rolls, gives way and flattens.
 
 The ball is a core from which pads stick out in all directions, each on a radial slide with a spring and a damper: the
-skin gives way where it is pressed and comes back slowly, and rolling costs energy. The core touches fingers and table too,
-once the pads have given way by a third of the radius.
+skin gives way where it is pressed and comes back slowly, and rolling costs energy. The core touches fingers and table
+too, once the pads have given way by a third of the radius.
 """
 
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ ARMATURE = 0.01
 HEIGHT = 0.075  # m: the hand passes over the ball
 SINKS = 0.0055  # m: how far the ball flattens under its weight
 ITERATIONS = 8
-GRIP = 10.0
+GRIP = 10.0  # or it would roll slowly over the edge by itself, its resistance to rolling notwithstanding
 
 
 def _sphere(splits: int) -> tuple[np.ndarray, np.ndarray]:

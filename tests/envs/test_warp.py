@@ -81,7 +81,7 @@ def test_arm_on_the_board():
 
 
 @pytest.mark.parametrize(
-    ("name", "usual", "worst"), [("towel", (5e-6, 5e-5), (1.5e-3, 2e-2)), ("ball", (2e-6, 2e-5), (5e-4, 1e-2))]
+    ("name", "usual", "worst"), [("towel", (5e-6, 5e-5), (1.5e-3, 2e-2)), ("ball", (2e-5, 2e-4), (5e-4, 1e-2))]
 )
 def test_pushing_what_deforms(name, usual, worst):
     """After 0.2 s in which a hard push moves it: what is observed, m, and any coordinate, m and rad, in half of the
@@ -108,9 +108,9 @@ def test_pushing_what_deforms(name, usual, worst):
     assert observed.max() < worst[0] and anything.max() < worst[1]
 
 
-@pytest.mark.parametrize(("name", "contacts"), [("towel", 72), ("ball", 129)])
+@pytest.mark.parametrize(("name", "contacts"), [("towel", 72), ("ball", 87)])
 def test_more_contacts_than_pushes_ever_make(name, contacts):
-    """All of the towel bundled up at a fingertip, or all pads drawn in between both and pressed on the table: 5 ms."""
+    """All of the towel bundled up at a fingertip, or all pads drawn in at one and pressed on the table: 5 ms."""
     scene = converging(DEFORMABLES[name])
     host = scene.build({p.name: p.nominal for p in scene.parameters}).compile()
     start, data = scene.initial(jnp.array([0.25, 0.0]), jax.random.key(0)), mujoco.MjData(host)
@@ -118,19 +118,20 @@ def test_more_contacts_than_pushes_ever_make(name, contacts):
     data.qpos[:n] = start.qpos[:n]
     mujoco.mj_kinematics(host, data)
     left, right = (data.geom(finger).xpos[:2] for finger in push.FINGERS.values())
+    near = 0.7 * left + 0.3 * right
     if name == "towel":
-        points = np.append(0.7 * left + 0.3 * right, 0.006) + 0.05 * towel.POINTS * [1, 1, 0]
+        points = np.append(near, 0.006) + 0.05 * towel.POINTS * [1, 1, 0]
         data.qpos[n:] = (points - towel.POINTS).ravel()
     else:
-        data.qpos[n:] = [*(left + right) / 2, 0.01, 1, 0, 0, 0, *np.full(len(ball.DIRECTIONS), ball.PAD - ball.RADIUS)]
+        data.qpos[n:] = [*near, 0.008, 1, 0, 0, 0, *np.full(len(ball.DIRECTIONS), ball.PAD - ball.RADIUS)]
     mujoco.mj_forward(host, data)
-    assert data.ncon == contacts and data.nefc == 4 * contacts
-    assert engine_warp.budget(host) == (host.npair, 4 * host.npair)  # spheres touch a thing once
+    assert data.ncon == contacts
+    assert engine_warp.budget(host) == (host.npair, (2 * (host.pair_dim - 1)).sum())  # spheres touch a thing once
     state = at_rest(start.qpos[:n], jnp.asarray(data.qpos[n:], jnp.float32), host.nv)
     controls = jnp.broadcast_to(state.ctrl, (1, *state.ctrl.shape))
     engines = engine_c.make_advance(host, ()), engine_warp.make_advance(host)
     wanted, seen = (jax.jit(advance)({}, state, controls) for advance in engines)
-    assert np.abs(wanted.qvel).max() > 1.0  # m/s
+    assert np.abs(wanted.qvel).max() > 0.5  # m/s
     np.testing.assert_allclose(seen.qvel, wanted.qvel, atol=1e-3)
 
 
