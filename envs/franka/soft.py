@@ -1,6 +1,6 @@
 """What the deformable objects of the pushing tasks share: a stage with gravity and a table that ends, and its events.
 
-Their simulator is `push` with a rigid puck, as in the paper (section 6.2), about as large as they are; cloth and ball are
+Their simulator is `push` with a rigid puck, as in the paper (section 6.2), about as large as they; cloth and ball are
 other scenes of the same task, with its observations, actions, parameters, reward and success. The place of an object is
 what a camera would report of it: the mean of a cloth's points, the middle of a ball. Objects are bodies on joints and
 springs, which all engines step alike; MJX has no flexes (docs/physics.md).
