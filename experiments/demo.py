@@ -3,6 +3,7 @@
 import contextlib
 import multiprocessing
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,10 @@ from experiments.finetune import finetune
 from experiments.finetune_args import FinetuneArgs, run_folder
 from experiments.presets import PRESETS
 from experiments.pretrain import PretrainArgs, pretrain
-from sgft_jax.finetune import FinetuneConfig
+from sgft_jax.methods import finetune_config, get_method
 from sgft_jax.types import UserError
 
-METHODS = ("sgft-sac", "sac")
+METHODS = ("sgft-mpc", "sgft-sac", "sac")  # the first is filmed
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class DemoArgs:
     rollouts: int = 20
     """Real rollouts per seed, the 5 initial ones included."""
     video: bool = True
-    """Render an episode before and after fine-tuning, where MuJoCo can render."""
+    """Render an episode before and after fine-tuning with sgft-mpc, where MuJoCo can render."""
     out: Path = Path("runs/demo")
     """Folder of the demo; an earlier demo in it is replaced."""
 
@@ -51,17 +52,17 @@ def main(args: DemoArgs) -> None:
     config = config if args.env_steps is None else replace(config, env_steps=args.env_steps)
     shared = {"task": args.task, "preset": "cpu", "out": args.out, "overwrite": True}
     pretrain(PretrainArgs(config=config, report=False, video=False, **shared))
-    both = [_finetune_args(args, method, shared) for method in METHODS]
-    _finetune_both(*both)
+    runs = [_finetune_args(args, method, shared) for method in METHODS]
+    _finetune_all(*runs)
     results = figures(FiguresArgs(task=args.task, out=args.out))
-    folder = run_folder(both[0], args.real).parent.parent
+    folder = run_folder(runs[0], args.real).parent.parent
     print(f"\n{outcome(read_comparison(folder))}\n")
     print(f"figure: {results.parent / f'{envs.name_of(args.task)}-{folder.name}.png'}, tables: {results}")
-    print(f"{time.monotonic() - started:.0f} s in all; curves, video and every real rollout: {folder}")
+    print(f"{time.monotonic() - started:.0f} s in all; curves, real rollouts and a video of {METHODS[0]}: {folder}")
 
 
 def outcome(comparison: Comparison) -> str:
-    """What came of it in a few lines: success of both methods, which are evaluated after as many rollouts."""
+    """What came of it in a few lines: success of the methods, which are evaluated after as many rollouts."""
     points = next(iter(comparison.curves.values())).rollouts
     head = ["method", *(f"{n} rollouts" if n else "zero-shot" for n in points)]
     rows = [[name, *map(tables.percent, curve.success.T)] for name, curve in comparison.curves.items()]
@@ -73,6 +74,7 @@ def outcome(comparison: Comparison) -> str:
 
 def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> FinetuneArgs:
     """Smaller batches and fewer, larger updates than on a GPU: what two cores can do; all methods get the same."""
+    small = {"batch_size": 64, "branches": 2, "lr_actor": 3e-4, "actor_ramp": 300}
     return FinetuneArgs(
         real=(args.real,),
         method=method,
@@ -82,40 +84,35 @@ def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> Finet
         utd=4.0,
         eval_every=5,
         eval_episodes=20,
-        options=FinetuneConfig(batch_size=64, branches=2, lr_actor=3e-4, actor_ramp=300),
+        options=finetune_config(get_method(method), **small),
         video=args.video and method == METHODS[0],
         **shared,
     )
 
 
-def _finetune_both(shown: FinetuneArgs, other: FinetuneArgs) -> None:
-    """One run here, on a CPU the other beside it in a process of its own: a run keeps little more than a core busy."""
+def _finetune_all(first: FinetuneArgs, *others: FinetuneArgs) -> None:
+    """One run here, on a CPU the others in turn in a process beside it: plans cost as much as what they all learn."""
     if jax.default_backend() != "cpu":
-        finetune(shown)
-        finetune(other)
+        for args in (first, *others):
+            finetune(args)
         return
-    log = other.out / f"{other.method}.log"
     context = multiprocessing.get_context("spawn")
-    beside = context.Process(target=_logged, args=(other, log, run_folder(shown, *shown.real) / "real"), daemon=True)
+    log = first.out / "beside.log"
+    beside = context.Process(target=_logged, args=(others, log), daemon=True)
     beside.start()
     try:
-        finetune(shown)
+        finetune(first)
         beside.join()
     finally:
         beside.kill()  # it has ended, unless the run above has failed
     if beside.exitcode:
-        raise UserError(f"fine-tuning with {other.method} failed, see {log}")
+        raise UserError(f"fine-tuning with {' or '.join(args.method for args in others)} failed, see {log}")
 
 
-def _logged(args: FinetuneArgs, log: Path, shown: Path) -> None:
-    """Begins when the run beside has its first real rollouts: what plays and evaluates is compiled and cached then."""
-    main = multiprocessing.parent_process()
-    while not any(shown.glob("*")):
-        if main is not None and not main.is_alive():
-            return  # nobody waits for this run any more
-        time.sleep(0.1)
+def _logged(runs: Sequence[FinetuneArgs], log: Path) -> None:
     with open(log, "w") as file, contextlib.redirect_stdout(file), contextlib.redirect_stderr(file):
-        finetune(args)
+        for args in runs:
+            finetune(args)
 
 
 if __name__ == "__main__":
