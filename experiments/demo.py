@@ -28,9 +28,9 @@ METHODS = ("sgft-mpc", "sgft-sac", "sac")  # the first is filmed
 class DemoArgs:
     """A few minutes of the whole pipeline; everything lands in one folder."""
 
-    task: str = "hammer"
-    """push, push-towel, push-ball, hammer or insert. Hammering is learned in simulation from so few steps; of pushing,
-    priors differ more than methods do (docs/results.md)."""
+    task: str = "insert"
+    """push, push-towel, push-ball, hammer or insert. Of hammering and pushing, priors as small as these differ more than
+    methods do (docs/results.md)."""
     real: str = "default"
     """The real system, as in fine-tuning."""
     env_steps: int | None = None
