@@ -29,8 +29,8 @@ class DemoArgs:
     """A few minutes of the whole pipeline; everything lands in one folder."""
 
     task: str = "insert"
-    """push, push-towel, push-ball, hammer or insert. Of hammering and pushing, priors as small as these differ more than
-    methods do (docs/results.md)."""
+    """push, push-towel, push-ball, hammer or insert. Of hammering and pushing, priors as small as these differ more
+    than methods do (docs/results.md)."""
     real: str = "default"
     """The real system, as in fine-tuning."""
     env_steps: int | None = None

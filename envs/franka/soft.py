@@ -3,7 +3,8 @@
 Their simulator is `push` with a rigid puck, as in the paper (section 6.2), about as large as they; cloth and ball are
 other scenes of the same task, with its observations, actions, parameters, reward and success. The place of an object is
 what a camera would report of it: the mean of a cloth's points, the middle of a ball. Objects are bodies on joints and
-springs, which all engines step alike; MJX has no flexes (docs/physics.md).
+springs, which all engines step, though MJX's own code damps the towel's threads otherwise; it has no flexes
+(docs/physics.md).
 """
 
 import functools
