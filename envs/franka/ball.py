@@ -31,7 +31,6 @@ ARMATURE = 0.01
 HEIGHT = 0.075  # m: the hand passes over the ball
 SINKS = 0.0055  # m: how far the ball flattens under its weight
 ITERATIONS = 12  # rolling resistance takes more than friction; with 8, Warp is not done
-GRIP = 10.0  # or it would roll slowly over the edge by itself, its resistance to rolling notwithstanding
 
 
 def _sphere(splits: int) -> tuple[np.ndarray, np.ndarray]:
@@ -61,7 +60,7 @@ NV = arm.N_JOINTS + 6 + len(DIRECTIONS)
 
 def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The real scene for one theta. Coordinates: the core's pose, then of every pad how far it sticks out, m."""
-    spec = soft.stage(theta, height=HEIGHT, iterations=ITERATIONS, grip=GRIP)
+    spec = soft.stage(theta, height=HEIGHT, iterations=ITERATIONS)
     core = spec.worldbody.add_body(name="ball", pos=[0, 0, RADIUS])
     core.add_freejoint()
     look = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "rgba": [0.95, 0.75, 0.2, 1], **NO_CONTACT}

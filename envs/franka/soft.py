@@ -24,6 +24,9 @@ from sgft_jax.types import Array
 TABLE = "table"
 TIP = 0.009  # m above the table: the middle of the round ends of the fingertips
 NEAREST_FARTHEST = 0.20, 0.30  # m, table frame: where objects lie at the start, clear of the hand
+# How much stiffer friction is than the contact that it belongs to. At 1 it gives way slowly: a towel that is pushed
+# together creeps on for seconds after the hand has stopped, a ball rolls over the edge by itself.
+_GRIP = 10.0
 _THICK = 0.1  # m, half of the table's: nothing passes through
 
 
@@ -34,16 +37,15 @@ def simulated(name: str, *, mass: float) -> Scene:
     return push.SCENE._replace(name=name, parameters=parameters)
 
 
-def stage(theta: dict[str, float], *, height: float, iterations: int, grip: float = 1.0) -> mujoco.MjSpec:
+def stage(theta: dict[str, float], *, height: float, iterations: int) -> mujoco.MjSpec:
     """Arm, fingers, a table with a physical edge, and gravity, which the arm compensates.
 
-    height: m, of the hand's tool centre point; the fingers reach down from there to just above the table. grip: how
-    much stiffer friction is than the contact it belongs to; objects on springs creep over the table at 1.
+    height: m, of the hand's tool centre point; the fingers reach down from there to just above the table.
     """
     spec = new_spec(substeps=push.SUBSTEPS, iterations=iterations, ls_iterations=iterations + 2)
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # a point or a pad touches nothing but its neighbours
     spec.option.gravity = [0, 0, -push.GRAVITY]
-    spec.option.impratio = grip
+    spec.option.impratio = _GRIP
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
     for side, name in push.FINGERS.items():
         x, y = push.finger_xy(side)

@@ -26,9 +26,6 @@ FELT = 0.005  # m: fingers feel the cloth between two points, which a finger wou
 STIFFNESS = {(1, 0): 20.0, (0, 1): 20.0, (1, 1): 3.0, (1, -1): 3.0, (2, 0): 0.1, (0, 2): 0.1}
 DAMPING_TIME = 0.003
 ITERATIONS = 8
-# Cloth that is pushed together pulls at the points that hold it. MuJoCo's friction alone gives way slowly: the towel
-# would go on for seconds after the hand has stopped.
-GRIP = 10.0
 _GRID = (np.arange(N) - (N - 1) / 2) * MESH
 # [N * N, 3] m, the points of the flat towel around its middle.
 POINTS = np.stack([*np.meshgrid(_GRID, _GRID, indexing="ij"), np.full((N, N), RADIUS)], axis=-1).reshape(-1, 3)
@@ -37,7 +34,7 @@ NV = arm.N_JOINTS + POINTS.size
 
 def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The real scene for one theta. Coordinates of a point are its displacement from `POINTS`."""
-    spec = soft.stage(theta, height=push.HEIGHT, iterations=ITERATIONS, grip=GRIP)
+    spec = soft.stage(theta, height=push.HEIGHT, iterations=ITERATIONS)
     for i, place in enumerate(POINTS):
         body = spec.worldbody.add_body(name=_name(i), pos=place)
         for axis in np.eye(3):
