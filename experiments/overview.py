@@ -72,8 +72,8 @@ def best_other(curves: Mapping[str, Curve]) -> str | None:
 
 def ended_before(curves: Mapping[str, Curve], best: str) -> list[str]:
     """Methods that are not SGFT and ended, without 90 %, before the best of them got there: it may not be the best."""
-    there = reached(curves[best], _LEVEL)
-    return [n for n in _others(curves) if there is not None and curves[n].transitions[-1] < there]
+    there = reached(curves[best], _LEVEL) or 0
+    return [n for n in _others(curves) if curves[n].transitions[-1] < there]
 
 
 def _others(curves: Mapping[str, Curve]) -> list[str]:

@@ -27,6 +27,7 @@ NEAREST_FARTHEST = 0.20, 0.30  # m, table frame: where objects lie at the start,
 # How much stiffer friction is than the contact that it belongs to. At 1 it gives way slowly: a towel that is pushed
 # together creeps on for seconds after the hand has stopped, a ball rolls over the edge by itself.
 _GRIP = 10.0
+_SPIN = 0.001  # m, torsional friction on the table of what resists rolling
 _THICK = 0.1  # m, half of the table's: nothing passes through
 
 
@@ -74,7 +75,7 @@ def touch(
 
     fingers: m, the distance at which it feels them already. rolling: m, its resistance to rolling on the table.
     """
-    friction = [theta["table_friction"]] * 2 + [0.001 if rolling else 0.0, rolling, rolling]
+    friction = [theta["table_friction"]] * 2 + [_SPIN, rolling, rolling]  # MuJoCo ignores the last three at condim 3
     spec.add_pair(geomname1=TABLE, geomname2=geom, condim=6 if rolling else 3, friction=friction)
     friction = [theta["finger_friction"]] * 2 + [0.0, 0.0, 0.0]
     for finger in push.FINGERS.values():

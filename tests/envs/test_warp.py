@@ -125,13 +125,13 @@ def test_more_contacts_than_pushes_ever_make(name, contacts):
     else:
         data.qpos[n:] = [*near, 0.008, 1, 0, 0, 0, *np.full(len(ball.DIRECTIONS), ball.PAD - ball.RADIUS)]
     mujoco.mj_forward(host, data)
-    assert data.ncon == contacts
+    assert data.ncon == contacts and data.nefc == (2 * (data.contact.dim - 1)).sum()
     assert engine_warp.budget(host) == (host.npair, (2 * (host.pair_dim - 1)).sum())  # spheres touch a thing once
     state = at_rest(start.qpos[:n], jnp.asarray(data.qpos[n:], jnp.float32), host.nv)
     controls = jnp.broadcast_to(state.ctrl, (1, *state.ctrl.shape))
     engines = engine_c.make_advance(host, ()), engine_warp.make_advance(host)
     wanted, seen = (jax.jit(advance)({}, state, controls) for advance in engines)
-    assert np.abs(wanted.qvel).max() > 0.5  # m/s
+    assert np.abs(wanted.qvel).max() > 0.8  # m/s
     np.testing.assert_allclose(seen.qvel, wanted.qvel, atol=1e-3)
 
 
