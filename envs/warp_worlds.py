@@ -36,7 +36,7 @@ class Worlds:
     def __init__(
         self, host: mujoco.MjModel, layout: Sequence[str], n: int, *, contacts: int, rows: int, iterations: int
     ) -> None:
-        self.model, self.graph = mjw.put_model(host), None
+        self.model, self.graph, self.stream = mjw.put_model(host), None, None
         self.model.opt.iterations = iterations
         self.model.opt.warn_overflow = False  # messages printed from inside kernels would stall the GPU
         self.data = mjw.make_data(host, nworld=n, naconmax=n * contacts, njmax=rows)
@@ -102,6 +102,9 @@ def make_call(
         if (key := (device.alias, n)) not in kept:
             kept[key] = worlds = Worlds(host, layout, n, contacts=contacts, rows=rows, iterations=iterations)
             if device.is_cuda:
+                # Warp compiles kernels now, which leaves a cycle of garbage that holds this call's wrapper around JAX's
+                # stream. Were it collected amid a later call, Warp would forget the stream: so it is kept.
+                worlds.stream = wp.get_stream(device)
                 worlds.load(packed)
                 worlds.capture()
         worlds = kept[key]

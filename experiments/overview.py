@@ -20,11 +20,11 @@ _LEGEND = (
 )
 _TIMES = (
     "How many times as many transitions the best method that is not SGFT needs: the one that got there after the "
-    "fewest or, if none did, ended after the fewest. Runs that ended before it got there are named: nobody knows what "
-    "they would have needed. > where it ended without, < where SGFT did, - where both did or nothing was to be "
-    "learned. The 95 % bootstrap interval draws the seeds of both methods together where they are the same, and takes "
-    "for granted which method is best. SGFT is what shapes rewards and shortens the horizon, or plans H steps that end "
-    "in a frozen V_sim."
+    "fewest or, if none did, ended highest. Runs that ended before it got there, or before its own end, are named: "
+    "nobody knows what they would have needed. > where it ended without, < where SGFT did, - where both did or nothing "
+    "was to be learned. The 95 % bootstrap interval draws the seeds of both methods together where they are the same, "
+    "and takes for granted which method is best. SGFT is what shapes rewards and shortens the horizon, or plans H "
+    "steps that end in a frozen V_sim."
 )
 
 
@@ -63,17 +63,22 @@ def times_fewer(comparison: Comparison, other: str, own: str) -> str:
 
 
 def best_other(curves: Mapping[str, Curve]) -> str | None:
-    """Of the methods that are not SGFT the one that got to 90 % or, if none did, ended after the fewest transitions."""
-    ended = {name: int(curves[name].transitions[-1]) for name in _others(curves)}
-    there = {name: n for name in ended if (n := reached(curves[name], _LEVEL)) is not None}
-    needs = there or ended
-    return min(needs, key=needs.__getitem__, default=None)
+    """Of the methods that are not SGFT the one that got to 90 % after the fewest transitions.
+
+    If none did, the one that ended with the highest mean success, of equals after the fewest transitions.
+    """
+    others = _others(curves)
+    there = {name: n for name in others if (n := reached(curves[name], _LEVEL)) is not None}
+    if there:
+        return min(there, key=there.__getitem__)
+    end = lambda name: (-curves[name].success[:, -1].mean(), curves[name].transitions[-1])  # noqa: E731
+    return min(others, key=end, default=None)
 
 
 def ended_before(curves: Mapping[str, Curve], best: str) -> list[str]:
-    """Methods that are not SGFT and ended, without 90 %, before the best of them got there: it may not be the best."""
-    there = reached(curves[best], _LEVEL) or 0
-    return [n for n in _others(curves) if curves[n].transitions[-1] < there]
+    """Methods that are not SGFT and ended, without 90 %, before the best of them got there or ended: may be better."""
+    until = reached(curves[best], _LEVEL) or curves[best].transitions[-1]
+    return [n for n in _others(curves) if curves[n].transitions[-1] < until]
 
 
 def _others(curves: Mapping[str, Curve]) -> list[str]:

@@ -8,6 +8,8 @@ follow the commands they gave, in the nominal scene, so all of them meet the sam
 import gc
 import os
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import jax
@@ -62,10 +64,8 @@ def speed(task: str, impl: str, worlds: int, *, control_steps: int, repeats: int
     if impl == "warp":
         host.opt.iterations = engine_warp.iterations(host)  # the references solve as exactly as the environment does
     if impl != "c":
-        # Warp forgets JAX's stream when an old wrapper around it is collected. In the midst of MJX's first call, which
-        # captures a graph, that would be the "unknown stream" it once failed with: what there is goes before.
-        gc.collect()
-        mjx_per_s = steps / _mjx_alone(host, impl, window, scene.substeps, repeats).seconds
+        with _nothing_collected():
+            mjx_per_s = steps / _mjx_alone(host, impl, window, scene.substeps, repeats).seconds
         found |= {"mjx_per_s": mjx_per_s} if impl == "warp" else {"bare_per_s": mjx_per_s}
     if impl != "jax":
         alone = {"c": _c_alone, "warp": _warp_alone}[impl]
@@ -86,6 +86,22 @@ def _play(env: Env, pool: World, fleet: Fleet, key: Key, *, control_steps: int) 
         return fleet, after.physics.ctrl
 
     return jax.lax.scan(step, fleet, jax.random.split(key, control_steps))
+
+
+@contextmanager
+def _nothing_collected() -> Iterator[None]:
+    """No garbage is collected within, all of it at the end.
+
+    MJX's first call compiles Warp's kernels, which leaves a cycle of garbage that holds the call's wrapper around JAX's
+    stream. When that is collected, Warp forgets the stream. If MJX is about to capture a graph on it just then, as its
+    second call does, that fails: "unknown stream".
+    """
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.collect()
+        gc.enable()
 
 
 def _mjx_alone(host: mujoco.MjModel, impl: str, window: Window, substeps: int, repeats: int) -> Timing:

@@ -75,12 +75,15 @@ def test_the_best_other_method_got_there_and_those_that_ended_before_are_named(t
     assert "| sgft-sac | 2.5 [2.5, 2.5] |" in text
 
 
-def test_where_no_other_method_got_there_the_shortest_run_bounds_the_ratio(tmp_path):
+def test_where_no_other_method_got_there_the_one_that_ended_highest_bounds_the_ratio(tmp_path):
+    """Not the one that ended first: a run ended early, which had learned nothing, would make any ratio small."""
     save(tmp_path, "sgft-sac", **rising(20))
-    save(tmp_path, "rlpd", **rising(None, to=40))
-    save(tmp_path, "sac", **rising(None, to=80))
+    save(tmp_path, "iql", [[0, 0], [0.1, 0.2]], rollouts=[0, 14])
+    save(tmp_path, "rlpd", [[0, 0], [0.6, 0.8]], rollouts=[0, 40])
+    save(tmp_path, "sac", [[0, 0], [0.6, 0.8]], rollouts=[0, 80])
     text = sections(tmp_path)
-    assert "| best that is not SGFT | rlpd: > 800 |" in text and "| sgft-sac | > 2.0 |" in text
+    assert "| best that is not SGFT | rlpd: > 800; ended before: iql at 280 |" in text
+    assert "| sgft-sac | > 2.0 |" in text
 
 
 def test_tasks_are_columns_and_seeds_left_behind_are_counted(tmp_path):
