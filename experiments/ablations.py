@@ -18,7 +18,8 @@ from sgft_jax import plot
 from sgft_jax.config import config_to_json
 from sgft_jax.methods import METHODS, Method, finetune_config
 
-HORIZON_METHOD = "sgft-sac"
+# Methods whose horizon is an option: one searches by learning an actor, the other by planning.
+HORIZON_METHODS = ("sgft-sac", "sgft-mpc")
 # Settings beside the options that are equal where horizons are compared.
 _BESIDE = ("preset", "prior", "initial_rollouts", "utd")
 AFTER = 20  # rollouts at which severities are drawn: enough for SGFT on push, not for SAC (docs/results.md)
@@ -82,54 +83,61 @@ class Setting(NamedTuple):
     horizon: int
     branches: int
 
-    def __str__(self) -> str:
-        usual = finetune_config(METHODS[HORIZON_METHOD]).branches
+    def text(self, method: str) -> str:
+        usual = finetune_config(METHODS[method]).branches
         return f"H = {self.horizon}" + (f", {self.branches} branches" if self.branches != usual else "")
 
 
 def horizons(comparisons: Sequence[Comparison], target: Path) -> Part:
-    """A panel per task that has runs of SGFT-SAC with several horizons on the default real system, and one table."""
-    tasks, missing = {}, []
-    for task, comparison in on_default(comparisons).items():
-        found = by_horizon(comparison)
-        if len({setting.horizon for setting in found}) > 1:
-            tasks[task] = {setting: found[setting] for setting in sorted(found)}
-        else:
-            missing.append(f"{task}/{DEFAULT}: no two horizons of {HORIZON_METHOD} with all else equal")
-    if not tasks:
-        return Part([], missing)
+    """A figure and a table for each method that ran with several horizons on a default real system."""
+    tasks = on_default(comparisons)
+    found = {method: {task: by_horizon(c, method) for task, c in tasks.items()} for method in HORIZON_METHODS}
+    several = {
+        method: {task: runs for task, runs in those.items() if len({setting.horizon for setting in runs}) > 1}
+        for method, those in found.items()
+    }
+    texts = [_horizon_section(method, those, target) for method, those in several.items() if those]
+    missing = []
+    for task in tasks:
+        if lacking := [method for method in HORIZON_METHODS if task not in several[method]]:
+            missing.append(f"{task}/{DEFAULT}: no two horizons of {' or '.join(lacking)} with all else equal")
+    return Part(["## The horizon", *texts] if texts else [], missing)
+
+
+def by_horizon(comparison: Comparison, method: str) -> dict[Setting, tuple[str, Curve]]:
+    """Name and curve of each run of a method that differs from the one without a variant, or else from the defaults, in
+    horizon and branches alone; of several with one setting the first.
+    """
+    usual = comparison.configs.get(method) or config_to_json(arguments(method))
+    found: dict[Setting, tuple[str, Curve]] = {}
+    for name, curve in comparison.curves.items():
+        config = comparison.configs[name]
+        if split(name)[0] == method and "options" in config and _alike(config, usual):
+            setting = Setting(config["options"]["horizon"], config["options"]["branches"])
+            found.setdefault(setting, (name, curve))
+    return dict(sorted(found.items()))
+
+
+def _horizon_section(method: str, tasks: Mapping[str, Mapping[Setting, tuple[str, Curve]]], target: Path) -> str:
+    title = f"{method} by its horizon"
     path = plot.curve_panels(
-        target / "horizon.png",
-        {t: {str(s): (x.rollouts, x.success) for s, (_, x) in found.items()} for t, found in tasks.items()},
-        over={task: tables.rollouts_axis(x for _, x in found.values()) for task, found in tasks.items()},
-        title=f"{HORIZON_METHOD} by its horizon",
-        order=[str(setting) for setting in sorted({setting for found in tasks.values() for setting in found})],
+        target / f"horizon-{method}.png",
+        {t: {s.text(method): (x.rollouts, x.success) for s, (_, x) in runs.items()} for t, runs in tasks.items()},
+        over={task: tables.rollouts_axis(x for _, x in runs.values()) for task, runs in tasks.items()},
+        title=title,
+        order=[s.text(method) for s in sorted({s for runs in tasks.values() for s in runs})],
     )
     head = ["task", "horizon", "run", "seeds", *(f"transitions to {level} %" for level in LEVELS),
             "at the end (rollouts)", "seeds behind"]  # fmt: skip
     rows = [
         [
-            task, str(setting), name, tables.seeds(curve), *(tables.transitions(curve, level) for level in LEVELS),
-            tables.end(curve), tables.behind(curve),
+            task, setting.text(method), name, tables.seeds(curve),
+            *(tables.transitions(curve, level) for level in LEVELS), tables.end(curve), tables.behind(curve),
         ]
-        for task, found in tasks.items()
-        for setting, (name, curve) in found.items()
+        for task, runs in tasks.items()
+        for setting, (name, curve) in runs.items()
     ]  # fmt: skip
-    return Part([f"## The horizon\n\n![The horizon]({path.name})\n\n{tables.markdown(head, rows)}"], missing)
-
-
-def by_horizon(comparison: Comparison) -> dict[Setting, tuple[str, Curve]]:
-    """Name and curve of each run of SGFT-SAC that differs from the one without a variant, or else from the defaults, in
-    horizon and branches alone; of several with one setting the first.
-    """
-    usual = comparison.configs.get(HORIZON_METHOD) or config_to_json(arguments(HORIZON_METHOD))
-    found: dict[Setting, tuple[str, Curve]] = {}
-    for name, curve in comparison.curves.items():
-        config = comparison.configs[name]
-        if split(name)[0] == HORIZON_METHOD and "options" in config and _alike(config, usual):
-            setting = Setting(config["options"]["horizon"], config["options"]["branches"])
-            found.setdefault(setting, (name, curve))
-    return found
+    return f"### {title}\n\n![{title}]({path.name})\n\n{tables.markdown(head, rows)}"
 
 
 def _alike(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
