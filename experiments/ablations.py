@@ -22,7 +22,7 @@ from sgft_jax.methods import METHODS, Method, finetune_config
 HORIZON_METHODS = ("sgft-sac", "sgft-mpc")
 # Settings beside the options that are equal where horizons are compared.
 _BESIDE = ("preset", "prior", "initial_rollouts", "utd")
-AFTER = 20  # rollouts at which severities are drawn: enough for SGFT on push, not for SAC (docs/results.md)
+AFTER = 20  # rollouts at which severities are drawn: enough for SGFT on push, not for SAC (docs/findings.md)
 _OTHER_KINDS = ("camera",)  # gaps that are not the others made worse: that one breaks what V_sim sees
 # A method takes the models from the prior exactly if it branches, V_sim exactly if it shapes.
 _TRANSFORMS = {"branch": "uses_dynamics", "shape": "uses_value", "shorten": "finite_horizon"}
@@ -84,6 +84,7 @@ class Setting(NamedTuple):
     branches: int
 
     def text(self, method: str) -> str:
+        """Such as H = 4, with the branches if they are not the usual ones of a method."""
         usual = finetune_config(METHODS[method]).branches
         return f"H = {self.horizon}" + (f", {self.branches} branches" if self.branches != usual else "")
 

@@ -44,7 +44,7 @@ class FinetuneArgs:
     """Real rollouts per seed, the initial ones included; may grow with --resume."""
     initial_rollouts: int = 5
     """Rollouts of the simulator's policy, or of plans if the method plans, that fill the buffer before learning starts.
-    The paper has 20; after 5 SGFT-SAC needs less than half of the transitions to get to 90 % (docs/results.md)."""
+    The paper has 20; after 5 SGFT-SAC needs less than half of the transitions to get to 90 % (docs/findings.md)."""
     utd: float = 8.0
     """Updates per real transition."""
     eval_every: int = 5

@@ -54,7 +54,7 @@ class FinetuneConfig:
         H = `horizon` too, and `branch_noise` on what the policy proposes.
     explore_noise: std of the noise on what `sgft-mpc` does on the real system, in units of the action's range. A plan
         does much the same in the same state, and from such data no model learns what actions do: from two small
-        priors success stayed or fell without noise and rose with it (docs/results.md).
+        priors success stayed or fell without noise and rose with it (docs/findings.md).
     critics, target_critics, actor_mean, policy_delay, train_critic: see `SACConfig`. A kept critic has two members.
         policy_delay None = the updates of a real transition (`utd`): the actor moves once for each, as in RLPD.
     reset_critic: None = the method's default. A kept critic under a shaped reward is read as Q_sim(s, a) - V_sim(s),

@@ -45,8 +45,9 @@ class View(NamedTuple):
 DEFAULT_VIEW = View((0.35, 0.0, 0.25), 1.8, 140.0, -22.0)
 VIEWS = {
     "push": View((0.36, 0.0, 0.12), 1.6, 140.0, -27.0, -0.75, _corners(-0.2, 0.7, 0.55)),
-    "push-towel": View((0.55, 0.0, 0.02), 0.62, 162.0, -38.0, -0.75, _corners(-0.2, 0.7, 0.55)),
-    "push-ball": View((0.54, 0.0, 0.05), 0.72, 150.0, -26.0, -0.75, _corners(-0.2, 0.7, 0.55)),
+    # From the front, all of the edge in sight: the hand, which comes from behind, hides nothing of what it pushes.
+    "push-towel": View((0.58, 0.0, 0.04), 0.86, 172.0, -36.0, -0.75, _corners(-0.2, 0.7, 0.55)),
+    "push-ball": View((0.58, 0.0, 0.05), 0.88, 172.0, -30.0, -0.75, _corners(-0.2, 0.7, 0.55)),
     "hammer": View((0.22, 0.0, 0.44), 1.4, 122.0, -14.0),
     "insert": View((0.46, 0.0, 0.09), 0.7, 135.0, -24.0, -0.75, _corners(-0.15, 0.75, 0.4)),
 }
