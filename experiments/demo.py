@@ -38,7 +38,7 @@ class DemoArgs:
     seeds: int = 3
     """Fine-tuning seeds per method."""
     rollouts: int = 20
-    """Real rollouts per seed, the 5 initial ones included."""
+    """Real rollouts per seed, the initial ones included."""
     video: bool = True
     """Render an episode before and after fine-tuning with sgft-mpc, where MuJoCo can render."""
     out: Path = Path("runs/demo")
@@ -62,10 +62,10 @@ def main(args: DemoArgs) -> None:
 
 
 def outcome(comparison: Comparison) -> str:
-    """What came of it in a few lines: success of the methods, which are evaluated after as many rollouts."""
-    points = next(iter(comparison.curves.values())).rollouts
-    head = ["method", *(f"{n} rollouts" if n else "zero-shot" for n in points)]
-    rows = [[name, *map(tables.percent, curve.success.T)] for name, curve in comparison.curves.items()]
+    """What came of it in a few lines: success of the methods wherever one was evaluated."""
+    points = sorted({int(n) for curve in comparison.curves.values() for n in curve.rollouts})
+    head = ["method", *(f"{n} rollout{'s' * (n > 1)}" if n else "zero-shot" for n in points)]
+    rows = [[name, *(tables.at(curve, n) for n in points)] for name, curve in comparison.curves.items()]
     return (
         f"Success on the {comparison.real} real system of {comparison.task} in per cent, interquartile mean over seeds "
         f"with its 95 % interval:\n\n{tables.markdown(head, rows)}"
@@ -80,7 +80,7 @@ def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> Finet
         method=method,
         seeds=args.seeds,
         rollouts=args.rollouts,
-        initial_rollouts=min(5, args.rollouts),
+        initial_rollouts=min(get_method(method).initial_rollouts, args.rollouts),
         utd=4.0,
         eval_every=5,
         eval_episodes=20,

@@ -44,7 +44,8 @@ class FinetuneArgs:
     """Real rollouts per seed, the initial ones included; may grow with --resume."""
     initial_rollouts: int = 5
     """Rollouts of the simulator's policy, or of plans if the method plans, that fill the buffer before learning starts.
-    The paper has 20; after 5 SGFT-SAC needs less than half of the transitions to get to 90 % (docs/findings.md)."""
+    Each method has its own. The paper has 20; after 5 SGFT-SAC needs less than half of the transitions to get to 90 %
+    (docs/findings.md), and sgft-mpc needs no more than one (docs/results.md)."""
     utd: float = 8.0
     """Updates per real transition."""
     eval_every: int = 5
@@ -78,7 +79,10 @@ class FinetuneArgs:
 def arguments(method: str, **changes: Any) -> FinetuneArgs:
     """The arguments with which a method runs unless told otherwise, and any changes to these."""
     chosen = get_method(method)
-    own = {"method": method, "utd": chosen.utd, "options": finetune_config(chosen), "preset": _preset(chosen)}
+    own = {
+        "method": method, "utd": chosen.utd, "initial_rollouts": chosen.initial_rollouts,
+        "options": finetune_config(chosen), "preset": _preset(chosen),
+    }  # fmt: skip
     return FinetuneArgs(**{**own, **changes})
 
 

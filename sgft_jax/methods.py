@@ -139,7 +139,8 @@ class Method(NamedTuple):
     finite_horizon: the agent is told the steps to go (for horizon > 1). reset_critic: default at transfer.
     uses_value, uses_dynamics: what its transforms take from the prior besides the agent.
     agent: the learner. fresh: it starts from nothing, and the simulator's policy only makes the initial rollouts.
-    utd: updates per real transition. options: where its `FinetuneConfig` differs from the defaults, by field.
+    utd: updates per real transition. initial_rollouts: real ones before it learns at all.
+    options: where its `FinetuneConfig` differs from the defaults, by field.
     space: what tuning may choose (experiments/tune.py): values for `utd` and for fields of `FinetuneConfig`.
     """
 
@@ -154,6 +155,7 @@ class Method(NamedTuple):
     agent: AgentName
     fresh: bool
     utd: float
+    initial_rollouts: int
     options: Mapping[str, Any]
     space: Mapping[str, tuple[Any, ...]]
 
@@ -183,6 +185,7 @@ def _method(
     agent: AgentName = "sac",
     fresh: bool = False,
     utd: float = 8.0,
+    initial_rollouts: int = 5,
     space: Mapping[str, tuple[Any, ...]],
     **options: Any,
 ) -> Method:
@@ -197,7 +200,8 @@ def _method(
         return tuple(built[part]() for part in parts.split())
 
     uses = ("shape" in parts, "branch" in parts)
-    return Method(name, description, source, transforms, finite, *uses, reset_critic, agent, fresh, utd, options, space)
+    learner = (reset_critic, agent, fresh, utd, initial_rollouts)
+    return Method(name, description, source, transforms, finite, *uses, *learner, options, space)
 
 
 METHODS: dict[str, Method] = {
@@ -258,7 +262,8 @@ METHODS: dict[str, Method] = {
         ),
         _method(
             "sgft-mpc", "", "MPC-SGFT: plans of H steps by SAC's prior's models, which learn, that end in V_sim",
-            "SGFT 2025", agent="mpc", plan_samples=128, space=_MODEL_SPACE,
+            # Its models can plan after one rollout; an actor that learns from so few is lost (docs/results.md).
+            "SGFT 2025", agent="mpc", initial_rollouts=1, plan_samples=128, space=_MODEL_SPACE,
         ),
         _method("sgft", "shape shorten", "model-free SGFT", "SGFT 2025", space=_SEGMENT_SPACE),
         _method("sgft-sac", "branch shape shorten", "SGFT-SAC", "SGFT 2025", space=_BRANCH_SPACE),
