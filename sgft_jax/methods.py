@@ -262,7 +262,7 @@ METHODS: dict[str, Method] = {
         ),
         _method(
             "sgft-mpc", "", "MPC-SGFT: plans of H steps by SAC's prior's models, which learn, that end in V_sim",
-            # Its models can plan after one rollout; an actor that learns from so few is lost (docs/results.md).
+            # Its models can plan after one rollout; actors gained nothing sure from fewer than five (docs/results.md).
             "SGFT 2025", agent="mpc", initial_rollouts=1, plan_samples=128, space=_MODEL_SPACE,
         ),
         _method("sgft", "shape shorten", "model-free SGFT", "SGFT 2025", space=_SEGMENT_SPACE),
