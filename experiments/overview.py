@@ -77,7 +77,8 @@ def best_other(curves: Mapping[str, Curve]) -> str | None:
 
 def ended_before(curves: Mapping[str, Curve], best: str) -> list[str]:
     """Methods that are not SGFT and ended, without 90 %, before the best of them got there or ended: may be better."""
-    until = reached(curves[best], _LEVEL) or curves[best].transitions[-1]
+    there = reached(curves[best], _LEVEL)
+    until = curves[best].transitions[-1] if there is None else there
     return [n for n in _others(curves) if curves[n].transitions[-1] < until]
 
 
