@@ -64,6 +64,9 @@ class Worlds:
 
     def capture(self) -> None:
         """Makes a graph of the step, and in doing so steps once: everything it needs must have been loaded before."""
+        # Warp compiles kernels now, which leaves a cycle of garbage that holds this call's wrapper around JAX's stream.
+        # Were it collected amid a later call, Warp would forget the stream: so it is kept.
+        self.stream = wp.get_stream()
         self._step()
         with wp.ScopedCapture() as capture:
             self._step()
@@ -102,9 +105,6 @@ def make_call(
         if (key := (device.alias, n)) not in kept:
             kept[key] = worlds = Worlds(host, layout, n, contacts=contacts, rows=rows, iterations=iterations)
             if device.is_cuda:
-                # Warp compiles kernels now, which leaves a cycle of garbage that holds this call's wrapper around JAX's
-                # stream. Were it collected amid a later call, Warp would forget the stream: so it is kept.
-                worlds.stream = wp.get_stream(device)
                 worlds.load(packed)
                 worlds.capture()
         worlds = kept[key]
