@@ -1,5 +1,6 @@
 """Draw the figures again from the fine-tuning runs on disk, and put all methods of a real system in one table."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any
 import envs
 from envs import gaps
 from experiments import ablations, cli, overview, tables
-from experiments.comparison import Comparison, colour_order, names_of, read_comparison
+from experiments.comparison import Comparison, colour_order, names_of, read_comparison, split
 from experiments.results import Curve
 from sgft_jax import plot
 from sgft_jax.stats import iqm_interval
@@ -54,7 +55,7 @@ def figures(args: FiguresArgs) -> Path:
     target = args.out / "figures"
     target.mkdir(parents=True, exist_ok=True)
     order = colour_order(names_of(drawn))
-    singles = [_section(c, draw(c, target / f"{c.task}-{c.real}.png", order)) for c in drawn]
+    singles = [_section(c, draw(c, target, order)) for c in drawn]
     above = overview.overview(drawn, target, order)
     below = [
         ablations.transforms(drawn),
@@ -74,20 +75,41 @@ def figures(args: FiguresArgs) -> Path:
     return path
 
 
-def draw(comparison: Comparison, path: Path, order: Sequence[str]) -> Path:
-    """Learning curves of all methods on one real system. order: of the methods in all figures, which gives colours.
+def draw(comparison: Comparison, target: Path, order: Sequence[str]) -> dict[str, Path]:
+    """Learning curves of all methods on one real system: figures in the folder `target`, by their titles.
 
-    Methods that plan start from priors of their own: zero-shot is a line where that of all is about the same.
+    order: of the methods in all figures, which gives colours. A variant that several methods have here, as `tuned`,
+    has a figure of its own. Methods that plan start from priors of their own: zero-shot is a line where that of all is
+    about the same.
     """
-    starts = [float(iqm_interval(curve.success[:, 0]).estimate) for curve in comparison.curves.values()]
-    return plot.learning_curves(
-        path,
-        {method: (curve.transitions, curve.success) for method, curve in comparison.curves.items()},
-        title=f"{comparison.task} on the {comparison.real} real system",
-        zero_shot=starts[0] if max(starts) - min(starts) < _SAME else None,
-        order=order,
-        **_robot_time(comparison.curves),
-    )
+    drawn = {}
+    for variant, curves in _apart(comparison.curves).items():
+        title = _title(comparison) + (f", {variant}" if variant else "")
+        name = "_".join(filter(None, [f"{comparison.task}-{comparison.real}", variant]))
+        starts = [float(iqm_interval(curve.success[:, 0]).estimate) for curve in curves.values()]
+        drawn[title] = plot.learning_curves(
+            target / f"{name}.png",
+            {method: (curve.transitions, curve.success) for method, curve in curves.items()},
+            title=title,
+            zero_shot=starts[0] if max(starts) - min(starts) < _SAME else None,
+            order=order,
+            **_robot_time(curves),
+        )
+    return drawn
+
+
+def _apart(curves: Mapping[str, Curve]) -> dict[str, dict[str, Curve]]:
+    """[variant][name], the methods first: variants that several of them have; those of a single one are with it."""
+    count = Counter(split(name)[1] for name in curves)
+    found: dict[str, dict[str, Curve]] = {}
+    for name, curve in curves.items():
+        variant = split(name)[1]
+        found.setdefault(variant if count[variant] > 1 else "", {})[name] = curve
+    return dict(sorted(found.items()))
+
+
+def _title(comparison: Comparison) -> str:
+    return f"{comparison.task} on the {comparison.real} real system"
 
 
 def _robot_time(curves: Mapping[str, Curve]) -> dict[str, Any]:
@@ -100,13 +122,12 @@ def _robot_time(curves: Mapping[str, Curve]) -> dict[str, Any]:
     return {}
 
 
-def _section(comparison: Comparison, figure: Path) -> str:
-    title = f"{comparison.task} on the {comparison.real} real system"
+def _section(comparison: Comparison, drawn: Mapping[str, Path]) -> str:
     lengths = [int(curve.rollouts[-1]) for curve in comparison.curves.values()]
     budgets = [n for n in tables.BUDGETS if n <= max(lengths)]
     rows = [tables.row(*item, budgets, min(lengths)) for item in comparison.curves.items()]
     table = tables.markdown(tables.columns(budgets, min(lengths)), rows)
-    return f"## {title}\n\n{table}\n\n![{title}]({figure.name})"
+    return "\n\n".join([f"## {_title(comparison)}", table, *(f"![{t}]({path.name})" for t, path in drawn.items())])
 
 
 def _untouched(task: str | None, seen: set[tuple[str, str]]) -> list[str]:

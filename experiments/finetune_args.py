@@ -45,7 +45,7 @@ class FinetuneArgs:
     initial_rollouts: int = 5
     """Rollouts of the simulator's policy, or of plans if the method plans, that fill the buffer before learning starts.
     Each method has its own. The paper has 20; after 5 SGFT-SAC needs less than half of the transitions to get to 90 %
-    (docs/findings.md), and sgft-mpc needs no more than one (docs/results.md)."""
+    (docs/findings.md), and plans on V_sim need no more than one (docs/results.md)."""
     utd: float = 8.0
     """Updates per real transition."""
     eval_every: int = 5

@@ -60,6 +60,7 @@ def _sac(method: Method, config: FinetuneConfig, obs_dim: int, act_dim: int) -> 
         entropy_per_dim=config.entropy_per_dim,
         actor_start=config.critic_warmup or 0,
         actor_ramp=config.actor_ramp,
+        lr_warmup=config.lr_warmup,
     )
     learner = make_sac(sac, hyper)
 

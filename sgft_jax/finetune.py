@@ -116,8 +116,9 @@ def make_finetuner(
         real = replay.sample(state.replay, keys[0], config.batch_size)
         metrics: Metrics = {}
         if method.uses_dynamics and config.train_dynamics:
+            rate = config.lr_dynamics * optim.risen(optim.steps_of(state.dynamics), config.lr_warmup)
             fit, metrics = dynamics.update(
-                model_network, optimiser, state.dynamics, state.normalizer, real, keys[1], rate=config.lr_dynamics
+                model_network, optimiser, state.dynamics, state.normalizer, real, keys[1], rate=rate
             )
             state = state.replace(dynamics=fit)
         rows = real

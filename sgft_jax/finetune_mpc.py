@@ -61,8 +61,9 @@ def make_mpc(
     def update(state: MPCState, key: Key) -> tuple[MPCState, Metrics]:
         key_rows, key_fit = jax.random.split(key)
         rows = replay.sample(state.replay, key_rows, config.batch_size)
+        rate = config.lr_dynamics * optim.risen(optim.steps_of(state.dynamics), config.lr_warmup)
         fit, metrics = dynamics.update(
-            model, optimiser, state.dynamics, state.prior.normalizer, rows, key_fit, rate=config.lr_dynamics
+            model, optimiser, state.dynamics, state.prior.normalizer, rows, key_fit, rate=rate
         )
         return state.replace(dynamics=fit), metrics
 

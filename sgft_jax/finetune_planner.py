@@ -28,7 +28,7 @@ def make_planner(method: Method, config: FinetuneConfig, *, obs_dim: int, act_di
         obs_dim, act_dim, size=config.size, horizon=config.horizon, plan_samples=config.plan_samples,
         sgft=not config.train_critic, train_encoder=config.train_encoder,
     )  # fmt: skip
-    hyper = tdmpc2.TDMPC2Hyper(lr=config.lr_critic, tau=config.tau, gamma=config.gamma)
+    hyper = tdmpc2.TDMPC2Hyper(config.lr_critic, config.lr_warmup, tau=config.tau, gamma=config.gamma)
     learner = tdmpc2.make_tdmpc2(structure, hyper)
 
     def init(prior: tdmpc2.TDMPC2Prior, key: Key) -> PlannerState:

@@ -33,6 +33,20 @@ def step(optimiser: optax.GradientTransformation, fit: Fit, grads: PyTree, rate:
     return Fit(jax.tree.map(lambda p, u: p - rate * u, fit.params, updates), moments)
 
 
+def risen(step: Array, warmup: Array | float) -> Array:
+    """What share [] of a learning rate the update after `step` [] others has, if rates rise linearly over `warmup`.
+
+    Adam's first steps are as long as its rate in every weight, however small the gradient, because its moments know
+    nothing else yet. In a network that comes from a prior they undo more than a few rows of new data can teach.
+    """
+    return jnp.clip((step + 1) / jnp.maximum(warmup, 1.0), 0.0, 1.0)
+
+
+def steps_of(fit: Fit) -> Array:
+    """How many steps [] a network in training has made."""
+    return optax.tree.get(fit.moments, "count")
+
+
 def keep_unless(moves: Array, new: PyTree, old: PyTree) -> PyTree:
     """`new` where the scalar `moves` is true, else `old` with the same bits."""
     return jax.tree.map(lambda n, o: jnp.where(moves, n, o), new, old)

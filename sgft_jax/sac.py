@@ -85,7 +85,7 @@ class SACHyper(NamedTuple):
     """The numbers of an agent, each [].
 
     lr_*: Adam learning rates. tau: target averaging rate. alpha: initial (or fixed) temperature.
-    entropy_per_dim: target entropy / act_dim, nats.
+    entropy_per_dim: target entropy / act_dim, nats. lr_warmup: updates over which lr_critic rises linearly from 0.
     actor_start: updates before the actor moves; actor_ramp: updates over which its learning rate then rises linearly.
     """
 
@@ -99,6 +99,7 @@ class SACHyper(NamedTuple):
     entropy_per_dim: float | Array = -1.0
     actor_start: float | Array = 0.0
     actor_ramp: float | Array = 0.0
+    lr_warmup: float | Array = 0.0
 
 
 class SACState(struct.PyTreeNode):
@@ -245,7 +246,8 @@ def _update_critic(
         return jnp.mean(jax.vmap(losses.critic_loss)(q, targets)), q
 
     (value, q), grads = jax.value_and_grad(loss, has_aux=True)(state.critic.params)
-    fit = optim.step(parts.optimiser, state.critic, grads, state.hyper.lr_critic)
+    rate = state.hyper.lr_critic * optim.risen(state.step, state.hyper.lr_warmup)
+    fit = optim.step(parts.optimiser, state.critic, grads, rate)
     average = optax.incremental_update(fit.params, state.target_critic, state.hyper.tau)
     metrics = {"critic/loss": value, "critic/q_mean": jnp.mean(q), "critic/target_mean": jnp.mean(targets)}
     return state.replace(critic=fit, target_critic=average), metrics
@@ -277,7 +279,7 @@ def _update_actor(
 
     (value, (q, log_prob)), grads = jax.value_and_grad(loss, has_aux=True)(state.actor.params)
     hyper, since = state.hyper, state.step - state.hyper.actor_start
-    rate = hyper.lr_actor * jnp.clip((since + 1) / jnp.maximum(hyper.actor_ramp, 1.0), 0.0, 1.0)
+    rate = hyper.lr_actor * optim.risen(since, hyper.actor_ramp)
     moves = (since >= 0) & _policy_turn(config, state)
     fit = optim.keep_unless(moves, optim.step(parts.optimiser, state.actor, grads, rate), state.actor)
     return state.replace(actor=fit), q, log_prob, {"actor/loss": value, "actor/entropy": -jnp.mean(log_prob)}

@@ -120,6 +120,11 @@ def _update(
     return state.replace(step=state.step + 1), metrics | more
 
 
+def _rate(state: TDMPC2State) -> Array:
+    """The learning rate [] of this update."""
+    return state.hyper.lr * optim.risen(state.step, state.hyper.lr_warmup)
+
+
 def _update_model(
     config: TDMPC2Config, parts: Parts, state: TDMPC2State, batch: Sequences, key: Key
 ) -> tuple[TDMPC2State, Array, Metrics]:
@@ -147,7 +152,7 @@ def _update_model(
     fits = {name: getattr(state, name) for name in config.learned}
     grads, (mean, zs) = jax.grad(loss, has_aux=True)({name: fit.params for name, fit in fits.items()})
     grads, norm = clip_by_norm(grads, hyper.max_grad_norm)
-    rates = {name: hyper.lr * (hyper.encoder_lr_scale if name == "encoder" else 1.0) for name in fits}
+    rates = {name: _rate(state) * (hyper.encoder_lr_scale if name == "encoder" else 1.0) for name in fits}
     fits = {name: optim.step(parts.adam, fit, grads[name], rates[name]) for name, fit in fits.items()}
     metrics = {f"model/{name}_loss": x for name, x in mean.items()} | {"model/grad_norm": norm}
     if not config.sgft:
@@ -228,7 +233,7 @@ def _update_policy(
 
     (total, (value, entropy, scale)), grads = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
     grads, norm = clip_by_norm(grads, hyper.max_grad_norm)
-    fit = optim.step(parts.policy_adam, state.policy, grads, hyper.lr)
+    fit = optim.step(parts.policy_adam, state.policy, grads, _rate(state))
     metrics = {
         "actor/loss": total,
         "actor/value_mean": jnp.mean(value, where=reached),

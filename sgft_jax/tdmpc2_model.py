@@ -115,13 +115,15 @@ def named_config(obs_dim: int, act_dim: int, *, size: str, plan_samples: int, **
 class TDMPC2Hyper(NamedTuple):
     """The numbers of an agent, each [] (but for `planner`, which holds its own).
 
-    lr: Adam learning rate, times encoder_lr_scale for the encoder. tau: averaging rate of target critic and scale.
+    lr: Adam learning rate, times encoder_lr_scale for the encoder. lr_warmup: updates over which it rises linearly
+        from 0. tau: averaging rate of target critic and scale.
     gamma: discount factor per step in plans; rows carry their own. rho: weight of a step relative to the one before.
     consistency, reward, value: weights of the losses. entropy: weight of the policy's scaled entropy.
     max_grad_norm: of the world model with the critic, and of the policy.
     """
 
     lr: float | Array = 3e-4
+    lr_warmup: float | Array = 0.0
     encoder_lr_scale: float | Array = 0.3
     tau: float | Array = 0.01
     gamma: float | Array = 0.99

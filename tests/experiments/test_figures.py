@@ -115,6 +115,22 @@ def test_one_figure_and_one_table_per_real_system(tmp_path, capsys, monkeypatch)
         assert missing in text
 
 
+def test_a_variant_of_several_methods_has_a_figure_of_its_own(tmp_path, monkeypatch):
+    drawn = {}
+    monkeypatch.setattr(
+        figures.plot, "learning_curves", lambda path, curves, **more: drawn.update({path.name: list(curves)}) or path
+    )
+    for method in ("sac", "sgft-sac", "sgft-sac_horizon-4", "sac_tuned", "sgft-sac_tuned"):
+        save(tmp_path, method, [[0.2, 0.3], [0.9, 1.0]], rollouts=[0, 20])
+    call("--out", tmp_path)
+    assert drawn == {
+        "toy-default.png": ["sgft-sac", "sgft-sac_horizon-4", "sac"],
+        "toy-default_tuned.png": ["sgft-sac_tuned", "sac_tuned"],
+    }
+    text = (tmp_path / "figures/results.md").read_text()
+    assert "![toy on the default real system, tuned](toy-default_tuned.png)" in text
+
+
 def test_real_figures_are_drawn_and_untouched_gaps_are_named(tmp_path, capsys):
     save(tmp_path, "sgft-sac", [[0.2, 0.3], [0.9, 1.0]], rollouts=[0, 20])
     call("--out", tmp_path)

@@ -91,6 +91,23 @@ def test_frozen_dynamics_and_warm_up_keep_their_bits(prior):
     assert not equal(warm.learner.actor, moved.learner.actor)
 
 
+@pytest.mark.parametrize("name", ["sgft-sac", "sgft-mpc"])
+def test_learning_rates_of_the_simulators_networks_rise_from_zero(prior, name):
+    """Adam's first step has the rate's length, so with a warm-up of 4 it is a quarter."""
+    moved = {}
+    for warmup in (0, 4):
+        tuner = make(name, lr_warmup=warmup)
+        state = started(tuner, prior)
+        new, _ = tuner.learn(state, jax.random.key(1), 1)
+        parts = [lambda s: s.dynamics] + ([lambda s: s.learner.critic] if name == "sgft-sac" else [])
+        moved[warmup] = [jnp.concatenate([
+            jnp.ravel(b - a) for a, b in zip(*(jax.tree.leaves(part(s).params) for s in (state, new)), strict=True)
+        ]) for part in parts]  # fmt: skip
+    for at_once, slowly in zip(moved[0], moved[4], strict=True):
+        assert jnp.abs(at_once).max() == pytest.approx(3e-4, rel=1e-2)
+        np.testing.assert_allclose(slowly, at_once / 4, atol=1e-7)
+
+
 @pytest.mark.parametrize(
     ("name", "clip", "bounded"), [("sgft", 0.01, True), ("sgft", None, False), ("sac", 0.01, False)]
 )

@@ -81,6 +81,7 @@ def test_unknown_method_is_answered_with_the_closest():
     [
         ({"horizon": 0}, "horizon is 0: must be at least 1"),
         ({"simulated_share": 1.5}, "simulated_share is 1.5: must be a share from 0 to 1"),
+        ({"lr_warmup": -1}, "lr_warmup is -1: must not be negative"),
         ({"offline_updates": 10}, "offline_updates needs the simulator's transitions"),
     ],
 )

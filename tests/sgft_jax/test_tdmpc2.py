@@ -390,6 +390,26 @@ def test_learning_rates(key):
         assert jnp.abs(moved - old).max() == pytest.approx(rate, rel=2e-2), name
 
 
+@pytest.mark.parametrize(("warmup", "done", "share"), [(4, 0, 1 / 4), (4, 2, 3 / 4), (4, 3, 1), (4, 9, 1), (0, 0, 1)])
+def test_learning_rates_rise_from_zero(key, warmup, done, share):
+    """Moments are fresh and the data the same, so steps are as their rates."""
+
+    def step(**hyper):
+        hyper = HYPER._replace(**hyper)
+        state = tdmpc2.fine_tune_state(PLAIN, hyper, tdmpc2.extract_prior(shaken(PLAIN, key)), key)
+        state = state.replace(step=jnp.int32(done))
+        return state, UPDATE[PLAIN](state, windows(key), key)[0]
+
+    (state, warm), (_, full) = step(lr=1e-2, lr_warmup=warmup), step(lr=1e-2)
+    for name in NETWORKS:
+        old, moved, whole = (getattr(s, name).params["Dense_1"]["kernel"] for s in (state, warm, full))
+        assert jnp.abs(whole - old).max() > 1e-3
+        if name == "policy":  # the critic that it follows has moved by then, not as far in both
+            assert jnp.median(jnp.abs(moved - old)) == pytest.approx(1e-2 * share, rel=0.05)
+        else:
+            np.testing.assert_allclose(moved - old, share * (whole - old), atol=1e-6, err_msg=name)
+
+
 @pytest.mark.slow
 def test_hyperparameters_vmap(key):
     state, rates = shaken(PLAIN, key), jnp.array([0.0, 1e-2])
