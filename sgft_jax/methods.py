@@ -67,9 +67,9 @@ class FinetuneConfig:
     train_dynamics: keep fitting the ensemble, on real transitions only.
     actor_real_only: the actor learns from the real rows, the critic from all (O-11).
     lr_warmup: updates over which the rates of networks that come from the simulator rise linearly from 0: of all that
-        learn in an agent of TD-MPC2, of dynamics models, of critics. Adam's first steps are as long as its rate in
-        every weight, however small the gradient: 40 of them, after one rollout, took plans that pushed a towel home in
-        93 % of all episodes to 4, and with a rise over 1,000 they stay (docs/results.md).
+        learn in an agent of TD-MPC2, of dynamics models, of critics but IQL's. Adam's first steps are as long as its
+        rate in every weight, however small the gradient: 40 of them, after one rollout, took plans that pushed a towel
+        home in 93 % of all episodes to 4, and with a rise over 1,000 they stay (docs/results.md).
     lr_*: other Adam learning rates. tau: target averaging rate. max_grad_norm: None = no clipping.
     simulated_share: share of each batch that is drawn from the simulator's transitions instead of the real ones; it
         goes linearly to `simulated_share_end` (None = stays) over `simulated_anneal` updates.
