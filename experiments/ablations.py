@@ -106,16 +106,28 @@ def horizons(comparisons: Sequence[Comparison], target: Path) -> Part:
 
 
 def by_horizon(comparison: Comparison, method: str) -> dict[Setting, tuple[str, Curve]]:
-    """Name and curve of each run of a method that differs from the one without a variant, or else from the defaults, in
-    horizon and branches alone; of several with one setting the first.
+    """Name and curve of the runs of a method that differ in horizon and branches alone, by these.
+
+    Those like the one with the defaults or, where they all have one horizon, like the first run that others differ from
+    in nothing else; of several with one setting the first.
     """
-    usual = comparison.configs.get(method) or config_to_json(arguments(method))
+    names = [name for name in comparison.curves if split(name)[0] == method and "options" in comparison.configs[name]]
     found: dict[Setting, tuple[str, Curve]] = {}
-    for name, curve in comparison.curves.items():
+    for usual in (config_to_json(arguments(method)), *(comparison.configs[name] for name in names)):
+        those = _like(comparison, names, usual)
+        found = found or those
+        if len({setting.horizon for setting in those}) > 1:
+            return those
+    return found
+
+
+def _like(comparison: Comparison, names: Sequence[str], usual: Mapping[str, Any]) -> dict[Setting, tuple[str, Curve]]:
+    found: dict[Setting, tuple[str, Curve]] = {}
+    for name in names:
         config = comparison.configs[name]
-        if split(name)[0] == method and "options" in config and _alike(config, usual):
+        if _alike(config, usual):
             setting = Setting(config["options"]["horizon"], config["options"]["branches"])
-            found.setdefault(setting, (name, curve))
+            found.setdefault(setting, (name, comparison.curves[name]))
     return dict(sorted(found.items()))
 
 

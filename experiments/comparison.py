@@ -1,5 +1,6 @@
 """The runs of a comparison on disk: all methods on one real system, which run of each counts, and what is missing."""
 
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,6 +71,12 @@ def split(name: str) -> tuple[str, str]:
     """Method and variant that a folder's name stands for; one's own method may have any name, and keeps it whole."""
     method, _, variant = name.partition("_")
     return (method, variant) if method in METHODS else (name, "")
+
+
+def shared_variants(names: Iterable[str]) -> list[str]:
+    """Variants that several methods have, such as `tuned`, in order."""
+    count = Counter(split(name)[1] for name in set(names))
+    return sorted(variant for variant, n in count.items() if variant and n > 1)
 
 
 def same_seeds(comparison: Comparison, one: str, other: str) -> bool:

@@ -80,7 +80,6 @@ def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> Finet
         method=method,
         seeds=args.seeds,
         rollouts=args.rollouts,
-        initial_rollouts=min(get_method(method).initial_rollouts, args.rollouts),
         utd=4.0,
         eval_every=5,
         eval_episodes=20,

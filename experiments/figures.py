@@ -1,6 +1,5 @@
 """Draw the figures again from the fine-tuning runs on disk, and put all methods of a real system in one table."""
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import Any
 import envs
 from envs import gaps
 from experiments import ablations, cli, overview, tables
-from experiments.comparison import Comparison, colour_order, names_of, read_comparison, split
+from experiments.comparison import Comparison, colour_order, names_of, read_comparison, shared_variants, split
 from experiments.results import Curve
 from sgft_jax import plot
 from sgft_jax.stats import iqm_interval
@@ -78,12 +77,12 @@ def figures(args: FiguresArgs) -> Path:
 def draw(comparison: Comparison, target: Path, order: Sequence[str]) -> dict[str, Path]:
     """Learning curves of all methods on one real system: figures in the folder `target`, by their titles.
 
-    order: of the methods in all figures, which gives colours. A variant that several methods have here, as `tuned`,
-    has a figure of its own. Methods that plan start from priors of their own: zero-shot is a line where that of all is
+    order: of the methods in all figures, which gives colours. A variant that several of them have, as `tuned`, has a
+    figure of its own. Methods that plan start from priors of their own: zero-shot is a line where that of all is
     about the same.
     """
     drawn = {}
-    for variant, curves in _apart(comparison.curves).items():
+    for variant, curves in _apart(comparison.curves, shared_variants(order)).items():
         title = _title(comparison) + (f", {variant}" if variant else "")
         name = "_".join(filter(None, [f"{comparison.task}-{comparison.real}", variant]))
         starts = [float(iqm_interval(curve.success[:, 0]).estimate) for curve in curves.values()]
@@ -98,13 +97,12 @@ def draw(comparison: Comparison, target: Path, order: Sequence[str]) -> dict[str
     return drawn
 
 
-def _apart(curves: Mapping[str, Curve]) -> dict[str, dict[str, Curve]]:
-    """[variant][name], the methods first: variants that several of them have; those of a single one are with it."""
-    count = Counter(split(name)[1] for name in curves)
+def _apart(curves: Mapping[str, Curve], shared: Sequence[str]) -> dict[str, dict[str, Curve]]:
+    """[variant][name], the methods first: shared variants by themselves, those of a single method with it."""
     found: dict[str, dict[str, Curve]] = {}
     for name, curve in curves.items():
         variant = split(name)[1]
-        found.setdefault(variant if count[variant] > 1 else "", {})[name] = curve
+        found.setdefault(variant if variant in shared else "", {})[name] = curve
     return dict(sorted(found.items()))
 
 

@@ -36,8 +36,8 @@ class GridArgs:
     """Seeds of each run, all in one program."""
     rollouts: int = 100
     """Real rollouts per seed, the initial ones included; may grow later."""
-    initial_rollouts: int | None = None
-    """Real rollouts before a method learns; default: each method's own."""
+    initial_rollouts: int = 1
+    """Real rollouts before a method learns."""
     eval_every: int = 5
     """Rollouts between evaluations."""
     together: bool = True
@@ -85,10 +85,10 @@ def check(args: GridArgs) -> None:
 
 def run_of(args: GridArgs, task: str, real: str, method: str) -> FinetuneArgs:
     """The run of one cell, with the method's own defaults."""
-    own = {} if args.initial_rollouts is None else {"initial_rollouts": args.initial_rollouts}
     return arguments(
         method, task=task, real=(real,), seed=args.seed, seeds=args.seeds, rollouts=args.rollouts,
-        eval_every=args.eval_every, impl=args.impl, devices=args.devices, video=False, out=args.out, **own,
+        initial_rollouts=args.initial_rollouts, eval_every=args.eval_every, impl=args.impl, devices=args.devices,
+        video=False, out=args.out,
     )  # fmt: skip
 
 

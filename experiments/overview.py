@@ -7,7 +7,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from experiments import tables
-from experiments.comparison import DEFAULT, Comparison, Part, is_sgft, names_of, on_default, same_seeds, split
+from experiments.comparison import (
+    DEFAULT,
+    Comparison,
+    Part,
+    is_sgft,
+    names_of,
+    on_default,
+    same_seeds,
+    shared_variants,
+    split,
+)
 from experiments.results import LEVELS, Curve, left_behind, reached
 from sgft_jax import plot
 from sgft_jax.methods import METHODS
@@ -89,12 +99,8 @@ def _others(curves: Mapping[str, Curve]) -> list[str]:
 
 def _panels(tasks: Mapping[str, Comparison]) -> dict[str, dict[str, dict[str, Curve]]]:
     """[variant][task][name]: the methods themselves, and variants that several methods have, such as `tuned`."""
-    methods: dict[str, set[str]] = {"": set()}
-    for name in names_of(tasks.values()):
-        method, variant = split(name)
-        methods.setdefault(variant, set()).add(method)
     found = {}
-    for variant in [v for v, those in methods.items() if len(those) > bool(v)]:
+    for variant in ["", *shared_variants(names_of(tasks.values()))]:
         panels = {t: {n: x for n, x in c.curves.items() if split(n)[1] == variant} for t, c in tasks.items()}
         found[variant] = {task: curves for task, curves in panels.items() if curves}
     return found

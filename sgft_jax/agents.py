@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from sgft_jax import normalizer
 from sgft_jax.iql import IQLConfig, IQLHyper, IQLState, make_iql
-from sgft_jax.methods import FinetuneConfig, Method, policy_delay
+from sgft_jax.methods import FinetuneConfig, Method, lr_warmup, policy_delay
 from sgft_jax.networks import fix_first_layer
 from sgft_jax.sac import SACConfig, SACHyper, SACState, fine_tune_state, make_sac
 from sgft_jax.sgft import append_steps_to_go
@@ -60,7 +60,7 @@ def _sac(method: Method, config: FinetuneConfig, obs_dim: int, act_dim: int) -> 
         entropy_per_dim=config.entropy_per_dim,
         actor_start=config.critic_warmup or 0,
         actor_ramp=config.actor_ramp,
-        lr_warmup=config.lr_warmup,
+        lr_warmup=0 if reset else lr_warmup(config, method.utd),
     )
     learner = make_sac(sac, hyper)
 

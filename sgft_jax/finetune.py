@@ -10,7 +10,7 @@ from sgft_jax import dynamics, optim, replay, value
 from sgft_jax.agents import make_agent
 from sgft_jax.finetune_mpc import make_mpc
 from sgft_jax.finetune_planner import make_planner
-from sgft_jax.methods import FinetuneConfig, Method
+from sgft_jax.methods import FinetuneConfig, Method, lr_warmup
 from sgft_jax.networks import make_dynamics, make_value
 from sgft_jax.sgft import append_steps_to_go, compose
 from sgft_jax.types import (
@@ -58,12 +58,13 @@ def make_finetuner(
     if method.agent == "tdmpc2":
         return make_planner(method, config, obs_dim=obs_dim, act_dim=act_dim)
     if method.agent == "mpc":
-        return make_mpc(config, obs_dim=obs_dim, act_dim=act_dim, reward=reward, terminated=terminated)
+        return make_mpc(method, config, obs_dim=obs_dim, act_dim=act_dim, reward=reward, terminated=terminated)
     agent = make_agent(method, config, obs_dim=obs_dim, act_dim=act_dim)
     learner = agent.learner
     value_network = make_value(obs_dim, config.network)
     model_network = make_dynamics(obs_dim, act_dim, config.network)
     optimiser = optim.adam(config.max_grad_norm)
+    warmup = lr_warmup(config, method.utd)
     transform = compose(*method.transforms(config.horizon, config.branches, config.branch_noise))
     told = config.horizon if method.finite_horizon else 1  # what the agent is told about the steps to go
 
@@ -116,7 +117,7 @@ def make_finetuner(
         real = replay.sample(state.replay, keys[0], config.batch_size)
         metrics: Metrics = {}
         if method.uses_dynamics and config.train_dynamics:
-            rate = config.lr_dynamics * optim.risen(optim.steps_of(state.dynamics), config.lr_warmup)
+            rate = config.lr_dynamics * optim.risen(optim.steps_of(state.dynamics), warmup)
             fit, metrics = dynamics.update(
                 model_network, optimiser, state.dynamics, state.normalizer, real, keys[1], rate=rate
             )

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from sgft_jax import dynamics, mpc, optim, replay
-from sgft_jax.methods import FinetuneConfig
+from sgft_jax.methods import FinetuneConfig, Method, lr_warmup
 from sgft_jax.networks import add_noise, make_dynamics
 from sgft_jax.types import Array, Finetuner, Key, Metrics, Prior, PyTree, Simulated, Transition
 
@@ -28,6 +28,7 @@ def plan_options(config: FinetuneConfig) -> dict[str, Any]:
 
 
 def make_mpc(
+    method: Method,
     config: FinetuneConfig,
     *,
     obs_dim: int,
@@ -40,6 +41,7 @@ def make_mpc(
     plan = mpc.make_act(planner, reward=reward, terminated=terminated)
     model = make_dynamics(obs_dim, act_dim, config.network)
     optimiser = optim.adam(config.max_grad_norm)
+    warmup = lr_warmup(config, method.utd)
 
     def init(prior: Prior, key: Key) -> MPCState:
         del key
@@ -61,7 +63,7 @@ def make_mpc(
     def update(state: MPCState, key: Key) -> tuple[MPCState, Metrics]:
         key_rows, key_fit = jax.random.split(key)
         rows = replay.sample(state.replay, key_rows, config.batch_size)
-        rate = config.lr_dynamics * optim.risen(optim.steps_of(state.dynamics), config.lr_warmup)
+        rate = config.lr_dynamics * optim.risen(optim.steps_of(state.dynamics), warmup)
         fit, metrics = dynamics.update(
             model, optimiser, state.dynamics, state.prior.normalizer, rows, key_fit, rate=rate
         )

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from sgft_jax import replay, sequences, tdmpc2, tdmpc2_model
-from sgft_jax.methods import FinetuneConfig, Method
+from sgft_jax.methods import FinetuneConfig, Method, lr_warmup
 from sgft_jax.types import Array, Finetuner, Key, Metrics, PyTree, Simulated, Transition
 
 
@@ -28,7 +28,8 @@ def make_planner(method: Method, config: FinetuneConfig, *, obs_dim: int, act_di
         obs_dim, act_dim, size=config.size, horizon=config.horizon, plan_samples=config.plan_samples,
         sgft=not config.train_critic, train_encoder=config.train_encoder,
     )  # fmt: skip
-    hyper = tdmpc2.TDMPC2Hyper(config.lr_critic, config.lr_warmup, tau=config.tau, gamma=config.gamma)
+    warmup = 0 if method.fresh else lr_warmup(config, method.utd)
+    hyper = tdmpc2.TDMPC2Hyper(config.lr_critic, warmup, tau=config.tau, gamma=config.gamma)
     learner = tdmpc2.make_tdmpc2(structure, hyper)
 
     def init(prior: tdmpc2.TDMPC2Prior, key: Key) -> PlannerState:

@@ -10,6 +10,8 @@ from sgft_jax.networks import NetworkConfig
 from sgft_jax.sgft import branch, shape, shorten
 from sgft_jax.types import Array, BatchTransform, UserError, unknown
 
+_WARM_TRANSITIONS = 1000  # real ones, for `FinetuneConfig.lr_warmup`: 20 to 25 rollouts of the tasks here
+
 AgentName = Literal["sac", "iql", "tdmpc2", "mpc"]
 
 # What tuning chooses from. Of every method the five options that its authors name as sensitive, or that our own
@@ -67,9 +69,10 @@ class FinetuneConfig:
     train_dynamics: keep fitting the ensemble, on real transitions only.
     actor_real_only: the actor learns from the real rows, the critic from all (O-11).
     lr_warmup: updates over which the rates of networks that come from the simulator rise linearly from 0: of all that
-        learn in an agent of TD-MPC2, of dynamics models, of critics but IQL's. Adam's first steps are as long as its
-        rate in every weight, however small the gradient: 40 of them, after one rollout, took plans that pushed a towel
-        home in 93 % of all episodes to 4, and with a rise over 1,000 they stay (docs/results.md).
+        learn in an agent of TD-MPC2, of dynamics models, of kept critics; what is new learns at full rate. Adam's first
+        steps are as long as its rate in every weight, however small the gradient: 40 of them, after one rollout, took
+        plans that pushed a towel home in 93 % of all episodes to 4. SAC, MBPO and TD-MPC2 gain as much from the rise as
+        SGFT (docs/results.md). None = the updates of the first 1,000 real transitions.
     lr_*: other Adam learning rates. tau: target averaging rate. max_grad_norm: None = no clipping.
     simulated_share: share of each batch that is drawn from the simulator's transitions instead of the real ones; it
         goes linearly to `simulated_share_end` (None = stays) over `simulated_anneal` updates.
@@ -108,7 +111,7 @@ class FinetuneConfig:
     actor_ramp: int = 1000
     train_dynamics: bool = True
     actor_real_only: bool = True
-    lr_warmup: int = 0
+    lr_warmup: int | None = None
     lr_actor: float = 1e-4
     lr_critic: float = 3e-4
     lr_dynamics: float = 3e-4
@@ -130,7 +133,7 @@ class FinetuneConfig:
         for name in ("horizon", "branches", "batch_size", "replay_capacity", "simulated_anneal"):
             if getattr(self, name) < 1:
                 raise UserError(f"fine-tuning option {name} is {getattr(self, name)}: must be at least 1")
-        if self.lr_warmup < 0:
+        if self.lr_warmup is not None and self.lr_warmup < 0:
             raise UserError(f"fine-tuning option lr_warmup is {self.lr_warmup}: must not be negative")
         for name in ("simulated_share", "simulated_share_end", "simulated_ladder"):
             if not 0 <= (getattr(self, name) or 0.0) <= 1:
@@ -146,8 +149,7 @@ class Method(NamedTuple):
     finite_horizon: the agent is told the steps to go (for horizon > 1). reset_critic: default at transfer.
     uses_value, uses_dynamics: what its transforms take from the prior besides the agent.
     agent: the learner. fresh: it starts from nothing, and the simulator's policy only makes the initial rollouts.
-    utd: updates per real transition. initial_rollouts: real ones before it learns at all.
-    options: where its `FinetuneConfig` differs from the defaults, by field.
+    utd: updates per real transition. options: where its `FinetuneConfig` differs from the defaults, by field.
     space: what tuning may choose (experiments/tune.py): values for `utd` and for fields of `FinetuneConfig`.
     """
 
@@ -162,7 +164,6 @@ class Method(NamedTuple):
     agent: AgentName
     fresh: bool
     utd: float
-    initial_rollouts: int
     options: Mapping[str, Any]
     space: Mapping[str, tuple[Any, ...]]
 
@@ -192,7 +193,6 @@ def _method(
     agent: AgentName = "sac",
     fresh: bool = False,
     utd: float = 8.0,
-    initial_rollouts: int = 5,
     space: Mapping[str, tuple[Any, ...]],
     **options: Any,
 ) -> Method:
@@ -207,8 +207,7 @@ def _method(
         return tuple(built[part]() for part in parts.split())
 
     uses = ("shape" in parts, "branch" in parts)
-    learner = (reset_critic, agent, fresh, utd, initial_rollouts)
-    return Method(name, description, source, transforms, finite, *uses, *learner, options, space)
+    return Method(name, description, source, transforms, finite, *uses, reset_critic, agent, fresh, utd, options, space)
 
 
 METHODS: dict[str, Method] = {
@@ -234,7 +233,7 @@ METHODS: dict[str, Method] = {
         _method(
             "sac-online", "", "SAC from kept networks and simulator data, many critic updates a slow actor update",
             "As 2026", utd=5.0, lr_actor=1e-5, policy_delay=20, actor_mean=True, simulated_share=0.5,
-            simulated_share_end=0.0, simulated_anneal=10_000, critic_warmup=0, actor_ramp=0,
+            simulated_share_end=0.0, simulated_anneal=10_000, critic_warmup=0, actor_ramp=0, lr_warmup=0,
             space={"utd": (2.0, 5.0, 10.0), "lr_actor": (1e-5, 3e-5, 1e-4), "lr_critic": _RATES["lr_critic"],
                    "policy_delay": (5, 10, 20), "simulated_share": _SHARE},
         ),
@@ -265,14 +264,12 @@ METHODS: dict[str, Method] = {
         ),
         _method(
             "sgft-tdmpc2", "", "SGFT-TDMPC-2: plans of H steps that end in a frozen V_sim", "SGFT 2025",
-            # Rates that rise let it learn from a single rollout: from 0 to 100 % on hammer (docs/results.md).
-            agent="tdmpc2", utd=1.0, initial_rollouts=1, horizon=4, tau=0.01, train_critic=False, lr_warmup=1000,
-            space=_PLANNER_SPACE,
+            agent="tdmpc2", utd=1.0, horizon=4, tau=0.01, train_critic=False, space=_PLANNER_SPACE,
         ),
         _method(
             "sgft-mpc", "", "MPC-SGFT: plans of H steps by SAC's prior's models, which learn, that end in V_sim",
-            # One rollout is enough, too. Those with an actor keep five while SGFT-SAC has not been measured with one.
-            "SGFT 2025", agent="mpc", initial_rollouts=1, plan_samples=128, space=_MODEL_SPACE,
+            # Models whose rates rise are better on insert, but worse on push and hammer (docs/results.md).
+            "SGFT 2025", agent="mpc", plan_samples=128, lr_warmup=0, space=_MODEL_SPACE,
         ),
         _method("sgft", "shape shorten", "model-free SGFT", "SGFT 2025", space=_SEGMENT_SPACE),
         _method("sgft-sac", "branch shape shorten", "SGFT-SAC", "SGFT 2025", space=_BRANCH_SPACE),
@@ -300,6 +297,11 @@ def get_method(name: str) -> Method:
 def finetune_config(method: Method, **changes: Any) -> FinetuneConfig:
     """The options that a method's authors use, where ours have them, and any changes to these."""
     return FinetuneConfig(**{**method.options, **changes})
+
+
+def lr_warmup(config: FinetuneConfig, utd: float) -> int:
+    """Updates over which the rates of the simulator's networks rise where there are `utd` of them per transition."""
+    return round(_WARM_TRANSITIONS * utd) if config.lr_warmup is None else config.lr_warmup
 
 
 def policy_delay(config: FinetuneConfig, utd: float) -> int:

@@ -439,7 +439,7 @@ def _robot_axis(axes: Axes, rollout_length: int, control_dt: float) -> None:
 
     top = axes.secondary_xaxis("top", functions=(rollouts, transitions))
     minutes = rollout_length * control_dt / 60
-    top.xaxis.set_major_locator(MaxNLocator(integer=True))
+    top.xaxis.set_major_locator(MaxNLocator(nbins=6, integer=True))  # labels of two lines, the lower ones long
     top.xaxis.set_major_formatter(lambda r, _: f"{r:,.0f}\n{_minutes(r * minutes)}" if r else "0")
     top.set_xlabel("rollouts, robot time", **_FONT)
     top.tick_params(colors=_INK, labelsize=9, color=_FAINT)

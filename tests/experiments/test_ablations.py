@@ -86,6 +86,14 @@ def test_horizons_without_a_run_of_the_default_one(tmp_path):
     assert missing == ["toy/default: no two horizons of sgft-mpc with all else equal"]
 
 
+def test_horizons_of_variants_beside_a_default_run_without_another(tmp_path):
+    save(tmp_path, "sgft-sac", **rising(20))
+    for horizon in (1, 4):
+        save(tmp_path, f"sgft-sac_slow-{horizon}", horizon=horizon, lr_actor=1e-5, **rising(20))
+    (_, text), _ = ablations.horizons(read(tmp_path), tmp_path)
+    assert "| toy | H = 1 | sgft-sac_slow-1 |" in text and "| toy | H = 4 | sgft-sac_slow-4 |" in text
+
+
 def test_an_older_run_lacks_options_that_came_later(tmp_path):
     older = save(tmp_path, "sgft-sac", **rising(20)) / "config.json"
     config = json.loads(older.read_text())

@@ -135,7 +135,7 @@ def test_what_fails_does_not_stop_the_rest_and_the_command_goes_on(tmp_path, ran
     assert (result["trial"], result["options"]) == (3, result["trials"][3]["options"])
     assert [trial["area"] for trial in result["trials"]] == pytest.approx([0.125, 0.175, 0.225, 0.275])
     assert result["budget"] == {
-        "trials": 4, "reals": ["mild"], "seeds": [100, 101], "rollouts": 10, "initial_rollouts": None, "eval_every": 5,
+        "trials": 4, "reals": ["mild"], "seeds": [100, 101], "rollouts": 10, "initial_rollouts": 1, "eval_every": 5,
     }  # fmt: skip
     assert result["gaps"] == [{"name": "mild"}] and result["provenance"]["versions"]
     assert "--tuned --tasks toy --methods sac" in capsys.readouterr().out

@@ -109,6 +109,19 @@ def test_learning_rates_of_the_simulators_networks_rise_from_zero(prior, name):
 
 
 @pytest.mark.parametrize(
+    ("name", "reset", "step"), [("sac", False, 3e-4 / 8_000), ("sac", True, 3e-4), ("rlpd", None, 3e-4)]
+)
+def test_a_new_critic_learns_at_full_rate_from_the_start(prior, name, reset, step):
+    agent = agents.make_agent(
+        methods.get_method(name), dataclasses.replace(SMALL, reset_critic=reset), obs_dim=2, act_dim=2
+    )
+    state = agent.start(prior, jax.random.key(0))
+    new, _ = jax.jit(agent.learner.update)(state, transitions(jax.random.key(1), SMALL.batch_size), jax.random.key(2))
+    moved = jax.tree.map(lambda a, b: jnp.abs(a - b).max(), state.critic.params, new.critic.params)
+    assert max(jax.tree.leaves(moved)) == pytest.approx(step, rel=0.05, abs=1e-7)
+
+
+@pytest.mark.parametrize(
     ("name", "clip", "bounded"), [("sgft", 0.01, True), ("sgft", None, False), ("sac", 0.01, False)]
 )
 def test_shaped_rewards_are_bounded_and_the_tasks_own_are_not(prior, name, clip, bounded):

@@ -56,6 +56,15 @@ def test_the_actor_moves_once_per_real_transition_if_nothing_else_is_said():
     rlpd, online = (methods.finetune_config(methods.METHODS[name]) for name in ("rlpd", "sac-online"))
     assert [methods.policy_delay(rlpd, utd) for utd in (40.0, 20.0, 0.5)] == [40, 20, 1]
     assert [methods.policy_delay(online, utd) for utd in (2.0, 5.0)] == [20, 20]
+
+
+@pytest.mark.parametrize(
+    ("name", "utd", "updates"),
+    [("sac", 8.0, 8_000), ("mbpo", 4.0, 4_000), ("tdmpc2", 1.0, 1_000), ("sgft-mpc", 8.0, 0)],
+)
+def test_rates_rise_over_the_first_thousand_real_transitions(name, utd, updates):
+    assert methods.lr_warmup(methods.finetune_config(methods.get_method(name)), utd) == updates
+    assert methods.lr_warmup(methods.FinetuneConfig(lr_warmup=7), utd) == 7
     assert methods.finetune_config(methods.METHODS["sgft-sac"]) == methods.FinetuneConfig()
 
 
