@@ -8,7 +8,7 @@ from flax import struct
 
 from sgft_jax import dynamics, optim, replay, value
 from sgft_jax.agents import make_agent
-from sgft_jax.finetune_mpc import make_mpc
+from sgft_jax.finetune_mpc import make_mpc, make_planned
 from sgft_jax.finetune_planner import make_planner
 from sgft_jax.methods import FinetuneConfig, Method, lr_warmup
 from sgft_jax.networks import make_dynamics, make_value
@@ -59,6 +59,8 @@ def make_finetuner(
         return make_planner(method, config, obs_dim=obs_dim, act_dim=act_dim)
     if method.agent == "mpc":
         return make_mpc(method, config, obs_dim=obs_dim, act_dim=act_dim, reward=reward, terminated=terminated)
+    if config.plan_rollouts and not (method.uses_value and method.uses_dynamics):
+        raise UserError(f"fine-tuning option plan_rollouts needs V_sim and models, method {method.name} has not both")
     agent = make_agent(method, config, obs_dim=obs_dim, act_dim=act_dim)
     learner = agent.learner
     value_network = make_value(obs_dim, config.network)
@@ -67,6 +69,7 @@ def make_finetuner(
     warmup = lr_warmup(config, method.utd)
     transform = compose(*method.transforms(config.horizon, config.branches, config.branch_noise))
     told = config.horizon if method.finite_horizon else 1  # what the agent is told about the steps to go
+    plans = make_planned(config, obs_dim=obs_dim, act_dim=act_dim, reward=reward, terminated=terminated)
 
     def init(prior: Prior, key: Key) -> FinetuneState:
         own = jax.tree.map(jnp.copy, prior)  # the caller may donate the state; the prior must survive it
@@ -85,6 +88,10 @@ def make_finetuner(
         state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
     ) -> tuple[Array, PyTree]:
         k = jnp.int32(config.horizon)
+        if config.plan_rollouts:
+            # A branch, not a choice between both: an evaluation has many times the steps of a rollout and plans none.
+            best = lambda: (policy(state.learner, obs, k, key, explore=False), carry)  # noqa: E731
+            return jax.lax.cond(explore, lambda: plans.act(export(state), carry, obs, key, explore=True), best)
         sample, mode = (policy(state.learner, obs, k, key, explore=choice) for choice in (True, False))
         return jnp.where(explore, sample, mode), carry
 
@@ -146,4 +153,5 @@ def make_finetuner(
         actor, critic = agent.networks(state.learner)
         return Prior(actor, critic, state.value, state.dynamics.params, state.normalizer)
 
-    return Finetuner(init, learner.init_carry, act, observe, learn, export)
+    init_carry = plans.init_carry if config.plan_rollouts else learner.init_carry
+    return Finetuner(init, init_carry, act, observe, learn, export)

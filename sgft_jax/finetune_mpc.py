@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,33 @@ def plan_options(config: FinetuneConfig) -> dict[str, Any]:
     return {"horizon": config.horizon, "samples": config.plan_samples, "noise": config.branch_noise}
 
 
+class Planned(NamedTuple):
+    """init_carry() -> the plan of a step that never was. act(prior, carry, obs, key, *, explore) -> (action, carry)."""
+
+    init_carry: Callable[[], PyTree]
+    act: Callable[..., tuple[Array, PyTree]]
+
+
+def make_planned(
+    config: FinetuneConfig,
+    *,
+    obs_dim: int,
+    act_dim: int,
+    reward: Callable[[Array, Array, Array], Array],
+    terminated: Callable[[Array, Array, Array], Array],
+) -> Planned:
+    """Plans on a prior of SAC (`mpc.make_act`), with `explore_noise` on what is done to explore."""
+    planner = mpc.MPCConfig(obs_dim, act_dim, config.network, **plan_options(config), gamma=config.gamma)
+    plan = mpc.make_act(planner, reward=reward, terminated=terminated)
+
+    def act(prior: Prior, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
+        key_plan, key_noise = jax.random.split(key)
+        action, carry = plan(prior, carry, obs, key_plan, explore=explore)
+        return add_noise(action, jnp.where(explore, config.explore_noise, 0.0), key_noise), carry
+
+    return Planned(lambda: mpc.init_carry(planner), act)
+
+
 def make_mpc(
     method: Method,
     config: FinetuneConfig,
@@ -37,8 +64,7 @@ def make_mpc(
     terminated: Callable[[Array, Array, Array], Array],
 ) -> Finetuner:
     """MPC-SGFT. reward, terminated: as for `finetune.make_finetuner`. Source: SGFT Algorithm 3."""
-    planner = mpc.MPCConfig(obs_dim, act_dim, config.network, **plan_options(config), gamma=config.gamma)
-    plan = mpc.make_act(planner, reward=reward, terminated=terminated)
+    plans = make_planned(config, obs_dim=obs_dim, act_dim=act_dim, reward=reward, terminated=terminated)
     model = make_dynamics(obs_dim, act_dim, config.network)
     optimiser = optim.adam(config.max_grad_norm)
     warmup = lr_warmup(config, method.utd)
@@ -53,9 +79,7 @@ def make_mpc(
         return replace(state.prior, dynamics=state.dynamics.params)
 
     def act(state: MPCState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
-        key_plan, key_noise = jax.random.split(key)
-        action, carry = plan(export(state), carry, obs, key_plan, explore=explore)
-        return add_noise(action, jnp.where(explore, config.explore_noise, 0.0), key_noise), carry
+        return plans.act(export(state), carry, obs, key, explore=explore)
 
     def observe(state: MPCState, transitions: Transition, valid: Array) -> MPCState:
         return state.replace(replay=replay.add_batch(state.replay, transitions, valid))
@@ -76,4 +100,4 @@ def make_mpc(
         state, metrics = jax.lax.scan(update, state, jax.random.split(key, n_updates))
         return state, jax.tree.map(jnp.mean, metrics)
 
-    return Finetuner(init, lambda: mpc.init_carry(planner), act, observe, learn, export)
+    return Finetuner(init, plans.init_carry, act, observe, learn, export)

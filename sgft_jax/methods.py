@@ -54,9 +54,11 @@ class FinetuneConfig:
         policy in V_sim stay the simulator's; train_encoder is the ablation that lets the encoder learn.
     plan_samples: sequences that a plan tries in each of its iterations. The planner on SAC's priors, `sgft-mpc`, has
         H = `horizon` too, and `branch_noise` on what the policy proposes.
-    explore_noise: std of the noise on what `sgft-mpc` does on the real system, in units of the action's range. A plan
-        does much the same in the same state, and from such data no model learns what actions do: from two small
-        priors success stayed or fell without noise and rose with it (docs/findings.md).
+    plan_rollouts: the real rollouts are plans on the agent's own policy, models and V_sim, as those of `sgft-mpc`, and
+        the policy learns from what they meet; it alone acts when it is evaluated or exported.
+    explore_noise: std of the noise on what these plans, and those of `sgft-mpc`, do on the real system, in units of the
+        action's range. A plan does much the same in the same state, and from such data no model learns what actions do:
+        from two small priors success stayed or fell without noise and rose with it (docs/findings.md).
     critics, target_critics, actor_mean, policy_delay, train_critic: see `SACConfig`. A kept critic has two members.
         policy_delay None = the updates of a real transition (`utd`): the actor moves once for each, as in RLPD.
     reset_critic: None = the method's default. A kept critic under a shaped reward is read as Q_sim(s, a) - V_sim(s),
@@ -104,6 +106,7 @@ class FinetuneConfig:
     train_critic: bool = True
     size: str = "5M"
     plan_samples: int = 512
+    plan_rollouts: bool = False
     explore_noise: float = 0.4
     train_encoder: bool = False
     reset_critic: bool | None = None

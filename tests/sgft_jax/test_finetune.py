@@ -176,6 +176,29 @@ def test_what_is_exported_acts_like_the_agent(prior, key, horizon):
     assert not np.allclose(expected, act(tuner, tuner.init(prior, key), obs), rtol=1e-3)
 
 
+@pytest.mark.parametrize("horizon", [1, 2])
+def test_rollouts_may_be_plans_while_the_policy_alone_is_evaluated(prior, key, horizon):
+    """The plans are those of `sgft-mpc` with the same options on the same prior."""
+    options = {"horizon": horizon, "plan_samples": 24, "explore_noise": 0.3}
+    planned, plain = make("sgft-sac", plan_rollouts=True, **options), make("sgft-sac", horizon=horizon)
+    mpc = make("sgft-mpc", **options)
+    obs = jnp.array([0.3, -0.4])
+    play = lambda tuner, explore: jax.jit(tuner.act)(  # noqa: E731
+        tuner.init(prior, jax.random.key(0)), tuner.init_carry(), obs, key, explore=explore
+    )
+    np.testing.assert_allclose(play(planned, False)[0], play(plain, False)[0], atol=1e-6)
+    for ours, theirs in zip(play(planned, True), play(mpc, True), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+    assert not np.allclose(play(planned, True)[0], play(plain, True)[0], atol=0.01)
+    assert planned.init_carry().shape == (horizon, 2)
+
+
+@pytest.mark.parametrize("name", ["sac", "mbpo", "sgft"])
+def test_plans_need_models_and_a_value(name):
+    with pytest.raises(UserError, match=f"plan_rollouts needs V_sim and models, method {name} has not both"):
+        make(name, plan_rollouts=True)
+
+
 def test_invalid_transitions_do_no_harm(prior, key):
     tuner = make("sgft-sac")
     state = tuner.init(prior, key)
