@@ -105,7 +105,7 @@ class _Run:
         """Everything, in order; returns the summaries. priors: [P]; seed i starts from prior i modulo P."""
         self.records, done = records, _common_rollouts(records)
         config = self._options(card)
-        self.simulation = self._simulate(config, priors, card) if config.simulated_share else None
+        self.simulation = self._simulate(config, priors, card) if config.needs_simulation else None
         if self.method.agent == "iql" and config.reward_scale is None:
             config = replace(config, reward_scale=self._reward_scale())
         self.tuner, self.program = self._programs(self.method, config)

@@ -12,7 +12,7 @@ from sgft_jax.finetune_mpc import make_mpc, make_planned
 from sgft_jax.finetune_planner import make_planner
 from sgft_jax.methods import FinetuneConfig, Method, lr_warmup
 from sgft_jax.networks import make_dynamics, make_value
-from sgft_jax.sgft import append_steps_to_go, compose
+from sgft_jax.sgft import append_steps_to_go, compose, relabel
 from sgft_jax.types import (
     Array,
     Finetuner,
@@ -61,6 +61,8 @@ def make_finetuner(
         return make_mpc(method, config, obs_dim=obs_dim, act_dim=act_dim, reward=reward, terminated=terminated)
     if config.plan_rollouts and not (method.uses_value and method.uses_dynamics):
         raise UserError(f"fine-tuning option plan_rollouts needs V_sim and models, method {method.name} has not both")
+    if config.relabel_simulated and not method.uses_dynamics:
+        raise UserError(f"fine-tuning option relabel_simulated needs models, method {method.name} has none")
     agent = make_agent(method, config, obs_dim=obs_dim, act_dim=act_dim)
     learner = agent.learner
     value_network = make_value(obs_dim, config.network)
@@ -132,7 +134,11 @@ def make_finetuner(
         rows = real
         if simulated is not None:
             drawn = simulated(jax.random.fold_in(keys[0], 1), config.batch_size)
-            rows = drawn if offline else mix(real, drawn, share(state))
+            if config.relabel_simulated:
+                relabelled = relabel(imagine(state, keys[2]), drawn, jax.random.fold_in(keys[3], 1))
+                rows = jax.tree.map(lambda *x: jnp.concatenate(x), real, relabelled)
+            else:
+                rows = drawn if offline else mix(real, drawn, share(state))
         batch = transform(imagine(state, keys[2]), rows, keys[3])
         if method.uses_value and config.clip_shaped is not None:
             batch = batch._replace(reward=jnp.clip(batch.reward, -config.clip_shaped, config.clip_shaped))
@@ -143,7 +149,7 @@ def make_finetuner(
     def learn(
         state: FinetuneState, key: Key, n_updates: int, simulated: Simulated | None = None, *, offline: bool = False
     ) -> tuple[FinetuneState, Metrics]:
-        if config.simulated_share and simulated is None:
+        if config.needs_simulation and simulated is None:
             raise UserError(f"method {method.name} needs transitions of the simulator")
         one = lambda state, key: update(state, key, simulated, offline)  # noqa: E731
         state, metrics = jax.lax.scan(one, state, jax.random.split(key, n_updates))

@@ -81,6 +81,9 @@ class FinetuneConfig:
     simulated_transitions: how many of them there are: whole episodes of the prior's policy in the training domain,
         more and more of its actions replaced by random ones from the first episode to the last, up to a share of
         `simulated_ladder`, as where the fleet of pretraining ends.
+    relabel_simulated: instead, each batch gets as many of them as it has real ones, with the successors, rewards and
+        ends that the models expect, which are fitted on real data; branches begin there and the actor learns there too.
+        What a plan asks the models about where it is, a policy then learns wherever the simulator's policies have been.
     offline_updates: updates on the simulator's transitions alone, before the first real rollout.
     expectile, beta, reward_scale: IQL's; see `IQLHyper`. reward_scale None = episode length / (best - worst return) of
         the simulator's episodes, as the authors scale theirs.
@@ -127,6 +130,7 @@ class FinetuneConfig:
     simulated_anneal: int = 10_000
     simulated_transitions: int = 200_000
     simulated_ladder: float = 0.6
+    relabel_simulated: bool = False
     offline_updates: int = 0
     expectile: float = 0.7
     beta: float = 3.0
@@ -138,11 +142,18 @@ class FinetuneConfig:
                 raise UserError(f"fine-tuning option {name} is {getattr(self, name)}: must be at least 1")
         if self.lr_warmup is not None and self.lr_warmup < 0:
             raise UserError(f"fine-tuning option lr_warmup is {self.lr_warmup}: must not be negative")
+        if self.relabel_simulated and self.simulated_share:
+            raise UserError("fine-tuning options relabel_simulated and simulated_share exclude each other: choose one")
         for name in ("simulated_share", "simulated_share_end", "simulated_ladder"):
             if not 0 <= (getattr(self, name) or 0.0) <= 1:
                 raise UserError(f"fine-tuning option {name} is {getattr(self, name)}: must be a share from 0 to 1")
         if self.offline_updates and not self.simulated_share:
             raise UserError("fine-tuning option offline_updates needs the simulator's transitions: set simulated_share")
+
+    @property
+    def needs_simulation(self) -> bool:
+        """Whether the learner draws from the simulator's transitions."""
+        return self.simulated_share > 0 or self.relabel_simulated
 
 
 class Method(NamedTuple):

@@ -90,14 +90,31 @@ def branch(horizon: int, branches: int, *, noise: float | Array = 0.0, segments:
     return transform
 
 
+def relabel(imagination: Imagination, batch: Transition, key: Key) -> Transition:
+    """Transitions [B, ...] of another system as the models have them: what follows from their observations and actions.
+
+    Only the dynamics need be real, not the observations: the simulator's are as wide as a task, and show a learner what
+    fine-tuned models say about places where no rollout has been.
+    """
+
+    def one(row: Transition, key: Key) -> Transition:
+        return _transition(imagination, row.obs, row.action, row.steps_to_go, key)[0]
+
+    return jax.vmap(one)(batch, jax.random.split(key, batch.reward.shape[0]))
+
+
 def _imagine(
     imagination: Imagination, obs: Array, k: Array, key: Key, *, noise: float | Array
 ) -> tuple[Transition, Array]:
     """One imagined transition from obs with k steps to go, and whether it terminates."""
     key_policy, key_noise, key_dynamics = jax.random.split(key, 3)
     action = imagination.policy(obs, k, key_policy)
-    action = add_noise(action, noise, key_noise)
-    next_obs = imagination.dynamics(obs, action, key_dynamics)
+    return _transition(imagination, obs, add_noise(action, noise, key_noise), k, key_dynamics)
+
+
+def _transition(imagination: Imagination, obs: Array, action: Array, k: Array, key: Key) -> tuple[Transition, Array]:
+    """The transition that the models expect, and whether it terminates."""
+    next_obs = imagination.dynamics(obs, action, key)
     terminated = imagination.terminated(obs, action, next_obs)
     discount = jnp.where(terminated, 0.0, imagination.gamma)
     reward = imagination.reward(obs, action, next_obs)
