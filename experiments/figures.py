@@ -78,13 +78,13 @@ def draw(comparison: Comparison, target: Path, order: Sequence[str]) -> dict[str
     """Learning curves of all methods on one real system: figures in the folder `target`, by their titles.
 
     order: of the methods in all figures, which gives colours. A variant that several of them have, as `tuned`, has a
-    figure of its own. Methods that plan start from priors of their own: zero-shot is a line where that of all is
-    about the same.
+    figure of its own, and so have the other variants of a method, beside it. Methods that plan start from priors of
+    their own: zero-shot is a line where that of all is about the same.
     """
     drawn = {}
-    for variant, curves in _apart(comparison.curves, shared_variants(order)).items():
-        title = _title(comparison) + (f", {variant}" if variant else "")
-        name = "_".join(filter(None, [f"{comparison.task}-{comparison.real}", variant]))
+    for part, curves in _apart(comparison.curves, shared_variants(order)).items():
+        title = _title(comparison) + (f", {part}" if part else "")
+        name = "_".join(filter(None, [f"{comparison.task}-{comparison.real}", part]))
         starts = [float(iqm_interval(curve.success[:, 0]).estimate) for curve in curves.values()]
         drawn[title] = plot.learning_curves(
             target / f"{name}.png",
@@ -98,11 +98,16 @@ def draw(comparison: Comparison, target: Path, order: Sequence[str]) -> dict[str
 
 
 def _apart(curves: Mapping[str, Curve], shared: Sequence[str]) -> dict[str, dict[str, Curve]]:
-    """[variant][name], the methods first: shared variants by themselves, those of a single method with it."""
+    """[part][name]: the methods themselves under "", shared variants under their names, other ones under their method's,
+    which comes first there; a variant of a method that has not been run stands for it among the methods.
+    """
     found: dict[str, dict[str, Curve]] = {}
     for name, curve in curves.items():
-        variant = split(name)[1]
-        found.setdefault(variant if variant in shared else "", {})[name] = curve
+        method, variant = split(name)
+        part = variant if variant in shared else method if variant and method in curves else ""
+        if part == method:
+            found.setdefault(part, {})[method] = curves[method]
+        found.setdefault(part, {})[name] = curve
     return dict(sorted(found.items()))
 
 

@@ -11,7 +11,7 @@ from envs.physics import Impl
 from experiments import cli, common
 from experiments.presets import PRESETS
 from sgft_jax import checkpoint
-from sgft_jax.methods import FinetuneConfig, Method, finetune_config, get_method
+from sgft_jax.methods import FinetuneConfig, Method, check_options, finetune_config, get_method
 from sgft_jax.types import UserError
 
 DEFAULT_METHOD, DEFAULT_PRESET = "sgft-sac", "fast"
@@ -127,7 +127,9 @@ def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
     folders = [run_folder(args, real) for real in args.real]
     if twice := [folder for folder in folders if folders.count(folder) > 1]:
         raise UserError(f"--real {' '.join(args.real)}: two of them would share the folder {twice[0]}; name it once")
-    return get_method(args.method), seeds
+    method = get_method(args.method)
+    check_options(method, args.options)
+    return method, seeds
 
 
 def check_prior(args: FinetuneArgs, method: Method, card: dict[str, Any]) -> None:

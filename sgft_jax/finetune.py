@@ -10,7 +10,7 @@ from sgft_jax import dynamics, optim, replay, value
 from sgft_jax.agents import make_agent
 from sgft_jax.finetune_mpc import make_mpc, make_planned
 from sgft_jax.finetune_planner import make_planner
-from sgft_jax.methods import FinetuneConfig, Method, lr_warmup
+from sgft_jax.methods import FinetuneConfig, Method, check_options, lr_warmup
 from sgft_jax.networks import make_dynamics, make_value
 from sgft_jax.sgft import append_steps_to_go, compose, relabel
 from sgft_jax.types import (
@@ -54,15 +54,15 @@ def make_finetuner(
     reward: Callable[[Array, Array, Array], Array],
     terminated: Callable[[Array, Array, Array], Array],
 ) -> Finetuner:
-    """Fine-tuning by `method`. reward, terminated: the task as functions of one (obs, action, next_obs)."""
+    """Fine-tuning by `method`. reward, terminated: the task as functions of one (obs, action, next_obs).
+
+    UserError for options that the method has no use for.
+    """
+    check_options(method, config)
     if method.agent == "tdmpc2":
         return make_planner(method, config, obs_dim=obs_dim, act_dim=act_dim)
     if method.agent == "mpc":
         return make_mpc(method, config, obs_dim=obs_dim, act_dim=act_dim, reward=reward, terminated=terminated)
-    if config.plan_rollouts and not (method.uses_value and method.uses_dynamics):
-        raise UserError(f"fine-tuning option plan_rollouts needs V_sim and models, method {method.name} has not both")
-    if config.relabel_simulated and not method.uses_dynamics:
-        raise UserError(f"fine-tuning option relabel_simulated needs models, method {method.name} has none")
     agent = make_agent(method, config, obs_dim=obs_dim, act_dim=act_dim)
     learner = agent.learner
     value_network = make_value(obs_dim, config.network)

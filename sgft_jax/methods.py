@@ -313,6 +313,14 @@ def finetune_config(method: Method, **changes: Any) -> FinetuneConfig:
     return FinetuneConfig(**{**method.options, **changes})
 
 
+def check_options(method: Method, config: FinetuneConfig) -> None:
+    """Raises UserError for options that ask for what the method lacks."""
+    if config.plan_rollouts and not (method.uses_value and method.uses_dynamics):
+        raise UserError(f"fine-tuning option plan_rollouts needs branches and shaped rewards: not with {method.name}")
+    if config.relabel_simulated and not method.uses_dynamics:
+        raise UserError(f"fine-tuning option relabel_simulated needs branches: not with {method.name}")
+
+
 def lr_warmup(config: FinetuneConfig, utd: float) -> int:
     """Updates over which the rates of the simulator's networks rise where there are `utd` of them per transition."""
     return round(_WARM_TRANSITIONS * utd) if config.lr_warmup is None else config.lr_warmup

@@ -93,12 +93,13 @@ def test_one_figure_and_one_table_per_real_system(tmp_path, capsys, monkeypatch)
 
     text = (tmp_path / "figures/results.md").read_text()
     assert text in capsys.readouterr().out
-    assert list(drawn) == [tmp_path / f"figures/toy-{real}.png" for real in ("default", "hard+latency=0.1")]
+    names = ("default", "default_sgft-sac", "hard+latency=0.1")
+    assert list(drawn) == [tmp_path / f"figures/toy-{name}.png" for name in names]
     curves, more = drawn[tmp_path / "figures/toy-default.png"]
-    assert list(curves) == ["sgft-sac", "sgft-sac_horizon-4", "sac"]
+    assert list(curves) == ["sgft-sac", "sac"]
     assert more["zero_shot"] == 0.25 and more["rollout_length"] == 20 and more["control_dt"] == pytest.approx(0.1)
     np.testing.assert_array_equal(curves["sac"][1], np.transpose(flat))
-    # Colours in both figures: the variant, which another figure lacks, must not move those of the methods.
+    # Colours in all figures: the variant, which others lack, must not move those of the methods.
     assert all(more["order"] == ["sgft-sac", "sac", "sgft-sac_horizon-4"] for _, more in drawn.values())
     titles = ["## All tasks", "## toy on the default", "## toy on the hard", "## The three transforms", "## Missing"]
     assert sorted(titles, key=text.index) == titles and "## The horizon" not in text
@@ -115,16 +116,17 @@ def test_one_figure_and_one_table_per_real_system(tmp_path, capsys, monkeypatch)
         assert missing in text
 
 
-def test_a_variant_of_several_methods_has_a_figure_of_its_own(tmp_path, monkeypatch):
+def test_variants_of_several_methods_and_of_a_single_one_have_figures_of_their_own(tmp_path, monkeypatch):
     drawn = {}
     monkeypatch.setattr(
         figures.plot, "learning_curves", lambda path, curves, **more: drawn.update({path.name: list(curves)}) or path
     )
-    for method in ("sac", "sgft-sac", "sgft-sac_horizon-4", "sac_tuned", "sgft-sac_tuned"):
+    for method in ("sac", "sgft-sac", "sgft-sac_horizon-4", "sac_tuned", "sgft-sac_tuned", "rlpd_utd-1"):
         save(tmp_path, method, [[0.2, 0.3], [0.9, 1.0]], rollouts=[0, 20])
     call("--out", tmp_path)
     assert drawn == {
-        "toy-default.png": ["sgft-sac", "sgft-sac_horizon-4", "sac"],
+        "toy-default.png": ["sgft-sac", "rlpd_utd-1", "sac"],  # there is no rlpd that it could be compared with
+        "toy-default_sgft-sac.png": ["sgft-sac", "sgft-sac_horizon-4"],
         "toy-default_tuned.png": ["sgft-sac_tuned", "sac_tuned"],
     }
     text = (tmp_path / "figures/results.md").read_text()

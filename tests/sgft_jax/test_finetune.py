@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax import agents, finetune, methods, networks, normalizer, sac
+from sgft_jax import agents, dynamics, finetune, methods, networks, normalizer, sac
 from sgft_jax.types import Transition, UserError
 
 NET = networks.NetworkConfig(hidden=(16,))
@@ -193,10 +193,13 @@ def test_rollouts_may_be_plans_while_the_policy_alone_is_evaluated(prior, key, h
     assert planned.init_carry().shape == (horizon, 2)
 
 
-@pytest.mark.parametrize("name", ["sac", "mbpo", "sgft"])
-def test_plans_need_models_and_a_value(name):
-    with pytest.raises(UserError, match=f"plan_rollouts needs V_sim and models, method {name} has not both"):
-        make(name, plan_rollouts=True)
+@pytest.mark.parametrize(
+    ("name", "option"),
+    [("sac", "plan_rollouts"), ("mbpo", "plan_rollouts"), ("sgft", "plan_rollouts"), ("pbrs", "relabel_simulated")],
+)
+def test_options_that_a_method_has_no_parts_for(name, option):
+    with pytest.raises(UserError, match=f"{option} needs branches.*: not with {name}$"):
+        make(name, **{option: True})
 
 
 def test_invalid_transitions_do_no_harm(prior, key):
@@ -268,6 +271,47 @@ def test_offline_means_simulated_rows_alone(prior):
     assert metrics["batch/reward_mean"] == 100
     with pytest.raises(UserError, match="rlpd needs transitions of the simulator"):
         make("rlpd", simulated_share=0.5).learn(state, jax.random.key(1), 1)
+
+
+@pytest.mark.parametrize(("name", "horizon"), [("mbpo", 1), ("sgft-sac", 2)])
+def test_the_simulators_transitions_as_the_models_have_them(prior, monkeypatch, name, horizon):
+    """After the real rows come as many relabelled ones; branches begin at both, and the actor learns from both."""
+    seen = {}
+    real_make = agents.make_sac
+
+    def spy(config, hyper):
+        learner = real_make(config, hyper)
+        seen["actor_batch"] = config.actor_batch
+        return learner._replace(update=lambda s, b, k: (seen.update(batch=b), learner.update(s, b, k))[1])
+
+    monkeypatch.setattr(agents, "make_sac", spy)
+    tuner = make.__wrapped__(name, horizon=horizon, relabel_simulated=True, clip_shaped=None, train_dynamics=False)
+    state = started(tuner, prior)
+    far = lambda key, n: simulated(key, n)._replace(obs=transitions(key, n).obs + 5.0)  # noqa: E731
+    with jax.disable_jit():
+        tuner.learn(state, jax.random.key(1), 1, far)
+    batch, n = seen["batch"], SMALL.batch_size
+    assert seen["actor_batch"] == 2 * n and batch.reward.shape == (2 * n * (1 + 2 * horizon),)
+    starts = np.asarray(batch.obs[:, :2]).reshape(-1, 2)
+    assert (starts[:n] < 1.1).all() and (starts[n : 2 * n] > 3.9).all()
+    first = starts[2 * n :].reshape(2 * n, 2, horizon, 2)[:, :, 0]
+    np.testing.assert_allclose(first, np.repeat(starts[: 2 * n, None], 2, axis=1))
+    assert jnp.abs(batch.reward).max() < 50  # of the models and the task, not the 100 of the simulator
+    predicted = jax.vmap(lambda obs, action: dynamics_of(prior, obs, action))(
+        starts[n : 2 * n], batch.action[n : 2 * n]
+    )
+    gap = np.abs(np.asarray(predicted) - np.asarray(batch.next_obs[n : 2 * n, None, :2])).max(-1).min(1)
+    assert gap.max() < 1e-4  # what one of the members says
+
+
+def dynamics_of(prior, obs, action):
+    """What each member of the prior's ensemble expects: [members, obs_dim]."""
+    return dynamics.predict(networks.make_dynamics(2, 2, NET), prior.dynamics, prior.normalizer, obs, action)
+
+
+def test_relabelling_and_a_share_of_the_simulators_own_rows_exclude_each_other():
+    with pytest.raises(UserError, match="relabel_simulated and simulated_share exclude each other"):
+        make("mbpo", relabel_simulated=True, simulated_share=0.5)
 
 
 @pytest.mark.parametrize("name", ["rlpd", "iql"])
