@@ -98,8 +98,8 @@ def draw(comparison: Comparison, target: Path, order: Sequence[str]) -> dict[str
 
 
 def _apart(curves: Mapping[str, Curve], shared: Sequence[str]) -> dict[str, dict[str, Curve]]:
-    """[part][name]: the methods themselves under "", shared variants under their names, other ones under their method's,
-    which comes first there; a variant of a method that has not been run stands for it among the methods.
+    """[part][name]: methods under "", shared variants under their names, other ones after their method under its name;
+    a variant of a method that has not been run stands for it among the methods.
     """
     found: dict[str, dict[str, Curve]] = {}
     for name, curve in curves.items():
