@@ -1,7 +1,7 @@
 """The runs of a comparison on disk: all methods on one real system, which run of each counts, and what is missing."""
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -65,6 +65,18 @@ def names_of(comparisons: Iterable[Comparison]) -> list[str]:
 def colour_order(names: Iterable[str]) -> list[str]:
     """The order in which names get colours: the methods first, which keep theirs whatever variants there are."""
     return sorted(names, key=lambda name: split(name)[1] != "")
+
+
+def figure_order(order: Sequence[str], names: Iterable[str]) -> list[str]:
+    """The order of colours in a figure of these names, of those that all figures have in `order`.
+
+    A method keeps its colour, and so does one of which a single variant is there instead; other variants come after.
+    """
+    names = list(names)
+    count = Counter(split(name)[0] for name in names)
+    alone = {split(name)[0]: name for name in names if count[split(name)[0]] == 1}
+    places = [alone.get(name, name) for name in order if not split(name)[1]]
+    return [*places, *(name for name in names if name not in places)]
 
 
 def split(name: str) -> tuple[str, str]:

@@ -8,7 +8,15 @@ from typing import Any
 import envs
 from envs import gaps
 from experiments import ablations, cli, overview, tables
-from experiments.comparison import Comparison, colour_order, names_of, read_comparison, shared_variants, split
+from experiments.comparison import (
+    Comparison,
+    colour_order,
+    figure_order,
+    names_of,
+    read_comparison,
+    shared_variants,
+    split,
+)
 from experiments.results import Curve
 from sgft_jax import plot
 from sgft_jax.stats import iqm_interval
@@ -91,7 +99,7 @@ def draw(comparison: Comparison, target: Path, order: Sequence[str]) -> dict[str
             {method: (curve.transitions, curve.success) for method, curve in curves.items()},
             title=title,
             zero_shot=starts[0] if max(starts) - min(starts) < _SAME else None,
-            order=order,
+            order=figure_order(order, curves),
             **_robot_time(curves),
         )
     return drawn

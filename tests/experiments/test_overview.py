@@ -4,7 +4,7 @@ import pytest
 from runs_by_hand import rising, save
 
 from experiments import overview
-from experiments.comparison import colour_order, is_sgft, names_of, read_comparison, split
+from experiments.comparison import colour_order, figure_order, is_sgft, names_of, read_comparison, split
 from sgft_jax.methods import METHODS
 
 
@@ -115,6 +115,16 @@ def test_what_is_drawn_in_the_overview(tmp_path, monkeypatch):
     }
     assert "(overview.png)" in text and "(overview_tuned.png)" in text
     assert colour_order(names_of(read(tmp_path)))[:2] == ["sgft-sac", "sac"]  # before any variant
+
+
+def test_a_variant_has_its_methods_colour_where_the_method_is_not_shown():
+    order = ["sgft-sac", "sac", "mine", "sgft-sac_horizon-4", "sac_tuned"]
+    methods = ["sgft-sac", "sac", "mine"]
+    assert figure_order(order, methods[1:]) == methods
+    assert figure_order(order, ["sgft-sac_tuned", "sac_tuned"]) == ["sgft-sac_tuned", "sac_tuned", "mine"]
+    assert figure_order(order, ["sac", "sac_tuned", "sac_slow"]) == [*methods, "sac_tuned", "sac_slow"]
+    assert figure_order(order, ["sac_tuned", "sac_slow"]) == [*methods, "sac_tuned", "sac_slow"]
+    assert figure_order(order, ["rlpd_tuned", "sac"]) == [*methods, "rlpd_tuned"]
 
 
 def test_no_overview_without_runs_on_the_default_real_systems(tmp_path):
