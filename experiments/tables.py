@@ -97,8 +97,8 @@ def _bound(least: float, most: float, number: float, digits: int) -> str:
 
 
 def area_to(curve: Curve, rollouts: int) -> str:
-    """Mean success over the real transitions up to so many rollouts."""
-    return percent(area(curve, rollouts)) if rollouts else NONE
+    """Mean success over the real transitions up to so many rollouts; needs an evaluation after one of them."""
+    return percent(area(curve, rollouts)) if np.sum(curve.rollouts <= rollouts) > 1 else NONE
 
 
 def behind(curve: Curve) -> str:

@@ -10,7 +10,7 @@ from sgft_jax import dynamics, optim, replay, value
 from sgft_jax.agents import make_agent
 from sgft_jax.finetune_mpc import make_mpc, make_planned
 from sgft_jax.finetune_planner import make_planner
-from sgft_jax.methods import FinetuneConfig, Method, check_options, lr_warmup
+from sgft_jax.methods import FinetuneConfig, Method, check_options, dynamics_warmup
 from sgft_jax.networks import make_dynamics, make_value
 from sgft_jax.sgft import append_steps_to_go, compose, relabel
 from sgft_jax.types import (
@@ -68,7 +68,7 @@ def make_finetuner(
     value_network = make_value(obs_dim, config.network)
     model_network = make_dynamics(obs_dim, act_dim, config.network)
     optimiser = optim.adam(config.max_grad_norm)
-    warmup = lr_warmup(config, method.utd)
+    warmup = dynamics_warmup(config, method.utd)
     transform = compose(*method.transforms(config.horizon, config.branches, config.branch_noise))
     told = config.horizon if method.finite_horizon else 1  # what the agent is told about the steps to go
     plans = make_planned(config, obs_dim=obs_dim, act_dim=act_dim, reward=reward, terminated=terminated)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from sgft_jax import dynamics, mpc, optim, replay
-from sgft_jax.methods import FinetuneConfig, Method, lr_warmup
+from sgft_jax.methods import FinetuneConfig, Method, dynamics_warmup
 from sgft_jax.networks import add_noise, make_dynamics
 from sgft_jax.types import Array, Finetuner, Key, Metrics, Prior, PyTree, Simulated, Transition
 
@@ -67,7 +67,7 @@ def make_mpc(
     plans = make_planned(config, obs_dim=obs_dim, act_dim=act_dim, reward=reward, terminated=terminated)
     model = make_dynamics(obs_dim, act_dim, config.network)
     optimiser = optim.adam(config.max_grad_norm)
-    warmup = lr_warmup(config, method.utd)
+    warmup = dynamics_warmup(config, method.utd)
 
     def init(prior: Prior, key: Key) -> MPCState:
         del key

@@ -75,6 +75,7 @@ class FinetuneConfig:
         steps are as long as its rate in every weight, however small the gradient: 40 of them, after one rollout, took
         plans that pushed a towel home in 93 % of all episodes to 4. SAC, MBPO and TD-MPC2 gain as much from the rise as
         SGFT (docs/results.md). None = the updates of the first 1,000 real transitions.
+    dynamics_warmup: the same for the dynamics models alone. None = as lr_warmup.
     lr_*: other Adam learning rates. tau: target averaging rate. max_grad_norm: None = no clipping.
     simulated_share: share of each batch that is drawn from the simulator's transitions instead of the real ones; it
         goes linearly to `simulated_share_end` (None = stays) over `simulated_anneal` updates.
@@ -118,6 +119,7 @@ class FinetuneConfig:
     train_dynamics: bool = True
     actor_real_only: bool = True
     lr_warmup: int | None = None
+    dynamics_warmup: int | None = None
     lr_actor: float = 1e-4
     lr_critic: float = 3e-4
     lr_dynamics: float = 3e-4
@@ -140,8 +142,9 @@ class FinetuneConfig:
         for name in ("horizon", "branches", "batch_size", "replay_capacity", "simulated_anneal"):
             if getattr(self, name) < 1:
                 raise UserError(f"fine-tuning option {name} is {getattr(self, name)}: must be at least 1")
-        if self.lr_warmup is not None and self.lr_warmup < 0:
-            raise UserError(f"fine-tuning option lr_warmup is {self.lr_warmup}: must not be negative")
+        for name in ("lr_warmup", "dynamics_warmup"):
+            if (getattr(self, name) or 0) < 0:
+                raise UserError(f"fine-tuning option {name} is {getattr(self, name)}: must not be negative")
         if self.relabel_simulated and self.simulated_share:
             raise UserError("fine-tuning options relabel_simulated and simulated_share exclude each other: choose one")
         for name in ("simulated_share", "simulated_share_end", "simulated_ladder"):
@@ -319,11 +322,18 @@ def check_options(method: Method, config: FinetuneConfig) -> None:
         raise UserError(f"fine-tuning option plan_rollouts needs branches and shaped rewards: not with {method.name}")
     if config.relabel_simulated and not method.uses_dynamics:
         raise UserError(f"fine-tuning option relabel_simulated needs branches: not with {method.name}")
+    if config.dynamics_warmup is not None and not (method.uses_dynamics or method.agent == "mpc"):
+        raise UserError(f"fine-tuning option dynamics_warmup needs dynamics models: not with {method.name}")
 
 
 def lr_warmup(config: FinetuneConfig, utd: float) -> int:
     """Updates over which the rates of the simulator's networks rise where there are `utd` of them per transition."""
     return round(_WARM_TRANSITIONS * utd) if config.lr_warmup is None else config.lr_warmup
+
+
+def dynamics_warmup(config: FinetuneConfig, utd: float) -> int:
+    """Updates over which the rate of dynamics models that stand alone rises, likewise."""
+    return lr_warmup(config, utd) if config.dynamics_warmup is None else config.dynamics_warmup
 
 
 def policy_delay(config: FinetuneConfig, utd: float) -> int:

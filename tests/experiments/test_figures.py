@@ -46,10 +46,12 @@ def test_a_row_says_what_the_curve_says(tmp_path):
     assert len(cells) == len(tables.columns(tables.BUDGETS, 50))
 
 
-def test_budgets_not_reached_or_not_evaluated_stay_empty(tmp_path):
+@pytest.mark.parametrize("common", [0, 18])
+def test_budgets_not_reached_or_not_evaluated_stay_empty(tmp_path, common):
+    """So does the area up to where all got, if there is no evaluation on the way to it."""
     folder = save(tmp_path, "sac", [[0.5], [0.6], [0.7]], rollouts=[0, 19, 50], seeds="seed-0")
     ended = "> 1,000"
-    assert tables.row("sac", read_curve(folder), (10, 50, 100), 0) == [
+    assert tables.row("sac", read_curve(folder), (10, 50, 100), common) == [
         *("sac", "1", "50", "-", "70", "-", "70 (50)"),
         *(ended, ended, "-", "0", "1.7"),
     ]

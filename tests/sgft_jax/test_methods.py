@@ -68,6 +68,13 @@ def test_rates_rise_over_the_first_thousand_real_transitions(name, utd, updates)
     assert methods.finetune_config(methods.METHODS["sgft-sac"]) == methods.FinetuneConfig()
 
 
+@pytest.mark.parametrize(
+    ("options", "updates"), [({}, 8_000), ({"lr_warmup": 7}, 7), ({"lr_warmup": 7, "dynamics_warmup": 0}, 0)]
+)
+def test_rates_of_models_rise_like_the_others_unless_told_otherwise(options, updates):
+    assert methods.dynamics_warmup(methods.FinetuneConfig(**options), 8.0) == updates
+
+
 @pytest.mark.parametrize("method", methods.METHODS.values(), ids=lambda method: method.name)
 def test_what_tuning_chooses_from(method):
     """Spaces are of one size and hold the default, and with every value of theirs there is a learner."""
@@ -91,6 +98,7 @@ def test_unknown_method_is_answered_with_the_closest():
         ({"horizon": 0}, "horizon is 0: must be at least 1"),
         ({"simulated_share": 1.5}, "simulated_share is 1.5: must be a share from 0 to 1"),
         ({"lr_warmup": -1}, "lr_warmup is -1: must not be negative"),
+        ({"dynamics_warmup": -1}, "dynamics_warmup is -1: must not be negative"),
         ({"offline_updates": 10}, "offline_updates needs the simulator's transitions"),
     ],
 )
