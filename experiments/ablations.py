@@ -26,8 +26,11 @@ AFTER = 20  # rollouts at which severities are drawn: enough for SGFT on push, n
 _OTHER_KINDS = ("camera",)  # gaps that are not the others made worse: that one breaks what V_sim sees
 # A method takes the models from the prior exactly if it branches, V_sim exactly if it shapes.
 _TRANSFORMS = {"branch": "uses_dynamics", "shape": "uses_value", "shorten": "finite_horizon"}
+# What comes with shortening: more than one step, and a critic that V_sim protects from its own first steps.
+_WITH_SHORTENING = {"horizon", "branches", "lr_warmup"}
 _TRANSFORMS_LEGEND = (
-    "The methods that are SAC but for the transforms of its batches and for the critic that they begin with. "
+    "The methods that are SAC but for the transforms of its batches, for the critic that they begin with and, where "
+    "the horizon is short, for what it is (docs/methods.md). "
     "Shortening without shaping is none of them: a return over H steps without a value at its end is blind to all that "
     "comes later."
 )
@@ -55,8 +58,8 @@ def marks(method: Method) -> list[str]:
 
 
 def _is_sac(method: Method) -> bool:
-    """Whether nothing but its transforms and its first critic make a method differ from SAC."""
-    return method.agent == "sac" and not method.options and not method.fresh
+    """Whether nothing but its transforms, with what they bring, and its first critic make a method differ from SAC."""
+    return method.agent == "sac" and not method.fresh and set(method.options) <= _WITH_SHORTENING
 
 
 def _transforms_table(curves: Mapping[str, Curve]) -> str:

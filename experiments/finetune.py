@@ -28,7 +28,7 @@ from sgft_jax.config import config_to_json
 from sgft_jax.finetune import make_finetuner
 from sgft_jax.finetune_mpc import plan_options
 from sgft_jax.log import RunProgress
-from sgft_jax.methods import METHODS, FinetuneConfig, Method, lr_warmup, policy_delay
+from sgft_jax.methods import METHODS, FinetuneConfig, Method, dynamics_warmup, lr_warmup, policy_delay
 from sgft_jax.replay import ReplayState
 from sgft_jax.types import Array, Finetuner, Key, PyTree, UserError
 
@@ -119,8 +119,8 @@ class _Run:
     def _options(self, card: dict[str, Any]) -> FinetuneConfig:
         """Those of the command line, with what must be as the prior has it and what follows from `--utd`."""
         options = self.args.options
-        follow = {"policy_delay": policy_delay(options, self.args.utd), "lr_warmup": lr_warmup(options, self.args.utd)}
-        own = {"gamma": card["gamma"], **follow}
+        rules = {"policy_delay": policy_delay, "lr_warmup": lr_warmup, "dynamics_warmup": dynamics_warmup}
+        own = {"gamma": card["gamma"], **{name: rule(options, self.args.utd) for name, rule in rules.items()}}
         if options.critic_warmup is None:
             own["critic_warmup"] = self.args.initial_rollouts * self._updates_per_rollout()
         if checkpoint.algorithm_of(card) == "tdmpc2":

@@ -54,7 +54,7 @@ class FinetuneArgs:
     """Episodes per seed and evaluation, always the same ones; they cost no real transitions."""
     checkpoint_every: int = 10
     """Rollouts between checkpoints."""
-    options: FinetuneConfig = field(default_factory=FinetuneConfig)
+    options: FinetuneConfig = field(default_factory=lambda: finetune_config(get_method(DEFAULT_METHOD)))
     """Method options; `network`, `size` and `gamma` always are the prior's."""
     tuned: bool = False
     """Begin with what `experiments.tune` chose for this task and method, in place of the defaults below: the variant

@@ -2,8 +2,10 @@
 
 import json
 
-from experiments.finetune_args import FinetuneArgs
+from experiments.comparison import split
+from experiments.finetune_args import FinetuneArgs, arguments
 from sgft_jax.config import config_to_json
+from sgft_jax.methods import METHODS
 
 STEPS = 20  # of an episode
 
@@ -16,7 +18,9 @@ def save(out, method, success, *, rollouts, task="toy", real="default", seeds="s
         for n, each in zip(rollouts, success, strict=True):
             line = {"step": STEPS * n, "rollouts": n, "robot_minutes": n * STEPS * 0.1 / 60}
             file.write(json.dumps({**line, "success": each, "return": each}) + "\n")
-    config = config_to_json(FinetuneArgs(rollouts=wanted or rollouts[-1]))
+    name, _ = split(method)
+    args = arguments(name) if name in METHODS else FinetuneArgs()
+    config = config_to_json(args) | {"rollouts": wanted or rollouts[-1]}
     config["options"] |= options
     (folder / "config.json").write_text(json.dumps({"sgft_jax": "0", "kind": "finetune", "config": config}))
     return folder

@@ -56,30 +56,30 @@ def test_nothing_but_the_horizon_differs(tmp_path, monkeypatch):
     save(tmp_path, "sgft-sac", task="push", **rising(20))
     save(tmp_path, "sgft-mpc", task="push", **rising(20))
     save(tmp_path, "sgft-mpc_h8", task="push", horizon=8, **rising(20))
-    save(tmp_path, "sgft-sac_h4", task="push", horizon=4, branches=2, **rising(40))
+    save(tmp_path, "sgft-sac_h1", task="push", horizon=1, branches=5, **rising(40))
     save(tmp_path, "sgft-sac_h2", task="push", horizon=2, rollouts=[0, 50], success=[[0, 0], [1.0, 0.5]])
     save(tmp_path, "sgft-sac_slow", task="push", horizon=8, lr_actor=1e-5, **rising(90))
     save(tmp_path, "sgft_h4", task="push", horizon=4, **rising(90))
     save(tmp_path, "sgft-sac", task="insert", **rising(20))
-    initial = save(tmp_path, "sgft-sac_initial", task="insert", horizon=4, **rising(90))
+    initial = save(tmp_path, "sgft-sac_initial", task="insert", horizon=1, **rising(90))
     config = json.loads((initial / "config.json").read_text())
     config["config"]["initial_rollouts"] = 20
     (initial / "config.json").write_text(json.dumps(config))
     (_, text, planned), missing = ablations.horizons(read(tmp_path), tmp_path)
     assert {name: {task: list(curves) for task, curves in panels.items()} for name, (panels, _) in drawn.items()} == {
-        "horizon-sgft-sac.png": {"push": ["H = 1", "H = 2", "H = 4, 2 branches"]},
+        "horizon-sgft-sac.png": {"push": ["H = 1, 5 branches", "H = 2", "H = 4"]},
         "horizon-sgft-mpc.png": {"push": ["H = 1", "H = 8"]},
     }
-    assert drawn["horizon-sgft-sac.png"][1]["order"] == ["H = 1", "H = 2", "H = 4, 2 branches"]
+    assert drawn["horizon-sgft-sac.png"][1]["order"] == ["H = 1, 5 branches", "H = 2", "H = 4"]
     assert "| push | H = 8 | sgft-mpc_h8 | 2 | 400 " in planned and "sgft-sac" not in planned
     assert "| push | H = 2 | sgft-sac_h2 | 2 | > 1,000 [1,000, > 1,000] | > 1,000 [1,000, > 1,000] | 75 " in text
-    assert "| push | H = 4, 2 branches | sgft-sac_h4 | 2 | 800 [800, 800] | 800 [800, 800] | 100 " in text
+    assert "| push | H = 1, 5 branches | sgft-sac_h1 | 2 | 800 [800, 800] | 800 [800, 800] | 100 " in text
     assert "| 75 [50, 100] (50) | 1 of 2 |" in text and "| 100 [100, 100] (100) | 0 of 2 |" in text
     assert missing == ["insert/default: no two horizons of sgft-sac or sgft-mpc with all else equal"]
 
 
 def test_horizons_without_a_run_of_the_default_one(tmp_path):
-    for horizon in (2, 4):
+    for horizon in (1, 2):
         save(tmp_path, f"sgft-sac_horizon-{horizon}", horizon=horizon, **rising(20))
     (_, text), missing = ablations.horizons(read(tmp_path), tmp_path)
     assert "| toy | H = 2 |" in text and (tmp_path / "horizon-sgft-sac.png").stat().st_size > 10_000
@@ -99,14 +99,14 @@ def test_an_older_run_lacks_options_that_came_later(tmp_path):
     config = json.loads(older.read_text())
     del config["config"]["options"]["train_encoder"]
     older.write_text(json.dumps(config))
-    save(tmp_path, "sgft-sac_h4", horizon=4, **rising(20))
+    save(tmp_path, "sgft-sac_h1", horizon=1, **rising(20))
     sections, _ = ablations.horizons(read(tmp_path), tmp_path)
     assert "| toy | H = 1 |" in sections[1] and "| toy | H = 4 |" in sections[1]
 
 
 def test_a_run_without_its_configuration_has_no_horizon(tmp_path):
     (save(tmp_path, "sgft-sac", **rising(20)) / "config.json").unlink()
-    save(tmp_path, "sgft-sac_h4", horizon=4, **rising(20))
+    save(tmp_path, "sgft-sac_h1", horizon=1, **rising(20))
     sections, missing = ablations.horizons(read(tmp_path), tmp_path)
     assert not sections and len(missing) == 1
 

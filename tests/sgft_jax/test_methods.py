@@ -60,19 +60,23 @@ def test_the_actor_moves_once_per_real_transition_if_nothing_else_is_said():
 
 @pytest.mark.parametrize(
     ("name", "utd", "updates"),
-    [("sac", 8.0, 8_000), ("mbpo", 4.0, 4_000), ("tdmpc2", 1.0, 1_000), ("sgft-mpc", 8.0, 0)],
+    [("sac", 8.0, 8_000), ("mbpo", 4.0, 4_000), ("tdmpc2", 1.0, 1_000), ("sgft-sac", 8.0, 0)],
 )
 def test_rates_rise_over_the_first_thousand_real_transitions(name, utd, updates):
     assert methods.lr_warmup(methods.finetune_config(methods.get_method(name)), utd) == updates
     assert methods.lr_warmup(methods.FinetuneConfig(lr_warmup=7), utd) == 7
-    assert methods.finetune_config(methods.METHODS["sgft-sac"]) == methods.FinetuneConfig()
 
 
-@pytest.mark.parametrize(
-    ("options", "updates"), [({}, 8_000), ({"lr_warmup": 7}, 7), ({"lr_warmup": 7, "dynamics_warmup": 0}, 0)]
-)
-def test_rates_of_models_rise_like_the_others_unless_told_otherwise(options, updates):
-    assert methods.dynamics_warmup(methods.FinetuneConfig(**options), 8.0) == updates
+@pytest.mark.parametrize(("name", "updates"), [("mbpo", 4_000), ("sgft-sac", 4_000), ("sgft-mpc", 0)])
+def test_rates_of_models_rise_by_themselves(name, updates):
+    assert methods.dynamics_warmup(methods.finetune_config(methods.get_method(name)), 4.0) == updates
+    assert methods.dynamics_warmup(methods.FinetuneConfig(lr_warmup=7, dynamics_warmup=3), 4.0) == 3
+
+
+def test_sgft_sac_is_the_only_one_with_another_horizon_than_the_papers_but_planners():
+    own = {m.name: methods.finetune_config(m) for m in methods.METHODS.values() if m.agent != "tdmpc2"}
+    assert {name: config.horizon for name, config in own.items() if config.horizon != 1} == {"sgft-sac": 4}
+    assert (own["sgft-sac"].branches, own["sgft-sac"].lr_warmup, own["mbpo"].branches) == (2, 0, 5)
 
 
 @pytest.mark.parametrize("method", methods.METHODS.values(), ids=lambda method: method.name)
