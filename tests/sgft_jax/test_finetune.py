@@ -405,6 +405,7 @@ def test_sgft_recovers_from_a_turned_command_frame(key):
         lr_critic=3e-3,
         critic_warmup=100,
         lr_warmup=100,
+        dynamics_warmup=100,
         batch_size=64,
         branches=5,
         replay_capacity=400,
