@@ -109,7 +109,7 @@ def _panels(tasks: Mapping[str, Comparison]) -> dict[str, dict[str, dict[str, Cu
 
 def _draw(panels: Mapping[str, Mapping[str, Curve]], path: Path, title: str, order: Sequence[str]) -> Path:
     """Over rollouts, as in the paper: episodes of the tasks differ in length, and what a robot does is episodes."""
-    order = figure_order(order, {name: None for curves in panels.values() for name in curves})
+    order = figure_order(order, dict.fromkeys(name for curves in panels.values() for name in curves))
     return plot.curve_panels(
         path,
         {task: {name: (x.rollouts, x.success) for name, x in curves.items()} for task, curves in panels.items()},

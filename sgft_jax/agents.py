@@ -33,6 +33,7 @@ def _sac(method: Method, config: FinetuneConfig, obs_dim: int, act_dim: int) -> 
     reset = method.reset_critic if config.reset_critic is None else config.reset_critic
     reset |= method.fresh
     told = config.horizon if method.finite_horizon else 1
+    rows = config.batch_size * (2 if config.relabel_simulated else 1)  # before those that branches add
     sac = SACConfig(
         obs_dim,
         act_dim,
@@ -47,7 +48,7 @@ def _sac(method: Method, config: FinetuneConfig, obs_dim: int, act_dim: int) -> 
         target_critics=config.target_critics,
         actor_mean=config.actor_mean,
         critic_baseline=method.uses_value and not reset,
-        actor_batch=config.batch_size * (2 if config.relabel_simulated else 1) if config.actor_real_only else None,
+        actor_batch=rows if config.actor_real_only else None,
         policy_delay=policy_delay(config, method.utd),
         max_grad_norm=config.max_grad_norm,
     )

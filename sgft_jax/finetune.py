@@ -131,15 +131,15 @@ def make_finetuner(
                 model_network, optimiser, state.dynamics, state.normalizer, real, keys[1], rate=rate
             )
             state = state.replace(dynamics=fit)
-        rows = real
+        imagination, rows = imagine(state, keys[2]), real
         if simulated is not None:
             drawn = simulated(jax.random.fold_in(keys[0], 1), config.batch_size)
             if config.relabel_simulated:
-                relabelled = relabel(imagine(state, keys[2]), drawn, jax.random.fold_in(keys[3], 1))
+                relabelled = relabel(imagination, drawn, jax.random.fold_in(keys[3], 1))
                 rows = jax.tree.map(lambda *x: jnp.concatenate(x), real, relabelled)
             else:
                 rows = drawn if offline else mix(real, drawn, share(state))
-        batch = transform(imagine(state, keys[2]), rows, keys[3])
+        batch = transform(imagination, rows, keys[3])
         if method.uses_value and config.clip_shaped is not None:
             batch = batch._replace(reward=jnp.clip(batch.reward, -config.clip_shaped, config.clip_shaped))
         new, more = learner.update(state.learner, batch, keys[4])

@@ -10,7 +10,7 @@ from sgft_jax.networks import NetworkConfig
 from sgft_jax.sgft import branch, shape, shorten
 from sgft_jax.types import Array, BatchTransform, UserError, unknown
 
-_WARM_TRANSITIONS = 1000  # real ones, for `FinetuneConfig.lr_warmup`: 20 to 25 rollouts of the tasks here
+_WARM_TRANSITIONS = 1000  # real ones, for `lr_warmup` and `dynamics_warmup`: 20 to 25 rollouts of the tasks here
 
 AgentName = Literal["sac", "iql", "tdmpc2", "mpc"]
 
@@ -194,11 +194,6 @@ class Method(NamedTuple):
         """The method whose agent is the simulator's policy until it learns; what critic it has does not matter."""
         return METHODS["tdmpc2" if self.agent == "tdmpc2" else "sac-reset"]
 
-    @property
-    def simulated(self) -> bool:
-        """Whether it needs transitions of the simulator, with its own options."""
-        return self.options.get("simulated_share", 0.0) > 0
-
 
 def _method(
     name: str,
@@ -330,12 +325,16 @@ def check_options(method: Method, config: FinetuneConfig) -> None:
 
 def lr_warmup(config: FinetuneConfig, utd: float) -> int:
     """Updates over which the rates of the simulator's agent rise where there are `utd` of them per real transition."""
-    return round(_WARM_TRANSITIONS * utd) if config.lr_warmup is None else config.lr_warmup
+    return _rise(config.lr_warmup, utd)
 
 
 def dynamics_warmup(config: FinetuneConfig, utd: float) -> int:
     """The same for its dynamics models."""
-    return round(_WARM_TRANSITIONS * utd) if config.dynamics_warmup is None else config.dynamics_warmup
+    return _rise(config.dynamics_warmup, utd)
+
+
+def _rise(updates: int | None, utd: float) -> int:
+    return round(_WARM_TRANSITIONS * utd) if updates is None else updates
 
 
 def policy_delay(config: FinetuneConfig, utd: float) -> int:

@@ -95,17 +95,17 @@ def test_frozen_dynamics_and_warm_up_keep_their_bits(prior):
 def test_learning_rates_of_the_simulators_networks_rise_from_zero(prior, name, models):
     """Adam's first step has the rate's length, so with a warm-up of 4 it is a quarter; models may have their own."""
     moved = {}
+    parts = [(lambda s: s.dynamics, models)] + [(lambda s: s.learner.critic, 4)] * (name == "sgft-sac")
     for warmup in (0, 4):
         tuner = make(name, lr_warmup=warmup, dynamics_warmup=models if warmup else 0)
         state = started(tuner, prior)
         new, _ = tuner.learn(state, jax.random.key(1), 1)
-        parts = [lambda s: s.dynamics] + ([lambda s: s.learner.critic] if name == "sgft-sac" else [])
         moved[warmup] = [jnp.concatenate([
             jnp.ravel(b - a) for a, b in zip(*(jax.tree.leaves(part(s).params) for s in (state, new)), strict=True)
-        ]) for part in parts]  # fmt: skip
-    for at_once, slowly, steps in zip(moved[0], moved[4], (models, 4), strict=False):
+        ]) for part, _ in parts]  # fmt: skip
+    for at_once, slowly, (_, n) in zip(moved[0], moved[4], parts, strict=True):
         assert jnp.abs(at_once).max() == pytest.approx(3e-4, rel=1e-2)
-        np.testing.assert_allclose(slowly, at_once / steps, atol=1e-7)
+        np.testing.assert_allclose(slowly, at_once / n, atol=1e-7)
 
 
 @pytest.mark.parametrize(
