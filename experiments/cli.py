@@ -35,9 +35,9 @@ def run_main[T](
     `| head`. Other exceptions are bugs and keep their traceback.
     """
     with _may_lose_its_reader():
-        config = parse(config_type, description, argv, default=default)
-        set_up()
         try:
+            config = parse(config_type, description, argv, default=default)  # a dataclass may refuse its values
+            set_up()
             main(config)
         except KeyboardInterrupt:
             print("\ninterrupted; the same command with --resume continues from the last checkpoint", file=sys.stderr)

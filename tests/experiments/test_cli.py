@@ -25,6 +25,10 @@ class Config:
     steps: int = 3
     inner: Inner = dataclasses.field(default_factory=Inner)
 
+    def __post_init__(self):
+        if self.steps < 1:
+            raise UserError(f"steps is {self.steps}: must be at least 1")
+
 
 @pytest.fixture(autouse=True)
 def _own_environment(monkeypatch):
@@ -82,6 +86,13 @@ def test_a_user_error_is_one_line_and_code_2(capsys):
         run(main)
     assert stopped.value.code == 2
     assert capsys.readouterr().err == "error: runs/x: no prior for hammer\n"
+
+
+def test_what_a_dataclass_refuses_is_one_line_and_code_2(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        run(pytest.fail, "--steps", "0")
+    assert stopped.value.code == 2
+    assert capsys.readouterr().err == "error: steps is 0: must be at least 1\n"
 
 
 def test_a_bug_keeps_its_traceback():
