@@ -1,30 +1,31 @@
 """Copy what runs say, without what they learned, to a folder that can be committed.
 
-Of every run the configuration, its origin, the evaluations, times and final numbers: texts of some kilobytes, no
-checkpoints, policies, rollouts or videos. `python -m experiments.figures --out docs/data` draws from the copy. Absolute
-paths become relative (`sgft_jax.runs.plain_path`). The command, given again, copies what is new.
+Of every run, the trials of tuning included, the configuration, its origin, the evaluations, times and final numbers:
+texts of some kilobytes, no checkpoints, policies, rollouts or videos; and what tuning chose. `python -m
+experiments.figures --out docs/data` draws from the copy. Absolute paths become relative (`sgft_jax.runs.plain_path`).
+The command, given again, copies what is new.
 """
 
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments import cli
+from experiments import cli, tuned
 from sgft_jax.jsonfile import read_json, write_json
 from sgft_jax.log import EVAL, SUMMARY, read_jsonl
 from sgft_jax.runs import CONFIG, PROVENANCE, ROOT, plain_path
 from sgft_jax.types import UserError
 
-_WHERE = {"finetune": "*/*/*/*", "pretrain": "*/*/*"}  # run folders below <out>/<kind>
+_WHERE = {"finetune": "*/*/*/*", "pretrain": "*/*/*", "tune/finetune": "*/*/*/*"}  # run folders below <out>/<kind>
 _JSON = (CONFIG, PROVENANCE, SUMMARY)
 _LOGS = (EVAL, "timing.jsonl")  # not metrics.jsonl, which is ten times as long and in no table
 
 
 @dataclass(frozen=True)
 class ExportArgs:
-    """Reads <out>/finetune and <out>/pretrain, writes folders of the same names."""
+    """Reads <out>/finetune, pretrain, tune and tuned, writes folders of the same names."""
 
     out: Path = Path("runs")
     """Parent of all run folders."""
@@ -60,7 +61,7 @@ def export(args: ExportArgs) -> list[str]:
         if problem := _problem(texts, before, args):
             said.append(f"{name}: {problem}")
             continue
-        texts = texts._replace(json=_made_relative(texts.json, changed))
+        texts = texts._replace(json=_made_relative(texts.json, _bases(texts.json[CONFIG]), changed))
         if before == texts:
             same += 1
             continue
@@ -69,8 +70,23 @@ def export(args: ExportArgs) -> list[str]:
         said.append(f"{name}: {f'replaced one of {before.length:,} steps' if before.json else 'new'}")
     if not (said or same):
         raise UserError(f"{args.out}: holds no run; --out names the parent of finetune/ and pretrain/")
+    said += _export_chosen(args, changed)
     said += [f"made relative: {old} -> {new}" for old, new in sorted(changed.items())]
     return [*said, f"{args.to}: {copied} runs copied, {same} were there already"]
+
+
+def _export_chosen(args: ExportArgs, changed: dict[str, str]) -> list[str]:
+    """Copies what tuning chose; returns a line for each file that is not there as it was before."""
+    said = []
+    for path in sorted((args.out / tuned.VARIANT).glob("*/*.json")):
+        name = path.relative_to(args.out)
+        there, chosen = args.to / name, _made_relative(read_json(path), _bases({}), changed)
+        before = read_json(there) if there.exists() else None
+        if chosen != before:
+            there.parent.mkdir(parents=True, exist_ok=True)
+            write_json(there, chosen)
+            said.append(f"{name}: {'replaced another choice' if before else 'new'}")
+    return said
 
 
 def read_texts(folder: Path) -> Texts:
@@ -113,10 +129,14 @@ def _whole_lines(path: Path) -> str:
     return text[: text.rfind("\n") + 1]
 
 
-def _made_relative(files: Mapping[str, Any], changed: dict[str, str]) -> dict[str, Any]:
-    """The data of a run without absolute paths; adds each of these and what became of it to `changed`."""
-    out = Path(files[CONFIG].get("config", {}).get("out", ""))
-    bases = [ROOT, Path.cwd(), *([out.parent] if out.is_absolute() else [])]  # a run may come from another machine
+def _bases(config: Mapping[str, Any]) -> list[Path]:
+    """Folders from which paths in a run with this configuration may go out: it may come from another machine."""
+    out = Path(config.get("config", {}).get("out", ""))
+    return [ROOT, Path.cwd(), *([out.parent] if out.is_absolute() else [])]
+
+
+def _made_relative(data: Mapping[str, Any], bases: Sequence[Path], changed: dict[str, str]) -> dict[str, Any]:
+    """JSON data without absolute paths; adds each of these and what became of it to `changed`."""
 
     def word(text: str) -> str:
         new = plain_path(text, bases)
@@ -133,7 +153,7 @@ def _made_relative(files: Mapping[str, Any], changed: dict[str, str]) -> dict[st
             return value
         return shlex.join(map(word, shlex.split(value))) if key == "command" else word(value)
 
-    return visit(files)
+    return visit(data)
 
 
 def _write(folder: Path, texts: Texts) -> None:

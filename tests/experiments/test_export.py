@@ -65,6 +65,23 @@ def test_texts_are_copied_and_nothing_heavy(tmp_path):
     assert said[-1] == f"{tmp_path / 'data'}: 2 runs copied, 0 were there already"
 
 
+def test_tuning_is_copied_with_its_trials(tmp_path):
+    out = tmp_path / "runs"
+    finish(save(out / "tune", "sac_trial-0", **rising(50)))
+    chosen = {"options": {"utd": 2.0}, "trials": [{"folders": [str(tmp_path / "elsewhere/trial-0")]}]}
+    (out / "tuned/toy").mkdir(parents=True)
+    (out / "tuned/toy/sac.json").write_text(json.dumps(chosen))
+    said = run(out, tmp_path / "data")
+    assert said[:2] == ["tune/finetune/toy/default/sac_trial-0/seeds-0-1: new", "tuned/toy/sac.json: new"]
+    copy = tmp_path / "data/tuned/toy/sac.json"
+    assert json.loads(copy.read_text()) == chosen | {"trials": [{"folders": [".../trial-0"]}]}
+    before = files(tmp_path / "data")
+    assert run(out, tmp_path / "data")[0].startswith("made relative") and files(tmp_path / "data") == before
+    (out / "tuned/toy/sac.json").write_text(json.dumps({"options": {"utd": 8.0}}))
+    assert run(out, tmp_path / "data")[0] == "tuned/toy/sac.json: replaced another choice"
+    assert json.loads(copy.read_text()) == {"options": {"utd": 8.0}}
+
+
 def test_a_second_time_nothing_happens(tmp_path):
     finish(save(tmp_path / "runs", "sac", **rising(50)), out="/home/me/project/runs")
     run(tmp_path / "runs", tmp_path / "data")
