@@ -74,7 +74,10 @@ def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:
     check_prior(args, method, card)
     # Every folder is that of a run on its real system alone: either kind of run continues the other.
     folders = {run_folder(args, real): config_to_json(args) | {"real": real} for real in args.real}
-    opened = runs.open_runs(folders, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE)
+    opened = runs.open_runs(
+        folders, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
+        inputs={"priors": [checkpoint.digest(prior) for prior in priors]},
+    )  # fmt: skip
     try:
         with mesh.use(devices):
             records = [

@@ -7,6 +7,7 @@ complete new one. A prior is such a folder plus a readable `prior.json`. Nothing
 
 import dataclasses
 import datetime
+import hashlib
 import importlib.metadata
 import itertools
 import shutil
@@ -165,6 +166,15 @@ def load_prior(
         raise UserError(f"{folder}: {_CARD} says obs_dim={card['obs_dim']}, the statistics have {len(statistics.mean)}")
     names = [field.name for field in dataclasses.fields(kind) if field.name != "normalizer"]
     return kind(**{name: tree.get(name, {}) for name in names}, normalizer=statistics), card
+
+
+def digest(tree: PyTree) -> str:
+    """Twelve hex digits that tell whether two trees of arrays hold the same numbers under the same names."""
+    found = hashlib.sha256()
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        found.update(str(_describe(path, leaf)).encode())
+        found.update(np.ascontiguousarray(leaf).tobytes())
+    return found.hexdigest()[:12]
 
 
 def algorithm_of(card: Mapping[str, Any]) -> str:

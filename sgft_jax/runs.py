@@ -109,12 +109,16 @@ def open_runs(
     resume: bool = False,
     overwrite: bool = False,
     volatile: tuple[str, ...] = ("resume", "overwrite"),
+    inputs: Mapping[str, Any] | None = None,
     say: Callable[[str], None] = print,
 ) -> list[Run]:
     """`open_run` for several folders with the configuration of each as JSON data: all of them or none.
 
-    What is wrong with one of them is found before anything is written to any.
+    inputs: JSON data that says what the runs begin with, such as digests of files, by name; it is recorded with the
+    provenance and must be the same on a resume. What is wrong with one folder is found before anything is written to
+    any.
     """
+    inputs = inputs or {}
     if resume and overwrite:
         raise UserError("--resume and --overwrite exclude each other: keep the run or replace it")
     existing = [_exists(folder, resume=resume, overwrite=overwrite, say=say) for folder in configs]
@@ -125,6 +129,7 @@ def open_runs(
             runs.append(Run(folder, resumed=there and resume, lock=Lock(folder)))
             if there and resume:
                 check_same(folder, kind, config, volatile)
+                _check_inputs(folder, inputs)
     except UserError:
         for run in runs:
             run.close()  # the traceback would keep the locks alive
@@ -132,7 +137,7 @@ def open_runs(
     for run, config, there in zip(runs, configs.values(), existing, strict=True):
         if there and overwrite:
             _empty(run.folder)
-        _record(run, kind, config)
+        _record(run, kind, config, inputs)
     return runs
 
 
@@ -205,13 +210,26 @@ def _exists(folder: Path, *, resume: bool, overwrite: bool, say: Callable[[str],
     return existing
 
 
-def _record(run: Run, kind: str, config: Mapping[str, Any]) -> None:
-    """Write down the start, and the configuration if it is the first one."""
+def _record(run: Run, kind: str, config: Mapping[str, Any], inputs: Mapping[str, Any]) -> None:
+    """Write down the start with what it begins with, and the configuration if it is the first one."""
     if not run.resumed:
         write_json(run.folder / CONFIG, {_MARK: _version("sgft-jax"), "kind": kind, "config": config})
-    path = run.folder / PROVENANCE
-    starts = read_json(path)["starts"] if path.exists() else []
-    write_json(path, {"starts": [*starts, provenance()]})
+    write_json(run.folder / PROVENANCE, {"starts": [*_starts(run.folder), {**provenance(), **inputs}]})
+
+
+def _starts(folder: Path) -> list[dict[str, Any]]:
+    return read_json(folder / PROVENANCE)["starts"] if (folder / PROVENANCE).exists() else []
+
+
+def _check_inputs(folder: Path, inputs: Mapping[str, Any]) -> None:
+    """Raises UserError if the run began with others; runs of earlier versions do not say."""
+    for start in _starts(folder):
+        for name, now in inputs.items():
+            if (before := start.get(name, now)) != now:
+                raise UserError(
+                    f"{folder}: cannot resume with other {name}: they were {before}, now {now}; put the first ones "
+                    "back, or begin again with --overwrite"
+                )
 
 
 def _check_ours(folder: Path, *, resume: bool, overwrite: bool) -> None:

@@ -302,6 +302,19 @@ def test_another_configuration_does_not_continue_a_run(home, capsys):
     assert "utd was 0.5, now 1.0" in complaint(argv(home, "sac", "--resume", "--utd", "1"), capsys)
 
 
+def test_other_priors_do_not_continue_a_run(home, tmp_path, capsys):
+    folder = tmp_path / run(home, "sac").relative_to(home)
+    shutil.copytree(run(home, "sac"), folder)
+    origin = json.loads((folder / "provenance.json").read_text())
+    (start,) = origin["starts"]
+    assert len(start["priors"]) == 2 and len(set(start["priors"])) == 2
+    start["priors"][1] = "0" * 12
+    (folder / "provenance.json").write_text(json.dumps(origin))
+    error = complaint(argv(home, "sac", "--resume", "--rollouts", "6", out=tmp_path), capsys)
+    assert f"{folder}: cannot resume with other priors: they were" in error and "000000000000" in error
+    assert read_jsonl(folder / "eval.jsonl") == read_jsonl(run(home, "sac") / "eval.jsonl")
+
+
 # ------------------------------------------------------------ several real systems
 
 

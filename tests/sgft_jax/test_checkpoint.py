@@ -315,6 +315,15 @@ def test_saving_a_prior_again_replaces_it(tmp_path):
     assert os.listdir(tmp_path) == ["prior"]
 
 
+def test_a_digest_tells_priors_apart(tmp_path):
+    prior = make_prior()
+    loaded, _ = checkpoint.load_prior(checkpoint.save_prior(tmp_path / "prior", prior, CARD))
+    assert checkpoint.digest(loaded) == checkpoint.digest(prior) and len(checkpoint.digest(prior)) == 12
+    nudged = prior.normalizer._replace(mean=prior.normalizer.mean.at[0].add(1e-6))
+    others = [prior.replace(normalizer=nudged), prior.replace(value={"renamed": prior.value}), make_prior(3.0)]
+    assert len({checkpoint.digest(each) for each in [prior, *others]}) == 4
+
+
 def test_a_foreign_prior_is_refused(tmp_path):
     folder = checkpoint.save_prior(tmp_path / "prior", make_prior(), CARD)
     with pytest.raises(UserError, match=r"prior: does not fit: .*task='hammer' where task='push' is needed"):

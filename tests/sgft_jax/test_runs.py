@@ -87,6 +87,20 @@ def test_of_several_runs_all_open_or_none(tmp_path):
     assert (first.folder, second.folder) == (new, old) and not (first.resumed or second.resumed)
 
 
+def test_a_run_goes_on_with_the_inputs_that_it_began_with(tmp_path):
+    given = {tmp_path / "x": {"task": "hammer"}}
+    begin = lambda **more: open_runs(given, kind="finetune", say=lambda _: None, **more)[0].close()  # noqa: E731
+    begin(inputs={"priors": ["ab"]})
+    begin(resume=True, inputs={"priors": ["ab"], "maps": 3})  # the first start did not tell of maps
+    with pytest.raises(UserError, match=r"other priors: they were \['ab'\], now \['cd'\]"):
+        begin(resume=True, inputs={"priors": ["cd"]})
+    with pytest.raises(UserError, match="other maps: they were 3, now 4"):
+        begin(resume=True, inputs={"priors": ["ab"], "maps": 4})
+    starts = json.loads((tmp_path / "x/provenance.json").read_text())["starts"]
+    assert [start.get("maps") for start in starts] == [None, 3]
+    begin(overwrite=True, inputs={"priors": ["cd"]})
+
+
 def test_resume_of_nothing(tmp_path):
     with pytest.raises(UserError, match="nothing to resume there"):
         start(tmp_path / "x", resume=True)
