@@ -130,7 +130,7 @@ def _whole_lines(path: Path) -> str:
 
 
 def _bases(config: Mapping[str, Any]) -> list[Path]:
-    """Folders from which paths in a run with this configuration may go out: it may come from another machine."""
+    """Folders that absolute paths of a run may lie in: those here and, if it comes from elsewhere, that of its own."""
     out = Path(config.get("config", {}).get("out", ""))
     return [ROOT, Path.cwd(), *([out.parent] if out.is_absolute() else [])]
 
