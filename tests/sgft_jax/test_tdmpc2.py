@@ -538,4 +538,6 @@ def test_learns_to_push_a_cart(key):
     state = train(PLAIN, INIT(key), functools.partial(draw, ring), key_train, 1000)
     planned = play(lambda memory, obs, key: LEARNERS[PLAIN].act(state, memory, obs, key, explore=False))
     alone = play(lambda memory, obs, key: (tdmpc2.policy_action(PLAIN, state, obs, key, explore=False), memory))
-    assert random < 2 and planned > 8.8 and alone > 8.6
+    # Of eight keys the planner came to 8.8 to 9.3 and the policy to 7.4 to 9.3, and of one key to half a point more or
+    # less from one machine to the next.
+    assert random < 2 and planned > 8.5 and alone > 7
