@@ -45,7 +45,7 @@ class FinetuneArgs:
     initial_rollouts: int = 1
     """Rollouts of the simulator's policy, or of plans if the method plans, that fill the buffer before learning starts.
     The paper has 20; with one, every method that has been run with both gets to 90 % as early or earlier
-    (docs/results.md)."""
+    (docs/five-rollouts.md)."""
     utd: float = 8.0
     """Updates per real transition."""
     eval_every: int = 5

@@ -41,7 +41,7 @@ class FinetuneConfig:
 
     horizon, branches: H and the model branches per sampled real state. With H = 1, the paper's, the agent never takes a
         step that costs V_sim now and pays later: on hammering, where strokes do, some seeds end up hovering. So
-        SGFT-SAC has H = 4 with 2 branches, nowhere worse (docs/results.md). batch_size: real transitions per update.
+        SGFT-SAC has H = 4 with 2 branches, nowhere worse (docs/ablations.md). batch_size: real transitions per update.
     branch_noise: std of the noise on imagined actions. The paper draws them from the policy alone (0). On pushing, 20
         rollouts and 6,000 updates, the best of 16 actions by the critic then has r_bar -0.34 in the mean, with noise
         0.5 -0.20; by the model itself -0.15, by the truth -0.07, the policy's own -0.71.
@@ -74,7 +74,7 @@ class FinetuneConfig:
         learns in one of TD-MPC2, of a kept critic; what is new learns at full rate. Adam's first steps are as long as
         its rate in every weight, however small the gradient: 40 of them, after one rollout, took plans that pushed a
         towel home in 93 % of all episodes to 4. SAC, MBPO and TD-MPC2 gain as much from the rise as SGFT, whose critics
-        of several steps it only delays (docs/results.md). None = the updates of the first 1,000 real transitions.
+        of several steps it only delays (docs/ablations.md). None = the updates of the first 1,000 real transitions.
     dynamics_warmup: the same for dynamics models that stand alone.
     lr_*: other Adam learning rates. tau: target averaging rate. max_grad_norm: None = no clipping.
     simulated_share: share of each batch that is drawn from the simulator's transitions instead of the real ones; it
@@ -280,7 +280,7 @@ METHODS: dict[str, Method] = {
         ),
         _method(
             "sgft-mpc", "", "MPC-SGFT: plans of H steps by SAC's prior's models, which learn, that end in V_sim",
-            # Models whose rates rise are better on insert, but worse on push and hammer (docs/results.md).
+            # Models whose rates rise are better on insert, but worse on push and hammer (docs/ablations.md).
             "SGFT 2025", agent="mpc", plan_samples=128, dynamics_warmup=0, space=_MODEL_SPACE,
         ),
         # Their critics are never asked beyond H steps, where V_sim stands, so they need no protection (lr_warmup).

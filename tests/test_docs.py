@@ -72,10 +72,24 @@ def test_make_flags_are_options_of_the_commands():
             assert f"--{name.lower()}" in help_of(f"experiments.{target}"), (target, name)
 
 
+def links(page):
+    """(target, anchor) of the links in a page to files of ours; one to a heading of the page itself has no target."""
+    return re.findall(r"\]\((?!https://)([^)#]*)#?([^)]*)\)", page.read_text())
+
+
 @pytest.mark.parametrize("page", DOCS, ids=lambda path: path.name)
 def test_links_lead_to_files(page):
-    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text()):
-        assert target.startswith("https://") or (page.parent / target).exists(), target
+    for target, _ in links(page):
+        assert (page.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("page", DOCS, ids=lambda path: path.name)
+def test_links_lead_to_headings(page):
+    """As GitHub names them: lower case, hyphens for spaces, without other signs."""
+    for target, anchor in links(page):
+        if anchor:
+            headings = re.findall(r"^#+ (.*)$", (page.parent / target if target else page).read_text(), re.M)
+            assert anchor in {re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in headings}, (target, anchor)
 
 
 def test_the_page_of_methods_lists_them_all():

@@ -483,9 +483,9 @@ def test_impossible_options_are_refused(key):
 FAST = tdmpc2.TDMPC2Hyper(lr=3e-3, tau=0.2, encoder_lr_scale=1.0)
 
 
-def train(config, state, draw, key, steps):
+def train(config, state, draw, key, steps, hyper=FAST):
     """`steps` updates with windows draw(key)."""
-    state = state.replace(hyper=jax.tree.map(jnp.float32, FAST))
+    state = state.replace(hyper=jax.tree.map(jnp.float32, hyper))
     keys = jax.random.split(key, (steps, 2))
     for step in range(steps):
         state, _ = UPDATE[config](state, draw(keys[step, 0]), keys[step, 1])
@@ -520,7 +520,7 @@ def episode(policy, key):
 @pytest.mark.slow
 def test_learns_to_push_a_cart(key):
     """From random episodes alone, through the ring, to a planner and a policy that are near the best return, 9.1."""
-    key_data, key_train, key_play = jax.random.split(key, 3)
+    key_data, key_train, key_end, key_play = jax.random.split(key, 4)
 
     @jax.jit
     def collect(key):
@@ -534,10 +534,11 @@ def test_learns_to_push_a_cart(key):
         return jax.jit(jax.vmap(lambda k: episode(policy, k).reward.sum()))(jax.random.split(key_play, 32)).mean()
 
     ring, random = collect(key_data)
-    draw = jax.jit(lambda ring, key: sequences.sample(ring, key, ROWS, 2))
-    state = train(PLAIN, INIT(key), functools.partial(draw, ring), key_train, 1000)
+    draw = functools.partial(jax.jit(lambda ring, key: sequences.sample(ring, key, ROWS, 2)), ring)
+    state = train(PLAIN, INIT(key), draw, key_train, 1000)
+    # At full rate the last few updates decide how good a policy is, and with them a machine's rounding: of eight keys
+    # it came to 7.6 to 9.3. At a tenth it settles.
+    state = train(PLAIN, state, draw, key_end, 1000, FAST._replace(lr=FAST.lr / 10))
     planned = play(lambda memory, obs, key: LEARNERS[PLAIN].act(state, memory, obs, key, explore=False))
     alone = play(lambda memory, obs, key: (tdmpc2.policy_action(PLAIN, state, obs, key, explore=False), memory))
-    # Of eight keys the planner came to 8.8 to 9.3 and the policy to 7.4 to 9.3, and of one key to half a point more or
-    # less from one machine to the next.
-    assert random < 2 and planned > 8.5 and alone > 7
+    assert random < 2 and planned > 8.8 and alone > 8.6
