@@ -251,14 +251,20 @@ def landscape(
     for path_, name, color in ((simulated, "simulated", PALETTE[5]), (real, "real", PALETTE[1])):
         places = np.asarray(path_)
         panel.plot(*places.T, color=color, linewidth=2, marker="o", markersize=3, label=name)
-    panel.plot(*np.asarray(real)[0], color=_INK, marker="o", markersize=7, linestyle="", label="start")
+    panel.plot(
+        *np.asarray(real)[0], color="white", markeredgecolor=_INK, marker="o", markersize=7, linestyle="", label="start"
+    )
     panel.grid(visible=False)
     panel.set_aspect("equal")
     panel.set_xlim(across[0], across[-1])
     panel.set_ylim(up[0], up[-1])
     panel.set_xlabel(axes[0], **_FONT)
     panel.set_ylabel(axes[1], **_FONT)
-    panel.legend(fontsize=8, facecolor=_FAINT, labelcolor=_INK, framealpha=0.8, edgecolor="none")
+    # Beside the drawing, for paths may lead anywhere, and dark, for the branches are white.
+    figure.legend(
+        *panel.get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8, frameon=True,
+        facecolor=mesh.cmap(0.0), framealpha=1, labelcolor="white", edgecolor="none",
+    )  # fmt: skip
     figure.suptitle(title, x=0.01, ha="left", size=11, weight="bold", color=_INK)
     return _save(figure, path)
 

@@ -1,3 +1,5 @@
+import itertools
+
 import matplotlib.image
 import numpy as np
 import pytest
@@ -52,6 +54,20 @@ def test_scaling_draws_lines_and_their_references(tmp_path):
     path = plot.scaling(tmp_path / "s.png", lines, {"push": ([32, 512], [1e5, 2e5])}, title="t", x="worlds", y="steps")
     image = matplotlib.image.imread(path)
     for color in plot.PALETTE[:2]:
+        assert pixels(image, color) > 200
+
+
+def test_landscape_does_not_search_a_place_for_its_legend(tmp_path, monkeypatch):
+    """With so many lines that takes so long on a slow machine that matplotlib warns, by its clock."""
+    monkeypatch.setattr("time.perf_counter", itertools.count(step=2).__next__)
+    grid, path = np.linspace(0, 1, 5), np.linspace(0, 1, 8)[:, None] * [0.5, 0.8]
+    imagined = np.broadcast_to(path[:-1, None, None], (7, 3, 2, 2))
+    image = matplotlib.image.imread(
+        plot.landscape(
+            tmp_path / "l.png", grid, grid, np.outer(grid, grid), path, path + 0.1, imagined, title="t", axes=("x", "y")
+        )
+    )
+    for color in (plot.PALETTE[1], plot.PALETTE[5]):
         assert pixels(image, color) > 200
 
 
