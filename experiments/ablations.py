@@ -166,7 +166,10 @@ def _alike(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
 
 
 def severity(comparisons: Sequence[Comparison], target: Path, order: Sequence[str]) -> Part:
-    """A figure and a table per task for the methods that ran on several of its gaps, in the order of their file."""
+    """A figure and a table per task for the methods that ran on several of its gaps, in the order of their file.
+
+    The figure leaves variants of a method out that is in it itself: the table has them.
+    """
     texts, missing = [], []
     for task in dict.fromkeys(c.task for c in comparisons):
         scale = [name for name in gaps.presets(task) if name not in _OTHER_KINDS]
@@ -185,11 +188,12 @@ def _severity_section(
     task: str, steps: Sequence[str], lines: Mapping[str, Mapping[str, Curve]], target: Path, order: Sequence[str]
 ) -> str:
     title = f"{task} by severity of the gap"
+    drawn = {name: curves for name, curves in lines.items() if not split(name)[1] or split(name)[0] not in lines}
     path = plot.severity(
         target / f"severity-{task}.png",
         steps,
-        {name: [_after(curves.get(real)) for real in steps] for name, curves in lines.items()},
-        {name: [_needed(curves.get(real)) for real in steps] for name, curves in lines.items()},
+        {name: [_after(curves.get(real)) for real in steps] for name, curves in drawn.items()},
+        {name: [_needed(curves.get(real)) for real in steps] for name, curves in drawn.items()},
         title=title,
         success=f"success after {AFTER} rollouts",
         transitions=f"real transitions to {LEVELS[0]} %",

@@ -147,6 +147,22 @@ def test_severity_is_in_the_order_of_the_file_of_gaps(tmp_path, monkeypatch):
     assert missing == ["push: no method has run on more than one gap of mild, default, hard"]
 
 
+def test_a_figure_of_severities_has_no_variants_beside_their_method(tmp_path, monkeypatch):
+    drawn = []
+
+    def record(path, steps, scores, needed, **_):
+        drawn.extend(scores)
+        return path
+
+    monkeypatch.setattr(ablations.plot, "severity", record)
+    for real in ("mild", "hard"):
+        for name in ("sac", "sac_tuned", "mbpo_tuned"):  # of MBPO there is no other
+            save(tmp_path, name, task="push", real=real, **rising(20))
+    sections, _ = severity(tmp_path)
+    assert sorted(drawn) == ["mbpo_tuned", "sac"]
+    assert "| sac_tuned | mild |" in sections[1]
+
+
 def test_a_figure_of_severities_with_holes(tmp_path):
     for real, to in (("mild", 10), ("hard", 10)):
         save(tmp_path, "sac", task="push", real=real, **rising(None, to=to, seeds=1))
