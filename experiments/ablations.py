@@ -11,7 +11,7 @@ import numpy as np
 
 from envs import gaps
 from experiments import tables
-from experiments.comparison import DEFAULT, ORDER, Comparison, Part, is_sgft, on_default, split
+from experiments.comparison import DEFAULT, ORDER, Comparison, Part, beside_its_method, is_sgft, on_default, split
 from experiments.finetune_args import arguments
 from experiments.results import LEVELS, Curve, reached
 from sgft_jax import plot
@@ -188,7 +188,7 @@ def _severity_section(
     task: str, steps: Sequence[str], lines: Mapping[str, Mapping[str, Curve]], target: Path, order: Sequence[str]
 ) -> str:
     title = f"{task} by severity of the gap"
-    drawn = {name: curves for name, curves in lines.items() if not split(name)[1] or split(name)[0] not in lines}
+    drawn = {name: curves for name, curves in lines.items() if not beside_its_method(name, lines)}
     path = plot.severity(
         target / f"severity-{task}.png",
         steps,

@@ -85,6 +85,12 @@ def split(name: str) -> tuple[str, str]:
     return (method, variant) if method in METHODS else (name, "")
 
 
+def beside_its_method(name: str, names: Iterable[str]) -> bool:
+    """Whether a name is a variant whose method is among the names itself; any other stands for its method."""
+    method, variant = split(name)
+    return bool(variant) and method in names
+
+
 def shared_variants(names: Iterable[str]) -> list[str]:
     """Variants that several methods have, such as `tuned`, in order."""
     count = Counter(split(name)[1] for name in set(names))

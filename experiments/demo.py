@@ -73,10 +73,9 @@ def outcome(comparison: Comparison) -> str:
 
 
 def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> FinetuneArgs:
-    """Smaller batches and fewer updates than on a GPU: what two cores can do; all methods get the same. Rates are the
-    methods' own: larger ones for the actor cost most methods success (docs/small-priors.md).
+    """Smaller batches and fewer updates than on a GPU: what two cores can do; all methods get the same. All else is the
+    methods' own: larger rates of the actor cost most of them success (docs/small-priors.md).
     """
-    small = {"batch_size": 64, "branches": 2}
     return FinetuneArgs(
         real=(args.real,),
         method=method,
@@ -85,7 +84,7 @@ def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> Finet
         utd=4.0,
         eval_every=5,
         eval_episodes=20,
-        options=finetune_config(get_method(method), **small),
+        options=finetune_config(get_method(method), batch_size=64),
         video=args.video and method == METHODS[0],
         **shared,
     )

@@ -10,6 +10,7 @@ from envs import gaps
 from experiments import ablations, cli, overview, tables
 from experiments.comparison import (
     Comparison,
+    beside_its_method,
     colour_order,
     figure_order,
     names_of,
@@ -112,7 +113,7 @@ def _apart(curves: Mapping[str, Curve], shared: Sequence[str]) -> dict[str, dict
     found: dict[str, dict[str, Curve]] = {}
     for name, curve in curves.items():
         method, variant = split(name)
-        part = variant if variant in shared else method if variant and method in curves else ""
+        part = variant if variant in shared else method if beside_its_method(name, curves) else ""
         if part == method:
             found.setdefault(part, {})[method] = curves[method]
         found.setdefault(part, {})[name] = curve

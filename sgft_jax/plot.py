@@ -141,7 +141,7 @@ def severity(
         right.plot(x, np.where(enough, counts, np.nan), **look, linewidth=weight, marker="o", markersize=4)
         right.plot(x[~enough], counts[~enough], color=look["color"], marker="^", mfc="white", linestyle="")
     left.set_ylim(-0.03, 1.03)
-    right.set_ylim(0, 1.05 * right.dataLim.y1)
+    right.set_ylim(0, 1.05 * right.dataLim.y1 or 1.0)  # 0 if all are there zero-shot
     right.yaxis.set_major_formatter(lambda n, _: f"{n:,.0f}")
     for axes, words in ((left, success), (right, transitions)):
         axes.set_xlim(-0.5, len(gaps) - 0.5)

@@ -145,3 +145,12 @@ def test_no_line_leads_past_a_gap_where_a_method_failed(tmp_path):
 
     through, past, none = blue((500, True)), blue((900, False)), blue(None)
     assert past < through - 200 and none < past
+
+
+def test_gaps_that_need_no_real_transition_are_drawn(tmp_path):
+    """Without a warning about axes of no height."""
+    path = plot.severity(
+        tmp_path / "severity.png", ["mild", "hard"], {"SAC": [None] * 2}, {"SAC": [(0, True)] * 2},
+        title="Push", success="success", transitions="transitions", order=["SAC"],
+    )  # fmt: skip
+    assert pixels(matplotlib.image.imread(path), plot.PALETTE[0]) > 100
