@@ -3,7 +3,7 @@
 The horizon is that of Figure 5 of the SGFT paper.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,12 +11,23 @@ import numpy as np
 
 from envs import gaps
 from experiments import tables
-from experiments.comparison import DEFAULT, ORDER, Comparison, Part, beside_its_method, is_sgft, on_default, split
+from experiments.comparison import (
+    DEFAULT,
+    ORDER,
+    Comparison,
+    Part,
+    beside_its_method,
+    is_sgft,
+    on_default,
+    same_seeds,
+    split,
+)
 from experiments.finetune_args import arguments
-from experiments.results import LEVELS, Curve, reached
+from experiments.results import LEVELS, Curve, area, reached
 from sgft_jax import plot
 from sgft_jax.config import config_to_json
 from sgft_jax.methods import METHODS, Method, finetune_config
+from sgft_jax.stats import difference_interval
 
 # Methods whose horizon is an option: one searches by learning an actor, the other by planning.
 HORIZON_METHODS = ("sgft-sac", "sgft-mpc")
@@ -173,9 +184,9 @@ def severity(comparisons: Sequence[Comparison], target: Path, order: Sequence[st
     texts, missing = [], []
     for task in dict.fromkeys(c.task for c in comparisons):
         scale = [name for name in gaps.presets(task) if name not in _OTHER_KINDS]
-        ran = {c.real: c.curves for c in comparisons if c.task == task and c.real in scale}
-        steps = [real for real in scale if real in ran]
-        lines = {n: {real: ran[real][n] for real in steps if n in ran[real]} for n in order}
+        ran = {c.real: c for c in comparisons if c.task == task and c.real in scale and c.curves}
+        steps = {real: ran[real] for real in scale if real in ran}
+        lines = {n: {real: c.curves[n] for real, c in steps.items() if n in c.curves} for n in order}
         lines = {name: curves for name, curves in lines.items() if len(curves) > 1}
         if lines:
             texts.append(_severity_section(task, steps, lines, target, order))
@@ -185,13 +196,17 @@ def severity(comparisons: Sequence[Comparison], target: Path, order: Sequence[st
 
 
 def _severity_section(
-    task: str, steps: Sequence[str], lines: Mapping[str, Mapping[str, Curve]], target: Path, order: Sequence[str]
+    task: str,
+    steps: Mapping[str, Comparison],
+    lines: Mapping[str, Mapping[str, Curve]],
+    target: Path,
+    order: Sequence[str],
 ) -> str:
     title = f"{task} by severity of the gap"
     drawn = {name: curves for name, curves in lines.items() if not beside_its_method(name, lines)}
     path = plot.severity(
         target / f"severity-{task}.png",
-        steps,
+        list(steps),
         {name: [_after(curves.get(real)) for real in steps] for name, curves in drawn.items()},
         {name: [_needed(curves.get(real)) for real in steps] for name, curves in drawn.items()},
         title=title,
@@ -212,7 +227,42 @@ def _severity_section(
         for name, curves in lines.items()
         for real, curve in curves.items()
     ]  # fmt: skip
-    return f"### {title}\n\n![{title}]({path.name})\n\n{tables.markdown(head, rows)}"
+    parts = [f"### {title}", f"![{title}]({path.name})", tables.markdown(head, rows), _leads(steps, drawn)]
+    return "\n\n".join(filter(None, parts))
+
+
+def _leads(steps: Mapping[str, Comparison], lines: Mapping[str, Mapping[str, Curve]]) -> str:
+    """A table of how far every SGFT method is above the best other one on each gap; empty without one of either kind.
+
+    The best is that with runs on the most gaps, of these the one with the largest mean success over them.
+    """
+    overall = lambda name: np.mean([area(x, int(x.rollouts[-1])).mean() for x in lines[name].values()])  # noqa: E731
+    own = [name for name in lines if is_sgft(name)]
+    others = [n for n, ran in lines.items() if split(n)[0] in METHODS and not is_sgft(n) and _learned(ran.values())]
+    best = max(others, key=lambda name: (len(lines[name]), overall(name)), default=None)
+    if best is None or not own:
+        return ""
+    legend = (
+        f"Mean success over the run, up to where both runs got, minus that of {best}: points, mean over seeds with its "
+        "95 % bootstrap interval, which draws the seeds of both together where they are the same."
+    )
+    rows = [[name, *(_lead(c, name, best) for c in steps.values())] for name in own]
+    return f"{legend}\n\n{tables.markdown(['method', *steps], rows)}"
+
+
+def _learned(curves: Iterable[Curve]) -> bool:
+    """Whether all of these runs were evaluated after they began."""
+    return all(curve.rollouts[-1] > 0 for curve in curves)
+
+
+def _lead(comparison: Comparison, name: str, other: str) -> str:
+    """By how many points the mean success over the run of one method is above another's: "13 [6, 20]"."""
+    own, best = comparison.curves.get(name), comparison.curves.get(other)
+    if own is None or best is None or not _learned([own, best]):
+        return tables.NONE
+    common = min(int(own.rollouts[-1]), int(best.rollouts[-1]))
+    paired = same_seeds(comparison, name, other)
+    return tables.points(difference_interval(area(own, common), area(best, common), paired=paired))
 
 
 def _after(curve: Curve | None) -> np.ndarray | None:

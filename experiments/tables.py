@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from experiments.results import LEVELS, Curve, area, dip, left_behind
-from sgft_jax.stats import Censored, iqm_interval, transitions_interval
+from sgft_jax.stats import Censored, Interval, iqm_interval, transitions_interval
 
 BUDGETS = (10, 20, 50, 100)  # rollouts at which tables compare, as far as a run got
 NONE = "-"
@@ -48,8 +48,12 @@ def seeds(curve: Curve) -> str:
 
 def percent(success: np.ndarray) -> str:
     """Interquartile mean over seeds [seeds] with its 95 % interval, in per cent."""
-    band = iqm_interval(success)
-    interval = f" [{100 * band.low:.0f}, {100 * band.high:.0f}]" if len(success) > 1 else ""
+    return points(iqm_interval(success))
+
+
+def points(band: Interval) -> str:
+    """A number of 0 to 1 with its interval, if it has one, in per cent or percentage points."""
+    interval = "" if np.isnan(band.low) else f" [{100 * band.low:.0f}, {100 * band.high:.0f}]"
     return f"{100 * band.estimate:.0f}{interval}"
 
 

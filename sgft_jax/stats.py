@@ -124,13 +124,9 @@ def ratio_interval(
     taken if one is there from the start, where nothing was to be learned. Such resamples stay: without them only those
     of fast seeds would count. So `least.low` and `most.high` enclose the interval that longer runs would have given.
     """
-    seeds = [np.shape(success)[0] for _, success in (numerator, denominator)]
-    if paired and seeds[0] != seeds[1]:
-        raise ValueError(f"paired methods need the same seeds, not {seeds[0]} and {seeds[1]} of them")
-    rng = np.random.default_rng(seed)
-    weights = _resampled(rng, seeds[0], resamples)
+    seeds = (np.shape(numerator[1])[0], np.shape(denominator[1])[0])
+    weights, own = _resampled_both(np.random.default_rng(seed), seeds, resamples, paired=paired)
     above_least, above_most = _needs(*numerator, threshold, weights)
-    own = weights if paired else _resampled(rng, seeds[1], resamples)
     below_least, below_most = _needs(*denominator, threshold, own)
     tells = (above_least > 0) & (below_least > 0)
     ratios = (
@@ -138,6 +134,29 @@ def ratio_interval(
         np.divide(above_most, below_least, out=np.full_like(above_most, np.inf), where=tells),
     )
     return Censored(*(_percentiles(each, level, seeds=min(seeds)) for each in ratios))
+
+
+def difference_interval(
+    above: ArrayLike, below: ArrayLike, *, paired: bool, level: float = 0.95, resamples: int = 2000, seed: int = 0
+) -> Interval:
+    """Mean over seeds of one method's scores minus that of another's, with its percentile-bootstrap interval.
+
+    above, below: [n_seeds] of either. paired: as in `ratio_interval`. Of one seed the bounds are nan.
+    """
+    above, below = np.asarray(above, np.float64), np.asarray(below, np.float64)
+    weights, own = _resampled_both(np.random.default_rng(seed), (len(above), len(below)), resamples, paired=paired)
+    differences = weights @ above / len(above) - own @ below / len(below)
+    return _percentiles(differences, level, seeds=min(len(above), len(below)))
+
+
+def _resampled_both(
+    rng: np.random.Generator, seeds: tuple[int, int], resamples: int, *, paired: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """`_resampled` of either method, the same if they are paired; raises ValueError if such ones differ in number."""
+    if paired and seeds[0] != seeds[1]:
+        raise ValueError(f"paired methods need the same seeds, not {seeds[0]} and {seeds[1]} of them")
+    weights = _resampled(rng, seeds[0], resamples)
+    return weights, weights if paired else _resampled(rng, seeds[1], resamples)
 
 
 def _resampled(rng: np.random.Generator, seeds: int, resamples: int) -> np.ndarray:

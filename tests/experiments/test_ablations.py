@@ -163,6 +163,33 @@ def test_a_figure_of_severities_has_no_variants_beside_their_method(tmp_path, mo
     assert "| sac_tuned | mild |" in sections[1]
 
 
+def test_how_far_sgft_is_ahead_by_severity(tmp_path):
+    """Against the best other method with runs on most gaps, over what both runs had: 0.9 - 0.6, and 0.9 - 0.3."""
+    steady = lambda level, **more: rising(0, level=level, **more)  # noqa: E731
+    for real, level in (("mild", 0.6), ("hard", 0.3)):
+        save(tmp_path, "sgft-sac", task="push", real=real, **steady(0.9))
+        save(tmp_path, "mbpo", task="push", real=real, **steady(level, to=50))
+        save(tmp_path, "sac", task="push", real=real, **steady(0.1))
+        save(tmp_path, "sac_tuned", task="push", real=real, **steady(1.0))  # beside its method
+    for real in ("mild", "default"):
+        save(tmp_path, "sgft", task="push", real=real, **steady(0.5))
+        save(tmp_path, "rlpd", task="push", real=real, **steady(1.0))
+    save(tmp_path, "mbpo", task="push", real="default", **steady(0.6))
+    text = severity(tmp_path)[0][1].split("minus that of ")[1]
+    assert text.startswith("mbpo:")
+    rows = re.findall(r"^\| (sgft\S*) \| (.*) \| (.*) \| (.*) \|$", text, re.M)
+    assert rows == [
+        ("sgft-sac", "30 [30, 30]", "-", "60 [60, 60]"), ("sgft", "-10 [-10, -10]", "-10 [-10, -10]", "-"),
+    ]  # fmt: skip
+
+
+def test_severities_without_two_kinds_of_method_compare_nothing(tmp_path):
+    for real in ("mild", "hard"):
+        save(tmp_path, "sgft-sac", task="push", real=real, **rising(20))
+        save(tmp_path, "sac", task="push", real=real, rollouts=[0], success=[[0.0, 0.0]])
+    assert "minus that of" not in severity(tmp_path)[0][1]
+
+
 def test_a_figure_of_severities_with_holes(tmp_path):
     for real, to in (("mild", 10), ("hard", 10)):
         save(tmp_path, "sac", task="push", real=real, **rising(None, to=to, seeds=1))

@@ -4,6 +4,7 @@ from scipy import stats as scipy_stats
 
 from sgft_jax.stats import (
     area_under,
+    difference_interval,
     first_dip,
     iqm,
     iqm_interval,
@@ -201,6 +202,24 @@ def test_one_seed_has_no_interval_of_transitions():
 def test_pairs_need_as_many_seeds():
     with pytest.raises(ValueError, match="not 2 and 1"):
         ratio_interval((TRANSITIONS, [FAST, LATE]), (TRANSITIONS, [FAST]), 0.9, paired=True)
+    with pytest.raises(ValueError, match="not 2 and 1"):
+        difference_interval([0.5, 0.7], [0.5], paired=True)
+
+
+def test_what_makes_a_seed_good_for_both_methods_is_not_in_the_spread_of_the_difference():
+    """One method is always 0.25 above the other; drawn apart, two seeds 0.5 apart leave anything from -0.25 to 0.75."""
+    assert difference_interval([0.75, 0.25], [0.5, 0.0], paired=True) == (0.25, 0.25, 0.25)
+    assert difference_interval([0.75, 0.25], [0.5, 0.0], paired=False) == (0.25, -0.25, 0.75)
+    assert difference_interval([0.75, 0.25], [0.5], paired=False)[0] == 0.0
+    assert np.isnan(difference_interval([0.75], [0.5], paired=True)[1:]).all()
+
+
+def test_interval_of_a_difference_agrees_with_scipy():
+    above, below = np.random.default_rng(1).normal([[0.5], [0.2]], 0.1, (2, 12))
+    ours = difference_interval(above, below, paired=True, resamples=20_000)
+    theirs = scipy_stats.bootstrap((above - below,), np.mean, method="percentile", n_resamples=20_000, rng=2)
+    np.testing.assert_allclose(ours[1:], theirs.confidence_interval, atol=0.003)
+    assert ours.estimate == pytest.approx((above - below).mean())
 
 
 def test_area_under_a_curve():
