@@ -285,6 +285,13 @@ METHODS: dict[str, Method] = {
         ),
         # Their critics are never asked beyond H steps, where V_sim stands, so they need no protection (lr_warmup).
         _method("sgft", "shape shorten", "model-free SGFT", "SGFT 2025", lr_warmup=0, space=_SEGMENT_SPACE),
+        # The relabelled rows know of all kinds of actions from the first update on, so the actor need not wait.
+        _method(
+            "sgft-relabel", "branch shape shorten",
+            "SGFT-SAC that also learns at the simulator's states, with what the fitted models expect there",
+            "SGFT 2025, ours", horizon=4, branches=2, lr_warmup=0, relabel_simulated=True, critic_warmup=0,
+            space=_BRANCH_SPACE,
+        ),
         _method(
             "sgft-sac", "branch shape shorten", "SGFT-SAC", "SGFT 2025", horizon=4, branches=2, lr_warmup=0,
             space=_BRANCH_SPACE,

@@ -109,8 +109,8 @@ def test_one_figure_and_one_table_per_real_system(tmp_path, capsys, monkeypatch)
     assert "| 20 rollouts |" in text and "50 rollouts" not in text  # no run got there
     assert text.index("| sgft-sac | 2 |") < text.index("| sac | 2 |") and "![toy on the default real system]" in text
     for missing in (
-        "- toy/default: no run of sgft, sgft-mpc, sgft-tdmpc2, sgft-tdmpc2-code, tdmpc2, iql, rlpd, sac-online, "
-        "frozen-critic, pbrs-branch, pbrs, sac-reset",
+        "- toy/default: no run of sgft-relabel, sgft, sgft-mpc, sgft-tdmpc2, sgft-tdmpc2-code, tdmpc2, iql, rlpd, "
+        "sac-online, frozen-critic, pbrs-branch, pbrs, sac-reset",
         "holds no evaluation yet",
         "- toy/default: no two horizons of sgft-sac",
         "- toy/hard+latency=0.1: sgft-sac: seed-0 left out, seeds-0-1 has more seeds or rollouts",

@@ -22,7 +22,9 @@ def sections(out):
 
 
 def test_which_methods_are_sgft():
-    assert {name for name in METHODS if is_sgft(name)} == {"sgft", "sgft-sac", "sgft-mpc", "sgft-tdmpc2"}
+    assert {name for name in METHODS if is_sgft(name)} == {
+        "sgft", "sgft-sac", "sgft-relabel", "sgft-mpc", "sgft-tdmpc2",
+    }  # fmt: skip
     assert is_sgft("sgft-sac_horizon-4") and not is_sgft("sac_tuned") and not is_sgft("sgft-mine")
     assert split("sgft-sac_a_b") == ("sgft-sac", "a_b") and split("my_own") == ("my_own", "")
 

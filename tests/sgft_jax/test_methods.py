@@ -1,5 +1,7 @@
 """The table of methods, and the settings that make one."""
 
+import dataclasses
+
 import pytest
 import toy
 
@@ -18,6 +20,7 @@ from sgft_jax.types import UserError
         ("pbrs-branch", True, True, True, False),
         ("sgft", True, False, False, True),
         ("sgft-sac", True, True, False, True),
+        ("sgft-relabel", True, True, False, True),
         ("frozen-critic", False, False, False, False),
         ("sac-online", False, False, False, False),
         ("rlpd", False, False, False, False),
@@ -39,7 +42,9 @@ def test_the_table_is_complete():
     (tested,) = (mark.args[1] for mark in test_method_table.pytestmark)
     assert {row[0] for row in tested} == set(methods.METHODS)
     own = {m.name: methods.finetune_config(m) for m in methods.METHODS.values()}
-    assert {name for name, config in own.items() if config.needs_simulation} == {"sac-online", "rlpd", "iql"}
+    assert {name for name, config in own.items() if config.needs_simulation} == {
+        "sac-online", "rlpd", "iql", "sgft-relabel",
+    }  # fmt: skip
     assert {m.name for m in methods.METHODS.values() if m.fresh} == {"rlpd", "iql", "sgft-tdmpc2-code"}
     assert {m.name for m in methods.METHODS.values() if m.prior == "tdmpc2"} == {
         "tdmpc2", "sgft-tdmpc2", "sgft-tdmpc2-code",
@@ -76,8 +81,14 @@ def test_rates_of_models_rise_by_themselves(name, updates):
 
 def test_sgft_sac_is_the_only_one_with_another_horizon_than_the_papers_but_planners():
     own = {m.name: methods.finetune_config(m) for m in methods.METHODS.values() if m.agent != "tdmpc2"}
-    assert {name: config.horizon for name, config in own.items() if config.horizon != 1} == {"sgft-sac": 4}
+    longer = {name: config.horizon for name, config in own.items() if config.horizon != 1}
+    assert longer == {"sgft-sac": 4, "sgft-relabel": 4}
     assert (own["sgft-sac"].branches, own["sgft-sac"].lr_warmup, own["mbpo"].branches) == (2, 0, 5)
+
+
+def test_sgft_relabel_is_sgft_sac_with_relabelled_rows_and_an_actor_that_does_not_wait():
+    plain, own = (methods.finetune_config(methods.METHODS[name]) for name in ("sgft-sac", "sgft-relabel"))
+    assert dataclasses.replace(plain, relabel_simulated=True, critic_warmup=0) == own
 
 
 @pytest.mark.parametrize("method", methods.METHODS.values(), ids=lambda method: method.name)
