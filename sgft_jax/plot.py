@@ -402,8 +402,11 @@ def _legend_below(figure: Figure, looks: Mapping[str, Mapping[str, Any]], thick:
     legend.get_title().set_color(_GREY)
 
 
-def _spread(values: Sequence[float], *, gap: float, top: float = 1.0) -> list[float]:
-    """The values moved at least `gap` apart and below `top`; a crowd stays centred on its mean where there is room."""
+def _spread(values: Sequence[float], *, gap: float, bottom: float = 0.0, top: float = 1.0) -> list[float]:
+    """The values moved at least `gap` apart and between `bottom` and `top`, below `bottom` if there is no room.
+
+    A crowd stays centred on its mean where it can.
+    """
     order = np.argsort(values, kind="stable")
     crowds: list[list[float]] = []
     for value in np.asarray(values, np.float64)[order]:
@@ -411,10 +414,9 @@ def _spread(values: Sequence[float], *, gap: float, top: float = 1.0) -> list[fl
         while len(crowds) > 1 and _bottom(crowds[-1], gap) - _top(crowds[-2], gap) < gap:
             crowds[-2:] = [crowds[-2] + crowds[-1]]
     placed = np.concatenate([_bottom(crowd, gap) + gap * np.arange(len(crowd)) for crowd in crowds])
-    ceiling = top
-    for i in reversed(range(len(placed))):
-        placed[i] = min(placed[i], ceiling)
-        ceiling = placed[i] - gap
+    steps = gap * np.arange(len(placed))
+    placed = np.maximum.accumulate(np.maximum(placed, bottom) - steps) + steps  # up from the bottom
+    placed = np.minimum.accumulate((np.minimum(placed, top) - steps)[::-1])[::-1] + steps  # then down from the top
     result = np.empty_like(placed)
     result[order] = placed
     return result.tolist()

@@ -95,6 +95,8 @@ def test_pretraining_panels(tmp_path, n):
         ([0.5, 0.5], [0.55, 0.45][::-1]),  # a pair parts around its mean
         ([0.5, 0.45, 0.9], [0.525, 0.425, 0.9]),  # mean 0.475 -+ 0.05, order kept
         ([1.0, 1.0, 1.0], [0.8, 0.9, 1.0]),  # the top is the top
+        ([0.0, 0.0, 0.25], [0.0, 0.1, 0.25]),  # and the bottom the bottom, where tick labels stand
+        ([0.0] * 12, np.linspace(-0.1, 1.0, 12)),  # but where there are too many
         ([0.3, 0.35, 0.42], [0.25667, 0.35667, 0.45667]),  # a crowd grows: mean 0.35667
     ],
 )
