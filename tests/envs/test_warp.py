@@ -80,12 +80,14 @@ def test_arm_on_the_board():
         state = after
 
 
-@pytest.mark.parametrize(
-    ("name", "usual", "worst"), [("towel", (5e-6, 5e-5), (1.5e-3, 2e-2)), ("ball", (2e-6, 2e-5), (1e-5, 2e-4))]
-)
-def test_pushing_what_deforms(name, usual, worst):
-    """After 0.2 s in which a hard push moves it: what is observed, m, and any coordinate, m and rad, in half of the
-    periods and in all. A towel of which a point moves by a micrometre ends elsewhere by up to 1.4 mm and 18 mm."""
+@pytest.mark.parametrize("name", DEFORMABLES)
+def test_pushing_what_deforms(name):
+    """After 0.2 s in which a hard push moves it Warp is about as far from C MuJoCo as C MuJoCo is from itself if all
+    begins a micrometre elsewhere: what is observed, m, and any coordinate, m and rad, in half of the periods and in all.
+
+    Contacts that deform amplify rounding, which differs between processors and compilers: one of ten periods may end
+    1 mm elsewhere, or none. What the same periods make of a micrometre is a bound that goes along.
+    """
     c, warp = make_env(converging(DEFORMABLES[name]), impl="c"), make_env(DEFORMABLES[name], impl="warp")
     worlds, key = in_random_worlds(c, DEFORMABLES[name], np.random.default_rng(3)), jax.random.key(1)
     states = [jax.jit(jax.vmap(c.reset))(worlds, jax.random.split(key, WORLDS))]
@@ -100,12 +102,25 @@ def test_pushing_what_deforms(name, usual, worst):
     assert len(t) == 10 and set(i) == set(range(WORLDS))
     before, after = (jax.tree.map(lambda x, s=s: x[s, i], episodes) for s in (t, t + 1))
     own = jax.tree.map(lambda x: x[i], worlds)
-    seen = jax.jit(jax.vmap(warp.step, (0, 0, 0, None)))(own, before, jnp.stack(acted)[t, i], key)
+    c_step, warp_step = (jax.jit(jax.vmap(env.step, (0, 0, 0, None))) for env in (c, warp))
+
+    def apart(state):
+        """[10] how far what is observed, and any coordinate, is from where C MuJoCo has it."""
+        pairs = ((state.true_obs, after.true_obs), (state.physics.qpos, after.physics.qpos))
+        return np.array([np.abs(one - other).max(1) for one, other in pairs])
+
+    def elsewhere(seed):
+        moved = before.physics.qpos + 1e-6 * jax.random.normal(jax.random.key(seed), before.physics.qpos.shape)
+        return before._replace(physics=before.physics._replace(qpos=moved))
+
+    actions = jnp.stack(acted)[t, i]
+    seen = warp_step(own, before, actions, key)
     assert not seen.invalid.any()
-    observed = np.abs(seen.true_obs - after.true_obs).max(1)
-    anything = np.abs(seen.physics.qpos - after.physics.qpos).max(1)
-    assert np.median(observed) < usual[0] and np.median(anything) < usual[1]
-    assert observed.max() < worst[0] and anything.max() < worst[1]
+    ours = apart(seen)
+    bound = np.concatenate([apart(c_step(own, elsewhere(seed), actions, key)) for seed in range(4)], axis=1)
+    assert (np.median(ours, axis=1) < 3 * np.median(bound, axis=1)).all()
+    assert (ours.max(1) < 3 * bound.max(1)).all()
+    assert (np.median(bound, axis=1) < (1e-4, 3e-3)).all()  # what is wrong by more than rounding would not hide there
 
 
 @pytest.mark.parametrize(("name", "contacts"), [("towel", 72), ("ball", 87)])
