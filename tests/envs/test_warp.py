@@ -82,8 +82,8 @@ def test_arm_on_the_board():
 
 @pytest.mark.parametrize("name", DEFORMABLES)
 def test_pushing_what_deforms(name):
-    """After 0.2 s in which a hard push moves it Warp is about as far from C MuJoCo as C MuJoCo is from itself if all
-    begins a micrometre elsewhere: what is observed, m, and any coordinate, m and rad, in half of the periods and in all.
+    """After 0.2 s in which a hard push moves it Warp is about as far from C MuJoCo as that is from itself if it begins
+    a micrometre elsewhere: what is observed, m, and any coordinate, m and rad, in half of the periods and in all.
 
     Contacts that deform amplify rounding, which differs between processors and compilers: one of ten periods may end
     1 mm elsewhere, or none. What the same periods make of a micrometre is a bound that goes along.
