@@ -105,7 +105,7 @@ def test_pushing_what_deforms(name):
     c_step, warp_step = (jax.jit(jax.vmap(env.step, (0, 0, 0, None))) for env in (c, warp))
 
     def apart(state):
-        """[10] how far what is observed, and any coordinate, is from where C MuJoCo has it."""
+        """[2, 10] how far what is observed, and any coordinate, is from where C MuJoCo has it."""
         pairs = ((state.true_obs, after.true_obs), (state.physics.qpos, after.physics.qpos))
         return np.array([np.abs(one - other).max(1) for one, other in pairs])
 

@@ -79,7 +79,7 @@ def test_rates_of_models_rise_by_themselves(name, updates):
     assert methods.dynamics_warmup(methods.FinetuneConfig(lr_warmup=7, dynamics_warmup=3), 4.0) == 3
 
 
-def test_sgft_sac_is_the_only_one_with_another_horizon_than_the_papers_but_planners():
+def test_only_sgft_sac_with_and_without_relabelling_and_planners_have_another_horizon_than_the_papers():
     own = {m.name: methods.finetune_config(m) for m in methods.METHODS.values() if m.agent != "tdmpc2"}
     longer = {name: config.horizon for name, config in own.items() if config.horizon != 1}
     assert longer == {"sgft-sac": 4, "sgft-relabel": 4}
