@@ -98,7 +98,11 @@ def shared_variants(names: Iterable[str]) -> list[str]:
 
 
 def same_seeds(comparison: Comparison, one: str, other: str) -> bool:
-    """Whether two runs are known to have the same seeds: equally many, from the same first one on."""
+    """Whether two runs are known to have the same seeds: equally many, from the same first one on.
+
+    They may have begun with different priors. Then only the real starts are the same, and to draw seeds in pairs leaves
+    an interval as wide as that of independent draws.
+    """
     first, second = (
         (comparison.configs[name].get("seed"), comparison.curves[name].success.shape[0]) for name in (one, other)
     )

@@ -57,9 +57,15 @@ def _tuned(default: FinetuneArgs, argv: Sequence[str]) -> FinetuneArgs:
 
 
 def _table() -> str:
-    """The methods in a line each."""
+    """The methods in two lines each."""
     width = max(map(len, METHODS))
-    return "methods:\n" + "\n".join(f"  {m.name:{width}}  {m.description} ({m.source})" for m in METHODS.values())
+
+    def row(m: Method) -> str:
+        transforms = f"batches: {', '.join(m.parts)}; " if m.parts else ""
+        return f"  {m.name:{width}}  {m.description} ({m.source})\n  {'':{width}}  {transforms}prior: {m.needs}"
+
+    title = "methods, what they do to their batches, and what of the prior they need:"
+    return "\n".join([title, *map(row, METHODS.values())])
 
 
 def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:

@@ -190,6 +190,26 @@ class Method(NamedTuple):
         return "tdmpc2" if self.agent == "tdmpc2" else "sac"
 
     @property
+    def parts(self) -> tuple[str, ...]:
+        """Its transforms by name, in order, as this table has them."""
+        has = {"branch": self.uses_dynamics, "shape": self.uses_value, "shorten": self.finite_horizon}
+        return tuple(name for name, there in has.items() if there)
+
+    @property
+    def needs(self) -> str:
+        """What it takes from the prior, in words. Agent: policy, critic and observation statistics."""
+        if self.agent == "tdmpc2":
+            return "TD-MPC2"
+        plans = self.agent == "mpc"
+        has = {
+            "agent": not self.fresh,
+            "V_sim": self.uses_value or plans,
+            "models": self.uses_dynamics or plans,
+            "policy for data": finetune_config(self).needs_simulation,
+        }
+        return ", ".join(name for name, there in has.items() if there)
+
+    @property
     def pilot(self) -> "Method":
         """The method whose agent is the simulator's policy until it learns; what critic it has does not matter."""
         return METHODS["tdmpc2" if self.agent == "tdmpc2" else "sac-reset"]

@@ -92,10 +92,15 @@ def test_links_lead_to_headings(page):
             assert anchor in {re.sub(r"[^\w -]", "", h.lower()).replace(" ", "-") for h in headings}, (target, anchor)
 
 
-def test_the_page_of_methods_lists_them_all():
-    rows = re.findall(r"^\| `([\w-]+)` \|", (ROOT / "docs/methods.md").read_text(), re.M)
-    assert sorted(rows) == sorted(METHODS)
-    assert all(name in help_of("experiments.finetune") for name in METHODS)
+def test_the_page_of_methods_lists_them_all_and_so_does_the_help():
+    page = (ROOT / "docs/methods.md").read_text()
+    rows = re.findall(r"^\| `([\w-]+)` \|[^|]*\|([^|]*)\|([^|]*)\|[^|]*\|$", page, re.M)
+    known = {name: (", ".join(m.parts), m.needs) for name, m in METHODS.items()}
+    assert {name: (transforms.strip(), needs.strip()) for name, transforms, needs in rows} == known
+    shown = help_of("experiments.finetune")
+    for name, (transforms, needs) in known.items():
+        about = f"batches: {transforms}; prior: {needs}" if transforms else f"prior: {needs}"
+        assert re.search(rf"^  {name} .*\n +{re.escape(about)}$", shown, re.M), name
 
 
 def test_the_page_of_methods_shows_what_tuning_chooses_from():
