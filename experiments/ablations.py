@@ -24,10 +24,10 @@ from experiments.comparison import (
 )
 from experiments.finetune_args import arguments
 from experiments.results import LEVELS, Curve, area, reached
-from sgft_jax import plot
-from sgft_jax.config import config_to_json
+from sgft_jax.analysis import plot
+from sgft_jax.analysis.stats import difference_interval
+from sgft_jax.io.config import config_to_json
 from sgft_jax.methods import METHODS, Method, finetune_config
-from sgft_jax.stats import difference_interval
 
 # Methods whose horizon is an option: one searches by learning an actor, the other by planning.
 HORIZON_METHODS = ("sgft-sac", "sgft-mpc")

@@ -20,8 +20,8 @@ from rich.console import Console
 from rich.table import Table
 
 from envs.franka import arm, hammer, host, insert, kinematics, push
-from envs.franka.task import CONTROL_DT, Scene
-from envs.physics import PhysicsState
+from envs.mujoco.scene import CONTROL_DT, Scene
+from envs.mujoco.worlds import PhysicsState
 from experiments.cli import run_main
 from sgft_jax.types import Array
 

@@ -8,10 +8,12 @@ import jax.numpy as jnp
 
 from envs.base import Env
 from experiments.presets import PretrainConfig
-from sgft_jax import checkpoint, replay, sac, sequences, tdmpc2, tdmpc2_model
-from sgft_jax.config import config_from_json, config_to_json
-from sgft_jax.mpc import MPCConfig
-from sgft_jax.networks import NetworkConfig
+from sgft_jax.data import replay, sequences
+from sgft_jax.io import checkpoint
+from sgft_jax.io.config import config_from_json, config_to_json
+from sgft_jax.learners import sac, tdmpc2, tdmpc2_model
+from sgft_jax.models.networks import NetworkConfig
+from sgft_jax.planning.mpc import MPCConfig
 from sgft_jax.players import Player, mpc_player, sac_player, tdmpc2_player
 from sgft_jax.types import Array, Key, Learner, PyTree, Transition
 

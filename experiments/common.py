@@ -17,8 +17,8 @@ from envs.base import Env, World
 from envs.gaps import Gap
 from envs.rollout import pool_size
 from experiments import cli
-from sgft_jax import checkpoint
-from sgft_jax.config import differences
+from sgft_jax.io import checkpoint
+from sgft_jax.io.config import differences
 from sgft_jax.types import Array, Key, PyTree, UserError
 
 SIM = "sim"
@@ -203,7 +203,7 @@ def film(env: Env, theta: Array, qpos: np.ndarray, path: Path) -> str:
         return f"no video: {env.name} has no scene to draw"
     if reason := cli.select_renderer():
         return f"no video: {reason}"
-    from envs.franka.render import render_episode
+    from envs.mujoco.render import render_episode
 
     path.parent.mkdir(parents=True, exist_ok=True)
     try:

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from experiments.results import Curve, read_curve
-from sgft_jax.jsonfile import read_json
-from sgft_jax.log import EVAL
+from sgft_jax.io.jsonfile import read_json
+from sgft_jax.io.log import EVAL
+from sgft_jax.io.runs import CONFIG
 from sgft_jax.methods import METHODS, finetune_config
-from sgft_jax.runs import CONFIG
 from sgft_jax.types import UserError
 
 ORDER = tuple(reversed(METHODS))  # SGFT first

@@ -10,11 +10,11 @@ import jax
 import numpy as np
 
 import envs
-from envs.physics import Impl
+from envs.mujoco.worlds import Impl
 from experiments import cli, common
 from experiments.algorithms import make_player
 from experiments.evaluation import describe, grade
-from sgft_jax.jsonfile import read_json
+from sgft_jax.io.jsonfile import read_json
 from sgft_jax.types import UserError
 
 _SEED = 2**31 + 2  # held out from training and from the choice of the prior

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from envs.base import Env, World
 from envs.rollout import Episode, Policy, play_episode
-from sgft_jax import stats
+from sgft_jax.analysis import stats
 from sgft_jax.mesh import split_vmap, whole
 from sgft_jax.players import Player
 from sgft_jax.types import Array, Key, Metrics, PyTree

@@ -2,7 +2,7 @@
 
 Of every run, the trials of tuning included, the configuration, its origin, the evaluations, times and final numbers:
 texts of some kilobytes, no checkpoints, policies, rollouts or videos; and what tuning chose. `python -m
-experiments.figures --out docs/data` draws from the copy. Absolute paths become relative (`sgft_jax.runs.plain_path`).
+experiments.figures --out docs/data` draws from the copy. Absolute paths become relative (`runs.plain_path`).
 The command, given again, copies what is new.
 """
 
@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from experiments import cli, tuned
-from sgft_jax.jsonfile import read_json, write_json
-from sgft_jax.log import EVAL, SUMMARY, read_jsonl
-from sgft_jax.runs import CONFIG, PROVENANCE, ROOT, plain_path
+from sgft_jax.io.jsonfile import read_json, write_json
+from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
+from sgft_jax.io.runs import CONFIG, PROVENANCE, ROOT, plain_path
 from sgft_jax.types import UserError
 
 _WHERE = {"finetune": "*/*/*/*", "pretrain": "*/*/*", "tune/finetune": "*/*/*/*"}  # run folders below <out>/<kind>

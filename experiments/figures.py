@@ -19,8 +19,8 @@ from experiments.comparison import (
     split,
 )
 from experiments.results import Curve
-from sgft_jax import plot
-from sgft_jax.stats import iqm_interval
+from sgft_jax.analysis import plot
+from sgft_jax.analysis.stats import iqm_interval
 from sgft_jax.types import UserError
 
 _SAME = 0.05  # of success: evaluations of one policy in two programs differ by as much, on a GPU

@@ -23,13 +23,14 @@ from experiments.evaluation import score
 from experiments.finetune_args import DEFAULT_METHOD, VOLATILE, FinetuneArgs, arguments, check, check_prior, run_folder
 from experiments.finetune_record import Record
 from experiments.finetuning import Program, Reals, Simulation, make_program, simulate
-from sgft_jax import checkpoint, mesh, runs
-from sgft_jax.config import config_to_json
+from sgft_jax import mesh
+from sgft_jax.data.replay import ReplayState
 from sgft_jax.finetune import make_finetuner
 from sgft_jax.finetune_mpc import plan_options
-from sgft_jax.log import RunProgress
+from sgft_jax.io import checkpoint, runs
+from sgft_jax.io.config import config_to_json
+from sgft_jax.io.log import RunProgress
 from sgft_jax.methods import METHODS, FinetuneConfig, Method, dynamics_warmup, lr_warmup, policy_delay
-from sgft_jax.replay import ReplayState
 from sgft_jax.types import Array, Finetuner, Key, PyTree, UserError
 
 _SIMULATED_WORLDS = 256

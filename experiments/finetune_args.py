@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import envs
-from envs.physics import Impl
+from envs.mujoco.worlds import Impl
 from experiments import cli, common
 from experiments.presets import PRESETS
-from sgft_jax import checkpoint
+from sgft_jax.io import checkpoint
 from sgft_jax.methods import FinetuneConfig, Method, check_options, finetune_config, get_method
 from sgft_jax.types import UserError
 

@@ -15,9 +15,10 @@ from envs.rollout import Episode
 from experiments.common import member
 from experiments.results import describe_run, read_curve
 from experiments.video import before_and_after
-from sgft_jax import checkpoint, plot
-from sgft_jax.log import MetricsLog, RealLog, write_summary
-from sgft_jax.stats import iqm_interval
+from sgft_jax.analysis import plot
+from sgft_jax.analysis.stats import iqm_interval
+from sgft_jax.io import checkpoint
+from sgft_jax.io.log import MetricsLog, RealLog, write_summary
 from sgft_jax.types import Array, Metrics, Prior, PyTree
 
 OFFLINE = "offline"  # checkpoints of learning before the first real rollout: those of the run count rollouts

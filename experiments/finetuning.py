@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from envs.base import Env, World
 from envs.rollout import Episode, play_episode
 from experiments.evaluation import play_episodes, prior_policy
-from sgft_jax import replay
+from sgft_jax.data import replay
 from sgft_jax.mesh import split_vmap
 from sgft_jax.players import Player
 from sgft_jax.types import Array, Finetuner, Key, Metrics, PyTree, Simulated, Transition

@@ -20,15 +20,15 @@ import envs
 from envs import gaps
 from envs.base import Env, World
 from envs.gaps import Gap
-from envs.physics import Impl
+from envs.mujoco.worlds import Impl
 from experiments import cli, common
 from experiments.algorithms import describe_use, make_player
 from experiments.evaluation import Best, Outcome, describe, grade, score
 from experiments.presets import PRESETS, PretrainConfig
 from experiments.pretrain import DEFAULT_PRESET, Program, Saved, make_program
 from experiments.pretraining import PretrainState, make_pretrainer, memory
-from sgft_jax.log import MetricsLog, RunProgress, write_summary
-from sgft_jax.stats import iqm_interval
+from sgft_jax.analysis.stats import iqm_interval
+from sgft_jax.io.log import MetricsLog, RunProgress, write_summary
 from sgft_jax.types import Key, Metrics, PyTree, UserError
 
 ZERO_SHOT_AT_MOST, TRAINED_AT_LEAST = 0.40, 0.95

@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import envs
-from envs.physics import Impl
+from envs.mujoco.worlds import Impl
 from experiments import common
 from experiments.finetune import finetune
 from experiments.finetune_args import VOLATILE, FinetuneArgs, arguments, label, run_folder
-from sgft_jax import checkpoint
-from sgft_jax.config import config_to_json
-from sgft_jax.jsonfile import read_json
-from sgft_jax.log import SUMMARY
+from sgft_jax.io import checkpoint
+from sgft_jax.io.config import config_to_json
+from sgft_jax.io.jsonfile import read_json
+from sgft_jax.io.log import SUMMARY
+from sgft_jax.io.runs import CONFIG, InUseError, check_same, in_use
 from sgft_jax.methods import METHODS, get_method
-from sgft_jax.runs import CONFIG, InUseError, check_same, in_use
 from sgft_jax.types import UserError
 
 

@@ -16,14 +16,14 @@ import numpy as np
 import envs
 from envs.base import Entry, Env
 from envs.gaps import Gap
-from envs.physics import Impl
+from envs.mujoco.worlds import Impl
 from envs.rollout import play_episode
 from experiments import cli, common
 from experiments.algorithms import make_player
 from experiments.evaluation import prior_policy
-from sgft_jax import plot
+from sgft_jax.analysis import plot
 from sgft_jax.players import Player
-from sgft_jax.sgft import branch
+from sgft_jax.transforms import branch
 from sgft_jax.types import Array, Imagination, Key, Prior, Transition, UserError
 
 _GRID = 80  # points along each side of the map

@@ -14,17 +14,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs import cartpole
 from envs.base import Env, World
-from envs.physics import Impl
+from envs.control import cartpole
+from envs.mujoco.worlds import Impl
 from envs.rollout import Episode
 from experiments import cli, common
 from experiments.evaluation import play_episodes, score
 from experiments.finetuning import Reals, make_program
-from sgft_jax import checkpoint, normalizer, plot, runs, tdmpc2
+from sgft_jax.analysis import plot
 from sgft_jax.finetune_planner import make_planner
-from sgft_jax.log import EVAL, MetricsLog, RunProgress, read_jsonl, write_summary
+from sgft_jax.io import checkpoint, runs
+from sgft_jax.io.log import EVAL, MetricsLog, RunProgress, read_jsonl, write_summary
+from sgft_jax.learners import tdmpc2
 from sgft_jax.methods import finetune_config, get_method
+from sgft_jax.models import normalizer
 from sgft_jax.types import Array, Key, PyTree, UserError
 
 RETURN_MAX = 1000.0  # of an episode of the DeepMind Control Suite

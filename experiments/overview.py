@@ -20,9 +20,9 @@ from experiments.comparison import (
     split,
 )
 from experiments.results import LEVELS, Curve, left_behind, reached
-from sgft_jax import plot
+from sgft_jax.analysis import plot
+from sgft_jax.analysis.stats import ratio_interval
 from sgft_jax.methods import METHODS
-from sgft_jax.stats import ratio_interval
 
 _LEVEL = LEVELS[0]
 _LEGEND = (

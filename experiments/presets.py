@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from sgft_jax.networks import NetworkConfig, Precision
+from sgft_jax.models.networks import NetworkConfig, Precision
 
 
 @dataclass(frozen=True)

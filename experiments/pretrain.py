@@ -20,7 +20,7 @@ import numpy as np
 import envs
 from envs.base import Env, World
 from envs.gaps import Gap
-from envs.physics import Impl
+from envs.mujoco.worlds import Impl
 from envs.rollout import pick, pool_size
 from experiments import cli, common, hosts
 from experiments.algorithms import describe_use, make_player
@@ -28,8 +28,10 @@ from experiments.evaluation import Best, Outcome, describe, grade, keep_better, 
 from experiments.presets import PRESETS, PretrainConfig
 from experiments.pretraining import PretrainState, make_pretrainer, memory, spread, spread_replay
 from experiments.report import Report, make_report, numbers
-from sgft_jax import checkpoint, mesh, plot, runs
-from sgft_jax.log import EVAL, MetricsLog, RunProgress, read_jsonl, write_summary
+from sgft_jax import mesh
+from sgft_jax.analysis import plot
+from sgft_jax.io import checkpoint, runs
+from sgft_jax.io.log import EVAL, MetricsLog, RunProgress, read_jsonl, write_summary
 from sgft_jax.types import Key, PyTree
 
 DEFAULT_PRESET = "fast"

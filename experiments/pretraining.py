@@ -10,9 +10,10 @@ from envs.base import Env, EnvState, World
 from envs.rollout import Fleet, launch, step_fleet
 from experiments.algorithms import Algorithm, make_algorithm
 from experiments.presets import PretrainConfig
-from sgft_jax import normalizer, replay
+from sgft_jax.data import replay
 from sgft_jax.mesh import split, whole
-from sgft_jax.networks import precision
+from sgft_jax.models import normalizer
+from sgft_jax.models.networks import precision
 from sgft_jax.types import Array, Key, Metrics, PyTree, Transition, UserError
 
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from envs.base import Env, World
 from envs.rollout import Episode
 from experiments.evaluation import play_episodes, prior_policy
-from sgft_jax import value
 from sgft_jax.mesh import whole
+from sgft_jax.models import value
 from sgft_jax.players import Player
 from sgft_jax.types import Array, Key, PyTree
 

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sgft_jax.log import EVAL, read_jsonl
-from sgft_jax.stats import area_under, first_dip, iqm_interval, transitions_to
+from sgft_jax.analysis.stats import area_under, first_dip, iqm_interval, transitions_to
+from sgft_jax.io.log import EVAL, read_jsonl
 from sgft_jax.types import UserError
 
 LEVELS = (90, 98)  # per cent of success: nearly always, and as good as always

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from experiments.results import LEVELS, Curve, area, dip, left_behind
-from sgft_jax.stats import Censored, Interval, iqm_interval, transitions_interval
+from sgft_jax.analysis.stats import Censored, Interval, iqm_interval, transitions_interval
 
 BUDGETS = (10, 20, 50, 100)  # rollouts at which tables compare, as far as a run got
 NONE = "-"

@@ -23,9 +23,9 @@ from experiments import cli, common, grid, tuned
 from experiments.finetune_args import with_settings
 from experiments.grid import Cell, GridArgs
 from experiments.results import area, read_curve
-from sgft_jax import runs
-from sgft_jax.jsonfile import read_json
-from sgft_jax.log import SUMMARY
+from sgft_jax.io import runs
+from sgft_jax.io.jsonfile import read_json
+from sgft_jax.io.log import SUMMARY
 from sgft_jax.methods import default_settings, get_method
 from sgft_jax.types import UserError
 

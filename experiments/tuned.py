@@ -7,7 +7,7 @@ from typing import Any
 
 import envs
 from experiments.finetune_args import FinetuneArgs, with_settings
-from sgft_jax.jsonfile import read_json, write_json
+from sgft_jax.io.jsonfile import read_json, write_json
 from sgft_jax.methods import FinetuneConfig, get_method
 from sgft_jax.types import UserError
 

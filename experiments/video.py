@@ -22,7 +22,7 @@ def before_and_after(env: Env, pool: World, play: Callable[[], Sequence[Episode]
         return f"no video: {env.name} has no scene to draw"
     if reason := cli.select_renderer():
         return f"no video: {reason}"
-    from envs.franka.render import render_side_by_side
+    from envs.mujoco.render import render_side_by_side
 
     episodes = play()
     qpos = [np.concatenate([episode.start.physics.qpos[None], episode.qpos]) for episode in episodes]

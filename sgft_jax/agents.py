@@ -6,12 +6,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sgft_jax import normalizer
-from sgft_jax.iql import IQLConfig, IQLHyper, IQLState, make_iql
+from sgft_jax.learners.iql import IQLConfig, IQLHyper, IQLState, make_iql
+from sgft_jax.learners.sac import SACConfig, SACHyper, SACState, fine_tune_state, make_sac
 from sgft_jax.methods import FinetuneConfig, Method, lr_warmup, policy_delay
-from sgft_jax.networks import fix_first_layer
-from sgft_jax.sac import SACConfig, SACHyper, SACState, fine_tune_state, make_sac
-from sgft_jax.sgft import append_steps_to_go
+from sgft_jax.models import normalizer
+from sgft_jax.models.networks import fix_first_layer
+from sgft_jax.transforms import append_steps_to_go
 from sgft_jax.types import Array, Key, Learner, Prior, PyTree
 
 

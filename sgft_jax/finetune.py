@@ -6,13 +6,15 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from sgft_jax import dynamics, optim, replay, value
 from sgft_jax.agents import make_agent
+from sgft_jax.data import replay
 from sgft_jax.finetune_mpc import make_mpc, make_planned
 from sgft_jax.finetune_planner import make_planner
+from sgft_jax.learners import optim
 from sgft_jax.methods import FinetuneConfig, Method, check_options, dynamics_warmup
-from sgft_jax.networks import make_dynamics, make_value
-from sgft_jax.sgft import append_steps_to_go, compose, relabel
+from sgft_jax.models import dynamics, value
+from sgft_jax.models.networks import make_dynamics, make_value
+from sgft_jax.transforms import append_steps_to_go, compose, relabel
 from sgft_jax.types import (
     Array,
     Finetuner,

@@ -8,9 +8,12 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from sgft_jax import dynamics, mpc, optim, replay
+from sgft_jax.data import replay
+from sgft_jax.learners import optim
 from sgft_jax.methods import FinetuneConfig, Method, dynamics_warmup
-from sgft_jax.networks import add_noise, make_dynamics
+from sgft_jax.models import dynamics
+from sgft_jax.models.networks import add_noise, make_dynamics
+from sgft_jax.planning import mpc
 from sgft_jax.types import Array, Finetuner, Key, Metrics, Prior, PyTree, Simulated, Transition
 
 

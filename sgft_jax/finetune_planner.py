@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from sgft_jax import replay, sequences, tdmpc2, tdmpc2_model
+from sgft_jax.data import replay, sequences
+from sgft_jax.learners import tdmpc2, tdmpc2_model
 from sgft_jax.methods import FinetuneConfig, Method, lr_warmup
 from sgft_jax.types import Array, Finetuner, Key, Metrics, PyTree, Simulated, Transition
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 from sgft_jax import extend
-from sgft_jax.networks import NetworkConfig
-from sgft_jax.sgft import branch, shape, shorten
+from sgft_jax.models.networks import NetworkConfig
+from sgft_jax.transforms import branch, shape, shorten
 from sgft_jax.types import Array, BatchTransform, UserError, unknown
 
 _WARM_TRANSITIONS = 1000  # real ones, for `lr_warmup` and `dynamics_warmup`: 20 to 25 rollouts of the tasks here

@@ -5,9 +5,11 @@ from typing import Any, NamedTuple
 
 import jax
 
-from sgft_jax import dynamics, mpc, tdmpc2, tdmpc2_model, value
-from sgft_jax.networks import NetworkConfig, make_actor, make_dynamics, make_value, tanh_gaussian_action
-from sgft_jax.normalizer import normalize
+from sgft_jax.learners import tdmpc2, tdmpc2_model
+from sgft_jax.models import dynamics, value
+from sgft_jax.models.networks import NetworkConfig, make_actor, make_dynamics, make_value, tanh_gaussian_action
+from sgft_jax.models.normalizer import normalize
+from sgft_jax.planning import mpc
 from sgft_jax.types import Array, Key, Prior, PyTree
 
 

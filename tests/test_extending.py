@@ -14,8 +14,10 @@ import pytest
 import envs
 from envs import gaps
 from experiments import cli, figures, finetune, pretrain
-from sgft_jax import NetworkConfig, Transition, UserError, checkpoint, extend, get_method, sac
-from sgft_jax.config import config_to_json
+from sgft_jax import NetworkConfig, Transition, UserError, extend, get_method
+from sgft_jax.io import checkpoint
+from sgft_jax.io.config import config_to_json
+from sgft_jax.learners import sac
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "docs/examples"

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Entry, Env, EnvState, Parameter, World
-from envs.franka.task import distort, make_effects, measure
+from envs.mujoco.scene import distort, make_effects, measure
 from sgft_jax.types import Array, Key, UserError
 
 DT, FORCE, TOLERANCE = 0.1, 4.0, 0.15  # s, N at full action, m

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from sgft_jax import NetworkConfig, Prior, Transition, checkpoint, finetune_config, get_method, make_finetuner
-from sgft_jax.config import config_from_json
+from sgft_jax import NetworkConfig, Prior, Transition, finetune_config, get_method, make_finetuner
+from sgft_jax.io import checkpoint
+from sgft_jax.io.config import config_from_json
 
 
 class PretendedRobot:

@@ -12,8 +12,8 @@ import numpy as np
 from envs.base import Env
 from envs.franka import arm, push, soft
 from envs.franka.arm import NO_CONTACT
-from envs.franka.task import Scene, at_rest, make_env
-from envs.physics import PhysicsState
+from envs.mujoco.scene import Scene, at_rest, make_env
+from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array, Key
 
 RADIUS = 0.035  # m

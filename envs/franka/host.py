@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.franka.task import Scene
-from envs.physics import PhysicsState
+from envs.mujoco.scene import Scene
+from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array
 
 

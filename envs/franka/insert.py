@@ -20,8 +20,8 @@ from envs.base import Entry, Env, Parameter
 from envs.franka import arm, kinematics
 from envs.franka.arm import NO_CONTACT
 from envs.franka.kinematics import DOWN, Pose
-from envs.franka.task import Scene, at_rest, clip_joints, make_env, new_spec
-from envs.physics import PhysicsState
+from envs.mujoco.scene import Scene, at_rest, clip_joints, make_env, new_spec
+from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array, Key
 
 SUBSTEPS = 40

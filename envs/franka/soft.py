@@ -17,8 +17,8 @@ import numpy as np
 from envs.base import Parameter
 from envs.franka import arm, push
 from envs.franka.arm import NO_CONTACT
-from envs.franka.task import Scene, new_spec
-from envs.physics import PhysicsState
+from envs.mujoco.scene import Scene, new_spec
+from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array
 
 TABLE = "table"

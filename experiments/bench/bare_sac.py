@@ -1,9 +1,8 @@
 """The reference for the speed of updates: pretraining's SAC update written by hand for whole batches, in bare JAX.
 
-The same networks, losses and Adam as `sgft_jax.sac` in pretraining (twin critic, actor, temperature, V, dynamics
+The same networks, losses and Adam as the SAC learner has in pretraining (twin critic, actor, temperature, V, dynamics
 ensemble, target average), without Flax, Optax, vmap over examples, or metrics. A test checks that both do the same
 arithmetic.
-"""
 
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -11,8 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.networks import LOG_STD_MAX, LOG_STD_MIN, NetworkConfig
-from sgft_jax.sac import LOG_ALPHA_MIN, SACHyper
+from sgft_jax.learners.sac import LOG_ALPHA_MIN, SACHyper
+from sgft_jax.models.networks import LOG_STD_MAX, LOG_STD_MIN, NetworkConfig
 from sgft_jax.types import Array, Key, PyTree, Transition
 
 

@@ -20,9 +20,9 @@ import numpy as np
 from mujoco import mjx
 
 import envs
-from envs import engine_warp
 from envs.base import Env, World
-from envs.physics import PhysicsState
+from envs.mujoco.engines import warp as engine_warp
+from envs.mujoco.worlds import PhysicsState
 from envs.rollout import Fleet, launch, step_fleet
 from experiments.bench.timing import Timing, ahead, fastest, measure
 from sgft_jax.types import Array, Key

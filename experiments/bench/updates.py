@@ -9,9 +9,9 @@ import jax.numpy as jnp
 
 from experiments.bench import bare_sac, other_sac
 from experiments.bench.timing import Timing, fastest, measure
-from sgft_jax import replay
-from sgft_jax.networks import NetworkConfig, Precision, precision
-from sgft_jax.sac import SACConfig, SACHyper, make_sac
+from sgft_jax.data import replay
+from sgft_jax.learners.sac import SACConfig, SACHyper, make_sac
+from sgft_jax.models.networks import NetworkConfig, Precision, precision
 from sgft_jax.types import Key, PyTree, Transition
 
 OBS_DIM, ACT_DIM, MEMBERS = 12, 3, 5  # sizes of the updates, a manipulation task's

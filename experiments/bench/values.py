@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 
 import envs
-from envs.physics import Impl
+from envs.mujoco.worlds import Impl
 from experiments import common
 from experiments.algorithms import make_player, network_of
 from experiments.evaluation import play_episodes, prior_policy
-from sgft_jax.networks import Precision, make_value
+from sgft_jax.models.networks import Precision, make_value
+from sgft_jax.models.value import predict
 from sgft_jax.types import Array, Prior, Transition, UserError
-from sgft_jax.value import predict
 
 EPISODES = 64
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from franka_bench import SCENES, member
 
-from envs.franka import task
-from envs.franka.task import make_env
+from envs.mujoco import scene as task
+from envs.mujoco.scene import make_env
 
 KEYS = jax.random.split(jax.random.key(3), 4)
 ACTIONS = jnp.array([[1.0, 0.0], [0.3, -1.0], [-0.5, 0.5], [1.0, 1.0]])

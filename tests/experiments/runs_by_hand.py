@@ -4,7 +4,7 @@ import json
 
 from experiments.comparison import split
 from experiments.finetune_args import FinetuneArgs, arguments
-from sgft_jax.config import config_to_json
+from sgft_jax.io.config import config_to_json
 from sgft_jax.methods import METHODS
 
 STEPS = 20  # of an episode

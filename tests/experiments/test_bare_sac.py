@@ -7,8 +7,8 @@ import pytest
 
 from experiments.bench import bare_sac
 from experiments.bench.updates import ACT_DIM, MEMBERS, OBS_DIM, multiplications, rows
-from sgft_jax.networks import NetworkConfig
-from sgft_jax.sac import SACConfig, SACHyper, make_sac
+from sgft_jax.learners.sac import SACConfig, SACHyper, make_sac
+from sgft_jax.models.networks import NetworkConfig
 
 NETWORK, BATCH = NetworkConfig(hidden=(16, 16), layer_norm=True), 8
 HYPER = SACHyper(tau=0.1, alpha=0.3)
@@ -25,7 +25,7 @@ def layers(params):
 
 
 def noise_of(key):
-    """The numbers that `sgft_jax.sac` draws from this key."""
+    """The numbers that `sgft_jax.learners.sac` draws from this key."""
     key_target, key_actor, key_dynamics = jax.random.split(key, 3)
     normal = lambda key: jax.random.normal(key, (ACT_DIM,))  # noqa: E731
     target, actor = (jax.vmap(normal)(jax.random.split(k, BATCH)) for k in (key_target, key_actor))

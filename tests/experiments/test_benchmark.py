@@ -13,12 +13,12 @@ from test_common import save_prior
 
 import envs
 from envs.franka import hammer
-from envs.physics import PhysicsState
+from envs.mujoco.worlds import PhysicsState
 from experiments import benchmark
 from experiments.bench import other_sac, physics, training, updates, values
 from experiments.bench.timing import fastest, measure
 from experiments.benchmark import BenchmarkConfig, main
-from sgft_jax import value
+from sgft_jax.models import value
 from sgft_jax.types import UserError
 
 

@@ -9,10 +9,10 @@ import toy
 
 from envs.gaps import Gap
 from experiments import algorithms, common
-from sgft_jax import checkpoint
-from sgft_jax.config import config_to_json
-from sgft_jax.networks import NetworkConfig
-from sgft_jax.sac import SACConfig, extract_prior, make_sac
+from sgft_jax.io import checkpoint
+from sgft_jax.io.config import config_to_json
+from sgft_jax.learners.sac import SACConfig, extract_prior, make_sac
+from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.types import UserError
 
 NETWORK = NetworkConfig(hidden=(8,))

@@ -7,8 +7,8 @@ import pytest
 
 import envs
 from experiments import cli, compare, grid
-from sgft_jax import checkpoint
-from sgft_jax.runs import Lock
+from sgft_jax.io import checkpoint
+from sgft_jax.io.runs import Lock
 from sgft_jax.types import UserError
 
 GRID = {"tasks": ("push", "insert"), "methods": ("sgft-sac", "rlpd"), "seeds": 2, "rollouts": 10}

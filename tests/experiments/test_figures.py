@@ -7,7 +7,7 @@ from runs_by_hand import save
 import envs
 from experiments import cli, figures, tables
 from experiments.results import read_curve
-from sgft_jax.stats import Censored, Interval
+from sgft_jax.analysis.stats import Censored, Interval
 
 
 @pytest.fixture(autouse=True)

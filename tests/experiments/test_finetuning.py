@@ -18,8 +18,8 @@ import envs
 from experiments import cli, evaluate, finetune, finetuning, video
 from experiments.algorithms import make_player
 from experiments.evaluation import play_episodes
-from sgft_jax import checkpoint, runs
-from sgft_jax.log import RealLog, read_jsonl
+from sgft_jax.io import checkpoint, runs
+from sgft_jax.io.log import RealLog, read_jsonl
 from sgft_jax.methods import FinetuneConfig, get_method
 from sgft_jax.types import UserError
 
@@ -34,7 +34,7 @@ import envs
 envs.TASKS["toy"] = "toy"
 from experiments import finetune
 from experiments.finetune_record import Record
-from sgft_jax.log import MetricsLog
+from sgft_jax.io.log import MetricsLog
 """
 PROGRAM = f"""{START}
 write = MetricsLog.metrics
@@ -396,14 +396,14 @@ def test_no_scene_no_renderer_or_a_broken_one_is_a_notice(tmp_path, monkeypatch)
     assert film(tmp_path, monkeypatch, scene, "no library")[0] == "no video: no library"
     for error in (UserError("no graphics"), RuntimeError("no encoder\nat all")):
         monkeypatch.setattr(
-            "envs.franka.render.render_side_by_side", lambda *_, error=error: (_ for _ in ()).throw(error)
+            "envs.mujoco.render.render_side_by_side", lambda *_, error=error: (_ for _ in ()).throw(error)
         )
         assert film(tmp_path, monkeypatch, scene)[0] == f"no video: {str(error).splitlines()[0]}"
 
 
 def test_both_policies_are_filmed_from_one_start_in_one_world(tmp_path, monkeypatch):
     seen = []
-    monkeypatch.setattr("envs.franka.render.render_side_by_side", lambda *given: seen.append(given))
+    monkeypatch.setattr("envs.mujoco.render.render_side_by_side", lambda *given: seen.append(given))
     said, pool = film(tmp_path, monkeypatch, object())
     _, thetas, (before, after), captions, path = seen[0]
     assert said == f"video: {path}" and path.parent.exists()

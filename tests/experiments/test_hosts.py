@@ -13,8 +13,9 @@ import pytest
 
 import envs
 from experiments import hosts, pretrain
-from sgft_jax import checkpoint, mesh
-from sgft_jax.log import read_jsonl
+from sgft_jax import mesh
+from sgft_jax.io import checkpoint
+from sgft_jax.io.log import read_jsonl
 from sgft_jax.types import UserError
 
 TESTS = Path(__file__).parent.parent

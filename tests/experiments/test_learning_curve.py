@@ -8,8 +8,8 @@ import toy
 
 from experiments import cli, learning_curve
 from experiments.learning_curve import LearningCurveArgs, main
-from sgft_jax import tdmpc2_model
-from sgft_jax.log import MetricsLog, read_jsonl
+from sgft_jax.io.log import MetricsLog, read_jsonl
+from sgft_jax.learners import tdmpc2_model
 from sgft_jax.types import UserError
 
 SMALL = {

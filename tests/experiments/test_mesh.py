@@ -12,14 +12,15 @@ import toy
 from jax.sharding import PartitionSpec
 
 import envs
-from envs import engine_c
-from envs.physics import PhysicsState
+from envs.mujoco.engines import c as engine_c
+from envs.mujoco.worlds import PhysicsState
 from experiments import cli, pretrain
 from experiments.common import seed_keys, stack
 from experiments.presets import PretrainConfig
 from experiments.pretraining import spread_replay
-from sgft_jax import mesh, replay
-from sgft_jax.networks import NetworkConfig
+from sgft_jax import mesh
+from sgft_jax.data import replay
+from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.types import UserError
 
 CONFIG = PretrainConfig(

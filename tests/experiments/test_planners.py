@@ -14,8 +14,9 @@ import envs
 from experiments import cli, evaluate, finetune, pretrain
 from experiments.algorithms import make_player
 from experiments.evaluation import grade
-from sgft_jax import checkpoint, tdmpc2, tdmpc2_model
-from sgft_jax.log import read_jsonl
+from sgft_jax.io import checkpoint
+from sgft_jax.io.log import read_jsonl
+from sgft_jax.learners import tdmpc2, tdmpc2_model
 
 PRETRAIN = """--task toy --preset tdmpc2 --no-video --config.size tiny --config.plan-samples 24 --config.n-envs 16
     --config.worlds 8 --config.env-steps 640 --config.random-transitions 160 --config.replay-capacity 320

@@ -19,9 +19,9 @@ from experiments.algorithms import network_of, sac_hyper
 from experiments.evaluation import Best, keep_better
 from experiments.presets import PRESETS
 from experiments.pretraining import make_pretrainer
-from sgft_jax import checkpoint
-from sgft_jax.log import MetricsLog, read_jsonl
-from sgft_jax.networks import NetworkConfig
+from sgft_jax.io import checkpoint
+from sgft_jax.io.log import MetricsLog, read_jsonl
+from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.types import Normalizer, Prior
 
 TESTS = Path(__file__).parent.parent
@@ -35,7 +35,7 @@ import os, signal, sys
 import envs
 envs.TASKS["toy"] = "toy"
 from experiments import pretrain
-from sgft_jax.log import MetricsLog
+from sgft_jax.io.log import MetricsLog
 write = MetricsLog.metrics
 def metrics(self, *args):
     write(self, *args)

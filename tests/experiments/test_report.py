@@ -5,9 +5,9 @@ import pytest
 import toy
 
 from experiments.report import make_report, numbers
-from sgft_jax.networks import NetworkConfig
+from sgft_jax.learners.sac import SACConfig, extract_prior, make_sac
+from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.players import sac_player
-from sgft_jax.sac import SACConfig, extract_prior, make_sac
 
 NETWORK = NetworkConfig(hidden=(4,))
 

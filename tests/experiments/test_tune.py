@@ -11,8 +11,8 @@ from test_common import save_prior
 import envs
 from experiments import cli, compare, finetune, grid, tune, tuned
 from experiments.finetune_args import arguments, run_folder
-from sgft_jax import checkpoint
-from sgft_jax.config import config_to_json
+from sgft_jax.io import checkpoint
+from sgft_jax.io.config import config_to_json
 from sgft_jax.methods import METHODS, default_settings
 from sgft_jax.types import UserError
 

@@ -13,8 +13,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sgft_jax import iql, networks, sac, tdmpc2, tdmpc2_model
-from sgft_jax.sequences import Sequences
+from sgft_jax.data.sequences import Sequences
+from sgft_jax.learners import iql, sac, tdmpc2, tdmpc2_model
+from sgft_jax.models import networks
 from sgft_jax.types import Learner, Transition
 
 ROWS = 32

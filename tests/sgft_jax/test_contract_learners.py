@@ -10,7 +10,10 @@ import probes
 import pytest
 from probes import MAKERS, PROBES
 
-from sgft_jax import checkpoint, finetune, methods, networks, sac, tdmpc2, tdmpc2_model
+from sgft_jax import finetune, methods
+from sgft_jax.io import checkpoint
+from sgft_jax.learners import sac, tdmpc2, tdmpc2_model
+from sgft_jax.models import networks
 from sgft_jax.types import Transition
 
 PLANNERS = {"tdmpc2", "sgft-tdmpc2"}

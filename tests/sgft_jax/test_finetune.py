@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax import agents, dynamics, finetune, methods, networks, normalizer, sac
+from sgft_jax import agents, finetune, methods
+from sgft_jax.learners import sac
+from sgft_jax.models import dynamics, networks, normalizer
 from sgft_jax.types import Transition, UserError
 
 NET = networks.NetworkConfig(hidden=(16,))

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax import finetune, methods, tdmpc2, tdmpc2_model
+from sgft_jax import finetune, methods
+from sgft_jax.learners import tdmpc2, tdmpc2_model
 from sgft_jax.types import Normalizer, Transition
 
 T, LENGTH = 12, 2

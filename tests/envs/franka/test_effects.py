@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.franka import task
+from envs.mujoco import scene as task
 from sgft_jax.types import UserError
 
 KEY = jax.random.key(0)

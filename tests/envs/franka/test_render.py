@@ -9,7 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from envs.franka import hammer, insert, push, render
+from envs.franka import hammer, insert, push
+from envs.mujoco import render
 from experiments.cli import select_renderer
 from sgft_jax.types import UserError
 

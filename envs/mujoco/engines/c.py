@@ -1,0 +1,115 @@
+"""MuJoCo's C engine behind a callback, as the engine of a scene. Impure inside, pure outside.
+
+On a CPU, XLA's program of an MJX step takes two to three times as long as C MuJoCo's, and many seconds to compile. The
+worlds of a batch are shared among as many threads as there are cores.
+
+On a CPU the callback works on XLA's own buffers. `jax.pure_callback`, which serves the other platforms, first makes
+JAX arrays of its arguments, and the copies wait for threads that may all be busy with programs that wait for them
+(https://github.com/jax-ml/jax/issues/24255).
+"""
+
+import concurrent.futures
+import copy
+import functools
+import os
+import threading
+import warnings
+from typing import Any, NamedTuple
+
+import jax
+import mujoco
+import mujoco.rollout
+import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
+
+from envs.mujoco.engines.mjx import MEAN_INERTIA, Advance
+from sgft_jax.types import Array, PyTree
+
+
+class _Slot(NamedTuple):
+    """What a thread steps worlds in, one after another. views: name of a field -> the array inside `model`."""
+
+    rollout: mujoco.rollout.Rollout
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    views: dict[str, np.ndarray]
+
+
+def make_advance(host: mujoco.MjModel, fields: tuple[str, ...]) -> Advance:
+    """The engine of a compiled scene; fields: names that a world may set in the model.
+
+    Under `vmap` all worlds reach the host together. States that MuJoCo would reset, because they explode, come back as
+    they are: not finite.
+    """
+    mujoco.set_mju_user_warning(_warn)
+    nominal = copy.deepcopy(host)
+    nominal.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    arrays = tuple(name for name in fields if name != MEAN_INERTIA)
+    cores = os.cpu_count() or 1
+    threads = concurrent.futures.ThreadPoolExecutor(cores)
+    lock = threading.Lock()  # XLA may run two programs at once
+
+    def new_slot() -> _Slot:
+        model = copy.deepcopy(nominal)
+        views = {name: getattr(model, name) for name in arrays}
+        return _Slot(mujoco.rollout.Rollout(nthread=0), model, mujoco.MjData(model), views)
+
+    slots = [new_slot() for _ in range(cores)]
+
+    def on_host(values: dict[str, Any], state: Any, controls: Any) -> Any:
+        values, state, controls = jax.tree.map(np.asarray, (values, state, controls))
+        lead = state.qpos.shape[:-1]
+        flat = lambda x: x.reshape(-1, *x.shape[len(lead) :])  # noqa: E731
+        values, state, controls = jax.tree.map(flat, (values, state, controls))
+        after = jax.tree.map(np.empty_like, state)
+
+        def run(k: int) -> None:
+            slot = slots[k]
+            for i in range(k, len(controls), cores):
+                _enter(slot, {name: x[i] for name, x in values.items()})
+                _steps(slot, jax.tree.map(lambda x, i=i: x[i], state), controls[i])
+                after.qpos[i], after.qvel[i] = slot.data.qpos, slot.data.qvel
+                after.warmstart[i], after.ctrl[i] = slot.data.qacc_warmstart, controls[i, -1]
+
+        with lock:
+            list(threads.map(run, range(min(cores, len(controls)))))
+        return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), after)
+
+    def in_place(context: Any, after: Any, *args: Any) -> None:
+        jax.tree.map(lambda out, x: np.copyto(np.asarray(out), x), after, on_host(*args))
+
+    def advance(values: dict[str, Array], state: PyTree, controls: Array) -> PyTree:
+        shape = jax.eval_shape(lambda: state)
+        on_cpu = buffer_callback(in_place, shape, vmap_method="broadcast_all")
+        elsewhere = functools.partial(jax.pure_callback, on_host, shape, vmap_method="broadcast_all")
+        return jax.lax.platform_dependent(values, state, controls, cpu=on_cpu, default=elsewhere)
+
+    return advance
+
+
+def _warn(message: str) -> None:
+    """Instead of a log file in the working directory. What is unstable is told by the state itself."""
+    if "unstable" not in message:
+        warnings.warn(message, RuntimeWarning, stacklevel=2)
+
+
+def _enter(slot: _Slot, values: dict[str, np.ndarray]) -> None:
+    """Make the slot's model that of one world."""
+    for name, value in values.items():
+        if name == MEAN_INERTIA:
+            slot.model.stat.meaninertia = float(value)
+        else:
+            slot.views[name][...] = value
+
+
+def _steps(slot: _Slot, state: Any, controls: np.ndarray) -> None:
+    """All steps under `controls` [substeps, nu], in one call that leaves Python's lock to the other threads."""
+    model, data = slot.model, slot.data
+    mujoco.mj_resetData(model, data)
+    start = np.concatenate([[0.0], state.qpos, state.qvel])  # time comes first
+    rolled = np.empty((1, len(controls), len(start)))
+    slot.rollout.rollout(
+        [model], [data], start[None], controls[None].astype(np.float64), skip_checks=True, nstep=len(controls),
+        initial_warmstart=state.warmstart[None].astype(np.float64), state=rolled,
+        sensordata=np.empty((1, len(controls), model.nsensordata)),
+    )  # fmt: skip

@@ -1,0 +1,216 @@
+"""Pictures and videos of episodes, drawn by C MuJoCo. Impure: uses a graphics context and writes files.
+
+Rendering needs a graphics library but no screen: set MUJOCO_GL to egl or osmesa before MuJoCo is first imported.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from envs.franka.arm import NO_CONTACT
+from envs.mujoco.scene import CONTROL_DT, Scene
+from sgft_jax.types import UserError
+
+FPS = 10
+SPEED = 2  # times the robot's: a graphics library without a graphics card needs 0.2 s a frame
+SIZE = 360, 480  # height, width in pixels
+CAPTION = 44  # pixels, height of the strip above a captioned video
+JUMP = 0.5  # m or rad in one control step: an event, such as a puck that fell, and nothing to draw in between
+SUPERSAMPLING = 2  # drawn so many times larger, then averaged: smooth edges on every backend
+WHITE, GREY, DARK = [0.93, 0.94, 0.95, 1.0], [0.60, 0.62, 0.65, 1.0], [0.20, 0.21, 0.24, 1.0]
+
+
+def _corners(back: float, front: float, side: float) -> tuple[tuple[float, float], ...]:
+    return tuple((x, y) for x in (back, front) for y in (-side, side))
+
+
+class View(NamedTuple):
+    """Where a viewer stands and what the scene stands on; lengths in m, angles in degrees.
+
+    The camera looks at `target` [3] from `distance` away (MuJoCo's free camera). floor: its height. legs: xy of the
+    table's legs, which reach from the floor to 4 cm below z = 0.
+    """
+
+    target: tuple[float, float, float]
+    distance: float
+    azimuth: float
+    elevation: float
+    floor: float = 0.0
+    legs: tuple[tuple[float, float], ...] = ()
+
+
+DEFAULT_VIEW = View((0.35, 0.0, 0.25), 1.8, 140.0, -22.0)
+VIEWS = {
+    "push": View((0.36, 0.0, 0.12), 1.6, 140.0, -27.0, -0.75, _corners(-0.2, 0.7, 0.55)),
+    # From the front, all of the edge in sight: the hand, which comes from behind, hides nothing of what it pushes.
+    "push-towel": View((0.58, 0.0, 0.04), 0.86, 172.0, -36.0, -0.75, _corners(-0.2, 0.7, 0.55)),
+    "push-ball": View((0.58, 0.0, 0.05), 0.88, 172.0, -30.0, -0.75, _corners(-0.2, 0.7, 0.55)),
+    "hammer": View((0.22, 0.0, 0.44), 1.4, 122.0, -14.0),
+    "insert": View((0.46, 0.0, 0.09), 0.7, 135.0, -24.0, -0.75, _corners(-0.15, 0.75, 0.4)),
+}
+
+
+def render_episode(
+    scene: Scene, theta: Mapping[str, float] | Sequence[float], qpos: np.ndarray, path: Path, *, picture_at: float = 0.5
+) -> None:
+    """Writes the episode as `path` (.mp4) and one frame of it as .png beside it.
+
+    theta: domain parameters by name or in the order of `scene.parameters`. qpos: [T + 1, nq], one per control step.
+    picture_at: which frame, 0 = first, 1 = last. Raises UserError when MuJoCo cannot render here.
+    """
+    frames = list(_frames(scene, theta, qpos))
+    _write(path, frames, picture_at)
+
+
+def render_side_by_side(
+    scene: Scene,
+    thetas: Sequence[Mapping[str, float] | Sequence[float]],
+    episodes: Sequence[np.ndarray],
+    captions: Sequence[str],
+    path: Path,
+    *,
+    picture_at: float = 0.5,
+) -> None:
+    """Writes several episodes of one task as one video, side by side, each under its caption; see `render_episode`.
+
+    An episode that ends earlier shows its last frame until the end.
+    """
+    columns = [
+        [np.concatenate([strip, frame]) for frame in _frames(scene, theta, qpos)]
+        for theta, qpos, strip in zip(thetas, episodes, map(_caption, captions), strict=True)
+    ]
+    length = max(map(len, columns))
+    frames = [np.concatenate([c[min(i, len(c) - 1)] for c in columns], axis=1) for i in range(length)]
+    _write(path, frames, picture_at)
+
+
+def smooth(qpos: np.ndarray, *, fps: int) -> np.ndarray:
+    """[frames, nq]: qpos [T + 1, nq] at control steps, linear in between; jumps stay jumps."""
+    steps = round(CONTROL_DT * fps)
+    index = np.arange(steps * (len(qpos) - 1) + 1) / steps
+    before = np.floor(index).astype(int)
+    after = np.minimum(before + 1, len(qpos) - 1)
+    move = qpos[after] - qpos[before]
+    move = np.where(np.abs(move) > JUMP, 0.0, move)
+    return qpos[before] + (index - before)[:, None] * move
+
+
+def _frames(scene: Scene, theta: Mapping[str, float] | Sequence[float], qpos: np.ndarray) -> Iterator[np.ndarray]:
+    values = theta.values() if isinstance(theta, Mapping) else theta
+    by_name = dict(zip([p.name for p in scene.parameters], map(float, values), strict=True))
+    view = VIEWS.get(scene.name, DEFAULT_VIEW)
+    spec = scene.build(by_name)
+    scene.dress(spec)
+    model = dressed(spec, view).compile()
+    data = mujoco.MjData(model)
+    camera = _camera(view)
+    renderer = _renderer(model)
+    try:
+        for row in smooth(np.asarray(qpos), fps=FPS // SPEED):
+            data.qpos[:] = row
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, camera)
+            yield _shrink(renderer.render())
+    finally:
+        renderer.close()
+
+
+def dressed(spec: mujoco.MjSpec, view: View) -> mujoco.MjSpec:
+    """The scene with what only a viewer needs: floor, sky, lights, table legs, the robot's livery."""
+    _add_surroundings(spec, view)
+    _add_lights(spec)
+    for body in spec.bodies:
+        if body.name.startswith("link"):
+            _paint_link(body)
+    world, cylinder = spec.worldbody, mujoco.mjtGeom.mjGEOM_CYLINDER
+    world.add_geom(type=cylinder, size=[0.11, 0.015, 0], pos=[0, 0, 0.015], rgba=DARK, **NO_CONTACT)
+    world.add_geom(type=cylinder, size=[0.09, 0.09, 0], pos=[0, 0, 0.09], rgba=WHITE, **NO_CONTACT)
+    spec.stat.extent, spec.stat.center = 1.5, [0.3, 0, 0.3]
+    visual = spec.visual
+    visual.map.znear, visual.map.zfar = 0.02, 20
+    visual.quality.shadowsize, visual.quality.offsamples = 2048, 0
+    visual.global_.offheight, visual.global_.offwidth = (SUPERSAMPLING * n for n in SIZE)
+    return spec
+
+
+def _add_surroundings(spec: mujoco.MjSpec, view: View) -> None:
+    look = {"width": 256, "height": 256}
+    gradient, checker = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, mujoco.mjtBuiltin.mjBUILTIN_CHECKER
+    sky, flat = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtTexture.mjTEXTURE_2D
+    spec.add_texture(name="sky", type=sky, builtin=gradient, rgb1=[0.92, 0.94, 0.97], rgb2=[0.6, 0.67, 0.77], **look)
+    spec.add_texture(name="tiles", type=flat, builtin=checker, rgb1=[0.84, 0.85, 0.87], rgb2=[0.78, 0.8, 0.82], **look)
+    tiles = spec.add_material(name="tiles", texrepeat=[8, 8], reflectance=0.0)
+    tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
+    plane, box = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX
+    spec.worldbody.add_geom(type=plane, size=[6, 6, 0.1], pos=[0, 0, view.floor], material="tiles", **NO_CONTACT)
+    half = -(view.floor + 0.04) / 2
+    for x, y in view.legs:
+        spec.worldbody.add_geom(type=box, size=[0.02, 0.02, half], pos=[x, y, -0.04 - half], rgba=DARK, **NO_CONTACT)
+
+
+def _add_lights(spec: mujoco.MjSpec) -> None:
+    for light in spec.lights:
+        spec.delete(light)
+    sun = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
+    add = spec.worldbody.add_light
+    add(type=sun, pos=[0.9, -1.0, 2.5], dir=[-0.35, 0.4, -1.0], diffuse=[0.5] * 3, specular=[0.2] * 3, castshadow=True)
+    add(type=sun, pos=[0.5, 1.5, 2.0], dir=[0.3, -0.7, -0.6], diffuse=[0.2] * 3, specular=[0.0] * 3, castshadow=False)
+    spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.35] * 3, [0.2] * 3
+
+
+def _paint_link(body: mujoco.MjsBody) -> None:
+    """White links with a grey ring at each joint; the first geom of a link is its capsule."""
+    capsule = body.geoms[0]
+    capsule.rgba = WHITE
+    radius, cylinder = 1.06 * capsule.size[0], mujoco.mjtGeom.mjGEOM_CYLINDER
+    body.add_geom(type=cylinder, size=[radius, 0.35 * radius, 0], rgba=GREY, mass=0, **NO_CONTACT)
+
+
+def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
+    try:
+        return mujoco.Renderer(model, *(SUPERSAMPLING * n for n in SIZE))
+    except Exception as error:  # MuJoCo raises whatever its graphics backend does
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise UserError(
+            f"MuJoCo cannot render here ({reason}); install libegl1 or libosmesa6 and set MUJOCO_GL to egl or osmesa"
+        ) from error
+
+
+def _camera(view: View) -> mujoco.MjvCamera:
+    camera = mujoco.MjvCamera()
+    camera.lookat[:], camera.distance = view.target, view.distance
+    camera.azimuth, camera.elevation = view.azimuth, view.elevation
+    return camera
+
+
+def _shrink(image: np.ndarray) -> np.ndarray:
+    n = SUPERSAMPLING
+    blocks = image.reshape(SIZE[0], n, SIZE[1], n, 3).astype(np.uint16)
+    return (blocks.sum((1, 3)) // n**2).astype(np.uint8)
+
+
+def _caption(text: str) -> np.ndarray:
+    """[CAPTION, width, 3] a strip with the text, shrunk until it fits."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    strip = Image.new("RGB", (SIZE[1], CAPTION), (28, 30, 36))
+    draw = ImageDraw.Draw(strip)
+    size = 24.0
+    while draw.textlength(text, font=ImageFont.load_default(size)) > SIZE[1] - 24 and size > 8:
+        size -= 1.0
+    middle = SIZE[1] / 2, CAPTION / 2
+    draw.text(middle, text, fill=(240, 240, 240), font=ImageFont.load_default(size), anchor="mm")
+    return np.asarray(strip)
+
+
+def _write(path: Path, frames: list[np.ndarray], picture_at: float) -> None:
+    import imageio_ffmpeg
+    import mediapy
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
+    mediapy.write_video(path.with_suffix(".mp4"), frames, fps=FPS, crf=20)
+    mediapy.write_image(path.with_suffix(".png"), frames[round(picture_at * (len(frames) - 1))])

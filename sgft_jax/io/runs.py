@@ -1,0 +1,270 @@
+"""Impure: the life of a run folder: made once, resumed or replaced on request, with its configuration and origin."""
+
+import dataclasses
+import fcntl
+import importlib.metadata
+import os
+import platform
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from sgft_jax.io.config import config_to_json, differences
+from sgft_jax.io.jsonfile import read_json, write_json
+from sgft_jax.types import UserError
+
+CONFIG, PROVENANCE = "config.json", "provenance.json"
+ROOT = Path(__file__).parent.parent  # of the repository, in a checkout
+_LOCK = ".lock"
+_MARK = "sgft_jax"
+_PACKAGES = ("sgft-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
+
+
+class InUseError(UserError):
+    """Another process has the run folder open."""
+
+
+class Lock:
+    """An exclusive lock on a folder, held until `release()`, collection or the end of the process, however it ends.
+
+    Raises InUseError if another process, or another Run of this one, holds it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        handle = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+        self.release = weakref.finalize(self, os.close, handle)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.release()
+            raise InUseError(f"{folder}: another process is writing to it") from None
+
+
+def in_use(folder: Path) -> bool:
+    """Whether somebody holds the lock of a run folder."""
+    if not (folder / _LOCK).exists():
+        return False
+    try:
+        Lock(folder).release()
+    except InUseError:
+        return True
+    return False
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """An open run folder, locked against other processes; `resumed`: it holds an earlier start of the same run."""
+
+    folder: Path
+    resumed: bool
+    lock: Lock = dataclasses.field(repr=False)
+
+    @property
+    def prior(self) -> Path:
+        """Where pretraining saves its prior."""
+        return self.folder / "prior"
+
+    def made(self, name: str) -> Path:
+        """The sub-folder `name` (`figures`, `videos`), created if needed."""
+        path = self.folder / name
+        path.mkdir(exist_ok=True)
+        return path
+
+    def close(self) -> None:
+        """Let other processes open the folder."""
+        self.lock.release()
+
+
+def open_run(
+    folder: Path,
+    *,
+    kind: str,
+    config: Any,
+    resume: bool = False,
+    overwrite: bool = False,
+    volatile: tuple[str, ...] = ("resume", "overwrite"),
+    say: Callable[[str], None] = print,
+) -> Run:
+    """Create or reopen a run folder, say where it is, and record configuration and provenance in it.
+
+    kind: what writes there ("pretrain", "finetune"). config: a frozen dataclass. volatile: dotted names of fields that
+    may differ on a resume. Raises UserError if the folder holds something already and neither `resume` nor `overwrite`
+    is set, if it is not a run folder, if the stored configuration differs, or if another process has it open.
+    """
+    configs = {Path(folder): config_to_json(config)}
+    return open_runs(configs, kind=kind, resume=resume, overwrite=overwrite, volatile=volatile, say=say)[0]
+
+
+def open_runs(
+    configs: Mapping[Path, Mapping[str, Any]],
+    *,
+    kind: str,
+    resume: bool = False,
+    overwrite: bool = False,
+    volatile: tuple[str, ...] = ("resume", "overwrite"),
+    inputs: Mapping[str, Any] | None = None,
+    say: Callable[[str], None] = print,
+) -> list[Run]:
+    """`open_run` for several folders with the configuration of each as JSON data: all of them or none.
+
+    inputs: JSON data that says what the runs begin with, such as digests of files, by name; it is recorded with the
+    provenance and must be the same on a resume. What is wrong with one folder is found before anything is written to
+    any.
+    """
+    inputs = inputs or {}
+    if resume and overwrite:
+        raise UserError("--resume and --overwrite exclude each other: keep the run or replace it")
+    existing = [_exists(folder, resume=resume, overwrite=overwrite, say=say) for folder in configs]
+    runs: list[Run] = []
+    try:
+        for (folder, config), there in zip(configs.items(), existing, strict=True):
+            folder.mkdir(parents=True, exist_ok=True)
+            runs.append(Run(folder, resumed=there and resume, lock=Lock(folder)))
+            if there and resume:
+                check_same(folder, kind, config, volatile)
+                _check_inputs(folder, inputs)
+    except UserError:
+        for run in runs:
+            run.close()  # the traceback would keep the locks alive
+        raise
+    for run, config, there in zip(runs, configs.values(), existing, strict=True):
+        if there and overwrite:
+            _empty(run.folder)
+        _record(run, kind, config, inputs)
+    return runs
+
+
+def provenance() -> dict[str, Any]:
+    """Where results come from: command, time, code, versions, device. Names no host, no user and no home folder."""
+    import jax
+
+    device = jax.devices()[0]
+    words = [plain_path(word, [Path.cwd(), ROOT]) for word in sys.argv[1:]]
+    return {
+        "command": shlex.join([Path(sys.argv[0]).name, *words]),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "git": _git_state(ROOT),
+        "python": platform.python_version(),
+        "versions": {name: _version(name) for name in _PACKAGES},
+        "device": {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()},
+    }
+
+
+def plain_path(word: str, bases: Sequence[Path]) -> str:
+    """A word of a command line, or any text, without the folders of the machine that it was written on.
+
+    An absolute path, alone or behind `option=`, becomes relative to the first of the folders `bases` that it lies in;
+    of one that lies in none `.../` and the last name are left. Everything else stays as it is.
+    """
+    found = re.fullmatch(r"([\w.-]+=)?(~?/.*)", word, re.DOTALL)
+    if found is None:
+        return word
+    option, path = found[1] or "", Path(found[2])
+    inside = [path.relative_to(base) for base in bases if path.is_relative_to(base)]
+    return option + (str(inside[0]) if inside else f".../{path.name}")
+
+
+def _version(package: str) -> str:
+    """Its version; a source tree on the path is not an installed package, and runs all the same."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _git_state(root: Path) -> dict[str, Any] | None:
+    """Commit, whether files differ from it, and by how much; None outside a git checkout of this project."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(root), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+    if not (root / ".git").exists():
+        return None
+    try:
+        changed = git("diff", "HEAD", "--stat")
+        return {"commit": git("rev-parse", "HEAD"), "dirty": bool(changed), "changed": changed.splitlines()}
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
+# ---------------------------------------------------------------- the folder
+
+
+def _exists(folder: Path, *, resume: bool, overwrite: bool, say: Callable[[str], None]) -> bool:
+    """Whether the folder holds a run already; raises UserError if that is not what was asked for."""
+    say(f"run folder: {folder}")
+    # A process killed while it made the folder leaves hidden files at most: nothing started yet.
+    existing = folder.exists() and any(not p.name.startswith(".") for p in folder.iterdir())
+    if existing:
+        _check_ours(folder, resume=resume, overwrite=overwrite)
+    elif resume and not folder.exists():
+        raise UserError(f"{folder}: nothing to resume there; leave --resume out to start it")
+    return existing
+
+
+def _record(run: Run, kind: str, config: Mapping[str, Any], inputs: Mapping[str, Any]) -> None:
+    """Write down the start with what it begins with, and the configuration if it is the first one."""
+    if not run.resumed:
+        write_json(run.folder / CONFIG, {_MARK: _version("sgft-jax"), "kind": kind, "config": config})
+    write_json(run.folder / PROVENANCE, {"starts": [*_starts(run.folder), {**provenance(), **inputs}]})
+
+
+def _starts(folder: Path) -> list[dict[str, Any]]:
+    return read_json(folder / PROVENANCE)["starts"] if (folder / PROVENANCE).exists() else []
+
+
+def _check_inputs(folder: Path, inputs: Mapping[str, Any]) -> None:
+    """Raises UserError if the run began with others; runs of earlier versions do not say."""
+    for start in _starts(folder):
+        for name, now in inputs.items():
+            if (before := start.get(name, now)) != now:
+                raise UserError(
+                    f"{folder}: cannot resume with other {name}: they were {before}, now {now}; put the first ones "
+                    "back, or begin again with --overwrite"
+                )
+
+
+def _check_ours(folder: Path, *, resume: bool, overwrite: bool) -> None:
+    if not (resume or overwrite):
+        raise UserError(f"{folder}: exists already; continue it with --resume or replace it with --overwrite")
+    stored = _stored(folder) if (folder / CONFIG).exists() else {}
+    if _MARK not in stored:
+        raise UserError(f"{folder}: is not a run folder (it has no {CONFIG} of ours); choose another one")
+
+
+def _stored(folder: Path) -> dict[str, Any]:
+    stored = read_json(folder / CONFIG)
+    if not isinstance(stored, dict) or not {_MARK, "kind", "config"} <= set(stored):
+        raise UserError(f"{folder / CONFIG}: was not written by this project")
+    return stored
+
+
+def check_same(folder: Path, kind: str, wanted: Mapping[str, Any], volatile: tuple[str, ...]) -> None:
+    """Raises UserError, which names the differences, unless a run folder is of that kind and configuration.
+
+    wanted: JSON data. volatile: dotted names that may differ.
+    """
+    stored = _stored(folder)
+    if stored["kind"] != kind:
+        raise UserError(f"{folder}: is a {stored['kind']} run, not a {kind} run")
+    differing = [d for d in differences(stored["config"], wanted) if d[0] not in volatile]
+    if differing:
+        listed = "; ".join(f"{name} was {old!r}, now {new!r}" for name, old, new in differing)
+        raise UserError(f"{folder}: cannot resume with another configuration: {listed}")
+
+
+def _empty(folder: Path) -> None:
+    """Delete the content of a folder that `_check_ours` accepted, its mark last; links are removed, never followed."""
+    for path in sorted(folder.iterdir(), key=lambda p: p.name == CONFIG):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        elif path.name != _LOCK:
+            path.unlink()

@@ -1,0 +1,352 @@
+"""Soft actor-critic, with a value network and a dynamics ensemble that may be trained alongside.
+
+Structure (shapes, which networks train) is static in `SACConfig`; every number is a leaf of the state in `SACHyper`,
+so that learning rates and temperatures vmap like seeds do. Source: Haarnoja et al. 2018; SGFT Appendix C.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from sgft_jax.learners import losses, optim
+from sgft_jax.models import dynamics, normalizer
+from sgft_jax.models.networks import (
+    Network,
+    NetworkConfig,
+    check_params,
+    make_actor,
+    make_critic,
+    make_dynamics,
+    make_value,
+    pad_first_layer,
+    precision,
+    tanh_gaussian_action,
+    tanh_gaussian_sample,
+)
+from sgft_jax.types import Array, Key, Learner, Metrics, Normalizer, Prior, PyTree, Transition, UserError
+
+LOG_ALPHA_MIN = -10.0  # dense negative rewards would drive an auto-tuned temperature to zero
+
+
+@dataclass(frozen=True)
+class SACConfig:
+    """The structure of an agent.
+
+    obs_dim, act_dim: sizes of what the environment gives and takes.
+    extra_obs: entries appended to the observation (steps-to-go one-hots), not normalised.
+    network: body of all networks; critic_network: body of the critic alone, default the same.
+    tune_alpha: follow the target entropy; False keeps the temperature at `SACHyper.alpha`.
+    train_value, train_dynamics, ensemble_size: the extra networks of pretraining.
+    train_critic: False keeps the critic as it is (a frozen-critic actor-critic).
+    critics: members of the critic ensemble. target_critics: a target is the minimum over so many random ones of them,
+        None = all (REDQ, RLPD). actor_mean: the actor follows the members' mean, not their minimum (RLPD).
+    entropy_in_target: count the entropy of the next action in the target, as SAC does.
+    critic_baseline: Q(s, a) = net(s, a) - V(s) with V frozen: what a kept critic means under shaped rewards.
+    actor_batch: leading rows of the batch that the actor learns from, None = all (O-11).
+    policy_delay: critic updates per update of actor and temperature. max_grad_norm: per network, None = no clipping.
+    """
+
+    obs_dim: int
+    act_dim: int
+    extra_obs: int = 0
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    critic_network: NetworkConfig | None = None
+    tune_alpha: bool = True
+    train_value: bool = True
+    train_dynamics: bool = True
+    ensemble_size: int = 5
+    train_critic: bool = True
+    critics: int = 2
+    target_critics: int | None = None
+    actor_mean: bool = False
+    entropy_in_target: bool = True
+    critic_baseline: bool = False
+    actor_batch: int | None = None
+    policy_delay: int = 1
+    max_grad_norm: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.critic_baseline and self.train_value:
+            raise UserError("SAC option critic_baseline needs a frozen value network: set train_value to False")
+        for name in ("policy_delay", "critics"):
+            if getattr(self, name) < 1:
+                raise UserError(f"SAC option {name} is {getattr(self, name)}: must be at least 1")
+        if self.target_critics is not None and not 1 <= self.target_critics <= self.critics:
+            raise UserError(
+                f"SAC option target_critics is {self.target_critics}: must be 1 to {self.critics} (critics)"
+            )
+
+
+class SACHyper(NamedTuple):
+    """The numbers of an agent, each [].
+
+    lr_*: Adam learning rates. tau: target averaging rate. alpha: initial (or fixed) temperature.
+    entropy_per_dim: target entropy / act_dim, nats. lr_warmup: updates over which lr_critic rises linearly from 0.
+    actor_start: updates before the actor moves; actor_ramp: updates over which its learning rate then rises linearly.
+    """
+
+    lr_actor: float | Array = 3e-4
+    lr_critic: float | Array = 3e-4
+    lr_value: float | Array = 3e-4
+    lr_dynamics: float | Array = 3e-4
+    lr_alpha: float | Array = 3e-4
+    tau: float | Array = 0.005
+    alpha: float | Array = 1.0
+    entropy_per_dim: float | Array = -1.0
+    actor_start: float | Array = 0.0
+    actor_ramp: float | Array = 0.0
+    lr_warmup: float | Array = 0.0
+
+
+class SACState(struct.PyTreeNode):
+    """An agent in training; `value` and `dynamics` are an `optim.Fit`, or None where the configuration has no use."""
+
+    actor: optim.Fit
+    critic: optim.Fit
+    target_critic: PyTree
+    log_alpha: optim.Fit
+    value: PyTree
+    dynamics: PyTree
+    normalizer: Normalizer
+    hyper: SACHyper
+    step: Array
+
+
+class _Parts(NamedTuple):
+    """The networks and the optimiser that a configuration describes."""
+
+    actor: Network
+    critic: Network
+    value: Network
+    dynamics: Network
+    optimiser: optax.GradientTransformation
+
+
+def _parts(config: SACConfig) -> _Parts:
+    obs_dim, act_dim, body = config.obs_dim + config.extra_obs, config.act_dim, config.network
+    return _Parts(
+        actor=make_actor(obs_dim, act_dim, body),
+        critic=make_critic(obs_dim, act_dim, config.critic_network or body, members=config.critics),
+        value=make_value(obs_dim, body),
+        dynamics=make_dynamics(obs_dim, act_dim, body, members=config.ensemble_size),
+        optimiser=optim.adam(config.max_grad_norm),
+    )
+
+
+def make_sac(config: SACConfig, hyper: SACHyper | None = None) -> Learner:
+    """The learner of a configuration. Set the observation statistics with `state.replace(normalizer=...)`."""
+    parts = _parts(config)
+    hyper = hyper or SACHyper()
+
+    def init(key: Key) -> SACState:
+        keys = jax.random.split(key, 4)
+        value = parts.value.init(keys[2]) if config.train_value or config.critic_baseline else None
+        model = parts.dynamics.init(keys[3]) if config.train_dynamics else None
+        return _assemble(config, parts, hyper, parts.actor.init(keys[0]), parts.critic.init(keys[1]), value, model)
+
+    def act(state: SACState, carry: tuple[()], obs: Array, key: Key, *, explore: bool) -> tuple[Array, tuple[()]]:
+        moments = parts.actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
+        return tanh_gaussian_action(moments, key, explore=explore), carry
+
+    def update(state: SACState, batch: Transition, key: Key) -> tuple[SACState, Metrics]:
+        return _update(config, parts, state, batch, key)
+
+    return Learner(init, lambda: (), act, update)
+
+
+def _assemble(
+    config: SACConfig,
+    parts: _Parts,
+    hyper: SACHyper,
+    actor: PyTree,
+    critic: PyTree,
+    value: PyTree | None,
+    model: PyTree | None,
+) -> SACState:
+    """Fresh moments around given parameters (O-9)."""
+    hyper = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hyper)
+    fit = lambda params: None if params is None else optim.start(parts.optimiser, params)  # noqa: E731
+    return SACState(
+        actor=optim.start(parts.optimiser, actor),
+        critic=optim.start(parts.optimiser, critic),
+        target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
+        log_alpha=optim.start(parts.optimiser, jnp.maximum(jnp.log(hyper.alpha), LOG_ALPHA_MIN)),
+        value=fit(value),
+        dynamics=fit(model),
+        normalizer=normalizer.identity(config.obs_dim + config.extra_obs),
+        hyper=hyper,
+        step=jnp.int32(0),
+    )
+
+
+# --- one update ---------------------------------------------------------------------------------------------------
+
+
+def _update(config: SACConfig, parts: _Parts, state: SACState, batch: Transition, key: Key) -> tuple[SACState, Metrics]:
+    """Critic, target, actor, temperature, then value (on the actor's own draws) and dynamics."""
+    key_target, key_actor, key_dynamics = jax.random.split(key, 3)
+    raw = batch
+    normal = jax.vmap(normalizer.normalize, (None, 0))
+    batch = batch._replace(obs=normal(state.normalizer, batch.obs), next_obs=normal(state.normalizer, batch.next_obs))
+
+    metrics: Metrics = {}
+    if config.train_critic:
+        state, metrics = _update_critic(config, parts, state, batch, key_target)
+    obs = batch.obs[: config.actor_batch]
+    state, q, log_prob, more = _update_actor(config, parts, state, obs, key_actor)
+    metrics |= more
+    if config.tune_alpha:
+        state = _update_temperature(config, parts, state, log_prob)
+    if config.train_value:
+        state, more = _update_value(parts, state, obs, q)
+        metrics |= more
+    if config.train_dynamics:
+        fit, more = dynamics.update(
+            parts.dynamics, parts.optimiser, state.dynamics, state.normalizer, raw, key_dynamics,
+            rate=state.hyper.lr_dynamics,
+        )  # fmt: skip
+        state, metrics = state.replace(dynamics=fit), metrics | more
+    metrics["actor/alpha"] = jnp.exp(state.log_alpha.params)
+    return state.replace(step=state.step + 1), metrics
+
+
+def _critic_of(config: SACConfig, parts: _Parts, state: SACState) -> Callable[[PyTree, Array, Array], Array]:
+    """The critic (params, obs, action) -> [members], relative to the frozen value where a baseline is asked for."""
+    if not config.critic_baseline:
+        return parts.critic.apply
+
+    def relative(params: PyTree, obs: Array, action: Array) -> Array:
+        with precision("float32"):  # as in value.predict: the difference of two large numbers
+            return parts.critic.apply(params, obs, action) - parts.value.apply(state.value.params, obs)
+
+    return relative
+
+
+def _update_critic(
+    config: SACConfig, parts: _Parts, state: SACState, batch: Transition, key: Key
+) -> tuple[SACState, Metrics]:
+    critic, alpha = _critic_of(config, parts, state), jnp.exp(state.log_alpha.params)
+
+    counted = _target_members(config, key)
+
+    def target(row: Transition, key: Key) -> Array:
+        action, log_prob = tanh_gaussian_sample(parts.actor.apply(state.actor.params, row.next_obs), key)
+        next_q = critic(state.target_critic, row.next_obs, action)[counted]
+        log_prob = log_prob if config.entropy_in_target else jnp.zeros_like(log_prob)
+        return losses.td_target(row.reward, row.discount, next_q, log_prob, alpha=alpha)
+
+    targets = jax.vmap(target)(batch, jax.random.split(key, batch.reward.shape[0]))
+
+    def loss(params: PyTree) -> tuple[Array, Array]:
+        q = jax.vmap(critic, (None, 0, 0))(params, batch.obs, batch.action)
+        return jnp.mean(jax.vmap(losses.critic_loss)(q, targets)), q
+
+    (value, q), grads = jax.value_and_grad(loss, has_aux=True)(state.critic.params)
+    rate = state.hyper.lr_critic * optim.risen(state.step, state.hyper.lr_warmup)
+    fit = optim.step(parts.optimiser, state.critic, grads, rate)
+    average = optax.incremental_update(fit.params, state.target_critic, state.hyper.tau)
+    metrics = {"critic/loss": value, "critic/q_mean": jnp.mean(q), "critic/target_mean": jnp.mean(targets)}
+    return state.replace(critic=fit, target_critic=average), metrics
+
+
+def _target_members(config: SACConfig, key: Key) -> Array | slice:
+    """Which members of the critic a target is the minimum of: the same ones for the whole batch."""
+    if config.target_critics is None:
+        return slice(None)
+    return jax.random.permutation(jax.random.fold_in(key, config.critics), config.critics)[: config.target_critics]
+
+
+def _update_actor(
+    config: SACConfig, parts: _Parts, state: SACState, obs: Array, key: Key
+) -> tuple[SACState, Array, Array, Metrics]:
+    """Also returns the q [B, members] and log-probabilities [B] of the actions drawn, for value and temperature."""
+    critic, alpha = _critic_of(config, parts, state), jnp.exp(state.log_alpha.params)
+    keys = jax.random.split(key, obs.shape[0])
+
+    def one(params: PyTree, obs: Array, key: Key) -> tuple[Array, Array, Array]:
+        action, log_prob = tanh_gaussian_sample(parts.actor.apply(params, obs), key)
+        q = critic(state.critic.params, obs, action)
+        followed = jnp.mean(q, keepdims=True) if config.actor_mean else q
+        return losses.actor_loss(log_prob, followed, alpha=alpha), q, log_prob
+
+    def loss(params: PyTree) -> tuple[Array, tuple[Array, Array]]:
+        each, q, log_prob = jax.vmap(one, (None, 0, 0))(params, obs, keys)
+        return jnp.mean(each), (q, log_prob)
+
+    (value, (q, log_prob)), grads = jax.value_and_grad(loss, has_aux=True)(state.actor.params)
+    hyper, since = state.hyper, state.step - state.hyper.actor_start
+    rate = hyper.lr_actor * optim.risen(since, hyper.actor_ramp)
+    moves = (since >= 0) & _policy_turn(config, state)
+    fit = optim.keep_unless(moves, optim.step(parts.optimiser, state.actor, grads, rate), state.actor)
+    return state.replace(actor=fit), q, log_prob, {"actor/loss": value, "actor/entropy": -jnp.mean(log_prob)}
+
+
+def _update_temperature(config: SACConfig, parts: _Parts, state: SACState, log_prob: Array) -> SACState:
+    target = state.hyper.entropy_per_dim * config.act_dim
+
+    def loss(log_alpha: Array) -> Array:
+        return jnp.mean(jax.vmap(lambda lp: losses.temperature_loss(log_alpha, lp, target_entropy=target))(log_prob))
+
+    fit = optim.step(parts.optimiser, state.log_alpha, jax.grad(loss)(state.log_alpha.params), state.hyper.lr_alpha)
+    fit = fit._replace(params=jnp.maximum(fit.params, LOG_ALPHA_MIN))
+    return state.replace(log_alpha=optim.keep_unless(_policy_turn(config, state), fit, state.log_alpha))
+
+
+def _policy_turn(config: SACConfig, state: SACState) -> Array:
+    """Whether this update is one of those that move actor and temperature."""
+    return state.step % config.policy_delay == 0
+
+
+def _update_value(parts: _Parts, state: SACState, obs: Array, q: Array) -> tuple[SACState, Metrics]:
+    def loss(params: PyTree) -> Array:
+        return jnp.mean(jax.vmap(losses.value_loss)(jax.vmap(parts.value.apply, (None, 0))(params, obs), q))
+
+    value, grads = jax.value_and_grad(loss)(state.value.params)
+    fit = optim.step(parts.optimiser, state.value, grads, state.hyper.lr_value)
+    return state.replace(value=fit), {"value/loss": value}
+
+
+# --- between simulation and reality -----------------------------------------------------------------------------------
+
+
+def extract_prior(state: SACState) -> Prior:
+    """What a pretrained agent hands over. Its configuration must have trained value and dynamics."""
+    if state.value is None or state.dynamics is None:
+        raise UserError("a prior needs an agent trained with train_value and train_dynamics")
+    networks = (state.actor, state.critic, state.value, state.dynamics)
+    return Prior(*(fit.params for fit in networks), normalizer=state.normalizer)
+
+
+def fine_tune_state(config: SACConfig, hyper: SACHyper, prior: Prior, key: Key, *, reset_critic: bool) -> SACState:
+    """An agent that starts from a prior: its actor, its normaliser (frozen), fresh Adam moments (O-9).
+
+    reset_critic: draw a new critic from `key`, else keep the simulator's. With `config.extra_obs` the kept networks get
+    zero rows for the new entries, so that the first policy is pi_sim whatever they hold.
+    """
+    parts, extra = _parts(config), config.extra_obs
+    check_prior(config, prior, critic=not reset_critic)
+    prior = jax.tree.map(jnp.copy, prior)  # the caller may donate the state; the prior must survive it
+
+    def pad(params: PyTree) -> PyTree:
+        return pad_first_layer(params, config.obs_dim, extra)
+
+    critic = parts.critic.init(key) if reset_critic else pad(prior.critic)
+    value = pad(prior.value) if config.train_value or config.critic_baseline else None
+    model = prior.dynamics if config.train_dynamics else None
+    state = _assemble(config, parts, hyper, pad(prior.actor), critic, value, model)
+    return state.replace(normalizer=normalizer.pad(prior.normalizer, extra))
+
+
+def check_prior(config: SACConfig, prior: Prior, *, critic: bool) -> None:
+    """Raise UserError where a network of the prior is not the one that `config` describes."""
+    body = {"network": config.network, "critic_network": config.critic_network, "critics": config.critics}
+    plain = SACConfig(config.obs_dim, config.act_dim, **body)
+    parts = _parts(plain)
+    owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, hidden {config.network.hidden}"
+    for name in ("actor", "value", *(["critic"] if critic else [])):
+        check_params(name, getattr(parts, name), getattr(prior, name), f"{owner}: use the prior's own task and network")

@@ -1,0 +1,343 @@
+"""TD-MPC2: planning in the latent space of a learned world model; and its fine-tuning by SGFT, with a frozen critic.
+
+The world model is in `tdmpc2_model.py`, the search in `mppi.py`; here is how an agent acts and learns. Source: Hansen
+et al. 2024; SGFT section 8.4. Left out: the termination head of tasks that end early. The TD target knows termination
+by `discount`, the planner assumes that an episode goes on for its horizon.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from sgft_jax.data.sequences import Sequences
+from sgft_jax.learners import optim
+from sgft_jax.learners.tdmpc2_model import (
+    NETWORKS,
+    Parts,
+    TDMPC2Config,
+    TDMPC2Hyper,
+    TDMPC2Prior,
+    TDMPC2State,
+    encode,
+    heads_of,
+    make_parts,
+    q_values,
+    reward_of,
+    two_heads,
+    v_sim,
+)
+from sgft_jax.models import normalizer, twohot
+from sgft_jax.models.networks import check_params, tanh_gaussian_action
+from sgft_jax.planning import mppi
+from sgft_jax.types import Array, Key, Learner, Metrics, PyTree, Transition, UserError
+
+# --- acting ---------------------------------------------------------------------------------------------------------
+
+
+def policy_action(config: TDMPC2Config, state: TDMPC2State, obs: Array, key: Key, *, explore: bool) -> Array:
+    """Action [act_dim] of the policy alone, some thousand times cheaper than a plan. obs: [obs_dim] raw."""
+    parts = make_parts(config)
+    moments = parts.policy.apply(state.policy.params, encode(parts, state, obs))
+    return tanh_gaussian_action(moments, key, explore=explore)
+
+
+def _plan(
+    config: TDMPC2Config,
+    parts: Parts,
+    state: TDMPC2State,
+    previous: Array,
+    obs: Array,
+    key: Key,
+    *,
+    explore: bool | Array,
+) -> tuple[Array, Array]:
+    key_policy, key_score, key_search = jax.random.split(key, 3)
+    z = encode(parts, state, obs)
+    keys = jax.random.split(key_policy, (config.horizon, config.policy_samples))
+    proposals = jax.vmap(lambda keys: _proposal(parts, state, z, keys), in_axes=1)(keys)
+    score = _score(config, parts, state, z, key_score)
+    return mppi.plan(config.planner, state.hyper.planner, score, proposals, previous, key_search, explore=explore)
+
+
+def _proposal(parts: Parts, state: TDMPC2State, z: Array, keys: Key) -> Array:
+    """Actions [H, act_dim] of the policy as the model sees the future; one of the keys [H] a step."""
+
+    def step(z: Array, key: Key) -> tuple[Array, Array]:
+        action = tanh_gaussian_action(parts.policy.apply(state.policy.params, z), key, explore=True)
+        return parts.dynamics.apply(state.dynamics.params, z, action), action
+
+    return jax.lax.scan(step, z, keys)[1]
+
+
+def _score(config: TDMPC2Config, parts: Parts, state: TDMPC2State, z: Array, key: Key) -> Callable[[Array], Array]:
+    """What a plan [H, act_dim] from z promises: sum of gamma^t R, then gamma^H times a value.
+
+    The value is V_sim with sgft (O-14), else the mean of 2 random heads at a drawn action. One draw for all candidates
+    of a plan, where the original draws for each: they then compare by their actions, not by their luck.
+    """
+    key_heads, key_action = jax.random.split(key)
+    critic, gamma = heads_of(state.critic.params, two_heads(config, key_heads)), state.hyper.gamma
+    noise = jax.random.normal(key_action, (config.act_dim,))
+
+    def final(z: Array) -> Array:
+        if config.sgft:
+            return v_sim(config, parts, state, z)
+        mean, log_std = parts.policy.apply(state.policy.params, z)
+        return jnp.mean(q_values(config, parts, critic, z, jnp.tanh(mean + jnp.exp(log_std) * noise)))
+
+    def step(carry: tuple[Array, Array], action: Array) -> tuple[tuple[Array, Array], Array]:
+        z, weight = carry
+        reward = weight * reward_of(config, parts, state, z, action)
+        return (parts.dynamics.apply(state.dynamics.params, z, action), weight * gamma), reward
+
+    def score(actions: Array) -> Array:
+        # The first step by itself: all candidates share its latent, which a loop would have to carry for each.
+        ahead, first = step((z, jnp.float32(1)), actions[0])
+        (last, weight), rewards = jax.lax.scan(step, ahead, actions[1:])
+        return first + jnp.sum(rewards) + weight * final(last)
+
+    return score
+
+
+# --- one update -----------------------------------------------------------------------------------------------------
+
+
+def _update(
+    config: TDMPC2Config, parts: Parts, state: TDMPC2State, batch: Sequences, key: Key
+) -> tuple[TDMPC2State, Metrics]:
+    """World model with critic, then the policy on the latents rolled out, then the target critic."""
+    key_model, key_policy = jax.random.split(key)
+    normal = jax.vmap(jax.vmap(normalizer.normalize, (None, 0)), (None, 0))
+    obs, next_obs = (normal(state.normalizer, x) for x in (batch.rows.obs, batch.rows.next_obs))
+    batch = batch._replace(rows=batch.rows._replace(obs=obs, next_obs=next_obs))
+
+    state, zs, metrics = _update_model(config, parts, state, batch, key_model)
+    state, more = _update_policy(config, parts, state, zs, batch.valid, key_policy)
+    if not config.sgft:
+        average = optax.incremental_update(state.critic.params, state.target_critic, state.hyper.tau)
+        state = state.replace(target_critic=average)
+    return state.replace(step=state.step + 1), metrics | more
+
+
+def _rate(state: TDMPC2State) -> Array:
+    """The learning rate [] of this update."""
+    return state.hyper.lr * optim.risen(state.step, state.hyper.lr_warmup)
+
+
+def _update_model(
+    config: TDMPC2Config, parts: Parts, state: TDMPC2State, batch: Sequences, key: Key
+) -> tuple[TDMPC2State, Array, Metrics]:
+    """Also returns the latents [B, H + 1, latent] rolled out by the model as it was."""
+    key_heads, key_action, key_dropout = jax.random.split(key, 3)
+    judges, hyper = heads_of(state.target_critic, two_heads(config, key_heads)), state.hyper
+
+    def target(row: Transition, key: Key) -> tuple[Array, Array]:
+        # The successor's latent is encoded, while losses are taken at rolled-out ones.
+        ahead = parts.encoder.apply(state.encoder.params, row.next_obs)
+        action = tanh_gaussian_action(parts.policy.apply(state.policy.params, ahead), key, explore=True)
+        return ahead, row.reward + row.discount * jnp.min(q_values(config, parts, judges, ahead, action))
+
+    keys = jax.random.split(key_action, batch.valid.shape)
+    ahead, q_target = jax.vmap(jax.vmap(target))(batch.rows, keys)
+    dropout = jax.random.split(key_dropout, batch.valid.shape)
+    frozen = {name: getattr(state, name).params for name in NETWORKS}
+
+    def loss(learned: dict[str, PyTree]) -> tuple[Array, tuple[dict[str, Array], Array]]:
+        one = lambda *window: _window_losses(config, parts, frozen | learned, *window)  # noqa: E731
+        each, zs = jax.vmap(one)(batch.rows, ahead, q_target, dropout)
+        mean = {name: discounted_mean(x, batch.valid, hyper.rho) for name, x in each.items()}
+        return sum((getattr(hyper, name) * x for name, x in mean.items()), jnp.float32(0)), (mean, zs)
+
+    fits = {name: getattr(state, name) for name in config.learned}
+    grads, (mean, zs) = jax.grad(loss, has_aux=True)({name: fit.params for name, fit in fits.items()})
+    grads, norm = clip_by_norm(grads, hyper.max_grad_norm)
+    rates = {name: _rate(state) * (hyper.encoder_lr_scale if name == "encoder" else 1.0) for name in fits}
+    fits = {name: optim.step(parts.adam, fit, grads[name], rates[name]) for name, fit in fits.items()}
+    metrics = {f"model/{name}_loss": x for name, x in mean.items()} | {"model/grad_norm": norm}
+    if not config.sgft:
+        metrics["critic/target_mean"] = jnp.mean(q_target, where=batch.valid)
+    return state.replace(**fits), zs, metrics
+
+
+def _window_losses(
+    config: TDMPC2Config,
+    parts: Parts,
+    params: dict[str, PyTree],
+    rows: Transition,
+    ahead: Array,
+    q_target: Array,
+    dropout: Key,
+) -> tuple[dict[str, Array], Array]:
+    """Losses [H] of one window, by the name of their weight, and its rolled-out latents [H + 1, latent].
+
+    rows: [H, ...]; ahead: [H, latent] encoded successors; q_target: [H]; dropout: [H] keys.
+    """
+
+    def advance(z: Array, action: Array) -> tuple[Array, Array]:
+        z = parts.dynamics.apply(params["dynamics"], z, action)
+        return z, z
+
+    def classify(logits: Array, x: Array) -> Array:
+        return twohot.cross_entropy(logits, x, config.bins)
+
+    def value(z: Array, action: Array, target: Array, key: Key) -> Array:
+        keys = jax.random.split(key, config.size.members)
+        logits = parts.critic.apply(params["critic"], z, action, keys=keys)
+        return jnp.mean(jax.vmap(classify, (0, None))(logits, target))
+
+    first = parts.encoder.apply(params["encoder"], rows.obs[0])
+    rolled = jax.lax.scan(advance, first, rows.action)[1]
+    zs = jnp.concatenate([first[None], rolled])
+    logits = jax.vmap(parts.reward.apply, (None, 0, 0))(params["reward"], zs[:-1], rows.action)
+    losses = {"consistency": jnp.mean((rolled - ahead) ** 2, axis=1), "reward": jax.vmap(classify)(logits, rows.reward)}
+    if not config.sgft:
+        losses["value"] = jax.vmap(value)(zs[:-1], rows.action, q_target, dropout)
+    return losses, zs
+
+
+def discounted_mean(values: Array, valid: Array, rho: Array | float) -> Array:
+    """Mean [] over the valid of values [B, T], step t weighing rho^t; with all valid, 1/T sum_t rho^t mean_B."""
+    decay = rho ** jnp.arange(values.shape[1])
+    weights = valid * decay[None]
+    return jnp.mean(decay) * jnp.sum(jnp.where(valid, values, 0.0) * weights) / jnp.maximum(jnp.sum(weights), 1e-6)
+
+
+def clip_by_norm(grads: PyTree, limit: Array | float) -> tuple[PyTree, Array]:
+    """The gradients, scaled down to a global norm of at most `limit` [], and the norm [] they had."""
+    norm = optax.tree.norm(grads)
+    factor = jnp.minimum(1.0, limit / (norm + 1e-6))
+    return jax.tree.map(lambda g: g * factor, grads), norm
+
+
+def _update_policy(
+    config: TDMPC2Config, parts: Parts, state: TDMPC2State, zs: Array, valid: Array, key: Key
+) -> tuple[TDMPC2State, Metrics]:
+    """zs: [B, H + 1, latent]; valid: [B, H] of the steps between them."""
+    key_heads, key_action, key_dropout = jax.random.split(key, 3)
+    heads, hyper = two_heads(config, key_heads), state.hyper
+    reached = jnp.concatenate([valid[:, :1], valid], axis=1)
+    keys = jax.random.split(key_action, reached.shape), jax.random.split(key_dropout, reached.shape)
+
+    def one(params: PyTree, z: Array, key: Key, dropout: Key) -> tuple[Array, Array]:
+        action, entropy = scaled_entropy_sample(parts.policy.apply(params, z), key)
+        return _promise(config, parts, state, z, action, heads, dropout), entropy
+
+    def loss(params: PyTree) -> tuple[Array, tuple[Array, Array, Array]]:
+        each = jax.vmap(jax.vmap(one, (None, 0, 0, 0)), (None, 0, 0, 0))
+        value, entropy = each(params, zs, *keys)
+        low, high = jnp.quantile(jax.lax.stop_gradient(value[:, 0]), jnp.array([0.05, 0.95]))
+        scale = state.scale + hyper.tau * (jnp.maximum(high - low, 1.0) - state.scale)
+        losses = -value / scale - hyper.entropy * entropy
+        return discounted_mean(losses, reached, hyper.rho), (value, entropy, scale)
+
+    (total, (value, entropy, scale)), grads = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
+    grads, norm = clip_by_norm(grads, hyper.max_grad_norm)
+    fit = optim.step(parts.policy_adam, state.policy, grads, _rate(state))
+    metrics = {
+        "actor/loss": total,
+        "actor/value_mean": jnp.mean(value, where=reached),
+        "actor/entropy": jnp.mean(entropy, where=reached) / config.act_dim,
+        "actor/scale": scale,
+        "actor/grad_norm": norm,
+    }
+    return state.replace(policy=fit, scale=scale), metrics
+
+
+def _promise(
+    config: TDMPC2Config, parts: Parts, state: TDMPC2State, z: Array, action: Array, heads: Array, dropout: Key
+) -> Array:
+    """What the policy maximises []: Q by two random heads, or one step of the model to V_sim."""
+    if not config.sgft:
+        keys = jax.random.split(dropout, config.size.members)[heads]
+        return jnp.mean(q_values(config, parts, heads_of(state.critic.params, heads), z, action, keys))
+    ahead = parts.dynamics.apply(state.dynamics.params, z, action)
+    return reward_of(config, parts, state, z, action) + state.hyper.gamma * v_sim(config, parts, state, ahead)
+
+
+def scaled_entropy_sample(moments: Array, key: Key) -> tuple[Array, Array]:
+    """An action [act_dim] of the policy, with gradients, and its scaled entropy [].
+
+    moments: [2, act_dim] pre-tanh mean and log-std. The scaled entropy is -act_dim times the Gaussian log-density
+    before the tanh: what the quotient of log-densities in the original comes to.
+    """
+    mean, log_std = moments
+    noise = jax.random.normal(key, mean.shape)
+    log_prob = jnp.sum(-0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi))
+    return jnp.tanh(mean + jnp.exp(log_std) * noise), -mean.shape[0] * log_prob
+
+
+# --- the learner ----------------------------------------------------------------------------------------------------
+
+
+def make_tdmpc2(config: TDMPC2Config, hyper: TDMPC2Hyper | None = None) -> Learner:
+    """The learner of a configuration: `update` takes `Sequences` [B, horizon], the carry is the last plan's mean.
+
+    Start every episode with `init_carry()`. Set the observation statistics with `state.replace(normalizer=...)`.
+    """
+    parts = make_parts(config)
+    hyper = hyper or TDMPC2Hyper()
+
+    def init(key: Key) -> TDMPC2State:
+        keys = dict(zip(NETWORKS, jax.random.split(key, len(NETWORKS)), strict=True))
+        params = {name: getattr(parts, name).init(keys[name]) for name in NETWORKS}
+        statistics = normalizer.identity(config.obs_dim)
+        return _assemble(config, parts, hyper, TDMPC2Prior(**params, normalizer=statistics, scale=jnp.float32(1)))
+
+    def act(state: TDMPC2State, carry: Array, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, Array]:
+        return _plan(config, parts, state, carry, obs, key, explore=explore)
+
+    def update(state: TDMPC2State, batch: Any, key: Key) -> tuple[TDMPC2State, Metrics]:
+        if batch.valid.shape[1] != config.horizon:
+            raise UserError(f"TD-MPC2 windows have {batch.valid.shape[1]} steps: must be the horizon, {config.horizon}")
+        return _update(config, parts, state, batch, key)
+
+    return Learner(init, lambda: jnp.zeros((config.horizon, config.act_dim)), act, update)
+
+
+def _assemble(config: TDMPC2Config, parts: Parts, hyper: TDMPC2Hyper, prior: TDMPC2Prior) -> TDMPC2State:
+    """Fresh moments around given parameters (O-9)."""
+    start = lambda name: optim.start(  # noqa: E731
+        parts.policy_adam if name == "policy" else parts.adam, getattr(prior, name)
+    )
+    return TDMPC2State(
+        **{name: start(name) for name in NETWORKS},
+        target_critic=jax.tree.map(jnp.copy, prior.critic),  # own buffers: a donated state must not hold one twice
+        anchor=jax.tree.map(jnp.copy, prior.policy) if config.sgft else None,
+        scale=prior.scale,
+        normalizer=prior.normalizer,
+        hyper=jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hyper),
+        step=jnp.int32(0),
+    )
+
+
+# --- between simulation and reality ---------------------------------------------------------------------------------
+
+
+def extract_prior(state: TDMPC2State) -> TDMPC2Prior:
+    """What a pretrained agent hands over."""
+    params = {name: getattr(state, name).params for name in NETWORKS}
+    return TDMPC2Prior(**params, normalizer=state.normalizer, scale=state.scale)
+
+
+def fine_tune_state(config: TDMPC2Config, hyper: TDMPC2Hyper, prior_params: TDMPC2Prior, key: Key) -> TDMPC2State:
+    """An agent that starts from a prior: all its networks, its normaliser (frozen), fresh Adam moments (O-9).
+
+    With `config.sgft` its policy becomes the anchor of V_sim. The horizon may differ from the prior's. `key` is there
+    as in other learners; nothing is drawn.
+    """
+    del key
+    check_prior(config, prior_params)
+    return _assemble(
+        config, make_parts(config), hyper, jax.tree.map(jnp.copy, prior_params)
+    )  # the prior must survive it
+
+
+def check_prior(config: TDMPC2Config, prior: TDMPC2Prior) -> None:
+    """Raise UserError where a network of the prior is not the one that `config` describes."""
+    parts = make_parts(config)
+    owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, {config.size}"
+    for name in NETWORKS:
+        check_params(name, getattr(parts, name), getattr(prior, name), f"{owner}: use the prior's own task and size")

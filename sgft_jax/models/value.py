@@ -1,0 +1,53 @@
+"""V_sim: the frozen, deterministic value of the simulator's policy, and how well it predicts returns."""
+
+import jax
+import jax.numpy as jnp
+
+from sgft_jax.models.networks import Network, Precision, precision
+from sgft_jax.models.normalizer import normalize
+from sgft_jax.types import Array, Metrics, Normalizer, PyTree
+
+
+def predict(
+    network: Network, params: PyTree, normalizer: Normalizer, obs: Array, *, exact: Precision = "float32"
+) -> Array:
+    """V(obs) []. obs: [obs_dim] raw units.
+
+    Full float32 on every device: the shaped reward is the small difference of two large values, and the ten mantissa
+    bits of a GPU's default matrix products would drown it. exact: another precision, to measure that
+    (`experiments.benchmark --parts values`).
+    """
+    with precision(exact):
+        return network.apply(params, normalize(normalizer, obs))
+
+
+def discounted_returns(rewards: Array, discounts: Array, bootstrap: Array) -> Array:
+    """Monte-Carlo returns G_t = r_t + d_t G_{t+1} of one trajectory. rewards, discounts: [T]; bootstrap: [] G_T."""
+
+    def back(later: Array, inputs: tuple[Array, Array]) -> tuple[Array, Array]:
+        reward, discount = inputs
+        now = reward + discount * later
+        return now, now
+
+    return jax.lax.scan(back, bootstrap, (rewards, discounts), reverse=True)[1]
+
+
+def explained_variance(values: Array, returns: Array) -> Array:
+    """1 - Var(returns - values) / Var(returns), both [N]: 1 is perfect, 0 no better than a constant."""
+    return 1 - jnp.var(returns - values) / jnp.maximum(jnp.var(returns), 1e-12)
+
+
+def rank_correlation(values: Array, returns: Array) -> Array:
+    """Spearman's rho, both [N], ties broken by order: shaping cares about order more than about scale."""
+    ranks = [jnp.argsort(jnp.argsort(x)).astype(jnp.float32) for x in (values, returns)]
+    a, b = (r - jnp.mean(r) for r in ranks)
+    return jnp.sum(a * b) / jnp.maximum(jnp.sqrt(jnp.sum(a**2) * jnp.sum(b**2)), 1e-12)
+
+
+def report(values: Array, returns: Array) -> Metrics:
+    """Quality of V against Monte-Carlo returns, both [N]."""
+    return {
+        "value/explained_variance": explained_variance(values, returns),
+        "value/rank_correlation": rank_correlation(values, returns),
+        "value/bias": jnp.mean(values - returns),
+    }

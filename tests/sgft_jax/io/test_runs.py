@@ -1,0 +1,201 @@
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sgft_jax.io import runs
+from sgft_jax.io.runs import Lock, open_run, open_runs, plain_path, provenance
+from sgft_jax.types import UserError
+
+
+@dataclasses.dataclass(frozen=True)
+class Inner:
+    lr: float = 1e-3
+    layers: tuple[int, ...] = (2, 3)
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    task: str = "hammer"
+    inner: Inner = dataclasses.field(default_factory=Inner)
+    resume: bool = False
+
+
+def start(folder, config=None, **options):
+    run = open_run(folder, kind="pretrain", config=config or Config(), say=lambda _: None, **options)
+    run.close()
+    return run
+
+
+def test_a_new_run_says_where_it_is_and_records_itself(tmp_path):
+    heard = []
+    run = open_run(tmp_path / "runs" / "x", kind="pretrain", config=Config(), say=heard.append)
+    assert heard == [f"run folder: {tmp_path / 'runs' / 'x'}"]
+    assert not run.resumed
+    stored = json.loads((run.folder / "config.json").read_text())
+    assert stored["kind"] == "pretrain" and stored["config"]["inner"] == {"lr": 0.001, "layers": [2, 3]}
+    (first,) = json.loads((run.folder / "provenance.json").read_text())["starts"]
+    assert first["versions"]["jax"] and first["device"]["platform"] == "cpu" and first["python"].startswith("3.")
+    assert run.made("figures").is_dir() and run.prior == run.folder / "prior"
+
+
+def test_an_existing_run_needs_a_decision(tmp_path):
+    start(tmp_path / "x")
+    with pytest.raises(UserError, match=r"x: exists already; continue it with --resume or replace it with --overwrite"):
+        start(tmp_path / "x")
+    with pytest.raises(UserError, match="exclude each other"):
+        start(tmp_path / "x", resume=True, overwrite=True)
+
+
+def test_resume_keeps_everything_and_adds_a_start(tmp_path):
+    start(tmp_path / "x")
+    (tmp_path / "x" / "metrics.jsonl").write_text("{}\n")
+    assert start(tmp_path / "x", Config(resume=True), resume=True).resumed
+    assert (tmp_path / "x" / "metrics.jsonl").read_text() == "{}\n"
+    assert len(json.loads((tmp_path / "x" / "provenance.json").read_text())["starts"]) == 2
+
+
+def test_resume_names_every_field_that_differs(tmp_path):
+    start(tmp_path / "x")
+    other = Config(task="push", inner=Inner(layers=(2, 4)))
+    with pytest.raises(UserError, match=r"task was 'hammer', now 'push'; inner.layers was \[2, 3\], now \[2, 4\]"):
+        start(tmp_path / "x", other, resume=True)
+    start(tmp_path / "x", other, resume=True, volatile=("task", "inner.layers"))
+    with pytest.raises(UserError, match="is a pretrain run, not a finetune run"):
+        open_run(tmp_path / "x", kind="finetune", config=Config(), resume=True, say=lambda _: None)
+
+
+def test_of_several_runs_all_open_or_none(tmp_path):
+    old, new = tmp_path / "old", tmp_path / "new"
+    start(old)
+    both = {folder: {"task": folder.name} for folder in (new, old)}
+    for options, words in (({}, "old: exists already"), ({"resume": True}, "new: nothing to resume there")):
+        with pytest.raises(UserError, match=words):
+            open_runs(both, kind="pretrain", say=lambda _: None, **options)
+        assert not new.exists()
+    held = Lock(old)
+    with pytest.raises(UserError, match="old: another process is writing to it"):
+        open_runs(both, kind="pretrain", overwrite=True, say=lambda _: None)
+    held.release()
+    assert [path.name for path in new.iterdir()] == [".lock"]  # not begun, and not locked any more
+    first, second = open_runs(both, kind="pretrain", overwrite=True, say=lambda _: None)
+    assert json.loads((first.folder / "config.json").read_text())["config"] == {"task": "new"}
+    assert (first.folder, second.folder) == (new, old) and not (first.resumed or second.resumed)
+
+
+def test_a_run_goes_on_with_the_inputs_that_it_began_with(tmp_path):
+    given = {tmp_path / "x": {"task": "hammer"}}
+    begin = lambda **more: open_runs(given, kind="finetune", say=lambda _: None, **more)[0].close()  # noqa: E731
+    begin(inputs={"priors": ["ab"]})
+    begin(resume=True, inputs={"priors": ["ab"], "maps": 3})  # the first start did not tell of maps
+    with pytest.raises(UserError, match=r"other priors: they were \['ab'\], now \['cd'\]"):
+        begin(resume=True, inputs={"priors": ["cd"]})
+    with pytest.raises(UserError, match="other maps: they were 3, now 4"):
+        begin(resume=True, inputs={"priors": ["ab"], "maps": 4})
+    starts = json.loads((tmp_path / "x/provenance.json").read_text())["starts"]
+    assert [start.get("maps") for start in starts] == [None, 3]
+    begin(overwrite=True, inputs={"priors": ["cd"]})
+
+
+def test_resume_of_nothing(tmp_path):
+    with pytest.raises(UserError, match="nothing to resume there"):
+        start(tmp_path / "x", resume=True)
+    assert not (tmp_path / "x").exists()
+
+
+def test_resume_of_a_run_killed_while_it_was_made_starts_it(tmp_path):
+    (tmp_path / "x").mkdir()
+    (tmp_path / "x" / ".lock").touch()
+    (tmp_path / "x" / ".tmp-config.json").write_text('{"sg')
+    assert not start(tmp_path / "x", resume=True).resumed
+
+
+def test_overwrite_empties_a_run_and_nothing_else(tmp_path):
+    precious = tmp_path / "precious"
+    precious.mkdir()
+    (precious / "data").write_text("keep")
+    run = start(tmp_path / "x")
+    (run.folder / "checkpoints" / "10").mkdir(parents=True)
+    (run.folder / "link").symlink_to(precious)
+    start(tmp_path / "x", Config(task="push"), overwrite=True)
+    assert sorted(p.name for p in run.folder.iterdir()) == [".lock", "config.json", "provenance.json"]
+    assert json.loads((run.folder / "config.json").read_text())["config"]["task"] == "push"
+    assert len(json.loads((run.folder / "provenance.json").read_text())["starts"]) == 1
+    assert (precious / "data").read_text() == "keep"
+
+
+@pytest.mark.parametrize("content", [None, "{}", '{"config": {"task": "hammer"}}'])
+def test_a_folder_that_is_no_run_is_left_alone(tmp_path, content):
+    folder = tmp_path / "x"
+    folder.mkdir()
+    (folder / "thesis.tex").write_text("years")
+    if content is not None:
+        (folder / "config.json").write_text(content)
+    for option in ({"overwrite": True}, {"resume": True}):
+        with pytest.raises(UserError, match=r"is not a run folder|was not written by this project"):
+            start(folder, **option)
+    assert (folder / "thesis.tex").read_text() == "years"
+
+
+HOLDER = """
+import dataclasses, sys, time
+from sgft_jax.io.runs import open_run
+@dataclasses.dataclass(frozen=True)
+class Config:
+    task: str = "hammer"
+run = open_run(sys.argv[1], kind="pretrain", config=Config(), say=lambda _: None)
+print("open", flush=True)
+time.sleep(60)
+"""
+
+
+def test_two_processes_never_share_a_folder_and_a_kill_frees_it(tmp_path):
+    command = [sys.executable, "-c", HOLDER, str(tmp_path / "x")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=dict(os.environ)) as holder:
+        assert holder.stdout.readline() == "open\n"
+        with pytest.raises(UserError, match=r"x: another process is writing to it"):
+            start(tmp_path / "x", overwrite=True)
+        holder.kill()
+    start(tmp_path / "x", overwrite=True)
+
+
+def test_a_forgotten_run_frees_its_folder(tmp_path):
+    run = open_run(tmp_path / "x", kind="pretrain", config=Config(), say=lambda _: None)
+    with pytest.raises(UserError, match="another process"):
+        start(tmp_path / "x", resume=True)
+    del run
+    start(tmp_path / "x", resume=True)
+
+
+def test_provenance_names_no_host_and_no_folder(monkeypatch):
+    monkeypatch.setattr(runs, "ROOT", Path("/home/someone/project"))
+    argv = ["/home/someone/project/experiments/pretrain.py", "--task", "a b", "--out=/home/someone/project/runs"]
+    monkeypatch.setattr(sys, "argv", [*argv, "--prior", "/scratch/someone/a/prior"])
+    monkeypatch.setattr(Path, "cwd", lambda: Path("/home/someone/project/docs"))
+    record = provenance()
+    assert record["command"] == "pretrain.py --task 'a b' --out=runs --prior .../prior"
+    assert os.uname().nodename not in json.dumps(record) and "someone" not in json.dumps(record)
+    if record["git"] is not None:
+        assert len(record["git"]["commit"]) == 40 and record["git"]["dirty"] == bool(record["git"]["changed"])
+
+
+@pytest.mark.parametrize(
+    ("word", "plain"),
+    [
+        ("/home/me/project/runs/a", "runs/a"),
+        ("/home/me/project", "."),
+        ("--out=/home/me/runs", "--out=.../runs"),
+        ("table=/data/x/my table.toml", "table=.../my table.toml"),
+        ("~/runs", ".../runs"),
+        ("/home/me/projects/runs", ".../runs"),  # begins alike, lies elsewhere
+        ("runs/a", "runs/a"),
+        ("action_scale=[1,0.5]", "action_scale=[1,0.5]"),
+        ("1/2", "1/2"),
+    ],
+)
+def test_paths_lose_the_folders_of_their_machine(word, plain):
+    assert plain_path(word, [Path("/home/me/project")]) == plain

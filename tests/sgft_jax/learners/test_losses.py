@@ -1,0 +1,56 @@
+"""Losses of one transition against arithmetic done by hand."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from sgft_jax.learners import losses
+
+f = jnp.float32
+
+
+def test_td_target_by_hand():
+    # min Q = 2; 1 + 0.9 * (2 - 0.5 * (-1)) = 1 + 0.9 * 2.5 = 3.25
+    target = losses.td_target(f(1.0), f(0.9), jnp.array([3.0, 2.0]), f(-1.0), alpha=0.5)
+    assert target == pytest.approx(3.25)
+    # terminated: the reward alone, whatever the networks say
+    assert losses.td_target(f(1.0), f(0.0), jnp.array([3.0, 2.0]), f(-1.0), alpha=0.5) == 1.0
+
+
+def test_td_target_is_a_constant_for_gradients():
+    grad = jax.grad(lambda q: losses.td_target(f(1.0), f(0.9), q, f(0.0), alpha=0.1))(jnp.ones(2))
+    assert jnp.all(grad == 0)
+
+
+def test_td_target_refuses_a_batch():
+    with pytest.raises(AssertionError):
+        losses.td_target(jnp.ones(3), f(0.9), jnp.ones(2), f(0.0), alpha=0.1)
+
+
+def test_critic_loss_by_hand():
+    # (3 - 1)^2 + (0 - 1)^2 = 5
+    assert losses.critic_loss(jnp.array([3.0, 0.0]), f(1.0)) == 5.0
+
+
+def test_actor_loss_by_hand():
+    # 0.5 * (-2) - min(3, 4) = -4; only the smaller critic gets a gradient
+    assert losses.actor_loss(f(-2.0), jnp.array([3.0, 4.0]), alpha=0.5) == -4.0
+    grad = jax.grad(lambda q: losses.actor_loss(f(-2.0), q, alpha=0.5))(jnp.array([3.0, 4.0]))
+    assert grad.tolist() == [-1.0, 0.0]
+
+
+def test_temperature_loss_by_hand():
+    # alpha = 1; -log_prob = entropy 1 below the target 2: slope 1 - 2 = -1, so descent raises alpha
+    value, slope = jax.value_and_grad(lambda a: losses.temperature_loss(a, f(-1.0), target_entropy=2.0))(f(0.0))
+    assert value == -1.0 and slope == -1.0
+
+
+def test_value_loss_by_hand():
+    # (1 - min(3, 4))^2 = 4, slope 2 (1 - 3) = -4, no gradient to the critics
+    value, (slope, to_q) = jax.value_and_grad(losses.value_loss, (0, 1))(f(1.0), jnp.array([3.0, 4.0]))
+    assert value == 4.0 and slope == -4.0 and jnp.all(to_q == 0)
+
+
+def test_dynamics_loss_by_hand():
+    # ((1 - 0)^2 + (2 - 4)^2) / 2 = 2.5
+    assert losses.dynamics_loss(jnp.array([1.0, 2.0]), jnp.array([0.0, 4.0])) == 2.5

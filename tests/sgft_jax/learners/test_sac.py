@@ -1,0 +1,281 @@
+"""SAC: temperature, ensembles of critics, what moves, what starts from a prior. See also test_contract_learners.py."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sgft_jax.learners import sac
+from sgft_jax.models import networks, normalizer
+from sgft_jax.types import Transition, UserError
+
+NET = networks.NetworkConfig(hidden=(32,))
+CONFIG = sac.SACConfig(1, 1, network=NET, tune_alpha=False, train_dynamics=False)
+# alpha 1e-4: entropy changes the answers below by less than their tolerance
+HYPER = sac.SACHyper(lr_actor=3e-3, lr_critic=1e-2, lr_value=1e-2, tau=0.1, alpha=1e-4)
+LEARNER = sac.make_sac(CONFIG, HYPER)
+ROWS = 128
+
+
+def probe(key, *, obs=None, reward=None, discount=None):
+    """One row per state and random action; reward is a function of (obs, action)."""
+    key_obs, key_action = jax.random.split(key)
+    obs = jnp.zeros(ROWS) if obs is None else jax.random.choice(key_obs, jnp.asarray(obs), (ROWS,))
+    action = jax.random.uniform(key_action, (ROWS,), minval=-1)
+    return Transition(
+        obs=obs[:, None],
+        action=action[:, None],
+        reward=jnp.ones(ROWS) if reward is None else reward(obs, action),
+        discount=jnp.zeros(ROWS) if discount is None else discount(obs),
+        next_obs=obs[:, None],
+        truncated=jnp.zeros(ROWS, bool),
+        steps_to_go=jnp.zeros(ROWS, jnp.int32),
+    )
+
+
+# --- temperature ----------------------------------------------------------------------------------------------------
+
+
+def test_temperature_finds_the_target_entropy(key):
+    config = sac.SACConfig(1, 1, network=NET, train_value=False, train_dynamics=False)
+    learner = sac.make_sac(config, HYPER._replace(alpha=1.0, lr_alpha=1e-2, entropy_per_dim=-0.5))
+    batch = probe(key, reward=lambda s, a: -((a - 0.2) ** 2))
+    scan = jax.jit(lambda s, k: jax.lax.scan(lambda s, k: learner.update(s, batch, k), s, jax.random.split(k, 3000)))
+    _, metrics = scan(learner.init(key), key)
+    assert metrics["actor/entropy"][-1000:].mean() == pytest.approx(-0.5, abs=0.15)
+    assert 0 < metrics["actor/alpha"][-1] < 0.2
+
+
+def test_log_alpha_stops_at_minus_ten(key):
+    config = sac.SACConfig(1, 1, network=NET, train_value=False, train_dynamics=False)
+    learner = sac.make_sac(config, sac.SACHyper(alpha=0.0, lr_alpha=1.0, entropy_per_dim=-50.0))
+    state = jax.jit(learner.init)(key)
+    assert state.log_alpha.params == -10.0
+    assert jax.jit(learner.update)(state, probe(key), key)[0].log_alpha.params == -10.0
+
+
+# --- contract -------------------------------------------------------------------------------------------------------
+
+FULL = sac.SACConfig(1, 1, network=networks.NetworkConfig((8,)), ensemble_size=3)
+FULL_LEARNER = sac.make_sac(FULL)
+FULL_LEARNER = FULL_LEARNER._replace(init=jax.jit(FULL_LEARNER.init), update=jax.jit(FULL_LEARNER.update))
+
+
+def equal(a, b):
+    return all(jnp.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def test_every_network_of_pretraining_moves_and_statistics_do_not(key):
+    state = FULL_LEARNER.init(key)
+    new, metrics = FULL_LEARNER.update(state, probe(key), key)
+    for name in ("actor", "critic", "value", "dynamics", "log_alpha"):
+        assert not equal(getattr(state, name).params, getattr(new, name).params), name
+    assert equal(state.normalizer, new.normalizer) and equal(state.hyper, new.hyper) and new.step == 1
+    assert {"critic/loss", "actor/loss", "value/loss", "dynamics/mse", "actor/alpha"} <= set(metrics)
+
+
+def test_target_critic_follows_at_rate_tau(key):
+    state = FULL_LEARNER.init(key)
+    state = state.replace(hyper=state.hyper._replace(tau=jnp.float32(0.25)))
+    new, _ = FULL_LEARNER.update(state, probe(key), key)
+    mix = jax.tree.map(lambda t, c: 0.75 * t + 0.25 * c, state.target_critic, new.critic.params)
+    chex.assert_trees_all_close(new.target_critic, mix, rtol=1e-6)
+
+
+def test_fixed_temperature_and_delayed_actor_keep_their_bits(key):
+    config = sac.SACConfig(1, 1, network=NET, tune_alpha=False, train_value=False, train_dynamics=False)
+    learner = sac.make_sac(config, sac.SACHyper(alpha=0.01, actor_start=2.0))
+    state = start = learner.init(key)
+    assert state.value is None and state.dynamics is None
+    update = jax.jit(learner.update)
+    for step in range(3):
+        state, _ = update(state, probe(key), jax.random.fold_in(key, step))
+        assert equal(start.actor, state.actor) == (step < 2)  # moments included
+    assert equal(start.log_alpha, state.log_alpha)
+
+
+def test_actor_ramp_scales_the_first_steps(key):
+    """Adam's first step has length lr per entry, so a ramp of 4 makes it a quarter."""
+    moved = []
+    for ramp in (0.0, 4.0):
+        state = FULL_LEARNER.init(key)
+        state = state.replace(hyper=state.hyper._replace(lr_actor=jnp.float32(1e-2), actor_ramp=jnp.float32(ramp)))
+        new, _ = FULL_LEARNER.update(state, probe(key), key)
+        moved.append(jnp.abs(new.actor.params["Dense_1"]["bias"] - state.actor.params["Dense_1"]["bias"]).max())
+    assert moved[0] == pytest.approx(1e-2, rel=1e-2) and moved[1] == pytest.approx(2.5e-3, rel=1e-2)
+
+
+def test_policy_delay(key):
+    config = sac.SACConfig(1, 1, network=NET, policy_delay=2, train_value=False, train_dynamics=False)
+    learner = sac.make_sac(config)
+    start, update = learner.init(key), jax.jit(learner.update)
+    first, _ = update(start, probe(key), key)
+    second, _ = update(first, probe(key), key)
+    assert equal(first.actor, second.actor) and not equal(start.actor, first.actor)
+
+
+def ensemble(**options):
+    """Four critics that say 0, 1, 2 and 3 everywhere, as a state, and the learner."""
+    config = sac.SACConfig(1, 1, network=NET, critics=4, train_value=False, train_dynamics=False, **options)
+    learner = sac.make_sac(config, sac.SACHyper(alpha=0.5))
+    state = learner.init(jax.random.key(0))
+    said = jax.tree.map(jnp.zeros_like, state.critic.params)
+    said["Dense_1"]["bias"] = jnp.arange(4.0)[:, None]
+    return state.replace(critic=state.critic._replace(params=said), target_critic=said), jax.jit(learner.update)
+
+
+def test_targets_are_the_minimum_of_some_members(key):
+    """Of two random members of four: 0, 1 or 2, and every one of them now and then; by default of all: 0."""
+    batch = probe(key, discount=lambda s: jnp.ones_like(s), reward=lambda s, a: jnp.zeros_like(s))
+    for chosen, expected in ((2, {0, 1, 2}), (None, {0})):
+        state, update = ensemble(target_critics=chosen, entropy_in_target=False)
+        seen = [update(state, batch, jax.random.key(i))[1]["critic/target_mean"] for i in range(20)]
+        assert {int(x) for x in seen} == expected and all(float(x).is_integer() for x in seen)
+
+
+def test_entropy_in_the_target(key):
+    batch = probe(key, discount=lambda s: jnp.ones_like(s), reward=lambda s, a: jnp.zeros_like(s))
+    with_entropy, without = (ensemble(entropy_in_target=e) for e in (True, False))
+    metrics = [update(state, batch, key)[1] for state, update in (with_entropy, without)]
+    assert metrics[1]["critic/target_mean"] == 0
+    assert metrics[0]["critic/target_mean"] == pytest.approx(0.5 * float(metrics[0]["actor/entropy"]), abs=0.15)
+
+
+def test_the_actor_follows_the_minimum_or_the_mean(key):
+    for mean, q in ((False, 0.0), (True, 1.5)):
+        state, update = ensemble(actor_mean=mean)
+        kept = state.replace(hyper=state.hyper._replace(lr_critic=jnp.float32(0)))
+        metrics = update(kept, probe(key), key)[1]
+        assert metrics["actor/loss"] == pytest.approx(-0.5 * float(metrics["actor/entropy"]) - q, abs=1e-4)
+
+
+def test_the_temperature_waits_with_the_actor(key):
+    config = sac.SACConfig(1, 1, network=NET, policy_delay=2, train_value=False, train_dynamics=False)
+    learner = sac.make_sac(config)
+    update = jax.jit(learner.update)
+    first, _ = update(learner.init(key), probe(key), key)
+    second, _ = update(first, probe(key), key)
+    assert first.log_alpha.params != 0 and equal(first.log_alpha, second.log_alpha)
+
+
+def test_actor_learns_from_the_leading_rows_only(key):
+    config = sac.SACConfig(1, 1, network=NET, actor_batch=4, train_value=False, train_dynamics=False)
+    learner = sac.make_sac(config)
+    state, batch, update = learner.init(key), probe(key, obs=[-1.0, 1.0]), jax.jit(learner.update)
+    other = batch._replace(obs=batch.obs.at[4:].add(3.0))
+    # from the same critic, the actor's step does not see rows 4 and later
+    kept = state.replace(hyper=state.hyper._replace(lr_critic=jnp.float32(0)))
+    a, b = (update(kept, x, key)[0] for x in (batch, other))
+    assert equal(a.actor, b.actor) and not equal(a.actor, state.actor)
+    c = update(kept, batch._replace(obs=batch.obs.at[3].add(3.0)), key)[0]
+    assert not equal(a.actor, c.actor)
+
+
+def test_without_discount_the_target_ignores_target_network_and_successor(key):
+    state, batch = FULL_LEARNER.init(key), probe(key, reward=lambda s, a: a)
+    other_state = state.replace(target_critic=jax.tree.map(lambda p: p + 1, state.target_critic))
+    other_batch = batch._replace(next_obs=batch.next_obs + 5)
+    a, b = (FULL_LEARNER.update(s, x, key)[0] for s, x in ((state, batch), (other_state, other_batch)))
+    assert equal(a.critic, b.critic)
+
+
+def test_hyperparameters_vmap(key):
+    state = FULL_LEARNER.init(key)
+    rates = jnp.array([0.0, 1e-2])
+
+    def step(rate):
+        return FULL_LEARNER.update(state.replace(hyper=state.hyper._replace(lr_critic=rate)), probe(key), key)[0]
+
+    new = jax.vmap(step)(rates)
+    assert equal(jax.tree.map(lambda x: x[0], new.critic.params), state.critic.params)
+    assert not equal(jax.tree.map(lambda x: x[1], new.critic.params), state.critic.params)
+
+
+def test_keys_decide_and_are_used_once(key):
+    state, batch = FULL_LEARNER.init(key), probe(key)
+    other = jax.random.key(1)
+    obs = jnp.zeros(1)
+
+    def explore(key):
+        return FULL_LEARNER.act(state, (), obs, key, explore=True)[0]
+
+    assert jnp.array_equal(explore(key), explore(key)) and not jnp.array_equal(explore(key), explore(other))
+    assert jnp.array_equal(*(FULL_LEARNER.act(state, (), obs, k, explore=False)[0] for k in (key, other)))
+    assert equal(FULL_LEARNER.update(state, batch, key)[0], FULL_LEARNER.update(state, batch, key)[0])
+    with jax.debug_key_reuse(True):
+        fresh = sac.make_sac(FULL)
+        jax.jit(fresh.update)(state, batch, jax.random.key(2))
+        jax.jit(fresh.init)(jax.random.key(3))
+
+
+# --- between simulation and reality ---------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def prior():
+    state = sac.make_sac(sac.SACConfig(3, 2, network=NET, ensemble_size=2)).init(jax.random.key(7))
+    statistics = normalizer.Normalizer(jnp.array([1.0, 2, 3]), jnp.array([2.0, 1, 0.5]))
+    return sac.extract_prior(state.replace(normalizer=statistics))
+
+
+def tuned(prior, *, reset, extra=0, **options):
+    config = sac.SACConfig(3, 2, extra, network=NET, train_value=False, train_dynamics=False, **options)
+    return sac.make_sac(config), sac.fine_tune_state(
+        config, sac.SACHyper(alpha=0.01), prior, jax.random.key(0), reset_critic=reset
+    )
+
+
+def test_fine_tuning_starts_from_the_prior(prior, key):
+    _, state = tuned(prior, reset=False)
+    assert equal(state.actor.params, prior.actor) and equal(state.critic.params, prior.critic)
+    assert equal(state.target_critic, prior.critic) and equal(state.normalizer, prior.normalizer)
+    assert jnp.exp(state.log_alpha.params) == pytest.approx(0.01)
+    assert all(jnp.all(m == 0) for m in jax.tree.leaves(state.actor.moments))
+    _, fresh = tuned(prior, reset=True)
+    assert equal(fresh.actor.params, prior.actor) and not equal(fresh.critic.params, prior.critic)
+    assert equal(fresh.target_critic, fresh.critic.params)
+
+
+def test_the_first_policy_is_the_simulators_for_every_steps_to_go(prior, key):
+    plain_learner, plain = tuned(prior, reset=False)
+    learner, state = tuned(prior, reset=False, extra=3)
+    obs, action = jnp.array([0.5, -1.0, 2.0]), jnp.array([0.1, -0.2])
+    expected = plain_learner.act(plain, (), obs, key, explore=True)[0]
+    q = networks.make_critic(3, 2, NET).apply(prior.critic, obs, action)
+    for k in range(4):
+        told = jnp.concatenate([obs, jax.nn.one_hot(k - 1, 3)])
+        np.testing.assert_allclose(learner.act(state, (), told, key, explore=True)[0], expected, rtol=1e-5)
+        got = networks.make_critic(6, 2, NET).apply(state.critic.params, told, action)
+        np.testing.assert_allclose(got, q, rtol=1e-5)
+
+
+def test_kept_critic_under_shaping_is_the_simulators_advantage(prior, key):
+    """r_bar of the simulator has mean Q_sim - V_sim: at discount 0 that critic has no error on such rewards."""
+    learner, state = tuned(prior, reset=False, critic_baseline=True, tune_alpha=False)
+    critic, value = networks.make_critic(3, 2, NET), networks.make_value(3, NET)
+    obs, action = jax.random.normal(key, (16, 3)), jax.random.uniform(key, (16, 2))
+    zs = jax.vmap(normalizer.normalize, (None, 0))(prior.normalizer, obs)
+    q = jax.vmap(critic.apply, (None, 0, 0))(prior.critic, zs, action)
+    v = jax.vmap(value.apply, (None, 0))(prior.value, zs)
+    zero = jnp.zeros(16)
+    batch = Transition(obs, action, q[:, 0] - v, zero, obs, zero > 0, zero.astype(jnp.int32))
+    new, metrics = jax.jit(learner.update)(state, batch, key)
+    # only the second critic errs: mean (Q_2 - Q_1)^2
+    assert metrics["critic/loss"] == pytest.approx(float(jnp.mean((q[:, 1] - q[:, 0]) ** 2)), rel=1e-4)
+    assert equal(new.value, state.value)
+
+
+def test_a_prior_of_another_shape_is_refused(prior):
+    config = sac.SACConfig(4, 2, network=NET)
+    with pytest.raises(UserError, match=r"prior actor.*\(3, 32\), expected \(4, 32\)"):
+        sac.fine_tune_state(config, sac.SACHyper(), prior, jax.random.key(0), reset_critic=True)
+    with pytest.raises(UserError, match="train_value and train_dynamics"):
+        sac.extract_prior(LEARNER.init(jax.random.key(0)))
+
+
+def test_impossible_options_are_refused():
+    with pytest.raises(UserError, match="critic_baseline"):
+        sac.SACConfig(1, 1, critic_baseline=True)
+    with pytest.raises(UserError, match="policy_delay"):
+        sac.SACConfig(1, 1, policy_delay=0)

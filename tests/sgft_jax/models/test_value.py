@@ -1,0 +1,42 @@
+"""Reports on V_sim against hand-computed returns and scipy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+from sgft_jax.models import networks, value
+from sgft_jax.types import Normalizer
+
+
+def test_returns_by_hand():
+    # G_2 = 3 + 0.5 * 8 = 7; G_1 = 2 + 0 * 7 = 2 (terminated); G_0 = 1 + 0.5 * 2 = 2
+    returns = value.discounted_returns(jnp.array([1.0, 2, 3]), jnp.array([0.5, 0, 0.5]), jnp.float32(8))
+    assert returns.tolist() == [2.0, 2.0, 7.0]
+
+
+def test_explained_variance_by_hand():
+    returns = jnp.array([0.0, 2.0])  # variance 1
+    assert value.explained_variance(returns + 5, returns) == 1.0  # a constant offset costs nothing
+    assert value.explained_variance(jnp.zeros(2), returns) == 0.0
+    assert value.explained_variance(returns / 2, returns) == 0.75  # the residual {0, 1} has variance 1 / 4
+
+
+def test_rank_correlation_is_spearman(key):
+    a, b = jax.random.normal(key, (2, 50))
+    assert value.rank_correlation(a, a + b) == pytest.approx(scipy.stats.spearmanr(a, a + b).statistic, abs=1e-5)
+    assert value.rank_correlation(a, -jnp.exp(a)) == pytest.approx(-1.0)
+
+
+def test_predict_normalises(key):
+    network = networks.make_value(2, networks.NetworkConfig((8,)))
+    params, statistics = network.init(key), Normalizer(jnp.array([1.0, 2]), jnp.array([2.0, 4]))
+    got = value.predict(network, params, statistics, jnp.array([3.0, 10.0]))
+    np.testing.assert_allclose(got, network.apply(params, jnp.array([1.0, 2.0])), rtol=1e-6)
+
+
+def test_report_names():
+    report = value.report(jnp.array([1.0, 2.0]), jnp.array([0.0, 1.0]))
+    assert report["value/bias"] == 1.0 and report["value/explained_variance"] == 1.0
+    assert report["value/rank_correlation"] == 1.0

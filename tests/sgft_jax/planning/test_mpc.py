@@ -1,0 +1,166 @@
+"""Plans by the models of a SAC prior: what they find in worlds that are known exactly, and what learns."""
+
+import functools
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sgft_jax import finetune, methods
+from sgft_jax.learners import sac
+from sgft_jax.models import networks
+from sgft_jax.planning import mpc
+from sgft_jax.players import mpc_player
+from sgft_jax.types import Normalizer, Prior, Transition, UserError
+
+NET = networks.NetworkConfig(hidden=(8,))
+STILL = Normalizer(jnp.zeros(1), jnp.ones(1))
+
+
+def nothing(obs, action, after):
+    return 0.0 * after[0]
+
+
+def never(obs, action, after):
+    return jnp.bool_(False)
+
+
+@pytest.fixture
+def plan(monkeypatch):
+    """plan(value, gains, ...) -> the planned action at `obs` in a world s' = s + gain * action, one gain per model.
+
+    The policy's proposals are all at 0 but for the noise on them.
+    """
+
+    def found(value, gains=(1.0,), *, obs=0.0, horizon=1, reward=nothing, terminated=never, noise=0.0, gamma=1.0):
+        model = networks.Network(lambda key: None, lambda gains, obs, action: gains[:, None] * action[None])
+        still = networks.Network(lambda key: None, lambda params, obs: jnp.array([[0.0], [-20.0]]))
+        monkeypatch.setattr(mpc, "make_dynamics", lambda *_: model)
+        monkeypatch.setattr(mpc, "make_value", lambda *_: networks.Network(lambda key: None, lambda _, s: value(s[0])))
+        monkeypatch.setattr(mpc, "make_actor", lambda *_: still)
+        config = mpc.MPCConfig(1, 1, NET, horizon=horizon, noise=noise, gamma=gamma)
+        act = mpc.make_act(config, reward=reward, terminated=terminated)
+        prior = Prior(None, None, None, jnp.array(gains), STILL)
+        keys = jax.random.split(jax.random.key(0), 20)
+        one = lambda key: act(prior, mpc.init_carry(config), jnp.array([obs]), key, explore=False)[0][0]  # noqa: E731
+        return jax.jit(jax.vmap(one))(keys)
+
+    return found
+
+
+def test_a_plan_goes_where_value_is_highest(plan):
+    np.testing.assert_allclose(plan(lambda s: -10 * (s - 0.6) ** 2), 0.6, atol=0.1)
+    np.testing.assert_allclose(plan(lambda s: -10 * (s - 7.0) ** 2), 1.0, atol=0.05)  # as far as the action goes
+
+
+def test_models_that_disagree_are_averaged(plan):
+    """Gains g = 0.5 and 1.5: the mean of (g a - 0.6)^2 is least at 0.6 mean(g) / mean(g^2) = 0.48."""
+    np.testing.assert_allclose(plan(lambda s: -40 * (s - 0.6) ** 2, (0.5, 1.5)), 0.48, atol=0.08)
+
+
+def test_rewards_on_the_way_count(plan):
+    np.testing.assert_allclose(
+        plan(lambda s: 0.0 * s, reward=lambda obs, action, after: -10 * (after[0] + 0.4) ** 2), -0.4, atol=0.1
+    )
+
+
+def test_a_longer_plan_crosses_a_valley(plan):
+    """Value falls before it rises: one step stays, two go through, to either side."""
+    value = lambda s: jnp.where(jnp.abs(s) > 1.5, 1.0, -(s**2))  # noqa: E731
+    assert (jnp.abs(plan(value, horizon=1)) < 0.2).all()
+    assert (jnp.abs(plan(value, horizon=2)) > 0.5).all()
+
+
+def test_nothing_comes_after_a_termination(plan):
+    """The highest value lies where the episode ends, and so counts for nothing."""
+    ends = lambda obs, action, after: after[0] > 0.5  # noqa: E731
+    goal = lambda s: 1.0 + s  # noqa: E731
+    assert (plan(goal) > 0.9).all()
+    assert (plan(goal, terminated=ends) <= 0.5).all() and (plan(goal, terminated=ends) > 0.3).all()
+
+
+def test_what_comes_later_is_discounted(plan):
+    """0.5 for staying or 1 for going, one step later: worth less at gamma 0.4."""
+    pays = lambda obs, action, after: jnp.where(jnp.abs(after[0]) < 0.1, 0.5, 0.0)  # noqa: E731
+    value = lambda s: jnp.where(s > 0.5, 1.0, 0.0)  # noqa: E731
+    assert (plan(value, reward=pays, gamma=0.9) > 0.5).all()
+    assert (jnp.abs(plan(value, reward=pays, gamma=0.4)) < 0.1).all()
+
+
+@pytest.mark.parametrize("options", [{"horizon": 0}, {"samples": 7}])
+def test_plans_that_cannot_be(options):
+    with pytest.raises(UserError, match=f"planner option {next(iter(options))} is"):
+        mpc.MPCConfig(1, 1, NET, **options)
+
+
+# --- fine-tuning ------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def tuner():
+    config = methods.finetune_config(
+        methods.get_method("sgft-mpc"),
+        network=NET,
+        plan_samples=24,
+        batch_size=32,
+        replay_capacity=64,
+        gamma=0.9,
+        lr_dynamics=1e-2,
+    )
+    made = finetune.make_finetuner(
+        methods.get_method("sgft-mpc"), config, obs_dim=1, act_dim=1,
+        reward=lambda obs, action, after: -jnp.abs(after[0]), terminated=never,
+    )  # fmt: skip
+    compiled = {name: jax.jit(getattr(made, name)) for name in ("init", "observe", "act")}
+    return made._replace(learn=jax.jit(made.learn, static_argnums=2), **compiled)
+
+
+@functools.cache
+def prior():
+    agent = sac.make_sac(sac.SACConfig(1, 1, network=NET, ensemble_size=3))
+    return sac.extract_prior(jax.jit(agent.init)(jax.random.key(7)))
+
+
+def rows(n=64):
+    """A real system in which actions work backwards."""
+    obs, action = jax.random.uniform(jax.random.key(1), (2, n, 1), minval=-1)
+    after, zero = obs - 0.5 * action, jnp.zeros(n)
+    return Transition(obs, action, -jnp.abs(after[:, 0]), zero + 0.9, after, zero > 0, zero.astype(jnp.int32))
+
+
+def test_the_models_learn_and_all_else_stays():
+    state = tuner().observe(tuner().init(prior(), jax.random.key(0)), rows(), jnp.arange(64) != 5)
+    assert state.replay.size == 63
+    new, metrics = tuner().learn(state, jax.random.key(2), 300)
+    before, after = prior(), tuner().export(new)
+    same = lambda a, b: jax.tree.map(np.testing.assert_array_equal, a, b)  # noqa: E731
+    same(replace(before, dynamics=None), replace(after, dynamics=None))
+    assert metrics["dynamics/mse"].shape == ()
+    assert tuner().learn(new, jax.random.key(3), 1)[1]["dynamics/mse"] < metrics["dynamics/mse"]
+    model = networks.make_dynamics(1, 1, NET)
+    predicted = mpc.dynamics.predict(model, after.dynamics, after.normalizer, jnp.array([0.2]), jnp.array([0.8]))
+    np.testing.assert_allclose(predicted, -0.2, atol=0.05)  # every member
+
+
+def test_real_actions_are_spread_and_the_best_one_is_not():
+    """By 0.4, which the bounds of actions cut a little, beside the 0.05 of the search."""
+    state, obs = tuner().init(prior(), jax.random.key(0)), jnp.array([0.3])
+    act = jax.vmap(
+        lambda key, explore: tuner().act(state, tuner().init_carry(), obs, key, explore=explore)[0], (0, None)
+    )
+    best, spread = (act(jax.random.split(jax.random.key(5), 200), explore) for explore in (False, True))
+    assert best.std() < 0.2 and 0.25 < (spread - best).std() < 0.5 and jnp.abs(spread).max() <= 1
+
+
+def test_what_fine_tuning_leaves_acts_as_the_agent_did():
+    """A player made of the same options, with the parameters that were exported."""
+    state = tuner().init(prior(), jax.random.key(0))
+    config = mpc.MPCConfig(1, 1, NET, samples=24, gamma=0.9)
+    player = mpc_player(config, reward=lambda obs, action, after: -jnp.abs(after[0]), terminated=never)
+    key, obs = jax.random.key(4), jnp.array([0.3])
+    own = tuner().act(state, tuner().init_carry(), obs, key, explore=False)
+    again = player.act(tuner().export(state), player.init_carry(), obs, jax.random.split(key)[0], explore=False)
+    np.testing.assert_allclose(own[0], again[0], atol=1e-5)
+    assert jnp.isfinite(player.value(prior(), jnp.array([0.3])))

@@ -1,0 +1,233 @@
+"""The three transforms: telescoping, brute-force H-step targets, branches, the method table."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from sgft_jax import methods
+from sgft_jax import transforms as sgft
+from sgft_jax.learners import losses
+from sgft_jax.types import Imagination, Transition, UserError
+
+GAMMA = 0.9
+
+
+def imagination(**changes):
+    """A world on a line: the action moves the state, V(s) = s^2 / 10, the episode ends beyond 3."""
+    line = Imagination(
+        value=lambda obs: obs[0] ** 2 / 10,
+        policy=lambda obs, k, key: jnp.ones(1),
+        dynamics=lambda obs, action, key: obs + action,
+        reward=lambda obs, action, next_obs: -next_obs[0],
+        terminated=lambda obs, action, next_obs: next_obs[0] > 3,
+        gamma=GAMMA,
+    )
+    return line._replace(**changes)
+
+
+def batch_of(obs, next_obs, reward, discount=None, steps_to_go=None):
+    n = len(reward)
+    return Transition(
+        obs=jnp.asarray(obs, jnp.float32).reshape(n, -1),
+        action=jnp.zeros((n, 1)),
+        reward=jnp.asarray(reward, jnp.float32),
+        discount=jnp.full(n, GAMMA) if discount is None else jnp.asarray(discount, jnp.float32),
+        next_obs=jnp.asarray(next_obs, jnp.float32).reshape(n, -1),
+        truncated=jnp.zeros(n, bool),
+        steps_to_go=jnp.zeros(n, jnp.int32) if steps_to_go is None else jnp.asarray(steps_to_go, jnp.int32),
+    )
+
+
+# --- shape ------------------------------------------------------------------------------------------------------------
+
+
+def test_shaped_reward_by_hand(key):
+    # 1 + 0.9 * 0.4 - 0.1 = 1.26; terminated: 1 + 0 - 0.1 = 0.9
+    out = sgft.shape(imagination(), batch_of([1, 1], [2, 2], [1, 1], [GAMMA, 0]), key)
+    np.testing.assert_allclose(out.reward, [1.26, 0.9], rtol=1e-6)
+    assert out.discount.tolist() == pytest.approx([GAMMA, 0])  # shaping alone shortens nothing
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 5, 40])
+@pytest.mark.parametrize("seed", range(3))
+def test_shaped_rewards_telescope(horizon, seed):
+    """sum gamma^t r_bar_t = sum gamma^t r_t + gamma^H V(s_H) - V(s_0) for any trajectory."""
+    keys = jax.random.split(jax.random.key(seed), 2)
+    states, rewards = jax.random.normal(keys[0], (horizon + 1,)), jax.random.normal(keys[1], (horizon,))
+    shaped = sgft.shape(imagination(), batch_of(states[:-1], states[1:], rewards), keys[0]).reward
+    powers = GAMMA ** jnp.arange(horizon)
+    potential = GAMMA**horizon * states[-1] ** 2 / 10 - states[0] ** 2 / 10
+    np.testing.assert_allclose(jnp.sum(powers * shaped), jnp.sum(powers * rewards) + potential, atol=1e-5)
+
+
+def test_expected_shaped_reward_is_zero_where_the_value_is_exact():
+    """The TD identity: under the simulator's dynamics and policy, E[r + gamma V(s') - V(s)] = 0 in every state."""
+    rng = np.random.default_rng(0)
+    chain = rng.dirichlet(np.ones(4), size=4)  # p(s' | s) under the policy
+    rewards = rng.normal(size=4)  # of arriving
+    v = jnp.asarray(np.linalg.solve(np.eye(4) - GAMMA * chain, chain @ rewards), jnp.float32)
+    tabular = imagination(value=lambda obs: v[obs[0].astype(int)])
+    s, s_next = (x.ravel() for x in np.meshgrid(np.arange(4), np.arange(4), indexing="ij"))
+    shaped = sgft.shape(tabular, batch_of(s, s_next, rewards[s_next]), jax.random.key(0)).reward
+    np.testing.assert_allclose((chain * np.asarray(shaped).reshape(4, 4)).sum(axis=1), 0, atol=1e-5)
+
+
+# --- shorten ----------------------------------------------------------------------------------------------------------
+
+
+def test_horizon_one_target_is_the_shaped_reward_to_the_bit(key):
+    raw = batch_of(jax.random.normal(key, (64,)), jax.random.normal(key, (64,)) + 1, jnp.linspace(-1, 1, 64))
+    shaped = sgft.shape(imagination(), raw, key)
+    short = sgft.shorten(1)(imagination(), shaped, key)
+    next_q = 1e3 * jax.random.normal(key, (64, 2))
+    target = jax.vmap(lambda r, d, q: losses.td_target(r, d, q, jnp.float32(7), alpha=0.5))
+    assert jnp.array_equal(target(short.reward, short.discount, next_q), shaped.reward)
+    assert short.obs.shape == raw.obs.shape and jnp.array_equal(short.next_obs, raw.next_obs)
+
+
+def test_shorten_appends_steps_to_go(key):
+    out = sgft.shorten(3)(imagination(), batch_of([7, 7, 7], [8, 8, 8], [0, 0, 0], steps_to_go=[3, 2, 1]), key)
+    assert out.obs.tolist() == [[7, 0, 0, 1], [7, 0, 1, 0], [7, 1, 0, 0]]
+    assert out.next_obs.tolist() == [[8, 0, 1, 0], [8, 1, 0, 0], [8, 0, 0, 0]]
+    assert out.discount.tolist() == pytest.approx([GAMMA, GAMMA, 0])
+
+
+def test_shorten_draws_missing_steps_to_go_uniformly(key):
+    n = 6000
+    raw = batch_of(np.zeros(n), np.zeros(n), np.zeros(n), steps_to_go=[0] * (n - 1) + [2])
+    out = sgft.shorten(3)(imagination(), raw, key)
+    counts = jnp.bincount(out.steps_to_go, length=5)
+    assert counts[0] == 0 and counts[4] == 0 and out.steps_to_go[-1] == 2
+    assert jnp.all(jnp.abs(counts[1:4] - 2000) < 190)  # 5 standard deviations: sqrt(6000 * 1/3 * 2/3) = 37
+    assert jnp.array_equal(out.discount == 0, out.steps_to_go == 1)
+
+
+def test_shorten_keeps_termination(key):
+    out = sgft.shorten(3)(imagination(), batch_of([1], [2], [0], discount=[0], steps_to_go=[3]), key)
+    assert out.discount[0] == 0
+
+
+@pytest.mark.parametrize("horizon", [1, 2, 3])
+def test_targets_equal_brute_force_on_a_tabular_problem(horizon):
+    """Iterating the transformed targets gives the best H-step plan: Q_k = r_bar + gamma 1{k>1} max Q_{k-1}."""
+    states, actions = 4, 2
+    rng = np.random.default_rng(horizon)
+    successor = rng.integers(states, size=(states, actions))
+    reward = rng.normal(size=states).astype(np.float32)  # of arriving
+    v = rng.normal(size=states).astype(np.float32)
+
+    def plan_return(s, plan):
+        total, start = 0.0, s
+        for t, a in enumerate(plan):
+            s = successor[s, a]
+            total += GAMMA**t * reward[s]
+        return total + GAMMA ** len(plan) * v[s] - v[start]
+
+    best = [max(plan_return(s, p) for p in itertools.product(range(actions), repeat=horizon)) for s in range(states)]
+
+    tabular = imagination(value=lambda obs: jnp.asarray(v)[obs[0].astype(int)])
+    rows = list(itertools.product(range(states), range(actions), range(1, horizon + 1)))
+    s, a, k = np.array(rows).T
+    raw = batch_of(s, successor[s, a], reward[successor[s, a]], steps_to_go=k)
+    transform = sgft.compose(sgft.shape, sgft.shorten(horizon))
+    batch = jax.tree.map(np.asarray, transform(tabular, raw, jax.random.key(0)))
+
+    def read(obs):
+        """State and steps to go as a learner sees them in an observation."""
+        return int(obs[0]), (1 if horizon == 1 else int(obs[1:] @ np.arange(1, horizon + 1)))
+
+    q = np.zeros((states, horizon + 1, actions))
+    for _ in range(horizon):
+        for i, action in enumerate(a):
+            q[(*read(batch.obs[i]), action)] = batch.reward[i] + batch.discount[i] * q[read(batch.next_obs[i])].max()
+    np.testing.assert_allclose(q[:, horizon].max(axis=1), best, atol=1e-5)
+
+
+# --- branch -----------------------------------------------------------------------------------------------------------
+
+
+def test_branches_follow_the_real_rows(key):
+    raw = batch_of([0, 10], [0.5, 10.5], [5, 6])
+    line = imagination(terminated=lambda obs, action, next_obs: jnp.bool_(False))
+    out = sgft.branch(2, 3)(line, raw, key)
+    assert out.reward.shape == (2 + 2 * 3 * 2,) and jnp.array_equal(out.obs[:2], raw.obs)
+    assert out.obs[2:, 0].tolist() == [0, 1] * 3 + [10, 11] * 3
+    assert out.next_obs[2:, 0].tolist() == [1, 2] * 3 + [11, 12] * 3
+    assert out.reward[2:].tolist() == [-1, -2] * 3 + [-11, -12] * 3
+    assert out.steps_to_go.tolist() == [0, 0] + [2, 1] * 6
+    assert jnp.all(out.discount == jnp.float32(GAMMA))
+    endless = sgft.branch(2, 3, segments=False)(line, raw, key)
+    assert jnp.all(endless.steps_to_go == 0)
+
+
+def test_after_an_imagined_termination_the_terminal_row_repeats(key):
+    # 2 -> 3 goes on, 3 -> 4 terminates, two steps remain
+    out = jax.tree.map(lambda x: x[1:], sgft.branch(4, 1)(imagination(), batch_of([2], [2], [0]), key))
+    assert out.obs[:, 0].tolist() == [2, 3, 3, 3] and out.next_obs[:, 0].tolist() == [3, 4, 4, 4]
+    assert out.discount.tolist() == pytest.approx([GAMMA, 0, 0, 0])
+    assert out.steps_to_go.tolist() == [4, 3, 3, 3] and out.reward.tolist() == [-3, -4, -4, -4]
+
+
+def test_branches_draw_their_own_actions_and_know_the_steps_to_go(key):
+    noisy = imagination(
+        policy=lambda obs, k, key: (k + 0.1 * jax.random.uniform(key, (1,))) / 10,
+        terminated=lambda obs, action, next_obs: jnp.bool_(False),
+    )
+    out = sgft.branch(3, 4)(noisy, batch_of([0, 0], [0, 0], [0, 0]), key)
+    imagined = out.action[2:, 0]
+    assert len(set(imagined.tolist())) == 24
+    assert jnp.array_equal(jnp.floor(10 * imagined), jnp.tile(jnp.array([3.0, 2.0, 1.0]), 8))
+
+
+def test_branch_noise_spreads_the_imagined_actions_within_their_range(key):
+    rest, zeros = imagination(policy=lambda obs, k, key: jnp.zeros(1)), np.zeros(40)
+    quiet, spread, wide = (
+        sgft.branch(1, 50, noise=noise)(rest, batch_of(zeros, zeros, zeros), key).action[40:, 0]
+        for noise in (0, 0.3, 5)
+    )
+    assert jnp.all(quiet == 0)
+    assert abs(spread.std() - 0.3) < 0.02 and abs(spread.mean()) < 0.02  # 2,000 draws
+    assert jnp.abs(wide).max() == 1.0 and 0.7 < (jnp.abs(wide) == 1.0).mean() < 0.95
+
+
+def test_batch_accounting_of_the_paper(key):
+    zeros = np.zeros(256)
+    transform = sgft.compose(*methods.METHODS["sgft-sac"].transforms(1, 5, 0.0))
+    out = transform(imagination(), batch_of(zeros, zeros, zeros), key)
+    assert out.reward.shape == (1536,) and jnp.all(out.discount == 0)
+
+
+# --- methods ----------------------------------------------------------------------------------------------------------
+
+
+def test_composition_runs_left_to_right_with_separate_keys(key):
+    seen = []
+
+    def note(name):
+        def transform(imagination, batch, key):
+            seen.append((name, key))
+            return batch
+
+        return transform
+
+    sgft.compose(note("a"), note("b"))(imagination(), batch_of([0], [0], [0]), key)
+    assert [name for name, _ in seen] == ["a", "b"] and seen[0][1] != seen[1][1]
+    raw = batch_of([0], [0], [0])
+    assert sgft.compose()(imagination(), raw, key) is raw
+
+
+@pytest.mark.parametrize("name", methods.METHODS)
+def test_only_finite_horizons_cut_the_bootstrap(name, key):
+    method = methods.METHODS[name]
+    out = sgft.compose(*method.transforms(1, 2, 0.0))(imagination(), batch_of([0, 1], [1, 2], [0, 0]), key)
+    assert out.reward.shape == ((6,) if method.uses_dynamics else (2,))
+    assert jnp.all(out.discount == (0 if method.finite_horizon else jnp.float32(GAMMA)))
+
+
+@pytest.mark.parametrize("make", [lambda: sgft.shorten(0), lambda: sgft.branch(0, 5), lambda: sgft.branch(1, 0)])
+def test_sizes_must_be_positive(make):
+    with pytest.raises(UserError, match="at least 1"):
+        make()
