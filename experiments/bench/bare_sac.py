@@ -3,6 +3,7 @@
 The same networks, losses and Adam as the SAC learner has in pretraining (twin critic, actor, temperature, V, dynamics
 ensemble, target average), without Flax, Optax, vmap over examples, or metrics. A test checks that both do the same
 arithmetic.
+"""
 
 from itertools import pairwise
 from typing import Any, NamedTuple
