@@ -1,9 +1,9 @@
-"""Settings of networks. Imports neither JAX nor MuJoCo, so that commands can list them at once."""
+"""What describes a network, as data. Command lines read this module, so it imports neither JAX nor Flax."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
-from sgft_jax import checks
+from sgft_jax.types import UserError
 
 type Precision = Literal["default", "float32", "bfloat16"]
 Activation = Literal["relu", "tanh", "silu", "elu"]
@@ -20,8 +20,9 @@ class NetworkConfig:
     actor_layer_norm: bool = False
     """The same in the actor."""
     activation: Activation = "relu"
-    """What follows each hidden layer."""
 
     def __post_init__(self) -> None:
-        checks.layers(self, "hidden")
-        checks.one_of(self, "activation", get_args(Activation))
+        if not self.hidden or min(self.hidden) < 1:
+            raise UserError(f"network option hidden is {self.hidden}: name one or more widths, each at least 1")
+        if self.activation not in Activation.__args__:
+            raise UserError(f"network activation {self.activation!r}: choose one of {', '.join(Activation.__args__)}")
