@@ -13,7 +13,6 @@ import jax.numpy as jnp
 from sgft_jax.models.networks import add_noise
 from sgft_jax.types import Array, Key, UserError
 
-
 _WORST = -1e9  # finite, so that weights stay defined where no score is
 
 
