@@ -93,8 +93,9 @@ def finetune(
 ) -> Iterator[tuple[FinetuneProgress, Metrics]]:
     """Fine-tunes M members, each a seed on a real system, until each has made `rollouts` real rollouts.
 
-    priors: params [P, ...] of P priors, or None; the member with seed s starts from prior s modulo P. seeds: [M] uint32.
-    simulated: see `simulate`, for methods that ask for it. progress: where an earlier run stopped, or None.
+    priors: params [P, ...] of P priors, or None; the member with seed s starts from prior s modulo P.
+    seeds: [M] uint32. simulated: see `simulate`, for methods that ask for it.
+    progress: where an earlier run stopped, or None.
 
     Yields the fresh state with no metrics (unless `progress` is given), then once per part of the offline phase, then
     once per real rollout, all initial ones together. Metrics are arrays [M]. Every random draw follows from (seed,
