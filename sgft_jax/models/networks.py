@@ -11,7 +11,7 @@ from flax import linen as nn
 from sgft_jax.models.config import NetworkConfig, Precision
 from sgft_jax.types import Array, Key, PyTree, UserError
 
-LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0  # O-5
+LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
 
 _ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"relu": nn.relu, "tanh": nn.tanh, "silu": nn.silu, "elu": nn.elu}
 
@@ -130,7 +130,7 @@ def tanh_gaussian_log_prob(moments: Array, u: Array) -> Array:
 
 
 def tanh_gaussian_mode(moments: Array) -> Array:
-    """The evaluation action tanh(mean) [act_dim] (O-13)."""
+    """The action of evaluations, tanh(mean) [act_dim]."""
     return jnp.tanh(moments[0])
 
 
@@ -139,9 +139,9 @@ def add_noise(action: Array, std: Array | float, key: Key) -> Array:
     return jnp.clip(action + std * jax.random.normal(key, action.shape), -1.0, 1.0)
 
 
-def tanh_gaussian_action(moments: Array, key: Key, *, explore: bool) -> Array:
-    """[act_dim]: a draw to explore, else the mode."""
-    return tanh_gaussian_sample(moments, key)[0] if explore else tanh_gaussian_mode(moments)
+def tanh_gaussian_action(moments: Array, key: Key, *, explore: bool | Array) -> Array:
+    """[act_dim]: a draw to explore, else the mode. `explore` may be traced."""
+    return jnp.where(explore, tanh_gaussian_sample(moments, key)[0], tanh_gaussian_mode(moments))
 
 
 def pad_first_layer(params: PyTree, obs_dim: int, extra: int) -> PyTree:
