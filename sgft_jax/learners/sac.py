@@ -253,7 +253,9 @@ def _critic_of(config: SACConfig, parts: _Parts, state: SACState) -> Callable[[P
 
     def relative(params: PyTree, obs: Array, action: Array) -> Array:
         with precision("float32"):  # as in value.predict: the difference of two large numbers
-            return parts.critic.apply(params, obs, action) - parts.value.apply(state.value.params, obs[: config.obs_dim])
+            return parts.critic.apply(params, obs, action) - parts.value.apply(
+                state.value.params, obs[: config.obs_dim]
+            )
 
     return relative
 
@@ -316,9 +318,7 @@ def _update_actor(
     return state.replace(actor=fit), q, log_prob, {"actor/loss": value, "actor/entropy": -jnp.mean(log_prob)}
 
 
-def _update_temperature(
-    config: SACConfig, parts: _Parts, state: SACState, rows: Batch, log_prob: Array
-) -> SACState:
+def _update_temperature(config: SACConfig, parts: _Parts, state: SACState, rows: Batch, log_prob: Array) -> SACState:
     target = state.hyper.entropy_per_dim * config.act_dim
 
     def loss(log_alpha: Array) -> Array:
@@ -335,9 +335,7 @@ def _policy_turn(config: SACConfig, state: SACState) -> Array:
     return state.step % config.policy_delay == 0
 
 
-def _update_value(
-    config: SACConfig, parts: _Parts, state: SACState, rows: Batch, q: Array
-) -> tuple[SACState, Metrics]:
+def _update_value(config: SACConfig, parts: _Parts, state: SACState, rows: Batch, q: Array) -> tuple[SACState, Metrics]:
     obs = rows.obs[:, : config.obs_dim]
 
     def loss(params: PyTree) -> Array:
@@ -388,4 +386,6 @@ def check_params_of_prior(config: SACConfig, params: SACParams, *, critic: bool)
     parts = _parts(SACConfig(config.obs_dim, config.act_dim, **body))
     owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, hidden {config.network.hidden}"
     for name in ("actor", "value", *(["critic"] if critic else [])):
-        check_params(name, getattr(parts, name), getattr(params, name), f"{owner}: use the prior's own task and network")
+        check_params(
+            name, getattr(parts, name), getattr(params, name), f"{owner}: use the prior's own task and network"
+        )

@@ -293,7 +293,9 @@ def make_tdmpc2(config: TDMPC2Config, hyper: TDMPC2Hyper | None = None) -> Learn
 
     def update(state: TDMPC2State, batch: Batch, key: Key) -> tuple[TDMPC2State, Metrics]:
         if batch.reward.shape[1] != config.horizon:
-            raise UserError(f"TD-MPC2 windows have {batch.reward.shape[1]} steps: must be {config.horizon}, the horizon")
+            raise UserError(
+                f"TD-MPC2 windows have {batch.reward.shape[1]} steps: must be {config.horizon}, the horizon"
+            )
         if batch.valid is None:
             batch = batch._replace(valid=jnp.ones(batch.reward.shape, bool))
         return _update(config, parts, state, batch, key)
