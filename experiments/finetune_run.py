@@ -52,7 +52,9 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int]) -> list[dict[str, 
     )  # fmt: skip
     try:
         with mesh.use(devices):
-            records = [Record(own.folder, real, gap, method.name, seeds) for own, gap in zip(opened, found, strict=True)]
+            records = [
+                Record(own.folder, real, gap, method.name, seeds) for own, gap in zip(opened, found, strict=True)
+            ]
             return _Run(args, env, real, found, seeds, finetuner, priors, records).work()
     finally:
         for own in opened:
@@ -119,9 +121,7 @@ class _Run:
             return None
         worlds = envs.sample_worlds(self.env, jax.random.key(_SIMULATION), _SIMULATED_WORLDS)
         policy, gamma = make_policy(self.card, self.env), self.card["gamma"]
-        rows = train.simulate(
-            self.env, policy, worlds, self.priors, jax.random.key(_SIMULATION), needs, gamma=gamma
-        )
+        rows = train.simulate(self.env, policy, worlds, self.priors, jax.random.key(_SIMULATION), needs, gamma=gamma)
         low, high = float(rows.returns.min()), float(rows.returns.max())
         print(f"simulated: {rows.returns.size} episodes, returns from {low:.1f} to {high:.1f}")
         return rows
@@ -174,7 +174,9 @@ class _Run:
         return {} if real is None else {f"{self.env.score}, exploring": float(real.mean())}
 
     def _evaluate(self, progress: FinetuneProgress, done: int) -> float:
-        scores = _scores(train.evaluate(self.finetuner, self.system, progress.agent, self.seeds, self.args.eval_episodes))
+        scores = _scores(
+            train.evaluate(self.finetuner, self.system, progress.agent, self.seeds, self.args.eval_episodes)
+        )
         for record, own in self._each(scores):
             record.evaluation(done, own)
         return float(scores["score"].mean())
