@@ -44,10 +44,6 @@ class Recorded:
                 store.append(_arrays(part(episodes, i, keys.shape[0] // len(self.stores))))
         return episodes
 
-    def close(self) -> None:
-        """Brings the system to rest."""
-        self.inner.close()
-
 
 def _arrays(episodes: Episode) -> dict[str, np.ndarray]:
     """Arrays [S, ...] of one rollout of every seed, as they are stored."""
