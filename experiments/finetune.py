@@ -5,7 +5,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -17,12 +16,14 @@ from envs import gaps
 from envs.base import Env
 from envs.gaps import Gap
 from envs.rollout import Episode
-from experiments import cli, common, tuned
+from experiments import cli, stacking, tuned
 from experiments.algorithms import make_player, network_of
 from experiments.evaluation import score
 from experiments.finetune_args import DEFAULT_METHOD, VOLATILE, FinetuneArgs, arguments, check, check_prior, run_folder
 from experiments.finetune_record import Record
 from experiments.finetuning import Program, Reals, Simulation, make_program, simulate
+from experiments.options import prior_folders
+from experiments.worlds import real_env, real_worlds
 from sgft_jax import mesh
 from sgft_jax.data.replay import ReplayState
 from sgft_jax.finetune import make_finetuner
@@ -30,6 +31,7 @@ from sgft_jax.finetune_mpc import plan_options
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.config import config_to_json
 from sgft_jax.io.log import RunProgress
+from sgft_jax.io.priors import load_priors
 from sgft_jax.methods import METHODS, FinetuneConfig, Method, dynamics_warmup, lr_warmup, policy_delay
 from sgft_jax.types import Array, Finetuner, Key, PyTree, UserError
 
@@ -41,20 +43,14 @@ _OFFLINE_PART = 10_000  # updates between two checkpoints, which are signs of li
 def main(argv: Sequence[str] | None = None) -> None:
     """The command line. The method is looked up first, because it gives the other options their defaults."""
     argv = list(sys.argv[1:] if argv is None else argv)
-    name = common.option(argv, "--method", DEFAULT_METHOD)
-    try:
-        default = arguments(name)
-        if "--tuned" in argv:
-            default = _tuned(default, argv)
-    except UserError as error:
-        cli.fail(str(error))
-    cli.run_main(finetune, FinetuneArgs, f"{__doc__}\n\n{_table()}", argv=argv, default=default)
+    cli.run_main(finetune, FinetuneArgs, f"{__doc__}\n\n{_table()}", argv=argv, default=_defaults)
 
 
-def _tuned(default: FinetuneArgs, argv: Sequence[str]) -> FinetuneArgs:
-    """The defaults with the options that tuning chose for the task."""
-    task, out = common.option(argv, "--task", default.task), common.option(argv, "--out", str(default.out))
-    return tuned.apply(replace(default, task=task, out=Path(out)))
+def _defaults(argv: Sequence[str]) -> FinetuneArgs:
+    """Those of the chosen method, with the options that tuning chose for the task if `--tuned` asks for them."""
+    chosen = cli.preview(argv, method=DEFAULT_METHOD, tuned=False, task=FinetuneArgs.task, out=FinetuneArgs.out)
+    default = arguments(chosen.method)
+    return tuned.apply(replace(default, task=chosen.task, out=chosen.out)) if chosen.tuned else default
 
 
 def _table() -> str:
@@ -72,12 +68,13 @@ def _table() -> str:
 def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:
     """Fine-tuning runs from (or back) to disk, one per real system; returns their summaries in the order of `real`."""
     method, seeds = check(args)
+    priors_in = prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
     members = "--seeds" if len(args.real) == 1 else "the number of --real times --seeds"
     devices = mesh.devices(args.devices, {members: len(args.real) * args.seeds})
     env = envs.make(args.task, args.impl)
     found = [gaps.load(env, real, args.set) for real in args.real]
-    system = common.real_env(env, found)
-    priors, card = common.find_priors(args.prior, out=args.out, env=env, preset=args.preset)
+    system = real_env(env, found)
+    priors, card = load_priors(priors_in, env)
     check_prior(args, method, card)
     # Every folder is that of a run on its real system alone: either kind of run continues the other.
     folders = {run_folder(args, real): config_to_json(args) | {"real": real} for real in args.real}
@@ -90,7 +87,7 @@ def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:
             records = [
                 Record(run.folder, system, gap, method.name, seeds) for run, gap in zip(opened, found, strict=True)
             ]
-            return _Run(args, env, system, found, method, seeds).work(records, common.stack(priors), card)
+            return _Run(args, env, system, found, method, seeds).work(records, stacking.stack(priors), card)
     finally:
         for run in opened:
             run.close()
@@ -108,7 +105,7 @@ class _Run:
     ) -> None:
         self.args, self.env, self.real, self.found, self.method, self.seeds = args, env, real, found, method, seeds
         which = jnp.repeat(jnp.arange(len(found)), len(seeds))
-        self.reals = Reals(common.real_worlds(real, found, jax.random.key(0)), which)
+        self.reals = Reals(real_worlds(real, found, jax.random.key(0)), which)
         self.numbers = jnp.tile(jnp.array(seeds, jnp.uint32), len(found))
 
     def work(self, records: list[Record], priors: PyTree, card: dict[str, Any]) -> list[dict[str, Any]]:
@@ -184,11 +181,11 @@ class _Run:
 
     def _like(self, make: Callable[[], PyTree]) -> PyTree:
         """Shapes of the state [S] of one real system."""
-        return jax.eval_shape(lambda: common.part(make(), 0, len(self.seeds)))
+        return jax.eval_shape(lambda: stacking.part(make(), 0, len(self.seeds)))
 
     def _each(self, members: PyTree) -> Iterator[tuple[Record, PyTree]]:
         """Every real system's record and, [S], what belongs to it in a pytree over all members."""
-        return ((record, common.part(members, i, len(self.seeds))) for i, record in enumerate(self.records))
+        return ((record, stacking.part(members, i, len(self.seeds))) for i, record in enumerate(self.records))
 
     def _each_state(self, state: PyTree) -> Iterator[tuple[Record, PyTree]]:
         """The same for a state, of whose many arrays one program cuts out one real system's at a time."""
@@ -292,15 +289,15 @@ class _Run:
 
     def _finish(self, state: PyTree, card: dict[str, Any]) -> list[dict[str, Any]]:
         """Policies, summaries, figures and films."""
-        export = jax.jit(lambda state, i: self.tuner.export(common.member(state, i)))
+        export = jax.jit(lambda state, i: self.tuner.export(stacking.member(state, i)))
         summaries, play = [], functools.cache(lambda: self._before_and_after(state))
         for i, (record, own) in enumerate(self._each_state(state)):
             record.save_policies(export, own, card)
             summary = record.summarise()
             summaries.append(summary)
             if self.args.video:
-                mine = lambda i=i: [common.part(played, i, len(self.seeds)) for played in play()]  # noqa: E731
-                print(record.film(common.member(self.reals.pools, i), mine, summary["final"]["rollouts"]))
+                mine = lambda i=i: [stacking.part(played, i, len(self.seeds)) for played in play()]  # noqa: E731
+                print(record.film(stacking.member(self.reals.pools, i), mine, summary["final"]["rollouts"]))
             print(f"results: {record.folder}  (policy/, real/, summary.json, figures/)")
         print("next: python -m experiments.figures")
         return summaries
@@ -311,7 +308,7 @@ class _Run:
         return [program.evaluate(state, self.reals, self.numbers, n) for program, state in players]
 
 
-_part = jax.jit(common.part, static_argnums=2)
+_part = jax.jit(stacking.part, static_argnums=2)
 
 
 @jax.jit

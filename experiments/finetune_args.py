@@ -8,7 +8,8 @@ from typing import Any
 
 import envs
 from envs.mujoco.worlds import Impl
-from experiments import cli, common
+from experiments import cli
+from experiments.options import seed_list, seeds_name
 from experiments.presets import PRESETS
 from sgft_jax.io import checkpoint
 from sgft_jax.methods import FinetuneConfig, Method, check_options, finetune_config, get_method
@@ -99,7 +100,7 @@ def _preset(method: Method) -> str:
 def run_folder(args: FinetuneArgs, real: str) -> Path:
     """Where the run on that real system lives; the seeds of one call share a folder."""
     system = "_".join([Path(real).stem, *(change.replace("/", "") for change in args.set)])
-    seeds = common.seeds_name(common.seed_list(args.seed, args.seeds))
+    seeds = seeds_name(seed_list(args.seed, args.seeds))
     return args.out / "finetune" / envs.name_of(args.task) / system / label(args) / seeds
 
 
@@ -121,7 +122,7 @@ def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
         raise UserError(f"--variant {args.variant!r}: letters, digits, '.', '_' and '-' only, it names a folder")
     if args.utd <= 0:
         raise UserError(f"--utd is {args.utd}: must be positive")
-    seeds = common.seed_list(args.seed, args.seeds)
+    seeds = seed_list(args.seed, args.seeds)
     if not args.real:
         raise UserError("--real: name at least one")
     folders = [run_folder(args, real) for real in args.real]

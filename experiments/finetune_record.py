@@ -12,8 +12,8 @@ import numpy as np
 from envs.base import Env, World
 from envs.gaps import Gap
 from envs.rollout import Episode
-from experiments.common import member
 from experiments.results import describe_run, read_curve
+from experiments.stacking import member
 from experiments.video import before_and_after
 from sgft_jax.analysis import plot
 from sgft_jax.analysis.stats import iqm_interval

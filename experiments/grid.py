@@ -8,9 +8,9 @@ from typing import Any, Literal, NamedTuple
 
 import envs
 from envs.mujoco.worlds import Impl
-from experiments import common
 from experiments.finetune import finetune
 from experiments.finetune_args import VOLATILE, FinetuneArgs, arguments, label, run_folder
+from experiments.options import seed_list
 from sgft_jax.io import checkpoint
 from sgft_jax.io.config import config_to_json
 from sgft_jax.io.jsonfile import read_json
@@ -80,7 +80,7 @@ def check(args: GridArgs) -> None:
         envs.name_of(task)
     for method in args.methods:
         get_method(method)
-    common.seed_list(args.seed, args.seeds)
+    seed_list(args.seed, args.seeds)
 
 
 def run_of(args: GridArgs, task: str, real: str, method: str) -> FinetuneArgs:

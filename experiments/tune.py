@@ -19,9 +19,10 @@ from rich.console import Console
 from rich.table import Table
 
 import envs
-from experiments import cli, common, grid, tuned
+from experiments import cli, grid, tuned
 from experiments.finetune_args import with_settings
 from experiments.grid import Cell, GridArgs
+from experiments.options import prior_home, seed_list
 from experiments.results import area, read_curve
 from sgft_jax.io import runs
 from sgft_jax.io.jsonfile import read_json
@@ -111,7 +112,7 @@ def trials(args: TuneArgs, task: str, method: str) -> list[Trial]:
 
 def _look_up(args: TuneArgs, task: str, real: str, method: str, number: int, settings: dict[str, Any]) -> Cell:
     run = grid.run_of(args, task, real, method)
-    priors = common.prior_home(args.out, envs.name_of(task), run.preset)
+    priors = prior_home(args.out, envs.name_of(task), run.preset)
     run = replace(run, prior=priors, variant=f"trial-{number}", out=args.out / FOLDER)
     return grid.look_up(with_settings(run, settings))
 
@@ -160,7 +161,7 @@ def _result(
     ]
     budget = {
         "trials": args.trials, "reals": [_name(real) for real in args.reals],
-        "seeds": common.seed_list(args.seed, args.seeds), "rollouts": args.rollouts,
+        "seeds": seed_list(args.seed, args.seeds), "rollouts": args.rollouts,
         "initial_rollouts": args.initial_rollouts, "eval_every": args.eval_every,
     }  # fmt: skip
     return {
