@@ -10,7 +10,7 @@ import envs
 from envs.mujoco.worlds import Impl
 from experiments import cli
 from experiments.options import seed_list, seeds_name
-from experiments.presets import PRESETS
+from sgft_jax.presets import PRESETS
 from sgft_jax.io import checkpoint
 from sgft_jax.methods import FinetuneConfig, Method, check_options, finetune_config, get_method
 from sgft_jax.types import UserError

@@ -8,6 +8,8 @@ from .models import normalizer
 from .models.config import NetworkConfig
 from .planning.mpc import MPCConfig
 from .policies import make_policy, mpc_policy, sac_policy, tdmpc2_policy
+from .presets import PRESETS, PretrainConfig
+from .pretraining import PretrainState, pretrain, priors_of
 from .systems import System
 from .systems.simulated import Simulated
 from .train import FinetuneProgress, evaluate, finetune, simulate
@@ -31,6 +33,7 @@ from .types import (
 )
 
 __all__ = [
+    "PRESETS",
     "Batch",
     "FinetuneProgress",
     "FinetuneState",
@@ -46,6 +49,8 @@ __all__ = [
     "Normalizer",
     "Parts",
     "Policy",
+    "PretrainConfig",
+    "PretrainState",
     "Prior",
     "SACConfig",
     "SACHyper",
@@ -79,6 +84,8 @@ __all__ = [
     "make_tdmpc2",
     "mpc_policy",
     "normalizer",
+    "pretrain",
+    "priors_of",
     "relabel",
     "replay",
     "sac_finetuner",

@@ -15,7 +15,7 @@ import envs
 from envs.mujoco.engines import c as engine_c
 from envs.mujoco.worlds import PhysicsState
 from experiments import cli, pretrain, pretrain_run
-from experiments.presets import PretrainConfig
+from sgft_jax.presets import PretrainConfig
 from experiments.pretraining import spread_replay
 from experiments.stacking import seed_keys, stack
 from sgft_jax import mesh

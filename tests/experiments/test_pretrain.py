@@ -17,7 +17,7 @@ import envs
 from experiments import pretrain
 from experiments.algorithms import network_of, sac_hyper
 from experiments.evaluation import Best, keep_better
-from experiments.presets import PRESETS
+from sgft_jax.presets import PRESETS
 from experiments.pretraining import make_pretrainer
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import MetricsLog, read_jsonl
