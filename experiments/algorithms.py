@@ -1,5 +1,6 @@
 """What pretraining asks of an algorithm, and the two there are: SAC and TD-MPC2. Pure."""
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -22,7 +23,8 @@ class Algorithm(NamedTuple):
     """A learner and its experience as pretraining uses them.
 
     hyper(progress [] from 0 to 1) -> its numbers.
-    act(agent, obs, key) -> an exploring action [act_dim], cheap enough for thousands of environments.
+    init_carry() -> what `act` remembers from step to step of an episode.
+    act(agent, carry, obs, key) -> (an exploring action [act_dim], carry), cheap enough for thousands of environments.
     extract(agent) -> what it hands to fine-tuning.
     empty(transitions) -> experience with room for that many; one that keeps time slots takes the slots that fit.
     add(experience, rows [n_envs], valid [n_envs], last [n_envs]) -> the same with one step more; valid: not exploded;
@@ -32,7 +34,8 @@ class Algorithm(NamedTuple):
 
     learner: Learner
     hyper: Callable[[float | Array], Any]
-    act: Callable[[PyTree, Array, Key], Array]
+    init_carry: Callable[[], PyTree]
+    act: Callable[[PyTree, PyTree, Array, Key], tuple[Array, PyTree]]
     extract: Callable[[Any], PyTree]
     empty: Callable[[int], PyTree]
     add: Callable[[PyTree, Transition, Array, Array], PyTree]
@@ -95,7 +98,8 @@ def _sac(env: Env, config: PretrainConfig) -> Algorithm:
     return Algorithm(
         learner=learner,
         hyper=lambda progress: sac_hyper(config, progress=progress),
-        act=lambda agent, obs, key: learner.act(agent, (), obs, key, explore=True)[0],
+        init_carry=learner.init_carry,
+        act=functools.partial(learner.act, explore=True),
         extract=sac.extract_prior,
         empty=lambda transitions: replay.init(replay.blank(env.obs_dim, env.act_dim), transitions),
         add=lambda experience, rows, valid, last: replay.add_batch(experience, rows, valid),
@@ -135,7 +139,8 @@ def _tdmpc2(env: Env, config: PretrainConfig) -> Algorithm:
         learner=tdmpc2.make_tdmpc2(structure, hyper(0.0)),
         hyper=hyper,
         # The policy alone: a plan costs some ten thousand evaluations of the model, the policy one.
-        act=lambda agent, obs, key: tdmpc2.policy_action(structure, agent, obs, key, explore=True),
+        init_carry=lambda: (),
+        act=lambda agent, carry, obs, key: (tdmpc2.policy_action(structure, agent, obs, key, explore=True), carry),
         extract=tdmpc2.extract_prior,
         empty=lambda transitions: sequences.init(
             replay.blank(env.obs_dim, env.act_dim), transitions // config.n_envs, config.n_envs

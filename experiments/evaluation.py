@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from envs.base import Env, World
-from envs.rollout import Episode, Policy, play_episode
+from envs.rollout import Act, Episode, play_episode
 from sgft_jax.analysis import stats
 from sgft_jax.mesh import split_vmap, whole
 from sgft_jax.players import Player
@@ -16,7 +16,7 @@ from sgft_jax.types import Array, Key, Metrics, PyTree
 def play_episodes(
     env: Env,
     pool: World,
-    policy: Policy,
+    policy: Act,
     carry: PyTree,
     keys: Key,
     *,
@@ -34,12 +34,12 @@ def play_episodes(
 
 
 class Outcome(NamedTuple):
-    """How episodes went: the fields of `Episode` of these names, [n]; qpos: [n, T + 1, nq], the start included."""
+    """How episodes went: the fields of `Episode` of these names, [n]."""
 
     success: Array
     total_reward: Array
     exploded: Array
-    qpos: Array
+    trace: Array
 
 
 def score(episodes: Episode | Outcome) -> Metrics:
@@ -51,7 +51,7 @@ def score(episodes: Episode | Outcome) -> Metrics:
     }
 
 
-def prior_policy(player: Player, prior: PyTree, *, explore: bool) -> Policy:
+def prior_policy(player: Player, prior: PyTree, *, explore: bool) -> Act:
     """pi_sim: what it takes for best, or, to explore, a sample."""
     return lambda carry, obs, key: player.act(prior, carry, obs, key, explore=explore)
 
@@ -61,8 +61,7 @@ def grade(env: Env, player: Player, pool: World, key: Key, prior: PyTree, *, gam
     policy = prior_policy(player, prior, explore=False)
     keys = jax.random.split(key, episodes)
     played = play_episodes(env, pool, policy, player.init_carry(), keys, gamma=gamma)
-    qpos = jnp.concatenate([played.start.physics.qpos[:, None], played.qpos], axis=1)
-    return whole(Outcome(played.success, played.total_reward, played.exploded, qpos))
+    return whole(Outcome(played.success, played.total_reward, played.exploded, played.trace))
 
 
 def describe(outcome: Outcome) -> dict[str, Any]:

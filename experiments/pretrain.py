@@ -343,8 +343,8 @@ class _Run:
     def _film(self, prior: PyTree) -> str:
         """The first seed's prior in one of the worlds of the final exam; the program is that of the exam."""
         one = pick(self.final, jnp.zeros(pool_size(self.final), int))
-        qpos = np.asarray(self.program.grade(one, jax.random.key(_REPORT_SEED), prior).qpos[0, 0])
-        return common.film(self.env, one.params[0], qpos, self.folder / "videos" / f"seed-{self.seeds[0]}.mp4")
+        qpos = np.asarray(self.program.grade(one, jax.random.key(_REPORT_SEED), prior).trace[0, 0])
+        return common.film(self.env, one.theta.params[0], qpos, self.folder / "videos" / f"seed-{self.seeds[0]}.mp4")
 
     def _chosen(self, best: Best) -> dict[str, float]:
         """Which evaluation the prior is from, and what that evaluation said."""

@@ -1,5 +1,6 @@
 """Massive training in simulation as pure functions: random data, then chunks of (step all, insert, update)."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -49,7 +50,8 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
     _check(config)
     algorithm = make_algorithm(env, config)
     learner = algorithm.learner
-    step = lambda pool, fleet, actions, key: step_fleet(env, pool, fleet, actions, key, gamma=config.gamma)  # noqa: E731
+    step = functools.partial(step_fleet, env, gamma=config.gamma)
+    fresh = algorithm.init_carry()
 
     def uniform_actions(key: Key) -> Array:
         return jax.random.uniform(key, (config.n_envs, env.act_dim), minval=-1.0, maxval=1.0)
@@ -60,18 +62,18 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         def random_step(carry: tuple[Fleet, PyTree], key: Key) -> tuple[tuple[Fleet, PyTree], None]:
             fleet, buffer = carry
             key_action, key_step = jax.random.split(key)
-            fleet, rows, valid, after = step(pool, fleet, uniform_actions(key_action), key_step)
+            fleet, rows, valid, after = step(pool, fleet, uniform_actions(key_action), (), key_step, initial_carry=())
             return (split(fleet), spread_replay(algorithm.add(buffer, rows, valid, _ended(after)))), None
 
         n_steps = config.random_transitions // config.n_envs
-        start = (launch(env, pool, key_launch, config.n_envs), algorithm.empty(n_steps * config.n_envs))
+        start = (launch(env, pool, key_launch, config.n_envs, ()), algorithm.empty(n_steps * config.n_envs))
         return jax.lax.scan(random_step, start, jax.random.split(key_steps, n_steps))[0][1]
 
     def init(pool: World, random: Any, key: Key) -> PretrainState:
         key_learner, key_fleet, key_run = jax.random.split(key, 3)
         statistics = normalizer.update(normalizer.init(env.obs_dim), random.data.obs, algorithm.held(random))
         agent = learner.init(key_learner).replace(normalizer=normalizer.finish(statistics))
-        fleet = launch(env, pool, key_fleet, config.n_envs)
+        fleet = launch(env, pool, key_fleet, config.n_envs, fresh)
         buffer = algorithm.empty(config.replay_capacity)
         return spread(PretrainState(agent, buffer, fleet, key_run, jnp.int32(0)))
 
@@ -88,20 +90,23 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         both = jax.tree.map(lambda a, b: jnp.concatenate([a, b], axis=1), old, new)
         return split(whole(both), axis=1)  # put together in pieces, they would travel between devices twice more
 
-    def explore(agent: PyTree, obs: Array, key: Key) -> Array:
-        """[n_envs, act_dim]: the policy's actions, more and more of them replaced by random ones along the fleet."""
+    def explore(agent: PyTree, fleet: Fleet, key: Key) -> tuple[Array, PyTree]:
+        """[n_envs, act_dim]: the policy's actions, more and more of them replaced by random ones along the fleet, and
+        its carries [n_envs].
+        """
         key_policy, key_replace, key_random = jax.random.split(key, 3)
-        actions = jax.vmap(algorithm.act, (None, 0, 0))(agent, obs, jax.random.split(key_policy, config.n_envs))
+        keys = jax.random.split(key_policy, config.n_envs)
+        actions, carry = jax.vmap(algorithm.act, (None, 0, 0, 0))(agent, fleet.carry, fleet.state.obs, keys)
         if not config.random_ladder:
-            return actions
+            return actions, carry
         share = jnp.linspace(0.0, config.random_ladder, config.n_envs)
         replaced = jax.random.uniform(key_replace, (config.n_envs,)) < share
-        return jnp.where(replaced[:, None], uniform_actions(key_random), actions)
+        return jnp.where(replaced[:, None], uniform_actions(key_random), actions), carry
 
     def vector_step(pool: World, random: PyTree, state: PretrainState) -> tuple[PretrainState, Metrics]:
         keys = jax.random.split(state.key, 5)
-        actions = explore(state.learner, state.fleet.state.obs, keys[1])
-        fleet, rows, valid, after = step(pool, state.fleet, actions, keys[2])
+        actions, carry = explore(state.learner, state.fleet, keys[1])
+        fleet, rows, valid, after = step(pool, state.fleet, actions, carry, keys[2], initial_carry=fresh)
         buffer = algorithm.add(state.replay, rows, valid, _ended(after))
         batches = sample(random, buffer, keys[3])
         learner_now = state.learner.replace(hyper=algorithm.hyper(state.steps / (config.env_steps / config.n_envs)))
