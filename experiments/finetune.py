@@ -151,7 +151,7 @@ class _Run:
 
     def _simulate(self, config: FinetuneConfig, priors: PyTree, card: dict[str, Any]) -> Simulation:
         """What every simulator's policy does in its training domain; the same for all methods and after a resume."""
-        worlds = self.env.sample_worlds(jax.random.key(_SIMULATION), _SIMULATED_WORLDS)
+        worlds = envs.sample_worlds(self.env, jax.random.key(_SIMULATION), _SIMULATED_WORLDS)
         player = make_player(card, self.env)
         sizes = {"transitions": config.simulated_transitions, "ladder": config.simulated_ladder, "gamma": config.gamma}
 
@@ -271,7 +271,7 @@ class _Run:
 
     def _store(self, episodes: Episode) -> None:
         """Real transitions reach the disk before a learner sees them."""
-        arrays = {**episodes.transitions._asdict(), "valid": episodes.valid, "qpos": episodes.qpos}
+        arrays = {**episodes.transitions._asdict(), "valid": episodes.valid, "trace": episodes.trace}
         for record, own in self._each({name: np.asarray(x) for name, x in arrays.items()}):
             record.store(own)
 

@@ -44,7 +44,7 @@ def program():
 
 
 def pools():
-    return stack([toy.make().sample_worlds(jax.random.key(0), CONFIG.worlds)])
+    return stack([envs.sample_worlds(toy.make(), jax.random.key(0), CONFIG.worlds)])
 
 
 def agree(one, two, **tolerance):

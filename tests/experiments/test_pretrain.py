@@ -225,7 +225,7 @@ def test_random_actions_grow_along_the_fleet(key):
         updates_per_step=1, batch_size=4, network=NetworkConfig(hidden=(8,)), ensemble_size=1,
     )  # fmt: skip
     env = envs.make("toy")
-    pool, trainer = env.sample_worlds(key, config.worlds), make_pretrainer(env, config)
+    pool, trainer = envs.sample_worlds(env, key, config.worlds), make_pretrainer(env, config)
 
     def run(key):
         random = trainer.collect_random(pool, key)
