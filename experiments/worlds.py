@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import envs
 from envs import gaps
 from envs.base import Env, World
+from envs.domains.uniform import sample_worlds
 from envs.gaps import Gap
 from envs.rollout import pool_size
 from experiments.options import SIM
@@ -40,7 +41,7 @@ def real_env(env: Env, found: Sequence[Gap]) -> Env:
 
 def training_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:
     """Worlds to learn in: the training domain, or the real system of a gap."""
-    return env.sample_worlds(key, n) if gap is None else gaps.worlds(env, gap, key, n)
+    return sample_worlds(env, key, n) if gap is None else gaps.worlds(env, gap, key, n)
 
 
 def real_worlds(env: Env, found: Sequence[Gap], key: Key, n: int = 256) -> World:
@@ -53,4 +54,4 @@ def real_worlds(env: Env, found: Sequence[Gap], key: Key, n: int = 256) -> World
 
 def heldout_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:
     """Worlds to evaluate in: the training domain without sensor noise, or the real system as its gap describes it."""
-    return env.sample_worlds(key, n, effects={"obs_noise": 0.0}) if gap is None else gaps.worlds(env, gap, key, n)
+    return sample_worlds(env, key, n, effects={"obs_noise": 0.0}) if gap is None else gaps.worlds(env, gap, key, n)

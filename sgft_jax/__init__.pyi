@@ -10,6 +10,8 @@ from .models import normalizer
 from .models.config import NetworkConfig
 from .planning.mpc import MPCConfig
 from .policies import make_policy, mpc_policy, sac_policy, tdmpc2_policy
+from .presets import PRESETS, PretrainConfig
+from .pretraining import PretrainState, pretrain, priors_of
 from .systems import System
 from .systems.simulated import Simulated
 from .train import FinetuneProgress, evaluate, finetune, simulate
@@ -33,6 +35,7 @@ from .types import (
 )
 
 __all__ = [
+    "PRESETS",
     "ActingPolicy",
     "Batch",
     "FinetuneProgress",
@@ -49,6 +52,8 @@ __all__ = [
     "Normalizer",
     "Parts",
     "Policy",
+    "PretrainConfig",
+    "PretrainState",
     "Prior",
     "SACConfig",
     "SACHyper",
@@ -86,6 +91,8 @@ __all__ = [
     "make_tdmpc2",
     "mpc_policy",
     "normalizer",
+    "pretrain",
+    "priors_of",
     "relabel",
     "replay",
     "sac_finetuner",
