@@ -112,12 +112,3 @@ def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
     if twice := [folder for folder in folders if folders.count(folder) > 1]:
         raise UserError(f"--real {' '.join(args.real)}: two of them would share the folder {twice[0]}; name it once")
     return method, seeds
-
-
-def check_prior(args: FinetuneArgs, method: Method, card: Mapping[str, Any]) -> None:
-    """Raises UserError for a prior of another algorithm than the method needs."""
-    if (found := card.get("algorithm", "sac")) != method.prior:
-        raise UserError(
-            f"--method {method.name} needs a prior of {method.prior}, not of {found}; "
-            f"make one with: python -m experiments.pretrain --task {args.task} --preset {_preset(method)}"
-        )

@@ -12,27 +12,21 @@ import numpy as np
 import envs
 from envs import gaps
 from envs.base import Env
-from envs.gaps import Gap
 from envs.rollout import Episode
-from experiments.finetune_args import NO_PRIOR, VOLATILE, FinetuneArgs, check_prior, run_folder
+from experiments.finetune_args import NO_PRIOR, VOLATILE, FinetuneArgs, run_folder
 from experiments.finetune_record import Record
 from experiments.options import prior_folders
 from experiments.recorded import Recorded
-from experiments.stacking import part, stack
-from experiments.worlds import real_env, real_worlds
-from sgft_jax import mesh, train
+from experiments.stacking import part
+from sgft_jax import api, mesh, train
+from sgft_jax.api import Setup
 from sgft_jax.io import runs
 from sgft_jax.io.config import config_to_json
 from sgft_jax.io.log import RunProgress
 from sgft_jax.io.priors import digest, load_priors
 from sgft_jax.methods.options import card_of
-from sgft_jax.policies import make_policy
-from sgft_jax.systems.simulated import Simulated
-from sgft_jax.train import FinetuneProgress, SimulatedRows
-from sgft_jax.types import Finetuner, Method, Metrics, Prior, PyTree, UserError
-
-_SIMULATED_WORLDS = 256
-_SIMULATION = 2**31  # seed of what happens in them, the same for every run
+from sgft_jax.train import FinetuneProgress
+from sgft_jax.types import Method, Metrics, Prior, PyTree, UserError
 
 
 def run(args: FinetuneArgs, method: Method, seeds: list[int]) -> list[dict[str, Any]]:
@@ -41,9 +35,9 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int]) -> list[dict[str, 
     devices = mesh.devices(args.devices, sizes)
     env = envs.make(args.task, args.impl)
     found = [gaps.load(env, real, args.set) for real in args.real]
-    real = real_env(env, found)
-    priors = _priors(args, method, env)
-    finetuner = method.build(args.options, priors[0] if priors else None, env)
+    priors = _priors(args, env)
+    for prior in priors:
+        api.check_prior(prior, method.prior, env)
     # Every folder is that of a run on its real system alone: either kind of run continues the other.
     folders = {run_folder(args, name): config_to_json(args) | {"real": name} for name in args.real}
     opened = runs.open_runs(
@@ -52,21 +46,20 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int]) -> list[dict[str, 
     )  # fmt: skip
     try:
         with mesh.use(devices):
-            records = [Record(own.folder, real, gap, method.name, seeds) for own, gap in zip(opened, found, strict=True)]
-            return _Run(args, env, real, found, seeds, finetuner, priors, records).work()
+            setup = api.setup(env, found, priors, method=args.method, seeds=seeds, config=args.options)
+            real = setup.system.env
+            records = [Record(o.folder, real, gap, method.name, seeds) for o, gap in zip(opened, found, strict=True)]
+            return _Run(args, setup, card_of(priors[0] if priors else None), records).work()
     finally:
         for own in opened:
             own.close()
 
 
-def _priors(args: FinetuneArgs, method: Method, env: Env) -> list[Prior]:
+def _priors(args: FinetuneArgs, env: Env) -> list[Prior]:
     """The priors to start from; none where the user says so."""
     if args.prior == NO_PRIOR:
         return []
-    folders = prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
-    priors = load_priors(folders, env)
-    check_prior(args, method, priors[0].card)
-    return priors
+    return load_priors(prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset), env)
 
 
 class _Run:
@@ -76,55 +69,19 @@ class _Run:
     for more worlds. Members [M = G * S] are the seeds of the first real system, then those of the next.
     """
 
-    def __init__(
-        self,
-        args: FinetuneArgs,
-        env: Env,
-        real: Env,
-        found: list[Gap],
-        seeds: list[int],
-        finetuner: Finetuner,
-        priors: list[Prior],
-        records: list[Record],
-    ) -> None:
-        self.args, self.env, self.finetuner, self.records, self.count = args, env, finetuner, records, len(seeds)
-        self.card = dict(card_of(priors[0] if priors else None))
-        self.priors = stack([prior.params for prior in priors]) if priors else None
-        self.seeds = jnp.tile(jnp.array(seeds, jnp.uint32), len(found))
-        which = jnp.repeat(jnp.arange(len(found)), len(seeds))
-        pools = real_worlds(real, found, jax.random.key(0))
-        self.system = Simulated(real, pools, which, gamma=self.card["gamma"])
-        self.title = f"{args.method} on {args.task}/{'+'.join(gap.name for gap in found)}"
+    def __init__(self, args: FinetuneArgs, setup: Setup, card: dict[str, Any], records: list[Record]) -> None:
+        self.args, self.setup, self.card, self.records = args, setup, card, records
+        self.finetuner, self.system, self.seeds = setup.finetuner, setup.system, setup.seeds
+        self.count = len(setup.seeds) // len(records)
+        self.begin = functools.partial(train.begin, setup.finetuner, setup.priors, setup.seeds, setup.simulated)
 
     def work(self) -> list[dict[str, Any]]:
         """Everything, in order; returns the summaries."""
-        simulated = self._simulate()
-        self.begin = functools.partial(train.begin, self.finetuner, self.priors, self.seeds, simulated)
         progress = self._restore()
         done = int(progress.rollouts) if progress else 0
-        system = Recorded(self.system, [record.real for record in self.records], done=done)
-        steps = train.finetune(
-            self.finetuner, system, self.priors, self.seeds, rollouts=self.args.rollouts, simulated=simulated,
-            progress=progress,
-        )  # fmt: skip
-        try:
-            return self._finish(self._follow(steps, progress))
-        finally:
-            system.close()
-
-    def _simulate(self) -> SimulatedRows | None:
-        """What every simulator's policy does in its training domain; the same for all methods and after a resume."""
-        needs = self.finetuner.simulation
-        if needs is None:
-            return None
-        worlds = envs.sample_worlds(self.env, jax.random.key(_SIMULATION), _SIMULATED_WORLDS)
-        policy, gamma = make_policy(self.card, self.env), self.card["gamma"]
-        rows = train.simulate(
-            self.env, policy, worlds, self.priors, jax.random.key(_SIMULATION), needs, gamma=gamma
-        )
-        low, high = float(rows.returns.min()), float(rows.returns.max())
-        print(f"simulated: {rows.returns.size} episodes, returns from {low:.1f} to {high:.1f}")
-        return rows
+        recorded = Recorded(self.system, [record.real for record in self.records], done=done)
+        steps = train.finetune(*self.setup._replace(system=recorded), rollouts=self.args.rollouts, progress=progress)
+        return self._finish(self._follow(steps, progress))
 
     def _restore(self) -> FinetuneProgress | None:
         """The state after the last checkpoint, None for a fresh start; raises UserError where real systems differ."""
@@ -142,7 +99,8 @@ class _Run:
     def _follow(self, steps: Iterator[tuple[FinetuneProgress, Metrics]], progress: Any) -> FinetuneProgress:
         """Logs, evaluates and checkpoints what the iterator yields; returns its last state."""
         done, started = int(progress.rollouts) if progress else 0, time.perf_counter()
-        bar = RunProgress(self.title, total=self.args.rollouts, unit="rollouts", done=done)
+        title = f"{self.args.method} on {self.args.task}/{'+'.join(record.gap.name for record in self.records)}"
+        bar = RunProgress(title, total=self.args.rollouts, unit="rollouts", done=done)
         with bar:
             for progress, metrics in steps:
                 before, done = done, int(progress.rollouts)
@@ -167,14 +125,15 @@ class _Run:
         if not values:
             return {}
         for record, own in self._each(values):
-            record.check_finite(done, own)
             record.metrics(done, own)
             record.time(done, seconds)
         real = values.get("real/score")
-        return {} if real is None else {f"{self.env.score}, exploring": float(real.mean())}
+        return {} if real is None else {f"{self.system.env.score}, exploring": float(real.mean())}
 
     def _evaluate(self, progress: FinetuneProgress, done: int) -> float:
-        scores = _scores(train.evaluate(self.finetuner, self.system, progress.agent, self.seeds, self.args.eval_episodes))
+        scores = _scores(
+            train.evaluate(self.finetuner, self.system, progress.agent, self.seeds, self.args.eval_episodes)
+        )
         for record, own in self._each(scores):
             record.evaluation(done, own)
         return float(scores["score"].mean())
@@ -191,7 +150,7 @@ class _Run:
 
     def _finish(self, progress: FinetuneProgress) -> list[dict[str, Any]]:
         """Policies, summaries, figures and films."""
-        best, card = progress.best, self.card | self.finetuner.card
+        best, card = progress.best, {**self.card, **self.finetuner.card}
         last = jax.jit(jax.vmap(self.finetuner.export))(progress.agent)
         played = train.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, self.args.eval_episodes)
         facts = {"score": _scores(played)["score"], "evidence": best.score, "rollouts": best.rollouts}
@@ -216,7 +175,7 @@ class _Run:
         if initial is None:
             before = evaluate(self.finetuner, states=jax.jit(self.begin)().agent, episodes=n)
         else:
-            own = jax.tree.map(lambda x: x[self.seeds % x.shape[0]], self.priors)
+            own = jax.tree.map(lambda x: x[self.seeds % x.shape[0]], self.setup.priors)
             before = evaluate(initial, states=own, episodes=n)
         return [before, evaluate(self.finetuner, states=progress.agent, episodes=n)]
 

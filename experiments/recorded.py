@@ -9,7 +9,7 @@ import numpy as np
 
 from envs.rollout import Episode
 from experiments.stacking import part
-from sgft_jax.io.log import RealStore
+from sgft_jax.io.real import RealStore
 from sgft_jax.systems import System
 from sgft_jax.types import Key, PyTree, Transition, UserError
 
@@ -43,10 +43,6 @@ class Recorded:
             if len(store) <= number:
                 store.append(_arrays(part(episodes, i, keys.shape[0] // len(self.stores))))
         return episodes
-
-    def close(self) -> None:
-        """Brings the system to rest."""
-        self.inner.close()
 
 
 def _arrays(episodes: Episode) -> dict[str, np.ndarray]:

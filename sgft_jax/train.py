@@ -86,9 +86,9 @@ def finetune(
     system: System,
     priors: PyTree,
     seeds: Array,
+    simulated: SimulatedRows | None = None,
     *,
     rollouts: int,
-    simulated: SimulatedRows | None = None,
     progress: FinetuneProgress | None = None,
 ) -> Iterator[tuple[FinetuneProgress, Metrics]]:
     """Fine-tunes M members, each a seed on a real system, until each has made `rollouts` real rollouts.
