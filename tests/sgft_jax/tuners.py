@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import pytest
 
 from sgft_jax import methods, train
 from sgft_jax.data import replay
@@ -139,6 +140,11 @@ def started(case, seed=0):
     """A state with one real episode."""
     state = case.fine.init(case.params, jax.random.key(seed))
     return case.fine.observe(state, episode(jax.random.key(seed)), jnp.ones(T, bool))
+
+
+def slow_but(fast, names):
+    """Parameters of a test that is quick for some names alone."""
+    return [pytest.param(name, marks=[] if name in fast else [pytest.mark.slow]) for name in names]
 
 
 def bits(tree):
