@@ -3,7 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from sgft_jax.models.networks import NetworkConfig, Precision
+from sgft_jax import checks
+from sgft_jax.models.config import NetworkConfig, Precision
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,21 @@ class PretrainConfig:
     """At least that many fresh episodes judge the prior; 256 give a 95 % interval of +-6 points at worst."""
     checkpoint_every: int = 8
     """Chunks between checkpoints."""
+
+    def __post_init__(self) -> None:
+        checks.at_least(
+            self, 1, "n_envs", "worlds", "env_steps", "random_transitions", "updates_per_step", "batch_size",
+            "replay_capacity", "policy_delay", "ensemble_size", "horizon", "plan_samples", "chunk_steps", "eval_every",
+            "eval_episodes", "report_episodes", "checkpoint_every",
+        )  # fmt: skip
+        checks.positive(self, "lr", "tau", "alpha")
+        checks.share(self, "random_ladder", "lr_end", "tau", "choose_from")
+        checks.below_one(self, "gamma", "random_fraction")
+        checks.finite(self, "entropy_per_dim")
+        for name in ("random_transitions", "replay_capacity"):
+            if getattr(self, name) < self.n_envs:
+                wanted = f"at least n-envs = {self.n_envs}, one step of all environments"
+                raise checks.refusal(name, getattr(self, name), wanted)
 
 
 _NORMED = NetworkConfig(hidden=(256, 256), layer_norm=True)

@@ -14,7 +14,7 @@ from sgft_jax.data import replay
 from sgft_jax.mesh import split, whole
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import precision
-from sgft_jax.types import Array, Key, Metrics, PyTree, Transition, UserError
+from sgft_jax.types import Array, Key, Metrics, PyTree, Transition
 
 
 class PretrainState(NamedTuple):
@@ -45,8 +45,7 @@ class Pretrainer(NamedTuple):
 
 
 def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
-    """Builds the pure functions; raises UserError for sizes that do not fit together."""
-    _check(config)
+    """Builds the pure functions."""
     algorithm = make_algorithm(env, config)
     learner = algorithm.learner
     step = lambda pool, fleet, actions, key: step_fleet(env, pool, fleet, actions, key, gamma=config.gamma)  # noqa: E731
@@ -155,13 +154,3 @@ def _fleet_metrics(after: EnvState, rows: Transition, valid: Array) -> Metrics:
 def _ended(after: EnvState) -> Array:
     """[n_envs] whether a step was the last of its episode."""
     return after.truncated | after.terminated
-
-
-def _check(config: PretrainConfig) -> None:
-    one_step = f"one step of n_envs={config.n_envs}"
-    if config.random_transitions < config.n_envs:
-        raise UserError(f"random_transitions={config.random_transitions} is less than {one_step}")
-    if config.replay_capacity < config.n_envs:
-        raise UserError(f"replay_capacity={config.replay_capacity} cannot hold {one_step}")
-    if not 0 <= config.random_fraction < 1:
-        raise UserError(f"random_fraction={config.random_fraction} must be in [0, 1)")

@@ -167,7 +167,7 @@ def test_a_finished_run_is_neither_repeated_nor_changed(finished, out, capsys):
         (["--task", "toy", "--seeds", "0"], "there must be at least one"),
         (["--task", "toy", "--real", "mild"], "toy has no gap 'mild'"),
         (["--task", "toy", "--set", "latency=0.1"], "name one with --real"),
-        (["--task", "toy", "--config.replay-capacity", "9"], "replay_capacity=9 cannot hold one step"),
+        (["--task", "toy", "--config.replay-capacity", "9"], "option replay-capacity is 9: must be at least n-envs = "),
         (
             ["--task", "toy", "--config.replay-capacity", "99999999999"],
             "GiB free on each device: lower --config.replay-capacity",
