@@ -12,17 +12,20 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from sgft_jax.players import Player
 
 import envs
 from envs.base import Entry, Env
 from envs.gaps import Gap
 from envs.mujoco.worlds import Impl
 from envs.rollout import play_episode
-from experiments import cli, common
+from experiments import cli
 from experiments.algorithms import make_player
 from experiments.evaluation import prior_policy
+from experiments.options import prior_folders
+from experiments.worlds import heldout_worlds, load_gap, real_env
 from sgft_jax.analysis import plot
-from sgft_jax.players import Player
+from sgft_jax.io.priors import load_priors
 from sgft_jax.transforms import branch
 from sgft_jax.types import Array, Imagination, Key, Prior, Transition, UserError
 
@@ -89,7 +92,8 @@ def landscape(args: LandscapeArgs) -> Path:
             raise UserError(f"--{name} is {getattr(args, name)}: must be at least 1")
     env = envs.make(args.task, args.impl)
     start, entry = find_entry(env, args.entry)
-    priors, card = common.find_priors(args.prior, out=args.out, env=env, preset=args.preset)
+    folders = prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
+    priors, card = load_priors(folders, env)
     if not 0 <= args.index < len(priors):
         raise UserError(f"--index {args.index}: there are {len(priors)} priors, counted from 0")
     player = make_player(card, env)
@@ -112,12 +116,12 @@ def find_entry(env: Env, name: str | None) -> tuple[int, Entry]:
 
 def survey(args: LandscapeArgs, env: Env, player: Player, prior: Prior, start: int, *, gamma: float) -> Landscape:
     """Plays, imagines and evaluates V_sim; `start`: of the object's place in the observation."""
-    gap = common.load_gap(env, args.real, args.set)
-    system = common.real_env(env, [gap] if gap else [])
+    gap = load_gap(env, args.real, args.set)
+    system = real_env(env, [gap] if gap else [])
     key = jax.random.fold_in(jax.random.key(args.seed), 0)
 
     def play(env: Env, gap: Gap | None) -> Array:
-        world = common.exam_worlds(env, gap, jax.random.key(args.seed), 1)
+        world = heldout_worlds(env, gap, jax.random.key(args.seed), 1)
         return jax.jit(lambda world: _observations(env, player, prior, world, key, gamma=gamma))(world)
 
     real, simulated = play(system, gap), play(env, None)

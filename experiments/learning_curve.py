@@ -13,16 +13,17 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from sgft_jax.finetune_planner import make_planner
 
 from envs.base import Env, World
 from envs.control import cartpole
 from envs.mujoco.worlds import Impl
 from envs.rollout import Episode
-from experiments import cli, common
+from experiments import cli, stacking
 from experiments.evaluation import play_episodes, score
 from experiments.finetuning import Reals, make_program
+from experiments.options import seed_list, seeds_name
 from sgft_jax.analysis import plot
-from sgft_jax.finetune_planner import make_planner
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import EVAL, MetricsLog, RunProgress, read_jsonl, write_summary
 from sgft_jax.learners import tdmpc2
@@ -80,10 +81,10 @@ class LearningCurveArgs:
 def main(args: LearningCurveArgs) -> None:
     """Trains all seeds and draws their curve."""
     _check(args)
-    seeds = common.seed_list(args.seed, args.seeds)
+    seeds = seed_list(args.seed, args.seeds)
     env = cartpole.make(args.impl)
     run = runs.open_run(
-        args.out / "learning_curve" / env.name / args.size / common.seeds_name(seeds),
+        args.out / "learning_curve" / env.name / args.size / seeds_name(seeds),
         kind="learning_curve",
         config=args,
         resume=args.resume,
@@ -145,7 +146,7 @@ class _Run:
         """The state to continue from and the episodes behind it: a checkpoint's, or a fresh one."""
         still = normalizer.identity(self.env.obs_dim)  # observations as they are
         fresh = tdmpc2.TDMPC2Prior(None, None, None, None, None, still, jnp.float32(1))
-        make = lambda: self.program.init(common.stack([fresh] * len(self.seeds)), self.numbers)  # noqa: E731
+        make = lambda: self.program.init(stacking.stack([fresh] * len(self.seeds)), self.numbers)  # noqa: E731
         if checkpoint.latest(self.folder) is None:
             self.log.truncate({})
             state = make()
@@ -161,7 +162,7 @@ class _Run:
         if done:
             episodes = self.program.collect(state, self.reals, self.numbers, done, 1)
         else:
-            episodes = self.collect_random(self.pool, common.seed_keys(self.seeds, _RANDOM))
+            episodes = self.collect_random(self.pool, stacking.seed_keys(self.seeds, _RANDOM))
         returns = np.asarray(episodes.total_reward).mean(1)
         collected = time.perf_counter()
         state, metrics = self.program.store(state, episodes), {}

@@ -28,9 +28,6 @@ class Simulated:
             self._programs[policy.act] = jax.jit(split_vmap(self._player(policy), (0, None, 0, 0, None)))
         return self._programs[policy.act](states, self.pools, self.which, keys, explore)
 
-    def close(self) -> None:
-        """Nothing to bring to rest."""
-
     def _player(self, policy: Any) -> Callable[..., Episode]:
         def play(state: PyTree, pools: World, which: Array, keys: Key, explore: Array) -> Episode:
             act = lambda carry, obs, key: policy.act(state, carry, obs, key, explore=explore)  # noqa: E731

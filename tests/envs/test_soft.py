@@ -12,7 +12,7 @@ import envs
 from envs import gaps
 from envs.base import EnvState
 from envs.franka import arm, ball, push, towel
-from experiments import common
+from experiments.worlds import real_env
 from sgft_jax.types import UserError
 
 KEY = jax.random.key(0)
@@ -168,12 +168,12 @@ def test_a_gap_names_its_scene(tmp_path):
     own = tmp_path / "own.toml"
     own.write_text('scene = "towel"\nparams = { table_friction = 0.7 }\n')
     gap = gaps.load(env, str(own), ["object_x=0.25"])
-    assert gap.scene == "towel" and common.real_env(env, [gap]).scene == "towel"
+    assert gap.scene == "towel" and real_env(env, [gap]).scene == "towel"
     own.write_text("params = { table_friction = 0.7 }\n")
     plain = gaps.load(env, str(own))
-    assert common.real_env(env, [plain]) is env and common.real_env(env, []) is env
+    assert real_env(env, [plain]) is env and real_env(env, []) is env
     with pytest.raises(UserError, match=r"own is in the simulated scene and .* in scene 'towel': .* one at a time"):
-        common.real_env(env, [plain, gap])
+        real_env(env, [plain, gap])
     own.write_text("scene = 3\n")
     with pytest.raises(UserError, match="'scene' must be a name, got 3"):
         gaps.load(env, str(own))

@@ -14,10 +14,10 @@ from jax.sharding import PartitionSpec
 import envs
 from envs.mujoco.engines import c as engine_c
 from envs.mujoco.worlds import PhysicsState
-from experiments import cli, pretrain
-from experiments.common import seed_keys, stack
+from experiments import cli, pretrain, pretrain_run
 from experiments.presets import PretrainConfig
 from experiments.pretraining import spread_replay
+from experiments.stacking import seed_keys, stack
 from sgft_jax import mesh
 from sgft_jax.data import replay
 from sgft_jax.models.networks import NetworkConfig
@@ -40,7 +40,7 @@ def begun(devices):
 
 @functools.cache
 def program():
-    return pretrain.make_program(toy.make(), CONFIG, seeds=1)
+    return pretrain_run.make_program(toy.make(), CONFIG, seeds=1)
 
 
 def pools():
