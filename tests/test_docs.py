@@ -47,6 +47,10 @@ def test_the_readme_has_commands():
     assert ["make", "setup"] in COMMANDS and ["make", "demo"] in COMMANDS and len(MODULES) >= 6
 
 
+def test_the_readme_is_short():
+    assert len(README.split()) <= 900
+
+
 @pytest.mark.parametrize("words", [c for c in COMMANDS if c[0] == "make"], ids=" ".join)
 def test_make_targets_and_variables_exist(words):
     targets = [word for word in words[1:] if "=" not in word]
