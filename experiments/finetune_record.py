@@ -13,10 +13,9 @@ from envs.base import Env, World
 from envs.gaps import Gap
 from envs.rollout import Episode
 from experiments.common import member
-from experiments.results import describe_run, read_curve
 from experiments.video import before_and_after
-from sgft_jax.analysis import plot
-from sgft_jax.analysis.stats import iqm_interval
+from sgft_jax.analysis import figures, tables
+from sgft_jax.analysis.curves import describe, read_curve
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import MetricsLog, RealLog, write_summary
 from sgft_jax.types import Array, Metrics, Prior, PyTree
@@ -99,21 +98,14 @@ class Record:
         self.log.close()
         env, curve = self.env, read_curve(self.folder)
         about = {"task": env.name, "method": self.method, "impl": env.impl, "gap": self.gap._asdict()}
-        summary = about | describe_run(curve)
+        summary = about | describe(curve)
         write_summary(self.folder, summary)
-        plot.learning_curves(
-            self.folder / "figures" / "success.png",
-            {self.method: (curve.transitions, curve.success)},
-            title=f"{env.name} on the {self.gap.name} real system",
-            zero_shot=float(iqm_interval(curve.success[:, 0]).estimate),
-            rollout_length=env.episode_length,
-            control_dt=env.control_dt,
-        )
-        zero, final = (summary[when]["success"] for when in ("zero_shot", "final"))
-        band = f" [{final['low']:.2f}, {final['high']:.2f}]" if len(self.seeds) > 1 else ""
+        title = f"{env.name} on the {self.gap.name} real system"
+        figures.learning_curves(self.folder / "figures" / "success.png", {self.method: [curve]}, title=title)
+        zero, final = (tables.middle(curve, curve.values[:, i]) for i in (0, -1))
         print(
-            f"{self.gap.name}: success {zero['iqm']:.2f} zero-shot -> {final['iqm']:.2f}{band} after "
-            f"{summary['final']['rollouts']} rollouts; deepest dip {summary['dip']['mean']:.3f}"
+            f"{self.gap.name}: success on the real system in evaluations {zero} % zero-shot -> {final} % after "
+            f"{curve.rollouts[-1]} rollouts; never more than {100 * summary['deepest_fall']:.0f} points below zero-shot"
         )
         return summary
 

@@ -27,7 +27,7 @@ from experiments.evaluation import Best, Outcome, describe, grade, score
 from experiments.presets import PRESETS, PretrainConfig
 from experiments.pretrain import DEFAULT_PRESET, Program, Saved, make_program
 from experiments.pretraining import PretrainState, make_pretrainer, memory
-from sgft_jax.analysis.stats import iqm_interval
+from sgft_jax.analysis import stats, tables
 from sgft_jax.io.log import MetricsLog, RunProgress, write_summary
 from sgft_jax.types import Key, Metrics, PyTree, UserError
 
@@ -130,8 +130,7 @@ def table(lines: Sequence[dict[str, Any]]) -> list[str]:
 def _percent(found: dict[str, Any] | None) -> str:
     if found is None:
         return "-"
-    low, high = found["interval"]
-    return f"{100 * found['success']:.0f} [{100 * low:.0f}, {100 * high:.0f}]"
+    return tables.number(stats.Interval(found["success"], *found["interval"]))
 
 
 def _line(gap: Gap, zero_shot: Outcome, trained: Outcome | None) -> dict[str, Any]:
@@ -145,7 +144,7 @@ def _rate(outcome: Outcome) -> dict[str, Any]:
     each = [describe(common.member(outcome, i)) for i in range(len(outcome.success))]
     if len(each) == 1:
         return {"success": each[0]["success"], "interval": each[0]["success/interval"], "policies": each}
-    band = iqm_interval(np.array([one["success"] for one in each]))
+    band = stats.bootstrap_interval(np.array([one["success"] for one in each]))
     return {"success": float(band.estimate), "interval": [float(band.low), float(band.high)], "policies": each}
 
 

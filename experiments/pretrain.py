@@ -29,7 +29,7 @@ from experiments.presets import PRESETS, PretrainConfig
 from experiments.pretraining import PretrainState, make_pretrainer, memory, spread, spread_replay
 from experiments.report import Report, make_report, numbers
 from sgft_jax import mesh
-from sgft_jax.analysis import plot
+from sgft_jax.analysis import figures
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import EVAL, MetricsLog, RunProgress, read_jsonl, write_summary
 from sgft_jax.types import Key, PyTree
@@ -311,7 +311,12 @@ class _Run:
         results = []
         for i, seed in enumerate(self.seeds):
             best = common.member(saved.best, i)
-            found = {"seed": seed, **describe(common.member(outcome, i)), **self._chosen(best)}
+            found = {
+                "seed": seed,
+                "digest": checkpoint.digest(best.prior),
+                **describe(common.member(outcome, i)),
+                **self._chosen(best),
+            }
             if report is not None:
                 found |= numbers(common.member(report, i))
                 self._save_report(seed, common.member(report, i), i)
@@ -359,7 +364,7 @@ class _Run:
         np.savez(self.folder / "report" / f"seed-{seed}.npz", allow_pickle=False, **report._asdict())
         if not some.size:
             return  # every trajectory exploded: there is nothing to draw
-        plot.pretraining(
+        figures.pretraining(
             self.folder / "figures" / f"seed-{seed}.png",
             title=f"pretraining {self.env.name}, preset {self.args.preset}, seed {seed}",
             steps=[line["step"] for line in curve],

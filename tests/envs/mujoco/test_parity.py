@@ -13,10 +13,10 @@ import mujoco
 import numpy as np
 import pytest
 from franka_bench import EXACT, SCENES, bench, member
+from scripted import PROBES, play_script
 
 from envs.franka import host, insert
 from envs.mujoco.scene import make_env
-from experiments.accuracy import PROBES, play_script
 
 KEY = jax.random.key(0)
 

@@ -8,12 +8,12 @@ import mujoco
 import numpy as np
 import pytest
 from franka_bench import EXACT, SCENES, push_hard, theta_of
+from scripted import PROBES
 
 from envs.franka import arm, ball, push, towel
 from envs.mujoco.engines import c as engine_c
 from envs.mujoco.engines import warp as engine_warp
 from envs.mujoco.scene import at_rest, make_env
-from experiments.accuracy import PROBES
 
 pytest.importorskip("warp")
 WORLDS, STEPS = 3, 24
