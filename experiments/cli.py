@@ -1,19 +1,27 @@
 """Impure: what every command shares: parsing, error messages, exit codes, caches, quiet logs. Imports nothing heavy."""
 
 import contextlib
+import dataclasses
+import difflib
 import importlib
-import io
 import logging
 import os
-import re
 import select
 import subprocess
 import sys
+import typing
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn, cast
+from types import SimpleNamespace
+from typing import Any, NoReturn, cast
 
 import tyro
+
+# What went wrong, as data. Not yet a public part of tyro (pyproject.toml keeps to versions that have it); the
+# alternative is to read the frames that it draws.
+from tyro import _errors
+
+from sgft_jax.types import UserError, unknown
 
 BROKEN_PIPE, USER_ERROR, INTERRUPTED = 1, 2, 130
 _CACHE_VARIABLE = "SGFT_CACHE_DIR"
@@ -26,27 +34,26 @@ def run_main[T](
     description: str,
     *,
     argv: Sequence[str] | None = None,
-    default: T | None = None,
+    default: Callable[[Sequence[str]], T] | None = None,
 ) -> None:
-    """Parse the command line into `config_type`, starting from `default`, and call `main` with it.
+    """Parse the command line into `config_type` and call `main` with it.
 
+    default(argv) -> the defaults of the options where some decide those of others, see `preview`.
     Exits with code 2 and one line `error: ...` on stderr for anything the user can mend (`UserError`, unknown options
     or choices), with 130 after an interrupt, with 1 and no word where nobody reads its output any more, as after
     `| head`. Other exceptions are bugs and keep their traceback.
     """
     with _may_lose_its_reader():
         try:
-            config = parse(config_type, description, argv, default=default)  # a dataclass may refuse its values
+            words = list(sys.argv[1:] if argv is None else argv)
+            start = None if default is None else default(words)
+            config = parse(config_type, description, words, default=start)  # a dataclass may refuse its values
             set_up()
             main(config)
         except KeyboardInterrupt:
             print("\ninterrupted; the same command with --resume continues from the last checkpoint", file=sys.stderr)
             sys.exit(INTERRUPTED)
-        except Exception as error:
-            from sgft_jax.types import UserError
-
-            if not isinstance(error, UserError):
-                raise
+        except UserError as error:
             fail(str(error))
 
 
@@ -72,15 +79,53 @@ def _may_lose_its_reader() -> Iterator[None]:
 def parse[T](
     config_type: type[T], description: str, argv: Sequence[str] | None = None, *, default: T | None = None
 ) -> T:
-    """A frozen dataclass from the command line; a bad one ends the process with one line and code 2."""
-    complaint = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(complaint):
-            return cast(T, tyro.cli(config_type, description=description, args=argv, default=default))
-    except SystemExit as stopped:
-        if stopped.code not in (None, 0):
-            fail(one_line(complaint.getvalue()))
-        raise
+    """A frozen dataclass from the command line; raises UserError for a bad one."""
+    with _errors.on_parse_error(lambda event: _refuse(event, config_type, default)):
+        return cast(T, tyro.cli(config_type, description=description, args=argv, default=default))
+
+
+def preview(argv: Sequence[str], **defaults: Any) -> SimpleNamespace:
+    """The values of the options that decide the defaults of all others; what else is in `argv` is left to `parse`.
+
+    defaults: by name with underscores, e.g. preset="fast". Raises UserError for a bad value.
+    """
+    fields = [(name, type(value), dataclasses.field(default=value)) for name, value in defaults.items()]
+    chosen = dataclasses.make_dataclass("Options", fields)
+    with _errors.on_parse_error(lambda event: _refuse(event, chosen, None)):
+        found, _ = tyro.cli(chosen, args=list(argv), return_unknown_args=True, add_help=False)
+    return SimpleNamespace(**vars(found))
+
+
+def _refuse(event: _errors.ParseErrorEvent, config_type: type, default: Any) -> None:
+    """Raise UserError with what is wrong in one line; of kinds of mistakes not listed here tyro tells."""
+    match event:
+        case _errors.UnrecognizedArgs(tokens=[first, *_]) if not first.startswith("-"):
+            raise UserError(f"unexpected word {first!r} on the command line; options begin with --")
+        case _errors.UnrecognizedArgs(tokens=[first, *_]):
+            option = first.partition("=")[0].replace("_", "-")
+            close = difflib.get_close_matches(option, option_names(config_type, default), n=1)
+            hint = f"did you mean {close[0]}?" if close else "--help lists them all"
+            raise UserError(f"there is no option {option}; {hint}")
+        case _errors.InvalidChoice():
+            raise UserError(unknown(event.argument.display_name(), event.value, event.choices))
+        case _errors.BadValue(reason="too_few_values"):
+            raise UserError(f"{event.argument.display_name()}: needs a value")
+        case _errors.InstantiationFailure(argument=None):
+            raise UserError(event.message)
+        case _errors.InstantiationFailure(argument=argument):
+            kind = {int: "a whole number", float: "a number"}.get(argument.field.type_stripped, "something else")
+            raise UserError(f"{argument.display_name()}: must be {kind} ({event.message})")
+
+
+def option_names(config_type: type, default: Any = None, *, prefix: str = "--") -> list[str]:
+    """`--task`, `--config.batch-size`, ...: the options of a dataclass and of those in it."""
+    hints, found = typing.get_type_hints(config_type), []
+    for one in dataclasses.fields(config_type):
+        value = getattr(default, one.name, None)
+        kind = type(value) if dataclasses.is_dataclass(value) else hints[one.name]
+        name = prefix + one.name.replace("_", "-")
+        found += option_names(kind, value, prefix=f"{name}.") if dataclasses.is_dataclass(kind) else [name]
+    return found
 
 
 def fail(message: str) -> NoReturn:
@@ -89,38 +134,10 @@ def fail(message: str) -> NoReturn:
     sys.exit(USER_ERROR)
 
 
-def one_line(boxed: str) -> str:
-    """The gist of tyro's framed complaint: its first paragraph, with the closest match where it offers some."""
-    paragraphs = _paragraphs(boxed)
-    from sgft_jax.types import unknown
-
-    message = paragraphs[0] if paragraphs else "bad command line"
-    if match := re.search(r"invalid choice '(.*?)' for argument '(.*?)'\. Expected one of \((.*)\)", message):
-        value, option, listed = match.groups()
-        return unknown(option, value, re.findall(r"'(.*?)'", listed))
-    if match := re.search(r"Perhaps you meant:\s*(--[\w.-]+)", " ".join(paragraphs)):
-        return f"{message}; did you mean {match.group(1)}?"
-    return message
-
-
-def _paragraphs(boxed: str) -> list[str]:
-    """Tyro's complaint, each part on one line and without title and frame, which is not drawn where stdout is ASCII."""
-    lines = [line.strip("│ \t") for line in boxed.splitlines() if line.strip() and line[0] not in "╭╰"]
-    parts = [[]]
-    for line in lines:
-        if set(line) <= set("─-"):
-            parts.append([])
-        else:
-            parts[-1].append(line)
-    return [" ".join(part) for part in (parts if boxed.startswith("╭") else parts[1:])]
-
-
 def choose[V](kind: str, name: str, options: dict[str, V]) -> V:
     """`options[name]`; raises UserError with the closest match and the list of what exists."""
     if name in options:
         return options[name]
-    from sgft_jax.types import UserError, unknown
-
     raise UserError(unknown(kind, name, options))
 
 

@@ -15,11 +15,11 @@ from experiments import cli
 from experiments.figures import FiguresArgs, figures
 from experiments.finetune import finetune
 from experiments.finetune_args import FinetuneArgs, run_folder
-from experiments.presets import PRESETS
 from experiments.pretrain import PretrainArgs, pretrain
 from sgft_jax.analysis import tables
 from sgft_jax.analysis.curves import Curve, read_runs
 from sgft_jax.methods import finetune_config, get_method
+from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError
 
 METHODS = ("sgft-mpc", "sgft-sac", "sac")  # the first is filmed
@@ -64,9 +64,10 @@ def main(args: DemoArgs) -> None:
 
 def outcome(curves: Sequence[Curve]) -> str:
     """What came of it in a few lines: success of the methods wherever one was evaluated."""
+    first, *_ = curves
     return (
-        f"Success on the {curves[0].gap} real system of {curves[0].task} in per cent, interquartile mean over seeds "
-        f"with its 95 % interval where there are enough:\n\n{tables.outcome(curves)}"
+        f"{tables.words(first.score).capitalize()} on the {first.gap} real system of {first.task}, interquartile mean "
+        f"over seeds with its 95 % interval where there are enough:\n\n{tables.outcome(curves)}"
     )
 
 

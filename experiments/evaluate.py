@@ -1,20 +1,24 @@
 """Evaluate a prior, or what fine-tuning has saved, in simulation or on a "real" system."""
 
-import functools
 import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
+import jax.numpy as jnp
 
 import envs
+from envs.gaps import SIM
 from envs.mujoco.worlds import Impl
-from experiments import cli, common
-from experiments.algorithms import make_player
-from experiments.evaluation import describe, grade
+from envs.pools import heldout_worlds, load_gap, real_env
+from experiments import cli, stacking
+from experiments.evaluation import describe, play
+from experiments.options import prior_folders
 from sgft_jax.io.jsonfile import read_json
+from sgft_jax.io.priors import load_priors
+from sgft_jax.policies import make_policy
+from sgft_jax.systems.simulated import Simulated
 from sgft_jax.types import UserError
 
 _SEED = 2**31 + 2  # held out from training and from the choice of the prior
@@ -32,7 +36,7 @@ class EvaluateArgs:
     """push, push-towel, push-ball, hammer or insert; default: the task of the prior."""
     preset: str = "fast"
     """Pretraining preset whose priors to take where neither --prior nor --run is given."""
-    real: str = common.SIM
+    real: str = SIM
     """Where: sim (the training domain without sensor noise), the name of a gap, or a .toml/.json file."""
     set: tuple[str, ...] = ()
     """Changes to the real system, e.g. --set latency=0.05 action_scale=[1,0.5]."""
@@ -72,18 +76,16 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     if args.prior is None and args.run is None and args.task is None:
         raise UserError("nothing to evaluate: name a folder with --prior or --run, or a task with --task")
     task = envs.name_of(args.task or "push")
-    folders = common.prior_folders(args.run or args.prior, out=args.out, task=task, preset=args.preset)
+    folders = prior_folders(args.run or args.prior, out=args.out, task=task, preset=args.preset)
     env = envs.make(args.task or read_json(folders[0] / "prior.json")["task"], args.impl)
-    gap = common.load_gap(env, args.real, args.set)
-    priors, card = common.load_priors(folders, env)
-    env = common.real_env(env, [gap] if gap else [])
-    player, gamma = make_player(card, env), card["gamma"]
+    gap = load_gap(env, args.real, args.set)
+    priors, card = load_priors(folders, env)
+    env = real_env(env, [gap] if gap else [])
     key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_SEED), args.seed))
-    worlds = common.exam_worlds(env, gap, key_worlds, args.episodes)
-
-    graded = functools.partial(grade, env, player, worlds, key_episodes, gamma=gamma, episodes=args.episodes)
-    outcome = jax.tree.map(np.asarray, jax.jit(jax.vmap(graded))(common.stack(priors)))
-    policies = [{"policy": str(f), **describe(common.member(outcome, i))} for i, f in enumerate(folders)]
+    worlds = stacking.stack([heldout_worlds(env, gap, key_worlds, args.episodes)])
+    system = Simulated(env, worlds, jnp.zeros(len(priors), jnp.int32), gamma=card["gamma"])
+    outcome = play(system, make_policy(card, env), stacking.stack(priors), key_episodes, args.episodes)
+    policies = [{"policy": str(f), **describe(stacking.member(outcome, i))} for i, f in enumerate(folders)]
     where = "in simulation" if gap is None else f"on the {gap.name} real system"
     return {"task": env.name, "impl": env.impl, "where": where, "episodes": args.episodes, "policies": policies}
 

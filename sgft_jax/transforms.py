@@ -1,137 +1,178 @@
-"""SGFT as three batch transforms; `methods.py` has the table of methods that they compose into.
+"""SGFT as transforms of a sampled batch: branch, relabel, shape, clip, shorten.
 
-A transform is `(imagination, batch, key) -> batch` on a batch [B, ...] of real transitions. Compose in the order
-branch, shape, shorten: branching needs plain observations, shaping the whole discount.
-Source: SGFT (Yin et al., ICLR 2025).
+A method composes them in this order. Branching and relabelling come first, because they make rows. Shaping comes before
+shortening, because it needs the discount of the whole task.
+Source: SGFT (Yin et al., ICLR 2025), section 4 and Algorithms 1 and 2.
 """
+
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from sgft_jax.models.networks import add_noise
-from sgft_jax.types import Array, BatchTransform, Imagination, Key, Transition, UserError
+from sgft_jax.types import Array, Batch, Imagination, Key, Metrics, PyTree, Transform
 
 
-def shaped_reward(imagination: Imagination, row: Transition) -> Array:
-    """Shaped reward [] r + discount V(s') - V(s) of one transition. The discount makes V(terminal) count as 0."""
+def stateless(apply: Callable[[Any, Batch, Key], Batch]) -> Transform:
+    """A transform that learns nothing."""
+
+    def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
+        del batch, key
+        return state, {}
+
+    return Transform(lambda key: (), lambda state, imagination, batch, key: apply(imagination, batch, key), update)
+
+
+def compose(*transforms: Transform) -> Transform:
+    """Applies transforms from left to right, each with its own key and state."""
+    n = max(len(transforms), 1)
+
+    def init(key: Key) -> PyTree:
+        return tuple(one.init(sub) for one, sub in zip(transforms, jax.random.split(key, n), strict=False))
+
+    def apply(state: PyTree, imagination: Any, batch: Batch, key: Key) -> Batch:
+        for one, own, sub in zip(transforms, state, jax.random.split(key, n), strict=False):
+            batch = one.apply(own, imagination, batch, sub)
+        return batch
+
+    def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
+        keys = jax.random.split(key, n)
+        done = [one.update(own, batch, sub) for one, own, sub in zip(transforms, state, keys, strict=False)]
+        return tuple(own for own, _ in done), {name: x for _, metrics in done for name, x in metrics.items()}
+
+    return Transform(init, apply, update)
+
+
+# --- rewards ----------------------------------------------------------------------------------------------------------
+
+
+def shaped_reward(imagination: Imagination, row: Batch) -> Array:
+    """Shaped reward [] r + discount V(s') - V(s) of one row. The discount makes V count as 0 after a termination."""
     return row.reward + row.discount * imagination.value(row.next_obs) - imagination.value(row.obs)
 
 
-def shape(imagination: Imagination, batch: Transition, key: Key) -> Transition:
-    """Replace every reward by the shaped one. Source: SGFT Algorithm 1; `key` is not used."""
+@stateless
+def shape(imagination: Imagination, batch: Batch, key: Key) -> Batch:
+    """Replaces every reward by the shaped one. Source: SGFT Algorithm 1; `key` is not used."""
     del key
     return batch._replace(reward=jax.vmap(lambda row: shaped_reward(imagination, row))(batch))
 
 
-def append_steps_to_go(obs: Array, steps_to_go: Array, horizon: int) -> Array:
-    """Observation [obs_dim] with one_hot(k) [horizon] appended, zeros for k = 0; unchanged for horizon 1."""
-    if horizon == 1:
-        return obs
-    return jnp.concatenate([obs, jax.nn.one_hot(steps_to_go - 1, horizon, dtype=obs.dtype)])
+def clip(bound: float) -> Transform:
+    """Keeps every reward in [-bound, bound].
 
-
-def shorten(horizon: int) -> BatchTransform:
-    """End every segment after `horizon` steps: no bootstrap at k = 1, and observations that tell the steps to go.
-
-    Rows without a segment (k = 0) get k ~ Uniform{1..H}: a real transition is as good a step of any segment. A learner
-    becomes conditioned on k without knowing: next observations carry k - 1. Source: SGFT section 3, O-12.
+    V_sim falls off a cliff where a task can be lost for good, such as a puck over the edge. One such row outweighs a
+    thousand others in a squared error, and its sign is all that a policy needs.
     """
-    _check_positive("horizon", horizon)
+    return stateless(lambda imagination, batch, key: batch._replace(reward=jnp.clip(batch.reward, -bound, bound)))
 
-    def transform(imagination: Imagination, batch: Transition, key: Key) -> Transition:
+
+# --- horizons ---------------------------------------------------------------------------------------------------------
+
+
+def steps_to_go(k: Array, horizon: int) -> Array:
+    """The context [horizon] that tells a network that `k` [] steps of a segment are left: one_hot(k), zeros for 0."""
+    return jax.nn.one_hot(k - 1, horizon, dtype=jnp.float32)
+
+
+def shorten(horizon: int) -> Transform:
+    """Ends every segment after `horizon` steps: no bootstrap in the last one, and a context with the steps to go.
+
+    Rows without a segment draw k ~ Uniform{1..H}: a real transition is as good a step of any segment. The context of
+    next observations says k - 1. With horizon 1 every row ends its segment, and there is no context.
+    Source: SGFT section 4.2.
+    """
+
+    def apply(imagination: Imagination, batch: Batch, key: Key) -> Batch:
         del imagination
-        drawn = jax.random.randint(key, batch.steps_to_go.shape, 1, horizon + 1)
-        k = jnp.where(batch.steps_to_go == 0, drawn, batch.steps_to_go)
-        append = jax.vmap(append_steps_to_go, (0, 0, None))
+        if horizon == 1:
+            return batch._replace(discount=jnp.zeros_like(batch.discount))
+        k = jax.random.randint(key, batch.reward.shape, 1, horizon + 1)
+        if batch.context is not None:
+            assigned = jnp.round(batch.context @ jnp.arange(1.0, horizon + 1)).astype(jnp.int32)
+            k = jnp.where(assigned == 0, k, assigned)
+        tell = jax.vmap(steps_to_go, (0, None))
         return batch._replace(
-            obs=append(batch.obs, k, horizon),
-            next_obs=append(batch.next_obs, k - 1, horizon),
+            context=tell(k, horizon),
+            next_context=tell(k - 1, horizon),
             discount=jnp.where(k == 1, 0.0, batch.discount),
-            steps_to_go=k,
         )
 
-    return transform
+    return stateless(apply)
 
 
-def branch(horizon: int, branches: int, *, noise: float | Array = 0.0, segments: bool = True) -> BatchTransform:
-    """Append `branches` imagined rollouts of `horizon` steps from every real observation, after the real rows.
+# --- models -----------------------------------------------------------------------------------------------------------
 
-    noise: std of Gaussian noise on the policy's imagined actions, in units of the action's range [-1, 1]. The policy's
-    own actions say nothing about better ones; a model can be asked about any.
 
-    B rows become B (1 + branches * horizon). segments: number the imagined steps H..1, else leave them 0 for methods
-    with an infinite horizon. Past an imagined termination a rollout repeats its last transition: every row stays valid.
+def branch(horizon: int, branches: int, *, noise: float | Array = 0.0, segments: bool = True) -> Transform:
+    """Appends `branches` imagined rollouts of `horizon` steps from every row's observation, after the rows themselves.
+
+    B rows become B (1 + branches * horizon). noise: std of Gaussian noise on the policy's imagined actions, in units of
+    the action's range [-1, 1]: the policy's own actions say nothing about better ones. segments: the policy is told the
+    steps to go, and so is the learner; False for methods with an infinite horizon. After an imagined termination a
+    rollout repeats its last transition, so that every row stays valid.
     Source: SGFT Algorithm 2; MBPO (Janner et al. 2019).
     """
-    _check_positive("horizon", horizon)
-    _check_positive("branches", branches)
+    tell = segments and horizon > 1
 
-    def rollout(imagination: Imagination, row: Transition, key: Key) -> Transition:
-        """One branch from row.obs: transitions with a leading axis [horizon]."""
+    def rollout(imagination: Imagination, start: Batch, key: Key) -> Batch:
+        """One branch from start.obs: rows with a leading axis [horizon]."""
 
-        def step(
-            carry: tuple[Transition, Array], inputs: tuple[Array, Key]
-        ) -> tuple[tuple[Transition, Array], Transition]:
+        def step(carry: tuple[Batch, Array], inputs: tuple[Array, Key]) -> tuple[tuple[Batch, Array], Batch]:
             last, alive = carry
-            new, terminated = _imagine(imagination, last.next_obs, *inputs, noise=noise)
+            k, key = inputs
+            new, terminated = _imagine(imagination, _told(last, k) if tell else last, key, noise=noise)
             last = jax.tree.map(lambda n, o: jnp.where(alive, n, o).astype(o.dtype), new, last)
             return (last, alive & ~terminated), last
 
-        k = jnp.arange(horizon, 0, -1, dtype=jnp.int32) if segments else jnp.zeros(horizon, jnp.int32)
-        start = row._replace(next_obs=row.obs)  # only its next_obs is read: the first step is always alive
-        return jax.lax.scan(step, (start, jnp.bool_(True)), (k, jax.random.split(key, horizon)))[1]
+        k = jnp.arange(horizon, 0, -1)
+        begin = start._replace(next_obs=start.obs)  # only its next_obs is read: the first step is always alive
+        return jax.lax.scan(step, (begin, jnp.bool_(True)), (k, jax.random.split(key, horizon)))[1]
 
-    def transform(imagination: Imagination, batch: Transition, key: Key) -> Transition:
+    def _told(row: Batch, k: Array) -> Batch:
+        return row._replace(context=steps_to_go(k, horizon), next_context=steps_to_go(k - 1, horizon))
+
+    def apply(imagination: Imagination, batch: Batch, key: Key) -> Batch:
+        if tell:
+            unassigned = jnp.zeros((batch.reward.shape[0], horizon))
+            batch = batch._replace(context=unassigned, next_context=unassigned)
         keys = jax.random.split(key, (batch.reward.shape[0], branches))
         from_row = jax.vmap(lambda row, key: rollout(imagination, row, key), (None, 0))
         imagined = jax.tree.map(lambda x: x.reshape(-1, *x.shape[3:]), jax.vmap(from_row)(batch, keys))
-        return jax.tree.map(lambda real, new: jnp.concatenate([real, new]), batch, imagined)
+        return jax.tree.map(lambda rows, new: jnp.concatenate([rows, new]), batch, imagined)
 
-    return transform
+    return stateless(apply)
 
 
-def relabel(imagination: Imagination, batch: Transition, key: Key) -> Transition:
-    """Transitions [B, ...] of another system as the models have them: what follows from their observations and actions.
+def relabel(first: int) -> Transform:
+    """Gives the rows from index `first` on the successors, rewards and ends that the models expect.
 
-    Only the dynamics need be real, not the observations: the simulator's are as wide as a task, and show a learner what
-    fine-tuned models say about places where no rollout has been.
+    These rows are the simulator's. Their observations and actions are as wide as a task; only what follows from them
+    need be real. They show a learner what the fitted models say about places where no rollout has been.
     """
 
-    def one(row: Transition, key: Key) -> Transition:
-        return _transition(imagination, row.obs, row.action, row.steps_to_go, key)[0]
+    def apply(imagination: Imagination, batch: Batch, key: Key) -> Batch:
+        keys = jax.random.split(key, batch.reward.shape[0] - first)
+        rows = jax.tree.map(lambda x: x[first:], batch)
+        new = jax.vmap(lambda row, key: _expected(imagination, row, row.obs, row.action, key)[0])(rows, keys)
+        return jax.tree.map(lambda old, changed: jnp.concatenate([old[:first], changed]), batch, new)
 
-    return jax.vmap(one)(batch, jax.random.split(key, batch.reward.shape[0]))
+    return stateless(apply)
 
 
-def _imagine(
-    imagination: Imagination, obs: Array, k: Array, key: Key, *, noise: float | Array
-) -> tuple[Transition, Array]:
-    """One imagined transition from obs with k steps to go, and whether it terminates."""
+def _imagine(imagination: Imagination, last: Batch, key: Key, *, noise: float | Array) -> tuple[Batch, Array]:
+    """One imagined row from last.next_obs, and whether it terminates."""
     key_policy, key_noise, key_dynamics = jax.random.split(key, 3)
-    action = imagination.policy(obs, k, key_policy)
-    return _transition(imagination, obs, add_noise(action, noise, key_noise), k, key_dynamics)
+    action = imagination.policy(last.next_obs, last.context, key_policy)
+    return _expected(imagination, last, last.next_obs, add_noise(action, noise, key_noise), key_dynamics)
 
 
-def _transition(imagination: Imagination, obs: Array, action: Array, k: Array, key: Key) -> tuple[Transition, Array]:
-    """The transition that the models expect, and whether it terminates."""
+def _expected(imagination: Imagination, row: Batch, obs: Array, action: Array, key: Key) -> tuple[Batch, Array]:
+    """`row` with the transition that the models expect, and whether it terminates."""
     next_obs = imagination.dynamics(obs, action, key)
     terminated = imagination.terminated(obs, action, next_obs)
     discount = jnp.where(terminated, 0.0, imagination.gamma)
     reward = imagination.reward(obs, action, next_obs)
-    return Transition(obs, action, reward, discount, next_obs, jnp.bool_(False), k), terminated
-
-
-def compose(*transforms: BatchTransform) -> BatchTransform:
-    """Apply transforms from left to right, each with its own key."""
-
-    def transform(imagination: Imagination, batch: Transition, key: Key) -> Transition:
-        for one, sub in zip(transforms, jax.random.split(key, max(len(transforms), 1)), strict=False):
-            batch = one(imagination, batch, sub)
-        return batch
-
-    return transform
-
-
-def _check_positive(name: str, value: int) -> None:
-    if value < 1:
-        raise UserError(f"{name} is {value}: must be at least 1")
+    return row._replace(obs=obs, action=action, reward=reward, discount=discount, next_obs=next_obs), terminated

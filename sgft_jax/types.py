@@ -1,20 +1,26 @@
-"""The nouns every other module speaks: transitions, learners, priors, fine-tuners. Imports nothing of ours."""
+"""The nouns that every other module uses. Imports nothing of ours, and JAX for type checkers alone."""
+
+from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
-import jax
-from flax import struct
+if TYPE_CHECKING:
+    import jax
 
-Array = jax.Array
-Key = jax.Array
+    Array = jax.Array
+    Key = jax.Array
+else:  # command lines read this module; JAX takes seconds to import
+    Array = Key = Any
+
 PyTree = Any
 Metrics = dict[str, Array]
 
 
 class UserError(Exception):
-    """Bad input: one line that names the file, key or option and says how to fix it. Entry points exit with code 2."""
+    """Bad input: one line that names the file, key or option and says how to fix it. Commands exit with code 2."""
 
 
 def unknown(kind: str, name: str, options: Iterable[str]) -> str:
@@ -25,16 +31,17 @@ def unknown(kind: str, name: str, options: Iterable[str]) -> str:
     return f"{kind}: there is no {name!r}{hint} Choose from: {', '.join(listed)}"
 
 
+# --- experience -----------------------------------------------------------------------------------------------------
+
+
 class Transition(NamedTuple):
-    """One step of experience, or a batch of them with leading axes.
+    """One step of experience as it is stored, or many of them with leading axes.
 
     obs: [obs_dim] observation before the action, raw units.
     action: [act_dim] in [-1, 1], as the policy chose it (before any effect of the system on it).
-    reward: [] task reward of arriving in `next_obs` (O-2), never reshaped in storage.
+    reward: [] task reward of arriving in `next_obs`; transforms reshape rewards, storage never does.
     discount: [] gamma * (1 - terminated). A time limit never zeroes it.
     next_obs: [obs_dim] the true successor, also at the end of an episode.
-    truncated: [] bool, the episode was cut here by its time limit.
-    steps_to_go: [] int32, steps left in an H-step segment including this one; 0 = no segment assigned.
     """
 
     obs: Array
@@ -42,91 +49,237 @@ class Transition(NamedTuple):
     reward: Array
     discount: Array
     next_obs: Array
-    truncated: Array
-    steps_to_go: Array
+
+
+class Batch(NamedTuple):
+    """Transitions [B, ...] as a learner sees them. A field that nobody uses is None and costs nothing.
+
+    Learners of sequences take windows: [B, H, ...], where `next_obs` of a step is `obs` of the next.
+    valid: [B] or [B, H] bool, False for rows that must not count. Their values are finite.
+    weight: [B], how much each row counts in the losses (mean 1).
+    is_sim: [B] bool, True for rows of the simulator.
+    context, next_context: [B, context_dim], further network inputs that go with `obs` and `next_obs` and are not part
+        of the observation, such as the steps to go. Networks read them as they are, without normalisation.
+    """
+
+    obs: Array
+    action: Array
+    reward: Array
+    discount: Array
+    next_obs: Array
+    valid: Array | None = None
+    weight: Array | None = None
+    is_sim: Array | None = None
+    context: Array | None = None
+    next_context: Array | None = None
+
+
+class Source(NamedTuple):
+    """Where the rows of a batch come from.
+
+    sample(state, key) -> Batch [n_real + n_sim, ...], real rows first. The counts are static.
+    """
+
+    sample: Callable[[PyTree, Key], Batch]
+    n_real: int
+    n_sim: int = 0
+
+
+class SimulatedData(NamedTuple):
+    """A fixed set of simulated transitions, seen by one member. All members share the arrays behind it.
+
+    draw(key, n) -> n rows, [n, ...]. returns: [episodes] undiscounted task returns of the episodes they come from.
+    """
+
+    draw: Callable[[Key, int], Transition]
+    returns: Array
+
+
+# --- learning -------------------------------------------------------------------------------------------------------
 
 
 class Learner(NamedTuple):
-    """A learning algorithm as pure functions, written for one agent and vmapped over seeds by the caller.
+    """A learning algorithm as pure functions, written for one agent; the caller vmaps over seeds.
 
-    init(key) -> state
-    init_carry() -> carry: what the policy remembers between steps; () for an MLP.
-    act(state, carry, obs, key, *, explore) -> (action, carry): one observation; `explore` is static.
-    update(state, batch, key) -> (state, metrics): one gradient step of every trained network on a `[B, ...]` batch of
-        transitions, or of what the learner says it needs.
+    init(key) -> state.
+    init_carry() -> carry, what the policy remembers from step to step of an episode; () for an MLP.
+    act(state, carry, obs [obs_dim], key, *, explore, context=None) -> (action [act_dim], carry). `explore` [] bool may
+        be traced. context: [context_dim], for learners that were built with one.
+    update(state, batch, key) -> (state, metrics), one gradient step of every network that trains.
     """
 
     init: Callable[[Key], PyTree]
     init_carry: Callable[[], PyTree]
     act: Callable[..., tuple[Array, PyTree]]
-    update: Callable[[PyTree, Any, Key], tuple[PyTree, Metrics]]
+    update: Callable[[PyTree, Batch, Key], tuple[PyTree, Metrics]]
 
 
 class Normalizer(NamedTuple):
-    """Fixed observation statistics: `mean`, `std`, both [obs_dim], raw units."""
+    """Fixed observation statistics: `mean` and `std`, both [obs_dim], raw units."""
 
     mean: Array
     std: Array
 
 
-@struct.dataclass
-class Prior:
-    """What pretraining hands to fine-tuning: parameters only, frozen, shareable.
-
-    actor, critic, value: network parameters (flax variables' `params`), critic with a leading ensemble axis of 2.
-    dynamics: parameters of the delta-dynamics ensemble, leading axis = member.
-    normalizer: statistics of the random-action data; every network above reads normalised observations.
-    """
-
-    actor: PyTree
-    critic: PyTree
-    value: PyTree
-    dynamics: PyTree
-    normalizer: Normalizer
-
-
 class Imagination(NamedTuple):
-    """What batch transforms may ask about the world: closures over the current fine-tuning state, for ONE example.
+    """What transforms may ask about the world: closures over the current fine-tuning state, for ONE example.
 
     value(obs) -> []: the frozen, deterministic V_sim.
-    policy(obs, steps_to_go, key) -> [act_dim]: a sample of the current policy with that many steps to go.
-    dynamics(obs, action, key) -> [obs_dim]: one predicted successor (a random ensemble member).
-    reward(obs, action, next_obs) -> []: the task's reward.
-    terminated(obs, action, next_obs) -> [] bool.
+    policy(obs, context, key) -> [act_dim]: a sample of the current policy. context: None or [context_dim].
+    dynamics(obs, action, key) -> [obs_dim]: one predicted successor.
+    reward(obs, action, next_obs) -> []: the task's reward. terminated(obs, action, next_obs) -> [] bool.
     gamma: [] discount factor.
     """
 
     value: Callable[[Array], Array]
-    policy: Callable[[Array, Array, Key], Array]
+    policy: Callable[[Array, Array | None, Key], Array]
     dynamics: Callable[[Array, Array, Key], Array]
     reward: Callable[[Array, Array, Array], Array]
     terminated: Callable[[Array, Array, Array], Array]
     gamma: float | Array
 
 
-BatchTransform = Callable[[Imagination, Transition, Key], Transition]
+class Transform(NamedTuple):
+    """A change of a sampled batch before the learner sees it.
+
+    init(key) -> state, () for a transform that does not learn.
+    apply(state, imagination, batch, key) -> Batch. imagination: an `Imagination`, or what else the method offers.
+    update(state, batch, key) -> (state, metrics): learns from the batch as it was sampled.
+    """
+
+    init: Callable[[Key], PyTree]
+    apply: Callable[[PyTree, Any, Batch, Key], Batch]
+    update: Callable[[PyTree, Batch, Key], tuple[PyTree, Metrics]]
 
 
-Simulated = Callable[[Key, int], Transition]
-"""(key, n) -> n transitions of the simulator, [n, ...]."""
+# --- between simulation and reality ---------------------------------------------------------------------------------
+
+
+class Task(Protocol):
+    """What a method needs to know of a task; every `envs.Env` is one.
+
+    reward, terminated: functions of one (obs, action, next_obs), None where the task has no such function.
+    """
+
+    @property
+    def obs_dim(self) -> int:
+        """Length of the observation vector."""
+        ...
+
+    @property
+    def act_dim(self) -> int:
+        """Length of the action vector."""
+        ...
+
+    @property
+    def episode_length(self) -> int:
+        """Control steps until the time limit."""
+        ...
+
+    @property
+    def reward(self) -> Callable[[Array, Array, Array], Array] | None:
+        """Task reward []."""
+        ...
+
+    @property
+    def terminated(self) -> Callable[[Array, Array, Array], Array] | None:
+        """Whether the episode ends for good, [] bool."""
+        ...
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What pretraining hands to fine-tuning.
+
+    params: the networks' parameters and the observation statistics (`SACParams` or `TDMPC2Params`).
+    card: JSON data: task, algorithm, network, gamma, and the numbers that were measured.
+    """
+
+    params: PyTree
+    card: Mapping[str, Any]
+
+
+class Policy(NamedTuple):
+    """How the parameters of a prior act, for one example.
+
+    init_carry() -> carry. act(params, carry, obs, key, *, explore) -> (action, carry); `explore` may be traced.
+    value(params, obs) -> []: V_sim, deterministic.
+    predict(params, obs, action, key) -> [obs_dim], a successor by a random member of its model; None where the model
+        does not predict observations.
+    model_error(params, obs [T + 1, obs_dim], actions [T, act_dim]) -> [T]: how far its model drifts from a trajectory,
+        in standard deviations of the observation; None likewise.
+    """
+
+    init_carry: Callable[[], PyTree]
+    act: Callable[..., tuple[Array, PyTree]]
+    value: Callable[[PyTree, Array], Array]
+    predict: Callable[[PyTree, Array, Array, Key], Array] | None = None
+    model_error: Callable[[PyTree, Array, Array], Array] | None = None
+
+
+class Simulation(NamedTuple):
+    """Simulated data that a method asks for: whole episodes of the prior's policy in the training domain.
+
+    transitions: how many. ladder: from the first episode to the last, a share of the actions that grows from 0 to this
+        is replaced by random ones, as along the fleet of pretraining. offline_updates: updates on them alone, before
+        the first real rollout.
+    """
+
+    transitions: int
+    ladder: float
+    offline_updates: int = 0
 
 
 class Finetuner(NamedTuple):
-    """Fine-tuning of one agent as pure functions.
+    """Fine-tuning of one agent on one real system, as pure functions; the caller vmaps over members.
 
-    init(prior, key) -> state.
-    init_carry() -> what it remembers from step to step of an episode.
-    act(state, carry, obs [obs_dim], key, *, explore) -> (action [act_dim], carry); explore: [] bool, may be traced.
-    observe(state, transitions [T, ...], valid [T]) -> state: keep the rows of one episode, in order.
-    learn(state, key, n_updates, simulated=None, *, offline=False) -> (state, metrics averaged over the updates);
-        `n_updates` is static. simulated(key, n) -> n transitions of the simulator, for methods that ask for them;
-        offline: learn from these alone (static).
-    export(state) -> the agent in the form of a prior: actor and critic as they act, with the whole horizon to go.
+    init(params, key, simulated) -> state. params: of a prior, None without one. simulated: a `SimulatedData` or None.
+    init_carry() -> carry of an episode.
+    act(state, carry, obs [obs_dim], key, *, explore) -> (action [act_dim], carry); `explore` may be traced.
+    observe(state, transitions [T, ...], valid [T]) -> state: keeps the rows of one episode, in order.
+    learn(state, key, updates, simulated, *, offline) -> (state, metrics averaged over the updates); `updates` and
+        `offline` are static. offline: learn from the simulated transitions alone.
+    export(state) -> params of the agent as it acts now.
+    policy: how exported params act.
+    updates_per_rollout: gradient updates that follow a real rollout.
+    initial_rollouts: real rollouts before the first update.
+    initial_policy: what makes them, from the prior's params; None = the agent itself.
+    simulation: the simulated data that the method needs, or None.
+    card: what the card of an exported policy says beyond the prior's, such as the options of a plan.
     """
 
-    init: Callable[[Any, Key], Any]
+    init: Callable[[PyTree, Key, SimulatedData | None], PyTree]
     init_carry: Callable[[], PyTree]
     act: Callable[..., tuple[Array, PyTree]]
-    observe: Callable[[Any, Transition, Array], Any]
-    learn: Callable[..., tuple[Any, Metrics]]
-    export: Callable[[Any], PyTree]
+    observe: Callable[[PyTree, Transition, Array], PyTree]
+    learn: Callable[..., tuple[PyTree, Metrics]]
+    export: Callable[[PyTree], PyTree]
+    policy: Policy
+    updates_per_rollout: int
+    initial_rollouts: int
+    initial_policy: Policy | None
+    simulation: Simulation | None
+    card: Mapping[str, Any]
+
+
+Algorithm = Literal["sac", "tdmpc2"]
+Family = Literal["sgft", "model-free", "model-based", "offline", "planning"]
+
+
+class Method(NamedTuple):
+    """A way to fine-tune. `sgft_jax/methods/` has one file for each.
+
+    family: the kind of method, for tables and figures. description, source: one line each.
+    config: a frozen dataclass whose fields carry their help; its defaults are the method's own settings.
+    build(config, prior, task) -> Finetuner. Every option left open (None) is resolved here.
+    prior: the algorithm of the priors that it starts from. needs_prior: False where it can start without one.
+    """
+
+    name: str
+    family: Family
+    description: str
+    source: str
+    config: Callable[..., Any]
+    build: Callable[[Any, Prior | None, Task], Finetuner]
+    prior: Algorithm = "sac"
+    needs_prior: bool = True

@@ -9,9 +9,11 @@ import jax.numpy as jnp
 
 import envs
 from envs.mujoco.worlds import Impl
-from experiments import common
+from envs.pools import training_worlds
 from experiments.algorithms import make_player, network_of
 from experiments.evaluation import play_episodes, prior_policy
+from experiments.options import prior_folders
+from sgft_jax.io.priors import load_priors
 from sgft_jax.models.networks import Precision, make_value
 from sgft_jax.models.value import predict
 from sgft_jax.types import Array, Prior, Transition, UserError
@@ -27,11 +29,11 @@ def errors(task: str, impl: Impl, prior: Path, precisions: Sequence[Precision]) 
     V_sim as a network of its own.
     """
     env = envs.make(task, impl)
-    priors, card = common.find_priors(prior, out=prior, env=env, preset="")
+    priors, card = load_priors(prior_folders(prior, out=prior, task=env.name, preset=""), env)
     if not isinstance(priors[0], Prior):
         raise UserError(f"{prior}: a prior of {card['algorithm']}; precisions are compared for those of SAC")
     player, network = make_player(card, env), make_value(env.obs_dim, network_of(card))
-    pool = common.training_worlds(env, None, jax.random.key(0), EPISODES)
+    pool = training_worlds(env, None, jax.random.key(0), EPISODES)
     keys = jax.random.split(jax.random.key(1), EPISODES)
 
     def play(prior: Prior) -> tuple[Transition, Array]:

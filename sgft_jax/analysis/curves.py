@@ -18,22 +18,14 @@ from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean
 from sgft_jax.io.jsonfile import read_json
 from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
 from sgft_jax.io.runs import CONFIG, PROVENANCE
-from sgft_jax.methods import METHODS
+from sgft_jax.methods import NAMES, get_method
 from sgft_jax.types import UserError
 
 LEVEL = 0.9  # success that counts as solved
-ORDER = tuple(reversed(METHODS))  # of methods in tables and legends
 SCORES = ("success", "return")
 IDENTITY = ("task", "gap", "method", "variant", "priors")
 COLUMNS = (*IDENTITY, "prior", "seed", "rollouts", "transitions", "minutes", *SCORES)
 _PER_RUN = ("out", "resume", "overwrite", "video", "devices", "checkpoint_every", "task", "method", "variant", "real")
-_FAMILIES = {
-    "sgft": ("sgft", "sgft-sac", "sgft-relabel", "pbrs", "pbrs-branch"),
-    "planning": ("sgft-mpc", "sgft-tdmpc2", "sgft-tdmpc2-code", "tdmpc2"),
-    "model-based": ("mbpo",),
-    "sac": ("sac", "sac-reset", "sac-online", "frozen-critic", "rlpd"),
-    "offline": ("iql",),
-}
 
 
 @dataclass(frozen=True)
@@ -74,7 +66,7 @@ class Curve:
     @property
     def family(self) -> str:
         """The kind of method; "own" for one that does not come with the library."""
-        return next((family for family, methods in _FAMILIES.items() if self.method in methods), "own")
+        return get_method(self.method).family if self.method in NAMES else "own"
 
     def of(self, score: str) -> "Curve":
         """The same curve for another score."""
@@ -109,8 +101,8 @@ def area(curve: Curve, grid: Sequence[int] | np.ndarray) -> np.ndarray | None:
     grid: rollouts, increasing, the same for all curves that are compared; None unless the curve was evaluated at two or
     more of them and at all of them. High where learning is early and lasts.
     """
-    points = [at(curve, int(n)) for n in grid]
-    if len(points) < 2 or any(point is None for point in points):
+    points = [point for n in grid if (point := at(curve, int(n))) is not None]
+    if len(points) < max(len(grid), 2):
         return None
     return np.trapezoid(np.stack(points, 1), np.asarray(grid, np.float64)) / (grid[-1] - grid[0])
 
@@ -176,7 +168,7 @@ def _point(curve: Curve, i: int) -> dict[str, Any]:
 
 
 def by_priors(curves: Iterable[Curve]) -> dict[str, list[Curve]]:
-    """Curves by their set of priors, the set with the most methods first, in the order of `ORDER`."""
+    """Curves by their set of priors, the set with the most methods first, in the order of `methods.NAMES`."""
     sets: dict[str, list[Curve]] = defaultdict(list)
     for curve in sorted(curves, key=_rank):
         sets[curve.priors].append(curve)
@@ -197,12 +189,11 @@ def from_main_priors(curves: Iterable[Curve]) -> list[Curve]:
 
 
 def _kind(curve: Curve) -> str:
-    method = METHODS.get(curve.method)
-    return "sac" if method is None else method.prior
+    return get_method(curve.method).prior if curve.method in NAMES else "sac"
 
 
 def _rank(curve: Curve) -> tuple[bool, int, str]:
-    place = ORDER.index(curve.method) if curve.method in ORDER else len(ORDER)
+    place = NAMES.index(curve.method) if curve.method in NAMES else len(NAMES)
     return (curve.variant != "", place, curve.name)
 
 
@@ -215,6 +206,7 @@ def read_curve(folder: Path) -> Curve:
     if not records:
         raise UserError(f"{folder / EVAL}: holds no evaluation yet")
     stored = read_json(folder / CONFIG) if (folder / CONFIG).exists() else {}
+    summary = read_json(folder / SUMMARY) if (folder / SUMMARY).exists() else {}
     config, start = stored.get("config", {}), _last_start(folder)
     column = lambda name: np.array([record[name] for record in records])  # noqa: E731
     scores = {name: column(name).T for name in SCORES if name in records[0]}
@@ -232,8 +224,8 @@ def read_curve(folder: Path) -> Curve:
         transitions=column("step"),
         minutes=column("robot_minutes"),
         scores=scores,
-        score=next(iter(scores)),
-        facts=_facts(folder, config, start),
+        score=summary.get("score", next(iter(scores))),
+        facts=_facts(summary, config, start),
     )
 
 
@@ -269,8 +261,7 @@ def _last_start(folder: Path) -> dict[str, Any]:
     return starts[-1] if starts else {}
 
 
-def _facts(folder: Path, config: Mapping[str, Any], start: Mapping[str, Any]) -> dict[str, Any]:
-    summary = read_json(folder / SUMMARY) if (folder / SUMMARY).exists() else {}
+def _facts(summary: Mapping[str, Any], config: Mapping[str, Any], start: Mapping[str, Any]) -> dict[str, Any]:
     return {
         **origin(start),
         "gap_definition": json.dumps(summary.get("gap", {})),

@@ -30,7 +30,7 @@ def learning_curves(path: Path, panels: Mapping[str, Sequence[Curve]], *, title:
 
     Raises no panel above `MOST` curves: one with more becomes several, each with the others in grey behind its own.
     """
-    parts = [part for words, curves in panels.items() for part in _split(words, curves)]
+    parts = [part for words, curves in panels.items() if curves for part in _split(words, curves)]
     columns = min(len(parts), 2)
     figure, grid = _figure(
         5.6 * columns, 3.1 * math.ceil(len(parts) / columns) + 0.4, columns=columns, count=len(parts)

@@ -10,6 +10,7 @@ tuning.csv          a row for each trial of tuning; trials.csv: the curves of th
 import csv
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +36,15 @@ def export(out: Path, to: Path) -> list[Path]:
     if not (found or trials or pretrained):
         raise UserError(f"{out}: holds no run; --out names the parent of finetune/ and pretrain/")
     to.mkdir(parents=True, exist_ok=True)
-    tasks = sorted({curve.task for curve in found})
-    tables = {f"curves-{task}": (curves.rows([c for c in found if c.task == task]), IDENTITY) for task in tasks}
-    tables["runs"] = (map(_run, found), IDENTITY)
-    tables["trials"] = (curves.rows(trials), IDENTITY)
-    tables["tuning"] = ((row for path in sorted((out / "tuned").glob("*/*.json")) for row in _tuning(path)), _OF_TUNING)
-    tables["pretraining"] = ((row for folder in pretrained for row in _pretraining(folder)), _OF_PRIORS)
-    tables["priors"] = ((row for folder in pretrained for row in _priors(folder)), _OF_PRIORS)
+    tables: dict[str, tuple[Iterable[Mapping[str, Any]], tuple[str, ...]]] = {
+        "runs": (map(_run, found), IDENTITY),
+        "trials": (curves.rows(trials), IDENTITY),
+        "tuning": (chain.from_iterable(map(_tuning, sorted((out / "tuned").glob("*/*.json")))), _OF_TUNING),
+        "pretraining": (chain.from_iterable(map(_pretraining, pretrained)), _OF_PRIORS),
+        "priors": (chain.from_iterable(map(_priors, pretrained)), _OF_PRIORS),
+    }
+    for task in sorted({curve.task for curve in found}):
+        tables[f"curves-{task}"] = (curves.rows([curve for curve in found if curve.task == task]), IDENTITY)
     written = [_merge(to / f"{name}.csv", list(new), key) for name, (new, key) in tables.items()]
     return [path for path in written if path is not None]
 

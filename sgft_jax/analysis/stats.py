@@ -87,7 +87,8 @@ def probability_of_improvement(above: ArrayLike, below: ArrayLike) -> float:
     above, below: [members] of either, not necessarily equally many. Source: Agarwal et al. 2021 (Mann-Whitney U).
     """
     above, below = np.asarray(above, np.float64), np.asarray(below, np.float64)
-    return float(stats.mannwhitneyu(above, below, method="asymptotic").statistic / (len(above) * len(below)))
+    statistic, _ = stats.mannwhitneyu(above, below, method="asymptotic")
+    return float(statistic) / (len(above) * len(below))
 
 
 def success_interval(

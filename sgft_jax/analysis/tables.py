@@ -102,6 +102,16 @@ def number(band: Interval, score: str = "success") -> str:
     return estimate if math.isnan(band.low) or low == high else f"{estimate} [{low}, {high}]"
 
 
+def plain(value: float, score: str) -> str:
+    """A score without interval, as `number` writes it."""
+    return number(Interval(*(np.asarray(x) for x in (value, np.nan, np.nan))), score)
+
+
+def words(score: str) -> str:
+    """What the numbers are, for people."""
+    return "success in per cent" if score == "success" else score
+
+
 def middle(curve: Curve, scores: np.ndarray | None) -> str:
     """The interquartile mean over members of these scores [members] with its interval."""
     return NONE if scores is None else number(spread(curve, scores), curve.score)
@@ -116,14 +126,13 @@ def outcome(curves: Sequence[Curve]) -> str:
 
 def _row(curve: Curve, grid: np.ndarray) -> list[str]:
     held = transitions_until_held(curve) if curve.score == "success" else None
-    fall = np.asarray(deepest_fall(curve))
     return [
         curve.name,
         str(len(curve.seeds)),
         middle(curve, curve.values[:, 0]),
         middle(curve, area(curve, grid)),
         f"{middle(curve, curve.values[:, -1])} ({curve.rollouts[-1]})",
-        number(Interval(fall, np.asarray(np.nan), np.asarray(np.nan)), curve.score),
+        plain(deepest_fall(curve), curve.score),
         f"> {curve.transitions[-1]:,}" if held is None else f"{held:,}",
     ]
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from sgft_jax.mesh import running_count, set_rows
-from sgft_jax.types import Array, Key, Transition, UserError
+from sgft_jax.types import Array, Batch, Key, Transition, UserError
 
 
 class ReplayState(NamedTuple):
@@ -20,7 +20,7 @@ class ReplayState(NamedTuple):
 def blank(obs_dim: int, act_dim: int) -> Transition:
     """A transition of zeros with the dtypes that are stored: the example that `init` needs."""
     obs, zero = jnp.zeros(obs_dim), jnp.float32(0)
-    return Transition(obs, jnp.zeros(act_dim), zero, zero, obs, jnp.bool_(False), jnp.int32(0))
+    return Transition(obs, jnp.zeros(act_dim), zero, zero, obs)
 
 
 def init(example: Transition, capacity: int) -> ReplayState:
@@ -46,7 +46,12 @@ def add_batch(state: ReplayState, batch: Transition, valid: Array | None = None)
     return ReplayState(data, (state.position + count[-1]) % capacity, jnp.minimum(state.size + count[-1], capacity))
 
 
-def sample(state: ReplayState, key: Key, n: int) -> Transition:
+def add_episode(state: ReplayState, rows: Transition, valid: Array) -> ReplayState:
+    """Append the valid rows [T] of one episode, as `sequences.add_episode` does."""
+    return add_batch(state, rows, valid)
+
+
+def sample(state: ReplayState, key: Key, n: int) -> Batch:
     """Draw n rows uniformly with replacement from what is held; zeros while the buffer is empty."""
     rows = jax.random.randint(key, (n,), 0, jnp.maximum(state.size, 1))
-    return jax.tree.map(lambda d: d[rows], state.data)
+    return Batch(*jax.tree.map(lambda d: d[rows], state.data))

@@ -4,26 +4,12 @@ A slot holds one step of every environment, also of those whose physics exploded
 found one slot further. Pure functions of a state that the caller donates; one buffer, vmapped over seeds.
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from flax import struct
 
 from sgft_jax.mesh import running_count, set_rows
-from sgft_jax.types import Array, Key, Transition, UserError
-
-
-class Sequences(NamedTuple):
-    """Windows of consecutive transitions of one episode.
-
-    rows: [B, H, ...]; `next_obs` of step t is `obs` of step t + 1 where both are valid.
-    valid: [B, H] bool, True for the leading steps that belong to the window and False from the first on that does not.
-        Invalid rows must be finite; `sample` makes them zeros.
-    """
-
-    rows: Transition
-    valid: Array
+from sgft_jax.types import Array, Batch, Key, Transition, UserError
 
 
 class SequenceState(struct.PyTreeNode):
@@ -85,6 +71,13 @@ def add_episode(state: SequenceState, rows: Transition, valid: Array) -> Sequenc
     return _write(state, index, rows, valid, last, count[-1])
 
 
+def end_episodes(state: SequenceState) -> SequenceState:
+    """The same ring, where no episode goes on after the newest slot."""
+    newest = (state.position - 1) % state.slots
+    slot = jnp.arange(state.last.shape[0]) // state.n_envs
+    return state.replace(last=state.last | (slot == newest))
+
+
 def _write(
     state: SequenceState, index: Array, rows: Transition, valid: Array, last: Array, steps: Array
 ) -> SequenceState:
@@ -93,8 +86,10 @@ def _write(
     return state.replace(data=data, valid=valid, last=last, position=position, size=size)
 
 
-def sample(state: SequenceState, key: Key, n: int, length: int) -> Sequences:
-    """Draw n windows of up to `length` steps, each starting at a valid row drawn uniformly with replacement.
+def sample(state: SequenceState, key: Key, n: int, length: int) -> Batch:
+    """Draw n windows [n, length, ...], each starting at a valid row drawn uniformly with replacement.
+
+    `valid` [n, length] is True for the leading steps that belong to the window; the rows of the others are zeros.
 
     A window is cut, by its mask, before an invalid row, after the last row of an episode and at the newest slot. Were
     windows redrawn until they fit, the last rows of an episode, where it is won or lost, would come up less often and
@@ -109,7 +104,7 @@ def sample(state: SequenceState, key: Key, n: int, length: int) -> Sequences:
     return jax.vmap(lambda row: _window(state, row, length))(start)
 
 
-def _window(state: SequenceState, start: Array, length: int) -> Sequences:
+def _window(state: SequenceState, start: Array, length: int) -> Batch:
     """The window [length, ...] that begins at row `start` []."""
     slot, env = start // state.n_envs, start % state.n_envs
     age, steps = (slot - state.position + state.size) % state.slots, jnp.arange(length)  # age: slots after the oldest
@@ -117,4 +112,4 @@ def _window(state: SequenceState, start: Array, length: int) -> Sequences:
     follows = jnp.concatenate([jnp.ones(1, bool), ~state.last[index][:-1]])
     valid = jnp.cumprod((age + steps < state.size) & state.valid[index] & follows).astype(bool)
     blank = lambda x: jnp.where(jnp.expand_dims(valid, tuple(range(1, x.ndim))), x, jnp.zeros_like(x))  # noqa: E731
-    return Sequences(jax.tree.map(lambda d: blank(d[index]), state.data), valid)
+    return Batch(*jax.tree.map(lambda d: blank(d[index]), state.data), valid=valid)

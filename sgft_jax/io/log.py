@@ -1,9 +1,10 @@
 """Impure: what a run writes while it works: metrics, evaluations, real rollouts, progress on the terminal."""
 
+import contextlib
 import json
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -291,3 +292,23 @@ def _duration(seconds: float) -> str:
     minutes, second = divmod(round(seconds), 60)
     hours, minute = divmod(minutes, 60)
     return f"{hours}:{minute:02d}:{second:02d}"
+
+
+class Clock:
+    """Wall-clock seconds per phase; what a checkpoint remembers of an earlier start counts too."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextlib.contextmanager
+    def __call__(self, phase: str) -> Iterator[None]:
+        """Count the time inside the `with` block, which must wait for its own results."""
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[phase] = self.seconds.get(phase, 0.0) + time.perf_counter() - begun
+
+    def record(self) -> dict[str, float]:
+        """{"time/<phase>_s": seconds}."""
+        return {f"time/{phase}_s": round(seconds, 3) for phase, seconds in self.seconds.items()}

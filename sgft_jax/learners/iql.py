@@ -26,7 +26,7 @@ from sgft_jax.models.networks import (
     make_critic,
     make_value,
 )
-from sgft_jax.types import Array, Key, Learner, Metrics, Normalizer, PyTree, Transition
+from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree
 
 ACTION_MAX = 1 - 1e-5  # a mean that ends in tanh never reaches 1: it would chase such an action forever
 
@@ -101,16 +101,25 @@ def make_gaussian_actor(obs_dim: int, act_dim: int, config: NetworkConfig) -> Ne
     return Network(init, apply)
 
 
+def as_tanh_gaussian(params: PyTree) -> PyTree:
+    """Parameters of an actor of `make_actor` with the same mean action and, before the tanh, the same spread."""
+    mean, log_std = params["mean"], params["log_std"]
+    last = max(mean, key=lambda name: (name.startswith("Dense"), name))
+    kernel, bias = mean[last]["kernel"], mean[last]["bias"]
+    wide = jnp.concatenate([kernel, jnp.zeros_like(kernel)], axis=1)
+    return {**mean, last: {"kernel": wide, "bias": jnp.concatenate([bias, log_std])}}
+
+
 def gaussian_log_prob(moments: Array, action: Array) -> Array:
     """Log density [] of a diagonal Gaussian. moments: [2, act_dim] mean and log-std; action: [act_dim]."""
     mean, log_std = moments
     return jnp.sum(-0.5 * ((action - mean) * jnp.exp(-log_std)) ** 2 - log_std - 0.5 * jnp.log(2 * jnp.pi))
 
 
-def gaussian_action(moments: Array, key: Key, *, explore: bool) -> Array:
+def gaussian_action(moments: Array, key: Key, *, explore: bool | Array) -> Array:
     """[act_dim] in [-1, 1]: a draw, clipped, to explore, else the mean. moments: [2, act_dim] mean and log-std."""
     mean, log_std = moments
-    return add_noise(mean, jnp.exp(log_std), key) if explore else mean
+    return jnp.where(explore, add_noise(mean, jnp.exp(log_std), key), mean)
 
 
 # --- losses of one transition -----------------------------------------------------------------------------------------
@@ -196,11 +205,14 @@ def make_iql(config: IQLConfig, hyper: IQLHyper | None = None) -> Learner:
             step=jnp.int32(0),
         )
 
-    def act(state: IQLState, carry: tuple[()], obs: Array, key: Key, *, explore: bool) -> tuple[Array, tuple[()]]:
+    def act(
+        state: IQLState, carry: tuple[()], obs: Array, key: Key, *, explore: bool | Array, context: Array | None = None
+    ) -> tuple[Array, tuple[()]]:
+        del context  # it reads the observation alone
         moments = parts.actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
         return gaussian_action(moments, key, explore=explore), carry
 
-    def update(state: IQLState, batch: Transition, key: Key) -> tuple[IQLState, Metrics]:
+    def update(state: IQLState, batch: Batch, key: Key) -> tuple[IQLState, Metrics]:
         return _update(parts, state, batch)  # draws nothing: the key is there because other learners need one
 
     return Learner(init, lambda: (), act, update)
@@ -209,13 +221,13 @@ def make_iql(config: IQLConfig, hyper: IQLHyper | None = None) -> Learner:
 # --- one update -------------------------------------------------------------------------------------------------------
 
 
-def _update(parts: _Parts, state: IQLState, batch: Transition) -> tuple[IQLState, Metrics]:
+def _update(parts: _Parts, state: IQLState, batch: Batch) -> tuple[IQLState, Metrics]:
     """Value, then actor and critic, which both use the new value, then the target critic."""
     normal = jax.vmap(normalizer.normalize, (None, 0))
     batch = batch._replace(obs=normal(state.normalizer, batch.obs), next_obs=normal(state.normalizer, batch.next_obs))
     q = jnp.min(jax.vmap(parts.critic.apply, (None, 0, 0))(state.target_critic, batch.obs, batch.action), axis=1)
 
-    state, metrics = _update_value(parts, state, batch.obs, q)
+    state, metrics = _update_value(parts, state, batch, q)
     state, more = _update_actor(parts, state, batch, q)
     metrics |= more
     state, more = _update_critic(parts, state, batch)
@@ -224,18 +236,18 @@ def _update(parts: _Parts, state: IQLState, batch: Transition) -> tuple[IQLState
     return state.replace(target_critic=target, step=state.step + 1), metrics
 
 
-def _update_value(parts: _Parts, state: IQLState, obs: Array, q: Array) -> tuple[IQLState, Metrics]:
+def _update_value(parts: _Parts, state: IQLState, batch: Batch, q: Array) -> tuple[IQLState, Metrics]:
     def loss(params: PyTree) -> tuple[Array, Array]:
-        values = jax.vmap(parts.value.apply, (None, 0))(params, obs)
+        values = jax.vmap(parts.value.apply, (None, 0))(params, batch.obs)
         each = jax.vmap(lambda v, q: expectile_loss(v, q, expectile=state.hyper.expectile))(values, q)
-        return jnp.mean(each), values
+        return losses.row_mean(each, batch), values
 
     (mean, values), grads = jax.value_and_grad(loss, has_aux=True)(state.value.params)
     fit = optim.step(parts.optimiser, state.value, grads, state.hyper.lr_value)
     return state.replace(value=fit), {"value/loss": mean, "value/mean": jnp.mean(values)}
 
 
-def _update_actor(parts: _Parts, state: IQLState, batch: Transition, q: Array) -> tuple[IQLState, Metrics]:
+def _update_actor(parts: _Parts, state: IQLState, batch: Batch, q: Array) -> tuple[IQLState, Metrics]:
     """q: [B] of the target critic, as the value saw them."""
     hyper = state.hyper
     values = jax.vmap(parts.value.apply, (None, 0))(state.value.params, batch.obs)
@@ -244,7 +256,7 @@ def _update_actor(parts: _Parts, state: IQLState, batch: Transition, q: Array) -
 
     def loss(params: PyTree) -> Array:
         moments = jax.vmap(parts.actor.apply, (None, 0))(params, batch.obs)
-        return jnp.mean(jax.vmap(policy_loss)(moments, batch.action, weights))
+        return losses.row_mean(jax.vmap(policy_loss)(moments, batch.action, weights), batch)
 
     mean, grads = jax.value_and_grad(loss)(state.actor.params)
     fit = optim.step(parts.optimiser, state.actor, grads, actor_rate(hyper, state.step))
@@ -259,14 +271,14 @@ def _update_actor(parts: _Parts, state: IQLState, batch: Transition, q: Array) -
     return state.replace(actor=fit._replace(params={**fit.params, "log_std": log_std})), metrics
 
 
-def _update_critic(parts: _Parts, state: IQLState, batch: Transition) -> tuple[IQLState, Metrics]:
+def _update_critic(parts: _Parts, state: IQLState, batch: Batch) -> tuple[IQLState, Metrics]:
     next_values = jax.vmap(parts.value.apply, (None, 0))(state.value.params, batch.next_obs)
     target = jax.vmap(lambda r, d, v: td_target(r, d, v, reward_scale=state.hyper.reward_scale))
     targets = target(batch.reward, batch.discount, next_values)
 
     def loss(params: PyTree) -> tuple[Array, Array]:
         q = jax.vmap(parts.critic.apply, (None, 0, 0))(params, batch.obs, batch.action)
-        return jnp.mean(jax.vmap(losses.critic_loss)(q, targets)), q
+        return losses.row_mean(jax.vmap(losses.critic_loss)(q, targets), batch), q
 
     (mean, q), grads = jax.value_and_grad(loss, has_aux=True)(state.critic.params)
     fit = optim.step(parts.optimiser, state.critic, grads, state.hyper.lr_critic)

@@ -4,7 +4,17 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.types import Array
+from sgft_jax.types import Array, Batch
+
+
+def row_mean(each: Array, batch: Batch) -> Array:
+    """Mean [] of one loss per row, each [B], over the valid rows of a batch, weighted where it has weights."""
+    if batch.valid is None and batch.weight is None:
+        return jnp.mean(each)
+    ones = jnp.ones_like(each)
+    valid = ones if batch.valid is None else batch.valid.astype(each.dtype)
+    weight = ones if batch.weight is None else batch.weight
+    return jnp.sum(jnp.where(valid > 0, each, 0.0) * weight) / jnp.maximum(jnp.sum(valid), 1.0)
 
 
 def td_target(reward: Array, discount: Array, next_q: Array, next_log_prob: Array, *, alpha: Array | float) -> Array:

@@ -33,8 +33,8 @@ def step(optimiser: optax.GradientTransformation, fit: Fit, grads: PyTree, rate:
     return Fit(jax.tree.map(lambda p, u: p - rate * u, fit.params, updates), moments)
 
 
-def risen(step: Array, warmup: Array | float) -> Array:
-    """What share [] of a learning rate the update after `step` [] others has, if rates rise linearly over `warmup`.
+def warmup_factor(step: Array, warmup: Array | float) -> Array:
+    """Factor [] on the learning rate of the update after `step` [] others; it rises linearly to 1 over `warmup`.
 
     Adam's first steps are as long as its rate in every weight, however small the gradient, because its moments know
     nothing else yet. In a network that comes from a prior they undo more than a few rows of new data can teach.

@@ -28,7 +28,7 @@ from sgft_jax.models.networks import (
     tanh_gaussian_action,
     tanh_gaussian_sample,
 )
-from sgft_jax.types import Array, Key, Learner, Metrics, Normalizer, Prior, PyTree, Transition, UserError
+from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree, UserError
 
 LOG_ALPHA_MIN = -10.0  # dense negative rewards would drive an auto-tuned temperature to zero
 
@@ -38,7 +38,7 @@ class SACConfig:
     """The structure of an agent.
 
     obs_dim, act_dim: sizes of what the environment gives and takes.
-    extra_obs: entries appended to the observation (steps-to-go one-hots), not normalised.
+    context_dim: length of `Batch.context`, which actor and critic read beside the observation.
     network: body of all networks; critic_network: body of the critic alone, default the same.
     tune_alpha: follow the target entropy; False keeps the temperature at `SACHyper.alpha`.
     train_value, train_dynamics, ensemble_size: the extra networks of pretraining.
@@ -47,13 +47,13 @@ class SACConfig:
         None = all (REDQ, RLPD). actor_mean: the actor follows the members' mean, not their minimum (RLPD).
     entropy_in_target: count the entropy of the next action in the target, as SAC does.
     critic_baseline: Q(s, a) = net(s, a) - V(s) with V frozen: what a kept critic means under shaped rewards.
-    actor_batch: leading rows of the batch that the actor learns from, None = all (O-11).
+    actor_batch: leading rows of the batch that the actor learns from, None = all.
     policy_delay: critic updates per update of actor and temperature. max_grad_norm: per network, None = no clipping.
     """
 
     obs_dim: int
     act_dim: int
-    extra_obs: int = 0
+    context_dim: int = 0
     network: NetworkConfig = field(default_factory=NetworkConfig)
     critic_network: NetworkConfig | None = None
     tune_alpha: bool = True
@@ -103,6 +103,21 @@ class SACHyper(NamedTuple):
     lr_warmup: float | Array = 0.0
 
 
+class SACParams(NamedTuple):
+    """What SAC leaves for fine-tuning: parameters alone.
+
+    actor, critic, value: networks; the critic has a leading axis of its two members.
+    dynamics: the delta-dynamics ensemble, leading axis = member.
+    normalizer: statistics of the random-action data; every network above reads normalised observations.
+    """
+
+    actor: PyTree
+    critic: PyTree
+    value: PyTree
+    dynamics: PyTree
+    normalizer: Normalizer
+
+
 class SACState(struct.PyTreeNode):
     """An agent in training; `value` and `dynamics` are an `optim.Fit`, or None where the configuration has no use."""
 
@@ -128,12 +143,12 @@ class _Parts(NamedTuple):
 
 
 def _parts(config: SACConfig) -> _Parts:
-    obs_dim, act_dim, body = config.obs_dim + config.extra_obs, config.act_dim, config.network
+    inputs, act_dim, body = config.obs_dim + config.context_dim, config.act_dim, config.network
     return _Parts(
-        actor=make_actor(obs_dim, act_dim, body),
-        critic=make_critic(obs_dim, act_dim, config.critic_network or body, members=config.critics),
-        value=make_value(obs_dim, body),
-        dynamics=make_dynamics(obs_dim, act_dim, body, members=config.ensemble_size),
+        actor=make_actor(inputs, act_dim, body),
+        critic=make_critic(inputs, act_dim, config.critic_network or body, members=config.critics),
+        value=make_value(config.obs_dim, body),
+        dynamics=make_dynamics(config.obs_dim, act_dim, body, members=config.ensemble_size),
         optimiser=optim.adam(config.max_grad_norm),
     )
 
@@ -149,14 +164,28 @@ def make_sac(config: SACConfig, hyper: SACHyper | None = None) -> Learner:
         model = parts.dynamics.init(keys[3]) if config.train_dynamics else None
         return _assemble(config, parts, hyper, parts.actor.init(keys[0]), parts.critic.init(keys[1]), value, model)
 
-    def act(state: SACState, carry: tuple[()], obs: Array, key: Key, *, explore: bool) -> tuple[Array, tuple[()]]:
-        moments = parts.actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
+    def act(
+        state: SACState,
+        carry: tuple[()],
+        obs: Array,
+        key: Key,
+        *,
+        explore: bool | Array,
+        context: Array | None = None,
+    ) -> tuple[Array, tuple[()]]:
+        moments = parts.actor.apply(state.actor.params, network_input(state.normalizer, obs, context))
         return tanh_gaussian_action(moments, key, explore=explore), carry
 
-    def update(state: SACState, batch: Transition, key: Key) -> tuple[SACState, Metrics]:
+    def update(state: SACState, batch: Batch, key: Key) -> tuple[SACState, Metrics]:
         return _update(config, parts, state, batch, key)
 
     return Learner(init, lambda: (), act, update)
+
+
+def network_input(statistics: Normalizer, obs: Array, context: Array | None) -> Array:
+    """What actor and critic read [obs_dim + context_dim]: the normalised observation, then the context as it is."""
+    obs = normalizer.normalize(statistics, obs)
+    return obs if context is None else jnp.concatenate([obs, context])
 
 
 def _assemble(
@@ -168,7 +197,7 @@ def _assemble(
     value: PyTree | None,
     model: PyTree | None,
 ) -> SACState:
-    """Fresh moments around given parameters (O-9)."""
+    """Fresh optimiser moments around given parameters."""
     hyper = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hyper)
     fit = lambda params: None if params is None else optim.start(parts.optimiser, params)  # noqa: E731
     return SACState(
@@ -178,7 +207,7 @@ def _assemble(
         log_alpha=optim.start(parts.optimiser, jnp.maximum(jnp.log(hyper.alpha), LOG_ALPHA_MIN)),
         value=fit(value),
         dynamics=fit(model),
-        normalizer=normalizer.identity(config.obs_dim + config.extra_obs),
+        normalizer=normalizer.identity(config.obs_dim),
         hyper=hyper,
         step=jnp.int32(0),
     )
@@ -187,23 +216,25 @@ def _assemble(
 # --- one update ---------------------------------------------------------------------------------------------------
 
 
-def _update(config: SACConfig, parts: _Parts, state: SACState, batch: Transition, key: Key) -> tuple[SACState, Metrics]:
+def _update(config: SACConfig, parts: _Parts, state: SACState, batch: Batch, key: Key) -> tuple[SACState, Metrics]:
     """Critic, target, actor, temperature, then value (on the actor's own draws) and dynamics."""
     key_target, key_actor, key_dynamics = jax.random.split(key, 3)
-    raw = batch
-    normal = jax.vmap(normalizer.normalize, (None, 0))
-    batch = batch._replace(obs=normal(state.normalizer, batch.obs), next_obs=normal(state.normalizer, batch.next_obs))
+    raw, read = batch, jax.vmap(network_input, (None, 0, 0))
+    batch = batch._replace(
+        obs=read(state.normalizer, batch.obs, batch.context),
+        next_obs=read(state.normalizer, batch.next_obs, batch.next_context),
+    )
 
     metrics: Metrics = {}
     if config.train_critic:
         state, metrics = _update_critic(config, parts, state, batch, key_target)
-    obs = batch.obs[: config.actor_batch]
-    state, q, log_prob, more = _update_actor(config, parts, state, obs, key_actor)
+    rows = jax.tree.map(lambda x: x[: config.actor_batch], batch)
+    state, q, log_prob, more = _update_actor(config, parts, state, rows, key_actor)
     metrics |= more
     if config.tune_alpha:
-        state = _update_temperature(config, parts, state, log_prob)
+        state = _update_temperature(config, parts, state, rows, log_prob)
     if config.train_value:
-        state, more = _update_value(parts, state, obs, q)
+        state, more = _update_value(config, parts, state, rows, q)
         metrics |= more
     if config.train_dynamics:
         fit, more = dynamics.update(
@@ -222,19 +253,20 @@ def _critic_of(config: SACConfig, parts: _Parts, state: SACState) -> Callable[[P
 
     def relative(params: PyTree, obs: Array, action: Array) -> Array:
         with precision("float32"):  # as in value.predict: the difference of two large numbers
-            return parts.critic.apply(params, obs, action) - parts.value.apply(state.value.params, obs)
+            return parts.critic.apply(params, obs, action) - parts.value.apply(
+                state.value.params, obs[: config.obs_dim]
+            )
 
     return relative
 
 
 def _update_critic(
-    config: SACConfig, parts: _Parts, state: SACState, batch: Transition, key: Key
+    config: SACConfig, parts: _Parts, state: SACState, batch: Batch, key: Key
 ) -> tuple[SACState, Metrics]:
     critic, alpha = _critic_of(config, parts, state), jnp.exp(state.log_alpha.params)
-
     counted = _target_members(config, key)
 
-    def target(row: Transition, key: Key) -> Array:
+    def target(row: Batch, key: Key) -> Array:
         action, log_prob = tanh_gaussian_sample(parts.actor.apply(state.actor.params, row.next_obs), key)
         next_q = critic(state.target_critic, row.next_obs, action)[counted]
         log_prob = log_prob if config.entropy_in_target else jnp.zeros_like(log_prob)
@@ -244,10 +276,10 @@ def _update_critic(
 
     def loss(params: PyTree) -> tuple[Array, Array]:
         q = jax.vmap(critic, (None, 0, 0))(params, batch.obs, batch.action)
-        return jnp.mean(jax.vmap(losses.critic_loss)(q, targets)), q
+        return losses.row_mean(jax.vmap(losses.critic_loss)(q, targets), batch), q
 
     (value, q), grads = jax.value_and_grad(loss, has_aux=True)(state.critic.params)
-    rate = state.hyper.lr_critic * optim.risen(state.step, state.hyper.lr_warmup)
+    rate = state.hyper.lr_critic * optim.warmup_factor(state.step, state.hyper.lr_warmup)
     fit = optim.step(parts.optimiser, state.critic, grads, rate)
     average = optax.incremental_update(fit.params, state.target_critic, state.hyper.tau)
     metrics = {"critic/loss": value, "critic/q_mean": jnp.mean(q), "critic/target_mean": jnp.mean(targets)}
@@ -262,11 +294,11 @@ def _target_members(config: SACConfig, key: Key) -> Array | slice:
 
 
 def _update_actor(
-    config: SACConfig, parts: _Parts, state: SACState, obs: Array, key: Key
+    config: SACConfig, parts: _Parts, state: SACState, rows: Batch, key: Key
 ) -> tuple[SACState, Array, Array, Metrics]:
     """Also returns the q [B, members] and log-probabilities [B] of the actions drawn, for value and temperature."""
     critic, alpha = _critic_of(config, parts, state), jnp.exp(state.log_alpha.params)
-    keys = jax.random.split(key, obs.shape[0])
+    keys = jax.random.split(key, rows.reward.shape[0])
 
     def one(params: PyTree, obs: Array, key: Key) -> tuple[Array, Array, Array]:
         action, log_prob = tanh_gaussian_sample(parts.actor.apply(params, obs), key)
@@ -275,22 +307,23 @@ def _update_actor(
         return losses.actor_loss(log_prob, followed, alpha=alpha), q, log_prob
 
     def loss(params: PyTree) -> tuple[Array, tuple[Array, Array]]:
-        each, q, log_prob = jax.vmap(one, (None, 0, 0))(params, obs, keys)
-        return jnp.mean(each), (q, log_prob)
+        each, q, log_prob = jax.vmap(one, (None, 0, 0))(params, rows.obs, keys)
+        return losses.row_mean(each, rows), (q, log_prob)
 
     (value, (q, log_prob)), grads = jax.value_and_grad(loss, has_aux=True)(state.actor.params)
     hyper, since = state.hyper, state.step - state.hyper.actor_start
-    rate = hyper.lr_actor * optim.risen(since, hyper.actor_ramp)
+    rate = hyper.lr_actor * optim.warmup_factor(since, hyper.actor_ramp)
     moves = (since >= 0) & _policy_turn(config, state)
     fit = optim.keep_unless(moves, optim.step(parts.optimiser, state.actor, grads, rate), state.actor)
     return state.replace(actor=fit), q, log_prob, {"actor/loss": value, "actor/entropy": -jnp.mean(log_prob)}
 
 
-def _update_temperature(config: SACConfig, parts: _Parts, state: SACState, log_prob: Array) -> SACState:
+def _update_temperature(config: SACConfig, parts: _Parts, state: SACState, rows: Batch, log_prob: Array) -> SACState:
     target = state.hyper.entropy_per_dim * config.act_dim
 
     def loss(log_alpha: Array) -> Array:
-        return jnp.mean(jax.vmap(lambda lp: losses.temperature_loss(log_alpha, lp, target_entropy=target))(log_prob))
+        each = jax.vmap(lambda lp: losses.temperature_loss(log_alpha, lp, target_entropy=target))(log_prob)
+        return losses.row_mean(each, rows)
 
     fit = optim.step(parts.optimiser, state.log_alpha, jax.grad(loss)(state.log_alpha.params), state.hyper.lr_alpha)
     fit = fit._replace(params=jnp.maximum(fit.params, LOG_ALPHA_MIN))
@@ -302,9 +335,12 @@ def _policy_turn(config: SACConfig, state: SACState) -> Array:
     return state.step % config.policy_delay == 0
 
 
-def _update_value(parts: _Parts, state: SACState, obs: Array, q: Array) -> tuple[SACState, Metrics]:
+def _update_value(config: SACConfig, parts: _Parts, state: SACState, rows: Batch, q: Array) -> tuple[SACState, Metrics]:
+    obs = rows.obs[:, : config.obs_dim]
+
     def loss(params: PyTree) -> Array:
-        return jnp.mean(jax.vmap(losses.value_loss)(jax.vmap(parts.value.apply, (None, 0))(params, obs), q))
+        values = jax.vmap(parts.value.apply, (None, 0))(params, obs)
+        return losses.row_mean(jax.vmap(losses.value_loss)(values, q), rows)
 
     value, grads = jax.value_and_grad(loss)(state.value.params)
     fit = optim.step(parts.optimiser, state.value, grads, state.hyper.lr_value)
@@ -314,39 +350,42 @@ def _update_value(parts: _Parts, state: SACState, obs: Array, q: Array) -> tuple
 # --- between simulation and reality -----------------------------------------------------------------------------------
 
 
-def extract_prior(state: SACState) -> Prior:
+def extract_params(state: SACState) -> SACParams:
     """What a pretrained agent hands over. Its configuration must have trained value and dynamics."""
     if state.value is None or state.dynamics is None:
         raise UserError("a prior needs an agent trained with train_value and train_dynamics")
     networks = (state.actor, state.critic, state.value, state.dynamics)
-    return Prior(*(fit.params for fit in networks), normalizer=state.normalizer)
+    return SACParams(*(fit.params for fit in networks), normalizer=state.normalizer)
 
 
-def fine_tune_state(config: SACConfig, hyper: SACHyper, prior: Prior, key: Key, *, reset_critic: bool) -> SACState:
-    """An agent that starts from a prior: its actor, its normaliser (frozen), fresh Adam moments (O-9).
+def state_from_prior(
+    config: SACConfig, hyper: SACHyper, params: SACParams, key: Key, *, reset_critic: bool
+) -> SACState:
+    """An agent that starts from a prior: its actor, its fixed normaliser, fresh optimiser moments.
 
-    reset_critic: draw a new critic from `key`, else keep the simulator's. With `config.extra_obs` the kept networks get
-    zero rows for the new entries, so that the first policy is pi_sim whatever they hold.
+    reset_critic: draw a new critic from `key`, else keep the simulator's. With `config.context_dim` the kept networks
+    get zero rows for the context, so that the first policy is the simulator's whatever the context holds.
     """
-    parts, extra = _parts(config), config.extra_obs
-    check_prior(config, prior, critic=not reset_critic)
-    prior = jax.tree.map(jnp.copy, prior)  # the caller may donate the state; the prior must survive it
+    parts = _parts(config)
+    check_params_of_prior(config, params, critic=not reset_critic)
+    params = jax.tree.map(jnp.copy, params)  # the caller may donate the state; the prior must survive it
 
-    def pad(params: PyTree) -> PyTree:
-        return pad_first_layer(params, config.obs_dim, extra)
+    def pad(network: PyTree) -> PyTree:
+        return pad_first_layer(network, config.obs_dim, config.context_dim)
 
-    critic = parts.critic.init(key) if reset_critic else pad(prior.critic)
-    value = pad(prior.value) if config.train_value or config.critic_baseline else None
-    model = prior.dynamics if config.train_dynamics else None
-    state = _assemble(config, parts, hyper, pad(prior.actor), critic, value, model)
-    return state.replace(normalizer=normalizer.pad(prior.normalizer, extra))
+    critic = parts.critic.init(key) if reset_critic else pad(params.critic)
+    value = params.value if config.train_value or config.critic_baseline else None
+    model = params.dynamics if config.train_dynamics else None
+    state = _assemble(config, parts, hyper, pad(params.actor), critic, value, model)
+    return state.replace(normalizer=params.normalizer)
 
 
-def check_prior(config: SACConfig, prior: Prior, *, critic: bool) -> None:
+def check_params_of_prior(config: SACConfig, params: SACParams, *, critic: bool) -> None:
     """Raise UserError where a network of the prior is not the one that `config` describes."""
     body = {"network": config.network, "critic_network": config.critic_network, "critics": config.critics}
-    plain = SACConfig(config.obs_dim, config.act_dim, **body)
-    parts = _parts(plain)
+    parts = _parts(SACConfig(config.obs_dim, config.act_dim, **body))
     owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, hidden {config.network.hidden}"
     for name in ("actor", "value", *(["critic"] if critic else [])):
-        check_params(name, getattr(parts, name), getattr(prior, name), f"{owner}: use the prior's own task and network")
+        check_params(
+            name, getattr(parts, name), getattr(params, name), f"{owner}: use the prior's own task and network"
+        )

@@ -6,20 +6,18 @@ by `discount`, the planner assumes that an episode goes on for its horizon.
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from sgft_jax.data.sequences import Sequences
 from sgft_jax.learners import optim
 from sgft_jax.learners.tdmpc2_model import (
     NETWORKS,
     Parts,
     TDMPC2Config,
     TDMPC2Hyper,
-    TDMPC2Prior,
+    TDMPC2Params,
     TDMPC2State,
     encode,
     heads_of,
@@ -32,12 +30,12 @@ from sgft_jax.learners.tdmpc2_model import (
 from sgft_jax.models import normalizer, twohot
 from sgft_jax.models.networks import check_params, tanh_gaussian_action
 from sgft_jax.planning import mppi
-from sgft_jax.types import Array, Key, Learner, Metrics, PyTree, Transition, UserError
+from sgft_jax.types import Array, Batch, Key, Learner, Metrics, PyTree, UserError
 
 # --- acting ---------------------------------------------------------------------------------------------------------
 
 
-def policy_action(config: TDMPC2Config, state: TDMPC2State, obs: Array, key: Key, *, explore: bool) -> Array:
+def policy_action(config: TDMPC2Config, state: TDMPC2State, obs: Array, key: Key, *, explore: bool | Array) -> Array:
     """Action [act_dim] of the policy alone, some thousand times cheaper than a plan. obs: [obs_dim] raw."""
     parts = make_parts(config)
     moments = parts.policy.apply(state.policy.params, encode(parts, state, obs))
@@ -75,7 +73,7 @@ def _proposal(parts: Parts, state: TDMPC2State, z: Array, keys: Key) -> Array:
 def _score(config: TDMPC2Config, parts: Parts, state: TDMPC2State, z: Array, key: Key) -> Callable[[Array], Array]:
     """What a plan [H, act_dim] from z promises: sum of gamma^t R, then gamma^H times a value.
 
-    The value is V_sim with sgft (O-14), else the mean of 2 random heads at a drawn action. One draw for all candidates
+    The value is V_sim with sgft, else the mean of 2 random heads at a drawn action. One draw for all candidates
     of a plan, where the original draws for each: they then compare by their actions, not by their luck.
     """
     key_heads, key_action = jax.random.split(key)
@@ -106,16 +104,17 @@ def _score(config: TDMPC2Config, parts: Parts, state: TDMPC2State, z: Array, key
 
 
 def _update(
-    config: TDMPC2Config, parts: Parts, state: TDMPC2State, batch: Sequences, key: Key
+    config: TDMPC2Config, parts: Parts, state: TDMPC2State, batch: Batch, key: Key
 ) -> tuple[TDMPC2State, Metrics]:
     """World model with critic, then the policy on the latents rolled out, then the target critic."""
     key_model, key_policy = jax.random.split(key)
+    valid = jnp.ones(batch.reward.shape, bool) if batch.valid is None else batch.valid
     normal = jax.vmap(jax.vmap(normalizer.normalize, (None, 0)), (None, 0))
-    obs, next_obs = (normal(state.normalizer, x) for x in (batch.rows.obs, batch.rows.next_obs))
-    batch = batch._replace(rows=batch.rows._replace(obs=obs, next_obs=next_obs))
+    obs, next_obs = (normal(state.normalizer, x) for x in (batch.obs, batch.next_obs))
+    batch = batch._replace(obs=obs, next_obs=next_obs)
 
-    state, zs, metrics = _update_model(config, parts, state, batch, key_model)
-    state, more = _update_policy(config, parts, state, zs, batch.valid, key_policy)
+    state, zs, metrics = _update_model(config, parts, state, batch, valid, key_model)
+    state, more = _update_policy(config, parts, state, zs, valid, key_policy)
     if not config.sgft:
         average = optax.incremental_update(state.critic.params, state.target_critic, state.hyper.tau)
         state = state.replace(target_critic=average)
@@ -124,31 +123,31 @@ def _update(
 
 def _rate(state: TDMPC2State) -> Array:
     """The learning rate [] of this update."""
-    return state.hyper.lr * optim.risen(state.step, state.hyper.lr_warmup)
+    return state.hyper.lr * optim.warmup_factor(state.step, state.hyper.lr_warmup)
 
 
 def _update_model(
-    config: TDMPC2Config, parts: Parts, state: TDMPC2State, batch: Sequences, key: Key
+    config: TDMPC2Config, parts: Parts, state: TDMPC2State, batch: Batch, valid: Array, key: Key
 ) -> tuple[TDMPC2State, Array, Metrics]:
     """Also returns the latents [B, H + 1, latent] rolled out by the model as it was."""
     key_heads, key_action, key_dropout = jax.random.split(key, 3)
     judges, hyper = heads_of(state.target_critic, two_heads(config, key_heads)), state.hyper
 
-    def target(row: Transition, key: Key) -> tuple[Array, Array]:
+    def target(row: Batch, key: Key) -> tuple[Array, Array]:
         # The successor's latent is encoded, while losses are taken at rolled-out ones.
         ahead = parts.encoder.apply(state.encoder.params, row.next_obs)
         action = tanh_gaussian_action(parts.policy.apply(state.policy.params, ahead), key, explore=True)
         return ahead, row.reward + row.discount * jnp.min(q_values(config, parts, judges, ahead, action))
 
-    keys = jax.random.split(key_action, batch.valid.shape)
-    ahead, q_target = jax.vmap(jax.vmap(target))(batch.rows, keys)
-    dropout = jax.random.split(key_dropout, batch.valid.shape)
+    keys = jax.random.split(key_action, valid.shape)
+    ahead, q_target = jax.vmap(jax.vmap(target))(batch, keys)
+    dropout = jax.random.split(key_dropout, valid.shape)
     frozen = {name: getattr(state, name).params for name in NETWORKS}
 
     def loss(learned: dict[str, PyTree]) -> tuple[Array, tuple[dict[str, Array], Array]]:
         one = lambda *window: _window_losses(config, parts, frozen | learned, *window)  # noqa: E731
-        each, zs = jax.vmap(one)(batch.rows, ahead, q_target, dropout)
-        mean = {name: discounted_mean(x, batch.valid, hyper.rho) for name, x in each.items()}
+        each, zs = jax.vmap(one)(batch, ahead, q_target, dropout)
+        mean = {name: discounted_mean(x, valid, hyper.rho) for name, x in each.items()}
         return sum((getattr(hyper, name) * x for name, x in mean.items()), jnp.float32(0)), (mean, zs)
 
     fits = {name: getattr(state, name) for name in config.learned}
@@ -158,7 +157,7 @@ def _update_model(
     fits = {name: optim.step(parts.adam, fit, grads[name], rates[name]) for name, fit in fits.items()}
     metrics = {f"model/{name}_loss": x for name, x in mean.items()} | {"model/grad_norm": norm}
     if not config.sgft:
-        metrics["critic/target_mean"] = jnp.mean(q_target, where=batch.valid)
+        metrics["critic/target_mean"] = jnp.mean(q_target, where=valid)
     return state.replace(**fits), zs, metrics
 
 
@@ -166,7 +165,7 @@ def _window_losses(
     config: TDMPC2Config,
     parts: Parts,
     params: dict[str, PyTree],
-    rows: Transition,
+    rows: Batch,
     ahead: Array,
     q_target: Array,
     dropout: Key,
@@ -273,7 +272,7 @@ def scaled_entropy_sample(moments: Array, key: Key) -> tuple[Array, Array]:
 
 
 def make_tdmpc2(config: TDMPC2Config, hyper: TDMPC2Hyper | None = None) -> Learner:
-    """The learner of a configuration: `update` takes `Sequences` [B, horizon], the carry is the last plan's mean.
+    """The learner of a configuration: `update` takes windows [B, horizon], the carry is the last plan's mean.
 
     Start every episode with `init_carry()`. Set the observation statistics with `state.replace(normalizer=...)`.
     """
@@ -284,21 +283,26 @@ def make_tdmpc2(config: TDMPC2Config, hyper: TDMPC2Hyper | None = None) -> Learn
         keys = dict(zip(NETWORKS, jax.random.split(key, len(NETWORKS)), strict=True))
         params = {name: getattr(parts, name).init(keys[name]) for name in NETWORKS}
         statistics = normalizer.identity(config.obs_dim)
-        return _assemble(config, parts, hyper, TDMPC2Prior(**params, normalizer=statistics, scale=jnp.float32(1)))
+        return _assemble(config, parts, hyper, TDMPC2Params(**params, normalizer=statistics, scale=jnp.float32(1)))
 
-    def act(state: TDMPC2State, carry: Array, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, Array]:
+    def act(
+        state: TDMPC2State, carry: Array, obs: Array, key: Key, *, explore: bool | Array, context: Array | None = None
+    ) -> tuple[Array, Array]:
+        del context  # it reads the observation alone
         return _plan(config, parts, state, carry, obs, key, explore=explore)
 
-    def update(state: TDMPC2State, batch: Any, key: Key) -> tuple[TDMPC2State, Metrics]:
-        if batch.valid.shape[1] != config.horizon:
-            raise UserError(f"TD-MPC2 windows have {batch.valid.shape[1]} steps: must be the horizon, {config.horizon}")
+    def update(state: TDMPC2State, batch: Batch, key: Key) -> tuple[TDMPC2State, Metrics]:
+        if batch.reward.shape[1] != config.horizon:
+            raise UserError(
+                f"TD-MPC2 windows have {batch.reward.shape[1]} steps: must be {config.horizon}, the horizon"
+            )
         return _update(config, parts, state, batch, key)
 
     return Learner(init, lambda: jnp.zeros((config.horizon, config.act_dim)), act, update)
 
 
-def _assemble(config: TDMPC2Config, parts: Parts, hyper: TDMPC2Hyper, prior: TDMPC2Prior) -> TDMPC2State:
-    """Fresh moments around given parameters (O-9)."""
+def _assemble(config: TDMPC2Config, parts: Parts, hyper: TDMPC2Hyper, prior: TDMPC2Params) -> TDMPC2State:
+    """Fresh moments around given parameters."""
     start = lambda name: optim.start(  # noqa: E731
         parts.policy_adam if name == "policy" else parts.adam, getattr(prior, name)
     )
@@ -316,28 +320,25 @@ def _assemble(config: TDMPC2Config, parts: Parts, hyper: TDMPC2Hyper, prior: TDM
 # --- between simulation and reality ---------------------------------------------------------------------------------
 
 
-def extract_prior(state: TDMPC2State) -> TDMPC2Prior:
+def extract_params(state: TDMPC2State) -> TDMPC2Params:
     """What a pretrained agent hands over."""
     params = {name: getattr(state, name).params for name in NETWORKS}
-    return TDMPC2Prior(**params, normalizer=state.normalizer, scale=state.scale)
+    return TDMPC2Params(**params, normalizer=state.normalizer, scale=state.scale)
 
 
-def fine_tune_state(config: TDMPC2Config, hyper: TDMPC2Hyper, prior_params: TDMPC2Prior, key: Key) -> TDMPC2State:
-    """An agent that starts from a prior: all its networks, its normaliser (frozen), fresh Adam moments (O-9).
+def state_from_prior(config: TDMPC2Config, hyper: TDMPC2Hyper, params: TDMPC2Params) -> TDMPC2State:
+    """An agent that starts from a prior: all its networks, its normaliser (frozen), fresh optimiser moments.
 
-    With `config.sgft` its policy becomes the anchor of V_sim. The horizon may differ from the prior's. `key` is there
-    as in other learners; nothing is drawn.
+    With `config.sgft` its policy becomes the anchor of V_sim. The horizon may differ from the prior's.
     """
-    del key
-    check_prior(config, prior_params)
-    return _assemble(
-        config, make_parts(config), hyper, jax.tree.map(jnp.copy, prior_params)
-    )  # the prior must survive it
+    check_params_of_prior(config, params)
+    own = jax.tree.map(jnp.copy, params)  # the caller may donate the state; the prior must survive it
+    return _assemble(config, make_parts(config), hyper, own)
 
 
-def check_prior(config: TDMPC2Config, prior: TDMPC2Prior) -> None:
+def check_params_of_prior(config: TDMPC2Config, params: TDMPC2Params) -> None:
     """Raise UserError where a network of the prior is not the one that `config` describes."""
     parts = make_parts(config)
     owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, {config.size}"
     for name in NETWORKS:
-        check_params(name, getattr(parts, name), getattr(prior, name), f"{owner}: use the prior's own task and size")
+        check_params(name, getattr(parts, name), getattr(params, name), f"{owner}: use the prior's own task and size")

@@ -154,8 +154,7 @@ class TDMPC2State(struct.PyTreeNode):
     step: Array
 
 
-@struct.dataclass
-class TDMPC2Prior:
+class TDMPC2Params(NamedTuple):
     """What pretraining hands to fine-tuning: parameters, observation statistics, and the scale [] of values."""
 
     encoder: PyTree
@@ -317,7 +316,7 @@ def reward_of(config: TDMPC2Config, parts: Parts, state: TDMPC2State, z: Array, 
 
 
 def v_sim(config: TDMPC2Config, parts: Parts, state: TDMPC2State, z: Array) -> Array:
-    """Mean over all heads at the policy's mean action (O-16): no draw, so that shaped rewards telescope."""
+    """Mean over all heads at the policy's mean action: no draw, so that shaped rewards telescope."""
     policy = state.policy.params if state.anchor is None else state.anchor
     action = jnp.tanh(parts.policy.apply(policy, z)[0])
     return jnp.mean(q_values(config, parts, state.critic.params, z, action))
@@ -329,7 +328,7 @@ def encode(parts: Parts, state: TDMPC2State, obs: Array) -> Array:
 
 
 def value_of(config: TDMPC2Config, state: TDMPC2State, obs: Array) -> Array:
-    """V_sim(obs) [], deterministic (O-16). obs: [obs_dim] raw.
+    """V_sim(obs) [], deterministic. obs: [obs_dim] raw.
 
     Full float32 on every device, as in `value.predict`: who shapes rewards takes small differences of it.
     """

@@ -7,7 +7,7 @@ import optax
 from sgft_jax.learners import losses, optim
 from sgft_jax.models.networks import Network
 from sgft_jax.models.normalizer import normalize
-from sgft_jax.types import Array, Key, Metrics, Normalizer, PyTree, Transition
+from sgft_jax.types import Array, Batch, Key, Metrics, Normalizer, PyTree
 
 
 def predict(network: Network, params: PyTree, normalizer: Normalizer, obs: Array, action: Array) -> Array:
@@ -34,7 +34,7 @@ def update(
     optimiser: optax.GradientTransformation,
     fit: optim.Fit,
     normalizer: Normalizer,
-    batch: Transition,
+    batch: Batch,
     key: Key,
     *,
     rate: Array | float,
@@ -53,7 +53,8 @@ def update(
         predictions = jax.vmap(network.apply, (None, 0, 0))(params, obs, batch.action)
         errors = jax.vmap(jax.vmap(losses.dynamics_loss, (0, None)))(predictions, next_obs - obs)
         # Sum over members: their parameters are disjoint, so each follows its own mean.
-        return jnp.sum(jnp.mean(weights * errors, axis=0)), jnp.mean(errors)
+        each = jax.vmap(losses.row_mean, (1, None))(weights * errors, batch)
+        return jnp.sum(each), losses.row_mean(jnp.mean(errors, axis=1), batch)
 
     grads, error = jax.grad(loss, has_aux=True)(fit.params)
     return optim.step(optimiser, fit, grads, rate), {"dynamics/mse": error}

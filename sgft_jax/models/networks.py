@@ -2,20 +2,19 @@
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
+from sgft_jax.models.config import NetworkConfig, Precision
 from sgft_jax.types import Array, Key, PyTree, UserError
 
-LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0  # O-5
+LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
 
 _ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"relu": nn.relu, "tanh": nn.tanh, "silu": nn.silu, "elu": nn.elu}
 
-type Precision = Literal["default", "float32", "bfloat16"]
 _MATMUL: dict[Precision, str] = {"default": "default", "float32": "highest", "bfloat16": "BF16_BF16_F32"}
 
 
@@ -26,25 +25,6 @@ def precision(name: Precision) -> contextlib.AbstractContextManager:
     CPUs compute in float32 whatever is asked for.
     """
     return jax.default_matmul_precision(_MATMUL[name])
-
-
-@dataclass(frozen=True)
-class NetworkConfig:
-    """The body shared by all networks of a run.
-
-    hidden: widths of the hidden layers.
-    layer_norm: LayerNorm after each linear layer of critic and value, before the activation (RLPD).
-    actor_layer_norm: the same in the actor. activation: relu, tanh, silu or elu.
-    """
-
-    hidden: tuple[int, ...] = (512, 512)
-    layer_norm: bool = False
-    actor_layer_norm: bool = False
-    activation: str = "relu"
-
-    def __post_init__(self) -> None:
-        if self.activation not in _ACTIVATIONS:
-            raise UserError(f"network activation {self.activation!r}: choose one of {', '.join(_ACTIVATIONS)}")
 
 
 class Network(NamedTuple):
@@ -150,7 +130,7 @@ def tanh_gaussian_log_prob(moments: Array, u: Array) -> Array:
 
 
 def tanh_gaussian_mode(moments: Array) -> Array:
-    """The evaluation action tanh(mean) [act_dim] (O-13)."""
+    """The action of evaluations, tanh(mean) [act_dim]."""
     return jnp.tanh(moments[0])
 
 
@@ -159,9 +139,9 @@ def add_noise(action: Array, std: Array | float, key: Key) -> Array:
     return jnp.clip(action + std * jax.random.normal(key, action.shape), -1.0, 1.0)
 
 
-def tanh_gaussian_action(moments: Array, key: Key, *, explore: bool) -> Array:
-    """[act_dim]: a draw to explore, else the mode."""
-    return tanh_gaussian_sample(moments, key)[0] if explore else tanh_gaussian_mode(moments)
+def tanh_gaussian_action(moments: Array, key: Key, *, explore: bool | Array) -> Array:
+    """[act_dim]: a draw to explore, else the mode. `explore` may be traced."""
+    return jnp.where(explore, tanh_gaussian_sample(moments, key)[0], tanh_gaussian_mode(moments))
 
 
 def pad_first_layer(params: PyTree, obs_dim: int, extra: int) -> PyTree:

@@ -40,12 +40,6 @@ def identity(obs_dim: int) -> Normalizer:
     return Normalizer(jnp.zeros(obs_dim), jnp.ones(obs_dim))
 
 
-def pad(normalizer: Normalizer, extra: int) -> Normalizer:
-    """Pass `extra` appended entries through unchanged (steps-to-go one-hots)."""
-    mean, std = normalizer
-    return Normalizer(jnp.concatenate([mean, jnp.zeros(extra)]), jnp.concatenate([std, jnp.ones(extra)]))
-
-
 def normalize(normalizer: Normalizer, obs: Array) -> Array:
     """From raw units [obs_dim] to [obs_dim] standard deviations from the mean. Not clipped: the tail is the task."""
     return (obs - normalizer.mean) / normalizer.std

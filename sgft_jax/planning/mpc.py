@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
+from sgft_jax.learners.sac import SACParams
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.networks import (
     NetworkConfig,
@@ -21,7 +22,7 @@ from sgft_jax.models.networks import (
 )
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.planning import mppi
-from sgft_jax.types import Array, Key, Prior, PyTree, UserError
+from sgft_jax.types import Array, Key, PyTree, UserError
 
 _ITERATIONS = 3  # of the search: half of TD-MPC2's, for plans a quarter as long
 _PROPOSALS, _ELITES = 4, 8  # one of so many samples is the policy's, and an elite
@@ -62,50 +63,50 @@ def make_act(
     reward: Callable[[Array, Array, Array], Array],
     terminated: Callable[[Array, Array, Array], Array],
 ) -> Callable[..., tuple[Array, PyTree]]:
-    """act(prior, carry, obs [obs_dim], key, *, explore) -> (action [act_dim], carry); explore: [] bool, may be traced.
+    """act(params, carry, obs [obs_dim], key, *, explore) -> (action [act_dim], carry); explore: [] bool, may be traced.
 
     reward, terminated: the task as functions of one (obs, action, next_obs). A plan's score is the mean over the
     ensemble's members, each followed on its own, of sum_t gamma^t r_t + gamma^H V_sim(s_H). Source: SGFT equation (1)
     but for V_sim(s_0), which is the same for all plans.
     """
     actor = make_actor(config.obs_dim, config.act_dim, config.network)
-    judge = make_value(config.obs_dim, config.network)
+    value_net = make_value(config.obs_dim, config.network)
     model = make_dynamics(config.obs_dim, config.act_dim, config.network)
     search = mppi.MPPIConfig(config.samples, config.samples // _ELITES, _ITERATIONS)
 
-    def score(prior: Prior, obs: Array, sequence: Array) -> Array:
-        members = jax.tree.leaves(prior.dynamics)[0].shape[0]
+    def score(params: SACParams, obs: Array, sequence: Array) -> Array:
+        members = jax.tree.leaves(params.dynamics)[0].shape[0]
 
         def step(carry: tuple[Array, Array, Array], action: Array) -> tuple[tuple[Array, Array, Array], None]:
             now, discount, total = carry  # each of every member: [members, obs_dim], [members], [members]
-            then = dynamics.predict_each(model, prior.dynamics, prior.normalizer, now, action)
+            then = dynamics.predict_each(model, params.dynamics, params.normalizer, now, action)
             ask = lambda question: jax.vmap(question, (0, None, 0))(now, action, then)  # noqa: E731
             goes_on = config.gamma * (1.0 - ask(terminated).astype(jnp.float32))
             return (then, discount * goes_on, total + discount * ask(reward)), None
 
         start = (jnp.tile(obs, (members, 1)), jnp.ones(members), jnp.zeros(members))
         (end, discount, total), _ = jax.lax.scan(step, start, sequence)
-        left = jax.vmap(lambda obs: value.predict(judge, prior.value, prior.normalizer, obs))(end)
+        left = jax.vmap(lambda obs: value.predict(value_net, params.value, params.normalizer, obs))(end)
         return jnp.mean(total + discount * left)
 
-    def propose(prior: Prior, member: PyTree, obs: Array, key: Key) -> Array:
+    def propose(params: SACParams, member: PyTree, obs: Array, key: Key) -> Array:
         """[H, act_dim]: the policy with noise, followed by one member of the ensemble."""
 
         def step(obs: Array, key: Key) -> tuple[Array, Array]:
             key_policy, key_noise = jax.random.split(key)
-            moments = actor.apply(prior.actor, normalize(prior.normalizer, obs))
+            moments = actor.apply(params.actor, normalize(params.normalizer, obs))
             action = tanh_gaussian_action(moments, key_policy, explore=True)
             action = add_noise(action, config.noise, key_noise)
-            return dynamics.predict(model, member, prior.normalizer, obs, action)[0], action
+            return dynamics.predict(model, member, params.normalizer, obs, action)[0], action
 
         return jax.lax.scan(step, obs, jax.random.split(key, config.horizon))[1]
 
-    def act(prior: Prior, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
+    def act(params: SACParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         key_member, key_propose, key_search = jax.random.split(key, 3)
-        member = dynamics.draw_member(prior.dynamics, key_member)
+        member = dynamics.draw_member(params.dynamics, key_member)
         keys = jax.random.split(key_propose, config.samples // _PROPOSALS)
-        proposals = jax.vmap(lambda key: propose(prior, member, obs, key))(keys)
-        rate = lambda sequence: score(prior, obs, sequence)  # noqa: E731
+        proposals = jax.vmap(lambda key: propose(params, member, obs, key))(keys)
+        rate = lambda sequence: score(params, obs, sequence)  # noqa: E731
         return mppi.plan(search, _SEARCH, rate, proposals, carry, key_search, explore=explore)
 
     return act

@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from sgft_jax.models.networks import add_noise
 from sgft_jax.types import Array, Key, UserError
 
+_WORST = -1e9  # finite, so that weights stay defined where no score is
+
 
 @dataclass(frozen=True)
 class MPPIConfig:
@@ -62,7 +64,8 @@ def plan(
 ) -> tuple[Array, Array]:
     """One action [act_dim] in [-1, 1], and the mean [H, act_dim] of the plan, which is the next call's `previous`.
 
-    score(sequence [H, act_dim]) -> []: higher is better; NaN counts as 0. Asked once for each of the `proposals`.
+    score(sequence [H, act_dim]) -> []: higher is better; a score that is not finite ranks last. Each of the
+        `proposals` is scored once.
     proposals: [n, H, act_dim] sequences in [-1, 1] that compete with the samples, n < samples (n = 0: none).
     previous: [H, act_dim] the last plan; its first step lies in the past by now. Zeros at the start of an episode.
     explore: [] bool, may be traced. Both modes draw one elite by its weight; exploring adds noise of the search's final
@@ -73,7 +76,11 @@ def plan(
     if n >= config.samples:
         raise UserError(f"planner: {n} proposals leave none of {config.samples} samples to draw; raise samples")
     key_search, key_pick, key_noise = jax.random.split(key, 3)
-    rate = lambda sequences: jnp.nan_to_num(jax.vmap(score)(sequences), nan=0.0)  # noqa: E731
+
+    def rate(sequences: Array) -> Array:
+        scores = jax.vmap(score)(sequences)
+        return jnp.where(jnp.isfinite(scores), scores, _WORST)
+
     known = rate(proposals) if n else jnp.zeros(0)
 
     def refine(search: _Search, key: Key) -> tuple[_Search, None]:

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.franka import arm, hammer, host, insert, kinematics, push
+from envs.franka import arm, hammer, insert, kinematics, push
+from envs.mujoco import host
 from envs.mujoco.scene import Scene
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array

@@ -6,11 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
+from experiments.priors import find_priors
 
 from envs.gaps import Gap
-from experiments import algorithms, common
+from envs.pools import heldout_worlds, load_gap, real_worlds, training_worlds
+from experiments import algorithms, memory, stacking
+from experiments.memory import reserve
+from experiments.options import seed_list, seeds_name
 from sgft_jax.io import checkpoint
 from sgft_jax.io.config import config_to_json
+from sgft_jax.io.log import Clock
 from sgft_jax.learners.sac import SACConfig, extract_prior, make_sac
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.types import UserError
@@ -27,33 +32,18 @@ def save_prior(folder, seed, **changes):
     return prior
 
 
-@pytest.mark.parametrize(
-    ("argv", "value"),
-    [
-        ([], "fast"),
-        (["--preset", "cpu"], "cpu"),
-        (["--preset=cpu", "--seed", "1"], "cpu"),
-        (["--preset"], "fast"),
-        (["--preset", "cpu", "--preset", "paper"], "paper"),
-        (["--presets", "cpu"], "fast"),
-    ],
-)
-def test_an_option_is_found_before_parsing(argv, value):
-    assert common.option(argv, "--preset", "fast") == value
-
-
 def test_names_of_seeds():
-    assert common.seeds_name(common.seed_list(3, 1)) == "seed-3"
-    assert common.seeds_name(common.seed_list(3, 4)) == "seeds-3-6"
+    assert seeds_name(seed_list(3, 1)) == "seed-3"
+    assert seeds_name(seed_list(3, 4)) == "seeds-3-6"
     for bad in ((0, 0), (-1, 1)):
         with pytest.raises(UserError, match="at least one"):
-            common.seed_list(*bad)
+            seed_list(*bad)
 
 
 def test_keys_depend_on_seed_and_purpose_alone():
-    keys = jax.random.key_data(common.seed_keys([0, 1, 2], 5))
-    np.testing.assert_array_equal(keys[1:], jax.random.key_data(common.seed_keys([1, 2], 5)))
-    assert len(np.unique(np.concatenate([keys, jax.random.key_data(common.seed_keys([0, 1, 2], 6))]), axis=0)) == 6
+    keys = jax.random.key_data(stacking.seed_keys([0, 1, 2], 5))
+    np.testing.assert_array_equal(keys[1:], jax.random.key_data(stacking.seed_keys([1, 2], 5)))
+    assert len(np.unique(np.concatenate([keys, jax.random.key_data(stacking.seed_keys([0, 1, 2], 6))]), axis=0)) == 6
 
 
 @pytest.mark.parametrize("seeds", [1, 3])
@@ -62,13 +52,13 @@ def test_over_seeds_is_a_loop_over_seeds(seeds):
         return shared + x, y.sum()
 
     x, y = jnp.arange(3.0)[:seeds], jnp.arange(6.0).reshape(3, 2)[:seeds]
-    total, sums = common.over_seeds(add, seeds, shared=1)(jnp.float32(10), x, y)
+    total, sums = stacking.over_seeds(add, seeds, shared=1)(jnp.float32(10), x, y)
     assert total.tolist() == [10, 11, 12][:seeds] and sums.tolist() == [1, 5, 9][:seeds]  # 0 + 1, 2 + 3, 4 + 5
 
 
 def test_one_seed_keeps_its_conditions():
     one, two = (
-        str(jax.make_jaxpr(common.over_seeds(lambda x: jax.lax.cond(x > 0, jnp.sin, jnp.cos, x), n))(jnp.ones(n)))
+        str(jax.make_jaxpr(stacking.over_seeds(lambda x: jax.lax.cond(x > 0, jnp.sin, jnp.cos, x), n))(jnp.ones(n)))
         for n in (1, 2)
     )
     assert "cond[" in one and "cond[" not in two
@@ -77,7 +67,7 @@ def test_one_seed_keeps_its_conditions():
 def test_priors_are_found_in_order(tmp_path):
     home = tmp_path / "pretrain/toy/fast"
     expected = {n: save_prior(home / run / "prior" / f"seed-{n}", n) for run, n in (("a", 10), ("a", 9), ("b", 2))}
-    find = lambda prior: common.find_priors(prior, out=tmp_path, env=toy.make(), preset="fast")  # noqa: E731
+    find = lambda prior: find_priors(prior, out=tmp_path, env=toy.make(), preset="fast")  # noqa: E731
     found, card = find(None)
     assert card["seed"] == 2 and algorithms.network_of(card) == NETWORK
     for prior, n in zip(found, (2, 9, 10), strict=True):
@@ -86,7 +76,7 @@ def test_priors_are_found_in_order(tmp_path):
 
 
 def test_what_is_wrong_with_priors_is_said(tmp_path):
-    find = lambda prior=None: common.find_priors(prior, out=tmp_path, env=toy.make(), preset="cpu")  # noqa: E731
+    find = lambda prior=None: find_priors(prior, out=tmp_path, env=toy.make(), preset="cpu")  # noqa: E731
     with pytest.raises(UserError, match=r"holds no prior; make one with: .*--task toy --preset cpu"):
         find()
     save_prior(tmp_path / "p/seed-0", 0)
@@ -101,25 +91,26 @@ def test_what_is_wrong_with_priors_is_said(tmp_path):
 def test_exam_worlds_have_exact_sensors_in_simulation_only(tmp_path, key):
     (tmp_path / "g.toml").write_text("[params]\nmass = 2.0\nfriction = [3, 5]\n")
     env = toy.make()
-    gap = common.load_gap(env, str(tmp_path / "g.toml"), ["mass=1.5"])
-    assert common.load_gap(env, "sim", []) is None and common.load_gap(env, None, []) is None
-    assert common.exam_worlds(env, None, key, 3).effects.obs_noise.tolist() == [0, 0, 0]
-    assert common.training_worlds(env, None, key, 3).effects.obs_noise.tolist() == pytest.approx([0.005] * 3)
-    real = common.exam_worlds(env, gap, key, 3)
-    assert real.params[:, 0].tolist() == [1.5] * 3 and float(real.effects.obs_noise[0]) == pytest.approx(0.005)
+    gap = load_gap(env, str(tmp_path / "g.toml"), ["mass=1.5"])
+    assert load_gap(env, "sim", []) is None and load_gap(env, None, []) is None
+    assert heldout_worlds(env, None, key, 3).theta.effects.high.obs_noise.tolist() == [0, 0, 0]
+    assert training_worlds(env, None, key, 3).theta.effects.high.obs_noise.tolist() == pytest.approx([0.005] * 3)
+    real = heldout_worlds(env, gap, key, 3)
+    assert real.theta.params[:, 0].tolist() == [1.5] * 3
+    assert float(real.theta.effects.high.obs_noise[0]) == pytest.approx(0.005)
 
 
 def test_pools_of_different_size_are_brought_to_one(key):
     env, fixed = toy.make(), Gap("fixed", {"mass": 2.0, "friction": 4.0}, {"latency": 0.05})
-    pools = common.real_worlds(env, [fixed, Gap("ranges", {"mass": [3.0, 4.0]}, {})], key, 5)
-    np.testing.assert_array_equal(pools.params[0], [[2.0, 4.0]] * 5)
-    assert pools.params.shape == (2, 5, 2) and len(np.unique(pools.params[1, :, 0])) == 5
-    np.testing.assert_allclose(pools.effects.latency, [[0.05] * 5, [0.0] * 5])
-    assert common.real_worlds(env, [fixed, fixed], key, 5).params.shape == (2, 1, 2)
+    pools = real_worlds(env, [fixed, Gap("ranges", {"mass": [3.0, 4.0]}, {})], key, 5)
+    np.testing.assert_array_equal(pools.theta.params[0], [[2.0, 4.0]] * 5)
+    assert pools.theta.params.shape == (2, 5, 2) and len(np.unique(pools.theta.params[1, :, 0])) == 5
+    np.testing.assert_allclose(pools.theta.effects.high.latency, [[0.05] * 5, [0.0] * 5])
+    assert real_worlds(env, [fixed, fixed], key, 5).theta.params.shape == (2, 1, 2)
 
 
 def test_clock_adds_up():
-    clock = common.Clock()
+    clock = Clock()
     clock.seconds = {"train": 10.0}
     for phase in ("train", "evaluate"):
         with clock(phase):
@@ -130,12 +121,12 @@ def test_clock_adds_up():
 
 def test_a_budget_that_does_not_fit_names_the_largest_part(monkeypatch, capsys):
     parts = {"random_transitions": 2**30, "replay_capacity": 3 * 2**30}
-    monkeypatch.setattr(common, "free_memory", lambda: 5 * 2**30)
-    common.reserve(parts, copies=2, devices=2)  # 4 GiB each
+    monkeypatch.setattr(memory, "free_memory", lambda: 5 * 2**30)
+    reserve(parts, copies=2, devices=2)  # 4 GiB each
     assert capsys.readouterr().out == (
         "experience: 4.00 GiB of 5.00 GiB free on each device (random_transitions 1.00 GiB, replay_capacity 3.00 GiB)\n"
     )
     with pytest.raises(UserError, match=r"8\.00 GiB of 5\.00 GiB free on each device: lower --config\.replay-capacity"):
-        common.reserve(parts, copies=2)
-    monkeypatch.setattr(common, "free_memory", lambda: None)
-    common.reserve(parts, copies=2)  # nobody knows: the run may try
+        reserve(parts, copies=2)
+    monkeypatch.setattr(memory, "free_memory", lambda: None)
+    reserve(parts, copies=2)  # nobody knows: the run may try

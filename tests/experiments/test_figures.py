@@ -4,6 +4,7 @@ import pytest
 from runs_by_hand import save
 
 from experiments import cli, figures
+from sgft_jax.analysis import figures as drawing
 
 
 @pytest.fixture(autouse=True)
@@ -25,7 +26,7 @@ def drawn(monkeypatch):
         found[path.name] = {words: [curve.name for curve in curves] for words, curves in panels.items()}
         return path
 
-    monkeypatch.setattr(figures.draw, "learning_curves", draw)
+    monkeypatch.setattr(drawing, "learning_curves", draw)
     return found
 
 

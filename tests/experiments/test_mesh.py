@@ -9,18 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
+from experiments.pretraining import spread_replay
 from jax.sharding import PartitionSpec
 
 import envs
 from envs.mujoco.engines import c as engine_c
 from envs.mujoco.worlds import PhysicsState
-from experiments import cli, pretrain
-from experiments.common import seed_keys, stack
-from experiments.presets import PretrainConfig
-from experiments.pretraining import spread_replay
+from experiments import cli, pretrain, pretrain_run
+from experiments.stacking import seed_keys, stack
 from sgft_jax import mesh
 from sgft_jax.data import replay
 from sgft_jax.models.networks import NetworkConfig
+from sgft_jax.presets import PretrainConfig
 from sgft_jax.types import UserError
 
 CONFIG = PretrainConfig(
@@ -40,11 +40,11 @@ def begun(devices):
 
 @functools.cache
 def program():
-    return pretrain.make_program(toy.make(), CONFIG, seeds=1)
+    return pretrain_run.make_program(toy.make(), CONFIG, seeds=1)
 
 
 def pools():
-    return stack([toy.make().sample_worlds(jax.random.key(0), CONFIG.worlds)])
+    return stack([envs.sample_worlds(toy.make(), jax.random.key(0), CONFIG.worlds)])
 
 
 def agree(one, two, **tolerance):

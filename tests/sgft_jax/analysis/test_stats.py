@@ -70,7 +70,7 @@ def test_wilson_by_hand():
     centre = (0.8 + z**2 / 20) / (1 + z**2 / 10)
     half = z / (1 + z**2 / 10) * np.sqrt(0.8 * 0.2 / 10 + z**2 / 400)
     interval = success_interval(8, 10)
-    np.testing.assert_allclose(interval, (0.8, centre - half, centre + half), rtol=1e-12)
+    np.testing.assert_allclose(interval, np.array([0.8, centre - half, centre + half]), rtol=1e-12)
     np.testing.assert_allclose(interval, (0.8, 0.490, 0.943), atol=1e-3)
 
 

@@ -1,0 +1,36 @@
+"""Impure: whether what a run keeps and computes fits into the memory of its devices."""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+
+from sgft_jax.types import UserError
+
+
+def reserve(parts: Mapping[str, int], *, copies: int, devices: int = 1) -> None:
+    """Prints how much experience each device will hold; raises UserError if it is more than the device has room for.
+
+    parts: bytes of one agent's by the setting of pretraining that decides them. copies: agents trained together.
+    """
+    share = {name: copies * size / devices for name, size in parts.items()}
+    need, room = sum(share.values()), free_memory()
+    there = "" if room is None else f" of {_gib(room)} free"
+    print(f"experience: {_gib(need)}{there} on each device ({', '.join(f'{k} {_gib(v)}' for k, v in share.items())})")
+    if room is not None and need > room:
+        option = max(share, key=share.__getitem__).replace("_", "-")
+        raise UserError(f"experience takes {_gib(need)}{there} on each device: lower --config.{option} or train fewer")
+
+
+def free_memory() -> int | None:
+    """Bytes that the first device can still hold; None where nobody says."""
+    if stats := jax.local_devices()[0].memory_stats():
+        return stats["bytes_limit"] - stats["bytes_in_use"]
+    table = Path("/proc/meminfo")
+    found = re.search(r"MemAvailable:\s+(\d+) kB", table.read_text()) if table.exists() else None
+    return int(found[1]) * 1024 if found else None
+
+
+def _gib(size: float) -> str:
+    return f"{size / 2**30:.2f} GiB"

@@ -1,0 +1,78 @@
+"""Options that several commands share, and what can be wrong with them. Imports neither JAX nor MuJoCo."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import arg
+
+from sgft_jax import extend
+from sgft_jax.types import UserError
+
+LAST_SEED = 2**31 - 1  # larger ones stand for held-out worlds and episodes
+
+Impl = Annotated[
+    Literal["auto", "jax", "warp", "c"],
+    arg(
+        help="Who steps the physics: MJX's own code, MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c on "
+        "a CPU, warp on an NVIDIA GPU where it is installed, jax elsewhere."
+    ),
+]
+
+
+def seed_list(first: int, count: int) -> list[int]:
+    """`count` seeds from `first` on; raises UserError for none, and for seeds that do not fit into 32 bits."""
+    if count < 1:
+        raise UserError(f"--seeds is {count}: must be at least 1")
+    if not 0 <= first <= LAST_SEED - count + 1:
+        raise UserError(f"--seed is {first}: seeds go from 0 to {LAST_SEED}, and --seeds {count} of them are wanted")
+    return list(range(first, first + count))
+
+
+def seeds_name(seeds: Sequence[int]) -> str:
+    """The folder of a run with these seeds: `seed-3`, or `seeds-0-9`."""
+    return f"seed-{seeds[0]}" if len(seeds) == 1 else f"seeds-{seeds[0]}-{seeds[-1]}"
+
+
+def without_repeats(option: str, words: Sequence[str]) -> None:
+    """Raise UserError for a word that is given twice."""
+    if twice := [word for i, word in enumerate(words) if word in words[:i]]:
+        raise UserError(f"{option} names {twice[0]} twice; name it once")
+
+
+def at_least_one(args: object, *names: str) -> None:
+    """Raise UserError for an option that is less than 1."""
+    for name in names:
+        if (value := getattr(args, name)) < 1:
+            raise UserError(f"--{name.replace('_', '-')} is {value}: must be at least 1")
+
+
+def prior_home(out: Path, task: str, preset: str) -> Path:
+    """Where the runs of pretraining are that leave the priors of a task."""
+    return out / "pretrain" / task / preset
+
+
+def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str) -> list[Path]:
+    """Where priors are, in the order of their seeds; raises UserError if there is none.
+
+    prior: a folder that is one, or that holds some as `seed-*`, `prior/seed-*`, `policy/seed-*` (what fine-tuning
+    leaves, in the same form) or `*/prior/seed-*`; None looks in `prior_home`. task: as the user has typed it.
+    """
+    home = prior or prior_home(out, extend.name_of(task), preset)
+    if (home / "prior.json").exists():
+        return [home]
+    found = [
+        card.parent for sub in ("", "prior/", "policy/", "*/prior/") for card in home.glob(f"{sub}seed-*/prior.json")
+    ]
+    if not found and prior:
+        raise UserError(f"--prior {prior}: {'holds no prior' if prior.is_dir() else 'no such folder'}")
+    if not found:
+        raise UserError(
+            f"{home}: holds no prior; make one with: python -m experiments.pretrain --task {task} --preset {preset}"
+        )
+    return sorted(found, key=_seed_number)
+
+
+def _seed_number(folder: Path) -> tuple[int, str]:
+    number = folder.name.removeprefix("seed-")
+    return (int(number) if number.isdigit() else 0, str(folder))

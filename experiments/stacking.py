@@ -1,0 +1,39 @@
+"""Pytrees and functions with a leading axis of seeds. Pure."""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+
+from sgft_jax.types import Array, Key, PyTree
+
+
+def seed_keys(seeds: Sequence[int], purpose: int) -> Key:
+    """Keys [n_seeds] that depend on nothing but the seed and a number that stands for the purpose."""
+    return jnp.stack([jax.random.fold_in(jax.random.key(seed), purpose) for seed in seeds])
+
+
+def stack(trees: Sequence[PyTree]) -> PyTree:
+    """Equal pytrees stacked on a new leading axis."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def member(tree: PyTree, i: int | Array) -> PyTree:
+    """The i-th of stacked pytrees."""
+    return jax.tree.map(lambda x: x[i], tree)
+
+
+def part(tree: PyTree, i: int | Array, n: int) -> PyTree:
+    """The i-th n of stacked pytrees."""
+    return jax.tree.map(lambda x: x.reshape(-1, n, *x.shape[1:])[i], tree)
+
+
+def over_seeds(function: Callable[..., PyTree], seeds: int, *, shared: int = 0) -> Callable[..., PyTree]:
+    """`function` of one seed for arguments and results with a leading seeds axis; the first `shared` have none.
+
+    A single seed is not vmapped, because vmap would make a `cond` (resets, only where an episode ended) compute both of
+    its branches at every step.
+    """
+    if seeds > 1:
+        return lambda *args: jax.vmap(function, [None] * shared + [0] * (len(args) - shared))(*args)
+    return lambda *args: jax.tree.map(lambda x: x[None], function(*args[:shared], *member(args[shared:], 0)))

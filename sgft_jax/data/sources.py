@@ -1,0 +1,56 @@
+"""Sources of batches: real rows from a replay, simulated rows from a fixed set, and mixtures of both.
+
+The state of every source here is (replay of the real system, `SimulatedData` or None). Real rows come first.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from sgft_jax.data import replay, sequences
+from sgft_jax.types import Array, Batch, Key, Source
+
+State = tuple  # (ReplayState or SequenceState, SimulatedData or None)
+
+
+def real_rows(n: int) -> Source:
+    """`n` rows of the real system."""
+    return Source(lambda state, key: replay.sample(state[0], key, n), n_real=n)
+
+
+def real_windows(n: int, length: int) -> Source:
+    """`n` windows [n, length] of consecutive real steps."""
+    return Source(lambda state, key: sequences.sample(state[0], key, n, length), n_real=n)
+
+
+def simulated_rows(n: int) -> Source:
+    """`n` rows of the simulator: what learns before the first real rollout."""
+    return Source(lambda state, key: Batch(*state[1].draw(key, n)), n_real=0, n_sim=n)
+
+
+def mixture(n_real: int, n_sim: int) -> Source:
+    """`n_real` real rows, then `n_sim` simulated ones. Source: symmetric sampling of RLPD (Ball et al. 2023)."""
+    if not n_sim:
+        return real_rows(n_real)
+
+    def sample(state: State, key: Key) -> Batch:
+        key_real, key_sim = jax.random.split(key)
+        both = replay.sample(state[0], key_real, n_real), Batch(*state[1].draw(key_sim, n_sim))
+        rows = jax.tree.map(lambda *x: jnp.concatenate(x), *both)
+        return rows._replace(is_sim=jnp.arange(n_real + n_sim) >= n_real)
+
+    return Source(sample, n_real, n_sim)
+
+
+def blend(source: Source, share: Array | float) -> Source:
+    """A mixture of equal halves of n rows each, thinned to n rows of which a `share` [] is simulated.
+
+    The share may be traced, so that it can follow a schedule; hence both halves are drawn.
+    """
+    n = source.n_real
+
+    def sample(state: State, key: Key) -> Batch:
+        rows = source.sample(state, key)
+        simulated = jnp.arange(n) >= n - jnp.round(share * n)
+        return jax.tree.map(lambda x: jnp.where(simulated.reshape(-1, *[1] * (x.ndim - 1)), x[n:], x[:n]), rows)
+
+    return Source(sample, n)

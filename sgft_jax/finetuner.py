@@ -1,0 +1,303 @@
+"""The one generic finetuner: sample a batch, transform it, learn from it. Methods choose the parts.
+
+`assemble` puts parts together; `sac_finetuner` chooses them for methods whose learner is SAC. The caller owns the loop
+(`train.finetune`) and vmaps over seeds and real systems.
+"""
+
+from collections.abc import Callable, Mapping
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sgft_jax.data import replay, sources
+from sgft_jax.learners import optim, sac
+from sgft_jax.methods import options as rules
+from sgft_jax.methods.options import LoopOptions, ModelOptions, SACOptions
+from sgft_jax.models import dynamics, value
+from sgft_jax.models.config import NetworkConfig
+from sgft_jax.models.networks import fix_first_layer, make_dynamics, make_value
+from sgft_jax.policies import network_of, sac_policy
+from sgft_jax.transforms import compose, steps_to_go
+from sgft_jax.types import (
+    Array,
+    Batch,
+    Finetuner,
+    Imagination,
+    Key,
+    Learner,
+    Metrics,
+    Normalizer,
+    Policy,
+    Prior,
+    PyTree,
+    SimulatedData,
+    Simulation,
+    Source,
+    Task,
+    Transform,
+    Transition,
+    UserError,
+)
+
+
+class FinetuneState(NamedTuple):
+    """learner: the agent. models: the dynamics ensemble in training, or None. frozen: what stays of the prior, or None.
+    transform: the transforms' own state. replay: the real transitions.
+    """
+
+    learner: PyTree
+    models: PyTree
+    frozen: PyTree
+    transform: PyTree
+    replay: PyTree
+
+
+class Models(NamedTuple):
+    """A part that fits dynamics models: start(params) -> fit; update(fit, normalizer, batch, key) -> (fit, metrics)."""
+
+    start: Callable[[PyTree], PyTree]
+    update: Callable[[PyTree, Normalizer, Batch, Key], tuple[PyTree, Metrics]]
+
+
+class Parts(NamedTuple):
+    """What a method chooses.
+
+    learner: its `update` takes the transformed batch.
+    start(params, key, simulated) -> (learner's state, frozen part of the prior).
+    init_carry, act: as in `Finetuner`, where act takes the `FinetuneState`.
+    export(state) -> params; policy: how they act.
+    source(state) -> where a batch comes from; offline: the same before the first real rollout.
+    transform: of every batch. imagine(state, key) -> what the transform may ask, None if it asks nothing.
+    models: the dynamics ensemble if it trains. memory: the module that keeps real rows, replay or sequences.
+    """
+
+    learner: Learner
+    start: Callable[[PyTree, Key, SimulatedData | None], tuple[PyTree, PyTree]]
+    init_carry: Callable[[], PyTree]
+    act: Callable[..., tuple[Array, PyTree]]
+    export: Callable[[FinetuneState], PyTree]
+    policy: Policy
+    source: Callable[[FinetuneState], Source]
+    transform: Transform
+    imagine: Callable[[FinetuneState, Key], Any] = lambda state, key: None
+    models: Models | None = None
+    offline: Source | None = None
+    memory: ModuleType = replay
+
+
+def assemble(
+    parts: Parts,
+    options: LoopOptions,
+    task: Task,
+    *,
+    initial_policy: Policy | None = None,
+    simulation: Simulation | None = None,
+    card: Mapping[str, Any] | None = None,
+) -> Finetuner:
+    """The finetuner of these parts; initial_policy, simulation, card: see `Finetuner`."""
+
+    def init(params: PyTree, key: Key, simulated: SimulatedData | None = None) -> FinetuneState:
+        key_learner, key_transform = jax.random.split(key)
+        own = jax.tree.map(jnp.copy, params)  # the caller may donate the state; the prior must survive it
+        learner, frozen = parts.start(own, key_learner, simulated)
+        models = None if parts.models is None else parts.models.start(own)
+        empty = parts.memory.init(replay.blank(task.obs_dim, task.act_dim), options.replay_capacity)
+        return FinetuneState(learner, models, frozen, parts.transform.init(key_transform), empty)
+
+    def observe(state: FinetuneState, rows: Transition, valid: Array) -> FinetuneState:
+        return state._replace(replay=parts.memory.add_episode(state.replay, rows, valid))
+
+    def update(
+        state: FinetuneState, key: Key, simulated: SimulatedData | None, offline: bool
+    ) -> tuple[FinetuneState, Metrics]:
+        keys = jax.random.split(key, 6)
+        source = parts.offline if offline and parts.offline else parts.source(state)
+        rows = source.sample((state.replay, simulated), keys[0])
+        metrics: Metrics = {}
+        if parts.models is not None and source.n_real:
+            real = jax.tree.map(lambda x: x[: source.n_real], rows)
+            fit, metrics = parts.models.update(state.models, state.frozen.normalizer, real, keys[1])
+            state = state._replace(models=fit)
+        own, more = parts.transform.update(state.transform, rows, keys[2])
+        metrics |= more
+        batch = parts.transform.apply(own, parts.imagine(state, keys[3]), rows, keys[4])
+        learner, more = parts.learner.update(state.learner, batch, keys[5])
+        where = True if batch.valid is None else batch.valid
+        metrics |= more | {
+            "batch/reward_mean": jnp.mean(batch.reward, where=where),
+            "batch/reward_std": jnp.std(batch.reward, where=where),
+        }
+        return state._replace(learner=learner, transform=own), metrics
+
+    def learn(
+        state: FinetuneState, key: Key, updates: int, simulated: SimulatedData | None = None, *, offline: bool = False
+    ) -> tuple[FinetuneState, Metrics]:
+        if simulation is not None and simulated is None:
+            raise UserError("this method learns from transitions of the simulator too: give it some (`SimulatedData`)")
+        one = lambda state, key: update(state, key, simulated, offline)  # noqa: E731
+        state, metrics = jax.lax.scan(one, state, jax.random.split(key, updates))
+        return state, jax.tree.map(jnp.mean, metrics)
+
+    return Finetuner(
+        init=init,
+        init_carry=parts.init_carry,
+        act=parts.act,
+        observe=observe,
+        learn=learn,
+        export=parts.export,
+        policy=parts.policy,
+        updates_per_rollout=rules.updates_per_rollout(options, task),
+        initial_rollouts=options.initial_rollouts,
+        initial_policy=initial_policy,
+        simulation=simulation,
+        card=card or {},
+    )
+
+
+# --- SAC --------------------------------------------------------------------------------------------------------------
+
+
+def sac_finetuner(
+    options: SACOptions,
+    prior: Prior | None,
+    task: Task,
+    *,
+    transforms: tuple[Transform, ...] = (),
+    horizon_dim: int = 0,
+    fresh: bool = False,
+    reset_critic: bool = False,
+    value_baseline: bool = False,
+    source: Callable[[FinetuneState], Source] | None = None,
+    simulation: Simulation | None = None,
+    **structure: Any,
+) -> Finetuner:
+    """Fine-tuning whose learner is SAC.
+
+    transforms: of every batch. horizon_dim: entries of the context that tell steps to go (`shorten`), 0 = none.
+    fresh: start from new networks; the simulator's policy makes the initial rollouts alone. reset_critic: start from
+    the simulator's actor and a new critic. value_baseline: a kept critic under shaped rewards is read as Q(s, a) -
+    V_sim(s), its exact meaning in simulation. source: of batches, default real rows alone.
+    structure: more fields of `SACConfig`, and numbers of `SACHyper`.
+    """
+    card = rules.card_of(prior)
+    network, gamma, fresh = network_of(card), card["gamma"], fresh or prior is None
+    new_critic = reset_critic or fresh
+    rows = source or (lambda state: sources.real_rows(options.batch_size))
+    numbers = {name: structure.pop(name) for name in ("entropy_per_dim",) if name in structure}
+    structure = {"tune_alpha": False} | structure
+    config = sac.SACConfig(
+        task.obs_dim,
+        task.act_dim,
+        context_dim=horizon_dim if horizon_dim > 1 else 0,
+        network=network,
+        train_value=False,
+        train_dynamics=False,
+        critic_baseline=value_baseline and not new_critic,
+        policy_delay=rules.policy_delay(options),
+        max_grad_norm=options.max_grad_norm,
+        **structure,
+    )
+    hyper = sac.SACHyper(
+        lr_actor=options.lr_actor,
+        lr_critic=options.lr_critic,
+        lr_alpha=options.lr_actor,
+        tau=options.tau,
+        alpha=options.alpha,
+        actor_start=rules.critic_warmup(options, task),
+        actor_ramp=options.actor_ramp,
+        lr_warmup=0 if new_critic else rules.warmup(options, options.lr_warmup),
+        **numbers,
+    )
+    learner = sac.make_sac(config, hyper)
+    whole = steps_to_go(jnp.int32(horizon_dim), horizon_dim) if config.context_dim else None
+
+    def start(params: sac.SACParams | None, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
+        del simulated
+        if params is None:
+            state = learner.init(key)
+            return state, sac.SACParams(None, None, None, None, state.normalizer)
+        frozen = sac.SACParams(None, None, params.value, params.dynamics, params.normalizer)
+        if fresh:
+            return learner.init(key).replace(normalizer=params.normalizer), frozen
+        return sac.state_from_prior(config, hyper, params, key, reset_critic=reset_critic), frozen
+
+    def act(
+        state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
+    ) -> tuple[Array, PyTree]:
+        return learner.act(state.learner, carry, obs, key, explore=explore, context=whole)
+
+    def export(state: FinetuneState) -> sac.SACParams:
+        actor = state.learner.actor.params
+        twin = jax.tree.map(lambda x: x[:2], state.learner.critic.params)
+        if whole is not None:
+            actor, twin = (fix_first_layer(x, task.obs_dim, whole) for x in (actor, twin))
+        models = state.frozen.dynamics if state.models is None else state.models.params
+        return state.frozen._replace(actor=actor, critic=twin, dynamics=models)
+
+    own_policy = sac_policy(task.obs_dim, task.act_dim, network)
+    uses_models = isinstance(options, ModelOptions)
+    parts = Parts(
+        learner=learner,
+        start=start,
+        init_carry=learner.init_carry,
+        act=act,
+        export=export,
+        policy=own_policy,
+        source=rows,
+        offline=sources.simulated_rows(options.batch_size) if simulation else None,
+        transform=compose(*transforms),
+        imagine=_imagine(learner, network, gamma, task) if transforms else lambda state, key: None,
+        models=dynamics_models(options, network, task) if uses_models and options.train_dynamics else None,
+    )
+    initial = own_policy if prior is not None and fresh else None
+    return assemble(parts, options, task, initial_policy=initial, simulation=simulation)
+
+
+def dynamics_models(options: Any, network: NetworkConfig, task: Task) -> Models:
+    """The dynamics ensemble of a prior, in training on real rows.
+
+    options: with lr_dynamics, dynamics_warmup and max_grad_norm.
+    """
+    model = make_dynamics(task.obs_dim, task.act_dim, network)
+    optimiser = optim.adam(options.max_grad_norm)
+    rise = rules.warmup(options, options.dynamics_warmup)
+
+    def update(fit: optim.Fit, normalizer: Normalizer, batch: Batch, key: Key) -> tuple[optim.Fit, Metrics]:
+        rate = options.lr_dynamics * optim.warmup_factor(optim.steps_of(fit), rise)
+        return dynamics.update(model, optimiser, fit, normalizer, batch, key, rate=rate)
+
+    return Models(lambda params: optim.start(optimiser, params.dynamics), update)
+
+
+def _imagine(
+    learner: Learner, network: NetworkConfig, gamma: float, task: Task
+) -> Callable[[FinetuneState, Key], Imagination]:
+    value_net = make_value(task.obs_dim, network)
+    model = make_dynamics(task.obs_dim, task.act_dim, network)
+
+    def policy(state: FinetuneState, obs: Array, context: Array | None, key: Key) -> Array:
+        return learner.act(state.learner, learner.init_carry(), obs, key, explore=True, context=context)[0]
+
+    def imagine(state: FinetuneState, key: Key) -> Imagination:
+        frozen = state.frozen
+        # One member for the whole batch, redrawn at each update: the same expected gradient as one per row, at a
+        # fraction of the cost, and no rollout mixes two models.
+        member = dynamics.draw_member(frozen.dynamics if state.models is None else state.models.params, key)
+        return Imagination(
+            value=lambda obs: value.predict(value_net, frozen.value, frozen.normalizer, obs),
+            policy=lambda obs, context, key: policy(state, obs, context, key),
+            dynamics=lambda obs, action, key: dynamics.predict(model, member, frozen.normalizer, obs, action)[0],
+            reward=_needed(task.reward, "reward"),
+            terminated=_needed(task.terminated, "terminated"),
+            gamma=gamma,
+        )
+
+    return imagine
+
+
+def _needed(function: Callable[..., Array] | None, name: str) -> Callable[..., Array]:
+    if function is None:
+        raise UserError(f"methods that imagine need a task with `{name}` as a function of observations")
+    return function

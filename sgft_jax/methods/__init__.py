@@ -1,0 +1,38 @@
+"""The methods, one file each. `get_method` finds them by name, or a method of your own by its Python file."""
+
+import importlib
+import re
+from functools import cache
+
+from sgft_jax import extend
+from sgft_jax.types import Method, UserError, unknown
+
+# In the order of tables and figures: the ones to try first stand first.
+NAMES = (
+    "sgft-sac", "sgft-relabel", "sgft-mpc", "sgft-tdmpc2", "sgft", "tdmpc2", "mbpo", "sac", "rlpd", "sac-online", "iql",
+    "sac-reset", "pbrs", "pbrs-branch", "frozen-critic", "sgft-tdmpc2-code",
+)  # fmt: skip
+DEFAULT = "sgft-sac"
+
+
+@cache
+def get_method(name: str) -> Method:
+    """The method of that name, or the `METHOD` of a Python file or module of your own (docs/extending.md).
+
+    UserError lists what exists and guesses what was meant, or says what is wrong with the file.
+    """
+    if name in NAMES:
+        return importlib.import_module(f"sgft_jax.methods.{name.replace('-', '_')}").METHOD
+    if not extend.is_source(name):
+        raise UserError(f"{unknown('method', name, NAMES)}; or name a file, e.g. my_{name}.py")
+    method = extend.load("method", name, "METHOD").METHOD
+    if not isinstance(method, Method):
+        raise UserError(f"method {name}: METHOD is a {type(method).__name__}, not a sgft_jax.Method")
+    if method.name in NAMES or not re.fullmatch(r"[\w-]+", method.name):
+        raise UserError(f"method {name}: the name {method.name!r} is taken or names no folder; choose another")
+    return method
+
+
+def all_methods() -> dict[str, Method]:
+    """Every method that comes with the package, by name."""
+    return {name: get_method(name) for name in NAMES}

@@ -1,0 +1,112 @@
+"""IQL: in-sample learning, offline from simulated data, then with real transitions in half of each batch."""
+
+from dataclasses import dataclass
+
+from sgft_jax import checks
+from sgft_jax.methods.options import LoopOptions
+from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
+
+
+@dataclass(frozen=True)
+class Config(LoopOptions):
+    """Options of `iql`; the defaults are Kostrikov et al. 2022's for locomotion."""
+
+    lr_actor: float = 3e-4
+    """Adam learning rate of the actor."""
+    lr_critic: float = 3e-4
+    """Adam learning rate of critic and value."""
+    tau: float = 0.005
+    """Averaging rate of the target critic."""
+    expectile: float = 0.7
+    """V is the mean of the data's actions at 0.5 and tends to their best towards 1."""
+    beta: float = 3.0
+    """Inverse temperature of the advantage weights; 0 clones the data."""
+    reward_scale: float | None = None
+    """Factor on every reward; None = episode length / (best - worst return of the simulated episodes)."""
+    simulated_share: float = 0.5
+    """Share of each batch that is simulated, once there are real transitions."""
+    simulated_transitions: int = 1_000_000
+    """Simulated transitions, of the simulator's policy with more and more random actions."""
+    simulated_ladder: float = 0.6
+    """Share of random actions in the last of these episodes; it grows from 0 in the first."""
+    offline_updates: int = 500_000
+    """Updates on the simulated transitions alone, before the first real rollout."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.positive(self, "lr_actor", "lr_critic", "reward_scale")
+        checks.not_negative(self, "beta", "offline_updates")
+        checks.share(self, "tau", "expectile", "simulated_share", "simulated_ladder")
+        checks.at_least(self, 1, "simulated_transitions")
+
+
+def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
+    """The finetuner; the simulator's policy makes data and the initial rollouts, the agent starts from nothing."""
+    import jax.numpy as jnp
+
+    from sgft_jax.data import sources
+    from sgft_jax.finetuner import FinetuneState, Parts, assemble
+    from sgft_jax.learners import iql
+    from sgft_jax.learners.sac import SACParams
+    from sgft_jax.methods.options import card_of
+    from sgft_jax.policies import network_of, sac_policy
+    from sgft_jax.transforms import compose
+    from sgft_jax.types import Array, Key, PyTree, SimulatedData
+
+    network = network_of(card_of(prior))
+    hyper = iql.IQLHyper(
+        lr_actor=config.lr_actor, lr_critic=config.lr_critic, lr_value=config.lr_critic, tau=config.tau,
+        expectile=config.expectile, beta=config.beta,
+    )  # fmt: skip
+    structure = iql.IQLConfig(task.obs_dim, task.act_dim, network=network, max_grad_norm=config.max_grad_norm)
+    learner = iql.make_iql(structure, hyper)
+
+    def reward_scale(simulated: SimulatedData | None) -> Array:
+        """Published scaling: the returns of the data span the length of an episode."""
+        if config.reward_scale is not None or simulated is None:
+            return jnp.float32(config.reward_scale or 1.0)
+        span = jnp.max(simulated.returns) - jnp.min(simulated.returns)
+        return jnp.float32(task.episode_length / jnp.maximum(span, 1e-6))
+
+    def start(params: SACParams | None, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
+        state = learner.init(key)
+        state = state.replace(hyper=state.hyper._replace(reward_scale=reward_scale(simulated)))
+        if params is None:
+            return state, SACParams(None, None, None, None, state.normalizer)
+        return state.replace(normalizer=params.normalizer), params._replace(actor=None, critic=None)
+
+    def act(
+        state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
+    ) -> tuple[Array, PyTree]:
+        return learner.act(state.learner, carry, obs, key, explore=explore)
+
+    def export(state: FinetuneState) -> SACParams:
+        actor = iql.as_tanh_gaussian(state.learner.actor.params)
+        return state.frozen._replace(actor=actor, critic=state.learner.critic.params)
+
+    n_sim = round(config.simulated_share * config.batch_size) if prior is not None else 0
+    source = sources.mixture(config.batch_size - n_sim, n_sim)
+    simulation = Simulation(config.simulated_transitions, config.simulated_ladder, config.offline_updates)
+    policy = sac_policy(task.obs_dim, task.act_dim, network)
+    parts = Parts(
+        learner=learner,
+        start=start,
+        init_carry=learner.init_carry,
+        act=act,
+        export=export,
+        policy=policy,
+        source=lambda state: source,
+        offline=sources.simulated_rows(config.batch_size),
+        transform=compose(),
+    )
+    with_prior = prior is not None
+    return assemble(
+        parts, config, task, initial_policy=policy if with_prior else None,
+        simulation=simulation if with_prior else None,
+    )  # fmt: skip
+
+
+METHOD = Method(
+    "iql", "offline", "in-sample learning: offline from simulated data, then online", "Kostrikov 2022", Config, build,
+    needs_prior=False,
+)  # fmt: skip

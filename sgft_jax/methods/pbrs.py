@@ -1,0 +1,35 @@
+"""Potential-based reward shaping: SAC with rewards shaped by V_sim over the infinite horizon, new critic."""
+
+from dataclasses import dataclass
+
+from sgft_jax import checks
+from sgft_jax.methods.options import SACOptions
+from sgft_jax.types import Finetuner, Method, Prior, Task
+
+
+@dataclass(frozen=True)
+class Config(SACOptions):
+    """Options of `pbrs`."""
+
+    clip_shaped: float | None = 2.0
+    """Bound on the shaped reward; None = no bound, as published. A bound breaks the invariance of the best policy."""
+    reset_critic: bool = True
+    """Start from a new critic; False keeps the simulator's, read as Q(s, a) - V_sim(s)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.positive(self, "clip_shaped")
+
+
+def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
+    """The finetuner."""
+    from sgft_jax.finetuner import sac_finetuner
+    from sgft_jax.transforms import clip, shape
+
+    transforms = (shape,) if config.clip_shaped is None else (shape, clip(config.clip_shaped))
+    return sac_finetuner(
+        config, prior, task, transforms=transforms, reset_critic=config.reset_critic, value_baseline=True
+    )
+
+
+METHOD = Method("pbrs", "model-free", "SAC on shaped rewards, infinite horizon, new critic", "Ng 1999", Config, build)

@@ -1,0 +1,21 @@
+"""SAC on the task reward, from the simulator's actor and a new critic."""
+
+from dataclasses import dataclass
+
+from sgft_jax.methods.options import SACOptions
+from sgft_jax.types import Finetuner, Method, Prior, Task
+
+
+@dataclass(frozen=True)
+class Config(SACOptions):
+    """Options of `sac-reset`."""
+
+
+def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
+    """The finetuner."""
+    from sgft_jax.finetuner import sac_finetuner
+
+    return sac_finetuner(config, prior, task, reset_critic=True)
+
+
+METHOD = Method("sac-reset", "model-free", "SAC on the task reward, new critic", "Haarnoja 2018", Config, build)

@@ -1,0 +1,44 @@
+"""Model-free SGFT: shaped rewards over segments of H steps, no models."""
+
+from dataclasses import dataclass
+
+from sgft_jax import checks
+from sgft_jax.methods.options import SACOptions
+from sgft_jax.types import Finetuner, Method, Prior, Task
+
+
+@dataclass(frozen=True)
+class Config(SACOptions):
+    """Options of `sgft`."""
+
+    horizon: int = 1
+    """Steps of a segment, the paper's H."""
+    lr_warmup: int | None = 0
+    """Updates over which the critic's learning rate rises from 0. V_sim stands at the end of every segment and
+    protects the critic already."""
+    clip_shaped: float | None = 2.0
+    """Bound on the shaped reward; None = no bound, as in the paper."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.at_least(self, 1, "horizon")
+        checks.positive(self, "clip_shaped")
+
+
+def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
+    """The finetuner."""
+    from sgft_jax.finetuner import sac_finetuner
+    from sgft_jax.transforms import clip, shape, shorten
+
+    bounded = () if config.clip_shaped is None else (clip(config.clip_shaped),)
+    return sac_finetuner(
+        config,
+        prior,
+        task,
+        transforms=(shape, *bounded, shorten(config.horizon)),
+        horizon_dim=config.horizon,
+        value_baseline=True,
+    )
+
+
+METHOD = Method("sgft", "sgft", "shaped rewards over short horizons, no models", "SGFT 2025", Config, build)

@@ -1,0 +1,83 @@
+"""MPC-SGFT on a prior of SAC: plans of H steps by its dynamics ensemble, which learns, that end in V_sim.
+
+Source: SGFT (Yin et al., ICLR 2025), Algorithm 3. The paper plans in TD-MPC2's latent space (`sgft-tdmpc2`).
+"""
+
+from dataclasses import dataclass
+
+from sgft_jax import checks
+from sgft_jax.methods.options import LoopOptions
+from sgft_jax.types import Finetuner, Method, Prior, Task
+
+
+@dataclass(frozen=True)
+class Config(LoopOptions):
+    """Options of `sgft-mpc`."""
+
+    horizon: int = 1
+    """Steps of a plan, the paper's H."""
+    plan_samples: int = 128
+    """Action sequences that a plan tries in each of its iterations."""
+    plan_noise: float = 0.5
+    """Std of the noise on what the policy proposes, in units of the action's range."""
+    explore_noise: float = 0.4
+    """Std of the noise on what a plan does in a training rollout. A plan does much the same in the same state, and from
+    such data no model learns what actions do."""
+    lr_dynamics: float = 3e-4
+    """Adam learning rate of the dynamics ensemble."""
+    dynamics_warmup: int | None = 0
+    """Updates over which that rate rises from 0; None = the updates of 1,000 real transitions."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.at_least(self, 1, "horizon")
+        checks.at_least(self, 8, "plan_samples")
+        checks.not_negative(self, "plan_noise", "explore_noise", "dynamics_warmup")
+        checks.positive(self, "lr_dynamics")
+
+
+def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
+    """The finetuner."""
+    from sgft_jax.data import sources
+    from sgft_jax.finetuner import FinetuneState, Parts, assemble, dynamics_models
+    from sgft_jax.learners.idle import IDLE
+    from sgft_jax.learners.sac import SACParams
+    from sgft_jax.methods.options import card_of
+    from sgft_jax.planning.mpc import MPCConfig
+    from sgft_jax.policies import mpc_policy, network_of
+    from sgft_jax.transforms import compose
+    from sgft_jax.types import Array, Key, PyTree, SimulatedData
+
+    card = card_of(prior)
+    network = network_of(card)
+    plan = {"horizon": config.horizon, "samples": config.plan_samples, "noise": config.plan_noise}
+    structure = MPCConfig(task.obs_dim, task.act_dim, network, **plan, gamma=card["gamma"])
+    policy = mpc_policy(structure, task, explore_noise=config.explore_noise)
+
+    def start(params: SACParams, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
+        del key, simulated
+        return (), params._replace(dynamics=None)
+
+    def export(state: FinetuneState) -> SACParams:
+        return state.frozen._replace(dynamics=state.models.params)
+
+    def act(
+        state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
+    ) -> tuple[Array, PyTree]:
+        return policy.act(export(state), carry, obs, key, explore=explore)
+
+    parts = Parts(
+        learner=IDLE,
+        start=start,
+        init_carry=policy.init_carry,
+        act=act,
+        export=export,
+        policy=policy,
+        source=lambda state: sources.real_rows(config.batch_size),
+        transform=compose(),
+        models=dynamics_models(config, network, task),
+    )
+    return assemble(parts, config, task, card={"plan": plan})
+
+
+METHOD = Method("sgft-mpc", "sgft", "plans of H steps by learning models, ended by V_sim", "SGFT 2025", Config, build)

@@ -1,0 +1,59 @@
+"""SGFT-SAC that also learns at the simulator's states, with what the fitted models expect there."""
+
+from dataclasses import dataclass
+
+from sgft_jax import checks
+from sgft_jax.methods import sgft_sac
+from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
+
+
+@dataclass(frozen=True)
+class Config(sgft_sac.Config):
+    """Options of `sgft-relabel`."""
+
+    critic_warmup: int | None = 0
+    """Updates at the start in which the critic alone learns. The relabelled rows know of all kinds of actions from the
+    first update on, so the actor need not wait."""
+    simulated_transitions: int = 200_000
+    """Simulated transitions, of the simulator's policy with more and more random actions. Each batch gets as many of
+    them as it has real ones."""
+    simulated_ladder: float = 0.6
+    """Share of random actions in the last of these episodes; it grows from 0 in the first."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.share(self, "simulated_ladder")
+        checks.at_least(self, 1, "simulated_transitions")
+
+
+def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
+    """The finetuner."""
+    from sgft_jax.data import sources
+    from sgft_jax.finetuner import sac_finetuner
+    from sgft_jax.transforms import branch, clip, relabel, shape, shorten
+
+    source = sources.mixture(config.batch_size, config.batch_size)
+    bounded = () if config.clip_shaped is None else (clip(config.clip_shaped),)
+    return sac_finetuner(
+        config,
+        prior,
+        task,
+        transforms=(
+            relabel(source.n_real),
+            branch(config.horizon, config.branches, noise=config.branch_noise),
+            shape,
+            *bounded,
+            shorten(config.horizon),
+        ),
+        horizon_dim=config.horizon,
+        reset_critic=config.reset_critic,
+        value_baseline=True,
+        source=lambda state: source,
+        simulation=Simulation(config.simulated_transitions, config.simulated_ladder),
+        actor_batch=source.n_real + source.n_sim if config.actor_real_only else None,
+    )
+
+
+METHOD = Method(
+    "sgft-relabel", "sgft", "SGFT-SAC that also learns at the simulator's states", "SGFT 2025, ours", Config, build
+)

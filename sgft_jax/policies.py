@@ -1,0 +1,92 @@
+"""How the parameters of a prior act and value states, for each algorithm that leaves one."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from sgft_jax.io.config import config_from_json
+from sgft_jax.learners import tdmpc2, tdmpc2_model
+from sgft_jax.learners.sac import SACParams
+from sgft_jax.models import dynamics, value
+from sgft_jax.models.config import NetworkConfig
+from sgft_jax.models.networks import add_noise, make_actor, make_dynamics, make_value, tanh_gaussian_action
+from sgft_jax.models.normalizer import normalize
+from sgft_jax.planning import mpc
+from sgft_jax.types import Array, Key, Policy, PyTree, Task, UserError
+
+
+def make_policy(card: Mapping[str, Any], task: Task) -> Policy:
+    """How the prior with this card acts. task: its task; policies that plan ask it for rewards.
+
+    card: `algorithm`, `gamma`, `network` (SAC) or `config` (TD-MPC2), and `plan` for a prior of SAC that plans.
+    """
+    if card.get("algorithm", "sac") == "tdmpc2":
+        own = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
+        structure = tdmpc2_model.named_config(task.obs_dim, task.act_dim, **own)
+        return tdmpc2_policy(structure, tdmpc2.TDMPC2Hyper(gamma=card["gamma"]))
+    network = network_of(card)
+    if plan := card.get("plan"):
+        config = mpc.MPCConfig(task.obs_dim, task.act_dim, network, **plan, gamma=card["gamma"])
+        return mpc_policy(config, task)
+    return sac_policy(task.obs_dim, task.act_dim, network)
+
+
+def network_of(card: Mapping[str, Any]) -> NetworkConfig:
+    """The networks of a prior of SAC."""
+    return config_from_json(NetworkConfig, card["network"], where="network.")
+
+
+def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig) -> Policy:
+    """Actor, V_sim and dynamics ensemble of `SACParams`."""
+    actor = make_actor(obs_dim, act_dim, network)
+    value_net = make_value(obs_dim, network)
+    model = make_dynamics(obs_dim, act_dim, network)
+
+    def act(params: SACParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
+        moments = actor.apply(params.actor, normalize(params.normalizer, obs))
+        return tanh_gaussian_action(moments, key, explore=explore), carry
+
+    def predict(params: SACParams, obs: Array, action: Array, key: Key) -> Array:
+        member = dynamics.draw_member(params.dynamics, key)
+        return dynamics.predict(model, member, params.normalizer, obs, action)[0]
+
+    return Policy(
+        init_carry=lambda: (),
+        act=act,
+        value=lambda params, obs: value.predict(value_net, params.value, params.normalizer, obs),
+        predict=predict,
+        model_error=lambda params, obs, actions: dynamics.rollout_error(
+            model, params.dynamics, params.normalizer, obs, actions
+        ),
+    )
+
+
+def mpc_policy(config: mpc.MPCConfig, task: Task, *, explore_noise: float = 0.0) -> Policy:
+    """The same parameters, acting by plans. explore_noise: std of the noise on what an exploring plan does."""
+    if task.reward is None or task.terminated is None:
+        raise UserError("plans need a task whose reward and termination are functions of observations")
+    plan = mpc.make_act(config, reward=task.reward, terminated=task.terminated)
+
+    def act(params: SACParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
+        key_plan, key_noise = jax.random.split(key)
+        action, carry = plan(params, carry, obs, key_plan, explore=explore)
+        return add_noise(action, jnp.where(explore, explore_noise, 0.0), key_noise), carry
+
+    return sac_policy(config.obs_dim, config.act_dim, config.network)._replace(
+        init_carry=lambda: mpc.init_carry(config), act=act
+    )
+
+
+def tdmpc2_policy(config: tdmpc2.TDMPC2Config, hyper: tdmpc2.TDMPC2Hyper) -> Policy:
+    """The planner and the value of `TDMPC2Params`."""
+    learner = tdmpc2.make_tdmpc2(config, hyper)
+
+    def act(params: PyTree, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
+        return learner.act(tdmpc2.state_from_prior(config, hyper, params), carry, obs, key, explore=explore)
+
+    def value_of(params: PyTree, obs: Array) -> Array:
+        return tdmpc2_model.value_of(config, tdmpc2.state_from_prior(config, hyper, params), obs)
+
+    return Policy(learner.init_carry, act, value_of)

@@ -1,0 +1,182 @@
+"""Settings of pretraining, some of them by name: `PRESETS`. A preset keeps its meaning; a new idea is a new preset.
+
+Command lines read this module, so it imports neither JAX nor MuJoCo.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+from sgft_jax import checks
+from sgft_jax.models.config import NetworkConfig, Precision
+
+
+@dataclass(frozen=True)
+class PretrainConfig:
+    """Everything that decides the result of pretraining, apart from the task, the worlds and the seeds."""
+
+    algorithm: Literal["sac", "tdmpc2"] = "sac"
+    """What trains: SAC, whose V_sim and models SGFT-SAC needs, or TD-MPC2 for the methods that plan."""
+    env_steps: int = 8_000_000
+    """Environment steps of training, after the random actions."""
+    n_envs: int = 4096
+    """Environments stepped together."""
+    updates_per_step: int = 16
+    """Gradient steps per step of all environments."""
+    batch_size: int = 4096
+    """Transitions (TD-MPC2: windows of `horizon` steps) in a batch."""
+    gamma: float = 0.99
+    """Discount factor per control step."""
+    lr: float = 3e-4
+    """Adam learning rate of every network at the start."""
+    lr_end: float = 1.0
+    """Share of the learning rate that is left at the end; it falls linearly. A falling rate settles V_sim."""
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    """Networks of SAC."""
+    worlds: int = 2048
+    """Worlds compiled for each seed; every episode takes place in a random one."""
+    refresh_every: int = 0
+    """Chunks after which new worlds are drawn and all environments start new episodes; 0 keeps the first worlds."""
+    replay_capacity: int = 1_000_000
+    """Transitions kept; new ones replace the oldest."""
+    random_transitions: int = 500_000
+    """Transitions under random actions, collected first: they give the observation statistics and a part of every
+    batch."""
+    random_fraction: float = 0.5
+    """Share of each batch that comes from the random actions (paper: 0.5)."""
+    random_ladder: float = 0.0
+    """Environment i of n replaces a share i / (n - 1) * random_ladder of its actions by random ones. V_sim then also
+    knows states beside the policy's own path, where a real system leads; 0 replaces none."""
+    tau: float = 0.005
+    """Averaging rate of the target critic."""
+    alpha: float = 1.0
+    """Initial temperature of SAC; training adapts it to the target entropy."""
+    entropy_per_dim: float = -1.0
+    """Target entropy of SAC per action dimension, nats."""
+    policy_delay: int = 1
+    """Critic updates of SAC per actor update."""
+    ensemble_size: int = 5
+    """Dynamics models that SAC trains alongside."""
+    precision: Precision = "default"
+    """Matrix products of the updates on GPUs. V_sim is always evaluated in float32."""
+    size: str = "5M"
+    """TD-MPC2's networks by their published number of parameters: 1M, 5M, 19M, 48M or 317M."""
+    horizon: int = 3
+    """Steps of TD-MPC2's plans and training windows."""
+    plan_samples: int = 512
+    """Action sequences that TD-MPC2 samples in each iteration of a plan; it plans in evaluations alone."""
+    chunk_steps: int = 50
+    """Steps of all environments per compiled chunk; logs, evaluations and checkpoints come between chunks."""
+    eval_every: int = 4
+    """Chunks between evaluations."""
+    eval_episodes: int = 256
+    """Episodes of an evaluation, in worlds that training does not see."""
+    choose_from: float = 0.75
+    """Share of training after which evaluations compete for the prior. Earlier policies may succeed while their critic
+    still promises twice what can be had."""
+    report_episodes: int = 256
+    """Fresh episodes that measure the prior, at least; 256 give a 95 % interval of +-6 points at worst."""
+    checkpoint_every: int = 8
+    """Chunks between checkpoints."""
+
+    def __post_init__(self) -> None:
+        checks.at_least(
+            self, 1, "n_envs", "worlds", "env_steps", "random_transitions", "updates_per_step", "batch_size",
+            "replay_capacity", "policy_delay", "ensemble_size", "horizon", "plan_samples", "chunk_steps", "eval_every",
+            "eval_episodes", "report_episodes", "checkpoint_every",
+        )  # fmt: skip
+        checks.at_least(self, 0, "refresh_every")
+        checks.positive(self, "lr", "tau", "alpha")
+        checks.share(self, "random_ladder", "lr_end", "tau", "choose_from")
+        checks.below_one(self, "gamma", "random_fraction")
+        checks.finite(self, "entropy_per_dim")
+        for name in ("random_transitions", "replay_capacity"):
+            if getattr(self, name) < self.n_envs:
+                wanted = f"at least n-envs = {self.n_envs}, one step of all environments"
+                raise checks.refusal(name, getattr(self, name), wanted)
+
+    @property
+    def chunk_env_steps(self) -> int:
+        """Environment steps of one chunk."""
+        return self.n_envs * self.chunk_steps
+
+    @property
+    def chunks(self) -> int:
+        """Chunks of the whole training."""
+        return math.ceil(self.env_steps / self.chunk_env_steps)
+
+
+_NORMED = NetworkConfig(hidden=(256, 256), layer_norm=True)
+
+PRESETS: dict[str, PretrainConfig] = {
+    # The paper's numbers (Appendix C): one update of batch 256 per environment step, 2 x 512 units, alpha from 1.
+    "paper": PretrainConfig(
+        n_envs=64,
+        env_steps=5_000_000,
+        random_transitions=25_000_000,
+        updates_per_step=64,
+        batch_size=256,
+        replay_capacity=5_000_000,
+        chunk_steps=200,
+    ),
+    # What pays on one GPU today: learning needs some 30,000 updates whatever the number of environments, so enough of
+    # both to keep the device busy; layer-normed critics, fast targets, a falling learning rate.
+    "fast": PretrainConfig(
+        n_envs=1024,
+        env_steps=2_500_000,
+        random_transitions=102_400,
+        random_fraction=0.1,
+        random_ladder=0.6,
+        updates_per_step=32,
+        batch_size=1024,
+        gamma=0.97,
+        lr=5e-4,
+        lr_end=0.05,
+        tau=0.01,
+        alpha=0.1,
+        network=_NORMED,
+    ),
+    # TD-MPC2 in many environments at once, for the methods that plan. Its own numbers but for what massive collection
+    # asks for: larger batches, and the discount factor and the exploration of `fast`.
+    "tdmpc2": PretrainConfig(
+        algorithm="tdmpc2",
+        n_envs=512,
+        env_steps=1_024_000,
+        random_transitions=51_200,
+        random_fraction=0.1,
+        random_ladder=0.6,
+        updates_per_step=16,
+        batch_size=512,
+        replay_capacity=512_000,
+        gamma=0.97,
+        lr=3e-4,
+        lr_end=0.1,
+        tau=0.01,
+        eval_every=10,
+        eval_episodes=128,
+    ),
+    # Two CPU cores, under three minutes, most of which go into the updates: one small update per environment step
+    # learns pushing from 40,000 steps; 30,000 updates are too few, with 60,000 steps too.
+    "cpu": PretrainConfig(
+        n_envs=32,
+        worlds=32,
+        env_steps=38_400,
+        random_transitions=1_024,
+        random_fraction=0.1,
+        random_ladder=0.5,
+        updates_per_step=32,
+        batch_size=128,
+        replay_capacity=100_000,
+        gamma=0.95,
+        lr=1e-3,
+        lr_end=0.1,
+        tau=0.02,
+        alpha=0.1,
+        network=NetworkConfig(hidden=(96, 96), layer_norm=True),
+        ensemble_size=3,
+        chunk_steps=100,
+        eval_every=1,
+        eval_episodes=32,
+        report_episodes=64,
+    ),
+}

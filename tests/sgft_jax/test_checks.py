@@ -1,0 +1,70 @@
+"""Checks of options: what passes, what is refused, and in which words."""
+
+import dataclasses
+import math
+from typing import Any
+
+import pytest
+
+from sgft_jax import checks
+from sgft_jax.types import UserError
+
+
+@dataclasses.dataclass
+class Config:
+    learning_rate: Any = None
+
+
+GOOD = [
+    (checks.finite, [-1.0, 0.0, 1e30]),
+    (checks.positive, [1e-30, 3]),
+    (checks.not_negative, [0.0, 3]),
+    (checks.share, [0.0, 0.5, 1.0]),
+    (checks.below_one, [0.0, 0.999]),
+]
+BAD = [
+    (checks.finite, [math.nan, math.inf, -math.inf]),
+    (checks.positive, [math.nan, math.inf, 0.0, -1e-30]),
+    (checks.not_negative, [math.nan, math.inf, -1e-30]),
+    (checks.share, [math.nan, math.inf, -0.001, 1.001]),
+    (checks.below_one, [math.nan, -0.001, 1.0, 2.0]),
+]
+
+
+@pytest.mark.parametrize(("check", "values"), GOOD)
+def test_good_values_pass_alone_in_tuples_and_not_at_all(check, values):
+    for value in [*values, tuple(values), None]:
+        check(Config(value), "learning_rate")
+
+
+@pytest.mark.parametrize(("check", "value"), [(check, value) for check, values in BAD for value in values])
+def test_bad_values_are_refused_alone_and_in_tuples(check, value):
+    for held in (value, (0.5, value)):
+        with pytest.raises(UserError, match=f"^option learning-rate is {value}: must be "):
+            check(Config(held), "learning_rate")
+
+
+def test_the_whole_line():
+    with pytest.raises(UserError) as refused:
+        checks.positive(Config(-0.1), "learning_rate")
+    assert str(refused.value) == "option learning-rate is -0.1: must be a positive number"
+
+
+def test_at_least():
+    checks.at_least(Config(2), 2, "learning_rate")
+    for value in (1, math.inf, math.nan):
+        with pytest.raises(UserError, match="must be at least 2"):
+            checks.at_least(Config(value), 2, "learning_rate")
+
+
+def test_layers():
+    checks.layers(Config((1, 1)), "learning_rate")
+    for value, said in (((), "empty"), ((8, 0), "8 0"), ((-1,), "-1")):
+        with pytest.raises(UserError, match=f"is {said}: must be one or more layers of at least 1 unit"):
+            checks.layers(Config(value), "learning_rate")
+
+
+def test_one_of_names_the_closest():
+    checks.one_of(Config("relu"), "learning_rate", ("relu", "tanh"))
+    with pytest.raises(UserError, match="option learning-rate: there is no 'rely', did you mean 'relu'"):
+        checks.one_of(Config("rely"), "learning_rate", ("relu", "tanh"))
