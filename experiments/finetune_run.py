@@ -125,7 +125,6 @@ class _Run:
         if not values:
             return {}
         for record, own in self._each(values):
-            record.check_finite(done, own)
             record.metrics(done, own)
             record.time(done, seconds)
         real = values.get("real/score")
