@@ -4,7 +4,7 @@ Pure functions of NumPy arrays; nothing here runs under jit.
 """
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -87,8 +87,8 @@ def probability_of_improvement(above: ArrayLike, below: ArrayLike) -> float:
     above, below: [members] of either, not necessarily equally many. Source: Agarwal et al. 2021 (Mann-Whitney U).
     """
     above, below = np.asarray(above, np.float64), np.asarray(below, np.float64)
-    statistic, _ = stats.mannwhitneyu(above, below, method="asymptotic")
-    return float(statistic) / (len(above) * len(below))
+    found: Any = stats.mannwhitneyu(above, below, method="asymptotic")
+    return float(found.statistic) / (len(above) * len(below))
 
 
 def success_interval(
