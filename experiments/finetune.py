@@ -30,7 +30,7 @@ from sgft_jax.finetune import make_finetuner
 from sgft_jax.finetune_mpc import plan_options
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.config import config_to_json
-from sgft_jax.io.log import RunProgress
+from sgft_jax.io.progress import RunProgress
 from sgft_jax.io.priors import load_priors
 from sgft_jax.methods import METHODS, FinetuneConfig, Method, dynamics_warmup, lr_warmup, policy_delay
 from sgft_jax.types import Array, Finetuner, Key, PyTree, UserError

@@ -18,7 +18,8 @@ from experiments.video import before_and_after
 from sgft_jax.analysis import plot
 from sgft_jax.analysis.stats import iqm_interval
 from sgft_jax.io import checkpoint
-from sgft_jax.io.log import MetricsLog, RealLog, write_summary
+from sgft_jax.io.log import MetricsLog, write_summary
+from sgft_jax.io.real import RealStore
 from sgft_jax.types import Array, Metrics, Prior, PyTree
 
 OFFLINE = "offline"  # checkpoints of learning before the first real rollout: those of the run count rollouts
@@ -29,7 +30,7 @@ class Record:
 
     def __init__(self, folder: Path, env: Env, gap: Gap, method: str, seeds: list[int]) -> None:
         self.folder, self.env, self.gap, self.method, self.seeds = folder, env, gap, method, seeds
-        self.log, self.real = MetricsLog(folder), RealLog(folder)
+        self.log, self.real = MetricsLog(folder), RealStore(folder)
         self.expect = {"kind": "finetune", "task": env.name, "method": method, "seeds": seeds}
 
     def rollouts(self) -> int:

@@ -24,7 +24,8 @@ from experiments.pretrain_run import Program, Saved, make_program
 from experiments.pretraining import PretrainState, memory
 from experiments.worlds import real_env, real_worlds
 from sgft_jax.analysis.stats import iqm_interval
-from sgft_jax.io.log import MetricsLog, RunProgress, write_summary
+from sgft_jax.io.log import MetricsLog, write_summary
+from sgft_jax.io.progress import RunProgress
 from sgft_jax.io.priors import load_priors
 from sgft_jax.types import Key, Metrics, PyTree, UserError
 

@@ -25,7 +25,8 @@ from experiments.options import seed_list, seeds_name
 from sgft_jax.analysis import plot
 from sgft_jax.finetune_planner import make_planner
 from sgft_jax.io import checkpoint, runs
-from sgft_jax.io.log import EVAL, MetricsLog, RunProgress, read_jsonl, write_summary
+from sgft_jax.io.log import EVAL, MetricsLog, read_jsonl, write_summary
+from sgft_jax.io.progress import RunProgress
 from sgft_jax.learners import tdmpc2
 from sgft_jax.methods import finetune_config, get_method
 from sgft_jax.models import normalizer

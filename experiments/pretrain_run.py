@@ -28,7 +28,8 @@ from experiments.worlds import heldout_worlds, load_gap, real_env, training_worl
 from sgft_jax import mesh
 from sgft_jax.analysis import plot
 from sgft_jax.io import checkpoint, runs
-from sgft_jax.io.log import EVAL, Clock, MetricsLog, RunProgress, read_jsonl, write_summary
+from sgft_jax.io.log import EVAL, MetricsLog, read_jsonl, write_summary
+from sgft_jax.io.progress import Clock, RunProgress
 from sgft_jax.types import Key, PyTree
 
 _WORLDS, _RANDOM, _START, _REPORT = range(4)  # purposes, folded into a seed's key

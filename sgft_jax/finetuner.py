@@ -32,7 +32,7 @@ from sgft_jax.types import (
     Policy,
     Prior,
     PyTree,
-    Simulated,
+    SimulatedData,
     Simulation,
     Source,
     Task,
@@ -74,7 +74,7 @@ class Parts(NamedTuple):
     """
 
     learner: Learner
-    start: Callable[[PyTree, Key, Simulated | None], tuple[PyTree, PyTree]]
+    start: Callable[[PyTree, Key, SimulatedData | None], tuple[PyTree, PyTree]]
     init_carry: Callable[[], PyTree]
     act: Callable[..., tuple[Array, PyTree]]
     export: Callable[[FinetuneState], PyTree]
@@ -98,7 +98,7 @@ def assemble(
 ) -> Finetuner:
     """The finetuner of these parts; initial_policy, simulation, card: see `Finetuner`."""
 
-    def init(params: PyTree, key: Key, simulated: Simulated | None = None) -> FinetuneState:
+    def init(params: PyTree, key: Key, simulated: SimulatedData | None = None) -> FinetuneState:
         key_learner, key_transform = jax.random.split(key)
         own = jax.tree.map(jnp.copy, params)  # the caller may donate the state; the prior must survive it
         learner, frozen = parts.start(own, key_learner, simulated)
@@ -110,7 +110,7 @@ def assemble(
         return state._replace(replay=parts.memory.add_episode(state.replay, rows, valid))
 
     def update(
-        state: FinetuneState, key: Key, simulated: Simulated | None, offline: bool
+        state: FinetuneState, key: Key, simulated: SimulatedData | None, offline: bool
     ) -> tuple[FinetuneState, Metrics]:
         keys = jax.random.split(key, 6)
         source = parts.offline if offline and parts.offline else parts.source(state)
@@ -132,10 +132,10 @@ def assemble(
         return state._replace(learner=learner, transform=own), metrics
 
     def learn(
-        state: FinetuneState, key: Key, updates: int, simulated: Simulated | None = None, *, offline: bool = False
+        state: FinetuneState, key: Key, updates: int, simulated: SimulatedData | None = None, *, offline: bool = False
     ) -> tuple[FinetuneState, Metrics]:
         if simulation is not None and simulated is None:
-            raise UserError("this method learns from transitions of the simulator too: give it some (`Simulated`)")
+            raise UserError("this method learns from transitions of the simulator too: give it some (`SimulatedData`)")
         one = lambda state, key: update(state, key, simulated, offline)  # noqa: E731
         state, metrics = jax.lax.scan(one, state, jax.random.split(key, updates))
         return state, jax.tree.map(jnp.mean, metrics)
@@ -186,6 +186,7 @@ def sac_finetuner(
     new_critic = reset_critic or fresh
     rows = source or (lambda state: sources.real_rows(options.batch_size))
     numbers = {name: structure.pop(name) for name in ("entropy_per_dim",) if name in structure}
+    structure = {"tune_alpha": False} | structure
     config = sac.SACConfig(
         task.obs_dim,
         task.act_dim,
@@ -196,7 +197,7 @@ def sac_finetuner(
         critic_baseline=value_baseline and not new_critic,
         policy_delay=rules.policy_delay(options),
         max_grad_norm=options.max_grad_norm,
-        **({"tune_alpha": False} | structure),
+        **structure,
     )
     hyper = sac.SACHyper(
         lr_actor=options.lr_actor,
@@ -212,7 +213,7 @@ def sac_finetuner(
     learner = sac.make_sac(config, hyper)
     whole = steps_to_go(jnp.int32(horizon_dim), horizon_dim) if config.context_dim else None
 
-    def start(params: sac.SACParams | None, key: Key, simulated: Simulated | None) -> tuple[PyTree, PyTree]:
+    def start(params: sac.SACParams | None, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
         del simulated
         if params is None:
             state = learner.init(key)

@@ -85,7 +85,7 @@ class Source(NamedTuple):
     n_sim: int = 0
 
 
-class Simulated(NamedTuple):
+class SimulatedData(NamedTuple):
     """A fixed set of simulated transitions, seen by one member. All members share the arrays behind it.
 
     draw(key, n) -> n rows, [n, ...]. returns: [episodes] undiscounted task returns of the episodes they come from.
@@ -233,7 +233,7 @@ class Simulation(NamedTuple):
 class Finetuner(NamedTuple):
     """Fine-tuning of one agent on one real system, as pure functions; the caller vmaps over members.
 
-    init(params, key, simulated) -> state. params: of a prior, None without one. simulated: a `Simulated` or None.
+    init(params, key, simulated) -> state. params: of a prior, None without one. simulated: a `SimulatedData` or None.
     init_carry() -> carry of an episode.
     act(state, carry, obs [obs_dim], key, *, explore) -> (action [act_dim], carry); `explore` may be traced.
     observe(state, transitions [T, ...], valid [T]) -> state: keeps the rows of one episode, in order.
@@ -248,7 +248,7 @@ class Finetuner(NamedTuple):
     card: what the card of an exported policy says beyond the prior's, such as the options of a plan.
     """
 
-    init: Callable[[PyTree, Key, Simulated | None], PyTree]
+    init: Callable[[PyTree, Key, SimulatedData | None], PyTree]
     init_carry: Callable[[], PyTree]
     act: Callable[..., tuple[Array, PyTree]]
     observe: Callable[[PyTree, Transition, Array], PyTree]

@@ -1,6 +1,6 @@
 """Sources of batches: real rows from a replay, simulated rows from a fixed set, and mixtures of both.
 
-The state of every source here is (replay of the real system, `Simulated` or None). Real rows come first.
+The state of every source here is (replay of the real system, `SimulatedData` or None). Real rows come first.
 """
 
 import jax
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from sgft_jax.data import replay, sequences
 from sgft_jax.types import Array, Batch, Key, Source
 
-State = tuple  # (ReplayState or SequenceState, Simulated or None)
+State = tuple  # (ReplayState or SequenceState, SimulatedData or None)
 
 
 def real_rows(n: int) -> Source:

@@ -51,7 +51,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.methods.options import card_of
     from sgft_jax.policies import network_of, sac_policy
     from sgft_jax.transforms import compose
-    from sgft_jax.types import Array, Key, PyTree, Simulated
+    from sgft_jax.types import Array, Key, PyTree, SimulatedData
 
     network = network_of(card_of(prior))
     hyper = iql.IQLHyper(
@@ -61,14 +61,14 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     structure = iql.IQLConfig(task.obs_dim, task.act_dim, network=network, max_grad_norm=config.max_grad_norm)
     learner = iql.make_iql(structure, hyper)
 
-    def reward_scale(simulated: Simulated | None) -> Array:
+    def reward_scale(simulated: SimulatedData | None) -> Array:
         """Published scaling: the returns of the data span the length of an episode."""
         if config.reward_scale is not None or simulated is None:
             return jnp.float32(config.reward_scale or 1.0)
         span = jnp.max(simulated.returns) - jnp.min(simulated.returns)
         return jnp.float32(task.episode_length / jnp.maximum(span, 1e-6))
 
-    def start(params: SACParams | None, key: Key, simulated: Simulated | None) -> tuple[PyTree, PyTree]:
+    def start(params: SACParams | None, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
         state = learner.init(key)
         state = state.replace(hyper=state.hyper._replace(reward_scale=reward_scale(simulated)))
         if params is None:

@@ -46,7 +46,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.planning.mpc import MPCConfig
     from sgft_jax.policies import mpc_policy, network_of
     from sgft_jax.transforms import compose
-    from sgft_jax.types import Array, Key, PyTree, Simulated
+    from sgft_jax.types import Array, Key, PyTree, SimulatedData
 
     card = card_of(prior)
     network = network_of(card)
@@ -54,7 +54,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     structure = MPCConfig(task.obs_dim, task.act_dim, network, **plan, gamma=card["gamma"])
     policy = mpc_policy(structure, task, explore_noise=config.explore_noise)
 
-    def start(params: SACParams, key: Key, simulated: Simulated | None) -> tuple[PyTree, PyTree]:
+    def start(params: SACParams, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
         del key, simulated
         return (), params._replace(dynamics=None)
 

@@ -64,7 +64,7 @@ def planner(
     from sgft_jax.methods.options import card_of, warmup
     from sgft_jax.policies import tdmpc2_policy
     from sgft_jax.transforms import compose, stateless
-    from sgft_jax.types import Array, Batch, Key, PyTree, Simulated
+    from sgft_jax.types import Array, Batch, Key, PyTree, SimulatedData
 
     card = card_of(prior)
     structure = tdmpc2_model.named_config(
@@ -77,7 +77,7 @@ def planner(
     )
     learner = tdmpc2.make_tdmpc2(structure, hyper)
 
-    def start(params: TDMPC2Params | None, key: Key, simulated: Simulated | None) -> tuple[PyTree, PyTree]:
+    def start(params: TDMPC2Params | None, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
         del simulated
         if params is None:
             return learner.init(key), None

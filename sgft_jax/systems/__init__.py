@@ -1,0 +1,35 @@
+"""The real side of fine-tuning: what plays episodes, in simulation or on hardware."""
+
+from typing import TYPE_CHECKING, Any, Protocol
+
+from sgft_jax.types import Array, Key, PyTree
+
+if TYPE_CHECKING:
+    from envs.rollout import Episode
+
+
+class System(Protocol):
+    """A real system, or several that are played together; M members, each a seed on one of them.
+
+    `Simulated` plays whole episodes in one compiled program. A robot is stepped from Python.
+    """
+
+    def play(self, policy: Any, states: PyTree, keys: Key, *, explore: bool) -> "Episode":
+        """Episodes [M, n, ...] of a policy.
+
+        policy: has `init_carry()` and `act(state, carry, obs, key, *, explore)`, such as a `Finetuner` or a `Policy`.
+        states: [M, ...] what `act` takes first. keys: [M, n], each decides one episode. explore: as in `act`.
+        """
+        ...
+
+    def close(self) -> None:
+        """Brings the system to rest; called once, also after an error."""
+        ...
+
+
+def members(tree: PyTree) -> int:
+    """The number of members of stacked states."""
+    import jax
+
+    leaves: list[Array] = jax.tree.leaves(tree)
+    return leaves[0].shape[0]

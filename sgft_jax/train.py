@@ -1,0 +1,296 @@
+"""Training as iterators. They yield (state, metrics), print nothing and touch no files; the caller does both.
+
+A yielded state is valid until the iterator's next step, which donates its arrays: copy it to keep it longer.
+"""
+
+import functools
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from envs.base import Env, World
+from envs.rollout import Episode, play_episode
+from sgft_jax.data import replay
+from sgft_jax.mesh import split_vmap
+from sgft_jax.systems import System
+from sgft_jax.types import (
+    Array,
+    Finetuner,
+    Key,
+    Metrics,
+    Policy,
+    PyTree,
+    SimulatedData,
+    Simulation,
+    Transition,
+    UserError,
+)
+
+_INIT, _COLLECT, _LEARN, _EVALUATE, _OFFLINE = range(5)  # purposes, folded into a seed's key
+OFFLINE_PART = 5_000  # updates of the offline phase between two yields
+WINDOW = 5  # real rollouts whose mean is the evidence for a policy
+_AT_ONCE = 1024  # simulated episodes played together
+
+
+class Best(NamedTuple):
+    """The best policy by real evidence: the mean score, then the mean return, of WINDOW training rollouts in a row.
+
+    params: [M, ...] of the policy that played the last of them. score, total: [M] its evidence, -inf before there is
+    any. rollouts: [M] int32, the real rollouts it had learned from. recent: [M, WINDOW, 2], scores and returns of the
+    last rollouts. count: [] int32 rollouts in there.
+    """
+
+    params: PyTree
+    score: Array
+    total: Array
+    rollouts: Array
+    recent: Array
+    count: Array
+
+
+class FinetuneProgress(NamedTuple):
+    """What a fine-tuning run needs to go on. agent: [M, ...]. rollouts, offline: int32 [], what lies behind it."""
+
+    agent: PyTree
+    best: Best
+    rollouts: Array
+    offline: Array
+
+
+class SimulatedRows(NamedTuple):
+    """Transitions of the simulator, one set for each of P priors, shared by all members.
+
+    replay: [P, ...]. returns: [P, episodes] of the task, undiscounted.
+    """
+
+    replay: replay.ReplayState
+    returns: Array
+
+    def of(self, which: Array) -> SimulatedData:
+        """The set of prior `which` [], without a copy of it."""
+
+        def draw(key: Key, n: int) -> Transition:
+            rows = jax.random.randint(key, (n,), 0, jnp.maximum(self.replay.size[which], 1))
+            return jax.tree.map(lambda x: x[which, rows], self.replay.data)
+
+        return SimulatedData(draw, self.returns[which])
+
+
+# --- fine-tuning ------------------------------------------------------------------------------------------------------
+
+
+def finetune(
+    finetuner: Finetuner,
+    system: System,
+    priors: PyTree,
+    seeds: Array,
+    *,
+    rollouts: int,
+    simulated: SimulatedRows | None = None,
+    progress: FinetuneProgress | None = None,
+) -> Iterator[tuple[FinetuneProgress, Metrics]]:
+    """Fine-tunes M members, each a seed on a real system, until each has made `rollouts` real rollouts.
+
+    priors: params [P, ...] of P priors, or None; the member with seed s starts from prior s modulo P.
+    seeds: [M] uint32. simulated: see `simulate`, for methods that ask for it.
+    progress: where an earlier run stopped, or None.
+
+    Yields the fresh state with no metrics (unless `progress` is given), then once per part of the offline phase, then
+    once per real rollout, all initial ones together. Metrics are arrays [M]. Every random draw follows from (seed,
+    purpose, rollout), so a resumed run draws what an uninterrupted one would have drawn, and all methods meet the same
+    real starts.
+    """
+    step = _Steps(finetuner, system, priors, seeds, simulated)
+    if progress is None:
+        progress = step.begin()
+        yield progress, {}
+    updates = finetuner.simulation.offline_updates if finetuner.simulation else 0
+    while (done := int(progress.offline)) < updates:
+        progress, metrics = step.offline(progress, done, min(OFFLINE_PART, updates - done))
+        yield progress, metrics
+    while (done := int(progress.rollouts)) < rollouts:
+        progress, metrics = step.rollouts(progress, done, 1 if done else finetuner.initial_rollouts)
+        yield progress, metrics
+
+
+def evaluate(policy: Any, system: System, states: PyTree, seeds: Array, episodes: int) -> Episode:
+    """Episodes [M, episodes] without exploration, the same ones at every call: a fixed series for each seed.
+
+    policy, states: see `System.play`; for a `Finetuner` the states are `FinetuneProgress.agent`.
+    """
+    return system.play(policy, states, _episode_keys(seeds, _EVALUATE, 0, episodes), explore=False)
+
+
+def start_shapes(
+    finetuner: Finetuner, priors: PyTree, seeds: Array, simulated: SimulatedRows | None = None
+) -> FinetuneProgress:
+    """Shapes and types of the state that `finetune` starts from: what a checkpoint is read into."""
+    return jax.eval_shape(functools.partial(_begin, finetuner), priors, seeds, simulated)
+
+
+def _begin(finetuner: Finetuner, priors: PyTree, seeds: Array, simulated: SimulatedRows | None) -> FinetuneProgress:
+    which = _prior_of(priors, seeds)
+
+    def one(params: PyTree, seed: Array, which: Array, rows: SimulatedRows | None) -> PyTree:
+        return finetuner.init(params, _key(seed, _INIT, 0), None if rows is None else rows.of(which))
+
+    own = None if priors is None else jax.tree.map(lambda x: x[which], priors)
+    agent = split_vmap(one, (0, 0, 0, None))(own, seeds, which, simulated)
+    m = seeds.shape[0]
+    low = jnp.full(m, -jnp.inf)
+    best = Best(
+        jax.tree.map(jnp.copy, jax.vmap(finetuner.export)(agent)), low, jnp.copy(low), jnp.zeros(m, jnp.int32),
+        jnp.zeros((m, WINDOW, 2)), jnp.int32(0),
+    )  # fmt: skip
+    return FinetuneProgress(agent, best, jnp.int32(0), jnp.int32(0))
+
+
+class _Steps:
+    """The compiled steps of one run."""
+
+    def __init__(
+        self, finetuner: Finetuner, system: System, priors: PyTree, seeds: Array, simulated: SimulatedRows | None
+    ) -> None:
+        self.finetuner, self.system, self.priors, self.seeds, self.simulated = (
+            finetuner,
+            system,
+            priors,
+            seeds,
+            simulated,
+        )
+        if finetuner.simulation is not None and simulated is None:
+            raise UserError("this method also learns from simulated transitions: pass `simulated` (see `simulate`)")
+        self._store = jax.jit(split_vmap(self._observe), donate_argnums=0)
+        self._learn = jax.jit(self._update, static_argnums=(2, 4), donate_argnums=0)
+        self._keep = jax.jit(functools.partial(_keep_best, finetuner), donate_argnums=0)
+
+    def begin(self) -> FinetuneProgress:
+        """The fresh state."""
+        return jax.jit(functools.partial(_begin, self.finetuner))(self.priors, self.seeds, self.simulated)
+
+    def offline(self, progress: FinetuneProgress, done: int, updates: int) -> tuple[FinetuneProgress, Metrics]:
+        """Updates on simulated transitions alone."""
+        agent, metrics = self._learn(progress.agent, self._keys(_OFFLINE, done), updates, self.simulated, True)
+        return progress._replace(agent=agent, offline=progress.offline + updates), metrics
+
+    def rollouts(self, progress: FinetuneProgress, done: int, n: int) -> tuple[FinetuneProgress, Metrics]:
+        """N real rollouts, one after another as on a robot, then the updates that they allow."""
+        initial = self.finetuner.initial_policy if done == 0 else None
+        agent, best, played = progress.agent, progress.best, []
+        for rollout in range(done, done + n):
+            keys = _episode_keys(self.seeds, _COLLECT, rollout, 1)
+            if initial is None:
+                episodes = self.system.play(self.finetuner, agent, keys, explore=True)
+                best = self._keep(best, agent, episodes.score[:, 0], episodes.total_reward[:, 0], jnp.int32(rollout))
+            else:
+                own = jax.tree.map(lambda x: x[_prior_of(self.priors, self.seeds)], self.priors)
+                episodes = self.system.play(initial, own, keys, explore=True)
+            played.append(episodes)
+        for episodes in played:
+            agent = self._store(agent, episodes.transitions, episodes.valid)
+        learned = []
+        for rollout in range(done, done + n):  # equal parts, so that one compiled program serves any number
+            updates = self.finetuner.updates_per_rollout
+            agent, metrics = self._learn(agent, self._keys(_LEARN, rollout), updates, self.simulated, False)
+            learned.append(metrics)
+        mean = lambda *x: jnp.mean(jnp.stack(x), axis=0)  # noqa: E731
+        real = {
+            "real/return": mean(*[x.total_reward[:, 0] for x in played]),
+            "real/score": mean(*[x.score[:, 0] for x in played]),
+            "real/exploded": mean(*[x.exploded[:, 0].astype(jnp.float32) for x in played]),
+        }
+        metrics = real | jax.tree.map(mean, *learned)
+        return FinetuneProgress(agent, best, progress.rollouts + n, progress.offline), metrics
+
+    def _observe(self, state: PyTree, transitions: Transition, valid: Array) -> PyTree:
+        """transitions, valid: [1, T, ...]."""
+        return self.finetuner.observe(state, jax.tree.map(lambda x: x[0], transitions), valid[0])
+
+    def _update(
+        self, states: PyTree, keys: Key, updates: int, simulated: SimulatedRows | None, offline: bool
+    ) -> tuple[PyTree, Metrics]:
+        def one(state: PyTree, key: Key, which: Array, rows: SimulatedRows | None) -> tuple[PyTree, Metrics]:
+            data = None if rows is None else rows.of(which)
+            return self.finetuner.learn(state, key, updates, data, offline=offline)
+
+        which = _prior_of(self.priors, self.seeds)
+        return split_vmap(one, (0, 0, 0, None))(states, keys, which, simulated)
+
+    def _keys(self, purpose: int, part: int) -> Key:
+        return jax.vmap(lambda seed: _key(seed, purpose, part))(self.seeds)
+
+
+def _keep_best(finetuner: Finetuner, best: Best, agent: PyTree, score: Array, total: Array, rollout: Array) -> Best:
+    """`best` after one more rollout by `agent` [M], with its score and return [M]; rollout: real ones before it."""
+    recent = jnp.concatenate([best.recent[:, 1:], jnp.stack([score, total], axis=1)[:, None]], axis=1)
+    mean_score, mean_total = jnp.mean(recent, axis=1).T
+    better = (mean_score > best.score) | ((mean_score == best.score) & (mean_total > best.total))
+    better &= best.count + 1 >= WINDOW
+    keep = lambda new, old: jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)  # noqa: E731
+    params = jax.tree.map(keep, jax.vmap(finetuner.export)(agent), best.params)
+    return Best(
+        params, keep(mean_score, best.score), keep(mean_total, best.total),
+        keep(jnp.broadcast_to(rollout, better.shape), best.rollouts), recent, best.count + 1,
+    )  # fmt: skip
+
+
+def _prior_of(priors: PyTree, seeds: Array) -> Array:
+    """[M] the prior of each member."""
+    return seeds % (1 if priors is None else jax.tree.leaves(priors)[0].shape[0])
+
+
+def _key(seed: Array, purpose: int | Array, part: int | Array) -> Key:
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), purpose), part)
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _episode_keys(seeds: Array, purpose: Array, rollout: Array, n: int) -> Key:
+    """Keys [M, n]; the first ones are the same for every n."""
+    each = lambda seed, i: jax.random.fold_in(_key(seed, purpose, rollout), i)  # noqa: E731
+    return jax.vmap(lambda seed: jax.vmap(lambda i: each(seed, i))(jnp.arange(n)))(seeds)
+
+
+# --- simulated data ---------------------------------------------------------------------------------------------------
+
+
+def simulate(
+    env: Env, policy: Policy, pool: World, priors: PyTree, key: Key, needs: Simulation, *, gamma: float
+) -> SimulatedRows:
+    """Whole episodes of every prior's exploring policy in simulated worlds.
+
+    pool: worlds [W] of the training domain. priors: params [P, ...]. needs: how many transitions, and the largest share
+    of random actions: in the i-th of n episodes a share i / (n - 1) * needs.ladder of the actions is uniformly random.
+    """
+    keys = jax.random.split(key, jax.tree.leaves(priors)[0].shape[0])
+    one = functools.partial(_simulate, env, policy, pool, needs=needs, gamma=gamma)
+    return SimulatedRows(*jax.jit(jax.vmap(one))(priors, keys))
+
+
+def _simulate(
+    env: Env, policy: Policy, pool: World, params: PyTree, key: Key, *, needs: Simulation, gamma: float
+) -> tuple[replay.ReplayState, Array]:
+    n = -(-needs.transitions // env.episode_length)
+    at_once = min(n, _AT_ONCE)
+    parts = -(-n // at_once)
+
+    def play(key: Key, share: Array) -> Episode:
+        def act(carry: PyTree, obs: Array, key: Key) -> tuple[Array, PyTree]:
+            key_policy, key_replace, key_random = jax.random.split(key, 3)
+            action, carry = policy.act(params, carry, obs, key_policy, explore=True)
+            random = jax.random.uniform(key_random, (env.act_dim,), minval=-1.0, maxval=1.0)
+            return jnp.where(jax.random.uniform(key_replace) < share, random, action), carry
+
+        return play_episode(env, pool, act, policy.init_carry(), key, gamma=gamma)
+
+    def part(buffer: replay.ReplayState, inputs: tuple[Key, Array]) -> tuple[replay.ReplayState, Array]:
+        key, shares = inputs
+        episodes = jax.vmap(play)(jax.random.split(key, at_once), shares)
+        rows, valid = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (episodes.transitions, episodes.valid))
+        return replay.add_batch(buffer, rows, valid), episodes.total_reward
+
+    empty = replay.init(replay.blank(env.obs_dim, env.act_dim), parts * at_once * env.episode_length)
+    shares = jnp.linspace(0.0, needs.ladder, parts * at_once).reshape(parts, at_once)
+    buffer, returns = jax.lax.scan(part, empty, (jax.random.split(key, parts), shares))
+    return buffer, returns.reshape(-1)
