@@ -1,15 +1,22 @@
-"""Tasks, worlds and episodes as pure functions of an explicit world. `make(name)` builds a task."""
+"""Tasks, worlds and episodes as pure functions of an explicit world. `make(name)` builds a task.
+
+What is named here is imported at its first use: listing tasks and gaps needs neither JAX nor MuJoCo.
+"""
 
 import importlib
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from envs import gaps, rollout
-from envs.base import Effects, Entry, Env, EnvState, Parameter, World
+from envs import gaps
+from envs.base import Domain, EffectRange, Effects, Entry, Env, EnvState, Parameter, Theta, World, packed, unpack
 from envs.gaps import Gap
-from envs.rollout import Episode, Fleet, launch, play_episode, step_fleet
 from sgft_jax import extend
 from sgft_jax.types import UserError, unknown
+
+if TYPE_CHECKING:
+    from envs import effects, rollout
+    from envs.domains.uniform import sample_worlds, uniform
+    from envs.rollout import Episode, Fleet, launch, play_episode, step_fleet
 
 TASKS = {
     "push": "envs.franka.push",
@@ -18,9 +25,15 @@ TASKS = {
     "hammer": "envs.franka.hammer",
     "insert": "envs.franka.insert",
 }
+_LAZY = {
+    **dict.fromkeys(("Episode", "Fleet", "launch", "play_episode", "step_fleet"), "envs.rollout"),
+    **dict.fromkeys(("sample_worlds", "uniform"), "envs.domains.uniform"),
+}
 
 __all__ = [
     "TASKS",
+    "Domain",
+    "EffectRange",
     "Effects",
     "Entry",
     "Env",
@@ -29,35 +42,52 @@ __all__ = [
     "Fleet",
     "Gap",
     "Parameter",
+    "Theta",
     "World",
+    "effects",
     "gaps",
     "launch",
     "make",
     "name_of",
+    "packed",
     "play_episode",
     "rollout",
+    "sample_worlds",
     "scene",
     "step_fleet",
+    "uniform",
+    "unpack",
 ]
 
 
+def __getattr__(name: str) -> Any:
+    if name in ("effects", "rollout"):
+        return importlib.import_module(f"envs.{name}")
+    if name in _LAZY:
+        return getattr(importlib.import_module(_LAZY[name]), name)
+    raise AttributeError(f"module 'envs' has no attribute {name!r}")
+
+
 def make(task: str, impl: str = "auto", scene: str = "") -> Env:
-    """The task of that name, file or module, compiled; impl: who steps its physics, see `physics.choose_impl`.
+    """The task of that name, file or module, compiled; impl: who steps its physics, see `worlds.choose_impl`.
 
     A file or module of your own must define `make(impl) -> Env`, with the file's name as the Env's name
     (docs/extending.md). scene: that of a real system which is more than the simulated one with other numbers; "" for
     the latter. What is observed, commanded and rewarded, and the parameters, are the same in all scenes of a task.
-    Raises UserError with the closest match for an unknown task or scene.
+    Raises UserError with the closest match for an unknown task or scene, and naming file and line for one that fails.
     """
     module = _module(task)
-    env = module.make(impl, _real(task, scene)) if scene else module.make(impl)
+    real = _real(task, scene) if scene else None
+    env = extend.run("task", task, lambda: module.make(impl, real) if scene else module.make(impl))
+    if not isinstance(env, Env):
+        raise UserError(f"task {task}: make(impl) returns a {type(env).__name__}, not an envs.Env")
     if env.name != name_of(task):
         raise UserError(f"task {task}: its Env is called {env.name!r}; call it {name_of(task)!r}, like the file")
-    return env
+    return packed(env)
 
 
 def scene(task: str, real: str = "") -> Any:
-    """The parts of a scene of that task (`franka.task.Scene`), see `make`; None for one not simulated by MuJoCo."""
+    """The `envs.mujoco.scene.Scene` of a task or of its real system, see `make`; None for a task without MuJoCo."""
     return _real(task, real) if real else getattr(_module(task), "SCENE", None)
 
 
@@ -66,6 +96,8 @@ def name_of(task: str) -> str:
 
     Also admits the task: from then on the name alone finds it in this process. Raises UserError if there is none.
     """
+    if task in TASKS:
+        return task
     _module(task)
     return extend.name_of(task)
 

@@ -1,9 +1,23 @@
-"""What an environment is: pure functions of an explicit world, and the words a task uses to describe itself."""
+"""What an environment is: pure functions of an explicit world, and the words a task uses to describe itself.
 
-from collections.abc import Callable
-from typing import NamedTuple
+Imports no JAX: commands that only list tasks read this module too.
+"""
 
-from sgft_jax.types import Array, Key, PyTree
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping
+from math import inf
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from sgft_jax.types import UserError
+
+if TYPE_CHECKING:
+    from sgft_jax.types import Array, Key, PyTree
+
+Value = float | list[float] | list[list[float]]
+NOTHING: Mapping[str, Value] = MappingProxyType({})
 
 
 class Entry(NamedTuple):
@@ -15,13 +29,18 @@ class Entry(NamedTuple):
 
 
 class Parameter(NamedTuple):
-    """One domain parameter: its value in the nominal model and the uniform range pretraining draws it from."""
+    """One domain parameter: its nominal value and the uniform range [low, high] that pretraining draws it from.
+
+    minimum, maximum: physical bounds of any value that a user may name (a mass is positive).
+    """
 
     name: str
     unit: str
     nominal: float
     low: float
     high: float
+    minimum: float = -inf
+    maximum: float = inf
 
 
 class Effects(NamedTuple):
@@ -48,17 +67,31 @@ class Effects(NamedTuple):
     obs_bias: Array
 
 
-class World(NamedTuple):
-    """One system to interact with; stack worlds along a leading axis and vmap.
+class EffectRange(NamedTuple):
+    """Each episode draws its effects uniformly from here; where low equals high, they have exactly this value."""
 
-    params: [n_params] the domain parameters theta, raw units, in the order of `Env.parameters`.
-    model: the fields of the MuJoCo model that differ between worlds, exactly as MuJoCo's compiler left them.
-    effects: see `Effects`.
+    low: Effects
+    high: Effects
+
+
+class Theta(NamedTuple):
+    """What distinguishes one system from others of its task.
+
+    params: [n_params] domain parameters, raw units, in the order of `Env.parameters`. effects: see `EffectRange`.
     """
 
     params: Array
+    effects: EffectRange
+
+
+class World(NamedTuple):
+    """One system to interact with; stack worlds along a leading axis and vmap.
+
+    model: the fields of the simulator's model that differ between worlds, as its compiler left them, by name.
+    """
+
+    theta: Theta
     model: dict[str, Array]
-    effects: Effects
 
 
 class EnvState(NamedTuple):
@@ -66,9 +99,11 @@ class EnvState(NamedTuple):
 
     physics: the simulator's own state.
     obs: [obs_dim] as measured (noise and bias included). true_obs: the same without measurement error.
-    reward: [] task reward computed from `true_obs`.
-    terminated, truncated, success, invalid: [] bool; `invalid` = physics exploded, the step must not be learned from.
+    reward: [] task reward of the step, computed from `true_obs` where it is a function of observations.
+    terminated: [] bool, the task ended the episode. truncated: [] bool, its time is up.
+    success: [] bool. invalid: [] bool, physics exploded, the step must not be learned from.
     time: [] int32 control steps since reset.
+    effects: those of this episode.
     """
 
     physics: PyTree
@@ -80,17 +115,52 @@ class EnvState(NamedTuple):
     success: Array
     invalid: Array
     time: Array
+    effects: Effects
+
+
+class Domain(NamedTuple):
+    """A distribution over systems, which may adapt while a policy trains in them. Plain Python on the host.
+
+    init() -> state.
+    sample(state, key, n) -> Theta [n].
+    log_prob(state, theta) -> [] log density of one theta.
+    update(state, theta [n], returns [n]) -> state, after the policy earned these returns there.
+    """
+
+    init: Callable[[], PyTree]
+    sample: Callable[[PyTree, Key, int], Theta]
+    log_prob: Callable[[PyTree, Theta], Array]
+    update: Callable[[PyTree, Theta, Array], PyTree]
+
+
+def never(obs: Array, action: Array, next_obs: Array) -> Any:
+    """[] False: what `terminated` is for a task whose episodes end by time alone."""
+    import jax.numpy as jnp
+
+    return jnp.zeros((), bool)
+
+
+def no_trace(physics: PyTree) -> Any:
+    """[0]: what `trace` is for a task that nobody can draw."""
+    import jax.numpy as jnp
+
+    return jnp.zeros(0)
 
 
 class Env(NamedTuple):
     """A task. All functions are for one world and one example; nothing is batched inside.
 
-    sample_worlds(key, n, params=..., effects=...) -> World stacked [n], compiled on the host (not jittable). Domain
-        parameters are drawn from their training ranges unless `params` names a value or a range [low, high]; `effects`
-        names what else differs from the simulator. Raises UserError for unknown names.
-    reset(world, key) -> EnvState; step(world, state, action, key) -> EnvState.
-    reward, terminated: functions of (obs, action, next_obs), true for imagined transitions too.
-    success: function of one observation; `success_anytime` tells whether it counts at any step or only at the last.
+    make_worlds(theta [n]) -> World stacked [n], compiled on the host (not jittable). Sampling is a `Domain`'s business.
+    reset(world, key) -> EnvState, with effects drawn for this episode.
+    step(world, state, action, key) -> EnvState.
+    reward, terminated: functions of (obs, action, next_obs), so true of imagined transitions too; success: function of
+        one observation. None where observations do not tell: then only `EnvState` knows.
+    success_anytime: whether success counts at any step or only at the last.
+    score: what a run is judged by, "success" or "return".
+    training: the simulator's own effects, by name: values or ranges, as in a gap.
+    cartesian: the first two action entries are x and y of one frame.
+    check(theta by name) -> what is impossible about it in one sentence, or None: relations between parameters.
+    trace(physics) -> [k] what a renderer needs of a state; [0] where nothing can be drawn.
     impl: who steps the physics. scene: the name of a real system's own scene, "" for the one to pretrain in.
     """
 
@@ -100,13 +170,18 @@ class Env(NamedTuple):
     parameters: tuple[Parameter, ...]
     episode_length: int
     control_dt: float
-    success_anytime: bool
-    sample_worlds: Callable[..., World]
+    make_worlds: Callable[[Theta], World]
     reset: Callable[[World, Key], EnvState]
     step: Callable[[World, EnvState, Array, Key], EnvState]
-    reward: Callable[[Array, Array, Array], Array]
-    terminated: Callable[[Array, Array, Array], Array]
-    success: Callable[[Array], Array]
+    reward: Callable[[Array, Array, Array], Array] | None = None
+    terminated: Callable[[Array, Array, Array], Array] | None = never
+    success: Callable[[Array], Array] | None = None
+    success_anytime: bool = False
+    score: str = "success"
+    training: Mapping[str, Value] = NOTHING
+    cartesian: bool = False
+    check: Callable[[dict[str, float]], str | None] = lambda theta: None
+    trace: Callable[[PyTree], Array] = no_trace
     impl: str = "jax"
     scene: str = ""
 
@@ -119,3 +194,55 @@ class Env(NamedTuple):
     def act_dim(self) -> int:
         """Length of the action vector."""
         return sum(e.size for e in self.action)
+
+
+def misnamed(env: Env, name: str) -> UserError:
+    """What to tell someone who named a domain parameter or an effect that the task does not have there."""
+    lists = {"parameter": [p.name for p in env.parameters], "effect": list(Effects._fields)}
+    for kind, names in lists.items():
+        if name in names:
+            what, other = ("an effect", "parameters") if kind == "effect" else ("a parameter", "effects")
+            return UserError(f"'{name}' is {what} of {env.name}, not one of its {other}")
+    close = difflib.get_close_matches(name, [*lists["parameter"], *lists["effect"]], n=1)
+    guess = f"; did you mean '{close[0]}'?" if close else "."
+    listed = " ".join(f"{kind.capitalize()}s: {', '.join(names) or 'none'}." for kind, names in lists.items())
+    return UserError(f"'{name}' is neither a parameter nor an effect of {env.name}{guess} {listed}")
+
+
+def pack(entries: tuple[Entry, ...], parts: Any) -> Any:
+    """[dim] one vector from a dict of vectors by entry name; what is an array already stays as it is.
+
+    Raises UserError if the dict does not hold exactly these entries in their sizes.
+    """
+    if not isinstance(parts, Mapping):
+        return parts
+    import jax.numpy as jnp
+
+    if odd := set(parts) ^ {e.name for e in entries}:
+        raise UserError(f"observation: {sorted(odd)[0]!r} is not both declared and returned")
+    vectors = [jnp.asarray(parts[e.name], jnp.float32).reshape(-1) for e in entries]
+    for entry, vector in zip(entries, vectors, strict=True):
+        if vector.size != entry.size:
+            raise UserError(f"observation: {entry.name!r} has {vector.size} numbers, {entry.size} are declared")
+    return jnp.concatenate(vectors)
+
+
+def unpack(entries: tuple[Entry, ...], vector: Array) -> dict[str, Array]:
+    """The parts of a vector [dim] by entry name."""
+    parts, start = {}, 0
+    for entry in entries:
+        parts[entry.name] = vector[start : start + entry.size]
+        start += entry.size
+    return parts
+
+
+def packed(env: Env) -> Env:
+    """The same task with observations as one vector [obs_dim], where `reset` and `step` may return dicts by entry name.
+
+    `step` gets states with packed observations; `reward`, `terminated` and `success` see packed ones too.
+    """
+
+    def flat(state: EnvState) -> EnvState:
+        return state._replace(obs=pack(env.observation, state.obs), true_obs=pack(env.observation, state.true_obs))
+
+    return env._replace(reset=lambda *given: flat(env.reset(*given)), step=lambda *given: flat(env.step(*given)))

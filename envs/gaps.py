@@ -7,19 +7,22 @@ another range), also outside the training range; `effects` distorts commands and
 
 import json
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from envs.base import Effects, Env, World
-from sgft_jax.types import Key, UserError
+from envs.base import Effects, Env, Value, World
+from sgft_jax.types import Key, UserError, unknown
 
-Value = float | list[float]
+SIM = "sim"  # names the training domain itself where a gap could stand
 
 
 class Gap(NamedTuple):
-    """A named difference between simulator and reality: parameter or effect name -> value, [low, high] or vector."""
+    """A named difference between simulator and reality: parameter or effect name -> value or range.
+
+    Ranges are [low, high], of vectors [[low, ...], [high, ...]]. Every episode draws its effects from their ranges.
+    """
 
     name: str
     params: dict[str, Value]
@@ -42,24 +45,33 @@ def load(env: Env, source: str, overrides: Sequence[str] = ()) -> Gap:
     """
     if source.endswith((".toml", ".json")):
         gap = _from_file(Path(source))
-    else:
-        known = presets(env.name)
-        if source not in known:
-            raise UserError(
-                f"{env.name} has no gap '{source}'; it has: {', '.join(known) or 'none'}; or give a .toml or .json file"
-            )
+    elif source in (known := presets(env.name)):
         gap = known[source]
+    else:
+        raise UserError(f"{unknown(f'gap of {env.name}', source, known)}; or give a .toml or .json file")
+    seen = set()
     for text in overrides:
-        gap = _override(env, gap, text)
-    _check_names(env, gap)
+        gap, name = _override(gap, text)
+        if name in seen:
+            raise UserError(f"'{text}': '{name}' is set twice; set it once")
+        seen.add(name)
+    _check(env, gap)
+    return gap
+
+
+def from_dict(env: Env, name: str, table: Mapping[str, Any]) -> Gap:
+    """A gap from {"params": {...}, "effects": {...}, "scene": ...}, what a file would hold. Raises UserError."""
+    gap = _parse(name, dict(table), where=f"gap '{name}'")
+    _check(env, gap)
     return gap
 
 
 def worlds(env: Env, gap: Gap, key: Key, n: int = 256) -> World:
-    """The real system of a gap as a pool of worlds [n], or [1] where nothing in it varies."""
-    fixed = {name for name, value in gap.params.items() if not isinstance(value, list) or value[0] == value[1]}
-    varies = any(p.name not in fixed and (p.name in gap.params or p.low < p.high) for p in env.parameters)
-    return env.sample_worlds(key, n if varies else 1, params=gap.params, effects=gap.effects)
+    """The real system of a gap as a pool of worlds [n], or [1] where its domain parameters do not vary."""
+    from envs.domains.uniform import parameter_ranges, sample_worlds
+
+    low, high = parameter_ranges(env, gap.params).T
+    return sample_worlds(env, key, n if (low < high).any() else 1, params=gap.params, effects=gap.effects)
 
 
 def _from_file(path: Path) -> Gap:
@@ -75,28 +87,30 @@ def _from_file(path: Path) -> Gap:
 
 def _parse(name: str, table: Any, *, where: str) -> Gap:
     if not isinstance(table, dict) or set(table) - {"params", "effects", "scene"}:
-        odd = (
-            sorted(set(table) - {"params", "effects", "scene"})[0] if isinstance(table, dict) else type(table).__name__
-        )
+        odd = sorted({*table} - {"params", "effects", "scene"})[0] if isinstance(table, dict) else type(table).__name__
         raise UserError(
             f"{where}: unexpected '{odd}'; a gap has two tables, 'params' and 'effects', and may name a 'scene'"
         )
-    scene = table.get("scene", "")
-    if not isinstance(scene, str):
-        raise UserError(f"{where}: 'scene' must be a name, got {scene!r}")
-    for section in (table.get(name, {}) for name in ("params", "effects")):
-        for key, value in section.items() if isinstance(section, dict) else [("params/effects", section)]:
+    gap = Gap(name, table.get("params", {}), table.get("effects", {}), table.get("scene", ""))
+    if not isinstance(gap.scene, str):
+        raise UserError(f"{where}: 'scene' must be a name, got {gap.scene!r}")
+    for section, values in (("params", gap.params), ("effects", gap.effects)):
+        if not isinstance(values, dict):
+            raise UserError(f"{where}: '{section}' must be a table of names and numbers, got {values!r}")
+        for key, value in values.items():
             if not _is_value(value):
                 raise UserError(f"{where}: '{key}' must be a number or a list of numbers, got {value!r}")
-    return Gap(name, table.get("params", {}), table.get("effects", {}), scene)
+    return gap
 
 
 def _is_value(value: Any) -> bool:
-    numbers = value if isinstance(value, list) and value else [value]
-    return all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers)
+    if isinstance(value, list):
+        return bool(value) and all(map(_is_value, value))
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _override(env: Env, gap: Gap, text: str) -> Gap:
+def _override(gap: Gap, text: str) -> tuple[Gap, str]:
+    """The gap with what the text sets, and the name of that."""
     name, equals, value = (part.strip() for part in text.partition("="))
     try:
         parsed = json.loads(value)
@@ -106,14 +120,14 @@ def _override(env: Env, gap: Gap, text: str) -> Gap:
         raise UserError(f"'{text}' does not set anything; write name=number or name=[number,number]")
     changed = Gap(f"{gap.name}+{name}={value}", dict(gap.params), dict(gap.effects), gap.scene)
     (changed.effects if name in Effects._fields else changed.params)[name] = parsed
-    return changed
+    return changed, name
 
 
-def _check_names(env: Env, gap: Gap) -> None:
-    for kind, given, known in (
-        ("domain parameter", gap.params, [p.name for p in env.parameters]),
-        ("effect", gap.effects, list(Effects._fields)),
-    ):
-        for name in given:
-            if name not in known:
-                raise UserError(f"gap '{gap.name}': {env.name} has no {kind} '{name}'; it has: {', '.join(known)}")
+def _check(env: Env, gap: Gap) -> None:
+    """Raises UserError for unknown names and impossible values."""
+    from envs.domains.uniform import uniform
+
+    try:
+        uniform(env, gap.params, gap.effects)
+    except UserError as error:
+        raise UserError(f"gap '{gap.name}': {error}") from None

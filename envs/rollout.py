@@ -10,24 +10,31 @@ from envs.base import Env, EnvState, World
 from sgft_jax.mesh import split_vmap
 from sgft_jax.types import Array, Key, PyTree, Transition
 
-# policy(carry, obs, key) -> (action, carry), for one environment
-Policy = Callable[[PyTree, Array, Key], tuple[Array, PyTree]]
+# act(carry, obs, key) -> (action, carry), for one environment
+Act = Callable[[PyTree, Array, Key], tuple[Array, PyTree]]
 
 
 class Fleet(NamedTuple):
-    """n environments in flight. index: [n] which world of the pool each one lives in. state: EnvState [n]."""
+    """n environments in flight.
+
+    index: [n] which world of the pool each one lives in. state: EnvState [n]. carry: [n, ...] what the policy remembers
+    of each episode.
+    """
 
     index: Array
     state: EnvState
+    carry: PyTree
 
 
 class Episode(NamedTuple):
     """One whole episode of T control steps.
 
-    transitions: [T]; `valid`: [T] bool, False from the first step with exploded physics on (such rows hold zeros).
+    transitions: [T]; `valid`: [T] bool, False after the step that terminated the episode and from the first step with
+        exploded physics on (such rows hold zeros).
     total_reward: [] undiscounted, of the task, never reshaped. success, exploded: [] bool.
-    world: [] int32, where it took place in the pool. start: the initial EnvState; qpos: [T, nq] after each step, for
-    rendering.
+    score: [] float, what the task is judged by: success or total_reward.
+    world: [] int32, where it took place in the pool.
+    trace: [T + 1, k] what a renderer needs of the start and of the state after each step, see `Env.trace`.
     """
 
     transitions: Transition
@@ -35,9 +42,9 @@ class Episode(NamedTuple):
     total_reward: Array
     success: Array
     exploded: Array
+    score: Array
     world: Array
-    start: EnvState
-    qpos: Array
+    trace: Array
 
 
 def pick(pool: World, index: Array | tuple[Array, Array]) -> World:
@@ -47,20 +54,31 @@ def pick(pool: World, index: Array | tuple[Array, Array]) -> World:
 
 def pool_size(pool: World) -> int:
     """Number of worlds in a pool, or in each of several stacked ones."""
-    return pool.params.shape[-2]
+    return pool.theta.params.shape[-2]
 
 
-def launch(env: Env, pool: World, key: Key, n: int) -> Fleet:
-    """N environments, each in a random world of the pool, freshly reset."""
+def launch(env: Env, pool: World, key: Key, n: int, carry: PyTree) -> Fleet:
+    """N environments, each in a random world of the pool, freshly reset. carry: the policy's initial one, of one."""
     key_world, key_reset = jax.random.split(key)
     index = jax.random.randint(key_world, (n,), 0, pool_size(pool))
-    return Fleet(index, split_vmap(env.reset)(pick(pool, index), jax.random.split(key_reset, n)))
+    carries = jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *jnp.shape(x))), carry)
+    return Fleet(index, split_vmap(env.reset)(pick(pool, index), jax.random.split(key_reset, n)), carries)
 
 
 def step_fleet(
-    env: Env, pool: World, fleet: Fleet, actions: Array, key: Key, *, gamma: float | Array
+    env: Env,
+    pool: World,
+    fleet: Fleet,
+    actions: Array,
+    carry: PyTree,
+    key: Key,
+    *,
+    initial_carry: PyTree,
+    gamma: float | Array,
 ) -> tuple[Fleet, Transition, Array, EnvState]:
-    """One step of every environment, then a fresh random world and start for those whose episode ended.
+    """One step of every environment, then a fresh random world, start and carry for those whose episode ended.
+
+    actions, carry: [n, ...] what the policy returned for the fleet's observations and carries. initial_carry: of one.
 
     Returns the new fleet, the transitions [n] with the true successor also at an episode's end, which of them are valid
     [n], and the states the step led to before any reset (rewards, success, explosions).
@@ -74,8 +92,8 @@ def step_fleet(
     # Fixed-length episodes end together, so most steps skip the (inverse kinematics of the) resets altogether.
     fleet = jax.lax.cond(
         done.any(),
-        lambda: _select(done, launch(env, pool, key_reset, n), Fleet(fleet.index, after)),
-        lambda: Fleet(fleet.index, after),
+        lambda: _select(done, launch(env, pool, key_reset, n, initial_carry), Fleet(fleet.index, after, carry)),
+        lambda: Fleet(fleet.index, after, carry),
     )
     return fleet, transitions, valid, after
 
@@ -83,7 +101,7 @@ def step_fleet(
 def play_episode(
     env: Env,
     pool: World,
-    policy: Policy,
+    act: Act,
     carry: PyTree,
     key: Key,
     *,
@@ -105,20 +123,30 @@ def play_episode(
     def step(loop: tuple[EnvState, PyTree, Array], key: Key) -> tuple[tuple[EnvState, PyTree, Array], tuple]:
         state, carry, over = loop
         key_act, key_env = jax.random.split(key)
-        action, carry = policy(carry, state.obs, key_act)
+        action, carry = act(carry, state.obs, key_act)
         after = env.step(world, state, action, key_env)
+        exploded = after.invalid & ~over
         valid = ~(over | after.invalid)
         row = _transition(state, action, after, gamma=gamma)
+        row = jax.tree.map(lambda x: jnp.where(valid, x, jnp.zeros_like(x)), row)
         over = over | after.terminated | after.invalid
-        return (after, carry, over), (row, valid, after.success & ~after.invalid, after.invalid, after.physics.qpos)
+        return (after, carry, over), (row, valid, after.success & valid, exploded, env.trace(after.physics))
 
-    (_, _, _), (rows, valid, success, invalid, qpos) = jax.lax.scan(
+    (_, _, _), (rows, valid, success, exploded, trace) = jax.lax.scan(
         step, (start, carry, jnp.zeros((), bool)), jax.random.split(key_steps, length or env.episode_length)
     )
-    total = jnp.where(valid, rows.reward, 0.0).sum()
-    last_valid = jnp.maximum(valid.sum() - 1, 0)
-    exploded = invalid.any()
-    return Episode(rows, valid, total, success[last_valid] & ~exploded, exploded, index, start, qpos)
+    total, failed = rows.reward.sum(), exploded.any()
+    succeeded = success[jnp.maximum(valid.sum() - 1, 0)] & ~failed
+    return Episode(
+        transitions=rows,
+        valid=valid,
+        total_reward=total,
+        success=succeeded,
+        exploded=failed,
+        score=succeeded.astype(jnp.float32) if env.score == "success" else total,
+        world=index,
+        trace=jnp.concatenate([env.trace(start.physics)[None], trace]),
+    )
 
 
 def _transition(before: EnvState, action: Array, after: EnvState, *, gamma: float | Array) -> Transition:
@@ -129,8 +157,6 @@ def _transition(before: EnvState, action: Array, after: EnvState, *, gamma: floa
         reward=after.reward,
         discount=gamma * (1.0 - after.terminated.astype(jnp.float32)),
         next_obs=after.obs,
-        truncated=after.truncated,
-        steps_to_go=jnp.zeros((), jnp.int32),
     )
     return jax.tree.map(lambda x: jnp.where(after.invalid, jnp.zeros_like(x), x), row)
 

@@ -19,8 +19,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from envs.franka import arm, hammer, host, insert, kinematics, push
-from envs.mujoco.scene import CONTROL_DT, Scene
+from envs.franka import arm, hammer, insert, kinematics, push
+from envs.mujoco import host
+from envs.mujoco.scene import Scene
 from envs.mujoco.worlds import PhysicsState
 from experiments.cli import run_main
 from sgft_jax.types import Array
@@ -195,7 +196,7 @@ def main(config: AccuracyConfig) -> None:
             sizes = (f"{x:.2f}" for x in (e.travel, e.mean, e.p95, e.worst))
             shares = (f"{100 * x:.1f} %" for x in (e.relative, e.bias))
             name = str(iterations or "own")
-            table.add_row(str(substeps), f"{1000 * CONTROL_DT / substeps:.2f}", name, *sizes, *shares)
+            table.add_row(str(substeps), f"{1000 * probe.scene.control_dt / substeps:.2f}", name, *sizes, *shares)
     Console(width=100).print(table)
 
 

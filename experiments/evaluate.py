@@ -1,23 +1,24 @@
 """Evaluate a prior, or what fine-tuning has saved, in simulation or on a "real" system."""
 
-import functools
 import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
-import numpy as np
+import jax.numpy as jnp
 
 import envs
+from envs.gaps import SIM
 from envs.mujoco.worlds import Impl
+from envs.pools import heldout_worlds, load_gap, real_env
 from experiments import cli, stacking
-from experiments.algorithms import make_player
-from experiments.evaluation import describe, grade
-from experiments.options import SIM
-from experiments.priors import load_priors, prior_folders
-from experiments.worlds import heldout_worlds, load_gap, real_env
+from experiments.evaluation import describe, play
+from experiments.options import prior_folders
 from sgft_jax.io.jsonfile import read_json
+from sgft_jax.io.priors import load_priors
+from sgft_jax.policies import make_policy
+from sgft_jax.systems.simulated import Simulated
 from sgft_jax.types import UserError
 
 _SEED = 2**31 + 2  # held out from training and from the choice of the prior
@@ -80,12 +81,10 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     gap = load_gap(env, args.real, args.set)
     priors, card = load_priors(folders, env)
     env = real_env(env, [gap] if gap else [])
-    player, gamma = make_player(card, env), card["gamma"]
     key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_SEED), args.seed))
-    worlds = heldout_worlds(env, gap, key_worlds, args.episodes)
-
-    graded = functools.partial(grade, env, player, worlds, key_episodes, gamma=gamma, episodes=args.episodes)
-    outcome = jax.tree.map(np.asarray, jax.jit(jax.vmap(graded))(stacking.stack(priors)))
+    worlds = stacking.stack([heldout_worlds(env, gap, key_worlds, args.episodes)])
+    system = Simulated(env, worlds, jnp.zeros(len(priors), jnp.int32), gamma=card["gamma"])
+    outcome = play(system, make_policy(card, env), stacking.stack(priors), key_episodes, args.episodes)
     policies = [{"policy": str(f), **describe(stacking.member(outcome, i))} for i, f in enumerate(folders)]
     where = "in simulation" if gap is None else f"on the {gap.name} real system"
     return {"task": env.name, "impl": env.impl, "where": where, "episodes": args.episodes, "policies": policies}

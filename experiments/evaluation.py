@@ -1,98 +1,59 @@
-"""Success and return of a policy on a pool of worlds: one batch of whole episodes. Pure."""
+"""Success and return of policies in held-out worlds, and the numbers that are told of them."""
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from envs.base import Env, World
-from envs.rollout import Episode, Policy, play_episode
+from envs.rollout import Episode
+from sgft_jax import mesh
 from sgft_jax.analysis import stats
-from sgft_jax.mesh import split_vmap, whole
-from sgft_jax.players import Player
-from sgft_jax.types import Array, Key, Metrics, PyTree
+from sgft_jax.pretraining import Best, keep_better
+from sgft_jax.systems.simulated import Simulated
+from sgft_jax.types import Array, Key, Policy, PyTree
 
 
-def play_episodes(
-    env: Env,
-    pool: World,
-    policy: Policy,
-    carry: PyTree,
-    keys: Key,
-    *,
-    gamma: float,
-    length: int | None = None,
-    which: Array | None = None,
-) -> Episode:
-    """Episodes [n, ...] of `policy(carry, obs, key) -> (action, carry)`, one per key [n], each in a random world.
+def play(system: Simulated, policy: Policy, params: PyTree, key: Key, episodes: int) -> Episode:
+    """Episodes [M, episodes] of each of M policies without exploration, as NumPy arrays on every host.
 
-    A key gives the same world, start and noise to every policy: differences between policies are paired. length, which:
-    as for `play_episode`.
+    All policies play the same episodes, so that differences between them are paired.
     """
-    one = lambda key: play_episode(env, pool, policy, carry, key, gamma=gamma, length=length, which=which)  # noqa: E731
-    return split_vmap(one)(keys)
+    keys = jnp.broadcast_to(jax.random.split(key, episodes), (*system.which.shape, episodes))
+    played = mesh.local(system.play(policy, params, keys, explore=False))
+    return jax.tree.map(np.asarray, played)
 
 
-class Outcome(NamedTuple):
-    """How episodes went: the fields of `Episode` of these names, [n]; qpos: [n, T + 1, nq], the start included."""
-
-    success: Array
-    total_reward: Array
-    exploded: Array
-    qpos: Array
-
-
-def score(episodes: Episode | Outcome) -> Metrics:
-    """Mean success, return and share of exploded episodes."""
+def scores(played: Episode) -> dict[str, np.ndarray]:
+    """Mean success, return and share of exploded episodes [M] of episodes [M, n]."""
     return {
-        "success": episodes.success.mean(),
-        "return": episodes.total_reward.mean(),
-        "exploded": episodes.exploded.astype(jnp.float32).mean(),
+        "success": played.success.mean(-1),
+        "return": played.total_reward.mean(-1),
+        "exploded": played.exploded.mean(-1),
     }
 
 
-def prior_policy(player: Player, prior: PyTree, *, explore: bool) -> Policy:
-    """pi_sim: what it takes for best, or, to explore, a sample."""
-    return lambda carry, obs, key: player.act(prior, carry, obs, key, explore=explore)
-
-
-def grade(env: Env, player: Player, pool: World, key: Key, prior: PyTree, *, gamma: float, episodes: int) -> Outcome:
-    """That many episodes of what the prior takes for best."""
-    policy = prior_policy(player, prior, explore=False)
-    keys = jax.random.split(key, episodes)
-    played = play_episodes(env, pool, policy, player.init_carry(), keys, gamma=gamma)
-    qpos = jnp.concatenate([played.start.physics.qpos[:, None], played.qpos], axis=1)
-    return whole(Outcome(played.success, played.total_reward, played.exploded, qpos))
-
-
-def describe(outcome: Outcome) -> dict[str, Any]:
-    """The numbers of one policy's episodes (NumPy arrays) as JSON data, success with its 95 % Wilson interval."""
-    interval = stats.success_interval(int(outcome.success.sum()), len(outcome.success))
+def describe(played: Episode) -> dict[str, Any]:
+    """The numbers of one policy's episodes [n] as JSON data, success with its 95 % Wilson interval."""
+    interval = stats.success_interval(int(played.success.sum()), len(played.success))
     return {
-        "episodes": len(outcome.success),
+        "episodes": len(played.success),
         "success": float(interval.estimate),
         "success/interval": [float(interval.low), float(interval.high)],
-        "return": float(outcome.total_reward.mean()),
-        "exploded": float(outcome.exploded.mean()),
+        "return": float(played.total_reward.mean()),
+        "exploded": float(played.exploded.mean()),
     }
 
 
-class Best(NamedTuple):
-    """The best policy so far with all that belongs to it.
+def best_of(best: Best | None, params: PyTree, played: Episode, steps: Array, *, since: float = 0.0) -> Best:
+    """The best [M] of an earlier evaluation, if there was one, and of this one, by the task's score, then by return.
 
-    success, total: [] of its evaluation. steps: [] int32, when that was.
+    params: [M, ...] what was evaluated, which may be donated afterwards. steps: [M]. since: see `keep_better`.
     """
-
-    prior: PyTree
-    success: Array
-    total: Array
-    steps: Array
+    score, total = (jnp.asarray(x.mean(-1), jnp.float32) for x in (played.score, played.total_reward))
+    now = Best(params, score, total, steps)
+    return jax.tree.map(jnp.copy, now) if best is None else _keep_better(best, now, since)
 
 
-def keep_better(old: Best, new: Best, since: float | Array) -> Best:
-    """The one with the higher success, then the higher return; the old one if they tie, or the new one in any case if
-    the old one is from before `since` [] steps.
-    """
-    better = (new.success > old.success) | ((new.success == old.success) & (new.total > old.total))
-    better |= old.steps < since
-    return jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
+_keep_better: Callable[..., Best] = jax.jit(jax.vmap(keep_better, (0, 0, None)))

@@ -12,20 +12,20 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from sgft_jax.players import Player
 
 import envs
 from envs.base import Entry, Env
 from envs.gaps import Gap
 from envs.mujoco.worlds import Impl
+from envs.pools import heldout_worlds, load_gap, real_env
 from envs.rollout import play_episode
 from experiments import cli
 from experiments.algorithms import make_player
 from experiments.evaluation import prior_policy
 from experiments.options import prior_folders
-from experiments.worlds import heldout_worlds, load_gap, real_env
 from sgft_jax.analysis import plot
 from sgft_jax.io.priors import load_priors
-from sgft_jax.players import Player
 from sgft_jax.transforms import branch
 from sgft_jax.types import Array, Imagination, Key, Prior, Transition, UserError
 

@@ -13,7 +13,9 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from sgft_jax.finetune_planner import make_planner
 
+import envs
 from envs.base import Env, World
 from envs.control import cartpole
 from envs.mujoco.worlds import Impl
@@ -23,7 +25,6 @@ from experiments.evaluation import play_episodes, score
 from experiments.finetuning import Reals, make_program
 from experiments.options import seed_list, seeds_name
 from sgft_jax.analysis import plot
-from sgft_jax.finetune_planner import make_planner
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import EVAL, MetricsLog, read_jsonl, write_summary
 from sgft_jax.io.progress import RunProgress
@@ -120,7 +121,7 @@ class _Run:
         self.program = make_program(env, tuner, gamma=gamma)
         self.collect_random = jax.jit(functools.partial(random_episodes, env, gamma=gamma, n=self.random_episodes))
         nominal = {p.name: p.nominal for p in env.parameters}
-        self.pool = env.sample_worlds(jax.random.key(0), 1, params=nominal, effects={"obs_noise": 0.0})
+        self.pool = envs.sample_worlds(env, jax.random.key(0), 1, params=nominal, effects={"obs_noise": 0.0})
         self.reals = Reals(jax.tree.map(lambda x: x[None], self.pool), jnp.zeros(len(seeds), int))
         self.numbers = jnp.array(seeds, jnp.uint32)
         self.log, self.started = MetricsLog(folder, tensorboard=False), time.monotonic()

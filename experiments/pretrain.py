@@ -12,7 +12,7 @@ from typing import Any
 
 from experiments import cli
 from experiments.options import Impl, seed_list
-from experiments.presets import PRESETS, PretrainConfig
+from sgft_jax.presets import PRESETS, PretrainConfig
 
 DEFAULT_PRESET = "fast"
 

@@ -1,5 +1,6 @@
 """What a prior is worth to fine-tuning: V_sim against returns, the model against trajectories. Pure."""
 
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -7,12 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from envs.base import Env, World
-from envs.rollout import Episode
-from experiments.evaluation import play_episodes, prior_policy
-from sgft_jax.mesh import whole
+from envs.rollout import Episode, play_episode
+from sgft_jax.mesh import split_vmap, whole
 from sgft_jax.models import value
-from sgft_jax.players import Player
-from sgft_jax.types import Array, Key, PyTree
+from sgft_jax.types import Array, Key, Policy, PyTree
 
 HORIZON = 10  # steps ahead that the model is judged at: twice the longest branches worth imagining
 
@@ -21,7 +20,7 @@ class Report(NamedTuple):
     """Measurements of one prior.
 
     values, returns: [trajectories * episode_length] V_sim of the states that the exploring policy visits, and the
-    discounted returns that followed. counts: the same shape, bool, False in exploded episodes.
+    discounted returns that followed. counts: the same shape, bool, False in exploded episodes and after their end.
     model_error, still_error: [horizon] RMS error, in standard deviations of the observation, of the model's open-loop
     prediction 1, 2, ... steps ahead, and of predicting that nothing changes.
     """
@@ -34,7 +33,7 @@ class Report(NamedTuple):
 
 
 def make_report(
-    env: Env, player: Player, pool: World, prior: PyTree, key: Key, *, gamma: float, trajectories: int
+    env: Env, policy: Policy, pool: World, prior: PyTree, key: Key, *, gamma: float, trajectories: int
 ) -> Report:
     """Measures one prior on that many fresh trajectories of its exploring policy in the worlds it has learned in.
 
@@ -42,18 +41,20 @@ def make_report(
     V_sim of the last state stands for the rest.
     """
     length = env.episode_length + math.ceil(3 / (1 - gamma))
-    policy, keys = prior_policy(player, prior, explore=True), jax.random.split(key, trajectories)
-    played = play_episodes(env, pool, policy, player.init_carry(), keys, gamma=gamma, length=length)
-    values, returns = jax.vmap(lambda e: _values(env, player, prior, e))(played)
-    model, still = jax.vmap(lambda e: _model_errors(env, player, prior, e))(played)
+    act = functools.partial(policy.act, prior, explore=True)
+    play = functools.partial(play_episode, env, pool, act, policy.init_carry(), gamma=gamma, length=length)
+    played = split_vmap(play)(jax.random.split(key, trajectories))
+    values, returns = jax.vmap(lambda e: _values(env, policy, prior, e))(played)
+    errors, windows = jax.vmap(lambda e: _model_errors(env, policy, prior, e))(played)
     intact = ~played.exploded[:, None]
-    average = lambda x: jnp.where(intact, x, 0.0).sum(0) / jnp.maximum(intact.sum(), 1)  # noqa: E731
+    weight = windows * intact
+    model, still = (jnp.einsum("nw,nwh->h", weight, x) / jnp.maximum(weight.sum(), 1.0) for x in errors)
     report = Report(
         values=values.reshape(-1),
         returns=returns.reshape(-1),
-        counts=jnp.broadcast_to(intact, values.shape).reshape(-1),
-        model_error=average(model),
-        still_error=average(still),
+        counts=(intact & played.valid[:, : env.episode_length]).reshape(-1),
+        model_error=model,
+        still_error=still,
     )
     return whole(report)
 
@@ -68,23 +69,26 @@ def numbers(report: Report) -> dict[str, Any]:
     return found
 
 
-def _values(env: Env, player: Player, prior: PyTree, episode: Episode) -> tuple[Array, Array]:
+def _values(env: Env, policy: Policy, prior: PyTree, episode: Episode) -> tuple[Array, Array]:
     """V_sim and Monte-Carlo returns [episode_length] of one episode."""
     rows = episode.transitions
-    predict = lambda obs: player.value(prior, obs)  # noqa: E731
+    predict = lambda obs: policy.value(prior, obs)  # noqa: E731
     returns = value.discounted_returns(rows.reward, rows.discount, predict(rows.next_obs[-1]))
     return jax.vmap(predict)(rows.obs[: env.episode_length]), returns[: env.episode_length]
 
 
-def _model_errors(env: Env, player: Player, prior: Any, episode: Episode) -> tuple[Array, Array]:
-    """Errors [horizon] of the model and of standing still, averaged over the windows that fit into one episode.
+def _model_errors(env: Env, policy: Policy, prior: Any, episode: Episode) -> tuple[tuple[Array, Array], Array]:
+    """Errors [windows, horizon] of the model and of standing still in one episode, and which windows [windows] count:
+    those that end before the episode does.
 
-    [0] where the model does not predict observations.
+    horizon is 0 where the model does not predict observations.
     """
-    if player.model_error is None:
-        return jnp.zeros(0), jnp.zeros(0)
-    error, horizon = player.model_error, min(HORIZON, env.episode_length)
+    error, horizon = policy.model_error, min(HORIZON, env.episode_length)
     starts = jnp.arange(0, env.episode_length - horizon + 1, horizon)
+    counts = episode.valid[starts + horizon - 1].astype(jnp.float32)
+    if error is None:
+        nothing = jnp.zeros((*starts.shape, 0))
+        return (nothing, nothing), counts
 
     def window(start: Array) -> tuple[Array, Array]:
         cut = lambda x: jax.lax.dynamic_slice_in_dim(x, start, horizon)  # noqa: E731
@@ -93,4 +97,4 @@ def _model_errors(env: Env, player: Player, prior: Any, episode: Episode) -> tup
         still = jax.vmap(lambda o: jnp.sqrt(jnp.mean(((obs[0] - o) / prior.normalizer.std) ** 2)))(obs[1:])
         return error(prior, obs, cut(rows.action)), still
 
-    return jax.tree.map(lambda x: x.mean(0), jax.vmap(window)(starts))
+    return jax.vmap(window)(starts), counts

@@ -24,12 +24,12 @@ def before_and_after(env: Env, pool: World, play: Callable[[], Sequence[Episode]
         from envs.mujoco.render import render_side_by_side
 
         episodes = play()
-        qpos = [np.concatenate([episode.start.physics.qpos[None], episode.qpos]) for episode in episodes]
+        qpos = [np.asarray(episode.trace) for episode in episodes]
         captions = [
             f"{name}: {'success' if episode.success else 'failure'}"
             for name, episode in zip(("before fine-tuning", f"after {rollouts} real rollouts"), episodes, strict=True)
         ]
-        theta = np.asarray(pool.params[episodes[0].world]).tolist()
+        theta = np.asarray(pool.theta.params[episodes[0].world]).tolist()
         render_side_by_side(scene, [theta, theta], qpos, captions, path)
 
     return _draw(env, path, render)

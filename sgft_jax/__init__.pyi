@@ -1,5 +1,7 @@
+from .api import ActingPolicy, Setup, evaluate_prior, load_policy, setup
 from .data import replay, sequences, sources
 from .finetuner import FinetuneState, Parts, assemble, sac_finetuner
+from .io.priors import load_prior, save_prior
 from .learners.iql import IQLConfig, IQLHyper, IQLState, make_iql
 from .learners.sac import SACConfig, SACHyper, SACParams, SACState, extract_params, make_sac, state_from_prior
 from .learners.tdmpc2 import TDMPC2Config, TDMPC2Hyper, TDMPC2Params, TDMPC2State, make_tdmpc2
@@ -8,6 +10,8 @@ from .models import normalizer
 from .models.config import NetworkConfig
 from .planning.mpc import MPCConfig
 from .policies import make_policy, mpc_policy, sac_policy, tdmpc2_policy
+from .presets import PRESETS, PretrainConfig
+from .pretraining import PretrainState, pretrain, priors_of
 from .systems import System
 from .systems.simulated import Simulated
 from .train import FinetuneProgress, evaluate, finetune, simulate
@@ -31,6 +35,8 @@ from .types import (
 )
 
 __all__ = [
+    "PRESETS",
+    "ActingPolicy",
     "Batch",
     "FinetuneProgress",
     "FinetuneState",
@@ -46,11 +52,14 @@ __all__ = [
     "Normalizer",
     "Parts",
     "Policy",
+    "PretrainConfig",
+    "PretrainState",
     "Prior",
     "SACConfig",
     "SACHyper",
     "SACParams",
     "SACState",
+    "Setup",
     "Simulated",
     "SimulatedData",
     "Simulation",
@@ -70,20 +79,27 @@ __all__ = [
     "clip",
     "compose",
     "evaluate",
+    "evaluate_prior",
     "extract_params",
     "finetune",
     "get_method",
+    "load_policy",
+    "load_prior",
     "make_iql",
     "make_policy",
     "make_sac",
     "make_tdmpc2",
     "mpc_policy",
     "normalizer",
+    "pretrain",
+    "priors_of",
     "relabel",
     "replay",
     "sac_finetuner",
     "sac_policy",
+    "save_prior",
     "sequences",
+    "setup",
     "shape",
     "shaped_reward",
     "shorten",

@@ -3,6 +3,8 @@
 import importlib
 import importlib.util
 import sys
+import traceback
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
@@ -22,29 +24,58 @@ def name_of(source: str) -> str:
 def load(kind: str, source: str, attribute: str) -> ModuleType:
     """The module of a file or of a dotted name, executed once per process; it must define `attribute`.
 
-    kind: what it should hold, for messages. Raises UserError if there is no such file or module, if it is no Python, or
-    if it lacks the attribute. Whatever else goes wrong while it runs is its author's and keeps its traceback.
+    kind: what it should hold, for messages. Raises UserError if there is no such file or module, if it fails (naming
+    file and line, the traceback as its cause), or if it lacks the attribute.
+    """
+    module = run(kind, source, lambda: _from_file(Path(source)) if source.endswith(".py") else _module(kind, source))
+    if not hasattr(module, attribute):
+        raise UserError(f"{kind} {source}: does not define `{attribute}`; see docs/extending.md")
+    return module
+
+
+def run[T](kind: str, source: str, function: Callable[[], T]) -> T:
+    """What a function of the user's file or module returns; a UserError, one line, for whatever it raises.
+
+    A name of ours keeps its traceback.
     """
     try:
-        module = _from_file(Path(source)) if source.endswith(".py") else importlib.import_module(source)
-    except OSError as error:
-        raise UserError(f"{kind} {source}: {error.strerror}") from None
+        return function()
+    except UserError:
+        raise
     except SyntaxError as error:
-        raise UserError(f"{kind} {source}: {error.msg} in line {error.lineno}") from None
+        raise UserError(f"{kind} {source}: {error.msg} in line {error.lineno} of {error.filename}") from error
+    except Exception as error:
+        if not is_source(source):
+            raise
+        if isinstance(error, OSError) and error.filename == source:
+            raise UserError(f"{kind} {source}: {error.strerror}") from None
+        said = (str(error).strip() or "no message").splitlines()[0]
+        raise UserError(f"{kind} {source}: {_place(source, error)}{type(error).__name__}: {said}") from error
+
+
+def _place(source: str, error: Exception) -> str:
+    """Where it failed: the line of the user's file, or the file and line of what it imports."""
+    frames = traceback.extract_tb(error.__traceback__)
+    own = [frame for frame in frames if source.endswith(".py") and Path(frame.filename) == Path(source).resolve()]
+    if own:
+        return f"line {own[-1].lineno}: "
+    return f"{frames[-1].filename}, line {frames[-1].lineno}: "
+
+
+def _module(kind: str, source: str) -> ModuleType:
+    try:
+        return importlib.import_module(source)
     except ModuleNotFoundError as error:
         if source != error.name and not source.startswith(f"{error.name}."):
             raise  # it is there, what it imports is not
         raise UserError(f"{kind} {source}: there is no module {error.name!r}; a file is named with its .py") from None
-    if not hasattr(module, attribute):
-        raise UserError(f"{kind} {source}: does not define `{attribute}`; see docs/extending.md")
-    return module
 
 
 def _from_file(path: Path) -> ModuleType:
     name = str(path.resolve())  # no other module can be called that
     if name in sys.modules:
         return sys.modules[name]
-    spec = importlib.util.spec_from_file_location(name, path)
+    spec = importlib.util.spec_from_file_location(name, name)
     assert spec is not None and spec.loader is not None  # as for any name that ends in .py
     sys.modules[name] = module = importlib.util.module_from_spec(spec)
     try:

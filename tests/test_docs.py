@@ -129,4 +129,4 @@ def test_the_gap_in_the_readme_loads(tmp_path, key):
     gap = gaps.load(env, str(tmp_path / "my_table.toml"), ["latency=0.08", "action_scale=[1.2,0.9]"])
     worlds = gaps.worlds(env, gap, key, n=2)
     assert gap.params == tomllib.loads(shown)["params"]
-    assert worlds.effects.action_scale[0].tolist() == pytest.approx([1.2, 0.9])
+    assert worlds.theta.effects.high.action_scale[0].tolist() == pytest.approx([1.2, 0.9])

@@ -58,7 +58,7 @@ def test_examples_are_short_and_explained():
 def test_the_task_can_be_solved_and_overshot(key):
     """A careful hand stops the puck at the mark; one that pushes as fast as it can throws it past."""
     env = envs.make(TASK)
-    pool = env.sample_worlds(key, 4)
+    pool = envs.sample_worlds(env, key, 4)
 
     def careful(carry, obs, key):
         return jnp.clip(3 * (0.3 - obs[1:2]), -1, 1), carry
@@ -74,9 +74,9 @@ def test_the_task_can_be_solved_and_overshot(key):
 
 def test_worlds_differ_in_what_the_parameters_say(key):
     env = envs.make(TASK)
-    worlds = env.sample_worlds(key, 3)
-    np.testing.assert_allclose(worlds.model["dof_frictionloss"][:, 1], worlds.params[:, 1], rtol=1e-6)
-    np.testing.assert_allclose(worlds.model["body_mass"][:, 2], worlds.params[:, 0], rtol=1e-6)
+    worlds = envs.sample_worlds(env, key, 3)
+    np.testing.assert_allclose(worlds.model["dof_frictionloss"][:, 1], worlds.theta.params[:, 1], rtol=1e-6)
+    np.testing.assert_allclose(worlds.model["body_mass"][:, 2], worlds.theta.params[:, 0], rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -129,8 +129,8 @@ def test_the_gap_is_outside_the_training_range(key):
     ranges = {p.name: (p.low, p.high) for p in env.parameters}
     assert gap.params["rail_friction"] < ranges["rail_friction"][0]
     worlds = gaps.worlds(env, gap, key, n=3)
-    np.testing.assert_allclose(worlds.params[:, 1], 0.25)
-    assert len(np.unique(worlds.params[:, 0])) == 3 and (worlds.effects.action_scale == 1.25).all()
+    np.testing.assert_allclose(worlds.theta.params[:, 1], 0.25)
+    assert len(np.unique(worlds.theta.params[:, 0])) == 3 and (worlds.theta.effects.low.action_scale == 1.25).all()
 
 
 def test_a_pretended_robot_teaches_a_policy(prior, capsys):

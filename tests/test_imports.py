@@ -6,7 +6,7 @@ import sys
 import pytest
 
 HEAVY = ("jax", "flax", "mujoco", "matplotlib", "scipy", "orbax")
-LIGHT = ("sgft_jax", "sgft_jax.checks", "sgft_jax.models.config", "experiments.cli", "experiments.presets")
+LIGHT = ("sgft_jax", "sgft_jax.checks", "sgft_jax.models.config", "experiments.cli", "sgft_jax.presets")
 
 
 def imported(program):

@@ -1,18 +1,16 @@
 """A point mass on a plane that is pushed to the origin: an Env without a physics engine, learned in seconds."""
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from envs.base import Entry, Env, EnvState, Parameter, World
-from envs.mujoco.scene import distort, make_effects, measure
-from sgft_jax.types import Array, Key, UserError
+from envs.effects import distort, draw, measure
+from sgft_jax.types import Array, Key
 
 DT, FORCE, TOLERANCE = 0.1, 4.0, 0.15  # s, N at full action, m
-PARAMETERS = (Parameter("mass", "kg", 1.0, 0.8, 1.2), Parameter("friction", "1/s", 4.0, 3.5, 4.5))
+PARAMETERS = (Parameter("mass", "kg", 1.0, 0.8, 1.2, 0.01), Parameter("friction", "1/s", 4.0, 3.5, 4.5, 0.0))
 TRAINING = {"obs_noise": 0.005, "obs_noise_prob": 0.3}
 
 
@@ -33,41 +31,30 @@ def make(impl: str = "auto") -> Env:
         parameters=PARAMETERS,
         episode_length=20,
         control_dt=DT,
-        success_anytime=False,
-        sample_worlds=sample_worlds,
+        make_worlds=lambda theta: World(theta._replace(params=jnp.asarray(theta.params, jnp.float32)), {}),
         reset=reset,
         step=step,
         reward=reward,
-        terminated=lambda obs, action, next_obs: jnp.zeros((), bool),
         success=success,
+        training=TRAINING,
+        cartesian=True,
+        trace=lambda physics: physics.qpos,
     )
 
 
-def sample_worlds(key: Key, n: int, *, params: Mapping | None = None, effects: Mapping | None = None) -> World:
-    ranges = {p.name: (p.low, p.high) for p in PARAMETERS}
-    for name, value in (params or {}).items():
-        if name not in ranges:
-            raise UserError(f"toy has no domain parameter '{name}'")
-        ranges[name] = tuple(np.broadcast_to(np.asarray(value, float), (2,)))
-    low, high = np.array(list(ranges.values()), np.float32).T
-    theta = jax.random.uniform(key, (n, 2), minval=jnp.asarray(low)[None], maxval=jnp.asarray(high)[None])
-    given = make_effects({**TRAINING, **(effects or {})}, 4, 2)
-    return World(theta, {}, jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *x.shape)), given))
-
-
 def reset(world: World, key: Key) -> EnvState:
-    key_start, key_noise = jax.random.split(key)
+    key_start, key_noise, key_effects = jax.random.split(key, 3)
     start = jax.random.uniform(key_start, (2,), minval=-0.8, maxval=0.8)
     no, rest = jnp.zeros((), bool), jnp.zeros(2)
-    obs = jnp.concatenate([start, rest])
-    measured = measure(world.effects, obs, key_noise)
-    return EnvState(Point(start, rest, rest), measured, obs, jnp.float32(0), no, no, no, no, jnp.int32(0))
+    obs, own = jnp.concatenate([start, rest]), draw(world.theta.effects, key_effects)
+    measured = measure(own, obs, key_noise)
+    return EnvState(Point(start, rest, rest), measured, obs, jnp.float32(0), no, no, no, no, jnp.int32(0), own)
 
 
 def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
-    mass, friction = world.params
-    command = distort(world.effects, action)
-    late = jnp.clip(world.effects.latency / DT, 0.0, 1.0)
+    mass, friction = world.theta.params
+    command = distort(state.effects, action)
+    late = jnp.clip(state.effects.latency / DT, 0.0, 1.0)
     force = FORCE * (late * state.physics.ctrl + (1 - late) * command)
     velocity = state.physics.qvel + DT * (force / mass - friction * state.physics.qvel)
     position = state.physics.qpos + DT * velocity
@@ -75,7 +62,7 @@ def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
     no, time = jnp.zeros((), bool), state.time + 1
     return EnvState(
         physics=Point(position, velocity, command),
-        obs=measure(world.effects, obs, key),
+        obs=measure(state.effects, obs, key),
         true_obs=obs,
         reward=reward(state.true_obs, action, obs),
         terminated=no,
@@ -83,6 +70,7 @@ def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
         success=success(obs),
         invalid=~jnp.isfinite(obs).all(),
         time=time,
+        effects=state.effects,
     )
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import mujoco
 
 from envs import Entry, Env, Parameter
-from envs.mujoco.scene import Scene, make_env
+from envs.mujoco.scene import Scene, View, make_env
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array, Key
 
@@ -22,7 +22,10 @@ MJCF = """
   <actuator><position joint="pusher" kp="200" kv="12" forcelimited="true" forcerange="-20 20"/></actuator>
 </mujoco>
 """
-PARAMETERS = (Parameter("puck_mass", "kg", 0.1, 0.08, 0.12), Parameter("rail_friction", "N", 0.6, 0.5, 0.7))
+PARAMETERS = (  # nominal, training range, physical bounds
+    Parameter("puck_mass", "kg", 0.1, 0.08, 0.12, minimum=0.001),
+    Parameter("rail_friction", "N", 0.6, 0.5, 0.7, minimum=0.001),
+)
 
 
 def build(theta: dict[str, float]) -> mujoco.MjSpec:
@@ -56,9 +59,10 @@ def success(obs: Array) -> Array:
 
 SCENE = Scene(
     name="own_task", observation=(Entry("pusher_x", "m", 1), Entry("puck_x", "m", 1), Entry("puck_speed", "m/s", 1)),
-    action=(Entry("pusher_step", "8 cm", 1),), parameters=PARAMETERS, episode_length=15, substeps=20,
-    success_anytime=False, cartesian=False, build=build, initial=initial, observe=observe, reward=reward,
-    success=success, target=lambda qpos, action: jnp.clip(qpos[:1] + STEP * action, -0.2, 0.5),
+    action=(Entry("pusher_step", "8 cm", 1),), parameters=PARAMETERS, episode_length=15, control_dt=0.2, substeps=20,
+    ramp=0.1, build=build, initial=initial, observe=observe, reward=reward, success=success,
+    target=lambda qpos, action: jnp.clip(qpos[:1] + STEP * action, -0.2, 0.5),
+    training={"obs_noise": 0.004, "obs_noise_prob": 0.3}, view=View((0.15, 0.0, 0.0), 0.7, 90.0, -30.0),
 )  # fmt: skip
 
 

@@ -11,7 +11,8 @@ import mujoco
 import numpy as np
 
 from envs.base import Entry, Env, Parameter
-from envs.mujoco.scene import Scene, make_env
+from envs.mujoco.engines.mjx import Engine
+from envs.mujoco.scene import Scene, View, make_env
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array, Key
 
@@ -25,10 +26,10 @@ UPRIGHT, CENTRED = 0.995, 0.25  # cosine and m: the bounds of dm_control's spars
 START_STD = 0.01  # m, rad, m/s, rad/s
 
 PARAMETERS = (
-    Parameter("cart_mass", "kg", 1.0, 0.8, 1.25),
-    Parameter("pole_mass", "kg", 0.1, 0.07, 0.14),
-    Parameter("pole_length", "m", 1.0, 0.9, 1.1),
-    Parameter("force", "N", 10.0, 8.0, 12.5),
+    Parameter("cart_mass", "kg", 1.0, 0.8, 1.25, minimum=0.01),
+    Parameter("pole_mass", "kg", 0.1, 0.07, 0.14, minimum=0.001),
+    Parameter("pole_length", "m", 1.0, 0.9, 1.1, minimum=0.05),
+    Parameter("force", "N", 10.0, 8.0, 12.5, minimum=0.0),
 )
 
 
@@ -168,8 +169,6 @@ SCENE = Scene(
     parameters=PARAMETERS,
     episode_length=500,
     substeps=REPEAT,
-    success_anytime=False,
-    cartesian=False,
     build=build,
     initial=initial,
     target=lambda qpos, action: jnp.clip(action, -1.0, 1.0),
@@ -178,8 +177,9 @@ SCENE = Scene(
     success=success,
     control_dt=CONTROL_DT,
     ramp=FRAME,
-    training={},
-    advance=advance,
+    score="return",
+    engine=Engine(advance),
+    view=View((0.0, 0.0, 1.0), 5.0, 90.0, -10.0),
 )
 
 

@@ -1,4 +1,4 @@
-"""Hammering: drive a nail into a board with three joints of the arm. Paper section 6.1; sgft.md sections 9 to 11.
+"""Hammering: drive a nail into a board with three joints of the arm. Paper section 6.1.
 
 Everything happens in the arm's vertical plane y = 0. The gripper points down and holds the hammer close to its head, on
 the side of the base, so that the striking face is almost below joint 6: the weak wrist (12 Nm) then carries over 250 N.
@@ -16,17 +16,18 @@ import mujoco
 import numpy as np
 
 from envs.base import Entry, Env, Parameter
-from envs.franka import arm, kinematics
+from envs.franka import arm, kinematics, workcell
 from envs.franka.arm import NO_CONTACT
 from envs.franka.kinematics import DOWN, Pose
-from envs.mujoco.scene import Scene, at_rest, clip_joints, make_env, new_spec
+from envs.franka.workcell import at_rest, clip_joints, new_spec
+from envs.mujoco.scene import View, make_env
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array, Key
 
 SUBSTEPS = 32
-STEP = 0.2  # rad per control step at |action| = 1 (O-19)
-JOINTS = np.array([1, 3, 5])  # joints 2, 4 and 6: parallel axes, one vertical plane (O-18)
-TOLERANCE = 0.005  # m above the board counts as driven home (O-23)
+STEP = 0.2  # rad per control step at |action| = 1
+JOINTS = np.array([1, 3, 5])  # joints 2, 4 and 6: parallel axes, one vertical plane
+TOLERANCE = 0.005  # m above the board counts as driven home
 HEAD_BACK = 0.045  # m from the gripper's centre to the hammer's axis, towards the base
 FACE = 0.035  # m from the gripper's centre down to the striking face
 FACE_RADIUS = 0.018  # m: the face is a sphere, so its contact does not depend on the hammer's tilt
@@ -47,20 +48,21 @@ PAIRS = (
     *((name, "board") for name in ("face", "handle", "wrist")),
     *((name, "block") for name in ELBOW),
 )
+BOARD_THICKNESS = 0.06  # m
 INVISIBLE = [0, 0, 0, 0]
 NV = arm.N_JOINTS + 1
 
 PARAMETERS = (
-    Parameter("nail_x", "m", 0.35, 0.30, 0.40),
-    Parameter("nail_z", "m", 0.60, 0.55, 0.65),
-    Parameter("nail_damping", "N s/m", 1000.0, 250.0, 2500.0),
-    Parameter("nail_half_height", "m", 0.04, 0.02, 0.06),
-    Parameter("nail_radius", "m", 0.01, 0.005, 0.015),
-    Parameter("head_radius", "m", 0.035, 0.03, 0.04),
-    Parameter("head_thickness", "m", 0.005, 0.001, 0.01),
-    Parameter("hammer_mass", "kg", 0.05, 0.015, 0.15),
-    Parameter("nail_friction", "N", 0.1, 0.1, 0.1),
-    Parameter("servo_stiffness", "", 1.0, 1.0, 1.0),
+    Parameter("nail_x", "m", 0.35, 0.30, 0.40, minimum=0.1, maximum=0.8),
+    Parameter("nail_z", "m", 0.60, 0.55, 0.65, minimum=0.1, maximum=1.0),
+    Parameter("nail_damping", "N s/m", 1000.0, 250.0, 2500.0, minimum=0.0),
+    Parameter("nail_half_height", "m", 0.04, 0.02, 0.06, minimum=0.001),
+    Parameter("nail_radius", "m", 0.01, 0.005, 0.015, minimum=0.0005),
+    Parameter("head_radius", "m", 0.035, 0.03, 0.04, minimum=0.0005),
+    Parameter("head_thickness", "m", 0.005, 0.001, 0.01, minimum=0.0001),
+    Parameter("hammer_mass", "kg", 0.05, 0.015, 0.15, minimum=0.001),
+    Parameter("nail_friction", "N", 0.1, 0.1, 0.1, minimum=0.001),
+    Parameter("servo_stiffness", "", 1.0, 1.0, 1.0, minimum=0.01),
 )
 _INDEX = {p.name: i for i, p in enumerate(PARAMETERS)}
 
@@ -91,7 +93,7 @@ def observe(params: Array, state: PhysicsState) -> Array:
 
 
 def reward(obs: Array, action: Array, next_obs: Array) -> Array:
-    """[]: minus ten times the height (m) by which the nail still stands out of the board (O-20)."""
+    """[]: minus ten times the height (m) by which the nail still stands out of the board."""
     return -10.0 * jnp.maximum(0.0, _exposed(next_obs))
 
 
@@ -114,13 +116,21 @@ def initial(params: Array, key: Key) -> PhysicsState:
 def target(qpos: Array, action: Array) -> Array:
     """[7] joint targets: joints 2, 4, 6 move by `action` * 0.2 rad from where they are, the others hold still.
 
-    Nothing keeps the hammer above the board (O-24) but the board itself.
+    Nothing keeps the hammer above the board but the board itself.
     """
     joints = qpos[: arm.N_JOINTS]
     return clip_joints(_hold(joints.at[JOINTS].add(STEP * action)))
 
 
-SCENE = Scene(
+def check(theta: dict[str, float]) -> str | None:
+    """The board has to lie above its stand."""
+    board = theta["nail_z"] - 2 * theta["nail_half_height"]
+    if board > BOARD_THICKNESS:
+        return None
+    return f"nail_z less twice nail_half_height is the board's height, {board:g} m: more than {BOARD_THICKNESS:g} m"
+
+
+SCENE = workcell.scene(
     name="hammer",
     observation=(
         Entry("face_xyz", "m", 3),
@@ -133,14 +143,15 @@ SCENE = Scene(
     parameters=PARAMETERS,
     episode_length=50,
     substeps=SUBSTEPS,
-    success_anytime=False,
-    cartesian=False,
     build=build,
     initial=initial,
     target=target,
     observe=observe,
     reward=reward,
     success=success,
+    check=check,
+    dress=workcell.dress,
+    view=View((0.30, 0.0, 0.52), 1.0, 125.0, -12.0, 0.0),
 )
 
 
@@ -268,6 +279,8 @@ def _add_board(spec: mujoco.MjSpec, x: float, height: float) -> None:
     center = [x - EDGE + 1, 0, height - DEPTH / 2]
     world.add_geom(name="block", type=box, pos=center, size=[1, 1, DEPTH / 2], **hidden)
     wood, dark = [0.78, 0.62, 0.42, 1], [0.35, 0.37, 0.4, 1]
-    world.add_geom(type=box, pos=[x, 0, height - 0.03], size=[EDGE, 0.16, 0.0299], rgba=wood, **NO_CONTACT)
-    stand = (height - 0.06) / 2
+    half = BOARD_THICKNESS / 2
+    size = [EDGE, 0.16, half - 1e-4]
+    world.add_geom(type=box, pos=[x, 0, height - half], size=size, rgba=wood, **NO_CONTACT)
+    stand = (height - BOARD_THICKNESS) / 2
     world.add_geom(type=box, pos=[x, 0, stand], size=[0.05, 0.09, stand], rgba=dark, **NO_CONTACT)

@@ -1,4 +1,4 @@
-"""Insertion: put a table leg into its hole in a table top. Paper section 6.2; sgft.md sections 9 and 15.4.
+"""Insertion: put a table leg into its hole in a table top. Paper section 6.2.
 
 Everything is measured in the robot's base frame. The table top lies in the bench with its upper face level with the
 bench, z = 0, so there is one surface with one hole. The leg is held rigidly, so it is part of the last link, and it
@@ -8,8 +8,10 @@ Contacts live in configuration space: a round peg of radius r that stays upright
 R moves exactly as a small ball in an opening of half-width R - r + ball. So two balls on the peg's axis collide with
 four boxes around the narrowed opening, and the drawn leg and hole have their true sizes. The balls' radius is the
 rounding of the leg's tip: it decides how far off the hole the leg may be and still slide in. Each ball costs 16
-constraint rows; a leg of its own shape against a ring of 12 to 16 boxes (O-31) would cost over a hundred.
+constraint rows; a leg of its own shape against a ring of 12 to 16 boxes would cost over a hundred.
 """
+
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -17,15 +19,16 @@ import mujoco
 import numpy as np
 
 from envs.base import Entry, Env, Parameter
-from envs.franka import arm, kinematics
+from envs.franka import arm, kinematics, workcell
 from envs.franka.arm import NO_CONTACT
 from envs.franka.kinematics import DOWN, Pose
-from envs.mujoco.scene import Scene, at_rest, clip_joints, make_env, new_spec
+from envs.franka.workcell import at_rest, clip_joints, new_spec
+from envs.mujoco.scene import View, make_env
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array, Key
 
 SUBSTEPS = 40
-STEP = 0.02  # m per control step at |action| = 1 (O-19)
+STEP = 0.02  # m per control step at |action| = 1
 TOLERANCE = 0.01  # m per axis
 PART_HALF = 0.08775  # m, half the side of the table top, scaled by 1.08
 HOLE_OFFSET = np.array([0.06075, 0.06075])  # m, hole in the frame of the table top
@@ -47,13 +50,13 @@ DAMPING_TIME = 1 / 16
 NV = arm.N_JOINTS
 
 PARAMETERS = (
-    Parameter("part_x", "m", 0.0, -0.05, 0.05),
-    Parameter("part_y", "m", 0.0, -0.05, 0.05),
-    Parameter("part_rotation", "rad", 0.0, -np.pi / 12, np.pi / 12),
-    Parameter("part_friction", "", 0.15, 0.14, 0.16),
-    Parameter("hole_radius", "m", 0.012, 0.012, 0.012),
-    Parameter("peg_radius", "m", 0.0115, 0.0115, 0.0115),
-    Parameter("servo_stiffness", "", 0.5, 0.5, 0.5),
+    Parameter("part_x", "m", 0.0, -0.05, 0.05, minimum=-0.15, maximum=0.15),
+    Parameter("part_y", "m", 0.0, -0.05, 0.05, minimum=-0.15, maximum=0.15),
+    Parameter("part_rotation", "rad", 0.0, -np.pi / 12, np.pi / 12, minimum=-np.pi, maximum=np.pi),
+    Parameter("part_friction", "", 0.15, 0.14, 0.16, minimum=0.0),
+    Parameter("hole_radius", "m", 0.012, 0.012, 0.012, minimum=0.001, maximum=0.05),
+    Parameter("peg_radius", "m", 0.0115, 0.0115, 0.0115, minimum=0.001, maximum=LEG_HALF_WIDTH),
+    Parameter("servo_stiffness", "", 0.5, 0.5, 0.5, minimum=0.01),
 )
 
 
@@ -73,7 +76,7 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
 
 
 def observe(params: Array, state: PhysicsState) -> Array:
-    """[9] m, base frame: tool centre point, the leg's tip, where the tip is when the leg is assembled (O-22)."""
+    """[9] m, base frame: tool centre point, the leg's tip, where the tip is when the leg is assembled."""
     joints = state.qpos[: arm.N_JOINTS]
     return jnp.concatenate([kinematics.forward(joints).position, _tip(joints), assembled(params)])
 
@@ -118,7 +121,13 @@ def target(qpos: Array, action: Array) -> Array:
     return clip_joints(kinematics.solve(joints, _pose(goal), iterations=3, posture=0.05))
 
 
-SCENE = Scene(
+def check(theta: dict[str, float]) -> str | None:
+    """The leg's peg has to fit: contacts are between balls of no peg's size, which would pass through the wood."""
+    hole, peg = theta["hole_radius"], theta["peg_radius"]
+    return f"hole_radius {hole:g} m is narrower than peg_radius {peg:g} m" if hole < peg else None
+
+
+SCENE = workcell.scene(
     name="insert",
     observation=(Entry("hand_xyz", "m", 3), Entry("leg_xyz", "m", 3), Entry("hole_xyz", "m", 3)),
     action=(Entry("hand_xyz_step", "2 cm", 3),),
@@ -133,6 +142,9 @@ SCENE = Scene(
     observe=observe,
     reward=reward,
     success=success,
+    check=check,
+    dress=functools.partial(workcell.dress, table=(-0.15, 0.75, 0.4)),
+    view=View((0.48, 0.0, 0.04), 0.5, 135.0, -24.0, workcell.FLOOR),
 )
 
 

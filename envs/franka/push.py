@@ -1,6 +1,6 @@
-"""Pushing: slide a puck to the edge of the table, not over it. Paper section 6.2; sgft.md section 9.
+"""Pushing: slide a puck to the edge of the table, not over it. Paper section 6.2.
 
-The table frame has its origin 0.2 m in front of the robot's base (O-25); observations and rewards live in it. The
+The table frame has its origin 0.2 m in front of the robot's base; observations and rewards live in it. The
 object's range of the paper's Table 2, [0, 0.3] m, starts at 0.15 m here: nearer to the base the gripper cannot point
 down behind it. Two fingertips, 4 cm apart, cradle the puck; they move in a plane just above the table. A flat puck tips
 over the edge when its centre passes it, so falling is an event on the centre's position: from then on the puck lies out
@@ -8,23 +8,27 @@ of reach and the camera reports it 3 cm past the edge, where it fell. Reward and
 observation alone.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from envs.base import Entry, Env, Parameter
-from envs.franka import arm, kinematics
+from envs.franka import arm, kinematics, workcell
 from envs.franka.arm import NO_CONTACT
 from envs.franka.kinematics import DOWN, Pose
-from envs.mujoco.scene import Scene, at_rest, clip_joints, make_env, new_spec
+from envs.franka.workcell import at_rest, clip_joints, new_spec
+from envs.mujoco.scene import View, make_env
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array, Key
 
 SUBSTEPS = 40
-STEP = 0.05  # m per control step at |action| = 1 (O-19)
+STEP = 0.05  # m per control step at |action| = 1
 TABLE_ORIGIN = 0.20  # m, x of the table frame in the base frame
 EDGE = 0.55  # m, table frame
+TABLE_HALF_WIDTH = 0.6  # m
 TOLERANCE = 0.025  # m short of the edge counts as reached
 BEHIND = 0.035  # m: where the reward wants the hand, behind the puck
 HEIGHT = 0.02  # m above the table: the plane in which the fingertips move
@@ -37,15 +41,16 @@ GRAVITY = 9.81  # m/s^2
 # Rubber fingertips: the contact stiffens over 3 mm instead of at once. Newton's method then converges in 4 iterations
 # on every contact we have seen; hard fingertips need more than 6 and throw the puck with fewer.
 RUBBER = (0.0, 0.95, 0.003, 0.5, 2.0)
+TABLE_LEGS = (-0.2, 0.7, 0.55)  # m, see `workcell.dress`
 NV = arm.N_JOINTS + 4  # puck: x, y, z, yaw
 
 PARAMETERS = (
-    Parameter("object_x", "m", 0.22, 0.15, 0.30),
-    Parameter("object_y", "m", 0.0, -0.25, 0.25),
-    Parameter("object_mass", "kg", 0.15, 0.15, 0.15),
-    Parameter("table_friction", "", 0.35, 0.35, 0.35),
-    Parameter("finger_friction", "", 0.5, 0.5, 0.5),
-    Parameter("servo_stiffness", "", 1.0, 1.0, 1.0),
+    Parameter("object_x", "m", 0.22, 0.15, 0.30, minimum=0.0, maximum=EDGE),
+    Parameter("object_y", "m", 0.0, -0.25, 0.25, minimum=-TABLE_HALF_WIDTH, maximum=TABLE_HALF_WIDTH),
+    Parameter("object_mass", "kg", 0.15, 0.15, 0.15, minimum=0.001),
+    Parameter("table_friction", "", 0.35, 0.35, 0.35, minimum=0.0),
+    Parameter("finger_friction", "", 0.5, 0.5, 0.5, minimum=0.0),
+    Parameter("servo_stiffness", "", 1.0, 1.0, 1.0, minimum=0.01),
 )
 
 
@@ -89,12 +94,12 @@ def reward(obs: Array, action: Array, next_obs: Array) -> Array:
 
 
 def fallen(obs: Array) -> Array:
-    """[] 1.0 if the puck's centre has passed the edge of the table (O-21), else 0.0."""
+    """[] 1.0 if the puck's centre has passed the edge of the table, else 0.0."""
     return (obs[2] > EDGE).astype(jnp.float32)
 
 
 def success(obs: Array) -> Array:
-    """[] bool: the puck is within 2.5 cm of the edge and still on the table (O-23)."""
+    """[] bool: the puck is within 2.5 cm of the edge and still on the table."""
     return (obs[2] >= EDGE - TOLERANCE) & (obs[2] <= EDGE)
 
 
@@ -128,14 +133,13 @@ def event(params: Array, state: PhysicsState) -> PhysicsState:
     return state._replace(qpos=qpos, qvel=qvel)
 
 
-SCENE = Scene(
+SCENE = workcell.scene(
     name="push",
     observation=(Entry("hand_xy", "m", 2), Entry("puck_xy", "m", 2)),
     action=(Entry("hand_xy_step", "5 cm", 2),),
     parameters=PARAMETERS,
     episode_length=40,
     substeps=SUBSTEPS,
-    success_anytime=False,
     cartesian=True,
     build=build,
     initial=initial,
@@ -144,6 +148,8 @@ SCENE = Scene(
     reward=reward,
     success=success,
     event=event,
+    dress=functools.partial(workcell.dress, table=TABLE_LEGS),
+    view=View((0.45, 0.0, 0.06), 1.1, 145.0, -30.0, workcell.FLOOR),
 )
 
 
@@ -235,6 +241,7 @@ def add_scenery(spec: mujoco.MjSpec) -> None:
     wood, line = [0.78, 0.66, 0.5, 1], [0.95, 0.85, 0.2, 1]
     box = mujoco.mjtGeom.mjGEOM_BOX
     world = spec.worldbody
-    world.add_geom(type=box, pos=[half - 0.25, 0, -0.02], size=[half, 0.6, 0.0199], rgba=wood, **NO_CONTACT)
+    size = [half, TABLE_HALF_WIDTH, 0.0199]
+    world.add_geom(type=box, pos=[half - 0.25, 0, -0.02], size=size, rgba=wood, **NO_CONTACT)
     x = TABLE_ORIGIN + EDGE - TOLERANCE / 2
-    world.add_geom(type=box, pos=[x, 0, 0], size=[TOLERANCE / 2, 0.6, 0.0005], rgba=line, **NO_CONTACT)
+    world.add_geom(type=box, pos=[x, 0, 0], size=[TOLERANCE / 2, TABLE_HALF_WIDTH, 0.0005], rgba=line, **NO_CONTACT)

@@ -15,9 +15,10 @@ import mujoco
 import numpy as np
 
 from envs.base import Parameter
-from envs.franka import arm, push
+from envs.franka import arm, push, workcell
 from envs.franka.arm import NO_CONTACT
-from envs.mujoco.scene import Scene, new_spec
+from envs.franka.workcell import new_spec
+from envs.mujoco.scene import Scene, View
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array
 
@@ -34,8 +35,10 @@ _THICK = 0.1  # m, half of the table's: nothing passes through
 def simulated(name: str, *, mass: float) -> Scene:
     """The scene to pretrain in: pushing a puck of that mass, kg, which leaves room for the larger real object."""
     own = {"object_x": (0.25, *NEAREST_FARTHEST), "object_mass": (mass, mass, mass)}
-    parameters = tuple(Parameter(p.name, p.unit, *own.get(p.name, p[2:])) for p in push.PARAMETERS)
-    return push.SCENE._replace(name=name, parameters=parameters)
+    parameters = tuple(Parameter(p.name, p.unit, *own.get(p.name, p[2:5]), *p[5:]) for p in push.PARAMETERS)
+    # From the front, all of the edge in sight: the hand, which comes from behind, hides nothing of what it pushes.
+    view = View((0.58, 0.0, 0.045), 0.87, 172.0, -33.0, workcell.FLOOR)
+    return push.SCENE._replace(name=name, parameters=parameters, view=view)
 
 
 def stage(theta: dict[str, float], *, height: float, iterations: int) -> mujoco.MjSpec:
@@ -62,7 +65,7 @@ def stage(theta: dict[str, float], *, height: float, iterations: int) -> mujoco.
     for body in spec.bodies:
         body.gravcomp = float(body.name.startswith("link"))
     half = (push.TABLE_ORIGIN + push.EDGE + 0.25) / 2
-    box, size = mujoco.mjtGeom.mjGEOM_BOX, [half, 0.6, _THICK]
+    box, size = mujoco.mjtGeom.mjGEOM_BOX, [half, push.TABLE_HALF_WIDTH, _THICK]
     spec.worldbody.add_geom(name=TABLE, type=box, pos=[half - 0.25, 0, -_THICK], size=size, rgba=[0] * 4, **NO_CONTACT)
     push.add_scenery(spec)
     return spec
@@ -109,6 +112,10 @@ def real_scene(
         qpos = jnp.where(gone, state.qpos.at[n:].set(lying), state.qpos)
         return state._replace(qpos=qpos, qvel=jnp.where(gone, state.qvel.at[n:].set(0.0), state.qvel))
 
+    def dressed(spec: mujoco.MjSpec) -> None:
+        simulated.dress(spec)
+        dress(spec)
+
     return simulated._replace(
         variant=variant,
         build=build,
@@ -116,7 +123,7 @@ def real_scene(
         target=functools.partial(push.target, height=height),
         observe=lambda params, state: push.seen(state.qpos, place(state.qpos)),
         event=event,
-        dress=dress,
+        dress=dressed,
     )
 
 

@@ -12,7 +12,8 @@ import numpy as np
 from envs.base import Env
 from envs.franka import arm, push, soft
 from envs.franka.arm import NO_CONTACT
-from envs.mujoco.scene import Scene, at_rest, make_env
+from envs.franka.workcell import at_rest
+from envs.mujoco.scene import Scene, make_env
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array, Key
 

@@ -5,52 +5,20 @@ Rendering needs a graphics library but no screen: set MUJOCO_GL to egl or osmesa
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from envs.franka.arm import NO_CONTACT
-from envs.mujoco.scene import CONTROL_DT, Scene
+from envs.mujoco.scene import Scene, View
 from sgft_jax.types import UserError
 
 FPS = 10
-SPEED = 2  # times the robot's: a graphics library without a graphics card needs 0.2 s a frame
+SPEED = 2  # times real time: a graphics library without a graphics card needs 0.2 s a frame
 SIZE = 360, 480  # height, width in pixels
 CAPTION = 44  # pixels, height of the strip above a captioned video
 JUMP = 0.5  # m or rad in one control step: an event, such as a puck that fell, and nothing to draw in between
 SUPERSAMPLING = 2  # drawn so many times larger, then averaged: smooth edges on every backend
-WHITE, GREY, DARK = [0.93, 0.94, 0.95, 1.0], [0.60, 0.62, 0.65, 1.0], [0.20, 0.21, 0.24, 1.0]
-
-
-def _corners(back: float, front: float, side: float) -> tuple[tuple[float, float], ...]:
-    return tuple((x, y) for x in (back, front) for y in (-side, side))
-
-
-class View(NamedTuple):
-    """Where a viewer stands and what the scene stands on; lengths in m, angles in degrees.
-
-    The camera looks at `target` [3] from `distance` away (MuJoCo's free camera). floor: its height. legs: xy of the
-    table's legs, which reach from the floor to 4 cm below z = 0.
-    """
-
-    target: tuple[float, float, float]
-    distance: float
-    azimuth: float
-    elevation: float
-    floor: float = 0.0
-    legs: tuple[tuple[float, float], ...] = ()
-
-
-DEFAULT_VIEW = View((0.35, 0.0, 0.25), 1.8, 140.0, -22.0)
-VIEWS = {
-    "push": View((0.36, 0.0, 0.12), 1.6, 140.0, -27.0, -0.75, _corners(-0.2, 0.7, 0.55)),
-    # From the front, all of the edge in sight: the hand, which comes from behind, hides nothing of what it pushes.
-    "push-towel": View((0.58, 0.0, 0.04), 0.86, 172.0, -36.0, -0.75, _corners(-0.2, 0.7, 0.55)),
-    "push-ball": View((0.58, 0.0, 0.05), 0.88, 172.0, -30.0, -0.75, _corners(-0.2, 0.7, 0.55)),
-    "hammer": View((0.22, 0.0, 0.44), 1.4, 122.0, -14.0),
-    "insert": View((0.46, 0.0, 0.09), 0.7, 135.0, -24.0, -0.75, _corners(-0.15, 0.75, 0.4)),
-}
+_NO_CONTACT = {"contype": 0, "conaffinity": 0}
 
 
 def render_episode(
@@ -87,10 +55,10 @@ def render_side_by_side(
     _write(path, frames, picture_at)
 
 
-def smooth(qpos: np.ndarray, *, fps: int) -> np.ndarray:
-    """[frames, nq]: qpos [T + 1, nq] at control steps, linear in between; jumps stay jumps."""
-    steps = round(CONTROL_DT * fps)
-    index = np.arange(steps * (len(qpos) - 1) + 1) / steps
+def smooth(qpos: np.ndarray, *, control_dt: float, fps: float) -> np.ndarray:
+    """[frames, nq]: qpos [T + 1, nq] at control steps of so many s, linear in between; jumps stay jumps."""
+    last = len(qpos) - 1
+    index = np.minimum(np.arange(round(last * control_dt * fps) + 1) / (control_dt * fps), last)
     before = np.floor(index).astype(int)
     after = np.minimum(before + 1, len(qpos) - 1)
     move = qpos[after] - qpos[before]
@@ -101,15 +69,12 @@ def smooth(qpos: np.ndarray, *, fps: int) -> np.ndarray:
 def _frames(scene: Scene, theta: Mapping[str, float] | Sequence[float], qpos: np.ndarray) -> Iterator[np.ndarray]:
     values = theta.values() if isinstance(theta, Mapping) else theta
     by_name = dict(zip([p.name for p in scene.parameters], map(float, values), strict=True))
-    view = VIEWS.get(scene.name, DEFAULT_VIEW)
-    spec = scene.build(by_name)
-    scene.dress(spec)
-    model = dressed(spec, view).compile()
+    model = dressed(scene, by_name).compile()
     data = mujoco.MjData(model)
-    camera = _camera(view)
+    camera = _camera(model, scene.view)
     renderer = _renderer(model)
     try:
-        for row in smooth(np.asarray(qpos), fps=FPS // SPEED):
+        for row in smooth(np.asarray(qpos), control_dt=scene.control_dt, fps=FPS / SPEED):
             data.qpos[:] = row
             mujoco.mj_forward(model, data)
             renderer.update_scene(data, camera)
@@ -118,17 +83,12 @@ def _frames(scene: Scene, theta: Mapping[str, float] | Sequence[float], qpos: np
         renderer.close()
 
 
-def dressed(spec: mujoco.MjSpec, view: View) -> mujoco.MjSpec:
-    """The scene with what only a viewer needs: floor, sky, lights, table legs, the robot's livery."""
-    _add_surroundings(spec, view)
+def dressed(scene: Scene, theta: dict[str, float]) -> mujoco.MjSpec:
+    """The scene of one theta with what only a viewer needs: sky, lights, a floor, and the scene's own decoration."""
+    spec = scene.build(theta)
+    scene.dress(spec)
+    _add_surroundings(spec, None if scene.view is None else scene.view.floor)
     _add_lights(spec)
-    for body in spec.bodies:
-        if body.name.startswith("link"):
-            _paint_link(body)
-    world, cylinder = spec.worldbody, mujoco.mjtGeom.mjGEOM_CYLINDER
-    world.add_geom(type=cylinder, size=[0.11, 0.015, 0], pos=[0, 0, 0.015], rgba=DARK, **NO_CONTACT)
-    world.add_geom(type=cylinder, size=[0.09, 0.09, 0], pos=[0, 0, 0.09], rgba=WHITE, **NO_CONTACT)
-    spec.stat.extent, spec.stat.center = 1.5, [0.3, 0, 0.3]
     visual = spec.visual
     visual.map.znear, visual.map.zfar = 0.02, 20
     visual.quality.shadowsize, visual.quality.offsamples = 2048, 0
@@ -136,19 +96,18 @@ def dressed(spec: mujoco.MjSpec, view: View) -> mujoco.MjSpec:
     return spec
 
 
-def _add_surroundings(spec: mujoco.MjSpec, view: View) -> None:
+def _add_surroundings(spec: mujoco.MjSpec, floor: float | None) -> None:
     look = {"width": 256, "height": 256}
     gradient, checker = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, mujoco.mjtBuiltin.mjBUILTIN_CHECKER
     sky, flat = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtTexture.mjTEXTURE_2D
     spec.add_texture(name="sky", type=sky, builtin=gradient, rgb1=[0.92, 0.94, 0.97], rgb2=[0.6, 0.67, 0.77], **look)
+    if floor is None:
+        return
     spec.add_texture(name="tiles", type=flat, builtin=checker, rgb1=[0.84, 0.85, 0.87], rgb2=[0.78, 0.8, 0.82], **look)
     tiles = spec.add_material(name="tiles", texrepeat=[8, 8], reflectance=0.0)
     tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
-    plane, box = mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_BOX
-    spec.worldbody.add_geom(type=plane, size=[6, 6, 0.1], pos=[0, 0, view.floor], material="tiles", **NO_CONTACT)
-    half = -(view.floor + 0.04) / 2
-    for x, y in view.legs:
-        spec.worldbody.add_geom(type=box, size=[0.02, 0.02, half], pos=[x, y, -0.04 - half], rgba=DARK, **NO_CONTACT)
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    spec.worldbody.add_geom(type=plane, size=[6, 6, 0.1], pos=[0, 0, floor], material="tiles", **_NO_CONTACT)
 
 
 def _add_lights(spec: mujoco.MjSpec) -> None:
@@ -161,14 +120,6 @@ def _add_lights(spec: mujoco.MjSpec) -> None:
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.35] * 3, [0.2] * 3
 
 
-def _paint_link(body: mujoco.MjsBody) -> None:
-    """White links with a grey ring at each joint; the first geom of a link is its capsule."""
-    capsule = body.geoms[0]
-    capsule.rgba = WHITE
-    radius, cylinder = 1.06 * capsule.size[0], mujoco.mjtGeom.mjGEOM_CYLINDER
-    body.add_geom(type=cylinder, size=[radius, 0.35 * radius, 0], rgba=GREY, mass=0, **NO_CONTACT)
-
-
 def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
     try:
         return mujoco.Renderer(model, *(SUPERSAMPLING * n for n in SIZE))
@@ -179,10 +130,12 @@ def _renderer(model: mujoco.MjModel) -> mujoco.Renderer:
         ) from error
 
 
-def _camera(view: View) -> mujoco.MjvCamera:
+def _camera(model: mujoco.MjModel, view: View | None) -> mujoco.MjvCamera:
     camera = mujoco.MjvCamera()
-    camera.lookat[:], camera.distance = view.target, view.distance
-    camera.azimuth, camera.elevation = view.azimuth, view.elevation
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    if view is not None:
+        camera.lookat[:], camera.distance = view.target, view.distance
+        camera.azimuth, camera.elevation = view.azimuth, view.elevation
     return camera
 
 

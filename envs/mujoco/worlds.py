@@ -17,7 +17,7 @@ import numpy as np
 from envs.mujoco.engines import c as engine_c
 from envs.mujoco.engines import mjx as engine_jax
 from envs.mujoco.engines import warp as engine_warp
-from envs.mujoco.engines.mjx import MEAN_INERTIA, Advance
+from envs.mujoco.engines.mjx import MEAN_INERTIA, Engine
 from sgft_jax.types import Array, UserError, unknown
 
 # Fields that only matter to a renderer: they may differ between worlds without being simulated.
@@ -41,19 +41,29 @@ class PhysicsState(NamedTuple):
 
     qpos: [nq], qvel: [nv], warmstart: [nv] last acceleration, where the constraint solver starts.
     ctrl: [nu] last command.
+    sensordata: [nsensordata] what MuJoCo's sensors read, touch and contact sensors among them. Like MuJoCo's own it is
+        that of the start of the last physics step. Engines fill it in; a scene without sensors has none.
     """
 
     qpos: Array
     qvel: Array
     warmstart: Array
     ctrl: Array
+    sensordata: Array | np.ndarray = np.zeros(0, np.float32)
 
 
-def make_engine(host: mujoco.MjModel, fields: tuple[str, ...], impl: str) -> Advance:
+def make_engine(host: mujoco.MjModel, fields: tuple[str, ...], impl: str) -> Engine:
     """What steps a scene whose worlds differ in `fields`, by one of the engines of `choose_impl`."""
     if impl == "c":
-        return engine_c.make_advance(host, fields)
-    return {"jax": engine_jax, "warp": engine_warp}[impl].make_advance(host)
+        return engine_c.make_engine(host, fields)
+    return {"jax": engine_jax, "warp": engine_warp}[impl].make_engine(host)
+
+
+def check_supported(name: str, host: mujoco.MjModel) -> None:
+    """Raises UserError for a scene whose state is more than a `PhysicsState`."""
+    for count, what in ((host.na, "actuators with a state of their own (dyntype)"), (host.nmocap, "mocap bodies")):
+        if count:
+            raise UserError(f"scene {name} has {what}, which no engine here carries from step to step")
 
 
 def choose_impl(wanted: str = "auto") -> str:
@@ -90,12 +100,15 @@ def compile_worlds(
 ) -> dict[str, np.ndarray]:
     """Compiles one model per spec and stacks the fields `names` (see `varying_fields`): name -> [n, ...].
 
-    Raises UserError when a spec changes the structure of the scene (number or types of elements), which a compiled
-    program cannot follow.
+    Raises UserError when MuJoCo refuses a spec, or when one changes the structure of the scene (number or types of
+    elements), which a compiled program cannot follow.
     """
     models = []
     for spec in specs:
-        host = spec.compile()
+        try:
+            host = spec.compile()
+        except ValueError as error:
+            raise UserError(f"MuJoCo cannot build these domain parameters: {str(error).splitlines()[0]}") from None
         _check_structure(nominal, host)
         models.append(_read(host, names))
     return {k: np.stack([fields[k] for fields in models]) for k in names}

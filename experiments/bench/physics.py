@@ -46,8 +46,8 @@ def speed(task: str, impl: str, worlds: int, *, control_steps: int, repeats: int
     """
     began = time.perf_counter()
     env, scene = envs.make(task, impl), envs.scene(task)
-    pool = env.sample_worlds(jax.random.key(0), POOL)
-    reset = ahead(lambda pool, key: launch(env, pool, key, worlds), (pool, jax.random.key(1)))
+    pool = envs.sample_worlds(env, jax.random.key(0), POOL)
+    reset = ahead(lambda pool, key: launch(env, pool, key, worlds, ()), (pool, jax.random.key(1)))
     fresh = reset.call(pool, jax.random.key(1))
     play = ahead(lambda *state: _play(env, *state, control_steps=control_steps), (pool, fresh, jax.random.key(2)))
     middle, _ = play.call(pool, fresh, jax.random.key(2))  # into the episode, where things touch
@@ -82,7 +82,7 @@ def _play(env: Env, pool: World, fleet: Fleet, key: Key, *, control_steps: int) 
     def step(fleet: Fleet, key: Key) -> tuple[Fleet, Array]:
         key_action, key_step = jax.random.split(key)
         actions = jax.random.uniform(key_action, (n, env.act_dim), minval=-1.0, maxval=1.0)
-        fleet, _, _, after = step_fleet(env, pool, fleet, actions, key_step, gamma=1.0)
+        fleet, _, _, after = step_fleet(env, pool, fleet, actions, (), key_step, initial_carry=(), gamma=1.0)
         return fleet, after.physics.ctrl
 
     return jax.lax.scan(step, fleet, jax.random.split(key, control_steps))

@@ -71,6 +71,13 @@ def add_episode(state: SequenceState, rows: Transition, valid: Array) -> Sequenc
     return _write(state, index, rows, valid, last, count[-1])
 
 
+def end_episodes(state: SequenceState) -> SequenceState:
+    """The same ring, where no episode goes on after the newest slot."""
+    newest = (state.position - 1) % state.slots
+    slot = jnp.arange(state.last.shape[0]) // state.n_envs
+    return state.replace(last=state.last | (slot == newest))
+
+
 def _write(
     state: SequenceState, index: Array, rows: Transition, valid: Array, last: Array, steps: Array
 ) -> SequenceState:

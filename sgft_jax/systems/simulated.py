@@ -28,8 +28,11 @@ class Simulated:
             self._programs[policy.act] = jax.jit(split_vmap(self._player(policy), (0, None, 0, 0, None)))
         return self._programs[policy.act](states, self.pools, self.which, keys, explore)
 
-    def close(self) -> None:
-        """Nothing to bring to rest."""
+    def moved(self, pools: World, which: Array) -> "Simulated":
+        """Other systems of the same task, played by the programs that are compiled already."""
+        other = Simulated(self.env, pools, which, gamma=self.gamma)
+        other._programs = self._programs
+        return other
 
     def _player(self, policy: Any) -> Callable[..., Episode]:
         def play(state: PyTree, pools: World, which: Array, keys: Key, explore: Array) -> Episode:

@@ -43,11 +43,13 @@ def member(tree, i: int):
 
 
 def theta_of(scene, rng):
-    """Every parameter varied: inside its range, or by up to 10 % where training keeps it fixed."""
+    """Every parameter varied: inside its range, or by up to 10 % where training keeps it fixed; something possible."""
     ranges = {
         p.name: (p.low, p.high) if p.low < p.high else (0.9 * p.nominal, 1.1 * p.nominal) for p in scene.parameters
     }
-    return {name: float(rng.uniform(*span)) for name, span in ranges.items()}
+    while scene.check(theta := {name: float(rng.uniform(*span)) for name, span in ranges.items()}):
+        pass
+    return theta
 
 
 def push_hard(obs):

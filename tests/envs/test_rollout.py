@@ -1,21 +1,27 @@
-"""Whole episodes in one of several stacked pools."""
+"""Fleets and whole episodes, where episodes end early, physics explodes and policies remember."""
 
 import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import toy
+import toy_terminating
 
-from envs.rollout import pick, play_episode, pool_size
+import envs
+from envs.rollout import launch, pick, play_episode, pool_size, step_fleet
+from sgft_jax.types import UserError
+
+N = 64
 
 
 def test_an_episode_in_a_stacked_pool_is_that_in_the_pool_alone(key):
     env = toy.make()
-    stacked = jax.tree.map(lambda x: x.reshape(2, 5, *x.shape[1:]), env.sample_worlds(key, 10))
+    stacked = jax.tree.map(lambda x: x.reshape(2, 5, *x.shape[1:]), envs.sample_worlds(env, key, 10))
     assert pool_size(stacked) == 5
     push = lambda carry, obs, key: (-obs[:2], carry)  # noqa: E731
-    play = functools.partial(play_episode, env, policy=push, carry=(), gamma=1.0, length=2)
+    play = functools.partial(play_episode, env, act=push, carry=(), gamma=1.0, length=2)
 
     @jax.jit
     @jax.vmap
@@ -25,3 +31,107 @@ def test_an_episode_in_a_stacked_pool_is_that_in_the_pool_alone(key):
     together, alone = both(jax.random.split(key, 6), jnp.array([0, 1, 1, 0, 1, 0]))
     jax.tree.map(np.testing.assert_array_equal, together, alone)
     assert len(set(together.world.tolist())) > 1
+
+
+def counting(carry, obs, key):
+    """An action that is the number of steps since the start of the episode."""
+    return carry[None].astype(jnp.float32), carry + 1
+
+
+@pytest.fixture(scope="module")
+def episodes():
+    """[N] episodes of `counting`, of which most end early."""
+    env = toy_terminating.make()
+    pool = envs.sample_worlds(env, jax.random.key(0), 1)
+    keys = jax.random.split(jax.random.key(1), N)
+    return jax.jit(jax.vmap(lambda key: play_episode(env, pool, counting, jnp.int32(0), key, gamma=0.9)))(keys)
+
+
+def test_an_episode_is_over_when_it_terminates(episodes):
+    rows, valid = episodes.transitions, np.asarray(episodes.valid)
+    alarm = np.asarray(rows.next_obs[..., 1]) > 0.5
+    lengths = valid.sum(1)
+    assert lengths.min() < 4 and lengths.max() == toy_terminating.LENGTH
+    for i, length in enumerate(lengths):
+        assert valid[i, :length].all() and not valid[i, length:].any()
+        assert alarm[i, : length - 1].sum() == 0 and (alarm[i, length - 1] or length == toy_terminating.LENGTH)
+    np.testing.assert_allclose(rows.discount, np.where(valid, 0.9 * (1 - alarm), 0.0), atol=1e-6)
+    assert all((np.asarray(x)[~valid] == 0).all() for x in jax.tree.leaves(rows))
+
+
+def test_return_and_score_count_up_to_the_end(episodes):
+    # Steps of 0, 1, 2, ... times 0.1 m: after k of them the position is 0.05 k (k - 1), and a step earns 1 + position.
+    lengths = np.asarray(episodes.valid).sum(1)
+    earned = np.array([sum(1 + 0.05 * k * (k - 1) for k in range(1, n + 1)) for n in lengths])
+    np.testing.assert_allclose(episodes.total_reward, earned, rtol=1e-5)
+    np.testing.assert_array_equal(episodes.score, episodes.total_reward)
+    assert not episodes.exploded.any() and episodes.trace.shape == (N, toy_terminating.LENGTH + 1, 0)
+
+
+def test_what_is_judged_by_success_scores_success(key):
+    env = toy.make()
+    pool = envs.sample_worlds(env, key, 1, effects={"obs_noise": 0.0})
+    brake = lambda carry, obs, key: (jnp.clip(-3 * obs[:2] - obs[2:], -1, 1), carry)  # noqa: E731
+    played = jax.vmap(lambda key: play_episode(env, pool, brake, (), key, gamma=1.0))(jax.random.split(key, 8))
+    assert played.success.any()
+    np.testing.assert_array_equal(played.score, played.success.astype(jnp.float32))
+    np.testing.assert_array_equal(played.trace[:, 1:, :], played.transitions.next_obs[..., :2])
+
+
+def test_an_explosion_after_the_end_is_none(key):
+    """The simulator goes on unseen after a termination; what it does then does not count."""
+    env = toy_terminating.make()
+    step = lambda *given: (after := env.step(*given))._replace(invalid=after.time > 1)  # noqa: E731
+    late = env._replace(step=step)
+    for risk, exploded in ((1.0, False), (0.0, True)):
+        pool = envs.sample_worlds(env, key, 1, params={"risk": risk})
+        played = play_episode(late, pool, counting, jnp.int32(0), key, gamma=1.0)
+        assert bool(played.exploded) == exploded and played.valid.sum() == 1
+
+
+def test_a_fleet_starts_episodes_anew_with_their_carry():
+    """What `counting` remembers of an environment is always the age of its episode."""
+    env = toy_terminating.make()
+    pool = envs.sample_worlds(env, jax.random.key(0), 1, params={"risk": 0.3})
+
+    def step(fleet, key):
+        actions, carry = jax.vmap(counting)(fleet.carry, fleet.state.obs, jax.random.split(key, N))
+        after, rows, valid, ended = step_fleet(
+            env, pool, fleet, actions, carry, key, initial_carry=jnp.int32(0), gamma=0.9
+        )
+        return after, (fleet, after, rows, valid, ended)
+
+    fleet = launch(env, pool, jax.random.key(1), N, jnp.int32(0))
+    assert fleet.carry.shape == (N,)
+    before, after, rows, valid, ended = jax.lax.scan(step, fleet, jax.random.split(jax.random.key(2), 30))[1]
+    over = np.asarray(ended.terminated | ended.truncated)
+    assert over.any(axis=0).all() and not over.all(axis=1).any() and valid.all()
+    assert ended.truncated.any() and (ended.terminated & ~ended.truncated).any()
+    np.testing.assert_array_equal(after.state.time, np.where(over, 0, ended.time))
+    np.testing.assert_array_equal(after.carry, after.state.time)
+    np.testing.assert_array_equal(after.state.obs[over], np.zeros((over.sum(), 2)))
+    np.testing.assert_array_equal(rows.action[..., 0], before.state.time)
+    np.testing.assert_allclose(rows.discount, 0.9 * (1.0 - ended.terminated), atol=1e-6)
+    np.testing.assert_array_equal(rows.next_obs, ended.obs)  # the true successor, not the next start
+
+
+def test_dicts_are_packed_in_the_declared_order(key):
+    env = toy_terminating.make()
+    world = pick(envs.sample_worlds(env, key, 1, params={"risk": 1.0}), jnp.int32(0))
+    state = env.step(world, env.reset(world, key), jnp.ones(1), key)
+    np.testing.assert_allclose(state.obs, [0.1, 1.0])
+    parts = envs.unpack(env.observation, state.obs)
+    assert set(parts) == {"position", "alarm"} and parts["alarm"].tolist() == [1.0]
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ({"position": jnp.zeros(1)}, "'alarm' is not both declared and returned"),
+        ({"position": jnp.zeros(1), "alarm": jnp.zeros(1), "depth": jnp.zeros(1)}, "'depth' is not both"),
+        ({"position": jnp.zeros(2), "alarm": jnp.zeros(1)}, "'position' has 2 numbers, 1 are declared"),
+    ],
+)
+def test_a_dict_that_is_not_as_declared_is_refused(parts, words):
+    with pytest.raises(UserError, match=words):
+        envs.base.pack(toy_terminating.OBSERVATION, parts)

@@ -12,7 +12,7 @@ import envs
 from envs import gaps
 from envs.base import EnvState
 from envs.franka import arm, ball, push, towel
-from experiments.worlds import real_env
+from envs.pools import real_env
 from sgft_jax.types import UserError
 
 KEY = jax.random.key(0)
@@ -45,7 +45,7 @@ def real(request) -> Bench:
     """Four worlds of the default real system on MuJoCo's C engine, with exact sensors."""
     env = envs.make(request.param, "c", NAMES[request.param])
     gap = gaps.load(env, "default")
-    return bench(env, env.sample_worlds(jax.random.key(7), 4, params=gap.params, effects=EXACT))
+    return bench(env, envs.sample_worlds(env, jax.random.key(7), 4, params=gap.params, effects=EXACT))
 
 
 def played(rig, act, i=0, steps=40) -> list[EnvState]:
@@ -72,7 +72,7 @@ def test_real_and_simulated_systems_are_one_task(real):
         assert getattr(simulated, name) == getattr(real.env, name)
     assert (simulated.scene, real.env.scene) == ("", NAMES[simulated.name])
     assert simulated.reward is real.env.reward and simulated.success is real.env.success
-    theta = np.asarray(real.worlds.params)
+    theta = np.asarray(real.worlds.theta.params)
     states = jax.vmap(real.env.reset)(real.worlds, jax.random.split(KEY, 4))
     np.testing.assert_allclose(states.obs[:, 2:], theta[:, :2], atol=1e-6)  # the object lies where theta says
     np.testing.assert_array_equal(states.reward, 0.0)

@@ -8,10 +8,10 @@ import toy
 from experiments.priors import find_priors
 
 from envs.gaps import Gap
+from envs.pools import heldout_worlds, load_gap, real_worlds, training_worlds
 from experiments import algorithms, memory, stacking
 from experiments.memory import reserve
 from experiments.options import seed_list, seeds_name
-from experiments.worlds import heldout_worlds, load_gap, real_worlds, training_worlds
 from sgft_jax.io import checkpoint
 from sgft_jax.io.config import config_to_json
 from sgft_jax.learners.sac import SACConfig, extract_prior, make_sac
@@ -91,19 +91,20 @@ def test_exam_worlds_have_exact_sensors_in_simulation_only(tmp_path, key):
     env = toy.make()
     gap = load_gap(env, str(tmp_path / "g.toml"), ["mass=1.5"])
     assert load_gap(env, "sim", []) is None and load_gap(env, None, []) is None
-    assert heldout_worlds(env, None, key, 3).effects.obs_noise.tolist() == [0, 0, 0]
-    assert training_worlds(env, None, key, 3).effects.obs_noise.tolist() == pytest.approx([0.005] * 3)
+    assert heldout_worlds(env, None, key, 3).theta.effects.high.obs_noise.tolist() == [0, 0, 0]
+    assert training_worlds(env, None, key, 3).theta.effects.high.obs_noise.tolist() == pytest.approx([0.005] * 3)
     real = heldout_worlds(env, gap, key, 3)
-    assert real.params[:, 0].tolist() == [1.5] * 3 and float(real.effects.obs_noise[0]) == pytest.approx(0.005)
+    assert real.theta.params[:, 0].tolist() == [1.5] * 3
+    assert float(real.theta.effects.high.obs_noise[0]) == pytest.approx(0.005)
 
 
 def test_pools_of_different_size_are_brought_to_one(key):
     env, fixed = toy.make(), Gap("fixed", {"mass": 2.0, "friction": 4.0}, {"latency": 0.05})
     pools = real_worlds(env, [fixed, Gap("ranges", {"mass": [3.0, 4.0]}, {})], key, 5)
-    np.testing.assert_array_equal(pools.params[0], [[2.0, 4.0]] * 5)
-    assert pools.params.shape == (2, 5, 2) and len(np.unique(pools.params[1, :, 0])) == 5
-    np.testing.assert_allclose(pools.effects.latency, [[0.05] * 5, [0.0] * 5])
-    assert real_worlds(env, [fixed, fixed], key, 5).params.shape == (2, 1, 2)
+    np.testing.assert_array_equal(pools.theta.params[0], [[2.0, 4.0]] * 5)
+    assert pools.theta.params.shape == (2, 5, 2) and len(np.unique(pools.theta.params[1, :, 0])) == 5
+    np.testing.assert_allclose(pools.theta.effects.high.latency, [[0.05] * 5, [0.0] * 5])
+    assert real_worlds(env, [fixed, fixed], key, 5).theta.params.shape == (2, 1, 2)
 
 
 def test_a_budget_that_does_not_fit_names_the_largest_part(monkeypatch, capsys):

@@ -12,11 +12,11 @@ import jax
 import numpy as np
 import pytest
 import toy
+from experiments.algorithms import make_player
 from test_common import save_prior
 
 import envs
 from experiments import cli, evaluate, finetune, finetuning, video
-from experiments.algorithms import make_player
 from experiments.evaluation import play_episodes
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import read_jsonl
@@ -329,7 +329,7 @@ def agree(one, two, upto):
     """The same starts and rollouts, and, up to the rounding of updates, metrics and evaluations."""
     for a, b in zip(RealStore(one).load()[:upto], RealStore(two).load()[:upto], strict=True):
         np.testing.assert_array_equal(a["obs"][:, 0], b["obs"][:, 0])
-        np.testing.assert_allclose(a["qpos"], b["qpos"], atol=1e-3)
+        np.testing.assert_allclose(a["trace"], b["trace"], atol=1e-3)
     for name in ("metrics.jsonl", "eval.jsonl"):
         lines = ([line for line in read_jsonl(run / name) if line["rollouts"] <= upto] for run in (one, two))
         for a, b in zip(*lines, strict=True):
@@ -380,7 +380,7 @@ def film(path, monkeypatch, scene=None, reason=None):
     monkeypatch.setattr(toy, "SCENE", scene, raising=False)
     monkeypatch.setattr(cli, "select_renderer", lambda: reason)
     env = toy.make()
-    pool = env.sample_worlds(jax.random.key(0), 3)
+    pool = envs.sample_worlds(env, jax.random.key(0), 3)
 
     def play():
         springs = [lambda carry, obs, key, k=k: (k * -obs[:2], carry) for k in (0.0, 1.0)]

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
+from experiments.algorithms import make_player
 from test_common import save_prior
 
 import envs
 from experiments import cli, evaluate, finetune, pretrain
-from experiments.algorithms import make_player
 from experiments.evaluation import grade
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import read_jsonl
@@ -57,7 +57,7 @@ def test_a_prior_of_td_mpc2_plays_as_its_card_says(home):
     env = toy.make()
     player = make_player(card, env)
     outcome = grade(
-        env, player, env.sample_worlds(jax.random.key(0), 4), jax.random.key(1), prior, gamma=0.9, episodes=4
+        env, player, envs.sample_worlds(env, jax.random.key(0), 4), jax.random.key(1), prior, gamma=0.9, episodes=4
     )
     found = evaluate.evaluate(evaluate.EvaluateArgs(prior=run, episodes=4))
     assert np.isfinite(outcome.total_reward).all() and found["policies"][0]["exploded"] == 0

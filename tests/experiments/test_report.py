@@ -3,11 +3,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
+from sgft_jax.players import sac_player
 
+import envs
 from experiments.report import make_report, numbers
 from sgft_jax.learners.sac import SACConfig, extract_prior, make_sac
 from sgft_jax.models.networks import NetworkConfig
-from sgft_jax.players import sac_player
 
 NETWORK = NetworkConfig(hidden=(4,))
 
@@ -19,7 +20,7 @@ def reported(env, *, dynamics_bias=0.0, value_bias=0.0):
     prior = prior.replace(dynamics=jax.tree.map(jnp.zeros_like, prior.dynamics))
     prior.value["Dense_1"]["bias"] += value_bias
     prior.dynamics["Dense_1"]["bias"] += dynamics_bias
-    pool = env.sample_worlds(jax.random.key(1), 2, effects={"obs_noise": 0.0})
+    pool = envs.sample_worlds(env, jax.random.key(1), 2, effects={"obs_noise": 0.0})
     report = make_report(env, sac_player(4, 2, NETWORK), pool, prior, jax.random.key(2), gamma=0.5, trajectories=3)
     return jax.tree.map(np.asarray, report)
 

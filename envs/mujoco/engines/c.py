@@ -22,7 +22,7 @@ import mujoco.rollout
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
-from envs.mujoco.engines.mjx import MEAN_INERTIA, Advance
+from envs.mujoco.engines.mjx import MEAN_INERTIA, Engine
 from sgft_jax.types import Array, PyTree
 
 
@@ -35,7 +35,7 @@ class _Slot(NamedTuple):
     views: dict[str, np.ndarray]
 
 
-def make_advance(host: mujoco.MjModel, fields: tuple[str, ...]) -> Advance:
+def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
     """The engine of a compiled scene; fields: names that a world may set in the model.
 
     Under `vmap` all worlds reach the host together. States that MuJoCo would reset, because they explode, come back as
@@ -56,35 +56,49 @@ def make_advance(host: mujoco.MjModel, fields: tuple[str, ...]) -> Advance:
 
     slots = [new_slot() for _ in range(cores)]
 
-    def on_host(values: dict[str, Any], state: Any, controls: Any) -> Any:
+    def on_host(values: dict[str, Any], state: Any, controls: Any, *, move: bool) -> Any:
         values, state, controls = jax.tree.map(np.asarray, (values, state, controls))
         lead = state.qpos.shape[:-1]
         flat = lambda x: x.reshape(-1, *x.shape[len(lead) :])  # noqa: E731
         values, state, controls = jax.tree.map(flat, (values, state, controls))
         after = jax.tree.map(np.empty_like, state)
+        if host.nsensordata:
+            after = after._replace(sensordata=np.empty((len(controls), host.nsensordata), np.float32))
 
         def run(k: int) -> None:
             slot = slots[k]
             for i in range(k, len(controls), cores):
                 _enter(slot, {name: x[i] for name, x in values.items()})
-                _steps(slot, jax.tree.map(lambda x, i=i: x[i], state), controls[i])
+                now = jax.tree.map(lambda x, i=i: x[i], state)
+                sensed = _steps(slot, now, controls[i]) if move else _forward(slot, now, controls[i])
                 after.qpos[i], after.qvel[i] = slot.data.qpos, slot.data.qvel
                 after.warmstart[i], after.ctrl[i] = slot.data.qacc_warmstart, controls[i, -1]
+                if host.nsensordata:
+                    after.sensordata[i] = sensed
 
         with lock:
             list(threads.map(run, range(min(cores, len(controls)))))
         return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), after)
 
-    def in_place(context: Any, after: Any, *args: Any) -> None:
-        jax.tree.map(lambda out, x: np.copyto(np.asarray(out), x), after, on_host(*args))
+    def call(values: dict[str, Array], state: PyTree, controls: Array, *, move: bool) -> PyTree:
+        """A scene without sensors hands none over: a callback has no use for empty arrays."""
+        sensors = jax.ShapeDtypeStruct((host.nsensordata,), np.float32) if host.nsensordata else None
+        given = state._replace(sensordata=None)
+        shape = jax.eval_shape(lambda: given)._replace(sensordata=sensors)
+        work = functools.partial(on_host, move=move)
 
-    def advance(values: dict[str, Array], state: PyTree, controls: Array) -> PyTree:
-        shape = jax.eval_shape(lambda: state)
+        def in_place(context: Any, after: Any, *args: Any) -> None:
+            jax.tree.map(lambda out, x: np.copyto(np.asarray(out), x), after, work(*args))
+
         on_cpu = buffer_callback(in_place, shape, vmap_method="broadcast_all")
-        elsewhere = functools.partial(jax.pure_callback, on_host, shape, vmap_method="broadcast_all")
-        return jax.lax.platform_dependent(values, state, controls, cpu=on_cpu, default=elsewhere)
+        elsewhere = functools.partial(jax.pure_callback, work, shape, vmap_method="broadcast_all")
+        after = jax.lax.platform_dependent(values, given, controls, cpu=on_cpu, default=elsewhere)
+        return after if host.nsensordata else after._replace(sensordata=state.sensordata)
 
-    return advance
+    def sense(values: dict[str, Array], state: PyTree) -> PyTree:
+        return state._replace(sensordata=call(values, state, state.ctrl[None], move=False).sensordata)
+
+    return Engine(functools.partial(call, move=True), sense)
 
 
 def _warn(message: str) -> None:
@@ -102,14 +116,27 @@ def _enter(slot: _Slot, values: dict[str, np.ndarray]) -> None:
             slot.views[name][...] = value
 
 
-def _steps(slot: _Slot, state: Any, controls: np.ndarray) -> None:
-    """All steps under `controls` [substeps, nu], in one call that leaves Python's lock to the other threads."""
+def _forward(slot: _Slot, state: Any, controls: np.ndarray) -> np.ndarray:
+    """[nsensordata] what the sensors read in that state under controls [1, nu]."""
+    data = slot.data
+    mujoco.mj_resetData(slot.model, data)
+    data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = state.qpos, state.qvel, state.warmstart
+    data.ctrl[:] = controls[0]
+    mujoco.mj_forward(slot.model, data)
+    return data.sensordata
+
+
+def _steps(slot: _Slot, state: Any, controls: np.ndarray) -> np.ndarray:
+    """All steps under `controls` [substeps, nu], in one call that leaves Python's lock to the other threads.
+
+    Returns [nsensordata], what the sensors read in the last one.
+    """
     model, data = slot.model, slot.data
     mujoco.mj_resetData(model, data)
     start = np.concatenate([[0.0], state.qpos, state.qvel])  # time comes first
-    rolled = np.empty((1, len(controls), len(start)))
+    rolled, sensed = np.empty((1, len(controls), len(start))), np.empty((1, len(controls), model.nsensordata))
     slot.rollout.rollout(
         [model], [data], start[None], controls[None].astype(np.float64), skip_checks=True, nstep=len(controls),
-        initial_warmstart=state.warmstart[None].astype(np.float64), state=rolled,
-        sensordata=np.empty((1, len(controls), model.nsensordata)),
+        initial_warmstart=state.warmstart[None].astype(np.float64), state=rolled, sensordata=sensed,
     )  # fmt: skip
+    return sensed[0, -1]

@@ -1,11 +1,12 @@
 """MJX's own JAX code as the engine of a scene, and what both engines of MJX share."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from mujoco import mjx
 
 import envs.mujoco.engines.fences  # noqa: F401 - a repair of mjx, before its first use
@@ -13,31 +14,49 @@ from sgft_jax.types import Array, PyTree
 
 MEAN_INERTIA = "stat.meaninertia"
 
-# (fields of one world, its state, controls [substeps, nu]) -> the state after these steps. `fields` are those of the
-# model that differ between worlds, by name; the state is a NamedTuple of qpos, qvel, warmstart and ctrl.
-Advance = Callable[[dict[str, Array], PyTree, Array], PyTree]
+
+class Engine(NamedTuple):
+    """Who steps a scene, for one world; vmap over worlds.
+
+    fields: of the model that differ between worlds, by name. state: a `PhysicsState`.
+    advance(fields, state, controls [substeps, nu]) -> the state after these steps.
+    sense(fields, state) -> the same state with what its sensors read.
+    """
+
+    advance: Callable[[dict[str, Array], PyTree, Array], PyTree]
+    sense: Callable[[dict[str, Array], PyTree], PyTree] = lambda fields, state: state
 
 
-def make_advance(host: mujoco.MjModel) -> Advance:
-    """The engine of a compiled scene; for one world, vmap over worlds.
+def make_engine(host: mujoco.MjModel) -> Engine:
+    """The engine of a compiled scene.
 
     Between substeps only the minimal state is carried: it keeps the loop's memory traffic small. Matrix products run in
     full float32: TF32 is not enough for contact dynamics.
     """
     nominal, blank = put(host)
+    servos = joint_servos(host)
+
+    def enter(state: Any, ctrl: Array) -> mjx.Data:
+        return blank.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl)
+
+    def sense(fields: dict[str, Array], state: Any) -> Any:
+        with jax.default_matmul_precision("highest"):
+            data = mjx.forward(with_fields(nominal, fields), enter(state, state.ctrl))
+        return state._replace(sensordata=data.sensordata)
 
     def advance(fields: dict[str, Array], state: Any, controls: Array) -> Any:
         model = with_fields(nominal, fields)
 
         def substep(state: Any, ctrl: Array) -> tuple[Any, None]:
-            data = blank.replace(qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.warmstart, ctrl=ctrl)
-            data = mjx.step(hold_saturated(model, data), data)
-            return state._replace(qpos=data.qpos, qvel=data.qvel, warmstart=data.qacc_warmstart, ctrl=ctrl), None
+            data = enter(state, ctrl)
+            data = mjx.step(hold_saturated(model, data, servos), data)
+            after = data.qpos, data.qvel, data.qacc_warmstart, ctrl, data.sensordata
+            return type(state)(*after), None
 
         with jax.default_matmul_precision("highest"):
             return jax.lax.scan(substep, state, controls)[0]
 
-    return advance
+    return Engine(advance, sense)
 
 
 def put(host: mujoco.MjModel) -> tuple[mjx.Model, mjx.Data]:
@@ -57,17 +76,37 @@ def with_fields(model: mjx.Model, fields: dict[str, Array]) -> mjx.Model:
     return model.replace(stat=model.stat.replace(meaninertia=mean_inertia), **fields)
 
 
-def hold_saturated(model: mjx.Model, data: mjx.Data) -> mjx.Model:
-    """The model for one step, in which servos at their force limit are constant forces.
+def joint_servos(host: mujoco.MjModel) -> np.ndarray:
+    """Indices of the actuators whose force is limited and linear in the position and velocity of one joint."""
+    joint = host.actuator_trnid[:, 0].clip(0)
+    one_dof = np.isin(host.jnt_type[joint], (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))
+    return np.flatnonzero(
+        (host.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
+        & one_dof
+        & (host.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
+        & (host.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE)
+        & (host.actuator_dyntype == mujoco.mjtDyn.mjDYN_NONE)
+        & (host.actuator_forcelimited != 0)
+        & (host.actuator_ctrllimited == 0)
+    )
+
+
+def hold_saturated(model: mjx.Model, data: mjx.Data, servos: np.ndarray) -> mjx.Model:
+    """The model for one step, in which servos at their force limit are constant forces; `servos`: see `joint_servos`.
 
     The implicit integrator counts a servo's damping in the inertia. C MuJoCo leaves out servos at their limit, MJX does
-    not: a saturated wrist of the hammering arm, 0.1 kg m^2, then moved as if it had 0.7. For servos on joints, gear 1.
+    not: a saturated wrist of the hammering arm, 0.1 kg m^2, then moved as if it had 0.7.
     """
-    joint = model.actuator_trnid[:, 0]
+    if not servos.size:
+        return model
+    joint, gear = model.actuator_trnid[servos, 0], model.actuator_gear[servos, 0]
     position, velocity = data.qpos[model.jnt_qposadr[joint]], data.qvel[model.jnt_dofadr[joint]]
-    gain, bias = model.actuator_gainprm, model.actuator_biasprm
-    force = gain[:, 0] * data.ctrl + bias[:, 0] + bias[:, 1] * position + bias[:, 2] * velocity
-    low, high = model.actuator_forcerange.T
-    held = (model.actuator_forcelimited & ((force <= low) | (force >= high)))[:, None]
+    gain, bias = model.actuator_gainprm[servos], model.actuator_biasprm[servos]
+    force = gain[:, 0] * data.ctrl[servos] + bias[:, 0] + gear * (bias[:, 1] * position + bias[:, 2] * velocity)
+    low, high = model.actuator_forcerange[servos].T
+    held = ((force <= low) | (force >= high))[:, None]
     constant = jnp.zeros_like(bias).at[:, 0].set(jnp.clip(force, low, high))
-    return model.replace(actuator_gainprm=jnp.where(held, 0.0, gain), actuator_biasprm=jnp.where(held, constant, bias))
+    return model.replace(
+        actuator_gainprm=model.actuator_gainprm.at[servos].set(jnp.where(held, 0.0, gain)),
+        actuator_biasprm=model.actuator_biasprm.at[servos].set(jnp.where(held, constant, bias)),
+    )

@@ -6,14 +6,17 @@ static layout tells, so nothing can overflow. Should it all the same, the state 
 and no learner sees it.
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from mujoco import mjx
 
-from envs.mujoco.engines.mjx import Advance, put, with_fields
+from envs.mujoco.engines.mjx import Engine, put, with_fields
 from sgft_jax.types import Array, PyTree, UserError
 
 # Newton iterations beyond the scene's. After the hardest pushes on the puck, one control step in a hundred, 4 of them
@@ -23,22 +26,21 @@ _MORE_ITERATIONS = 4
 _POSES = ("xpos", "xquat", "xmat", "xipos", "ximat", "geom_xpos", "geom_xmat")
 
 
-def make_advance(host: mujoco.MjModel) -> Advance:
-    """The engine of a compiled scene; for one world, vmap over worlds. Raises UserError where Warp is not installed."""
+def make_engine(host: mujoco.MjModel) -> Engine:
+    """The engine of a compiled scene. Raises UserError where Warp is not installed."""
     if not available():
         raise UserError("the engine warp needs the package warp-lang: install sgft-jax[warp]")
     from envs.mujoco.engines import warp_worlds
 
     contacts, rows = budget(host)
     still, at_rest = put(host)
-    calls: dict[tuple[str, ...], Any] = {}
+    ends = np.cumsum([host.nq, host.nv, host.nv])
 
-    def call(layout: tuple[str, ...]) -> Any:
+    @functools.cache
+    def call(layout: tuple[str, ...], move: bool) -> Any:
         """Worlds that differ in the same fields share buffers and graphs."""
-        if layout not in calls:
-            size = {"contacts": contacts, "rows": rows, "iterations": iterations(host)}
-            calls[layout] = warp_worlds.make_call(host, layout, **size)
-        return calls[layout]
+        size = {"contacts": contacts, "rows": rows, "iterations": iterations(host)}
+        return warp_worlds.make_call(host, layout, move=move, **size)
 
     def placed(values: dict[str, Array], qpos: Array) -> dict[str, Array]:
         """Where everything is. Warp leaves what is fixed to the world where it was when its data were made."""
@@ -46,31 +48,40 @@ def make_advance(host: mujoco.MjModel) -> Advance:
             data = mjx.kinematics(with_fields(still, values), at_rest.replace(qpos=qpos))
         return {name: getattr(data, name) for name in _POSES}
 
-    @jax.custom_batching.custom_vmap
-    def batch(values: dict[str, Array], state: Any, controls: Array) -> Any:
-        """Worlds [n]."""
+    def batch(values: dict[str, Array], state: Any, controls: Array, *, move: bool) -> Any:
+        """Worlds [n] after steps under controls [n, steps, nu], or, unless they move, what their sensors read."""
         n = len(controls)
         parts = {"qpos": state.qpos, "qvel": state.qvel, "qacc_warmstart": state.warmstart}
         parts |= jax.vmap(placed)(values, state.qpos)
         parts |= {name: x for name, x in values.items() if warp_worlds.reads(name)}
         packed = jnp.concatenate([x.reshape(n, -1) for x in parts.values()], axis=1)
-        after = call(tuple(parts))(packed, controls)
-        qpos, qvel, warmstart = jnp.split(after, [host.nq, host.nq + host.nv], axis=1)
-        return state._replace(qpos=qpos, qvel=qvel, warmstart=warmstart, ctrl=controls[:, -1])
+        qpos, qvel, warmstart, sensordata = jnp.split(call(tuple(parts), move)(packed, controls), ends, axis=1)
+        return type(state)(qpos, qvel, warmstart, controls[:, -1], sensordata)
 
-    @batch.def_vmap
-    def _(size: int, batched: PyTree, *args: PyTree) -> tuple[Any, Any]:
-        """A batch of batches is one larger batch: Warp wants all of its worlds at once."""
-        spread = lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape))  # noqa: E731
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), jax.tree.map(spread, args, tuple(batched)))
-        after = jax.tree.map(lambda x: x.reshape(size, -1, *x.shape[1:]), batch(*flat))
-        return after, jax.tree.map(lambda _: True, after)
+    def of_one(move: bool) -> Callable[[dict[str, Array], PyTree, Array], PyTree]:
+        together = jax.custom_batching.custom_vmap(functools.partial(batch, move=move))
 
-    def advance(values: dict[str, Array], state: PyTree, controls: Array) -> PyTree:
-        alone = jax.tree.map(lambda x: x[None], (values, state, controls))
-        return jax.tree.map(lambda x: x[0], batch(*alone))
+        @together.def_vmap
+        def _(size: int, batched: PyTree, *args: PyTree) -> tuple[Any, Any]:
+            """A batch of batches is one larger batch: Warp wants all of its worlds at once."""
+            spread = lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape))  # noqa: E731
+            flat = jax.tree.map(
+                lambda x: x.reshape(size * x.shape[1], *x.shape[2:]), jax.tree.map(spread, args, tuple(batched))
+            )
+            after = jax.tree.map(lambda x: x.reshape(size, len(x) // size, *x.shape[1:]), together(*flat))
+            return after, jax.tree.map(lambda _: True, after)
 
-    return advance
+        def alone(*args: PyTree) -> PyTree:
+            return jax.tree.map(lambda x: x[0], together(*jax.tree.map(lambda x: x[None], args)))
+
+        return alone
+
+    moved, sensed = of_one(True), of_one(False)
+
+    def sense(values: dict[str, Array], state: PyTree) -> PyTree:
+        return state._replace(sensordata=sensed(values, state, state.ctrl[None]).sensordata)
+
+    return Engine(moved, sense)
 
 
 def available() -> bool:

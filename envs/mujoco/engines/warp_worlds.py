@@ -54,6 +54,11 @@ class Worlds:
             wp.copy(floats, packed[:, start:stop])
         self.lost.zero_()
 
+    def sense(self, ctrl: wp.array) -> None:
+        """What sensors read under commands [n, nu]; nothing moves."""
+        wp.copy(self.data.ctrl, ctrl)
+        mjw.forward(self.model, self.data)
+
     def step(self, ctrl: wp.array) -> None:
         """One physics step under commands [n, nu]."""
         wp.copy(self.data.ctrl, ctrl)
@@ -73,9 +78,10 @@ class Worlds:
         self.graph = capture.graph
 
     def unload(self, out: wp.array) -> None:
-        """out: [n, nq + 2 nv] positions, velocities and accelerations; NaN where contacts were lost."""
+        """out: [n, nq + 2 nv + nsensordata] state, accelerations and sensors; NaN where contacts were lost."""
         data = self.data
-        wp.launch(_unload, out.shape, inputs=[data.qpos, data.qvel, data.qacc_warmstart, self.lost], outputs=[out])
+        inputs = [data.qpos, data.qvel, data.qacc_warmstart, data.sensordata, self.lost]
+        wp.launch(_unload, out.shape, inputs=inputs, outputs=[out])
 
     def _step(self) -> None:
         mjw.step(self.model, self.data)
@@ -95,26 +101,29 @@ class Worlds:
 
 
 def make_call(
-    host: mujoco.MjModel, layout: Sequence[str], *, contacts: int, rows: int, iterations: int
+    host: mujoco.MjModel, layout: Sequence[str], *, move: bool, contacts: int, rows: int, iterations: int
 ) -> Callable[[Array, Array], Array]:
-    """(packed [n, floats], controls [n, substeps, nu]) -> [n, nq + 2 nv], see `Worlds`: a JAX function of a batch."""
+    """(packed [n, floats], controls [n, substeps, nu]) -> [n, nq + 2 nv + nsensordata], a JAX function of a batch.
+
+    See `Worlds`. move: whether to take the steps, or to read the sensors and stay.
+    """
     kept: dict[tuple[str, int], Worlds] = {}
 
     def run(packed: wp.array2d[float], controls: wp.array3d[float], out: wp.array2d[float]) -> None:
         n, device = packed.shape[0], packed.device
         if (key := (device.alias, n)) not in kept:
             kept[key] = worlds = Worlds(host, layout, n, contacts=contacts, rows=rows, iterations=iterations)
-            if device.is_cuda:
+            if device.is_cuda and move:
                 worlds.load(packed)
                 worlds.capture()
         worlds = kept[key]
         worlds.load(packed)
         for i in range(controls.shape[1]):
-            worlds.step(controls[:, i])
+            (worlds.step if move else worlds.sense)(controls[:, i])
         worlds.unload(out)
 
     call = wp.jax_callable(run, graph_mode=wp.JaxCallableGraphMode.NONE, vmap_method=None)
-    states = host.nq + 2 * host.nv
+    states = host.nq + 2 * host.nv + host.nsensordata
     return lambda packed, controls: call(packed, controls, output_dims=(packed.shape[0], states))[0]
 
 
@@ -129,6 +138,7 @@ def _unload(
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
     acceleration: wp.array2d[float],
+    sensors: wp.array2d[float],
     lost: wp.array[int],
     out: wp.array2d[float],
 ) -> None:
@@ -140,5 +150,7 @@ def _unload(
         out[i, j] = qpos[i, j]
     elif j < nq + nv:
         out[i, j] = qvel[i, j - nq]
-    else:
+    elif j < nq + 2 * nv:
         out[i, j] = acceleration[i, j - nq - nv]
+    else:
+        out[i, j] = sensors[i, j - nq - 2 * nv]

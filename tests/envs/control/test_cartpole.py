@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from franka_bench import member, theta_of
 
+import envs
 from envs.control import cartpole
-from envs.franka import host
+from envs.mujoco import host
 
 KEY = jax.random.key(0)
 STEPS = 120
@@ -36,7 +37,7 @@ def played():
     """Episodes in three worlds, thrown to and fro so that the cart hits both ends: (thetas, worlds, starts, after)."""
     env, rng = cartpole.make("jax"), np.random.default_rng(0)
     thetas = [theta_of(cartpole.SCENE, rng) for _ in range(3)]
-    pools = [env.sample_worlds(KEY, 1, params=theta) for theta in thetas]
+    pools = [envs.sample_worlds(env, KEY, 1, params=theta) for theta in thetas]
     worlds = jax.tree.map(lambda *x: jnp.concatenate(x), *pools)
     starts = jax.vmap(env.reset)(worlds, jax.random.split(KEY, 3))
 
@@ -93,7 +94,7 @@ def test_an_episode_starts_hanging_and_ends_by_time_alone(played):
 
 
 def env_world(env):
-    return member(env.sample_worlds(KEY, 1), 0)
+    return member(envs.sample_worlds(env, KEY, 1), 0)
 
 
 def test_success_is_upright_in_the_middle():

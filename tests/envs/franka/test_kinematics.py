@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from envs.franka import arm, insert, kinematics, push
-from envs.mujoco.scene import new_spec
+from envs.franka.workcell import new_spec
 
 TOOLS = (None, [0.02, -0.03, 0.25])
 

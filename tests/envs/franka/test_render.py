@@ -43,7 +43,7 @@ def renderer(monkeypatch):
 
 def test_smooth_is_linear_and_keeps_jumps():
     # 0.2 s at 10 frames a second: one frame in between. The second coordinate jumps by 0.9 m.
-    frames = render.smooth(np.array([[0.0, 0.0], [0.1, 0.9], [0.3, 0.9]]), fps=10)
+    frames = render.smooth(np.array([[0.0, 0.0], [0.1, 0.9], [0.3, 0.9]]), control_dt=0.2, fps=10)
     np.testing.assert_allclose(frames, [[0, 0], [0.05, 0], [0.1, 0.9], [0.2, 0.9], [0.3, 0.9]], atol=1e-12)
 
 
@@ -51,11 +51,7 @@ def test_smooth_is_linear_and_keeps_jumps():
 def test_dressing_leaves_motion_alone(name):
     """The drawn model has the joints and the solid geoms of the simulated one."""
     scene = SCENES[name]
-    plain, drawn = (
-        scene.build(nominal(scene)).compile(),
-        render.dressed(scene.build(nominal(scene)), render.VIEWS[name]),
-    )
-    drawn = drawn.compile()
+    plain, drawn = scene.build(nominal(scene)).compile(), render.dressed(scene, nominal(scene)).compile()
     assert drawn.nq == plain.nq and drawn.npair == plain.npair
     data, plain_data = mujoco.MjData(drawn), mujoco.MjData(plain)
     data.qpos[:] = plain_data.qpos[:] = still(scene, 0)[0]

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from franka_bench import EXACT, SCENES, member, theta_of
 
-from envs.franka import host
+import envs
+from envs.mujoco import host
 from envs.mujoco import worlds as physics
 from envs.mujoco.engines import mjx as engine_jax
 from envs.mujoco.scene import make_env
@@ -21,7 +22,7 @@ def rig(request):
     scene, rng = SCENES[request.param], np.random.default_rng(1)
     env = make_env(scene, impl="c")
     thetas = [theta_of(scene, rng) for _ in range(N)]
-    pools = [env.sample_worlds(jax.random.key(0), 1, params=theta, effects=EXACT) for theta in thetas]
+    pools = [envs.sample_worlds(env, jax.random.key(0), 1, params=theta, effects=EXACT) for theta in thetas]
     worlds = jax.tree.map(lambda *x: jnp.concatenate(x), *pools)
     starts = jax.jit(jax.vmap(env.reset))(worlds, jax.random.split(jax.random.key(1), N))
     return scene, env, thetas, worlds, starts, jax.random.uniform(jax.random.key(2), (N, STEPS, env.act_dim)) - 0.5
@@ -61,7 +62,7 @@ def test_an_explosion_is_reported_not_reset(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     scene = SCENES["push"]
     env = make_env(scene, impl="c")
-    worlds = env.sample_worlds(jax.random.key(0), 2, effects=EXACT)
+    worlds = envs.sample_worlds(env, jax.random.key(0), 2, effects=EXACT)
     states = jax.vmap(env.reset)(worlds, jax.random.split(jax.random.key(1), 2))
     broken = states.physics._replace(qvel=states.physics.qvel.at[0].set(1e12))
     after = jax.jit(jax.vmap(env.step))(

@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 from franka_bench import EXACT, SCENES, bench, member
 
-from envs.franka import host, insert
+import envs
+from envs.franka import insert
+from envs.mujoco import host
 from envs.mujoco.scene import make_env
 from experiments.accuracy import PROBES, play_script
 
@@ -24,10 +26,10 @@ KEY = jax.random.key(0)
 def play_in_c(rig, world, start):
     """The scripted episode and its true observations [T + 1, obs_dim]."""
     probe = PROBES[rig.env.name]
-    theta = dict(zip([p.name for p in rig.env.parameters], map(float, world.params), strict=True))
+    theta = dict(zip([p.name for p in rig.env.parameters], map(float, world.theta.params), strict=True))
     steps = play_script(probe, theta, start.physics, steps=rig.env.episode_length)
     observe = jax.jit(probe.scene.observe)
-    return steps, np.array([observe(world.params, s) for s in [start.physics, *(step.after for step in steps)]])
+    return steps, np.array([observe(world.theta.params, s) for s in [start.physics, *(step.after for step in steps)]])
 
 
 def repeat_in_mjx(rig, world, start, steps):
@@ -39,7 +41,7 @@ def play_in_mjx(rig, world, start):
     """[T, obs_dim] true observations of an episode that the script plays in MJX itself."""
     script, state, seen = jax.jit(PROBES[rig.env.name].script), start, []
     for t in range(rig.env.episode_length):
-        state = rig.step(world, state, script(world.params, state.physics, t), KEY)
+        state = rig.step(world, state, script(world.theta.params, state.physics, t), KEY)
         assert not state.invalid
         seen.append(np.asarray(state.true_obs))
     return np.array(seen)
@@ -61,7 +63,7 @@ def test_saturated_servos(pushing):
     world = member(pushing.worlds, 0)
     start = pushing.reset(world, KEY)
     far = start.physics._replace(ctrl=start.physics.ctrl + 1.0)
-    theta = dict(zip([p.name for p in pushing.env.parameters], map(float, world.params), strict=True))
+    theta = dict(zip([p.name for p in pushing.env.parameters], map(float, world.theta.params), strict=True))
     wanted = host.play(SCENES["push"], theta, far, [np.zeros(2, np.float32)])[0]
     assert (np.abs(wanted.qpos - far.qpos)[:7] > 0.01).all()
     seen = pushing.step(world, start._replace(physics=far), np.zeros(2, np.float32), KEY).physics
@@ -70,7 +72,7 @@ def test_saturated_servos(pushing):
 
 def slow_rig(name):
     env = make_env(SCENES[name])
-    return bench(env, env.sample_worlds(jax.random.key(5), 3, effects=EXACT))
+    return bench(env, envs.sample_worlds(env, jax.random.key(5), 3, effects=EXACT))
 
 
 @pytest.mark.slow
@@ -102,7 +104,7 @@ def test_arm_on_the_board():
     rig, scene = slow_rig("hammer"), SCENES["hammer"]
     world = member(rig.worlds, 0)
     start = rig.reset(world, KEY)
-    theta = dict(zip([p.name for p in rig.env.parameters], map(float, world.params), strict=True))
+    theta = dict(zip([p.name for p in rig.env.parameters], map(float, world.theta.params), strict=True))
     names = set()
     for signs in itertools.product((-1.0, 1.0), repeat=3):
         action = jnp.array(signs)

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from franka_bench import EXACT, SCENES, push_hard, theta_of
 
+import envs
 from envs.franka import arm, ball, push, towel
+from envs.franka.workcell import at_rest
 from envs.mujoco.engines import c as engine_c
 from envs.mujoco.engines import warp as engine_warp
-from envs.mujoco.scene import at_rest, make_env
+from envs.mujoco.scene import make_env
 from experiments.accuracy import PROBES
 
 pytest.importorskip("warp")
@@ -23,7 +25,7 @@ DEFORMABLES = {"towel": towel.REAL["towel"], "ball": ball.REAL["ball"]}
 def in_random_worlds(env, scene, rng):
     """[WORLDS], every parameter varied, so that the board of hammer stands elsewhere in each."""
     thetas = [theta_of(scene, rng) for _ in range(WORLDS)]
-    pools = [env.sample_worlds(jax.random.key(0), 1, params=theta, effects=EXACT) for theta in thetas]
+    pools = [envs.sample_worlds(env, jax.random.key(0), 1, params=theta, effects=EXACT) for theta in thetas]
     return jax.tree.map(lambda *x: jnp.concatenate(x), *pools)
 
 
@@ -32,7 +34,7 @@ def hammer(env, world, key):
     start = env.reset(world, key)
 
     def step(state, t):
-        action = PROBES["hammer"].script(world.params, state.physics, t)
+        action = PROBES["hammer"].script(world.theta.params, state.physics, t)
         after = env.step(world, state, action, key)
         return after, (action, after)
 
@@ -71,7 +73,7 @@ def test_arm_on_the_board():
     """0.1 mrad after 0.2 s under saturated commands that press hammer, wrist and elbow on the board."""
     c, warp = (make_env(SCENES["hammer"], impl=impl) for impl in ("c", "warp"))
     actions = jnp.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    worlds = c.sample_worlds(jax.random.key(3), len(actions), effects=EXACT)
+    worlds = envs.sample_worlds(c, jax.random.key(3), len(actions), effects=EXACT)
     keys = jax.random.split(jax.random.key(0), len(actions))
     state = jax.vmap(c.reset)(worlds, keys)
     steps = [jax.jit(jax.vmap(env.step)) for env in (c, warp)]
@@ -145,8 +147,8 @@ def test_more_contacts_than_pushes_ever_make(name, contacts):
     assert engine_warp.budget(host) == (host.npair, (2 * (host.pair_dim - 1)).sum())  # spheres touch a thing once
     state = at_rest(start.qpos[:n], jnp.asarray(data.qpos[n:], jnp.float32), host.nv)
     controls = jnp.broadcast_to(state.ctrl, (1, *state.ctrl.shape))
-    engines = engine_c.make_advance(host, ()), engine_warp.make_advance(host)
-    wanted, seen = (jax.jit(advance)({}, state, controls) for advance in engines)
+    engines = engine_c.make_engine(host, ()), engine_warp.make_engine(host)
+    wanted, seen = (jax.jit(engine.advance)({}, state, controls) for engine in engines)
     assert np.abs(wanted.qvel).max() > 0.8  # m/s
     np.testing.assert_allclose(seen.qvel, wanted.qvel, atol=1e-3)
 

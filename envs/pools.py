@@ -1,4 +1,4 @@
-"""Worlds by name: the training domain, real systems, and the worlds that policies are evaluated in."""
+"""Pools of worlds: the training domain, real systems, and the worlds that policies are evaluated in."""
 
 from collections.abc import Sequence
 
@@ -8,10 +8,9 @@ import jax.numpy as jnp
 import envs
 from envs import gaps
 from envs.base import Env, World
-from envs.gaps import Gap
+from envs.domains.uniform import sample_worlds
+from envs.gaps import SIM, Gap
 from envs.rollout import pool_size
-from experiments.options import SIM
-from experiments.stacking import stack
 from sgft_jax.types import Key, UserError
 
 
@@ -40,7 +39,7 @@ def real_env(env: Env, found: Sequence[Gap]) -> Env:
 
 def training_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:
     """Worlds to learn in: the training domain, or the real system of a gap."""
-    return env.sample_worlds(key, n) if gap is None else gaps.worlds(env, gap, key, n)
+    return sample_worlds(env, key, n) if gap is None else gaps.worlds(env, gap, key, n)
 
 
 def real_worlds(env: Env, found: Sequence[Gap], key: Key, n: int = 256) -> World:
@@ -48,9 +47,9 @@ def real_worlds(env: Env, found: Sequence[Gap], key: Key, n: int = 256) -> World
     pools = [gaps.worlds(env, gap, key, n) for gap in found]
     size = max(map(pool_size, pools))
     repeat = lambda x: jnp.repeat(x, size // x.shape[0], axis=0)  # noqa: E731
-    return stack([jax.tree.map(repeat, pool) for pool in pools])
+    return jax.tree.map(lambda *x: jnp.stack(x), *[jax.tree.map(repeat, pool) for pool in pools])
 
 
 def heldout_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:
     """Worlds to evaluate in: the training domain without sensor noise, or the real system as its gap describes it."""
-    return env.sample_worlds(key, n, effects={"obs_noise": 0.0}) if gap is None else gaps.worlds(env, gap, key, n)
+    return sample_worlds(env, key, n, effects={"obs_noise": 0.0}) if gap is None else gaps.worlds(env, gap, key, n)

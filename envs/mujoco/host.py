@@ -51,7 +51,8 @@ def _control_step(
     data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = state.qpos, state.qvel, state.warmstart
     previous = np.asarray(state.ctrl)
     for i in range(substeps):
-        progress = min((i + 1) * model.opt.timestep / ramp, 1.0)
+        progress = min((i + 1) * model.opt.timestep / max(ramp, 1e-9), 1.0)
         data.ctrl[:] = previous + progress * (command - previous)
         mujoco.mj_step(model, data)
-    return PhysicsState(*(jnp.asarray(x, jnp.float32) for x in (data.qpos, data.qvel, data.qacc_warmstart, data.ctrl)))
+    found = data.qpos, data.qvel, data.qacc_warmstart, data.ctrl, data.sensordata
+    return PhysicsState(*(jnp.asarray(x, jnp.float32) for x in found))

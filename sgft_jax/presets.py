@@ -1,5 +1,9 @@
-"""Named settings of pretraining. A preset never changes meaning; a new idea is a new preset."""
+"""Settings of pretraining, some of them by name: `PRESETS`. A preset keeps its meaning; a new idea is a new preset.
 
+Command lines read this module, so it imports neither JAX nor MuJoCo.
+"""
+
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -9,60 +13,69 @@ from sgft_jax.models.config import NetworkConfig, Precision
 
 @dataclass(frozen=True)
 class PretrainConfig:
-    """Everything that decides the result of pretraining, apart from task and seeds."""
+    """Everything that decides the result of pretraining, apart from the task, the worlds and the seeds."""
 
     algorithm: Literal["sac", "tdmpc2"] = "sac"
     """What trains: SAC, whose V_sim and models SGFT-SAC needs, or TD-MPC2 for the methods that plan."""
+    env_steps: int = 8_000_000
+    """Environment steps of training, after the random actions."""
     n_envs: int = 4096
     """Environments stepped together."""
-    worlds: int = 2048
-    """Domain parameter vectors compiled; each episode lives in a random one."""
-    env_steps: int = 8_000_000
-    """Environment steps of training, after the random-action data."""
-    random_transitions: int = 500_000
-    """Random-action transitions: observation statistics and part of every batch."""
-    random_fraction: float = 0.5
-    """Share of each batch that comes from the random-action data (paper: 0.5)."""
-    random_ladder: float = 0.0
-    """Environment i of n acts uniformly at random in a share i / (n - 1) * random_ladder of its steps (0 = never), so
-    that V_sim knows what lies beside the policy's own path: a real system leads there."""
     updates_per_step: int = 16
     """Gradient steps per step of all environments."""
     batch_size: int = 4096
-    replay_capacity: int = 1_000_000
+    """Transitions (TD-MPC2: windows of `horizon` steps) in a batch."""
     gamma: float = 0.99
+    """Discount factor per control step."""
     lr: float = 3e-4
-    """Adam learning rate of every network, at the start."""
+    """Adam learning rate of every network at the start."""
     lr_end: float = 1.0
-    """Share of it that is left at the end; it falls linearly. A falling rate settles V_sim and the last policies."""
+    """Share of the learning rate that is left at the end; it falls linearly. A falling rate settles V_sim."""
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    """Networks of SAC."""
+    worlds: int = 2048
+    """Worlds compiled for each seed; every episode takes place in a random one."""
+    refresh_every: int = 0
+    """Chunks after which new worlds are drawn and all environments start new episodes; 0 keeps the first worlds."""
+    replay_capacity: int = 1_000_000
+    """Transitions kept; new ones replace the oldest."""
+    random_transitions: int = 500_000
+    """Transitions under random actions, collected first: they give the observation statistics and a part of every
+    batch."""
+    random_fraction: float = 0.5
+    """Share of each batch that comes from the random actions (paper: 0.5)."""
+    random_ladder: float = 0.0
+    """Environment i of n replaces a share i / (n - 1) * random_ladder of its actions by random ones. V_sim then also
+    knows states beside the policy's own path, where a real system leads; 0 replaces none."""
     tau: float = 0.005
     """Averaging rate of the target critic."""
     alpha: float = 1.0
-    """Initial temperature; it follows the target entropy."""
+    """Initial temperature of SAC; training adapts it to the target entropy."""
     entropy_per_dim: float = -1.0
-    """Target entropy per action dimension, nats."""
+    """Target entropy of SAC per action dimension, nats."""
     policy_delay: int = 1
-    """Critic updates per actor update."""
-    network: NetworkConfig = field(default_factory=NetworkConfig)
-    precision: Precision = "default"
-    """Of the updates' matrix products on GPUs. V_sim is evaluated in float32 whatever it was trained in."""
+    """Critic updates of SAC per actor update."""
     ensemble_size: int = 5
+    """Dynamics models that SAC trains alongside."""
+    precision: Precision = "default"
+    """Matrix products of the updates on GPUs. V_sim is always evaluated in float32."""
     size: str = "5M"
     """TD-MPC2's networks by their published number of parameters: 1M, 5M, 19M, 48M or 317M."""
     horizon: int = 3
-    """Steps of TD-MPC2's plans and training windows; a batch holds `batch_size` windows."""
+    """Steps of TD-MPC2's plans and training windows."""
     plan_samples: int = 512
-    """Sequences that a plan tries in each of its iterations; plans are made in evaluations alone."""
+    """Action sequences that TD-MPC2 samples in each iteration of a plan; it plans in evaluations alone."""
     chunk_steps: int = 50
-    """Steps of all environments per compiled chunk: between chunks we log, evaluate and checkpoint."""
+    """Steps of all environments per compiled chunk; logs, evaluations and checkpoints come between chunks."""
     eval_every: int = 4
     """Chunks between evaluations."""
-    choose_from: float = 0.75
-    """Share of training after which evaluations compete to give the prior. On the way there a critic may promise twice
-    what can be had while its policy already succeeds: a good policy with a useless V_sim."""
     eval_episodes: int = 256
+    """Episodes of an evaluation, in worlds that training does not see."""
+    choose_from: float = 0.75
+    """Share of training after which evaluations compete for the prior. Earlier policies may succeed while their critic
+    still promises twice what can be had."""
     report_episodes: int = 256
-    """At least that many fresh episodes judge the prior; 256 give a 95 % interval of +-6 points at worst."""
+    """Fresh episodes that measure the prior, at least; 256 give a 95 % interval of +-6 points at worst."""
     checkpoint_every: int = 8
     """Chunks between checkpoints."""
 
@@ -72,6 +85,7 @@ class PretrainConfig:
             "replay_capacity", "policy_delay", "ensemble_size", "horizon", "plan_samples", "chunk_steps", "eval_every",
             "eval_episodes", "report_episodes", "checkpoint_every",
         )  # fmt: skip
+        checks.at_least(self, 0, "refresh_every")
         checks.positive(self, "lr", "tau", "alpha")
         checks.share(self, "random_ladder", "lr_end", "tau", "choose_from")
         checks.below_one(self, "gamma", "random_fraction")
@@ -80,6 +94,16 @@ class PretrainConfig:
             if getattr(self, name) < self.n_envs:
                 wanted = f"at least n-envs = {self.n_envs}, one step of all environments"
                 raise checks.refusal(name, getattr(self, name), wanted)
+
+    @property
+    def chunk_env_steps(self) -> int:
+        """Environment steps of one chunk."""
+        return self.n_envs * self.chunk_steps
+
+    @property
+    def chunks(self) -> int:
+        """Chunks of the whole training."""
+        return math.ceil(self.env_steps / self.chunk_env_steps)
 
 
 _NORMED = NetworkConfig(hidden=(256, 256), layer_norm=True)

@@ -1,0 +1,105 @@
+"""Gaps from names, files, dicts and overrides."""
+
+import jax
+import numpy as np
+import pytest
+import toy
+
+import envs
+from envs import gaps
+from envs.franka import hammer, insert
+from sgft_jax.types import UserError
+
+ENV = toy.make()
+
+
+def test_a_dict_is_what_a_file_would_hold(tmp_path):
+    table = {"params": {"mass": 2.0, "friction": [3, 5]}, "effects": {"latency": [0.02, 0.04], "action_scale": 0.7}}
+    gap = gaps.from_dict(ENV, "heavy", table)
+    (tmp_path / "heavy.toml").write_text(
+        "[params]\nmass = 2.0\nfriction = [3, 5]\n[effects]\nlatency = [0.02, 0.04]\naction_scale = 0.7\n"
+    )
+    assert gaps.load(ENV, str(tmp_path / "heavy.toml")) == gap
+    worlds = gaps.worlds(ENV, gap, jax.random.key(0), n=3)
+    np.testing.assert_allclose(worlds.theta.params[:, 0], 2.0)
+    starts = jax.vmap(ENV.reset)(worlds, jax.random.split(jax.random.key(1), 3))
+    assert len(set(starts.effects.latency.tolist())) == 3
+    assert ((starts.effects.latency >= 0.02) & (starts.effects.latency <= 0.04)).all()
+
+
+def test_ranges_of_vectors(tmp_path):
+    gap = gaps.from_dict(
+        ENV, "g", {"params": {"mass": 1.0, "friction": 4.0}, "effects": {"action_bias": [[0, 1], [0, 2]]}}
+    )
+    worlds = gaps.worlds(ENV, gap, jax.random.key(0))
+    assert worlds.theta.params.shape == (1, 2)  # no parameter varies: one world will do
+    drawn = jax.vmap(lambda key: ENV.reset(jax.tree.map(lambda x: x[0], worlds), key))(
+        jax.random.split(jax.random.key(0), 9)
+    )
+    assert (drawn.effects.action_bias[:, 0] == 0).all() and len(set(drawn.effects.action_bias[:, 1].tolist())) == 9
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["latency=0.01", "latency=0.02"], "'latency=0.02': 'latency' is set twice; set it once"),
+        (["latncy=0.01"], r"gap 'own\+latncy=0.01': 'latncy' is neither a parameter nor an effect .* mean 'latency'\?"),
+        (["mass"], "'mass' does not set anything"),
+        (["latency=[[1],2]"], "effect 'latency' needs one value"),
+        (["mass=-2"], "parameter 'mass' must be at least 0.01, got -2"),
+        (["latency=0.5"], "must be shorter than the control period of toy, 0.1 s"),
+        (["obs_noise=NaN"], "effect 'obs_noise' needs finite numbers"),
+    ],
+)
+def test_bad_overrides_are_one_line(tmp_path, overrides, words):
+    (tmp_path / "own.toml").write_text("")
+    with pytest.raises(UserError, match=words) as refused:
+        gaps.load(ENV, str(tmp_path / "own.toml"), overrides)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"param": {}}, "gap 'g': unexpected 'param'"),
+        ({"params": {"mass": "1"}}, "'mass' must be a number or a list of numbers, got '1'"),
+        ({"params": {"mass": True}}, "'mass' must be a number"),
+        ({"params": {"latency": 0.01}}, "'latency' is an effect of toy, not one of its parameters"),
+        ({"effects": {"mass": 1.0}}, "'mass' is a parameter of toy, not one of its effects"),
+        ({"params": [1.0]}, "'params' must be a table of names and numbers"),
+    ],
+)
+def test_bad_tables_are_one_line(table, words):
+    with pytest.raises(UserError, match=words):
+        gaps.from_dict(ENV, "g", table)
+
+
+def test_an_unknown_gap_gets_the_closest_match():
+    with pytest.raises(
+        UserError, match=r"gap of push: there is no 'defalt', did you mean 'default'\? .* or give a .toml"
+    ):
+        gaps.load(ENV._replace(name="push"), "defalt")
+
+
+@pytest.mark.parametrize(
+    ("scene", "params", "words"),
+    [
+        (insert, {"hole_radius": 0.011}, "hole_radius 0.011 m is narrower than peg_radius 0.0115 m"),
+        (insert, {"hole_radius": [0.011, 0.013]}, "hole_radius 0.011 m is narrower"),
+        (insert, {"peg_radius": [0.011, 0.0125]}, "is narrower than peg_radius 0.0125 m"),
+        (insert, {"part_friction": -0.1}, "parameter 'part_friction' must be at least 0, got -0.1"),
+        (hammer, {"nail_half_height": 0.3}, "nail_z less twice nail_half_height is the board's height, -0.05 m"),
+        (hammer, {"hammer_mass": 0.0}, "parameter 'hammer_mass' must be at least 0.001, got 0.0"),
+    ],
+)
+def test_what_cannot_be_built_is_refused_before_it_is(scene, params, words):
+    env = scene.make("c")
+    with pytest.raises(UserError, match=words):
+        gaps.from_dict(env, "g", {"params": params})
+
+
+@pytest.mark.parametrize("task", envs.TASKS)
+def test_all_presets_are_possible(task):
+    env = envs.make(task, "c")
+    for name in gaps.presets(task):
+        assert gaps.load(env, name).name == name
