@@ -27,7 +27,8 @@ from experiments.video import film
 from sgft_jax import mesh
 from sgft_jax.analysis import figures
 from sgft_jax.io import checkpoint, runs
-from sgft_jax.io.log import EVAL, Clock, MetricsLog, RunProgress, read_jsonl, write_summary
+from sgft_jax.io.log import EVAL, MetricsLog, read_jsonl, write_summary
+from sgft_jax.io.progress import Clock, RunProgress
 from sgft_jax.policies import make_policy
 from sgft_jax.pretraining import (
     Best,
