@@ -1,7 +1,6 @@
-"""Impure: what a fine-tuning run leaves on disk for one real system, whether that is stepped alone or with others."""
+"""Impure: what a fine-tuning run leaves on disk for one real system, whether that is played alone or with others."""
 
 import json
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,10 +17,10 @@ from experiments.video import before_and_after
 from sgft_jax.analysis import plot
 from sgft_jax.analysis.stats import iqm_interval
 from sgft_jax.io import checkpoint
-from sgft_jax.io.log import MetricsLog, RealLog, write_summary
-from sgft_jax.types import Array, Metrics, Prior, PyTree
-
-OFFLINE = "offline"  # checkpoints of learning before the first real rollout: those of the run count rollouts
+from sgft_jax.io.log import MetricsLog, RealStore, write_summary
+from sgft_jax.io.priors import save_prior
+from sgft_jax.train import OFFLINE_PART, FinetuneProgress
+from sgft_jax.types import Metrics, Prior, PyTree
 
 
 class Record:
@@ -29,43 +28,26 @@ class Record:
 
     def __init__(self, folder: Path, env: Env, gap: Gap, method: str, seeds: list[int]) -> None:
         self.folder, self.env, self.gap, self.method, self.seeds = folder, env, gap, method, seeds
-        self.log, self.real = MetricsLog(folder), RealLog(folder)
+        self.log, self.real = MetricsLog(folder), RealStore(folder)
         self.expect = {"kind": "finetune", "task": env.name, "method": method, "seeds": seeds}
 
-    def rollouts(self) -> int:
-        """Those behind the last checkpoint; 0 without one."""
-        return checkpoint.latest(self.folder) or 0
+    def latest(self) -> int | None:
+        """The step of the last checkpoint: parts of the offline phase and rollouts together; None without one."""
+        return checkpoint.latest(self.folder)
 
-    def clear(self) -> None:
-        """What an earlier start wrote before its first checkpoint."""
-        self.log.truncate({})
-        self.real.truncate(0)
-
-    def restore(self, like: PyTree, rollouts: int) -> PyTree:
-        """The state of the checkpoint after so many rollouts, to which the logs are cut back."""
-        state, meta = checkpoint.restore(self.folder, like, step=rollouts, expect=self.expect)
+    def restore(self, like: FinetuneProgress, step: int) -> FinetuneProgress:
+        """The state of that checkpoint, to which the logs are cut back. What the robot did stays."""
+        progress, meta = checkpoint.restore(self.folder, like, step=step, expect=self.expect)
         self.log.truncate(meta["position"])
-        self.real.truncate(meta["stored"])
-        return state
+        return progress
 
-    def offline(self) -> int:
-        """Updates of the offline phase behind its last checkpoint; 0 without one."""
-        return checkpoint.latest(self.folder / OFFLINE) or 0
+    def checkpoint(self, progress: FinetuneProgress) -> None:
+        """The state, and how long the logs are."""
+        step = int(progress.rollouts) + -(-int(progress.offline) // OFFLINE_PART)
+        meta = {**self.expect, "rollouts": int(progress.rollouts), "position": self.log.position()}
+        checkpoint.save(self.folder, step, progress, meta=meta)
 
-    def restore_offline(self, like: PyTree, updates: int) -> PyTree:
-        """The state of the checkpoint after so many of them."""
-        return checkpoint.restore(self.folder / OFFLINE, like, step=updates, expect=self.expect)[0]
-
-    def checkpoint_offline(self, state: PyTree, updates: int) -> None:
-        """The state after so many of them."""
-        checkpoint.save(self.folder / OFFLINE, updates, state, meta=self.expect)
-
-    def store(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Real rollouts, arrays [S, rollouts, T, ...]: one file each, of arrays [S, T, ...]."""
-        for i in range(arrays["reward"].shape[1]):
-            self.real.append({name: x[:, i] for name, x in arrays.items()})
-
-    def metrics(self, done: int, values: Mapping[str, Array | np.ndarray]) -> None:
+    def metrics(self, done: int, values: Mapping[str, np.ndarray]) -> None:
         """A line of one learning phase."""
         self.log.metrics(self._transitions(done), {"rollouts": done, **values})
 
@@ -74,32 +56,26 @@ class Record:
         minutes = self._transitions(done) * self.env.control_dt / 60
         self.log.eval(self._transitions(done), {"rollouts": done, "robot_minutes": minutes, **scores})
 
-    def checkpoint(self, state: PyTree, done: int) -> None:
-        """The state, and how long the logs are. The offline phase is not gone back to."""
-        meta = {**self.expect, "rollouts": done, "stored": len(self.real), "position": self.log.position()}
-        checkpoint.save(self.folder, done, state, meta=meta)
-        shutil.rmtree(self.folder / OFFLINE, ignore_errors=True)
-
-    def time(self, done: int, collect_s: float, learn_s: float) -> None:
+    def time(self, done: int, seconds: float) -> None:
         """Apart from the metrics, which must not depend on the clock."""
-        line = {"rollouts": done, "time/collect_s": round(collect_s, 3), "time/learn_s": round(learn_s, 3)}
         with open(self.folder / "timing.jsonl", "a") as file:
-            file.write(json.dumps(line) + "\n")
+            file.write(json.dumps({"rollouts": done, "time/rollout_s": round(seconds, 3)}) + "\n")
 
-    def save_policies(self, export: Callable[[PyTree, int], Prior], state: PyTree, card: Mapping[str, Any]) -> None:
-        """The fine-tuned policies in the form of priors: policy/seed-<k>. export(state, i) -> that of the i-th seed."""
+    def save_policies(self, kind: str, params: PyTree, card: Mapping[str, Any]) -> None:
+        """Policies [S] in the form of priors: <kind>/seed-<k>. kind: `policy`, the last ones, or `best`."""
         for i, seed in enumerate(self.seeds):
-            facts = {"method": self.method, "gap": self.gap._asdict(), "seed": seed}
-            checkpoint.save_prior(
-                self.folder / "policy" / f"seed-{seed}", export(state, i), {**card, "finetuned": facts}
-            )
+            facts = {"method": self.method, "gap": self.gap._asdict(), "seed": seed, "which": kind}
+            save_prior(self.folder / kind / f"seed-{seed}", Prior(member(params, i), {**card, "finetuned": facts}))
 
-    def summarise(self) -> dict[str, Any]:
-        """summary.json, the learning curve and the closing words; the log ends here."""
+    def summarise(self, best: Mapping[str, np.ndarray]) -> dict[str, Any]:
+        """summary.json, the learning curve and the closing words; the log ends here.
+
+        best: of the best policies by real evidence, [S] each: `score` in the evaluation, `evidence`, `rollouts`.
+        """
         self.log.close()
         env, curve = self.env, read_curve(self.folder)
         about = {"task": env.name, "method": self.method, "impl": env.impl, "gap": self.gap._asdict()}
-        summary = about | describe_run(curve)
+        summary = about | describe_run(curve) | {"best": {name: x.tolist() for name, x in best.items()}}
         write_summary(self.folder, summary)
         plot.learning_curves(
             self.folder / "figures" / "success.png",
@@ -109,11 +85,11 @@ class Record:
             rollout_length=env.episode_length,
             control_dt=env.control_dt,
         )
-        zero, final = (summary[when]["success"] for when in ("zero_shot", "final"))
-        band = f" [{final['low']:.2f}, {final['high']:.2f}]" if len(self.seeds) > 1 else ""
+        zero, final = (summary[when]["success"]["iqm"] for when in ("zero_shot", "final"))
         print(
-            f"{self.gap.name}: success {zero['iqm']:.2f} zero-shot -> {final['iqm']:.2f}{band} after "
-            f"{summary['final']['rollouts']} rollouts; deepest dip {summary['dip']['mean']:.3f}"
+            f"{self.gap.name}: success on the real system {100 * zero:.0f} % before -> {100 * final:.0f} % after "
+            f"{summary['final']['rollouts']} rollouts; deepest fall below the start {100 * summary['dip']['mean']:.0f} "
+            f"points; best policy by the training rollouts {100 * float(best['score'].mean()):.0f} %"
         )
         return summary
 

@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import envs
-from envs.mujoco.worlds import Impl
 from experiments.finetune import finetune
 from experiments.finetune_args import VOLATILE, FinetuneArgs, arguments, label, run_folder
-from experiments.options import seed_list
+from experiments.options import Impl, seed_list, without_repeats
+from sgft_jax import extend
 from sgft_jax.io import checkpoint
 from sgft_jax.io.config import config_to_json
 from sgft_jax.io.jsonfile import read_json
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.io.runs import CONFIG, InUseError, check_same, in_use
-from sgft_jax.methods import METHODS, get_method
+from sgft_jax.methods import NAMES, get_method
 from sgft_jax.types import UserError
 
 
@@ -26,7 +26,7 @@ class GridArgs:
 
     tasks: tuple[str, ...] = tuple(envs.TASKS)
     """Tasks."""
-    methods: tuple[str, ...] = tuple(reversed(METHODS))
+    methods: tuple[str, ...] = tuple(reversed(NAMES))
     """Methods, in the order in which they run."""
     reals: tuple[str, ...] = ("default",)
     """Real systems of every task: mild, default, hard, or .toml/.json files."""
@@ -36,8 +36,6 @@ class GridArgs:
     """Seeds of each run, all in one program."""
     rollouts: int = 100
     """Real rollouts per seed, the initial ones included; may grow later."""
-    initial_rollouts: int = 1
-    """Real rollouts before a method learns."""
     eval_every: int = 5
     """Rollouts between evaluations."""
     together: bool = True
@@ -63,7 +61,7 @@ class Cell(NamedTuple):
 
     def __str__(self) -> str:
         (real,) = self.args.real
-        return f"{envs.name_of(self.args.task)}/{Path(real).stem}: {label(self.args)}"
+        return f"{extend.name_of(self.args.task)}/{Path(real).stem}: {label(self.args)}"
 
     @property
     def folder(self) -> Path:
@@ -76,8 +74,9 @@ def check(args: GridArgs) -> None:
     for name, given in (("tasks", args.tasks), ("methods", args.methods), ("reals", args.reals)):
         if not given:
             raise UserError(f"--{name}: name at least one")
+        without_repeats(f"--{name}", given)
     for task in args.tasks:
-        envs.name_of(task)
+        extend.name_of(task)
     for method in args.methods:
         get_method(method)
     seed_list(args.seed, args.seeds)
@@ -87,8 +86,7 @@ def run_of(args: GridArgs, task: str, real: str, method: str) -> FinetuneArgs:
     """The run of one cell, with the method's own defaults."""
     return arguments(
         method, task=task, real=(real,), seed=args.seed, seeds=args.seeds, rollouts=args.rollouts,
-        initial_rollouts=args.initial_rollouts, eval_every=args.eval_every, impl=args.impl, devices=args.devices,
-        video=False, out=args.out,
+        eval_every=args.eval_every, impl=args.impl, devices=args.devices, video=False, out=args.out,
     )  # fmt: skip
 
 
@@ -117,7 +115,7 @@ def work(cells: Sequence[Cell], args: GridArgs) -> list[str]:
     """
     started, failed = time.monotonic(), []
     for cell in cells:
-        print(f"{cell.state:10} {cell}" + (f", {cell.done} rollouts" if cell.done else ""))
+        print(f"{cell.state:10} {cell}" + (f", step {cell.done}" if cell.done else ""))
     if args.dry:
         return []
     for batch in _batches(cells, together=args.together):

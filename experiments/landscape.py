@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from sgft_jax.players import Player
 
 import envs
 from envs.base import Entry, Env
@@ -25,7 +26,6 @@ from experiments.options import prior_folders
 from experiments.worlds import heldout_worlds, load_gap, real_env
 from sgft_jax.analysis import plot
 from sgft_jax.io.priors import load_priors
-from sgft_jax.players import Player
 from sgft_jax.transforms import branch
 from sgft_jax.types import Array, Imagination, Key, Prior, Transition, UserError
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from sgft_jax.finetune_planner import make_planner
 
 import envs
 from envs.base import Env, World
@@ -24,7 +25,6 @@ from experiments.evaluation import play_episodes, score
 from experiments.finetuning import Reals, make_program
 from experiments.options import seed_list, seeds_name
 from sgft_jax.analysis import plot
-from sgft_jax.finetune_planner import make_planner
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import EVAL, MetricsLog, RunProgress, read_jsonl, write_summary
 from sgft_jax.learners import tdmpc2

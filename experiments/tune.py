@@ -18,16 +18,16 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-import envs
 from experiments import cli, grid, tuned
 from experiments.finetune_args import with_settings
 from experiments.grid import Cell, GridArgs
 from experiments.options import prior_home, seed_list
 from experiments.results import area, read_curve
+from experiments.spaces import defaults, space_of
+from sgft_jax import extend
 from sgft_jax.io import runs
 from sgft_jax.io.jsonfile import read_json
 from sgft_jax.io.log import SUMMARY
-from sgft_jax.methods import default_settings, get_method
 from sgft_jax.types import UserError
 
 FOLDER = "tune"  # the trials have a tree of their own, which figures of the comparison do not look into
@@ -99,11 +99,11 @@ def draw(
 
 def trials(args: TuneArgs, task: str, method: str) -> list[Trial]:
     """The trials of a method on a task, and how far each has got."""
-    found = get_method(method)
-    if args.trials > (size := math.prod(map(len, found.space.values()))):
+    space = space_of(method)
+    if args.trials > (size := math.prod(map(len, space.values()))):
         raise UserError(f"--trials is {args.trials}: {method} has only {size} different ones")
     key = (args.seed, zlib.crc32(task.encode()), zlib.crc32(method.encode()))
-    drawn = draw(found.space, default_settings(found), args.trials, key=key)
+    drawn = draw(space, defaults(method), args.trials, key=key)
     return [
         Trial(k, settings, [_look_up(args, task, real, method, k, settings) for real in args.reals])
         for k, settings in enumerate(drawn)
@@ -112,7 +112,7 @@ def trials(args: TuneArgs, task: str, method: str) -> list[Trial]:
 
 def _look_up(args: TuneArgs, task: str, real: str, method: str, number: int, settings: dict[str, Any]) -> Cell:
     run = grid.run_of(args, task, real, method)
-    priors = prior_home(args.out, envs.name_of(task), run.preset)
+    priors = prior_home(args.out, extend.name_of(task), run.preset)
     run = replace(run, prior=priors, variant=f"trial-{number}", out=args.out / FOLDER)
     return grid.look_up(with_settings(run, settings))
 
@@ -162,12 +162,12 @@ def _result(
     budget = {
         "trials": args.trials, "reals": [_name(real) for real in args.reals],
         "seeds": seed_list(args.seed, args.seeds), "rollouts": args.rollouts,
-        "initial_rollouts": args.initial_rollouts, "eval_every": args.eval_every,
+        "eval_every": args.eval_every,
     }  # fmt: skip
     return {
         "task": task, "method": method, "options": found[chosen].settings, "trial": chosen, "budget": budget,
         "gaps": [read_json(cell.folder / SUMMARY)["gap"] for cell in found[0].cells],
-        "space": get_method(method).space, "trials": tried, "provenance": runs.provenance(),
+        "space": space_of(method), "trials": tried, "provenance": runs.provenance(),
     }  # fmt: skip
 
 

@@ -1,18 +1,18 @@
 """The options that tuning has chosen, one file for a task and method: read, written, and put into a run's arguments."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import envs
 from experiments.finetune_args import FinetuneArgs, with_settings
+from experiments.spaces import space_of
+from sgft_jax import extend
 from sgft_jax.io.jsonfile import read_json, write_json
-from sgft_jax.methods import FinetuneConfig, get_method
+from sgft_jax.methods import get_method
 from sgft_jax.types import UserError
 
 VARIANT = "tuned"
-_OPTIONS = {"utd", *(field.name for field in fields(FinetuneConfig))}
 
 
 def path_of(out: Path, task: str, method: str) -> Path:
@@ -21,7 +21,7 @@ def path_of(out: Path, task: str, method: str) -> Path:
 
 
 def _home(out: Path, task: str) -> Path:
-    return out / VARIANT / envs.name_of(task)
+    return out / VARIANT / extend.name_of(task)
 
 
 def write(out: Path, task: str, method: str, result: Mapping[str, Any]) -> Path:
@@ -39,7 +39,7 @@ def read(out: Path, task: str, method: str) -> dict[str, Any]:
     result = read_json(path)
     if not isinstance(result, dict) or not {"budget", "options"} <= set(result):
         raise UserError(f"{path}: was not written by experiments.tune")
-    if unknown := sorted(set(result["options"]) - _OPTIONS):
+    if unknown := sorted(set(result["options"]) - set(space_of(method))):
         raise UserError(f"{path}: there is no option {unknown[0]!r}; tune again with: {_command(task, [method])}")
     return result
 

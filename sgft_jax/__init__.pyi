@@ -1,5 +1,7 @@
+from .api import ActingPolicy, Setup, evaluate_prior, load_policy, setup
 from .data import replay, sequences, sources
 from .finetuner import FinetuneState, Parts, assemble, sac_finetuner
+from .io.priors import load_prior, save_prior
 from .learners.iql import IQLConfig, IQLHyper, IQLState, make_iql
 from .learners.sac import SACConfig, SACHyper, SACParams, SACState, extract_params, make_sac, state_from_prior
 from .learners.tdmpc2 import TDMPC2Config, TDMPC2Hyper, TDMPC2Params, TDMPC2State, make_tdmpc2
@@ -34,6 +36,7 @@ from .types import (
 
 __all__ = [
     "PRESETS",
+    "ActingPolicy",
     "Batch",
     "FinetuneProgress",
     "FinetuneState",
@@ -56,6 +59,7 @@ __all__ = [
     "SACHyper",
     "SACParams",
     "SACState",
+    "Setup",
     "Simulated",
     "SimulatedData",
     "Simulation",
@@ -75,9 +79,12 @@ __all__ = [
     "clip",
     "compose",
     "evaluate",
+    "evaluate_prior",
     "extract_params",
     "finetune",
     "get_method",
+    "load_policy",
+    "load_prior",
     "make_iql",
     "make_policy",
     "make_sac",
@@ -90,7 +97,9 @@ __all__ = [
     "replay",
     "sac_finetuner",
     "sac_policy",
+    "save_prior",
     "sequences",
+    "setup",
     "shape",
     "shaped_reward",
     "shorten",

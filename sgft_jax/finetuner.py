@@ -186,6 +186,7 @@ def sac_finetuner(
     new_critic = reset_critic or fresh
     rows = source or (lambda state: sources.real_rows(options.batch_size))
     numbers = {name: structure.pop(name) for name in ("entropy_per_dim",) if name in structure}
+    structure = {"tune_alpha": False} | structure
     config = sac.SACConfig(
         task.obs_dim,
         task.act_dim,
@@ -196,7 +197,7 @@ def sac_finetuner(
         critic_baseline=value_baseline and not new_critic,
         policy_delay=rules.policy_delay(options),
         max_grad_norm=options.max_grad_norm,
-        **({"tune_alpha": False} | structure),
+        **structure,
     )
     hyper = sac.SACHyper(
         lr_actor=options.lr_actor,

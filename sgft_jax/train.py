@@ -39,7 +39,7 @@ class Best(NamedTuple):
 
     params: [M, ...] of the policy that played the last of them. score, total: [M] its evidence, -inf before there is
     any. rollouts: [M] int32, the real rollouts it had learned from. recent: [M, WINDOW, 2], scores and returns of the
-    last rollouts. count: [] int32 rollouts in there.
+    last rollouts. count: [M] int32, how many rollouts it has seen.
     """
 
     params: PyTree
@@ -86,15 +86,16 @@ def finetune(
     system: System,
     priors: PyTree,
     seeds: Array,
+    simulated: SimulatedRows | None = None,
     *,
     rollouts: int,
-    simulated: SimulatedRows | None = None,
     progress: FinetuneProgress | None = None,
 ) -> Iterator[tuple[FinetuneProgress, Metrics]]:
     """Fine-tunes M members, each a seed on a real system, until each has made `rollouts` real rollouts.
 
-    priors: params [P, ...] of P priors, or None; the member with seed s starts from prior s modulo P. seeds: [M] uint32.
-    simulated: see `simulate`, for methods that ask for it. progress: where an earlier run stopped, or None.
+    priors: params [P, ...] of P priors, or None; the member with seed s starts from prior s modulo P.
+    seeds: [M] uint32. simulated: see `simulate`, for methods that ask for it.
+    progress: where an earlier run stopped, or None.
 
     Yields the fresh state with no metrics (unless `progress` is given), then once per part of the offline phase, then
     once per real rollout, all initial ones together. Metrics are arrays [M]. Every random draw follows from (seed,
@@ -122,14 +123,10 @@ def evaluate(policy: Any, system: System, states: PyTree, seeds: Array, episodes
     return system.play(policy, states, _episode_keys(seeds, _EVALUATE, 0, episodes), explore=False)
 
 
-def start_shapes(
+def begin(
     finetuner: Finetuner, priors: PyTree, seeds: Array, simulated: SimulatedRows | None = None
 ) -> FinetuneProgress:
-    """Shapes and types of the state that `finetune` starts from: what a checkpoint is read into."""
-    return jax.eval_shape(functools.partial(_begin, finetuner), priors, seeds, simulated)
-
-
-def _begin(finetuner: Finetuner, priors: PyTree, seeds: Array, simulated: SimulatedRows | None) -> FinetuneProgress:
+    """The state that `finetune` starts from. `jax.eval_shape` of it says what a checkpoint is read into."""
     which = _prior_of(priors, seeds)
 
     def one(params: PyTree, seed: Array, which: Array, rows: SimulatedRows | None) -> PyTree:
@@ -141,7 +138,7 @@ def _begin(finetuner: Finetuner, priors: PyTree, seeds: Array, simulated: Simula
     low = jnp.full(m, -jnp.inf)
     best = Best(
         jax.tree.map(jnp.copy, jax.vmap(finetuner.export)(agent)), low, jnp.copy(low), jnp.zeros(m, jnp.int32),
-        jnp.zeros((m, WINDOW, 2)), jnp.int32(0),
+        jnp.zeros((m, WINDOW, 2)), jnp.zeros(m, jnp.int32),
     )  # fmt: skip
     return FinetuneProgress(agent, best, jnp.int32(0), jnp.int32(0))
 
@@ -167,7 +164,7 @@ class _Steps:
 
     def begin(self) -> FinetuneProgress:
         """The fresh state."""
-        return jax.jit(functools.partial(_begin, self.finetuner))(self.priors, self.seeds, self.simulated)
+        return jax.jit(functools.partial(begin, self.finetuner))(self.priors, self.seeds, self.simulated)
 
     def offline(self, progress: FinetuneProgress, done: int, updates: int) -> tuple[FinetuneProgress, Metrics]:
         """Updates on simulated transitions alone."""

@@ -1,18 +1,19 @@
-"""Impure: writes and reads checkpoints and priors on disk. Orbax holds the numbers, a JSON file says what they are.
+"""Impure: writes and reads the states of runs. Orbax holds the numbers, a JSON file says what they are.
 
 A checkpoint is `<run>/checkpoints/<step>/` with `state/` (Orbax) and `manifest.json`. It is written under a temporary
 name, its manifest last, and then renamed: a process killed at any moment leaves either the previous checkpoint or a
-complete new one. A prior is such a folder plus a readable `prior.json`. Nothing here ever unpickles anything.
+complete new one. Nothing here ever unpickles anything.
+
+The steps are not Orbax's own `training.Checkpointer`. Of 0.12.8 it offers a step with a damaged file as the latest,
+keeps the later steps that a resume from an earlier one has abandoned, and refuses arrays without elements.
 """
 
-import dataclasses
+import contextlib
 import datetime
-import hashlib
 import importlib.metadata
-import itertools
 import shutil
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,18 +24,15 @@ from orbax.checkpoint import v1 as ocp
 
 from sgft_jax import mesh
 from sgft_jax.io.jsonfile import jsonable, read_json, write_json
-from sgft_jax.learners.tdmpc2 import TDMPC2Prior
-from sgft_jax.types import Normalizer, Prior, PyTree, UserError
+from sgft_jax.types import PyTree, UserError
 
 FORMAT = 1
-_CHECKPOINTS, _MANIFEST, _STATE, _CARD, _TEMPORARY = "checkpoints", "manifest.json", "state", "prior.json", ".tmp-"
+_CHECKPOINTS, _MANIFEST, _STATE, _TEMPORARY = "checkpoints", "manifest.json", "state", ".tmp-"
 _PACKAGES = ("jax", "flax", "optax", "orbax-checkpoint", "numpy")
-_KINDS = {"sac": Prior, "tdmpc2": TDMPC2Prior}
-_PYTHON = {"int": int, "float": float, "bool": bool}
 
 
-class _Leaf(NamedTuple):
-    """What the manifest says of one leaf; `kind` is one of jax, numpy, key, int, float, bool."""
+class Leaf(NamedTuple):
+    """What the manifest says of one array; `kind` is "key" for typed keys, which are stored as their data."""
 
     path: str
     kind: str
@@ -45,27 +43,20 @@ class _Leaf(NamedTuple):
         return f"{self.path} {self.dtype}[{','.join(map(str, self.shape))}]"
 
 
-# ---------------------------------------------------------------- training checkpoints
+# --- checkpoints of a run ---------------------------------------------------------------------------------------------
 
 
 def save(folder: Path, step: int, state: PyTree, *, meta: Mapping[str, Any], keep: int = 2) -> Path:
     """Write `<folder>/checkpoints/<step>/` and return it; blocks until the files are there.
 
-    Several hosts save together, each all of it. state: any pytree of jax or numpy arrays, typed keys and Python
-    numbers. meta: JSON-able facts (`kind`, `task`, log positions, counters), handed back by `restore`. keep: complete
-    checkpoints that stay, this one included. Checkpoints of a later step belong to a future that a resume has
-    abandoned, and are removed too.
+    Several hosts save together, each all of it. state: any pytree of arrays and typed keys. meta: JSON-able facts
+    (`kind`, `task`, log positions, counters), handed back by `restore`. keep: complete checkpoints that stay, this one
+    included. Checkpoints of a later step belong to a future that a resume has abandoned, and are removed too.
     """
     root = Path(folder) / _CHECKPOINTS
-    temporary = root / f"{_TEMPORARY}{step}"
-    if _first():
-        root.mkdir(parents=True, exist_ok=True)
-        for leftover in root.glob(f"{_TEMPORARY}*"):
-            shutil.rmtree(leftover)
-        temporary.mkdir()
-    _write(temporary, state, {"step": step, "meta": dict(meta)})
-    if _first():
-        _swap(temporary, root / str(step))
+    with replaced(root / str(step)) as temporary:
+        write_tree(temporary, state, {"step": step, "meta": dict(meta)})
+    if first_host():
         _prune(root, newest=step, keep=keep)
     mesh.meet()
     return root / str(step)
@@ -76,7 +67,7 @@ def latest(folder: Path, *, say: Callable[[str], None] = print) -> int | None:
     root = Path(folder) / _CHECKPOINTS
     for step in sorted(_steps(root), reverse=True):
         try:
-            _manifest(root / str(step))
+            read_manifest(root / str(step))
         except UserError as torn:
             say(f"skipped: {torn}")
         else:
@@ -102,156 +93,97 @@ def restore(
         if step is None:
             raise UserError(f"{folder}: holds no complete checkpoint to restore")
     where = Path(folder) / _CHECKPOINTS / str(step)
-    manifest = _manifest(where)
-    _check_meta(where, manifest["meta"], expect or {})
-    leaves = _leaves(manifest)
-    _check_leaves(where, leaves, [_describe(p, x) for p, x in jax.tree_util.tree_leaves_with_path(like)])
-    return jax.tree.unflatten(jax.tree.structure(like), _read(where, manifest)), manifest["meta"]
+    manifest = read_manifest(where)
+    check_facts(where, manifest["meta"], expect or {})
+    _check_leaves(where, leaves_of(manifest), [describe(p, x) for p, x in jax.tree_util.tree_leaves_with_path(like)])
+    return jax.tree.unflatten(jax.tree.structure(like), read_leaves(where, manifest)), manifest["meta"]
 
 
-# ---------------------------------------------------------------- priors
+def check_facts(where: Path, saved: Mapping[str, Any], expect: Mapping[str, Any]) -> None:
+    """Raise UserError where saved facts are not those that are needed."""
+    wanted = jsonable(expect)  # the saved values have been through JSON: tuples are lists by now
+    differing = [f"{k}={saved.get(k)!r} where {k}={v!r} is needed" for k, v in wanted.items() if saved.get(k) != v]
+    if differing:
+        raise UserError(f"{where}: does not fit: it was saved with {', '.join(differing)}")
 
 
-def save_prior(folder: Path, prior: Prior | TDMPC2Prior, card: Mapping[str, Any]) -> Path:
-    """Write a prior to `folder`, replacing the one that may be there, and return the folder.
-
-    card: readable JSON-able facts; `task`, `obs_dim` and `act_dim` are checked on loading, `algorithm` (sac, unless it
-    says otherwise) tells what kind of prior it is, the rest (network configuration, gamma, observation entries, domain,
-    config, provenance, metrics) is for the reader. Parameters must
-    be nested dicts of arrays, so that a prior can be read without any code that describes its networks.
-    Raises ValueError or TypeError otherwise.
-    """
-    if missing := {"task", "obs_dim", "act_dim"} - set(card):
-        raise ValueError(f"the prior's card lacks {sorted(missing)}")
-    tree = vars(prior) | {"normalizer": prior.normalizer._asdict()}
-    if not _is_nested_dict(tree):
-        raise TypeError("prior parameters must be nested dicts of arrays")
-    folder = Path(folder)
-    temporary = folder.with_name(f"{_TEMPORARY}{folder.name}")
-    if _first():
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir(parents=True)
-        write_json(temporary / _CARD, card)
-    _write(temporary, tree, {})
-    if _first():
-        _swap(temporary, folder)
-    mesh.meet()
-    return folder
+def _check_leaves(where: Path, saved: list[Leaf], wanted: list[Leaf]) -> None:
+    """Raise UserError naming the first array that differs."""
+    for have, want in zip(saved, wanted, strict=False):
+        if (have.path, have.shape, have.dtype) != (want.path, want.shape, want.dtype):
+            raise UserError(f"{where}: does not fit: it holds {have} where {want} is needed")
+    if len(saved) != len(wanted):
+        odd = max(saved, wanted, key=len)[min(len(saved), len(wanted))]
+        counts = f"{len(saved)} arrays saved, {len(wanted)} needed"
+        raise UserError(f"{where}: does not fit: {counts}, the first odd one is {odd}")
 
 
-def load_prior(
-    folder: Path, *, task: str | None = None, obs_dim: int | None = None, act_dim: int | None = None
-) -> tuple[Any, dict[str, Any]]:
-    """Read (prior, card) from a prior folder, or from the run folder that holds one as `prior/`.
-
-    The prior is a `Prior` or a `TDMPC2Prior`, as the card's `algorithm` says.
-
-    Raises UserError if it is missing, torn, or of another task or other observation or action sizes than asked for.
-    """
-    folder = Path(folder)
-    if not (folder / _CARD).exists() and (folder / "prior" / _CARD).exists():
-        folder = folder / "prior"
-    manifest = _manifest(folder)
-    card = read_json(folder / _CARD)
-    kind = _KINDS.get(algorithm_of(card))
-    if kind is None:
-        raise UserError(f"{folder}: {_CARD} says algorithm={card['algorithm']!r}: choose one of {', '.join(_KINDS)}")
-    asked = {"task": task, "obs_dim": obs_dim, "act_dim": act_dim}
-    _check_meta(folder, card, {k: v for k, v in asked.items() if v is not None})
-    tree = _nest([leaf.path for leaf in _leaves(manifest)], _read(folder, manifest))
-    if set(tree.get("normalizer", {})) != {"mean", "std"}:
-        raise UserError(f"{folder}: not a prior: it has no observation statistics")
-    statistics = Normalizer(**tree.pop("normalizer"))
-    if statistics.mean.shape != (card["obs_dim"],):
-        raise UserError(f"{folder}: {_CARD} says obs_dim={card['obs_dim']}, the statistics have {len(statistics.mean)}")
-    names = [field.name for field in dataclasses.fields(kind) if field.name != "normalizer"]
-    return kind(**{name: tree.get(name, {}) for name in names}, normalizer=statistics), card
+def _prune(root: Path, *, newest: int, keep: int) -> None:
+    """Delete all but the `keep` newest complete steps up to `newest`; what goes is renamed first, lest it stay torn."""
+    steps = _steps(root)
+    complete = [step for step in sorted(steps, reverse=True) if step <= newest and _is_complete(root / str(step))]
+    for step in set(steps) - set(complete[: max(keep, 1)]):
+        doomed = root / f"{_TEMPORARY}old-{step}"
+        (root / str(step)).rename(doomed)
+        shutil.rmtree(doomed)
 
 
-def digest(tree: PyTree) -> str:
-    """Twelve hex digits that tell whether two trees of arrays hold the same numbers under the same names."""
-    found = hashlib.sha256()
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        found.update(str(_describe(path, leaf)).encode())
-        found.update(np.ascontiguousarray(leaf).tobytes())
-    return found.hexdigest()[:12]
+def _is_complete(where: Path) -> bool:
+    try:
+        return bool(read_manifest(where))
+    except UserError:
+        return False
 
 
-def algorithm_of(card: Mapping[str, Any]) -> str:
-    """Which algorithm a prior is from; the first priors did not say, they were all SAC's."""
-    return card.get("algorithm", "sac")
+def _steps(root: Path) -> list[int]:
+    return [int(p.name) for p in root.iterdir() if p.name.isdigit() and p.is_dir()] if root.is_dir() else []
 
 
-def _is_nested_dict(tree: PyTree) -> bool:
-    """Whether every inner node is a dict with names free of the path separator; empty dicts count, None does not."""
-    if isinstance(tree, dict):
-        return all(isinstance(k, str) and "/" not in k and _is_nested_dict(v) for k, v in tree.items())
-    return isinstance(tree, (jax.Array, np.ndarray))
+# --- one tree in one folder -------------------------------------------------------------------------------------------
 
 
-def _nest(paths: list[str], leaves: list[Any]) -> dict[str, Any]:
-    """Nested dicts from paths such as `actor/Dense_0/kernel`."""
-    tree: dict[str, Any] = {}
-    for path, leaf in zip(paths, leaves, strict=True):
-        *parents, name = path.split("/")
-        node = tree
-        for parent in parents:
-            node = node.setdefault(parent, {})
-        node[name] = leaf
-    return tree
+@contextlib.contextmanager
+def replaced(folder: Path) -> Iterator[Path]:
+    """Give a folder to fill, which then takes the place of `folder`."""
+    temporary, aside = (folder.with_name(f"{_TEMPORARY}{word}{folder.name}") for word in ("", "old-"))
+    if first_host():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        for leftover in folder.parent.glob(f"{_TEMPORARY}*"):
+            shutil.rmtree(leftover)
+        temporary.mkdir()
+    yield temporary
+    if first_host():
+        if folder.exists():
+            folder.rename(aside)
+        temporary.rename(folder)
+        shutil.rmtree(aside, ignore_errors=True)
 
 
-# ---------------------------------------------------------------- one tree on disk
-
-
-def _write(where: Path, tree: PyTree, facts: dict[str, Any]) -> None:
-    """Put the tree into `where/state/` and, last, the manifest that makes it count. `where` exists."""
+def write_tree(where: Path, tree: PyTree, facts: Mapping[str, Any]) -> None:
+    """Put a tree into `where/state/` and, last, the manifest that makes it count. `where` exists."""
     flat = jax.tree_util.tree_leaves_with_path(tree)
-    leaves = [_describe(path, leaf) for path, leaf in flat]
+    leaves = [describe(path, leaf) for path, leaf in flat]
     arrays = {_slot(i): _to_numpy(leaf) for i, (_, leaf) in enumerate(flat)}
     mesh.meet()
     # Orbax refuses arrays without elements; their shape in the manifest says all there is to say.
     if stored := {slot: x for slot, x in arrays.items() if x.size}:
         ocp.save(str((where / _STATE).absolute()), stored)
-    if not _first():
+    if not first_host():
         return
-    impls = {_slot(i): str(jax.random.key_impl(x)) for i, (_, x) in enumerate(flat) if leaves[i].kind == "key"}
-    files = {str(f.relative_to(where)): _fingerprint(f) for f in sorted(where.glob(f"{_STATE}/**/*")) if f.is_file()}
+    files = [file for file in sorted(where.glob(f"{_STATE}/**/*")) if file.is_file()]
     manifest = {
         "format": FORMAT,
         **facts,
         "saved": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
         "leaves": [list(leaf) for leaf in leaves],
-        "key_impls": impls,
-        "files": files,
+        "key_impls": {_slot(i): str(jax.random.key_impl(x)) for i, (_, x) in enumerate(flat) if _is_key(x)},
+        "files": {str(file.relative_to(where)): _fingerprint(file) for file in files},
     }
     write_json(where / _MANIFEST, manifest)
 
 
-def _read(where: Path, manifest: dict[str, Any]) -> list[Any]:
-    """The leaves in order, after every file has been compared with its checksum."""
-    for name, (size, crc) in manifest["files"].items():
-        if _fingerprint(where / name) != [size, crc]:
-            raise UserError(f"{where}: torn: {name} is damaged (checksum differs); use another checkpoint")
-    stored: dict[str, np.ndarray] = {}
-    if manifest["files"]:
-        try:
-            stored = ocp.load(str((where / _STATE).absolute()))
-        except Exception as error:
-            raise UserError(f"{where}: Orbax cannot read it: {str(error).splitlines()[0]}") from error
-    return [
-        _from_numpy(leaf, stored.get(_slot(i)), impl=manifest["key_impls"].get(_slot(i)))
-        for i, leaf in enumerate(_leaves(manifest))
-    ]
-
-
-def _first() -> bool:
-    """Of several hosts, which save together, the first one looks after the files."""
-    return jax.process_index() == 0
-
-
-def _manifest(where: Path) -> dict[str, Any]:
+def read_manifest(where: Path) -> dict[str, Any]:
     """Read and check the manifest and that every file it lists is there in full size; raises UserError."""
     if not where.is_dir():
         raise UserError(f"{where}: no such folder")
@@ -272,38 +204,59 @@ def _manifest(where: Path) -> dict[str, Any]:
     return manifest
 
 
-def _leaves(manifest: dict[str, Any]) -> list[_Leaf]:
-    return [_Leaf(path, kind, tuple(shape), dtype) for path, kind, shape, dtype in manifest["leaves"]]
+def read_leaves(where: Path, manifest: Mapping[str, Any]) -> list[Any]:
+    """The arrays in order, after every file has been compared with its checksum."""
+    for name, (size, crc) in manifest["files"].items():
+        if _fingerprint(where / name) != [size, crc]:
+            raise UserError(f"{where}: torn: {name} is damaged (checksum differs); use another checkpoint")
+    stored: dict[str, np.ndarray] = {}
+    if manifest["files"]:
+        try:
+            stored = ocp.load(str((where / _STATE).absolute()))
+        except Exception as error:
+            raise UserError(f"{where}: Orbax cannot read it: {str(error).splitlines()[0]}") from error
+    impls = manifest["key_impls"]
+    return [_from_numpy(leaf, stored.get(_slot(i)), impls.get(_slot(i))) for i, leaf in enumerate(leaves_of(manifest))]
+
+
+def leaves_of(manifest: Mapping[str, Any]) -> list[Leaf]:
+    """What a manifest says of its arrays, in order."""
+    return [Leaf(path, kind, tuple(shape), dtype) for path, kind, shape, dtype in manifest["leaves"]]
+
+
+def describe(path: tuple[Any, ...], leaf: Any) -> Leaf:
+    """An array of a tree; raises TypeError for anything that JAX could not hand back as it is."""
+    name = jax.tree_util.keystr(path, simple=True, separator="/")
+    if not hasattr(leaf, "dtype"):
+        raise TypeError(f"cannot checkpoint {name}: a {type(leaf).__name__} is not an array")
+    if _is_key(leaf):
+        return Leaf(name, "key", tuple(leaf.shape), str(leaf.dtype))
+    if jax.dtypes.canonicalize_dtype(leaf.dtype) != leaf.dtype:
+        raise TypeError(f"cannot checkpoint {name}: JAX does not keep {leaf.dtype}")
+    return Leaf(name, "jax", tuple(leaf.shape), str(leaf.dtype))
+
+
+def first_host() -> bool:
+    """Of several hosts, which save together, the first one looks after the files."""
+    return jax.process_index() == 0
 
 
 def _slot(index: int) -> str:
     return f"leaf_{index:05d}"
 
 
-def _describe(path: tuple[Any, ...], leaf: Any) -> _Leaf:
-    name = jax.tree_util.keystr(path, simple=True, separator="/")
-    if isinstance(leaf, (bool, int, float)):
-        return _Leaf(name, type(leaf).__name__, (), type(leaf).__name__)
-    if not hasattr(leaf, "dtype"):
-        raise TypeError(f"cannot checkpoint {name}: a {type(leaf).__name__} is not an array or a number")
-    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-        return _Leaf(name, "key", tuple(leaf.shape), str(leaf.dtype))
-    kind = "numpy" if isinstance(leaf, (np.ndarray, np.generic)) else "jax"
-    return _Leaf(name, kind, tuple(leaf.shape), str(leaf.dtype))
+def _is_key(leaf: Any) -> bool:
+    return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
 
 
 def _to_numpy(leaf: Any) -> np.ndarray:
-    is_key = hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-    return np.asarray(jax.random.key_data(leaf) if is_key else leaf)
+    return np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
 
 
-def _from_numpy(leaf: _Leaf, stored: Any, *, impl: str | None) -> Any:
+def _from_numpy(leaf: Leaf, stored: Any, impl: str | None) -> jax.Array:
     if leaf.kind == "key":
         return jax.random.wrap_key_data(jnp.array(stored), impl=impl)
-    if leaf.kind in _PYTHON:
-        return _PYTHON[leaf.kind](stored)
-    array = np.zeros(leaf.shape, jnp.dtype(leaf.dtype)) if stored is None else np.asarray(stored)
-    return array if leaf.kind == "numpy" else jnp.array(array)
+    return jnp.zeros(leaf.shape, jnp.dtype(leaf.dtype)) if stored is None else jnp.array(np.asarray(stored))
 
 
 def _fingerprint(file: Path) -> list[int]:
@@ -313,62 +266,3 @@ def _fingerprint(file: Path) -> list[int]:
         while piece := stream.read(1 << 22):
             crc = zlib.crc32(piece, crc)
     return [file.stat().st_size, crc]
-
-
-# ---------------------------------------------------------------- folders and comparisons
-
-
-def _swap(temporary: Path, final: Path) -> None:
-    """Rename `temporary` to `final`; an older `final` steps aside first and is deleted last."""
-    aside = final.with_name(f"{_TEMPORARY}old-{final.name}")
-    shutil.rmtree(aside, ignore_errors=True)
-    if final.exists():
-        final.rename(aside)
-    temporary.rename(final)
-    shutil.rmtree(aside, ignore_errors=True)
-
-
-def _prune(root: Path, *, newest: int, keep: int) -> None:
-    """Delete all but the `keep` newest complete steps up to `newest`; what goes is renamed first, lest it stay torn."""
-    candidates = (s for s in sorted(_steps(root), reverse=True) if s <= newest and _is_complete(root / str(s)))
-    staying = set(itertools.islice(candidates, max(keep, 1)))
-    for step in set(_steps(root)) - staying:
-        doomed = root / f"{_TEMPORARY}old-{step}"
-        (root / str(step)).rename(doomed)
-        shutil.rmtree(doomed)
-
-
-def _is_complete(where: Path) -> bool:
-    try:
-        return bool(_manifest(where))
-    except UserError:
-        return False
-
-
-def _steps(root: Path) -> list[int]:
-    return [int(p.name) for p in root.iterdir() if p.name.isdigit() and p.is_dir()] if root.is_dir() else []
-
-
-def _check_meta(where: Path, saved: Mapping[str, Any], expect: Mapping[str, Any]) -> None:
-    wanted = jsonable(expect)  # the saved values have been through JSON: tuples are lists by now
-    differing = [f"{k}={saved.get(k)!r} where {k}={v!r} is needed" for k, v in wanted.items() if saved.get(k) != v]
-    if differing:
-        raise UserError(f"{where}: does not fit: it was saved with {', '.join(differing)}")
-
-
-def _check_leaves(where: Path, saved: list[_Leaf], wanted: list[_Leaf]) -> None:
-    """Raise UserError naming the first leaf that differs."""
-    for have, want in zip(saved, wanted, strict=False):
-        if not _same(have, want):
-            raise UserError(f"{where}: does not fit: it holds {have} where {want} is needed")
-    if len(saved) != len(wanted):
-        odd = max(saved, wanted, key=len)[min(len(saved), len(wanted))]
-        counts = f"{len(saved)} arrays saved, {len(wanted)} needed"
-        raise UserError(f"{where}: does not fit: {counts}, the first odd one is {odd}")
-
-
-def _same(saved: _Leaf, wanted: _Leaf) -> bool:
-    """Equal path, shape and dtype; a Python number also fits the abstract scalar that `jax.eval_shape` makes of it."""
-    if saved.kind in _PYTHON and wanted.kind not in _PYTHON:
-        return saved.path == wanted.path and wanted.shape == () and wanted.dtype.startswith(saved.kind)
-    return (saved.path, saved.shape, saved.dtype) == (wanted.path, wanted.shape, wanted.dtype)

@@ -1,26 +1,131 @@
-"""Impure: several priors that are used together."""
+"""Impure: priors on disk, what pretraining hands to fine-tuning: a checkpoint of parameters and a readable card."""
 
-from collections.abc import Sequence
+import hashlib
+import importlib
+import importlib.util
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
+
+from sgft_jax import mesh
 from sgft_jax.io import checkpoint
 from sgft_jax.io.config import differences
-from sgft_jax.types import PyTree, UserError
+from sgft_jax.io.jsonfile import read_json, write_json
+from sgft_jax.types import Normalizer, Prior, PyTree, UserError
+
+CARD = "prior.json"
 
 
-def load_priors(folders: Sequence[Path], env: Any) -> tuple[list[PyTree], dict[str, Any]]:
-    """The priors in these folders and the card of the first; raises UserError where they do not fit together.
+def save_prior(folder: Path, prior: Prior) -> Path:
+    """Write a prior to `folder`, replacing the one that may be there, and return the folder.
+
+    The card must have `task`, `obs_dim` and `act_dim`, which are checked on loading, and `algorithm` unless that is
+    SAC. Parameters must be NamedTuples and dicts of arrays: such a prior can be read without the code that describes
+    its networks. Raises ValueError or TypeError otherwise.
+    """
+    if missing := {"task", "obs_dim", "act_dim"} - set(prior.card):
+        raise ValueError(f"the prior's card lacks {sorted(missing)}")
+    tree = _plain(prior.params)
+    with checkpoint.replaced(Path(folder)) as temporary:
+        if checkpoint.first_host():
+            write_json(temporary / CARD, prior.card)
+        checkpoint.write_tree(temporary, tree, {})
+    mesh.meet()
+    return Path(folder)
+
+
+def load_prior(
+    folder: Path, *, task: str | None = None, obs_dim: int | None = None, act_dim: int | None = None
+) -> Prior:
+    """Read a prior from its folder, or from the run folder that holds one as `prior/`.
+
+    Its parameters are the `<ALGORITHM>Params` of `sgft_jax.learners.<algorithm>`. Raises UserError if the prior is
+    missing, torn, or of another task, other observation or action sizes than asked for, or another version.
+    """
+    folder = Path(folder)
+    if not (folder / CARD).exists() and (folder / "prior" / CARD).exists():
+        folder = folder / "prior"
+    manifest, card = checkpoint.read_manifest(folder), read_json(folder / CARD)
+    asked = {"task": task, "obs_dim": obs_dim, "act_dim": act_dim}
+    checkpoint.check_facts(folder, card, {name: value for name, value in asked.items() if value is not None})
+    container = _container(folder, algorithm_of(card))
+    paths = [leaf.path for leaf in checkpoint.leaves_of(manifest)]
+    tree = _nest(paths, checkpoint.read_leaves(folder, manifest))
+    if odd := sorted(set(tree) - set(container._fields)):
+        raise UserError(f"{folder}: holds {', '.join(odd)}, which this version does not know; pretrain again")
+    if set(tree.get("normalizer", {})) != set(Normalizer._fields):
+        raise UserError(f"{folder}: not a prior: it has no observation statistics")
+    tree["normalizer"] = statistics = Normalizer(**tree["normalizer"])
+    if statistics.mean.shape != (card["obs_dim"],):
+        raise UserError(f"{folder}: {CARD} says obs_dim={card['obs_dim']}, the statistics have {len(statistics.mean)}")
+    return Prior(container(**{name: tree.get(name, {}) for name in container._fields}), card)
+
+
+def load_priors(folders: Sequence[Path], env: Any) -> list[Prior]:
+    """Priors that are used together; raises UserError where they differ in more than their numbers.
 
     env: what has the `name`, `obs_dim` and `act_dim` that they must have.
     """
-    sizes = {"task": env.name, "obs_dim": env.obs_dim, "act_dim": env.act_dim}
-    priors, cards = zip(*(checkpoint.load_prior(folder, **sizes) for folder in folders), strict=True)
-    for folder, card in zip(folders, cards, strict=True):
-        odd = [key for key in ("network", "gamma", "ensemble_size") if differences(cards[0][key], card[key])]
-        odd += ["plan"] if card.get("plan") != cards[0].get("plan") else []
-        if checkpoint.algorithm_of(card) != checkpoint.algorithm_of(cards[0]):
-            odd.append("algorithm")
-        if odd:
-            raise UserError(f"{folder}: differs from {folders[0]} in {', '.join(odd)}; choose one with --prior")
-    return list(priors), cards[0]
+    priors = [load_prior(folder, task=env.name, obs_dim=env.obs_dim, act_dim=env.act_dim) for folder in folders]
+    first = _structure(priors[0].card)
+    for folder, prior in zip(folders, priors, strict=True):
+        if odd := differences(first, _structure(prior.card)):
+            names = sorted({name.partition(".")[0] for name, *_ in odd})
+            raise UserError(f"{folder}: differs from {folders[0]} in {', '.join(names)}; choose one with --prior")
+    return priors
+
+
+def digest(prior: Prior) -> str:
+    """Twelve hex digits that tell whether two priors hold the same numbers under the same names."""
+    found = hashlib.sha256()
+    for path, leaf in jax.tree_util.tree_leaves_with_path(_plain(prior.params)):
+        found.update(str(checkpoint.describe(path, leaf)).encode())
+        found.update(np.ascontiguousarray(leaf).tobytes())
+    return found.hexdigest()[:12]
+
+
+def algorithm_of(card: Mapping[str, Any]) -> str:
+    """Which algorithm a prior is from; the first priors did not say, they were all SAC's."""
+    return card.get("algorithm", "sac")
+
+
+def _structure(card: Mapping[str, Any]) -> dict[str, Any]:
+    """What must be equal for policies that run in one program."""
+    own = {name: card.get(name) for name in ("network", "gamma", "ensemble_size", "plan")}
+    return own | {"algorithm": algorithm_of(card)}
+
+
+def _container(folder: Path, algorithm: str) -> Any:
+    """The NamedTuple that holds the parameters of an algorithm."""
+    home = f"sgft_jax.learners.{algorithm}"
+    if not algorithm.isidentifier() or importlib.util.find_spec(home) is None:
+        raise UserError(f"{folder}: {CARD} says algorithm={algorithm!r}, which this version does not know")
+    return getattr(importlib.import_module(home), f"{algorithm.upper()}Params")
+
+
+def _plain(tree: PyTree) -> PyTree:
+    """The same parameters as nested dicts, empty where there are none; raises TypeError for anything else."""
+    if hasattr(tree, "_asdict"):
+        tree = tree._asdict()
+    if isinstance(tree, dict) and all(isinstance(name, str) and "/" not in name for name in tree):
+        return {name: _plain(each) for name, each in tree.items()}
+    if tree is None:
+        return {}
+    if not isinstance(tree, (jax.Array, np.ndarray)):
+        raise TypeError("prior parameters must be NamedTuples and dicts of arrays")
+    return tree
+
+
+def _nest(paths: Sequence[str], leaves: Sequence[Any]) -> dict[str, Any]:
+    """Nested dicts from paths such as `actor/Dense_0/kernel`."""
+    tree: dict[str, Any] = {}
+    for path, leaf in zip(paths, leaves, strict=True):
+        *parents, name = path.split("/")
+        node = tree
+        for parent in parents:
+            node = node.setdefault(parent, {})
+        node[name] = leaf
+    return tree

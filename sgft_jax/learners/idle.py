@@ -1,9 +1,11 @@
 """A learner that learns nothing: for methods whose models alone adapt."""
 
-from sgft_jax.types import Batch, Key, Learner, Metrics, PyTree, UserError
+from typing import Any
+
+from sgft_jax.types import Array, Batch, Key, Learner, Metrics, PyTree, UserError
 
 
-def _act(state: PyTree, carry: PyTree, obs: object, key: Key, **options: object) -> tuple[object, PyTree]:
+def _act(state: PyTree, carry: PyTree, obs: Array, key: Key, **options: Any) -> tuple[Array, PyTree]:
     raise UserError("this learner has no policy: the method that uses it brings its own")
 
 

@@ -108,12 +108,13 @@ def _update(
 ) -> tuple[TDMPC2State, Metrics]:
     """World model with critic, then the policy on the latents rolled out, then the target critic."""
     key_model, key_policy = jax.random.split(key)
+    valid = jnp.ones(batch.reward.shape, bool) if batch.valid is None else batch.valid
     normal = jax.vmap(jax.vmap(normalizer.normalize, (None, 0)), (None, 0))
     obs, next_obs = (normal(state.normalizer, x) for x in (batch.obs, batch.next_obs))
     batch = batch._replace(obs=obs, next_obs=next_obs)
 
-    state, zs, metrics = _update_model(config, parts, state, batch, key_model)
-    state, more = _update_policy(config, parts, state, zs, batch.valid, key_policy)
+    state, zs, metrics = _update_model(config, parts, state, batch, valid, key_model)
+    state, more = _update_policy(config, parts, state, zs, valid, key_policy)
     if not config.sgft:
         average = optax.incremental_update(state.critic.params, state.target_critic, state.hyper.tau)
         state = state.replace(target_critic=average)
@@ -126,7 +127,7 @@ def _rate(state: TDMPC2State) -> Array:
 
 
 def _update_model(
-    config: TDMPC2Config, parts: Parts, state: TDMPC2State, batch: Batch, key: Key
+    config: TDMPC2Config, parts: Parts, state: TDMPC2State, batch: Batch, valid: Array, key: Key
 ) -> tuple[TDMPC2State, Array, Metrics]:
     """Also returns the latents [B, H + 1, latent] rolled out by the model as it was."""
     key_heads, key_action, key_dropout = jax.random.split(key, 3)
@@ -138,15 +139,15 @@ def _update_model(
         action = tanh_gaussian_action(parts.policy.apply(state.policy.params, ahead), key, explore=True)
         return ahead, row.reward + row.discount * jnp.min(q_values(config, parts, judges, ahead, action))
 
-    keys = jax.random.split(key_action, batch.valid.shape)
+    keys = jax.random.split(key_action, valid.shape)
     ahead, q_target = jax.vmap(jax.vmap(target))(batch, keys)
-    dropout = jax.random.split(key_dropout, batch.valid.shape)
+    dropout = jax.random.split(key_dropout, valid.shape)
     frozen = {name: getattr(state, name).params for name in NETWORKS}
 
     def loss(learned: dict[str, PyTree]) -> tuple[Array, tuple[dict[str, Array], Array]]:
         one = lambda *window: _window_losses(config, parts, frozen | learned, *window)  # noqa: E731
         each, zs = jax.vmap(one)(batch, ahead, q_target, dropout)
-        mean = {name: discounted_mean(x, batch.valid, hyper.rho) for name, x in each.items()}
+        mean = {name: discounted_mean(x, valid, hyper.rho) for name, x in each.items()}
         return sum((getattr(hyper, name) * x for name, x in mean.items()), jnp.float32(0)), (mean, zs)
 
     fits = {name: getattr(state, name) for name in config.learned}
@@ -156,7 +157,7 @@ def _update_model(
     fits = {name: optim.step(parts.adam, fit, grads[name], rates[name]) for name, fit in fits.items()}
     metrics = {f"model/{name}_loss": x for name, x in mean.items()} | {"model/grad_norm": norm}
     if not config.sgft:
-        metrics["critic/target_mean"] = jnp.mean(q_target, where=batch.valid)
+        metrics["critic/target_mean"] = jnp.mean(q_target, where=valid)
     return state.replace(**fits), zs, metrics
 
 
@@ -295,8 +296,6 @@ def make_tdmpc2(config: TDMPC2Config, hyper: TDMPC2Hyper | None = None) -> Learn
             raise UserError(
                 f"TD-MPC2 windows have {batch.reward.shape[1]} steps: must be {config.horizon}, the horizon"
             )
-        if batch.valid is None:
-            batch = batch._replace(valid=jnp.ones(batch.reward.shape, bool))
         return _update(config, parts, state, batch, key)
 
     return Learner(init, lambda: jnp.zeros((config.horizon, config.act_dim)), act, update)

@@ -10,8 +10,8 @@ from sgft_jax import checks
 from sgft_jax.types import Prior, Task
 
 _WARMUP_TRANSITIONS = 1000  # real transitions over which learning rates of kept networks rise: 20 to 25 rollouts here
-_WITHOUT_PRIOR = {"network": {"hidden": [256, 256], "layer_norm": True, "actor_layer_norm": False, "activation": "relu"},
-                  "gamma": 0.99, "algorithm": "sac"}  # fmt: skip
+_BODY = {"hidden": [256, 256], "layer_norm": True, "actor_layer_norm": False, "activation": "relu"}
+_WITHOUT_PRIOR = {"algorithm": "sac", "network": _BODY, "gamma": 0.99}
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """RLPD: SAC from nothing with ten normalised critics; half of each batch is simulated."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from sgft_jax import checks
 from sgft_jax.methods.options import SACOptions
@@ -29,7 +29,7 @@ class Config(SACOptions):
     """Members of the critic ensemble."""
     target_critics: int = 2
     """Random members whose minimum is a target."""
-    critic_network: NetworkConfig = NetworkConfig(hidden=(256, 256), layer_norm=True)
+    critic_network: NetworkConfig = field(default_factory=lambda: NetworkConfig(hidden=(256, 256), layer_norm=True))
     """Body of the critic. LayerNorm tames extrapolation on little data."""
     simulated_share: float = 0.5
     """Share of each batch that is simulated."""

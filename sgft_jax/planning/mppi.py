@@ -64,7 +64,8 @@ def plan(
 ) -> tuple[Array, Array]:
     """One action [act_dim] in [-1, 1], and the mean [H, act_dim] of the plan, which is the next call's `previous`.
 
-    score(sequence [H, act_dim]) -> []: higher is better; a score that is not finite ranks last. Asked once for each of the `proposals`.
+    score(sequence [H, act_dim]) -> []: higher is better; a score that is not finite ranks last. Each of the
+        `proposals` is scored once.
     proposals: [n, H, act_dim] sequences in [-1, 1] that compete with the samples, n < samples (n = 0: none).
     previous: [H, act_dim] the last plan; its first step lies in the past by now. Zeros at the start of an episode.
     explore: [] bool, may be traced. Both modes draw one elite by its weight; exploring adds noise of the search's final

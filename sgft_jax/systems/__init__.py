@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any, Protocol
 
-from sgft_jax.types import Array, Key, PyTree
+from sgft_jax.types import Key, PyTree
 
 if TYPE_CHECKING:
     from envs.rollout import Episode
@@ -21,15 +21,3 @@ class System(Protocol):
         states: [M, ...] what `act` takes first. keys: [M, n], each decides one episode. explore: as in `act`.
         """
         ...
-
-    def close(self) -> None:
-        """Brings the system to rest; called once, also after an error."""
-        ...
-
-
-def members(tree: PyTree) -> int:
-    """The number of members of stacked states."""
-    import jax
-
-    leaves: list[Array] = jax.tree.leaves(tree)
-    return leaves[0].shape[0]

@@ -34,9 +34,6 @@ class Simulated:
         other._programs = self._programs
         return other
 
-    def close(self) -> None:
-        """Nothing to bring to rest."""
-
     def _player(self, policy: Any) -> Callable[..., Episode]:
         def play(state: PyTree, pools: World, which: Array, keys: Key, explore: Array) -> Episode:
             act = lambda carry, obs, key: policy.act(state, carry, obs, key, explore=explore)  # noqa: E731

@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -16,7 +15,7 @@ import pytest
 from flax import struct
 
 from sgft_jax.io import checkpoint
-from sgft_jax.types import Normalizer, Prior, UserError
+from sgft_jax.types import UserError
 
 META = {"kind": "pretrain", "task": "hammer", "position": {"metrics.jsonl": 12}}
 
@@ -33,9 +32,6 @@ class State(NamedTuple):
     keys: jax.Array
     count: jax.Array
     nothing: jax.Array
-    step: int
-    rate: float
-    done: bool
     on_host: np.ndarray
     absent: None = None
 
@@ -45,17 +41,14 @@ def make_learner(key):
     return Learner(params, optax.adam(1e-3).init(params), jax.random.fold_in(key, 1))
 
 
-def make_state(seed=0, *, step=7, width=2):
+def make_state(seed=0):
     key = jax.random.key(seed)
     return State(
         learner=make_learner(key),
         keys=jax.random.split(jax.random.key(seed, impl="rbg"), 3),
         count=jnp.int32(5),
         nothing=jnp.zeros((0, 4)),
-        step=step,
-        rate=0.1,
-        done=True,
-        on_host=np.arange(width, dtype=np.float64) / 3,
+        on_host=np.arange(2, dtype=np.float32) / 3,
     )
 
 
@@ -65,7 +58,7 @@ def bits(tree):
     def one(x):
         if hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
             return "key", str(jax.random.key_impl(x)), np.asarray(jax.random.key_data(x)).tobytes()
-        return type(x).__name__, str(getattr(x, "dtype", "")), np.asarray(x).tobytes()
+        return str(x.dtype), np.asarray(x).tobytes()
 
     return jax.tree.map(one, tree), jax.tree.structure(tree)
 
@@ -101,12 +94,6 @@ def test_restore_into_an_abstract_state(tmp_path, key):
     assert bits(state) == bits(learner)
 
 
-def test_python_numbers_fit_the_scalars_that_eval_shape_makes_of_them(tmp_path):
-    checkpoint.save(tmp_path, 1, {"n": 3, "x": 0.5}, meta={})
-    like = jax.eval_shape(lambda: {"n": 3, "x": 0.5})
-    assert checkpoint.restore(tmp_path, like)[0] == {"n": 3, "x": 0.5}
-
-
 def test_a_state_without_any_elements(tmp_path):
     checkpoint.save(tmp_path, 1, {"a": jnp.zeros((0, 2), jnp.int8)}, meta={})
     state, _ = checkpoint.restore(tmp_path, {"a": jnp.zeros((0, 2), jnp.int8)})
@@ -118,9 +105,14 @@ def test_named_step_and_newest(saved):
     assert bits(checkpoint.restore(saved, make_state(), step=10)[0]) == bits(make_state(0))
 
 
-def test_nothing_is_pickled(tmp_path):
-    with pytest.raises(TypeError, match="name: a str is not an array"):
-        checkpoint.save(tmp_path, 1, {"name": "hammer"}, meta={})
+@pytest.mark.parametrize(
+    ("leaf", "words"),
+    [("hammer", "a str is not an array"), (3, "a int is not"), (np.zeros(2), "does not keep float64")],
+)
+def test_what_would_not_come_back_as_it_was_is_not_saved(tmp_path, leaf, words):
+    with pytest.raises(TypeError, match=f"name: .*{words}"):
+        checkpoint.save(tmp_path, 1, {"name": leaf}, meta={})
+    assert checkpoint.latest(tmp_path) is None
 
 
 def test_saving_is_quiet(tmp_path, capfd):
@@ -222,7 +214,7 @@ import itertools, sys
 import numpy as np
 from sgft_jax.io import checkpoint
 for step in itertools.count(1):
-    checkpoint.save(sys.argv[1], step, {"x": np.full(50_000, step, np.float64)}, meta={"step": step})
+    checkpoint.save(sys.argv[1], step, {"x": np.full(50_000, step, np.float32)}, meta={"step": step})
 """
 
 
@@ -239,7 +231,7 @@ def test_kill_at_any_moment_leaves_a_complete_checkpoint(tmp_path):
             process.send_signal(signal.SIGKILL)
             process.wait()
         heard = []
-        state, meta = checkpoint.restore(tmp_path, {"x": np.zeros(50_000)}, say=heard.append)
+        state, meta = checkpoint.restore(tmp_path, {"x": np.zeros(50_000, np.float32)}, say=heard.append)
         assert (state["x"] == meta["step"]).all()
         assert heard == []
         shutil.rmtree(tmp_path / "checkpoints")
@@ -281,80 +273,3 @@ def test_another_format_is_refused(saved):
     path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 99}))
     with pytest.raises(UserError, match="written in format 99, this version reads format 1"):
         checkpoint.restore(saved, make_state(), step=20)
-
-
-# ---------------------------------------------------------------- priors
-
-CARD = {"task": "hammer", "obs_dim": 4, "act_dim": 2, "gamma": 0.99, "metrics": {"success": float("nan")}}
-
-
-def make_prior(scale=1.0):
-    dense = {"Dense_0": {"kernel": scale * jnp.arange(12.0).reshape(4, 3), "bias": jnp.zeros(3)}}
-    return Prior(
-        actor=dense,
-        critic=jax.tree.map(lambda x: jnp.stack([x, x]), dense),
-        value=dense,
-        dynamics={},
-        normalizer=Normalizer(jnp.zeros(4), jnp.ones(4)),
-    )
-
-
-def test_prior_round_trip(tmp_path):
-    folder = checkpoint.save_prior(tmp_path / "run" / "prior", make_prior(2.0), CARD)
-    prior, card = checkpoint.load_prior(folder, task="hammer", obs_dim=4, act_dim=2)
-    assert bits(prior) == bits(make_prior(2.0))
-    assert card == {**CARD, "metrics": {"success": "nan"}}
-    assert json.loads((folder / "prior.json").read_text())["task"] == "hammer"
-    assert bits(checkpoint.load_prior(tmp_path / "run")[0]) == bits(prior)
-
-
-def test_saving_a_prior_again_replaces_it(tmp_path):
-    checkpoint.save_prior(tmp_path / "prior", make_prior(1.0), CARD)
-    checkpoint.save_prior(tmp_path / "prior", make_prior(3.0), CARD)
-    assert bits(checkpoint.load_prior(tmp_path / "prior")[0]) == bits(make_prior(3.0))
-    assert os.listdir(tmp_path) == ["prior"]
-
-
-def test_a_digest_tells_priors_apart(tmp_path):
-    prior = make_prior()
-    loaded, _ = checkpoint.load_prior(checkpoint.save_prior(tmp_path / "prior", prior, CARD))
-    assert checkpoint.digest(loaded) == checkpoint.digest(prior) and len(checkpoint.digest(prior)) == 12
-    nudged = prior.normalizer._replace(mean=prior.normalizer.mean.at[0].add(1e-6))
-    others = [prior.replace(normalizer=nudged), prior.replace(value={"renamed": prior.value}), make_prior(3.0)]
-    assert len({checkpoint.digest(each) for each in [prior, *others]}) == 4
-
-
-def test_a_foreign_prior_is_refused(tmp_path):
-    folder = checkpoint.save_prior(tmp_path / "prior", make_prior(), CARD)
-    with pytest.raises(UserError, match=r"prior: does not fit: .*task='hammer' where task='push' is needed"):
-        checkpoint.load_prior(folder, task="push")
-    with pytest.raises(UserError, match="obs_dim=4 where obs_dim=5 is needed"):
-        checkpoint.load_prior(folder, obs_dim=5)
-
-
-def test_a_prior_whose_card_lies_is_refused(tmp_path):
-    folder = checkpoint.save_prior(tmp_path / "prior", make_prior(), CARD | {"obs_dim": 3})
-    with pytest.raises(UserError, match="says obs_dim=3, the statistics have 4"):
-        checkpoint.load_prior(folder)
-
-
-def test_a_torn_prior_is_refused(tmp_path):
-    folder = checkpoint.save_prior(tmp_path / "prior", make_prior(), CARD)
-    damage_truncate(folder)
-    with pytest.raises(UserError, match="torn"):
-        checkpoint.load_prior(folder)
-    with pytest.raises(UserError, match="no such folder"):
-        checkpoint.load_prior(tmp_path / "elsewhere")
-
-
-def test_a_checkpoint_is_not_a_prior(saved):
-    with pytest.raises(UserError, match=r"prior.json: no such file"):
-        checkpoint.load_prior(saved / "checkpoints" / "20")
-
-
-def test_a_prior_needs_its_card_and_plain_dicts(tmp_path):
-    with pytest.raises(ValueError, match="act_dim"):
-        checkpoint.save_prior(tmp_path / "prior", make_prior(), {"task": "hammer", "obs_dim": 4})
-    with pytest.raises(TypeError, match="nested dicts"):
-        checkpoint.save_prior(tmp_path / "prior", make_prior().replace(dynamics=(jnp.ones(2),)), CARD)
-    assert not Path(tmp_path / "prior").exists()

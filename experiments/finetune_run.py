@@ -1,0 +1,206 @@
+"""Impure: a fine-tuning run, `train.finetune` with folders, checkpoints, logs, evaluations and videos around it."""
+
+import functools
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from envs import gaps
+from envs.base import Env
+from envs.rollout import Episode
+from experiments.finetune_args import NO_PRIOR, VOLATILE, FinetuneArgs, run_folder
+from experiments.finetune_record import Record
+from experiments.options import prior_folders
+from experiments.recorded import Recorded
+from experiments.stacking import part
+from sgft_jax import api, mesh, train
+from sgft_jax.api import Setup
+from sgft_jax.io import runs
+from sgft_jax.io.config import config_to_json
+from sgft_jax.io.log import RunProgress
+from sgft_jax.io.priors import digest, load_priors
+from sgft_jax.methods.options import card_of
+from sgft_jax.train import FinetuneProgress
+from sgft_jax.types import Method, Metrics, Prior, PyTree, UserError
+
+
+def run(args: FinetuneArgs, method: Method, seeds: list[int]) -> list[dict[str, Any]]:
+    """The runs on the real systems of `args`; returns their summaries."""
+    sizes = {"--seeds" if len(args.real) == 1 else "the number of --real times --seeds": len(args.real) * args.seeds}
+    devices = mesh.devices(args.devices, sizes)
+    env = envs.make(args.task, args.impl)
+    found = [gaps.load(env, real, args.set) for real in args.real]
+    priors = _priors(args, env)
+    for prior in priors:
+        api.check_prior(prior, method.prior, env)
+    # Every folder is that of a run on its real system alone: either kind of run continues the other.
+    folders = {run_folder(args, name): config_to_json(args) | {"real": name} for name in args.real}
+    opened = runs.open_runs(
+        folders, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
+        inputs={"priors": [digest(prior) for prior in priors]},
+    )  # fmt: skip
+    try:
+        with mesh.use(devices):
+            setup = api.setup(env, found, priors, method=args.method, seeds=seeds, config=args.options)
+            real = setup.system.env
+            records = [Record(o.folder, real, gap, method.name, seeds) for o, gap in zip(opened, found, strict=True)]
+            return _Run(args, setup, card_of(priors[0] if priors else None), records).work()
+    finally:
+        for own in opened:
+            own.close()
+
+
+def _priors(args: FinetuneArgs, env: Env) -> list[Prior]:
+    """The priors to start from; none where the user says so."""
+    if args.prior == NO_PRIOR:
+        return []
+    return load_priors(prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset), env)
+
+
+class _Run:
+    """What happens between compiled calls, on disk before in memory.
+
+    The real systems are played together, because physics takes as long as its longest chain of steps and hardly longer
+    for more worlds. Members [M = G * S] are the seeds of the first real system, then those of the next.
+    """
+
+    def __init__(self, args: FinetuneArgs, setup: Setup, card: dict[str, Any], records: list[Record]) -> None:
+        self.args, self.setup, self.card, self.records = args, setup, card, records
+        self.finetuner, self.system, self.seeds = setup.finetuner, setup.system, setup.seeds
+        self.count = len(setup.seeds) // len(records)
+        self.begin = functools.partial(train.begin, setup.finetuner, setup.priors, setup.seeds, setup.simulated)
+
+    def work(self) -> list[dict[str, Any]]:
+        """Everything, in order; returns the summaries."""
+        progress = self._restore()
+        done = int(progress.rollouts) if progress else 0
+        recorded = Recorded(self.system, [record.real for record in self.records], done=done)
+        steps = train.finetune(*self.setup._replace(system=recorded), rollouts=self.args.rollouts, progress=progress)
+        return self._finish(self._follow(steps, progress))
+
+    def _restore(self) -> FinetuneProgress | None:
+        """The state after the last checkpoint, None for a fresh start; raises UserError where real systems differ."""
+        steps = [record.latest() for record in self.records]
+        if len(set(steps)) > 1:
+            listed = ", ".join(f"{own.folder} is at step {n or 0}" for own, n in zip(self.records, steps, strict=True))
+            raise UserError(f"{listed}: they cannot go on together, resume them one at a time")
+        if steps[0] is None:
+            for record in self.records:
+                record.log.truncate({})
+            return None
+        like = jax.eval_shape(lambda: _part(self.begin(), 0, self.count))
+        return _join([record.restore(like, step) for record, step in zip(self.records, steps, strict=True) if step])
+
+    def _follow(self, steps: Iterator[tuple[FinetuneProgress, Metrics]], progress: Any) -> FinetuneProgress:
+        """Logs, evaluates and checkpoints what the iterator yields; returns its last state."""
+        done, started = int(progress.rollouts) if progress else 0, time.perf_counter()
+        title = f"{self.args.method} on {self.args.task}/{'+'.join(record.gap.name for record in self.records)}"
+        bar = RunProgress(title, total=self.args.rollouts, unit="rollouts", done=done)
+        with bar:
+            for progress, metrics in steps:
+                before, done = done, int(progress.rollouts)
+                values = {name: np.asarray(x) for name, x in metrics.items()}
+                shown = self._log(done, values, time.perf_counter() - started)
+                if done == before and values:  # a part of the offline phase
+                    self._checkpoint(progress)
+                elif self._due(self.args.eval_every, before, done):
+                    shown["success, evaluation"] = self._evaluate(progress, done)
+                if done and self._due(self.args.checkpoint_every, before, done):
+                    self._checkpoint(progress)
+                bar.advance(done - before, shown)
+                started = time.perf_counter()
+        return progress
+
+    def _due(self, every: int, before: int, done: int) -> bool:
+        """Whether something that happens every so many rollouts happens now: also at the start, the first and last."""
+        return before == 0 or done >= self.args.rollouts or done % every == 0
+
+    def _log(self, done: int, values: Mapping[str, np.ndarray], seconds: float) -> dict[str, float]:
+        """Writes a line of metrics for each real system; returns what the progress bar shows."""
+        if not values:
+            return {}
+        for record, own in self._each(values):
+            record.check_finite(done, own)
+            record.metrics(done, own)
+            record.time(done, seconds)
+        real = values.get("real/score")
+        return {} if real is None else {f"{self.system.env.score}, exploring": float(real.mean())}
+
+    def _evaluate(self, progress: FinetuneProgress, done: int) -> float:
+        scores = _scores(
+            train.evaluate(self.finetuner, self.system, progress.agent, self.seeds, self.args.eval_episodes)
+        )
+        for record, own in self._each(scores):
+            record.evaluation(done, own)
+        return float(scores["score"].mean())
+
+    def _checkpoint(self, progress: FinetuneProgress) -> None:
+        for i, record in enumerate(self.records):
+            record.checkpoint(_part(progress, i, self.count))
+
+    def _each(self, members: PyTree) -> Iterator[tuple[Record, PyTree]]:
+        """Every real system's record and, [S], what belongs to it in a pytree over all members."""
+        return ((record, part(members, i, self.count)) for i, record in enumerate(self.records))
+
+    # ------------------------------------------------------------ what stays
+
+    def _finish(self, progress: FinetuneProgress) -> list[dict[str, Any]]:
+        """Policies, summaries, figures and films."""
+        best, card = progress.best, {**self.card, **self.finetuner.card}
+        last = jax.jit(jax.vmap(self.finetuner.export))(progress.agent)
+        played = train.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, self.args.eval_episodes)
+        facts = {"score": _scores(played)["score"], "evidence": best.score, "rollouts": best.rollouts}
+        films = functools.cache(lambda: self._before_and_after(progress))
+        summaries = []
+        for i, record in enumerate(self.records):
+            own = lambda tree, i=i: part(tree, i, self.count)  # noqa: E731
+            record.save_policies("policy", own(last), card)
+            record.save_policies("best", own(best.params), card)
+            summaries.append(record.summarise({name: np.asarray(own(x)) for name, x in facts.items()}))
+            if self.args.video:
+                pool = jax.tree.map(lambda x, i=i: x[i], self.system.pools)
+                print(record.film(pool, lambda own=own: [own(x) for x in films()], int(progress.rollouts)))
+            print(f"results: {record.folder}  (policy/, best/, real/, summary.json, figures/)")
+        print(f"next: python -m experiments.figures --out {self.args.out}")
+        return summaries
+
+    def _before_and_after(self, progress: FinetuneProgress) -> list[Episode]:
+        """The evaluation episodes [M, n] of the policy before the first real rollout and of the agent as it is now."""
+        evaluate = functools.partial(train.evaluate, system=self.system, seeds=self.seeds)
+        n, initial = self.args.eval_episodes, self.finetuner.initial_policy
+        if initial is None:
+            before = evaluate(self.finetuner, states=jax.jit(self.begin)().agent, episodes=n)
+        else:
+            own = jax.tree.map(lambda x: x[self.seeds % x.shape[0]], self.setup.priors)
+            before = evaluate(initial, states=own, episodes=n)
+        return [before, evaluate(self.finetuner, states=progress.agent, episodes=n)]
+
+
+def _scores(episodes: Episode) -> dict[str, np.ndarray]:
+    """Means over the episodes [M, n] of each member, [M]."""
+    return {
+        "score": np.asarray(episodes.score.mean(1)),
+        "success": np.asarray(episodes.success.mean(1)),
+        "return": np.asarray(episodes.total_reward.mean(1)),
+        "exploded": np.asarray(episodes.exploded.mean(1)),
+    }
+
+
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def _part(progress: FinetuneProgress, i: int, n: int) -> FinetuneProgress:
+    """The members of the i-th real system."""
+    own = functools.partial(part, i=i, n=n)
+    return progress._replace(agent=own(progress.agent), best=own(progress.best))
+
+
+@jax.jit
+def _join(states: list[FinetuneProgress]) -> FinetuneProgress:
+    """The states of all members from those of each real system."""
+    together = lambda *trees: jax.tree.map(lambda *x: jnp.concatenate(x), *trees)  # noqa: E731
+    agent = together(*[state.agent for state in states])
+    return states[0]._replace(agent=agent, best=together(*[state.best for state in states]))

@@ -1,0 +1,62 @@
+"""Impure: a real system whose every rollout is on disk before anything learns from it."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.rollout import Episode
+from experiments.stacking import part
+from sgft_jax.io.log import RealStore
+from sgft_jax.systems import System
+from sgft_jax.types import Key, PyTree, Transition, UserError
+
+_FACTS = tuple(name for name in Episode._fields if name != "transitions")
+
+
+class Recorded:
+    """A `System` that stores exploring rollouts, and replays those stored already instead of playing them again.
+
+    A run that was killed after its last checkpoint learns from what the robot has done since, and repeats nothing.
+
+    inner: what plays. stores: one for each real system, whose members stand one after another. done: rollouts behind
+    the state that the run starts from.
+    """
+
+    def __init__(self, inner: System, stores: Sequence[RealStore], *, done: int) -> None:
+        self.inner, self.stores, self.rollout = inner, stores, done
+        if short := [store for store in stores if len(store) < done]:
+            raise UserError(f"{short[0].folder}: holds {len(short[0])} rollouts, the checkpoint remembers {done}")
+
+    def play(self, policy: Any, states: PyTree, keys: Key, *, explore: bool) -> Episode:
+        """Episodes [M, n]; exploring ones come one at a time, n = 1."""
+        if not explore:
+            return self.inner.play(policy, states, keys, explore=False)
+        number, self.rollout = self.rollout, self.rollout + 1
+        missing = [store for store in self.stores if len(store) <= number]
+        if not missing:
+            return _join([_read(store.load(number)) for store in self.stores])
+        episodes = self.inner.play(policy, states, keys, explore=True)
+        for i, store in enumerate(self.stores):
+            if len(store) <= number:
+                store.append(_arrays(part(episodes, i, keys.shape[0] // len(self.stores))))
+        return episodes
+
+
+def _arrays(episodes: Episode) -> dict[str, np.ndarray]:
+    """Arrays [S, ...] of one rollout of every seed, as they are stored."""
+    arrays = episodes.transitions._asdict() | {name: getattr(episodes, name) for name in _FACTS}
+    return {name: np.asarray(x[:, 0]) for name, x in arrays.items()}
+
+
+def _read(arrays: dict[str, np.ndarray]) -> Episode:
+    """The inverse."""
+    stored = {name: jnp.asarray(x)[:, None] for name, x in arrays.items()}
+    transitions = Transition(*(stored[name] for name in Transition._fields))
+    return Episode(transitions=transitions, **{name: stored[name] for name in _FACTS})
+
+
+def _join(episodes: list[Episode]) -> Episode:
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *episodes)

@@ -1,0 +1,149 @@
+"""The short way in from Python: from a task, a gap and priors to what `finetune` takes, and policies that act.
+
+The only module of this package that builds tasks; the others take an `Env` or less.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from envs.base import Env
+from envs.gaps import Gap
+from envs.rollout import Episode
+from sgft_jax import train
+from sgft_jax.io.priors import load_prior
+from sgft_jax.methods import DEFAULT, get_method
+from sgft_jax.methods.options import card_of
+from sgft_jax.policies import make_policy
+from sgft_jax.systems.simulated import Simulated
+from sgft_jax.train import SimulatedRows
+from sgft_jax.types import Array, Finetuner, Policy, Prior, PyTree, UserError
+
+SIMULATED_WORLDS = 256
+_SIMULATION = 2**31  # seed of what happens in them, the same for every run
+_EVALUATION = 2**31 + 2  # held out from training and from the choice of the prior
+
+
+class Setup(NamedTuple):
+    """What `finetune(*setup, rollouts=...)` takes.
+
+    Members [M = gaps * seeds] are the seeds of the first gap, then those of the next.
+    """
+
+    finetuner: Finetuner
+    system: Simulated
+    priors: PyTree
+    seeds: Array
+    simulated: SimulatedRows | None
+
+
+def setup(
+    env: Env,
+    gaps: Gap | Sequence[Gap],
+    priors: Prior | Sequence[Prior],
+    *,
+    method: str = DEFAULT,
+    seeds: int | Sequence[int] = 1,
+    config: Any = None,
+    **options: Any,
+) -> Setup:
+    """Fine-tuning of seeds on simulated real systems, ready to run.
+
+    gaps: the real systems. priors: [P], none of them to start from nothing; seed s starts from prior s modulo P.
+    method: by name or file. seeds: their number, or themselves. options: of the method, by name (`config` instead: all
+    of them). Raises UserError for a prior of another algorithm or task, and for options that do not fit.
+    """
+    found = [gaps] if isinstance(gaps, Gap) else list(gaps)
+    known = [priors] if isinstance(priors, Prior) else list(priors)
+    chosen = get_method(method)
+    for prior in known:
+        check_prior(prior, chosen.prior, env)
+    if not known and chosen.needs_prior:
+        raise UserError(f"method {chosen.name} needs a prior of {chosen.prior}")
+    finetuner = chosen.build(chosen.config(**options) if config is None else config, known[0] if known else None, env)
+    numbers = range(seeds) if isinstance(seeds, int) else seeds
+    real = envs.gaps.real_env(env, found)
+    system = Simulated(
+        real,
+        envs.gaps.pools(real, found, jax.random.key(0)),
+        jnp.repeat(jnp.arange(len(found)), len(numbers)),
+        gamma=card_of(known[0] if known else None)["gamma"],
+    )
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *[prior.params for prior in known]) if known else None
+    members = jnp.tile(jnp.array(list(numbers), jnp.uint32), len(found))
+    return Setup(finetuner, system, stacked, members, _simulated(env, finetuner, known, stacked))
+
+
+def _simulated(env: Env, finetuner: Finetuner, priors: list[Prior], stacked: PyTree) -> SimulatedRows | None:
+    """What every prior's policy does in its training domain, where the method asks for it; always the same."""
+    if finetuner.simulation is None:
+        return None
+    key, card = jax.random.key(_SIMULATION), priors[0].card
+    worlds = envs.sample_worlds(env, key, SIMULATED_WORLDS)
+    return train.simulate(env, make_policy(card, env), worlds, stacked, key, finetuner.simulation, gamma=card["gamma"])
+
+
+def check_prior(prior: Prior, algorithm: str, env: Env) -> None:
+    """Raises UserError for a prior of another algorithm or task."""
+    if (found := prior.card.get("algorithm", "sac")) != algorithm:
+        preset = "tdmpc2" if algorithm == "tdmpc2" else "fast"
+        command = f"python -m experiments.pretrain --task {env.name} --preset {preset}"
+        raise UserError(f"the method needs a prior of {algorithm}, not of {found}; make one with: {command}")
+    if prior.card["task"] != env.name:
+        raise UserError(f"the prior is of the task {prior.card['task']!r}, not of {env.name!r}")
+
+
+def evaluate_prior(prior: Prior, env: Env, gap: Gap | None = None, *, episodes: int = 200, seed: int = 0) -> Episode:
+    """Episodes [episodes] of a prior's policy without exploration.
+
+    gap: the real system; None = the training domain without sensor noise. Another seed draws other worlds and starts.
+    """
+    key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_EVALUATION), seed))
+    real = env if gap is None else envs.gaps.real_env(env, [gap])
+    pool = envs.gaps.heldout_worlds(real, gap, key_worlds, episodes)
+    system = Simulated(real, jax.tree.map(lambda x: x[None], pool), jnp.zeros(1, int), gamma=prior.card["gamma"])
+    one = jax.tree.map(lambda x: x[None], prior.params)
+    keys = jax.random.split(key_episodes, (1, episodes))
+    played = system.play(make_policy(prior.card, env), one, keys, explore=False)
+    return jax.tree.map(lambda x: x[0], played)
+
+
+class ActingPolicy:
+    """A policy that remembers what it must between the steps of an episode.
+
+    prior: its parameters and card. env: its task, for policies that plan and for the names of its numbers.
+    """
+
+    def __init__(self, prior: Prior, env: Env, *, seed: int = 0) -> None:
+        self.prior, self.env = prior, env
+        self._policy: Policy = make_policy(prior.card, env)
+        self._act = jax.jit(self._policy.act)
+        self._key = jax.random.key(seed)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the episode; call it at the start of the next one."""
+        self._carry = self._policy.init_carry()
+
+    def act(self, obs: np.ndarray, *, explore: bool = False) -> np.ndarray:
+        """The action [act_dim] in [-1, 1] for an observation [obs_dim] in raw units."""
+        if np.shape(obs) != (self.env.obs_dim,):
+            raise UserError(f"the policy reads observations of {self.env.obs_dim} numbers, got shape {np.shape(obs)}")
+        self._key, key = jax.random.split(self._key)
+        action, self._carry = self._act(self.prior.params, self._carry, jnp.asarray(obs), key, explore=explore)
+        return np.asarray(action)
+
+
+def load_policy(folder: str | Path, *, task: str | None = None, seed: int = 0) -> ActingPolicy:
+    """The policy of a prior's folder, or of what fine-tuning left in `policy/` or `best/`.
+
+    task: where the file of a task of your own is; otherwise the prior's card names its task. seed: of exploration and
+    of plans. Raises UserError if there is no prior.
+    """
+    prior = load_prior(Path(folder))
+    return ActingPolicy(prior, envs.make(task or prior.card["task"]), seed=seed)
