@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 
 import envs
+from envs.gaps import SIM
 from envs.mujoco.worlds import Impl
+from envs.pools import heldout_worlds, load_gap, real_env
 from experiments import cli, stacking
 from experiments.evaluation import describe, play
-from experiments.options import SIM, prior_folders
-from experiments.worlds import heldout_worlds, load_gap, real_env
+from experiments.options import prior_folders
 from sgft_jax.io.jsonfile import read_json
 from sgft_jax.io.priors import load_priors
 from sgft_jax.policies import make_policy

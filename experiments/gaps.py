@@ -11,8 +11,8 @@ from typing import Any
 
 from experiments import cli
 from experiments.options import Impl, prior_folders, seed_list, without_repeats
-from sgft_jax.presets import PRESETS, PretrainConfig
 from experiments.pretrain import DEFAULT_PRESET
+from sgft_jax.presets import PRESETS, PretrainConfig
 from sgft_jax.types import UserError
 
 

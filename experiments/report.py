@@ -42,9 +42,7 @@ def make_report(
     """
     length = env.episode_length + math.ceil(3 / (1 - gamma))
     act = functools.partial(policy.act, prior, explore=True)
-    play = functools.partial(
-        play_episode, env, pool, act, policy.init_carry(), gamma=gamma, length=length
-    )
+    play = functools.partial(play_episode, env, pool, act, policy.init_carry(), gamma=gamma, length=length)
     played = split_vmap(play)(jax.random.split(key, trajectories))
     values, returns = jax.vmap(lambda e: _values(env, policy, prior, e))(played)
     errors, windows = jax.vmap(lambda e: _model_errors(env, policy, prior, e))(played)
@@ -79,9 +77,7 @@ def _values(env: Env, policy: Policy, prior: PyTree, episode: Episode) -> tuple[
     return jax.vmap(predict)(rows.obs[: env.episode_length]), returns[: env.episode_length]
 
 
-def _model_errors(
-    env: Env, policy: Policy, prior: Any, episode: Episode
-) -> tuple[tuple[Array, Array], Array]:
+def _model_errors(env: Env, policy: Policy, prior: Any, episode: Episode) -> tuple[tuple[Array, Array], Array]:
     """Errors [windows, horizon] of the model and of standing still in one episode, and which windows [windows] count:
     those that end before the episode does.
 
