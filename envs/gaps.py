@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 from envs.base import Effects, Env, Value, World
 from sgft_jax.types import Key, UserError, unknown
 
+SIM = "sim"  # names the training domain itself where a gap could stand
+
 
 class Gap(NamedTuple):
     """A named difference between simulator and reality: parameter or effect name -> value or range.

@@ -22,11 +22,11 @@ import envs
 from envs.mujoco.worlds import Impl, choose_impl
 from experiments import cli
 from experiments.bench import physics, training, updates, values
-from sgft_jax.presets import PRESETS
 from sgft_jax.analysis import plot
 from sgft_jax.io import runs
 from sgft_jax.io.log import write_summary
 from sgft_jax.models.networks import Precision
+from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError
 
 type Part = Literal["physics", "updates", "plain", "values", "pretrain", "finetune", "devices"]

@@ -16,9 +16,9 @@ from experiments.comparison import Comparison, read_comparison
 from experiments.figures import FiguresArgs, figures
 from experiments.finetune import finetune
 from experiments.finetune_args import FinetuneArgs, run_folder
-from sgft_jax.presets import PRESETS
 from experiments.pretrain import PretrainArgs, pretrain
 from sgft_jax.methods import finetune_config, get_method
+from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError
 
 METHODS = ("sgft-mpc", "sgft-sac", "sac")  # the first is filmed

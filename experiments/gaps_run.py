@@ -12,12 +12,12 @@ import envs
 from envs import gaps
 from envs.base import Env, World
 from envs.gaps import Gap
+from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
 from experiments import stacking
 from experiments.evaluation import best_of, describe, play, scores
 from experiments.gaps import GapsArgs
 from experiments.memory import reserve
-from experiments.worlds import real_env, real_worlds
 from sgft_jax.analysis.stats import iqm_interval
 from sgft_jax.io.log import MetricsLog, RunProgress, write_summary
 from sgft_jax.io.priors import load_priors

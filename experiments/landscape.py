@@ -18,12 +18,12 @@ import envs
 from envs.base import Entry, Env
 from envs.gaps import Gap
 from envs.mujoco.worlds import Impl
+from envs.pools import heldout_worlds, load_gap, real_env
 from envs.rollout import play_episode
 from experiments import cli
 from experiments.algorithms import make_player
 from experiments.evaluation import prior_policy
 from experiments.options import prior_folders
-from experiments.worlds import heldout_worlds, load_gap, real_env
 from sgft_jax.analysis import plot
 from sgft_jax.io.priors import load_priors
 from sgft_jax.transforms import branch

@@ -9,7 +9,6 @@ from tyro.conf import arg
 from sgft_jax import extend
 from sgft_jax.types import UserError
 
-SIM = "sim"
 LAST_SEED = 2**31 - 1  # larger ones stand for held-out worlds and episodes
 
 Impl = Annotated[

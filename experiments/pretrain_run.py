@@ -15,6 +15,7 @@ import numpy as np
 import envs
 from envs.base import Env, World
 from envs.gaps import Gap
+from envs.pools import heldout_worlds, load_gap, real_env, training_worlds
 from envs.rollout import Episode
 from experiments import hosts, stacking
 from experiments.evaluation import best_of, describe, play, scores
@@ -23,7 +24,6 @@ from experiments.options import seed_list, seeds_name
 from experiments.pretrain import PretrainArgs
 from experiments.report import Report, make_report, numbers
 from experiments.video import film
-from experiments.worlds import heldout_worlds, load_gap, real_env, training_worlds
 from sgft_jax import mesh
 from sgft_jax.analysis import plot
 from sgft_jax.io import checkpoint, runs

@@ -14,6 +14,7 @@ import numpy as np
 import envs
 from envs.base import Env
 from envs.gaps import Gap
+from envs.pools import heldout_worlds, real_env, real_worlds
 from envs.rollout import Episode
 from sgft_jax import train
 from sgft_jax.io.priors import load_prior
@@ -67,10 +68,10 @@ def setup(
         raise UserError(f"method {chosen.name} needs a prior of {chosen.prior}")
     finetuner = chosen.build(chosen.config(**options) if config is None else config, known[0] if known else None, env)
     numbers = range(seeds) if isinstance(seeds, int) else seeds
-    real = envs.gaps.real_env(env, found)
+    real = real_env(env, found)
     system = Simulated(
         real,
-        envs.gaps.pools(real, found, jax.random.key(0)),
+        real_worlds(real, found, jax.random.key(0)),
         jnp.repeat(jnp.arange(len(found)), len(numbers)),
         gamma=card_of(known[0] if known else None)["gamma"],
     )
@@ -104,8 +105,8 @@ def evaluate_prior(prior: Prior, env: Env, gap: Gap | None = None, *, episodes: 
     gap: the real system; None = the training domain without sensor noise. Another seed draws other worlds and starts.
     """
     key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_EVALUATION), seed))
-    real = env if gap is None else envs.gaps.real_env(env, [gap])
-    pool = envs.gaps.heldout_worlds(real, gap, key_worlds, episodes)
+    real = env if gap is None else real_env(env, [gap])
+    pool = heldout_worlds(real, gap, key_worlds, episodes)
     system = Simulated(real, jax.tree.map(lambda x: x[None], pool), jnp.zeros(1, int), gamma=prior.card["gamma"])
     one = jax.tree.map(lambda x: x[None], prior.params)
     keys = jax.random.split(key_episodes, (1, episodes))

@@ -15,9 +15,9 @@ from typing import Any
 from envs.mujoco.worlds import Impl
 from experiments.finetune import finetune
 from experiments.finetune_args import FinetuneArgs, run_folder
-from sgft_jax.presets import PRESETS
 from experiments.pretrain import PretrainArgs, pretrain
 from sgft_jax.io.log import read_jsonl
+from sgft_jax.presets import PRESETS
 
 _NEVER = 10**9  # chunks between what training is not slowed by
 

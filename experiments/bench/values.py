@@ -9,10 +9,10 @@ import jax.numpy as jnp
 
 import envs
 from envs.mujoco.worlds import Impl
+from envs.pools import training_worlds
 from experiments.algorithms import make_player, network_of
 from experiments.evaluation import play_episodes, prior_policy
 from experiments.options import prior_folders
-from experiments.worlds import training_worlds
 from sgft_jax.io.priors import load_priors
 from sgft_jax.models.networks import Precision, make_value
 from sgft_jax.models.value import predict

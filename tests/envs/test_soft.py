@@ -12,7 +12,7 @@ import envs
 from envs import gaps
 from envs.base import EnvState
 from envs.franka import arm, ball, push, towel
-from experiments.worlds import real_env
+from envs.pools import real_env
 from sgft_jax.types import UserError
 
 KEY = jax.random.key(0)

@@ -9,10 +9,10 @@ import toy
 from experiments.priors import find_priors
 
 from envs.gaps import Gap
+from envs.pools import heldout_worlds, load_gap, real_worlds, training_worlds
 from experiments import algorithms, memory, stacking
 from experiments.memory import reserve
 from experiments.options import seed_list, seeds_name
-from experiments.worlds import heldout_worlds, load_gap, real_worlds, training_worlds
 from sgft_jax.io import checkpoint
 from sgft_jax.io.config import config_to_json
 from sgft_jax.io.log import Clock

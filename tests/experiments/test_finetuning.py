@@ -12,11 +12,11 @@ import jax
 import numpy as np
 import pytest
 import toy
+from experiments.algorithms import make_player
 from test_common import save_prior
 
 import envs
 from experiments import cli, evaluate, finetune, finetuning, video
-from experiments.algorithms import make_player
 from experiments.evaluation import play_episodes
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import RealLog, read_jsonl

@@ -9,18 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
+from experiments.pretraining import spread_replay
 from jax.sharding import PartitionSpec
 
 import envs
 from envs.mujoco.engines import c as engine_c
 from envs.mujoco.worlds import PhysicsState
 from experiments import cli, pretrain, pretrain_run
-from sgft_jax.presets import PretrainConfig
-from experiments.pretraining import spread_replay
 from experiments.stacking import seed_keys, stack
 from sgft_jax import mesh
 from sgft_jax.data import replay
 from sgft_jax.models.networks import NetworkConfig
+from sgft_jax.presets import PretrainConfig
 from sgft_jax.types import UserError
 
 CONFIG = PretrainConfig(

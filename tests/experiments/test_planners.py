@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
+from experiments.algorithms import make_player
 from test_common import save_prior
 
 import envs
 from experiments import cli, evaluate, finetune, pretrain
-from experiments.algorithms import make_player
 from experiments.evaluation import grade
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import read_jsonl

@@ -12,16 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from experiments.algorithms import network_of, sac_hyper
+from experiments.pretraining import make_pretrainer
 
 import envs
 from experiments import pretrain
-from experiments.algorithms import network_of, sac_hyper
 from experiments.evaluation import Best, keep_better
-from sgft_jax.presets import PRESETS
-from experiments.pretraining import make_pretrainer
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import MetricsLog, read_jsonl
 from sgft_jax.models.networks import NetworkConfig
+from sgft_jax.presets import PRESETS
 from sgft_jax.types import Normalizer, Prior
 
 TESTS = Path(__file__).parent.parent

@@ -3,12 +3,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
+from sgft_jax.players import sac_player
 
 import envs
 from experiments.report import make_report, numbers
 from sgft_jax.learners.sac import SACConfig, extract_prior, make_sac
 from sgft_jax.models.networks import NetworkConfig
-from sgft_jax.players import sac_player
 
 NETWORK = NetworkConfig(hidden=(4,))
 

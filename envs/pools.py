@@ -1,4 +1,4 @@
-"""Worlds by name: the training domain, real systems, and the worlds that policies are evaluated in."""
+"""Pools of worlds: the training domain, real systems, and the worlds that policies are evaluated in."""
 
 from collections.abc import Sequence
 
@@ -9,10 +9,8 @@ import envs
 from envs import gaps
 from envs.base import Env, World
 from envs.domains.uniform import sample_worlds
-from envs.gaps import Gap
+from envs.gaps import SIM, Gap
 from envs.rollout import pool_size
-from experiments.options import SIM
-from experiments.stacking import stack
 from sgft_jax.types import Key, UserError
 
 
@@ -49,7 +47,7 @@ def real_worlds(env: Env, found: Sequence[Gap], key: Key, n: int = 256) -> World
     pools = [gaps.worlds(env, gap, key, n) for gap in found]
     size = max(map(pool_size, pools))
     repeat = lambda x: jnp.repeat(x, size // x.shape[0], axis=0)  # noqa: E731
-    return stack([jax.tree.map(repeat, pool) for pool in pools])
+    return jax.tree.map(lambda *x: jnp.stack(x), *[jax.tree.map(repeat, pool) for pool in pools])
 
 
 def heldout_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:
