@@ -17,8 +17,8 @@ from sgft_jax.analysis import figures, tables
 from sgft_jax.analysis.curves import deepest_fall, describe, read_curve
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import MetricsLog, check_finite, write_summary
-from sgft_jax.io.real import RealStore
 from sgft_jax.io.priors import save_prior
+from sgft_jax.io.real import RealStore
 from sgft_jax.train import OFFLINE_PART, FinetuneProgress
 from sgft_jax.types import Metrics, Prior, PyTree
 
