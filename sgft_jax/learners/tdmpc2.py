@@ -329,7 +329,7 @@ def extract_params(state: TDMPC2State) -> TDMPC2Params:
 def state_from_prior(config: TDMPC2Config, hyper: TDMPC2Hyper, params: TDMPC2Params) -> TDMPC2State:
     """An agent that starts from a prior: all its networks, its normaliser (frozen), fresh optimiser moments.
 
-    With `config.sgft` its policy becomes the anchor of V_sim, unless it brings one. The horizon may differ from the prior's.
+    With `config.sgft` its policy becomes the anchor of V_sim, unless it brings one. The horizon may be another one.
     """
     check_params_of_prior(config, params)
     own = jax.tree.map(jnp.copy, params)  # the caller may donate the state; the prior must survive it
