@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tuners
-from tuners import METHODS, NET, TASK, T, bits, compiled, equal, prior, started, tuner
+from tuners import METHODS, NET, TASK, T, compiled, equal, prior, started, tuner
 
 from sgft_jax.data import sources
 from sgft_jax.finetuner import Parts, assemble
@@ -141,7 +141,9 @@ def test_methods_that_need_no_prior_start_without_one(name, monkeypatch):
     monkeypatch.setitem(tdmpc2_model.SIZES, "5M", tdmpc2_model.SIZES["tiny"])
     plain = METHODS[name].build(tuners.configure(name), None, TASK)
     assert plain.simulation is None and plain.initial_policy is None
-    state = plain.observe(plain.init(None, jax.random.key(0), None), tuners.episode(jax.random.key(1)), jnp.ones(T, bool))
+    state = plain.observe(
+        plain.init(None, jax.random.key(0), None), tuners.episode(jax.random.key(1)), jnp.ones(T, bool)
+    )
     new, metrics = jax.jit(lambda state: plain.learn(state, jax.random.key(2), 2))(state)
     assert all(jnp.isfinite(x) for x in metrics.values()) and not equal(state.learner, new.learner)
 
