@@ -219,5 +219,5 @@ def test_modules_are_found_and_their_own_faults_are_not_hidden(tmp_path, monkeyp
     with pytest.raises(UserError, match=r"no module 'own_package.gone'; a file is named with its .py"):
         extend.load("task", "own_package.gone", "make")
     for source in ("own_package.broken", str(tmp_path / "own_package/broken.py")):
-        with pytest.raises(UserError, match="line 1: ModuleNotFoundError: .*'a_module_that_is_not_there'"):
+        with pytest.raises(UserError, match=r"line 1: ModuleNotFoundError: .*'a_module_that_is_not_there'"):
             extend.load("task", source, "make")
