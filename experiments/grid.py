@@ -11,7 +11,6 @@ from experiments.finetune import finetune
 from experiments.finetune_args import VOLATILE, FinetuneArgs, arguments, label, run_folder
 from experiments.options import Impl, seed_list, without_repeats
 from sgft_jax import extend
-from sgft_jax.io import checkpoint
 from sgft_jax.io.config import config_to_json
 from sgft_jax.io.jsonfile import read_json
 from sgft_jax.io.log import SUMMARY
@@ -26,7 +25,7 @@ class GridArgs:
 
     tasks: tuple[str, ...] = tuple(envs.TASKS)
     """Tasks."""
-    methods: tuple[str, ...] = tuple(reversed(NAMES))
+    methods: tuple[str, ...] = NAMES
     """Methods, in the order in which they run."""
     reals: tuple[str, ...] = ("default",)
     """Real systems of every task: mild, default, hard, or .toml/.json files."""
@@ -76,7 +75,7 @@ def check(args: GridArgs) -> None:
             raise UserError(f"--{name}: name at least one")
         without_repeats(f"--{name}", given)
     for task in args.tasks:
-        extend.name_of(task)
+        envs.name_of(task)  # complains if there is none
     for method in args.methods:
         get_method(method)
     seed_list(args.seed, args.seeds)
@@ -92,6 +91,8 @@ def run_of(args: GridArgs, task: str, real: str, method: str) -> FinetuneArgs:
 
 def look_up(run: FinetuneArgs) -> Cell:
     """How far the run on the one real system of these arguments has got."""
+    from sgft_jax.io import checkpoint
+
     folder = run_folder(run, *run.real)
     if not (folder / CONFIG).exists():
         return Cell(run, "missing", 0)
