@@ -47,8 +47,10 @@ def load(env: Env, source: str, overrides: Sequence[str] = ()) -> Gap:
         gap = _from_file(Path(source))
     elif source in (known := presets(env.name)):
         gap = known[source]
-    else:
+    elif known:
         raise UserError(f"{unknown(f'gap of {env.name}', source, known)}; or give a .toml or .json file")
+    else:
+        raise UserError(f"{env.name} has no gap {source!r}: it comes with none; give a .toml or .json file")
     seen = set()
     for text in overrides:
         gap, name = _override(gap, text)
