@@ -19,7 +19,8 @@ from experiments.evaluation import best_of, describe, play, scores
 from experiments.gaps import GapsArgs
 from experiments.memory import reserve
 from sgft_jax.analysis.stats import iqm_interval
-from sgft_jax.io.log import MetricsLog, RunProgress, write_summary
+from sgft_jax.io.log import MetricsLog, write_summary
+from sgft_jax.io.progress import RunProgress
 from sgft_jax.io.priors import load_priors
 from sgft_jax.policies import make_policy
 from sgft_jax.pretraining import exported, memory, pretrain, prior_card
@@ -77,10 +78,7 @@ def table(lines: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def _percent(found: dict[str, Any] | None) -> str:
-    if found is None:
-        return "-"
-    low, high = found["interval"]
-    return f"{100 * found['success']:.0f} [{100 * low:.0f}, {100 * high:.0f}]"
+    return "-" if found is None else tables.number(stats.Interval(found["success"], *found["interval"]))
 
 
 def _line(gap: Gap, zero_shot: Episode, trained: Episode | None) -> dict[str, Any]:
@@ -94,7 +92,7 @@ def _rate(played: Episode) -> dict[str, Any]:
     each = [describe(stacking.member(played, i)) for i in range(len(played.success))]
     if len(each) == 1:
         return {"success": each[0]["success"], "interval": each[0]["success/interval"], "policies": each}
-    band = iqm_interval(np.array([one["success"] for one in each]))
+    band = stats.bootstrap_interval(np.array([one["success"] for one in each]))
     return {"success": float(band.estimate), "interval": [float(band.low), float(band.high)], "policies": each}
 
 

@@ -25,9 +25,10 @@ from experiments.pretrain import PretrainArgs
 from experiments.report import Report, make_report, numbers
 from experiments.video import film
 from sgft_jax import mesh
-from sgft_jax.analysis import plot
+from sgft_jax.analysis import figures
 from sgft_jax.io import checkpoint, runs
-from sgft_jax.io.log import EVAL, Clock, MetricsLog, RunProgress, read_jsonl, write_summary
+from sgft_jax.io.log import EVAL, MetricsLog, read_jsonl, write_summary
+from sgft_jax.io.progress import Clock, RunProgress
 from sgft_jax.io.priors import save_prior
 from sgft_jax.policies import make_policy
 from sgft_jax.pretraining import (
@@ -277,7 +278,7 @@ class _Run:
         np.savez(self.folder / "report" / f"seed-{seed}.npz", allow_pickle=False, **report._asdict())
         if not some.size:
             return  # every trajectory exploded: there is nothing to draw
-        plot.pretraining(
+        figures.pretraining(
             self.folder / "figures" / f"seed-{seed}.png",
             title=f"pretraining {self.env.name}, preset {self.args.preset}, seed {seed}",
             steps=[line["step"] for line in curve],

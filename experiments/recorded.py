@@ -9,7 +9,7 @@ import numpy as np
 
 from envs.rollout import Episode
 from experiments.stacking import part
-from sgft_jax.io.log import RealStore
+from sgft_jax.io.real import RealStore
 from sgft_jax.systems import System
 from sgft_jax.types import Key, PyTree, Transition, UserError
 
