@@ -5,12 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
-from test_common import save_prior
+from priors_by_hand import save_prior
+from sgft_jax.players import Player
 
 import envs
 from envs.base import Entry
 from experiments import cli, landscape
-from sgft_jax.players import Player
 from sgft_jax.types import UserError
 
 ENV = toy.make()
