@@ -80,8 +80,10 @@ def parse[T](
     config_type: type[T], description: str, argv: Sequence[str] | None = None, *, default: T | None = None
 ) -> T:
     """A frozen dataclass from the command line; raises UserError for a bad one."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    prog = f"python -m {spec.name}" if spec else None
     with _errors.on_parse_error(lambda event: _refuse(event, config_type, default)):
-        return cast(T, tyro.cli(config_type, description=description, args=argv, default=default))
+        return cast(T, tyro.cli(config_type, prog=prog, description=description, args=argv, default=default))
 
 
 def preview(argv: Sequence[str], **defaults: Any) -> SimpleNamespace:

@@ -17,8 +17,8 @@ from sgft_jax.analysis import figures, tables
 from sgft_jax.analysis.curves import deepest_fall, describe, read_curve
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import MetricsLog, check_finite, write_summary
-from sgft_jax.io.real import RealStore
 from sgft_jax.io.priors import save_prior
+from sgft_jax.io.real import RealStore
 from sgft_jax.train import OFFLINE_PART, FinetuneProgress
 from sgft_jax.types import Metrics, Prior, PyTree
 
@@ -50,7 +50,7 @@ class Record:
     def metrics(self, done: int, values: Mapping[str, np.ndarray]) -> None:
         """A line of one learning phase; raises DivergedError where a number is not finite."""
         step = self.latest()
-        good = None if step is None else self.folder / "checkpoints" / str(step)
+        good = None if step is None else checkpoint.path(self.folder, step)
         check_finite(values, done, unit="rollouts", last_good=good)
         self.log.metrics(self._transitions(done), {"rollouts": done, **values})
 

@@ -20,8 +20,8 @@ from experiments.gaps import GapsArgs
 from experiments.memory import reserve
 from sgft_jax.analysis.stats import iqm_interval
 from sgft_jax.io.log import MetricsLog, write_summary
-from sgft_jax.io.progress import RunProgress
 from sgft_jax.io.priors import load_priors
+from sgft_jax.io.progress import RunProgress
 from sgft_jax.policies import make_policy
 from sgft_jax.pretraining import exported, memory, pretrain, prior_card
 from sgft_jax.systems.simulated import Simulated

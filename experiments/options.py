@@ -6,16 +6,18 @@ from typing import Annotated, Literal
 
 from tyro.conf import arg
 
+import envs
+from envs import gaps
 from sgft_jax import extend
-from sgft_jax.types import UserError
+from sgft_jax.types import UserError, unknown
 
 LAST_SEED = 2**31 - 1  # larger ones stand for held-out worlds and episodes
 
 Impl = Annotated[
     Literal["auto", "jax", "warp", "c"],
     arg(
-        help="Who steps the physics: MJX's own code, MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c on "
-        "a CPU, warp on an NVIDIA GPU where it is installed, jax elsewhere."
+        help="Expert: who steps the physics: MJX's own code, MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or "
+        "else c on a CPU, warp on an NVIDIA GPU where it is installed, jax elsewhere."
     ),
 ]
 
@@ -38,6 +40,17 @@ def without_repeats(option: str, words: Sequence[str]) -> None:
     """Raise UserError for a word that is given twice."""
     if twice := [word for i, word in enumerate(words) if word in words[:i]]:
         raise UserError(f"{option} names {twice[0]} twice; name it once")
+
+
+def check_task(task: str, reals: Sequence[str] = ()) -> None:
+    """Raise UserError where there is no such task, or no such real system of it, by name or file."""
+    name = envs.name_of(task)
+    for real in reals:
+        if real.endswith((".toml", ".json")):
+            if not Path(real).is_file():
+                raise UserError(f"--real {real}: no such file")
+        elif real not in (known := gaps.presets(name)):
+            raise UserError(f"{unknown(f'gap of {name}', real, known)}; or give a .toml or .json file")
 
 
 def at_least_one(args: object, *names: str) -> None:

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_common import save_prior
+from priors_by_hand import save_prior
 
 import envs
 from envs.franka import hammer

@@ -4,7 +4,7 @@ import json
 import os
 
 import pytest
-from test_common import save_prior
+from priors_by_hand import save_prior
 
 import envs
 from experiments import cli, gaps
