@@ -18,7 +18,7 @@ from experiments import stacking
 from experiments.evaluation import best_of, describe, play, scores
 from experiments.gaps import GapsArgs
 from experiments.memory import reserve
-from sgft_jax.analysis.stats import iqm_interval
+from sgft_jax.analysis import stats, tables
 from sgft_jax.io.log import MetricsLog, write_summary
 from sgft_jax.io.priors import load_priors
 from sgft_jax.io.progress import RunProgress
