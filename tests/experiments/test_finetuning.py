@@ -121,7 +121,8 @@ def test_a_run_leaves_curve_summary_policies_and_every_rollout(home, method):
     assert [line["rollouts"] for line in read_jsonl(folder / "metrics.jsonl")] == [2, 3, 4, 5]
     assert all(len(line["success"]) == 2 for line in curve)
     summary = json.loads((folder / "summary.json").read_text())
-    assert set(summary) == {"task", "method", "impl", "gap", "zero_shot", "final", "dip", "to_90", "to_98", "seeds"}
+    numbers = {"zero_shot", "final", "deepest_fall", "transitions_until_held", "seeds"}
+    assert set(summary) == {"task", "method", "impl", "gap", *numbers}
     assert summary["gap"]["effects"] == {"action_rotation": 0.52} and summary["final"]["transitions"] == 100
     rollouts = RealStore(folder).load()
     assert len(rollouts) == 5 and rollouts[0]["obs"].shape == (2, 20, 4) and rollouts[0]["valid"].all()
