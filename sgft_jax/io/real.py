@@ -21,14 +21,14 @@ class RealStore:
 
     def __init__(self, folder: Path, *, say: Callable[[str], None] = print) -> None:
         """Open or make the store of a run folder; `say` hears of a rollout that a kill has cut short."""
-        self._folder = Path(folder) / _REAL
-        self._folder.mkdir(parents=True, exist_ok=True)
-        for half in sorted(self._folder.glob(f"*{_HALF}")):
+        self.folder = Path(folder) / _REAL
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for half in sorted(self.folder.glob(f"*{_HALF}")):
             say(f"ignored: {half}: writing it was cut short")
 
     def __len__(self) -> int:
         """Rollouts on disk."""
-        numbers = [int(path.stem.removeprefix(_ROLLOUT)) for path in self._folder.glob(f"{_ROLLOUT}*.npz")]
+        numbers = [int(path.stem.removeprefix(_ROLLOUT)) for path in self.folder.glob(f"{_ROLLOUT}*.npz")]
         return max(numbers, default=-1) + 1
 
     def append(self, rollout: Mapping[str, Any]) -> int:
@@ -44,7 +44,7 @@ class RealStore:
             file.flush()
             os.fsync(file.fileno())
         half.rename(path)
-        _sync_folder(self._folder)
+        _sync_folder(self.folder)
         return number
 
     def load(self, number: int) -> dict[str, np.ndarray]:
@@ -59,7 +59,7 @@ class RealStore:
             raise UserError(f"{path}: damaged: {error}") from error
 
     def _path(self, number: int) -> Path:
-        return self._folder / f"{_ROLLOUT}{number:06d}.npz"
+        return self.folder / f"{_ROLLOUT}{number:06d}.npz"
 
 
 def _sync_folder(folder: Path) -> None:
