@@ -94,7 +94,7 @@ def _window():
             physics.mujoco.mj_step(host, data, 3)
         ends.append(data.qpos.copy())
     two = lambda x: jnp.broadcast_to(jnp.asarray(x, jnp.float32), (2, len(x)))  # noqa: E731
-    start = PhysicsState(two(arm), two(np.zeros(host.nv)), two(np.zeros(host.nv)), two(arm[: host.nu]))
+    start = PhysicsState(two(arm), two(np.zeros(host.nv)), two(np.zeros(host.nv)), two(arm[: host.nu]), two([]))
     return host, physics.Window(start, jnp.asarray(commands, jnp.float32)), np.stack(ends)
 
 
