@@ -19,13 +19,11 @@ from rich.console import Console
 from rich.table import Table
 
 import envs
-from envs.mujoco.worlds import Impl, choose_impl
 from experiments import cli
-from experiments.bench import physics, training, updates, values
-from sgft_jax.analysis import figures
+from experiments.options import Impl, at_least_one
 from sgft_jax.io import runs
 from sgft_jax.io.log import write_summary
-from sgft_jax.models.networks import Precision
+from sgft_jax.models.config import Precision
 from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError
 
@@ -95,20 +93,20 @@ def main(config: BenchmarkConfig) -> dict[str, list[dict[str, Any]]]:
 def _check(config: BenchmarkConfig) -> None:
     cli.choose("--preset", config.preset, PRESETS)
     for task in config.tasks:
-        envs.name_of(task)
-        if "physics" in config.parts and 2 * config.control_steps > envs.scene(task).episode_length:
-            raise UserError(f"--control-steps {config.control_steps} is more than half an episode of {task}")
-    for name in ("worlds", "control_steps", "batches", "seeds", "width", "updates", "repeats", "devices"):
-        value = getattr(config, name)
-        least = min(value, default=0) if isinstance(value, tuple) else value
-        if least < 1:
-            raise UserError(f"--{name.replace('_', '-')} is {least}: must be at least 1")
+        envs.name_of(task)  # complains if there is none
+    at_least_one(config, "worlds", "control_steps", "batches", "seeds", "width", "updates", "repeats", "devices")
     for part in ("finetune", "values"):
         if part in config.parts and config.prior is None:
             raise UserError(f"--parts {part} needs --prior FOLDER, as made by python -m experiments.pretrain")
+    for task in config.tasks if "physics" in config.parts else ():
+        if 2 * config.control_steps > envs.scene(task).episode_length:
+            raise UserError(f"--control-steps {config.control_steps} is more than half an episode of {task}")
 
 
 def _physics(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    from envs.mujoco.worlds import choose_impl
+    from experiments.bench import physics
+
     for task in config.tasks:
         for impl in map(choose_impl, config.impls):
             for n in config.worlds:
@@ -116,6 +114,8 @@ def _physics(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
 
 
 def _updates(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    from experiments.bench import updates
+
     size = {"width": config.width, "updates": config.updates, "repeats": config.repeats}
     for exact in config.precisions:
         for batch in config.batches:
@@ -124,11 +124,15 @@ def _updates(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
 
 
 def _plain(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    from experiments.bench import updates
+
     for batch in config.batches:
         yield updates.plain_speed(batch, width=config.width, updates=config.updates, repeats=config.repeats)
 
 
 def _values(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    from experiments.bench import values
+
     for task in config.tasks:
         for impl in config.impls:
             assert config.prior is not None  # checked before
@@ -136,6 +140,8 @@ def _values(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
 
 
 def _pretrain(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    from experiments.bench import training
+
     for task in config.tasks:
         for impl in config.impls:
             for seeds in config.seeds:
@@ -143,6 +149,8 @@ def _pretrain(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
 
 
 def _finetune(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    from experiments.bench import training
+
     for task in config.tasks:
         for impl in config.impls:
             for seeds in config.seeds:
@@ -151,6 +159,8 @@ def _finetune(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
 
 
 def _devices(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    from experiments.bench import training
+
     for task in config.tasks:
         for impl in config.impls:
             for worlds in config.worlds:
@@ -201,6 +211,8 @@ def draw(part: str, lines: list[dict[str, Any]], path: Path) -> Path | None:
             xs.append(line[x])
             ys.append(line[column])
         return found
+
+    from sgft_jax.analysis import figures
 
     references = curves(growth.reference) if growth.reference else {}
     return figures.scaling(path, curves(growth.y), references, title=_TITLES[part], x=x, y=growth.label)

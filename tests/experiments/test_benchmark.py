@@ -18,6 +18,7 @@ from experiments import benchmark
 from experiments.bench import other_sac, physics, training, updates, values
 from experiments.bench.timing import fastest, measure
 from experiments.benchmark import BenchmarkConfig, main
+from sgft_jax.analysis import figures
 from sgft_jax.models import value
 from sgft_jax.types import UserError
 
@@ -204,7 +205,7 @@ def test_precisions_are_compared_by_value_and_by_shaped_reward(tmp_path, monkeyp
 
 def test_figures_show_how_costs_grow(tmp_path, monkeypatch):
     drawn = []
-    monkeypatch.setattr(benchmark.plot, "scaling", lambda path, *curves, **words: drawn.append((curves, words)) or path)
+    monkeypatch.setattr(figures, "scaling", lambda path, *curves, **words: drawn.append((curves, words)) or path)
     line = lambda batch, seeds: {  # noqa: E731
         "batch": batch, "seeds": seeds, "precision": "default", "updates_per_s": 10.0 * seeds, "bare_per_s": 5.0
     }  # fmt: skip
