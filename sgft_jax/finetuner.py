@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from sgft_jax.data import replay, sources
 from sgft_jax.learners import optim, sac
 from sgft_jax.methods import options as rules
-from sgft_jax.methods.options import LoopOptions, ModelOptions, SACOptions
+from sgft_jax.methods.options import KeptCriticOptions, LoopOptions, ModelOptions, SACOptions
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import fix_first_layer, make_dynamics, make_value
@@ -199,6 +199,8 @@ def sac_finetuner(
         max_grad_norm=options.max_grad_norm,
         **structure,
     )
+    keeps = isinstance(options, KeptCriticOptions) and not new_critic
+    rise = rules.warmup(options, options.lr_warmup) if keeps else 0
     hyper = sac.SACHyper(
         lr_actor=options.lr_actor,
         lr_critic=options.lr_critic,
@@ -207,7 +209,7 @@ def sac_finetuner(
         alpha=options.alpha,
         actor_start=rules.critic_warmup(options, task),
         actor_ramp=options.actor_ramp,
-        lr_warmup=0 if new_critic else rules.warmup(options, options.lr_warmup),
+        lr_warmup=rise,
         **numbers,
     )
     learner = sac.make_sac(config, hyper)

@@ -309,7 +309,7 @@ def _assemble(config: TDMPC2Config, parts: Parts, hyper: TDMPC2Hyper, prior: TDM
     return TDMPC2State(
         **{name: start(name) for name in NETWORKS},
         target_critic=jax.tree.map(jnp.copy, prior.critic),  # own buffers: a donated state must not hold one twice
-        anchor=jax.tree.map(jnp.copy, prior.policy) if config.sgft else None,
+        anchor=jax.tree.map(jnp.copy, prior.anchor or prior.policy) if config.sgft else None,
         scale=prior.scale,
         normalizer=prior.normalizer,
         hyper=jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hyper),
@@ -323,13 +323,13 @@ def _assemble(config: TDMPC2Config, parts: Parts, hyper: TDMPC2Hyper, prior: TDM
 def extract_params(state: TDMPC2State) -> TDMPC2Params:
     """What a pretrained agent hands over."""
     params = {name: getattr(state, name).params for name in NETWORKS}
-    return TDMPC2Params(**params, normalizer=state.normalizer, scale=state.scale)
+    return TDMPC2Params(**params, normalizer=state.normalizer, scale=state.scale, anchor=state.anchor)
 
 
 def state_from_prior(config: TDMPC2Config, hyper: TDMPC2Hyper, params: TDMPC2Params) -> TDMPC2State:
     """An agent that starts from a prior: all its networks, its normaliser (frozen), fresh optimiser moments.
 
-    With `config.sgft` its policy becomes the anchor of V_sim. The horizon may differ from the prior's.
+    With `config.sgft` its policy becomes the anchor of V_sim, unless it brings one. The horizon may differ from the prior's.
     """
     check_params_of_prior(config, params)
     own = jax.tree.map(jnp.copy, params)  # the caller may donate the state; the prior must survive it
