@@ -122,11 +122,16 @@ def _refuse(event: _errors.ParseErrorEvent, config_type: type, default: Any) -> 
             raise UserError(unknown(event.argument.display_name(), event.value, event.choices))
         case _errors.BadValue(reason="too_few_values"):
             raise UserError(f"{event.argument.display_name()}: needs a value")
-        case _errors.InstantiationFailure(argument=None):
-            raise UserError(event.message)
-        case _errors.InstantiationFailure(argument=argument):
-            kind = {int: "a whole number", float: "a number"}.get(argument.field.type_stripped, "something else")
-            raise UserError(f"{argument.display_name()}: must be {kind} ({event.message})")
+        case _errors.InstantiationFailure():
+            raise UserError(_bad_value(event))
+
+
+def _bad_value(event: _errors.InstantiationFailure) -> str:
+    """What is wrong with the value of an option, as far as tyro knows which."""
+    if event.argument is None:
+        return event.message
+    kind = {int: "a whole number", float: "a number"}.get(event.argument.field.type_stripped, "something else")
+    return f"{event.argument.display_name()}: must be {kind} ({event.message})"
 
 
 def option_names(config_type: type, default: Any = None, *, prefix: str = "--") -> list[str]:
