@@ -54,10 +54,11 @@ def check_task(task: str, reals: Sequence[str] = ()) -> None:
 
 
 def at_least_one(args: object, *names: str) -> None:
-    """Raise UserError for an option that is less than 1."""
+    """Raise UserError for an option that is less than 1, or of several numbers has one that is, or has none."""
     for name in names:
-        if (value := getattr(args, name)) < 1:
-            raise UserError(f"--{name.replace('_', '-')} is {value}: must be at least 1")
+        value = getattr(args, name)
+        if (least := min(value, default=0) if isinstance(value, tuple) else value) < 1:
+            raise UserError(f"--{name.replace('_', '-')} is {least}: must be at least 1")
 
 
 def prior_home(out: Path, task: str, preset: str) -> Path:

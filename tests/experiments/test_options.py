@@ -83,7 +83,7 @@ def test_a_budget_that_does_not_fit_names_the_largest_part(monkeypatch, capsys):
     monkeypatch.setattr(memory, "free_memory", lambda: 5 * 2**30)
     reserve(parts, copies=2, devices=2)  # 4 GiB each
     assert capsys.readouterr().out == (
-        "experience: 4.00 GiB of 5.00 GiB free on each device (random_transitions 1.00 GiB, replay_capacity 3.00 GiB)\n"
+        "memory: 4.00 GiB of 5.00 GiB free on each device (random_transitions 1.00 GiB, replay_capacity 3.00 GiB)\n"
     )
     with pytest.raises(UserError, match=r"8\.00 GiB of 5\.00 GiB free on each device: lower --config\.replay-capacity"):
         reserve(parts, copies=2)

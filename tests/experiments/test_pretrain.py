@@ -16,7 +16,6 @@ from experiments import pretrain
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import MetricsLog, read_jsonl
 from sgft_jax.io.priors import load_prior
-from sgft_jax.policies import network_of
 from sgft_jax.presets import PRESETS
 
 TESTS = Path(__file__).parent.parent
@@ -90,7 +89,7 @@ def test_sac_learns_the_toy_task_and_leaves_a_prior_per_seed(finished):
         assert found["success/interval"][0] <= found["success"] <= found["success/interval"][1]
         prior = load_prior(finished / "prior" / f"seed-{seed}", task="toy", obs_dim=4, act_dim=2)
         assert prior.card["metrics"] == found and prior.card["config"]["n_envs"] == 32
-        assert network_of(prior.card).hidden == (32, 32)
+        assert prior.card["network"]["hidden"] == [32, 32]
         assert prior.params.actor["Dense_0"]["kernel"].shape == (4, 32)
         assert (finished / "figures" / f"seed-{seed}.png").stat().st_size > 10_000
 
@@ -161,6 +160,14 @@ def test_a_finished_run_is_neither_repeated_nor_changed(finished, out, capsys):
         (["--config.gama", "0.9"], "did you mean --config.gamma?"),
         (["--task", "toy", "--seeds", "0"], "--seeds is 0: must be at least 1"),
         (["--task", "toy", "--real", "mild"], "toy has no gap 'mild'"),
+        (["--task", "toy", "--config.n-envs", "0"], "option n-envs is 0: must be at least 1"),
+        (["--task", "toy", "--config.gamma", "2"], "option gamma is 2.0: must be at least 0 and less than 1"),
+        (["--task", "toy", "--config.lr", "nan"], "option lr is nan: must be a positive number"),
+        (["--task", "toy", "--config.env-steps", "-5"], "option env-steps is -5: must be at least 1"),
+        (["--task", "toy", "--config.network.hidden"], "hidden is (): name one or more widths"),
+        (["--task", "toy", "--config.network.hidden", "0"], "hidden is (0,): name one or more widths"),
+        (["--task", "toy", "--seed", "4294967296"], "--seed is 4294967296: seeds go from 0 to 2147483647"),
+        (["--task", "toy", "--config.batch-size", "999999999"], "GiB free on each device: lower --config.batch-size"),
         (["--task", "toy", "--set", "latency=0.1"], "name one with --real"),
         (["--task", "toy", "--config.replay-capacity", "9"], "option replay-capacity is 9: must be at least n-envs = "),
         (
@@ -191,3 +198,18 @@ def test_training_on_the_real_system_has_its_own_folder(tmp_path):
     pretrain.main(argv)
     (card,) = tmp_path.glob("pretrain/toy/cpu-on-strange+mass=3/seed-0/prior/seed-0/prior.json")
     assert json.loads(card.read_text())["gap"]["params"] == {"mass": 3, "friction": 4.0}
+
+
+def test_out_that_is_a_file_is_one_line(capsys, tmp_path):
+    (tmp_path / "file").touch()
+    assert "file is a file; choose another --out" in complaint(["--out", str(tmp_path / "file")], capsys)
+
+
+@pytest.mark.slow
+def test_training_that_diverges_stops_in_one_line_and_a_failed_start_blocks_nobody(capsys, tmp_path, monkeypatch):
+    argv = [*TINY, "--config.env-steps", "2560", "--out", str(tmp_path)]
+    said = complaint([*argv, "--config.lr", "1e30"], capsys)
+    assert "training has diverged: " in said and "is not finite after 1,280 env steps; there is no checkpoint" in said
+    (lines,) = (read_jsonl(path) for path in tmp_path.rglob("metrics.jsonl"))
+    assert len(lines) == 1
+    pretrain.main(argv)  # neither --resume nor --overwrite: nothing was achieved that could be lost

@@ -187,7 +187,9 @@ def test_memory_counts_what_is_kept_and_drawn():
         toy.make(), replace(CONFIG, random_transitions=100, replay_capacity=10**9, batch_size=50)
     )
     assert found["random_transitions"] == 100 * row + 8 and found["replay_capacity"] == 10**9 * row + 8  # two counters
-    assert found["batch_size"] == 2 * 50 * row
+    networks = CONFIG.ensemble_size + 4
+    activations = 2 * networks * 50 * sum(CONFIG.network.hidden) * 4
+    assert found["batch_size"] == 2 * 50 * CONFIG.updates_per_step * row + activations
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from sgft_jax.players import mpc_player
 
 from sgft_jax import finetune, methods
 from sgft_jax.learners import sac
 from sgft_jax.models import networks
 from sgft_jax.planning import mpc
-from sgft_jax.players import mpc_player
 from sgft_jax.types import Normalizer, Prior, Transition, UserError
 
 NET = networks.NetworkConfig(hidden=(8,))
