@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 import envs
 from experiments.finetune import finetune
 from experiments.finetune_args import VOLATILE, FinetuneArgs, arguments, label, run_folder
-from experiments.options import Impl, seed_list, without_repeats
+from experiments.options import Impl, check_task, seed_list, without_repeats
 from sgft_jax import extend
 from sgft_jax.io.config import config_to_json
 from sgft_jax.io.jsonfile import read_json
@@ -75,7 +75,7 @@ def check(args: GridArgs) -> None:
             raise UserError(f"--{name}: name at least one")
         without_repeats(f"--{name}", given)
     for task in args.tasks:
-        envs.name_of(task)  # complains if there is none
+        check_task(task, args.reals)
     for method in args.methods:
         get_method(method)
     seed_list(args.seed, args.seeds)
@@ -96,6 +96,7 @@ def look_up(run: FinetuneArgs) -> Cell:
     folder = run_folder(run, *run.real)
     if not (folder / CONFIG).exists():
         return Cell(run, "missing", 0)
+
     summed_up = read_json(folder / SUMMARY)["final"]["rollouts"] if (folder / SUMMARY).exists() else 0
     state = "finished" if summed_up >= run.rollouts else "unfinished"
     return Cell(run, state, checkpoint.latest(folder, say=lambda _: None) or 0)

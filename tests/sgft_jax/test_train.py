@@ -337,7 +337,7 @@ def rows_of(n, p=2):
     example = replay.blank(2, 1)
     one = lambda i: replay.add_batch(
         replay.init(example, n), jax.tree.map(lambda x: jnp.full((n, *x.shape), 100.0 * (i + 1)), example)
-    )  # noqa: E501, E731
+    )
     return train.SimulatedRows(jax.tree.map(lambda *x: jnp.stack(x), *map(one, range(p))), jnp.ones((p, 3)))
 
 
