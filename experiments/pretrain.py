@@ -85,8 +85,8 @@ def check(args: PretrainArgs) -> list[int]:
     if args.set and not real:
         raise UserError(f"--set {args.set[0]}: changes a real system; name one with --real")
     check_task(args.task, [str(args.real)] if real else [])
-    if args.hosts is None:  # several hosts look after one folder: the first of them does, later
-        check_start(run_folder(args), resume=args.resume, overwrite=args.overwrite)
+    # Of several hosts every one sees what is there now: the first changes nothing before it has met the others.
+    check_start(run_folder(args), resume=args.resume, overwrite=args.overwrite)
     return seeds
 
 
