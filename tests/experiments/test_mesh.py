@@ -136,7 +136,7 @@ def test_physics_that_xla_cannot_look_into_steps_in_pieces():
     """C MuJoCo behind a callback: each device calls it for its own worlds."""
     scene = envs.scene("hammer")
     host = scene.build({p.name: p.nominal for p in scene.parameters}).compile()
-    advance = engine_c.make_advance(host, ())
+    advance = engine_c.make_engine(host, ()).advance
     step = mesh.split_vmap(lambda state, controls: advance({}, state, controls))
     rest = jnp.asarray(host.qpos0, jnp.float32)
     start = PhysicsState(rest, jnp.zeros(host.nv), jnp.zeros(host.nv), rest[: host.nu])
