@@ -22,7 +22,7 @@ import envs
 from envs.mujoco.worlds import Impl, choose_impl
 from experiments import cli
 from experiments.bench import physics, training, updates, values
-from sgft_jax.analysis import plot
+from sgft_jax.analysis import figures
 from sgft_jax.io import runs
 from sgft_jax.io.log import write_summary
 from sgft_jax.models.networks import Precision
@@ -203,7 +203,7 @@ def draw(part: str, lines: list[dict[str, Any]], path: Path) -> Path | None:
         return found
 
     references = curves(growth.reference) if growth.reference else {}
-    return plot.scaling(path, curves(growth.y), references, title=_TITLES[part], x=x, y=growth.label)
+    return figures.scaling(path, curves(growth.y), references, title=_TITLES[part], x=x, y=growth.label)
 
 
 _PARTS: dict[Part, Callable[[BenchmarkConfig], Iterator[dict[str, Any]]]] = {

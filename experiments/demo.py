@@ -11,12 +11,13 @@ from typing import Any
 import jax
 
 import envs
-from experiments import cli, tables
-from experiments.comparison import Comparison, read_comparison
+from experiments import cli
 from experiments.figures import FiguresArgs, figures
 from experiments.finetune import finetune
 from experiments.finetune_args import FinetuneArgs, run_folder
 from experiments.pretrain import PretrainArgs, pretrain
+from sgft_jax.analysis import tables
+from sgft_jax.analysis.curves import Curve, read_runs
 from sgft_jax.methods import finetune_config, get_method
 from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError
@@ -54,21 +55,19 @@ def main(args: DemoArgs) -> None:
     pretrain(PretrainArgs(config=config, report=False, video=False, **shared))
     runs = [_finetune_args(args, method, shared) for method in METHODS]
     _finetune_all(*runs)
-    results = figures(FiguresArgs(task=args.task, out=args.out))
+    results = figures(FiguresArgs(task=envs.name_of(args.task), out=args.out))
     folder = run_folder(runs[0], args.real).parent.parent
-    print(f"\n{outcome(read_comparison(folder))}\n")
+    print(f"\n{outcome([c for c in read_runs(args.out).curves if c.gap == folder.name])}\n")
     print(f"figure: {results.parent / f'{envs.name_of(args.task)}-{folder.name}.png'}, tables: {results}")
     print(f"{time.monotonic() - started:.0f} s in all; curves, real rollouts and a video of {METHODS[0]}: {folder}")
 
 
-def outcome(comparison: Comparison) -> str:
+def outcome(curves: Sequence[Curve]) -> str:
     """What came of it in a few lines: success of the methods wherever one was evaluated."""
-    points = sorted({int(n) for curve in comparison.curves.values() for n in curve.rollouts})
-    head = ["method", *(f"{n} rollout{'s' * (n > 1)}" if n else "zero-shot" for n in points)]
-    rows = [[name, *(tables.at(curve, n) for n in points)] for name, curve in comparison.curves.items()]
+    first, *_ = curves
     return (
-        f"Success on the {comparison.real} real system of {comparison.task} in per cent, interquartile mean over seeds "
-        f"with its 95 % interval:\n\n{tables.markdown(head, rows)}"
+        f"{tables.words(first.score).capitalize()} on the {first.gap} real system of {first.task}, interquartile mean "
+        f"over seeds with its 95 % interval where there are enough:\n\n{tables.outcome(curves)}"
     )
 
 

@@ -79,12 +79,13 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     folders = prior_folders(args.run or args.prior, out=args.out, task=task, preset=args.preset)
     env = envs.make(args.task or read_json(folders[0] / "prior.json")["task"], args.impl)
     gap = load_gap(env, args.real, args.set)
-    priors, card = load_priors(folders, env)
+    priors = load_priors(folders, env)
+    card, params = priors[0].card, stacking.stack([prior.params for prior in priors])
     env = real_env(env, [gap] if gap else [])
     key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_SEED), args.seed))
     worlds = stacking.stack([heldout_worlds(env, gap, key_worlds, args.episodes)])
     system = Simulated(env, worlds, jnp.zeros(len(priors), jnp.int32), gamma=card["gamma"])
-    outcome = play(system, make_policy(card, env), stacking.stack(priors), key_episodes, args.episodes)
+    outcome = play(system, make_policy(card, env), params, key_episodes, args.episodes)
     policies = [{"policy": str(f), **describe(stacking.member(outcome, i))} for i, f in enumerate(folders)]
     where = "in simulation" if gap is None else f"on the {gap.name} real system"
     return {"task": env.name, "impl": env.impl, "where": where, "episodes": args.episodes, "policies": policies}

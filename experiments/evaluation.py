@@ -12,7 +12,7 @@ from sgft_jax import mesh
 from sgft_jax.analysis import stats
 from sgft_jax.pretraining import Best, keep_better
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.types import Array, Key, Policy, PyTree
+from sgft_jax.types import Array, Key, Metrics, Policy, PyTree
 
 
 def play(system: Simulated, policy: Policy, params: PyTree, key: Key, episodes: int) -> Episode:
@@ -25,7 +25,7 @@ def play(system: Simulated, policy: Policy, params: PyTree, key: Key, episodes: 
     return jax.tree.map(np.asarray, played)
 
 
-def scores(played: Episode) -> dict[str, np.ndarray]:
+def scores(played: Episode) -> Metrics:
     """Mean success, return and share of exploded episodes [M] of episodes [M, n]."""
     return {
         "success": played.success.mean(-1),

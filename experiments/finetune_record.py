@@ -11,15 +11,14 @@ import numpy as np
 from envs.base import Env, World
 from envs.gaps import Gap
 from envs.rollout import Episode
-from experiments.results import describe_run, read_curve
 from experiments.stacking import member
 from experiments.video import before_and_after
-from sgft_jax.analysis import plot
-from sgft_jax.analysis.stats import iqm_interval
+from sgft_jax.analysis import figures, tables
+from sgft_jax.analysis.curves import deepest_fall, describe, read_curve
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import MetricsLog, check_finite, write_summary
-from sgft_jax.io.real import RealStore
 from sgft_jax.io.priors import save_prior
+from sgft_jax.io.real import RealStore
 from sgft_jax.train import OFFLINE_PART, FinetuneProgress
 from sgft_jax.types import Metrics, Prior, PyTree
 
@@ -51,7 +50,7 @@ class Record:
     def metrics(self, done: int, values: Mapping[str, np.ndarray]) -> None:
         """A line of one learning phase; raises DivergedError where a number is not finite."""
         step = self.latest()
-        good = None if step is None else self.folder / f"step-{step}"
+        good = None if step is None else self.folder / "checkpoints" / str(step)
         check_finite(values, done, unit="rollouts", last_good=good)
         self.log.metrics(self._transitions(done), {"rollouts": done, **values})
 
@@ -77,23 +76,18 @@ class Record:
         best: of the best policies by real evidence, [S] each: `score` in the evaluation, `evidence`, `rollouts`.
         """
         self.log.close()
-        env, curve = self.env, read_curve(self.folder)
+        env, curve = self.env, read_curve(self.folder).of(self.env.score)
         about = {"task": env.name, "method": self.method, "impl": env.impl, "gap": self.gap._asdict()}
-        summary = about | describe_run(curve) | {"best": {name: x.tolist() for name, x in best.items()}}
+        summary = about | {"score": env.score} | describe(curve) | {"best": {k: x.tolist() for k, x in best.items()}}
         write_summary(self.folder, summary)
-        plot.learning_curves(
-            self.folder / "figures" / "success.png",
-            {self.method: (curve.transitions, curve.success)},
-            title=f"{env.name} on the {self.gap.name} real system",
-            zero_shot=float(iqm_interval(curve.success[:, 0]).estimate),
-            rollout_length=env.episode_length,
-            control_dt=env.control_dt,
-        )
-        zero, final = (summary[when]["success"]["iqm"] for when in ("zero_shot", "final"))
+        title = f"{env.name} on the {self.gap.name} real system"
+        figures.learning_curves(self.folder / "figures" / "success.png", {self.method: [curve]}, title=title)
+        before, after = (tables.middle(curve, curve.values[:, i]) for i in (0, -1))
+        fall, chosen = (tables.plain(x, env.score) for x in (deepest_fall(curve), float(best["score"].mean())))
         print(
-            f"{self.gap.name}: success on the real system {100 * zero:.0f} % before -> {100 * final:.0f} % after "
-            f"{summary['final']['rollouts']} rollouts; deepest fall below the start {100 * summary['dip']['mean']:.0f} "
-            f"points; best policy by the training rollouts {100 * float(best['score'].mean()):.0f} %"
+            f"{self.gap.name}: {tables.words(env.score)} on the real system {before} before -> {after} after "
+            f"{curve.rollouts[-1]} rollouts; deepest fall below the start {fall}; best policy by the training rollouts "
+            f"{chosen}"
         )
         return summary
 

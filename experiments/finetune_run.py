@@ -22,8 +22,8 @@ from sgft_jax import api, mesh, train
 from sgft_jax.api import Setup
 from sgft_jax.io import runs
 from sgft_jax.io.config import config_to_json
-from sgft_jax.io.log import RunProgress
 from sgft_jax.io.priors import digest, load_priors
+from sgft_jax.io.progress import RunProgress
 from sgft_jax.methods.options import card_of
 from sgft_jax.train import FinetuneProgress
 from sgft_jax.types import Method, Metrics, Prior, PyTree, UserError

@@ -18,13 +18,14 @@ from experiments import stacking
 from experiments.evaluation import best_of, describe, play, scores
 from experiments.gaps import GapsArgs
 from experiments.memory import reserve
-from sgft_jax.analysis.stats import iqm_interval
-from sgft_jax.io.log import MetricsLog, RunProgress, write_summary
+from sgft_jax.analysis import stats, tables
+from sgft_jax.io.log import MetricsLog, write_summary
 from sgft_jax.io.priors import load_priors
+from sgft_jax.io.progress import RunProgress
 from sgft_jax.policies import make_policy
 from sgft_jax.pretraining import exported, memory, pretrain, prior_card
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.types import Key, PyTree, UserError
+from sgft_jax.types import Key, Prior, UserError
 
 ZERO_SHOT_AT_MOST, TRAINED_AT_LEAST = 0.40, 0.95
 _HELDOUT_SEED, _FINAL_SEED = 2**31 + 4, 2**31 + 5  # held-out worlds and episodes
@@ -39,8 +40,7 @@ def run(args: GapsArgs, seeds: list[int], folders: list[Path]) -> dict[str, Any]
         raise UserError(f"{task} comes with no gaps; name .toml or .json files with --presets")
     env = real_env(env, found)
     folder = args.out / "gaps" / task
-    priors, card = load_priors(folders, env)
-    here = _zero_shot(env, found, stacking.stack(priors), card, args.episodes)
+    here = _zero_shot(env, found, load_priors(folders, env), args.episodes)
     about = {"task": task, "impl": env.impl, "preset": args.preset, "priors": [str(prior) for prior in folders]}
     summary = _report(folder, about, [_line(gap, here[i], None) for i, gap in enumerate(found)])
     if args.train:  # the long part: what is known already is on disk
@@ -78,10 +78,7 @@ def table(lines: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def _percent(found: dict[str, Any] | None) -> str:
-    if found is None:
-        return "-"
-    low, high = found["interval"]
-    return f"{100 * found['success']:.0f} [{100 * low:.0f}, {100 * high:.0f}]"
+    return "-" if found is None else tables.number(stats.Interval(found["success"], *found["interval"]))
 
 
 def _line(gap: Gap, zero_shot: Episode, trained: Episode | None) -> dict[str, Any]:
@@ -95,16 +92,16 @@ def _rate(played: Episode) -> dict[str, Any]:
     each = [describe(stacking.member(played, i)) for i in range(len(played.success))]
     if len(each) == 1:
         return {"success": each[0]["success"], "interval": each[0]["success/interval"], "policies": each}
-    band = iqm_interval(np.array([one["success"] for one in each]))
+    band = stats.bootstrap_interval(np.array([one["success"] for one in each]))
     return {"success": float(band.estimate), "interval": [float(band.low), float(band.high)], "policies": each}
 
 
-def _zero_shot(env: Env, found: Sequence[Gap], priors: PyTree, card: dict[str, Any], episodes: int) -> list[Episode]:
+def _zero_shot(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: int) -> list[Episode]:
     """For each gap, the episodes of the priors [priors, episodes]; every policy plays the same ones."""
-    n = jax.tree.leaves(priors)[0].shape[0]
+    n, card = len(priors), priors[0].card
     pools = real_worlds(env, found, jax.random.key(_FINAL_SEED), episodes)
     system = Simulated(env, pools, jnp.repeat(jnp.arange(len(found)), n), gamma=card["gamma"])
-    members = jax.tree.map(lambda x: jnp.tile(x, (len(found), *[1] * (x.ndim - 1))), priors)
+    members = stacking.stack([prior.params for prior in priors] * len(found))
     played = play(system, make_policy(card, env), members, _episode_key(_FINAL_SEED), episodes)
     return [stacking.part(played, i, n) for i in range(len(found))]
 

@@ -25,9 +25,11 @@ from experiments.pretrain import PretrainArgs
 from experiments.report import Report, make_report, numbers
 from experiments.video import film
 from sgft_jax import mesh
-from sgft_jax.analysis import plot
+from sgft_jax.analysis import figures
 from sgft_jax.io import checkpoint, runs
-from sgft_jax.io.log import EVAL, Clock, MetricsLog, RunProgress, read_jsonl, write_summary
+from sgft_jax.io.log import EVAL, MetricsLog, read_jsonl, write_summary
+from sgft_jax.io.priors import save_prior
+from sgft_jax.io.progress import Clock, RunProgress
 from sgft_jax.policies import make_policy
 from sgft_jax.pretraining import (
     Best,
@@ -41,7 +43,7 @@ from sgft_jax.pretraining import (
     world_keys,
 )
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.types import Key, PyTree
+from sgft_jax.types import Key, Metrics, Prior, PyTree
 
 _REPORT = 3  # purpose, folded into a seed's key
 _CUT = ("n_envs", "replay_capacity", "batch_size")  # sizes that devices share
@@ -134,13 +136,16 @@ class _Run:
     def _restore(self) -> tuple[Saved, int]:
         """The newest checkpoint and the chunks behind it."""
         state = self.shapes()[1]
-        params = jax.eval_shape(functools.partial(exported, self.env, self.config), state)
-        number = jax.ShapeDtypeStruct((len(self.seeds),), jnp.float32)
-        like = Saved(state, Best(params, number, number, state.steps))
+        like = jax.eval_shape(lambda run: Saved(run, self._first_best(run)), state)
         saved, meta = checkpoint.restore(self.home, like, expect=self.expect)
         self.log.truncate(meta["position"])
         self.clock.seconds = meta["seconds"]
         return saved, meta["chunks"]
+
+    def _first_best(self, state: PretrainState) -> Best:
+        """What any evaluation is better than."""
+        none = jnp.full(len(self.seeds), -jnp.inf)
+        return Best(exported(self.env, self.config, state), none, none, state.steps)
 
     def _random(self) -> PyTree:
         """Experience under random actions: collected once, then read from disk."""
@@ -178,7 +183,7 @@ class _Run:
                 progress.advance(size, shown)
         return best
 
-    def _evaluate(self, state: PretrainState, best: Best | None, done: int) -> tuple[Best, dict[str, np.ndarray]]:
+    def _evaluate(self, state: PretrainState, best: Best | None, done: int) -> tuple[Best, Metrics]:
         """Every evaluation plays the same episodes in the same held-out worlds."""
         params = exported(self.env, self.config, state)
         with self.clock("evaluate"):
@@ -207,7 +212,7 @@ class _Run:
             if report is not None:
                 found |= numbers(stacking.member(report, i))
                 self._save_report(seed, stacking.member(report, i), i)
-            checkpoint.save_prior(self.home / "prior" / f"seed-{seed}", own.params, self._card(found))
+            save_prior(self.home / "prior" / f"seed-{seed}", Prior(own.params, self._card(found)))
             results.append(found)
         summary = {
             "task": self.env.name,
@@ -258,7 +263,7 @@ class _Run:
     def _film(self, played: Episode) -> str:
         """The first of the episodes [n] in the final worlds."""
         theta = self.final.theta.params[0, played.world[0]]
-        return film(self.env, theta, played.trace[0], self.folder / "videos" / f"seed-{self.seeds[0]}.mp4")
+        return film(self.env, theta, np.asarray(played.trace[0]), self.folder / "videos" / f"seed-{self.seeds[0]}.mp4")
 
     def _chosen(self, best: Best) -> dict[str, float]:
         """Which evaluation the prior is from, and what that evaluation said."""
@@ -273,7 +278,7 @@ class _Run:
         np.savez(self.folder / "report" / f"seed-{seed}.npz", allow_pickle=False, **report._asdict())
         if not some.size:
             return  # every trajectory exploded: there is nothing to draw
-        plot.pretraining(
+        figures.pretraining(
             self.folder / "figures" / f"seed-{seed}.png",
             title=f"pretraining {self.env.name}, preset {self.args.preset}, seed {seed}",
             steps=[line["step"] for line in curve],

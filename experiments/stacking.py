@@ -1,6 +1,6 @@
-"""Pytrees and functions with a leading axis of seeds. Pure."""
+"""Pytrees with a leading axis of seeds. Pure."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -26,14 +26,3 @@ def member(tree: PyTree, i: int | Array) -> PyTree:
 def part(tree: PyTree, i: int | Array, n: int) -> PyTree:
     """The i-th n of stacked pytrees."""
     return jax.tree.map(lambda x: x.reshape(-1, n, *x.shape[1:])[i], tree)
-
-
-def over_seeds(function: Callable[..., PyTree], seeds: int, *, shared: int = 0) -> Callable[..., PyTree]:
-    """`function` of one seed for arguments and results with a leading seeds axis; the first `shared` have none.
-
-    A single seed is not vmapped, because vmap would make a `cond` (resets, only where an episode ended) compute both of
-    its branches at every step.
-    """
-    if seeds > 1:
-        return lambda *args: jax.vmap(function, [None] * shared + [0] * (len(args) - shared))(*args)
-    return lambda *args: jax.tree.map(lambda x: x[None], function(*args[:shared], *member(args[shared:], 0)))

@@ -22,9 +22,9 @@ from experiments import cli, grid, tuned
 from experiments.finetune_args import with_settings
 from experiments.grid import Cell, GridArgs
 from experiments.options import prior_home, seed_list
-from experiments.results import area, read_curve
 from experiments.spaces import defaults, space_of
 from sgft_jax import extend
+from sgft_jax.analysis.curves import area, read_curve
 from sgft_jax.io import runs
 from sgft_jax.io.jsonfile import read_json
 from sgft_jax.io.log import SUMMARY
@@ -124,8 +124,11 @@ def score(trial: Trial, rollouts: int) -> Score | None:
     areas, finals = {}, []
     for cell in trial.cells:
         curve = read_curve(cell.folder)
-        areas[_name(*cell.args.real)] = area(curve, rollouts).tolist()
-        finals.append(curve.success[:, curve.rollouts <= rollouts][:, -1].mean())
+        inside = curve.rollouts <= rollouts
+        found = area(curve, curve.rollouts[inside])
+        assert found is not None  # a finished run has been evaluated twice at least
+        areas[_name(*cell.args.real)] = found.tolist()
+        finals.append(curve.values[:, inside][:, -1].mean())
     return Score(float(np.mean(list(areas.values()))), float(np.mean(finals)), areas)
 
 

@@ -75,21 +75,20 @@ def pretrain(
     """
     seeds = jnp.asarray(seeds, jnp.uint32)
     programs, pools = make_programs(env, config, seeds.shape[0]), pools or training_pools(env, config, seeds)
-    done = 0 if state is None else chunks_done(state, config)
-    number = set_number(config, done)
+    begun = 0 if state is None else chunks_done(state, config)
+    number = set_number(config, max(begun - 1, 0))
+    random = programs.collect(pools(0), _keys(seeds, _RANDOM)) if random is None else programs.spread_random(random)
     worlds = pools(number)
-    random = programs.collect(worlds, _keys(seeds, _RANDOM)) if random is None else programs.spread_random(random)
-    state = programs.begin(worlds, random, _keys(seeds, _START)) if state is None else programs.spread(state)
-    chunk = programs.chunk.lower(worlds, random, state).compile() if done < config.chunks else None
-    yield state, {}
-    while chunk is not None and done < config.chunks:
+    now = programs.begin(worlds, random, _keys(seeds, _START)) if state is None else programs.spread(state)
+    chunk: Any = programs.chunk.lower(worlds, random, now).compile() if begun < config.chunks else None
+    yield now, {}
+    for done in range(begun, config.chunks):
         if set_number(config, done) != number:
             number = set_number(config, done)
             worlds = pools(number)
-            state = programs.renew(worlds, state)
-        state, metrics = chunk(worlds, random, state)
-        done += 1
-        yield state, metrics
+            now = programs.renew(worlds, now)
+        now, metrics = chunk(worlds, random, now)
+        yield now, metrics
 
 
 def collect_random(env: Env, config: PretrainConfig, seeds: Sequence[int] | Array, worlds: World) -> PyTree:
@@ -114,6 +113,7 @@ def training_pools(
     """Pools of `config.worlds` worlds each, drawn from a domain (default: the task's training domain) by each seed."""
     domain = domain or uniform(env)
 
+    @functools.lru_cache(maxsize=1)  # worlds take long to compile
     def pools(number: int) -> World:
         keys = world_keys(seeds, number)
         return _stack([env.make_worlds(domain.sample(domain.init(), key, config.worlds)) for key in keys])

@@ -279,7 +279,7 @@ class Method(NamedTuple):
     family: Family
     description: str
     source: str
-    config: Callable[..., Any]
+    config: type[Any]
     build: Callable[[Any, Prior | None, Task], Finetuner]
     prior: Algorithm = "sac"
     needs_prior: bool = True

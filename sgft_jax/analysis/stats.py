@@ -1,35 +1,24 @@
-"""Statistics over seeds and episodes: interquartile mean, bootstrap intervals, success intervals, curve summaries.
+"""Statistics over seeds and episodes: interquartile means, bootstrap intervals, success intervals, comparisons.
 
 Pure functions of NumPy arrays; nothing here runs under jit.
 """
 
-from typing import Literal, NamedTuple
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-# A mean over seeds that is 0.9 in exact arithmetic is often a little less in floating point.
-_ROUNDING = 1e-9
+ENOUGH = 3  # members (seeds or priors) below which a bootstrap interval says nothing about spread
 
 
 class Interval(NamedTuple):
-    """An estimate with its confidence bounds; floats or arrays of one shape."""
+    """An estimate with its confidence bounds: floats or arrays of one shape; bounds are nan where nothing is known."""
 
     estimate: np.ndarray
     low: np.ndarray
     high: np.ndarray
-
-
-class Censored(NamedTuple):
-    """A statistic of runs of which some may have ended before they could tell.
-
-    least, most: what it is if all that was not seen is as small as it can be, and as large; equal where it is known. A
-    lower bound has most = inf, an upper bound least = 0, and of nothing at all is known [0, inf].
-    """
-
-    least: Interval
-    most: Interval
 
 
 def iqm(scores: ArrayLike, *, axis: int = 0) -> np.ndarray:
@@ -40,31 +29,66 @@ def iqm(scores: ArrayLike, *, axis: int = 0) -> np.ndarray:
     return np.asarray(stats.trim_mean(np.asarray(scores, np.float64), 0.25, axis=axis))
 
 
-def iqm_interval(scores: ArrayLike, *, level: float = 0.95, resamples: int = 2000, seed: int = 0) -> Interval:
-    """IQM over seeds with its percentile-bootstrap interval, pointwise along a curve.
+def mean(scores: ArrayLike, *, axis: int = 0) -> np.ndarray:
+    """The mean, as a statistic for `bootstrap_interval`."""
+    return np.asarray(scores, np.float64).mean(axis)
 
-    scores: [n_seeds] or [n_seeds, ...points], finite. The percentile method (that of rliable) gives a band of no
-    width where all seeds agree. One seed says nothing about spread: the bounds are then nan. Raises ValueError if
-    there is no seed or a score is not finite.
+
+def bootstrap_interval(
+    scores: ArrayLike,
+    *,
+    statistic: Callable[..., np.ndarray] = iqm,
+    priors: ArrayLike | None = None,
+    strata: ArrayLike | None = None,
+    level: float = 0.95,
+    resamples: int = 2000,
+    seed: int = 0,
+) -> Interval:
+    """A statistic over members with its percentile-bootstrap interval, pointwise along a curve.
+
+    scores: [members] or [members, ...points], finite. priors: [members], the prior that each member began from; the
+    prior is then the random factor: each resample draws priors, and then members of each drawn prior (hierarchical
+    bootstrap). strata: [members], such as the task of each; each resample draws within each of them (stratified
+    bootstrap, that of rliable). The bounds are nan for fewer than `ENOUGH` members, or fewer than `ENOUGH` priors: so
+    few cannot show how much others would differ. Raises ValueError if there is no member or a score is not finite.
     """
     scores = np.asarray(scores, np.float64)
     if scores.shape[0] == 0 or not np.isfinite(scores).all():
         raise ValueError("scores need at least one seed and finite values")
-    estimate = iqm(scores)
-    if scores.shape[0] == 1:
+    estimate = statistic(scores)
+    units = scores.shape[0] if priors is None else len(np.unique(priors))
+    if units < ENOUGH:
         return Interval(estimate, np.full_like(estimate, np.nan), np.full_like(estimate, np.nan))
-    bounds = stats.bootstrap(
-        (scores,),
-        iqm,
-        axis=0,
-        vectorized=True,
-        n_resamples=resamples,
-        batch=100,
-        confidence_level=level,
-        method="percentile",
-        rng=np.random.default_rng(seed),
-    ).confidence_interval
-    return Interval(estimate, np.asarray(bounds.low), np.asarray(bounds.high))
+    drawn = _draws(np.random.default_rng(seed), scores.shape[0], resamples, priors=priors, strata=strata)
+    values = np.concatenate(
+        [statistic(scores[some], axis=1) for some in np.array_split(drawn, max(resamples // 200, 1))]
+    )
+    low, high = np.quantile(values, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    return Interval(estimate, low, high)
+
+
+def difference_interval(
+    above: ArrayLike, below: ArrayLike, *, priors: ArrayLike | None = None, level: float = 0.95
+) -> Interval:
+    """Mean paired difference of two methods' scores with its bootstrap interval.
+
+    above, below: [members], member i of both from the same prior with the same seed, so that what makes it easy or hard
+    does so for both. priors: as for `bootstrap_interval`. Raises ValueError if the numbers of members differ.
+    """
+    above, below = np.asarray(above, np.float64), np.asarray(below, np.float64)
+    if above.shape != below.shape:
+        raise ValueError(f"paired methods need the same members, not {len(above)} and {len(below)} of them")
+    return bootstrap_interval(above - below, statistic=mean, priors=priors, level=level)
+
+
+def probability_of_improvement(above: ArrayLike, below: ArrayLike) -> float:
+    """Probability that a random member of one method scores higher than one of another; ties count half.
+
+    above, below: [members] of either, not necessarily equally many. Source: Agarwal et al. 2021 (Mann-Whitney U).
+    """
+    above, below = np.asarray(above, np.float64), np.asarray(below, np.float64)
+    found: Any = stats.mannwhitneyu(above, below, method="asymptotic")
+    return float(found.statistic) / (len(above) * len(below))
 
 
 def success_interval(
@@ -75,127 +99,24 @@ def success_interval(
     return Interval(np.asarray(successes / trials), np.asarray(bounds.low), np.asarray(bounds.high))
 
 
-def transitions_to(transitions: ArrayLike, success: ArrayLike, threshold: float) -> int | None:
-    """Real transitions used at the first evaluation whose success is at least `threshold`; None if there is none.
-
-    transitions, success: [n_evaluations], in order; later drops below the threshold do not count against it.
-    """
-    reached = np.asarray(success, np.float64) >= threshold - _ROUNDING
-    return int(np.asarray(transitions)[np.argmax(reached)]) if reached.any() else None
-
-
-def transitions_interval(
-    transitions: ArrayLike,
-    success: ArrayLike,
-    threshold: float,
-    *,
-    level: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
-) -> Censored:
-    """`transitions_to` of the mean over seeds, with its percentile-bootstrap interval over seeds.
-
-    transitions: [n_evaluations], in order. success: [n_seeds, n_evaluations]. A mean that never gets there needs at
-    least the last of `transitions`, at most inf. Bounds are evaluations, not points between them; of one seed, nan.
-    """
-    success = np.asarray(success, np.float64)
-    weights = _resampled(np.random.default_rng(seed), success.shape[0], resamples)
-    needs = _needs(transitions, success, threshold, weights)
-    return Censored(*(_percentiles(each, level, seeds=success.shape[0]) for each in needs))
+def _draws(
+    rng: np.random.Generator, members: int, resamples: int, *, priors: ArrayLike | None, strata: ArrayLike | None
+) -> np.ndarray:
+    """[resamples, drawn] members of each resample."""
+    if priors is not None and strata is not None:
+        raise ValueError("a bootstrap draws by priors or by strata, not by both")
+    if priors is not None:
+        groups = _groups(priors)
+        size = -(-members // len(groups))  # of each drawn prior, so that a resample is about as large as the data
+        table = np.stack([rng.choice(group, (resamples, len(groups), size)) for group in groups])
+        drawn = rng.integers(len(groups), size=(resamples, len(groups)))
+        rows, places = np.arange(resamples)[:, None], np.arange(len(groups))
+        return table[drawn, rows, places].reshape(resamples, -1)
+    groups = _groups(np.zeros(members) if strata is None else strata)
+    return np.concatenate([rng.choice(group, (resamples, len(group))) for group in groups], axis=1)
 
 
-def ratio_interval(
-    numerator: tuple[ArrayLike, ArrayLike],
-    denominator: tuple[ArrayLike, ArrayLike],
-    threshold: float,
-    *,
-    paired: bool,
-    level: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
-) -> Censored:
-    """The transitions of one method over those of another, as of `transitions_interval`, with its interval.
-
-    numerator, denominator: (transitions [n], success [n_seeds, n]) of either. paired: they have the same seeds, which
-    are resampled together, else each has its own. Raises ValueError if paired ones differ in number.
-
-    A resample in which the numerator never gets to the threshold says how large the ratio is at least, one in which the
-    denominator never does how large at most. If neither does the ratio may be anything from 0 to inf, and so it is
-    taken if one is there from the start, where nothing was to be learned. Such resamples stay: without them only those
-    of fast seeds would count. So `least.low` and `most.high` enclose the interval that longer runs would have given.
-    """
-    seeds = (np.shape(numerator[1])[0], np.shape(denominator[1])[0])
-    weights, own = _resampled_both(np.random.default_rng(seed), seeds, resamples, paired=paired)
-    above_least, above_most = _needs(*numerator, threshold, weights)
-    below_least, below_most = _needs(*denominator, threshold, own)
-    tells = (above_least > 0) & (below_least > 0)
-    ratios = (
-        np.divide(above_least, below_most, out=np.zeros_like(above_least), where=tells),
-        np.divide(above_most, below_least, out=np.full_like(above_most, np.inf), where=tells),
-    )
-    return Censored(*(_percentiles(each, level, seeds=min(seeds)) for each in ratios))
-
-
-def difference_interval(
-    above: ArrayLike, below: ArrayLike, *, paired: bool, level: float = 0.95, resamples: int = 2000, seed: int = 0
-) -> Interval:
-    """Mean over seeds of one method's scores minus that of another's, with its percentile-bootstrap interval.
-
-    above, below: [n_seeds] of either. paired: as in `ratio_interval`. Of one seed the bounds are nan.
-    """
-    above, below = np.asarray(above, np.float64), np.asarray(below, np.float64)
-    weights, own = _resampled_both(np.random.default_rng(seed), (len(above), len(below)), resamples, paired=paired)
-    differences = weights @ above / len(above) - own @ below / len(below)
-    return _percentiles(differences, level, seeds=min(len(above), len(below)))
-
-
-def _resampled_both(
-    rng: np.random.Generator, seeds: tuple[int, int], resamples: int, *, paired: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """`_resampled` of either method, the same if they are paired; raises ValueError if such ones differ in number."""
-    if paired and seeds[0] != seeds[1]:
-        raise ValueError(f"paired methods need the same seeds, not {seeds[0]} and {seeds[1]} of them")
-    weights = _resampled(rng, seeds[0], resamples)
-    return weights, weights if paired else _resampled(rng, seeds[1], resamples)
-
-
-def _resampled(rng: np.random.Generator, seeds: int, resamples: int) -> np.ndarray:
-    """[1 + resamples, seeds] how often each seed is drawn: once in the first row, which is that of the estimate."""
-    return np.vstack([np.ones(seeds), rng.multinomial(seeds, np.full(seeds, 1 / seeds), size=resamples)])
-
-
-def _needs(
-    transitions: ArrayLike, success: ArrayLike, threshold: float, weights: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the most transitions until the mean is at the threshold, [resamples] each."""
-    transitions, success = np.asarray(transitions, np.float64), np.asarray(success, np.float64)
-    reached = weights @ success / success.shape[0] >= threshold - _ROUNDING
-    least = np.where(reached.any(1), transitions[np.argmax(reached, axis=1)], transitions[-1])
-    return least, np.where(reached.any(1), least, np.inf)
-
-
-def _percentiles(values: np.ndarray, level: float, *, seeds: int) -> Interval:
-    """The first value with percentiles of the others, which are values themselves: nothing lies halfway to inf."""
-    if seeds == 1:
-        return Interval(values[0], np.asarray(np.nan), np.asarray(np.nan))
-    ordered = np.sort(values[1:])
-    outside = int(len(ordered) * (1 - level) / 2)
-    return Interval(values[0], ordered[outside], ordered[-1 - outside])
-
-
-def area_under(transitions: ArrayLike, success: ArrayLike) -> np.ndarray:
-    """Mean success over the real transitions of a curve, from 0 to 1: its area by trapezoids over its length.
-
-    transitions: [n], increasing, n > 1. success: [..., n]. Returns [...]: high where learning is early and lasts.
-    """
-    transitions = np.asarray(transitions, np.float64)
-    return np.trapezoid(np.asarray(success, np.float64), transitions) / (transitions[-1] - transitions[0])
-
-
-def first_dip(success: ArrayLike) -> float:
-    """How far fine-tuning fell below where it started: zero-shot success minus the lowest of the curve.
-
-    success: [n_evaluations], the zero-shot evaluation first. Never negative, as the curve contains its start.
-    """
-    success = np.asarray(success, np.float64)
-    return float(success[0] - success.min())
+def _groups(labels: ArrayLike) -> list[np.ndarray]:
+    """The members of each label."""
+    labels = np.asarray(labels)
+    return [np.flatnonzero(labels == label) for label in np.unique(labels)]

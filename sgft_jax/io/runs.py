@@ -21,9 +21,12 @@ from sgft_jax.io.jsonfile import read_json, write_json
 from sgft_jax.types import UserError
 
 CONFIG, PROVENANCE = "config.json", "provenance.json"
-ROOT = Path(__file__).parent.parent  # of the repository, in a checkout
+ROOT = Path(__file__).parents[2]  # of the repository, in a checkout
 _LOCK = ".lock"
 _MARK = "sgft_jax"
+FORMAT = 2  # of run folders; a state saved by another format does not fit the code of this one
+# What a start has to show for itself; one that has failed before any of it is there can be forgotten.
+_RESULTS = ("checkpoints/[0-9]*", "real/*.npz", "prior/*", "policy/*", "summary.json")
 _PACKAGES = ("sgft-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
@@ -119,9 +122,9 @@ def open_runs(
     any.
     """
     inputs = inputs or {}
-    if resume and overwrite:
-        raise UserError("--resume and --overwrite exclude each other: keep the run or replace it")
-    existing = [_exists(folder, resume=resume, overwrite=overwrite, say=say) for folder in configs]
+    for folder in configs:
+        say(f"run folder: {folder}")
+    existing = [check_start(folder, resume=resume, overwrite=overwrite) for folder in configs]
     runs: list[Run] = []
     try:
         for (folder, config), there in zip(configs.items(), existing, strict=True):
@@ -135,7 +138,7 @@ def open_runs(
             run.close()  # the traceback would keep the locks alive
         raise
     for run, config, there in zip(runs, configs.values(), existing, strict=True):
-        if there and overwrite:
+        if there and not resume:
             _empty(run.folder)
         _record(run, kind, config, inputs)
     return runs
@@ -198,9 +201,19 @@ def _git_state(root: Path) -> dict[str, Any] | None:
 # ---------------------------------------------------------------- the folder
 
 
-def _exists(folder: Path, *, resume: bool, overwrite: bool, say: Callable[[str], None]) -> bool:
-    """Whether the folder holds a run already; raises UserError if that is not what was asked for."""
-    say(f"run folder: {folder}")
+def check_start(folder: Path, *, resume: bool, overwrite: bool) -> bool:
+    """Whether a run folder holds an earlier start; raises UserError if that is not what was asked for.
+
+    Commands call it before anything slow. A start that failed before it left a checkpoint, a real rollout or a result
+    does not count and is replaced.
+    """
+    if resume and overwrite:
+        raise UserError("--resume and --overwrite exclude each other: keep the run or replace it")
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise UserError(f"{folder}: cannot be made, {there} is a file; choose another --out")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise UserError(f"{folder}: cannot be written, you may not write to {there}; choose another --out")
     # A process killed while it made the folder leaves hidden files at most: nothing started yet.
     existing = folder.exists() and any(not p.name.startswith(".") for p in folder.iterdir())
     if existing:
@@ -213,7 +226,7 @@ def _exists(folder: Path, *, resume: bool, overwrite: bool, say: Callable[[str],
 def _record(run: Run, kind: str, config: Mapping[str, Any], inputs: Mapping[str, Any]) -> None:
     """Write down the start with what it begins with, and the configuration if it is the first one."""
     if not run.resumed:
-        write_json(run.folder / CONFIG, {_MARK: _version("sgft-jax"), "kind": kind, "config": config})
+        write_json(run.folder / CONFIG, {_MARK: _version("sgft-jax"), "format": FORMAT, "kind": kind, "config": config})
     write_json(run.folder / PROVENANCE, {"starts": [*_starts(run.folder), {**provenance(), **inputs}]})
 
 
@@ -233,11 +246,11 @@ def _check_inputs(folder: Path, inputs: Mapping[str, Any]) -> None:
 
 
 def _check_ours(folder: Path, *, resume: bool, overwrite: bool) -> None:
-    if not (resume or overwrite):
-        raise UserError(f"{folder}: exists already; continue it with --resume or replace it with --overwrite")
     stored = _stored(folder) if (folder / CONFIG).exists() else {}
     if _MARK not in stored:
         raise UserError(f"{folder}: is not a run folder (it has no {CONFIG} of ours); choose another one")
+    if not (resume or overwrite) and any(path for pattern in _RESULTS for path in folder.glob(pattern)):
+        raise UserError(f"{folder}: exists already; continue it with --resume or replace it with --overwrite")
 
 
 def _stored(folder: Path) -> dict[str, Any]:
@@ -253,6 +266,11 @@ def check_same(folder: Path, kind: str, wanted: Mapping[str, Any], volatile: tup
     wanted: JSON data. volatile: dotted names that may differ.
     """
     stored = _stored(folder)
+    if (found := stored.get("format", 1)) != FORMAT:
+        raise UserError(
+            f"{folder}: is a run of sgft_jax {stored[_MARK]} in format {found}; this version continues format {FORMAT} "
+            "alone. Begin again with --overwrite"
+        )
     if stored["kind"] != kind:
         raise UserError(f"{folder}: is a {stored['kind']} run, not a {kind} run")
     differing = [d for d in differences(stored["config"], wanted) if d[0] not in volatile]

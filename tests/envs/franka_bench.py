@@ -53,7 +53,7 @@ def theta_of(scene, rng):
 
 
 def push_hard(obs):
-    """[2]: what brings a puck to the edge, see `accuracy.push_puck`."""
+    """[2]: what brings a puck to the edge, see `scripted.push_puck`."""
     off = obs[2:] - obs[:2]
     ahead = jnp.where(jnp.abs(off[1]) > 0.01, 0.0, push.EDGE - push.TOLERANCE / 2 - obs[2])
     return jnp.clip(jnp.stack([ahead, off[1]]) / push.STEP, -1.0, 1.0)

@@ -1,5 +1,4 @@
 import dataclasses
-import time
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,6 @@ from experiments.memory import reserve
 from experiments.options import seed_list, seeds_name
 from sgft_jax.io import checkpoint
 from sgft_jax.io.config import config_to_json
-from sgft_jax.io.log import Clock
 from sgft_jax.learners.sac import SACConfig, extract_prior, make_sac
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.types import UserError
@@ -107,16 +105,6 @@ def test_pools_of_different_size_are_brought_to_one(key):
     assert pools.theta.params.shape == (2, 5, 2) and len(np.unique(pools.theta.params[1, :, 0])) == 5
     np.testing.assert_allclose(pools.theta.effects.high.latency, [[0.05] * 5, [0.0] * 5])
     assert real_worlds(env, [fixed, fixed], key, 5).theta.params.shape == (2, 1, 2)
-
-
-def test_clock_adds_up():
-    clock = Clock()
-    clock.seconds = {"train": 10.0}
-    for phase in ("train", "evaluate"):
-        with clock(phase):
-            time.sleep(0.02)
-    times = clock.record()
-    assert 10.02 <= times["time/train_s"] < 11 and 0.02 <= times["time/evaluate_s"] < 1
 
 
 def test_a_budget_that_does_not_fit_names_the_largest_part(monkeypatch, capsys):

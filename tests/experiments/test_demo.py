@@ -7,7 +7,7 @@ from runs_by_hand import save
 
 import envs
 from experiments import demo
-from experiments.comparison import read_comparison
+from sgft_jax.analysis.curves import read_runs
 from sgft_jax.types import UserError
 
 
@@ -62,13 +62,13 @@ def test_the_outcome_is_said_in_a_few_lines(tmp_path):
     for method, end in (("sgft-sac", 0.9), ("sac", 0.2)):
         save(tmp_path, method, [[0.0, 0.0], [end, end]], rollouts=[0, 5])
     save(tmp_path, "sgft-mpc", [[0.0, 0.0], [0.5, 0.5], [1.0, 1.0]], rollouts=[0, 1, 5])  # learns from the first on
-    said = demo.outcome(read_comparison(tmp_path / "finetune/toy/default")).splitlines()
+    said = demo.outcome(read_runs(tmp_path).curves).splitlines()
     assert said[2:] == [
         "| method | zero-shot | 1 rollout | 5 rollouts |",
         "| --- | --- | --- | --- |",
-        "| sgft-sac | 0 [0, 0] | - | 90 [90, 90] |",
-        "| sgft-mpc | 0 [0, 0] | 50 [50, 50] | 100 [100, 100] |",
-        "| sac | 0 [0, 0] | - | 20 [20, 20] |",
+        "| sac | 0 | - | 20 |",
+        "| sgft-mpc | 0 | 50 | 100 |",
+        "| sgft-sac | 0 | - | 90 |",
     ]
 
 

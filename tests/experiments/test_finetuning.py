@@ -19,7 +19,8 @@ import envs
 from experiments import cli, evaluate, finetune, finetuning, video
 from experiments.evaluation import play_episodes
 from sgft_jax.io import checkpoint, runs
-from sgft_jax.io.log import RealLog, read_jsonl
+from sgft_jax.io.log import read_jsonl
+from sgft_jax.io.real import RealStore
 from sgft_jax.methods import FinetuneConfig, get_method
 from sgft_jax.types import UserError
 
@@ -120,9 +121,10 @@ def test_a_run_leaves_curve_summary_policies_and_every_rollout(home, method):
     assert [line["rollouts"] for line in read_jsonl(folder / "metrics.jsonl")] == [2, 3, 4, 5]
     assert all(len(line["success"]) == 2 for line in curve)
     summary = json.loads((folder / "summary.json").read_text())
-    assert set(summary) == {"task", "method", "impl", "gap", "zero_shot", "final", "dip", "to_90", "to_98", "seeds"}
+    numbers = {"zero_shot", "final", "deepest_fall", "transitions_until_held", "seeds"}
+    assert set(summary) == {"task", "method", "impl", "gap", *numbers}
     assert summary["gap"]["effects"] == {"action_rotation": 0.52} and summary["final"]["transitions"] == 100
-    rollouts = RealLog(folder).load()
+    rollouts = RealStore(folder).load()
     assert len(rollouts) == 5 and rollouts[0]["obs"].shape == (2, 20, 4) and rollouts[0]["valid"].all()
     assert (folder / "figures/success.png").stat().st_size > 10_000
 
@@ -135,7 +137,7 @@ def test_methods_that_learn_from_the_simulator_too(home, method, capsys):
     offline = ["--options.offline-updates", "20"] if method == "iql" else []
     call(argv(home, method, "--options.simulated-transitions", "390", *offline))
     assert "simulated: 40 episodes, returns from -" in capsys.readouterr().out  # 20 steps each, two priors
-    mine, others = (RealLog(home / f"finetune/toy/turned/{name}/seeds-0-1").load() for name in (method, "sac"))
+    mine, others = (RealStore(home / f"finetune/toy/turned/{name}/seeds-0-1").load() for name in (method, "sac"))
     for i in range(2):
         np.testing.assert_allclose(mine[i]["obs"], others[i]["obs"], atol=1e-5)
     assert not np.allclose(mine[2]["obs"], others[2]["obs"], atol=1e-2)
@@ -187,7 +189,7 @@ def test_a_planner_leaves_priors_that_plan(home):
 
 
 def test_all_methods_meet_the_same_real_starts(home):
-    ours, theirs = (RealLog(run(home, method)).load() for method in ("sgft-sac", "sac"))
+    ours, theirs = (RealStore(run(home, method)).load() for method in ("sgft-sac", "sac"))
     for i, (a, b) in enumerate(zip(ours, theirs, strict=True)):
         np.testing.assert_array_equal(a["obs"][:, 0], b["obs"][:, 0])
         assert np.array_equal(a["action"], b["action"]) == (i < 2)  # the initial rollouts are those of the prior
@@ -211,12 +213,12 @@ def test_killed_and_resumed_is_bit_for_bit_uninterrupted(home, tmp_path, method)
     killed(PROGRAM, arguments)
     cut = tmp_path / "finetune/toy/turned" / method / "seeds-0-1"
     assert checkpoint.latest(cut) == 4
-    assert len(read_jsonl(cut / "metrics.jsonl")) == 4 and len(RealLog(cut)) == 5
+    assert len(read_jsonl(cut / "metrics.jsonl")) == 4 and len(RealStore(cut)) == 5
 
     call([*arguments, "--resume"])
     for name in ("metrics.jsonl", "eval.jsonl", "summary.json"):
         assert (cut / name).read_bytes() == (run(home, method) / name).read_bytes()
-    assert len(RealLog(cut)) == 5
+    assert len(RealStore(cut)) == 5
     assert len(list(cut.glob("real/superseded-0/*.npz"))) == 1  # what the robot did is kept
 
 
@@ -263,7 +265,7 @@ def test_a_rollout_is_on_disk_before_learning_from_it(home, tmp_path, monkeypatc
     monkeypatch.setattr(finetune, "make_program", lambda *a, **k: make(*a, **k)._replace(learn=crash))
     with pytest.raises(RuntimeError, match="the learner died"):
         call(argv(home, "sac", out=tmp_path))
-    real = RealLog(tmp_path / "finetune/toy/turned/sac/seeds-0-1").load()
+    real = RealStore(tmp_path / "finetune/toy/turned/sac/seeds-0-1").load()
     assert len(real) == 2 and np.isfinite(real[1]["reward"]).all()
 
 
@@ -326,7 +328,7 @@ def files(folder):
 
 def agree(one, two, upto):
     """The same starts and rollouts, and, up to the rounding of updates, metrics and evaluations."""
-    for a, b in zip(RealLog(one).load()[:upto], RealLog(two).load()[:upto], strict=True):
+    for a, b in zip(RealStore(one).load()[:upto], RealStore(two).load()[:upto], strict=True):
         np.testing.assert_array_equal(a["obs"][:, 0], b["obs"][:, 0])
         np.testing.assert_allclose(a["trace"], b["trace"], atol=1e-3)
     for name in ("metrics.jsonl", "eval.jsonl"):

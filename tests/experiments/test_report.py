@@ -3,25 +3,26 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
-from sgft_jax.players import sac_player
 
 import envs
 from experiments.report import make_report, numbers
-from sgft_jax.learners.sac import SACConfig, extract_prior, make_sac
+from sgft_jax.learners.sac import SACConfig, extract_params, make_sac
 from sgft_jax.models.networks import NetworkConfig
+from sgft_jax.policies import sac_policy
 
 NETWORK = NetworkConfig(hidden=(4,))
 
 
 def reported(env, *, dynamics_bias=0.0, value_bias=0.0):
     """Report of a prior whose networks are zero but for the biases of value and model; gamma 0.5, 3 trajectories."""
-    prior = extract_prior(make_sac(SACConfig(4, 2, network=NETWORK, ensemble_size=2)).init(jax.random.key(0)))
-    prior = prior.replace(value=jax.tree.map(jnp.zeros_like, prior.value))
-    prior = prior.replace(dynamics=jax.tree.map(jnp.zeros_like, prior.dynamics))
+    prior = extract_params(make_sac(SACConfig(4, 2, network=NETWORK, ensemble_size=2)).init(jax.random.key(0)))
+    prior = prior._replace(
+        **{name: jax.tree.map(jnp.zeros_like, getattr(prior, name)) for name in ("value", "dynamics")}
+    )
     prior.value["Dense_1"]["bias"] += value_bias
     prior.dynamics["Dense_1"]["bias"] += dynamics_bias
     pool = envs.sample_worlds(env, jax.random.key(1), 2, effects={"obs_noise": 0.0})
-    report = make_report(env, sac_player(4, 2, NETWORK), pool, prior, jax.random.key(2), gamma=0.5, trajectories=3)
+    report = make_report(env, sac_policy(4, 2, NETWORK), pool, prior, jax.random.key(2), gamma=0.5, trajectories=3)
     return jax.tree.map(np.asarray, report)
 
 

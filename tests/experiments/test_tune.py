@@ -260,4 +260,4 @@ def test_tuned_runs_on_a_point_mass(tmp_path, monkeypatch):
     (cell,) = compare.cells(compare.CompareArgs(tuned=True, reals=(real,), out=tmp_path, **sizes))
     assert cell.state == "finished" and checkpoint.latest(cell.folder) == 2
     assert json.loads((cell.folder / "config.json").read_text())["config"]["utd"] == result["options"]["utd"]
-    assert "| sac_tuned | 2 |" in (tmp_path / "figures/results.md").read_text()
+    assert "| sac tuned | 2 |" in (tmp_path / "figures/tables.md").read_text()

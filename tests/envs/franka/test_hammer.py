@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from scripted import PROBES, as_params, measure, play_script, reference_steps
 
 from envs.franka import arm, hammer, host
-from experiments.accuracy import PROBES, as_params, measure, play_script, reference_steps
 
 NOMINAL = {p.name: p.nominal for p in hammer.PARAMETERS}
 PROBE = PROBES["hammer"]

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from scripted import PROBES, as_params, measure, play_script, reference_steps, sample_theta
 
 from envs.franka import arm, host, insert, kinematics
-from experiments.accuracy import PROBES, as_params, measure, play_script, reference_steps, sample_theta
 
 NOMINAL = {p.name: p.nominal for p in insert.PARAMETERS}
 PROBE = PROBES["insert"]

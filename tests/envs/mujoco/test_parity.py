@@ -13,12 +13,12 @@ import mujoco
 import numpy as np
 import pytest
 from franka_bench import EXACT, SCENES, bench, member
+from scripted import PROBES, play_script
 
 import envs
 from envs.franka import insert
 from envs.mujoco import host
 from envs.mujoco.scene import make_env
-from experiments.accuracy import PROBES, play_script
 
 KEY = jax.random.key(0)
 

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 from franka_bench import EXACT, SCENES, push_hard, theta_of
+from scripted import PROBES
 
 import envs
 from envs.franka import arm, ball, push, towel
@@ -15,7 +16,6 @@ from envs.franka.workcell import at_rest
 from envs.mujoco.engines import c as engine_c
 from envs.mujoco.engines import warp as engine_warp
 from envs.mujoco.scene import make_env
-from experiments.accuracy import PROBES
 
 pytest.importorskip("warp")
 WORLDS, STEPS = 3, 24

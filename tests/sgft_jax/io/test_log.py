@@ -1,14 +1,11 @@
-import io
 import json
-import os
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from rich.console import Console
 
 from sgft_jax.io import log
-from sgft_jax.io.log import MetricsLog, RealLog, RunProgress, read_jsonl, write_summary
+from sgft_jax.io.log import DivergedError, MetricsLog, check_finite, read_jsonl, write_summary
 from sgft_jax.types import UserError
 
 # ---------------------------------------------------------------- metrics
@@ -93,123 +90,26 @@ def test_summary(tmp_path):
     assert json.loads(path.read_text()) == {"success": 0.75, "never": None}
 
 
-# ---------------------------------------------------------------- real rollouts
-
-
-def rollout(number, length=3):
-    return {
-        "obs": np.full((length, 2), number, np.float32),
-        "truncated": np.arange(length) == length - 1,
-        "reward": jnp.ones(length) * number,
-    }
-
-
-def numbers(rollouts):
-    return [int(r["obs"][0, 0]) for r in rollouts]
-
-
-def test_rollouts_come_back_in_order_with_their_dtypes(tmp_path):
-    stored = RealLog(tmp_path)
-    assert [stored.append(rollout(n, length=n + 1)) for n in range(12)] == list(range(12))
-    again = RealLog(tmp_path)
-    assert len(again) == 12
-    loaded = again.load()
-    assert numbers(loaded) == list(range(12))
-    assert loaded[3]["obs"].shape == (4, 2) and loaded[3]["obs"].dtype == np.float32
-    assert loaded[3]["truncated"].dtype == bool
-
-
-def test_rollouts_are_on_disk_before_append_returns(tmp_path, monkeypatch):
-    synced = []
-    real_fsync = os.fsync
-    monkeypatch.setattr(os, "fsync", lambda handle: synced.append(os.fstat(handle).st_size) or real_fsync(handle))
-    RealLog(tmp_path).append(rollout(0))
-    data, _ = synced  # the file, then its folder
-    assert data == (tmp_path / "real" / "rollout-000000.npz").stat().st_size
-
-
-def test_resume_moves_later_rollouts_aside(tmp_path):
-    stored = RealLog(tmp_path)
-    for n in range(5):
-        stored.append(rollout(n))
-    assert stored.truncate(5) is None
-    assert stored.truncate(3) == tmp_path / "real" / "superseded-0"
-    assert stored.append(rollout(30)) == 3
-    assert stored.truncate(3) == tmp_path / "real" / "superseded-1"
-    assert numbers(stored.load()) == [0, 1, 2]
-    aside = sorted(str(p.relative_to(tmp_path / "real")) for p in tmp_path.glob("real/superseded-*/*"))
-    assert aside == [
-        "superseded-0/rollout-000003.npz",
-        "superseded-0/rollout-000004.npz",
-        "superseded-1/rollout-000003.npz",
-    ]
-    with pytest.raises(UserError, match="holds 3 rollouts, the checkpoint remembers 4"):
-        stored.truncate(4)
-
-
-def test_damaged_missing_and_half_written_rollouts(tmp_path):
-    stored = RealLog(tmp_path)
-    for n in range(3):
-        stored.append(rollout(n))
-    (tmp_path / "real" / "rollout-000003.tmp").write_bytes(b"half")  # killed while writing
-    assert numbers(stored.load()) == [0, 1, 2]
-    os.truncate(tmp_path / "real" / "rollout-000001.npz", 100)
-    with pytest.raises(UserError, match=r"rollout-000001.npz: damaged"):
-        stored.load()
-    (tmp_path / "real" / "rollout-000001.npz").unlink()
-    with pytest.raises(UserError, match="rollout 1 is missing"):
-        stored.load()
-
-
-def test_nothing_is_pickled(tmp_path):
-    stored = RealLog(tmp_path)
-    with pytest.raises(TypeError, match="info"):
-        stored.append({"obs": np.ones(2), "info": [{}, None]})
-    np.savez(tmp_path / "real" / "rollout-000000.npz", obs=np.array([{}, None], dtype=object))
-    with pytest.raises(UserError, match="allow_pickle=False"):
-        stored.load()
-
-
-# ---------------------------------------------------------------- progress
-
-
-class Clock:
-    def __init__(self):
-        self.now = 100.0
-
-    def monotonic(self):
-        return self.now
-
-
-def test_plain_lines_give_rate_and_time_left(monkeypatch):
-    """100 steps in 2 s: 50 steps/s, the 500 left take 10 s; 100 more in 8 s: 20 steps/s, the 400 left take 20 s."""
-    clock = Clock()
-    monkeypatch.setattr(log, "time", clock)
-    console = Console(file=io.StringIO(), width=40, soft_wrap=True)
-    with RunProgress("pretrain", total=1000, done=400, console=console) as progress:
-        clock.now += 2
-        progress.advance(100, {"success": 0.25})
-        clock.now += 8
-        progress.advance(100)
-        progress.say("checkpoint [1]")
-    assert console.file.getvalue().splitlines() == [
-        "pretrain: 500/1,000 steps (50 %), 50 steps/s, 0:00:10 left  success 0.25",
-        "pretrain: 600/1,000 steps (60 %), 20 steps/s, 0:00:20 left",
-        "checkpoint [1]",
-    ]
-
-
-def test_live_bar_on_a_terminal():
-    console = Console(file=io.StringIO(), width=120, force_terminal=True)
-    with RunProgress("finetune", total=100, unit="transitions", console=console) as progress:
-        progress.advance(40, {"success": 0.5})
-        progress.say("hello")
-    written = console.file.getvalue()
-    assert "40/100 transitions" in written and "success 0.5" in written and "hello" in written
+# ---------------------------------------------------------------- numbers that are not finite
 
 
 @pytest.mark.parametrize(
-    ("seconds", "shown"), [(0, "0:00:00"), (59.6, "0:01:00"), (3661, "1:01:01"), (90000, "25:00:00")]
+    ("value", "members"),
+    [
+        (float("nan"), ""),
+        (jnp.array([1.0, jnp.inf, 2.0]), " of 1 of 3 members"),
+        (np.array([-np.inf, np.nan]), " of 2 of 2 members"),
+    ],
 )
-def test_durations(seconds, shown):
-    assert log._duration(seconds) == shown
+def test_a_metric_that_is_not_finite_stops_the_run_in_one_line(tmp_path, value, members):
+    with pytest.raises(DivergedError) as stopped:
+        check_finite({"actor/loss": 1.0, "critic/loss": value}, 1200, unit="rollouts", last_good=tmp_path / "10")
+    said = str(stopped.value)
+    assert said.startswith(f"training has diverged: critic/loss{members} is not finite after 1,200 rollouts; ")
+    assert f"the last good checkpoint is {tmp_path / '10'}" in said and "\n" not in said
+
+
+def test_without_a_checkpoint_it_says_so_and_finite_metrics_pass():
+    check_finite({"critic/loss": jnp.ones(3), "step": 3}, 1, unit="steps", last_good=None)
+    with pytest.raises(DivergedError, match="there is no checkpoint from before"):
+        check_finite({"critic/loss": jnp.float32(jnp.nan)}, 1, unit="steps", last_good=None)

@@ -43,12 +43,52 @@ def test_a_new_run_says_where_it_is_and_records_itself(tmp_path):
     assert run.made("figures").is_dir() and run.prior == run.folder / "prior"
 
 
+def leave_a_checkpoint(folder):
+    (folder / "checkpoints" / "10").mkdir(parents=True)
+
+
 def test_an_existing_run_needs_a_decision(tmp_path):
     start(tmp_path / "x")
+    leave_a_checkpoint(tmp_path / "x")
     with pytest.raises(UserError, match=r"x: exists already; continue it with --resume or replace it with --overwrite"):
         start(tmp_path / "x")
     with pytest.raises(UserError, match="exclude each other"):
         start(tmp_path / "x", resume=True, overwrite=True)
+
+
+@pytest.mark.parametrize("result", ["checkpoints/10/manifest.json", "real/rollout-000000.npz", "summary.json"])
+def test_a_start_that_failed_before_it_left_a_result_blocks_nobody(tmp_path, result):
+    folder = start(tmp_path / "x").folder
+    for name in ("random/checkpoints/0/manifest.json", "metrics.jsonl", "checkpoints/.tmp-10/manifest.json"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).touch()
+    start(folder, Config(task="push"))
+    assert sorted(p.name for p in folder.iterdir()) == [".lock", "config.json", "provenance.json"]
+    assert json.loads((folder / "config.json").read_text())["config"]["task"] == "push"
+    (folder / result).parent.mkdir(parents=True, exist_ok=True)
+    (folder / result).touch()
+    with pytest.raises(UserError, match="exists already"):
+        start(folder)
+
+
+def test_a_folder_that_cannot_be_made_is_named_before_anything_is(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(UserError, match=r"cannot be made, .*/file is a file; choose another --out"):
+        start(tmp_path / "file" / "a" / "b")
+    monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write anywhere
+    with pytest.raises(UserError, match="you may not write to"):
+        start(tmp_path / "a" / "b")
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_run_of_an_earlier_format_is_not_continued_but_may_be_replaced(tmp_path):
+    folder = start(tmp_path / "x").folder
+    stored = json.loads((folder / "config.json").read_text())
+    del stored["format"]  # the first format did not say
+    (folder / "config.json").write_text(json.dumps(stored | {"sgft_jax": "0.1.0"}))
+    with pytest.raises(UserError, match=r"x: is a run of sgft_jax 0\.1\.0 in format 1; this version"):
+        start(folder, resume=True)
+    start(folder, overwrite=True)
 
 
 def test_resume_keeps_everything_and_adds_a_start(tmp_path):
@@ -72,6 +112,7 @@ def test_resume_names_every_field_that_differs(tmp_path):
 def test_of_several_runs_all_open_or_none(tmp_path):
     old, new = tmp_path / "old", tmp_path / "new"
     start(old)
+    leave_a_checkpoint(old)
     both = {folder: {"task": folder.name} for folder in (new, old)}
     for options, words in (({}, "old: exists already"), ({"resume": True}, "new: nothing to resume there")):
         with pytest.raises(UserError, match=words):
@@ -169,6 +210,10 @@ def test_a_forgotten_run_frees_its_folder(tmp_path):
         start(tmp_path / "x", resume=True)
     del run
     start(tmp_path / "x", resume=True)
+
+
+def test_the_root_is_that_of_the_repository():
+    assert (runs.ROOT / "pyproject.toml").exists()
 
 
 def test_provenance_names_no_host_and_no_folder(monkeypatch):

@@ -1,0 +1,353 @@
+"""Learning curves: what fine-tuning runs scored on the real system. Reads run folders and released tables.
+
+A curve holds any score (success, return) of several members, one for each seed. Curves as arrays are `Curve.scores`, as
+a flat table `rows`.
+"""
+
+import csv
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean
+from sgft_jax.io.jsonfile import read_json
+from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
+from sgft_jax.io.runs import CONFIG, PROVENANCE
+from sgft_jax.methods import NAMES, get_method
+from sgft_jax.types import UserError
+
+LEVEL = 0.9  # success that counts as solved
+SCORES = ("success", "return")
+IDENTITY = ("task", "gap", "method", "variant", "priors")
+COLUMNS = (*IDENTITY, "prior", "seed", "rollouts", "transitions", "minutes", *SCORES)
+_PER_RUN = ("out", "resume", "overwrite", "video", "devices", "checkpoint_every", "task", "method", "variant", "real")
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Evaluations of one fine-tuning run on the real system; the first one is zero-shot.
+
+    task, gap, method, variant ("" for a method's defaults): what was run. priors: name of the set of priors that the
+    members began from; curves are comparable member by member where it is the same. seeds: [members]. prior: [members]
+    index into the set, -1 where unknown. rollouts, transitions: [evaluations] real ones used so far. minutes:
+    [evaluations] of robot time without resets. scores: by name, [members, evaluations], the task's own, never reshaped.
+    score: the one that summaries are of. facts: commit, hardware and options of the run, for tables of runs.
+    """
+
+    task: str
+    gap: str
+    method: str
+    variant: str
+    priors: str
+    seeds: np.ndarray
+    prior: np.ndarray
+    rollouts: np.ndarray
+    transitions: np.ndarray
+    minutes: np.ndarray
+    scores: Mapping[str, np.ndarray]
+    score: str = "success"
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def values(self) -> np.ndarray:
+        """[members, evaluations] of the chosen score."""
+        return self.scores[self.score]
+
+    @property
+    def name(self) -> str:
+        """The method, with its variant if it has one."""
+        return " ".join(filter(None, [self.method, self.variant]))
+
+    @property
+    def family(self) -> str:
+        """The kind of method; "own" for one that does not come with the library."""
+        return get_method(self.method).family if self.method in NAMES else "own"
+
+    def of(self, score: str) -> "Curve":
+        """The same curve for another score."""
+        return replace(self, score=score)
+
+
+class Found(NamedTuple):
+    """Curves, and a line for each run that was left out or is unfinished."""
+
+    curves: list[Curve]
+    notes: list[str]
+
+
+# ---------------------------------------------------------------- metrics
+
+
+def common_grid(curves: Iterable[Curve]) -> np.ndarray:
+    """Rollouts at which every one of the curves was evaluated, in order."""
+    first, *others = (set(curve.rollouts.tolist()) for curve in curves)
+    return np.array(sorted(first.intersection(*others)), int)
+
+
+def at(curve: Curve, rollouts: int) -> np.ndarray | None:
+    """[members] score at the evaluation after exactly so many rollouts; None where there was none."""
+    (index,) = np.nonzero(curve.rollouts == rollouts)
+    return curve.values[:, index[-1]] if index.size else None
+
+
+def area(curve: Curve, grid: Sequence[int] | np.ndarray) -> np.ndarray | None:
+    """[members] mean score over the rollouts from the first to the last of a grid: area by trapezoids over length.
+
+    grid: rollouts, increasing, the same for all curves that are compared; None unless the curve was evaluated at two or
+    more of them and at all of them. High where learning is early and lasts.
+    """
+    points = [point for n in grid if (point := at(curve, int(n))) is not None]
+    if len(points) < max(len(grid), 2):
+        return None
+    return np.trapezoid(np.stack(points, 1), np.asarray(grid, np.float64)) / (grid[-1] - grid[0])
+
+
+def deepest_fall(curve: Curve) -> float:
+    """How far the mean over members ever fell below zero-shot; never negative."""
+    average = curve.values.mean(0)
+    return float(average[0] - average.min())
+
+
+def transitions_until_held(curve: Curve, level: float = LEVEL) -> int | None:
+    """Real transitions at the first of two evaluations in a row at which the mean over members is at least `level`.
+
+    None if that never happened; a single evaluation says too little, as success often falls again after it.
+    """
+    there = curve.values.mean(0) >= level - 1e-9  # a mean that is 0.9 in exact arithmetic is often a little less
+    held = there[:-1] & there[1:]
+    return int(curve.transitions[np.argmax(held)]) if held.any() else None
+
+
+def by_prior(curve: Curve) -> bool:
+    """Whether enough priors are behind a curve to treat the prior as the random factor."""
+    return bool((curve.prior >= 0).all()) and len(np.unique(curve.prior)) >= ENOUGH
+
+
+def spread(curve: Curve, scores: np.ndarray) -> Interval:
+    """Interquartile mean over members with its interval, pointwise: hierarchical by prior if `by_prior`, else by seed.
+
+    scores: [members, ...], such as those at one evaluation.
+    """
+    return bootstrap_interval(scores, priors=curve.prior if by_prior(curve) else None)
+
+
+def describe(curve: Curve) -> dict[str, Any]:
+    """The numbers of a run for machines, as JSON data.
+
+    zero_shot, final: every score, as interquartile mean with its 95 % interval (`spread`; nan where too few
+    seeds tell) and as mean. deepest_fall, transitions_until_held: of the mean over seeds.
+    """
+    return {
+        "zero_shot": _point(curve, 0),
+        "final": _point(curve, -1),
+        "deepest_fall": deepest_fall(curve),
+        "transitions_until_held": {"level": LEVEL, "transitions": transitions_until_held(curve)},
+        "seeds": len(curve.seeds),
+    }
+
+
+def _point(curve: Curve, i: int) -> dict[str, Any]:
+    found: dict[str, Any] = {
+        "rollouts": int(curve.rollouts[i]),
+        "transitions": int(curve.transitions[i]),
+        "robot_minutes": float(curve.minutes[i]),
+    }
+    for name, values in curve.scores.items():
+        band = spread(curve, values[:, i])
+        bounds = {"iqm": band.estimate, "low": band.low, "high": band.high, "mean": mean(values[:, i])}
+        found[name] = {key: float(value) for key, value in bounds.items()}
+    return found
+
+
+# ---------------------------------------------------------------- choosing what to compare
+
+
+def by_priors(curves: Iterable[Curve]) -> dict[str, list[Curve]]:
+    """Curves by their set of priors, the set with the most methods first, in the order of `methods.NAMES`."""
+    sets: dict[str, list[Curve]] = defaultdict(list)
+    for curve in sorted(curves, key=_rank):
+        sets[curve.priors].append(curve)
+    return dict(sorted(sets.items(), key=lambda item: -len({curve.method for curve in item[1]})))
+
+
+def from_main_priors(curves: Iterable[Curve]) -> list[Curve]:
+    """Curves of methods with their defaults that are comparable: from one set of priors for each kind of prior.
+
+    Methods on SAC's priors and on TD-MPC2's cannot share a set; of either kind the set with the most methods counts.
+    """
+    chosen: dict[str, str] = {}
+    plain = [curve for curve in curves if not curve.variant]
+    for name, members in by_priors(plain).items():
+        for curve in members:
+            chosen.setdefault(_kind(curve), name)
+    return sorted((curve for curve in plain if chosen[_kind(curve)] == curve.priors), key=_rank)
+
+
+def _kind(curve: Curve) -> str:
+    return get_method(curve.method).prior if curve.method in NAMES else "sac"
+
+
+def _rank(curve: Curve) -> tuple[bool, int, str]:
+    place = NAMES.index(curve.method) if curve.method in NAMES else len(NAMES)
+    return (curve.variant != "", place, curve.name)
+
+
+# ---------------------------------------------------------------- run folders
+
+
+def read_curve(folder: Path) -> Curve:
+    """The learning curve of one fine-tuning run <task>/<gap>/<method>[_<variant>]/<seeds>; UserError if it has none."""
+    records = read_jsonl(folder / EVAL) if (folder / EVAL).exists() else []
+    if not records:
+        raise UserError(f"{folder / EVAL}: holds no evaluation yet")
+    stored = read_json(folder / CONFIG) if (folder / CONFIG).exists() else {}
+    summary = read_json(folder / SUMMARY) if (folder / SUMMARY).exists() else {}
+    config, start = stored.get("config", {}), _last_start(folder)
+    column = lambda name: np.array([record[name] for record in records])  # noqa: E731
+    scores = {name: column(name).T for name in SCORES if name in records[0]}
+    variant = config.get("variant") or ""
+    digests, seeds = start.get("priors", []), config.get("seed", 0) + np.arange(len(next(iter(scores.values()))))
+    return Curve(
+        task=folder.parent.parent.parent.name,
+        gap=folder.parent.parent.name,
+        method=folder.parent.name.removesuffix(f"_{variant}"),
+        variant=variant,
+        priors=set_name(Path(config.get("prior") or config.get("preset") or "").name, digests),
+        seeds=seeds,
+        prior=seeds % len(digests) if digests else np.full(len(seeds), -1),
+        rollouts=column("rollouts"),
+        transitions=column("step"),
+        minutes=column("robot_minutes"),
+        scores=scores,
+        score=summary.get("score", next(iter(scores))),
+        facts=_facts(summary, config, start),
+    )
+
+
+def read_runs(out: Path) -> Found:
+    """Every run below <out>/finetune; of several that differ in seeds alone that with the most seeds, then rollouts."""
+    runs: dict[tuple[str, ...], tuple[Curve, Path]] = {}
+    notes = []
+    for folder in sorted(path for path in (out / "finetune").glob("*/*/*/*") if path.is_dir()):
+        try:
+            curve = read_curve(folder)
+        except UserError as error:
+            notes.append(str(error))
+            continue
+        key = tuple(getattr(curve, name) for name in IDENTITY)
+        other = runs.get(key, (curve, folder))
+        less, more = sorted([(curve, folder), other], key=lambda run: (len(run[0].seeds), run[0].rollouts[-1]))
+        runs[key] = more
+        if less[1] != more[1]:
+            notes.append(f"{less[1]}: left out, {more[1].name} has more seeds or rollouts")
+    for curve, folder in runs.values():
+        if (wanted := curve.facts.get("rollouts", 0)) > curve.rollouts[-1]:
+            notes.append(f"{folder}: unfinished, {curve.rollouts[-1]} of {wanted} rollouts")
+    return Found([curve for curve, _ in runs.values()], notes)
+
+
+def set_name(name: str, digests: Sequence[str]) -> str:
+    """Names a set of priors: its folder and, where known, what tells it from another set trained into that folder."""
+    return "-".join(filter(None, [name, *(digest[:6] for digest in digests[:1])]))
+
+
+def _last_start(folder: Path) -> dict[str, Any]:
+    starts = read_json(folder / PROVENANCE).get("starts", []) if (folder / PROVENANCE).exists() else []
+    return starts[-1] if starts else {}
+
+
+def _facts(summary: Mapping[str, Any], config: Mapping[str, Any], start: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        **origin(start),
+        "gap_definition": json.dumps(summary.get("gap", {})),
+        "impl": summary.get("impl", ""),
+        **flat({name: value for name, value in config.items() if name not in (*_PER_RUN, "impl")}),
+    }
+
+
+def origin(start: Mapping[str, Any]) -> dict[str, Any]:
+    """Commit, time, versions and hardware of one start of a run, from its provenance."""
+    device, versions = start.get("device", {}), start.get("versions", {})
+    return {
+        "commit": (start.get("git") or {}).get("commit", "")[:12],
+        "started": start.get("started", ""),
+        "hardware": " ".join(f"{device.get('count', '')} {device.get('kind', '')}".split()),
+        **{name: versions.get(name, "") for name in ("jax", "mujoco")},
+    }
+
+
+def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested options as one level with dotted names; lists become words."""
+    found: dict[str, Any] = {}
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            found |= flat(value, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = " ".join(map(str, value)) if isinstance(value, (list, tuple)) else value
+    return found
+
+
+# ---------------------------------------------------------------- flat tables
+
+
+def rows(curves: Iterable[Curve]) -> Iterator[dict[str, Any]]:
+    """The flat table: a row for each evaluation of each member, with the columns `COLUMNS`."""
+    for curve in curves:
+        identity = {name: getattr(curve, name) for name in IDENTITY}
+        for i, (seed, prior) in enumerate(zip(curve.seeds.tolist(), curve.prior.tolist(), strict=True)):
+            for j, (n, used, minutes) in enumerate(
+                zip(curve.rollouts.tolist(), curve.transitions.tolist(), curve.minutes.tolist(), strict=True)
+            ):
+                axes = {"prior": prior, "seed": seed, "rollouts": n, "transitions": used, "minutes": minutes}
+                yield {**identity, **axes, **{name: float(values[i, j]) for name, values in curve.scores.items()}}
+
+
+def from_rows(table: Iterable[Mapping[str, Any]]) -> list[Curve]:
+    """The curves of a flat table; inverse of `rows`. Raises UserError where members differ in their evaluations."""
+    runs: dict[tuple[str, ...], dict[int, list[Mapping[str, Any]]]] = defaultdict(lambda: defaultdict(list))
+    for row in table:
+        runs[tuple(row[name] for name in IDENTITY)][int(row["seed"])].append(row)
+    return [_curve(identity, members) for identity, members in runs.items()]
+
+
+def _curve(identity: tuple[str, ...], members: Mapping[int, list[Mapping[str, Any]]]) -> Curve:
+    if len({tuple(row["rollouts"] for row in each) for each in members.values()}) > 1:
+        raise UserError(f"{'/'.join(identity)}: its seeds were not evaluated after the same rollouts")
+    first, *_ = members.values()
+
+    def column(name: str) -> np.ndarray:
+        return np.array([[float(row[name]) for row in each] for each in members.values()])
+
+    scores = {name: column(name) for name in SCORES if first[0].get(name) not in (None, "")}
+    return Curve(
+        *identity,
+        seeds=np.array(list(members)),
+        prior=np.array([int(each[0]["prior"]) for each in members.values()]),
+        rollouts=column("rollouts")[0].astype(int),
+        transitions=column("transitions")[0].astype(int),
+        minutes=column("minutes")[0],
+        scores=scores,
+        score=next(iter(scores)),
+    )
+
+
+def read_data(folder: Path) -> Found:
+    """The curves of released tables, `curves-*.csv`; raises UserError if there is none."""
+    files = sorted(folder.glob("curves-*.csv"))
+    if not files:
+        raise UserError(f"{folder}: holds no curves-*.csv; write some from runs with: "
+                        f"python -m experiments.figures --export {folder}")  # fmt: skip
+    return Found(from_rows(row for path in files for row in read_csv(path)), [])
+
+
+def read_csv(path: Path) -> list[dict[str, str]]:
+    """The rows of a table; none if it does not exist."""
+    if not path.exists():
+        return []
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))

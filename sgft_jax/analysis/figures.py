@@ -1,0 +1,235 @@
+"""Impure: writes figures as PNG files: learning curves, what pretraining left behind, how costs grow.
+
+Each function returns the path it wrote. No panel has more than `MOST` curves, each in a colour of its own from the
+Okabe-Ito palette (safe for colour-blind readers).
+"""
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator
+from numpy.typing import ArrayLike
+
+from sgft_jax.analysis.curves import Curve, by_prior, spread
+from sgft_jax.analysis.stats import ENOUGH, iqm
+
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+MOST = len(PALETTE)
+_INK, _GREY, _FAINT = "#333333", "#777777", "#B0B0B0"
+_FONT = {"size": 10, "color": _INK}
+
+
+def learning_curves(path: Path, panels: Mapping[str, Sequence[Curve]], *, title: str) -> Path:
+    """Scores over real rollouts: a panel for each entry, by its words; IQM over members with its 95 % bootstrap band.
+
+    Raises no panel above `MOST` curves: one with more becomes several, each with the others in grey behind its own.
+    """
+    parts = [part for words, curves in panels.items() if curves for part in _split(words, curves)]
+    columns = min(len(parts), 2)
+    figure, grid = _figure(
+        5.6 * columns, 3.1 * math.ceil(len(parts) / columns) + 0.4, columns=columns, count=len(parts)
+    )
+    colours = _colours(curve.name for _, own, _ in parts for curve in own)
+    for axes, (words, own, others) in zip(grid, parts, strict=True):
+        for curve in others:
+            axes.plot(curve.rollouts, iqm(curve.values), color=_FAINT, linewidth=0.8, zorder=1)
+        for curve, colour in zip(own, colours(own), strict=True):
+            _draw_curve(axes, curve, colour)
+        _dress(axes, words, [*own, *others])
+    figure.suptitle(title, x=0.01, ha="left", size=12, weight="bold", color=_INK)
+    figure.supxlabel(_note([curve for _, own, _ in parts for curve in own]), size=8, color=_GREY)
+    return _save(figure, path)
+
+
+def _split(words: str, curves: Sequence[Curve]) -> list[tuple[str, Sequence[Curve], list[Curve]]]:
+    """(words, curves, others in grey) of each panel: families together, at most `MOST` curves in each."""
+    if len(curves) <= MOST:
+        return [(words, curves, [])]
+    ordered = sorted(curves, key=lambda curve: curve.family)
+    count = math.ceil(len(curves) / MOST)
+    parts = [[ordered[i] for i in some] for some in np.array_split(np.arange(len(ordered)), count)]
+    return [
+        (f"{words}, {i + 1} of {count}", part, [curve for curve in ordered if curve not in part])
+        for i, part in enumerate(parts)
+    ]
+
+
+def _colours(names: Iterable[str]) -> Callable[[Sequence[Curve]], list[str]]:
+    """(curves) -> a colour for each, all distinct; a name keeps its colour from panel to panel where it can."""
+    place = {name: i for i, name in enumerate(dict.fromkeys(names))}
+
+    def of(curves: Sequence[Curve]) -> list[str]:
+        free, chosen = list(PALETTE), []
+        for curve in curves:
+            wanted = PALETTE[place[curve.name] % len(PALETTE)]
+            chosen.append(wanted if wanted in free else free[0])
+            free.remove(chosen[-1])
+        return chosen
+
+    return of
+
+
+def _draw_curve(axes: Axes, curve: Curve, colour: str) -> None:
+    band = spread(curve, curve.values)
+    if np.isfinite(band.low).all():
+        axes.fill_between(curve.rollouts, band.low, band.high, color=colour, alpha=0.13, linewidth=0)
+    marks = {"marker": "o", "markersize": 2.5} if len(curve.rollouts) < 25 else {}
+    axes.plot(curve.rollouts, band.estimate, color=colour, linewidth=1.8, label=curve.name, clip_on=False, **marks)
+
+
+def _dress(axes: Axes, words: str, curves: Sequence[Curve]) -> None:
+    """Names, limits and a legend beside the panel, from the curve that ends highest to the one that ends lowest."""
+    axes.set_title(words, **_FONT, loc="left")
+    axes.set_xlim(0, max(int(curve.rollouts[-1]) for curve in curves) or 1)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_ylabel(curves[0].score, **_FONT)
+    if curves[0].score == "success":
+        axes.set_ylim(-0.03, 1.03)
+    longest = max(curves, key=lambda curve: curve.rollouts[-1])
+    each = max(int(longest.rollouts[-1]), 1)
+    seconds, steps = 60 * float(longest.minutes[-1]) / each, int(longest.transitions[-1]) // each
+    axes.set_xlabel(f"real rollouts of {steps} transitions, {seconds:.3g} s", **{**_FONT, "size": 9})
+    lines, names = axes.get_legend_handles_labels()
+    ends = [float(np.asarray(line.get_ydata())[-1]) for line in lines]  # pyright: ignore[reportAttributeAccessIssue]
+    order = np.argsort(ends, kind="stable")[::-1]
+    axes.legend(
+        [lines[i] for i in order], [names[i] for i in order], loc="center left", bbox_to_anchor=(1.0, 0.5),
+        frameon=False, fontsize=9, labelcolor=_INK, handlelength=1.4,
+    )  # fmt: skip
+
+
+def _note(curves: Sequence[Curve]) -> str:
+    """What the lines and bands are."""
+    sizes = sorted({len(curve.seeds) for curve in curves})
+    if sizes[-1] == 1:
+        return "one seed"
+    seeds = str(sizes[0]) if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}"
+    drawn = "priors, then seeds" if all(by_prior(curve) for curve in curves) else "seeds"
+    band = f"; band: 95 % bootstrap interval, drawing {drawn}" if sizes[-1] >= ENOUGH else ""
+    return f"line: interquartile mean of {seeds} seeds{band}"
+
+
+def scaling(
+    path: Path,
+    lines: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    references: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    *,
+    title: str,
+    x: str,
+    y: str,
+) -> Path:
+    """How a quantity grows with a size, both on logarithmic axes.
+
+    lines: {name: (sizes [n], values [n])}. references: the same for some of these names, drawn dashed in their colour.
+    """
+    figure, (axes,) = _figure(6.4, 4.0, columns=1)
+    for (name, points), colour in zip(lines.items(), itertools.cycle(PALETTE), strict=False):
+        axes.plot(*map(np.asarray, points), color=colour, linewidth=2, marker="o", markersize=4, label=name)
+        if name in references:
+            axes.plot(*map(np.asarray, references[name]), color=colour, linewidth=1.2, linestyle=(0, (4, 3)))
+    axes.set_xscale("log", base=2)
+    axes.set_yscale("log")
+    sizes = sorted({float(size) for points in lines.values() for size in np.asarray(points[0])})
+    axes.set_xticks(sizes, [f"{size:,.0f}" for size in sizes])
+    axes.minorticks_off()
+    low, high = axes.get_ylim()
+    steps = (1, 2, 5) if high < 30 * low else (1,)  # a single decade would have one tick, or none
+    axes.yaxis.set_major_locator(LogLocator(subs=steps))
+    axes.yaxis.set_major_formatter(EngFormatter(sep=" "))
+    axes.set_xlabel(x, **_FONT)
+    axes.set_ylabel(y, **_FONT)
+    axes.legend(frameon=False, fontsize=9, labelcolor=_INK)
+    figure.suptitle(title, x=0.01, ha="left", size=12, weight="bold", color=_INK)
+    if references:
+        figure.text(0.99, 0.012, "dashed: the reference", ha="right", size=8, color=_GREY)
+    return _save(figure, path)
+
+
+def pretraining(
+    path: Path,
+    *,
+    title: str,
+    steps: ArrayLike,
+    success: ArrayLike,
+    returns: ArrayLike,
+    value: ArrayLike,
+    monte_carlo: ArrayLike,
+    dynamics_error: ArrayLike,
+    baseline_error: ArrayLike | None = None,
+) -> Path:
+    """Panels: success and return while training, V_sim against what happened, model error by horizon if there is one.
+
+    steps, success, returns: [n_evaluations], steps in env steps. value, monte_carlo: [n] V_sim of a state and the
+    discounted return that followed. dynamics_error: [horizon] mean normalised error of the model's open-loop prediction
+    1, 2, ... steps ahead; baseline_error: the same for predicting that nothing changes.
+    """
+    columns = 4 if np.size(dynamics_error) else 3
+    figure, panels = _figure(3.0 * columns, 3.2, columns=columns)
+    for axes, values, name in zip(panels, (success, returns), ("success rate", "return"), strict=False):
+        axes.plot(np.asarray(steps) / 1e6, np.asarray(values), color=PALETTE[0], linewidth=2)
+        axes.set_title(name, **_FONT, loc="left")
+        axes.set_xlabel("env steps (millions)", **_FONT)
+        axes.set_xlim(left=0)
+    panels[0].set_ylim(-0.03, 1.03)
+    _value_panel(panels[2], np.asarray(value), np.asarray(monte_carlo))
+    if columns == 4:
+        _dynamics_panel(panels[3], np.asarray(dynamics_error), baseline_error)
+    figure.suptitle(title, x=0.005, ha="left", size=12, weight="bold", color=_INK)
+    return _save(figure, path)
+
+
+def _value_panel(axes: Axes, value: np.ndarray, monte_carlo: np.ndarray) -> None:
+    both = np.concatenate([value, monte_carlo])
+    margin = 0.05 * (np.ptp(both) or 1.0)
+    limits = (both.min() - margin, both.max() + margin)
+    axes.plot(limits, limits, color=_FAINT, linewidth=1, zorder=0)
+    axes.scatter(monte_carlo, value, s=6, color=PALETTE[0], alpha=min(1.0, 60 / len(value) ** 0.75), linewidths=0)
+    axes.set_xlim(*limits)
+    axes.set_ylim(*limits)
+    axes.set_title("V_sim against discounted return", **_FONT, loc="left")
+    axes.set_xlabel("return that followed", **_FONT)
+    bias, error = float((value - monte_carlo).mean()), float(np.sqrt(((value - monte_carlo) ** 2).mean()))
+    axes.text(0.04, 0.95, f"bias {bias:+.2g}\nRMSE {error:.2g}", transform=axes.transAxes, va="top", size=9, color=_INK)
+
+
+def _dynamics_panel(axes: Axes, error: np.ndarray, baseline: ArrayLike | None) -> None:
+    horizon = np.arange(1, len(error) + 1)
+    axes.plot(horizon, error, color=PALETTE[0], linewidth=2, marker="o", markersize=3)
+    if baseline is not None:
+        axes.plot(horizon, np.asarray(baseline), color=_FAINT, linewidth=2)
+        end = (len(error), float(np.asarray(baseline)[-1]))
+        axes.annotate("if nothing moved", end, (-14, 0), textcoords="offset points", ha="right", size=9, color=_GREY)
+    axes.set_ylim(bottom=0)
+    axes.set_title("model error, standard deviations", **_FONT, loc="left")
+    axes.set_xlabel("steps ahead", **_FONT)
+
+
+# ---------------------------------------------------------------- the look
+
+
+def _figure(width: float, height: float, *, columns: int, count: int | None = None) -> tuple[Figure, Sequence[Axes]]:
+    """A figure without pyplot (no global state, no window), axes without frame. count: of panels; default one row."""
+    figure = Figure(figsize=(width, height), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    count = count or columns
+    panels = [figure.add_subplot(math.ceil(count / columns), columns, i + 1) for i in range(count)]
+    for axes in panels:
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.spines[["left", "bottom"]].set_color(_FAINT)
+        axes.tick_params(colors=_INK, labelsize=9, color=_FAINT)
+        axes.grid(axis="y", color="#ECECEC", linewidth=0.8)
+        axes.set_axisbelow(True)
+    return figure, panels
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, facecolor="white")
+    return path

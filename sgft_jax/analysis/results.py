@@ -1,0 +1,66 @@
+"""Impure: figures and tables of many runs in one folder: what `experiments.figures` writes."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from sgft_jax.analysis import figures, tables
+from sgft_jax.analysis.curves import Curve, Found, by_priors, from_main_priors
+from sgft_jax.types import UserError, unknown
+
+
+def select(found: Found, *, variants: bool = True, **wanted: Sequence[str]) -> Found:
+    """Only the curves of certain tasks, gaps, methods or priors: names by field of `Curve`, empty for all.
+
+    Raises UserError if one of the names is of no curve, or if nothing is left.
+    """
+    curves = [curve for curve in found.curves if variants or not curve.variant]
+    for field, names in wanted.items():
+        there = sorted({getattr(curve, field) for curve in curves})
+        if missing := [name for name in names if name not in there]:
+            raise UserError(unknown(f"run of the {field}", missing[0], there))
+        curves = [curve for curve in curves if not names or getattr(curve, field) in names]
+    if not curves:
+        raise UserError(f"no run fits all that is asked of {', '.join(name for name in wanted if wanted[name])}")
+    return Found(curves, found.notes)
+
+
+def write_results(found: Found, target: Path) -> Path:
+    """A figure and tables for each task and gap, and of all tasks for each gap; returns the path of tables.md."""
+    sections = ["# Fine-tuning results", tables.LEGEND]
+    for gap in dict.fromkeys(curve.gap for curve in found.curves):
+        sections += _overview(gap, [curve for curve in found.curves if curve.gap == gap], target)
+    for task, gap in dict.fromkeys((curve.task, curve.gap) for curve in found.curves):
+        own = [curve for curve in found.curves if (curve.task, curve.gap) == (task, gap)]
+        sections += _section(f"{task} on the {gap} real system", own, target / f"{task}-{gap}.png")
+    if found.notes:
+        sections.append("\n".join(["## Left out or unfinished", "", *(f"- {note}" for note in found.notes)]))
+    path = target / "tables.md"
+    path.write_text("\n\n".join(sections) + "\n")
+    return path
+
+
+def _overview(gap: str, curves: Sequence[Curve], target: Path) -> list[str]:
+    """All tasks on one gap, methods with their defaults from the same priors; [] for a single task."""
+    tasks = {task: from_main_priors(c for c in curves if c.task == task) for task in sorted({c.task for c in curves})}
+    tasks = {task: own for task, own in tasks.items() if own}
+    if len(tasks) < 2:
+        return []
+    title = f"All tasks, {gap} real systems"
+    shown = tables.leading(tasks, figures.MOST)
+    panels = {task: [curve for curve in own if curve.name in shown] for task, own in tasks.items()}
+    path = figures.learning_curves(target / f"overview-{gap}.png", panels, title=title)
+    return [f"## {title}", f"![{title}]({path.name})", tables.areas_by_task(tasks)]
+
+
+def _section(title: str, curves: Sequence[Curve], path: Path) -> list[str]:
+    """One task and gap: a panel for each set of priors and for each method with variants, tables for each set."""
+    panels: dict[str, list[Curve]] = {}
+    texts = []
+    for priors, own in by_priors(curves).items():
+        words = f"priors {priors}" if priors else "priors unknown"
+        panels[words] = [curve for curve in own if not curve.variant]
+        for method in dict.fromkeys(curve.method for curve in own if curve.variant):
+            panels[f"{method} and its variants, {words}"] = [curve for curve in own if curve.method == method]
+        texts += [f"### {title}, {words}", tables.summary(own), tables.differences(own)]
+    figures.learning_curves(path, panels, title=title)
+    return [f"## {title}", f"![{title}]({path.name})", *filter(None, texts)]

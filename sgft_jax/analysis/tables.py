@@ -1,0 +1,154 @@
+"""Tables in Markdown of what learning curves say. Pure functions."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from sgft_jax.analysis.curves import (
+    LEVEL,
+    Curve,
+    area,
+    at,
+    by_prior,
+    common_grid,
+    deepest_fall,
+    spread,
+    transitions_until_held,
+)
+from sgft_jax.analysis.stats import Interval, bootstrap_interval, difference_interval, probability_of_improvement
+
+NONE = "-"
+LEGEND = (
+    "Scores on the real system, success in per cent: interquartile mean over seeds with its 95 % bootstrap interval, "
+    "which draws priors and then seeds where there are three priors or more, seeds otherwise; none where it would say "
+    "nothing. Area: mean score over the rollouts given, from evaluations that all methods of the table have. End: "
+    "the last evaluation. Deepest fall: how far the mean ever was below zero-shot. "
+    f"{100 * LEVEL:.0f} % held: real transitions at the first of two evaluations in a row at which the mean is there. "
+    "Only methods from the same priors can be compared."
+)
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table of these cells."""
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, ["---"] * len(head), *rows))
+
+
+def summary(curves: Sequence[Curve]) -> str:
+    """A row for each curve of one task, gap and set of priors; the methods' defaults decide the grid of the area."""
+    grid = shared_grid(curves)
+    until = f"area, {grid[0]} to {grid[-1]} rollouts" if len(grid) > 1 else "area"
+    head = ["method", "seeds", "zero-shot", until, "end (rollouts)", "deepest fall", f"{100 * LEVEL:.0f} % held after"]
+    return markdown(head, [_row(curve, grid) for curve in curves])
+
+
+def differences(curves: Sequence[Curve]) -> str:
+    """How far each area is from that of the best curve, seed by seed from the same priors; "" where there is one."""
+    grid = shared_grid(curves)
+    areas = {curve.name: (curve, found) for curve in curves if (found := area(curve, grid)) is not None}
+    if len(areas) < 2:
+        return ""
+    best = max(areas, key=lambda name: float(areas[name][1].mean()))
+    rows = [[name, *_against(curve, own, *areas[best])] for name, (curve, own) in areas.items() if name != best]
+    return markdown([f"area minus that of {best}", "mean difference", "probability of being better"], rows)
+
+
+def areas_by_task(tasks: Mapping[str, Sequence[Curve]]) -> str:
+    """Rows of methods, columns of tasks: areas, each column on its own grid; the last column over all tasks.
+
+    The last one is the interquartile mean over tasks and seeds, with seeds drawn within each task (stratified); it
+    stands only for methods that were run on all of them.
+    """
+    grids = {task: shared_grid(curves) for task, curves in tasks.items()}
+    found: dict[str, dict[str, tuple[Curve, np.ndarray]]] = {}
+    for task, curves in tasks.items():
+        for curve in curves:
+            if (own := area(curve, grids[task])) is not None:
+                found.setdefault(curve.name, {})[task] = (curve, own)
+    head = ["area", *(f"{task}, to {grid[-1]} rollouts" for task, grid in grids.items() if len(grid))]
+    rows = [
+        [name, *(middle(*cells[task]) if task in cells else NONE for task in tasks), _overall(cells, len(tasks))]
+        for name, cells in found.items()
+    ]
+    return markdown([*head, "all tasks"], rows)
+
+
+def leading(tasks: Mapping[str, Sequence[Curve]], count: int) -> list[str]:
+    """The names of so many curves: those that were run on the most tasks, of these the ones with the largest areas."""
+    areas: dict[str, list[float]] = {}
+    for curves in tasks.values():
+        grid = shared_grid(curves)
+        for curve in curves:
+            own = area(curve, grid)
+            areas.setdefault(curve.name, []).append(0.0 if own is None else float(own.mean()))
+    return sorted(areas, key=lambda name: (len(areas[name]), float(np.mean(areas[name]))), reverse=True)[:count]
+
+
+def shared_grid(curves: Sequence[Curve]) -> np.ndarray:
+    """The evaluations that the methods with their defaults share or, without any, that all of them do.
+
+    A run that is less than a third as long as the usual one does not shorten the grid of the others.
+    """
+    plain = [curve for curve in curves if not curve.variant] or curves
+    usual = np.median([curve.rollouts[-1] for curve in plain])
+    return common_grid([curve for curve in plain if curve.rollouts[-1] >= usual / 3])
+
+
+def number(band: Interval, score: str = "success") -> str:
+    """A score with its interval, "92 [88, 95]", and alone where the interval says nothing; success is in per cent."""
+    scale, digits = (100, 0) if score == "success" else (1, 1)
+    rounded = [round(scale * float(x), digits) + 0.0 for x in band]  # + 0.0: no minus zero
+    estimate, low, high = (f"{x:.{digits}f}" for x in rounded)
+    return estimate if math.isnan(band.low) or low == high else f"{estimate} [{low}, {high}]"
+
+
+def plain(value: float, score: str) -> str:
+    """A score without interval, as `number` writes it."""
+    return number(Interval(*(np.asarray(x) for x in (value, np.nan, np.nan))), score)
+
+
+def words(score: str) -> str:
+    """What the numbers are, for people."""
+    return "success in per cent" if score == "success" else score
+
+
+def middle(curve: Curve, scores: np.ndarray | None) -> str:
+    """The interquartile mean over members of these scores [members] with its interval."""
+    return NONE if scores is None else number(spread(curve, scores), curve.score)
+
+
+def outcome(curves: Sequence[Curve]) -> str:
+    """A row for each curve, a column for each evaluation that any of them has."""
+    points = sorted({int(n) for curve in curves for n in curve.rollouts})
+    head = ["method", *(f"{n} rollout{'s' * (n > 1)}" if n else "zero-shot" for n in points)]
+    return markdown(head, [[curve.name, *(middle(curve, at(curve, n)) for n in points)] for curve in curves])
+
+
+def _row(curve: Curve, grid: np.ndarray) -> list[str]:
+    held = transitions_until_held(curve) if curve.score == "success" else None
+    return [
+        curve.name,
+        str(len(curve.seeds)),
+        middle(curve, curve.values[:, 0]),
+        middle(curve, area(curve, grid)),
+        f"{middle(curve, curve.values[:, -1])} ({curve.rollouts[-1]})",
+        plain(deepest_fall(curve), curve.score),
+        f"> {curve.transitions[-1]:,}" if held is None else f"{held:,}",
+    ]
+
+
+def _against(curve: Curve, own: np.ndarray, other: Curve, best: np.ndarray) -> list[str]:
+    shared, mine, theirs = np.intersect1d(curve.seeds, other.seeds, return_indices=True)
+    probability = f"{probability_of_improvement(own, best):.2f}"
+    if not len(shared):
+        return [NONE, probability]
+    priors = curve.prior[mine] if by_prior(curve) else None
+    return [number(difference_interval(own[mine], best[theirs], priors=priors), curve.score), probability]
+
+
+def _overall(cells: Mapping[str, tuple[Curve, np.ndarray]], tasks: int) -> str:
+    if len(cells) < tasks or tasks < 2:
+        return NONE
+    scores = np.concatenate([own for _, own in cells.values()])
+    strata = np.repeat(np.arange(len(cells)), [len(own) for _, own in cells.values()])
+    return number(bootstrap_interval(scores, strata=strata), next(iter(cells.values()))[0].score)

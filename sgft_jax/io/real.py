@@ -1,0 +1,71 @@
+"""Impure: the real rollouts of a run on disk. What a robot did is never repeated, cut off or deleted."""
+
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sgft_jax.types import UserError
+
+_REAL, _ROLLOUT, _HALF = "real", "rollout-", ".half"
+
+
+class RealStore:
+    """Every real rollout, on disk in `<folder>/real/` before anything learns from it.
+
+    One `.npz` per rollout, numbered from 0, written under another name, flushed to disk and renamed. Arrays only,
+    nothing is ever pickled. On a resume, rollouts from after the last checkpoint are loaded and learned from again.
+    """
+
+    def __init__(self, folder: Path, *, say: Callable[[str], None] = print) -> None:
+        """Open or make the store of a run folder; `say` hears of a rollout that a kill has cut short."""
+        self.folder = Path(folder) / _REAL
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for half in sorted(self.folder.glob(f"*{_HALF}")):
+            say(f"ignored: {half}: writing it was cut short")
+
+    def __len__(self) -> int:
+        """Rollouts on disk."""
+        numbers = [int(path.stem.removeprefix(_ROLLOUT)) for path in self.folder.glob(f"{_ROLLOUT}*.npz")]
+        return max(numbers, default=-1) + 1
+
+    def append(self, rollout: Mapping[str, Any]) -> int:
+        """Store one rollout, {name: array [..., T, ...]}, and return its number once it is safely on disk."""
+        arrays = {name: np.asarray(x) for name, x in rollout.items()}
+        if unfit := [name for name, x in arrays.items() if x.dtype.kind not in "biufcSU"]:
+            raise TypeError(f"a rollout holds plain numeric arrays only, not {unfit}")
+        number = len(self)
+        path = self._path(number)
+        half = path.with_suffix(_HALF)
+        with open(half, "wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        half.rename(path)
+        _sync_folder(self.folder)
+        return number
+
+    def load(self, number: int) -> dict[str, np.ndarray]:
+        """The arrays of one rollout; raises UserError if it is missing or damaged."""
+        path = self._path(number)
+        if not path.exists():
+            raise UserError(f"{path}: rollout {number} is missing; this run cannot go on without it")
+        try:
+            with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
+                return {name: stored[name] for name in stored.files}
+        except Exception as error:  # numpy raises half a dozen types for a damaged archive
+            raise UserError(f"{path}: damaged: {error}") from error
+
+    def _path(self, number: int) -> Path:
+        return self.folder / f"{_ROLLOUT}{number:06d}.npz"
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make a rename in `folder` survive a power cut."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,143 @@
+"""Learning curves by hand: metrics, what is comparable, run folders."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from runs_by_hand import save
+
+from sgft_jax.analysis.curves import (
+    Curve,
+    area,
+    at,
+    by_prior,
+    by_priors,
+    common_grid,
+    deepest_fall,
+    describe,
+    from_main_priors,
+    from_rows,
+    read_curve,
+    read_runs,
+    rows,
+    spread,
+    transitions_until_held,
+)
+from sgft_jax.types import UserError
+
+
+def curve(values, rollouts=(0, 1, 2, 4), *, method="sac", variant="", priors="fast", prior=None, score="success"):
+    values, rollouts = np.atleast_2d(np.asarray(values, float)), np.asarray(rollouts)
+    members = np.arange(len(values))
+    prior = np.full(len(values), -1) if prior is None else np.asarray(prior)
+    axes = (rollouts, 20 * rollouts, rollouts / 30)
+    return Curve("toy", "default", method, variant, priors, members, prior, *axes, {score: values}, score)
+
+
+def test_area_is_on_the_common_grid():
+    """One method was evaluated more often than the other. Of both count 0, 2 and 4 rollouts: (0.2 + 0.6) / 2 * 2 +
+    (0.6 + 1) / 2 * 2 = 2.4 over 4 rollouts, 0.6, whatever the first one scored after one rollout.
+    """
+    often, seldom = curve([0.2, 0.9, 0.6, 1.0]), curve([0.2, 0.6, 1.0, 1.0], (0, 2, 4, 8))
+    grid = common_grid([often, seldom])
+    assert grid.tolist() == [0, 2, 4]
+    assert area(often, grid) == area(seldom, grid) == pytest.approx(0.6)
+    assert area(often, [0, 2, 8]) is None and area(often, [0]) is None  # not evaluated there; no area
+    assert at(often, 1) == [0.9] and at(often, 3) is None
+
+
+def test_a_level_is_held_at_two_evaluations_in_a_row():
+    """Success after one rollout is gone after two; it stays from the third evaluation, after 40 transitions, on."""
+    assert transitions_until_held(curve([0.1, 0.95, 0.5, 0.9], (0, 1, 2, 3))) is None
+    assert transitions_until_held(curve([0.1, 0.95, 0.5, 0.9, 1.0], (0, 1, 2, 3, 4))) == 60
+    assert transitions_until_held(curve([[0.94, 0.94], [0.84, 0.84], [0.92, 0.92]], (0, 1))) == 0  # 2.7 of three
+    assert transitions_until_held(curve([1.0], (0,))) is None
+
+
+def test_deepest_fall_is_of_the_mean():
+    assert deepest_fall(curve([[0.6, 0.2, 0.9], [0.4, 0.6, 0.9]], (0, 1, 2))) == pytest.approx(0.1)  # 0.5 to 0.4
+    assert deepest_fall(curve([0.5, 0.6, 0.9], (0, 1, 2))) == 0.0
+
+
+def test_spread_is_over_priors_where_there_are_three():
+    values = [[0.0], [0.5], [1.0]] * 4
+    assert by_prior(curve(values, (0,), prior=[0, 1, 2] * 4))
+    assert spread(curve(values, (0,), prior=[0, 1, 2] * 4), np.ravel(values)).low == 0.0
+    two = curve(values, (0,), prior=[0, 1, 0] * 4)
+    assert not by_prior(two) and spread(two, np.ravel(values)).low > 0.0
+    assert not by_prior(curve(values, (0,)))  # unknown
+
+
+def test_any_score():
+    returns = curve([[-3.0, 5.0], [-1.0, 7.0]], (0, 1), score="return")
+    assert describe(returns)["final"]["return"]["mean"] == 6.0 and "success" not in describe(returns)["final"]
+    np.testing.assert_array_equal(area(returns, [0, 1]), [1.0, 3.0])
+    both = dataclasses.replace(returns, scores={**returns.scores, "success": np.zeros((2, 2))})
+    assert both.of("success").values.sum() == 0.0 and both.values.sum() == 8.0
+
+
+def test_the_numbers_of_a_run():
+    """Means 0.3, 0.1, 0.9, 1.0; 90 % held from 2 rollouts of 20 transitions on; two seeds tell no interval."""
+    found = describe(curve([[0.2, 0.1, 0.8, 1.0], [0.4, 0.1, 1.0, 1.0]]))
+    assert found["zero_shot"]["success"]["mean"] == pytest.approx(0.3)
+    assert found["final"] == {
+        "rollouts": 4, "transitions": 80, "robot_minutes": pytest.approx(4 / 30),
+        "success": {"iqm": 1.0, "low": pytest.approx(np.nan, nan_ok=True), "high": pytest.approx(np.nan, nan_ok=True),
+                    "mean": 1.0},
+    }  # fmt: skip
+    assert found["deepest_fall"] == pytest.approx(0.2) and found["seeds"] == 2
+    assert found["transitions_until_held"] == {"level": 0.9, "transitions": 40}
+
+
+def test_only_methods_from_the_same_priors_are_comparable():
+    """Two methods began from `fast-2`, so that set counts; TD-MPC2 cannot begin from it and has a set of its own."""
+    curves = [
+        curve([0, 0, 0, 0], method=method, priors=priors, variant=variant)
+        for method, priors, variant in (
+            ("mbpo", "fast", ""), ("mbpo", "fast-2", ""), ("sac", "fast-2", ""), ("tdmpc2", "tdmpc2", ""),
+            ("sac", "fast", "tuned"), ("mine", "fast-2", ""),
+        )
+    ]  # fmt: skip
+    chosen = [(c.method, c.priors) for c in from_main_priors(curves)]
+    assert chosen == [("tdmpc2", "tdmpc2"), ("mbpo", "fast-2"), ("sac", "fast-2"), ("mine", "fast-2")]
+    sets = by_priors(curves)
+    assert next(iter(sets)) == "fast-2" and [c.name for c in sets["fast"]] == ["mbpo", "sac tuned"]
+    assert {c.method: c.family for c in curves}["tdmpc2"] == "planning" and curves[-1].family == "own"
+
+
+def test_a_run_folder(tmp_path):
+    digests = ("aaaaaaaaaaaa", "bbbbbbbbbbbb")
+    success = [[0.2, 0.4, 0.3], [0.8, 1.0, 0.5]]
+    save(tmp_path, "my_own_v2", success, rollouts=[0, 20], seeds="seeds-3-5", priors=digests, variant="v2", wanted=100)
+    (found,), notes = read_runs(tmp_path)
+    assert (found.task, found.gap, found.method, found.variant) == ("toy", "default", "my_own", "v2")
+    assert found.priors == "fast-aaaaaa" and found.seeds.tolist() == [3, 4, 5] and found.prior.tolist() == [1, 0, 1]
+    np.testing.assert_array_equal(found.values, np.transpose(success))
+    np.testing.assert_array_equal(found.of("return").values, 10 * np.transpose(success))
+    assert found.transitions.tolist() == [0, 400] and found.minutes[1] == pytest.approx(40 / 60)
+    assert found.facts["commit"] == "0123456789ab" and found.facts["options.network.hidden"] == "8 8"
+    assert notes == [f"{tmp_path / 'finetune/toy/default/my_own_v2/seeds-3-5'}: unfinished, 20 of 100 rollouts"]
+
+
+def test_of_several_runs_that_with_the_most_seeds(tmp_path):
+    save(tmp_path, "sac", [[0.2], [0.3]], rollouts=[0, 90], seeds="seed-0")
+    save(tmp_path, "sac", [[0.2, 0.4], [0.8, 1.0]], rollouts=[0, 20])
+    (tmp_path / "finetune/toy/default/mbpo/seed-0").mkdir(parents=True)
+    found, notes = read_runs(tmp_path)
+    assert [len(c.seeds) for c in found] == [2]
+    assert "holds no evaluation yet" in notes[0] and "seed-0: left out, seeds-0-1 has more seeds" in notes[1]
+    with pytest.raises(UserError, match="holds no evaluation yet"):
+        read_curve(tmp_path / "finetune/toy/default/mbpo/seed-0")
+
+
+def test_a_flat_table_and_back():
+    original = [curve([[0.1, 0.2, 0.3, 0.4], [0, 0, 1, 1]], prior=[0, 1]), curve([1, 2, 3, 4], score="return")]
+    original[1] = dataclasses.replace(original[1], variant="x")
+    table = list(rows(original))
+    assert len(table) == 8 + 4 and table[1]["rollouts"] == 1 and table[1]["success"] == 0.2
+    for one, other in zip(original, from_rows(table), strict=True):
+        assert (one.name, one.priors, one.score) == (other.name, other.priors, other.score)
+        for name in ("seeds", "prior", "rollouts", "transitions", "minutes", "values"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+    with pytest.raises(UserError, match="not evaluated after the same rollouts"):
+        from_rows(table[:7])

@@ -1,0 +1,91 @@
+import matplotlib.image
+import numpy as np
+import pytest
+from test_curves import curve
+
+from sgft_jax.analysis import figures
+
+
+def curves(count, seeds=3):
+    values = np.random.default_rng(0).uniform(0.2, 1.0, (count, seeds, 5))
+    return [curve(x, np.arange(5), method=f"method-{i}") for i, x in enumerate(values)]
+
+
+def pixels(image, color):
+    """How many have about that colour."""
+    wanted = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    return (np.abs(image[..., :3] - wanted).max(-1) < 0.01).sum()
+
+
+def read(path):
+    return matplotlib.image.imread(path)
+
+
+@pytest.mark.parametrize("count", [1, 2, 6])
+def test_every_curve_has_a_colour_of_its_own(tmp_path, count):
+    image = read(figures.learning_curves(tmp_path / "new" / "c.png", {"push": curves(count)}, title="Push"))
+    drawn = [pixels(image, color) > 200 for color in figures.PALETTE]
+    assert drawn == [True] * count + [False] * (6 - count)
+    assert (image[[0, -1]] > 0.99).all() and (image[:, [0, -1]] > 0.99).all()  # nothing is cut off at the border
+
+
+@pytest.mark.parametrize(("count", "sizes"), [(6, [6]), (7, [4, 3]), (13, [5, 4, 4])])
+def test_more_than_six_curves_become_small_multiples(count, sizes):
+    parts = figures._split("push", curves(count))
+    assert [len(own) for _, own, _ in parts] == sizes
+    assert all(len(own) + len(others) == count or not others for _, own, others in parts)
+    assert len({curve.name for _, own, _ in parts for curve in own}) == count
+    assert [words for words, *_ in parts][:1] == (["push"] if count == 6 else [f"push, 1 of {len(sizes)}"])
+
+
+def test_colours_are_distinct_in_a_panel_and_stay_from_panel_to_panel():
+    eight = curves(8)
+    colours = figures._colours(curve.name for curve in eight)
+    assert colours(eight[:3]) == list(figures.PALETTE[:3]) and colours(eight[1:2]) == [figures.PALETTE[1]]
+    assert len(set(colours([eight[0], eight[6], eight[7]]))) == 3  # the seventh would have the first one's
+
+
+def test_a_band_needs_three_seeds(tmp_path):
+    """Two seeds and one draw the same line and nothing around it."""
+    images = [
+        read(figures.learning_curves(tmp_path / f"{n}.png", {"": [curve([[0.1, 0.9]] * n, (0, 1))]}, title=""))
+        for n in (1, 2)
+    ]
+    assert pixels(images[0], figures.PALETTE[0]) == pixels(images[1], figures.PALETTE[0])
+    assert figures._note(curves(1, seeds=1)) == "one seed"
+    assert figures._note(curves(1, seeds=2)) == "line: interquartile mean of 2 seeds"
+    assert "drawing seeds" in figures._note(curves(1, seeds=3))
+
+
+def test_returns_are_drawn_too(tmp_path):
+    path = figures.learning_curves(tmp_path / "r.png", {"": [curve([-300, 40], (0, 1), score="return")]}, title="")
+    assert pixels(read(path), figures.PALETTE[0]) > 200
+
+
+def test_a_run_without_a_real_rollout_is_drawn(tmp_path):
+    assert figures.learning_curves(tmp_path / "z.png", {"": [curve([[0.5]], (0,))]}, title="").exists()
+
+
+def test_scaling_draws_lines_and_their_references(tmp_path):
+    lines = {"push": ([32, 512], [5e4, 9e4]), "insert": ([32, 512], [6e4, 2e5])}
+    references = {"push": ([32, 512], [1e5, 2e5])}
+    image = read(figures.scaling(tmp_path / "s.png", lines, references, title="t", x="worlds", y="steps"))
+    for color in figures.PALETTE[:2]:
+        assert pixels(image, color) > 200
+
+
+@pytest.mark.parametrize("n", [1, 200])
+def test_pretraining_panels(tmp_path, n):
+    returns = np.linspace(0, 5, n)
+    path = figures.pretraining(
+        tmp_path / "pretraining.png",
+        title="Pretraining",
+        steps=np.arange(10) * 1e5,
+        success=np.linspace(0, 1, 10),
+        returns=np.linspace(0, 50, 10),
+        value=returns,
+        monte_carlo=returns,
+        dynamics_error=[0.1, 0.2, 0.3],
+        baseline_error=[0.2, 0.5, 0.9],
+    )
+    assert read(path).shape[:2] == (384, 1440)

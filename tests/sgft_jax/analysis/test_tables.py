@@ -1,0 +1,81 @@
+"""Tables of learning curves: cells by hand."""
+
+import math
+
+import numpy as np
+import pytest
+from test_curves import curve
+
+from sgft_jax.analysis import tables
+from sgft_jax.analysis.stats import Interval
+
+
+def cells(table):
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+
+
+@pytest.mark.parametrize(
+    ("band", "score", "text"),
+    [
+        ((0.923, 0.88, 0.951), "success", "92 [88, 95]"),
+        ((0.923, math.nan, math.nan), "success", "92"),  # too few seeds for an interval
+        ((1.0, 1.0, 1.0), "success", "100"),  # all agree: the bootstrap has nothing to say
+        ((-0.001, -0.2, 0.0), "success", "0 [-20, 0]"),
+        ((12.34, 10.0, 15.0), "return", "12.3 [10.0, 15.0]"),
+    ],
+)
+def test_how_a_number_is_written(band, score, text):
+    assert tables.number(Interval(*map(np.asarray, band)), score) == text
+
+
+def test_a_row_says_what_the_curve_says():
+    """Two seeds, no intervals. Grid 0, 2, 4, as `often` was evaluated there too; area of the means 0.3, 0.95, 1:
+    (0.3 + 0.95) + (0.95 + 1) = 3.2 of 4 rollouts, 80 %; the fall from 0.3 to 0.1 is 20 points.
+    """
+    often = curve([[0.2, 0.1, 0.9, 1.0], [0.4, 0.1, 1.0, 1.0]], method="mbpo")
+    seldom = curve([[0.0, 0.0, 0.5, 0.5]] * 2, (0, 2, 4, 10))
+    head, _, first, second = cells(tables.summary([often, seldom]))
+    assert head == [
+        "method", "seeds", "zero-shot", "area, 0 to 4 rollouts", "end (rollouts)", "deepest fall", "90 % held after",
+    ]  # fmt: skip
+    assert first == ["mbpo", "2", "30", "80", "100 (4)", "20", "40"]
+    assert second == ["sac", "2", "0", "12", "50 (10)", "0", "> 200"]
+
+
+def test_a_short_run_and_variants_do_not_shorten_the_grid():
+    curves = [curve([0, 0, 0, 1], (0, 5, 10, n), method=m) for m, n in (("mbpo", 90), ("sac", 90))]
+    short, variant = curve([0, 1], (0, 5), method="iql"), curve([0, 1], (0, 7), variant="x")
+    assert tables.shared_grid([*curves, short, variant]).tolist() == [0, 5, 10, 90]
+    assert cells(tables.summary([*curves, short]))[-1][3] == "-"
+    assert tables.shared_grid([variant]).tolist() == [0, 7]
+
+
+def test_differences_are_paired_and_from_the_best():
+    """Each of three seeds of `mbpo` is 0.2 above the same seed of `sac`, so there is no spread."""
+    low, high = np.array([[0.0], [0.3], [0.6]]), np.array([[0.2], [0.5], [0.8]])
+    curves = [curve(np.repeat(x, 2, 1), (0, 4), method=m) for m, x in (("sac", low), ("mbpo", high))]
+    head, _, row = cells(tables.differences(curves))
+    assert head[0] == "area minus that of mbpo" and row == [
+        "sac",
+        "-20",
+        "0.33",
+    ]  # 0.3 > 0.2, 0.6 > 0.2 and 0.5: 3 of 9
+    assert tables.differences(curves[:1]) == ""
+
+
+def test_all_tasks():
+    """`sac` ran on both tasks, three seeds each: all areas are 1 and 0, whose middle half is 1, 1, 0, 0."""
+    one, zero = (curve([[x, x]] * 3, (0, 4)) for x in (1.0, 0.0))
+    other = curve([[0.5, 0.5]] * 3, (0, 4), method="mbpo")
+    head, _, *rows = cells(tables.areas_by_task({"hammer": [one, other], "push": [zero]}))
+    assert head == ["area", "hammer, to 4 rollouts", "push, to 4 rollouts", "all tasks"]
+    assert rows == [["sac", "100", "0", "50"], ["mbpo", "50", "-", "-"]]
+    assert tables.leading({"hammer": [one, other], "push": [zero]}, 1) == ["sac"]
+
+
+def test_the_outcome_has_a_column_for_each_evaluation():
+    table = tables.outcome([curve([0.0, 0.9], (0, 5)), curve([0.0, 0.5, 1.0], (0, 1, 5), method="mbpo")])
+    assert cells(table) == [
+        ["method", "zero-shot", "1 rollout", "5 rollouts"], ["---"] * 4,
+        ["sac", "0", "-", "90"], ["mbpo", "0", "50", "100"],
+    ]  # fmt: skip

@@ -1,0 +1,204 @@
+"""The iterator of pretraining: fleets that reset, worlds that are renewed, resuming, what it leaves."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toy
+import toy_terminating
+from flax import struct
+
+import envs
+from sgft_jax import pretraining, recipes
+from sgft_jax.data import replay
+from sgft_jax.learners import tdmpc2_model
+from sgft_jax.models import normalizer
+from sgft_jax.models.networks import NetworkConfig
+from sgft_jax.policies import make_policy
+from sgft_jax.presets import PRESETS, PretrainConfig
+from sgft_jax.pretraining import Best, keep_better, over_members, pretrain, priors_of
+from sgft_jax.types import Learner, UserError
+
+N, STEPS, LENGTH = 16, 30, toy_terminating.LENGTH
+CONFIG = PretrainConfig(
+    n_envs=N, chunk_steps=STEPS, env_steps=2 * N * STEPS, worlds=4, random_transitions=4 * N,
+    replay_capacity=4 * N * STEPS, batch_size=8, updates_per_step=1, gamma=0.9, network=NetworkConfig(hidden=(8,)), ensemble_size=1,
+    size="tiny", horizon=2, plan_samples=8,
+)  # fmt: skip
+
+
+class Agent(struct.PyTreeNode):
+    """An agent that learns nothing."""
+
+    normalizer: Any
+    hyper: Any
+
+
+def counting(task, config):
+    """Actions are the age of the episode, as far as the carry tells."""
+    learner = Learner(
+        init=lambda key: Agent(normalizer.identity(task.obs_dim), jnp.float32(0)),
+        init_carry=lambda: jnp.float32(0),
+        act=lambda agent, carry, obs, key, *, explore: (jnp.full(task.act_dim, carry), carry + 1),
+        update=lambda agent, batch, key: (agent, {"batch/reward": batch.reward.mean()}),
+    )
+    sac = recipes.RECIPES["sac"](task, config)
+    act = lambda agent, carry, obs, key: learner.act(agent, carry, obs, key, explore=True)  # noqa: E731
+    return sac._replace(
+        learner=learner, hyper=lambda steps: jnp.float32(0), init_carry=learner.init_carry, act=act,
+        extract=lambda agent: agent.normalizer,
+    )  # fmt: skip
+
+
+def played(state, chunk):
+    """The stored rows [STEPS, N] of a chunk of a single member."""
+    rows = slice(chunk * STEPS * N, (chunk + 1) * STEPS * N)
+    return jax.tree.map(lambda x: np.asarray(x[0, rows]).reshape(STEPS, N, *x.shape[2:]), state.replay.data)
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """Trains the counting agent on risks by number of the set: [(state, metrics)] after every chunk, state in NumPy."""
+    monkeypatch.setattr(pretraining, "RECIPES", {"sac": counting})
+
+    def run(risks, **changes):
+        env, config = toy_terminating.make(), replace(CONFIG, **changes)
+
+        def pools(number):
+            pool = envs.sample_worlds(env, jax.random.key(number), 4, params={"risk": risks[number]})
+            return jax.tree.map(lambda x: x[None], pool)
+
+        return [jax.tree.map(jnp.copy, found) for found in pretrain(env, config, [3], pools=pools)][1:]
+
+    return run
+
+
+def test_episodes_end_and_begin_anew_with_their_carry(counted):
+    (state, metrics), _ = counted([0.2])
+    rows = played(state, 0)
+    alarm, age = rows.next_obs[..., 1] > 0.5, rows.action[..., 0]
+    over = alarm | (age == LENGTH - 1)
+    np.testing.assert_allclose(rows.discount, 0.9 * (1 - alarm), rtol=1e-6)
+    assert alarm.any(axis=0).all() and (over & ~alarm).any(), "episodes end both ways"
+    assert (rows.obs[0] == 0).all() and (age[0] == 0).all()
+    np.testing.assert_allclose(rows.obs[1:], np.where(over[:-1, :, None], 0, rows.next_obs[:-1]))
+    np.testing.assert_array_equal(age[1:], np.where(over[:-1], 0, age[:-1] + 1))
+    np.testing.assert_array_equal(state.fleet.carry[0], state.fleet.state.time[0])
+    assert metrics["train/terminated"][0] == pytest.approx(alarm.sum() / over.sum())
+    assert metrics["train/exploded"][0] == metrics["train/success"][0] == 0
+
+
+def test_new_worlds_begin_new_episodes(counted):
+    """Nothing ends the first set's episodes but time, everything those of the second."""
+    state, metrics = counted([0.0, 1.0], refresh_every=1)[-1]
+    first, second = played(state, 0), played(state, 1)
+    assert (first.discount > 0).all() and (second.discount == 0).all()
+    assert (second.obs[0] == 0).all() and (second.action == 0).all() and first.action.max() == LENGTH - 1
+    assert metrics["train/terminated"][0] == 1
+
+
+def test_a_set_that_is_not_due_is_never_asked_for(counted):
+    """There is no second set in either case, and nothing else differs."""
+    never, late = (counted([0.2], refresh_every=every)[-1][0] for every in (0, 2))
+    equal(never, late)
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "tdmpc2"])
+@pytest.mark.parametrize("refresh_every", [0, 1])
+def test_resumed_is_bit_for_bit_uninterrupted(algorithm, refresh_every, monkeypatch):
+    monkeypatch.setitem(tdmpc2_model.SIZES, "tiny", tdmpc2_model.Size(8, 8, 8, 2, 2))
+    env, config = (
+        toy_terminating.make(),
+        replace(CONFIG, algorithm=algorithm, refresh_every=refresh_every, random_ladder=0.5),
+    )
+    seeds = [3, 4]
+    states = [jax.tree.map(jnp.copy, state) for state, _ in pretrain(env, config, seeds)]
+    assert [pretraining.chunks_done(state, config) for state in states] == [0, 1, 2]
+    _, (end, metrics) = pretrain(env, config, seeds, state=jax.tree.map(jnp.copy, states[1]))
+    equal(end, states[2])
+    assert all(np.isfinite(x).all() and x.shape == (2,) for x in metrics.values())
+    first, other = end.replay.data.action
+    assert (first != other).any(), "seeds differ"
+
+    prior, _ = priors_of(env, config, end)
+    assert prior.card["task"] == "toy_terminating" and prior.card["gamma"] == 0.9
+    policy = make_policy(prior.card, env)
+    action, _ = policy.act(prior.params, policy.init_carry(), jnp.zeros(2), jax.random.key(0), explore=False)
+    assert action.shape == (1,) and np.isfinite(action).all()
+
+
+def equal(one, other):
+    for (path, a), b in zip(jax.tree_util.tree_leaves_with_path(one), jax.tree.leaves(other), strict=True):
+        a, b = (jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x for x in (a, b))
+        np.testing.assert_array_equal(a, b, err_msg=jax.tree_util.keystr(path))
+
+
+def test_random_actions_grow_along_the_fleet(key, monkeypatch):
+    """A policy always says 2: the first environment obeys, the last acts at random, the middle one does both."""
+    always = lambda agent, carry, obs, key: (jnp.full(2, 2.0), carry)  # noqa: E731
+    monkeypatch.setattr(pretraining, "RECIPES", {"sac": lambda *given: counting(*given)._replace(act=always)})
+    config = replace(CONFIG, n_envs=3, chunk_steps=60, env_steps=180, random_ladder=1.0)
+    *_, (state, _) = pretrain(toy.make(), config, [0])
+    obeyed = (state.replay.data.action[0, : 3 * 60].reshape(60, 3, 2) > 1).all(-1).mean(0)
+    assert obeyed[0] == 1 and obeyed[2] == 0 and 0.25 < obeyed[1] < 0.75
+
+
+def test_better_is_a_higher_score_then_a_higher_return():
+    def best(score, total, steps):
+        return Best({"w": jnp.full(2, float(steps))}, jnp.float32(score), jnp.float32(total), jnp.int32(steps))
+
+    old = best(0.5, 3.0, 1)
+    for score, total, steps in [(0.6, -9.0, 2), (0.5, 3.1, 2), (0.5, 3.0, 1), (0.5, 2.9, 1), (0.4, 9.0, 1)]:
+        kept = keep_better(old, best(score, total, 2), 0.0)
+        assert kept.steps == steps and kept.params["w"].tolist() == [steps, steps]
+    assert keep_better(old, best(0.1, 0.0, 2), 1.5).steps == 2, "an early evaluation does not compete"
+
+
+@pytest.mark.parametrize("algorithm", ["sac", "tdmpc2"])
+def test_the_learning_rate_falls_linearly_to_its_end(algorithm):
+    config = replace(PRESETS["cpu"], algorithm=algorithm, size="1M", n_envs=10, env_steps=1000, lr=1e-3, lr_end=0.1)
+    recipe = recipes.RECIPES[algorithm](toy.make(), config)
+    rate = {"sac": "lr_critic", "tdmpc2": "lr"}[algorithm]
+    rates = [float(getattr(recipe.hyper(jnp.int32(steps)), rate)) for steps in (0, 50, 100, 120)]
+    np.testing.assert_allclose(rates, [1e-3, 5.5e-4, 1e-4, 1e-4], rtol=1e-5)
+
+
+@pytest.mark.parametrize("members", [1, 3])
+def test_over_members_is_a_loop(members):
+    x, y = jnp.arange(3.0)[:members], jnp.arange(6.0).reshape(3, 2)[:members]
+    twice, sums = over_members(lambda x, y: (2 * x, y.sum()), members)(x, y)
+    assert twice.tolist() == [0, 2, 4][:members] and sums.tolist() == [1, 5, 9][:members]  # 0 + 1, 2 + 3, 4 + 5
+
+
+def test_a_single_member_keeps_its_conditions():
+    branch = lambda x: jax.lax.cond(x > 0, jnp.sin, jnp.cos, x)  # noqa: E731
+    one, two = (str(jax.make_jaxpr(over_members(branch, n))(jnp.ones(n))) for n in (1, 2))
+    assert "cond[" in one and "cond[" not in two
+
+
+def test_memory_counts_what_is_kept_and_drawn():
+    """A row of the toy task: two observations of 4 numbers, 2 of the action, reward and discount, 4 bytes each."""
+    row = sum(x.nbytes for x in jax.tree.leaves(replay.blank(4, 2)))
+    assert row == 4 * (4 + 4 + 2 + 1 + 1)
+    found = pretraining.memory(
+        toy.make(), replace(CONFIG, random_transitions=100, replay_capacity=10**9, batch_size=50)
+    )
+    assert found["random_transitions"] == 100 * row + 8 and found["replay_capacity"] == 10**9 * row + 8  # two counters
+    assert found["batch_size"] == 2 * 50 * row
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"replay_capacity": 9}, "option replay-capacity is 9: must be at least n-envs = 16"),
+        ({"refresh_every": -1}, "option refresh-every is -1: must be at least 0"),
+        ({"gamma": 2.0}, "option gamma is 2.0: must be at least 0 and less than 1"),
+        ({"lr": float("nan")}, "option lr is nan: must be a positive number"),
+    ],
+)
+def test_settings_that_make_no_sense_are_refused(changes, words):
+    with pytest.raises(UserError, match=words):
+        replace(CONFIG, **changes)
