@@ -34,7 +34,7 @@ def test_one_task_for_people(capsys):
     text = {line.split("  ")[0]: line for line in lines if line}
     assert text["observation"].endswith("hand_xyz [3] in m, leg_xyz [3] in m, hole_xyz [3] in m")
     assert text["episode"].endswith("40 steps of 0.2 s = 8 s") and text["judged by"].endswith("success at any step")
-    assert text["part_x"].split()[1:] == "m 0 -0.05 to 0.05 -0.15 to 0.15".split()
+    assert text["part_x"].split()[1:] == ["m", "0", "-0.05", "to", "0.05", "-0.15", "to", "0.15"]
     assert "fixed" in text["hole_radius"] and text["part_friction"].endswith("at least 0")
     assert "0.004" in text["obs_noise"] and "s, how long the previous command stays" in text["latency"]
     assert "action_rotation 0.5; latency 0.05" in text["hard"]
