@@ -200,8 +200,9 @@ def sac_finetuner(
         max_grad_norm=options.max_grad_norm,
         **structure,
     )
-    keeps = isinstance(options, KeptCriticOptions) and not new_critic
-    rise = rules.warmup(options, options.lr_warmup) if keeps else 0
+    rise = 0
+    if isinstance(options, KeptCriticOptions) and not new_critic:
+        rise = rules.warmup(options, options.lr_warmup)
     hyper = sac.SACHyper(
         lr_actor=options.lr_actor,
         lr_critic=options.lr_critic,
