@@ -70,9 +70,8 @@ def load_priors(folders: Sequence[Path], env: Any) -> list[Prior]:
     env: what has the `name`, `obs_dim` and `act_dim` that they must have.
     """
     priors = [load_prior(folder, task=env.name, obs_dim=env.obs_dim, act_dim=env.act_dim) for folder in folders]
-    first = _structure(priors[0].card)
     for folder, prior in zip(folders, priors, strict=True):
-        if odd := differences(first, _structure(prior.card)):
+        if odd := differences(_structure(priors[0].card), _structure(prior.card)):
             names = sorted({name.partition(".")[0] for name, *_ in odd})
             raise UserError(f"{folder}: differs from {folders[0]} in {', '.join(names)}; choose one with --prior")
     return priors

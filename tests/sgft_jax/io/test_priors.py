@@ -43,9 +43,8 @@ def test_prior_round_trip(tmp_path):
 
 
 def test_every_learner_that_leaves_a_prior_names_its_container(tmp_path):
-    params = TDMPC2Params(
-        *({"kernel": jnp.ones(2) * i} for i in range(5)), Normalizer(jnp.zeros(4), jnp.ones(4)), jnp.float32(3)
-    )
+    fields: dict = {name: {"kernel": jnp.ones(2) * i} for i, name in enumerate(TDMPC2Params._fields)}
+    params = TDMPC2Params(**fields | {"normalizer": Normalizer(jnp.zeros(4), jnp.ones(4)), "scale": jnp.float32(3)})
     folder = priors.save_prior(tmp_path / "prior", Prior(params, CARD | {"algorithm": "tdmpc2"}))
     assert bits(priors.load_prior(folder).params) == bits(params)
 
