@@ -25,6 +25,7 @@ TASKS = {
     "hammer": "envs.franka.hammer",
     "insert": "envs.franka.insert",
 }
+_OURS = frozenset(TASKS.values())
 _LAZY = {
     **dict.fromkeys(("Episode", "Fleet", "launch", "play_episode", "step_fleet"), "envs.rollout"),
     **dict.fromkeys(("sample_worlds", "uniform"), "envs.domains.uniform"),
@@ -77,13 +78,17 @@ def make(task: str, impl: str = "auto", scene: str = "") -> Env:
     Raises UserError with the closest match for an unknown task or scene, and naming file and line for one that fails.
     """
     module = _module(task)
-    real = _real(task, scene) if scene else None
-    env = extend.run("task", task, lambda: module.make(impl, real) if scene else module.make(impl))
+    given = (impl, _real(task, scene)) if scene else (impl,)
+    if module.__name__ in _OURS:
+        return packed(module.make(*given))
+    source = task if extend.is_source(task) else module.__name__
+    env = extend.guard("task", source, module.make)(*given)
     if not isinstance(env, Env):
         raise UserError(f"task {task}: make(impl) returns a {type(env).__name__}, not an envs.Env")
     if env.name != name_of(task):
         raise UserError(f"task {task}: its Env is called {env.name!r}; call it {name_of(task)!r}, like the file")
-    return packed(env)
+    called = {name: getattr(env, name) for name in ("make_worlds", "reset", "step")}
+    return packed(env._replace(**{name: extend.guard("task", source, f) for name, f in called.items()}))
 
 
 def scene(task: str, real: str = "") -> Any:

@@ -25,7 +25,7 @@ class GridArgs:
 
     tasks: tuple[str, ...] = tuple(envs.TASKS)
     """Tasks."""
-    methods: tuple[str, ...] = tuple(reversed(NAMES))
+    methods: tuple[str, ...] = NAMES
     """Methods, in the order in which they run."""
     reals: tuple[str, ...] = ("default",)
     """Real systems of every task: mild, default, hard, or .toml/.json files."""
@@ -91,10 +91,11 @@ def run_of(args: GridArgs, task: str, real: str, method: str) -> FinetuneArgs:
 
 def look_up(run: FinetuneArgs) -> Cell:
     """How far the run on the one real system of these arguments has got."""
+    from sgft_jax.io import checkpoint
+
     folder = run_folder(run, *run.real)
     if not (folder / CONFIG).exists():
         return Cell(run, "missing", 0)
-    from sgft_jax.io import checkpoint  # starts JAX
 
     summed_up = read_json(folder / SUMMARY)["final"]["rollouts"] if (folder / SUMMARY).exists() else 0
     state = "finished" if summed_up >= run.rollouts else "unfinished"

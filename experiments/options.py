@@ -9,7 +9,7 @@ from tyro.conf import arg
 import envs
 from envs import gaps
 from sgft_jax import extend
-from sgft_jax.types import UserError, unknown
+from sgft_jax.types import UserError
 
 LAST_SEED = 2**31 - 1  # larger ones stand for held-out worlds and episodes
 
@@ -49,8 +49,8 @@ def check_task(task: str, reals: Sequence[str] = ()) -> None:
         if real.endswith((".toml", ".json")):
             if not Path(real).is_file():
                 raise UserError(f"--real {real}: no such file")
-        elif real not in (known := gaps.presets(name)):
-            raise UserError(f"{unknown(f'gap of {name}', real, known)}; or give a .toml or .json file")
+        elif real not in gaps.presets(name):
+            raise gaps.no_such_gap(name, real)
 
 
 def at_least_one(args: object, *names: str) -> None:

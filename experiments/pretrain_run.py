@@ -27,7 +27,7 @@ from sgft_jax import mesh
 from sgft_jax.analysis import figures
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
-from sgft_jax.io.priors import save_prior
+from sgft_jax.io.priors import digest, save_prior
 from sgft_jax.io.progress import Clock, RunProgress
 from sgft_jax.policies import make_policy
 from sgft_jax.pretraining import (
@@ -205,7 +205,8 @@ class _Run:
         results = []
         for i, seed in enumerate(self.seeds):
             own = stacking.member(best, i)
-            found = {"seed": seed, **describe(stacking.member(played, i)), **self._chosen(own)}
+            name = digest(Prior(own.params, {}))  # by which runs of fine-tuning tell which priors they began from
+            found = {"seed": seed, "digest": name, **describe(stacking.member(played, i)), **self._chosen(own)}
             if report is not None:
                 found |= numbers(stacking.member(report, i))
                 self._save_report(seed, stacking.member(report, i), i)

@@ -7,6 +7,7 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from sgft_jax.types import UserError
 
@@ -24,55 +25,57 @@ def name_of(source: str) -> str:
 def load(kind: str, source: str, attribute: str) -> ModuleType:
     """The module of a file or of a dotted name, executed once per process; it must define `attribute`.
 
-    kind: what it should hold, for messages. Raises UserError if there is no such file or module, if it fails (naming
-    file and line, the traceback as its cause), or if it lacks the attribute.
+    kind: what it should hold, for messages. Raises UserError if there is no such file or module, if it fails, or if it
+    lacks the attribute.
     """
-    module = run(kind, source, lambda: _from_file(Path(source)) if source.endswith(".py") else _module(kind, source))
+    module = guard(kind, source, _from_file if source.endswith(".py") else _module)(source)
     if not hasattr(module, attribute):
         raise UserError(f"{kind} {source}: does not define `{attribute}`; see docs/extending.md")
     return module
 
 
-def run[T](kind: str, source: str, function: Callable[[], T]) -> T:
-    """What a function of the user's file or module returns; a UserError, one line, for whatever it raises.
+def guard[T](kind: str, source: str, function: Callable[..., T]) -> Callable[..., T]:
+    """The same function of the user's file or module; whatever it raises is a UserError that names file and line.
 
-    A name of ours keeps its traceback.
+    Under `jax.jit` this holds while it is traced. The traceback stays as the error's cause.
     """
-    try:
-        return function()
-    except UserError:
-        raise
-    except SyntaxError as error:
-        raise UserError(f"{kind} {source}: {error.msg} in line {error.lineno} of {error.filename}") from error
-    except Exception as error:
-        if not is_source(source):
+
+    def guarded(*args: Any) -> T:
+        try:
+            return function(*args)
+        except UserError:
             raise
-        if isinstance(error, OSError) and error.filename == source:
-            raise UserError(f"{kind} {source}: {error.strerror}") from None
-        said = (str(error).strip() or "no message").splitlines()[0]
-        raise UserError(f"{kind} {source}: {_place(source, error)}{type(error).__name__}: {said}") from error
+        except SyntaxError as error:
+            raise UserError(f"{kind} {source}: {error.msg} in line {error.lineno} of {error.filename}") from error
+        except Exception as error:
+            if isinstance(error, OSError) and error.filename == str(Path(source).resolve()):
+                raise UserError(f"{kind} {source}: {error.strerror}") from None
+            said = (str(error).strip() or "no message").splitlines()[0]
+            raise UserError(f"{kind} {source}: {_place(source, error)}: {type(error).__name__}: {said}") from error
+
+    return guarded
 
 
 def _place(source: str, error: Exception) -> str:
-    """Where it failed: the line of the user's file, or the file and line of what it imports."""
+    """Where it failed: the line of the user's file, or file and line of what it called."""
+    own = str(Path(source).resolve()) if source.endswith(".py") else getattr(sys.modules.get(source), "__file__", None)
     frames = traceback.extract_tb(error.__traceback__)
-    own = [frame for frame in frames if source.endswith(".py") and Path(frame.filename) == Path(source).resolve()]
-    if own:
-        return f"line {own[-1].lineno}: "
-    return f"{frames[-1].filename}, line {frames[-1].lineno}: "
+    if lines := [frame.lineno for frame in frames if frame.filename == own]:
+        return f"line {lines[-1]}"
+    return f"{frames[-1].filename}, line {frames[-1].lineno}"
 
 
-def _module(kind: str, source: str) -> ModuleType:
+def _module(source: str) -> ModuleType:
     try:
         return importlib.import_module(source)
     except ModuleNotFoundError as error:
         if source != error.name and not source.startswith(f"{error.name}."):
             raise  # it is there, what it imports is not
-        raise UserError(f"{kind} {source}: there is no module {error.name!r}; a file is named with its .py") from None
+        raise UserError(f"there is no module {error.name!r}; a file is named with its .py") from None
 
 
-def _from_file(path: Path) -> ModuleType:
-    name = str(path.resolve())  # no other module can be called that
+def _from_file(source: str) -> ModuleType:
+    name = str(Path(source).resolve())  # no other module can be called that
     if name in sys.modules:
         return sys.modules[name]
     spec = importlib.util.spec_from_file_location(name, name)

@@ -193,8 +193,7 @@ def memory(env: Env, config: PretrainConfig) -> dict[str, int]:
         "random_transitions": size(lambda: kept.empty(config.random_transitions)),
         "replay_capacity": size(lambda: kept.empty(config.replay_capacity)),
         # Drawn, then put together.
-        "batch_size": activations
-        + 2 * size(lambda: kept.sample(kept.empty(config.n_envs), jax.random.key(0), drawn)),
+        "batch_size": activations + 2 * size(lambda: kept.sample(kept.empty(config.n_envs), jax.random.key(0), drawn)),
     }
 
 

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from envs.base import Entry, Env, Parameter
-from envs.mujoco.engines.mjx import Engine
+from envs.mujoco.engines import Engine
 from envs.mujoco.scene import Scene, View, make_env
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array, Key

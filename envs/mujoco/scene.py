@@ -11,7 +11,7 @@ import numpy as np
 from envs import effects as env_effects
 from envs.base import NOTHING, Entry, Env, EnvState, Parameter, Theta, Value, World, never, pack
 from envs.mujoco import worlds as physics
-from envs.mujoco.engines.mjx import Engine
+from envs.mujoco.engines import Engine
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array, Key, UserError
 
@@ -164,7 +164,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
 
 def _outcome(
     scene: Scene, params: Array, before: EnvState, action: Array, after: PhysicsState, true_obs: Array
-) -> Measured:
+) -> tuple[Array, Array, Array]:
     """Reward, end and success of a step, each as observations tell it or as the simulator measures it."""
     measured = scene.measured(params, before.physics, action, after)
     step = before.true_obs, action, true_obs
@@ -177,11 +177,7 @@ def _outcome(
             raise UserError(f"scene {scene.name} measures '{name}': then its function of observations must be None")
         return function(*given)
 
-    return Measured(
-        reward=found("reward", step, 0.0),
-        terminated=found("terminated", step, False),
-        success=found("success", (true_obs,), False),
-    )
+    return found("reward", step, 0.0), found("terminated", step, False), found("success", (true_obs,), False)
 
 
 def _perturbed(scene: Scene, nominal: dict[str, float]) -> Iterator[mujoco.MjSpec]:

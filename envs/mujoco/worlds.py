@@ -5,6 +5,7 @@ compiler, and the fields in which the compiled models differ are stacked. That i
 and all constants derived from them), because no derived field is ever recomputed by hand.
 """
 
+import importlib
 import os
 from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple, get_args
@@ -14,10 +15,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.mujoco.engines import c as engine_c
-from envs.mujoco.engines import mjx as engine_jax
-from envs.mujoco.engines import warp as engine_warp
-from envs.mujoco.engines.mjx import MEAN_INERTIA, Engine
+from envs.mujoco.engines import MEAN_INERTIA, Engine
 from sgft_jax.types import Array, UserError, unknown
 
 # Fields that only matter to a renderer: they may differ between worlds without being simulated.
@@ -54,9 +52,8 @@ class PhysicsState(NamedTuple):
 
 def make_engine(host: mujoco.MjModel, fields: tuple[str, ...], impl: str) -> Engine:
     """What steps a scene whose worlds differ in `fields`, by one of the engines of `choose_impl`."""
-    if impl == "c":
-        return engine_c.make_engine(host, fields)
-    return {"jax": engine_jax, "warp": engine_warp}[impl].make_engine(host)
+    module = importlib.import_module(f"envs.mujoco.engines.{'mjx' if impl == 'jax' else impl}")
+    return module.make_engine(host, fields)
 
 
 def check_supported(name: str, host: mujoco.MjModel) -> None:
@@ -78,8 +75,15 @@ def choose_impl(wanted: str = "auto") -> str:
         raise UserError(unknown(IMPL_VARIABLE if wanted == "auto" else "impl", impl, get_args(Impl)))
     if impl != "auto":
         return impl
-    fastest = {"cpu": "c", "gpu": "warp" if engine_warp.available() else "jax"}
-    return fastest.get(jax.default_backend(), "jax")
+    match jax.default_backend():
+        case "cpu":
+            return "c"
+        case "gpu":
+            from envs.mujoco.engines import warp
+
+            return "warp" if warp.available() else "jax"
+        case _:
+            return "jax"
 
 
 def varying_fields(nominal: mujoco.MjModel, specs: Iterable[mujoco.MjSpec]) -> tuple[str, ...]:
@@ -88,7 +92,9 @@ def varying_fields(nominal: mujoco.MjModel, specs: Iterable[mujoco.MjSpec]) -> t
     Found once per task from perturbed specs, so that all worlds of a task are pytrees of one structure: programs
     compiled for one gap serve every other, and gaps can be vmapped over.
     """
-    model, _ = engine_jax.put(nominal)
+    from envs.mujoco.engines import mjx
+
+    model, _ = mjx.put(nominal)
     names = [k for k, v in vars(model).items() if isinstance(v, jax.Array) and not k.startswith(_COSMETIC)]
     reference = _read(nominal, names)
     others = [_read(spec.compile(), names) for spec in specs]

@@ -159,7 +159,7 @@ def test_a_finished_run_is_neither_repeated_nor_changed(finished, out, capsys):
         (["--preset", "fats"], "--preset: there is no 'fats', did you mean 'fast'? Choose from: cpu, fast, paper"),
         (["--config.gama", "0.9"], "did you mean --config.gamma?"),
         (["--task", "toy", "--seeds", "0"], "--seeds is 0: must be at least 1"),
-        (["--task", "toy", "--real", "mild"], "gap of toy: there is no 'mild'"),
+        (["--task", "toy", "--real", "mild"], "toy has no gap 'mild'"),
         (["--task", "toy", "--config.n-envs", "0"], "option n-envs is 0: must be at least 1"),
         (["--task", "toy", "--config.gamma", "2"], "option gamma is 2.0: must be at least 0 and less than 1"),
         (["--task", "toy", "--config.lr", "nan"], "option lr is nan: must be a positive number"),

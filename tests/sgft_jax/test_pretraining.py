@@ -25,8 +25,8 @@ from sgft_jax.types import Learner, UserError
 N, STEPS, LENGTH = 16, 30, toy_terminating.LENGTH
 CONFIG = PretrainConfig(
     n_envs=N, chunk_steps=STEPS, env_steps=2 * N * STEPS, worlds=4, random_transitions=4 * N,
-    replay_capacity=4 * N * STEPS, batch_size=8, updates_per_step=1, gamma=0.9, network=NetworkConfig(hidden=(8,)), ensemble_size=1,
-    size="tiny", horizon=2, plan_samples=8,
+    replay_capacity=4 * N * STEPS, batch_size=8, updates_per_step=1, gamma=0.9,
+    network=NetworkConfig(hidden=(8,)), ensemble_size=1, size="tiny", horizon=2, plan_samples=8,
 )  # fmt: skip
 
 

@@ -1,0 +1,20 @@
+"""Who steps the physics. The engines themselves are imported where one is made: MJX alone takes two seconds."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from sgft_jax.types import Array, PyTree
+
+MEAN_INERTIA = "stat.meaninertia"  # a field that worlds differ in, though MuJoCo does not keep it with the others
+
+
+class Engine(NamedTuple):
+    """Who steps a scene, for one world; vmap over worlds.
+
+    fields: of the model that differ between worlds, by name. state: a `PhysicsState`.
+    advance(fields, state, controls [substeps, nu]) -> the state after these steps.
+    sense(fields, state) -> the same state with what its sensors read.
+    """
+
+    advance: Callable[[dict[str, Array], PyTree, Array], PyTree]
+    sense: Callable[[dict[str, Array], PyTree], PyTree] = lambda fields, state: state

@@ -22,7 +22,7 @@ import mujoco.rollout
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
-from envs.mujoco.engines.mjx import MEAN_INERTIA, Engine
+from envs.mujoco.engines import MEAN_INERTIA, Engine
 from sgft_jax.types import Array, PyTree
 
 

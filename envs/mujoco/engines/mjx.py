@@ -1,34 +1,24 @@
 """MJX's own JAX code as the engine of a scene, and what both engines of MJX share."""
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+import contextlib
+import io
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
+
+with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that the optional Warp backend is absent
+    from mujoco import mjx
 
 import envs.mujoco.engines.fences  # noqa: F401 - a repair of mjx, before its first use
-from sgft_jax.types import Array, PyTree
-
-MEAN_INERTIA = "stat.meaninertia"
-
-
-class Engine(NamedTuple):
-    """Who steps a scene, for one world; vmap over worlds.
-
-    fields: of the model that differ between worlds, by name. state: a `PhysicsState`.
-    advance(fields, state, controls [substeps, nu]) -> the state after these steps.
-    sense(fields, state) -> the same state with what its sensors read.
-    """
-
-    advance: Callable[[dict[str, Array], PyTree, Array], PyTree]
-    sense: Callable[[dict[str, Array], PyTree], PyTree] = lambda fields, state: state
+from envs.mujoco.engines import MEAN_INERTIA, Engine
+from sgft_jax.types import Array
 
 
-def make_engine(host: mujoco.MjModel) -> Engine:
-    """The engine of a compiled scene.
+def make_engine(host: mujoco.MjModel, fields: tuple[str, ...] = ()) -> Engine:
+    """The engine of a compiled scene. fields: not needed here, every field may be set.
 
     Between substeps only the minimal state is carried: it keeps the loop's memory traffic small. Matrix products run in
     full float32: TF32 is not enough for contact dynamics.

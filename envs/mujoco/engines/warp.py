@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
-from envs.mujoco.engines.mjx import Engine, put, with_fields
+from envs.mujoco.engines import Engine
+from envs.mujoco.engines.mjx import mjx, put, with_fields
 from sgft_jax.types import Array, PyTree, UserError
 
 # Newton iterations beyond the scene's. After the hardest pushes on the puck, one control step in a hundred, 4 of them
@@ -26,8 +26,8 @@ _MORE_ITERATIONS = 4
 _POSES = ("xpos", "xquat", "xmat", "xipos", "ximat", "geom_xpos", "geom_xmat")
 
 
-def make_engine(host: mujoco.MjModel) -> Engine:
-    """The engine of a compiled scene. Raises UserError where Warp is not installed."""
+def make_engine(host: mujoco.MjModel, fields: tuple[str, ...] = ()) -> Engine:
+    """The engine of a compiled scene. fields: not needed here. Raises UserError where Warp is not installed."""
     if not available():
         raise UserError("the engine warp needs the package warp-lang: install sgft-jax[warp]")
     from envs.mujoco.engines import warp_worlds

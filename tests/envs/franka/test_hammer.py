@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scripted import PROBES, as_params, measure, play_script, reference_steps
 
-from envs.franka import arm, hammer, host
+from envs.franka import arm, hammer
+from envs.mujoco import host
 
 NOMINAL = {p.name: p.nominal for p in hammer.PARAMETERS}
 PROBE = PROBES["hammer"]

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scripted import PROBES, as_params, measure, play_script, reference_steps, sample_theta
 
-from envs.franka import arm, host, insert, kinematics
+from envs.franka import arm, insert, kinematics
+from envs.mujoco import host
 
 NOMINAL = {p.name: p.nominal for p in insert.PARAMETERS}
 PROBE = PROBES["insert"]

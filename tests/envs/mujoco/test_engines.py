@@ -10,6 +10,7 @@ import envs
 from envs.mujoco import host
 from envs.mujoco import worlds as physics
 from envs.mujoco.engines import mjx as engine_jax
+from envs.mujoco.engines import warp as engine_warp
 from envs.mujoco.scene import make_env
 from sgft_jax.types import UserError
 
@@ -77,7 +78,7 @@ def test_who_steps_the_physics(monkeypatch):
     assert physics.choose_impl() == "c"  # the tests run on a CPU
     for backend, installed, chosen in (("gpu", True, "warp"), ("gpu", False, "jax"), ("tpu", True, "jax")):
         monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
-        monkeypatch.setattr(physics.engine_warp, "available", lambda installed=installed: installed)
+        monkeypatch.setattr(engine_warp, "available", lambda installed=installed: installed)
         assert physics.choose_impl() == chosen
     assert physics.choose_impl("jax") == "jax" and make_env(SCENES["hammer"], "c").impl == "c"
     monkeypatch.setenv(physics.IMPL_VARIABLE, "wrap")

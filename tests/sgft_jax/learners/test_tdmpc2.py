@@ -185,6 +185,8 @@ def test_discounted_mean_by_hand():
     # (1 + 3 + 0.5 * 2) / 2.5 = 2, times the mean weight (1 + 0.5) / 2
     assert tdmpc2.discounted_mean(values, short, 0.5) == pytest.approx(1.5)
     assert tdmpc2.discounted_mean(values, jnp.zeros((2, 2), bool), 0.5) == 0
+    # (0.5 * 1 + 1.5 * 3 + 0.5 * 0.5 * 2) / 2.5 * 0.75
+    assert tdmpc2.discounted_mean(values, short, 0.5, jnp.array([0.5, 1.5])) == pytest.approx(1.65)
 
 
 def test_scaled_entropy_by_hand(key):

@@ -1,0 +1,161 @@
+"""What tasks there are; of one task: observation, action, parameters, effects, gaps, with units."""
+
+import ast
+import importlib.util
+import inspect
+import json
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+import envs
+from envs import gaps
+from envs.base import Effects, Value
+from experiments import cli
+
+
+@dataclass(frozen=True)
+class TasksArgs:
+    """Lists all tasks, or describes one."""
+
+    task: Annotated[str | None, tyro.conf.Positional] = None
+    """One of them, or a Python file with a task of your own (docs/extending.md); default: a list of all."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+
+
+def main(args: TasksArgs) -> None:
+    """Prints what is asked for."""
+    if args.task is None:
+        found, lines = listing(), _list_lines
+    else:
+        found, lines = describe(args.task), _task_lines
+    print(json.dumps(found) if args.json else "\n".join(lines(found)))
+
+
+def listing() -> dict[str, Any]:
+    """All tasks with what they are about and their gaps. Imports none of them."""
+    return {
+        name: {"about": _first_line(module), "gaps": list(gaps.presets(name))} for name, module in envs.TASKS.items()
+    }
+
+
+def describe(task: str) -> dict[str, Any]:
+    """One task as JSON data. A task in MuJoCo is not compiled for it."""
+    name = envs.name_of(task)
+    it: Any = envs.scene(task) or envs.make(task)  # both have the fields below
+    sizes = {"act_dim": sum(e.size for e in it.action), "obs_dim": sum(e.size for e in it.observation)}
+    named = gaps.presets(name)
+    return {
+        "name": name,
+        "about": _first_line(envs.TASKS[name]),
+        "observation": [e._asdict() for e in it.observation],
+        "action": [e._asdict() for e in it.action],
+        "control_dt": it.control_dt,
+        "episode_length": it.episode_length,
+        "score": it.score,
+        "success_anytime": it.success_anytime,
+        "parameters": [_finite(p._asdict()) for p in it.parameters],
+        "effects": _effects(it.training, sizes, cartesian=it.cartesian),
+        "gaps": {gap: {k: v for k, v in named[gap]._asdict().items() if v and k != "name"} for gap in named},
+    }
+
+
+def _finite(facts: dict[str, Any]) -> dict[str, Any]:
+    """JSON has no infinity: no bound is null."""
+    return {name: None if value in (math.inf, -math.inf) else value for name, value in facts.items()}
+
+
+def _effects(training: Any, sizes: dict[str, int], *, cartesian: bool) -> list[dict[str, Any]]:
+    """Every effect of that task, in the words of `Effects`, and its value in the simulator, None for no effect."""
+    doc = inspect.getdoc(Effects) or ""
+    found = []
+    for name in Effects._fields if cartesian else [x for x in Effects._fields if x != "action_rotation"]:
+        match = re.search(rf"^{name}: \[(\w*)\] (.*(?:\n    .*)*)", doc, re.M)
+        assert match is not None  # tested: all of them explain themselves
+        about = " ".join(match[2].split()).split(". ")[0].rstrip(".")
+        found.append({"name": name, "size": sizes.get(match[1], 1), "about": about, "simulator": training.get(name)})
+    return found
+
+
+def _first_line(module: str) -> str:
+    """The first sentence of a module's docstring, read without running it."""
+    spec = None if module.endswith(".py") else importlib.util.find_spec(module)
+    path = module if spec is None else spec.origin
+    doc = ast.get_docstring(ast.parse(Path(path or "").read_text())) or "no description."
+    return doc.split("\n\n")[0].replace("\n", " ").split(". ")[0].rstrip(".") + "."
+
+
+# --- for people -----------------------------------------------------------------------------------------------------
+
+
+def _list_lines(found: dict[str, Any]) -> list[str]:
+    rows = [("task", "what it is", "gaps")]
+    rows += [(name, task["about"], ", ".join(task["gaps"]) or "none") for name, task in found.items()]
+    return [*_columns(rows), "", "one of them in full: python -m experiments.tasks push"]
+
+
+def _task_lines(found: dict[str, Any]) -> list[str]:
+    seconds = found["episode_length"] * found["control_dt"]
+    when = "at any step" if found["success_anytime"] else "at the last step"
+    score = f"success {when}" if found["score"] == "success" else "return, the sum of rewards"
+    parameters = [("parameter", "unit", "nominal", "training range", "bounds")]
+    for p in found["parameters"]:
+        drawn = "fixed" if p["low"] == p["high"] else _range(p["low"], p["high"])
+        parameters.append((p["name"], p["unit"], f"{p['nominal']:.4g}", drawn, _range(p["minimum"], p["maximum"])))
+    effects = [("effect", "numbers", "simulator", "what it does")]
+    for e in found["effects"]:
+        effects.append((e["name"], str(e["size"]), _value(e["simulator"]), e["about"]))
+    reals = [("gap", "what differs from the simulator")]
+    for name, gap in found["gaps"].items():
+        scene = [f"scene {gap['scene']}"] if "scene" in gap else []
+        values = {**gap.get("params", {}), **gap.get("effects", {})}
+        reals.append((name, "; ".join([*scene, *(f"{k} {_value(v)}" for k, v in values.items())])))
+    return [
+        f"{found['name']}: {found['about']}",
+        "",
+        *_columns(
+            [
+                ("observation", _entries(found["observation"])),
+                ("action", _entries(found["action"])),
+                ("episode", f"{found['episode_length']} steps of {found['control_dt']:g} s = {seconds:g} s"),
+                ("judged by", score),
+            ]
+        ),
+        "",
+        *_columns(parameters),
+        "",
+        *_columns(effects),
+        "",
+        *(_columns(reals) if found["gaps"] else ["no gaps come with this task; write one: docs/extending.md"]),
+    ]
+
+
+def _entries(entries: Iterable[dict[str, Any]]) -> str:
+    return ", ".join(f"{e['name']} [{e['size']}]{f' in {e["unit"]}' if e['unit'] else ''}" for e in entries)
+
+
+def _range(low: float | None, high: float | None) -> str:
+    if low is None:
+        return "any" if high is None else f"at most {high:.4g}"
+    return f"at least {low:.4g}" if high is None else f"{low:.4g} to {high:.4g}"
+
+
+def _value(value: Value | None) -> str:
+    if value is None:
+        return "-"
+    return str(value) if isinstance(value, list) else f"{value:g}"
+
+
+def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+if __name__ == "__main__":
+    cli.run_main(main, TasksArgs, __doc__ or "")
