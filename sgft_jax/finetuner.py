@@ -200,7 +200,7 @@ def sac_finetuner(
         max_grad_norm=options.max_grad_norm,
         **structure,
     )
-    rise = 0
+    rise = 0  # a new critic has nothing to lose
     if isinstance(options, KeptCriticOptions) and not new_critic:
         rise = rules.warmup(options, options.lr_warmup)
     hyper = sac.SACHyper(

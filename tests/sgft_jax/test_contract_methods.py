@@ -13,7 +13,9 @@ from tuners import METHODS, T, bits, equal
 from sgft_jax.io import checkpoint
 from sgft_jax.policies import make_policy
 
-each_method = pytest.mark.parametrize("name", METHODS)
+# Each shows what others are put together of; all of them are compiled in `make test-all`.
+FAST = {"sgft-sac", "sgft-relabel", "sgft-mpc", "sgft-tdmpc2", "rlpd", "iql"}
+each_method = pytest.mark.parametrize("name", tuners.slow_but(FAST, METHODS))
 OBS = jnp.array([0.3, -0.8])
 
 
@@ -104,7 +106,7 @@ def test_the_check_of_keys_finds_them():
 
 
 @pytest.mark.slow
-@each_method
+@pytest.mark.parametrize("name", METHODS)
 def test_members_together_equal_each_alone(name, key):
     case, states, together = two(name)
     seeds = jax.random.split(key)

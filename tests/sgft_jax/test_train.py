@@ -335,9 +335,11 @@ NEEDS = Simulation(48, 0.8, offline_updates=12)
 def rows_of(n, p=2):
     """n rows for each of p priors: rewards are 100 for the first prior, 200 for the next."""
     example = replay.blank(2, 1)
-    one = lambda i: replay.add_batch(
-        replay.init(example, n), jax.tree.map(lambda x: jnp.full((n, *x.shape), 100.0 * (i + 1)), example)
-    )
+
+    def one(i):
+        rows = jax.tree.map(lambda x: jnp.full((n, *x.shape), 100.0 * (i + 1)), example)
+        return replay.add_batch(replay.init(example, n), rows)
+
     return train.SimulatedRows(jax.tree.map(lambda *x: jnp.stack(x), *map(one, range(p))), jnp.ones((p, 3)))
 
 
