@@ -6,7 +6,7 @@ import sys
 import pytest
 
 HEAVY = ("jax", "flax", "mujoco", "matplotlib", "scipy", "orbax")
-COMMANDS = ("pretrain", "finetune", "evaluate", "demo", "figures", "compare", "gaps", "tune", "benchmark")
+COMMANDS = ("pretrain", "finetune", "evaluate", "demo", "figures", "compare", "gaps", "tune", "benchmark", "tasks")
 MISTAKES = {
     "pretrain": "--config.gamma 2",
     "finetune": "--method sgft-sca",
