@@ -48,7 +48,7 @@ def load(env: Env, source: str, overrides: Sequence[str] = ()) -> Gap:
     elif source in (known := presets(env.name)):
         gap = known[source]
     else:
-        raise UserError(f"{unknown(f'gap of {env.name}', source, known)}; or give a .toml or .json file")
+        raise no_such_gap(env.name, source)
     seen = set()
     for text in overrides:
         gap, name = _override(gap, text)
@@ -57,6 +57,13 @@ def load(env: Env, source: str, overrides: Sequence[str] = ()) -> Gap:
         seen.add(name)
     _check(env, gap)
     return gap
+
+
+def no_such_gap(task: str, name: str) -> UserError:
+    """What to tell someone who named a gap that the task does not come with."""
+    if known := presets(task):
+        return UserError(f"{unknown(f'gap of {task}', name, known)}; or give a .toml or .json file")
+    return UserError(f"{task} has no gap {name!r}: it comes with none; give a .toml or .json file")
 
 
 def from_dict(env: Env, name: str, table: Mapping[str, Any]) -> Gap:

@@ -46,8 +46,12 @@ def real_worlds(env: Env, found: Sequence[Gap], key: Key, n: int = 256) -> World
     """The real systems of gaps as pools of one size, [gaps, n]; [gaps, 1] where nothing varies in any of them."""
     pools = [gaps.worlds(env, gap, key, n) for gap in found]
     size = max(map(pool_size, pools))
-    repeat = lambda x: jnp.repeat(x, size // x.shape[0], axis=0)  # noqa: E731
-    return jax.tree.map(lambda *x: jnp.stack(x), *[jax.tree.map(repeat, pool) for pool in pools])
+    return jax.tree.map(lambda *x: jnp.stack(x), *[padded(pool, size) for pool in pools])
+
+
+def padded(pool: World, n: int) -> World:
+    """The same worlds as a pool [n], where there are n of them or one."""
+    return jax.tree.map(lambda x: jnp.repeat(x, n // x.shape[0], axis=0), pool)
 
 
 def heldout_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:

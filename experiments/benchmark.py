@@ -4,7 +4,6 @@ physics: the step that training takes, with its own domain parameters in every w
 and automatic reset, against the bare engine under it, which repeats the same physics.
 updates: SAC updates of pretraining, with all its networks, against the same update written by hand in bare JAX.
 plain: updates of plain SAC, against Stable-Baselines3 and SBX where they are installed.
-values: V_sim of priors and the rewards that it shapes in each precision, against float32.
 pretrain, finetune: seconds of the whole commands, with what the time goes into.
 devices: pretraining on several devices with as many times the environments and batches (weak scaling), against as many
 times one device.
@@ -13,23 +12,15 @@ times one device.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
-from rich.console import Console
-from rich.table import Table
-
-import envs
-from envs.mujoco.worlds import Impl, choose_impl
 from experiments import cli
-from experiments.bench import physics, training, updates, values
-from sgft_jax.analysis import figures
-from sgft_jax.io import runs
-from sgft_jax.io.log import write_summary
-from sgft_jax.models.networks import Precision
+from experiments.options import Impl, at_least_one, check_task
+from sgft_jax.models.config import Precision
 from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError
 
-type Part = Literal["physics", "updates", "plain", "values", "pretrain", "finetune", "devices"]
+type Part = Literal["physics", "updates", "plain", "pretrain", "finetune", "devices"]
 
 
 @dataclass(frozen=True)
@@ -51,7 +42,7 @@ class BenchmarkConfig:
     seeds: tuple[int, ...] = (1,)
     """Agents updated, pretrained or fine-tuned together."""
     precisions: tuple[Precision, ...] = ("default",)
-    """Precisions of matrix products on GPUs, of updates and values."""
+    """Precisions of the updates' matrix products on GPUs."""
     width: int = 256
     """Units of both hidden layers of the updates' networks; critics and values of pretraining have LayerNorm."""
     updates: int = 200
@@ -65,16 +56,19 @@ class BenchmarkConfig:
     devices: tuple[int, ...] = (1,)
     """Numbers of devices; the smallest is what the others are compared with."""
     prior: Path | None = None
-    """Folder of the priors that finetune starts from and values evaluates."""
+    """Folder of the priors that finetune starts from."""
     rollouts: int = 30
     """Of finetune."""
     out: Path = Path("runs")
-    """The numbers go to <out>/benchmark/summary.json, figures beside them."""
+    """The numbers go to <out>/benchmark/summary.json."""
 
 
 def main(config: BenchmarkConfig) -> dict[str, list[dict[str, Any]]]:
     """Measures, prints tables, writes the numbers and returns them by kind of measurement."""
     _check(config)
+    from sgft_jax.io import runs
+    from sgft_jax.io.log import write_summary
+
     measured: dict[str, list[dict[str, Any]]] = {}
     for part in config.parts:
         measured[part] = []
@@ -85,9 +79,7 @@ def main(config: BenchmarkConfig) -> dict[str, list[dict[str, Any]]]:
     folder.mkdir(parents=True, exist_ok=True)
     path = write_summary(folder, {"provenance": runs.provenance(), **measured})
     for part, lines in measured.items():
-        Console().print(table(part, lines))
-        if figure := draw(part, lines, folder / f"{part}.png"):
-            print(f"figure: {figure}")
+        print(f"\n{table(part, lines)}")
     print(f"numbers: {path}")
     return measured
 
@@ -95,20 +87,23 @@ def main(config: BenchmarkConfig) -> dict[str, list[dict[str, Any]]]:
 def _check(config: BenchmarkConfig) -> None:
     cli.choose("--preset", config.preset, PRESETS)
     for task in config.tasks:
-        envs.name_of(task)
-        if "physics" in config.parts and 2 * config.control_steps > envs.scene(task).episode_length:
-            raise UserError(f"--control-steps {config.control_steps} is more than half an episode of {task}")
-    for name in ("worlds", "control_steps", "batches", "seeds", "width", "updates", "repeats", "devices"):
-        value = getattr(config, name)
-        least = min(value, default=0) if isinstance(value, tuple) else value
-        if least < 1:
-            raise UserError(f"--{name.replace('_', '-')} is {least}: must be at least 1")
-    for part in ("finetune", "values"):
-        if part in config.parts and config.prior is None:
-            raise UserError(f"--parts {part} needs --prior FOLDER, as made by python -m experiments.pretrain")
+        check_task(task)
+    at_least_one(config, "control_steps", "width", "updates", "repeats")
+    for name in ("worlds", "batches", "seeds", "devices"):
+        if (least := min(getattr(config, name), default=0)) < 1:
+            raise UserError(f"--{name} is {least}: must be at least 1")
+    if "finetune" in config.parts and config.prior is None:
+        raise UserError("--parts finetune needs --prior FOLDER, as made by python -m experiments.pretrain")
 
 
 def _physics(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    import envs
+    from envs.mujoco.worlds import choose_impl
+    from experiments.bench import physics
+
+    for task in config.tasks:
+        if 2 * config.control_steps > envs.scene(task).episode_length:
+            raise UserError(f"--control-steps {config.control_steps} is more than half an episode of {task}")
     for task in config.tasks:
         for impl in map(choose_impl, config.impls):
             for n in config.worlds:
@@ -116,6 +111,8 @@ def _physics(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
 
 
 def _updates(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    from experiments.bench import updates
+
     size = {"width": config.width, "updates": config.updates, "repeats": config.repeats}
     for exact in config.precisions:
         for batch in config.batches:
@@ -124,18 +121,15 @@ def _updates(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
 
 
 def _plain(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    from experiments.bench import updates
+
     for batch in config.batches:
         yield updates.plain_speed(batch, width=config.width, updates=config.updates, repeats=config.repeats)
 
 
-def _values(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
-    for task in config.tasks:
-        for impl in config.impls:
-            assert config.prior is not None  # checked before
-            yield from values.errors(task, impl, config.prior, config.precisions)
-
-
 def _pretrain(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    from experiments.bench import training
+
     for task in config.tasks:
         for impl in config.impls:
             for seeds in config.seeds:
@@ -143,6 +137,8 @@ def _pretrain(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
 
 
 def _finetune(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    from experiments.bench import training
+
     for task in config.tasks:
         for impl in config.impls:
             for seeds in config.seeds:
@@ -151,6 +147,8 @@ def _finetune(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
 
 
 def _devices(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    from experiments.bench import training
+
     for task in config.tasks:
         for impl in config.impls:
             for worlds in config.worlds:
@@ -159,58 +157,10 @@ def _devices(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
                     yield from training.weak_scaling(task, impl, config.devices, **size)
 
 
-class Growth(NamedTuple):
-    """What a figure shows of a part. sizes: columns of which the one with the most values becomes the x axis; the other
-    ones and `by` tell lines apart. y: the column drawn, called `label`. reference: the column drawn dashed.
-    """
-
-    sizes: tuple[str, ...]
-    y: str
-    label: str
-    by: tuple[str, ...] = ()
-    reference: str | None = None
-
-
-_GROWTH = {
-    "physics": Growth(("worlds",), "env_per_s", "physics steps per second", ("task", "impl"), "bare_per_s"),
-    "updates": Growth(("batch", "seeds"), "updates_per_s", "updates per second", ("precision",), "bare_per_s"),
-    "plain": Growth(("batch",), "updates_per_s", "updates per second"),
-    "pretrain": Growth(("seeds",), "seconds", "seconds", ("task", "impl")),
-    "finetune": Growth(("seeds",), "seconds", "seconds", ("task", "impl")),
-    "devices": Growth(
-        ("devices", "worlds", "batch"), "env_per_s", "environment steps per second", ("task", "impl"), "ideal_per_s"
-    ),
-}
-
-
-def draw(part: str, lines: list[dict[str, Any]], path: Path) -> Path | None:
-    """How a part grows with worlds, batch, seeds or devices; no figure of a single size."""
-    if part not in _GROWTH:
-        return None
-    growth = _GROWTH[part]
-    x = max(growth.sizes, key=lambda name: len({line[name] for line in lines}))
-    if len({line[x] for line in lines}) < 2:
-        return None
-    apart = [*growth.by, *(name for name in growth.sizes if name != x)]
-
-    def curves(column: str) -> dict[str, tuple[list[float], list[float]]]:
-        found: dict[str, tuple[list[float], list[float]]] = {}
-        for line in sorted(lines, key=lambda line: line[x]):
-            words = [str(line[name]) if name in growth.by else f"{name} {line[name]:,}" for name in apart]
-            xs, ys = found.setdefault(", ".join(words) or "sgft_jax", ([], []))
-            xs.append(line[x])
-            ys.append(line[column])
-        return found
-
-    references = curves(growth.reference) if growth.reference else {}
-    return figures.scaling(path, curves(growth.y), references, title=_TITLES[part], x=x, y=growth.label)
-
-
 _PARTS: dict[Part, Callable[[BenchmarkConfig], Iterator[dict[str, Any]]]] = {
     "physics": _physics,
     "updates": _updates,
     "plain": _plain,
-    "values": _values,
     "pretrain": _pretrain,
     "finetune": _finetune,
     "devices": _devices,
@@ -219,23 +169,19 @@ _TITLES = {
     "physics": "environments",
     "updates": "updates of pretraining",
     "plain": "updates of plain SAC",
-    "values": "V_sim by precision",
     "pretrain": "pretraining",
     "finetune": "fine-tuning with SGFT-SAC",
     "devices": "pretraining on several devices",
 }
 
 
-def table(part: str, lines: list[dict[str, Any]]) -> Table:
+def table(part: str, lines: list[dict[str, Any]]) -> str:
     """The lines of one kind as a table."""
-    made = Table(title=_TITLES[part])
+    from sgft_jax.analysis import tables
+
     names = list(dict.fromkeys(name for line in lines for name in line))
-    for name in names:
-        heading = name.replace("_", " ").replace("/", " / ")
-        made.add_column(heading, justify="left" if name in ("task", "impl") else "right")
-    for line in lines:
-        made.add_row(*(_text(line[name]) if name in line else "-" for name in names))
-    return made
+    rows = [[_text(line.get(name, "-")) for name in names] for line in lines]
+    return f"{_TITLES[part]}\n\n{tables.markdown([name.replace('_', ' ') for name in names], rows)}\n"
 
 
 def _text(x: Any) -> str:

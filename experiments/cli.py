@@ -40,8 +40,8 @@ def run_main[T](
 
     default(argv) -> the defaults of the options where some decide those of others, see `preview`.
     Exits with code 2 and one line `error: ...` on stderr for anything the user can mend (`UserError`, unknown options
-    or choices), with 130 after an interrupt, with 1 and no word where nobody reads its output any more, as after
-    `| head`. Other exceptions are bugs and keep their traceback.
+    or choices, a device without room), with 130 after an interrupt, with 1 and no word where nobody reads its output
+    any more, as after `| head`. Other exceptions are bugs and keep their traceback.
     """
     with _may_lose_its_reader():
         try:
@@ -55,6 +55,16 @@ def run_main[T](
             sys.exit(INTERRUPTED)
         except UserError as error:
             fail(str(error))
+        except Exception as error:
+            if not _is_out_of_memory(error):
+                raise
+            said = (str(error).strip() or "MemoryError").splitlines()[0]
+            fail(f"out of memory ({said}): lower the batch size, the number of environments or of seeds")
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """Whether the host or, as JAX says it, a device had no room for an array."""
+    return isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
 
 
 @contextlib.contextmanager
@@ -80,8 +90,10 @@ def parse[T](
     config_type: type[T], description: str, argv: Sequence[str] | None = None, *, default: T | None = None
 ) -> T:
     """A frozen dataclass from the command line; raises UserError for a bad one."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    prog = f"python -m {spec.name}" if spec else None
     with _errors.on_parse_error(lambda event: _refuse(event, config_type, default)):
-        return cast(T, tyro.cli(config_type, description=description, args=argv, default=default))
+        return cast(T, tyro.cli(config_type, prog=prog, description=description, args=argv, default=default))
 
 
 def preview(argv: Sequence[str], **defaults: Any) -> SimpleNamespace:
@@ -110,11 +122,16 @@ def _refuse(event: _errors.ParseErrorEvent, config_type: type, default: Any) -> 
             raise UserError(unknown(event.argument.display_name(), event.value, event.choices))
         case _errors.BadValue(reason="too_few_values"):
             raise UserError(f"{event.argument.display_name()}: needs a value")
-        case _errors.InstantiationFailure(argument=None):
-            raise UserError(event.message)
-        case _errors.InstantiationFailure(argument=argument):
-            kind = {int: "a whole number", float: "a number"}.get(argument.field.type_stripped, "something else")
-            raise UserError(f"{argument.display_name()}: must be {kind} ({event.message})")
+        case _errors.InstantiationFailure():
+            raise UserError(_bad_value(event))
+
+
+def _bad_value(event: _errors.InstantiationFailure) -> str:
+    """What is wrong with the value of an option, as far as tyro knows which."""
+    if event.argument is None:
+        return event.message
+    kind = {int: "a whole number", float: "a number"}.get(event.argument.field.type_stripped, "something else")
+    return f"{event.argument.display_name()}: must be {kind} ({event.message})"
 
 
 def option_names(config_type: type, default: Any = None, *, prefix: str = "--") -> list[str]:

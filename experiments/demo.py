@@ -6,21 +6,23 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import jax
-
-import envs
 from experiments import cli
-from experiments.figures import FiguresArgs, figures
 from experiments.finetune import finetune
-from experiments.finetune_args import FinetuneArgs, run_folder
+from experiments.finetune_args import FinetuneArgs, arguments, check, run_folder
+from experiments.options import check_task
 from experiments.pretrain import PretrainArgs, pretrain
-from sgft_jax.analysis import tables
-from sgft_jax.analysis.curves import Curve, read_runs
-from sgft_jax.methods import finetune_config, get_method
+from experiments.pretrain import check as check_pretraining
+from sgft_jax import extend
+from sgft_jax.io.jsonfile import read_json
+from sgft_jax.io.log import SUMMARY
+from sgft_jax.methods import get_method
 from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError
+
+if TYPE_CHECKING:
+    from sgft_jax.analysis.curves import Curve
 
 METHODS = ("sgft-mpc", "sgft-sac", "sac")  # the first is filmed
 
@@ -30,12 +32,9 @@ class DemoArgs:
     """A few minutes of the whole pipeline; everything lands in one folder."""
 
     task: str = "insert"
-    """push, push-towel, push-ball, hammer or insert. Of hammering and pushing, priors as small as these differ more
-    than methods do (docs/results.md)."""
+    """A task by name. On hammer and push, priors as small as these differ more than methods do (docs/results.md)."""
     real: str = "default"
     """The real system, as in fine-tuning."""
-    env_steps: int | None = None
-    """Environment steps of pretraining, default: those of preset `cpu`."""
     seeds: int = 3
     """Fine-tuning seeds per method."""
     rollouts: int = 20
@@ -44,46 +43,69 @@ class DemoArgs:
     """Render an episode before and after fine-tuning with sgft-mpc, where MuJoCo can render."""
     out: Path = Path("runs/demo")
     """Folder of the demo; an earlier demo in it is replaced."""
+    env_steps: int | None = None
+    """Expert: environment steps of pretraining, default: those of preset `cpu`."""
 
 
 def main(args: DemoArgs) -> None:
     """Pretrains once, fine-tunes with each method from the same prior on the same real starts, and compares."""
+    pretraining, runs = plan(args)
     started = time.monotonic()
+    pretrain(pretraining)
+    _finetune_all(*runs)
+    summaries = {run.method: read_json(run_folder(run, args.real) / SUMMARY) for run in runs}
+    from experiments.figures import FiguresArgs, figures
+    from sgft_jax.analysis.curves import read_runs
+
+    results = figures(FiguresArgs(task=extend.name_of(args.task), out=args.out))
+    folder = run_folder(runs[0], args.real).parent.parent
+    print(f"\n{outcome([c for c in read_runs(args.out).curves if c.gap == folder.name], summaries)}\n")
+    print(f"figures and tables: {results.parent}; curves, real rollouts and a video of {METHODS[0]}: {folder}")
+    print(f"{(time.monotonic() - started) / 60:.1f} minutes in all")
+
+
+def plan(args: DemoArgs) -> tuple[PretrainArgs, list[FinetuneArgs]]:
+    """What runs; raises UserError for all that is wrong with it before any of it does."""
     config = PRESETS["cpu"]
     config = config if args.env_steps is None else replace(config, env_steps=args.env_steps)
     shared = {"task": args.task, "preset": "cpu", "out": args.out, "overwrite": True}
-    pretrain(PretrainArgs(config=config, report=False, video=False, **shared))
+    pretraining = PretrainArgs(config=config, report=False, video=False, **shared)
+    check_task(args.task, [args.real])
     runs = [_finetune_args(args, method, shared) for method in METHODS]
-    _finetune_all(*runs)
-    results = figures(FiguresArgs(task=envs.name_of(args.task), out=args.out))
-    folder = run_folder(runs[0], args.real).parent.parent
-    print(f"\n{outcome([c for c in read_runs(args.out).curves if c.gap == folder.name])}\n")
-    print(f"figure: {results.parent / f'{envs.name_of(args.task)}-{folder.name}.png'}, tables: {results}")
-    print(f"{time.monotonic() - started:.0f} s in all; curves, real rollouts and a video of {METHODS[0]}: {folder}")
+    check_pretraining(pretraining)
+    for run in runs:
+        check(run)
+    return pretraining, runs
 
 
-def outcome(curves: Sequence[Curve]) -> str:
-    """What came of it in a few lines: success of the methods wherever one was evaluated."""
+def outcome(curves: "Sequence[Curve]", summaries: dict[str, dict[str, Any]]) -> str:
+    """What came of it in a few lines: the methods wherever one was evaluated, and their best policies."""
+    from sgft_jax.analysis import tables
+
     first, *_ = curves
+    score = tables.words(first.score)
+    mean = {name: sum(own["best"]["score"]) / len(own["best"]["score"]) for name, own in summaries.items()}
+    best = [f"{name} {tables.plain(score, first.score)}" for name, score in mean.items()]
     return (
-        f"{tables.words(first.score).capitalize()} on the {first.gap} real system of {first.task}, interquartile mean "
-        f"over seeds with its 95 % interval where there are enough:\n\n{tables.outcome(curves)}"
+        f"{score.capitalize()} on the {first.gap} real system of {first.task} without exploration, interquartile mean "
+        f"over seeds with its 95 % interval where there are enough:\n\n{tables.outcome(curves)}\n\n"
+        f"The last policy need not be the best. Those that did best in the real rollouts: {', '.join(best)}.\n"
+        "Seeds, machines and small priors differ: a few per cent more or less between methods mean nothing here."
     )
 
 
 def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> FinetuneArgs:
     """Smaller batches and fewer updates than on a GPU: what two cores can do; all methods get the same. All else is the
-    methods' own: larger rates of the actor cost most of them success (docs/small-priors.md).
+    methods' own: larger rates of the actor cost most of them success (docs/history.md).
     """
-    return FinetuneArgs(
+    return arguments(
+        method,
         real=(args.real,),
-        method=method,
         seeds=args.seeds,
         rollouts=args.rollouts,
-        utd=4.0,
         eval_every=5,
         eval_episodes=20,
-        options=finetune_config(get_method(method), batch_size=64),
+        options=get_method(method).config(utd=4.0, batch_size=64),
         video=args.video and method == METHODS[0],
         **shared,
     )
@@ -91,12 +113,15 @@ def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> Finet
 
 def _finetune_all(first: FinetuneArgs, *others: FinetuneArgs) -> None:
     """One run here, on a CPU the others in turn in a process beside it: plans cost as much as what they all learn."""
+    import jax
+
     if jax.default_backend() != "cpu":
         for args in (first, *others):
             finetune(args)
         return
     context = multiprocessing.get_context("spawn")
     log = first.out / "beside.log"
+    print(f"{' and '.join(args.method for args in others)} run beside {first.method}; what they say: {log}")
     beside = context.Process(target=_logged, args=(others, log), daemon=True)
     beside.start()
     try:

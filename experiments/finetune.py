@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 from experiments import cli
-from experiments.finetune_args import FinetuneArgs, arguments, check
+from experiments.finetune_args import FinetuneArgs, arguments, check, priors_of
 from sgft_jax.methods import DEFAULT, all_methods
 
 
@@ -34,9 +34,10 @@ def _table() -> str:
 def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:
     """Fine-tuning runs from (or back) to disk, one per real system; returns their summaries in the order of `real`."""
     method, seeds = check(args)
+    priors = priors_of(args)
     from experiments.finetune_run import run  # JAX starts here
 
-    return run(args, method, seeds)
+    return run(args, method, seeds, priors)
 
 
 if __name__ == "__main__":

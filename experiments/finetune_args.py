@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from experiments.options import Impl, at_least_one, seed_list, seeds_name, without_repeats
+from experiments.options import Impl, at_least_one, check_task, prior_folders, seed_list, seeds_name, without_repeats
 from sgft_jax import extend
+from sgft_jax.io.runs import check_start
 from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.types import Method, UserError
 
@@ -94,7 +95,7 @@ def label(args: FinetuneArgs) -> str:
 
 
 def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
-    """The method and the seeds; raises UserError for what is wrong in the arguments alone."""
+    """The method and the seeds; raises UserError for what is wrong in the arguments and with the run folders."""
     at_least_one(args, "rollouts", "eval_every", "eval_episodes", "checkpoint_every")
     method, seeds = get_method(args.method), seed_list(args.seed, args.seeds)
     if not isinstance(args.options, method.config):
@@ -108,7 +109,17 @@ def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
     if not args.real:
         raise UserError("--real: name at least one")
     without_repeats("--real", args.real)
+    check_task(args.task, args.real)
     folders = [run_folder(args, real) for real in args.real]
     if twice := [folder for folder in folders if folders.count(folder) > 1]:
         raise UserError(f"--real {' '.join(args.real)}: two of them would share the folder {twice[0]}; name it once")
+    for folder in folders:
+        check_start(folder, resume=args.resume, overwrite=args.overwrite)
     return method, seeds
+
+
+def priors_of(args: FinetuneArgs) -> list[Path]:
+    """The folders of the priors to start from, none where the user says so; raises UserError where there is none."""
+    if args.prior == NO_PRIOR:
+        return []
+    return prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)

@@ -50,7 +50,7 @@ class Record:
     def metrics(self, done: int, values: Mapping[str, np.ndarray]) -> None:
         """A line of one learning phase; raises DivergedError where a number is not finite."""
         step = self.latest()
-        good = None if step is None else self.folder / "checkpoints" / str(step)
+        good = None if step is None else checkpoint.path(self.folder, step)
         check_finite(values, done, unit="rollouts", last_good=good)
         self.log.metrics(self._transitions(done), {"rollouts": done, **values})
 

@@ -3,6 +3,7 @@
 import functools
 import time
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -11,11 +12,9 @@ import numpy as np
 
 import envs
 from envs import gaps
-from envs.base import Env
 from envs.rollout import Episode
-from experiments.finetune_args import NO_PRIOR, VOLATILE, FinetuneArgs, run_folder
+from experiments.finetune_args import VOLATILE, FinetuneArgs, run_folder
 from experiments.finetune_record import Record
-from experiments.options import prior_folders
 from experiments.recorded import Recorded
 from experiments.stacking import part
 from sgft_jax import api, mesh, train
@@ -26,22 +25,22 @@ from sgft_jax.io.priors import digest, load_priors
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.methods.options import card_of
 from sgft_jax.train import FinetuneProgress
-from sgft_jax.types import Method, Metrics, Prior, PyTree, UserError
+from sgft_jax.types import Method, Metrics, PyTree, UserError
 
 
-def run(args: FinetuneArgs, method: Method, seeds: list[int]) -> list[dict[str, Any]]:
-    """The runs on the real systems of `args`; returns their summaries."""
+def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path]) -> list[dict[str, Any]]:
+    """The runs on the real systems of `args`; returns their summaries. folders: of the priors."""
     sizes = {"--seeds" if len(args.real) == 1 else "the number of --real times --seeds": len(args.real) * args.seeds}
     devices = mesh.devices(args.devices, sizes)
     env = envs.make(args.task, args.impl)
     found = [gaps.load(env, real, args.set) for real in args.real]
-    priors = _priors(args, env)
+    priors = load_priors(folders, env)
     for prior in priors:
         api.check_prior(prior, method.prior, env)
     # Every folder is that of a run on its real system alone: either kind of run continues the other.
-    folders = {run_folder(args, name): config_to_json(args) | {"real": name} for name in args.real}
+    homes = {run_folder(args, name): config_to_json(args) | {"real": name} for name in args.real}
     opened = runs.open_runs(
-        folders, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
+        homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
         inputs={"priors": [digest(prior) for prior in priors]},
     )  # fmt: skip
     try:
@@ -53,13 +52,6 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int]) -> list[dict[str, 
     finally:
         for own in opened:
             own.close()
-
-
-def _priors(args: FinetuneArgs, env: Env) -> list[Prior]:
-    """The priors to start from; none where the user says so."""
-    if args.prior == NO_PRIOR:
-        return []
-    return load_priors(prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset), env)
 
 
 class _Run:

@@ -9,9 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from envs import gaps
 from experiments import cli
-from experiments.options import Impl, prior_folders, seed_list, without_repeats
+from experiments.options import Impl, check_task, prior_folders, seed_list, without_repeats
 from experiments.pretrain import DEFAULT_PRESET
+from sgft_jax import extend
 from sgft_jax.presets import PRESETS, PretrainConfig
 from sgft_jax.types import UserError
 
@@ -21,26 +23,26 @@ class GapsArgs:
     """One table: a line per gap of a task."""
 
     task: str = "push"
-    """push, push-towel, push-ball, hammer or insert; or a Python file with a task of your own (docs/extending.md)."""
+    """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
     presets: tuple[str, ...] = ()
     """Gaps to measure, by name or as .toml/.json files; default: all that come with the task."""
     prior: Path | None = None
     """Folder of a prior, or of several (prior/seed-*); default: those of <out>/pretrain/<task>/<preset>."""
     preset: str = DEFAULT_PRESET
     """Pretraining preset of the priors, and of the training on the real systems; --config.* changes the latter."""
-    config: PretrainConfig = field(default_factory=lambda: PRESETS[DEFAULT_PRESET])
-    """The settings themselves."""
     train: bool = True
     """Also train on every real system, all of them in one program; --no-train measures zero-shot success only."""
-    seed: int = 0
-    """First seed of that training."""
     seeds: int = 1
     """Policies trained per gap."""
-    impl: Impl = "auto"
     episodes: int = 256
     """Evaluation episodes per policy and gap, at least 200."""
     out: Path = Path("runs")
     """Parent of all run folders; the summary goes to <out>/gaps/<task>/summary.json."""
+    seed: int = 0
+    """Expert: first seed of the training on real systems."""
+    impl: Impl = "auto"
+    config: PretrainConfig = field(default_factory=lambda: PRESETS[DEFAULT_PRESET])
+    """Expert: single settings of that training; the defaults are those of the preset."""
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -60,10 +62,10 @@ def measure(args: GapsArgs) -> dict[str, Any]:
     if args.episodes < 200:
         raise UserError(f"--episodes is {args.episodes}: a success rate needs at least 200 to tell 40 % from 50 %")
     without_repeats("--presets", args.presets)
-    seeds = seed_list(args.seed, args.seeds)
-    import envs
-
-    envs.name_of(args.task)  # complains if there is none
+    seeds, task = seed_list(args.seed, args.seeds), extend.name_of(args.task)
+    check_task(args.task, args.presets)
+    if not (args.presets or gaps.presets(task)):
+        raise UserError(f"{task} comes with no gaps; name .toml or .json files with --presets")
     folders = prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
     from experiments.gaps_run import run
 

@@ -9,9 +9,8 @@ from typing import Any, Literal, NamedTuple
 import envs
 from experiments.finetune import finetune
 from experiments.finetune_args import VOLATILE, FinetuneArgs, arguments, label, run_folder
-from experiments.options import Impl, seed_list, without_repeats
+from experiments.options import Impl, check_task, seed_list, without_repeats
 from sgft_jax import extend
-from sgft_jax.io import checkpoint
 from sgft_jax.io.config import config_to_json
 from sgft_jax.io.jsonfile import read_json
 from sgft_jax.io.log import SUMMARY
@@ -26,7 +25,7 @@ class GridArgs:
 
     tasks: tuple[str, ...] = tuple(envs.TASKS)
     """Tasks."""
-    methods: tuple[str, ...] = tuple(reversed(NAMES))
+    methods: tuple[str, ...] = NAMES
     """Methods, in the order in which they run."""
     reals: tuple[str, ...] = ("default",)
     """Real systems of every task: mild, default, hard, or .toml/.json files."""
@@ -76,7 +75,7 @@ def check(args: GridArgs) -> None:
             raise UserError(f"--{name}: name at least one")
         without_repeats(f"--{name}", given)
     for task in args.tasks:
-        extend.name_of(task)
+        check_task(task, args.reals)
     for method in args.methods:
         get_method(method)
     seed_list(args.seed, args.seeds)
@@ -92,9 +91,12 @@ def run_of(args: GridArgs, task: str, real: str, method: str) -> FinetuneArgs:
 
 def look_up(run: FinetuneArgs) -> Cell:
     """How far the run on the one real system of these arguments has got."""
+    from sgft_jax.io import checkpoint
+
     folder = run_folder(run, *run.real)
     if not (folder / CONFIG).exists():
         return Cell(run, "missing", 0)
+
     summed_up = read_json(folder / SUMMARY)["final"]["rollouts"] if (folder / SUMMARY).exists() else 0
     state = "finished" if summed_up >= run.rollouts else "unfinished"
     return Cell(run, state, checkpoint.latest(folder, say=lambda _: None) or 0)

@@ -10,17 +10,20 @@ from sgft_jax.types import UserError
 
 
 def reserve(parts: Mapping[str, int], *, copies: int, devices: int = 1) -> None:
-    """Prints how much experience each device will hold; raises UserError if it is more than the device has room for.
+    """Prints how much memory each device will need; raises UserError if it is more than the device has room for.
 
     parts: bytes of one agent's by the setting of pretraining that decides them. copies: agents trained together.
     """
     share = {name: copies * size / devices for name, size in parts.items()}
     need, room = sum(share.values()), free_memory()
     there = "" if room is None else f" of {_gib(room)} free"
-    print(f"experience: {_gib(need)}{there} on each device ({', '.join(f'{k} {_gib(v)}' for k, v in share.items())})")
+    listed = ", ".join(f"{name} {_gib(size)}" for name, size in share.items())
+    print(f"memory: {_gib(need)}{there} on each device ({listed})")
     if room is not None and need > room:
         option = max(share, key=share.__getitem__).replace("_", "-")
-        raise UserError(f"experience takes {_gib(need)}{there} on each device: lower --config.{option} or train fewer")
+        raise UserError(
+            f"experience and batches take {_gib(need)}{there} on each device: lower --config.{option} or train fewer"
+        )
 
 
 def free_memory() -> int | None:

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 from tyro.conf import arg
 
+import envs
+from envs import gaps
 from sgft_jax import extend
 from sgft_jax.types import UserError
 
@@ -14,8 +16,8 @@ LAST_SEED = 2**31 - 1  # larger ones stand for held-out worlds and episodes
 Impl = Annotated[
     Literal["auto", "jax", "warp", "c"],
     arg(
-        help="Who steps the physics: MJX's own code, MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or else c on "
-        "a CPU, warp on an NVIDIA GPU where it is installed, jax elsewhere."
+        help="Expert: who steps the physics: MJX's own code, MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or "
+        "else c on a CPU, warp on an NVIDIA GPU where it is installed, jax elsewhere."
     ),
 ]
 
@@ -40,11 +42,23 @@ def without_repeats(option: str, words: Sequence[str]) -> None:
         raise UserError(f"{option} names {twice[0]} twice; name it once")
 
 
+def check_task(task: str, reals: Sequence[str] = ()) -> None:
+    """Raise UserError where there is no such task, or no such real system of it, by name or file."""
+    name = envs.name_of(task)
+    for real in reals:
+        if real.endswith((".toml", ".json")):
+            if not Path(real).is_file():
+                raise UserError(f"--real {real}: no such file")
+        elif real not in gaps.presets(name):
+            raise gaps.no_such_gap(name, real)
+
+
 def at_least_one(args: object, *names: str) -> None:
-    """Raise UserError for an option that is less than 1."""
+    """Raise UserError for an option that is less than 1, or of several numbers has one that is, or has none."""
     for name in names:
-        if (value := getattr(args, name)) < 1:
-            raise UserError(f"--{name.replace('_', '-')} is {value}: must be at least 1")
+        value = getattr(args, name)
+        if (least := min(value, default=0) if isinstance(value, tuple) else value) < 1:
+            raise UserError(f"--{name.replace('_', '-')} is {least}: must be at least 1")
 
 
 def prior_home(out: Path, task: str, preset: str) -> Path:

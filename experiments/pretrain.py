@@ -10,9 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from envs.gaps import SIM
 from experiments import cli
-from experiments.options import Impl, seed_list
+from experiments.options import Impl, check_task, seed_list, seeds_name
+from sgft_jax import extend
+from sgft_jax.io.runs import check_start
 from sgft_jax.presets import PRESETS, PretrainConfig
+from sgft_jax.types import UserError
 
 DEFAULT_PRESET = "fast"
 
@@ -22,36 +26,37 @@ class PretrainArgs:
     """One run of pretraining."""
 
     task: str = "push"
-    """push, push-towel, push-ball, hammer or insert; or a Python file with a task of your own (docs/extending.md)."""
+    """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
     preset: str = DEFAULT_PRESET
-    """Named settings, see experiments/presets.py; --config.* changes single ones."""
-    config: PretrainConfig = field(default_factory=lambda: PRESETS[DEFAULT_PRESET])
-    """The settings themselves."""
+    """Named settings: cpu (two cores, minutes), fast (one GPU, minutes), paper, or tdmpc2 for the methods that need
+    its prior. --config.* changes single ones."""
     seed: int = 0
     """First seed."""
     seeds: int = 1
-    """Number of seeds, trained together."""
-    real: str | None = None
-    """Train on a "real" system instead of the simulator's domain: the name of a gap, or a .toml/.json file."""
-    set: tuple[str, ...] = ()
-    """Changes to that system, e.g. --set latency=0.05 action_scale=[1,0.5]."""
-    impl: Impl = "auto"
-    devices: int | None = None
-    """Devices that share the environments, the replay and every batch; 0: all there are; default: one, or all of
-    several hosts. Results stay the same but for rounding, and a run may be resumed on another number."""
-    hosts: str | None = None
-    """Several hosts together, which see the same files: `auto` asks the cluster (SLURM, Open MPI, Kubernetes),
-    ADDRESS:PORT,COUNT,INDEX says where the first one listens, how many there are, and which one this is."""
-    report: bool = True
-    """Also measure V_sim against returns and the models against the simulator: numbers on the card, a figure."""
-    video: bool = True
-    """Render an episode of the first prior, where MuJoCo can render."""
+    """Number of seeds, trained together. Each leaves a prior."""
     out: Path = Path("runs")
     """Parent of all run folders."""
     resume: bool = False
     """Continue from the last checkpoint."""
     overwrite: bool = False
     """Replace an earlier run of the same name."""
+    video: bool = True
+    """Render an episode of the first prior, where MuJoCo can render."""
+    real: str | None = None
+    """Expert: train on a "real" system instead of the simulator's domain, named by a gap or a .toml/.json file."""
+    set: tuple[str, ...] = ()
+    """Expert: changes to that system, e.g. --set latency=0.05 action_scale=[1,0.5]."""
+    report: bool = True
+    """Expert: also measure V_sim against returns and the models against the simulator, for the card and a figure."""
+    impl: Impl = "auto"
+    devices: int | None = None
+    """Expert: devices that share the environments, the replay and every batch; 0: all there are; default: one, or all
+    of several hosts. Results stay the same but for rounding, and a run may be resumed on another number."""
+    hosts: str | None = None
+    """Expert: several hosts together, which see the same files: `auto` asks the cluster (SLURM, Open MPI, Kubernetes),
+    ADDRESS:PORT,COUNT,INDEX says where the first one listens, how many there are, and which one this is."""
+    config: PretrainConfig = field(default_factory=lambda: PRESETS[DEFAULT_PRESET])
+    """Expert: single settings; the defaults are those of the preset."""
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -67,14 +72,31 @@ def _defaults(argv: Sequence[str]) -> PretrainArgs:
 
 def pretrain(args: PretrainArgs) -> dict[str, Any]:
     """One run from (or back) to disk; returns its summary."""
-    cli.choose("--preset", args.preset, PRESETS)
-    seeds = seed_list(args.seed, args.seeds)
-    import envs
-
-    envs.name_of(args.task)  # complains if there is none
-    from experiments.pretrain_run import run
+    seeds = check(args)
+    from experiments.pretrain_run import run  # JAX starts here
 
     return run(args, seeds)
+
+
+def check(args: PretrainArgs) -> list[int]:
+    """The seeds; raises UserError for what is wrong in the arguments and on disk."""
+    cli.choose("--preset", args.preset, PRESETS)
+    seeds, real = seed_list(args.seed, args.seeds), args.real not in (None, SIM)
+    if args.set and not real:
+        raise UserError(f"--set {args.set[0]}: changes a real system; name one with --real")
+    check_task(args.task, [str(args.real)] if real else [])
+    # Of several hosts every one sees what is there now: the first changes nothing before it has met the others.
+    check_start(run_folder(args), resume=args.resume, overwrite=args.overwrite)
+    return seeds
+
+
+def run_folder(args: PretrainArgs) -> Path:
+    """Where the run of these arguments lives; the seeds of one call share a folder."""
+    where, seeds = args.preset, seeds_name(seed_list(args.seed, args.seeds))
+    if args.real not in (None, SIM):
+        changes = ["=".join(word.strip() for word in change.partition("=")[::2]) for change in args.set]
+        where += "-on-" + "+".join([Path(str(args.real)).stem, *changes])
+    return args.out / "pretrain" / extend.name_of(args.task) / where / seeds
 
 
 if __name__ == "__main__":

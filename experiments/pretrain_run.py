@@ -20,15 +20,14 @@ from envs.rollout import Episode
 from experiments import hosts, stacking
 from experiments.evaluation import best_of, describe, play, scores
 from experiments.memory import reserve
-from experiments.options import seed_list, seeds_name
-from experiments.pretrain import PretrainArgs
+from experiments.pretrain import PretrainArgs, run_folder
 from experiments.report import Report, make_report, numbers
 from experiments.video import film
 from sgft_jax import mesh
 from sgft_jax.analysis import figures
 from sgft_jax.io import checkpoint, runs
-from sgft_jax.io.log import EVAL, MetricsLog, read_jsonl, write_summary
-from sgft_jax.io.priors import save_prior
+from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
+from sgft_jax.io.priors import digest, save_prior
 from sgft_jax.io.progress import Clock, RunProgress
 from sgft_jax.policies import make_policy
 from sgft_jax.pretraining import (
@@ -65,7 +64,7 @@ def run(args: PretrainArgs, seeds: list[int]) -> dict[str, Any]:
     env = real_env(env, [gap] if gap else [])
     sizes = memory(env, args.config)  # what does not fit is reported before anything is written
     devices = mesh.devices(args.devices, {f"--config.{n.replace('_', '-')}": getattr(args.config, n) for n in _CUT})
-    home = run_folder(args, gap)
+    home = run_folder(args)
     with hosts.own(home) as folder, mesh.use(devices):
         reserve(sizes, copies=args.seeds, devices=devices)
         opened = runs.open_run(
@@ -81,13 +80,6 @@ def run(args: PretrainArgs, seeds: list[int]) -> dict[str, Any]:
             return _Run(args, env, gap, seeds, opened.folder, home).work()
         finally:
             opened.close()
-
-
-def run_folder(args: PretrainArgs, gap: Gap | None) -> Path:
-    """Where the run of these arguments lives; the seeds of one call share a folder."""
-    where = args.preset if gap is None else f"{args.preset}-on-{gap.name}"
-    seeds = seeds_name(seed_list(args.seed, args.seeds))
-    return args.out / "pretrain" / envs.name_of(args.task) / where / seeds
 
 
 class _Run:
@@ -174,14 +166,19 @@ class _Run:
                     metrics = {name: np.asarray(x) for name, x in metrics.items()}
                 done += 1
                 self.log.metrics(done * size, metrics)
-                shown = {name: float(metrics[name].mean()) for name in ("train/success", "train/reward")}
+                check_finite(metrics, done * size, unit="env steps", last_good=self._last_good())
+                shown = {"success, exploring": float(metrics["train/success"].mean())}
                 if done % self.config.eval_every == 0 or done == chunks:
                     best, found = self._evaluate(state, best, done)
-                    shown |= {name: float(found[name].mean()) for name in ("success", "return")}
+                    shown |= {f"{name}, evaluation": float(found[name].mean()) for name in ("success", "return")}
                 if done % self.config.checkpoint_every == 0 or done == chunks:
                     self._checkpoint(Saved(state, best), done)
                 progress.advance(size, shown)
         return best
+
+    def _last_good(self) -> Path | None:
+        step = checkpoint.latest(self.home)
+        return None if step is None else checkpoint.path(self.home, step)
 
     def _evaluate(self, state: PretrainState, best: Best | None, done: int) -> tuple[Best, Metrics]:
         """Every evaluation plays the same episodes in the same held-out worlds."""
@@ -208,7 +205,8 @@ class _Run:
         results = []
         for i, seed in enumerate(self.seeds):
             own = stacking.member(best, i)
-            found = {"seed": seed, **describe(stacking.member(played, i)), **self._chosen(own)}
+            name = digest(Prior(own.params, {}))  # by which runs of fine-tuning tell which priors they began from
+            found = {"seed": seed, "digest": name, **describe(stacking.member(played, i)), **self._chosen(own)}
             if report is not None:
                 found |= numbers(stacking.member(report, i))
                 self._save_report(seed, stacking.member(report, i), i)

@@ -24,7 +24,6 @@ from experiments.grid import Cell, GridArgs
 from experiments.options import prior_home, seed_list
 from experiments.spaces import defaults, space_of
 from sgft_jax import extend
-from sgft_jax.analysis.curves import area, read_curve
 from sgft_jax.io import runs
 from sgft_jax.io.jsonfile import read_json
 from sgft_jax.io.log import SUMMARY
@@ -119,6 +118,8 @@ def _look_up(args: TuneArgs, task: str, real: str, method: str, number: int, set
 
 def score(trial: Trial, rollouts: int) -> Score | None:
     """How its runs went up to so many rollouts; None if one is not finished."""
+    from sgft_jax.analysis.curves import area, read_curve
+
     if any(cell.state != "finished" for cell in trial.cells):
         return None
     areas, finals = {}, []

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from sgft_jax.data import replay, sources
 from sgft_jax.learners import optim, sac
 from sgft_jax.methods import options as rules
-from sgft_jax.methods.options import LoopOptions, ModelOptions, SACOptions
+from sgft_jax.methods.options import KeptCriticOptions, LoopOptions, ModelOptions, SACOptions
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import fix_first_layer, make_dynamics, make_value
@@ -100,11 +100,12 @@ def assemble(
 
     def init(params: PyTree, key: Key, simulated: SimulatedData | None = None) -> FinetuneState:
         key_learner, key_transform = jax.random.split(key)
-        own = jax.tree.map(jnp.copy, params)  # the caller may donate the state; the prior must survive it
-        learner, frozen = parts.start(own, key_learner, simulated)
-        models = None if parts.models is None else parts.models.start(own)
+        learner, frozen = parts.start(params, key_learner, simulated)
+        models = None if parts.models is None else parts.models.start(params)
         empty = parts.memory.init(replay.blank(task.obs_dim, task.act_dim), options.replay_capacity)
-        return FinetuneState(learner, models, frozen, parts.transform.init(key_transform), empty)
+        state = FinetuneState(learner, models, frozen, parts.transform.init(key_transform), empty)
+        # The caller may donate the state. The prior must survive that, and no two leaves may share a buffer.
+        return jax.tree.map(jnp.copy, state)
 
     def observe(state: FinetuneState, rows: Transition, valid: Array) -> FinetuneState:
         return state._replace(replay=parts.memory.add_episode(state.replay, rows, valid))
@@ -199,6 +200,9 @@ def sac_finetuner(
         max_grad_norm=options.max_grad_norm,
         **structure,
     )
+    rise = 0  # a new critic has nothing to lose
+    if isinstance(options, KeptCriticOptions) and not new_critic:
+        rise = rules.warmup(options, options.lr_warmup)
     hyper = sac.SACHyper(
         lr_actor=options.lr_actor,
         lr_critic=options.lr_critic,
@@ -207,10 +211,12 @@ def sac_finetuner(
         alpha=options.alpha,
         actor_start=rules.critic_warmup(options, task),
         actor_ramp=options.actor_ramp,
-        lr_warmup=0 if new_critic else rules.warmup(options, options.lr_warmup),
+        lr_warmup=rise,
         **numbers,
     )
     learner = sac.make_sac(config, hyper)
+    trains = isinstance(options, ModelOptions) and options.train_dynamics
+    models = dynamics_models(options, network, task) if trains else None
     whole = steps_to_go(jnp.int32(horizon_dim), horizon_dim) if config.context_dim else None
 
     def start(params: sac.SACParams | None, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
@@ -218,7 +224,8 @@ def sac_finetuner(
         if params is None:
             state = learner.init(key)
             return state, sac.SACParams(None, None, None, None, state.normalizer)
-        frozen = sac.SACParams(None, None, params.value, params.dynamics, params.normalizer)
+        kept = None if models else params.dynamics  # else they are in training
+        frozen = sac.SACParams(None, None, params.value, kept, params.normalizer)
         if fresh:
             return learner.init(key).replace(normalizer=params.normalizer), frozen
         return sac.state_from_prior(config, hyper, params, key, reset_critic=reset_critic), frozen
@@ -233,11 +240,10 @@ def sac_finetuner(
         twin = jax.tree.map(lambda x: x[:2], state.learner.critic.params)
         if whole is not None:
             actor, twin = (fix_first_layer(x, task.obs_dim, whole) for x in (actor, twin))
-        models = state.frozen.dynamics if state.models is None else state.models.params
-        return state.frozen._replace(actor=actor, critic=twin, dynamics=models)
+        ensemble = state.frozen.dynamics if state.models is None else state.models.params
+        return state.frozen._replace(actor=actor, critic=twin, dynamics=ensemble)
 
     own_policy = sac_policy(task.obs_dim, task.act_dim, network)
-    uses_models = isinstance(options, ModelOptions)
     parts = Parts(
         learner=learner,
         start=start,
@@ -249,7 +255,7 @@ def sac_finetuner(
         offline=sources.simulated_rows(options.batch_size) if simulation else None,
         transform=compose(*transforms),
         imagine=_imagine(learner, network, gamma, task) if transforms else lambda state, key: None,
-        models=dynamics_models(options, network, task) if uses_models and options.train_dynamics else None,
+        models=models,
     )
     initial = own_policy if prior is not None and fresh else None
     return assemble(parts, options, task, initial_policy=initial, simulation=simulation)

@@ -24,6 +24,7 @@ def make_policy(card: Mapping[str, Any], task: Task) -> Policy:
     """
     if card.get("algorithm", "sac") == "tdmpc2":
         own = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
+        own["sgft"] = card["config"].get("sgft", False)
         structure = tdmpc2_model.named_config(task.obs_dim, task.act_dim, **own)
         return tdmpc2_policy(structure, tdmpc2.TDMPC2Hyper(gamma=card["gamma"]))
     network = network_of(card)

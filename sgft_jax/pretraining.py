@@ -183,15 +183,17 @@ def priors_of(env: Env, config: PretrainConfig, state: PretrainState) -> list[Pr
 
 
 def memory(env: Env, config: PretrainConfig) -> dict[str, int]:
-    """Bytes of experience that one seed keeps on its devices, by the setting that decides them."""
+    """Bytes that one seed keeps on its devices, by the setting that decides them: experience, and what updates hold."""
     kept = RECIPES[config.algorithm](env, config).memory
     size = lambda f: sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(f)))  # noqa: E731
     drawn = config.updates_per_step * config.batch_size
+    networks = config.ensemble_size + 4  # two critics, actor and V_sim
+    activations = 2 * networks * config.batch_size * sum(config.network.hidden) * 4  # forwards and backwards, float32
     return {
         "random_transitions": size(lambda: kept.empty(config.random_transitions)),
         "replay_capacity": size(lambda: kept.empty(config.replay_capacity)),
         # Drawn, then put together.
-        "batch_size": 2 * size(lambda: kept.sample(kept.empty(config.n_envs), jax.random.key(0), drawn)),
+        "batch_size": activations + 2 * size(lambda: kept.sample(kept.empty(config.n_envs), jax.random.key(0), drawn)),
     }
 
 

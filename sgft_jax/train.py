@@ -179,7 +179,7 @@ class _Steps:
             keys = _episode_keys(self.seeds, _COLLECT, rollout, 1)
             if initial is None:
                 episodes = self.system.play(self.finetuner, agent, keys, explore=True)
-                best = self._keep(best, agent, episodes.score[:, 0], episodes.total_reward[:, 0], jnp.int32(rollout))
+                best = self._keep(best, agent, episodes.score[:, 0], episodes.total_reward[:, 0], jnp.int32(done))
             else:
                 own = jax.tree.map(lambda x: x[_prior_of(self.priors, self.seeds)], self.priors)
                 episodes = self.system.play(initial, own, keys, explore=True)
@@ -218,8 +218,8 @@ class _Steps:
         return jax.vmap(lambda seed: _key(seed, purpose, part))(self.seeds)
 
 
-def _keep_best(finetuner: Finetuner, best: Best, agent: PyTree, score: Array, total: Array, rollout: Array) -> Best:
-    """`best` after one more rollout by `agent` [M], with its score and return [M]; rollout: real ones before it."""
+def _keep_best(finetuner: Finetuner, best: Best, agent: PyTree, score: Array, total: Array, learned: Array) -> Best:
+    """`best` after one more rollout by `agent` [M], with its score and return [M]; learned: from so many rollouts."""
     recent = jnp.concatenate([best.recent[:, 1:], jnp.stack([score, total], axis=1)[:, None]], axis=1)
     mean_score, mean_total = jnp.mean(recent, axis=1).T
     better = (mean_score > best.score) | ((mean_score == best.score) & (mean_total > best.total))
@@ -228,7 +228,7 @@ def _keep_best(finetuner: Finetuner, best: Best, agent: PyTree, score: Array, to
     params = jax.tree.map(keep, jax.vmap(finetuner.export)(agent), best.params)
     return Best(
         params, keep(mean_score, best.score), keep(mean_total, best.total),
-        keep(jnp.broadcast_to(rollout, better.shape), best.rollouts), recent, best.count + 1,
+        keep(jnp.broadcast_to(learned, better.shape), best.rollouts), recent, best.count + 1,
     )  # fmt: skip
 
 

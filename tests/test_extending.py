@@ -14,10 +14,11 @@ import pytest
 import envs
 from envs import gaps
 from experiments import cli, figures, finetune, pretrain
-from sgft_jax import NetworkConfig, Transition, extend, get_method
-from sgft_jax.io import checkpoint
+from sgft_jax import Batch, NetworkConfig, Prior, extend, get_method
 from sgft_jax.io.config import config_to_json
+from sgft_jax.io.priors import load_prior, save_prior
 from sgft_jax.learners import sac
+from sgft_jax.methods import sgft_sac
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "docs/examples"
@@ -39,9 +40,8 @@ def prior(tmp_path_factory):
     agent = sac.make_sac(sac.SACConfig(3, 1, network=NETWORK, ensemble_size=2))
     card = {"task": "own_task", "obs_dim": 3, "act_dim": 1, "network": config_to_json(NETWORK), "gamma": 0.9}
     folder = home / "pretrain/own_task/fast/seed-0/prior/seed-0"
-    checkpoint.save_prior(
-        folder, sac.extract_prior(jax.jit(agent.init)(jax.random.key(0))), {**card, "ensemble_size": 2, "seed": 0}
-    )
+    params = sac.extract_params(jax.jit(agent.init)(jax.random.key(0)))
+    save_prior(folder, Prior(params, {**card, "algorithm": "sac", "ensemble_size": 2, "seed": 0}))
     return folder
 
 
@@ -49,7 +49,7 @@ def test_examples_are_short_and_explained():
     page = (ROOT / "docs/extending.md").read_text()
     for path in EXAMPLES.iterdir():
         if path.is_file():
-            assert len(path.read_text().splitlines()) < 75 and f"(examples/{path.name})" in page
+            assert len(path.read_text().splitlines()) < 85 and f"(examples/{path.name})" in page
 
 
 # --- a task ---------------------------------------------------------------------------------------------------------
@@ -96,12 +96,35 @@ def test_commands_take_the_file(prior, tmp_path):
 
 
 def test_the_transform_by_hand(key):
-    method = get_method(METHOD)
-    assert method.name == "sgft-bent" and len(method.transforms(1, 5, 0.5)) == 4
+    bend = extend.load("method", METHOD, "bend").bend(2.0)
     zero = jnp.zeros(3)
-    batch = Transition(zero, zero, jnp.array([0.01, -100.0, 2.0]), zero, zero, zero > 0, zero.astype(jnp.int32))
-    bent = method.transforms(1, 5, 0.5)[2](None, batch, key)
+    batch = Batch(zero, zero, jnp.array([0.01, -100.0, 2.0]), zero, zero)
+    bent = bend.apply(bend.init(key), None, batch, key)
     np.testing.assert_allclose(bent.reward, [0.01, -2.0, 2 * np.tanh(1.0)], rtol=1e-4)  # tanh(1) = 0.76
+
+
+def test_the_method_keeps_the_settings_of_sgft_sac(prior, monkeypatch):
+    """Its horizon, branches and warm-ups reach the learner; what SGFT-SAC does besides clipping is done, too."""
+    seen, make = {}, sac.make_sac
+
+    def spy(config, hyper):
+        learner = make(config, hyper)
+        seen["config"] = config, hyper
+        return learner._replace(update=lambda s, b, k: (seen.update(batch=b), learner.update(s, b, k))[1])
+
+    monkeypatch.setattr(sac, "make_sac", spy)
+    env, known = envs.make(TASK), load_prior(prior)
+    found = {}
+    for name, method in (("own", get_method(METHOD)), ("ours", get_method("sgft-sac"))):
+        tuner = method.build(method.config(), known, env)
+        state = jax.eval_shape(lambda t=tuner: t.init(known.params, jax.random.key(0), None))
+        jax.eval_shape(lambda s, t=tuner: t.learn(s, jax.random.key(0), 1), state)
+        found[name] = seen["config"], jax.tree.map(jnp.shape, seen["batch"]), tuner.updates_per_rollout
+    assert found["own"] == found["ours"]
+    (config, hyper), batch, updates = found["own"]
+    assert batch.context == (256 * (1 + 2 * 4), 4) and config.context_dim == 4 and config.actor_batch == 256
+    assert hyper.actor_start == updates == 8 * env.episode_length and hyper.actor_ramp == 1000
+    assert get_method(METHOD).config().clip_shaped == sgft_sac.Config().clip_shaped == 2.0
 
 
 def test_the_method_runs_alone(capsys):
@@ -116,7 +139,7 @@ def test_the_method_and_the_gap_run_in_a_command_and_are_drawn(prior, tmp_path):
     given = ["--task", TASK, "--method", METHOD, "--real", GAP, "--prior", str(prior), "--out", str(tmp_path)]
     finetune.main([*given, *options.split()])
     run = tmp_path / "finetune/own_task/own_gap/sgft-bent/seed-0"
-    assert '"clip_shaped": null' in (run / "config.json").read_text() and (run / "policy/seed-0/prior.json").exists()
+    assert '"clip_shaped": 2.0' in (run / "config.json").read_text() and (run / "policy/seed-0/prior.json").exists()
     assert "| sgft-bent | 1 |" in figures.figures(figures.FiguresArgs(task=TASK, out=tmp_path)).read_text()
 
 
@@ -136,18 +159,20 @@ def test_the_gap_is_outside_the_training_range(key):
 def test_a_pretended_robot_teaches_a_policy(prior, capsys):
     example = extend.load("example", str(EXAMPLES / "own_gap.py"), "finetune")
     env = envs.make(TASK)
-    before, card = checkpoint.load_prior(prior, task="own_task")
+    before = load_prior(prior, task="own_task")
     robot = example.PretendedRobot(env, gaps.load(env, GAP))
     start = robot.reset()
     assert start.shape == (3,) and robot.step(np.ones(1))[0] > start[0]
-    after = example.finetune(env, robot, before, card, rollouts=6, updates=2)  # the actor waits for five
-    assert len(re.findall(r"rollout \d: return -?\d+\.\d+, success (?:True|False)", capsys.readouterr().out)) == 6
-    assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, before)
-    changed = jax.tree.map(lambda a, b: bool((a != b).any()), after.actor, before.actor)
+    options = {"batch_size": 8, "horizon": 2, "utd": 0.1, "critic_warmup": 0, "actor_ramp": 0}
+    after = example.finetune(env, robot, before, rollouts=6, **options)
+    assert len(re.findall(r"return -?\d+\.\d+, success (?:True|False)", capsys.readouterr().out)) == 6
+    assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, before.params)
+    changed = jax.tree.map(lambda a, b: bool((a != b).any()), after.actor, before.params.actor)
     assert any(jax.tree.leaves(changed))
 
 
 # --- what can be wrong ----------------------------------------------------------------------------------------------
+
 
 @pytest.mark.parametrize(
     ("text", "words"),

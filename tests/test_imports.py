@@ -6,6 +6,17 @@ import sys
 import pytest
 
 HEAVY = ("jax", "flax", "mujoco", "matplotlib", "scipy", "orbax")
+COMMANDS = ("pretrain", "finetune", "evaluate", "demo", "figures", "compare", "gaps", "tune", "benchmark", "tasks")
+MISTAKES = {
+    "pretrain": "--config.gamma 2",
+    "finetune": "--method sgft-sca",
+    "evaluate": "--task hamer",
+    "demo": "--seeds 0",
+    "compare": "--methods sac sac",
+    "gaps": "--episodes 3",
+    "tune": "--tasks hamer",
+    "benchmark": "--worlds 0",
+}
 LIGHT = ("sgft_jax", "sgft_jax.checks", "sgft_jax.models.config", "experiments.cli", "sgft_jax.presets")
 
 
@@ -19,6 +30,26 @@ def imported(program):
 @pytest.mark.parametrize("module", LIGHT)
 def test_modules_that_define_options_are_light(module):
     assert imported(f"import {module}") == []
+
+
+def ends(command, *argv, code):
+    """What a command imports until it ends with that exit code."""
+    return imported(
+        f"import runpy; sys.argv = {['x', *argv]}\n"
+        f"try: runpy.run_module('experiments.{command}', run_name='__main__')\n"
+        f"except SystemExit as stopped: assert (stopped.code or 0) == {code}"
+    )
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_starts_neither_jax_nor_mujoco(command):
+    assert ends(command, "--help", code=0) == []
+
+
+@pytest.mark.parametrize("command", MISTAKES)
+def test_mistakes_are_found_without_jax_or_mujoco(command, tmp_path):
+    assert ends(command, *MISTAKES[command].split(), "--out", str(tmp_path), code=2) == []
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_public_name_is_imported_when_it_is_used():

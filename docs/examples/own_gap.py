@@ -9,21 +9,22 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from sgft_jax import NetworkConfig, Prior, Transition, finetune_config, get_method, make_finetuner
-from sgft_jax.io import checkpoint
-from sgft_jax.io.config import config_from_json
+import sgft_jax
+from sgft_jax.io.priors import load_prior
 
 
 class PretendedRobot:
     """A gap in the place of hardware. Write the same two methods for your driver; rehearse the loop with this one."""
 
     def __init__(self, env: envs.Env, gap: envs.Gap) -> None:
-        self.world = jax.tree.map(lambda x: x[0], envs.gaps.worlds(env, gap, jax.random.key(0), 1))
-        self.fresh, self.next, self.key = jax.jit(env.reset), jax.jit(env.step), jax.random.key(1)
+        self.worlds, self.key = envs.gaps.worlds(env, gap, jax.random.key(0), 64), jax.random.key(1)
+        self.fresh, self.next = jax.jit(env.reset), jax.jit(env.step)
 
     def reset(self) -> np.ndarray:
         """Brings everything back to a start; returns the observation [obs_dim] there, in units of env.observation."""
-        self.key, key = jax.random.split(self.key)
+        self.key, key_world, key = jax.random.split(self.key, 3)
+        index = jax.random.randint(key_world, (), 0, 64)
+        self.world = envs.rollout.pick(self.worlds, index)
         self.state = self.fresh(self.world, key)
         return np.asarray(self.state.obs)
 
@@ -34,35 +35,46 @@ class PretendedRobot:
         return np.asarray(self.state.obs)
 
 
-def finetune(env: envs.Env, robot: Any, prior: Prior, card: dict, *, rollouts: int = 20, updates: int = 120) -> Prior:
-    """SGFT-SAC on a robot: act, keep what happened, learn, again. Returns the new policy in the form of a prior."""
-    method, network = get_method("sgft-sac"), config_from_json(NetworkConfig, card["network"])
-    config = finetune_config(method, network=network, gamma=card["gamma"], critic_warmup=5 * updates)
-    task = {"obs_dim": env.obs_dim, "act_dim": env.act_dim, "reward": env.reward, "terminated": env.terminated}
-    tuner = make_finetuner(method, config, **task)
-    act, learn, state = (
-        jax.jit(tuner.act),
-        jax.jit(tuner.learn, static_argnums=2),
-        jax.jit(tuner.init)(prior, jax.random.key(0)),
-    )
-    for n in range(rollouts):
-        key_learn, *keys = jax.random.split(jax.random.key(n), 1 + env.episode_length)
-        rows, obs, carry = [], robot.reset(), tuner.init_carry()
-        for t, key in enumerate(keys, start=1):
-            action, carry = act(state, carry, obs, key, explore=True)
-            after = robot.step(np.asarray(action))
-            step = (jnp.asarray(obs), action, jnp.asarray(after))
-            discount = card["gamma"] * (1.0 - env.terminated(*step))  # a time limit is no termination
-            row = Transition(*step[:2], env.reward(*step), discount, step[2], np.bool_(t == len(keys)), np.int32(0))
-            rows, obs = [*rows, row], after
-        episode = jax.tree.map(lambda *leaves: jnp.stack(leaves), *rows)  # [T, ...]; put it on disk first
-        state, _ = learn(tuner.observe(state, episode, jnp.ones(len(rows), bool)), key_learn, updates)
-        print(f"rollout {n + 1}: return {episode.reward.sum():.2f}, success {bool(env.success(obs))}")
-    return tuner.export(state)
+class Stepped:
+    """A `System` of one robot: episodes from `reset` and `step`, judged by the task's functions of observations."""
+
+    def __init__(self, env: envs.Env, robot: Any, gamma: float) -> None:
+        self.env, self.robot, self.gamma = env, robot, gamma
+
+    def play(self, policy: Any, states: Any, keys: jax.Array, *, explore: bool) -> envs.Episode:
+        """One episode [1, 1]; see `System`."""
+        env, act = self.env, jax.jit(policy.act)
+        state = jax.tree.map(lambda x: x[0], states)
+        obs, carry, rows, over = self.robot.reset(), policy.init_carry(), [], False
+        while not over and len(rows) < env.episode_length:
+            key = jax.random.fold_in(keys[0, 0], len(rows))
+            action, carry = act(state, carry, obs, key, explore=jnp.bool_(explore))
+            after = self.robot.step(np.asarray(action))
+            over = bool(env.terminated(obs, action, after))
+            # A time limit is no termination. Put the row on disk here, before anything learns from it.
+            discount = 0.0 if over else self.gamma
+            rows.append(sgft_jax.Transition(obs, action, env.reward(obs, action, after), discount, after))
+            obs = after
+        valid = jnp.arange(env.episode_length) < len(rows)
+        rows += [jax.tree.map(jnp.zeros_like, rows[0])] * (env.episode_length - len(rows))
+        stacked = jax.tree.map(lambda *x: jnp.stack([jnp.asarray(y, jnp.float32) for y in x])[None, None], *rows)
+        total, success, no = stacked.reward.sum(-1), jnp.bool_(env.success(obs))[None, None], jnp.zeros((1, 1), bool)
+        print(f"return {total[0, 0]:.2f}, success {success[0, 0]}")
+        score = success.astype(jnp.float32)
+        return envs.Episode(stacked, valid[None, None], total, success, no, score, no.astype(int), jnp.zeros((1, 1, 0)))
+
+
+def finetune(env: envs.Env, robot: Any, prior: sgft_jax.Prior, *, rollouts: int = 20, **options: Any) -> Any:
+    """SGFT-SAC on a robot: act, keep what happened, learn, again. Returns the best policy's parameters."""
+    method = sgft_jax.get_method("sgft-sac")
+    tuner = method.build(method.config(**options), prior, env)
+    system, one = Stepped(env, robot, prior.card["gamma"]), jax.tree.map(lambda x: x[None], prior.params)
+    for progress, _ in sgft_jax.finetune(tuner, system, one, jnp.zeros(1, jnp.uint32), rollouts=rollouts):
+        params = jax.tree.map(lambda x: np.array(x[0]), progress.best.params)
+    return params
 
 
 if __name__ == "__main__":  # its argument is the folder of a prior
     env = envs.make(str(Path(__file__).with_name("own_task.py")))
     gap = envs.gaps.load(env, str(Path(__file__).with_name("own_gap.toml")))
-    prior, card = checkpoint.load_prior(Path(sys.argv[1]), task=env.name, obs_dim=env.obs_dim, act_dim=env.act_dim)
-    finetune(env, PretendedRobot(env, gap), prior, card)
+    finetune(env, PretendedRobot(env, gap), load_prior(Path(sys.argv[1]), task=env.name))

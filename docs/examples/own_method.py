@@ -1,54 +1,75 @@
-"""A method of your own: SGFT-SAC whose shaped rewards are bent, not clipped: the larger one stays the larger."""
+"""A method of your own: SGFT-SAC whose shaped rewards are bent, not clipped: the larger one stays the larger.
 
-import jax
-import jax.numpy as jnp
+Commands read this file before they start JAX, so JAX is imported where it is used.
+"""
 
-import sgft_jax
-from sgft_jax import BatchTransform, Imagination, Transition, branch, shape, shorten
-from sgft_jax.types import Array, Key
+from dataclasses import dataclass
 
-BOUND = 2.0  # of |r_bar|
-
-
-def bend(bound: float) -> BatchTransform:
-    """Rewards [B] to bound * tanh(reward / bound): unchanged where they are small, never larger than the bound."""
-
-    def transform(imagination: Imagination, batch: Transition, key: Key) -> Transition:
-        del imagination, key  # what V_sim, the models and the policy say, and chance: not needed here
-        return batch._replace(reward=bound * jnp.tanh(batch.reward / bound))
-
-    return transform
+from sgft_jax.methods import sgft_sac
+from sgft_jax.types import Finetuner, Method, Prior, Task, Transform
 
 
-def transforms(horizon: int, branches: int, noise: float | Array) -> tuple[BatchTransform, ...]:
-    """What happens to every sampled batch, in order. `horizon`, `branches` and `noise` are options of fine-tuning."""
-    return branch(horizon, branches, noise=noise), shape, bend(BOUND), shorten(horizon)
+@dataclass(frozen=True)
+class Config(sgft_sac.Config):
+    """Options of `sgft-bent`: those of SGFT-SAC with their defaults, but for what is written here."""
+
+    clip_shaped: float | None = 2.0
+    """Bound that the shaped reward approaches; None = no bound."""
 
 
-METHOD = sgft_jax.get_method("sgft-sac")._replace(  # what `--method docs/examples/own_method.py` looks for
-    name="sgft-bent",
-    description="SGFT-SAC with shaped rewards that are bent instead of clipped",
-    source="docs/extending.md",
-    transforms=transforms,
-    options={"clip_shaped": None},  # its own defaults of `FinetuneConfig`
+def bend(bound: float) -> Transform:
+    """Rewards become bound * tanh(reward / bound): unchanged where they are small, never larger than the bound."""
+    import jax.numpy as jnp
+
+    from sgft_jax import stateless
+
+    return stateless(lambda imagination, batch, key: batch._replace(reward=bound * jnp.tanh(batch.reward / bound)))
+
+
+def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
+    """What happens to every sampled batch, in order, and which learner gets it."""
+    from sgft_jax import branch, sac_finetuner, shape, shorten
+
+    bent = () if config.clip_shaped is None else (bend(config.clip_shaped),)
+    imagined = branch(config.horizon, config.branches, noise=config.branch_noise)
+    return sac_finetuner(
+        config, prior, task,
+        transforms=(imagined, shape, *bent, shorten(config.horizon)),
+        horizon_dim=config.horizon,
+        reset_critic=config.reset_critic,
+        value_baseline=True,
+        actor_batch=config.batch_size if config.actor_real_only else None,
+    )  # fmt: skip
+
+
+METHOD = Method(  # what `--method docs/examples/own_method.py` looks for
+    "sgft-bent", "sgft", "SGFT-SAC with bent instead of clipped rewards", "docs/extending.md", Config, build
 )
 
 
 def main() -> None:
     """Twenty updates on random data of a point on a line, without any command: the library alone."""
+    from dataclasses import asdict
+    from types import SimpleNamespace
+
+    import jax
+    import jax.numpy as jnp
+
+    import sgft_jax
+
     network = sgft_jax.NetworkConfig(hidden=(16,))
     agent = sgft_jax.make_sac(sgft_jax.SACConfig(1, 1, network=network))
-    prior = sgft_jax.extract_prior(jax.jit(agent.init)(jax.random.key(0)))
-    config = sgft_jax.finetune_config(METHOD, network=network, batch_size=16, replay_capacity=64, critic_warmup=0)
-    tuner = sgft_jax.make_finetuner(
-        METHOD, config, obs_dim=1, act_dim=1,
-        reward=lambda obs, action, next_obs: -jnp.abs(next_obs[0]),
+    params = sgft_jax.extract_params(jax.jit(agent.init)(jax.random.key(0)))
+    prior = Prior(params, {"algorithm": "sac", "network": {**asdict(network), "hidden": [16]}, "gamma": 0.9})
+    line = SimpleNamespace(
+        obs_dim=1, act_dim=1, episode_length=32, reward=lambda obs, action, next_obs: -jnp.abs(next_obs[0]),
         terminated=lambda obs, action, next_obs: jnp.bool_(False),
     )  # fmt: skip
+    tuner = METHOD.build(Config(batch_size=16, replay_capacity=64), prior, line)
     obs, action = jax.random.uniform(jax.random.key(1), (2, 32, 1), minval=-1)
-    zero, next_obs = jnp.zeros(32), obs + 0.1 * action
-    rows = Transition(obs, action, -jnp.abs(next_obs[:, 0]), zero + 0.9, next_obs, zero > 0, zero.astype(jnp.int32))
-    state = tuner.observe(jax.jit(tuner.init)(prior, jax.random.key(2)), rows, jnp.ones(32, bool))
+    next_obs = obs + 0.1 * action
+    rows = sgft_jax.Transition(obs, action, -jnp.abs(next_obs[:, 0]), jnp.full(32, 0.9), next_obs)
+    state = tuner.observe(tuner.init(params, jax.random.key(2), None), rows, jnp.ones(32, bool))
     state, metrics = jax.jit(tuner.learn, static_argnums=2)(state, jax.random.key(3), 20)
     print(f"mean shaped reward {metrics['batch/reward_mean']:.3f}, critic loss {metrics['critic/loss']:.3f}")
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from envs.mujoco.worlds import Impl
 from experiments.finetune import finetune
-from experiments.finetune_args import FinetuneArgs, run_folder
+from experiments.finetune_args import arguments, run_folder
 from experiments.pretrain import PretrainArgs, pretrain
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.presets import PRESETS
@@ -77,18 +77,19 @@ def weak_scaling(
 
 
 def fine_tuning(task: str, impl: Impl, seeds: int, *, prior: Path, rollouts: int) -> dict[str, Any]:
-    """Seconds of SGFT-SAC from that prior, its curve included, and the median rollout's by what it does."""
+    """Seconds of SGFT-SAC from that prior, its curve included, and those of the median rollout with its updates."""
 
     def run(out: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        args = FinetuneArgs(task=task, seeds=seeds, rollouts=rollouts, prior=prior, impl=impl, video=False, out=out)
+        own = {"task": task, "seeds": seeds, "rollouts": rollouts, "prior": prior, "impl": impl}
+        args = arguments("sgft-sac", **own, video=False, out=out)
         (summary,) = finetune(args)
         return summary, read_jsonl(run_folder(args, *args.real) / "timing.jsonl")
 
     first_s, ((summary, timing), seconds) = _twice(run)
-    parts = {part: statistics.median(line[f"time/{part}"] for line in timing[1:]) for part in ("collect_s", "learn_s")}
+    rollout_s = statistics.median(line["time/rollout_s"] for line in timing[1:])
     return {
         "task": task, "impl": summary["impl"], "seeds": seeds, "rollouts": rollouts,
-        "seconds": seconds, "first_run_s": first_s, **parts,
+        "seconds": seconds, "first_run_s": first_s, "rollout_s": rollout_s,
     }  # fmt: skip
 
 

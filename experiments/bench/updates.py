@@ -12,7 +12,7 @@ from experiments.bench.timing import Timing, fastest, measure
 from sgft_jax.data import replay
 from sgft_jax.learners.sac import SACConfig, SACHyper, make_sac
 from sgft_jax.models.networks import NetworkConfig, Precision, precision
-from sgft_jax.types import Key, PyTree, Transition
+from sgft_jax.types import Batch, Key, PyTree, Transition
 
 OBS_DIM, ACT_DIM, MEMBERS = 12, 3, 5  # sizes of the updates, a manipulation task's
 REPLAY = 100_000  # rows that batches of plain SAC are drawn from
@@ -82,7 +82,7 @@ def rows(key: Key, batch: int) -> Transition:
 def _library(network: NetworkConfig) -> Agent:
     """SAC as pretraining uses it."""
     learner = make_sac(SACConfig(OBS_DIM, ACT_DIM, network=network, ensemble_size=MEMBERS))
-    return Agent(lambda state, batch, key: learner.update(state, batch, key)[0], learner.init)
+    return Agent(lambda state, batch, key: learner.update(state, Batch(*batch), key)[0], learner.init)
 
 
 def _by_hand(network: NetworkConfig, batch: int) -> Agent:

@@ -25,7 +25,11 @@ LEVEL = 0.9  # success that counts as solved
 SCORES = ("success", "return")
 IDENTITY = ("task", "gap", "method", "variant", "priors")
 COLUMNS = (*IDENTITY, "prior", "seed", "rollouts", "transitions", "minutes", *SCORES)
-_PER_RUN = ("out", "resume", "overwrite", "video", "devices", "checkpoint_every", "task", "method", "variant", "real")
+# Of a run's options those that are in other columns, or say nothing about its outcome; paths of a machine above all.
+_LEFT_OUT = (
+    "out", "prior", "resume", "overwrite", "video", "devices", "checkpoint_every", "task", "method", "variant", "real",
+    "impl",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -266,7 +270,7 @@ def _facts(summary: Mapping[str, Any], config: Mapping[str, Any], start: Mapping
         **origin(start),
         "gap_definition": json.dumps(summary.get("gap", {})),
         "impl": summary.get("impl", ""),
-        **flat({name: value for name, value in config.items() if name not in (*_PER_RUN, "impl")}),
+        **flat({name: value for name, value in config.items() if name not in _LEFT_OUT}),
     }
 
 

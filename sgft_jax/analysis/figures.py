@@ -4,7 +4,6 @@ Each function returns the path it wrote. No panel has more than `MOST` curves, e
 Okabe-Ito palette (safe for colour-blind readers).
 """
 
-import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from sgft_jax.analysis.curves import Curve, by_prior, spread
@@ -113,42 +112,6 @@ def _note(curves: Sequence[Curve]) -> str:
     drawn = "priors, then seeds" if all(by_prior(curve) for curve in curves) else "seeds"
     band = f"; band: 95 % bootstrap interval, drawing {drawn}" if sizes[-1] >= ENOUGH else ""
     return f"line: interquartile mean of {seeds} seeds{band}"
-
-
-def scaling(
-    path: Path,
-    lines: Mapping[str, tuple[ArrayLike, ArrayLike]],
-    references: Mapping[str, tuple[ArrayLike, ArrayLike]],
-    *,
-    title: str,
-    x: str,
-    y: str,
-) -> Path:
-    """How a quantity grows with a size, both on logarithmic axes.
-
-    lines: {name: (sizes [n], values [n])}. references: the same for some of these names, drawn dashed in their colour.
-    """
-    figure, (axes,) = _figure(6.4, 4.0, columns=1)
-    for (name, points), colour in zip(lines.items(), itertools.cycle(PALETTE), strict=False):
-        axes.plot(*map(np.asarray, points), color=colour, linewidth=2, marker="o", markersize=4, label=name)
-        if name in references:
-            axes.plot(*map(np.asarray, references[name]), color=colour, linewidth=1.2, linestyle=(0, (4, 3)))
-    axes.set_xscale("log", base=2)
-    axes.set_yscale("log")
-    sizes = sorted({float(size) for points in lines.values() for size in np.asarray(points[0])})
-    axes.set_xticks(sizes, [f"{size:,.0f}" for size in sizes])
-    axes.minorticks_off()
-    low, high = axes.get_ylim()
-    steps = (1, 2, 5) if high < 30 * low else (1,)  # a single decade would have one tick, or none
-    axes.yaxis.set_major_locator(LogLocator(subs=steps))
-    axes.yaxis.set_major_formatter(EngFormatter(sep=" "))
-    axes.set_xlabel(x, **_FONT)
-    axes.set_ylabel(y, **_FONT)
-    axes.legend(frameon=False, fontsize=9, labelcolor=_INK)
-    figure.suptitle(title, x=0.01, ha="left", size=12, weight="bold", color=_INK)
-    if references:
-        figure.text(0.99, 0.012, "dashed: the reference", ha="right", size=8, color=_GREY)
-    return _save(figure, path)
 
 
 def pretraining(

@@ -75,6 +75,11 @@ def latest(folder: Path, *, say: Callable[[str], None] = print) -> int | None:
     return None
 
 
+def path(folder: Path, step: int) -> Path:
+    """Where the checkpoint of a step is."""
+    return Path(folder) / _CHECKPOINTS / str(step)
+
+
 def restore(
     folder: Path,
     like: PyTree,
@@ -92,7 +97,7 @@ def restore(
         step = latest(folder, say=say)
         if step is None:
             raise UserError(f"{folder}: holds no complete checkpoint to restore")
-    where = Path(folder) / _CHECKPOINTS / str(step)
+    where = path(folder, step)
     manifest = read_manifest(where)
     check_facts(where, manifest["meta"], expect or {})
     _check_leaves(where, leaves_of(manifest), [describe(p, x) for p, x in jax.tree_util.tree_leaves_with_path(like)])

@@ -42,8 +42,8 @@ def load_prior(
 ) -> Prior:
     """Read a prior from its folder, or from the run folder that holds one as `prior/`.
 
-    Its parameters are the `<ALGORITHM>Params` of `sgft_jax.learners.<algorithm>`. Raises UserError if the prior is
-    missing, torn, or of another task, other observation or action sizes than asked for, or another version.
+    Its parameters are the `<ALGORITHM>Params` of `sgft_jax.learners.<algorithm>`, None where there are none. Raises
+    UserError if the prior is missing, torn, or of another task, other sizes than asked for, or another version.
     """
     folder = Path(folder)
     if not (folder / CARD).exists() and (folder / "prior" / CARD).exists():
@@ -61,7 +61,7 @@ def load_prior(
     tree["normalizer"] = statistics = Normalizer(**tree["normalizer"])
     if statistics.mean.shape != (card["obs_dim"],):
         raise UserError(f"{folder}: {CARD} says obs_dim={card['obs_dim']}, the statistics have {len(statistics.mean)}")
-    return Prior(container(**{name: tree.get(name, {}) for name in container._fields}), card)
+    return Prior(container(**{name: tree.get(name) for name in container._fields}), card)
 
 
 def load_priors(folders: Sequence[Path], env: Any) -> list[Prior]:
@@ -70,9 +70,8 @@ def load_priors(folders: Sequence[Path], env: Any) -> list[Prior]:
     env: what has the `name`, `obs_dim` and `act_dim` that they must have.
     """
     priors = [load_prior(folder, task=env.name, obs_dim=env.obs_dim, act_dim=env.act_dim) for folder in folders]
-    first = _structure(priors[0].card)
     for folder, prior in zip(folders, priors, strict=True):
-        if odd := differences(first, _structure(prior.card)):
+        if odd := differences(_structure(priors[0].card), _structure(prior.card)):
             names = sorted({name.partition(".")[0] for name, *_ in odd})
             raise UserError(f"{folder}: differs from {folders[0]} in {', '.join(names)}; choose one with --prior")
     return priors

@@ -69,17 +69,6 @@ class Run:
     resumed: bool
     lock: Lock = dataclasses.field(repr=False)
 
-    @property
-    def prior(self) -> Path:
-        """Where pretraining saves its prior."""
-        return self.folder / "prior"
-
-    def made(self, name: str) -> Path:
-        """The sub-folder `name` (`figures`, `videos`), created if needed."""
-        path = self.folder / name
-        path.mkdir(exist_ok=True)
-        return path
-
     def close(self) -> None:
         """Let other processes open the folder."""
         self.lock.release()

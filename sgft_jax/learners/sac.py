@@ -218,7 +218,7 @@ def _assemble(
 
 def _update(config: SACConfig, parts: _Parts, state: SACState, batch: Batch, key: Key) -> tuple[SACState, Metrics]:
     """Critic, target, actor, temperature, then value (on the actor's own draws) and dynamics."""
-    key_target, key_actor, key_dynamics = jax.random.split(key, 3)
+    key_target, key_actor, key_dynamics, key_members = jax.random.split(key, 4)
     raw, read = batch, jax.vmap(network_input, (None, 0, 0))
     batch = batch._replace(
         obs=read(state.normalizer, batch.obs, batch.context),
@@ -227,7 +227,7 @@ def _update(config: SACConfig, parts: _Parts, state: SACState, batch: Batch, key
 
     metrics: Metrics = {}
     if config.train_critic:
-        state, metrics = _update_critic(config, parts, state, batch, key_target)
+        state, metrics = _update_critic(config, parts, state, batch, _target_members(config, key_members), key_target)
     rows = jax.tree.map(lambda x: x[: config.actor_batch], batch)
     state, q, log_prob, more = _update_actor(config, parts, state, rows, key_actor)
     metrics |= more
@@ -261,10 +261,10 @@ def _critic_of(config: SACConfig, parts: _Parts, state: SACState) -> Callable[[P
 
 
 def _update_critic(
-    config: SACConfig, parts: _Parts, state: SACState, batch: Batch, key: Key
+    config: SACConfig, parts: _Parts, state: SACState, batch: Batch, counted: Array | slice, key: Key
 ) -> tuple[SACState, Metrics]:
+    """counted: the members that a target is the minimum of."""
     critic, alpha = _critic_of(config, parts, state), jnp.exp(state.log_alpha.params)
-    counted = _target_members(config, key)
 
     def target(row: Batch, key: Key) -> Array:
         action, log_prob = tanh_gaussian_sample(parts.actor.apply(state.actor.params, row.next_obs), key)
@@ -290,7 +290,7 @@ def _target_members(config: SACConfig, key: Key) -> Array | slice:
     """Which members of the critic a target is the minimum of: the same ones for the whole batch."""
     if config.target_critics is None:
         return slice(None)
-    return jax.random.permutation(jax.random.fold_in(key, config.critics), config.critics)[: config.target_critics]
+    return jax.random.permutation(key, config.critics)[: config.target_critics]
 
 
 def _update_actor(

@@ -114,7 +114,7 @@ def _update(
     batch = batch._replace(obs=obs, next_obs=next_obs)
 
     state, zs, metrics = _update_model(config, parts, state, batch, valid, key_model)
-    state, more = _update_policy(config, parts, state, zs, valid, key_policy)
+    state, more = _update_policy(config, parts, state, zs, valid, batch.weight, key_policy)
     if not config.sgft:
         average = optax.incremental_update(state.critic.params, state.target_critic, state.hyper.tau)
         state = state.replace(target_critic=average)
@@ -147,7 +147,7 @@ def _update_model(
     def loss(learned: dict[str, PyTree]) -> tuple[Array, tuple[dict[str, Array], Array]]:
         one = lambda *window: _window_losses(config, parts, frozen | learned, *window)  # noqa: E731
         each, zs = jax.vmap(one)(batch, ahead, q_target, dropout)
-        mean = {name: discounted_mean(x, valid, hyper.rho) for name, x in each.items()}
+        mean = {name: discounted_mean(x, valid, hyper.rho, batch.weight) for name, x in each.items()}
         return sum((getattr(hyper, name) * x for name, x in mean.items()), jnp.float32(0)), (mean, zs)
 
     fits = {name: getattr(state, name) for name in config.learned}
@@ -197,11 +197,16 @@ def _window_losses(
     return losses, zs
 
 
-def discounted_mean(values: Array, valid: Array, rho: Array | float) -> Array:
-    """Mean [] over the valid of values [B, T], step t weighing rho^t; with all valid, 1/T sum_t rho^t mean_B."""
+def discounted_mean(values: Array, valid: Array, rho: Array | float, weight: Array | None = None) -> Array:
+    """Mean [] over the valid of values [B, T], step t weighing rho^t; with all valid, 1/T sum_t rho^t mean_B.
+
+    weight: [B] how much each row counts, mean 1.
+    """
     decay = rho ** jnp.arange(values.shape[1])
-    weights = valid * decay[None]
-    return jnp.mean(decay) * jnp.sum(jnp.where(valid, values, 0.0) * weights) / jnp.maximum(jnp.sum(weights), 1e-6)
+    counts = valid * decay[None]
+    total = jnp.maximum(jnp.sum(counts), 1e-6)
+    counts = counts if weight is None else counts * weight[:, None]
+    return jnp.mean(decay) * jnp.sum(jnp.where(valid, values, 0.0) * counts) / total
 
 
 def clip_by_norm(grads: PyTree, limit: Array | float) -> tuple[PyTree, Array]:
@@ -212,9 +217,9 @@ def clip_by_norm(grads: PyTree, limit: Array | float) -> tuple[PyTree, Array]:
 
 
 def _update_policy(
-    config: TDMPC2Config, parts: Parts, state: TDMPC2State, zs: Array, valid: Array, key: Key
+    config: TDMPC2Config, parts: Parts, state: TDMPC2State, zs: Array, valid: Array, weight: Array | None, key: Key
 ) -> tuple[TDMPC2State, Metrics]:
-    """zs: [B, H + 1, latent]; valid: [B, H] of the steps between them."""
+    """zs: [B, H + 1, latent]; valid: [B, H] of the steps between them; weight: [B] or None."""
     key_heads, key_action, key_dropout = jax.random.split(key, 3)
     heads, hyper = two_heads(config, key_heads), state.hyper
     reached = jnp.concatenate([valid[:, :1], valid], axis=1)
@@ -230,7 +235,7 @@ def _update_policy(
         low, high = jnp.quantile(jax.lax.stop_gradient(value[:, 0]), jnp.array([0.05, 0.95]))
         scale = state.scale + hyper.tau * (jnp.maximum(high - low, 1.0) - state.scale)
         losses = -value / scale - hyper.entropy * entropy
-        return discounted_mean(losses, reached, hyper.rho), (value, entropy, scale)
+        return discounted_mean(losses, reached, hyper.rho, weight), (value, entropy, scale)
 
     (total, (value, entropy, scale)), grads = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
     grads, norm = clip_by_norm(grads, hyper.max_grad_norm)
@@ -309,7 +314,7 @@ def _assemble(config: TDMPC2Config, parts: Parts, hyper: TDMPC2Hyper, prior: TDM
     return TDMPC2State(
         **{name: start(name) for name in NETWORKS},
         target_critic=jax.tree.map(jnp.copy, prior.critic),  # own buffers: a donated state must not hold one twice
-        anchor=jax.tree.map(jnp.copy, prior.policy) if config.sgft else None,
+        anchor=jax.tree.map(jnp.copy, prior.anchor or prior.policy) if config.sgft else None,
         scale=prior.scale,
         normalizer=prior.normalizer,
         hyper=jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hyper),
@@ -323,13 +328,13 @@ def _assemble(config: TDMPC2Config, parts: Parts, hyper: TDMPC2Hyper, prior: TDM
 def extract_params(state: TDMPC2State) -> TDMPC2Params:
     """What a pretrained agent hands over."""
     params = {name: getattr(state, name).params for name in NETWORKS}
-    return TDMPC2Params(**params, normalizer=state.normalizer, scale=state.scale)
+    return TDMPC2Params(**params, normalizer=state.normalizer, scale=state.scale, anchor=state.anchor)
 
 
 def state_from_prior(config: TDMPC2Config, hyper: TDMPC2Hyper, params: TDMPC2Params) -> TDMPC2State:
     """An agent that starts from a prior: all its networks, its normaliser (frozen), fresh optimiser moments.
 
-    With `config.sgft` its policy becomes the anchor of V_sim. The horizon may differ from the prior's.
+    With `config.sgft` its policy becomes the anchor of V_sim, unless it brings one. The horizon may be another one.
     """
     check_params_of_prior(config, params)
     own = jax.tree.map(jnp.copy, params)  # the caller may donate the state; the prior must survive it

@@ -155,7 +155,10 @@ class TDMPC2State(struct.PyTreeNode):
 
 
 class TDMPC2Params(NamedTuple):
-    """What pretraining hands to fine-tuning: parameters, observation statistics, and the scale [] of values."""
+    """What pretraining hands to fine-tuning: parameters, observation statistics, and the scale [] of values.
+
+    anchor: the policy of V_sim where that is another one than `policy`: what `sgft` leaves.
+    """
 
     encoder: PyTree
     dynamics: PyTree
@@ -164,6 +167,7 @@ class TDMPC2Params(NamedTuple):
     critic: PyTree
     normalizer: Normalizer
     scale: Array
+    anchor: PyTree = None
 
 
 # --- networks -------------------------------------------------------------------------------------------------------

@@ -1,24 +1,36 @@
 """The actor alone learns, from the simulator's critic, which stays as it is."""
 
+import dataclasses
 from dataclasses import dataclass
 
-from sgft_jax.methods.options import SACOptions
+from sgft_jax import checks
+from sgft_jax.methods.options import LoopOptions, SACOptions
 from sgft_jax.types import Finetuner, Method, Prior, Task
 
 
 @dataclass(frozen=True)
-class Config(SACOptions):
+class Config(LoopOptions):
     """Options of `frozen-critic`."""
 
-    critic_warmup: int | None = 0
-    """Updates at the start before the actor moves; the critic never does."""
+    lr_actor: float = 1e-4
+    """Adam learning rate of the actor."""
+    alpha: float = 0.01
+    """Entropy temperature."""
+    actor_ramp: int = 1000
+    """Updates over which the actor's learning rate rises from 0."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.positive(self, "lr_actor", "alpha")
+        checks.not_negative(self, "actor_ramp")
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
     from sgft_jax.finetuner import sac_finetuner
 
-    return sac_finetuner(config, prior, task, train_critic=False)
+    options = SACOptions(**dataclasses.asdict(config), critic_warmup=0)
+    return sac_finetuner(options, prior, task, train_critic=False)
 
 
 METHOD = Method(

@@ -52,9 +52,6 @@ class SACOptions(LoopOptions):
     do not say what another action would do. None = the updates that follow the initial rollouts; the paper has 0."""
     actor_ramp: int = 1000
     """Updates over which the actor's learning rate then rises from 0, for the same reason."""
-    lr_warmup: int | None = None
-    """Updates over which the learning rate of a critic kept from the simulator rises from 0. Adam's first steps are as
-    long as its rate in every weight, however small the gradient. None = the updates of 1,000 real transitions."""
     policy_delay: int | None = 1
     """Critic updates per update of the actor; None = `utd`, one actor update per real transition (RLPD)."""
 
@@ -62,12 +59,25 @@ class SACOptions(LoopOptions):
         super().__post_init__()
         checks.positive(self, "lr_actor", "lr_critic", "alpha")
         checks.share(self, "tau")
-        checks.not_negative(self, "critic_warmup", "actor_ramp", "lr_warmup")
+        checks.not_negative(self, "critic_warmup", "actor_ramp")
         checks.at_least(self, 1, "policy_delay")
 
 
 @dataclass(frozen=True)
-class ModelOptions(SACOptions):
+class KeptCriticOptions(SACOptions):
+    """Options of methods that may go on with the simulator's critic."""
+
+    lr_warmup: int | None = None
+    """Updates over which the learning rate of a critic kept from the simulator rises from 0. Adam's first steps are as
+    long as its rate in every weight, however small the gradient. None = the updates of 1,000 real transitions."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.not_negative(self, "lr_warmup")
+
+
+@dataclass(frozen=True)
+class ModelOptions(KeptCriticOptions):
     """Options of methods that branch with dynamics models."""
 
     horizon: int = 1

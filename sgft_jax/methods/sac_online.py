@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import SACOptions
+from sgft_jax.methods.options import KeptCriticOptions
 from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
 
 
 @dataclass(frozen=True)
-class Config(SACOptions):
+class Config(KeptCriticOptions):
     """Options of `sac-online`; the defaults are As et al. 2026's."""
 
     utd: float = 5.0

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import SACOptions
+from sgft_jax.methods.options import KeptCriticOptions
 from sgft_jax.types import Finetuner, Method, Prior, Task
 
 
 @dataclass(frozen=True)
-class Config(SACOptions):
+class Config(KeptCriticOptions):
     """Options of `sgft`."""
 
     horizon: int = 1

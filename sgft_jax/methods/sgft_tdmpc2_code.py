@@ -7,7 +7,7 @@ from sgft_jax.types import Finetuner, Method, Prior, Task
 
 
 @dataclass(frozen=True)
-class Config(tdmpc2.Config):
+class Config(tdmpc2.PlannerOptions):
     """Options of `sgft-tdmpc2-code`."""
 
     horizon: int = 3

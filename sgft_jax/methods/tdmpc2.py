@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import inf
 
 from sgft_jax import checks
 from sgft_jax.methods.options import LoopOptions
@@ -9,8 +10,8 @@ from sgft_jax.types import Finetuner, Method, Prior, Task
 
 
 @dataclass(frozen=True)
-class Config(LoopOptions):
-    """Options of `tdmpc2`; the defaults are Hansen et al. 2024's, but for the horizon and the warm-up."""
+class PlannerOptions(LoopOptions):
+    """Options of methods whose learner is TD-MPC2; the defaults are Hansen et al. 2024's, but for the horizon."""
 
     utd: float = 1.0
     """Gradient updates per real transition."""
@@ -20,19 +21,30 @@ class Config(LoopOptions):
     """Action sequences that a plan tries in each of its iterations."""
     lr: float = 3e-4
     """Adam learning rate of all networks; the encoder's is 0.3 of it."""
-    lr_warmup: int | None = None
-    """Updates over which the rate rises from 0; None = the updates of 1,000 real transitions. 40 updates at full rate
-    took plans that pushed a towel home in 93 % of all episodes to 4 % (docs/history.md)."""
     tau: float = 0.01
-    """Averaging rate of the target critic."""
+    """Averaging rate of the target critic and of the range of values that scales the policy's loss."""
+    max_grad_norm: float | None = 20.0
+    """Bound on the norm of the gradient of world model with critic, and of the policy's; None = no bound."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.at_least(self, 1, "horizon")
         checks.at_least(self, 8, "plan_samples")
         checks.positive(self, "lr")
-        checks.not_negative(self, "lr_warmup")
         checks.share(self, "tau")
+
+
+@dataclass(frozen=True)
+class Config(PlannerOptions):
+    """Options of `tdmpc2`."""
+
+    lr_warmup: int | None = None
+    """Updates over which the rate rises from 0; None = the updates of 1,000 real transitions. 40 updates at full rate
+    took plans that pushed a towel home in 93 % of all episodes to 4 % (docs/history.md)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.not_negative(self, "lr_warmup")
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
@@ -41,7 +53,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 
 def planner(
-    config: Config,
+    config: PlannerOptions,
     prior: Prior | None,
     task: Task,
     *,
@@ -67,14 +79,17 @@ def planner(
     from sgft_jax.types import Array, Batch, Key, PyTree, SimulatedData
 
     card = card_of(prior)
+    own = {"size": "5M", **card.get("config", {}), "horizon": config.horizon, "plan_samples": config.plan_samples}
     structure = tdmpc2_model.named_config(
-        task.obs_dim, task.act_dim, size=card["config"]["size"] if prior else "5M", horizon=config.horizon,
+        task.obs_dim, task.act_dim, size=own["size"], horizon=config.horizon,
         plan_samples=config.plan_samples, sgft=sgft, train_encoder=train_encoder,
     )  # fmt: skip
     fresh = fresh or prior is None
+    rise = warmup(config, config.lr_warmup) if isinstance(config, Config) and not fresh else 0
     hyper = tdmpc2.TDMPC2Hyper(
-        config.lr, 0 if fresh else warmup(config, config.lr_warmup), tau=config.tau, gamma=card["gamma"]
-    )
+        config.lr, rise, tau=config.tau, gamma=card["gamma"],
+        max_grad_norm=inf if config.max_grad_norm is None else config.max_grad_norm,
+    )  # fmt: skip
     learner = tdmpc2.make_tdmpc2(structure, hyper)
 
     def start(params: TDMPC2Params | None, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
@@ -118,7 +133,8 @@ def planner(
         memory=sequences,
     )
     initial = tdmpc2_policy(structure, hyper) if fresh and prior is not None else None
-    return assemble(parts, config, task, initial_policy=initial)
+    says = {"algorithm": "tdmpc2", "config": {**own, "sgft": sgft}}
+    return assemble(parts, config, task, initial_policy=initial, card=says)
 
 
 METHOD = Method(

@@ -9,6 +9,7 @@ from experiments.bench import bare_sac
 from experiments.bench.updates import ACT_DIM, MEMBERS, OBS_DIM, multiplications, rows
 from sgft_jax.learners.sac import SACConfig, SACHyper, make_sac
 from sgft_jax.models.networks import NetworkConfig
+from sgft_jax.types import Batch
 
 NETWORK, BATCH = NetworkConfig(hidden=(16, 16), layer_norm=True), 8
 HYPER = SACHyper(tau=0.1, alpha=0.3)
@@ -47,7 +48,7 @@ def test_it_is_the_update_of_the_library(key):
     for step in range(3):
         key_rows, key_step = jax.random.split(jax.random.fold_in(key, step))
         batch = rows(key_rows, BATCH)._replace(reward=jnp.arange(8.0), action=jnp.full((BATCH, ACT_DIM), 0.3))
-        state, _ = update(state, batch, key_step)
+        state, _ = update(state, Batch(*batch), key_step)
         with jax.numpy_rank_promotion("allow"):
             bare = by_hand(bare, batch, noise_of(key_step), HYPER)
     pairs = [(layers(getattr(state, name).params), getattr(bare, name).params) for name in (*parts, "dynamics")]

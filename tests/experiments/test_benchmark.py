@@ -9,16 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_common import save_prior
 
-import envs
 from envs.franka import hammer
 from envs.mujoco.worlds import PhysicsState
-from experiments import benchmark
-from experiments.bench import other_sac, physics, training, updates, values
+from experiments.bench import other_sac, physics, training, updates
 from experiments.bench.timing import fastest, measure
 from experiments.benchmark import BenchmarkConfig, main
-from sgft_jax.models import value
 from sgft_jax.types import UserError
 
 
@@ -98,7 +94,7 @@ def _window():
             physics.mujoco.mj_step(host, data, 3)
         ends.append(data.qpos.copy())
     two = lambda x: jnp.broadcast_to(jnp.asarray(x, jnp.float32), (2, len(x)))  # noqa: E731
-    start = PhysicsState(two(arm), two(np.zeros(host.nv)), two(np.zeros(host.nv)), two(arm[: host.nu]))
+    start = PhysicsState(two(arm), two(np.zeros(host.nv)), two(np.zeros(host.nv)), two(arm[: host.nu]), two([]))
     return host, physics.Window(start, jnp.asarray(commands, jnp.float32)), np.stack(ends)
 
 
@@ -184,39 +180,6 @@ def test_one_device_trains_and_is_its_own_ideal(tmp_path):
     assert line["env_per_s"] > 0 and line["env/ideal"] == 1.0
 
 
-def test_precisions_are_compared_by_value_and_by_shaped_reward(tmp_path, monkeypatch):
-    """A CPU computes in float32 whatever is asked for: what is less exact is played here."""
-
-    def predict(network, params, normalizer, obs, *, exact):
-        return value.predict(network, params, normalizer, obs) + {"float32": 0.0, "default": 0.5}[exact]
-
-    monkeypatch.setitem(envs.TASKS, "toy", "toy")
-    monkeypatch.setattr(values, "predict", predict)
-    for seed in (0, 1):
-        save_prior(tmp_path / f"prior/seed-{seed}", seed)
-    config = BenchmarkConfig(parts=("values",), tasks=("toy",), prior=tmp_path, precisions=("float32", "default"))
-    exact, rough, *others = main(replace(config, out=tmp_path))["values"]
-    assert [line["prior"] for line in others] == [1, 1] and exact["value_error"] == exact["shaped_error"] == 0
-    assert rough["value_error"] == pytest.approx(0.5, rel=1e-3)
-    assert rough["shaped_error"] == pytest.approx(0.5 * 0.1, rel=1e-3)  # gamma = 0.9 leaves a tenth
-    assert exact["value_std"] > 0 and exact["shaped_std"] > 0
-
-
-def test_figures_show_how_costs_grow(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(benchmark.plot, "scaling", lambda path, *curves, **words: drawn.append((curves, words)) or path)
-    line = lambda batch, seeds: {  # noqa: E731
-        "batch": batch, "seeds": seeds, "precision": "default", "updates_per_s": 10.0 * seeds, "bare_per_s": 5.0
-    }  # fmt: skip
-    assert benchmark.draw("updates", [line(4, 1)], tmp_path / "one.png") is None
-    lines = [line(batch, seeds) for seeds in (8, 1, 2) for batch in (4, 16)]
-    assert benchmark.draw("updates", lines, tmp_path / "two.png") == tmp_path / "two.png"
-    (curves, references), words = drawn[0]
-    assert curves == {f"default, batch {batch}": ([1, 2, 8], [10.0, 20.0, 80.0]) for batch in (4, 16)}
-    assert references["default, batch 16"] == ([1, 2, 8], [5.0] * 3)
-    assert words["x"] == "seeds" and words["y"] == "updates per second"
-
-
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
@@ -227,7 +190,6 @@ def test_figures_show_how_costs_grow(tmp_path, monkeypatch):
         ({"batches": ()}, "--batches is 0"),
         ({"control_steps": 30}, "--control-steps 30 is more than half an episode of push"),
         ({"parts": ("finetune",)}, "--parts finetune needs --prior FOLDER"),
-        ({"parts": ("values",)}, "--parts values needs --prior FOLDER"),
         ({"preset": "fats"}, "--preset: there is no 'fats', did you mean 'fast'?"),
     ],
 )

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import Literal
 
+import jax
 import pytest
 
 from experiments import cli
@@ -109,6 +110,22 @@ def test_a_bug_keeps_its_traceback():
 
     with pytest.raises(ZeroDivisionError):
         run(main)
+
+
+def test_want_of_memory_is_one_line_and_code_2(capsys):
+    for error, words in (
+        (jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 99 bytes.\nmore"), "allocating 99"),
+        (MemoryError(), "MemoryError"),
+    ):
+
+        def main(config, error=error):
+            raise error
+
+        with pytest.raises(SystemExit) as stopped:
+            run(main)
+        said = capsys.readouterr().err
+        assert stopped.value.code == 2 and said.count("\n") == 1
+        assert words in said and "lower the batch size" in said
 
 
 def test_an_interrupt_tells_how_to_go_on(capsys):

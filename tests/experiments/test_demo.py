@@ -55,21 +55,41 @@ def test_demo_compares_its_methods_from_one_prior(tmp_path, monkeypatch, capsys)
     for method in demo.METHODS:
         run = out / "finetune" / "toy" / "turned" / method / "seeds-0-1"
         assert (run / "summary.json").exists() and len(list((run / "real").glob("*.npz"))) == 3
-    assert "zero-shot" in (out / "beside.log").read_text()
+    assert "rollouts" in (out / "beside.log").read_text()
+    assert "Those that did best in the real rollouts: sgft-mpc " in printed
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"seeds": 0}, "--seeds is 0: must be at least 1"),
+        ({"rollouts": 0}, "--rollouts is 0: must be at least 1"),
+        ({"task": "insrt"}, "there is no 'insrt', did you mean 'insert'"),
+        ({"real": "hrd"}, "gap of insert: there is no 'hrd', did you mean 'hard'"),
+        ({"env_steps": 0}, "option env-steps is 0: must be at least 1"),
+    ],
+)
+def test_mistakes_are_found_before_anything_is_trained(tmp_path, monkeypatch, options, words):
+    monkeypatch.setattr(demo, "pretrain", lambda args: pytest.fail("trains"))
+    with pytest.raises(UserError, match=words):
+        demo.main(demo.DemoArgs(out=tmp_path, **options))
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_outcome_is_said_in_a_few_lines(tmp_path):
     for method, end in (("sgft-sac", 0.9), ("sac", 0.2)):
         save(tmp_path, method, [[0.0, 0.0], [end, end]], rollouts=[0, 5])
     save(tmp_path, "sgft-mpc", [[0.0, 0.0], [0.5, 0.5], [1.0, 1.0]], rollouts=[0, 1, 5])  # learns from the first on
-    said = demo.outcome(read_runs(tmp_path).curves).splitlines()
-    assert said[2:] == [
+    best = {"sgft-mpc": {"best": {"score": [0.75, 1.0]}}}
+    said = demo.outcome(read_runs(tmp_path).curves, best).splitlines()
+    assert said[2:7] == [
         "| method | zero-shot | 1 rollout | 5 rollouts |",
         "| --- | --- | --- | --- |",
         "| sac | 0 | - | 20 |",
         "| sgft-mpc | 0 | 50 | 100 |",
         "| sgft-sac | 0 | - | 90 |",
     ]
+    assert "did best in the real rollouts: sgft-mpc 88" in said[8]  # (75 + 100) / 2
 
 
 def test_a_failure_beside_is_reported(tmp_path, monkeypatch):

@@ -1,7 +1,8 @@
 import json
+import re
 
 import pytest
-from test_common import save_prior
+from priors_by_hand import save_prior
 
 import envs
 from experiments import cli, evaluate
@@ -28,9 +29,10 @@ def call(*argv):
 def test_success_with_its_interval_as_json(run, capsys):
     call("--run", run, "--episodes", 20, "--json")
     found = json.loads(capsys.readouterr().out)
-    assert (found["task"], found["where"]) == ("toy", "in simulation")
-    assert [p["policy"] for p in found["policies"]] == [str(run / "policy" / f"seed-{i}") for i in (0, 1)]
-    for policy in found["policies"]:
+    (system,) = found["systems"]
+    assert (found["task"], system["where"]) == ("toy", "in simulation")
+    assert [p["policy"] for p in system["policies"]] == [str(run / "policy" / f"seed-{i}") for i in (0, 1)]
+    for policy in system["policies"]:
         low, high = policy["success/interval"]
         assert policy["episodes"] == 20 and low <= policy["success"] <= high and policy["exploded"] == 0
         # Wilson at 0 of 20, z = 1.96: upper end z^2 / (n + z^2) = 3.84 / 23.84 = 0.161
@@ -40,17 +42,41 @@ def test_success_with_its_interval_as_json(run, capsys):
 def test_episodes_are_the_same_every_time_and_others_on_request(run, capsys):
     def returns(*more):
         call("--prior", run / "policy/seed-0", "--episodes", 10, "--json", *more)
-        return json.loads(capsys.readouterr().out)["policies"][0]["return"]
+        return json.loads(capsys.readouterr().out)["systems"][0]["policies"][0]["return"]
 
     first = returns()
     assert returns() == first != returns("--seed", 1)
 
 
-def test_a_line_per_policy_on_the_real_system(run, capsys):
+def test_several_systems_in_one_program_are_each_as_alone(run, capsys):
+    def returns(*reals):
+        call("--run", run, "--episodes", 10, "--json", "--real", *reals)
+        systems = json.loads(capsys.readouterr().out)["systems"]
+        return {s["where"]: [p["return"] for p in s["policies"]] for s in systems}
+
+    heavy, ranged = run / "heavy.toml", run / "ranged.toml"
+    heavy.write_text("[params]\nmass = 9.0\nfriction = 4.0\n")
+    ranged.write_text("[params]\nmass = [2.0, 3.0]\n")
+    together = returns("sim", heavy, ranged)
+    assert list(together) == ["in simulation", "on the heavy real system", "on the ranged real system"]
+    alone = returns("sim") | returns(heavy) | returns(ranged)
+    for where, values in together.items():
+        assert values == pytest.approx(alone[where], rel=1e-5)
+    assert len({tuple(values) for values in together.values()}) == 3
+
+
+def test_lines_for_people(run, capsys):
     (run / "slow.toml").write_text("[params]\nmass = 9.0\nfriction = 4.0\n")
     call("--run", run, "--episodes", 10, "--real", run / "slow.toml")
-    lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 2 and all("(10 episodes of toy, on the slow real system)" in line for line in lines)
+    head, *lines = capsys.readouterr().out.splitlines()
+    assert head == "toy, on the slow real system, 10 episodes for each policy:"
+    assert len(lines) == 2 and all(re.search(r"seed-\d: success \d+\.\d % \[.*\], return -?\d", line) for line in lines)
+
+
+def test_the_best_policies_of_a_run(run, capsys):
+    save_prior(run / "best" / "seed-0", 7)
+    call("--run", run, "--best", "--episodes", 2)
+    assert "best/seed-0: success" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -60,7 +86,11 @@ def test_a_line_per_policy_on_the_real_system(run, capsys):
         (["--prior", "a", "--run", "b"], "exclude each other"),
         (["--task", "toi"], "did you mean 'toy'?"),
         (["--task", "toy", "--out", "nowhere"], "nowhere/pretrain/toy/fast: holds no prior"),
-        (["--prior", "nowhere"], "nowhere: holds no prior"),
+        (["--prior", "nowhere"], "--prior nowhere: no such folder"),
+        (["--task", "toy", "--real", "sim", "sim"], "--real names sim twice"),
+        (["--task", "toy", "--real", "strange"], "gap of toy: there is no 'strange'"),
+        (["--task", "toy", "--set", "mass=3"], "name one with --real"),
+        (["--task", "toy", "--best"], "--best: name the fine-tuning run"),
         (["--task", "toy", "--episodes", "0"], "must be at least 1"),
     ],
 )

@@ -4,10 +4,10 @@ import json
 import os
 
 import pytest
-from test_common import save_prior
+from priors_by_hand import save_prior
 
 import envs
-from experiments import cli, gaps
+from experiments import cli, gaps, gaps_run
 
 FILES = {
     "turned": "[params]\nmass = 1.0\nfriction = 4.0\n[effects]\naction_rotation = 0.3\n",
@@ -72,7 +72,7 @@ def test_without_training_the_answer_is_open(home, capsys):
     [(0.4, 0.95, True), (0.41, 1.0, False), (0.41, None, False), (0.0, 0.94, False), (0.0, None, None)],
 )
 def test_the_limits(zero_shot, trained, answer):
-    assert gaps.admissible(zero_shot, trained) is answer
+    assert gaps_run.admissible(zero_shot, trained) is answer
 
 
 @pytest.mark.parametrize(

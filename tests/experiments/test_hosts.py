@@ -16,6 +16,7 @@ from experiments import hosts, pretrain
 from sgft_jax import mesh
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import read_jsonl
+from sgft_jax.io.priors import load_prior
 from sgft_jax.types import UserError
 
 TESTS = Path(__file__).parent.parent
@@ -70,7 +71,7 @@ def test_two_hosts_continue_what_one_began(tmp_path, monkeypatch):
         for key, value in a.items():
             np.testing.assert_allclose(b[key], value, rtol=0.02, atol=1e-3, err_msg=key)
     assert checkpoint.latest(two) == 2 and (two / "summary.json").exists()
-    priors = [checkpoint.load_prior(run / "prior/seed-0")[0] for run in (one, two)]
+    priors = [load_prior(run / "prior/seed-0").params for run in (one, two)]
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=0.02, atol=2e-3), *priors)
 
 

@@ -9,18 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
-from experiments.pretraining import spread_replay
 from jax.sharding import PartitionSpec
 
 import envs
 from envs.mujoco.engines import c as engine_c
 from envs.mujoco.worlds import PhysicsState
-from experiments import cli, pretrain, pretrain_run
-from experiments.stacking import seed_keys, stack
+from experiments import cli, pretrain
 from sgft_jax import mesh
 from sgft_jax.data import replay
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.presets import PretrainConfig
+from sgft_jax.pretraining import make_programs, spread_replay, training_pools
 from sgft_jax.types import UserError
 
 CONFIG = PretrainConfig(
@@ -34,17 +33,17 @@ CUT = PartitionSpec(None, mesh.DATA)  # [seeds, ...]
 def begun(devices):
     """Random data and the start of a run."""
     with mesh.use(devices):
-        random = program().collect(pools(), seed_keys([0], 1))
-        return random, program().begin(pools(), random, seed_keys([0], 2))
+        random = program().collect(pools(), jax.random.split(jax.random.key(1), 1))
+        return random, program().begin(pools(), random, jax.random.split(jax.random.key(2), 1))
 
 
 @functools.cache
 def program():
-    return pretrain_run.make_program(toy.make(), CONFIG, seeds=1)
+    return make_programs(toy.make(), CONFIG, 1)
 
 
 def pools():
-    return stack([envs.sample_worlds(toy.make(), jax.random.key(0), CONFIG.worlds)])
+    return training_pools(toy.make(), CONFIG, [0])(0)
 
 
 def agree(one, two, **tolerance):
@@ -59,10 +58,10 @@ def test_a_run_begins_alike_on_any_number_of_devices():
 
 
 def test_environments_and_experience_are_cut_and_the_agent_is_whole():
-    random, saved = begun(2)
-    for tree in (random.data, saved.run.replay.data, saved.run.fleet):
+    random, state = begun(2)
+    for tree in (random.data, state.replay.data, state.fleet):
         assert {x.sharding.spec for x in jax.tree.leaves(tree)} == {CUT}
-    assert all(x.sharding.is_fully_replicated for x in jax.tree.leaves((saved.run.learner, saved.best)))
+    assert all(x.sharding.is_fully_replicated for x in jax.tree.leaves(state.learner))
 
 
 @pytest.mark.slow
@@ -70,9 +69,9 @@ def test_training_is_the_same_on_any_number_of_devices():
     """One chunk, in which episodes end; test_hosts.py has the same on two hosts."""
 
     def trained(devices):
-        random, saved = begun(devices)
+        random, state = begun(devices)
         with mesh.use(devices):
-            return program().chunk(pools(), random, jax.tree.map(jnp.copy, saved.run))
+            return program().chunk(pools(), random, jax.tree.map(jnp.copy, state))
 
     one, two = trained(1), trained(2)
     agree(one, two, rtol=2e-2, atol=2e-3)  # 48 updates amplify the rounding of sums
@@ -84,9 +83,9 @@ def test_training_is_the_same_on_any_number_of_devices():
 
 def test_little_travels_between_devices():
     """A step of all environments: what they saw once to all, drawn rows summed, two sums of gradients an update."""
-    random, saved = begun(2)
+    random, state = begun(2)
     with mesh.use(2):
-        text = program().chunk.lower(pools(), random, saved.run).compile().as_text()
+        text = program().chunk.lower(pools(), random, state).compile().as_text()
     kinds = "all-reduce|all-gather|all-to-all|collective-permute"
     found = collections.Counter(re.findall(rf" ({kinds})(?:-start)?\(", text))
     assert found["all-to-all"] == found["collective-permute"] == 0
@@ -124,20 +123,20 @@ def test_rows_are_counted_whole():
 
 def test_what_one_device_left_two_continue():
     """A checkpoint holds whole arrays; `spread` lays them out."""
-    random, saved = begun(1)
+    random, state = begun(1)
     with mesh.use(2):
-        laid_out = program().spread(jax.tree.map(jnp.copy, saved))
+        laid_out = program().spread(jax.tree.map(jnp.copy, state))
         data = program().spread_random(jax.tree.map(jnp.copy, random)).data
-    agree(saved, laid_out)
-    assert laid_out.run.replay.data.reward.sharding.spec == data.reward.sharding.spec == CUT
+    agree(state, laid_out)
+    assert laid_out.replay.data.reward.sharding.spec == data.reward.sharding.spec == CUT
 
 
 def test_physics_that_xla_cannot_look_into_steps_in_pieces():
     """C MuJoCo behind a callback: each device calls it for its own worlds."""
     scene = envs.scene("hammer")
     host = scene.build({p.name: p.nominal for p in scene.parameters}).compile()
-    advance = engine_c.make_engine(host, ()).advance
-    step = mesh.split_vmap(lambda state, controls: advance({}, state, controls))
+    engine = engine_c.make_engine(host, ())
+    step = mesh.split_vmap(lambda state, controls: engine.advance({}, state, controls))
     rest = jnp.asarray(host.qpos0, jnp.float32)
     start = PhysicsState(rest, jnp.zeros(host.nv), jnp.zeros(host.nv), rest[: host.nu])
     states = jax.tree.map(lambda x: jnp.repeat(x[None], 4, axis=0), start)

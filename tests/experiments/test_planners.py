@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import toy
 from experiments.algorithms import make_player
-from test_common import save_prior
+from priors_by_hand import save_prior
 
 import envs
 from experiments import cli, evaluate, finetune, pretrain

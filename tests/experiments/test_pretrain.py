@@ -5,24 +5,18 @@ import os
 import signal
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from experiments.algorithms import network_of, sac_hyper
-from experiments.pretraining import make_pretrainer
 
 import envs
 from experiments import pretrain
-from experiments.evaluation import Best, keep_better
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import MetricsLog, read_jsonl
-from sgft_jax.models.networks import NetworkConfig
+from sgft_jax.io.priors import load_prior
 from sgft_jax.presets import PRESETS
-from sgft_jax.types import Normalizer, Prior
 
 TESTS = Path(__file__).parent.parent
 OPTIONS = """--task toy --preset cpu --no-video --config.n-envs 32 --config.worlds 16 --config.env-steps 10240
@@ -93,10 +87,10 @@ def test_sac_learns_the_toy_task_and_leaves_a_prior_per_seed(finished):
     for seed, found in zip((0, 1), summary["seeds"], strict=True):
         assert found["seed"] == seed and found["success"] > 0.9
         assert found["success/interval"][0] <= found["success"] <= found["success/interval"][1]
-        prior, card = checkpoint.load_prior(finished / "prior" / f"seed-{seed}", task="toy", obs_dim=4, act_dim=2)
-        assert card["metrics"] == found and card["config"]["n_envs"] == 32
-        assert network_of(card).hidden == (32, 32)
-        assert prior.actor["Dense_0"]["kernel"].shape == (4, 32)
+        prior = load_prior(finished / "prior" / f"seed-{seed}", task="toy", obs_dim=4, act_dim=2)
+        assert prior.card["metrics"] == found and prior.card["config"]["n_envs"] == 32
+        assert prior.card["network"]["hidden"] == [32, 32]
+        assert prior.params.actor["Dense_0"]["kernel"].shape == (4, 32)
         assert (finished / "figures" / f"seed-{seed}.png").stat().st_size > 10_000
 
 
@@ -142,7 +136,7 @@ def test_killed_and_resumed_is_bit_for_bit_uninterrupted(finished, tmp_path, mon
         assert (cut / name).read_bytes() == (finished / name).read_bytes()
     found, wanted = (json.loads((run / "summary.json").read_text())["seeds"] for run in (cut, finished))
     assert found == wanted
-    priors = [checkpoint.load_prior(run / "prior/seed-1")[0] for run in (cut, finished)]
+    priors = [load_prior(run / "prior/seed-1").params for run in (cut, finished)]
     jax.tree.map(np.testing.assert_array_equal, *priors)
 
 
@@ -164,8 +158,16 @@ def test_a_finished_run_is_neither_repeated_nor_changed(finished, out, capsys):
         ),
         (["--preset", "fats"], "--preset: there is no 'fats', did you mean 'fast'? Choose from: cpu, fast, paper"),
         (["--config.gama", "0.9"], "did you mean --config.gamma?"),
-        (["--task", "toy", "--seeds", "0"], "there must be at least one"),
+        (["--task", "toy", "--seeds", "0"], "--seeds is 0: must be at least 1"),
         (["--task", "toy", "--real", "mild"], "toy has no gap 'mild'"),
+        (["--task", "toy", "--config.n-envs", "0"], "option n-envs is 0: must be at least 1"),
+        (["--task", "toy", "--config.gamma", "2"], "option gamma is 2.0: must be at least 0 and less than 1"),
+        (["--task", "toy", "--config.lr", "nan"], "option lr is nan: must be a positive number"),
+        (["--task", "toy", "--config.env-steps", "-5"], "option env-steps is -5: must be at least 1"),
+        (["--task", "toy", "--config.network.hidden"], "hidden is (): name one or more widths"),
+        (["--task", "toy", "--config.network.hidden", "0"], "hidden is (0,): name one or more widths"),
+        (["--task", "toy", "--seed", "4294967296"], "--seed is 4294967296: seeds go from 0 to 2147483647"),
+        (["--task", "toy", "--config.batch-size", "999999999"], "GiB free on each device: lower --config.batch-size"),
         (["--task", "toy", "--set", "latency=0.1"], "name one with --real"),
         (["--task", "toy", "--config.replay-capacity", "9"], "option replay-capacity is 9: must be at least n-envs = "),
         (
@@ -198,41 +200,16 @@ def test_training_on_the_real_system_has_its_own_folder(tmp_path):
     assert json.loads(card.read_text())["gap"]["params"] == {"mass": 3, "friction": 4.0}
 
 
-def test_better_is_more_success_then_more_return():
-    def best(success, total, steps):
-        params = {"w": jnp.full(2, float(steps))}
-        prior = Prior(params, {}, {}, {}, Normalizer(jnp.zeros(1), jnp.ones(1)))
-        return Best(prior, jnp.float32(success), jnp.float32(total), jnp.int32(steps))
-
-    old = best(0.5, 3.0, 1)
-    for success, total, steps in [(0.6, -9.0, 2), (0.5, 3.1, 2), (0.5, 3.0, 1), (0.5, 2.9, 1), (0.4, 9.0, 1)]:
-        kept = keep_better(old, best(success, total, 2), 0.0)
-        assert kept.steps == steps and kept.prior.actor["w"].tolist() == [steps, steps]
-    assert keep_better(old, best(0.1, 0.0, 2), 1.5).steps == 2, "an early evaluation does not compete"
-
-
-def test_the_learning_rate_falls_linearly_to_its_end():
-    config = replace(PRESETS["cpu"], lr=1e-3, lr_end=0.1)
-    rates = [float(sac_hyper(config, progress=progress).lr_critic) for progress in (0.0, 0.5, 1.0, 1.2)]
-    np.testing.assert_allclose(rates, [1e-3, 5.5e-4, 1e-4, 1e-4], rtol=1e-5)
+def test_out_that_is_a_file_is_one_line(capsys, tmp_path):
+    (tmp_path / "file").touch()
+    assert "file is a file; choose another --out" in complaint(["--out", str(tmp_path / "file")], capsys)
 
 
 @pytest.mark.slow
-def test_random_actions_grow_along_the_fleet(key):
-    """A policy always says 1: the first environment obeys, the last acts at random, the middle one does both."""
-    config = replace(
-        PRESETS["cpu"], n_envs=3, chunk_steps=40, random_transitions=30, worlds=4, random_ladder=1.0,
-        updates_per_step=1, batch_size=4, network=NetworkConfig(hidden=(8,)), ensemble_size=1,
-    )  # fmt: skip
-    env = envs.make("toy")
-    pool, trainer = envs.sample_worlds(env, key, config.worlds), make_pretrainer(env, config)
-
-    def run(key):
-        random = trainer.collect_random(pool, key)
-        state = trainer.init(pool, random, key)
-        last = state.learner.actor.params["Dense_1"]
-        last["bias"] = last["bias"].at[: env.act_dim].set(20.0)
-        return trainer.chunk(pool, random, state)[0].replay.data.action[: 3 * config.chunk_steps]
-
-    obeyed = (jax.jit(run)(key).reshape(-1, 3, env.act_dim) > 0.999).all(-1).mean(0)
-    assert obeyed[0] == 1 and obeyed[2] < 0.05 and 0.25 < obeyed[1] < 0.75
+def test_training_that_diverges_stops_in_one_line_and_a_failed_start_blocks_nobody(capsys, tmp_path, monkeypatch):
+    argv = [*TINY, "--config.env-steps", "2560", "--out", str(tmp_path)]
+    said = complaint([*argv, "--config.lr", "1e30"], capsys)
+    assert "training has diverged: " in said and "is not finite after 1,280 env steps; there is no checkpoint" in said
+    (lines,) = (read_jsonl(path) for path in tmp_path.rglob("metrics.jsonl"))
+    assert len(lines) == 1
+    pretrain.main(argv)  # neither --resume nor --overwrite: nothing was achieved that could be lost

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_common import save_prior
+from priors_by_hand import save_prior
 
 import envs
 from experiments import cli, compare, finetune, grid, tune, tuned

@@ -13,10 +13,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.data.sequences import Sequences
 from sgft_jax.learners import iql, sac, tdmpc2, tdmpc2_model
 from sgft_jax.models import networks
-from sgft_jax.types import Learner, Transition
+from sgft_jax.types import Batch, Learner
 
 ROWS = 32
 NET = networks.NetworkConfig(hidden=(32,))
@@ -25,15 +24,14 @@ NET = networks.NetworkConfig(hidden=(32,))
 class Probe(NamedTuple):
     """A world of a few states in which actions change nothing but the reward.
 
-    states: s of the rows, equally likely. reward(s, a); discount(s); following(s) -> the next s. cut: s whose rows are
-    the last of an episode by its time limit. values: s -> V; actions: s -> the best action.
+    states: s of the rows, equally likely. reward(s, a); discount(s); following(s) -> the next s. values: s -> V;
+    actions: s -> the best action.
     """
 
     states: tuple[float, ...]
     reward: Callable = lambda s, a: jnp.ones_like(s)
     discount: Callable = jnp.zeros_like
     following: Callable = lambda s: s
-    cut: float | None = None
     values: Mapping[float, float] = MappingProxyType({})
     actions: Mapping[float, float] = MappingProxyType({})
 
@@ -46,7 +44,7 @@ PROBES = {
         (0.0, 1.0), lambda s, a: s, lambda s: 0.8 * (s == 0), jnp.ones_like, values={0.0: 0.8, 1.0: 1.0}
     ),
     # 1 / (1 - 0.8): a time limit ends an episode, not what could still be had
-    "time limit": Probe((0.0, 1.0), discount=lambda s: 0.8 + 0 * s, cut=1.0, values={0.0: 5.0, 1.0: 5.0}),
+    "time limit": Probe((0.0, 1.0), discount=lambda s: 0.8 + 0 * s, values={0.0: 5.0, 1.0: 5.0}),
     "termination": Probe((0.0, 1.0), discount=lambda s: 0.8 * (s == 0), values={0.0: 5.0, 1.0: 1.0}),
     "action decides": Probe((0.0,), lambda s, a: 1 - (a - 0.5) ** 2, actions={0.0: 0.5}),
     "state and action decide": Probe((-1.0, 1.0), lambda s, a: 1 - (a - 0.6 * s) ** 2, actions={-1.0: -0.6, 1.0: 0.6}),
@@ -65,20 +63,19 @@ def rows(probe, key):
     action = jax.random.uniform(key_action, (ROWS, 1), minval=-1)
     wide = lambda s: jnp.stack([s, jnp.zeros(ROWS)], axis=1)  # noqa: E731
     reward, discount = (jnp.asarray(x, jnp.float32) for x in (probe.reward(s, action[:, 0]), probe.discount(s)))
-    cut = jnp.zeros(ROWS, bool) if probe.cut is None else s == probe.cut
-    return Transition(wide(s), action, reward, discount, wide(probe.following(s)), cut, jnp.zeros(ROWS, jnp.int32))
+    return Batch(wide(s), action, reward, discount, wide(probe.following(s)))
 
 
 def windows(batch):
     """The same rows as windows of two steps, of which the second does not belong to them."""
     twice = jax.tree.map(lambda x: jnp.stack([x, jnp.zeros_like(x)], axis=1), batch)
-    return Sequences(twice, jnp.stack([jnp.ones(ROWS, bool), jnp.zeros(ROWS, bool)], axis=1))
+    return twice._replace(valid=jnp.stack([jnp.ones(ROWS, bool), jnp.zeros(ROWS, bool)], axis=1))
 
 
 class Case(NamedTuple):
     """A learner as all tests of a module share it: compiled, and its `update` counted by `traces` (a list of one).
 
-    start(key) -> state. feed(transitions) -> the batch it wants. values(state, obs) -> all its estimates of V(obs), or
+    start(key) -> state. feed(rows) -> the batch it wants. values(state, obs) -> all its estimates of V(obs), or
     None where its V is frozen. mode(state, obs) -> the action [1] that its policy takes for best. steps: updates to
     solve a probe.
     """
@@ -113,12 +110,12 @@ def _sac(**options: Any):
     config = sac.SACConfig(2, 1, network=NET, tune_alpha=False, **options)
     learner = sac.make_sac(config, SAC_HYPER)
     critic = networks.make_critic(2, 1, config.critic_network or NET, members=config.critics)
-    judge = networks.make_value(2, NET)
+    value_net = networks.make_value(2, NET)
 
     @jax.jit
     def values(state, obs):
         q = critic.apply(state.critic.params, obs, jnp.zeros(1))
-        return q if state.value is None else jnp.append(q, judge.apply(state.value.params, obs))
+        return q if state.value is None else jnp.append(q, value_net.apply(state.value.params, obs))
 
     case = counted(learner, feed=lambda batch: batch, values=values, mode=None, steps=400)
     return case._replace(mode=_mode(case))
@@ -129,12 +126,12 @@ def _iql():
     learner = iql.make_iql(
         iql.IQLConfig(2, 1, network=NET), iql.IQLHyper(lr_actor=3e-3, lr_critic=1e-2, lr_value=1e-2, tau=0.1, beta=20.0)
     )
-    critic, judge = networks.make_critic(2, 1, NET), networks.make_value(2, NET)
+    critic, value_net = networks.make_critic(2, 1, NET), networks.make_value(2, NET)
 
     @jax.jit
     def values(state, obs):
         q = critic.apply(state.critic.params, obs, jnp.zeros(1))
-        return jnp.append(q, judge.apply(state.value.params, obs))
+        return jnp.append(q, value_net.apply(state.value.params, obs))
 
     case = counted(learner, feed=lambda batch: batch, values=values, mode=None, steps=400)
     return case._replace(mode=_mode(case))
@@ -158,7 +155,7 @@ def _tdmpc2(config, steps):
 
     def start(key):
         state = first(key)
-        return tdmpc2.fine_tune_state(config, PLANNER_HYPER, tdmpc2.extract_prior(state), key) if config.sgft else state
+        return tdmpc2.state_from_prior(config, PLANNER_HYPER, tdmpc2.extract_params(state)) if config.sgft else state
 
     value = jax.jit(functools.partial(tdmpc2_model.value_of, config))
     policy = jax.jit(functools.partial(tdmpc2.policy_action, config), static_argnames="explore")

@@ -1,6 +1,4 @@
-"""What every learner and method keeps: compiled once, one program for all seeds, resumed exactly, and it learns."""
-
-import functools
+"""What every learner keeps: compiled once, one program for all seeds, resumed exactly, and it learns."""
 
 import chex
 import jax
@@ -10,11 +8,7 @@ import probes
 import pytest
 from probes import MAKERS, PROBES
 
-from sgft_jax import finetune, methods
 from sgft_jax.io import checkpoint
-from sgft_jax.learners import sac, tdmpc2, tdmpc2_model
-from sgft_jax.models import networks
-from sgft_jax.types import Transition
 
 PLANNERS = {"tdmpc2", "sgft-tdmpc2"}
 # What takes long: the fast tests see less of it.
@@ -52,9 +46,11 @@ def bits(tree):
 
 @each_learner
 def test_update_compiles_once(name, key):
-    """However many tests have used it before."""
-    trained(name, "constant reward", key, 3)
-    assert probes.case(name).traces == [1]
+    """However often it has run before."""
+    trained(name, "constant reward", key, 1)
+    before = list(probes.case(name).traces)
+    trained(name, "termination", key, 3)
+    assert probes.case(name).traces == before
 
 
 @pytest.mark.parametrize("name", [slow_if(name != "iql", name) for name in MAKERS])
@@ -113,96 +109,71 @@ def test_probe(name, probe, key):
         assert case.mode(state, probes.obs_of(s))[0] == pytest.approx(action, abs=near)
 
 
-# --- methods --------------------------------------------------------------------------------------------------------
+# --- which rows count -----------------------------------------------------------------------------------------------
 
-T = 12
-SMALL = {
-    "network": networks.NetworkConfig(hidden=(8,)), "batch_size": 8, "branches": 2, "horizon": 2, "actor_ramp": 0,
-    "replay_capacity": 32, "critic_warmup": 0, "size": "probe", "plan_samples": 24,
-}  # fmt: skip
-FAST_METHODS = {"sgft-sac"}
+FLAT = [name for name in MAKERS if name not in PLANNERS]
+HALF = probes.ROWS // 2
 
 
-@pytest.fixture(autouse=True)
-def _size(monkeypatch):
-    monkeypatch.setitem(tdmpc2_model.SIZES, "probe", tdmpc2_model.Size(encoder=8, mlp=8, latent=8, members=2))
+def weighed(name, fields):
+    """One update of a state with Adam moments on a batch with further fields; the learner's networks."""
+    case, key = probes.case(name), jax.random.key(4)
+    _, state = trained(name, "state and action decide", key, 2)
+    batch = case.feed(probes.rows(PROBES["state and action decide"], key))
+    new, metrics = case.learner.update(state, fields(batch), jax.random.key(5))
+    return new, {loss: x for loss, x in metrics.items() if loss.endswith("loss")}
 
 
-def episode(key, n=T):
-    """n steps of a point on a line."""
-    obs, action = jax.random.uniform(key, (2, n, 1), minval=-1)
-    after, zero = obs + 0.1 * action, jnp.zeros(n)
-    return Transition(obs, action, -jnp.abs(after[:, 0]), zero + 0.9, after, zero > 0, zero.astype(jnp.int32))
+def rows_where(mask, new, old):
+    return jnp.where(jnp.expand_dims(mask, tuple(range(1, new.ndim))), new, old)
 
 
-@functools.cache
-def tuner(name):
-    """Fine-tuning by a method, compiled, with a prior and how often `learn` was traced."""
-    method, traces = methods.get_method(name), [0]
-    own = {"critic_network": SMALL["network"]} if name == "rlpd" else {}
-    config = methods.finetune_config(method, **SMALL, **own)
-    plain = finetune.make_finetuner(
-        method, config, obs_dim=1, act_dim=1, reward=lambda obs, action, after: -jnp.abs(after[0]),
-        terminated=lambda obs, action, after: jnp.bool_(False),
-    )  # fmt: skip
+@pytest.mark.parametrize("name", [slow_if(name == "sac, ten critics", name) for name in FLAT])
+def test_invalid_rows_do_not_count(name):
+    """Whatever finite numbers they hold."""
+    valid = jnp.arange(probes.ROWS) < HALF
+    numbers = ("obs", "action", "reward", "discount", "next_obs")
 
-    def learn(state, key):
-        traces[0] += 1
-        return plain.learn(state, key, 2, episode)
+    def torn(batch):
+        other = {x: rows_where(valid, getattr(batch, x), 0.5 * jnp.flip(getattr(batch, x)) + 3.0) for x in numbers}
+        return batch._replace(**other, valid=valid)
 
-    if method.agent == "tdmpc2":
-        shape = tdmpc2_model.named_config(1, 1, size="probe", plan_samples=24, horizon=2)
-        prior = tdmpc2.extract_prior(jax.jit(tdmpc2.make_tdmpc2(shape).init)(jax.random.key(7)))
-    else:
-        agent = sac.SACConfig(1, 1, network=SMALL["network"], ensemble_size=2)
-        prior = sac.extract_prior(jax.jit(sac.make_sac(agent).init)(jax.random.key(7)))
-    compiled = plain._replace(init=jax.jit(plain.init), learn=jax.jit(learn), act=jax.jit(plain.act))
-    return compiled, prior, traces
+    clean, dirty = weighed(name, lambda batch: batch._replace(valid=valid)), weighed(name, torn)
+    chex.assert_trees_all_close(clean, dirty, rtol=1e-5, atol=1e-6)
+    assert bits(clean) != bits(weighed(name, lambda batch: batch))
 
 
-def started(name, seed=0):
-    fine, prior, _ = tuner(name)
-    return fine.observe(fine.init(prior, jax.random.key(seed)), episode(jax.random.key(seed)), jnp.ones(T, bool))
+@pytest.mark.parametrize("name", [slow_if(name == "sac, ten critics", name) for name in FLAT])
+def test_a_row_of_weight_two_counts_twice(name):
+    """Of weight 0 it does not count at all; weights of 1 change nothing."""
+    twice = jnp.where(jnp.arange(probes.ROWS) < HALF, 2.0, 0.0)
+    heavy = weighed(name, lambda batch: batch._replace(weight=twice))
+    alone = weighed(name, lambda batch: batch._replace(valid=twice > 0))
+    chex.assert_trees_all_close(heavy, alone, rtol=1e-5, atol=1e-6)
+    ones = weighed(name, lambda batch: batch._replace(weight=jnp.ones(probes.ROWS)))
+    chex.assert_trees_all_close(ones, weighed(name, lambda batch: batch), rtol=1e-5, atol=1e-6)
 
 
-each_method = pytest.mark.parametrize("name", [slow_if(name not in FAST_METHODS, name) for name in methods.METHODS])
-
-
-@each_method
-def test_a_method_compiles_once_and_goes_on_with_the_same_bits(name, key, tmp_path):
-    fine, prior, traces = tuner(name)
-    state, metrics = fine.learn(started(name), key)
-    assert all(jnp.isfinite(x) and x.shape == () for x in metrics.values())
-    state = fine.observe(state, episode(key), jnp.arange(T) != 5)
-    checkpoint.save(tmp_path, 1, state, meta={})
-    restored, _ = checkpoint.restore(tmp_path, jax.eval_shape(fine.init, prior, key))
-    assert bits(fine.learn(restored, key)) == bits(fine.learn(state, key)) and traces == [1]
-
-
-@each_method
-def test_the_best_action_of_a_method_is_deterministic_and_in_bounds(name, key):
-    fine, _, _ = tuner(name)
-    state = started(name)
-    for s in (-9.0, 0.3):
-        obs, mode = jnp.array([s]), functools.partial(fine.act, explore=jnp.bool_(False))
-        action, again = (mode(state, fine.init_carry(), obs, key)[0] for _ in range(2))
-        assert bits(action) == bits(again) and action.shape == (1,) and jnp.abs(action[0]) <= 1
+def test_a_row_of_weight_two_is_the_row_twice(key):
+    """With a learner that draws nothing: rows 0, 1, 1 are rows 0 and 1 with weights 2/3 and 4/3."""
+    case = probes.case("iql")
+    state = case.start(key)
+    rows = jax.tree.map(lambda x: x[:2], probes.rows(PROBES["state and action decide"], key))
+    again = jax.tree.map(lambda x: jnp.concatenate([x, x[1:]]), rows)
+    weighted, doubled = (
+        case.learner.update(state, batch, key)[0] for batch in (rows._replace(weight=jnp.array([2 / 3, 4 / 3])), again)
+    )
+    for part in ("critic", "value", "actor"):
+        moments = [getattr(new, part).moments for new in (weighted, doubled)]
+        chex.assert_trees_all_close(*moments, rtol=1e-3, atol=1e-6)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", methods.METHODS)
-def test_a_method_over_seeds_equals_each_alone(name, key):
-    fine, _, _ = tuner(name)
-    keys = jax.random.split(key, 2)
-    alone = [fine.learn(started(name, seed), keys[seed])[0] for seed in range(2)]  # with Adam moments
-    together = jax.jit(jax.vmap(lambda state, key: fine.learn(state, key)[0]))(
-        jax.tree.map(lambda *x: jnp.stack(x), *alone), keys
-    )
-    for i in range(2):
-        one, _ = fine.learn(alone[i], keys[i])
-        chex.assert_trees_all_close(jax.tree.map(lambda x, i=i: x[i], together), one, rtol=1e-3, atol=1e-3)
-
-
-def test_every_agent_of_the_table_is_a_learner_of_the_contract():
-    """But for plans by SAC's models: what learns there are the models of `sac`, and test_mpc.py has the plans."""
-    assert {method.agent for method in methods.METHODS.values()} <= {*MAKERS, "mpc"}
+@pytest.mark.parametrize("name", sorted(PLANNERS))
+def test_a_window_of_weight_two_counts_twice(name):
+    """The range of values, which scales the policy's loss, counts all windows."""
+    twice = jnp.where(jnp.arange(probes.ROWS) < HALF, 2.0, 0.0)
+    heavy, metrics = weighed(name, lambda batch: batch._replace(weight=twice))
+    alone, same = weighed(name, lambda batch: batch._replace(valid=batch.valid & (twice > 0)[:, None]))
+    chex.assert_trees_all_close(heavy, alone, rtol=1e-4, atol=1e-5)
+    chex.assert_trees_all_close(metrics, same, rtol=1e-4, atol=1e-5)

@@ -1,106 +1,46 @@
-"""The table of methods, and the settings that make one."""
+"""The methods, their options, and what becomes of options that are left open."""
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import pytest
-import toy
+import tuners
+from tuners import METHODS, T
 
 from sgft_jax import methods
-from sgft_jax.finetune import make_finetuner
+from sgft_jax.methods import options as rules
+from sgft_jax.methods import sgft_relabel, sgft_sac
 from sgft_jax.types import UserError
 
-
-@pytest.mark.parametrize(
-    ("name", "value", "dynamics", "reset", "finite"),
-    [
-        ("sac", False, False, False, False),
-        ("sac-reset", False, False, True, False),
-        ("pbrs", True, False, True, False),
-        ("mbpo", False, True, False, False),
-        ("pbrs-branch", True, True, True, False),
-        ("sgft", True, False, False, True),
-        ("sgft-sac", True, True, False, True),
-        ("sgft-relabel", True, True, False, True),
-        ("frozen-critic", False, False, False, False),
-        ("sac-online", False, False, False, False),
-        ("rlpd", False, False, False, False),
-        ("iql", False, False, False, False),
-        ("tdmpc2", False, False, False, False),
-        ("sgft-tdmpc2", False, False, False, False),
-        ("sgft-tdmpc2-code", True, False, False, False),
-        ("sgft-mpc", False, False, False, False),
-    ],
-)
-def test_method_table(name, value, dynamics, reset, finite):
-    m = methods.get_method(name)
-    assert (m.uses_value, m.uses_dynamics, m.reset_critic, m.finite_horizon) == (value, dynamics, reset, finite)
-    assert m.description and m.source
+each_method = pytest.mark.parametrize("name", METHODS)
 
 
-def test_the_table_is_complete():
-    """The rows above are all there are."""
-    (tested,) = (mark.args[1] for mark in test_method_table.pytestmark)
-    assert {row[0] for row in tested} == set(methods.METHODS)
-    own = {m.name: methods.finetune_config(m) for m in methods.METHODS.values()}
-    assert {name for name, config in own.items() if config.needs_simulation} == {
-        "sac-online", "rlpd", "iql", "sgft-relabel",
+# --- the list -------------------------------------------------------------------------------------------------------
+
+
+def test_the_list_of_methods_is_complete():
+    assert {name for name, method in METHODS.items() if not method.needs_prior} == {
+        "sac", "rlpd", "iql", "tdmpc2",
     }  # fmt: skip
-    assert {m.name for m in methods.METHODS.values() if m.fresh} == {"rlpd", "iql", "sgft-tdmpc2-code"}
-    assert {m.name for m in methods.METHODS.values() if m.prior == "tdmpc2"} == {
-        "tdmpc2", "sgft-tdmpc2", "sgft-tdmpc2-code",
-    }  # fmt: skip
-    assert all(m.pilot.prior == m.prior and not m.pilot.fresh for m in methods.METHODS.values())
+    assert {name for name, method in METHODS.items() if method.prior == "tdmpc2"} == tuners.PLANNERS
+    tuned = {name: tuners.build(name) for name in METHODS}
+    assert {name for name, fine in tuned.items() if fine.simulation} == {"sac-online", "rlpd", "iql", "sgft-relabel"}
+    assert {name for name, fine in tuned.items() if fine.initial_policy} == {"rlpd", "iql", "sgft-tdmpc2-code"}
+    assert all(method.name == name and method.description and method.source for name, method in METHODS.items())
 
 
-def test_a_methods_own_options_and_changes_to_them():
-    rlpd = methods.finetune_config(methods.METHODS["rlpd"], target_critics=1)
-    assert (rlpd.critics, rlpd.target_critics, rlpd.policy_delay, rlpd.simulated_share) == (10, 1, None, 0.5)
-    assert methods.METHODS["rlpd"].utd == 20
+@each_method
+def test_every_option_has_its_help_and_a_default(name):
+    """Tyro reads the string below a field."""
+    import inspect
 
-
-def test_the_actor_moves_once_per_real_transition_if_nothing_else_is_said():
-    rlpd, online = (methods.finetune_config(methods.METHODS[name]) for name in ("rlpd", "sac-online"))
-    assert [methods.policy_delay(rlpd, utd) for utd in (40.0, 20.0, 0.5)] == [40, 20, 1]
-    assert [methods.policy_delay(online, utd) for utd in (2.0, 5.0)] == [20, 20]
-
-
-@pytest.mark.parametrize(
-    ("name", "utd", "updates"),
-    [("sac", 8.0, 8_000), ("mbpo", 4.0, 4_000), ("tdmpc2", 1.0, 1_000), ("sgft-sac", 8.0, 0)],
-)
-def test_rates_rise_over_the_first_thousand_real_transitions(name, utd, updates):
-    assert methods.lr_warmup(methods.finetune_config(methods.get_method(name)), utd) == updates
-    assert methods.lr_warmup(methods.FinetuneConfig(lr_warmup=7), utd) == 7
-
-
-@pytest.mark.parametrize(("name", "updates"), [("mbpo", 4_000), ("sgft-sac", 4_000), ("sgft-mpc", 0)])
-def test_rates_of_models_rise_by_themselves(name, updates):
-    assert methods.dynamics_warmup(methods.finetune_config(methods.get_method(name)), 4.0) == updates
-    assert methods.dynamics_warmup(methods.FinetuneConfig(lr_warmup=7, dynamics_warmup=3), 4.0) == 3
-
-
-def test_only_sgft_sac_with_and_without_relabelling_and_planners_have_another_horizon_than_the_papers():
-    own = {m.name: methods.finetune_config(m) for m in methods.METHODS.values() if m.agent != "tdmpc2"}
-    longer = {name: config.horizon for name, config in own.items() if config.horizon != 1}
-    assert longer == {"sgft-sac": 4, "sgft-relabel": 4}
-    assert (own["sgft-sac"].branches, own["sgft-sac"].lr_warmup, own["mbpo"].branches) == (2, 0, 5)
-
-
-def test_sgft_relabel_is_sgft_sac_with_relabelled_rows_and_an_actor_that_does_not_wait():
-    plain, own = (methods.finetune_config(methods.METHODS[name]) for name in ("sgft-sac", "sgft-relabel"))
-    assert dataclasses.replace(plain, relabel_simulated=True, critic_warmup=0) == own
-
-
-@pytest.mark.parametrize("method", methods.METHODS.values(), ids=lambda method: method.name)
-def test_what_tuning_chooses_from(method):
-    """Spaces are of one size and hold the default, and with every value of theirs there is a learner."""
-    default = methods.default_settings(method)
-    assert len(method.space) == 5 and all(len(set(values)) == 3 for values in method.space.values())
-    assert all(default[name] in values for name, values in method.space.items())
-    assert all(utd > 0 for utd in method.space["utd"])
-    for name, value in [(name, value) for name, values in method.space.items() if name != "utd" for value in values]:
-        config = methods.finetune_config(method, **{name: value})
-        make_finetuner(method, config, obs_dim=4, act_dim=2, reward=toy.reward, terminated=toy.success)
+    for kind in METHODS[name].config.__mro__[:-1]:
+        source = inspect.getsource(kind)
+        for field in kind.__annotations__:
+            assert f"    {field}: " in source
+            assert source.split(f"    {field}: ")[1].split("\n")[1].strip().startswith('"""'), f"{name}: {field}"
+    METHODS[name].config()
 
 
 def test_unknown_method_is_answered_with_the_closest():
@@ -108,16 +48,158 @@ def test_unknown_method_is_answered_with_the_closest():
         methods.get_method("sgft-sca")
 
 
+def test_only_sgft_sac_with_and_without_relabelling_and_planners_have_another_horizon_than_the_papers():
+    own = {name: method.config() for name, method in METHODS.items() if method.prior == "sac"}
+    longer = {name: config.horizon for name, config in own.items() if getattr(config, "horizon", 1) != 1}
+    assert longer == {"sgft-sac": 4, "sgft-relabel": 4}
+    assert (own["sgft-sac"].branches, own["sgft-sac"].lr_warmup, own["mbpo"].branches) == (2, 0, 5)
+
+
+def test_sgft_relabel_is_sgft_sac_with_relabelled_rows_and_an_actor_that_does_not_wait():
+    plain, own = sgft_sac.Config(), sgft_relabel.Config()
+    differ = {f.name for f in dataclasses.fields(plain) if getattr(plain, f.name) != getattr(own, f.name)}
+    assert differ == {"critic_warmup"} and own.critic_warmup == 0
+
+
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("name", "options", "words"),
     [
-        ({"horizon": 0}, "horizon is 0: must be at least 1"),
-        ({"simulated_share": 1.5}, "simulated_share is 1.5: must be a share from 0 to 1"),
-        ({"lr_warmup": -1}, "lr_warmup is -1: must not be negative"),
-        ({"dynamics_warmup": -1}, "dynamics_warmup is -1: must not be negative"),
-        ({"offline_updates": 10}, "offline_updates needs the simulator's transitions"),
+        ("sgft-sac", {"horizon": 0}, "horizon is 0: must be at least 1"),
+        ("mbpo", {"branches": 0}, "branches is 0: must be at least 1"),
+        ("rlpd", {"simulated_share": 1.5}, "simulated-share is 1.5: must be from 0 to 1"),
+        ("sac", {"lr_warmup": -1}, "lr-warmup is -1: must be 0 or a positive number"),
+        ("mbpo", {"dynamics_warmup": -1}, "dynamics-warmup is -1: must be 0 or a positive number"),
+        ("sac", {"utd": float("nan")}, "utd is nan: must be a positive number"),
+        ("tdmpc2", {"plan_samples": 7}, "plan-samples is 7: must be at least 8"),
     ],
 )
-def test_impossible_options_are_refused(options, words):
+def test_impossible_options_are_refused(name, options, words):
     with pytest.raises(UserError, match=words):
-        methods.FinetuneConfig(**options)
+        METHODS[name].config(**options)
+
+
+# --- options left open ----------------------------------------------------------------------------------------------
+
+
+def hyper(fine, name):
+    """The learner's numbers at the start."""
+    data = tuners.simulated().of(0) if fine.simulation else None
+    return fine.init(tuners.prior(METHODS[name].prior).params, jax.random.key(0), data).learner.hyper
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "resolved"),
+    [
+        # 2 rollouts of 12 steps, 0.5 updates a step
+        ("sac", {"critic_warmup": None}, {"actor_start": 12, "lr_warmup": 500}),
+        ("sac", {"critic_warmup": 7, "lr_warmup": 3}, {"actor_start": 7, "lr_warmup": 3}),
+        ("sgft-sac", {"critic_warmup": None, "lr_warmup": 0}, {"actor_start": 12, "lr_warmup": 0}),
+        ("sac-reset", {}, {"lr_warmup": 0}),  # a new critic has nothing to lose
+        ("pbrs", {"lr_warmup": 9, "reset_critic": True}, {"lr_warmup": 0}),
+        ("pbrs", {"lr_warmup": 9, "reset_critic": False}, {"lr_warmup": 9}),
+        ("rlpd", {}, {"lr_warmup": 0, "actor_start": 0}),
+        ("tdmpc2", {}, {"lr_warmup": 500}),
+        ("tdmpc2", {"lr_warmup": 4}, {"lr_warmup": 4}),
+        ("sgft-tdmpc2-code", {}, {"lr_warmup": 0}),
+    ],
+)
+def test_numbers_left_open_are_resolved_when_a_method_is_built(name, given, resolved):
+    """`build` alone resolves them, so commands and library cannot differ."""
+    own = {f.name for f in dataclasses.fields(METHODS[name].config)}
+    open_ = {"lr_warmup": None, "dynamics_warmup": None}
+    config = {key: value for key, value in open_.items() if key in own} | {"utd": 0.5, "initial_rollouts": 2} | given
+    found = hyper(tuners.build(name, **config), name)
+    assert {key: float(getattr(found, key)) for key in resolved} == resolved
+
+
+@pytest.mark.parametrize(("given", "scale"), [(None, T / 200), (0.3, 0.3)])
+def test_rewards_of_iql_span_the_length_of_an_episode(given, scale):
+    """The simulator's returns are 100 to 300."""
+    assert float(hyper(tuners.build("iql", reward_scale=given), "iql").reward_scale) == pytest.approx(scale)
+
+
+def test_the_actor_moves_once_per_real_transition_if_nothing_else_is_said():
+    rlpd, online = METHODS["rlpd"].config, METHODS["sac-online"].config
+    assert [rules.policy_delay(rlpd(utd=utd)) for utd in (40.0, 20.0, 0.5)] == [40, 20, 1]
+    assert [rules.policy_delay(online(utd=utd)) for utd in (2.0, 5.0)] == [20, 20]
+
+
+@pytest.mark.parametrize(("name", "utd", "updates"), [("mbpo", 4.0, 4_000), ("sgft-mpc", 8.0, 0)])
+def test_rates_of_models_rise_by_themselves(name, utd, updates):
+    config = METHODS[name].config(utd=utd)
+    assert rules.warmup(config, config.dynamics_warmup) == updates
+
+
+def test_updates_follow_a_rollout():
+    assert tuners.build("sac", utd=8.0).updates_per_rollout == 8 * T
+    assert tuners.build("sac", utd=1e-9).updates_per_rollout == 1
+
+
+# --- no option is idle ----------------------------------------------------------------------------------------------
+
+# Another value for each option, and what must be so for it to matter.
+OTHER = {
+    "batch_size": 6, "branches": 3, "horizon": 3, "actor_ramp": 50, "replay_capacity": 40, "critic_warmup": 50,
+    "lr_warmup": 50, "dynamics_warmup": 50, "plan_samples": 32, "critics": 4, "target_critics": 1,
+    "simulated_transitions": 36, "offline_updates": 5, "simulated_anneal": 80, "policy_delay": 2, "utd": 0.5,
+    "initial_rollouts": 3, "max_grad_norm": 0.001, "lr_actor": 1e-2, "lr_critic": 1e-2, "lr_dynamics": 1e-2, "lr": 1e-2,
+    "tau": 0.2, "alpha": 0.3, "expectile": 0.9, "beta": 1.0, "reward_scale": 2.0, "simulated_share": 0.25,
+    "simulated_share_end": 0.4, "simulated_ladder": 0.1, "critic_network": dataclasses.replace(tuners.NET, hidden=(4,)),
+    "branch_noise": 0.1, "clip_shaped": 0.01, "plan_noise": 0.1, "explore_noise": 0.1,
+}  # fmt: skip
+GIVEN = {"lr_warmup": {"reset_critic": False}}
+
+
+def other_value(field, value):
+    return not value if isinstance(value, bool) else OTHER[field]
+
+
+def outcome(case, state):
+    """What some updates make of the networks, and how the agent then explores."""
+    state = case.fine.observe(state, tuners.episode(jax.random.key(0)), jnp.ones(T, bool))
+    state, _ = case.fine.learn(state, jax.random.key(1), 2)
+    act = case.fine.act(state, case.fine.init_carry(), jnp.array([0.3, -0.8]), jax.random.key(2), explore=True)
+    return case.fine.export(state), act
+
+
+def program(case, state):
+    """What is compiled, as text: constants included."""
+    data = case.data
+    learn = jax.make_jaxpr(lambda state, key: case.plain.learn(state, key, 2, data))
+    act = jax.make_jaxpr(lambda *x: case.plain.act(*x, explore=True))
+    args = state, jax.random.key(0)
+    return f"{learn(*args)} {act(state, case.plain.init_carry(), jnp.zeros(2), args[1])}"
+
+
+def facts(fine):
+    """What training loops and files read."""
+    simulation = fine.simulation
+    return fine.updates_per_rollout, fine.initial_rollouts, simulation, dict(fine.card)
+
+
+@pytest.mark.parametrize("name", tuners.slow_but({"sgft-sac", "frozen-critic"}, METHODS))
+def test_every_option_changes_something(name):
+    """Either a fact that training loops read, the size of the state, the compiled program, or what is learned."""
+    own = {f.name for f in dataclasses.fields(METHODS[name].config)}
+    idle = []
+    for field in dataclasses.fields(METHODS[name].config):
+        given = {key: value for key, value in GIVEN.get(field.name, {}).items() if key in own}
+        base = tuners.tuner(name, **given)
+        other = other_value(field.name, getattr(tuners.configure(name, **given), field.name))
+        plain = tuners.build(name, **given | {field.name: other})
+        idle += [] if differs(base, plain) else [field.name]
+    assert not idle
+
+
+def differs(base, plain):
+    if facts(base.plain) != facts(plain):
+        return True
+    params = base.params
+    start = lambda fine: fine.init(params, jax.random.key(0), base.data)  # noqa: E731
+    shapes = [jax.tree.map(jnp.shape, jax.eval_shape(lambda f=f: start(f))) for f in (base.plain, plain)]
+    if shapes[0] != shapes[1]:
+        return True
+    before, after = start(base.plain), start(plain)
+    if not tuners.equal(outcome(base, before), outcome(base, after)):
+        return True  # a number in the state
+    return program(base, before) != program(base._replace(plain=plain), before)

@@ -25,8 +25,8 @@ from sgft_jax.types import Learner, UserError
 N, STEPS, LENGTH = 16, 30, toy_terminating.LENGTH
 CONFIG = PretrainConfig(
     n_envs=N, chunk_steps=STEPS, env_steps=2 * N * STEPS, worlds=4, random_transitions=4 * N,
-    replay_capacity=4 * N * STEPS, batch_size=8, updates_per_step=1, gamma=0.9, network=NetworkConfig(hidden=(8,)), ensemble_size=1,
-    size="tiny", horizon=2, plan_samples=8,
+    replay_capacity=4 * N * STEPS, batch_size=8, updates_per_step=1, gamma=0.9,
+    network=NetworkConfig(hidden=(8,)), ensemble_size=1, size="tiny", horizon=2, plan_samples=8,
 )  # fmt: skip
 
 
@@ -187,7 +187,9 @@ def test_memory_counts_what_is_kept_and_drawn():
         toy.make(), replace(CONFIG, random_transitions=100, replay_capacity=10**9, batch_size=50)
     )
     assert found["random_transitions"] == 100 * row + 8 and found["replay_capacity"] == 10**9 * row + 8  # two counters
-    assert found["batch_size"] == 2 * 50 * row
+    networks = CONFIG.ensemble_size + 4
+    activations = 2 * networks * 50 * sum(CONFIG.network.hidden) * 4
+    assert found["batch_size"] == 2 * 50 * CONFIG.updates_per_step * row + activations
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The three transforms: telescoping, brute-force H-step targets, branches, the method table."""
+"""The transforms: telescoping, brute-force H-step targets, branches, relabelled rows, composition."""
 
 import itertools
 
@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax import methods
 from sgft_jax import transforms as sgft
 from sgft_jax.learners import losses
-from sgft_jax.types import Imagination, Transition, UserError
+from sgft_jax.types import Batch, Imagination
 
 GAMMA = 0.9
 
@@ -19,7 +18,7 @@ def imagination(**changes):
     """A world on a line: the action moves the state, V(s) = s^2 / 10, the episode ends beyond 3."""
     line = Imagination(
         value=lambda obs: obs[0] ** 2 / 10,
-        policy=lambda obs, k, key: jnp.ones(1),
+        policy=lambda obs, context, key: jnp.ones(1),
         dynamics=lambda obs, action, key: obs + action,
         reward=lambda obs, action, next_obs: -next_obs[0],
         terminated=lambda obs, action, next_obs: next_obs[0] > 3,
@@ -28,16 +27,33 @@ def imagination(**changes):
     return line._replace(**changes)
 
 
-def batch_of(obs, next_obs, reward, discount=None, steps_to_go=None):
+def told(k, horizon):
+    """Contexts [n, horizon] that say k [n] steps are left."""
+    return jax.vmap(sgft.steps_to_go, (0, None))(jnp.asarray(k), horizon)
+
+
+def left(context):
+    """What contexts say [n]."""
+    return (context @ jnp.arange(1.0, context.shape[1] + 1)).astype(int)
+
+
+def run(transform, imagination, batch, key):
+    """A transform that does not learn, applied to a batch."""
+    return transform.apply(transform.init(key), imagination, batch, key)
+
+
+def batch_of(obs, next_obs, reward, discount=None, steps_to_go=None, horizon=3):
+    """steps_to_go: [n] of a segment of `horizon` steps that the rows belong to already."""
     n = len(reward)
-    return Transition(
+    context = None if steps_to_go is None else told(steps_to_go, horizon)
+    return Batch(
         obs=jnp.asarray(obs, jnp.float32).reshape(n, -1),
         action=jnp.zeros((n, 1)),
         reward=jnp.asarray(reward, jnp.float32),
         discount=jnp.full(n, GAMMA) if discount is None else jnp.asarray(discount, jnp.float32),
         next_obs=jnp.asarray(next_obs, jnp.float32).reshape(n, -1),
-        truncated=jnp.zeros(n, bool),
-        steps_to_go=jnp.zeros(n, jnp.int32) if steps_to_go is None else jnp.asarray(steps_to_go, jnp.int32),
+        context=context,
+        next_context=context,
     )
 
 
@@ -46,7 +62,7 @@ def batch_of(obs, next_obs, reward, discount=None, steps_to_go=None):
 
 def test_shaped_reward_by_hand(key):
     # 1 + 0.9 * 0.4 - 0.1 = 1.26; terminated: 1 + 0 - 0.1 = 0.9
-    out = sgft.shape(imagination(), batch_of([1, 1], [2, 2], [1, 1], [GAMMA, 0]), key)
+    out = run(sgft.shape, imagination(), batch_of([1, 1], [2, 2], [1, 1], [GAMMA, 0]), key)
     np.testing.assert_allclose(out.reward, [1.26, 0.9], rtol=1e-6)
     assert out.discount.tolist() == pytest.approx([GAMMA, 0])  # shaping alone shortens nothing
 
@@ -57,7 +73,7 @@ def test_shaped_rewards_telescope(horizon, seed):
     """sum gamma^t r_bar_t = sum gamma^t r_t + gamma^H V(s_H) - V(s_0) for any trajectory."""
     keys = jax.random.split(jax.random.key(seed), 2)
     states, rewards = jax.random.normal(keys[0], (horizon + 1,)), jax.random.normal(keys[1], (horizon,))
-    shaped = sgft.shape(imagination(), batch_of(states[:-1], states[1:], rewards), keys[0]).reward
+    shaped = run(sgft.shape, imagination(), batch_of(states[:-1], states[1:], rewards), keys[0]).reward
     powers = GAMMA ** jnp.arange(horizon)
     potential = GAMMA**horizon * states[-1] ** 2 / 10 - states[0] ** 2 / 10
     np.testing.assert_allclose(jnp.sum(powers * shaped), jnp.sum(powers * rewards) + potential, atol=1e-5)
@@ -71,7 +87,7 @@ def test_expected_shaped_reward_is_zero_where_the_value_is_exact():
     v = jnp.asarray(np.linalg.solve(np.eye(4) - GAMMA * chain, chain @ rewards), jnp.float32)
     tabular = imagination(value=lambda obs: v[obs[0].astype(int)])
     s, s_next = (x.ravel() for x in np.meshgrid(np.arange(4), np.arange(4), indexing="ij"))
-    shaped = sgft.shape(tabular, batch_of(s, s_next, rewards[s_next]), jax.random.key(0)).reward
+    shaped = run(sgft.shape, tabular, batch_of(s, s_next, rewards[s_next]), jax.random.key(0)).reward
     np.testing.assert_allclose((chain * np.asarray(shaped).reshape(4, 4)).sum(axis=1), 0, atol=1e-5)
 
 
@@ -80,33 +96,34 @@ def test_expected_shaped_reward_is_zero_where_the_value_is_exact():
 
 def test_horizon_one_target_is_the_shaped_reward_to_the_bit(key):
     raw = batch_of(jax.random.normal(key, (64,)), jax.random.normal(key, (64,)) + 1, jnp.linspace(-1, 1, 64))
-    shaped = sgft.shape(imagination(), raw, key)
-    short = sgft.shorten(1)(imagination(), shaped, key)
+    shaped = run(sgft.shape, imagination(), raw, key)
+    short = run(sgft.shorten(1), imagination(), shaped, key)
     next_q = 1e3 * jax.random.normal(key, (64, 2))
     target = jax.vmap(lambda r, d, q: losses.td_target(r, d, q, jnp.float32(7), alpha=0.5))
     assert jnp.array_equal(target(short.reward, short.discount, next_q), shaped.reward)
-    assert short.obs.shape == raw.obs.shape and jnp.array_equal(short.next_obs, raw.next_obs)
+    assert short.context is None and jnp.array_equal(short.next_obs, raw.next_obs)
 
 
-def test_shorten_appends_steps_to_go(key):
-    out = sgft.shorten(3)(imagination(), batch_of([7, 7, 7], [8, 8, 8], [0, 0, 0], steps_to_go=[3, 2, 1]), key)
-    assert out.obs.tolist() == [[7, 0, 0, 1], [7, 0, 1, 0], [7, 1, 0, 0]]
-    assert out.next_obs.tolist() == [[8, 0, 1, 0], [8, 1, 0, 0], [8, 0, 0, 0]]
+def test_shorten_tells_the_steps_to_go(key):
+    out = run(sgft.shorten(3), imagination(), batch_of([7, 7, 7], [8, 8, 8], [0, 0, 0], steps_to_go=[3, 2, 1]), key)
+    assert out.context.tolist() == [[0, 0, 1], [0, 1, 0], [1, 0, 0]]
+    assert out.next_context.tolist() == [[0, 1, 0], [1, 0, 0], [0, 0, 0]]
+    assert out.obs[:, 0].tolist() == [7, 7, 7] and out.next_obs[:, 0].tolist() == [8, 8, 8]
     assert out.discount.tolist() == pytest.approx([GAMMA, GAMMA, 0])
 
 
 def test_shorten_draws_missing_steps_to_go_uniformly(key):
     n = 6000
     raw = batch_of(np.zeros(n), np.zeros(n), np.zeros(n), steps_to_go=[0] * (n - 1) + [2])
-    out = sgft.shorten(3)(imagination(), raw, key)
-    counts = jnp.bincount(out.steps_to_go, length=5)
-    assert counts[0] == 0 and counts[4] == 0 and out.steps_to_go[-1] == 2
+    out = run(sgft.shorten(3), imagination(), raw, key)
+    counts = jnp.bincount(left(out.context), length=5)
+    assert counts[0] == 0 and counts[4] == 0 and left(out.context)[-1] == 2
     assert jnp.all(jnp.abs(counts[1:4] - 2000) < 190)  # 5 standard deviations: sqrt(6000 * 1/3 * 2/3) = 37
-    assert jnp.array_equal(out.discount == 0, out.steps_to_go == 1)
+    assert jnp.array_equal(out.discount == 0, left(out.context) == 1)
 
 
 def test_shorten_keeps_termination(key):
-    out = sgft.shorten(3)(imagination(), batch_of([1], [2], [0], discount=[0], steps_to_go=[3]), key)
+    out = run(sgft.shorten(3), imagination(), batch_of([1], [2], [0], discount=[0], steps_to_go=[3]), key)
     assert out.discount[0] == 0
 
 
@@ -131,18 +148,19 @@ def test_targets_equal_brute_force_on_a_tabular_problem(horizon):
     tabular = imagination(value=lambda obs: jnp.asarray(v)[obs[0].astype(int)])
     rows = list(itertools.product(range(states), range(actions), range(1, horizon + 1)))
     s, a, k = np.array(rows).T
-    raw = batch_of(s, successor[s, a], reward[successor[s, a]], steps_to_go=k)
+    raw = batch_of(s, successor[s, a], reward[successor[s, a]], steps_to_go=k, horizon=horizon)
     transform = sgft.compose(sgft.shape, sgft.shorten(horizon))
-    batch = jax.tree.map(np.asarray, transform(tabular, raw, jax.random.key(0)))
+    batch = jax.tree.map(np.asarray, run(transform, tabular, raw, jax.random.key(0)))
 
-    def read(obs):
-        """State and steps to go as a learner sees them in an observation."""
-        return int(obs[0]), (1 if horizon == 1 else int(obs[1:] @ np.arange(1, horizon + 1)))
+    def read(obs, context, i):
+        """State and steps to go of row i as a learner sees them."""
+        return int(obs[i, 0]), (1 if horizon == 1 else int(context[i] @ np.arange(1, horizon + 1)))
 
     q = np.zeros((states, horizon + 1, actions))
     for _ in range(horizon):
         for i, action in enumerate(a):
-            q[(*read(batch.obs[i]), action)] = batch.reward[i] + batch.discount[i] * q[read(batch.next_obs[i])].max()
+            best_next = q[read(batch.next_obs, batch.next_context, i)].max()
+            q[(*read(batch.obs, batch.context, i), action)] = batch.reward[i] + batch.discount[i] * best_next
     np.testing.assert_allclose(q[:, horizon].max(axis=1), best, atol=1e-5)
 
 
@@ -152,40 +170,41 @@ def test_targets_equal_brute_force_on_a_tabular_problem(horizon):
 def test_branches_follow_the_real_rows(key):
     raw = batch_of([0, 10], [0.5, 10.5], [5, 6])
     line = imagination(terminated=lambda obs, action, next_obs: jnp.bool_(False))
-    out = sgft.branch(2, 3)(line, raw, key)
+    out = run(sgft.branch(2, 3), line, raw, key)
     assert out.reward.shape == (2 + 2 * 3 * 2,) and jnp.array_equal(out.obs[:2], raw.obs)
     assert out.obs[2:, 0].tolist() == [0, 1] * 3 + [10, 11] * 3
     assert out.next_obs[2:, 0].tolist() == [1, 2] * 3 + [11, 12] * 3
     assert out.reward[2:].tolist() == [-1, -2] * 3 + [-11, -12] * 3
-    assert out.steps_to_go.tolist() == [0, 0] + [2, 1] * 6
+    assert left(out.context).tolist() == [0, 0] + [2, 1] * 6
+    assert left(out.next_context).tolist() == [0, 0] + [1, 0] * 6
     assert jnp.all(out.discount == jnp.float32(GAMMA))
-    endless = sgft.branch(2, 3, segments=False)(line, raw, key)
-    assert jnp.all(endless.steps_to_go == 0)
+    endless = run(sgft.branch(2, 3, segments=False), line, raw, key)
+    assert endless.context is None and jnp.array_equal(endless.obs, out.obs)
 
 
 def test_after_an_imagined_termination_the_terminal_row_repeats(key):
     # 2 -> 3 goes on, 3 -> 4 terminates, two steps remain
-    out = jax.tree.map(lambda x: x[1:], sgft.branch(4, 1)(imagination(), batch_of([2], [2], [0]), key))
+    out = jax.tree.map(lambda x: x[1:], run(sgft.branch(4, 1), imagination(), batch_of([2], [2], [0]), key))
     assert out.obs[:, 0].tolist() == [2, 3, 3, 3] and out.next_obs[:, 0].tolist() == [3, 4, 4, 4]
     assert out.discount.tolist() == pytest.approx([GAMMA, 0, 0, 0])
-    assert out.steps_to_go.tolist() == [4, 3, 3, 3] and out.reward.tolist() == [-3, -4, -4, -4]
+    assert left(out.context).tolist() == [4, 3, 3, 3] and out.reward.tolist() == [-3, -4, -4, -4]
 
 
 def test_branches_draw_their_own_actions_and_know_the_steps_to_go(key):
     noisy = imagination(
-        policy=lambda obs, k, key: (k + 0.1 * jax.random.uniform(key, (1,))) / 10,
+        policy=lambda obs, context, key: (left(context[None]) + 0.1 * jax.random.uniform(key, (1,))) / 10,
         terminated=lambda obs, action, next_obs: jnp.bool_(False),
     )
-    out = sgft.branch(3, 4)(noisy, batch_of([0, 0], [0, 0], [0, 0]), key)
+    out = run(sgft.branch(3, 4), noisy, batch_of([0, 0], [0, 0], [0, 0]), key)
     imagined = out.action[2:, 0]
     assert len(set(imagined.tolist())) == 24
     assert jnp.array_equal(jnp.floor(10 * imagined), jnp.tile(jnp.array([3.0, 2.0, 1.0]), 8))
 
 
 def test_branch_noise_spreads_the_imagined_actions_within_their_range(key):
-    rest, zeros = imagination(policy=lambda obs, k, key: jnp.zeros(1)), np.zeros(40)
+    rest, zeros = imagination(policy=lambda obs, context, key: jnp.zeros(1)), np.zeros(40)
     quiet, spread, wide = (
-        sgft.branch(1, 50, noise=noise)(rest, batch_of(zeros, zeros, zeros), key).action[40:, 0]
+        run(sgft.branch(1, 50, noise=noise), rest, batch_of(zeros, zeros, zeros), key).action[40:, 0]
         for noise in (0, 0.3, 5)
     )
     assert jnp.all(quiet == 0)
@@ -193,41 +212,52 @@ def test_branch_noise_spreads_the_imagined_actions_within_their_range(key):
     assert jnp.abs(wide).max() == 1.0 and 0.7 < (jnp.abs(wide) == 1.0).mean() < 0.95
 
 
-def test_batch_accounting_of_the_paper(key):
-    zeros = np.zeros(256)
-    transform = sgft.compose(*methods.METHODS["sgft-sac"].transforms(1, 5, 0.0))
-    out = transform(imagination(), batch_of(zeros, zeros, zeros), key)
-    assert out.reward.shape == (1536,) and jnp.all(out.discount == 0)
+def test_relabelled_rows_say_what_the_models_expect(key):
+    raw = batch_of([0, 1, 2.5], [9, 9, 9], [7, 7, 7])._replace(action=jnp.array([[0.5], [0.5], [1.0]]))
+    out = run(sgft.relabel(1), imagination(), raw, key)
+    assert out.obs[:, 0].tolist() == [0, 1, 2.5] and out.next_obs[:, 0].tolist() == [9, 1.5, 3.5]
+    assert out.reward.tolist() == [7, -1.5, -3.5]
+    assert out.discount.tolist() == pytest.approx([GAMMA, GAMMA, 0])  # the last one terminates
 
 
-# --- methods ----------------------------------------------------------------------------------------------------------
+def test_clip_bounds_rewards_alone(key):
+    raw = batch_of([0, 0, 0], [1, 1, 1], [-5, 0.3, 5])
+    out = run(sgft.clip(2.0), imagination(), raw, key)
+    assert out.reward.tolist() == pytest.approx([-2, 0.3, 2])
+    assert all(jnp.array_equal(x, y) for x, y in zip(out._replace(reward=None), raw, strict=True)
+               if x is not None)  # fmt: skip
 
 
-def test_composition_runs_left_to_right_with_separate_keys(key):
+@pytest.mark.parametrize("make", [sgft.shape, sgft.clip(1.0), sgft.branch(2, 1), sgft.shorten(1), sgft.relabel(1)])
+def test_other_fields_of_a_row_go_with_it(make, key):
+    """Branches keep the weight, origin and validity of the row they begin at."""
+    raw = batch_of([0, 1], [1, 2], [0, 0])
+    raw = raw._replace(weight=jnp.array([0.5, 1.5]), is_sim=jnp.array([False, True]), valid=jnp.array([True, False]))
+    out = run(make, imagination(), raw, key)
+    origin = np.resize([0, 1], 2).tolist() + ([0, 0, 1, 1] if out.reward.shape[0] > 2 else [])
+    for name in ("weight", "is_sim", "valid"):
+        np.testing.assert_array_equal(getattr(out, name), np.asarray(getattr(raw, name))[origin])
+
+
+# --- composition ------------------------------------------------------------------------------------------------------
+
+
+def test_composition_runs_left_to_right_with_separate_keys_and_states(key):
     seen = []
 
     def note(name):
-        def transform(imagination, batch, key):
-            seen.append((name, key))
+        def apply(state, imagination, batch, key):
+            seen.append((name, state, key))
             return batch
 
-        return transform
+        learn = lambda state, batch, key: (state + name, {f"seen/{name}": key})  # noqa: E731
+        return sgft.Transform(lambda key: name, apply, learn)
 
-    sgft.compose(note("a"), note("b"))(imagination(), batch_of([0], [0], [0]), key)
-    assert [name for name, _ in seen] == ["a", "b"] and seen[0][1] != seen[1][1]
+    both = sgft.compose(note("a"), note("b"))
+    assert both.init(key) == ("a", "b")
     raw = batch_of([0], [0], [0])
-    assert sgft.compose()(imagination(), raw, key) is raw
-
-
-@pytest.mark.parametrize("name", methods.METHODS)
-def test_only_finite_horizons_cut_the_bootstrap(name, key):
-    method = methods.METHODS[name]
-    out = sgft.compose(*method.transforms(1, 2, 0.0))(imagination(), batch_of([0, 1], [1, 2], [0, 0]), key)
-    assert out.reward.shape == ((6,) if method.uses_dynamics else (2,))
-    assert jnp.all(out.discount == (0 if method.finite_horizon else jnp.float32(GAMMA)))
-
-
-@pytest.mark.parametrize("make", [lambda: sgft.shorten(0), lambda: sgft.branch(0, 5), lambda: sgft.branch(1, 0)])
-def test_sizes_must_be_positive(make):
-    with pytest.raises(UserError, match="at least 1"):
-        make()
+    assert both.apply(("x", "y"), imagination(), raw, key) is raw
+    assert [(name, state) for name, state, _ in seen] == [("a", "x"), ("b", "y")] and seen[0][2] != seen[1][2]
+    state, metrics = both.update(("x", "y"), raw, key)
+    assert state == ("xa", "yb") and metrics["seen/a"] != metrics["seen/b"]
+    assert run(sgft.compose(), imagination(), raw, key) is raw and sgft.compose().init(key) == ()

@@ -66,14 +66,6 @@ def test_a_run_without_a_real_rollout_is_drawn(tmp_path):
     assert figures.learning_curves(tmp_path / "z.png", {"": [curve([[0.5]], (0,))]}, title="").exists()
 
 
-def test_scaling_draws_lines_and_their_references(tmp_path):
-    lines = {"push": ([32, 512], [5e4, 9e4]), "insert": ([32, 512], [6e4, 2e5])}
-    references = {"push": ([32, 512], [1e5, 2e5])}
-    image = read(figures.scaling(tmp_path / "s.png", lines, references, title="t", x="worlds", y="steps"))
-    for color in figures.PALETTE[:2]:
-        assert pixels(image, color) > 200
-
-
 @pytest.mark.parametrize("n", [1, 200])
 def test_pretraining_panels(tmp_path, n):
     returns = np.linspace(0, 5, n)

@@ -12,15 +12,15 @@ def rows(values):
     """Transitions that carry `values` in every field that can hold them."""
     x = jnp.asarray(values, jnp.float32)
     obs = x[..., None]
-    return Transition(obs, obs, x, x, obs, x > 100, x.astype(jnp.int32))
+    return Transition(obs, obs, x, x, obs)
 
 
 EMPTY = replay.init(rows(0.0), 5)
 
 
 def test_dtypes_and_sizes():
-    assert EMPTY.data.truncated.dtype == bool and EMPTY.data.steps_to_go.dtype == jnp.int32
-    assert EMPTY.data.obs.shape == (5, 1) and EMPTY.size == 0
+    assert all(x.dtype == jnp.float32 for x in EMPTY.data)
+    assert EMPTY.data.obs.shape == (5, 1) and EMPTY.data.reward.shape == (5,) and EMPTY.size == 0
 
 
 def test_oldest_rows_are_overwritten():
@@ -55,7 +55,7 @@ def test_invalid_rows_are_never_sampled(key):
 def test_sampling_is_uniform_and_keeps_rows_together(key):
     state = replay.add_batch(EMPTY, rows([1, 2, 3, 4]))
     batch = replay.sample(state, key, 8000)
-    counts = jnp.bincount(batch.steps_to_go, length=6)
+    counts = jnp.bincount(batch.reward.astype(int), length=6)
     assert counts[0] == 0 and counts[5] == 0
     assert jnp.all(jnp.abs(counts[1:5] - 2000) < 200)  # 5 standard deviations: sqrt(8000 / 4 * 3 / 4) = 39
     assert jnp.all(batch.obs[:, 0] == batch.reward) and jnp.all(batch.next_obs[:, 0] == batch.reward)

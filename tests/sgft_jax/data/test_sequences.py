@@ -15,7 +15,7 @@ LENGTH, DRAWS = 4, 300
 def rows(values):
     """Transitions that carry `values` in every field that can hold them; next_obs is the value + 0.5."""
     x = jnp.asarray(values, jnp.float32)
-    return Transition(x[..., None], x[..., None], x, x, x[..., None] + 0.5, x > 100, x.astype(jnp.int32))
+    return Transition(x[..., None], x[..., None], x, x, x[..., None] + 0.5)
 
 
 add = jax.jit(sequences.add)
@@ -28,7 +28,7 @@ def windows(ring, key):
     drawn = sample(ring, key, DRAWS, LENGTH)
     found = set()
     for values, next_obs, valid in zip(
-        drawn.rows.reward.tolist(), drawn.rows.next_obs[..., 0].tolist(), drawn.valid.tolist(), strict=True
+        drawn.reward.tolist(), drawn.next_obs[..., 0].tolist(), drawn.valid.tolist(), strict=True
     ):
         n = sum(valid)
         assert valid == [True] * n + [False] * (LENGTH - n)
@@ -86,14 +86,14 @@ def test_a_hole_in_an_episode_ends_the_windows_before_it(key):
 
 def test_starts_are_uniform_over_valid_rows(key):
     ring = add_episode(sequences.init(rows(0.0), 8), rows([1, 2, 3, 4]), jnp.ones(4, bool))
-    starts = sample(ring, key, 8000, LENGTH).rows.steps_to_go[:, 0]
+    starts = sample(ring, key, 8000, LENGTH).reward[:, 0].astype(int)
     counts = jnp.bincount(starts, length=6)
     assert counts[0] == 0 and jnp.all(jnp.abs(counts[1:5] - 2000) < 200)  # 5 standard deviations
 
 
 def test_an_empty_ring_gives_nothing(key):
     drawn = sample(sequences.init(rows(0.0), 3, 2), key, 5, LENGTH)
-    assert not drawn.valid.any() and not drawn.rows.obs.any()
+    assert not drawn.valid.any() and not drawn.obs.any()
 
 
 def test_windows_longer_than_the_ring(key):
@@ -116,8 +116,8 @@ def test_vmap_over_seeds(key):
     rings = jax.vmap(sequences.add_episode)(rings, rows([[1, 2, 3], [4, 5, 6]]), valid)
     assert rings.size.tolist() == [3, 1]
     drawn = jax.vmap(lambda r, k: sequences.sample(r, k, 50, LENGTH))(rings, jax.random.split(key, 2))
-    assert set(drawn.rows.reward[0, :, 0].tolist()) == {1, 2, 3}
-    assert set(drawn.rows.reward[1, :, 0].tolist()) == {4} and drawn.valid[1].sum() == 50
+    assert set(drawn.reward[0, :, 0].tolist()) == {1, 2, 3}
+    assert set(drawn.reward[1, :, 0].tolist()) == {4} and drawn.valid[1].sum() == 50
 
 
 def test_impossible_sizes_are_refused():

@@ -23,7 +23,7 @@ def make_prior(scale=1.0, **changes):
         actor=dense,
         critic=jax.tree.map(lambda x: jnp.stack([x, x]), dense),
         value=dense,
-        dynamics={},
+        dynamics=None,
         normalizer=Normalizer(jnp.zeros(4), jnp.ones(4)),
     )
     return Prior(params, CARD | changes)
@@ -43,17 +43,18 @@ def test_prior_round_trip(tmp_path):
 
 
 def test_every_learner_that_leaves_a_prior_names_its_container(tmp_path):
-    params = TDMPC2Params(
-        *({"kernel": jnp.ones(2) * i} for i in range(5)), Normalizer(jnp.zeros(4), jnp.ones(4)), jnp.float32(3)
-    )
+    fields: dict = {name: {"kernel": jnp.ones(2) * i} for i, name in enumerate(TDMPC2Params._fields)}
+    params = TDMPC2Params(**fields | {"normalizer": Normalizer(jnp.zeros(4), jnp.ones(4)), "scale": jnp.float32(3)})
     folder = priors.save_prior(tmp_path / "prior", Prior(params, CARD | {"algorithm": "tdmpc2"}))
     assert bits(priors.load_prior(folder).params) == bits(params)
 
 
-def test_what_a_prior_does_not_have_is_empty(tmp_path):
-    params = make_prior().params._replace(value=None)
+def test_what_a_prior_does_not_have_is_none(tmp_path):
+    params = make_prior().params._replace(value={})
     folder = priors.save_prior(tmp_path / "prior", Prior(params, CARD))
-    assert bits(priors.load_prior(folder).params) == bits(params._replace(value={}))
+    loaded = priors.load_prior(folder).params
+    assert loaded.value is None and loaded.dynamics is None
+    assert bits(loaded) == bits(params._replace(value=None))
 
 
 def test_saving_a_prior_again_replaces_it(tmp_path):

@@ -40,7 +40,6 @@ def test_a_new_run_says_where_it_is_and_records_itself(tmp_path):
     assert stored["kind"] == "pretrain" and stored["config"]["inner"] == {"lr": 0.001, "layers": [2, 3]}
     (first,) = json.loads((run.folder / "provenance.json").read_text())["starts"]
     assert first["versions"]["jax"] and first["device"]["platform"] == "cpu" and first["python"].startswith("3.")
-    assert run.made("figures").is_dir() and run.prior == run.folder / "prior"
 
 
 def leave_a_checkpoint(folder):

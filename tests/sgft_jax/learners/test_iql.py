@@ -9,7 +9,7 @@ import pytest
 
 from sgft_jax.learners import iql
 from sgft_jax.models import networks, normalizer
-from sgft_jax.types import Transition
+from sgft_jax.types import Batch
 
 f = jnp.float32
 
@@ -107,14 +107,12 @@ def train(batch, hyper, key):
 def rows(obs, action, reward, discount, *, next_obs=None):
     """[ROWS] numbers, or one for all, as a batch."""
     obs, action, reward, discount = (jnp.broadcast_to(f(x), ROWS) for x in (obs, action, reward, discount))
-    return Transition(
+    return Batch(
         obs=obs[:, None],
         action=action[:, None],
         reward=reward,
         discount=discount,
         next_obs=(obs if next_obs is None else jnp.broadcast_to(f(next_obs), ROWS))[:, None],
-        truncated=jnp.zeros(ROWS, bool),
-        steps_to_go=jnp.zeros(ROWS, jnp.int32),
     )
 
 
@@ -188,14 +186,12 @@ SMALL_CRITIC, SMALL_VALUE = networks.make_critic(3, 2, CONFIG.network), networks
 @jax.jit
 def batch_of(key):
     n, keys = 16, jax.random.split(key, 5)
-    return Transition(
+    return Batch(
         obs=jax.random.normal(keys[0], (n, 3)),
         action=jax.random.uniform(keys[1], (n, 2), minval=-1),
         reward=jax.random.normal(keys[2], (n,)),
         discount=jnp.where(jax.random.bernoulli(keys[3], 0.2, (n,)), 0.0, 0.99),
         next_obs=jax.random.normal(keys[4], (n, 3)),
-        truncated=jnp.zeros(n, bool),
-        steps_to_go=jnp.zeros(n, jnp.int32),
     )
 
 
@@ -264,12 +260,12 @@ def test_target_critic_follows_at_rate_tau(key):
 def test_observations_are_normalised_everywhere(key):
     state, batch = SMALL.init(key), batch_of(key)
     statistics = normalizer.Normalizer(jnp.array([1.0, 2, 3]), jnp.array([2.0, 1, 0.5]))
-    told = state.replace(normalizer=statistics)
+    other = state.replace(normalizer=statistics)
     to_raw = jax.vmap(lambda z: z * statistics.std + statistics.mean)
     raw = batch._replace(obs=to_raw(batch.obs), next_obs=to_raw(batch.next_obs))
-    (_, plain), (_, scaled) = SMALL.update(state, batch, key), SMALL.update(told, raw, key)
+    (_, plain), (_, scaled) = SMALL.update(state, batch, key), SMALL.update(other, raw, key)
     chex.assert_trees_all_close(plain, scaled, rtol=1e-4, atol=1e-5)
-    actions = [SMALL.act(s, (), x.obs[0], key, explore=False)[0] for s, x in ((state, batch), (told, raw))]
+    actions = [SMALL.act(s, (), x.obs[0], key, explore=False)[0] for s, x in ((state, batch), (other, raw))]
     np.testing.assert_allclose(*actions, rtol=1e-4)
 
 

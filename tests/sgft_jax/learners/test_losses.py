@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 from sgft_jax.learners import losses
+from sgft_jax.types import Batch
 
 f = jnp.float32
 
@@ -54,3 +55,28 @@ def test_value_loss_by_hand():
 def test_dynamics_loss_by_hand():
     # ((1 - 0)^2 + (2 - 4)^2) / 2 = 2.5
     assert losses.dynamics_loss(jnp.array([1.0, 2.0]), jnp.array([0.0, 4.0])) == 2.5
+
+
+# --- which rows count -----------------------------------------------------------------------------------------------
+
+
+def batch_of(**fields):
+    x = jnp.zeros(3)
+    return Batch(x[:, None], x[:, None], x, x, x[:, None], **fields)
+
+
+def test_row_mean_by_hand():
+    each = jnp.array([1.0, 2.0, 6.0])
+    valid, weight = jnp.array([True, False, True]), jnp.array([0.5, 1.0, 1.5])
+    assert losses.row_mean(each, batch_of()) == 3.0
+    assert losses.row_mean(each, batch_of(valid=valid)) == 3.5  # (1 + 6) / 2
+    assert losses.row_mean(each, batch_of(weight=weight)) == pytest.approx(11.5 / 3)  # (0.5 + 2 + 9) / 3
+    assert losses.row_mean(each, batch_of(valid=valid, weight=weight)) == pytest.approx(9.5 / 2)
+    assert losses.row_mean(each, batch_of(valid=jnp.zeros(3, bool))) == 0.0
+    assert losses.row_mean(each.at[1].set(jnp.nan), batch_of(valid=valid)) == 3.5
+
+
+def test_fields_that_nobody_uses_cost_nothing():
+    """The program is the plain mean."""
+    each, batch = jnp.arange(3.0), batch_of()
+    assert str(jax.make_jaxpr(lambda x: losses.row_mean(x, batch))(each)) == str(jax.make_jaxpr(jnp.mean)(each))

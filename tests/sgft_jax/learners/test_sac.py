@@ -8,7 +8,7 @@ import pytest
 
 from sgft_jax.learners import sac
 from sgft_jax.models import networks, normalizer
-from sgft_jax.types import Transition, UserError
+from sgft_jax.types import Batch, UserError
 
 NET = networks.NetworkConfig(hidden=(32,))
 CONFIG = sac.SACConfig(1, 1, network=NET, tune_alpha=False, train_dynamics=False)
@@ -23,14 +23,12 @@ def probe(key, *, obs=None, reward=None, discount=None):
     key_obs, key_action = jax.random.split(key)
     obs = jnp.zeros(ROWS) if obs is None else jax.random.choice(key_obs, jnp.asarray(obs), (ROWS,))
     action = jax.random.uniform(key_action, (ROWS,), minval=-1)
-    return Transition(
+    return Batch(
         obs=obs[:, None],
         action=action[:, None],
         reward=jnp.ones(ROWS) if reward is None else reward(obs, action),
         discount=jnp.zeros(ROWS) if discount is None else discount(obs),
         next_obs=obs[:, None],
-        truncated=jnp.zeros(ROWS, bool),
-        steps_to_go=jnp.zeros(ROWS, jnp.int32),
     )
 
 
@@ -216,12 +214,12 @@ def test_keys_decide_and_are_used_once(key):
 def prior():
     state = sac.make_sac(sac.SACConfig(3, 2, network=NET, ensemble_size=2)).init(jax.random.key(7))
     statistics = normalizer.Normalizer(jnp.array([1.0, 2, 3]), jnp.array([2.0, 1, 0.5]))
-    return sac.extract_prior(state.replace(normalizer=statistics))
+    return sac.extract_params(state.replace(normalizer=statistics))
 
 
 def tuned(prior, *, reset, extra=0, **options):
     config = sac.SACConfig(3, 2, extra, network=NET, train_value=False, train_dynamics=False, **options)
-    return sac.make_sac(config), sac.fine_tune_state(
+    return sac.make_sac(config), sac.state_from_prior(
         config, sac.SACHyper(alpha=0.01), prior, jax.random.key(0), reset_critic=reset
     )
 
@@ -242,11 +240,13 @@ def test_the_first_policy_is_the_simulators_for_every_steps_to_go(prior, key):
     learner, state = tuned(prior, reset=False, extra=3)
     obs, action = jnp.array([0.5, -1.0, 2.0]), jnp.array([0.1, -0.2])
     expected = plain_learner.act(plain, (), obs, key, explore=True)[0]
-    q = networks.make_critic(3, 2, NET).apply(prior.critic, obs, action)
+    z = normalizer.normalize(prior.normalizer, obs)
+    q = networks.make_critic(3, 2, NET).apply(prior.critic, z, action)
     for k in range(4):
-        told = jnp.concatenate([obs, jax.nn.one_hot(k - 1, 3)])
-        np.testing.assert_allclose(learner.act(state, (), told, key, explore=True)[0], expected, rtol=1e-5)
-        got = networks.make_critic(6, 2, NET).apply(state.critic.params, told, action)
+        context = jax.nn.one_hot(k - 1, 3)
+        action_then = learner.act(state, (), obs, key, explore=True, context=context)[0]
+        np.testing.assert_allclose(action_then, expected, rtol=1e-5)
+        got = networks.make_critic(6, 2, NET).apply(state.critic.params, jnp.concatenate([z, context]), action)
         np.testing.assert_allclose(got, q, rtol=1e-5)
 
 
@@ -259,7 +259,7 @@ def test_kept_critic_under_shaping_is_the_simulators_advantage(prior, key):
     q = jax.vmap(critic.apply, (None, 0, 0))(prior.critic, zs, action)
     v = jax.vmap(value.apply, (None, 0))(prior.value, zs)
     zero = jnp.zeros(16)
-    batch = Transition(obs, action, q[:, 0] - v, zero, obs, zero > 0, zero.astype(jnp.int32))
+    batch = Batch(obs, action, q[:, 0] - v, zero, obs)
     new, metrics = jax.jit(learner.update)(state, batch, key)
     # only the second critic errs: mean (Q_2 - Q_1)^2
     assert metrics["critic/loss"] == pytest.approx(float(jnp.mean((q[:, 1] - q[:, 0]) ** 2)), rel=1e-4)
@@ -269,9 +269,9 @@ def test_kept_critic_under_shaping_is_the_simulators_advantage(prior, key):
 def test_a_prior_of_another_shape_is_refused(prior):
     config = sac.SACConfig(4, 2, network=NET)
     with pytest.raises(UserError, match=r"prior actor.*\(3, 32\), expected \(4, 32\)"):
-        sac.fine_tune_state(config, sac.SACHyper(), prior, jax.random.key(0), reset_critic=True)
+        sac.state_from_prior(config, sac.SACHyper(), prior, jax.random.key(0), reset_critic=True)
     with pytest.raises(UserError, match="train_value and train_dynamics"):
-        sac.extract_prior(LEARNER.init(jax.random.key(0)))
+        sac.extract_params(LEARNER.init(jax.random.key(0)))
 
 
 def test_impossible_options_are_refused():

@@ -12,10 +12,9 @@ import pytest
 from probes import PLAIN, ROWS, SIZE, case
 
 from sgft_jax.data import sequences
-from sgft_jax.data.sequences import Sequences
 from sgft_jax.learners import optim, tdmpc2, tdmpc2_model
 from sgft_jax.models import normalizer, twohot
-from sgft_jax.types import Transition, UserError
+from sgft_jax.types import Batch, Transition, UserError
 
 SGFT = dataclasses.replace(PLAIN, sgft=True)
 MOVING = dataclasses.replace(SGFT, train_encoder=True)
@@ -42,16 +41,14 @@ def windows(key, horizon=2):
     action = jax.random.uniform(keys[1], (ROWS, horizon, 1), minval=-1)
     reward = jax.random.normal(keys[2], (ROWS, horizon))
     discount = jnp.float32(0.9) * jax.random.bernoulli(keys[3], 0.8, (ROWS, horizon))
-    no = jnp.zeros((ROWS, horizon), bool)
     valid = jnp.ones((ROWS, horizon), bool).at[-ROWS // 4 :, -1].set(False)
-    rows = Transition(obs[:, :-1], action, reward, discount, obs[:, 1:], no, no.astype(jnp.int32))
-    return Sequences(rows, valid)
+    return Batch(obs[:, :-1], action, reward, discount, obs[:, 1:], valid=valid)
 
 
 def start(config, key):
     """An untrained agent."""
     state = INIT(key)
-    return state if config == PLAIN else tdmpc2.fine_tune_state(config, HYPER, tdmpc2.extract_prior(state), key)
+    return state if config == PLAIN else tdmpc2.state_from_prior(config, HYPER, tdmpc2.extract_params(state))
 
 
 def shaken(config, key, scale=0.3):
@@ -188,6 +185,8 @@ def test_discounted_mean_by_hand():
     # (1 + 3 + 0.5 * 2) / 2.5 = 2, times the mean weight (1 + 0.5) / 2
     assert tdmpc2.discounted_mean(values, short, 0.5) == pytest.approx(1.5)
     assert tdmpc2.discounted_mean(values, jnp.zeros((2, 2), bool), 0.5) == 0
+    # (0.5 * 1 + 1.5 * 3 + 0.5 * 0.5 * 2) / 2.5 * 0.75
+    assert tdmpc2.discounted_mean(values, short, 0.5, jnp.array([0.5, 1.5])) == pytest.approx(1.65)
 
 
 def test_scaled_entropy_by_hand(key):
@@ -219,7 +218,7 @@ def model_losses_by_hand(config, state, batch, heads):
     ce = jax.jit(lambda logits, x: twohot.cross_entropy(logits, x, config.bins))
     sums, weight, targets = jnp.zeros(3), 0.0, []
     for b in (0, ROWS - 1):
-        row = jax.tree.map(lambda x, b=b: x[b], batch.rows)
+        row = jax.tree.map(lambda x, b=b: x[b], batch)
         z = parts.encoder.apply(state.encoder.params, normal(row.obs[0]))
         for t in range(config.horizon):
             if b == ROWS - 1 and t == 1:  # not valid
@@ -258,13 +257,13 @@ def test_losses_against_a_loop(key):
 @pytest.mark.parametrize("config", [PLAIN, pytest.param(SGFT, marks=pytest.mark.slow)])
 def test_invalid_rows_do_not_matter(config, key):
     state, batch = shaken(config, key), windows(key)
-    noise = windows(jax.random.key(9)).rows
+    noise = windows(jax.random.key(9))
     mix = lambda x, y: jnp.where(jnp.expand_dims(batch.valid, tuple(range(2, x.ndim))), x, y)  # noqa: E731
-    other = batch._replace(rows=jax.tree.map(mix, batch.rows, noise))
+    other = jax.tree.map(mix, batch, noise)
     assert not equal(batch, other)
     a, b = (UPDATE[config](state, x, key)[0] for x in (batch, other))
     chex.assert_trees_all_close(a, b, rtol=1e-6)
-    seen = batch._replace(rows=batch.rows._replace(reward=batch.rows.reward.at[0, 1].add(1.0)))
+    seen = batch._replace(reward=batch.reward.at[0, 1].add(1.0))
     assert not equal(UPDATE[config](state, seen, key)[0].reward, a.reward)
 
 
@@ -398,7 +397,7 @@ def test_learning_rates_rise_from_zero(key, warmup, done, share):
 
     def step(**hyper):
         hyper = HYPER._replace(**hyper)
-        state = tdmpc2.fine_tune_state(PLAIN, hyper, tdmpc2.extract_prior(shaken(PLAIN, key)), key)
+        state = tdmpc2.state_from_prior(PLAIN, hyper, tdmpc2.extract_params(shaken(PLAIN, key)))
         state = state.replace(step=jnp.int32(done))
         return state, UPDATE[PLAIN](state, windows(key), key)[0]
 
@@ -441,9 +440,9 @@ def test_keys_are_used_once(key):
 
 def test_fine_tuning_starts_from_the_prior(key):
     trained = shaken(PLAIN, key).replace(scale=jnp.float32(7.0))
-    prior = tdmpc2.extract_prior(trained)
+    prior = tdmpc2.extract_params(trained)
     longer = dataclasses.replace(SGFT, horizon=4)
-    state = tdmpc2.fine_tune_state(longer, tdmpc2.TDMPC2Hyper(lr=1e-3), prior, key)
+    state = tdmpc2.state_from_prior(longer, tdmpc2.TDMPC2Hyper(lr=1e-3), prior)
     for name in NETWORKS:
         assert equal(getattr(state, name).params, getattr(prior, name))
         assert not any(m.any() for m in jax.tree.leaves(getattr(state, name).moments))
@@ -453,13 +452,13 @@ def test_fine_tuning_starts_from_the_prior(key):
     assert VALUE(longer, state, obs) == VALUE(PLAIN, trained, obs)
     buffers = [x.unsafe_buffer_pointer() for x in jax.tree.leaves((state, prior)) if x.size > 1]
     assert len(buffers) == len(set(buffers))  # either may be donated
-    assert tdmpc2.fine_tune_state(PLAIN, tdmpc2.TDMPC2Hyper(), prior, key).anchor is None
+    assert tdmpc2.state_from_prior(PLAIN, tdmpc2.TDMPC2Hyper(), prior).anchor is None
 
 
 def test_a_prior_of_another_shape_is_refused(key):
-    prior = tdmpc2.extract_prior(INIT(key))
+    prior = tdmpc2.extract_params(INIT(key))
     with pytest.raises(UserError, match=r"prior encoder.*\(2, 24\), expected \(3, 24\)"):
-        tdmpc2.fine_tune_state(dataclasses.replace(PLAIN, obs_dim=3), tdmpc2.TDMPC2Hyper(), prior, key)
+        tdmpc2.state_from_prior(dataclasses.replace(PLAIN, obs_dim=3), tdmpc2.TDMPC2Hyper(), prior)
 
 
 def test_impossible_options_are_refused(key):
@@ -474,7 +473,7 @@ def test_impossible_options_are_refused(key):
     ):
         with pytest.raises(UserError, match=match):
             dataclasses.replace(PLAIN, **options)
-    with pytest.raises(UserError, match="3 steps: must be the horizon, 2"):
+    with pytest.raises(UserError, match="3 steps: must be 2, the horizon"):
         LEARNERS[PLAIN].update(INIT(key), windows(key, horizon=3), key)
     assert PLAIN.planner.iterations == 4
     assert [tdmpc2.TDMPC2Config(1, n).planner.iterations for n in (19, 20)] == [6, 8]
@@ -513,7 +512,7 @@ def episode(policy, key):
         obs, memory = carry
         action, memory = policy(memory, obs, key)
         following, reward = cart(obs, action)
-        row = Transition(obs, action, reward, jnp.float32(0.9), following, jnp.bool_(False), jnp.int32(0))
+        row = Transition(obs, action, reward, jnp.float32(0.9), following)
         return (following, memory), row
 
     return jax.lax.scan(step, (begin, jnp.zeros((2, 1))), jax.random.split(key, STEPS))[1]

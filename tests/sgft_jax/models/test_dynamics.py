@@ -7,7 +7,7 @@ import pytest
 
 from sgft_jax.learners import optim
 from sgft_jax.models import dynamics, networks
-from sgft_jax.types import Normalizer, Transition
+from sgft_jax.types import Batch, Normalizer
 
 # A stand-in whose member m moves the normalised observation by action + m's own bias.
 BIASED = networks.Network(lambda key: jnp.zeros(2), lambda params, obs, action: action[None, :] + params[:, None])
@@ -18,7 +18,7 @@ def data(key, n=64):
     keys = jax.random.split(key, 3)
     obs, action = jax.random.normal(keys[0], (n, 2)), jax.random.uniform(keys[1], (n, 1), minval=-1)
     zero = jnp.zeros(n)
-    return Transition(obs, action, zero, zero, obs + 0.5 * action, zero > 0, zero.astype(jnp.int32))
+    return Batch(obs, action, zero, zero, obs + 0.5 * action)
 
 
 def test_predict_by_hand():

@@ -32,8 +32,3 @@ def test_an_entry_that_never_moved_gets_the_floor():
     np.testing.assert_allclose(result.std, [1e-2, 1.0], rtol=1e-6)
     # 5 cm away: 5 floors of 1 cm
     np.testing.assert_allclose(normalizer.normalize(result, jnp.array([0.35, 1.0])), [5.0, 1.0], rtol=1e-4)
-
-
-def test_padding_passes_the_new_entries_through():
-    padded = normalizer.pad(normalizer.Normalizer(jnp.array([1.0]), jnp.array([2.0])), 2)
-    assert normalizer.normalize(padded, jnp.array([5.0, 1.0, 0.0])).tolist() == [2.0, 1.0, 0.0]

@@ -1,19 +1,20 @@
 """Plans by the models of a SAC prior: what they find in worlds that are known exactly, and what learns."""
 
 import functools
-from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax import finetune, methods
+from sgft_jax.io.config import config_to_json
 from sgft_jax.learners import sac
+from sgft_jax.methods import sgft_mpc
 from sgft_jax.models import networks
 from sgft_jax.planning import mpc
-from sgft_jax.players import mpc_player
-from sgft_jax.types import Normalizer, Prior, Transition, UserError
+from sgft_jax.types import Normalizer, Prior, Task, Transition, UserError
 
 NET = networks.NetworkConfig(hidden=(8,))
 STILL = Normalizer(jnp.zeros(1), jnp.ones(1))
@@ -42,9 +43,9 @@ def plan(monkeypatch):
         monkeypatch.setattr(mpc, "make_actor", lambda *_: still)
         config = mpc.MPCConfig(1, 1, NET, horizon=horizon, noise=noise, gamma=gamma)
         act = mpc.make_act(config, reward=reward, terminated=terminated)
-        prior = Prior(None, None, None, jnp.array(gains), STILL)
+        params = sac.SACParams(None, None, None, jnp.array(gains), STILL)
         keys = jax.random.split(jax.random.key(0), 20)
-        one = lambda key: act(prior, mpc.init_carry(config), jnp.array([obs]), key, explore=False)[0][0]  # noqa: E731
+        one = lambda key: act(params, mpc.init_carry(config), jnp.array([obs]), key, explore=False)[0][0]  # noqa: E731
         return jax.jit(jax.vmap(one))(keys)
 
     return found
@@ -100,34 +101,27 @@ def test_plans_that_cannot_be(options):
 
 @functools.cache
 def tuner():
-    config = methods.finetune_config(
-        methods.get_method("sgft-mpc"),
-        network=NET,
-        plan_samples=24,
-        batch_size=32,
-        replay_capacity=64,
-        gamma=0.9,
-        lr_dynamics=1e-2,
+    task = SimpleNamespace(
+        obs_dim=1, act_dim=1, episode_length=64, reward=lambda obs, action, after: -jnp.abs(after[0]), terminated=never
     )
-    made = finetune.make_finetuner(
-        methods.get_method("sgft-mpc"), config, obs_dim=1, act_dim=1,
-        reward=lambda obs, action, after: -jnp.abs(after[0]), terminated=never,
-    )  # fmt: skip
-    compiled = {name: jax.jit(getattr(made, name)) for name in ("init", "observe", "act")}
-    return made._replace(learn=jax.jit(made.learn, static_argnums=2), **compiled)
+    config = sgft_mpc.Config(plan_samples=24, batch_size=32, replay_capacity=64, lr_dynamics=1e-2)
+    made = sgft_mpc.build(config, Prior(prior(), {"network": config_to_json(NET), "gamma": 0.9}), cast(Task, task))
+    compiled = {name: jax.jit(getattr(made, name)) for name in ("observe", "act")}
+    init = jax.jit(lambda params, key: made.init(params, key, None))
+    return made._replace(init=init, learn=jax.jit(made.learn, static_argnums=2), **compiled)
 
 
 @functools.cache
 def prior():
     agent = sac.make_sac(sac.SACConfig(1, 1, network=NET, ensemble_size=3))
-    return sac.extract_prior(jax.jit(agent.init)(jax.random.key(7)))
+    return sac.extract_params(jax.jit(agent.init)(jax.random.key(7)))
 
 
 def rows(n=64):
     """A real system in which actions work backwards."""
     obs, action = jax.random.uniform(jax.random.key(1), (2, n, 1), minval=-1)
-    after, zero = obs - 0.5 * action, jnp.zeros(n)
-    return Transition(obs, action, -jnp.abs(after[:, 0]), zero + 0.9, after, zero > 0, zero.astype(jnp.int32))
+    after = obs - 0.5 * action
+    return Transition(obs, action, -jnp.abs(after[:, 0]), jnp.full(n, 0.9), after)
 
 
 def test_the_models_learn_and_all_else_stays():
@@ -136,7 +130,7 @@ def test_the_models_learn_and_all_else_stays():
     new, metrics = tuner().learn(state, jax.random.key(2), 300)
     before, after = prior(), tuner().export(new)
     same = lambda a, b: jax.tree.map(np.testing.assert_array_equal, a, b)  # noqa: E731
-    same(replace(before, dynamics=None), replace(after, dynamics=None))
+    same(before._replace(dynamics=None), after._replace(dynamics=None))
     assert metrics["dynamics/mse"].shape == ()
     assert tuner().learn(new, jax.random.key(3), 1)[1]["dynamics/mse"] < metrics["dynamics/mse"]
     model = networks.make_dynamics(1, 1, NET)
@@ -152,15 +146,3 @@ def test_real_actions_are_spread_and_the_best_one_is_not():
     )
     best, spread = (act(jax.random.split(jax.random.key(5), 200), explore) for explore in (False, True))
     assert best.std() < 0.2 and 0.25 < (spread - best).std() < 0.5 and jnp.abs(spread).max() <= 1
-
-
-def test_what_fine_tuning_leaves_acts_as_the_agent_did():
-    """A player made of the same options, with the parameters that were exported."""
-    state = tuner().init(prior(), jax.random.key(0))
-    config = mpc.MPCConfig(1, 1, NET, samples=24, gamma=0.9)
-    player = mpc_player(config, reward=lambda obs, action, after: -jnp.abs(after[0]), terminated=never)
-    key, obs = jax.random.key(4), jnp.array([0.3])
-    own = tuner().act(state, tuner().init_carry(), obs, key, explore=False)
-    again = player.act(tuner().export(state), player.init_carry(), obs, jax.random.split(key)[0], explore=False)
-    np.testing.assert_allclose(own[0], again[0], atol=1e-5)
-    assert jnp.isfinite(player.value(prior(), jnp.array([0.3])))

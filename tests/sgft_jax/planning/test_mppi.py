@@ -75,10 +75,17 @@ def test_spread_has_a_floor(key):
     assert actions.mean() == pytest.approx(0.1, abs=0.005) and actions.std() == pytest.approx(0.05, rel=0.05)
 
 
-@pytest.mark.parametrize(("other", "sign"), [(-1.0, 1), (1.0, -1)])
-def test_nan_counts_as_zero(key, other, sign):
-    action, _ = run(lambda s: jnp.where(s[0, 0] > 0, jnp.nan, other))(key)
-    assert jnp.sign(action[0]) == sign
+@pytest.mark.parametrize("bad", [jnp.nan, jnp.inf, -jnp.inf])
+@pytest.mark.parametrize("other", [-100.0, -1.0, 1.0])
+def test_scores_that_are_not_finite_rank_last(key, bad, other):
+    """Also where all true scores are negative, so that 0 would be the best of them."""
+    actions, means = jax.vmap(run(lambda s: jnp.where(s[0, 0] > 0, bad, other)))(jax.random.split(key, 20))
+    assert (actions[:, 0] <= 0).all() and (means[:, 0, 0] < 0).all()
+
+
+def test_no_score_at_all_gives_a_finite_plan(key):
+    action, mean = run(lambda s: jnp.nan * s[0, 0], proposals=TARGET[None], explore=True)(key)
+    assert jnp.isfinite(action).all() and jnp.isfinite(mean).all() and (jnp.abs(action) <= 1).all()
 
 
 def test_a_good_proposal_is_taken(key):

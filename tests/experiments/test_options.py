@@ -1,0 +1,91 @@
+"""What commands share: seeds, where priors are, trees over seeds, and whether a run fits into memory."""
+
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+from priors_by_hand import save_prior
+
+from experiments import memory, options, stacking
+from experiments.memory import reserve
+from experiments.options import prior_folders, seed_list, seeds_name
+from sgft_jax.types import UserError
+
+
+def test_names_of_seeds():
+    assert seeds_name(seed_list(3, 1)) == "seed-3"
+    assert seeds_name(seed_list(3, 4)) == "seeds-3-6"
+    assert seed_list(options.LAST_SEED, 1) == [2**31 - 1]
+
+
+@pytest.mark.parametrize(
+    ("first", "count", "words"),
+    [
+        (0, 0, "--seeds is 0: must be at least 1"),
+        (-1, 1, "--seed is -1: seeds go from 0 to 2147483647"),
+        (2**31 - 1, 2, "--seed is 2147483647: seeds go from 0 to 2147483647, and --seeds 2"),
+    ],
+)
+def test_seeds_out_of_range_are_named(first, count, words):
+    with pytest.raises(UserError, match=words):
+        seed_list(first, count)
+
+
+def test_small_checks_name_option_and_value(monkeypatch, tmp_path):
+    options.at_least_one(SimpleNamespace(eval_every=1), "eval_every")
+    with pytest.raises(UserError, match="--eval-every is 0: must be at least 1"):
+        options.at_least_one(SimpleNamespace(eval_every=0), "eval_every")
+    options.without_repeats("--methods", ["sac", "sgft-sac"])
+    with pytest.raises(UserError, match="--methods names sac twice; name it once"):
+        options.without_repeats("--methods", ["sac", "sgft-sac", "sac"])
+
+
+def test_tasks_and_real_systems_are_checked_by_name(tmp_path):
+    (tmp_path / "g.toml").touch()
+    options.check_task("hammer", ["default", str(tmp_path / "g.toml")])
+    for task, reals, words in (
+        ("hamer", [], "did you mean 'hammer'"),
+        ("hammer", ["mild", "hrad"], "gap of hammer: there is no 'hrad', did you mean 'hard'"),
+        ("hammer", [str(tmp_path / "h.toml")], "h.toml: no such file"),
+    ):
+        with pytest.raises(UserError, match=words):
+            options.check_task(task, reals)
+
+
+def test_keys_depend_on_seed_and_purpose_alone():
+    keys = jax.random.key_data(stacking.seed_keys([0, 1, 2], 5))
+    np.testing.assert_array_equal(keys[1:], jax.random.key_data(stacking.seed_keys([1, 2], 5)))
+    assert len(np.unique(np.concatenate([keys, jax.random.key_data(stacking.seed_keys([0, 1, 2], 6))]), axis=0)) == 6
+
+
+def test_priors_are_found_in_order(tmp_path):
+    home = tmp_path / "pretrain/toy/fast"
+    for run, n in (("a", 10), ("a", 9), ("b", 2)):
+        save_prior(home / run / "prior" / f"seed-{n}", n)
+    find = lambda prior: prior_folders(prior, out=tmp_path, task="toy", preset="fast")  # noqa: E731
+    assert [folder.name for folder in find(None)] == ["seed-2", "seed-9", "seed-10"]
+    assert [len(find(home / p)) for p in ("", "a", "a/prior", "a/prior/seed-9")] == [3, 2, 2, 1]
+
+
+def test_advice_where_there_is_no_prior_fits_what_was_asked(tmp_path):
+    """Of a task that is a file it repeats the file; where the user names a folder it proposes no task."""
+    with pytest.raises(UserError, match=r"toy/cpu: holds no prior; make one with: .*--task my/toy.py --preset cpu"):
+        prior_folders(None, out=tmp_path, task="my/toy.py", preset="cpu")
+    with pytest.raises(UserError, match=r"--prior .*nowhere: no such folder$"):
+        prior_folders(tmp_path / "nowhere", out=tmp_path, task="toy", preset="cpu")
+    with pytest.raises(UserError, match=r"--prior .*: holds no prior$"):
+        prior_folders(tmp_path, out=tmp_path, task="toy", preset="cpu")
+
+
+def test_a_budget_that_does_not_fit_names_the_largest_part(monkeypatch, capsys):
+    parts = {"random_transitions": 2**30, "replay_capacity": 3 * 2**30}
+    monkeypatch.setattr(memory, "free_memory", lambda: 5 * 2**30)
+    reserve(parts, copies=2, devices=2)  # 4 GiB each
+    assert capsys.readouterr().out == (
+        "memory: 4.00 GiB of 5.00 GiB free on each device (random_transitions 1.00 GiB, replay_capacity 3.00 GiB)\n"
+    )
+    with pytest.raises(UserError, match=r"8\.00 GiB of 5\.00 GiB free on each device: lower --config\.replay-capacity"):
+        reserve(parts, copies=2)
+    monkeypatch.setattr(memory, "free_memory", lambda: None)
+    reserve(parts, copies=2)  # nobody knows: the run may try

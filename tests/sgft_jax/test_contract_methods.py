@@ -1,0 +1,127 @@
+"""What every method keeps: compiled once, members apart, resumed exactly, exported as it acts, no key used twice."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import keys
+import numpy as np
+import pytest
+import tuners
+from tuners import METHODS, T, bits, equal
+
+from sgft_jax.io import checkpoint
+from sgft_jax.policies import make_policy
+
+# Each shows what others are put together of; all of them are compiled in `make test-all`.
+FAST = {"sgft-sac", "sgft-relabel", "sgft-mpc", "sgft-tdmpc2", "rlpd", "iql"}
+each_method = pytest.mark.parametrize("name", tuners.slow_but(FAST, METHODS))
+OBS = jnp.array([0.3, -0.8])
+
+
+@functools.cache
+def two(name):
+    """Two members of a method: their case, their states after some updates, and the program that both share."""
+    case = tuners.tuner(name)
+    together = jax.jit(jax.vmap(lambda state, key: case.fine.learn(state, key)))
+    begin = jax.tree.map(lambda *x: jnp.stack(x), *(tuners.started(case, seed) for seed in (0, 1)))
+    states, metrics = together(begin, jax.random.split(jax.random.key(2)))
+    assert all(x.shape == (2,) and jnp.isfinite(x).all() for x in metrics.values())
+    return case, states, together
+
+
+def member(tree, i):
+    return jax.tree.map(lambda x: x[i], tree)
+
+
+@each_method
+def test_one_program_learns_for_all_members_and_keeps_them_apart(name, key):
+    """Swapped members give swapped results, to the bit; `learn` is traced once however often it runs."""
+    case, states, together = two(name)
+    seeds = jax.random.split(key)
+    after, metrics = together(states, seeds)
+    swapped, other = together(jax.tree.map(lambda x: x[::-1], states), seeds[::-1])
+    assert equal(after, jax.tree.map(lambda x: x[::-1], swapped))
+    assert equal(metrics, jax.tree.map(lambda x: x[::-1], other))
+    assert not equal(member(after, 0), member(after, 1))
+    assert case.traces == [1]
+
+
+@each_method
+def test_a_saved_state_goes_on_with_the_same_bits(name, key, tmp_path):
+    _, states, together = two(name)
+    checkpoint.save(tmp_path, 1, states, meta={})
+    restored, _ = checkpoint.restore(tmp_path, jax.eval_shape(lambda: states))
+    seeds = jax.random.split(key)
+    assert bits(together(restored, seeds)) == bits(together(states, seeds))
+
+
+@each_method
+def test_what_is_exported_acts_like_the_agent(name, key):
+    """Also as loaded from a file, by the prior's card and what the method adds to it."""
+    case, states, _ = two(name)
+    state, fine, card = member(states, 0), case.fine, tuners.prior(METHODS[name].prior).card
+    params = fine.export(state)
+    for policy in (case.plain.policy, make_policy({**card, **case.plain.card}, tuners.TASK)):
+        act = jax.jit(policy.act)
+        for explore in (jnp.bool_(False), jnp.bool_(name != "iql" and policy is case.plain.policy)):
+            expected, carry = fine.act(state, fine.init_carry(), OBS, key, explore=explore)
+            action, own = act(params, policy.init_carry(), OBS, key, explore=explore)
+            np.testing.assert_allclose(action, expected, rtol=1e-4, atol=1e-5)
+            assert jax.tree.map(jnp.shape, own) == jax.tree.map(jnp.shape, carry)
+    assert expected.shape == (2,) and (jnp.abs(expected) <= 1).all()
+
+
+@each_method
+def test_exploring_differs_and_the_best_action_follows_from_the_key(name, key):
+    case, states, _ = two(name)
+    act = functools.partial(case.fine.act, member(states, 0), case.fine.init_carry(), OBS)
+    best, again, explored = (act(key, explore=jnp.bool_(x))[0] for x in (False, False, True))
+    assert equal(best, again) and not jnp.allclose(best, explored, atol=1e-4)
+
+
+@each_method
+def test_no_key_is_used_twice(name):
+    """In acting, in learning and in the offline phase."""
+    case, states, _ = two(name)
+    plain, state = case.plain, member(states, 0)
+
+    def whole(key, state):
+        parts = jax.random.split(key, 4)
+        learned = plain.learn(state, parts[0], 1, case.data)[0]
+        acted = plain.act(learned, plain.init_carry(), OBS, parts[1], explore=True)
+        fresh = plain.init(case.params, parts[2], case.data)
+        offline = plain.learn(fresh, parts[3], 1, case.data, offline=True) if case.data else ()
+        return learned, acted, fresh, offline
+
+    assert keys.used_twice(whole, state) == 0
+
+
+def test_the_check_of_keys_finds_them():
+    """A loop over one key, and a key derived twice: `split(key)[1]` is `fold_in(key, 1)`."""
+    loop = lambda key: jax.lax.scan(lambda x, _: (x + jax.random.normal(key), None), 0.0, length=3)[0]  # noqa: E731
+    twins = lambda key: [jax.random.normal(k) for k in (jax.random.split(key)[1], jax.random.fold_in(key, 1))]  # noqa: E731
+    assert keys.used_twice(loop) == 1 and keys.used_twice(twins) == 1
+    assert keys.used_twice(lambda key: jax.vmap(jax.random.normal)(jax.random.split(key, 5))) == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", METHODS)
+def test_members_together_equal_each_alone(name, key):
+    case, states, together = two(name)
+    seeds = jax.random.split(key)
+    after, _ = together(states, seeds)
+    for i in range(2):
+        one, _ = case.fine.learn(member(states, i), seeds[i])
+        jax.tree.map(lambda x, y, i=i: np.testing.assert_allclose(x[i], y, rtol=1e-3, atol=1e-3), after, one)
+
+
+@each_method
+def test_invalid_rows_are_not_stored_and_may_hold_anything(name):
+    case = tuners.tuner(name)
+    state = case.fine.init(case.params, jax.random.key(0))
+    valid = jnp.arange(T) % 2 == 1
+    torn = jax.tree.map(lambda x: x.at[::2].set(jnp.nan), tuners.episode(jax.random.key(0)))
+    state = case.fine.observe(state, torn, valid)
+    assert state.replay.size == T // 2
+    assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(state.replay.data))

@@ -1,0 +1,310 @@
+"""The generic finetuner on a point that moves in a plane: what moves, what is frozen, what a learner gets to see."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tuners
+from tuners import METHODS, NET, TASK, T, compiled, equal, prior, started, tuner
+
+from sgft_jax.data import sources
+from sgft_jax.finetuner import Parts, assemble
+from sgft_jax.learners import sac, tdmpc2_model
+from sgft_jax.methods.options import LoopOptions
+from sgft_jax.models import dynamics, networks, normalizer
+from sgft_jax.transforms import compose, stateless
+from sgft_jax.types import Learner, Policy, Transform, UserError
+
+OBS = jnp.array([0.3, -0.4])
+
+
+def act(case, state, obs=OBS, explore=False):
+    """At the start of an episode."""
+    return case.fine.act(state, case.fine.init_carry(), obs, jax.random.key(0), explore=jnp.bool_(explore))[0]
+
+
+# --- what moves and what stays --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "moves"),
+    [
+        ("sac", {"actor", "critic"}),
+        ("sgft", {"actor", "critic"}),
+        ("sgft-sac", {"actor", "critic", "models"}),
+        ("frozen-critic", {"actor"}),
+        ("sgft-mpc", {"models"}),
+    ],
+)
+def test_what_moves_and_what_is_frozen(name, moves):
+    case = tuner(name)
+    state = started(case)
+    new, metrics = case.fine.learn(state, jax.random.key(1), 2)
+    fits = lambda s: {"actor": s.learner.actor, "critic": s.learner.critic} if name != "sgft-mpc" else {}  # noqa: E731
+    before, after = fits(state) | {"models": state.models}, fits(new) | {"models": new.models}
+    assert {part for part in before if not equal(before[part], after[part])} == moves
+    assert equal(state.frozen, new.frozen) and equal(state.replay, new.replay)
+    assert equal(new.frozen.value, case.params.value) and equal(new.frozen.normalizer, case.params.normalizer)
+    assert "critic" in moves or "critic/loss" not in metrics
+    assert all(jnp.isfinite(m) and m.shape == () for m in metrics.values())
+
+
+@pytest.mark.parametrize("name", ["tdmpc2", "sgft-tdmpc2"])
+def test_what_moves_in_a_planner(name):
+    case = tuner(name)
+    state = started(case)
+    new, _ = case.fine.learn(state, jax.random.key(1), 2)
+    parts = tdmpc2_model.NETWORKS
+    moved = {part for part in parts if not equal(getattr(state.learner, part), getattr(new.learner, part))}
+    assert moved == (set(parts) if name == "tdmpc2" else {"dynamics", "reward", "policy"})
+    assert jax.tree.map(jnp.shape, case.fine.export(new).policy) == jax.tree.map(jnp.shape, case.params.policy)
+
+
+@pytest.mark.slow
+def test_the_released_code_learns_a_new_agent_from_shaped_rewards():
+    case = tuner("sgft-tdmpc2-code")
+    state = started(case)
+    assert not equal(state.learner.dynamics.params, case.params.dynamics) and equal(state.frozen, case.params)
+    new, metrics = case.fine.learn(state, jax.random.key(1), 2)
+    assert equal(new.frozen, case.params) and not equal(new.learner.critic, state.learner.critic)
+    plain = tuner("tdmpc2")
+    raw = plain.fine.learn(started(plain), jax.random.key(1), 2)[1]["batch/reward_mean"]  # of the same draws
+    assert abs(metrics["batch/reward_mean"] - raw) > 1e-3
+
+
+def test_frozen_models_and_a_warm_up_keep_their_bits():
+    case = tuner("sgft-sac", train_dynamics=False, critic_warmup=2, reset_critic=True)
+    state = started(case)
+    assert state.models is None and equal(state.frozen.dynamics, case.params.dynamics)
+    warm, _ = case.fine.learn(state, jax.random.key(1), 2)
+    assert equal(state.learner.actor, warm.learner.actor) and not equal(state.learner.critic, warm.learner.critic)
+    moved, _ = case.fine.learn(warm, jax.random.key(2), 2)
+    assert not equal(warm.learner.actor, moved.learner.actor)
+
+
+@pytest.mark.parametrize(("name", "models"), [("sgft-sac", 4), ("sgft-sac", 2), ("sgft-mpc", 2)])
+def test_learning_rates_of_the_simulators_networks_rise_from_zero(name, models):
+    """Adam's first step has the rate's length, so with a warm-up of 4 it is a quarter; models may have their own."""
+    moved = {}
+    parts = [(lambda s: s.models, models)] + [(lambda s: s.learner.critic, 4)] * (name == "sgft-sac")
+    for warmup in (0, 4):
+        own = {"lr_warmup": warmup} if name == "sgft-sac" else {}
+        case = tuner(name, dynamics_warmup=models if warmup else 0, **own)
+        state = started(case)
+        new, _ = case.fine.learn(state, jax.random.key(1), 1)
+        moved[warmup] = [jnp.concatenate([
+            jnp.ravel(b - a) for a, b in zip(*(jax.tree.leaves(part(s).params) for s in (state, new)), strict=True)
+        ]) for part, _ in parts]  # fmt: skip
+    for at_once, slowly, (_, n) in zip(moved[0], moved[4], parts, strict=True):
+        assert jnp.abs(at_once).max() == pytest.approx(3e-4, rel=1e-2)
+        np.testing.assert_allclose(slowly, at_once / n, atol=1e-7)
+
+
+# --- from the prior to the agent ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["sac", "sgft-sac", "rlpd", "iql", "sgft-mpc", "sgft-tdmpc2-code"])
+def test_a_fresh_state_has_buffers_of_its_own(name):
+    """Whoever gets it may donate it, and the prior survives."""
+    case = tuner(name)
+    state = case.plain.init(case.params, jax.random.key(0), case.data)
+    buffers = [x.unsafe_buffer_pointer() for x in jax.tree.leaves((state, case.params)) if x.size]
+    assert len(buffers) == len(set(buffers))
+
+
+@pytest.mark.parametrize(("name", "horizon"), [("sgft", 1), ("sgft", 3), ("sac", None)])
+def test_the_first_action_is_the_simulators(name, horizon):
+    case = tuner(name, **({} if horizon is None else {"horizon": horizon}))
+    z = normalizer.normalize(case.params.normalizer, OBS)
+    moments = networks.make_actor(2, 2, NET).apply(case.params.actor, z)
+    got = act(case, case.fine.init(case.params, jax.random.key(1)))
+    np.testing.assert_allclose(got, jnp.tanh(moments[0]), rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["rlpd", "iql"])
+def test_a_fresh_agent_takes_the_statistics_alone(name):
+    case = tuner(name)
+    state = case.fine.init(case.params, jax.random.key(0))
+    assert equal(state.learner.normalizer, case.params.normalizer)
+    own = state.learner.actor.params
+    own = own["mean"] if name == "iql" else own
+    assert not equal(own["Dense_0"]["kernel"], case.params.actor["Dense_0"]["kernel"])
+
+
+@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if not method.needs_prior])
+def test_methods_that_need_no_prior_start_without_one(name, monkeypatch):
+    """With networks of their own; made small here."""
+    from sgft_jax.methods import options
+
+    small = {"hidden": [8], "layer_norm": False, "actor_layer_norm": False, "activation": "relu"}
+    monkeypatch.setitem(options._WITHOUT_PRIOR, "network", small)
+    monkeypatch.setitem(tdmpc2_model.SIZES, "5M", tdmpc2_model.SIZES["tiny"])
+    plain = METHODS[name].build(tuners.configure(name), None, TASK)
+    assert plain.simulation is None and plain.initial_policy is None
+    state = plain.observe(
+        plain.init(None, jax.random.key(0), None), tuners.episode(jax.random.key(1)), jnp.ones(T, bool)
+    )
+    new, metrics = jax.jit(lambda state: plain.learn(state, jax.random.key(2), 2))(state)
+    assert all(jnp.isfinite(x) for x in metrics.values()) and not equal(state.learner, new.learner)
+
+
+# --- what a learner gets to see -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def seen(monkeypatch):
+    """The last configuration of SAC and the last batch that its update was given."""
+    prior()  # made before: it is of another agent
+    found, make = {}, sac.make_sac
+
+    def spy(config, hyper=None):
+        learner = make(config, hyper)
+        found["config"] = config
+        return learner._replace(update=lambda s, b, k: (found.update(batch=b), learner.update(s, b, k))[1])
+
+    monkeypatch.setattr(sac, "make_sac", spy)
+    return found
+
+
+def test_horizon_one_learner_sees_the_papers_batch(seen):
+    """256 real rows become 1536, nothing bootstraps, and the actor reads the 256."""
+    plain = tuners.build("sgft-sac", horizon=1, branches=5, batch_size=256)
+    state = plain.init(prior().params, jax.random.key(0), None)
+    jax.eval_shape(lambda state: plain.learn(state, jax.random.key(0), 1, None), state)
+    assert seen["batch"].obs.shape == (1536, 2) and seen["config"].actor_batch == 256
+    assert seen["batch"].context is None and seen["config"].context_dim == 0
+
+
+def test_longer_horizons_tell_the_steps_to_go(seen):
+    plain = tuners.build("sgft-sac", horizon=3)
+    state = plain.init(prior().params, jax.random.key(0), None)
+    jax.eval_shape(lambda state: plain.learn(state, jax.random.key(0), 1, None), state)
+    rows = 8 * (1 + 2 * 3)
+    assert seen["batch"].context.shape == (rows, 3) == seen["batch"].next_context.shape
+    assert seen["config"].context_dim == 3
+
+
+@pytest.mark.parametrize(("name", "bound"), [("sgft", 0.01), ("sgft", None), ("pbrs", 0.01)])
+def test_shaped_rewards_are_bounded_where_asked(name, bound):
+    case = tuner(name, clip_shaped=bound)
+    _, metrics = case.fine.learn(started(case), jax.random.key(1), 2)
+    assert (metrics["batch/reward_std"] <= 0.011) == (bound is not None)
+
+
+def test_the_simulators_transitions_as_the_models_have_them(seen):
+    """After the real rows come as many relabelled ones; branches begin at both, and the actor learns from both."""
+    plain = tuners.build("sgft-relabel", clip_shaped=None, train_dynamics=False)
+    data = tuners.simulated().of(0)
+    far = data._replace(draw=lambda key, n: (rows := data.draw(key, n))._replace(obs=rows.obs + 5.0))
+    state = plain.init(prior().params, jax.random.key(0), far)
+    state = plain.observe(state, tuners.episode(jax.random.key(1)), jnp.ones(T, bool))
+    with jax.disable_jit():
+        plain.learn(state, jax.random.key(1), 1, far)
+    batch, n, horizon = seen["batch"], 8, 2
+    assert seen["config"].actor_batch == 2 * n and batch.reward.shape == (2 * n * (1 + 2 * horizon),)
+    starts = np.asarray(batch.obs)
+    assert (starts[:n] < 1.1).all() and (starts[n : 2 * n] > 3.9).all()
+    assert batch.is_sim[: 2 * n].tolist() == [False] * n + [True] * n
+    first = starts[2 * n :].reshape(2 * n, 2, horizon, 2)[:, :, 0]
+    np.testing.assert_allclose(first, np.repeat(starts[: 2 * n, None], 2, axis=1))
+    assert jnp.abs(batch.reward).max() < 50  # of the models and the task, not the 100 of the simulator
+    model, params = networks.make_dynamics(2, 2, NET), prior().params
+    each = jax.vmap(lambda o, a: dynamics.predict(model, params.dynamics, params.normalizer, o, a))
+    predicted = each(batch.obs[n : 2 * n], batch.action[n : 2 * n])
+    gap = np.abs(np.asarray(predicted) - np.asarray(batch.next_obs[n : 2 * n, None])).max(-1).min(1)
+    assert gap.max() < 1e-4  # what one of the members says
+
+
+def test_models_learn_from_real_rows_alone():
+    """The simulated rows of sgft-relabel, however odd, do not move the models."""
+    case, data = tuner("sgft-relabel"), tuners.simulated().of(0)
+    odd = data._replace(draw=lambda key, n: (rows := data.draw(key, n))._replace(next_obs=rows.next_obs + 9.0))
+    state = started(case)
+    fits = [jax.jit(lambda s, d=d: case.plain.learn(s, jax.random.key(1), 1, d)[0].models)(state) for d in (data, odd)]
+    assert equal(*fits) and not equal(fits[0], state.models)
+
+
+def test_the_share_of_simulated_rows_falls_with_the_updates():
+    case = tuner("sac-online", simulated_share=0.5, simulated_share_end=0.0, simulated_anneal=4)
+    _, metrics = case.fine.learn(started(case), jax.random.key(1), 8)
+    # of 8 rows 4, 3, 2, 1, 0, ... are simulated: 10 of 64, and the real rewards are about -0.8
+    assert metrics["batch/reward_mean"] == pytest.approx(100 * 10 / 64 - 0.8 * 54 / 64, abs=0.3)
+
+
+def test_offline_means_simulated_rows_alone():
+    case = tuner("iql")
+    state = case.fine.init(case.params, jax.random.key(0))  # nothing real yet
+    _, metrics = case.fine.learn(state, jax.random.key(1), 2, offline=True)
+    assert metrics["batch/reward_mean"] == 100
+    with pytest.raises(UserError, match="learns from transitions of the simulator"):
+        case.plain.learn(state, jax.random.key(1), 1, None)
+
+
+# --- a method of one's own ------------------------------------------------------------------------------------------
+
+
+def counting(transform):
+    """Fine-tuning with a transform, whose learner counts its updates."""
+
+    learner = Learner(
+        init=lambda key: jnp.float32(0), init_carry=lambda: (),
+        act=lambda state, carry, obs, key, *, explore: (jnp.zeros(2), carry),
+        update=lambda state, batch, key: (state + 1.0, {}),
+    )  # fmt: skip
+    parts = Parts(
+        learner=learner,
+        start=lambda params, key, simulated: (learner.init(key), None),
+        init_carry=learner.init_carry,
+        act=learner.act,
+        export=lambda state: state.learner,
+        policy=Policy(learner.init_carry, learner.act, lambda params, obs: params),
+        source=lambda state: sources.real_rows(4),
+        transform=transform,
+    )
+    return assemble(parts, LoopOptions(utd=0.25, initial_rollouts=1, replay_capacity=40), TASK)
+
+
+def test_a_transform_that_learns_keeps_its_state():
+    """It counts the updates that it saw, before each batch; the batches carry its count."""
+    count = Transform(
+        init=lambda key: jnp.float32(0),
+        apply=lambda state, imagination, batch, key: batch._replace(reward=jnp.full_like(batch.reward, state)),
+        update=lambda state, batch, key: (state + 1.0, {"transform/seen": state}),
+    )
+    case = compiled(counting(compose(stateless(lambda imagination, batch, key: batch), count)), None)
+    state = started(case)
+    for calls, mean in ((1, 2.0), (2, 5.0)):  # updates 1 to 3, then 4 to 6
+        state, metrics = case.fine.learn(state, jax.random.key(calls), 3)
+        assert state.transform == ((), 3.0 * calls) and metrics["batch/reward_mean"] == mean
+        assert metrics["transform/seen"] == mean - 1.0
+
+
+def test_transforms_learn_from_the_batch_as_it_was_sampled():
+    look = Transform(
+        init=lambda key: (),
+        apply=lambda state, imagination, batch, key: batch._replace(reward=batch.reward + 50.0),
+        update=lambda state, batch, key: (state, {"transform/reward": jnp.mean(batch.reward)}),
+    )
+    case = compiled(counting(compose(look, look)), None)
+    _, metrics = case.fine.learn(started(case), jax.random.key(0), 3)
+    assert metrics["transform/reward"] < 1 < 99 < metrics["batch/reward_mean"]
+
+
+def test_means_of_a_batch_leave_invalid_rows_out():
+    torn = stateless(lambda imagination, batch, key: batch._replace(
+        valid=jnp.arange(4) < 2, reward=jnp.array([1.0, 3.0, 1e9, 1e9])
+    ))  # fmt: skip
+    case = compiled(counting(compose(torn)), None)
+    _, metrics = case.fine.learn(started(case), jax.random.key(0), 1)
+    assert metrics["batch/reward_mean"] == 2.0 and metrics["batch/reward_std"] == 1.0
+
+
+@pytest.mark.parametrize("missing", ["reward", "terminated"])
+def test_methods_that_imagine_need_functions_of_the_task(missing):
+    task = TASK._replace(**{missing: None})
+    plain = METHODS["mbpo"].build(tuners.configure("mbpo"), prior(), task)
+    with pytest.raises(UserError, match=f"need a task with `{missing}` as a function"):
+        plain.learn(plain.init(prior().params, jax.random.key(0), None), jax.random.key(0), 1, None)
+    METHODS["sac"].build(tuners.configure("sac"), prior(), task)
+    with pytest.raises(UserError, match="plans need a task"):
+        METHODS["sgft-mpc"].build(tuners.configure("sgft-mpc"), prior(), task)

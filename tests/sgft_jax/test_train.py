@@ -1,0 +1,386 @@
+"""The loop of fine-tuning: what it yields, on which systems, what it keeps, and how it goes on."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toy_terminating
+from tuners import bits, equal
+
+import envs
+from envs.rollout import Episode
+from sgft_jax import train
+from sgft_jax.data import replay, sources
+from sgft_jax.finetuner import Parts, assemble
+from sgft_jax.io import checkpoint
+from sgft_jax.methods.options import LoopOptions
+from sgft_jax.systems.simulated import Simulated
+from sgft_jax.transforms import compose
+from sgft_jax.types import Learner, Policy, Simulation, Transition, UserError
+
+ENV, GAMMA = toy_terminating.make(), 0.9
+LENGTH = ENV.episode_length
+SEEDS = jnp.array([3, 8], jnp.uint32)
+PER_ROLLOUT = 3
+PRIORS = jnp.array([0.0, 0.5])  # [P] params: where the toy agent starts
+NUMBER = 1e-2  # of an action for each step of memory
+
+
+def act(state, carry, obs, key, *, explore):
+    """The steps of this episode so far, and what was learned; exploring adds noise."""
+    noise = jnp.where(explore, 1e-4 * jax.random.normal(key), 0.0)
+    return (NUMBER * carry + 1e-4 * jnp.tanh(state) + noise)[None], carry + 1.0
+
+
+def make(initial_policy=None, simulation=None, initial_rollouts=1):
+    """Fine-tuning whose learner adds up what it sees and draws, and whose policy counts its own steps."""
+
+    def update(state, batch, key):
+        return state + 1.0 + 1e-3 * jnp.mean(batch.obs) + 1e-3 * jax.random.normal(key), {"learner/state": state}
+
+    learner = Learner(lambda key: jnp.float32(0), lambda: jnp.float32(0), act, update)
+    parts = Parts(
+        learner=learner,
+        start=lambda params, key, simulated: (jnp.float32(0) if params is None else params, None),
+        init_carry=learner.init_carry,
+        act=lambda state, *step, explore: act(state.learner, *step, explore=explore),
+        export=lambda state: state.learner,
+        policy=Policy(learner.init_carry, act, lambda params, obs: params),
+        source=lambda state: sources.mixture(4, 2) if simulation else sources.real_rows(4),
+        offline=sources.simulated_rows(4),
+        transform=compose(),
+    )
+    options = LoopOptions(utd=PER_ROLLOUT / LENGTH, initial_rollouts=initial_rollouts, replay_capacity=200)
+    return assemble(parts, options, ENV, initial_policy=initial_policy, simulation=simulation)
+
+
+FINE = make()
+
+
+@functools.cache
+def simulated():
+    """Two systems; the members play one each."""
+    pools = envs.sample_worlds(ENV, jax.random.key(0), 4)
+    return Simulated(ENV, jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), pools), jnp.array([0, 1]), gamma=GAMMA)
+
+
+class Recorded:
+    """A system and all that was played on it: [(episodes, explore)]."""
+
+    def __init__(self, system):
+        self.system, self.played = system, []
+
+    def play(self, policy, states, keys, *, explore):
+        episodes = self.system.play(policy, states, keys, explore=explore)
+        self.played.append((episodes, explore))
+        return episodes
+
+
+def copied(tree):
+    """A yielded state is donated to the next step."""
+    return jax.tree.map(lambda x: np.array(x), tree)
+
+
+def run(finetuner=FINE, system=None, rollouts=4, **options):
+    """All that a run yields."""
+    system = simulated() if system is None else system
+    steps = train.finetune(finetuner, system, PRIORS, SEEDS, rollouts=rollouts, **options)
+    return [(copied(progress), metrics) for progress, metrics in steps]
+
+
+# --- what it yields -------------------------------------------------------------------------------------------------
+
+
+def test_the_fresh_state_comes_first_then_one_a_rollout():
+    yielded = run(rollouts=3)
+    assert [int(p.rollouts) for p, _ in yielded] == [0, 1, 2, 3] and yielded[0][1] == {}
+    assert {"real/return", "real/score", "real/exploded", "learner/state", "batch/reward_mean"} <= set(yielded[1][1])
+    assert all(x.shape == (2,) and jnp.isfinite(x).all() for _, metrics in yielded[1:] for x in metrics.values())
+    # seed 3 starts from prior 1, seed 8 from prior 0
+    np.testing.assert_array_equal(yielded[0][0].agent.learner, [0.5, 0.0])
+    np.testing.assert_allclose(yielded[3][0].agent.learner, [0.5 + 9, 9.0], atol=0.1)
+
+
+def test_initial_rollouts_come_together_and_each_brings_its_updates():
+    yielded = run(make(initial_rollouts=3), rollouts=4)
+    assert [int(p.rollouts) for p, _ in yielded] == [0, 3, 4]
+    np.testing.assert_allclose(yielded[1][0].agent.learner, [0.5 + 9, 9.0], atol=0.1)
+    assert run(make(initial_rollouts=3), rollouts=3)[-1][0].rollouts == 3
+
+
+def test_a_resumed_run_goes_on_with_the_same_bits(tmp_path):
+    whole = run(rollouts=5)
+    checkpoint.save(tmp_path, 3, whole[3][0], meta={})
+    like = jax.eval_shape(functools.partial(train.begin, FINE), PRIORS, SEEDS)
+    restored, _ = checkpoint.restore(tmp_path, like)
+    rest = run(rollouts=5, progress=jax.tree.map(jnp.asarray, restored))
+    assert [int(p.rollouts) for p, _ in rest] == [4, 5]
+    assert bits(rest[-1]) == bits(whole[-1])
+
+
+def test_all_methods_meet_the_same_starts():
+    """World and luck follow from the seed and the rollout alone, not from who plays."""
+    worlds = []
+    for finetuner in (FINE, make(initial_policy=Policy(FINE.init_carry, act, act))):
+        system = Recorded(simulated())
+        run(finetuner, system, rollouts=3)
+        worlds.append([episodes.world for episodes, _ in system.played])
+    assert equal(*worlds) and len(set(np.ravel(worlds[0]).tolist())) == 2
+
+
+# --- memory ---------------------------------------------------------------------------------------------------------
+
+
+def steps_of(episodes):
+    """What the policy remembered at each valid step, episode by episode."""
+    action, valid = np.asarray(episodes.transitions.action[..., 0]), np.asarray(episodes.valid)
+    return [np.round(a[v] / NUMBER).tolist() for a, v in zip(action.reshape(-1, LENGTH), valid.reshape(-1, LENGTH),
+                                                             strict=True)]  # fmt: skip
+
+
+def test_the_carry_is_threaded_and_begins_anew_with_each_episode():
+    system = Recorded(simulated())
+    *_, (last, _) = run(system=system, rollouts=3)
+    system.play(FINE, jax.tree.map(jnp.asarray, last.agent), train._episode_keys(SEEDS, 3, 0, 4), explore=False)
+    assert len(system.played) == 4 and any(len(steps) > 5 for steps in steps_of(system.played[-1][0]))
+    for episodes, _ in system.played:
+        for steps in steps_of(episodes):
+            assert steps == list(range(len(steps)))
+
+
+def test_evaluation_repeats_a_fixed_series_without_exploring():
+    *_, (last, _) = run(rollouts=1)
+    agent = jax.tree.map(jnp.asarray, last.agent)
+    system = Recorded(simulated())
+    few, more, again = (train.evaluate(FINE, system, agent, SEEDS, n) for n in (2, 5, 5))
+    assert equal(more, again) and equal(few, jax.tree.map(lambda x: x[:, :2], more))
+    assert [explore for _, explore in system.played] == [False] * 3
+    other = jax.tree.map(lambda x: x[::-1], agent)
+    same_starts = train.evaluate(FINE, system, other, SEEDS, 5)
+    assert equal(same_starts.world, more.world)
+
+
+# --- what is stored -------------------------------------------------------------------------------------------------
+
+
+def test_terminations_and_time_limits_are_stored_as_what_they_are():
+    system = Recorded(simulated())
+    *_, (last, _) = run(system=system, rollouts=6)
+    for m in range(2):
+        rows = jax.tree.map(lambda x, m=m: np.asarray(x[m]), last.agent.replay)
+        valid = [np.asarray(episodes.valid[m, 0]) for episodes, _ in system.played]
+        held = jax.tree.map(lambda x, n=int(rows.size): x[:n], rows.data)
+        assert rows.size == sum(v.sum() for v in valid)
+        alarm = held.next_obs[:, 1] > 0.5
+        np.testing.assert_allclose(held.discount, np.where(alarm, 0.0, GAMMA), rtol=1e-6)
+        ends = np.cumsum([v.sum() for v in valid]) - 1
+        assert set(np.flatnonzero(alarm)) <= set(ends) and alarm.any()
+        in_time = [end for end, v in zip(ends, valid, strict=True) if v.all() and not alarm[end]]
+        assert all(held.discount[end] > 0 for end in in_time)
+    assert any(np.asarray(e.valid).all(-1).any() for e, _ in system.played)  # some episode reached its time limit
+
+
+class Scripted:
+    """A system whose episodes have scores and returns [rollouts, M] as written; every other row is invalid."""
+
+    def __init__(self, scores, returns=None):
+        self.scores, self.calls = np.asarray(scores, np.float32), 0
+        self.returns = self.scores if returns is None else np.asarray(returns, np.float32)
+
+    def play(self, policy, states, keys, *, explore):
+        assert keys.shape == (2, 1)
+        score, total = (jnp.asarray(x[self.calls])[:, None] for x in (self.scores, self.returns))
+        self.calls += 1
+        shape, no = (2, 1, LENGTH), jnp.zeros((2, 1), bool)
+        valid = jnp.broadcast_to(jnp.arange(LENGTH) % 2 == 0, shape)
+        obs = jnp.where(valid[..., None], 1.0, jnp.nan) * jnp.ones((*shape, 2))
+        rows = Transition(obs, jnp.zeros((*shape, 1)), jnp.ones(shape), jnp.ones(shape), obs)
+        return Episode(rows, valid, total, no, ~valid.all(-1), score, jnp.zeros((2, 1), int), jnp.zeros((*shape, 0)))
+
+
+def test_rows_with_exploded_physics_are_not_stored():
+    *_, (last, metrics) = run(system=Scripted(np.zeros((3, 2))), rollouts=3)
+    assert last.agent.replay.size.tolist() == [3 * LENGTH // 2] * 2
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(last)[1:] if x.dtype == np.float32 and x.size > 2)
+    assert np.isfinite(last.agent.learner).all() and metrics["real/exploded"].tolist() == [1, 1]
+
+
+# --- the best policy by real evidence -------------------------------------------------------------------------------
+
+
+def test_the_policy_of_the_best_five_rollouts_is_kept():
+    """One member rises and falls, the other rises at the end."""
+    rise = [0, 0, 1, 1, 1, 1, 1, 0, 0, 0, 1, 1]
+    late = [0, 0, 0, 0, 0, 0, 1, 0, 1, 1, 1, 1]
+    yielded = run(system=Scripted(np.stack([rise, late], 1)), rollouts=12)
+    assert np.isneginf(yielded[4][0].best.score).all()  # four rollouts are no evidence
+    best, played = (
+        yielded[-1][0].best,
+        [7 - 1, 11 - 1],
+    )  # rollouts by the policies that are kept; of equal ones the first
+    assert best.rollouts.tolist() == played and best.score.tolist() == pytest.approx([1.0, 0.8])
+    before = np.stack([p.agent.learner for p, _ in yielded])
+    np.testing.assert_array_equal(best.params, [before[played[0], 0], before[played[1], 1]])
+    assert best.count.tolist() == [12, 12]
+
+
+def test_equal_scores_are_told_apart_by_returns():
+    returns = np.stack([[1] * 5 + [2] * 5, [2] * 5 + [1] * 5], 1)
+    best = run(system=Scripted(np.ones((10, 2)), returns), rollouts=10)[-1][0].best
+    assert best.rollouts.tolist() == [9, 4] and best.total.tolist() == [2, 2]
+
+
+def test_the_best_policy_had_learned_from_what_came_before_it():
+    """Six rollouts at once, by one policy that had learned from none."""
+    best = run(make(initial_rollouts=6), Scripted(np.ones((6, 2))), rollouts=6)[-1][0].best
+    assert best.rollouts.tolist() == [0, 0] and best.params.tolist() == [0.5, 0.0]
+
+
+def test_rollouts_of_an_initial_policy_are_no_evidence_for_the_agent():
+    """They are played with the prior's own parameters, and they are learned from."""
+    seen = []
+
+    def constant(params, carry, obs, key, *, explore):
+        return params[None], carry
+
+    class Looking(Recorded):
+        def play(self, policy, states, keys, *, explore):
+            seen.append((policy is first, explore))
+            return super().play(policy, states, keys, explore=explore)
+
+    first = Policy(lambda: (), constant, lambda params, obs: params)
+    system = Looking(simulated())
+    yielded = run(make(first, initial_rollouts=5), system, rollouts=6)
+    assert seen == [(True, True)] * 5 + [(False, True)]
+    action, valid = system.played[0][0].transitions.action[..., 0], system.played[0][0].valid
+    assert set(np.asarray(action)[0][np.asarray(valid)[0]]) == {0.5}
+    assert set(np.asarray(action)[1][np.asarray(valid)[1]]) == {0.0}
+    assert yielded[1][0].best.count.tolist() == [0, 0] and yielded[-1][0].best.count.tolist() == [1, 1]
+    assert yielded[1][0].agent.replay.size.min() > 10
+
+
+# --- a system that is stepped from Python ---------------------------------------------------------------------------
+
+
+class Robot:
+    """One episode at a time: reset() and step(action), as hardware has them."""
+
+    reset_, step_ = staticmethod(jax.jit(ENV.reset)), staticmethod(jax.jit(ENV.step))
+
+    def __init__(self, pool):
+        self.pool = pool
+
+    def reset(self, key):
+        key_world, key_start, key_steps = jax.random.split(key, 3)
+        index = jax.random.randint(key_world, (), 0, envs.rollout.pool_size(self.pool))
+        self.world = envs.rollout.pick(self.pool, index)
+        self.state = self.reset_(self.world, key_start)
+        return np.asarray(self.state.obs), index, jax.random.split(key_steps, LENGTH)
+
+    def step(self, action, key):
+        self.state = self.step_(self.world, self.state, jnp.asarray(action), key)
+        return np.asarray(self.state.obs), float(self.state.reward), bool(self.state.terminated)
+
+
+class Stepped:
+    """A `System` of robots, one for each member."""
+
+    def __init__(self, robots):
+        self.robots = robots
+
+    def play(self, policy, states, keys, *, explore):
+        act = jax.jit(functools.partial(policy.act, explore=explore))
+        each = [
+            self.one(robot, act, jax.tree.map(lambda x, m=m: x[m], states), policy.init_carry(), keys[m, 0])
+            for m, robot in enumerate(self.robots)
+        ]
+        return jax.tree.map(lambda *x: jnp.stack(x)[:, None], *each)
+
+    @staticmethod
+    def one(robot, act, state, carry, key):
+        obs, index, step_keys = robot.reset(key)
+        zero = Transition(np.zeros(2), np.zeros(1), 0.0, 0.0, np.zeros(2))
+        rows, over = [], False
+        for step_key in step_keys:
+            if over:
+                rows.append((zero, False))
+                continue
+            key_act, key_env = jax.random.split(step_key)
+            action, carry = act(state, carry, obs, key_act)
+            following, reward, over = robot.step(action, key_env)
+            rows.append((Transition(obs, np.asarray(action), reward, GAMMA * (not over), following), True))
+            obs = following
+        transitions = jax.tree.map(lambda *x: jnp.asarray(np.stack(x), jnp.float32), *[row for row, _ in rows])
+        total, no = transitions.reward.sum(), jnp.bool_(False)
+        valid = jnp.array([ok for _, ok in rows])
+        return Episode(transitions, valid, total, no, no, total, index, jnp.zeros((LENGTH + 1, 0)))
+
+
+def test_a_system_stepped_from_python_goes_through_the_same_loop():
+    """With the same dynamics it gives the same run, whatever is played in one program or step by step."""
+    fast = simulated()
+    robots = [Robot(jax.tree.map(lambda x, m=m: x[m], fast.pools)) for m in range(2)]
+    for (one, metrics), (other, same) in zip(run(rollouts=3), run(system=Stepped(robots), rollouts=3), strict=True):
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5), one, other)
+        jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5), metrics, same)
+
+
+# --- simulated data -------------------------------------------------------------------------------------------------
+
+NEEDS = Simulation(48, 0.8, offline_updates=12)
+
+
+def rows_of(n, p=2):
+    """n rows for each of p priors: rewards are 100 for the first prior, 200 for the next."""
+    example = replay.blank(2, 1)
+
+    def one(i):
+        rows = jax.tree.map(lambda x: jnp.full((n, *x.shape), 100.0 * (i + 1)), example)
+        return replay.add_batch(replay.init(example, n), rows)
+
+    return train.SimulatedRows(jax.tree.map(lambda *x: jnp.stack(x), *map(one, range(p))), jnp.ones((p, 3)))
+
+
+def test_the_offline_phase_comes_in_parts(monkeypatch):
+    monkeypatch.setattr(train, "OFFLINE_PART", 5)
+    fine = make(simulation=NEEDS)
+    yielded = run(fine, rollouts=1, simulated=rows_of(10))
+    assert [(int(p.offline), int(p.rollouts)) for p, _ in yielded] == [(0, 0), (5, 0), (10, 0), (12, 0), (12, 1)]
+    # its rows are those of each member's own prior: seed 3 has the second one's
+    assert [x["batch/reward_mean"].tolist() for _, x in yielded[1:4]] == [[200.0, 100.0]] * 3
+    assert "real/return" not in yielded[3][1] and "real/return" in yielded[4][1]
+    rest = run(fine, rollouts=1, simulated=rows_of(10), progress=jax.tree.map(jnp.asarray, yielded[2][0]))
+    assert bits(rest[-1]) == bits(yielded[-1])
+
+
+def test_methods_that_need_simulated_data_say_so():
+    with pytest.raises(UserError, match="pass `simulated`"):
+        run(make(simulation=NEEDS), rollouts=1)
+
+
+def test_members_share_simulated_rows():
+    """No array of the compiled program holds a set of rows for each member."""
+    fine, n, members = make(simulation=NEEDS), 1009, 7
+    seeds, simulated = jnp.arange(members, dtype=jnp.uint32), rows_of(n)
+    steps = train._Steps(fine, Scripted([]), PRIORS, seeds, simulated)
+    states = jax.eval_shape(lambda: train.begin(fine, PRIORS, seeds, simulated)).agent
+    program = steps._learn.lower(states, steps._keys(2, 0), 1, simulated, False).as_text()
+    assert f"2x{n}x" in program and f"{members}x{n}x" not in program
+
+
+def test_simulate_plays_whole_episodes_with_more_and_more_random_actions():
+    pool = envs.sample_worlds(ENV, jax.random.key(0), 4)
+    still = Policy(lambda: (), lambda params, carry, obs, key, *, explore: (params[None], carry), lambda *_: 0.0)
+    made = train.simulate(ENV, still, pool, PRIORS, jax.random.key(1), Simulation(600, 0.8), gamma=GAMMA)
+    assert made.returns.shape == (2, 50) and (made.replay.size > 100).all()
+    for p, own in enumerate(PRIORS):
+        data = made.of(p).draw(jax.random.key(2), 4000)
+        kept = np.isclose(data.action[:, 0], own)
+        assert kept.mean() == pytest.approx(0.6, abs=0.1)  # shares rise from 0 to 0.8
+        held = np.asarray(made.replay.data.action[p, :, 0])[: int(made.replay.size[p])]
+        third = len(held) // 3
+        assert np.isclose(held[:third], own).mean() > np.isclose(held[-third:], own).mean() + 0.3
+    assert np.unique(np.asarray(data.discount)).tolist() == pytest.approx([0.0, 0.9])
+    np.testing.assert_allclose(made.of(1).returns, made.returns[1])
