@@ -151,7 +151,7 @@ SCENE = workcell.scene(
     success=success,
     check=check,
     dress=workcell.dress,
-    view=View((0.30, 0.0, 0.52), 1.0, 125.0, -12.0, 0.0),
+    view=View((0.33, 0.0, 0.58), 0.75, 122.0, -14.0, 0.0),
 )
 
 

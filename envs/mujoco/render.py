@@ -15,7 +15,7 @@ from sgft_jax.types import UserError
 FPS = 10
 SPEED = 2  # times real time: a graphics library without a graphics card needs 0.2 s a frame
 SIZE = 360, 480  # height, width in pixels
-CAPTION = 44  # pixels, height of the strip above a captioned video
+CAPTION = 52  # pixels, height of the strip above a captioned video
 JUMP = 0.5  # m or rad in one control step: an event, such as a puck that fell, and nothing to draw in between
 SUPERSAMPLING = 2  # drawn so many times larger, then averaged: smooth edges on every backend
 _NO_CONTACT = {"contype": 0, "conaffinity": 0}
@@ -151,7 +151,7 @@ def _caption(text: str) -> np.ndarray:
 
     strip = Image.new("RGB", (SIZE[1], CAPTION), (28, 30, 36))
     draw = ImageDraw.Draw(strip)
-    size = 24.0
+    size = 32.0
     while draw.textlength(text, font=ImageFont.load_default(size)) > SIZE[1] - 24 and size > 8:
         size -= 1.0
     middle = SIZE[1] / 2, CAPTION / 2
