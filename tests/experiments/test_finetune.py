@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -20,7 +19,7 @@ from priors_by_hand import save_prior
 import envs
 from envs import gaps
 from envs.rollout import Episode, play_episode
-from experiments import cli, evaluate, finetune, finetune_run
+from experiments import cli, evaluate, finetune
 from experiments.finetune_args import FinetuneArgs, run_folder
 from experiments.finetune_record import Record
 from experiments.recorded import Recorded
@@ -215,8 +214,8 @@ def test_the_policies_are_what_the_run_evaluated(home):
 
 
 @pytest.mark.slow
-def test_a_planner_leaves_priors_that_plan(home):
-    """The card says how."""
+def test_a_planner_leaves_priors_that_plan(home, tmp_path):
+    """The card says how, until a method that does not plan goes on from there."""
     tuned = load_prior(run(home, "sgft-mpc") / "policy/seed-1", task="toy")
     prior, card = tuned.params, tuned.card
     assert card["plan"] == {"horizon": 1, "samples": 24, "noise": 0.5}
@@ -227,19 +226,19 @@ def test_a_planner_leaves_priors_that_plan(home):
     assert not np.allclose(planned, reflex, atol=0.01)
     jax.tree.map(np.testing.assert_array_equal, (before.actor, before.value), (prior.actor, prior.value))
     assert not np.array_equal(*(p.dynamics["Dense_0"]["kernel"] for p in (before, prior)))
+    arguments = argv(home, "sac", "--prior", str(run(home, "sgft-mpc")), "--rollouts", "2", out=tmp_path)
+    finetune.main(arguments)
+    assert not load_prior(tmp_path / "finetune/toy/turned/sac/seeds-0-1/policy/seed-0").card["plan"]
 
 
 def test_without_a_prior(home, tmp_path):
-    """Of two seeds each has networks of its own, those of RLPD."""
-    arguments = argv(home, "sac", "--rollouts", "2", "--eval-episodes", "2", out=tmp_path)
-    finetune.main([*arguments, "--prior", "none"])
-    folder = tmp_path / "finetune/toy/turned/sac/seeds-0-1"
-    one, two = (load_prior(folder / f"policy/seed-{seed}", task="toy", obs_dim=4, act_dim=2) for seed in (0, 1))
-    assert one.card["network"]["hidden"] == [256, 256] and one.params.value is None
-    assert not np.array_equal(one.params.actor["Dense_0"]["kernel"], two.params.actor["Dense_0"]["kernel"])
-    env = toy.make()
-    policy = make_policy(one.card, env)
-    action, _ = policy.act(one.params, policy.init_carry(), jnp.zeros(4), jax.random.key(0), explore=False)
+    """The networks are RLPD's; what is left acts, and says what it is of."""
+    finetune.main([*argv(home, "sac", "--rollouts", "2", seeds=1, out=tmp_path), "--prior", "none"])
+    folder = tmp_path / "finetune/toy/turned/sac/seed-0/policy/seed-0"
+    found = load_prior(folder, task="toy", obs_dim=4, act_dim=2)
+    assert found.card["network"]["hidden"] == [256, 256] and found.params.value is None
+    policy = make_policy(found.card, toy.make())
+    action, _ = policy.act(found.params, policy.init_carry(), jnp.zeros(4), jax.random.key(0), explore=False)
     assert action.shape == (2,) and np.isfinite(action).all()
 
 
@@ -402,7 +401,6 @@ def test_no_rollout_of_a_real_system_is_replaced_because_another_lacks_it(tmp_pa
     [
         (["--method", "sgft-sca"], "did you mean 'sgft-sac'?"),
         (["--task", "toi"], "did you mean 'toy'?"),
-        (["--preset", "fats"], "pretrain/toy/fats: holds no prior; make one with"),
         (["--real", "mild"], "toy has no gap 'mild'"),
         (["--real", "nowhere.toml"], "nowhere.toml: no such file"),
         (["--set", "latensy=0.1"], "did you mean 'latency'?"),
