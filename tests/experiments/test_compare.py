@@ -21,7 +21,7 @@ def ran(monkeypatch):
 
     def finetune(args):
         seen.append(args)
-        if (args.task, args.method) == ("insert", "rlpd") or "lacking" in args.real:
+        if (args.task, args.method) == ("insert", "rlpd") or any("lacking" in real for real in args.real):
             raise UserError("holds no prior")
         for real in args.real:
             leave(replace(args, real=(real,)), args.rollouts)
@@ -39,6 +39,13 @@ def leave(args, rollouts, *, killed=False):
         checkpoint.save(folder, rollouts, {}, meta={})
     if rollouts and not killed:
         (folder / "summary.json").write_text(json.dumps({"final": {"rollouts": rollouts}}))
+
+
+def own_gaps(folder, *names):
+    """The files of gaps of one's own."""
+    for name in names:
+        (folder / f"{name}.toml").touch()
+    return tuple(str(folder / f"{name}.toml") for name in names)
 
 
 def names(runs):
@@ -61,15 +68,16 @@ def test_what_is_missing_runs_and_what_is_finished_stays(tmp_path, ran, capsys):
 
 def test_real_systems_that_got_equally_far_go_on_together(tmp_path, ran, capsys):
     """Of five, one is finished, two were killed after 6 rollouts, one after 8, one has not begun."""
-    reals = ("mild", "default", "hard", "soft", "new")
+    soft, new = own_gaps(tmp_path, "soft", "new")
+    reals = ("mild", "default", "hard", soft, new)
     grid = {**GRID, "tasks": ("push",), "methods": ("sac",), "reals": reals, "out": tmp_path}
     for cell, done in zip(compare.cells(compare.CompareArgs(**grid)), (10, 6, 8, 6), strict=False):
         leave(cell.args, done, killed=done < 10)
     compare.compare(compare.CompareArgs(**grid))
     assert [(run.real, run.resume) for run in ran] == [
-        (("default", "soft"), True),
+        (("default", soft), True),
         (("hard",), True),
-        (("new",), False),
+        ((new,), False),
     ]
     printed = capsys.readouterr().out.splitlines()
     assert printed[:2] == ["finished   push/mild: sac, step 10", "unfinished push/default: sac, step 6"]
@@ -80,9 +88,10 @@ def test_real_systems_that_got_equally_far_go_on_together(tmp_path, ran, capsys)
 
 
 def test_what_one_real_system_lacks_does_not_stop_the_others(tmp_path, ran):
-    args = compare.CompareArgs(tasks=("push",), methods=("sac",), reals=("mild", "lacking", "hard"), out=tmp_path)
+    (lacking,) = own_gaps(tmp_path, "lacking")
+    args = compare.CompareArgs(tasks=("push",), methods=("sac",), reals=("mild", lacking, "hard"), out=tmp_path)
     assert compare.compare(args) == ["push/lacking: sac: holds no prior"]
-    assert [run.real for run in ran] == [args.reals, ("mild",), ("lacking",), ("hard",)]
+    assert [run.real for run in ran] == [args.reals, ("mild",), (lacking,), ("hard",)]
     assert [cell.state for cell in compare.cells(args)] == ["finished", "missing", "finished"]
 
 
