@@ -32,33 +32,10 @@ _LAZY = {
 }
 
 __all__ = [
-    "TASKS",
-    "Domain",
-    "EffectRange",
-    "Effects",
-    "Entry",
-    "Env",
-    "EnvState",
-    "Episode",
-    "Fleet",
-    "Gap",
-    "Parameter",
-    "Theta",
-    "World",
-    "effects",
-    "gaps",
-    "launch",
-    "make",
-    "name_of",
-    "packed",
-    "play_episode",
-    "rollout",
-    "sample_worlds",
-    "scene",
-    "step_fleet",
-    "uniform",
-    "unpack",
-]
+    "TASKS", "Domain", "EffectRange", "Effects", "Entry", "Env", "EnvState", "Episode", "Fleet", "Gap", "Parameter",
+    "Theta", "World", "effects", "gaps", "launch", "make", "name_of", "packed", "play_episode", "rollout",
+    "sample_worlds", "scene", "step_fleet", "uniform", "unpack",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

@@ -20,7 +20,7 @@ from experiments.stacking import part
 from sgft_jax import api, mesh, train
 from sgft_jax.api import Setup
 from sgft_jax.io import runs
-from sgft_jax.io.config import config_to_json
+from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.priors import digest, load_priors
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.methods.options import card_of
@@ -38,7 +38,7 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
     for prior in priors:
         api.check_prior(prior, method.prior, env)
     # Every folder is that of a run on its real system alone: either kind of run continues the other.
-    homes = {run_folder(args, name): config_to_json(args) | {"real": name} for name in args.real}
+    homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in args.real}
     opened = runs.open_runs(
         homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
         inputs={"priors": [digest(prior) for prior in priors]},

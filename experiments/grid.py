@@ -11,8 +11,7 @@ from experiments.finetune import finetune
 from experiments.finetune_args import VOLATILE, FinetuneArgs, arguments, label, run_folder
 from experiments.options import Impl, check_task, seed_list, without_repeats
 from sgft_jax import extend
-from sgft_jax.io.config import config_to_json
-from sgft_jax.io.jsonfile import read_json
+from sgft_jax.io.jsonfile import jsonable, read_json
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.io.runs import CONFIG, InUseError, check_same, in_use
 from sgft_jax.methods import NAMES, get_method
@@ -107,7 +106,7 @@ def check_begun(cells: Iterable[Cell]) -> None:
     for cell in cells:
         if cell.state != "missing":
             (real,) = cell.args.real
-            check_same(cell.folder, "finetune", config_to_json(cell.args) | {"real": real}, VOLATILE)
+            check_same(cell.folder, "finetune", jsonable(cell.args) | {"real": real}, VOLATILE)
 
 
 def work(cells: Sequence[Cell], args: GridArgs) -> list[str]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from envs.base import Domain, Env, EnvState, World
 from envs.domains.uniform import uniform
 from envs.rollout import Fleet, launch, step_fleet
-from sgft_jax.io.config import config_to_json
+from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.mesh import split, whole
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import precision
@@ -162,10 +162,10 @@ def prior_card(env: Env, config: PretrainConfig) -> dict[str, Any]:
         "algorithm": config.algorithm,
         "obs_dim": env.obs_dim,
         "act_dim": env.act_dim,
-        "network": config_to_json(config.network),
+        "network": jsonable(config.network),
         "ensemble_size": config.ensemble_size,
         "gamma": config.gamma,
-        "config": config_to_json(config),
+        "config": jsonable(config),
         "observation": [e._asdict() for e in env.observation],
         "action": [e._asdict() for e in env.action],
         "control_dt": env.control_dt,

@@ -60,13 +60,14 @@ def shape(imagination: Imagination, batch: Batch, key: Key) -> Batch:
     return batch._replace(reward=jax.vmap(lambda row: shaped_reward(imagination, row))(batch))
 
 
-def clip(bound: float) -> Transform:
-    """Keeps every reward in [-bound, bound].
+def clip(bound: float | None) -> Transform:
+    """Keeps every reward in [-bound, bound]; None leaves it as it is.
 
     V_sim falls off a cliff where a task can be lost for good, such as a puck over the edge. One such row outweighs a
     thousand others in a squared error, and its sign is all that a policy needs.
     """
-    return stateless(lambda imagination, batch, key: batch._replace(reward=jnp.clip(batch.reward, -bound, bound)))
+    limit = jnp.inf if bound is None else bound
+    return stateless(lambda imagination, batch, key: batch._replace(reward=jnp.clip(batch.reward, -limit, limit)))
 
 
 # --- horizons ---------------------------------------------------------------------------------------------------------

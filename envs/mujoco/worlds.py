@@ -23,15 +23,8 @@ _COSMETIC = ("geom_rgba", "mat_", "light_", "cam_")
 Impl = Literal["auto", "jax", "warp", "c"]  # see `choose_impl`
 IMPL_VARIABLE = "SGFT_IMPL"
 _STRUCTURE = (
-    "body_parentid",
-    "jnt_type",
-    "geom_type",
-    "geom_bodyid",
-    "actuator_trnid",
-    "pair_geom1",
-    "pair_geom2",
-    "pair_dim",
-)
+    "body_parentid", "jnt_type", "geom_type", "geom_bodyid", "actuator_trnid", "pair_geom1", "pair_geom2", "pair_dim",
+)  # fmt: skip
 
 
 class PhysicsState(NamedTuple):

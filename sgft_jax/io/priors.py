@@ -12,8 +12,7 @@ import numpy as np
 
 from sgft_jax import mesh
 from sgft_jax.io import checkpoint
-from sgft_jax.io.config import differences
-from sgft_jax.io.jsonfile import read_json, write_json
+from sgft_jax.io.jsonfile import differences, read_json, write_json
 from sgft_jax.types import Normalizer, Prior, PyTree, UserError
 
 CARD = "prior.json"

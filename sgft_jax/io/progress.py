@@ -54,10 +54,6 @@ class RunProgress:
         else:
             self._console.print(f"{self._title}: {words}", highlight=False, markup=False)
 
-    def say(self, message: str) -> None:
-        """Print a line without breaking the bar."""
-        self._console.print(message, highlight=False, markup=False)
-
     def _counts(self) -> str:
         return f"{self._done:,}/{self._total:,} {self._unit} ({100 * self._done / max(self._total, 1):.0f} %)"
 

@@ -45,7 +45,6 @@ class SACConfig:
     train_critic: False keeps the critic as it is (a frozen-critic actor-critic).
     critics: members of the critic ensemble. target_critics: a target is the minimum over so many random ones of them,
         None = all (REDQ, RLPD). actor_mean: the actor follows the members' mean, not their minimum (RLPD).
-    entropy_in_target: count the entropy of the next action in the target, as SAC does.
     critic_baseline: Q(s, a) = net(s, a) - V(s) with V frozen: what a kept critic means under shaped rewards.
     actor_batch: leading rows of the batch that the actor learns from, None = all.
     policy_delay: critic updates per update of actor and temperature. max_grad_norm: per network, None = no clipping.
@@ -64,7 +63,6 @@ class SACConfig:
     critics: int = 2
     target_critics: int | None = None
     actor_mean: bool = False
-    entropy_in_target: bool = True
     critic_baseline: bool = False
     actor_batch: int | None = None
     policy_delay: int = 1
@@ -269,7 +267,6 @@ def _update_critic(
     def target(row: Batch, key: Key) -> Array:
         action, log_prob = tanh_gaussian_sample(parts.actor.apply(state.actor.params, row.next_obs), key)
         next_q = critic(state.target_critic, row.next_obs, action)[counted]
-        log_prob = log_prob if config.entropy_in_target else jnp.zeros_like(log_prob)
         return losses.td_target(row.reward, row.discount, next_q, log_prob, alpha=alpha)
 
     targets = jax.vmap(target)(batch, jax.random.split(key, batch.reward.shape[0]))

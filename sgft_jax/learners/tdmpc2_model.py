@@ -59,7 +59,6 @@ class TDMPC2Config:
         iterations None = 6, and 8 from 20 action entries on.
     sgft: encoder, critic and a copy of the first policy never change. They make V_sim, the frozen value that ends plans
         and teaches the policy; dynamics, reward head and policy learn. False: everything learns, as published.
-    train_encoder: with sgft, learn the encoder, too. An ablation: the frozen critic then reads latents that drift.
     """
 
     obs_dim: int
@@ -74,7 +73,6 @@ class TDMPC2Config:
     policy_samples: int = 24
     iterations: int | None = None
     sgft: bool = False
-    train_encoder: bool = False
 
     def __post_init__(self) -> None:
         for name in ("obs_dim", "act_dim", "horizon", "simnorm_group"):
@@ -88,8 +86,6 @@ class TDMPC2Config:
             raise UserError(f"TD-MPC2 option dropout is {self.dropout}: must be in [0, 1)")
         if not 0 <= self.policy_samples < self.samples:
             raise UserError(f"TD-MPC2 option policy_samples is {self.policy_samples}: must be in [0, {self.samples=})")
-        if self.train_encoder and not self.sgft:
-            raise UserError("TD-MPC2 option train_encoder belongs to sgft: without it the encoder always learns")
         _ = self.planner  # complains about the rest
 
     @property
@@ -101,9 +97,7 @@ class TDMPC2Config:
     @property
     def learned(self) -> tuple[str, ...]:
         """The networks of the world model that learn; one limit on their gradients' common norm."""
-        if not self.sgft:
-            return ("encoder", "dynamics", "reward", "critic")
-        return ("encoder", "dynamics", "reward") if self.train_encoder else ("dynamics", "reward")
+        return ("dynamics", "reward") if self.sgft else ("encoder", "dynamics", "reward", "critic")
 
 
 def named_config(obs_dim: int, act_dim: int, *, size: str, plan_samples: int, **structure: Any) -> TDMPC2Config:

@@ -30,12 +30,10 @@ def test_plain_lines_give_rate_and_time_left_after_the_chunk_that_compiles(monke
         shown.advance(100, {"success": 0.5})
         clock.now += 8
         shown.advance(100)
-        shown.say("checkpoint [1]")
     assert console.file.getvalue().splitlines() == [
         "pretrain: 500/1,000 steps (50 %)  success 0.25",
         "pretrain: 600/1,000 steps (60 %), 50 steps/s, 0:00:08 left  success 0.5",
         "pretrain: 700/1,000 steps (70 %), 20 steps/s, 0:00:15 left",
-        "checkpoint [1]",
     ]
 
 
@@ -43,9 +41,8 @@ def test_live_bar_on_a_terminal():
     console = Console(file=io.StringIO(), width=120, force_terminal=True)
     with RunProgress("finetune", total=100, unit="transitions", console=console) as shown:
         shown.advance(40, {"success": 0.5})
-        shown.say("hello")
     written = console.file.getvalue()
-    assert "40/100 transitions" in written and "success 0.5" in written and "hello" in written
+    assert "40/100 transitions" in written and "success 0.5" in written
 
 
 @pytest.mark.parametrize(
