@@ -39,6 +39,7 @@ from sgft_jax.pretraining import (
     memory,
     pretrain,
     prior_card,
+    seed_keys,
     shapes,
     world_keys,
 )
@@ -252,7 +253,7 @@ class _Run:
         measure = functools.partial(
             make_report, self.env, self.policy, gamma=self.config.gamma, trajectories=self.config.eval_episodes
         )
-        report = jax.jit(jax.vmap(measure))(self.pools(0), params, stacking.seed_keys(self.seeds, _REPORT))
+        report = jax.jit(jax.vmap(measure))(self.pools(0), params, seed_keys(self.seeds, _REPORT))
         return jax.tree.map(np.asarray, mesh.local(report))
 
     def _film(self, played: Episode) -> str:

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from sgft_jax import checks
 from sgft_jax.learners import losses, optim
 from sgft_jax.models import dynamics, normalizer
 from sgft_jax.models.networks import (
@@ -71,13 +72,9 @@ class SACConfig:
     def __post_init__(self) -> None:
         if self.critic_baseline and self.train_value:
             raise UserError("SAC option critic_baseline needs a frozen value network: set train_value to False")
-        for name in ("policy_delay", "critics"):
-            if getattr(self, name) < 1:
-                raise UserError(f"SAC option {name} is {getattr(self, name)}: must be at least 1")
-        if self.target_critics is not None and not 1 <= self.target_critics <= self.critics:
-            raise UserError(
-                f"SAC option target_critics is {self.target_critics}: must be 1 to {self.critics} (critics)"
-            )
+        checks.at_least(self, 1, "policy_delay", "critics", "target_critics")
+        if (self.target_critics or 1) > self.critics:
+            raise checks.refusal("target_critics", self.target_critics, f"at most critics, {self.critics}")
 
 
 class SACHyper(NamedTuple):

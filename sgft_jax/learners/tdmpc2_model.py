@@ -14,6 +14,7 @@ import optax
 from flax import linen as nn
 from flax import struct
 
+from sgft_jax import checks
 from sgft_jax.learners import optim
 from sgft_jax.models import normalizer, twohot
 from sgft_jax.models.networks import Network, precision, tanh_gaussian_action
@@ -75,17 +76,14 @@ class TDMPC2Config:
     sgft: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("obs_dim", "act_dim", "horizon", "simnorm_group"):
-            if getattr(self, name) < 1:
-                raise UserError(f"TD-MPC2 option {name} is {getattr(self, name)}: must be at least 1")
+        checks.at_least(self, 1, "obs_dim", "act_dim", "horizon", "simnorm_group")
+        checks.below_one(self, "dropout")
         if self.size.latent % self.simnorm_group:
             raise UserError(f"TD-MPC2 latent size {self.size.latent}: not a multiple of {self.simnorm_group=}")
         if self.size.members < 2:
             raise UserError(f"TD-MPC2 size members is {self.size.members}: targets take the lower of 2")
-        if not 0 <= self.dropout < 1:
-            raise UserError(f"TD-MPC2 option dropout is {self.dropout}: must be in [0, 1)")
         if not 0 <= self.policy_samples < self.samples:
-            raise UserError(f"TD-MPC2 option policy_samples is {self.policy_samples}: must be in [0, {self.samples=})")
+            raise checks.refusal("policy_samples", self.policy_samples, f"from 0 to less than samples, {self.samples}")
         _ = self.planner  # complains about the rest
 
     @property

@@ -5,6 +5,7 @@ It goes through every engine that is here.
 
 import os
 
+import c_reference as reference
 import jax
 import jax.numpy as jnp
 import mediapy
@@ -15,7 +16,6 @@ import pytest
 import envs
 from envs.base import Entry, Parameter
 from envs.franka import push
-from envs.mujoco import host as reference
 from envs.mujoco import render
 from envs.mujoco.engines import mjx as engine_jax
 from envs.mujoco.engines import warp as engine_warp

@@ -276,5 +276,5 @@ def test_a_prior_of_another_shape_is_refused(prior):
 def test_impossible_options_are_refused():
     with pytest.raises(UserError, match="critic_baseline"):
         sac.SACConfig(1, 1, critic_baseline=True)
-    with pytest.raises(UserError, match="policy_delay"):
+    with pytest.raises(UserError, match="policy-delay"):
         sac.SACConfig(1, 1, policy_delay=0)

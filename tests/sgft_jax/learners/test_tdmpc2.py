@@ -460,7 +460,7 @@ def test_impossible_options_are_refused(key):
         ({"simnorm_group": 5}, "latent size 16"),
         ({"size": dataclasses.replace(SIZE, members=1)}, "members is 1"),
         ({"dropout": 1.0}, "dropout"),
-        ({"policy_samples": 32}, "policy_samples is 32"),
+        ({"policy_samples": 32}, "policy-samples is 32"),
         ({"elites": 33}, "elites is 33"),
     ):
         with pytest.raises(UserError, match=match):

@@ -92,7 +92,7 @@ def test_what_comes_later_is_discounted(plan):
 
 @pytest.mark.parametrize("options", [{"horizon": 0}, {"samples": 7}])
 def test_plans_that_cannot_be(options):
-    with pytest.raises(UserError, match=f"planner option {next(iter(options))} is"):
+    with pytest.raises(UserError, match=f"option {next(iter(options))} is"):
         mpc.MPCConfig(1, 1, NET, **options)
 
 
