@@ -151,6 +151,12 @@ def fail(message: str) -> NoReturn:
     sys.exit(USER_ERROR)
 
 
+def columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """A line for each row of a table, cells of a column below each other."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
 def choose[V](kind: str, name: str, options: dict[str, V]) -> V:
     """`options[name]`; raises UserError with the closest match and the list of what exists."""
     if name in options:
