@@ -141,7 +141,8 @@ class _Run:
 
     def _finish(self, progress: FinetuneProgress) -> list[dict[str, Any]]:
         """Policies, summaries, figures and films."""
-        best, card = progress.best, {**self.card, **self.finetuner.card}
+        best = progress.best
+        card = {**self.card, "plan": None, **self.finetuner.card}  # the prior may be one that plans
         last = jax.jit(jax.vmap(self.finetuner.export))(progress.agent)
         played = train.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, self.args.eval_episodes)
         facts = {"score": scores(played)["score"], "evidence": best.score, "rollouts": best.rollouts}
