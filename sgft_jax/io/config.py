@@ -77,7 +77,7 @@ def _from_json(hint: Any, value: Any, where: str) -> Any:
 
 
 def _from_union(kinds: tuple[Any, ...], value: Any, where: str) -> Any:
-    """The first member that fits; dataclasses are told apart by the names of their fields."""
+    """The first member that fits; dataclasses differ by the names of their fields."""
     failure = None
     for kind in kinds:
         try:
