@@ -1,4 +1,4 @@
-from .api import ActingPolicy, Setup, evaluate_prior, load_policy, setup
+from .api import ActingPolicy, Setup, evaluate_prior, finetuned_priors, load_policy, setup
 from .data import replay, sequences, sources
 from .finetuner import FinetuneState, Parts, assemble, sac_finetuner
 from .io.priors import load_prior, save_prior
@@ -82,6 +82,7 @@ __all__ = [
     "evaluate_prior",
     "extract_params",
     "finetune",
+    "finetuned_priors",
     "get_method",
     "load_policy",
     "load_prior",

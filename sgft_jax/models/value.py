@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.models.networks import Network, Precision, precision
+from sgft_jax.models.networks import Network, precision
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.types import Array, Metrics, Normalizer, PyTree
 
