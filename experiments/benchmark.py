@@ -31,15 +31,15 @@ class BenchmarkConfig:
     parts: tuple[Part, ...] = ("physics", "updates", "plain")
     """Kinds of measurements."""
     tasks: tuple[str, ...] = ("push", "hammer", "insert")
-    """Tasks, of all but updates and plain."""
+    """Tasks to measure on, for all parts but updates and plain."""
     worlds: tuple[int, ...] = (1024,)
-    """Worlds stepped together; in devices, by each device."""
+    """Worlds stepped together; for devices, on each device."""
     impls: tuple[Impl, ...] = ("auto",)
-    """Engines of physics."""
+    """Physics engines."""
     control_steps: int = 10
     """Control steps (of 0.2 s) per timed call; at most half an episode."""
     batches: tuple[int, ...] = (256,)
-    """Batch sizes of the updates; in devices, of each device."""
+    """Batch sizes of the updates; for devices, on each device."""
     seeds: tuple[int, ...] = (1,)
     """Agents updated, pretrained or fine-tuned together."""
     precisions: tuple[Precision, ...] = ("default",)
@@ -51,15 +51,15 @@ class BenchmarkConfig:
     repeats: int = 3
     """Timed calls; the fastest counts."""
     preset: str = "fast"
-    """Of pretrain and devices."""
+    """Pretraining preset, for pretrain and devices."""
     env_steps: int | None = None
-    """Of pretrain, and of each device in devices; default: the preset's."""
+    """Environment steps, for pretrain and for each device in devices; default: the preset's."""
     devices: tuple[int, ...] = (1,)
-    """Numbers of devices; the smallest is what the others are compared with."""
+    """Numbers of devices; all are compared with the smallest."""
     prior: Path | None = None
     """Folder of the priors that finetune starts from."""
     rollouts: int = 30
-    """Of finetune."""
+    """Real rollouts, for finetune."""
     out: Path = Path("runs")
     """The numbers go to <out>/benchmark/summary.json."""
 

@@ -1,4 +1,4 @@
-"""Success and return of policies in held-out worlds, and the numbers that are told of them."""
+"""Success and return of policies in held-out worlds, and how they are summarised."""
 
 from collections.abc import Callable
 from typing import Any

@@ -43,7 +43,7 @@ class GridArgs:
     dry: bool = False
     """Only list the runs and what is missing."""
     impl: Impl = "auto"
-    """Who steps the physics, as in fine-tuning."""
+    """Physics engine, as in fine-tuning."""
     devices: int | None = None
     """Devices that share the seeds; 0: all there are; default: one."""
     out: Path = Path("runs")
@@ -112,7 +112,7 @@ def check_begun(cells: Iterable[Cell]) -> None:
 def work(cells: Sequence[Cell], args: GridArgs) -> list[str]:
     """Lists the cells, then runs those that are missing, in order; returns a line for each that could not run.
 
-    Several processes may work on one grid: what another one has finished or is at is left to it.
+    Several processes may work on one grid: each skips cells that another has finished or is running.
     """
     started, failed = time.monotonic(), []
     for cell in cells:

@@ -1,4 +1,4 @@
-from .api import ActingPolicy, Setup, evaluate_prior, load_policy, setup
+from .api import ActingPolicy, Setup, evaluate_prior, finetuned_priors, load_policy, setup
 from .data import replay, sequences, sources
 from .finetuner import FinetuneState, Parts, assemble, sac_finetuner
 from .io.priors import load_prior, save_prior
@@ -40,8 +40,8 @@ __all__ = [
     "PretrainConfig", "PretrainState", "Prior", "SACConfig", "SACHyper", "SACParams", "SACState", "Setup", "Simulated",
     "SimulatedData", "Simulation", "Source", "System", "TDMPC2Config", "TDMPC2Hyper", "TDMPC2Params", "TDMPC2State",
     "Task", "Transform", "Transition", "UserError", "all_methods", "assemble", "branch", "clip", "compose", "evaluate",
-    "evaluate_prior", "extract_params", "finetune", "get_method", "load_policy", "load_prior", "make_iql",
-    "make_policy", "make_sac", "make_tdmpc2", "mpc_policy", "normalizer", "pretrain", "priors_of", "relabel", "replay",
-    "sac_finetuner", "sac_policy", "save_prior", "sequences", "setup", "shape", "shaped_reward", "shorten", "simulate",
-    "sources", "state_from_prior", "stateless", "tdmpc2_policy",
+    "evaluate_prior", "extract_params", "finetune", "finetuned_priors", "get_method", "load_policy", "load_prior",
+    "make_iql", "make_policy", "make_sac", "make_tdmpc2", "mpc_policy", "normalizer", "pretrain", "priors_of",
+    "relabel", "replay", "sac_finetuner", "sac_policy", "save_prior", "sequences", "setup", "shape", "shaped_reward",
+    "shorten", "simulate", "sources", "state_from_prior", "stateless", "tdmpc2_policy",
 ]  # fmt: skip

@@ -57,7 +57,7 @@ def check_supported(name: str, host: mujoco.MjModel) -> None:
 
 
 def choose_impl(wanted: str = "auto") -> str:
-    """Who steps the physics: "jax" (MJX's own code), "warp" (MuJoCo Warp) or "c" (MuJoCo's own engine).
+    """The physics engine: "jax" (MJX's own code), "warp" (MuJoCo Warp) or "c" (MuJoCo's own engine).
 
     wanted: one of them, or "auto": what $SGFT_IMPL says, or else the fastest (docs/performance.md), which is "c" where
         JAX computes on CPUs, "warp" on NVIDIA GPUs where it is installed, "jax" elsewhere. Raises UserError for
