@@ -66,9 +66,11 @@ class Record:
 
     def save_policies(self, kind: str, params: PyTree, card: Mapping[str, Any]) -> None:
         """Policies [S] in the form of priors: <kind>/seed-<k>. kind: `policy`, the last ones, or `best`."""
+        own = {"task": self.env.name, "obs_dim": self.env.obs_dim, "act_dim": self.env.act_dim}
         for i, seed in enumerate(self.seeds):
             facts = {"method": self.method, "gap": self.gap._asdict(), "seed": seed, "which": kind}
-            save_prior(self.folder / kind / f"seed-{seed}", Prior(member(params, i), {**card, "finetuned": facts}))
+            prior = Prior(member(params, i), {**card, **own, "finetuned": facts})
+            save_prior(self.folder / kind / f"seed-{seed}", prior)
 
     def summarise(self, best: Mapping[str, np.ndarray]) -> dict[str, Any]:
         """summary.json, the learning curve and the closing words; the log ends here.

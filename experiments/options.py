@@ -9,14 +9,15 @@ from tyro.conf import arg
 import envs
 from envs import gaps
 from sgft_jax import extend
-from sgft_jax.types import UserError
+from sgft_jax.presets import PRESETS
+from sgft_jax.types import UserError, unknown
 
 LAST_SEED = 2**31 - 1  # larger ones stand for held-out worlds and episodes
 
 Impl = Annotated[
     Literal["auto", "jax", "warp", "c"],
     arg(
-        help="Expert: who steps the physics: MJX's own code, MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or "
+        help="Expert: physics engine: MJX's own code, MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or "
         "else c on a CPU, warp on an NVIDIA GPU where it is installed, jax elsewhere."
     ),
 ]
@@ -80,6 +81,8 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str) -> l
     ]
     if not found and prior:
         raise UserError(f"--prior {prior}: {'holds no prior' if prior.is_dir() else 'no such folder'}")
+    if not found and preset not in PRESETS:
+        raise UserError(unknown("--preset", preset, PRESETS))
     if not found:
         raise UserError(
             f"{home}: holds no prior; make one with: python -m experiments.pretrain --task {task} --preset {preset}"

@@ -2,12 +2,10 @@
 
 from types import SimpleNamespace
 
-import jax
-import numpy as np
 import pytest
 from priors_by_hand import save_prior
 
-from experiments import memory, options, stacking
+from experiments import memory, options
 from experiments.memory import reserve
 from experiments.options import prior_folders, seed_list, seeds_name
 from sgft_jax.types import UserError
@@ -53,12 +51,6 @@ def test_tasks_and_real_systems_are_checked_by_name(tmp_path):
             options.check_task(task, reals)
 
 
-def test_keys_depend_on_seed_and_purpose_alone():
-    keys = jax.random.key_data(stacking.seed_keys([0, 1, 2], 5))
-    np.testing.assert_array_equal(keys[1:], jax.random.key_data(stacking.seed_keys([1, 2], 5)))
-    assert len(np.unique(np.concatenate([keys, jax.random.key_data(stacking.seed_keys([0, 1, 2], 6))]), axis=0)) == 6
-
-
 def test_priors_are_found_in_order(tmp_path):
     home = tmp_path / "pretrain/toy/fast"
     for run, n in (("a", 10), ("a", 9), ("b", 2)):
@@ -72,6 +64,8 @@ def test_advice_where_there_is_no_prior_fits_what_was_asked(tmp_path):
     """Of a task that is a file it repeats the file; where the user names a folder it proposes no task."""
     with pytest.raises(UserError, match=r"toy/cpu: holds no prior; make one with: .*--task my/toy.py --preset cpu"):
         prior_folders(None, out=tmp_path, task="my/toy.py", preset="cpu")
+    with pytest.raises(UserError, match=r"--preset: there is no 'cpus', did you mean 'cpu'"):
+        prior_folders(None, out=tmp_path, task="toy", preset="cpus")
     with pytest.raises(UserError, match=r"--prior .*nowhere: no such folder$"):
         prior_folders(tmp_path / "nowhere", out=tmp_path, task="toy", preset="cpu")
     with pytest.raises(UserError, match=r"--prior .*: holds no prior$"):

@@ -12,7 +12,7 @@ import envs
 from experiments import cli, compare, finetune, grid, tune, tuned
 from experiments.finetune_args import arguments, run_folder
 from sgft_jax.io import checkpoint
-from sgft_jax.io.config import config_to_json
+from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.methods import METHODS, default_settings
 from sgft_jax.types import UserError
 
@@ -47,7 +47,7 @@ def leave(args, success, *, rollouts=(0, 5, 10)):
     """A finished run: success [evaluations][seeds] after so many rollouts."""
     folder = run_folder(args, *args.real)
     folder.mkdir(parents=True, exist_ok=True)
-    config = {"sgft_jax": "0", "kind": "finetune", "config": config_to_json(args) | {"real": args.real[0]}}
+    config = {"sgft_jax": "0", "kind": "finetune", "config": jsonable(args) | {"real": args.real[0]}}
     (folder / "config.json").write_text(json.dumps(config))
     final = {"final": {"rollouts": rollouts[-1]}, "gap": {"name": args.real[0]}}
     (folder / "summary.json").write_text(json.dumps(final))

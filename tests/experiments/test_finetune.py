@@ -1,0 +1,574 @@
+"""The fine-tuning command end to end, on a point mass whose force is turned by 30 degrees in reality."""
+
+import dataclasses
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toy
+from priors_by_hand import save_prior
+
+import envs
+from envs import gaps
+from envs.rollout import Episode, play_episode
+from experiments import cli, evaluate, finetune
+from experiments.finetune_args import FinetuneArgs, run_folder
+from experiments.finetune_record import Record
+from experiments.recorded import Recorded
+from sgft_jax import train
+from sgft_jax.io import checkpoint, runs
+from sgft_jax.io.log import read_jsonl
+from sgft_jax.io.priors import load_prior
+from sgft_jax.io.real import RealStore
+from sgft_jax.methods import get_method
+from sgft_jax.policies import make_policy
+from sgft_jax.systems.simulated import Simulated
+from sgft_jax.types import Transition, UserError
+
+TESTS = Path(__file__).parent.parent
+GAP = "[params]\nmass = 2.0\nfriction = 4.0\n[effects]\naction_rotation = 0.52\n"
+COMMON = "--task toy --rollouts 5 --eval-every 2 --eval-episodes 8 --checkpoint-every 3 --no-video"
+# A method gets those that it has.
+SMALL = {
+    "initial_rollouts": 2, "utd": 0.5, "batch_size": 16, "branches": 2, "critic_warmup": 0, "actor_ramp": 0,
+    "replay_capacity": 256, "simulated_transitions": 390, "offline_updates": 20, "plan_samples": 24,
+}  # fmt: skip
+START = """
+import os, signal, sys
+import envs
+envs.TASKS["toy"] = "toy"
+from experiments import finetune
+from experiments.finetune_record import Record
+from sgft_jax import train
+from sgft_jax.io.real import RealStore
+def die():
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+STORED = """
+append = RealStore.append
+def stored(self, rollout):
+    if append(self, rollout) == 3:
+        die()
+RealStore.append = stored
+"""
+LOGGED = """
+metrics = Record.metrics
+def logged(self, done, values):
+    metrics(self, done, values)
+    if done == 5:
+        die()
+Record.metrics = logged
+"""
+OFFLINE = """
+train.OFFLINE_PART = 10
+checkpoint = Record.checkpoint
+def offline(self, progress):
+    checkpoint(self, progress)
+    if int(progress.offline) == 20:
+        die()
+Record.checkpoint = offline
+"""
+
+
+@pytest.fixture(autouse=True)
+def _toy(monkeypatch):
+    monkeypatch.setitem(envs.TASKS, "toy", "toy")
+    monkeypatch.setattr(os, "environ", os.environ.copy())
+    monkeypatch.setattr(cli, "set_up", lambda: None)  # the tests have their own cache and environment
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory):
+    """Two untrained priors and two gaps."""
+    home = tmp_path_factory.mktemp("runs")
+    for seed in (0, 1):
+        save_prior(home / f"pretrain/toy/fast/seeds-0-1/prior/seed-{seed}", seed)
+    (home / "turned.toml").write_text(GAP)
+    (home / "heavy.toml").write_text("[params]\nmass = [1.5, 2.5]\n")  # its worlds vary, those of the other do not
+    return home
+
+
+def small(method):
+    """The options that make a method small, as words."""
+    own = {field.name for field in dataclasses.fields(get_method(method).config)}
+    found = {name: value for name, value in SMALL.items() if name in own}
+    return [word for name, value in found.items() for word in (f"--options.{name.replace('_', '-')}", str(value))]
+
+
+def argv(home, method="sgft-sac", *more, seeds=2, out=None, reals=("turned",)):
+    """Two seeds have a device each."""
+    given = ["--method", method, "--seeds", seeds, "--devices", seeds]
+    given += ["--out", out or home, "--real", *(home / f"{real}.toml" for real in reals)]
+    given += ["--prior", home / "pretrain/toy/fast/seeds-0-1"]
+    return [*COMMON.split(), *small(method), *map(str, given), *more]
+
+
+def run(home, method):
+    """A finished run of two seeds, made once for all tests of the module."""
+    folder = home / "finetune/toy/turned" / method / "seeds-0-1"
+    if not folder.exists():
+        finetune.main(argv(home, method))
+    return folder
+
+
+def rollouts(folder):
+    """The arrays of every real rollout of a run."""
+    store = RealStore(folder)
+    return [store.load(i) for i in range(len(store))]
+
+
+def killed(program, arguments):
+    """Runs a program in a process of its own, which kills itself."""
+    paths = {"PYTHONPATH": f"{TESTS}:{TESTS.parent}", "SGFT_CACHE_DIR": str(TESTS.parent / ".cache/jax")}
+    program = f"{START}{program}\nfinetune.main(sys.argv[1:])"
+    done = subprocess.run([sys.executable, "-c", program, *arguments], env={**os.environ, **paths}, timeout=300)
+    assert done.returncode == -signal.SIGKILL
+
+
+@pytest.fixture
+def explored(monkeypatch):
+    """How many episodes each member has explored on real systems since the test began, [] of numbers."""
+    seen, play = [], Simulated.play
+
+    def counted(self, policy, states, keys, *, explore):
+        seen.extend([keys.shape[1]] * explore)
+        return play(self, policy, states, keys, explore=explore)
+
+    monkeypatch.setattr(Simulated, "play", counted)
+    return seen
+
+
+def complaint(arguments, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        finetune.main(arguments)
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and error.startswith("error: ") and error.count("\n") == 1
+    return error
+
+
+def same_results(one, two):
+    """To the bit: logs, summaries, real rollouts and policies."""
+    for name in ("metrics.jsonl", "eval.jsonl", "summary.json"):
+        assert (one / name).read_bytes() == (two / name).read_bytes(), name
+    jax.tree.map(np.testing.assert_array_equal, rollouts(one), rollouts(two))
+    for name in ("policy/seed-0", "policy/seed-1", "best/seed-0", "best/seed-1"):
+        jax.tree.map(np.testing.assert_array_equal, *(load_prior(folder / name).params for folder in (one, two)))
+
+
+# --- what a run leaves ------------------------------------------------------------------------------------------------
+
+
+def test_a_run_leaves_curve_summary_policies_and_every_rollout(home):
+    folder = run(home, "sgft-sac")
+    curve = read_jsonl(folder / "eval.jsonl")
+    assert [line["rollouts"] for line in curve] == [0, 2, 4, 5]
+    assert [line["step"] for line in curve] == [0, 40, 80, 100]  # 20 steps a rollout
+    assert curve[2]["robot_minutes"] == pytest.approx(4 * 20 * 0.1 / 60)
+    assert [line["rollouts"] for line in read_jsonl(folder / "metrics.jsonl")] == [2, 3, 4, 5]
+    assert all(len(line["success"]) == len(line["score"]) == 2 for line in curve)
+    summary = json.loads((folder / "summary.json").read_text())
+    numbers = {"zero_shot", "final", "deepest_fall", "transitions_until_held", "seeds", "best"}
+    assert set(summary) == {"task", "method", "impl", "gap", "score", *numbers}
+    assert summary["gap"]["effects"] == {"action_rotation": 0.52} and summary["final"]["transitions"] == 100
+    assert summary["score"] == "success" and len(summary["best"]["score"]) == 2
+    real = rollouts(folder)
+    assert len(real) == 5 and real[0]["obs"].shape == (2, 20, 4) and real[0]["valid"].all()
+    assert (folder / "figures/success.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("method", ["sgft-sac", "sac"])
+def test_value_and_statistics_of_the_prior_stay_frozen_and_its_actor_moves(home, method):
+    for seed in (0, 1):
+        before = load_prior(home / f"pretrain/toy/fast/seeds-0-1/prior/seed-{seed}").params
+        tuned = load_prior(run(home, method) / f"policy/seed-{seed}", task="toy")
+        after = tuned.params
+        jax.tree.map(np.testing.assert_array_equal, (before.value, before.normalizer), (after.value, after.normalizer))
+        assert not np.array_equal(before.actor["Dense_0"]["kernel"], after.actor["Dense_0"]["kernel"])
+        assert (tuned.card["finetuned"]["method"], tuned.card["finetuned"]["seed"]) == (method, seed)
+
+
+def test_the_best_policy_is_of_an_earlier_moment(home):
+    """Five rollouts are evidence for the policy that played the last of them: it had learned from four."""
+    folder = run(home, "sac")
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["best"]["rollouts"] == [4, 4] and all(np.isfinite(summary["best"]["evidence"]))
+    last, best = (load_prior(folder / kind / "seed-1") for kind in ("policy", "best"))
+    assert (last.card["finetuned"]["which"], best.card["finetuned"]["which"]) == ("policy", "best")
+    assert not np.array_equal(last.params.actor["Dense_0"]["kernel"], best.params.actor["Dense_0"]["kernel"])
+
+
+def test_the_policies_are_what_the_run_evaluated(home):
+    args = evaluate.EvaluateArgs(run=run(home, "sac"), real=(str(home / "turned.toml"),), episodes=30)
+    (system,) = evaluate.evaluate(args)["systems"]
+    assert [Path(p["policy"]).name for p in system["policies"]] == ["seed-0", "seed-1"]
+    final = read_jsonl(run(home, "sac") / "eval.jsonl")[-1]["return"]
+    assert [p["return"] for p in system["policies"]] == pytest.approx(final, abs=6.0)  # other episodes, 30 and 8
+
+
+@pytest.mark.slow
+def test_a_planner_leaves_priors_that_plan(home, tmp_path):
+    """The card says how, until a method that does not plan goes on from there."""
+    tuned = load_prior(run(home, "sgft-mpc") / "policy/seed-1", task="toy")
+    prior, card = tuned.params, tuned.card
+    assert card["plan"] == {"horizon": 1, "samples": 24, "noise": 0.5}
+    env, before = toy.make(), load_prior(home / "pretrain/toy/fast/seeds-0-1/prior/seed-1").params
+    key, obs = jax.random.key(0), np.array([0.5, -0.5, 0.1, 0.0], np.float32)
+    plans, plain = (make_policy({**card, "plan": plan}, env) for plan in (card["plan"], None))
+    planned, reflex = (p.act(prior, p.init_carry(), obs, key, explore=False)[0] for p in (plans, plain))
+    assert not np.allclose(planned, reflex, atol=0.01)
+    jax.tree.map(np.testing.assert_array_equal, (before.actor, before.value), (prior.actor, prior.value))
+    assert not np.array_equal(*(p.dynamics["Dense_0"]["kernel"] for p in (before, prior)))
+    arguments = argv(home, "sac", "--prior", str(run(home, "sgft-mpc")), "--rollouts", "2", out=tmp_path)
+    finetune.main(arguments)
+    assert not load_prior(tmp_path / "finetune/toy/turned/sac/seeds-0-1/policy/seed-0").card["plan"]
+
+
+def test_without_a_prior(home, tmp_path):
+    """The networks are RLPD's; what is left acts, and says what it is of."""
+    finetune.main([*argv(home, "sac", "--rollouts", "2", seeds=1, out=tmp_path), "--prior", "none"])
+    folder = tmp_path / "finetune/toy/turned/sac/seed-0/policy/seed-0"
+    found = load_prior(folder, task="toy", obs_dim=4, act_dim=2)
+    assert found.card["network"]["hidden"] == [256, 256] and found.params.value is None
+    policy = make_policy(found.card, toy.make())
+    action, _ = policy.act(found.params, policy.init_carry(), jnp.zeros(4), jax.random.key(0), explore=False)
+    assert action.shape == (2,) and np.isfinite(action).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["rlpd", "iql"])
+def test_methods_that_learn_from_the_simulator_too(home, method):
+    """They start from nothing, so the simulator's policy makes the initial rollouts: those of any other method."""
+    mine, others = (rollouts(run(home, name)) for name in (method, "sac"))
+    for i in range(2):
+        np.testing.assert_allclose(mine[i]["obs"], others[i]["obs"], atol=1e-5)
+    assert not np.allclose(mine[2]["obs"], others[2]["obs"], atol=1e-2)
+
+
+def test_all_methods_meet_the_same_real_starts(home):
+    ours, theirs = (rollouts(run(home, method)) for method in ("sgft-sac", "sac"))
+    for i, (a, b) in enumerate(zip(ours, theirs, strict=True)):
+        np.testing.assert_array_equal(a["obs"][:, 0], b["obs"][:, 0])
+        assert np.array_equal(a["action"], b["action"]) == (i < 2)  # the initial rollouts are those of the prior
+    assert len({rollout["obs"][seed, 0].tobytes() for rollout in ours for seed in (0, 1)}) == 10
+
+
+@pytest.mark.slow
+def test_seeds_together_are_seeds_one_by_one(home, tmp_path):
+    both = read_jsonl(run(home, "sgft-sac") / "eval.jsonl")
+    finetune.main(argv(home, "sgft-sac", "--seed", "1", seeds=1, out=tmp_path))
+    alone = read_jsonl(tmp_path / "finetune/toy/turned/sgft-sac/seed-1/eval.jsonl")
+    for a, b in zip(both, alone, strict=True):
+        assert a["return"][1] == pytest.approx(b["return"][0], abs=0.02)
+    assert max(abs(line["return"][0] - line["return"][1]) for line in both) > 0.1
+
+
+def test_a_variant_has_a_folder_beside_its_method():
+    args = FinetuneArgs(task="push", seeds=2, variant="horizon-4")
+    assert run_folder(args, "default") == Path("runs/finetune/push/default/sgft-sac_horizon-4/seeds-0-1")
+
+
+# --- killed and resumed -----------------------------------------------------------------------------------------------
+
+
+def test_what_was_stored_after_the_last_checkpoint_is_replayed_not_collected_again(home, tmp_path, explored):
+    """SIGKILL when rollout 4 of 5 is on disk and the checkpoint is of rollout 3: one rollout is left to play."""
+    arguments = argv(home, "sgft-sac", out=tmp_path)
+    killed(STORED, arguments)
+    cut = tmp_path / "finetune/toy/turned/sgft-sac/seeds-0-1"
+    stored = [path.read_bytes() for path in sorted(cut.glob("real/*"))]
+    assert checkpoint.latest(cut) == 3 and len(read_jsonl(cut / "metrics.jsonl")) == 2 and len(stored) == 4
+
+    whole = run(home, "sgft-sac")
+    explored.clear()
+    finetune.main([*arguments, "--resume"])
+    assert explored == [1]
+    assert [path.read_bytes() for path in sorted(cut.glob("real/*"))][:4] == stored
+    same_results(cut, whole)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["sac", "rlpd", "iql", "sgft-mpc", "sgft-relabel", "sac-online", "frozen-critic"])
+def test_every_learner_killed_and_resumed_is_bit_for_bit_uninterrupted(home, tmp_path, method, explored):
+    """SIGKILL when all rollouts are on disk, and the lines of the last one, but not its checkpoint."""
+    arguments = argv(home, method, out=tmp_path)
+    killed(LOGGED, arguments)
+    cut = tmp_path / "finetune/toy/turned" / method / "seeds-0-1"
+    assert checkpoint.latest(cut) in (3, 4)  # with an offline phase that is a step of its own
+    assert len(RealStore(cut)) == 5 and read_jsonl(cut / "metrics.jsonl")[-1]["rollouts"] == 5
+    whole = run(home, method)
+    explored.clear()
+    finetune.main([*arguments, "--resume"])
+    assert explored == []
+    same_results(cut, whole)
+
+
+@pytest.mark.slow
+def test_killed_in_the_offline_phase_and_resumed_is_bit_for_bit_uninterrupted(home, tmp_path, monkeypatch, capsys):
+    """SIGKILL when one of two real systems has a checkpoint after 20 of 40 updates, the other only after 10."""
+    monkeypatch.setattr(train, "OFFLINE_PART", 10)
+    monkeypatch.setattr("experiments.finetune_record.OFFLINE_PART", 10)
+    more = ["--rollouts", "2", "--options.offline-updates", "40"]
+    whole, parts = (argv(home, "iql", *more, out=tmp_path / o, reals=("turned", "heavy")) for o in ("whole", "parts"))
+    finetune.main(whole)
+    killed(OFFLINE, parts)
+    folders = [tmp_path / f"parts/finetune/toy/{real}/iql/seeds-0-1" for real in ("turned", "heavy")]
+    assert [checkpoint.latest(folder) for folder in folders] == [2, 1]
+    assert "they cannot go on together, resume them one at a time" in complaint([*parts, "--resume"], capsys)
+    for real, folder in zip(("turned", "heavy"), folders, strict=True):
+        finetune.main([*argv(home, "iql", *more, out=tmp_path / "parts", reals=(real,)), "--resume"])
+        assert [line["rollouts"] for line in read_jsonl(folder / "metrics.jsonl")] == [0, 0, 0, 0, 2]
+        agree(folder, tmp_path / "whole" / folder.relative_to(tmp_path / "parts"), upto=2)
+
+
+@pytest.mark.slow
+def test_more_rollouts_continue_a_finished_run(home, tmp_path):
+    finetune.main(argv(home, "sac", "--rollouts", "4", out=tmp_path))
+    finetune.main(argv(home, "sac", "--rollouts", "5", "--resume", out=tmp_path))
+    same_results(tmp_path / "finetune/toy/turned/sac/seeds-0-1", run(home, "sac"))
+
+
+def test_a_rollout_is_on_disk_before_learning_from_it(home, tmp_path, monkeypatch):
+    def crash(*_):
+        raise RuntimeError("the learner died")
+
+    monkeypatch.setattr(train._Steps, "_observe", crash)
+    with pytest.raises(RuntimeError, match="the learner died"):
+        finetune.main(argv(home, "sac", out=tmp_path))
+    real = rollouts(tmp_path / "finetune/toy/turned/sac/seeds-0-1")
+    assert len(real) == 2 and np.isfinite(real[1]["reward"]).all()
+
+
+class Counter:
+    """A system of two members whose rollouts are numbered: observations of the n-th are n and n + 0.5."""
+
+    def __init__(self):
+        self.played = []
+
+    def play(self, policy, states, keys, *, explore):
+        self.played.append(explore)
+        shape, number = (2, keys.shape[1], 3), 10.0 + len(self.played)
+        obs = number + jnp.broadcast_to(jnp.array([0.0, 0.5])[:, None, None, None], (*shape, 2))
+        rows = Transition(obs, jnp.zeros((*shape, 1)), jnp.ones(shape), jnp.ones(shape), obs)
+        each, no = jnp.zeros(shape[:2]), jnp.zeros(shape[:2], bool)
+        return Episode(rows, jnp.ones(shape, bool), each, no, no, each, each.astype(int), jnp.zeros((*shape, 2)))
+
+
+def play(system, *, explore=True):
+    """The first observation of each member's episode."""
+    played = system.play(None, None, jax.random.split(jax.random.key(0), (2, 1)), explore=explore)
+    return played.transitions.obs[:, 0, 0, 0].tolist()
+
+
+def test_a_recorded_system_plays_what_is_missing_and_no_more(tmp_path):
+    store = RealStore(tmp_path)
+    first = Recorded(Counter(), [store], done=0)
+    assert [play(first), play(first, explore=False), play(first)] == [[11, 11.5], [12, 12.5], [13, 13.5]]
+    assert len(store) == 2  # evaluations are not stored
+    inner = Counter()
+    again = Recorded(inner, [store], done=1)
+    assert play(again) == [13, 13.5] and inner.played == []
+    assert play(again) == [11, 11.5] and len(store) == 3
+    with pytest.raises(UserError, match=r"real: holds 3 rollouts, the checkpoint remembers 4"):
+        Recorded(inner, [store], done=4)
+
+
+def test_no_rollout_of_a_real_system_is_replaced_because_another_lacks_it(tmp_path):
+    one, two = RealStore(tmp_path / "one"), RealStore(tmp_path / "two")
+    system = Recorded(Counter(), [one, two], done=0)
+    play(system)
+    shutil.rmtree(two.folder)
+    two = RealStore(tmp_path / "two")
+    before = one.load(0)["obs"]
+    play(Recorded(Counter(), [one, two], done=0))
+    assert len(one) == len(two) == 1
+    np.testing.assert_array_equal(one.load(0)["obs"], before)
+    assert two.load(0)["obs"][0, 0, 0] == 11.5
+
+
+# --- what can be wrong ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--method", "sgft-sca"], "did you mean 'sgft-sac'?"),
+        (["--task", "toi"], "did you mean 'toy'?"),
+        (["--real", "mild"], "toy has no gap 'mild'"),
+        (["--real", "nowhere.toml"], "nowhere.toml: no such file"),
+        (["--set", "latensy=0.1"], "did you mean 'latency'?"),
+        (["--set", "latency"], "'latency' does not set anything"),
+        (["--set", "latency=0.2"], "latency"),
+        (["--set", "latency=nan"], "latency"),
+        (["--set", "obs_noise_prob=1.5"], "obs_noise_prob"),
+        (["--set", "friction=-1"], "friction"),
+        (["--set", "mass=1", "mass=2"], "'mass' is set twice"),
+        (["--prior", "nowhere"], "--prior nowhere: no such folder"),
+        (["--prior", "none"], "--prior none: sgft-sac needs a prior of sac"),
+        (["--rolouts", "5"], "did you mean --rollouts?"),
+        (["--rollouts", "1"], "--options.initial-rollouts 2 is more than --rollouts 1"),
+        (["--eval-every", "0"], "--eval-every is 0: must be at least 1"),
+        (["--options.utd", "-1"], "utd is -1.0: must be a positive number"),
+        (["--options.utd", "nan"], "utd is nan: must be a positive number"),
+        (["--options.lr-actor", "inf"], "lr-actor is inf: must be a positive number"),
+        (["--options.gamma", "0.9"], "--options.gamma"),
+        (["--variant", "a/b"], "--variant 'a/b': letters"),
+        (["--seeds", "0"], "--seeds is 0: must be at least 1"),
+        (["--seed", "4294967296"], "--seed is 4294967296: seeds go from 0 to"),
+        (["--real"], "--real: name at least one"),
+        (["--real", "mild", "mild"], "--real names mild twice"),
+        (["--real", "{home}/turned.toml", "{home}/else/turned.toml"], "two of them would share the folder"),
+        (["--real", "{home}/turned.toml", "{home}/heavy.toml", "{home}/else/light.toml", "--seeds", "1"],
+         "times --seeds is 3: not a multiple of the 2"),
+        (["--resume"], "nothing to resume there"),
+        (["--out", "{home}/turned.toml"], "turned.toml is a file; choose another --out"),
+    ],
+)  # fmt: skip
+def test_a_bad_command_is_one_line_and_code_2(home, tmp_path, more, words, capsys):
+    (home / "else").mkdir(exist_ok=True)
+    for name in ("turned", "light"):
+        (home / f"else/{name}.toml").write_text("[params]\nmass = 0.5\n")
+    assert words in complaint([*argv(home, out=tmp_path), *(word.format(home=home) for word in more)], capsys)
+    assert not list(tmp_path.iterdir())
+
+
+def test_training_that_diverges_stops_in_one_line(home, tmp_path, capsys):
+    error = complaint([*argv(home, "sac", out=tmp_path), "--options.lr-critic", "1e30"], capsys)
+    assert "training has diverged: " in error and "is not finite after 2 rollouts; there is no checkpoint" in error
+    folder = tmp_path / "finetune/toy/turned/sac/seeds-0-1"
+    assert len(RealStore(folder)) == 2 and not (folder / "metrics.jsonl").exists()
+
+
+def test_another_configuration_does_not_continue_a_run(home, capsys):
+    run(home, "sac")
+    capsys.readouterr()
+    assert "exists already" in complaint(argv(home, "sac"), capsys)
+    error = complaint(argv(home, "sac", "--resume", "--options.utd", "1"), capsys)
+    assert "options.utd was 0.5, now 1.0" in error
+
+
+def test_other_priors_do_not_continue_a_run(home, tmp_path, capsys):
+    folder = tmp_path / run(home, "sac").relative_to(home)
+    shutil.copytree(run(home, "sac"), folder)
+    origin = json.loads((folder / "provenance.json").read_text())
+    (start,) = origin["starts"]
+    assert len(start["priors"]) == 2 and len(set(start["priors"])) == 2
+    start["priors"][1] = "0" * 12
+    (folder / "provenance.json").write_text(json.dumps(origin))
+    error = complaint(argv(home, "sac", "--resume", "--rollouts", "6", out=tmp_path), capsys)
+    assert f"{folder}: cannot resume with other priors: they were" in error and "000000000000" in error
+    assert read_jsonl(folder / "eval.jsonl") == read_jsonl(run(home, "sac") / "eval.jsonl")
+
+
+# --- several real systems ---------------------------------------------------------------------------------------------
+
+
+def files(folder):
+    """What a run leaves, but for checkpoints and names that are drawn by chance or tell the time."""
+    paths = (str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+    return sorted(path for path in paths if "/d/" not in path and not path.startswith(("tensorboard/", "checkpoints/")))
+
+
+def agree(one, two, upto):
+    """The same starts and rollouts, and, up to the rounding of updates, metrics and evaluations."""
+    for a, b in zip(rollouts(one)[:upto], rollouts(two)[:upto], strict=True):
+        np.testing.assert_array_equal(a["obs"][:, 0], b["obs"][:, 0])
+        np.testing.assert_allclose(a["trace"], b["trace"], atol=1e-3)
+    for name in ("metrics.jsonl", "eval.jsonl"):
+        lines = ([line for line in read_jsonl(run / name) if line["rollouts"] <= upto] for run in (one, two))
+        for a, b in zip(*lines, strict=True):
+            assert a.keys() == b.keys()
+            for key in a:
+                assert a[key] == pytest.approx(b[key], rel=1e-3, abs=1e-3), key
+
+
+def test_real_systems_together_are_what_each_is_alone(home, tmp_path, capsys):
+    both = [tmp_path / f"finetune/toy/{real}/sac/seeds-0-1" for real in ("heavy", "turned")]
+    alone = run(home, "sac")
+    arguments = argv(home, "sac", "--rollouts", "4", reals=("heavy", "turned"), out=tmp_path)
+    finetune.main(arguments)
+    assert files(both[0]) == files(both[1]) == [path for path in files(alone) if path != "real/rollout-000004.npz"]
+    agree(both[1], alone, upto=4)
+    heavy, turned = (read_jsonl(folder / "eval.jsonl")[-1]["return"] for folder in both)
+    assert heavy != pytest.approx(turned, abs=0.05)
+    named = [json.loads((folder / "config.json").read_text())["config"]["real"] for folder in (*both, alone)]
+    assert named == [str(home / "heavy.toml"), *[str(home / "turned.toml")] * 2]
+    card = load_prior(both[0] / "policy/seed-1").card["finetuned"]
+    assert (card["gap"]["name"], card["seed"]) == ("heavy", 1)
+
+    shutil.rmtree(both[1] / "checkpoints/4")
+    error = complaint([*arguments, "--resume"], capsys)
+    assert f"{both[0]} is at step 4, {both[1]} is at step 3: they cannot go on together" in error
+    runs.Lock(both[0])  # they are free again
+
+
+@pytest.mark.slow
+def test_runs_go_on_together_or_alone_whichever_way_they_began(home, tmp_path):
+    """Together for 3 rollouts, alone for the fourth, together for the last."""
+    reals = ("heavy", "turned")
+    finetune.main(argv(home, "sgft-sac", "--rollouts", "3", reals=reals, out=tmp_path))
+    for real in reals:
+        finetune.main(argv(home, "sgft-sac", "--rollouts", "4", "--resume", reals=(real,), out=tmp_path))
+    finetune.main(argv(home, "sgft-sac", "--resume", reals=reals, out=tmp_path))
+    heavy, turned = (tmp_path / f"finetune/toy/{real}/sgft-sac/seeds-0-1" for real in reals)
+    assert [line["rollouts"] for line in read_jsonl(heavy / "eval.jsonl")] == [0, 2, 3, 4, 5]  # 3 was an end once
+    curve = turned / "eval.jsonl"
+    curve.write_text("".join(line for line in curve.read_text().splitlines(True) if '"rollouts": 3' not in line))
+    agree(turned, run(home, "sgft-sac"), upto=5)
+
+
+# --- video ------------------------------------------------------------------------------------------------------------
+
+
+def film(folder, monkeypatch, *, pushes=(0.0, 1.0), scene=None, reason=None, episodes=6):
+    """Records two springs, before and after, with their strengths; returns what was said, and the episodes."""
+    monkeypatch.setattr(toy, "SCENE", scene, raising=False)
+    monkeypatch.setattr(cli, "select_renderer", lambda: reason)
+    env = toy.make()
+    pool = envs.sample_worlds(env, jax.random.key(0), 3)
+    keys = jax.random.split(jax.random.key(4), (1, episodes))
+    springs = [lambda carry, obs, key, k=k: (k * -obs[:2], carry) for k in pushes]
+    played = [
+        jax.vmap(jax.vmap(lambda key, s=spring: play_episode(env, pool, s, (), key, gamma=1.0)))(keys)
+        for spring in springs
+    ]
+    record = Record(folder, env, gaps.Gap("toy", {}, {}), "sac", [0])
+    return record.film(pool, lambda: played, 7), played, pool
+
+
+def test_no_scene_no_renderer_or_a_broken_one_is_a_notice(tmp_path, monkeypatch):
+    assert film(tmp_path, monkeypatch)[0] == "no video: toy has no scene to draw"
+    scene = object()
+    assert film(tmp_path, monkeypatch, scene=scene, reason="no library")[0] == "no video: no library"
+    for error in (UserError("no graphics"), RuntimeError("no encoder\nat all")):
+        monkeypatch.setattr(
+            "envs.mujoco.render.render_side_by_side", lambda *_, error=error: (_ for _ in ()).throw(error)
+        )
+        assert film(tmp_path, monkeypatch, scene=scene)[0] == f"no video: {str(error).splitlines()[0]}"
+
+
+@pytest.mark.parametrize(("pushes", "words"), [((0.0, 1.0), ("failure", "success")), ((1.0, 0.0), None)])
+def test_the_film_shows_an_episode_that_only_the_tuned_agent_solves(tmp_path, monkeypatch, pushes, words):
+    """Both from the same start in the same world; without such an episode the first one."""
+    seen = []
+    monkeypatch.setattr("envs.mujoco.render.render_side_by_side", lambda *given: seen.append(given))
+    said, (old, new), pool = film(tmp_path, monkeypatch, pushes=pushes, scene=object())
+    only_new = np.flatnonzero(np.asarray(new.success & ~old.success)[0])
+    expected = int(only_new[0]) if only_new.size else 0
+    _, thetas, (before, after), captions, path = seen[0]
+    assert said == f"video: {path}" and path.parent.exists()
+    np.testing.assert_allclose(thetas, [np.asarray(pool.theta.params)[new.world[0, expected]]] * 2)
+    np.testing.assert_array_equal(before, old.trace[0, expected])
+    np.testing.assert_array_equal(after, new.trace[0, expected])
+    np.testing.assert_array_equal(before[0], after[0])
+    assert captions[0].startswith("before fine-tuning: ") and captions[1].startswith("after 7 real rollouts: ")
+    assert (only_new.size > 0) == (words is not None)
+    if words:
+        assert [caption.split(": ")[1] for caption in captions] == list(words)
