@@ -8,22 +8,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
-from experiments.algorithms import make_player
 from priors_by_hand import save_prior
 
 import envs
 from experiments import cli, evaluate, finetune, pretrain
-from experiments.evaluation import grade
-from sgft_jax.io import checkpoint
+from sgft_jax import api
 from sgft_jax.io.log import read_jsonl
-from sgft_jax.learners import tdmpc2, tdmpc2_model
+from sgft_jax.io.priors import load_prior
+from sgft_jax.learners import tdmpc2_model
+from sgft_jax.policies import make_policy
 
 PRETRAIN = """--task toy --preset tdmpc2 --no-video --config.size tiny --config.plan-samples 24 --config.n-envs 16
     --config.worlds 8 --config.env-steps 640 --config.random-transitions 160 --config.replay-capacity 320
     --config.batch-size 16 --config.updates-per-step 1 --config.chunk-steps 20 --config.eval-every 1
     --config.checkpoint-every 1 --config.eval-episodes 8 --config.report-episodes 8 --config.gamma 0.9"""
-FINETUNE = """--task toy --no-video --seeds 2 --rollouts 4 --initial-rollouts 2 --eval-every 1 --eval-episodes 4
-    --checkpoint-every 1 --options.plan-samples 24 --options.batch-size 16 --options.replay-capacity 256"""
+FINETUNE = """--task toy --no-video --seeds 2 --rollouts 4 --eval-every 1 --eval-episodes 4 --checkpoint-every 1
+    --options.initial-rollouts 2 --options.utd 1 --options.plan-samples 24 --options.batch-size 16
+    --options.replay-capacity 256"""
 
 
 @pytest.fixture(autouse=True)
@@ -50,24 +51,24 @@ def started(home):
 @pytest.mark.slow
 def test_a_prior_of_td_mpc2_plays_as_its_card_says(home):
     run = started(home)
-    prior, card = checkpoint.load_prior(run / "prior/seed-0", task="toy")
-    assert isinstance(prior, tdmpc2.TDMPC2Prior) and card["algorithm"] == "tdmpc2"
-    assert "value/explained_variance" in card["metrics"] and "dynamics/error" not in card["metrics"]
+    prior = load_prior(run / "prior/seed-0", task="toy")
+    assert isinstance(prior.params, tdmpc2_model.TDMPC2Params) and prior.card["algorithm"] == "tdmpc2"
+    assert "value/explained_variance" in prior.card["metrics"] and "dynamics/error" not in prior.card["metrics"]
     assert (run / "figures/seed-0.png").stat().st_size > 10_000
-    env = toy.make()
-    player = make_player(card, env)
-    outcome = grade(
-        env, player, envs.sample_worlds(env, jax.random.key(0), 4), jax.random.key(1), prior, gamma=0.9, episodes=4
-    )
-    found = evaluate.evaluate(evaluate.EvaluateArgs(prior=run, episodes=4))
-    assert np.isfinite(outcome.total_reward).all() and found["policies"][0]["exploded"] == 0
-    assert jnp.isfinite(player.value(prior, jnp.zeros(4)))
+    outcome = api.evaluate_prior(prior, toy.make(), episodes=4)
+    (system,) = evaluate.evaluate(evaluate.EvaluateArgs(prior=run, episodes=4))["systems"]
+    assert np.isfinite(outcome.total_reward).all() and system["policies"][0]["exploded"] == 0
+    assert system["policies"][0]["return"] == pytest.approx(float(outcome.total_reward.mean()), rel=1e-5)
+    policy = make_policy(prior.card, toy.make())
+    assert jnp.isfinite(policy.value(prior.params, jnp.zeros(4)))
+    acting = api.load_policy(run / "prior/seed-0")
+    assert (np.abs(acting.act(np.zeros(4, np.float32))) <= 1).all()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["tdmpc2", "sgft-tdmpc2", "sgft-tdmpc2-code"])
 def test_fine_tuning_and_its_continuation(home, method):
-    """Two runs of 3 rollouts, one of which stops after 2 and is resumed: the same bits."""
+    """Two runs of 4 rollouts, one of which stops after 3 and is resumed: the same bits."""
     run = started(home)
     gap = home / "heavy.toml"
     gap.write_text("[params]\nmass = 2.0\n")
@@ -80,7 +81,9 @@ def test_fine_tuning_and_its_continuation(home, method):
     curves = [[read_jsonl(folder / name)[-1] for name in ("eval.jsonl", "metrics.jsonl")] for folder in folders]
     assert curves[0] == curves[1]
     assert json.loads((folders[0] / "summary.json").read_text())["final"]["rollouts"] == 4
-    assert checkpoint.load_prior(folders[0] / "policy/seed-1", task="toy")[1]["finetuned"]["method"] == method
+    tuned = [load_prior(folder / "policy/seed-1", task="toy") for folder in folders]
+    jax.tree.map(np.testing.assert_array_equal, tuned[0].params, tuned[1].params)
+    assert tuned[0].card["finetuned"]["method"] == method
 
 
 def test_methods_refuse_the_other_algorithms_priors(tmp_path, capsys):
@@ -92,7 +95,5 @@ def test_methods_refuse_the_other_algorithms_priors(tmp_path, capsys):
         finetune.main(["--method", "sgft-tdmpc2", *common])
     assert stopped.value.code == 2
     error = capsys.readouterr().err
-    assert (
-        error.startswith("error: --method sgft-tdmpc2 needs a prior of tdmpc2, not of sac") and error.count("\n") == 1
-    )
+    assert error.startswith("error: the method needs a prior of tdmpc2, not of sac") and error.count("\n") == 1
     assert "--preset tdmpc2" in error

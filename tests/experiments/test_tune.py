@@ -7,16 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from priors_by_hand import save_prior
+from sgft_jax.io.config import config_to_json
 
 import envs
-from experiments import cli, compare, finetune, grid, tune, tuned
-from experiments.finetune_args import arguments, run_folder
+from envs import gaps
+from experiments import cli, compare, finetune, grid, spaces, tune, tuned
+from experiments.finetune_args import arguments, run_folder, with_settings
 from sgft_jax.io import checkpoint
-from sgft_jax.io.jsonfile import jsonable
-from sgft_jax.methods import METHODS, default_settings
+from sgft_jax.io.runs import FORMAT
 from sgft_jax.types import UserError
 
 STEPS = 20  # of an episode
+SYSTEMS = ("mild", "soft", "default")
 
 
 @pytest.fixture(autouse=True)
@@ -24,6 +26,7 @@ def _toy(monkeypatch):
     monkeypatch.setitem(envs.TASKS, "toy", "toy")
     monkeypatch.setattr(os, "environ", os.environ.copy())
     monkeypatch.setattr(cli, "set_up", lambda: None)  # the tests have their own cache and environment
+    monkeypatch.setattr("envs.gaps.presets", lambda task: {name: gaps.Gap(name, {}, {}) for name in SYSTEMS})
 
 
 @pytest.fixture
@@ -47,7 +50,12 @@ def leave(args, success, *, rollouts=(0, 5, 10)):
     """A finished run: success [evaluations][seeds] after so many rollouts."""
     folder = run_folder(args, *args.real)
     folder.mkdir(parents=True, exist_ok=True)
-    config = {"sgft_jax": "0", "kind": "finetune", "config": jsonable(args) | {"real": args.real[0]}}
+    config = {
+        "sgft_jax": "0",
+        "format": FORMAT,
+        "kind": "finetune",
+        "config": config_to_json(args) | {"real": args.real[0]},
+    }
     (folder / "config.json").write_text(json.dumps(config))
     final = {"final": {"rollouts": rollouts[-1]}, "gap": {"name": args.real[0]}}
     (folder / "summary.json").write_text(json.dumps(final))
@@ -86,7 +94,9 @@ def test_tasks_methods_and_seeds_have_draws_of_their_own(tmp_path):
 
     assert drawn("sac") == drawn("sac", rollouts=20, seeds=5, trials=4) == drawn("sac", trials=9)[:4]
     assert drawn("sac")[1:] != drawn("sac-reset")[1:] and drawn("sac")[1:] != drawn("sac", seed=7)[1:]
-    assert drawn("rlpd")[0] == default_settings(METHODS["rlpd"])
+    assert drawn("rlpd")[0] == {
+        "utd": 20.0, "lr_actor": 3e-4, "lr_critic": 3e-4, "target_critics": 2, "simulated_share": 0.5,
+    }  # fmt: skip
 
 
 def test_a_score_is_the_area_up_to_the_budget(tmp_path):
@@ -116,9 +126,9 @@ def test_every_trial_is_a_run_apart_from_the_comparison(tmp_path, ran):
         (100, 2, 10, ("mild", "soft"), False)
     }
     assert first.out == tmp_path / "tune" and first.prior == tmp_path / "pretrain/toy/fast"
-    assert (first.utd, first.options) == (8.0, arguments("sac").options)
+    assert first.options == arguments("sac").options
     expected = tune.trials(budget(tmp_path), "toy", "sac")[1].settings
-    assert {"utd": second.utd, **{k: getattr(second.options, k) for k in expected if k != "utd"}} == expected
+    assert {name: getattr(second.options, name) for name in expected} == expected != spaces.defaults("sac")
     assert not (tmp_path / "finetune").exists()
     assert written(tmp_path)["budget"]["reals"] == ["mild", "soft"] and len(written(tmp_path)["gaps"]) == 2
 
@@ -135,7 +145,7 @@ def test_what_fails_does_not_stop_the_rest_and_the_command_goes_on(tmp_path, ran
     assert (result["trial"], result["options"]) == (3, result["trials"][3]["options"])
     assert [trial["area"] for trial in result["trials"]] == pytest.approx([0.125, 0.175, 0.225, 0.275])
     assert result["budget"] == {
-        "trials": 4, "reals": ["mild"], "seeds": [100, 101], "rollouts": 10, "initial_rollouts": 1, "eval_every": 5,
+        "trials": 4, "reals": ["mild"], "seeds": [100, 101], "rollouts": 10, "eval_every": 5,
     }  # fmt: skip
     assert result["gaps"] == [{"name": "mild"}] and result["provenance"]["versions"]
     assert "--tuned --tasks toy --methods sac" in capsys.readouterr().out
@@ -145,8 +155,8 @@ def test_what_fails_does_not_stop_the_rest_and_the_command_goes_on(tmp_path, ran
 
 def test_trials_of_other_options_are_refused(tmp_path, ran):
     (trial,) = tune.trials(budget(tmp_path, trials=1), "toy", "sac")
-    leave(replace(trial.cells[0].args, utd=3.0), [[0, 0], [0, 0], [0, 0]])
-    with pytest.raises(UserError, match=r"trial-0.*another configuration: utd was 3\.0, now 8\.0"):
+    leave(with_settings(trial.cells[0].args, {"utd": 3.0}), [[0, 0], [0, 0], [0, 0]])
+    with pytest.raises(UserError, match=r"trial-0.*another configuration: options.utd was 3\.0, now 8\.0"):
         tune.tune(budget(tmp_path))
     assert ran == []
 
@@ -179,7 +189,7 @@ def test_bad_input(argv, words, tmp_path, capsys):
 def choose(out, method, **changes):
     """A file as tuning leaves it."""
     facts = {"trials": 8, "reals": ["mild"], "rollouts": 40} | changes
-    options = {"utd": 2.0, "lr_actor": 3e-4, "critic_warmup": None}
+    options = {"utd": 2.0, "lr_actor": 3e-4}
     return tuned.write(out, "toy", method, {"budget": facts, "options": options})
 
 
@@ -192,7 +202,7 @@ def test_a_comparison_of_tuned_methods(tmp_path, ran):
     for method in ("sac", "sgft-sac"):
         choose(tmp_path, method)
     assert compare.compare(grid_of(tmp_path)) == []
-    assert {(run.utd, run.options.lr_actor, run.options.critic_warmup) for run in ran} == {(2.0, 3e-4, None)}
+    assert {(run.options.utd, run.options.lr_actor) for run in ran} == {(2.0, 3e-4)}
     assert (tmp_path / "finetune/toy/default/sac_tuned/seeds-0-9").is_dir()
     assert [str(cell) for cell in compare.cells(grid_of(tmp_path))] == [
         "toy/default: sac_tuned",
@@ -201,7 +211,7 @@ def test_a_comparison_of_tuned_methods(tmp_path, ran):
     tuned.write(
         tmp_path, "toy", "sac", {"budget": tuned.read(tmp_path, "toy", "sac")["budget"], "options": {"utd": 20}}
     )
-    with pytest.raises(UserError, match=r"sac_tuned.*utd was 2\.0, now 20"):  # tuned again since
+    with pytest.raises(UserError, match=r"sac_tuned.*options.utd was 2\.0, now 20"):  # tuned again since
         compare.compare(grid_of(tmp_path))
 
 
@@ -229,9 +239,9 @@ def test_finetune_begins_with_tuned_options_and_takes_changes(tmp_path, monkeypa
     monkeypatch.setattr(finetune, "finetune", seen.append)
     choose(tmp_path, "sac")
     words = ["--task", "toy", "--method", "sac", "--out", str(tmp_path), "--tuned"]
-    finetune.main([*words, "--utd", "4"])
+    finetune.main([*words, "--options.utd", "4"])
     (run,) = seen
-    assert (run.variant, run.utd, run.options.lr_actor, run.task) == ("tuned", 4.0, 3e-4, "toy")
+    assert (run.variant, run.options.utd, run.options.lr_actor, run.task) == ("tuned", 4.0, 3e-4, "toy")
     with pytest.raises(SystemExit) as stopped:
         finetune.main([*words, "--method", "rlpd"])
     error = capsys.readouterr().err
@@ -245,19 +255,17 @@ def test_tuned_runs_on_a_point_mass(tmp_path, monkeypatch):
         save_prior(tmp_path / f"pretrain/toy/fast/{run}/prior/seed-{seed}", seed)
     for name, mass in (("heavy", 2.0), ("light", 0.5)):
         (tmp_path / f"{name}.toml").write_text(f"[params]\nmass = {mass}\n")
-    space = {"utd": (0.1, 0.2), "batch_size": (8,)}
-    method = METHODS["sac"]._replace(space=space, utd=0.1, options={"batch_size": 8, "replay_capacity": 128})
-    monkeypatch.setitem(METHODS, "sac", method)
-    sizes = {"tasks": ("toy",), "methods": ("sac",), "initial_rollouts": 1, "rollouts": 2, "eval_every": 1, "seeds": 2}
+    monkeypatch.setitem(spaces.SPACES, "sac", {"utd": (0.1, 8.0), "batch_size": (256,)})
+    sizes = {"tasks": ("toy",), "methods": ("sac",), "rollouts": 2, "eval_every": 1, "seeds": 2}
     tune.main(tune.TuneArgs(trials=2, reals=(str(tmp_path / "heavy.toml"),), out=tmp_path, **sizes))
     result = written(tmp_path)
-    assert {trial["options"]["utd"] for trial in result["trials"]} == {0.1, 0.2} and result["gaps"][0][
-        "name"
-    ] == "heavy"
+    assert {trial["options"]["utd"] for trial in result["trials"]} == {8.0, 0.1}
+    assert result["gaps"][0]["name"] == "heavy"
     assert all(np.shape(trial["areas"]["heavy"]) == (2,) for trial in result["trials"])
     real = str(tmp_path / "light.toml")
     compare.main(compare.CompareArgs(tuned=True, reals=(real,), out=tmp_path, **sizes))
     (cell,) = compare.cells(compare.CompareArgs(tuned=True, reals=(real,), out=tmp_path, **sizes))
     assert cell.state == "finished" and checkpoint.latest(cell.folder) == 2
-    assert json.loads((cell.folder / "config.json").read_text())["config"]["utd"] == result["options"]["utd"]
+    stored = json.loads((cell.folder / "config.json").read_text())["config"]["options"]
+    assert stored["utd"] == result["options"]["utd"]
     assert "| sac tuned | 2 |" in (tmp_path / "figures/tables.md").read_text()
