@@ -32,33 +32,10 @@ _LAZY = {
 }
 
 __all__ = [
-    "TASKS",
-    "Domain",
-    "EffectRange",
-    "Effects",
-    "Entry",
-    "Env",
-    "EnvState",
-    "Episode",
-    "Fleet",
-    "Gap",
-    "Parameter",
-    "Theta",
-    "World",
-    "effects",
-    "gaps",
-    "launch",
-    "make",
-    "name_of",
-    "packed",
-    "play_episode",
-    "rollout",
-    "sample_worlds",
-    "scene",
-    "step_fleet",
-    "uniform",
-    "unpack",
-]
+    "TASKS", "Domain", "EffectRange", "Effects", "Entry", "Env", "EnvState", "Episode", "Fleet", "Gap", "Parameter",
+    "Theta", "World", "effects", "gaps", "launch", "make", "name_of", "packed", "play_episode", "rollout",
+    "sample_worlds", "scene", "step_fleet", "uniform", "unpack",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
@@ -70,7 +47,7 @@ def __getattr__(name: str) -> Any:
 
 
 def make(task: str, impl: str = "auto", scene: str = "") -> Env:
-    """The task of that name, file or module, compiled; impl: who steps its physics, see `worlds.choose_impl`.
+    """The task of that name, file or module, compiled; impl: its physics engine, see `worlds.choose_impl`.
 
     A file or module of your own must define `make(impl) -> Env`, with the file's name as the Env's name
     (docs/extending.md). scene: that of a real system which is more than the simulated one with other numbers; "" for
@@ -99,7 +76,7 @@ def scene(task: str, real: str = "") -> Any:
 def name_of(task: str) -> str:
     """What a task given by name, file or module is called; its run folders too.
 
-    Also admits the task: from then on the name alone finds it in this process. Raises UserError if there is none.
+    Also registers the task: from then on its name alone finds it in this process. Raises UserError if there is none.
     """
     if task in TASKS:
         return task

@@ -161,7 +161,7 @@ class Env(NamedTuple):
     cartesian: the first two action entries are x and y of one frame.
     check(theta by name) -> what is impossible about it in one sentence, or None: relations between parameters.
     trace(physics) -> [k] what a renderer needs of a state; [0] where nothing can be drawn.
-    impl: who steps the physics. scene: the name of a real system's own scene, "" for the one to pretrain in.
+    impl: the physics engine. scene: the name of a real system's own scene, "" for the one to pretrain in.
     """
 
     name: str

@@ -11,6 +11,7 @@ times one device.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -30,15 +31,15 @@ class BenchmarkConfig:
     parts: tuple[Part, ...] = ("physics", "updates", "plain")
     """Kinds of measurements."""
     tasks: tuple[str, ...] = ("push", "hammer", "insert")
-    """Tasks, of all but updates and plain."""
+    """Tasks to measure on, for all parts but updates and plain."""
     worlds: tuple[int, ...] = (1024,)
-    """Worlds stepped together; in devices, by each device."""
+    """Worlds stepped together; for devices, on each device."""
     impls: tuple[Impl, ...] = ("auto",)
-    """Engines of physics."""
+    """Physics engines."""
     control_steps: int = 10
     """Control steps (of 0.2 s) per timed call; at most half an episode."""
     batches: tuple[int, ...] = (256,)
-    """Batch sizes of the updates; in devices, of each device."""
+    """Batch sizes of the updates; for devices, on each device."""
     seeds: tuple[int, ...] = (1,)
     """Agents updated, pretrained or fine-tuned together."""
     precisions: tuple[Precision, ...] = ("default",)
@@ -50,15 +51,15 @@ class BenchmarkConfig:
     repeats: int = 3
     """Timed calls; the fastest counts."""
     preset: str = "fast"
-    """Of pretrain and devices."""
+    """Pretraining preset, for pretrain and devices."""
     env_steps: int | None = None
-    """Of pretrain, and of each device in devices; default: the preset's."""
+    """Environment steps, for pretrain and for each device in devices; default: the preset's."""
     devices: tuple[int, ...] = (1,)
-    """Numbers of devices; the smallest is what the others are compared with."""
+    """Numbers of devices; all are compared with the smallest."""
     prior: Path | None = None
     """Folder of the priors that finetune starts from."""
     rollouts: int = 30
-    """Of finetune."""
+    """Real rollouts, for finetune."""
     out: Path = Path("runs")
     """The numbers go to <out>/benchmark/summary.json."""
 
@@ -104,20 +105,16 @@ def _physics(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
     for task in config.tasks:
         if 2 * config.control_steps > envs.scene(task).episode_length:
             raise UserError(f"--control-steps {config.control_steps} is more than half an episode of {task}")
-    for task in config.tasks:
-        for impl in map(choose_impl, config.impls):
-            for n in config.worlds:
-                yield physics.speed(task, impl, n, control_steps=config.control_steps, repeats=config.repeats)
+    for task, impl, n in product(config.tasks, map(choose_impl, config.impls), config.worlds):
+        yield physics.speed(task, impl, n, control_steps=config.control_steps, repeats=config.repeats)
 
 
 def _updates(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
     from experiments.bench import updates
 
     size = {"width": config.width, "updates": config.updates, "repeats": config.repeats}
-    for exact in config.precisions:
-        for batch in config.batches:
-            for seeds in config.seeds:
-                yield updates.speed(batch, seeds, exact=exact, **size)
+    for exact, batch, seeds in product(config.precisions, config.batches, config.seeds):
+        yield updates.speed(batch, seeds, exact=exact, **size)
 
 
 def _plain(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
@@ -130,31 +127,24 @@ def _plain(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
 def _pretrain(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
     from experiments.bench import training
 
-    for task in config.tasks:
-        for impl in config.impls:
-            for seeds in config.seeds:
-                yield training.pretraining(task, impl, seeds, preset=config.preset, env_steps=config.env_steps)
+    for task, impl, seeds in product(config.tasks, config.impls, config.seeds):
+        yield training.pretraining(task, impl, seeds, preset=config.preset, env_steps=config.env_steps)
 
 
 def _finetune(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
     from experiments.bench import training
 
-    for task in config.tasks:
-        for impl in config.impls:
-            for seeds in config.seeds:
-                assert config.prior is not None  # checked before
-                yield training.fine_tuning(task, impl, seeds, prior=config.prior, rollouts=config.rollouts)
+    assert config.prior is not None  # checked before
+    for task, impl, seeds in product(config.tasks, config.impls, config.seeds):
+        yield training.fine_tuning(task, impl, seeds, prior=config.prior, rollouts=config.rollouts)
 
 
 def _devices(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
     from experiments.bench import training
 
-    for task in config.tasks:
-        for impl in config.impls:
-            for worlds in config.worlds:
-                for batch in config.batches:
-                    size = {"worlds": worlds, "batch": batch, "preset": config.preset, "env_steps": config.env_steps}
-                    yield from training.weak_scaling(task, impl, config.devices, **size)
+    for task, impl, worlds, batch in product(config.tasks, config.impls, config.worlds, config.batches):
+        size = {"worlds": worlds, "batch": batch, "preset": config.preset, "env_steps": config.env_steps}
+        yield from training.weak_scaling(task, impl, config.devices, **size)
 
 
 _PARTS: dict[Part, Callable[[BenchmarkConfig], Iterator[dict[str, Any]]]] = {

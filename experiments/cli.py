@@ -40,8 +40,8 @@ def run_main[T](
 
     default(argv) -> the defaults of the options where some decide those of others, see `preview`.
     Exits with code 2 and one line `error: ...` on stderr for anything the user can mend (`UserError`, unknown options
-    or choices, a device without room), with 130 after an interrupt, with 1 and no word where nobody reads its output
-    any more, as after `| head`. Other exceptions are bugs and keep their traceback.
+    or choices, a device without room), with 130 after an interrupt, with 1 and no message if the reader of its output
+    has gone, as after `| head`. Other exceptions are bugs and keep their traceback.
     """
     with _may_lose_its_reader():
         try:
@@ -109,7 +109,7 @@ def preview(argv: Sequence[str], **defaults: Any) -> SimpleNamespace:
 
 
 def _refuse(event: _errors.ParseErrorEvent, config_type: type, default: Any) -> None:
-    """Raise UserError with what is wrong in one line; of kinds of mistakes not listed here tyro tells."""
+    """Raise UserError with what is wrong in one line; other kinds of mistakes in tyro's words."""
     match event:
         case _errors.UnrecognizedArgs(tokens=[first, *_]) if not first.startswith("-"):
             raise UserError(f"unexpected word {first!r} on the command line; options begin with --")
@@ -149,6 +149,12 @@ def fail(message: str) -> NoReturn:
     """End the process as every user error does."""
     print(f"error: {message}", file=sys.stderr)
     sys.exit(USER_ERROR)
+
+
+def columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """A line for each row of a table, cells of a column below each other."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def choose[V](kind: str, name: str, options: dict[str, V]) -> V:

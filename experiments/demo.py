@@ -112,7 +112,7 @@ def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> Finet
 
 
 def _finetune_all(first: FinetuneArgs, *others: FinetuneArgs) -> None:
-    """One run here, on a CPU the others in turn in a process beside it: plans cost as much as what they all learn."""
+    """On a CPU the first runs here and the others one by one in a second process: planning takes as long as they do."""
     import jax
 
     if jax.default_backend() != "cpu":

@@ -1,4 +1,4 @@
-"""Success and return of policies in held-out worlds, and the numbers that are told of them."""
+"""Success and return of policies in held-out worlds, and how they are summarised."""
 
 from collections.abc import Callable
 from typing import Any
@@ -26,8 +26,9 @@ def play(system: Simulated, policy: Policy, params: PyTree, key: Key, episodes: 
 
 
 def scores(played: Episode) -> Metrics:
-    """Mean success, return and share of exploded episodes [M] of episodes [M, n]."""
+    """Mean score, success, return and share of exploded episodes [M] of episodes [M, n]."""
     return {
+        "score": played.score.mean(-1),
         "success": played.success.mean(-1),
         "return": played.total_reward.mean(-1),
         "exploded": played.exploded.mean(-1),

@@ -25,10 +25,8 @@ def _defaults(argv: Sequence[str]) -> FinetuneArgs:
 
 def _table() -> str:
     """The methods, a line each."""
-    methods = all_methods().values()
-    width = max(len(m.name) for m in methods)
-    rows = [f"  {m.name:{width}}  {m.description} ({m.source}); prior: {m.prior}" for m in methods]
-    return "\n".join(["methods:", *rows])
+    rows = [("", m.name, f"{m.description} ({m.source}); prior: {m.prior}") for m in all_methods().values()]
+    return "\n".join(["methods:", *cli.columns(rows)])
 
 
 def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:

@@ -24,12 +24,12 @@ class FinetuneArgs:
     task: str = "push"
     """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
     method: str = DEFAULT
-    """How it learns; the table is at the top. Or a Python file with a method of your own (docs/extending.md)."""
+    """A method from the table at the top, or a Python file with a method of your own (docs/extending.md)."""
     real: tuple[str, ...] = ("default",)
     """The real system: a gap by name, or a .toml/.json file with tables `params` and `effects`. Several are played
     together in one program, which takes little longer; each has a run folder of its own."""
     set: tuple[str, ...] = ()
-    """Changes to it, e.g. --set latency=0.05 action_scale=[1,0.5]; of several real systems, to each."""
+    """Changes to the real systems, e.g. --set latency=0.05 action_scale=[1,0.5]."""
     seeds: int = 10
     """Number of seeds; seed i starts from prior i modulo the number of priors."""
     rollouts: int = 100
@@ -44,7 +44,7 @@ class FinetuneArgs:
     overwrite: bool = False
     """Replace an earlier run of the same name."""
     options: Any = None  # the `Config` of the method, see `arguments`
-    """Of the method that --method names:"""
+    """Options of the method that --method names:"""
     preset: str = DEFAULT_PRESET
     """Expert: pretraining preset whose priors to start from."""
     seed: int = 0

@@ -7,20 +7,20 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import envs
 from envs import gaps
 from envs.rollout import Episode
+from experiments.evaluation import scores
 from experiments.finetune_args import VOLATILE, FinetuneArgs, run_folder
 from experiments.finetune_record import Record
 from experiments.recorded import Recorded
-from experiments.stacking import part
+from experiments.stacking import join, part
 from sgft_jax import api, mesh, train
 from sgft_jax.api import Setup
 from sgft_jax.io import runs
-from sgft_jax.io.config import config_to_json
+from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.priors import digest, load_priors
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.methods.options import card_of
@@ -38,7 +38,7 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
     for prior in priors:
         api.check_prior(prior, method.prior, env)
     # Every folder is that of a run on its real system alone: either kind of run continues the other.
-    homes = {run_folder(args, name): config_to_json(args) | {"real": name} for name in args.real}
+    homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in args.real}
     opened = runs.open_runs(
         homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
         inputs={"priors": [digest(prior) for prior in priors]},
@@ -123,12 +123,11 @@ class _Run:
         return {} if real is None else {f"{self.system.env.score}, exploring": float(real.mean())}
 
     def _evaluate(self, progress: FinetuneProgress, done: int) -> float:
-        scores = _scores(
-            train.evaluate(self.finetuner, self.system, progress.agent, self.seeds, self.args.eval_episodes)
-        )
-        for record, own in self._each(scores):
+        n = self.args.eval_episodes
+        found = scores(train.evaluate(self.finetuner, self.system, progress.agent, self.seeds, n))
+        for record, own in self._each(found):
             record.evaluation(done, own)
-        return float(scores["score"].mean())
+        return float(found["score"].mean())
 
     def _checkpoint(self, progress: FinetuneProgress) -> None:
         for i, record in enumerate(self.records):
@@ -146,7 +145,7 @@ class _Run:
         card = {**self.card, "plan": None, **self.finetuner.card}  # the prior may be one that plans
         last = jax.jit(jax.vmap(self.finetuner.export))(progress.agent)
         played = train.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, self.args.eval_episodes)
-        facts = {"score": _scores(played)["score"], "evidence": best.score, "rollouts": best.rollouts}
+        facts = {"score": scores(played)["score"], "evidence": best.score, "rollouts": best.rollouts}
         films = functools.cache(lambda: self._before_and_after(progress))
         summaries = []
         for i, record in enumerate(self.records):
@@ -173,16 +172,6 @@ class _Run:
         return [before, evaluate(self.finetuner, states=progress.agent, episodes=n)]
 
 
-def _scores(episodes: Episode) -> dict[str, np.ndarray]:
-    """Means over the episodes [M, n] of each member, [M]."""
-    return {
-        "score": np.asarray(episodes.score.mean(1)),
-        "success": np.asarray(episodes.success.mean(1)),
-        "return": np.asarray(episodes.total_reward.mean(1)),
-        "exploded": np.asarray(episodes.exploded.mean(1)),
-    }
-
-
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def _part(progress: FinetuneProgress, i: int, n: int) -> FinetuneProgress:
     """The members of the i-th real system."""
@@ -193,6 +182,5 @@ def _part(progress: FinetuneProgress, i: int, n: int) -> FinetuneProgress:
 @jax.jit
 def _join(states: list[FinetuneProgress]) -> FinetuneProgress:
     """The states of all members from those of each real system."""
-    together = lambda *trees: jax.tree.map(lambda *x: jnp.concatenate(x), *trees)  # noqa: E731
-    agent = together(*[state.agent for state in states])
-    return states[0]._replace(agent=agent, best=together(*[state.best for state in states]))
+    agent, best = (join([getattr(state, name) for state in states]) for name in ("agent", "best"))
+    return states[0]._replace(agent=agent, best=best)

@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _defaults(argv: Sequence[str]) -> GapsArgs:
-    """Those of the preset; of one that does not exist `measure` complains."""
+    """The defaults of the preset; `measure` refuses a preset that does not exist."""
     preset = cli.preview(argv, preset=DEFAULT_PRESET).preset
     return GapsArgs(preset=preset, config=PRESETS.get(preset, PRESETS[DEFAULT_PRESET]))
 

@@ -15,6 +15,7 @@ from envs.gaps import Gap
 from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
 from experiments import stacking
+from experiments.cli import columns
 from experiments.evaluation import best_of, describe, play, scores
 from experiments.gaps import GapsArgs
 from experiments.memory import reserve
@@ -71,8 +72,7 @@ def table(lines: Sequence[dict[str, Any]]) -> list[str]:
     for line in lines:
         answer = {True: "yes", False: "no", None: "not known"}[line["admissible"]]
         rows.append((line["gap"]["name"], _percent(line["zero_shot"]), _percent(line["trained"]), answer))
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return columns(rows)
 
 
 def _percent(found: dict[str, Any] | None) -> str:

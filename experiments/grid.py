@@ -11,8 +11,7 @@ from experiments.finetune import finetune
 from experiments.finetune_args import VOLATILE, FinetuneArgs, arguments, label, run_folder
 from experiments.options import Impl, check_task, seed_list, without_repeats
 from sgft_jax import extend
-from sgft_jax.io.config import config_to_json
-from sgft_jax.io.jsonfile import read_json
+from sgft_jax.io.jsonfile import jsonable, read_json
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.io.runs import CONFIG, InUseError, check_same, in_use
 from sgft_jax.methods import NAMES, get_method
@@ -44,7 +43,7 @@ class GridArgs:
     dry: bool = False
     """Only list the runs and what is missing."""
     impl: Impl = "auto"
-    """Who steps the physics, as in fine-tuning."""
+    """Physics engine, as in fine-tuning."""
     devices: int | None = None
     """Devices that share the seeds; 0: all there are; default: one."""
     out: Path = Path("runs")
@@ -107,13 +106,13 @@ def check_begun(cells: Iterable[Cell]) -> None:
     for cell in cells:
         if cell.state != "missing":
             (real,) = cell.args.real
-            check_same(cell.folder, "finetune", config_to_json(cell.args) | {"real": real}, VOLATILE)
+            check_same(cell.folder, "finetune", jsonable(cell.args) | {"real": real}, VOLATILE)
 
 
 def work(cells: Sequence[Cell], args: GridArgs) -> list[str]:
     """Lists the cells, then runs those that are missing, in order; returns a line for each that could not run.
 
-    Several processes may work on one grid: what another one has finished or is at is left to it.
+    Several processes may work on one grid: each skips cells that another has finished or is running.
     """
     started, failed = time.monotonic(), []
     for cell in cells:

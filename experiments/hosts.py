@@ -1,5 +1,5 @@
-"""Impure: one run on several hosts. All of them run the same program, each on its own devices; the first one writes it
-down. The others write, too, but to a folder that goes when they do, so that hardly anybody need know of them.
+"""Impure: one run on several hosts. All of them run the same program, each on its own devices. The first
+host writes the run folder. The others write to a temporary folder, so other modules need no special case for them.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ _TOGETHER = ("checkpoints", "random", "prior")
 
 
 def join(hosts: str | None) -> None:
-    """Meets the other hosts, before JAX is used for anything; None: there are no others.
+    """Connects to the other hosts, before JAX is used for anything; None: there are no others.
 
     hosts: `auto` asks the cluster that started this process (SLURM, Open MPI, Kubernetes, as JAX detects them);
     `ADDRESS:PORT,COUNT,INDEX` says where the first host listens, how many there are, and which one this is. Raises

@@ -27,7 +27,7 @@ def reserve(parts: Mapping[str, int], *, copies: int, devices: int = 1) -> None:
 
 
 def free_memory() -> int | None:
-    """Bytes that the first device can still hold; None where nobody says."""
+    """Bytes that the first device can still hold; None where the device does not report it."""
     if stats := jax.local_devices()[0].memory_stats():
         return stats["bytes_limit"] - stats["bytes_in_use"]
     table = Path("/proc/meminfo")

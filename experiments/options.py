@@ -17,7 +17,7 @@ LAST_SEED = 2**31 - 1  # larger ones stand for held-out worlds and episodes
 Impl = Annotated[
     Literal["auto", "jax", "warp", "c"],
     arg(
-        help="Expert: who steps the physics: MJX's own code, MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or "
+        help="Expert: physics engine: MJX's own code, MuJoCo Warp, or MuJoCo's C engine. auto: $SGFT_IMPL, or "
         "else c on a CPU, warp on an NVIDIA GPU where it is installed, jax elsewhere."
     ),
 ]

@@ -65,7 +65,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _defaults(argv: Sequence[str]) -> PretrainArgs:
-    """Those of the preset; of one that does not exist `pretrain` complains."""
+    """The defaults of the preset; `pretrain` refuses a preset that does not exist."""
     preset = cli.preview(argv, preset=DEFAULT_PRESET).preset
     return PretrainArgs(preset=preset, config=PRESETS.get(preset, PRESETS[DEFAULT_PRESET]))
 

@@ -26,6 +26,7 @@ from experiments.video import film
 from sgft_jax import mesh
 from sgft_jax.analysis import figures
 from sgft_jax.io import checkpoint, runs
+from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
 from sgft_jax.io.priors import digest, save_prior
 from sgft_jax.io.progress import Clock, RunProgress
@@ -38,6 +39,7 @@ from sgft_jax.pretraining import (
     memory,
     pretrain,
     prior_card,
+    seed_keys,
     shapes,
     world_keys,
 )
@@ -67,14 +69,10 @@ def run(args: PretrainArgs, seeds: list[int]) -> dict[str, Any]:
     home = run_folder(args)
     with hosts.own(home) as folder, mesh.use(devices):
         reserve(sizes, copies=args.seeds, devices=devices)
-        opened = runs.open_run(
-            folder,
-            kind="pretrain",
-            config=args,
-            resume=args.resume,
-            overwrite=args.overwrite,
+        (opened,) = runs.open_runs(
+            {folder: jsonable(args)}, kind="pretrain", resume=args.resume, overwrite=args.overwrite,
             volatile=("resume", "overwrite", "devices", "hosts", "report", "video", "out"),
-        )
+        )  # fmt: skip
         mesh.meet()  # nobody looks for checkpoints before the first host has emptied a folder that is to be replaced
         try:
             return _Run(args, env, gap, seeds, opened.folder, home).work()
@@ -255,7 +253,7 @@ class _Run:
         measure = functools.partial(
             make_report, self.env, self.policy, gamma=self.config.gamma, trajectories=self.config.eval_episodes
         )
-        report = jax.jit(jax.vmap(measure))(self.pools(0), params, stacking.seed_keys(self.seeds, _REPORT))
+        report = jax.jit(jax.vmap(measure))(self.pools(0), params, seed_keys(self.seeds, _REPORT))
         return jax.tree.map(np.asarray, mesh.local(report))
 
     def _film(self, played: Episode) -> str:

@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from envs.rollout import Episode
-from experiments.stacking import part
+from experiments.stacking import join, part
 from sgft_jax.io.real import RealStore
 from sgft_jax.systems import System
 from sgft_jax.types import Key, PyTree, Transition, UserError
@@ -37,7 +36,7 @@ class Recorded:
         number, self.rollout = self.rollout, self.rollout + 1
         missing = [store for store in self.stores if len(store) <= number]
         if not missing:
-            return _join([_read(store.load(number)) for store in self.stores])
+            return join([_read(store.load(number)) for store in self.stores])
         episodes = self.inner.play(policy, states, keys, explore=True)
         for i, store in enumerate(self.stores):
             if len(store) <= number:
@@ -56,7 +55,3 @@ def _read(arrays: dict[str, np.ndarray]) -> Episode:
     stored = {name: jnp.asarray(x)[:, None] for name, x in arrays.items()}
     transitions = Transition(*(stored[name] for name in Transition._fields))
     return Episode(transitions=transitions, **{name: stored[name] for name in _FACTS})
-
-
-def _join(episodes: list[Episode]) -> Episode:
-    return jax.tree.map(lambda *x: jnp.concatenate(x), *episodes)

@@ -1,21 +1,21 @@
-"""Pytrees with a leading axis of seeds. Pure."""
+"""Pytrees with a leading axis of members, such as seeds. Pure."""
 
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.types import Array, Key, PyTree
-
-
-def seed_keys(seeds: Sequence[int], purpose: int) -> Key:
-    """Keys [n_seeds] that depend on nothing but the seed and a number that stands for the purpose."""
-    return jnp.stack([jax.random.fold_in(jax.random.key(seed), purpose) for seed in seeds])
+from sgft_jax.types import Array, PyTree
 
 
 def stack(trees: Sequence[PyTree]) -> PyTree:
     """Equal pytrees stacked on a new leading axis."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
+
+
+def join(trees: Sequence[PyTree]) -> PyTree:
+    """Pytrees with that axis already, one after another."""
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *trees)
 
 
 def member(tree: PyTree, i: int | Array) -> PyTree:

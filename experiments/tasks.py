@@ -6,7 +6,7 @@ import inspect
 import json
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,6 +17,7 @@ import envs
 from envs import gaps
 from envs.base import Effects, Value
 from experiments import cli
+from experiments.cli import columns
 
 
 @dataclass(frozen=True)
@@ -97,7 +98,7 @@ def _first_line(module: str) -> str:
 def _list_lines(found: dict[str, Any]) -> list[str]:
     rows = [("task", "what it is", "gaps")]
     rows += [(name, task["about"], ", ".join(task["gaps"]) or "none") for name, task in found.items()]
-    return [*_columns(rows), "", "one of them in full: python -m experiments.tasks push"]
+    return [*columns(rows), "", "one of them in full: python -m experiments.tasks push"]
 
 
 def _task_lines(found: dict[str, Any]) -> list[str]:
@@ -119,7 +120,7 @@ def _task_lines(found: dict[str, Any]) -> list[str]:
     return [
         f"{found['name']}: {found['about']}",
         "",
-        *_columns(
+        *columns(
             [
                 ("observation", _entries(found["observation"])),
                 ("action", _entries(found["action"])),
@@ -128,11 +129,11 @@ def _task_lines(found: dict[str, Any]) -> list[str]:
             ]
         ),
         "",
-        *_columns(parameters),
+        *columns(parameters),
         "",
-        *_columns(effects),
+        *columns(effects),
         "",
-        *(_columns(reals) if found["gaps"] else ["no gaps come with this task; write one: docs/extending.md"]),
+        *(columns(reals) if found["gaps"] else ["no gaps come with this task; write one: docs/extending.md"]),
     ]
 
 
@@ -150,11 +151,6 @@ def _value(value: Value | None) -> str:
     if value is None:
         return "-"
     return str(value) if isinstance(value, list) else f"{value:g}"
-
-
-def _columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 import envs
 from envs.base import Env
@@ -22,7 +23,7 @@ from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.methods.options import card_of
 from sgft_jax.policies import make_policy
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.train import SimulatedRows
+from sgft_jax.train import FinetuneProgress, SimulatedRows
 from sgft_jax.types import Array, Finetuner, Policy, Prior, PyTree, UserError
 
 SIMULATED_WORLDS = 256
@@ -114,6 +115,18 @@ def evaluate_prior(prior: Prior, env: Env, gap: Gap | None = None, *, episodes: 
     return jax.tree.map(lambda x: x[0], played)
 
 
+def finetuned_priors(setup: Setup, state: FinetuneProgress, prior: Prior, *, best: bool = True) -> list[Prior]:
+    """What fine-tuning leaves, a prior [M] for each member: to save with `save_prior`, to act with `ActingPolicy`.
+
+    state: what `finetune` has yielded. prior: one that it began with, for what its card says. best: the policies that
+    did best in the real rollouts; False: the last ones.
+    """
+    params = state.best.params if best else jax.vmap(setup.finetuner.export)(state.agent)
+    card = {**prior.card, **setup.finetuner.card}
+    own = lambda i: jax.tree.map(lambda x: jnp.copy(x[i]), params)  # noqa: E731 - the state's arrays may be donated
+    return [Prior(own(i), card) for i in range(len(setup.seeds))]
+
+
 class ActingPolicy:
     """A policy that remembers what it must between the steps of an episode.
 
@@ -131,7 +144,7 @@ class ActingPolicy:
         """Forgets the episode; call it at the start of the next one."""
         self._carry = self._policy.init_carry()
 
-    def act(self, obs: np.ndarray, *, explore: bool = False) -> np.ndarray:
+    def act(self, obs: ArrayLike, *, explore: bool = False) -> np.ndarray:
         """The action [act_dim] in [-1, 1] for an observation [obs_dim] in raw units."""
         if np.shape(obs) != (self.env.obs_dim,):
             raise UserError(f"the policy reads observations of {self.env.obs_dim} numbers, got shape {np.shape(obs)}")

@@ -5,10 +5,10 @@ a tuple every entry is. Imports neither JAX nor MuJoCo.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import Any
 
-from sgft_jax.types import UserError, unknown
+from sgft_jax.types import UserError
 
 
 def finite(config: Any, *names: str) -> None:
@@ -47,12 +47,6 @@ def layers(config: Any, *names: str) -> None:
         widths = getattr(config, name)
         if not widths or any(width < 1 for width in widths):
             raise refusal(name, " ".join(map(str, widths)) or "empty", "one or more layers of at least 1 unit")
-
-
-def one_of(config: Any, name: str, options: Sequence[str]) -> None:
-    """One of these words."""
-    if (value := getattr(config, name)) not in options:
-        raise UserError(unknown(f"option {name.replace('_', '-')}", value, options))
 
 
 def refusal(name: str, value: Any, wanted: str) -> UserError:

@@ -51,7 +51,7 @@ def use(n: int) -> contextlib.AbstractContextManager:
 
 
 def pieces() -> int:
-    """Into how many pieces the marks cut here: 1 without a mesh, and inside a piece."""
+    """The number of pieces that the marks cut into: 1 without a mesh, and inside a piece."""
     mesh = jax.sharding.get_abstract_mesh()
     return 1 if mesh.empty or DATA in mesh.manual_axes else mesh.shape[DATA]
 

@@ -6,7 +6,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.io.config import config_from_json
 from sgft_jax.learners import tdmpc2, tdmpc2_model
 from sgft_jax.learners.sac import SACParams
 from sgft_jax.models import dynamics, value
@@ -35,8 +34,12 @@ def make_policy(card: Mapping[str, Any], task: Task) -> Policy:
 
 
 def network_of(card: Mapping[str, Any]) -> NetworkConfig:
-    """The networks of a prior of SAC."""
-    return config_from_json(NetworkConfig, card["network"], where="network.")
+    """The networks of a prior of SAC; raises UserError where this version knows no such network."""
+    try:
+        own: dict[str, Any] = {**card["network"], "hidden": tuple(card["network"]["hidden"])}
+        return NetworkConfig(**own)
+    except (TypeError, KeyError):
+        raise UserError(f"this version knows no such network: {card['network']}; pretrain again") from None
 
 
 def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig) -> Policy:
@@ -49,15 +52,10 @@ def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig) -> Policy:
         moments = actor.apply(params.actor, normalize(params.normalizer, obs))
         return tanh_gaussian_action(moments, key, explore=explore), carry
 
-    def predict(params: SACParams, obs: Array, action: Array, key: Key) -> Array:
-        member = dynamics.draw_member(params.dynamics, key)
-        return dynamics.predict(model, member, params.normalizer, obs, action)[0]
-
     return Policy(
         init_carry=lambda: (),
         act=act,
         value=lambda params, obs: value.predict(value_net, params.value, params.normalizer, obs),
-        predict=predict,
         model_error=lambda params, obs, actions: dynamics.rollout_error(
             model, params.dynamics, params.normalizer, obs, actions
         ),

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from envs.base import Domain, Env, EnvState, World
 from envs.domains.uniform import uniform
 from envs.rollout import Fleet, launch, step_fleet
-from sgft_jax.io.config import config_to_json
+from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.mesh import split, whole
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import precision
@@ -77,9 +77,9 @@ def pretrain(
     programs, pools = make_programs(env, config, seeds.shape[0]), pools or training_pools(env, config, seeds)
     begun = 0 if state is None else chunks_done(state, config)
     number = set_number(config, max(begun - 1, 0))
-    random = programs.collect(pools(0), _keys(seeds, _RANDOM)) if random is None else programs.spread_random(random)
+    random = programs.collect(pools(0), seed_keys(seeds, _RANDOM)) if random is None else programs.spread_random(random)
     worlds = pools(number)
-    now = programs.begin(worlds, random, _keys(seeds, _START)) if state is None else programs.spread(state)
+    now = programs.begin(worlds, random, seed_keys(seeds, _START)) if state is None else programs.spread(state)
     chunk: Any = programs.chunk.lower(worlds, random, now).compile() if begun < config.chunks else None
     yield now, {}
     for done in range(begun, config.chunks):
@@ -94,7 +94,7 @@ def pretrain(
 def collect_random(env: Env, config: PretrainConfig, seeds: Sequence[int] | Array, worlds: World) -> PyTree:
     """Experience [M, ...] under uniformly random actions in `worlds` [M, W]: the first set of a run's pools."""
     seeds = jnp.asarray(seeds, jnp.uint32)
-    return make_programs(env, config, seeds.shape[0]).collect(worlds, _keys(seeds, _RANDOM))
+    return make_programs(env, config, seeds.shape[0]).collect(worlds, seed_keys(seeds, _RANDOM))
 
 
 def shapes(
@@ -103,8 +103,8 @@ def shapes(
     """Shapes and types of a run's random experience and state: what checkpoints are read into."""
     seeds = jnp.asarray(seeds, jnp.uint32)
     programs = make_programs(env, config, seeds.shape[0])
-    random = jax.eval_shape(programs.collect, worlds, _keys(seeds, _RANDOM))
-    return random, jax.eval_shape(programs.begin, worlds, random, _keys(seeds, _START))
+    random = jax.eval_shape(programs.collect, worlds, seed_keys(seeds, _RANDOM))
+    return random, jax.eval_shape(programs.begin, worlds, random, seed_keys(seeds, _START))
 
 
 def training_pools(
@@ -123,7 +123,7 @@ def training_pools(
 
 def world_keys(seeds: Sequence[int] | Array, number: int = 0) -> Key:
     """Keys [M] that decide the worlds of a set."""
-    keys = _keys(jnp.asarray(seeds, jnp.uint32), _WORLDS)
+    keys = seed_keys(seeds, _WORLDS)
     return keys if number == 0 else jax.vmap(jax.random.fold_in, (0, None))(keys, number)
 
 
@@ -162,10 +162,10 @@ def prior_card(env: Env, config: PretrainConfig) -> dict[str, Any]:
         "algorithm": config.algorithm,
         "obs_dim": env.obs_dim,
         "act_dim": env.act_dim,
-        "network": config_to_json(config.network),
+        "network": jsonable(config.network),
         "ensemble_size": config.ensemble_size,
         "gamma": config.gamma,
-        "config": config_to_json(config),
+        "config": jsonable(config),
         "observation": [e._asdict() for e in env.observation],
         "action": [e._asdict() for e in env.action],
         "control_dt": env.control_dt,
@@ -372,9 +372,9 @@ def _ended(after: EnvState) -> Array:
     return after.truncated | after.terminated
 
 
-def _keys(seeds: Array, purpose: int) -> Key:
-    """Keys [M] that depend on nothing but the seed and the purpose."""
-    return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), purpose))(seeds)
+def seed_keys(seeds: Sequence[int] | Array, purpose: int) -> Key:
+    """Keys [M] that depend on nothing but the seed and a number that stands for the purpose."""
+    return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), purpose))(jnp.asarray(seeds, jnp.uint32))
 
 
 def _stack(trees: Sequence[PyTree]) -> PyTree:

@@ -60,13 +60,14 @@ def shape(imagination: Imagination, batch: Batch, key: Key) -> Batch:
     return batch._replace(reward=jax.vmap(lambda row: shaped_reward(imagination, row))(batch))
 
 
-def clip(bound: float) -> Transform:
-    """Keeps every reward in [-bound, bound].
+def clip(bound: float | None) -> Transform:
+    """Keeps every reward in [-bound, bound]; None leaves it as it is.
 
     V_sim falls off a cliff where a task can be lost for good, such as a puck over the edge. One such row outweighs a
     thousand others in a squared error, and its sign is all that a policy needs.
     """
-    return stateless(lambda imagination, batch, key: batch._replace(reward=jnp.clip(batch.reward, -bound, bound)))
+    limit = jnp.inf if bound is None else bound
+    return stateless(lambda imagination, batch, key: batch._replace(reward=jnp.clip(batch.reward, -limit, limit)))
 
 
 # --- horizons ---------------------------------------------------------------------------------------------------------
@@ -110,12 +111,12 @@ def branch(horizon: int, branches: int, *, noise: float | Array = 0.0, segments:
     """Appends `branches` imagined rollouts of `horizon` steps from every row's observation, after the rows themselves.
 
     B rows become B (1 + branches * horizon). noise: std of Gaussian noise on the policy's imagined actions, in units of
-    the action's range [-1, 1]: the policy's own actions say nothing about better ones. segments: the policy is told the
-    steps to go, and so is the learner; False for methods with an infinite horizon. After an imagined termination a
+    the action's range [-1, 1]: the policy's own actions say nothing about better ones. segments: policy and learner
+    read the steps to go; False for methods with an infinite horizon. After an imagined termination a
     rollout repeats its last transition, so that every row stays valid.
     Source: SGFT Algorithm 2; MBPO (Janner et al. 2019).
     """
-    tell = segments and horizon > 1
+    segmented = segments and horizon > 1
 
     def rollout(imagination: Imagination, start: Batch, key: Key) -> Batch:
         """One branch from start.obs: rows with a leading axis [horizon]."""
@@ -123,7 +124,7 @@ def branch(horizon: int, branches: int, *, noise: float | Array = 0.0, segments:
         def step(carry: tuple[Batch, Array], inputs: tuple[Array, Key]) -> tuple[tuple[Batch, Array], Batch]:
             last, alive = carry
             k, key = inputs
-            new, terminated = _imagine(imagination, _told(last, k) if tell else last, key, noise=noise)
+            new, terminated = _imagine(imagination, _with_steps(last, k) if segmented else last, key, noise=noise)
             last = jax.tree.map(lambda n, o: jnp.where(alive, n, o).astype(o.dtype), new, last)
             return (last, alive & ~terminated), last
 
@@ -131,11 +132,11 @@ def branch(horizon: int, branches: int, *, noise: float | Array = 0.0, segments:
         begin = start._replace(next_obs=start.obs)  # only its next_obs is read: the first step is always alive
         return jax.lax.scan(step, (begin, jnp.bool_(True)), (k, jax.random.split(key, horizon)))[1]
 
-    def _told(row: Batch, k: Array) -> Batch:
+    def _with_steps(row: Batch, k: Array) -> Batch:
         return row._replace(context=steps_to_go(k, horizon), next_context=steps_to_go(k - 1, horizon))
 
     def apply(imagination: Imagination, batch: Batch, key: Key) -> Batch:
-        if tell:
+        if segmented:
             unassigned = jnp.zeros((batch.reward.shape[0], horizon))
             batch = batch._replace(context=unassigned, next_context=unassigned)
         keys = jax.random.split(key, (batch.reward.shape[0], branches))

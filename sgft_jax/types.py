@@ -204,16 +204,13 @@ class Policy(NamedTuple):
 
     init_carry() -> carry. act(params, carry, obs, key, *, explore) -> (action, carry); `explore` may be traced.
     value(params, obs) -> []: V_sim, deterministic.
-    predict(params, obs, action, key) -> [obs_dim], a successor by a random member of its model; None where the model
-        does not predict observations.
     model_error(params, obs [T + 1, obs_dim], actions [T, act_dim]) -> [T]: how far its model drifts from a trajectory,
-        in standard deviations of the observation; None likewise.
+        in standard deviations of the observation; None where the model does not predict observations.
     """
 
     init_carry: Callable[[], PyTree]
     act: Callable[..., tuple[Array, PyTree]]
     value: Callable[[PyTree, Array], Array]
-    predict: Callable[[PyTree, Array, Array, Key], Array] | None = None
     model_error: Callable[[PyTree, Array, Array], Array] | None = None
 
 

@@ -15,7 +15,7 @@ import envs
 from envs import gaps
 from experiments import cli, figures, finetune, pretrain
 from sgft_jax import Batch, NetworkConfig, Prior, extend, get_method
-from sgft_jax.io.config import config_to_json
+from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.priors import load_prior, save_prior
 from sgft_jax.learners import sac
 from sgft_jax.methods import sgft_sac
@@ -38,7 +38,7 @@ def prior(tmp_path_factory):
     """An untrained prior of the example's task, with its card."""
     home = tmp_path_factory.mktemp("runs")
     agent = sac.make_sac(sac.SACConfig(3, 1, network=NETWORK, ensemble_size=2))
-    card = {"task": "own_task", "obs_dim": 3, "act_dim": 1, "network": config_to_json(NETWORK), "gamma": 0.9}
+    card = {"task": "own_task", "obs_dim": 3, "act_dim": 1, "network": jsonable(NETWORK), "gamma": 0.9}
     folder = home / "pretrain/own_task/fast/seed-0/prior/seed-0"
     params = sac.extract_params(jax.jit(agent.init)(jax.random.key(0)))
     save_prior(folder, Prior(params, {**card, "algorithm": "sac", "ensemble_size": 2, "seed": 0}))

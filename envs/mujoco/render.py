@@ -21,16 +21,13 @@ SUPERSAMPLING = 2  # drawn so many times larger, then averaged: smooth edges on 
 _NO_CONTACT = {"contype": 0, "conaffinity": 0}
 
 
-def render_episode(
-    scene: Scene, theta: Mapping[str, float] | Sequence[float], qpos: np.ndarray, path: Path, *, picture_at: float = 0.5
-) -> None:
-    """Writes the episode as `path` (.mp4) and one frame of it as .png beside it.
+def render_episode(scene: Scene, theta: Mapping[str, float] | Sequence[float], qpos: np.ndarray, path: Path) -> None:
+    """Writes the episode as `path` (.mp4) and the frame in its middle as .png beside it.
 
     theta: domain parameters by name or in the order of `scene.parameters`. qpos: [T + 1, nq], one per control step.
-    picture_at: which frame, 0 = first, 1 = last. Raises UserError when MuJoCo cannot render here.
+    Raises UserError when MuJoCo cannot render here.
     """
-    frames = list(_frames(scene, theta, qpos))
-    _write(path, frames, picture_at)
+    _write(path, list(_frames(scene, theta, qpos)))
 
 
 def render_side_by_side(
@@ -39,8 +36,6 @@ def render_side_by_side(
     episodes: Sequence[np.ndarray],
     captions: Sequence[str],
     path: Path,
-    *,
-    picture_at: float = 0.5,
 ) -> None:
     """Writes several episodes of one task as one video, side by side, each under its caption; see `render_episode`.
 
@@ -52,7 +47,7 @@ def render_side_by_side(
     ]
     length = max(map(len, columns))
     frames = [np.concatenate([c[min(i, len(c) - 1)] for c in columns], axis=1) for i in range(length)]
-    _write(path, frames, picture_at)
+    _write(path, frames)
 
 
 def smooth(qpos: np.ndarray, *, control_dt: float, fps: float) -> np.ndarray:
@@ -159,11 +154,11 @@ def _caption(text: str) -> np.ndarray:
     return np.asarray(strip)
 
 
-def _write(path: Path, frames: list[np.ndarray], picture_at: float) -> None:
+def _write(path: Path, frames: list[np.ndarray]) -> None:
     import imageio_ffmpeg
     import mediapy
 
     path.parent.mkdir(parents=True, exist_ok=True)
     mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
     mediapy.write_video(path.with_suffix(".mp4"), frames, fps=FPS, crf=20)
-    mediapy.write_image(path.with_suffix(".png"), frames[round(picture_at * (len(frames) - 1))])
+    mediapy.write_image(path.with_suffix(".png"), frames[len(frames) // 2])

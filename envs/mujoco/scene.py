@@ -30,7 +30,7 @@ class View(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """What the simulator knows of a step and observations do not tell; a field that is None is theirs to tell.
+    """What the simulator knows of a step and observations do not show; a field that is None follows from observations.
 
     reward: [] float. terminated, success: [] bool.
     """
@@ -88,7 +88,7 @@ class Scene(NamedTuple):
 
 
 def make_env(scene: Scene, impl: str = "auto") -> Env:
-    """Assembles the Env of a scene. impl: who steps the physics, see `worlds.choose_impl`.
+    """Assembles the Env of a scene. impl: the physics engine, see `worlds.choose_impl`.
 
     Raises UserError for a scene that these engines cannot step.
     """

@@ -23,15 +23,8 @@ _COSMETIC = ("geom_rgba", "mat_", "light_", "cam_")
 Impl = Literal["auto", "jax", "warp", "c"]  # see `choose_impl`
 IMPL_VARIABLE = "SGFT_IMPL"
 _STRUCTURE = (
-    "body_parentid",
-    "jnt_type",
-    "geom_type",
-    "geom_bodyid",
-    "actuator_trnid",
-    "pair_geom1",
-    "pair_geom2",
-    "pair_dim",
-)
+    "body_parentid", "jnt_type", "geom_type", "geom_bodyid", "actuator_trnid", "pair_geom1", "pair_geom2", "pair_dim",
+)  # fmt: skip
 
 
 class PhysicsState(NamedTuple):
@@ -64,7 +57,7 @@ def check_supported(name: str, host: mujoco.MjModel) -> None:
 
 
 def choose_impl(wanted: str = "auto") -> str:
-    """Who steps the physics: "jax" (MJX's own code), "warp" (MuJoCo Warp) or "c" (MuJoCo's own engine).
+    """The physics engine: "jax" (MJX's own code), "warp" (MuJoCo Warp) or "c" (MuJoCo's own engine).
 
     wanted: one of them, or "auto": what $SGFT_IMPL says, or else the fastest (docs/performance.md), which is "c" where
         JAX computes on CPUs, "warp" on NVIDIA GPUs where it is installed, "jax" elsewhere. Raises UserError for

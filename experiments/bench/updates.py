@@ -1,7 +1,6 @@
 """Speed of SAC updates next to the same arithmetic by hand, and next to other libraries where they are installed."""
 
 from collections.abc import Callable
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -30,7 +29,7 @@ def speed(
 ) -> dict[str, Any]:
     """Updates of pretraining per second over all seeds: of the library, and of the hand-written one.
 
-    gflop: of the matrix products alone. gb: bytes that the compiled update reads and writes, as XLA counts them.
+    gb: bytes that the compiled update reads and writes, as XLA counts them.
     """
     network = NetworkConfig(hidden=(width, width), layer_norm=True)
     keys, count = jax.random.split(jax.random.key(0), seeds), seeds * updates
@@ -38,12 +37,10 @@ def speed(
         library, bare = (
             _repeated(agent, batch, keys, updates, repeats) for agent in (_library(network), _by_hand(network, batch))
         )
-    flops, moved = multiplications(network) * 2 * batch, _bytes(_library(network), batch, keys)
-    per_s = count / library.seconds
+    moved, per_s = _bytes(_library(network), batch, keys), count / library.seconds
     return {
         "batch": batch, "seeds": seeds, "width": width, "precision": exact,
         "updates_per_s": per_s, "bare_per_s": count / bare.seconds, "updates/bare": bare.seconds / library.seconds,
-        "gflop_per_update": flops / 1e9, "tflop_per_s": per_s * flops / 1e12,
         "gb_per_update": moved / 1e9, "tb_per_s": per_s * moved / 1e12,
         "compile_s": library.compile_s, "memory_mb": library.memory_mb,
     }  # fmt: skip
@@ -114,30 +111,3 @@ def _bytes(agent: Agent, batch: int, keys: Key) -> float:
     data = jax.vmap(lambda key: rows(key, batch))(keys)
     cost: Any = jax.jit(jax.vmap(agent.update)).lower(made, data, keys).compile().cost_analysis()
     return float(cost["bytes accessed"]) / len(keys)
-
-
-def multiplications(network: NetworkConfig) -> int:
-    """Multiplications of the matrix products that one row of a batch causes in an update, gradients included.
-
-    A forward pass through kernels of K weights takes K, the gradient by these weights K, the gradient by the inputs of
-    the layers K, less the first kernel where nobody asks for the gradient by the network's input.
-    """
-
-    def sizes(inputs: int, outputs: int) -> tuple[int, int]:
-        widths = [inputs, *network.hidden, outputs]
-        kernels = [n * m for n, m in pairwise(widths)]
-        return sum(kernels), sum(kernels) - kernels[0]
-
-    def trained(inputs: int, outputs: int) -> int:
-        all_kernels, later = sizes(inputs, outputs)
-        return 2 * all_kernels + later
-
-    actor, critic = sizes(OBS_DIM, 2 * ACT_DIM)[0], sizes(OBS_DIM + ACT_DIM, 1)
-    through = 2 * (2 * critic[0])  # twin critics forward, then back to the action
-    return (
-        actor + 2 * critic[0]  # targets
-        + 2 * trained(OBS_DIM + ACT_DIM, 1)
-        + trained(OBS_DIM, 2 * ACT_DIM) + through
-        + trained(OBS_DIM, 1)
-        + MEMBERS * trained(OBS_DIM + ACT_DIM, OBS_DIM)
-    )  # fmt: skip

@@ -233,6 +233,29 @@ def read_curve(folder: Path) -> Curve:
     )
 
 
+def make_curve(
+    evaluations: Mapping[int, Any], task: Any, *, gap: str, method: str, seeds: Sequence[int], variant: str = ""
+) -> Curve:
+    """A curve from Python alone, without a run folder.
+
+    evaluations: the real rollouts made so far -> what `sgft_jax.evaluate` played then, episodes [members, n]. task: the
+    `Env`. gap, method, variant: names for tables and figures. seeds: [members].
+    """
+    played, rollouts = list(evaluations.values()), np.array(list(evaluations))
+    mean_of = lambda name: np.stack([np.asarray(getattr(x, name)).mean(1) for x in played], axis=1)  # noqa: E731
+    transitions = rollouts * task.episode_length
+    return Curve(
+        task.name, gap, method, variant, priors="",
+        seeds=np.asarray(seeds),
+        prior=np.full(len(seeds), -1),
+        rollouts=rollouts,
+        transitions=transitions,
+        minutes=transitions * task.control_dt / 60,
+        scores={"success": mean_of("success"), "return": mean_of("total_reward")},
+        score=task.score,
+    )  # fmt: skip
+
+
 def read_runs(out: Path) -> Found:
     """Every run below <out>/finetune; of several that differ in seeds alone that with the most seeds, then rollouts."""
     runs: dict[tuple[str, ...], tuple[Curve, Path]] = {}

@@ -27,7 +27,7 @@ _FONT = {"size": 10, "color": _INK}
 def learning_curves(path: Path, panels: Mapping[str, Sequence[Curve]], *, title: str) -> Path:
     """Scores over real rollouts: a panel for each entry, by its words; IQM over members with its 95 % bootstrap band.
 
-    Raises no panel above `MOST` curves: one with more becomes several, each with the others in grey behind its own.
+    A panel with more than `MOST` curves becomes several; each shows the others in grey behind its own.
     """
     parts = [part for words, curves in panels.items() if curves for part in _split(words, curves)]
     columns = min(len(parts), 2)

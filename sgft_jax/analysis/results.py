@@ -11,7 +11,7 @@ from sgft_jax.types import UserError, unknown
 def select(found: Found, *, variants: bool = True, **wanted: Sequence[str]) -> Found:
     """Only the curves of certain tasks, gaps, methods or priors: names by field of `Curve`, empty for all.
 
-    Raises UserError if one of the names is of no curve, or if nothing is left.
+    Raises UserError if no curve has one of the names, or if nothing is left.
     """
     curves = [curve for curve in found.curves if variants or not curve.variant]
     for field, names in wanted.items():
@@ -20,7 +20,7 @@ def select(found: Found, *, variants: bool = True, **wanted: Sequence[str]) -> F
             raise UserError(unknown(f"run of the {field}", missing[0], there))
         curves = [curve for curve in curves if not names or getattr(curve, field) in names]
     if not curves:
-        raise UserError(f"no run fits all that is asked of {', '.join(name for name in wanted if wanted[name])}")
+        raise UserError(f"no run matches all of the chosen: {', '.join(name for name in wanted if wanted[name])}")
     return Found(curves, found.notes)
 
 

@@ -124,7 +124,7 @@ def _check_leaves(where: Path, saved: list[Leaf], wanted: list[Leaf]) -> None:
 
 
 def _prune(root: Path, *, newest: int, keep: int) -> None:
-    """Delete all but the `keep` newest complete steps up to `newest`; what goes is renamed first, lest it stay torn."""
+    """Delete all but the `keep` newest complete steps up to `newest`; a kill leaves none half deleted."""
     steps = _steps(root)
     complete = [step for step in sorted(steps, reverse=True) if step <= newest and _is_complete(root / str(step))]
     for step in set(steps) - set(complete[: max(keep, 1)]):

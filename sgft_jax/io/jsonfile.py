@@ -1,5 +1,6 @@
 """Impure: reads and writes small JSON files, atomically and without the numbers that JSON does not know."""
 
+import dataclasses
 import json
 import math
 import os
@@ -13,7 +14,8 @@ from sgft_jax.types import UserError
 
 
 def jsonable(value: Any) -> Any:
-    """Plain JSON data: arrays become lists, array scalars numbers, paths strings, infinities and nan their names.
+    """Plain JSON data: dataclasses become objects with every field spelled out, arrays lists, array scalars numbers,
+    paths strings, infinities and nan their names.
 
     Those strings keep the file valid JSON for every reader and, unlike null, still tell divergence from a missing
     value; Python's `float` turns them back. Raises TypeError for anything else.
@@ -22,6 +24,8 @@ def jsonable(value: Any) -> Any:
         return {str(k): jsonable(v) for k, v in value.items()}
     if hasattr(value, "_asdict"):
         return jsonable(value._asdict())
+    if dataclasses.is_dataclass(value):
+        return {field.name: jsonable(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, (list, tuple)):
         return [jsonable(v) for v in value]
     if isinstance(value, Path):
@@ -62,3 +66,13 @@ def read_json(path: Path) -> Any:
         raise UserError(f"{path}: no such file") from None
     except ValueError as error:
         raise UserError(f"{path}: not valid JSON ({error})") from error
+
+
+def differences(old: Any, new: Any, *, name: str = "") -> list[tuple[str, Any, Any]]:
+    """(dotted name, old, new) of every leaf that differs between two pieces of JSON data."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        found: list[tuple[str, Any, Any]] = []
+        for key in [*old, *(k for k in new if k not in old)]:
+            found += differences(old.get(key), new.get(key), name=f"{name}.{key}" if name else key)
+        return found
+    return [] if old == new else [(name, old, new)]

@@ -12,14 +12,13 @@ import numpy as np
 
 from sgft_jax import mesh
 from sgft_jax.io import checkpoint
-from sgft_jax.io.config import differences
-from sgft_jax.io.jsonfile import read_json, write_json
+from sgft_jax.io.jsonfile import differences, read_json, write_json
 from sgft_jax.types import Normalizer, Prior, PyTree, UserError
 
 CARD = "prior.json"
 
 
-def save_prior(folder: Path, prior: Prior) -> Path:
+def save_prior(folder: str | Path, prior: Prior) -> Path:
     """Write a prior to `folder`, replacing the one that may be there, and return the folder.
 
     The card must have `task`, `obs_dim` and `act_dim`, which are checked on loading, and `algorithm` unless that is
@@ -38,7 +37,7 @@ def save_prior(folder: Path, prior: Prior) -> Path:
 
 
 def load_prior(
-    folder: Path, *, task: str | None = None, obs_dim: int | None = None, act_dim: int | None = None
+    folder: str | Path, *, task: str | None = None, obs_dim: int | None = None, act_dim: int | None = None
 ) -> Prior:
     """Read a prior from its folder, or from the run folder that holds one as `prior/`.
 

@@ -48,24 +48,20 @@ class RunProgress:
         """Count `amount` more units; `info` is shown behind them, by name."""
         self._done += amount
         said = [f"{name} {value:.3g}" for name, value in (info or {}).items()]
-        words = "  ".join([", ".join([self._counts(), *self._speed()]), *said])
+        words = "  ".join([", ".join([self._counts(), *self._speed(amount)]), *said])
         if self._live is not None:
             self._live.update(self._live.task_ids[0], completed=self._done, words=words)
         else:
             self._console.print(f"{self._title}: {words}", highlight=False, markup=False)
 
-    def say(self, message: str) -> None:
-        """Print a line without breaking the bar."""
-        self._console.print(message, highlight=False, markup=False)
-
     def _counts(self) -> str:
         return f"{self._done:,}/{self._total:,} {self._unit} ({100 * self._done / max(self._total, 1):.0f} %)"
 
-    def _speed(self) -> list[str]:
-        """Rate and time left, as soon as they can be known."""
+    def _speed(self, amount: int) -> list[str]:
+        """Rate and time left, as soon as they can be known. A chunk of no units, such as an evaluation, is not one."""
         now = time.monotonic()
         if self._first is None:
-            self._first = self._done, now
+            self._first = (self._done, now) if amount else None
             return []
         done, begun = self._first
         rate = (self._done - done) / max(now - begun, 1e-9)

@@ -16,8 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from sgft_jax.io.config import config_to_json, differences
-from sgft_jax.io.jsonfile import read_json, write_json
+from sgft_jax.io.jsonfile import differences, read_json, write_json
 from sgft_jax.types import UserError
 
 CONFIG, PROVENANCE = "config.json", "provenance.json"
@@ -74,26 +73,6 @@ class Run:
         self.lock.release()
 
 
-def open_run(
-    folder: Path,
-    *,
-    kind: str,
-    config: Any,
-    resume: bool = False,
-    overwrite: bool = False,
-    volatile: tuple[str, ...] = ("resume", "overwrite"),
-    say: Callable[[str], None] = print,
-) -> Run:
-    """Create or reopen a run folder, say where it is, and record configuration and provenance in it.
-
-    kind: what writes there ("pretrain", "finetune"). config: a frozen dataclass. volatile: dotted names of fields that
-    may differ on a resume. Raises UserError if the folder holds something already and neither `resume` nor `overwrite`
-    is set, if it is not a run folder, if the stored configuration differs, or if another process has it open.
-    """
-    configs = {Path(folder): config_to_json(config)}
-    return open_runs(configs, kind=kind, resume=resume, overwrite=overwrite, volatile=volatile, say=say)[0]
-
-
 def open_runs(
     configs: Mapping[Path, Mapping[str, Any]],
     *,
@@ -104,11 +83,14 @@ def open_runs(
     inputs: Mapping[str, Any] | None = None,
     say: Callable[[str], None] = print,
 ) -> list[Run]:
-    """`open_run` for several folders with the configuration of each as JSON data: all of them or none.
+    """Create or reopen run folders, say where they are, and record configuration and provenance: all of them or none.
 
-    inputs: JSON data that says what the runs begin with, such as digests of files, by name; it is recorded with the
-    provenance and must be the same on a resume. What is wrong with one folder is found before anything is written to
-    any.
+    configs: the configuration of each folder as JSON data. kind: what writes there ("pretrain", "finetune"). volatile:
+    dotted names of fields that may differ on a resume. inputs: JSON data that says what the runs begin with, such as
+    digests of files, by name; it is recorded with the provenance and must be the same on a resume.
+    Raises UserError if a folder holds something already and neither `resume` nor `overwrite` is set, if it is not a run
+    folder, if the stored configuration differs, or if another process has it open. What is wrong with one folder is
+    found before anything is written to any.
     """
     inputs = inputs or {}
     for folder in configs:

@@ -54,8 +54,6 @@ class IQLHyper(NamedTuple):
     beta: inverse temperature of the advantage weights, 1 / scaled return; 0 clones the data.
     max_weight: cap of these weights.
     reward_scale: factor on every reward. beta and the cap mean something only where returns span about 1.
-    actor_decay: updates, counted by `IQLState.step`, over which lr_actor falls to 0 along half a cosine: the offline
-        phase. 0 = constant: fine-tuning.
     """
 
     lr_actor: float | Array = 3e-4
@@ -66,7 +64,6 @@ class IQLHyper(NamedTuple):
     beta: float | Array = 3.0
     max_weight: float | Array = 100.0
     reward_scale: float | Array = 1.0
-    actor_decay: float | Array = 0.0
 
 
 class IQLState(struct.PyTreeNode):
@@ -159,12 +156,6 @@ def td_target(reward: Array, discount: Array, next_value: Array, *, reward_scale
     return jax.lax.stop_gradient(reward_scale * reward + discount * next_value)
 
 
-def actor_rate(hyper: IQLHyper, step: Array) -> Array:
-    """Learning rate [] of the actor after `step` [] updates."""
-    done = jnp.clip(step / jnp.maximum(hyper.actor_decay, 1.0), 0.0, 1.0)
-    return hyper.lr_actor * jnp.where(hyper.actor_decay > 0, 0.5 * (1 + jnp.cos(jnp.pi * done)), 1.0)
-
-
 # --- the learner ------------------------------------------------------------------------------------------------------
 
 
@@ -180,8 +171,8 @@ class _Parts(NamedTuple):
 def make_iql(config: IQLConfig, hyper: IQLHyper | None = None) -> Learner:
     """The learner of a configuration. Set the observation statistics with `state.replace(normalizer=...)`.
 
-    From the offline phase to fine-tuning: `state.replace(hyper=state.hyper._replace(actor_decay=jnp.float32(0)))`. New
-    numbers must be float32 arrays like the old ones, or the update is compiled again.
+    New numbers, set with `state.replace(hyper=...)`, must be float32 arrays like the old ones, or the update is
+    compiled again.
     """
     sizes, body = (config.obs_dim, config.act_dim), config.network
     parts = _Parts(
@@ -259,7 +250,7 @@ def _update_actor(parts: _Parts, state: IQLState, batch: Batch, q: Array) -> tup
         return losses.row_mean(jax.vmap(policy_loss)(moments, batch.action, weights), batch)
 
     mean, grads = jax.value_and_grad(loss)(state.actor.params)
-    fit = optim.step(parts.optimiser, state.actor, grads, actor_rate(hyper, state.step))
+    fit = optim.step(parts.optimiser, state.actor, grads, hyper.lr_actor)
     # The parameter itself is kept in bounds: a bound in `apply` has no gradient beyond it, and would hold it for ever.
     log_std = jnp.clip(fit.params["log_std"], LOG_STD_MIN, LOG_STD_MAX)
     metrics = {

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from sgft_jax import checks
 from sgft_jax.learners import losses, optim
 from sgft_jax.models import dynamics, normalizer
 from sgft_jax.models.networks import (
@@ -45,7 +46,6 @@ class SACConfig:
     train_critic: False keeps the critic as it is (a frozen-critic actor-critic).
     critics: members of the critic ensemble. target_critics: a target is the minimum over so many random ones of them,
         None = all (REDQ, RLPD). actor_mean: the actor follows the members' mean, not their minimum (RLPD).
-    entropy_in_target: count the entropy of the next action in the target, as SAC does.
     critic_baseline: Q(s, a) = net(s, a) - V(s) with V frozen: what a kept critic means under shaped rewards.
     actor_batch: leading rows of the batch that the actor learns from, None = all.
     policy_delay: critic updates per update of actor and temperature. max_grad_norm: per network, None = no clipping.
@@ -64,7 +64,6 @@ class SACConfig:
     critics: int = 2
     target_critics: int | None = None
     actor_mean: bool = False
-    entropy_in_target: bool = True
     critic_baseline: bool = False
     actor_batch: int | None = None
     policy_delay: int = 1
@@ -73,13 +72,9 @@ class SACConfig:
     def __post_init__(self) -> None:
         if self.critic_baseline and self.train_value:
             raise UserError("SAC option critic_baseline needs a frozen value network: set train_value to False")
-        for name in ("policy_delay", "critics"):
-            if getattr(self, name) < 1:
-                raise UserError(f"SAC option {name} is {getattr(self, name)}: must be at least 1")
-        if self.target_critics is not None and not 1 <= self.target_critics <= self.critics:
-            raise UserError(
-                f"SAC option target_critics is {self.target_critics}: must be 1 to {self.critics} (critics)"
-            )
+        checks.at_least(self, 1, "policy_delay", "critics", "target_critics")
+        if (self.target_critics or 1) > self.critics:
+            raise checks.refusal("target_critics", self.target_critics, f"at most critics, {self.critics}")
 
 
 class SACHyper(NamedTuple):
@@ -269,7 +264,6 @@ def _update_critic(
     def target(row: Batch, key: Key) -> Array:
         action, log_prob = tanh_gaussian_sample(parts.actor.apply(state.actor.params, row.next_obs), key)
         next_q = critic(state.target_critic, row.next_obs, action)[counted]
-        log_prob = log_prob if config.entropy_in_target else jnp.zeros_like(log_prob)
         return losses.td_target(row.reward, row.discount, next_q, log_prob, alpha=alpha)
 
     targets = jax.vmap(target)(batch, jax.random.split(key, batch.reward.shape[0]))

@@ -74,7 +74,7 @@ def _score(config: TDMPC2Config, parts: Parts, state: TDMPC2State, z: Array, key
     """What a plan [H, act_dim] from z promises: sum of gamma^t R, then gamma^H times a value.
 
     The value is V_sim with sgft, else the mean of 2 random heads at a drawn action. One draw for all candidates
-    of a plan, where the original draws for each: they then compare by their actions, not by their luck.
+    of a plan, where the original draws for each, so that they differ by their actions alone.
     """
     key_heads, key_action = jax.random.split(key)
     critic, gamma = heads_of(state.critic.params, two_heads(config, key_heads)), state.hyper.gamma

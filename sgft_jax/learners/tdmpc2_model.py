@@ -14,6 +14,7 @@ import optax
 from flax import linen as nn
 from flax import struct
 
+from sgft_jax import checks
 from sgft_jax.learners import optim
 from sgft_jax.models import normalizer, twohot
 from sgft_jax.models.networks import Network, precision, tanh_gaussian_action
@@ -59,7 +60,6 @@ class TDMPC2Config:
         iterations None = 6, and 8 from 20 action entries on.
     sgft: encoder, critic and a copy of the first policy never change. They make V_sim, the frozen value that ends plans
         and teaches the policy; dynamics, reward head and policy learn. False: everything learns, as published.
-    train_encoder: with sgft, learn the encoder, too. An ablation: the frozen critic then reads latents that drift.
     """
 
     obs_dim: int
@@ -74,22 +74,16 @@ class TDMPC2Config:
     policy_samples: int = 24
     iterations: int | None = None
     sgft: bool = False
-    train_encoder: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("obs_dim", "act_dim", "horizon", "simnorm_group"):
-            if getattr(self, name) < 1:
-                raise UserError(f"TD-MPC2 option {name} is {getattr(self, name)}: must be at least 1")
+        checks.at_least(self, 1, "obs_dim", "act_dim", "horizon", "simnorm_group")
+        checks.below_one(self, "dropout")
         if self.size.latent % self.simnorm_group:
             raise UserError(f"TD-MPC2 latent size {self.size.latent}: not a multiple of {self.simnorm_group=}")
         if self.size.members < 2:
             raise UserError(f"TD-MPC2 size members is {self.size.members}: targets take the lower of 2")
-        if not 0 <= self.dropout < 1:
-            raise UserError(f"TD-MPC2 option dropout is {self.dropout}: must be in [0, 1)")
         if not 0 <= self.policy_samples < self.samples:
-            raise UserError(f"TD-MPC2 option policy_samples is {self.policy_samples}: must be in [0, {self.samples=})")
-        if self.train_encoder and not self.sgft:
-            raise UserError("TD-MPC2 option train_encoder belongs to sgft: without it the encoder always learns")
+            raise checks.refusal("policy_samples", self.policy_samples, f"from 0 to less than samples, {self.samples}")
         _ = self.planner  # complains about the rest
 
     @property
@@ -101,9 +95,7 @@ class TDMPC2Config:
     @property
     def learned(self) -> tuple[str, ...]:
         """The networks of the world model that learn; one limit on their gradients' common norm."""
-        if not self.sgft:
-            return ("encoder", "dynamics", "reward", "critic")
-        return ("encoder", "dynamics", "reward") if self.train_encoder else ("dynamics", "reward")
+        return ("dynamics", "reward") if self.sgft else ("encoder", "dynamics", "reward", "critic")
 
 
 def named_config(obs_dim: int, act_dim: int, *, size: str, plan_samples: int, **structure: Any) -> TDMPC2Config:

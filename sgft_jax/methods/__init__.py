@@ -1,17 +1,20 @@
-"""The methods, one file each. `get_method` finds them by name, or a method of your own by its Python file."""
+"""The methods: every file in this folder is one. `get_method` finds them by name, or a method of your own by its file."""
 
 import importlib
+import pkgutil
 import re
 from functools import cache
 
 from sgft_jax import extend
 from sgft_jax.types import Method, UserError, unknown
 
-# In the order of tables and figures: the ones to try first stand first.
-NAMES = (
+# The order of tables and figures: the ones to try first stand first, what is not listed last.
+_ORDER = (
     "sgft-sac", "sgft-relabel", "sgft-mpc", "sgft-tdmpc2", "sgft", "tdmpc2", "mbpo", "sac", "rlpd", "sac-online", "iql",
     "sac-reset", "pbrs", "pbrs-branch", "frozen-critic", "sgft-tdmpc2-code",
 )  # fmt: skip
+_FILES = [module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__) if module.name != "options"]
+NAMES = tuple(sorted(_FILES, key=lambda name: (_ORDER.index(name) if name in _ORDER else len(_ORDER), name)))
 DEFAULT = "sgft-sac"
 
 

@@ -26,7 +26,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.finetuner import sac_finetuner
     from sgft_jax.transforms import clip, shape
 
-    transforms = (shape,) if config.clip_shaped is None else (shape, clip(config.clip_shaped))
+    transforms = (shape, clip(config.clip_shaped))
     return sac_finetuner(
         config, prior, task, transforms=transforms, reset_critic=config.reset_critic, value_baseline=True
     )

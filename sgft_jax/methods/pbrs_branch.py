@@ -26,20 +26,11 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.finetuner import sac_finetuner
     from sgft_jax.transforms import branch, clip, shape
 
-    bounded = () if config.clip_shaped is None else (clip(config.clip_shaped),)
+    imagined = branch(config.horizon, config.branches, noise=config.branch_noise, segments=False)
     return sac_finetuner(
-        config,
-        prior,
-        task,
-        transforms=(
-            branch(config.horizon, config.branches, noise=config.branch_noise, segments=False),
-            shape,
-            *bounded,
-        ),
-        reset_critic=config.reset_critic,
-        value_baseline=True,
-        actor_batch=config.batch_size if config.actor_real_only else None,
-    )
+        config, prior, task, transforms=(imagined, shape, clip(config.clip_shaped)), reset_critic=config.reset_critic,
+        value_baseline=True, actor_batch=config.batch_size if config.actor_real_only else None,
+    )  # fmt: skip
 
 
 METHOD = Method(

@@ -30,15 +30,8 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.finetuner import sac_finetuner
     from sgft_jax.transforms import clip, shape, shorten
 
-    bounded = () if config.clip_shaped is None else (clip(config.clip_shaped),)
-    return sac_finetuner(
-        config,
-        prior,
-        task,
-        transforms=(shape, *bounded, shorten(config.horizon)),
-        horizon_dim=config.horizon,
-        value_baseline=True,
-    )
+    transforms = (shape, clip(config.clip_shaped), shorten(config.horizon))
+    return sac_finetuner(config, prior, task, transforms=transforms, horizon_dim=config.horizon, value_baseline=True)
 
 
 METHOD = Method("sgft", "sgft", "shaped rewards over short horizons, no models", "SGFT 2025", Config, build)

@@ -33,25 +33,19 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.transforms import branch, clip, relabel, shape, shorten
 
     source = sources.mixture(config.batch_size, config.batch_size)
-    bounded = () if config.clip_shaped is None else (clip(config.clip_shaped),)
+    transforms = (
+        relabel(source.n_real),
+        branch(config.horizon, config.branches, noise=config.branch_noise),
+        shape,
+        clip(config.clip_shaped),
+        shorten(config.horizon),
+    )
     return sac_finetuner(
-        config,
-        prior,
-        task,
-        transforms=(
-            relabel(source.n_real),
-            branch(config.horizon, config.branches, noise=config.branch_noise),
-            shape,
-            *bounded,
-            shorten(config.horizon),
-        ),
-        horizon_dim=config.horizon,
-        reset_critic=config.reset_critic,
-        value_baseline=True,
-        source=lambda state: source,
+        config, prior, task, transforms=transforms, horizon_dim=config.horizon, reset_critic=config.reset_critic,
+        value_baseline=True, source=lambda state: source,
         simulation=Simulation(config.simulated_transitions, config.simulated_ladder),
         actor_batch=source.n_real + source.n_sim if config.actor_real_only else None,
-    )
+    )  # fmt: skip
 
 
 METHOD = Method(

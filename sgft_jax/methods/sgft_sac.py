@@ -38,22 +38,16 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.finetuner import sac_finetuner
     from sgft_jax.transforms import branch, clip, shape, shorten
 
-    bounded = () if config.clip_shaped is None else (clip(config.clip_shaped),)
-    return sac_finetuner(
-        config,
-        prior,
-        task,
-        transforms=(
-            branch(config.horizon, config.branches, noise=config.branch_noise),
-            shape,
-            *bounded,
-            shorten(config.horizon),
-        ),
-        horizon_dim=config.horizon,
-        reset_critic=config.reset_critic,
-        value_baseline=True,
-        actor_batch=config.batch_size if config.actor_real_only else None,
+    transforms = (
+        branch(config.horizon, config.branches, noise=config.branch_noise),
+        shape,
+        clip(config.clip_shaped),
+        shorten(config.horizon),
     )
+    return sac_finetuner(
+        config, prior, task, transforms=transforms, horizon_dim=config.horizon, reset_critic=config.reset_critic,
+        value_baseline=True, actor_batch=config.batch_size if config.actor_real_only else None,
+    )  # fmt: skip
 
 
 METHOD = Method(

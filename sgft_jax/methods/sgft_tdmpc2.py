@@ -13,13 +13,10 @@ from sgft_jax.types import Finetuner, Method, Prior, Task
 class Config(tdmpc2.Config):
     """Options of `sgft-tdmpc2`."""
 
-    train_encoder: bool = False
-    """Let the encoder learn too; V_sim then changes with it (an ablation)."""
-
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
-    return tdmpc2.planner(config, prior, task, sgft=True, train_encoder=config.train_encoder)
+    return tdmpc2.planner(config, prior, task, sgft=True)
 
 
 METHOD = Method(

@@ -60,12 +60,11 @@ def planner(
     shaped: bool = False,
     fresh: bool = False,
     sgft: bool = False,
-    train_encoder: bool = False,
 ) -> Finetuner:
     """Fine-tuning whose learner is TD-MPC2.
 
-    shaped: rewards are shaped by draws of the simulator's value. fresh: the agent starts from nothing. sgft,
-    train_encoder: see `TDMPC2Config`.
+    shaped: rewards are shaped by draws of the simulator's value. fresh: the agent starts from nothing. sgft: see
+    `TDMPC2Config`.
     """
     import jax
 
@@ -79,11 +78,9 @@ def planner(
     from sgft_jax.types import Array, Batch, Key, PyTree, SimulatedData
 
     card = card_of(prior)
-    own = {"size": "5M", **card.get("config", {}), "horizon": config.horizon, "plan_samples": config.plan_samples}
-    structure = tdmpc2_model.named_config(
-        task.obs_dim, task.act_dim, size=own["size"], horizon=config.horizon,
-        plan_samples=config.plan_samples, sgft=sgft, train_encoder=train_encoder,
-    )  # fmt: skip
+    plan = {"horizon": config.horizon, "plan_samples": config.plan_samples}
+    own = {"size": "5M", **card.get("config", {}), **plan}
+    structure = tdmpc2_model.named_config(task.obs_dim, task.act_dim, size=own["size"], sgft=sgft, **plan)
     fresh = fresh or prior is None
     rise = warmup(config, config.lr_warmup) if isinstance(config, Config) and not fresh else 0
     hyper = tdmpc2.TDMPC2Hyper(

@@ -1,9 +1,10 @@
 """What describes a network, as data. Command lines read this module, so it imports neither JAX nor Flax."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
-from sgft_jax.types import UserError
+from sgft_jax import checks
+from sgft_jax.types import UserError, unknown
 
 type Precision = Literal["default", "float32", "bfloat16"]
 Activation = Literal["relu", "tanh", "silu", "elu"]
@@ -22,7 +23,6 @@ class NetworkConfig:
     activation: Activation = "relu"
 
     def __post_init__(self) -> None:
-        if not self.hidden or min(self.hidden) < 1:
-            raise UserError(f"network option hidden is {self.hidden}: name one or more widths, each at least 1")
-        if self.activation not in Activation.__args__:
-            raise UserError(f"network activation {self.activation!r}: choose one of {', '.join(Activation.__args__)}")
+        checks.layers(self, "hidden")
+        if self.activation not in (known := get_args(Activation)):
+            raise UserError(unknown("activation", self.activation, known))

@@ -3,21 +3,18 @@
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.models.networks import Network, Precision, precision
+from sgft_jax.models.networks import Network, precision
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.types import Array, Metrics, Normalizer, PyTree
 
 
-def predict(
-    network: Network, params: PyTree, normalizer: Normalizer, obs: Array, *, exact: Precision = "float32"
-) -> Array:
+def predict(network: Network, params: PyTree, normalizer: Normalizer, obs: Array) -> Array:
     """V(obs) []. obs: [obs_dim] raw units.
 
     Full float32 on every device: the shaped reward is the small difference of two large values, and the ten mantissa
-    bits of a GPU's default matrix products would drown it. exact: another precision, to measure that
-    (`experiments.benchmark --parts values`).
+    bits of a GPU's default matrix products would drown it.
     """
-    with precision(exact):
+    with precision("float32"):
         return network.apply(params, normalize(normalizer, obs))
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
+from sgft_jax import checks
 from sgft_jax.learners.sac import SACParams
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.networks import (
@@ -22,7 +23,7 @@ from sgft_jax.models.networks import (
 )
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.planning import mppi
-from sgft_jax.types import Array, Key, PyTree, UserError
+from sgft_jax.types import Array, Key, PyTree
 
 _ITERATIONS = 3  # of the search: half of TD-MPC2's, for plans a quarter as long
 _PROPOSALS, _ELITES = 4, 8  # one of so many samples is the policy's, and an elite
@@ -46,10 +47,8 @@ class MPCConfig:
     gamma: float = 0.99
 
     def __post_init__(self) -> None:
-        if self.horizon < 1:
-            raise UserError(f"planner option horizon is {self.horizon}: must be at least 1")
-        if self.samples < _ELITES:
-            raise UserError(f"planner option samples is {self.samples}: must be at least {_ELITES}")
+        checks.at_least(self, 1, "horizon")
+        checks.at_least(self, _ELITES, "samples")
 
 
 def init_carry(config: MPCConfig) -> Array:

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from sgft_jax import checks
 from sgft_jax.models.networks import add_noise
 from sgft_jax.types import Array, Key, UserError
 
@@ -25,10 +26,9 @@ class MPPIConfig:
     iterations: int = 6
 
     def __post_init__(self) -> None:
-        if self.iterations < 1:
-            raise UserError(f"planner option iterations is {self.iterations}: must be at least 1")
-        if not 1 <= self.elites <= self.samples:
-            raise UserError(f"planner option elites is {self.elites}: must be from 1 to samples, {self.samples}")
+        checks.at_least(self, 1, "iterations", "elites")
+        if self.elites > self.samples:
+            raise checks.refusal("elites", self.elites, f"at most samples, {self.samples}")
 
 
 class MPPIHyper(NamedTuple):

@@ -9,12 +9,12 @@ chaos of contacts from growing one early micrometre into centimetres. docs/physi
 from collections.abc import Callable
 from typing import NamedTuple
 
+import c_reference
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from envs.franka import arm, hammer, insert, kinematics, push
-from envs.mujoco import host
 from envs.mujoco.scene import Scene
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array
@@ -103,12 +103,12 @@ def sample_theta(scene: Scene, rng: np.random.Generator) -> dict[str, float]:
 def play_script(
     probe: Probe, theta: dict[str, float], start: PhysicsState, *, steps: int, refine: int = 1, iterations: int = 0
 ) -> list[Step]:
-    """An episode of the scripted controller in C MuJoCo. refine, iterations: see `host.play`."""
+    """An episode of the scripted controller in C MuJoCo. refine, iterations: see `c_reference.play`."""
     script, params = jax.jit(probe.script), as_params(theta)
     state, episode = start, []
     for t in range(steps):
         action = script(params, state, t)
-        after = host.play(probe.scene, theta, state, [action], refine=refine, iterations=iterations)[0]
+        after = c_reference.play(probe.scene, theta, state, [action], refine=refine, iterations=iterations)[0]
         episode.append(Step(theta, state, action, after))
         state = after
     return episode
@@ -132,7 +132,7 @@ def measure(probe: Probe, reference: list[Step], *, substeps: int, iterations: i
     scene, place = probe.scene._replace(substeps=substeps), jax.jit(probe.place)
     travels, errors = [], []
     for step in reference:
-        tested = host.play(scene, step.theta, step.before, [step.action], iterations=iterations)[0]
+        tested = c_reference.play(scene, step.theta, step.before, [step.action], iterations=iterations)[0]
         before, after, reached = (place(as_params(step.theta), s) for s in (step.before, step.after, tested))
         travels.append(1000 * np.asarray(after - before))
         errors.append(1000 * np.asarray(reached - after))

@@ -3,7 +3,7 @@
 import jax
 
 from sgft_jax.io import priors
-from sgft_jax.io.config import config_to_json
+from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.learners.sac import SACConfig, extract_params, make_sac
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.types import Prior
@@ -15,6 +15,6 @@ def save_prior(folder, seed, **changes):
     """An untrained prior of the toy task; returns its parameters."""
     config = SACConfig(4, 2, network=NETWORK, ensemble_size=2)
     params = extract_params(make_sac(config).init(jax.random.key(seed)))
-    card = {"task": "toy", "obs_dim": 4, "act_dim": 2, "network": config_to_json(NETWORK), "gamma": 0.9}
+    card = {"task": "toy", "obs_dim": 4, "act_dim": 2, "network": jsonable(NETWORK), "gamma": 0.9}
     priors.save_prior(folder, Prior(params, {**card, "ensemble_size": 2, "seed": seed, **changes}))
     return params

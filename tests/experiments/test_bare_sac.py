@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.bench import bare_sac
-from experiments.bench.updates import ACT_DIM, MEMBERS, OBS_DIM, multiplications, rows
+from experiments.bench.updates import ACT_DIM, MEMBERS, OBS_DIM, rows
 from sgft_jax.learners.sac import SACConfig, SACHyper, make_sac
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.types import Batch
@@ -57,14 +57,3 @@ def test_it_is_the_update_of_the_library(key):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), wanted, seen)
     moved = np.abs(layers(state.actor.params)[0][0] - layers(learner.init(key).actor.params)[0][0]).max()
     assert moved > 3e-4  # further than the tolerance, so the comparison says something
-
-
-@pytest.mark.slow
-def test_multiplications_are_those_of_xla(key):
-    """XLA counts two operations per multiplication and what is beside matrix products: little where layers are wide."""
-    wide = NetworkConfig(hidden=(128, 128), layer_norm=True)
-    agent = bare_sac.init(key, wide, OBS_DIM, ACT_DIM, members=MEMBERS, alpha=1.0)
-    batch, noise = rows(key, 64), bare_sac.draw(key, 64, ACT_DIM, MEMBERS)
-    with jax.numpy_rank_promotion("allow"):
-        cost = jax.jit(bare_sac.update).lower(agent, batch, noise, HYPER).compile().cost_analysis()
-    assert 0.8 < 2 * 64 * multiplications(wide) / cost["flops"] <= 1.0

@@ -41,7 +41,7 @@ def test_updates_are_compared_with_the_hand_written_ones(tmp_path):
     with jax.numpy_rank_promotion("allow"):  # the hand-written update broadcasts ensembles against batches
         (line,) = main(replace(SMALL, parts=("updates",), out=tmp_path))["updates"]
     assert line["updates/bare"] == pytest.approx(line["updates_per_s"] / line["bare_per_s"])
-    assert line["gb_per_update"] > 1e-6 and line["gflop_per_update"] > 0
+    assert line["gb_per_update"] > 1e-6
 
 
 @pytest.mark.slow

@@ -2,12 +2,10 @@
 
 from types import SimpleNamespace
 
-import jax
-import numpy as np
 import pytest
 from priors_by_hand import save_prior
 
-from experiments import memory, options, stacking
+from experiments import memory, options
 from experiments.memory import reserve
 from experiments.options import prior_folders, seed_list, seeds_name
 from sgft_jax.types import UserError
@@ -51,12 +49,6 @@ def test_tasks_and_real_systems_are_checked_by_name(tmp_path):
     ):
         with pytest.raises(UserError, match=words):
             options.check_task(task, reals)
-
-
-def test_keys_depend_on_seed_and_purpose_alone():
-    keys = jax.random.key_data(stacking.seed_keys([0, 1, 2], 5))
-    np.testing.assert_array_equal(keys[1:], jax.random.key_data(stacking.seed_keys([1, 2], 5)))
-    assert len(np.unique(np.concatenate([keys, jax.random.key_data(stacking.seed_keys([0, 1, 2], 6))]), axis=0)) == 6
 
 
 def test_priors_are_found_in_order(tmp_path):

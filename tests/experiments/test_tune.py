@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from priors_by_hand import save_prior
+from sgft_jax.io.config import config_to_json
 
 import envs
 from envs import gaps
 from experiments import cli, compare, finetune, grid, spaces, tune, tuned
 from experiments.finetune_args import arguments, run_folder, with_settings
 from sgft_jax.io import checkpoint
-from sgft_jax.io.config import config_to_json
 from sgft_jax.io.runs import FORMAT
 from sgft_jax.types import UserError
 

@@ -62,9 +62,3 @@ def test_layers():
     for value, said in (((), "empty"), ((8, 0), "8 0"), ((-1,), "-1")):
         with pytest.raises(UserError, match=f"is {said}: must be one or more layers of at least 1 unit"):
             checks.layers(Config(value), "learning_rate")
-
-
-def test_one_of_names_the_closest():
-    checks.one_of(Config("relu"), "learning_rate", ("relu", "tanh"))
-    with pytest.raises(UserError, match="option learning-rate: there is no 'rely', did you mean 'relu'"):
-        checks.one_of(Config("rely"), "learning_rate", ("relu", "tanh"))

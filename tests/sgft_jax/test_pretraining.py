@@ -204,3 +204,9 @@ def test_memory_counts_what_is_kept_and_drawn():
 def test_settings_that_make_no_sense_are_refused(changes, words):
     with pytest.raises(UserError, match=words):
         replace(CONFIG, **changes)
+
+
+def test_keys_depend_on_seed_and_purpose_alone():
+    keys = jax.random.key_data(pretraining.seed_keys([0, 1, 2], 5))
+    np.testing.assert_array_equal(keys[1:], jax.random.key_data(pretraining.seed_keys([1, 2], 5)))
+    assert len(np.unique(np.concatenate([keys, jax.random.key_data(pretraining.seed_keys([0, 1, 2], 6))]), axis=0)) == 6

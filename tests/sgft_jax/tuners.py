@@ -11,7 +11,7 @@ import pytest
 
 from sgft_jax import methods, train
 from sgft_jax.data import replay
-from sgft_jax.io.config import config_to_json
+from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.learners import sac, tdmpc2, tdmpc2_model
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.types import Finetuner, Normalizer, Prior, Transition
@@ -67,7 +67,7 @@ def prior(algorithm="sac"):
     else:
         init = sac.make_sac(sac.SACConfig(2, 2, network=NET, ensemble_size=2)).init
         params = sac.extract_params(jax.jit(init)(jax.random.key(7)))
-        card = {"algorithm": "sac", "network": config_to_json(NET), "gamma": 0.9}
+        card = {"algorithm": "sac", "network": jsonable(NET), "gamma": 0.9}
     return Prior(shaken(params)._replace(normalizer=statistics), card)
 
 

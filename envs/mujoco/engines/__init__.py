@@ -1,4 +1,4 @@
-"""Who steps the physics. The engines themselves are imported where one is made: MJX alone takes two seconds."""
+"""Physics engines. They are imported where one is made: MJX alone takes two seconds."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -9,7 +9,7 @@ MEAN_INERTIA = "stat.meaninertia"  # a field that worlds differ in, though MuJoC
 
 
 class Engine(NamedTuple):
-    """Who steps a scene, for one world; vmap over worlds.
+    """What steps a scene, for one world; vmap over worlds.
 
     fields: of the model that differ between worlds, by name. state: a `PhysicsState`.
     advance(fields, state, controls [substeps, nu]) -> the state after these steps.

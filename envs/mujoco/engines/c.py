@@ -102,7 +102,7 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
 
 
 def _warn(message: str) -> None:
-    """Instead of a log file in the working directory. What is unstable is told by the state itself."""
+    """Instead of a log file in the working directory. The state itself shows what is unstable."""
     if "unstable" not in message:
         warnings.warn(message, RuntimeWarning, stacklevel=2)
 

@@ -1,5 +1,6 @@
 """Cartpole swing-up: the reward by hand, the motion in closed form against C MuJoCo, the course of an episode."""
 
+import c_reference
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -9,7 +10,6 @@ from franka_bench import member, theta_of
 
 import envs
 from envs.control import cartpole
-from envs.mujoco import host
 
 KEY = jax.random.key(0)
 STEPS = 120
@@ -58,7 +58,7 @@ def actions():
 @pytest.mark.parametrize("i", range(3))
 def test_motion_is_that_of_mujoco(played, i):
     thetas, starts, after = played
-    wanted = host.play(cartpole.SCENE, thetas[i], member(starts, i).physics, actions(), iterations=100)
+    wanted = c_reference.play(cartpole.SCENE, thetas[i], member(starts, i).physics, actions(), iterations=100)
     qpos, qvel = (np.array([getattr(state, name) for state in wanted]) for name in ("qpos", "qvel"))
     assert qpos[:, 0].max() > cartpole.RAIL and qpos[:, 0].min() < -cartpole.RAIL  # both ends were hit
     np.testing.assert_allclose(after.physics.qpos[i], qpos, atol=1e-4)

@@ -2,6 +2,7 @@
 
 import itertools
 
+import c_reference
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -10,7 +11,6 @@ import pytest
 from scripted import PROBES, as_params, measure, play_script, reference_steps
 
 from envs.franka import arm, hammer
-from envs.mujoco import host
 
 NOMINAL = {p.name: p.nominal for p in hammer.PARAMETERS}
 PROBE = PROBES["hammer"]
@@ -143,7 +143,7 @@ def test_more_damping_means_less_travel_per_blow():
     struck = int(np.argmax(heights(high, [s.after for s in episode]) < 0.079))
     actions = [step.action for step in episode[: struck + 1]]
     left = [
-        heights(high, host.play(hammer.SCENE, high | {"nail_damping": d}, start(high), actions))[-1]
+        heights(high, c_reference.play(hammer.SCENE, high | {"nail_damping": d}, start(high), actions))[-1]
         for d in (500.0, 1000.0, 2000.0)
     ]
     travels = 0.08 - np.array(left)
@@ -178,7 +178,7 @@ def test_arm_stays_out_of_the_board(theta):
     hand, limbs = drawn(model, ["link6", "link7"]), drawn(model, ["link3", "link4", "link5"])
     board = [g for g in drawn(model, ["world"]) if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_BOX]
     for signs in itertools.product((-1.0, 1.0), repeat=3):
-        for state in host.play(hammer.SCENE, theta, start(theta), jnp.tile(jnp.array(signs), (15, 1))):
+        for state in c_reference.play(hammer.SCENE, theta, start(theta), jnp.tile(jnp.array(signs), (15, 1))):
             assert depth(model, state.qpos, hand, [model.geom("board").id]) < 0.015
             assert depth(model, state.qpos, hand + limbs, board) < 0.015
 
@@ -187,7 +187,7 @@ def test_random_saturated_actions_never_explode():
     rng = np.random.default_rng(0)
     for seed, theta in enumerate(corners()):
         actions = np.repeat(np.sign(rng.normal(size=(10, 3))), 4, axis=0)
-        states = host.play(hammer.SCENE, theta, start(theta, seed), jnp.asarray(actions, jnp.float32))
+        states = c_reference.play(hammer.SCENE, theta, start(theta, seed), jnp.asarray(actions, jnp.float32))
         speeds = np.array([np.abs(s.qvel).max() for s in states])
         assert np.isfinite(speeds).all() and speeds.max() < 20.0
 

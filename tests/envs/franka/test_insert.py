@@ -1,5 +1,6 @@
 """Insertion in C MuJoCo: rewards and geometry by hand, a script that solves it, walls that hold, time-step accuracy."""
 
+import c_reference
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -8,7 +9,6 @@ import pytest
 from scripted import PROBES, as_params, measure, play_script, reference_steps, sample_theta
 
 from envs.franka import arm, insert, kinematics
-from envs.mujoco import host
 
 NOMINAL = {p.name: p.nominal for p in insert.PARAMETERS}
 PROBE = PROBES["insert"]
@@ -97,7 +97,7 @@ def pressed(theta, aside, *, down, seed=0):
         obs = np.asarray(observe(params, state))
         aim = obs[6:8] + np.array([aside, 0.0]) - obs[3:5]
         action = np.append(aim / insert.STEP, 0.0 if t < 8 and np.abs(aim).max() > 5e-4 else -down)
-        state = host.play(insert.SCENE, theta, state, [np.clip(action, -1, 1).astype(np.float32)])[0]
+        state = c_reference.play(insert.SCENE, theta, state, [np.clip(action, -1, 1).astype(np.float32)])[0]
         seen.append(np.asarray(observe(params, state))[3:6] - obs[6:9] + [0, 0, -insert.DEPTH])
     return np.array(seen)
 
@@ -122,7 +122,7 @@ def test_clearance(hole_radius, clearance):
     start = insert.initial(params, jax.random.key(0))
     state = play_script(PROBE, theta, start, steps=15)[-1].after
     for _ in range(3):
-        state = host.play(insert.SCENE, theta, state, [np.array([0.1, 0, 0], np.float32)])[0]  # 2 mm
+        state = c_reference.play(insert.SCENE, theta, state, [np.array([0.1, 0, 0], np.float32)])[0]  # 2 mm
     obs = observe(params, state)
     np.testing.assert_allclose(obs[3] - obs[6], clearance, atol=1.5e-4)
 

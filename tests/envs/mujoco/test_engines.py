@@ -1,5 +1,6 @@
 """MuJoCo's C engine behind a callback: the same physics, however the worlds are batched, and no silent resets."""
 
+import c_reference
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +8,6 @@ import pytest
 from franka_bench import EXACT, SCENES, member, theta_of
 
 import envs
-from envs.mujoco import host
 from envs.mujoco import worlds as physics
 from envs.mujoco.engines import mjx as engine_jax
 from envs.mujoco.engines import warp as engine_warp
@@ -43,7 +43,7 @@ def test_steps_are_those_of_mujoco_in_each_world(rig):
     scene, env, thetas, worlds, starts, actions = rig
     played = jax.jit(jax.vmap(lambda *x: episode(env, *x)))(worlds, starts, actions)
     for i, theta in enumerate(thetas):
-        wanted = host.play(scene, theta, member(starts, i).physics, actions[i])
+        wanted = c_reference.play(scene, theta, member(starts, i).physics, actions[i])
         np.testing.assert_allclose(played.physics.qpos[i], np.array([s.qpos for s in wanted]), atol=1e-5)
         np.testing.assert_allclose(played.physics.qvel[i], np.array([s.qvel for s in wanted]), atol=1e-3)
     assert np.ptp(played.physics.qpos[:, -1], axis=0).max() > 1e-3  # the worlds are not one

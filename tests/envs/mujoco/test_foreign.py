@@ -5,6 +5,7 @@ It goes through every engine that is here.
 
 import os
 
+import c_reference as reference
 import jax
 import jax.numpy as jnp
 import mediapy
@@ -15,7 +16,6 @@ import pytest
 import envs
 from envs.base import Entry, Parameter
 from envs.franka import push
-from envs.mujoco import host as reference
 from envs.mujoco import render
 from envs.mujoco.engines import mjx as engine_jax
 from envs.mujoco.engines import warp as engine_warp
@@ -188,7 +188,7 @@ def test_the_picture_shows_this_task_and_nothing_else(tmp_path, monkeypatch):
     if reason := select_renderer():
         pytest.skip(reason)
     assert os.environ["MUJOCO_GL"]
-    render.render_episode(SCENE, [1.0], np.zeros((2, 2)), tmp_path / "e.mp4", picture_at=0.0)
+    render.render_episode(SCENE, [1.0], np.zeros((2, 2)), tmp_path / "e.mp4")
     picture = mediapy.read_image(tmp_path / "e.png").astype(int)
     red = (picture[..., 0] > 120) & (picture[..., 1] < 90) & (picture[..., 2] < 90)
     blue = (picture[..., 2] > 80) & (picture[..., 0] < 90)

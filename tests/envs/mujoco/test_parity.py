@@ -7,6 +7,7 @@ plays a whole episode in MJX and must end alike.
 
 import itertools
 
+import c_reference
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -17,7 +18,6 @@ from scripted import PROBES, play_script
 
 import envs
 from envs.franka import insert
-from envs.mujoco import host
 from envs.mujoco.scene import make_env
 
 KEY = jax.random.key(0)
@@ -64,7 +64,7 @@ def test_saturated_servos(pushing):
     start = pushing.reset(world, KEY)
     far = start.physics._replace(ctrl=start.physics.ctrl + 1.0)
     theta = dict(zip([p.name for p in pushing.env.parameters], map(float, world.theta.params), strict=True))
-    wanted = host.play(SCENES["push"], theta, far, [np.zeros(2, np.float32)])[0]
+    wanted = c_reference.play(SCENES["push"], theta, far, [np.zeros(2, np.float32)])[0]
     assert (np.abs(wanted.qpos - far.qpos)[:7] > 0.01).all()
     seen = pushing.step(world, start._replace(physics=far), np.zeros(2, np.float32), KEY).physics
     np.testing.assert_allclose(seen.qpos[:7], wanted.qpos[:7], atol=1e-5)
@@ -108,7 +108,7 @@ def test_arm_on_the_board():
     names = set()
     for signs in itertools.product((-1.0, 1.0), repeat=3):
         action = jnp.array(signs)
-        states = [start.physics, *host.play(scene, theta, start.physics, [action] * 12)]
+        states = [start.physics, *c_reference.play(scene, theta, start.physics, [action] * 12)]
         names |= touched(scene.build(theta).compile(), states)
         seen = [rig.step(world, start._replace(physics=s), action, KEY).physics.qpos for s in states[:-1]]
         np.testing.assert_allclose(seen, [s.qpos for s in states[1:]], atol=1e-4)

@@ -1,13 +1,14 @@
+import dataclasses
 import json
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax.io.jsonfile import jsonable, read_json, write_json
+from sgft_jax.io.jsonfile import differences, jsonable, read_json, write_json
 from sgft_jax.types import UserError
 
 
@@ -59,3 +60,74 @@ def test_read_says_what_is_wrong(tmp_path):
     (tmp_path / "x.json").write_text('{"a": ')
     with pytest.raises(UserError, match=r"x.json: not valid JSON"):
         read_json(tmp_path / "x.json")
+
+
+@dataclasses.dataclass(frozen=True)
+class Network:
+    hidden: tuple[int, ...] = (256, 256)
+    activation: Literal["relu", "silu"] = "relu"
+
+
+@dataclasses.dataclass(frozen=True)
+class Fixed:
+    value: float = 0.2
+
+
+@dataclasses.dataclass(frozen=True)
+class Decay:
+    start: float = 1.0
+    end: float = 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    task: str = "hammer"
+    network: Network = dataclasses.field(default_factory=Network)
+    target_entropy: float | None = None
+    schedule: Fixed | Decay = dataclasses.field(default_factory=Fixed)
+    gap: dict[str, float] = dataclasses.field(default_factory=dict)
+    ranges: tuple[tuple[str, float], ...] = ()
+    prior: Path | None = None
+    seed: int = 0
+    resume: bool = False
+
+
+RICH = Config(
+    network=Network((64,), "silu"),
+    target_entropy=-3.0,
+    schedule=Decay(2.0, math.inf),
+    gap={"friction": 0.5},
+    ranges=(("mass", 0.1), ("damping", 2.0)),
+    prior=Path("runs/prior"),
+    seed=3,
+    resume=True,
+)
+
+
+def test_every_kind_of_field_becomes_plain_data():
+    assert json.loads(json.dumps(jsonable(RICH), allow_nan=False)) == {
+        "task": "hammer",
+        "network": {"hidden": [64], "activation": "silu"},
+        "target_entropy": -3.0,
+        "schedule": {"start": 2.0, "end": "inf"},
+        "gap": {"friction": 0.5},
+        "ranges": [["mass", 0.1], ["damping", 2.0]],
+        "prior": "runs/prior",
+        "seed": 3,
+        "resume": True,
+    }
+
+
+def test_every_field_is_spelled_out():
+    assert jsonable(Config())["network"] == {"hidden": [256, 256], "activation": "relu"}
+    assert set(jsonable(Config())) == {f.name for f in dataclasses.fields(Config)}
+
+
+def test_differences_name_the_leaves():
+    old, new = jsonable(Config()), jsonable(RICH)
+    assert differences(old, old) == []
+    assert differences({"a": {"b": 1, "c": [2]}}, {"a": {"b": 1, "c": [3]}, "d": 4}) == [
+        ("a.c", [2], [3]),
+        ("d", None, 4),
+    ]
+    assert ("network.activation", "relu", "silu") in differences(old, new)

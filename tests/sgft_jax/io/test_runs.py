@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from sgft_jax.io import runs
-from sgft_jax.io.runs import Lock, open_run, open_runs, plain_path, provenance
+from sgft_jax.io.jsonfile import jsonable
+from sgft_jax.io.runs import Lock, open_runs, plain_path, provenance
 from sgft_jax.types import UserError
 
 
@@ -25,15 +26,19 @@ class Config:
     resume: bool = False
 
 
+def open_run(folder, config=None, *, kind="pretrain", say=lambda _: None, **options):
+    return open_runs({folder: jsonable(config or Config())}, kind=kind, say=say, **options)[0]
+
+
 def start(folder, config=None, **options):
-    run = open_run(folder, kind="pretrain", config=config or Config(), say=lambda _: None, **options)
+    run = open_run(folder, config, **options)
     run.close()
     return run
 
 
 def test_a_new_run_says_where_it_is_and_records_itself(tmp_path):
     heard = []
-    run = open_run(tmp_path / "runs" / "x", kind="pretrain", config=Config(), say=heard.append)
+    run = open_run(tmp_path / "runs" / "x", say=heard.append)
     assert heard == [f"run folder: {tmp_path / 'runs' / 'x'}"]
     assert not run.resumed
     stored = json.loads((run.folder / "config.json").read_text())
@@ -105,7 +110,7 @@ def test_resume_names_every_field_that_differs(tmp_path):
         start(tmp_path / "x", other, resume=True)
     start(tmp_path / "x", other, resume=True, volatile=("task", "inner.layers"))
     with pytest.raises(UserError, match="is a pretrain run, not a finetune run"):
-        open_run(tmp_path / "x", kind="finetune", config=Config(), resume=True, say=lambda _: None)
+        open_run(tmp_path / "x", kind="finetune", resume=True)
 
 
 def test_of_several_runs_all_open_or_none(tmp_path):
@@ -182,12 +187,9 @@ def test_a_folder_that_is_no_run_is_left_alone(tmp_path, content):
 
 
 HOLDER = """
-import dataclasses, sys, time
-from sgft_jax.io.runs import open_run
-@dataclasses.dataclass(frozen=True)
-class Config:
-    task: str = "hammer"
-run = open_run(sys.argv[1], kind="pretrain", config=Config(), say=lambda _: None)
+import pathlib, sys, time
+from sgft_jax.io.runs import open_runs
+runs = open_runs({pathlib.Path(sys.argv[1]): {"task": "hammer"}}, kind="pretrain", say=lambda _: None)
 print("open", flush=True)
 time.sleep(60)
 """
@@ -204,7 +206,7 @@ def test_two_processes_never_share_a_folder_and_a_kill_frees_it(tmp_path):
 
 
 def test_a_forgotten_run_frees_its_folder(tmp_path):
-    run = open_run(tmp_path / "x", kind="pretrain", config=Config(), say=lambda _: None)
+    run = open_run(tmp_path / "x")
     with pytest.raises(UserError, match="another process"):
         start(tmp_path / "x", resume=True)
     del run

@@ -78,14 +78,6 @@ def test_losses_refuse_a_batch():
         iql.td_target(f(1.0), f(0.9), jnp.ones(2), reward_scale=1.0)
 
 
-def test_actor_rate_by_hand():
-    hyper = iql.IQLHyper(lr_actor=2.0, actor_decay=100.0)
-    steps, rates = [0, 25, 50, 100, 150], [2.0, 1 + np.cos(np.pi / 4), 1.0, 0.0, 0.0]
-    np.testing.assert_allclose([iql.actor_rate(hyper, jnp.int32(t)) for t in steps], rates, atol=1e-6)
-    constant = hyper._replace(actor_decay=0.0)
-    assert all(iql.actor_rate(constant, jnp.int32(t)) == 2.0 for t in (0, 1, 10**6))
-
-
 # --- problems with known answers ------------------------------------------------------------------------------------
 
 NET = networks.NetworkConfig(hidden=(32,))
@@ -289,18 +281,6 @@ def test_log_std_stays_in_bounds_and_can_leave_them(key):
     np.testing.assert_allclose(after(-5.0, batch), -5.0 + 1e-2, rtol=1e-4)  # Adam's first step has length lr
 
 
-def test_actor_rate_follows_the_cosine_and_the_others_do_not(key):
-    state, batch = with_hyper(SMALL.init(key), actor_decay=100.0), batch_of(key)
-    moved = {}
-    for step in (0, 50, 100):
-        new, _ = SMALL.update(state.replace(step=jnp.int32(step)), batch, key)
-        moved[step] = new
-        length = jnp.abs(new.actor.params["log_std"])  # from 0
-        np.testing.assert_allclose(length, 1e-2 * (1 - step / 100), rtol=1e-4)  # these three lie on a line, too
-    assert equal(moved[100].actor.params, state.actor.params)
-    assert equal(moved[0].critic, moved[100].critic) and equal(moved[0].value, moved[100].value)
-
-
 def test_act_draws_around_the_mode_within_bounds(key):
     state, obs = with_log_std(SMALL.init(key), -3.0), jnp.array([0.1, -0.2, 0.3])
     draw = jax.jit(jax.vmap(lambda s, k: SMALL.act(s, (), obs, k, explore=True)[0], (None, 0)))
@@ -317,7 +297,7 @@ def test_update_is_traced_once_whatever_the_numbers(key):
     state = SMALL.init(key)
     for step in range(3):
         state, _ = SMALL.update(state, batch_of(jax.random.fold_in(key, step)), jax.random.fold_in(key, step))
-        state = with_hyper(state, actor_decay=0.0, lr_actor=1e-4)  # from the offline phase to fine-tuning
+        state = with_hyper(state, beta=1.0, lr_actor=1e-4)  # from the offline phase to fine-tuning
         state = state.replace(normalizer=normalizer.Normalizer(jnp.ones(3), 2 * jnp.ones(3)))
     assert state.step == 3
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax.io.config import config_to_json
+from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.learners import sac
 from sgft_jax.methods import sgft_mpc
 from sgft_jax.models import networks
@@ -92,7 +92,7 @@ def test_what_comes_later_is_discounted(plan):
 
 @pytest.mark.parametrize("options", [{"horizon": 0}, {"samples": 7}])
 def test_plans_that_cannot_be(options):
-    with pytest.raises(UserError, match=f"planner option {next(iter(options))} is"):
+    with pytest.raises(UserError, match=f"option {next(iter(options))} is"):
         mpc.MPCConfig(1, 1, NET, **options)
 
 
@@ -105,7 +105,7 @@ def tuner():
         obs_dim=1, act_dim=1, episode_length=64, reward=lambda obs, action, after: -jnp.abs(after[0]), terminated=never
     )
     config = sgft_mpc.Config(plan_samples=24, batch_size=32, replay_capacity=64, lr_dynamics=1e-2)
-    made = sgft_mpc.build(config, Prior(prior(), {"network": config_to_json(NET), "gamma": 0.9}), cast(Task, task))
+    made = sgft_mpc.build(config, Prior(prior(), {"network": jsonable(NET), "gamma": 0.9}), cast(Task, task))
     compiled = {name: jax.jit(getattr(made, name)) for name in ("observe", "act")}
     init = jax.jit(lambda params, key: made.init(params, key, None))
     return made._replace(init=init, learn=jax.jit(made.learn, static_argnums=2), **compiled)

@@ -1,0 +1,23 @@
+"""docs/quickstart.ipynb runs from top to bottom, as a notebook would run it: in its folder, in one namespace."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+NOTEBOOK = Path(__file__).parent.parent / "docs/quickstart.ipynb"
+CHECKS = """
+zero_shot, end = curve.values.mean(0)[[0, -1]]
+assert end > zero_shot + 0.2, (zero_shot, end)
+assert {row["seed"] for row in rows} == set(setup.seeds.tolist()) and rows[-1]["success"] == curve.values[-1, -1]
+assert axes.lines and policy.act(np.array([-0.15, 0.0, 0.0])).shape == (1,)
+"""
+
+
+def test_the_notebook_runs_and_fine_tuning_helps():
+    cells = [cell for cell in json.loads(NOTEBOOK.read_text())["cells"] if cell["cell_type"] == "code"]
+    assert not any(cell["outputs"] for cell in cells), "commit it without outputs"
+    program = "\n".join(["".join(cell["source"]) for cell in cells] + [CHECKS])
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg", "PYTHONPATH": str(NOTEBOOK.parent.parent)}
+    subprocess.run([sys.executable, "-c", program], cwd=NOTEBOOK.parent, env=environment, check=True, timeout=500)
