@@ -10,9 +10,12 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import toy
 
 import envs
+from envs import gaps
 from experiments import pretrain
+from sgft_jax import api, train
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import MetricsLog, read_jsonl
 from sgft_jax.io.priors import load_prior
@@ -114,6 +117,26 @@ def test_value_and_model_are_worth_something(finished):
         assert max(found["dynamics/error"]) < 0.5 * min(found["dynamics/error_if_nothing_moved"])
     arrays = np.load(finished / "report/seed-0.npz", allow_pickle=False)
     assert arrays["values"].shape == arrays["returns"].shape == (64 * 20,)  # evaluation episodes * their length
+
+
+@pytest.mark.slow
+def test_sgft_recovers_from_a_turned_command_frame(finished):
+    """Commands turned by 80 degrees: the simulators' policies circle, 8 real rollouts bring them back to the goal."""
+    env = toy.make()
+    gap = gaps.from_dict(env, "turned", {"effects": {"action_rotation": 1.4}})
+    priors = [load_prior(finished / f"prior/seed-{i}") for i in (0, 1)]
+    options = {"lr_actor": 1e-3, "lr_critic": 1e-3, "batch_size": 64, "replay_capacity": 800, "utd": 4.0}
+    tuning = api.setup(env, gap, priors, method="sgft-sac", seeds=4, critic_warmup=100, actor_ramp=0, **options)
+
+    def success(policy, states):
+        return np.asarray(train.evaluate(policy, tuning.system, states, tuning.seeds, 16).success.mean(1))
+
+    steps = train.finetune(*tuning, rollouts=8)
+    begun, _ = next(steps)
+    before = success(tuning.finetuner, begun.agent)
+    *_, (ended, _) = steps
+    after, best = success(tuning.finetuner, ended.agent), success(tuning.finetuner.policy, ended.best.params)
+    assert before.mean() < 0.2 and after.min() > 0.8 and best.mean() > 0.8
 
 
 def test_killed_and_resumed_is_bit_for_bit_uninterrupted(finished, tmp_path, monkeypatch):
