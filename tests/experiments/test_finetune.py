@@ -1,6 +1,7 @@
 """The fine-tuning command end to end, on a point mass whose force is turned by 30 degrees in reality."""
 
 import dataclasses
+import functools
 import json
 import os
 import shutil
@@ -527,18 +528,26 @@ def test_runs_go_on_together_or_alone_whichever_way_they_began(home, tmp_path):
 # --- video ------------------------------------------------------------------------------------------------------------
 
 
-def film(folder, monkeypatch, *, pushes=(0.0, 1.0), scene=None, reason=None, episodes=6):
-    """Records two springs, before and after, with their strengths; returns what was said, and the episodes."""
-    monkeypatch.setattr(toy, "SCENE", scene, raising=False)
-    monkeypatch.setattr(cli, "select_renderer", lambda: reason)
+@functools.cache
+def springs(pushes):
+    """The toy task, worlds, and six episodes [1, 6] of each of two springs, with their strengths."""
     env = toy.make()
     pool = envs.sample_worlds(env, jax.random.key(0), 3)
-    keys = jax.random.split(jax.random.key(4), (1, episodes))
-    springs = [lambda carry, obs, key, k=k: (k * -obs[:2], carry) for k in pushes]
-    played = [
-        jax.vmap(jax.vmap(lambda key, s=spring: play_episode(env, pool, s, (), key, gamma=1.0)))(keys)
-        for spring in springs
-    ]
+    keys = jax.random.split(jax.random.key(4), (1, 6))
+
+    def played(push):
+        spring = lambda carry, obs, key: (push * -obs[:2], carry)  # noqa: E731
+        return jax.vmap(jax.vmap(lambda key: play_episode(env, pool, spring, (), key, gamma=1.0)))(keys)
+
+    return env, pool, jax.vmap(jax.jit(played))(jnp.array(pushes))
+
+
+def film(folder, monkeypatch, *, pushes=(0.0, 1.0), scene=None, reason=None):
+    """Records two springs, before and after; returns what was said, and the episodes."""
+    monkeypatch.setattr(toy, "SCENE", scene, raising=False)
+    monkeypatch.setattr(cli, "select_renderer", lambda: reason)
+    env, pool, both = springs(pushes)
+    played = [jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1)]
     record = Record(folder, env, gaps.Gap("toy", {}, {}), "sac", [0])
     return record.film(pool, lambda: played, 7), played, pool
 
