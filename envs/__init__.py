@@ -24,6 +24,7 @@ TASKS = {
     "push-ball": "envs.franka.ball",
     "hammer": "envs.franka.hammer",
     "insert": "envs.franka.insert",
+    "pendulum": "envs.control.pendulum",
 }
 _OURS = frozenset(TASKS.values())
 _LAZY = {
