@@ -24,7 +24,6 @@ TASKS = {
     "push-ball": "envs.franka.ball",
     "hammer": "envs.franka.hammer",
     "insert": "envs.franka.insert",
-    "pendulum": "envs.control.pendulum",
 }
 _OURS = frozenset(TASKS.values())
 _LAZY = {
