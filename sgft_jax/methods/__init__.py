@@ -1,4 +1,4 @@
-"""The methods: every file in this folder is one. `get_method` finds them by name, or a method of your own by its file."""
+"""The methods: every file in this folder is one. `get_method` finds them by name, or your own by its Python file."""
 
 import importlib
 import pkgutil
