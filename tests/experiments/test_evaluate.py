@@ -88,7 +88,7 @@ def test_the_best_policies_of_a_run(run, capsys):
         (["--task", "toy", "--out", "nowhere"], "nowhere/pretrain/toy/fast: holds no prior"),
         (["--prior", "nowhere"], "--prior nowhere: no such folder"),
         (["--task", "toy", "--real", "sim", "sim"], "--real names sim twice"),
-        (["--task", "toy", "--real", "strange"], "toy has no gap 'strange': it comes with none; give a .toml"),
+        (["--task", "toy", "--real", "strange"], "toy has no gap 'strange'"),
         (["--task", "toy", "--set", "mass=3"], "name one with --real"),
         (["--task", "toy", "--best"], "--best: name the fine-tuning run"),
         (["--task", "toy", "--episodes", "0"], "must be at least 1"),

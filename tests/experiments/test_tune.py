@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from priors_by_hand import save_prior
-from sgft_jax.io.config import config_to_json
 
 import envs
 from envs import gaps
 from experiments import cli, compare, finetune, grid, spaces, tune, tuned
 from experiments.finetune_args import arguments, run_folder, with_settings
 from sgft_jax.io import checkpoint
+from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.runs import FORMAT
 from sgft_jax.types import UserError
 
@@ -54,7 +54,7 @@ def leave(args, success, *, rollouts=(0, 5, 10)):
         "sgft_jax": "0",
         "format": FORMAT,
         "kind": "finetune",
-        "config": config_to_json(args) | {"real": args.real[0]},
+        "config": jsonable(args) | {"real": args.real[0]},
     }
     (folder / "config.json").write_text(json.dumps(config))
     final = {"final": {"rollouts": rollouts[-1]}, "gap": {"name": args.real[0]}}
