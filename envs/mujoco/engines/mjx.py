@@ -67,10 +67,10 @@ def with_fields(model: mjx.Model, fields: dict[str, Array]) -> mjx.Model:
 
 
 def joint_servos(host: mujoco.MjModel) -> np.ndarray:
-    """Indices of the actuators whose force is limited and linear in the position and velocity of one joint."""
+    """[nu] bool: actuators whose force is limited and linear in the position and velocity of one joint."""
     joint = host.actuator_trnid[:, 0].clip(0)
     one_dof = np.isin(host.jnt_type[joint], (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE))
-    return np.flatnonzero(
+    return (
         (host.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT)
         & one_dof
         & (host.actuator_gaintype == mujoco.mjtGain.mjGAIN_FIXED)
@@ -87,16 +87,13 @@ def hold_saturated(model: mjx.Model, data: mjx.Data, servos: np.ndarray) -> mjx.
     The implicit integrator counts a servo's damping in the inertia. C MuJoCo leaves out servos at their limit, MJX does
     not: a saturated wrist of the hammering arm, 0.1 kg m^2, then moved as if it had 0.7.
     """
-    if not servos.size:
+    if not servos.any():
         return model
-    joint, gear = model.actuator_trnid[servos, 0], model.actuator_gear[servos, 0]
+    joint, gear = model.actuator_trnid[:, 0].clip(0), model.actuator_gear[:, 0]
     position, velocity = data.qpos[model.jnt_qposadr[joint]], data.qvel[model.jnt_dofadr[joint]]
-    gain, bias = model.actuator_gainprm[servos], model.actuator_biasprm[servos]
-    force = gain[:, 0] * data.ctrl[servos] + bias[:, 0] + gear * (bias[:, 1] * position + bias[:, 2] * velocity)
-    low, high = model.actuator_forcerange[servos].T
-    held = ((force <= low) | (force >= high))[:, None]
+    gain, bias = model.actuator_gainprm, model.actuator_biasprm
+    force = gain[:, 0] * data.ctrl + bias[:, 0] + gear * (bias[:, 1] * position + bias[:, 2] * velocity)
+    low, high = model.actuator_forcerange.T
+    held = (servos & ((force <= low) | (force >= high)))[:, None]
     constant = jnp.zeros_like(bias).at[:, 0].set(jnp.clip(force, low, high))
-    return model.replace(
-        actuator_gainprm=model.actuator_gainprm.at[servos].set(jnp.where(held, 0.0, gain)),
-        actuator_biasprm=model.actuator_biasprm.at[servos].set(jnp.where(held, constant, bias)),
-    )
+    return model.replace(actuator_gainprm=jnp.where(held, 0.0, gain), actuator_biasprm=jnp.where(held, constant, bias))
