@@ -36,12 +36,16 @@ class Recorded:
         number, self.rollout = self.rollout, self.rollout + 1
         missing = [store for store in self.stores if len(store) <= number]
         if not missing:
-            return join([_read(store.load(number)) for store in self.stores])
+            return self._stored(number)
         episodes = self.inner.play(policy, states, keys, explore=True)
         for i, store in enumerate(self.stores):
             if len(store) <= number:
                 store.append(_arrays(part(episodes, i, keys.shape[0] // len(self.stores))))
-        return episodes
+        # What a robot has done stands, also where the others had to play this rollout again.
+        return episodes if len(missing) == len(self.stores) else self._stored(number)
+
+    def _stored(self, number: int) -> Episode:
+        return join([_read(store.load(number)) for store in self.stores])
 
 
 def _arrays(episodes: Episode) -> dict[str, np.ndarray]:

@@ -388,10 +388,12 @@ def test_no_rollout_of_a_real_system_is_replaced_because_another_lacks_it(tmp_pa
     shutil.rmtree(two.folder)
     two = RealStore(tmp_path / "two")
     before = one.load(0)["obs"]
-    play(Recorded(Counter(), [one, two], done=0))
+    later = Counter()
+    later.played = [True] * 3
+    assert play(Recorded(later, [one, two], done=0)) == [11, 14.5]  # what is learned from is what is stored
     assert len(one) == len(two) == 1
     np.testing.assert_array_equal(one.load(0)["obs"], before)
-    assert two.load(0)["obs"][0, 0, 0] == 11.5
+    assert two.load(0)["obs"][0, 0, 0] == 14.5
 
 
 # --- what can be wrong ------------------------------------------------------------------------------------------------
