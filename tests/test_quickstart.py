@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 NOTEBOOK = Path(__file__).parent.parent / "docs/quickstart.ipynb"
 CHECKS = """
 zero_shot, *later = curve.values.mean(0)
@@ -15,6 +17,7 @@ assert axes.lines and policy.act(np.array([-0.15, 0.0, 0.0])).shape == (1,)
 """
 
 
+@pytest.mark.slow  # .ci/run runs it
 def test_the_notebook_runs_and_fine_tuning_helps():
     cells = [cell for cell in json.loads(NOTEBOOK.read_text())["cells"] if cell["cell_type"] == "code"]
     assert not any(cell["outputs"] for cell in cells), "commit it without outputs"

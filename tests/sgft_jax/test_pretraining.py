@@ -106,8 +106,10 @@ def test_a_set_that_is_not_due_is_never_asked_for(counted):
     equal(never, late)
 
 
-@pytest.mark.parametrize("algorithm", ["sac", "tdmpc2"])
-@pytest.mark.parametrize("refresh_every", [0, 1])
+@pytest.mark.parametrize(
+    ("algorithm", "refresh_every"),
+    [("sac", 0), ("sac", 1), ("tdmpc2", 0), pytest.param("tdmpc2", 1, marks=pytest.mark.slow)],
+)
 def test_resumed_is_bit_for_bit_uninterrupted(algorithm, refresh_every, monkeypatch):
     monkeypatch.setitem(tdmpc2_model.SIZES, "tiny", tdmpc2_model.Size(8, 8, 8, 2, 2))
     env, config = (
