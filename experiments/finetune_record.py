@@ -29,6 +29,7 @@ class Record:
     def __init__(self, folder: Path, env: Env, gap: Gap, method: str, seeds: list[int]) -> None:
         self.folder, self.env, self.gap, self.method, self.seeds = folder, env, gap, method, seeds
         self.log, self.real = MetricsLog(folder), RealStore(folder)
+        self.last_good: Path | None = None  # the checkpoint to go back to when training diverges
         self.expect = {"kind": "finetune", "task": env.name, "method": method, "seeds": seeds}
 
     def latest(self) -> int | None:
@@ -39,19 +40,18 @@ class Record:
         """The state of that checkpoint, to which the logs are cut back. What the robot did stays."""
         progress, meta = checkpoint.restore(self.folder, like, step=step, expect=self.expect)
         self.log.truncate(meta["position"])
+        self.last_good = checkpoint.path(self.folder, step)
         return progress
 
     def checkpoint(self, progress: FinetuneProgress) -> None:
         """The state, and how long the logs are."""
         step = int(progress.rollouts) + -(-int(progress.offline) // OFFLINE_PART)
         meta = {**self.expect, "rollouts": int(progress.rollouts), "position": self.log.position()}
-        checkpoint.save(self.folder, step, progress, meta=meta)
+        self.last_good = checkpoint.save(self.folder, step, progress, meta=meta)
 
     def metrics(self, done: int, values: Mapping[str, np.ndarray]) -> None:
         """A line of one learning phase; raises DivergedError where a number is not finite."""
-        step = self.latest()
-        good = None if step is None else checkpoint.path(self.folder, step)
-        check_finite(values, done, unit="rollouts", last_good=good)
+        check_finite(values, done, unit="rollouts", last_good=self.last_good)
         self.log.metrics(self._transitions(done), {"rollouts": done, **values})
 
     def evaluation(self, done: int, scores: Metrics) -> None:

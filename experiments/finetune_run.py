@@ -101,7 +101,7 @@ class _Run:
                 if done == before and values:  # a part of the offline phase
                     self._checkpoint(progress)
                 elif self._due(self.args.eval_every, before, done):
-                    shown["success, evaluation"] = self._evaluate(progress, done)
+                    shown[f"{self.system.env.score}, evaluation"] = self._evaluate(progress, done)
                 if done and self._due(self.args.checkpoint_every, before, done):
                     self._checkpoint(progress)
                 bar.advance(done - before, shown)
@@ -167,7 +167,7 @@ class _Run:
         if initial is None:
             before = evaluate(self.finetuner, states=jax.jit(self.begin)().agent, episodes=n)
         else:
-            own = jax.tree.map(lambda x: x[self.seeds % x.shape[0]], self.setup.priors)
+            own = train.priors_of_members(self.setup.priors, self.seeds)
             before = evaluate(initial, states=own, episodes=n)
         return [before, evaluate(self.finetuner, states=progress.agent, episodes=n)]
 

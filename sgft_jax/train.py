@@ -132,8 +132,7 @@ def begin(
     def one(params: PyTree, seed: Array, which: Array, rows: SimulatedRows | None) -> PyTree:
         return finetuner.init(params, _key(seed, _INIT, 0), None if rows is None else rows.of(which))
 
-    own = None if priors is None else jax.tree.map(lambda x: x[which], priors)
-    agent = split_vmap(one, (0, 0, 0, None))(own, seeds, which, simulated)
+    agent = split_vmap(one, (0, 0, 0, None))(priors_of_members(priors, seeds), seeds, which, simulated)
     m = seeds.shape[0]
     low = jnp.full(m, -jnp.inf)
     best = Best(
@@ -149,13 +148,8 @@ class _Steps:
     def __init__(
         self, finetuner: Finetuner, system: System, priors: PyTree, seeds: Array, simulated: SimulatedRows | None
     ) -> None:
-        self.finetuner, self.system, self.priors, self.seeds, self.simulated = (
-            finetuner,
-            system,
-            priors,
-            seeds,
-            simulated,
-        )
+        self.finetuner, self.system, self.simulated = finetuner, system, simulated
+        self.priors, self.seeds = priors, seeds
         if finetuner.simulation is not None and simulated is None:
             raise UserError("this method also learns from simulated transitions: pass `simulated` (see `simulate`)")
         self._store = jax.jit(split_vmap(self._observe), donate_argnums=0)
@@ -181,7 +175,7 @@ class _Steps:
                 episodes = self.system.play(self.finetuner, agent, keys, explore=True)
                 best = self._keep(best, agent, episodes.score[:, 0], episodes.total_reward[:, 0], jnp.int32(done))
             else:
-                own = jax.tree.map(lambda x: x[_prior_of(self.priors, self.seeds)], self.priors)
+                own = priors_of_members(self.priors, self.seeds)
                 episodes = self.system.play(initial, own, keys, explore=True)
             played.append(episodes)
         for episodes in played:
@@ -230,6 +224,12 @@ def _keep_best(finetuner: Finetuner, best: Best, agent: PyTree, score: Array, to
         params, keep(mean_score, best.score), keep(mean_total, best.total),
         keep(jnp.broadcast_to(learned, better.shape), best.rollouts), recent, best.count + 1,
     )  # fmt: skip
+
+
+def priors_of_members(priors: PyTree, seeds: Array) -> PyTree:
+    """The params [M, ...] that each member starts from, of priors [P, ...]; None without priors. seeds: [M]."""
+    which = _prior_of(priors, seeds)
+    return jax.tree.map(lambda x: x[which], priors)
 
 
 def _prior_of(priors: PyTree, seeds: Array) -> Array:
