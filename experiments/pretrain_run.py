@@ -108,7 +108,9 @@ class _Run:
                 for seed in (_HELDOUT_SEED, _FINAL_SEED)
             )
         self.heldout = Simulated(self.env, heldout, first, gamma=self.config.gamma)
-        if checkpoint.latest(self.home) is None:
+        step = checkpoint.latest(self.home)
+        self.last_good = None if step is None else checkpoint.path(self.home, step)
+        if step is None:
             self.log.truncate({})
             saved, done = None, 0
         else:
@@ -164,7 +166,7 @@ class _Run:
                     metrics = {name: np.asarray(x) for name, x in metrics.items()}
                 done += 1
                 self.log.metrics(done * size, metrics)
-                check_finite(metrics, done * size, unit="env steps", last_good=self._last_good())
+                check_finite(metrics, done * size, unit="env steps", last_good=self.last_good)
                 shown = {"success, exploring": float(metrics["train/success"].mean())}
                 if done % self.config.eval_every == 0 or done == chunks:
                     best, found = self._evaluate(state, best, done)
@@ -173,10 +175,6 @@ class _Run:
                     self._checkpoint(Saved(state, best), done)
                 progress.advance(size, shown)
         return best
-
-    def _last_good(self) -> Path | None:
-        step = checkpoint.latest(self.home)
-        return None if step is None else checkpoint.path(self.home, step)
 
     def _evaluate(self, state: PretrainState, best: Best | None, done: int) -> tuple[Best, Metrics]:
         """Every evaluation plays the same episodes in the same held-out worlds."""
@@ -191,7 +189,7 @@ class _Run:
     def _checkpoint(self, saved: Saved, done: int) -> None:
         meta = {**self.expect, "chunks": done, "position": self.log.position(), "seconds": self.clock.seconds}
         with self.clock("checkpoint"):
-            checkpoint.save(self.home, done, mesh.local(saved), meta=meta)
+            self.last_good = checkpoint.save(self.home, done, mesh.local(saved), meta=meta)
 
     # ------------------------------------------------------------ what stays
 
