@@ -1,6 +1,7 @@
 """A walk along a line that an alarm may end at any step: an Env without a physics engine, with dict observations.
 
 The alarm is a part of the observation, so that the end is a function of it. Parameter `risk` is its probability.
+A test may declare more actions; the first one alone moves something.
 """
 
 import jax
@@ -48,7 +49,7 @@ def reset(world: World, key: Key) -> EnvState:
 def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
     """The state arrives with packed observations; the new ones are a dict."""
     key_alarm, key_noise = jax.random.split(key)
-    position = state.physics + STEP * distort(state.effects, action)
+    position = state.physics + STEP * distort(state.effects, action)[:1]
     alarm = jax.random.bernoulli(key_alarm, world.theta.params[0]).astype(jnp.float32)
     seen = measure(state.effects, jnp.append(position, alarm), key_noise)
     true_obs = jnp.append(position, alarm)

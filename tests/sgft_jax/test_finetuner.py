@@ -215,6 +215,19 @@ def test_the_simulators_transitions_as_the_models_have_them(seen):
     assert gap.max() < 1e-4  # what one of the members says
 
 
+def test_imagined_steps_follow_every_model():
+    """An update draws one. The second of two moves a point by 1,000, so the mean reward tells which it was."""
+    plain = tuners.build("mbpo", horizon=1, train_dynamics=False)
+    state = plain.init(prior().params, jax.random.key(0), None)
+    state = plain.observe(state, tuners.episode(jax.random.key(1)), jnp.ones(T, bool))
+    far = jax.tree.map(jnp.copy, state.frozen.dynamics)
+    far["Dense_1"]["bias"] = far["Dense_1"]["bias"].at[1].add(1000.0)
+    state = state._replace(frozen=state.frozen._replace(dynamics=far))
+    learn = jax.jit(jax.vmap(lambda key: plain.learn(state, key, 1)[1]["batch/reward_mean"]))
+    went_far = np.asarray(learn(jax.random.split(jax.random.key(2), 20)) < -100)
+    assert 0.2 < went_far.mean() < 0.8
+
+
 def test_models_learn_from_real_rows_alone():
     """The simulated rows of sgft-relabel, however odd, do not move the models."""
     case, data = tuner("sgft-relabel"), tuners.simulated().of(0)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy_terminating
-from tuners import bits, equal
+from tuners import Recorded, bits, copied, equal
 
 import envs
 from envs.rollout import Episode
@@ -65,23 +65,6 @@ def simulated():
     """Two systems; the members play one each."""
     pools = envs.sample_worlds(ENV, jax.random.key(0), 4)
     return Simulated(ENV, jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), pools), jnp.array([0, 1]), gamma=GAMMA)
-
-
-class Recorded:
-    """A system and all that was played on it: [(episodes, explore)]."""
-
-    def __init__(self, system):
-        self.system, self.played = system, []
-
-    def play(self, policy, states, keys, *, explore):
-        episodes = self.system.play(policy, states, keys, explore=explore)
-        self.played.append((episodes, explore))
-        return episodes
-
-
-def copied(tree):
-    """A yielded state is donated to the next step."""
-    return jax.tree.map(lambda x: np.array(x), tree)
 
 
 def run(finetuner=FINE, system=None, rollouts=4, **options):

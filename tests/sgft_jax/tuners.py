@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from sgft_jax import methods, train
@@ -140,6 +141,23 @@ def started(case, seed=0):
     """A state with one real episode."""
     state = case.fine.init(case.params, jax.random.key(seed))
     return case.fine.observe(state, episode(jax.random.key(seed)), jnp.ones(T, bool))
+
+
+class Recorded:
+    """A system and all that was played on it: [(episodes, explore)]."""
+
+    def __init__(self, system):
+        self.system, self.played = system, []
+
+    def play(self, policy, states, keys, *, explore):
+        episodes = self.system.play(policy, states, keys, explore=explore)
+        self.played.append((episodes, explore))
+        return episodes
+
+
+def copied(tree):
+    """A yielded state is donated to the next step."""
+    return jax.tree.map(lambda x: np.array(x), tree)
 
 
 def slow_but(fast, names):

@@ -90,6 +90,24 @@ def test_what_comes_later_is_discounted(plan):
     assert (jnp.abs(plan(value, reward=pays, gamma=0.4)) < 0.1).all()
 
 
+def test_proposals_follow_every_model(monkeypatch):
+    """The policy goes up to where it believes to be and one step on; each plan's proposals follow one model."""
+    model = networks.Network(lambda key: None, lambda gains, obs, action: gains[:, None] * action[None])
+    up = networks.Network(lambda key: None, lambda params, obs: jnp.array([[0.2 + obs[0]], [-20.0]]))
+    monkeypatch.setattr(mpc, "make_dynamics", lambda *_: model)
+    monkeypatch.setattr(mpc, "make_actor", lambda *_: up)
+    monkeypatch.setattr(mpc.mppi, "plan", lambda config, hyper, rate, proposals, *_, explore: proposals)
+    act = mpc.make_act(mpc.MPCConfig(1, 1, NET, horizon=2, noise=0.0), reward=nothing, terminated=never)
+    gains = jnp.array([0.0, 1.0, 2.0])
+    params = sac.SACParams(None, None, None, gains, STILL)
+    keys = jax.random.split(jax.random.key(0), 20)
+    proposed = jax.vmap(lambda key: act(params, None, jnp.zeros(1), key, explore=False))(keys)[..., 0]
+    first = np.tanh(0.2)
+    np.testing.assert_allclose(proposed[:, :, 0], first, rtol=1e-5)
+    np.testing.assert_allclose(proposed[:, :, 1], np.tile(proposed[:, :1, 1], (1, proposed.shape[1])), rtol=1e-5)
+    np.testing.assert_allclose(np.unique(np.round(proposed[:, 0, 1], 4)), np.tanh(0.2 + gains * first), atol=1e-4)
+
+
 @pytest.mark.parametrize("options", [{"horizon": 0}, {"samples": 7}])
 def test_plans_that_cannot_be(options):
     with pytest.raises(UserError, match=f"option {next(iter(options))} is"):
