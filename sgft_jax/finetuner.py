@@ -304,6 +304,10 @@ def _imagine(
 
 
 def _needed(function: Callable[..., Array] | None, name: str) -> Callable[..., Array]:
-    if function is None:
+    """The task's function; where it has none, one that refuses to be asked."""
+
+    def missing(*transition: Array) -> Array:
+        del transition
         raise UserError(f"methods that imagine need a task with `{name}` as a function of observations")
-    return function
+
+    return missing if function is None else function

@@ -134,7 +134,7 @@ def begin(
 
     agent = split_vmap(one, (0, 0, 0, None))(priors_of_members(priors, seeds), seeds, which, simulated)
     m = seeds.shape[0]
-    low = jnp.full(m, -jnp.inf)
+    low = jnp.full(m, -jnp.inf, jnp.float32)
     best = Best(
         jax.tree.map(jnp.copy, jax.vmap(finetuner.export)(agent)), low, jnp.copy(low), jnp.zeros(m, jnp.int32),
         jnp.zeros((m, WINDOW, 2)), jnp.zeros(m, jnp.int32),

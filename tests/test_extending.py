@@ -134,8 +134,8 @@ def test_the_method_runs_alone(capsys):
 
 @pytest.mark.slow
 def test_the_method_and_the_gap_run_in_a_command_and_are_drawn(prior, tmp_path):
-    options = """--rollouts 2 --initial-rollouts 1 --seeds 1 --utd 0.2 --eval-every 1 --eval-episodes 2 --no-video
-        --options.batch-size 8 --options.branches 1"""
+    options = """--rollouts 2 --seeds 1 --eval-every 1 --eval-episodes 2 --no-video --options.initial-rollouts 1
+        --options.utd 0.2 --options.batch-size 8 --options.branches 1"""
     given = ["--task", TASK, "--method", METHOD, "--real", GAP, "--prior", str(prior), "--out", str(tmp_path)]
     finetune.main([*given, *options.split()])
     run = tmp_path / "finetune/own_task/own_gap/sgft-bent/seed-0"

@@ -133,14 +133,14 @@ def _update_model(
     key_heads, key_action, key_dropout = jax.random.split(key, 3)
     judges, hyper = heads_of(state.target_critic, two_heads(config, key_heads)), state.hyper
 
-    def target(row: Batch, key: Key) -> tuple[Array, Array]:
+    def target(next_obs: Array, reward: Array, discount: Array, key: Key) -> tuple[Array, Array]:
         # The successor's latent is encoded, while losses are taken at rolled-out ones.
-        ahead = parts.encoder.apply(state.encoder.params, row.next_obs)
+        ahead = parts.encoder.apply(state.encoder.params, next_obs)
         action = tanh_gaussian_action(parts.policy.apply(state.policy.params, ahead), key, explore=True)
-        return ahead, row.reward + row.discount * jnp.min(q_values(config, parts, judges, ahead, action))
+        return ahead, reward + discount * jnp.min(q_values(config, parts, judges, ahead, action))
 
     keys = jax.random.split(key_action, valid.shape)
-    ahead, q_target = jax.vmap(jax.vmap(target))(batch, keys)
+    ahead, q_target = jax.vmap(jax.vmap(target))(batch.next_obs, batch.reward, batch.discount, keys)
     dropout = jax.random.split(key_dropout, valid.shape)
     frozen = {name: getattr(state, name).params for name in NETWORKS}
 
