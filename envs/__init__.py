@@ -46,14 +46,21 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'envs' has no attribute {name!r}")
 
 
-def make(task: str, impl: str = "auto", scene: str = "") -> Env:
+def make(task: str, impl: str = "auto", scene: str = "", previous_actions: int = 0) -> Env:
     """The task of that name, file or module, compiled; impl: its physics engine, see `worlds.choose_impl`.
 
     A file or module of your own must define `make(impl) -> Env`, with the file's name as the Env's name
     (docs/extending.md). scene: that of a real system which is more than the simulated one with other numbers; "" for
     the latter. What is observed, commanded and rewarded, and the parameters, are the same in all scenes of a task.
+    previous_actions: how many of the last actions the observation ends with, see `envs.history`.
     Raises UserError with the closest match for an unknown task or scene, and naming file and line for one that fails.
     """
+    from envs.history import with_previous_actions
+
+    return with_previous_actions(_make(task, impl, scene), previous_actions)
+
+
+def _make(task: str, impl: str, scene: str) -> Env:
     module = _module(task)
     given = (impl, _real(task, scene)) if scene else (impl,)
     if module.__name__ in _OURS:

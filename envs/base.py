@@ -54,7 +54,7 @@ class Effects(NamedTuple):
     latency_jitter: [] s, half-width of the uniform spread of the latency, redrawn at every step.
     obs_noise: [] raw units, std of Gaussian sensor noise.
     obs_noise_prob: [] probability that an observation vector is noisy.
-    obs_bias: [obs_dim] raw units, constant calibration error of the sensors.
+    obs_bias: [measured_dim] raw units, constant calibration error of the sensors.
     """
 
     action_scale: Array
@@ -161,6 +161,7 @@ class Env(NamedTuple):
     cartesian: the first two action entries are x and y of one frame.
     check(theta by name) -> what is impossible about it in one sentence, or None: relations between parameters.
     trace(physics) -> [k] what a renderer needs of a state; [0] where nothing can be drawn.
+    previous_actions: how many of the last actions the observation ends with, see `envs.history`.
     impl: the physics engine. scene: the name of a real system's own scene, "" for the one to pretrain in.
     """
 
@@ -182,6 +183,7 @@ class Env(NamedTuple):
     cartesian: bool = False
     check: Callable[[dict[str, float]], str | None] = lambda theta: None
     trace: Callable[[PyTree], Array] = no_trace
+    previous_actions: int = 0
     impl: str = "jax"
     scene: str = ""
 
@@ -189,6 +191,11 @@ class Env(NamedTuple):
     def obs_dim(self) -> int:
         """Length of the observation vector."""
         return sum(e.size for e in self.observation)
+
+    @property
+    def measured_dim(self) -> int:
+        """How many numbers of the observation are measured: all but the previous actions."""
+        return self.obs_dim - self.previous_actions * self.act_dim
 
     @property
     def act_dim(self) -> int:

@@ -20,7 +20,7 @@ def make_range(env: Env, values: Mapping[str, Value]) -> EffectRange:
     effect and the bound, for what is no finite number, has another size or is impossible.
     """
     shapes: dict[str, tuple[int, ...]] = dict.fromkeys(Effects._fields, ())
-    shapes |= {"action_scale": (env.act_dim,), "action_bias": (env.act_dim,), "obs_bias": (env.obs_dim,)}
+    shapes |= {"action_scale": (env.act_dim,), "action_bias": (env.act_dim,), "obs_bias": (env.measured_dim,)}
     for name in values:
         if name not in shapes:
             raise misnamed(env, name)

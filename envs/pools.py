@@ -34,7 +34,7 @@ def real_env(env: Env, found: Sequence[Gap]) -> Env:
         said = f"{first} is in {f"scene '{one}'" if one else 'the simulated scene'} and {second} in scene '{other}'"
         raise UserError(f"{said}: real systems of different scenes cannot share a program, run them one at a time")
     scene = "".join(scenes)
-    return envs.make(env.name, env.impl, scene) if scene else env
+    return envs.make(env.name, env.impl, scene, env.previous_actions) if scene else env
 
 
 def training_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments import cli
+from sgft_jax import extend
 from sgft_jax.types import UserError
 
 
@@ -50,7 +51,7 @@ def figures(args: FiguresArgs) -> Path:
     if not found.curves:
         command = f"python -m experiments.finetune --task {args.task or 'push'}"
         raise UserError(f"{args.out / 'finetune'}: holds no evaluated run to draw; make one with: {command}")
-    task = (args.task,) if args.task else ()
+    task = (extend.name_of(args.task),) if args.task else ()
     chosen = select(found, variants=args.variants, task=task, gap=args.gaps, method=args.methods, priors=args.priors)
     return write_results(chosen, args.out / "figures")
 

@@ -21,7 +21,7 @@ from sgft_jax import api, mesh, train
 from sgft_jax.api import Setup
 from sgft_jax.io import runs
 from sgft_jax.io.jsonfile import jsonable
-from sgft_jax.io.priors import digest, load_priors
+from sgft_jax.io.priors import digest, load_priors, previous_actions
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.methods.options import card_of
 from sgft_jax.train import FinetuneProgress
@@ -32,7 +32,7 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
     """The runs on the real systems of `args`; returns their summaries. folders: of the priors."""
     sizes = {"--seeds" if len(args.real) == 1 else "the number of --real times --seeds": len(args.real) * args.seeds}
     devices = mesh.devices(args.devices, sizes)
-    env = envs.make(args.task, args.impl)
+    env = envs.make(args.task, args.impl, previous_actions=previous_actions(folders))
     found = [gaps.load(env, real, args.set) for real in args.real]
     priors = load_priors(folders, env)
     for prior in priors:
@@ -91,7 +91,8 @@ class _Run:
     def _follow(self, steps: Iterator[tuple[FinetuneProgress, Metrics]], progress: Any) -> FinetuneProgress:
         """Logs, evaluates and checkpoints what the iterator yields; returns its last state."""
         done, started = int(progress.rollouts) if progress else 0, time.perf_counter()
-        title = f"{self.args.method} on {self.args.task}/{'+'.join(record.gap.name for record in self.records)}"
+        systems = "+".join(record.gap.name for record in self.records)
+        title = f"{self.records[0].method} on {self.system.env.name}/{systems}"
         bar = RunProgress(title, total=self.args.rollouts, unit="rollouts", done=done)
         with bar:
             for progress, metrics in steps:

@@ -61,7 +61,7 @@ class Saved(NamedTuple):
 def run(args: PretrainArgs, seeds: list[int]) -> dict[str, Any]:
     """One run from (or back) to disk; returns its summary."""
     hosts.join(args.hosts)
-    env = envs.make(args.task, args.impl)
+    env = envs.make(args.task, args.impl, previous_actions=args.config.previous_actions)
     gap = load_gap(env, args.real, args.set)
     env = real_env(env, [gap] if gap else [])
     sizes = memory(env, args.config)  # what does not fit is reported before anything is written

@@ -143,13 +143,16 @@ class ActingPolicy:
     def reset(self) -> None:
         """Forgets the episode; call it at the start of the next one."""
         self._carry = self._policy.init_carry()
+        self._actions = np.zeros((self.env.previous_actions, self.env.act_dim), np.float32)
 
     def act(self, obs: ArrayLike, *, explore: bool = False) -> np.ndarray:
-        """The action [act_dim] in [-1, 1] for an observation [obs_dim] in raw units."""
-        if np.shape(obs) != (self.env.obs_dim,):
-            raise UserError(f"the policy reads observations of {self.env.obs_dim} numbers, got shape {np.shape(obs)}")
+        """The action [act_dim] in [-1, 1] for what was measured, [measured_dim] in raw units."""
+        if np.shape(obs) != (self.env.measured_dim,):
+            raise UserError(f"the policy reads {self.env.measured_dim} measured numbers, got shape {np.shape(obs)}")
+        obs = np.concatenate([obs, self._actions.ravel()])
         self._key, key = jax.random.split(self._key)
         action, self._carry = self._act(self.prior.params, self._carry, jnp.asarray(obs), key, explore=explore)
+        self._actions = np.concatenate([np.asarray(action)[None], self._actions])[: len(self._actions)]
         return np.asarray(action)
 
 
@@ -160,4 +163,5 @@ def load_policy(folder: str | Path, *, task: str | None = None, seed: int = 0) -
     of plans. Raises UserError if there is no prior.
     """
     prior = load_prior(Path(folder))
-    return ActingPolicy(prior, envs.make(task or prior.card["task"]), seed=seed)
+    env = envs.make(task or prior.card["task"], previous_actions=prior.card.get("previous_actions", 0))
+    return ActingPolicy(prior, env, seed=seed)

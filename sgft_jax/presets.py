@@ -27,6 +27,9 @@ class PretrainConfig:
     """Transitions (TD-MPC2: windows of `horizon` steps) in a batch."""
     gamma: float = 0.99
     """Discount factor per control step."""
+    previous_actions: int = 0
+    """Last actions that end the observation of all networks. Where commands arrive late, measurements alone do not say
+    what will happen next."""
     lr: float = 3e-4
     """Adam learning rate of every network at the start."""
     lr_end: float = 1.0
@@ -85,7 +88,7 @@ class PretrainConfig:
             "replay_capacity", "policy_delay", "ensemble_size", "horizon", "plan_samples", "chunk_steps", "eval_every",
             "eval_episodes", "report_episodes", "checkpoint_every",
         )  # fmt: skip
-        checks.at_least(self, 0, "refresh_every")
+        checks.at_least(self, 0, "refresh_every", "previous_actions")
         checks.positive(self, "lr", "tau", "alpha")
         checks.share(self, "random_ladder", "lr_end", "tau", "choose_from")
         checks.below_one(self, "gamma", "random_fraction")

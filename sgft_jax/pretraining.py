@@ -162,6 +162,7 @@ def prior_card(env: Env, config: PretrainConfig) -> dict[str, Any]:
         "algorithm": config.algorithm,
         "obs_dim": env.obs_dim,
         "act_dim": env.act_dim,
+        "previous_actions": env.previous_actions,
         "network": jsonable(config.network),
         "ensemble_size": config.ensemble_size,
         "gamma": config.gamma,

@@ -44,9 +44,7 @@ def load_prior(
     Its parameters are the `<ALGORITHM>Params` of `sgft_jax.learners.<algorithm>`, None where there are none. Raises
     UserError if the prior is missing, torn, or of another task, other sizes than asked for, or another version.
     """
-    folder = Path(folder)
-    if not (folder / CARD).exists() and (folder / "prior" / CARD).exists():
-        folder = folder / "prior"
+    folder = _home(folder)
     manifest, card = checkpoint.read_manifest(folder), read_json(folder / CARD)
     asked = {"task": task, "obs_dim": obs_dim, "act_dim": act_dim}
     checkpoint.check_facts(folder, card, {name: value for name, value in asked.items() if value is not None})
@@ -63,6 +61,14 @@ def load_prior(
     return Prior(container(**{name: tree.get(name) for name in container._fields}), card)
 
 
+def previous_actions(folders: Sequence[Path]) -> int:
+    """How many previous actions priors that are used together read; 0 where there is none."""
+    for folder in folders:
+        card = _home(folder) / CARD
+        return read_json(card).get("previous_actions", 0) if card.exists() else 0
+    return 0
+
+
 def load_priors(folders: Sequence[Path], env: Any) -> list[Prior]:
     """Priors that are used together; raises UserError where they differ in more than their numbers.
 
@@ -74,6 +80,12 @@ def load_priors(folders: Sequence[Path], env: Any) -> list[Prior]:
             names = sorted({name.partition(".")[0] for name, *_ in odd})
             raise UserError(f"{folder}: differs from {folders[0]} in {', '.join(names)}; choose one with --prior")
     return priors
+
+
+def _home(folder: str | Path) -> Path:
+    """The folder itself, or the prior inside a run folder."""
+    inside = Path(folder) / "prior"
+    return inside if not (Path(folder) / CARD).exists() and (inside / CARD).exists() else Path(folder)
 
 
 def digest(prior: Prior) -> str:
@@ -93,7 +105,7 @@ def algorithm_of(card: Mapping[str, Any]) -> str:
 def _structure(card: Mapping[str, Any]) -> dict[str, Any]:
     """What must be equal for policies that run in one program."""
     own = {name: card.get(name) for name in ("network", "gamma", "ensemble_size", "plan")}
-    return own | {"algorithm": algorithm_of(card)}
+    return own | {"algorithm": algorithm_of(card), "previous_actions": card.get("previous_actions", 0)}
 
 
 def _container(folder: Path, algorithm: str) -> Any:
