@@ -186,7 +186,7 @@ def sac_finetuner(
     network, gamma, fresh = network_of(card), card["gamma"], fresh or prior is None
     new_critic = reset_critic or fresh
     rows = source or (lambda state: sources.real_rows(options.batch_size))
-    numbers = {name: structure.pop(name) for name in ("entropy_per_dim",) if name in structure}
+    numbers = {name: structure.pop(name) for name in ("entropy_per_dim", "anchor") if name in structure}
     structure = {"tune_alpha": False} | structure
     config = sac.SACConfig(
         task.obs_dim,

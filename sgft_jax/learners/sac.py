@@ -27,6 +27,7 @@ from sgft_jax.models.networks import (
     pad_first_layer,
     precision,
     tanh_gaussian_action,
+    tanh_gaussian_divergence,
     tanh_gaussian_sample,
 )
 from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree, UserError
@@ -66,6 +67,7 @@ class SACConfig:
     actor_mean: bool = False
     critic_baseline: bool = False
     actor_batch: int | None = None
+    anchored: bool = False
     policy_delay: int = 1
     max_grad_norm: float | None = None
 
@@ -83,6 +85,7 @@ class SACHyper(NamedTuple):
     lr_*: Adam learning rates. tau: target averaging rate. alpha: initial (or fixed) temperature.
     entropy_per_dim: target entropy / act_dim, nats. lr_warmup: updates over which lr_critic rises linearly from 0.
     actor_start: updates before the actor moves; actor_ramp: updates over which its learning rate then rises linearly.
+    anchor: weight of the divergence from the anchor in the actor's loss, in units of reward per nat.
     """
 
     lr_actor: float | Array = 3e-4
@@ -96,6 +99,7 @@ class SACHyper(NamedTuple):
     actor_start: float | Array = 0.0
     actor_ramp: float | Array = 0.0
     lr_warmup: float | Array = 0.0
+    anchor: float | Array = 0.0
 
 
 class SACParams(NamedTuple):
@@ -114,7 +118,10 @@ class SACParams(NamedTuple):
 
 
 class SACState(struct.PyTreeNode):
-    """An agent in training; `value` and `dynamics` are an `optim.Fit`, or None where the configuration has no use."""
+    """An agent in training; `value` and `dynamics` are an `optim.Fit`, or None where the configuration has no use.
+
+    anchor: parameters of the actor that an anchored one is held to, or None.
+    """
 
     actor: optim.Fit
     critic: optim.Fit
@@ -125,6 +132,7 @@ class SACState(struct.PyTreeNode):
     normalizer: Normalizer
     hyper: SACHyper
     step: Array
+    anchor: PyTree = None
 
 
 class _Parts(NamedTuple):
@@ -298,7 +306,12 @@ def _update_actor(
         action, log_prob = tanh_gaussian_sample(parts.actor.apply(params, obs), key)
         q = critic(state.critic.params, obs, action)
         followed = jnp.mean(q, keepdims=True) if config.actor_mean else q
-        return losses.actor_loss(log_prob, followed, alpha=alpha), q, log_prob
+        loss = losses.actor_loss(log_prob, followed, alpha=alpha)
+        if config.anchored:
+            loss += state.hyper.anchor * tanh_gaussian_divergence(
+                parts.actor.apply(params, obs), parts.actor.apply(state.anchor, obs)
+            )
+        return loss, q, log_prob
 
     def loss(params: PyTree) -> tuple[Array, tuple[Array, Array]]:
         each, q, log_prob = jax.vmap(one, (None, 0, 0))(params, rows.obs, keys)
@@ -371,7 +384,8 @@ def state_from_prior(
     value = params.value if config.train_value or config.critic_baseline else None
     model = params.dynamics if config.train_dynamics else None
     state = _assemble(config, parts, hyper, pad(params.actor), critic, value, model)
-    return state.replace(normalizer=params.normalizer)
+    anchor = jax.tree.map(jnp.copy, state.actor.params) if config.anchored else None
+    return state.replace(normalizer=params.normalizer, anchor=anchor)
 
 
 def check_params_of_prior(config: SACConfig, params: SACParams, *, critic: bool) -> None:

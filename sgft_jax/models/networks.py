@@ -129,6 +129,17 @@ def tanh_gaussian_log_prob(moments: Array, u: Array) -> Array:
     return jnp.sum(normal - squash)
 
 
+def tanh_gaussian_divergence(moments: Array, others: Array) -> Array:
+    """KL divergence [] from N(others) to N(moments), nats; tanh, which both share, leaves it as it is.
+
+    moments, others: [2, act_dim] mean and log-std.
+    """
+    mean, log_std = moments
+    other_mean, other_log_std = others
+    scaled = jnp.exp(2 * (log_std - other_log_std)) + ((mean - other_mean) * jnp.exp(-other_log_std)) ** 2
+    return jnp.sum(other_log_std - log_std + 0.5 * (scaled - 1.0))
+
+
 def tanh_gaussian_mode(moments: Array) -> Array:
     """The action of evaluations, tanh(mean) [act_dim]."""
     return jnp.tanh(moments[0])
