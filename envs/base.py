@@ -16,7 +16,8 @@ from sgft_jax.types import UserError
 if TYPE_CHECKING:
     from sgft_jax.types import Array, Key, PyTree
 
-Value = float | list[float] | list[list[float]]
+Numbers = float | list[float] | list[list[float]]
+Value = Numbers | Mapping[str, Numbers]  # the latter by entry name, see `effects.make_range`
 NOTHING: Mapping[str, Value] = MappingProxyType({})
 
 
