@@ -16,7 +16,8 @@ from sgft_jax.types import UserError
 if TYPE_CHECKING:
     from sgft_jax.types import Array, Key, PyTree
 
-Value = float | list[float] | list[list[float]]
+Numbers = float | list[float] | list[list[float]]
+Value = Numbers | Mapping[str, Numbers]  # the latter by entry name, see `effects.make_range`
 NOTHING: Mapping[str, Value] = MappingProxyType({})
 
 
@@ -193,9 +194,14 @@ class Env(NamedTuple):
         return sum(e.size for e in self.observation)
 
     @property
+    def measured(self) -> tuple[Entry, ...]:
+        """The entries of the observation that sensors report: all but the previous actions."""
+        return self.observation[:-1] if self.previous_actions else self.observation
+
+    @property
     def measured_dim(self) -> int:
-        """How many numbers of the observation are measured: all but the previous actions."""
-        return self.obs_dim - self.previous_actions * self.act_dim
+        """How many numbers sensors report."""
+        return sum(e.size for e in self.measured)
 
     @property
     def act_dim(self) -> int:

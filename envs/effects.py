@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.base import EffectRange, Effects, Env, Value, misnamed
-from sgft_jax.types import Array, Key, UserError
+from envs.base import EffectRange, Effects, Entry, Env, Numbers, Value, misnamed
+from sgft_jax.types import Array, Key, UserError, unknown
 
 _DEFAULTS = {"action_scale": 1.0, "obs_noise_prob": 1.0}
 _NOT_NEGATIVE = ("latency", "latency_jitter", "obs_noise", "obs_noise_prob")
@@ -16,17 +16,22 @@ _NOT_NEGATIVE = ("latency", "latency_jitter", "obs_noise", "obs_noise_prob")
 def make_range(env: Env, values: Mapping[str, Value]) -> EffectRange:
     """Effects of that task from named values or ranges; what is not named has no effect. Scalars fill vectors.
 
-    A range is [low, high] for a scalar and [[low, ...], [high, ...]] for a vector. Raises UserError, which names the
-    effect and the bound, for what is no finite number, has another size or is impossible.
+    A range is [low, high] for a scalar and [[low, ...], [high, ...]] for a vector. A vector may also be named by the
+    entries of the action or observation, e.g. {"goal_xz": [0.03, 0.0]}; entries without a name have no effect. Raises
+    UserError, which names the effect and the bound, for what is no finite number, has another size or is impossible.
     """
-    shapes: dict[str, tuple[int, ...]] = dict.fromkeys(Effects._fields, ())
-    shapes |= {"action_scale": (env.act_dim,), "action_bias": (env.act_dim,), "obs_bias": (env.measured_dim,)}
+    vectors = {"action_scale": env.action, "action_bias": env.action, "obs_bias": env.measured}
     for name in values:
-        if name not in shapes:
+        if name not in Effects._fields:
             raise misnamed(env, name)
     low, high = ({}, {})
-    for name, shape in shapes.items():
-        low[name], high[name] = _ends(name, values.get(name, _DEFAULTS.get(name, 0.0)), shape)
+    for name in Effects._fields:
+        default, entries = _DEFAULTS.get(name, 0.0), vectors.get(name)
+        given = values.get(name, default)
+        if isinstance(given, Mapping):
+            low[name], high[name] = _ends_by_entry(name, given, entries or (), default)
+        else:
+            low[name], high[name] = _ends(name, given, () if entries is None else (sum(e.size for e in entries),))
     _check_possible(env, low, high)
     return EffectRange(*(Effects(**{k: jnp.asarray(v, jnp.float32) for k, v in end.items()}) for end in (low, high)))
 
@@ -39,7 +44,23 @@ def numbers(value: Value) -> np.ndarray:
         return np.zeros((0, 0, 0))
 
 
-def _ends(name: str, value: Value, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _ends_by_entry(
+    name: str, values: Mapping[str, Numbers], entries: tuple[Entry, ...], default: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Both ends of a vector whose parts are named."""
+    names = [e.name for e in entries]
+    if not names:
+        raise UserError(f"effect '{name}' needs one value or a range [low, high], got {dict(values)}")
+    for odd in values:
+        if odd not in names:
+            raise UserError(unknown(f"entry of effect '{name}'", odd, names))
+    shape = lambda e: () if e.size == 1 else (e.size,)  # noqa: E731
+    parts = [_ends(f"{name}.{e.name}", values.get(e.name, default), shape(e)) for e in entries]
+    low, high = (np.concatenate([x.reshape(-1) for x in ends]) for ends in zip(*parts, strict=True))
+    return low, high
+
+
+def _ends(name: str, value: Numbers, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
     given = numbers(value)
     if given.shape not in ((), shape, (2, *shape)):
         needs = f"{shape[0]} values" if shape else "one value"

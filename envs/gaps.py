@@ -1,13 +1,15 @@
-"""Gaps: how a "real" system differs from the simulator, as data. Reads TOML and JSON files.
+"""Gaps: how a "real" system differs from the simulator, as data. Reads TOML and JSON files, writes TOML.
 
 A gap names only what differs; everything else stays as in training. `params` fixes domain parameters (or gives them
 another range), also outside the training range; `effects` distorts commands and measurements, see `envs.base.Effects`.
-`scene` names another scene than the simulated one, see `envs.make`: a towel where the simulator has a puck.
+`scene` names another scene than the simulated one, see `envs.make`: a towel where the simulator has a puck. `families`
+says which kinds of difference were drawn, see `envs.gap_distribution`; nothing follows from it.
 """
 
 import json
+import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,19 +17,23 @@ from typing import Any, NamedTuple
 from envs.base import Effects, Env, Value, World
 from sgft_jax.types import Key, UserError, unknown
 
-SIM = "sim"  # names the training domain itself where a gap could stand
+SIM = "sim"  # names the gap in which nothing differs: the real system is the training domain itself
+_KEYS = frozenset({"params", "effects", "scene", "families"})
+_FILE = re.compile(r"(.*\.(?:toml|json))(?::(.+))?")  # a file, or one gap of a file
 
 
 class Gap(NamedTuple):
     """A named difference between simulator and reality: parameter or effect name -> value or range.
 
-    Ranges are [low, high], of vectors [[low, ...], [high, ...]]. Every episode draws its effects from their ranges.
+    Ranges are [low, high], of vectors [[low, ...], [high, ...]]; a vector may be a table by entry name, see
+    `envs.effects.make_range`. Every episode draws its effects from their ranges. families: of a gap that was drawn.
     """
 
     name: str
     params: dict[str, Value]
     effects: dict[str, Value]
     scene: str = ""
+    families: tuple[str, ...] = ()
 
 
 def presets(task: str) -> dict[str, Gap]:
@@ -37,19 +43,50 @@ def presets(task: str) -> dict[str, Gap]:
     return {name: _parse(name, table, where=f"{task}.toml [{name}]") for name, table in tables.items()}
 
 
-def load(env: Env, source: str, overrides: Sequence[str] = ()) -> Gap:
-    """A gap from a preset name or a .toml/.json file, changed by overrides such as "latency=0.05".
+def read_file(path: str | Path) -> dict[str, Gap]:
+    """The gaps of a .toml/.json file by name. Raises UserError naming file and key.
 
-    A file holds two tables, `params` and `effects`, and the name of a `scene`; all may be missing. Raises UserError
-    naming file and key.
+    A file holds either one gap, called like the file, or a table for each of several, called like the tables.
     """
-    if source.endswith((".toml", ".json")):
-        gap = _from_file(Path(source))
-    elif source in (known := presets(env.name)):
-        gap = known[source]
-    else:
-        raise no_such_gap(env.name, source)
-    seen = set()
+    path = Path(path)
+    table = _content(path)
+    if _holds_several(table):
+        return {name: _parse(name, own, where=f"{path} [{name}]") for name, own in table.items()}
+    return {path.stem: _parse(path.stem, table, where=str(path))}
+
+
+def find(task: str, source: str) -> Gap:
+    """The gap called SIM, one that comes with a task, by name, or that of a file; its values are not checked.
+
+    source: a name, "file.toml", or "file.toml:name" for one of several in a file. Raises UserError if there is none.
+    """
+    if source == SIM:
+        return Gap(SIM, {}, {})
+    if match := _FILE.fullmatch(source):
+        path, name = match.groups()
+        found = read_file(path)
+        if name is None and len(found) > 1:
+            raise UserError(f"{path} holds {len(found)} gaps; name one of them, e.g. {path}:{next(iter(found))}")
+        name = name or next(iter(found))
+        if name not in found:
+            raise UserError(unknown(f"gap in {path}", name, found))
+        return found[name]
+    if source in (known := presets(task)):
+        return known[source]
+    if known:
+        raise UserError(f"{unknown(f'gap of {task}', source, [*known, SIM])}; or give a .toml or .json file")
+    raise UserError(f"{task} has no gap {source!r}: it comes with none; give a .toml or .json file, or {SIM}")
+
+
+def title(source: str) -> str:
+    """What folders call the gap of that source, see `find`: the name of one of several, else that of the file."""
+    match = _FILE.fullmatch(source)
+    return source if match is None else match[2] or Path(match[1]).stem
+
+
+def load(env: Env, source: str, overrides: Sequence[str] = ()) -> Gap:
+    """The gap that `find` finds, changed by overrides such as "latency=0.05". Raises UserError naming file and key."""
+    gap, seen = find(env.name, source), set()
     for text in overrides:
         gap, name = _override(gap, text)
         if name in seen:
@@ -59,15 +96,8 @@ def load(env: Env, source: str, overrides: Sequence[str] = ()) -> Gap:
     return gap
 
 
-def no_such_gap(task: str, name: str) -> UserError:
-    """What to tell someone who named a gap that the task does not come with."""
-    if known := presets(task):
-        return UserError(f"{unknown(f'gap of {task}', name, known)}; or give a .toml or .json file")
-    return UserError(f"{task} has no gap {name!r}: it comes with none; give a .toml or .json file")
-
-
 def from_dict(env: Env, name: str, table: Mapping[str, Any]) -> Gap:
-    """A gap from {"params": {...}, "effects": {...}, "scene": ...}, what a file would hold. Raises UserError."""
+    """A gap from {"params": {...}, "effects": {...}, "scene": ...}, what a file of it would hold. Raises UserError."""
     gap = _parse(name, dict(table), where=f"gap '{name}'")
     _check(env, gap)
     return gap
@@ -81,24 +111,57 @@ def worlds(env: Env, gap: Gap, key: Key, n: int = 256) -> World:
     return sample_worlds(env, key, n if (low < high).any() else 1, params=gap.params, effects=gap.effects)
 
 
-def _from_file(path: Path) -> Gap:
+def to_toml(found: Iterable[Gap]) -> str:
+    """Gaps as the text of a file that holds several, for people too. `read_file` gives back the same gaps."""
+    return "\n".join(_table(gap) for gap in found)
+
+
+def _table(gap: Gap) -> str:
+    values = {"scene": gap.scene, "families": list(gap.families), "params": gap.params, "effects": gap.effects}
+    lines = [f"{_key(name)} = {_inline(value)}" for name, value in values.items() if value]
+    return "\n".join([f"[{_key(gap.name)}]", *lines, ""])
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[\w-]+", name, re.ASCII) else json.dumps(name)
+
+
+def _inline(value: Any) -> str:
+    """What is not a table reads the same in TOML as in JSON."""
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(f'{_key(name)} = {_inline(own)}' for name, own in value.items())} }}"
+    return json.dumps(value)
+
+
+def _content(path: Path) -> Any:
     try:
         data = path.read_text()
-        table = json.loads(data) if path.suffix == ".json" else tomllib.loads(data)
+        return json.loads(data) if path.suffix == ".json" else tomllib.loads(data)
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
     except OSError as error:
         raise UserError(f"{path}: {error.strerror}") from None
     except ValueError as error:  # both decoders raise subclasses of it
         raise UserError(f"{path}: not valid {path.suffix[1:].upper()}: {error}") from None
-    return _parse(path.stem, table, where=str(path))
+
+
+def _holds_several(table: Any) -> bool:
+    if not isinstance(table, dict) or not table or set(table) & _KEYS:
+        return False
+    return all(isinstance(own, dict) and not set(own) - _KEYS for own in table.values())
 
 
 def _parse(name: str, table: Any, *, where: str) -> Gap:
-    if not isinstance(table, dict) or set(table) - {"params", "effects", "scene"}:
-        odd = sorted({*table} - {"params", "effects", "scene"})[0] if isinstance(table, dict) else type(table).__name__
+    if not isinstance(table, dict) or set(table) - _KEYS:
+        odd = sorted({*table} - _KEYS)[0] if isinstance(table, dict) else type(table).__name__
         raise UserError(
-            f"{where}: unexpected '{odd}'; a gap has two tables, 'params' and 'effects', and may name a 'scene'"
+            f"{where}: unexpected '{odd}'; a gap has two tables, 'params' and 'effects', and may name a 'scene' and "
+            "'families'"
         )
-    gap = Gap(name, table.get("params", {}), table.get("effects", {}), table.get("scene", ""))
+    families = table.get("families", [])
+    if not isinstance(families, list) or not all(isinstance(family, str) for family in families):
+        raise UserError(f"{where}: 'families' must be a list of names, got {families!r}")
+    gap = Gap(name, table.get("params", {}), table.get("effects", {}), table.get("scene", ""), tuple(families))
     if not isinstance(gap.scene, str):
         raise UserError(f"{where}: 'scene' must be a name, got {gap.scene!r}")
     for section, values in (("params", gap.params), ("effects", gap.effects)):
@@ -111,8 +174,10 @@ def _parse(name: str, table: Any, *, where: str) -> Gap:
 
 
 def _is_value(value: Any) -> bool:
+    if isinstance(value, dict):
+        return bool(value) and all(not isinstance(part, dict) and _is_value(part) for part in value.values())
     if isinstance(value, list):
-        return bool(value) and all(map(_is_value, value))
+        return bool(value) and all(not isinstance(part, dict) and _is_value(part) for part in value)
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -125,7 +190,7 @@ def _override(gap: Gap, text: str) -> tuple[Gap, str]:
         parsed = None
     if not equals or parsed is None or not _is_value(parsed):
         raise UserError(f"'{text}' does not set anything; write name=number or name=[number,number]")
-    changed = Gap(f"{gap.name}+{name}={value}", dict(gap.params), dict(gap.effects), gap.scene)
+    changed = gap._replace(name=f"{gap.name}+{name}={value}", params=dict(gap.params), effects=dict(gap.effects))
     (changed.effects if name in Effects._fields else changed.params)[name] = parsed
     return changed, name
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from envs import gaps
 from experiments.options import Impl, at_least_one, check_task, prior_folders, seed_list, seeds_name, without_repeats
 from sgft_jax import extend
 from sgft_jax.io.runs import check_start
@@ -26,8 +27,9 @@ class FinetuneArgs:
     method: str = DEFAULT
     """A method from the table at the top, or a Python file with a method of your own (docs/extending.md)."""
     real: tuple[str, ...] = ("default",)
-    """The real system: a gap by name, or a .toml/.json file with tables `params` and `effects`. Several are played
-    together in one program, which takes little longer; each has a run folder of its own."""
+    """The real system: a gap by name, a .toml/.json file with tables `params` and `effects`, file.toml:name for one
+    of several in a file, or sim for no gap. Several are played together in one program, which takes little longer;
+    each has a run folder of its own."""
     set: tuple[str, ...] = ()
     """Changes to the real systems, e.g. --set latency=0.05 action_scale=[1,0.5]."""
     seeds: int = 10
@@ -84,7 +86,7 @@ def _preset(method: Method) -> str:
 
 def run_folder(args: FinetuneArgs, real: str) -> Path:
     """Where the run on that real system lives; the seeds of one call share a folder."""
-    system = "_".join([Path(real).stem, *(change.replace("/", "") for change in args.set)])
+    system = "_".join([gaps.title(real), *(change.replace("/", "") for change in args.set)])
     seeds = seeds_name(seed_list(args.seed, args.seeds))
     return args.out / "finetune" / extend.name_of(args.task) / system / label(args) / seeds
 

@@ -2,6 +2,10 @@
 
 A gap is worth studying only if pretraining alone does not bridge it and a policy that does exists: it is admissible if
 zero-shot success is at most 40 % and training on the real system itself reaches 95 %.
+
+With --draw N, gaps are drawn from a distribution, written to a file and sorted: solved by the simulator's policy (80 %
+and more), partial, or failed (below 20 %); trivial where a fit of the action map to one rollout suffices. What the
+table beside the file holds already is not measured again.
 """
 
 from collections.abc import Sequence
@@ -26,20 +30,33 @@ class GapsArgs:
     """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
     presets: tuple[str, ...] = ()
     """Gaps to measure, by name or as .toml/.json files; default: all that come with the task."""
+    draw: int = 0
+    """Draw so many gaps instead and write them to <out>/gaps/<task>/seed-<seed>.toml; gap i of a seed is always the
+    same."""
+    distribution: Path | None = None
+    """With --draw: a .toml file of families to draw from; default: the one that comes with the task."""
+    plan: bool = False
+    """With --draw: also measure what sgft-mpc does at its start, plans by the prior's models."""
+    judge: bool = False
+    """With --draw: also train a policy on every gap, in one program, that sees its previous actions. Gaps on which it
+    reaches 90 % can be mastered."""
+    judge_preset: str = DEFAULT_PRESET
+    """Pretraining preset of that training; --config.* changes it."""
     prior: Path | None = None
     """Folder of a prior, or of several (prior/seed-*); default: those of <out>/pretrain/<task>/<preset>."""
     preset: str = DEFAULT_PRESET
     """Pretraining preset of the priors, and of the training on the real systems; --config.* changes the latter."""
     train: bool = True
-    """Also train on every real system, all of them in one program; --no-train measures zero-shot success only."""
+    """Also train on every real system, all of them in one program; --no-train measures zero-shot success only. Drawn
+    gaps have --judge instead."""
     seeds: int = 1
-    """Policies trained per gap."""
+    """Policies trained per gap; of drawn gaps the best one counts."""
     episodes: int = 256
     """Evaluation episodes per policy and gap, at least 200."""
     out: Path = Path("runs")
     """Parent of all run folders; the summary goes to <out>/gaps/<task>/summary.json."""
     seed: int = 0
-    """Expert: first seed of the training on real systems."""
+    """What is drawn; also the first seed of the training on real systems."""
     impl: Impl = "auto"
     config: PretrainConfig = field(default_factory=lambda: PRESETS[DEFAULT_PRESET])
     """Expert: single settings of that training; the defaults are those of the preset."""
@@ -51,25 +68,43 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def _defaults(argv: Sequence[str]) -> GapsArgs:
-    """The defaults of the preset; `measure` refuses a preset that does not exist."""
-    preset = cli.preview(argv, preset=DEFAULT_PRESET).preset
-    return GapsArgs(preset=preset, config=PRESETS.get(preset, PRESETS[DEFAULT_PRESET]))
+    """The defaults of the presets; `measure` refuses a preset that does not exist."""
+    chosen = cli.preview(argv, preset=DEFAULT_PRESET, judge_preset=DEFAULT_PRESET, draw=0)
+    training = chosen.judge_preset if chosen.draw else chosen.preset
+    return GapsArgs(
+        preset=chosen.preset, judge_preset=chosen.judge_preset, config=PRESETS.get(training, PRESETS[DEFAULT_PRESET])
+    )
 
 
 def measure(args: GapsArgs) -> dict[str, Any]:
     """Measures, prints a table, writes and returns the summary."""
-    cli.choose("--preset", args.preset, PRESETS)
+    for option in ("preset", "judge_preset"):
+        cli.choose(f"--{option.replace('_', '-')}", getattr(args, option), PRESETS)
     if args.episodes < 200:
         raise UserError(f"--episodes is {args.episodes}: a success rate needs at least 200 to tell 40 % from 50 %")
+    _check_draw(args)
     without_repeats("--presets", args.presets)
     seeds, task = seed_list(args.seed, args.seeds), extend.name_of(args.task)
     check_task(args.task, args.presets)
-    if not (args.presets or gaps.presets(task)):
+    if not (args.draw or args.presets or gaps.presets(task)):
         raise UserError(f"{task} comes with no gaps; name .toml or .json files with --presets")
     folders = prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
-    from experiments.gaps_run import run
+    if args.draw:
+        from experiments.gaps_draw import run
+    else:
+        from experiments.gaps_run import run
 
     return run(args, seeds, folders)
+
+
+def _check_draw(args: GapsArgs) -> None:
+    if args.draw < 0:
+        raise UserError(f"--draw is {args.draw}: must be at least 1")
+    if args.draw and args.presets:
+        raise UserError(f"--presets {args.presets[0]}: names gaps, and --draw draws them; give one of the two")
+    only = {"--distribution": args.distribution, "--plan": args.plan, "--judge": args.judge}
+    if odd := [option for option, value in only.items() if value and not args.draw]:
+        raise UserError(f"{odd[0]}: is for drawn gaps; say how many with --draw")
 
 
 if __name__ == "__main__":

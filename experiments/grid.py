@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import envs
+from envs import gaps
 from experiments.finetune import finetune
 from experiments.finetune_args import VOLATILE, FinetuneArgs, arguments, label, run_folder
 from experiments.options import Impl, check_task, seed_list, without_repeats
@@ -27,7 +28,7 @@ class GridArgs:
     methods: tuple[str, ...] = NAMES
     """Methods, in the order in which they run."""
     reals: tuple[str, ...] = ("default",)
-    """Real systems of every task: mild, default, hard, or .toml/.json files."""
+    """Real systems of every task: mild, default, hard, sim for no gap, or .toml/.json files."""
     seed: int = 0
     """First seed."""
     seeds: int = 10
@@ -59,7 +60,7 @@ class Cell(NamedTuple):
 
     def __str__(self) -> str:
         (real,) = self.args.real
-        return f"{extend.name_of(self.args.task)}/{Path(real).stem}: {label(self.args)}"
+        return f"{extend.name_of(self.args.task)}/{gaps.title(real)}: {label(self.args)}"
 
     @property
     def folder(self) -> Path:

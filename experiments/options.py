@@ -47,11 +47,7 @@ def check_task(task: str, reals: Sequence[str] = ()) -> None:
     """Raise UserError where there is no such task, or no such real system of it, by name or file."""
     name = envs.name_of(task)
     for real in reals:
-        if real.endswith((".toml", ".json")):
-            if not Path(real).is_file():
-                raise UserError(f"--real {real}: no such file")
-        elif real not in gaps.presets(name):
-            raise gaps.no_such_gap(name, real)
+        gaps.find(name, real)
 
 
 def at_least_one(args: object, *names: str) -> None:

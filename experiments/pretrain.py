@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from envs import gaps
 from envs.gaps import SIM
 from experiments import cli
 from experiments.options import Impl, check_task, seed_list, seeds_name
@@ -95,7 +96,7 @@ def run_folder(args: PretrainArgs) -> Path:
     where, seeds = args.preset, seeds_name(seed_list(args.seed, args.seeds))
     if args.real not in (None, SIM):
         changes = ["=".join(word.strip() for word in change.partition("=")[::2]) for change in args.set]
-        where += "-on-" + "+".join([Path(str(args.real)).stem, *changes])
+        where += "-on-" + "+".join([gaps.title(str(args.real)), *changes])
     return args.out / "pretrain" / extend.name_of(args.task) / where / seeds
 
 

@@ -25,4 +25,4 @@ def member(tree: PyTree, i: int | Array) -> PyTree:
 
 def part(tree: PyTree, i: int | Array, n: int) -> PyTree:
     """The i-th n of stacked pytrees."""
-    return jax.tree.map(lambda x: x.reshape(-1, n, *x.shape[1:])[i], tree)
+    return jax.tree.map(lambda x: x.reshape(len(x) // n, n, *x.shape[1:])[i], tree)

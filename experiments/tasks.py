@@ -6,7 +6,7 @@ import inspect
 import json
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -150,6 +150,8 @@ def _range(low: float | None, high: float | None) -> str:
 def _value(value: Value | None) -> str:
     if value is None:
         return "-"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{entry} {_value(part)}" for entry, part in value.items())
     return str(value) if isinstance(value, list) else f"{value:g}"
 
 

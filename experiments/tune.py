@@ -11,13 +11,13 @@ import math
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from envs import gaps
 from experiments import cli, grid, tuned
 from experiments.finetune_args import with_settings
 from experiments.grid import Cell, GridArgs
@@ -128,7 +128,7 @@ def score(trial: Trial, rollouts: int) -> Score | None:
         inside = curve.rollouts <= rollouts
         found = area(curve, curve.rollouts[inside])
         assert found is not None  # a finished run has been evaluated twice at least
-        areas[_name(*cell.args.real)] = found.tolist()
+        areas[gaps.title(*cell.args.real)] = found.tolist()
         finals.append(curve.values[:, inside][:, -1].mean())
     return Score(float(np.mean(list(areas.values()))), float(np.mean(finals)), areas)
 
@@ -164,7 +164,7 @@ def _result(
         for trial, each in zip(found, scores, strict=True)
     ]
     budget = {
-        "trials": args.trials, "reals": [_name(real) for real in args.reals],
+        "trials": args.trials, "reals": [gaps.title(real) for real in args.reals],
         "seeds": seed_list(args.seed, args.seeds), "rollouts": args.rollouts,
         "eval_every": args.eval_every,
     }  # fmt: skip
@@ -186,10 +186,6 @@ def _table(title: str, found: Sequence[Trial], scores: Sequence[Score | None], c
         values = ("None" if value is None else f"{value:g}" for value in trial.settings.values())
         table.add_row(str(trial.number), *values, *cells, note)
     return table
-
-
-def _name(real: str) -> str:
-    return Path(real).stem
 
 
 def _pairs(args: TuneArgs) -> list[tuple[str, str]]:

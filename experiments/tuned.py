@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from envs import gaps
 from experiments.finetune_args import FinetuneArgs, with_settings
 from experiments.spaces import space_of
 from sgft_jax import extend
@@ -69,5 +70,5 @@ def check_fair(out: Path, task: str, methods: Sequence[str], reals: Sequence[str
             listed = ", ".join(f"{key} {budgets[first][key]} and {budgets[other].get(key)}" for key in odd)
             again = _command(task, budgets)
             raise UserError(f"--tuned: {first} and {other} had different budgets ({listed}); tune again with: {again}")
-    if seen := sorted({Path(real).stem for real in reals} & set(budgets[first]["reals"])):
+    if seen := sorted({gaps.title(real) for real in reals} & set(budgets[first]["reals"])):
         raise UserError(f"--reals {seen[0]}: the options were tuned there; compare on another, or tune on another")

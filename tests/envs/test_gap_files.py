@@ -6,8 +6,10 @@ import pytest
 import toy
 
 import envs
-from envs import gaps
+from envs import effects, gaps
+from envs.base import Entry
 from envs.franka import hammer, insert
+from envs.gaps import Gap
 from sgft_jax.types import UserError
 
 ENV = toy.make()
@@ -39,6 +41,53 @@ def test_ranges_of_vectors(tmp_path):
     assert (drawn.effects.action_bias[:, 0] == 0).all() and len(set(drawn.effects.action_bias[:, 1].tolist())) == 9
 
 
+def test_parts_of_a_vector_are_named_by_entry():
+    """velocity [m/s] of (xy [2], velocity [2]); xy stays as measured."""
+    low, high = effects.make_range(
+        ENV, {"obs_bias": {"velocity": [[0.1, -0.2], [0.1, 0.3]]}, "action_scale": {"force": 2}}
+    )
+    np.testing.assert_allclose(low.obs_bias, [0, 0, 0.1, -0.2])
+    np.testing.assert_allclose(high.obs_bias, [0, 0, 0.1, 0.3])
+    np.testing.assert_allclose(low.action_scale, [2, 2])
+    single = ENV._replace(action=(Entry("x", "", 1), Entry("yz", "", 2)))
+    low, high = effects.make_range(single, {"action_scale": {"x": [0.5, 0.7]}})
+    np.testing.assert_allclose(low.action_scale, [0.5, 1, 1])  # what is not named has no effect
+    np.testing.assert_allclose(high.action_scale, [0.7, 1, 1])
+
+
+def test_the_camera_of_hammer_errs_in_x_alone():
+    env = hammer.make("c")
+    bias = effects.make_range(env, gaps.load(env, "camera").effects).low.obs_bias
+    np.testing.assert_allclose(bias, np.eye(12)[10] * 0.029)
+
+
+def test_a_file_holds_one_gap_or_several_by_name(tmp_path):
+    one, two = Gap("one", {"mass": 2.0}, {}), Gap("the 2nd", {}, {"latency": 0.0312, "obs_bias": {"xy": [1e-5, -0.2]}})
+    two = two._replace(families=("actuation", "sensing"), scene="ice")
+    file = tmp_path / "some.toml"
+    file.write_text("# words\n\n" + gaps.to_toml([one, two]))
+    assert gaps.read_file(file) == {"one": one, "the 2nd": two}
+    assert gaps.load(ENV, f"{file}:one") == one and gaps.title(f"{file}:one") == "one"
+    assert gaps.load(ENV, f"{file}:the 2nd", ["latency=0.01"]).families == two.families
+    (tmp_path / "alone.toml").write_text(gaps.to_toml([one]))
+    assert gaps.load(ENV, str(tmp_path / "alone.toml")) == one
+    assert gaps.title("a/alone.toml") == "alone" and gaps.title("mild") == "mild"
+    with pytest.raises(UserError, match=r"some.toml holds 2 gaps; name one of them, e.g. .*some.toml:one$"):
+        gaps.load(ENV, str(file))
+    with pytest.raises(UserError, match=r"gap in .*some.toml: there is no 'tow'. Choose from: one, the 2nd"):
+        gaps.load(ENV, f"{file}:tow")
+    file.write_text("[a.params]\nmass = 2\n[b]\nfamilies = 'dynamics'\n")
+    with pytest.raises(UserError, match=r"some.toml \[b\]: 'families' must be a list of names, got 'dynamics'"):
+        gaps.read_file(file)
+
+
+def test_in_the_gap_called_sim_nothing_differs(key):
+    gap = gaps.load(ENV, "sim")
+    assert gap == Gap("sim", {}, {})
+    jax.tree.map(np.testing.assert_array_equal, gaps.worlds(ENV, gap, key, 7), envs.sample_worlds(ENV, key, 7))
+    assert gaps.load(ENV, "sim", ["latency=0.03"]).effects == {"latency": 0.03}
+
+
 @pytest.mark.parametrize(
     ("overrides", "words"),
     [
@@ -49,6 +98,10 @@ def test_ranges_of_vectors(tmp_path):
         (["mass=-2"], "parameter 'mass' must be at least 0.01, got -2"),
         (["latency=0.5"], "must be shorter than the control period of toy, 0.1 s"),
         (["obs_noise=NaN"], "effect 'obs_noise' needs finite numbers"),
+        (['obs_bias={"yx": 0.1}'], "entry of effect 'obs_bias': there is no 'yx'. Choose from"),
+        (['obs_bias={"xy": [1, 2, 3]}'], "effect 'obs_bias.xy' needs 2 values or a range"),
+        (['latency={"xy": 0.1}'], "effect 'latency' needs one value or a range"),
+        (['mass={"xy": 0.1}'], "parameter 'mass' needs a value or a range"),
     ],
 )
 def test_bad_overrides_are_one_line(tmp_path, overrides, words):
@@ -61,6 +114,7 @@ def test_bad_overrides_are_one_line(tmp_path, overrides, words):
 @pytest.mark.parametrize(
     ("table", "words"),
     [
+        ({"families": [1]}, "gap 'g': 'families' must be a list of names"),
         ({"param": {}}, "gap 'g': unexpected 'param'"),
         ({"params": {"mass": "1"}}, "'mass' must be a number or a list of numbers, got '1'"),
         ({"params": {"mass": True}}, "'mass' must be a number"),

@@ -1,0 +1,197 @@
+"""Impure: draws gaps and measures them, with a table on disk that grows. `experiments.gaps --draw` is its command."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from envs import gap_distribution, gaps
+from envs.base import Env
+from envs.gaps import SIM, Gap
+from envs.rollout import Episode
+from experiments import stacking
+from experiments.cli import columns
+from experiments.evaluation import play
+from experiments.gaps import GapsArgs
+from experiments.gaps_run import FINAL_SEED, episode_key, percent, rate, systems, train
+from sgft_jax import api, identify
+from sgft_jax.analysis import stats
+from sgft_jax.identify import ActionMap, Correction
+from sgft_jax.io.jsonfile import differences, read_json, write_json
+from sgft_jax.io.priors import digest, load_priors
+from sgft_jax.methods import get_method
+from sgft_jax.policies import make_policy
+from sgft_jax.types import Array, Prior, UserError
+
+SOLVED_AT_LEAST, FAILED_BELOW, TRIVIAL_AT_LEAST, ADMITTED_AT_LEAST = 0.8, 0.2, 0.9, 0.9
+PLANNER = "sgft-mpc"
+PREVIOUS_ACTIONS = 2  # that the judge sees: a command that comes late is still in force, or was when the step began
+_ROLLOUT_SEED = 2**31 + 6  # of the rollouts that action maps are fitted to
+_SIMULATED = 8  # rollouts that tell the simulator's own map; the real system's is fitted to one
+
+
+def run(args: GapsArgs, seeds: list[int], folders: list[Path]) -> dict[str, Any]:
+    """Draws, writes and measures gaps; prints and returns the table. folders: of the priors."""
+    task = envs.name_of(args.task)
+    env = envs.make(args.task, args.impl)
+    found = gap_distribution.draw(env, gap_distribution.load(env, args.distribution), args.seed, args.draw)
+    path = args.out / "gaps" / task / f"seed-{args.seed}.toml"
+    write_gaps(path, found)
+    priors = load_priors(folders, env)
+    about = {"task": task, "seed": args.seed, "impl": env.impl, "episodes": args.episodes}
+    table = _Table(path.with_suffix(".json"), {**about, "priors": [digest(prior) for prior in priors]})
+    everywhere = [gaps.find(task, SIM), *found]
+    if missing := [gap for gap in table.without("zero_shot", everywhere) if gap.name != SIM]:
+        table.add(_zero_shot(env, missing, priors, args.episodes))
+    if args.plan and (missing := table.without("plan", everywhere)):
+        table.add(_plan(env, missing, priors, args.episodes))
+    if args.judge and (missing := table.without("judge", found)):
+        table.add(_judge(env, args, missing, seeds, path.with_suffix("")))
+    print("\n".join(lines([gap.name for gap in everywhere], table.found["gaps"])))
+    print(f"gaps: {path}\ntable: {table.path}")
+    return table.found
+
+
+def write_gaps(path: Path, found: Sequence[Gap]) -> None:
+    """Writes drawn gaps as one file. It only grows: raises UserError if it holds others under these names."""
+    old = list(gaps.read_file(path).values()) if path.exists() else []
+    if odd := [gap.name for gap, now in zip(old, found, strict=False) if gap != now]:
+        raise UserError(f"{path}: {odd[0]} is not what is drawn now; choose another --seed or --out")
+    if len(found) > len(old):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"# Drawn by python -m experiments.gaps --draw {len(found)}\n\n{gaps.to_toml(found)}")
+
+
+class _Table:
+    """What is known of drawn gaps, on disk as soon as it is known.
+
+    about: what all measurements have in common; raises UserError for a table that was made otherwise.
+    """
+
+    def __init__(self, path: Path, about: Mapping[str, Any]) -> None:
+        self.path = path
+        self.found = read_json(path) if path.exists() else {**about, "gaps": {}}
+        if odd := differences({name: self.found.get(name) for name in about}, dict(about)):
+            raise UserError(f"{path}: was measured with other {odd[0][0]}; choose another --out, or remove the table")
+
+    def without(self, what: str, found: Sequence[Gap]) -> list[Gap]:
+        """Those of which this is not known yet."""
+        return [gap for gap in found if what not in self.found["gaps"].get(gap.name, {})]
+
+    def add(self, lines: Mapping[str, Mapping[str, Any]]) -> None:
+        """Writes what has been found of gaps, by name."""
+        known = self.found["gaps"]
+        for name, line in lines.items():
+            known[name] = known.get(name, {}) | line
+            known[name] |= labels(known[name])
+        write_json(self.path, self.found)
+
+
+def labels(line: Mapping[str, Any]) -> dict[str, Any]:
+    """What follows from the measurements of a gap; None where they are missing."""
+    success = line["zero_shot"]["success"] if "zero_shot" in line else None
+    fit, judge = line.get("fit"), line.get("judge")
+    stratum = None
+    if success is not None:
+        stratum = "solved" if success >= SOLVED_AT_LEAST else "failed" if success < FAILED_BELOW else "partial"
+    return {
+        "stratum": stratum,
+        "trivial": None if fit is None else fit["success"] >= TRIVIAL_AT_LEAST,
+        # Training fails now and then where there is a way: one policy that succeeds shows that there is.
+        "admitted": None if judge is None else max(p["success"] for p in judge["policies"]) >= ADMITTED_AT_LEAST,
+    }
+
+
+def lines(names: Sequence[str], known: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """The table for people, success in per cent with 95 % intervals."""
+    rows = [("gap", "families", "zero-shot %", "plan %", "after fit %", "trained there %", "stratum", "labels")]
+    said = {"trivial": {True: "trivial"}, "admitted": {True: "admitted", False: "not mastered"}}
+    for name in names:
+        line = known[name]
+        zero, plan, fit, judge = (percent(line.get(what)) for what in ("zero_shot", "plan", "fit", "judge"))
+        marks = [words[line[label]] for label, words in said.items() if line[label] in words]
+        rows.append(
+            (name, " ".join(line["families"]) or "none", zero, plan, fit, judge, line["stratum"], ", ".join(marks))
+        )
+    return columns(rows)
+
+
+# --- measurements -----------------------------------------------------------------------------------------------------
+
+
+def _zero_shot(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: int) -> dict[str, dict[str, Any]]:
+    """Success of the priors' policies on gaps and without one, as they are and behind a fit of the action map."""
+    everywhere = [gaps.find(env.name, SIM), *found]
+    system, members = systems(env, everywhere, priors, episodes)
+    policy = identify.corrected(make_policy(priors[0].card, env))
+    count = len(everywhere) * len(priors)
+    none = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), identify.no_correction(env.act_dim))
+
+    def rates(corrections: Correction) -> list[dict[str, Any]]:
+        played = play(system, policy, (members, corrections), episode_key(FINAL_SEED), episodes)
+        return _rates(played, len(everywhere), len(priors))
+
+    plain = {
+        gap.name: {"families": list(gap.families), "zero_shot": own} for gap, own in _each(everywhere, rates(none))
+    }
+    try:
+        place = identify.end_effector(env)
+    except UserError as refused:
+        print(f"no fit of the action map: {refused}")
+        return plain
+    keys = jnp.broadcast_to(jax.random.split(episode_key(_ROLLOUT_SEED), _SIMULATED), (count, _SIMULATED))
+    explored = system.play(policy, (members, none), keys, explore=True)
+    fitted = rates(_corrections(explored, place, len(priors)))
+    return {gap.name: plain[gap.name] | {"fit": own} for gap, own in _each(everywhere, fitted)}
+
+
+def _corrections(explored: Episode, place: np.ndarray, priors: int) -> Correction:
+    """A correction [members] for each policy on each system, of which the first is the simulator.
+
+    explored: [members, rollouts, T]; of real systems only the first rollout counts.
+    """
+    rows = explored.transitions
+    given = ((rows.next_obs - rows.obs)[..., place], rows.action, explored.valid)
+
+    def fit(steps: tuple[Array, Array, Array], around: ActionMap | None = None) -> ActionMap:
+        return identify.action_map(*steps, around=around)
+
+    sim = jax.vmap(fit)(jax.tree.map(lambda x: x[:priors].reshape(priors, -1, *x.shape[3:]), given))
+    copies = len(explored.valid) // priors
+    own = jax.tree.map(lambda x: jnp.tile(x, (copies, *[1] * (x.ndim - 1))), sim)
+    real = jax.vmap(fit)(jax.tree.map(lambda x: x[:, 0], given), own)
+    return jax.vmap(identify.correction)(real, own)
+
+
+def _plan(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: int) -> dict[str, dict[str, Any]]:
+    """Success of what the planning method does before it has learned anything."""
+    method = get_method(PLANNER)
+    for prior in priors:
+        api.check_prior(prior, method.prior, env)
+    policy = method.build(method.config(), priors[0], env).policy
+    system, members = systems(env, found, priors, episodes)
+    played = play(system, policy, members, episode_key(FINAL_SEED), episodes)
+    return {gap.name: {"plan": own} for gap, own in _each(found, _rates(played, len(found), len(priors)))}
+
+
+def _judge(env: Env, args: GapsArgs, found: Sequence[Gap], seeds: list[int], folder: Path) -> dict[str, dict[str, Any]]:
+    """Success of policies that were trained on the gaps themselves and see their previous actions."""
+    from envs.history import with_previous_actions
+
+    seen = with_previous_actions(env, PREVIOUS_ACTIONS)
+    played = train(env, args.config, found, seeds, folder, episodes=args.episodes, seen=seen)
+    rates = [rate(own, stats.mean) for own in played]
+    return {gap.name: {"judge": {"preset": args.judge_preset, **own}} for gap, own in _each(found, rates)}
+
+
+def _rates(played: Episode, systems: int, policies: int) -> list[dict[str, Any]]:
+    """Mean success over policies on each system, of episodes [systems * policies, n]."""
+    return [rate(stacking.part(played, i, policies), stats.mean) for i in range(systems)]
+
+
+def _each(found: Sequence[Gap], rates: Sequence[dict[str, Any]]) -> list[tuple[Gap, dict[str, Any]]]:
+    return list(zip(found, rates, strict=True))

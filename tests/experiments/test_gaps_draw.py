@@ -1,0 +1,196 @@
+"""Drawn gaps end to end: a hand that commands move by a matrix, and a policy that goes straight to the goal."""
+
+import json
+import os
+import sys
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import pytest
+from priors_by_hand import save_prior
+
+import envs
+from envs import gap_distribution, gaps
+from envs.base import Entry
+from experiments import cli, gaps_draw
+from experiments import gaps as command
+from sgft_jax import policies
+from sgft_jax.io.jsonfile import read_json
+from sgft_jax.types import UserError
+
+TEXT = """
+[actuation]
+action_rotation = [1.2, 1.4]
+[contact]
+slip = [0.0, 0.1]
+"""
+OPTIONS = """--task toy_steps --preset cpu --seed 5 --episodes 200 --config.n-envs 16 --config.worlds 4
+    --config.env-steps 320 --config.random-transitions 320 --config.replay-capacity 640 --config.batch-size 16
+    --config.chunk-steps 20 --config.updates-per-step 1 --config.network.hidden 8 --config.eval-every 1
+    --config.eval-episodes 8"""
+
+
+def straight(params, carry, obs, key, *, explore):
+    noise = jnp.where(explore, 0.5, 0.0) * jax.random.normal(key, (2,))
+    return jnp.clip(2.0 * (obs[:2] - obs[2:4]) + noise, -1.0, 1.0), carry
+
+
+def with_previous_actions(env, n):
+    """The last action in front of nothing else: enough to see that the judge sees more."""
+
+    def longer(state, action):
+        obs, true_obs = (jnp.concatenate([x, action]) for x in (state.obs, state.true_obs))
+        return state._replace(obs=obs, true_obs=true_obs)
+
+    def step(world, state, action, key):
+        inner = state._replace(obs=state.obs[:4], true_obs=state.true_obs[:4])
+        return longer(env.step(world, inner, action, key), action)
+
+    return env._replace(
+        observation=(*env.observation, Entry("previous_actions", "", 2)),
+        reset=lambda world, key: longer(env.reset(world, key), jnp.zeros(2)),
+        step=step,
+    )
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch):
+    """Two priors, whose policies go straight to the goal, and a distribution."""
+    monkeypatch.setitem(envs.TASKS, "toy_steps", "toy_steps")
+    monkeypatch.setattr(os, "environ", os.environ.copy())
+    monkeypatch.setattr(cli, "set_up", lambda: None)
+    by_hand = lambda card, env: policies.make_policy(card, env)._replace(act=straight)  # noqa: E731
+    monkeypatch.setattr(gaps_draw, "make_policy", by_hand)
+    for seed in (0, 1):
+        save_prior(tmp_path / f"pretrain/toy_steps/cpu/seeds-0-1/prior/seed-{seed}", seed, task="toy_steps")
+    (tmp_path / "families.toml").write_text(TEXT)
+    return tmp_path
+
+
+def call(home, *more):
+    command.main([*OPTIONS.split(), "--out", str(home), "--distribution", str(home / "families.toml"), *more])
+    return json.loads((home / "gaps/toy_steps/seed-5.json").read_text())
+
+
+def test_drawn_gaps_are_written_measured_and_sorted(home, capsys, monkeypatch):
+    found = call(home, "--draw", "6")["gaps"]
+    file = home / "gaps/toy_steps/seed-5.toml"
+    env = envs.make("toy_steps")
+    drawn = gap_distribution.draw(env, gap_distribution.load(env, home / "families.toml"), 5, 6)
+    assert list(gaps.read_file(file).values()) == drawn and list(found) == ["sim", *(gap.name for gap in drawn)]
+    assert found["sim"]["stratum"] == "solved" and found["sim"]["zero_shot"]["success"] > 0.95
+    for gap in drawn:
+        line = found[gap.name]
+        assert line["families"] == list(gap.families) and len(line["zero_shot"]["policies"]) == 2
+        turned = "actuation" in gap.families  # the hand comes half the way in the time there is
+        assert line["stratum"] == ("failed" if turned else "solved")
+        assert line["fit"]["success"] > 0.9 and line["trivial"] is True and line["admitted"] is None
+    assert {line["stratum"] for line in found.values()} == {"failed", "solved"}
+    head, *rows = capsys.readouterr().out.splitlines()
+    assert (
+        head.startswith("gap")
+        and rows[0].split()[:2] == ["sim", "none"]
+        and rows[-1] == f"table: {file.with_suffix('.json')}"
+    )
+
+    measured, whole = [], gaps_draw._zero_shot
+
+    def noted(env, missing, *given):
+        measured.append([gap.name for gap in missing])
+        return whole(env, missing, *given)
+
+    monkeypatch.setattr(gaps_draw, "_zero_shot", noted)
+    assert call(home, "--draw", "4")["gaps"] == found and measured == []
+    more = call(home, "--draw", "7")["gaps"]
+    assert measured == [["toy_steps-5-06"]] and len(gaps.read_file(file)) == 7
+    assert {name: more[name] for name in found} == found
+
+    save_prior(home / "other/seed-3", 3, task="toy_steps")
+    with pytest.raises(SystemExit):
+        call(home, "--draw", "4", "--prior", str(home / "other"))
+    assert "seed-5.json: was measured with other priors; choose another --out" in capsys.readouterr().err
+    (home / "families.toml").write_text(TEXT.replace("1.4", "1.5").replace("0.1", "0.2"))
+    with pytest.raises(SystemExit):
+        call(home, "--draw", "4")
+    assert "toy_steps-5-00 is not what is drawn now" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_plan_and_the_judge_are_measured_where_they_are_missing(home, monkeypatch):
+    monkeypatch.setitem(sys.modules, "envs.history", SimpleNamespace(with_previous_actions=with_previous_actions))
+    seen, train = [], gaps_draw.train
+
+    def noted(env, config, found, *given, **more):
+        seen.append((more["seen"].obs_dim, config.batch_size, [gap.name for gap in found]))
+        return train(env, config, found, *given, **more)
+
+    monkeypatch.setattr(gaps_draw, "train", noted)
+    call(home, "--draw", "1")
+    found = call(home, "--draw", "2", "--plan", "--judge", "--judge-preset", "cpu", "--seeds", "2")["gaps"]
+    assert seen == [(6, 16, ["toy_steps-5-00", "toy_steps-5-01"])]
+    assert all(0 <= line["plan"]["success"] <= 1 for line in found.values()) and "judge" not in found["sim"]
+    for name in seen[0][2]:
+        assert (
+            len(found[name]["judge"]["policies"]) == 2 and found[name]["admitted"] is False
+        )  # one update teaches nothing
+        assert found[name]["judge"]["preset"] == "cpu"
+    assert call(home, "--draw", "2", "--plan", "--judge")["gaps"] == found and len(seen) == 1
+
+
+@pytest.mark.parametrize(
+    ("success", "stratum"), [(1.0, "solved"), (0.8, "solved"), (0.79, "partial"), (0.2, "partial"), (0.19, "failed")]
+)
+def test_strata(success, stratum):
+    assert gaps_draw.labels({"zero_shot": {"success": success}})["stratum"] == stratum
+
+
+def test_labels_say_what_is_known():
+    rate = {"success": 0.85, "policies": [{"success": 0.8}, {"success": 0.9}]}
+    assert gaps_draw.labels({}) == {"stratum": None, "trivial": None, "admitted": None}
+    known = gaps_draw.labels({"zero_shot": rate, "fit": rate, "judge": rate})
+    assert known == {"stratum": "solved", "trivial": False, "admitted": True}  # the best policy counts
+
+
+def test_a_task_without_cartesian_actions_has_no_fit(home, capsys, monkeypatch):
+    env = envs.make("toy_steps")._replace(cartesian=False)
+    monkeypatch.setattr(envs, "make", lambda *given: env)
+    (home / "families.toml").write_text("[contact]\nslip = [0.0, 0.1]\n")
+    found = call(home, "--draw", "1")["gaps"]
+    assert "no fit of the action map: toy_steps commands joints" in capsys.readouterr().out
+    assert all("fit" not in line and line["trivial"] is None for line in found.values())
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (["--draw", "-1"], "--draw is -1: must be at least 1"),
+        (["--draw", "2", "--presets", "mild"], "--presets mild: names gaps, and --draw draws them"),
+        (["--judge"], "--judge: is for drawn gaps"),
+        (["--draw", "2", "--judge-preset", "fats"], "--judge-preset: there is no 'fats', did you mean 'fast'?"),
+        (["--draw", "2"], "toy_steps comes with no distribution of gaps; name a file of one"),
+    ],
+)
+def test_a_bad_command_is_one_line_and_code_2(home, more, words, capsys):
+    task = ["--task", "toy_steps", "--preset", "cpu", "--out", str(home)]
+    with pytest.raises(SystemExit) as stopped:
+        command.main([*task, *more])
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and words in error and error.count("\n") == 1
+
+
+def test_the_settings_of_the_training_are_those_of_the_preset_that_trains(monkeypatch):
+    seen = []
+    monkeypatch.setattr(command, "measure", seen.append)
+    command.main(["--draw", "2", "--preset", "cpu", "--judge-preset", "paper"])
+    command.main(["--preset", "cpu"])
+    assert [args.config.n_envs for args in seen] == [64, 32]
+
+
+def test_a_table_is_only_continued_as_it_was_begun(tmp_path):
+    table = gaps_draw._Table(tmp_path / "t.json", {"episodes": 200})
+    table.add({"a": {"families": [], "zero_shot": {"success": 0.1}}})
+    table.add({"a": {"fit": {"success": 0.95}}})
+    assert read_json(tmp_path / "t.json")["gaps"]["a"]["trivial"] is True
+    with pytest.raises(UserError, match="other episodes"):
+        gaps_draw._Table(tmp_path / "t.json", {"episodes": 300})
