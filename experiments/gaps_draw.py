@@ -10,7 +10,7 @@ import numpy as np
 
 import envs
 from envs import gap_distribution, gaps
-from envs.base import Env
+from envs.base import Env, end_effector
 from envs.gaps import SIM, Gap
 from envs.rollout import Episode
 from experiments import stacking
@@ -18,12 +18,13 @@ from experiments.cli import columns
 from experiments.evaluation import play
 from experiments.gaps import GapsArgs
 from experiments.gaps_run import FINAL_SEED, episode_key, percent, rate, systems, train
-from sgft_jax import api, identify
+from sgft_jax import api
 from sgft_jax.analysis import stats
-from sgft_jax.identify import ActionMap, Correction
 from sgft_jax.io.jsonfile import differences, read_json, write_json
 from sgft_jax.io.priors import digest, load_priors
 from sgft_jax.methods import get_method
+from sgft_jax.models import action_map
+from sgft_jax.models.action_map import ActionMap, Correction
 from sgft_jax.policies import make_policy
 from sgft_jax.types import Array, Prior, UserError
 
@@ -127,24 +128,24 @@ def _zero_shot(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: in
     """Success of the priors' policies on gaps and without one, as they are and behind a fit of the action map."""
     everywhere = [gaps.find(env.name, SIM), *found]
     system, members = systems(env, everywhere, priors, episodes)
-    policy = identify.corrected(make_policy(priors[0].card, env))
+    policy = make_policy(priors[0].card, env)
     count = len(everywhere) * len(priors)
-    none = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), identify.no_correction(env.act_dim))
+    none = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), action_map.no_correction(env.act_dim))
 
     def rates(corrections: Correction) -> list[dict[str, Any]]:
-        played = play(system, policy, (members, corrections), episode_key(FINAL_SEED), episodes)
+        played = play(system, policy, members._replace(correction=corrections), episode_key(FINAL_SEED), episodes)
         return _rates(played, len(everywhere), len(priors))
 
     plain = {
         gap.name: {"families": list(gap.families), "zero_shot": own} for gap, own in _each(everywhere, rates(none))
     }
     try:
-        place = identify.end_effector(env)
+        place = end_effector(env)
     except UserError as refused:
         print(f"no fit of the action map: {refused}")
         return plain
     keys = jnp.broadcast_to(jax.random.split(episode_key(_ROLLOUT_SEED), _SIMULATED), (count, _SIMULATED))
-    explored = system.play(policy, (members, none), keys, explore=True)
+    explored = system.play(policy, members._replace(correction=none), keys, explore=True)
     fitted = rates(_corrections(explored, place, len(priors)))
     return {gap.name: plain[gap.name] | {"fit": own} for gap, own in _each(everywhere, fitted)}
 
@@ -158,13 +159,13 @@ def _corrections(explored: Episode, place: np.ndarray, priors: int) -> Correctio
     given = ((rows.next_obs - rows.obs)[..., place], rows.action, explored.valid)
 
     def fit(steps: tuple[Array, Array, Array], around: ActionMap | None = None) -> ActionMap:
-        return identify.action_map(*steps, around=around)
+        return action_map.action_map(*steps, around=around)
 
     sim = jax.vmap(fit)(jax.tree.map(lambda x: x[:priors].reshape(priors, -1, *x.shape[3:]), given))
     copies = len(explored.valid) // priors
     own = jax.tree.map(lambda x: jnp.tile(x, (copies, *[1] * (x.ndim - 1))), sim)
     real = jax.vmap(fit)(jax.tree.map(lambda x: x[:, 0], given), own)
-    return jax.vmap(identify.correction)(real, own)
+    return jax.vmap(action_map.correction)(real, own)
 
 
 def _plan(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: int) -> dict[str, dict[str, Any]]:

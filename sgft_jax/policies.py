@@ -50,7 +50,8 @@ def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig) -> Policy:
 
     def act(params: SACParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         moments = actor.apply(params.actor, normalize(params.normalizer, obs))
-        return tanh_gaussian_action(moments, key, explore=explore), carry
+        action = tanh_gaussian_action(moments, key, explore=explore)
+        return action if params.correction is None else params.correction.apply(action), carry
 
     return Policy(
         init_carry=lambda: (),

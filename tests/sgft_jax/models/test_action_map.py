@@ -9,10 +9,11 @@ import toy_steps
 
 import envs
 from envs import gaps
+from envs.base import end_effector
 from envs.rollout import play_episode
-from sgft_jax import identify
-from sgft_jax.identify import ActionMap
-from sgft_jax.types import Policy, UserError
+from sgft_jax.models import action_map
+from sgft_jax.models.action_map import ActionMap
+from sgft_jax.types import UserError
 
 
 def turn(angle):
@@ -27,16 +28,16 @@ def fitted(env, gap, key, **given):
     """The map from one rollout of random actions."""
     pool = gaps.worlds(env, gap, key, 1)
     played = jax.jit(lambda key: play_episode(env, pool, random_actions, (), key, gamma=0.9))(key)
-    rows, place = played.transitions, identify.end_effector(env)
+    rows, place = played.transitions, end_effector(env)
     moves = rows.next_obs[:, place] - rows.obs[:, place]
-    return identify.action_map(moves, rows.action, played.valid, **given)
+    return action_map.action_map(moves, rows.action, played.valid, **given)
 
 
 def test_exact_moves_give_the_exact_map_and_rows_that_do_not_count_change_nothing():
     actions = jnp.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 1.0], [0.5, 0.5]])
     truth = ActionMap(jnp.array([[2.0, 1.0], [0.0, 3.0], [1.0, 0.0]]), jnp.array([0.1, -0.2, 0.0]))
     moves = (actions @ truth.matrix.T + truth.offset[None]).at[3].set(99.0)
-    found = identify.action_map(moves, actions, jnp.arange(4) < 3, ridge=1e-7)
+    found = action_map.action_map(moves, actions, jnp.arange(4) < 3, ridge=1e-7)
     np.testing.assert_allclose(found.matrix, truth.matrix, atol=1e-4)
     np.testing.assert_allclose(found.offset, truth.offset, atol=1e-4)
 
@@ -45,7 +46,7 @@ def test_steps_that_hit_something_are_left_out():
     """Two of ten steps were stopped after a fifth of their way."""
     actions = jax.random.uniform(jax.random.key(0), (10, 2), minval=-1.0, maxval=1.0)
     moves = (0.05 * actions).at[:2].multiply(0.2)
-    found = identify.action_map(moves, actions, jnp.ones(10, bool), ridge=1e-6)
+    found = action_map.action_map(moves, actions, jnp.ones(10, bool), ridge=1e-6)
     np.testing.assert_allclose(found.matrix, 0.05 * np.eye(2), atol=1e-4)
 
 
@@ -54,11 +55,11 @@ def test_where_the_rows_say_nothing_the_known_map_stays():
     known = ActionMap(jnp.eye(2), jnp.zeros(2))
     actions = jnp.array([[1.0, 0.0], [-1.0, 0.0]])
     moves = jnp.array([[3.0, 0.0], [-3.0, 0.0]])
-    found = identify.action_map(moves, actions, jnp.ones(2, bool), around=known, ridge=0.5)
+    found = action_map.action_map(moves, actions, jnp.ones(2, bool), around=known, ridge=0.5)
     # First column: (2 rows * 3 + 0.5 * 1) / 2.5 = 2.6.
     np.testing.assert_allclose(found.matrix, [[2.6, 0.0], [0.0, 1.0]], atol=1e-6)
     np.testing.assert_allclose(found.offset, 0.0, atol=1e-6)
-    nothing = identify.action_map(moves, actions, jnp.zeros(2, bool), around=known)
+    nothing = action_map.action_map(moves, actions, jnp.zeros(2, bool), around=known)
     np.testing.assert_allclose(nothing.matrix, np.eye(2), atol=1e-6)
 
 
@@ -66,10 +67,10 @@ def test_a_correction_makes_the_real_system_move_like_the_simulated_one():
     sim = ActionMap(0.05 * jnp.eye(2), jnp.zeros(2))
     real = ActionMap(0.05 * 0.6 * jnp.asarray(turn(0.7), jnp.float32), jnp.array([0.006, 0.0]))
     action = jnp.array([0.3, -0.2])
-    sent = identify.correction(real, sim).apply(action)
+    sent = action_map.correction(real, sim).apply(action)
     np.testing.assert_allclose(real.matrix @ sent + real.offset, sim.matrix @ action, atol=1e-6)
-    assert jnp.abs(identify.correction(real, sim).apply(jnp.ones(2))).max() == 1.0  # more cannot be commanded
-    np.testing.assert_array_equal(identify.no_correction(2).apply(action), action)
+    assert jnp.abs(action_map.correction(real, sim).apply(jnp.ones(2))).max() == 1.0  # more cannot be commanded
+    np.testing.assert_array_equal(action_map.no_correction(2).apply(action), action)
 
 
 def test_one_rollout_of_pushing_tells_how_commands_are_turned_and_scaled():
@@ -91,25 +92,21 @@ def test_behind_the_correction_a_policy_reaches_the_goal_again(key):
     sim = fitted(env, gaps.load(env, "sim"), keys[0])
     real = fitted(env, gap, keys[1], around=sim)
 
-    def straight(gain, carry, obs, key, *, explore):
-        return jnp.clip(gain * (obs[:2] - obs[2:]), -1.0, 1.0), carry
-
-    policy = identify.corrected(Policy(lambda: (), straight, lambda gain, obs: gain * obs[0]))
     pool = gaps.worlds(env, gap, keys[2], 1)
 
     def succeeds(correction, key):
-        act = lambda carry, obs, key: policy.act((5.0, correction), carry, obs, key, explore=False)  # noqa: E731
+        straight = lambda obs: jnp.clip(5.0 * (obs[:2] - obs[2:]), -1.0, 1.0)  # noqa: E731
+        act = lambda carry, obs, key: (correction.apply(straight(obs)), carry)  # noqa: E731
         return play_episode(env, pool, act, (), key, gamma=0.9).success
 
     rate = jax.jit(lambda own: jax.vmap(succeeds, (None, 0))(own, jax.random.split(keys[2], 50)).mean())
-    assert rate(identify.no_correction(2)) < 0.2
-    assert rate(identify.correction(real, sim)) > 0.9
-    assert policy.value((2.0, None), jnp.array([3.0])) == 6.0
+    assert rate(action_map.no_correction(2)) < 0.2
+    assert rate(action_map.correction(real, sim)) > 0.9
 
 
 def test_what_moves_is_found_by_name():
-    assert identify.end_effector(toy_steps.make()).tolist() == [2, 3]
-    assert identify.end_effector(envs.make("insert", "c")).tolist() == [0, 1, 2]
+    assert end_effector(toy_steps.make()).tolist() == [2, 3]
+    assert end_effector(envs.make("insert", "c")).tolist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize(
@@ -117,5 +114,5 @@ def test_what_moves_is_found_by_name():
 )
 def test_other_actions_are_refused_in_one_line(env, words):
     with pytest.raises(UserError, match=words) as refused:
-        identify.end_effector(toy.make() if env == "toy" else envs.make(env, "c"))
+        end_effector(toy.make() if env == "toy" else envs.make(env, "c"))
     assert "\n" not in str(refused.value)

@@ -1,15 +1,11 @@
-"""What a few rollouts say of a real system: how commands move its hand, and the commands that undo that. Pure."""
+"""How commands move the end effector, fitted to a few rollouts, and the commands that undo a difference. Pure."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from envs.base import Env
-from sgft_jax.types import Array, Key, Policy, PyTree, UserError
-
-_STEP = "_step"  # an action entry "hand_xy_step" moves what the observation entry "hand_xy" measures
+from sgft_jax.types import Array
 
 
 class ActionMap(NamedTuple):
@@ -36,23 +32,6 @@ class Correction(NamedTuple):
         """The command [act_dim] for an action [act_dim]."""
         # Less precise products of a GPU would round actions that nothing corrects.
         return jnp.clip(jnp.dot(self.matrix, action, precision="highest") + self.offset, -1.0, 1.0)
-
-
-def end_effector(env: Env) -> np.ndarray:
-    """[k] which numbers of the observation are the place that actions move.
-
-    Raises UserError for a task whose actions are no Cartesian steps: a joint's step moves its hand differently in every
-    posture, which no one matrix says.
-    """
-    if not env.cartesian:
-        raise UserError(f"{env.name} commands joints, and what a joint's step does to the hand depends on the posture")
-    numbers = np.split(np.arange(env.measured_dim), np.cumsum([e.size for e in env.measured])[:-1])
-    place = {f"{e.name}{_STEP}": own for e, own in zip(env.measured, numbers, strict=True)}
-    if odd := [e.name for e in env.action if e.name not in place]:
-        raise UserError(
-            f"{env.name}: no observation entry says where '{odd[0]}' moves; it would be called '<x>{_STEP}'"
-        )
-    return np.concatenate([place[e.name] for e in env.action])
 
 
 def action_map(
@@ -92,18 +71,13 @@ def correction(real: ActionMap, sim: ActionMap) -> Correction:
         return Correction(inverse @ sim.matrix, inverse @ (sim.offset - real.offset))
 
 
+def meaning(real: ActionMap, sim: ActionMap, command: Array) -> Array:
+    """The action [act_dim] that moves the simulated system as `command` moves the real one; it may exceed [-1, 1]."""
+    with jax.default_matmul_precision("highest"):
+        inverse = jnp.linalg.pinv(sim.matrix, rtol=1e-2)
+        return inverse @ (real.move(command) - sim.offset)
+
+
 def no_correction(act_dim: int) -> Correction:
     """What changes no action."""
     return Correction(jnp.eye(act_dim), jnp.zeros(act_dim))
-
-
-def corrected(policy: Policy) -> Policy:
-    """The same policy behind a correction; its parameters are (those of the policy, a `Correction`)."""
-
-    def act(
-        params: tuple[PyTree, Correction], carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
-    ) -> tuple[Array, PyTree]:
-        action, carry = policy.act(params[0], carry, obs, key, explore=explore)
-        return params[1].apply(action), carry
-
-    return Policy(policy.init_carry, act, lambda params, obs: policy.value(params[0], obs))
