@@ -6,6 +6,7 @@ Imports no JAX: commands that only list tasks read this module too.
 from __future__ import annotations
 
 import difflib
+import itertools
 from collections.abc import Callable, Mapping
 from math import inf
 from types import MappingProxyType
@@ -14,8 +15,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from sgft_jax.types import UserError
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from sgft_jax.types import Array, Key, PyTree
 
 Numbers = float | list[float] | list[list[float]]
@@ -206,6 +205,21 @@ class Env(NamedTuple):
         return sum(e.size for e in self.measured)
 
     @property
+    def end_effector(self) -> tuple[int, ...] | None:
+        """Which numbers of the observation actions move, in the order of actions; None where they are no such steps.
+
+        A Cartesian action entry `hand_xy_step` moves what the observation entry `hand_xy` measures. A joint's step
+        moves the hand differently in every posture.
+        """
+        if not self.cartesian:
+            return None
+        ends = list(itertools.accumulate(e.size for e in self.measured))
+        numbers = {f"{e.name}_step": range(end - e.size, end) for e, end in zip(self.measured, ends, strict=True)}
+        if any(e.name not in numbers for e in self.action):
+            return None
+        return tuple(i for e in self.action for i in numbers[e.name])
+
+    @property
     def act_dim(self) -> int:
         """Length of the action vector."""
         return sum(e.size for e in self.action)
@@ -222,24 +236,6 @@ def misnamed(env: Env, name: str) -> UserError:
     guess = f"; did you mean '{close[0]}'?" if close else "."
     listed = " ".join(f"{kind.capitalize()}s: {', '.join(names) or 'none'}." for kind, names in lists.items())
     return UserError(f"'{name}' is neither a parameter nor an effect of {env.name}{guess} {listed}")
-
-
-def end_effector(env: Env) -> np.ndarray:
-    """[k] which numbers of the observation are the place that actions move.
-
-    Raises UserError for a task whose actions are no Cartesian steps: a joint's step moves its hand differently in every
-    posture, which no one matrix says.
-    """
-    if not env.cartesian:
-        raise UserError(f"{env.name} commands joints, and what a joint's step does to the hand depends on the posture")
-    import numpy as np
-
-    # An action entry `hand_xy_step` moves what the observation entry `hand_xy` measures.
-    numbers = np.split(np.arange(env.measured_dim), np.cumsum([e.size for e in env.measured])[:-1])
-    place = {f"{e.name}_step": own for e, own in zip(env.measured, numbers, strict=True)}
-    if odd := [e.name for e in env.action if e.name not in place]:
-        raise UserError(f"{env.name}: no observation entry says where '{odd[0]}' moves; it would be called '<x>_step'")
-    return np.concatenate([place[e.name] for e in env.action])
 
 
 def pack(entries: tuple[Entry, ...], parts: Any) -> Any:

@@ -10,7 +10,7 @@ import numpy as np
 
 import envs
 from envs import gap_distribution, gaps
-from envs.base import Env, end_effector
+from envs.base import Env
 from envs.gaps import SIM, Gap
 from envs.rollout import Episode
 from experiments import stacking
@@ -20,6 +20,7 @@ from experiments.gaps import GapsArgs
 from experiments.gaps_run import FINAL_SEED, episode_key, percent, rate, systems, train
 from sgft_jax import api
 from sgft_jax.analysis import stats
+from sgft_jax.identify import place_of
 from sgft_jax.io.jsonfile import differences, read_json, write_json
 from sgft_jax.io.priors import digest, load_priors
 from sgft_jax.methods import get_method
@@ -140,7 +141,7 @@ def _zero_shot(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: in
         gap.name: {"families": list(gap.families), "zero_shot": own} for gap, own in _each(everywhere, rates(none))
     }
     try:
-        place = end_effector(env)
+        place = place_of(env)
     except UserError as refused:
         print(f"no fit of the action map: {refused}")
         return plain

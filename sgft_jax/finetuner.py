@@ -10,8 +10,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from sgft_jax import identify
 from sgft_jax.data import replay, sources
+from sgft_jax.identify import Identified
 from sgft_jax.learners import optim, sac
 from sgft_jax.methods import options as rules
 from sgft_jax.methods.options import KeptCriticOptions, LoopOptions, ModelOptions, SACOptions
@@ -44,7 +47,8 @@ from sgft_jax.types import (
 
 class FinetuneState(NamedTuple):
     """learner: the agent. models: the dynamics ensemble in training, or None. frozen: what stays of the prior, or None.
-    transform: the transforms' own state. replay: the real transitions.
+    transform: the transforms' own state. replay: the real transitions. interface: what is known of how the real system
+    takes commands, or None.
     """
 
     learner: PyTree
@@ -52,6 +56,7 @@ class FinetuneState(NamedTuple):
     frozen: PyTree
     transform: PyTree
     replay: PyTree
+    interface: Identified | None = None
 
 
 class Models(NamedTuple):
@@ -71,6 +76,8 @@ class Parts(NamedTuple):
     source(state) -> where a batch comes from; offline: the same before the first real rollout.
     transform: of every batch. imagine(state, key) -> what the transform may ask, None if it asks nothing.
     models: the dynamics ensemble if it trains. memory: the module that keeps real rows, replay or sequences.
+    place: which numbers of the observation are what Cartesian actions move, to correct commands by; None = no
+    correction. Then the learner acts and learns in the simulator's actions, and the replay keeps the commands.
     """
 
     learner: Learner
@@ -85,6 +92,7 @@ class Parts(NamedTuple):
     models: Models | None = None
     offline: Source | None = None
     memory: ModuleType = replay
+    place: np.ndarray | None = None
 
 
 def assemble(
@@ -103,12 +111,30 @@ def assemble(
         learner, frozen = parts.start(params, key_learner, simulated)
         models = None if parts.models is None else parts.models.start(params)
         empty = parts.memory.init(replay.blank(task.obs_dim, task.act_dim), options.replay_capacity)
-        state = FinetuneState(learner, models, frozen, parts.transform.init(key_transform), empty)
+        known = None if parts.place is None or simulated is None else identify.begin(simulated, parts.place)
+        state = FinetuneState(learner, models, frozen, parts.transform.init(key_transform), empty, known)
         # The caller may donate the state. The prior must survive that, and no two leaves may share a buffer.
         return jax.tree.map(jnp.copy, state)
 
     def observe(state: FinetuneState, rows: Transition, valid: Array) -> FinetuneState:
-        return state._replace(replay=parts.memory.add_episode(state.replay, rows, valid))
+        state = state._replace(replay=parts.memory.add_episode(state.replay, rows, valid))
+        if parts.place is None or state.interface is None:
+            return state
+        held = jnp.arange(options.replay_capacity) < state.replay.size
+        return state._replace(interface=identify.refit(state.interface, state.replay.data, held, parts.place))
+
+    def act(
+        state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
+    ) -> tuple[Array, PyTree]:
+        if state.interface is None:
+            return parts.act(state, carry, obs, key, explore=explore)
+        obs = state.interface.correction.undo_in(obs, task.previous_actions)
+        action, carry = parts.act(state, carry, obs, key, explore=explore)
+        return state.interface.correction.apply(action), carry
+
+    def export(state: FinetuneState) -> PyTree:
+        params = parts.export(state)
+        return params if state.interface is None else params._replace(correction=state.interface.correction)
 
     def update(
         state: FinetuneState, key: Key, simulated: SimulatedData | None, offline: bool
@@ -116,6 +142,8 @@ def assemble(
         keys = jax.random.split(key, 6)
         source = parts.offline if offline and parts.offline else parts.source(state)
         rows = source.sample((state.replay, simulated), keys[0])
+        if state.interface is not None:
+            rows = identify.in_actions_of_the_simulator(state.interface, rows, task.previous_actions)
         metrics: Metrics = {}
         if parts.models is not None and source.n_real:
             real = jax.tree.map(lambda x: x[: source.n_real], rows)
@@ -144,10 +172,10 @@ def assemble(
     return Finetuner(
         init=init,
         init_carry=parts.init_carry,
-        act=parts.act,
+        act=act,
         observe=observe,
         learn=learn,
-        export=parts.export,
+        export=export,
         policy=parts.policy,
         updates_per_rollout=rules.updates_per_rollout(options, task),
         initial_rollouts=options.initial_rollouts,
@@ -172,6 +200,7 @@ def sac_finetuner(
     value_baseline: bool = False,
     source: Callable[[FinetuneState], Source] | None = None,
     simulation: Simulation | None = None,
+    place: np.ndarray | None = None,
     **structure: Any,
 ) -> Finetuner:
     """Fine-tuning whose learner is SAC.
@@ -180,6 +209,7 @@ def sac_finetuner(
     fresh: start from new networks; the simulator's policy makes the initial rollouts alone. reset_critic: start from
     the simulator's actor and a new critic. value_baseline: a kept critic under shaped rewards is read as Q(s, a) -
     V_sim(s), its exact meaning in simulation. source: of batches, default real rows alone.
+    place: see `Parts`.
     structure: more fields of `SACConfig`, and numbers of `SACHyper`.
     """
     card = rules.card_of(prior)
@@ -243,7 +273,7 @@ def sac_finetuner(
         ensemble = state.frozen.dynamics if state.models is None else state.models.params
         return state.frozen._replace(actor=actor, critic=twin, dynamics=ensemble)
 
-    own_policy = sac_policy(task.obs_dim, task.act_dim, network)
+    own_policy = sac_policy(task.obs_dim, task.act_dim, network, task.previous_actions)
     parts = Parts(
         learner=learner,
         start=start,
@@ -256,6 +286,7 @@ def sac_finetuner(
         transform=compose(*transforms),
         imagine=_imagine(learner, network, gamma, task) if transforms else lambda state, key: None,
         models=models,
+        place=place,
     )
     initial = own_policy if prior is not None and fresh else None
     return assemble(parts, options, task, initial_policy=initial, simulation=simulation)

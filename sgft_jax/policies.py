@@ -30,7 +30,7 @@ def make_policy(card: Mapping[str, Any], task: Task) -> Policy:
     if plan := card.get("plan"):
         config = mpc.MPCConfig(task.obs_dim, task.act_dim, network, **plan, gamma=card["gamma"])
         return mpc_policy(config, task)
-    return sac_policy(task.obs_dim, task.act_dim, network)
+    return sac_policy(task.obs_dim, task.act_dim, network, task.previous_actions)
 
 
 def network_of(card: Mapping[str, Any]) -> NetworkConfig:
@@ -42,15 +42,18 @@ def network_of(card: Mapping[str, Any]) -> NetworkConfig:
         raise UserError(f"this version knows no such network: {card['network']}; pretrain again") from None
 
 
-def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig) -> Policy:
-    """Actor, V_sim and dynamics ensemble of `SACParams`."""
+def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig, previous_actions: int = 0) -> Policy:
+    """Actor, V_sim and dynamics ensemble of `SACParams`. previous_actions: with which observations end."""
     actor = make_actor(obs_dim, act_dim, network)
     value_net = make_value(obs_dim, network)
     model = make_dynamics(obs_dim, act_dim, network)
 
     def act(params: SACParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
-        moments = actor.apply(params.actor, normalize(params.normalizer, obs))
-        action = tanh_gaussian_action(moments, key, explore=explore)
+        if params.correction is not None:
+            obs = params.correction.undo_in(obs, previous_actions)
+        action = tanh_gaussian_action(
+            actor.apply(params.actor, normalize(params.normalizer, obs)), key, explore=explore
+        )
         return action if params.correction is None else params.correction.apply(action), carry
 
     return Policy(

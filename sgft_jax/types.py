@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
@@ -169,6 +169,16 @@ class Task(Protocol):
     @property
     def act_dim(self) -> int:
         """Length of the action vector."""
+        ...
+
+    @property
+    def previous_actions(self) -> int:
+        """How many of the last actions the observation ends with."""
+        ...
+
+    @property
+    def end_effector(self) -> Sequence[int] | None:
+        """Which numbers of the observation Cartesian actions move, None where actions are no such steps."""
         ...
 
     @property

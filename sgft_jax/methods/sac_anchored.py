@@ -17,6 +17,8 @@ class Config(KeptCriticOptions):
 
     anchor: float = 0.1
     """Price of the actor's divergence from the simulator's policy, in reward per nat; 0 = free."""
+    identify: bool = False
+    """Fit how commands move the end effector to the real rollouts, and correct the commands. Cartesian actions only."""
     simulated_share: float = 0.5
     """Share of each batch that is simulated."""
     simulated_transitions: int = 200_000
@@ -35,11 +37,13 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
     from sgft_jax.data import sources
     from sgft_jax.finetuner import sac_finetuner
+    from sgft_jax.identify import place_of
 
     simulated = round(config.simulated_share * config.batch_size)
     source = sources.mixture(config.batch_size - simulated, simulated)
     return sac_finetuner(
         config, prior, task, source=lambda state: source, anchored=config.anchor > 0, anchor=config.anchor,
+        place=place_of(task) if config.identify else None,
         simulation=Simulation(config.simulated_transitions, config.simulated_ladder) if simulated else None,
     )  # fmt: skip
 

@@ -9,8 +9,8 @@ import toy_steps
 
 import envs
 from envs import gaps
-from envs.base import end_effector
 from envs.rollout import play_episode
+from sgft_jax.identify import place_of
 from sgft_jax.models import action_map
 from sgft_jax.models.action_map import ActionMap
 from sgft_jax.types import UserError
@@ -28,7 +28,7 @@ def fitted(env, gap, key, **given):
     """The map from one rollout of random actions."""
     pool = gaps.worlds(env, gap, key, 1)
     played = jax.jit(lambda key: play_episode(env, pool, random_actions, (), key, gamma=0.9))(key)
-    rows, place = played.transitions, end_effector(env)
+    rows, place = played.transitions, place_of(env)
     moves = rows.next_obs[:, place] - rows.obs[:, place]
     return action_map.action_map(moves, rows.action, played.valid, **given)
 
@@ -105,8 +105,8 @@ def test_behind_the_correction_a_policy_reaches_the_goal_again(key):
 
 
 def test_what_moves_is_found_by_name():
-    assert end_effector(toy_steps.make()).tolist() == [2, 3]
-    assert end_effector(envs.make("insert", "c")).tolist() == [0, 1, 2]
+    assert place_of(toy_steps.make()).tolist() == [2, 3]
+    assert place_of(envs.make("insert", "c")).tolist() == [0, 1, 2]
 
 
 @pytest.mark.parametrize(
@@ -114,5 +114,5 @@ def test_what_moves_is_found_by_name():
 )
 def test_other_actions_are_refused_in_one_line(env, words):
     with pytest.raises(UserError, match=words) as refused:
-        end_effector(toy.make() if env == "toy" else envs.make(env, "c"))
+        place_of(toy.make() if env == "toy" else envs.make(env, "c"))
     assert "\n" not in str(refused.value)
