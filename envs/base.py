@@ -6,7 +6,6 @@ Imports no JAX: commands that only list tasks read this module too.
 from __future__ import annotations
 
 import difflib
-import itertools
 from collections.abc import Callable, Mapping
 from math import inf
 from types import MappingProxyType
@@ -203,21 +202,6 @@ class Env(NamedTuple):
     def measured_dim(self) -> int:
         """How many numbers sensors report."""
         return sum(e.size for e in self.measured)
-
-    @property
-    def end_effector(self) -> tuple[int, ...] | None:
-        """Which numbers of the observation actions move, in the order of actions; None where they are no such steps.
-
-        A Cartesian action entry `hand_xy_step` moves what the observation entry `hand_xy` measures. A joint's step
-        moves the hand differently in every posture.
-        """
-        if not self.cartesian:
-            return None
-        ends = list(itertools.accumulate(e.size for e in self.measured))
-        numbers = {f"{e.name}_step": range(end - e.size, end) for e, end in zip(self.measured, ends, strict=True)}
-        if any(e.name not in numbers for e in self.action):
-            return None
-        return tuple(i for e in self.action for i in numbers[e.name])
 
     @property
     def act_dim(self) -> int:

@@ -1,12 +1,12 @@
 """Impure: draws gaps and measures them, with a table on disk that grows. `experiments.gaps --draw` is its command."""
 
+import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 import envs
 from envs import gap_distribution, gaps
@@ -20,20 +20,20 @@ from experiments.gaps import GapsArgs
 from experiments.gaps_run import FINAL_SEED, episode_key, percent, rate, systems, train
 from sgft_jax import api
 from sgft_jax.analysis import stats
-from sgft_jax.identify import place_of
+from sgft_jax.finetuner import command_interface
+from sgft_jax.identify import Identified, Interface
 from sgft_jax.io.jsonfile import differences, read_json, write_json
 from sgft_jax.io.priors import digest, load_priors
 from sgft_jax.methods import get_method
-from sgft_jax.models import action_map
-from sgft_jax.models.action_map import ActionMap, Correction
-from sgft_jax.policies import make_policy
-from sgft_jax.types import Array, Prior, UserError
+from sgft_jax.models.distortion import Distortion, none
+from sgft_jax.policies import make_policy, network_of
+from sgft_jax.types import Prior, PyTree, SimulatedData, Transition, UserError
 
 SOLVED_AT_LEAST, FAILED_BELOW, TRIVIAL_AT_LEAST, ADMITTED_AT_LEAST = 0.8, 0.2, 0.9, 0.9
 PLANNER = "sgft-mpc"
 PREVIOUS_ACTIONS = 2  # that the judge sees: a command that comes late is still in force, or was when the step began
-_ROLLOUT_SEED = 2**31 + 6  # of the rollouts that action maps are fitted to
-_SIMULATED = 8  # rollouts that tell the simulator's own map; the real system's is fitted to one
+_ROLLOUT_SEED = 2**31 + 6  # of the rollouts that distortions are fitted to
+_SIMULATED = 8  # rollouts that tell how far the model is off in simulation; the real system is fitted to one
 
 
 def run(args: GapsArgs, seeds: list[int], folders: list[Path]) -> dict[str, Any]:
@@ -126,47 +126,45 @@ def lines(names: Sequence[str], known: Mapping[str, Mapping[str, Any]]) -> list[
 
 
 def _zero_shot(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: int) -> dict[str, dict[str, Any]]:
-    """Success of the priors' policies on gaps and without one, as they are and behind a fit of the action map."""
+    """Success of the priors' policies on gaps and without one, as they are and after one rollout of identification."""
     everywhere = [gaps.find(env.name, SIM), *found]
     system, members = systems(env, everywhere, priors, episodes)
     policy = make_policy(priors[0].card, env)
     count = len(everywhere) * len(priors)
-    none = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), action_map.no_correction(env.act_dim))
+    nothing = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), none(env.act_dim))
 
-    def rates(corrections: Correction) -> list[dict[str, Any]]:
-        played = play(system, policy, members._replace(correction=corrections), episode_key(FINAL_SEED), episodes)
+    def rates(known: Distortion) -> list[dict[str, Any]]:
+        played = play(system, policy, members._replace(distortion=known), episode_key(FINAL_SEED), episodes)
         return _rates(played, len(everywhere), len(priors))
 
-    plain = {
-        gap.name: {"families": list(gap.families), "zero_shot": own} for gap, own in _each(everywhere, rates(none))
-    }
-    try:
-        place = place_of(env)
-    except UserError as refused:
-        print(f"no fit of the action map: {refused}")
-        return plain
+    plain = rates(nothing)
     keys = jnp.broadcast_to(jax.random.split(episode_key(_ROLLOUT_SEED), _SIMULATED), (count, _SIMULATED))
-    explored = system.play(policy, members._replace(correction=none), keys, explore=True)
-    fitted = rates(_corrections(explored, place, len(priors)))
-    return {gap.name: plain[gap.name] | {"fit": own} for gap, own in _each(everywhere, fitted)}
+    explored = system.play(policy, members._replace(distortion=nothing), keys, explore=True)
+    part = command_interface(network_of(priors[0].card), env)
+    fitted = rates(jax.jit(functools.partial(_identified, part, len(priors)))(members, explored))
+    return {
+        gap.name: {"families": list(gap.families), "zero_shot": before, "fit": after}
+        for gap, before, after in zip(everywhere, plain, fitted, strict=True)
+    }
 
 
-def _corrections(explored: Episode, place: np.ndarray, priors: int) -> Correction:
-    """A correction [members] for each policy on each system, of which the first is the simulator.
+def _identified(part: Interface, priors: int, members: PyTree, explored: Episode) -> Distortion:
+    """What each policy [members] finds of each system, of which the first is the simulator.
 
     explored: [members, rollouts, T]; of real systems only the first rollout counts.
     """
-    rows = explored.transitions
-    given = ((rows.next_obs - rows.obs)[..., place], rows.action, explored.valid)
+    rows, held = explored.transitions, explored.valid
 
-    def fit(steps: tuple[Array, Array, Array], around: ActionMap | None = None) -> ActionMap:
-        return action_map.action_map(*steps, around=around)
+    def start(params: PyTree, rows: Transition) -> Identified:
+        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
+        draw = lambda key, n: jax.tree.map(  # noqa: E731
+            lambda x: x[jax.random.randint(key, (n,), 0, flat.reward.shape[0])], flat
+        )
+        return part.start(params, SimulatedData(draw, jnp.zeros(1)))
 
-    sim = jax.vmap(fit)(jax.tree.map(lambda x: x[:priors].reshape(priors, -1, *x.shape[3:]), given))
-    copies = len(explored.valid) // priors
-    own = jax.tree.map(lambda x: jnp.tile(x, (copies, *[1] * (x.ndim - 1))), sim)
-    real = jax.vmap(fit)(jax.tree.map(lambda x: x[:, 0], given), own)
-    return jax.vmap(action_map.correction)(real, own)
+    sim = jax.vmap(start)(*jax.tree.map(lambda x: x[:priors], (members, rows)))
+    own = jax.tree.map(lambda x: jnp.tile(x, (len(held) // priors, *[1] * (x.ndim - 1))), sim)
+    return jax.vmap(part.refit)(own, *jax.tree.map(lambda x: x[:, 0], (rows, held))).distortion
 
 
 def _plan(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: int) -> dict[str, dict[str, Any]]:

@@ -10,11 +10,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from sgft_jax import identify
 from sgft_jax.data import replay, sources
-from sgft_jax.identify import Identified
+from sgft_jax.identify import Identified, Interface, interface
 from sgft_jax.learners import optim, sac
 from sgft_jax.methods import options as rules
 from sgft_jax.methods.options import KeptCriticOptions, LoopOptions, ModelOptions, SACOptions
@@ -43,6 +41,8 @@ from sgft_jax.types import (
     Transition,
     UserError,
 )
+
+_SIMULATION = Simulation(20_000, 0.6)  # simulated rows that identification compares with
 
 
 class FinetuneState(NamedTuple):
@@ -76,8 +76,8 @@ class Parts(NamedTuple):
     source(state) -> where a batch comes from; offline: the same before the first real rollout.
     transform: of every batch. imagine(state, key) -> what the transform may ask, None if it asks nothing.
     models: the dynamics ensemble if it trains. memory: the module that keeps real rows, replay or sequences.
-    place: which numbers of the observation are what Cartesian actions move, to correct commands by; None = no
-    correction. Then the learner acts and learns in the simulator's actions, and the replay keeps the commands.
+    interface: identifies what the real system makes of commands, or None. The learner then acts and learns in the
+        simulator's actions, and the replay keeps the commands.
     """
 
     learner: Learner
@@ -92,7 +92,7 @@ class Parts(NamedTuple):
     models: Models | None = None
     offline: Source | None = None
     memory: ModuleType = replay
-    place: np.ndarray | None = None
+    interface: Interface | None = None
 
 
 def assemble(
@@ -111,30 +111,32 @@ def assemble(
         learner, frozen = parts.start(params, key_learner, simulated)
         models = None if parts.models is None else parts.models.start(params)
         empty = parts.memory.init(replay.blank(task.obs_dim, task.act_dim), options.replay_capacity)
-        known = None if parts.place is None or simulated is None else identify.begin(simulated, parts.place)
+        known = None
+        if parts.interface is not None and simulated is not None:
+            known = parts.interface.start(params, simulated)
         state = FinetuneState(learner, models, frozen, parts.transform.init(key_transform), empty, known)
         # The caller may donate the state. The prior must survive that, and no two leaves may share a buffer.
         return jax.tree.map(jnp.copy, state)
 
     def observe(state: FinetuneState, rows: Transition, valid: Array) -> FinetuneState:
         state = state._replace(replay=parts.memory.add_episode(state.replay, rows, valid))
-        if parts.place is None or state.interface is None:
+        if parts.interface is None or state.interface is None:
             return state
         held = jnp.arange(options.replay_capacity) < state.replay.size
-        return state._replace(interface=identify.refit(state.interface, state.replay.data, held, parts.place))
+        return state._replace(interface=parts.interface.refit(state.interface, state.replay.data, held))
 
     def act(
         state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
     ) -> tuple[Array, PyTree]:
         if state.interface is None:
             return parts.act(state, carry, obs, key, explore=explore)
-        obs = state.interface.correction.undo_in(obs, task.previous_actions)
+        obs = state.interface.distortion.meaning_in(obs, task.previous_actions)
         action, carry = parts.act(state, carry, obs, key, explore=explore)
-        return state.interface.correction.apply(action), carry
+        return state.interface.distortion.command(action), carry
 
     def export(state: FinetuneState) -> PyTree:
         params = parts.export(state)
-        return params if state.interface is None else params._replace(correction=state.interface.correction)
+        return params if state.interface is None else params._replace(distortion=state.interface.distortion)
 
     def update(
         state: FinetuneState, key: Key, simulated: SimulatedData | None, offline: bool
@@ -142,8 +144,8 @@ def assemble(
         keys = jax.random.split(key, 6)
         source = parts.offline if offline and parts.offline else parts.source(state)
         rows = source.sample((state.replay, simulated), keys[0])
-        if state.interface is not None:
-            rows = identify.in_actions_of_the_simulator(state.interface, rows, task.previous_actions)
+        if parts.interface is not None and state.interface is not None:
+            rows = parts.interface.meant(state.interface, rows)
         metrics: Metrics = {}
         if parts.models is not None and source.n_real:
             real = jax.tree.map(lambda x: x[: source.n_real], rows)
@@ -200,7 +202,6 @@ def sac_finetuner(
     value_baseline: bool = False,
     source: Callable[[FinetuneState], Source] | None = None,
     simulation: Simulation | None = None,
-    place: np.ndarray | None = None,
     **structure: Any,
 ) -> Finetuner:
     """Fine-tuning whose learner is SAC.
@@ -209,14 +210,16 @@ def sac_finetuner(
     fresh: start from new networks; the simulator's policy makes the initial rollouts alone. reset_critic: start from
     the simulator's actor and a new critic. value_baseline: a kept critic under shaped rewards is read as Q(s, a) -
     V_sim(s), its exact meaning in simulation. source: of batches, default real rows alone.
-    place: see `Parts`.
     structure: more fields of `SACConfig`, and numbers of `SACHyper`.
     """
     card = rules.card_of(prior)
     network, gamma, fresh = network_of(card), card["gamma"], fresh or prior is None
     new_critic = reset_critic or fresh
     rows = source or (lambda state: sources.real_rows(options.batch_size))
-    numbers = {name: structure.pop(name) for name in ("entropy_per_dim", "anchor") if name in structure}
+    numbers = {name: structure.pop(name) for name in ("entropy_per_dim",) if name in structure}
+    keeps = options if isinstance(options, KeptCriticOptions) and prior is not None else None
+    if keeps and keeps.identify:
+        simulation = simulation or _SIMULATION
     structure = {"tune_alpha": False} | structure
     config = sac.SACConfig(
         task.obs_dim,
@@ -226,6 +229,7 @@ def sac_finetuner(
         train_value=False,
         train_dynamics=False,
         critic_baseline=value_baseline and not new_critic,
+        anchored=bool(keeps and keeps.anchor),
         policy_delay=rules.policy_delay(options),
         max_grad_norm=options.max_grad_norm,
         **structure,
@@ -242,6 +246,7 @@ def sac_finetuner(
         actor_start=rules.critic_warmup(options, task),
         actor_ramp=options.actor_ramp,
         lr_warmup=rise,
+        anchor=keeps.anchor if keeps else 0.0,
         **numbers,
     )
     learner = sac.make_sac(config, hyper)
@@ -286,7 +291,7 @@ def sac_finetuner(
         transform=compose(*transforms),
         imagine=_imagine(learner, network, gamma, task) if transforms else lambda state, key: None,
         models=models,
-        place=place,
+        interface=command_interface(network, task) if keeps and keeps.identify else None,
     )
     initial = own_policy if prior is not None and fresh else None
     return assemble(parts, options, task, initial_policy=initial, simulation=simulation)
@@ -306,6 +311,19 @@ def dynamics_models(options: Any, network: NetworkConfig, task: Task) -> Models:
         return dynamics.update(model, optimiser, fit, normalizer, batch, key, rate=rate)
 
     return Models(lambda params: optim.start(optimiser, params.dynamics), update)
+
+
+def command_interface(network: NetworkConfig, task: Task) -> Interface:
+    """Identification through one model of the prior's ensemble, as the simulator left it."""
+    model = make_dynamics(task.obs_dim, task.act_dim, network)
+
+    def change(kept: tuple[PyTree, Normalizer], obs: Array, action: Array) -> Array:
+        member, statistics = kept
+        after = dynamics.predict(model, member, statistics, obs, action)[0]
+        return (after - obs)[: task.measured_dim]
+
+    first = lambda params: jax.tree.map(lambda x: x[:1], params.dynamics)  # noqa: E731
+    return interface(change, lambda params: (first(params), params.normalizer), task)
 
 
 def _imagine(

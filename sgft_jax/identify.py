@@ -1,70 +1,75 @@
-"""How a real system takes commands, fitted to its rollouts while it is learned: scale, rotation and bias of actions.
+"""What a real system makes of commands (scale, rotation, bias), identified while something else learns on it.
 
-A learner behind a correction acts in the simulator's actions: it asks for a move, and the correction commands what
-makes the real system move so.
+The learner acts and learns in the simulator's actions. What it wants is turned into the command that stands for it.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from sgft_jax.models import action_map
-from sgft_jax.models.action_map import ActionMap, Correction
-from sgft_jax.types import Array, Batch, SimulatedData, Task, Transition, UserError
+from sgft_jax.models import distortion
+from sgft_jax.models.distortion import Distortion
+from sgft_jax.types import Array, Batch, PyTree, SimulatedData, Task, Transition
 
-_SIMULATED = 2048  # rows that tell the simulator's own map
-_ROWS = 1024  # of the real system that are fitted, some 25 rollouts; more of them add little
-_EVIDENCE = 20.0  # nats by which a distortion must explain the rows better than none; neighbouring steps are alike
+_SIMULATED = 2048  # rows that tell how far the model is off in simulation
+_ROWS = 320  # real ones that are fitted, the first 8 rollouts or so; more of them add little
+_EVIDENCE = 20.0  # nats by which a distortion must explain them better than none; neighbouring steps are alike
+
+Model = Callable[[PyTree, Array, Array], Array]  # (params, obs, action) -> [measured_dim] what a step changes
 
 
 class Identified(NamedTuple):
-    """sim, real: how either system moves. spread: [k] std of what `sim` leaves unexplained in simulation.
+    """params: of the simulator's model. spread: [measured_dim] std of its residuals in simulation.
 
-    correction: the command for an action; it changes nothing until data say so.
+    distortion: what the real system makes of commands; none until data say otherwise.
     """
 
-    sim: ActionMap
-    real: ActionMap
+    params: PyTree
     spread: Array
-    correction: Correction
+    distortion: Distortion
 
 
-def place_of(task: Task) -> np.ndarray:
-    """[k] which numbers of the observation actions move; raises UserError for a task where no entry says so."""
-    if task.end_effector is None:
-        raise UserError("identify: needs Cartesian actions `x_step`, which move what the observation's `x` measures")
-    return np.array(task.end_effector)
+class Interface(NamedTuple):
+    """A part that identifies.
+
+    start(params of a prior, simulated) -> Identified. refit(identified, rows [n], held [n]) -> Identified after more
+    real rows. meant(identified, batch) -> the batch with its real commands replaced by what they stand for.
+    """
+
+    start: Callable[[PyTree, SimulatedData], Identified]
+    refit: Callable[[Identified, Transition, Array], Identified]
+    meant: Callable[[Identified, Batch], Batch]
 
 
-def begin(simulated: SimulatedData, place: np.ndarray) -> Identified:
-    """The real system taken for the simulated one. place: [k] numbers of the observation that actions move."""
-    rows = simulated.draw(jax.random.key(0), _SIMULATED)
-    moves = (rows.next_obs - rows.obs)[:, place]
-    sim = action_map.action_map(moves, rows.action, jnp.ones(_SIMULATED, bool))
-    spread = 1.48 * jnp.median(jnp.abs(moves - jax.vmap(sim.move)(rows.action)), axis=0)
-    least = 0.01 * jnp.abs(moves).max()
-    return Identified(sim, sim, jnp.maximum(spread, least), action_map.no_correction(rows.action.shape[-1]))
+def interface(model: Model, kept: Callable[[PyTree], PyTree], task: Task) -> Interface:
+    """The part for a task. model: predicts its steps. kept: what the model needs of a prior's params."""
 
+    def start(params: PyTree, simulated: SimulatedData) -> Identified:
+        own, rows = jax.tree.map(jnp.copy, kept(params)), simulated.draw(jax.random.key(0), _SIMULATED)
+        nothing, held = distortion.none(task.act_dim), jnp.ones(_SIMULATED, bool)
+        missed = distortion.residuals(lambda *x: model(own, *x), rows, nothing, task.previous_actions)
+        least = 0.01 * distortion.robust_std((rows.next_obs - rows.obs)[:, : missed.shape[1]], held)
+        return Identified(own, jnp.maximum(distortion.robust_std(missed, held), least) + 1e-6, nothing)
 
-def refit(known: Identified, rows: Transition, held: Array, place: np.ndarray) -> Identified:
-    """The same after more real rows [n], of which `held` [n] bool are there; their actions are commands."""
-    rows, held = jax.tree.map(lambda x: x[:_ROWS], (rows, held))
-    moves = (rows.next_obs - rows.obs)[:, place]
-    found, evidence = action_map.distortion(moves, rows.action, held, known.sim, known.spread)
-    real = found.seen_by(known.sim)
-    new = known._replace(real=real, correction=action_map.correction(real, known.sim))
-    old = known._replace(real=known.sim, correction=action_map.no_correction(rows.action.shape[-1]))
-    return jax.tree.map(lambda a, b: jnp.where(evidence > _EVIDENCE, a, b), new, old)
+    def refit(known: Identified, rows: Transition, held: Array) -> Identified:
+        rows, held = jax.tree.map(lambda x: x[:_ROWS], (rows, held))
+        found, evidence = distortion.fit(
+            lambda *x: model(known.params, *x), rows, held, known.spread, turns=task.cartesian,
+            previous_actions=task.previous_actions,
+        )  # fmt: skip
+        nothing = distortion.none(task.act_dim)
+        return known._replace(
+            distortion=jax.tree.map(lambda a, b: jnp.where(evidence > _EVIDENCE, a, b), found, nothing)
+        )
 
+    def meant(known: Identified, batch: Batch) -> Batch:
+        seen = jax.vmap(lambda obs: known.distortion.meaning_in(obs, task.previous_actions))
+        action = jax.vmap(known.distortion.meaning)(batch.action)
+        new = batch._replace(action=action, obs=seen(batch.obs), next_obs=seen(batch.next_obs))
+        if (simulated := batch.is_sim) is None:
+            return new
+        return jax.tree.map(lambda a, b: jnp.where(simulated.reshape(-1, *[1] * (a.ndim - 1)), a, b), batch, new)
 
-def in_actions_of_the_simulator(known: Identified, batch: Batch, previous_actions: int) -> Batch:
-    """Rows whose real commands are replaced by the actions that they stand for."""
-    seen = jax.vmap(lambda obs: known.correction.undo_in(obs, previous_actions))
-    meant = batch._replace(
-        action=jax.vmap(known.correction.undo)(batch.action), obs=seen(batch.obs), next_obs=seen(batch.next_obs)
-    )
-    if (simulated := batch.is_sim) is None:
-        return meant
-    return jax.tree.map(lambda a, b: jnp.where(simulated.reshape(-1, *[1] * (a.ndim - 1)), a, b), batch, meant)
+    return Interface(start, refit, meant)

@@ -49,12 +49,12 @@ def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig, previous_acti
     model = make_dynamics(obs_dim, act_dim, network)
 
     def act(params: SACParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
-        if params.correction is not None:
-            obs = params.correction.undo_in(obs, previous_actions)
+        if params.distortion is not None:
+            obs = params.distortion.meaning_in(obs, previous_actions)
         action = tanh_gaussian_action(
             actor.apply(params.actor, normalize(params.normalizer, obs)), key, explore=explore
         )
-        return action if params.correction is None else params.correction.apply(action), carry
+        return action if params.distortion is None else params.distortion.command(action), carry
 
     return Policy(
         init_carry=lambda: (),

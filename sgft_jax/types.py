@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
 
@@ -177,8 +177,13 @@ class Task(Protocol):
         ...
 
     @property
-    def end_effector(self) -> Sequence[int] | None:
-        """Which numbers of the observation Cartesian actions move, None where actions are no such steps."""
+    def measured_dim(self) -> int:
+        """How many numbers of the observation are measured."""
+        ...
+
+    @property
+    def cartesian(self) -> bool:
+        """Whether the first two actions are x and y of one frame."""
         ...
 
     @property

@@ -13,7 +13,7 @@ import numpy as np
 from sgft_jax import mesh
 from sgft_jax.io import checkpoint
 from sgft_jax.io.jsonfile import differences, read_json, write_json
-from sgft_jax.models.action_map import Correction
+from sgft_jax.models.distortion import Distortion
 from sgft_jax.types import Normalizer, Prior, PyTree, UserError
 
 CARD = "prior.json"
@@ -57,8 +57,8 @@ def load_prior(
     if set(tree.get("normalizer", {})) != set(Normalizer._fields):
         raise UserError(f"{folder}: not a prior: it has no observation statistics")
     tree["normalizer"] = statistics = Normalizer(**tree["normalizer"])
-    if correction := tree.get("correction"):
-        tree["correction"] = Correction(**correction)
+    if distortion := tree.get("distortion"):
+        tree["distortion"] = Distortion(**distortion)
     if statistics.mean.shape != (card["obs_dim"],):
         raise UserError(f"{folder}: {CARD} says obs_dim={card['obs_dim']}, the statistics have {len(statistics.mean)}")
     return Prior(container(**{name: tree.get(name) for name in container._fields}), card)

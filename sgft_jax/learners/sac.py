@@ -16,7 +16,7 @@ from flax import struct
 from sgft_jax import checks
 from sgft_jax.learners import losses, optim
 from sgft_jax.models import dynamics, normalizer
-from sgft_jax.models.action_map import Correction
+from sgft_jax.models.distortion import Distortion
 from sgft_jax.models.networks import (
     Network,
     NetworkConfig,
@@ -109,7 +109,7 @@ class SACParams(NamedTuple):
     actor, critic, value: networks; the critic has a leading axis of its two members.
     dynamics: the delta-dynamics ensemble, leading axis = member.
     normalizer: statistics of the random-action data; every network above reads normalised observations.
-    correction: what turns the actor's actions into commands of a real system, None = nothing.
+    distortion: what the real system makes of commands, None = nothing.
     """
 
     actor: PyTree
@@ -117,7 +117,7 @@ class SACParams(NamedTuple):
     value: PyTree
     dynamics: PyTree
     normalizer: Normalizer
-    correction: Correction | None = None
+    distortion: Distortion | None = None
 
 
 class SACState(struct.PyTreeNode):

@@ -70,10 +70,16 @@ class KeptCriticOptions(SACOptions):
     lr_warmup: int | None = None
     """Updates over which the learning rate of a critic kept from the simulator rises from 0. Adam's first steps are as
     long as its rate in every weight, however small the gradient. None = the updates of 1,000 real transitions."""
+    anchor: float = 0.0
+    """Price of the actor's divergence from the simulator's policy, in reward per nat; 0 = free. Where that policy is
+    right already, 0.1 keeps it so (docs/protocol.md)."""
+    identify: bool = False
+    """Fit what the real system makes of commands (scale, rotation, bias) to its rollouts, through the prior's models,
+    and command accordingly."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.not_negative(self, "lr_warmup")
+        checks.not_negative(self, "lr_warmup", "anchor")
 
 
 @dataclass(frozen=True)

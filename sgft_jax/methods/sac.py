@@ -2,23 +2,41 @@
 
 from dataclasses import dataclass
 
+from sgft_jax import checks
 from sgft_jax.methods.options import KeptCriticOptions
-from sgft_jax.types import Finetuner, Method, Prior, Task
+from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
 
 
 @dataclass(frozen=True)
 class Config(KeptCriticOptions):
     """Options of `sac`."""
 
+    simulated_share: float = 0.0
+    """Share of each batch that is simulated, as in RLPD (Ball et al. 2023); 0 = none."""
+    simulated_transitions: int = 200_000
+    """Simulated transitions to draw it from, of the simulator's policy with more and more random actions."""
+    simulated_ladder: float = 0.6
+    """Share of random actions in the last of these episodes; it grows from 0 in the first."""
     tune_alpha: bool = False
     """Let the temperature follow a target entropy of -1 nat per action dimension instead of staying at `alpha`."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.share(self, "simulated_share", "simulated_ladder")
+        checks.at_least(self, 1, "simulated_transitions")
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner; without a prior it learns from nothing."""
+    from sgft_jax.data import sources
     from sgft_jax.finetuner import sac_finetuner
 
-    return sac_finetuner(config, prior, task, tune_alpha=config.tune_alpha)
+    simulated = round(config.simulated_share * config.batch_size) if prior is not None else 0
+    source = sources.mixture(config.batch_size - simulated, simulated)
+    return sac_finetuner(
+        config, prior, task, tune_alpha=config.tune_alpha, source=lambda state: source,
+        simulation=Simulation(config.simulated_transitions, config.simulated_ladder) if simulated else None,
+    )  # fmt: skip
 
 
 METHOD = Method(

@@ -130,7 +130,7 @@ def tanh_gaussian_log_prob(moments: Array, u: Array) -> Array:
 
 
 def tanh_gaussian_divergence(moments: Array, others: Array) -> Array:
-    """KL divergence [] from N(others) to N(moments), nats; tanh, which both share, leaves it as it is.
+    """KL(moments || others) [], nats: of the Gaussians, which tanh leaves as it is.
 
     moments, others: [2, act_dim] mean and log-std.
     """

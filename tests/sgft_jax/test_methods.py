@@ -146,8 +146,13 @@ OTHER = {
     "tau": 0.2, "alpha": 0.3, "expectile": 0.9, "beta": 1.0, "reward_scale": 2.0, "simulated_share": 0.25,
     "simulated_share_end": 0.4, "simulated_ladder": 0.1, "critic_network": dataclasses.replace(tuners.NET, hidden=(4,)),
     "branch_noise": 0.1, "clip_shaped": 0.01, "plan_noise": 0.1, "explore_noise": 0.1,
+    "anchor": 0.5,
 }  # fmt: skip
-GIVEN = {"lr_warmup": {"reset_critic": False}}
+GIVEN = {
+    "lr_warmup": {"reset_critic": False},
+    "simulated_transitions": {"simulated_share": 0.5},
+    "simulated_ladder": {"simulated_share": 0.5},
+}
 
 
 def other_value(field, value):

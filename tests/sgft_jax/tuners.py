@@ -38,6 +38,9 @@ class Point(NamedTuple):
 
     obs_dim: int = 2
     act_dim: int = 2
+    measured_dim: int = 2
+    previous_actions: int = 0
+    cartesian: bool = True
     episode_length: int = T
     reward: Callable[..., jax.Array] | None = reward
     terminated: Callable[..., jax.Array] | None = lambda obs, action, next_obs: jnp.bool_(False)

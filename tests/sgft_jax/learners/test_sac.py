@@ -1,5 +1,7 @@
 """SAC: temperature, ensembles of critics, what moves, what starts from a prior. See also test_contract_learners.py."""
 
+import dataclasses
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -102,6 +104,24 @@ def test_actor_ramp_scales_the_first_steps(key):
         new, _ = FULL_LEARNER.update(state, probe(key), key)
         moved.append(jnp.abs(new.actor.params["Dense_1"]["bias"] - state.actor.params["Dense_1"]["bias"]).max())
     assert moved[0] == pytest.approx(1e-2, rel=1e-2) and moved[1] == pytest.approx(2.5e-3, rel=1e-2)
+
+
+def test_an_anchored_actor_stays_with_the_policy_it_began_with(key):
+    """The dearer it is to leave, the less far it goes; what it is held to never moves."""
+    config = dataclasses.replace(FULL, tune_alpha=False, train_value=False, train_dynamics=False, anchored=True)
+    actor = jax.vmap(networks.make_actor(1, 1, FULL.network).apply, (None, 0))
+    params = sac.extract_params(FULL_LEARNER.init(key))
+    batch, far = probe(key, reward=lambda s, a: 5.0 * a), []
+    for price in (0.0, 10.0, 1000.0):
+        hyper = HYPER._replace(anchor=price)
+        state = start = sac.state_from_prior(config, hyper, params, key, reset_critic=False)
+        update = jax.jit(sac.make_sac(config, hyper).update)
+        for step in range(150):
+            state, _ = update(state, batch, jax.random.fold_in(key, step))
+        assert equal(start.anchor, state.anchor) and equal(start.anchor, params.actor)
+        now, then = (actor(p, jnp.linspace(-1.0, 1.0, 9)[:, None]) for p in (state.actor.params, state.anchor))
+        far.append(float(jax.vmap(networks.tanh_gaussian_divergence)(now, then).mean()))
+    assert far[0] > 2 * far[1] > 4 * far[2] > 0
 
 
 def test_policy_delay(key):

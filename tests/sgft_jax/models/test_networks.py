@@ -33,6 +33,13 @@ def test_tanh_gaussian_is_finite_at_the_bounds():
     assert jnp.isfinite(value) and jnp.all(jnp.isfinite(slope))
 
 
+def test_divergence_by_hand():
+    """KL(N(1, 2^2) || N(0, 1)) = -ln 2 + (4 + 1 - 1) / 2 = 1.3068528, twice over two dimensions."""
+    wide = jnp.stack([jnp.ones(2), jnp.full(2, jnp.log(2.0))])
+    assert networks.tanh_gaussian_divergence(wide, jnp.zeros((2, 2))) == pytest.approx(2 * 1.3068528, abs=1e-5)
+    assert networks.tanh_gaussian_divergence(wide, wide) == 0.0
+
+
 def test_sample_and_mode(key):
     moments = jnp.array([[0.5, -0.5], [-5.0, -5.0]])
     assert jnp.allclose(networks.tanh_gaussian_mode(moments), jnp.tanh(moments[0]))

@@ -1,0 +1,103 @@
+"""What a real system makes of commands: by hand, through a model, and on pushing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from envs import gaps
+from envs.rollout import play_episode
+from sgft_jax.models import distortion
+from sgft_jax.models.distortion import Distortion
+from sgft_jax.types import Transition
+
+STEP, WALL = 0.05, 0.3  # m at full action, m
+
+
+def walled(obs, action):
+    """A hand that moves by 5 cm at full action, and stops at walls."""
+    return jnp.clip(obs[:2] + STEP * action, -WALL, WALL) - obs[:2]
+
+
+def turned(angle, scale, bias):
+    c, s = np.cos(angle), np.sin(angle)
+    return Distortion(scale * jnp.array([[c, -s], [s, c]]), jnp.array(bias))
+
+
+def steps(truth, key, n=40, noise=1e-3):
+    """Steps of a real hand whose commands point mostly one way, into a wall."""
+    keys = jax.random.split(key, 3)
+    obs = jax.random.uniform(keys[0], (n, 2), minval=-WALL, maxval=WALL)
+    command = jnp.clip(jnp.array([[0.9, 0.2]]) + 0.4 * jax.random.normal(keys[1], (n, 2)), -1.0, 1.0)
+    moved = jax.vmap(walled)(obs, jax.vmap(truth.meaning)(command))
+    return Transition(obs, command, jnp.zeros(n), jnp.ones(n), obs + moved + noise * jax.random.normal(keys[2], (n, 2)))
+
+
+def fit(rows, held=None, **given):
+    held = jnp.ones(len(rows.reward), bool) if held is None else held
+    given = {"turns": True} | given
+    return jax.jit(lambda: distortion.fit(walled, rows, held, jnp.full(2, 1e-3), **given))()
+
+
+@pytest.mark.parametrize(("angle", "scale", "bias"), [(0.7, 0.6, [0.0, 0.0]), (-1.2, 1.4, [0.1, -0.2])])
+def test_one_rollout_tells_rotation_scale_and_bias_walls_or_not(angle, scale, bias, key):
+    truth = turned(angle, scale, bias)
+    found, evidence = fit(steps(truth, key))
+    np.testing.assert_allclose(found.matrix, truth.matrix, atol=0.05)
+    np.testing.assert_allclose(found.bias, truth.bias, atol=0.05)
+    assert evidence > 100
+
+
+def test_a_system_that_takes_commands_as_they_are_meant_gives_no_evidence(key):
+    found, evidence = fit(steps(turned(0.0, 1.0, [0.0, 0.0]), key))
+    np.testing.assert_allclose(found.matrix, np.eye(2), atol=0.05)
+    assert evidence < 10
+
+
+def test_rows_that_are_not_there_change_nothing(key):
+    """Without any row what was believed stays; rows that are not held may hold anything."""
+    rows = steps(turned(0.7, 0.6, [0.0, 0.0]), key)
+    nothing, evidence = fit(rows, jnp.zeros(40, bool))
+    np.testing.assert_allclose(nothing.matrix, np.eye(2), atol=1e-6)
+    assert abs(evidence) < 1e-6
+    held = jnp.arange(40) < 30
+    torn = rows._replace(next_obs=jnp.where(held[:, None], rows.next_obs, 99.0))
+    np.testing.assert_array_equal(fit(rows, held)[0].matrix, fit(torn, held)[0].matrix)
+
+
+def test_without_a_common_frame_nothing_is_turned(key):
+    found, _ = fit(steps(turned(0.7, 1.0, [0.0, 0.0]), key), turns=False)
+    np.testing.assert_allclose(found.matrix - jnp.diag(jnp.diag(found.matrix)), 0.0, atol=1e-3)
+
+
+def test_commands_undo_the_distortion_as_far_as_they_can():
+    truth = turned(0.7, 0.6, [0.1, 0.0])
+    action = jnp.array([0.3, -0.2])
+    np.testing.assert_allclose(truth.meaning(truth.command(action)), action, atol=1e-6)
+    assert jnp.abs(truth.command(jnp.ones(2))).max() == 1.0  # more cannot be commanded
+    np.testing.assert_array_equal(distortion.none(2).command(action), action)
+    seen = truth.meaning_in(jnp.array([5.0, *truth.command(action), 0.0, 0.0]), 2)
+    np.testing.assert_allclose(seen, [5.0, *action, *truth.bias], atol=1e-6)
+
+
+def test_it_is_what_effects_do_to_actions():
+    """The family is that of `envs.effects.distort`."""
+    env = envs.make("push", "c")
+    values = {"action_rotation": 0.5, "action_scale": [0.6, 1.2], "action_bias": [0.1, -0.1]}
+    effects = envs.effects.make_range(env, values).low
+    own = distortion.turned_and_scaled(effects.action_rotation, jnp.log(effects.action_scale), effects.action_bias)
+    action = jnp.array([0.4, -0.7])
+    np.testing.assert_allclose(own.meaning(action), envs.effects.distort(effects, action), rtol=1e-5)
+
+
+def test_one_rollout_of_pushing_tells_how_commands_are_turned_and_scaled():
+    """Through a linear model of the free hand; a puck and the end of the workspace are in its way."""
+    env = envs.make("push", "c")
+    gap = gaps.from_dict(env, "g", {"effects": {"obs_noise": 0.001, "action_rotation": 0.7, "action_scale": 0.6}})
+    pool, key = gaps.worlds(env, gap, jax.random.key(0), 1), jax.random.key(1)
+    uniform = lambda carry, obs, key: (jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0), carry)  # noqa: E731
+    played = jax.jit(lambda key: play_episode(env, pool, uniform, (), key, gamma=0.9))(key)
+    free = lambda obs, action: 0.05 * action  # noqa: E731
+    found, evidence = distortion.fit(free, played.transitions, played.valid, jnp.full(2, 1e-3), turns=True)
+    assert np.linalg.norm(found.matrix - turned(0.7, 0.6, [0.0, 0.0]).matrix) < 0.1 and evidence > 20
