@@ -63,7 +63,8 @@ def main() -> None:
     prior = Prior(params, {"algorithm": "sac", "network": {**asdict(network), "hidden": [16]}, "gamma": 0.9})
     line = SimpleNamespace(
         obs_dim=1, act_dim=1, previous_actions=0, episode_length=32,
-        reward=lambda obs, action, next_obs: -jnp.abs(next_obs[0]), terminated=lambda obs, action, next_obs: jnp.bool_(False),
+        reward=lambda obs, action, next_obs: -jnp.abs(next_obs[0]),
+        terminated=lambda obs, action, next_obs: jnp.bool_(False),
     )  # fmt: skip
     tuner = METHOD.build(Config(batch_size=16, replay_capacity=64), prior, line)
     obs, action = jax.random.uniform(jax.random.key(1), (2, 32, 1), minval=-1)
