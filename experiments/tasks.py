@@ -50,7 +50,7 @@ def describe(task: str) -> dict[str, Any]:
     """One task as JSON data. A task in MuJoCo is not compiled for it."""
     name = envs.name_of(task)
     it: Any = envs.scene(task) or envs.make(task)  # both have the fields below
-    sizes = {"act_dim": sum(e.size for e in it.action), "obs_dim": sum(e.size for e in it.observation)}
+    sizes = {"act_dim": sum(e.size for e in it.action), "measured_dim": sum(e.size for e in it.observation)}
     named = gaps.presets(name)
     return {
         "name": name,
