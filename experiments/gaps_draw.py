@@ -12,6 +12,7 @@ import envs
 from envs import gap_distribution, gaps
 from envs.base import Env
 from envs.gaps import SIM, Gap
+from envs.history import with_previous_actions
 from envs.rollout import Episode
 from experiments import stacking
 from experiments.cli import columns
@@ -23,7 +24,7 @@ from sgft_jax.analysis import stats
 from sgft_jax.finetuner import command_interface
 from sgft_jax.identify import Identified, Interface
 from sgft_jax.io.jsonfile import differences, read_json, write_json
-from sgft_jax.io.priors import digest, load_priors
+from sgft_jax.io.priors import digest, load_priors, previous_actions
 from sgft_jax.methods import get_method
 from sgft_jax.models.distortion import Distortion, none
 from sgft_jax.policies import make_policy, network_of
@@ -39,7 +40,7 @@ _SIMULATED = 8  # rollouts that tell how far the model is off in simulation; the
 def run(args: GapsArgs, seeds: list[int], folders: list[Path]) -> dict[str, Any]:
     """Draws, writes and measures gaps; prints and returns the table. folders: of the priors."""
     task = envs.name_of(args.task)
-    env = envs.make(args.task, args.impl)
+    env = envs.make(args.task, args.impl, previous_actions=previous_actions(folders))
     found = gap_distribution.draw(env, gap_distribution.load(env, args.distribution), args.seed, args.draw)
     path = args.out / "gaps" / task / f"seed-{args.seed}.toml"
     write_gaps(path, found)
@@ -180,9 +181,7 @@ def _plan(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: int) ->
 
 def _judge(env: Env, args: GapsArgs, found: Sequence[Gap], seeds: list[int], folder: Path) -> dict[str, dict[str, Any]]:
     """Success of policies that were trained on the gaps themselves and see their previous actions."""
-    from envs.history import with_previous_actions
-
-    seen = with_previous_actions(env, PREVIOUS_ACTIONS)
+    seen = env if env.previous_actions else with_previous_actions(env, PREVIOUS_ACTIONS)
     played = train(env, args.config, found, seeds, folder, episodes=args.episodes, seen=seen)
     rates = [rate(own, stats.mean) for own in played]
     return {gap.name: {"judge": {"preset": args.judge_preset, **own}} for gap, own in _each(found, rates)}
