@@ -209,6 +209,11 @@ class Env(NamedTuple):
         return sum(e.size for e in self.action)
 
 
+def entries_of(env: Env, effect: str) -> tuple[Entry, ...]:
+    """What an effect is a vector over; () for one that is a number, and for what is no effect."""
+    return {"action_scale": env.action, "action_bias": env.action, "obs_bias": env.measured}.get(effect, ())
+
+
 def misnamed(env: Env, name: str) -> UserError:
     """What to tell someone who named a domain parameter or an effect that the task does not have there."""
     lists = {"parameter": [p.name for p in env.parameters], "effect": list(Effects._fields)}

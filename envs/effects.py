@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.base import EffectRange, Effects, Entry, Env, Numbers, Value, misnamed
+from envs.base import EffectRange, Effects, Entry, Env, Numbers, Value, entries_of, misnamed
 from sgft_jax.types import Array, Key, UserError, unknown
 
 _DEFAULTS = {"action_scale": 1.0, "obs_noise_prob": 1.0}
@@ -20,18 +20,17 @@ def make_range(env: Env, values: Mapping[str, Value]) -> EffectRange:
     entries of the action or observation, e.g. {"goal_xz": [0.03, 0.0]}; entries without a name have no effect. Raises
     UserError, which names the effect and the bound, for what is no finite number, has another size or is impossible.
     """
-    vectors = {"action_scale": env.action, "action_bias": env.action, "obs_bias": env.measured}
     for name in values:
         if name not in Effects._fields:
             raise misnamed(env, name)
     low, high = ({}, {})
     for name in Effects._fields:
-        default, entries = _DEFAULTS.get(name, 0.0), vectors.get(name)
+        default, entries = _DEFAULTS.get(name, 0.0), entries_of(env, name)
         given = values.get(name, default)
         if isinstance(given, Mapping):
-            low[name], high[name] = _ends_by_entry(name, given, entries or (), default)
+            low[name], high[name] = _ends_by_entry(name, given, entries, default)
         else:
-            low[name], high[name] = _ends(name, given, () if entries is None else (sum(e.size for e in entries),))
+            low[name], high[name] = _ends(name, given, (sum(e.size for e in entries),) if entries else ())
     _check_possible(env, low, high)
     return EffectRange(*(Effects(**{k: jnp.asarray(v, jnp.float32) for k, v in end.items()}) for end in (low, high)))
 

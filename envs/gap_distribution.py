@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from envs import gaps
-from envs.base import Effects, Entry, Env, Value, misnamed
+from envs.base import Effects, Entry, Env, Value, entries_of, misnamed
 from envs.gaps import Gap
 from sgft_jax.types import UserError, unknown
 
@@ -89,7 +89,7 @@ def _table(env: Env, distribution: Distribution, rng: np.random.Generator) -> di
         items = distribution.families[family]
         for name in _some(rng, list(items), len(items)):
             kind = "effects" if name in Effects._fields else "params"
-            table[kind][name] = _value(rng, items[name], _entries(env, name))
+            table[kind][name] = _value(rng, items[name], entries_of(env, name))
     return table
 
 
@@ -113,18 +113,11 @@ def _numbers(rng: np.random.Generator, ends: tuple[float, float], size: int) -> 
     return drawn if size > 1 else drawn[0]
 
 
-def _entries(env: Env, name: str) -> tuple[Entry, ...]:
-    """What an item is a vector over; () for a number."""
-    if name in ("action_scale", "action_bias"):
-        return env.action
-    return env.measured if name == "obs_bias" else ()
-
-
 def _item(env: Env, name: str, given: Any, where: str) -> dict[str, tuple[float, float]]:
     """How an item is drawn. Raises UserError for an unknown name and for what is no range."""
     if name not in Effects._fields and name not in [p.name for p in env.parameters]:
         raise UserError(f"{where}: {misnamed(env, name)}")
-    ways, entries = given if isinstance(given, dict) else {_COMMON: given}, [e.name for e in _entries(env, name)]
+    ways, entries = given if isinstance(given, dict) else {_COMMON: given}, [e.name for e in entries_of(env, name)]
     allowed = [_COMMON, *([_EACH, *entries] if entries else [])]
     for way, ends in ways.items():
         if way not in allowed:
