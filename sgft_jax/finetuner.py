@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from sgft_jax.data import replay, sources
+from sgft_jax.guard import guarded
 from sgft_jax.identify import Identified, Interface, interface
 from sgft_jax.learners import optim, sac
 from sgft_jax.methods import options as rules
@@ -66,6 +67,17 @@ class Models(NamedTuple):
     update: Callable[[PyTree, Normalizer, Batch, Key], tuple[PyTree, Metrics]]
 
 
+def agents_own(params: PyTree, own: PyTree) -> PyTree:
+    """The policy of a fresh agent: what it exports itself."""
+    del params
+    return own
+
+
+def simulators_actor(params: sac.SACParams, own: sac.SACParams) -> sac.SACParams:
+    """The simulator's policy in the form that an agent with new networks exports."""
+    return own._replace(actor=params.actor)
+
+
 class Parts(NamedTuple):
     """What a method chooses.
 
@@ -78,6 +90,8 @@ class Parts(NamedTuple):
     models: the dynamics ensemble if it trains. memory: the module that keeps real rows, replay or sequences.
     interface: identifies what the real system makes of commands, or None. The learner then acts and learns in the
         simulator's actions, and the replay keeps the commands.
+    reference(params of a prior, what the fresh agent exports) -> params of the policy that a guard holds on to at
+        first: the agent's own unless the simulator's policy is another one.
     """
 
     learner: Learner
@@ -93,6 +107,7 @@ class Parts(NamedTuple):
     offline: Source | None = None
     memory: ModuleType = replay
     interface: Interface | None = None
+    reference: Callable[[PyTree, PyTree], PyTree] = agents_own
 
 
 def assemble(
@@ -118,7 +133,8 @@ def assemble(
         # The caller may donate the state. The prior must survive that, and no two leaves may share a buffer.
         return jax.tree.map(jnp.copy, state)
 
-    def observe(state: FinetuneState, rows: Transition, valid: Array) -> FinetuneState:
+    def observe(state: FinetuneState, rows: Transition, valid: Array, score: Array) -> FinetuneState:
+        del score  # rewards are what is learned from
         state = state._replace(replay=parts.memory.add_episode(state.replay, rows, valid))
         if parts.interface is None or state.interface is None:
             return state
@@ -171,7 +187,7 @@ def assemble(
         state, metrics = jax.lax.scan(one, state, jax.random.split(key, updates))
         return state, jax.tree.map(jnp.mean, metrics)
 
-    return Finetuner(
+    finetuner = Finetuner(
         init=init,
         init_carry=parts.init_carry,
         act=act,
@@ -185,6 +201,7 @@ def assemble(
         simulation=simulation,
         card=card or {},
     )
+    return guarded(finetuner, parts.reference, score=task.score) if options.guard else finetuner
 
 
 # --- SAC --------------------------------------------------------------------------------------------------------------
@@ -278,6 +295,7 @@ def sac_finetuner(
         ensemble = state.frozen.dynamics if state.models is None else state.models.params
         return state.frozen._replace(actor=actor, critic=twin, dynamics=ensemble)
 
+    simulators = prior is not None and fresh
     own_policy = sac_policy(task.obs_dim, task.act_dim, network, task.previous_actions)
     parts = Parts(
         learner=learner,
@@ -292,9 +310,9 @@ def sac_finetuner(
         imagine=_imagine(learner, network, gamma, task) if transforms else lambda state, key: None,
         models=models,
         interface=command_interface(network, task) if keeps and keeps.identify else None,
+        reference=simulators_actor if simulators else agents_own,
     )
-    initial = own_policy if prior is not None and fresh else None
-    return assemble(parts, options, task, initial_policy=initial, simulation=simulation)
+    return assemble(parts, options, task, initial_policy=own_policy if simulators else None, simulation=simulation)
 
 
 def dynamics_models(options: Any, network: NetworkConfig, task: Task) -> Models:

@@ -179,7 +179,7 @@ class _Steps:
                 episodes = self.system.play(initial, own, keys, explore=True)
             played.append(episodes)
         for episodes in played:
-            agent = self._store(agent, episodes.transitions, episodes.valid)
+            agent = self._store(agent, episodes.transitions, episodes.valid, episodes.score)
         learned = []
         for rollout in range(done, done + n):  # equal parts, so that one compiled program serves any number
             updates = self.finetuner.updates_per_rollout
@@ -194,9 +194,9 @@ class _Steps:
         metrics = real | jax.tree.map(mean, *learned)
         return FinetuneProgress(agent, best, progress.rollouts + n, progress.offline), metrics
 
-    def _observe(self, state: PyTree, transitions: Transition, valid: Array) -> PyTree:
-        """transitions, valid: [1, T, ...]."""
-        return self.finetuner.observe(state, jax.tree.map(lambda x: x[0], transitions), valid[0])
+    def _observe(self, state: PyTree, transitions: Transition, valid: Array, score: Array) -> PyTree:
+        """transitions, valid: [1, T, ...]. score: [1]."""
+        return self.finetuner.observe(state, jax.tree.map(lambda x: x[0], transitions), valid[0], score[0])
 
     def _update(
         self, states: PyTree, keys: Key, updates: int, simulated: SimulatedRows | None, offline: bool

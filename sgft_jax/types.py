@@ -192,6 +192,11 @@ class Task(Protocol):
         ...
 
     @property
+    def score(self) -> str:
+        """What a run is judged by, "success" or "return"."""
+        ...
+
+    @property
     def reward(self) -> Callable[[Array, Array, Array], Array] | None:
         """Task reward []."""
         ...
@@ -248,7 +253,8 @@ class Finetuner(NamedTuple):
     init(params, key, simulated) -> state. params: of a prior, None without one. simulated: a `SimulatedData` or None.
     init_carry() -> carry of an episode.
     act(state, carry, obs [obs_dim], key, *, explore) -> (action [act_dim], carry); `explore` may be traced.
-    observe(state, transitions [T, ...], valid [T]) -> state: keeps the rows of one episode, in order.
+    observe(state, transitions [T, ...], valid [T], score []) -> state: keeps the rows of one episode, in order. score:
+        of the episode.
     learn(state, key, updates, simulated, *, offline) -> (state, metrics averaged over the updates); `updates` and
         `offline` are static. offline: learn from the simulated transitions alone.
     export(state) -> params of the agent as it acts now.
@@ -263,7 +269,7 @@ class Finetuner(NamedTuple):
     init: Callable[[PyTree, Key, SimulatedData | None], PyTree]
     init_carry: Callable[[], PyTree]
     act: Callable[..., tuple[Array, PyTree]]
-    observe: Callable[[PyTree, Transition, Array], PyTree]
+    observe: Callable[[PyTree, Transition, Array, Array], PyTree]
     learn: Callable[..., tuple[PyTree, Metrics]]
     export: Callable[[PyTree], PyTree]
     policy: Policy

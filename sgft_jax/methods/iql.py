@@ -45,7 +45,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     import jax.numpy as jnp
 
     from sgft_jax.data import sources
-    from sgft_jax.finetuner import FinetuneState, Parts, assemble
+    from sgft_jax.finetuner import FinetuneState, Parts, agents_own, assemble, simulators_actor
     from sgft_jax.learners import iql
     from sgft_jax.learners.sac import SACParams
     from sgft_jax.methods.options import card_of
@@ -98,6 +98,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
         source=lambda state: source,
         offline=sources.simulated_rows(config.batch_size),
         transform=compose(),
+        reference=agents_own if prior is None else simulators_actor,
     )
     with_prior = prior is not None
     return assemble(

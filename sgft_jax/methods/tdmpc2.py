@@ -69,7 +69,7 @@ def planner(
     import jax
 
     from sgft_jax.data import sequences, sources
-    from sgft_jax.finetuner import FinetuneState, Parts, assemble
+    from sgft_jax.finetuner import FinetuneState, Parts, agents_own, assemble
     from sgft_jax.learners import tdmpc2, tdmpc2_model
     from sgft_jax.learners.tdmpc2_model import TDMPC2Params
     from sgft_jax.methods.options import card_of, warmup
@@ -128,6 +128,7 @@ def planner(
         transform=compose(shape) if shaped else compose(),
         imagine=drawn_value if shaped else lambda state, key: None,
         memory=sequences,
+        reference=agents_own if not fresh or prior is None else lambda params, own: params,
     )
     initial = tdmpc2_policy(structure, hyper) if fresh and prior is not None else None
     says = {"algorithm": "tdmpc2", "config": {**own, "sgft": sgft}}

@@ -124,6 +124,6 @@ def test_invalid_rows_are_not_stored_and_may_hold_anything(name):
     state = case.fine.init(case.params, jax.random.key(0))
     valid = jnp.arange(T) % 2 == 1
     torn = jax.tree.map(lambda x: x.at[::2].set(jnp.nan), tuners.episode(jax.random.key(0)))
-    state = case.fine.observe(state, torn, valid)
+    state = case.fine.observe(state, torn, valid, jnp.float32(0))
     assert state.replay.size == T // 2
     assert all(jnp.isfinite(x).all() for x in jax.tree.leaves(state.replay.data))

@@ -142,7 +142,7 @@ def test_methods_that_need_no_prior_start_without_one(name, monkeypatch):
     plain = METHODS[name].build(tuners.configure(name), None, TASK)
     assert plain.simulation is None and plain.initial_policy is None
     state = plain.observe(
-        plain.init(None, jax.random.key(0), None), tuners.episode(jax.random.key(1)), jnp.ones(T, bool)
+        plain.init(None, jax.random.key(0), None), tuners.episode(jax.random.key(1)), jnp.ones(T, bool), jnp.float32(0)
     )
     new, metrics = jax.jit(lambda state: plain.learn(state, jax.random.key(2), 2))(state)
     assert all(jnp.isfinite(x) for x in metrics.values()) and not equal(state.learner, new.learner)
@@ -197,7 +197,7 @@ def test_the_simulators_transitions_as_the_models_have_them(seen):
     data = tuners.simulated().of(0)
     far = data._replace(draw=lambda key, n: (rows := data.draw(key, n))._replace(obs=rows.obs + 5.0))
     state = plain.init(prior().params, jax.random.key(0), far)
-    state = plain.observe(state, tuners.episode(jax.random.key(1)), jnp.ones(T, bool))
+    state = plain.observe(state, tuners.episode(jax.random.key(1)), jnp.ones(T, bool), jnp.float32(0))
     with jax.disable_jit():
         plain.learn(state, jax.random.key(1), 1, far)
     batch, n, horizon = seen["batch"], 8, 2
@@ -224,7 +224,7 @@ def test_imagined_steps_follow_every_model(monkeypatch):
     far = jax.tree.map(jnp.copy, params.dynamics)
     far["Dense_1"]["bias"] = far["Dense_1"]["bias"].at[1].add(1000.0)
     state = plain.init(params._replace(dynamics=far), jax.random.key(0), None)
-    state = plain.observe(state, tuners.episode(jax.random.key(1)), jnp.ones(T, bool))
+    state = plain.observe(state, tuners.episode(jax.random.key(1)), jnp.ones(T, bool), jnp.float32(0))
     learn = jax.jit(jax.vmap(lambda key: plain.learn(state, key, 1)[1]["batch/reward_mean"]))
     went_far = np.asarray(learn(jax.random.split(jax.random.key(2), 20)) < -100)
     assert 0.2 < went_far.mean() < 0.8

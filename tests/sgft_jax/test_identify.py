@@ -44,7 +44,7 @@ def case():
 def learned(case):
     """A state that has seen one real rollout."""
     state = case.fine.init(case.params, jax.random.key(0))
-    return case.fine.observe(state, steps(case.params, jax.random.key(1), TURN), jnp.ones(N, bool))
+    return case.fine.observe(state, steps(case.params, jax.random.key(1), TURN), jnp.ones(N, bool), jnp.float32(0))
 
 
 def test_one_rollout_through_the_prior_s_model_tells_the_distortion(learned):
@@ -55,7 +55,7 @@ def test_one_rollout_through_the_prior_s_model_tells_the_distortion(learned):
 def test_where_nothing_differs_commands_stay_as_they_are(case):
     state = case.fine.init(case.params, jax.random.key(0))
     rows = steps(case.params, jax.random.key(1), distortion.none(2))
-    state = case.fine.observe(state, rows, jnp.ones(N, bool))
+    state = case.fine.observe(state, rows, jnp.ones(N, bool), jnp.float32(0))
     np.testing.assert_array_equal(state.interface.distortion.matrix, np.eye(2))
     np.testing.assert_array_equal(state.interface.distortion.bias, 0.0)
 

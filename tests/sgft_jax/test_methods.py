@@ -161,7 +161,7 @@ def other_value(field, value):
 
 def outcome(case, state):
     """What some updates make of the networks, and how the agent then explores."""
-    state = case.fine.observe(state, tuners.episode(jax.random.key(0)), jnp.ones(T, bool))
+    state = case.fine.observe(state, tuners.episode(jax.random.key(0)), jnp.ones(T, bool), jnp.float32(0))
     state, _ = case.fine.learn(state, jax.random.key(1), 2)
     act = case.fine.act(state, case.fine.init_carry(), jnp.array([0.3, -0.8]), jax.random.key(2), explore=True)
     return case.fine.export(state), act

@@ -35,7 +35,7 @@ def act(state, carry, obs, key, *, explore):
     return (NUMBER * carry + 1e-4 * jnp.tanh(state) + noise)[None], carry + 1.0
 
 
-def make(initial_policy=None, simulation=None, initial_rollouts=1):
+def make(initial_policy=None, simulation=None, initial_rollouts=1, guard=False):
     """Fine-tuning whose learner adds up what it sees and draws, and whose policy counts its own steps."""
 
     def update(state, batch, key):
@@ -53,7 +53,7 @@ def make(initial_policy=None, simulation=None, initial_rollouts=1):
         offline=sources.simulated_rows(4),
         transform=compose(),
     )
-    options = LoopOptions(utd=PER_ROLLOUT / LENGTH, initial_rollouts=initial_rollouts, replay_capacity=200)
+    options = LoopOptions(utd=PER_ROLLOUT / LENGTH, initial_rollouts=initial_rollouts, replay_capacity=200, guard=guard)
     return assemble(parts, options, ENV, initial_policy=initial_policy, simulation=simulation)
 
 
@@ -243,6 +243,44 @@ def test_rollouts_of_an_initial_policy_are_no_evidence_for_the_agent():
     assert set(np.asarray(action)[1][np.asarray(valid)[1]]) == {0.0}
     assert yielded[1][0].best.count.tolist() == [0, 0] and yielded[-1][0].best.count.tolist() == [1, 1]
     assert yielded[1][0].agent.replay.size.min() > 10
+
+
+# --- which policy is deployed -----------------------------------------------------------------------------------------
+
+RETURNS = np.stack([[5, 6, 9, 9, 9, 9], [5, 6, 0, 5, 6, 5]], 1)
+
+
+def test_the_guard_decides_for_each_member_who_plays_next():
+    """By the scores of its rollouts. One learner becomes the reference, the other is given up."""
+    fine = make(guard=True)
+    yielded = run(fine, Scripted(RETURNS), rollouts=6)
+    flags = [(x["guard/challenger"].tolist(), x["guard/replaced"].tolist()) for _, x in yielded[1:]]
+    assert flags[:3] == [([0, 0], [0, 0]), ([1, 1], [0, 0]), ([0, 0], [1, 0])]
+    states = [progress.agent for progress, _ in yielded]
+    acting = np.stack([jax.vmap(fine.export)(jax.tree.map(jnp.asarray, state)) for state in states])
+    np.testing.assert_array_equal(acting[:2], np.tile([0.5, 0.0], (2, 1)))
+    np.testing.assert_array_equal(acting[2], states[2].agent.learner)
+    np.testing.assert_array_equal(acting[3], [states[2].agent.learner[0], 0.0])  # what played, before it went on
+    assert states[3].agent.learner[0] != states[2].agent.learner[0]
+
+
+def test_initial_rollouts_are_evidence_for_the_policy_that_made_them():
+    """All four, though the learner would have been deployed after the second."""
+    _, (progress, metrics) = run(make(guard=True, initial_rollouts=4), Scripted(RETURNS), rollouts=4)
+    guard = progress.agent.guard
+    assert guard.reference.weight.tolist() == [4, 4] and guard.reference.total.tolist() == [29, 16]
+    assert guard.challenger.weight.tolist() == [0, 0] and metrics["guard/challenger"].tolist() == [1, 1]
+
+
+def test_a_guarded_run_that_was_stopped_goes_on_with_the_same_bits(tmp_path):
+    """Reference, evidence and who is deployed are in the checkpoint."""
+    fine = make(guard=True)
+    whole = run(fine, rollouts=6)
+    assert len({tuple(metrics["guard/challenger"].tolist()) for _, metrics in whole[1:]}) > 1
+    checkpoint.save(tmp_path, 3, whole[3][0], meta={})
+    restored, _ = checkpoint.restore(tmp_path, jax.eval_shape(functools.partial(train.begin, fine), PRIORS, SEEDS))
+    rest = run(fine, rollouts=6, progress=jax.tree.map(jnp.asarray, restored))
+    assert bits(rest[-1]) == bits(whole[-1])
 
 
 # --- a system that is stepped from Python ---------------------------------------------------------------------------

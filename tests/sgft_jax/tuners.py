@@ -42,6 +42,7 @@ class Point(NamedTuple):
     previous_actions: int = 0
     cartesian: bool = True
     episode_length: int = T
+    score: str = "success"
     reward: Callable[..., jax.Array] | None = reward
     terminated: Callable[..., jax.Array] | None = lambda obs, action, next_obs: jnp.bool_(False)
 
@@ -143,7 +144,7 @@ def episode(key, n=T):
 def started(case, seed=0):
     """A state with one real episode."""
     state = case.fine.init(case.params, jax.random.key(seed))
-    return case.fine.observe(state, episode(jax.random.key(seed)), jnp.ones(T, bool))
+    return case.fine.observe(state, episode(jax.random.key(seed)), jnp.ones(T, bool), jnp.float32(0))
 
 
 class Recorded:

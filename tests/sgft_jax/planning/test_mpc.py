@@ -143,7 +143,7 @@ def rows(n=64):
 
 
 def test_the_models_learn_and_all_else_stays():
-    state = tuner().observe(tuner().init(prior(), jax.random.key(0)), rows(), jnp.arange(64) != 5)
+    state = tuner().observe(tuner().init(prior(), jax.random.key(0)), rows(), jnp.arange(64) != 5, 0.0)
     assert state.replay.size == 63
     new, metrics = tuner().learn(state, jax.random.key(2), 300)
     before, after = prior(), tuner().export(new)

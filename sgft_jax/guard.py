@@ -1,0 +1,174 @@
+"""A guard: real training rollouts decide whether what learns is deployed, or a policy that is known to work.
+
+The *reference* is at first the policy that a method begins with, the *challenger* is what learns. One of the two is
+deployed: it plays the next training rollout and is what is evaluated and exported. Scores of training rollouts are the
+only evidence, so a guard costs no real transition.
+
+The rule compares means of scores, each with a few imagined rollouts as a prior. It is the same for success (a Beta
+posterior) and for returns (a normal one), as it needs no scale but the worst and the best score known: 0 and 1 for
+success, those seen so far for returns.
+
+- Reference: the mean of its rollouts and, for success, of one imagined success: what the simulator promised.
+- Challenger: the mean of its rollouts, each of which counts 0.8 times as much after every learning phase, because it
+  has changed since, and of two imagined rollouts half way between the reference's mean and the best score. It is given
+  credit as far as the reference falls short, and none where the reference never failed.
+- The challenger is deployed if its mean is above the reference's, and not if they are equal.
+- It becomes the reference, as it was when it played, if its rollouts alone and one more with the worst score have a
+  mean above the reference's. No success rate above 5/6 is ever replaced, as the challenger's evidence is worth five
+  rollouts at most.
+
+What it guarantees: while the reference has never failed, nothing else is deployed. While its mean is above 0.84, one
+failure of the challenger brings it back. Where the first rollouts fail, the challenger is deployed most of the time.
+If the reference succeeds with probability 0.97 and the challenger with 0.8, what is deployed succeeds with 0.93 or
+more after any of 20 rollouts, on average over runs, and with 0.9 or more whatever the challenger does. If they succeed
+with 0.05 and 0.9, it is 0.88 from the third rollout on (tests/sgft_jax/test_guard.py).
+What it does not guarantee: that a single run never falls, as a worse policy succeeds at times; anything about
+differences smaller than the spread of returns; that an improvement on a reference that rarely fails is found soon;
+that what works while exploring works as well without.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from sgft_jax.types import Array, Finetuner, Key, Metrics, PyTree, SimulatedData, Transition
+
+_FADE = 0.8  # of the challenger's evidence per learning phase
+_CREDIT = 2.0  # imagined rollouts of the challenger
+
+
+class Evidence(NamedTuple):
+    """Weighted rollouts of one policy: the sum of their scores [] and of their weights []."""
+
+    total: Array
+    weight: Array
+
+
+class Guard(NamedTuple):
+    """reference, challenger: the evidence for either. worst, best: [] the extreme scores known.
+
+    deployed: [] bool, whether the challenger is.
+    """
+
+    reference: Evidence
+    challenger: Evidence
+    worst: Array
+    best: Array
+    deployed: Array
+
+
+class Guarded(NamedTuple):
+    """agent: the state of what learns. reference: params of the other policy. guard: what is known of both."""
+
+    agent: PyTree
+    reference: PyTree
+    guard: Guard
+
+
+# --- the rule ---------------------------------------------------------------------------------------------------------
+
+
+def start(score: str) -> Guard:
+    """Before the first rollout, which is the reference's. score: "success" or "return", as of an `Env`."""
+    promised, worst, best = (1.0, 0.0, 1.0) if score == "success" else (0.0, jnp.inf, -jnp.inf)
+    return Guard(
+        Evidence(jnp.float32(promised), jnp.float32(promised)),
+        Evidence(jnp.float32(0), jnp.float32(0)),
+        jnp.float32(worst),
+        jnp.float32(best),
+        jnp.zeros((), bool),
+    )
+
+
+def scored(guard: Guard, score: Array) -> Guard:
+    """After a training rollout with this score [] by the policy that is deployed."""
+    add = lambda evidence, mine: Evidence(evidence.total + mine * score, evidence.weight + mine)  # noqa: E731
+    challenger = guard.deployed.astype(jnp.float32)
+    return guard._replace(
+        reference=add(guard.reference, 1 - challenger),
+        challenger=add(guard.challenger, challenger),
+        worst=jnp.minimum(guard.worst, score),
+        best=jnp.maximum(guard.best, score),
+    )
+
+
+def replaces(guard: Guard) -> Array:
+    """[] bool, whether the challenger as it has just played is to become the reference."""
+    total, weight = guard.challenger
+    return (weight > 0) & ((total + guard.worst) / (weight + 1) > _mean(guard.reference))
+
+
+def replaced(guard: Guard) -> Guard:
+    """The challenger has become the reference; what is known of it stays known of both."""
+    return guard._replace(reference=guard.challenger)
+
+
+def learned(guard: Guard) -> Guard:
+    """The challenger has changed, which ages its evidence; who is deployed is decided anew."""
+    challenger = Evidence(*(_FADE * x for x in guard.challenger))
+    reference, expected = means(guard._replace(challenger=challenger))
+    return guard._replace(challenger=challenger, deployed=expected > reference)
+
+
+def means(guard: Guard) -> tuple[Array, Array]:
+    """The scores [] that are expected of the reference and of the challenger."""
+    reference, (total, weight) = _mean(guard.reference), guard.challenger
+    credit = (reference + jnp.maximum(guard.best, reference)) / 2
+    # As a distance from the reference, so that without evidence or shortfall they are equal to the bit.
+    return reference, reference + (_CREDIT * (credit - reference) + total - weight * reference) / (_CREDIT + weight)
+
+
+def _mean(evidence: Evidence) -> Array:
+    return evidence.total / jnp.maximum(evidence.weight, 1e-6)
+
+
+# --- around a finetuner -----------------------------------------------------------------------------------------------
+
+
+def guarded(inner: Finetuner, first: Callable[[PyTree, PyTree], PyTree], *, score: str) -> Finetuner:
+    """The same fine-tuning, of which only that is deployed what the guard lets through.
+
+    first(params of a prior, what the fresh agent exports) -> params of the first reference, for `inner.policy`.
+    score: what rollouts are judged by, "success" or "return". `learn` must follow each rollout once, as in
+    `train.finetune`. Metrics: guard/challenger, whether it is deployed next; guard/replaced; the expected scores.
+    """
+
+    def init(params: PyTree, key: Key, simulated: SimulatedData | None = None) -> Guarded:
+        agent = inner.init(params, key, simulated)
+        # A copy: the caller may donate the state, and the prior must survive that.
+        return Guarded(agent, jax.tree.map(jnp.copy, first(params, inner.export(agent))), start(score))
+
+    def export(state: Guarded) -> PyTree:
+        return _choose(state.guard.deployed, inner.export(state.agent), state.reference)
+
+    def act(state: Guarded, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
+        return inner.policy.act(export(state), carry, obs, key, explore=explore)
+
+    def observe(state: Guarded, rows: Transition, valid: Array, score: Array) -> Guarded:
+        return state._replace(
+            agent=inner.observe(state.agent, rows, valid, score), guard=scored(state.guard, jnp.float32(score))
+        )
+
+    def learn(
+        state: Guarded, key: Key, updates: int, simulated: SimulatedData | None = None, *, offline: bool = False
+    ) -> tuple[Guarded, Metrics]:
+        agent, metrics = inner.learn(state.agent, key, updates, simulated, offline=offline)
+        if offline:  # no rollout has been played
+            return state._replace(agent=agent), metrics
+        better = replaces(state.guard)
+        reference = _choose(better, inner.export(state.agent), state.reference)
+        guard = learned(_choose(better, replaced(state.guard), state.guard))
+        expected = dict(zip(("guard/expected_reference", "guard/expected_challenger"), means(guard), strict=True))
+        flags = {"guard/challenger": guard.deployed, "guard/replaced": better}
+        metrics |= expected | {name: x.astype(jnp.float32) for name, x in flags.items()}
+        return Guarded(agent, reference, guard), metrics
+
+    return inner._replace(
+        init=init, init_carry=inner.policy.init_carry, act=act, observe=observe, learn=learn, export=export
+    )
+
+
+def _choose(which: Array, one: PyTree, other: PyTree) -> PyTree:
+    return jax.tree.map(lambda a, b: jnp.where(which, a, b), one, other)

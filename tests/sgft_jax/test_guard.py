@@ -1,0 +1,207 @@
+"""The guard: its rule on bandits whose success is known, and what it does to fine-tuning."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import tuners
+from tuners import METHODS, T, bits, equal, prior
+
+from sgft_jax import guard
+
+RUNS, ROLLOUTS = 4000, 20
+OBS = jnp.array([0.3, -0.8])
+
+
+# --- the rule ---------------------------------------------------------------------------------------------------------
+
+
+@functools.cache
+def bandit(reference, challenger):
+    """Success of what is deployed and the share of runs that deploy the challenger, [ROLLOUTS + 1] each.
+
+    challenger: its success after 0, 1, ... rollouts. What becomes the reference keeps the success that it had then.
+    """
+
+    def rollout(carry, step):
+        state, champion, now = carry
+        key, then = step
+        success = jax.random.bernoulli(key, jnp.where(state.deployed, now, champion)).astype(jnp.float32)
+        state = guard.scored(state, success)
+        better = guard.replaces(state)
+        champion = jnp.where(better, now, champion)
+        state = jax.tree.map(lambda a, b: jnp.where(better, a, b), guard.replaced(state), state)
+        state = guard.learned(state)
+        return (state, champion, then), (jnp.where(state.deployed, then, champion), state.deployed)
+
+    def run(key):
+        start = (guard.start("success"), jnp.float32(reference), jnp.float32(challenger[0]))
+        steps = (jax.random.split(key, ROLLOUTS), jnp.array(challenger[1:], jnp.float32))
+        return jax.lax.scan(rollout, start, steps)[1]
+
+    success, share = (np.asarray(x).mean(0) for x in jax.jit(jax.vmap(run))(jax.random.split(jax.random.key(0), RUNS)))
+    return np.append(reference, success), np.append(0.0, share)
+
+
+def constant(p):
+    return (p,) * (ROLLOUTS + 1)
+
+
+@pytest.mark.parametrize(("challenger", "least"), [(constant(0.8), 0.93), (constant(0.5), 0.91), (constant(0.0), 0.9)])
+def test_on_a_solved_gap_next_to_nothing_is_lost(challenger, least):
+    """The challenger is deployed in a fifth of the runs at most."""
+    success, share = bandit(0.97, challenger)
+    assert success.min() >= least and share.max() < 0.2
+
+
+def test_a_challenger_that_collapses_is_given_up():
+    """Without the guard it ends at 0.3."""
+    success, _ = bandit(0.97, tuple(np.linspace(0.97, 0.3, ROLLOUTS + 1).tolist()))
+    assert success.min() >= 0.9
+
+
+def test_where_the_reference_fails_the_challenger_takes_over():
+    """By the third rollout, and for good: what is deployed may also be a copy of it."""
+    success, share = bandit(0.05, constant(0.9))
+    assert share[1] > 0.9 and success[3:].min() >= 0.88
+    _, share = bandit(0.05, constant(0.05))
+    assert share[1:].mean() > 0.7  # neither works, so the one that learns goes on
+
+
+def test_what_was_learned_is_held_when_it_is_lost_again():
+    """A challenger that rises from 0.1 to 0.9 and falls to 0.2: a copy of what it was stays deployed."""
+    rise, fall = np.linspace(0.1, 0.9, 11), np.full(10, 0.2)
+    success, _ = bandit(0.05, tuple(np.concatenate([rise, fall]).tolist()))
+    assert success[-1] >= 0.6
+
+
+def play(state, *scores):
+    """After these rollouts, a learning phase behind each."""
+    for score in scores:
+        state = guard.scored(state, jnp.float32(score))
+        state = guard.learned(guard.replaced(state) if guard.replaces(state) else state)
+    return state
+
+
+def test_the_rule_by_hand():
+    state = play(guard.start("success"), 1, 1)
+    assert not state.deployed and guard.means(state) == (1, 1)  # no shortfall, no credit
+    state = play(state, 0)  # 3 of 4 with the promise; credit (3/4 + 1) / 2
+    assert state.deployed and guard.means(state) == pytest.approx((0.75, 0.875))
+    lost = play(state, 0)  # (2 * 0.875 + 0.8 * 0) / 2.8
+    assert not lost.deployed and guard.means(lost) == pytest.approx((0.75, 0.625))
+    won = play(state, 1)  # (2 * 0.875 + 0.8 * 1) / 2.8
+    assert won.deployed and guard.means(won) == pytest.approx((0.75, 2.55 / 2.8))
+    # 1 + 0.8 + 0.64 and so on of its rollouts and one failure more: beyond 3/4 after the fifth success
+    four = play(won, 1, 1, 1)
+    assert four.reference == (3, 4)
+    five = guard.scored(four, jnp.float32(1))
+    assert guard.replaces(five) and not guard.replaces(four)
+    after = guard.learned(guard.replaced(five))
+    assert not after.deployed and guard.means(after) == (1, 1)  # the copy acts, until it fails
+
+
+@pytest.mark.parametrize(("successes", "brings_back"), [(6, True), (4, False)])
+def test_one_failure_after_many_successes_brings_a_good_reference_back(successes, brings_back):
+    """Of 7 and one failure, 0.875; of 5 and one failure, 0.83. The challenger never failed."""
+    state = play(guard.start("success"), *[1] * successes, 0)
+    state = state._replace(challenger=guard.Evidence(jnp.float32(4), jnp.float32(4)))
+    assert state.deployed and bool(play(state, 0).deployed) != brings_back
+
+
+def test_returns_need_no_scale():
+    """Moved and stretched, they lead to the same decisions; a challenger that falls far is given up at once."""
+    returns = np.random.default_rng(0).normal(50.0, 5.0, 30)
+
+    def deployed(scores):
+        state, found = guard.start("return"), []
+        for score in scores:
+            state = play(state, score)
+            found.append(bool(state.deployed))
+        return found
+
+    assert deployed(returns) == deployed(8.0 * returns - 1024.0) and len(set(deployed(returns))) == 2
+    state = play(guard.start("return"), 50, 52)
+    assert state.deployed  # half way from 51 to 52 is more than 51
+    assert not play(state, 20).deployed and play(state, 51).deployed
+
+
+# --- around a finetuner -----------------------------------------------------------------------------------------------
+
+
+def finish(case, state, score, seed=0):
+    """A rollout with this score, and what is learned from it."""
+    rows = tuners.episode(jax.random.key(seed))
+    state = case.fine.observe(state, rows, jnp.ones(T, bool), jnp.float32(score))
+    return case.fine.learn(state, jax.random.key(seed), 2)
+
+
+def action(case, state):
+    return case.fine.act(state, case.fine.init_carry(), OBS, jax.random.key(0), explore=jnp.bool_(False))[0]
+
+
+@pytest.mark.parametrize("name", ["sac", "sgft-mpc"])
+def test_failures_deploy_what_learned_and_a_failure_of_that_brings_the_reference_back(name):
+    case, bare = tuners.tuner(name, guard=True), tuners.tuner(name)
+    state = case.fine.init(case.params, jax.random.key(0))
+    first = case.fine.export(state)
+    state, metrics = finish(case, state, 1)
+    assert metrics["guard/challenger"] == 0 and equal(case.fine.export(state), first)
+    assert not equal(bare.fine.export(state.agent), first)  # it learned
+    state, metrics = finish(case, state, 0)
+    assert metrics["guard/challenger"] == 1 and metrics["guard/replaced"] == 0
+    own = bare.fine.export(state.agent)
+    assert equal(case.fine.export(state), own) and not equal(own, first)
+    np.testing.assert_allclose(action(case, state), action(bare, state.agent), rtol=1e-4, atol=1e-6)
+    back, metrics = finish(case, state, 0)
+    assert metrics["guard/challenger"] == 0 and equal(case.fine.export(back), first)
+    assert {"guard/expected_reference", "guard/expected_challenger"} <= set(metrics)
+
+
+def test_a_challenger_that_proves_itself_becomes_the_reference_as_it_played():
+    case, bare = tuners.tuner("sac", guard=True), tuners.tuner("sac")
+    state = case.fine.init(case.params, jax.random.key(0))
+    for seed in range(2):  # two failures, the second of the challenger
+        state, _ = finish(case, state, 0, seed)
+    state = state._replace(guard=state.guard._replace(deployed=jnp.bool_(True)))
+    while True:
+        played = bare.fine.export(state.agent)
+        state, metrics = finish(case, state, 1, 3)
+        if metrics["guard/replaced"]:
+            break
+    assert equal(state.reference, played) and not equal(bare.fine.export(state.agent), played)
+
+
+@pytest.mark.parametrize(
+    "name", tuners.slow_but({"rlpd", "iql", "sgft-tdmpc2-code"}, [n for n in METHODS if n != "sac"])
+)
+def test_the_first_reference_is_the_simulators_policy(name):
+    """Also where the agent starts from nothing."""
+    case, kind = tuners.tuner(name, guard=True), METHODS[name].prior
+    state = case.fine.init(case.params, jax.random.key(1))
+    played = case.plain.initial_policy or tuners.tuner(name).plain.policy
+    params = prior(kind).params
+    expected, _ = jax.jit(played.act)(params, played.init_carry(), OBS, jax.random.key(0), explore=jnp.bool_(False))
+    np.testing.assert_allclose(action(case, state), expected, rtol=1e-4, atol=1e-6)
+
+
+def test_without_a_prior_it_is_the_first_policy():
+    plain = METHODS["sac"].build(tuners.configure("sac", guard=True), None, tuners.TASK)
+    state = jax.jit(lambda key: plain.init(None, key))(jax.random.key(0))
+    assert equal(state.reference.actor, state.agent.learner.actor.params)
+
+
+def test_learning_offline_decides_nothing():
+    case = tuners.tuner("iql", guard=True)
+    state = case.fine.init(case.params, jax.random.key(0))
+    after, metrics = case.fine.learn(state, jax.random.key(1), 2, offline=True)
+    assert bits(after.guard) == bits(state.guard) and not any(name.startswith("guard/") for name in metrics)
+
+
+def test_a_fresh_state_has_buffers_of_its_own():
+    case = tuners.tuner("sac", guard=True)
+    state = case.plain.init(case.params, jax.random.key(0), case.data)
+    buffers = [x.unsafe_buffer_pointer() for x in jax.tree.leaves((state, case.params)) if x.size]
+    assert len(buffers) == len(set(buffers))
