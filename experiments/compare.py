@@ -22,6 +22,8 @@ class CompareArgs(GridArgs):
     tuned: bool = False
     """Start from the options that `experiments.tune` chose for each task and method; the runs are a variant of their
     own, `tuned`, beside those with the defaults."""
+    reference: str | None = None
+    """Compare the others with METHOD or METHOD:VARIANT; default: with the best of each table."""
 
 
 def main(args: CompareArgs) -> None:
@@ -30,7 +32,7 @@ def main(args: CompareArgs) -> None:
     if args.dry:
         return
     if any(cell.done for cell in cells(args)):
-        print(figures(FiguresArgs(out=args.out)).read_text())
+        print(figures(FiguresArgs(out=args.out, reference=args.reference)).read_text())
     if failed:
         raise UserError(f"{len(failed)} of the cells did not run: {'; '.join(failed)}")
 

@@ -22,6 +22,8 @@ class FiguresArgs:
     """Only runs from these sets of priors, as the tables name them; default: all."""
     variants: bool = True
     """Also show variants (runs with other options), in panels beside their methods; --no-variants leaves them out."""
+    reference: str | None = None
+    """Compare the others with METHOD or METHOD:VARIANT; default: with the best of each table."""
     out: Path = Path("runs")
     """Parent of all run folders; the figures and tables.md go to <out>/figures."""
     data: Path | None = None
@@ -53,7 +55,7 @@ def figures(args: FiguresArgs) -> Path:
         raise UserError(f"{args.out / 'finetune'}: holds no evaluated run to draw; make one with: {command}")
     task = (extend.name_of(args.task),) if args.task else ()
     chosen = select(found, variants=args.variants, task=task, gap=args.gaps, method=args.methods, priors=args.priors)
-    return write_results(chosen, args.out / "figures")
+    return write_results(chosen, args.out / "figures", reference=args.reference)
 
 
 if __name__ == "__main__":

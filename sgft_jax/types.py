@@ -291,6 +291,7 @@ class Method(NamedTuple):
     config: a frozen dataclass whose fields carry their help; its defaults are the method's own settings.
     build(config, prior, task) -> Finetuner. Every option left open (None) is resolved here.
     prior: the algorithm of the priors that it starts from. needs_prior: False where it can start without one.
+    zero_shot: whether it begins as its prior acts; False where it plans otherwise or begins from nothing.
     """
 
     name: str
@@ -301,3 +302,4 @@ class Method(NamedTuple):
     build: Callable[[Any, Prior | None, Task], Finetuner]
     prior: Algorithm = "sac"
     needs_prior: bool = True
+    zero_shot: bool = True

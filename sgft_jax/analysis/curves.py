@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean
+from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean, paired_improvement
 from sgft_jax.io.jsonfile import read_json
-from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
+from sgft_jax.io.log import EVAL, METRICS, SUMMARY, read_jsonl
 from sgft_jax.io.runs import CONFIG, PROVENANCE
 from sgft_jax.methods import NAMES, get_method
 from sgft_jax.types import UserError
@@ -24,7 +24,7 @@ from sgft_jax.types import UserError
 LEVEL = 0.9  # success that counts as solved
 SCORES = ("success", "return")
 IDENTITY = ("task", "gap", "method", "variant", "priors")
-COLUMNS = (*IDENTITY, "prior", "seed", "rollouts", "transitions", "minutes", *SCORES)
+COLUMNS = (*IDENTITY, "prior", "seed", "rollouts", "transitions", "minutes", *SCORES, "training")
 # Of a run's options those that are in other columns, or say nothing about its outcome; paths of a machine above all.
 _LEFT_OUT = (
     "out", "prior", "resume", "overwrite", "video", "devices", "checkpoint_every", "task", "method", "variant", "real",
@@ -41,6 +41,8 @@ class Curve:
     index into the set, -1 where unknown. rollouts, transitions: [evaluations] real ones used so far. minutes:
     [evaluations] of robot time without resets. scores: by name, [members, evaluations], the task's own, never reshaped.
     score: the one that summaries are of. facts: commit, hardware and options of the run, for tables of runs.
+    training: [members, evaluations] mean score of the training rollouts since the evaluation before, nan where there
+    were none; None where it is not known.
     """
 
     task: str
@@ -56,6 +58,7 @@ class Curve:
     scores: Mapping[str, np.ndarray]
     score: str = "success"
     facts: Mapping[str, Any] = field(default_factory=dict)
+    training: np.ndarray | None = None
 
     @property
     def values(self) -> np.ndarray:
@@ -73,8 +76,8 @@ class Curve:
         return get_method(self.method).family if self.method in NAMES else "own"
 
     def of(self, score: str) -> "Curve":
-        """The same curve for another score."""
-        return replace(self, score=score)
+        """The same curve for another score; training rollouts are known by the run's own alone."""
+        return replace(self, score=score, training=self.training if score == self.score else None)
 
 
 class Found(NamedTuple):
@@ -111,10 +114,49 @@ def area(curve: Curve, grid: Sequence[int] | np.ndarray) -> np.ndarray | None:
     return np.trapezoid(np.stack(points, 1), np.asarray(grid, np.float64)) / (grid[-1] - grid[0])
 
 
-def deepest_fall(curve: Curve) -> float:
-    """How far the mean over members ever fell below zero-shot; never negative."""
+def deepest_fall(curve: Curve, below: np.ndarray | None = None) -> float:
+    """How far the mean over members ever was below the mean of these scores [members]; never negative.
+
+    below: for example `zero_shot`; default: the method's own start.
+    """
     average = curve.values.mean(0)
-    return float(average[0] - average.min())
+    return max(float((average[0] if below is None else below.mean()) - average.min()), 0.0)
+
+
+def zero_shot(curve: Curve, others: Iterable[Curve]) -> np.ndarray | None:
+    """[members] scores of the simulator's policy before any fine-tuning, with the same seeds and priors.
+
+    others: curves of the same task, gap and set of priors, to look it up where the method itself begins otherwise (see
+    `Method.zero_shot`). None if it was not evaluated there.
+    """
+    for other in sorted(others, key=lambda other: other is not curve):
+        if other.method in NAMES and get_method(other.method).zero_shot and other.rollouts[0] == 0:
+            found = dict(zip(other.seeds.tolist(), other.values[:, 0].tolist(), strict=True))
+            if set(curve.seeds.tolist()) <= found.keys():
+                return np.array([found[seed] for seed in curve.seeds.tolist()])
+    return None
+
+
+def training_score(curve: Curve) -> np.ndarray | None:
+    """[members] mean score of all training rollouts: what the robot lived through. None where it is not known."""
+    if curve.training is None:
+        return None
+    weights = np.diff(curve.rollouts, prepend=0) * np.isfinite(curve.training)
+    played = weights.sum(1)
+    return np.nansum(curve.training * weights, axis=1) / played if played.all() else None
+
+
+def improvement(curve: Curve, over: Curve, grid: Sequence[int] | np.ndarray) -> Interval | None:
+    """Probability that the area of one method is larger than that of another from the same prior, with its interval.
+
+    The prior is the random factor; where priors are unknown, the seed. None where there is nothing to compare.
+    """
+    own, other = area(curve, grid), area(over, grid)
+    if own is None or other is None:
+        return None
+    known = bool((curve.prior >= 0).all() and (over.prior >= 0).all())
+    labels = (curve.prior, over.prior) if known else (curve.seeds, over.seeds)
+    return paired_improvement(own, other, *labels) if np.intersect1d(*labels).size else None
 
 
 def transitions_until_held(curve: Curve, level: float = LEVEL) -> int | None:
@@ -230,7 +272,22 @@ def read_curve(folder: Path) -> Curve:
         scores=scores,
         score=summary.get("score", next(iter(scores))),
         facts=_facts(summary, config, start),
+        training=_training(folder / METRICS, column("rollouts")),
     )
+
+
+def _training(path: Path, rollouts: np.ndarray) -> np.ndarray | None:
+    """`Curve.training` of a run that was evaluated after so many rollouts, from its metrics."""
+    records = [record for record in (read_jsonl(path) if path.exists() else []) if "real/score" in record]
+    if not records:
+        return None
+    ends = np.array([record["rollouts"] for record in records])  # a record is the mean of all rollouts since the last
+    counts, scores = np.diff(ends, prepend=0), np.array([record["real/score"] for record in records]).T
+    means = np.full((len(scores), len(rollouts)), np.nan)
+    for i, (before, now) in enumerate(zip([0, *rollouts[:-1]], rollouts, strict=True)):
+        if (since := (ends > before) & (ends <= now)).any():
+            means[:, i] = np.average(scores[:, since], axis=1, weights=counts[since])
+    return means
 
 
 def make_curve(
@@ -331,7 +388,10 @@ def rows(curves: Iterable[Curve]) -> Iterator[dict[str, Any]]:
                 zip(curve.rollouts.tolist(), curve.transitions.tolist(), curve.minutes.tolist(), strict=True)
             ):
                 axes = {"prior": prior, "seed": seed, "rollouts": n, "transitions": used, "minutes": minutes}
-                yield {**identity, **axes, **{name: float(values[i, j]) for name, values in curve.scores.items()}}
+                found = {name: float(values[i, j]) for name, values in curve.scores.items()}
+                if curve.training is not None and np.isfinite(curve.training[i, j]):
+                    found["training"] = float(curve.training[i, j])
+                yield {**identity, **axes, **found}
 
 
 def from_rows(table: Iterable[Mapping[str, Any]]) -> list[Curve]:
@@ -351,6 +411,8 @@ def _curve(identity: tuple[str, ...], members: Mapping[int, list[Mapping[str, An
         return np.array([[float(row[name]) for row in each] for each in members.values()])
 
     scores = {name: column(name) for name in SCORES if first[0].get(name) not in (None, "")}
+    missing = lambda row: row.get("training") in (None, "")  # noqa: E731 - at the first evaluation, or everywhere
+    training = np.array([[np.nan if missing(r) else float(r["training"]) for r in each] for each in members.values()])
     return Curve(
         *identity,
         seeds=np.array(list(members)),
@@ -360,6 +422,7 @@ def _curve(identity: tuple[str, ...], members: Mapping[int, list[Mapping[str, An
         minutes=column("minutes")[0],
         scores=scores,
         score=next(iter(scores)),
+        training=training if np.isfinite(training).any() else None,
     )
 
 

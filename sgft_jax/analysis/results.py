@@ -24,14 +24,19 @@ def select(found: Found, *, variants: bool = True, **wanted: Sequence[str]) -> F
     return Found(curves, found.notes)
 
 
-def write_results(found: Found, target: Path) -> Path:
-    """A figure and tables for each task and gap, and of all tasks for each gap; returns the path of tables.md."""
+def write_results(found: Found, target: Path, *, reference: str | None = None) -> Path:
+    """A figure and tables for each task and gap, and of all tasks for each gap; returns the path of tables.md.
+
+    reference: METHOD or METHOD:VARIANT that the others are compared with, see `tables.summary`; UserError without it.
+    """
+    if reference and reference not in (names := {tables.spec(curve) for curve in found.curves}):
+        raise UserError(unknown("--reference", reference, names))
     sections = ["# Fine-tuning results", tables.LEGEND]
     for gap in dict.fromkeys(curve.gap for curve in found.curves):
         sections += _overview(gap, [curve for curve in found.curves if curve.gap == gap], target)
     for task, gap in dict.fromkeys((curve.task, curve.gap) for curve in found.curves):
         own = [curve for curve in found.curves if (curve.task, curve.gap) == (task, gap)]
-        sections += _section(f"{task} on the {gap} real system", own, target / f"{task}-{gap}.png")
+        sections += _section(f"{task} on the {gap} real system", own, target / f"{task}-{gap}.png", reference)
     if found.notes:
         sections.append("\n".join(["## Left out or unfinished", "", *(f"- {note}" for note in found.notes)]))
     path = target / "tables.md"
@@ -52,8 +57,8 @@ def _overview(gap: str, curves: Sequence[Curve], target: Path) -> list[str]:
     return [f"## {title}", f"![{title}]({path.name})", tables.areas_by_task(tasks)]
 
 
-def _section(title: str, curves: Sequence[Curve], path: Path) -> list[str]:
-    """One task and gap: a panel for each set of priors and for each method with variants, tables for each set."""
+def _section(title: str, curves: Sequence[Curve], path: Path, reference: str | None) -> list[str]:
+    """One task and gap: a panel for each set of priors and for each method with variants, a table for each set."""
     panels: dict[str, list[Curve]] = {}
     texts = []
     for priors, own in by_priors(curves).items():
@@ -61,6 +66,6 @@ def _section(title: str, curves: Sequence[Curve], path: Path) -> list[str]:
         panels[words] = [curve for curve in own if not curve.variant]
         for method in dict.fromkeys(curve.method for curve in own if curve.variant):
             panels[f"{method} and its variants, {words}"] = [curve for curve in own if curve.method == method]
-        texts += [f"### {title}, {words}", tables.summary(own), tables.differences(own)]
+        texts += [f"### {title}, {words}", tables.summary(own, reference)]
     figures.learning_curves(path, panels, title=title)
-    return [f"## {title}", f"![{title}]({path.name})", *filter(None, texts)]
+    return [f"## {title}", f"![{title}]({path.name})", *texts]

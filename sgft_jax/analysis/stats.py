@@ -49,17 +49,20 @@ def bootstrap_interval(
     scores: [members] or [members, ...points], finite. priors: [members], the prior that each member began from; the
     prior is then the random factor: each resample draws priors, and then members of each drawn prior (hierarchical
     bootstrap). strata: [members], such as the task of each; each resample draws within each of them (stratified
-    bootstrap, that of rliable). The bounds are nan for fewer than `ENOUGH` members, or fewer than `ENOUGH` priors: so
-    few cannot show how much others would differ. Raises ValueError if there is no member or a score is not finite.
+    bootstrap, that of rliable), priors first if there are any. The bounds are nan for fewer than `ENOUGH` members, or
+    fewer than `ENOUGH` priors in a stratum: so few cannot show how much others would differ. Raises ValueError if there
+    is no member or a score is not finite.
     """
     scores = np.asarray(scores, np.float64)
     if scores.shape[0] == 0 or not np.isfinite(scores).all():
         raise ValueError("scores need at least one seed and finite values")
     estimate = statistic(scores)
-    units = scores.shape[0] if priors is None else len(np.unique(priors))
+    groups = _groups(np.zeros(scores.shape[0]) if strata is None else strata)
+    units = scores.shape[0] if priors is None else min(len(np.unique(np.asarray(priors)[group])) for group in groups)
     if units < ENOUGH:
         return Interval(estimate, np.full_like(estimate, np.nan), np.full_like(estimate, np.nan))
-    drawn = _draws(np.random.default_rng(seed), scores.shape[0], resamples, priors=priors, strata=strata)
+    rng = np.random.default_rng(seed)
+    drawn = np.concatenate([_draws(rng, group, resamples, priors) for group in groups], axis=1)
     values = np.concatenate(
         [statistic(scores[some], axis=1) for some in np.array_split(drawn, max(resamples // 200, 1))]
     )
@@ -91,6 +94,20 @@ def probability_of_improvement(above: ArrayLike, below: ArrayLike) -> float:
     return float(found.statistic) / (len(above) * len(below))
 
 
+def paired_improvement(
+    above: ArrayLike, below: ArrayLike, above_priors: ArrayLike, below_priors: ArrayLike
+) -> Interval:
+    """The same from one prior for both methods, as mean over the priors that they share, with its interval over these.
+
+    above, below: [members] of either. above_priors, below_priors: the prior of each. Raises ValueError where none is
+    shared.
+    """
+    above, below, above_priors, below_priors = map(np.asarray, (above, below, above_priors, below_priors))
+    shared = np.intersect1d(above_priors, below_priors)
+    each = [probability_of_improvement(above[above_priors == p], below[below_priors == p]) for p in shared]
+    return bootstrap_interval(each, statistic=mean)
+
+
 def success_interval(
     successes: int, trials: int, *, level: float = 0.95, method: Literal["wilson", "exact"] = "wilson"
 ) -> Interval:
@@ -99,21 +116,16 @@ def success_interval(
     return Interval(np.asarray(successes / trials), np.asarray(bounds.low), np.asarray(bounds.high))
 
 
-def _draws(
-    rng: np.random.Generator, members: int, resamples: int, *, priors: ArrayLike | None, strata: ArrayLike | None
-) -> np.ndarray:
-    """[resamples, drawn] members of each resample."""
-    if priors is not None and strata is not None:
-        raise ValueError("a bootstrap draws by priors or by strata, not by both")
-    if priors is not None:
-        groups = _groups(priors)
-        size = -(-members // len(groups))  # of each drawn prior, so that a resample is about as large as the data
-        table = np.stack([rng.choice(group, (resamples, len(groups), size)) for group in groups])
-        drawn = rng.integers(len(groups), size=(resamples, len(groups)))
-        rows, places = np.arange(resamples)[:, None], np.arange(len(groups))
-        return table[drawn, rows, places].reshape(resamples, -1)
-    groups = _groups(np.zeros(members) if strata is None else strata)
-    return np.concatenate([rng.choice(group, (resamples, len(group))) for group in groups], axis=1)
+def _draws(rng: np.random.Generator, members: np.ndarray, resamples: int, priors: ArrayLike | None) -> np.ndarray:
+    """[resamples, drawn] of these members in each resample."""
+    if priors is None:
+        return rng.choice(members, (resamples, len(members)))
+    groups = [members[group] for group in _groups(np.asarray(priors)[members])]
+    size = -(-len(members) // len(groups))  # of each drawn prior, so that a resample is about as large as the data
+    table = np.stack([rng.choice(group, (resamples, len(groups), size)) for group in groups])
+    drawn = rng.integers(len(groups), size=(resamples, len(groups)))
+    rows, places = np.arange(resamples)[:, None], np.arange(len(groups))
+    return table[drawn, rows, places].reshape(resamples, -1)
 
 
 def _groups(labels: ArrayLike) -> list[np.ndarray]:

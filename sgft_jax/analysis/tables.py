@@ -13,18 +13,24 @@ from sgft_jax.analysis.curves import (
     by_prior,
     common_grid,
     deepest_fall,
+    improvement,
     spread,
+    training_score,
     transitions_until_held,
+    zero_shot,
 )
-from sgft_jax.analysis.stats import Interval, bootstrap_interval, difference_interval, probability_of_improvement
+from sgft_jax.analysis.stats import Interval, bootstrap_interval, difference_interval
 
 NONE = "-"
 LEGEND = (
     "Scores on the real system, success in per cent: interquartile mean over seeds with its 95 % bootstrap interval, "
     "which draws priors and then seeds where there are three priors or more, seeds otherwise; none where it would say "
-    "nothing. Area: mean score over the rollouts given, from evaluations that all methods of the table have. End: "
-    "the last evaluation. Deepest fall: how far the mean ever was below zero-shot. "
+    "nothing. Start: before the first real rollout. Area: mean score over the rollouts given, from evaluations that "
+    "all methods of the table have. End: the last evaluation. Deepest fall: how far the mean ever was below the "
+    "simulator's policy, and below the method's own start. Training: mean over all training rollouts, exploring. "
     f"{100 * LEVEL:.0f} % held: real transitions at the first of two evaluations in a row at which the mean is there. "
+    "The last columns compare areas with those of one method, from the same priors: mean paired difference, and "
+    "probability of being better with the prior as the random factor. "
     "Only methods from the same priors can be compared."
 )
 
@@ -34,29 +40,41 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(cells) + " |" for cells in (head, ["---"] * len(head), *rows))
 
 
-def summary(curves: Sequence[Curve]) -> str:
-    """A row for each curve of one task, gap and set of priors; the methods' defaults decide the grid of the area."""
+def summary(curves: Sequence[Curve], reference: str | None = None) -> str:
+    """A row for each curve of one task, gap and set of priors; the methods' defaults decide the grid of the area.
+
+    reference: the `spec` of the curve that the others are compared with; default: the one with the largest area.
+    """
     grid = shared_grid(curves)
     until = f"area, {grid[0]} to {grid[-1]} rollouts" if len(grid) > 1 else "area"
-    head = ["method", "seeds", "zero-shot", until, "end (rollouts)", "deepest fall", f"{100 * LEVEL:.0f} % held after"]
-    return markdown(head, [_row(curve, grid) for curve in curves])
+    head = [
+        "method", "seeds", "start", until, "end (rollouts)", "deepest fall: zero-shot / own start", "training",
+        f"{100 * LEVEL:.0f} % held after",
+    ]  # fmt: skip
+    other = _reference(curves, grid, reference)
+    rows = [_row(curve, curves, grid) for curve in curves]
+    if other is None or len(curves) < 2:
+        return markdown(head, rows)
+    head += [f"area minus {spec(other)}", f"P(better than {spec(other)})"]
+    return markdown(head, [row + _against(curve, other, grid) for row, curve in zip(rows, curves, strict=True)])
 
 
-def differences(curves: Sequence[Curve]) -> str:
-    """How far each area is from that of the best curve, seed by seed from the same priors; "" where there is one."""
-    grid = shared_grid(curves)
-    areas = {curve.name: (curve, found) for curve in curves if (found := area(curve, grid)) is not None}
-    if len(areas) < 2:
-        return ""
-    best = max(areas, key=lambda name: float(areas[name][1].mean()))
-    rows = [[name, *_against(curve, own, *areas[best])] for name, (curve, own) in areas.items() if name != best]
-    return markdown([f"area minus that of {best}", "mean difference", "probability of being better"], rows)
+def spec(curve: Curve) -> str:
+    """The method with its variant, as commands take it: METHOD or METHOD:VARIANT."""
+    return ":".join(filter(None, [curve.method, curve.variant]))
+
+
+def _reference(curves: Sequence[Curve], grid: np.ndarray, name: str | None) -> Curve | None:
+    """The curve of that name; without a name the best one. None where it is not, or has no area."""
+    areas = [(float(own.mean()), curve) for curve in curves if (own := area(curve, grid)) is not None]
+    chosen = [(mean, curve) for mean, curve in areas if name in (None, spec(curve))]
+    return max(chosen, key=lambda pair: pair[0])[1] if chosen else None
 
 
 def areas_by_task(tasks: Mapping[str, Sequence[Curve]]) -> str:
     """Rows of methods, columns of tasks: areas, each column on its own grid; the last column over all tasks.
 
-    The last one is the interquartile mean over tasks and seeds, with seeds drawn within each task (stratified); it
+    The last one is the interquartile mean over tasks and seeds, with priors and then seeds drawn within each task; it
     stands only for methods that were run on all of them.
     """
     grids = {task: shared_grid(curves) for task, curves in tasks.items()}
@@ -94,9 +112,9 @@ def shared_grid(curves: Sequence[Curve]) -> np.ndarray:
     return common_grid([curve for curve in plain if curve.rollouts[-1] >= usual / 3])
 
 
-def number(band: Interval, score: str = "success") -> str:
+def number(band: Interval, score: str = "success", *, digits: int = 1) -> str:
     """A score with its interval, "92 [88, 95]", and alone where the interval says nothing; success is in per cent."""
-    scale, digits = (100, 0) if score == "success" else (1, 1)
+    scale, digits = (100, 0) if score == "success" else (1, digits)
     rounded = [round(scale * float(x), digits) + 0.0 for x in band]  # + 0.0: no minus zero
     estimate, low, high = (f"{x:.{digits}f}" for x in rounded)
     return estimate if math.isnan(band.low) or low == high else f"{estimate} [{low}, {high}]"
@@ -124,26 +142,31 @@ def outcome(curves: Sequence[Curve]) -> str:
     return markdown(head, [[curve.name, *(middle(curve, at(curve, n)) for n in points)] for curve in curves])
 
 
-def _row(curve: Curve, grid: np.ndarray) -> list[str]:
+def _row(curve: Curve, curves: Sequence[Curve], grid: np.ndarray) -> list[str]:
     held = transitions_until_held(curve) if curve.score == "success" else None
+    before = zero_shot(curve, curves)
+    falls = [NONE if before is None else plain(deepest_fall(curve, before), curve.score)]
+    falls.append(plain(deepest_fall(curve), curve.score))
     return [
         curve.name,
         str(len(curve.seeds)),
         middle(curve, curve.values[:, 0]),
         middle(curve, area(curve, grid)),
         f"{middle(curve, curve.values[:, -1])} ({curve.rollouts[-1]})",
-        plain(deepest_fall(curve), curve.score),
+        " / ".join(falls),
+        middle(curve, training_score(curve)),
         f"> {curve.transitions[-1]:,}" if held is None else f"{held:,}",
     ]
 
 
-def _against(curve: Curve, own: np.ndarray, other: Curve, best: np.ndarray) -> list[str]:
-    shared, mine, theirs = np.intersect1d(curve.seeds, other.seeds, return_indices=True)
-    probability = f"{probability_of_improvement(own, best):.2f}"
-    if not len(shared):
-        return [NONE, probability]
-    priors = curve.prior[mine] if by_prior(curve) else None
-    return [number(difference_interval(own[mine], best[theirs], priors=priors), curve.score), probability]
+def _against(curve: Curve, other: Curve, grid: np.ndarray) -> list[str]:
+    own, theirs, better = area(curve, grid), area(other, grid), improvement(curve, other, grid)
+    if curve is other or own is None or theirs is None or better is None:
+        return [NONE, NONE]
+    shared, i, j = np.intersect1d(curve.seeds, other.seeds, return_indices=True)
+    priors = curve.prior[i] if by_prior(curve) else None
+    difference = number(difference_interval(own[i], theirs[j], priors=priors), curve.score) if len(shared) else NONE
+    return [difference, number(better, "probability", digits=2)]
 
 
 def _overall(cells: Mapping[str, tuple[Curve, np.ndarray]], tasks: int) -> str:
@@ -151,4 +174,6 @@ def _overall(cells: Mapping[str, tuple[Curve, np.ndarray]], tasks: int) -> str:
         return NONE
     scores = np.concatenate([own for _, own in cells.values()])
     strata = np.repeat(np.arange(len(cells)), [len(own) for _, own in cells.values()])
-    return number(bootstrap_interval(scores, strata=strata), next(iter(cells.values()))[0].score)
+    curves = [curve for curve, _ in cells.values()]
+    priors = np.concatenate([curve.prior for curve in curves]) if all(map(by_prior, curves)) else None
+    return number(bootstrap_interval(scores, priors=priors, strata=strata), curves[0].score)

@@ -109,5 +109,5 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 METHOD = Method(
     "iql", "offline", "in-sample learning: offline from simulated data, then online", "Kostrikov 2022", Config, build,
-    needs_prior=False,
+    needs_prior=False, zero_shot=False,
 )  # fmt: skip

@@ -69,5 +69,5 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 METHOD = Method(
     "rlpd", "model-free", "from nothing; ten normalised critics, half of each batch simulated", "Ball 2023", Config,
-    build, needs_prior=False,
+    build, needs_prior=False, zero_shot=False,
 )  # fmt: skip

@@ -80,4 +80,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     return assemble(parts, config, task, card={"plan": plan})
 
 
-METHOD = Method("sgft-mpc", "sgft", "plans of H steps by learning models, ended by V_sim", "SGFT 2025", Config, build)
+METHOD = Method(
+    "sgft-mpc", "sgft", "plans of H steps by learning models, ended by V_sim", "SGFT 2025", Config, build,
+    zero_shot=False,
+)  # fmt: skip

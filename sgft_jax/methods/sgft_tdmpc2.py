@@ -21,5 +21,5 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 METHOD = Method(
     "sgft-tdmpc2", "sgft", "TD-MPC2 whose plans of H steps end in a frozen V_sim", "SGFT 2025", Config, build,
-    prior="tdmpc2",
+    prior="tdmpc2", zero_shot=False,
 )  # fmt: skip

@@ -21,5 +21,5 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 METHOD = Method(
     "sgft-tdmpc2-code", "sgft", "TD-MPC2 from nothing with shaped rewards", "SGFT 2025, released code", Config, build,
-    prior="tdmpc2",
+    prior="tdmpc2", zero_shot=False,
 )  # fmt: skip

@@ -58,7 +58,7 @@ def test_a_figure_and_tables_for_each_task_and_gap(tmp_path, capsys, drawn):
     }
     titles = ["## All tasks", "## other on the default", "### toy on the default real system, priors fast\n"]
     assert sorted(titles, key=text.index) == titles
-    assert "| sgft-sac | 2 | 25 | 60 | 95 (20) | 0 | > 400 |" in text
+    assert "| sgft-sac | 2 | 25 | 60 | 95 (20) | 0 / 0 | - | > 400 |" in text
     assert f"- {tmp_path / 'finetune/toy/hard/sgft-sac/seeds-0-1'}: unfinished, 20 of 100 rollouts" in text
 
 

@@ -12,6 +12,7 @@ from sgft_jax.finetuner import Parts, assemble
 from sgft_jax.learners import sac, tdmpc2_model
 from sgft_jax.methods.options import LoopOptions
 from sgft_jax.models import dynamics, networks, normalizer
+from sgft_jax.policies import make_policy
 from sgft_jax.transforms import compose, stateless
 from sgft_jax.types import Learner, Policy, Transform, UserError
 
@@ -119,6 +120,15 @@ def test_the_first_action_is_the_simulators(name, horizon):
     moments = networks.make_actor(2, 2, NET).apply(case.params.actor, z)
     got = act(case, case.fine.init(case.params, jax.random.key(1)))
     np.testing.assert_allclose(got, jnp.tanh(moments[0]), rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", tuners.slow_but({"sac", "sgft-mpc", "rlpd", "iql"}, METHODS))
+def test_a_method_says_whether_it_begins_as_the_simulators_policy(name):
+    case = tuner(name)
+    acts = make_policy(prior(METHODS[name].prior).card, TASK)
+    expected, _ = acts.act(case.params, acts.init_carry(), OBS, jax.random.key(0), explore=False)
+    got = act(case, case.fine.init(case.params, jax.random.key(1)))
+    assert np.allclose(got, expected, rtol=1e-3, atol=1e-4) == METHODS[name].zero_shot
 
 
 @pytest.mark.parametrize("name", ["rlpd", "iql"])

@@ -1,6 +1,7 @@
 """Learning curves by hand: metrics, what is comparable, run folders."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -17,11 +18,14 @@ from sgft_jax.analysis.curves import (
     describe,
     from_main_priors,
     from_rows,
+    improvement,
     read_curve,
     read_runs,
     rows,
     spread,
+    training_score,
     transitions_until_held,
+    zero_shot,
 )
 from sgft_jax.types import UserError
 
@@ -57,6 +61,38 @@ def test_a_level_is_held_at_two_evaluations_in_a_row():
 def test_deepest_fall_is_of_the_mean():
     assert deepest_fall(curve([[0.6, 0.2, 0.9], [0.4, 0.6, 0.9]], (0, 1, 2))) == pytest.approx(0.1)  # 0.5 to 0.4
     assert deepest_fall(curve([0.5, 0.6, 0.9], (0, 1, 2))) == 0.0
+    assert deepest_fall(curve([0.5, 0.6, 0.9], (0, 1, 2)), np.array([0.7, 0.9])) == pytest.approx(0.3)
+    assert deepest_fall(curve([0.5, 0.6, 0.9], (0, 1, 2)), np.array([0.4])) == 0.0
+
+
+def test_zero_shot_is_where_the_simulators_policy_was_evaluated():
+    """A method that begins with plans, or from nothing, is held against the same seeds of one that does not."""
+    plans, nothing = curve([[0.9, 1], [0.8, 1]], (0, 1), method="sgft-mpc"), curve([[0, 1]], (0, 1), method="rlpd")
+    policy, late = curve([[0.2, 0], [0.4, 0]], (0, 1), method="sac"), curve([[0.7, 0]] * 2, (1, 2), method="mbpo")
+    others = [plans, nothing, late, policy]
+    assert zero_shot(policy, others).tolist() == zero_shot(plans, others).tolist() == [0.2, 0.4]
+    assert zero_shot(nothing, others).tolist() == [0.2]  # it has the first seed alone
+    assert zero_shot(plans, [plans, nothing, late]) is None
+    more = curve([[0, 0]] * 3, (0, 1), method="iql")
+    assert zero_shot(more, [more, policy]) is None
+
+
+def test_training_rollouts_count_once_each():
+    """Evaluated after 1, 2 and 4 rollouts, of which the third and the fourth scored 0.5 on average."""
+    own = dataclasses.replace(curve([0, 0, 0, 0]), training=np.array([[np.nan, 1.0, 0.0, 0.5]]))
+    assert training_score(own) == pytest.approx([0.5]) and training_score(curve([0])) is None
+    assert own.of("success").training is own.training and own.of("return").training is None
+
+
+@pytest.mark.parametrize("priors", [[0, 0, 1, 1], None])
+def test_improvement_of_areas_is_by_prior_or_else_by_seed(priors):
+    """By seed 1, 0, 1, 1; from the first prior 0.5 against 0 and 0.3: 1; 0.1 against 0.2: 0; that is 2 of 4."""
+    high, low = (curve(np.repeat(x, 2, 1), (0, 4), prior=priors) for x in (
+        np.array([[0.5], [0.1], [1], [1]]), np.array([[0.0], [0.2], [0], [0]])))  # fmt: skip
+    found = improvement(high, low, [0, 4])
+    assert found.estimate == (pytest.approx((0.75 + 1) / 2) if priors else 0.75)
+    assert improvement(high, low, [0, 8]) is None
+    assert improvement(high, dataclasses.replace(low, prior=low.prior - 5, seeds=low.seeds + 9), [0, 4]) is None
 
 
 def test_spread_is_over_priors_where_there_are_three():
@@ -108,13 +144,20 @@ def test_only_methods_from_the_same_priors_are_comparable():
 def test_a_run_folder(tmp_path):
     digests = ("aaaaaaaaaaaa", "bbbbbbbbbbbb")
     success = [[0.2, 0.4, 0.3], [0.8, 1.0, 0.5]]
-    save(tmp_path, "my_own_v2", success, rollouts=[0, 20], seeds="seeds-3-5", priors=digests, variant="v2", wanted=100)
+    folder = save(
+        tmp_path, "my_own_v2", success, rollouts=[0, 20], seeds="seeds-3-5", priors=digests, variant="v2", wanted=100
+    )
+    scores = {0: None, 2: [0.1, 0.2, 0.3], **dict.fromkeys(range(3, 21), [0.9] * 3), 21: [0.0] * 3}
+    lines = [{"rollouts": n} | ({"real/score": each} if each else {}) for n, each in scores.items()]
+    (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     (found,), notes = read_runs(tmp_path)
     assert (found.task, found.gap, found.method, found.variant) == ("toy", "default", "my_own", "v2")
     assert found.priors == "fast-aaaaaa" and found.seeds.tolist() == [3, 4, 5] and found.prior.tolist() == [1, 0, 1]
     np.testing.assert_array_equal(found.values, np.transpose(success))
     np.testing.assert_array_equal(found.of("return").values, 10 * np.transpose(success))
     assert found.transitions.tolist() == [0, 400] and found.minutes[1] == pytest.approx(40 / 60)
+    # initial rollouts 1 and 2 scored 0.1, 0.2, 0.3, those from 3 to 20 on average 0.9 for all
+    np.testing.assert_allclose(found.training, [[np.nan, 0.82], [np.nan, 0.83], [np.nan, 0.84]])
     assert found.facts["commit"] == "0123456789ab" and found.facts["options.network.hidden"] == "8 8"
     assert notes == [f"{tmp_path / 'finetune/toy/default/my_own_v2/seeds-3-5'}: unfinished, 20 of 100 rollouts"]
 
@@ -132,12 +175,14 @@ def test_of_several_runs_that_with_the_most_seeds(tmp_path):
 
 def test_a_flat_table_and_back():
     original = [curve([[0.1, 0.2, 0.3, 0.4], [0, 0, 1, 1]], prior=[0, 1]), curve([1, 2, 3, 4], score="return")]
-    original[1] = dataclasses.replace(original[1], variant="x")
+    original[1] = dataclasses.replace(original[1], variant="x", training=np.array([[np.nan, 0.5, 0.2, 1.0]]))
     table = list(rows(original))
     assert len(table) == 8 + 4 and table[1]["rollouts"] == 1 and table[1]["success"] == 0.2
     for one, other in zip(original, from_rows(table), strict=True):
         assert (one.name, one.priors, one.score) == (other.name, other.priors, other.score)
         for name in ("seeds", "prior", "rollouts", "transitions", "minutes", "values"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+        assert (one.training is None) == (other.training is None)
+    np.testing.assert_array_equal(from_rows(table)[1].training, original[1].training)
     with pytest.raises(UserError, match="not evaluated after the same rollouts"):
         from_rows(table[:7])

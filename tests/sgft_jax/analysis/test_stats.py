@@ -7,6 +7,7 @@ from sgft_jax.analysis.stats import (
     difference_interval,
     iqm,
     mean,
+    paired_improvement,
     probability_of_improvement,
     success_interval,
 )
@@ -119,8 +120,18 @@ def test_strata_are_drawn_within():
     strata = [0, 0, 0, 1, 1, 1]
     assert bootstrap_interval([0.0] * 3 + [1.0] * 3, statistic=mean, strata=strata) == (0.5, 0.5, 0.5)
     assert bootstrap_interval([0.0] * 3 + [1.0] * 3, statistic=mean).low < 0.5
-    with pytest.raises(ValueError, match="not by both"):
-        bootstrap_interval(np.zeros(6), priors=[0, 0, 1, 1, 2, 2], strata=strata)
+
+
+def test_priors_are_drawn_within_strata():
+    """Two tasks, three priors each with two alike seeds: only which priors are drawn matters, in each task for itself.
+    Three zeros in the first task have a probability of 1 in 27, six of 27^-2.
+    """
+    scores, strata = [0, 0, 0, 0, 1, 1] * 2, [0] * 6 + [1] * 6
+    found = bootstrap_interval(scores, statistic=mean, priors=[0, 0, 1, 1, 2, 2] * 2, strata=strata, resamples=20_000)
+    assert found.estimate == pytest.approx(1 / 3) and (found.low, found.high) == pytest.approx((0.0, 2 / 3))
+    apart = bootstrap_interval([0.0] * 6 + [1.0] * 6, statistic=mean, priors=[0, 0, 1, 1, 2, 2] * 2, strata=strata)
+    assert apart == (0.5, 0.5, 0.5)
+    assert np.isnan(bootstrap_interval(scores, priors=[0] * 6 + [0, 0, 1, 1, 2, 2], strata=strata).low)
 
 
 def test_what_makes_a_seed_good_for_both_methods_is_not_in_the_spread_of_the_difference():
@@ -141,3 +152,16 @@ def test_probability_of_improvement_by_hand():
     """0.5 beats 0.2, ties with 0.5 and loses to 0.9: 1.5 of 3; 1.0 beats all three: 4.5 of 6."""
     assert probability_of_improvement([0.5, 1.0], [0.2, 0.5, 0.9]) == 0.75
     assert probability_of_improvement([1.0, 1.0], [0.0]) == 1.0
+
+
+def test_improvement_is_paired_by_prior_and_the_prior_is_the_random_factor():
+    """From a bad prior all are bad: 0.1 against 0, 0.6 against 0.5, 1 against 1 and 0.9. In all, (1 + 1 + 0.75) / 3.
+    Unpaired it would be 7.5 of 12. A prior of one method alone does not count.
+    """
+    above, below = [0.1, 0.6, 1.0, 9.0], [0.0, 0.5, 1.0, 0.9]
+    found = paired_improvement(above, below, [4, 5, 6, 7], [4, 5, 6, 6])
+    assert found.estimate == pytest.approx(2.75 / 3) and (found.low, found.high) == pytest.approx((0.75, 1.0))
+    two = paired_improvement(above[:2] * 50, below[:2] * 50, [4, 5] * 50, [4, 5] * 50)
+    assert two.estimate == 1 and np.isnan(two.low)  # however many seeds
+    same = np.random.default_rng(0).normal(size=60)
+    assert paired_improvement(same, same, np.arange(60) % 6, np.arange(60) % 6).estimate == 0.5

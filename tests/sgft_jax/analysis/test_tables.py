@@ -1,5 +1,6 @@
 """Tables of learning curves: cells by hand."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -36,10 +37,29 @@ def test_a_row_says_what_the_curve_says():
     seldom = curve([[0.0, 0.0, 0.5, 0.5]] * 2, (0, 2, 4, 10))
     head, _, first, second = cells(tables.summary([often, seldom]))
     assert head == [
-        "method", "seeds", "zero-shot", "area, 0 to 4 rollouts", "end (rollouts)", "deepest fall", "90 % held after",
+        "method", "seeds", "start", "area, 0 to 4 rollouts", "end (rollouts)", "deepest fall: zero-shot / own start",
+        "training", "90 % held after", "area minus mbpo", "P(better than mbpo)",
     ]  # fmt: skip
-    assert first == ["mbpo", "2", "30", "80", "100 (4)", "20", "40"]
-    assert second == ["sac", "2", "0", "12", "50 (10)", "0", "> 200"]
+    assert first == ["mbpo", "2", "30", "80", "100 (4)", "20 / 20", "-", "40", "-", "-"]
+    assert second == ["sac", "2", "0", "12", "50 (10)", "0 / 0", "-", "> 200", "-68", "0.00"]
+    assert len(cells(tables.summary([often]))[0]) == 8  # nothing to compare with
+
+
+def test_a_method_that_plans_is_held_against_the_policy_too():
+    """Plans begin at 0.5 and fall to 0.4; the policy had 0.7. The robot lived through 0.25 while exploring."""
+    plans = dataclasses.replace(curve([0.5, 0.4], (0, 4), method="sgft-mpc"), training=np.array([[np.nan, 0.25]]))
+    row = cells(tables.summary([plans, curve([0.7, 0.7], (0, 4))]))[2]
+    assert row[5:7] == ["30 / 10", "25"]
+
+
+def test_a_pair_of_runs_with_the_same_options_is_compared_like_any_other():
+    """An A/A pair, three priors: variant b is better from one of them, equal from another, worse from the third."""
+    a, b = np.array([[0.2], [0.5], [0.8]]), np.array([[0.3], [0.5], [0.7]])
+    pair = [curve(np.repeat(x, 2, 1), (0, 4), variant=v, prior=[0, 1, 2]) for v, x in (("a", a), ("b", b))]
+    head, _, first, second = cells(tables.summary(pair, "sac:a"))
+    assert head[-2:] == ["area minus sac:a", "P(better than sac:a)"]
+    assert first[-2:] == ["-", "-"] and second[-2:] == ["0 [-10, 10]", "0.50 [0.00, 1.00]"]
+    assert len(cells(tables.summary(pair, "mbpo"))[0]) == 8  # a table without it
 
 
 def test_a_short_run_and_variants_do_not_shorten_the_grid():
@@ -54,13 +74,8 @@ def test_differences_are_paired_and_from_the_best():
     """Each of three seeds of `mbpo` is 0.2 above the same seed of `sac`, so there is no spread."""
     low, high = np.array([[0.0], [0.3], [0.6]]), np.array([[0.2], [0.5], [0.8]])
     curves = [curve(np.repeat(x, 2, 1), (0, 4), method=m) for m, x in (("sac", low), ("mbpo", high))]
-    head, _, row = cells(tables.differences(curves))
-    assert head[0] == "area minus that of mbpo" and row == [
-        "sac",
-        "-20",
-        "0.33",
-    ]  # 0.3 > 0.2, 0.6 > 0.2 and 0.5: 3 of 9
-    assert tables.differences(curves[:1]) == ""
+    row = cells(tables.summary(curves))[2]
+    assert row[-2:] == ["-20", "0.00"]
 
 
 def test_all_tasks():
