@@ -25,6 +25,7 @@ from experiments.finetune_args import FinetuneArgs, run_folder
 from experiments.finetune_record import Record
 from experiments.recorded import Recorded
 from sgft_jax import train
+from sgft_jax.analysis.curves import read_curve, training_score
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.priors import load_prior
@@ -309,6 +310,22 @@ def test_every_learner_killed_and_resumed_is_bit_for_bit_uninterrupted(home, tmp
     finetune.main([*arguments, "--resume"])
     assert explored == []
     same_results(cut, whole)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["sgft-mpc", "rlpd"])
+def test_a_guarded_run_killed_and_resumed_is_bit_for_bit_uninterrupted(home, tmp_path, method):
+    """The log says who is deployed: after failures alone what learns; the curve knows what training scored."""
+    arguments = {part: argv(home, method, "--options.guard", out=tmp_path / part) for part in ("whole", "cut")}
+    finetune.main(arguments["whole"])
+    killed(LOGGED, arguments["cut"])
+    finetune.main([*arguments["cut"], "--resume"])
+    cut, whole = (tmp_path / part / "finetune/toy/turned" / method / "seeds-0-1" for part in ("cut", "whole"))
+    same_results(cut, whole)
+    lines = read_jsonl(whole / "metrics.jsonl")
+    assert [line["rollouts"] for line in lines] == [2, 3, 4, 5] and 1.0 in lines[0]["guard/challenger"]
+    scores = np.average([line["real/score"] for line in lines], axis=0, weights=[2, 1, 1, 1])
+    np.testing.assert_allclose(training_score(read_curve(whole)), scores)
 
 
 @pytest.mark.slow
