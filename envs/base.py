@@ -85,6 +85,18 @@ class Theta(NamedTuple):
     effects: EffectRange
 
 
+class Varying(NamedTuple):
+    """A number that differs between systems of a domain, uniform in [low, high], raw units.
+
+    name: of a domain parameter or an effect. index: its place in an effect that is a vector, else 0.
+    """
+
+    name: str
+    index: int
+    low: float
+    high: float
+
+
 class World(NamedTuple):
     """One system to interact with; stack worlds along a leading axis and vmap.
 
@@ -163,6 +175,7 @@ class Env(NamedTuple):
     check(theta by name) -> what is impossible about it in one sentence, or None: relations between parameters.
     trace(physics) -> [k] what a renderer needs of a state; [0] where nothing can be drawn.
     previous_actions: how many of the last actions the observation ends with, see `envs.history`.
+    system: what the observation then tells of the system that the episode takes place in, see `envs.system`.
     impl: the physics engine. scene: the name of a real system's own scene, "" for the one to pretrain in.
     """
 
@@ -185,6 +198,7 @@ class Env(NamedTuple):
     check: Callable[[dict[str, float]], str | None] = lambda theta: None
     trace: Callable[[PyTree], Array] = no_trace
     previous_actions: int = 0
+    system: tuple[Varying, ...] = ()
     impl: str = "jax"
     scene: str = ""
 
@@ -195,8 +209,8 @@ class Env(NamedTuple):
 
     @property
     def measured(self) -> tuple[Entry, ...]:
-        """The entries of the observation that sensors report: all but the previous actions."""
-        return self.observation[:-1] if self.previous_actions else self.observation
+        """The entries of the observation that sensors report: all but the previous actions and the system."""
+        return self.observation[: len(self.observation) - bool(self.previous_actions) - bool(self.system)]
 
     @property
     def measured_dim(self) -> int:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from sgft_jax.models import distortion
 from sgft_jax.models.distortion import Distortion
+from sgft_jax.models.robust import spread_of
 from sgft_jax.types import Array, Batch, PyTree, SimulatedData, Task, Transition
 
 _SIMULATED = 2048  # rows that tell how far the model is off in simulation
@@ -50,8 +51,8 @@ def interface(model: Model, kept: Callable[[PyTree], PyTree], task: Task) -> Int
         own, rows = jax.tree.map(jnp.copy, kept(params)), simulated.draw(jax.random.key(0), _SIMULATED)
         nothing, held = distortion.none(task.act_dim), jnp.ones(_SIMULATED, bool)
         missed = distortion.residuals(lambda *x: model(own, *x), rows, nothing, task.previous_actions)
-        least = 0.01 * distortion.robust_std((rows.next_obs - rows.obs)[:, : missed.shape[1]], held)
-        return Identified(own, jnp.maximum(distortion.robust_std(missed, held), least) + 1e-6, nothing)
+        change = (rows.next_obs - rows.obs)[:, : missed.shape[1]]
+        return Identified(own, spread_of(missed, change, held), nothing)
 
     def refit(known: Identified, rows: Transition, held: Array) -> Identified:
         rows, held = jax.tree.map(lambda x: x[:_ROWS], (rows, held))

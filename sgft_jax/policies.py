@@ -12,6 +12,7 @@ from sgft_jax.models import dynamics, value
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import add_noise, make_actor, make_dynamics, make_value, tanh_gaussian_action
 from sgft_jax.models.normalizer import normalize
+from sgft_jax.models.system import told
 from sgft_jax.planning import mpc
 from sgft_jax.types import Array, Key, Policy, PyTree, Task, UserError
 
@@ -51,6 +52,8 @@ def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig, previous_acti
     def act(params: SACParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         if params.distortion is not None:
             obs = params.distortion.meaning_in(obs, previous_actions)
+        if params.system is not None:
+            obs = told(obs, params.system)
         action = tanh_gaussian_action(
             actor.apply(params.actor, normalize(params.normalizer, obs)), key, explore=explore
         )

@@ -285,6 +285,7 @@ class Method(NamedTuple):
     config: a frozen dataclass whose fields carry their help; its defaults are the method's own settings.
     build(config, prior, task) -> Finetuner. Every option left open (None) is resolved here.
     prior: the algorithm of the priors that it starts from. needs_prior: False where it can start without one.
+    sees_system: True where these priors must see which system they are in, as no others may.
     """
 
     name: str
@@ -295,3 +296,4 @@ class Method(NamedTuple):
     build: Callable[[Any, Prior | None, Task], Finetuner]
     prior: Algorithm = "sac"
     needs_prior: bool = True
+    sees_system: bool = False
