@@ -3,6 +3,8 @@
 What is named here is imported at its first use: listing tasks and gaps needs neither JAX nor MuJoCo.
 """
 
+from __future__ import annotations
+
 import importlib
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
