@@ -6,19 +6,27 @@ No network learns. The prior's dynamics models are told the system too, so they 
 from dataclasses import dataclass
 from typing import Literal
 
+from sgft_jax import checks
 from sgft_jax.methods.options import LoopOptions
 from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
 
-_ROWS = {"map": 320, "dropo": 80}  # real ones that are fitted, the first of them; DROPO takes two trajectories
+_ROWS = {"map": 320, "dropo": 80}  # what `rows` is if it is left open; DROPO takes two trajectories
 _SIMULATED = 2048  # rows that tell how far the models are off in simulation
 
 
 @dataclass(frozen=True)
-class Config(LoopOptions):
+class Config:
     """Options of `sysid`."""
 
     fit: Literal["map", "dropo"] = "map"
     """map: the most probable system. dropo: the mean of a distribution over systems (Tiboni et al. 2023)."""
+    rows: int | None = None
+    """Real transitions that are fitted, the first ones; None = 320 for map, 80 for dropo."""
+    initial_rollouts: int = 1
+    """Real rollouts before the first fit."""
+
+    def __post_init__(self) -> None:
+        checks.at_least(self, 1, "rows", "initial_rollouts")
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
@@ -40,6 +48,8 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
     card = card_of(prior)
     network, varying = network_of(card), card.get("system", [])
+    loop = LoopOptions(initial_rollouts=config.initial_rollouts)
+    rows_fitted = min(config.rows or _ROWS[config.fit], loop.replay_capacity)
     model = make_dynamics(task.obs_dim, task.act_dim, network)
     policy = sac_policy(task.obs_dim, task.act_dim, network)
 
@@ -62,8 +72,8 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
         if not varying:
             return state
         spread, _ = state.learner
-        held = jnp.arange(config.replay_capacity) < state.replay.size
-        data, held = jax.tree.map(lambda x: x[: _ROWS[config.fit]], (state.replay.data, held))
+        held = jnp.arange(rows_fitted) < state.replay.size
+        data = jax.tree.map(lambda x: x[:rows_fitted], state.replay.data)
         predict = lambda obs, action: change(state.frozen, obs, action)  # noqa: E731
         given = (predict, data, held, spread, len(varying))
         found = system.dropo(*given) if config.fit == "dropo" else system.most_probable_system(*given)
@@ -92,10 +102,10 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
         act=act,
         export=export,
         policy=policy,
-        source=lambda state: sources.real_rows(config.batch_size),
+        source=lambda state: sources.real_rows(loop.batch_size),
         transform=compose(),
     )
-    finetuner = assemble(parts, config, task, simulation=Simulation(20_000, 0.6))
+    finetuner = assemble(parts, loop, task, simulation=Simulation(20_000, 0.6))
     # One update after a rollout says what was found; more would say it again.
     return finetuner._replace(observe=observe, updates_per_rollout=1)
 

@@ -60,7 +60,7 @@ def steps(prior, key, told, n=N, noise=0.0):
 def found(request, prior):
     """The finetuner, its state before and after one rollout, and the simulated data that it asks for."""
     method = get_method("sysid")
-    fine = method.build(method.config(fit=request.param, replay_capacity=64), prior, ENV)
+    fine = method.build(method.config(fit=request.param), prior, ENV)
     data = SimulatedData(lambda key, n: steps(prior, key, told=True, n=n, noise=0.003), jnp.zeros(1))
     state = jax.jit(lambda params, key: fine.init(params, key, data))(prior.params, jax.random.key(0))
     rows = steps(prior, jax.random.key(1), told=False, noise=0.003)
@@ -120,7 +120,7 @@ def test_other_methods_refuse_such_a_prior_and_this_one_every_other(prior):
 def test_nothing_of_the_true_system_reaches_the_method(prior):
     """The whole way from Python."""
     gap = envs.gaps.from_dict(ENV, "off", {"effects": {"action_scale": 0.7}})
-    setup = api.setup(ENV, gap, prior, method="sysid", replay_capacity=64)
+    setup = api.setup(ENV, gap, prior, method="sysid")
     progress, _ = list(api.train.finetune(*setup, rollouts=2))[-1]
     np.testing.assert_array_equal(progress.agent.replay.data.obs[..., -K:], 0.0)
     assert jnp.isfinite(progress.agent.learner[1].mean).all()

@@ -71,7 +71,8 @@ def prior(algorithm="sac"):
     else:
         init = sac.make_sac(sac.SACConfig(2, 2, network=NET, ensemble_size=2)).init
         params = sac.extract_params(jax.jit(init)(jax.random.key(7)))
-        card = {"algorithm": "sac", "network": jsonable(NET), "gamma": 0.9}
+        told = [{"name": "wind", "index": 0, "low": -1.0, "high": 1.0}]  # `sysid` takes the last number for it
+        card = {"algorithm": "sac", "network": jsonable(NET), "gamma": 0.9, "system": told}
     return Prior(shaken(params)._replace(normalizer=statistics), card)
 
 
