@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -54,6 +55,28 @@ def with_system(env: Env, system: tuple[Varying, ...]) -> Env:
         remember=lambda memory, action: memory,
     )
     return longer._replace(system=system)
+
+
+def blurred(env: Env, noise: float) -> Env:
+    """The same task with Gaussian noise of that std on what observations tell of the system, new at every step.
+
+    Without it, networks tell the episodes of training apart by numbers that stay the same for a whole one.
+    """
+    own_dim = env.obs_dim - len(env.system)
+
+    def blur(state: EnvState, key: Key) -> EnvState:
+        told = noise * jax.random.normal(key, (len(env.system),))
+        return state._replace(obs=state.obs.at[own_dim:].add(told), true_obs=state.true_obs.at[own_dim:].add(told))
+
+    def reset(world: World, key: Key) -> EnvState:
+        key_own, key_noise = jax.random.split(key)
+        return blur(env.reset(world, key_own), key_noise)
+
+    def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
+        key_own, key_noise = jax.random.split(key)
+        return blur(env.step(world, state, action, key_own), key_noise)
+
+    return env._replace(reset=reset, step=step)
 
 
 def concealed(env: Env) -> Env:

@@ -10,7 +10,7 @@ import envs
 from envs.base import Varying
 from envs.history import with_previous_actions
 from envs.rollout import play_episode
-from envs.system import concealed, varying, with_system
+from envs.system import blurred, concealed, varying, with_system
 from sgft_jax.types import UserError
 
 TOY = toy.make()
@@ -58,6 +58,17 @@ def test_a_real_system_tells_the_middle_and_is_the_same_otherwise(key):
     np.testing.assert_array_equal(silent.transitions.next_obs[:, -3:], 0.0)
     np.testing.assert_array_equal(open_.transitions.obs[:, :-3], silent.transitions.obs[:, :-3])
     np.testing.assert_array_equal(open_.transitions.reward, silent.transitions.reward)
+
+
+def test_noise_is_on_what_is_told_alone_and_new_at_every_step(key):
+    there, noisy = world({"action_scale": [0.75, 1.0], "action_rotation": 0.0}, {"mass": 1.1}), blurred(SEEN, 0.3)
+    states = [noisy.reset(there, key)]
+    for i in range(400):
+        states.append(noisy.step(there, states[-1], jnp.zeros(2), jax.random.fold_in(key, i)))
+    told = np.array([state.obs[-3:] for state in states])
+    np.testing.assert_allclose(told.mean(axis=0), [0.5, -0.5, 0.0], atol=0.07)
+    np.testing.assert_allclose(told.std(axis=0), 0.3, atol=0.05)
+    assert jnp.abs(states[-1].true_obs[: TOY.obs_dim] - states[-1].obs[: TOY.obs_dim]).max() < 0.1
 
 
 def test_nothing_to_tell_is_the_task_itself():
