@@ -3,6 +3,8 @@
 What is named here is imported at its first use: listing tasks and gaps needs neither JAX nor MuJoCo.
 """
 
+from __future__ import annotations
+
 import importlib
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -15,6 +17,7 @@ from sgft_jax.types import UserError, unknown
 
 if TYPE_CHECKING:
     from envs import effects, rollout
+    from envs.base import Varying
     from envs.domains.uniform import sample_worlds, uniform
     from envs.rollout import Episode, Fleet, launch, play_episode, step_fleet
 
@@ -46,18 +49,22 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'envs' has no attribute {name!r}")
 
 
-def make(task: str, impl: str = "auto", scene: str = "", previous_actions: int = 0) -> Env:
+def make(
+    task: str, impl: str = "auto", scene: str = "", previous_actions: int = 0, system: tuple[Varying, ...] = ()
+) -> Env:
     """The task of that name, file or module, compiled; impl: its physics engine, see `worlds.choose_impl`.
 
     A file or module of your own must define `make(impl) -> Env`, with the file's name as the Env's name
     (docs/extending.md). scene: that of a real system which is more than the simulated one with other numbers; "" for
     the latter. What is observed, commanded and rewarded, and the parameters, are the same in all scenes of a task.
-    previous_actions: how many of the last actions the observation ends with, see `envs.history`.
+    previous_actions: how many of the last actions the observation ends with, see `envs.history`. system: what it tells
+    of the system after that, see `envs.system`.
     Raises UserError with the closest match for an unknown task or scene, and naming file and line for one that fails.
     """
     from envs.history import with_previous_actions
+    from envs.system import with_system
 
-    return with_previous_actions(_make(task, impl, scene), previous_actions)
+    return with_system(with_previous_actions(_make(task, impl, scene), previous_actions), system)
 
 
 def _make(task: str, impl: str, scene: str) -> Env:

@@ -22,11 +22,16 @@ NOTHING: Mapping[str, Value] = MappingProxyType({})
 
 
 class Entry(NamedTuple):
-    """One named group of numbers in an observation or action vector, e.g. ("ee_xyz", "m", 3)."""
+    """One named group of numbers in an observation or action vector, e.g. ("ee_xyz", "m", 3).
+
+    error: of a measurement, the std of the constant error that a real system's sensor may have, in its unit: that of a
+        camera's calibration, for example. 0 for what is measured well. `identify` looks for errors of up to twice that.
+    """
 
     name: str
     unit: str
     size: int
+    error: float = 0.0
 
 
 class Parameter(NamedTuple):
@@ -83,6 +88,18 @@ class Theta(NamedTuple):
 
     params: Array
     effects: EffectRange
+
+
+class Varying(NamedTuple):
+    """A number that differs between systems of a domain, uniform in [low, high], raw units.
+
+    name: of a domain parameter or an effect. index: its place in an effect that is a vector, else 0.
+    """
+
+    name: str
+    index: int
+    low: float
+    high: float
 
 
 class World(NamedTuple):
@@ -163,6 +180,7 @@ class Env(NamedTuple):
     check(theta by name) -> what is impossible about it in one sentence, or None: relations between parameters.
     trace(physics) -> [k] what a renderer needs of a state; [0] where nothing can be drawn.
     previous_actions: how many of the last actions the observation ends with, see `envs.history`.
+    system: what the observation then tells of the system that the episode takes place in, see `envs.system`.
     impl: the physics engine. scene: the name of a real system's own scene, "" for the one to pretrain in.
     """
 
@@ -185,6 +203,7 @@ class Env(NamedTuple):
     check: Callable[[dict[str, float]], str | None] = lambda theta: None
     trace: Callable[[PyTree], Array] = no_trace
     previous_actions: int = 0
+    system: tuple[Varying, ...] = ()
     impl: str = "jax"
     scene: str = ""
 
@@ -195,13 +214,18 @@ class Env(NamedTuple):
 
     @property
     def measured(self) -> tuple[Entry, ...]:
-        """The entries of the observation that sensors report: all but the previous actions."""
-        return self.observation[:-1] if self.previous_actions else self.observation
+        """The entries of the observation that sensors report: all but the previous actions and the system."""
+        return self.observation[: len(self.observation) - bool(self.previous_actions) - bool(self.system)]
 
     @property
     def measured_dim(self) -> int:
         """How many numbers sensors report."""
         return sum(e.size for e in self.measured)
+
+    @property
+    def sensor_errors(self) -> tuple[float, ...]:
+        """[measured_dim] of every measured number, the `error` of its entry."""
+        return tuple(e.error for e in self.measured for _ in range(e.size))
 
     @property
     def act_dim(self) -> int:

@@ -1,11 +1,11 @@
-"""Observations that hold the last actions: with commands that arrive late, measurements alone are no state."""
+"""Observations that hold more than sensors measure, such as the last actions."""
 
 from collections.abc import Callable
 
 import jax.numpy as jnp
 
 from envs.base import Entry, Env, EnvState, World
-from sgft_jax.types import Array, Key
+from sgft_jax.types import Array, Key, PyTree
 
 
 def with_previous_actions(env: Env, n: int) -> Env:
@@ -17,42 +17,59 @@ def with_previous_actions(env: Env, n: int) -> Env:
     """
     if n == 0:
         return env
-    measured = env.obs_dim
+    longer = extended(
+        env,
+        Entry("previous_actions", "1", n * env.act_dim),
+        tell=lambda world, state, actions: actions.reshape(-1),
+        start=lambda: jnp.zeros((n, env.act_dim)),
+        remember=lambda actions, action: jnp.concatenate([action[None], actions[:-1]]),
+    )
+    return longer._replace(previous_actions=n)
 
-    def inside(state: EnvState) -> tuple[EnvState, Array]:
-        """The state as the task knows it, and the actions [n, act_dim]."""
-        physics, actions = state.physics
-        own = state._replace(physics=physics, obs=state.obs[:measured], true_obs=state.true_obs[:measured])
-        return own, actions
 
-    def outside(state: EnvState, actions: Array) -> EnvState:
-        told = actions.reshape(-1)
+def extended(
+    env: Env,
+    entry: Entry,
+    *,
+    tell: Callable[[World, EnvState, PyTree], Array],
+    start: Callable[[], PyTree],
+    remember: Callable[[PyTree, Array], PyTree],
+) -> Env:
+    """The same task with one more entry at the end of its observation; rewards and success are what they were.
+
+    tell(world, state of `env`, memory) -> [entry.size]. start() -> memory of an episode. remember(memory, action) ->
+    memory.
+    """
+    own_dim = env.obs_dim
+
+    def outside(world: World, state: EnvState, memory: PyTree) -> EnvState:
+        told = tell(world, state, memory)
         return state._replace(
-            physics=(state.physics, actions),
+            physics=(state.physics, memory),
             obs=jnp.concatenate([state.obs, told]),
             true_obs=jnp.concatenate([state.true_obs, told]),
         )
 
     def reset(world: World, key: Key) -> EnvState:
-        return outside(env.reset(world, key), jnp.zeros((n, env.act_dim)))
+        return outside(world, env.reset(world, key), start())
 
     def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
-        own, actions = inside(state)
-        return outside(env.step(world, own, action, key), jnp.concatenate([action[None], actions[:-1]]))
+        physics, memory = state.physics
+        own = state._replace(physics=physics, obs=state.obs[:own_dim], true_obs=state.true_obs[:own_dim])
+        return outside(world, env.step(world, own, action, key), remember(memory, action))
 
     def of_transition(function: Callable[..., Array] | None) -> Callable[..., Array] | None:
         if function is None:
             return None
-        return lambda obs, action, next_obs: function(obs[:measured], action, next_obs[:measured])
+        return lambda obs, action, next_obs: function(obs[:own_dim], action, next_obs[:own_dim])
 
     success = env.success
     return env._replace(
-        observation=(*env.observation, Entry("previous_actions", "1", n * env.act_dim)),
-        previous_actions=n,
+        observation=(*env.observation, entry),
         reset=reset,
         step=step,
         reward=of_transition(env.reward),
         terminated=of_transition(env.terminated),
-        success=None if success is None else lambda obs: success(obs[:measured]),
+        success=None if success is None else lambda obs: success(obs[:own_dim]),
         trace=lambda physics: env.trace(physics[0]),
     )

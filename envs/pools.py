@@ -11,6 +11,7 @@ from envs.base import Env, World
 from envs.domains.uniform import sample_worlds
 from envs.gaps import SIM, Gap
 from envs.rollout import pool_size
+from envs.system import concealed
 from sgft_jax.types import Key, UserError
 
 
@@ -26,6 +27,8 @@ def load_gap(env: Env, real: str | None, overrides: Sequence[str]) -> Gap | None
 def real_env(env: Env, found: Sequence[Gap]) -> Env:
     """The Env of these real systems: that of the simulator, or of the other scene that they name.
 
+    None of them tells what system it is, see `envs.system.concealed`.
+
     Raises UserError where they name several, which no one program can step.
     """
     scenes = {gap.scene: gap.name for gap in found}
@@ -34,7 +37,7 @@ def real_env(env: Env, found: Sequence[Gap]) -> Env:
         said = f"{first} is in {f"scene '{one}'" if one else 'the simulated scene'} and {second} in scene '{other}'"
         raise UserError(f"{said}: real systems of different scenes cannot share a program, run them one at a time")
     scene = "".join(scenes)
-    return envs.make(env.name, env.impl, scene, env.previous_actions) if scene else env
+    return concealed(envs.make(env.name, env.impl, scene, env.previous_actions, env.system) if scene else env)
 
 
 def training_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:

@@ -70,11 +70,11 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     from envs.pools import heldout_worlds, load_gap, padded, real_env
     from experiments.evaluation import describe, play
     from experiments.stacking import member, part, stack
-    from sgft_jax.io.priors import load_priors, previous_actions
+    from sgft_jax.io.priors import load_priors, observed_by
     from sgft_jax.policies import make_policy
     from sgft_jax.systems.simulated import Simulated
 
-    env = envs.make(task, args.impl, previous_actions=previous_actions(folders))
+    env = envs.make(task, args.impl, **observed_by(folders))
     found = [load_gap(env, real, () if real == SIM else args.set) for real in args.real]
     priors = load_priors(folders, env)
     card, system_env = priors[0].card, real_env(env, [gap for gap in found if gap])

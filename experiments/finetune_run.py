@@ -21,7 +21,7 @@ from sgft_jax import api, mesh, train
 from sgft_jax.api import Setup
 from sgft_jax.io import runs
 from sgft_jax.io.jsonfile import jsonable
-from sgft_jax.io.priors import digest, load_priors, previous_actions
+from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.methods.options import card_of
 from sgft_jax.train import FinetuneProgress
@@ -32,11 +32,11 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
     """The runs on the real systems of `args`; returns their summaries. folders: of the priors."""
     sizes = {"--seeds" if len(args.real) == 1 else "the number of --real times --seeds": len(args.real) * args.seeds}
     devices = mesh.devices(args.devices, sizes)
-    env = envs.make(args.task, args.impl, previous_actions=previous_actions(folders))
+    env = envs.make(args.task, args.impl, **observed_by(folders))
     found = [gaps.load(env, real, args.set) for real in args.real]
     priors = load_priors(folders, env)
     for prior in priors:
-        api.check_prior(prior, method.prior, env)
+        api.check_prior(prior, method, env)
     # Every folder is that of a run on its real system alone: either kind of run continues the other.
     homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in args.real}
     opened = runs.open_runs(

@@ -14,6 +14,7 @@ from envs.base import Env
 from envs.gaps import SIM, Gap
 from envs.history import with_previous_actions
 from envs.rollout import Episode
+from envs.system import concealed
 from experiments import stacking
 from experiments.cli import columns
 from experiments.evaluation import play
@@ -24,7 +25,7 @@ from sgft_jax.analysis import stats
 from sgft_jax.finetuner import command_interface
 from sgft_jax.identify import Identified, Interface
 from sgft_jax.io.jsonfile import differences, read_json, write_json
-from sgft_jax.io.priors import digest, load_priors, previous_actions
+from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.methods import get_method
 from sgft_jax.models.distortion import Distortion, none
 from sgft_jax.policies import make_policy, network_of
@@ -40,7 +41,7 @@ _SIMULATED = 8  # rollouts that tell how far the model is off in simulation; the
 def run(args: GapsArgs, seeds: list[int], folders: list[Path]) -> dict[str, Any]:
     """Draws, writes and measures gaps; prints and returns the table. folders: of the priors."""
     task = envs.name_of(args.task)
-    env = envs.make(args.task, args.impl, previous_actions=previous_actions(folders))
+    env = concealed(envs.make(args.task, args.impl, **observed_by(folders)))
     found = gap_distribution.draw(env, gap_distribution.load(env, args.distribution), args.seed, args.draw)
     path = args.out / "gaps" / task / f"seed-{args.seed}.toml"
     write_gaps(path, found)
@@ -132,7 +133,7 @@ def _zero_shot(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: in
     system, members = systems(env, everywhere, priors, episodes)
     policy = make_policy(priors[0].card, env)
     count = len(everywhere) * len(priors)
-    nothing = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), none(env.act_dim))
+    nothing = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), none(env.act_dim, env.measured_dim))
 
     def rates(known: Distortion) -> list[dict[str, Any]]:
         played = play(system, policy, members._replace(distortion=known), episode_key(FINAL_SEED), episodes)
@@ -172,7 +173,7 @@ def _plan(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: int) ->
     """Success of what the planning method does before it has learned anything."""
     method = get_method(PLANNER)
     for prior in priors:
-        api.check_prior(prior, method.prior, env)
+        api.check_prior(prior, method, env)
     policy = method.build(method.config(), priors[0], env).policy
     system, members = systems(env, found, priors, episodes)
     played = play(system, policy, members, episode_key(FINAL_SEED), episodes)

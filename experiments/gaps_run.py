@@ -21,7 +21,7 @@ from experiments.gaps import GapsArgs
 from experiments.memory import reserve
 from sgft_jax.analysis import stats, tables
 from sgft_jax.io.log import MetricsLog, write_summary
-from sgft_jax.io.priors import load_priors, previous_actions
+from sgft_jax.io.priors import load_priors, observed_by
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.policies import make_policy
 from sgft_jax.presets import PretrainConfig
@@ -36,7 +36,7 @@ _HELDOUT_SEED, FINAL_SEED = 2**31 + 4, 2**31 + 5  # held-out worlds and episodes
 def run(args: GapsArgs, seeds: list[int], folders: list[Path]) -> dict[str, Any]:
     """Measures, prints a table, writes and returns the summary. folders: of the priors."""
     task = envs.name_of(args.task)
-    env = envs.make(args.task, args.impl, previous_actions=previous_actions(folders))
+    env = envs.make(args.task, args.impl, **observed_by(folders))
     found = [gaps.load(env, name) for name in args.presets or gaps.presets(task)]
     env = real_env(env, found)
     folder = args.out / "gaps" / task

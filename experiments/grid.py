@@ -25,8 +25,8 @@ class GridArgs:
 
     tasks: tuple[str, ...] = tuple(envs.TASKS)
     """Tasks."""
-    methods: tuple[str, ...] = NAMES
-    """Methods, in the order in which they run."""
+    methods: tuple[str, ...] = tuple(name for name in NAMES if not get_method(name).sees_system)
+    """Methods, in the order in which they run; by default all that start from the usual priors."""
     reals: tuple[str, ...] = ("default",)
     """Real systems of every task: mild, default, hard, sim for no gap, or .toml/.json files."""
     seed: int = 0

@@ -17,6 +17,7 @@ from envs.base import Env, World
 from envs.gaps import Gap
 from envs.pools import heldout_worlds, load_gap, real_env, training_worlds
 from envs.rollout import Episode
+from envs.system import blurred, varying, with_system
 from experiments import hosts, stacking
 from experiments.evaluation import best_of, describe, play, scores
 from experiments.memory import reserve
@@ -64,6 +65,9 @@ def run(args: PretrainArgs, seeds: list[int]) -> dict[str, Any]:
     env = envs.make(args.task, args.impl, previous_actions=args.config.previous_actions)
     gap = load_gap(env, args.real, args.set)
     env = real_env(env, [gap] if gap else [])
+    if args.config.sees_system:
+        told = with_system(env, varying(env, gap.params, gap.effects) if gap else varying(env))
+        env = blurred(told, args.config.system_noise)
     sizes = memory(env, args.config)  # what does not fit is reported before anything is written
     devices = mesh.devices(args.devices, {f"--config.{n.replace('_', '-')}": getattr(args.config, n) for n in _CUT})
     home = run_folder(args)

@@ -18,13 +18,13 @@ from envs.gaps import Gap
 from envs.pools import heldout_worlds, real_env, real_worlds
 from envs.rollout import Episode
 from sgft_jax import train
-from sgft_jax.io.priors import load_prior
+from sgft_jax.io.priors import load_prior, observed
 from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.methods.options import card_of
 from sgft_jax.policies import make_policy
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import FinetuneProgress, SimulatedRows
-from sgft_jax.types import Array, Finetuner, Policy, Prior, PyTree, UserError
+from sgft_jax.types import Array, Finetuner, Method, Policy, Prior, PyTree, UserError
 
 SIMULATED_WORLDS = 256
 _SIMULATION = 2**31  # seed of what happens in them, the same for every run
@@ -64,7 +64,7 @@ def setup(
     known = [priors] if isinstance(priors, Prior) else list(priors)
     chosen = get_method(method)
     for prior in known:
-        check_prior(prior, chosen.prior, env)
+        check_prior(prior, chosen, env)
     if not known and chosen.needs_prior:
         raise UserError(f"method {chosen.name} needs a prior of {chosen.prior}")
     finetuner = chosen.build(chosen.config(**options) if config is None else config, known[0] if known else None, env)
@@ -90,12 +90,20 @@ def _simulated(env: Env, finetuner: Finetuner, priors: list[Prior], stacked: PyT
     return train.simulate(env, make_policy(card, env), worlds, stacked, key, finetuner.simulation, gamma=card["gamma"])
 
 
-def check_prior(prior: Prior, algorithm: str, env: Env) -> None:
-    """Raises UserError for a prior of another algorithm or task."""
-    if (found := prior.card.get("algorithm", "sac")) != algorithm:
-        preset = "tdmpc2" if algorithm == "tdmpc2" else "fast"
-        command = f"python -m experiments.pretrain --task {env.name} --preset {preset}"
-        raise UserError(f"the method needs a prior of {algorithm}, not of {found}; make one with: {command}")
+def check_prior(prior: Prior, method: Method, env: Env) -> None:
+    """Raises UserError for a prior of another algorithm or task, or of a policy that is told more or less."""
+    command = f"python -m experiments.pretrain --task {env.name}"
+    if (found := prior.card.get("algorithm", "sac")) != method.prior:
+        preset = "tdmpc2" if method.prior == "tdmpc2" else "fast"
+        raise UserError(
+            f"the method needs a prior of {method.prior}, not of {found}; make one with: {command} --preset {preset}"
+        )
+    if method.sees_system != bool(prior.card.get("system")):
+        flag = "sees-system" if method.sees_system else "no-sees-system"
+        raise UserError(
+            f"{method.name} needs a prior that was {'' if method.sees_system else 'not '}told the system; make one "
+            f"with: {command} --config.{flag}"
+        )
     if prior.card["task"] != env.name:
         raise UserError(f"the prior is of the task {prior.card['task']!r}, not of {env.name!r}")
 
@@ -106,7 +114,7 @@ def evaluate_prior(prior: Prior, env: Env, gap: Gap | None = None, *, episodes: 
     gap: the real system; None = the training domain without sensor noise. Another seed draws other worlds and starts.
     """
     key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_EVALUATION), seed))
-    real = env if gap is None else real_env(env, [gap])
+    real = real_env(env, [] if gap is None else [gap])
     pool = heldout_worlds(real, gap, key_worlds, episodes)
     system = Simulated(real, jax.tree.map(lambda x: x[None], pool), jnp.zeros(1, int), gamma=prior.card["gamma"])
     one = jax.tree.map(lambda x: x[None], prior.params)
@@ -149,7 +157,7 @@ class ActingPolicy:
         """The action [act_dim] in [-1, 1] for what was measured, [measured_dim] in raw units."""
         if np.shape(obs) != (self.env.measured_dim,):
             raise UserError(f"the policy reads {self.env.measured_dim} measured numbers, got shape {np.shape(obs)}")
-        obs = np.concatenate([obs, self._actions.ravel()])
+        obs = np.concatenate([obs, self._actions.ravel(), np.zeros(len(self.env.system))])  # its own estimate counts
         self._key, key = jax.random.split(self._key)
         action, self._carry = self._act(self.prior.params, self._carry, jnp.asarray(obs), key, explore=explore)
         self._actions = np.concatenate([np.asarray(action)[None], self._actions])[: len(self._actions)]
@@ -163,5 +171,5 @@ def load_policy(folder: str | Path, *, task: str | None = None, seed: int = 0) -
     of plans. Raises UserError if there is no prior.
     """
     prior = load_prior(Path(folder))
-    env = envs.make(task or prior.card["task"], previous_actions=prior.card.get("previous_actions", 0))
+    env = envs.make(task or prior.card["task"], **observed(prior.card))
     return ActingPolicy(prior, env, seed=seed)

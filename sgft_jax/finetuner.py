@@ -90,6 +90,7 @@ class Parts(NamedTuple):
     models: the dynamics ensemble if it trains. memory: the module that keeps real rows, replay or sequences.
     interface: identifies what the real system makes of commands, or None. The learner then acts and learns in the
         simulator's actions, and the replay keeps the commands.
+    observed(state) -> state, once the rows of a rollout are kept.
     reference(params of a prior, what the fresh agent exports) -> params of the policy that a guard holds on to at
         first: the agent's own unless the simulator's policy is another one.
     """
@@ -107,6 +108,7 @@ class Parts(NamedTuple):
     offline: Source | None = None
     memory: ModuleType = replay
     interface: Interface | None = None
+    observed: Callable[[FinetuneState], FinetuneState] = lambda state: state
     reference: Callable[[PyTree, PyTree], PyTree] = agents_own
 
 
@@ -135,7 +137,7 @@ def assemble(
 
     def observe(state: FinetuneState, rows: Transition, valid: Array, score: Array) -> FinetuneState:
         del score  # rewards are what is learned from
-        state = state._replace(replay=parts.memory.add_episode(state.replay, rows, valid))
+        state = parts.observed(state._replace(replay=parts.memory.add_episode(state.replay, rows, valid)))
         if parts.interface is None or state.interface is None:
             return state
         held = jnp.arange(options.replay_capacity) < state.replay.size
@@ -146,7 +148,7 @@ def assemble(
     ) -> tuple[Array, PyTree]:
         if state.interface is None:
             return parts.act(state, carry, obs, key, explore=explore)
-        obs = state.interface.distortion.meaning_in(obs, task.previous_actions)
+        obs = state.interface.distortion.seen(obs)
         action, carry = parts.act(state, carry, obs, key, explore=explore)
         return state.interface.distortion.command(action), carry
 
@@ -296,7 +298,7 @@ def sac_finetuner(
         return state.frozen._replace(actor=actor, critic=twin, dynamics=ensemble)
 
     simulators = prior is not None and fresh
-    own_policy = sac_policy(task.obs_dim, task.act_dim, network, task.previous_actions)
+    own_policy = sac_policy(task.obs_dim, task.act_dim, network)
     parts = Parts(
         learner=learner,
         start=start,

@@ -1,6 +1,8 @@
-"""What a real system makes of commands (scale, rotation, bias), identified while something else learns on it.
+"""What a real system makes of commands (scale, rotation, bias) and of measurements (a constant error), identified
+while something else learns on it.
 
-The learner acts and learns in the simulator's actions. What it wants is turned into the command that stands for it.
+The learner acts and learns in the simulator's actions and measurements. What it wants is turned into the command that
+stands for it.
 """
 
 from collections.abc import Callable
@@ -11,6 +13,7 @@ import jax.numpy as jnp
 
 from sgft_jax.models import distortion
 from sgft_jax.models.distortion import Distortion
+from sgft_jax.models.robust import spread_of
 from sgft_jax.types import Array, Batch, PyTree, SimulatedData, Task, Transition
 
 _SIMULATED = 2048  # rows that tell how far the model is off in simulation
@@ -23,7 +26,7 @@ Model = Callable[[PyTree, Array, Array], Array]  # (params, obs, action) -> [mea
 class Identified(NamedTuple):
     """params: of the simulator's model. spread: [measured_dim] std of its residuals in simulation.
 
-    distortion: what the real system makes of commands; none until data say otherwise.
+    distortion: what the real system makes of commands and measurements; none until data say otherwise.
     """
 
     params: PyTree
@@ -35,7 +38,7 @@ class Interface(NamedTuple):
     """A part that identifies.
 
     start(params of a prior, simulated) -> Identified. refit(identified, rows [n], held [n]) -> Identified after more
-    real rows. meant(identified, batch) -> the batch with its real commands replaced by what they stand for.
+    real rows. meant(identified, batch) -> the batch with its real rows as the simulator would have made them.
     """
 
     start: Callable[[PyTree, SimulatedData], Identified]
@@ -48,24 +51,24 @@ def interface(model: Model, kept: Callable[[PyTree], PyTree], task: Task) -> Int
 
     def start(params: PyTree, simulated: SimulatedData) -> Identified:
         own, rows = jax.tree.map(jnp.copy, kept(params)), simulated.draw(jax.random.key(0), _SIMULATED)
-        nothing, held = distortion.none(task.act_dim), jnp.ones(_SIMULATED, bool)
-        missed = distortion.residuals(lambda *x: model(own, *x), rows, nothing, task.previous_actions)
-        least = 0.01 * distortion.robust_std((rows.next_obs - rows.obs)[:, : missed.shape[1]], held)
-        return Identified(own, jnp.maximum(distortion.robust_std(missed, held), least) + 1e-6, nothing)
+        nothing, held = distortion.none(task.act_dim, task.measured_dim), jnp.ones(_SIMULATED, bool)
+        missed = distortion.residuals(lambda *x: model(own, *x), rows, nothing)
+        change = (rows.next_obs - rows.obs)[:, : missed.shape[1]]
+        return Identified(own, spread_of(missed, change, held), nothing)
 
     def refit(known: Identified, rows: Transition, held: Array) -> Identified:
         rows, held = jax.tree.map(lambda x: x[:_ROWS], (rows, held))
         found, evidence = distortion.fit(
             lambda *x: model(known.params, *x), rows, held, known.spread, turns=task.cartesian,
-            previous_actions=task.previous_actions,
+            errors=task.sensor_errors,
         )  # fmt: skip
-        nothing = distortion.none(task.act_dim)
+        nothing = distortion.none(task.act_dim, task.measured_dim)
         return known._replace(
             distortion=jax.tree.map(lambda a, b: jnp.where(evidence > _EVIDENCE, a, b), found, nothing)
         )
 
     def meant(known: Identified, batch: Batch) -> Batch:
-        seen = jax.vmap(lambda obs: known.distortion.meaning_in(obs, task.previous_actions))
+        seen = jax.vmap(known.distortion.seen)
         action = jax.vmap(known.distortion.meaning)(batch.action)
         new = batch._replace(action=action, obs=seen(batch.obs), next_obs=seen(batch.next_obs))
         if (simulated := batch.is_sim) is None:

@@ -12,6 +12,7 @@ from sgft_jax.models import dynamics, value
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import add_noise, make_actor, make_dynamics, make_value, tanh_gaussian_action
 from sgft_jax.models.normalizer import normalize
+from sgft_jax.models.system import told
 from sgft_jax.planning import mpc
 from sgft_jax.types import Array, Key, Policy, PyTree, Task, UserError
 
@@ -30,7 +31,7 @@ def make_policy(card: Mapping[str, Any], task: Task) -> Policy:
     if plan := card.get("plan"):
         config = mpc.MPCConfig(task.obs_dim, task.act_dim, network, **plan, gamma=card["gamma"])
         return mpc_policy(config, task)
-    return sac_policy(task.obs_dim, task.act_dim, network, task.previous_actions)
+    return sac_policy(task.obs_dim, task.act_dim, network)
 
 
 def network_of(card: Mapping[str, Any]) -> NetworkConfig:
@@ -42,15 +43,17 @@ def network_of(card: Mapping[str, Any]) -> NetworkConfig:
         raise UserError(f"this version knows no such network: {card['network']}; pretrain again") from None
 
 
-def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig, previous_actions: int = 0) -> Policy:
-    """Actor, V_sim and dynamics ensemble of `SACParams`. previous_actions: with which observations end."""
+def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig) -> Policy:
+    """Actor, V_sim and dynamics ensemble of `SACParams`."""
     actor = make_actor(obs_dim, act_dim, network)
     value_net = make_value(obs_dim, network)
     model = make_dynamics(obs_dim, act_dim, network)
 
     def act(params: SACParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         if params.distortion is not None:
-            obs = params.distortion.meaning_in(obs, previous_actions)
+            obs = params.distortion.seen(obs)
+        if params.system is not None:
+            obs = told(obs, params.system)
         action = tanh_gaussian_action(
             actor.apply(params.actor, normalize(params.normalizer, obs)), key, explore=explore
         )

@@ -30,6 +30,12 @@ class PretrainConfig:
     previous_actions: int = 0
     """Last actions that end the observation of all networks. Where commands arrive late, measurements alone do not say
     what will happen next."""
+    sees_system: bool = False
+    """End the observation of all networks with what varies between episodes of the training domain, parameters and
+    effects. Such a prior is for the method `sysid`, which tells it what it has identified."""
+    system_noise: float = 0.3
+    """Std of the noise on that in training, where each number's range is [-1, 1]; new at every step. Without it,
+    networks of few episodes learn to tell these apart (docs/methods.md)."""
     lr: float = 3e-4
     """Adam learning rate of every network at the start."""
     lr_end: float = 1.0
@@ -93,6 +99,9 @@ class PretrainConfig:
         checks.share(self, "random_ladder", "lr_end", "tau", "choose_from")
         checks.below_one(self, "gamma", "random_fraction")
         checks.finite(self, "entropy_per_dim")
+        checks.not_negative(self, "system_noise")
+        if self.sees_system and self.algorithm != "sac":
+            raise checks.refusal("sees_system", True, "off for a prior of tdmpc2, which no method could tell anything")
         for name in ("random_transitions", "replay_capacity"):
             if getattr(self, name) < self.n_envs:
                 wanted = f"at least n-envs = {self.n_envs}, one step of all environments"

@@ -163,6 +163,7 @@ def prior_card(env: Env, config: PretrainConfig) -> dict[str, Any]:
         "obs_dim": env.obs_dim,
         "act_dim": env.act_dim,
         "previous_actions": env.previous_actions,
+        "system": [v._asdict() for v in env.system],
         "network": jsonable(config.network),
         "ensemble_size": config.ensemble_size,
         "gamma": config.gamma,

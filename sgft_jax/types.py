@@ -172,13 +172,13 @@ class Task(Protocol):
         ...
 
     @property
-    def previous_actions(self) -> int:
-        """How many of the last actions the observation ends with."""
+    def measured_dim(self) -> int:
+        """How many numbers of the observation are measured."""
         ...
 
     @property
-    def measured_dim(self) -> int:
-        """How many numbers of the observation are measured."""
+    def sensor_errors(self) -> tuple[float, ...]:
+        """[measured_dim] how far off each sensor of a real system may be for good, as a std in its own unit."""
         ...
 
     @property
@@ -292,6 +292,7 @@ class Method(NamedTuple):
     build(config, prior, task) -> Finetuner. Every option left open (None) is resolved here.
     prior: the algorithm of the priors that it starts from. needs_prior: False where it can start without one.
     zero_shot: whether it begins as its prior acts; False where it plans otherwise or begins from nothing.
+    sees_system: True where these priors must see which system they are in, as no others may.
     """
 
     name: str
@@ -303,3 +304,4 @@ class Method(NamedTuple):
     prior: Algorithm = "sac"
     needs_prior: bool = True
     zero_shot: bool = True
+    sees_system: bool = False

@@ -129,7 +129,7 @@ def check(theta: dict[str, float]) -> str | None:
 
 SCENE = workcell.scene(
     name="insert",
-    observation=(Entry("hand_xyz", "m", 3), Entry("leg_xyz", "m", 3), Entry("hole_xyz", "m", 3)),
+    observation=(Entry("hand_xyz", "m", 3), Entry("leg_xyz", "m", 3), Entry("hole_xyz", "m", 3, error=0.006)),
     action=(Entry("hand_xyz_step", "2 cm", 3),),
     parameters=PARAMETERS,
     episode_length=40,

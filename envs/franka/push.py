@@ -135,7 +135,7 @@ def event(params: Array, state: PhysicsState) -> PhysicsState:
 
 SCENE = workcell.scene(
     name="push",
-    observation=(Entry("hand_xy", "m", 2), Entry("puck_xy", "m", 2)),
+    observation=(Entry("hand_xy", "m", 2), Entry("puck_xy", "m", 2, error=0.01)),
     action=(Entry("hand_xy_step", "5 cm", 2),),
     parameters=PARAMETERS,
     episode_length=40,

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from envs.base import Varying
 from sgft_jax import mesh
 from sgft_jax.io import checkpoint
 from sgft_jax.io.jsonfile import differences, read_json, write_json
@@ -64,12 +65,16 @@ def load_prior(
     return Prior(container(**{name: tree.get(name) for name in container._fields}), card)
 
 
-def previous_actions(folders: Sequence[Path]) -> int:
-    """How many previous actions priors that are used together read; 0 where there is none."""
-    for folder in folders:
-        card = _home(folder) / CARD
-        return read_json(card).get("previous_actions", 0) if card.exists() else 0
-    return 0
+def observed(card: Mapping[str, Any]) -> dict[str, Any]:
+    """What the policy of a prior reads beside measurements, as arguments of `envs.make`."""
+    system = tuple(Varying(**own) for own in card.get("system", []))
+    return {"previous_actions": card.get("previous_actions", 0), "system": system}
+
+
+def observed_by(folders: Sequence[Path]) -> dict[str, Any]:
+    """The same for priors in folders that are used together; nothing where there is no prior."""
+    card = _home(folders[0]) / CARD if folders else None
+    return observed(read_json(card) if card is not None and card.exists() else {})
 
 
 def load_priors(folders: Sequence[Path], env: Any) -> list[Prior]:
@@ -108,7 +113,11 @@ def algorithm_of(card: Mapping[str, Any]) -> str:
 def _structure(card: Mapping[str, Any]) -> dict[str, Any]:
     """What must be equal for policies that run in one program."""
     own = {name: card.get(name) for name in ("network", "gamma", "ensemble_size", "plan")}
-    return own | {"algorithm": algorithm_of(card), "previous_actions": card.get("previous_actions", 0)}
+    return own | {
+        "algorithm": algorithm_of(card),
+        "previous_actions": card.get("previous_actions", 0),
+        "system": card.get("system", []),
+    }
 
 
 def _container(folder: Path, algorithm: str) -> Any:

@@ -110,6 +110,7 @@ class SACParams(NamedTuple):
     dynamics: the delta-dynamics ensemble, leading axis = member.
     normalizer: statistics of the random-action data; every network above reads normalised observations.
     distortion: what the real system makes of commands, None = nothing.
+    system: [k] what the actor is told of the system at the end of its observation, None = what stands there.
     """
 
     actor: PyTree
@@ -118,6 +119,7 @@ class SACParams(NamedTuple):
     dynamics: PyTree
     normalizer: Normalizer
     distortion: Distortion | None = None
+    system: Array | None = None
 
 
 class SACState(struct.PyTreeNode):

@@ -14,7 +14,7 @@ from sgft_jax.models.networks import make_dynamics
 from sgft_jax.policies import network_of
 from sgft_jax.types import Batch, Prior, SimulatedData
 
-TURN = Distortion(0.7 * jnp.array([[0.8, -0.6], [0.6, 0.8]]), jnp.array([0.1, 0.0]))
+TURN = Distortion(0.7 * jnp.array([[0.8, -0.6], [0.6, 0.8]]), jnp.array([0.1, 0.0]), jnp.zeros(2))
 N = 30
 
 
@@ -34,7 +34,7 @@ def steps(params, key, what, n=N):
 def case():
     plain = tuners.build("sac", identify=True, replay_capacity=64)
     params = tuners.prior().params
-    data = SimulatedData(lambda key, n: steps(params, key, distortion.none(2), n), jnp.zeros(1))
+    data = SimulatedData(lambda key, n: steps(params, key, distortion.none(2, 2), n), jnp.zeros(1))
     init = jax.jit(lambda params, key: plain.init(params, key, data))
     fine = plain._replace(init=init, observe=jax.jit(plain.observe), act=jax.jit(plain.act))
     return tuners.Case(plain, fine, data, params, [0])
@@ -54,7 +54,7 @@ def test_one_rollout_through_the_prior_s_model_tells_the_distortion(learned):
 
 def test_where_nothing_differs_commands_stay_as_they_are(case):
     state = case.fine.init(case.params, jax.random.key(0))
-    rows = steps(case.params, jax.random.key(1), distortion.none(2))
+    rows = steps(case.params, jax.random.key(1), distortion.none(2, 2))
     state = case.fine.observe(state, rows, jnp.ones(N, bool), jnp.float32(0))
     np.testing.assert_array_equal(state.interface.distortion.matrix, np.eye(2))
     np.testing.assert_array_equal(state.interface.distortion.bias, 0.0)

@@ -25,7 +25,13 @@ def test_the_list_of_methods_is_complete():
     }  # fmt: skip
     assert {name for name, method in METHODS.items() if method.prior == "tdmpc2"} == tuners.PLANNERS
     tuned = {name: tuners.build(name) for name in METHODS}
-    assert {name for name, fine in tuned.items() if fine.simulation} == {"sac-online", "rlpd", "iql", "sgft-relabel"}
+    assert {name for name, fine in tuned.items() if fine.simulation} == {
+        "sac-online",
+        "rlpd",
+        "iql",
+        "sgft-relabel",
+        "sysid",
+    }
     assert {name for name, fine in tuned.items() if fine.initial_policy} == {"rlpd", "iql", "sgft-tdmpc2-code"}
     assert all(method.name == name and method.description and method.source for name, method in METHODS.items())
 
@@ -146,7 +152,7 @@ OTHER = {
     "tau": 0.2, "alpha": 0.3, "expectile": 0.9, "beta": 1.0, "reward_scale": 2.0, "simulated_share": 0.25,
     "simulated_share_end": 0.4, "simulated_ladder": 0.1, "critic_network": dataclasses.replace(tuners.NET, hidden=(4,)),
     "branch_noise": 0.1, "clip_shaped": 0.01, "plan_noise": 0.1, "explore_noise": 0.1,
-    "anchor": 0.5,
+    "anchor": 0.5, "fit": "dropo", "rows": 5,
 }  # fmt: skip
 GIVEN = {
     "lr_warmup": {"reset_critic": False},
@@ -173,7 +179,8 @@ def program(case, state):
     learn = jax.make_jaxpr(lambda state, key: case.plain.learn(state, key, 2, data))
     act = jax.make_jaxpr(lambda *x: case.plain.act(*x, explore=True))
     args = state, jax.random.key(0)
-    return f"{learn(*args)} {act(state, case.plain.init_carry(), jnp.zeros(2), args[1])}"
+    seen = jax.make_jaxpr(case.plain.observe)(state, tuners.episode(jax.random.key(0)), jnp.ones(T, bool))
+    return f"{seen} {learn(*args)} {act(state, case.plain.init_carry(), jnp.zeros(2), args[1])}"
 
 
 def facts(fine):

@@ -39,7 +39,7 @@ class Point(NamedTuple):
     obs_dim: int = 2
     act_dim: int = 2
     measured_dim: int = 2
-    previous_actions: int = 0
+    sensor_errors: tuple[float, ...] = (0.0, 0.0)
     cartesian: bool = True
     episode_length: int = T
     score: str = "success"
@@ -72,7 +72,8 @@ def prior(algorithm="sac"):
     else:
         init = sac.make_sac(sac.SACConfig(2, 2, network=NET, ensemble_size=2)).init
         params = sac.extract_params(jax.jit(init)(jax.random.key(7)))
-        card = {"algorithm": "sac", "network": jsonable(NET), "gamma": 0.9}
+        told = [{"name": "wind", "index": 0, "low": -1.0, "high": 1.0}]  # `sysid` takes the last number for it
+        card = {"algorithm": "sac", "network": jsonable(NET), "gamma": 0.9, "system": told}
     return Prior(shaken(params)._replace(normalizer=statistics), card)
 
 

@@ -20,9 +20,9 @@ def walled(obs, action):
     return jnp.clip(obs[:2] + STEP * action, -WALL, WALL) - obs[:2]
 
 
-def turned(angle, scale, bias):
+def turned(angle, scale, bias, offset=(0.0, 0.0)):
     c, s = np.cos(angle), np.sin(angle)
-    return Distortion(scale * jnp.array([[c, -s], [s, c]]), jnp.array(bias))
+    return Distortion(scale * jnp.array([[c, -s], [s, c]]), jnp.array(bias), jnp.array(offset))
 
 
 def steps(truth, key, n=40, noise=1e-3):
@@ -36,7 +36,7 @@ def steps(truth, key, n=40, noise=1e-3):
 
 def fit(rows, held=None, **given):
     held = jnp.ones(len(rows.reward), bool) if held is None else held
-    given = {"turns": True} | given
+    given = {"turns": True, "errors": (0.0, 0.0)} | given
     return jax.jit(lambda: distortion.fit(walled, rows, held, jnp.full(2, 1e-3), **given))()
 
 
@@ -53,6 +53,19 @@ def test_a_system_that_takes_commands_as_they_are_meant_gives_no_evidence(key):
     found, evidence = fit(steps(turned(0.0, 1.0, [0.0, 0.0]), key))
     np.testing.assert_allclose(found.matrix, np.eye(2), atol=0.05)
     assert evidence < 10
+
+
+def test_walls_tell_that_a_camera_is_off(key):
+    """The hand stops where it should not: what is measured is not where it is."""
+    truth = turned(0.3, 0.8, [0.0, 0.0], [0.06, 0.0])
+    rows = steps(truth._replace(offset=jnp.zeros(2)), key, n=120)
+    rows = rows._replace(obs=rows.obs + truth.offset[None], next_obs=rows.next_obs + truth.offset[None])
+    found, evidence = fit(rows, errors=(0.05, 0.05))
+    np.testing.assert_allclose(found.offset[0], 0.06, atol=0.01)
+    np.testing.assert_allclose(found.matrix, truth.matrix, atol=0.05)
+    assert evidence > fit(rows)[1] + 20
+    assert jnp.abs(fit(rows, errors=(0.01, 0.01))[0].offset).max() <= 0.02  # twice the error at most
+    np.testing.assert_array_equal(fit(rows)[0].offset, 0.0)
 
 
 def test_rows_that_are_not_there_change_nothing(key):
@@ -76,9 +89,9 @@ def test_commands_undo_the_distortion_as_far_as_they_can():
     action = jnp.array([0.3, -0.2])
     np.testing.assert_allclose(truth.meaning(truth.command(action)), action, atol=1e-6)
     assert jnp.abs(truth.command(jnp.ones(2))).max() == 1.0  # more cannot be commanded
-    np.testing.assert_array_equal(distortion.none(2).command(action), action)
-    seen = truth.meaning_in(jnp.array([5.0, *truth.command(action), 0.0, 0.0]), 2)
-    np.testing.assert_allclose(seen, [5.0, *action, *truth.bias], atol=1e-6)
+    np.testing.assert_array_equal(distortion.none(2, 1).command(action), action)
+    seen = truth._replace(offset=jnp.array([2.0])).seen(jnp.array([5.0, *truth.command(action), 0.0, 0.0]))
+    np.testing.assert_allclose(seen, [3.0, *action, *truth.bias], atol=1e-6)
 
 
 def test_it_is_what_effects_do_to_actions():
@@ -86,7 +99,9 @@ def test_it_is_what_effects_do_to_actions():
     env = envs.make("push", "c")
     values = {"action_rotation": 0.5, "action_scale": [0.6, 1.2], "action_bias": [0.1, -0.1]}
     effects = envs.effects.make_range(env, values).low
-    own = distortion.turned_and_scaled(effects.action_rotation, jnp.log(effects.action_scale), effects.action_bias)
+    own = distortion.turned_and_scaled(
+        effects.action_rotation, jnp.log(effects.action_scale), effects.action_bias, jnp.zeros(4)
+    )
     action = jnp.array([0.4, -0.7])
     np.testing.assert_allclose(own.meaning(action), envs.effects.distort(effects, action), rtol=1e-5)
 
@@ -99,5 +114,7 @@ def test_one_rollout_of_pushing_tells_how_commands_are_turned_and_scaled():
     uniform = lambda carry, obs, key: (jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0), carry)  # noqa: E731
     played = jax.jit(lambda key: play_episode(env, pool, uniform, (), key, gamma=0.9))(key)
     free = lambda obs, action: 0.05 * action  # noqa: E731
-    found, evidence = distortion.fit(free, played.transitions, played.valid, jnp.full(2, 1e-3), turns=True)
+    found, evidence = distortion.fit(
+        free, played.transitions, played.valid, jnp.full(2, 1e-3), turns=True, errors=(0.0,) * 4
+    )
     assert np.linalg.norm(found.matrix - turned(0.7, 0.6, [0.0, 0.0]).matrix) < 0.1 and evidence > 20

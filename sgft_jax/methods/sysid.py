@@ -1,0 +1,116 @@
+"""System identification: fits what varies in simulation to the real rollouts, and tells it to a policy that knows it.
+
+No network learns. The prior's dynamics models are told the system too, so they say how likely real steps are in each.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from sgft_jax import checks
+from sgft_jax.methods.options import LoopOptions
+from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
+
+_ROWS = {"map": 320, "dropo": 80}  # what `rows` is if it is left open; DROPO takes two trajectories
+_SIMULATED = 2048  # rows that tell how far the models are off in simulation
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of `sysid`."""
+
+    fit: Literal["map", "dropo"] = "map"
+    """map: the most probable system. dropo: the mean of a distribution over systems (Tiboni et al. 2023)."""
+    rows: int | None = None
+    """Real transitions that are fitted, the first ones; None = 320 for map, 80 for dropo."""
+    initial_rollouts: int = 1
+    """Real rollouts before the first fit."""
+
+    def __post_init__(self) -> None:
+        checks.at_least(self, 1, "rows", "initial_rollouts")
+
+
+def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
+    """The finetuner; a prior that is told nothing has nothing to fit and acts as it is."""
+    import jax
+    import jax.numpy as jnp
+
+    from sgft_jax.data import sources
+    from sgft_jax.finetuner import FinetuneState, Parts, assemble
+    from sgft_jax.learners.idle import IDLE
+    from sgft_jax.learners.sac import SACParams
+    from sgft_jax.methods.options import card_of
+    from sgft_jax.models import dynamics, system
+    from sgft_jax.models.networks import make_dynamics
+    from sgft_jax.models.robust import spread_of
+    from sgft_jax.policies import network_of, sac_policy
+    from sgft_jax.transforms import compose
+    from sgft_jax.types import Array, Batch, Key, Metrics, PyTree, SimulatedData, UserError
+
+    card = card_of(prior)
+    network, varying = network_of(card), card.get("system", [])
+    loop = LoopOptions(initial_rollouts=config.initial_rollouts)
+    rows_fitted = min(config.rows or _ROWS[config.fit], loop.replay_capacity)
+    model = make_dynamics(task.obs_dim, task.act_dim, network)
+    policy = sac_policy(task.obs_dim, task.act_dim, network)
+
+    def change(params: SACParams, obs: Array, action: Array) -> Array:
+        after = dynamics.predict(model, params.dynamics, params.normalizer, obs, action).mean(axis=0)
+        return (after - obs)[: task.measured_dim]
+
+    def start(params: SACParams, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
+        del key
+        if simulated is None:
+            raise UserError("sysid needs simulated transitions, which tell how far the models are off")
+        rows = simulated.draw(jax.random.key(0), _SIMULATED)
+        after = (rows.next_obs - rows.obs)[:, : task.measured_dim]
+        missed = after - jax.vmap(lambda row: change(params, row.obs, row.action))(rows)
+        spread = spread_of(missed, after, jnp.ones(_SIMULATED, bool))
+        return (spread, system.unknown(len(varying))), params
+
+    def observed(state: FinetuneState) -> FinetuneState:
+        if not varying:
+            return state
+        spread, _ = state.learner
+        held = jnp.arange(rows_fitted) < state.replay.size
+        data = jax.tree.map(lambda x: x[:rows_fitted], state.replay.data)
+        predict = lambda obs, action: change(state.frozen, obs, action)  # noqa: E731
+        given = (predict, data, held, spread, len(varying))
+        found = system.dropo(*given) if config.fit == "dropo" else system.most_probable_system(*given)
+        return state._replace(learner=(spread, found))
+
+    def export(state: FinetuneState) -> SACParams:
+        return state.frozen._replace(system=state.learner[1].mean) if varying else state.frozen
+
+    def act(
+        state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
+    ) -> tuple[Array, PyTree]:
+        return policy.act(export(state), carry, obs, key, explore=explore)
+
+    def tell(learner: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
+        """Learns nothing, says what it has found, in raw units."""
+        del batch, key
+        metrics = {}
+        for v, mean in zip(varying, learner[1].mean, strict=True):
+            metrics[f"system/{v['name']}_{v['index']}"] = v["low"] + 0.5 * (1.0 + mean) * (v["high"] - v["low"])
+        return learner, metrics
+
+    parts = Parts(
+        learner=IDLE._replace(update=tell),
+        start=start,
+        init_carry=policy.init_carry,
+        act=act,
+        export=export,
+        policy=policy,
+        source=lambda state: sources.real_rows(loop.batch_size),
+        transform=compose(),
+        observed=observed,
+    )
+    finetuner = assemble(parts, loop, task, simulation=Simulation(20_000, 0.6))
+    # One update after a rollout says what was found; more would say it again.
+    return finetuner._replace(updates_per_rollout=1)
+
+
+METHOD = Method(
+    "sysid", "model-based", "fits parameters and effects, and tells them to a policy that knows them",
+    "DROPO (Tiboni 2023)", Config, build, sees_system=True,
+)  # fmt: skip

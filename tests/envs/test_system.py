@@ -1,0 +1,75 @@
+"""Observations that tell the system: what they hold, what they leave out, and that real systems keep silent."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toy
+
+import envs
+from envs.base import Varying
+from envs.history import with_previous_actions
+from envs.rollout import play_episode
+from envs.system import blurred, concealed, varying, with_system
+from sgft_jax.types import UserError
+
+TOY = toy.make()
+EFFECTS = {"action_scale": [[0.5, 1.0], [1.5, 1.0]], "action_rotation": [-0.4, 0.4], "obs_noise": 0.01}
+SYSTEM = varying(TOY, {"friction": 4.0}, EFFECTS)
+SEEN = with_system(with_previous_actions(TOY, 1), SYSTEM)
+
+
+def world(effects, params=None):
+    worlds = envs.sample_worlds(SEEN, jax.random.key(0), 1, params=params or {}, effects=effects)
+    return jax.tree.map(lambda x: x[0], worlds)
+
+
+def test_what_varies_is_listed_and_constants_are_dropped():
+    assert (
+        Varying("mass", 0, 0.8, 1.2),
+        Varying("action_scale", 0, 0.5, 1.5),
+        Varying("action_rotation", 0, pytest.approx(-0.4), pytest.approx(0.4)),
+    ) == SYSTEM
+    assert [v.name for v in varying(TOY)] == ["mass", "friction"]
+    with pytest.raises(UserError, match="varies"):
+        varying(TOY, {"mass": 1.0, "friction": 4.0})
+
+
+def test_observations_end_with_the_system_of_the_episode_scaled_and_clipped(key):
+    there = world({"action_scale": [0.75, 1.0], "action_rotation": 0.8}, {"mass": 1.1})
+    state = SEEN.reset(there, key)
+    for _ in range(2):
+        np.testing.assert_allclose(state.obs[-3:], [0.5, -0.5, 1.0], atol=1e-5)
+        state = SEEN.step(there, state, jnp.ones(2), key)
+    np.testing.assert_array_equal(state.obs[-5:-3], 1.0)  # the previous action, before them
+    assert SEEN.measured == TOY.observation and SEEN.obs_dim == TOY.obs_dim + 2 + 3
+
+
+def test_what_an_episode_draws_is_told(key):
+    states = jax.vmap(SEEN.reset, (None, 0))(world(EFFECTS), jax.random.split(key, 8))
+    np.testing.assert_allclose(states.obs[:, -1], states.effects.action_rotation / 0.4, atol=1e-5)
+    assert states.obs[:, -1].std() > 0.1
+
+
+def test_a_real_system_tells_the_middle_and_is_the_same_otherwise(key):
+    pool = envs.sample_worlds(SEEN, key, 2, effects=EFFECTS)
+    steer = lambda carry, obs, key: (jnp.tanh(-obs[:2]), carry)  # noqa: E731
+    open_, silent = (play_episode(env, pool, steer, (), key, gamma=0.9) for env in (SEEN, concealed(SEEN)))
+    np.testing.assert_array_equal(silent.transitions.next_obs[:, -3:], 0.0)
+    np.testing.assert_array_equal(open_.transitions.obs[:, :-3], silent.transitions.obs[:, :-3])
+    np.testing.assert_array_equal(open_.transitions.reward, silent.transitions.reward)
+
+
+def test_noise_is_on_what_is_told_alone_and_new_at_every_step(key):
+    there, noisy = world({"action_scale": [0.75, 1.0], "action_rotation": 0.0}, {"mass": 1.1}), blurred(SEEN, 0.3)
+    states = [noisy.reset(there, key)]
+    for i in range(400):
+        states.append(noisy.step(there, states[-1], jnp.zeros(2), jax.random.fold_in(key, i)))
+    told = np.array([state.obs[-3:] for state in states])
+    np.testing.assert_allclose(told.mean(axis=0), [0.5, -0.5, 0.0], atol=0.07)
+    np.testing.assert_allclose(told.std(axis=0), 0.3, atol=0.05)
+    assert jnp.abs(states[-1].true_obs[: TOY.obs_dim] - states[-1].obs[: TOY.obs_dim]).max() < 0.1
+
+
+def test_nothing_to_tell_is_the_task_itself():
+    assert with_system(TOY, ()) is TOY and concealed(TOY) is TOY
