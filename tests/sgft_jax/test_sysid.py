@@ -64,7 +64,7 @@ def found(request, prior):
     data = SimulatedData(lambda key, n: steps(prior, key, told=True, n=n, noise=0.003), jnp.zeros(1))
     state = jax.jit(lambda params, key: fine.init(params, key, data))(prior.params, jax.random.key(0))
     rows = steps(prior, jax.random.key(1), told=False, noise=0.003)
-    return fine, state, jax.jit(fine.observe)(state, rows, jnp.ones(N, bool)), data
+    return fine, state, jax.jit(fine.observe)(state, rows, jnp.ones(N, bool), jnp.float32(0.0)), data
 
 
 def test_one_rollout_tells_the_system(found):
