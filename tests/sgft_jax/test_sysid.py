@@ -77,7 +77,7 @@ def test_rows_that_do_not_count_change_nothing(found, prior):
     fine, before, after, _ = found
     rows = steps(prior, jax.random.key(1), told=False, noise=0.003)
     more = jax.tree.map(lambda x: jnp.concatenate([x, 9.0 + x]), rows)
-    state = jax.jit(fine.observe)(before, more, jnp.arange(2 * N) < N)
+    state = jax.jit(fine.observe)(before, more, jnp.arange(2 * N) < N, jnp.float32(0.0))
     np.testing.assert_allclose(state.learner[1].mean, after.learner[1].mean, atol=1e-3)
 
 
