@@ -179,7 +179,8 @@ def program(case, state):
     learn = jax.make_jaxpr(lambda state, key: case.plain.learn(state, key, 2, data))
     act = jax.make_jaxpr(lambda *x: case.plain.act(*x, explore=True))
     args = state, jax.random.key(0)
-    seen = jax.make_jaxpr(case.plain.observe)(state, tuners.episode(jax.random.key(0)), jnp.ones(T, bool))
+    rollout = tuners.episode(jax.random.key(0)), jnp.ones(T, bool), jnp.float32(0)
+    seen = jax.make_jaxpr(case.plain.observe)(state, *rollout)
     return f"{seen} {learn(*args)} {act(state, case.plain.init_carry(), jnp.zeros(2), args[1])}"
 
 
