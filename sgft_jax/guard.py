@@ -49,7 +49,7 @@ class Evidence(NamedTuple):
 class Guard(NamedTuple):
     """reference, challenger: the evidence for either. worst, best: [] the extreme scores known.
 
-    deployed: [] bool, whether the challenger is.
+    deployed: [] bool, whether the challenger is. replaced: [] bool, whether the last rollout made it the reference.
     """
 
     reference: Evidence
@@ -57,6 +57,7 @@ class Guard(NamedTuple):
     worst: Array
     best: Array
     deployed: Array
+    replaced: Array
 
 
 class Guarded(NamedTuple):
@@ -79,30 +80,22 @@ def start(score: str) -> Guard:
         jnp.float32(worst),
         jnp.float32(best),
         jnp.zeros((), bool),
+        jnp.zeros((), bool),
     )
 
 
 def scored(guard: Guard, score: Array) -> Guard:
-    """After a training rollout with this score [] by the policy that is deployed."""
+    """After a training rollout with this score [] by the policy that is deployed.
+
+    If the challenger becomes the reference, as it was in this rollout, its evidence counts for both.
+    """
     add = lambda evidence, mine: Evidence(evidence.total + mine * score, evidence.weight + mine)  # noqa: E731
-    challenger = guard.deployed.astype(jnp.float32)
-    return guard._replace(
-        reference=add(guard.reference, 1 - challenger),
-        challenger=add(guard.challenger, challenger),
-        worst=jnp.minimum(guard.worst, score),
-        best=jnp.maximum(guard.best, score),
-    )
-
-
-def replaces(guard: Guard) -> Array:
-    """[] bool, whether the challenger as it has just played is to become the reference."""
-    total, weight = guard.challenger
-    return (weight > 0) & ((total + guard.worst) / (weight + 1) > _mean(guard.reference))
-
-
-def replaced(guard: Guard) -> Guard:
-    """The challenger has become the reference; what is known of it stays known of both."""
-    return guard._replace(reference=guard.challenger)
+    mine = guard.deployed.astype(jnp.float32)
+    reference, challenger = add(guard.reference, 1 - mine), add(guard.challenger, mine)
+    worst, best = jnp.minimum(guard.worst, score), jnp.maximum(guard.best, score)
+    proven = (challenger.total + worst) / (challenger.weight + 1) > _mean(reference)
+    replaced = guard.deployed & proven
+    return Guard(_choose(replaced, challenger, reference), challenger, worst, best, guard.deployed, replaced)
 
 
 def learned(guard: Guard) -> Guard:
@@ -147,9 +140,10 @@ def guarded(inner: Finetuner, first: Callable[[PyTree, PyTree], PyTree], *, scor
         return inner.policy.act(export(state), carry, obs, key, explore=explore)
 
     def observe(state: Guarded, rows: Transition, valid: Array, score: Array) -> Guarded:
-        return state._replace(
-            agent=inner.observe(state.agent, rows, valid, score), guard=scored(state.guard, jnp.float32(score))
-        )
+        guard = scored(state.guard, jnp.float32(score))
+        # What has played: `inner.observe` may change the policy too, as identification does.
+        reference = _choose(guard.replaced, inner.export(state.agent), state.reference)
+        return Guarded(inner.observe(state.agent, rows, valid, score), reference, guard)
 
     def learn(
         state: Guarded, key: Key, updates: int, simulated: SimulatedData | None = None, *, offline: bool = False
@@ -157,13 +151,11 @@ def guarded(inner: Finetuner, first: Callable[[PyTree, PyTree], PyTree], *, scor
         agent, metrics = inner.learn(state.agent, key, updates, simulated, offline=offline)
         if offline:  # no rollout has been played
             return state._replace(agent=agent), metrics
-        better = replaces(state.guard)
-        reference = _choose(better, inner.export(state.agent), state.reference)
-        guard = learned(_choose(better, replaced(state.guard), state.guard))
+        guard = learned(state.guard)
         expected = dict(zip(("guard/expected_reference", "guard/expected_challenger"), means(guard), strict=True))
-        flags = {"guard/challenger": guard.deployed, "guard/replaced": better}
+        flags = {"guard/challenger": guard.deployed, "guard/replaced": guard.replaced}
         metrics |= expected | {name: x.astype(jnp.float32) for name, x in flags.items()}
-        return Guarded(agent, reference, guard), metrics
+        return Guarded(agent, state.reference, guard), metrics
 
     return inner._replace(
         init=init, init_carry=inner.policy.init_carry, act=act, observe=observe, learn=learn, export=export

@@ -24,6 +24,9 @@ class Config:
     """Real transitions that are fitted, the first ones; None = 320 for map, 80 for dropo."""
     initial_rollouts: int = 1
     """Real rollouts before the first fit."""
+    guard: bool = False
+    """Deploy a fit only while its real rollouts say that it is better than the policy that knows nothing of the system,
+    or than the best fit since (sgft_jax/guard.py)."""
 
     def __post_init__(self) -> None:
         checks.at_least(self, 1, "rows", "initial_rollouts")
@@ -48,7 +51,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
     card = card_of(prior)
     network, varying = network_of(card), card.get("system", [])
-    loop = LoopOptions(initial_rollouts=config.initial_rollouts)
+    loop = LoopOptions(initial_rollouts=config.initial_rollouts, guard=config.guard)
     rows_fitted = min(config.rows or _ROWS[config.fit], loop.replay_capacity)
     model = make_dynamics(task.obs_dim, task.act_dim, network)
     policy = sac_policy(task.obs_dim, task.act_dim, network)
