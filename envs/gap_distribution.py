@@ -7,6 +7,8 @@ effects by name, with what they are drawn from, uniformly:
     action_bias = { each = [-0.3, 0.3] }                 a number for each axis of a vector
     action_scale = { common = [0.4, 1], each = [0.4, 1] }    either, at even odds
     obs_bias = { puck_xy = [-0.02, 0.02] }               a number for each axis of these entries, nothing for the others
+    obs_bias = { puck_xy = { length = [0.005, 0.02] } }  a vector of that length in any direction, instead of a box
+    together = true                                      all items of this family are drawn, not some of them
 
 A gap draws one to four of the families and of each of these one to all of its items, any number as likely as another.
 """
@@ -28,17 +30,27 @@ from sgft_jax.types import UserError, unknown
 MOST_FAMILIES = 4
 ATTEMPTS = 100  # to draw a gap that is possible
 DIGITS = 3  # that a drawn number keeps, so that a file says exactly what was drawn and a person can read it
-_COMMON, _EACH = "common", "each"
+_COMMON, _EACH, _LENGTH, _TOGETHER = "common", "each", "length", "together"
+
+
+class Range(NamedTuple):
+    """Ends of a uniform draw: of each number, or of the length of the vector that they make."""
+
+    low: float
+    high: float
+    of_length: bool = False
 
 
 class Distribution(NamedTuple):
-    """Families by name; a family is items by name and how each is drawn: {how: (low, high)}.
+    """Families by name; a family is items by name and how each is drawn: {how: range}.
 
-    how: "common", "each" or an entry's name, see above. source: the file, for messages.
+    how: "common", "each" or an entry's name, see above. together: the families of which all items are drawn. source:
+    the file, for messages.
     """
 
     source: str
-    families: Mapping[str, Mapping[str, Mapping[str, tuple[float, float]]]]
+    families: Mapping[str, Mapping[str, Mapping[str, Range]]]
+    together: frozenset[str]
 
 
 def load(env: Env, path: Path | None = None) -> Distribution:
@@ -54,12 +66,16 @@ def load(env: Env, path: Path | None = None) -> Distribution:
         raise UserError(f"{source}: not valid TOML: {error}") from None
     if not tables:
         raise UserError(f"{source}: has no family; write a table for each, with items and their ranges")
-    families = {}
-    for family, items in tables.items():
-        if not isinstance(items, dict) or not items:
-            raise UserError(f"{source}: '{family}' must be a table of items and their ranges, got {items!r}")
+    families, together = {}, set()
+    for family, table in tables.items():
+        items = {name: given for name, given in table.items() if name != _TOGETHER} if isinstance(table, dict) else {}
+        if not items:
+            raise UserError(f"{source}: '{family}' must be a table of items and their ranges, got {table!r}")
         families[family] = {name: _item(env, name, given, f"{source} [{family}]") for name, given in items.items()}
-    return Distribution(source, families)
+        if not isinstance(whole := table.get(_TOGETHER, False), bool):
+            raise UserError(f"{source} [{family}]: '{_TOGETHER}' must be true or false, got {whole!r}")
+        together |= {family} if whole else set()
+    return Distribution(source, families, frozenset(together))
 
 
 def draw(env: Env, distribution: Distribution, seed: int, n: int) -> list[Gap]:
@@ -87,7 +103,7 @@ def _table(env: Env, distribution: Distribution, rng: np.random.Generator) -> di
     table: dict[str, Any] = {"families": chosen, "params": {}, "effects": {}}
     for family in chosen:
         items = distribution.families[family]
-        for name in _some(rng, list(items), len(items)):
+        for name in list(items) if family in distribution.together else _some(rng, list(items), len(items)):
             kind = "effects" if name in Effects._fields else "params"
             table[kind][name] = _value(rng, items[name], entries_of(env, name))
     return table
@@ -99,34 +115,47 @@ def _some(rng: np.random.Generator, names: list[str], most: int) -> list[str]:
     return [names[i] for i in sorted(rng.choice(len(names), count, replace=False))]
 
 
-def _value(rng: np.random.Generator, ways: Mapping[str, tuple[float, float]], entries: tuple[Entry, ...]) -> Value:
+def _value(rng: np.random.Generator, ways: Mapping[str, Range], entries: tuple[Entry, ...]) -> Value:
     """What a gap says of an item."""
     if not set(ways) & {_COMMON, _EACH}:
         sizes = {e.name: e.size for e in entries}
-        return {name: _numbers(rng, ends, sizes[name]) for name, ends in ways.items()}
+        return {name: _numbers(rng, given, sizes[name]) for name, given in ways.items()}
     way = list(ways)[rng.integers(len(ways))]
     return _numbers(rng, ways[way], 1 if way == _COMMON else sum(e.size for e in entries))
 
 
-def _numbers(rng: np.random.Generator, ends: tuple[float, float], size: int) -> float | list[float]:
-    drawn = [float(f"{x:.{DIGITS}g}") for x in rng.uniform(*ends, size)]
-    return drawn if size > 1 else drawn[0]
+def _numbers(rng: np.random.Generator, given: Range, size: int) -> float | list[float]:
+    drawn = rng.uniform(given.low, given.high, 1 if given.of_length else size)
+    if given.of_length:
+        direction = rng.normal(size=size)
+        drawn = drawn * direction / np.linalg.norm(direction)
+    rounded = [float(f"{x:.{DIGITS}g}") for x in drawn]
+    return rounded if size > 1 else rounded[0]
 
 
-def _item(env: Env, name: str, given: Any, where: str) -> dict[str, tuple[float, float]]:
+def _item(env: Env, name: str, given: Any, where: str) -> dict[str, Range]:
     """How an item is drawn. Raises UserError for an unknown name and for what is no range."""
     if name not in Effects._fields and name not in [p.name for p in env.parameters]:
         raise UserError(f"{where}: {misnamed(env, name)}")
     ways, entries = given if isinstance(given, dict) else {_COMMON: given}, [e.name for e in entries_of(env, name)]
     allowed = [_COMMON, *([_EACH, *entries] if entries else [])]
-    for way, ends in ways.items():
+    for way in ways:
         if way not in allowed:
             raise UserError(f"{where} {unknown(name, way, allowed)}")
-        if not _is_range(ends):
-            raise UserError(f"{where}: '{name}' needs a range [low, high], got {ends!r}")
     if not ways or (set(ways) & {_COMMON, _EACH} and set(ways) & set(entries)):
         raise UserError(f"{where}: '{name}' needs ranges of '{_COMMON}' and '{_EACH}', or of entries, got {given!r}")
-    return {way: (float(low), float(high)) for way, (low, high) in ways.items()}
+    return {way: _range(ends, f"{where}: '{name}'", named=way in entries) for way, ends in ways.items()}
+
+
+def _range(given: Any, where: str, *, named: bool) -> Range:
+    """named: of an entry, of which the length may be given."""
+    of_length = named and isinstance(given, dict) and set(given) == {_LENGTH}
+    ends = given[_LENGTH] if of_length else given
+    if not _is_range(ends):
+        raise UserError(f"{where} needs a range [low, high], got {given!r}")
+    if of_length and ends[0] < 0:
+        raise UserError(f"{where}: a length must not be negative, got {ends!r}")
+    return Range(float(ends[0]), float(ends[1]), of_length)
 
 
 def _is_range(ends: Any) -> bool:

@@ -3,6 +3,7 @@
 import tomllib
 from importlib import resources
 
+import numpy as np
 import pytest
 import toy
 
@@ -64,6 +65,23 @@ def test_all_families_and_items_are_drawn_and_the_gap_says_which(distribution):
     assert all(len(gap.effects.get("action_bias", [0, 0])) == 2 for gap in drawn)
 
 
+def test_a_vector_of_some_length_points_anywhere(tmp_path):
+    """A camera's error of at least 1 cm, beside one of the velocity."""
+    text = "[a]\nobs_bias = { xy = { length = [0.01, 0.02] }, velocity = { length = [0.3, 0.3] } }"
+    drawn = gap_distribution.draw(ENV, gap_distribution.load(ENV, write(tmp_path, text)), 0, 100)
+    errors = np.array([gap.effects["obs_bias"]["xy"] for gap in drawn])
+    lengths, angles = np.linalg.norm(errors, axis=1), np.arctan2(*errors.T)
+    assert errors.shape == (100, 2) and 0.0099 < lengths.min() < 0.011 and 0.019 < lengths.max() < 0.0201
+    quarters = np.histogram(angles, 4, (-np.pi, np.pi))[0]
+    assert quarters.min() > 10  # of 25, standard deviation 4.3
+
+
+def test_a_family_may_be_drawn_as_a_whole(tmp_path):
+    whole = gap_distribution.load(ENV, write(tmp_path, TEXT.replace("[dynamics]", "[dynamics]\ntogether = true")))
+    drawn = [gap for gap in gap_distribution.draw(ENV, whole, 0, 60) if "dynamics" in gap.families]
+    assert len(drawn) > 20 and all(set(gap.params) == {"mass", "friction"} for gap in drawn)
+
+
 def test_a_file_says_exactly_what_was_drawn(distribution, tmp_path):
     drawn = gap_distribution.draw(ENV, distribution, 7, 40)
     path = write(tmp_path, gaps.to_toml(drawn))
@@ -94,6 +112,11 @@ def test_what_is_impossible_is_drawn_again(distribution):
         ("[a]\nmass = 2", "'mass' needs a range \\[low, high\\], got 2"),
         ("[a]\nmass = [2, 1]", "'mass' needs a range"),
         ("[a]\nmass = { each = [1, 2] }", "mass: there is no 'each'"),
+        ("[a]\nmass = { length = [1, 2] }", "mass: there is no 'length'"),
+        ("[a]\naction_bias = { each = { length = [1, 2] } }", r"'action_bias' needs a range \[low, high\], got {'len"),
+        ("[a]\nobs_bias = { xy = { length = [-1, 2] } }", r"'obs_bias': a length must not be negative, got \[-1, 2\]"),
+        ("[a]\ntogether = true", "'a' must be a table of items"),
+        ("[a]\nmass = [1, 2]\ntogether = 1", r"own.toml \[a\]: 'together' must be true or false, got 1"),
         ("[a]\nobs_bias = { yx = [1, 2] }", "obs_bias: there is no 'yx'. Choose from"),
         ("[a]\nobs_bias = { xy = [1, 2], each = [1, 2] }", "needs ranges of 'common' and 'each', or of entries"),
         ("[a", "own.toml: not valid TOML"),
@@ -120,12 +143,29 @@ def test_the_distributions_of_the_tasks_lie_within_the_bounds_and_reach_beyond_t
     for name in items(distribution):
         if name in Effects._fields:
             continue
-        ((low, high),) = distribution.families[items(distribution)[name]][name].values()
+        ((low, high, _),) = distribution.families[items(distribution)[name]][name].values()
         p = parameters[name]
         assert p.minimum <= low <= high <= p.maximum, name
         assert low < p.low or high > p.high, name
     drawn = gap_distribution.draw(env, distribution, 0, 40)
     assert {family for gap in drawn for family in gap.families} == set(distribution.families)
+    assert {len(gap.families) for gap in drawn} == set(range(1, min(4, len(distribution.families)) + 1))
+    assert gap_distribution.draw(env, distribution, 0, 40) == drawn
+
+
+@pytest.mark.parametrize("task", SHIPPED)
+def test_drawn_sensors_and_delays_are_possible_and_no_better_than_simulated(task):
+    env = envs.make(task, "c")
+    rms = lambda noise, share: noise * share**0.5  # noqa: E731
+    simulated = rms(env.training["obs_noise"], env.training["obs_noise_prob"])
+    drawn = [gap.effects for gap in gap_distribution.draw(env, gap_distribution.load(env), 1, 60)]
+    sensing = [effects for effects in drawn if {"obs_noise", "obs_noise_prob", "obs_bias"} & set(effects)]
+    assert len(sensing) > 15
+    for effects in sensing:
+        (error,) = effects["obs_bias"].values()
+        assert rms(effects["obs_noise"], effects["obs_noise_prob"]) >= simulated and np.linalg.norm(error) > 0.0029
+    delays = [effects.get("latency", 0.0) + effects.get("latency_jitter", 0.0) for effects in drawn]
+    assert max(delays) <= 0.1
 
 
 def test_every_distribution_is_that_of_a_task():
