@@ -42,6 +42,8 @@ class GapsArgs:
     reaches 90 % can be mastered."""
     judge_preset: str = DEFAULT_PRESET
     """Pretraining preset of that training; --config.* changes it."""
+    overwrite: bool = False
+    """With --draw: measure again what the table holds with other settings; default: refuse."""
     prior: Path | None = None
     """Folder of a prior, or of several (prior/seed-*); default: those of <out>/pretrain/<task>/<preset>."""
     preset: str = DEFAULT_PRESET
@@ -102,9 +104,9 @@ def _check_draw(args: GapsArgs) -> None:
         raise UserError(f"--draw is {args.draw}: must be at least 1")
     if args.draw and args.presets:
         raise UserError(f"--presets {args.presets[0]}: names gaps, and --draw draws them; give one of the two")
-    only = {"--distribution": args.distribution, "--plan": args.plan, "--judge": args.judge}
-    if odd := [option for option, value in only.items() if value and not args.draw]:
-        raise UserError(f"{odd[0]}: is for drawn gaps; say how many with --draw")
+    names = ("distribution", "plan", "judge", "overwrite")
+    if odd := [name for name in names if getattr(args, name) and not args.draw]:
+        raise UserError(f"--{odd[0]}: is for drawn gaps; say how many with --draw")
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ from sgft_jax import api
 from sgft_jax.analysis import stats
 from sgft_jax.finetuner import command_interface
 from sgft_jax.identify import Identified, Interface
-from sgft_jax.io.jsonfile import differences, read_json, write_json
+from sgft_jax.io.jsonfile import differences, jsonable, read_json, write_json
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.methods import get_method
 from sgft_jax.models.distortion import Distortion, none
@@ -35,6 +35,8 @@ SOLVED_AT_LEAST, FAILED_BELOW, TRIVIAL_AT_LEAST, ADMITTED_AT_LEAST = 0.8, 0.2, 0
 PLANNER = "sgft-mpc"
 PREVIOUS_ACTIONS = 2  # that the judge sees: a command that comes late is still in force, or was when the step began
 _ROLLOUT_SEED = 2**31 + 6  # of the rollouts that distortions are fitted to
+_MEASURED = {"zero_shot": ("zero_shot", "fit"), "plan": ("plan",), "judge": ("judge",)}  # of a line, by measurement
+_ELSE = "choose another --out, or remove the table"
 _SIMULATED = 8  # rollouts that tell how far the model is off in simulation; the real system is fitted to one
 
 
@@ -46,9 +48,11 @@ def run(args: GapsArgs, seeds: list[int], folders: list[Path]) -> dict[str, Any]
     path = args.out / "gaps" / task / f"seed-{args.seed}.toml"
     write_gaps(path, found)
     priors = load_priors(folders, env)
-    about = {"task": task, "seed": args.seed, "impl": env.impl, "episodes": args.episodes}
-    table = _Table(path.with_suffix(".json"), {**about, "priors": [digest(prior) for prior in priors]})
     everywhere = [gaps.find(task, SIM), *found]
+    table = Table(path.with_suffix(".json"), {"task": task, "seed": args.seed}, everywhere)
+    settings = _settings(env, args, priors, seeds)
+    for what in settings:
+        table.settle(what, settings[what], again=args.overwrite)
     if missing := [gap for gap in table.without("zero_shot", everywhere) if gap.name != SIM]:
         table.add(_zero_shot(env, missing, priors, args.episodes))
     if args.plan and (missing := table.without("plan", everywhere)):
@@ -70,28 +74,66 @@ def write_gaps(path: Path, found: Sequence[Gap]) -> None:
         path.write_text(f"# Drawn by python -m experiments.gaps --draw {len(found)}\n\n{gaps.to_toml(found)}")
 
 
-class _Table:
+def _settings(env: Env, args: GapsArgs, priors: Sequence[Prior], seeds: Sequence[int]) -> dict[str, dict[str, Any]]:
+    """What decides each of the measurements that are asked for, see `Table.settle`."""
+    played = {"impl": env.impl, "episodes": args.episodes}
+    own = {**played, "priors": [digest(prior) for prior in priors]}
+    judge = {
+        "preset": args.judge_preset,
+        "config": args.config,
+        "seeds": seeds,
+        "previous_actions": env.previous_actions or PREVIOUS_ACTIONS,
+        **played,
+    }
+    asked = {"zero_shot": own}
+    if args.plan:
+        asked["plan"] = {**own, "method": PLANNER, "options": get_method(PLANNER).config()}
+    if args.judge:
+        asked["judge"] = judge
+    return asked
+
+
+class Table:
     """What is known of drawn gaps, on disk as soon as it is known.
 
-    about: what all measurements have in common; raises UserError for a table that was made otherwise.
+    found: {**of, "about": settings by measurement, "gaps": by name the gap and what was measured on it}. of: what the
+    table is of. Raises UserError for a table of something else, or of other gaps under these names.
     """
 
-    def __init__(self, path: Path, about: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, of: Mapping[str, Any], gaps: Sequence[Gap]) -> None:
         self.path = path
-        self.found = read_json(path) if path.exists() else {**about, "gaps": {}}
-        if odd := differences({name: self.found.get(name) for name in about}, dict(about)):
-            raise UserError(f"{path}: was measured with other {odd[0][0]}; choose another --out, or remove the table")
+        self.found = read_json(path) if path.exists() else {**of, "about": {}, "gaps": {}}
+        if odd := differences({name: self.found.get(name) for name in of}, dict(of)):
+            raise UserError(f"{path}: is a table of another {odd[0][0]}; {_ELSE}")
+        if not isinstance(self.found.get("about"), dict):
+            raise UserError(f"{path}: does not say how it was measured, an earlier version wrote it; {_ELSE}")
+        for gap in gaps:
+            line = self.found["gaps"].setdefault(gap.name, {"gap": jsonable(gap)})
+            if line["gap"] != jsonable(gap):
+                raise UserError(f"{path}: its {gap.name} is another gap; {_ELSE}")
+
+    def settle(self, what: str, settings: Mapping[str, Any], *, again: bool) -> None:
+        """Says what decides a measurement. again: forget what other settings gave; else that raises UserError."""
+        about, now = self.found["about"], jsonable(settings)
+        if (old := about.get(what, now)) != now and not again:
+            how = f"{what.replace('_', '-')} was measured with other {differences(old, now)[0][0]}, see its 'about'"
+            raise UserError(f"{self.path}: {how}; --overwrite measures it again, another --out keeps both")
+        if old != now:
+            for line in self.found["gaps"].values():
+                for gone in _MEASURED[what]:
+                    line.pop(gone, None)
+                line |= labels(line)
+        about[what] = now
 
     def without(self, what: str, found: Sequence[Gap]) -> list[Gap]:
         """Those of which this is not known yet."""
-        return [gap for gap in found if what not in self.found["gaps"].get(gap.name, {})]
+        return [gap for gap in found if what not in self.found["gaps"][gap.name]]
 
     def add(self, lines: Mapping[str, Mapping[str, Any]]) -> None:
         """Writes what has been found of gaps, by name."""
-        known = self.found["gaps"]
         for name, line in lines.items():
-            known[name] = known.get(name, {}) | line
-            known[name] |= labels(known[name])
+            self.found["gaps"][name] |= line
+            self.found["gaps"][name] |= labels(self.found["gaps"][name])
         write_json(self.path, self.found)
 
 
@@ -118,9 +160,8 @@ def lines(names: Sequence[str], known: Mapping[str, Mapping[str, Any]]) -> list[
         line = known[name]
         zero, plan, fit, judge = (percent(line.get(what)) for what in ("zero_shot", "plan", "fit", "judge"))
         marks = [words[line[label]] for label, words in said.items() if line[label] in words]
-        rows.append(
-            (name, " ".join(line["families"]) or "none", zero, plan, fit, judge, line["stratum"], ", ".join(marks))
-        )
+        families = " ".join(line["gap"]["families"]) or "none"
+        rows.append((name, families, zero, plan, fit, judge, line["stratum"], ", ".join(marks)))
     return columns(rows)
 
 
@@ -145,7 +186,7 @@ def _zero_shot(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: in
     part = command_interface(network_of(priors[0].card), env)
     fitted = rates(jax.jit(functools.partial(_identified, part, len(priors)))(members, explored))
     return {
-        gap.name: {"families": list(gap.families), "zero_shot": before, "fit": after}
+        gap.name: {"zero_shot": before, "fit": after}
         for gap, before, after in zip(everywhere, plain, fitted, strict=True)
     }
 
@@ -185,7 +226,7 @@ def _judge(env: Env, args: GapsArgs, found: Sequence[Gap], seeds: list[int], fol
     seen = env if env.previous_actions else with_previous_actions(env, PREVIOUS_ACTIONS)
     played = train(env, args.config, found, seeds, folder, episodes=args.episodes, seen=seen)
     rates = [rate(own, stats.mean) for own in played]
-    return {gap.name: {"judge": {"preset": args.judge_preset, **own}} for gap, own in _each(found, rates)}
+    return {gap.name: {"judge": own} for gap, own in _each(found, rates)}
 
 
 def _rates(played: Episode, systems: int, policies: int) -> list[dict[str, Any]]:

@@ -70,7 +70,7 @@ def test_drawn_gaps_are_written_measured_and_sorted(home, capsys, monkeypatch):
     assert found["sim"]["stratum"] == "solved" and found["sim"]["zero_shot"]["success"] > 0.95
     for gap in drawn:
         line = found[gap.name]
-        assert line["families"] == list(gap.families) and len(line["zero_shot"]["policies"]) == 2
+        assert gaps_draw.jsonable(gap) == line["gap"] and len(line["zero_shot"]["policies"]) == 2
         turned = "actuation" in gap.families  # the hand comes half the way in the time there is
         assert line["stratum"] == ("failed" if turned else "solved")
         assert line["fit"]["success"] > 0.9 and line["trivial"] is True and line["admitted"] is None
@@ -97,15 +97,19 @@ def test_drawn_gaps_are_written_measured_and_sorted(home, capsys, monkeypatch):
     save_prior(home / "other/seed-3", 3, task="toy_steps")
     with pytest.raises(SystemExit):
         call(home, "--draw", "4", "--prior", str(home / "other"))
-    assert "seed-5.json: was measured with other priors; choose another --out" in capsys.readouterr().err
+    assert "seed-5.json: zero-shot was measured with other priors, see its 'about'; --over" in capsys.readouterr().err
     (home / "families.toml").write_text(TEXT.replace("1.4", "1.5").replace("0.1", "0.2"))
     with pytest.raises(SystemExit):
         call(home, "--draw", "4")
     assert "toy_steps-5-00 is not what is drawn now" in capsys.readouterr().err
+    file.unlink()
+    with pytest.raises(SystemExit):
+        call(home, "--draw", "4")
+    assert "seed-5.json: its toy_steps-5-00 is another gap; choose another --out" in capsys.readouterr().err
 
 
 @pytest.mark.slow
-def test_the_plan_and_the_judge_are_measured_where_they_are_missing(home, monkeypatch):
+def test_the_plan_and_the_judge_are_measured_where_they_are_missing(home, monkeypatch, capsys):
     seen, train = [], gaps_draw.train
 
     def noted(env, config, found, *given, **more):
@@ -121,8 +125,16 @@ def test_the_plan_and_the_judge_are_measured_where_they_are_missing(home, monkey
         assert (
             len(found[name]["judge"]["policies"]) == 2 and found[name]["admitted"] is False
         )  # one update teaches nothing
-        assert found[name]["judge"]["preset"] == "cpu"
-    assert call(home, "--draw", "2", "--plan", "--judge")["gaps"] == found and len(seen) == 1
+    same = ["--draw", "2", "--plan", "--judge", "--judge-preset", "cpu", "--seeds"]
+    assert call(home, *same, "2")["gaps"] == found and len(seen) == 1
+    with pytest.raises(SystemExit):
+        call(home, *same, "1")
+    assert "judge was measured with other seeds" in capsys.readouterr().err
+    again = call(home, *same, "1", "--overwrite")
+    assert len(seen) == 2 and again["about"]["judge"]["seeds"] == [5]
+    for name in seen[0][2]:
+        assert again["gaps"][name]["zero_shot"] == found[name]["zero_shot"]
+        assert len(again["gaps"][name]["judge"]["policies"]) == 1
 
 
 @pytest.mark.parametrize(
@@ -165,10 +177,40 @@ def test_the_settings_of_the_training_are_those_of_the_preset_that_trains(monkey
     assert [args.config.n_envs for args in seen] == [64, 32]
 
 
+GAPS = [gaps.Gap(name, {}, {}) for name in ("a", "b")]
+
+
+def begun(path):
+    """A table of two gaps, judged and not."""
+    table = gaps_draw.Table(path, {"task": "toy"}, GAPS)
+    table.settle("zero_shot", {"episodes": 200}, again=False)
+    table.settle("judge", {"config": {"rate": 0.1}, "seeds": [0]}, again=False)
+    rate = {"success": 0.95, "policies": [{"success": 0.95}]}
+    table.add({"a": {"zero_shot": rate, "fit": rate, "judge": rate}, "b": {"zero_shot": rate}})
+    return table
+
+
 def test_a_table_is_only_continued_as_it_was_begun(tmp_path):
-    table = gaps_draw._Table(tmp_path / "t.json", {"episodes": 200})
-    table.add({"a": {"families": [], "zero_shot": {"success": 0.1}}})
-    table.add({"a": {"fit": {"success": 0.95}}})
-    assert read_json(tmp_path / "t.json")["gaps"]["a"]["trivial"] is True
-    with pytest.raises(UserError, match="other episodes"):
-        gaps_draw._Table(tmp_path / "t.json", {"episodes": 300})
+    path = tmp_path / "t.json"
+    begun(path)
+    assert read_json(path)["gaps"]["a"]["trivial"] is True
+    table = gaps_draw.Table(path, {"task": "toy"}, GAPS)
+    table.settle("zero_shot", {"episodes": 200}, again=False)
+    with pytest.raises(UserError, match=r"t.json: judge was measured with other config.rate, see its 'about'; --over"):
+        table.settle("judge", {"config": {"rate": 0.2}, "seeds": [0]}, again=False)
+    with pytest.raises(UserError, match="is a table of another task"):
+        gaps_draw.Table(path, {"task": "push"}, GAPS)
+    with pytest.raises(UserError, match="its b is another gap"):
+        gaps_draw.Table(path, {"task": "toy"}, [GAPS[0], GAPS[1]._replace(effects={"latency": 0.1})])
+    (tmp_path / "old.json").write_text('{"task": "toy", "gaps": {}}')
+    with pytest.raises(UserError, match=r"old.json: does not say how it was measured"):
+        gaps_draw.Table(tmp_path / "old.json", {"task": "toy"}, GAPS)
+
+
+def test_other_settings_of_the_judge_forget_what_it_said_and_nothing_else(tmp_path):
+    table = begun(tmp_path / "t.json")
+    assert [gap.name for gap in table.without("judge", GAPS)] == ["b"]
+    table.settle("judge", {"config": {"rate": 0.2}, "seeds": [0]}, again=True)
+    assert table.without("judge", GAPS) == GAPS and table.without("zero_shot", GAPS) == []
+    line = table.found["gaps"]["a"]
+    assert line["admitted"] is None and line["stratum"] == "solved" and line["trivial"] is True
