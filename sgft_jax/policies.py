@@ -20,7 +20,7 @@ from sgft_jax.types import Array, Key, Policy, PyTree, Task, UserError
 def make_policy(card: Mapping[str, Any], task: Task) -> Policy:
     """How the prior with this card acts. task: its task; policies that plan ask it for rewards.
 
-    card: `algorithm`, `gamma`, `network` (SAC and recurrent SAC), `config` (TD-MPC2 and recurrent SAC), and `plan` for a
+    card: `algorithm`, `gamma`, `network` (SAC, recurrent SAC), `config` (TD-MPC2, recurrent SAC), and `plan` for a
     prior of SAC that plans.
     """
     if card.get("algorithm", "sac") == "tdmpc2":

@@ -171,11 +171,11 @@ PRESETS: dict[str, PretrainConfig] = {
         eval_every=10,
         eval_episodes=128,
     ),
-    # A policy that remembers the episode, for domains that hide something (actuators, latency, sensors). Meant for three
-    # seeds in five minutes of one H100; estimated, never run: a step of physics takes 50 ms (`fast`), an update 5 ms, of
-    # which 4 go into 51 steps of the GRUs forwards and backwards, a few small kernels each. That is 130 ms per step of
-    # all environments, 195 s for 1,500 of them; compilation, random actions and evaluations take the rest. A batch has
-    # 3,200 transitions (64 episodes of 50 steps), so 24,000 updates see as many as 75,000 of `fast`.
+    # A policy that remembers the episode, for domains that hide something (actuators, latency, sensors). For three
+    # seeds in five minutes of one H100, by estimate; never run. A step of physics takes 50 ms (`fast`), an update 5
+    # ms, of which 4 go into 51 steps of the GRUs forwards and backwards, a few small kernels each. That is 130 ms per
+    # step of all environments, 195 s for 1,500 of them; compilation, random actions and evaluations take the rest. A
+    # batch has 3,200 transitions (64 episodes of 50 steps), so 24,000 updates see as many as 75,000 of `fast`.
     "recurrent": PretrainConfig(
         algorithm="recurrent",
         n_envs=1024,

@@ -343,8 +343,8 @@ def step_temperature(
     rows: Batch,
     log_prob: Array,
     *,
-    target: Array,
-    rate: Array,
+    target: float | Array,
+    rate: float | Array,
 ) -> optim.Fit:
     """One step of the temperature's logarithm. log_prob: [B] of the actions drawn. target: [] entropy, nats."""
 
