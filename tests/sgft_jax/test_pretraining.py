@@ -224,7 +224,7 @@ def test_settings_that_make_no_sense_are_refused(changes, words):
 
 def test_recurrent_policies_need_room_for_whole_episodes():
     config = replace(CONFIG, algorithm="recurrent", random_transitions=(LENGTH - 1) * N)
-    with pytest.raises(UserError, match="--config.random-transitions 176: .* 16 environments need at least 192"):
+    with pytest.raises(UserError, match=r"--config\.random-transitions 176: .* 16 environments need at least 192"):
         pretraining.make_pretrainer(toy_terminating.make(), config)
 
 
