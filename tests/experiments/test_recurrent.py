@@ -12,9 +12,9 @@ from sgft_jax.io.priors import load_prior
 from sgft_jax.learners.recurrent import RECURRENTParams
 
 PRETRAIN = """--task push --preset recurrent --real envs/gaps/development/push.toml:actuators --no-video
-    --config.n-envs 4 --config.worlds 2 --config.env-steps 80 --config.random-transitions 160 --config.replay-capacity 160
-    --config.batch-size 4 --config.updates-per-step 1 --config.chunk-steps 10 --config.eval-every 1
-    --config.checkpoint-every 1 --config.eval-episodes 2 --config.report-episodes 2 --config.gru 8"""
+    --config.n-envs 4 --config.worlds 2 --config.env-steps 80 --config.random-transitions 160 --config.gru 8
+    --config.replay-capacity 160 --config.batch-size 4 --config.updates-per-step 1 --config.chunk-steps 10
+    --config.eval-every 1 --config.checkpoint-every 1 --config.eval-episodes 2 --config.report-episodes 2"""
 FINETUNE = "--task push --real default --no-video --seeds 2 --rollouts 2 --eval-every 1 --eval-episodes 2"
 
 
