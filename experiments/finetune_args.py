@@ -81,7 +81,7 @@ def with_settings(args: FinetuneArgs, settings: Mapping[str, Any]) -> FinetuneAr
 
 def _preset(method: Method) -> str:
     """The preset that makes the priors a method needs."""
-    return "tdmpc2" if method.prior == "tdmpc2" else DEFAULT_PRESET
+    return DEFAULT_PRESET if method.prior == "sac" else method.prior
 
 
 def run_folder(args: FinetuneArgs, real: str) -> Path:

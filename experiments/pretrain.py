@@ -29,8 +29,8 @@ class PretrainArgs:
     task: str = "push"
     """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
     preset: str = DEFAULT_PRESET
-    """Named settings: cpu (two cores, minutes), fast (one GPU, minutes), paper, or tdmpc2 for the methods that need
-    its prior. --config.* changes single ones."""
+    """Named settings: cpu (two cores, minutes), fast (one GPU, minutes), paper, or tdmpc2 and recurrent for the
+    methods that need their priors. --config.* changes single ones."""
     seed: int = 0
     """First seed."""
     seeds: int = 1

@@ -200,7 +200,7 @@ class _Run:
     def _hand_over(self, best: Best) -> dict[str, Any]:
         """Priors with their cards, report, figures, summary, closing words."""
         with self.clock("report"):
-            report = self._report(best.params) if self.args.report else None
+            report = self._report(best.params) if self.args.report and self.policy.value else None
             played = self._final_episodes(best.params)
         results = []
         for i, seed in enumerate(self.seeds):
@@ -300,6 +300,8 @@ class _Run:
             print(line)
         left = ", ".join(name for name in ("prior/", "summary.json", "figures/") if (self.folder / name).exists())
         print(f"results: {self.folder}  ({left})")
-        method = " --method sgft-tdmpc2" if self.config.algorithm == "tdmpc2" else ""
+        method = {"sac": "", "tdmpc2": " --method sgft-tdmpc2", "recurrent": " --method recurrent"}[
+            self.config.algorithm
+        ]
         out = "" if self.args.out == PretrainArgs.out else f" --out {self.args.out}"
         print(f"next: python -m experiments.finetune --task {self.args.task}{method} --prior {self.folder}{out}")

@@ -71,8 +71,9 @@ def numbers(report: Report) -> dict[str, Any]:
 
 def _values(env: Env, policy: Policy, prior: PyTree, episode: Episode) -> tuple[Array, Array]:
     """V_sim and Monte-Carlo returns [episode_length] of one episode."""
-    rows = episode.transitions
-    predict = lambda obs: policy.value(prior, obs)  # noqa: E731
+    rows, value_of = episode.transitions, policy.value
+    assert value_of is not None  # checked before
+    predict = lambda obs: value_of(prior, obs)  # noqa: E731
     returns = value.discounted_returns(rows.reward, rows.discount, predict(rows.next_obs[-1]))
     return jax.vmap(predict)(rows.obs[: env.episode_length]), returns[: env.episode_length]
 

@@ -94,7 +94,7 @@ def check_prior(prior: Prior, method: Method, env: Env) -> None:
     """Raises UserError for a prior of another algorithm or task, or of a policy that is told more or less."""
     command = f"python -m experiments.pretrain --task {env.name}"
     if (found := prior.card.get("algorithm", "sac")) != method.prior:
-        preset = "tdmpc2" if method.prior == "tdmpc2" else "fast"
+        preset = "fast" if method.prior == "sac" else method.prior
         raise UserError(
             f"the method needs a prior of {method.prior}, not of {found}; make one with: {command} --preset {preset}"
         )

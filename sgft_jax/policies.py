@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.learners import tdmpc2, tdmpc2_model
+from sgft_jax.learners import recurrent, tdmpc2, tdmpc2_model
 from sgft_jax.learners.sac import SACParams
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.config import NetworkConfig
@@ -20,7 +20,8 @@ from sgft_jax.types import Array, Key, Policy, PyTree, Task, UserError
 def make_policy(card: Mapping[str, Any], task: Task) -> Policy:
     """How the prior with this card acts. task: its task; policies that plan ask it for rewards.
 
-    card: `algorithm`, `gamma`, `network` (SAC) or `config` (TD-MPC2), and `plan` for a prior of SAC that plans.
+    card: `algorithm`, `gamma`, `network` (SAC, recurrent SAC), `config` (TD-MPC2, recurrent SAC), and `plan` for a
+    prior of SAC that plans.
     """
     if card.get("algorithm", "sac") == "tdmpc2":
         own = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
@@ -28,6 +29,8 @@ def make_policy(card: Mapping[str, Any], task: Task) -> Policy:
         structure = tdmpc2_model.named_config(task.obs_dim, task.act_dim, **own)
         return tdmpc2_policy(structure, tdmpc2.TDMPC2Hyper(gamma=card["gamma"]))
     network = network_of(card)
+    if card.get("algorithm") == "recurrent":
+        return recurrent_policy(recurrent.RecurrentConfig(task.obs_dim, task.act_dim, network, card["config"]["gru"]))
     if plan := card.get("plan"):
         config = mpc.MPCConfig(task.obs_dim, task.act_dim, network, **plan, gamma=card["gamma"])
         return mpc_policy(config, task)
@@ -83,6 +86,17 @@ def mpc_policy(config: mpc.MPCConfig, task: Task, *, explore_noise: float = 0.0)
     return sac_policy(config.obs_dim, config.act_dim, config.network)._replace(
         init_carry=lambda: mpc.init_carry(config), act=act
     )
+
+
+def recurrent_policy(config: recurrent.RecurrentConfig) -> Policy:
+    """The actor of `RECURRENTParams`, which remembers the episode."""
+
+    def act(
+        params: recurrent.RECURRENTParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
+    ) -> tuple[Array, PyTree]:
+        return recurrent.act(config, params.actor, params.normalizer, carry, obs, key, explore=explore)
+
+    return Policy(lambda: recurrent.init_carry(config), act)
 
 
 def tdmpc2_policy(config: tdmpc2.TDMPC2Config, hyper: tdmpc2.TDMPC2Hyper) -> Policy:

@@ -316,7 +316,8 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
             return actions, carry
         share = jnp.linspace(0.0, config.random_ladder, config.n_envs)
         replaced = jax.random.uniform(key_replace, (config.n_envs,)) < share
-        return jnp.where(replaced[:, None], uniform_actions(key_random), actions), carry
+        actions = jnp.where(replaced[:, None], uniform_actions(key_random), actions)
+        return actions, jax.vmap(recipe.replaced)(carry, actions)
 
     def vector_step(pool: World, random: PyTree, state: PretrainState) -> tuple[PretrainState, Metrics]:
         keys = jax.random.split(state.key, 5)

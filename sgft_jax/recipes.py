@@ -1,4 +1,4 @@
-"""How pretraining uses each algorithm: `RECIPES` has one entry for `sac` and one for `tdmpc2`. Pure."""
+"""How pretraining uses each algorithm: `RECIPES` has an entry for each. Pure."""
 
 import functools
 from collections.abc import Callable
@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import optax
 
 from sgft_jax.data import replay, sequences
-from sgft_jax.learners import sac, tdmpc2, tdmpc2_model
+from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.presets import PretrainConfig
-from sgft_jax.types import Array, Batch, Key, Learner, PyTree, Task, Transition
+from sgft_jax.types import Array, Batch, Key, Learner, PyTree, Task, Transition, UserError
 
 
 class Memory(NamedTuple):
@@ -37,6 +37,7 @@ class Recipe(NamedTuple):
     hyper(steps []) -> the learner's numbers after so many steps of all environments.
     init_carry() and act(agent, carry, obs, key) -> (action, carry): exploration, cheap enough for a fleet.
     extract(agents [M]) -> params [M].
+    replaced(carry, action) -> the carry if another action was taken than `act` chose.
     """
 
     learner: Learner
@@ -45,6 +46,7 @@ class Recipe(NamedTuple):
     init_carry: Callable[[], PyTree]
     act: Callable[[PyTree, PyTree, Array, Key], tuple[Array, PyTree]]
     extract: Callable[[Any], PyTree]
+    replaced: Callable[[PyTree, Array], PyTree] = lambda carry, action: carry
 
 
 def _sac(task: Task, config: PretrainConfig) -> Recipe:
@@ -87,17 +89,56 @@ def _tdmpc2(task: Task, config: PretrainConfig) -> Recipe:
     def act(agent: Any, carry: PyTree, obs: Array, key: Key) -> tuple[Array, PyTree]:
         return tdmpc2.policy_action(structure, agent, obs, key, explore=True), carry
 
-    windows = Memory(
-        empty=lambda transitions: sequences.init(
-            replay.blank(task.obs_dim, task.act_dim), transitions // config.n_envs, config.n_envs
-        ),
+    windows = _windows(task, config, lambda experience, key, n: sequences.sample(experience, key, n, config.horizon))
+    learner = tdmpc2.make_tdmpc2(structure, hyper(jnp.int32(0)))
+    return Recipe(learner, windows, hyper, lambda: (), act, tdmpc2.extract_params)
+
+
+def _recurrent(task: Task, config: PretrainConfig) -> Recipe:
+    """Learns from whole episodes, so a batch has `batch_size` of them."""
+    slots = {name: getattr(config, name) // config.n_envs for name in ("random_transitions", "replay_capacity")}
+    for name, held in slots.items():
+        if held < task.episode_length:
+            raise UserError(
+                f"--config.{name.replace('_', '-')} {getattr(config, name)}: recurrent policies learn from whole "
+                f"episodes; {config.n_envs} environments need at least {config.n_envs * task.episode_length}"
+            )
+    structure = recurrent.RecurrentConfig(task.obs_dim, task.act_dim, network=config.network, gru=config.gru)
+    rate = _rate(config)
+
+    def hyper(steps: Array) -> recurrent.RecurrentHyper:
+        numbers = recurrent.RecurrentHyper(rate(steps), config.tau, config.alpha, config.entropy_per_dim)
+        return jax.tree.map(jnp.float32, numbers)
+
+    episodes = _windows(
+        task,
+        config,
+        lambda experience, key, n: sequences.sample_episodes(experience, key, n, task.episode_length),
+        spare=1,  # of a full ring the oldest slot begins nothing
+    )
+    learner = recurrent.make_recurrent(structure, hyper(jnp.int32(0)))
+    explore = functools.partial(learner.act, explore=True)
+    return Recipe(
+        learner,
+        episodes,
+        hyper,
+        learner.init_carry,
+        explore,
+        recurrent.extract_params,
+        replaced=lambda carry, action: carry._replace(action=action),
+    )
+
+
+def _windows(task: Task, config: PretrainConfig, sample: Callable[..., Batch], *, spare: int = 0) -> Memory:
+    """A ring of time slots, which `sample` draws from. spare: slots more than the transitions fill."""
+    blank, n = replay.blank(task.obs_dim, task.act_dim), config.n_envs
+    return Memory(
+        empty=lambda transitions: sequences.init(blank, transitions // n + spare, n),
         add=sequences.add,
         cut=sequences.end_episodes,
         held=lambda experience: experience.valid,
-        sample=lambda experience, key, n: sequences.sample(experience, key, n, config.horizon),
+        sample=sample,
     )
-    learner = tdmpc2.make_tdmpc2(structure, hyper(jnp.int32(0)))
-    return Recipe(learner, windows, hyper, lambda: (), act, tdmpc2.extract_params)
 
 
 def _rate(config: PretrainConfig) -> Callable[[Array], Array]:
@@ -106,4 +147,8 @@ def _rate(config: PretrainConfig) -> Callable[[Array], Array]:
     return lambda steps: jnp.asarray(schedule(steps))
 
 
-RECIPES: dict[str, Callable[[Task, PretrainConfig], Recipe]] = {"sac": _sac, "tdmpc2": _tdmpc2}
+RECIPES: dict[str, Callable[[Task, PretrainConfig], Recipe]] = {
+    "sac": _sac,
+    "tdmpc2": _tdmpc2,
+    "recurrent": _recurrent,
+}

@@ -211,7 +211,8 @@ class Task(Protocol):
 class Prior:
     """What pretraining hands to fine-tuning.
 
-    params: the networks' parameters and the observation statistics (`SACParams` or `TDMPC2Params`).
+    params: the networks' parameters and the observation statistics (`SACParams`, `TDMPC2Params` or
+        `RECURRENTParams`).
     card: JSON data: task, algorithm, network, gamma, and the numbers that were measured.
     """
 
@@ -223,14 +224,14 @@ class Policy(NamedTuple):
     """How the parameters of a prior act, for one example.
 
     init_carry() -> carry. act(params, carry, obs, key, *, explore) -> (action, carry); `explore` may be traced.
-    value(params, obs) -> []: V_sim, deterministic.
+    value(params, obs) -> []: V_sim, deterministic; None where an observation does not decide the value.
     model_error(params, obs [T + 1, obs_dim], actions [T, act_dim]) -> [T]: how far its model drifts from a trajectory,
         in standard deviations of the observation; None where the model does not predict observations.
     """
 
     init_carry: Callable[[], PyTree]
     act: Callable[..., tuple[Array, PyTree]]
-    value: Callable[[PyTree, Array], Array]
+    value: Callable[[PyTree, Array], Array] | None = None
     model_error: Callable[[PyTree, Array, Array], Array] | None = None
 
 
@@ -280,7 +281,7 @@ class Finetuner(NamedTuple):
     card: Mapping[str, Any]
 
 
-Algorithm = Literal["sac", "tdmpc2"]
+Algorithm = Literal["sac", "tdmpc2", "recurrent"]
 Family = Literal["sgft", "model-free", "model-based", "offline", "planning"]
 
 

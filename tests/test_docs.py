@@ -101,7 +101,7 @@ def test_links_lead_to_headings(page):
 
 def test_the_page_of_methods_lists_them_all_and_so_does_the_help():
     """With the family and the kind of prior that each declares, in the order of the package."""
-    page, kinds = (ROOT / "docs/methods.md").read_text(), {"sac": "SAC", "tdmpc2": "TD-MPC2"}
+    page, kinds = (ROOT / "docs/methods.md").read_text(), {"sac": "SAC", "tdmpc2": "TD-MPC2", "recurrent": "recurrent"}
     rows = re.findall(r"^\| `([\w-]+)` \| ([\w-]+) \|[^|]*\| ([\w-]+)[^|]*\|[^|]*\|$", page, re.M)
     assert rows == [(name, method.family, kinds[method.prior]) for name, method in all_methods().items()]
     shown = help_of("experiments.finetune")

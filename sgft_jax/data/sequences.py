@@ -98,18 +98,36 @@ def sample(state: SequenceState, key: Key, n: int, length: int) -> Batch:
     Nothing is valid while the ring is empty. Draw the windows of several updates at once: counting the valid rows
     visits the whole ring.
     """
-    count = running_count(state.valid)
+    return _draw(state, state.valid, key, n, length)
+
+
+def sample_episodes(state: SequenceState, key: Key, n: int, length: int) -> Batch:
+    """The same, but windows begin where episodes begin: whole episodes, also unfinished ones, if none is longer.
+
+    The ring's first row must begin an episode. Once the ring is full, its oldest rows count as the middle of one.
+    Nothing is valid while no episode begins in the ring.
+    """
+    slot = jnp.arange(state.valid.shape[0]) // state.n_envs
+    oldest = slot == (state.position - state.size) % state.slots
+    ended = jnp.roll(state.last | ~state.valid, state.n_envs)  # whether the row before was the last of its episode
+    begins = state.valid & jnp.where(oldest, state.size < state.slots, ended)
+    return _draw(state, begins, key, n, length)
+
+
+def _draw(state: SequenceState, begins: Array, key: Key, n: int, length: int) -> Batch:
+    """Windows [n, length, ...] from rows where `begins` [rows] holds."""
+    count = running_count(begins)
     nth = jax.random.randint(key, (n,), 0, jnp.maximum(count[-1], 1))
     start = jnp.minimum(jnp.searchsorted(count, nth, side="right"), count.shape[0] - 1)
-    return jax.vmap(lambda row: _window(state, row, length))(start)
+    return jax.vmap(lambda row: _window(state, row, count[-1] > 0, length))(start)
 
 
-def _window(state: SequenceState, start: Array, length: int) -> Batch:
-    """The window [length, ...] that begins at row `start` []."""
+def _window(state: SequenceState, start: Array, some: Array, length: int) -> Batch:
+    """The window [length, ...] that begins at row `start` []; some: [] whether a window may begin anywhere."""
     slot, env = start // state.n_envs, start % state.n_envs
     age, steps = (slot - state.position + state.size) % state.slots, jnp.arange(length)  # age: slots after the oldest
     index = (slot + steps) % state.slots * state.n_envs + env
     follows = jnp.concatenate([jnp.ones(1, bool), ~state.last[index][:-1]])
-    valid = jnp.cumprod((age + steps < state.size) & state.valid[index] & follows).astype(bool)
+    valid = jnp.cumprod(some & (age + steps < state.size) & state.valid[index] & follows).astype(bool)
     blank = lambda x: jnp.where(jnp.expand_dims(valid, tuple(range(1, x.ndim))), x, jnp.zeros_like(x))  # noqa: E731
     return Batch(*jax.tree.map(lambda d: blank(d[index]), state.data), valid=valid)

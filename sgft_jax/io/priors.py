@@ -115,6 +115,7 @@ def _structure(card: Mapping[str, Any]) -> dict[str, Any]:
     own = {name: card.get(name) for name in ("network", "gamma", "ensemble_size", "plan")}
     return own | {
         "algorithm": algorithm_of(card),
+        "gru": card["config"]["gru"] if algorithm_of(card) == "recurrent" else None,
         "previous_actions": card.get("previous_actions", 0),
         "system": card.get("system", []),
     }

@@ -332,14 +332,28 @@ def _update_actor(
 
 def _update_temperature(config: SACConfig, parts: _Parts, state: SACState, rows: Batch, log_prob: Array) -> SACState:
     target = state.hyper.entropy_per_dim * config.act_dim
+    rate = state.hyper.lr_alpha
+    fit = step_temperature(parts.optimiser, state.log_alpha, rows, log_prob, target=target, rate=rate)
+    return state.replace(log_alpha=optim.keep_unless(_policy_turn(config, state), fit, state.log_alpha))
+
+
+def step_temperature(
+    optimiser: optax.GradientTransformation,
+    log_alpha: optim.Fit,
+    rows: Batch,
+    log_prob: Array,
+    *,
+    target: float | Array,
+    rate: float | Array,
+) -> optim.Fit:
+    """One step of the temperature's logarithm. log_prob: [B] of the actions drawn. target: [] entropy, nats."""
 
     def loss(log_alpha: Array) -> Array:
         each = jax.vmap(lambda lp: losses.temperature_loss(log_alpha, lp, target_entropy=target))(log_prob)
         return losses.row_mean(each, rows)
 
-    fit = optim.step(parts.optimiser, state.log_alpha, jax.grad(loss)(state.log_alpha.params), state.hyper.lr_alpha)
-    fit = fit._replace(params=jnp.maximum(fit.params, LOG_ALPHA_MIN))
-    return state.replace(log_alpha=optim.keep_unless(_policy_turn(config, state), fit, state.log_alpha))
+    fit = optim.step(optimiser, log_alpha, jax.grad(loss)(log_alpha.params), rate)
+    return fit._replace(params=jnp.maximum(fit.params, LOG_ALPHA_MIN))
 
 
 def _policy_turn(config: SACConfig, state: SACState) -> Array:

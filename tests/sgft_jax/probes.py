@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.learners import iql, sac, tdmpc2, tdmpc2_model
-from sgft_jax.models import networks
+from sgft_jax.learners import iql, recurrent, sac, tdmpc2, tdmpc2_model
+from sgft_jax.models import gru, networks
 from sgft_jax.types import Batch, Learner
 
 ROWS = 32
@@ -137,6 +137,25 @@ def _iql():
     return case._replace(mode=_mode(case))
 
 
+def _recurrent():
+    """Rows are first steps of episodes."""
+    config = recurrent.RecurrentConfig(2, 1, network=NET, gru=8)
+    memory = gru.make_gru(2, 1, 8)
+    critic = networks.make_critic(memory.features, 1, NET)
+    # the temperature stays so low that entropy changes the answers by less than their tolerance
+    learner = recurrent.make_recurrent(config, recurrent.RecurrentHyper(lr=4e-3, tau=0.1, alpha=1e-4))
+
+    @jax.jit
+    def values(state, obs):
+        params = state.critic.params
+        return critic.apply(
+            params["head"], memory.along(params["memory"], jnp.zeros((1, 1)), obs[None])[0], jnp.zeros(1)
+        )
+
+    case = counted(learner, feed=windows, values=values, mode=None, steps=800)
+    return case._replace(mode=_mode(case))
+
+
 def _mode(case):
     key = jax.random.key(0)
     return lambda state, obs: case.learner.act(state, case.learner.init_carry(), obs, key, explore=False)[0]
@@ -177,6 +196,7 @@ MAKERS = {
         critic_network=dataclasses.replace(NET, layer_norm=True),
     ),
     "iql": _iql,
+    "recurrent": _recurrent,
     "tdmpc2": lambda: _tdmpc2(PLAIN, 800),
     "sgft-tdmpc2": lambda: _tdmpc2(dataclasses.replace(PLAIN, sgft=True), 1000),
 }  # fmt: skip

@@ -24,9 +24,9 @@ from sgft_jax.types import Learner, UserError
 
 N, STEPS, LENGTH = 16, 30, toy_terminating.LENGTH
 CONFIG = PretrainConfig(
-    n_envs=N, chunk_steps=STEPS, env_steps=2 * N * STEPS, worlds=4, random_transitions=4 * N,
+    n_envs=N, chunk_steps=STEPS, env_steps=2 * N * STEPS, worlds=4, random_transitions=LENGTH * N,
     replay_capacity=4 * N * STEPS, batch_size=8, updates_per_step=1, gamma=0.9,
-    network=NetworkConfig(hidden=(8,)), ensemble_size=1, size="tiny", horizon=2, plan_samples=8,
+    network=NetworkConfig(hidden=(8,)), ensemble_size=1, size="tiny", horizon=2, plan_samples=8, gru=4,
 )  # fmt: skip
 
 
@@ -108,7 +108,14 @@ def test_a_set_that_is_not_due_is_never_asked_for(counted):
 
 @pytest.mark.parametrize(
     ("algorithm", "refresh_every"),
-    [("sac", 0), ("sac", 1), ("tdmpc2", 0), pytest.param("tdmpc2", 1, marks=pytest.mark.slow)],
+    [
+        ("sac", 0),
+        ("sac", 1),
+        ("tdmpc2", 0),
+        pytest.param("tdmpc2", 1, marks=pytest.mark.slow),
+        ("recurrent", 0),
+        pytest.param("recurrent", 1, marks=pytest.mark.slow),
+    ],
 )
 def test_resumed_is_bit_for_bit_uninterrupted(algorithm, refresh_every, monkeypatch):
     monkeypatch.setitem(tdmpc2_model.SIZES, "tiny", tdmpc2_model.Size(8, 8, 8, 2, 2))
@@ -124,6 +131,11 @@ def test_resumed_is_bit_for_bit_uninterrupted(algorithm, refresh_every, monkeypa
     assert all(np.isfinite(x).all() and x.shape == (2,) for x in metrics.values())
     first, other = end.replay.data.action
     assert (first != other).any(), "seeds differ"
+    if algorithm == "recurrent":  # it remembers what was done, also where a random action replaced its own
+        done = end.replay.data.action[:, (2 * STEPS - 1) * N : 2 * STEPS * N]
+        goes_on = end.fleet.state.time > 0
+        np.testing.assert_array_equal(end.fleet.carry.action, jnp.where(goes_on[..., None], done, 0.0))
+        assert goes_on.any()
 
     prior, _ = priors_of(env, config, end)
     assert prior.card["task"] == "toy_terminating" and prior.card["gamma"] == 0.9
@@ -159,11 +171,11 @@ def test_better_is_a_higher_score_then_a_higher_return():
     assert keep_better(old, best(0.1, 0.0, 2), 1.5).steps == 2, "an early evaluation does not compete"
 
 
-@pytest.mark.parametrize("algorithm", ["sac", "tdmpc2"])
+@pytest.mark.parametrize("algorithm", ["sac", "tdmpc2", "recurrent"])
 def test_the_learning_rate_falls_linearly_to_its_end(algorithm):
     config = replace(PRESETS["cpu"], algorithm=algorithm, size="1M", n_envs=10, env_steps=1000, lr=1e-3, lr_end=0.1)
     recipe = recipes.RECIPES[algorithm](toy.make(), config)
-    rate = {"sac": "lr_critic", "tdmpc2": "lr"}[algorithm]
+    rate = {"sac": "lr_critic", "tdmpc2": "lr", "recurrent": "lr"}[algorithm]
     rates = [float(getattr(recipe.hyper(jnp.int32(steps)), rate)) for steps in (0, 50, 100, 120)]
     np.testing.assert_allclose(rates, [1e-3, 5.5e-4, 1e-4, 1e-4], rtol=1e-5)
 
@@ -201,11 +213,19 @@ def test_memory_counts_what_is_kept_and_drawn():
         ({"refresh_every": -1}, "option refresh-every is -1: must be at least 0"),
         ({"gamma": 2.0}, "option gamma is 2.0: must be at least 0 and less than 1"),
         ({"lr": float("nan")}, "option lr is nan: must be a positive number"),
+        ({"gru": 0}, "option gru is 0: must be at least 1"),
+        ({"algorithm": "recurrent", "sees_system": True}, "sees-system is True: must be off for a prior of recurrent"),
     ],
 )
 def test_settings_that_make_no_sense_are_refused(changes, words):
     with pytest.raises(UserError, match=words):
         replace(CONFIG, **changes)
+
+
+def test_recurrent_policies_need_room_for_whole_episodes():
+    config = replace(CONFIG, algorithm="recurrent", random_transitions=(LENGTH - 1) * N)
+    with pytest.raises(UserError, match=r"--config\.random-transitions 176: .* 16 environments need at least 192"):
+        pretraining.make_pretrainer(toy_terminating.make(), config)
 
 
 def test_keys_depend_on_seed_and_purpose_alone():

@@ -13,7 +13,7 @@ import pytest
 from sgft_jax import methods, train
 from sgft_jax.data import replay
 from sgft_jax.io.jsonfile import jsonable
-from sgft_jax.learners import sac, tdmpc2, tdmpc2_model
+from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.types import Finetuner, Normalizer, Prior, Transition
 
@@ -69,6 +69,10 @@ def prior(algorithm="sac"):
         init = tdmpc2.make_tdmpc2(tdmpc2_model.named_config(2, 2, **config)).init
         params = tdmpc2.extract_params(jax.jit(init)(jax.random.key(7)))
         card = {"algorithm": "tdmpc2", "config": config, "gamma": 0.9}
+    elif algorithm == "recurrent":
+        init = recurrent.make_recurrent(recurrent.RecurrentConfig(2, 2, network=NET, gru=4)).init
+        params = recurrent.extract_params(jax.jit(init)(jax.random.key(7)))
+        card = {"algorithm": "recurrent", "network": jsonable(NET), "config": {"gru": 4}, "gamma": 0.9}
     else:
         init = sac.make_sac(sac.SACConfig(2, 2, network=NET, ensemble_size=2)).init
         params = sac.extract_params(jax.jit(init)(jax.random.key(7)))

@@ -21,9 +21,10 @@ def rows(values):
 add = jax.jit(sequences.add)
 add_episode = jax.jit(sequences.add_episode)
 sample = jax.jit(sequences.sample, static_argnames=("n", "length"))
+sample_episodes = jax.jit(sequences.sample_episodes, static_argnames=("n", "length"))
 
 
-def windows(ring, key):
+def windows(ring, key, sample=sample):
     """The valid parts of DRAWS windows, as a set of tuples of values; checks that masks are prefixes and rest is 0."""
     drawn = sample(ring, key, DRAWS, LENGTH)
     found = set()
@@ -39,17 +40,19 @@ def windows(ring, key):
 
 def expected(held):
     """The windows from every valid row of one environment; held: [(value, valid, last)], oldest first."""
-    found = set()
-    for start, (_, valid, _) in enumerate(held):
-        window = []
-        for value, ok, last in held[start : start + LENGTH] if valid else ():
-            if not ok:
-                break
-            window.append(value)
-            if last:
-                break
-        found |= {tuple(window)} if valid else set()
-    return found
+    return {window_at(held, start) for start, (_, valid, _) in enumerate(held) if valid}
+
+
+def window_at(held, start):
+    """The window that begins at that row."""
+    window = []
+    for value, ok, last in held[start : start + LENGTH]:
+        if not ok:
+            break
+        window.append(value)
+        if last:
+            break
+    return tuple(window)
 
 
 def test_windows_equal_those_of_a_python_ring(key):
@@ -130,3 +133,34 @@ def test_impossible_sizes_are_refused():
         sequences.add_episode(ring, rows([1, 2]), jnp.ones(2, bool))
     with pytest.raises(UserError, match="3 steps does not fit 2 slots"):
         sequences.add_episode(sequences.init(rows(0.0), 2), rows([1, 2, 3]), jnp.ones(3, bool))
+
+
+def test_episodes_begin_where_those_of_a_python_ring_do(key):
+    """All windows from the first rows of episodes, none from elsewhere; a full ring's oldest row may be anywhere."""
+    n_envs, slots, rng = 2, 9, random.Random(2)
+    ring, held = sequences.init(rows(0.0), slots, n_envs), [[] for _ in range(n_envs)]
+    assert not sample_episodes(ring, key, 5, LENGTH).valid.any()
+    for step in range(25):
+        values = [100 * (env + 1) + step for env in range(n_envs)]
+        valid = [rng.random() > 0.1 for _ in range(n_envs)]
+        last = [not ok or rng.random() < 0.3 for ok in valid]
+        ring = add(ring, rows(values), jnp.array(valid), jnp.array(last))
+        if step == 13:
+            ring = sequences.end_episodes(ring)
+            last = [True] * n_envs
+        wanted = set()
+        for env in range(n_envs):
+            held[env] = [*held[env], (values[env], valid[env], last[env])][-slots:]
+            firsts = [i for i in range(1, len(held[env])) if held[env][i - 1][2]] + [0] * (len(held[env]) < slots)
+            wanted |= {window_at(held[env], i) for i in firsts if held[env][i][1]}
+        got = windows(ring, jax.random.fold_in(key, step), sample_episodes)
+        assert got == (wanted or {()}), step
+
+
+def test_without_a_beginning_no_window_is_valid(key):
+    """Slots of a full ring in the middle of one long episode."""
+    ring, no = sequences.init(rows(0.0), 3, 1), jnp.zeros(1, bool)
+    for step in range(4):
+        ring = add(ring, rows([step]), ~no, no)
+    assert sample(ring, key, DRAWS, LENGTH).valid.any()
+    assert not sample_episodes(ring, key, DRAWS, LENGTH).valid.any()

@@ -1,0 +1,58 @@
+"""A recurrent policy, zero-shot: trained where actuators, latency and sensors differ, it finds out while it acts.
+
+Nothing learns from real rollouts. Source: Ni et al. 2022 (pomdp-baselines), with domain randomisation.
+"""
+
+from dataclasses import dataclass
+
+from sgft_jax import checks
+from sgft_jax.methods.options import LoopOptions
+from sgft_jax.types import Finetuner, Method, Prior, Task
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of `recurrent`."""
+
+    initial_rollouts: int = 1
+    """Real rollouts before the first update, which changes nothing here."""
+
+    def __post_init__(self) -> None:
+        checks.at_least(self, 1, "initial_rollouts")
+
+
+def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
+    """The finetuner."""
+    from sgft_jax.data import sources
+    from sgft_jax.finetuner import FinetuneState, Parts, assemble
+    from sgft_jax.learners.idle import IDLE
+    from sgft_jax.methods.options import card_of
+    from sgft_jax.policies import make_policy
+    from sgft_jax.transforms import compose
+    from sgft_jax.types import Array, Key, PyTree
+
+    policy = make_policy(card_of(prior), task)
+    loop = LoopOptions(initial_rollouts=config.initial_rollouts)
+
+    def act(
+        state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
+    ) -> tuple[Array, PyTree]:
+        return policy.act(state.frozen, carry, obs, key, explore=explore)
+
+    parts = Parts(
+        learner=IDLE,
+        start=lambda params, key, simulated: ((), params),
+        init_carry=policy.init_carry,
+        act=act,
+        export=lambda state: state.frozen,
+        policy=policy,
+        source=lambda state: sources.real_rows(loop.batch_size),
+        transform=compose(),
+    )
+    return assemble(parts, loop, task)._replace(updates_per_rollout=1)
+
+
+METHOD = Method(
+    "recurrent", "model-free", "zero-shot: a policy with memory, from a simulator whose actuators and sensors differ",
+    "Ni 2022", Config, build, prior="recurrent",
+)  # fmt: skip
