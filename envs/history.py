@@ -23,6 +23,7 @@ def with_previous_actions(env: Env, n: int) -> Env:
         tell=lambda world, state, actions: actions.reshape(-1),
         start=lambda: jnp.zeros((n, env.act_dim)),
         remember=lambda actions, action: jnp.concatenate([action[None], actions[:-1]]),
+        recall=lambda told: told.reshape(n, env.act_dim),
     )
     return longer._replace(previous_actions=n)
 
@@ -34,11 +35,12 @@ def extended(
     tell: Callable[[World, EnvState, PyTree], Array],
     start: Callable[[], PyTree],
     remember: Callable[[PyTree, Array], PyTree],
+    recall: Callable[[Array], PyTree],
 ) -> Env:
     """The same task with one more entry at the end of its observation; rewards and success are what they were.
 
     tell(world, state of `env`, memory) -> [entry.size]. start() -> memory of an episode. remember(memory, action) ->
-    memory.
+    memory. recall(what was told [entry.size]) -> memory.
     """
     own_dim = env.obs_dim
 
@@ -58,16 +60,20 @@ def extended(
         own = state._replace(physics=physics, obs=state.obs[:own_dim], true_obs=state.true_obs[:own_dim])
         return outside(world, env.step(world, own, action, key), remember(memory, action))
 
+    def restore(world: World, obs: Array, key: Key) -> EnvState:
+        return outside(world, own_restore(world, obs[:own_dim], key), recall(obs[own_dim:]))
+
     def of_transition(function: Callable[..., Array] | None) -> Callable[..., Array] | None:
         if function is None:
             return None
         return lambda obs, action, next_obs: function(obs[:own_dim], action, next_obs[:own_dim])
 
-    success = env.success
+    success, own_restore = env.success, env.restore
     return env._replace(
         observation=(*env.observation, entry),
         reset=reset,
         step=step,
+        restore=None if own_restore is None else restore,
         reward=of_transition(env.reward),
         terminated=of_transition(env.terminated),
         success=None if success is None else lambda obs: success(obs[:own_dim]),
