@@ -60,20 +60,19 @@ def extended(
         own = state._replace(physics=physics, obs=state.obs[:own_dim], true_obs=state.true_obs[:own_dim])
         return outside(world, env.step(world, own, action, key), remember(memory, action))
 
-    def restore(world: World, obs: Array, key: Key) -> EnvState:
-        return outside(world, own_restore(world, obs[:own_dim], key), recall(obs[own_dim:]))
-
     def of_transition(function: Callable[..., Array] | None) -> Callable[..., Array] | None:
         if function is None:
             return None
         return lambda obs, action, next_obs: function(obs[:own_dim], action, next_obs[:own_dim])
 
-    success, own_restore = env.success, env.restore
+    success, restore = env.success, env.restore
     return env._replace(
         observation=(*env.observation, entry),
         reset=reset,
         step=step,
-        restore=None if own_restore is None else restore,
+        restore=None
+        if restore is None
+        else lambda world, obs, key: outside(world, restore(world, obs[:own_dim], key), recall(obs[own_dim:])),
         reward=of_transition(env.reward),
         terminated=of_transition(env.terminated),
         success=None if success is None else lambda obs: success(obs[:own_dim]),

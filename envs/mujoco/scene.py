@@ -1,5 +1,6 @@
 """From the parts in which tasks in MuJoCo differ, a `Scene`, to an Env."""
 
+import functools
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -100,6 +101,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
     physics.check_supported(scene.name, host)
     fields = physics.varying_fields(host, _perturbed(scene, nominal))
     impl = physics.choose_impl(impl)
+    settled = scene.settled
     engine = scene.engine if impl == "jax" and scene.engine else physics.make_engine(host, fields, impl)
     seen = lambda params, state: pack(scene.observation, scene.observe(params, state))  # noqa: E731
 
@@ -114,10 +116,10 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
         own = env_effects.draw(world.theta.effects, key_effects)
         return begin(world, scene.initial(world.theta.params, key_start), own, key_noise)
 
-    def restore(world: World, obs: Array, key: Key) -> EnvState:
+    def restore(settled: Callable[[Array, Array], PhysicsState], world: World, obs: Array, key: Key) -> EnvState:
         key_noise, key_effects = jax.random.split(key)
         own = env_effects.draw(world.theta.effects, key_effects)
-        state = scene.settled(world.theta.params, obs - own.obs_bias)
+        state = settled(world.theta.params, obs - own.obs_bias)
         return begin(world, state, own, key_noise)._replace(obs=obs)
 
     def begin(world: World, state: PhysicsState, own: Effects, key_noise: Key) -> EnvState:
@@ -167,7 +169,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
         make_worlds=make_worlds,
         reset=reset,
         step=step,
-        restore=restore if scene.settled else None,
+        restore=None if settled is None else functools.partial(restore, settled),
         trace=lambda state: state.qpos,
         impl=impl,
         scene=scene.variant,

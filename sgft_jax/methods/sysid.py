@@ -1,6 +1,7 @@
 """System identification: fits what varies in simulation to the real rollouts, and tells it to a policy that knows it.
 
-No network learns. The prior's dynamics models are told the system too, so they say how likely real steps are in each.
+No network learns. The prior's dynamics models are told the system too, so they say how likely real steps are in each;
+or the simulator does, replaying them.
 """
 
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from sgft_jax import checks
 from sgft_jax.methods.options import LoopOptions
 from sgft_jax.types import Array, Finetuner, Method, Prior, Simulation, Task, UserError
 
-_ROWS = {"map": 320, "dropo": 80}  # what `rows` is if it is left open; DROPO takes two trajectories
+_ROWS, _FEW = 320, 80  # what `rows` is if it is left open; DROPO takes two trajectories, and so does the slow simulator
 _SIMULATED = 2048  # rows that tell how far the models are off in simulation
 
 
@@ -22,10 +23,10 @@ class Config:
     fit: Literal["map", "dropo"] = "map"
     """map: the most probable system. dropo: the mean of a distribution over systems (Tiboni et al. 2023)."""
     through: Literal["models", "simulator"] = "models"
-    """What is asked about real steps: the prior's dynamics models, or the simulator, set to what was measured before each
-    step. The simulator is right about itself and slower."""
+    """What is asked about real steps: the prior's dynamics models, or the simulator, set to what was measured before
+    each step. The simulator is right about itself and slower."""
     rows: int | None = None
-    """Real transitions that are fitted, the first ones; None = 320 for map, 80 for dropo."""
+    """Real transitions that are fitted, the first ones; None = 320 for map through models, else 80."""
     initial_rollouts: int = 1
     """Real rollouts before the first fit."""
 
@@ -53,7 +54,8 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     card = card_of(prior)
     network, varying = network_of(card), card.get("system", [])
     loop = LoopOptions(initial_rollouts=config.initial_rollouts)
-    rows_fitted = min(config.rows or _ROWS[config.fit], loop.replay_capacity)
+    few = config.fit == "dropo" or config.through == "simulator"
+    rows_fitted = min(config.rows or (_FEW if few else _ROWS), loop.replay_capacity)
     model = make_dynamics(task.obs_dim, task.act_dim, network)
     policy = sac_policy(task.obs_dim, task.act_dim, network)
 
