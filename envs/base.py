@@ -171,6 +171,9 @@ class Env(NamedTuple):
     make_worlds(theta [n]) -> World stacked [n], compiled on the host (not jittable). Sampling is a `Domain`'s business.
     reset(world, key) -> EnvState, with effects drawn for this episode.
     step(world, state, action, key) -> EnvState.
+    restore(world, obs, key) -> EnvState: a state in which that world's sensors read `obs` [obs_dim] without noise, with
+        effects drawn as by `reset`, at rest where observations do not say how fast things move. None where nobody wrote
+        it: then the simulator cannot be asked about recorded steps.
     reward, terminated: functions of (obs, action, next_obs), so true of imagined transitions too; success: function of
         one observation. None where observations do not tell: then only `EnvState` knows.
     success_anytime: whether success counts at any step or only at the last.
@@ -181,6 +184,8 @@ class Env(NamedTuple):
     trace(physics) -> [k] what a renderer needs of a state; [0] where nothing can be drawn.
     previous_actions: how many of the last actions the observation ends with, see `envs.history`.
     system: what the observation then tells of the system that the episode takes place in, see `envs.system`.
+    simulator() -> (obs, action) -> [measured_dim] what a step changes in the system that `obs` tells. None where it
+        tells none or the task has no `restore`.
     impl: the physics engine. scene: the name of a real system's own scene, "" for the one to pretrain in.
     """
 
@@ -193,6 +198,7 @@ class Env(NamedTuple):
     make_worlds: Callable[[Theta], World]
     reset: Callable[[World, Key], EnvState]
     step: Callable[[World, EnvState, Array, Key], EnvState]
+    restore: Callable[[World, Array, Key], EnvState] | None = None
     reward: Callable[[Array, Array, Array], Array] | None = None
     terminated: Callable[[Array, Array, Array], Array] | None = never
     success: Callable[[Array], Array] | None = None
@@ -204,6 +210,7 @@ class Env(NamedTuple):
     trace: Callable[[PyTree], Array] = no_trace
     previous_actions: int = 0
     system: tuple[Varying, ...] = ()
+    simulator: Callable[[], Callable[[Array, Array], Array]] | None = None
     impl: str = "jax"
     scene: str = ""
 
@@ -287,4 +294,9 @@ def packed(env: Env) -> Env:
     def flat(state: EnvState) -> EnvState:
         return state._replace(obs=pack(env.observation, state.obs), true_obs=pack(env.observation, state.true_obs))
 
-    return env._replace(reset=lambda *given: flat(env.reset(*given)), step=lambda *given: flat(env.step(*given)))
+    restore = env.restore
+    return env._replace(
+        reset=lambda *given: flat(env.reset(*given)),
+        step=lambda *given: flat(env.step(*given)),
+        restore=None if restore is None else lambda *given: flat(restore(*given)),
+    )

@@ -23,6 +23,7 @@ def with_previous_actions(env: Env, n: int) -> Env:
         tell=lambda world, state, actions: actions.reshape(-1),
         start=lambda: jnp.zeros((n, env.act_dim)),
         remember=lambda actions, action: jnp.concatenate([action[None], actions[:-1]]),
+        recall=lambda told: told.reshape(n, env.act_dim),
     )
     return longer._replace(previous_actions=n)
 
@@ -34,11 +35,12 @@ def extended(
     tell: Callable[[World, EnvState, PyTree], Array],
     start: Callable[[], PyTree],
     remember: Callable[[PyTree, Array], PyTree],
+    recall: Callable[[Array], PyTree],
 ) -> Env:
     """The same task with one more entry at the end of its observation; rewards and success are what they were.
 
     tell(world, state of `env`, memory) -> [entry.size]. start() -> memory of an episode. remember(memory, action) ->
-    memory.
+    memory. recall(what was told [entry.size]) -> memory.
     """
     own_dim = env.obs_dim
 
@@ -63,11 +65,14 @@ def extended(
             return None
         return lambda obs, action, next_obs: function(obs[:own_dim], action, next_obs[:own_dim])
 
-    success = env.success
+    success, restore = env.success, env.restore
     return env._replace(
         observation=(*env.observation, entry),
         reset=reset,
         step=step,
+        restore=None
+        if restore is None
+        else lambda world, obs, key: outside(world, restore(world, obs[:own_dim], key), recall(obs[own_dim:])),
         reward=of_transition(env.reward),
         terminated=of_transition(env.terminated),
         success=None if success is None else lambda obs: success(obs[:own_dim]),

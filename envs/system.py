@@ -1,12 +1,14 @@
 """Observations that tell which system an episode takes place in: for policies that are told what is identified."""
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.spatial.transform import Rotation
 
-from envs.base import NOTHING, Effects, Entry, Env, EnvState, Value, Varying, World, entries_of
+from envs.base import NOTHING, EffectRange, Effects, Entry, Env, EnvState, Theta, Value, Varying, World, entries_of
 from envs.domains.uniform import parameter_ranges
 from envs.effects import make_range
 from envs.history import extended
@@ -53,8 +55,10 @@ def with_system(env: Env, system: tuple[Varying, ...]) -> Env:
         tell=tell,
         start=lambda: (),
         remember=lambda memory, action: memory,
+        recall=lambda told: (),
     )
-    return longer._replace(system=system)
+    asked = None if env.restore is None else functools.partial(simulator, env, env.restore, system)
+    return longer._replace(system=system, simulator=asked)
 
 
 def blurred(env: Env, noise: float) -> Env:
@@ -96,6 +100,111 @@ def concealed(env: Env) -> Env:
         return hide(env.step(world, state, action, key))
 
     return env._replace(reset=reset, step=step)
+
+
+def simulator(
+    env: Env, restore: Callable[[World, Array, Key], EnvState], system: tuple[Varying, ...]
+) -> Callable[[Array, Array], Array]:
+    """What the simulator says of one step: (obs, action) -> [measured_dim] by how much its measurements change.
+
+    obs: what was measured in the real system, with a system [k] of `system` at its end, in which the step takes place;
+    everything else is as the simulator has it. No noise is added. A step with exploded physics changes nothing. The
+    derivative is that of finite differences over 5 % of a number's range, by the system alone.
+
+    Worlds are compiled on the host, which no jitted search can ask for. So some are compiled now, and every field of
+    their models becomes a quadratic function of the domain parameters.
+    """
+    own_dim, measured = env.obs_dim, env.measured_dim
+    model_of, key = models_of(env, system), jax.random.key(0)
+    place = {name: i for i, name in enumerate(_names(env))}
+    where = np.array([place[v.name, v.index] for v in system])
+    low, high = (np.array([getattr(v, end) for v in system]) for end in ("low", "high"))
+    ends = make_range(env, {**env.training, "latency_jitter": 0.0})
+    usual = jax.tree.map(lambda low, high: 0.5 * (low + high), ends.low, ends.high)
+    nominal = jnp.concatenate([jnp.array([p.nominal for p in env.parameters]), *(jnp.ravel(x) for x in usual)])
+    sizes = np.cumsum([len(env.parameters), *(x.size for x in usual)])[:-1]
+
+    def world_of(told: Array) -> World:
+        params, *parts = jnp.split(nominal.at[where].set(low + 0.5 * (1.0 + told) * (high - low)), sizes)
+        own = Effects(*(part.reshape(x.shape) for part, x in zip(parts, usual, strict=True)))
+        own = own._replace(latency_jitter=jnp.zeros(()))
+        return World(Theta(params, EffectRange(own, own)), model_of(told))
+
+    @jax.custom_jvp
+    def change(obs: Array, action: Array) -> Array:
+        world = world_of(obs[own_dim:])
+        before = restore(world, obs[:own_dim], key)
+        after = env.step(world, before, action, key)
+        there = after.true_obs[:measured] + after.effects.obs_bias
+        return jnp.where(after.invalid, 0.0, there - obs[:measured])
+
+    @change.defjvp
+    def differences(given: tuple[Array, Array], along: tuple[Array, Array]) -> tuple[Array, Array]:
+        (obs, action), step = given, 0.05 * along[0].at[:own_dim].set(0.0)
+        return change(obs, action), 10.0 * (change(obs + step, action) - change(obs - step, action))
+
+    return change
+
+
+def models_of(env: Env, system: tuple[Varying, ...]) -> Callable[[Array], dict[str, Array]]:
+    """A system [k] -> `World.model`: least squares over worlds compiled at random systems, quadratic in parameters."""
+    names = [p.name for p in env.parameters]
+    which = np.array([i for i, v in enumerate(system) if v.name in names], int)
+    low, high = (np.array([getattr(system[i], end) for i in which]) for end in ("low", "high"))
+    pairs = np.triu_indices(len(which))
+
+    def features(told: Array) -> Array:
+        return jnp.concatenate([jnp.ones(1), told, jnp.outer(told, told)[pairs]])
+
+    n = 2 * (1 + len(which) + len(pairs[0]))
+    told = np.random.default_rng(0).uniform(-1.0, 1.0, (n, len(which))).astype(np.float32)
+    params = np.tile([p.nominal for p in env.parameters], (n, 1))
+    params[:, [names.index(system[i].name) for i in which]] = low + 0.5 * (1.0 + told) * (high - low)
+    ends = make_range(env, env.training)
+    worlds = env.make_worlds(
+        Theta(jnp.asarray(params), jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *x.shape)), ends))
+    )
+    smooth = jax.vmap(with_tensors, axis_size=n)(worlds.model)
+    seen = np.asarray(jax.vmap(features)(jnp.asarray(told)), np.float64)
+
+    def fitted(values: Array) -> Array:
+        flat = np.asarray(values, np.float64).reshape(n, -1)
+        return jnp.asarray(np.linalg.lstsq(seen, flat, rcond=None)[0], jnp.float32)
+
+    weights = jax.tree.map(fitted, smooth)
+
+    def model(told: Array) -> dict[str, Array]:
+        given = features(told[which])
+        with jax.default_matmul_precision("highest"):
+            found = {k: (given @ weights[k]).reshape(x.shape[1:]).astype(x.dtype) for k, x in smooth.items()}
+        return _with_axes(found)
+
+    return model
+
+
+def with_tensors(model: dict[str, Array]) -> dict[str, Array]:
+    """Inertias [bodies, 3] as tensors [bodies, 3, 3]: unlike principal axes these do not jump from world to world."""
+    if not {"body_iquat", "body_inertia"} <= model.keys():
+        return model
+    axes = jax.vmap(lambda q: Rotation.from_quat(jnp.roll(q, -1)).as_matrix())(model["body_iquat"])
+    with jax.default_matmul_precision("highest"):
+        tensors = jnp.einsum("bij,bj,bkj->bik", axes, model["body_inertia"], axes)
+    return {k: x for k, x in model.items() if k != "body_iquat"} | {"body_inertia": tensors}
+
+
+def _with_axes(model: dict[str, Array]) -> dict[str, Array]:
+    """The reverse of `with_tensors`."""
+    if model.get("body_inertia", jnp.zeros(0)).ndim < 3:
+        return model
+
+    def axes_of(tensor: Array) -> tuple[Array, Array]:
+        size = jnp.abs(tensor).max() + 1e-12
+        inertia, axes = jnp.linalg.eigh(tensor / size)
+        axes = axes.at[:, 0].multiply(jnp.sign(jnp.linalg.det(axes)))
+        return size * inertia, jnp.roll(Rotation.from_matrix(axes).as_quat(), 1)
+
+    inertia, quat = jax.vmap(axes_of)(model["body_inertia"])
+    return model | {"body_inertia": inertia, "body_iquat": quat}
 
 
 def _names(env: Env) -> list[tuple[str, int]]:

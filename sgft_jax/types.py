@@ -197,6 +197,11 @@ class Task(Protocol):
         ...
 
     @property
+    def simulator(self) -> Callable[[], Callable[[Array, Array], Array]] | None:
+        """Compiles (obs, action) -> [measured_dim], what a step changes in the system that `obs` tells."""
+        ...
+
+    @property
     def reward(self) -> Callable[[Array, Array, Array], Array] | None:
         """Task reward []."""
         ...

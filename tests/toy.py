@@ -34,6 +34,7 @@ def make(impl: str = "auto") -> Env:
         make_worlds=lambda theta: World(theta._replace(params=jnp.asarray(theta.params, jnp.float32)), {}),
         reset=reset,
         step=step,
+        restore=restore,
         reward=reward,
         success=success,
         training=TRAINING,
@@ -49,6 +50,13 @@ def reset(world: World, key: Key) -> EnvState:
     obs, own = jnp.concatenate([start, rest]), draw(world.theta.effects, key_effects)
     measured = measure(own, obs, key_noise)
     return EnvState(Point(start, rest, rest), measured, obs, jnp.float32(0), no, no, no, no, jnp.int32(0), own)
+
+
+def restore(world: World, obs: Array, key: Key) -> EnvState:
+    own = draw(world.theta.effects, key)
+    true_obs, command, no = obs - own.obs_bias, jnp.zeros(2), jnp.zeros((), bool)
+    point = Point(true_obs[:2], true_obs[2:], command)
+    return EnvState(point, obs, true_obs, jnp.float32(0), no, no, no, no, jnp.int32(0), own)
 
 
 def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:

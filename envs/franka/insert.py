@@ -111,6 +111,12 @@ def initial(params: Array, key: Key) -> PhysicsState:
     return at_rest(joints, jnp.zeros(0), NV)
 
 
+def settled(params: Array, obs: Array) -> PhysicsState:
+    """The leg where its tip is seen, upright and at rest."""
+    joints = kinematics.solve(jnp.asarray(_ready(), jnp.float32), _pose(obs[3:6]), iterations=12, posture=0.05)
+    return at_rest(joints, jnp.zeros(0), NV)
+
+
 def target(qpos: Array, action: Array) -> Array:
     """[7] joint targets that move the tip by `action` * 2 cm, inside the workspace, and set the leg upright.
 
@@ -138,6 +144,7 @@ SCENE = workcell.scene(
     cartesian=True,
     build=build,
     initial=initial,
+    settled=settled,
     target=target,
     observe=observe,
     reward=reward,

@@ -109,6 +109,12 @@ def initial(params: Array, key: Key) -> PhysicsState:
     return at_rest(ready(key), puck, NV)
 
 
+def settled(params: Array, obs: Array) -> PhysicsState:
+    """The hand and the puck where they are seen, at rest: within a control period both come to rest."""
+    joints = kinematics.solve(jnp.asarray(_folded(), jnp.float32), _pose(obs[:2], HEIGHT), iterations=12, posture=0.05)
+    return at_rest(joints, jnp.concatenate([obs[2:4] + jnp.array([TABLE_ORIGIN, 0.0]), jnp.zeros(2)]), NV)
+
+
 def ready(key: Key, height: float = HEIGHT) -> Array:
     """[7] joint angles with the hand at a random place near the base, `height` m above the table."""
     start = jax.random.uniform(key, (2,), minval=jnp.array([0.09, -0.15]), maxval=jnp.array([0.11, 0.15]))
@@ -143,6 +149,7 @@ SCENE = workcell.scene(
     cartesian=True,
     build=build,
     initial=initial,
+    settled=settled,
     target=target,
     observe=observe,
     reward=reward,

@@ -1,5 +1,6 @@
 """From the parts in which tasks in MuJoCo differ, a `Scene`, to an Env."""
 
+import functools
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
@@ -9,7 +10,7 @@ import mujoco
 import numpy as np
 
 from envs import effects as env_effects
-from envs.base import NOTHING, Entry, Env, EnvState, Parameter, Theta, Value, World, never, pack
+from envs.base import NOTHING, Effects, Entry, Env, EnvState, Parameter, Theta, Value, World, never, pack
 from envs.mujoco import worlds as physics
 from envs.mujoco.engines import Engine
 from envs.mujoco.worlds import PhysicsState
@@ -47,6 +48,8 @@ class Scene(NamedTuple):
         the old one.
     build(params by name) -> MjSpec: the whole scene for one theta.
     initial(params, key) -> PhysicsState: a fresh random start.
+    settled(params, obs) -> PhysicsState: what is observed as `obs`, a vector without measurement error, at rest but for
+        what it says; None where observations do not tell. See `Env.restore`.
     target(qpos, action) -> [nu] controls for an action in [-1, 1] (effects already applied).
     observe(params, state) -> [obs_dim] without measurement error, or a dict of vectors by entry name.
     reward, terminated, success, success_anytime, score, training, cartesian, check: see `Env`.
@@ -69,6 +72,7 @@ class Scene(NamedTuple):
     initial: Callable[[Array, Key], PhysicsState]
     target: Callable[[Array, Array], Array]
     observe: Callable[[Array, PhysicsState], Any]
+    settled: Callable[[Array, Array], PhysicsState] | None = None
     reward: Callable[[Array, Array, Array], Array] | None = None
     success: Callable[[Array], Array] | None = None
     terminated: Callable[[Array, Array, Array], Array] | None = never
@@ -97,6 +101,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
     physics.check_supported(scene.name, host)
     fields = physics.varying_fields(host, _perturbed(scene, nominal))
     impl = physics.choose_impl(impl)
+    settled = scene.settled
     engine = scene.engine if impl == "jax" and scene.engine else physics.make_engine(host, fields, impl)
     seen = lambda params, state: pack(scene.observation, scene.observe(params, state))  # noqa: E731
 
@@ -108,10 +113,18 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
 
     def reset(world: World, key: Key) -> EnvState:
         key_start, key_noise, key_effects = jax.random.split(key, 3)
-        state = scene.initial(world.theta.params, key_start)
+        own = env_effects.draw(world.theta.effects, key_effects)
+        return begin(world, scene.initial(world.theta.params, key_start), own, key_noise)
+
+    def restore(settled: Callable[[Array, Array], PhysicsState], world: World, obs: Array, key: Key) -> EnvState:
+        key_noise, key_effects = jax.random.split(key)
+        own = env_effects.draw(world.theta.effects, key_effects)
+        state = settled(world.theta.params, obs - own.obs_bias)
+        return begin(world, state, own, key_noise)._replace(obs=obs)
+
+    def begin(world: World, state: PhysicsState, own: Effects, key_noise: Key) -> EnvState:
         if host.nsensordata:
             state = engine.sense(world.model, state)
-        own = env_effects.draw(world.theta.effects, key_effects)
         true_obs = seen(world.theta.params, state)
         no = jnp.zeros((), bool)
         return EnvState(
@@ -156,6 +169,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
         make_worlds=make_worlds,
         reset=reset,
         step=step,
+        restore=None if settled is None else functools.partial(restore, settled),
         trace=lambda state: state.qpos,
         impl=impl,
         scene=scene.variant,

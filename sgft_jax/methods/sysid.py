@@ -1,16 +1,18 @@
 """System identification: fits what varies in simulation to the real rollouts, and tells it to a policy that knows it.
 
-No network learns. The prior's dynamics models are told the system too, so they say how likely real steps are in each.
+No network learns. The prior's dynamics models are told the system too, so they say how likely real steps are in each;
+or the simulator does, replaying them.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
 from sgft_jax import checks
 from sgft_jax.methods.options import LoopOptions
-from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
+from sgft_jax.types import Array, Finetuner, Method, Prior, Simulation, Task, UserError
 
-_ROWS = {"map": 320, "dropo": 80}  # what `rows` is if it is left open; DROPO takes two trajectories
+_ROWS, _FEW = 320, 80  # what `rows` is if it is left open; DROPO takes two trajectories, and so does the slow simulator
 _SIMULATED = 2048  # rows that tell how far the models are off in simulation
 
 
@@ -20,8 +22,11 @@ class Config:
 
     fit: Literal["map", "dropo"] = "map"
     """map: the most probable system. dropo: the mean of a distribution over systems (Tiboni et al. 2023)."""
+    through: Literal["models", "simulator"] = "models"
+    """What is asked about real steps: the prior's dynamics models, or the simulator, set to what was measured before
+    each step. The simulator is right about itself and slower."""
     rows: int | None = None
-    """Real transitions that are fitted, the first ones; None = 320 for map, 80 for dropo."""
+    """Real transitions that are fitted, the first ones; None = 320 for map through models, else 80."""
     initial_rollouts: int = 1
     """Real rollouts before the first fit."""
     guard: bool = False
@@ -47,16 +52,21 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.models.robust import spread_of
     from sgft_jax.policies import network_of, sac_policy
     from sgft_jax.transforms import compose
-    from sgft_jax.types import Array, Batch, Key, Metrics, PyTree, SimulatedData, UserError
+    from sgft_jax.types import Batch, Key, Metrics, PyTree, SimulatedData
 
     card = card_of(prior)
     network, varying = network_of(card), card.get("system", [])
     loop = LoopOptions(initial_rollouts=config.initial_rollouts, guard=config.guard)
-    rows_fitted = min(config.rows or _ROWS[config.fit], loop.replay_capacity)
+    few = config.fit == "dropo" or config.through == "simulator"
+    rows_fitted = min(config.rows or (_FEW if few else _ROWS), loop.replay_capacity)
     model = make_dynamics(task.obs_dim, task.act_dim, network)
     policy = sac_policy(task.obs_dim, task.act_dim, network)
 
+    asked = _simulator(task) if config.through == "simulator" else None
+
     def change(params: SACParams, obs: Array, action: Array) -> Array:
+        if asked is not None:
+            return asked(obs, action)
         after = dynamics.predict(model, params.dynamics, params.normalizer, obs, action).mean(axis=0)
         return (after - obs)[: task.measured_dim]
 
@@ -111,6 +121,12 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     finetuner = assemble(parts, loop, task, simulation=Simulation(20_000, 0.6))
     # One update after a rollout says what was found; more would say it again.
     return finetuner._replace(updates_per_rollout=1)
+
+
+def _simulator(task: Task) -> Callable[[Array, Array], Array]:
+    if task.simulator is None:
+        raise UserError("--options.through simulator: this task cannot be set to what was measured; use models")
+    return task.simulator()
 
 
 METHOD = Method(

@@ -10,7 +10,7 @@ import envs
 from envs.base import Varying
 from envs.history import with_previous_actions
 from envs.rollout import play_episode
-from envs.system import blurred, concealed, varying, with_system
+from envs.system import blurred, concealed, models_of, varying, with_system
 from sgft_jax.types import UserError
 
 TOY = toy.make()
@@ -69,6 +69,36 @@ def test_noise_is_on_what_is_told_alone_and_new_at_every_step(key):
     np.testing.assert_allclose(told.mean(axis=0), [0.5, -0.5, 0.0], atol=0.07)
     np.testing.assert_allclose(told.std(axis=0), 0.3, atol=0.05)
     assert jnp.abs(states[-1].true_obs[: TOY.obs_dim] - states[-1].obs[: TOY.obs_dim]).max() < 0.1
+
+
+def test_the_simulator_says_what_a_recorded_step_does_in_the_system_that_is_told(key):
+    """With a bias of the sensors, and whatever the step's own noise was."""
+    biased = {**EFFECTS, "obs_bias": [[0.0] * 4, [0.2] * 4], "latency_jitter": [0.0, 0.02]}
+    env = with_system(with_previous_actions(TOY, 1), varying(TOY, {}, biased))
+    there = jax.tree.map(lambda x: x[0], envs.sample_worlds(env, key, 1, effects=biased | {"obs_noise": 0.0}))
+    before, action = env.reset(there, key), jnp.array([0.6, -0.9])
+    expected = (env.step(there, before, action, key).obs - before.obs)[: env.measured_dim]
+    change = env.simulator()
+    np.testing.assert_allclose(change(before.obs, action), expected, atol=1e-5)
+    other = before.obs.at[-len(env.system) :].add(0.3)
+    assert jnp.abs(change(other, action) - expected).max() > 1e-2
+
+
+def test_what_the_simulator_says_has_a_derivative_by_the_system(key):
+    change, obs = SEEN.simulator(), SEEN.reset(world(EFFECTS), key).obs
+    action = jnp.array([0.5, 0.25])
+    slope = jax.jacfwd(lambda told: change(obs.at[-3:].set(told), action))(jnp.zeros(3))
+    # At mass 1 a step adds dt F / m = 0.1 * 4 * scale * action to the velocity; the ranges' halves are 0.2, 0.5, 0.4.
+    np.testing.assert_allclose(slope[2:], [[-0.04, 0.1, -0.04], [-0.02, 0.0, 0.08]], atol=2e-3)
+
+
+def test_models_are_nothing_where_worlds_have_none():
+    assert models_of(TOY, SYSTEM)(jnp.zeros(3)) == {}
+
+
+def test_tasks_that_cannot_be_set_to_what_is_measured_have_no_simulator_to_ask():
+    blind = with_system(with_previous_actions(TOY._replace(restore=None), 1), SYSTEM)
+    assert blind.simulator is None
 
 
 def test_nothing_to_tell_is_the_task_itself():

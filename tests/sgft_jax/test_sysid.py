@@ -11,7 +11,8 @@ import tuners
 
 import envs
 from envs.base import Varying
-from envs.system import with_system
+from envs.rollout import play_episode
+from envs.system import concealed, with_system
 from sgft_jax import api
 from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.priors import load_prior, observed, save_prior
@@ -79,6 +80,29 @@ def test_rows_that_do_not_count_change_nothing(found, prior):
     more = jax.tree.map(lambda x: jnp.concatenate([x, 9.0 + x]), rows)
     state = jax.jit(fine.observe)(before, more, jnp.arange(2 * N) < N, jnp.float32(0.0))
     np.testing.assert_allclose(state.learner[1].mean, after.learner[1].mean, atol=1e-3)
+
+
+@pytest.mark.parametrize("fit", ["map", "dropo"])
+def test_the_simulator_tells_the_system_too(prior, fit, key):
+    """Of steps with noise, played in the task itself; the prior's models, which know nothing, are not asked."""
+    method = get_method("sysid")
+    fine = method.build(method.config(fit=fit, through="simulator"), prior, ENV)
+    wander = lambda carry, obs, key: (jax.random.uniform(key, (2,), minval=-1.0), carry)  # noqa: E731
+
+    def play(env, n, effects):
+        nominal = {p.name: p.nominal for p in env.parameters}
+        pool = envs.sample_worlds(env, key, n, params=nominal, effects=effects)
+        rows = jax.vmap(lambda key: play_episode(env, pool, wander, (), key, gamma=0.9))(jax.random.split(key, n))
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (rows.transitions, rows.valid))
+
+    known, _ = play(ENV, 32, {v.name: [v.low, v.high] for v in SYSTEM})
+    real = play(concealed(ENV), 1, {"action_scale": [0.8, 1.0], "action_rotation": 0.3})
+    draw = lambda key, n: jax.tree.map(lambda x: x[jax.random.randint(key, (n,), 0, len(x))], known)  # noqa: E731
+    state = jax.jit(lambda: fine.init(prior.params, key, SimulatedData(draw, jnp.zeros(1))))()
+    state = jax.jit(fine.observe)(state, *real, jnp.float32(0))
+    np.testing.assert_allclose(state.learner[1].mean, TRUE, atol=0.1)
+    with pytest.raises(UserError, match="use models"):
+        method.build(method.config(through="simulator"), prior, ENV._replace(simulator=None))
 
 
 def test_it_acts_as_if_the_system_were_told_and_so_does_what_it_exports(found, prior, tmp_path, key):

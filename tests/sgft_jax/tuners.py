@@ -43,6 +43,7 @@ class Point(NamedTuple):
     cartesian: bool = True
     episode_length: int = T
     score: str = "success"
+    simulator: None = None
     reward: Callable[..., jax.Array] | None = reward
     terminated: Callable[..., jax.Array] | None = lambda obs, action, next_obs: jnp.bool_(False)
 
