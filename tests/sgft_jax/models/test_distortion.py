@@ -57,7 +57,7 @@ def test_a_system_that_takes_commands_as_they_are_meant_gives_no_evidence(key):
 
 def test_walls_tell_that_a_camera_is_off(key):
     """The hand stops where it should not: what is measured is not where it is."""
-    truth = turned(0.3, 0.8, [0.0, 0.0], [0.06, 0.0])
+    truth = turned(0.1, 0.95, [0.0, 0.0], [0.06, 0.0])
     rows = steps(truth._replace(offset=jnp.zeros(2)), key, n=120)
     rows = rows._replace(obs=rows.obs + truth.offset[None], next_obs=rows.next_obs + truth.offset[None])
     found, evidence = fit(rows, errors=(0.05, 0.05))
@@ -66,6 +66,19 @@ def test_walls_tell_that_a_camera_is_off(key):
     assert evidence > fit(rows)[1] + 20
     assert jnp.abs(fit(rows, errors=(0.01, 0.01))[0].offset).max() <= 0.02  # twice the error at most
     np.testing.assert_array_equal(fit(rows)[0].offset, 0.0)
+
+
+def test_what_else_is_wrong_with_contacts_is_no_error_of_a_camera(key):
+    """A real wall that stands elsewhere: errors of the camera would explain some of it, and are not believed."""
+    rows = steps(turned(0.7, 0.6, [0.0, 0.0]), key)
+    rows = rows._replace(next_obs=jnp.clip(rows.next_obs, -1.0, jnp.maximum(0.8 * WALL, rows.obs)))
+    found, evidence = fit(rows, errors=(0.05, 0.05))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(distortion, "_EARNED", -1e9)
+        patch.setattr(distortion, "_TIMES", 0.0)
+        believed, more = fit(rows, errors=(0.05, 0.05))
+    assert more > evidence and jnp.abs(believed.offset).max() > 0.01
+    np.testing.assert_array_equal(found.offset, 0.0)
 
 
 def test_rows_that_are_not_there_change_nothing(key):
