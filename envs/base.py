@@ -179,6 +179,8 @@ class Env(NamedTuple):
     success_anytime: whether success counts at any step or only at the last.
     score: what a run is judged by, "success" or "return".
     training: the simulator's own effects, by name: values or ranges, as in a gap.
+    actuators: effects of a simulator whose actuators differ too, see `envs.domains.actuators`; those not named have
+        the ranges given there.
     cartesian: the first two action entries are x and y of one frame.
     check(theta by name) -> what is impossible about it in one sentence, or None: relations between parameters.
     trace(physics) -> [k] what a renderer needs of a state; [0] where nothing can be drawn.
@@ -205,6 +207,7 @@ class Env(NamedTuple):
     success_anytime: bool = False
     score: str = "success"
     training: Mapping[str, Value] = NOTHING
+    actuators: Mapping[str, Value] = NOTHING
     cartesian: bool = False
     check: Callable[[dict[str, float]], str | None] = lambda theta: None
     trace: Callable[[PyTree], Array] = no_trace

@@ -9,6 +9,7 @@ from envs.gaps import SIM
 from experiments import cli
 from experiments.options import Impl, at_least_one, check_task, prior_folders, without_repeats
 from sgft_jax.io.jsonfile import read_json
+from sgft_jax.presets import DEFAULT_PRESET
 from sgft_jax.types import UserError
 
 _SEED = 2**31 + 2  # held out from training and from the choice of the prior
@@ -36,7 +37,7 @@ class EvaluateArgs:
     """Print one JSON object and nothing else."""
     out: Path = Path("runs")
     """Parent of all run folders."""
-    preset: str = "fast"
+    preset: str = DEFAULT_PRESET
     """Expert: pretraining preset whose priors to take where neither --prior nor --run is given."""
     seed: int = 0
     """Expert: another seed draws other worlds and episodes."""

@@ -11,9 +11,9 @@ from experiments.options import Impl, at_least_one, check_task, prior_folders, s
 from sgft_jax import extend
 from sgft_jax.io.runs import check_start
 from sgft_jax.methods import DEFAULT, get_method
+from sgft_jax.presets import DEFAULT_PRESET, preset_of
 from sgft_jax.types import Method, UserError
 
-DEFAULT_PRESET = "fast"
 NO_PRIOR = Path("none")
 VOLATILE = ("resume", "overwrite", "rollouts", "devices", "video", "out", "tuned")  # may differ when a run goes on
 
@@ -71,17 +71,12 @@ class FinetuneArgs:
 def arguments(method: str, **changes: Any) -> FinetuneArgs:
     """The arguments with which a method runs unless the user says otherwise, and any changes to these."""
     chosen = get_method(method)
-    return FinetuneArgs(**{"method": method, "options": chosen.config(), "preset": _preset(chosen), **changes})
+    return FinetuneArgs(**{"method": method, "options": chosen.config(), "preset": preset_of(chosen), **changes})
 
 
 def with_settings(args: FinetuneArgs, settings: Mapping[str, Any]) -> FinetuneArgs:
     """The arguments with other values for some of the method's options."""
     return replace(args, options=replace(args.options, **settings))
-
-
-def _preset(method: Method) -> str:
-    """The preset that makes the priors a method needs."""
-    return DEFAULT_PRESET if method.prior == "sac" else method.prior
 
 
 def run_folder(args: FinetuneArgs, real: str) -> Path:

@@ -16,10 +16,11 @@ from typing import Any
 from envs import gaps
 from experiments import cli
 from experiments.options import Impl, check_task, prior_folders, seed_list, without_repeats
-from experiments.pretrain import DEFAULT_PRESET
 from sgft_jax import extend
 from sgft_jax.presets import PRESETS, PretrainConfig
 from sgft_jax.types import UserError
+
+PLAIN = "fast"  # strata are those of priors that know the task's own domain alone
 
 
 @dataclass(frozen=True)
@@ -40,13 +41,13 @@ class GapsArgs:
     judge: bool = False
     """With --draw: also train a policy on every gap, in one program, that sees its previous actions. Gaps on which it
     reaches 90 % can be mastered."""
-    judge_preset: str = DEFAULT_PRESET
+    judge_preset: str = PLAIN
     """Pretraining preset of that training; --config.* changes it."""
     overwrite: bool = False
     """With --draw: measure again what the table holds with other settings; default: refuse."""
     prior: Path | None = None
     """Folder of a prior, or of several (prior/seed-*); default: those of <out>/pretrain/<task>/<preset>."""
-    preset: str = DEFAULT_PRESET
+    preset: str = PLAIN
     """Pretraining preset of the priors, and of the training on the real systems; --config.* changes the latter."""
     train: bool = True
     """Also train on every real system, all of them in one program; --no-train measures zero-shot success only. Drawn
@@ -60,7 +61,7 @@ class GapsArgs:
     seed: int = 0
     """What is drawn; also the first seed of the training on real systems."""
     impl: Impl = "auto"
-    config: PretrainConfig = field(default_factory=lambda: PRESETS[DEFAULT_PRESET])
+    config: PretrainConfig = field(default_factory=lambda: PRESETS[PLAIN])
     """Expert: single settings of that training; the defaults are those of the preset."""
 
 
@@ -71,10 +72,10 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _defaults(argv: Sequence[str]) -> GapsArgs:
     """The defaults of the presets; `measure` refuses a preset that does not exist."""
-    chosen = cli.preview(argv, preset=DEFAULT_PRESET, judge_preset=DEFAULT_PRESET, draw=0)
+    chosen = cli.preview(argv, preset=PLAIN, judge_preset=PLAIN, draw=0)
     training = chosen.judge_preset if chosen.draw else chosen.preset
     return GapsArgs(
-        preset=chosen.preset, judge_preset=chosen.judge_preset, config=PRESETS.get(training, PRESETS[DEFAULT_PRESET])
+        preset=chosen.preset, judge_preset=chosen.judge_preset, config=PRESETS.get(training, PRESETS[PLAIN])
     )
 
 

@@ -16,10 +16,8 @@ from experiments import cli
 from experiments.options import Impl, check_task, seed_list, seeds_name
 from sgft_jax import extend
 from sgft_jax.io.runs import check_start
-from sgft_jax.presets import PRESETS, PretrainConfig
+from sgft_jax.presets import DEFAULT_PRESET, PRESETS, PretrainConfig
 from sgft_jax.types import UserError
-
-DEFAULT_PRESET = "fast"
 
 
 @dataclass(frozen=True)
@@ -29,8 +27,9 @@ class PretrainArgs:
     task: str = "push"
     """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
     preset: str = DEFAULT_PRESET
-    """Named settings: cpu (two cores, minutes), fast (one GPU, minutes), paper, or tdmpc2 and recurrent for the
-    methods that need their priors. --config.* changes single ones."""
+    """Named settings: robust (one GPU, minutes; actuators and sensors differ between episodes), fast (the task's own
+    domain), cpu (two cores, minutes), paper, or tdmpc2, recurrent and informed (sysid) for the methods that need their
+    priors. --config.* changes single ones."""
     seed: int = 0
     """First seed."""
     seeds: int = 1

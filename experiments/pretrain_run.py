@@ -14,6 +14,7 @@ import numpy as np
 
 import envs
 from envs.base import Env, World
+from envs.domains.actuators import with_actuators
 from envs.gaps import Gap
 from envs.pools import heldout_worlds, load_gap, real_env, training_worlds
 from envs.rollout import Episode
@@ -65,6 +66,7 @@ def run(args: PretrainArgs, seeds: list[int]) -> dict[str, Any]:
     env = envs.make(args.task, args.impl, previous_actions=args.config.previous_actions)
     gap = load_gap(env, args.real, args.set)
     env = real_env(env, [gap] if gap else [])
+    env = with_actuators(env) if args.config.actuators else env
     if args.config.sees_system:
         told = with_system(env, varying(env, gap.params, gap.effects) if gap else varying(env))
         env = blurred(told, args.config.system_noise)
@@ -300,8 +302,8 @@ class _Run:
             print(line)
         left = ", ".join(name for name in ("prior/", "summary.json", "figures/") if (self.folder / name).exists())
         print(f"results: {self.folder}  ({left})")
-        method = {"sac": "", "tdmpc2": " --method sgft-tdmpc2", "recurrent": " --method recurrent"}[
-            self.config.algorithm
-        ]
+        kind = "informed" if self.config.sees_system else self.config.algorithm
+        method = {"sac": "", "informed": "sysid", "tdmpc2": "sgft-tdmpc2", "recurrent": "recurrent"}[kind]
+        method = method and f" --method {method}"
         out = "" if self.args.out == PretrainArgs.out else f" --out {self.args.out}"
         print(f"next: python -m experiments.finetune --task {self.args.task}{method} --prior {self.folder}{out}")

@@ -22,6 +22,7 @@ from sgft_jax.io.priors import load_prior, observed
 from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.methods.options import card_of
 from sgft_jax.policies import make_policy
+from sgft_jax.presets import preset_of
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import FinetuneProgress, SimulatedRows
 from sgft_jax.types import Array, Finetuner, Method, Policy, Prior, PyTree, UserError
@@ -92,18 +93,12 @@ def _simulated(env: Env, finetuner: Finetuner, priors: list[Prior], stacked: PyT
 
 def check_prior(prior: Prior, method: Method, env: Env) -> None:
     """Raises UserError for a prior of another algorithm or task, or of a policy that is told more or less."""
-    command = f"python -m experiments.pretrain --task {env.name}"
+    command = f"python -m experiments.pretrain --task {env.name} --preset {preset_of(method)}"
     if (found := prior.card.get("algorithm", "sac")) != method.prior:
-        preset = "fast" if method.prior == "sac" else method.prior
-        raise UserError(
-            f"the method needs a prior of {method.prior}, not of {found}; make one with: {command} --preset {preset}"
-        )
+        raise UserError(f"the method needs a prior of {method.prior}, not of {found}; make one with: {command}")
     if method.sees_system != bool(prior.card.get("system")):
-        flag = "sees-system" if method.sees_system else "no-sees-system"
-        raise UserError(
-            f"{method.name} needs a prior that was {'' if method.sees_system else 'not '}told the system; make one "
-            f"with: {command} --config.{flag}"
-        )
+        told = f"{'' if method.sees_system else 'not '}told the system"
+        raise UserError(f"{method.name} needs a prior that was {told}; make one with: {command}")
     if prior.card["task"] != env.name:
         raise UserError(f"the prior is of the task {prior.card['task']!r}, not of {env.name!r}")
 

@@ -4,11 +4,13 @@ Command lines read this module, so it imports neither JAX nor MuJoCo.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from sgft_jax import checks
 from sgft_jax.models.config import NetworkConfig, Precision
-from sgft_jax.types import Algorithm
+from sgft_jax.types import Algorithm, Method
+
+DEFAULT_PRESET = "robust"
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,9 @@ class PretrainConfig:
     previous_actions: int = 0
     """Last actions that end the observation of all networks. Where commands arrive late, measurements alone do not say
     what will happen next."""
+    actuators: bool = False
+    """Also vary between episodes how commands reach the robot (scale, bias, rotation, latency) and how noisy its
+    sensors are, see `envs.domains.actuators`. What such a policy sees should end with its previous actions."""
     sees_system: bool = False
     """End the observation of all networks with what varies between episodes of the training domain, parameters and
     effects. Such a prior is for the method `sysid`, which tells it what it has identified."""
@@ -124,7 +129,44 @@ class PretrainConfig:
 
 _NORMED = NetworkConfig(hidden=(256, 256), layer_norm=True)
 
+# What pays on one GPU: learning needs many updates whatever the number of environments, so enough of both to keep the
+# device busy; layer-normed critics, fast targets, a falling learning rate.
+_FAST = PretrainConfig(
+    n_envs=1024,
+    env_steps=2_500_000,
+    random_transitions=102_400,
+    random_fraction=0.1,
+    random_ladder=0.6,
+    updates_per_step=32,
+    batch_size=1024,
+    gamma=0.97,
+    lr=5e-4,
+    lr_end=0.05,
+    tau=0.01,
+    alpha=0.1,
+    network=_NORMED,
+)
+
+# For real systems that nobody knows yet: actuators and sensors differ between episodes, and the policy remembers what
+# it commanded. Four times the environments and the learning rate of `fast` do with 30,000 of its 78,400 updates
+# (docs/protocol.md).
+_ROBUST = replace(
+    _FAST,
+    previous_actions=2,
+    actuators=True,
+    n_envs=4096,
+    env_steps=2_560_000,
+    random_transitions=204_800,
+    updates_per_step=48,
+    lr=2e-3,
+    chunk_steps=25,
+    eval_every=10,
+)
+
 PRESETS: dict[str, PretrainConfig] = {
+    "robust": _ROBUST,
+    # The same, told what differs: for the method `sysid`, which identifies it.
+    "informed": replace(_ROBUST, sees_system=True, system_noise=0.1),
     # The paper's numbers (Appendix C): one update of batch 256 per environment step, 2 x 512 units, alpha from 1.
     "paper": PretrainConfig(
         n_envs=64,
@@ -135,23 +177,8 @@ PRESETS: dict[str, PretrainConfig] = {
         replay_capacity=5_000_000,
         chunk_steps=200,
     ),
-    # What pays on one GPU today: learning needs some 30,000 updates whatever the number of environments, so enough of
-    # both to keep the device busy; layer-normed critics, fast targets, a falling learning rate.
-    "fast": PretrainConfig(
-        n_envs=1024,
-        env_steps=2_500_000,
-        random_transitions=102_400,
-        random_fraction=0.1,
-        random_ladder=0.6,
-        updates_per_step=32,
-        batch_size=1024,
-        gamma=0.97,
-        lr=5e-4,
-        lr_end=0.05,
-        tau=0.01,
-        alpha=0.1,
-        network=_NORMED,
-    ),
+    # The task's own domain and measurements alone: the priors of docs/results.md, and of the strata of drawn gaps.
+    "fast": _FAST,
     # TD-MPC2 in many environments at once, for the methods that plan. Its own numbers but for what massive collection
     # asks for: larger batches, and the discount factor and the exploration of `fast`.
     "tdmpc2": PretrainConfig(
@@ -171,13 +198,11 @@ PRESETS: dict[str, PretrainConfig] = {
         eval_every=10,
         eval_episodes=128,
     ),
-    # A policy that remembers the episode, for domains that hide something (actuators, latency, sensors). For three
-    # seeds in five minutes of one H100, by estimate; never run. A step of physics takes 50 ms (`fast`), an update 5
-    # ms, of which 4 go into 51 steps of the GRUs forwards and backwards, a few small kernels each. That is 130 ms per
-    # step of all environments, 195 s for 1,500 of them; compilation, random actions and evaluations take the rest. A
-    # batch has 3,200 transitions (64 episodes of 50 steps), so 24,000 updates see as many as 75,000 of `fast`.
+    # A policy that remembers the episode, in the domain of `robust`. A batch has 3,200 transitions (64 episodes of 50
+    # steps), so 24,000 updates see as many as 75,000 of `fast`.
     "recurrent": PretrainConfig(
         algorithm="recurrent",
+        actuators=True,
         n_envs=1024,
         env_steps=1_536_000,
         random_transitions=102_400,
@@ -217,3 +242,10 @@ PRESETS: dict[str, PretrainConfig] = {
         report_episodes=64,
     ),
 }
+
+
+def preset_of(method: Method) -> str:
+    """The preset that makes the priors which a method needs."""
+    if method.sees_system:
+        return "informed"
+    return DEFAULT_PRESET if method.prior == "sac" else method.prior

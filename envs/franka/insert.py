@@ -142,6 +142,7 @@ SCENE = workcell.scene(
     substeps=SUBSTEPS,
     success_anytime=True,
     cartesian=True,
+    actuators={**workcell.NOISE, "action_scale": [[0.5] * 3, [1.4] * 3]},
     build=build,
     initial=initial,
     settled=settled,

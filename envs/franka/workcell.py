@@ -16,7 +16,8 @@ CONTROL_DT = 0.2  # s, 5 Hz as in the paper
 RAMP = 0.1  # s: the servo's target moves linearly to its new value, then rests, so the arm has settled at the next step
 # Exact commands, occasional sensor noise in raw units (paper, Appendix C).
 TRAINING = {"obs_noise": 0.004, "obs_noise_prob": 0.3}
-scene = functools.partial(Scene, control_dt=CONTROL_DT, ramp=RAMP, training=TRAINING)
+NOISE = {"obs_noise": [0.0, 0.004]}  # of the domain in which actuators and sensors differ
+scene = functools.partial(Scene, control_dt=CONTROL_DT, ramp=RAMP, training=TRAINING, actuators=NOISE)
 FLOOR = -0.75  # m: the arm stands on a table
 _WHITE, _GREY, _DARK = [0.93, 0.94, 0.95, 1.0], [0.60, 0.62, 0.65, 1.0], [0.20, 0.21, 0.24, 1.0]
 

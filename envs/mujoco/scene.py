@@ -52,7 +52,7 @@ class Scene(NamedTuple):
         what it says; None where observations do not tell. See `Env.restore`.
     target(qpos, action) -> [nu] controls for an action in [-1, 1] (effects already applied).
     observe(params, state) -> [obs_dim] without measurement error, or a dict of vectors by entry name.
-    reward, terminated, success, success_anytime, score, training, cartesian, check: see `Env`.
+    reward, terminated, success, success_anytime, score, training, actuators, cartesian, check: see `Env`.
     measured(params, before, action, after) -> Measured: where reward, end or success are no functions of observations.
     event(params, state) -> state: what happens between control steps (a fallen object stays down); default nothing.
     max_speed: m/s or rad/s, ten times what any joint or object reaches: beyond it the physics has exploded.
@@ -83,6 +83,7 @@ class Scene(NamedTuple):
     score: str = "success"
     cartesian: bool = False
     training: Mapping[str, Value] = NOTHING
+    actuators: Mapping[str, Value] = NOTHING
     check: Callable[[dict[str, float]], str | None] = lambda theta: None
     max_speed: float = 50.0
     engine: Engine | None = None

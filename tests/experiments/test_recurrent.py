@@ -11,7 +11,7 @@ from sgft_jax import api
 from sgft_jax.io.priors import load_prior
 from sgft_jax.learners.recurrent import RECURRENTParams
 
-PRETRAIN = """--task push --preset recurrent --real envs/gaps/development/push.toml:actuators --no-video
+PRETRAIN = """--task push --preset recurrent --no-video
     --config.n-envs 4 --config.worlds 2 --config.env-steps 80 --config.random-transitions 160 --config.gru 8
     --config.replay-capacity 160 --config.batch-size 4 --config.updates-per-step 1 --config.chunk-steps 10
     --config.eval-every 1 --config.checkpoint-every 1 --config.eval-episodes 2 --config.report-episodes 2"""
@@ -27,7 +27,7 @@ def _engine():
 @pytest.mark.slow
 def test_from_pretraining_to_a_policy_that_acts(tmp_path, capsys):
     pretrain.main([*PRETRAIN.split(), "--out", str(tmp_path)])
-    run = tmp_path / "pretrain/push/recurrent-on-actuators/seed-0"
+    run = tmp_path / "pretrain/push/recurrent/seed-0"
     assert "--method recurrent" in capsys.readouterr().out
     prior = load_prior(run / "prior/seed-0")
     assert isinstance(prior.params, RECURRENTParams) and prior.card["algorithm"] == "recurrent"
