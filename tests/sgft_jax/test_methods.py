@@ -31,6 +31,7 @@ def test_the_list_of_methods_is_complete():
         "iql",
         "sgft-relabel",
         "sysid",
+        "anchored",
     }
     assert {name for name, fine in tuned.items() if fine.initial_policy} == {"rlpd", "iql", "sgft-tdmpc2-code"}
     assert all(method.name == name and method.description and method.source for name, method in METHODS.items())
