@@ -145,7 +145,8 @@ def train(
     with RunProgress("train on the real systems", total=config.chunks * size, unit="env steps") as progress:
         for done, (state, metrics) in enumerate(steps, start=1):
             log.metrics(done * size, metrics)
-            shown = {"train/success": float(metrics["train/success"].mean())}
+            ended = metrics["train/episodes"].all()
+            shown = {"train/success": float(metrics["train/success"].mean())} if ended else {}
             if done % config.eval_every == 0 or done == config.chunks:
                 params = exported(seen, config, state)
                 played = play(heldout, policy, params, episode_key(_HELDOUT_SEED), config.eval_episodes)

@@ -173,7 +173,9 @@ class _Run:
                 done += 1
                 self.log.metrics(done * size, metrics)
                 check_finite(metrics, done * size, unit="env steps", last_good=self.last_good)
-                shown = {"success, exploring": float(metrics["train/success"].mean())}
+                # Episodes begin together, so in some chunks none ends.
+                ended = metrics["train/episodes"].all()
+                shown = {"success, exploring": float(metrics["train/success"].mean())} if ended else {}
                 if done % self.config.eval_every == 0 or done == chunks:
                     best, found = self._evaluate(state, best, done)
                     shown |= {f"{name}, evaluation": float(found[name].mean()) for name in ("success", "return")}

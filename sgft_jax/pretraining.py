@@ -339,7 +339,8 @@ def make_pretrainer(env: Env, config: PretrainConfig) -> Pretrainer:
         counts = {name: metrics.pop(name).sum() for name in ("ended", "succeeded", "terminated")}
         ended = jnp.maximum(counts["ended"], 1.0)
         shares = {f"train/{own}": counts[count] / ended for own, count in _SHARES.items()}
-        return state, whole({k: v.mean() for k, v in metrics.items()} | shares)
+        counted = {"train/episodes": counts["ended"]}
+        return state, whole({k: v.mean() for k, v in metrics.items()} | shares | counted)
 
     return Pretrainer(collect_random, init, chunk, renew)
 
