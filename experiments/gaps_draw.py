@@ -15,7 +15,7 @@ from envs.gaps import SIM, Gap
 from envs.history import with_previous_actions
 from envs.rollout import Episode
 from envs.system import concealed
-from experiments import stacking
+from experiments import gaps_choose, stacking
 from experiments.cli import columns
 from experiments.evaluation import play
 from experiments.gaps import GapsArgs
@@ -61,7 +61,34 @@ def run(args: GapsArgs, seeds: list[int], folders: list[Path]) -> dict[str, Any]
         table.add(_judge(env, args, missing, seeds, path.with_suffix("")))
     print("\n".join(lines([gap.name for gap in everywhere], table.found["gaps"])))
     print(f"gaps: {path}\ntable: {table.path}")
+    if args.choose and args.to:
+        _choose(args, args.to, found, table.found["gaps"])
     return table.found
+
+
+def _choose(args: GapsArgs, path: Path, found: Sequence[Gap], known: Mapping[str, Mapping[str, Any]]) -> None:
+    """Writes a frozen set of the gaps that were asked for and says what is to know of it."""
+    drawn = {gap.name: gap for gap in found}
+    lines = {name: known[name] for name in drawn}
+    names = gaps_choose.choose(lines, args.choose)
+    words = [
+        ", ".join([f"{known[name]['stratum']}, zero-shot {_success(known[name])} %", *_marks(known[name])])
+        for name in names
+    ]
+    gaps_choose.write(path, [drawn[name] for name in names], words, _command(args))
+    print("\n".join([*gaps_choose.remarks(lines, names), f"chosen: {path}"]))
+
+
+def _success(line: Mapping[str, Any]) -> str:
+    return f"{100 * line['zero_shot']['success']:.0f}"
+
+
+def _command(args: GapsArgs) -> str:
+    """What draws and chooses the same gaps, where the same priors are."""
+    own = [f"--distribution {args.distribution}"] if args.distribution else []
+    flags = [f"--{name}" for name in ("plan", "judge") if getattr(args, name)]
+    given = [f"--task {args.task} --draw {args.draw} --seed {args.seed}", *own, *flags]
+    return f"python -m experiments.gaps {' '.join(given)} --choose {args.choose} --to {args.to}"
 
 
 def write_gaps(path: Path, found: Sequence[Gap]) -> None:
@@ -155,14 +182,18 @@ def labels(line: Mapping[str, Any]) -> dict[str, Any]:
 def lines(names: Sequence[str], known: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """The table for people, success in per cent with 95 % intervals."""
     rows = [("gap", "families", "zero-shot %", "plan %", "after fit %", "trained there %", "stratum", "labels")]
-    said = {"trivial": {True: "trivial"}, "admitted": {True: "admitted", False: "not mastered"}}
     for name in names:
         line = known[name]
         zero, plan, fit, judge = (percent(line.get(what)) for what in ("zero_shot", "plan", "fit", "judge"))
-        marks = [words[line[label]] for label, words in said.items() if line[label] in words]
         families = " ".join(line["gap"]["families"]) or "none"
-        rows.append((name, families, zero, plan, fit, judge, line["stratum"], ", ".join(marks)))
+        rows.append((name, families, zero, plan, fit, judge, line["stratum"], ", ".join(_marks(line))))
     return columns(rows)
+
+
+def _marks(line: Mapping[str, Any]) -> list[str]:
+    """The labels of a gap for people."""
+    said = {"trivial": {True: "trivial"}, "admitted": {True: "admitted", False: "not mastered"}}
+    return [words[line[label]] for label, words in said.items() if line[label] in words]
 
 
 # --- measurements -----------------------------------------------------------------------------------------------------

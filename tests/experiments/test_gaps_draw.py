@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 
 import jax
 import jax.numpy as jnp
@@ -89,7 +90,20 @@ def test_drawn_gaps_are_written_measured_and_sorted(home, capsys, monkeypatch):
         return whole(env, missing, *given)
 
     monkeypatch.setattr(gaps_draw, "_zero_shot", noted)
-    assert call(home, "--draw", "4")["gaps"] == found and measured == []
+    frozen = home / "frozen.toml"
+    to = ["--choose", "4", "--to", str(frozen)]
+    assert call(home, "--draw", "4")["gaps"] == call(home, "--draw", "6", *to)["gaps"] == found and measured == []
+    assert list(gaps.read_file(frozen).values()) == [gap for gap in drawn if gap.name in gaps.read_file(frozen)]
+    head, *text = frozen.read_text().splitlines()
+    assert head.startswith("# Chosen by python -m experiments.gaps --task toy_steps --draw 6 --seed 5 --distribution ")
+    comments = [line for line in text if line.startswith("# ")]
+    assert len(comments) == 4 and re.fullmatch(r"# (failed|solved), zero-shot \d+ %, trivial", comments[0])
+    few, unknown, last = capsys.readouterr().out.splitlines()[-3:]
+    assert few.startswith("too few gaps: ") and "partial has 0 of 1;" in few and last == f"chosen: {frozen}"
+    assert unknown.startswith("nobody checked that these gaps can be mastered") and unknown.count("toy_steps-5-0") == 4
+    with pytest.raises(SystemExit):
+        call(home, "--draw", "6", "--choose", "3", "--to", str(frozen))
+    assert "frozen.toml: holds other gaps; a frozen set is never replaced" in capsys.readouterr().err
     more = call(home, "--draw", "7")["gaps"]
     assert measured == [["toy_steps-5-06"]] and len(gaps.read_file(file)) == 7
     assert {name: more[name] for name in found} == found
@@ -157,6 +171,10 @@ def test_labels_say_what_is_known():
         (["--draw", "-1"], "--draw is -1: must be at least 1"),
         (["--draw", "2", "--presets", "mild"], "--presets mild: names gaps, and --draw draws them"),
         (["--judge"], "--judge: is for drawn gaps"),
+        (["--choose", "2"], "--choose: is for drawn gaps"),
+        (["--draw", "2", "--choose", "3", "--to", "f.toml"], "--choose is 3: must be from 1 to the 2 of --draw"),
+        (["--draw", "2", "--choose", "1"], "--choose N and --to FILE.toml: give both"),
+        (["--draw", "2", "--choose", "1", "--to", "f.json"], "--to f.json: must end in .toml"),
         (["--draw", "2", "--judge-preset", "fats"], "--judge-preset: there is no 'fats', did you mean 'fast'?"),
         (["--draw", "2"], "toy_steps comes with no distribution of gaps; name a file of one"),
     ],
