@@ -40,8 +40,8 @@ class GapsArgs:
     plan: bool = False
     """With --draw: also measure what sgft-mpc does at its start, plans by the prior's models."""
     judge: bool = False
-    """With --draw: also train a policy on every gap, in one program, that sees its previous actions. Gaps on which it
-    reaches 90 % can be mastered."""
+    """With --draw: also train policies that see their previous actions, in one program, on every gap that nothing
+    measured so far masters (90 %): a gap counts only if something does."""
     judge_preset: str = PLAIN
     """Pretraining preset of that training; --config.* changes it."""
     choose: int = 0
