@@ -78,6 +78,17 @@ def find(task: str, source: str) -> Gap:
     raise UserError(f"{task} has no gap {source!r}: it comes with none; give a .toml or .json file, or {SIM}")
 
 
+def each(sources: Iterable[str]) -> tuple[str, ...]:
+    """Sources of one gap each, see `find`: a file that holds several becomes "file.toml:name" of every one of them."""
+    return tuple(one for source in sources for one in _each(source))
+
+
+def _each(source: str) -> list[str]:
+    match = _FILE.fullmatch(source)
+    found = {} if match is None or match[2] else read_file(source)
+    return [f"{source}:{name}" for name in found] if len(found) > 1 else [source]
+
+
 def title(source: str) -> str:
     """What folders call the gap of that source, see `find`: the name of one of several, else that of the file."""
     match = _FILE.fullmatch(source)

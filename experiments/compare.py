@@ -6,8 +6,9 @@ given again, does what is missing. The real systems of a task that a method has 
 in one program.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from envs import gaps
 from experiments import cli, grid, tuned
 from experiments.figures import FiguresArgs, figures
 from experiments.finetune_args import FinetuneArgs
@@ -47,6 +48,7 @@ def compare(args: CompareArgs) -> list[str]:
 
 def cells(args: CompareArgs) -> list[Cell]:
     """The grid, methods innermost, so that every task and real system is compared early."""
+    args = replace(args, reals=gaps.each(args.reals))
     grid.check(args)
     if args.tuned:
         for task in args.tasks:

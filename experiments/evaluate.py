@@ -1,10 +1,11 @@
 """Evaluate priors, or what fine-tuning has saved, in simulation or on "real" systems."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from envs import gaps
 from envs.gaps import SIM
 from experiments import cli
 from experiments.options import Impl, at_least_one, check_task, prior_folders, without_repeats
@@ -28,7 +29,8 @@ class EvaluateArgs:
     task: str | None = None
     """A task by name, or a Python file with a task of your own; default: the task of the prior."""
     real: tuple[str, ...] = (SIM,)
-    """Where: sim (the training domain without sensor noise), gaps by name, or .toml/.json files."""
+    """Where: sim (the training domain without sensor noise), gaps by name, or .toml/.json files: all gaps of a file, or
+    file.toml:name."""
     set: tuple[str, ...] = ()
     """Changes to the real systems, e.g. --set latency=0.05 action_scale=[1,0.5]."""
     episodes: int = 200
@@ -63,6 +65,7 @@ def main(args: EvaluateArgs) -> None:
 
 def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     """Success with its 95 % Wilson interval, mean return and share of exploded episodes of every policy everywhere."""
+    args = replace(args, real=gaps.each(args.real))
     folders, task = check(args)
     import jax
     import jax.numpy as jnp

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+from envs import gaps
 from experiments import cli
 from experiments.finetune_args import FinetuneArgs, arguments, check, priors_of
 from sgft_jax.methods import DEFAULT, all_methods
@@ -31,6 +32,7 @@ def _table() -> str:
 
 def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:
     """Fine-tuning runs from (or back) to disk, one per real system; returns their summaries in the order of `real`."""
+    args = replace(args, real=gaps.each(args.real))
     method, seeds = check(args)
     priors = priors_of(args)
     from experiments.finetune_run import run  # JAX starts here

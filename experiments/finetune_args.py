@@ -27,9 +27,9 @@ class FinetuneArgs:
     method: str = DEFAULT
     """A method from the table at the top, or a Python file with a method of your own (docs/extending.md)."""
     real: tuple[str, ...] = ("default",)
-    """The real system: a gap by name, a .toml/.json file with tables `params` and `effects`, file.toml:name for one
-    of several in a file, or sim for no gap. Several are played together in one program, which takes little longer;
-    each has a run folder of its own."""
+    """The real system: a gap by name, a .toml/.json file of one gap (tables `params` and `effects`) or of several, then
+    all of them, file.toml:name for one of several, or sim for no gap. Several are played together in one program,
+    which takes little longer; each has a run folder of its own."""
     set: tuple[str, ...] = ()
     """Changes to the real systems, e.g. --set latency=0.05 action_scale=[1,0.5]."""
     seeds: int = 10

@@ -9,7 +9,7 @@ rollout suffices. What the table beside the file holds already is not measured a
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,8 @@ class GapsArgs:
     task: str = "push"
     """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
     presets: tuple[str, ...] = ()
-    """Gaps to measure, by name or as .toml/.json files; default: all that come with the task."""
+    """Gaps to measure, by name or as .toml/.json files (all gaps of a file, or file.toml:name); default: all that come
+    with the task."""
     draw: int = 0
     """Draw so many gaps instead and write them to <out>/gaps/<task>/seed-<seed>.toml; gap i of a seed is always the
     same."""
@@ -39,10 +40,15 @@ class GapsArgs:
     plan: bool = False
     """With --draw: also measure what sgft-mpc does at its start, plans by the prior's models."""
     judge: bool = False
-    """With --draw: also train a policy on every gap, in one program, that sees its previous actions. Gaps on which it
-    reaches 90 % can be mastered."""
+    """With --draw: also train policies that see their previous actions, in one program, on every gap that nothing
+    measured so far masters (90 %): a gap counts only if something does."""
     judge_preset: str = PLAIN
     """Pretraining preset of that training; --config.* changes it."""
+    choose: int = 0
+    """With --draw: choose so many of the measured gaps for a frozen set, evenly over strata and families. A gap that a
+    policy trained there (--judge) did not master is never chosen."""
+    to: Path | None = None
+    """With --choose: the .toml file of the frozen set; one that holds other gaps is never replaced."""
     overwrite: bool = False
     """With --draw: measure again what the table holds with other settings; default: refuse."""
     prior: Path | None = None
@@ -86,6 +92,7 @@ def measure(args: GapsArgs) -> dict[str, Any]:
     if args.episodes < 200:
         raise UserError(f"--episodes is {args.episodes}: a success rate needs at least 200 to tell 40 % from 50 %")
     _check_draw(args)
+    args = replace(args, presets=gaps.each(args.presets))
     without_repeats("--presets", args.presets)
     seeds, task = seed_list(args.seed, args.seeds), extend.name_of(args.task)
     check_task(args.task, args.presets)
@@ -105,9 +112,15 @@ def _check_draw(args: GapsArgs) -> None:
         raise UserError(f"--draw is {args.draw}: must be at least 1")
     if args.draw and args.presets:
         raise UserError(f"--presets {args.presets[0]}: names gaps, and --draw draws them; give one of the two")
-    names = ("distribution", "plan", "judge", "overwrite")
+    names = ("distribution", "plan", "judge", "choose", "to", "overwrite")
     if odd := [name for name in names if getattr(args, name) and not args.draw]:
         raise UserError(f"--{odd[0]}: is for drawn gaps; say how many with --draw")
+    if not 0 <= args.choose <= args.draw:
+        raise UserError(f"--choose is {args.choose}: must be from 1 to the {args.draw} of --draw")
+    if bool(args.choose) != bool(args.to):
+        raise UserError("--choose N and --to FILE.toml: give both, the number of gaps and where they go")
+    if args.to and args.to.suffix != ".toml":
+        raise UserError(f"--to {args.to}: must end in .toml")
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from envs.gaps import SIM, Gap
 from envs.history import with_previous_actions
 from envs.rollout import Episode
 from envs.system import concealed
-from experiments import stacking
+from experiments import gaps_choose, stacking
 from experiments.cli import columns
 from experiments.evaluation import play
 from experiments.gaps import GapsArgs
@@ -36,6 +36,7 @@ PLANNER = "sgft-mpc"
 PREVIOUS_ACTIONS = 2  # that the judge sees: a command that comes late is still in force, or was when the step began
 _ROLLOUT_SEED = 2**31 + 6  # of the rollouts that distortions are fitted to
 _MEASURED = {"zero_shot": ("zero_shot", "fit"), "plan": ("plan",), "judge": ("judge",)}  # of a line, by measurement
+_MASTERED = {"zero_shot": "zero-shot", "fit": "after fit", "plan": "by plan", "judge": "after training"}
 _ELSE = "choose another --out, or remove the table"
 _SIMULATED = 8  # rollouts that tell how far the model is off in simulation; the real system is fitted to one
 
@@ -57,11 +58,38 @@ def run(args: GapsArgs, seeds: list[int], folders: list[Path]) -> dict[str, Any]
         table.add(_zero_shot(env, missing, priors, args.episodes))
     if args.plan and (missing := table.without("plan", everywhere)):
         table.add(_plan(env, missing, priors, args.episodes))
-    if args.judge and (missing := table.without("judge", found)):
+    if args.judge and (missing := table.to_judge(found)):
         table.add(_judge(env, args, missing, seeds, path.with_suffix("")))
     print("\n".join(lines([gap.name for gap in everywhere], table.found["gaps"])))
     print(f"gaps: {path}\ntable: {table.path}")
+    if args.choose and args.to:
+        _choose(args, args.to, found, table.found["gaps"])
     return table.found
+
+
+def _choose(args: GapsArgs, path: Path, found: Sequence[Gap], known: Mapping[str, Mapping[str, Any]]) -> None:
+    """Writes a frozen set of the gaps that were asked for and says what is to know of it."""
+    drawn = {gap.name: gap for gap in found}
+    lines = {name: known[name] for name in drawn}
+    names = gaps_choose.choose(lines, args.choose)
+    words = [
+        ", ".join([f"{known[name]['stratum']}, zero-shot {_success(known[name])} %", *_marks(known[name])])
+        for name in names
+    ]
+    gaps_choose.write(path, [drawn[name] for name in names], words, _command(args))
+    print("\n".join([*gaps_choose.remarks(lines, names), f"chosen: {path}"]))
+
+
+def _success(line: Mapping[str, Any]) -> str:
+    return f"{100 * line['zero_shot']['success']:.0f}"
+
+
+def _command(args: GapsArgs) -> str:
+    """What draws and chooses the same gaps, where the same priors are."""
+    own = [f"--distribution {args.distribution}"] if args.distribution else []
+    flags = [f"--{name}" for name in ("plan", "judge") if getattr(args, name)]
+    given = [f"--task {args.task} --draw {args.draw} --seed {args.seed}", *own, *flags]
+    return f"python -m experiments.gaps {' '.join(given)} --choose {args.choose} --to {args.to}"
 
 
 def write_gaps(path: Path, found: Sequence[Gap]) -> None:
@@ -111,6 +139,7 @@ class Table:
             line = self.found["gaps"].setdefault(gap.name, {"gap": jsonable(gap)})
             if line["gap"] != jsonable(gap):
                 raise UserError(f"{path}: its {gap.name} is another gap; {_ELSE}")
+            line |= labels(line)
 
     def settle(self, what: str, settings: Mapping[str, Any], *, again: bool) -> None:
         """Says what decides a measurement. again: forget what other settings gave; else that raises UserError."""
@@ -129,6 +158,10 @@ class Table:
         """Those of which this is not known yet."""
         return [gap for gap in found if what not in self.found["gaps"][gap.name]]
 
+    def to_judge(self, found: Sequence[Gap]) -> list[Gap]:
+        """Those that nothing has mastered yet and on which no policy was trained: training is the dear measurement."""
+        return [gap for gap in found if self.found["gaps"][gap.name]["admitted"] is None]
+
     def add(self, lines: Mapping[str, Mapping[str, Any]]) -> None:
         """Writes what has been found of gaps, by name."""
         for name, line in lines.items():
@@ -138,31 +171,49 @@ class Table:
 
 
 def labels(line: Mapping[str, Any]) -> dict[str, Any]:
-    """What follows from the measurements of a gap; None where they are missing."""
+    """What follows from the measurements of a gap; None where they are missing.
+
+    admitted: whether something masters the gap. mastered_by: the measurement that shows it.
+    """
     success = line["zero_shot"]["success"] if "zero_shot" in line else None
-    fit, judge = line.get("fit"), line.get("judge")
+    fit, mastered_by = line.get("fit"), _mastered_by(line)
     stratum = None
     if success is not None:
         stratum = "solved" if success >= SOLVED_AT_LEAST else "failed" if success < FAILED_BELOW else "partial"
     return {
         "stratum": stratum,
         "trivial": None if fit is None else fit["success"] >= TRIVIAL_AT_LEAST,
-        # Training fails now and then where there is a way: one policy that succeeds shows that there is.
-        "admitted": None if judge is None else max(p["success"] for p in judge["policies"]) >= ADMITTED_AT_LEAST,
+        "admitted": True if mastered_by else False if "judge" in line else None,
+        "mastered_by": mastered_by,
     }
+
+
+def _mastered_by(line: Mapping[str, Any]) -> str | None:
+    """The first measurement in which a gap is mastered."""
+    reached = {what: line[what]["success"] for what in ("zero_shot", "fit", "plan") if what in line}
+    if "judge" in line:
+        # Training fails now and then where there is a way: one policy that succeeds shows that there is.
+        reached["judge"] = max(policy["success"] for policy in line["judge"]["policies"])
+    return next((what for what, success in reached.items() if success >= ADMITTED_AT_LEAST), None)
 
 
 def lines(names: Sequence[str], known: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """The table for people, success in per cent with 95 % intervals."""
     rows = [("gap", "families", "zero-shot %", "plan %", "after fit %", "trained there %", "stratum", "labels")]
-    said = {"trivial": {True: "trivial"}, "admitted": {True: "admitted", False: "not mastered"}}
     for name in names:
         line = known[name]
         zero, plan, fit, judge = (percent(line.get(what)) for what in ("zero_shot", "plan", "fit", "judge"))
-        marks = [words[line[label]] for label, words in said.items() if line[label] in words]
         families = " ".join(line["gap"]["families"]) or "none"
-        rows.append((name, families, zero, plan, fit, judge, line["stratum"], ", ".join(marks)))
+        rows.append((name, families, zero, plan, fit, judge, line["stratum"], ", ".join(_marks(line))))
     return columns(rows)
+
+
+def _marks(line: Mapping[str, Any]) -> list[str]:
+    """The labels of a gap for people."""
+    marks = ["trivial"] if line["trivial"] else []
+    if line["mastered_by"]:
+        marks.append(f"mastered {_MASTERED[line['mastered_by']]}")
+    return [*marks, "not mastered"] if line["admitted"] is False else marks
 
 
 # --- measurements -----------------------------------------------------------------------------------------------------

@@ -28,7 +28,8 @@ class GridArgs:
     methods: tuple[str, ...] = tuple(name for name in NAMES if not get_method(name).sees_system)
     """Methods, in the order in which they run; by default all that start from the usual priors."""
     reals: tuple[str, ...] = ("default",)
-    """Real systems of every task: mild, default, hard, sim for no gap, or .toml/.json files."""
+    """Real systems of every task: mild, default, hard, sim for no gap, or .toml/.json files: all gaps of a file, or
+    file.toml:name."""
     seed: int = 0
     """First seed."""
     seeds: int = 10

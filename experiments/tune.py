@@ -75,6 +75,7 @@ def main(args: TuneArgs) -> None:
 
 def tune(args: TuneArgs) -> list[str]:
     """Works through the trials, then writes and prints the results; returns a line for each run that failed."""
+    args = replace(args, reals=gaps.each(args.reals))
     cells = [cell for task, method in _pairs(args) for trial in trials(args, task, method) for cell in trial.cells]
     grid.check_begun(cells)
     failed = grid.work(cells, args)

@@ -72,6 +72,9 @@ def test_a_file_holds_one_gap_or_several_by_name(tmp_path):
     (tmp_path / "alone.toml").write_text(gaps.to_toml([one]))
     assert gaps.load(ENV, str(tmp_path / "alone.toml")) == one
     assert gaps.title("a/alone.toml") == "alone" and gaps.title("mild") == "mild"
+    named = (f"{file}:one", f"{file}:the 2nd")
+    assert gaps.each(["mild", str(file)]) == ("mild", *named) and gaps.each(named) == named
+    assert gaps.each([str(tmp_path / "alone.toml")]) == (str(tmp_path / "alone.toml"),)
     with pytest.raises(UserError, match=r"some.toml holds 2 gaps; name one of them, e.g. .*some.toml:one$"):
         gaps.load(ENV, str(file))
     with pytest.raises(UserError, match=r"gap in .*some.toml: there is no 'tow'. Choose from: one, the 2nd"):

@@ -95,6 +95,13 @@ def test_what_one_real_system_lacks_does_not_stop_the_others(tmp_path, ran):
     assert [cell.state for cell in compare.cells(args)] == ["finished", "missing", "finished"]
 
 
+def test_a_file_without_a_name_means_all_of_its_gaps(tmp_path):
+    file = tmp_path / "two.toml"
+    file.write_text("[a.params]\nmass = 9.0\n[b.params]\nmass = 2.0\n")
+    args = compare.CompareArgs(tasks=("push",), methods=("sac",), reals=("sim", str(file)), out=tmp_path)
+    assert [str(cell) for cell in compare.cells(args)] == ["push/sim: sac", "push/a: sac", "push/b: sac"]
+
+
 def test_several_processes_share_a_grid(tmp_path, ran, capsys, monkeypatch):
     """Of four cells one is another's from the start, one is opened in this moment, one is finished meanwhile."""
     args = compare.CompareArgs(out=tmp_path, **{**GRID, "methods": ("sgft-sac", "sac")})

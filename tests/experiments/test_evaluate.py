@@ -58,6 +58,9 @@ def test_several_systems_in_one_program_are_each_as_alone(run, capsys):
     heavy.write_text("[params]\nmass = 9.0\nfriction = 4.0\n")
     ranged.write_text("[params]\nmass = [2.0, 3.0]\n")
     together = returns("sim", heavy, ranged)
+    both = run / "both.toml"
+    both.write_text("[heavy.params]\nmass = 9.0\nfriction = 4.0\n[ranged.params]\nmass = [2.0, 3.0]\n")
+    assert returns("sim", both) == together  # a file without a name: all of its gaps
     assert list(together) == ["in simulation", "on the heavy real system", "on the ranged real system"]
     alone = returns("sim") | returns(heavy) | returns(ranged)
     for where, values in together.items():

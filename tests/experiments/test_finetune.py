@@ -20,8 +20,8 @@ from priors_by_hand import save_prior
 import envs
 from envs import gaps
 from envs.rollout import Episode, play_episode
-from experiments import cli, evaluate, finetune
-from experiments.finetune_args import FinetuneArgs, run_folder
+from experiments import cli, evaluate, finetune, finetune_run
+from experiments.finetune_args import FinetuneArgs, arguments, run_folder
 from experiments.finetune_record import Record
 from experiments.recorded import Recorded
 from sgft_jax import train
@@ -270,6 +270,15 @@ def test_seeds_together_are_seeds_one_by_one(home, tmp_path):
     for a, b in zip(both, alone, strict=True):
         assert a["return"][1] == pytest.approx(b["return"][0], abs=0.02)
     assert max(abs(line["return"][0] - line["return"][1]) for line in both) > 0.1
+
+
+def test_a_file_without_a_name_means_all_of_its_gaps(tmp_path, monkeypatch):
+    file = tmp_path / "two.toml"
+    file.write_text("[a.params]\nmass = 9.0\n[b.params]\nmass = 2.0\n")
+    save_prior(tmp_path / "prior/seed-0", 0)
+    monkeypatch.setattr(finetune_run, "run", lambda args, *given: args.real)
+    args = arguments("sac", prior=tmp_path / "prior", real=("sim", str(file)), out=tmp_path)
+    assert finetune.finetune(args) == ("sim", f"{file}:a", f"{file}:b")
 
 
 def test_a_variant_has_a_folder_beside_its_method():

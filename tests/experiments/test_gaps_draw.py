@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +28,11 @@ OPTIONS = """--task toy_steps --preset cpu --seed 5 --episodes 200 --config.n-en
     --config.env-steps 320 --config.random-transitions 320 --config.replay-capacity 640 --config.batch-size 16
     --config.chunk-steps 20 --config.updates-per-step 1 --config.network.hidden 8 --config.eval-every 1
     --config.eval-episodes 8"""
+
+
+def blindly(network, task):
+    """Identification that finds nothing."""
+    return exactly(network, task)._replace(refit=lambda own, rows, held: own)
 
 
 def straight(params, carry, obs, key, *, explore):
@@ -73,7 +79,8 @@ def test_drawn_gaps_are_written_measured_and_sorted(home, capsys, monkeypatch):
         assert gaps_draw.jsonable(gap) == line["gap"] and len(line["zero_shot"]["policies"]) == 2
         turned = "actuation" in gap.families  # the hand comes half the way in the time there is
         assert line["stratum"] == ("failed" if turned else "solved")
-        assert line["fit"]["success"] > 0.9 and line["trivial"] is True and line["admitted"] is None
+        assert line["fit"]["success"] > 0.9 and line["trivial"] is True
+        assert line["admitted"] is True and line["mastered_by"] == ("fit" if turned else "zero_shot")
     assert {line["stratum"] for line in found.values()} == {"failed", "solved"}
     head, *rows = capsys.readouterr().out.splitlines()
     assert (
@@ -89,7 +96,21 @@ def test_drawn_gaps_are_written_measured_and_sorted(home, capsys, monkeypatch):
         return whole(env, missing, *given)
 
     monkeypatch.setattr(gaps_draw, "_zero_shot", noted)
-    assert call(home, "--draw", "4")["gaps"] == found and measured == []
+    frozen = home / "frozen.toml"
+    to = ["--choose", "4", "--to", str(frozen)]
+    assert call(home, "--draw", "4")["gaps"] == call(home, "--draw", "6", *to)["gaps"] == found and measured == []
+    assert list(gaps.read_file(frozen).values()) == [gap for gap in drawn if gap.name in gaps.read_file(frozen)]
+    head, *text = frozen.read_text().splitlines()
+    assert head.startswith("# Chosen by python -m experiments.gaps --task toy_steps --draw 6 --seed 5 --distribution ")
+    comments = [line for line in text if line.startswith("# ")]
+    assert len(comments) == 4 and re.fullmatch(
+        r"# (failed|solved), zero-shot \d+ %, trivial, mastered after fit", comments[0]
+    )
+    few, last = capsys.readouterr().out.splitlines()[-2:]
+    assert few.startswith("too few gaps: ") and "partial has 0 of 1;" in few and last == f"chosen: {frozen}"
+    with pytest.raises(SystemExit):
+        call(home, "--draw", "6", "--choose", "3", "--to", str(frozen))
+    assert "frozen.toml: holds other gaps; a frozen set is never replaced" in capsys.readouterr().err
     more = call(home, "--draw", "7")["gaps"]
     assert measured == [["toy_steps-5-06"]] and len(gaps.read_file(file)) == 7
     assert {name: more[name] for name in found} == found
@@ -108,6 +129,32 @@ def test_drawn_gaps_are_written_measured_and_sorted(home, capsys, monkeypatch):
     assert "seed-5.json: its toy_steps-5-00 is another gap; choose another --out" in capsys.readouterr().err
 
 
+def test_policies_are_trained_where_nothing_else_masters_the_gap(home, monkeypatch, capsys):
+    monkeypatch.setattr(gaps_draw, "command_interface", blindly)
+    trained = []
+
+    def judge(env, args, found, seeds, folder):
+        trained.append([gap.name for gap in found])
+        reached = zip(trained[-1], [0.95, *[0.5] * (len(found) - 1)], strict=True)
+        return {n: {"judge": {"success": s, "interval": [s, s], "policies": [{"success": s}]}} for n, s in reached}
+
+    monkeypatch.setattr(gaps_draw, "_judge", judge)
+    (home / "families.toml").write_text(TEXT.replace("1.2", "0.0"))  # some are turned too little to matter
+    found = call(home, "--draw", "6", "--judge")["gaps"]
+    del found["sim"]
+    hard = [name for name, line in found.items() if line["zero_shot"]["success"] < 0.9]
+    assert trained == [hard] and 1 < len(hard) < 6
+    shown = {name: line["mastered_by"] for name, line in found.items()}
+    assert shown == {name: None if name in hard else "zero_shot" for name in found} | {hard[0]: "judge"}
+    assert all(found[name]["admitted"] is False for name in hard[1:])
+    rows = [row.rpartition("  ")[2] for row in capsys.readouterr().out.splitlines()[2:8]]
+    assert {*rows} >= {"mastered after training", "not mastered"} and "judge" not in found[
+        (set(found) - set(hard)).pop()
+    ]
+    call(home, "--draw", "6", "--judge")
+    assert len(trained) == 1
+
+
 @pytest.mark.slow
 def test_the_plan_and_the_judge_are_measured_where_they_are_missing(home, monkeypatch, capsys):
     seen, train = [], gaps_draw.train
@@ -117,6 +164,7 @@ def test_the_plan_and_the_judge_are_measured_where_they_are_missing(home, monkey
         return train(env, config, found, *given, **more)
 
     monkeypatch.setattr(gaps_draw, "train", noted)
+    monkeypatch.setattr(gaps_draw, "command_interface", blindly)
     call(home, "--draw", "1")
     found = call(home, "--draw", "2", "--plan", "--judge", "--judge-preset", "cpu", "--seeds", "2")["gaps"]
     assert seen == [(8, 16, ["toy_steps-5-00", "toy_steps-5-01"])]
@@ -146,9 +194,19 @@ def test_strata(success, stratum):
 
 def test_labels_say_what_is_known():
     rate = {"success": 0.85, "policies": [{"success": 0.8}, {"success": 0.9}]}
-    assert gaps_draw.labels({}) == {"stratum": None, "trivial": None, "admitted": None}
-    known = gaps_draw.labels({"zero_shot": rate, "fit": rate, "judge": rate})
-    assert known == {"stratum": "solved", "trivial": False, "admitted": True}  # the best policy counts
+    assert gaps_draw.labels({}) == {"stratum": None, "trivial": None, "admitted": None, "mastered_by": None}
+    known = gaps_draw.labels({"zero_shot": rate, "fit": rate})
+    assert known == {"stratum": "solved", "trivial": False, "admitted": None, "mastered_by": None}
+    judged = gaps_draw.labels({"zero_shot": rate, "fit": rate, "judge": rate})
+    assert judged == {**known, "admitted": True, "mastered_by": "judge"}  # of trained policies the best one counts
+
+
+@pytest.mark.parametrize("what", ["zero_shot", "fit", "plan"])
+def test_any_measurement_may_show_that_a_gap_can_be_mastered(what):
+    line = {"judge": {"policies": [{"success": 0.5}]}, "zero_shot": {"success": 0.1}, "fit": {"success": 0.89}}
+    assert gaps_draw.labels(line)["admitted"] is False and gaps_draw.labels(line)["mastered_by"] is None
+    found = gaps_draw.labels({**line, what: {"success": 0.9}})
+    assert found["admitted"] is True and found["mastered_by"] == what
 
 
 @pytest.mark.parametrize(
@@ -157,6 +215,10 @@ def test_labels_say_what_is_known():
         (["--draw", "-1"], "--draw is -1: must be at least 1"),
         (["--draw", "2", "--presets", "mild"], "--presets mild: names gaps, and --draw draws them"),
         (["--judge"], "--judge: is for drawn gaps"),
+        (["--choose", "2"], "--choose: is for drawn gaps"),
+        (["--draw", "2", "--choose", "3", "--to", "f.toml"], "--choose is 3: must be from 1 to the 2 of --draw"),
+        (["--draw", "2", "--choose", "1"], "--choose N and --to FILE.toml: give both"),
+        (["--draw", "2", "--choose", "1", "--to", "f.json"], "--to f.json: must end in .toml"),
         (["--draw", "2", "--judge-preset", "fats"], "--judge-preset: there is no 'fats', did you mean 'fast'?"),
         (["--draw", "2"], "toy_steps comes with no distribution of gaps; name a file of one"),
     ],
@@ -185,15 +247,15 @@ def begun(path):
     table = gaps_draw.Table(path, {"task": "toy"}, GAPS)
     table.settle("zero_shot", {"episodes": 200}, again=False)
     table.settle("judge", {"config": {"rate": 0.1}, "seeds": [0]}, again=False)
-    rate = {"success": 0.95, "policies": [{"success": 0.95}]}
-    table.add({"a": {"zero_shot": rate, "fit": rate, "judge": rate}, "b": {"zero_shot": rate}})
+    some, most = ({"success": rate, "policies": [{"success": rate}]} for rate in (0.85, 0.95))
+    table.add({"a": {"zero_shot": some, "fit": some, "judge": most}, "b": {"zero_shot": some}})
     return table
 
 
 def test_a_table_is_only_continued_as_it_was_begun(tmp_path):
     path = tmp_path / "t.json"
     begun(path)
-    assert read_json(path)["gaps"]["a"]["trivial"] is True
+    assert read_json(path)["gaps"]["a"]["mastered_by"] == "judge"
     table = gaps_draw.Table(path, {"task": "toy"}, GAPS)
     table.settle("zero_shot", {"episodes": 200}, again=False)
     with pytest.raises(UserError, match=r"t.json: judge was measured with other config.rate, see its 'about'; --over"):
@@ -209,8 +271,10 @@ def test_a_table_is_only_continued_as_it_was_begun(tmp_path):
 
 def test_other_settings_of_the_judge_forget_what_it_said_and_nothing_else(tmp_path):
     table = begun(tmp_path / "t.json")
-    assert [gap.name for gap in table.without("judge", GAPS)] == ["b"]
+    assert [gap.name for gap in table.to_judge(GAPS)] == ["b"]
     table.settle("judge", {"config": {"rate": 0.2}, "seeds": [0]}, again=True)
-    assert table.without("judge", GAPS) == GAPS and table.without("zero_shot", GAPS) == []
+    assert table.to_judge(GAPS) == GAPS and table.without("zero_shot", GAPS) == []
     line = table.found["gaps"]["a"]
-    assert line["admitted"] is None and line["stratum"] == "solved" and line["trivial"] is True
+    assert line["admitted"] is None and line["stratum"] == "solved" and line["trivial"] is False
+    table.add({"b": {"fit": {"success": 0.9}}})
+    assert [gap.name for gap in table.to_judge(GAPS)] == ["a"]
