@@ -189,12 +189,9 @@ def labels(line: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _mastered_by(line: Mapping[str, Any]) -> str | None:
-    """The first measurement in which a gap is mastered."""
-    reached = {what: line[what]["success"] for what in ("zero_shot", "fit", "plan") if what in line}
-    if "judge" in line:
-        # Training fails now and then where there is a way: one policy that succeeds shows that there is.
-        reached["judge"] = max(policy["success"] for policy in line["judge"]["policies"])
-    return next((what for what, success in reached.items() if success >= ADMITTED_AT_LEAST), None)
+    """The first measurement in which a gap is mastered: one policy that succeeds shows that there is a way."""
+    best = {what: max(one["success"] for one in line[what]["policies"]) for what in _MASTERED if what in line}
+    return next((what for what, success in best.items() if success >= ADMITTED_AT_LEAST), None)
 
 
 def lines(names: Sequence[str], known: Mapping[str, Mapping[str, Any]]) -> list[str]:

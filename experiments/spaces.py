@@ -24,6 +24,7 @@ _PLANNER = {
 
 SPACES: dict[str, dict[str, tuple[Any, ...]]] = {
     "sac": _PLAIN,
+    "anchored": {"utd": _UTD, **_RATES, "anchor": (0.03, 0.1, 0.3), "simulated_share": _SHARE},
     "sac-reset": _PLAIN,
     "pbrs": _PLAIN,
     "mbpo": _BRANCH,

@@ -88,7 +88,7 @@ def test_the_best_policies_of_a_run(run, capsys):
         ([], "name a folder with --prior or --run"),
         (["--prior", "a", "--run", "b"], "exclude each other"),
         (["--task", "toi"], "did you mean 'toy'?"),
-        (["--task", "toy", "--out", "nowhere"], "nowhere/pretrain/toy/fast: holds no prior"),
+        (["--task", "toy", "--out", "nowhere"], "nowhere/pretrain/toy/robust: holds no prior"),
         (["--prior", "nowhere"], "--prior nowhere: no such folder"),
         (["--task", "toy", "--real", "sim", "sim"], "--real names sim twice"),
         (["--task", "toy", "--real", "strange"], "toy has no gap 'strange'"),

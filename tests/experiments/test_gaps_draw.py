@@ -189,23 +189,23 @@ def test_the_plan_and_the_judge_are_measured_where_they_are_missing(home, monkey
     ("success", "stratum"), [(1.0, "solved"), (0.8, "solved"), (0.79, "partial"), (0.2, "partial"), (0.19, "failed")]
 )
 def test_strata(success, stratum):
-    assert gaps_draw.labels({"zero_shot": {"success": success}})["stratum"] == stratum
+    assert gaps_draw.labels({"zero_shot": rate(success)})["stratum"] == stratum
 
 
 def test_labels_say_what_is_known():
-    rate = {"success": 0.85, "policies": [{"success": 0.8}, {"success": 0.9}]}
+    some, most = rate(0.8, 0.88), rate(0.8, 0.9)
     assert gaps_draw.labels({}) == {"stratum": None, "trivial": None, "admitted": None, "mastered_by": None}
-    known = gaps_draw.labels({"zero_shot": rate, "fit": rate})
+    known = gaps_draw.labels({"zero_shot": some, "fit": some})
     assert known == {"stratum": "solved", "trivial": False, "admitted": None, "mastered_by": None}
-    judged = gaps_draw.labels({"zero_shot": rate, "fit": rate, "judge": rate})
-    assert judged == {**known, "admitted": True, "mastered_by": "judge"}  # of trained policies the best one counts
+    judged = gaps_draw.labels({"zero_shot": some, "fit": some, "judge": most})
+    assert judged == {**known, "admitted": True, "mastered_by": "judge"}  # the best policy counts
 
 
 @pytest.mark.parametrize("what", ["zero_shot", "fit", "plan"])
 def test_any_measurement_may_show_that_a_gap_can_be_mastered(what):
-    line = {"judge": {"policies": [{"success": 0.5}]}, "zero_shot": {"success": 0.1}, "fit": {"success": 0.89}}
+    line = {"judge": rate(0.5), "zero_shot": rate(0.1), "fit": rate(0.0, 0.89)}
     assert gaps_draw.labels(line)["admitted"] is False and gaps_draw.labels(line)["mastered_by"] is None
-    found = gaps_draw.labels({**line, what: {"success": 0.9}})
+    found = gaps_draw.labels({**line, what: rate(0.2, 0.9)})
     assert found["admitted"] is True and found["mastered_by"] == what
 
 
@@ -242,12 +242,17 @@ def test_the_settings_of_the_training_are_those_of_the_preset_that_trains(monkey
 GAPS = [gaps.Gap(name, {}, {}) for name in ("a", "b")]
 
 
+def rate(*successes):
+    """What was measured with policies of these successes."""
+    return {"success": sum(successes) / len(successes), "policies": [{"success": each} for each in successes]}
+
+
 def begun(path):
     """A table of two gaps, judged and not."""
     table = gaps_draw.Table(path, {"task": "toy"}, GAPS)
     table.settle("zero_shot", {"episodes": 200}, again=False)
     table.settle("judge", {"config": {"rate": 0.1}, "seeds": [0]}, again=False)
-    some, most = ({"success": rate, "policies": [{"success": rate}]} for rate in (0.85, 0.95))
+    some, most = rate(0.85), rate(0.95)
     table.add({"a": {"zero_shot": some, "fit": some, "judge": most}, "b": {"zero_shot": some}})
     return table
 
@@ -276,5 +281,5 @@ def test_other_settings_of_the_judge_forget_what_it_said_and_nothing_else(tmp_pa
     assert table.to_judge(GAPS) == GAPS and table.without("zero_shot", GAPS) == []
     line = table.found["gaps"]["a"]
     assert line["admitted"] is None and line["stratum"] == "solved" and line["trivial"] is False
-    table.add({"b": {"fit": {"success": 0.9}}})
+    table.add({"b": {"fit": rate(0.9)}})
     assert [gap.name for gap in table.to_judge(GAPS)] == ["a"]

@@ -125,7 +125,7 @@ def test_every_trial_is_a_run_apart_from_the_comparison(tmp_path, ran):
     assert {(run.seed, run.seeds, run.rollouts, run.real, run.resume) for run in ran} == {
         (100, 2, 10, ("mild", "soft"), False)
     }
-    assert first.out == tmp_path / "tune" and first.prior == tmp_path / "pretrain/toy/fast"
+    assert first.out == tmp_path / "tune" and first.prior == tmp_path / "pretrain/toy/robust"
     assert first.options == arguments("sac").options
     expected = tune.trials(budget(tmp_path), "toy", "sac")[1].settings
     assert {name: getattr(second.options, name) for name in expected} == expected != spaces.defaults("sac")
@@ -172,7 +172,7 @@ def test_dry_and_the_clock_run_nothing(tmp_path, ran, capsys):
     ("argv", "words"),
     [
         (["--trials", "0"], "--trials is 0: must be at least 1"),
-        (["--trials", "244"], "--trials is 244: sgft-sac has only 243 different ones"),
+        (["--trials", "244"], "--trials is 244: anchored has only 243 different ones"),
         (["--methods", "sgft-sca"], "did you mean 'sgft-sac'"),
     ],
 )
@@ -252,7 +252,7 @@ def test_finetune_begins_with_tuned_options_and_takes_changes(tmp_path, monkeypa
 def test_tuned_runs_on_a_point_mass(tmp_path, monkeypatch):
     """Two real trials, then a run with what they chose: the path from a prior to the file and back."""
     for run, seed in (("a", 0), ("b", 1)):
-        save_prior(tmp_path / f"pretrain/toy/fast/{run}/prior/seed-{seed}", seed)
+        save_prior(tmp_path / f"pretrain/toy/robust/{run}/prior/seed-{seed}", seed)
     for name, mass in (("heavy", 2.0), ("light", 0.5)):
         (tmp_path / f"{name}.toml").write_text(f"[params]\nmass = {mass}\n")
     monkeypatch.setitem(spaces.SPACES, "sac", {"utd": (0.1, 8.0), "batch_size": (256,)})
