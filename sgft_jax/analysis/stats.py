@@ -34,6 +34,17 @@ def mean(scores: ArrayLike, *, axis: int = 0) -> np.ndarray:
     return np.asarray(scores, np.float64).mean(axis)
 
 
+def rank_correlation(pairs: ArrayLike, *, axis: int = 0) -> np.ndarray:
+    """Spearman's of pairs [n, 2], also as a statistic for `bootstrap_interval`; 0 where one of the two is constant.
+
+    axis: along which the pairs are; the two members of a pair are along the last one.
+    """
+    ranks = stats.rankdata(np.asarray(pairs, np.float64), axis=axis)
+    centred = ranks - ranks.mean(axis=axis, keepdims=True)
+    own, other = (np.square(centred[..., i]).sum(axis) for i in (0, 1))
+    return np.prod(centred, axis=-1).sum(axis) / np.maximum(np.sqrt(own * other), 1e-9)
+
+
 def bootstrap_interval(
     scores: ArrayLike,
     *,

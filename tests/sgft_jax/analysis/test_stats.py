@@ -9,6 +9,7 @@ from sgft_jax.analysis.stats import (
     mean,
     paired_improvement,
     probability_of_improvement,
+    rank_correlation,
     success_interval,
 )
 
@@ -165,3 +166,12 @@ def test_improvement_is_paired_by_prior_and_the_prior_is_the_random_factor():
     assert two.estimate == 1 and np.isnan(two.low)  # however many seeds
     same = np.random.default_rng(0).normal(size=60)
     assert paired_improvement(same, same, np.arange(60) % 6, np.arange(60) % 6).estimate == 0.5
+
+
+def test_rank_correlation_is_spearman_s_and_has_an_interval():
+    pairs = np.random.default_rng(0).integers(0, 6, (40, 2)).astype(float)  # with ties
+    assert rank_correlation(pairs) == pytest.approx(scipy_stats.spearmanr(*pairs.T).statistic)
+    assert rank_correlation([[1, 10], [2, 20], [3, 15]]) == pytest.approx(0.5)
+    assert rank_correlation([[1, 10], [1, 20]]) == 0
+    band = bootstrap_interval(pairs, statistic=rank_correlation, priors=np.arange(40) % 8)
+    assert -1 <= band.low < band.estimate < band.high <= 1

@@ -1,0 +1,154 @@
+"""A prior examines rollouts on a real system: what `sgft_jax.diagnosis` measures, compiled, and its statistics."""
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from sgft_jax import diagnosis
+from sgft_jax.analysis.stats import success_interval
+from sgft_jax.diagnosis import HORIZONS, Lateness, Rollouts
+from sgft_jax.finetuner import command_interface
+from sgft_jax.identify import Identified
+from sgft_jax.models.distortion import Distortion, none, residuals
+from sgft_jax.policies import network_of
+from sgft_jax.types import Array, Key, SimulatedData, Task, Transition
+
+_STATES, _OFFSETS = 256, 32  # visited states that are looked at, and ways to act that are tried in each
+_AT_ONCE = 32  # of these states, which bounds memory
+
+
+class Look(NamedTuple):
+    """What one prior sees in n rollouts, before any statistics; see the functions above.
+
+    known: what identification finds. nats: [] its evidence. values, returns, valid: [n, T]. best: [states, horizon].
+    surprise: [n * T]. errors, plain_errors: [n, windows, HORIZONS] with and without what is known. windows: [n,
+    windows]. late: with what is known. expected, change: [n * T, measured_dim], what a step changes by the model and in
+    fact. Arrays are JAX's within a program and NumPy's after it.
+    """
+
+    known: Distortion
+    nats: Any
+    values: Any
+    returns: Any
+    valid: Any
+    best: Any
+    surprise: Any
+    errors: Any
+    plain_errors: Any
+    windows: Any
+    late: Lateness
+    expected: Any
+    change: Any
+
+
+class Examiner:
+    """Examines rollouts of priors with one card on real systems of one task; its programs are compiled once."""
+
+    def __init__(self, card: Mapping[str, Any], task: Task) -> None:
+        self.task, self._look = task, jax.jit(functools.partial(_look, card, task))
+        self._start = jax.jit(functools.partial(_start, card, task))
+
+    def examine(self, params: Any, real: Rollouts, simulated: Rollouts, counts: Sequence[int]) -> list[dict[str, Any]]:
+        """What the first `count` real rollouts say, as JSON data for each of the counts (see `describe`).
+
+        params: of the prior. simulated: rollouts of its exploring policy in simulation.
+        """
+        begun = self._start(params, simulated)
+        seen = jax.device_get(self._look(params, begun, simulated, 0.0, False))
+        found = []
+        for count in counts:
+            first = jnp.arange(real.valid.shape[0])[:, None] < count
+            some = real._replace(valid=jnp.asarray(real.valid) & first)
+            looked = jax.device_get(self._look(params, begun, some, seen.late.share, True))
+            found.append(describe(looked, seen, np.asarray(real.success)[:count], turns=self.task.cartesian))
+        return found
+
+
+def _start(card: Mapping[str, Any], task: Task, params: Any, simulated: Rollouts) -> Identified:
+    rows, valid = simulated.flat()
+    order = jnp.argsort(~valid, stable=True)  # valid ones first
+
+    def draw(key: Key, n: int) -> Transition:
+        which = order[jax.random.randint(key, (n,), 0, jnp.maximum(valid.sum(), 1))]
+        return jax.tree.map(lambda x: x[which], rows)
+
+    return command_interface(network_of(card), task).start(params, SimulatedData(draw, jnp.zeros(1)))
+
+
+def _look(
+    card: Mapping[str, Any], task: Task, params: Any, begun: Identified, rollouts: Rollouts, usual: Array, real: Array
+) -> Look:
+    """usual: see `lateness`. real: [] bool; in the simulator there is nothing to identify."""
+    beliefs = diagnosis.beliefs_of(params, card, task)
+    rows, valid = rollouts.flat()
+    nothing = none(task.act_dim, task.measured_dim)
+    fitted = command_interface(network_of(card), task).refit(begun, rows, valid).distortion
+    known = jax.tree.map(lambda a, b: jnp.where(real, a, b), fitted, nothing)
+    own = rollouts._replace(transitions=jax.vmap(functools.partial(diagnosis.meant, known))(rollouts.transitions))
+    flat, _ = own.flat()
+    first = jax.tree.map(lambda x: x[0], params.dynamics)
+
+    def change(obs: Array, action: Array) -> Array:
+        return (beliefs.after(first, obs, action) - obs)[: task.measured_dim]
+
+    key_states, key_offsets = jax.random.split(jax.random.key(0))
+    which = jax.random.categorical(key_states, jnp.where(valid, 0.0, -jnp.inf), shape=(_STATES,))
+    offsets = diagnosis.draw_offsets(key_offsets, _OFFSETS, task.act_dim)
+    best = jax.lax.map(
+        lambda obs: diagnosis.headroom(beliefs, known, obs, offsets, HORIZONS[-1]), flat.obs[which], batch_size=_AT_ONCE
+    )
+    values, returns = diagnosis.promises(beliefs, own)
+    errors, windows = diagnosis.model_errors(beliefs, own)
+    return Look(
+        known=known,
+        nats=diagnosis.evidence(residuals(change, rows, nothing), residuals(change, rows, known), valid, begun.spread),
+        values=values,
+        returns=returns,
+        valid=rollouts.valid,
+        best=best,
+        surprise=diagnosis.surprises(beliefs, flat),
+        errors=errors,
+        plain_errors=diagnosis.model_errors(beliefs, rollouts)[0],
+        windows=windows,
+        late=diagnosis.lateness(change, own, begun.spread, usual),
+        expected=jax.vmap(change)(flat.obs, flat.action),
+        change=(flat.next_obs - flat.obs)[:, : task.measured_dim],
+    )
+
+
+def describe(real: Look, simulated: Look, success: np.ndarray, *, turns: bool) -> dict[str, Any]:
+    """The statistics of NumPy `Look`s at real and at simulated rollouts, as JSON data; docs/diagnose.md explains them.
+
+    success: [n] of the real ones. turns: see `parts`.
+    """
+    held, everywhere = real.valid.reshape(-1), simulated.valid.reshape(-1)
+    margin = 1.48 * float(np.median(np.abs(simulated.surprise[everywhere])))
+    ahead = np.array(HORIZONS) - 1
+    error = lambda errors, windows: np.where(windows.any(), errors[windows].mean(axis=0), np.nan).tolist()  # noqa: E731
+    band = success_interval(int(success.sum()), len(success))
+    return {
+        "rollouts": len(success),
+        "success": float(success.mean()),
+        "success/interval": [float(band.low), float(band.high)],
+        "value": {
+            **diagnosis.honesty(*((look.values, look.returns, look.valid) for look in (real, simulated))),
+            "margin": margin,
+            "real": [diagnosis.guidance(real.best[:, i], margin) for i in ahead],
+            "simulated": [diagnosis.guidance(simulated.best[:, i], margin) for i in ahead],
+        },
+        "model_error": {
+            "real": error(real.plain_errors, real.windows),
+            "identified": error(real.errors, real.windows),
+            "simulated": error(simulated.errors, simulated.windows),
+        },
+        "identified": {**diagnosis.parts(real.known, turns=turns), "nats": float(real.nats)},
+        "delay": {"share": float(real.late.share - simulated.late.share), "nats": float(real.late.nats)},
+        "noise": {
+            "real": diagnosis.noise(real.expected[held], real.change[held]).tolist(),
+            "simulated": diagnosis.noise(simulated.expected[everywhere], simulated.change[everywhere]).tolist(),
+        },
+    }
