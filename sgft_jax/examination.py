@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from sgft_jax import diagnosis
-from sgft_jax.analysis.stats import success_interval
 from sgft_jax.diagnosis import HORIZONS, Lateness, Rollouts
 from sgft_jax.finetuner import command_interface
 from sgft_jax.identify import Identified
@@ -52,20 +51,34 @@ class Examiner:
         self.task, self._look = task, jax.jit(functools.partial(_look, card, task))
         self._start = jax.jit(functools.partial(_start, card, task))
 
-    def examine(self, params: Any, real: Rollouts, simulated: Rollouts, counts: Sequence[int]) -> list[dict[str, Any]]:
-        """What the first `count` real rollouts say, as JSON data for each of the counts (see `describe`).
+    def examine(self, params: Any, real: Rollouts, simulated: Rollouts, counts: Sequence[int]) -> "Examined":
+        """What the first `count` real rollouts say, for each of the counts.
 
-        params: of the prior. simulated: rollouts of its exploring policy in simulation.
+        params: of the prior. simulated: rollouts of its exploring policy in simulation. Arrays keep their shapes from
+        call to call, or everything is compiled again.
         """
         begun = self._start(params, simulated)
         seen = jax.device_get(self._look(params, begun, simulated, 0.0, False))
-        found = []
+        found, looked = [], seen
         for count in counts:
             first = jnp.arange(real.valid.shape[0])[:, None] < count
             some = real._replace(valid=jnp.asarray(real.valid) & first)
             looked = jax.device_get(self._look(params, begun, some, seen.late.share, True))
             found.append(describe(looked, seen, np.asarray(real.success)[:count], turns=self.task.cartesian))
-        return found
+        return Examined(found, {"real": _points(looked), "simulated": _points(seen)})
+
+
+class Examined(NamedTuple):
+    """found: JSON data for each number of rollouts, see `describe`. points: by "real" (of the last of these) and
+    "simulated", V_sim and return [n] of visited states.
+    """
+
+    found: list[dict[str, Any]]
+    points: dict[str, tuple[np.ndarray, np.ndarray]]
+
+
+def _points(look: Look) -> tuple[np.ndarray, np.ndarray]:
+    return look.values[look.valid], look.returns[look.valid]
 
 
 def _start(card: Mapping[str, Any], task: Task, params: Any, simulated: Rollouts) -> Identified:
@@ -121,19 +134,16 @@ def _look(
 
 
 def describe(real: Look, simulated: Look, success: np.ndarray, *, turns: bool) -> dict[str, Any]:
-    """The statistics of NumPy `Look`s at real and at simulated rollouts, as JSON data; docs/diagnose.md explains them.
+    """The statistics of `Look`s at real and at simulated rollouts, as JSON data; docs/diagnose.md explains them.
 
-    success: [n] of the real ones. turns: see `parts`.
+    success: [n] of the real ones. turns: see `diagnosis.parts`.
     """
-    held, everywhere = real.valid.reshape(-1), simulated.valid.reshape(-1)
-    margin = 1.48 * float(np.median(np.abs(simulated.surprise[everywhere])))
+    margin = 1.48 * float(np.median(np.abs(simulated.surprise[simulated.valid.reshape(-1)])))
     ahead = np.array(HORIZONS) - 1
-    error = lambda errors, windows: np.where(windows.any(), errors[windows].mean(axis=0), np.nan).tolist()  # noqa: E731
-    band = success_interval(int(success.sum()), len(success))
     return {
         "rollouts": len(success),
         "success": float(success.mean()),
-        "success/interval": [float(band.low), float(band.high)],
+        "horizons": list(HORIZONS),
         "value": {
             **diagnosis.honesty(*((look.values, look.returns, look.valid) for look in (real, simulated))),
             "margin": margin,
@@ -141,14 +151,21 @@ def describe(real: Look, simulated: Look, success: np.ndarray, *, turns: bool) -
             "simulated": [diagnosis.guidance(simulated.best[:, i], margin) for i in ahead],
         },
         "model_error": {
-            "real": error(real.plain_errors, real.windows),
-            "identified": error(real.errors, real.windows),
-            "simulated": error(simulated.errors, simulated.windows),
+            "real": _mean(real.plain_errors, real.windows),
+            "identified": _mean(real.errors, real.windows),
+            "simulated": _mean(simulated.errors, simulated.windows),
         },
         "identified": {**diagnosis.parts(real.known, turns=turns), "nats": float(real.nats)},
         "delay": {"share": float(real.late.share - simulated.late.share), "nats": float(real.late.nats)},
-        "noise": {
-            "real": diagnosis.noise(real.expected[held], real.change[held]).tolist(),
-            "simulated": diagnosis.noise(simulated.expected[everywhere], simulated.change[everywhere]).tolist(),
-        },
+        "noise": {"real": _noise(real), "simulated": _noise(simulated)},
     }
+
+
+def _mean(errors: np.ndarray, windows: np.ndarray) -> list[float]:
+    """[HORIZONS] over the windows that count; nan where no episode lasts so long."""
+    return errors[windows].mean(axis=0).tolist() if windows.any() else [float("nan")] * len(HORIZONS)
+
+
+def _noise(look: Look) -> list[float]:
+    held = look.valid.reshape(-1)
+    return diagnosis.noise(look.expected[held], look.change[held]).tolist()

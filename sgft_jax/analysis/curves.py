@@ -253,7 +253,7 @@ def read_curve(folder: Path) -> Curve:
         raise UserError(f"{folder / EVAL}: holds no evaluation yet")
     stored = read_json(folder / CONFIG) if (folder / CONFIG).exists() else {}
     summary = read_json(folder / SUMMARY) if (folder / SUMMARY).exists() else {}
-    config, start = stored.get("config", {}), _last_start(folder)
+    config, start = stored.get("config", {}), last_start(folder)
     column = lambda name: np.array([record[name] for record in records])  # noqa: E731
     scores = {name: column(name).T for name in SCORES if name in records[0]}
     variant = config.get("variant") or ""
@@ -340,7 +340,8 @@ def set_name(name: str, digests: Sequence[str]) -> str:
     return "-".join(filter(None, [name, *(digest[:6] for digest in digests[:1])]))
 
 
-def _last_start(folder: Path) -> dict[str, Any]:
+def last_start(folder: Path) -> dict[str, Any]:
+    """What the provenance of a run says of its last start; nothing where there is none."""
     starts = read_json(folder / PROVENANCE).get("starts", []) if (folder / PROVENANCE).exists() else []
     return starts[-1] if starts else {}
 

@@ -1,4 +1,4 @@
-"""Impure: writes figures as PNG files: learning curves, what pretraining left behind, how costs grow.
+"""Impure: writes figures as PNG files: learning curves, what pretraining left behind, what a gap is.
 
 Each function returns the path it wrote. No panel has more than `MOST` curves, each in a colour of its own from the
 Okabe-Ito palette (safe for colour-blind readers).
@@ -7,6 +7,7 @@ Okabe-Ito palette (safe for colour-blind readers).
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from sgft_jax.analysis.curves import Curve, by_prior, spread
 from sgft_jax.analysis.stats import ENOUGH, iqm
+from sgft_jax.analysis.verdict import Sign
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MOST = len(PALETTE)
@@ -143,6 +145,57 @@ def pretraining(
     _value_panel(panels[2], np.asarray(value), np.asarray(monte_carlo))
     if columns == 4:
         _dynamics_panel(panels[3], np.asarray(dynamics_error), baseline_error)
+    figure.suptitle(title, x=0.005, ha="left", size=12, weight="bold", color=_INK)
+    return _save(figure, path)
+
+
+def diagnosis(
+    path: Path,
+    found: Mapping[str, Any],
+    signs: Sequence[Sign],
+    points: Mapping[str, tuple[np.ndarray, np.ndarray]],
+    *,
+    title: str,
+) -> Path:
+    """Panels: improvable states by horizon, V_sim against what happened, model error by horizon, signs of the gap.
+
+    found: see `examination.describe`. signs: see `verdict.signs`. points: ([n] V_sim, [n] returns) by "real" and
+    "simulated".
+    """
+    figure, (states, promise, model, kinds) = _figure(10.4, 6.6, columns=2, count=4)
+    horizons = found["horizons"]
+    for where, colour in (("simulated", _FAINT), ("real", PALETTE[0])):
+        for name, dash in (("improvable", "-"), ("improving", ":")):
+            shares = [one[name] for one in found["value"][where]]
+            states.plot(horizons, shares, dash, color=colour, linewidth=2, label=f"{name}, {where}", clip_on=False)
+    states.set_ylim(-0.03, 1.03)
+    states.set_title("states where the best action keeps / exceeds V_sim", **_FONT, loc="left")
+    for where, colour in (("simulated", _FAINT), ("real", PALETTE[0])):
+        value, returns = points[where]
+        promise.scatter(returns, value, s=6, color=colour, alpha=0.6, linewidths=0, label=where)
+    both = np.concatenate([x for pair in points.values() for x in pair])
+    promise.plot(*[(both.min(), both.max())] * 2, color=_GREY, linewidth=1, zorder=0)
+    promise.set_title("V_sim against discounted return", **_FONT, loc="left")
+    promise.set_xlabel("return that followed", **_FONT)
+    colours = {"simulated": _FAINT, "real": PALETTE[1], "identified": PALETTE[0]}
+    words = {"simulated": "simulated", "real": "real", "identified": "real, identified"}
+    for where, colour in colours.items():
+        error = found["model_error"][where]
+        model.plot(horizons, error, color=colour, linewidth=2, marker="o", markersize=3, label=words[where])
+    model.set_ylim(bottom=0)
+    model.set_title("model error, standard deviations", **_FONT, loc="left")
+    for axes in (states, model):
+        axes.set_xticks(horizons)
+        axes.set_xlabel("steps ahead", **_FONT)
+    for axes in (states, promise, model):
+        axes.legend(frameon=False, fontsize=8, labelcolor=_INK)
+    strengths = np.array([min(sign.strength, 3.0) for sign in signs])
+    kinds.barh(np.arange(len(signs)), strengths, color=[PALETTE[1] if x >= 1 else _FAINT for x in strengths])
+    kinds.set_yticks(np.arange(len(signs)), [sign.name for sign in signs])
+    kinds.invert_yaxis()
+    kinds.set_xlim(0, 3)
+    kinds.axvline(1.0, color=_GREY, linewidth=1)
+    kinds.set_title("signs of the gap; one counts from 1 on", **_FONT, loc="left")
     figure.suptitle(title, x=0.005, ha="left", size=12, weight="bold", color=_INK)
     return _save(figure, path)
 

@@ -1,0 +1,116 @@
+"""Say from a few real rollouts what kind of gap this is, whether fine-tuning will help, and how soon.
+
+Draws four panels, writes the numbers as JSON, and prints a verdict in words (docs/diagnose.md). With --calibrate it
+measures on finished fine-tuning runs how well that verdict predicts what they have gained.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiments import cli
+from experiments.options import Impl, at_least_one, check_task, prior_folders
+from sgft_jax.io.jsonfile import read_json
+from sgft_jax.presets import DEFAULT_PRESET
+from sgft_jax.types import UserError
+
+_FOLDER = "real"  # of a run, or of a robot's recordings, with rollout-*.npz in it
+_CONFIG = "config.json"
+
+
+@dataclass(frozen=True)
+class DiagnoseArgs:
+    """One diagnosis, by every prior; or the calibration of all."""
+
+    task: str | None = None
+    """A task by name, or a Python file with a task of your own; default: the task of the prior."""
+    prior: Path | None = None
+    """Folder of a prior of SAC, or of several (prior/seed-*); default: those that a run began with, else those of
+    <out>/pretrain/<task>/<preset>."""
+    real: str = "default"
+    """What happened: a folder of a fine-tuning run, or any other with rollouts in real/ (docs/formats.md). Or a gap by
+    name, a .toml/.json file, or file.toml:name, on which the policies then play zero-shot."""
+    rollouts: int | None = None
+    """Only the first so many recorded rollouts; default: all. On a gap: how many to play, default 4."""
+    calibrate: tuple[Path, ...] = ()
+    """Fit the prediction to these finished fine-tuning runs instead: their folders, or folders that hold some."""
+    check: tuple[Path, ...] = ()
+    """With --calibrate: other runs, on which the fitted prediction is then checked."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+    out: Path = Path("runs")
+    """Parent of all run folders; picture and numbers go to <out>/diagnose/<task>/<name>."""
+    preset: str = DEFAULT_PRESET
+    """Expert: pretraining preset whose priors to take where neither --prior nor a run names any."""
+    seed: int = 0
+    """Expert: another seed plays other rollouts."""
+    impl: Impl = "auto"
+
+
+def main(args: DiagnoseArgs) -> None:
+    """Diagnoses or calibrates, and prints."""
+    if args.check and not args.calibrate:
+        raise UserError("--check: is for a prediction that --calibrate has fitted; name runs there too")
+    if args.calibrate:
+        runs = [find_runs("--calibrate", args.calibrate), find_runs("--check", args.check)]
+        if shared := set(runs[0]) & set(runs[1]):
+            raise UserError(f"--check: {min(shared)} is also in --calibrate; what was fitted cannot check the fit")
+        from experiments.diagnose_calibrate import calibrate
+
+        found, lines = calibrate(args, *runs)
+    else:
+        folders, task, recorded = check(args)
+        from experiments.diagnose_run import diagnose
+
+        found, lines = diagnose(args, folders, task, recorded)
+    print(json.dumps(found) if args.json else "\n".join(lines))
+
+
+def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
+    """The folders of the priors, the task, and where real/ is if --real is no gap; UserError for what is wrong."""
+    if args.rollouts is not None:
+        at_least_one(args, "rollouts")
+    recorded = home_of(Path(args.real)) if Path(args.real).is_dir() else None
+    config = config_of(recorded) if recorded else {}
+    task, prior = args.task or config.get("task"), args.prior
+    if task is not None:
+        check_task(task, [] if recorded else [args.real])
+    if prior is None and task is None:
+        raise UserError("nothing to diagnose with: name a prior with --prior, or a task with --task")
+    if prior is None and config.get("prior"):
+        prior = Path(config["prior"])
+    folders = prior_folders(prior, out=args.out, task=task or "", preset=config.get("preset") or args.preset)
+    task = task or read_json(folders[0] / "prior.json")["task"]
+    check_task(task, [] if recorded else [args.real])
+    return folders, task, recorded
+
+
+def home_of(folder: Path) -> Path:
+    """The folder that holds real/ with rollouts; raises UserError where there is none."""
+    home = folder.parent if folder.name == _FOLDER else folder
+    if not any((home / _FOLDER).glob("rollout-*.npz")):
+        raise UserError(f"--real {folder}: holds no recorded rollouts (real/rollout-*.npz)")
+    return home
+
+
+def config_of(home: Path) -> dict:
+    """The options of the run in a folder; none where a robot has recorded."""
+    return read_json(home / _CONFIG)["config"] if (home / _CONFIG).exists() else {}
+
+
+def find_runs(option: str, folders: Sequence[Path]) -> list[Path]:
+    """The folders of fine-tuning runs with recorded rollouts and a curve; raises UserError where there is none."""
+    found: dict[Path, None] = {}
+    for folder in folders:
+        own = [path.parent for path in sorted(folder.rglob("eval.jsonl")) if (path.parent / _FOLDER).is_dir()]
+        if not own:
+            raise UserError(
+                f"{option} {folder}: holds no fine-tuning run with recorded rollouts (eval.jsonl and real/)"
+            )
+        found |= dict.fromkeys(own)
+    return list(found)
+
+
+if __name__ == "__main__":
+    cli.run_main(main, DiagnoseArgs, __doc__ or "")

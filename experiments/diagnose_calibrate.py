@@ -1,0 +1,113 @@
+"""Impure: how well diagnoses of finished runs predict what these have gained. `experiments.diagnose` is its command."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from envs import gaps
+from envs.gaps import SIM
+from experiments.cli import columns
+from experiments.diagnose import DiagnoseArgs, config_of
+from experiments.diagnose_run import SIMULATED, load, play, read
+from experiments.options import prior_folders
+from sgft_jax.analysis import prediction, tables
+from sgft_jax.analysis.curves import read_curve
+from sgft_jax.analysis.prediction import AHEAD, Cases, Inputs
+from sgft_jax.examination import Examiner
+from sgft_jax.io.jsonfile import jsonable
+from sgft_jax.types import UserError
+
+COUNTS = (1, 2, 4)  # rollouts that a prediction is made from
+
+
+def calibrate(args: DiagnoseArgs, runs: list[Path], checked: list[Path]) -> tuple[dict[str, Any], list[str]]:
+    """How well gains are predicted, as JSON data and as lines for people.
+
+    Without runs to check on, every gap is predicted from the others; with them, they are from `runs`.
+    """
+    own = gather(args, runs)
+    last = own[-1]
+    coefficients = prediction.fit(last)
+    if checked:
+        held, words = gather(args, checked), f"{len(checked)} other runs, predicted from {len(runs)}"
+        fits = [prediction.gain(case.inputs, prediction.fit(fitted)) for case, fitted in zip(held, own, strict=True)]
+    else:
+        if len(set(last.gaps)) < 2:
+            raise UserError("--calibrate: these runs are on one gap; name runs on others too, or some with --check")
+        held, words = own, f"{len(runs)} runs, every gap predicted from the others"
+        fits = [prediction.predict_unseen(case) for case in own]
+    final = held[-1]
+    lines = {f"prediction after {n} rollouts": (fit, case) for n, fit, case in zip(COUNTS, fits, held, strict=True)}
+    lines["the same, coefficients of this version"] = (prediction.gain(final.inputs), final)
+    lines["100 - zero-shot (50 episodes or so)"] = (1.0 - final.zero_shot, final)
+    lines["100 - success of the same 4 rollouts"] = (1.0 - final.inputs.success, final)
+    bands = {name: prediction.agreement(*pair) for name, pair in lines.items()}
+    rows = prediction.table(fits[-1], final)
+    found = {
+        "runs": [str(run) for run in runs],
+        "checked": [str(run) for run in checked],
+        "members": len(final.gains),
+        "coefficients": jsonable(coefficients),
+        "rank_correlation": {name: jsonable(band) for name, band in bands.items()},
+        "table": [dict(zip(("low", "high", "members", "predicted", "measured"), row, strict=True)) for row in rows],
+    }
+    return jsonable(found), _lines(words, final, coefficients, bands, rows)
+
+
+def _lines(
+    words: str, cases: Cases, coefficients: prediction.Coefficients, bands: dict, rows: Sequence[tuple]
+) -> list[str]:
+    names = (f"{name} {value:.3f}" for name, value in coefficients._asdict().items())
+    table = [(f"{100 * low:.0f} to {100 * high:.0f}", str(n), f"{100 * guess:+.0f}", f"{100 * real:+.0f}")
+             for low, high, n, guess, real in rows]  # fmt: skip
+    return [
+        f"{words}: {len(cases.gains)} members, {len(set(cases.gaps))} gaps, {len(set(cases.priors))} priors; mean gain "
+        f"in {AHEAD} rollouts or all there are {100 * cases.gains.mean():+.0f} points",
+        "",
+        *columns([("rank correlation with the gain", "[95 %, priors drawn first]"),
+                  *((name, tables.number(band, "correlation", digits=2)) for name, band in bands.items())]),
+        "",
+        *columns([("predicted gain, points", "members", "mean predicted", "mean measured"), *table]),
+        "",
+        f"coefficients from {COUNTS[-1]} rollouts of all of --calibrate: {', '.join(names)}",
+    ]  # fmt: skip
+
+
+def gather(args: DiagnoseArgs, runs: Sequence[Path]) -> list[Cases]:
+    """The cases of finished runs, as diagnosed from each of the COUNTS of rollouts; one run at a time is in memory."""
+    examiners: dict[Any, Any] = {}
+    inputs: list[list[Inputs]] = [[] for _ in COUNTS]
+    facts: list[tuple[float, float, tuple[np.ndarray, np.ndarray], str, str]] = []
+    for run in runs:
+        config, curve = config_of(run), read_curve(run).of("success")
+        folders = prior_folders(
+            args.prior or (Path(config["prior"]) if config.get("prior") else None),
+            out=args.out, task=config["task"], preset=config.get("preset", args.preset),
+        )  # fmt: skip
+        key = (config["task"], *folders)
+        if key not in examiners:
+            env, priors = load(config["task"], args.impl, folders)
+            simulated = play(env, [gaps.find(env.name, SIM)], priors, SIMULATED, args.seed)
+            examiners[key] = (env, priors, simulated, Examiner(priors[0].card, env))
+        env, priors, simulated, examiner = examiners[key]
+        rollouts, which = read(run, env, priors, COUNTS[-1])
+        if (there := rollouts[0].valid.shape[0]) < COUNTS[-1]:
+            raise UserError(f"{run}: holds {there} recorded rollouts, a calibration needs {COUNTS[-1]}")
+        held = curve.rollouts <= AHEAD
+        for member, (own, p) in enumerate(zip(rollouts, which, strict=True)):
+            seen = examiner.examine(priors[p].params, own, simulated[p], COUNTS).found
+            for some, found in zip(inputs, seen, strict=True):
+                some.append(prediction.inputs_of(found))
+            success = curve.values[member, held]
+            facts.append(
+                (success[0], success[-1] - success[0], (curve.rollouts[held], success), f"{env.name} {curve.gap}",
+                 f"{env.name} {folders[p]}")
+            )  # fmt: skip
+        if not args.json:
+            print(f"diagnosed: {run}", flush=True)
+    zero_shot, gains, curves, names, priors = zip(*facts, strict=True)
+    stacked = [Inputs(*np.array(some).T) for some in inputs]
+    rest = (np.array(zero_shot), np.array(gains), curves, np.array(names), np.array(priors))
+    return [Cases(x, *rest) for x in stacked]

@@ -1,0 +1,152 @@
+"""What fine-tuning will gain, predicted from a diagnosis: one formula of three numbers, and its calibration. Pure."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import nnls
+
+from sgft_jax.analysis.stats import Interval, bootstrap_interval, rank_correlation
+
+AHEAD, LEVEL = 20, 0.9  # rollouts after which the gain is meant, and success that counts as solved
+_BINS = (0.0, 0.05, 0.2, 0.5, 1.0)  # of predicted gain, for the calibration table
+_PACES = np.linspace(0.5, 20.0, 79)
+
+
+class Coefficients(NamedTuple):
+    """What `experiments.diagnose --calibrate` fits; base, improvable and fidelity are never negative.
+
+    The share of what is missing to full success that fine-tuning gains in AHEAD rollouts is
+    base + improvable * (share of improvable states) + fidelity * (how right the identified models are).
+    pace: rollouts after which all but a share 1/e of the gain is there.
+    """
+
+    base: float
+    improvable: float
+    fidelity: float
+    pace: float
+
+
+COEFFICIENTS = Coefficients(base=0.0, improvable=0.3, fidelity=0.7, pace=3.0)
+
+
+class Inputs(NamedTuple):
+    """Of the formula, numbers in [0, 1] or arrays [m] of them.
+
+    success: of the rollouts, see `inputs_of`. improvable: share of visited states in which some action keeps what V_sim
+    promises. fidelity: model error in simulation over that on the real system after identification, at most 1.
+    """
+
+    success: Any
+    improvable: Any
+    fidelity: Any
+
+
+def inputs_of(found: Mapping[str, Any]) -> Inputs:
+    """Of one diagnosis, see `examination.describe`.
+
+    Success of n rollouts counts as (successes + 1/2) / (n + 1): after one rollout nothing is certain.
+    """
+    n, ahead = found["rollouts"], found["horizons"].index(4)
+    errors = found["model_error"]
+    return Inputs(
+        success=(n * found["success"] + 0.5) / (n + 1),
+        improvable=found["value"]["real"][0]["improvable"],
+        fidelity=min(errors["simulated"][ahead] / max(errors["identified"][ahead], 1e-9), 1.0),
+    )
+
+
+def gain(x: Inputs, c: Coefficients = COEFFICIENTS) -> Any:
+    """Success after AHEAD rollouts minus zero-shot success; falls with success, grows with the other two."""
+    share = c.base + c.improvable * x.improvable + c.fidelity * x.fidelity
+    return (1.0 - x.success) * np.clip(share, 0.0, 1.0)
+
+
+def success_after(x: Inputs, rollouts: Any, c: Coefficients = COEFFICIENTS) -> Any:
+    """Expected success after that many rollouts; the gain comes exponentially at the pace."""
+    return x.success + gain(x, c) * progress(rollouts, c.pace)
+
+
+def progress(rollouts: Any, pace: Any, ahead: int = AHEAD) -> Any:
+    """The share of the gain of `ahead` rollouts that is there after so many."""
+    return -np.expm1(-np.asarray(rollouts) / pace) / -np.expm1(-ahead / pace)
+
+
+def rollouts_until(x: Inputs, level: float = LEVEL, c: Coefficients = COEFFICIENTS) -> int | None:
+    """The first number of rollouts after which that success is expected; None if it takes more than AHEAD."""
+    there = np.flatnonzero(success_after(x, np.arange(AHEAD + 1), c) >= level)
+    return int(there[0]) if there.size else None
+
+
+# --- calibration ------------------------------------------------------------------------------------------------------
+
+
+class Cases(NamedTuple):
+    """Finished runs of m members (a gap and a prior each).
+
+    inputs: [m] of the formula. zero_shot, gains: [m] success before fine-tuning, and what came on top. curves: success
+    of every member at its evaluations [e], as (rollouts, success). gaps, priors: [m] names; the prior is the random
+    factor.
+    """
+
+    inputs: Inputs
+    zero_shot: np.ndarray
+    gains: np.ndarray
+    curves: Sequence[tuple[np.ndarray, np.ndarray]]
+    gaps: np.ndarray
+    priors: np.ndarray
+
+    def of(self, held: np.ndarray) -> "Cases":
+        """Those members, [m] bool."""
+        curves = [curve for curve, one in zip(self.curves, held, strict=True) if one]
+        zero_shot, gains, gaps, priors = (x[held] for x in (self.zero_shot, self.gains, self.gaps, self.priors))
+        return Cases(Inputs(*(x[held] for x in self.inputs)), zero_shot, gains, curves, gaps, priors)
+
+
+def fit(cases: Cases) -> Coefficients:
+    """The coefficients by least squares, none negative, so that the formula stays monotone; the pace by search."""
+    x = cases.inputs
+    columns = np.stack([np.ones_like(x.success), x.improvable, x.fidelity], axis=1)
+    shares, _ = nnls(columns * (1.0 - x.success)[:, None], cases.gains)
+    return Coefficients(*map(float, shares), pace=_pace(cases))
+
+
+def _pace(cases: Cases) -> float:
+    """That which describes the curves best, of members that gained something."""
+    gained = [curve for curve, own in zip(cases.curves, cases.gains, strict=True) if own > 0.1]
+    if not gained:
+        return COEFFICIENTS.pace
+    missed = np.zeros(len(_PACES))
+    for rollouts, success in gained:
+        share = (success - success[0]) / (success[-1] - success[0])
+        missed += np.square(progress(rollouts[:, None], _PACES, int(rollouts[-1])) - share[:, None]).sum(axis=0)
+    return float(_PACES[np.argmin(missed)])
+
+
+def predict_unseen(cases: Cases) -> np.ndarray:
+    """[m] gain predicted for every gap by coefficients fitted to the other gaps; raises ValueError for one gap."""
+    if len(names := np.unique(cases.gaps)) < 2:
+        raise ValueError("one gap alone cannot be predicted from others")
+    found = np.zeros(len(cases.gains))
+    for name in names:
+        own = cases.gaps == name
+        found[own] = gain(cases.of(own).inputs, fit(cases.of(~own)))
+    return found
+
+
+def agreement(predicted: ArrayLike, cases: Cases) -> Interval:
+    """Spearman's rank correlation of predicted [m] and measured gain; its 95 % interval draws priors, then members."""
+    pairs = np.stack([np.asarray(predicted, np.float64), cases.gains], axis=1)
+    return bootstrap_interval(pairs, statistic=rank_correlation, priors=cases.priors)
+
+
+def table(predicted: np.ndarray, cases: Cases) -> list[tuple[float, float, int, float, float]]:
+    """The calibration table: (low, high, members, mean predicted, mean measured gain) of each range that has any."""
+    rows = []
+    for low, high in itertools.pairwise(_BINS):
+        own = (predicted >= low) & ((predicted < high) | (high == _BINS[-1]))
+        if own.any():
+            rows.append((low, high, int(own.sum()), float(predicted[own].mean()), float(cases.gains[own].mean())))
+    return rows

@@ -1,0 +1,170 @@
+"""What a diagnosis means, in words and as strengths of signs. Pure."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from sgft_jax.analysis import prediction
+from sgft_jax.analysis.prediction import AHEAD, LEVEL, Inputs
+
+# From where on a sign counts. The numbers are ours: they separate the development gaps from the control `sim`.
+_NATS = 20.0  # of evidence, as in `identify`
+_SCALE, _ROTATION, _BIAS = 0.15, 0.1, 0.08  # share, rad, share of the range of commands
+_ERROR = 0.3  # of the std of a sensor's error
+_DELAY = 0.15  # of a control period
+_NOISE = 2.0  # times that in simulation
+_MODELS = 1.5  # times the error in simulation
+_IMPROVABLE = 0.9  # of visited states, for a horizon that suffices
+_WORTH = 0.05  # gain in success
+
+
+class Names(NamedTuple):
+    """Of a task's numbers, for people. action: [act_dim]. sensors: [measured_dim] (name, unit). errors: [measured_dim]
+    std of constant sensor errors. dt: s, control period.
+    """
+
+    action: Sequence[str]
+    sensors: Sequence[tuple[str, str]]
+    errors: Sequence[float]
+    dt: float
+
+
+class Sign(NamedTuple):
+    """Of one kind of gap. strength: it counts from 1 on. words: what was found."""
+
+    name: str
+    strength: float
+    words: str
+
+
+def signs(found: Mapping[str, Any], names: Names) -> list[Sign]:
+    """All kinds of gap that a diagnosis looks for, of one `examination.describe`."""
+    known, late, noise = found["identified"], found["delay"], found["noise"]
+    sure = min(known["nats"] / _NATS, 1.0)
+    scales = {name: s for name, s in zip(names.action, known["scale"], strict=True)}
+    biases = dict(zip(names.action, known["bias"], strict=True))
+    ahead = found["horizons"].index(4)
+    errors = {key: values[ahead] for key, values in found["model_error"].items()}
+    times = errors["identified"] / max(errors["simulated"], 1e-9)
+    return [
+        Sign(
+            "command scale",
+            sure * max(abs(math.log(s)) for s in scales.values()) / math.log1p(_SCALE),
+            f"the robot moves {_each(scales, '{:.2f}')} times as far as commanded",
+        ),
+        Sign(
+            "command rotation",
+            sure * abs(known["rotation"]) / _ROTATION,
+            f"commands are turned by {known['rotation']:+.2f} rad",
+        ),
+        Sign(
+            "command bias",
+            sure * max(map(abs, biases.values())) / _BIAS,
+            f"commands are off by {_each(biases, '{:+.2f}')} of their range",
+        ),
+        _sensor_error(known["sensor_errors"], names),
+        Sign(
+            "delay",
+            min(late["nats"] / _NATS, 1.0) * abs(late["share"]) / _DELAY,
+            f"commands come {abs(late['share']) * names.dt:.3f} s {'later' if late['share'] > 0 else 'earlier'} than "
+            "in simulation",
+        ),
+        _noise(noise, names),
+        Sign(
+            "what is left",
+            times / _MODELS,
+            f"with all that identified, the models err {times:.1f} times as much as in simulation four steps ahead: "
+            "something else differs, such as masses, friction, contacts or noise",
+        ),
+    ]  # fmt: skip
+
+
+def _sensor_error(offsets: Sequence[float], names: Names) -> Sign:
+    wrong = [
+        (abs(offset) / std, f"{name} by {_measure(offset, unit)}")
+        for offset, std, (name, unit) in zip(offsets, names.errors, names.sensors, strict=True) if std
+    ]  # fmt: skip
+    counted = [words for size, words in wrong if size >= _ERROR]
+    return Sign(
+        "sensor error", max((size for size, _ in wrong), default=0.0) / _ERROR, f"sensors are off: {', '.join(counted)}"
+    )
+
+
+def _noise(found: Mapping[str, Sequence[float]], names: Names) -> Sign:
+    each = zip(found["real"], found["simulated"], names.sensors, strict=True)
+    times, own, usual, (name, unit) = max((own / max(usual, 1e-4), own, usual, sensor) for own, usual, sensor in each)
+    return Sign(
+        "noise",
+        times / _NOISE,
+        f"noise of {name} is {_measure(own, unit, '')}, {_measure(usual, unit, '')} in simulation",
+    )
+
+
+def _each(values: Mapping[str, float], form: str) -> str:
+    """One number where all are alike, else each with its name."""
+    shown = {name: form.format(value) for name, value in values.items()}
+    return (
+        shown[next(iter(shown))] if len(set(shown.values())) == 1 else ", ".join(f"{v} ({k})" for k, v in shown.items())
+    )
+
+
+def _measure(value: float, unit: str, sign: str = "+") -> str:
+    """A length in mm, anything else in its unit."""
+    return f"{1000 * value:{sign}.1f} mm" if unit == "m" else f"{value:{sign}.3g} {unit}".rstrip()
+
+
+def verdict(found: Mapping[str, Any], names: Names) -> list[str]:
+    """What kind of gap it looks like, whether fine-tuning helps, which horizon, how many rollouts: a line for each."""
+    x = prediction.inputs_of(found)
+    return [_kind(signs(found, names)), _guide(found["value"]), _worth(x), _horizon(found), _how_long(x)]
+
+
+def _kind(found: Sequence[Sign]) -> str:
+    counted = sorted((sign for sign in found if sign.strength >= 1.0), key=lambda sign: -sign.strength)
+    if not counted:
+        return "gap: nothing stands out against simulation"
+    return f"gap: {', '.join(sign.name for sign in counted)}. In words: {'; '.join(sign.words for sign in counted)}"
+
+
+def _guide(value: Mapping[str, Any]) -> str:
+    share, usual = (100 * value[where][0]["improvable"] for where in ("real", "simulated"))
+    trust = (
+        f"rollouts fall short of it by {value['shortfall']:.1f} standard deviations of what it is off by in simulation"
+    )
+    if value["shortfall"] < 1.0:
+        trust = "rollouts return what it promises"
+    return (
+        f"V_sim: in {share:.0f} % of the visited states some action keeps what it promises ({usual:.0f} % in "
+        f"simulation); {trust}; rank correlation with returns {value['rank_correlation']:.2f}"
+    )
+
+
+def _worth(x: Inputs) -> str:
+    own = 100 * prediction.gain(x)
+    after = 100 * prediction.success_after(x, AHEAD)
+    said = f"{own:+.0f} points expected in {AHEAD} rollouts, to {after:.0f} %"
+    if own >= 100 * _WORTH:
+        return f"fine-tuning: worth it, {said}"
+    if x.success >= LEVEL - _WORTH:
+        return f"fine-tuning: there is little to gain ({said}); keep the policy, or use --options.guard"
+    return f"fine-tuning: little hope ({said}); a simulator with what differs, see above, helps more"
+
+
+def _horizon(found: Mapping[str, Any]) -> str:
+    shares = [one["improvable"] for one in found["value"]["real"]]
+    enough = [h for h, share in zip(found["horizons"], shares, strict=True) if share >= _IMPROVABLE]
+    if enough:
+        share = shares[found["horizons"].index(enough[0])]
+        return f"horizon: H = {enough[0]} is enough, {100 * share:.0f} % of the states are improvable with it"
+    best = max(range(len(shares)), key=shares.__getitem__)
+    return (
+        f"horizon: H = {found['horizons'][best]}, with which {100 * shares[best]:.0f} % of the states are improvable; "
+        "no horizon up to 8 suffices, so methods without V_sim's guidance (sac, mbpo) may do as well"
+    )
+
+
+def _how_long(x: Inputs) -> str:
+    n = prediction.rollouts_until(x)
+    if n is None:
+        return f"time: {100 * LEVEL:.0f} % are not expected within {AHEAD} rollouts"
+    return f"time: {100 * LEVEL:.0f} % expected {f'after {n} rollout{"s" * (n > 1)}' if n else 'now'}"

@@ -1,0 +1,85 @@
+import numpy as np
+import pytest
+
+from sgft_jax.analysis import prediction
+from sgft_jax.analysis.prediction import Cases, Coefficients, Inputs
+
+C = Coefficients(base=0.1, improvable=0.2, fidelity=0.5, pace=4.0)
+
+
+def cases(n=60, coefficients=C, noise=0.0, gaps=6):
+    rng = np.random.default_rng(0)
+    x = Inputs(*rng.uniform(0, 1, (3, n)))
+    gains = prediction.gain(x, coefficients) + noise * rng.normal(size=n)
+    rollouts = np.array([0, 1, 2, 4, 8, 20])
+    curves = [(rollouts, s + g * prediction.progress(rollouts, coefficients.pace))
+              for s, g in zip(x.success, gains, strict=True)]  # fmt: skip
+    names = lambda word, of: np.array([f"{word}{i % of}" for i in range(n)])  # noqa: E731
+    return Cases(x, x.success, gains, curves, names("gap", gaps), names("prior", 4))
+
+
+def test_the_formula_by_hand():
+    x = Inputs(success=0.2, improvable=0.5, fidelity=1.0)
+    assert prediction.gain(x, C) == pytest.approx(0.8 * (0.1 + 0.1 + 0.5))
+    assert prediction.gain(x, C._replace(base=2.0)) == pytest.approx(0.8)  # never more than what is missing
+    assert prediction.success_after(x, 0, C) == 0.2 and prediction.success_after(x, 20, C) == pytest.approx(0.76)
+    ratio = (1 - np.exp(-1)) / (1 - np.exp(-5))
+    assert prediction.success_after(x, 4, C) == pytest.approx(0.2 + 0.56 * ratio)
+
+
+@pytest.mark.parametrize(("name", "sign"), [("success", -1), ("improvable", 1), ("fidelity", 1)])
+def test_it_is_monotone_in_every_input(name, sign):
+    x = Inputs(0.4, 0.4, 0.4)
+    change = prediction.gain(x._replace(**{name: 0.6})) - prediction.gain(x)
+    assert sign * change > 0.01
+
+
+def test_rollouts_until_success():
+    full = Coefficients(1.0, 0.0, 0.0, pace=4.0)
+    x = Inputs(0.0, 1.0, 1.0)
+    n = prediction.rollouts_until(x, 0.9, full)
+    assert n == 9  # 1 - exp(-n / 4) >= 0.9 (1 - exp(-5)), n >= 8.97
+    assert prediction.rollouts_until(x._replace(success=0.95), 0.9, full) == 0
+    assert prediction.rollouts_until(x, 0.9, full._replace(base=0.5)) is None
+
+
+def test_a_fit_finds_the_coefficients_and_never_a_negative_one():
+    assert prediction.fit(cases()) == pytest.approx(C, abs=1e-6)
+    downwards = cases(coefficients=Coefficients(0.8, -0.6, 0.0, 4.0))
+    assert prediction.fit(downwards).improvable == 0.0
+
+
+def test_what_is_unseen_is_predicted_from_the_other_gaps():
+    """A gap whose members gain nothing, whatever the formula says, does not teach its own prediction."""
+    odd = cases()
+    odd = odd._replace(gains=np.where(odd.gaps == "gap0", 0.0, odd.gains))
+    own = odd.gaps == "gap0"
+    np.testing.assert_allclose(prediction.predict_unseen(odd)[own], prediction.gain(odd.inputs, C)[own], atol=1e-6)
+    assert (
+        prediction.gain(odd.inputs, prediction.fit(odd))[own].mean() < 0.9 * prediction.gain(odd.inputs, C)[own].mean()
+    )
+    with pytest.raises(ValueError, match="one gap"):
+        prediction.predict_unseen(cases(gaps=1))
+
+
+def test_agreement_and_table():
+    some = cases(noise=0.02)
+    predicted = prediction.gain(some.inputs, C)
+    band = prediction.agreement(predicted, some)
+    assert 0.9 < band.low < band.estimate < band.high <= 1.0
+    assert prediction.agreement(-predicted, some).estimate == -band.estimate
+    rows = prediction.table(predicted, some)
+    assert sum(count for _, _, count, *_ in rows) == 60
+    for low, high, _, expected, measured in rows:
+        assert low <= expected <= high and measured == pytest.approx(expected, abs=0.03)
+
+
+def test_inputs_of_a_diagnosis():
+    found = {
+        "rollouts": 3, "success": 1 / 3, "horizons": [1, 2, 4, 8],
+        "value": {"real": [{"improvable": 0.7}, {"improvable": 0.9}]},
+        "model_error": {"simulated": [1.0, 1.0, 2.0, 1.0], "identified": [1.0, 1.0, 8.0, 1.0]},
+    }  # fmt: skip
+    assert prediction.inputs_of(found) == pytest.approx(Inputs(success=1.5 / 4, improvable=0.7, fidelity=0.25))
+    right = {**found, "model_error": {"simulated": [2.0] * 4, "identified": [1.0] * 4}}
+    assert prediction.inputs_of(right).fidelity == 1.0
