@@ -6,11 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from envs import gaps
-from envs.gaps import SIM
 from experiments.cli import columns
 from experiments.diagnose import DiagnoseArgs, config_of
-from experiments.diagnose_run import SIMULATED, load, play, read
+from experiments.diagnose_run import load, play_simulated, read
 from experiments.options import prior_folders
 from sgft_jax.analysis import prediction, tables
 from sgft_jax.analysis.curves import read_curve
@@ -27,15 +25,14 @@ def calibrate(args: DiagnoseArgs, runs: list[Path], checked: list[Path]) -> tupl
 
     Without runs to check on, every gap is predicted from the others; with them, they are from `runs`.
     """
+    if not checked and len({(curve.task, curve.gap) for curve in map(read_curve, runs)}) < 2:
+        raise UserError("--calibrate: these runs are on one gap; name runs on others too, or some with --check")
     own = gather(args, runs)
-    last = own[-1]
-    coefficients = prediction.fit(last)
+    coefficients = prediction.fit(own[-1])
     if checked:
         held, words = gather(args, checked), f"{len(checked)} other runs, predicted from {len(runs)}"
         fits = [prediction.gain(case.inputs, prediction.fit(fitted)) for case, fitted in zip(held, own, strict=True)]
     else:
-        if len(set(last.gaps)) < 2:
-            raise UserError("--calibrate: these runs are on one gap; name runs on others too, or some with --check")
         held, words = own, f"{len(runs)} runs, every gap predicted from the others"
         fits = [prediction.predict_unseen(case) for case in own]
     final = held[-1]
@@ -89,20 +86,21 @@ def gather(args: DiagnoseArgs, runs: Sequence[Path]) -> list[Cases]:
         key = (config["task"], *folders)
         if key not in examiners:
             env, priors = load(config["task"], args.impl, folders)
-            simulated = play(env, [gaps.find(env.name, SIM)], priors, SIMULATED, args.seed)
-            examiners[key] = (env, priors, simulated, Examiner(priors[0].card, env))
-        env, priors, simulated, examiner = examiners[key]
+            examiner, simulated = Examiner(priors[0].card, env), play_simulated(env, priors, args.seed)
+            controls = [examiner.control(prior.params, own) for prior, own in zip(priors, simulated, strict=True)]
+            examiners[key] = (env, priors, examiner, controls)
+        env, priors, examiner, controls = examiners[key]
         rollouts, which = read(run, env, priors, COUNTS[-1])
         if (there := rollouts[0].valid.shape[0]) < COUNTS[-1]:
             raise UserError(f"{run}: holds {there} recorded rollouts, a calibration needs {COUNTS[-1]}")
         held = curve.rollouts <= AHEAD
         for member, (own, p) in enumerate(zip(rollouts, which, strict=True)):
-            seen = examiner.examine(priors[p].params, own, simulated[p], COUNTS).found
+            seen = examiner.examine(priors[p].params, controls[p], own, COUNTS).found
             for some, found in zip(inputs, seen, strict=True):
                 some.append(prediction.inputs_of(found))
             success = curve.values[member, held]
             facts.append(
-                (success[0], success[-1] - success[0], (curve.rollouts[held], success), f"{env.name} {curve.gap}",
+                (success[0], round(success[-1] - success[0], 6), (curve.rollouts[held], success), f"{env.name} {curve.gap}",
                  f"{env.name} {folders[p]}")
             )  # fmt: skip
         if not args.json:

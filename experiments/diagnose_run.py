@@ -45,14 +45,15 @@ def diagnose(
         count = args.rollouts or PLAYED
         real, simulated = _play_both(env, gap, priors, count, args.seed)
         which, name = list(range(len(priors))), gap.name
-        what = f"{count} zero-shot rollout{'s' * (count > 1)} that were just played on the gap {gap.name}"
+        what = f"{_rollouts(count)} of {_priors(len(priors))}, just played zero-shot on the gap {gap.name}"
     else:
         real, which = read(recorded, env, priors, args.rollouts)
-        simulated = play(env, [gaps.find(env.name, SIM)], priors, SIMULATED, args.seed)
+        simulated = play_simulated(env, priors, args.seed)
         count, name = real[0].valid.shape[0], recorded.name
-        what = f"{count} rollout{'s' * (count > 1)} recorded in {recorded}"
+        what = f"{_rollouts(count)} recorded in {recorded}"
     examiner, counts = Examiner(priors[0].card, env), counts_to(count)
-    each = [examiner.examine(priors[p].params, own, simulated[p], counts) for own, p in zip(real, which, strict=True)]
+    controls = [examiner.control(prior.params, own) for prior, own in zip(priors, simulated, strict=True)]
+    each = [examiner.examine(priors[p].params, controls[p], own, counts) for own, p in zip(real, which, strict=True)]
     labels = [str(folders[p]) for p in which]
     found = {
         "task": env.name,
@@ -128,12 +129,16 @@ def play(env: Env, found: Sequence[Gap], priors: list[Prior], n: int, seed: int)
     return [rollouts_of(jax.tree.map(np.asarray, stacking.member(played, i))) for i in range(len(keys))]
 
 
+def play_simulated(env: Env, priors: list[Prior], seed: int) -> list[Rollouts]:
+    """Exploring rollouts [SIMULATED] of every prior where nothing differs."""
+    return play(env, [gaps.find(env.name, SIM)], priors, SIMULATED, seed)
+
+
 def _play_both(env: Env, gap: Gap, priors: list[Prior], n: int, seed: int) -> tuple[list[Rollouts], list[Rollouts]]:
     """Rollouts [n] of every prior on a gap, and [SIMULATED] in simulation; one program plays both where it can."""
-    sim, count = gaps.find(env.name, SIM), max(n, SIMULATED)
     if gap.scene:
-        return play(env, [gap], priors, n, seed), play(env, [sim], priors, SIMULATED, seed)
-    both = play(env, [gap, sim], priors, count, seed)
+        return play(env, [gap], priors, n, seed), play_simulated(env, priors, seed)
+    both = play(env, [gap, gaps.find(env.name, SIM)], priors, max(n, SIMULATED), seed)
     first = lambda rollouts, k: jax.tree.map(lambda x: x[:k], rollouts)  # noqa: E731
     real, simulated = both[: len(priors)], both[len(priors) :]
     return [first(one, n) for one in real], [first(one, SIMULATED) for one in simulated]
@@ -206,6 +211,14 @@ def _points(each: Sequence[Examined]) -> dict[str, tuple[np.ndarray, np.ndarray]
         some = np.random.default_rng(0).permutation(len(value))[:1000]
         found[where] = (value[some], returns[some])
     return found
+
+
+def _rollouts(n: int) -> str:
+    return f"{n} rollout{'s' * (n > 1)}"
+
+
+def _priors(n: int) -> str:
+    return "one prior" if n == 1 else f"each of {n} priors"
 
 
 def _lines(labels: Sequence[str], each: Sequence[Examined]) -> list[str]:

@@ -23,6 +23,7 @@ HORIZONS = (1, 2, 4, 8)  # steps ahead
 _SHARES = np.linspace(-0.5, 1.0, 61)  # of a command that may come from the step before
 _DEGREES = 3.0  # of freedom of Student's t: no model is right about every step
 _STILL = 0.25  # the share of steps that move an entry least
+_LARGEST, _KEPT_STD = 0.05, 0.871  # share of residuals left out there; std of a Gaussian without it
 
 
 class Rollouts(NamedTuple):
@@ -260,10 +261,14 @@ def lateness(
 
 
 def noise(expected: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """[k] std of the noise of each sensor, from what the steps change that move it least.
+    """[k] std of the noise of each sensor, from the steps that move it least.
+
+    It is the rms of what the model leaves unexplained there, without the largest twentieth, corrected for that as if
+    the rest were Gaussian. Sensors that are noisy now and then count by their share.
 
     expected: [n, k] what the model predicts. change: [n, k] what was measured, with the noise of two measurements.
     """
     still = np.abs(expected) <= np.quantile(np.abs(expected), _STILL, axis=0)
-    missed = np.where(still, np.abs(change - expected), np.nan)
-    return 1.48 * np.nanmedian(missed, axis=0) / np.sqrt(2.0)
+    squares = np.where(still, np.square(change - expected), np.nan)
+    kept = np.where(squares <= np.nanquantile(squares, 1.0 - _LARGEST, axis=0), squares, np.nan)
+    return np.sqrt(np.nanmean(kept, axis=0) / 2.0) / _KEPT_STD

@@ -51,21 +51,30 @@ class Examiner:
         self.task, self._look = task, jax.jit(functools.partial(_look, card, task))
         self._start = jax.jit(functools.partial(_start, card, task))
 
-    def examine(self, params: Any, real: Rollouts, simulated: Rollouts, counts: Sequence[int]) -> "Examined":
+    def control(self, params: Any, simulated: Rollouts) -> "Control":
+        """What real rollouts are compared with. params: of the prior. simulated: of its exploring policy."""
+        begun = self._start(params, simulated)
+        return Control(begun, jax.device_get(self._look(params, begun, simulated, 0.0, False)))
+
+    def examine(self, params: Any, control: "Control", real: Rollouts, counts: Sequence[int]) -> "Examined":
         """What the first `count` real rollouts say, for each of the counts.
 
-        params: of the prior. simulated: rollouts of its exploring policy in simulation. Arrays keep their shapes from
-        call to call, or everything is compiled again.
+        Arrays keep their shapes from call to call, or everything is compiled again.
         """
-        begun = self._start(params, simulated)
-        seen = jax.device_get(self._look(params, begun, simulated, 0.0, False))
-        found, looked = [], seen
+        found, looked = [], control.seen
         for count in counts:
             first = jnp.arange(real.valid.shape[0])[:, None] < count
             some = real._replace(valid=jnp.asarray(real.valid) & first)
-            looked = jax.device_get(self._look(params, begun, some, seen.late.share, True))
-            found.append(describe(looked, seen, np.asarray(real.success)[:count], turns=self.task.cartesian))
-        return Examined(found, {"real": _points(looked), "simulated": _points(seen)})
+            looked = jax.device_get(self._look(params, control.begun, some, control.seen.late.share, True))
+            found.append(describe(looked, control.seen, np.asarray(real.success)[:count], turns=self.task.cartesian))
+        return Examined(found, {"real": _points(looked), "simulated": _points(control.seen)})
+
+
+class Control(NamedTuple):
+    """What a prior sees in simulation. begun: identification, before it has seen anything real. seen: the rest."""
+
+    begun: Identified
+    seen: Look
 
 
 class Examined(NamedTuple):

@@ -92,7 +92,7 @@ def _sensor_error(offsets: Sequence[float], names: Names) -> Sign:
 
 def _noise(found: Mapping[str, Sequence[float]], names: Names) -> Sign:
     each = zip(found["real"], found["simulated"], names.sensors, strict=True)
-    times, own, usual, (name, unit) = max((own / max(usual, 1e-4), own, usual, sensor) for own, usual, sensor in each)
+    times, own, usual, (name, unit) = max((own / max(usual, 1e-9), own, usual, sensor) for own, usual, sensor in each)
     return Sign(
         "noise",
         times / _NOISE,

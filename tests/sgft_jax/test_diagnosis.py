@@ -190,16 +190,17 @@ def played(key, known, n=4, noise=0.0):
 def test_an_examination_names_the_scale_and_counts_the_rollouts_it_is_given(examiner):
     weak = Distortion(jnp.diag(jnp.array([0.6, 1.0])), jnp.zeros(2), jnp.zeros(2))
     params, simulated = agreed(), played(jax.random.key(0), distortion.none(2, 2), 8)
-    one, three = examiner.examine(params, played(jax.random.key(1), weak), simulated, (1, 3)).found
+    control = examiner.control(params, simulated)
+    one, three = examiner.examine(params, control, played(jax.random.key(1), weak), (1, 3)).found
     assert (one["rollouts"], one["success"]) == (1, 1.0) and three["success"] == pytest.approx(2 / 3)
     assert three["identified"]["scale"] == pytest.approx([0.6, 1.0], abs=0.03) and three["identified"]["nats"] > 20
     real, identified, usual = (three["model_error"][name][0] for name in ("real", "identified", "simulated"))
     assert usual < 1e-6 and identified < 0.1 * real
-    (nothing,) = examiner.examine(params, simulated, simulated, (8,)).found
+    (nothing,) = examiner.examine(params, control, simulated, (8,)).found
     assert nothing["identified"]["scale"] == [1.0, 1.0] and nothing["value"]["shortfall"] == pytest.approx(0, abs=1e-4)
     assert nothing["value"]["real"] == nothing["value"]["simulated"]
     trembling = played(jax.random.key(2), distortion.none(2, 2), noise=0.1)
-    (noisy,) = examiner.examine(params, trembling, simulated, (4,)).found
+    (noisy,) = examiner.examine(params, control, trembling, (4,)).found
     assert min(noisy["noise"]["real"]) > 5 * max(noisy["noise"]["simulated"]) and noisy["noise"]["real"][0] < 0.15
 
 
