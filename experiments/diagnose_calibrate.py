@@ -76,7 +76,7 @@ def gather(args: DiagnoseArgs, runs: Sequence[Path]) -> list[Cases]:
     """The cases of finished runs, as diagnosed from each of the COUNTS of rollouts; one run at a time is in memory."""
     examiners: dict[Any, Any] = {}
     inputs: list[list[Inputs]] = [[] for _ in COUNTS]
-    facts: list[tuple[float, float, tuple[np.ndarray, np.ndarray], str, str]] = []
+    facts: list[tuple[Any, ...]] = []
     for run in runs:
         config, curve = config_of(run), read_curve(run).of("success")
         folders = prior_folders(
@@ -99,10 +99,9 @@ def gather(args: DiagnoseArgs, runs: Sequence[Path]) -> list[Cases]:
             for some, found in zip(inputs, seen, strict=True):
                 some.append(prediction.inputs_of(found))
             success = curve.values[member, held]
-            facts.append(
-                (success[0], round(success[-1] - success[0], 6), (curve.rollouts[held], success), f"{env.name} {curve.gap}",
-                 f"{env.name} {folders[p]}")
-            )  # fmt: skip
+            gained = round(success[-1] - success[0], 6)  # equal ones must tie
+            names = (f"{env.name} {curve.gap}", f"{env.name} {folders[p]}")
+            facts.append((success[0], gained, (curve.rollouts[held], success), *names))
         if not args.json:
             print(f"diagnosed: {run}", flush=True)
     zero_shot, gains, curves, names, priors = zip(*facts, strict=True)

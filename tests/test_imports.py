@@ -6,7 +6,19 @@ import sys
 import pytest
 
 HEAVY = ("jax", "flax", "mujoco", "matplotlib", "scipy", "orbax")
-COMMANDS = ("pretrain", "finetune", "evaluate", "demo", "figures", "compare", "gaps", "tune", "benchmark", "tasks")
+COMMANDS = (
+    "pretrain",
+    "finetune",
+    "evaluate",
+    "demo",
+    "figures",
+    "compare",
+    "gaps",
+    "tune",
+    "benchmark",
+    "tasks",
+    "diagnose",
+)
 MISTAKES = {
     "pretrain": "--config.gamma 2",
     "finetune": "--method sgft-sca",
@@ -16,6 +28,7 @@ MISTAKES = {
     "gaps": "--episodes 3",
     "tune": "--tasks hamer",
     "benchmark": "--worlds 0",
+    "diagnose": "--rollouts 0",
 }
 LIGHT = ("sgft_jax", "sgft_jax.checks", "sgft_jax.models.config", "experiments.cli", "sgft_jax.presets")
 
