@@ -160,6 +160,8 @@ def read(home: Path, env: Env, priors: Sequence[Prior], most: int | None) -> tup
     for i, arrays in enumerate(stored):
         _check(home / "real", i, arrays, stored[0], env)
     joined = {name: jnp.stack([arrays[name] for arrays in stored], axis=1) for name in _READ}
+    if not joined["valid"].any():
+        raise UserError(f"{home / 'real'}: holds no valid step")
     rows = Transition(*(joined[name] for name in Transition._fields))
     both = Rollouts(rows, joined["valid"].astype(bool), joined["success"].astype(bool))
     each = [stacking.member(both, s) for s in range(len(both.success))]

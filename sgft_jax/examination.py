@@ -21,7 +21,7 @@ _AT_ONCE = 32  # of these states, which bounds memory
 
 
 class Look(NamedTuple):
-    """What one prior sees in n rollouts, before any statistics; see the functions above.
+    """What one prior sees in n rollouts, before any statistics; see `diagnosis`.
 
     known: what identification finds. nats: [] its evidence. values, returns, valid: [n, T]. best: [states, horizon].
     surprise: [n * T]. errors, plain_errors: [n, windows, HORIZONS] with and without what is known. windows: [n,
@@ -48,13 +48,13 @@ class Examiner:
     """Examines rollouts of priors with one card on real systems of one task; its programs are compiled once."""
 
     def __init__(self, card: Mapping[str, Any], task: Task) -> None:
-        self.task, self._look = task, jax.jit(functools.partial(_look, card, task))
+        self.task, self._look = task, jax.jit(functools.partial(_look, card, task), static_argnames="real")
         self._start = jax.jit(functools.partial(_start, card, task))
 
     def control(self, params: Any, simulated: Rollouts) -> "Control":
         """What real rollouts are compared with. params: of the prior. simulated: of its exploring policy."""
         begun = self._start(params, simulated)
-        return Control(begun, jax.device_get(self._look(params, begun, simulated, 0.0, False)))
+        return Control(begun, jax.device_get(self._look(params, begun, simulated, 0.0, real=False)))
 
     def examine(self, params: Any, control: "Control", real: Rollouts, counts: Sequence[int]) -> "Examined":
         """What the first `count` real rollouts say, for each of the counts.
@@ -65,7 +65,7 @@ class Examiner:
         for count in counts:
             first = jnp.arange(real.valid.shape[0])[:, None] < count
             some = real._replace(valid=jnp.asarray(real.valid) & first)
-            looked = jax.device_get(self._look(params, control.begun, some, control.seen.late.share, True))
+            looked = jax.device_get(self._look(params, control.begun, some, control.seen.late.share, real=True))
             found.append(describe(looked, control.seen, np.asarray(real.success)[:count], turns=self.task.cartesian))
         return Examined(found, {"real": _points(looked), "simulated": _points(control.seen)})
 
@@ -102,14 +102,13 @@ def _start(card: Mapping[str, Any], task: Task, params: Any, simulated: Rollouts
 
 
 def _look(
-    card: Mapping[str, Any], task: Task, params: Any, begun: Identified, rollouts: Rollouts, usual: Array, real: Array
+    card: Mapping[str, Any], task: Task, params: Any, begun: Identified, rollouts: Rollouts, usual: Array, *, real: bool
 ) -> Look:
-    """usual: see `lateness`. real: [] bool; in the simulator there is nothing to identify."""
+    """usual: see `diagnosis.lateness`. real: False for simulated rollouts, in which there is nothing to identify."""
     beliefs = diagnosis.beliefs_of(params, card, task)
     rows, valid = rollouts.flat()
     nothing = none(task.act_dim, task.measured_dim)
-    fitted = command_interface(network_of(card), task).refit(begun, rows, valid).distortion
-    known = jax.tree.map(lambda a, b: jnp.where(real, a, b), fitted, nothing)
+    known = command_interface(network_of(card), task).refit(begun, rows, valid).distortion if real else nothing
     own = rollouts._replace(transitions=jax.vmap(functools.partial(diagnosis.meant, known))(rollouts.transitions))
     flat, _ = own.flat()
     first = jax.tree.map(lambda x: x[0], params.dynamics)

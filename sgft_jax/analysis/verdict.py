@@ -15,7 +15,7 @@ _DELAY = 0.15  # of a control period
 _NOISE = 2.0  # times that in simulation
 _MODELS = 1.5  # times the error in simulation
 _IMPROVABLE = 0.9  # of visited states, for a horizon that suffices
-_WORTH = 0.05  # gain in success
+_SOLVED, _WORTH = 0.95, 0.05  # success from which on fine-tuning has little to gain, and gain that is worth it
 
 
 class Names(NamedTuple):
@@ -116,7 +116,13 @@ def _measure(value: float, unit: str, sign: str = "+") -> str:
 def verdict(found: Mapping[str, Any], names: Names) -> list[str]:
     """What kind of gap it looks like, whether fine-tuning helps, which horizon, how many rollouts: a line for each."""
     x = prediction.inputs_of(found)
-    return [_kind(signs(found, names)), _guide(found["value"]), _worth(x), _horizon(found), _how_long(x)]
+    return [
+        _kind(signs(found, names)),
+        _guide(found["value"]),
+        _worth(found["success"], x),
+        _horizon(found),
+        _how_long(x),
+    ]
 
 
 def _kind(found: Sequence[Sign]) -> str:
@@ -139,14 +145,17 @@ def _guide(value: Mapping[str, Any]) -> str:
     )
 
 
-def _worth(x: Inputs) -> str:
+def _worth(success: float, x: Inputs) -> str:
+    """success: share of the rollouts, without the doubt that `inputs_of` adds."""
     own = 100 * prediction.gain(x)
     after = 100 * prediction.success_after(x, AHEAD)
     said = f"{own:+.0f} points expected in {AHEAD} rollouts, to {after:.0f} %"
+    if success >= _SOLVED:
+        return (
+            f"fine-tuning: there is little to gain, at most {own:.0f} points; keep the policy, or use --options.guard"
+        )
     if own >= 100 * _WORTH:
         return f"fine-tuning: worth it, {said}"
-    if x.success >= LEVEL - _WORTH:
-        return f"fine-tuning: there is little to gain ({said}); keep the policy, or use --options.guard"
     return f"fine-tuning: little hope ({said}); a simulator with what differs, see above, helps more"
 
 

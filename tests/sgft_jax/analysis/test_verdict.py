@@ -73,7 +73,7 @@ def test_nothing_counts_without_evidence():
 def test_what_is_worth_it():
     words = lambda **changes: verdict.verdict(found(**changes), NAMES)[2:]  # noqa: E731
     solved, horizon, now = words(rollouts=40)
-    assert "there is little to gain" in solved and now == "time: 90 % expected now"
+    assert "there is little to gain, at most 1 points" in solved and now == "time: 90 % expected now"
     assert horizon == "horizon: H = 1 is enough, 100 % of the states are improvable with it"
     failed, _, later = words(success=0.0)
     assert failed.startswith("fine-tuning: worth it, +") and "expected after" in later
