@@ -11,56 +11,60 @@ from scipy.optimize import nnls
 from sgft_jax.analysis.stats import Interval, bootstrap_interval, rank_correlation
 
 AHEAD, LEVEL = 20, 0.9  # rollouts after which the gain is meant, and success that counts as solved
+_SHORT = 40.0  # standard deviations, a shortfall as of a rollout that succeeds every other time
 _BINS = (0.0, 0.05, 0.2, 0.5, 1.0)  # of predicted gain, for the calibration table
 _PACES = np.linspace(0.5, 20.0, 79)
 
 
 class Coefficients(NamedTuple):
-    """What `experiments.diagnose --calibrate` fits; base, improvable and fidelity are never negative.
+    """What `experiments.diagnose --calibrate` fits; base, improvable and explained are never negative.
 
     The share of what is missing to full success that fine-tuning gains in AHEAD rollouts is
-    base + improvable * (share of improvable states) + fidelity * (how right the identified models are).
+    base + improvable * (share of improvable states) + explained * (share of the models' error that identification
+    removes).
     pace: rollouts after which all but a share 1/e of the gain is there.
     """
 
     base: float
     improvable: float
-    fidelity: float
+    explained: float
     pace: float
 
 
-COEFFICIENTS = Coefficients(base=0.0, improvable=0.3, fidelity=0.7, pace=3.0)
+COEFFICIENTS = Coefficients(base=0.0, improvable=0.43, explained=1.18, pace=1.25)
 
 
 class Inputs(NamedTuple):
     """Of the formula, numbers in [0, 1] or arrays [m] of them.
 
     success: of the rollouts, see `inputs_of`. improvable: share of visited states in which some action keeps what V_sim
-    promises. fidelity: model error in simulation over that on the real system after identification, at most 1.
+    promises. explained: share of the models' error four steps ahead that identification removes.
     """
 
     success: Any
     improvable: Any
-    fidelity: Any
+    explained: Any
 
 
 def inputs_of(found: Mapping[str, Any]) -> Inputs:
     """Of one diagnosis, see `examination.describe`.
 
-    Success of n rollouts counts as (successes + 1/2) / (n + 1): after one rollout nothing is certain.
+    Success of n rollouts counts as (successes + p) / (n + 1), where p is 1 if rollouts return what V_sim promises and
+    falls with their shortfall: after a few rollouts, how far they fall short says more than how many failed.
     """
     n, ahead = found["rollouts"], found["horizons"].index(4)
-    errors = found["model_error"]
+    likely = 1.0 / (1.0 + max(found["value"]["shortfall"], 0.0) / _SHORT)
+    real, identified = (found["model_error"][name][ahead] for name in ("real", "identified"))
     return Inputs(
-        success=(n * found["success"] + 0.5) / (n + 1),
+        success=(n * found["success"] + likely) / (n + 1),
         improvable=found["value"]["real"][0]["improvable"],
-        fidelity=min(errors["simulated"][ahead] / max(errors["identified"][ahead], 1e-9), 1.0),
+        explained=float(np.clip(1.0 - identified / max(real, 1e-9), 0.0, 1.0)),
     )
 
 
 def gain(x: Inputs, c: Coefficients = COEFFICIENTS) -> Any:
     """Success after AHEAD rollouts minus zero-shot success; falls with success, grows with the other two."""
-    share = c.base + c.improvable * x.improvable + c.fidelity * x.fidelity
+    share = c.base + c.improvable * x.improvable + c.explained * x.explained
     return (1.0 - x.success) * np.clip(share, 0.0, 1.0)
 
 
@@ -108,7 +112,7 @@ class Cases(NamedTuple):
 def fit(cases: Cases) -> Coefficients:
     """The coefficients by least squares, none negative, so that the formula stays monotone; the pace by search."""
     x = cases.inputs
-    columns = np.stack([np.ones_like(x.success), x.improvable, x.fidelity], axis=1)
+    columns = np.stack([np.ones_like(x.success), x.improvable, x.explained], axis=1)
     shares, _ = nnls(columns * (1.0 - x.success)[:, None], cases.gains)
     return Coefficients(*map(float, shares), pace=_pace(cases))
 

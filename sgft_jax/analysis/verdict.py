@@ -151,9 +151,7 @@ def _worth(success: float, x: Inputs) -> str:
     after = 100 * prediction.success_after(x, AHEAD)
     said = f"{own:+.0f} points expected in {AHEAD} rollouts, to {after:.0f} %"
     if success >= _SOLVED:
-        return (
-            f"fine-tuning: there is little to gain, at most {own:.0f} points; keep the policy, or use --options.guard"
-        )
+        return f"fine-tuning: there is little to gain ({own:+.0f} points expected); keep the policy, or use --options.guard"
     if own >= 100 * _WORTH:
         return f"fine-tuning: worth it, {said}"
     return f"fine-tuning: little hope ({said}); a simulator with what differs, see above, helps more"

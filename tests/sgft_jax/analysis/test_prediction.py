@@ -4,7 +4,7 @@ import pytest
 from sgft_jax.analysis import prediction
 from sgft_jax.analysis.prediction import Cases, Coefficients, Inputs
 
-C = Coefficients(base=0.1, improvable=0.2, fidelity=0.5, pace=4.0)
+C = Coefficients(base=0.1, improvable=0.2, explained=0.5, pace=4.0)
 
 
 def cases(n=60, coefficients=C, noise=0.0, gaps=6):
@@ -19,7 +19,7 @@ def cases(n=60, coefficients=C, noise=0.0, gaps=6):
 
 
 def test_the_formula_by_hand():
-    x = Inputs(success=0.2, improvable=0.5, fidelity=1.0)
+    x = Inputs(success=0.2, improvable=0.5, explained=1.0)
     assert prediction.gain(x, C) == pytest.approx(0.8 * (0.1 + 0.1 + 0.5))
     assert prediction.gain(x, C._replace(base=2.0)) == pytest.approx(0.8)  # never more than what is missing
     assert prediction.success_after(x, 0, C) == 0.2 and prediction.success_after(x, 20, C) == pytest.approx(0.76)
@@ -27,7 +27,7 @@ def test_the_formula_by_hand():
     assert prediction.success_after(x, 4, C) == pytest.approx(0.2 + 0.56 * ratio)
 
 
-@pytest.mark.parametrize(("name", "sign"), [("success", -1), ("improvable", 1), ("fidelity", 1)])
+@pytest.mark.parametrize(("name", "sign"), [("success", -1), ("improvable", 1), ("explained", 1)])
 def test_it_is_monotone_in_every_input(name, sign):
     x = Inputs(0.4, 0.4, 0.4)
     change = prediction.gain(x._replace(**{name: 0.6})) - prediction.gain(x)
@@ -77,9 +77,10 @@ def test_agreement_and_table():
 def test_inputs_of_a_diagnosis():
     found = {
         "rollouts": 3, "success": 1 / 3, "horizons": [1, 2, 4, 8],
-        "value": {"real": [{"improvable": 0.7}, {"improvable": 0.9}]},
-        "model_error": {"simulated": [1.0, 1.0, 2.0, 1.0], "identified": [1.0, 1.0, 8.0, 1.0]},
+        "value": {"shortfall": 120.0, "real": [{"improvable": 0.7}, {"improvable": 0.9}]},
+        "model_error": {"real": [1.0, 1.0, 8.0, 1.0], "identified": [1.0, 1.0, 2.0, 1.0]},
     }  # fmt: skip
-    assert prediction.inputs_of(found) == pytest.approx(Inputs(success=1.5 / 4, improvable=0.7, fidelity=0.25))
-    right = {**found, "model_error": {"simulated": [2.0] * 4, "identified": [1.0] * 4}}
-    assert prediction.inputs_of(right).fidelity == 1.0
+    assert prediction.inputs_of(found) == pytest.approx(Inputs(success=1.25 / 4, improvable=0.7, explained=0.75))
+    found["value"]["shortfall"] = -1.0
+    found["model_error"]["identified"] = [9.0] * 4
+    assert prediction.inputs_of(found) == pytest.approx(Inputs(success=0.5, improvable=0.7, explained=0.0))
