@@ -151,7 +151,7 @@ def _worth(success: float, x: Inputs) -> str:
     after = 100 * prediction.success_after(x, AHEAD)
     said = f"{own:+.0f} points expected in {AHEAD} rollouts, to {after:.0f} %"
     if success >= _SOLVED:
-        return f"fine-tuning: there is little to gain ({own:+.0f} points expected); keep the policy, or use --options.guard"
+        return f"fine-tuning: little to gain ({own:+.0f} points expected); keep the policy, or use a guarded method"
     if own >= 100 * _WORTH:
         return f"fine-tuning: worth it, {said}"
     return f"fine-tuning: little hope ({said}); a simulator with what differs, see above, helps more"
@@ -162,11 +162,11 @@ def _horizon(found: Mapping[str, Any]) -> str:
     enough = [h for h, share in zip(found["horizons"], shares, strict=True) if share >= _IMPROVABLE]
     if enough:
         share = shares[found["horizons"].index(enough[0])]
-        return f"horizon: H = {enough[0]} is enough, {100 * share:.0f} % of the states are improvable with it"
+        return f"horizon of SGFT: H = {enough[0]} is enough, {100 * share:.0f} % of the states are improvable with it"
     best = max(range(len(shares)), key=shares.__getitem__)
     return (
-        f"horizon: H = {found['horizons'][best]}, with which {100 * shares[best]:.0f} % of the states are improvable; "
-        "no horizon up to 8 suffices, so methods without V_sim's guidance (sac, mbpo) may do as well"
+        f"horizon of SGFT: H = {found['horizons'][best]}, with which {100 * shares[best]:.0f} % of the states are "
+        "improvable; no horizon up to 8 suffices, so methods without V_sim (anchored, sac, mbpo) may do better"
     )
 
 

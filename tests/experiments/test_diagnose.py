@@ -49,7 +49,7 @@ def test_a_gap_is_played_and_diagnosed_by_every_prior(priors, tmp_path, capsys):
     text = capsys.readouterr().out
     assert "3 rollouts of each of 2 priors, just played zero-shot on the gap weak" in text
     assert all(f"\n{priors}/seed-{i} " in text for i in (0, 1)) and "\nmean " in text
-    assert all(f"\n{word}: " in text for word in ("gap", "V_sim", "fine-tuning", "horizon", "time"))
+    assert all(f"\n{word}: " in text for word in ("gap", "V_sim", "fine-tuning", "horizon of SGFT", "time"))
     home = tmp_path / "runs/diagnose/toy/weak"
     found = json.loads((home / "diagnosis.json").read_text())
     assert (home / "diagnosis.png").stat().st_size > 10_000

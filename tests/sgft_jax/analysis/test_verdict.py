@@ -73,8 +73,8 @@ def test_nothing_counts_without_evidence():
 def test_what_is_worth_it():
     words = lambda **changes: verdict.verdict(found(**changes), NAMES)[2:]  # noqa: E731
     solved, horizon, now = words(rollouts=40)
-    assert "there is little to gain (+0 points expected)" in solved and now == "time: 90 % expected now"
-    assert horizon == "horizon: H = 1 is enough, 100 % of the states are improvable with it"
+    assert "little to gain (+0 points expected)" in solved and now == "time: 90 % expected now"
+    assert horizon == "horizon of SGFT: H = 1 is enough, 100 % of the states are improvable with it"
     failed, _, later = words(success=0.0, model_error__identified=[0.01] * 4)
     assert failed.startswith("fine-tuning: worth it, +") and "expected after" in later
     hopeless = {"value__real": [{"improvable": 0.0, "improving": 0.0}] * 4, "model_error__identified": [9.0] * 4}
