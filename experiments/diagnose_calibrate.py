@@ -39,7 +39,7 @@ def calibrate(args: DiagnoseArgs, runs: list[Path], checked: list[Path]) -> tupl
     lines = {f"prediction after {n} rollouts": (fit, case) for n, fit, case in zip(COUNTS, fits, held, strict=True)}
     lines["the same, coefficients of this version"] = (prediction.gain(final.inputs), final)
     lines["100 - zero-shot (50 episodes or so)"] = (1.0 - final.zero_shot, final)
-    lines["100 - success of the same 4 rollouts"] = (1.0 - final.inputs.success, final)
+    lines[f"100 - success of the same {COUNTS[-1]} rollouts"] = (1.0 - final.played, final)
     bands = {name: prediction.agreement(*pair) for name, pair in lines.items()}
     rows = prediction.table(fits[-1], final)
     found = {
@@ -76,6 +76,7 @@ def gather(args: DiagnoseArgs, runs: Sequence[Path]) -> list[Cases]:
     """The cases of finished runs, as diagnosed from each of the COUNTS of rollouts; one run at a time is in memory."""
     examiners: dict[Any, Any] = {}
     inputs: list[list[Inputs]] = [[] for _ in COUNTS]
+    played: list[list[float]] = [[] for _ in COUNTS]
     facts: list[tuple[Any, ...]] = []
     for run in runs:
         config, curve = config_of(run), read_curve(run).of("success")
@@ -96,8 +97,9 @@ def gather(args: DiagnoseArgs, runs: Sequence[Path]) -> list[Cases]:
         held = curve.rollouts <= AHEAD
         for member, (own, p) in enumerate(zip(rollouts, which, strict=True)):
             seen = examiner.examine(priors[p].params, controls[p], own, COUNTS).found
-            for some, found in zip(inputs, seen, strict=True):
-                some.append(prediction.inputs_of(found))
+            for i, found in enumerate(seen):
+                inputs[i].append(prediction.inputs_of(found))
+                played[i].append(found["success"])
             success = curve.values[member, held]
             gained = round(success[-1] - success[0], 6)  # equal ones must tie
             names = (f"{env.name} {curve.gap}", f"{env.name} {folders[p]}")
@@ -105,6 +107,5 @@ def gather(args: DiagnoseArgs, runs: Sequence[Path]) -> list[Cases]:
         if not args.json:
             print(f"diagnosed: {run}", flush=True)
     zero_shot, gains, curves, names, priors = zip(*facts, strict=True)
-    stacked = [Inputs(*np.array(some).T) for some in inputs]
     rest = (np.array(zero_shot), np.array(gains), curves, np.array(names), np.array(priors))
-    return [Cases(x, *rest) for x in stacked]
+    return [Cases(Inputs(*np.array(x).T), np.array(own), *rest) for x, own in zip(inputs, played, strict=True)]

@@ -49,7 +49,10 @@ def diagnose(
     else:
         real, which = read(recorded, env, priors, args.rollouts)
         simulated = play_simulated(env, priors, args.seed)
-        count, name = real[0].valid.shape[0], recorded.name
+        count, name = (
+            real[0].valid.shape[0],
+            "_".join(recorded.parts[-3:] if config_of(recorded) else recorded.parts[-1:]),
+        )
         what = f"{_rollouts(count)} recorded in {recorded}"
     examiner, counts = Examiner(priors[0].card, env), counts_to(count)
     controls = [examiner.control(prior.params, own) for prior, own in zip(priors, simulated, strict=True)]

@@ -31,7 +31,7 @@ class Coefficients(NamedTuple):
     pace: float
 
 
-COEFFICIENTS = Coefficients(base=0.0, improvable=0.43, explained=1.18, pace=1.25)
+COEFFICIENTS = Coefficients(base=0.10, improvable=0.53, explained=0.63, pace=2.75)  # provisional, docs/diagnose.md
 
 
 class Inputs(NamedTuple):
@@ -90,12 +90,13 @@ def rollouts_until(x: Inputs, level: float = LEVEL, c: Coefficients = COEFFICIEN
 class Cases(NamedTuple):
     """Finished runs of m members (a gap and a prior each).
 
-    inputs: [m] of the formula. zero_shot, gains: [m] success before fine-tuning, and what came on top. curves: success
-    of every member at its evaluations [e], as (rollouts, success). gaps, priors: [m] names; the prior is the random
-    factor.
+    inputs: [m] of the formula. played: [m] success of the rollouts that these are from. zero_shot, gains: [m] success
+    before fine-tuning, and what came on top. curves: success of every member at its evaluations [e], as (rollouts,
+    success). gaps, priors: [m] names; the prior is the random factor.
     """
 
     inputs: Inputs
+    played: np.ndarray
     zero_shot: np.ndarray
     gains: np.ndarray
     curves: Sequence[tuple[np.ndarray, np.ndarray]]
@@ -105,8 +106,10 @@ class Cases(NamedTuple):
     def of(self, held: np.ndarray) -> "Cases":
         """Those members, [m] bool."""
         curves = [curve for curve, one in zip(self.curves, held, strict=True) if one]
-        zero_shot, gains, gaps, priors = (x[held] for x in (self.zero_shot, self.gains, self.gaps, self.priors))
-        return Cases(Inputs(*(x[held] for x in self.inputs)), zero_shot, gains, curves, gaps, priors)
+        return Cases(
+            Inputs(*(x[held] for x in self.inputs)), self.played[held], self.zero_shot[held], self.gains[held], curves,
+            self.gaps[held], self.priors[held],
+        )  # fmt: skip
 
 
 def fit(cases: Cases) -> Coefficients:

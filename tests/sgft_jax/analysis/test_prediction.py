@@ -15,7 +15,7 @@ def cases(n=60, coefficients=C, noise=0.0, gaps=6):
     curves = [(rollouts, s + g * prediction.progress(rollouts, coefficients.pace))
               for s, g in zip(x.success, gains, strict=True)]  # fmt: skip
     names = lambda word, of: np.array([f"{word}{i % of}" for i in range(n)])  # noqa: E731
-    return Cases(x, x.success, gains, curves, names("gap", gaps), names("prior", 4))
+    return Cases(x, x.success, x.success, gains, curves, names("gap", gaps), names("prior", 4))
 
 
 def test_the_formula_by_hand():
