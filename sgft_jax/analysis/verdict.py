@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from sgft_jax.analysis import prediction
-from sgft_jax.analysis.prediction import AHEAD, LEVEL, Inputs
+from sgft_jax.analysis.prediction import AHEAD, COEFFICIENTS, LEVEL, Coefficients, Inputs
 
 # From where on a sign counts. The numbers are ours: they separate the development gaps from the control `sim`.
 _NATS = 20.0  # of evidence, as in `identify`
@@ -113,15 +113,18 @@ def _measure(value: float, unit: str, sign: str = "+") -> str:
     return f"{1000 * value:{sign}.1f} mm" if unit == "m" else f"{value:{sign}.3g} {unit}".rstrip()
 
 
-def verdict(found: Mapping[str, Any], names: Names) -> list[str]:
-    """What kind of gap it looks like, whether fine-tuning helps, which horizon, how many rollouts: a line for each."""
+def verdict(found: Mapping[str, Any], names: Names, c: Coefficients = COEFFICIENTS) -> list[str]:
+    """What kind of gap it looks like, whether fine-tuning helps, which horizon, how many rollouts: a line for each.
+
+    found: see `examination.describe`. c: of the prediction.
+    """
     x = prediction.inputs_of(found)
     return [
         _kind(signs(found, names)),
         _guide(found["value"]),
-        _worth(found["success"], x),
+        _worth(found["success"], x, c),
         _horizon(found),
-        _how_long(x),
+        _how_long(x, c),
     ]
 
 
@@ -145,10 +148,10 @@ def _guide(value: Mapping[str, Any]) -> str:
     )
 
 
-def _worth(success: float, x: Inputs) -> str:
+def _worth(success: float, x: Inputs, c: Coefficients) -> str:
     """success: share of the rollouts, without the doubt that `inputs_of` adds."""
-    own = 100 * prediction.gain(x)
-    after = 100 * prediction.success_after(x, AHEAD)
+    own = 100 * prediction.gain(x, c)
+    after = 100 * prediction.success_after(x, AHEAD, c)
     said = f"{own:+.0f} points expected in {AHEAD} rollouts, to {after:.0f} %"
     if success >= _SOLVED:
         return f"fine-tuning: little to gain ({own:+.0f} points expected); keep the policy, or use a guarded method"
@@ -170,8 +173,8 @@ def _horizon(found: Mapping[str, Any]) -> str:
     )
 
 
-def _how_long(x: Inputs) -> str:
-    n = prediction.rollouts_until(x)
+def _how_long(x: Inputs, c: Coefficients) -> str:
+    n = prediction.rollouts_until(x, LEVEL, c)
     if n is None:
         return f"time: {100 * LEVEL:.0f} % are not expected within {AHEAD} rollouts"
     return f"time: {100 * LEVEL:.0f} % expected {f'after {n} rollout{"s" * (n > 1)}' if n else 'now'}"

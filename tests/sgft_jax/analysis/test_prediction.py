@@ -30,7 +30,7 @@ def test_the_formula_by_hand():
 @pytest.mark.parametrize(("name", "sign"), [("success", -1), ("improvable", 1), ("explained", 1)])
 def test_it_is_monotone_in_every_input(name, sign):
     x = Inputs(0.4, 0.4, 0.4)
-    change = prediction.gain(x._replace(**{name: 0.6})) - prediction.gain(x)
+    change = prediction.gain(x._replace(**{name: 0.6}), C) - prediction.gain(x, C)
     assert sign * change > 0.01
 
 

@@ -5,11 +5,13 @@ import numpy as np
 import pytest
 
 from sgft_jax.analysis import figures, verdict
+from sgft_jax.analysis.prediction import Coefficients
 from sgft_jax.analysis.verdict import Names
 
 NAMES = Names(
     action=["x", "y"], sensors=[("hand", "m"), ("puck", "m"), ("angle", "rad")], errors=(0.0, 0.01, 0.0), dt=0.2
 )
+C = Coefficients(base=0.0, improvable=0.5, explained=0.5, pace=3.0)
 NOTHING = {
     "rollouts": 4,
     "success": 1.0,
@@ -71,7 +73,7 @@ def test_nothing_counts_without_evidence():
 
 
 def test_what_is_worth_it():
-    words = lambda **changes: verdict.verdict(found(**changes), NAMES)[2:]  # noqa: E731
+    words = lambda **changes: verdict.verdict(found(**changes), NAMES, C)[2:]  # noqa: E731
     solved, horizon, now = words(rollouts=40)
     assert "little to gain (+0 points expected)" in solved and now == "time: 90 % expected now"
     assert horizon == "horizon of SGFT: H = 1 is enough, 100 % of the states are improvable with it"
