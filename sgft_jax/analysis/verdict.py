@@ -9,6 +9,7 @@ from sgft_jax.analysis.prediction import AHEAD, COEFFICIENTS, LEVEL, Coefficient
 
 # From where on a sign counts. The numbers are ours: they separate the development gaps from the control `sim`.
 _NATS = 20.0  # of evidence, as in `identify`
+_EXPLAINED = 0.3  # of the models' error, by what was identified
 _SCALE, _ROTATION, _BIAS = 0.15, 0.1, 0.08  # share, rad, share of the range of commands
 _ERROR = 0.3  # of the std of a sensor's error
 _DELAY = 0.15  # of a control period
@@ -39,13 +40,12 @@ class Sign(NamedTuple):
 
 def signs(found: Mapping[str, Any], names: Names) -> list[Sign]:
     """All kinds of gap that a diagnosis looks for, of one `examination.describe`."""
-    known, late, noise = found["identified"], found["delay"], found["noise"]
-    sure = min(known["nats"] / _NATS, 1.0)
-    scales = {name: s for name, s in zip(names.action, known["scale"], strict=True)}
-    biases = dict(zip(names.action, known["bias"], strict=True))
+    known, late = found["identified"], found["delay"]
     ahead = found["horizons"].index(4)
     errors = {key: values[ahead] for key, values in found["model_error"].items()}
     times = errors["identified"] / max(errors["simulated"], 1e-9)
+    sure = min(known["nats"] / _NATS, 1.0) * min(prediction.inputs_of(found).explained / _EXPLAINED, 1.0)
+    scales, biases = (dict(zip(names.action, known[key], strict=True)) for key in ("scale", "bias"))
     return [
         Sign(
             "command scale",
@@ -69,7 +69,7 @@ def signs(found: Mapping[str, Any], names: Names) -> list[Sign]:
             f"commands come {abs(late['share']) * names.dt:.3f} s {'later' if late['share'] > 0 else 'earlier'} than "
             "in simulation",
         ),
-        _noise(noise, names),
+        _noise(found["noise"], names),
         Sign(
             "what is left",
             times / _MODELS,

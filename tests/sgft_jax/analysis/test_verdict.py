@@ -20,7 +20,7 @@ NOTHING = {
         "bias": 0.1, "rank_correlation": 0.9, "shortfall": 0.2, "margin": 0.3,
         "real": [{"improvable": 1.0, "improving": 0.4}] * 4, "simulated": [{"improvable": 1.0, "improving": 0.5}] * 4,
     },
-    "model_error": {"real": [0.1] * 4, "identified": [0.1] * 4, "simulated": [0.1] * 4},
+    "model_error": {"real": [0.2] * 4, "identified": [0.1] * 4, "simulated": [0.1] * 4},
     "identified": {
         "scale": [1.0, 1.0], "rotation": 0.0, "bias": [0.0, 0.0], "sensor_errors": [0.0, 0.0, 0.0], "nats": 0.0
     },
@@ -68,6 +68,7 @@ def test_every_kind_of_gap_is_named_and_no_other(changes, name, words):
 
 def test_nothing_counts_without_evidence():
     assert counted(identified__scale=[1.4, 1.4], identified__nats=2.0) == {}
+    assert counted(identified__scale=[1.4, 1.4], identified__nats=50.0, model_error__real=[0.102] * 4) == {}
     assert counted(delay={"share": 0.5, "nats": 2.0}) == {}
     assert verdict.verdict(NOTHING, NAMES)[0] == "gap: nothing stands out against simulation"
 
