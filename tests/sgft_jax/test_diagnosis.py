@@ -141,11 +141,10 @@ def test_a_delay_is_found_and_its_evidence(share):
     assert used_to_it.share == pytest.approx(share, abs=0.02) and used_to_it.nats < 1
 
 
-def test_a_delay_is_not_read_across_episodes():
-    """Where only first steps are valid there is no predecessor, and so no evidence."""
+def test_a_step_without_a_valid_predecessor_says_nothing_of_delays():
     some = moved(0.5, jax.random.key(1))
-    alone = some._replace(valid=jnp.zeros((4, 20), bool).at[:, 0].set(True))
-    assert diagnosis.lateness(lambda obs, action: action, alone, jnp.full(2, 0.01)).nats == 0
+    gaps = some._replace(valid=jnp.broadcast_to(jnp.arange(20) % 2 == 0, (4, 20)))
+    assert diagnosis.lateness(lambda obs, action: action, gaps, jnp.full(2, 0.01)).nats == 0
 
 
 def test_noise_is_read_where_little_moves():
@@ -193,6 +192,7 @@ def test_an_examination_names_the_scale_and_counts_the_rollouts_it_is_given(exam
     control = examiner.control(params, simulated)
     one, three = examiner.examine(params, control, played(jax.random.key(1), weak), (1, 3)).found
     assert (one["rollouts"], one["success"]) == (1, 1.0) and three["success"] == pytest.approx(2 / 3)
+    assert one["value"]["bias"] != three["value"]["bias"]
     assert three["identified"]["scale"] == pytest.approx([0.6, 1.0], abs=0.03) and three["identified"]["nats"] > 20
     real, identified, usual = (three["model_error"][name][0] for name in ("real", "identified", "simulated"))
     assert usual < 1e-6 and identified < 0.1 * real
