@@ -23,18 +23,20 @@ COUNTS = (1, 2, 4)  # rollouts that a prediction is made from
 def calibrate(args: DiagnoseArgs, runs: list[Path], checked: list[Path]) -> tuple[dict[str, Any], list[str]]:
     """How well gains are predicted, as JSON data and as lines for people.
 
-    Without runs to check on, every gap is predicted from the others; with them, they are from `runs`.
+    The runs to check on are predicted from `runs`; without any, every second gap is from the others.
     """
     if not checked and len({(curve.task, curve.gap) for curve in map(read_curve, runs)}) < 2:
         raise UserError("--calibrate: these runs are on one gap; name runs on others too, or some with --check")
     own = gather(args, runs)
     coefficients = prediction.fit(own[-1])
     if checked:
-        held, words = gather(args, checked), f"{len(checked)} other runs, predicted from {len(runs)}"
-        fits = [prediction.gain(case.inputs, prediction.fit(fitted)) for case, fitted in zip(held, own, strict=True)]
+        fitted, held = own, gather(args, checked)
+        words = f"{len(checked)} other runs, predicted from {len(runs)}"
     else:
-        held, words = own, f"{len(runs)} runs, every gap predicted from the others"
-        fits = [prediction.predict_unseen(case) for case in own]
+        out = prediction.held_out(own[-1].gaps)
+        fitted, held = ([case.of(some) for case in own] for some in (~out, out))
+        words = f"every second gap of {len(runs)} runs, predicted from the other gaps"
+    fits = [prediction.gain(new.inputs, prediction.fit(old)) for old, new in zip(fitted, held, strict=True)]
     final = held[-1]
     lines = {f"prediction after {n} rollouts": (fit, case) for n, fit, case in zip(COUNTS, fits, held, strict=True)}
     lines["the same, coefficients of this version"] = (prediction.gain(final.inputs), final)

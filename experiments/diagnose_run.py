@@ -57,12 +57,12 @@ def diagnose(
     examiner, counts = Examiner(priors[0].card, env), counts_to(count)
     controls = [examiner.control(prior.params, own) for prior, own in zip(priors, simulated, strict=True)]
     each = [examiner.examine(priors[p].params, controls[p], own, counts) for own, p in zip(real, which, strict=True)]
-    labels = [str(folders[p]) for p in which]
+    labels, same = [str(folders[p]) for p in which], all(own is real[0] for own in real)
     found = {
         "task": env.name,
         "data": what,
         "priors": [{"prior": label, "found": one.found} for label, one in zip(labels, each, strict=True)],
-        "mean": [average([one.found[i] for one in each]) for i in range(len(counts))],
+        "mean": [average([one.found[i] for one in each], same=same) for i in range(len(counts))],
     }
     mean, names = found["mean"][-1], names_of(env)
     found["signs"] = jsonable(verdict.signs(mean, names))
@@ -74,7 +74,7 @@ def diagnose(
         home / "diagnosis.png", mean, verdict.signs(mean, names), _points(each), title=f"{env.name}: {what}"
     )
     write_json(home / "diagnosis.json", found)
-    lines = [f"{env.name}: {what}", *_lines(labels, each), "", *found["verdict"], ""]
+    lines = [f"{env.name}: {what}", *_lines(labels, each, mean), "", *found["verdict"], ""]
     return jsonable(found), [*lines, f"picture: {picture}", f"numbers: {home / 'diagnosis.json'}"]
 
 
@@ -103,10 +103,10 @@ def names_of(env: Env) -> Names:
     )
 
 
-def average(found: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The mean of every number of several diagnoses; their rollouts are added up."""
+def average(found: Sequence[Mapping[str, Any]], *, same: bool) -> dict[str, Any]:
+    """The mean of every number of several diagnoses; their rollouts are added up unless they are the same ones."""
     mean = jax.tree.map(lambda *x: x[0] if len(set(x)) == 1 else float(np.mean(x)), *found)
-    return {**mean, "rollouts": sum(one["rollouts"] for one in found)}
+    return mean if same else {**mean, "rollouts": sum(one["rollouts"] for one in found)}
 
 
 def predicted(found: Mapping[str, Any]) -> dict[str, Any]:
@@ -226,10 +226,10 @@ def _priors(n: int) -> str:
     return "one prior" if n == 1 else f"each of {n} priors"
 
 
-def _lines(labels: Sequence[str], each: Sequence[Examined]) -> list[str]:
+def _lines(labels: Sequence[str], each: Sequence[Examined], mean: Mapping[str, Any]) -> list[str]:
     """One line for each prior, and one for their mean."""
-    last = [one.found[-1] for one in each]
-    rows = [*zip(labels, last, strict=True)] + ([("mean", average(last))] if len(last) > 1 else [])
+    rows = [(label, one.found[-1]) for label, one in zip(labels, each, strict=True)]
+    rows += [("mean", mean)] * (len(each) > 1)
     head = ("prior", "success %", "improvable %", "V_sim short by", "rank", "model error -> identified (sim)", "gain")
     return columns([head, *(_row(label, found) for label, found in rows)])
 

@@ -63,6 +63,7 @@ def test_recordings_of_one_policy_are_looked_at_by_every_prior(priors, tmp_path,
     def successes(*argv):
         call("--prior", priors, "--out", tmp_path / "runs", "--json", *argv)
         found = json.loads(capsys.readouterr().out)
+        assert [one["rollouts"] for one in found["mean"]] == [one["rollouts"] for one in found["priors"][0]["found"]]
         return found["data"], [[one["success"] for one in prior["found"]] for prior in found["priors"]]
 
     every = [0.0, 0.5, 0.5]  # of the first 1, 2 and 4
@@ -77,7 +78,7 @@ def run(out, real, success, priors, **settings):
     config = json.loads((folder / "config.json").read_text())
     config["config"] |= {"task": "toy", "prior": str(priors)}
     (folder / "config.json").write_text(json.dumps(config))
-    return record(folder, policies=2, success=(0,) if real == "half" else ())
+    return record(folder, policies=2, success=(0,) if "half" in real else ())
 
 
 def test_a_run_says_which_prior_each_seed_has(priors, tmp_path, capsys):
@@ -90,18 +91,23 @@ def test_a_run_says_which_prior_each_seed_has(priors, tmp_path, capsys):
 def test_calibration_and_its_check_on_other_runs(priors, tmp_path, capsys):
     runs = [
         run(tmp_path / "a", real, [[0.2, 0.1], [0.5, 0.4], after], priors)
-        for real, after in (("half", [0.4, 0.3]), ("none", [0.9, 0.8]))
+        for real, after in (
+            ("half-1", [0.4, 0.3]),
+            ("half-2", [0.4, 0.3]),
+            ("none-1", [0.9, 0.8]),
+            ("none-2", [0.9, 0.8]),
+        )
     ]
     call("--calibrate", tmp_path / "a", "--json")
     found = json.loads(capsys.readouterr().out)
     assert sorted(found["runs"]) == sorted(map(str, runs)) and found["members"] == 4
     assert all(value >= 0 for value in found["coefficients"].values())
-    # Gains 0.2, 0.2 of half a success and 0.7, 0.7 of none: less success, more gain.
+    # Held out, of each kind one: gains 0.2, 0.2 of half a success and 0.7, 0.7 of none: less success, more gain.
     assert found["rank_correlation"]["100 - success of the same 4 rollouts"]["estimate"] == pytest.approx(1.0)
     other = run(tmp_path / "b", "other", [[0.0, 0.0], [0.0, 0.0], [1.0, 0.5]], priors)
     call("--calibrate", tmp_path / "a", "--check", other)
     text = capsys.readouterr().out
-    assert "1 other runs, predicted from 2: 2 members, 1 gaps" in text and "are +75 points" in text
+    assert "1 other runs, predicted from 4: 2 members, 1 gaps" in text and "are +75 points" in text
     assert "coefficients from 4 rollouts of all of --calibrate: base" in text
 
 

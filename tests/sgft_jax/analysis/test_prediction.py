@@ -49,17 +49,12 @@ def test_a_fit_finds_the_coefficients_and_never_a_negative_one():
     assert prediction.fit(downwards).improvable == 0.0
 
 
-def test_what_is_unseen_is_predicted_from_the_other_gaps():
-    """A gap whose members gain nothing, whatever the formula says, does not teach its own prediction."""
-    odd = cases()
-    odd = odd._replace(gains=np.where(odd.gaps == "gap0", 0.0, odd.gains))
-    own = odd.gaps == "gap0"
-    np.testing.assert_allclose(prediction.predict_unseen(odd)[own], prediction.gain(odd.inputs, C)[own], atol=1e-6)
-    assert (
-        prediction.gain(odd.inputs, prediction.fit(odd))[own].mean() < 0.9 * prediction.gain(odd.inputs, C)[own].mean()
-    )
-    with pytest.raises(ValueError, match="one gap"):
-        prediction.predict_unseen(cases(gaps=1))
+def test_every_second_gap_is_held_out_whole_and_teaches_nothing():
+    some = cases()
+    out = prediction.held_out(some.gaps)
+    assert set(some.gaps[out]) == {"gap1", "gap3", "gap5"} and set(some.gaps[~out]) == {"gap0", "gap2", "gap4"}
+    odd = some._replace(gains=np.where(out, 0.0, some.gains))
+    assert prediction.fit(odd.of(~out)) == pytest.approx(C, abs=1e-6)
 
 
 def test_agreement_and_table():
