@@ -26,7 +26,7 @@ class Look(NamedTuple):
     known: what identification finds. nats: [] its evidence. values, returns, valid: [n, T]. best: [states, horizon].
     surprise: [n * T]. errors, plain_errors: [n, windows, HORIZONS] with and without what is known. windows: [n,
     windows]. late: with what is known. expected, change: [n * T, measured_dim], what a step changes by the model and in
-    fact. Arrays are JAX's within a program and NumPy's after it.
+    fact. In simulation only `late` makes use of what is known. Arrays are JAX's within a program and NumPy's after it.
     """
 
     known: Distortion
@@ -104,12 +104,16 @@ def _start(card: Mapping[str, Any], task: Task, params: Any, simulated: Rollouts
 def _look(
     card: Mapping[str, Any], task: Task, params: Any, begun: Identified, rollouts: Rollouts, usual: Array, *, real: bool
 ) -> Look:
-    """usual: see `diagnosis.lateness`. real: False for simulated rollouts, in which there is nothing to identify."""
+    """usual: see `diagnosis.lateness`. real: False for simulated rollouts.
+
+    What identification finds in these is what the models have learned to expect of other systems in their domain.
+    """
     beliefs = diagnosis.beliefs_of(params, card, task)
     rows, valid = rollouts.flat()
     nothing = none(task.act_dim, task.measured_dim)
-    known = command_interface(network_of(card), task).refit(begun, rows, valid).distortion if real else nothing
-    own = rollouts._replace(transitions=jax.vmap(functools.partial(diagnosis.meant, known))(rollouts.transitions))
+    known = command_interface(network_of(card), task).refit(begun, rows, valid).distortion
+    meant = rollouts._replace(transitions=jax.vmap(functools.partial(diagnosis.meant, known))(rollouts.transitions))
+    own, acted = (meant, known) if real else (rollouts, nothing)
     flat, _ = own.flat()
     first = jax.tree.map(lambda x: x[0], params.dynamics)
 
@@ -120,7 +124,7 @@ def _look(
     which = jax.random.categorical(key_states, jnp.where(valid, 0.0, -jnp.inf), shape=(_STATES,))
     offsets = diagnosis.draw_offsets(key_offsets, _OFFSETS, task.act_dim)
     best = jax.lax.map(
-        lambda obs: diagnosis.headroom(beliefs, known, obs, offsets, HORIZONS[-1]), flat.obs[which], batch_size=_AT_ONCE
+        lambda obs: diagnosis.headroom(beliefs, acted, obs, offsets, HORIZONS[-1]), flat.obs[which], batch_size=_AT_ONCE
     )
     values, returns = diagnosis.promises(beliefs, own)
     errors, windows = diagnosis.model_errors(beliefs, own)
@@ -135,7 +139,7 @@ def _look(
         errors=errors,
         plain_errors=diagnosis.model_errors(beliefs, rollouts)[0],
         windows=windows,
-        late=diagnosis.lateness(change, own, begun.spread, usual),
+        late=diagnosis.lateness(change, meant, begun.spread, usual),
         expected=jax.vmap(change)(flat.obs, flat.action),
         change=(flat.next_obs - flat.obs)[:, : task.measured_dim],
     )
@@ -163,7 +167,11 @@ def describe(real: Look, simulated: Look, success: np.ndarray, *, turns: bool) -
             "identified": _mean(real.errors, real.windows),
             "simulated": _mean(simulated.errors, simulated.windows),
         },
-        "identified": {**diagnosis.parts(real.known, turns=turns), "nats": float(real.nats)},
+        "identified": {
+            **diagnosis.parts(real.known, turns=turns),
+            "nats": float(real.nats),
+            "simulated": diagnosis.parts(simulated.known, turns=turns),
+        },
         "delay": {"share": float(real.late.share - simulated.late.share), "nats": float(real.late.nats)},
         "noise": {"real": _noise(real), "simulated": _noise(simulated)},
     }

@@ -196,6 +196,11 @@ def test_an_examination_names_the_scale_and_counts_the_rollouts_it_is_given(exam
     assert three["identified"]["scale"] == pytest.approx([0.6, 1.0], abs=0.03) and three["identified"]["nats"] > 20
     real, identified, usual = (three["model_error"][name][0] for name in ("real", "identified", "simulated"))
     assert usual < 1e-6 and identified < 0.1 * real
+    assert three["identified"]["simulated"]["scale"] == [1.0, 1.0]
+    overshoots = played(jax.random.key(3), Distortion(1.4 * jnp.eye(2), jnp.zeros(2), jnp.zeros(2)), 8)
+    (used_to_it,) = examiner.examine(params, examiner.control(params, overshoots), overshoots, (8,)).found
+    assert used_to_it["identified"]["scale"] == used_to_it["identified"]["simulated"]["scale"] != [1.0, 1.0]
+    assert used_to_it["delay"]["share"] == 0.0
     (nothing,) = examiner.examine(params, control, simulated, (8,)).found
     assert nothing["identified"]["scale"] == [1.0, 1.0] and nothing["value"]["shortfall"] == pytest.approx(0, abs=1e-4)
     assert nothing["value"]["real"] == nothing["value"]["simulated"]

@@ -22,7 +22,8 @@ NOTHING = {
     },
     "model_error": {"real": [0.2] * 4, "identified": [0.1] * 4, "simulated": [0.1] * 4},
     "identified": {
-        "scale": [1.0, 1.0], "rotation": 0.0, "bias": [0.0, 0.0], "sensor_errors": [0.0, 0.0, 0.0], "nats": 0.0
+        "scale": [1.0, 1.0], "rotation": 0.0, "bias": [0.0, 0.0], "sensor_errors": [0.0, 0.0, 0.0], "nats": 0.0,
+        "simulated": {"scale": [1.0, 1.0], "rotation": 0.0, "bias": [0.0, 0.0], "sensor_errors": [0.0, 0.0, 0.0]},
     },
     "delay": {"share": 0.02, "nats": 3.0},
     "noise": {"real": [0.001, 0.001, 0.01], "simulated": [0.001, 0.001, 0.01]},
@@ -48,7 +49,7 @@ def counted(**changes):
 @pytest.mark.parametrize(
     ("changes", "name", "words"),
     [
-        ({"identified__scale": [1.4, 1.4]}, "command scale", "the robot moves 1.40 times as far as commanded"),
+        ({"identified__scale": [1.4, 1.4]}, "command scale", "the robot moves 1.40 times as far as in simulation"),
         ({"identified__scale": [0.5, 1.0]}, "command scale", "0.50 (x), 1.00 (y)"),
         ({"identified__rotation": -0.3}, "command rotation", "-0.30 rad"),
         ({"identified__bias": [0.0, 0.2]}, "command bias", "+0.00 (x), +0.20 (y)"),
@@ -64,6 +65,13 @@ def test_every_kind_of_gap_is_named_and_no_other(changes, name, words):
     assert list(signs) == [name] and words in signs[name]
     said = verdict.verdict(found(**changes, identified__nats=50.0), NAMES)[0]
     assert said == f"gap: {name}. In words: {signs[name]}"
+
+
+def test_what_is_identified_in_simulation_too_does_not_count():
+    same = {"scale": [1.4, 0.7], "rotation": -0.3, "bias": [0.2, 0.0], "sensor_errors": [0.0, 0.02, 0.0]}
+    both = {f"identified__{name}": value for name, value in same.items()} | {"identified__nats": 50.0}
+    assert counted(**both, identified__simulated=same) == {}
+    assert list(counted(**both)) == ["command scale", "command rotation", "command bias", "sensor error"]
 
 
 def test_nothing_counts_without_evidence():
