@@ -31,6 +31,7 @@ SPACES: dict[str, dict[str, tuple[Any, ...]]] = {
     "pbrs-branch": _BRANCH,
     "sgft-sac": _BRANCH,
     "sgft-relabel": _BRANCH,
+    "sgft-parts": _BRANCH,
     "sgft": {"utd": _UTD, **_RATES, "horizon": (1, 2, 4), "critic_warmup": _WARMUP},
     "frozen-critic": {
         "utd": _UTD, "lr_actor": _RATES["lr_actor"], "alpha": _PLAIN["alpha"], "actor_ramp": (0, 1_000, 5_000),

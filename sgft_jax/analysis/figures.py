@@ -17,7 +17,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
 
 from sgft_jax.analysis.curves import Curve, by_prior, spread
-from sgft_jax.analysis.stats import ENOUGH, iqm
+from sgft_jax.analysis.stats import ENOUGH, Interval, iqm
 from sgft_jax.analysis.verdict import Sign
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
@@ -197,6 +197,28 @@ def diagnosis(
     kinds.axvline(1.0, color=_GREY, linewidth=1)
     kinds.set_title("signs of the gap; one counts from 1 on", **_FONT, loc="left")
     figure.suptitle(title, x=0.005, ha="left", size=12, weight="bold", color=_INK)
+    return _save(figure, path)
+
+
+def effects(path: Path, found: Mapping[str, Mapping[str, Mapping[str, Interval]]]) -> Path:
+    """A panel for each place: every effect as a dot with its interval, one colour for each measure.
+
+    found: by place, measure and name of the effect, see `factorial.effects`.
+    """
+    figure, panels = _figure(5.2 * len(found), 4.4, columns=len(found))
+    for axes, (place, measures) in zip(panels, found.items(), strict=True):
+        for i, (measure, own) in enumerate(measures.items()):
+            rows = np.arange(len(own)) + 0.22 * (i - (len(measures) - 1) / 2)
+            estimate, low, high = (np.array([float(x) for x in bounds]) for bounds in zip(*own.values(), strict=True))
+            axes.hlines(rows, low, high, color=PALETTE[i], linewidth=1.5)
+            axes.plot(estimate, rows, "o", color=PALETTE[i], markersize=4, label=measure)
+        names = list(next(iter(measures.values())))
+        axes.set_yticks(np.arange(len(names)), names)
+        axes.invert_yaxis()
+        axes.axvline(0.0, color=_GREY, linewidth=1)
+        axes.set_title(place, **_FONT, loc="left")
+    panels[0].legend(frameon=False, fontsize=8, labelcolor=_INK)
+    figure.suptitle("effect of each part, mean over all others", x=0.01, ha="left", size=12, weight="bold", color=_INK)
     return _save(figure, path)
 
 

@@ -1,0 +1,149 @@
+"""What do SGFT's parts do? Shaping, shortening, their horizon, a new critic and warm-up, all combinations of them.
+
+Every cell is a run of `sgft-parts` with equal branches. Cells that are finished are left alone, begun ones go on where
+they stopped. When all are finished, the effects of each part on area, end and deepest fall are printed and drawn.
+"""
+
+import itertools
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from envs import gaps
+from experiments import cli, grid
+from experiments.finetune_args import with_settings
+from experiments.grid import Cell, GridArgs
+from sgft_jax.io.jsonfile import jsonable, write_json
+from sgft_jax.types import UserError
+
+if TYPE_CHECKING:
+    from sgft_jax.analysis.curves import Curve
+    from sgft_jax.analysis.factorial import Factor, Levels
+
+METHOD, MEASURES = "sgft-parts", ("area", "end", "deepest fall")
+COLD = {"critic_warmup": 0, "lr_warmup": 0, "dynamics_warmup": 0, "actor_ramp": 0}  # as the paper prints it
+
+
+@dataclass(frozen=True)
+class FactorialArgs(GridArgs):
+    """The 32 cells on each real system; everything not named here is as `experiments.finetune` has it."""
+
+    tasks: tuple[str, ...] = ("push",)
+    """Tasks."""
+    methods: tuple[str, ...] = (METHOD,)
+    """Has no other value."""
+    reals: tuple[str, ...] = ("default", "sim")
+    """Real systems of every task: gaps by name, sim for no gap, or .toml/.json files."""
+    seeds: int = 12
+    """Seeds of each run, all in one program."""
+    rollouts: int = 12
+    """Real rollouts per seed, the initial ones included."""
+    eval_every: int = 2
+    """Rollouts between evaluations."""
+    prior: Path | None = None
+    """Folder of priors (prior/seed-*); default: those of <out>/pretrain/<task>/<preset>."""
+    horizon: int = 4
+    """Horizon of the cells that do not have one of 1."""
+    anchor: float = 0.0
+    """Of all cells, see `experiments.finetune --options.anchor`."""
+    identify: bool = False
+    """Of all cells."""
+    guard: bool = False
+    """Of all cells."""
+
+
+def main(args: FactorialArgs) -> None:
+    """Runs what is missing, then says what the parts do."""
+    args = replace(args, reals=gaps.each(args.reals))
+    check(args)
+    places = [(task, real) for task in args.tasks for real in args.reals]
+    cells = {place: cells_of(args, *place) for place in places}
+    failed = grid.work([cell for each in cells.values() for cell in each.values()], args)
+    if args.dry:
+        return
+    if failed:
+        raise UserError(f"{len(failed)} of the cells did not run: {'; '.join(failed)}")
+    states = [grid.look_up(cell.args).state for each in cells.values() for cell in each.values()]
+    if left := len(states) - states.count("finished"):
+        print(f"{left} cells are not finished; the same command goes on")
+        return
+    print(report(args, cells))
+
+
+def check(args: FactorialArgs) -> None:
+    """Raises UserError for what is wrong in the arguments alone."""
+    if args.methods != (METHOD,):
+        raise UserError(f"--methods: the cells are all of {METHOD}")
+    if args.horizon < 2:
+        raise UserError(f"--horizon is {args.horizon}: must be at least 2, to differ from 1")
+    grid.check(args)
+
+
+def factors(args: FactorialArgs) -> "list[Factor]":
+    """What varies, in the order of `Levels`."""
+    from sgft_jax.analysis.factorial import Factor
+
+    return [
+        Factor("shape", "task reward", "shaped"),
+        Factor("shorten", "infinite", "short"),
+        Factor("horizon", "1", str(args.horizon)),
+        Factor("new critic", "kept", "new"),
+        Factor("warm-up", "none", "warm"),
+    ]
+
+
+def settings(args: FactorialArgs, levels: "Levels") -> dict[str, Any]:
+    """The options of a cell."""
+    shape, shorten, horizon, new, warm = levels
+    own = {"shape": shape, "shorten": shorten, "horizon": args.horizon if horizon else 1, "reset_critic": new}
+    shared = {"anchor": args.anchor, "identify": args.identify, "guard": args.guard}
+    return own | shared | ({} if warm else COLD)
+
+
+def cells_of(args: FactorialArgs, task: str, real: str) -> "dict[Levels, Cell]":
+    """Every combination of levels on a real system."""
+    names = [(factor.low, factor.high) for factor in factors(args)]
+    found = {}
+    for levels in itertools.product((False, True), repeat=len(names)):
+        variant = "-".join(name[high].replace(" ", ".") for name, high in zip(names, levels, strict=True))
+        run = replace(grid.run_of(args, task, real, METHOD), prior=args.prior, variant=variant)
+        found[levels] = grid.look_up(with_settings(run, settings(args, levels)))
+    return found
+
+
+def report(args: FactorialArgs, cells: "dict[tuple[str, str], dict[Levels, Cell]]") -> str:
+    """Tables of the effects; writes factorial.json and factorial.png."""
+    from sgft_jax.analysis import figures, tables
+    from sgft_jax.analysis.curves import read_curve
+    from sgft_jax.analysis.factorial import effects
+
+    folder, found, said = args.out / "factorial", {}, []
+    for (task, real), each in cells.items():
+        curves = {levels: read_curve(cell.folder) for levels, cell in each.items()}
+        scores = {levels: measures(curve) for levels, curve in curves.items()}
+        place, score = f"{task}, {gaps.title(real)}", next(iter(curves.values())).score
+        found[place] = {
+            what: effects({levels: own[what] for levels, own in scores.items()}, factors(args)) for what in MEASURES
+        }
+        rows = [
+            [name, *(tables.number(found[place][what][name], score) for what in MEASURES)]
+            for name in found[place][MEASURES[0]]
+        ]
+        said += [f"{place}, effects on {tables.words(score)}:", "", tables.markdown(("effect of", *MEASURES), rows), ""]
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "factorial.json", jsonable(found))
+    figures.effects(folder / "factorial.png", found)
+    return "\n".join([*said, f"written: {folder}"])
+
+
+def measures(curve: "Curve") -> dict[str, Any]:
+    """[members] of each of MEASURES: area under the curve, score at the end, deepest fall below the own start."""
+    from sgft_jax.analysis.curves import area, common_grid
+
+    values = curve.values
+    numbers = (area(curve, common_grid([curve])), values[:, -1], values[:, 0] - values.min(axis=1))
+    return dict(zip(MEASURES, numbers, strict=True))
+
+
+if __name__ == "__main__":
+    cli.run_main(main, FactorialArgs, __doc__ or "")

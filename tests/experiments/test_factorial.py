@@ -1,0 +1,69 @@
+"""The factorial of SGFT's parts: its cells, what it refuses, and the report of runs that are there."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import runs_by_hand
+
+from experiments import cli, factorial, grid
+from experiments.factorial import FactorialArgs
+from sgft_jax.io import checkpoint
+from sgft_jax.types import UserError
+
+ARGS = FactorialArgs(tasks=("push",), reals=("default",), seeds=4, rollouts=4)
+
+
+def test_every_combination_is_a_cell_of_its_own(tmp_path):
+    cells = factorial.cells_of(replace(ARGS, out=tmp_path, anchor=0.1), "push", "default")
+    assert len(cells) == 32 == len({cell.args.variant for cell in cells.values()})
+    plain, full = (cells[(level,) * 5].args for level in (False, True))
+    assert (plain.variant, full.variant) == ("task.reward-infinite-1-kept-none", "shaped-short-4-new-warm")
+    first, last = plain.options, full.options
+    assert (first.shape, first.shorten, first.horizon, first.reset_critic, first.lr_warmup) == (
+        False,
+        False,
+        1,
+        False,
+        0,
+    )
+    assert (last.shape, last.shorten, last.horizon, last.reset_critic, last.lr_warmup) == (True, True, 4, True, None)
+    assert first.branches == last.branches and first.anchor == last.anchor == 0.1
+    assert {cell.state for cell in cells.values()} == {"missing"}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"methods": ("sac",)}, "--methods: the cells are all of sgft-parts"),
+        ({"horizon": 1}, "--horizon is 1: must be at"),
+    ],
+)
+def test_bad_input(changes, words):
+    with pytest.raises(UserError, match=words):
+        factorial.main(replace(ARGS, **changes))
+
+
+def leave(args):
+    """A finished run in which shaping is worth 20 points at the end, and members differ by more."""
+    (real,) = args.real
+    end = np.array([0.1, 0.3, 0.5, 0.7]) + 0.2 * args.options.shape
+    folder = runs_by_hand.save(
+        args.out, f"sgft-parts_{args.variant}", [[0.1] * 4, end.tolist()], rollouts=(0, 4), task="push", real=real,
+        seeds="seeds-0-3", variant=args.variant,
+    )  # fmt: skip
+    checkpoint.save(folder, 4, {}, meta={})
+    (folder / "summary.json").write_text(json.dumps({"final": {"rollouts": 4}}))
+
+
+def test_the_report_names_what_each_part_does(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(grid, "finetune", leave)
+    monkeypatch.setattr(cli, "set_up", lambda: None)
+    factorial.main(replace(ARGS, out=tmp_path))
+    said = capsys.readouterr().out
+    assert "| shape | 10 | 20 | 0 |" in said and "| shorten | 0 | 0 | 0 |" in said
+    assert "push, default, effects on success in per cent" in said
+    found = json.loads((tmp_path / "factorial/factorial.json").read_text())
+    np.testing.assert_allclose(found["push, default"]["end"]["shape"]["estimate"], 0.2)
+    assert (tmp_path / "factorial/factorial.png").stat().st_size > 10_000
