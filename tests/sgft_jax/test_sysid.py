@@ -137,7 +137,7 @@ def test_other_methods_refuse_such_a_prior_and_this_one_every_other(prior):
     with pytest.raises(UserError, match="sac needs a prior that was not told the system"):
         api.check_prior(prior, get_method("sac"), ENV)
     plain = dataclasses.replace(prior, card={**prior.card, "system": []})
-    with pytest.raises(UserError, match=r"--config\.sees-system"):
+    with pytest.raises(UserError, match="--preset informed"):
         api.check_prior(plain, get_method("sysid"), ENV)
 
 
