@@ -227,7 +227,7 @@ def test_simulated_rows_end_where_their_episodes_do(name):
 # --- tasks that do not say how they are rewarded or end ---------------------------------------------------------------
 
 # These ask for the reward and the end of transitions that never were.
-IMAGINE = {"sgft-sac", "sgft-relabel", "sgft-mpc", "mbpo", "pbrs-branch"}
+IMAGINE = {"sgft-sac", "sgft-relabel", "sgft-mpc", "sgft-parts", "mbpo", "pbrs-branch"}
 
 
 @pytest.mark.parametrize("missing", ["reward", "terminated"])
