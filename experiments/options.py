@@ -12,6 +12,7 @@ from sgft_jax import extend
 from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError, unknown
 
+SHIPPED = Path("docs/priors")  # in the folder of the code, where commands are usually typed
 LAST_SEED = 2**31 - 1  # larger ones stand for held-out worlds and episodes
 
 Impl = Annotated[
@@ -80,9 +81,10 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str) -> l
     if not found and preset not in PRESETS:
         raise UserError(unknown("--preset", preset, PRESETS))
     if not found:
-        raise UserError(
-            f"{home}: holds no prior; make one with: python -m experiments.pretrain --task {task} --preset {preset}"
-        )
+        shipped = SHIPPED / extend.name_of(task)
+        other = f", or take --prior {shipped}, which comes with the code" if shipped.exists() else ""
+        command = f"python -m experiments.pretrain --task {task} --preset {preset}"
+        raise UserError(f"{home}: holds no prior; make one with: {command}{other}")
     return sorted(found, key=_seed_number)
 
 

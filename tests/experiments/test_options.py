@@ -64,6 +64,8 @@ def test_advice_where_there_is_no_prior_fits_what_was_asked(tmp_path):
     """Of a task that is a file it repeats the file; where the user names a folder it proposes no task."""
     with pytest.raises(UserError, match=r"toy/cpu: holds no prior; make one with: .*--task my/toy.py --preset cpu"):
         prior_folders(None, out=tmp_path, task="my/toy.py", preset="cpu")
+    with pytest.raises(UserError, match=r"--task push --preset robust, or take --prior docs/priors/push"):
+        prior_folders(None, out=tmp_path, task="push", preset="robust")
     with pytest.raises(UserError, match=r"--preset: there is no 'cpus', did you mean 'cpu'"):
         prior_folders(None, out=tmp_path, task="toy", preset="cpus")
     with pytest.raises(UserError, match=r"--prior .*nowhere: no such folder$"):
