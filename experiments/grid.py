@@ -111,12 +111,13 @@ def check_begun(cells: Iterable[Cell]) -> None:
             check_same(cell.folder, "finetune", jsonable(cell.args) | {"real": real}, VOLATILE)
 
 
-def work(cells: Sequence[Cell], args: GridArgs) -> list[str]:
+def work(cells: Sequence[Cell], args: GridArgs, *, started: float | None = None) -> list[str]:
     """Lists the cells, then runs those that are missing, in order; returns a line for each that could not run.
 
     Several processes may work on one grid: each skips cells that another has finished or is running.
+    started: `time.monotonic` from which --minutes count, default now.
     """
-    started, failed = time.monotonic(), []
+    started, failed = time.monotonic() if started is None else started, []
     for cell in cells:
         print(f"{cell.state:10} {cell}" + (f", step {cell.done}" if cell.done else ""))
     if args.dry:

@@ -2,12 +2,14 @@
 
 A trial is one fine-tuning run. The first one has the method's defaults, the others are drawn from the method's own
 space (docs/methods.md). Trials that are finished are left alone, begun ones go on where they stopped: the same command,
-given again, does what is missing, and with more --trials it adds some. When all trials of a method are finished, the
-options of the best one are written down, for `experiments.compare --tuned`.
+given again, does what is missing, and with more --trials it adds some. With --halve all trials begin short, and the
+better half goes on to twice as many rollouts, again and again (successive halving: Jamieson and Talwalkar 2016). When
+all trials of a method are finished, the options of the best one are written down, for `experiments.compare --tuned`.
 """
 
 import itertools
 import math
+import time
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +23,7 @@ from envs import gaps
 from experiments import cli, grid, tuned
 from experiments.finetune_args import with_settings
 from experiments.grid import Cell, GridArgs
-from experiments.options import prior_home, seed_list
+from experiments.options import at_least_one, prior_home, seed_list
 from experiments.spaces import defaults, space_of
 from sgft_jax import extend
 from sgft_jax.io import runs
@@ -46,6 +48,16 @@ class TuneArgs(GridArgs):
     """Seeds of each run, all in one program."""
     rollouts: int = 40
     """Real rollouts per seed, the initial ones included; may grow later."""
+    halve: bool = False
+    """Successive halving: the better half of the trials goes on to twice as many rollouts, until two are left at
+    --rollouts. The trial with the defaults always goes on. About half the rollouts for eight trials."""
+
+
+class Rung(NamedTuple):
+    """So many trials run up to so many real rollouts per seed."""
+
+    trials: int
+    rollouts: int
 
 
 class Trial(NamedTuple):
@@ -76,12 +88,48 @@ def main(args: TuneArgs) -> None:
 def tune(args: TuneArgs) -> list[str]:
     """Works through the trials, then writes and prints the results; returns a line for each run that failed."""
     args = replace(args, reals=gaps.each(args.reals))
-    cells = [cell for task, method in _pairs(args) for trial in trials(args, task, method) for cell in trial.cells]
-    grid.check_begun(cells)
-    failed = grid.work(cells, args)
-    for task, method in _pairs(args):
+    pairs, started, failed = _pairs(args), time.monotonic(), []
+    print(f"budget of each method on each task: {_budget_words(args)}")
+    for i in range(len(rungs(args))):
+        found = [stages(args, *pair)[i:] for pair in pairs]  # empty where the rung before is not finished
+        cells = [cell for stage in found for trial in (stage[0] if stage else []) for cell in trial.cells]
+        grid.check_begun(cells)
+        failed += grid.work(cells, args, started=started)
+    for task, method in pairs:
         _conclude(args, task, method)
     return failed
+
+
+def rungs(args: TuneArgs) -> list[Rung]:
+    """How many trials run how far, the last ones to --rollouts; one rung without --halve.
+
+    Each rung has half as many trials as the one before, rounded up, and about twice as many rollouts: it ends at an
+    evaluation, so that halving changes no curve. Raises UserError where two of them would end at the same.
+    """
+    counts = [args.trials]
+    while args.halve and counts[-1] > 2:
+        counts.append(-(-counts[-1] // 2))
+    every = args.eval_every
+    ends = [-(-args.rollouts // (every * 2**k)) * every for k in range(len(counts) - 1, 0, -1)] + [args.rollouts]
+    if any(after <= before for before, after in itertools.pairwise(ends)):
+        raise UserError(
+            f"--halve: {args.trials} trials would end after {', '.join(map(str, ends))} rollouts, which do not grow; "
+            "give more --rollouts, a smaller --eval-every or fewer --trials"
+        )
+    return list(itertools.starmap(Rung, zip(counts, ends, strict=True)))
+
+
+def real_rollouts(found: Sequence[Rung]) -> int:
+    """Real rollouts of one seed on one real system in all trials; those that go on begin where they stopped."""
+    before = [0, *(rung.rollouts for rung in found)]
+    return sum(rung.trials * (rung.rollouts - done) for rung, done in zip(found, before, strict=False))
+
+
+def _budget_words(args: TuneArgs) -> str:
+    found = rungs(args)
+    steps = ", ".join(f"{rung.trials} trials to {rung.rollouts} rollouts" for rung in found)
+    total = real_rollouts(found) * args.seeds * len(args.reals)
+    return f"{steps}; seeds: {args.seeds}, real systems: {len(args.reals)}; {total:,} real rollouts in all"
 
 
 def draw(
@@ -117,6 +165,29 @@ def _look_up(args: TuneArgs, task: str, real: str, method: str, number: int, set
     return grid.look_up(with_settings(run, settings))
 
 
+def stages(args: TuneArgs, task: str, method: str) -> list[list[Trial]]:
+    """The trials of each rung, as far as it is known: who goes on is decided when a rung is finished."""
+    found: list[list[Trial]] = []
+    numbers, before = list(range(args.trials)), 0
+    for rung in rungs(args):
+        if found:
+            scores = [score(trial, before) for trial in found[-1]]
+            finished = [each for each in scores if each is not None]
+            if len(finished) < len(scores):
+                break
+            numbers = [numbers[i] for i in keep(finished, rung.trials)]
+        every = trials(replace(args, rollouts=rung.rollouts), task, method)
+        found.append([every[number] for number in numbers])
+        before = rung.rollouts
+    return found
+
+
+def keep(scores: Sequence[Score], count: int) -> list[int]:
+    """Which trials go on, in order: the first, which has the defaults, and the best of the others."""
+    others = sorted(range(1, len(scores)), key=lambda i: _merit(scores, i), reverse=True)
+    return [0, *sorted(others[: count - 1])]
+
+
 def score(trial: Trial, rollouts: int) -> Score | None:
     """How its runs went up to so many rollouts; None if one is not finished."""
     from sgft_jax.analysis.curves import area, read_curve
@@ -136,56 +207,79 @@ def score(trial: Trial, rollouts: int) -> Score | None:
 
 def best(scores: Sequence[Score]) -> int:
     """The trial of the largest area; ties go to the higher final success, then to the earlier trial."""
-    return max(range(len(scores)), key=lambda i: (scores[i].area, scores[i].final, -i))
+    return max(range(len(scores)), key=lambda i: _merit(scores, i))
+
+
+def _merit(scores: Sequence[Score], i: int) -> tuple[float, float, int]:
+    return scores[i].area, scores[i].final, -i
+
+
+class Outcome(NamedTuple):
+    """A trial, the rollouts that it was allowed, and its score up to there; None if it is not finished."""
+
+    trial: Trial
+    rollouts: int
+    score: Score | None
+
+
+def outcomes(args: TuneArgs, task: str, method: str) -> list[Outcome]:
+    """Every trial in its last rung that is known, in order."""
+    last = {
+        trial.number: Outcome(trial, rung.rollouts, score(trial, rung.rollouts))
+        for rung, stage in zip(rungs(args), stages(args, task, method), strict=False)
+        for trial in stage
+    }
+    return [last[number] for number in sorted(last)]
 
 
 def _conclude(args: TuneArgs, task: str, method: str) -> None:
     """Prints the trials of one method and, if all are finished, writes down which is best."""
-    found = trials(args, task, method)
-    scores = [score(trial, args.rollouts) for trial in found]
-    finished = [each for each in scores if each is not None]
-    complete = len(finished) == len(found)
-    chosen = best(finished) if complete else None
-    Console(width=120).print(_table(f"{method} on {task}", found, scores, chosen))
+    found = outcomes(args, task, method)
+    finished = sum(each.score is not None for each in found)
+    finalists = {each.trial.number: each.score for each in found if each.rollouts == args.rollouts and each.score}
+    complete = finished == len(found) and len(finalists) == rungs(args)[-1].trials
+    chosen = list(finalists)[best(list(finalists.values()))] if complete else None
+    Console(width=120).print(_table(f"{method} on {task}", found, chosen))
     if args.dry:
         return
     if chosen is None:
-        print(f"{task}/{method}: {len(finished)} of {len(found)} trials are finished; nothing is chosen before all are")
+        print(f"{task}/{method}: {finished} of {len(found)} trials are finished; nothing is chosen before all are")
         return
-    path = tuned.write(args.out, task, method, _result(args, task, method, found, finished, chosen))
+    path = tuned.write(args.out, task, method, _result(args, task, method, found, chosen))
     print(f"written: {path}; next: python -m experiments.compare --tuned --tasks {task} --methods {method}")
 
 
-def _result(
-    args: TuneArgs, task: str, method: str, found: list[Trial], scores: list[Score], chosen: int
-) -> dict[str, Any]:
+def _result(args: TuneArgs, task: str, method: str, found: list[Outcome], chosen: int) -> dict[str, Any]:
     """The file of one method, see docs/formats.md."""
     tried = [
-        {"options": trial.settings, **each._asdict(), "folders": [cell.folder for cell in trial.cells]}
-        for trial, each in zip(found, scores, strict=True)
-    ]
+        {
+            "options": trial.settings, "rollouts": rollouts, **each._asdict(),
+            "folders": [cell.folder for cell in trial.cells],
+        }
+        for trial, rollouts, each in found if each is not None
+    ]  # fmt: skip
     budget = {
         "trials": args.trials, "reals": [gaps.title(real) for real in args.reals],
         "seeds": seed_list(args.seed, args.seeds), "rollouts": args.rollouts,
-        "eval_every": args.eval_every,
+        "eval_every": args.eval_every, "halve": args.halve,
     }  # fmt: skip
     return {
-        "task": task, "method": method, "options": found[chosen].settings, "trial": chosen, "budget": budget,
-        "gaps": [read_json(cell.folder / SUMMARY)["gap"] for cell in found[0].cells],
+        "task": task, "method": method, "options": found[chosen].trial.settings, "trial": chosen, "budget": budget,
+        "gaps": [read_json(cell.folder / SUMMARY)["gap"] for cell in found[0].trial.cells],
         "space": space_of(method), "trials": tried, "provenance": runs.provenance(),
     }  # fmt: skip
 
 
-def _table(title: str, found: Sequence[Trial], scores: Sequence[Score | None], chosen: int | None) -> Table:
+def _table(title: str, found: Sequence[Outcome], chosen: int | None) -> Table:
     """The trials with their options and scores; the chosen one is marked."""
     table = Table(title=title)
-    for column in ("trial", *found[0].settings, "area", "final %", ""):
+    for column in ("trial", *found[0].trial.settings, "rollouts", "area", "final %", ""):
         table.add_column(column, justify="right")
-    for trial, each in zip(found, scores, strict=True):
+    for trial, rollouts, each in found:
         cells = ("-", "-") if each is None else (f"{each.area:.3f}", f"{100 * each.final:.0f}")
         note = "chosen" if trial.number == chosen else "defaults" if trial.number == 0 else ""
         values = ("None" if value is None else f"{value:g}" for value in trial.settings.values())
-        table.add_row(str(trial.number), *values, *cells, note)
+        table.add_row(str(trial.number), *values, str(rollouts), *cells, note)
     return table
 
 
@@ -194,6 +288,7 @@ def _pairs(args: TuneArgs) -> list[tuple[str, str]]:
     grid.check(args)
     if args.trials < 1:
         raise UserError(f"--trials is {args.trials}: must be at least 1")
+    at_least_one(args, "rollouts", "eval_every")
     return [(task, method) for task in args.tasks for method in args.methods]
 
 

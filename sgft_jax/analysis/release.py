@@ -60,7 +60,8 @@ def _tuning(path: Path) -> Iterable[dict[str, Any]]:
     for number, trial in enumerate(result["trials"]):
         yield {
             "task": result["task"], "method": result["method"], "trial": number, "chosen": number == result["trial"],
-            "area": trial["area"], "final": trial["final"], "options": json.dumps(trial["options"]),
+            "rollouts": trial["rollouts"], "area": trial["area"], "final": trial["final"],
+            "options": json.dumps(trial["options"]),
             "budget": json.dumps(result["budget"]), "space": json.dumps(result["space"]),
         }  # fmt: skip
 

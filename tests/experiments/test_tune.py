@@ -145,7 +145,7 @@ def test_what_fails_does_not_stop_the_rest_and_the_command_goes_on(tmp_path, ran
     assert (result["trial"], result["options"]) == (3, result["trials"][3]["options"])
     assert [trial["area"] for trial in result["trials"]] == pytest.approx([0.125, 0.175, 0.225, 0.275])
     assert result["budget"] == {
-        "trials": 4, "reals": ["mild"], "seeds": [100, 101], "rollouts": 10, "eval_every": 5,
+        "trials": 4, "reals": ["mild"], "seeds": [100, 101], "rollouts": 10, "eval_every": 5, "halve": False,
     }  # fmt: skip
     assert result["gaps"] == [{"name": "mild"}] and result["provenance"]["versions"]
     assert "--tuned --tasks toy --methods sac" in capsys.readouterr().out
@@ -181,6 +181,90 @@ def test_bad_input(argv, words, tmp_path, capsys):
         cli.run_main(tune.main, tune.TuneArgs, "Tune.", argv=[*argv, "--out", str(tmp_path)])
     error = capsys.readouterr().err
     assert stopped.value.code == 2 and words in error and error.count("\n") == 1
+
+
+# ------------------------------------------------------------ successive halving
+
+
+@pytest.mark.parametrize(
+    ("trials", "rollouts", "expected", "total"),
+    [
+        (8, 40, [(8, 10), (4, 20), (2, 40)], 8 * 10 + 4 * 10 + 2 * 20),
+        (5, 12, [(5, 4), (3, 6), (2, 12)], 5 * 4 + 3 * 2 + 2 * 6),  # a quarter of 12 is no evaluation, 4 is
+        (2, 40, [(2, 40)], 80),
+    ],
+)
+def test_rungs_of_halving(tmp_path, trials, rollouts, expected, total):
+    every = 2 if rollouts == 12 else 5
+    args = budget(tmp_path, trials=trials, rollouts=rollouts, eval_every=every, halve=True)
+    assert tune.rungs(args) == expected and tune.real_rollouts(tune.rungs(args)) == total
+    assert tune.rungs(replace(args, halve=False)) == [(trials, rollouts)]
+
+
+def test_rungs_that_do_not_grow_are_refused(tmp_path):
+    with pytest.raises(UserError, match=r"--halve: 8 trials would end after 5, 5, 10 rollouts, which do not grow"):
+        tune.tune(budget(tmp_path, trials=8, halve=True))
+
+
+def test_the_default_goes_on_with_the_best_of_the_others():
+    scores = [tune.Score(area, 0.0, {}) for area in (0.1, 0.4, 0.2, 0.9, 0.4)]
+    assert tune.keep(scores, 3) == [0, 1, 3] and tune.keep(scores, 1) == [0]
+
+
+def made_up(monkeypatch, success):
+    """Runs of which only the curve is left, success(trial, rollouts); the list of (trial, rollouts, resume) seen."""
+    seen = []
+
+    def run(args):
+        number = int(args.variant.removeprefix("trial-"))
+        seen.append((number, args.rollouts, args.resume))
+        grown = range(0, args.rollouts + 1, 5)
+        leave(args, [[success(number, n)] * 2 for n in grown], rollouts=tuple(grown))
+
+    monkeypatch.setattr(grid, "finetune", run)
+    return seen
+
+
+def test_halving_goes_on_with_the_better_half_and_chooses_at_the_end(tmp_path, monkeypatch, capsys):
+    """Trials 5 and 6 learn fast, 7 learns more but late. Of 0, 5, 6, 7 the best other one after 20 rollouts is 7."""
+    speed = {5: 0.02, 6: 0.015, 7: 0.01}
+
+    def success(trial, n):
+        return min(speed.get(trial, 0.0) * n, 0.1) if trial != 7 or n < 15 else 0.9
+
+    seen = made_up(monkeypatch, success)
+    tune.main(budget(tmp_path, trials=8, rollouts=40, halve=True))
+    assert seen == [
+        *((k, 10, False) for k in range(8)),
+        *((k, 20, True) for k in (0, 5, 6, 7)),
+        *((k, 40, True) for k in (0, 7)),
+    ]
+    result = written(tmp_path)
+    assert result["trial"] == 7 and result["budget"]["halve"] and len(result["trials"]) == 8
+    assert [trial["rollouts"] for trial in result["trials"]] == [40, 10, 10, 10, 10, 20, 20, 40]
+    # Of trial 5: 0, 0.1, 0.1 after 0, 5, 10 rollouts and then level, so (0.25 + 1.5) / 20.
+    assert result["trials"][5]["area"] == pytest.approx(0.0875)
+    assert "seeds: 2, real systems: 1; 320 real rollouts in all" in capsys.readouterr().out
+    tune.main(budget(tmp_path, trials=8, rollouts=40, halve=True))
+    assert len(seen) == 14 and written(tmp_path)["trial"] == 7
+
+
+def test_a_trial_that_stopped_early_is_not_chosen(tmp_path, monkeypatch):
+    """After 40 rollouts trial 1 is better than the default and 2 better still; then 2 forgets all: the default wins."""
+    seen = made_up(monkeypatch, lambda trial, n: (0.4, 0.5, 0.6 * (n <= 40), 0.0)[trial])
+    tune.main(budget(tmp_path, trials=4, rollouts=80, halve=True))
+    assert seen[4:] == [(0, 80, True), (2, 80, True)]
+    assert written(tmp_path)["trial"] == 0 and written(tmp_path)["trials"][1]["area"] == pytest.approx(0.5)
+
+
+def test_halving_waits_for_every_trial_of_a_rung(tmp_path, monkeypatch, capsys):
+    seen = made_up(monkeypatch, lambda trial, n: 0.1 * trial)
+    tune.main(budget(tmp_path, trials=4, rollouts=20, halve=True, minutes=0.0))
+    tune.main(budget(tmp_path, trials=4, rollouts=20, halve=True, dry=True))
+    assert seen == [] and not (tmp_path / "tuned").exists()
+    printed = capsys.readouterr().out
+    assert "4 trials to 10 rollouts, 2 trials to 20 rollouts; seeds: 2" in printed
+    assert "toy/sac: 0 of 4 trials are finished" in printed
 
 
 # ------------------------------------------------------------ what uses it

@@ -52,7 +52,8 @@ def test_pretraining_and_tuning(tmp_path):
     out, to = tmp_path / "runs", tmp_path / "data"
     pretrained(out)
     save(out / "tune", "sac_trial-0", [[0.2], [0.9]], rollouts=[0, 20], seeds="seed-9", variant="trial-0")
-    trials = [{"options": {"utd": 2.0}, "area": 0.55, "final": 0.9, "areas": {}, "folders": ["/home/somebody/x"]}]
+    scores = {"rollouts": 20, "area": 0.55, "final": 0.9, "areas": {}}
+    trials = [{"options": {"utd": 2.0}, **scores, "folders": ["/home/somebody/x"]}]
     chosen = {"task": "toy", "method": "sac", "trial": 0, "trials": trials, "budget": {"trials": 1}, "space": {}}
     (out / "tuned/toy").mkdir(parents=True)
     (out / "tuned/toy/sac.json").write_text(json.dumps(chosen))
@@ -61,7 +62,8 @@ def test_pretraining_and_tuning(tmp_path):
     assert [row["success"] for row in read_csv(written["pretraining.csv"])] == ["0", "0", "0.4", "0.8"]
     prior = read_csv(written["priors.csv"])[1]
     assert (prior["success"], prior["success/low"], prior["time/train_s"]) == ("0.9", "0.3", "12.5")
-    assert read_csv(written["tuning.csv"])[0]["chosen"] == "True"
+    trial = read_csv(written["tuning.csv"])[0]
+    assert (trial["chosen"], trial["rollouts"]) == ("True", "20")
     assert not any("/home/somebody" in path.read_text() for path in written.values())
 
 
