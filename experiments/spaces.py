@@ -1,9 +1,10 @@
-"""What tuning chooses from: of every method five of its options with three values each.
+"""What tuning chooses from: of every method five to seven of its options with two or three values each.
 
-The options are those that the method's authors name as sensitive, or our own measurements do (docs/history.md). The
-spaces are equally large, so that the same number of trials searches the same share of each. The default is among the
-three values; the others are published ones of close relatives, or lie a factor of two to three away. Nothing that
-decides what a method is can be chosen.
+The options are those that the method's authors name as sensitive, or our own measurements do (docs/history.md): warm-up
+of the critic is among them wherever a critic learns, except for `anchored`, whose anchor is what warm-up is for. The
+spaces have 243 to 324 settings, so that the same number of trials searches about the same share of each. The default is
+among the values; the others are published ones of close relatives, switch off what the method's authors do not have, or
+lie a factor of two to three away. Nothing that decides what a method is can be chosen.
 """
 
 from typing import Any
@@ -14,43 +15,48 @@ from sgft_jax.types import UserError
 _UTD = (2.0, 8.0, 20.0)  # from an update or two per step to RLPD's and MBPO's twenty
 _RATES = {"lr_actor": (3e-5, 1e-4, 3e-4), "lr_critic": (1e-4, 3e-4, 1e-3)}
 _WARMUP = (None, 0, 5_000)  # as long as argued here, as printed in the paper, longer
+_SWITCHED = {"critic_warmup": (None, 0), "lr_warmup": (None, 0)}  # as argued here, or none
+_ALPHA = (0.003, 0.01, 0.03)
 _SHARE = (0.25, 0.5, 0.75)
-_PLAIN = {"utd": _UTD, **_RATES, "alpha": (0.003, 0.01, 0.03), "critic_warmup": _WARMUP}
-_BRANCH = {"utd": _UTD, **_RATES, "horizon": (1, 2, 4), "branches": (2, 5, 10)}
+_SHORT = {"utd": _UTD, **_RATES, "horizon": (1, 2, 4), **_SWITCHED}
+_SHAPED = {
+    "utd": _UTD, "lr_actor": (1e-4, 3e-4), "lr_critic": _RATES["lr_critic"], "reset_critic": (True, False), **_SWITCHED,
+}  # fmt: skip
 _PLANNER = {
-    "utd": (1.0, 2.0, 4.0), "lr": (1e-4, 3e-4, 1e-3), "horizon": (2, 3, 4), "batch_size": (128, 256, 512),
+    "utd": (1.0, 2.0, 8.0), "lr": (1e-4, 3e-4, 1e-3), "horizon": (2, 3, 4), "batch_size": (128, 256, 512),
     "plan_samples": (256, 512, 1024),
 }  # fmt: skip
+_TDMPC2 = {**_PLANNER, "utd": (1.0, 8.0), "lr_warmup": (None, 0)}  # 8 and none are what `sgft-mpc` has
 
 SPACES: dict[str, dict[str, tuple[Any, ...]]] = {
-    "sac": _PLAIN,
+    "sac": {"utd": _UTD, **_RATES, "critic_warmup": _WARMUP, "lr_warmup": (None, 0, 1_000)},
     "anchored": {"utd": _UTD, **_RATES, "anchor": (0.03, 0.1, 0.3), "simulated_share": _SHARE},
-    "sac-reset": _PLAIN,
-    "pbrs": _PLAIN,
-    "mbpo": _BRANCH,
-    "pbrs-branch": _BRANCH,
-    "sgft-sac": _BRANCH,
-    "sgft-relabel": _BRANCH,
-    "sgft-parts": _BRANCH,
-    "sgft": {"utd": _UTD, **_RATES, "horizon": (1, 2, 4), "critic_warmup": _WARMUP},
+    "sac-reset": {"utd": _UTD, **_RATES, "alpha": _ALPHA, "critic_warmup": _WARMUP},
+    "pbrs": {**_SHAPED, "clip_shaped": (None, 2.0)},
+    "mbpo": _SHORT,
+    "pbrs-branch": {**_SHAPED, "horizon": (1, 4)},
+    "sgft-sac": _SHORT,
+    "sgft-relabel": _SHORT,
+    "sgft-parts": _SHORT,
+    "sgft": _SHORT,
     "frozen-critic": {
-        "utd": _UTD, "lr_actor": _RATES["lr_actor"], "alpha": _PLAIN["alpha"], "actor_ramp": (0, 1_000, 5_000),
+        "utd": _UTD, "lr_actor": _RATES["lr_actor"], "alpha": _ALPHA, "actor_ramp": (0, 1_000, 5_000),
         "batch_size": (128, 256, 512),
     },
     "sac-online": {
         "utd": (2.0, 5.0, 10.0), "lr_actor": (1e-5, 3e-5, 1e-4), "lr_critic": _RATES["lr_critic"],
-        "policy_delay": (5, 10, 20), "simulated_share": _SHARE,
+        "simulated_share": _SHARE, **_SWITCHED,
     },
     "rlpd": {
         "utd": (10.0, 20.0, 40.0), "lr_actor": (1e-4, 3e-4, 1e-3), "lr_critic": _RATES["lr_critic"],
-        "target_critics": (1, 2, 10), "simulated_share": _SHARE,
+        "target_critics": (1, 2), "simulated_share": _SHARE, "critic_warmup": (None, 0),
     },
     "iql": {
         "utd": _UTD, "lr_actor": (1e-4, 3e-4, 1e-3), "expectile": (0.7, 0.8, 0.9), "beta": (1.0, 3.0, 10.0),
         "simulated_share": _SHARE,
     },
-    "tdmpc2": _PLANNER,
-    "sgft-tdmpc2": _PLANNER,
+    "tdmpc2": _TDMPC2,
+    "sgft-tdmpc2": _TDMPC2,
     "sgft-tdmpc2-code": _PLANNER,
     "sgft-mpc": {
         "utd": _UTD, "lr_dynamics": (1e-4, 3e-4, 1e-3), "horizon": (1, 2, 4), "plan_noise": (0.25, 0.5, 1.0),

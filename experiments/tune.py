@@ -24,11 +24,12 @@ from experiments import cli, grid, tuned
 from experiments.finetune_args import with_settings
 from experiments.grid import Cell, GridArgs
 from experiments.options import at_least_one, prior_home, seed_list
-from experiments.spaces import defaults, space_of
+from experiments.spaces import SPACES, defaults, space_of
 from sgft_jax import extend
 from sgft_jax.io import runs
 from sgft_jax.io.jsonfile import read_json
 from sgft_jax.io.log import SUMMARY
+from sgft_jax.methods import NAMES
 from sgft_jax.types import UserError
 
 FOLDER = "tune"  # the trials have a tree of their own, which figures of the comparison do not look into
@@ -38,6 +39,8 @@ FOLDER = "tune"  # the trials have a tree of their own, which figures of the com
 class TuneArgs(GridArgs):
     """The budget, the same for all methods; everything not named here is as `experiments.finetune` has it."""
 
+    methods: tuple[str, ...] = tuple(name for name in NAMES if name in SPACES)
+    """Methods, in the order in which they run; by default all that have something to tune (experiments/spaces.py)."""
     trials: int = 8
     """Trials of each method on each task, that with the defaults included."""
     reals: tuple[str, ...] = ("mild",)
@@ -278,7 +281,7 @@ def _table(title: str, found: Sequence[Outcome], chosen: int | None) -> Table:
     for trial, rollouts, each in found:
         cells = ("-", "-") if each is None else (f"{each.area:.3f}", f"{100 * each.final:.0f}")
         note = "chosen" if trial.number == chosen else "defaults" if trial.number == 0 else ""
-        values = ("None" if value is None else f"{value:g}" for value in trial.settings.values())
+        values = (f"{value:g}" if isinstance(value, float) else str(value) for value in trial.settings.values())
         table.add_row(str(trial.number), *values, str(rollouts), *cells, note)
     return table
 

@@ -1,6 +1,8 @@
 """Tuning: the same budget for every method, on another real system, chosen by area under the curve, and used."""
 
+import dataclasses
 import json
+import math
 import os
 from dataclasses import replace
 
@@ -15,6 +17,7 @@ from experiments.finetune_args import arguments, run_folder, with_settings
 from sgft_jax.io import checkpoint
 from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.runs import FORMAT
+from sgft_jax.methods import get_method
 from sgft_jax.types import UserError
 
 STEPS = 20  # of an episode
@@ -75,6 +78,30 @@ def written(out, method="sac"):
     return json.loads((out / f"tuned/toy/{method}.json").read_text())
 
 
+# ------------------------------------------------------------ spaces
+
+
+@pytest.mark.parametrize("method", spaces.SPACES)
+def test_a_space_holds_the_default_repeats_nothing_and_is_as_large_as_the_others(method):
+    space, default = spaces.space_of(method), spaces.defaults(method)
+    assert all(default[name] in values and len(set(values)) == len(values) for name, values in space.items())
+    assert 243 <= math.prod(map(len, space.values())) <= 324
+    for values in zip(*(values * 3 for values in space.values()), strict=False):  # each is a value that a method takes
+        with_settings(arguments(method), dict(zip(space, values, strict=True)))
+
+
+def test_warm_up_can_be_chosen_wherever_a_critic_learns():
+    options = {name: dataclasses.asdict(get_method(name).config()) for name in spaces.SPACES if name != "anchored"}
+    for warmup in ("critic_warmup", "lr_warmup"):
+        having = {name for name, own in options.items() if warmup in own}
+        assert having == {name for name in options if {None, 0} <= set(spaces.space_of(name).get(warmup, ()))}
+        assert "sac" in having
+
+
+def test_all_methods_with_a_space_are_tuned_by_default():
+    assert set(tune.TuneArgs().methods) == set(spaces.SPACES)
+
+
 # ------------------------------------------------------------ drawing and scoring
 
 
@@ -96,6 +123,7 @@ def test_tasks_methods_and_seeds_have_draws_of_their_own(tmp_path):
     assert drawn("sac")[1:] != drawn("sac-reset")[1:] and drawn("sac")[1:] != drawn("sac", seed=7)[1:]
     assert drawn("rlpd")[0] == {
         "utd": 20.0, "lr_actor": 3e-4, "lr_critic": 3e-4, "target_critics": 2, "simulated_share": 0.5,
+        "critic_warmup": 0,
     }  # fmt: skip
 
 
