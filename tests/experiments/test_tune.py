@@ -5,6 +5,7 @@ import json
 import math
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -362,16 +363,20 @@ def test_finetune_begins_with_tuned_options_and_takes_changes(tmp_path, monkeypa
 
 @pytest.mark.slow
 def test_tuned_runs_on_a_point_mass(tmp_path, monkeypatch):
-    """Two real trials, then a run with what they chose: the path from a prior to the file and back."""
+    """Three real trials, two of which go on, then a run with what they chose: from a prior to the file and back."""
     for run, seed in (("a", 0), ("b", 1)):
         save_prior(tmp_path / f"pretrain/toy/robust/{run}/prior/seed-{seed}", seed)
     for name, mass in (("heavy", 2.0), ("light", 0.5)):
         (tmp_path / f"{name}.toml").write_text(f"[params]\nmass = {mass}\n")
-    monkeypatch.setitem(spaces.SPACES, "sac", {"utd": (0.1, 8.0), "batch_size": (256,)})
+    monkeypatch.setitem(spaces.SPACES, "sac", {"utd": (0.1, 1.0, 8.0), "batch_size": (256,)})
     sizes = {"tasks": ("toy",), "methods": ("sac",), "rollouts": 2, "eval_every": 1, "seeds": 2}
-    tune.main(tune.TuneArgs(trials=2, reals=(str(tmp_path / "heavy.toml"),), out=tmp_path, **sizes))
+    tune.main(tune.TuneArgs(trials=3, halve=True, reals=(str(tmp_path / "heavy.toml"),), out=tmp_path, **sizes))
     result = written(tmp_path)
-    assert {trial["options"]["utd"] for trial in result["trials"]} == {8.0, 0.1}
+    assert {trial["options"]["utd"] for trial in result["trials"]} == {8.0, 1.0, 0.1}
+    assert sorted(trial["rollouts"] for trial in result["trials"]) == [1, 2, 2]
+    assert [checkpoint.latest(Path(trial["folders"][0])) for trial in result["trials"]] == [
+        trial["rollouts"] for trial in result["trials"]
+    ]
     assert result["gaps"][0]["name"] == "heavy"
     assert all(np.shape(trial["areas"]["heavy"]) == (2,) for trial in result["trials"])
     real = str(tmp_path / "light.toml")
