@@ -1,5 +1,7 @@
 """The generic finetuner on a point that moves in a plane: what moves, what is frozen, what a learner gets to see."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 import tuners
 from tuners import METHODS, NET, TASK, T, compiled, equal, prior, started, tuner
 
+from sgft_jax import finetuner
 from sgft_jax.data import sources
 from sgft_jax.finetuner import Parts, assemble
 from sgft_jax.learners import sac, tdmpc2_model
@@ -192,6 +195,44 @@ def test_longer_horizons_tell_the_steps_to_go(seen):
     rows = 8 * (1 + 2 * 3)
     assert seen["batch"].context.shape == (rows, 3) == seen["batch"].next_context.shape
     assert seen["config"].context_dim == 3
+
+
+@pytest.mark.parametrize(
+    ("name", "others", "parts"),
+    [
+        ("mbpo", {}, {"shape": False, "shorten": False}),
+        ("sgft-sac", {"clip_shaped": None}, {"shape": True, "shorten": True}),
+        ("sgft-sac", {"clip_shaped": None, "reset_critic": True, "horizon": 1}, {"shape": True, "shorten": True}),
+        ("pbrs-branch", {"clip_shaped": None, "reset_critic": False}, {"shape": True, "shorten": False}),
+        ("pbrs-branch", {"clip_shaped": None, "reset_critic": True}, {"shape": True, "shorten": False}),
+    ],
+)
+def test_parts_that_are_a_method_begin_as_it_does_and_see_its_batch(name, others, parts, monkeypatch):
+    """The same structure, numbers and networks to begin with, and the same rows, rewards, discounts and contexts."""
+    prior()  # made before: it is of another agent
+    make, found = sac.make_sac, []
+
+    def idle(config, hyper=None):
+        keep = lambda state, batch, key: (found.append((config, state, batch)), (state, {}))[1]  # noqa: E731
+        return make(config, hyper)._replace(update=keep)
+
+    def one_key(*transforms):  # a clip without a bound would shift the keys of the others
+        each = lambda imagination, rows, key: functools.reduce(  # noqa: E731
+            lambda rows, one: one.apply((), imagination, rows, key), transforms, rows
+        )
+        return stateless(each)
+
+    monkeypatch.setattr(sac, "make_sac", idle)
+    monkeypatch.setattr(finetuner, "compose", one_key)
+    shared = {key: value for key, value in others.items() if key != "clip_shaped"}
+    for method, options in ((name, others), ("sgft-parts", shared | parts)):
+        plain = tuners.build(method, train_dynamics=False, **options)
+        state = plain.init(prior().params, jax.random.key(0), None)
+        state = plain.observe(state, tuners.episode(jax.random.key(1)), jnp.ones(T, bool), jnp.float32(0))
+        with jax.disable_jit():
+            plain.learn(state, jax.random.key(1), 1, None)
+    (config, learner, batch), (own_config, own_learner, own_batch) = found
+    assert config == own_config and equal(learner, own_learner) and equal(batch, own_batch)
 
 
 @pytest.mark.parametrize(("name", "bound"), [("sgft", 0.01), ("sgft", None), ("pbrs", 0.01)])
