@@ -3,7 +3,8 @@
 A gap names only what differs; everything else stays as in training. `params` fixes domain parameters (or gives them
 another range), also outside the training range; `effects` distorts commands and measurements, see `envs.base.Effects`.
 `scene` names another scene than the simulated one, see `envs.make`: a towel where the simulator has a puck. `families`
-says which kinds of difference were drawn, see `envs.gap_distribution`; nothing follows from it.
+says which kinds of difference were drawn, see `envs.gap_distribution`, and `stratum` how often the simulator's policies
+succeed there, see `experiments.gaps`; only tables read them.
 """
 
 import json
@@ -18,7 +19,7 @@ from envs.base import Effects, Env, Value, World
 from sgft_jax.types import Key, UserError, unknown
 
 SIM = "sim"  # names the gap in which nothing differs: the real system is the training domain itself
-_KEYS = frozenset({"params", "effects", "scene", "families"})
+_KEYS = frozenset({"params", "effects", "scene", "families", "stratum"})
 _FILE = re.compile(r"(.*\.(?:toml|json))(?::(.+))?")  # a file, or one gap of a file
 
 
@@ -27,6 +28,7 @@ class Gap(NamedTuple):
 
     Ranges are [low, high], of vectors [[low, ...], [high, ...]]; a vector may be a table by entry name, see
     `envs.effects.make_range`. Every episode draws its effects from their ranges. families: of a gap that was drawn.
+    stratum: "solved", "partial" or "failed" of one that was measured too.
     """
 
     name: str
@@ -34,6 +36,7 @@ class Gap(NamedTuple):
     effects: dict[str, Value]
     scene: str = ""
     families: tuple[str, ...] = ()
+    stratum: str = ""
 
 
 def presets(task: str) -> dict[str, Gap]:
@@ -128,7 +131,10 @@ def to_toml(found: Iterable[Gap]) -> str:
 
 
 def _table(gap: Gap) -> str:
-    values = {"scene": gap.scene, "families": list(gap.families), "params": gap.params, "effects": gap.effects}
+    values = {
+        "stratum": gap.stratum, "scene": gap.scene, "families": list(gap.families), "params": gap.params,
+        "effects": gap.effects,
+    }  # fmt: skip
     lines = [f"{_key(name)} = {_inline(value)}" for name, value in values.items() if value]
     return "\n".join([f"[{_key(gap.name)}]", *lines, ""])
 
@@ -166,15 +172,16 @@ def _parse(name: str, table: Any, *, where: str) -> Gap:
     if not isinstance(table, dict) or set(table) - _KEYS:
         odd = sorted({*table} - _KEYS)[0] if isinstance(table, dict) else type(table).__name__
         raise UserError(
-            f"{where}: unexpected '{odd}'; a gap has two tables, 'params' and 'effects', and may name a 'scene' and "
-            "'families'"
+            f"{where}: unexpected '{odd}'; a gap has two tables, 'params' and 'effects', and may name a 'scene', "
+            "'families' and a 'stratum'"
         )
     families = table.get("families", [])
     if not isinstance(families, list) or not all(isinstance(family, str) for family in families):
         raise UserError(f"{where}: 'families' must be a list of names, got {families!r}")
-    gap = Gap(name, table.get("params", {}), table.get("effects", {}), table.get("scene", ""), tuple(families))
-    if not isinstance(gap.scene, str):
-        raise UserError(f"{where}: 'scene' must be a name, got {gap.scene!r}")
+    words = {key: table.get(key, "") for key in ("scene", "stratum")}
+    if odd := [key for key, word in words.items() if not isinstance(word, str)]:
+        raise UserError(f"{where}: '{odd[0]}' must be a name, got {words[odd[0]]!r}")
+    gap = Gap(name, table.get("params", {}), table.get("effects", {}), families=tuple(families), **words)
     for section, values in (("params", gap.params), ("effects", gap.effects)):
         if not isinstance(values, dict):
             raise UserError(f"{where}: '{section}' must be a table of names and numbers, got {values!r}")

@@ -58,12 +58,14 @@ def main(args: FactorialArgs) -> None:
     check(args)
     places = [(task, real) for task in args.tasks for real in args.reals]
     cells = {place: cells_of(args, *place) for place in places}
-    failed = grid.work([cell for each in cells.values() for cell in each.values()], args)
+    every = [cell for each in cells.values() for cell in each.values()]
+    grid.check_begun(every)  # the same folders with other options or priors
+    failed = grid.work(every, args)
     if args.dry:
         return
     if failed:
         raise UserError(f"{len(failed)} of the cells did not run: {'; '.join(failed)}")
-    states = [grid.look_up(cell.args).state for each in cells.values() for cell in each.values()]
+    states = [grid.look_up(cell.args).state for cell in every]
     if left := len(states) - states.count("finished"):
         print(f"{left} cells are not finished; the same command goes on")
         return
@@ -114,16 +116,18 @@ def cells_of(args: FactorialArgs, task: str, real: str) -> "dict[Levels, Cell]":
 def report(args: FactorialArgs, cells: "dict[tuple[str, str], dict[Levels, Cell]]") -> str:
     """Tables of the effects; writes factorial.json and factorial.png."""
     from sgft_jax.analysis import figures, tables
-    from sgft_jax.analysis.curves import read_curve
+    from sgft_jax.analysis.curves import by_prior, read_curve
     from sgft_jax.analysis.factorial import effects
 
     folder, found, said = args.out / "factorial", {}, []
     for (task, real), each in cells.items():
         curves = {levels: read_curve(cell.folder) for levels, cell in each.items()}
         scores = {levels: measures(curve) for levels, curve in curves.items()}
-        place, score = f"{task}, {gaps.title(real)}", next(iter(curves.values())).score
+        first = next(iter(curves.values()))
+        place, score, priors = f"{task}, {gaps.title(real)}", first.score, first.prior if by_prior(first) else None
         found[place] = {
-            what: effects({levels: own[what] for levels, own in scores.items()}, factors(args)) for what in MEASURES
+            what: effects({levels: own[what] for levels, own in scores.items()}, factors(args), priors=priors)
+            for what in MEASURES
         }
         rows = [
             [name, *(tables.number(found[place][what][name], score) for what in MEASURES)]

@@ -72,11 +72,9 @@ def _choose(args: GapsArgs, path: Path, found: Sequence[Gap], known: Mapping[str
     drawn = {gap.name: gap for gap in found}
     lines = {name: known[name] for name in drawn}
     names = gaps_choose.choose(lines, args.choose)
-    words = [
-        ", ".join([f"{known[name]['stratum']}, zero-shot {_success(known[name])} %", *_marks(known[name])])
-        for name in names
-    ]
-    gaps_choose.write(path, [drawn[name] for name in names], words, _command(args))
+    words = [", ".join([f"zero-shot {_success(known[name])} %", *_marks(known[name])]) for name in names]
+    chosen = [drawn[name]._replace(stratum=known[name]["stratum"]) for name in names]
+    gaps_choose.write(path, chosen, words, _command(args))
     print("\n".join([*gaps_choose.remarks(lines, names), f"chosen: {path}"]))
 
 

@@ -21,12 +21,15 @@ class Factor(NamedTuple):
 Levels = tuple[bool, ...]  # of every factor, whether it is high
 
 
-def effects(cells: Mapping[Levels, ArrayLike], factors: Sequence[Factor]) -> dict[str, Interval]:
+def effects(
+    cells: Mapping[Levels, ArrayLike], factors: Sequence[Factor], *, priors: ArrayLike | None = None
+) -> dict[str, Interval]:
     """Main effects by name of the factor, and two-way interactions as "one x other".
 
     cells: [members] scores of every combination of levels; member i of each began from the same prior. A main effect is
     the mean at the high level minus that at the low one. An interaction is half of what one effect gains where the
-    other factor is high. Intervals draw members. Raises ValueError for a combination that is missing.
+    other factor is high. Intervals draw members, or priors [members] first where they are given. Raises ValueError
+    for a combination that is missing.
     """
     wanted = list(itertools.product((False, True), repeat=len(factors)))
     if missing := [levels for levels in wanted if levels not in cells]:
@@ -37,4 +40,5 @@ def effects(cells: Mapping[Levels, ArrayLike], factors: Sequence[Factor]) -> dic
     for (i, one), (j, other) in itertools.combinations(enumerate(factors), 2):
         contrasts[f"{one.name} x {other.name}"] = signs[:, i] * signs[:, j]
     half = len(wanted) / 2
-    return {name: bootstrap_interval(each @ scores / half, statistic=mean) for name, each in contrasts.items()}
+    own = {name: each @ scores / half for name, each in contrasts.items()}
+    return {name: bootstrap_interval(each, statistic=mean, priors=priors) for name, each in own.items()}

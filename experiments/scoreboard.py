@@ -1,0 +1,126 @@
+"""How methods did on a frozen set of gaps: a line for each method and stratum, and the reference against the others.
+
+Reads what fine-tuning has left in <out>/finetune for the gaps of these files, and for the control `sim` beside them.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from envs import gaps
+from envs.gaps import SIM
+from experiments import cli
+from sgft_jax.methods import DEFAULT
+from sgft_jax.types import UserError
+
+if TYPE_CHECKING:
+    from sgft_jax.analysis.curves import Curve
+    from sgft_jax.analysis.scoreboard import Row
+
+CONTROL, SOLVED = "no gap", "solved"
+
+
+@dataclass(frozen=True)
+class ScoreboardArgs:
+    """Which gaps, and who is compared."""
+
+    gaps: tuple[Path, ...]
+    """Frozen sets, as `experiments.gaps --choose` writes them."""
+    reference: str = DEFAULT
+    """Compare the others with METHOD or METHOD:VARIANT."""
+    tasks: tuple[str, ...] = ()
+    """Only these tasks; default: all that ran on these gaps."""
+    out: Path = Path("runs")
+    """Parent of all run folders; the table also goes to <out>/scoreboard.md."""
+
+
+def main(args: ScoreboardArgs) -> None:
+    """Prints the tables and writes them."""
+    text = board(args)
+    (args.out / "scoreboard.md").write_text(text + "\n")
+    print(f"{text}\n\nwritten: {args.out / 'scoreboard.md'}")
+
+
+def board(args: ScoreboardArgs) -> str:
+    """The tables; raises UserError where nobody ran on these gaps, or the reference did not."""
+    from sgft_jax.analysis import scoreboard, tables
+
+    strata = strata_of(args.gaps)
+    played = runs_on(args, strata)
+    if not played:
+        raise UserError(f"{args.out / 'finetune'}: holds no evaluated run on these gaps")
+    if args.reference not in played:
+        raise UserError(f"--reference {args.reference}: did not run on these gaps; there are: {', '.join(played)}")
+    rows = [
+        scoreboard.row(method, stratum, own)
+        for stratum in dict.fromkeys(strata.values())
+        for method, each in played.items()
+        if (own := {name: curve for name, curve in each.items() if strata[name.partition("/")[2]] == stratum})
+    ]
+    head = (
+        "stratum",
+        "method",
+        "gaps",
+        "start",
+        "area",
+        "end",
+        "90 % held",
+        "deepest fall",
+        "loss at the end",
+        "training",
+    )
+    said = ["Success in per cent, mean over gaps.", "", tables.markdown(head, [_line(row) for row in rows]), ""]
+    hard = {method: _where(each, strata, solved=False) for method, each in played.items()}
+    if len(played) > 1 and (own := hard.pop(args.reference)):
+        found = [scoreboard.duel(own, method, each) for method, each in hard.items() if set(own) & set(each)]
+        lines = [[d.other, f"{d.ahead} of {d.gaps}", tables.number(d.better)] for d in found]
+        head = (f"{args.reference} against", "gaps with at least its area", "P(better), per cent")
+        said += ["On gaps that are not solved:", "", tables.markdown(head, lines), ""]
+    return "\n".join(said).rstrip()
+
+
+def strata_of(files: tuple[Path, ...]) -> dict[str, str]:
+    """The stratum of every gap by name, the control first; raises UserError for a gap that has none."""
+    found = {SIM: CONTROL}
+    for file in files:
+        for gap in gaps.read_file(file).values():
+            if not gap.stratum:
+                raise UserError(f"{file} [{gap.name}]: has no 'stratum'; sets are written by experiments.gaps --choose")
+            found[gap.name] = gap.stratum
+    return found
+
+
+def runs_on(args: ScoreboardArgs, strata: Mapping[str, str]) -> "dict[str, dict[str, Curve]]":
+    """By METHOD or METHOD:VARIANT the curves by "task/gap"."""
+    from sgft_jax.analysis.curves import read_runs
+    from sgft_jax.analysis.tables import spec
+
+    found: dict[str, dict[str, Curve]] = {}
+    for curve in read_runs(args.out).curves:
+        if curve.gap in strata and (not args.tasks or curve.task in args.tasks):
+            own = found.setdefault(spec(curve), {})
+            if (name := f"{curve.task}/{curve.gap}") in own:
+                raise UserError(f"{args.out}: {spec(curve)} ran on {name} with several sets of seeds; keep one")
+            own[name] = curve
+    return found
+
+
+def _where(each: "Mapping[str, Curve]", strata: Mapping[str, str], *, solved: bool) -> "dict[str, Curve]":
+    """The curves on gaps that are solved, or that are not."""
+    stays = lambda name: strata[name.partition("/")[2]] in (CONTROL, SOLVED)  # noqa: E731
+    return {name: curve for name, curve in each.items() if stays(name) == solved}
+
+
+def _line(row: "Row") -> list[str]:
+    from sgft_jax.analysis import tables
+
+    scores = [tables.number(band) for band in (row.start, row.area, row.end)]
+    worst = f"{100 * row.fall:.0f} ({row.worst})" if row.fall >= 0.005 else "0"
+    training = "" if row.training != row.training else f"{100 * row.training:.0f}"
+    held = f"{row.held} of {row.gaps}"
+    return [row.stratum, row.method, str(row.gaps), *scores, held, worst, f"{100 * max(row.loss, 0):.0f}", training]
+
+
+if __name__ == "__main__":
+    cli.run_main(main, ScoreboardArgs, __doc__ or "")

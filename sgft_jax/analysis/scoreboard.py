@@ -1,0 +1,123 @@
+"""How methods did on a set of gaps that nobody chose: by stratum, and against each other. Pure.
+
+The prior is the random factor: member i of a curve began from prior i, on every gap, and intervals draw members.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sgft_jax.analysis.curves import LEVEL, Curve, area, common_grid
+from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean
+
+_RESAMPLES = 1000
+
+
+class Row(NamedTuple):
+    """A method on the gaps of one stratum.
+
+    gaps: their number. start, area, end: mean score over gaps, with its interval. held: gaps whose mean was at least
+    90 % at the last two evaluations. fall: how far the mean of any gap ever was below its start; worst: that gap.
+    loss: how far the mean of any gap ended below its start. training: mean score of the training rollouts, nan where
+    nobody kept them.
+    """
+
+    method: str
+    stratum: str
+    gaps: int
+    start: Interval
+    area: Interval
+    end: Interval
+    held: int
+    fall: float
+    worst: str
+    loss: float
+    training: float
+
+
+class Duel(NamedTuple):
+    """A reference against another method.
+
+    gaps: those on which both ran. ahead: on how many of them the reference's mean area is at least the other's. better:
+    probability that a member of it has the larger area, mean over gaps.
+    """
+
+    other: str
+    gaps: int
+    ahead: int
+    better: Interval
+
+
+Played = Mapping[str, Curve]  # by gap
+
+
+def row(method: str, stratum: str, played: Played) -> Row:
+    """The line of a method on these gaps. Raises ValueError where gaps have different numbers of members."""
+    _check(method, played)
+    curves = list(played.values())
+    grid = common_grid(curves)
+    means = {gap: curve.values.mean(0) for gap, curve in played.items()}
+    falls = {gap: float(each[0] - each.min()) for gap, each in means.items()}
+    worst = max(falls, key=lambda gap: falls[gap])
+    trained = [np.nanmean(curve.training) for curve in curves if curve.training is not None]
+    over = lambda scores: bootstrap_interval(np.mean(scores, axis=0), statistic=mean)  # noqa: E731
+    return Row(
+        method,
+        stratum,
+        len(curves),
+        start=over([curve.values[:, 0] for curve in curves]),
+        area=over(_areas(played, list(played), grid)),
+        end=over([curve.values[:, -1] for curve in curves]),
+        held=sum(bool((each[-2:] >= LEVEL).all()) for each in means.values()),
+        fall=falls[worst],
+        worst=worst,
+        loss=max(float(each[0] - each[-1]) for each in means.values()),
+        training=float(np.mean(trained)) if trained else np.nan,
+    )
+
+
+def duel(reference: Played, other: str, played: Played) -> Duel:
+    """The reference against one method, on the gaps and evaluations that they share; ValueError if there is none."""
+    gaps = [gap for gap in reference if gap in played]
+    if not gaps:
+        raise ValueError(f"{other} shares no gap with the reference")
+    grid = common_grid([*(reference[gap] for gap in gaps), *(played[gap] for gap in gaps)])
+    own, theirs = _areas(reference, gaps, grid), _areas(played, gaps, grid)
+    ahead = int((own.mean(1) >= theirs.mean(1)).sum())
+    return Duel(other, len(gaps), ahead, _improvement(own, theirs))
+
+
+def best_other(reference: Played, others: Mapping[str, Played]) -> str:
+    """The method with the largest mean area on the reference's gaps, among those that ran on all of them."""
+    whole = {name: played for name, played in others.items() if set(reference) <= set(played)}
+    if not whole:
+        raise ValueError("no other method ran on all of these gaps")
+    grid = common_grid([curve for played in (reference, *whole.values()) for curve in (played[g] for g in reference)])
+    return max(whole, key=lambda name: float(_areas(whole[name], list(reference), grid).mean()))
+
+
+def _areas(played: Played, gaps: Sequence[str], grid: np.ndarray) -> np.ndarray:
+    """[gaps, members]"""
+    found = [area(played[gap], grid) for gap in gaps]
+    assert all(each is not None for each in found)
+    return np.stack([each for each in found if each is not None])
+
+
+def _improvement(above: np.ndarray, below: np.ndarray) -> Interval:
+    """P(above > below) of areas [gaps, members] of two methods; ties count half. Intervals draw members of either."""
+    a, b = above[:, :, None], below[:, None, :]
+    wins = ((a > b) + 0.5 * (a == b)).mean(0)  # [members of one, members of the other], mean over gaps
+    estimate = np.asarray(wins.mean())
+    if min(wins.shape) < ENOUGH:
+        return Interval(estimate, np.asarray(np.nan), np.asarray(np.nan))
+    rng = np.random.default_rng(0)
+    drawn = [wins[np.ix_(*(rng.integers(n, size=n) for n in wins.shape))].mean() for _ in range(_RESAMPLES)]
+    return Interval(estimate, *np.quantile(drawn, (0.025, 0.975)))
+
+
+def _check(method: str, played: Played) -> None:
+    sizes = {gap: len(curve.seeds) for gap, curve in played.items()}
+    if len(set(sizes.values())) > 1:
+        (one, n), (other, m), *_ = sorted(sizes.items(), key=lambda each: each[1])[:: len(sizes) - 1]
+        raise ValueError(f"{method} has {n} seeds on {one} and {m} on {other}")

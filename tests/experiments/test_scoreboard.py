@@ -1,0 +1,54 @@
+"""The table of a frozen set: strata, falls, who is ahead, and what is refused."""
+
+import pytest
+import runs_by_hand
+
+from experiments import scoreboard
+from experiments.scoreboard import ScoreboardArgs
+from sgft_jax.types import UserError
+
+SET = """
+[easy]
+stratum = "solved"
+effects = { latency = 0.01 }
+[hard]
+stratum = "failed"
+effects = { latency = 0.1 }
+"""
+
+
+@pytest.fixture
+def home(tmp_path):
+    """`anchored` never falls and learns the hard gap; `sac` falls on the easy one and learns half as much."""
+    (tmp_path / "set.toml").write_text(SET)
+    for method, gap, curve in (
+        ("anchored", "easy", ([0.9] * 4, [0.9] * 4, [0.9] * 4)),
+        ("anchored", "hard", ([0.1] * 4, [0.9, 0.9, 1.0, 1.0], [1.0] * 4)),
+        ("sac", "easy", ([0.9] * 4, [0.5] * 4, [0.8] * 4)),
+        ("sac", "hard", ([0.1] * 4, [0.3] * 4, [0.5, 0.5, 0.6, 0.6])),
+        ("sac", "elsewhere", ([0.0] * 4, [0.0] * 4, [0.0] * 4)),
+    ):
+        digests = [f"p{i}" for i in range(4)]
+        runs_by_hand.save(tmp_path, method, curve, rollouts=(0, 4, 8), real=gap, seeds="seeds-0-3", priors=digests)
+    return tmp_path
+
+
+def test_strata_falls_and_who_is_ahead(home, capsys):
+    scoreboard.main(ScoreboardArgs((home / "set.toml",), out=home))
+    said = capsys.readouterr().out
+    assert "| solved | anchored | 1 | 90 | 90 | 90 | 1 of 1 | 0 | 0 |" in said
+    assert "| solved | sac | 1 | 90 | 68 | 80 | 0 of 1 | 40 (toy/easy) | 10 |" in said
+    assert "| failed | anchored | 1 | 10 |" in said and "| 1 of 1 | 0 | 0 |" in said.split("failed | anchored")[1]
+    assert "| sac | 1 of 1 | 100 |" in said and "elsewhere" not in said
+    assert (home / "scoreboard.md").read_text() in said
+
+
+def test_bad_input(home):
+    args = ScoreboardArgs((home / "set.toml",), out=home)
+    with pytest.raises(UserError, match=r"--reference mbpo: did not run on these gaps; there are: .*sac"):
+        scoreboard.board(ScoreboardArgs(args.gaps, reference="mbpo", out=home))
+    with pytest.raises(UserError, match="holds no evaluated run on these gaps"):
+        scoreboard.board(ScoreboardArgs(args.gaps, out=home / "nothing"))
+    (home / "set.toml").write_text("[easy.params]\nmass = 1.0\n[hard.params]\nmass = 2.0\n")
+    with pytest.raises(UserError, match=r"set.toml \[easy\]: has no 'stratum'"):
+        scoreboard.board(args)
