@@ -28,6 +28,7 @@ from sgft_jax.types import PyTree, UserError
 
 FORMAT = 1
 _CHECKPOINTS, _MANIFEST, _STATE, _TEMPORARY = "checkpoints", "manifest.json", "state", ".tmp-"
+_MARK = "commit_success.txt"
 _PACKAGES = ("jax", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
@@ -175,6 +176,8 @@ def write_tree(where: Path, tree: PyTree, facts: Mapping[str, Any]) -> None:
         ocp.save(str((where / _STATE).absolute()), stored)
     if not first_host():
         return
+    # Orbax's own mark of completeness names the folders of this machine; ours is the manifest.
+    (where / _STATE / _MARK).unlink(missing_ok=True)
     files = [file for file in sorted(where.glob(f"{_STATE}/**/*")) if file.is_file()]
     manifest = {
         "format": FORMAT,
