@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from envs import gaps
 from envs.gaps import SIM
 from experiments import cli
+from experiments.gaps_choose import STRATA
 from sgft_jax.methods import DEFAULT
 from sgft_jax.types import UserError
 
@@ -18,7 +19,10 @@ if TYPE_CHECKING:
     from sgft_jax.analysis.curves import Curve
     from sgft_jax.analysis.scoreboard import Row
 
-CONTROL, SOLVED = "no gap", "solved"
+CONTROL = "no gap"
+_HEAD = (
+    "stratum", "method", "gaps", "start", "area", "end", "90 % held", "deepest fall", "loss at the end", "training",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -53,25 +57,13 @@ def board(args: ScoreboardArgs) -> str:
     if args.reference not in played:
         raise UserError(f"--reference {args.reference}: did not run on these gaps; there are: {', '.join(played)}")
     rows = [
-        scoreboard.row(method, stratum, own)
-        for stratum in dict.fromkeys(strata.values())
+        scoreboard.row(method, stratum, each[stratum])
+        for stratum in (CONTROL, *STRATA)
         for method, each in played.items()
-        if (own := {name: curve for name, curve in each.items() if strata[name.partition("/")[2]] == stratum})
+        if stratum in each
     ]
-    head = (
-        "stratum",
-        "method",
-        "gaps",
-        "start",
-        "area",
-        "end",
-        "90 % held",
-        "deepest fall",
-        "loss at the end",
-        "training",
-    )
-    said = ["Success in per cent, mean over gaps.", "", tables.markdown(head, [_line(row) for row in rows]), ""]
-    hard = {method: _where(each, strata, solved=False) for method, each in played.items()}
+    said = ["Success in per cent, mean over gaps.", "", tables.markdown(_HEAD, [_line(row) for row in rows]), ""]
+    hard = {method: {**each.get("partial", {}), **each.get("failed", {})} for method, each in played.items()}
     if len(played) > 1 and (own := hard.pop(args.reference)):
         found = [scoreboard.duel(own, method, each) for method, each in hard.items() if set(own) & set(each)]
         lines = [[d.other, f"{d.ahead} of {d.gaps}", tables.number(d.better)] for d in found]
@@ -91,25 +83,19 @@ def strata_of(files: tuple[Path, ...]) -> dict[str, str]:
     return found
 
 
-def runs_on(args: ScoreboardArgs, strata: Mapping[str, str]) -> "dict[str, dict[str, Curve]]":
-    """By METHOD or METHOD:VARIANT the curves by "task/gap"."""
+def runs_on(args: ScoreboardArgs, strata: Mapping[str, str]) -> "dict[str, dict[str, dict[str, Curve]]]":
+    """By METHOD or METHOD:VARIANT and stratum, the curves by "task/gap"."""
     from sgft_jax.analysis.curves import read_runs
     from sgft_jax.analysis.tables import spec
 
-    found: dict[str, dict[str, Curve]] = {}
+    found: dict[str, dict[str, dict[str, Curve]]] = {}
     for curve in read_runs(args.out).curves:
         if curve.gap in strata and (not args.tasks or curve.task in args.tasks):
-            own = found.setdefault(spec(curve), {})
+            own = found.setdefault(spec(curve), {}).setdefault(strata[curve.gap], {})
             if (name := f"{curve.task}/{curve.gap}") in own:
                 raise UserError(f"{args.out}: {spec(curve)} ran on {name} with several sets of seeds; keep one")
             own[name] = curve
     return found
-
-
-def _where(each: "Mapping[str, Curve]", strata: Mapping[str, str], *, solved: bool) -> "dict[str, Curve]":
-    """The curves on gaps that are solved, or that are not."""
-    stays = lambda name: strata[name.partition("/")[2]] in (CONTROL, SOLVED)  # noqa: E731
-    return {name: curve for name, curve in each.items() if stays(name) == solved}
 
 
 def _line(row: "Row") -> list[str]:

@@ -15,13 +15,12 @@ from sgft_jax.analysis.stats import rank_correlation
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.distortion import Distortion, none, residuals
 from sgft_jax.models.networks import make_dynamics
-from sgft_jax.models.robust import robust_std
+from sgft_jax.models.robust import robust_std, student_cost
 from sgft_jax.policies import network_of, sac_policy
 from sgft_jax.types import Array, Key, PyTree, Task, Transition, UserError
 
 HORIZONS = (1, 2, 4, 8)  # steps ahead
 _SHARES = np.linspace(-0.5, 1.0, 61)  # of a command that may come from the step before
-_DEGREES = 3.0  # of freedom of Student's t: no model is right about every step
 _STILL = 0.25  # the share of steps that move an entry least
 _LARGEST, _KEPT_STD = 0.05, 0.871  # share of residuals left out there; std of a Gaussian without it
 
@@ -80,12 +79,6 @@ def beliefs_of(params: Any, card: Mapping[str, Any], task: Task) -> Beliefs:
         terminated=task.terminated,
         gamma=card["gamma"],
     )
-
-
-def meant(known: Distortion, rows: Transition) -> Transition:
-    """Real steps [n] as the simulator would have made them."""
-    seen = jax.vmap(known.seen)
-    return rows._replace(obs=seen(rows.obs), action=jax.vmap(known.meaning)(rows.action), next_obs=seen(rows.next_obs))
 
 
 # --- V_sim ------------------------------------------------------------------------------------------------------------
@@ -215,13 +208,7 @@ def evidence(without: Array, explained: Array, held: Array, spread: Array) -> Ar
     without, explained: residuals [n, k]. held: [n] bool. spread: [k] their least std.
     """
     scale = jnp.maximum(robust_std(explained, held), spread)
-    return _cost(without, held, scale) - _cost(explained, held, scale)
-
-
-def _cost(missed: Array, held: Array, scale: Array) -> Array:
-    square = jnp.sum((missed / scale[None]) ** 2, axis=1)
-    each = 0.5 * (_DEGREES + missed.shape[1]) * jnp.log1p(square / _DEGREES)
-    return jnp.sum(jnp.where(held, each, 0.0))
+    return student_cost(without, held, scale) - student_cost(explained, held, scale)
 
 
 class Lateness(NamedTuple):
@@ -255,7 +242,8 @@ def lateness(
     shares, best = jnp.asarray(_SHARES, jnp.float32), jnp.asarray(usual, jnp.float32)
     start = missed(best)
     for _ in range(2):  # the scale is that of the best share, and the other way round
-        cost = functools.partial(_cost, held=held, scale=jnp.maximum(robust_std(missed(best), held), spread))
+        scale = jnp.maximum(robust_std(missed(best), held), spread)
+        cost = functools.partial(student_cost, held=held, scale=scale)
         best = shares[jnp.argmin(jax.lax.map(lambda share, cost=cost: cost(missed(share)), shares))]
     return Lateness(best, evidence(start, missed(best), held, spread))
 

@@ -12,7 +12,7 @@ from sgft_jax import diagnosis
 from sgft_jax.diagnosis import HORIZONS, Lateness, Rollouts
 from sgft_jax.finetuner import command_interface
 from sgft_jax.identify import Identified
-from sgft_jax.models.distortion import Distortion, none, residuals
+from sgft_jax.models.distortion import Distortion, none, residuals, undone
 from sgft_jax.policies import network_of
 from sgft_jax.types import Array, Key, SimulatedData, Task, Transition
 
@@ -112,7 +112,7 @@ def _look(
     rows, valid = rollouts.flat()
     nothing = none(task.act_dim, task.measured_dim)
     known = command_interface(network_of(card), task).refit(begun, rows, valid).distortion
-    meant = rollouts._replace(transitions=jax.vmap(functools.partial(diagnosis.meant, known))(rollouts.transitions))
+    meant = rollouts._replace(transitions=jax.vmap(functools.partial(undone, known))(rollouts.transitions))
     own, acted = (meant, known) if real else (rollouts, nothing)
     flat, _ = own.flat()
     first = jax.tree.map(lambda x: x[0], params.dynamics)

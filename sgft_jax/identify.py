@@ -68,9 +68,7 @@ def interface(model: Model, kept: Callable[[PyTree], PyTree], task: Task) -> Int
         )
 
     def meant(known: Identified, batch: Batch) -> Batch:
-        seen = jax.vmap(known.distortion.seen)
-        action = jax.vmap(known.distortion.meaning)(batch.action)
-        new = batch._replace(action=action, obs=seen(batch.obs), next_obs=seen(batch.next_obs))
+        new = distortion.undone(known.distortion, batch)
         if (simulated := batch.is_sim) is None:
             return new
         return jax.tree.map(lambda a, b: jnp.where(simulated.reshape(-1, *[1] * (a.ndim - 1)), a, b), batch, new)

@@ -200,22 +200,15 @@ PRESETS: dict[str, PretrainConfig] = {
     ),
     # A policy that remembers the episode, in the domain of `robust`. A batch has 3,200 transitions (64 episodes of 50
     # steps), so 24,000 updates see as many as 75,000 of `fast`.
-    "recurrent": PretrainConfig(
+    "recurrent": replace(
+        _FAST,
         algorithm="recurrent",
         actuators=True,
-        n_envs=1024,
         env_steps=1_536_000,
-        random_transitions=102_400,
-        random_fraction=0.1,
-        random_ladder=0.6,
         updates_per_step=16,
         batch_size=64,
-        gamma=0.97,
         lr=3e-4,
         lr_end=0.1,
-        tau=0.01,
-        alpha=0.1,
-        network=_NORMED,
     ),
     # Two CPU cores, under three minutes, most of which go into the updates: one small update per environment step
     # learns pushing from 40,000 steps; 30,000 updates are too few, with 60,000 steps too.

@@ -10,6 +10,7 @@ import numpy as np
 
 from sgft_jax.analysis.curves import LEVEL, Curve, area, common_grid
 from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean
+from sgft_jax.types import UserError
 
 _RESAMPLES = 1000
 
@@ -53,9 +54,10 @@ Played = Mapping[str, Curve]  # by gap
 
 
 def row(method: str, stratum: str, played: Played) -> Row:
-    """The line of a method on these gaps. Raises ValueError where gaps have different numbers of members."""
-    _check(method, played)
+    """The line of a method on these gaps. Raises UserError where gaps have different numbers of members."""
     curves = list(played.values())
+    if len(sizes := sorted({len(curve.seeds) for curve in curves})) > 1:
+        raise UserError(f"{method}: ran with {sizes[0]} seeds on some gaps and with {sizes[-1]} on others")
     grid = common_grid(curves)
     means = {gap: curve.values.mean(0) for gap, curve in played.items()}
     falls = {gap: float(each[0] - each.min()) for gap, each in means.items()}
@@ -88,15 +90,6 @@ def duel(reference: Played, other: str, played: Played) -> Duel:
     return Duel(other, len(gaps), ahead, _improvement(own, theirs))
 
 
-def best_other(reference: Played, others: Mapping[str, Played]) -> str:
-    """The method with the largest mean area on the reference's gaps, among those that ran on all of them."""
-    whole = {name: played for name, played in others.items() if set(reference) <= set(played)}
-    if not whole:
-        raise ValueError("no other method ran on all of these gaps")
-    grid = common_grid([curve for played in (reference, *whole.values()) for curve in (played[g] for g in reference)])
-    return max(whole, key=lambda name: float(_areas(whole[name], list(reference), grid).mean()))
-
-
 def _areas(played: Played, gaps: Sequence[str], grid: np.ndarray) -> np.ndarray:
     """[gaps, members]"""
     found = [area(played[gap], grid) for gap in gaps]
@@ -114,10 +107,3 @@ def _improvement(above: np.ndarray, below: np.ndarray) -> Interval:
     rng = np.random.default_rng(0)
     drawn = [wins[np.ix_(*(rng.integers(n, size=n) for n in wins.shape))].mean() for _ in range(_RESAMPLES)]
     return Interval(estimate, *np.quantile(drawn, (0.025, 0.975)))
-
-
-def _check(method: str, played: Played) -> None:
-    sizes = {gap: len(curve.seeds) for gap, curve in played.items()}
-    if len(set(sizes.values())) > 1:
-        (one, n), (other, m), *_ = sorted(sizes.items(), key=lambda each: each[1])[:: len(sizes) - 1]
-        raise ValueError(f"{method} has {n} seeds on {one} and {m} on {other}")

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from sgft_jax.models.robust import most_probable
-from sgft_jax.types import Array, Transition
+from sgft_jax.types import Array, Batch, Transition
 
 _TURN, _SCALE, _BIAS = 0.6, 0.4, 0.2  # std of the rotation (rad), log-scales and biases before any data
 _FURTHEST = 2.0  # std of a sensor's error
@@ -44,6 +44,13 @@ class Distortion(NamedTuple):
         measured, commands = jnp.split(obs, [self.offset.shape[0]])
         meant = jax.vmap(self.meaning)(commands.reshape(-1, self.bias.shape[0]))
         return jnp.concatenate([measured - self.offset, meant.ravel()])
+
+
+def undone[Rows: (Batch, Transition)](distortion: Distortion, rows: Rows) -> Rows:
+    """Real rows [n] as the simulator would have made them: what was meant and what there was."""
+    seen = jax.vmap(distortion.seen)
+    action = jax.vmap(distortion.meaning)(rows.action)
+    return rows._replace(obs=seen(rows.obs), action=action, next_obs=seen(rows.next_obs))
 
 
 def none(act_dim: int, measured_dim: int) -> Distortion:

@@ -26,6 +26,13 @@ def robust_std(values: Array, held: Array) -> Array:
     return jnp.nan_to_num(1.48 * jnp.nanmedian(sizes, axis=0))
 
 
+def student_cost(missed: Array, held: Array, scale: Array) -> Array:
+    """[] nats of residuals [n, k] of the rows `held` [n] under Student's t with this scale [k], but for constants."""
+    square = jnp.sum((missed / scale[None]) ** 2, axis=1)
+    each = 0.5 * (_DEGREES + missed.shape[1]) * jnp.log1p(square / _DEGREES)
+    return jnp.sum(jnp.where(held, each, 0.0))
+
+
 def spread_of(missed: Array, change: Array, held: Array) -> Array:
     """[k] std of a model's residuals [n, k] in simulation, never below 1 % of what a step changes [n, k]."""
     return jnp.maximum(robust_std(missed, held), 0.01 * robust_std(change, held)) + 1e-6
@@ -55,9 +62,7 @@ def most_probable(
         return jnp.where(held[:, None], missed(p), 0.0)
 
     def cost(p: Array, scale: Array) -> Array:
-        square = jnp.sum((counted(p) / scale[None]) ** 2, axis=1)
-        each = 0.5 * (_DEGREES + spread.shape[0]) * jnp.log1p(square / _DEGREES)
-        return jnp.sum(jnp.where(held, each, 0.0)) + 0.5 * jnp.sum((p / belief) ** 2)
+        return student_cost(counted(p), held, scale) + 0.5 * jnp.sum((p / belief) ** 2)
 
     def step(p: Array, scale: Array) -> Array:
         """Of Gauss and Newton, with the weights that make least squares Student's t."""
