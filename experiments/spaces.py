@@ -64,6 +64,22 @@ SPACES: dict[str, dict[str, tuple[Any, ...]]] = {
     },
 }  # fmt: skip
 
+# Tried before others, if there are trials enough: what papers print, what practice here has shown, one update per step.
+_AS_PRINTED = {
+    "reset_critic": True, "clip_shaped": None, "branch_noise": 0.0, "critic_warmup": 0, "lr_warmup": 0,
+    "dynamics_warmup": 0, "actor_ramp": 0,
+}  # fmt: skip
+_COLD = {"critic_warmup": 0, "lr_warmup": 0}
+FIRST: dict[str, tuple[dict[str, Any], ...]] = {
+    "sac": ({"utd": 1.0}, _COLD),
+    "mbpo": ({"horizon": 4}, {"utd": 1.0}, _COLD),
+    "pbrs": ({"clip_shaped": None, "reset_critic": False}, {"clip_shaped": None}),
+    "sgft-sac": ({"horizon": 1, **_AS_PRINTED}, {"utd": 1.0}, _AS_PRINTED),
+    "rlpd": ({"utd": 10.0, "critic_warmup": None},),
+    "sac-online": ({"critic_warmup": None, "lr_warmup": None},),
+    "tdmpc2": ({"utd": 8.0}, {"lr_warmup": 0}, {"utd": 8.0, "lr_warmup": 0}),
+}
+
 
 def space_of(method: str) -> dict[str, tuple[Any, ...]]:
     """The options of a method that tuning may choose; raises UserError for a method without a space."""
@@ -72,7 +88,9 @@ def space_of(method: str) -> dict[str, tuple[Any, ...]]:
     return SPACES[method]
 
 
-def defaults(method: str) -> dict[str, Any]:
-    """What these options are unless somebody chooses."""
-    config = get_method(method).config()
-    return {name: getattr(config, name) for name in space_of(method)}
+def first(method: str) -> list[dict[str, Any]]:
+    """The settings of the first trials: the defaults, then those of `FIRST`."""
+    config, named = get_method(method).config(), FIRST.get(method, ())
+    names = dict.fromkeys([*space_of(method), *(name for settings in named for name in settings)])
+    default = {name: getattr(config, name) for name in names}
+    return [default | settings for settings in ({}, *named)]

@@ -1,10 +1,11 @@
 """Tune every method with the same budget: so many trials, on real systems that are not those of the comparison.
 
-A trial is one fine-tuning run. The first one has the method's defaults, the others are drawn from the method's own
-space (docs/methods.md). Trials that are finished are left alone, begun ones go on where they stopped: the same command,
-given again, does what is missing, and with more --trials it adds some. With --halve all trials begin short, and the
-better half goes on to twice as many rollouts, again and again (successive halving: Jamieson and Talwalkar 2016). When
-all trials of a method are finished, the options of the best one are written down, for `experiments.compare --tuned`.
+A trial is one fine-tuning run. The first one has the method's defaults, the next ones settings that papers print or
+practice has shown, the others are drawn from the method's own space (experiments/spaces.py). Trials that are finished
+are left alone, begun ones go on where they stopped: the same command, given again, does what is missing, and with more
+--trials it adds some. With --halve all trials begin short, and the better half goes on to twice as many rollouts, again
+and again (successive halving: Jamieson and Talwalkar 2016). When all trials of a method are finished, the options of
+the best one are written down, for `experiments.compare --tuned`.
 """
 
 import itertools
@@ -24,7 +25,7 @@ from experiments import cli, grid, tuned
 from experiments.finetune_args import with_settings
 from experiments.grid import Cell, GridArgs
 from experiments.options import at_least_one, prior_home, seed_list
-from experiments.spaces import SPACES, defaults, space_of
+from experiments.spaces import SPACES, first, space_of
 from sgft_jax import extend
 from sgft_jax.io import runs
 from sgft_jax.io.jsonfile import read_json
@@ -136,16 +137,16 @@ def _budget_words(args: TuneArgs) -> str:
 
 
 def draw(
-    space: Mapping[str, Sequence[Any]], default: dict[str, Any], trials: int, *, key: Sequence[int]
+    space: Mapping[str, Sequence[Any]], first: Sequence[dict[str, Any]], trials: int, *, key: Sequence[int]
 ) -> list[dict[str, Any]]:
-    """The default and then other settings of the space, at random and each at most once.
+    """The first settings, the defaults before all, and then others of the space, at random and each at most once.
 
     key: what the draw depends on; of the same key, more trials begin with the same ones.
     """
-    every = [dict(zip(space, values, strict=True)) for values in itertools.product(*space.values())]
-    others = [settings for settings in every if settings != default]
+    every = [first[0] | dict(zip(space, values, strict=True)) for values in itertools.product(*space.values())]
+    others = [settings for settings in every if settings not in first]
     order = np.random.default_rng(key).permutation(len(others))
-    return [default, *(others[i] for i in order[: trials - 1])]
+    return [*first, *(others[i] for i in order)][:trials]
 
 
 def trials(args: TuneArgs, task: str, method: str) -> list[Trial]:
@@ -154,7 +155,7 @@ def trials(args: TuneArgs, task: str, method: str) -> list[Trial]:
     if args.trials > (size := math.prod(map(len, space.values()))):
         raise UserError(f"--trials is {args.trials}: {method} has only {size} different ones")
     key = (args.seed, zlib.crc32(task.encode()), zlib.crc32(method.encode()))
-    drawn = draw(space, defaults(method), args.trials, key=key)
+    drawn = draw(space, first(method), args.trials, key=key)
     return [
         Trial(k, settings, [_look_up(args, task, real, method, k, settings) for real in args.reals])
         for k, settings in enumerate(drawn)
@@ -274,14 +275,16 @@ def _result(args: TuneArgs, task: str, method: str, found: list[Outcome], chosen
 
 
 def _table(title: str, found: Sequence[Outcome], chosen: int | None) -> Table:
-    """The trials with their options and scores; the chosen one is marked."""
+    """The trials with the options in which they differ, and their scores; the chosen one is marked."""
     table = Table(title=title)
-    for column in ("trial", *found[0].trial.settings, "rollouts", "area", "final %", ""):
+    differ = [name for name in found[0].trial.settings if len({each.trial.settings[name] for each in found}) > 1]
+    for column in ("trial", *differ, "rollouts", "area", "final %", ""):
         table.add_column(column, justify="right")
     for trial, rollouts, each in found:
         cells = ("-", "-") if each is None else (f"{each.area:.3f}", f"{100 * each.final:.0f}")
         note = "chosen" if trial.number == chosen else "defaults" if trial.number == 0 else ""
-        values = (f"{value:g}" if isinstance(value, float) else str(value) for value in trial.settings.values())
+        own = (trial.settings[name] for name in differ)
+        values = (f"{value:g}" if isinstance(value, float) else str(value) for value in own)
         table.add_row(str(trial.number), *values, str(rollouts), *cells, note)
     return table
 

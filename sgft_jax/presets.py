@@ -163,6 +163,26 @@ _ROBUST = replace(
     eval_every=10,
 )
 
+# TD-MPC2 in many environments at once, for the methods that plan. Its own numbers but for what massive collection asks
+# for: larger batches, and the discount factor and the exploration of `fast`.
+_TDMPC2 = PretrainConfig(
+    algorithm="tdmpc2",
+    n_envs=512,
+    env_steps=1_024_000,
+    random_transitions=51_200,
+    random_fraction=0.1,
+    random_ladder=0.6,
+    updates_per_step=16,
+    batch_size=512,
+    replay_capacity=512_000,
+    gamma=0.97,
+    lr=3e-4,
+    lr_end=0.1,
+    tau=0.01,
+    eval_every=10,
+    eval_episodes=128,
+)
+
 PRESETS: dict[str, PretrainConfig] = {
     "robust": _ROBUST,
     # The same, told what differs: for the method `sysid`, which identifies it.
@@ -179,25 +199,8 @@ PRESETS: dict[str, PretrainConfig] = {
     ),
     # The task's own domain and measurements alone: the priors of docs/results.md, and of the strata of drawn gaps.
     "fast": _FAST,
-    # TD-MPC2 in many environments at once, for the methods that plan. Its own numbers but for what massive collection
-    # asks for: larger batches, and the discount factor and the exploration of `fast`.
-    "tdmpc2": PretrainConfig(
-        algorithm="tdmpc2",
-        n_envs=512,
-        env_steps=1_024_000,
-        random_transitions=51_200,
-        random_fraction=0.1,
-        random_ladder=0.6,
-        updates_per_step=16,
-        batch_size=512,
-        replay_capacity=512_000,
-        gamma=0.97,
-        lr=3e-4,
-        lr_end=0.1,
-        tau=0.01,
-        eval_every=10,
-        eval_episodes=128,
-    ),
+    "tdmpc2": _TDMPC2,
+    "robust-tdmpc2": replace(_TDMPC2, previous_actions=2, actuators=True),  # in the domain of `robust`
     # A policy that remembers the episode, in the domain of `robust`. A batch has 3,200 transitions (64 episodes of 50
     # steps), so 24,000 updates see as many as 75,000 of `fast`.
     "recurrent": replace(
@@ -241,4 +244,4 @@ def preset_of(method: Method) -> str:
     """The preset that makes the priors which a method needs."""
     if method.sees_system:
         return "informed"
-    return DEFAULT_PRESET if method.prior == "sac" else method.prior
+    return {"sac": DEFAULT_PRESET, "tdmpc2": "robust-tdmpc2", "recurrent": "recurrent"}[method.prior]

@@ -96,4 +96,4 @@ def test_methods_refuse_the_other_algorithms_priors(tmp_path, capsys):
     assert stopped.value.code == 2
     error = capsys.readouterr().err
     assert error.startswith("error: the method needs a prior of tdmpc2, not of sac") and error.count("\n") == 1
-    assert "--preset tdmpc2" in error
+    assert "--preset robust-tdmpc2" in error

@@ -84,11 +84,19 @@ def written(out, method="sac"):
 
 @pytest.mark.parametrize("method", spaces.SPACES)
 def test_a_space_holds_the_default_repeats_nothing_and_is_as_large_as_the_others(method):
-    space, default = spaces.space_of(method), spaces.defaults(method)
+    space, default = spaces.space_of(method), spaces.first(method)[0]
     assert all(default[name] in values and len(set(values)) == len(values) for name, values in space.items())
     assert 243 <= math.prod(map(len, space.values())) <= 324
     for values in zip(*(values * 3 for values in space.values()), strict=False):  # each is a value that a method takes
         with_settings(arguments(method), dict(zip(space, values, strict=True)))
+
+
+@pytest.mark.parametrize("method", spaces.FIRST)
+def test_settings_that_are_tried_first_differ_and_are_options_of_the_method(method):
+    found = spaces.first(method)
+    assert len(found) == 1 + len(spaces.FIRST[method]) == len({str(settings) for settings in found})
+    for settings in found:
+        with_settings(arguments(method), settings)
 
 
 def test_warm_up_can_be_chosen_wherever_a_critic_learns():
@@ -106,14 +114,14 @@ def test_all_methods_with_a_space_are_tuned_by_default():
 # ------------------------------------------------------------ drawing and scoring
 
 
-def test_a_draw_begins_with_the_default_and_repeats_nothing():
-    space, default = {"a": (1, 2, 3), "b": (None, 5)}, {"a": 2, "b": None}
-    six = tune.draw(space, default, 6, key=(0, 1))
-    assert six[0] == default and sorted(map(str, six)) == sorted(
-        str({"a": a, "b": b}) for a in (1, 2, 3) for b in (None, 5)
+def test_a_draw_begins_with_the_first_settings_and_repeats_nothing():
+    space, first = {"a": (1, 2, 3), "b": (None, 5)}, [{"a": 2, "b": None, "c": 0}, {"a": 2, "b": None, "c": 1}]
+    seven = tune.draw(space, first, 9, key=(0, 1))
+    assert seven[:2] == first and sorted(map(str, seven[2:])) == sorted(
+        str({"a": a, "b": b, "c": 0}) for a in (1, 2, 3) for b in (None, 5) if (a, b) != (2, None)
     )
-    assert tune.draw(space, default, 3, key=(0, 1)) == six[:3] and tune.draw(space, default, 1, key=(0, 1)) == [default]
-    assert any(tune.draw(space, default, 6, key=(k, 1)) != six for k in range(3))
+    assert tune.draw(space, first, 3, key=(0, 1)) == seven[:3] and tune.draw(space, first, 1, key=(0, 1)) == first[:1]
+    assert any(tune.draw(space, first, 9, key=(k, 1)) != seven for k in range(3))
 
 
 def test_tasks_methods_and_seeds_have_draws_of_their_own(tmp_path):
@@ -121,7 +129,7 @@ def test_tasks_methods_and_seeds_have_draws_of_their_own(tmp_path):
         return [trial.settings for trial in tune.trials(budget(tmp_path, **changes), "toy", method)]
 
     assert drawn("sac") == drawn("sac", rollouts=20, seeds=5, trials=4) == drawn("sac", trials=9)[:4]
-    assert drawn("sac")[1:] != drawn("sac-reset")[1:] and drawn("sac")[1:] != drawn("sac", seed=7)[1:]
+    assert drawn("sac-reset") != drawn("sac-reset", seed=7) and drawn("sac")[3:] != drawn("sac", seed=7)[3:]
     assert drawn("rlpd")[0] == {
         "utd": 20.0, "lr_actor": 3e-4, "lr_critic": 3e-4, "target_critics": 2, "simulated_share": 0.5,
         "critic_warmup": 0,
@@ -157,7 +165,7 @@ def test_every_trial_is_a_run_apart_from_the_comparison(tmp_path, ran):
     assert first.out == tmp_path / "tune" and first.prior == tmp_path / "pretrain/toy/robust"
     assert first.options == arguments("sac").options
     expected = tune.trials(budget(tmp_path), "toy", "sac")[1].settings
-    assert {name: getattr(second.options, name) for name in expected} == expected != spaces.defaults("sac")
+    assert {name: getattr(second.options, name) for name in expected} == expected != spaces.first("sac")[0]
     assert not (tmp_path / "finetune").exists()
     assert written(tmp_path)["budget"]["reals"] == ["mild", "soft"] and len(written(tmp_path)["gaps"]) == 2
 
@@ -369,6 +377,7 @@ def test_tuned_runs_on_a_point_mass(tmp_path, monkeypatch):
     for name, mass in (("heavy", 2.0), ("light", 0.5)):
         (tmp_path / f"{name}.toml").write_text(f"[params]\nmass = {mass}\n")
     monkeypatch.setitem(spaces.SPACES, "sac", {"utd": (0.1, 1.0, 8.0), "batch_size": (256,)})
+    monkeypatch.setitem(spaces.FIRST, "sac", ({"utd": 1.0},))
     sizes = {"tasks": ("toy",), "methods": ("sac",), "rollouts": 2, "eval_every": 1, "seeds": 2}
     tune.main(tune.TuneArgs(trials=3, halve=True, reals=(str(tmp_path / "heavy.toml"),), out=tmp_path, **sizes))
     result = written(tmp_path)
