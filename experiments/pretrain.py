@@ -28,8 +28,8 @@ class PretrainArgs:
     """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
     preset: str = DEFAULT_PRESET
     """Named settings: robust (one GPU, minutes; actuators and sensors differ between episodes), fast (the task's own
-    domain), cpu (two cores, minutes), paper, or tdmpc2, recurrent and informed (sysid) for the methods that need their
-    priors. --config.* changes single ones."""
+    domain), cpu (two cores, minutes), paper, or robust-tdmpc2, recurrent and informed (sysid) for the methods that need
+    their priors. --config.* changes single ones."""
     seed: int = 0
     """First seed."""
     seeds: int = 1
