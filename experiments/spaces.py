@@ -64,7 +64,7 @@ SPACES: dict[str, dict[str, tuple[Any, ...]]] = {
     },
 }  # fmt: skip
 
-# Tried before others, if there are trials enough: what papers print, what practice here has shown, one update per step.
+# Tried before others, if there are trials enough: what papers print, what practice here has shown.
 _AS_PRINTED = {
     "reset_critic": True, "clip_shaped": None, "branch_noise": 0.0, "critic_warmup": 0, "lr_warmup": 0,
     "dynamics_warmup": 0, "actor_ramp": 0,

@@ -137,16 +137,16 @@ def _budget_words(args: TuneArgs) -> str:
 
 
 def draw(
-    space: Mapping[str, Sequence[Any]], first: Sequence[dict[str, Any]], trials: int, *, key: Sequence[int]
+    space: Mapping[str, Sequence[Any]], leading: Sequence[dict[str, Any]], trials: int, *, key: Sequence[int]
 ) -> list[dict[str, Any]]:
-    """The first settings, the defaults before all, and then others of the space, at random and each at most once.
+    """The leading settings, the defaults before all, and then others of the space, at random and each at most once.
 
     key: what the draw depends on; of the same key, more trials begin with the same ones.
     """
-    every = [first[0] | dict(zip(space, values, strict=True)) for values in itertools.product(*space.values())]
-    others = [settings for settings in every if settings not in first]
+    every = [leading[0] | dict(zip(space, values, strict=True)) for values in itertools.product(*space.values())]
+    others = [settings for settings in every if settings not in leading]
     order = np.random.default_rng(key).permutation(len(others))
-    return [*first, *(others[i] for i in order)][:trials]
+    return [*leading, *(others[i] for i in order)][:trials]
 
 
 def trials(args: TuneArgs, task: str, method: str) -> list[Trial]:
