@@ -1,7 +1,7 @@
 """What tuning chooses from: of every method five to seven of its options with two or three values each.
 
 The options are those that the method's authors name as sensitive, or our own measurements do (docs/history.md): warm-up
-of the critic is among them wherever a critic learns, except for `anchored`, whose anchor is what warm-up is for. The
+of the critic is among them wherever a critic learns, except for `guarded`, which the guard protects instead. The
 spaces have 243 to 324 settings, so that the same number of trials searches about the same share of each. The default is
 among the values; the others are published ones of close relatives, switch off what the method's authors do not have, or
 lie a factor of two to three away. Nothing that decides what a method is can be chosen.
@@ -29,8 +29,8 @@ _PLANNER = {
 _TDMPC2 = {**_PLANNER, "utd": (1.0, 8.0), "lr_warmup": (None, 0)}  # 8 and none are what `sgft-mpc` has
 
 SPACES: dict[str, dict[str, tuple[Any, ...]]] = {
-    "sac": {"utd": _UTD, **_RATES, "critic_warmup": _WARMUP, "lr_warmup": (None, 0, 1_000)},
-    "anchored": {"utd": _UTD, **_RATES, "anchor": (0.03, 0.1, 0.3), "simulated_share": _SHARE},
+    "sac": {"utd": (1.0, 2.0, 8.0), **_RATES, "critic_warmup": _WARMUP, "lr_warmup": (None, 0, 1_000)},
+    "guarded": {"utd": _UTD, **_RATES, "anchor": (0.0, 0.03, 0.1), "simulated_share": _SHARE},
     "sac-reset": {"utd": _UTD, **_RATES, "alpha": _ALPHA, "critic_warmup": _WARMUP},
     "pbrs": {**_SHAPED, "clip_shaped": (None, 2.0)},
     "mbpo": _SHORT,
@@ -71,12 +71,13 @@ _AS_PRINTED = {
 }  # fmt: skip
 _COLD = {"critic_warmup": 0, "lr_warmup": 0}
 FIRST: dict[str, tuple[dict[str, Any], ...]] = {
-    "sac": ({"utd": 1.0}, _COLD),
+    "guarded": ({"anchor": 0.1}, {"utd": 1.0}),
+    "sac": ({"utd": 8.0}, _COLD),
     "mbpo": ({"horizon": 4}, {"utd": 1.0}, _COLD),
-    "pbrs": ({"clip_shaped": None, "reset_critic": False}, {"clip_shaped": None}),
+    "pbrs": ({"reset_critic": True}, {"clip_shaped": 2.0, "reset_critic": True}),
     "sgft-sac": ({"horizon": 1, **_AS_PRINTED}, {"utd": 1.0}, _AS_PRINTED),
-    "rlpd": ({"utd": 10.0, "critic_warmup": None},),
-    "sac-online": ({"critic_warmup": None, "lr_warmup": None},),
+    "rlpd": ({"lr_critic": 3e-4, "target_critics": 2}, {"utd": 10.0, "critic_warmup": None}),
+    "sac-online": ({"utd": 5.0, "lr_actor": 1e-5, "lr_critic": 3e-4, "lr_warmup": 0}, {"critic_warmup": None}),
     "tdmpc2": ({"utd": 8.0}, {"lr_warmup": 0}, {"utd": 8.0, "lr_warmup": 0}),
 }
 

@@ -9,7 +9,6 @@ the best one are written down, for `experiments.compare --tuned`.
 """
 
 import itertools
-import math
 import time
 import zlib
 from collections.abc import Mapping, Sequence
@@ -151,11 +150,10 @@ def draw(
 
 def trials(args: TuneArgs, task: str, method: str) -> list[Trial]:
     """The trials of a method on a task, and how far each has got."""
-    space = space_of(method)
-    if args.trials > (size := math.prod(map(len, space.values()))):
-        raise UserError(f"--trials is {args.trials}: {method} has only {size} different ones")
     key = (args.seed, zlib.crc32(task.encode()), zlib.crc32(method.encode()))
-    drawn = draw(space, first(method), args.trials, key=key)
+    drawn = draw(space_of(method), first(method), args.trials, key=key)
+    if len(drawn) < args.trials:
+        raise UserError(f"--trials is {args.trials}: {method} has only {len(drawn)} different ones")
     return [
         Trial(k, settings, [_look_up(args, task, real, method, k, settings) for real in args.reals])
         for k, settings in enumerate(drawn)

@@ -184,7 +184,7 @@ def _horizon(found: Mapping[str, Any]) -> str:
     best = max(range(len(shares)), key=shares.__getitem__)
     return (
         f"horizon of SGFT: H = {found['horizons'][best]}, with which {100 * shares[best]:.0f} % of the states are "
-        "improvable; no horizon up to 8 suffices, so methods without V_sim (anchored, sac, mbpo) may do better"
+        "improvable; no horizon up to 8 suffices, so methods without V_sim (guarded, sac, mbpo) may do better"
     )
 
 

@@ -10,13 +10,13 @@ from sgft_jax.types import Method, UserError, unknown
 
 # The order of tables and figures: the ones to try first stand first, what is not listed last.
 _ORDER = (
-    "anchored", "sgft-sac", "sgft-relabel", "sgft-mpc", "sgft-tdmpc2", "sgft", "tdmpc2", "mbpo", "sysid", "recurrent",
+    "guarded", "sgft-sac", "sgft-relabel", "sgft-mpc", "sgft-tdmpc2", "sgft", "tdmpc2", "mbpo", "sysid", "recurrent",
     "sac", "rlpd", "sac-online", "iql", "sac-reset", "pbrs", "pbrs-branch", "frozen-critic", "sgft-tdmpc2-code",
     "sgft-parts",
 )  # fmt: skip
 _FILES = [module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__) if module.name != "options"]
 NAMES = tuple(sorted(_FILES, key=lambda name: (_ORDER.index(name) if name in _ORDER else len(_ORDER), name)))
-DEFAULT = "anchored"
+DEFAULT = "guarded"
 
 
 @cache

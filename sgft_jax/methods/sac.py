@@ -11,6 +11,8 @@ from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
 class Config(KeptCriticOptions):
     """Options of `sac`."""
 
+    utd: float = 1.0
+    """Gradient updates per real transition. One did better than eight wherever both were tried (docs/protocol.md)."""
     simulated_share: float = 0.0
     """Share of each batch that is simulated, as in RLPD (Ball et al. 2023); 0 = none."""
     simulated_transitions: int = 200_000

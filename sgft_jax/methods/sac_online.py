@@ -9,20 +9,23 @@ from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
 
 @dataclass(frozen=True)
 class Config(KeptCriticOptions):
-    """Options of `sac-online`; the defaults are As et al. 2026's."""
+    """Options of `sac-online`; the defaults are As et al. 2026's, but for what tuning found better (docs/protocol.md).
 
-    utd: float = 5.0
+    There are 5 updates per transition, rates of 1e-5 and 3e-4 and no `lr_warmup`.
+    """
+
+    utd: float = 2.0
     """Gradient updates per real transition."""
-    lr_actor: float = 1e-5
+    lr_actor: float = 3e-5
     """Adam learning rate of the actor."""
+    lr_critic: float = 1e-3
+    """Adam learning rate of the critic."""
     policy_delay: int | None = 20
     """Critic updates per update of the actor; None = `utd`."""
     critic_warmup: int | None = 0
     """Updates at the start in which the critic alone learns."""
     actor_ramp: int = 0
     """Updates over which the actor's learning rate rises from 0."""
-    lr_warmup: int | None = 0
-    """Updates over which the critic's learning rate rises from 0."""
     simulated_share: float = 0.5
     """Share of each batch that is simulated, at the start."""
     simulated_share_end: float = 0.0

@@ -283,7 +283,7 @@ def test_a_file_without_a_name_means_all_of_its_gaps(tmp_path, monkeypatch):
 
 def test_a_variant_has_a_folder_beside_its_method():
     args = FinetuneArgs(task="push", seeds=2, variant="horizon-4")
-    assert run_folder(args, "default") == Path("runs/finetune/push/default/anchored_horizon-4/seeds-0-1")
+    assert run_folder(args, "default") == Path("runs/finetune/push/default/guarded_horizon-4/seeds-0-1")
 
 
 # --- killed and resumed -----------------------------------------------------------------------------------------------

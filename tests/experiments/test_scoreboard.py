@@ -19,11 +19,11 @@ effects = { latency = 0.1 }
 
 @pytest.fixture
 def home(tmp_path):
-    """`anchored` never falls and learns the hard gap; `sac` falls on the easy one and learns half as much."""
+    """`guarded` never falls and learns the hard gap; `sac` falls on the easy one and learns half as much."""
     (tmp_path / "set.toml").write_text(SET)
     for method, gap, curve in (
-        ("anchored", "easy", ([0.9] * 4, [0.9] * 4, [0.9] * 4)),
-        ("anchored", "hard", ([0.1] * 4, [0.9, 0.9, 1.0, 1.0], [1.0] * 4)),
+        ("guarded", "easy", ([0.9] * 4, [0.9] * 4, [0.9] * 4)),
+        ("guarded", "hard", ([0.1] * 4, [0.9, 0.9, 1.0, 1.0], [1.0] * 4)),
         ("sac", "easy", ([0.9] * 4, [0.5] * 4, [0.8] * 4)),
         ("sac", "hard", ([0.1] * 4, [0.3] * 4, [0.5, 0.5, 0.6, 0.6])),
         ("sac", "elsewhere", ([0.0] * 4, [0.0] * 4, [0.0] * 4)),
@@ -36,9 +36,9 @@ def home(tmp_path):
 def test_strata_falls_and_who_is_ahead(home, capsys):
     scoreboard.main(ScoreboardArgs((home / "set.toml",), out=home))
     said = capsys.readouterr().out
-    assert "| solved | anchored | 1 | 90 | 90 | 90 | 1 of 1 | 0 | 0 |" in said
+    assert "| solved | guarded | 1 | 90 | 90 | 90 | 1 of 1 | 0 | 0 |" in said
     assert "| solved | sac | 1 | 90 | 68 | 80 | 0 of 1 | 40 (toy/easy) | 10 |" in said
-    assert "| failed | anchored | 1 | 10 |" in said and "| 1 of 1 | 0 | 0 |" in said.split("failed | anchored")[1]
+    assert "| failed | guarded | 1 | 10 |" in said and "| 1 of 1 | 0 | 0 |" in said.split("failed | guarded")[1]
     assert "| sac | 1 of 1 | 100 |" in said and "elsewhere" not in said
     assert (home / "scoreboard.md").read_text() in said
 

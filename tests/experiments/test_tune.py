@@ -100,7 +100,7 @@ def test_settings_that_are_tried_first_differ_and_are_options_of_the_method(meth
 
 
 def test_warm_up_can_be_chosen_wherever_a_critic_learns():
-    options = {name: dataclasses.asdict(get_method(name).config()) for name in spaces.SPACES if name != "anchored"}
+    options = {name: dataclasses.asdict(get_method(name).config()) for name in spaces.SPACES if name != "guarded"}
     for warmup in ("critic_warmup", "lr_warmup"):
         having = {name for name, own in options.items() if warmup in own}
         assert having == {name for name in options if {None, 0} <= set(spaces.space_of(name).get(warmup, ()))}
@@ -131,7 +131,7 @@ def test_tasks_methods_and_seeds_have_draws_of_their_own(tmp_path):
     assert drawn("sac") == drawn("sac", rollouts=20, seeds=5, trials=4) == drawn("sac", trials=9)[:4]
     assert drawn("sac-reset") != drawn("sac-reset", seed=7) and drawn("sac")[3:] != drawn("sac", seed=7)[3:]
     assert drawn("rlpd")[0] == {
-        "utd": 20.0, "lr_actor": 3e-4, "lr_critic": 3e-4, "target_critics": 2, "simulated_share": 0.5,
+        "utd": 20.0, "lr_actor": 3e-4, "lr_critic": 1e-3, "target_critics": 1, "simulated_share": 0.5,
         "critic_warmup": 0,
     }  # fmt: skip
 
@@ -193,7 +193,7 @@ def test_what_fails_does_not_stop_the_rest_and_the_command_goes_on(tmp_path, ran
 def test_trials_of_other_options_are_refused(tmp_path, ran):
     (trial,) = tune.trials(budget(tmp_path, trials=1), "toy", "sac")
     leave(with_settings(trial.cells[0].args, {"utd": 3.0}), [[0, 0], [0, 0], [0, 0]])
-    with pytest.raises(UserError, match=r"trial-0.*another configuration: options.utd was 3\.0, now 8\.0"):
+    with pytest.raises(UserError, match=r"trial-0.*another configuration: options.utd was 3\.0, now 1\.0"):
         tune.tune(budget(tmp_path))
     assert ran == []
 
@@ -209,7 +209,7 @@ def test_dry_and_the_clock_run_nothing(tmp_path, ran, capsys):
     ("argv", "words"),
     [
         (["--trials", "0"], "--trials is 0: must be at least 1"),
-        (["--trials", "244"], "--trials is 244: anchored has only 243 different ones"),
+        (["--trials", "245"], "--trials is 245: guarded has only 244 different ones"),
         (["--methods", "sgft-sca"], "did you mean 'sgft-sac'"),
     ],
 )
@@ -377,7 +377,7 @@ def test_tuned_runs_on_a_point_mass(tmp_path, monkeypatch):
     for name, mass in (("heavy", 2.0), ("light", 0.5)):
         (tmp_path / f"{name}.toml").write_text(f"[params]\nmass = {mass}\n")
     monkeypatch.setitem(spaces.SPACES, "sac", {"utd": (0.1, 1.0, 8.0), "batch_size": (256,)})
-    monkeypatch.setitem(spaces.FIRST, "sac", ({"utd": 1.0},))
+    monkeypatch.setitem(spaces.FIRST, "sac", ({"utd": 8.0},))
     sizes = {"tasks": ("toy",), "methods": ("sac",), "rollouts": 2, "eval_every": 1, "seeds": 2}
     tune.main(tune.TuneArgs(trials=3, halve=True, reals=(str(tmp_path / "heavy.toml"),), out=tmp_path, **sizes))
     result = written(tmp_path)

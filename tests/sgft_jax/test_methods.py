@@ -31,7 +31,7 @@ def test_the_list_of_methods_is_complete():
         "iql",
         "sgft-relabel",
         "sysid",
-        "anchored",
+        "guarded",
     }
     assert {name for name, fine in tuned.items() if fine.initial_policy} == {"rlpd", "iql", "sgft-tdmpc2-code"}
     assert all(method.name == name and method.description and method.source for name, method in METHODS.items())
@@ -147,7 +147,7 @@ def test_updates_follow_a_rollout():
 # Another value for each option, and what must be so for it to matter.
 OTHER = {
     "batch_size": 6, "branches": 3, "horizon": 3, "actor_ramp": 50, "replay_capacity": 40, "critic_warmup": 50,
-    "lr_warmup": 50, "dynamics_warmup": 50, "plan_samples": 32, "critics": 4, "target_critics": 1,
+    "lr_warmup": 50, "dynamics_warmup": 50, "plan_samples": 32, "critics": 4, "target_critics": 2,
     "simulated_transitions": 36, "offline_updates": 5, "simulated_anneal": 80, "policy_delay": 2, "utd": 0.5,
     "initial_rollouts": 3, "max_grad_norm": 0.001, "lr_actor": 1e-2, "lr_critic": 1e-2, "lr_dynamics": 1e-2, "lr": 1e-2,
     "tau": 0.2, "alpha": 0.3, "expectile": 0.9, "beta": 1.0, "reward_scale": 2.0, "simulated_share": 0.25,
@@ -197,6 +197,8 @@ def test_every_option_changes_something(name):
     own = {f.name for f in dataclasses.fields(METHODS[name].config)}
     idle = []
     for field in dataclasses.fields(METHODS[name].config):
+        if field.name == "through":  # needs a simulator that can be set to a state: tests/sgft_jax/test_sysid.py
+            continue
         given = {key: value for key, value in GIVEN.get(field.name, {}).items() if key in own}
         base = tuners.tuner(name, **given)
         other = other_value(field.name, getattr(tuners.configure(name, **given), field.name))
