@@ -13,7 +13,7 @@ FLAGS = $(call flag,TASK,task) $(call flag,PRESET,preset) $(call flag,METHOD,met
 	$(call flag,PRIOR,prior) $(call flag,SEED,seed) $(call flag,SEEDS,seeds) $(ARGS)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup lint type test test-all demo bench gaps pretrain finetune evaluate figures docs lock clean
+.PHONY: help setup lint type test test-all demo bench gaps pretrain finetune evaluate figures frozen docs lock clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -67,6 +67,9 @@ evaluate: $(PY) ## evaluate what a run has saved
 
 figures: $(PY) ## draw the figures again from the runs
 	$(PY) -m experiments.figures $(FLAGS)
+
+frozen: $(PY) ## every run of the frozen test, then its table (ARGS='--gpus 2 --jobs 6')
+	$(PY) -m experiments.frozen $(ARGS)
 
 docs: $(PY) ## build the documentation site in build/site (EXTRAS=dev,docs)
 	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict --quiet

@@ -1,0 +1,247 @@
+"""The frozen test: what runs, in which order, as which processes. Nothing is trained here."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from envs import gaps
+from experiments import cli, frozen, grid
+from sgft_jax.methods import NAMES
+from sgft_jax.types import UserError
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(frozen, "_PAUSE", 0.0)
+    monkeypatch.setattr(cli, "set_up", lambda: None)
+
+
+@pytest.fixture
+def ran(monkeypatch):
+    """Fine-tuning runs that only leave their folders."""
+    seen = []
+
+    def finetune(args):
+        seen.append(args)
+        for real in args.real:
+            folder = grid.run_folder(args, real)
+            folder.mkdir(parents=True, exist_ok=True)
+            (folder / "config.json").write_text("{}")
+            (folder / "summary.json").write_text(json.dumps({"final": {"rollouts": args.rollouts}}))
+
+    monkeypatch.setattr(grid, "finetune", finetune)
+    return seen
+
+
+def every(**changes):
+    return {unit.name: unit for unit in frozen.units(frozen.FrozenArgs(**changes))}
+
+
+def played(tmp_path, ran, name, **changes):
+    """The arguments of the one run of a unit."""
+    unit = every(out=tmp_path, **changes)[name]
+    assert unit.state() == "missing"
+    unit.work()
+    assert unit.state() == "finished"
+    (args,) = ran
+    return args
+
+
+# ------------------------------------------------------------ what there is to do
+
+
+def test_every_method_runs_on_every_task_after_its_priors():
+    names = list(every())
+    for task in frozen.TASKS:
+        assert {f"{task}/{method}" for method in NAMES if method not in frozen.LEFT_OUT} <= set(names)
+    for name, unit in every().items():
+        assert all(names.index(need) < names.index(name) for need in unit.needs)
+        assert bool(unit.needs) != ("/prior-" in name)
+    assert every()["hammer/tdmpc2"].needs == ("hammer/prior-robust-tdmpc2",)
+    assert every()["push/sysid"].needs == ("push/prior-informed",)
+    assert every()["push-ball/mbpo"].needs == ("push-ball/prior-robust",)
+
+
+def test_the_main_methods_run_on_all_test_gaps_and_without_one(tmp_path, ran):
+    args = played(tmp_path, ran, "insert/mbpo")
+    file = frozen._test_file("insert")
+    assert args.real == ("sim", *(f"{file}:{name}" for name in gaps.read_file(file)))
+    assert (args.seeds, args.seed, args.rollouts, args.eval_every, args.variant) == (12, 0, 20, 2, "")
+    assert args.prior == tmp_path / "pretrain/insert/robust/seeds-0-11"
+
+
+def test_methods_with_priors_of_their_own_have_fewer(tmp_path, ran):
+    args = played(tmp_path, ran, "push/recurrent", fewer=2)
+    assert len(args.real) == 9 and args.seeds == 2
+    assert args.prior == tmp_path / "pretrain/push/recurrent/seeds-0-1"
+
+
+def test_the_default_method_runs_again_with_the_same_priors_and_other_seeds(tmp_path, ran):
+    args = played(tmp_path, ran, "push/guarded-again")
+    assert (args.method, args.variant, args.seed, args.seeds) == ("guarded", "again", 12, 12)
+    assert args.prior == tmp_path / "pretrain/push/robust/seeds-0-11"  # seed 12 starts from prior 0 again
+
+
+def test_the_others_run_on_the_first_partial_and_the_first_failed_gap(tmp_path, ran):
+    args = played(tmp_path, ran, "hammer/pbrs")
+    strata = {gap.name: gap.stratum for gap in gaps.read_file(frozen._test_file("hammer")).values()}
+    chosen = [real.rpartition(":")[2] for real in args.real]
+    assert [strata[name] for name in chosen] == ["partial", "failed"] and args.seeds == 6
+    assert chosen == [next(n for n in strata if strata[n] == stratum) for stratum in ("partial", "failed")]
+
+
+def test_a_run_that_lacks_a_gap_is_unfinished(tmp_path, ran):
+    args = played(tmp_path, ran, "push/sac")
+    (grid.run_folder(args, args.real[3]) / "summary.json").unlink()
+    unit = every(out=tmp_path)["push/sac"]
+    assert unit.state() == "unfinished"
+    unit.work()
+    assert [run.real for run in ran[1:]] == [(args.real[3],)] and ran[1].resume
+
+
+def test_priors_go_on_where_they_stopped(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(frozen, "pretrain", seen.append)
+    unit = every(out=tmp_path)["push/prior-robust"]
+    unit.work()
+    folder = tmp_path / "pretrain/push/robust/seeds-0-11"
+    folder.mkdir(parents=True)
+    (folder / "config.json").touch()
+    assert unit.state() == "unfinished"
+    unit.work()
+    (folder / "summary.json").touch()
+    assert unit.state() == "finished"
+    assert [(args.preset, args.seeds, args.resume) for args in seen] == [("robust", 12, False), ("robust", 12, True)]
+
+
+def test_a_part_comes_with_the_priors_that_it_needs():
+    assert [unit.name for unit in frozen.select(every(), ("hammer/sysid", "hammer/sac-r"))] == [
+        "hammer/prior-robust", "hammer/prior-informed", "hammer/sysid", "hammer/sac-reset",
+    ]  # fmt: skip
+    found = every()
+    assert frozen.select(found, ()) == frozen.select(found, ("push", "insert", "hammer")) == list(found.values())
+    with pytest.raises(UserError, match=r"--only slide: no unit begins like this"):
+        frozen.select(every(), ("slide",))
+
+
+# ------------------------------------------------------------ doing it
+
+
+class Process:
+    """Ends at the n-th look."""
+
+    def __init__(self, looks, code):
+        self.looks, self.code, self.returncode, self.terminated = looks, code, None, False
+
+    def poll(self):
+        self.looks -= 1
+        self.returncode = self.code if self.looks <= 0 else None
+        return self.returncode
+
+    def terminate(self):
+        self.terminated = True
+
+
+def pool(tmp_path, monkeypatch, units, *, fails=(), **changes):
+    """A pool of units {name: needs} whose processes last three looks; and its starts: (name, GPU, beside how many)."""
+    begun = []
+
+    def process(self, unit, gpu):
+        begun.append((unit.name, gpu, len(self.running)))
+        return Process(3, int(unit.name in fails))
+
+    monkeypatch.setattr(frozen.Pool, "_process", process)
+    waiting = [frozen.Unit(name, needs, lambda: "missing", lambda: None) for name, needs in units.items()]
+    return frozen.Pool(frozen.FrozenArgs(out=tmp_path, **changes), waiting), begun
+
+
+def test_units_wait_for_what_they_need_and_share_the_gpus(tmp_path, monkeypatch, capsys):
+    units = {"p": (), "q": (), "a": ("p",), "b": ("q",), "c": ("p",)}
+    own, begun = pool(tmp_path, monkeypatch, units, jobs=1, gpus=2)
+    assert own.work() == []
+    assert begun == [("p", 0, 0), ("q", 1, 1), ("a", 0, 0), ("b", 1, 1), ("c", 0, 0)]
+    assert capsys.readouterr().out.count("done") == 5
+
+
+def test_what_needs_a_failed_unit_is_not_tried(tmp_path, monkeypatch):
+    own, begun = pool(tmp_path, monkeypatch, {"p": (), "q": (), "a": ("p",), "b": ("q",)}, fails=("p",), jobs=4)
+    assert own.work() == ["p", "a"]
+    assert [name for name, *_ in begun] == ["p", "q", "b"]
+
+
+def test_when_the_time_is_up_nothing_begins(tmp_path, monkeypatch, capsys):
+    own, begun = pool(tmp_path, monkeypatch, {"p": ()}, minutes=0.0)
+    assert own.work() == [] and begun == []
+    assert "no new units after 0 minutes" in capsys.readouterr().out
+
+
+def test_processes_end_with_the_command(tmp_path, monkeypatch):
+    own, _ = pool(tmp_path, monkeypatch, {"p": ()})
+
+    def interrupt(seconds):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(frozen.time, "sleep", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        own.work()
+    assert own.running["p"].process.terminated
+
+
+def test_a_process_does_one_unit_on_its_gpu(tmp_path, monkeypatch):
+    """What it is told is understood by the command line itself."""
+    seen = {}
+
+    def start(words, **given):
+        seen.update(given, words=words)
+        return Process(1, 0)
+
+    monkeypatch.setattr(frozen.subprocess, "Popen", start)
+    args = frozen.FrozenArgs(out=tmp_path / "a b", gpus=1, priors=3)
+    unit = every(out=args.out)["push/sac"]
+    frozen.Pool(args, [unit]).work()
+    assert seen["words"][1:3] == ["-m", "experiments.frozen"] and seen["env"]["CUDA_VISIBLE_DEVICES"] == "0"
+    told = cli.parse(frozen.FrozenArgs, "", seen["words"][3:])
+    assert (told.unit, told.priors, told.out) == ("push/sac", 3, tmp_path / "a b")
+    assert Path(seen["stdout"].name) == args.out / "frozen/push-sac.log"
+
+
+def test_the_command_ends_with_the_scoreboard_and_names_what_failed(tmp_path, ran, monkeypatch, capsys):
+    def process(self, unit, gpu):
+        code = int("mbpo" in unit.name)
+        if not code:
+            unit.work()
+        return Process(1, code)
+
+    monkeypatch.setattr(frozen.Pool, "_process", process)
+    monkeypatch.setattr(frozen, "pretrain", lambda args: leave_prior(args))
+    monkeypatch.setattr(frozen, "board", lambda args: f"board of {args.reference}, {len(args.gaps)} files")
+    words = ["--only", "push/sac", "push/mbpo", "--out", str(tmp_path)]
+    with pytest.raises(SystemExit) as stopped:
+        cli.run_main(frozen.main, frozen.FrozenArgs, "", argv=words)
+    told = capsys.readouterr()
+    assert stopped.value.code == 2 and told.err == f"error: failed, see {tmp_path / 'frozen'}: push/mbpo\n"
+    assert "board of guarded, 3 files" in told.out and "missing    push/sac\n" in told.out
+    cli.run_main(frozen.main, frozen.FrozenArgs, "", argv=["--only", "push/sac", "--dry", "--out", str(tmp_path)])
+    assert "finished   push/sac\n" in capsys.readouterr().out
+
+
+def leave_prior(args):
+    folder = frozen.run_folder(args)
+    folder.mkdir(parents=True)
+    (folder / "summary.json").touch()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--jobs", "0"], "--jobs is 0: must be at least 1"),
+        (["--unit", "push/sack"], "did you mean 'push/sac'"),
+        (["--only", "pull"], "--only pull: no unit begins like this"),
+    ],
+)
+def test_bad_input(words, said, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        cli.run_main(frozen.main, frozen.FrozenArgs, "", argv=[*words, "--out", str(tmp_path)])
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and said in error and error.count("\n") == 1
