@@ -42,6 +42,16 @@ def test_real_rows_come_first_and_the_numbers_are_static(source, real, simulated
         assert batch.is_sim.tolist() == [False] * real + [True] * simulated
 
 
+def test_two_buffers_draw_from_a_fixed_set_and_a_growing_one(key):
+    """Of the growing one only what it holds."""
+    source = sources.two_buffers(3, 20)
+    assert (source.n_real, source.n_sim) == (3, 20)
+    growing = replay.add_batch(replay.init(replay.blank(1, 1), 500), rows(SIM, 2))
+    batch = jax.jit(source.sample)((replay.full(rows(REAL, 4)), growing), key)
+    assert batch.reward.tolist() == batch.next_obs[:, 0].tolist() == [REAL] * 3 + [SIM] * 20
+    assert batch.is_sim.tolist() == [False] * 3 + [True] * 20
+
+
 def test_what_a_source_does_not_say_is_none(key):
     """It then costs nothing: a batch of real rows has five arrays."""
     assert len(jax.tree.leaves(sources.real_rows(4).sample(STATE, key))) == 5
