@@ -1,7 +1,7 @@
 """Sources of batches: real rows from a replay, simulated rows from a fixed set, and mixtures of both.
 
 The state of every source here is (replay of the real system, `SimulatedData` or None), but for `two_buffers`. Real rows
-come first.
+come first, but for `beside`.
 """
 
 import jax
@@ -51,6 +51,17 @@ def two_buffers(n_real: int, n_sim: int) -> Source:
         return _mixed(replay.sample(state[0], key_real, n_real), replay.sample(state[1], key_sim, n_sim))
 
     return Source(sample, n_real, n_sim)
+
+
+def beside(first: Source, second: Source) -> Source:
+    """The rows of `first`, then rows that `second` draws from the same state: a learner may treat them differently."""
+
+    def sample(state: State, key: Key) -> Batch:
+        key_first, key_second = jax.random.split(key)
+        both = first.sample(state, key_first), second.sample(state, key_second)
+        return jax.tree.map(lambda *x: jnp.concatenate(x), *both)
+
+    return Source(sample, first.n_real + second.n_real, first.n_sim + second.n_sim)
 
 
 def _mixed(real: Batch, simulated: Batch) -> Batch:
