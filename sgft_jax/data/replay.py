@@ -31,6 +31,14 @@ def init(example: Transition, capacity: int) -> ReplayState:
     return ReplayState(data, jnp.int32(0), jnp.int32(0))
 
 
+def full(rows: Transition) -> ReplayState:
+    """A buffer that is filled by given rows [N, ...] and by nothing else: a fixed set of data to sample."""
+    n = rows.reward.shape[0]
+    if n < 1:
+        raise UserError("replay: a fixed set needs at least 1 transition")
+    return ReplayState(jax.tree.map(jnp.asarray, rows), jnp.int32(0), jnp.int32(n))
+
+
 def add_batch(state: ReplayState, batch: Transition, valid: Array | None = None) -> ReplayState:
     """Append the valid rows, overwriting the oldest. batch: [n, ...] with n <= capacity; valid: [n] bool, default all.
 

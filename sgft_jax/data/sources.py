@@ -1,6 +1,7 @@
 """Sources of batches: real rows from a replay, simulated rows from a fixed set, and mixtures of both.
 
-The state of every source here is (replay of the real system, `SimulatedData` or None). Real rows come first.
+The state of every source here is (replay of the real system, `SimulatedData` or None), but for `two_buffers`. Real rows
+come first, but for `beside`.
 """
 
 import jax
@@ -34,11 +35,40 @@ def mixture(n_real: int, n_sim: int) -> Source:
 
     def sample(state: State, key: Key) -> Batch:
         key_real, key_sim = jax.random.split(key)
-        both = replay.sample(state[0], key_real, n_real), Batch(*state[1].draw(key_sim, n_sim))
-        rows = jax.tree.map(lambda *x: jnp.concatenate(x), *both)
-        return rows._replace(is_sim=jnp.arange(n_real + n_sim) >= n_real)
+        return _mixed(replay.sample(state[0], key_real, n_real), Batch(*state[1].draw(key_sim, n_sim)))
 
     return Source(sample, n_real, n_sim)
+
+
+def two_buffers(n_real: int, n_sim: int) -> Source:
+    """`n_real` rows of a fixed real set, then `n_sim` rows that a policy collects in a simulator.
+
+    The state is (`replay.full` of the set, replay of the simulator). Source: H2O (Niu et al. 2022).
+    """
+
+    def sample(state: tuple[replay.ReplayState, replay.ReplayState], key: Key) -> Batch:
+        key_real, key_sim = jax.random.split(key)
+        return _mixed(replay.sample(state[0], key_real, n_real), replay.sample(state[1], key_sim, n_sim))
+
+    return Source(sample, n_real, n_sim)
+
+
+def beside(first: Source, second: Source) -> Source:
+    """The rows of `first`, then rows that `second` draws from the same state: a learner may treat them differently."""
+
+    def sample(state: State, key: Key) -> Batch:
+        key_first, key_second = jax.random.split(key)
+        both = first.sample(state, key_first), second.sample(state, key_second)
+        return jax.tree.map(lambda *x: jnp.concatenate(x), *both)
+
+    return Source(sample, first.n_real + second.n_real, first.n_sim + second.n_sim)
+
+
+def _mixed(real: Batch, simulated: Batch) -> Batch:
+    """Real rows, then simulated ones, and which are which."""
+    n_real, n_sim = real.reward.shape[0], simulated.reward.shape[0]
+    rows = jax.tree.map(lambda *x: jnp.concatenate(x), real, simulated)
+    return rows._replace(is_sim=jnp.arange(n_real + n_sim) >= n_real)
 
 
 def blend(source: Source, share: Array | float) -> Source:

@@ -4,7 +4,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.types import Array, Batch
+from sgft_jax.types import Array, Batch, UserError
 
 
 def row_mean(each: Array, batch: Batch) -> Array:
@@ -15,6 +15,30 @@ def row_mean(each: Array, batch: Batch) -> Array:
     valid = ones if batch.valid is None else batch.valid.astype(each.dtype)
     weight = ones if batch.weight is None else batch.weight
     return jnp.sum(jnp.where(valid > 0, each, 0.0) * weight) / jnp.maximum(jnp.sum(valid), 1.0)
+
+
+def is_simulated(batch: Batch) -> Array:
+    """Which rows [B] bool are the simulator's; raises UserError where the batch does not say so."""
+    if batch.is_sim is None:
+        raise UserError("this learner must know which rows are simulated: give it batches of a source that mixes both")
+    return batch.is_sim
+
+
+def real_mean(each: Array, batch: Batch) -> Array:
+    """`row_mean` [] over the rows of the real system alone."""
+    return row_mean(each, batch._replace(valid=real_rows(batch)))
+
+
+def sim_mean(each: Array, batch: Batch) -> Array:
+    """`row_mean` [] over the simulator's rows alone."""
+    simulated = is_simulated(batch)
+    return row_mean(each, batch._replace(valid=simulated if batch.valid is None else simulated & batch.valid))
+
+
+def real_rows(batch: Batch) -> Array:
+    """The valid rows [B] bool of the real system."""
+    real = ~is_simulated(batch)
+    return real if batch.valid is None else real & batch.valid
 
 
 def td_target(reward: Array, discount: Array, next_q: Array, next_log_prob: Array, *, alpha: Array | float) -> Array:

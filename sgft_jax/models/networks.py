@@ -35,12 +35,16 @@ class Network(NamedTuple):
 
 
 class MLP(nn.Module):
-    """Linear layers with optional LayerNorm before each activation, and a linear output layer."""
+    """Linear layers with optional LayerNorm before each activation, and a linear output layer.
+
+    output_gain: of Xavier's uniform initialisation of the output layer, None = Flax's default.
+    """
 
     hidden: tuple[int, ...]
     outputs: int
     layer_norm: bool
     activation: str
+    output_gain: float | None = None
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
@@ -50,11 +54,16 @@ class MLP(nn.Module):
             if self.layer_norm:
                 x = nn.LayerNorm()(x)
             x = _ACTIVATIONS[self.activation](x)
-        return nn.Dense(self.outputs)(x)
+        if self.output_gain is None:
+            return nn.Dense(self.outputs)(x)
+        small = nn.initializers.variance_scaling(self.output_gain**2, "fan_avg", "uniform")
+        return nn.Dense(self.outputs, kernel_init=small)(x)
 
 
-def _mlp(inputs: int, outputs: int, config: NetworkConfig, *, layer_norm: bool) -> Network:
-    body = MLP(config.hidden, outputs, layer_norm, config.activation)
+def _mlp(
+    inputs: int, outputs: int, config: NetworkConfig, *, layer_norm: bool, output_gain: float | None = None
+) -> Network:
+    body = MLP(config.hidden, outputs, layer_norm, config.activation, output_gain)
 
     def init(key: Key) -> PyTree:
         return body.init(key, jnp.zeros(inputs))["params"]
@@ -88,15 +97,36 @@ def make_actor(obs_dim: int, act_dim: int, config: NetworkConfig) -> Network:
     return Network(body.init, apply)
 
 
-def make_critic(obs_dim: int, act_dim: int, config: NetworkConfig, *, members: int = 2) -> Network:
-    """apply(params, obs [obs_dim], action [act_dim]) -> [members] values."""
-    body = _ensemble(_mlp(obs_dim + act_dim, 1, config, layer_norm=config.layer_norm), members)
+def make_affine_actor(obs_dim: int, act_dim: int, config: NetworkConfig, *, output_gain: float) -> Network:
+    """As `make_actor`, with log std = scale * output + offset, clipped to [-20, 2].
+
+    scale and offset are learnt numbers that begin at 1 and -1: a std of about 0.37. output_gain: of `MLP`.
+    Source: the released code of H2O+ (Niu et al. 2023).
+    """
+    body = _mlp(obs_dim, 2 * act_dim, config, layer_norm=config.actor_layer_norm, output_gain=output_gain)
+
+    def init(key: Key) -> PyTree:
+        return {"body": body.init(key), "scale": jnp.float32(1.0), "offset": jnp.float32(-1.0)}
+
+    def apply(params: PyTree, obs: Array) -> Array:
+        mean, output = jnp.split(body.apply(params["body"], obs), 2)
+        return jnp.stack([mean, jnp.clip(params["scale"] * output + params["offset"], -20.0, LOG_STD_MAX)])
+
+    return Network(init, apply)
+
+
+def make_critic(
+    obs_dim: int, act_dim: int, config: NetworkConfig, *, members: int = 2, output_gain: float | None = None
+) -> Network:
+    """apply(params, obs [obs_dim], action [act_dim]) -> [members] values. output_gain: of `MLP`."""
+    member = _mlp(obs_dim + act_dim, 1, config, layer_norm=config.layer_norm, output_gain=output_gain)
+    body = _ensemble(member, members)
     return Network(body.init, lambda params, obs, action: body.apply(params, obs, action)[:, 0])
 
 
-def make_value(obs_dim: int, config: NetworkConfig) -> Network:
-    """apply(params, obs [obs_dim]) -> []."""
-    body = _mlp(obs_dim, 1, config, layer_norm=config.layer_norm)
+def make_value(obs_dim: int, config: NetworkConfig, *, output_gain: float | None = None) -> Network:
+    """apply(params, obs [obs_dim]) -> []. output_gain: of `MLP`."""
+    body = _mlp(obs_dim, 1, config, layer_norm=config.layer_norm, output_gain=output_gain)
     return Network(body.init, lambda params, obs: body.apply(params, obs)[0])
 
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.learners import iql, recurrent, sac, tdmpc2, tdmpc2_model
+from sgft_jax.learners import h2oplus, iql, recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.models import gru, networks
 from sgft_jax.types import Batch, Learner
 
@@ -137,6 +137,28 @@ def _iql():
     return case._replace(mode=_mode(case))
 
 
+def _h2oplus():
+    """Every other row is simulated."""
+    learner = h2oplus.make_h2oplus(
+        h2oplus.H2OPlusConfig(2, 1, network=NET, ratio_network=NET, tune_alpha=False),
+        h2oplus.H2OPlusHyper(lr_actor=3e-3, lr_critic=1e-2, lr_value=1e-2, tau=0.1, alpha=1e-4),
+    )
+    critic, value_net = networks.make_critic(2, 1, NET), networks.make_value(2, NET)
+
+    @jax.jit
+    def values(state, obs):
+        q = critic.apply(state.critic.params, obs, jnp.zeros(1))
+        return jnp.append(q, value_net.apply(state.value.params, obs))
+
+    case = counted(learner, feed=half_simulated, values=values, mode=None, steps=400)
+    return case._replace(mode=_mode(case))
+
+
+def half_simulated(batch):
+    """The same rows, of which every other one is the simulator's."""
+    return batch._replace(is_sim=jnp.arange(ROWS) % 2 == 1)
+
+
 def _recurrent():
     """Rows are first steps of episodes."""
     config = recurrent.RecurrentConfig(2, 1, network=NET, gru=8)
@@ -196,6 +218,7 @@ MAKERS = {
         critic_network=dataclasses.replace(NET, layer_norm=True),
     ),
     "iql": _iql,
+    "h2oplus": _h2oplus,
     "recurrent": _recurrent,
     "tdmpc2": lambda: _tdmpc2(PLAIN, 800),
     "sgft-tdmpc2": lambda: _tdmpc2(dataclasses.replace(PLAIN, sgft=True), 1000),

@@ -42,6 +42,26 @@ def test_real_rows_come_first_and_the_numbers_are_static(source, real, simulated
         assert batch.is_sim.tolist() == [False] * real + [True] * simulated
 
 
+def test_two_buffers_draw_from_a_fixed_set_and_a_growing_one(key):
+    """Of the growing one only what it holds."""
+    source = sources.two_buffers(3, 20)
+    assert (source.n_real, source.n_sim) == (3, 20)
+    growing = replay.add_batch(replay.init(replay.blank(1, 1), 500), rows(SIM, 2))
+    batch = jax.jit(source.sample)((replay.full(rows(REAL, 4)), growing), key)
+    assert batch.reward.tolist() == batch.next_obs[:, 0].tolist() == [REAL] * 3 + [SIM] * 20
+    assert batch.is_sim.tolist() == [False] * 3 + [True] * 20
+
+
+def test_beside_draws_twice_and_independently(key):
+    """A mixture, then another mixture of rows of their own."""
+    source = sources.beside(sources.two_buffers(2, 1), sources.two_buffers(30, 30))
+    real, sim = (replay.full(rows(0.0, 500)._replace(reward=jnp.arange(500.0) + start)) for start in (0, 1000))
+    batch = jax.jit(source.sample)((real, sim), key)
+    assert (source.n_real, source.n_sim) == (32, 31)
+    assert batch.is_sim.tolist() == (batch.reward >= 1000).tolist() == [False] * 2 + [True] + [False] * 30 + [True] * 30
+    assert batch.reward[:2].tolist() != batch.reward[3:5].tolist()
+
+
 def test_what_a_source_does_not_say_is_none(key):
     """It then costs nothing: a batch of real rows has five arrays."""
     assert len(jax.tree.leaves(sources.real_rows(4).sample(STATE, key))) == 5

@@ -109,3 +109,27 @@ def test_padded_rows_can_learn(key):
 def test_unknown_activation_is_named():
     with pytest.raises(UserError, match="gelu"):
         networks.NetworkConfig(activation="gelu")
+
+
+def test_affine_actor_by_hand(key):
+    """Log std = scale * output + offset, from -20 to 2; at first nearly -1 everywhere."""
+    actor = networks.make_affine_actor(3, 2, networks.NetworkConfig((8,)), output_gain=0.01)
+    params, obs = actor.init(key), jnp.array([0.5, -1.0, 2.0])
+    plain = actor.apply({**params, "scale": jnp.float32(1.0), "offset": jnp.float32(0.0)}, obs)
+    mean, log_std = actor.apply({**params, "scale": jnp.float32(3.0), "offset": jnp.float32(-2.0)}, obs)
+    np.testing.assert_allclose(mean, plain[0])
+    np.testing.assert_allclose(log_std, 3 * plain[1] - 2, rtol=1e-6)
+    np.testing.assert_allclose(actor.apply(params, obs)[1], -1.0, atol=0.05)
+    for offset, bound in ((-30.0, -20.0), (9.0, 2.0)):
+        assert jnp.all(actor.apply({**params, "offset": jnp.float32(offset)}, obs)[1] == bound)
+
+
+def test_output_gain_is_xaviers(key):
+    """Uniform up to gain * sqrt(6 / (inputs + outputs)); other layers are as without it."""
+    small, plain = (
+        networks.make_value(3, networks.NetworkConfig((64,)), output_gain=g).init(key) for g in (0.01, None)
+    )
+    limit = 0.01 * np.sqrt(6 / (64 + 1))
+    kernel = np.abs(small["Dense_1"]["kernel"])
+    assert 0.9 * limit < kernel.max() <= limit and not np.any(small["Dense_1"]["bias"])
+    np.testing.assert_array_equal(small["Dense_0"]["kernel"], plain["Dense_0"]["kernel"])

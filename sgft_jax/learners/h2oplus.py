@@ -1,0 +1,358 @@
+"""H2O+: one policy from a fixed set of real data and the rows that it collects in an imperfect simulator.
+
+Both feed one critic. Its target mixes two bootstraps, the in-sample value of the real data and SAC's; simulated errors
+weigh as much as the simulator's dynamics can be trusted there. Structure is static in `H2OPlusConfig`; every number is
+a leaf of the state in `H2OPlusHyper`. Source: Niu et al. 2023 (H2O+), and where it is silent its released code.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from sgft_jax import checks
+from sgft_jax.data import sources
+from sgft_jax.learners import iql, losses, optim
+from sgft_jax.learners.sac import step_temperature
+from sgft_jax.learners.value_losses import ValueLoss, value_loss
+from sgft_jax.models import normalizer
+from sgft_jax.models.networks import (
+    Network,
+    NetworkConfig,
+    make_affine_actor,
+    make_critic,
+    make_value,
+    tanh_gaussian_action,
+    tanh_gaussian_sample,
+)
+from sgft_jax.models.ratio import Ratio, RatioConfig, RatioState, make_ratio, weight
+from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree, Source, UserError, unknown
+
+OUTPUT_GAIN = 0.01  # of the last layers: all values and means begin near 0
+
+
+def _wide() -> NetworkConfig:
+    return NetworkConfig((256, 256))
+
+
+@dataclass(frozen=True)
+class H2OPlusConfig:
+    """The structure of an agent.
+
+    obs_dim, act_dim: sizes of what the environment gives and takes.
+    network: body of actor, critics and value. critics: members; targets and actor use the minimum of all.
+    value_loss: the backbone, which says what V is.
+    tune_alpha: follow the target entropy; False keeps the temperature at `H2OPlusHyper.alpha`.
+    ratio: weigh simulated errors by the ratio of the dynamics; False counts them like real ones.
+    ratio_network: body of the two discriminators. ratio_noise: std of their training noise, in units of what they read.
+    ratio_rows: the last so many rows of a batch train the discriminators and nothing else; None = all rows train all.
+    """
+
+    obs_dim: int
+    act_dim: int
+    network: NetworkConfig = field(default_factory=_wide)
+    critics: int = 2
+    value_loss: ValueLoss = "iql"
+    tune_alpha: bool = True
+    ratio: bool = True
+    ratio_network: NetworkConfig = field(default_factory=_wide)
+    ratio_noise: float = 0.1
+    ratio_rows: int | None = None
+
+    def __post_init__(self) -> None:
+        checks.at_least(self, 1, "critics", "ratio_rows")
+        if self.value_loss not in (known := get_args(ValueLoss)):
+            raise UserError(unknown("value loss", self.value_loss, known))
+
+
+class H2OPlusHyper(NamedTuple):
+    """The numbers of an agent, each []. The defaults are those of the preset "paper".
+
+    lr_*: Adam learning rates. tau: target averaging rate.
+    alpha: initial (or fixed) temperature; entropy_per_dim: target entropy / act_dim, nats.
+    value_share: lambda, share of the bootstrap from V; 0 is SAC on both sources, 1 never asks the policy.
+    expectile: of the value loss "iql". value_alpha: scale of the others, in units of return.
+    """
+
+    lr_actor: float | Array = 3e-4
+    lr_critic: float | Array = 3e-4
+    lr_value: float | Array = 3e-4
+    lr_alpha: float | Array = 3e-4
+    lr_ratio: float | Array = 3e-4
+    tau: float | Array = 0.005
+    alpha: float | Array = 1.0
+    entropy_per_dim: float | Array = -1.0
+    value_share: float | Array = 0.1
+    expectile: float | Array = 0.7
+    value_alpha: float | Array = 1.0
+
+
+class H2OPlusState(struct.PyTreeNode):
+    """An agent in training. step: [] int32 updates done.
+
+    normalizer: of the observations that actor, critic and value read. ratio: None where the ratio is off; it has a
+    normaliser of its own. Both leave observations as they are until they are set.
+    """
+
+    actor: optim.Fit
+    critic: optim.Fit
+    target_critic: PyTree
+    value: optim.Fit
+    log_alpha: optim.Fit
+    ratio: RatioState | None
+    normalizer: Normalizer
+    hyper: H2OPlusHyper
+    step: Array
+
+
+# --- published settings -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class H2OPlusPreset:
+    """Settings with a name.
+
+    source: where they come from. hidden: of actor, critics and value; the discriminators stay at 256 x 2.
+    rows: how many real rows an update takes, and as many simulated ones. ratio_rows: the same of the discriminators'.
+    hyper: the numbers.
+    """
+
+    source: str
+    hidden: tuple[int, ...] = (256, 256)
+    rows: int = 128
+    ratio_rows: int = 256
+    hyper: H2OPlusHyper = field(default_factory=H2OPlusHyper)
+
+    def config(self, obs_dim: int, act_dim: int) -> H2OPlusConfig:
+        """The structure for an environment."""
+        return H2OPlusConfig(obs_dim, act_dim, NetworkConfig(self.hidden), ratio_rows=2 * self.ratio_rows)
+
+    def batches(self) -> Source:
+        """What an update takes, from the state of `sources.two_buffers`."""
+        return sources.beside(*(sources.two_buffers(n, n) for n in (self.rows, self.ratio_rows)))
+
+
+PRESETS: Mapping[str, H2OPlusPreset] = MappingProxyType(
+    {
+        "paper": H2OPlusPreset("H2O+ paper; expectile and sizes, which it leaves out, from IQL and the released code"),
+        "released": H2OPlusPreset(
+            "released MuJoCo code: an expectile of 0.5 makes V the mean of the data's actions",
+            hyper=H2OPlusHyper(value_share=0.5, expectile=0.5),
+        ),
+        "released-robot": H2OPlusPreset(
+            "released code of the wheel-legged robot", (32, 32), 16, hyper=H2OPlusHyper(expectile=0.9)
+        ),
+    }
+)
+
+
+# --- the learner ------------------------------------------------------------------------------------------------------
+
+
+def mixed_target(
+    reward: Array,
+    discount: Array,
+    next_value: Array,
+    next_q: Array,
+    next_log_prob: Array,
+    *,
+    value_share: Array | float,
+    alpha: Array | float,
+) -> Array:
+    """A share lambda of r + discount V(s'), the rest of r + discount (min_i Q_i(s', a') - alpha log pi(a'|s')).
+
+    next_q: [members]; all others []. A constant for gradients. The discount is gamma (1 - terminated).
+    Source: H2O+ Eq. (7).
+    """
+    in_sample = iql.td_target(reward, discount, next_value, reward_scale=1.0)
+    online = losses.td_target(reward, discount, next_q, next_log_prob, alpha=alpha)
+    return value_share * in_sample + (1 - value_share) * online
+
+
+class _Parts(NamedTuple):
+    """The networks and the optimiser that a configuration describes."""
+
+    actor: Network
+    critic: Network
+    value: Network
+    ratio: Ratio
+    optimiser: optax.GradientTransformation
+
+
+def make_h2oplus(config: H2OPlusConfig, hyper: H2OPlusHyper | None = None) -> Learner:
+    """The learner of a configuration. Its batches must say which rows are simulated (`Batch.is_sim`)."""
+    sizes, body = (config.obs_dim, config.act_dim), config.network
+    parts = _Parts(
+        actor=make_affine_actor(*sizes, body, output_gain=OUTPUT_GAIN),
+        critic=make_critic(*sizes, body, members=config.critics, output_gain=OUTPUT_GAIN),
+        value=make_value(config.obs_dim, body, output_gain=OUTPUT_GAIN),
+        ratio=make_ratio(RatioConfig(*sizes, config.ratio_network, noise=config.ratio_noise)),
+        optimiser=optim.adam(),
+    )
+    leaves = hyper or H2OPlusHyper()
+
+    def init(key: Key) -> H2OPlusState:
+        keys = jax.random.split(key, 4)
+        critic = parts.critic.init(keys[1])
+        numbers = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), leaves)
+        return H2OPlusState(
+            actor=optim.start(parts.optimiser, parts.actor.init(keys[0])),
+            critic=optim.start(parts.optimiser, critic),
+            target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
+            value=optim.start(parts.optimiser, parts.value.init(keys[2])),
+            log_alpha=optim.start(parts.optimiser, jnp.log(numbers.alpha)),
+            ratio=parts.ratio.init(keys[3]) if config.ratio else None,
+            normalizer=normalizer.identity(config.obs_dim),
+            hyper=numbers,
+            step=jnp.int32(0),
+        )
+
+    def act(
+        state: H2OPlusState,
+        carry: tuple[()],
+        obs: Array,
+        key: Key,
+        *,
+        explore: bool | Array,
+        context: Array | None = None,
+    ) -> tuple[Array, tuple[()]]:
+        del context  # it reads the observation alone
+        moments = parts.actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
+        return tanh_gaussian_action(moments, key, explore=explore), carry
+
+    def update(state: H2OPlusState, batch: Batch, key: Key) -> tuple[H2OPlusState, Metrics]:
+        return _update(config, parts, state, batch, key)
+
+    return Learner(init, lambda: (), act, update)
+
+
+# --- one update -------------------------------------------------------------------------------------------------------
+
+
+def _update(
+    config: H2OPlusConfig, parts: _Parts, state: H2OPlusState, batch: Batch, key: Key
+) -> tuple[H2OPlusState, Metrics]:
+    """Discriminators first. All other losses are those of the networks before the update. Source: the released code."""
+    key_ratio, key_actor, key_target = jax.random.split(key, 3)
+    batch, for_ratio = _split(config, batch)
+    state, weights, metrics = _update_ratio(config, parts, state, batch, for_ratio, key_ratio)
+    normal = jax.vmap(normalizer.normalize, (None, 0))
+    batch = batch._replace(obs=normal(state.normalizer, batch.obs), next_obs=normal(state.normalizer, batch.next_obs))
+
+    actor, log_alpha, of_actor = _step_policy(config, parts, state, batch, key_actor)
+    value, of_value = _step_value(config, parts, state, batch)
+    critic, of_critic = _step_critic(parts, state, batch, weights, key_target)
+    target = optax.incremental_update(critic.params, state.target_critic, state.hyper.tau)
+    state = state.replace(
+        actor=actor, log_alpha=log_alpha, value=value, critic=critic, target_critic=target, step=state.step + 1
+    )
+    return state, metrics | of_actor | of_value | of_critic | {"actor/alpha": jnp.exp(log_alpha.params)}
+
+
+def _split(config: H2OPlusConfig, batch: Batch) -> tuple[Batch, Batch]:
+    """The rows that everything but the discriminators learns from, and theirs."""
+    if config.ratio_rows is None:
+        return batch, batch
+    kept = batch.reward.shape[0] - config.ratio_rows
+    if kept < 1:
+        raise UserError(
+            f"option ratio-rows is {config.ratio_rows}: must be less than the batch, {kept + config.ratio_rows}"
+        )
+    return jax.tree.map(lambda x: x[:kept], batch), jax.tree.map(lambda x: x[kept:], batch)
+
+
+def _update_ratio(
+    config: H2OPlusConfig, parts: _Parts, state: H2OPlusState, batch: Batch, for_ratio: Batch, key: Key
+) -> tuple[H2OPlusState, Array, Metrics]:
+    """One step of the discriminators, then the weights [B] that they give to the rows of `batch`, 1 to real ones."""
+    simulated, ones = losses.is_simulated(batch), jnp.ones_like(batch.reward)
+    if not config.ratio:
+        return state, ones, {}
+    fit, metrics = parts.ratio.update(state.ratio, for_ratio, key, rate=state.hyper.lr_ratio)
+    log_w = jax.vmap(parts.ratio.log_ratio, (None, 0, 0, 0))(fit, batch.obs, batch.action, batch.next_obs)
+    weights = jax.vmap(weight)(log_w)
+    metrics |= {
+        "ratio/weight_sim": losses.sim_mean(weights, batch),
+        "ratio/weight_real": losses.real_mean(weights, batch),
+    }
+    return state.replace(ratio=fit), jnp.where(simulated, weights, ones), metrics
+
+
+def _step_policy(
+    config: H2OPlusConfig, parts: _Parts, state: H2OPlusState, batch: Batch, key: Key
+) -> tuple[optim.Fit, optim.Fit, Metrics]:
+    """Actor and temperature after a step on the states of both sources. Source: H2O+ Eq. (10), with a ~ pi."""
+    alpha, keys = jnp.exp(state.log_alpha.params), jax.random.split(key, batch.reward.shape[0])
+
+    def one(params: PyTree, obs: Array, key: Key) -> tuple[Array, Array]:
+        action, log_prob = tanh_gaussian_sample(parts.actor.apply(params, obs), key)
+        q = parts.critic.apply(state.critic.params, obs, action)
+        return losses.actor_loss(log_prob, q, alpha=alpha), log_prob
+
+    def loss(params: PyTree) -> tuple[Array, Array]:
+        each, log_prob = jax.vmap(one, (None, 0, 0))(params, batch.obs, keys)
+        return losses.row_mean(each, batch), log_prob
+
+    (mean, log_prob), grads = jax.value_and_grad(loss, has_aux=True)(state.actor.params)
+    actor = optim.step(parts.optimiser, state.actor, grads, state.hyper.lr_actor)
+    metrics = {"actor/loss": mean, "actor/entropy": -jnp.mean(log_prob)}
+    if not config.tune_alpha:
+        return actor, state.log_alpha, metrics
+    target = state.hyper.entropy_per_dim * config.act_dim
+    log_alpha = step_temperature(
+        parts.optimiser, state.log_alpha, batch, log_prob, target=target, rate=state.hyper.lr_alpha
+    )
+    return actor, log_alpha, metrics
+
+
+def _step_value(config: H2OPlusConfig, parts: _Parts, state: H2OPlusState, batch: Batch) -> tuple[optim.Fit, Metrics]:
+    """V after a step on the real rows alone, against the minimum of the target critics. Source: H2O+ Eq. (4)."""
+    q = jnp.min(jax.vmap(parts.critic.apply, (None, 0, 0))(state.target_critic, batch.obs, batch.action), axis=1)
+    hyper, counted = state.hyper, losses.real_rows(batch)
+
+    def loss(params: PyTree) -> tuple[Array, Array]:
+        values = jax.vmap(parts.value.apply, (None, 0))(params, batch.obs)
+        each = value_loss(config.value_loss, values, q, counted, expectile=hyper.expectile, alpha=hyper.value_alpha)
+        return losses.real_mean(each, batch), values
+
+    (mean, values), grads = jax.value_and_grad(loss, has_aux=True)(state.value.params)
+    fit = optim.step(parts.optimiser, state.value, grads, hyper.lr_value)
+    return fit, {"value/loss": mean, "value/mean": losses.real_mean(values, batch)}
+
+
+def _step_critic(
+    parts: _Parts, state: H2OPlusState, batch: Batch, weights: Array, key: Key
+) -> tuple[optim.Fit, Metrics]:
+    """The critics after a step on real and weighted simulated errors, a mean of each. Source: H2O+ Eqs. (7), (8)."""
+    hyper, alpha = state.hyper, jnp.exp(state.log_alpha.params)
+
+    def target(row: Batch, key: Key) -> Array:
+        action, log_prob = tanh_gaussian_sample(parts.actor.apply(state.actor.params, row.next_obs), key)
+        next_q = parts.critic.apply(state.target_critic, row.next_obs, action)
+        next_value = parts.value.apply(state.value.params, row.next_obs)
+        return mixed_target(
+            row.reward, row.discount, next_value, next_q, log_prob, value_share=hyper.value_share, alpha=alpha
+        )
+
+    targets = jax.vmap(target)(batch, jax.random.split(key, batch.reward.shape[0]))
+
+    def loss(params: PyTree) -> tuple[Array, tuple[Array, Array, Array]]:
+        q = jax.vmap(parts.critic.apply, (None, 0, 0))(params, batch.obs, batch.action)
+        each = jax.vmap(losses.critic_loss)(q, targets)
+        real, simulated = losses.real_mean(each, batch), losses.sim_mean(weights * each, batch)
+        return real + simulated, (q, real, simulated)
+
+    (total, (q, real, simulated)), grads = jax.value_and_grad(loss, has_aux=True)(state.critic.params)
+    fit = optim.step(parts.optimiser, state.critic, grads, hyper.lr_critic)
+    return fit, {
+        "critic/loss": total,
+        "critic/real_loss": real,
+        "critic/sim_loss": simulated,
+        "critic/q_mean": jnp.mean(q),
+        "critic/target_mean": jnp.mean(targets),
+    }

@@ -1,0 +1,281 @@
+"""Recorded sets: every row of small files that are written here, both conventions, and files that are not whole."""
+
+import dataclasses
+import hashlib
+import json
+
+import h5py
+import jax
+import numpy as np
+import pytest
+
+from sgft_jax.data import logs, replay, sources
+from sgft_jax.types import SimulatedData, Transition, UserError
+
+# Row by row: an episode that ends by falling, one that the time limit ends, one that falls at its time limit, and one
+# that the end of the file cuts off.
+TERMINAL = np.array([0, 1, 0, 0, 0, 1, 0], bool)
+TIMEOUT = np.array([0, 0, 0, 1, 0, 1, 0], bool)
+REWARD = np.array([1, 2, 3, 4, 5, 6, 7], np.float32)
+N = len(REWARD)
+
+
+def numbers(offset, width=2):
+    """[N, width] numbers that cannot be mistaken for others."""
+    return (offset + np.arange(N)[:, None] + 0.1 * np.arange(width)).astype(np.float32)
+
+
+def d4rl(**changes):
+    """The arrays of a D4RL file; None leaves one out."""
+    arrays = {
+        "observations": numbers(0),
+        "actions": np.linspace(-0.9, 0.9, N)[:, None],
+        "next_observations": numbers(100),
+        "rewards": REWARD,
+        "terminals": TERMINAL,
+        "timeouts": TIMEOUT,
+        "metadata/algorithm": np.bytes_("SAC"),
+    }
+    return {name: array for name, array in {**arrays, **changes}.items() if array is not None}
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(arrays, name="some.hdf5"):
+        with h5py.File(tmp_path / name, "w") as file:
+            for key, array in arrays.items():
+                file[key] = array
+        return tmp_path / name
+
+    return write
+
+
+# --- D4RL -----------------------------------------------------------------------------------------------------------
+
+
+def test_stored_successors_keep_every_row(write):
+    rows, facts = logs.load(write(d4rl()), gamma=0.9)
+    np.testing.assert_array_equal(rows.obs, numbers(0))
+    np.testing.assert_array_equal(rows.next_obs, numbers(100))
+    np.testing.assert_array_equal(rows.reward, REWARD)
+    np.testing.assert_array_equal(rows.action, np.float32(np.linspace(-0.9, 0.9, N)[:, None]))
+    # row 3 ends by the time limit alone: what could still be had counts
+    np.testing.assert_array_equal(rows.discount, np.float32([0.9, 0, 0.9, 0.9, 0.9, 0, 0.9]))
+    assert all(x.dtype == np.float32 for x in rows)
+    assert (facts.layout, facts.successors, facts.dropped) == ("d4rl", "stored", 0)
+
+
+def test_shifted_successors_drop_time_limits_and_the_last_row(write):
+    """Row 5 is both terminal and a time limit: D4RL's own reader drops it."""
+    rows, facts = logs.load(write(d4rl(next_observations=None)), gamma=0.9, successors="shifted")
+    np.testing.assert_array_equal(rows.reward, [1, 2, 3, 5])
+    np.testing.assert_array_equal(rows.obs[:, 0], [0, 1, 2, 4])
+    np.testing.assert_array_equal(rows.next_obs[:, 0], [1, 2, 3, 5])
+    np.testing.assert_array_equal(rows.discount, np.float32([0.9, 0, 0.9, 0.9]))
+    assert (facts.successors, facts.dropped, facts.terminal) == ("shifted", 3, 1)
+
+
+def test_facts_by_hand(write):
+    path = write(d4rl())
+    facts = logs.load(path, gamma=0.99).facts
+    # whole episodes: 1 + 2, 3 + 4, 5 + 6; the 7 belongs to one that is cut off
+    assert (facts.transitions, facts.episodes, facts.whole_episodes, facts.terminal) == (7, 4, 3, 2)
+    assert (facts.return_mean, facts.return_min, facts.return_max) == (7.0, 3.0, 11.0)
+    assert facts.return_std == pytest.approx(np.sqrt(32 / 3))  # (16 + 0 + 16) / 3
+    assert facts.size == path.stat().st_size and facts.path == str(path)
+    assert facts.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    json.dumps(dataclasses.asdict(facts))
+
+
+def test_the_checksum_tells_files_apart(write):
+    one, other = (logs.load(write(d4rl(rewards=REWARD + i)), gamma=0.9).facts.sha256 for i in range(2))
+    assert one != other
+
+
+def test_without_a_whole_episode_the_rest_counts(write):
+    facts = logs.load(write(d4rl(terminals=np.zeros(N, bool), timeouts=np.zeros(N, bool))), gamma=0.9).facts
+    assert (facts.episodes, facts.whole_episodes, facts.return_mean, facts.return_std) == (1, 0, 28.0, 0.0)
+
+
+def test_actions_are_clipped_and_counted(write):
+    action = np.zeros((N, 2))
+    action[1], action[4] = [1.5, 0.2], [0.1, -3.0]
+    rows, facts = logs.load(write(d4rl(actions=action)), gamma=0.9)
+    np.testing.assert_array_equal(rows.action[[1, 4]], np.float32([[1, 0.2], [0.1, -1]]))
+    assert facts.clipped == 2
+
+
+def test_a_log_can_be_sampled(write, key):
+    rows = logs.load(write(d4rl()), gamma=0.9).rows
+    state = replay.full(rows)
+    assert state.size == N and state.position == 0
+    batch = jax.jit(replay.sample, static_argnums=2)(state, key, 500)
+    assert set(np.asarray(batch.reward).tolist()) == set(REWARD.tolist())
+    np.testing.assert_array_equal(batch.next_obs[:, 0], 99 + batch.reward)
+    simulated = SimulatedData(lambda key, n: jax.tree.map(lambda x: x[:n], rows), REWARD)
+    mixed = sources.mixture(4, 3).sample((state, simulated), key)
+    assert mixed.is_sim.tolist() == [False] * 4 + [True] * 3
+
+
+# --- files that are not what they should be ---------------------------------------------------------------------------
+
+
+def refused(path, **options):
+    """The one line that the user reads; it names the file."""
+    with pytest.raises(UserError) as caught:
+        logs.load(path, gamma=0.9, **options)
+    said = str(caught.value)
+    assert "\n" not in said and str(path) in said
+    return said
+
+
+def test_a_missing_or_foreign_file_is_refused(tmp_path, write):
+    assert "no such file" in refused(tmp_path / "absent.hdf5")
+    (tmp_path / "foreign.hdf5").write_text("<html>403 Forbidden</html>")
+    assert "not an HDF5 file" in refused(tmp_path / "foreign.hdf5")
+    assert "no 'observations' in /, only images" in refused(write({"images": np.zeros(3)}))
+    assert "holds no data/main_data.hdf5" in refused(tmp_path)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9, 0.999])
+def test_a_file_that_was_cut_off_is_refused(write, share):
+    path = write(d4rl(observations=np.zeros((N, 5000))))
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    assert "cut off" in refused(path) and "supply a whole file" in refused(path)
+
+
+def test_damaged_chunks_are_refused(tmp_path):
+    """The file opens, and its numbers do not."""
+    path = tmp_path / "damaged.hdf5"
+    with h5py.File(path, "w") as file:
+        for name, array in d4rl().items():
+            if array.shape:
+                file.create_dataset(name, data=array, compression="gzip", fletcher32=True)
+        where = file["rewards"].id.get_chunk_info(0)
+    content = bytearray(path.read_bytes())
+    content[where.byte_offset : where.byte_offset + where.size] = bytes(where.size)
+    path.write_bytes(content)
+    assert "damaged or cut off" in refused(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"timeouts": None}, "no 'timeouts'"),
+        ({"next_observations": None}, "set successors to 'shifted'"),
+        ({"rewards": REWARD[:-1]}, "rows differ (obs 7, action 7, reward 6"),
+        ({"next_observations": numbers(0, width=3)}, "next observations are [7, 3], observations [7, 2]"),
+        ({"observations": np.where(np.arange(N)[:, None] == 4, np.nan, numbers(0))}, "obs of row 4 is not finite"),
+        ({"rewards": np.where(np.arange(N) == 2, np.inf, REWARD)}, "reward of row 2 is not finite"),
+        ({"observations": np.zeros((N, 8, 8, 3))}, "not [rows, numbers]"),
+        ({"rewards": REWARD[:, None]}, "not [rows] numbers"),
+        ({"actions": np.full((N, 1), b"left")}, "not [rows, numbers]"),
+        ({"observations/state": numbers(0), "observations": None}, "/observations is a group"),
+        ({name: array[:0] for name, array in d4rl().items() if array.shape}, "holds no transitions"),
+    ],
+)
+def test_odd_arrays_are_refused(write, changes, said):
+    assert said in refused(write(d4rl(**changes)))
+
+
+def test_an_unknown_convention_is_refused(write):
+    with pytest.raises(UserError, match="did you mean 'shifted'"):
+        logs.load(write(d4rl()), gamma=0.9, successors="shift")
+
+
+def test_a_fixed_set_needs_a_row():
+    with pytest.raises(UserError, match="at least 1 transition"):
+        replay.full(Transition(*(np.zeros((0, 1)), np.zeros((0, 1)), np.zeros(0), np.zeros(0), np.zeros((0, 1)))))
+
+
+# --- Minari ---------------------------------------------------------------------------------------------------------
+
+
+def episode(number, steps, *, terminated):
+    """The arrays of one episode, whose observations are 10 * number + step."""
+    last = np.arange(steps) == steps - 1
+    return {
+        "observations": np.repeat(10.0 * number + np.arange(steps + 1)[:, None], 2, axis=1),
+        "actions": np.full((steps, 1), 0.5),
+        "rewards": np.ones(steps),
+        "terminations": last & terminated,
+        "truncations": last & (not terminated),
+        "infos/qpos": np.zeros((steps + 1, 3)),
+    }
+
+
+@pytest.fixture
+def minari(tmp_path):
+    """Writes a data set of twelve episodes: 10 comes after 9, not after 1."""
+
+    def write(change=lambda file: None, **card):
+        data = tmp_path / "toy" / "walk-v0" / "data"
+        data.mkdir(parents=True, exist_ok=True)
+        with h5py.File(data / "main_data.hdf5", "w") as file:
+            for number in range(12):
+                group = file.create_group(f"episode_{number}")
+                group.attrs["total_steps"] = 2
+                for name, array in episode(number, 2, terminated=number % 2 == 1).items():
+                    group[name] = array
+            change(file)
+        said = {"data_format": "hdf5", "total_episodes": 12, "total_steps": 24, **card}
+        (data / "metadata.json").write_text(json.dumps(said))
+        return data.parent
+
+    return write
+
+
+def test_minari_episodes_have_their_own_successors(minari):
+    folder = minari()
+    rows, facts = logs.load(folder, gamma=0.9)
+    first = np.array([10 * number + step for number in range(12) for step in range(2)])
+    np.testing.assert_array_equal(rows.obs[:, 0], first)
+    np.testing.assert_array_equal(rows.next_obs[:, 0], first + 1)
+    # even episodes end by the time limit, odd ones for good
+    np.testing.assert_array_equal(rows.discount, np.float32([0.9, 0.9, 0.9, 0.0] * 6))
+    assert (facts.layout, facts.successors, facts.transitions, facts.episodes) == ("minari", "episode", 24, 12)
+    assert (facts.return_mean, facts.return_std, facts.terminal, facts.whole_episodes) == (2.0, 0.0, 6, 12)
+    for same in (folder / "data", folder / "data" / "main_data.hdf5"):
+        assert logs.load(same, gamma=0.9).facts == facts
+
+
+def test_odd_minari_sets_are_refused(minari):
+    folder = minari(total_steps=30)
+    with pytest.raises(UserError, match=r"holds total_steps 24, but metadata.json says 30; supply a whole data set"):
+        logs.load(folder, gamma=0.9)
+
+    def shorten(file):
+        del file["episode_3/observations"]
+        file["episode_3/observations"] = np.zeros((2, 2))
+
+    with pytest.raises(UserError, match=r"/episode_3 has 2 observations for 2 of 2 rewards"):
+        logs.load(minari(shorten), gamma=0.9)
+    with pytest.raises(UserError, match="leave successors at 'stored'"):
+        logs.load(minari(), gamma=0.9, successors="shifted")
+    (folder / "data" / "main_data.hdf5").unlink()
+    (folder / "data" / "metadata.json").write_text(json.dumps({"data_format": "arrow"}))
+    with pytest.raises(UserError, match="data_format is arrow; make the data set with data_format='hdf5'"):
+        logs.load(folder, gamma=0.9)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # its advice on authors and links
+def test_what_minaris_own_library_writes_can_be_read(tmp_path, monkeypatch):
+    minari = pytest.importorskip("minari", reason="Minari's library is not installed: pip install 'sgft-jax[minari]'")
+    import gymnasium
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    box = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    episodes = []
+    for number in range(3):
+        arrays = episode(number, 4, terminated=number == 1)
+        arrays.pop("infos/qpos")
+        episodes.append(minari.data_collector.EpisodeBuffer(id=number, infos={}, **arrays))
+    minari.create_dataset_from_buffers(
+        "toy/walk-v0", episodes, observation_space=box, action_space=gymnasium.spaces.Box(-1, 1, (1,), np.float64),
+        data_format="hdf5",
+    )  # fmt: skip
+    rows, facts = logs.load(tmp_path / "toy" / "walk-v0", gamma=0.9)
+    np.testing.assert_array_equal(rows.obs[:, 0], [10 * number + step for number in range(3) for step in range(4)])
+    np.testing.assert_array_equal(rows.next_obs, rows.obs + 1)
+    assert (facts.episodes, facts.terminal) == (3, 1)
