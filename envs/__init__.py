@@ -27,6 +27,8 @@ TASKS = {
     "push-ball": "envs.franka.ball",
     "hammer": "envs.franka.hammer",
     "insert": "envs.franka.insert",
+    "halfcheetah": "envs.locomotion.halfcheetah",
+    "walker2d": "envs.locomotion.walker2d",
 }
 _OURS = frozenset(TASKS.values())
 _LAZY = {

@@ -61,6 +61,8 @@ class Effects(NamedTuple):
     obs_noise: [] raw units, std of Gaussian sensor noise.
     obs_noise_prob: [] probability that an observation vector is noisy.
     obs_bias: [measured_dim] raw units, constant calibration error of the sensors.
+    action_noise: [act_dim] std of Gaussian noise that the robot adds to the command at every step, in units of its
+        range; where it is not 0, the noisy command is clipped to [-1, 1].
     """
 
     action_scale: Array
@@ -71,6 +73,7 @@ class Effects(NamedTuple):
     obs_noise: Array
     obs_noise_prob: Array
     obs_bias: Array
+    action_noise: Array
 
 
 class EffectRange(NamedTuple):
@@ -245,7 +248,8 @@ class Env(NamedTuple):
 
 def entries_of(env: Env, effect: str) -> tuple[Entry, ...]:
     """What an effect is a vector over; () for one that is a number, and for what is no effect."""
-    return {"action_scale": env.action, "action_bias": env.action, "obs_bias": env.measured}.get(effect, ())
+    of_actions = dict.fromkeys(("action_scale", "action_bias", "action_noise"), env.action)
+    return {**of_actions, "obs_bias": env.measured}.get(effect, ())
 
 
 def misnamed(env: Env, name: str) -> UserError:

@@ -10,7 +10,7 @@ from envs.base import EffectRange, Effects, Entry, Env, Numbers, Value, entries_
 from sgft_jax.types import Array, Key, UserError, unknown
 
 _DEFAULTS = {"action_scale": 1.0, "obs_noise_prob": 1.0}
-_NOT_NEGATIVE = ("latency", "latency_jitter", "obs_noise", "obs_noise_prob")
+_NOT_NEGATIVE = ("latency", "latency_jitter", "obs_noise", "obs_noise_prob", "action_noise")
 
 
 def make_range(env: Env, values: Mapping[str, Value]) -> EffectRange:
@@ -73,8 +73,8 @@ def _ends(name: str, value: Numbers, shape: tuple[int, ...]) -> tuple[np.ndarray
 
 def _check_possible(env: Env, low: Mapping[str, np.ndarray], high: Mapping[str, np.ndarray]) -> None:
     for name in _NOT_NEGATIVE:
-        if low[name] < 0:
-            raise UserError(f"effect '{name}' must not be negative, got {low[name]:g}")
+        if (least := np.min(low[name])) < 0:
+            raise UserError(f"effect '{name}' must not be negative, got {least:g}")
     if high["obs_noise_prob"] > 1:
         raise UserError(f"effect 'obs_noise_prob' is a probability, at most 1, got {high['obs_noise_prob']:g}")
     latest = high["latency"] + high["latency_jitter"]
@@ -100,6 +100,13 @@ def distort(effects: Effects, action: Array) -> Array:
         c, s = jnp.cos(effects.action_rotation), jnp.sin(effects.action_rotation)
         action = action.at[:2].set(jnp.stack([c * action[0] - s * action[1], s * action[0] + c * action[1]]))
     return effects.action_scale * action + effects.action_bias
+
+
+def shake(effects: Effects, command: Array, key: Key) -> Array:
+    """The command [act_dim], distorted before, with its noise: clipped to [-1, 1] where there is any, else as it is."""
+    noise = effects.action_noise
+    noisy = jnp.clip(command + noise * jax.random.normal(key, command.shape), -1.0, 1.0)
+    return jnp.where(noise > 0, noisy, command)
 
 
 def measure(effects: Effects, true_obs: Array, key: Key) -> Array:

@@ -72,6 +72,8 @@ def _frames(scene: Scene, theta: Mapping[str, float] | Sequence[float], qpos: np
         for row in smooth(np.asarray(qpos), control_dt=scene.control_dt, fps=FPS / SPEED):
             data.qpos[:] = row
             mujoco.mj_forward(model, data)
+            if scene.view is not None and scene.view.follow:
+                camera.lookat[:] = data.body(scene.view.follow).xpos + scene.view.target
             renderer.update_scene(data, camera)
             yield _shrink(renderer.render())
     finally:
@@ -82,7 +84,7 @@ def dressed(scene: Scene, theta: dict[str, float]) -> mujoco.MjSpec:
     """The scene of one theta with what only a viewer needs: sky, lights, a floor, and the scene's own decoration."""
     spec = scene.build(theta)
     scene.dress(spec)
-    _add_surroundings(spec, None if scene.view is None else scene.view.floor)
+    _add_surroundings(spec, scene.view)
     _add_lights(spec)
     visual = spec.visual
     visual.map.znear, visual.map.zfar = 0.02, 20
@@ -91,18 +93,19 @@ def dressed(scene: Scene, theta: dict[str, float]) -> mujoco.MjSpec:
     return spec
 
 
-def _add_surroundings(spec: mujoco.MjSpec, floor: float | None) -> None:
+def _add_surroundings(spec: mujoco.MjSpec, view: View | None) -> None:
     look = {"width": 256, "height": 256}
     gradient, checker = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, mujoco.mjtBuiltin.mjBUILTIN_CHECKER
     sky, flat = mujoco.mjtTexture.mjTEXTURE_SKYBOX, mujoco.mjtTexture.mjTEXTURE_2D
     spec.add_texture(name="sky", type=sky, builtin=gradient, rgb1=[0.92, 0.94, 0.97], rgb2=[0.6, 0.67, 0.77], **look)
-    if floor is None:
+    if view is None or view.floor is None:
         return
     spec.add_texture(name="tiles", type=flat, builtin=checker, rgb1=[0.84, 0.85, 0.87], rgb2=[0.78, 0.8, 0.82], **look)
     tiles = spec.add_material(name="tiles", texrepeat=[8, 8], reflectance=0.0)
     tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
     plane = mujoco.mjtGeom.mjGEOM_PLANE
-    spec.worldbody.add_geom(type=plane, size=[6, 6, 0.1], pos=[0, 0, floor], material="tiles", **_NO_CONTACT)
+    size = [0, 0, 0.1] if view.follow else [6, 6, 0.1]  # 0 is without end
+    spec.worldbody.add_geom(type=plane, size=size, pos=[0, 0, view.floor], material="tiles", **_NO_CONTACT)
 
 
 def _add_lights(spec: mujoco.MjSpec) -> None:

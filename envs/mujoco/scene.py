@@ -20,7 +20,8 @@ from sgft_jax.types import Array, Key, UserError
 class View(NamedTuple):
     """Where a viewer stands: MuJoCo's free camera looks at `target` [3] m from `distance` m away; angles in degrees.
 
-    floor: m, the height of a tiled floor; None draws none.
+    floor: m, the height of a tiled floor; None draws none. follow: a body that the camera keeps beside: `target` is
+        seen from there, and the floor has no end; "" for a camera that stays.
     """
 
     target: tuple[float, float, float]
@@ -28,6 +29,7 @@ class View(NamedTuple):
     azimuth: float = 140.0
     elevation: float = -25.0
     floor: float | None = None
+    follow: str = ""
 
 
 class Measured(NamedTuple):
@@ -142,9 +144,9 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
         )
 
     def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
-        key_latency, key_noise = jax.random.split(key)
-        params, own = world.theta.params, state.effects
-        before, target = state.physics, scene.target(state.physics.qpos, env_effects.distort(own, action))
+        key_latency, key_noise, key_action = jax.random.split(key, 3)
+        params, own, before = world.theta.params, state.effects, state.physics
+        target = scene.target(before.qpos, env_effects.shake(own, env_effects.distort(own, action), key_action))
         dt = scene.control_dt / scene.substeps
         control = env_effects.ramp(own, before.ctrl, target, key_latency, dt=dt, duration=scene.ramp)
         controls = jax.vmap(control)(jnp.arange(scene.substeps))

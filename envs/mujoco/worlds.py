@@ -8,6 +8,7 @@ and all constants derived from them), because no derived field is ever recompute
 import importlib
 import os
 from collections.abc import Iterable, Sequence
+from operator import attrgetter
 from typing import Literal, NamedTuple, get_args
 
 import jax
@@ -15,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.mujoco.engines import MEAN_INERTIA, Engine
+from envs.mujoco.engines import NESTED, Engine
 from sgft_jax.types import Array, UserError, unknown
 
 # Fields that only matter to a renderer: they may differ between worlds without being simulated.
@@ -120,9 +121,8 @@ def exploded(state: PhysicsState, *, max_speed: float) -> Array:
 
 
 def _read(host: mujoco.MjModel, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Fields of a compiled model in the precision MJX keeps them in, and the mean inertia that scales its solver."""
-    fields = {name: np.array(getattr(host, name)) for name in names if name != MEAN_INERTIA}
-    fields[MEAN_INERTIA] = np.array(host.stat.meaninertia)
+    """Fields of a compiled model in the precision MJX keeps them in, the nested ones always among them."""
+    fields = {name: np.array(attrgetter(name)(host)) for name in dict.fromkeys([*names, *NESTED])}
     return {k: v.astype(np.float32) if v.dtype == np.float64 else v for k, v in fields.items()}
 
 

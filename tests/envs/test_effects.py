@@ -27,6 +27,7 @@ def test_no_effects_change_nothing():
     none = effects()
     np.testing.assert_array_equal(env_effects.distort(none, jnp.array([0.3, -0.7])), np.float32([0.3, -0.7]))
     np.testing.assert_array_equal(env_effects.measure(none, jnp.arange(3.0), KEY), [0, 1, 2])
+    np.testing.assert_array_equal(env_effects.shake(none, jnp.array([1.3, -0.7]), KEY), np.float32([1.3, -0.7]))
 
 
 def test_commands_are_turned_then_scaled_then_offset():
@@ -39,6 +40,18 @@ def test_rotation_leaves_z_alone():
     arm = ENV._replace(action=(Entry("xyz", "m", 3),))
     turned = env_effects.make_range(arm, {"action_rotation": np.pi / 2}).low
     np.testing.assert_allclose(env_effects.distort(turned, jnp.array([1.0, 0.0, 0.3])), [0, 1, 0.3], atol=1e-6)
+
+
+def test_noisy_commands_are_clipped_and_exact_ones_are_not():
+    """Of the second entry alone; the first one, which is too large, stays as it is."""
+    own = effects(action_noise=[0.0, 0.5])
+    shaken = jax.vmap(env_effects.shake, (None, None, 0))(own, jnp.array([1.4, 0.2]), jax.random.split(KEY, 4000))
+    assert set(shaken[:, 0].tolist()) == {np.float32(1.4)}
+    noisy = np.asarray(shaken[:, 1])
+    assert noisy.max() == 1.0 and noisy.min() == -1.0
+    # P(n > 1.6 std) = 0.0548, P(n < -2.4 std) = 0.0082; the median is that of the command
+    np.testing.assert_allclose([(noisy == 1).mean(), (noisy == -1).mean()], [0.0548, 0.0082], atol=0.012)
+    np.testing.assert_allclose(np.median(noisy), 0.2, atol=0.04)
 
 
 def test_bias_and_noise_of_measurements():
@@ -115,6 +128,7 @@ def toy_pool(env, effects):
         ({"action_scale": [1.0, float("inf")]}, "effect 'action_scale' needs finite numbers"),
         ({"latency": [0.1, 0.05]}, "effect 'latency' needs finite numbers, low before high"),
         ({"obs_noise": -0.1}, "effect 'obs_noise' must not be negative, got -0.1"),
+        ({"action_noise": [0.2, -0.3]}, "effect 'action_noise' must not be negative, got -0.3"),
         ({"latency": [-0.1, 0.1]}, "effect 'latency' must not be negative, got -0.1"),
         ({"obs_noise_prob": 1.5}, "effect 'obs_noise_prob' is a probability, at most 1, got 1.5"),
         (

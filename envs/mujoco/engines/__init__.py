@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 from sgft_jax.types import Array, PyTree
 
-MEAN_INERTIA = "stat.meaninertia"  # a field that worlds differ in, though MuJoCo does not keep it with the others
+MEAN_INERTIA, GRAVITY = "stat.meaninertia", "opt.gravity"
+NESTED = (MEAN_INERTIA, GRAVITY)  # fields that worlds may differ in, though MuJoCo does not keep them with the others
 
 
 class Engine(NamedTuple):

@@ -14,6 +14,7 @@ import functools
 import os
 import threading
 import warnings
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 import jax
@@ -51,7 +52,7 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
 
     def new_slot() -> _Slot:
         model = copy.deepcopy(nominal)
-        views = {name: getattr(model, name) for name in arrays}
+        views = {name: attrgetter(name)(model) for name in arrays}
         return _Slot(mujoco.rollout.Rollout(nthread=0), model, mujoco.MjData(model), views)
 
     slots = [new_slot() for _ in range(cores)]

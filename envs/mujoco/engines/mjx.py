@@ -13,7 +13,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that 
     from mujoco import mjx
 
 import envs.mujoco.engines.fences  # noqa: F401 - a repair of mjx, before its first use
-from envs.mujoco.engines import MEAN_INERTIA, Engine
+from envs.mujoco.engines import NESTED, Engine
 from sgft_jax.types import Array
 
 
@@ -61,9 +61,11 @@ def put(host: mujoco.MjModel) -> tuple[mjx.Model, mjx.Data]:
 def with_fields(model: mjx.Model, fields: dict[str, Array]) -> mjx.Model:
     """The model of one world: the nominal one with the fields of that world, in the shapes that its engine uses."""
     fields = dict(fields)
-    mean_inertia = fields.pop(MEAN_INERTIA, model.stat.meaninertia)
+    for part, own in (name.split(".") for name in NESTED if name in fields):
+        changed = getattr(model, part).replace(**{own: fields.pop(f"{part}.{own}")})
+        model = model.replace(**{part: changed})
     fields = {name: x.reshape(getattr(model, name).shape) for name, x in fields.items()}
-    return model.replace(stat=model.stat.replace(meaninertia=mean_inertia), **fields)
+    return model.replace(**fields)
 
 
 def joint_servos(host: mujoco.MjModel) -> np.ndarray:

@@ -14,6 +14,7 @@ import mujoco
 import warp as wp
 from mujoco.mjx.third_party import mujoco_warp as mjw
 
+from envs.mujoco.engines import GRAVITY
 from sgft_jax.types import Array, UserError
 
 wp.config.log_level = wp.LOG_WARNING  # no report on every kernel it loads
@@ -24,7 +25,7 @@ _LOSSES = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.Overflo
 
 def reads(name: str) -> bool:
     """Whether that field of a model means anything to Warp."""
-    return name in mjw.Model.__dataclass_fields__
+    return name in mjw.Model.__dataclass_fields__ or name == GRAVITY
 
 
 class Worlds:
@@ -91,11 +92,13 @@ class Worlds:
         """The field of that name as floats [n, ...]; a field of the model gets room for n values of its own first."""
         array: Any = getattr(self.data, name, None)
         if array is None:
-            shared = getattr(self.model, name)
+            part, _, last = name.rpartition(".")
+            owner = getattr(self.model, part) if part else self.model
+            shared = getattr(owner, last)
             if shared.shape[0] != 1:
                 raise UserError(f"MuJoCo Warp has one '{name}' for all worlds: it cannot be a domain parameter")
             array = wp.empty((n, *shared.shape[1:]), dtype=shared.dtype)
-            setattr(self.model, name, array)
+            setattr(owner, last, array)
         count = math.prod(array.shape[1:]) * wp.types.type_size_in_bytes(array.dtype) // 4
         return wp.array(ptr=array.ptr, shape=(n, count), dtype=float, device=array.device)
 

@@ -1,0 +1,221 @@
+"""What the planar runners share: links on hinges over a floor, the observation, the reward for running along x.
+
+They are the `-v2` systems of OpenAI Gym that D4RL was recorded on. A domain parameter multiplies what that system has,
+so all are 1 there.
+"""
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from envs.base import Entry, Parameter
+from envs.mujoco.scene import Measured, Scene, View
+from envs.mujoco.worlds import PhysicsState
+from sgft_jax.types import Array
+
+N_ROOT, N_JOINTS = 3, 6  # x, z, pitch; three joints of either leg
+NV = N_ROOT + N_JOINTS
+GRAVITY = 9.81  # m/s^2
+VIEW = View((0.0, 0.0, -0.35), 3.6, 90.0, -12.0, floor=0.0, follow="torso")
+FLOOR = "floor"
+ROLLING = [0.1, 0.1, 0.1]  # torsional and rolling friction, which contacts of three dimensions do not feel
+NO_CONTACT = {"contype": 0, "conaffinity": 0}  # geoms touch only in pairs that are declared
+NO_MORE: Mapping[str, Sequence[float]] = MappingProxyType({})
+LIGHT, ORANGE, BLUE = [0.85, 0.86, 0.88, 1.0], [0.87, 0.52, 0.25, 1.0], [0.30, 0.46, 0.68, 1.0]
+
+OBSERVATION = (
+    Entry("height", "m", 1),
+    Entry("pitch", "rad", 1),
+    Entry("joint_angles", "rad", N_JOINTS),
+    Entry("velocity_xz", "m/s", 2),
+    Entry("pitch_velocity", "rad/s", 1),
+    Entry("joint_velocities", "rad/s", N_JOINTS),
+)
+
+
+class Capsule(NamedTuple):
+    """A capsule in the frame of its body: radius and half length in m, centre (x, z) in m.
+
+    turn: rad about +y, from upright.
+    """
+
+    radius: float
+    half: float
+    center: tuple[float, float]
+    turn: float
+
+    @property
+    def volume(self) -> float:
+        """m^3, with both round ends."""
+        return np.pi * self.radius**2 * (2 * self.half + 4 / 3 * self.radius)
+
+
+class Link(NamedTuple):
+    """A link on a hinge with a motor.
+
+    position: (x, z) m in the frame of the parent. anchor: (x, z) m of the hinge in its own frame. range: rad.
+    stiffness: N m/rad. damping: N m s/rad. gear: N m at full action.
+    """
+
+    name: str
+    parent: str
+    position: tuple[float, float]
+    anchor: tuple[float, float]
+    range: tuple[float, float]
+    stiffness: float
+    damping: float
+    gear: float
+    capsule: Capsule
+
+
+def new_spec(*, timestep: float, integrator: mujoco.mjtIntegrator, gravity: float) -> mujoco.MjSpec:
+    """An empty scene in radians. gravity: multiplies that of the Earth.
+
+    MuJoCo's defaults are Gym's solver settings: Newton's method, 100 iterations, pyramidal friction cones.
+    """
+    spec = mujoco.MjSpec()
+    spec.compiler.degree = False
+    spec.option.timestep, spec.option.integrator = timestep, integrator
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    spec.option.gravity = [0.0, 0.0, -GRAVITY * gravity]
+    return spec
+
+
+def add_floor(spec: mujoco.MjSpec) -> None:
+    """The floor at z = 0. Viewers see the one of `VIEW`."""
+    plane = mujoco.mjtGeom.mjGEOM_PLANE
+    spec.worldbody.add_geom(name=FLOOR, type=plane, size=[0, 0, 1], rgba=[0, 0, 0, 0], **NO_CONTACT)
+
+
+def add_torso(spec: mujoco.MjSpec, height: float, *, ref: float) -> mujoco.MjsBody:
+    """The root at that height, m: free to slide along x and z, where z reads `ref` m there, and to pitch."""
+    torso = spec.worldbody.add_body(name="torso", pos=[0, 0, height])
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    torso.add_joint(name="root_x", type=slide, axis=[1, 0, 0])
+    torso.add_joint(name="root_z", type=slide, axis=[0, 0, 1], ref=ref)
+    torso.add_joint(name="root_pitch", type=hinge, axis=[0, 1, 0])
+    return torso
+
+
+def add_capsule(
+    spec: mujoco.MjSpec,
+    body: mujoco.MjsBody,
+    name: str,
+    capsule: Capsule,
+    *,
+    density: float,
+    friction: float,
+    contact: Mapping[str, Sequence[float]] = NO_MORE,
+) -> None:
+    """The capsule as a geom of that density, kg/m^3, that touches the floor and nothing else.
+
+    friction: of the contact, in MuJoCo the larger of both geoms. contact: its `solref` and `solimp`.
+    """
+    radius, half, (x, z), turn = capsule
+    body.add_geom(
+        name=name, type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[radius, half, 0], pos=[x, 0, z],
+        quat=[np.cos(turn / 2), 0, np.sin(turn / 2), 0], density=density, rgba=_tint(name),
+        **NO_CONTACT,
+    )  # fmt: skip
+    spec.add_pair(geomname1=FLOOR, geomname2=name, condim=3, friction=[friction, friction, *ROLLING], **contact)
+
+
+def add_link(
+    spec: mujoco.MjSpec,
+    link: Link,
+    *,
+    axis: float,
+    armature: float,
+    density: float,
+    friction: float,
+    limit: Mapping[str, Sequence[float]] = NO_MORE,
+    contact: Mapping[str, Sequence[float]] = NO_MORE,
+) -> None:
+    """The link with its hinge about +y or -y (axis: 1 or -1) and its motor; its geom as in `add_capsule`.
+
+    armature: kg m^2. limit: `solref_limit` and `solimp_limit` of the hinge.
+    """
+    (x, z), (anchor_x, anchor_z) = link.position, link.anchor
+    body = spec.body(link.parent).add_body(name=link.name, pos=[x, 0, z])
+    body.add_joint(
+        name=link.name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, axis, 0], pos=[anchor_x, 0, anchor_z], limited=True,
+        range=link.range, stiffness=link.stiffness, damping=link.damping, armature=armature, **limit,
+    )  # fmt: skip
+    add_capsule(spec, body, link.name, link.capsule, density=density, friction=friction, contact=contact)
+    spec.add_actuator(
+        name=link.name, target=link.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, gear=[link.gear, 0, 0, 0, 0, 0],
+        ctrllimited=True, ctrlrange=[-1, 1],
+    )  # fmt: skip
+
+
+def _tint(name: str) -> list[float]:
+    """The colour of a geom: the leg that is in front, or the right one, is orange, the other one blue."""
+    if name in ("torso", "head"):
+        return LIGHT
+    return BLUE if name.startswith("b") or name.endswith("_left") else ORANGE
+
+
+def multiple(name: str, minimum: float) -> Parameter:
+    """A domain parameter that multiplies what the real system has, fixed in training."""
+    return Parameter(name, "", 1.0, 1.0, 1.0, minimum=minimum)
+
+
+def start(qpos: Array, qvel: Array) -> PhysicsState:
+    """A state [9], [9] before anything was commanded."""
+    return PhysicsState(qpos, qvel, jnp.zeros(NV), jnp.zeros(N_JOINTS))
+
+
+def observe(params: Array, state: PhysicsState, *, clip: float = np.inf) -> Array:
+    """[17]: everything but x. clip: m/s and rad/s, beyond which a speed is not told."""
+    return jnp.concatenate([state.qpos[1:], jnp.clip(state.qvel, -clip, clip)])
+
+
+def settled(params: Array, obs: Array) -> PhysicsState:
+    """The state that is seen, at x = 0: nothing but the place depends on x."""
+    return start(jnp.concatenate([jnp.zeros(1), obs[: NV - 1]]), obs[NV - 1 :])
+
+
+def progress(before: PhysicsState, after: PhysicsState, *, dt: float) -> Array:
+    """[] m/s along x during a step of `dt` s. x is not observed.
+
+    In float32 it is right to 0.001 m/s as far away as runners get in an episode: 500 m (HalfCheetah), 40 m (Walker2d).
+    """
+    return (after.qpos[0] - before.qpos[0]) / dt
+
+
+def run(
+    params: Array,
+    before: PhysicsState,
+    action: Array,
+    after: PhysicsState,
+    *,
+    dt: float,
+    bonus: float,
+    cost: float,
+    torque: Callable[[Array], Array | float] = lambda params: 1.0,
+) -> Measured:
+    """The reward: speed along x, a bonus, minus the cost of the squared control.
+
+    The control is what the motors got, scaled, noisy and clipped. torque(params): [6] multiplies it where a gap makes
+    motors stronger, as Gym counts it.
+    """
+    control = after.ctrl * torque(params)
+    return Measured(reward=progress(before, after, dt=dt) + bonus - cost * jnp.sum(control**2))
+
+
+scene = functools.partial(
+    Scene,
+    observation=OBSERVATION,
+    action=(Entry("joint_torques", "gear", N_JOINTS),),
+    episode_length=1_000,
+    settled=settled,
+    target=lambda qpos, action: jnp.clip(action, -1.0, 1.0),
+    score="return",
+    view=VIEW,
+    max_speed=1_000.0,  # feet of Walker2d reach 100 rad/s
+)
