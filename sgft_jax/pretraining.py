@@ -232,15 +232,23 @@ def make_programs(env: Env, config: PretrainConfig, members: int) -> Programs:
     )
 
 
-def over_members(function: Callable[..., PyTree], members: int) -> Callable[..., PyTree]:
+def over_members(
+    function: Callable[..., PyTree], members: int, *, shared: tuple[int, ...] = ()
+) -> Callable[..., PyTree]:
     """`function` of one member for arguments and results with a leading axis of members.
 
-    A single member is not vmapped, because vmap would make a `cond` (resets, only where an episode ended) compute both
-    of its branches at every step.
+    shared: positions of arguments without that axis, one for all members. A single member is not vmapped, because vmap
+    would make a `cond` (resets, only where an episode ended) compute both of its branches at every step.
     """
-    if members > 1:
-        return jax.vmap(function)
-    return lambda *args: jax.tree.map(lambda x: x[None], function(*jax.tree.map(lambda x: x[0], args)))
+
+    def several(*args: PyTree) -> PyTree:
+        return jax.vmap(function, tuple(None if i in shared else 0 for i in range(len(args))))(*args)
+
+    def single(*args: PyTree) -> PyTree:
+        own = (x if i in shared else jax.tree.map(lambda leaf: leaf[0], x) for i, x in enumerate(args))
+        return jax.tree.map(lambda x: x[None], function(*own))
+
+    return several if members > 1 else single
 
 
 class Pretrainer(NamedTuple):

@@ -287,6 +287,7 @@ class Finetuner(NamedTuple):
 
 
 Algorithm = Literal["sac", "tdmpc2", "recurrent"]
+ValueLoss = Literal["iql", "sql", "eql", "xql"]
 Family = Literal["sgft", "model-free", "model-based", "offline", "planning"]
 
 
@@ -311,3 +312,48 @@ class Method(NamedTuple):
     needs_prior: bool = True
     zero_shot: bool = True
     sees_system: bool = False
+
+
+# --- from a fixed set of real data and a simulator ------------------------------------------------------------------
+
+
+class HybridAgent(NamedTuple):
+    """An agent that learns from a fixed set of real rows, from rows that it collects in a simulator, or from both.
+
+    batches: what an update takes, from the state (replay of the real rows, replay of its own rows or None).
+    simulates: whether it acts in a simulator while it learns.
+    prepare(state, rows [N, ...]) -> state: a fresh learner that has seen the real rows once, for statistics.
+    export(state) -> params of its policy. policy: how these act. card: what the card of an exported policy says of it.
+    """
+
+    learner: Learner
+    batches: Source
+    simulates: bool
+    prepare: Callable[[PyTree, Transition], PyTree]
+    export: Callable[[PyTree], PyTree]
+    policy: Policy
+    card: Mapping[str, Any]
+
+
+HybridKind = Literal["hybrid", "offline", "simulator"]
+
+
+class HybridMethod(NamedTuple):
+    """A way to learn without touching the real system. `sgft_jax/hybrid/methods/` has one file for each.
+
+    kind: what it learns from: both, the real rows alone, or the simulator alone. description, source: one line each.
+    config: a frozen dataclass whose fields carry their help. presets: named settings of it; the first is the default.
+    build(config, task) -> HybridAgent.
+    """
+
+    name: str
+    kind: HybridKind
+    description: str
+    source: str
+    presets: Mapping[str, Any]
+    build: Callable[[Any, Task], HybridAgent]
+
+    @property
+    def config(self) -> Any:
+        """The default settings."""
+        return next(iter(self.presets.values()))

@@ -19,7 +19,7 @@ from sgft_jax import checks
 from sgft_jax.data import sources
 from sgft_jax.learners import iql, losses, optim
 from sgft_jax.learners.sac import step_temperature
-from sgft_jax.learners.value_losses import ValueLoss, value_loss
+from sgft_jax.learners.value_losses import value_loss
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import (
     Network,
@@ -31,7 +31,19 @@ from sgft_jax.models.networks import (
     tanh_gaussian_sample,
 )
 from sgft_jax.models.ratio import Ratio, RatioConfig, RatioState, make_ratio, weight
-from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree, Source, UserError, unknown
+from sgft_jax.types import (
+    Array,
+    Batch,
+    Key,
+    Learner,
+    Metrics,
+    Normalizer,
+    PyTree,
+    Source,
+    UserError,
+    ValueLoss,
+    unknown,
+)
 
 OUTPUT_GAIN = 0.01  # of the last layers: all values and means begin near 0
 

@@ -5,16 +5,14 @@ backbones of H2O+. Source: H2O+ (Niu et al. 2023) Eq. (4); IQL (Kostrikov et al.
 XQL (Garg et al. 2023).
 """
 
-from typing import Literal, get_args
+from typing import get_args
 
 import chex
 import jax
 import jax.numpy as jnp
 
 from sgft_jax.learners.iql import expectile_loss
-from sgft_jax.types import Array, UserError, unknown
-
-ValueLoss = Literal["iql", "sql", "eql", "xql"]
+from sgft_jax.types import Array, UserError, ValueLoss, unknown
 
 EXPONENT_MAX = 5.0  # of y / alpha; exp(5) = 148
 SHIFT_MIN = -1.0  # the shift of a batch in which V is far above every Q would make exp(-shift) overflow

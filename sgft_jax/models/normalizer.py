@@ -35,6 +35,11 @@ def finish(statistics: Statistics, *, std_floor: float = STD_FLOOR) -> Normalize
     return Normalizer(mean, jnp.maximum(std, std_floor))
 
 
+def of(obs: Array) -> Normalizer:
+    """That of fixed data. obs: [N, obs_dim] raw units."""
+    return finish(update(init(obs.shape[1]), obs))
+
+
 def identity(obs_dim: int) -> Normalizer:
     """Leaves observations as they are."""
     return Normalizer(jnp.zeros(obs_dim), jnp.ones(obs_dim))

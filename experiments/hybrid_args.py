@@ -1,0 +1,110 @@
+"""The options of learning from real data and a simulator, what can be wrong with them, and the folders that follow."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from envs.gaps import SIM, title
+from experiments.options import Impl, at_least_one, check_task, seed_list, seeds_name, without_repeats
+from sgft_jax import extend
+from sgft_jax.hybrid.methods import get_method
+from sgft_jax.hybrid.schedule import Schedule
+from sgft_jax.io.runs import check_start
+from sgft_jax.types import HybridMethod, UserError
+
+DEFAULT, NO_DATA = "h2oplus", "no-data"
+NO_SIMULATOR = "no-simulator"
+VOLATILE = ("resume", "overwrite", "out", "video", "data")  # may differ when a run goes on; what is in the data may not
+
+
+@dataclass(frozen=True)
+class HybridArgs:
+    """Several seeds for one or more simulators at once, all in one compiled program."""
+
+    task: str = "halfcheetah"
+    """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own. The real
+    system is the task without a gap; it is only evaluated in."""
+    method: str = DEFAULT
+    """A method from the table at the top."""
+    gap: tuple[str, ...] = ("gravity",)
+    """How the simulator differs from the real system: gaps by name, .toml/.json files, or sim for no gap. Several share
+    one program; each has a run folder of its own. Methods without a simulator leave it out."""
+    data: Path | None = None
+    """The real data: a D4RL or Minari HDF5 file, or the folder of a Minari data set."""
+    seeds: int = 5
+    """Number of seeds."""
+    out: Path = Path("runs")
+    """Parent of all run folders."""
+    resume: bool = False
+    """Continue from the last checkpoint."""
+    overwrite: bool = False
+    """Replace an earlier run of the same name."""
+    preset: str = ""
+    """Named settings of the method, see its help; default: its first."""
+    options: Any = None  # the `Config` of the method
+    """Options of the method that --method names:"""
+    schedule: Schedule = field(default_factory=Schedule)
+    successors: str = "stored"
+    """Expert: where the next observations of a D4RL file come from: stored, or shifted (the row below)."""
+    seed: int = 0
+    """Expert: first seed."""
+    eval_every: int = 10_000
+    """Expert: updates between evaluations in the real system, rounded to whole chunks. No choice depends on them."""
+    eval_episodes: int = 10
+    """Expert: episodes per seed and evaluation, without exploration."""
+    checkpoint_every: int = 100_000
+    """Expert: updates between checkpoints, rounded to whole chunks."""
+    variant: str = ""
+    """Expert: a word for these options. The run gets a folder of its own beside the method's."""
+    impl: Impl = "auto"
+    video: bool = True
+    """Expert: render an episode of the first seed in the real system, where MuJoCo can render."""
+
+
+def gaps_of(args: HybridArgs, method: HybridMethod) -> tuple[str, ...]:
+    """The simulators, or the one word that stands for none."""
+    return (NO_SIMULATOR,) if method.kind == "offline" else args.gap
+
+
+def run_folder(args: HybridArgs, gap: str) -> Path:
+    """Where the run with that simulator lives; the seeds of one call share a folder."""
+    method = get_method(args.method)
+    data = NO_DATA if method.kind == "simulator" or args.data is None else data_name(args.data)
+    label = "_".join(filter(None, [method.name, args.variant]))
+    seeds = seeds_name(seed_list(args.seed, args.seeds))
+    return args.out / "hybrid" / extend.name_of(args.task) / title(gap) / data / label / seeds
+
+
+def data_name(path: Path) -> str:
+    """What a data set is called in folders: its file without the ending, or its folder."""
+    inside = path.parent.parent if path.name == "main_data.hdf5" else path
+    return re.sub(r"[^\w.-]", "-", inside.name.removesuffix(".hdf5"))
+
+
+def check(args: HybridArgs) -> tuple[HybridMethod, list[int]]:
+    """The method and the seeds; raises UserError for what is wrong in the arguments and with the run folders."""
+    at_least_one(args, "eval_every", "eval_episodes", "checkpoint_every")
+    method, seeds = get_method(args.method), seed_list(args.seed, args.seeds)
+    if not isinstance(args.options, type(method.config)):
+        raise UserError(f"--method {method.name}: the options are those of another method")
+    if method.kind != "simulator" and args.data is None:
+        raise UserError(f"--data: {method.name} learns from real data; name a D4RL or Minari file")
+    if not re.fullmatch(r"[\w.-]*", args.variant):
+        raise UserError(f"--variant {args.variant!r}: letters, digits, '.', '_' and '-' only, it names a folder")
+    if not args.gap:
+        raise UserError(f"--gap: name at least one, or {SIM} for no gap")
+    without_repeats("--gap", args.gap)
+    check_task(args.task, args.gap)
+    for folder in folders(args, method):
+        check_start(folder, resume=args.resume, overwrite=args.overwrite)
+    return method, seeds
+
+
+def folders(args: HybridArgs, method: HybridMethod) -> Sequence[Path]:
+    """The run folders of all simulators; raises UserError where two would share one."""
+    found = [run_folder(args, gap) for gap in gaps_of(args, method)]
+    if twice := [folder for folder in found if found.count(folder) > 1]:
+        raise UserError(f"--gap {' '.join(args.gap)}: two of them would share the folder {twice[0]}; name it once")
+    return found

@@ -1,0 +1,246 @@
+"""Impure: a run of `sgft_jax.hybrid.trainer` with data, folders, checkpoints, logs and evaluations around it."""
+
+import functools
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from envs import gaps
+from envs.base import Env, World
+from envs.gaps import SIM, Gap
+from envs.pools import real_worlds
+from envs.rollout import Episode
+from experiments.evaluation import play, scores
+from experiments.hybrid_args import NO_SIMULATOR, VOLATILE, HybridArgs, gaps_of, run_folder
+from experiments.stacking import join, member, part
+from experiments.video import film
+from sgft_jax.data import logs, replay
+from sgft_jax.hybrid import trainer
+from sgft_jax.hybrid.scores import normalised
+from sgft_jax.hybrid.trainer import HybridState
+from sgft_jax.io import checkpoint, runs
+from sgft_jax.io.jsonfile import jsonable
+from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
+from sgft_jax.io.priors import save_prior
+from sgft_jax.io.progress import RunProgress
+from sgft_jax.pretraining import seed_keys
+from sgft_jax.systems.simulated import Simulated
+from sgft_jax.types import HybridMethod, Metrics, Prior, PyTree, Transition, UserError
+
+_TRAINING, _EVALUATION = 11, 12  # purposes, folded into a seed's key
+_LATE = 10  # evaluations that a score averages, beside the last one
+
+
+def run(args: HybridArgs, method: HybridMethod, seeds: list[int]) -> list[dict[str, Any]]:
+    """The runs with the simulators of `args`; returns their summaries."""
+    env = envs.make(args.task, args.impl)
+    named = gaps_of(args, method)
+    found = [Gap(NO_SIMULATOR, {}, {}) if name == NO_SIMULATOR else gaps.load(env, name) for name in named]
+    log = None if method.kind == "simulator" or args.data is None else _load(args, env)
+    homes = {run_folder(args, name): jsonable(args) | {"gap": name} for name in named}
+    inputs = {"data": None if log is None else {"sha256": log.facts.sha256, "successors": log.facts.successors}}
+    opened = runs.open_runs(
+        homes, kind="hybrid", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE, inputs=inputs
+    )
+    try:
+        return _Run(args, method, env, found, seeds, log, [own.folder for own in opened]).work()
+    finally:
+        for own in opened:
+            own.close()
+
+
+def _load(args: HybridArgs, env: Env) -> logs.Log:
+    """The real rows; says what they are, and raises UserError if they are not of this task."""
+    assert args.data is not None
+    log = logs.load(args.data, gamma=args.options.gamma, successors=args.successors)  # pyright: ignore
+    facts, sizes = log.facts, (log.rows.obs.shape[1], log.rows.action.shape[1])
+    if sizes != (env.obs_dim, env.act_dim):
+        raise UserError(
+            f"{args.data}: has {sizes[0]} observations and {sizes[1]} actions, {env.name} has {env.obs_dim} and "
+            f"{env.act_dim}; name the task that it was recorded on"
+        )
+    print(
+        f"data: {facts.path}, {facts.size:,} bytes, sha256 {facts.sha256[:12]}; {facts.transitions:,} transitions of "
+        f"{facts.episodes:,} episodes, return {facts.return_mean:.0f} (std {facts.return_std:.0f}, "
+        f"{facts.return_min:.0f} to {facts.return_max:.0f})"
+    )
+    return log
+
+
+class _Run:
+    """What happens between chunks. Members [M = G * S] are the seeds of the first simulator, then those of the next."""
+
+    def __init__(
+        self, args: HybridArgs, method: HybridMethod, env: Env, found: list[Gap], seeds: list[int],
+        log: logs.Log | None, folders: list[Path],
+    ) -> None:  # fmt: skip
+        self.args, self.method, self.env, self.gaps, self.seeds = args, method, env, found, seeds
+        self.folders, self.data = folders, log
+        self.agent = method.build(args.options, env)
+        self.logs = [MetricsLog(folder) for folder in folders]
+        self.last_good: Path | None = None
+        self.expect = {"kind": "hybrid", "task": env.name, "method": method.name, "seeds": seeds}
+        members = jnp.zeros(len(found) * len(seeds), jnp.int32)
+        real = real_worlds(env, [gaps.load(env, SIM)], jax.random.key(0))
+        self.system = Simulated(env, real, members, gamma=args.options.gamma)
+        self.chunk = args.schedule.rounds_per_chunk * args.schedule.updates_per_round
+
+    def work(self) -> list[dict[str, Any]]:
+        """Everything, in order; returns the summaries."""
+        inputs = (self._pools(), self._rows(), self._keys())
+        state = self._restore(*inputs)
+        steps = trainer.train(
+            self.env, self.agent, self.args.schedule, *inputs, gamma=self.args.options.gamma, state=state
+        )
+        return self._finish(self._follow(steps))
+
+    def _pools(self) -> World:
+        """The worlds [M, W] of each member's simulator; those of the real system where there is none."""
+        found = [gaps.load(self.env, SIM) if gap.name == NO_SIMULATOR else gap for gap in self.gaps]
+        pools = real_worlds(self.env, found, jax.random.key(1))
+        return jax.tree.map(lambda x: jnp.repeat(x, len(self.seeds), axis=0), pools)
+
+    def _rows(self) -> Transition:
+        """The real rows [N]; a single one of zeros where the method asks for none."""
+        if self.data is not None:
+            return self.data.rows
+        blank = replay.blank(self.env.obs_dim, self.env.act_dim)
+        return jax.tree.map(lambda x: x[None], blank)
+
+    def _keys(self) -> Any:
+        """[M]: a seed gives the same draws whichever simulators share the program."""
+        return jnp.concatenate([seed_keys(self.seeds, _TRAINING)] * len(self.gaps))
+
+    def _restore(self, pools: World, rows: Transition, keys: Any) -> HybridState | None:
+        """The state after the last checkpoint, None for a fresh start; raises UserError where simulators differ."""
+        steps = [checkpoint.latest(folder) for folder in self.folders]
+        if len(set(steps)) > 1:
+            listed = ", ".join(f"{own} is at {n or 0} updates" for own, n in zip(self.folders, steps, strict=True))
+            raise UserError(f"{listed}: they cannot go on together, resume them one at a time")
+        if steps[0] is None:
+            for log in self.logs:
+                log.truncate({})
+            return None
+        first = len(self.seeds)  # of the members: those of one simulator
+        own = jax.tree.map(lambda x: x[:first], pools)
+        like = trainer.shape_of(self.env, self.agent, self.args.schedule, own, rows, keys[:first])
+        found = [checkpoint.restore(folder, like, step=steps[0], expect=self.expect) for folder in self.folders]
+        for log, (_, meta) in zip(self.logs, found, strict=True):
+            log.truncate(meta["position"])
+        return join([state for state, _ in found])
+
+    def _follow(self, steps: Iterator[tuple[HybridState, Metrics]]) -> HybridState:
+        """Logs, evaluates and checkpoints what the iterator yields; returns its last state."""
+        schedule, names = self.args.schedule, "+".join(gap.name for gap in self.gaps)
+        state, _ = next(steps)
+        done, total = trainer.chunks_done(state, schedule), schedule.chunks
+        if done == 0:
+            self._evaluate(state, 0)
+        title = f"{self.method.name} on {self.env.name}/{names}"
+        with RunProgress(title, total=total * self.chunk, unit="updates", done=done * self.chunk) as progress:
+            for state, metrics in steps:
+                before, done = done * self.chunk, done + 1
+                values = {name: np.asarray(x) for name, x in metrics.items()}
+                check_finite(values, done * self.chunk, unit="updates", last_good=self.last_good)
+                for log, own in zip(self.logs, self._each(values), strict=True):
+                    log.metrics(done * self.chunk, own)
+                shown = {}
+                if self._due(self.args.eval_every, before, done):
+                    shown = {f"{self.env.score}, real system": self._evaluate(state, done)}
+                if self._due(self.args.checkpoint_every, before, done):
+                    self._checkpoint(state, done)
+                progress.advance(self.chunk, shown)
+        return state
+
+    def _due(self, every: int, before: int, done: int) -> bool:
+        """Whether something that happens every so many updates happens after this chunk: also after the last."""
+        return before // every != done * self.chunk // every or done == self.args.schedule.chunks
+
+    def _evaluate(self, state: HybridState, done: int) -> float:
+        found = scores(self._play(state, self.args.eval_episodes))
+        for log, own in zip(self.logs, self._each(found), strict=True):
+            log.eval(done * self.chunk, own)
+        return float(found["score"].mean())
+
+    def _play(self, state: HybridState, episodes: int) -> Episode:
+        """Episodes [M, episodes] in the real system, always the same starts."""
+        params = jax.jit(jax.vmap(self.agent.export))(state.learner)
+        return play(self.system, self.agent.policy, params, jax.random.key(_EVALUATION), episodes)
+
+    def _checkpoint(self, state: HybridState, done: int) -> None:
+        for folder, log, own in zip(self.folders, self.logs, self._each(state), strict=True):
+            meta = {**self.expect, "position": log.position()}
+            self.last_good = checkpoint.save(folder, done * self.chunk, own, meta=meta)
+
+    def _each(self, members: PyTree) -> Iterator[PyTree]:
+        """Of each simulator, [S], what belongs to it in a pytree over all members."""
+        return (part(members, i, len(self.seeds)) for i in range(len(self.gaps)))
+
+    # ------------------------------------------------------------ what stays
+
+    def _finish(self, state: HybridState) -> list[dict[str, Any]]:
+        """Policies, summaries and closing words. The last policy is the result: nothing real chose it."""
+        params = jax.jit(jax.vmap(self.agent.export))(state.learner)
+        filmed = functools.cache(lambda: self._play(state, 1))
+        found = []
+        for i, (folder, gap, own) in enumerate(zip(self.folders, self.gaps, self._each(params), strict=True)):
+            self.logs[i].close()
+            for k, seed in enumerate(self.seeds):
+                save_prior(folder / "policy" / f"seed-{seed}", Prior(member(own, k), self._card(gap, seed)))
+            summary = self._summary(folder, gap)
+            write_summary(folder, summary)
+            if self.args.video:
+                print(self._film(folder, member(member(filmed(), i * len(self.seeds)), 0)))
+            self._say(folder, gap, summary)
+            found.append(summary)
+        return found
+
+    def _card(self, gap: Gap, seed: int) -> dict[str, Any]:
+        env = self.env
+        sizes = {"task": env.name, "obs_dim": env.obs_dim, "act_dim": env.act_dim, "control_dt": env.control_dt}
+        layout = {"observation": [e._asdict() for e in env.observation], "action": [e._asdict() for e in env.action]}
+        facts = {"method": self.method.name, "gap": gap._asdict(), "seed": seed, "data": self._facts()}
+        return {**self.agent.card, **sizes, **layout, "hybrid": facts, "provenance": runs.provenance()}
+
+    def _facts(self) -> dict[str, Any] | None:
+        return None if self.data is None else asdict(self.data.facts) | {"path": Path(self.data.facts.path).name}
+
+    def _summary(self, folder: Path, gap: Gap) -> dict[str, Any]:
+        """Score of each seed at the last evaluation, and the mean over the last ten."""
+        curve = np.array([line["score"] for line in read_jsonl(folder / EVAL)])
+        last, late = curve[-1], curve[-_LATE:].mean(0)
+        return {
+            "task": self.env.name,
+            "method": self.method.name,
+            "gap": gap._asdict(),
+            "impl": self.env.impl,
+            "data": self._facts(),
+            "schedule": jsonable(self.args.schedule),
+            "updates": self.args.schedule.chunks * self.chunk,
+            "score": self.env.score,
+            "seeds": self.seeds,
+            "last": last.tolist(),
+            "late": late.tolist(),
+            "normalised": [normalised(self.env.name, x) for x in last.tolist()],
+        }
+
+    def _film(self, folder: Path, played: Episode) -> str:
+        """An episode in the real system."""
+        theta = self.system.pools.theta.params[0, played.world]
+        return film(self.env, theta, np.asarray(played.trace), folder / "videos" / f"seed-{self.seeds[0]}.mp4")
+
+    def _say(self, folder: Path, gap: Gap, summary: dict[str, Any]) -> None:
+        last, late = np.array(summary["last"]), np.array(summary["late"])
+        rescaled = [x for x in summary["normalised"] if x is not None]
+        scale = f", {np.mean(rescaled):.1f} on D4RL's scale" if rescaled else ""
+        print(
+            f"{gap.name}: {self.env.score} in the real system {last.mean():.4g} (std over seeds {last.std():.3g}) "
+            f"after {summary['updates']:,} updates{scale}; mean of the last {_LATE} evaluations {late.mean():.4g}"
+        )
+        print(f"results: {folder}  (policy/, summary.json, eval.jsonl)")

@@ -1,0 +1,86 @@
+"""H2O+: the in-sample value of the real data and SAC in the simulator feed one critic (Niu et al. 2023)."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from sgft_jax import checks
+from sgft_jax.hybrid.methods.options import ActorCriticOptions
+from sgft_jax.types import HybridAgent, HybridMethod, Task, ValueLoss
+
+if TYPE_CHECKING:
+    from sgft_jax.learners.h2oplus import H2OPlusState
+    from sgft_jax.types import Transition
+
+
+@dataclass(frozen=True)
+class Config(ActorCriticOptions):
+    """Options of `h2oplus`. The defaults are the paper's, and where it is silent IQL's and the released code's."""
+
+    value_loss: ValueLoss = "iql"
+    """What the value of the real data is: IQL's expectile, or that of SQL, EQL or XQL."""
+    value_share: float = 0.1
+    """Lambda: share of the target's bootstrap that comes from that value; 0 is SAC on both kinds of rows."""
+    expectile: float = 0.7
+    """Of the value loss `iql`."""
+    value_alpha: float = 1.0
+    """Scale of the other value losses, in units of return."""
+    ratio: bool = True
+    """Weigh simulated errors by the ratio of the dynamics; off: they count like real ones."""
+    standardise: bool = False
+    """Let the discriminators of that ratio read standardised observations. The released code does not."""
+    rows: int = 128
+    """Real rows of a batch; it has as many simulated ones."""
+    ratio_rows: int = 256
+    """The same for the discriminators, which have batches of their own."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.share(self, "value_share", "expectile")
+        checks.positive(self, "value_alpha")
+        checks.at_least(self, 1, "rows", "ratio_rows")
+
+
+def build(config: Config, task: Task) -> HybridAgent:
+    """The agent."""
+    from sgft_jax.data import sources
+    from sgft_jax.learners import actor, h2oplus
+    from sgft_jax.models import normalizer
+    from sgft_jax.models.config import NetworkConfig
+
+    network = NetworkConfig(config.hidden)
+    structure = h2oplus.H2OPlusConfig(
+        task.obs_dim, task.act_dim, network, value_loss=config.value_loss, ratio=config.ratio,
+        ratio_rows=2 * config.ratio_rows,
+    )  # fmt: skip
+    rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_value", "lr_alpha", "lr_ratio"), config.lr)
+    numbers = {name: getattr(config, name) for name in ("tau", "value_share", "expectile", "value_alpha")}
+
+    def prepare(state: "H2OPlusState", rows: "Transition") -> "H2OPlusState":
+        if state.ratio is None or not config.standardise:
+            return state
+        return state.replace(ratio=state.ratio._replace(normalizer=normalizer.of(rows.obs)))
+
+    return HybridAgent(
+        learner=h2oplus.make_h2oplus(structure, h2oplus.H2OPlusHyper(**rates, **numbers)),
+        batches=sources.beside(*(sources.two_buffers(n, n) for n in (config.rows, config.ratio_rows))),
+        simulates=True,
+        prepare=prepare,
+        export=actor.exported,
+        policy=actor.affine_policy(task.obs_dim, task.act_dim, network),
+        card=actor.card(network, config.gamma),
+    )
+
+
+_PAPER = Config()
+METHOD = HybridMethod(
+    "h2oplus",
+    "hybrid",
+    "in-sample value of the data and SAC in the simulator, weighted by a ratio of dynamics",
+    "Niu et al. 2023",
+    {
+        "paper": _PAPER,
+        "released": replace(_PAPER, value_share=0.5, expectile=0.5),
+        "released-robot": replace(_PAPER, expectile=0.9, hidden=(32, 32), rows=16),
+    },
+    build,
+)

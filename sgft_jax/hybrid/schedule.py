@@ -1,0 +1,53 @@
+"""How simulator steps and updates alternate. Imports no JAX: command lines read it."""
+
+from dataclasses import dataclass
+
+from sgft_jax import checks
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How simulator steps and updates alternate."""
+
+    updates: int = 1_000_000
+    """Gradient updates in all."""
+    simulators: int = 25
+    """Simulators of a run that are stepped together. The released code has one."""
+    steps_per_round: int = 1
+    """Steps of every simulator before updates follow. The released code makes 1,000 of its one simulator."""
+    updates_per_step: float = 1.0
+    """Updates for each step of one simulator."""
+    buffer: int = 1_000_000
+    """Simulated transitions kept; new ones replace the oldest."""
+    chunk_updates: int = 5_000
+    """Updates of a compiled chunk, rounded to whole rounds; logs, evaluations and checkpoints come between chunks."""
+
+    def __post_init__(self) -> None:
+        checks.at_least(self, 1, "updates", "simulators", "steps_per_round", "buffer", "chunk_updates")
+        checks.positive(self, "updates_per_step")
+        if self.rows_per_round > self.buffer:
+            raise checks.refusal("buffer", self.buffer, f"at least the rows of a round, {self.rows_per_round}")
+
+    @property
+    def rows_per_round(self) -> int:
+        """Simulated transitions of a round."""
+        return self.simulators * self.steps_per_round
+
+    @property
+    def updates_per_round(self) -> int:
+        """Updates of a round."""
+        return max(round(self.rows_per_round * self.updates_per_step), 1)
+
+    @property
+    def rounds_per_chunk(self) -> int:
+        """Rounds of a chunk."""
+        return max(round(self.chunk_updates / self.updates_per_round), 1)
+
+    @property
+    def chunks(self) -> int:
+        """Chunks of the whole run; the last one is whole too."""
+        return max(-(-self.updates // (self.rounds_per_chunk * self.updates_per_round)), 1)
+
+
+# Of H2O+: what is stated wherever numbers are shown, and what its authors ran.
+SCHEDULES = {"fleet": Schedule(), "released": Schedule(simulators=1, steps_per_round=1_000)}

@@ -1,0 +1,147 @@
+"""Learning from a fixed set of real data and an imperfect simulator, as an iterator over compiled chunks.
+
+A round steps every simulator, keeps what happened, and updates the agent on real and simulated rows. The real system is
+never stepped here. It prints nothing and touches no files; the caller does both. Members are pairs of a simulator and a
+seed, all in one program; they share the real rows. Source: H2O+ (Niu et al. 2023), its released code.
+"""
+
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from envs.base import Env, World
+from envs.rollout import Fleet, launch, step_fleet
+from sgft_jax.data import replay
+from sgft_jax.data.replay import ReplayState
+from sgft_jax.hybrid.schedule import Schedule
+from sgft_jax.pretraining import over_members
+from sgft_jax.types import Array, HybridAgent, Key, Metrics, PyTree, Transition
+
+
+class HybridState(NamedTuple):
+    """Everything that changes, [M, ...].
+
+    learner: the agent. simulated: `ReplayState` of its own rows. fleet: its simulators in flight. The last two are None
+    for an agent that does not act in a simulator. rounds: [M] int32 rounds done.
+    """
+
+    learner: Any
+    simulated: Any
+    fleet: Any
+    key: Key
+    rounds: Array
+
+
+class Trainer(NamedTuple):
+    """Training of one member as pure functions.
+
+    init(pool, real, key) -> HybridState, with a first batch of simulated rows.
+    chunk(pool, real, state) -> (state, metrics averaged over its updates).
+    """
+
+    init: Callable[[World, ReplayState, Key], HybridState]
+    chunk: Callable[[World, ReplayState, HybridState], tuple[HybridState, Metrics]]
+
+
+def train(
+    env: Env,
+    agent: HybridAgent,
+    schedule: Schedule,
+    pools: World,
+    real: Transition,
+    keys: Key,
+    *,
+    gamma: float,
+    state: HybridState | None = None,
+) -> Iterator[tuple[HybridState, Metrics]]:
+    """Trains M members for `schedule.chunks` chunks each.
+
+    pools: [M, W] worlds of each member's simulator. real: [N, ...] rows that all share. keys: [M], what decides a
+    member's draws. gamma: discount factor of simulated rows, that of the real ones. state: where an earlier run
+    stopped, or None; it is consumed.
+
+    Yields the state that it starts from with no metrics, then once per chunk. Metrics are arrays [M]. A yielded state
+    is valid until the next step, which donates its arrays. A resumed run ends like an uninterrupted one.
+    """
+    trainer, members = make_trainer(env, agent, schedule, gamma=gamma), keys.shape[0]
+    rows = replay.full(real)
+    now: HybridState = state or jax.jit(over_members(trainer.init, members, shared=(1,)))(pools, rows, keys)
+    chunk = jax.jit(over_members(trainer.chunk, members, shared=(1,)), donate_argnums=2)
+    yield now, {}
+    for _ in range(chunks_done(now, schedule), schedule.chunks):
+        now, metrics = chunk(pools, rows, now)
+        yield now, metrics
+
+
+def shape_of(
+    env: Env, agent: HybridAgent, schedule: Schedule, pools: World, real: Transition, keys: Key
+) -> HybridState:
+    """Shapes and types of a run's state: what checkpoints are read into."""
+    trainer = make_trainer(env, agent, schedule, gamma=1.0)
+    init = over_members(trainer.init, keys.shape[0], shared=(1,))
+    return jax.eval_shape(lambda pools, real, keys: init(pools, replay.full(real), keys), pools, real, keys)
+
+
+def chunks_done(state: HybridState, schedule: Schedule) -> int:
+    """Chunks behind a state."""
+    return int(jax.device_get(state.rounds)[0]) // schedule.rounds_per_chunk
+
+
+def make_trainer(env: Env, agent: HybridAgent, schedule: Schedule, *, gamma: float) -> Trainer:
+    """Builds the pure functions."""
+    learner, fresh = agent.learner, agent.learner.init_carry()
+    step = functools.partial(step_fleet, env, gamma=gamma, initial_carry=fresh)
+
+    def vector_step(
+        pool: World, agent_state: PyTree, fleet: Fleet, rows: ReplayState, key: Key
+    ) -> tuple[Fleet, ReplayState]:
+        """One step of all simulators under the exploring policy."""
+        key_act, key_step = jax.random.split(key)
+        act = functools.partial(learner.act, explore=True)
+        keys = jax.random.split(key_act, schedule.simulators)
+        actions, carry = jax.vmap(act, (None, 0, 0, 0))(agent_state, fleet.carry, fleet.state.obs, keys)
+        fleet, new, valid, _ = step(pool, fleet, actions, carry, key_step)
+        return fleet, replay.add_batch(rows, new, valid)
+
+    def collect(pool: World, state: HybridState, key: Key, steps: int) -> HybridState:
+        def one(carry: tuple[Fleet, ReplayState], key: Key) -> tuple[tuple[Fleet, ReplayState], None]:
+            return vector_step(pool, state.learner, *carry, key), None
+
+        (fleet, rows), _ = jax.lax.scan(one, (state.fleet, state.simulated), jax.random.split(key, steps))
+        return state._replace(fleet=fleet, simulated=rows)
+
+    def init(pool: World, real: ReplayState, key: Key) -> HybridState:
+        key_learner, key_fleet, key_fill, key_run = jax.random.split(key, 4)
+        agent_state = agent.prepare(learner.init(key_learner), real.data)
+        state = HybridState(agent_state, None, None, key_run, jnp.int32(0))
+        if not agent.simulates:
+            return state
+        empty = replay.init(replay.blank(env.obs_dim, env.act_dim), schedule.buffer)
+        state = state._replace(fleet=launch(env, pool, key_fleet, schedule.simulators, fresh), simulated=empty)
+        return collect(pool, state, key_fill, -(-agent.batches.n_sim // schedule.simulators))
+
+    def update(real: ReplayState, state: HybridState, key: Key) -> tuple[PyTree, Metrics]:
+        def one(agent_state: PyTree, key: Key) -> tuple[PyTree, Metrics]:
+            key_rows, key_update = jax.random.split(key)
+            batch = agent.batches.sample((real, state.simulated), key_rows)
+            return learner.update(agent_state, batch, key_update)
+
+        return jax.lax.scan(one, state.learner, jax.random.split(key, schedule.updates_per_round))
+
+    def one_round(pool: World, real: ReplayState, state: HybridState) -> tuple[HybridState, Metrics]:
+        key, key_collect, key_update = jax.random.split(state.key, 3)
+        if agent.simulates:
+            state = collect(pool, state, key_collect, schedule.steps_per_round)
+        trained, metrics = update(real, state, key_update)
+        averages = {name: x.mean() for name, x in metrics.items()}
+        return state._replace(learner=trained, key=key, rounds=state.rounds + 1), averages
+
+    def chunk(pool: World, real: ReplayState, state: HybridState) -> tuple[HybridState, Metrics]:
+        rounds = schedule.rounds_per_chunk
+        state, metrics = jax.lax.scan(lambda own, _: one_round(pool, real, own), state, None, length=rounds)
+        return state, {name: x.mean() for name, x in metrics.items()}
+
+    return Trainer(init, chunk)

@@ -1,0 +1,39 @@
+"""What agents leave that act by an actor network alone."""
+
+from typing import Any, NamedTuple
+
+import jax
+
+from sgft_jax.io.jsonfile import jsonable
+from sgft_jax.models.config import NetworkConfig
+from sgft_jax.models.networks import make_affine_actor, tanh_gaussian_action
+from sgft_jax.models.normalizer import normalize
+from sgft_jax.types import Array, Key, Normalizer, Policy, PyTree
+
+
+class ACTORParams(NamedTuple):
+    """actor: parameters of the network. normalizer: of the observations that it reads."""
+
+    actor: PyTree
+    normalizer: Normalizer
+
+
+def affine_policy(obs_dim: int, act_dim: int, network: NetworkConfig) -> Policy:
+    """How an actor of `make_affine_actor` acts."""
+    actor = make_affine_actor(obs_dim, act_dim, network, output_gain=1.0)  # which only says where training begins
+
+    def act(params: ACTORParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
+        moments = actor.apply(params.actor, normalize(params.normalizer, obs))
+        return tanh_gaussian_action(moments, key, explore=explore), carry
+
+    return Policy(lambda: (), act)
+
+
+def exported(state: PyTree) -> ACTORParams:
+    """Copies of the actor and the statistics of a learner's state, which may be donated afterwards."""
+    return ACTORParams(*jax.tree.map(lambda x: x + 0, (state.actor.params, state.normalizer)))
+
+
+def card(network: NetworkConfig, gamma: float) -> dict[str, Any]:
+    """What the card of such a policy says, see `sgft_jax.policies.make_policy`."""
+    return {"algorithm": "actor", "network": jsonable(network), "gamma": gamma}

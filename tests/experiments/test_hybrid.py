@@ -1,0 +1,162 @@
+"""Learning from real data and a simulator, end to end on a point mass: run, interrupt, resume, errors."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+import toy
+
+import envs
+import sgft_jax
+from experiments import cli, hybrid
+from experiments.hybrid_args import data_name, run_folder
+from sgft_jax.hybrid.scores import normalised
+from sgft_jax.io.log import MetricsLog, read_jsonl
+from sgft_jax.types import UserError
+
+OPTIONS = """--task toy --seeds 2 --no-video --schedule.updates 24 --schedule.simulators 2 --schedule.buffer 64
+    --schedule.chunk-updates 6 --eval-every 12 --eval-episodes 2 --checkpoint-every 6 --options.hidden 16
+    --options.rows 8"""
+TINY = OPTIONS.split()
+
+
+@pytest.fixture(autouse=True)
+def _toy(monkeypatch):
+    monkeypatch.setitem(envs.TASKS, "toy", "toy")
+    monkeypatch.setattr(cli, "set_up", lambda: None)
+
+
+@pytest.fixture
+def data(tmp_path):
+    return d4rl(tmp_path / "recorded-v2.hdf5", toy.make().obs_dim, 2)
+
+
+@pytest.fixture
+def gap(tmp_path):
+    """A file of two simulators."""
+    path = tmp_path / "two.toml"
+    path.write_text("[heavy.params]\nmass = 2.0\n[slippery.params]\nfriction = 1.0\n")
+    return str(path)
+
+
+def d4rl(path, obs_dim, act_dim, n=60):
+    draw = np.random.default_rng(0)
+    obs = draw.uniform(-1, 1, (n, obs_dim)).astype(np.float32)
+    with h5py.File(path, "w") as file:
+        file["observations"], file["next_observations"] = obs, obs + 0.01
+        file["actions"] = draw.uniform(-1, 1, (n, act_dim)).astype(np.float32)
+        file["rewards"] = draw.normal(size=n).astype(np.float32)
+        file["terminals"], file["timeouts"] = np.zeros(n, bool), (np.arange(n) % 20) == 19
+    return path
+
+
+def words(tmp_path, data, *more, out="out"):
+    given = [] if data is None else ["--data", str(data), "--options.ratio-rows", "8"]
+    return [*TINY, *given, "--out", str(tmp_path / out), *more]
+
+
+def complaint(argv, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        hybrid.main(argv)
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and error.count("\n") == 1
+    return error
+
+
+def test_a_run_leaves_curves_policies_and_a_summary_for_each_simulator(tmp_path, data, gap, capsys):
+    hybrid.main(words(tmp_path, data, "--gap", gap, "--variant", "w"))
+    said = capsys.readouterr().out
+    assert "60 transitions of 3 episodes" in said and "heavy: success in the real system" in said
+    for name in ("heavy", "slippery"):
+        folder = tmp_path / f"out/hybrid/toy/{name}/recorded-v2/h2oplus_w/seeds-0-1"
+        evaluations = read_jsonl(folder / "eval.jsonl")
+        assert [line["step"] for line in evaluations] == [0, 12, 24] and len(evaluations[0]["score"]) == 2
+        assert [line["step"] for line in read_jsonl(folder / "metrics.jsonl")] == [6, 12, 18, 24]
+        summary = json.loads((folder / "summary.json").read_text())
+        assert summary["last"] == evaluations[-1]["score"] and summary["updates"] == 24
+        assert summary["data"]["transitions"] == 60 and summary["gap"]["name"] == name
+        np.testing.assert_allclose(summary["late"], np.mean([line["score"] for line in evaluations], axis=0))
+        policy = sgft_jax.load_policy(folder / "policy/seed-1")
+        action = np.asarray(policy.act([0.5, 0.0, 0.0, 0.0]))
+        assert action.shape == (2,) and (np.abs(action) < 1).all()
+
+
+def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path, data, monkeypatch):
+    hybrid.main(words(tmp_path, data, "--gap", "sim", out="whole"))
+    write, left = MetricsLog.metrics, iter(range(3))
+
+    def metrics(*args):
+        if next(left, None) is None:
+            raise KeyboardInterrupt
+        write(*args)
+
+    with monkeypatch.context() as patched, pytest.raises(SystemExit) as stopped:
+        patched.setattr(MetricsLog, "metrics", metrics)
+        hybrid.main(words(tmp_path, data, "--gap", "sim", out="cut"))
+    assert stopped.value.code == 130
+    hybrid.main(words(tmp_path, data, "--gap", "sim", "--resume", out="cut"))
+    whole, cut = (tmp_path / f"{out}/hybrid/toy/sim/recorded-v2/h2oplus/seeds-0-1" for out in ("whole", "cut"))
+    for name in ("metrics.jsonl", "eval.jsonl"):
+        assert (whole / name).read_text() == (cut / name).read_text()
+
+
+def test_sac_needs_no_data(tmp_path):
+    hybrid.main(words(tmp_path, None, "--method", "sac", "--gap", "sim"))
+    folder = tmp_path / "out/hybrid/toy/sim/no-data/sac/seeds-0-1"
+    assert json.loads((folder / "summary.json").read_text())["data"] is None and (folder / "policy/seed-1").exists()
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["--method", "h2opuls"], "did you mean 'h2oplus'"),
+        (["--preset", "papre"], "did you mean 'paper'"),
+        (["--options.value-share", "2"], "option value-share is 2.0: must be from 0 to 1"),
+        (["--schedule.simulators", "0"], "option simulators is 0: must be at least 1"),
+        (["--gap", "gravitiy"], "gravitiy"),
+        (["--variant", "a/b"], "--variant 'a/b'"),
+        (["--gap", "sim", "--successors", "next"], "successors: there is no 'next'"),
+    ],
+)
+def test_bad_options(more, said, tmp_path, data, capsys):
+    assert said in complaint(words(tmp_path, data, *more), capsys)
+    assert not (tmp_path / "out").exists()
+
+
+def test_data_that_is_missing_or_of_another_task(tmp_path, capsys):
+    assert "--data: h2oplus learns from real data" in complaint([*TINY, "--gap", "sim"], capsys)
+    other = d4rl(tmp_path / "other.hdf5", 3, 2)
+    error = complaint(words(tmp_path, other, "--gap", "sim"), capsys)
+    assert "other.hdf5: has 3 observations and 2 actions, toy has 4 and 2" in error
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_data_are_refused_when_a_run_goes_on(tmp_path, data, capsys):
+    hybrid.main(words(tmp_path, data, "--gap", "sim"))
+    d4rl(data, 4, 2, n=70)
+    assert "data" in complaint(words(tmp_path, data, "--gap", "sim", "--resume"), capsys)
+
+
+def test_presets_are_the_defaults_of_their_options():
+    paper, released = (hybrid.arguments("h2oplus", preset=name).options for name in ("", "released"))
+    assert (paper.value_share, released.value_share) == (0.1, 0.5)
+
+
+def test_folders_are_named_after_what_a_method_learns_from(tmp_path):
+    args = hybrid.arguments("h2oplus", data=tmp_path / "halfcheetah_medium-v2.hdf5", seeds=1)
+    assert run_folder(args, "gravity").parts[-5:] == (
+        "halfcheetah", "gravity", "halfcheetah_medium-v2", "h2oplus", "seed-0",
+    )  # fmt: skip
+    assert data_name(tmp_path / "mine-v0/data/main_data.hdf5") == "mine-v0" == data_name(tmp_path / "mine-v0")
+
+
+def test_returns_on_the_scale_of_d4rl():
+    assert normalised("halfcheetah", -280.178953) == 0 and normalised("walker2d", 4592.3) == 100
+    assert normalised("halfcheetah", 6861.0) == pytest.approx(57.5, abs=0.1)  # H2O+'s mark, section 7 of its table
+    assert normalised("toy", 1.0) is None
+
+
+def test_unknown_methods_are_named():
+    with pytest.raises(UserError, match="did you mean 'sac'"):
+        hybrid.arguments("sacc")

@@ -1,0 +1,159 @@
+"""The loop of simulators and updates, on a point mass: what is collected, how often one learns, exact resumption."""
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toy
+
+from envs import gaps
+from envs.gaps import Gap
+from envs.pools import real_worlds
+from sgft_jax.data import replay
+from sgft_jax.hybrid import trainer
+from sgft_jax.hybrid.methods import NAMES, get_method
+from sgft_jax.hybrid.schedule import Schedule
+from sgft_jax.types import Transition, UserError
+
+ENV = toy.make()
+SMALL = {"hidden": (16,), "rows": 8}
+SCHEDULE = Schedule(updates=24, simulators=3, buffer=64, chunk_updates=6)  # 4 chunks of 2 rounds
+
+
+def build(name="h2oplus", **changes):
+    method = get_method(name)
+    own = {key: value for key, value in {**SMALL, "ratio_rows": 8}.items() if hasattr(method.config, key)}
+    return method.build(dataclasses.replace(method.config, **own | changes), ENV)
+
+
+def real_rows(n=50):
+    draw = np.random.default_rng(0)
+    blank = replay.blank(ENV.obs_dim, ENV.act_dim)
+    rows = jax.tree.map(lambda x: draw.uniform(-1, 1, (n, *x.shape)).astype(np.float32), blank)
+    return rows._replace(discount=np.full(n, 0.9, np.float32))
+
+
+def pools_of(*masses):
+    """[M, 1] simulators that differ in the mass, in kg."""
+    found = [Gap(f"mass-{mass}", {"mass": mass}, {}) for mass in masses]
+    return real_worlds(ENV, [gaps.from_dict(ENV, gap.name, {"params": gap.params}) for gap in found], jax.random.key(0))
+
+
+def keys_of(*seeds):
+    return jnp.stack([jax.random.key(seed) for seed in seeds])
+
+
+def played(agent, schedule=SCHEDULE, masses=(1.0,), seeds=(0,), **given):
+    """The state after every chunk."""
+    pools, keys = pools_of(*masses), keys_of(*seeds)
+    steps = trainer.train(ENV, agent, schedule, pools, real_rows(), keys, gamma=0.9, **given)
+    return [(jax.tree.map(jnp.copy, state), metrics) for state, metrics in steps]
+
+
+def plain(state):
+    """Without random keys, which numpy cannot read."""
+    return state._replace(key=jax.random.key_data(state.key), fleet=None)
+
+
+def test_each_round_collects_and_learns():
+    (start, none), *chunks = played(build())
+    assert none == {} and len(chunks) == 4
+    fill = 18  # six steps of three simulators hold a first batch of 16
+    assert int(start.simulated.size[0]) == fill and int(start.learner.step[0]) == 0
+    for i, (state, metrics) in enumerate(chunks, 1):
+        assert int(state.rounds[0]) == 2 * i and int(state.learner.step[0]) == 6 * i
+        assert int(state.simulated.size[0]) == min(fill + 6 * i, 64)
+        assert all(np.isfinite(values).all() and values.shape == (1,) for values in metrics.values())
+
+
+def test_the_released_schedule_collects_long_and_then_learns_as_often():
+    schedule = Schedule(updates=20, simulators=1, steps_per_round=10, buffer=100, chunk_updates=10)
+    assert (schedule.updates_per_round, schedule.rounds_per_chunk, schedule.chunks) == (10, 1, 2)
+    *_, (state, _) = played(build(), schedule)
+    assert int(state.simulated.size[0]) == 16 + 20 and int(state.learner.step[0]) == 20
+
+
+def test_the_rows_are_those_of_the_members_own_simulator():
+    """What a push does to a heavy and to a light point tells which simulator a row is from."""
+    *_, (state, _) = played(build(), masses=(0.5, 4.0), seeds=(0, 0))
+    rows = state.simulated.data
+    held = np.arange(64) < int(state.simulated.size[0])
+    pushed = np.asarray(rows.next_obs[:, held, 2:] - (1 - 0.1 * 4.0) * rows.obs[:, held, 2:])
+    gain = [np.polyfit(np.asarray(rows.action[i, held]).ravel(), pushed[i].ravel(), 1)[0] for i in range(2)]
+    np.testing.assert_allclose(gain, [0.1 * toy.FORCE / 0.5, 0.1 * toy.FORCE / 4.0], rtol=0.1)
+
+
+def test_members_do_what_they_would_do_alone():
+    *_, (both, _) = played(build(), masses=(0.5, 4.0), seeds=(0, 1))
+    *_, (alone, _) = played(build(), masses=(4.0,), seeds=(1,))
+    own = jax.tree.map(lambda x: x[1:], plain(both))
+    chex.assert_trees_all_close(own.learner, plain(alone).learner, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_resumed_run_ends_like_an_uninterrupted_one(name):
+    agent = build(name)
+    whole = played(agent)
+    middle, end = whole[2][0], whole[-1][0]
+    resumed = played(agent, state=middle)
+    assert len(resumed) == 3  # where it stopped, and two chunks
+    chex.assert_trees_all_equal(plain(resumed[-1][0]), plain(end))
+
+
+def test_the_shapes_of_a_state_are_known_without_training():
+    agent = build()
+    like = trainer.shape_of(ENV, agent, SCHEDULE, pools_of(1.0), real_rows(), keys_of(0))
+    chex.assert_trees_all_equal_shapes_and_dtypes(plain_shapes(like), plain_shapes(played(agent)[-1][0]))
+
+
+def plain_shapes(state):
+    return state._replace(key=None)
+
+
+def test_discriminators_read_standardised_observations_only_if_asked_to():
+    rows = real_rows()
+    for asked, mean in ((False, np.zeros(4)), (True, rows.obs.mean(0))):
+        state = played(build(standardise=asked))[0][0]
+        np.testing.assert_allclose(state.learner.ratio.normalizer.mean[0], mean, atol=1e-6)
+
+
+def test_sac_sees_no_real_row():
+    def rows(sign):
+        return Transition(*(sign * 1e3 * np.ones_like(x) for x in real_rows()))
+
+    agent, pools, keys = build("sac"), pools_of(1.0), keys_of(0)
+    ends = []
+    for sign in (-1, 1):
+        *_, (state, _) = trainer.train(ENV, agent, SCHEDULE, pools, rows(sign), keys, gamma=0.9)
+        ends.append(state.learner)
+    chex.assert_trees_all_equal(*ends)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"updates": 0}, "option updates is 0: must be at least 1"),
+        ({"updates_per_step": -1.0}, "option updates-per-step is -1.0: must be a positive number"),
+        ({"simulators": 50, "buffer": 20}, "option buffer is 20: must be at least the rows of a round, 50"),
+    ],
+)
+def test_bad_schedules(changes, words):
+    with pytest.raises(UserError, match=words):
+        Schedule(**changes)
+
+
+def test_presets_are_what_they_are_called():
+    """Section 3 of the paper, and the released code, which differs from it."""
+    paper, released, robot = (get_method("h2oplus").presets[name] for name in ("paper", "released", "released-robot"))
+    assert (paper.value_share, paper.value_loss, paper.ratio, paper.rows) == (0.1, "iql", True, 128)
+    assert (released.value_share, released.expectile) == (0.5, 0.5)
+    assert (robot.value_share, robot.expectile, robot.hidden, robot.rows, robot.ratio_rows) == (
+        0.1,
+        0.9,
+        (32, 32),
+        16,
+        256,
+    )
