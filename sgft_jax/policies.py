@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from sgft_jax.learners import recurrent, tdmpc2, tdmpc2_model
-from sgft_jax.learners.actor import affine_policy
+from sgft_jax.learners.actor import actor_policy
 from sgft_jax.learners.sac import SACParams
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.config import NetworkConfig
@@ -21,8 +21,8 @@ from sgft_jax.types import Array, Key, Policy, PyTree, Task, UserError
 def make_policy(card: Mapping[str, Any], task: Task) -> Policy:
     """How the prior with this card acts. task: its task; policies that plan ask it for rewards.
 
-    card: `algorithm`, `gamma`, `network` (SAC, recurrent SAC, actors alone), `config` (TD-MPC2, recurrent SAC), and
-    `plan` for a prior of SAC that plans.
+    card: `algorithm`, `gamma`, `network` (SAC, recurrent SAC, actors alone), `head` (actors alone), `config` (TD-MPC2,
+    recurrent SAC), and `plan` for a prior of SAC that plans.
     """
     if card.get("algorithm", "sac") == "tdmpc2":
         own = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
@@ -31,7 +31,7 @@ def make_policy(card: Mapping[str, Any], task: Task) -> Policy:
         return tdmpc2_policy(structure, tdmpc2.TDMPC2Hyper(gamma=card["gamma"]))
     network = network_of(card)
     if card.get("algorithm") == "actor":
-        return affine_policy(task.obs_dim, task.act_dim, network)
+        return actor_policy(task.obs_dim, task.act_dim, network, card["head"])
     if card.get("algorithm") == "recurrent":
         return recurrent_policy(recurrent.RecurrentConfig(task.obs_dim, task.act_dim, network, card["config"]["gru"]))
     if plan := card.get("plan"):

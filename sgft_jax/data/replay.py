@@ -59,6 +59,14 @@ def add_episode(state: ReplayState, rows: Transition, valid: Array) -> ReplaySta
     return add_batch(state, rows, valid)
 
 
+def obs_std(state: ReplayState) -> Array:
+    """Standard deviation [obs_dim] of the observations that are held; rows not yet written do not count."""
+    held = (jnp.arange(state.data.reward.shape[0]) < state.size)[:, None]
+    count = jnp.maximum(state.size, 1)
+    mean = jnp.sum(state.data.obs, axis=0, where=held) / count
+    return jnp.sqrt(jnp.sum(jax.vmap(lambda obs: (obs - mean) ** 2)(state.data.obs), axis=0, where=held) / count)
+
+
 def sample(state: ReplayState, key: Key, n: int) -> Batch:
     """Draw n rows uniformly with replacement from what is held; zeros while the buffer is empty."""
     rows = jax.random.randint(key, (n,), 0, jnp.maximum(state.size, 1))

@@ -1,14 +1,17 @@
 """What agents leave that act by an actor network alone."""
 
-from typing import Any, NamedTuple
+import functools
+from typing import Any, Literal, NamedTuple
 
 import jax
 
 from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.models.config import NetworkConfig
-from sgft_jax.models.networks import make_affine_actor, tanh_gaussian_action
+from sgft_jax.models.networks import make_actor, make_affine_actor, tanh_gaussian_action
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.types import Array, Key, Normalizer, Policy, PyTree
+
+Head = Literal["affine", "gaussian"]
 
 
 class ACTORParams(NamedTuple):
@@ -18,9 +21,12 @@ class ACTORParams(NamedTuple):
     normalizer: Normalizer
 
 
-def affine_policy(obs_dim: int, act_dim: int, network: NetworkConfig) -> Policy:
-    """How an actor of `make_affine_actor` acts."""
-    actor = make_affine_actor(obs_dim, act_dim, network, output_gain=1.0)  # which only says where training begins
+def actor_policy(obs_dim: int, act_dim: int, network: NetworkConfig, head: Head) -> Policy:
+    """How such an actor acts. head: what its last layer says, "affine" of `make_affine_actor`, "gaussian" of
+    `make_actor`.
+    """
+    make = make_actor if head == "gaussian" else functools.partial(make_affine_actor, output_gain=1.0)
+    actor = make(obs_dim, act_dim, network)  # the gain only says where training begins
 
     def act(params: ACTORParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         moments = actor.apply(params.actor, normalize(params.normalizer, obs))
@@ -34,6 +40,6 @@ def exported(state: PyTree) -> ACTORParams:
     return ACTORParams(*jax.tree.map(lambda x: x + 0, (state.actor.params, state.normalizer)))
 
 
-def card(network: NetworkConfig, gamma: float) -> dict[str, Any]:
+def card(network: NetworkConfig, head: Head, gamma: float) -> dict[str, Any]:
     """What the card of such a policy says, see `sgft_jax.policies.make_policy`."""
-    return {"algorithm": "actor", "network": jsonable(network), "gamma": gamma}
+    return {"algorithm": "actor", "network": jsonable(network), "head": head, "gamma": gamma}

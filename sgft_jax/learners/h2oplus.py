@@ -5,9 +5,7 @@ weigh as much as the simulator's dynamics can be trusted there. Structure is sta
 a leaf of the state in `H2OPlusHyper`. Source: Niu et al. 2023 (H2O+), and where it is silent its released code.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import NamedTuple, get_args
 
 import jax
@@ -16,11 +14,9 @@ import optax
 from flax import struct
 
 from sgft_jax import checks
-from sgft_jax.data import sources
-from sgft_jax.learners import iql, losses, optim
-from sgft_jax.learners.sac import step_temperature
+from sgft_jax.learners import iql, losses, optim, soft
 from sgft_jax.learners.value_losses import value_loss
-from sgft_jax.models import normalizer
+from sgft_jax.models import normalizer, ratio
 from sgft_jax.models.networks import (
     Network,
     NetworkConfig,
@@ -30,22 +26,7 @@ from sgft_jax.models.networks import (
     tanh_gaussian_action,
     tanh_gaussian_sample,
 )
-from sgft_jax.models.ratio import Ratio, RatioConfig, RatioState, make_ratio, weight
-from sgft_jax.types import (
-    Array,
-    Batch,
-    Key,
-    Learner,
-    Metrics,
-    Normalizer,
-    PyTree,
-    Source,
-    UserError,
-    ValueLoss,
-    unknown,
-)
-
-OUTPUT_GAIN = 0.01  # of the last layers: all values and means begin near 0
+from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree, UserError, ValueLoss, unknown
 
 
 def _wide() -> NetworkConfig:
@@ -83,7 +64,7 @@ class H2OPlusConfig:
 
 
 class H2OPlusHyper(NamedTuple):
-    """The numbers of an agent, each []. The defaults are those of the preset "paper".
+    """The numbers of an agent, each []. The defaults are the paper's; where it is silent, IQL's and the released code's.
 
     lr_*: Adam learning rates. tau: target averaging rate.
     alpha: initial (or fixed) temperature; entropy_per_dim: target entropy / act_dim, nats.
@@ -107,8 +88,8 @@ class H2OPlusHyper(NamedTuple):
 class H2OPlusState(struct.PyTreeNode):
     """An agent in training. step: [] int32 updates done.
 
-    normalizer: of the observations that actor, critic and value read. ratio: None where the ratio is off; it has a
-    normaliser of its own. Both leave observations as they are until they are set.
+    normalizer: of the observations that actor, critic and value read. ratio: a `RatioState` with a normaliser of its
+    own, None where the ratio is off. Both leave observations as they are until they are set.
     """
 
     actor: optim.Fit
@@ -116,51 +97,10 @@ class H2OPlusState(struct.PyTreeNode):
     target_critic: PyTree
     value: optim.Fit
     log_alpha: optim.Fit
-    ratio: RatioState | None
+    ratio: PyTree
     normalizer: Normalizer
     hyper: H2OPlusHyper
     step: Array
-
-
-# --- published settings -----------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class H2OPlusPreset:
-    """Settings with a name.
-
-    source: where they come from. hidden: of actor, critics and value; the discriminators stay at 256 x 2.
-    rows: how many real rows an update takes, and as many simulated ones. ratio_rows: the same of the discriminators'.
-    hyper: the numbers.
-    """
-
-    source: str
-    hidden: tuple[int, ...] = (256, 256)
-    rows: int = 128
-    ratio_rows: int = 256
-    hyper: H2OPlusHyper = field(default_factory=H2OPlusHyper)
-
-    def config(self, obs_dim: int, act_dim: int) -> H2OPlusConfig:
-        """The structure for an environment."""
-        return H2OPlusConfig(obs_dim, act_dim, NetworkConfig(self.hidden), ratio_rows=2 * self.ratio_rows)
-
-    def batches(self) -> Source:
-        """What an update takes, from the state of `sources.two_buffers`."""
-        return sources.beside(*(sources.two_buffers(n, n) for n in (self.rows, self.ratio_rows)))
-
-
-PRESETS: Mapping[str, H2OPlusPreset] = MappingProxyType(
-    {
-        "paper": H2OPlusPreset("H2O+ paper; expectile and sizes, which it leaves out, from IQL and the released code"),
-        "released": H2OPlusPreset(
-            "released MuJoCo code: an expectile of 0.5 makes V the mean of the data's actions",
-            hyper=H2OPlusHyper(value_share=0.5, expectile=0.5),
-        ),
-        "released-robot": H2OPlusPreset(
-            "released code of the wheel-legged robot", (32, 32), 16, hyper=H2OPlusHyper(expectile=0.9)
-        ),
-    }
-)
 
 
 # --- the learner ------------------------------------------------------------------------------------------------------
@@ -192,7 +132,7 @@ class _Parts(NamedTuple):
     actor: Network
     critic: Network
     value: Network
-    ratio: Ratio
+    ratio: ratio.Ratio
     optimiser: optax.GradientTransformation
 
 
@@ -200,10 +140,10 @@ def make_h2oplus(config: H2OPlusConfig, hyper: H2OPlusHyper | None = None) -> Le
     """The learner of a configuration. Its batches must say which rows are simulated (`Batch.is_sim`)."""
     sizes, body = (config.obs_dim, config.act_dim), config.network
     parts = _Parts(
-        actor=make_affine_actor(*sizes, body, output_gain=OUTPUT_GAIN),
-        critic=make_critic(*sizes, body, members=config.critics, output_gain=OUTPUT_GAIN),
-        value=make_value(config.obs_dim, body, output_gain=OUTPUT_GAIN),
-        ratio=make_ratio(RatioConfig(*sizes, config.ratio_network, noise=config.ratio_noise)),
+        actor=make_affine_actor(*sizes, body, output_gain=soft.OUTPUT_GAIN),
+        critic=make_critic(*sizes, body, members=config.critics, output_gain=soft.OUTPUT_GAIN),
+        value=make_value(config.obs_dim, body, output_gain=soft.OUTPUT_GAIN),
+        ratio=ratio.make_ratio(ratio.RatioConfig(*sizes, config.ratio_network, noise=config.ratio_noise)),
         optimiser=optim.adam(),
     )
     leaves = hyper or H2OPlusHyper()
@@ -251,75 +191,27 @@ def _update(
 ) -> tuple[H2OPlusState, Metrics]:
     """Discriminators first. All other losses are those of the networks before the update. Source: the released code."""
     key_ratio, key_actor, key_target = jax.random.split(key, 3)
-    batch, for_ratio = _split(config, batch)
-    state, weights, metrics = _update_ratio(config, parts, state, batch, for_ratio, key_ratio)
+    batch, for_ratio = ratio.split_rows(batch, config.ratio_rows)
+    weights, metrics = jnp.ones_like(batch.reward), {}
+    if config.ratio:
+        fit, log_w, metrics = ratio.step(
+            parts.ratio, state.ratio, batch, for_ratio, key_ratio, rate=state.hyper.lr_ratio
+        )
+        state, weights = state.replace(ratio=fit), jax.vmap(ratio.weight)(log_w)
     normal = jax.vmap(normalizer.normalize, (None, 0))
     batch = batch._replace(obs=normal(state.normalizer, batch.obs), next_obs=normal(state.normalizer, batch.next_obs))
 
-    actor, log_alpha, of_actor = _step_policy(config, parts, state, batch, key_actor)
+    target_entropy = state.hyper.entropy_per_dim * config.act_dim if config.tune_alpha else None
+    actor, log_alpha, of_actor = soft.step_policy(
+        parts.actor, parts.critic, parts.optimiser, state, batch, key_actor, target_entropy=target_entropy
+    )
     value, of_value = _step_value(config, parts, state, batch)
     critic, of_critic = _step_critic(parts, state, batch, weights, key_target)
     target = optax.incremental_update(critic.params, state.target_critic, state.hyper.tau)
     state = state.replace(
         actor=actor, log_alpha=log_alpha, value=value, critic=critic, target_critic=target, step=state.step + 1
     )
-    return state, metrics | of_actor | of_value | of_critic | {"actor/alpha": jnp.exp(log_alpha.params)}
-
-
-def _split(config: H2OPlusConfig, batch: Batch) -> tuple[Batch, Batch]:
-    """The rows that everything but the discriminators learns from, and theirs."""
-    if config.ratio_rows is None:
-        return batch, batch
-    kept = batch.reward.shape[0] - config.ratio_rows
-    if kept < 1:
-        raise UserError(
-            f"option ratio-rows is {config.ratio_rows}: must be less than the batch, {kept + config.ratio_rows}"
-        )
-    return jax.tree.map(lambda x: x[:kept], batch), jax.tree.map(lambda x: x[kept:], batch)
-
-
-def _update_ratio(
-    config: H2OPlusConfig, parts: _Parts, state: H2OPlusState, batch: Batch, for_ratio: Batch, key: Key
-) -> tuple[H2OPlusState, Array, Metrics]:
-    """One step of the discriminators, then the weights [B] that they give to the rows of `batch`, 1 to real ones."""
-    simulated, ones = losses.is_simulated(batch), jnp.ones_like(batch.reward)
-    if not config.ratio:
-        return state, ones, {}
-    fit, metrics = parts.ratio.update(state.ratio, for_ratio, key, rate=state.hyper.lr_ratio)
-    log_w = jax.vmap(parts.ratio.log_ratio, (None, 0, 0, 0))(fit, batch.obs, batch.action, batch.next_obs)
-    weights = jax.vmap(weight)(log_w)
-    metrics |= {
-        "ratio/weight_sim": losses.sim_mean(weights, batch),
-        "ratio/weight_real": losses.real_mean(weights, batch),
-    }
-    return state.replace(ratio=fit), jnp.where(simulated, weights, ones), metrics
-
-
-def _step_policy(
-    config: H2OPlusConfig, parts: _Parts, state: H2OPlusState, batch: Batch, key: Key
-) -> tuple[optim.Fit, optim.Fit, Metrics]:
-    """Actor and temperature after a step on the states of both sources. Source: H2O+ Eq. (10), with a ~ pi."""
-    alpha, keys = jnp.exp(state.log_alpha.params), jax.random.split(key, batch.reward.shape[0])
-
-    def one(params: PyTree, obs: Array, key: Key) -> tuple[Array, Array]:
-        action, log_prob = tanh_gaussian_sample(parts.actor.apply(params, obs), key)
-        q = parts.critic.apply(state.critic.params, obs, action)
-        return losses.actor_loss(log_prob, q, alpha=alpha), log_prob
-
-    def loss(params: PyTree) -> tuple[Array, Array]:
-        each, log_prob = jax.vmap(one, (None, 0, 0))(params, batch.obs, keys)
-        return losses.row_mean(each, batch), log_prob
-
-    (mean, log_prob), grads = jax.value_and_grad(loss, has_aux=True)(state.actor.params)
-    actor = optim.step(parts.optimiser, state.actor, grads, state.hyper.lr_actor)
-    metrics = {"actor/loss": mean, "actor/entropy": -jnp.mean(log_prob)}
-    if not config.tune_alpha:
-        return actor, state.log_alpha, metrics
-    target = state.hyper.entropy_per_dim * config.act_dim
-    log_alpha = step_temperature(
-        parts.optimiser, state.log_alpha, batch, log_prob, target=target, rate=state.hyper.lr_alpha
-    )
-    return actor, log_alpha, metrics
+    return state, metrics | of_actor | of_value | of_critic
 
 
 def _step_value(config: H2OPlusConfig, parts: _Parts, state: H2OPlusState, batch: Batch) -> tuple[optim.Fit, Metrics]:
@@ -353,18 +245,4 @@ def _step_critic(
 
     targets = jax.vmap(target)(batch, jax.random.split(key, batch.reward.shape[0]))
 
-    def loss(params: PyTree) -> tuple[Array, tuple[Array, Array, Array]]:
-        q = jax.vmap(parts.critic.apply, (None, 0, 0))(params, batch.obs, batch.action)
-        each = jax.vmap(losses.critic_loss)(q, targets)
-        real, simulated = losses.real_mean(each, batch), losses.sim_mean(weights * each, batch)
-        return real + simulated, (q, real, simulated)
-
-    (total, (q, real, simulated)), grads = jax.value_and_grad(loss, has_aux=True)(state.critic.params)
-    fit = optim.step(parts.optimiser, state.critic, grads, hyper.lr_critic)
-    return fit, {
-        "critic/loss": total,
-        "critic/real_loss": real,
-        "critic/sim_loss": simulated,
-        "critic/q_mean": jnp.mean(q),
-        "critic/target_mean": jnp.mean(targets),
-    }
+    return soft.step_critic(parts.critic, parts.optimiser, state, batch, targets, weights)

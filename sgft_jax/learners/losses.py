@@ -31,14 +31,19 @@ def real_mean(each: Array, batch: Batch) -> Array:
 
 def sim_mean(each: Array, batch: Batch) -> Array:
     """`row_mean` [] over the simulator's rows alone."""
-    simulated = is_simulated(batch)
-    return row_mean(each, batch._replace(valid=simulated if batch.valid is None else simulated & batch.valid))
+    return row_mean(each, batch._replace(valid=sim_rows(batch)))
 
 
 def real_rows(batch: Batch) -> Array:
     """The valid rows [B] bool of the real system."""
     real = ~is_simulated(batch)
     return real if batch.valid is None else real & batch.valid
+
+
+def sim_rows(batch: Batch) -> Array:
+    """The valid rows [B] bool of the simulator."""
+    simulated = is_simulated(batch)
+    return simulated if batch.valid is None else simulated & batch.valid
 
 
 def td_target(reward: Array, discount: Array, next_q: Array, next_log_prob: Array, *, alpha: Array | float) -> Array:

@@ -6,7 +6,8 @@ so that learning rates and temperatures vmap like seeds do. Source: Haarnoja et 
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from functools import partial
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +49,7 @@ class SACConfig:
     train_critic: False keeps the critic as it is (a frozen-critic actor-critic).
     critics: members of the critic ensemble. target_critics: a target is the minimum over so many random ones of them,
         None = all (REDQ, RLPD). actor_mean: the actor follows the members' mean, not their minimum (RLPD).
+    entropy_in_target: False bootstraps from Q alone.
     critic_baseline: Q(s, a) = net(s, a) - V(s) with V frozen: what a kept critic means under shaped rewards.
     actor_batch: leading rows of the batch that the actor learns from, None = all.
     policy_delay: critic updates per update of actor and temperature. max_grad_norm: per network, None = no clipping.
@@ -66,6 +68,7 @@ class SACConfig:
     critics: int = 2
     target_critics: int | None = None
     actor_mean: bool = False
+    entropy_in_target: bool = True
     critic_baseline: bool = False
     actor_batch: int | None = None
     anchored: bool = False
@@ -78,6 +81,20 @@ class SACConfig:
         checks.at_least(self, 1, "policy_delay", "critics", "target_critics")
         if (self.target_critics or 1) > self.critics:
             raise checks.refusal("target_critics", self.target_critics, f"at most critics, {self.critics}")
+
+
+class CriticTerm(Protocol):
+    """What is added to the critic's loss; `__call__` -> []."""
+
+    def __call__(
+        self,
+        q: Callable[[Array, Array], Array],
+        policy: Callable[[Array, Key], tuple[Array, Array]],
+        batch: Batch,
+        key: Key,
+    ) -> Array:
+        """q(obs, action) -> [members]; policy(obs, key) -> (action, log pi []). batch: what the networks read."""
+        ...
 
 
 class SACHyper(NamedTuple):
@@ -148,6 +165,7 @@ class _Parts(NamedTuple):
     value: Network
     dynamics: Network
     optimiser: optax.GradientTransformation
+    critic_term: CriticTerm | None = None
 
 
 def _parts(config: SACConfig) -> _Parts:
@@ -161,9 +179,12 @@ def _parts(config: SACConfig) -> _Parts:
     )
 
 
-def make_sac(config: SACConfig, hyper: SACHyper | None = None) -> Learner:
-    """The learner of a configuration. Set the observation statistics with `state.replace(normalizer=...)`."""
-    parts = _parts(config)
+def make_sac(config: SACConfig, hyper: SACHyper | None = None, *, critic_term: CriticTerm | None = None) -> Learner:
+    """The learner of a configuration. Set the observation statistics with `state.replace(normalizer=...)`.
+
+    critic_term: what other algorithms add to the critic's loss.
+    """
+    parts = _parts(config)._replace(critic_term=critic_term)
     hyper = hyper or SACHyper()
 
     def init(key: Key) -> SACState:
@@ -226,7 +247,7 @@ def _assemble(
 
 def _update(config: SACConfig, parts: _Parts, state: SACState, batch: Batch, key: Key) -> tuple[SACState, Metrics]:
     """Critic, target, actor, temperature, then value (on the actor's own draws) and dynamics."""
-    key_target, key_actor, key_dynamics, key_members = jax.random.split(key, 4)
+    key_target, key_actor, key_dynamics, key_members, *key_term = jax.random.split(key, 5 if parts.critic_term else 4)
     raw, read = batch, jax.vmap(network_input, (None, 0, 0))
     batch = batch._replace(
         obs=read(state.normalizer, batch.obs, batch.context),
@@ -235,7 +256,8 @@ def _update(config: SACConfig, parts: _Parts, state: SACState, batch: Batch, key
 
     metrics: Metrics = {}
     if config.train_critic:
-        state, metrics = _update_critic(config, parts, state, batch, _target_members(config, key_members), key_target)
+        members = _target_members(config, key_members)
+        state, metrics = _update_critic(config, parts, state, batch, members, key_target, *key_term)
     rows = jax.tree.map(lambda x: x[: config.actor_batch], batch)
     state, q, log_prob, more = _update_actor(config, parts, state, rows, key_actor)
     metrics |= more
@@ -269,21 +291,32 @@ def _critic_of(config: SACConfig, parts: _Parts, state: SACState) -> Callable[[P
 
 
 def _update_critic(
-    config: SACConfig, parts: _Parts, state: SACState, batch: Batch, counted: Array | slice, key: Key
+    config: SACConfig,
+    parts: _Parts,
+    state: SACState,
+    batch: Batch,
+    counted: Array | slice,
+    key: Key,
+    key_term: Key | None = None,
 ) -> tuple[SACState, Metrics]:
-    """counted: the members that a target is the minimum of."""
+    """counted: the members that a target is the minimum of. key_term: for the critic term, where there is one."""
     critic, alpha = _critic_of(config, parts, state), jnp.exp(state.log_alpha.params)
 
     def target(row: Batch, key: Key) -> Array:
         action, log_prob = tanh_gaussian_sample(parts.actor.apply(state.actor.params, row.next_obs), key)
         next_q = critic(state.target_critic, row.next_obs, action)[counted]
-        return losses.td_target(row.reward, row.discount, next_q, log_prob, alpha=alpha)
+        price = alpha if config.entropy_in_target else 0.0
+        return losses.td_target(row.reward, row.discount, next_q, log_prob, alpha=price)
 
     targets = jax.vmap(target)(batch, jax.random.split(key, batch.reward.shape[0]))
 
     def loss(params: PyTree) -> tuple[Array, Array]:
         q = jax.vmap(critic, (None, 0, 0))(params, batch.obs, batch.action)
-        return losses.row_mean(jax.vmap(losses.critic_loss)(q, targets), batch), q
+        error = losses.row_mean(jax.vmap(losses.critic_loss)(q, targets), batch)
+        if parts.critic_term is None or key_term is None:
+            return error, q
+        policy = lambda obs, key: tanh_gaussian_sample(parts.actor.apply(state.actor.params, obs), key)  # noqa: E731
+        return error + parts.critic_term(partial(critic, params), policy, batch, key_term), q
 
     (value, q), grads = jax.value_and_grad(loss, has_aux=True)(state.critic.params)
     rate = state.hyper.lr_critic * optim.warmup_factor(state.step, state.hyper.lr_warmup)

@@ -17,7 +17,7 @@ from sgft_jax import checks
 from sgft_jax.learners import losses, optim
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import MLP, Network, NetworkConfig
-from sgft_jax.types import Array, Batch, Key, Metrics, Normalizer, PyTree
+from sgft_jax.types import Array, Batch, Key, Metrics, Normalizer, PyTree, UserError
 
 REAL, SIM = 0, 1  # the two logits of a discriminator
 
@@ -145,6 +145,28 @@ def make_ratio(config: RatioConfig) -> Ratio:
         return RatioState(joint_fit, pair_fit, state.normalizer), {"ratio/loss": value}
 
     return Ratio(init, update, ratio_of)
+
+
+def split_rows(batch: Batch, last: int | None) -> tuple[Batch, Batch]:
+    """The rows that a learner learns from, and the `last` rows, for its discriminators; None = all rows for both."""
+    if last is None:
+        return batch, batch
+    rows = batch.reward.shape[0]
+    if last >= rows:
+        raise UserError(f"option ratio-rows is {last}: must be less than the batch, {rows}")
+    return jax.tree.map(lambda x: x[:-last], batch), jax.tree.map(lambda x: x[-last:], batch)
+
+
+def step(
+    ratio: Ratio, state: RatioState, batch: Batch, for_ratio: Batch, key: Key, *, rate: Array | float
+) -> tuple[RatioState, Array, Metrics]:
+    """Discriminators after a step on `for_ratio`, and log w [B] of the rows of `batch` by the new ones, a constant."""
+    state, metrics = ratio.update(state, for_ratio, key, rate=rate)
+    log_w = jax.vmap(ratio.log_ratio, (None, 0, 0, 0))(state, batch.obs, batch.action, batch.next_obs)
+    for name, mean in (("real", losses.real_mean), ("sim", losses.sim_mean)):
+        metrics[f"ratio/log_{name}"] = mean(log_w, batch)
+        metrics[f"ratio/weight_{name}"] = mean(jax.vmap(weight)(log_w), batch)
+    return state, jax.lax.stop_gradient(log_w), metrics
 
 
 def _with_noise(parts: tuple[Array, ...], key: Key, std: float) -> tuple[Array, ...]:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.learners import h2oplus, iql, recurrent, sac, tdmpc2, tdmpc2_model
+from sgft_jax.learners import cql, darc, edac, h2o, h2oplus, iql, recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.models import gru, networks
 from sgft_jax.types import Batch, Learner
 
@@ -138,19 +138,57 @@ def _iql():
 
 
 def _h2oplus():
-    """Every other row is simulated."""
     learner = h2oplus.make_h2oplus(
         h2oplus.H2OPlusConfig(2, 1, network=NET, ratio_network=NET, tune_alpha=False),
         h2oplus.H2OPlusHyper(lr_actor=3e-3, lr_critic=1e-2, lr_value=1e-2, tau=0.1, alpha=1e-4),
     )
-    critic, value_net = networks.make_critic(2, 1, NET), networks.make_value(2, NET)
+    return _soft(learner, half_simulated, value=True)
+
+
+def _h2o():
+    """Hardly conservative: the answers are those of plain values."""
+    learner = h2o.make_h2o(
+        h2o.H2OConfig(2, 1, network=NET, ratio_network=NET, tune_alpha=False),
+        h2o.H2OHyper(lr_actor=3e-3, lr_critic=1e-2, tau=0.1, alpha=1e-4, conservatism=1e-3),
+    )
+    return _soft(learner, half_simulated)
+
+
+def _darc():
+    """Its discriminators begin without a clue, log w = 0: the probes' answers are those of the unchanged reward."""
+    config = darc.DARCConfig(2, 1, network=NET, ratio_network=NET, tune_alpha=False)
+    learner = darc.make_darc(config, SAC_HYPER, lr_ratio=1e-4)
+    case = _soft(learner, half_simulated, critic_of=lambda state: state.sac.critic)
+
+    def start(key):
+        state = case.learner.init(key)
+        return state.replace(
+            ratio=jax.tree.map(jnp.zeros_like, state.ratio)._replace(normalizer=state.ratio.normalizer)
+        )
+
+    return case._replace(start=start)
+
+
+def _cql():
+    config = cql.CQLConfig(2, 1, network=NET, conservatism=1e-3, tune_alpha=False)
+    return _soft(cql.make_cql(config, SAC_HYPER), lambda batch: batch)
+
+
+def _edac():
+    config = edac.EDACConfig(2, 1, network=NET, critics=4, diversity=1e-2, tune_alpha=False)
+    return _soft(edac.make_edac(config, SAC_HYPER), lambda batch: batch, members=4)
+
+
+def _soft(learner, feed, *, value=False, members=2, critic_of=lambda state: state.critic):
+    """A case of an actor-critic whose networks are those of NET."""
+    critic, value_net = networks.make_critic(2, 1, NET, members=members), networks.make_value(2, NET)
 
     @jax.jit
     def values(state, obs):
-        q = critic.apply(state.critic.params, obs, jnp.zeros(1))
-        return jnp.append(q, value_net.apply(state.value.params, obs))
+        q = critic.apply(critic_of(state).params, obs, jnp.zeros(1))
+        return jnp.append(q, value_net.apply(state.value.params, obs)) if value else q
 
-    case = counted(learner, feed=half_simulated, values=values, mode=None, steps=400)
+    case = counted(learner, feed=feed, values=values, mode=None, steps=400)
     return case._replace(mode=_mode(case))
 
 
@@ -219,6 +257,10 @@ MAKERS = {
     ),
     "iql": _iql,
     "h2oplus": _h2oplus,
+    "h2o": _h2o,
+    "darc": _darc,
+    "cql": _cql,
+    "edac": _edac,
     "recurrent": _recurrent,
     "tdmpc2": lambda: _tdmpc2(PLAIN, 800),
     "sgft-tdmpc2": lambda: _tdmpc2(dataclasses.replace(PLAIN, sgft=True), 1000),

@@ -18,7 +18,12 @@ QUICK = {
     "tdmpc2": set(),
     "sgft-tdmpc2": set(),
     "sac, ten critics": {"reward one step later", "action decides"},
+    "h2o": {"time limit"},
+    "darc": {"action decides"},
+    "cql": {"termination"},
+    "edac": {"state and action decide"},
 }
+SLOW = {"sac, ten critics", "h2o", "darc", "cql", "edac"}  # their weights and masks
 each_learner = pytest.mark.parametrize("name", MAKERS)
 
 
@@ -136,7 +141,7 @@ def rows_where(mask, new, old):
     return jnp.where(jnp.expand_dims(mask, tuple(range(1, new.ndim))), new, old)
 
 
-@pytest.mark.parametrize("name", [slow_if(name == "sac, ten critics", name) for name in FLAT])
+@pytest.mark.parametrize("name", [slow_if(name in SLOW, name) for name in FLAT])
 def test_invalid_rows_do_not_count(name):
     """Whatever finite numbers they hold."""
     valid = jnp.arange(probes.ROWS) < HALF
@@ -151,7 +156,7 @@ def test_invalid_rows_do_not_count(name):
     assert bits(clean) != bits(weighed(name, lambda batch: batch))
 
 
-@pytest.mark.parametrize("name", [slow_if(name == "sac, ten critics", name) for name in FLAT])
+@pytest.mark.parametrize("name", [slow_if(name in SLOW, name) for name in FLAT])
 def test_a_row_of_weight_two_counts_twice(name):
     """Of weight 0 it does not count at all; weights of 1 change nothing."""
     twice = jnp.where(jnp.arange(probes.ROWS) < HALF, 2.0, 0.0)

@@ -66,8 +66,8 @@ def build(config: Config, task: Task) -> HybridAgent:
         simulates=True,
         prepare=prepare,
         export=actor.exported,
-        policy=actor.affine_policy(task.obs_dim, task.act_dim, network),
-        card=actor.card(network, config.gamma),
+        policy=actor.actor_policy(task.obs_dim, task.act_dim, network, "affine"),
+        card=actor.card(network, "affine", config.gamma),
     )
 
 

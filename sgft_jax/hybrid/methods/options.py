@@ -1,8 +1,14 @@
 """Options that methods share, each with its help. Imports no JAX: command lines read it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 from sgft_jax import checks
+from sgft_jax.types import HybridAgent, Learner, PyTree, Source, Task
+
+if TYPE_CHECKING:
+    from sgft_jax.learners.sac import SACHyper
 
 
 @dataclass(frozen=True)
@@ -23,3 +29,47 @@ class ActorCriticOptions:
         checks.share(self, "tau")
         checks.layers(self, "hidden")
         checks.below_one(self, "gamma")
+
+
+@dataclass(frozen=True)
+class OfflineOptions(ActorCriticOptions):
+    """Options of methods that learn from the real rows alone."""
+
+    rows: int = 256
+    """Real rows of a batch."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.at_least(self, 1, "rows")
+
+
+def sac_numbers(config: ActorCriticOptions) -> "SACHyper":
+    """The numbers of methods that are made of SAC."""
+    from sgft_jax.learners.sac import SACHyper
+
+    return SACHyper(lr_actor=config.lr, lr_critic=config.lr, lr_alpha=config.lr, tau=config.tau)
+
+
+def sac_agent(
+    learner: Learner,
+    config: ActorCriticOptions,
+    task: Task,
+    batches: Source,
+    *,
+    simulates: bool,
+    sac_of: Callable[[PyTree], Any] = lambda state: state,
+) -> HybridAgent:
+    """The agent of a learner that is made of SAC. sac_of(state) -> its `SACState`."""
+    from sgft_jax.learners import actor
+    from sgft_jax.models.config import NetworkConfig
+
+    network = NetworkConfig(config.hidden)
+    return HybridAgent(
+        learner=learner,
+        batches=batches,
+        simulates=simulates,
+        prepare=lambda state, rows: state,
+        export=lambda state: actor.exported(sac_of(state)),
+        policy=actor.actor_policy(task.obs_dim, task.act_dim, network, "gaussian"),
+        card=actor.card(network, "gaussian", config.gamma),
+    )

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import ActorCriticOptions
+from sgft_jax.hybrid.methods.options import ActorCriticOptions, sac_agent, sac_numbers
 from sgft_jax.types import HybridAgent, HybridMethod, Task
 
 
@@ -20,23 +20,16 @@ class Config(ActorCriticOptions):
 
 
 def build(config: Config, task: Task) -> HybridAgent:
-    """The agent: H2O+ with neither real rows nor their value is SAC, with the same networks."""
+    """The agent."""
     from sgft_jax.data import sources
-    from sgft_jax.learners import actor, h2oplus
+    from sgft_jax.learners.sac import SACConfig, make_sac
     from sgft_jax.models.config import NetworkConfig
 
-    network = NetworkConfig(config.hidden)
-    structure = h2oplus.H2OPlusConfig(task.obs_dim, task.act_dim, network, ratio=False)
-    rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_value", "lr_alpha"), config.lr)
-    return HybridAgent(
-        learner=h2oplus.make_h2oplus(structure, h2oplus.H2OPlusHyper(**rates, tau=config.tau, value_share=0.0)),
-        batches=sources.two_buffers(0, config.rows),
-        simulates=True,
-        prepare=lambda state, rows: state,
-        export=actor.exported,
-        policy=actor.affine_policy(task.obs_dim, task.act_dim, network),
-        card=actor.card(network, config.gamma),
+    structure = SACConfig(
+        task.obs_dim, task.act_dim, network=NetworkConfig(config.hidden), train_value=False, train_dynamics=False
     )
+    learner = make_sac(structure, sac_numbers(config))
+    return sac_agent(learner, config, task, sources.two_buffers(0, config.rows), simulates=True)
 
 
 METHOD = HybridMethod(

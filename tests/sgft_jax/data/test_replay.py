@@ -52,6 +52,13 @@ def test_invalid_rows_are_never_sampled(key):
         assert set(drawn.tolist()) == set(held[-7:])
 
 
+def test_the_spread_of_observations_is_that_of_filled_rows():
+    """1, 3 and 5: mean 3, variance 8/3. With the two rows of zeros it would be 1.94."""
+    state = replay.add_batch(EMPTY, rows([1, 3, 5]))
+    assert replay.obs_std(state)[0] == pytest.approx((8 / 3) ** 0.5, rel=1e-6)
+    assert replay.obs_std(EMPTY)[0] == 0.0
+
+
 def test_sampling_is_uniform_and_keeps_rows_together(key):
     state = replay.add_batch(EMPTY, rows([1, 2, 3, 4]))
     batch = replay.sample(state, key, 8000)

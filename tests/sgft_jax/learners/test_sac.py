@@ -159,6 +159,32 @@ def test_entropy_in_the_target(key):
     assert metrics["critic/target_mean"] == pytest.approx(0.5 * float(metrics["actor/entropy"]), abs=0.15)
 
 
+def test_without_entropy_in_the_target(key):
+    batch = probe(key, discount=lambda s: jnp.ones_like(s), reward=lambda s, a: jnp.zeros_like(s))
+    state, update = ensemble(entropy_in_target=False)
+    assert update(state, batch, key)[1]["critic/target_mean"] == 0.0  # the minimum of the four
+
+
+def test_a_critic_term_joins_the_loss(key):
+    """3 + 5 times the mean of all critics at the data's actions; it may ask the policy, too."""
+    config = sac.SACConfig(1, 1, network=NET, train_value=False, train_dynamics=False)
+
+    def after(slope):
+        def term(q, policy, batch, key):
+            action, log_prob = policy(batch.obs[0], key)
+            assert action.shape == (1,) and log_prob.shape == ()
+            return 3.0 + slope * jnp.mean(jax.vmap(q)(batch.obs, batch.action))
+
+        learner = sac.make_sac(config, critic_term=term)
+        return jax.jit(learner.update)(learner.init(key), probe(key), key)
+
+    (flat, of_flat), (steep, of_steep) = after(0.0), after(5.0)
+    assert not equal(flat.critic, steep.critic)
+    assert of_steep["critic/q_mean"] == of_flat["critic/q_mean"] and of_flat["critic/loss"] > 3
+    gained = float(of_steep["critic/loss"] - of_flat["critic/loss"])
+    assert gained == pytest.approx(5 * float(of_flat["critic/q_mean"]), rel=1e-4)
+
+
 def test_the_actor_follows_the_minimum_or_the_mean(key):
     for mean, q in ((False, 0.0), (True, 1.5)):
         state, update = ensemble(actor_mean=mean)

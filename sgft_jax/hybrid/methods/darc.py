@@ -1,0 +1,40 @@
+"""DARC: SAC in a simulator that pays less where it does what the real system would not (Eysenbach et al. 2021)."""
+
+from dataclasses import dataclass
+
+from sgft_jax import checks
+from sgft_jax.hybrid.methods.options import ActorCriticOptions, sac_agent, sac_numbers
+from sgft_jax.types import HybridAgent, HybridMethod, Task
+
+
+@dataclass(frozen=True)
+class Config(ActorCriticOptions):
+    """Options of `darc`; the defaults are those of the baseline of H2O+, with a fixed set of real data."""
+
+    rows: int = 256
+    """Simulated rows of a batch."""
+    ratio_rows: int = 256
+    """Real rows for the discriminators; they have as many simulated ones."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.at_least(self, 1, "rows", "ratio_rows")
+
+
+def build(config: Config, task: Task) -> HybridAgent:
+    """The agent."""
+    from sgft_jax.learners import darc
+    from sgft_jax.models.config import NetworkConfig
+
+    structure = darc.DARCConfig(
+        task.obs_dim, task.act_dim, NetworkConfig(config.hidden), ratio_rows=2 * config.ratio_rows
+    )
+    learner = darc.make_darc(structure, sac_numbers(config), lr_ratio=config.lr)
+    batches = darc.batches(config.rows, config.ratio_rows)
+    return sac_agent(learner, config, task, batches, simulates=True, sac_of=lambda state: state.sac)
+
+
+METHOD = HybridMethod(
+    "darc", "hybrid", "SAC in the simulator, paid less where the real system would act otherwise",
+    "Eysenbach et al. 2021", {"default": Config()}, build,
+)  # fmt: skip

@@ -1,0 +1,65 @@
+"""H2O: one critic from real and simulated rows, pushed down where the simulator is wrong (Niu et al. 2022)."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from sgft_jax import checks
+from sgft_jax.hybrid.methods.options import ActorCriticOptions
+from sgft_jax.types import HybridAgent, HybridMethod, Task
+
+if TYPE_CHECKING:
+    from sgft_jax.learners.h2o import H2OState
+    from sgft_jax.types import Transition
+
+
+@dataclass(frozen=True)
+class Config(ActorCriticOptions):
+    """Options of `h2o`."""
+
+    conservatism: float = 0.01
+    """Weight of the push on the critic, in units of return."""
+    spread_scale: float = 1.0
+    """Factor on the spread of the data over which a pair's gap of the dynamics is averaged. The released code takes
+    the spread over a buffer padded with zeros, which makes it 0.3."""
+    rows: int = 128
+    """Real rows of a batch; it has as many simulated ones."""
+    ratio_rows: int = 256
+    """The same for the discriminators, which have batches of their own."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.not_negative(self, "conservatism")
+        checks.positive(self, "spread_scale")
+        checks.at_least(self, 1, "rows", "ratio_rows")
+
+
+def build(config: Config, task: Task) -> HybridAgent:
+    """The agent."""
+    from sgft_jax.data import replay, sources
+    from sgft_jax.learners import actor, h2o
+    from sgft_jax.models.config import NetworkConfig
+
+    network = NetworkConfig(config.hidden)
+    structure = h2o.H2OConfig(task.obs_dim, task.act_dim, network, ratio_rows=2 * config.ratio_rows)
+    rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_alpha", "lr_ratio"), config.lr)
+    numbers = {name: getattr(config, name) for name in ("tau", "conservatism", "spread_scale")}
+
+    def prepare(state: "H2OState", rows: "Transition") -> "H2OState":
+        return state.replace(spread=replay.obs_std(replay.full(rows)))
+
+    return HybridAgent(
+        learner=h2o.make_h2o(structure, h2o.H2OHyper(**rates, **numbers)),
+        batches=sources.beside(*(sources.two_buffers(n, n) for n in (config.rows, config.ratio_rows))),
+        simulates=True,
+        prepare=prepare,
+        export=actor.exported,
+        policy=actor.actor_policy(task.obs_dim, task.act_dim, network, "affine"),
+        card=actor.card(network, "affine", config.gamma),
+    )
+
+
+_PAPER = Config()
+METHOD = HybridMethod(
+    "h2o", "hybrid", "one critic, pushed down where the simulator is wrong", "Niu et al. 2022",
+    {"paper": _PAPER, "released": replace(_PAPER, spread_scale=0.3)}, build,
+)  # fmt: skip
