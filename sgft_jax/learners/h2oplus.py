@@ -64,7 +64,7 @@ class H2OPlusConfig:
 
 
 class H2OPlusHyper(NamedTuple):
-    """The numbers of an agent, each []. The defaults are the paper's; where it is silent, IQL's and the released code's.
+    """The numbers of an agent, each []. The defaults are the paper's, else those of IQL and the released code.
 
     lr_*: Adam learning rates. tau: target averaging rate.
     alpha: initial (or fixed) temperature; entropy_per_dim: target entropy / act_dim, nats.

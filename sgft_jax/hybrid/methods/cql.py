@@ -1,4 +1,4 @@
-"""CQL: SAC whose critic is pushed down where the data do not go (Kumar et al. 2020). It learns from the real rows alone."""
+"""CQL: SAC whose critic is pushed down where the data do not go (Kumar et al. 2020)."""
 
 from dataclasses import dataclass
 

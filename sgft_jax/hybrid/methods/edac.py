@@ -1,4 +1,4 @@
-"""EDAC: SAC whose many critics must not agree on how to leave the data (An et al. 2021). It learns from the real rows alone."""
+"""EDAC: SAC whose many critics must not agree on how to leave the data (An et al. 2021)."""
 
 from dataclasses import dataclass
 

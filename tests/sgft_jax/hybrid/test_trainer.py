@@ -157,3 +157,18 @@ def test_presets_are_what_they_are_called():
         16,
         256,
     )
+    h2o = get_method("h2o").presets
+    assert (h2o["paper"].conservatism, h2o["paper"].spread_scale) == (0.01, 1.0)
+    assert h2o["released"].spread_scale == pytest.approx(np.sqrt(1 / 11), abs=2e-3)  # one row in eleven is not padding
+    assert get_method("cql").config.conservatism == 2.0 and get_method("edac").config.critics == 10
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if get_method(name).kind == "offline"])
+def test_offline_methods_have_no_simulator(name):
+    state, _ = played(build(name))[-1]
+    assert state.fleet is None and state.simulated is None and int(state.learner.step[0]) == 24
+
+
+def test_the_noise_of_h2o_has_the_spread_of_the_data():
+    state = played(build("h2o"))[0][0]
+    np.testing.assert_allclose(state.learner.spread[0], real_rows().obs.std(0), rtol=1e-4)

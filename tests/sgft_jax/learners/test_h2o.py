@@ -148,10 +148,8 @@ def test_simulated_pairs_fall_and_real_ones_rise(key):
     assert q[~SIM].mean() > q[SIM].mean() + 1
 
 
-def test_presets_and_options():
-    paper, released = h2o.PRESETS["paper"], h2o.PRESETS["released"]
-    assert paper.conservatism == released.conservatism == 0.01
-    assert (paper.spread_scale, released.spread_scale) == (1.0, pytest.approx(np.sqrt(1 / 11), abs=2e-3))
+def test_options():
+    assert (h2o.H2OHyper().conservatism, h2o.H2OHyper().spread_scale) == (0.01, 1.0)
     config = h2o.H2OConfig(17, 6)
     assert (config.successors, config.network.hidden, config.ratio_noise) == (10, (256, 256), 0.1)
     with pytest.raises(UserError, match="option successors is 0"):

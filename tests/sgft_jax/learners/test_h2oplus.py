@@ -1,4 +1,4 @@
-"""H2O+: targets by hand, which rows move what and in which order, presets. See also test_contract_learners.py."""
+"""H2O+: targets by hand, which rows move what and in which order. See also test_contract_learners.py."""
 
 import chex
 import jax
@@ -8,10 +8,9 @@ import optax
 import pytest
 from keys import used_twice
 
-from sgft_jax.data import replay
 from sgft_jax.learners import h2oplus
 from sgft_jax.models import networks, normalizer, ratio
-from sgft_jax.types import Batch, Transition, UserError
+from sgft_jax.types import Batch, UserError
 
 f = jnp.float32
 BODY = networks.NetworkConfig((16,))
@@ -296,49 +295,6 @@ def test_options_are_checked():
         h2oplus.H2OPlusConfig(3, 2, value_loss="expectile")
     with pytest.raises(UserError, match="option critics is 0"):
         h2oplus.H2OPlusConfig(3, 2, critics=0)
-
-
-# --- presets --------------------------------------------------------------------------------------------------------
-
-
-def test_presets_by_name():
-    numbers = {
-        name: (float(p.hyper.value_share), float(p.hyper.expectile), p.hidden, p.rows, p.ratio_rows)
-        for name, p in h2oplus.PRESETS.items()
-    }
-    assert numbers == {
-        "paper": (0.1, 0.7, (256, 256), 128, 256),
-        "released": (0.5, 0.5, (256, 256), 128, 256),
-        "released-robot": (0.1, 0.9, (32, 32), 16, 256),
-    }
-    for preset in h2oplus.PRESETS.values():
-        hyper = preset.hyper
-        assert {hyper.lr_actor, hyper.lr_critic, hyper.lr_value, hyper.lr_alpha, hyper.lr_ratio} == {3e-4}
-        assert (hyper.tau, hyper.alpha, hyper.entropy_per_dim) == (0.005, 1.0, -1.0)
-        config = preset.config(17, 6)
-        assert (config.value_loss, config.ratio, config.critics, config.ratio_noise) == ("iql", True, 2, 0.1)
-        assert config.ratio_network.hidden == (256, 256)
-
-
-@pytest.mark.parametrize("name", h2oplus.PRESETS)
-def test_every_preset_trains(name, key):
-    """From a fixed set and a buffer of the simulator, as its runs do."""
-    preset = h2oplus.PRESETS[name]
-    learner, source = h2oplus.make_h2oplus(preset.config(3, 2), preset.hyper), preset.batches()
-    assert source.n_real == source.n_sim == preset.rows + preset.ratio_rows
-    data = Transition(*batch_of(key)[:5])
-    buffers = replay.full(data), replay.add_batch(replay.init(replay.blank(3, 2), 40), data)
-
-    @jax.jit
-    def train(state, key):
-        def step(state, key):
-            key_rows, key_update = jax.random.split(key)
-            return learner.update(state, source.sample(buffers, key_rows), key_update)
-
-        return jax.lax.scan(step, state, jax.random.split(key, 3))
-
-    state, metrics = train(learner.init(key), key)
-    assert state.step == 3 and all(jnp.isfinite(m).all() for m in metrics.values())
 
 
 # --- keys and buffers -------------------------------------------------------------------------------------------------
