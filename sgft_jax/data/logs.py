@@ -53,10 +53,14 @@ class Facts:
 
 
 class Log(NamedTuple):
-    """rows: [N, ...] transitions in the order of the file, float32 on the host. facts: where they come from."""
+    """rows: [N, ...] transitions in the order of the file, float32 on the host. facts: where they come from.
+
+    last: [N] bool, the rows that the row below does not follow: what `sequences.full` needs.
+    """
 
     rows: Transition
     facts: Facts
+    last: np.ndarray
 
 
 class _Recorded(NamedTuple):
@@ -91,7 +95,9 @@ def load(path: Path | str, *, gamma: float, successors: Successors = "stored") -
             raise UserError(f"{file}: Minari episodes hold their last observation; leave successors at 'stored'")
         recorded = _read_minari(file, content) if minari else _read_d4rl(file, content, successors)
     _check(file, recorded)
-    return Log(_transitions(recorded, gamma), _facts(file, recorded, "episode" if minari else successors))
+    facts = _facts(file, recorded, "episode" if minari else successors)
+    below = np.append(recorded.keep[1:], False)
+    return Log(_transitions(recorded, gamma), facts, (recorded.ends | ~below)[recorded.keep])
 
 
 def _file_of(path: Path) -> Path:

@@ -42,6 +42,15 @@ def init(example: Transition, slots: int, n_envs: int = 1) -> SequenceState:
     return SequenceState(data, no, jnp.copy(no), jnp.int32(0), jnp.int32(0), n_envs)
 
 
+def full(rows: Transition, last: Array) -> SequenceState:
+    """A ring that is filled by given rows [N, ...] of one environment: a fixed set of data. last: [N] bool."""
+    n = rows.reward.shape[0]
+    if n < 1:
+        raise UserError("sequence ring: a fixed set needs at least 1 transition")
+    data = jax.tree.map(jnp.asarray, rows)
+    return SequenceState(data, jnp.ones(n, bool), jnp.asarray(last), jnp.int32(0), jnp.int32(n), 1)
+
+
 def add(state: SequenceState, rows: Transition, valid: Array, last: Array) -> SequenceState:
     """Write one step of every environment over the oldest slot.
 

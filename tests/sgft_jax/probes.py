@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.learners import cql, darc, edac, h2o, h2oplus, iql, recurrent, sac, tdmpc2, tdmpc2_model
+from sgft_jax.learners import cql, darc, edac, h2o, h2oplus, iql, rebrac, recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.models import gru, networks
 from sgft_jax.types import Batch, Learner
 
@@ -179,8 +179,18 @@ def _edac():
     return _soft(edac.make_edac(config, SAC_HYPER), lambda batch: batch, members=4)
 
 
+def _rebrac():
+    """Hardly penalised: the answers are those of plain values."""
+    learner = rebrac.make_rebrac(
+        rebrac.ReBRACConfig(2, 1, network=NET, policy_delay=1),
+        rebrac.ReBRACHyper(lr_actor=1e-2, lr_critic=1e-2, tau=0.1, actor_penalty=1e-3, critic_penalty=1e-3),
+    )
+    # Q is divided by its mean size, which is nearly 0 at first: Adam remembers these steps for a while
+    return _soft(learner, windows)._replace(steps=800)
+
+
 def _soft(learner, feed, *, value=False, members=2, critic_of=lambda state: state.critic):
-    """A case of an actor-critic whose networks are those of NET."""
+    """A Case of an actor-critic whose networks are those of NET."""
     critic, value_net = networks.make_critic(2, 1, NET, members=members), networks.make_value(2, NET)
 
     @jax.jit
@@ -261,6 +271,7 @@ MAKERS = {
     "darc": _darc,
     "cql": _cql,
     "edac": _edac,
+    "rebrac": _rebrac,
     "recurrent": _recurrent,
     "tdmpc2": lambda: _tdmpc2(PLAIN, 800),
     "sgft-tdmpc2": lambda: _tdmpc2(dataclasses.replace(PLAIN, sgft=True), 1000),

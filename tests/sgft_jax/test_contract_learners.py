@@ -11,7 +11,7 @@ from probes import MAKERS, PROBES
 from sgft_jax.io import checkpoint
 
 PLANNERS = {"tdmpc2", "sgft-tdmpc2"}
-OF_WINDOWS = PLANNERS | {"recurrent"}
+OF_WINDOWS = PLANNERS | {"recurrent", "rebrac"}
 LATER = {"reward one step later", "time limit", "termination"}  # a memory must have seen the second step for these
 # What takes long: the fast tests see less of it.
 QUICK = {
@@ -22,6 +22,7 @@ QUICK = {
     "darc": {"action decides"},
     "cql": {"termination"},
     "edac": {"state and action decide"},
+    "rebrac": {"reward one step later"},
 }
 SLOW = {"sac, ten critics", "h2o", "darc", "cql", "edac"}  # their weights and masks
 each_learner = pytest.mark.parametrize("name", MAKERS)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from sgft_jax.data import logs, replay, sources
+from sgft_jax.data import logs, replay, sequences, sources
 from sgft_jax.types import SimulatedData, Transition, UserError
 
 # Row by row: an episode that ends by falling, one that the time limit ends, one that falls at its time limit, and one
@@ -54,7 +54,7 @@ def write(tmp_path):
 
 
 def test_stored_successors_keep_every_row(write):
-    rows, facts = logs.load(write(d4rl()), gamma=0.9)
+    rows, facts, _ = logs.load(write(d4rl()), gamma=0.9)
     np.testing.assert_array_equal(rows.obs, numbers(0))
     np.testing.assert_array_equal(rows.next_obs, numbers(100))
     np.testing.assert_array_equal(rows.reward, REWARD)
@@ -67,7 +67,7 @@ def test_stored_successors_keep_every_row(write):
 
 def test_shifted_successors_drop_time_limits_and_the_last_row(write):
     """Row 5 is both terminal and a time limit: D4RL's own reader drops it."""
-    rows, facts = logs.load(write(d4rl(next_observations=None)), gamma=0.9, successors="shifted")
+    rows, facts, _ = logs.load(write(d4rl(next_observations=None)), gamma=0.9, successors="shifted")
     np.testing.assert_array_equal(rows.reward, [1, 2, 3, 5])
     np.testing.assert_array_equal(rows.obs[:, 0], [0, 1, 2, 4])
     np.testing.assert_array_equal(rows.next_obs[:, 0], [1, 2, 3, 5])
@@ -100,7 +100,7 @@ def test_without_a_whole_episode_the_rest_counts(write):
 def test_actions_are_clipped_and_counted(write):
     action = np.zeros((N, 2))
     action[1], action[4] = [1.5, 0.2], [0.1, -3.0]
-    rows, facts = logs.load(write(d4rl(actions=action)), gamma=0.9)
+    rows, facts, _ = logs.load(write(d4rl(actions=action)), gamma=0.9)
     np.testing.assert_array_equal(rows.action[[1, 4]], np.float32([[1, 0.2], [0.1, -1]]))
     assert facts.clipped == 2
 
@@ -115,6 +115,18 @@ def test_a_log_can_be_sampled(write, key):
     simulated = SimulatedData(lambda key, n: jax.tree.map(lambda x: x[:n], rows), REWARD)
     mixed = sources.mixture(4, 3).sample((state, simulated), key)
     assert mixed.is_sim.tolist() == [False] * 4 + [True] * 3
+
+
+def test_windows_of_a_log_do_not_cross_episodes(write, key):
+    """Nor gaps where rows were dropped: 3 after 2 of the shifted rows, and 5 after 4, are not there."""
+    for successors, last in (("stored", [0, 1, 0, 1, 0, 1, 1]), ("shifted", [0, 1, 1, 1])):
+        log = logs.load(write(d4rl()), gamma=0.9, successors=successors)
+        assert log.last.tolist() == [bool(x) for x in last]
+        batch = sequences.sample(sequences.full(log.rows, log.last), key, 200, 2)
+        assert batch.valid[:, 0].all() and set(batch.reward[:, 0].tolist()) == set(log.rows.reward.tolist())
+        for (first, second), follows in zip(batch.reward.tolist(), batch.valid[:, 1].tolist(), strict=True):
+            assert follows == (not last[log.rows.reward.tolist().index(first)])
+            assert second == (first + 1 if follows else 0)
 
 
 # --- files that are not what they should be ---------------------------------------------------------------------------
@@ -186,7 +198,9 @@ def test_an_unknown_convention_is_refused(write):
 
 def test_a_fixed_set_needs_a_row():
     with pytest.raises(UserError, match="at least 1 transition"):
-        replay.full(Transition(*(np.zeros((0, 1)), np.zeros((0, 1)), np.zeros(0), np.zeros(0), np.zeros((0, 1)))))
+        replay.full(Transition(*map(np.zeros, ((0, 1), (0, 1), 0, 0, (0, 1)))))
+    with pytest.raises(UserError, match="at least 1 transition"):
+        sequences.full(Transition(*map(np.zeros, ((0, 1), (0, 1), 0, 0, (0, 1)))), np.zeros(0, bool))
 
 
 # --- Minari ---------------------------------------------------------------------------------------------------------
@@ -228,7 +242,7 @@ def minari(tmp_path):
 
 def test_minari_episodes_have_their_own_successors(minari):
     folder = minari()
-    rows, facts = logs.load(folder, gamma=0.9)
+    rows, facts, _ = logs.load(folder, gamma=0.9)
     first = np.array([10 * number + step for number in range(12) for step in range(2)])
     np.testing.assert_array_equal(rows.obs[:, 0], first)
     np.testing.assert_array_equal(rows.next_obs[:, 0], first + 1)
@@ -275,7 +289,7 @@ def test_what_minaris_own_library_writes_can_be_read(tmp_path, monkeypatch):
         "toy/walk-v0", episodes, observation_space=box, action_space=gymnasium.spaces.Box(-1, 1, (1,), np.float64),
         data_format="hdf5",
     )  # fmt: skip
-    rows, facts = logs.load(tmp_path / "toy" / "walk-v0", gamma=0.9)
+    rows, facts, _ = logs.load(tmp_path / "toy" / "walk-v0", gamma=0.9)
     np.testing.assert_array_equal(rows.obs[:, 0], [10 * number + step for number in range(3) for step in range(4)])
     np.testing.assert_array_equal(rows.next_obs, rows.obs + 1)
     assert (facts.episodes, facts.terminal) == (3, 1)

@@ -290,6 +290,26 @@ def test_losses_fall_on_a_fixed_batch(backbone, key):
     assert np.corrcoef(v, q)[0, 1] > 0.98
 
 
+@pytest.mark.parametrize(("with_ratio", "expected"), [(False, 0.45), (True, 0.02)])
+def test_the_ratio_keeps_a_wrong_simulator_from_misleading(with_ratio, expected, key):
+    """From 0 the real system goes to 1, which pays nothing, the simulator to 2, which pays 1; both end there.
+
+    Q at 0 minimises (Q - 0)^2 + w (Q - .9)^2: .9 w / (1 + w), with w = 1 or e^-4.
+    """
+    s = jnp.tile(jnp.array([0.0, 0.0, 1.0, 2.0]), 8)
+    is_sim = jnp.tile(jnp.array([False, True, False, True]), 8)
+    following = jnp.where(s == 0, 1.0 + is_sim, s)
+    action = jax.random.uniform(key, (32, 1), minval=-1)
+    batch = Batch(s[:, None], action, 1.0 * (s == 2), 0.9 * (s == 0), following[:, None], is_sim=is_sim)
+    config = h2oplus.H2OPlusConfig(1, 1, network=BODY, ratio_network=BODY, ratio=with_ratio, tune_alpha=False)
+    numbers = h2oplus.H2OPlusHyper(lr_critic=1e-2, lr_value=1e-2, lr_ratio=1e-2, tau=0.1, alpha=1e-4)
+    learner = h2oplus.make_h2oplus(config, numbers)
+    fit = jax.jit(lambda s: jax.lax.scan(lambda s, k: learner.update(s, batch, k), s, jax.random.split(key, 1000))[0])
+    params = fit(learner.init(key)).critic.params
+    q = jax.vmap(networks.make_critic(1, 1, BODY).apply, (None, None, 0))(params, jnp.zeros(1), action)
+    np.testing.assert_allclose(q.mean(axis=0), expected, atol=0.08)
+
+
 def test_options_are_checked():
     with pytest.raises(UserError, match="value loss: there is no 'expectile'"):
         h2oplus.H2OPlusConfig(3, 2, value_loss="expectile")

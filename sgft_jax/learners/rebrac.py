@@ -1,0 +1,228 @@
+"""ReBRAC: TD3 on a fixed set of data, whose actor and critic each pay for leaving the data's actions.
+
+It learns from windows of two consecutive steps, because the critic's penalty needs the data's next action. Structure is
+static in `ReBRACConfig`; every number is a leaf of the state in `ReBRACHyper`. Source: Tarasov et al. 2023.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import NamedTuple, cast
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from sgft_jax import checks
+from sgft_jax.learners import losses, optim
+from sgft_jax.models import normalizer
+from sgft_jax.models.networks import MLP, Network, NetworkConfig, add_noise, make_critic
+from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree, UserError
+
+
+@dataclass(frozen=True)
+class ReBRACConfig:
+    """The structure of an agent. The defaults are the published ones, but for LayerNorm, which is after ReLU there.
+
+    obs_dim, act_dim: sizes of what the environment gives and takes. network: body of actor and critics.
+    policy_delay: critic updates per update of actor and targets.
+    """
+
+    obs_dim: int
+    act_dim: int
+    network: NetworkConfig = field(default_factory=lambda: NetworkConfig((256, 256, 256), layer_norm=True))
+    policy_delay: int = 2
+
+    def __post_init__(self) -> None:
+        checks.at_least(self, 1, "policy_delay")
+
+
+class ReBRACHyper(NamedTuple):
+    """The numbers of an agent, each []. Batches are 1,024 windows.
+
+    lr_*: Adam learning rates. tau: target averaging rate.
+    actor_penalty: weight of |pi(s) - a|^2 beside Q / mean |Q|; critic_penalty: of |pi(s') - a'|^2 in targets, in units
+        of return. `PENALTIES` has those of data sets.
+    target_noise, target_noise_max: std and bound of the noise on target actions. explore_noise: std when it explores.
+    """
+
+    lr_actor: float | Array = 1e-3
+    lr_critic: float | Array = 1e-3
+    tau: float | Array = 0.005
+    actor_penalty: float | Array = 0.01
+    critic_penalty: float | Array = 0.001
+    target_noise: float | Array = 0.2
+    target_noise_max: float | Array = 0.5
+    explore_noise: float | Array = 0.1
+
+
+# Of D4RL's sets: (actor_penalty, critic_penalty).
+PENALTIES: Mapping[str, tuple[float, float]] = MappingProxyType(
+    {
+        "halfcheetah-medium": (0.001, 0.01),
+        "halfcheetah-medium-replay": (0.01, 0.001),
+        "walker2d-medium": (0.05, 0.1),
+        "walker2d-medium-replay": (0.05, 0.01),
+    }
+)
+
+
+class ReBRACState(struct.PyTreeNode):
+    """An agent in training. step: [] int32 updates done. normalizer: does nothing to observations until it is set."""
+
+    actor: optim.Fit
+    critic: optim.Fit
+    target_actor: PyTree
+    target_critic: PyTree
+    normalizer: Normalizer
+    hyper: ReBRACHyper
+    step: Array
+
+
+class _Parts(NamedTuple):
+    """The networks and the optimiser that a configuration describes."""
+
+    actor: Network
+    critic: Network
+    optimiser: optax.GradientTransformation
+
+
+# --- losses of one transition -----------------------------------------------------------------------------------------
+
+
+def distance(action: Array, other: Array) -> Array:
+    """Squared distance [] of two actions [act_dim]."""
+    chex.assert_rank([action, other], 1)
+    return jnp.sum((action - other) ** 2)
+
+
+def td_target(reward: Array, discount: Array, next_q: Array, next_distance: Array, *, penalty: Array | float) -> Array:
+    """Target r + discount (min_i Q_i(s', a') - penalty |a' - a'_data|^2) [], a constant. next_q: [members]."""
+    chex.assert_rank([reward, discount, next_q, next_distance], [0, 0, 1, 0])
+    return jax.lax.stop_gradient(reward + discount * (jnp.min(next_q) - penalty * next_distance))
+
+
+# --- the learner ------------------------------------------------------------------------------------------------------
+
+
+def make_deterministic_actor(obs_dim: int, act_dim: int, config: NetworkConfig) -> Network:
+    """apply(params, obs [obs_dim]) -> [act_dim] in (-1, 1)."""
+    body = MLP(config.hidden, act_dim, config.actor_layer_norm, config.activation)
+
+    def apply(params: PyTree, obs: Array) -> Array:
+        return jnp.tanh(cast(Array, body.apply({"params": params}, obs)))
+
+    return Network(lambda key: body.init(key, jnp.zeros(obs_dim))["params"], apply)
+
+
+def make_rebrac(config: ReBRACConfig, hyper: ReBRACHyper | None = None) -> Learner:
+    """The learner of a configuration: `update` takes windows [B, 2] of consecutive steps.
+
+    A window whose second step is not valid has no next action: its target is without the penalty.
+    """
+    sizes = config.obs_dim, config.act_dim
+    parts = _Parts(make_deterministic_actor(*sizes, config.network), make_critic(*sizes, config.network), optim.adam())
+    leaves = hyper or ReBRACHyper()
+
+    def init(key: Key) -> ReBRACState:
+        key_actor, key_critic = jax.random.split(key)
+        actor, critic = parts.actor.init(key_actor), parts.critic.init(key_critic)
+        copy = lambda params: jax.tree.map(jnp.copy, params)  # noqa: E731  a donated state must not hold a buffer twice
+        return ReBRACState(
+            actor=optim.start(parts.optimiser, actor),
+            critic=optim.start(parts.optimiser, critic),
+            target_actor=copy(actor),
+            target_critic=copy(critic),
+            normalizer=normalizer.identity(config.obs_dim),
+            hyper=jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), leaves),
+            step=jnp.int32(0),
+        )
+
+    def act(
+        state: ReBRACState,
+        carry: tuple[()],
+        obs: Array,
+        key: Key,
+        *,
+        explore: bool | Array,
+        context: Array | None = None,
+    ) -> tuple[Array, tuple[()]]:
+        del context  # it reads the observation alone
+        action = parts.actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
+        return jnp.where(explore, add_noise(action, state.hyper.explore_noise, key), action), carry
+
+    def update(state: ReBRACState, batch: Batch, key: Key) -> tuple[ReBRACState, Metrics]:
+        return _update(config, parts, state, batch, key)
+
+    return Learner(init, lambda: (), act, update)
+
+
+# --- one update -------------------------------------------------------------------------------------------------------
+
+
+def _update(
+    config: ReBRACConfig, parts: _Parts, state: ReBRACState, batch: Batch, key: Key
+) -> tuple[ReBRACState, Metrics]:
+    """Critic; on every `policy_delay`-th turn, actor and targets."""
+    rows, next_action, follows = _rows(batch)
+    normal = jax.vmap(normalizer.normalize, (None, 0))
+    rows = rows._replace(obs=normal(state.normalizer, rows.obs), next_obs=normal(state.normalizer, rows.next_obs))
+    state, metrics = _update_critic(parts, state, rows, next_action, follows, key)
+    actor, more = _step_actor(parts, state, rows)
+    moved = state.replace(
+        actor=actor,
+        target_actor=optax.incremental_update(actor.params, state.target_actor, state.hyper.tau),
+        target_critic=optax.incremental_update(state.critic.params, state.target_critic, state.hyper.tau),
+    )
+    state = optim.keep_unless(state.step % config.policy_delay == 0, moved, state)
+    return state.replace(step=state.step + 1), metrics | more
+
+
+def _rows(batch: Batch) -> tuple[Batch, Array, Array]:
+    """The first steps of windows as rows [B, ...], the actions [B, act_dim] of the second ones, and which [B] count."""
+    if batch.reward.ndim != 2 or batch.reward.shape[1] != 2 or batch.valid is None:
+        raise UserError(f"ReBRAC learns from windows [rows, 2] with a mask, not {list(batch.reward.shape)}")
+    first = jax.tree.map(lambda x: x[:, 0], batch._replace(weight=None))
+    return first._replace(weight=batch.weight), batch.action[:, 1], batch.valid[:, 1]
+
+
+def _update_critic(
+    parts: _Parts, state: ReBRACState, rows: Batch, next_action: Array, follows: Array, key: Key
+) -> tuple[ReBRACState, Metrics]:
+    hyper = state.hyper
+
+    def target(row: Batch, next_action: Array, follows: Array, key: Key) -> Array:
+        action = parts.actor.apply(state.target_actor, row.next_obs)
+        noise = hyper.target_noise * jax.random.normal(key, action.shape)
+        action = jnp.clip(action + jnp.clip(noise, -hyper.target_noise_max, hyper.target_noise_max), -1.0, 1.0)
+        next_q = parts.critic.apply(state.target_critic, row.next_obs, action)
+        away = jnp.where(follows, distance(action, next_action), 0.0)
+        return td_target(row.reward, row.discount, next_q, away, penalty=hyper.critic_penalty)
+
+    targets = jax.vmap(target)(rows, next_action, follows, jax.random.split(key, rows.reward.shape[0]))
+
+    def loss(params: PyTree) -> tuple[Array, Array]:
+        q = jax.vmap(parts.critic.apply, (None, 0, 0))(params, rows.obs, rows.action)
+        return losses.row_mean(jax.vmap(losses.critic_loss)(q, targets), rows), q
+
+    (mean, q), grads = jax.value_and_grad(loss, has_aux=True)(state.critic.params)
+    fit = optim.step(parts.optimiser, state.critic, grads, hyper.lr_critic)
+    metrics = {"critic/loss": mean, "critic/q_mean": jnp.mean(q), "critic/target_mean": jnp.mean(targets)}
+    return state.replace(critic=fit), metrics
+
+
+def _step_actor(parts: _Parts, state: ReBRACState, rows: Batch) -> tuple[optim.Fit, Metrics]:
+    """The actor after a step on penalty |pi(s) - a|^2 - Q / mean |Q|."""
+
+    def loss(params: PyTree) -> tuple[Array, Array]:
+        action = jax.vmap(parts.actor.apply, (None, 0))(params, rows.obs)
+        q = jnp.min(jax.vmap(parts.critic.apply, (None, 0, 0))(state.critic.params, rows.obs, action), axis=1)
+        scale = jax.lax.stop_gradient(1 / jnp.maximum(losses.row_mean(jnp.abs(q), rows), 1e-6))
+        away = jax.vmap(distance)(action, rows.action)
+        return losses.row_mean(state.hyper.actor_penalty * away - scale * q, rows), jnp.mean(away)
+
+    (mean, away), grads = jax.value_and_grad(loss, has_aux=True)(state.actor.params)
+    fit = optim.step(parts.optimiser, state.actor, grads, state.hyper.lr_actor)
+    return fit, {"actor/loss": mean, "actor/distance": away}
