@@ -29,6 +29,8 @@ TASKS = {
     "insert": "envs.franka.insert",
     "halfcheetah": "envs.locomotion.halfcheetah",
     "walker2d": "envs.locomotion.walker2d",
+    "wheel-legged": "envs.locomotion.wheel_legged",
+    "wheel-legged-forward": "envs.locomotion.wheel_forward",
 }
 _OURS = frozenset(TASKS.values())
 _LAZY = {

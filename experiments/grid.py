@@ -23,8 +23,8 @@ from sgft_jax.types import UserError
 class GridArgs:
     """A grid of fine-tuning runs; everything not named here is as `experiments.finetune` has it."""
 
-    tasks: tuple[str, ...] = tuple(envs.TASKS)
-    """Tasks."""
+    tasks: tuple[str, ...] = tuple(task for task in envs.TASKS if "default" in gaps.presets(task))
+    """Tasks, by default all that have a real system called default."""
     methods: tuple[str, ...] = tuple(name for name in NAMES if not get_method(name).sees_system)
     """Methods, in the order in which they run; by default all that start from the usual priors."""
     reals: tuple[str, ...] = ("default",)

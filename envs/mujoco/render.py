@@ -85,7 +85,7 @@ def dressed(scene: Scene, theta: dict[str, float]) -> mujoco.MjSpec:
     spec = scene.build(theta)
     scene.dress(spec)
     _add_surroundings(spec, scene.view)
-    _add_lights(spec)
+    _add_lights(spec, shadows=scene.view is None or not scene.view.follow)
     visual = spec.visual
     visual.map.znear, visual.map.zfar = 0.02, 20
     visual.quality.shadowsize, visual.quality.offsamples = 2048, 0
@@ -108,12 +108,20 @@ def _add_surroundings(spec: mujoco.MjSpec, view: View | None) -> None:
     spec.worldbody.add_geom(type=plane, size=size, pos=[0, 0, view.floor], material="tiles", **_NO_CONTACT)
 
 
-def _add_lights(spec: mujoco.MjSpec) -> None:
+def _add_lights(spec: mujoco.MjSpec, *, shadows: bool) -> None:
+    """shadows: not on a floor without end, where MuJoCo draws stripes."""
     for light in spec.lights:
         spec.delete(light)
     sun = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     add = spec.worldbody.add_light
-    add(type=sun, pos=[0.9, -1.0, 2.5], dir=[-0.35, 0.4, -1.0], diffuse=[0.5] * 3, specular=[0.2] * 3, castshadow=True)
+    add(
+        type=sun,
+        pos=[0.9, -1.0, 2.5],
+        dir=[-0.35, 0.4, -1.0],
+        diffuse=[0.5] * 3,
+        specular=[0.2] * 3,
+        castshadow=shadows,
+    )
     add(type=sun, pos=[0.5, 1.5, 2.0], dir=[0.3, -0.7, -0.6], diffuse=[0.2] * 3, specular=[0.0] * 3, castshadow=False)
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.35] * 3, [0.2] * 3
 

@@ -53,6 +53,8 @@ class Scene(NamedTuple):
     settled(params, obs) -> PhysicsState: what is observed as `obs`, a vector without measurement error, at rest but for
         what it says; None where observations do not tell. See `Env.restore`.
     target(qpos, action) -> [nu] controls for an action in [-1, 1] (effects already applied).
+    motors(params, previous, target) -> [nu] the control that follows the last one, `previous` [nu], where motors are
+        slower than a control period; default `target` at once.
     observe(params, state) -> [obs_dim] without measurement error, or a dict of vectors by entry name.
     reward, terminated, success, success_anytime, score, training, actuators, cartesian, check: see `Env`.
     measured(params, before, action, after) -> Measured: where reward, end or success are no functions of observations.
@@ -79,6 +81,7 @@ class Scene(NamedTuple):
     success: Callable[[Array], Array] | None = None
     terminated: Callable[[Array, Array, Array], Array] | None = never
     measured: Callable[[Array, PhysicsState, Array, PhysicsState], Measured] = lambda *step: Measured()
+    motors: Callable[[Array, Array, Array], Array] = lambda params, previous, target: target
     event: Callable[[Array, PhysicsState], PhysicsState] = lambda params, state: state
     ramp: float = 0.0
     success_anytime: bool = False
@@ -146,7 +149,8 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
     def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
         key_latency, key_noise, key_action = jax.random.split(key, 3)
         params, own, before = world.theta.params, state.effects, state.physics
-        target = scene.target(before.qpos, env_effects.shake(own, env_effects.distort(own, action), key_action))
+        command = env_effects.shake(own, env_effects.distort(own, action), key_action)
+        target = scene.motors(params, before.ctrl, scene.target(before.qpos, command))
         dt = scene.control_dt / scene.substeps
         control = env_effects.ramp(own, before.ctrl, target, key_latency, dt=dt, duration=scene.ramp)
         controls = jax.vmap(control)(jnp.arange(scene.substeps))

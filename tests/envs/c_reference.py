@@ -35,10 +35,10 @@ def play(
     model = spec.compile()
     data = mujoco.MjData(model)
     params = jnp.asarray(list(theta.values()), jnp.float32)
-    target, event = jax.jit(scene.target), jax.jit(scene.event)
+    target, event = jax.jit(lambda s, a: scene.motors(params, s.ctrl, scene.target(s.qpos, a))), jax.jit(scene.event)
     states, state = [], start
     for action in actions:
-        command = np.asarray(target(state.qpos, action))
+        command = np.asarray(target(state, action))
         after = _control_step(model, data, state, command, scene.substeps * refine, scene.ramp)
         state = event(params, after)
         states.append(state)

@@ -52,6 +52,12 @@ def names(runs):
     return [(run.task, run.method, run.resume) for run in runs]
 
 
+def test_by_default_all_tasks_with_a_default_real_system():
+    args = compare.CompareArgs()
+    assert {"push", "insert"} < set(args.tasks) and "halfcheetah" not in args.tasks
+    grid.check(args)
+
+
 def test_what_is_missing_runs_and_what_is_finished_stays(tmp_path, ran, capsys):
     args = compare.CompareArgs(out=tmp_path, **GRID)
     first, second = (cell.args for cell in compare.cells(args)[:2])

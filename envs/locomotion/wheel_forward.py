@@ -1,0 +1,51 @@
+"""The wheel-legged robot rolls forward at 0.2 m/s and does not see where it is: the other robot task of H2O+.
+
+The robot is that of `envs.locomotion.wheel_legged`.
+"""
+
+import jax.numpy as jnp
+
+from envs.base import Env
+from envs.locomotion import wheel_legged
+from envs.locomotion.wheel_legged import ENTRIES, fallen, state_of, torque
+from envs.mujoco.scene import make_env
+from envs.mujoco.worlds import PhysicsState
+from sgft_jax.types import Array
+
+SPEED = 0.2  # m/s
+ALIVE = 15.0
+
+
+def observe(params: Array, state: PhysicsState) -> Array:
+    """[3]: v of the axle, pitch and its speed."""
+    return wheel_legged.observe(params, state)[1:]
+
+
+def settled(params: Array, obs: Array) -> PhysicsState:
+    """The state that is seen, at x = 0, as if the motors had rested."""
+    return state_of(jnp.stack([jnp.zeros(()), obs[1]]), jnp.stack([obs[0], obs[2]]))
+
+
+def reward(obs: Array, action: Array, next_obs: Array) -> Array:
+    """[]: 15 less the squares of the error of v and of the commanded torque, in SI units. Source: H2O+."""
+    return ALIVE - (next_obs[0] - SPEED) ** 2 - jnp.sum(torque(action) ** 2)
+
+
+def terminated(obs: Array, action: Array, next_obs: Array) -> Array:
+    """[] bool: fallen, pitched by more than 30 degrees."""
+    return fallen(next_obs[1])
+
+
+SCENE = wheel_legged.SCENE._replace(
+    name="wheel-legged-forward",
+    observation=(ENTRIES["velocity"], ENTRIES["pitch"], ENTRIES["pitch_velocity"]),
+    observe=observe,
+    settled=settled,
+    reward=reward,
+    terminated=terminated,
+)
+
+
+def make(impl: str = "auto") -> Env:
+    """The task of moving forward."""
+    return make_env(SCENE, impl)

@@ -1,0 +1,168 @@
+"""A wheel-legged robot stands still: a planar inverted pendulum on wheels, the robot task of H2O+.
+
+Facts of the real robot (arXiv 2309.12716 and its code): about 12 kg on two wheels of 6.5 cm, commanded at 200 Hz by a
+torque of up to 3 N m, on a furry carpet; the rewards. Everything else was not published and is ours: how the mass is
+split, where its centre is, how hard the wheels roll, the starts, the length of an episode.
+
+Wheels do not slip, so the robot has two coordinates, x of the axle and pitch (positive forwards). The wheels turn by
+x / radius - pitch against the body; a tendon has that length, and the motor pulls at it.
+"""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from envs.base import Entry, Env, Parameter
+from envs.locomotion.planar import NO_CONTACT
+from envs.mujoco.scene import Scene, View, make_env
+from envs.mujoco.worlds import PhysicsState
+from sgft_jax.types import Array, Key
+
+CONTROL_DT, SUBSTEPS = 0.005, 2  # s; physics steps in it
+EPISODE_LENGTH = 2_000  # 10 s
+TORQUE = 3.0  # N m of both wheels together, at full action
+WHEEL_RADIUS, WHEEL_MASS = 0.065, 1.5  # m; kg of both wheels
+WHEEL_INERTIA = WHEEL_MASS * WHEEL_RADIUS**2 / 2  # kg m^2, of solid discs
+BODY_HALF = (0.1, 0.12, 0.15)  # m, of a homogeneous box around the centre of mass
+FALLEN = np.radians(30.0)  # rad
+ALIVE = 30.0  # reward of a step in which nothing moves
+START = np.array([0.05, 0.05, 0.05, 0.1])  # m, rad, m/s, rad/s: half-widths of a uniform draw
+ENTRIES = {
+    "position": Entry("position", "m", 1),
+    "velocity": Entry("velocity", "m/s", 1),
+    "pitch": Entry("pitch", "rad", 1),
+    "pitch_velocity": Entry("pitch_velocity", "rad/s", 1),
+}
+
+PARAMETERS = (
+    Parameter("mass", "kg", 12.0, 12.0, 12.0, minimum=WHEEL_MASS + 0.5),
+    Parameter("com_height", "m", 0.2, 0.2, 0.2, minimum=0.05, maximum=1.0),
+    Parameter("com_x", "m", 0.0, 0.0, 0.0, minimum=-0.2, maximum=0.2),
+    Parameter("wheel_friction", "N m", 0.02, 0.02, 0.02, minimum=0.001),
+    Parameter("motor_lag", "s", 0.0, 0.0, 0.0, minimum=0.0, maximum=1.0),
+)
+_LAG = [p.name for p in PARAMETERS].index("motor_lag")
+
+
+def build(theta: dict[str, float]) -> mujoco.MjSpec:
+    """The scene for one theta. The lag of the motors is no part of it, see `follow`."""
+    spec = mujoco.MjSpec()
+    option = spec.option
+    option.timestep, option.integrator = CONTROL_DT / SUBSTEPS, mujoco.mjtIntegrator.mjINT_EULER
+    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    axle = spec.worldbody.add_body(name="axle", pos=[0, 0, WHEEL_RADIUS])
+    # Wheels that roll turn with x: their inertia adds to the mass that x moves.
+    axle.add_joint(
+        name="x", type=slide, axis=[1, 0, 0], armature=WHEEL_INERTIA / WHEEL_RADIUS**2,
+        frictionloss=theta["wheel_friction"] / WHEEL_RADIUS,
+    )  # fmt: skip
+    _add_wheels(axle)
+    body = axle.add_body(name="body")
+    body.add_joint(name="pitch", type=hinge, axis=[0, 1, 0])
+    com, mass = [theta["com_x"], 0, theta["com_height"]], theta["mass"] - WHEEL_MASS
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=com, size=BODY_HALF, mass=mass, rgba=[0.85, 0.86, 0.88, 1])
+    _add_legs(body, theta["com_height"])
+    wheel = spec.add_tendon(name="wheel")
+    wheel.wrap_joint("x", 1 / WHEEL_RADIUS)
+    wheel.wrap_joint("pitch", -1.0)
+    spec.add_actuator(
+        name="motor", target="wheel", trntype=mujoco.mjtTrn.mjTRN_TENDON, gear=[TORQUE, 0, 0, 0, 0, 0],
+        ctrllimited=True, ctrlrange=[-1, 1],
+    )  # fmt: skip
+    return spec
+
+
+def follow(params: Array, previous: Array, target: Array) -> Array:
+    """[1] the control of a period, which follows the command `target` [1] from `previous` [1] on, a first-order lag."""
+    return target + jnp.exp(-CONTROL_DT / jnp.maximum(params[_LAG], 1e-6)) * (previous - target)
+
+
+def initial(params: Array, key: Key) -> PhysicsState:
+    """Nearly upright, nearly at rest, nearly at x = 0."""
+    spread = jnp.asarray(START) * jax.random.uniform(key, (4,), minval=-1.0, maxval=1.0)
+    return state_of(spread[:2], spread[2:])
+
+
+def state_of(qpos: Array, qvel: Array) -> PhysicsState:
+    """A state [2], [2] whose motors rest."""
+    return PhysicsState(qpos, qvel, jnp.zeros(2), jnp.zeros(1))
+
+
+def observe(params: Array, state: PhysicsState) -> Array:
+    """[4]: x and v of the axle, pitch and its speed."""
+    return jnp.stack([state.qpos[0], state.qvel[0], state.qpos[1], state.qvel[1]])
+
+
+def settled(params: Array, obs: Array) -> PhysicsState:
+    """The state that is seen, as if the motors had rested."""
+    return state_of(obs[jnp.array([0, 2])], obs[jnp.array([1, 3])])
+
+
+def reward(obs: Array, action: Array, next_obs: Array) -> Array:
+    """[]: 30 less the squares of x, v, pitch, its speed, and the commanded torque, in SI units. Source: H2O+."""
+    return ALIVE - jnp.sum(next_obs**2) - jnp.sum(torque(action) ** 2)
+
+
+def torque(action: Array) -> Array:
+    """[1] N m that an action commands."""
+    return TORQUE * jnp.clip(action, -1.0, 1.0)
+
+
+def terminated(obs: Array, action: Array, next_obs: Array) -> Array:
+    """[] bool: fallen, pitched by more than 30 degrees."""
+    return fallen(next_obs[2])
+
+
+def fallen(pitch: Array) -> Array:
+    """[] bool."""
+    return jnp.abs(pitch) > FALLEN
+
+
+SCENE = Scene(
+    name="wheel-legged",
+    observation=tuple(ENTRIES.values()),
+    action=(Entry("wheel_torque", "3 N m", 1),),
+    parameters=PARAMETERS,
+    episode_length=EPISODE_LENGTH,
+    control_dt=CONTROL_DT,
+    substeps=SUBSTEPS,
+    build=build,
+    initial=initial,
+    settled=settled,
+    target=lambda qpos, action: jnp.clip(action, -1.0, 1.0),
+    motors=follow,
+    observe=observe,
+    reward=reward,
+    terminated=terminated,
+    score="return",
+    max_speed=500.0,
+    view=View((0.0, 0.0, 0.1), 1.6, 90.0, -12.0, floor=0.0, follow="axle"),
+)
+
+
+def make(impl: str = "auto") -> Env:
+    """The task of standing still."""
+    return make_env(SCENE, impl)
+
+
+def _add_wheels(axle: mujoco.MjsBody) -> None:
+    cylinder, dark = mujoco.mjtGeom.mjGEOM_CYLINDER, [0.20, 0.21, 0.24, 1]
+    sideways = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
+    for y in (-0.15, 0.15):
+        axle.add_geom(
+            type=cylinder, pos=[0, y, 0], size=[WHEEL_RADIUS, 0.02, 0], quat=sideways, mass=WHEEL_MASS / 2, rgba=dark,
+            **NO_CONTACT,
+        )  # fmt: skip
+
+
+def _add_legs(body: mujoco.MjsBody, height: float) -> None:
+    """What only a viewer sees."""
+    capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
+    for y in (-0.12, 0.12):
+        body.add_geom(
+            type=capsule, fromto=[0, y, 0, 0, y, height], size=[0.015, 0, 0], mass=0, rgba=[0.30, 0.46, 0.68, 1],
+            **NO_CONTACT,
+        )  # fmt: skip

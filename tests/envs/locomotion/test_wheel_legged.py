@@ -1,0 +1,185 @@
+"""The wheel-legged robot: motion and rewards by hand, lag, and a linear controller that stands in every gap."""
+
+import c_reference
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import scipy.linalg
+from runners import member, pool_of
+
+import envs
+from envs import gaps
+from envs.locomotion import wheel_forward, wheel_legged
+from envs.mujoco.engines import warp as engine_warp
+
+KEY = jax.random.key(0)
+NAMES = (gaps.SIM, *gaps.presets("wheel-legged"))
+NOMINAL = {p.name: p.nominal for p in wheel_legged.PARAMETERS}
+ENGINES = ["c", "jax", *(["warp"] if engine_warp.available() else [])]
+
+
+def by_hand(theta):
+    """Of the body its mass (kg), distance of its centre from the axle (m) and angle forwards (rad); (a, b, c).
+
+    The mass matrix of x and pitch is [[a, b cos], [b cos, c]].
+    """
+    mass, height, ahead = theta["mass"] - 1.5, theta["com_height"], theta["com_x"]
+    arm = np.hypot(height, ahead)
+    inertia = mass * (0.2**2 + 0.3**2) / 12  # a box of 20 x 30 cm
+    a = theta["mass"] + 1.5 / 2  # discs that roll add half of their mass
+    return mass, arm, np.arctan2(ahead, height), (a, mass * arm, inertia + mass * arm**2)
+
+
+def acceleration(theta, qpos, qvel, torque, rolling=0.0):
+    """m/s^2, rad/s^2 of an inverted pendulum on wheels; Lagrange. rolling: N against x."""
+    mass, arm, lean, (a, b, c) = by_hand(theta)
+    angle, spin = qpos[1] + lean, qvel[1]
+    push = torque / 0.065 - rolling + b * np.sin(angle) * spin**2
+    turn = mass * 9.81 * arm * np.sin(angle) - torque
+    return np.linalg.solve([[a, b * np.cos(angle)], [b * np.cos(angle), c]], [push, turn])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_motion_is_that_of_an_inverted_pendulum(name):
+    """Rolling friction of 1e-9 N m leaves only the motion; that of the gap then is a force at the wheel's rim."""
+    theta = NOMINAL | gaps.find("wheel-legged", name).params
+    rng = np.random.default_rng(0)
+    smooth, rough = (
+        wheel_legged.build(theta | {"wheel_friction": f}).compile() for f in (1e-9, theta["wheel_friction"])
+    )
+    np.testing.assert_allclose(smooth.body_mass.sum(), theta["mass"])
+    for _ in range(5):
+        qpos, qvel, action = rng.normal(size=2) * [1, 0.2], rng.normal(size=2) * [1, 2], rng.uniform(-1, 1)
+        qvel[0] = abs(qvel[0]) + 0.2
+        for model, rolling in ((smooth, 0.0), (rough, theta["wheel_friction"] / 0.065)):
+            data = mujoco.MjData(model)
+            data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, action
+            mujoco.mj_forward(model, data)
+            wanted = acceleration(theta, qpos, qvel, 3.0 * action, rolling)
+            np.testing.assert_allclose(data.qacc, wanted, atol=1e-5)
+
+
+def test_motors_lag():
+    """With 0.02 s, after k periods of 5 ms a step has come to 1 - exp(-k / 4); without, at once."""
+    params = jnp.array([{**NOMINAL, "motor_lag": 0.02}[p.name] for p in wheel_legged.PARAMETERS])
+    control, seen = jnp.zeros(1), []
+    for _ in range(4):
+        control = wheel_legged.follow(params, control, jnp.ones(1))
+        seen.append(float(control[0]))
+    np.testing.assert_allclose(seen, 1 - np.exp(-np.arange(1, 5) / 4), rtol=1e-5)
+    assert float(wheel_legged.follow(params.at[-1].set(0.0), jnp.zeros(1), jnp.full(1, 0.7))[0]) == np.float32(0.7)
+
+
+def test_the_lag_of_a_gap_reaches_the_motors():
+    env = envs.make("wheel-legged", "c")
+    pool = pool_of(env, [gaps.SIM, "lag"])
+    states = jax.vmap(env.reset)(pool, jax.random.split(KEY, 2))
+    after = jax.vmap(env.step, (0, 0, None, None))(pool, states, jnp.full(1, -0.5), KEY)
+    np.testing.assert_allclose(after.physics.ctrl[:, 0], [-0.5, -0.5 * (1 - np.exp(-5 / 30))], rtol=1e-5)
+
+
+def test_rewards_by_hand():
+    """x 0.3 m, v 0.5 m/s, pitch 0.1 rad, its speed -2 rad/s, torque 3 * -0.4 = -1.2 N m; commands stop at 1."""
+    obs = jnp.array([0.3, 0.5, 0.1, -2.0])
+    action = jnp.array([-0.4])
+    np.testing.assert_allclose(wheel_legged.reward(obs * 0, action, obs), 30 - 0.09 - 0.25 - 0.01 - 4 - 1.44, rtol=1e-6)
+    np.testing.assert_allclose(wheel_forward.reward(obs[1:] * 0, action, obs[1:]), 15 - 0.09 - 1.44, rtol=1e-6)
+    np.testing.assert_allclose(wheel_forward.reward(obs[1:], jnp.array([7.0]), obs[1:] * 0), 15 - 0.04 - 9, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("degrees", "fallen"), [(0.0, False), (29.9, False), (30.1, True), (-30.1, True)])
+def test_it_has_fallen(degrees, fallen):
+    obs = jnp.array([0.0, 0.0, np.radians(degrees), 0.0])
+    assert bool(wheel_legged.terminated(obs * 0, jnp.zeros(1), obs)) == fallen
+    assert bool(wheel_forward.terminated(obs[1:] * 0, jnp.zeros(1), obs[1:])) == fallen
+
+
+def gain(theta):
+    """[4] of the linear-quadratic controller: action = -gain . (x, v, pitch, its speed)."""
+    mass, arm, _, (a, b, c) = by_hand(theta)
+    inverse = np.linalg.inv([[a, b], [b, c]])
+    dynamics, control = np.zeros((4, 4)), np.zeros((4, 1))
+    dynamics[:2, 2:] = np.eye(2)
+    dynamics[2:, :2] = inverse @ [[0, 0], [0, mass * 9.81 * arm]]
+    control[2:] = 3.0 * inverse @ [[1 / 0.065], [-1]]
+    cost = scipy.linalg.solve_continuous_are(dynamics, control, np.eye(4), np.array([[9.0]]))
+    return jnp.asarray((control.T @ cost / 9.0)[0][[0, 2, 1, 3]], jnp.float32)
+
+
+def episodes(env, names, act):
+    """One episode [gaps] in each of them."""
+    one = lambda pool, key: envs.play_episode(env, member(pool, None), act, (), key, gamma=1.0)  # noqa: E731
+    return jax.jit(jax.vmap(one))(pool_of(env, names), jax.random.split(KEY, len(names)))
+
+
+def test_a_linear_controller_stands_in_every_gap_and_nothing_falls():
+    """That of the nominal robot. Where the centre of mass is ahead or the floor is rough, it does not stay in place."""
+    env, own = envs.make("wheel-legged", "c"), gain(NOMINAL)
+    steady = lambda carry, obs, key: (jnp.clip(-own @ obs, -1.0, 1.0)[None], carry)  # noqa: E731
+    found = episodes(env, NAMES, steady)
+    assert (found.valid.sum(1) == env.episode_length).all() and not found.exploded.any()
+    away = dict(zip(NAMES, np.abs(found.transitions.next_obs[:, 1000:, 0]).max(1), strict=True))
+    assert away[gaps.SIM] < 0.05 and away["leaning"] > 0.5 and away["robot"] > 0.2  # m; H2O+ calls 0.2 standing still
+    still = episodes(env, [gaps.SIM] * 4, lambda carry, obs, key: (jnp.zeros(1), carry))
+    last = still.valid.sum(1) - 1
+    assert (last < 400).all()  # 2 s
+    assert (still.transitions.discount[jnp.arange(4), last] == 0.0).all()
+
+
+def test_it_can_roll_forward():
+    env, own = envs.make("wheel-legged-forward", "c"), gain(NOMINAL)[1:]
+    aim = jnp.array([wheel_forward.SPEED, 0.0, 0.0])
+    found = episodes(env, [gaps.SIM] * 4, lambda carry, obs, key: (jnp.clip(-own @ (obs - aim), -1, 1)[None], carry))
+    assert (found.valid.sum(1) == env.episode_length).all()
+    np.testing.assert_allclose(found.transitions.next_obs[:, 1000:, 0], wheel_forward.SPEED, atol=0.03)
+    assert (found.total_reward > 14.9 * env.episode_length).all()
+
+
+@pytest.mark.parametrize("impl", ENGINES)
+def test_every_engine_moves_it_like_mujoco(impl):
+    """A micrometre and a microradian after a period, in every gap, under torques that change."""
+    env, c = envs.make("wheel-legged", impl), envs.make("wheel-legged", "c")
+    pool = pool_of(c, NAMES)
+    states = jax.vmap(c.reset)(pool, jax.random.split(KEY, len(NAMES)))
+    steps = [jax.jit(jax.vmap(e.step, (0, 0, 0, None))) for e in (env, c)]
+    models = [wheel_legged.build(NOMINAL | gaps.find("wheel-legged", name).params).compile() for name in NAMES]
+    for t in range(20):
+        action = jax.random.uniform(jax.random.key(t), (len(NAMES), 1), minval=-1.0, maxval=1.0)
+        with jax.numpy_rank_promotion("allow"):  # MJX broadcasts matrices against vectors
+            seen, after = (step(pool, states, action, KEY) for step in steps)
+        for i, model in enumerate(models):
+            data = mujoco.MjData(model)
+            data.qpos[:], data.qvel[:] = states.physics.qpos[i], states.physics.qvel[i]
+            data.ctrl[:] = after.physics.ctrl[i]
+            mujoco.mj_step(model, data, wheel_legged.SUBSTEPS)
+            np.testing.assert_allclose(seen.physics.qpos[i], data.qpos, atol=1e-6)
+            np.testing.assert_allclose(seen.physics.qvel[i], data.qvel, atol=1e-4)
+        states = after
+
+
+def test_the_time_step_is_fine_enough():
+    """0.4 s of a fall under changing torques end as with a step a tenth as long, to 1 cm and 1 % of the pitch."""
+    start = wheel_legged.state_of(jnp.array([0.0, 0.02]), jnp.zeros(2))
+    actions = jnp.sin(jnp.arange(80) / 5.0)[:, None] * 0.5
+    own, fine = (
+        c_reference.play(wheel_legged.SCENE, NOMINAL, start, actions, refine=n, iterations=20)[-1].qpos for n in (1, 10)
+    )
+    np.testing.assert_allclose(own, fine, atol=1e-2, rtol=1e-2)
+
+
+@pytest.mark.parametrize("task", ["wheel-legged", "wheel-legged-forward"])
+def test_starts_and_states_that_are_seen_again(task):
+    env = envs.make(task, "c")
+    world = member(pool_of(env, [gaps.SIM]), 0)
+    states = jax.vmap(lambda key: env.reset(world, key))(jax.random.split(KEY, 500))
+    wide = np.abs(np.concatenate([states.physics.qpos, states.physics.qvel], axis=1)).max(0)
+    np.testing.assert_allclose(wide, wheel_legged.START, rtol=0.02)
+    state = env.step(world, member(states, 0), jnp.zeros(1), KEY)
+    again = env.restore(world, state.obs, KEY)
+    np.testing.assert_array_equal(again.true_obs, state.true_obs)
+    one, other = (env.step(world, s, jnp.full(1, 0.3), KEY).true_obs for s in (state, again))
+    np.testing.assert_allclose(one, other, atol=1e-6)
+    late = env.step(world, state._replace(time=jnp.int32(env.episode_length - 1)), jnp.zeros(1), KEY)
+    assert late.truncated and not late.terminated and not state.truncated
