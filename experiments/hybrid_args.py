@@ -96,7 +96,7 @@ def check(args: HybridArgs) -> tuple[HybridMethod, list[int]]:
     if not args.gap:
         raise UserError(f"--gap: name at least one, or {SIM} for no gap")
     without_repeats("--gap", args.gap)
-    check_task(args.task, args.gap)
+    check_task(args.task, () if method.kind == "offline" else args.gap)
     for folder in folders(args, method):
         check_start(folder, resume=args.resume, overwrite=args.overwrite)
     return method, seeds

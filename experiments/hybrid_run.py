@@ -31,7 +31,7 @@ from sgft_jax.io.priors import save_prior
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.pretraining import seed_keys
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.types import HybridMethod, Metrics, Prior, PyTree, Transition, UserError
+from sgft_jax.types import HybridMethod, Metrics, Prior, PyTree, RealData, UserError
 
 _TRAINING, _EVALUATION = 11, 12  # purposes, folded into a seed's key
 _LATE = 10  # evaluations that a score averages, beside the last one
@@ -93,7 +93,7 @@ class _Run:
 
     def work(self) -> list[dict[str, Any]]:
         """Everything, in order; returns the summaries."""
-        inputs = (self._pools(), self._rows(), self._keys())
+        inputs = (self._pools(), self._real(), self._keys())
         state = self._restore(*inputs)
         steps = trainer.train(
             self.env, self.agent, self.args.schedule, *inputs, gamma=self.args.options.gamma, state=state
@@ -106,18 +106,18 @@ class _Run:
         pools = real_worlds(self.env, found, jax.random.key(1))
         return jax.tree.map(lambda x: jnp.repeat(x, len(self.seeds), axis=0), pools)
 
-    def _rows(self) -> Transition:
-        """The real rows [N]; a single one of zeros where the method asks for none."""
+    def _real(self) -> RealData:
+        """The real data; a single row of zeros where the method asks for none."""
         if self.data is not None:
-            return self.data.rows
+            return RealData(self.data.rows, jnp.asarray(self.data.last))
         blank = replay.blank(self.env.obs_dim, self.env.act_dim)
-        return jax.tree.map(lambda x: x[None], blank)
+        return RealData(jax.tree.map(lambda x: x[None], blank), jnp.ones(1, bool))
 
     def _keys(self) -> Any:
         """[M]: a seed gives the same draws whichever simulators share the program."""
         return jnp.concatenate([seed_keys(self.seeds, _TRAINING)] * len(self.gaps))
 
-    def _restore(self, pools: World, rows: Transition, keys: Any) -> HybridState | None:
+    def _restore(self, pools: World, real: RealData, keys: Any) -> HybridState | None:
         """The state after the last checkpoint, None for a fresh start; raises UserError where simulators differ."""
         steps = [checkpoint.latest(folder) for folder in self.folders]
         if len(set(steps)) > 1:
@@ -129,7 +129,7 @@ class _Run:
             return None
         first = len(self.seeds)  # of the members: those of one simulator
         own = jax.tree.map(lambda x: x[:first], pools)
-        like = trainer.shape_of(self.env, self.agent, self.args.schedule, own, rows, keys[:first])
+        like = trainer.shape_of(self.env, self.agent, self.args.schedule, own, real, keys[:first])
         found = [checkpoint.restore(folder, like, step=steps[0], expect=self.expect) for folder in self.folders]
         for log, (_, meta) in zip(self.logs, found, strict=True):
             log.truncate(meta["position"])

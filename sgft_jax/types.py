@@ -317,19 +317,31 @@ class Method(NamedTuple):
 # --- from a fixed set of real data and a simulator ------------------------------------------------------------------
 
 
+class RealData(NamedTuple):
+    """A fixed set of real transitions, in the order in which they were recorded.
+
+    rows: [N, ...]. last: [N] bool, those that the next row does not follow.
+    """
+
+    rows: Transition
+    last: Array
+
+
 class HybridAgent(NamedTuple):
     """An agent that learns from a fixed set of real rows, from rows that it collects in a simulator, or from both.
 
-    batches: what an update takes, from the state (replay of the real rows, replay of its own rows or None).
+    keep(real) -> memory of the real rows. batches: what an update takes, from the state (that memory, replay of its own
+        rows or None).
     simulates: whether it acts in a simulator while it learns.
-    prepare(state, rows [N, ...]) -> state: a fresh learner that has seen the real rows once, for statistics.
+    prepare(state, real) -> state: a fresh learner that has seen the real data once, for statistics.
     export(state) -> params of its policy. policy: how these act. card: what the card of an exported policy says of it.
     """
 
     learner: Learner
+    keep: Callable[[RealData], PyTree]
     batches: Source
     simulates: bool
-    prepare: Callable[[PyTree, Transition], PyTree]
+    prepare: Callable[[PyTree, RealData], PyTree]
     export: Callable[[PyTree], PyTree]
     policy: Policy
     card: Mapping[str, Any]

@@ -18,7 +18,7 @@ from sgft_jax.data import replay
 from sgft_jax.data.replay import ReplayState
 from sgft_jax.hybrid.schedule import Schedule
 from sgft_jax.pretraining import over_members
-from sgft_jax.types import Array, HybridAgent, Key, Metrics, PyTree, Transition
+from sgft_jax.types import Array, HybridAgent, Key, Metrics, PyTree, RealData
 
 
 class HybridState(NamedTuple):
@@ -39,11 +39,11 @@ class Trainer(NamedTuple):
     """Training of one member as pure functions.
 
     init(pool, real, key) -> HybridState, with a first batch of simulated rows.
-    chunk(pool, real, state) -> (state, metrics averaged over its updates).
+    chunk(pool, memory, state) -> (state, metrics averaged over its updates). memory: of the real rows.
     """
 
-    init: Callable[[World, ReplayState, Key], HybridState]
-    chunk: Callable[[World, ReplayState, HybridState], tuple[HybridState, Metrics]]
+    init: Callable[[World, RealData, Key], HybridState]
+    chunk: Callable[[World, PyTree, HybridState], tuple[HybridState, Metrics]]
 
 
 def train(
@@ -51,7 +51,7 @@ def train(
     agent: HybridAgent,
     schedule: Schedule,
     pools: World,
-    real: Transition,
+    real: RealData,
     keys: Key,
     *,
     gamma: float,
@@ -59,7 +59,7 @@ def train(
 ) -> Iterator[tuple[HybridState, Metrics]]:
     """Trains M members for `schedule.chunks` chunks each.
 
-    pools: [M, W] worlds of each member's simulator. real: [N, ...] rows that all share. keys: [M], what decides a
+    pools: [M, W] worlds of each member's simulator. real: what all share. keys: [M], what decides a
     member's draws. gamma: discount factor of simulated rows, that of the real ones. state: where an earlier run
     stopped, or None; it is consumed.
 
@@ -67,22 +67,21 @@ def train(
     is valid until the next step, which donates its arrays. A resumed run ends like an uninterrupted one.
     """
     trainer, members = make_trainer(env, agent, schedule, gamma=gamma), keys.shape[0]
-    rows = replay.full(real)
-    now: HybridState = state or jax.jit(over_members(trainer.init, members, shared=(1,)))(pools, rows, keys)
+    real = jax.tree.map(jnp.asarray, real)
+    memory = agent.keep(real)
+    now: HybridState = state or jax.jit(over_members(trainer.init, members, shared=(1,)))(pools, real, keys)
     chunk = jax.jit(over_members(trainer.chunk, members, shared=(1,)), donate_argnums=2)
     yield now, {}
     for _ in range(chunks_done(now, schedule), schedule.chunks):
-        now, metrics = chunk(pools, rows, now)
+        now, metrics = chunk(pools, memory, now)
         yield now, metrics
 
 
-def shape_of(
-    env: Env, agent: HybridAgent, schedule: Schedule, pools: World, real: Transition, keys: Key
-) -> HybridState:
+def shape_of(env: Env, agent: HybridAgent, schedule: Schedule, pools: World, real: RealData, keys: Key) -> HybridState:
     """Shapes and types of a run's state: what checkpoints are read into."""
     trainer = make_trainer(env, agent, schedule, gamma=1.0)
     init = over_members(trainer.init, keys.shape[0], shared=(1,))
-    return jax.eval_shape(lambda pools, real, keys: init(pools, replay.full(real), keys), pools, real, keys)
+    return jax.eval_shape(init, pools, real, keys)
 
 
 def chunks_done(state: HybridState, schedule: Schedule) -> int:
@@ -113,9 +112,9 @@ def make_trainer(env: Env, agent: HybridAgent, schedule: Schedule, *, gamma: flo
         (fleet, rows), _ = jax.lax.scan(one, (state.fleet, state.simulated), jax.random.split(key, steps))
         return state._replace(fleet=fleet, simulated=rows)
 
-    def init(pool: World, real: ReplayState, key: Key) -> HybridState:
+    def init(pool: World, real: RealData, key: Key) -> HybridState:
         key_learner, key_fleet, key_fill, key_run = jax.random.split(key, 4)
-        agent_state = agent.prepare(learner.init(key_learner), real.data)
+        agent_state = agent.prepare(learner.init(key_learner), real)
         state = HybridState(agent_state, None, None, key_run, jnp.int32(0))
         if not agent.simulates:
             return state
@@ -123,25 +122,25 @@ def make_trainer(env: Env, agent: HybridAgent, schedule: Schedule, *, gamma: flo
         state = state._replace(fleet=launch(env, pool, key_fleet, schedule.simulators, fresh), simulated=empty)
         return collect(pool, state, key_fill, -(-agent.batches.n_sim // schedule.simulators))
 
-    def update(real: ReplayState, state: HybridState, key: Key) -> tuple[PyTree, Metrics]:
+    def update(memory: PyTree, state: HybridState, key: Key) -> tuple[PyTree, Metrics]:
         def one(agent_state: PyTree, key: Key) -> tuple[PyTree, Metrics]:
             key_rows, key_update = jax.random.split(key)
-            batch = agent.batches.sample((real, state.simulated), key_rows)
+            batch = agent.batches.sample((memory, state.simulated), key_rows)
             return learner.update(agent_state, batch, key_update)
 
         return jax.lax.scan(one, state.learner, jax.random.split(key, schedule.updates_per_round))
 
-    def one_round(pool: World, real: ReplayState, state: HybridState) -> tuple[HybridState, Metrics]:
+    def one_round(pool: World, memory: PyTree, state: HybridState) -> tuple[HybridState, Metrics]:
         key, key_collect, key_update = jax.random.split(state.key, 3)
         if agent.simulates:
             state = collect(pool, state, key_collect, schedule.steps_per_round)
-        trained, metrics = update(real, state, key_update)
+        trained, metrics = update(memory, state, key_update)
         averages = {name: x.mean() for name, x in metrics.items()}
         return state._replace(learner=trained, key=key, rounds=state.rounds + 1), averages
 
-    def chunk(pool: World, real: ReplayState, state: HybridState) -> tuple[HybridState, Metrics]:
+    def chunk(pool: World, memory: PyTree, state: HybridState) -> tuple[HybridState, Metrics]:
         rounds = schedule.rounds_per_chunk
-        state, metrics = jax.lax.scan(lambda own, _: one_round(pool, real, own), state, None, length=rounds)
+        state, metrics = jax.lax.scan(lambda own, _: one_round(pool, memory, own), state, None, length=rounds)
         return state, {name: x.mean() for name, x in metrics.items()}
 
     return Trainer(init, chunk)

@@ -4,14 +4,22 @@ import functools
 from typing import Any, Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.models.config import NetworkConfig
-from sgft_jax.models.networks import make_actor, make_affine_actor, tanh_gaussian_action
+from sgft_jax.models.networks import (
+    add_noise,
+    make_actor,
+    make_affine_actor,
+    make_deterministic_actor,
+    tanh_gaussian_action,
+)
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.types import Array, Key, Normalizer, Policy, PyTree
 
-Head = Literal["affine", "gaussian"]
+_EXPLORE_NOISE = 0.1
+Head = Literal["affine", "gaussian", "deterministic"]
 
 
 class ACTORParams(NamedTuple):
@@ -22,15 +30,26 @@ class ACTORParams(NamedTuple):
 
 
 def actor_policy(obs_dim: int, act_dim: int, network: NetworkConfig, head: Head) -> Policy:
-    """How such an actor acts. head: what its last layer says, "affine" of `make_affine_actor`, "gaussian" of
-    `make_actor`.
+    """How such an actor acts.
+
+    head: what its last layer says: that of `make_affine_actor`, `make_actor` or `make_deterministic_actor`. The last
+    explores with noise of std 0.1.
     """
-    make = make_actor if head == "gaussian" else functools.partial(make_affine_actor, output_gain=1.0)
-    actor = make(obs_dim, act_dim, network)  # the gain only says where training begins
+    if head == "deterministic":
+        point = make_deterministic_actor(obs_dim, act_dim, network)
+
+        def choose(params: PyTree, obs: Array, key: Key, explore: bool | Array) -> Array:
+            return add_noise(point.apply(params, obs), jnp.where(explore, _EXPLORE_NOISE, 0.0), key)
+
+    else:
+        make = make_actor if head == "gaussian" else functools.partial(make_affine_actor, output_gain=1.0)
+        spread = make(obs_dim, act_dim, network)  # the gain only says where training begins
+
+        def choose(params: PyTree, obs: Array, key: Key, explore: bool | Array) -> Array:
+            return tanh_gaussian_action(spread.apply(params, obs), key, explore=explore)
 
     def act(params: ACTORParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
-        moments = actor.apply(params.actor, normalize(params.normalizer, obs))
-        return tanh_gaussian_action(moments, key, explore=explore), carry
+        return choose(params.actor, normalize(params.normalizer, obs), key, explore), carry
 
     return Policy(lambda: (), act)
 

@@ -4,10 +4,8 @@ It learns from windows of two consecutive steps, because the critic's penalty ne
 static in `ReBRACConfig`; every number is a leaf of the state in `ReBRACHyper`. Source: Tarasov et al. 2023.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import chex
 import jax
@@ -18,7 +16,7 @@ from flax import struct
 from sgft_jax import checks
 from sgft_jax.learners import losses, optim
 from sgft_jax.models import normalizer
-from sgft_jax.models.networks import MLP, Network, NetworkConfig, add_noise, make_critic
+from sgft_jax.models.networks import Network, NetworkConfig, add_noise, make_critic, make_deterministic_actor
 from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree, UserError
 
 
@@ -44,7 +42,7 @@ class ReBRACHyper(NamedTuple):
 
     lr_*: Adam learning rates. tau: target averaging rate.
     actor_penalty: weight of |pi(s) - a|^2 beside Q / mean |Q|; critic_penalty: of |pi(s') - a'|^2 in targets, in units
-        of return. `PENALTIES` has those of data sets.
+        of return.
     target_noise, target_noise_max: std and bound of the noise on target actions. explore_noise: std when it explores.
     """
 
@@ -56,17 +54,6 @@ class ReBRACHyper(NamedTuple):
     target_noise: float | Array = 0.2
     target_noise_max: float | Array = 0.5
     explore_noise: float | Array = 0.1
-
-
-# Of D4RL's sets: (actor_penalty, critic_penalty).
-PENALTIES: Mapping[str, tuple[float, float]] = MappingProxyType(
-    {
-        "halfcheetah-medium": (0.001, 0.01),
-        "halfcheetah-medium-replay": (0.01, 0.001),
-        "walker2d-medium": (0.05, 0.1),
-        "walker2d-medium-replay": (0.05, 0.01),
-    }
-)
 
 
 class ReBRACState(struct.PyTreeNode):
@@ -105,16 +92,6 @@ def td_target(reward: Array, discount: Array, next_q: Array, next_distance: Arra
 
 
 # --- the learner ------------------------------------------------------------------------------------------------------
-
-
-def make_deterministic_actor(obs_dim: int, act_dim: int, config: NetworkConfig) -> Network:
-    """apply(params, obs [obs_dim]) -> [act_dim] in (-1, 1)."""
-    body = MLP(config.hidden, act_dim, config.actor_layer_norm, config.activation)
-
-    def apply(params: PyTree, obs: Array) -> Array:
-        return jnp.tanh(cast(Array, body.apply({"params": params}, obs)))
-
-    return Network(lambda key: body.init(key, jnp.zeros(obs_dim))["params"], apply)
 
 
 def make_rebrac(config: ReBRACConfig, hyper: ReBRACHyper | None = None) -> Learner:

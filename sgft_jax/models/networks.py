@@ -115,6 +115,16 @@ def make_affine_actor(obs_dim: int, act_dim: int, config: NetworkConfig, *, outp
     return Network(init, apply)
 
 
+def make_deterministic_actor(obs_dim: int, act_dim: int, config: NetworkConfig) -> Network:
+    """apply(params, obs [obs_dim]) -> [act_dim] in (-1, 1)."""
+    body = MLP(config.hidden, act_dim, config.actor_layer_norm, config.activation)
+
+    def apply(params: PyTree, obs: Array) -> Array:
+        return jnp.tanh(cast(Array, body.apply({"params": params}, obs)))
+
+    return Network(lambda key: body.init(key, jnp.zeros(obs_dim))["params"], apply)
+
+
 def make_critic(
     obs_dim: int, act_dim: int, config: NetworkConfig, *, members: int = 2, output_gain: float | None = None
 ) -> Network:

@@ -9,7 +9,7 @@ from sgft_jax.types import HybridAgent, HybridMethod, Task
 
 if TYPE_CHECKING:
     from sgft_jax.learners.h2o import H2OState
-    from sgft_jax.types import Transition
+    from sgft_jax.types import RealData
 
 
 @dataclass(frozen=True)
@@ -44,11 +44,12 @@ def build(config: Config, task: Task) -> HybridAgent:
     rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_alpha", "lr_ratio"), config.lr)
     numbers = {name: getattr(config, name) for name in ("tau", "conservatism", "spread_scale")}
 
-    def prepare(state: "H2OState", rows: "Transition") -> "H2OState":
-        return state.replace(spread=replay.obs_std(replay.full(rows)))
+    def prepare(state: "H2OState", real: "RealData") -> "H2OState":
+        return state.replace(spread=replay.obs_std(replay.full(real.rows)))
 
     return HybridAgent(
         learner=h2o.make_h2o(structure, h2o.H2OHyper(**rates, **numbers)),
+        keep=lambda real: replay.full(real.rows),
         batches=sources.beside(*(sources.two_buffers(n, n) for n in (config.rows, config.ratio_rows))),
         simulates=True,
         prepare=prepare,

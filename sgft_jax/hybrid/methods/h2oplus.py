@@ -9,7 +9,7 @@ from sgft_jax.types import HybridAgent, HybridMethod, Task, ValueLoss
 
 if TYPE_CHECKING:
     from sgft_jax.learners.h2oplus import H2OPlusState
-    from sgft_jax.types import Transition
+    from sgft_jax.types import RealData
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Config(ActorCriticOptions):
 
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
-    from sgft_jax.data import sources
+    from sgft_jax.data import replay, sources
     from sgft_jax.learners import actor, h2oplus
     from sgft_jax.models import normalizer
     from sgft_jax.models.config import NetworkConfig
@@ -55,13 +55,14 @@ def build(config: Config, task: Task) -> HybridAgent:
     rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_value", "lr_alpha", "lr_ratio"), config.lr)
     numbers = {name: getattr(config, name) for name in ("tau", "value_share", "expectile", "value_alpha")}
 
-    def prepare(state: "H2OPlusState", rows: "Transition") -> "H2OPlusState":
+    def prepare(state: "H2OPlusState", real: "RealData") -> "H2OPlusState":
         if state.ratio is None or not config.standardise:
             return state
-        return state.replace(ratio=state.ratio._replace(normalizer=normalizer.of(rows.obs)))
+        return state.replace(ratio=state.ratio._replace(normalizer=normalizer.of(real.rows.obs)))
 
     return HybridAgent(
         learner=h2oplus.make_h2oplus(structure, h2oplus.H2OPlusHyper(**rates, **numbers)),
+        keep=lambda real: replay.full(real.rows),
         batches=sources.beside(*(sources.two_buffers(n, n) for n in (config.rows, config.ratio_rows))),
         simulates=True,
         prepare=prepare,

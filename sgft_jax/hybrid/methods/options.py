@@ -60,15 +60,17 @@ def sac_agent(
     sac_of: Callable[[PyTree], Any] = lambda state: state,
 ) -> HybridAgent:
     """The agent of a learner that is made of SAC. sac_of(state) -> its `SACState`."""
+    from sgft_jax.data import replay
     from sgft_jax.learners import actor
     from sgft_jax.models.config import NetworkConfig
 
     network = NetworkConfig(config.hidden)
     return HybridAgent(
         learner=learner,
+        keep=lambda real: replay.full(real.rows),
         batches=batches,
         simulates=simulates,
-        prepare=lambda state, rows: state,
+        prepare=lambda state, real: state,
         export=lambda state: actor.exported(sac_of(state)),
         policy=actor.actor_policy(task.obs_dim, task.act_dim, network, "gaussian"),
         card=actor.card(network, "gaussian", config.gamma),

@@ -14,9 +14,10 @@ from envs.gaps import Gap
 from envs.pools import real_worlds
 from sgft_jax.data import replay
 from sgft_jax.hybrid import trainer
-from sgft_jax.hybrid.methods import NAMES, get_method
+from sgft_jax.hybrid.methods import NAMES, get_method, iql
 from sgft_jax.hybrid.schedule import Schedule
-from sgft_jax.types import Transition, UserError
+from sgft_jax.policies import make_policy
+from sgft_jax.types import RealData, UserError
 
 ENV = toy.make()
 SMALL = {"hidden": (16,), "rows": 8}
@@ -33,7 +34,7 @@ def real_rows(n=50):
     draw = np.random.default_rng(0)
     blank = replay.blank(ENV.obs_dim, ENV.act_dim)
     rows = jax.tree.map(lambda x: draw.uniform(-1, 1, (n, *x.shape)).astype(np.float32), blank)
-    return rows._replace(discount=np.full(n, 0.9, np.float32))
+    return RealData(rows._replace(discount=np.full(n, 0.9, np.float32)), np.arange(n) % 10 == 9)
 
 
 def pools_of(*masses):
@@ -115,14 +116,15 @@ def plain_shapes(state):
 
 def test_discriminators_read_standardised_observations_only_if_asked_to():
     rows = real_rows()
-    for asked, mean in ((False, np.zeros(4)), (True, rows.obs.mean(0))):
+    for asked, mean in ((False, np.zeros(4)), (True, rows.rows.obs.mean(0))):
         state = played(build(standardise=asked))[0][0]
         np.testing.assert_allclose(state.learner.ratio.normalizer.mean[0], mean, atol=1e-6)
 
 
 def test_sac_sees_no_real_row():
     def rows(sign):
-        return Transition(*(sign * 1e3 * np.ones_like(x) for x in real_rows()))
+        real = real_rows()
+        return real._replace(rows=jax.tree.map(lambda x: sign * 1e3 * np.ones_like(x), real.rows))
 
     agent, pools, keys = build("sac"), pools_of(1.0), keys_of(0)
     ends = []
@@ -160,6 +162,13 @@ def test_presets_are_what_they_are_called():
     h2o = get_method("h2o").presets
     assert (h2o["paper"].conservatism, h2o["paper"].spread_scale) == (0.01, 1.0)
     assert h2o["released"].spread_scale == pytest.approx(np.sqrt(1 / 11), abs=2e-3)  # one row in eleven is not padding
+    penalties = {name: (own.actor_penalty, own.critic_penalty) for name, own in get_method("rebrac").presets.items()}
+    assert penalties == {
+        "halfcheetah-medium-replay": (0.01, 0.001),
+        "halfcheetah-medium": (0.001, 0.01),
+        "walker2d-medium-replay": (0.05, 0.01),
+        "walker2d-medium": (0.05, 0.1),
+    }
     assert get_method("cql").config.conservatism == 2.0 and get_method("edac").config.critics == 10
 
 
@@ -171,4 +180,26 @@ def test_offline_methods_have_no_simulator(name):
 
 def test_the_noise_of_h2o_has_the_spread_of_the_data():
     state = played(build("h2o"))[0][0]
-    np.testing.assert_allclose(state.learner.spread[0], real_rows().obs.std(0), rtol=1e-4)
+    np.testing.assert_allclose(state.learner.spread[0], real_rows().rows.obs.std(0), rtol=1e-4)
+
+
+def test_iql_scales_rewards_to_the_span_of_the_returns():
+    rows = real_rows()
+    returns = rows.rows.reward.reshape(5, 10).sum(1)
+    state = played(build("iql"))[0][0]
+    np.testing.assert_allclose(state.learner.hyper.reward_scale[0], 1000 / np.ptp(returns), rtol=1e-4)
+    cut = RealData(rows.rows, rows.last & (np.arange(50) != 49))  # the last episode is cut off
+    np.testing.assert_allclose(iql.return_span(jax.tree.map(jnp.asarray, cut)), np.ptp(returns), rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_exported_policy_acts_as_the_agent(name):
+    agent = build(name)
+    state = jax.tree.map(lambda x: x[0], played(agent)[-1][0].learner)
+    obs, key = jnp.array([0.3, -0.2, 0.1, 0.5]), jax.random.key(3)
+    own, _ = agent.learner.act(state, (), obs, key, explore=False)
+    exported, _ = agent.policy.act(agent.export(state), (), obs, key, explore=False)
+    np.testing.assert_allclose(exported, own, atol=1e-6)
+    card = {**agent.card, "config": {}}
+    again, _ = make_policy(card, ENV).act(agent.export(state), (), obs, key, explore=False)
+    np.testing.assert_allclose(again, own, atol=1e-6)

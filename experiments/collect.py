@@ -1,0 +1,99 @@
+"""Record data sets of a real system: what a learning policy did up to some level, and what it does then.
+
+SAC learns in the system itself, in a few environments. When its exploring policy returns --level on average, its whole
+experience is written as `replay`, and episodes of that policy as `medium`: the sets of D4RL, made anew. With --policy
+nothing is learned, and episodes of that policy are written. Files are in the layouts of D4RL and of Minari.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from envs.gaps import SIM
+from experiments import cli
+from experiments.options import Impl, at_least_one, check_task, seed_list
+from sgft_jax import extend
+from sgft_jax.types import UserError
+
+LEVELS = {"halfcheetah": 4770.0, "walker2d": 2850.0}  # mean returns of D4RL's medium sets, v2
+PAIR = ("medium-replay", "medium")
+
+
+@dataclass(frozen=True)
+class CollectArgs:
+    """Data sets of one real system, one pair for each seed."""
+
+    task: str = "halfcheetah"
+    """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
+    real: str = SIM
+    """The real system: a gap by name or as a file, or sim for the task as it is."""
+    policy: Path | None = None
+    """Folder of a policy that another command has left (policy/seed-0, prior/seed-0): record it, learn nothing."""
+    level: float | None = None
+    """Mean return at which learning stops; default: that of D4RL's medium set, where there is one."""
+    transitions: int = 1_000_000
+    """Transitions of the set of one policy."""
+    seeds: int = 1
+    """Number of seeds, all in one program."""
+    out: Path = Path("runs/data")
+    """Folder for the files."""
+    overwrite: bool = False
+    """Replace files of the same name."""
+    seed: int = 0
+    """Expert: first seed."""
+    environments: int = 8
+    """Expert: environments that learning steps together. Many would fill the experience with early, poor episodes."""
+    updates: int = 1_000_000
+    """Expert: updates, and so steps of learning, after which it gives up."""
+    eval_every: int = 10_000
+    """Expert: updates between looks at the level."""
+    eval_episodes: int = 20
+    """Expert: episodes of the exploring policy that decide whether it is reached."""
+    impl: Impl = "auto"
+
+
+def name_of(args: CollectArgs, kind: str, seed: int) -> str:
+    """What a data set is called: `halfcheetah-medium-regenerated-seed-0`."""
+    return f"{extend.name_of(args.task)}-{kind}-regenerated-seed-{seed}"
+
+
+def targets(args: CollectArgs) -> list[Path]:
+    """The files that a call writes. Minari's folder beside a file has its name with `-v0` for the ending."""
+    if args.policy is not None:
+        kinds = [(extend.name_of(args.task), args.policy.parent.parent.name, args.policy.name)]
+        return [args.out / f"{'-'.join(filter(None, kinds[0]))}.hdf5"]
+    seeds = seed_list(args.seed, args.seeds)
+    return [args.out / f"{name_of(args, kind, seed)}.hdf5" for seed in seeds for kind in PAIR]
+
+
+def check(args: CollectArgs) -> float:
+    """The level; raises UserError for what is wrong in the arguments and on disk."""
+    at_least_one(args, "transitions", "environments", "updates", "eval_every", "eval_episodes")
+    seed_list(args.seed, args.seeds)
+    check_task(args.task, [] if args.real == SIM else [args.real])
+    level = args.level if args.level is not None else LEVELS.get(extend.name_of(args.task))
+    if args.policy is None and level is None:
+        raise UserError(f"--level: say at which mean return learning stops; only {', '.join(LEVELS)} have a default")
+    if args.policy is not None and not args.policy.is_dir():
+        raise UserError(f"--policy {args.policy}: no such folder")
+    if there := [path for path in targets(args) if path.exists() and not args.overwrite]:
+        raise UserError(f"{there[0]}: exists already; --overwrite replaces it, another --out keeps both")
+    return level or 0.0
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line."""
+    cli.run_main(collect, CollectArgs, __doc__ or "", argv=argv)
+
+
+def collect(args: CollectArgs) -> list[dict[str, Any]]:
+    """Records and writes; returns what each file holds."""
+    level = check(args)
+    from experiments.collect_run import record, teach  # JAX starts here
+
+    return teach(args, level) if args.policy is None else record(args)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,142 @@
+"""Impure: learning in a real system until a level is reached, and recording. `experiments.collect` is its command."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from envs import gaps
+from envs.base import Env
+from envs.pools import real_env, real_worlds
+from envs.rollout import Episode
+from experiments.collect import CollectArgs, name_of, targets
+from experiments.options import seed_list
+from experiments.stacking import member
+from sgft_jax.data import logs, replay
+from sgft_jax.data.recording import Recorded, cut, of_episodes, of_fleet, write_d4rl, write_minari
+from sgft_jax.hybrid import trainer
+from sgft_jax.hybrid.methods import get_method
+from sgft_jax.hybrid.schedule import Schedule
+from sgft_jax.hybrid.trainer import HybridState
+from sgft_jax.io.priors import load_prior, observed_by
+from sgft_jax.io.progress import RunProgress
+from sgft_jax.policies import make_policy
+from sgft_jax.pretraining import seed_keys
+from sgft_jax.systems.simulated import Simulated
+from sgft_jax.types import HybridAgent, Policy, PyTree, RealData, Transition, UserError
+
+_TRAINING, _LEVEL, _RECORDING = 21, 22, 23  # purposes, folded into a seed's key
+_AT_ONCE = 50  # episodes of one recording call
+
+
+def teach(args: CollectArgs, level: float) -> list[dict[str, Any]]:
+    """SAC in the system itself, all seeds in one program; the pair of sets of each seed."""
+    method = get_method("sac")
+    env, system = _system(args, envs.make(args.task, args.impl), args.seeds, method.config.gamma)
+    agent, schedule = method.build(method.config, env), _schedule(args)
+    seeds = seed_list(args.seed, args.seeds)
+    pools = jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), system.pools)
+    nothing = RealData(jax.tree.map(lambda x: x[None], replay.blank(env.obs_dim, env.act_dim)), jnp.ones(1, bool))
+    steps = trainer.train(env, agent, schedule, pools, nothing, seed_keys(seeds, _TRAINING), gamma=method.config.gamma)
+    reached: dict[int, tuple[PyTree, Transition]] = {}
+    with RunProgress(f"SAC on {env.name}", total=schedule.chunks * args.eval_every, unit="updates") as progress:
+        for state, metrics in steps:
+            if not metrics:
+                continue
+            returns = _level(args, agent, system, state)
+            for i in np.flatnonzero(returns >= level):
+                reached.setdefault(int(i), _snapshot(agent, state, int(i)))
+            progress.advance(args.eval_every, {"return, exploring": float(returns.mean())})
+            if len(reached) == len(seeds):
+                break
+    if late := [str(seeds[i]) for i in range(len(seeds)) if i not in reached]:
+        print(f"no data of seed {', '.join(late)}: {level:g} was not reached in {args.updates:,} updates")
+    if not reached:
+        raise UserError(f"--level {level:g}: no seed reached it; raise --updates or lower it")
+    found = []
+    for i, (params, rows) in sorted(reached.items()):
+        old = of_fleet(rows, args.environments)
+        new = _play(args, env, system, agent.policy, params, seeds[i])
+        for kind, episodes in (("medium-replay", old), ("medium", new)):
+            found.append(_write(args, args.out / f"{name_of(args, kind, seeds[i])}.hdf5", episodes))
+    return found
+
+
+def record(args: CollectArgs) -> list[dict[str, Any]]:
+    """Episodes of a policy that exists."""
+    assert args.policy is not None
+    env = envs.make(args.task, args.impl, **observed_by([args.policy]))
+    prior = load_prior(args.policy, task=env.name, obs_dim=env.obs_dim, act_dim=env.act_dim)
+    env, system = _system(args, env, 1, prior.card["gamma"])
+    episodes = _play(args, env, system, make_policy(prior.card, env), prior.params, args.seed)
+    return [_write(args, targets(args)[0], episodes)]
+
+
+def _system(args: CollectArgs, env: Env, members: int, gamma: float) -> tuple[Env, Simulated]:
+    """The real system, and how it is played."""
+    gap = gaps.load(env, args.real)
+    env = real_env(env, [gap])
+    pools = real_worlds(env, [gap], jax.random.key(0))
+    return env, Simulated(env, pools, jnp.zeros(members, jnp.int32), gamma=gamma)
+
+
+def _schedule(args: CollectArgs) -> Schedule:
+    """An update for each step; nothing is overwritten."""
+    room = args.updates + args.environments * 1_000  # the first batch comes before the first update
+    return Schedule(args.updates, args.environments, buffer=room, chunk_updates=args.eval_every)
+
+
+def _level(args: CollectArgs, agent: HybridAgent, system: Simulated, state: HybridState) -> np.ndarray:
+    """Mean return [seeds] of the exploring policies."""
+    params = jax.jit(jax.vmap(agent.export))(state.learner)
+    played = _episodes(system, agent.policy, params, jax.random.key(_LEVEL), args.eval_episodes)
+    return np.asarray(played.total_reward).mean(axis=1)
+
+
+def _episodes(system: Simulated, policy: Policy, params: PyTree, key: Any, n: int) -> Episode:
+    """Exploring episodes [members, n]."""
+    keys = jnp.broadcast_to(jax.random.split(key, n), (*system.which.shape, n))
+    return system.play(policy, params, keys, explore=True)
+
+
+def _snapshot(agent: HybridAgent, state: HybridState, i: int) -> tuple[PyTree, Transition]:
+    """The policy of a seed and all that it has experienced, on the host."""
+    held = int(state.simulated.size[i])
+    rows = jax.tree.map(lambda x: np.asarray(x[i, :held]), state.simulated.data)
+    return jax.tree.map(np.asarray, agent.export(member(state.learner, i))), rows
+
+
+def _play(args: CollectArgs, env: Env, system: Simulated, policy: Policy, params: PyTree, seed: int) -> list[Recorded]:
+    """Exploring episodes of one policy, until there are transitions enough."""
+    alone = system.moved(system.pools, jnp.zeros(1, jnp.int32))
+    params = jax.tree.map(lambda x: jnp.asarray(x)[None], params)
+    key, found, held = jax.random.fold_in(jax.random.key(seed), _RECORDING), [], 0
+    at_once = min(_AT_ONCE, math.ceil(args.transitions / env.episode_length))
+    while held < args.transitions:
+        key, key_now = jax.random.split(key)
+        played = jax.tree.map(lambda x: np.asarray(x[0]), _episodes(alone, policy, params, key_now, at_once))
+        new = of_episodes(played)
+        found, held = found + new, held + sum(len(own.reward) for own in new)
+        if not new:
+            raise UserError(f"{env.name}: physics exploded in the first step of {at_once} episodes; nothing to record")
+    return cut(found, args.transitions)
+
+
+def _write(args: CollectArgs, path: Path, episodes: Sequence[Recorded]) -> dict[str, Any]:
+    """Both layouts of a data set; says what it holds, as a reader finds it."""
+    author = "sgft_jax experiments.collect"
+    write_d4rl(path, episodes, {"algorithm": "SAC", "task": args.task, "real": args.real, "author": author})
+    write_minari(path.with_name(f"{path.stem}-v0"), episodes, {"algorithm_name": "SAC", "author": author})
+    facts = logs.load(path, gamma=1.0).facts
+    steps = np.mean([len(own.reward) for own in episodes])
+    print(
+        f"{path}: {facts.transitions:,} transitions, {facts.episodes:,} episodes of {steps:.0f} steps on average, "
+        f"return {facts.return_mean:.1f} (std {facts.return_std:.1f}, {facts.return_min:.1f} to {facts.return_max:.1f})"
+    )
+    return dataclasses.asdict(facts)

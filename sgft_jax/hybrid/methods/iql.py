@@ -1,0 +1,78 @@
+"""IQL: the best of the data's own actions, without asking what another is worth (Kostrikov et al. 2021)."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from sgft_jax import checks
+from sgft_jax.hybrid.methods.options import OfflineOptions
+from sgft_jax.types import HybridAgent, HybridMethod, Task
+
+if TYPE_CHECKING:
+    from sgft_jax.learners.iql import IQLState
+    from sgft_jax.types import Array, RealData
+
+_RETURN_SPAN = 1000.0  # of the scaled returns, as published for locomotion
+
+
+@dataclass(frozen=True)
+class Config(OfflineOptions):
+    """Options of `iql`; the published ones for locomotion, but for the actor's learning rate, which does not fall."""
+
+    expectile: float = 0.7
+    """V is the mean of the data's actions at 0.5 and their best towards 1."""
+    beta: float = 3.0
+    """Inverse temperature of the advantage weights; 0 clones the data."""
+    scale_rewards: bool = True
+    """Divide rewards by the span of the data's returns and multiply them by 1,000, as the authors do."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.share(self, "expectile")
+        checks.not_negative(self, "beta")
+
+
+def build(config: Config, task: Task) -> HybridAgent:
+    """The agent."""
+    from sgft_jax.data import replay, sources
+    from sgft_jax.learners import actor, iql
+    from sgft_jax.models.config import NetworkConfig
+
+    network = NetworkConfig(config.hidden)
+    rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_value"), config.lr)
+    numbers = {name: getattr(config, name) for name in ("tau", "expectile", "beta")}
+
+    def prepare(state: "IQLState", real: "RealData") -> "IQLState":
+        scale = _RETURN_SPAN / return_span(real) if config.scale_rewards else state.hyper.reward_scale
+        return state.replace(hyper=state.hyper._replace(reward_scale=scale))
+
+    def export(state: "IQLState") -> actor.ACTORParams:
+        return actor.ACTORParams(iql.as_tanh_gaussian(state.actor.params), actor.exported(state).normalizer)
+
+    return HybridAgent(
+        learner=iql.make_iql(iql.IQLConfig(task.obs_dim, task.act_dim, network), iql.IQLHyper(**rates, **numbers)),
+        keep=lambda real: replay.full(real.rows),
+        batches=sources.real_rows(config.rows),
+        simulates=False,
+        prepare=prepare,
+        export=export,
+        policy=actor.actor_policy(task.obs_dim, task.act_dim, network, "gaussian"),
+        card=actor.card(network, "gaussian", config.gamma),
+    )
+
+
+def return_span(real: "RealData") -> "Array":
+    """Best less worst undiscounted return [] of the recorded episodes; 1 where they do not differ."""
+    import jax
+    import jax.numpy as jnp
+
+    n = real.last.shape[0]
+    number = jnp.cumsum(real.last) - real.last  # of the episode of every row
+    returns = jax.ops.segment_sum(real.rows.reward, number, n)
+    there = jnp.arange(n) <= number[-1]
+    span = jnp.max(returns, where=there, initial=-jnp.inf) - jnp.min(returns, where=there, initial=jnp.inf)
+    return jnp.where(span > 0, span, 1.0)
+
+
+METHOD = HybridMethod(
+    "iql", "offline", "the best of the data's own actions", "Kostrikov et al. 2021", {"default": Config()}, build
+)

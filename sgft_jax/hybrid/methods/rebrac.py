@@ -1,0 +1,61 @@
+"""ReBRAC: TD3 whose actor and critic each pay for leaving the data's actions (Tarasov et al. 2023)."""
+
+from dataclasses import dataclass, replace
+
+from sgft_jax import checks
+from sgft_jax.hybrid.methods.options import OfflineOptions
+from sgft_jax.types import HybridAgent, HybridMethod, Task
+
+
+@dataclass(frozen=True)
+class Config(OfflineOptions):
+    """Options of `rebrac`."""
+
+    lr: float = 1e-3
+    """Adam learning rate of every network."""
+    hidden: tuple[int, ...] = (256, 256, 256)
+    """Widths of the hidden layers of actor and critics."""
+    rows: int = 1024
+    """Real rows of a batch, each with the action that followed it."""
+    actor_penalty: float = 0.01
+    """Weight of the squared distance of the actor's action from the data's."""
+    critic_penalty: float = 0.001
+    """The same in targets, in units of return."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.not_negative(self, "actor_penalty", "critic_penalty")
+
+
+def build(config: Config, task: Task) -> HybridAgent:
+    """The agent."""
+    from sgft_jax.data import sequences, sources
+    from sgft_jax.learners import actor, rebrac
+    from sgft_jax.models.config import NetworkConfig
+
+    network = NetworkConfig(config.hidden, layer_norm=True)
+    numbers = {name: getattr(config, name) for name in ("tau", "actor_penalty", "critic_penalty")}
+    hyper = rebrac.ReBRACHyper(lr_actor=config.lr, lr_critic=config.lr, **numbers)
+    return HybridAgent(
+        learner=rebrac.make_rebrac(rebrac.ReBRACConfig(task.obs_dim, task.act_dim, network), hyper),
+        keep=lambda real: sequences.full(real.rows, real.last),
+        batches=sources.real_windows(config.rows, 2),
+        simulates=False,
+        prepare=lambda state, real: state,
+        export=actor.exported,
+        policy=actor.actor_policy(task.obs_dim, task.act_dim, network, "deterministic"),
+        card=actor.card(network, "deterministic", config.gamma),
+    )
+
+
+_REPLAY = Config()  # the published penalties, by data set
+METHOD = HybridMethod(
+    "rebrac", "offline", "TD3 whose actor and critic pay for leaving the data", "Tarasov et al. 2023",
+    {
+        "halfcheetah-medium-replay": _REPLAY,
+        "halfcheetah-medium": replace(_REPLAY, actor_penalty=0.001, critic_penalty=0.01),
+        "walker2d-medium-replay": replace(_REPLAY, actor_penalty=0.05, critic_penalty=0.01),
+        "walker2d-medium": replace(_REPLAY, actor_penalty=0.05, critic_penalty=0.1),
+    },
+    build,
+)  # fmt: skip

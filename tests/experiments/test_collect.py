@@ -1,0 +1,153 @@
+"""Recording data sets of a real system on a point mass: both layouts, what SAC did and what it does then."""
+
+import h5py
+import jax
+import numpy as np
+import pytest
+
+import envs
+from experiments import cli, collect, hybrid
+from sgft_jax.data import logs, recording
+from sgft_jax.data.recording import Recorded
+from sgft_jax.types import Transition, UserError
+
+OPTIONS = """--task toy --level -100 --transitions 50 --seeds 2 --environments 3 --updates 60 --eval-every 30
+    --eval-episodes 2"""
+LEARN = OPTIONS.split()
+
+
+@pytest.fixture(autouse=True)
+def _toy(monkeypatch):
+    monkeypatch.setitem(envs.TASKS, "toy", "toy")
+    monkeypatch.setattr(cli, "set_up", lambda: None)
+
+
+def episode(first, steps, *, terminated=False):
+    """Observations that count up from `first`."""
+    obs = (first + np.arange(steps + 1))[:, None].astype(np.float32)
+    return Recorded(obs, obs[:-1] / 100, np.ones(steps, np.float32), terminated)
+
+
+def rows_of(*episodes):
+    """Transitions [T] of episodes of one environment, one after the other."""
+    discount = [np.append(np.full(len(e.reward) - 1, 0.9), 0.0 if e.terminated else 0.9) for e in episodes]
+    return Transition(
+        np.concatenate([e.obs[:-1] for e in episodes]), np.concatenate([e.action for e in episodes]),
+        np.concatenate([e.reward for e in episodes]), np.concatenate(discount),
+        np.concatenate([e.obs[1:] for e in episodes]),
+    )  # fmt: skip
+
+
+def same(a, b):
+    return a.terminated == b.terminated and all(np.array_equal(x, y) for x, y in zip(a[:3], b[:3], strict=True))
+
+
+def test_episodes_of_a_fleet_are_found_again_in_the_order_of_their_ends():
+    """Two environments, eight steps: one falls after three; the recording cuts off both last episodes."""
+    one = [episode(0, 3, terminated=True), episode(50, 5)]
+    two = [episode(200, 6), episode(300, 2)]
+    rows = jax.tree.map(lambda a, b: np.stack([a, b], 1).reshape(16, *a.shape[1:]), rows_of(*one), rows_of(*two))
+    found = recording.of_fleet(rows, 2)
+    for got, wanted in zip(found, [one[0], two[0], one[1], two[1]], strict=True):
+        assert same(got, wanted)
+
+
+def test_what_is_cut_off_is_not_terminal():
+    episodes = [episode(0, 4, terminated=True), episode(10, 4, terminated=True)]
+    first, second = recording.cut(episodes, 6)
+    assert same(first, episodes[0]) and same(second, episode(10, 2))
+    assert same(recording.cut(episodes, 8)[1], episodes[1])
+    with pytest.raises(UserError, match="8 transitions were recorded, 9 are wanted"):
+        recording.cut(episodes, 9)
+
+
+@pytest.mark.parametrize("layout", ["d4rl", "minari"])
+def test_what_is_written_is_read_again(layout, tmp_path):
+    episodes = [episode(0, 3, terminated=True), episode(50, 2), episode(70, 4)]
+    if layout == "d4rl":
+        recording.write_d4rl(tmp_path / "a" / "set.hdf5", episodes, {"algorithm": "SAC"})
+        log = logs.load(tmp_path / "a" / "set.hdf5", gamma=0.9)
+    else:
+        recording.write_minari(tmp_path / "set-v0", episodes, {"author": "me"})
+        log = logs.load(tmp_path / "set-v0", gamma=0.9)
+    wanted = rows_of(*episodes)
+    for got, own in zip(log.rows, wanted, strict=True):
+        np.testing.assert_allclose(got, own, rtol=1e-6)
+    assert np.flatnonzero(log.last).tolist() == [2, 4, 8]
+    assert (log.facts.episodes, log.facts.terminal, log.facts.return_max) == (3, 1, 4.0)
+    assert not list(tmp_path.rglob("*.part"))
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # its advice on authors and links
+def test_minaris_own_library_opens_a_set(tmp_path, monkeypatch):
+    minari = pytest.importorskip("minari", reason="Minari's library is not installed: pip install 'sgft-jax[minari]'")
+    recording.write_minari(tmp_path / "toy" / "point-v0", [episode(0, 3, terminated=True), episode(50, 2)], {})
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    found = list(minari.MinariDataset(tmp_path / "toy" / "point-v0" / "data").iterate_episodes())
+    assert [len(own.rewards) for own in found] == [3, 2] and found[0].terminations.tolist() == [False, False, True]
+    np.testing.assert_array_equal(found[1].observations[:, 0], [50, 51, 52])
+
+
+def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys):
+    out = tmp_path / "data"
+    collect.main([*LEARN, "--out", str(out)])
+    said = capsys.readouterr().out
+    for seed in (0, 1):
+        medium = logs.load(out / f"toy-medium-regenerated-seed-{seed}.hdf5", gamma=0.99)
+        assert medium.facts.transitions == 50 and medium.facts.episodes == 3
+        again = logs.load(out / f"toy-medium-regenerated-seed-{seed}-v0", gamma=0.99)  # in Minari's layout
+        np.testing.assert_array_equal(medium.rows.obs, again.rows.obs)
+        old = logs.load(out / f"toy-medium-replay-regenerated-seed-{seed}.hdf5", gamma=0.99)
+        fill = 3 * -(-256 // 3)  # a first batch, in whole steps of three environments
+        assert old.facts.transitions == fill + 30 and f"seed-{seed}.hdf5: {fill + 30} transitions" in said
+        assert old.facts.episodes == 3 * -(-(fill + 30) // 60)  # of 20 steps; three are cut off
+    with h5py.File(out / "toy-medium-regenerated-seed-0.hdf5") as file:
+        assert file["metadata/algorithm"][()] == b"SAC" and file["timeouts"][()].sum() == 3
+    # what was recorded is what experiments.hybrid learns from
+    data = out / "toy-medium-replay-regenerated-seed-0.hdf5"
+    hybrid.main(
+        f"""--task toy --method iql --data {data} --seeds 1 --no-video --schedule.updates 4 --schedule.chunk-updates 2
+        --eval-every 2 --eval-episodes 2 --options.hidden 8 --options.rows 8 --out {tmp_path}""".split()
+    )
+    assert (tmp_path / "hybrid/toy/no-simulator/toy-medium-replay-regenerated-seed-0/iql/seed-0/policy").exists()
+    collect.main(
+        [
+            "--task",
+            "toy",
+            "--transitions",
+            "30",
+            "--out",
+            str(out),
+            "--policy",
+            str(tmp_path / "hybrid/toy/no-simulator/toy-medium-replay-regenerated-seed-0/iql/seed-0/policy/seed-0"),
+        ]
+    )
+    (recorded,) = out.glob("toy-seed-0-seed-0.hdf5")
+    assert logs.load(recorded, gamma=1.0).facts.transitions == 30
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--task", "toy"], "--level: say at which mean return learning stops"),
+        (["--task", "toy", "--policy", "nowhere"], "--policy nowhere: no such folder"),
+        (
+            ["--task", "toy", "--level", "1e9", "--updates", "8", "--eval-every", "8"],
+            "--level 1e+09: no seed reached it",
+        ),
+        (["--environments", "0"], "--environments is 0: must be at least 1"),
+    ],
+)
+def test_bad_input(words, said, tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        collect.main([*words, "--out", str(tmp_path / "data")])
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and said in error and error.count("\n") == 1
+    assert not (tmp_path / "data").exists()
+
+
+def test_files_are_not_replaced(tmp_path, capsys):
+    (tmp_path / "toy-medium-regenerated-seed-0.hdf5").touch()
+    with pytest.raises(SystemExit):
+        collect.main([*LEARN, "--out", str(tmp_path)])
+    assert "exists already; --overwrite replaces it" in capsys.readouterr().err
