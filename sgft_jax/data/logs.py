@@ -136,8 +136,10 @@ def _array(file: Path, group: h5py.Group, name: str, rank: int) -> np.ndarray:
     if not isinstance(data, h5py.Dataset):
         raise UserError(f"{file}: {data.name} is a group; only vectors are read, so flatten it before it is recorded")
     if data.ndim != rank or data.dtype.kind not in "biuf":
-        wanted = "[rows]" if rank == 1 else "[rows, numbers]"
-        raise UserError(f"{file}: {data.name} is {data.dtype} {list(data.shape)}, not {wanted} numbers; supply another")
+        wanted = "[rows]" if rank == 1 else "[rows, entries]"
+        raise UserError(
+            f"{file}: {data.name} is {data.dtype} {list(data.shape)}, not numbers {wanted}; supply another file"
+        )
     return np.asarray(data[()])
 
 

@@ -42,7 +42,7 @@ def step_policy(
 
     (mean, log_prob), grads = jax.value_and_grad(loss, has_aux=True)(state.actor.params)
     fit, log_alpha = optim.step(optimiser, state.actor, grads, state.hyper.lr_actor), state.log_alpha
-    if target_entropy is not None:
+    if target_entropy is not None:  # the released loss has log alpha in the place of alpha: with Adam nearly the same
         log_alpha = step_temperature(
             optimiser, log_alpha, batch, log_prob, target=target_entropy, rate=state.hyper.lr_alpha
         )

@@ -158,6 +158,13 @@ def test_order_and_rows_of_the_update(learner, key):
     assert metrics["critic/loss"] == pytest.approx(
         float(squared[real].mean() + (weights * squared)[sim].mean()), rel=1e-4
     )
+
+    def of_policy(obs, key):
+        action, log_prob = networks.tanh_gaussian_sample(ACTOR.apply(state.actor.params, obs), key)
+        return log_prob - CRITIC.apply(state.critic.params, obs, action).min()
+
+    each = jax.vmap(of_policy)(batch.obs, jax.random.split(jax.random.split(key, 3)[1], ROWS))
+    assert metrics["actor/loss"] == pytest.approx(float(each.mean()), rel=1e-4)
     mix = jax.tree.map(lambda t, c: 0.995 * t + 0.005 * c, state.target_critic, new.critic.params)
     chex.assert_trees_all_close(new.target_critic, mix, rtol=1e-5)
 

@@ -152,7 +152,7 @@ def test_the_pair_learns_from_both_losses_and_the_joint_from_its_own(key):
         return total
 
     params = state.joint.params, state.pair.params
-    value, expected = jax.value_and_grad(loss, argnums=(0, 1))(*params)
+    value, expected = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))(*params)
     assert metrics["ratio/loss"] == pytest.approx(float(value), rel=1e-5)
     chex.assert_trees_all_close(gradients(new), list(expected), rtol=1e-3, atol=1e-6)
 
