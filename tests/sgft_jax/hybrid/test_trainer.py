@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
+import tuners
 
 from envs import gaps
 from envs.gaps import Gap
@@ -94,7 +95,7 @@ def test_members_do_what_they_would_do_alone():
     chex.assert_trees_all_close(own.learner, plain(alone).learner, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", tuners.slow_but({"h2oplus", "rebrac"}, NAMES))
 def test_a_resumed_run_ends_like_an_uninterrupted_one(name):
     agent = build(name)
     whole = played(agent)
@@ -172,7 +173,7 @@ def test_presets_are_what_they_are_called():
     assert get_method("cql").config.conservatism == 2.0 and get_method("edac").config.critics == 10
 
 
-@pytest.mark.parametrize("name", [name for name in NAMES if get_method(name).kind == "offline"])
+@pytest.mark.parametrize("name", ["iql", "rebrac"])
 def test_offline_methods_have_no_simulator(name):
     state, _ = played(build(name))[-1]
     assert state.fleet is None and state.simulated is None and int(state.learner.step[0]) == 24
@@ -192,7 +193,7 @@ def test_iql_scales_rewards_to_the_span_of_the_returns():
     np.testing.assert_allclose(iql.return_span(jax.tree.map(jnp.asarray, cut)), np.ptp(returns), rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", tuners.slow_but({"h2oplus", "rebrac"}, NAMES))
 def test_an_exported_policy_acts_as_the_agent(name):
     agent = build(name)
     state = jax.tree.map(lambda x: x[0], played(agent)[-1][0].learner)
