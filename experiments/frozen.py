@@ -89,7 +89,7 @@ def main(args: FrozenArgs) -> None:
     if args.dry:
         return
     failed = Pool(args, [unit for unit in chosen if unit.state() != "finished"]).work()
-    if any(unit.state() == "finished" for unit in chosen if not _is_prior(unit.name)):
+    if any(every[f"{task}/{DEFAULT}"].state() == "finished" for task in TASKS):  # what others are compared with
         files = tuple(_test_file(task) for task in TASKS)
         print(board(ScoreboardArgs(gaps=files, out=args.out)))
     if failed:
@@ -176,10 +176,6 @@ def _run_unit(
 
 def _prior_name(task: str, preset: str) -> str:
     return f"{task}/prior-{preset}"
-
-
-def _is_prior(name: str) -> bool:
-    return "/prior-" in name
 
 
 def select(every: dict[str, Unit], only: Sequence[str]) -> list[Unit]:

@@ -216,14 +216,20 @@ def test_the_command_ends_with_the_scoreboard_and_names_what_failed(tmp_path, ra
     monkeypatch.setattr(frozen.Pool, "_process", process)
     monkeypatch.setattr(frozen, "pretrain", lambda args: leave_prior(args))
     monkeypatch.setattr(frozen, "board", lambda args: f"board of {args.reference}, {len(args.gaps)} files")
-    words = ["--only", "push/sac", "push/mbpo", "--out", str(tmp_path)]
+    words = ["--only", "push/guarded", "push/mbpo", "--out", str(tmp_path)]
     with pytest.raises(SystemExit) as stopped:
         cli.run_main(frozen.main, frozen.FrozenArgs, "", argv=words)
     told = capsys.readouterr()
     assert stopped.value.code == 2 and told.err == f"error: failed, see {tmp_path / 'frozen'}: push/mbpo\n"
-    assert "board of guarded, 3 files" in told.out and "missing    push/sac\n" in told.out
-    cli.run_main(frozen.main, frozen.FrozenArgs, "", argv=["--only", "push/sac", "--dry", "--out", str(tmp_path)])
-    assert "finished   push/sac\n" in capsys.readouterr().out
+    assert "board of guarded, 3 files" in told.out and "missing    push/guarded\n" in told.out
+    cli.run_main(frozen.main, frozen.FrozenArgs, "", argv=["--only", "push/guarded", "--dry", "--out", str(tmp_path)])
+    assert "finished   push/guarded\n" in capsys.readouterr().out
+
+
+def test_without_the_method_that_others_are_compared_with_there_is_no_scoreboard(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(frozen.Pool, "work", lambda self: [])
+    cli.run_main(frozen.main, frozen.FrozenArgs, "", argv=["--only", "push/sac", "--out", str(tmp_path)])
+    assert "Success in per cent" not in capsys.readouterr().out
 
 
 def leave_prior(args):
