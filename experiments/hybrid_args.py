@@ -24,15 +24,17 @@ class HybridArgs:
     """Several seeds for one or more simulators at once, all in one compiled program."""
 
     task: str = "halfcheetah"
-    """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own. The real
-    system is the task without a gap; it is only evaluated in."""
+    """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
     method: str = DEFAULT
     """A method from the table at the top."""
     gap: tuple[str, ...] = ("gravity",)
     """How the simulator differs from the real system: gaps by name, .toml/.json files, or sim for no gap. Several share
     one program; each has a run folder of its own. Methods without a simulator leave it out."""
     data: Path | None = None
-    """The real data: a D4RL or Minari HDF5 file, or the folder of a Minari data set."""
+    """The real data: a D4RL or Minari HDF5 file, the folder of a Minari data set, or the .txt or .csv log of a
+    wheel-legged robot."""
+    real: str = SIM
+    """The real system to evaluate in: sim for the task as it is, or a gap by name or as a file."""
     seeds: int = 5
     """Number of seeds."""
     out: Path = Path("runs")
@@ -74,7 +76,8 @@ def run_folder(args: HybridArgs, gap: str) -> Path:
     data = NO_DATA if method.kind == "simulator" or args.data is None else data_name(args.data)
     label = "_".join(filter(None, [method.name, args.variant]))
     seeds = seeds_name(seed_list(args.seed, args.seeds))
-    return args.out / "hybrid" / extend.name_of(args.task) / title(gap) / data / label / seeds
+    systems = title(gap) if args.real == SIM else f"{title(gap)}-for-{title(args.real)}"
+    return args.out / "hybrid" / extend.name_of(args.task) / systems / data / label / seeds
 
 
 def data_name(path: Path) -> str:
@@ -96,7 +99,8 @@ def check(args: HybridArgs) -> tuple[HybridMethod, list[int]]:
     if not args.gap:
         raise UserError(f"--gap: name at least one, or {SIM} for no gap")
     without_repeats("--gap", args.gap)
-    check_task(args.task, () if method.kind == "offline" else args.gap)
+    systems = () if method.kind == "offline" else args.gap
+    check_task(args.task, systems if args.real == SIM else (*systems, args.real))
     for folder in folders(args, method):
         check_start(folder, resume=args.resume, overwrite=args.overwrite)
     return method, seeds

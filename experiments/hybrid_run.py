@@ -55,10 +55,20 @@ def run(args: HybridArgs, method: HybridMethod, seeds: list[int]) -> list[dict[s
             own.close()
 
 
+def _read(args: HybridArgs, env: Env) -> logs.Log:
+    """The file, as its ending says."""
+    assert args.data is not None
+    gamma = args.options.gamma
+    if args.data.suffix not in (".txt", ".csv"):
+        return logs.load(args.data, gamma=gamma, successors=args.successors)  # pyright: ignore
+    if not env.name.startswith("wheel-legged") or env.reward is None:
+        raise UserError(f"{args.data}: tables are logs of a wheel-legged robot; {env.name} wants an HDF5 file")
+    return logs.load_table(args.data, gamma=gamma, obs_dim=env.obs_dim, reward=jax.vmap(env.reward))
+
+
 def _load(args: HybridArgs, env: Env) -> logs.Log:
     """The real rows; says what they are, and raises UserError if they are not of this task."""
-    assert args.data is not None
-    log = logs.load(args.data, gamma=args.options.gamma, successors=args.successors)  # pyright: ignore
+    log = _read(args, env)
     facts, sizes = log.facts, (log.rows.obs.shape[1], log.rows.action.shape[1])
     if sizes != (env.obs_dim, env.act_dim):
         raise UserError(
@@ -87,7 +97,7 @@ class _Run:
         self.last_good: Path | None = None
         self.expect = {"kind": "hybrid", "task": env.name, "method": method.name, "seeds": seeds}
         members = jnp.zeros(len(found) * len(seeds), jnp.int32)
-        real = real_worlds(env, [gaps.load(env, SIM)], jax.random.key(0))
+        real = real_worlds(env, [gaps.load(env, args.real)], jax.random.key(0))
         self.system = Simulated(env, real, members, gamma=args.options.gamma)
         self.chunk = args.schedule.rounds_per_chunk * args.schedule.updates_per_round
 
@@ -219,6 +229,7 @@ class _Run:
             "task": self.env.name,
             "method": self.method.name,
             "gap": gap._asdict(),
+            "real": self.args.real,
             "impl": self.env.impl,
             "data": self._facts(),
             "schedule": jsonable(self.args.schedule),

@@ -7,7 +7,7 @@ be is a `UserError` with one line. Arrays are float32 on the host; `replay.full`
 import dataclasses
 import hashlib
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal, NamedTuple, cast, get_args
@@ -20,6 +20,7 @@ from sgft_jax.types import Array, Transition, UserError, unknown
 
 Successors = Literal["stored", "shifted"]
 
+_COLUMNS, _TORQUE = 6, 3.0  # of a table; N m
 _MAIN, _METADATA = "main_data.hdf5", "metadata.json"
 
 
@@ -27,7 +28,7 @@ _MAIN, _METADATA = "main_data.hdf5", "metadata.json"
 class Facts:
     """What a file held, for provenance and for a look before training.
 
-    path: of the HDF5 file. layout: "d4rl" or "minari". size: bytes. sha256: of its bytes, hex.
+    path: of the HDF5 file. layout: "d4rl", "minari" or "table". size: bytes. sha256: of its bytes, hex.
     successors: where next observations come from; "episode" for Minari, whose episodes hold one observation more.
     transitions: rows that are returned; dropped: rows of the file that are not. terminal: returned rows whose discount
         is 0. clipped: returned rows with an action beyond [-1, 1].
@@ -98,6 +99,48 @@ def load(path: Path | str, *, gamma: float, successors: Successors = "stored") -
     facts = _facts(file, recorded, "episode" if minari else successors)
     below = np.append(recorded.keep[1:], False)
     return Log(_transitions(recorded, gamma), facts, (recorded.ends | ~below)[recorded.keep])
+
+
+def load_table(path: Path | str, *, gamma: float, obs_dim: int, reward: Callable[..., Array]) -> Log:
+    """The transitions of a wheel-legged robot's log: text, a row each control period, with these six columns.
+
+    x (m), v (m/s), pitch (rad), pitch velocity (rad/s), torque (N m), done. obs_dim: 4 reads the first four as the
+    observation, 3 leaves x out. reward(obs [N, obs_dim], action [N, 1], next_obs [N, obs_dim]) -> [N], of the task.
+    Rows with a torque beyond +-3 N m are dropped, whatever its sign, and an episode ends before each of them. A row
+    whose successor is done is terminal; rows that are done are dropped. Source: H2O+'s log of the standing robot, whose
+    released loader keeps torques below -3 and joins what lies on both sides of a dropped row.
+    Raises UserError for a file that is missing, has other columns, numbers that are not finite, or no transition.
+    """
+    file = Path(path)
+    table = _table(file)
+    state, torque, done = table[:, 4 - obs_dim : 4], table[:, 4:5], table[:, 5] != 0
+    small = np.abs(torque[:, 0]) <= _TORQUE
+    rows = np.flatnonzero((small & ~done)[:-1] & (small | done)[1:])
+    obs, action, next_obs = state[rows], torque[rows] / _TORQUE, state[rows + 1]
+    terminal, apart = done[rows + 1], np.diff(rows, append=rows[-1:]) > 1
+    paid = np.asarray(reward(obs, action, next_obs))
+    recorded = _Recorded(obs, action, paid, next_obs, terminal, terminal | apart, np.ones(len(rows), bool))
+    _check(file, recorded)
+    facts = dataclasses.replace(_facts(file, recorded, "stored"), layout="table", dropped=len(table) - len(rows))
+    last = recorded.ends.copy()
+    last[-1:] = True
+    return Log(_transitions(recorded, gamma), facts, last)
+
+
+def _table(file: Path) -> np.ndarray:
+    """[N, 6] numbers of a text file."""
+    if not file.is_file():
+        raise UserError(f"{file}: no such file")
+    try:
+        with open(file) as text:
+            delimiter = "," if "," in text.readline() else None
+        table = np.loadtxt(file, dtype=np.float32, ndmin=2, delimiter=delimiter)
+    except (ValueError, UnicodeDecodeError) as error:
+        said = str(error).splitlines()[0]
+        raise UserError(f"{file}: is not a table of numbers ({said}); supply six columns without a head") from error
+    if table.shape[1] != _COLUMNS:
+        raise UserError(f"{file}: has {table.shape[1]} columns, not x, v, pitch, its velocity, torque and done")
+    return table
 
 
 def _file_of(path: Path) -> Path:

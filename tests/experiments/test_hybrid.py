@@ -3,6 +3,7 @@
 import json
 
 import h5py
+import jax
 import numpy as np
 import pytest
 import toy
@@ -129,6 +130,8 @@ def test_data_that_is_missing_or_of_another_task(tmp_path, capsys):
     other = d4rl(tmp_path / "other.hdf5", 3, 2)
     error = complaint(words(tmp_path, other, "--gap", "sim"), capsys)
     assert "other.hdf5: has 3 observations and 2 actions, toy has 4 and 2" in error
+    table = tmp_path / "robot.txt"
+    assert "tables are logs of a wheel-legged robot" in complaint(words(tmp_path, table, "--gap", "sim"), capsys)
     assert not (tmp_path / "out").exists()
 
 
@@ -148,7 +151,24 @@ def test_folders_are_named_after_what_a_method_learns_from(tmp_path):
     assert run_folder(args, "gravity").parts[-5:] == (
         "halfcheetah", "gravity", "halfcheetah_medium-v2", "h2oplus", "seed-0",
     )  # fmt: skip
+    other = hybrid.arguments("h2oplus", data=tmp_path / "log.txt", seeds=1, real="robot", task="wheel-legged")
+    assert run_folder(other, "sim").parts[-5:-1] == ("wheel-legged", "sim-for-robot", "log.txt", "h2oplus")
     assert data_name(tmp_path / "mine-v0/data/main_data.hdf5") == "mine-v0" == data_name(tmp_path / "mine-v0")
+
+
+@pytest.mark.slow
+def test_a_table_of_the_wheel_legged_robot(tmp_path):
+    """The real robot is a gap, the simulator is the nominal one."""
+    draw = np.random.default_rng(0)
+    np.savetxt(tmp_path / "standing.txt", np.column_stack([0.05 * draw.normal(size=(80, 5)), np.zeros(80)]))
+    argv = f"""--task wheel-legged --gap sim --real robot --data {tmp_path}/standing.txt --seeds 1 --no-video
+        --schedule.updates 4 --schedule.simulators 2 --schedule.buffer 64 --schedule.chunk-updates 2 --eval-every 4
+        --eval-episodes 1 --options.hidden 8 --options.rows 8 --options.ratio-rows 8 --out {tmp_path}""".split()
+    with jax.numpy_rank_promotion("allow"):  # MJX promotes ranks
+        hybrid.main(argv)
+    folder = tmp_path / "hybrid/wheel-legged/sim-for-robot/standing.txt/h2oplus/seed-0"
+    summary = json.loads((folder / "summary.json").read_text())
+    assert (summary["real"], summary["data"]["layout"], summary["data"]["transitions"]) == ("robot", "table", 79)
 
 
 def test_returns_on_the_scale_of_d4rl():

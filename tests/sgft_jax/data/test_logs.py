@@ -293,3 +293,63 @@ def test_what_minaris_own_library_writes_can_be_read(tmp_path, monkeypatch):
     np.testing.assert_array_equal(rows.obs[:, 0], [10 * number + step for number in range(3) for step in range(4)])
     np.testing.assert_array_equal(rows.next_obs, rows.obs + 1)
     assert (facts.episodes, facts.terminal) == (3, 1)
+
+
+# --- tables of a wheel-legged robot -----------------------------------------------------------------------------------
+
+# x, v, pitch, pitch velocity, torque, done. Row 2 is too strong, row 3 too, with the other sign; row 7 has fallen.
+TABLE = np.array(
+    [
+        [0.0, 0.1, 0.2, 0.3, 1.5, 0],
+        [1.0, 1.1, 1.2, 1.3, -3.0, 0],
+        [2.0, 2.1, 2.2, 2.3, 3.1, 0],
+        [3.0, 3.1, 3.2, 3.3, -3.1, 0],
+        [4.0, 4.1, 4.2, 4.3, 0.0, 0],
+        [5.0, 5.1, 5.2, 5.3, 0.3, 0],
+        [6.0, 6.1, 6.2, 6.3, 0.6, 0],
+        [7.0, 7.1, 7.2, 7.3, 9.0, 1],
+        [8.0, 8.1, 8.2, 8.3, 0.0, 0],
+        [9.0, 9.1, 9.2, 9.3, 0.0, 0],
+    ]
+)
+
+
+@pytest.mark.parametrize(("ending", "delimiter"), [(".txt", " "), (".csv", ",")])
+def test_tables_drop_strong_torques_of_both_signs_and_split_there(ending, delimiter, tmp_path):
+    path = tmp_path / f"log{ending}"
+    np.savetxt(path, TABLE, delimiter=delimiter)
+    log = logs.load_table(
+        path, gamma=0.9, obs_dim=4, reward=lambda obs, action, next_obs: next_obs[:, 0] + action[:, 0]
+    )
+    # row 1 has no successor that counts, row 7 is over, row 9 is the last
+    np.testing.assert_allclose(log.rows.obs[:, 0], [0, 4, 5, 6, 8])
+    np.testing.assert_allclose(log.rows.next_obs, log.rows.obs + 1, rtol=1e-6)
+    np.testing.assert_allclose(log.rows.action[:, 0], [0.5, 0, 0.1, 0.2, 0], rtol=1e-6)
+    np.testing.assert_allclose(log.rows.reward, [1.5, 5, 6.1, 7.2, 9], rtol=1e-6)
+    np.testing.assert_allclose(log.rows.discount, [0.9, 0.9, 0.9, 0.0, 0.9])
+    assert log.last.tolist() == [True, False, False, True, True]
+    facts = log.facts
+    assert (facts.layout, facts.transitions, facts.dropped, facts.terminal, facts.episodes) == ("table", 5, 5, 1, 3)
+
+
+def test_tables_without_position(tmp_path):
+    np.savetxt(tmp_path / "log.txt", TABLE)
+    log = logs.load_table(tmp_path / "log.txt", gamma=0.9, obs_dim=3, reward=lambda obs, action, next_obs: obs[:, 0])
+    np.testing.assert_allclose(log.rows.obs[0], [0.1, 0.2, 0.3], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x v\n1 2\n", "is not a table of numbers .*; supply six columns without a head"),
+        ("1 2 3\n4 5 6\n", "has 3 columns, not x, v, pitch, its velocity, torque and done"),
+        ("0 0 0 0 9 0\n0 0 0 0 9 0\n", "holds no transitions"),
+        ("0 0 0 nan 1 0\n0 0 0 0 1 0\n", "obs of row 0 is not finite"),
+    ],
+)
+def test_odd_tables_are_refused(text, words, tmp_path):
+    (tmp_path / "log.txt").write_text(text)
+    with pytest.raises(UserError, match=words):
+        logs.load_table(tmp_path / "log.txt", gamma=0.9, obs_dim=4, reward=lambda obs, action, next_obs: obs[:, 0])
+    with pytest.raises(UserError, match="no such file"):
+        logs.load_table(tmp_path / "none.txt", gamma=0.9, obs_dim=4, reward=lambda *step: step[0][:, 0])
