@@ -24,12 +24,14 @@ QUICK = {
     "edac": {"state and action decide"},
     "rebrac": {"reward one step later"},
 }
-SLOW = {"sac, ten critics", "h2o", "darc", "cql", "edac"}  # their weights and masks
-each_learner = pytest.mark.parametrize("name", MAKERS)
+SLOW = {"sac, ten critics", "h2o", "darc", "cql", "edac"}  # made of what the others are made of
 
 
 def slow_if(slow, *values):
     return pytest.param(*values, marks=[pytest.mark.slow] if slow else [])
+
+
+each_learner = pytest.mark.parametrize("name", [slow_if(name in SLOW, name) for name in MAKERS])
 
 
 def trained(name, probe, key, steps):

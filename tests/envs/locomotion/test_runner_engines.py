@@ -10,7 +10,7 @@ import envs
 from envs.mujoco.engines import warp as engine_warp
 
 STEPS = 24
-ENGINES = ["c", "jax", *(["warp"] if engine_warp.available() else [])]
+ENGINES = ["c", pytest.param("jax", marks=pytest.mark.slow), *(["warp"] if engine_warp.available() else [])]
 
 
 @pytest.fixture(scope="module", params=TASKS)

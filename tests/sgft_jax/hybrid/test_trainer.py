@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
-import tuners
 
 from envs import gaps
 from envs.gaps import Gap
@@ -22,6 +21,10 @@ from sgft_jax.types import RealData, UserError
 
 ENV = toy.make()
 SMALL = {"hidden": (16,), "rows": 8}
+QUICK = {"h2oplus", "rebrac"}  # what the fast tests see of the methods
+each_method = pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in NAMES]
+)
 SCHEDULE = Schedule(updates=24, simulators=3, buffer=64, chunk_updates=6)  # 4 chunks of 2 rounds
 
 
@@ -95,7 +98,7 @@ def test_members_do_what_they_would_do_alone():
     chex.assert_trees_all_close(own.learner, plain(alone).learner, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", tuners.slow_but({"h2oplus", "rebrac"}, NAMES))
+@each_method
 def test_a_resumed_run_ends_like_an_uninterrupted_one(name):
     agent = build(name)
     whole = played(agent)
@@ -193,7 +196,7 @@ def test_iql_scales_rewards_to_the_span_of_the_returns():
     np.testing.assert_allclose(iql.return_span(jax.tree.map(jnp.asarray, cut)), np.ptp(returns), rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", tuners.slow_but({"h2oplus", "rebrac"}, NAMES))
+@each_method
 def test_an_exported_policy_acts_as_the_agent(name):
     agent = build(name)
     state = jax.tree.map(lambda x: x[0], played(agent)[-1][0].learner)
