@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import ActorCriticOptions, sac_agent, sac_numbers
+from sgft_jax.hybrid.methods.options import ActorCriticOptions, agent_of_rows, sac_numbers
 from sgft_jax.types import HybridAgent, HybridMethod, Task
 
 
@@ -23,7 +23,7 @@ class Config(ActorCriticOptions):
 
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
-    from sgft_jax.learners import darc
+    from sgft_jax.learners import actor, darc
     from sgft_jax.models.config import NetworkConfig
 
     structure = darc.DARCConfig(
@@ -31,7 +31,8 @@ def build(config: Config, task: Task) -> HybridAgent:
     )
     learner = darc.make_darc(structure, sac_numbers(config), lr_ratio=config.lr)
     batches = darc.batches(config.rows, config.ratio_rows)
-    return sac_agent(learner, config, task, batches, simulates=True, sac_of=lambda state: state.sac)
+    export = lambda state: actor.exported(state.sac)  # noqa: E731
+    return agent_of_rows(learner, config, task, batches, simulates=True, export=export)
 
 
 METHOD = HybridMethod(

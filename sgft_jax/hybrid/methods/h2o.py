@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import ActorCriticOptions
+from sgft_jax.hybrid.methods.options import ActorCriticOptions, agent_of_rows
 from sgft_jax.types import HybridAgent, HybridMethod, Task
 
 if TYPE_CHECKING:
@@ -36,27 +36,21 @@ class Config(ActorCriticOptions):
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
     from sgft_jax.data import replay, sources
-    from sgft_jax.learners import actor, h2o
+    from sgft_jax.learners import h2o
     from sgft_jax.models.config import NetworkConfig
 
-    network = NetworkConfig(config.hidden)
-    structure = h2o.H2OConfig(task.obs_dim, task.act_dim, network, ratio_rows=2 * config.ratio_rows)
+    structure = h2o.H2OConfig(
+        task.obs_dim, task.act_dim, NetworkConfig(config.hidden), ratio_rows=2 * config.ratio_rows
+    )
     rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_alpha", "lr_ratio"), config.lr)
     numbers = {name: getattr(config, name) for name in ("tau", "conservatism", "spread_scale")}
 
     def prepare(state: "H2OState", real: "RealData") -> "H2OState":
         return state.replace(spread=replay.obs_std(replay.full(real.rows)))
 
-    return HybridAgent(
-        learner=h2o.make_h2o(structure, h2o.H2OHyper(**rates, **numbers)),
-        keep=lambda real: replay.full(real.rows),
-        batches=sources.beside(*(sources.two_buffers(n, n) for n in (config.rows, config.ratio_rows))),
-        simulates=True,
-        prepare=prepare,
-        export=actor.exported,
-        policy=actor.actor_policy(task.obs_dim, task.act_dim, network, "affine"),
-        card=actor.card(network, "affine", config.gamma),
-    )
+    learner = h2o.make_h2o(structure, h2o.H2OHyper(**rates, **numbers))
+    batches = sources.beside(*(sources.two_buffers(n, n) for n in (config.rows, config.ratio_rows)))
+    return agent_of_rows(learner, config, task, batches, simulates=True, head="affine", prepare=prepare)
 
 
 _PAPER = Config()

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import ActorCriticOptions
+from sgft_jax.hybrid.methods.options import ActorCriticOptions, agent_of_rows
 from sgft_jax.types import HybridAgent, HybridMethod, Task, ValueLoss
 
 if TYPE_CHECKING:
@@ -42,14 +42,13 @@ class Config(ActorCriticOptions):
 
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
-    from sgft_jax.data import replay, sources
-    from sgft_jax.learners import actor, h2oplus
+    from sgft_jax.data import sources
+    from sgft_jax.learners import h2oplus
     from sgft_jax.models import normalizer
     from sgft_jax.models.config import NetworkConfig
 
-    network = NetworkConfig(config.hidden)
     structure = h2oplus.H2OPlusConfig(
-        task.obs_dim, task.act_dim, network, value_loss=config.value_loss, ratio=config.ratio,
+        task.obs_dim, task.act_dim, NetworkConfig(config.hidden), value_loss=config.value_loss, ratio=config.ratio,
         ratio_rows=2 * config.ratio_rows,
     )  # fmt: skip
     rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_value", "lr_alpha", "lr_ratio"), config.lr)
@@ -60,16 +59,9 @@ def build(config: Config, task: Task) -> HybridAgent:
             return state
         return state.replace(ratio=state.ratio._replace(normalizer=normalizer.of(real.rows.obs)))
 
-    return HybridAgent(
-        learner=h2oplus.make_h2oplus(structure, h2oplus.H2OPlusHyper(**rates, **numbers)),
-        keep=lambda real: replay.full(real.rows),
-        batches=sources.beside(*(sources.two_buffers(n, n) for n in (config.rows, config.ratio_rows))),
-        simulates=True,
-        prepare=prepare,
-        export=actor.exported,
-        policy=actor.actor_policy(task.obs_dim, task.act_dim, network, "affine"),
-        card=actor.card(network, "affine", config.gamma),
-    )
+    learner = h2oplus.make_h2oplus(structure, h2oplus.H2OPlusHyper(**rates, **numbers))
+    batches = sources.beside(*(sources.two_buffers(n, n) for n in (config.rows, config.ratio_rows)))
+    return agent_of_rows(learner, config, task, batches, simulates=True, head="affine", prepare=prepare)
 
 
 _PAPER = Config()

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import OfflineOptions
+from sgft_jax.hybrid.methods.options import OfflineOptions, agent_of_rows
 from sgft_jax.types import HybridAgent, HybridMethod, Task
 
 if TYPE_CHECKING:
@@ -33,11 +33,10 @@ class Config(OfflineOptions):
 
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
-    from sgft_jax.data import replay, sources
+    from sgft_jax.data import sources
     from sgft_jax.learners import actor, iql
     from sgft_jax.models.config import NetworkConfig
 
-    network = NetworkConfig(config.hidden)
     rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_value"), config.lr)
     numbers = {name: getattr(config, name) for name in ("tau", "expectile", "beta")}
 
@@ -48,16 +47,10 @@ def build(config: Config, task: Task) -> HybridAgent:
     def export(state: "IQLState") -> actor.ACTORParams:
         return actor.ACTORParams(iql.as_tanh_gaussian(state.actor.params), actor.exported(state).normalizer)
 
-    return HybridAgent(
-        learner=iql.make_iql(iql.IQLConfig(task.obs_dim, task.act_dim, network), iql.IQLHyper(**rates, **numbers)),
-        keep=lambda real: replay.full(real.rows),
-        batches=sources.real_rows(config.rows),
-        simulates=False,
-        prepare=prepare,
-        export=export,
-        policy=actor.actor_policy(task.obs_dim, task.act_dim, network, "gaussian"),
-        card=actor.card(network, "gaussian", config.gamma),
-    )
+    structure = iql.IQLConfig(task.obs_dim, task.act_dim, NetworkConfig(config.hidden))
+    learner = iql.make_iql(structure, iql.IQLHyper(**rates, **numbers))
+    batches = sources.real_rows(config.rows)
+    return agent_of_rows(learner, config, task, batches, simulates=False, prepare=prepare, export=export)
 
 
 def return_span(real: "RealData") -> "Array":

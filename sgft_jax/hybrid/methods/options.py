@@ -2,12 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sgft_jax import checks
-from sgft_jax.types import HybridAgent, Learner, PyTree, Source, Task
+from sgft_jax.types import HybridAgent, Learner, PyTree, RealData, Source, Task
 
 if TYPE_CHECKING:
+    from sgft_jax.learners.actor import Head
     from sgft_jax.learners.sac import SACHyper
 
 
@@ -50,16 +51,22 @@ def sac_numbers(config: ActorCriticOptions) -> "SACHyper":
     return SACHyper(lr_actor=config.lr, lr_critic=config.lr, lr_alpha=config.lr, tau=config.tau)
 
 
-def sac_agent(
+def agent_of_rows(
     learner: Learner,
     config: ActorCriticOptions,
     task: Task,
     batches: Source,
     *,
     simulates: bool,
-    sac_of: Callable[[PyTree], Any] = lambda state: state,
+    head: "Head" = "gaussian",
+    prepare: Callable[[PyTree, RealData], PyTree] = lambda state, real: state,
+    export: Callable[[PyTree], PyTree] | None = None,
 ) -> HybridAgent:
-    """The agent of a learner that is made of SAC. sac_of(state) -> its `SACState`."""
+    """The agent of a learner whose batches are single rows.
+
+    head: of its actor, see `learners.actor.actor_policy`. prepare, export: see `HybridAgent`; by default nothing, and
+    the actor and statistics of the learner's state.
+    """
     from sgft_jax.data import replay
     from sgft_jax.learners import actor
     from sgft_jax.models.config import NetworkConfig
@@ -70,8 +77,8 @@ def sac_agent(
         keep=lambda real: replay.full(real.rows),
         batches=batches,
         simulates=simulates,
-        prepare=lambda state, real: state,
-        export=lambda state: actor.exported(sac_of(state)),
-        policy=actor.actor_policy(task.obs_dim, task.act_dim, network, "gaussian"),
-        card=actor.card(network, "gaussian", config.gamma),
+        prepare=prepare,
+        export=export or actor.exported,
+        policy=actor.actor_policy(task.obs_dim, task.act_dim, network, head),
+        card=actor.card(network, head, config.gamma),
     )
