@@ -18,7 +18,7 @@ from envs.rollout import Episode
 from experiments.collect import CollectArgs, name_of, targets
 from experiments.options import seed_list
 from experiments.stacking import member
-from sgft_jax.data import logs, replay
+from sgft_jax.data import logs
 from sgft_jax.data.recording import Recorded, cut, of_episodes, of_fleet, write_d4rl, write_minari
 from sgft_jax.hybrid import trainer
 from sgft_jax.hybrid.methods import get_method
@@ -29,7 +29,7 @@ from sgft_jax.io.progress import RunProgress
 from sgft_jax.policies import make_policy
 from sgft_jax.pretraining import seed_keys
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.types import HybridAgent, Policy, PyTree, RealData, Transition, UserError
+from sgft_jax.types import HybridAgent, Policy, PyTree, Transition, UserError
 
 _TRAINING, _LEVEL, _RECORDING = 21, 22, 23  # purposes, folded into a seed's key
 _AT_ONCE = 50  # episodes of one recording call
@@ -42,8 +42,9 @@ def teach(args: CollectArgs, level: float) -> list[dict[str, Any]]:
     agent, schedule = method.build(method.config, env), _schedule(args)
     seeds = seed_list(args.seed, args.seeds)
     pools = jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), system.pools)
-    nothing = RealData(jax.tree.map(lambda x: x[None], replay.blank(env.obs_dim, env.act_dim)), jnp.ones(1, bool))
-    steps = trainer.train(env, agent, schedule, pools, nothing, seed_keys(seeds, _TRAINING), gamma=method.config.gamma)
+    steps = trainer.train(
+        env, agent, schedule, pools, trainer.no_data(env), seed_keys(seeds, _TRAINING), gamma=method.config.gamma
+    )
     reached: dict[int, tuple[PyTree, Transition]] = {}
     with RunProgress(f"SAC on {env.name}", total=schedule.chunks * args.eval_every, unit="updates") as progress:
         for state, metrics in steps:

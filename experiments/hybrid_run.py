@@ -20,7 +20,7 @@ from experiments.evaluation import play, scores
 from experiments.hybrid_args import NO_SIMULATOR, VOLATILE, HybridArgs, gaps_of, run_folder
 from experiments.stacking import join, member, part
 from experiments.video import film
-from sgft_jax.data import logs, replay
+from sgft_jax.data import logs
 from sgft_jax.hybrid import trainer
 from sgft_jax.hybrid.scores import normalised
 from sgft_jax.hybrid.trainer import HybridState
@@ -117,11 +117,10 @@ class _Run:
         return jax.tree.map(lambda x: jnp.repeat(x, len(self.seeds), axis=0), pools)
 
     def _real(self) -> RealData:
-        """The real data; a single row of zeros where the method asks for none."""
-        if self.data is not None:
-            return RealData(self.data.rows, jnp.asarray(self.data.last))
-        blank = replay.blank(self.env.obs_dim, self.env.act_dim)
-        return RealData(jax.tree.map(lambda x: x[None], blank), jnp.ones(1, bool))
+        """The real data, or what stands for it."""
+        if self.data is None:
+            return trainer.no_data(self.env)
+        return RealData(self.data.rows, jnp.asarray(self.data.last))
 
     def _keys(self) -> Any:
         """[M]: a seed gives the same draws whichever simulators share the program."""

@@ -84,6 +84,11 @@ def shape_of(env: Env, agent: HybridAgent, schedule: Schedule, pools: World, rea
     return jax.eval_shape(init, pools, real, keys)
 
 
+def no_data(env: Env) -> RealData:
+    """What stands for the real data where a method asks for none: one row of zeros."""
+    return RealData(jax.tree.map(lambda x: x[None], replay.blank(env.obs_dim, env.act_dim)), jnp.ones(1, bool))
+
+
 def chunks_done(state: HybridState, schedule: Schedule) -> int:
     """Chunks behind a state."""
     return int(jax.device_get(state.rounds)[0]) // schedule.rounds_per_chunk
