@@ -6,6 +6,7 @@ a flat table `rows`.
 
 import csv
 import json
+import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -26,6 +27,7 @@ SCORES = ("success", "return")
 IDENTITY = ("task", "gap", "method", "variant", "priors")
 COLUMNS = (*IDENTITY, "prior", "seed", "rollouts", "transitions", "minutes", *SCORES, "training")
 # Of a run's options those that are in other columns, or say nothing about its outcome; paths of a machine above all.
+_UNNAMED = re.compile(r"prior|seeds?-\d+(-\d+)?")  # folders that name no set of priors
 _LEFT_OUT = (
     "out", "prior", "resume", "overwrite", "video", "devices", "checkpoint_every", "task", "method", "variant", "real",
     "impl",
@@ -263,7 +265,7 @@ def read_curve(folder: Path) -> Curve:
         gap=folder.parent.parent.name,
         method=folder.parent.name.removesuffix(f"_{variant}"),
         variant=variant,
-        priors=set_name(Path(config.get("prior") or config.get("preset") or "").name, digests),
+        priors=set_name(Path(config.get("prior") or config.get("preset") or ""), digests),
         seeds=seeds,
         prior=seeds % len(digests) if digests else np.full(len(seeds), -1),
         rollouts=column("rollouts"),
@@ -335,9 +337,13 @@ def read_runs(out: Path) -> Found:
     return Found([curve for curve, _ in runs.values()], notes)
 
 
-def set_name(name: str, digests: Sequence[str]) -> str:
-    """Names a set of priors: its folder and, where known, what tells it from another set trained into that folder."""
-    return "-".join(filter(None, [name, *(digest[:6] for digest in digests[:1])]))
+def set_name(folder: Path, digests: Sequence[str]) -> str:
+    """Names a set of priors: its folder and, where known, what tells it from another set trained into that folder.
+
+    A pretraining run lives in <preset>/<seeds>/prior: there the preset is the name.
+    """
+    parts = [part for part in folder.parts if not _UNNAMED.fullmatch(part)]
+    return "-".join([*parts[-1:], *(digest[:6] for digest in digests[:1])])
 
 
 def last_start(folder: Path) -> dict[str, Any]:

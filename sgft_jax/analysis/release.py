@@ -87,7 +87,7 @@ def _priors(folder: Path) -> Iterable[dict[str, Any]]:
 
 def _set_of(folder: Path) -> dict[str, str]:
     digests = [one.get("digest", "") for one in read_json(folder / SUMMARY)["seeds"]]
-    return {"task": folder.parent.parent.name, "priors": curves.set_name(folder.parent.name, digests)}
+    return {"task": folder.parent.parent.name, "priors": curves.set_name(folder, digests)}
 
 
 def _merge(path: Path, new: Sequence[Mapping[str, Any]], key: Sequence[str]) -> Path | None:

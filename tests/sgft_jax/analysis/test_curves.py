@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from sgft_jax.analysis.curves import (
     read_curve,
     read_runs,
     rows,
+    set_name,
     spread,
     training_score,
     transitions_until_held,
@@ -139,6 +141,17 @@ def test_only_methods_from_the_same_priors_are_comparable():
     sets = by_priors(curves)
     assert next(iter(sets)) == "fast-2" and [c.name for c in sets["fast"]] == ["mbpo", "sac tuned"]
     assert {c.method: c.family for c in curves}["tdmpc2"] == "planning" and curves[-1].family == "own"
+
+
+@pytest.mark.parametrize(
+    "folder", ["fast", "runs/pretrain/push/fast/seeds-0-11", "x/fast/seed-3/prior", "fast/prior/seed-2"]
+)
+def test_a_set_of_priors_is_named_like_its_preset(folder):
+    assert set_name(Path(folder), ["aaaaaaaaaaaa", "bbbbbbbbbbbb"]) == "fast-aaaaaa"
+
+
+def test_a_set_of_priors_without_a_folder_or_a_digest():
+    assert set_name(Path("docs/priors/push"), []) == "push" and set_name(Path(), ["aaaaaaaaaaaa"]) == "aaaaaa"
 
 
 def test_a_run_folder(tmp_path):
