@@ -186,7 +186,8 @@ class Env(NamedTuple):
         the ranges given there.
     cartesian: the first two action entries are x and y of one frame.
     check(theta by name) -> what is impossible about it in one sentence, or None: relations between parameters.
-    trace(physics) -> [k] what a renderer needs of a state; [0] where nothing can be drawn.
+    trace(physics) -> [k] what a renderer needs of a state; [0] where nothing can be drawn. Commands that record put
+        another function in its place, which may return a pytree.
     previous_actions: how many of the last actions the observation ends with, see `envs.history`.
     system: what the observation then tells of the system that the episode takes place in, see `envs.system`.
     simulator() -> (obs, action) -> [measured_dim] what a step changes in the system that `obs` tells. None where it
@@ -213,7 +214,7 @@ class Env(NamedTuple):
     actuators: Mapping[str, Value] = NOTHING
     cartesian: bool = False
     check: Callable[[dict[str, float]], str | None] = lambda theta: None
-    trace: Callable[[PyTree], Array] = no_trace
+    trace: Callable[[PyTree], PyTree] = no_trace
     previous_actions: int = 0
     system: tuple[Varying, ...] = ()
     simulator: Callable[[], Callable[[Array, Array], Array]] | None = None

@@ -44,7 +44,7 @@ class Episode(NamedTuple):
     exploded: Array
     score: Array
     world: Array
-    trace: Array
+    trace: PyTree
 
 
 def pick(pool: World, index: Array | tuple[Array, Array]) -> World:
@@ -145,7 +145,7 @@ def play_episode(
         exploded=failed,
         score=succeeded.astype(jnp.float32) if env.score == "success" else total,
         world=index,
-        trace=jnp.concatenate([env.trace(start.physics)[None], trace]),
+        trace=jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), env.trace(start.physics), trace),
     )
 
 

@@ -1,6 +1,7 @@
 """Impure: learning in a real system until a level is reached, and recording. `experiments.collect` is its command."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,14 +13,14 @@ import numpy as np
 
 import envs
 from envs import gaps
-from envs.base import Env
+from envs.base import Env, EnvState
 from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
 from experiments.collect import CollectArgs, name_of, targets
 from experiments.options import seed_list
 from experiments.stacking import member
 from sgft_jax.data import logs
-from sgft_jax.data.recording import Recorded, cut, of_episodes, of_fleet, write_d4rl, write_minari
+from sgft_jax.data.recording import Joints, Noted, Recorded, cut, of_episodes, of_fleet, write_d4rl, write_minari
 from sgft_jax.hybrid import trainer
 from sgft_jax.hybrid.methods import get_method
 from sgft_jax.hybrid.schedule import Schedule
@@ -29,7 +30,7 @@ from sgft_jax.io.progress import RunProgress
 from sgft_jax.policies import make_policy
 from sgft_jax.pretraining import seed_keys
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.types import HybridAgent, Policy, PyTree, Transition, UserError
+from sgft_jax.types import Array, HybridAgent, Policy, PyTree, Transition, UserError
 
 _TRAINING, _LEVEL, _RECORDING = 21, 22, 23  # purposes, folded into a seed's key
 _AT_ONCE = 50  # episodes of one recording call
@@ -43,9 +44,10 @@ def teach(args: CollectArgs, level: float) -> list[dict[str, Any]]:
     seeds = seed_list(args.seed, args.seeds)
     pools = jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), system.pools)
     steps = trainer.train(
-        env, agent, schedule, pools, trainer.no_data(env), seed_keys(seeds, _TRAINING), gamma=method.config.gamma
-    )
-    reached: dict[int, tuple[PyTree, Transition]] = {}
+        env, agent, schedule, pools, trainer.no_data(env), seed_keys(seeds, _TRAINING), gamma=method.config.gamma,
+        note=functools.partial(_note, agent),
+    )  # fmt: skip
+    reached: dict[int, tuple[PyTree, Transition, Noted]] = {}
     with RunProgress(f"SAC on {env.name}", total=schedule.chunks * args.eval_every, unit="updates") as progress:
         for state, metrics in steps:
             if not metrics:
@@ -61,8 +63,8 @@ def teach(args: CollectArgs, level: float) -> list[dict[str, Any]]:
     if not reached:
         raise UserError(f"--level {level:g}: no seed reached it; raise --updates or lower it")
     found = []
-    for i, (params, rows) in sorted(reached.items()):
-        old = of_fleet(rows, args.environments)
+    for i, (params, rows, noted) in sorted(reached.items()):
+        old = of_fleet(rows, args.environments, noted)
         new = _play(args, env, system, agent.policy, params, seeds[i])
         for kind, episodes in (("medium-replay", old), ("medium", new)):
             found.append(_write(args, args.out / f"{name_of(args, kind, seeds[i])}.hdf5", episodes))
@@ -80,9 +82,9 @@ def record(args: CollectArgs) -> list[dict[str, Any]]:
 
 
 def _system(args: CollectArgs, env: Env, members: int, gamma: float) -> tuple[Env, Simulated]:
-    """The real system, and how it is played."""
+    """The real system, and how it is played: its traces are `Joints`."""
     gap = gaps.load(env, args.real)
-    env = real_env(env, [gap])
+    env = real_env(env, [gap])._replace(trace=_joints)
     pools = real_worlds(env, [gap], jax.random.key(0))
     return env, Simulated(env, pools, jnp.zeros(members, jnp.int32), gamma=gamma)
 
@@ -106,11 +108,36 @@ def _episodes(system: Simulated, policy: Policy, params: PyTree, key: Any, n: in
     return system.play(policy, params, keys, explore=True)
 
 
-def _snapshot(agent: HybridAgent, state: HybridState, i: int) -> tuple[PyTree, Transition]:
+def _joints(physics: Any) -> Joints | None:
+    """Those of a state, None where the task's physics has none."""
+    while type(physics) is tuple:  # an observation with more entries keeps its memory beside it
+        physics = physics[0]
+    return Joints(physics.qpos, physics.qvel) if hasattr(physics, "qpos") and hasattr(physics, "qvel") else None
+
+
+def _note(agent: HybridAgent, state: PyTree, before: EnvState, action: Array, after: EnvState) -> Noted:
+    """What is kept of a step of learning."""
+    density = agent.policy.log_prob
+    log_prob = None if density is None else density(agent.export(state), before.obs, action)
+    return Noted(_joints(before.physics), _joints(after.physics), log_prob)
+
+
+def _noted(policy: Policy, params: PyTree, played: Episode) -> Noted:
+    """The same of the steps of episodes [n] of one policy."""
+    rows, log_prob = played.transitions, None
+    if policy.log_prob is not None:
+        each = jax.vmap(jax.vmap(policy.log_prob, (None, 0, 0)), (None, 0, 0))
+        log_prob = jax.jit(each)(params, rows.obs, rows.action)
+    before, after = (jax.tree.map(lambda x, own=own: x[:, own], played.trace) for own in (slice(-1), slice(1, None)))
+    return Noted(before, after, log_prob)
+
+
+def _snapshot(agent: HybridAgent, state: HybridState, i: int) -> tuple[PyTree, Transition, Noted]:
     """The policy of a seed and all that it has experienced, on the host."""
     held = int(state.simulated.size[i])
-    rows = jax.tree.map(lambda x: np.asarray(x[i, :held]), state.simulated.data)
-    return jax.tree.map(np.asarray, agent.export(member(state.learner, i))), rows
+    kept = state.simulated.data, state.notes.data
+    rows, noted = jax.tree.map(lambda x: np.asarray(x[i, :held]), kept)
+    return jax.tree.map(np.asarray, agent.export(member(state.learner, i))), rows, noted
 
 
 def _play(args: CollectArgs, env: Env, system: Simulated, policy: Policy, params: PyTree, seed: int) -> list[Recorded]:
@@ -121,8 +148,8 @@ def _play(args: CollectArgs, env: Env, system: Simulated, policy: Policy, params
     at_once = min(_AT_ONCE, math.ceil(args.transitions / env.episode_length))
     while held < args.transitions:
         key, key_now = jax.random.split(key)
-        played = jax.tree.map(lambda x: np.asarray(x[0]), _episodes(alone, policy, params, key_now, at_once))
-        new = of_episodes(played)
+        played = member(_episodes(alone, policy, params, key_now, at_once), 0)
+        new = of_episodes(played, _noted(policy, member(params, 0), played))
         found, held = found + new, held + sum(len(own.reward) for own in new)
         if not new:
             raise UserError(f"{env.name}: physics exploded in the first step of {at_once} episodes; nothing to record")

@@ -232,12 +232,14 @@ class Policy(NamedTuple):
     value(params, obs) -> []: V_sim, deterministic; None where an observation does not decide the value.
     model_error(params, obs [T + 1, obs_dim], actions [T, act_dim]) -> [T]: how far its model drifts from a trajectory,
         in standard deviations of the observation; None where the model does not predict observations.
+    log_prob(params, obs, action) -> []: log density of an exploring action; None where it has none, or nobody wrote it.
     """
 
     init_carry: Callable[[], PyTree]
     act: Callable[..., tuple[Array, PyTree]]
     value: Callable[[PyTree, Array], Array] | None = None
     model_error: Callable[[PyTree, Array, Array], Array] | None = None
+    log_prob: Callable[[PyTree, Array, Array], Array] | None = None
 
 
 class Simulation(NamedTuple):

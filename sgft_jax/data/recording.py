@@ -4,9 +4,10 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import h5py
+import jax
 import numpy as np
 
 from envs.rollout import Episode
@@ -16,17 +17,38 @@ from sgft_jax.types import Transition, UserError
 _SAME = 1e-4  # relative; compilers may round the two copies of an observation differently
 
 
+class Joints(NamedTuple):
+    """qpos: [..., nq] positions, qvel: [..., nv] speeds, in SI units and the order of the model."""
+
+    qpos: Any
+    qvel: Any
+
+
+class Noted(NamedTuple):
+    """What a recording keeps of a step beside its transition.
+
+    before, after: `Joints` of the two states, None of a task without joints. log_prob: [] log density of the action
+    under the policy that drew it, None of a policy without one.
+    """
+
+    before: Any
+    after: Any
+    log_prob: Any
+
+
 class Recorded(NamedTuple):
     """One episode of T steps on the host, float32.
 
     obs: [T + 1, obs_dim]. action: [T, act_dim]. reward: [T]. terminated: whether the task ended it; else time did, or
-    the recording.
+    the recording. joints: [T + 1, ...], log_prob: [T], see `Noted`.
     """
 
     obs: np.ndarray
     action: np.ndarray
     reward: np.ndarray
     terminated: bool
+    joints: Joints | None = None
+    log_prob: np.ndarray | None = None
 
 
 class _Rows(NamedTuple):
@@ -39,14 +61,19 @@ class _Rows(NamedTuple):
     next_obs: np.ndarray
 
 
-def of_fleet(rows: Transition, environments: int) -> list[Recorded]:
+def of_fleet(rows: Transition, environments: int, noted: Noted | None = None) -> list[Recorded]:
     """The episodes of environments that were stepped together, in the order in which they ended.
 
     rows: [N, ...] as a replay that has not overwritten anything keeps them: row t * environments + i is step t of
-    environment i. A step whose successor is not the next observation was the last of its episode.
+    environment i. A step whose successor is not the next observation was the last of its episode. noted: [N, ...], of
+    these rows.
     """
     steps = len(rows.reward) // environments
-    shaped = _Rows(*(np.asarray(x)[: steps * environments].reshape(steps, environments, *x.shape[1:]) for x in rows))
+    both = jax.tree.map(
+        lambda x: np.asarray(x)[: steps * environments].reshape(steps, environments, *x.shape[1:]),
+        (_Rows(*rows), noted),
+    )
+    shaped = both[0]
     jump = np.abs(shaped.next_obs[:-1] - shaped.obs[1:]) > _SAME * (1 + np.abs(shaped.obs[1:]))
     ended = np.ones((steps, environments), bool)
     ended[:-1] = (shaped.discount[:-1] == 0) | jump.any(axis=2)
@@ -54,22 +81,27 @@ def of_fleet(rows: Transition, environments: int) -> list[Recorded]:
     for i in range(environments):
         ends = np.flatnonzero(ended[:, i])
         for start, end in zip(np.concatenate([[0], ends[:-1] + 1]), ends, strict=True):
-            found.append((end, i, _Rows(*(x[start : end + 1, i] for x in shaped))))
-    return [_recorded(own) for _, _, own in sorted(found, key=lambda each: each[:2])]
+            found.append((end, i, jax.tree.map(lambda x, own=slice(start, end + 1), i=i: x[own, i], both)))
+    return [_recorded(*own) for _, _, own in sorted(found, key=lambda each: each[:2])]
 
 
-def of_episodes(played: Episode) -> list[Recorded]:
-    """Episodes [n] as `System.play` returns them, without the rows after their ends."""
-    rows, valid = played.transitions, np.asarray(played.valid)
-    found = (_Rows(*(np.asarray(x)[i][valid[i]] for x in rows)) for i in range(len(valid)))
-    return [_recorded(own) for own in found if len(own.reward)]
+def of_episodes(played: Episode, noted: Noted | None = None) -> list[Recorded]:
+    """Episodes [n] as `System.play` returns them, without the rows after their ends. noted: [n, T, ...], of their rows."""
+    both = jax.tree.map(np.asarray, (_Rows(*played.transitions), noted))
+    valid = np.asarray(played.valid)
+    found = (jax.tree.map(lambda x, i=i: x[i][valid[i]], both) for i in range(len(valid)))
+    return [_recorded(*own) for own in found if len(own[0].reward)]
 
 
-def _recorded(rows: _Rows) -> Recorded:
+def _recorded(rows: _Rows, noted: Noted | None) -> Recorded:
     """The episode of its rows [T]."""
-    obs = np.concatenate([rows.obs, rows.next_obs[-1:]]).astype(np.float32)
-    terminated = bool(rows.discount[-1] == 0)
-    return Recorded(obs, np.asarray(rows.action, np.float32), np.asarray(rows.reward, np.float32), terminated)
+    chained = lambda first, then: np.concatenate([first, then[-1:]]).astype(np.float32)  # noqa: E731
+    joints = None if noted is None else jax.tree.map(chained, noted.before, noted.after)
+    log_prob = None if noted is None or noted.log_prob is None else np.asarray(noted.log_prob, np.float32)
+    return Recorded(
+        chained(rows.obs, rows.next_obs), np.asarray(rows.action, np.float32), np.asarray(rows.reward, np.float32),
+        terminated=bool(rows.discount[-1] == 0), joints=joints, log_prob=log_prob,
+    )  # fmt: skip
 
 
 def cut(episodes: Sequence[Recorded], transitions: int) -> list[Recorded]:
@@ -77,12 +109,20 @@ def cut(episodes: Sequence[Recorded], transitions: int) -> list[Recorded]:
     found, left = [], transitions
     for own in episodes:
         n = min(len(own.reward), left)
-        whole = n == len(own.reward)
-        found.append(Recorded(own.obs[: n + 1], own.action[:n], own.reward[:n], own.terminated and whole))
+        found.append(_first(own, n))
         left -= n
         if not left:
             return found
     raise UserError(f"{transitions - left:,} transitions were recorded, {transitions:,} are wanted")
+
+
+def _first(own: Recorded, n: int) -> Recorded:
+    """The first n steps of an episode."""
+    return Recorded(
+        own.obs[: n + 1], own.action[:n], own.reward[:n], own.terminated and n == len(own.reward),
+        joints=jax.tree.map(lambda x: x[: n + 1], own.joints),
+        log_prob=None if own.log_prob is None else own.log_prob[:n],
+    )  # fmt: skip
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -112,7 +152,16 @@ def _flat(own: Recorded) -> dict[str, np.ndarray]:
         "rewards": own.reward,
         "terminals": last & own.terminated,
         "timeouts": last & (not own.terminated),
+        **{name: x[:-1] for name, x in _infos(own).items()},
     }
+
+
+def _infos(own: Recorded) -> dict[str, np.ndarray]:
+    """The arrays [T + 1, ...] of one episode under D4RL's names; no action follows the last row: there it is nan."""
+    found = {} if own.joints is None else {"infos/qpos": own.joints.qpos, "infos/qvel": own.joints.qvel}
+    if own.log_prob is not None:
+        found["infos/action_log_probs"] = np.append(own.log_prob, np.float32(np.nan))
+    return found
 
 
 def write_minari(folder: Path, episodes: Sequence[Recorded], about: Mapping[str, str]) -> None:
@@ -129,7 +178,7 @@ def write_minari(folder: Path, episodes: Sequence[Recorded], about: Mapping[str,
             group.attrs.update(id=number, total_steps=len(own.reward))
             flat = _flat(own)
             arrays = {"observations": own.obs, "actions": own.action, "rewards": own.reward}
-            arrays |= {"terminations": flat["terminals"], "truncations": flat["timeouts"]}
+            arrays |= {"terminations": flat["terminals"], "truncations": flat["timeouts"], **_infos(own)}
             for name, values in arrays.items():
                 group.create_dataset(name, data=values, compression="gzip")
     obs, action = episodes[0].obs.shape[1], episodes[0].action.shape[1]

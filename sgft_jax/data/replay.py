@@ -1,18 +1,21 @@
 """A ring buffer on the device. Pure functions of a state that the caller donates; one buffer, vmapped over seeds."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from sgft_jax.mesh import running_count, set_rows
-from sgft_jax.types import Array, Batch, Key, Transition, UserError
+from sgft_jax.types import Array, Batch, Key, PyTree, Transition, UserError
 
 
 class ReplayState(NamedTuple):
-    """data: rows on a leading [capacity] axis; position: [] int32 next row to write; size: [] int32 rows held."""
+    """data: rows on a leading [capacity] axis, transitions or what is kept beside them.
 
-    data: Transition
+    position: [] int32 next row to write; size: [] int32 rows held.
+    """
+
+    data: Any
     position: Array
     size: Array
 
@@ -23,8 +26,8 @@ def blank(obs_dim: int, act_dim: int) -> Transition:
     return Transition(obs, jnp.zeros(act_dim), zero, zero, obs)
 
 
-def init(example: Transition, capacity: int) -> ReplayState:
-    """An empty buffer for transitions shaped like `example` (one transition, no batch axis)."""
+def init(example: PyTree, capacity: int) -> ReplayState:
+    """An empty buffer for rows shaped like `example` (one row, no batch axis)."""
     if capacity < 1:
         raise UserError(f"replay capacity {capacity}: must be at least 1")
     data = jax.tree.map(lambda x: jnp.zeros((capacity, *jnp.shape(x)), jnp.asarray(x).dtype), example)
@@ -39,12 +42,12 @@ def full(rows: Transition) -> ReplayState:
     return ReplayState(jax.tree.map(jnp.asarray, rows), jnp.int32(0), jnp.int32(n))
 
 
-def add_batch(state: ReplayState, batch: Transition, valid: Array | None = None) -> ReplayState:
+def add_batch(state: ReplayState, batch: PyTree, valid: Array | None = None) -> ReplayState:
     """Append the valid rows, overwriting the oldest. batch: [n, ...] with n <= capacity; valid: [n] bool, default all.
 
     Invalid rows get an index beyond the end, where they are dropped: they take no space and are never sampled.
     """
-    capacity, n = state.data.reward.shape[0], batch.reward.shape[0]
+    capacity, n = (jax.tree.leaves(rows)[0].shape[0] for rows in (state.data, batch))
     if n > capacity:
         raise UserError(f"replay: {n} transitions at once do not fit a capacity of {capacity}; raise the capacity")
     valid = jnp.ones(n, bool) if valid is None else valid

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from envs.base import Env, World
+from envs.base import Env, EnvState, World
 from envs.rollout import Fleet, launch, step_fleet
 from sgft_jax.data import replay
 from sgft_jax.data.replay import ReplayState
@@ -21,11 +21,16 @@ from sgft_jax.pretraining import over_members
 from sgft_jax.types import Array, HybridAgent, Key, Metrics, PyTree, RealData
 
 
+# note(learner's state, before, action, after) -> what is kept of one simulated step beside its row
+Note = Callable[[PyTree, EnvState, Array, EnvState], PyTree]
+
+
 class HybridState(NamedTuple):
     """Everything that changes, [M, ...].
 
     learner: the agent. simulated: `ReplayState` of its own rows. fleet: its simulators in flight. The last two are None
-    for an agent that does not act in a simulator. rounds: [M] int32 rounds done.
+    for an agent that does not act in a simulator. rounds: [M] int32 rounds done. notes: `ReplayState` of what a `Note`
+    said of the rows, None without one.
     """
 
     learner: Any
@@ -33,6 +38,7 @@ class HybridState(NamedTuple):
     fleet: Any
     key: Key
     rounds: Array
+    notes: Any = None
 
 
 class Trainer(NamedTuple):
@@ -56,17 +62,18 @@ def train(
     *,
     gamma: float,
     state: HybridState | None = None,
+    note: Note | None = None,
 ) -> Iterator[tuple[HybridState, Metrics]]:
     """Trains M members for `schedule.chunks` chunks each.
 
     pools: [M, W] worlds of each member's simulator. real: what all share. keys: [M], what decides a
     member's draws. gamma: discount factor of simulated rows, that of the real ones. state: where an earlier run
-    stopped, or None; it is consumed.
+    stopped, or None; it is consumed. note: what else to keep of simulated steps.
 
     Yields the state that it starts from with no metrics, then once per chunk. Metrics are arrays [M]. A yielded state
     is valid until the next step, which donates its arrays. A resumed run ends like an uninterrupted one.
     """
-    trainer, members = make_trainer(env, agent, schedule, gamma=gamma), keys.shape[0]
+    trainer, members = make_trainer(env, agent, schedule, gamma=gamma, note=note), keys.shape[0]
     real = jax.tree.map(jnp.asarray, real)
     memory = agent.keep(real)
     now: HybridState = state or jax.jit(over_members(trainer.init, members, shared=(1,)))(pools, real, keys)
@@ -94,28 +101,34 @@ def chunks_done(state: HybridState, schedule: Schedule) -> int:
     return int(jax.device_get(state.rounds)[0]) // schedule.rounds_per_chunk
 
 
-def make_trainer(env: Env, agent: HybridAgent, schedule: Schedule, *, gamma: float) -> Trainer:
+def make_trainer(
+    env: Env, agent: HybridAgent, schedule: Schedule, *, gamma: float, note: Note | None = None
+) -> Trainer:
     """Builds the pure functions."""
     learner, fresh = agent.learner, agent.learner.init_carry()
     step = functools.partial(step_fleet, env, gamma=gamma, initial_carry=fresh)
 
     def vector_step(
-        pool: World, agent_state: PyTree, fleet: Fleet, rows: ReplayState, key: Key
-    ) -> tuple[Fleet, ReplayState]:
+        pool: World, agent_state: PyTree, fleet: Fleet, rows: ReplayState, notes: ReplayState | None, key: Key
+    ) -> tuple[Fleet, ReplayState, ReplayState | None]:
         """One step of all simulators under the exploring policy."""
         key_act, key_step = jax.random.split(key)
         act = functools.partial(learner.act, explore=True)
         keys = jax.random.split(key_act, schedule.simulators)
         actions, carry = jax.vmap(act, (None, 0, 0, 0))(agent_state, fleet.carry, fleet.state.obs, keys)
-        fleet, new, valid, _ = step(pool, fleet, actions, carry, key_step)
-        return fleet, replay.add_batch(rows, new, valid)
+        before = fleet.state
+        fleet, new, valid, after = step(pool, fleet, actions, carry, key_step)
+        if note is not None and notes is not None:
+            notes = replay.add_batch(notes, jax.vmap(note, (None, 0, 0, 0))(agent_state, before, actions, after), valid)
+        return fleet, replay.add_batch(rows, new, valid), notes
 
     def collect(pool: World, state: HybridState, key: Key, steps: int) -> HybridState:
-        def one(carry: tuple[Fleet, ReplayState], key: Key) -> tuple[tuple[Fleet, ReplayState], None]:
+        def one(carry: tuple, key: Key) -> tuple[tuple, None]:
             return vector_step(pool, state.learner, *carry, key), None
 
-        (fleet, rows), _ = jax.lax.scan(one, (state.fleet, state.simulated), jax.random.split(key, steps))
-        return state._replace(fleet=fleet, simulated=rows)
+        start = state.fleet, state.simulated, state.notes
+        (fleet, rows, notes), _ = jax.lax.scan(one, start, jax.random.split(key, steps))
+        return state._replace(fleet=fleet, simulated=rows, notes=notes)
 
     def init(pool: World, real: RealData, key: Key) -> HybridState:
         key_learner, key_fleet, key_fill, key_run = jax.random.split(key, 4)
@@ -125,6 +138,10 @@ def make_trainer(env: Env, agent: HybridAgent, schedule: Schedule, *, gamma: flo
             return state
         empty = replay.init(replay.blank(env.obs_dim, env.act_dim), schedule.buffer)
         state = state._replace(fleet=launch(env, pool, key_fleet, schedule.simulators, fresh), simulated=empty)
+        if note is not None:
+            first = jax.tree.map(lambda x: x[0], state.fleet.state)
+            example = note(agent_state, first, jnp.zeros(env.act_dim), first)
+            state = state._replace(notes=replay.init(example, schedule.buffer))
         return collect(pool, state, key_fill, -(-agent.batches.n_sim // schedule.simulators))
 
     def update(memory: PyTree, state: HybridState, key: Key) -> tuple[PyTree, Metrics]:

@@ -14,6 +14,8 @@ from sgft_jax.models.networks import (
     make_affine_actor,
     make_deterministic_actor,
     tanh_gaussian_action,
+    tanh_gaussian_log_prob,
+    untanh,
 )
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.types import Array, Key, Normalizer, Policy, PyTree
@@ -33,8 +35,9 @@ def actor_policy(obs_dim: int, act_dim: int, network: NetworkConfig, head: Head)
     """How such an actor acts.
 
     head: what its last layer says: that of `make_affine_actor`, `make_actor` or `make_deterministic_actor`. The last
-    explores with noise of std 0.1.
+    explores with noise of std 0.1, which is cut off at the bounds, so its actions have no density.
     """
+    log_prob = None
     if head == "deterministic":
         point = make_deterministic_actor(obs_dim, act_dim, network)
 
@@ -48,10 +51,14 @@ def actor_policy(obs_dim: int, act_dim: int, network: NetworkConfig, head: Head)
         def choose(params: PyTree, obs: Array, key: Key, explore: bool | Array) -> Array:
             return tanh_gaussian_action(spread.apply(params, obs), key, explore=explore)
 
+        def log_prob(params: ACTORParams, obs: Array, action: Array) -> Array:
+            moments = spread.apply(params.actor, normalize(params.normalizer, obs))
+            return tanh_gaussian_log_prob(moments, untanh(action))
+
     def act(params: ACTORParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         return choose(params.actor, normalize(params.normalizer, obs), key, explore), carry
 
-    return Policy(lambda: (), act)
+    return Policy(lambda: (), act, log_prob=log_prob)
 
 
 def exported(state: PyTree) -> ACTORParams:

@@ -169,6 +169,15 @@ def tanh_gaussian_log_prob(moments: Array, u: Array) -> Array:
     return jnp.sum(normal - squash)
 
 
+def untanh(action: Array) -> Array:
+    """[act_dim] u with tanh(u) = action; what has rounded to a bound becomes the last float inside it, 8.7 or -8.7.
+
+    In float32 it is right to 0.001 where |u| < 5.
+    """
+    last = 1.0 - 2.0**-24
+    return jnp.arctanh(jnp.clip(action, -last, last))
+
+
 def tanh_gaussian_divergence(moments: Array, others: Array) -> Array:
     """KL(moments || others) [], nats: of the Gaussians, which tanh leaves as it is.
 

@@ -8,7 +8,7 @@ import pytest
 import envs
 from experiments import cli, collect, hybrid
 from sgft_jax.data import logs, recording
-from sgft_jax.data.recording import Recorded
+from sgft_jax.data.recording import Joints, Noted, Recorded
 from sgft_jax.types import Transition, UserError
 
 OPTIONS = """--task toy --level -100 --transitions 50 --seeds 2 --environments 3 --updates 60 --eval-every 30
@@ -25,7 +25,19 @@ def _toy(monkeypatch):
 def episode(first, steps, *, terminated=False):
     """Observations that count up from `first`."""
     obs = (first + np.arange(steps + 1))[:, None].astype(np.float32)
-    return Recorded(obs, obs[:-1] / 100, np.ones(steps, np.float32), terminated)
+    return Recorded(
+        obs, obs[:-1] / 100, np.ones(steps, np.float32), terminated,
+        joints=Joints(obs + 0.5, -np.tile(obs, 2)), log_prob=obs[:-1, 0] / 10,
+    )  # fmt: skip
+
+
+def noted_of(*episodes):
+    """What is kept beside the rows of `rows_of`."""
+    each = [
+        Noted(jax.tree.map(lambda x: x[:-1], e.joints), jax.tree.map(lambda x: x[1:], e.joints), e.log_prob)
+        for e in episodes
+    ]
+    return jax.tree.map(lambda *x: np.concatenate(x), *each)
 
 
 def rows_of(*episodes):
@@ -39,15 +51,16 @@ def rows_of(*episodes):
 
 
 def same(a, b):
-    return a.terminated == b.terminated and all(np.array_equal(x, y) for x, y in zip(a[:3], b[:3], strict=True))
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
 def test_episodes_of_a_fleet_are_found_again_in_the_order_of_their_ends():
     """Two environments, eight steps: one falls after three; the recording cuts off both last episodes."""
     one = [episode(0, 3, terminated=True), episode(50, 5)]
     two = [episode(200, 6), episode(300, 2)]
-    rows = jax.tree.map(lambda a, b: np.stack([a, b], 1).reshape(16, *a.shape[1:]), rows_of(*one), rows_of(*two))
-    found = recording.of_fleet(rows, 2)
+    mixed = lambda a, b: np.stack([a, b], 1).reshape(16, *a.shape[1:])  # noqa: E731
+    rows, noted = (jax.tree.map(mixed, of(*one), of(*two)) for of in (rows_of, noted_of))
+    found = recording.of_fleet(rows, 2, noted)
     for got, wanted in zip(found, [one[0], two[0], one[1], two[1]], strict=True):
         assert same(got, wanted)
 
@@ -78,6 +91,27 @@ def test_what_is_written_is_read_again(layout, tmp_path):
     assert not list(tmp_path.rglob("*.part"))
 
 
+def test_joints_and_densities_lie_beside_what_was_observed(tmp_path):
+    """A row for each step in D4RL's layout. Minari has one more for each episode; no action follows it."""
+    episodes = [episode(0, 3, terminated=True), episode(50, 2)]
+    recording.write_d4rl(tmp_path / "set.hdf5", episodes, {})
+    recording.write_minari(tmp_path / "set-v0", episodes, {})
+    with h5py.File(tmp_path / "set.hdf5") as file:
+        infos = file["infos"]
+        np.testing.assert_array_equal(infos["qpos"][:, 0], [0.5, 1.5, 2.5, 50.5, 51.5])
+        assert infos["qvel"].shape == (5, 2) and infos["qvel"].dtype == np.float32
+        np.testing.assert_allclose(infos["action_log_probs"], [0.0, 0.1, 0.2, 5.0, 5.1], rtol=1e-6)
+    with h5py.File(tmp_path / "set-v0/data/main_data.hdf5") as file:
+        infos = file["episode_1/infos"]
+        np.testing.assert_array_equal(infos["qpos"][:, 0], [50.5, 51.5, 52.5])
+        np.testing.assert_array_equal(infos["qvel"][:, 1], [-50, -51, -52])
+        np.testing.assert_allclose(infos["action_log_probs"], [5.0, 5.1, np.nan], rtol=1e-6)
+    bare = [own._replace(joints=None, log_prob=None) for own in episodes]
+    recording.write_d4rl(tmp_path / "bare.hdf5", bare, {})
+    with h5py.File(tmp_path / "bare.hdf5") as file:
+        assert "infos" not in file
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")  # its advice on authors and links
 def test_minaris_own_library_opens_a_set(tmp_path, monkeypatch):
     minari = pytest.importorskip("minari", reason="Minari's library is not installed: pip install 'sgft-jax[minari]'")
@@ -103,6 +137,12 @@ def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys):
         assert old.facts.episodes == 3 * -(-(fill + 30) // 60)  # of 20 steps; three are cut off
     with h5py.File(out / "toy-medium-regenerated-seed-0.hdf5") as file:
         assert file["metadata/algorithm"][()] == b"SAC" and file["timeouts"][()].sum() == 3
+    for kind in ("medium", "medium-replay"):
+        with h5py.File(out / f"toy-{kind}-regenerated-seed-1.hdf5") as file:
+            own = np.concatenate([file["infos/qpos"], file["infos/qvel"]], axis=1)
+            assert (own == file["observations"][()]).all(1).mean() > 0.5  # the others were observed with noise
+            found = file["infos/action_log_probs"][()]
+            assert np.isfinite(found).all() and found.std() > 0.1
     # what was recorded is what experiments.hybrid learns from
     data = out / "toy-medium-replay-regenerated-seed-0.hdf5"
     hybrid.main(
@@ -124,6 +164,8 @@ def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys):
     )
     (recorded,) = out.glob("toy-seed-0-seed-0.hdf5")
     assert logs.load(recorded, gamma=1.0).facts.transitions == 30
+    with h5py.File(recorded) as file:
+        assert {"qpos", "qvel", "action_log_probs"} == set(file["infos"])
 
 
 @pytest.mark.parametrize(
