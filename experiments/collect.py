@@ -58,6 +58,11 @@ def name_of(args: CollectArgs, kind: str, seed: int) -> str:
     return f"{extend.name_of(args.task)}-{kind}-regenerated-seed-{seed}"
 
 
+def is_d4rls(args: CollectArgs) -> bool:
+    """Whether the sets are made as D4RL's were, and may be judged by these."""
+    return args.real == SIM and args.policy is None and args.level in (None, LEVELS.get(args.task))
+
+
 def targets(args: CollectArgs) -> list[Path]:
     """The files that a call writes. Minari's folder beside a file has its name with `-v0` for the ending."""
     if args.policy is not None:

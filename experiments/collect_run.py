@@ -16,15 +16,17 @@ from envs import gaps
 from envs.base import Env, EnvState
 from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
-from experiments.collect import CollectArgs, name_of, targets
+from experiments.collect import PAIR, CollectArgs, is_d4rls, name_of, targets
 from experiments.options import seed_list
 from experiments.stacking import member
-from sgft_jax.data import logs
+from sgft_jax.data import acceptance, logs
 from sgft_jax.data.recording import Joints, Noted, Recorded, cut, of_episodes, of_fleet, write_d4rl, write_minari
 from sgft_jax.hybrid import trainer
 from sgft_jax.hybrid.methods import get_method
 from sgft_jax.hybrid.schedule import Schedule
 from sgft_jax.hybrid.trainer import HybridState
+from sgft_jax.io import runs
+from sgft_jax.io.jsonfile import write_json
 from sgft_jax.io.priors import load_prior, observed_by
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.policies import make_policy
@@ -66,8 +68,9 @@ def teach(args: CollectArgs, level: float) -> list[dict[str, Any]]:
     for i, (params, rows, noted) in sorted(reached.items()):
         old = of_fleet(rows, args.environments, noted)
         new = _play(args, env, system, agent.policy, params, seeds[i])
-        for kind, episodes in (("medium-replay", old), ("medium", new)):
-            found.append(_write(args, args.out / f"{name_of(args, kind, seeds[i])}.hdf5", episodes))
+        for kind, episodes in zip(PAIR, (old, new), strict=True):
+            path = args.out / f"{name_of(args, kind, seeds[i])}.hdf5"
+            found.append(_write(args, path, episodes, kind=kind if is_d4rls(args) else ""))
     return found
 
 
@@ -156,8 +159,11 @@ def _play(args: CollectArgs, env: Env, system: Simulated, policy: Policy, params
     return cut(found, args.transitions)
 
 
-def _write(args: CollectArgs, path: Path, episodes: Sequence[Recorded]) -> dict[str, Any]:
-    """Both layouts of a data set; says what it holds, as a reader finds it."""
+def _write(args: CollectArgs, path: Path, episodes: Sequence[Recorded], *, kind: str = "") -> dict[str, Any]:
+    """Both layouts of a data set and its card; says what it holds, as a reader finds it.
+
+    kind: which of D4RL's sets it shall stand for, "" for none: then nothing is judged.
+    """
     author = "sgft_jax experiments.collect"
     write_d4rl(path, episodes, {"algorithm": "SAC", "task": args.task, "real": args.real, "author": author})
     write_minari(path.with_name(f"{path.stem}-v0"), episodes, {"algorithm_name": "SAC", "author": author})
@@ -167,4 +173,10 @@ def _write(args: CollectArgs, path: Path, episodes: Sequence[Recorded]) -> dict[
         f"{path}: {facts.transitions:,} transitions, {facts.episodes:,} episodes of {steps:.0f} steps on average, "
         f"return {facts.return_mean:.1f} (std {facts.return_std:.1f}, {facts.return_min:.1f} to {facts.return_max:.1f})"
     )
-    return dataclasses.asdict(facts)
+    verdicts = acceptance.judge(f"{args.task}-{kind}", facts, mean_length=float(steps))
+    for verdict in verdicts:
+        print(f"  {verdict}")
+    judged = [{**verdict._asdict(), "passed": verdict.passed} for verdict in verdicts]
+    card = {**dataclasses.asdict(facts), "path": path.name, "mean_length": float(steps), "acceptance": judged}
+    write_json(path.with_suffix(".json"), {**card, "provenance": runs.provenance()})
+    return card

@@ -86,7 +86,10 @@ def of_fleet(rows: Transition, environments: int, noted: Noted | None = None) ->
 
 
 def of_episodes(played: Episode, noted: Noted | None = None) -> list[Recorded]:
-    """Episodes [n] as `System.play` returns them, without the rows after their ends. noted: [n, T, ...], of their rows."""
+    """Episodes [n] as `System.play` returns them, without the rows after their ends.
+
+    noted: [n, T, ...], of their rows.
+    """
     both = jax.tree.map(np.asarray, (_Rows(*played.transitions), noted))
     valid = np.asarray(played.valid)
     found = (jax.tree.map(lambda x, i=i: x[i][valid[i]], both) for i in range(len(valid)))

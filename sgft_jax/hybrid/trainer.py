@@ -20,7 +20,6 @@ from sgft_jax.hybrid.schedule import Schedule
 from sgft_jax.pretraining import over_members
 from sgft_jax.types import Array, HybridAgent, Key, Metrics, PyTree, RealData
 
-
 # note(learner's state, before, action, after) -> what is kept of one simulated step beside its row
 Note = Callable[[PyTree, EnvState, Array, EnvState], PyTree]
 

@@ -1,5 +1,8 @@
 """Recording data sets of a real system on a point mass: both layouts, what SAC did and what it does then."""
 
+import json
+from pathlib import Path
+
 import h5py
 import jax
 import numpy as np
@@ -7,7 +10,7 @@ import pytest
 
 import envs
 from experiments import cli, collect, hybrid
-from sgft_jax.data import logs, recording
+from sgft_jax.data import acceptance, logs, recording
 from sgft_jax.data.recording import Joints, Noted, Recorded
 from sgft_jax.types import Transition, UserError
 
@@ -122,7 +125,9 @@ def test_minaris_own_library_opens_a_set(tmp_path, monkeypatch):
     np.testing.assert_array_equal(found[1].observations[:, 0], [50, 51, 52])
 
 
-def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys):
+def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(collect.LEVELS, "toy", -100.0)
+    monkeypatch.setattr(acceptance, "BANDS", {"toy-medium-replay": {"transitions": acceptance.Band(300, 0.25)}})
     out = tmp_path / "data"
     collect.main([*LEARN, "--out", str(out)])
     said = capsys.readouterr().out
@@ -135,6 +140,13 @@ def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys):
         fill = 3 * -(-256 // 3)  # a first batch, in whole steps of three environments
         assert old.facts.transitions == fill + 30 and f"seed-{seed}.hdf5: {fill + 30} transitions" in said
         assert old.facts.episodes == 3 * -(-(fill + 30) // 60)  # of 20 steps; three are cut off
+        card = json.loads((out / f"toy-medium-replay-regenerated-seed-{seed}.json").read_text())
+        assert card["sha256"] == old.facts.sha256 and card["provenance"]["versions"]
+        assert card["acceptance"] == [
+            {"criterion": "transitions", "value": fill + 30, "low": 225.0, "high": 375.0, "passed": True}
+        ]
+        assert not json.loads((out / f"toy-medium-regenerated-seed-{seed}.json").read_text())["acceptance"]
+    assert said.count(f"  pass: transitions {fill + 30}, accepted from 225 to 375\n") == 2
     with h5py.File(out / "toy-medium-regenerated-seed-0.hdf5") as file:
         assert file["metadata/algorithm"][()] == b"SAC" and file["timeouts"][()].sum() == 3
     for kind in ("medium", "medium-replay"):
@@ -166,6 +178,20 @@ def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys):
     assert logs.load(recorded, gamma=1.0).facts.transitions == 30
     with h5py.File(recorded) as file:
         assert {"qpos", "qvel", "action_log_probs"} == set(file["infos"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "judged"),
+    [
+        ({}, True),
+        ({"level": 4770.0}, True),
+        ({"level": 1500.0}, False),
+        ({"real": "gravity"}, False),
+        ({"policy": Path("policy/seed-0")}, False),
+    ],
+)
+def test_sets_made_in_another_way_are_not_judged(changes, judged):
+    assert collect.is_d4rls(collect.CollectArgs(**changes)) == judged
 
 
 @pytest.mark.parametrize(
