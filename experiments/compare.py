@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 
 from envs import gaps
 from experiments import cli, grid, tuned
+from experiments.cells import Cell, check_begun, complete
 from experiments.figures import FiguresArgs, figures
 from experiments.finetune_args import FinetuneArgs
-from experiments.grid import Cell, GridArgs
+from experiments.grid import GridArgs
 from sgft_jax.types import UserError
 
 
@@ -42,8 +43,8 @@ def compare(args: CompareArgs) -> list[str]:
     """Works through the cells in order; returns a line for each that could not run."""
     found = cells(args)
     if args.tuned:
-        grid.check_begun(found)  # tuning may have chosen again since
-    return grid.work(found, args)
+        check_begun(found)  # tuning may have chosen again since
+    return complete(found, args)
 
 
 def cells(args: CompareArgs) -> list[Cell]:

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from envs import gaps
 from experiments import cli, grid
+from experiments.cells import Cell, check_begun, complete
 from experiments.finetune_args import with_settings
-from experiments.grid import Cell, GridArgs
+from experiments.grid import GridArgs
 from sgft_jax.io.jsonfile import jsonable, write_json
 from sgft_jax.types import UserError
 
@@ -59,8 +60,8 @@ def main(args: FactorialArgs) -> None:
     places = [(task, real) for task in args.tasks for real in args.reals]
     cells = {place: cells_of(args, *place) for place in places}
     every = [cell for each in cells.values() for cell in each.values()]
-    grid.check_begun(every)  # the same folders with other options or priors
-    failed = grid.work(every, args)
+    check_begun(every)  # the same folders with other options or priors
+    failed = complete(every, args)
     if args.dry:
         return
     if failed:

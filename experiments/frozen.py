@@ -18,7 +18,8 @@ import envs
 from envs import gaps
 from envs.gaps import SIM
 from experiments import cli, grid
-from experiments.grid import Cell, GridArgs
+from experiments.cells import Cell, complete
+from experiments.grid import GridArgs
 from experiments.options import at_least_one
 from experiments.pretrain import PretrainArgs, pretrain, run_folder
 from experiments.scoreboard import ScoreboardArgs, board
@@ -167,7 +168,7 @@ def _run_unit(
         return states.pop() if len(states) == 1 else "unfinished"
 
     def work() -> None:
-        if failed := grid.work(cells(), shared):
+        if failed := complete(cells(), shared):
             raise UserError("; ".join(failed))
 
     name = f"{task}/{method}" + (f"-{AGAIN}" if again else "")

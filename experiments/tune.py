@@ -21,8 +21,9 @@ from rich.table import Table
 
 from envs import gaps
 from experiments import cli, grid, tuned
+from experiments.cells import Cell, check_begun, complete
 from experiments.finetune_args import with_settings
-from experiments.grid import Cell, GridArgs
+from experiments.grid import GridArgs
 from experiments.options import at_least_one, prior_home, seed_list
 from experiments.spaces import SPACES, first, space_of
 from sgft_jax import extend
@@ -96,8 +97,8 @@ def tune(args: TuneArgs) -> list[str]:
     for i in range(len(rungs(args))):
         found = [stages(args, *pair)[i:] for pair in pairs]  # empty where the rung before is not finished
         cells = [cell for stage in found for trial in (stage[0] if stage else []) for cell in trial.cells]
-        grid.check_begun(cells)
-        failed += grid.work(cells, args, started=started)
+        check_begun(cells)
+        failed += complete(cells, args, started=started)
     for task, method in pairs:
         _conclude(args, task, method)
     return failed

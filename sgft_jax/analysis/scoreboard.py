@@ -87,7 +87,7 @@ def duel(reference: Played, other: str, played: Played) -> Duel:
     grid = common_grid([*(reference[gap] for gap in gaps), *(played[gap] for gap in gaps)])
     own, theirs = _areas(reference, gaps, grid), _areas(played, gaps, grid)
     ahead = int((own.mean(1) >= theirs.mean(1)).sum())
-    return Duel(other, len(gaps), ahead, _improvement(own, theirs))
+    return Duel(other, len(gaps), ahead, improvement(own, theirs))
 
 
 def _areas(played: Played, gaps: Sequence[str], grid: np.ndarray) -> np.ndarray:
@@ -97,8 +97,8 @@ def _areas(played: Played, gaps: Sequence[str], grid: np.ndarray) -> np.ndarray:
     return np.stack([each for each in found if each is not None])
 
 
-def _improvement(above: np.ndarray, below: np.ndarray) -> Interval:
-    """P(above > below) of areas [gaps, members] of two methods; ties count half. Intervals draw members of either."""
+def improvement(above: np.ndarray, below: np.ndarray) -> Interval:
+    """P(above > below) of scores [gaps, members] of two methods; ties count half. Intervals draw members of either."""
     a, b = above[:, :, None], below[:, None, :]
     wins = ((a > b) + 0.5 * (a == b)).mean(0)  # [members of one, members of the other], mean over gaps
     estimate = np.asarray(wins.mean())

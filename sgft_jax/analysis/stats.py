@@ -61,15 +61,16 @@ def bootstrap_interval(
     prior is then the random factor: each resample draws priors, and then members of each drawn prior (hierarchical
     bootstrap). strata: [members], such as the task of each; each resample draws within each of them (stratified
     bootstrap, that of rliable), priors first if there are any. The bounds are nan for fewer than `ENOUGH` members, or
-    fewer than `ENOUGH` priors in a stratum: so few cannot show how much others would differ. Raises ValueError if there
-    is no member or a score is not finite.
+    priors, in a stratum: so few cannot show how much others would differ. Raises ValueError if there is no member or a
+    score is not finite.
     """
     scores = np.asarray(scores, np.float64)
     if scores.shape[0] == 0 or not np.isfinite(scores).all():
         raise ValueError("scores need at least one seed and finite values")
     estimate = statistic(scores)
     groups = _groups(np.zeros(scores.shape[0]) if strata is None else strata)
-    units = scores.shape[0] if priors is None else min(len(np.unique(np.asarray(priors)[group])) for group in groups)
+    drawn_first = np.arange(scores.shape[0]) if priors is None else np.asarray(priors)
+    units = min(len(np.unique(drawn_first[group])) for group in groups)
     if units < ENOUGH:
         return Interval(estimate, np.full_like(estimate, np.nan), np.full_like(estimate, np.nan))
     rng = np.random.default_rng(seed)

@@ -1,0 +1,196 @@
+"""Run every method on every data set and simulator, cell by cell, and print tables of what there is.
+
+A cell is one run of `experiments.hybrid` with all seeds. Methods without a simulator run once for each data set, those
+without data once for each simulator. Cells that are finished are left alone, begun ones go on where they stopped: the
+same command, given again, does what is missing. All simulators and seeds of a method and data set share one program.
+"""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from envs import gaps
+from envs.gaps import SIM
+from experiments import cells, cli
+from experiments.cells import Cell, Kind, check_begun, complete
+from experiments.hybrid import arguments, hybrid
+from experiments.hybrid_args import DEFAULT, VOLATILE, HybridArgs, data_name, gaps_of, run_folder
+from experiments.options import Impl, at_least_one, check_task, seed_list, without_repeats
+from sgft_jax import extend
+from sgft_jax.hybrid.methods import NAMES, get_method
+from sgft_jax.hybrid.schedule import Schedule
+from sgft_jax.io.jsonfile import jsonable, read_json
+from sgft_jax.io.log import SUMMARY
+from sgft_jax.types import UserError, unknown
+
+if TYPE_CHECKING:
+    from sgft_jax.analysis.hybrid import Outcome
+
+_SCORES = {"late": "mean of the last ten evaluations", "last": "last evaluation"}
+LEGEND = (
+    "Scores in the real system ({score}), mean and standard deviation over {seeds} seeds. Means over simulators{scale} "
+    "have a 95 % bootstrap interval that draws seeds within every simulator. P(better): a random seed of {reference} "
+    "against one of the other method, mean over simulators. Intervals need three seeds. The data sets are what the "
+    "files hold: numbers on sets that were made anew do not belong beside published ones."
+)
+
+
+@dataclass(frozen=True)
+class CompareHybridArgs:
+    """A grid of runs; everything not named here is as `experiments.hybrid` has it."""
+
+    task: str = "halfcheetah"
+    """A task by name, or a Python file with a task of your own."""
+    methods: tuple[str, ...] = NAMES
+    """Methods in the order in which they run, as METHOD or METHOD:PRESET; the latter is a variant of that name."""
+    gaps: tuple[str, ...] = ()
+    """How simulators differ from the real system: gaps by name, .toml/.json files, or sim for no gap; default: all that
+    come with the task."""
+    data: tuple[Path, ...] = ()
+    """The real data: D4RL or Minari files, folders of Minari sets, or logs of a wheel-legged robot."""
+    real: str = SIM
+    """The real system to evaluate in: sim for the task as it is, or a gap by name or as a file."""
+    seeds: int = 5
+    """Number of seeds of each run."""
+    schedule: Schedule = field(default_factory=Schedule)
+    score: Literal["late", "last"] = "late"
+    """What tables show of a run: the mean of its last ten evaluations, or its last one."""
+    reference: str = DEFAULT
+    """Compare the others with this METHOD or METHOD:PRESET."""
+    together: bool = True
+    """Step the simulators of a method together; --no-together: one after another, in less memory but more time."""
+    minutes: float | None = None
+    """Begin no new run after so many minutes."""
+    dry: bool = False
+    """Only list the runs and what is missing."""
+    out: Path = Path("runs")
+    """Parent of all run folders; the tables also go to <out>/figures."""
+    seed: int = 0
+    """Expert: first seed."""
+    eval_every: int = 10_000
+    """Expert: updates between evaluations in the real system."""
+    eval_episodes: int = 10
+    """Expert: episodes per seed and evaluation."""
+    impl: Impl = "auto"
+
+
+def _system(args: HybridArgs) -> str:
+    """The one simulator, or what stands for none."""
+    return gaps_of(args, get_method(args.method))[0]
+
+
+def _title(args: HybridArgs) -> str:
+    learnt_from = [_gap_of(args), _data_of(args)]
+    return f"{'/'.join(filter(None, [extend.name_of(args.task), *learnt_from]))}: {_spec(args)}"
+
+
+def _spec(args: HybridArgs) -> str:
+    return ":".join(filter(None, [args.method, args.variant]))
+
+
+def _data_of(args: HybridArgs) -> str:
+    """The name of the data, "" of a method without."""
+    return "" if args.data is None else data_name(args.data)
+
+
+def _gap_of(args: HybridArgs) -> str:
+    """The name of the simulator, "" of a method without."""
+    return "" if get_method(args.method).kind == "offline" else gaps.title(args.gap[0])
+
+
+HYBRID = Kind(
+    name="hybrid",
+    systems="gap",
+    run=lambda args: hybrid(args),
+    folder=lambda args: run_folder(args, _system(args)),
+    config=lambda args: jsonable(args) | {"gap": _system(args)},
+    title=_title,
+    volatile=VOLATILE,
+    finished=lambda args, summary: True,  # a summary is written at the end; another schedule is refused
+)
+
+
+def main(args: CompareHybridArgs) -> None:
+    """Runs what is missing, then prints tables; raises UserError in the end if some cells could not run."""
+    args = replace(args, gaps=gaps.each(args.gaps or tuple(gaps.presets(extend.name_of(args.task)))))
+    check(args)
+    found = grid(args)
+    check_begun(found)
+    failed = complete(found, args)
+    if args.dry:
+        return
+    if text := tables(args):
+        path = args.out / "figures" / f"hybrid-{extend.name_of(args.task)}-{gaps.title(args.real)}-{args.score}.md"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text + "\n")
+        print(f"{text}\n\nwritten: {path}")
+    if failed:
+        raise UserError(f"{len(failed)} of the cells did not run: {'; '.join(failed)}")
+
+
+def check(args: CompareHybridArgs) -> None:
+    """Raises UserError for what is wrong in the arguments alone."""
+    at_least_one(args, "eval_every", "eval_episodes")
+    seed_list(args.seed, args.seeds)
+    if not args.gaps:
+        raise UserError(f"--gaps: {extend.name_of(args.task)} comes with none; name some, or {SIM} for no gap")
+    for name, given in (("methods", args.methods), ("gaps", args.gaps), ("data", tuple(map(data_name, args.data)))):
+        without_repeats(f"--{name}", given)
+    check_task(args.task, args.gaps if args.real == SIM else (*args.gaps, args.real))
+    if args.reference not in args.methods:
+        raise UserError(unknown("--reference", args.reference, args.methods))
+    learning = [name for name in args.methods if get_method(name.partition(":")[0]).kind != "simulator"]
+    if learning and not args.data:
+        raise UserError(f"--data: {learning[0]} learns from real data; name D4RL or Minari files")
+    if missing := [path for path in args.data if not path.exists()]:
+        raise UserError(f"--data {missing[0]}: no such file")
+
+
+def grid(args: CompareHybridArgs) -> list[Cell]:
+    """The cells, methods innermost, so that every data set is compared early."""
+    runs = [run for data in args.data or (None,) for method in args.methods for run in _runs(args, method, data)]
+    return [cells.look_up(HYBRID, run) for run in dict.fromkeys(runs)]  # of a method without data once
+
+
+def _runs(args: CompareHybridArgs, method: str, data: Path | None) -> list[HybridArgs]:
+    """Of one method on one data set, a run for each simulator."""
+    name, _, preset = method.partition(":")
+    kind = get_method(name).kind
+    run = arguments(
+        name, preset=preset, variant=preset, task=args.task, data=None if kind == "simulator" else data,
+        real=args.real, seeds=args.seeds, seed=args.seed, schedule=args.schedule, eval_every=args.eval_every,
+        eval_episodes=args.eval_episodes, impl=args.impl, out=args.out, video=False,
+    )  # fmt: skip
+    return [replace(run, gap=(gap,)) for gap in ((SIM,) if kind == "offline" else args.gaps)]
+
+
+def tables(args: CompareHybridArgs) -> str:
+    """What has finished, as Markdown; "" if nothing has."""
+    from sgft_jax.analysis import hybrid as analysis
+
+    done = [cell for cell in grid(args) if cell.state == "finished"]
+    if not done:
+        return ""
+    summaries = [read_json(cell.folder / SUMMARY) for cell in done]
+    task, score = (summaries[0][name] for name in ("task", "score"))
+    outcomes = [_outcome(cell.args, one[args.score]) for cell, one in zip(done, summaries, strict=True)]
+    data, systems = [data_name(path) for path in args.data] or [""], [gaps.title(gap) for gap in args.gaps]
+    results = analysis.Results(task, score, data, systems, args.methods, outcomes)
+    scale = " on D4RL's scale" if task in analysis.BOUNDS else ""
+    words = {"score": _SCORES[args.score], "seeds": args.seeds, "scale": scale, "reference": args.reference}
+    parts = [f"# {task}", LEGEND.format(**words), analysis.headline(results)]
+    if len(args.methods) > 1:
+        parts.append(analysis.duels(results, args.reference))
+    return "\n\n".join([*parts, analysis.cells(results)])
+
+
+def _outcome(run: HybridArgs, scores: list[float]) -> "Outcome":
+    import numpy as np
+
+    from sgft_jax.analysis.hybrid import Outcome
+
+    return Outcome(_spec(run), _data_of(run), _gap_of(run), np.array(scores))
+
+
+if __name__ == "__main__":
+    cli.run_main(main, CompareHybridArgs, __doc__ or "")

@@ -1,0 +1,115 @@
+"""Tables of learning from real data and a simulator: methods on data sets and simulators. Pure.
+
+A method without a simulator has one outcome for each data set, a method without data one for each simulator; both stand
+in every row that they belong to.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sgft_jax.analysis.scoreboard import improvement
+from sgft_jax.analysis.stats import Interval, bootstrap_interval, mean
+from sgft_jax.analysis.tables import NONE, markdown, number, plain
+from sgft_jax.hybrid.scores import BOUNDS, normalised
+
+EVERY = ""  # data or simulator of a method that sees none
+
+
+class Outcome(NamedTuple):
+    """What one run scored in the real system. data, gap: names, or `EVERY`. scores: [seeds]."""
+
+    method: str
+    data: str
+    gap: str
+    scores: np.ndarray
+
+
+class Results(NamedTuple):
+    """The outcomes of one task, and what the tables have: data sets, simulators and methods in their order.
+
+    score: "success" or "return".
+    """
+
+    task: str
+    score: str
+    data: Sequence[str]
+    gaps: Sequence[str]
+    methods: Sequence[str]
+    outcomes: Sequence[Outcome]
+
+    def of(self, method: str, data: str, gap: str) -> np.ndarray | None:
+        """[seeds] scores in that cell; None where nothing has finished."""
+        for own in self.outcomes:
+            if own.method == method and own.data in (data, EVERY) and own.gap in (gap, EVERY):
+                return own.scores
+        return None
+
+
+def cells(results: Results) -> str:
+    """A row for each data set and simulator: mean of every method with its standard deviation over seeds."""
+    rows = [
+        [data or NONE, gap, *(_spread(results.of(method, data, gap), results.score) for method in results.methods)]
+        for data in results.data
+        for gap in results.gaps
+    ]
+    return markdown(["data", "simulator", *results.methods], rows)
+
+
+def headline(results: Results) -> str:
+    """A row for each data set: mean over simulators with its bootstrap interval, on D4RL's scale if there is one.
+
+    A resample draws seeds within every simulator. A method stands only where it has finished on all of them.
+    """
+    rows = [[data or NONE, *(_overall(results, method, data) for method in results.methods)] for data in results.data]
+    return markdown([f"mean over {len(results.gaps)} simulators", *results.methods], rows)
+
+
+def duels(results: Results, reference: str) -> str:
+    """A row for each data set: probability that a seed of the reference scores higher than one of another method.
+
+    It is the mean over the simulators on which both have finished, in per cent, with its bootstrap interval over seeds.
+    """
+    others = [method for method in results.methods if method != reference]
+    rows = [[data or NONE, *(_duel(results, reference, other, data) for other in others)] for data in results.data]
+    return markdown([f"P({reference} better), per cent", *others], rows)
+
+
+def overall(results: Results, method: str, data: str) -> Interval | None:
+    """What `headline` shows in a cell; None where a simulator is missing."""
+    found = [results.of(method, data, gap) for gap in results.gaps]
+    each = [own for own in found if own is not None]
+    if len(each) < len(found):
+        return None
+    if any(own.method == method and own.gap == EVERY for own in results.outcomes):
+        each = each[:1]  # the same run in every row: more of it would say that there are more seeds
+    strata = np.repeat(np.arange(len(each)), [len(own) for own in each])
+    return bootstrap_interval(rescaled(results.task, np.concatenate(each)), statistic=mean, strata=strata)
+
+
+def rescaled(task: str, scores: np.ndarray) -> np.ndarray:
+    """[n] on D4RL's scale, unchanged for a task that has none."""
+    return np.array([normalised(task, x) for x in scores.tolist()]) if task in BOUNDS else scores
+
+
+def _spread(scores: np.ndarray | None, score: str) -> str:
+    if scores is None:
+        return NONE
+    middle = plain(float(scores.mean()), score) if score == "success" else f"{scores.mean():,.0f}"
+    spread = plain(float(scores.std()), score) if score == "success" else f"{scores.std():,.0f}"
+    return middle if len(scores) == 1 else f"{middle} ± {spread}"
+
+
+def _overall(results: Results, method: str, data: str) -> str:
+    found = overall(results, method, data)
+    return NONE if found is None else number(found, results.score)
+
+
+def _duel(results: Results, reference: str, other: str, data: str) -> str:
+    pairs = [(results.of(reference, data, gap), results.of(other, data, gap)) for gap in results.gaps]
+    both = [(own, theirs) for own, theirs in pairs if own is not None and theirs is not None]
+    if not both:
+        return NONE
+    above, below = (np.stack(scores) for scores in zip(*both, strict=True))
+    return number(improvement(above, below))

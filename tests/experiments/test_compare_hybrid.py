@@ -1,0 +1,123 @@
+"""The grid of methods, data sets and simulators: what runs together, what is left alone, what the tables say."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from experiments import cli, compare_hybrid
+from experiments.hybrid_args import run_folder
+from sgft_jax.io.jsonfile import jsonable
+from sgft_jax.io.runs import FORMAT
+from sgft_jax.types import UserError
+
+METHODS = ("h2oplus", "sac", "iql", "rebrac:walker2d-medium")
+
+
+@pytest.fixture
+def ran(monkeypatch):
+    """Runs that only leave their folders."""
+    seen = []
+
+    def hybrid(args):
+        seen.append(args)
+        for i, gap in enumerate(args.gap):
+            leave(replace(args, gap=(gap,)), [100.0 * i + 10 * seed for seed in range(args.seeds)])
+
+    monkeypatch.setattr(compare_hybrid, "hybrid", hybrid)
+    monkeypatch.setattr(cli, "set_up", lambda: None)
+    return seen
+
+
+def leave(args, scores):
+    """What a run leaves; without scores, one that was killed."""
+    folder = compare_hybrid.HYBRID.folder(args)
+    folder.mkdir(parents=True, exist_ok=True)
+    config = {"config": dict(compare_hybrid.HYBRID.config(args)), "kind": "hybrid", "sgft_jax": "0", "format": FORMAT}
+    (folder / "config.json").write_text(json.dumps(jsonable(config)))
+    if scores:
+        summary = {"task": "halfcheetah", "score": "return", "late": scores, "last": [-x for x in scores]}
+        (folder / "summary.json").write_text(json.dumps(summary))
+
+
+@pytest.fixture
+def grid(tmp_path):
+    """Two data sets and two simulators."""
+    data = tuple(tmp_path / f"{name}.hdf5" for name in ("medium", "replay"))
+    for path in data:
+        path.touch()
+    return compare_hybrid.CompareHybridArgs(
+        methods=METHODS, gaps=("gravity", "friction"), data=data, seeds=3, out=tmp_path / "runs"
+    )
+
+
+def test_each_method_runs_as_often_as_it_learns_from_other_things(grid, ran, capsys):
+    compare_hybrid.main(grid)
+    found = [(run.method, None if run.data is None else run.data.stem, run.gap) for run in ran]
+    assert found == [
+        ("h2oplus", "medium", ("gravity", "friction")), ("sac", None, ("gravity", "friction")),
+        ("iql", "medium", ("sim",)), ("rebrac", "medium", ("sim",)), ("h2oplus", "replay", ("gravity", "friction")),
+        ("iql", "replay", ("sim",)), ("rebrac", "replay", ("sim",)),
+    ]  # fmt: skip
+    assert ran[3].variant == "walker2d-medium" and ran[3].options.critic_penalty == 0.1
+    said = capsys.readouterr().out
+    assert "missing    halfcheetah/gravity/medium: h2oplus\n" in said and "halfcheetah/gravity: sac\n" in said
+    assert "halfcheetah/medium: rebrac:walker2d-medium\n" in said
+    assert "| replay | friction | 110 ± 8 | 110 ± 8 | 10 ± 8 | 10 ± 8 |" in said
+    (table,) = (grid.out / "figures").glob("hybrid-halfcheetah-sim-late.md")
+    assert table.read_text() in said
+    # of 60 (mean over simulators) on D4RL's scale, -280 to 12,135: 2.7
+    assert "| medium | 2.7 [2.7, 2.8] |" in said
+    ran.clear()
+    compare_hybrid.main(replace(grid, score="last"))
+    assert ran == [] and "| replay | friction | -110 ± 8 |" in capsys.readouterr().out
+
+
+def test_what_was_killed_goes_on_and_what_is_missing_follows(grid, ran):
+    first = compare_hybrid.grid(replace(grid, gaps=("gravity",)))[0]
+    leave(first.args, None)
+    compare_hybrid.main(replace(grid, methods=("h2oplus",), data=grid.data[:1]))
+    assert [(run.gap, run.resume) for run in ran] == [(("gravity",), True), (("friction",), False)]
+
+
+def test_runs_with_other_settings_are_not_mixed(grid, ran, capsys):
+    own = replace(grid, methods=("iql",), reference="iql")
+    compare_hybrid.main(own)
+    with pytest.raises(UserError, match=r"schedule\.updates was 1000000, now 500"):
+        compare_hybrid.main(replace(own, schedule=replace(own.schedule, updates=500)))
+
+
+def test_dry_runs_nothing(grid, ran, capsys):
+    compare_hybrid.main(replace(grid, dry=True))
+    assert ran == [] and capsys.readouterr().out.count("missing") == 10 and not grid.out.exists()
+
+
+def test_by_default_all_simulators_of_the_task(grid, ran, capsys):
+    compare_hybrid.main(replace(grid, gaps=(), methods=("sac",), reference="sac", data=(), dry=True))
+    assert capsys.readouterr().out.count("missing") == 9
+    folder = run_folder(compare_hybrid.grid(replace(grid, methods=("sac",), data=()))[0].args, "gravity")
+    assert folder.relative_to(grid.out) == Path("hybrid/halfcheetah/gravity/no-data/sac/seeds-0-2")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--methods iql:papre --reference iql:papre --data SET", "--preset: there is no 'papre'"),
+        ("--methods sac iql --reference sac", "--data: iql learns from real data"),
+        ("--methods sac", "--reference: there is no 'h2oplus'"),
+        ("--data nowhere.hdf5", "--data nowhere.hdf5: no such file"),
+        ("--gaps gravitiy --methods sac --reference sac", "gravitiy"),
+        ("--seeds 0", "--seeds is 0: must be at least 1"),
+    ],
+)
+def test_bad_input(words, said, tmp_path, ran, capsys):
+    (tmp_path / "set.hdf5").touch()
+    with pytest.raises(SystemExit) as stopped:
+        cli.run_main(
+            compare_hybrid.main, compare_hybrid.CompareHybridArgs, "Compare.",
+            argv=[*words.replace("SET", f"{tmp_path}/set.hdf5").split(), "--out", str(tmp_path / "runs")],
+        )  # fmt: skip
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and error.count("\n") == 1 and said in error
+    assert ran == []

@@ -1,0 +1,81 @@
+"""Tables of methods on data sets and simulators, against numbers by hand."""
+
+import numpy as np
+import pytest
+
+from sgft_jax.analysis import hybrid
+from sgft_jax.analysis.hybrid import EVERY, Outcome, Results
+from sgft_jax.hybrid.scores import BOUNDS
+
+LOW, HIGH = BOUNDS["halfcheetah"]
+
+
+def of_scale(*scores):
+    """Returns with these scores on D4RL's scale."""
+    return np.array([LOW + x / 100 * (HIGH - LOW) for x in scores])
+
+
+def results(*outcomes, task="halfcheetah", score="return", methods=("h2oplus", "iql", "sac")):
+    return Results(task, score, ("replay", "medium"), ("gravity", "friction"), methods, outcomes)
+
+
+def rows(text):
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines()[2:]]
+
+
+FOUND = results(
+    Outcome("h2oplus", "replay", "gravity", of_scale(50, 60, 70)),
+    Outcome("h2oplus", "replay", "friction", of_scale(10, 20, 30)),
+    Outcome("h2oplus", "medium", "gravity", of_scale(80, 80, 80)),
+    Outcome("iql", "replay", EVERY, of_scale(40, 40, 40)),
+    Outcome("iql", "medium", EVERY, of_scale(55, 45, 50)),
+    Outcome("sac", EVERY, "gravity", of_scale(0, 0, 0)),
+    Outcome("sac", EVERY, "friction", of_scale(30, 30, 30)),
+)
+
+
+def test_a_run_stands_in_every_row_that_it_belongs_to():
+    """In returns: 60 points of 12,415 above -280 are 7,169; the std of 50, 60, 70 is 8.165 points, 1,014."""
+    found = rows(hybrid.cells(FOUND))
+    assert found[0] == ["replay", "gravity", "7,169 ± 1,014", "4,686 ± 0", "-280 ± 0"]
+    assert [row[3] for row in found] == ["4,686 ± 0", "4,686 ± 0", "5,927 ± 507", "5,927 ± 507"]
+    assert [row[2] for row in found][2:] == ["9,652 ± 0", "-"]
+    assert [row[4] for row in found] == ["-280 ± 0", "3,444 ± 0"] * 2
+
+
+def test_the_mean_over_simulators_needs_all_of_them():
+    found = rows(hybrid.headline(FOUND))
+    assert found[0][1].startswith("40.0 [") and found[0][2:] == ["40.0", "15.0"]
+    assert found[1][1] == "-" and found[1][2].startswith("50.0 [") and found[1][3] == "15.0"
+
+
+def test_intervals_draw_seeds_within_a_simulator():
+    """The spread between simulators, 60 and 20, does not widen the mean of 50, 60, 70 and of 10, 20, 30."""
+    band = hybrid.overall(FOUND, "h2oplus", "replay")
+    assert band is not None and band.estimate == pytest.approx(40) and 30 < band.low < 36 and 44 < band.high < 50
+    alone = hybrid.overall(results(Outcome("iql", "replay", EVERY, of_scale(40, 50, 60))), "iql", "replay")
+    # one run, not two strata: a resample of three has the std 8.165 / sqrt(3) = 4.7
+    assert alone is not None and alone.low == pytest.approx(40, abs=3.4) and alone.high == pytest.approx(60, abs=3.4)
+    few = hybrid.overall(results(Outcome("iql", "replay", EVERY, of_scale(40, 50))), "iql", "replay")
+    assert few is not None and np.isnan(few.low)
+
+
+def test_two_seeds_on_many_simulators_give_no_interval():
+    found = results(*(Outcome("h2oplus", "replay", gap, of_scale(1, 2)) for gap in ("gravity", "friction")))
+    band = hybrid.overall(found, "h2oplus", "replay")
+    assert band is not None and np.isnan(band.low)
+
+
+def test_probability_of_improvement():
+    """On gravity all seeds are better than IQL's 40, on friction none; of IQL's medium on gravity alone, all."""
+    found = rows(hybrid.duels(FOUND, "h2oplus"))
+    assert found[0][1].startswith("50") and found[1][1].startswith("100")
+    # SAC: all are better on gravity; on friction 10, 20, 30 against 30: half of a third, 1/6; mean 58 %
+    assert found[0][2].startswith("58 ")
+
+
+def test_tasks_without_a_scale_are_in_their_own():
+    found = results(Outcome("iql", "replay", EVERY, np.array([0.25, 0.75, 0.5])), task="toy", score="success")
+    assert rows(hybrid.headline(found))[0][2].startswith("50 [")
+    assert rows(hybrid.cells(found))[0][3] == "50 ± 20"
+    assert rows(hybrid.cells(found))[2][3] == "-"
