@@ -2,15 +2,16 @@
 
 SAC learns in the system itself, in a few environments. When its exploring policy returns --level on average, its whole
 experience is written as `replay`, and episodes of that policy as `medium`: the sets of D4RL, made anew. With --policy
-nothing is learned, and episodes of that policy are written. Files are in the layouts of D4RL and of Minari.
+nothing is learned, and episodes of that policy are written. Files are in the layouts of D4RL and of Minari. With
+--operator someone keeps a wheel-legged robot up by hand, and the log is a text file.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from envs.gaps import SIM
+from envs.gaps import SIM, title
 from experiments import cli
 from experiments.options import Impl, at_least_one, check_task, seed_list
 from sgft_jax import extend
@@ -18,6 +19,8 @@ from sgft_jax.types import UserError
 
 LEVELS = {"halfcheetah": 4770.0, "walker2d": 2850.0}  # mean returns of D4RL's medium sets, v2
 PAIR = ("medium-replay", "medium")
+ROBOTS = {"wheel-legged": 0.0, "wheel-legged-forward": 0.2}  # tasks with an operator, and the speed it wants, m/s
+_LOG, _SET = 16_588, 1_000_000  # transitions of H2O+'s logs of the robot, and of D4RL's medium sets
 
 
 @dataclass(frozen=True)
@@ -30,10 +33,12 @@ class CollectArgs:
     """The real system: a gap by name or as a file, or sim for the task as it is."""
     policy: Path | None = None
     """Folder of a policy that another command has left (policy/seed-0, prior/seed-0): record it, learn nothing."""
+    operator: bool = False
+    """Of a wheel-legged robot: record someone who keeps it up by hand, learn nothing."""
     level: float | None = None
     """Mean return at which learning stops; default: that of D4RL's medium set, where there is one."""
-    transitions: int = 1_000_000
-    """Transitions of the set of one policy."""
+    transitions: int | None = None
+    """Transitions of the set of one policy, or of the log of an operator; default: 1,000,000 and 16,588."""
     seeds: int = 1
     """Number of seeds, all in one program."""
     out: Path = Path("runs/data")
@@ -65,6 +70,9 @@ def is_d4rls(args: CollectArgs) -> bool:
 
 def targets(args: CollectArgs) -> list[Path]:
     """The files that a call writes. Minari's folder beside a file has its name with `-v0` for the ending."""
+    if args.operator:
+        name = f"{extend.name_of(args.task)}-{title(args.real)}-operator"
+        return [args.out / f"{name}-seed-{seed}.txt" for seed in seed_list(args.seed, args.seeds)]
     if args.policy is not None:
         kinds = [(extend.name_of(args.task), args.policy.parent.parent.name, args.policy.name)]
         return [args.out / f"{'-'.join(filter(None, kinds[0]))}.hdf5"]
@@ -77,8 +85,12 @@ def check(args: CollectArgs) -> float:
     at_least_one(args, "transitions", "environments", "updates", "eval_every", "eval_episodes")
     seed_list(args.seed, args.seeds)
     check_task(args.task, [] if args.real == SIM else [args.real])
+    if args.operator and args.task not in ROBOTS:
+        raise UserError(f"--operator: {extend.name_of(args.task)} has none, only {', '.join(ROBOTS)}")
+    if args.operator and args.policy is not None:
+        raise UserError("--operator and --policy exclude each other: record one of them")
     level = args.level if args.level is not None else LEVELS.get(extend.name_of(args.task))
-    if args.policy is None and level is None:
+    if args.policy is None and level is None and not args.operator:
         raise UserError(f"--level: say at which mean return learning stops; only {', '.join(LEVELS)} have a default")
     if args.policy is not None and not args.policy.is_dir():
         raise UserError(f"--policy {args.policy}: no such folder")
@@ -94,10 +106,19 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def collect(args: CollectArgs) -> list[dict[str, Any]]:
     """Records and writes; returns what each file holds."""
+    args = replace(args, transitions=args.transitions if args.transitions is not None else _default(args))
     level = check(args)
+    if args.operator:
+        from experiments.collect_operator import operate  # JAX starts here
+
+        return operate(args)
     from experiments.collect_run import record, teach  # JAX starts here
 
     return teach(args, level) if args.policy is None else record(args)
+
+
+def _default(args: CollectArgs) -> int:
+    return _LOG if args.operator else _SET
 
 
 if __name__ == "__main__":

@@ -14,6 +14,8 @@ from sgft_jax.pretraining import Best, keep_better
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.types import Array, Key, Metrics, Policy, PyTree
 
+SCORES = ("score", "success", "return", "exploded")  # of every task, see `scores`
+
 
 def play(system: Simulated, policy: Policy, params: PyTree, key: Key, episodes: int) -> Episode:
     """Episodes [M, episodes] of each of M policies without exploration, as NumPy arrays on every host.

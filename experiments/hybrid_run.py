@@ -16,12 +16,13 @@ from envs.base import Env, World
 from envs.gaps import SIM, Gap
 from envs.pools import real_worlds
 from envs.rollout import Episode
-from experiments.evaluation import play, scores
+from experiments.evaluation import SCORES, play, scores
 from experiments.hybrid_args import NO_SIMULATOR, VOLATILE, HybridArgs, gaps_of, run_folder
 from experiments.stacking import join, member, part
 from experiments.video import film
 from sgft_jax.data import logs
 from sgft_jax.hybrid import trainer
+from sgft_jax.hybrid.robot import MEASURES
 from sgft_jax.hybrid.scores import normalised
 from sgft_jax.hybrid.trainer import HybridState
 from sgft_jax.io import checkpoint, runs
@@ -172,10 +173,19 @@ class _Run:
         return before // every != done * self.chunk // every or done == self.args.schedule.chunks
 
     def _evaluate(self, state: HybridState, done: int) -> float:
-        found = scores(self._play(state, self.args.eval_episodes))
+        played = self._play(state, self.args.eval_episodes)
+        found = scores(played) | self._measures(played)
         for log, own in zip(self.logs, self._each(found), strict=True):
             log.eval(done * self.chunk, own)
         return float(found["score"].mean())
+
+    def _measures(self, played: Episode) -> Metrics:
+        """What else the task is judged by, [M] means over episodes."""
+        measure = MEASURES.get(self.env.name)
+        if measure is None:
+            return {}
+        found = measure(played.transitions.next_obs, played.valid, dt=self.env.control_dt)
+        return {name: values.mean(-1) for name, values in found.items()}
 
     def _play(self, state: HybridState, episodes: int) -> Episode:
         """Episodes [M, episodes] in the real system, always the same starts."""
@@ -222,8 +232,10 @@ class _Run:
 
     def _summary(self, folder: Path, gap: Gap) -> dict[str, Any]:
         """Score of each seed at the last evaluation, and the mean over the last ten."""
-        curve = np.array([line["score"] for line in read_jsonl(folder / EVAL)])
+        lines = read_jsonl(folder / EVAL)
+        curve = np.array([line["score"] for line in lines])
         last, late = curve[-1], curve[-_LATE:].mean(0)
+        others = {name: lines[-1][name] for name in lines[-1] if name not in ("step", *SCORES)}
         return {
             "task": self.env.name,
             "method": self.method.name,
@@ -238,6 +250,7 @@ class _Run:
             "last": last.tolist(),
             "late": late.tolist(),
             "normalised": [normalised(self.env.name, x) for x in last.tolist()],
+            "measures": others,
         }
 
     def _film(self, folder: Path, played: Episode) -> str:
@@ -253,4 +266,6 @@ class _Run:
             f"{gap.name}: {self.env.score} in the real system {last.mean():.4g} (std over seeds {last.std():.3g}) "
             f"after {summary['updates']:,} updates{scale}; mean of the last {_LATE} evaluations {late.mean():.4g}"
         )
+        for name, values in summary["measures"].items():
+            print(f"  {name}: {np.mean(values):.3g} (std over seeds {np.std(values):.2g})")
         print(f"results: {folder}  (policy/, summary.json, eval.jsonl)")

@@ -167,6 +167,21 @@ def _infos(own: Recorded) -> dict[str, np.ndarray]:
     return found
 
 
+def write_table(path: Path, episodes: Sequence[Recorded], *, scale: float) -> None:
+    """A text file as `logs.load_table` reads it: episodes of the wheel-legged robot, whose obs are [T + 1, 4].
+
+    scale: N m at an action of 1. The state in which an episode ended is a row of its own, with `done` where it fell.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = [
+        np.column_stack([own.obs, np.append(scale * own.action[:, 0], 0.0), np.append(0 * own.reward, own.terminated)])
+        for own in episodes
+    ]
+    part = path.with_name(f".{path.name}.part")
+    np.savetxt(part, np.concatenate(rows), fmt="%.8g")
+    part.replace(path)
+
+
 def write_minari(folder: Path, episodes: Sequence[Recorded], about: Mapping[str, str]) -> None:
     """A data set in Minari's layout: `<folder>/data/main_data.hdf5` and `metadata.json`.
 

@@ -115,6 +115,20 @@ def test_joints_and_densities_lie_beside_what_was_observed(tmp_path):
         assert "infos" not in file
 
 
+def test_a_table_is_read_again(tmp_path):
+    """Of two episodes one falls after three steps, the other is cut off after two: five transitions, one terminal."""
+    states = np.arange(28, dtype=np.float32).reshape(7, 4) / 64
+    fallen = Recorded(states[:4], np.float32([[0.5], [-1.0], [1.0]]), np.zeros(3, np.float32), terminated=True)
+    cut_off = Recorded(states[4:], np.float32([[0.25], [0.0]]), np.zeros(2, np.float32), terminated=False)
+    recording.write_table(tmp_path / "new" / "log.txt", [fallen, cut_off], scale=3.0)
+    log = logs.load_table(tmp_path / "new" / "log.txt", gamma=0.9, obs_dim=4, reward=lambda *step: step[0][:, 0])
+    np.testing.assert_array_equal(log.rows.obs, states[[0, 1, 2, 4, 5]])
+    np.testing.assert_array_equal(log.rows.next_obs, states[[1, 2, 3, 5, 6]])
+    np.testing.assert_allclose(log.rows.action[:, 0], [0.5, -1.0, 1.0, 0.25, 0.0])
+    np.testing.assert_allclose(log.rows.discount, [0.9, 0.9, 0.0, 0.9, 0.9])
+    assert log.last.tolist() == [False, False, True, False, True] and log.facts.dropped == 2
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")  # its advice on authors and links
 def test_minaris_own_library_opens_a_set(tmp_path, monkeypatch):
     minari = pytest.importorskip("minari", reason="Minari's library is not installed: pip install 'sgft-jax[minari]'")
@@ -123,6 +137,7 @@ def test_minaris_own_library_opens_a_set(tmp_path, monkeypatch):
     found = list(minari.MinariDataset(tmp_path / "toy" / "point-v0" / "data").iterate_episodes())
     assert [len(own.rewards) for own in found] == [3, 2] and found[0].terminations.tolist() == [False, False, True]
     np.testing.assert_array_equal(found[1].observations[:, 0], [50, 51, 52])
+    np.testing.assert_array_equal(found[1].infos["qpos"][:, 0], [50.5, 51.5, 52.5])
 
 
 def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys, monkeypatch):
@@ -204,6 +219,9 @@ def test_sets_made_in_another_way_are_not_judged(changes, judged):
             "--level 1e+09: no seed reached it",
         ),
         (["--environments", "0"], "--environments is 0: must be at least 1"),
+        (["--transitions", "0"], "--transitions is 0: must be at least 1"),
+        (["--operator"], "--operator: halfcheetah has none, only wheel-legged, wheel-legged-forward"),
+        (["--task", "wheel-legged", "--operator", "--policy", "."], "--operator and --policy exclude each other"),
     ],
 )
 def test_bad_input(words, said, tmp_path, capsys):
@@ -212,6 +230,20 @@ def test_bad_input(words, said, tmp_path, capsys):
     error = capsys.readouterr().err
     assert stopped.value.code == 2 and said in error and error.count("\n") == 1
     assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "reward"), [("wheel-legged", 29.0), ("wheel-legged-forward", 14.4)])
+def test_the_log_of_an_operator_resembles_the_published_one(task, reward, tmp_path):
+    """Spread within a factor of two of that of H2O+'s log, reward of a step within 1 % or 0.3."""
+    args = collect.CollectArgs(task=task, real="robot", operator=True, transitions=6_000, out=tmp_path, impl="c")
+    (facts,) = collect.collect(args)
+    published = {"v": 0.197, "pitch": 0.0475, "pitch velocity": 0.534, "torque": 0.719}
+    for name, value in published.items():
+        assert value / 2 < facts["std"][name] < 2 * value, name
+    assert next(iter(facts["reward"].values())) == pytest.approx(reward, abs=0.3)
+    (log,) = tmp_path.glob(f"{task}-robot-operator-seed-0.txt")
+    assert facts["transitions"] == 6_000 and json.loads(log.with_suffix(".json").read_text())["std"] == facts["std"]
 
 
 def test_files_are_not_replaced(tmp_path, capsys):

@@ -76,7 +76,7 @@ def test_a_run_leaves_curves_policies_and_a_summary_for_each_simulator(tmp_path,
         assert [line["step"] for line in read_jsonl(folder / "metrics.jsonl")] == [6, 12, 18, 24]
         summary = json.loads((folder / "summary.json").read_text())
         assert summary["last"] == evaluations[-1]["score"] and summary["updates"] == 24
-        assert summary["data"]["transitions"] == 60 and summary["gap"]["name"] == name
+        assert summary["data"]["transitions"] == 60 and summary["gap"]["name"] == name and not summary["measures"]
         np.testing.assert_allclose(summary["late"], np.mean([line["score"] for line in evaluations], axis=0))
         policy = sgft_jax.load_policy(folder / "policy/seed-1")
         action = np.asarray(policy.act([0.5, 0.0, 0.0, 0.0]))
@@ -169,6 +169,9 @@ def test_a_table_of_the_wheel_legged_robot(tmp_path):
     folder = tmp_path / "hybrid/wheel-legged/sim-for-robot/standing.txt/h2oplus/seed-0"
     summary = json.loads((folder / "summary.json").read_text())
     assert (summary["real"], summary["data"]["layout"], summary["data"]["transitions"]) == ("robot", "table", 79)
+    last = read_jsonl(folder / "eval.jsonl")[-1]
+    assert summary["measures"] == {name: last[name] for name in ("upright_s", "in_place_s")}
+    assert 0 < last["in_place_s"][0] <= last["upright_s"][0] < 10  # s: it has not learned to stand
 
 
 def test_returns_on_the_scale_of_d4rl():

@@ -207,3 +207,15 @@ def test_an_exported_policy_acts_as_the_agent(name):
     card = {**agent.card, "config": {}}
     again, _ = make_policy(card, ENV).act(agent.export(state), (), obs, key, explore=False)
     np.testing.assert_allclose(again, own, atol=1e-6)
+
+
+def test_notes_lie_beside_their_rows():
+    """Also of the first batch, and after old rows were overwritten."""
+    note = lambda learner, before, action, after: (before.obs, action, after.obs)  # noqa: E731
+    schedule = dataclasses.replace(SCHEDULE, updates=12, buffer=20)
+    state, _ = played(build("sac"), schedule, note=note)[-1]
+    (obs, action, next_obs), rows = state.notes.data, state.simulated.data
+    assert int(state.notes.position[0]) == int(state.simulated.position[0]) and int(state.notes.size[0]) == 20
+    for kept, own in ((obs, rows.obs), (action, rows.action), (next_obs, rows.next_obs)):
+        np.testing.assert_array_equal(kept, own)
+    assert np.abs(action).max() > 0

@@ -1,0 +1,80 @@
+"""Impure: logs of someone who keeps a wheel-legged robot up by hand. `experiments.collect --operator` writes them."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from envs import gaps
+from envs.base import Env
+from envs.locomotion import wheel_forward, wheel_legged
+from envs.locomotion.wheel_operator import nominal_gain, operator
+from envs.pools import real_env, real_worlds
+from envs.rollout import play_episode
+from experiments.collect import ROBOTS, CollectArgs, targets
+from experiments.options import seed_list
+from experiments.stacking import member
+from sgft_jax.data import logs
+from sgft_jax.data.recording import Recorded, cut, of_episodes, write_table
+from sgft_jax.io import runs
+from sgft_jax.io.jsonfile import write_json
+
+_NAMES = ("v", "pitch", "pitch velocity", "torque")  # columns 1 to 4
+
+
+def operate(args: CollectArgs) -> list[dict[str, Any]]:
+    """The log of each seed; returns what the files hold."""
+    env = envs.make("wheel-legged", args.impl)  # an operator sees where the robot is, whatever the task tells
+    gap = gaps.load(env, args.real)
+    env = real_env(env, [gap])
+    pool = member(real_worlds(env, [gap], jax.random.key(0)), 0)
+    policy, gain = operator(ROBOTS[args.task]), jnp.asarray(nominal_gain(), jnp.float32)
+    act = lambda carry, obs, key: policy.act(gain, carry, obs, key, explore=True)  # noqa: E731
+
+    def play(key: Any) -> Any:
+        return play_episode(env, pool, act, policy.init_carry(), key, gamma=1.0, length=args.transitions)
+
+    play = jax.jit(jax.vmap(play))
+    return [
+        _write(args, env, path, _enough(play, args.transitions or 0, seed))
+        for path, seed in zip(targets(args), seed_list(args.seed, args.seeds), strict=True)
+    ]
+
+
+def _enough(play: Any, transitions: int, seed: int) -> list[Recorded]:
+    """Episodes until there are transitions enough: a robot that has fallen is put up again."""
+    key, found = jax.random.key(seed), []
+    while sum(len(own.reward) for own in found) < transitions:
+        key, key_now = jax.random.split(key)
+        found += of_episodes(play(key_now[None]))
+    return cut(found, transitions)
+
+
+def _write(args: CollectArgs, env: Env, path: Path, episodes: list[Recorded]) -> dict[str, Any]:
+    """The log and its card; says how it compares with what is published of the real one."""
+    write_table(path, episodes, scale=wheel_legged.TORQUE)
+    assert env.reward is not None
+    log = logs.load_table(path, gamma=1.0, obs_dim=env.obs_dim, reward=jax.vmap(env.reward))
+    rows, seen = log.rows, np.asarray(log.rows.obs)
+    spread = [*seen[:, 1:].std(0), wheel_legged.TORQUE * np.asarray(rows.action).std()]
+    rewards = {"moving": jax.vmap(wheel_forward.reward)(rows.obs[:, 1:], rows.action, rows.next_obs[:, 1:])}
+    if not ROBOTS[args.task]:  # a robot that moves on has left its place
+        rewards = {"standing": rows.reward, **rewards}
+    facts = {
+        **dataclasses.asdict(log.facts),
+        "path": path.name,
+        "std": dict(zip(_NAMES, map(float, spread), strict=True)),
+        "reward": {name: float(np.mean(values)) for name, values in rewards.items()},
+    }
+    said = ", ".join(f"{name} {value:.3g}" for name, value in facts["std"].items())
+    earned = ", ".join(f"{value:.2f} {name}" for name, value in facts["reward"].items())
+    print(
+        f"{path}: {log.facts.transitions:,} transitions, {log.facts.terminal} falls; std of {said}; "
+        f"reward of a step {earned}"
+    )
+    write_json(path.with_suffix(".json"), {**facts, "real": args.real, "provenance": runs.provenance()})
+    return facts
