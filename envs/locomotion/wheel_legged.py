@@ -14,7 +14,7 @@ import mujoco
 import numpy as np
 
 from envs.base import Entry, Env, Parameter
-from envs.locomotion.planar import NO_CONTACT
+from envs.locomotion.planar import BLUE, LIGHT, NO_CONTACT, ORANGE
 from envs.mujoco.scene import Scene, View, make_env
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array, Key
@@ -63,7 +63,7 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     body = axle.add_body(name="body")
     body.add_joint(name="pitch", type=hinge, axis=[0, 1, 0])
     com, mass = [theta["com_x"], 0, theta["com_height"]], theta["mass"] - WHEEL_MASS
-    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=com, size=BODY_HALF, mass=mass, rgba=[0.85, 0.86, 0.88, 1])
+    body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=com, size=BODY_HALF, mass=mass, rgba=LIGHT)
     _add_legs(body, theta["com_height"])
     wheel = spec.add_tendon(name="wheel")
     wheel.wrap_joint("x", 1 / WHEEL_RADIUS)
@@ -121,6 +121,13 @@ def fallen(pitch: Array) -> Array:
     return jnp.abs(pitch) > FALLEN
 
 
+def mark(spec: mujoco.MjSpec) -> None:
+    """A line on the floor at x = 0, the place to stand at."""
+    spec.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX, pos=[0, 0, 0], size=[0.008, 0.3, 0.002], rgba=ORANGE, **NO_CONTACT,
+    )  # fmt: skip
+
+
 SCENE = Scene(
     name="wheel-legged",
     observation=tuple(ENTRIES.values()),
@@ -139,7 +146,8 @@ SCENE = Scene(
     terminated=terminated,
     score="return",
     max_speed=500.0,
-    view=View((0.0, 0.0, 0.1), 1.6, 90.0, -12.0, floor=0.0, follow="axle"),
+    dress=mark,
+    view=View((0.0, 0.0, 0.12), 1.25, 118.0, -14.0, floor=0.0, follow="axle"),
 )
 
 
@@ -163,6 +171,6 @@ def _add_legs(body: mujoco.MjsBody, height: float) -> None:
     capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
     for y in (-0.12, 0.12):
         body.add_geom(
-            type=capsule, fromto=[0, y, 0, 0, y, height], size=[0.015, 0, 0], mass=0, rgba=[0.30, 0.46, 0.68, 1],
+            type=capsule, fromto=[0, y, 0, 0, y, height], size=[0.015, 0, 0], mass=0, rgba=BLUE,
             **NO_CONTACT,
         )  # fmt: skip

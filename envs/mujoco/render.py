@@ -18,6 +18,8 @@ SIZE = 360, 480  # height, width in pixels
 CAPTION = 52  # pixels, height of the strip above a captioned video
 JUMP = 0.5  # m or rad in one control step: an event, such as a puck that fell, and nothing to draw in between
 SUPERSAMPLING = 2  # drawn so many times larger, then averaged: smooth edges on every backend
+TILE, TILES = 0.75, 16  # m, of a tile of the floor; how many there are along each side
+_GROUND = "ground"
 _NO_CONTACT = {"contype": 0, "conaffinity": 0}
 
 
@@ -71,13 +73,23 @@ def _frames(scene: Scene, theta: Mapping[str, float] | Sequence[float], qpos: np
     try:
         for row in smooth(np.asarray(qpos), control_dt=scene.control_dt, fps=FPS / SPEED):
             data.qpos[:] = row
-            mujoco.mj_forward(model, data)
             if scene.view is not None and scene.view.follow:
-                camera.lookat[:] = data.body(scene.view.follow).xpos + scene.view.target
+                _follow(model, data, scene.view, camera)
+            mujoco.mj_forward(model, data)
             renderer.update_scene(data, camera)
             yield _shrink(renderer.render())
     finally:
         renderer.close()
+
+
+def _follow(model: mujoco.MjModel, data: mujoco.MjData, view: View, camera: mujoco.MjvCamera) -> None:
+    """Takes the camera and the floor along. The floor goes by whole pairs of tiles: they seem to stay."""
+    mujoco.mj_kinematics(model, data)
+    place = data.body(view.follow).xpos
+    camera.lookat[:] = place + view.target
+    if view.floor is not None:
+        ground = model.body(_GROUND).mocapid[0]
+        data.mocap_pos[ground, :2] = 2 * TILE * np.round(place[:2] / (2 * TILE))
 
 
 def dressed(scene: Scene, theta: dict[str, float]) -> mujoco.MjSpec:
@@ -85,10 +97,11 @@ def dressed(scene: Scene, theta: dict[str, float]) -> mujoco.MjSpec:
     spec = scene.build(theta)
     scene.dress(spec)
     _add_surroundings(spec, scene.view)
-    _add_lights(spec, shadows=scene.view is None or not scene.view.follow)
+    _add_lights(spec, follow=scene.view.follow if scene.view else "")
     visual = spec.visual
     visual.map.znear, visual.map.zfar = 0.02, 20
     visual.quality.shadowsize, visual.quality.offsamples = 2048, 0
+    visual.map.shadowclip = 3  # shadows reach further than the picture: MuJoCo draws stripes where they end
     visual.global_.offheight, visual.global_.offwidth = (SUPERSAMPLING * n for n in SIZE)
     return spec
 
@@ -101,27 +114,25 @@ def _add_surroundings(spec: mujoco.MjSpec, view: View | None) -> None:
     if view is None or view.floor is None:
         return
     spec.add_texture(name="tiles", type=flat, builtin=checker, rgb1=[0.84, 0.85, 0.87], rgb2=[0.78, 0.8, 0.82], **look)
-    tiles = spec.add_material(name="tiles", texrepeat=[8, 8], reflectance=0.0)
+    tiles = spec.add_material(name="tiles", texrepeat=[TILES / 2, TILES / 2], reflectance=0.0)
     tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
-    plane = mujoco.mjtGeom.mjGEOM_PLANE
-    size = [0, 0, 0.1] if view.follow else [6, 6, 0.1]  # 0 is without end
-    spec.worldbody.add_geom(type=plane, size=size, pos=[0, 0, view.floor], material="tiles", **_NO_CONTACT)
+    ground = spec.worldbody.add_body(name=_GROUND, mocap=True, pos=[0, 0, view.floor])
+    half = TILE * TILES / 2
+    ground.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[half, half, 0.1], material="tiles", **_NO_CONTACT)
 
 
-def _add_lights(spec: mujoco.MjSpec, *, shadows: bool) -> None:
-    """shadows: not on a floor without end, where MuJoCo draws stripes."""
+def _add_lights(spec: mujoco.MjSpec, *, follow: str) -> None:
+    """follow: the body that the light which casts shadows keeps beside: shadows end some metres from a light."""
     for light in spec.lights:
         spec.delete(light)
     sun = mujoco.mjtLightType.mjLIGHT_DIRECTIONAL
     add = spec.worldbody.add_light
-    add(
-        type=sun,
-        pos=[0.9, -1.0, 2.5],
-        dir=[-0.35, 0.4, -1.0],
-        diffuse=[0.5] * 3,
-        specular=[0.2] * 3,
-        castshadow=shadows,
-    )
+    home = spec.body(follow) if follow else spec.worldbody
+    track = mujoco.mjtCamLight.mjCAMLIGHT_TRACK if follow else mujoco.mjtCamLight.mjCAMLIGHT_FIXED
+    home.add_light(
+        type=sun, mode=track, pos=[0.9, -1.0, 2.5], dir=[-0.35, 0.4, -1.0], diffuse=[0.5] * 3, specular=[0.2] * 3,
+        castshadow=True,
+    )  # fmt: skip
     add(type=sun, pos=[0.5, 1.5, 2.0], dir=[0.3, -0.7, -0.6], diffuse=[0.2] * 3, specular=[0.0] * 3, castshadow=False)
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.35] * 3, [0.2] * 3
 
