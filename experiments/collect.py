@@ -68,6 +68,11 @@ def is_d4rls(args: CollectArgs) -> bool:
     return args.real == SIM and args.policy is None and args.level in (None, LEVELS.get(args.task))
 
 
+def transitions_of(args: CollectArgs) -> int:
+    """Transitions of the set of one policy, or of the log of an operator."""
+    return args.transitions if args.transitions is not None else _LOG if args.operator else _SET
+
+
 def targets(args: CollectArgs) -> list[Path]:
     """The files that a call writes. Minari's folder beside a file has its name with `-v0` for the ending."""
     if args.operator:
@@ -82,6 +87,7 @@ def targets(args: CollectArgs) -> list[Path]:
 
 def check(args: CollectArgs) -> float:
     """The level; raises UserError for what is wrong in the arguments and on disk."""
+    args = replace(args, transitions=transitions_of(args))
     at_least_one(args, "transitions", "environments", "updates", "eval_every", "eval_episodes")
     seed_list(args.seed, args.seeds)
     check_task(args.task, [] if args.real == SIM else [args.real])
@@ -106,7 +112,6 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def collect(args: CollectArgs) -> list[dict[str, Any]]:
     """Records and writes; returns what each file holds."""
-    args = replace(args, transitions=args.transitions if args.transitions is not None else _default(args))
     level = check(args)
     if args.operator:
         from experiments.collect_operator import operate  # JAX starts here
@@ -115,10 +120,6 @@ def collect(args: CollectArgs) -> list[dict[str, Any]]:
     from experiments.collect_run import record, teach  # JAX starts here
 
     return teach(args, level) if args.policy is None else record(args)
-
-
-def _default(args: CollectArgs) -> int:
-    return _LOG if args.operator else _SET
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from envs.locomotion import wheel_forward, wheel_legged
 from envs.locomotion.wheel_operator import nominal_gain, operator
 from envs.pools import real_env, real_worlds
 from envs.rollout import play_episode
-from experiments.collect import ROBOTS, CollectArgs, targets
+from experiments.collect import ROBOTS, CollectArgs, targets, transitions_of
 from experiments.options import seed_list
 from experiments.stacking import member
 from sgft_jax.data import logs
@@ -36,11 +36,11 @@ def operate(args: CollectArgs) -> list[dict[str, Any]]:
     act = lambda carry, obs, key: policy.act(gain, carry, obs, key, explore=True)  # noqa: E731
 
     def play(key: Any) -> Any:
-        return play_episode(env, pool, act, policy.init_carry(), key, gamma=1.0, length=args.transitions)
+        return play_episode(env, pool, act, policy.init_carry(), key, gamma=1.0, length=transitions_of(args))
 
     play = jax.jit(jax.vmap(play))
     return [
-        _write(args, env, path, _enough(play, args.transitions or 0, seed))
+        _write(args, env, path, _enough(play, transitions_of(args), seed))
         for path, seed in zip(targets(args), seed_list(args.seed, args.seeds), strict=True)
     ]
 

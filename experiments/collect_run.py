@@ -16,7 +16,7 @@ from envs import gaps
 from envs.base import Env, EnvState
 from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
-from experiments.collect import PAIR, CollectArgs, is_d4rls, name_of, targets
+from experiments.collect import PAIR, CollectArgs, is_d4rls, name_of, targets, transitions_of
 from experiments.options import seed_list
 from experiments.stacking import member
 from sgft_jax.data import acceptance, logs
@@ -148,15 +148,16 @@ def _play(args: CollectArgs, env: Env, system: Simulated, policy: Policy, params
     alone = system.moved(system.pools, jnp.zeros(1, jnp.int32))
     params = jax.tree.map(lambda x: jnp.asarray(x)[None], params)
     key, found, held = jax.random.fold_in(jax.random.key(seed), _RECORDING), [], 0
-    at_once = min(_AT_ONCE, math.ceil(args.transitions / env.episode_length))
-    while held < args.transitions:
+    wanted = transitions_of(args)
+    at_once = min(_AT_ONCE, math.ceil(wanted / env.episode_length))
+    while held < wanted:
         key, key_now = jax.random.split(key)
         played = member(_episodes(alone, policy, params, key_now, at_once), 0)
         new = of_episodes(played, _noted(policy, member(params, 0), played))
         found, held = found + new, held + sum(len(own.reward) for own in new)
         if not new:
             raise UserError(f"{env.name}: physics exploded in the first step of {at_once} episodes; nothing to record")
-    return cut(found, args.transitions)
+    return cut(found, wanted)
 
 
 def _write(args: CollectArgs, path: Path, episodes: Sequence[Recorded], *, kind: str = "") -> dict[str, Any]:

@@ -179,7 +179,7 @@ class _Run:
             log.eval(done * self.chunk, own)
         return float(found["score"].mean())
 
-    def _measures(self, played: Episode) -> Metrics:
+    def _measures(self, played: Episode) -> dict[str, Any]:
         """What else the task is judged by, [M] means over episodes."""
         measure = MEASURES.get(self.env.name)
         if measure is None:

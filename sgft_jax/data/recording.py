@@ -71,7 +71,7 @@ def of_fleet(rows: Transition, environments: int, noted: Noted | None = None) ->
     steps = len(rows.reward) // environments
     both = jax.tree.map(
         lambda x: np.asarray(x)[: steps * environments].reshape(steps, environments, *x.shape[1:]),
-        (_Rows(*rows), noted),
+        (_Rows(*map(np.asarray, rows)), noted),
     )
     shaped = both[0]
     jump = np.abs(shaped.next_obs[:-1] - shaped.obs[1:]) > _SAME * (1 + np.abs(shaped.obs[1:]))
@@ -90,7 +90,7 @@ def of_episodes(played: Episode, noted: Noted | None = None) -> list[Recorded]:
 
     noted: [n, T, ...], of their rows.
     """
-    both = jax.tree.map(np.asarray, (_Rows(*played.transitions), noted))
+    both = _Rows(*map(np.asarray, played.transitions)), jax.tree.map(np.asarray, noted)
     valid = np.asarray(played.valid)
     found = (jax.tree.map(lambda x, i=i: x[i][valid[i]], both) for i in range(len(valid)))
     return [_recorded(*own) for own in found if len(own[0].reward)]

@@ -22,6 +22,7 @@ from sgft_jax.types import Array, HybridAgent, Key, Metrics, PyTree, RealData
 
 # note(learner's state, before, action, after) -> what is kept of one simulated step beside its row
 Note = Callable[[PyTree, EnvState, Array, EnvState], PyTree]
+_Collected = tuple[Fleet, ReplayState, ReplayState | None]  # the simulators, their rows, notes on these
 
 
 class HybridState(NamedTuple):
@@ -109,7 +110,7 @@ def make_trainer(
 
     def vector_step(
         pool: World, agent_state: PyTree, fleet: Fleet, rows: ReplayState, notes: ReplayState | None, key: Key
-    ) -> tuple[Fleet, ReplayState, ReplayState | None]:
+    ) -> _Collected:
         """One step of all simulators under the exploring policy."""
         key_act, key_step = jax.random.split(key)
         act = functools.partial(learner.act, explore=True)
@@ -122,7 +123,7 @@ def make_trainer(
         return fleet, replay.add_batch(rows, new, valid), notes
 
     def collect(pool: World, state: HybridState, key: Key, steps: int) -> HybridState:
-        def one(carry: tuple, key: Key) -> tuple[tuple, None]:
+        def one(carry: _Collected, key: Key) -> tuple[_Collected, None]:
             return vector_step(pool, state.learner, *carry, key), None
 
         start = state.fleet, state.simulated, state.notes

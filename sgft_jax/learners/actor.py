@@ -1,6 +1,7 @@
 """What agents leave that act by an actor network alone."""
 
 import functools
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -37,7 +38,7 @@ def actor_policy(obs_dim: int, act_dim: int, network: NetworkConfig, head: Head)
     head: what its last layer says: that of `make_affine_actor`, `make_actor` or `make_deterministic_actor`. The last
     explores with noise of std 0.1, which is cut off at the bounds, so its actions have no density.
     """
-    log_prob = None
+    log_prob: Callable[[ACTORParams, Array, Array], Array] | None = None
     if head == "deterministic":
         point = make_deterministic_actor(obs_dim, act_dim, network)
 
@@ -51,9 +52,11 @@ def actor_policy(obs_dim: int, act_dim: int, network: NetworkConfig, head: Head)
         def choose(params: PyTree, obs: Array, key: Key, explore: bool | Array) -> Array:
             return tanh_gaussian_action(spread.apply(params, obs), key, explore=explore)
 
-        def log_prob(params: ACTORParams, obs: Array, action: Array) -> Array:
+        def density(params: ACTORParams, obs: Array, action: Array) -> Array:
             moments = spread.apply(params.actor, normalize(params.normalizer, obs))
             return tanh_gaussian_log_prob(moments, untanh(action))
+
+        log_prob = density
 
     def act(params: ACTORParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         return choose(params.actor, normalize(params.normalizer, obs), key, explore), carry
