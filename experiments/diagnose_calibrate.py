@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments import stacking
 from experiments.cli import columns
 from experiments.diagnose import DiagnoseArgs, config_of
 from experiments.diagnose_run import load, play_simulated, read
@@ -90,16 +91,17 @@ def gather(args: DiagnoseArgs, runs: Sequence[Path]) -> list[Cases]:
         if key not in examiners:
             env, priors = load(config["task"], args.impl, folders)
             examiner, simulated = Examiner(priors[0].card, env), play_simulated(env, priors, args.seed)
-            controls = [examiner.control(prior.params, own) for prior, own in zip(priors, simulated, strict=True)]
-            examiners[key] = (env, priors, examiner, controls)
-        env, priors, examiner, controls = examiners[key]
+            params = stacking.stack([prior.params for prior in priors])
+            examiners[key] = (env, priors, examiner, params, examiner.control(params, stacking.stack(simulated)))
+        env, priors, examiner, *known = examiners[key]
         rollouts, which = read(run, env, priors, COUNTS[-1])
         if (there := rollouts[0].valid.shape[0]) < COUNTS[-1]:
             raise UserError(f"{run}: holds {there} recorded rollouts, a calibration needs {COUNTS[-1]}")
         held = curve.rollouts <= AHEAD
-        for member, (own, p) in enumerate(zip(rollouts, which, strict=True)):
-            seen = examiner.examine(priors[p].params, controls[p], own, COUNTS).found
-            for i, found in enumerate(seen):
+        params, control = (stacking.member(x, np.array(which)) for x in known)
+        examined = examiner.examine(params, control, stacking.stack(rollouts), COUNTS)
+        for member, (own, p) in enumerate(zip(examined, which, strict=True)):
+            for i, found in enumerate(own.found):
                 inputs[i].append(prediction.inputs_of(found))
                 played[i].append(found["success"])
             success = curve.values[member, held]

@@ -55,8 +55,10 @@ def diagnose(
         )
         what = f"{_rollouts(count)} recorded in {recorded}"
     examiner, counts = Examiner(priors[0].card, env), counts_to(count)
-    controls = [examiner.control(prior.params, own) for prior, own in zip(priors, simulated, strict=True)]
-    each = [examiner.examine(priors[p].params, controls[p], own, counts) for own, p in zip(real, which, strict=True)]
+    params = stacking.stack([prior.params for prior in priors])
+    control = examiner.control(params, stacking.stack(simulated))
+    looks = [stacking.member(x, np.array(which)) for x in (params, control)]
+    each = examiner.examine(*looks, stacking.stack(real), counts)
     labels, same = [str(folders[p]) for p in which], all(own is real[0] for own in real)
     found = {
         "task": env.name,

@@ -45,41 +45,59 @@ class Look(NamedTuple):
 
 
 class Examiner:
-    """Examines rollouts of priors with one card on real systems of one task; its programs are compiled once."""
+    """Examines rollouts of priors with one card on real systems of one task; its programs are compiled once.
+
+    Everything has a leading axis of members: priors, or rollouts that a prior looks at. One program examines them all.
+    """
 
     def __init__(self, card: Mapping[str, Any], task: Task) -> None:
-        self.task, self._look = task, jax.jit(functools.partial(_look, card, task), static_argnames="real")
-        self._start = jax.jit(functools.partial(_start, card, task))
+        def look(real: bool) -> Any:
+            return jax.jit(jax.vmap(functools.partial(_look, card, task, real=real)))
+
+        self.task, self._simulated, self._real = task, look(False), look(True)
+        self._start = jax.jit(jax.vmap(functools.partial(_start, card, task)))
 
     def control(self, params: Any, simulated: Rollouts) -> "Control":
-        """What real rollouts are compared with. params: of the prior. simulated: of its exploring policy."""
-        begun = self._start(params, simulated)
-        return Control(begun, jax.device_get(self._look(params, begun, simulated, 0.0, real=False)))
-
-    def examine(self, params: Any, control: "Control", real: Rollouts, counts: Sequence[int]) -> "Examined":
-        """What the first `count` real rollouts say, for each of the counts.
-
-        Arrays keep their shapes from call to call, or everything is compiled again.
+        """What real rollouts are compared with. params: [P, ...] of the priors. simulated: [P, n], of their exploring
+        policies.
         """
-        found, looked = [], control.seen
+        begun = self._start(params, simulated)
+        unknown = jnp.zeros(simulated.success.shape[0])
+        return Control(begun, jax.device_get(self._simulated(params, begun, simulated, unknown)))
+
+    def examine(self, params: Any, control: "Control", real: Rollouts, counts: Sequence[int]) -> "list[Examined]":
+        """What the first `count` real rollouts of each member say, for each of the counts.
+
+        params, control: [M, ...], of the prior that looks at each. real: [M, n]. Arrays keep their shapes from call to
+        call, or everything is compiled again.
+        """
+        n = real.valid.shape[1]
+        looks = []
         for count in counts:
-            first = jnp.arange(real.valid.shape[0])[:, None] < count
-            some = real._replace(valid=jnp.asarray(real.valid) & first)
-            looked = jax.device_get(self._look(params, control.begun, some, control.seen.late.share, real=True))
-            found.append(describe(looked, control.seen, np.asarray(real.success)[:count], turns=self.task.cartesian))
-        return Examined(found, {"real": _points(looked), "simulated": _points(control.seen)})
+            some = real._replace(valid=jnp.asarray(real.valid) & (jnp.arange(n)[None, :, None] < count))
+            looks.append(jax.device_get(self._real(params, control.begun, some, control.seen.late.share)))
+        return [self._of(i, counts, looks, control.seen, np.asarray(real.success)) for i in range(len(real.success))]
+
+    def _of(self, i: int, counts: Sequence[int], looks: Sequence[Look], seen: Look, success: np.ndarray) -> "Examined":
+        """What was found of member i; looks, seen: [M, ...]."""
+        own, *each = (jax.tree.map(lambda x: x[i], look) for look in (seen, *looks))
+        found = [
+            describe(look, own, success[i, :count], turns=self.task.cartesian)
+            for count, look in zip(counts, each, strict=True)
+        ]
+        return Examined(found, {"real": _points(each[-1]), "simulated": _points(own)})
 
 
 class Control(NamedTuple):
-    """What a prior sees in simulation. begun: identification, before it has seen anything real. seen: the rest."""
+    """What priors see in simulation, [P, ...]. begun: identification before anything real is seen. seen: the rest."""
 
     begun: Identified
     seen: Look
 
 
 class Examined(NamedTuple):
-    """found: JSON data for each number of rollouts, see `describe`. points: by "real" (of the last of these) and
-    "simulated", V_sim and return [n] of visited states.
+    """Of one member. found: JSON data for each number of rollouts, see `describe`. points: by "real" (of the last of
+    these) and "simulated", V_sim and return [n] of visited states.
     """
 
     found: list[dict[str, Any]]

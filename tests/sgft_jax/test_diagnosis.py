@@ -186,11 +186,30 @@ def played(key, known, n=4, noise=0.0):
     return Rollouts(rows, jnp.ones((n, tuners.T), bool), jnp.arange(n) % 2 == 0)
 
 
+def members(*trees):
+    """Stacked on an axis of members."""
+    return jax.tree.map(lambda *x: jnp.stack(x), *trees)
+
+
+def twice(tree):
+    """The one member two times."""
+    return jax.tree.map(lambda x: jnp.concatenate([x, x]), tree)
+
+
+def found(examined):
+    """What was found of each member."""
+    return [own.found for own in examined]
+
+
 def test_an_examination_names_the_scale_and_counts_the_rollouts_it_is_given(examiner):
     weak = Distortion(jnp.diag(jnp.array([0.6, 1.0])), jnp.zeros(2), jnp.zeros(2))
-    params, simulated = agreed(), played(jax.random.key(0), distortion.none(2, 2), 8)
+    turned = Distortion(jnp.array([[0.0, -1.0], [1.0, 0.0]]), jnp.zeros(2), jnp.zeros(2))
+    params, simulated = members(agreed()), members(played(jax.random.key(0), distortion.none(2, 2), 8))
     control = examiner.control(params, simulated)
-    one, three = examiner.examine(params, control, played(jax.random.key(1), weak), (1, 3)).found
+    both = [played(jax.random.key(1), weak), played(jax.random.key(4), turned)]
+    first, second = found(examiner.examine(twice(params), twice(control), members(*both), (1, 3)))
+    assert second[1]["identified"]["rotation"] == pytest.approx(jnp.pi / 2, abs=0.05)  # each member has its own rows
+    one, three = first
     assert (one["rollouts"], one["success"]) == (1, 1.0) and three["success"] == pytest.approx(2 / 3)
     assert one["value"]["bias"] != three["value"]["bias"]
     assert three["identified"]["scale"] == pytest.approx([0.6, 1.0], abs=0.03) and three["identified"]["nats"] > 20
@@ -198,14 +217,15 @@ def test_an_examination_names_the_scale_and_counts_the_rollouts_it_is_given(exam
     assert usual < 1e-6 and identified < 0.1 * real
     assert three["identified"]["simulated"]["scale"] == [1.0, 1.0]
     overshoots = played(jax.random.key(3), Distortion(1.4 * jnp.eye(2), jnp.zeros(2), jnp.zeros(2)), 8)
-    (used_to_it,) = examiner.examine(params, examiner.control(params, overshoots), overshoots, (8,)).found
+    overshoots = members(overshoots)
+    ((used_to_it,),) = found(examiner.examine(params, examiner.control(params, overshoots), overshoots, (8,)))
     assert used_to_it["identified"]["scale"] == used_to_it["identified"]["simulated"]["scale"] != [1.0, 1.0]
     assert used_to_it["delay"]["share"] == 0.0
-    (nothing,) = examiner.examine(params, control, simulated, (8,)).found
+    ((nothing,),) = found(examiner.examine(params, control, simulated, (8,)))
     assert nothing["identified"]["scale"] == [1.0, 1.0] and nothing["value"]["shortfall"] == pytest.approx(0, abs=1e-4)
     assert nothing["value"]["real"] == nothing["value"]["simulated"]
-    trembling = played(jax.random.key(2), distortion.none(2, 2), noise=0.1)
-    (noisy,) = examiner.examine(params, control, trembling, (4,)).found
+    trembling = members(played(jax.random.key(2), distortion.none(2, 2), noise=0.1))
+    ((noisy,),) = found(examiner.examine(params, control, trembling, (4,)))
     assert min(noisy["noise"]["real"]) > 5 * max(noisy["noise"]["simulated"]) and noisy["noise"]["real"][0] < 0.15
 
 

@@ -75,7 +75,7 @@ def test_nothing_to_write_or_read(tmp_path):
 
 
 def test_the_released_tables():
-    """At most 30 files and 8 MB (the frozen test takes half), readable by anything that reads CSV, and every curve is the run of some row."""
+    """At most 30 files and 8 MB, readable by anything that reads CSV, and every curve is the run of some row."""
     files = [path for path in DATA.rglob("*") if path.is_file()]
     assert len(files) <= 30 and sum(path.stat().st_size for path in files) <= 8_000_000
     with open(DATA / "curves-push.csv", newline="") as file:
