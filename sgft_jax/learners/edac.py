@@ -59,12 +59,20 @@ def alignment(grads: Array) -> Array:
     return (jnp.sum(cosines) - jnp.trace(cosines)) / (grads.shape[0] - 1)
 
 
+def mean_alignment(q: Callable[[Array, Array], Array], batch: Batch) -> Array:
+    """Mean [] over the rows of a batch of the `alignment` of the gradients of q in the action.
+
+    q(obs, action) -> [members]. batch: what the critics read.
+    """
+    grads = jax.vmap(jax.jacrev(q, argnums=1))(batch.obs, batch.action)
+    return losses.row_mean(jax.vmap(alignment)(grads), batch)
+
+
 def _diversity(config: EDACConfig) -> CriticTerm:
     def term(
         q: Callable[[Array, Array], Array], policy: Callable[[Array, Key], tuple[Array, Array]], batch: Batch, key: Key
     ) -> Array:
         del policy, key  # it looks at the data's own actions
-        grads = jax.vmap(jax.jacrev(q, argnums=1))(batch.obs, batch.action)
-        return config.diversity * losses.row_mean(jax.vmap(alignment)(grads), batch)
+        return config.diversity * mean_alignment(q, batch)
 
     return term

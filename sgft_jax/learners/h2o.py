@@ -200,7 +200,7 @@ def _update(config: H2OConfig, parts: _Parts, state: H2OState, batch: Batch, key
     )
     critic, of_critic = soft.step_critic(
         parts.critic, parts.optimiser, state, batch, _targets(parts, state, batch, key_target), weights,
-        penalty=lambda q: state.hyper.conservatism * penalty(q, shares, batch),
+        penalty=lambda params, q: state.hyper.conservatism * penalty(q, shares, batch),
     )  # fmt: skip
     target = optax.incremental_update(critic.params, state.target_critic, state.hyper.tau)
     metrics |= of_actor | of_critic | {"ratio/gap_sim": losses.sim_mean(gaps, batch)}

@@ -1,11 +1,14 @@
 """H2O+: one policy from a fixed set of real data and the rows that it collects in an imperfect simulator.
 
 Both feed one critic. Its target mixes two bootstraps, the in-sample value of the real data and SAC's; simulated errors
-weigh as much as the simulator's dynamics can be trusted there. Structure is static in `H2OPlusConfig`; every number is
-a leaf of the state in `H2OPlusHyper`. Source: Niu et al. 2023 (H2O+), and where it is silent its released code.
+weigh as much as the simulator's dynamics can be trusted there. The critic is a twin, or an ensemble whose members must
+not agree on how to leave the real data, as in EDAC (An et al. 2021). Structure is static in `H2OPlusConfig`; every
+number is a leaf of the state in `H2OPlusHyper`. Source: Niu et al. 2023 (H2O+), and where it is silent its released
+code.
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple, get_args
 
 import jax
@@ -14,7 +17,7 @@ import optax
 from flax import struct
 
 from sgft_jax import checks
-from sgft_jax.learners import iql, losses, optim, soft
+from sgft_jax.learners import edac, iql, losses, optim, soft
 from sgft_jax.learners.value_losses import value_loss
 from sgft_jax.models import normalizer, ratio
 from sgft_jax.models.networks import (
@@ -39,6 +42,7 @@ class H2OPlusConfig:
 
     obs_dim, act_dim: sizes of what the environment gives and takes.
     network: body of actor, critics and value. critics: members; targets and actor use the minimum of all.
+    diversity: weight eta of what keeps the members' gradients apart at the real pairs; 0 = nothing does.
     value_loss: the backbone, which says what V is.
     tune_alpha: follow the target entropy; False keeps the temperature at `H2OPlusHyper.alpha`.
     ratio: weigh simulated errors by the ratio of the dynamics; False counts them like real ones.
@@ -50,6 +54,7 @@ class H2OPlusConfig:
     act_dim: int
     network: NetworkConfig = field(default_factory=_wide)
     critics: int = 2
+    diversity: float = 0.0
     value_loss: ValueLoss = "iql"
     tune_alpha: bool = True
     ratio: bool = True
@@ -59,6 +64,9 @@ class H2OPlusConfig:
 
     def __post_init__(self) -> None:
         checks.at_least(self, 1, "critics", "ratio_rows")
+        checks.not_negative(self, "diversity")
+        if self.diversity and self.critics < 2:
+            raise checks.refusal("critics", self.critics, "at least 2, or diversity 0")
         if self.value_loss not in (known := get_args(ValueLoss)):
             raise UserError(unknown("value loss", self.value_loss, known))
 
@@ -206,7 +214,7 @@ def _update(
         parts.actor, parts.critic, parts.optimiser, state, batch, key_actor, target_entropy=target_entropy
     )
     value, of_value = _step_value(config, parts, state, batch)
-    critic, of_critic = _step_critic(parts, state, batch, weights, key_target)
+    critic, of_critic = _step_critic(config, parts, state, batch, weights, key_target)
     target = optax.incremental_update(critic.params, state.target_critic, state.hyper.tau)
     state = state.replace(
         actor=actor, log_alpha=log_alpha, value=value, critic=critic, target_critic=target, step=state.step + 1
@@ -230,7 +238,7 @@ def _step_value(config: H2OPlusConfig, parts: _Parts, state: H2OPlusState, batch
 
 
 def _step_critic(
-    parts: _Parts, state: H2OPlusState, batch: Batch, weights: Array, key: Key
+    config: H2OPlusConfig, parts: _Parts, state: H2OPlusState, batch: Batch, weights: Array, key: Key
 ) -> tuple[optim.Fit, Metrics]:
     """The critics after a step on real and weighted simulated errors, a mean of each. Source: H2O+ Eqs. (7), (8)."""
     hyper, alpha = state.hyper, jnp.exp(state.log_alpha.params)
@@ -243,6 +251,12 @@ def _step_critic(
             row.reward, row.discount, next_value, next_q, log_prob, value_share=hyper.value_share, alpha=alpha
         )
 
-    targets = jax.vmap(target)(batch, jax.random.split(key, batch.reward.shape[0]))
+    def crowding(params: PyTree, q: Array) -> Array:
+        del q  # it looks at gradients alone
+        real = batch._replace(valid=losses.real_rows(batch))  # the policy itself tries what lies beside simulated pairs
+        return config.diversity * edac.mean_alignment(partial(parts.critic.apply, params), real)
 
-    return soft.step_critic(parts.critic, parts.optimiser, state, batch, targets, weights)
+    targets = jax.vmap(target)(batch, jax.random.split(key, batch.reward.shape[0]))
+    return soft.step_critic(
+        parts.critic, parts.optimiser, state, batch, targets, weights, penalty=crowding if config.diversity else None
+    )

@@ -58,18 +58,19 @@ def step_critic(
     targets: Array,
     weights: Array,
     *,
-    penalty: Callable[[Array], Array] | None = None,
+    penalty: Callable[[PyTree, Array], Array] | None = None,
 ) -> tuple[optim.Fit, Metrics]:
     """The critics after a step on real and weighted simulated errors, a mean of each. Source: H2O+ Eq. (8).
 
-    targets: [B]. weights: [B], of which those of simulated rows count. penalty(q [B, members]) -> [] joins the loss.
+    targets: [B]. weights: [B], of which those of simulated rows count. penalty(params, q) -> [] joins the loss; it is
+    given the critics' parameters and their values [B, members].
     """
 
     def loss(params: PyTree) -> tuple[Array, tuple[Array, ...]]:
         q = jax.vmap(critic.apply, (None, 0, 0))(params, batch.obs, batch.action)
         each = jax.vmap(losses.critic_loss)(q, targets)
         real, simulated = losses.real_mean(each, batch), losses.sim_mean(weights * each, batch)
-        further = jnp.float32(0) if penalty is None else penalty(q)
+        further = jnp.float32(0) if penalty is None else penalty(params, q)
         return real + simulated + further, (q, real, simulated, further)
 
     (total, (q, real, simulated, further)), grads = jax.value_and_grad(loss, has_aux=True)(state.critic.params)

@@ -137,12 +137,14 @@ def _iql():
     return case._replace(mode=_mode(case))
 
 
-def _h2oplus():
+def _h2oplus(critics=2, diversity=0.0):
     learner = h2oplus.make_h2oplus(
-        h2oplus.H2OPlusConfig(2, 1, network=NET, ratio_network=NET, tune_alpha=False),
+        h2oplus.H2OPlusConfig(
+            2, 1, network=NET, ratio_network=NET, tune_alpha=False, critics=critics, diversity=diversity
+        ),
         h2oplus.H2OPlusHyper(lr_actor=3e-3, lr_critic=1e-2, lr_value=1e-2, tau=0.1, alpha=1e-4),
     )
-    return _soft(learner, half_simulated, value=True)
+    return _soft(learner, half_simulated, value=True, members=critics)
 
 
 def _h2o():
@@ -267,6 +269,7 @@ MAKERS = {
     ),
     "iql": _iql,
     "h2oplus": _h2oplus,
+    "h2oplus, four critics": lambda: _h2oplus(4, 1e-2),
     "h2o": _h2o,
     "darc": _darc,
     "cql": _cql,

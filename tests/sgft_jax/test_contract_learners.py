@@ -18,13 +18,15 @@ QUICK = {
     "tdmpc2": set(),
     "sgft-tdmpc2": set(),
     "sac, ten critics": {"reward one step later", "action decides"},
+    "h2oplus, four critics": set(),
     "h2o": {"time limit"},
     "darc": {"action decides"},
     "cql": {"termination"},
     "edac": {"state and action decide"},
     "rebrac": {"reward one step later"},
 }
-SLOW = {"sac, ten critics", "h2o", "darc", "cql", "edac"}  # made of what the others are made of
+# Made of what the others are made of.
+SLOW = {"sac, ten critics", "h2oplus, four critics", "h2o", "darc", "cql", "edac"}
 
 
 def slow_if(slow, *values):

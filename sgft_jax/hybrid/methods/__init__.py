@@ -5,7 +5,7 @@ import pkgutil
 
 from sgft_jax.types import HybridMethod, UserError, unknown
 
-_ORDER = ("h2oplus", "h2o", "darc", "sac", "iql", "cql", "rebrac", "edac")  # of tables and figures
+_ORDER = ("h2oplus", "h2oplus-edac", "h2o", "darc", "sac", "iql", "cql", "rebrac", "edac")  # of tables and figures
 _FILES = [module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__) if module.name != "options"]
 NAMES = tuple(sorted(_FILES, key=lambda name: (_ORDER.index(name) if name in _ORDER else len(_ORDER), name)))
 

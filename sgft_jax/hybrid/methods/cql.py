@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import OfflineOptions, agent_of_rows, sac_numbers
+from sgft_jax.hybrid.methods.options import OfflineOptions, agent_of, sac_numbers
 from sgft_jax.types import HybridAgent, HybridMethod, Task
 
 
@@ -36,7 +36,7 @@ def build(config: Config, task: Task) -> HybridAgent:
         samples=config.samples,
     )
     learner = cql.make_cql(structure, sac_numbers(config))
-    return agent_of_rows(learner, config, task, sources.real_rows(config.rows), simulates=False)
+    return agent_of(learner, config, task, sources.real_rows(config.rows), simulates=False)
 
 
 METHOD = HybridMethod(

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import ActorCriticOptions, agent_of_rows, sac_numbers
+from sgft_jax.hybrid.methods.options import ActorCriticOptions, agent_of, sac_numbers
 from sgft_jax.types import HybridAgent, HybridMethod, Task
 
 
@@ -32,7 +32,7 @@ def build(config: Config, task: Task) -> HybridAgent:
     learner = darc.make_darc(structure, sac_numbers(config), lr_ratio=config.lr)
     batches = darc.batches(config.rows, config.ratio_rows)
     export = lambda state: actor.exported(state.sac)  # noqa: E731
-    return agent_of_rows(learner, config, task, batches, simulates=True, export=export)
+    return agent_of(learner, config, task, batches, simulates=True, export=export)
 
 
 METHOD = HybridMethod(

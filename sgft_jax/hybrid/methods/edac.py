@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import OfflineOptions, agent_of_rows, sac_numbers
+from sgft_jax.hybrid.methods.options import OfflineOptions, agent_of, sac_numbers
 from sgft_jax.types import HybridAgent, HybridMethod, Task
 
 
@@ -34,7 +34,7 @@ def build(config: Config, task: Task) -> HybridAgent:
         task.obs_dim, task.act_dim, NetworkConfig(config.hidden), critics=config.critics, diversity=config.diversity
     )
     learner = edac.make_edac(structure, sac_numbers(config))
-    return agent_of_rows(learner, config, task, sources.real_rows(config.rows), simulates=False)
+    return agent_of(learner, config, task, sources.real_rows(config.rows), simulates=False)
 
 
 METHOD = HybridMethod(

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import ActorCriticOptions, agent_of_rows
+from sgft_jax.hybrid.methods.options import HybridOptions, agent_of, numbers_of, real_and_simulated
 from sgft_jax.types import HybridAgent, HybridMethod, Task
 
 if TYPE_CHECKING:
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Config(ActorCriticOptions):
+class Config(HybridOptions):
     """Options of `h2o`."""
 
     conservatism: float = 0.01
@@ -21,36 +21,30 @@ class Config(ActorCriticOptions):
     spread_scale: float = 1.0
     """Factor on the spread of the data over which a pair's gap of the dynamics is averaged. The released code takes
     the spread over a buffer padded with zeros, which makes it 0.3."""
-    rows: int = 128
-    """Real rows of a batch; it has as many simulated ones."""
-    ratio_rows: int = 256
-    """The same for the discriminators, which have batches of their own."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.not_negative(self, "conservatism")
         checks.positive(self, "spread_scale")
-        checks.at_least(self, 1, "rows", "ratio_rows")
 
 
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
-    from sgft_jax.data import replay, sources
+    from sgft_jax.data import replay
     from sgft_jax.learners import h2o
     from sgft_jax.models.config import NetworkConfig
 
     structure = h2o.H2OConfig(
         task.obs_dim, task.act_dim, NetworkConfig(config.hidden), ratio_rows=2 * config.ratio_rows
     )
-    rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_alpha", "lr_ratio"), config.lr)
-    numbers = {name: getattr(config, name) for name in ("tau", "conservatism", "spread_scale")}
 
     def prepare(state: "H2OState", real: "RealData") -> "H2OState":
         return state.replace(spread=replay.obs_std(replay.full(real.rows)))
 
-    learner = h2o.make_h2o(structure, h2o.H2OHyper(**rates, **numbers))
-    batches = sources.beside(*(sources.two_buffers(n, n) for n in (config.rows, config.ratio_rows)))
-    return agent_of_rows(learner, config, task, batches, simulates=True, head="affine", prepare=prepare)
+    numbers = numbers_of(h2o.H2OHyper, config, "actor", "critic", "alpha", "ratio")
+    learner = h2o.make_h2o(structure, numbers)
+    batches = real_and_simulated(config)
+    return agent_of(learner, config, task, batches, simulates=True, head="affine", prepare=prepare)
 
 
 _PAPER = Config()

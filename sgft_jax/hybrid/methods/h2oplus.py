@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import ActorCriticOptions, agent_of_rows
+from sgft_jax.hybrid.methods.options import HybridOptions, agent_of, numbers_of, real_and_simulated
 from sgft_jax.types import HybridAgent, HybridMethod, Task, ValueLoss
 
 if TYPE_CHECKING:
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Config(ActorCriticOptions):
+class Config(HybridOptions):
     """Options of `h2oplus`. The defaults are the paper's, and where it is silent IQL's and the released code's."""
 
     value_loss: ValueLoss = "iql"
@@ -28,40 +28,33 @@ class Config(ActorCriticOptions):
     """Weigh simulated errors by the ratio of the dynamics; off: they count like real ones."""
     standardise: bool = False
     """Let the discriminators of that ratio read standardised observations. The released code does not."""
-    rows: int = 128
-    """Real rows of a batch; it has as many simulated ones."""
-    ratio_rows: int = 256
-    """The same for the discriminators, which have batches of their own."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.share(self, "value_share", "expectile")
         checks.positive(self, "value_alpha")
-        checks.at_least(self, 1, "rows", "ratio_rows")
 
 
-def build(config: Config, task: Task) -> HybridAgent:
-    """The agent."""
-    from sgft_jax.data import sources
+def build(config: Config, task: Task, *, critics: int = 2, diversity: float = 0.0) -> HybridAgent:
+    """The agent. critics, diversity: of its ensemble, see `H2OPlusConfig`."""
     from sgft_jax.learners import h2oplus
     from sgft_jax.models import normalizer
     from sgft_jax.models.config import NetworkConfig
 
     structure = h2oplus.H2OPlusConfig(
-        task.obs_dim, task.act_dim, NetworkConfig(config.hidden), value_loss=config.value_loss, ratio=config.ratio,
-        ratio_rows=2 * config.ratio_rows,
+        task.obs_dim, task.act_dim, NetworkConfig(config.hidden), critics=critics, diversity=diversity,
+        value_loss=config.value_loss, ratio=config.ratio, ratio_rows=2 * config.ratio_rows,
     )  # fmt: skip
-    rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_value", "lr_alpha", "lr_ratio"), config.lr)
-    numbers = {name: getattr(config, name) for name in ("tau", "value_share", "expectile", "value_alpha")}
 
     def prepare(state: "H2OPlusState", real: "RealData") -> "H2OPlusState":
         if state.ratio is None or not config.standardise:
             return state
         return state.replace(ratio=state.ratio._replace(normalizer=normalizer.of(real.rows.obs)))
 
-    learner = h2oplus.make_h2oplus(structure, h2oplus.H2OPlusHyper(**rates, **numbers))
-    batches = sources.beside(*(sources.two_buffers(n, n) for n in (config.rows, config.ratio_rows)))
-    return agent_of_rows(learner, config, task, batches, simulates=True, head="affine", prepare=prepare)
+    numbers = numbers_of(h2oplus.H2OPlusHyper, config, "actor", "critic", "value", "alpha", "ratio")
+    learner = h2oplus.make_h2oplus(structure, numbers)
+    batches = real_and_simulated(config)
+    return agent_of(learner, config, task, batches, simulates=True, head="affine", prepare=prepare)
 
 
 _PAPER = Config()

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import OfflineOptions, agent_of_rows
+from sgft_jax.hybrid.methods.options import OfflineOptions, agent_of, numbers_of
 from sgft_jax.types import HybridAgent, HybridMethod, Task
 
 if TYPE_CHECKING:
@@ -37,9 +37,6 @@ def build(config: Config, task: Task) -> HybridAgent:
     from sgft_jax.learners import actor, iql
     from sgft_jax.models.config import NetworkConfig
 
-    rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_value"), config.lr)
-    numbers = {name: getattr(config, name) for name in ("tau", "expectile", "beta")}
-
     def prepare(state: "IQLState", real: "RealData") -> "IQLState":
         scale = _RETURN_SPAN / return_span(real) if config.scale_rewards else state.hyper.reward_scale
         return state.replace(hyper=state.hyper._replace(reward_scale=scale))
@@ -48,9 +45,9 @@ def build(config: Config, task: Task) -> HybridAgent:
         return actor.ACTORParams(iql.as_tanh_gaussian(state.actor.params), actor.exported(state).normalizer)
 
     structure = iql.IQLConfig(task.obs_dim, task.act_dim, NetworkConfig(config.hidden))
-    learner = iql.make_iql(structure, iql.IQLHyper(**rates, **numbers))
+    learner = iql.make_iql(structure, numbers_of(iql.IQLHyper, config, "actor", "critic", "value"))
     batches = sources.real_rows(config.rows)
-    return agent_of_rows(learner, config, task, batches, simulates=False, prepare=prepare, export=export)
+    return agent_of(learner, config, task, batches, simulates=False, prepare=prepare, export=export)
 
 
 def return_span(real: "RealData") -> "Array":

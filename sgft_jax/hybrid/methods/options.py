@@ -10,6 +10,7 @@ from sgft_jax.types import HybridAgent, Learner, PyTree, RealData, Source, Task
 if TYPE_CHECKING:
     from sgft_jax.learners.actor import Head
     from sgft_jax.learners.sac import SACHyper
+    from sgft_jax.models.config import NetworkConfig
 
 
 @dataclass(frozen=True)
@@ -44,14 +45,41 @@ class OfflineOptions(ActorCriticOptions):
         checks.at_least(self, 1, "rows")
 
 
+@dataclass(frozen=True)
+class HybridOptions(ActorCriticOptions):
+    """Options of methods whose critic learns from real and simulated rows, which discriminators tell apart."""
+
+    rows: int = 128
+    """Real rows of a batch; it has as many simulated ones."""
+    ratio_rows: int = 256
+    """The same for the discriminators, which have batches of their own."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.at_least(self, 1, "rows", "ratio_rows")
+
+
+def numbers_of[Hyper](kind: type[Hyper], config: ActorCriticOptions, *networks: str) -> Hyper:
+    """The numbers of a learner: the rates of these networks are `lr`, others are the options of the same name."""
+    rates = {f"lr_{name}": config.lr for name in networks}
+    return kind(**rates, **{name: getattr(config, name) for name in kind.__annotations__ if hasattr(config, name)})
+
+
 def sac_numbers(config: ActorCriticOptions) -> "SACHyper":
     """The numbers of methods that are made of SAC."""
     from sgft_jax.learners.sac import SACHyper
 
-    return SACHyper(lr_actor=config.lr, lr_critic=config.lr, lr_alpha=config.lr, tau=config.tau)
+    return numbers_of(SACHyper, config, "actor", "critic", "alpha")
 
 
-def agent_of_rows(
+def real_and_simulated(config: HybridOptions) -> Source:
+    """Rows of both origins for actor, critic and value, then those of the discriminators."""
+    from sgft_jax.data import sources
+
+    return sources.beside(*(sources.two_buffers(n, n) for n in (config.rows, config.ratio_rows)))
+
+
+def agent_of(
     learner: Learner,
     config: ActorCriticOptions,
     task: Task,
@@ -59,22 +87,24 @@ def agent_of_rows(
     *,
     simulates: bool,
     head: "Head" = "gaussian",
+    network: "NetworkConfig | None" = None,
+    keep: Callable[[RealData], PyTree] | None = None,
     prepare: Callable[[PyTree, RealData], PyTree] = lambda state, real: state,
     export: Callable[[PyTree], PyTree] | None = None,
 ) -> HybridAgent:
-    """The agent of a learner whose batches are single rows.
+    """The agent of a learner.
 
-    head: of its actor, see `learners.actor.actor_policy`. prepare, export: see `HybridAgent`; by default nothing, and
-    the actor and statistics of the learner's state.
+    head, network: of its actor, see `learners.actor.actor_policy`; by default layers of `hidden`. keep, prepare,
+    export: see `HybridAgent`; by default single rows, nothing, and the actor and statistics of the learner's state.
     """
     from sgft_jax.data import replay
     from sgft_jax.learners import actor
     from sgft_jax.models.config import NetworkConfig
 
-    network = NetworkConfig(config.hidden)
+    network = network or NetworkConfig(config.hidden)
     return HybridAgent(
         learner=learner,
-        keep=lambda real: replay.full(real.rows),
+        keep=keep or (lambda real: replay.full(real.rows)),
         batches=batches,
         simulates=simulates,
         prepare=prepare,

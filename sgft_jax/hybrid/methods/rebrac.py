@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import OfflineOptions
+from sgft_jax.hybrid.methods.options import OfflineOptions, agent_of, numbers_of
 from sgft_jax.types import HybridAgent, HybridMethod, Task
 
 
@@ -30,22 +30,16 @@ class Config(OfflineOptions):
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
     from sgft_jax.data import sequences, sources
-    from sgft_jax.learners import actor, rebrac
+    from sgft_jax.learners import rebrac
     from sgft_jax.models.config import NetworkConfig
 
     network = NetworkConfig(config.hidden, layer_norm=True)
-    numbers = {name: getattr(config, name) for name in ("tau", "actor_penalty", "critic_penalty")}
-    hyper = rebrac.ReBRACHyper(lr_actor=config.lr, lr_critic=config.lr, **numbers)
-    return HybridAgent(
-        learner=rebrac.make_rebrac(rebrac.ReBRACConfig(task.obs_dim, task.act_dim, network), hyper),
+    structure = rebrac.ReBRACConfig(task.obs_dim, task.act_dim, network)
+    return agent_of(
+        rebrac.make_rebrac(structure, numbers_of(rebrac.ReBRACHyper, config, "actor", "critic")), config, task,
+        sources.real_windows(config.rows, 2), simulates=False, head="deterministic", network=network,
         keep=lambda real: sequences.full(real.rows, real.last),
-        batches=sources.real_windows(config.rows, 2),
-        simulates=False,
-        prepare=lambda state, real: state,
-        export=actor.exported,
-        policy=actor.actor_policy(task.obs_dim, task.act_dim, network, "deterministic"),
-        card=actor.card(network, "deterministic", config.gamma),
-    )
+    )  # fmt: skip
 
 
 _REPLAY = Config()  # the published penalties, by data set

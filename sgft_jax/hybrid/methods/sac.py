@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import ActorCriticOptions, agent_of_rows, sac_numbers
+from sgft_jax.hybrid.methods.options import ActorCriticOptions, agent_of, sac_numbers
 from sgft_jax.types import HybridAgent, HybridMethod, Task
 
 
@@ -29,7 +29,7 @@ def build(config: Config, task: Task) -> HybridAgent:
         task.obs_dim, task.act_dim, network=NetworkConfig(config.hidden), train_value=False, train_dynamics=False
     )
     learner = make_sac(structure, sac_numbers(config))
-    return agent_of_rows(learner, config, task, sources.two_buffers(0, config.rows), simulates=True)
+    return agent_of(learner, config, task, sources.two_buffers(0, config.rows), simulates=True)
 
 
 METHOD = HybridMethod(

@@ -173,7 +173,15 @@ def test_presets_are_what_they_are_called():
         "walker2d-medium-replay": (0.05, 0.01),
         "walker2d-medium": (0.05, 0.1),
     }
+    ensemble = get_method("h2oplus-edac").config
+    assert (ensemble.critics, ensemble.diversity, ensemble.value_share, ensemble.expectile) == (10, 1.0, 0.1, 0.7)
     assert get_method("cql").config.conservatism == 2.0 and get_method("edac").config.critics == 10
+
+
+@pytest.mark.slow
+def test_two_critics_without_diversity_are_those_of_h2oplus():
+    states = [played(agent)[-1][0] for agent in (build(), build("h2oplus-edac", critics=2, diversity=0.0))]
+    chex.assert_trees_all_equal(*map(plain, states))
 
 
 @pytest.mark.parametrize("name", ["iql", "rebrac"])

@@ -8,7 +8,7 @@ import optax
 import pytest
 from keys import used_twice
 
-from sgft_jax.learners import h2oplus
+from sgft_jax.learners import edac, h2oplus
 from sgft_jax.models import networks, normalizer, ratio
 from sgft_jax.types import Batch, UserError
 
@@ -276,6 +276,25 @@ def test_origin_is_needed(key):
         h2oplus.make_h2oplus(CONFIG).update(compiled(CONFIG).init(key), batch_of(key)._replace(is_sim=None), key)
 
 
+# --- the ensemble -----------------------------------------------------------------------------------------------------
+
+
+def test_diversity_counts_the_gradients_of_the_real_pairs_alone(key):
+    """Half of their mean alignment joins the loss, and what pulls them apart moves the critics and nothing else."""
+    body = {"network": BODY, "ratio": False, "tune_alpha": False, "critics": 3}
+    learners = [h2oplus.make_h2oplus(h2oplus.H2OPlusConfig(3, 2, **body, diversity=d)) for d in (0.0, 0.5)]
+    state, batch = learners[0].init(key), batch_of(key)
+    critic = networks.make_critic(3, 2, BODY, members=3)
+    (without, _), (apart, metrics) = (jax.jit(learner.update)(state, batch, key) for learner in learners)
+    grads = jax.vmap(jax.jacrev(lambda o, a: critic.apply(state.critic.params, o, a), 1))(batch.obs, batch.action)
+    expected = 0.5 * np.mean([edac.alignment(g) for g in grads[::2]])
+    assert metrics["critic/penalty"] == pytest.approx(expected, rel=1e-4)
+    total = metrics["critic/real_loss"] + metrics["critic/sim_loss"] + metrics["critic/penalty"]
+    assert metrics["critic/loss"] == pytest.approx(float(total), rel=1e-5)
+    assert not equal(without.critic, apart.critic)
+    assert equal((without.actor, without.value), (apart.actor, apart.value))
+
+
 # --- learning -------------------------------------------------------------------------------------------------------
 
 
@@ -322,6 +341,8 @@ def test_options_are_checked():
         h2oplus.H2OPlusConfig(3, 2, value_loss="expectile")
     with pytest.raises(UserError, match="option critics is 0"):
         h2oplus.H2OPlusConfig(3, 2, critics=0)
+    with pytest.raises(UserError, match="option critics is 1: must be at least 2, or diversity 0"):
+        h2oplus.H2OPlusConfig(3, 2, critics=1, diversity=1.0)
 
 
 # --- keys and buffers -------------------------------------------------------------------------------------------------
