@@ -100,7 +100,7 @@ class _Run:
         members = jnp.zeros(len(found) * len(seeds), jnp.int32)
         real = real_worlds(env, [gaps.load(env, args.real)], jax.random.key(0))
         self.system = Simulated(env, real, members, gamma=args.options.gamma)
-        self.chunk = args.schedule.rounds_per_chunk * args.schedule.updates_per_round
+        self.chunk = args.schedule.updates_per_chunk
 
     def work(self) -> list[dict[str, Any]]:
         """Everything, in order; returns the summaries."""
@@ -149,11 +149,11 @@ class _Run:
         """Logs, evaluates and checkpoints what the iterator yields; returns its last state."""
         schedule, names = self.args.schedule, "+".join(gap.name for gap in self.gaps)
         state, _ = next(steps)
-        done, total = trainer.chunks_done(state, schedule), schedule.chunks
+        done = trainer.chunks_done(state, schedule)
         if done == 0:
             self._evaluate(state, 0)
         title = f"{self.method.name} on {self.env.name}/{names}"
-        with RunProgress(title, total=total * self.chunk, unit="updates", done=done * self.chunk) as progress:
+        with RunProgress(title, total=schedule.updates_in_all, unit="updates", done=done * self.chunk) as progress:
             for state, metrics in steps:
                 before, done = done * self.chunk, done + 1
                 values = {name: np.asarray(x) for name, x in metrics.items()}
@@ -244,7 +244,7 @@ class _Run:
             "impl": self.env.impl,
             "data": self._facts(),
             "schedule": jsonable(self.args.schedule),
-            "updates": self.args.schedule.chunks * self.chunk,
+            "updates": self.args.schedule.updates_in_all,
             "score": self.env.score,
             "seeds": self.seeds,
             "last": last.tolist(),

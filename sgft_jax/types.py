@@ -335,7 +335,8 @@ class HybridAgent(NamedTuple):
     keep(real) -> memory of the real rows. batches: what an update takes, from the state (that memory, replay of its own
         rows or None).
     simulates: whether it acts in a simulator while it learns.
-    prepare(state, real) -> state: a fresh learner that has seen the real data once, for statistics.
+    prepare(state, real, updates) -> state: a fresh learner that has seen the real data once, for statistics, and knows
+        how many updates will follow.
     export(state) -> params of its policy. policy: how these act. card: what the card of an exported policy says of it.
     """
 
@@ -343,7 +344,7 @@ class HybridAgent(NamedTuple):
     keep: Callable[[RealData], PyTree]
     batches: Source
     simulates: bool
-    prepare: Callable[[PyTree, RealData], PyTree]
+    prepare: Callable[[PyTree, RealData, int], PyTree]
     export: Callable[[PyTree], PyTree]
     policy: Policy
     card: Mapping[str, Any]

@@ -44,9 +44,19 @@ class Schedule:
         return max(round(self.chunk_updates / self.updates_per_round), 1)
 
     @property
+    def updates_per_chunk(self) -> int:
+        """Updates of a chunk."""
+        return self.rounds_per_chunk * self.updates_per_round
+
+    @property
     def chunks(self) -> int:
         """Chunks of the whole run; the last one is whole too."""
-        return max(-(-self.updates // (self.rounds_per_chunk * self.updates_per_round)), 1)
+        return max(-(-self.updates // self.updates_per_chunk), 1)
+
+    @property
+    def updates_in_all(self) -> int:
+        """Updates of the whole run, those of the last chunk too."""
+        return self.chunks * self.updates_per_chunk
 
 
 # Of H2O+: what is stated wherever numbers are shown, and what its authors ran.

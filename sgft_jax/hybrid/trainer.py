@@ -132,7 +132,7 @@ def make_trainer(
 
     def init(pool: World, real: RealData, key: Key) -> HybridState:
         key_learner, key_fleet, key_fill, key_run = jax.random.split(key, 4)
-        agent_state = agent.prepare(learner.init(key_learner), real)
+        agent_state = agent.prepare(learner.init(key_learner), real, schedule.updates_in_all)
         state = HybridState(agent_state, None, None, key_run, jnp.int32(0))
         if not agent.simulates:
             return state

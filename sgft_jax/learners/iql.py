@@ -5,6 +5,7 @@ state is simply carried over. Structure is static in `IQLConfig`; every number i
 that expectiles and learning rates vmap like seeds do. Source: Kostrikov et al. 2021.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import NamedTuple, cast
 
@@ -54,6 +55,7 @@ class IQLHyper(NamedTuple):
     beta: inverse temperature of the advantage weights, 1 / scaled return; 0 clones the data.
     max_weight: cap of these weights.
     reward_scale: factor on every reward. beta and the cap mean something only where returns span about 1.
+    actor_updates: updates over which lr_actor falls to 0 along a cosine; inf = it stays as it is.
     """
 
     lr_actor: float | Array = 3e-4
@@ -64,6 +66,7 @@ class IQLHyper(NamedTuple):
     beta: float | Array = 3.0
     max_weight: float | Array = 100.0
     reward_scale: float | Array = 1.0
+    actor_updates: float | Array = math.inf
 
 
 class IQLState(struct.PyTreeNode):
@@ -250,11 +253,13 @@ def _update_actor(parts: _Parts, state: IQLState, batch: Batch, q: Array) -> tup
         return losses.row_mean(jax.vmap(policy_loss)(moments, batch.action, weights), batch)
 
     mean, grads = jax.value_and_grad(loss)(state.actor.params)
-    fit = optim.step(parts.optimiser, state.actor, grads, hyper.lr_actor)
+    rate = hyper.lr_actor * optim.cosine_factor(state.step, hyper.actor_updates)
+    fit = optim.step(parts.optimiser, state.actor, grads, rate)
     # The parameter itself is kept in bounds: a bound in `apply` has no gradient beyond it, and would hold it for ever.
     log_std = jnp.clip(fit.params["log_std"], LOG_STD_MIN, LOG_STD_MAX)
     metrics = {
         "actor/loss": mean,
+        "actor/lr": rate,
         "actor/advantage_mean": jnp.mean(q - values),
         "actor/weight_saturated_share": jnp.mean(weights >= hyper.max_weight),
         "actor/std_mean": jnp.mean(jnp.exp(log_std)),

@@ -42,6 +42,14 @@ def warmup_factor(step: Array, warmup: Array | float) -> Array:
     return jnp.clip((step + 1) / jnp.maximum(warmup, 1.0), 0.0, 1.0)
 
 
+def cosine_factor(step: Array, updates: Array | float) -> Array:
+    """Factor [] on the learning rate of the update after `step` [] others; it falls from 1 along half a cosine.
+
+    updates: [] over which it falls; it is 0 from then on. Infinitely many leave it at 1.
+    """
+    return 0.5 * (1 + jnp.cos(jnp.pi * jnp.minimum(step / updates, 1.0)))
+
+
 def steps_of(fit: Fit) -> Array:
     """How many steps [] a network in training has made."""
     return optax.tree.get(fit.moments, "count")

@@ -52,9 +52,9 @@ def d4rl(path, obs_dim, act_dim, n=60):
     return path
 
 
-def words(tmp_path, data, *more, out="out"):
+def words(tmp_path, data, *more):
     given = [] if data is None else ["--data", str(data), "--options.ratio-rows", "8"]
-    return [*TINY, *given, "--out", str(tmp_path / out), *more]
+    return [*TINY, *given, "--out", str(tmp_path / "out"), *more]
 
 
 def complaint(argv, capsys):
@@ -83,8 +83,14 @@ def test_a_run_leaves_curves_policies_and_a_summary_for_each_simulator(tmp_path,
         assert action.shape == (2,) and (np.abs(action) < 1).all()
 
 
-def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path, data, monkeypatch):
-    hybrid.main(words(tmp_path, data, "--gap", "sim", out="whole"))
+@pytest.mark.parametrize(
+    ("method", "simulator"),
+    [("h2oplus", "sim"), pytest.param("iql", "no-simulator", marks=pytest.mark.slow)],  # its rate follows the updates
+)
+def test_an_interrupted_run_goes_on_and_ends_the_same(method, simulator, tmp_path, data, monkeypatch):
+    ratio_rows = [] if method == "iql" else ["--options.ratio-rows", "8"]
+    given = [*TINY, "--data", str(data), *ratio_rows, "--method", method, "--gap", "sim", "--out"]
+    hybrid.main([*given, str(tmp_path / "whole")])
     write, left = MetricsLog.metrics, iter(range(3))
 
     def metrics(*args):
@@ -94,10 +100,11 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path, data, monkeypatc
 
     with monkeypatch.context() as patched, pytest.raises(SystemExit) as stopped:
         patched.setattr(MetricsLog, "metrics", metrics)
-        hybrid.main(words(tmp_path, data, "--gap", "sim", out="cut"))
+        hybrid.main([*given, str(tmp_path / "cut")])
     assert stopped.value.code == 130
-    hybrid.main(words(tmp_path, data, "--gap", "sim", "--resume", out="cut"))
-    whole, cut = (tmp_path / f"{out}/hybrid/toy/sim/recorded-v2/h2oplus/seeds-0-1" for out in ("whole", "cut"))
+    hybrid.main([*given, str(tmp_path / "cut"), "--resume"])
+    home = f"hybrid/toy/{simulator}/recorded-v2/{method}/seeds-0-1"
+    whole, cut = (tmp_path / out / home for out in ("whole", "cut"))
     for name in ("metrics.jsonl", "eval.jsonl"):
         assert (whole / name).read_text() == (cut / name).read_text()
 

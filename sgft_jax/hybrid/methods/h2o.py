@@ -38,7 +38,7 @@ def build(config: Config, task: Task) -> HybridAgent:
         task.obs_dim, task.act_dim, NetworkConfig(config.hidden), ratio_rows=2 * config.ratio_rows
     )
 
-    def prepare(state: "H2OState", real: "RealData") -> "H2OState":
+    def prepare(state: "H2OState", real: "RealData", updates: int) -> "H2OState":
         return state.replace(spread=replay.obs_std(replay.full(real.rows)))
 
     numbers = numbers_of(h2o.H2OHyper, config, "actor", "critic", "alpha", "ratio")

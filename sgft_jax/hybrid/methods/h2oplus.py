@@ -46,7 +46,7 @@ def build(config: Config, task: Task, *, critics: int = 2, diversity: float = 0.
         value_loss=config.value_loss, ratio=config.ratio, ratio_rows=2 * config.ratio_rows,
     )  # fmt: skip
 
-    def prepare(state: "H2OPlusState", real: "RealData") -> "H2OPlusState":
+    def prepare(state: "H2OPlusState", real: "RealData", updates: int) -> "H2OPlusState":
         if state.ratio is None or not config.standardise:
             return state
         return state.replace(ratio=state.ratio._replace(normalizer=normalizer.of(real.rows.obs)))

@@ -16,12 +16,14 @@ _RETURN_SPAN = 1000.0  # of the scaled returns, as published for locomotion
 
 @dataclass(frozen=True)
 class Config(OfflineOptions):
-    """Options of `iql`; the published ones for locomotion, but for the actor's learning rate, which does not fall."""
+    """Options of `iql`; the published ones for locomotion."""
 
     expectile: float = 0.7
     """V is the mean of the data's actions at 0.5 and their best towards 1."""
     beta: float = 3.0
     """Inverse temperature of the advantage weights; 0 clones the data."""
+    falling_rate: bool = True
+    """Let the actor's learning rate fall to 0 along a cosine over all updates of the run, as the authors do."""
     scale_rewards: bool = True
     """Divide rewards by the span of the data's returns and multiply them by 1,000, as the authors do."""
 
@@ -33,13 +35,19 @@ class Config(OfflineOptions):
 
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
+    import jax.numpy as jnp
+
     from sgft_jax.data import sources
     from sgft_jax.learners import actor, iql
     from sgft_jax.models.config import NetworkConfig
 
-    def prepare(state: "IQLState", real: "RealData") -> "IQLState":
-        scale = _RETURN_SPAN / return_span(real) if config.scale_rewards else state.hyper.reward_scale
-        return state.replace(hyper=state.hyper._replace(reward_scale=scale))
+    def prepare(state: "IQLState", real: "RealData", updates: int) -> "IQLState":
+        hyper = state.hyper
+        if config.scale_rewards:
+            hyper = hyper._replace(reward_scale=_RETURN_SPAN / return_span(real))
+        if config.falling_rate:
+            hyper = hyper._replace(actor_updates=jnp.float32(updates))
+        return state.replace(hyper=hyper)
 
     def export(state: "IQLState") -> actor.ACTORParams:
         return actor.ACTORParams(iql.as_tanh_gaussian(state.actor.params), actor.exported(state).normalizer)

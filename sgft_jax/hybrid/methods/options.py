@@ -89,7 +89,7 @@ def agent_of(
     head: "Head" = "gaussian",
     network: "NetworkConfig | None" = None,
     keep: Callable[[RealData], PyTree] | None = None,
-    prepare: Callable[[PyTree, RealData], PyTree] = lambda state, real: state,
+    prepare: Callable[[PyTree, RealData, int], PyTree] = lambda state, real, updates: state,
     export: Callable[[PyTree], PyTree] | None = None,
 ) -> HybridAgent:
     """The agent of a learner.

@@ -195,6 +195,20 @@ def test_the_noise_of_h2o_has_the_spread_of_the_data():
     np.testing.assert_allclose(state.learner.spread[0], real_rows().rows.obs.std(0), rtol=1e-4)
 
 
+@pytest.mark.parametrize("falls", [True, False])
+def test_the_rate_of_iqls_actor_falls_over_the_whole_run(falls):
+    """The last chunk is whole: 20 updates make four chunks of 6. A resumed run goes on where the rate was."""
+    agent, schedule = build("iql", falling_rate=falls), dataclasses.replace(SCHEDULE, updates=20)
+    chunks = played(agent, schedule)
+    updates = np.arange(24)
+    rates = 3e-4 * (0.5 + 0.5 * np.cos(np.pi * updates / 24) if falls else np.ones(24))
+    seen = np.array([metrics["actor/lr"][0] for _, metrics in chunks[1:]])
+    np.testing.assert_allclose(seen, rates.reshape(4, 6).mean(1), rtol=1e-4)
+    if falls:
+        resumed = played(agent, schedule, state=chunks[2][0])
+        chex.assert_trees_all_equal(plain(resumed[-1][0]), plain(chunks[-1][0]))
+
+
 def test_iql_scales_rewards_to_the_span_of_the_returns():
     rows = real_rows()
     returns = rows.rows.reward.reshape(5, 10).sum(1)

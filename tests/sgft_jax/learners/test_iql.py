@@ -261,6 +261,20 @@ def test_observations_are_normalised_everywhere(key):
     np.testing.assert_allclose(*actions, rtol=1e-4)
 
 
+@pytest.mark.parametrize(("step", "factor"), [(0, 1.0), (25, 0.85355339), (50, 0.5), (100, 0.0), (130, 0.0)])
+def test_the_actors_rate_falls_along_half_a_cosine(step, factor, key):
+    """Of 100 updates; the rates of critic and value stay. (1 + cos(pi / 4)) / 2 = .854."""
+    state, batch = SMALL.init(key), batch_of(key)
+    still, metrics = SMALL.update(state, batch, key)
+    assert metrics["actor/lr"] == f(1e-2)  # nothing falls unless it is told to
+    falling = with_hyper(state, actor_updates=100).replace(step=jnp.int32(step))
+    new, metrics = SMALL.update(falling, batch, key)
+    assert metrics["actor/lr"] == pytest.approx(1e-2 * factor, abs=1e-9)
+    assert equal((still.critic, still.value), (new.critic, new.value))
+    way = lambda end: jax.tree.map(jnp.subtract, end.actor.params, state.actor.params)  # noqa: E731
+    chex.assert_trees_all_close(way(new), jax.tree.map(lambda x: factor * x, way(still)), atol=1e-6)
+
+
 def test_reward_scale_multiplies_rewards(key):
     state, batch = SMALL.init(key), batch_of(key)
     scaled = SMALL.update(with_hyper(state, reward_scale=4.0), batch, key)[0]
