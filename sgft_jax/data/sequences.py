@@ -16,7 +16,8 @@ class SequenceState(struct.PyTreeNode):
     """A ring of `slots` time slots for `n_envs` environments; row = slot * n_envs + environment.
 
     data: rows on a leading [slots * n_envs] axis. valid: which hold a transition that may be learned from.
-    last: which end an episode. position: [] int32 next slot to write. size: [] int32 slots held.
+    last: which end an episode. position: [] int32 next slot to write. size: [] int32 slots held. fixed: all rows are
+    valid and stay as they are, so that a draw need not count which are.
     """
 
     data: Transition
@@ -25,6 +26,7 @@ class SequenceState(struct.PyTreeNode):
     position: Array
     size: Array
     n_envs: int = struct.field(pytree_node=False)
+    fixed: bool = struct.field(pytree_node=False, default=False)
 
     @property
     def slots(self) -> int:
@@ -48,7 +50,7 @@ def full(rows: Transition, last: Array) -> SequenceState:
     if n < 1:
         raise UserError("sequence ring: a fixed set needs at least 1 transition")
     data = jax.tree.map(jnp.asarray, rows)
-    return SequenceState(data, jnp.ones(n, bool), jnp.asarray(last), jnp.int32(0), jnp.int32(n), 1)
+    return SequenceState(data, jnp.ones(n, bool), jnp.asarray(last), jnp.int32(0), jnp.int32(n), 1, fixed=True)
 
 
 def add(state: SequenceState, rows: Transition, valid: Array, last: Array) -> SequenceState:
@@ -90,6 +92,8 @@ def end_episodes(state: SequenceState) -> SequenceState:
 def _write(
     state: SequenceState, index: Array, rows: Transition, valid: Array, last: Array, steps: Array
 ) -> SequenceState:
+    if state.fixed:
+        raise UserError("sequence ring: it is full of a fixed set of data, which takes no further rows")
     data, valid, last = set_rows((state.data, state.valid, state.last), index, (rows, valid, last))
     position, size = (state.position + steps) % state.slots, jnp.minimum(state.size + steps, state.slots)
     return state.replace(data=data, valid=valid, last=last, position=position, size=size)
@@ -105,8 +109,10 @@ def sample(state: SequenceState, key: Key, n: int, length: int) -> Batch:
     with the small weights of late steps, and rows of an episode shorter than `length` never. Masked, every stored row
     is as often the first of a window as any other.
     Nothing is valid while the ring is empty. Draw the windows of several updates at once: counting the valid rows
-    visits the whole ring.
+    visits the whole ring, unless it is `fixed`.
     """
+    if state.fixed:
+        return _windows(state, jax.random.randint(key, (n,), 0, state.valid.shape[0]), jnp.ones((), bool), length)
     return _draw(state, state.valid, key, n, length)
 
 
@@ -128,11 +134,16 @@ def _draw(state: SequenceState, begins: Array, key: Key, n: int, length: int) ->
     count = running_count(begins)
     nth = jax.random.randint(key, (n,), 0, jnp.maximum(count[-1], 1))
     start = jnp.minimum(jnp.searchsorted(count, nth, side="right"), count.shape[0] - 1)
-    return jax.vmap(lambda row: _window(state, row, count[-1] > 0, length))(start)
+    return _windows(state, start, count[-1] > 0, length)
+
+
+def _windows(state: SequenceState, start: Array, some: Array, length: int) -> Batch:
+    """The windows [n, length, ...] that begin at rows `start` [n]; some: [] whether a window may begin anywhere."""
+    return jax.vmap(lambda row: _window(state, row, some, length))(start)
 
 
 def _window(state: SequenceState, start: Array, some: Array, length: int) -> Batch:
-    """The window [length, ...] that begins at row `start` []; some: [] whether a window may begin anywhere."""
+    """The window [length, ...] that begins at row `start` []."""
     slot, env = start // state.n_envs, start % state.n_envs
     age, steps = (slot - state.position + state.size) % state.slots, jnp.arange(length)  # age: slots after the oldest
     index = (slot + steps) % state.slots * state.n_envs + env

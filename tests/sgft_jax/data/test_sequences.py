@@ -2,6 +2,7 @@
 
 import random
 
+import chex
 import jax
 import jax.numpy as jnp
 import pytest
@@ -53,6 +54,17 @@ def window_at(held, start):
         if last:
             break
     return tuple(window)
+
+
+def test_a_fixed_set_is_drawn_from_without_a_look_at_all_its_rows(key):
+    """The same windows as from a ring that counts its valid rows."""
+    ring = sequences.full(rows(jnp.arange(50.0)), jnp.arange(50) % 7 == 6)
+    counted = ring.replace(fixed=False)
+    chex.assert_trees_all_equal(*(sample(r, key, DRAWS, LENGTH) for r in (ring, counted)))
+    programs = [str(jax.make_jaxpr(lambda r: sequences.sample(r, key, DRAWS, LENGTH))(r)) for r in (ring, counted)]
+    assert ["cumsum" in program for program in programs] == [False, True]
+    with pytest.raises(UserError, match="a fixed set of data, which takes no further rows"):
+        sequences.add(ring, rows(jnp.zeros(1)), jnp.ones(1, bool), jnp.zeros(1, bool))
 
 
 def test_windows_equal_those_of_a_python_ring(key):
