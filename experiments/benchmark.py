@@ -3,6 +3,7 @@
 physics: the step that training takes, with its own domain parameters in every world, controller, observation, reward
 and automatic reset, against the bare engine under it, which repeats the same physics.
 updates: SAC updates of pretraining, with all its networks, against the same update written by hand in bare JAX.
+hybrid: updates of a hybrid run (H2O+ with its simulators), against its update written by hand in bare JAX, alone.
 plain: updates of plain SAC, against Stable-Baselines3 and SBX where they are installed.
 pretrain, finetune: seconds of the whole commands, with what the time goes into.
 devices: pretraining on several devices with as many times the environments and batches (weak scaling), against as many
@@ -21,7 +22,7 @@ from sgft_jax.models.config import Precision
 from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError
 
-type Part = Literal["physics", "updates", "plain", "pretrain", "finetune", "devices"]
+type Part = Literal["physics", "updates", "plain", "hybrid", "pretrain", "finetune", "devices"]
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class BenchmarkConfig:
     batches: tuple[int, ...] = (256,)
     """Batch sizes of the updates; for devices, on each device."""
     seeds: tuple[int, ...] = (1,)
-    """Agents updated, pretrained or fine-tuned together."""
+    """Agents updated, pretrained or fine-tuned together; for hybrid, pairs of a seed and a gap."""
     precisions: tuple[Precision, ...] = ("default",)
     """Precisions of the updates' matrix products on GPUs."""
     width: int = 256
@@ -124,6 +125,15 @@ def _plain(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
         yield updates.plain_speed(batch, width=config.width, updates=config.updates, repeats=config.repeats)
 
 
+def _hybrid(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    from envs.mujoco.worlds import choose_impl
+    from experiments.bench import hybrid
+
+    size = {"width": config.width, "updates": config.updates, "repeats": config.repeats}
+    for task, impl, members in product(config.tasks, map(choose_impl, config.impls), config.seeds):
+        yield hybrid.speed(task, impl, members, **size)
+
+
 def _pretrain(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
     from experiments.bench import training
 
@@ -151,6 +161,7 @@ _PARTS: dict[Part, Callable[[BenchmarkConfig], Iterator[dict[str, Any]]]] = {
     "physics": _physics,
     "updates": _updates,
     "plain": _plain,
+    "hybrid": _hybrid,
     "pretrain": _pretrain,
     "finetune": _finetune,
     "devices": _devices,
@@ -159,6 +170,7 @@ _TITLES = {
     "physics": "environments",
     "updates": "updates of pretraining",
     "plain": "updates of plain SAC",
+    "hybrid": "updates of hybrid runs",
     "pretrain": "pretraining",
     "finetune": "fine-tuning with SGFT-SAC",
     "devices": "pretraining on several devices",

@@ -48,14 +48,14 @@ def init(key: Key, config: NetworkConfig, obs_dim: int, act_dim: int, *, members
     """A fresh agent of those sizes."""
     keys = jax.random.split(key, 4)
     norm = config.layer_norm
-    critic = _layers(keys[1], obs_dim + act_dim, 1, config.hidden, layer_norm=norm, stack=2)
+    critic = layers(keys[1], obs_dim + act_dim, 1, config.hidden, layer_norm=norm, stack=2)
     return Bare(
-        actor=trained(_layers(keys[0], obs_dim, 2 * act_dim, config.hidden, layer_norm=config.actor_layer_norm)),
+        actor=trained(layers(keys[0], obs_dim, 2 * act_dim, config.hidden, layer_norm=config.actor_layer_norm)),
         critic=trained(critic),
         target=jax.tree.map(jnp.copy, critic),
         log_alpha=trained(jnp.log(jnp.float32(alpha))),
-        value=trained(_layers(keys[2], obs_dim, 1, config.hidden, layer_norm=norm)),
-        dynamics=trained(_layers(keys[3], obs_dim + act_dim, obs_dim, config.hidden, layer_norm=False, stack=members)),
+        value=trained(layers(keys[2], obs_dim, 1, config.hidden, layer_norm=norm)),
+        dynamics=trained(layers(keys[3], obs_dim + act_dim, obs_dim, config.hidden, layer_norm=False, stack=members)),
     )
 
 
@@ -71,42 +71,43 @@ def update(agent: Bare, batch: Transition, noise: Noise, hyper: SACHyper) -> Bar
     act_dim, alpha = batch.action.shape[-1], jnp.exp(agent.log_alpha.params)
     both = jnp.concatenate([batch.obs, batch.action], axis=1)
     following, log_prob = _sample(agent.actor.params, batch.next_obs, noise.target)
-    next_q = _forward(agent.target, jnp.concatenate([batch.next_obs, following], axis=1))[..., 0].min(0)
+    next_q = forward(agent.target, jnp.concatenate([batch.next_obs, following], axis=1))[..., 0].min(0)
     target = batch.reward + batch.discount * (next_q - alpha * log_prob)
 
     def critic_loss(params: PyTree) -> Array:
-        return jnp.mean(jnp.sum((_forward(params, both)[..., 0] - target) ** 2, axis=0))
+        return jnp.mean(jnp.sum((forward(params, both)[..., 0] - target) ** 2, axis=0))
 
-    critic = _adam(agent.critic, jax.grad(critic_loss)(agent.critic.params), hyper.lr_critic)
+    critic = adam(agent.critic, jax.grad(critic_loss)(agent.critic.params), hyper.lr_critic)
     average = jax.tree.map(lambda old, new: old + hyper.tau * (new - old), agent.target, critic.params)
 
     def actor_loss(params: PyTree) -> tuple[Array, tuple[Array, Array]]:
         action, log_prob = _sample(params, batch.obs, noise.actor)
-        q = _forward(critic.params, jnp.concatenate([batch.obs, action], axis=1))[..., 0].min(0)
+        q = forward(critic.params, jnp.concatenate([batch.obs, action], axis=1))[..., 0].min(0)
         return jnp.mean(alpha * log_prob - q), (q, log_prob)
 
     grads, (q, log_prob) = jax.grad(actor_loss, has_aux=True)(agent.actor.params)
-    actor = _adam(agent.actor, grads, hyper.lr_actor)
+    actor = adam(agent.actor, grads, hyper.lr_actor)
     slope = alpha * jnp.mean(-log_prob - hyper.entropy_per_dim * act_dim)
-    log_alpha = _adam(agent.log_alpha, slope, hyper.lr_alpha)
+    log_alpha = adam(agent.log_alpha, slope, hyper.lr_alpha)
     log_alpha = log_alpha._replace(params=jnp.maximum(log_alpha.params, LOG_ALPHA_MIN))
 
     def value_loss(params: PyTree) -> Array:
-        return jnp.mean((_forward(params, batch.obs)[:, 0] - q) ** 2)
+        return jnp.mean((forward(params, batch.obs)[:, 0] - q) ** 2)
 
-    value = _adam(agent.value, jax.grad(value_loss)(agent.value.params), hyper.lr_value)
+    value = adam(agent.value, jax.grad(value_loss)(agent.value.params), hyper.lr_value)
 
     def dynamics_loss(params: PyTree) -> Array:
-        errors = jnp.mean((_forward(params, both) - (batch.next_obs - batch.obs)) ** 2, axis=-1)
+        errors = jnp.mean((forward(params, both) - (batch.next_obs - batch.obs)) ** 2, axis=-1)
         return jnp.sum(jnp.mean(noise.bootstrap.T * errors, axis=1))
 
-    dynamics = _adam(agent.dynamics, jax.grad(dynamics_loss)(agent.dynamics.params), hyper.lr_dynamics)
+    dynamics = adam(agent.dynamics, jax.grad(dynamics_loss)(agent.dynamics.params), hyper.lr_dynamics)
     return Bare(actor, critic, average, log_alpha, value, dynamics)
 
 
-def _layers(
+def layers(
     key: Key, inputs: int, outputs: int, hidden: tuple[int, ...], *, layer_norm: bool, stack: int | None = None
 ) -> list[tuple[Array, ...]]:
+    """A network of such sizes, or `stack` of them: tuples (kernel, bias) or (kernel, bias, scale, offset)."""
     lead, sizes = (() if stack is None else (stack,)), [inputs, *hidden, outputs]
     made = []
     for i, (n, m) in enumerate(pairwise(sizes)):
@@ -116,24 +117,28 @@ def _layers(
     return made
 
 
-def _forward(layers: list[tuple[Array, ...]], x: Array) -> Array:
+def forward(network: list[tuple[Array, ...]], x: Array) -> Array:
     """x: [B, inputs] -> [B, outputs], or [members, B, outputs] through stacked layers."""
-    for i, (kernel, bias, *norm) in enumerate(layers):
+    for i, (kernel, bias, *norm) in enumerate(network):
         x = x @ kernel + bias[..., None, :]
         if norm:
             scale, offset = (v[..., None, :] for v in norm)
             mean = jnp.mean(x, axis=-1, keepdims=True)
             variance = jnp.maximum(jnp.mean(x**2, axis=-1, keepdims=True) - mean**2, 0.0)
             x = (x - mean) * (jax.lax.rsqrt(variance + 1e-6) * scale) + offset
-        if i < len(layers) - 1:
+        if i < len(network) - 1:
             x = jnp.maximum(x, 0.0)
     return x
 
 
-def _sample(layers: list[tuple[Array, ...]], obs: Array, noise: Array) -> tuple[Array, Array]:
+def _sample(actor: list[tuple[Array, ...]], obs: Array, noise: Array) -> tuple[Array, Array]:
     """Actions [B, act_dim] of the tanh-Gaussian policy and their log-probabilities [B]."""
-    mean, log_std = jnp.split(_forward(layers, obs), 2, axis=-1)
-    log_std = jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX)
+    mean, log_std = jnp.split(forward(actor, obs), 2, axis=-1)
+    return squashed(mean, jnp.clip(log_std, LOG_STD_MIN, LOG_STD_MAX), noise)
+
+
+def squashed(mean: Array, log_std: Array, noise: Array) -> tuple[Array, Array]:
+    """The tanh of a Gaussian's draws [B, act_dim], given standard normal noise, and their log-probabilities [B]."""
     u = mean + jnp.exp(log_std) * noise
     normal = -0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi)
     squash = 2 * (jnp.log(2.0) - u - jax.nn.softplus(-2 * u))
@@ -146,7 +151,8 @@ def trained(params: PyTree) -> Trained:
     return Trained(params, zeros(), zeros(), jnp.int32(0))
 
 
-def _adam(old: Trained, grads: PyTree, rate: Any) -> Trained:
+def adam(old: Trained, grads: PyTree, rate: Any) -> Trained:
+    """Parameters and moments after one step of Adam."""
     count = old.count + 1
     first = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, old.first, grads)
     second = jax.tree.map(lambda v, g: 0.999 * v + 0.001 * g**2, old.second, grads)

@@ -25,10 +25,10 @@ class Timing(NamedTuple):
     memory_mb: float
 
 
-def ahead(function: Callable[..., Any], arguments: Sequence[Any]) -> Compiled:
-    """The function compiled for arguments like these."""
+def ahead(function: Callable[..., Any], arguments: Sequence[Any], *, donate: Sequence[int] = ()) -> Compiled:
+    """The function compiled for arguments like these. donate: positions of those that a call consumes."""
     start = time.perf_counter()
-    compiled = jax.jit(function).lower(*arguments).compile()
+    compiled = jax.jit(function, donate_argnums=donate).lower(*arguments).compile()
     compile_s = time.perf_counter() - start
     return Compiled(lambda *given: jax.block_until_ready(compiled(*given)), compile_s, _memory(compiled))
 
@@ -41,13 +41,20 @@ def measure(function: Callable[..., Any], arguments: Sequence[Any], *, repeats: 
 
 def fastest(call: Callable[[], Any], *, repeats: int) -> float:
     """Seconds of the fastest of `repeats` calls, after one that does not count."""
-    call()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
+    return fastest_in_turns([call], repeats=repeats)[0]
+
+
+def fastest_in_turns(calls: Sequence[Callable[[], Any]], *, repeats: int) -> list[float]:
+    """The same of several calls, made in turns: whatever else the machine does slows all of them alike."""
+    for call in calls:
         call()
-        times.append(time.perf_counter() - start)
-    return min(times)
+    times: list[list[float]] = [[] for _ in calls]
+    for _ in range(repeats):
+        for call, own in zip(calls, times, strict=True):
+            start = time.perf_counter()
+            call()
+            own.append(time.perf_counter() - start)
+    return [min(own) for own in times]
 
 
 def _memory(compiled: Any) -> float:

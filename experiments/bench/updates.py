@@ -68,10 +68,10 @@ def plain_speed(batch: int, *, width: int, updates: int, repeats: int) -> dict[s
     return found | {"compile_s": own.compile_s}
 
 
-def rows(key: Key, batch: int) -> Transition:
+def rows(key: Key, batch: int, obs_dim: int = OBS_DIM, act_dim: int = ACT_DIM) -> Transition:
     """A batch of made-up transitions."""
-    blank = replay.blank(OBS_DIM, ACT_DIM)
-    obs, next_obs = jax.random.normal(key, (2, batch, OBS_DIM))
+    blank = replay.blank(obs_dim, act_dim)
+    obs, next_obs = jax.random.normal(key, (2, batch, obs_dim))
     full = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *x.shape)), blank)
     return full._replace(obs=obs, next_obs=next_obs, discount=full.discount + 0.97)
 

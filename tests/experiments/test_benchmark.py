@@ -13,7 +13,7 @@ import pytest
 from envs.franka import hammer
 from envs.mujoco.worlds import PhysicsState
 from experiments.bench import other_sac, physics, training, updates
-from experiments.bench.timing import fastest, measure
+from experiments.bench.timing import fastest, fastest_in_turns, measure
 from experiments.benchmark import BenchmarkConfig, main
 from sgft_jax.types import UserError
 
@@ -23,6 +23,14 @@ def test_the_fastest_call_counts_without_the_first(monkeypatch):
     monkeypatch.setattr(time, "perf_counter", lambda: next(times))
     calls = []
     assert fastest(lambda: calls.append(1), repeats=3) == 0.25 and len(calls) == 4
+
+
+def test_calls_in_turns_are_timed_apart(monkeypatch):
+    times = iter([10.0, 11.0, 20.0, 20.5, 30.0, 30.25, 40.0, 42.0])  # a, b, a, b
+    monkeypatch.setattr(time, "perf_counter", lambda: next(times))
+    calls = []
+    found = fastest_in_turns([lambda: calls.append("a"), lambda: calls.append("b")], repeats=2)
+    assert found == [0.25, 0.5] and "".join(calls) == "ababab"
 
 
 def test_memory_is_that_of_the_compiled_program():
@@ -42,6 +50,15 @@ def test_updates_are_compared_with_the_hand_written_ones(tmp_path):
         (line,) = main(replace(SMALL, parts=("updates",), out=tmp_path))["updates"]
     assert line["updates/bare"] == pytest.approx(line["updates_per_s"] / line["bare_per_s"])
     assert line["gb_per_update"] > 1e-6
+
+
+@pytest.mark.slow
+def test_a_hybrid_run_is_compared_with_its_hand_written_update(tmp_path):
+    with jax.numpy_rank_promotion("allow"):  # the hand-written update and MJX promote ranks
+        config = replace(SMALL, parts=("hybrid",), tasks=("halfcheetah",), impls=("jax",), out=tmp_path)
+        (line,) = main(config)["hybrid"]
+    assert line["members"] == 1 and line["run/bare"] == pytest.approx(line["updates_per_s"] / line["bare_per_s"])
+    assert line["simulators_share"] == pytest.approx(1 - line["run/bare"] / line["updates/bare"])
 
 
 @pytest.mark.slow
