@@ -18,6 +18,7 @@ from envs.pools import real_worlds
 from envs.rollout import Episode
 from experiments.evaluation import SCORES, play, scores
 from experiments.hybrid_args import NO_SIMULATOR, VOLATILE, HybridArgs, gaps_of, run_folder
+from experiments.memory import reserve
 from experiments.stacking import join, member, part
 from experiments.video import film
 from sgft_jax.data import logs
@@ -105,11 +106,18 @@ class _Run:
     def work(self) -> list[dict[str, Any]]:
         """Everything, in order; returns the summaries."""
         inputs = (self._pools(), self._real(), self._keys())
+        self._reserve(inputs[1])
         state = self._restore(*inputs)
         steps = trainer.train(
             self.env, self.agent, self.args.schedule, *inputs, gamma=self.args.options.gamma, state=state
         )
         return self._finish(self._follow(steps))
+
+    def _reserve(self, real: RealData) -> None:
+        """Says how much memory the rows take; raises UserError where there is not as much."""
+        kept = trainer.memory(self.env, self.agent, self.args.schedule, real)
+        members = len(self.gaps) * len(self.seeds)
+        reserve({"buffer": kept.buffer}, copies=members, shared=kept.data, settings="schedule")
 
     def _pools(self) -> World:
         """The worlds [M, W] of each member's simulator; those of the real system where there is none."""

@@ -9,20 +9,25 @@ import jax
 from sgft_jax.types import UserError
 
 
-def reserve(parts: Mapping[str, int], *, copies: int, devices: int = 1) -> None:
+def reserve(
+    parts: Mapping[str, int], *, copies: int, devices: int = 1, shared: int = 0, settings: str = "config"
+) -> None:
     """Prints how much memory each device will need; raises UserError if it is more than the device has room for.
 
-    parts: bytes of one agent's by the setting of pretraining that decides them. copies: agents trained together.
+    parts: bytes of one agent's by the setting that decides them. copies: agents trained together. shared: bytes of data
+    that they all read. settings: the group of options that these settings belong to.
     """
     share = {name: copies * size / devices for name, size in parts.items()}
-    need, room = sum(share.values()), free_memory()
+    need, room = sum(share.values()) + shared, free_memory()
     there = "" if room is None else f" of {_gib(room)} free"
-    listed = ", ".join(f"{name} {_gib(size)}" for name, size in share.items())
+    data = {"data": shared} if shared else {}
+    listed = ", ".join(f"{name} {_gib(size)}" for name, size in (share | data).items())
     print(f"memory: {_gib(need)}{there} on each device ({listed})")
     if room is not None and need > room:
         option = max(share, key=share.__getitem__).replace("_", "-")
         raise UserError(
-            f"experience and batches take {_gib(need)}{there} on each device: lower --config.{option} or train fewer"
+            f"experience and batches take {_gib(need)}{there} on each device: "
+            f"lower --{settings}.{option} or train fewer"
         )
 
 

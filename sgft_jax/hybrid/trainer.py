@@ -91,6 +91,19 @@ def shape_of(env: Env, agent: HybridAgent, schedule: Schedule, pools: World, rea
     return jax.eval_shape(init, pools, real, keys)
 
 
+class Memory(NamedTuple):
+    """Bytes of experience. buffer: of one member's simulated rows. data: of the real rows, which all members share."""
+
+    buffer: int
+    data: int
+
+
+def memory(env: Env, agent: HybridAgent, schedule: Schedule, real: RealData) -> Memory:
+    """What a run will keep, from the shapes of its arrays alone."""
+    size = lambda f, *args: sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(f, *args)))  # noqa: E731
+    return Memory(size(lambda: _buffer(env, schedule)) if agent.simulates else 0, size(agent.keep, real))
+
+
 def no_data(env: Env) -> RealData:
     """What stands for the real data where a method asks for none: one row of zeros."""
     return RealData(jax.tree.map(lambda x: x[None], replay.blank(env.obs_dim, env.act_dim)), jnp.ones(1, bool))
@@ -136,10 +149,10 @@ def make_trainer(
         state = HybridState(agent_state, None, None, key_run, jnp.int32(0))
         if not agent.simulates:
             return state
-        empty = replay.init(replay.blank(env.obs_dim, env.act_dim), schedule.buffer)
-        state = state._replace(fleet=launch(env, pool, key_fleet, schedule.simulators, fresh), simulated=empty)
+        fleet = launch(env, pool, key_fleet, schedule.simulators, fresh)
+        state = state._replace(fleet=fleet, simulated=_buffer(env, schedule))
         if note is not None:
-            first = jax.tree.map(lambda x: x[0], state.fleet.state)
+            first = jax.tree.map(lambda x: x[0], fleet.state)
             example = note(agent_state, first, jnp.zeros(env.act_dim), first)
             state = state._replace(notes=replay.init(example, schedule.buffer))
         return collect(pool, state, key_fill, -(-agent.batches.n_sim // schedule.simulators))
@@ -166,3 +179,8 @@ def make_trainer(
         return state, {name: x.mean() for name, x in metrics.items()}
 
     return Trainer(init, chunk)
+
+
+def _buffer(env: Env, schedule: Schedule) -> ReplayState:
+    """The empty buffer of a member's simulated rows."""
+    return replay.init(replay.blank(env.obs_dim, env.act_dim), schedule.buffer)

@@ -83,5 +83,8 @@ def test_a_budget_that_does_not_fit_names_the_largest_part(monkeypatch, capsys):
     )
     with pytest.raises(UserError, match=r"8\.00 GiB of 5\.00 GiB free on each device: lower --config\.replay-capacity"):
         reserve(parts, copies=2)
+    with pytest.raises(UserError, match=r"7\.00 GiB of 5\.00 GiB free on each device: lower --schedule\.buffer"):
+        reserve({"buffer": 2**31}, copies=3, shared=2**30, settings="schedule")  # what is shared counts once
+    assert "(buffer 6.00 GiB, data 1.00 GiB)" in capsys.readouterr().out
     monkeypatch.setattr(memory, "free_memory", lambda: None)
     reserve(parts, copies=2)  # nobody knows: the run may try

@@ -17,6 +17,7 @@ from sgft_jax.hybrid import trainer
 from sgft_jax.hybrid.methods import NAMES, get_method, iql
 from sgft_jax.hybrid.schedule import Schedule
 from sgft_jax.policies import make_policy
+from sgft_jax.pretraining import over_members
 from sgft_jax.types import RealData, UserError
 
 ENV = toy.make()
@@ -176,6 +177,32 @@ def test_presets_are_what_they_are_called():
     ensemble = get_method("h2oplus-edac").config
     assert (ensemble.critics, ensemble.diversity, ensemble.value_share, ensemble.expectile) == (10, 1.0, 0.1, 0.7)
     assert get_method("cql").config.conservatism == 2.0 and get_method("edac").config.critics == 10
+
+
+def test_the_bytes_of_a_run_are_those_of_its_buffers_and_of_one_copy_of_the_data():
+    """A row is 4 + 2 + 1 + 1 + 4 floats: 48 bytes. Two counters of 4 bytes go with each buffer."""
+    assert trainer.memory(ENV, build(), SCHEDULE, real_rows()) == (64 * 48 + 8, 50 * 48 + 8)
+    assert trainer.memory(ENV, build("iql"), SCHEDULE, real_rows()).buffer == 0
+    state = trainer.shape_of(ENV, build(), SCHEDULE, pools_of(0.5, 4.0), real_rows(), keys_of(0, 0))
+    assert sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state.simulated)) == 2 * (64 * 48 + 8)
+
+
+@pytest.mark.slow
+def test_a_chunk_holds_neither_buffers_nor_data_twice():
+    """What it needs beside its arguments stays the same where these are 400 times as large."""
+
+    def beside(n):
+        """Bytes of the temporaries of two members' chunk."""
+        agent, schedule = build(), dataclasses.replace(SCHEDULE, buffer=n)
+        inputs = pools_of(0.5, 4.0), real_rows(n), keys_of(0, 1)
+        state = trainer.shape_of(ENV, agent, schedule, *inputs)
+        chunk = over_members(trainer.make_trainer(ENV, agent, schedule, gamma=0.9).chunk, 2, shared=(1,))
+        kept = jax.eval_shape(agent.keep, inputs[1])
+        made = jax.jit(chunk, donate_argnums=2).lower(inputs[0], kept, state).compile()
+        return made.memory_analysis().temp_size_in_bytes
+
+    few, many = 100, 40_000
+    assert beside(many) < beside(few) + 48 * many  # a copy of either would be as much
 
 
 @pytest.mark.slow
