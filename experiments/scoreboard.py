@@ -1,6 +1,7 @@
 """How methods did on a frozen set of gaps: a line for each method and stratum, and the reference against the others.
 
-Reads what fine-tuning has left in <out>/finetune for the gaps of these files, and for the control `sim` beside them.
+Reads what fine-tuning has left in <out>/finetune for the gaps of these files, and for the control `sim` beside them, or
+released tables.
 """
 
 from collections.abc import Mapping
@@ -35,15 +36,21 @@ class ScoreboardArgs:
     """Compare the others with METHOD or METHOD:VARIANT."""
     tasks: tuple[str, ...] = ()
     """Only these tasks; default: all that ran on these gaps."""
+    priors: tuple[str, ...] = ()
+    """Only runs from these sets of priors, as released tables name them; default: all."""
+    data: Path | None = None
+    """Folder of released tables to read instead of runs, such as docs/data."""
     out: Path = Path("runs")
-    """Parent of all run folders; the table also goes to <out>/scoreboard.md."""
+    """Parent of all run folders; the table also goes to <out>/scoreboard.md, a picture to <out>/scoreboard.png."""
 
 
 def main(args: ScoreboardArgs) -> None:
-    """Prints the tables and writes them."""
+    """Prints the tables, writes them, and draws every method on the gaps of each stratum."""
     text = board(args)
+    args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "scoreboard.md").write_text(text + "\n")
-    print(f"{text}\n\nwritten: {args.out / 'scoreboard.md'}")
+    picture = draw(args)
+    print(f"{text}\n\nwritten: {args.out / 'scoreboard.md'}, {picture}")
 
 
 def board(args: ScoreboardArgs) -> str:
@@ -53,7 +60,7 @@ def board(args: ScoreboardArgs) -> str:
     strata = strata_of(args.gaps)
     played = runs_on(args, strata)
     if not played:
-        raise UserError(f"{args.out / 'finetune'}: holds no evaluated run on these gaps")
+        raise UserError(f"{args.data or args.out / 'finetune'}: holds no evaluated run on these gaps")
     if args.reference not in played:
         raise UserError(f"--reference {args.reference}: did not run on these gaps; there are: {', '.join(played)}")
     rows = [
@@ -72,6 +79,22 @@ def board(args: ScoreboardArgs) -> str:
     return "\n".join(said).rstrip()
 
 
+def draw(args: ScoreboardArgs) -> Path:
+    """The picture of those methods that ran on all gaps of a stratum that the reference ran on: a panel a stratum."""
+    from sgft_jax.analysis import figures, scoreboard
+
+    played = runs_on(args, strata_of(args.gaps))
+    reference = played[args.reference]
+    panels = {
+        f"{stratum}, {len(own)} {'tasks' if stratum == CONTROL else 'gaps'}": [
+            scoreboard.pooled(each[stratum]) for each in played.values() if set(each.get(stratum, ())) >= set(own)
+        ]
+        for stratum in (CONTROL, *STRATA)
+        if (own := reference.get(stratum))
+    }
+    return figures.learning_curves(args.out / "scoreboard.png", panels, title="Mean over the gaps of a stratum")
+
+
 def strata_of(files: tuple[Path, ...]) -> dict[str, str]:
     """The stratum of every gap by name, the control first; raises UserError for a gap that has none."""
     found = {SIM: CONTROL}
@@ -85,15 +108,20 @@ def strata_of(files: tuple[Path, ...]) -> dict[str, str]:
 
 def runs_on(args: ScoreboardArgs, strata: Mapping[str, str]) -> "dict[str, dict[str, dict[str, Curve]]]":
     """By METHOD or METHOD:VARIANT and stratum, the curves by "task/gap"."""
-    from sgft_jax.analysis.curves import read_runs
+    from sgft_jax.analysis.curves import read_data, read_runs
     from sgft_jax.analysis.tables import spec
 
     found: dict[str, dict[str, dict[str, Curve]]] = {}
-    for curve in read_runs(args.out).curves:
-        if curve.gap in strata and (not args.tasks or curve.task in args.tasks):
+    for curve in (read_data(args.data) if args.data else read_runs(args.out)).curves:
+        if curve.gap in strata and all(
+            not wanted or own in wanted for own, wanted in ((curve.task, args.tasks), (curve.priors, args.priors))
+        ):
             own = found.setdefault(spec(curve), {}).setdefault(strata[curve.gap], {})
             if (name := f"{curve.task}/{curve.gap}") in own:
-                raise UserError(f"{args.out}: {spec(curve)} ran on {name} with several sets of seeds; keep one")
+                raise UserError(
+                    f"{args.data or args.out}: {spec(curve)} ran on {name} with several sets of seeds or priors; keep "
+                    "one, or choose with --priors"
+                )
             own[name] = curve
     return found
 

@@ -93,9 +93,7 @@ def _dress(axes: Axes, words: str, curves: Sequence[Curve]) -> None:
     if curves[0].score == "success":
         axes.set_ylim(-0.03, 1.03)
     longest = max(curves, key=lambda curve: curve.rollouts[-1])
-    each = max(int(longest.rollouts[-1]), 1)
-    seconds, steps = 60 * float(longest.minutes[-1]) / each, int(longest.transitions[-1]) // each
-    axes.set_xlabel(f"real rollouts of {steps} transitions, {seconds:.3g} s", **{**_FONT, "size": 9})
+    axes.set_xlabel(f"real rollouts{_length(longest)}", **{**_FONT, "size": 9})
     lines, names = axes.get_legend_handles_labels()
     ends = [float(np.asarray(line.get_ydata())[-1]) for line in lines]  # pyright: ignore[reportAttributeAccessIssue]
     order = np.argsort(ends, kind="stable")[::-1]
@@ -103,6 +101,14 @@ def _dress(axes: Axes, words: str, curves: Sequence[Curve]) -> None:
         [lines[i] for i in order], [names[i] for i in order], loc="center left", bbox_to_anchor=(1.0, 0.5),
         frameon=False, fontsize=9, labelcolor=_INK, handlelength=1.4,
     )  # fmt: skip
+
+
+def _length(curve: Curve) -> str:
+    """How long a rollout is, in words; nothing where the curve does not know."""
+    if np.isnan(curve.minutes[-1]):
+        return ""
+    each = max(int(curve.rollouts[-1]), 1)
+    return f" of {int(curve.transitions[-1]) // each} transitions, {60 * float(curve.minutes[-1]) / each:.3g} s"
 
 
 def _note(curves: Sequence[Curve]) -> str:

@@ -4,11 +4,12 @@ The prior is the random factor: member i of a curve began from prior i, on every
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from sgft_jax.analysis.curves import LEVEL, Curve, area, common_grid
+from sgft_jax.analysis.curves import LEVEL, Curve, area, at, common_grid
 from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean
 from sgft_jax.types import UserError
 
@@ -88,6 +89,21 @@ def duel(reference: Played, other: str, played: Played) -> Duel:
     own, theirs = _areas(reference, gaps, grid), _areas(played, gaps, grid)
     ahead = int((own.mean(1) >= theirs.mean(1)).sum())
     return Duel(other, len(gaps), ahead, improvement(own, theirs))
+
+
+def pooled(played: Played) -> Curve:
+    """A method on several gaps as one curve: member by member the mean over them, at the evaluations that they share.
+
+    Tasks have rollouts of different lengths, so the curve knows neither transitions nor minutes (nan).
+    """
+    curves = list(played.values())
+    grid = common_grid(curves)
+    score = curves[0].score
+    nothing = np.full(len(grid), np.nan)
+    values = np.mean([[at(curve, n) for n in grid] for curve in curves], axis=0).T
+    return replace(
+        curves[0], rollouts=grid, scores={score: values}, transitions=nothing, minutes=nothing, training=None
+    )
 
 
 def _areas(played: Played, gaps: Sequence[str], grid: np.ndarray) -> np.ndarray:

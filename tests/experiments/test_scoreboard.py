@@ -1,5 +1,7 @@
 """The table of a frozen set: strata, falls, who is ahead, and what is refused."""
 
+from dataclasses import replace
+
 import pytest
 import runs_by_hand
 
@@ -40,7 +42,17 @@ def test_strata_falls_and_who_is_ahead(home, capsys):
     assert "| solved | sac | 1 | 90 | 68 | 80 | 0 of 1 | 40 (toy/easy) | 10 |" in said
     assert "| failed | guarded | 1 | 10 |" in said and "| 1 of 1 | 0 | 0 |" in said.split("failed | guarded")[1]
     assert "| sac | 1 of 1 | 100 |" in said and "elsewhere" not in said
-    assert (home / "scoreboard.md").read_text() in said
+    assert (home / "scoreboard.md").read_text() in said and (home / "scoreboard.png").stat().st_size > 10_000
+
+
+def test_released_tables_say_the_same(home):
+    from sgft_jax.analysis.release import export
+
+    args = ScoreboardArgs((home / "set.toml",), out=home)
+    export(home, home / "data")
+    assert scoreboard.board(replace(args, data=home / "data", out=home / "nothing")) == scoreboard.board(args)
+    with pytest.raises(UserError, match=r"data: holds no evaluated run"):
+        scoreboard.board(replace(args, data=home / "data", priors=("others",)))
 
 
 def test_bad_input(home):
