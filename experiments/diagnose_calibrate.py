@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from experiments import stacking
@@ -98,7 +99,7 @@ def gather(args: DiagnoseArgs, runs: Sequence[Path]) -> list[Cases]:
         if (there := rollouts[0].valid.shape[0]) < COUNTS[-1]:
             raise UserError(f"{run}: holds {there} recorded rollouts, a calibration needs {COUNTS[-1]}")
         held = curve.rollouts <= AHEAD
-        params, control = (stacking.member(x, np.array(which)) for x in known)
+        params, control = (stacking.member(x, jnp.array(which)) for x in known)
         examined = examiner.examine(params, control, stacking.stack(rollouts), COUNTS)
         for member, (own, p) in enumerate(zip(examined, which, strict=True)):
             for i, found in enumerate(own.found):

@@ -57,8 +57,8 @@ def diagnose(
     examiner, counts = Examiner(priors[0].card, env), counts_to(count)
     params = stacking.stack([prior.params for prior in priors])
     control = examiner.control(params, stacking.stack(simulated))
-    looks = [stacking.member(x, np.array(which)) for x in (params, control)]
-    each = examiner.examine(*looks, stacking.stack(real), counts)
+    own, usual = (stacking.member(x, jnp.array(which)) for x in (params, control))
+    each = examiner.examine(own, usual, stacking.stack(real), counts)
     labels, same = [str(folders[p]) for p in which], all(own is real[0] for own in real)
     found = {
         "task": env.name,

@@ -100,7 +100,9 @@ def pooled(played: Played) -> Curve:
     grid = common_grid(curves)
     score = curves[0].score
     nothing = np.full(len(grid), np.nan)
-    values = np.mean([[at(curve, n) for n in grid] for curve in curves], axis=0).T
+    points = (at(curve, n) for n in grid for curve in curves)
+    each = np.stack([point for point in points if point is not None])  # of a common grid none is
+    values = each.reshape(len(grid), len(curves), -1).mean(1).T
     return replace(
         curves[0], rollouts=grid, scores={score: values}, transitions=nothing, minutes=nothing, training=None
     )

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import runs_by_hand
 
@@ -64,3 +65,13 @@ def test_bad_input(home):
     (home / "set.toml").write_text("[easy.params]\nmass = 1.0\n[hard.params]\nmass = 2.0\n")
     with pytest.raises(UserError, match=r"set.toml \[easy\]: has no 'stratum'"):
         scoreboard.board(args)
+
+
+def test_pooled_curves_are_means_over_gaps_member_by_member(home):
+    from sgft_jax.analysis.curves import read_runs
+    from sgft_jax.analysis.scoreboard import pooled
+
+    sac = {curve.gap: curve for curve in read_runs(home).curves if curve.method == "sac" and curve.gap != "elsewhere"}
+    one = pooled(sac)
+    np.testing.assert_allclose(one.values, [[0.5, 0.4, 0.65], [0.5, 0.4, 0.65], [0.5, 0.4, 0.7], [0.5, 0.4, 0.7]])
+    assert one.rollouts.tolist() == [0, 4, 8] and np.isnan(one.minutes).all()
