@@ -92,10 +92,29 @@ def step_fleet(
     # Fixed-length episodes end together, so most steps skip the (inverse kinematics of the) resets altogether.
     fleet = jax.lax.cond(
         done.any(),
-        lambda: _select(done, launch(env, pool, key_reset, n, initial_carry), Fleet(fleet.index, after, carry)),
+        lambda: select(done, launch(env, pool, key_reset, n, initial_carry), Fleet(fleet.index, after, carry)),
         lambda: Fleet(fleet.index, after, carry),
     )
     return fleet, transitions, valid, after
+
+
+def episode_keys(key: Key, length: int) -> tuple[Key, Key, Key]:
+    """What an episode draws from its key: the keys of its world, of its start and of its steps.
+
+    Those of the steps are [length, 2]: of each step the policy's key, then the environment's.
+    """
+    key_world, key_reset, key_steps = jax.random.split(key, 3)
+    return key_world, key_reset, jax.vmap(jax.random.split)(jax.random.split(key_steps, length))
+
+
+def begin_episode(
+    env: Env, pool: World, key_world: Key, key_reset: Key, which: Array | None = None
+) -> tuple[Array, World, EnvState]:
+    """A random world of the pool with its number, and a start in it. which: see `play_episode`."""
+    index = jax.random.randint(key_world, (), 0, pool_size(pool))
+    # Of stacked pools, too, the one world is gathered: under vmap an episode costs a copy of a world, never of a pool.
+    world = pick(pool, index if which is None else (which, index))
+    return index, world, env.reset(world, key_reset)
 
 
 def play_episode(
@@ -114,15 +133,12 @@ def play_episode(
     length: control steps, default `env.episode_length`; a longer one looks past the time limit. which: [] which one of
     several pools stacked to [pools, worlds]; the episode is that of this pool alone.
     """
-    key_world, key_reset, key_steps = jax.random.split(key, 3)
-    index = jax.random.randint(key_world, (), 0, pool_size(pool))
-    # Of stacked pools, too, the one world is gathered: under vmap an episode costs a copy of a world, never of a pool.
-    world = pick(pool, index if which is None else (which, index))
-    start = env.reset(world, key_reset)
+    key_world, key_reset, key_steps = episode_keys(key, length or env.episode_length)
+    index, world, start = begin_episode(env, pool, key_world, key_reset, which)
 
-    def step(loop: tuple[EnvState, PyTree, Array], key: Key) -> tuple[tuple[EnvState, PyTree, Array], tuple]:
+    def step(loop: tuple[EnvState, PyTree, Array], keys: Key) -> tuple[tuple[EnvState, PyTree, Array], tuple]:
         state, carry, over = loop
-        key_act, key_env = jax.random.split(key)
+        key_act, key_env = keys
         action, carry = act(carry, state.obs, key_act)
         after = env.step(world, state, action, key_env)
         exploded = after.invalid & ~over
@@ -133,7 +149,7 @@ def play_episode(
         return (after, carry, over), (row, valid, after.success & valid, exploded, env.trace(after.physics))
 
     (_, _, _), (rows, valid, success, exploded, trace) = jax.lax.scan(
-        step, (start, carry, jnp.zeros((), bool)), jax.random.split(key_steps, length or env.episode_length)
+        step, (start, carry, jnp.zeros((), bool)), key_steps
     )
     total, failed = rows.reward.sum(), exploded.any()
     succeeded = success[jnp.maximum(valid.sum() - 1, 0)] & ~failed
@@ -161,5 +177,6 @@ def _transition(before: EnvState, action: Array, after: EnvState, *, gamma: floa
     return jax.tree.map(lambda x: jnp.where(after.invalid, jnp.zeros_like(x), x), row)
 
 
-def _select(mask: Array, new: PyTree, old: PyTree) -> PyTree:
+def select(mask: Array, new: PyTree, old: PyTree) -> PyTree:
+    """Of members [n], the new ones where `mask` [n] is true, else the old ones."""
     return jax.tree.map(lambda a, b: jnp.where(mask.reshape(-1, *[1] * (a.ndim - 1)), a, b), new, old)

@@ -10,9 +10,7 @@ import numpy as np
 import pytest
 from runners import EVERY, TASKS, compiled
 
-gymnasium = pytest.importorskip(
-    "gymnasium", reason="the foreign oracle needs gymnasium: pip install 'sgft-jax[locomotion-oracles]'"
-)
+gymnasium = pytest.importorskip("gymnasium", reason="make setup EXTRAS=dev, or pip install 'sgft-jax[gymnasium]'")
 FILES = {"halfcheetah": "half_cheetah.xml", "walker2d": "walker2d.xml"}  # of -v4; Walker2d-v5 has other feet
 ASSETS = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
 STEPS = 60
