@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import jax.numpy as jnp
+import numpy as np
 
 from envs.base import Entry, Env, EnvState, World
 from sgft_jax.types import Array, Key, PyTree
@@ -78,3 +79,20 @@ def extended(
         success=None if success is None else lambda obs: success(obs[:own_dim]),
         trace=lambda physics: env.trace(physics[0]),
     )
+
+
+def with_memory(env: Env, measured: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """[..., obs_dim] what a policy reads where steps are taken outside jit, from what sensors say.
+
+    measured: [..., measured_dim]. actions: [..., previous_actions, act_dim], the last ones, the newest first. Of the
+    system it tells the middle of every range, see `envs.system.concealed`.
+    """
+    told = actions.reshape(*measured.shape[:-1], -1)
+    return np.concatenate(
+        [measured, told, np.zeros((*measured.shape[:-1], len(env.system)))], axis=-1, dtype=np.float32
+    )
+
+
+def remember(actions: np.ndarray, action: np.ndarray) -> np.ndarray:
+    """The last actions [..., n, act_dim], the newest first, after one more [..., act_dim]."""
+    return np.concatenate([action[..., None, :], actions], axis=-2)[..., : actions.shape[-2], :]

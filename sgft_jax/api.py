@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 import envs
 from envs.base import Env
 from envs.gaps import Gap
+from envs.history import remember, with_memory
 from envs.pools import heldout_worlds, real_env, real_worlds
 from envs.rollout import Episode
 from sgft_jax import train
@@ -23,6 +24,7 @@ from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.methods.options import card_of
 from sgft_jax.policies import make_policy
 from sgft_jax.presets import preset_of
+from sgft_jax.systems import System
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import FinetuneProgress, SimulatedRows
 from sgft_jax.types import Array, Finetuner, Method, Policy, Prior, PyTree, UserError
@@ -35,11 +37,11 @@ _EVALUATION = 2**31 + 2  # held out from training and from the choice of the pri
 class Setup(NamedTuple):
     """What `finetune(*setup, rollouts=...)` takes.
 
-    Members [M = gaps * seeds] are the seeds of the first gap, then those of the next.
+    Members [M = gaps * seeds] are the seeds of the first gap, then those of the next; of a `System` its seeds.
     """
 
     finetuner: Finetuner
-    system: Simulated
+    system: System
     priors: PyTree
     seeds: Array
     simulated: SimulatedRows | None
@@ -47,7 +49,7 @@ class Setup(NamedTuple):
 
 def setup(
     env: Env,
-    gaps: Gap | Sequence[Gap],
+    real: Gap | Sequence[Gap] | System,
     priors: Prior | Sequence[Prior],
     *,
     method: str = DEFAULT,
@@ -55,13 +57,13 @@ def setup(
     config: Any = None,
     **options: Any,
 ) -> Setup:
-    """Fine-tuning of seeds on simulated real systems, ready to run.
+    """Fine-tuning of seeds on real systems, ready to run.
 
-    gaps: the real systems. priors: [P], none of them to start from nothing; seed s starts from prior s modulo P.
-    method: by name or file. seeds: their number, or themselves. options: of the method, by name (`config` instead: all
-    of them). Raises UserError for a prior of another algorithm or task, and for options that do not fit.
+    real: gaps, which are simulated, or any other `System`, such as `Gymnasium`, with a member for each seed.
+    priors: [P], none of them to start from nothing; seed s starts from prior s modulo P. method: by name or file.
+    seeds: their number, or themselves. options: of the method, by name (`config` instead: all of them).
+    Raises UserError for a prior of another algorithm or task, and for options that do not fit.
     """
-    found = [gaps] if isinstance(gaps, Gap) else list(gaps)
     known = [priors] if isinstance(priors, Prior) else list(priors)
     chosen = get_method(method)
     for prior in known:
@@ -70,19 +72,24 @@ def setup(
         raise UserError(f"method {chosen.name} needs a prior of {chosen.prior}")
     finetuner = chosen.build(chosen.config(**options) if config is None else config, known[0] if known else None, env)
     numbers = range(seeds) if isinstance(seeds, int) else seeds
-    real = real_env(env, found)
-    system = Simulated(
-        real,
-        real_worlds(real, found, jax.random.key(0)),
-        jnp.repeat(jnp.arange(len(found)), len(numbers)),
-        gamma=card_of(known[0] if known else None)["gamma"],
-    )
+    system, copies = real, 1
+    if not isinstance(real, System):
+        found = [real] if isinstance(real, Gap) else list(real)
+        gamma, copies = card_of(known[0] if known else None)["gamma"], len(found)
+        system = _simulated_systems(env, found, len(numbers), gamma=gamma)
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *[prior.params for prior in known]) if known else None
-    members = jnp.tile(jnp.array(list(numbers), jnp.uint32), len(found))
-    return Setup(finetuner, system, stacked, members, _simulated(env, finetuner, known, stacked))
+    members = jnp.tile(jnp.array(list(numbers), jnp.uint32), copies)
+    return Setup(finetuner, system, stacked, members, _simulated_rows(env, finetuner, known, stacked))
 
 
-def _simulated(env: Env, finetuner: Finetuner, priors: list[Prior], stacked: PyTree) -> SimulatedRows | None:
+def _simulated_systems(env: Env, found: Sequence[Gap], seeds: int, *, gamma: float) -> Simulated:
+    """The real systems of gaps with so many seeds on each."""
+    real = real_env(env, found)
+    which = jnp.repeat(jnp.arange(len(found)), seeds)
+    return Simulated(real, real_worlds(real, found, jax.random.key(0)), which, gamma=gamma)
+
+
+def _simulated_rows(env: Env, finetuner: Finetuner, priors: list[Prior], stacked: PyTree) -> SimulatedRows | None:
     """What every prior's policy does in its training domain, where the method asks for it; always the same."""
     if finetuner.simulation is None:
         return None
@@ -152,10 +159,10 @@ class ActingPolicy:
         """The action [act_dim] in [-1, 1] for what was measured, [measured_dim] in raw units."""
         if np.shape(obs) != (self.env.measured_dim,):
             raise UserError(f"the policy reads {self.env.measured_dim} measured numbers, got shape {np.shape(obs)}")
-        obs = np.concatenate([obs, self._actions.ravel(), np.zeros(len(self.env.system))])  # its own estimate counts
+        seen = with_memory(self.env, np.asarray(obs), self._actions)  # of the system its own estimate counts
         self._key, key = jax.random.split(self._key)
-        action, self._carry = self._act(self.prior.params, self._carry, jnp.asarray(obs), key, explore=explore)
-        self._actions = np.concatenate([np.asarray(action)[None], self._actions])[: len(self._actions)]
+        action, self._carry = self._act(self.prior.params, self._carry, seen, key, explore=explore)
+        self._actions = remember(self._actions, np.asarray(action))
         return np.asarray(action)
 
 

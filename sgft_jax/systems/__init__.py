@@ -1,6 +1,6 @@
 """The real side of fine-tuning: what plays episodes, in simulation or on hardware."""
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from sgft_jax.types import Key, PyTree
 
@@ -8,10 +8,11 @@ if TYPE_CHECKING:
     from envs.rollout import Episode
 
 
+@runtime_checkable
 class System(Protocol):
     """A real system, or several that are played together; M members, each a seed on one of them.
 
-    `Simulated` plays whole episodes in one compiled program. A robot is stepped from Python.
+    `Simulated` plays whole episodes in one compiled program. `Gymnasium` is stepped from Python, and so is a robot.
     """
 
     def play(self, policy: Any, states: PyTree, keys: Key, *, explore: bool) -> "Episode":

@@ -1,0 +1,275 @@
+"""Gymnasium environments as real systems: the episodes of `Simulated`, stepped from Python."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import toy
+import toy_terminating
+
+from envs.base import Entry
+from envs.gaps import Gap
+from envs.history import with_previous_actions
+from envs.pools import real_worlds
+from sgft_jax import api
+from sgft_jax.learners.sac import SACConfig, extract_params, make_sac
+from sgft_jax.models.config import NetworkConfig
+from sgft_jax.systems import System
+from sgft_jax.systems.gymnasium import Gymnasium, seed_of
+from sgft_jax.systems.simulated import Simulated
+from sgft_jax.train import finetune
+from sgft_jax.types import Policy, Prior, UserError
+
+gymnasium = pytest.importorskip("gymnasium", reason="make setup EXTRAS=dev, or pip install 'sgft-jax[gymnasium]'")
+
+from gymnasium import spaces  # noqa: E402
+from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
+
+from envs.adapters.gymnasium import TaskEnv, TaskVectorEnv  # noqa: E402
+
+GAMMA, MEMBERS, EPISODES = 0.9, 2, 2
+TURNED = Gap("turned", {"mass": [0.8, 2.0]}, {"action_rotation": 0.4, "obs_noise": 0.02})
+ALARM = Gap("alarm", {"risk": 0.15}, {})
+
+
+def wandering(actions):
+    """A policy that depends on all it is given: its state, what it remembers, the observation, its key."""
+
+    def act(state, carry, obs, key, *, explore):
+        noise = jnp.where(explore, 0.5, 0.0) * jax.random.normal(key, (actions,))
+        return jnp.tanh(state * obs.sum() + 0.1 * carry + noise), carry + 1.0
+
+    return Policy(lambda: jnp.zeros(()), act)
+
+
+def sync(make, gap, mode):
+    return SyncVectorEnv([lambda: TaskEnv(make(), gap)] * MEMBERS, autoreset_mode=mode)
+
+
+REAL = {
+    "each": lambda make, gap: [TaskEnv(make(), gap) for _ in range(MEMBERS)],
+    "vector": lambda make, gap: TaskVectorEnv(make(), gap, num_envs=MEMBERS),
+    "next step": lambda make, gap: sync(make, gap, AutoresetMode.NEXT_STEP),
+    "same step": lambda make, gap: sync(make, gap, AutoresetMode.SAME_STEP),
+}
+
+
+@pytest.mark.parametrize("real", REAL)
+@pytest.mark.parametrize(("make", "gap"), [(toy.make, TURNED), (toy_terminating.make, ALARM)])
+def test_out_and_in_again_plays_the_episodes_of_the_simulation(make, gap, real):
+    """Also where policies see their last two actions, and where episodes end at different steps."""
+    env = with_previous_actions(make(), 2)
+    policy, states = wandering(env.act_dim), jnp.array([0.3, -0.7])
+    keys = jax.random.split(jax.random.key(3), (MEMBERS, EPISODES))
+    same = jax.vmap(jax.vmap(lambda key: jax.random.key(seed_of(key))))(keys)
+    simulated = Simulated(env, real_worlds(env, [gap], jax.random.key(0)), jnp.zeros(MEMBERS, int), gamma=GAMMA)
+    system = Gymnasium(env, REAL[real](make, gap), gamma=GAMMA)
+    for explore in (True, False):
+        expected = simulated.play(policy, states, same, explore=explore)
+        found = system.play(policy, states, keys, explore=explore)
+        for name in ("transitions", "valid", "total_reward", "success", "exploded", "score"):
+            pair = getattr(found, name), getattr(expected, name)
+            jax.tree.map(functools.partial(np.testing.assert_allclose, atol=2e-5), *pair)
+        assert jax.tree.map(jnp.shape, found.world) == (MEMBERS, EPISODES)
+    system.close()
+
+
+class Spoken(gymnasium.Env):
+    """Counts steps in each part of its observation; ends, and says of a step, what it is told to."""
+
+    def __init__(self, observation=None, low=-1.0, high=1.0, ends=None, says=()):
+        self.observation_space = observation or spaces.Box(-9, 9, (4,), np.float32)
+        self.action_space = spaces.Box(low, high, (2,), np.float32)
+        self.ends, self.says, self.actions = ends, dict(says), []
+
+    def seen(self):
+        full = lambda space: np.full(space.shape, float(self.time), space.dtype)  # noqa: E731
+        return full(self.observation_space)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return self.seen(), {}
+
+    def step(self, action):
+        self.time += 1
+        self.actions.append(action)
+        over = self.time == 3
+        told = self.says.get(self.time, {})
+        return (
+            self.seen(),
+            10.0 * self.time,
+            over and self.ends == "terminated",
+            over and self.ends == "truncated",
+            told,
+        )
+
+
+class Parts(Spoken):
+    """The same in parts, which stand in another order than the task's."""
+
+    def __init__(self):
+        parts = {"velocity": spaces.Box(-9, 9, (2,)), "xy": spaces.Box(-9, 9, (2,))}
+        super().__init__(spaces.Dict(parts))
+
+    def seen(self):
+        return {"velocity": np.array([1.0, 2.0], np.float32), "xy": np.array([3.0, 4.0], np.float32)}
+
+
+STILL = Policy(lambda: (), lambda state, carry, obs, key, *, explore: (jnp.array([0.5, -1.0]), carry))
+
+
+def play(real, env=None, policy=STILL, members=1, **options):
+    """One episode of one member."""
+    system = Gymnasium(env or toy.make(), real, gamma=GAMMA, **options)
+    keys = jax.random.split(jax.random.key(0), (members, 1))
+    episode = system.play(policy, jnp.zeros(members), keys, explore=False)
+    return jax.tree.map(lambda x: np.asarray(x[0, 0]), episode)
+
+
+def test_actions_reach_the_bounds_of_the_space():
+    """From [-1, 1]: 0.5 is three quarters of the way from 0 to 4, -1 the lower bound."""
+    real = Spoken(low=np.array([0, -3], np.float32), high=np.array([4, 3], np.float32))
+    episode = play(real)
+    np.testing.assert_allclose(real.actions[0], [3.0, -3.0])
+    assert real.actions[0].dtype == np.float32
+    np.testing.assert_allclose(episode.transitions.action[0], [0.5, -1.0])  # what the policy chose is what is kept
+
+
+def test_the_environments_own_reward_is_recorded():
+    episode = play(Spoken(ends="truncated"))
+    np.testing.assert_allclose(episode.transitions.reward[:4], [10.0, 20.0, 30.0, 0.0])
+    assert episode.total_reward == 60.0
+
+
+@pytest.mark.parametrize(("ends", "discount"), [("terminated", 0.0), ("truncated", GAMMA)])
+def test_only_a_termination_zeroes_the_discount(ends, discount):
+    episode = play(Spoken(ends=ends))
+    assert episode.valid.tolist() == [True] * 3 + [False] * 17
+    np.testing.assert_allclose(episode.transitions.discount[:4], [GAMMA, GAMMA, discount, 0.0])
+    np.testing.assert_allclose(episode.transitions.next_obs[2], 3.0)  # the true successor
+    assert not episode.transitions.obs[3:].any()
+
+
+def test_the_task_ends_what_does_not_end_by_itself():
+    assert play(Spoken()).valid.sum() == 20
+
+
+def test_a_dict_is_flattened_in_the_order_of_the_task():
+    np.testing.assert_allclose(play(Parts()).transitions.obs[0], [3.0, 4.0, 1.0, 2.0])
+
+
+def test_a_function_of_ones_own_maps_observations():
+    real = Spoken(spaces.Dict({"camera": spaces.Box(0, 255, (8, 8))}))
+    real.seen = lambda: {"camera": np.full((8, 8), 2.0)}
+    episode = play(real, observe=lambda obs: obs["camera"][0, :4])
+    np.testing.assert_allclose(episode.transitions.obs[0], 2.0)
+
+
+@pytest.mark.parametrize(
+    ("says", "success"),
+    [
+        ({3: {"is_success": True}}, True),
+        ({2: {"success": True}, 3: {"success": False}}, False),
+        ({3: {"is_success": False, "success": True}}, False),
+    ],
+)
+def test_info_says_what_success_is(says, success):
+    """At the last step. Of two words the first counts, and both before the task's own function."""
+    episode = play(Spoken(ends="truncated", says=says))
+    assert bool(episode.success) == success and episode.score == float(success)
+
+
+def test_success_at_any_step_where_the_task_says_so():
+    env = toy.make()._replace(success_anytime=True)
+    assert play(Spoken(ends="truncated", says={2: {"success": True}, 3: {"success": False}}), env).success
+
+
+def test_the_task_says_what_success_is_where_info_does_not():
+    """A point that ends at (3, 3) is not at the origin; one that ends at (0, 0) is."""
+    here = Spoken(ends="truncated")
+    here.seen = lambda: np.zeros(4, np.float32)
+    assert not play(Spoken(ends="truncated")).success and play(here).success
+
+
+@pytest.mark.parametrize("bad", ["info", "nan"])
+def test_an_invalid_step_ends_the_episode_and_is_not_kept(bad):
+    real = Spoken(says={2: {"invalid": bad == "info"}})
+    real.seen = lambda: np.full(4, np.nan if bad == "nan" and real.time == 2 else 1.0, np.float32)
+    episode = play(real)
+    assert episode.valid.tolist() == [True] + [False] * 19 and episode.exploded and not episode.success
+    assert all(np.isfinite(x).all() for x in episode.transitions) and len(real.actions) == 2
+
+
+@pytest.mark.slow
+def test_it_is_a_system_that_setup_takes():
+    """Two seeds learn on two environments; their policies part from the prior's."""
+    env = toy.make()
+    network = NetworkConfig(hidden=(8,))
+    params = extract_params(make_sac(SACConfig(4, 2, network=network, ensemble_size=2)).init(jax.random.key(0)))
+    card = {"task": "toy", "obs_dim": 4, "act_dim": 2, "gamma": GAMMA, "ensemble_size": 2}
+    prior = Prior(params, {**card, "network": {"hidden": [8]}})
+    system = Gymnasium(env, [Spoken(), Spoken()], gamma=GAMMA)
+    assert isinstance(system, System)
+    options = {"initial_rollouts": 1, "utd": 0.1, "batch_size": 8, "critic_warmup": 0, "replay_capacity": 64}
+    setup = api.setup(env, system, prior, method="sac", seeds=2, **options)
+    assert setup.system is system and setup.seeds.tolist() == [0, 1]
+    for state, metrics in finetune(*setup, rollouts=2):
+        assert not metrics or metrics["real/return"].tolist() == [2100.0, 2100.0]  # 10 + 20 + ... + 200
+    assert int(state.rollouts) == 2
+    tuned = api.finetuned_priors(setup, state, prior, best=False)[1]
+    changed = jax.tree.map(lambda a, b: bool((a != b).any()), tuned.params.actor, params.actor)
+    assert any(jax.tree.leaves(changed))
+
+
+# --- what does not fit ------------------------------------------------------------------------------------------------
+
+
+class Buttons(Spoken):
+    def __init__(self):
+        super().__init__()
+        self.action_space = spaces.Discrete(3)
+
+
+def box(*shape):
+    return Spoken(spaces.Box(-1, 1, shape))
+
+
+@pytest.mark.parametrize(
+    ("real", "words"),
+    [
+        (Buttons, "its actions are Discrete(3); only a Box can be commanded"),
+        (lambda: Spoken(low=-np.inf), "its actions have no bounds"),
+        (lambda: box(3), "observes 3 numbers, the task measures 4: {'xy': 2, 'velocity': 2}; pass observe="),
+        (lambda: Spoken(spaces.Discrete(4)), "observes Discrete(4), neither a Box nor a Dict"),
+        (
+            lambda: Spoken(spaces.Dict({"xy": spaces.Box(0, 1, (2,))})),
+            "observes {'xy': 2}, the task measures {'xy': 2, 'velocity': 2}; pass observe=",
+        ),
+        (lambda: [box(4)] * 2, "the same environment is given twice; make one for each seed"),
+        (lambda: [box(4), box(4)], "2 for 1 members; give one environment for each seed"),
+        (lambda: sync(toy.make, TURNED, AutoresetMode.DISABLED), "its autoreset mode is AutoresetMode.DISABLED"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(real, words):
+    with pytest.raises(UserError) as stopped:
+        play(real())
+    assert words in str(stopped.value) and "\n" not in str(stopped.value)
+
+
+def test_the_number_of_actions_must_be_the_tasks():
+    env = toy.make()._replace(action=(Entry("force", "N", 3),))
+    with pytest.raises(UserError, match="takes 2 numbers as action, the task toy has 3"):
+        play(Spoken(), env)
+
+
+def test_a_function_that_maps_wrongly_is_one_line():
+    with pytest.raises(UserError, match=r"observe: returns 1 numbers, the task toy measures 4: xy \[2\]"):
+        play(Spoken(), observe=lambda obs: obs[:1])
+
+
+def test_a_task_judged_by_success_must_be_told_of_it():
+    with pytest.raises(UserError, match="nothing tells success, by which toy is judged"):
+        play(Spoken(ends="truncated"), toy.make()._replace(success=None))
