@@ -10,7 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments import cli
-from experiments.options import Impl, at_least_one, check_task, prior_folders
+from experiments.options import Impl, at_least_one, prior_folders
+from experiments.real_systems import check as check_real
 from sgft_jax.io.jsonfile import read_json
 from sgft_jax.presets import DEFAULT_PRESET
 from sgft_jax.types import UserError
@@ -30,7 +31,7 @@ class DiagnoseArgs:
     <out>/pretrain/<task>/<preset>."""
     real: str = "default"
     """What happened: a folder of a fine-tuning run, or any other with rollouts in real/ (docs/formats.md). Or a gap by
-    name, a .toml/.json file, or file.toml:name, on which the policies then play zero-shot."""
+    name, a .toml/.json file, file.toml:name, or gymnasium:NAME, on which the policies then play zero-shot."""
     rollouts: int | None = None
     """Only the first so many recorded rollouts; default: all. On a gap: how many to play, default 4."""
     calibrate: tuple[Path, ...] = ()
@@ -75,14 +76,14 @@ def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
     config = config_of(recorded) if recorded else {}
     task, prior = args.task or config.get("task"), args.prior
     if task is not None:
-        check_task(task, [] if recorded else [args.real])
+        check_real(task, [] if recorded else [args.real])
     if prior is None and task is None:
         raise UserError("nothing to diagnose with: name a prior with --prior, or a task with --task")
     if prior is None and config.get("prior"):
         prior = Path(config["prior"])
     folders = prior_folders(prior, out=args.out, task=task or "", preset=config.get("preset") or args.preset)
     task = task or read_json(folders[0] / "prior.json")["task"]
-    check_task(task, [] if recorded else [args.real])
+    check_real(task, [] if recorded else [args.real])
     return folders, task, recorded
 
 

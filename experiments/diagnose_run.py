@@ -17,6 +17,8 @@ from experiments import stacking
 from experiments.cli import columns
 from experiments.diagnose import DiagnoseArgs, config_of
 from experiments.gaps_run import systems
+from experiments.real_systems import connect, is_gymnasium, title
+from experiments.recorded import Recorded
 from sgft_jax import api
 from sgft_jax.analysis import figures, prediction, stats, tables, verdict
 from sgft_jax.analysis.curves import last_start
@@ -40,12 +42,17 @@ def diagnose(
 ) -> tuple[dict[str, Any], list[str]]:
     """The diagnosis as JSON data and as lines for people; writes the picture and the numbers."""
     env, priors = load(task, args.impl, folders)
+    home = args.out / "diagnose" / env.name
     if recorded is None:
-        gap = gaps.load(env, args.real)
-        count = args.rollouts or PLAYED
-        real, simulated = _play_both(env, gap, priors, count, args.seed)
-        which, name = list(range(len(priors))), gap.name
-        what = f"{_rollouts(count)} of {_priors(len(priors))}, just played zero-shot on the gap {gap.name}"
+        count, name = args.rollouts or PLAYED, title(args.real)
+        where = "" if is_gymnasium(args.real) else "the gap "
+        if is_gymnasium(args.real):
+            real = _play_real(env, args.real, priors, count, args.seed, RealStore(home / name))
+            simulated = play_simulated(env, priors, args.seed)
+        else:
+            real, simulated = _play_both(env, gaps.load(env, args.real), priors, count, args.seed)
+        which = list(range(len(priors)))
+        what = f"{_rollouts(count)} of {_priors(len(priors))}, just played zero-shot on {where}{name}"
     else:
         real, which = read(recorded, env, priors, args.rollouts)
         simulated = play_simulated(env, priors, args.seed)
@@ -70,7 +77,7 @@ def diagnose(
     found["signs"] = jsonable(verdict.signs(mean, names))
     found["verdict"] = verdict.verdict(mean, names)
     found["prediction"] = predicted(mean)
-    home = args.out / "diagnose" / env.name / name
+    home /= name
     home.mkdir(parents=True, exist_ok=True)
     picture = figures.diagnosis(
         home / "diagnosis.png", mean, verdict.signs(mean, names), _points(each), title=f"{env.name}: {what}"
@@ -147,6 +154,18 @@ def _play_both(env: Env, gap: Gap, priors: list[Prior], n: int, seed: int) -> tu
     first = lambda rollouts, k: jax.tree.map(lambda x: x[:k], rollouts)  # noqa: E731
     real, simulated = both[: len(priors)], both[len(priors) :]
     return [first(one, n) for one in real], [first(one, SIMULATED) for one in simulated]
+
+
+def _play_real(env: Env, real: str, priors: list[Prior], n: int, seed: int, store: RealStore) -> list[Rollouts]:
+    """Exploring rollouts [n] of every prior on a Gymnasium environment, each of them kept on disk."""
+    system = connect(env, [real], (), members=len(priors), gamma=priors[0].card["gamma"])
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(_SEED), seed), len(store))
+    keys = jnp.broadcast_to(jax.random.split(key, n), (len(priors), n))
+    members = stacking.stack([prior.params for prior in priors])
+    kept = Recorded(system, [store], done=len(store))
+    played = kept.play(make_policy(priors[0].card, env), members, keys, explore=True)
+    system.close()
+    return [rollouts_of(stacking.member(played, i)) for i in range(len(priors))]
 
 
 def rollouts_of(episodes: Episode) -> Rollouts:

@@ -1,14 +1,17 @@
 """Evaluate priors, or what fine-tuning has saved, in simulation or on "real" systems."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from envs import gaps
-from envs.gaps import SIM
+from envs.gaps import SIM, Gap
 from experiments import cli
-from experiments.options import Impl, at_least_one, check_task, prior_folders, without_repeats
+from experiments.options import Impl, at_least_one, prior_folders, without_repeats
+from experiments.real_systems import TOGETHER, connect, described, is_gymnasium
+from experiments.real_systems import check as check_real
 from sgft_jax.io.jsonfile import read_json
 from sgft_jax.presets import DEFAULT_PRESET
 from sgft_jax.types import UserError
@@ -30,9 +33,10 @@ class EvaluateArgs:
     """A task by name, or a Python file with a task of your own; default: the task of the prior."""
     real: tuple[str, ...] = (SIM,)
     """Where: sim (the training domain without sensor noise), gaps by name, or .toml/.json files: all gaps of a file, or
-    file.toml:name."""
+    file.toml:name. Or gymnasium:NAME, where every episode is a real one (docs/gymnasium.md)."""
     set: tuple[str, ...] = ()
-    """Changes to the real systems, e.g. --set latency=0.05 action_scale=[1,0.5]."""
+    """Changes to the real systems, e.g. --set latency=0.05 action_scale=[1,0.5]; of a Gymnasium environment keyword
+    arguments of gymnasium.make."""
     episodes: int = 200
     """Episodes per policy and system."""
     json: bool = False
@@ -53,7 +57,8 @@ def main(args: EvaluateArgs) -> None:
         print(json.dumps(found))
         return
     for system in found["systems"]:
-        print(f"{found['task']}, {system['where']}, {found['episodes']} episodes for each policy:")
+        steps = f", {system['real_steps']:,} real steps" if "real_steps" in system else ""
+        print(f"{found['task']}, {system['where']}, {found['episodes']} episodes for each policy{steps}:")
         for one in system["policies"]:
             low, high = (100 * x for x in one["success/interval"])
             exploded = f", {100 * one['exploded']:.1f} % exploded" if one["exploded"] else ""
@@ -68,38 +73,46 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     args = replace(args, real=gaps.each(args.real))
     folders, task = check(args)
     import jax
-    import jax.numpy as jnp
 
     import envs
-    from envs.pools import heldout_worlds, load_gap, padded, real_env
     from experiments.evaluation import describe, play
     from experiments.stacking import member, part, stack
     from sgft_jax.io.priors import load_priors, observed_by
     from sgft_jax.policies import make_policy
-    from sgft_jax.systems.simulated import Simulated
 
     env = envs.make(task, args.impl, **observed_by(folders))
-    found = [load_gap(env, real, () if real == SIM else args.set) for real in args.real]
+    found = [None if real == SIM else described(env, real, args.set) for real in args.real]
     priors = load_priors(folders, env)
-    card, system_env = priors[0].card, real_env(env, [gap for gap in found if gap])
+    card, stepped = priors[0].card, is_gymnasium(args.real[0])
     key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_SEED), args.seed))
-    pools = [heldout_worlds(system_env, gap, key_worlds, args.episodes) for gap in found]
-    system = Simulated(
-        system_env,
-        stack([padded(pool, args.episodes) for pool in pools]),
-        jnp.repeat(jnp.arange(len(pools)), len(priors)),
-        gamma=card["gamma"],
-    )
-    members = stack([prior.params for prior in priors] * len(pools))
+    if stepped:
+        system = connect(env, args.real, args.set, members=len(priors), gamma=card["gamma"])
+    else:
+        system = _simulated(env, found, key_worlds, args.episodes, members=len(priors), gamma=card["gamma"])
+    members = stack([prior.params for prior in priors] * len(found))
     played = play(system, make_policy(card, env), members, key_episodes, args.episodes)
 
-    def of_system(i: int) -> list[dict[str, Any]]:
+    def of_system(i: int) -> dict[str, Any]:
         own = part(played, i, len(priors))
-        return [{"policy": str(folder), **describe(member(own, k))} for k, folder in enumerate(folders)]
+        policies = [{"policy": str(folder), **describe(member(own, k))} for k, folder in enumerate(folders)]
+        return {"policies": policies, **({"real_steps": int(own.valid.sum())} if stepped else {})}
 
     where = ["in simulation" if gap is None else f"on the {gap.name} real system" for gap in found]
-    systems = [{"where": name, "policies": of_system(i)} for i, name in enumerate(where)]
+    systems = [{"where": name, **of_system(i)} for i, name in enumerate(where)]
     return {"task": env.name, "impl": env.impl, "episodes": args.episodes, "systems": systems}
+
+
+def _simulated(env: Any, found: Sequence[Gap | None], key: Any, episodes: int, *, members: int, gamma: float) -> Any:
+    """The `Simulated` systems of gaps, None for the simulator, in held-out worlds with so many members on each."""
+    import jax.numpy as jnp
+
+    from envs.pools import heldout_worlds, padded, real_env
+    from experiments.stacking import stack
+    from sgft_jax.systems.simulated import Simulated
+
+    real = real_env(env, [gap for gap in found if gap])
+    pools = [padded(heldout_worlds(real, gap, key, episodes), episodes) for gap in found]
+    return Simulated(real, stack(pools), jnp.repeat(jnp.arange(len(pools)), members), gamma=gamma)
 
 
 def check(args: EvaluateArgs) -> tuple[list[Path], str]:
@@ -115,14 +128,16 @@ def check(args: EvaluateArgs) -> tuple[list[Path], str]:
         raise UserError("--real: name at least one")
     without_repeats("--real", args.real)
     reals = [real for real in args.real if real != SIM]
+    if len(reals) < len(args.real) and any(map(is_gymnasium, reals)):
+        raise UserError(f"--real {' '.join(args.real)}: {TOGETHER}")
     if args.set and not reals:
         raise UserError(f"--set {args.set[0]}: changes a real system; name one with --real")
     if args.task is not None:
-        check_task(args.task, reals)
+        check_real(args.task, reals, args.set)
     home = args.run / "best" if args.best and args.run else args.run or args.prior
     folders = prior_folders(home, out=args.out, task=args.task or "", preset=args.preset)
     task = args.task or read_json(folders[0] / "prior.json")["task"]
-    check_task(task, reals)
+    check_real(task, reals, args.set)
     return folders, task
 
 

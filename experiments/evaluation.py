@@ -11,18 +11,19 @@ from envs.rollout import Episode
 from sgft_jax import mesh
 from sgft_jax.analysis import stats
 from sgft_jax.pretraining import Best, keep_better
-from sgft_jax.systems.simulated import Simulated
+from sgft_jax.systems import System
 from sgft_jax.types import Array, Key, Metrics, Policy, PyTree
 
 SCORES = ("score", "success", "return", "exploded")  # of every task, see `scores`
 
 
-def play(system: Simulated, policy: Policy, params: PyTree, key: Key, episodes: int) -> Episode:
+def play(system: System, policy: Policy, params: PyTree, key: Key, episodes: int) -> Episode:
     """Episodes [M, episodes] of each of M policies without exploration, as NumPy arrays on every host.
 
     All policies play the same episodes, so that differences between them are paired.
     """
-    keys = jnp.broadcast_to(jax.random.split(key, episodes), (*system.which.shape, episodes))
+    members = jax.tree.leaves(params)[0].shape[0]
+    keys = jnp.broadcast_to(jax.random.split(key, episodes), (members, episodes))
     played = mesh.local(system.play(policy, params, keys, explore=False))
     return jax.tree.map(np.asarray, played)
 

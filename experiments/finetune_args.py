@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from envs import gaps
-from experiments.options import Impl, at_least_one, check_task, prior_folders, seed_list, seeds_name, without_repeats
+from experiments.options import Impl, at_least_one, prior_folders, seed_list, seeds_name, without_repeats
+from experiments.real_systems import check as check_real
+from experiments.real_systems import title
 from sgft_jax import extend
 from sgft_jax.io.runs import check_start
 from sgft_jax.methods import DEFAULT, get_method
@@ -29,9 +30,11 @@ class FinetuneArgs:
     real: tuple[str, ...] = ("default",)
     """The real system: a gap by name, a .toml/.json file of one gap (tables `params` and `effects`) or of several, then
     all of them, file.toml:name for one of several, or sim for no gap. Several are played together in one program,
-    which takes little longer; each has a run folder of its own."""
+    which takes little longer; each has a run folder of its own. Or gymnasium:NAME, an environment for each seed
+    (docs/gymnasium.md)."""
     set: tuple[str, ...] = ()
-    """Changes to the real systems, e.g. --set latency=0.05 action_scale=[1,0.5]."""
+    """Changes to the real systems, e.g. --set latency=0.05 action_scale=[1,0.5]; of a Gymnasium environment keyword
+    arguments of gymnasium.make, e.g. --set frame_skip=5."""
     seeds: int = 10
     """Number of seeds; seed i starts from prior i modulo the number of priors."""
     rollouts: int = 100
@@ -54,7 +57,8 @@ class FinetuneArgs:
     eval_every: int = 5
     """Expert: rollouts between evaluations."""
     eval_episodes: int = 50
-    """Expert: episodes per seed and evaluation, always the same ones; they cost no real transitions."""
+    """Expert: episodes per seed and evaluation, always the same ones; 0: no evaluation. They cost no real transitions,
+    except on Gymnasium environments, where they are counted and kept."""
     checkpoint_every: int = 10
     """Expert: rollouts between checkpoints."""
     tuned: bool = False
@@ -81,7 +85,7 @@ def with_settings(args: FinetuneArgs, settings: Mapping[str, Any]) -> FinetuneAr
 
 def run_folder(args: FinetuneArgs, real: str) -> Path:
     """Where the run on that real system lives; the seeds of one call share a folder."""
-    system = "_".join([gaps.title(real), *(change.replace("/", "") for change in args.set)])
+    system = "_".join([title(real), *(change.replace("/", "") for change in args.set)])
     seeds = seeds_name(seed_list(args.seed, args.seeds))
     return args.out / "finetune" / extend.name_of(args.task) / system / label(args) / seeds
 
@@ -93,7 +97,9 @@ def label(args: FinetuneArgs) -> str:
 
 def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
     """The method and the seeds; raises UserError for what is wrong in the arguments and with the run folders."""
-    at_least_one(args, "rollouts", "eval_every", "eval_episodes", "checkpoint_every")
+    at_least_one(args, "rollouts", "eval_every", "checkpoint_every")
+    if args.eval_episodes < 0:
+        raise UserError(f"--eval-episodes is {args.eval_episodes}: must be at least 0")
     method, seeds = get_method(args.method), seed_list(args.seed, args.seeds)
     if not isinstance(args.options, method.config):
         raise UserError(f"--method {method.name}: the options are those of another method")
@@ -106,7 +112,7 @@ def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
     if not args.real:
         raise UserError("--real: name at least one")
     without_repeats("--real", args.real)
-    check_task(args.task, args.real)
+    check_real(args.task, args.real, args.set)
     folders = [run_folder(args, real) for real in args.real]
     if twice := [folder for folder in folders if folders.count(folder) > 1]:
         raise UserError(f"--real {' '.join(args.real)}: two of them would share the folder {twice[0]}; name it once")

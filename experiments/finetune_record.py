@@ -14,19 +14,27 @@ from envs.rollout import Episode
 from experiments.stacking import member
 from experiments.video import before_and_after
 from sgft_jax.analysis import figures, tables
-from sgft_jax.analysis.curves import deepest_fall, describe, read_curve
+from sgft_jax.analysis.curves import Curve, deepest_fall, describe, read_curve
 from sgft_jax.io import checkpoint
-from sgft_jax.io.log import MetricsLog, check_finite, write_summary
+from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
 from sgft_jax.io.priors import save_prior
 from sgft_jax.io.real import RealStore
 from sgft_jax.train import OFFLINE_PART, FinetuneProgress
 from sgft_jax.types import Metrics, Prior, PyTree
 
+EVALUATION = "evaluation"  # the folder of episodes that evaluations on a real system have cost
+
 
 class Record:
-    """The files of one run folder (docs/formats.md). Arrays and states have a leading axis of the seeds [S]."""
+    """The files of one run folder (docs/formats.md). Arrays and states have a leading axis of the seeds [S].
 
-    def __init__(self, folder: Path, env: Env, gap: Gap, method: str, seeds: list[int]) -> None:
+    evaluations_cost: real episodes that an evaluation costs every seed; None where episodes are simulated and free.
+    """
+
+    def __init__(
+        self, folder: Path, env: Env, gap: Gap, method: str, seeds: list[int], *, evaluations_cost: int | None = None
+    ) -> None:
+        self.evaluations_cost, self.evaluated = evaluations_cost, 0  # episodes, `evaluated` by all so far
         self.folder, self.env, self.gap, self.method, self.seeds = folder, env, gap, method, seeds
         self.log, self.real = MetricsLog(folder), RealStore(folder)
         self.last_good: Path | None = None  # the checkpoint to go back to when training diverges
@@ -40,13 +48,15 @@ class Record:
         """The state of that checkpoint, to which the logs are cut back. What the robot did stays."""
         progress, meta = checkpoint.restore(self.folder, like, step=step, expect=self.expect)
         self.log.truncate(meta["position"])
+        self.evaluated = meta.get("evaluated", 0)
         self.last_good = checkpoint.path(self.folder, step)
         return progress
 
     def checkpoint(self, progress: FinetuneProgress) -> None:
         """The state, and how long the logs are."""
         step = int(progress.rollouts) + -(-int(progress.offline) // OFFLINE_PART)
-        meta = {**self.expect, "rollouts": int(progress.rollouts), "position": self.log.position()}
+        counts = {"rollouts": int(progress.rollouts), "evaluated": self.evaluated}
+        meta = {**self.expect, **counts, "position": self.log.position()}
         self.last_good = checkpoint.save(self.folder, step, progress, meta=meta)
 
     def metrics(self, done: int, values: Mapping[str, np.ndarray]) -> None:
@@ -55,9 +65,13 @@ class Record:
         self.log.metrics(self._transitions(done), {"rollouts": done, **values})
 
     def evaluation(self, done: int, scores: Metrics) -> None:
-        """A line of the learning curve."""
-        minutes = self._transitions(done) * self.env.control_dt / 60
-        self.log.eval(self._transitions(done), {"rollouts": done, "robot_minutes": minutes, **scores})
+        """A line of the learning curve. Its step is what lies behind it; what it costs itself counts from then on."""
+        self.log.eval(self._transitions(done), {"rollouts": done, "robot_minutes": self._minutes(done), **scores})
+        self.evaluated += self.evaluations_cost or 0
+
+    def evaluation_store(self, name: str) -> RealStore:
+        """Where the episodes of an evaluation go that costs real ones."""
+        return RealStore(self.folder / EVALUATION / name)
 
     def time(self, done: int, seconds: float) -> None:
         """Apart from the metrics, which must not depend on the clock."""
@@ -72,26 +86,43 @@ class Record:
             prior = Prior(member(params, i), {**card, **own, "finetuned": facts})
             save_prior(self.folder / kind / f"seed-{seed}", prior)
 
-    def summarise(self, best: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    def summarise(self, done: int, best: Mapping[str, np.ndarray]) -> dict[str, Any]:
         """summary.json, the learning curve and the closing words; the log ends here.
 
-        best: of the best policies by real evidence, [S] each: `score` in the evaluation, `evidence`, `rollouts`.
+        done: rollouts. best: of the best policies by real evidence, [S] each: `evidence`, `rollouts`, and `score` in
+        an evaluation of their own, where there was one.
         """
         self.log.close()
-        env, curve = self.env, read_curve(self.folder).of(self.env.score)
+        env, evaluated = self.env, read_jsonl(self.folder / EVAL) if (self.folder / EVAL).exists() else []
+        curve = read_curve(self.folder).of(env.score) if evaluated else None
+        far = {"rollouts": done, "transitions": self._transitions(done), "robot_minutes": self._minutes(done)}
+        numbers = {"final": far, "seeds": len(self.seeds)} if curve is None else describe(curve)
         about = {"task": env.name, "method": self.method, "impl": env.impl, "gap": self.gap._asdict()}
-        summary = about | {"score": env.score} | describe(curve) | {"best": {k: x.tolist() for k, x in best.items()}}
+        summary = about | {"score": env.score} | numbers | {"best": {k: x.tolist() for k, x in best.items()}}
+        if self.evaluations_cost is not None:
+            summary["real_steps"] = self._real_steps()
         write_summary(self.folder, summary)
-        title = f"{env.name} on the {self.gap.name} real system"
+        if curve is not None:
+            self._show(curve, best.get("score"))
+        return summary
+
+    def _show(self, curve: Curve, best: np.ndarray | None) -> None:
+        """The learning curve as a figure and in words. best: [S] scores of the best policies."""
+        score = self.env.score
+        title = f"{self.env.name} on the {self.gap.name} real system"
         figures.learning_curves(self.folder / "figures" / "success.png", {self.method: [curve]}, title=title)
         before, after = (tables.middle(curve, curve.values[:, i]) for i in (0, -1))
-        fall, chosen = (tables.plain(x, env.score) for x in (deepest_fall(curve), float(best["score"].mean())))
+        chosen = "" if best is None else f"; best policy by the training rollouts {tables.plain(best.mean(), score)}"
         print(
-            f"{self.gap.name}: {tables.words(env.score)} on the real system {before} before -> {after} after "
-            f"{curve.rollouts[-1]} rollouts; deepest fall below the start {fall}; best policy by the training rollouts "
+            f"{self.gap.name}: {tables.words(score)} on the real system {before} before -> {after} after "
+            f"{curve.rollouts[-1]} rollouts; deepest fall below the start {tables.plain(deepest_fall(curve), score)}"
             f"{chosen}"
         )
-        return summary
+
+    def _real_steps(self) -> list[int]:
+        """[S] all steps of the real system that are on disk, those of evaluations included."""
+        stores = [self.real, *(RealStore(folder) for folder in sorted((self.folder / EVALUATION).glob("*")))]
+        return sum(store.load(i)["valid"].sum(1) for store in stores for i in range(len(store))).tolist()
 
     def film(self, pool: World, play: Callable[[], Sequence[Episode]], rollouts: int) -> str:
         """An evaluation episode of the first seed before and after fine-tuning; says in one line how it went.
@@ -110,4 +141,8 @@ class Record:
         return before_and_after(self.env, pool, chosen, path, rollouts=rollouts)
 
     def _transitions(self, rollouts: int) -> int:
-        return rollouts * self.env.episode_length
+        """Real transitions per seed, those that evaluations have cost included."""
+        return (rollouts + self.evaluated) * self.env.episode_length
+
+    def _minutes(self, rollouts: int) -> float:
+        return self._transitions(rollouts) * self.env.control_dt / 60

@@ -1,5 +1,6 @@
 """Impure: a fine-tuning run, `train.finetune` with folders, checkpoints, logs, evaluations and videos around it."""
 
+import contextlib
 import functools
 import time
 from collections.abc import Iterator, Mapping
@@ -10,8 +11,8 @@ import jax
 import numpy as np
 
 import envs
-from envs import gaps
 from envs.rollout import Episode
+from experiments import real_systems
 from experiments.evaluation import scores
 from experiments.finetune_args import VOLATILE, FinetuneArgs, run_folder
 from experiments.finetune_record import Record
@@ -24,8 +25,12 @@ from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.methods.options import card_of
+from sgft_jax.systems.gymnasium import Gymnasium
+from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import FinetuneProgress
 from sgft_jax.types import Method, Metrics, PyTree, UserError
+
+_AFTER = "rollouts-"  # what the folder of an evaluation is called, before their number
 
 
 def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path]) -> list[dict[str, Any]]:
@@ -33,7 +38,7 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
     sizes = {"--seeds" if len(args.real) == 1 else "the number of --real times --seeds": len(args.real) * args.seeds}
     devices = mesh.devices(args.devices, sizes)
     env = envs.make(args.task, args.impl, **observed_by(folders))
-    found = [gaps.load(env, real, args.set) for real in args.real]
+    found = [real_systems.described(env, name, args.set) for name in args.real]
     priors = load_priors(folders, env)
     for prior in priors:
         api.check_prior(prior, method, env)
@@ -43,15 +48,23 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
         homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
         inputs={"priors": [digest(prior) for prior in priors]},
     )  # fmt: skip
-    try:
-        with mesh.use(devices):
-            setup = api.setup(env, found, priors, method=args.method, seeds=seeds, config=args.options)
-            real = setup.system.env
-            records = [Record(o.folder, real, gap, method.name, seeds) for o, gap in zip(opened, found, strict=True)]
-            return _Run(args, setup, card_of(priors[0] if priors else None), records).work()
-    finally:
+    card = card_of(priors[0] if priors else None)
+    with contextlib.ExitStack() as last:
         for own in opened:
-            own.close()
+            last.callback(own.close)
+        last.enter_context(mesh.use(devices))
+        playing, members, cost = found, seeds, None
+        if real_systems.is_gymnasium(args.real[0]):
+            playing = real_systems.connect(env, args.real, args.set, members=len(seeds), gamma=card["gamma"])
+            last.callback(playing.close)
+            members, cost = seeds * len(args.real), args.eval_episodes
+        setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
+        assert isinstance(setup.system, Simulated | Gymnasium)
+        records = [
+            Record(own.folder, setup.system.env, gap, method.name, seeds, evaluations_cost=cost)
+            for own, gap in zip(opened, found, strict=True)
+        ]
+        return _Run(args, setup, setup.system, card, records).work()
 
 
 class _Run:
@@ -61,9 +74,16 @@ class _Run:
     for more worlds. Members [M = G * S] are the seeds of the first real system, then those of the next.
     """
 
-    def __init__(self, args: FinetuneArgs, setup: Setup, card: dict[str, Any], records: list[Record]) -> None:
+    def __init__(
+        self,
+        args: FinetuneArgs,
+        setup: Setup,
+        system: Simulated | Gymnasium,
+        card: dict[str, Any],
+        records: list[Record],
+    ) -> None:
         self.args, self.setup, self.card, self.records = args, setup, card, records
-        self.finetuner, self.system, self.seeds = setup.finetuner, setup.system, setup.seeds
+        self.finetuner, self.system, self.seeds = setup.finetuner, system, setup.seeds
         self.count = len(setup.seeds) // len(records)
         self.begin = functools.partial(train.begin, setup.finetuner, setup.priors, setup.seeds, setup.simulated)
 
@@ -101,7 +121,7 @@ class _Run:
                 shown = self._log(done, values, time.perf_counter() - started)
                 if done == before and values:  # a part of the offline phase
                     self._checkpoint(progress)
-                elif self._due(self.args.eval_every, before, done):
+                elif self.args.eval_episodes and self._due(self.args.eval_every, before, done):
                     shown[f"{self.system.env.score}, evaluation"] = self._evaluate(progress, done)
                 if done and self._due(self.args.checkpoint_every, before, done):
                     self._checkpoint(progress)
@@ -124,8 +144,12 @@ class _Run:
         return {} if real is None else {f"{self.system.env.score}, exploring": float(real.mean())}
 
     def _evaluate(self, progress: FinetuneProgress, done: int) -> float:
-        n = self.args.eval_episodes
-        found = scores(train.evaluate(self.finetuner, self.system, progress.agent, self.seeds, n))
+        system = self.system
+        if isinstance(system, Gymnasium):  # its episodes are real ones, and as dear as those of training
+            stores = [record.evaluation_store(f"{_AFTER}{done:06d}") for record in self.records]
+            system = Recorded(system, stores, done=0, explore=False)
+        played = train.evaluate(self.finetuner, system, progress.agent, self.seeds, self.args.eval_episodes)
+        found = scores(played)
         for record, own in self._each(found):
             record.evaluation(done, own)
         return float(found["score"].mean())
@@ -145,18 +169,22 @@ class _Run:
         best = progress.best
         card = {**self.card, "plan": None, **self.finetuner.card}  # the prior may be one that plans
         last = jax.jit(jax.vmap(self.finetuner.export))(progress.agent)
-        played = train.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, self.args.eval_episodes)
-        facts = {"score": scores(played)["score"], "evidence": best.score, "rollouts": best.rollouts}
+        facts = {"evidence": best.score, "rollouts": best.rollouts}
+        n = self.args.eval_episodes
+        if n and isinstance(self.system, Simulated):
+            played = train.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, n)
+            facts["score"] = scores(played)["score"]
         films = functools.cache(lambda: self._before_and_after(progress))
         summaries = []
         for i, record in enumerate(self.records):
             own = lambda tree, i=i: part(tree, i, self.count)  # noqa: E731
             record.save_policies("policy", own(last), card)
             record.save_policies("best", own(best.params), card)
-            summaries.append(record.summarise({name: np.asarray(own(x)) for name, x in facts.items()}))
-            if self.args.video:
+            rollouts, chosen = int(progress.rollouts), {name: np.asarray(own(x)) for name, x in facts.items()}
+            summaries.append(record.summarise(rollouts, chosen))
+            if self.args.video and n and isinstance(self.system, Simulated):
                 pool = jax.tree.map(lambda x, i=i: x[i], self.system.pools)
-                print(record.film(pool, lambda own=own: [own(x) for x in films()], int(progress.rollouts)))
+                print(record.film(pool, lambda own=own: [own(x) for x in films()], rollouts))
             print(f"results: {record.folder}  (policy/, best/, real/, summary.json, figures/)")
         print(f"next: python -m experiments.figures --out {self.args.out}")
         return summaries

@@ -1,8 +1,9 @@
-"""Impure: a real system whose every rollout is on disk before anything learns from it."""
+"""Impure: a real system whose every episode is on disk before anything learns from it."""
 
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -16,28 +17,34 @@ _FACTS = tuple(name for name in Episode._fields if name != "transitions")
 
 
 class Recorded:
-    """A `System` that stores exploring rollouts, and replays those stored already instead of playing them again.
+    """A `System` that stores episodes, and replays those stored already instead of playing them again.
 
     A run that was killed after its last checkpoint learns from what the robot has done since, and repeats nothing.
 
-    inner: what plays. stores: one for each real system, whose members stand one after another. done: rollouts behind
-    the state that the run starts from.
+    inner: what plays. stores: one for each real system, whose members stand one after another. done: episodes behind
+    the state that the run starts from. explore: whether exploring episodes are stored, or those without exploration;
+    the others are played and forgotten.
     """
 
-    def __init__(self, inner: System, stores: Sequence[RealStore], *, done: int) -> None:
-        self.inner, self.stores, self.rollout = inner, stores, done
+    def __init__(self, inner: System, stores: Sequence[RealStore], *, done: int, explore: bool = True) -> None:
+        self.inner, self.stores, self.rollout, self.explore = inner, stores, done, explore
         if short := [store for store in stores if len(store) < done]:
             raise UserError(f"{short[0].folder}: holds {len(short[0])} rollouts, the checkpoint remembers {done}")
 
     def play(self, policy: Any, states: PyTree, keys: Key, *, explore: bool) -> Episode:
-        """Episodes [M, n]; exploring ones come one at a time, n = 1."""
-        if not explore:
-            return self.inner.play(policy, states, keys, explore=False)
+        """Episodes [M, n], stored one after another."""
+        if explore != self.explore:
+            return self.inner.play(policy, states, keys, explore=explore)
+        played = [self._one(policy, states, keys[:, i : i + 1]) for i in range(keys.shape[1])]
+        return jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *played)
+
+    def _one(self, policy: Any, states: PyTree, keys: Key) -> Episode:
+        """The next episode of every member, [M, 1]."""
         number, self.rollout = self.rollout, self.rollout + 1
         missing = [store for store in self.stores if len(store) <= number]
         if not missing:
             return self._stored(number)
-        episodes = self.inner.play(policy, states, keys, explore=True)
+        episodes = self.inner.play(policy, states, keys, explore=self.explore)
         for i, store in enumerate(self.stores):
             if len(store) <= number:
                 store.append(_arrays(part(episodes, i, keys.shape[0] // len(self.stores))))

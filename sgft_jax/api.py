@@ -110,15 +110,20 @@ def check_prior(prior: Prior, method: Method, env: Env) -> None:
         raise UserError(f"the prior is of the task {prior.card['task']!r}, not of {env.name!r}")
 
 
-def evaluate_prior(prior: Prior, env: Env, gap: Gap | None = None, *, episodes: int = 200, seed: int = 0) -> Episode:
+def evaluate_prior(
+    prior: Prior, env: Env, real: Gap | System | None = None, *, episodes: int = 200, seed: int = 0
+) -> Episode:
     """Episodes [episodes] of a prior's policy without exploration.
 
-    gap: the real system; None = the training domain without sensor noise. Another seed draws other worlds and starts.
+    real: a gap or a `System` of one member; None = the training domain without sensor noise. Another seed draws other
+    worlds and starts.
     """
     key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_EVALUATION), seed))
-    real = real_env(env, [] if gap is None else [gap])
-    pool = heldout_worlds(real, gap, key_worlds, episodes)
-    system = Simulated(real, jax.tree.map(lambda x: x[None], pool), jnp.zeros(1, int), gamma=prior.card["gamma"])
+    system = real
+    if not isinstance(system, System):
+        there = real_env(env, [] if system is None else [system])
+        pool = jax.tree.map(lambda x: x[None], heldout_worlds(there, system, key_worlds, episodes))
+        system = Simulated(there, pool, jnp.zeros(1, int), gamma=prior.card["gamma"])
     one = jax.tree.map(lambda x: x[None], prior.params)
     keys = jax.random.split(key_episodes, (1, episodes))
     played = system.play(make_policy(prior.card, env), one, keys, explore=False)
