@@ -1,0 +1,220 @@
+"""Impure: a real system behind a socket. The robot's side is `robot_client`, one file that is copied to the robot.
+
+The learner listens, the robot connects. Every step is asked for by number until its outcome has come, and the robot
+answers a number that it has done already without moving again: so a message that is lost, damaged or doubled costs
+time and nothing else. A step whose outcome never came, because robot or connection died, is in doubt: it ends its
+episode and is not learned from.
+"""
+
+import contextlib
+import hmac
+import queue
+import secrets
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import ServerConnection, serve
+
+from sgft_jax.systems.robot_client import LIMIT, VERSION, array, pack, unpack
+from sgft_jax.types import UserError
+
+_HELLO = 10.0  # seconds for the first message
+_GONE = {"type": "gone"}
+
+
+class Box(NamedTuple):
+    """Bounds of numbers, as a Gymnasium space names them. low, high: [n]."""
+
+    low: np.ndarray
+    high: np.ndarray
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(n,)"""
+        return self.low.shape
+
+    @property
+    def dtype(self) -> np.dtype:
+        """That of the bounds."""
+        return self.low.dtype
+
+
+class Remote:
+    """One robot, at whatever computer, in the manner of a Gymnasium environment; waits for it as long as it takes.
+
+    Rewards are nan where the robot does not know them. `info` of a step has "sent", what the robot was really told
+    [action_size]; "late", if no command came in time; "is_success", if the robot knows; and "invalid" where the outcome
+    is in doubt: that step is not to be learned from.
+
+    obs_size, action_size: of the task; a robot with others is refused. host: interface to listen at, default this
+    computer alone. port: 0 chooses a free one. token: what the robot must know, default a fresh one. again: seconds
+    after which an unanswered message is repeated. say: hears one line about everything unusual.
+    Raises UserError where the port is taken.
+    """
+
+    def __init__(
+        self, obs_size: int, action_size: int, *, host: str = "127.0.0.1", port: int = 0, token: str | None = None,
+        again: float = 1.0, say: Callable[[str], None] = print,
+    ) -> None:  # fmt: skip
+        self.obs_size, self.action_size, self.token = obs_size, action_size, token or secrets.token_hex(16)
+        self._again, self._say = again, say
+        self._lock, self._inbox = threading.Lock(), queue.SimpleQueue[Mapping[str, Any]]()
+        self._connection: ServerConnection | None = None
+        self._there = threading.Event()
+        self._episode, self._step = 0, 0
+        self._obs = np.zeros(obs_size, np.float32)
+        self.period: float | None = None
+        self.observation_space = Box(*(x * np.full(obs_size, np.inf, np.float32) for x in (-1, 1)))
+        self.action_space = Box(*(x * np.ones(action_size, np.float32) for x in (-1, 1)))
+        self.spec, self.unwrapped = None, self
+        try:
+            self._server = serve(
+                self._serve, host, port, max_size=LIMIT, max_queue=16, compression=None, open_timeout=_HELLO
+            )
+        except OSError as error:
+            raise UserError(f"cannot listen at {host}:{port} ({error.strerror}); choose another port") from error
+        self.url = "ws://{}:{}".format(*self._server.socket.getsockname()[:2])
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread.start()
+
+    def reset(self, *, seed: int) -> tuple[np.ndarray, dict[str, Any]]:
+        """Has the robot begin an episode; returns what it measures, [obs_size], and nothing else."""
+        while True:
+            self._wait()
+            self._episode, self._step = self._episode + 1, 0
+            said = self._ask(pack("reset", episode=self._episode, seed=seed), "began")
+            if said is not None:
+                self._obs = said["obs"]
+                return self._obs, {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Has the robot take a step: obs, reward, terminated, truncated, info. action: [action_size] in [-1, 1]."""
+        said = self._ask(pack("act", episode=self._episode, step=self._step, action=np.asarray(action)), "moved")
+        if said is None:
+            return self._obs, float("nan"), False, True, {"invalid": True}
+        self._step += 1
+        self._obs = said["obs"]
+        reward = float("nan") if said["reward"] is None else said["reward"]
+        known = {} if said["success"] is None else {"is_success": said["success"]}
+        return (
+            self._obs,
+            reward,
+            said["terminated"],
+            said["truncated"],
+            {"sent": said["sent"], "late": said["late"], **known},
+        )
+
+    def rest(self) -> None:
+        """Stops the robot until the next episode."""
+        self._send(pack("rest", episode=self._episode))
+
+    def __str__(self) -> str:
+        return f"robot at {self.url}"
+
+    def close(self) -> None:
+        """Ends the run on both sides."""
+        self._send(pack("end"))
+        self._server.shutdown()
+        self._thread.join()
+
+    # ------------------------------------------------------------ asking
+
+    def _wait(self) -> None:
+        """Until a robot is connected."""
+        if not self._there.is_set():
+            self._say(f"waiting for a robot at {self.url}, token {self.token}")
+            self._there.wait()
+
+    def _ask(self, message: bytes, answer: str) -> Mapping[str, Any] | None:
+        """The answer to a message of this episode and step; None if the robot is gone or has failed."""
+        self._send(message)
+        while True:
+            try:
+                said = self._inbox.get(timeout=self._again)
+            except queue.Empty:
+                if not self._there.is_set():
+                    return None
+                self._send(message)
+                continue
+            if said["type"] == "gone":
+                self._say(f"the robot is gone in episode {self._episode} before the outcome of step {self._step}")
+                return None
+            if said["episode"] != self._episode:
+                continue  # of before
+            if said["type"] == "failed":
+                self._say(f"the robot has stopped: {said['reason']}")
+                return None
+            if said["type"] == answer and said.get("step", 0) == self._step:
+                try:
+                    return self._read(said)
+                except ValueError as error:
+                    self._say(f"the robot's {answer} of step {self._step}: {error}")
+                    return None
+
+    def _read(self, said: Mapping[str, Any]) -> Mapping[str, Any]:
+        """With its arrays as arrays; ValueError for wrong sizes and numbers."""
+        sizes = {"obs": self.obs_size, "sent": self.action_size}
+        return {**said, **{name: array(said[name], n, name) for name, n in sizes.items() if name in said}}
+
+    def _send(self, message: bytes) -> None:
+        connection = self._connection
+        if connection is not None:
+            with contextlib.suppress(ConnectionClosed):  # the thread that reads says so
+                connection.send(message)
+
+    # ------------------------------------------------------------ the server's threads
+
+    def _serve(self, connection: ServerConnection) -> None:
+        """One connection, from its first message to its end."""
+        reason = self._admit(connection)
+        if reason is not None:
+            self._say(f"refused a connection: {reason}")
+            with contextlib.suppress(ConnectionClosed):
+                connection.send(pack("refused", reason=reason[:500]))
+            return
+        connection.send(pack("welcome"))
+        self._there.set()
+        try:
+            for data in connection:
+                try:
+                    message = unpack(data)
+                except ValueError as error:
+                    self._say(f"ignored: a message of the robot {error}")
+                    continue
+                if message["type"] in ("began", "moved", "failed"):
+                    self._inbox.put(message)
+        except ConnectionClosed:
+            pass
+        finally:
+            self._there.clear()
+            self._inbox.put(_GONE)
+            with self._lock:
+                self._connection = None
+
+    def _admit(self, connection: ServerConnection) -> str | None:
+        """Takes a robot that fits as the one robot; else says why not."""
+        try:
+            said = unpack(connection.recv(timeout=_HELLO))
+        except (ValueError, TimeoutError) as error:
+            return f"its first message {error or 'did not come'}"
+        if said["type"] != "hello":
+            return f"its first message is {said['type']}, not hello"
+        if not hmac.compare_digest(said["token"].encode(), self.token.encode()):
+            return "wrong token"
+        for name, own, theirs in (
+            ("protocol version", VERSION, said["version"]),
+            ("numbers measured", self.obs_size, said["obs_size"]),
+            ("numbers commanded", self.action_size, said["action_size"]),
+        ):
+            if own != theirs:
+                return f"{said['robot']}: {name}: the robot has {theirs}, the learner {own}"
+        with self._lock:
+            if self._connection is not None:
+                return f"{said['robot']}: another robot is connected"
+            while not self._inbox.empty():
+                self._inbox.get_nowait()
+            self._connection, self.period = connection, said["period"]
+        return None

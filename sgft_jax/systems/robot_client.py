@@ -1,0 +1,361 @@
+"""Impure: the robot's side of a remote real system. Copy this one file to the robot's computer.
+
+It needs Python 3.9 or newer, numpy, msgpack and websockets, and nothing else of this project. You write a driver,
+one of
+
+    class Simulated:                        class Arm:
+        obs_size, action_size = 18, 3           obs_size, action_size = 18, 3
+        def reset(self, seed): ...              def reset(self, seed): ...     # brings it to a start, returns obs
+        def step(self, action): ...             def read(self): ...            # what the sensors say now
+        def stop(self): ...                     def send(self, action): ...    # commands the motors, does not wait
+                                                def stop(self): ...            # safe, at any time and repeatedly
+
+and call `play(driver, "ws://learner:8765", token=...)`. `step` returns what a Gymnasium environment's does: obs,
+reward, terminated, truncated, info. A driver with `read` and `send` is run by the clock: one step every `period`
+seconds, and `judge(obs)` may return reward, terminated and success of what was read. Actions lie in [-1, 1].
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import msgpack
+import numpy as np
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+VERSION = 1
+LIMIT = 64 * 1024  # bytes of a message at most
+_SOME = object()
+_SHAPES: dict[str, dict[str, Any]] = {  # what each message holds; a tuple names types that are allowed
+    "hello": {
+        "version": int, "token": str, "robot": str, "obs_size": int, "action_size": int, "period": (float, type(None)),
+    },
+    "welcome": {},
+    "refused": {"reason": str},
+    "reset": {"episode": int, "seed": int},
+    "began": {"episode": int, "obs": bytes},
+    "act": {"episode": int, "step": int, "action": bytes},
+    "moved": {
+        "episode": int, "step": int, "sent": bytes, "obs": bytes, "reward": (float, type(None)), "terminated": bool,
+        "truncated": bool, "success": (bool, type(None)), "late": bool,
+    },
+    "rest": {"episode": int},
+    "failed": {"episode": int, "reason": str},
+    "end": {},
+}  # fmt: skip
+
+
+# --- messages ---------------------------------------------------------------------------------------------------------
+
+
+def pack(kind: str, **fields: Any) -> bytes:
+    """A message: a checksum, then a msgpack map. Arrays become little-endian float32."""
+    fields = {name: _plain(x) for name, x in fields.items()}
+    body = msgpack.packb({"type": kind, **fields})
+    return zlib.crc32(body).to_bytes(4, "little") + body
+
+
+def unpack(data: Any) -> dict[str, Any]:
+    """The fields of a message, with its "type"; ValueError says what is wrong with it."""
+    if not isinstance(data, bytes):
+        raise ValueError("is text, not bytes")
+    if len(data) > LIMIT:
+        raise ValueError(f"has {len(data):,} bytes, at most {LIMIT:,} are allowed")
+    if len(data) < 5 or zlib.crc32(data[4:]).to_bytes(4, "little") != data[:4]:
+        raise ValueError("was damaged on the way")
+    try:
+        fields = msgpack.unpackb(data[4:])
+    except Exception as error:  # msgpack raises half a dozen types
+        raise ValueError(f"is no msgpack ({type(error).__name__})") from error
+    kind = fields.get("type") if isinstance(fields, dict) else None
+    if kind not in _SHAPES:
+        raise ValueError(f"is of the unknown type {kind!r}")
+    for name, wanted in _SHAPES[kind].items():
+        value = fields.get(name, _SOME)
+        if type(value) not in (wanted if isinstance(wanted, tuple) else (wanted,)):
+            raise ValueError(f"{kind} has no proper {name!r}")
+    return fields
+
+
+def array(data: bytes, size: int, what: str) -> np.ndarray:
+    """[size] float32; ValueError where it has another size or a number is not finite."""
+    if len(data) != 4 * size:
+        raise ValueError(f"{what} has {len(data) / 4:g} numbers, expected {size}")
+    values = np.frombuffer(data, "<f4").astype(np.float32)
+    if not np.isfinite(values).all():
+        raise ValueError(f"{what} holds a number that is not finite")
+    return values
+
+
+def _plain(value: Any) -> Any:
+    """What msgpack can hold."""
+    if isinstance(value, np.ndarray):
+        return value.astype("<f4").tobytes()
+    return value.item() if isinstance(value, np.generic) else value
+
+
+# --- playing ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the robot may be told. Commands are brought within; what was sent is what is reported.
+
+    low, high: of every action. change: how far an action may be from the one before, at most.
+    """
+
+    low: float | Sequence[float] = -1.0
+    high: float | Sequence[float] = 1.0
+    change: float | Sequence[float] = np.inf
+
+    def of(self, action: np.ndarray, before: np.ndarray) -> np.ndarray:
+        """The nearest action that is allowed. before: the last one sent, zeros at the start of an episode."""
+        change = np.asarray(self.change)
+        return np.clip(np.clip(action, before - change, before + change), self.low, self.high).astype(np.float32)
+
+
+class RefusedError(Exception):
+    """The learner does not want this robot, and says why."""
+
+
+def play(
+    driver: Any,
+    url: str,
+    *,
+    token: str,
+    name: str = "robot",
+    period: float | None = None,
+    answer_within: float | None = None,
+    late: str | Sequence[float] = "hold",
+    patience: int = 10,
+    limits: Limits = Limits(),
+    log: str | os.PathLike[str] | None = None,
+    retry: float = 1.0,
+    say: Callable[[str], None] = print,
+) -> dict[str, int]:
+    """Plays episodes for a learner until it ends the run; returns how many steps there were and how many were late.
+
+    driver: see the top of this file. url: of the learner. token: what it printed. period: seconds of a step, for a
+    driver with `read` and `send`. answer_within: seconds after which a command is too late, default half a period.
+    late: what happens then: "hold" leaves the last command, an action is sent instead. patience: after so many late
+    steps in a row the episode ends. log: a file to which every command is appended before it is sent. retry: seconds
+    between attempts to connect. say: hears one line about everything unusual.
+
+    A lost connection stops the robot; it connects again and goes on with the next episode. Whatever happens, `stop` is
+    called before this returns or raises. Raises `RefusedError` if the learner says that the two do not fit.
+    """
+    timed = hasattr(driver, "send")
+    if timed and not period:
+        raise ValueError("a driver with `send` needs a period, in seconds")
+    rhythm = _Rhythm(period, answer_within or period / 2, late, patience) if timed and period else None
+    robot = _Robot(driver, rhythm, limits, _Log(log))
+    hello = pack(
+        "hello", version=VERSION, token=token, robot=name, obs_size=int(driver.obs_size),
+        action_size=int(driver.action_size), period=float(period) if period else None,
+    )  # fmt: skip
+    waiting = False
+    try:
+        while True:
+            try:
+                with connect(url, max_size=LIMIT, compression=None, proxy=None, open_timeout=10) as socket:
+                    waiting = False
+                    socket.send(hello)
+                    answer = unpack(socket.recv(timeout=10))
+                    if answer["type"] == "refused":
+                        raise RefusedError(answer["reason"])
+                    say(f"connected to {url}")
+                    robot.serve(socket, say)
+                    return robot.counts
+            except (ConnectionClosed, OSError, TimeoutError, ValueError) as error:
+                driver.stop()
+                if not waiting:
+                    say(f"no connection to {url} ({error}); the robot is stopped, trying again")
+                waiting = True
+                time.sleep(retry)
+    finally:
+        driver.stop()
+        robot.log.close()
+
+
+@dataclass(frozen=True)
+class _Rhythm:
+    period: float
+    answer_within: float
+    late: str | Sequence[float]
+    patience: int
+
+
+class _Log:
+    """Commands on disk before they are sent, one msgpack map each; nothing without a path."""
+
+    def __init__(self, path: str | os.PathLike[str] | None) -> None:
+        self._file = None if path is None else open(path, "ab")  # noqa: SIM115
+
+    def write(self, **fields: Any) -> None:
+        if self._file is not None:
+            self._file.write(msgpack.packb({name: _plain(x) for name, x in fields.items()}))
+            self._file.flush()
+            os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+
+
+class _Robot:
+    """A driver and what it has answered, so that a message that comes twice moves nothing twice.
+
+    Of an episode all answers stay: the first that says how it began, then one for each step, and perhaps how it failed.
+    """
+
+    def __init__(self, driver: Any, rhythm: _Rhythm | None, limits: Limits, log: _Log) -> None:
+        self.driver, self.rhythm, self.limits, self.log = driver, rhythm, limits, log
+        self.counts = {"steps": 0, "late": 0}
+        self._episode, self._over = -1, True
+        self._answers: list[bytes] = []
+        self._failed: bytes | None = None
+        self._last = np.zeros(driver.action_size, np.float32)
+        self._tick = 0.0
+        self._lates = 0
+
+    def serve(self, socket: Any, say: Callable[[str], None]) -> None:
+        """Answers until the learner ends the run."""
+        self._over = True  # an episode that another connection began is over
+        while True:
+            message = self._next(socket, say)
+            if message is None:
+                self._hold(socket, say)
+            elif message["type"] == "end":
+                return
+            elif message["type"] == "rest":
+                self._over = True
+                self.driver.stop()
+            elif message["type"] == "reset":
+                self._reset(socket, message, say)
+            elif message["type"] == "act":
+                self._act(socket, message, say)
+
+    def _next(self, socket: Any, say: Callable[[str], None]) -> Mapping[str, Any] | None:
+        """The next message; None where the clock says that it is too late for one."""
+        while True:
+            wait = None
+            if self.rhythm is not None and not self._over:
+                wait = max(self._tick + self.rhythm.answer_within - time.monotonic(), 1e-3)
+            try:
+                return unpack(socket.recv(timeout=wait))
+            except TimeoutError:
+                return None
+            except ValueError as error:
+                say(f"ignored: a message of the learner {error}")
+
+    def _reset(self, socket: Any, message: Mapping[str, Any], say: Callable[[str], None]) -> None:
+        if message["episode"] == self._episode and not self._over:
+            _send(socket, self._answers[0])  # the learner has not heard it
+            return
+        self.driver.stop()
+        self._episode, self._over, self._lates = message["episode"], False, 0
+        self._answers, self._failed = [], None
+        self._last = np.zeros(self.driver.action_size, np.float32)
+        try:
+            obs = self._checked(self.driver.reset(message["seed"]))
+        except Exception as error:
+            self._fail(socket, error, say)
+            return
+        self._tick = time.monotonic()
+        self._tell(socket, pack("began", episode=self._episode, obs=obs))
+
+    def _act(self, socket: Any, message: Mapping[str, Any], say: Callable[[str], None]) -> None:
+        step, done = message["step"], len(self._answers) - 1
+        if message["episode"] != self._episode:
+            return
+        if 0 <= step < done:
+            _send(socket, self._answers[step + 1])  # too late, or heard already: what happened is said again
+        elif self._failed is not None:
+            _send(socket, self._failed)
+        elif step == done and not self._over:
+            try:
+                action = array(message["action"], self.driver.action_size, "an action")
+            except ValueError as error:
+                self._fail(socket, error, say)
+                return
+            self._move(socket, self.limits.of(action, self._last), say, late=False)
+
+    def _hold(self, socket: Any, say: Callable[[str], None]) -> None:
+        """A step for which no command came in time."""
+        assert self.rhythm is not None
+        held = isinstance(self.rhythm.late, str)
+        action = self._last if held else np.asarray(self.rhythm.late, np.float32)
+        self._move(socket, action, say, late=True)
+
+    def _tell(self, socket: Any, answer: bytes) -> None:
+        self._answers.append(answer)
+        _send(socket, answer)
+
+    def _move(self, socket: Any, action: np.ndarray, say: Callable[[str], None], *, late: bool) -> None:
+        step = len(self._answers) - 1
+        self.log.write(episode=self._episode, step=step, action=action, late=late, time=time.time())
+        try:
+            told = self._by_clock(action, late=late) if self.rhythm else self._at_once(action)
+        except Exception as error:
+            self._fail(socket, error, say)
+            return
+        self._last = action
+        self._lates = self._lates + 1 if late else 0
+        self.counts["steps"] += 1
+        self.counts["late"] += late
+        if self.rhythm and self._lates >= self.rhythm.patience:
+            say(f"{self._lates} steps in a row without a command in time; the episode ends here")
+            told["truncated"] = True
+        if told["terminated"] or told["truncated"]:
+            self._over = True
+            self.driver.stop()
+        self._tell(socket, pack("moved", episode=self._episode, step=step, sent=action, late=late, **told))
+
+    def _at_once(self, action: np.ndarray) -> dict[str, Any]:
+        obs, reward, terminated, truncated, info = self.driver.step(action)
+        success = next((bool(info[name]) for name in ("is_success", "success") if name in info), None)
+        return {
+            "obs": self._checked(obs), "reward": float(reward), "terminated": bool(terminated),
+            "truncated": bool(truncated), "success": success,
+        }  # fmt: skip
+
+    def _by_clock(self, action: np.ndarray, *, late: bool) -> dict[str, Any]:
+        """Sends, waits for the end of the period, reads. The clock goes on from where it should be, not from now."""
+        assert self.rhythm is not None
+        if not late or not isinstance(self.rhythm.late, str):
+            self.driver.send(action)
+        self._tick += self.rhythm.period
+        time.sleep(max(self._tick - time.monotonic(), 0.0))
+        self._tick = max(self._tick, time.monotonic() - self.rhythm.period)  # what was lost is not caught up
+        obs = self._checked(self.driver.read())
+        judge = getattr(self.driver, "judge", None)
+        reward, terminated, success = (None, False, None) if judge is None else judge(obs)
+        return {
+            "obs": obs, "reward": None if reward is None else float(reward), "terminated": bool(terminated),
+            "truncated": False, "success": None if success is None else bool(success),
+        }  # fmt: skip
+
+    def _checked(self, obs: Any) -> np.ndarray:
+        obs = np.asarray(obs, np.float32).reshape(-1)
+        return array(obs.astype("<f4").tobytes(), self.driver.obs_size, "an observation")
+
+    def _fail(self, socket: Any, error: Exception, say: Callable[[str], None]) -> None:
+        self._over = True
+        self.driver.stop()
+        reason = f"{type(error).__name__}: {error}"[:500]
+        say(f"the robot is stopped: {reason}")
+        self._failed = pack("failed", episode=self._episode, reason=reason)
+        _send(socket, self._failed)
+
+
+def _send(socket: Any, message: bytes) -> None:
+    """Sends; a connection that is closed says so when it is read, after what came before its end."""
+    with contextlib.suppress(ConnectionClosed):
+        socket.send(message)

@@ -1,0 +1,338 @@
+"""A robot behind a socket: nothing moves twice, nothing is lost, whoever dies or talks nonsense."""
+
+import ast
+import contextlib
+import random
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import msgpack
+import numpy as np
+import pytest
+from websockets.sync.client import connect
+
+from sgft_jax.systems import robot_client
+from sgft_jax.systems.remote import Remote
+from sgft_jax.systems.robot_client import Limits, RefusedError, array, pack, play, unpack
+from sgft_jax.types import UserError
+
+
+class Point:
+    """A point that moves by its action; counts how often it was moved."""
+
+    obs_size, action_size = 2, 2
+
+    def __init__(self):
+        self.at, self.moves, self.resets, self.stops = np.zeros(2), [], [], 0
+
+    def reset(self, seed):
+        self.resets.append(seed)
+        self.at = np.zeros(2)
+        return self.at
+
+    def step(self, action):
+        self.moves.append(action.copy())
+        self.at = self.at + action
+        return self.at, float(self.at[0]), bool(self.at[0] > 2.5), False, {"success": self.at[0] > 2.5}
+
+    def stop(self):
+        self.stops += 1
+
+
+class Arm(Point):
+    """The same by the clock: it moves by its last command in every period."""
+
+    def reset(self, seed):
+        self.command = np.zeros(2)
+        return super().reset(seed)
+
+    def read(self):
+        self.at = self.at + self.command
+        return self.at
+
+    def send(self, action):
+        self.moves.append(action.copy())
+        self.command = action
+
+
+class Pair:
+    """A learner and a robot that connects from a thread."""
+
+    def __init__(self, driver, **options):
+        self.said, self.driver = [], driver
+        self.remote = Remote(2, 2, again=options.pop("again", 5.0), say=self.said.append)
+        self.counts, self.options = None, options
+        self.thread = threading.Thread(target=self.run, daemon=True)
+        self.thread.start()
+
+    def run(self):
+        with contextlib.suppress(RefusedError, SystemExit):
+            self.counts = play(
+                self.driver, self.remote.url, token=self.remote.token, retry=0.01, say=self.said.append, **self.options
+            )
+
+
+@pytest.fixture
+def pair():
+    pairs = []
+
+    def make(driver, **options):
+        pairs.append(Pair(driver, **options))
+        return pairs[-1]
+
+    yield make
+    for own in pairs:
+        own.remote.close()
+        own.thread.join(timeout=10)
+
+
+RIGHT = np.array([1.0, 0.0], np.float32)
+
+
+class Moved(NamedTuple):
+    obs: np.ndarray
+    reward: float
+    terminated: bool
+    truncated: bool
+    info: dict
+
+
+def begin(own, seed):
+    return own.remote.reset(seed=seed)[0]
+
+
+def move(own, action):
+    return Moved(*own.remote.step(action))
+
+
+def test_episodes_and_their_end(pair):
+    own = pair(Point())
+    np.testing.assert_array_equal(begin(own, 7), [0, 0])
+    moved = [move(own, RIGHT) for _ in range(3)]
+    assert [x.obs[0] for x in moved] == [1, 2, 3] and [x.reward for x in moved] == [1, 2, 3]
+    assert [x.terminated for x in moved] == [False, False, True] and moved[-1].info["is_success"] is True
+    assert not any("invalid" in x.info or x.info["late"] for x in moved)
+    np.testing.assert_array_equal(begin(own, 8), [0, 0])
+    assert own.driver.resets == [7, 8] and len(own.driver.moves) == 3
+    own.remote.close()
+    own.thread.join(timeout=10)
+    assert own.counts == {"steps": 3, "late": 0} and own.driver.stops >= 2
+
+
+def test_commands_are_kept_within_limits_and_what_was_sent_is_said(pair):
+    own = pair(Point(), limits=Limits(low=-0.5, high=0.5, change=0.4))
+    begin(own, 0)
+    sent = [move(own, RIGHT).info["sent"][0] for _ in range(3)]
+    np.testing.assert_allclose(sent, [0.4, 0.5, 0.5])
+    np.testing.assert_allclose([x[0] for x in own.driver.moves], sent)
+
+
+@pytest.mark.parametrize("driver", [Point, Arm])
+def test_lost_doubled_and_damaged_messages_move_nothing_twice(pair, driver, monkeypatch):
+    """Every fourth message is lost, some come twice, some are damaged, in both directions."""
+    rng, real = random.Random(0), pack
+
+    def spoil(socket):
+        send = socket.send
+
+        def worse(data):
+            luck = rng.random()
+            if luck < 0.25 and unpack(data)["type"] not in ("hello", "welcome", "end"):
+                return
+            if luck > 0.9:
+                send(data[:-1] + bytes([data[-1] ^ 255]))
+            for _ in range(1 + (luck > 0.8)):
+                send(data)
+
+        socket.send = worse
+        return socket
+
+    monkeypatch.setattr(robot_client, "connect", lambda *a, **k: spoil(connect(*a, **k)))
+    options = {"period": 0.01, "answer_within": 0.009, "patience": 10**6} if driver is Arm else {}
+    own = pair(driver(), again=0.02, **options)
+    assert real is pack
+    send = own.remote._send
+    own.remote._send = lambda message: rng.random() < 0.25 or send(message)
+    seen = []
+    for episode in range(3):
+        at = begin(own, episode)
+        for _ in range(20):
+            moved = move(own, 0.1 * RIGHT)
+            assert "invalid" not in moved.info
+            np.testing.assert_allclose(moved.obs, at + moved.info["sent"], atol=1e-5)
+            at = moved.obs
+            seen.append(moved.info["sent"][0])
+    if driver is Point:  # by the clock more steps may follow the last one that was asked for
+        assert len(own.driver.moves) == 60 and own.driver.resets == [0, 1, 2]
+    own.remote._send = send
+    assert len(seen) == 60
+
+
+def test_a_late_command_is_replaced_and_counted(pair):
+    own = pair(Arm(), period=0.05)
+    begin(own, 0)
+    first = move(own, 0.5 * RIGHT)
+    time.sleep(0.2)
+    late = move(own, -RIGHT)
+    assert not first.info["late"] and late.info["late"] and late.info["sent"][0] == 0.5  # held
+    own.remote.rest()
+    safe = pair(Arm(), period=0.05, late=[0.0, 0.0])
+    begin(safe, 0)
+    move(safe, 0.5 * RIGHT)
+    time.sleep(0.2)
+    late = move(safe, -RIGHT)
+    assert late.info["late"] and late.info["sent"][0] == 0.0
+
+
+def test_a_learner_that_does_not_answer_ends_the_episode(pair):
+    own = pair(Arm(), period=0.01, patience=3)
+    begin(own, 0)
+    time.sleep(0.3)
+    moved = [move(own, RIGHT) for _ in range(3)]
+    assert [x.truncated for x in moved] == [False, False, True] and all(x.info["late"] for x in moved)
+    assert own.driver.stops and any("in a row" in line for line in own.said)
+
+
+def test_a_driver_that_fails_is_stopped_and_its_step_is_in_doubt(pair):
+    driver = Point()
+    driver.step = lambda action: (np.array([np.nan, 0]), 0.0, False, False, {})
+    own = pair(driver, again=0.05)
+    begin(own, 0)
+    moved = move(own, RIGHT)
+    assert moved.info["invalid"] and driver.stops and any("not finite" in line for line in own.said)
+    np.testing.assert_array_equal(begin(own, 1), [0, 0])  # the next episode is a new chance
+
+
+def test_a_robot_that_dies_leaves_one_step_in_doubt(pair):
+    driver, own = Point(), None
+
+    def die(action):
+        raise SystemExit
+
+    own = pair(driver, again=0.05)
+    begin(own, 0)
+    move(own, RIGHT)
+    driver.step = die
+    moved = move(own, RIGHT)
+    assert moved.info["invalid"] and moved.truncated and any("gone" in line and "step 1" in line for line in own.said)
+    driver = Point()
+    again = threading.Thread(
+        target=play, args=(driver, own.remote.url), kwargs={"token": own.remote.token}, daemon=True
+    )
+    again.start()
+    np.testing.assert_array_equal(begin(own, 5), [0, 0])
+    assert driver.resets == [5] and driver.stops
+
+
+def hello(remote, **changes):
+    fields = {
+        "version": 1, "token": remote.token, "robot": "r", "obs_size": 2, "action_size": 2, "period": None, **changes,
+    }  # fmt: skip
+    with connect(remote.url) as socket:
+        socket.send(pack("hello", **fields))
+        return unpack(socket.recv(timeout=5))
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"token": "guess"}, "wrong token"),
+        ({"version": 2}, "protocol version: the robot has 2, the learner 1"),
+        ({"obs_size": 3}, "numbers measured: the robot has 3, the learner 2"),
+        ({"action_size": 7}, "numbers commanded: the robot has 7, the learner 2"),
+    ],
+)
+def test_a_robot_that_does_not_fit_is_refused(changes, reason):
+    said = []
+    remote = Remote(2, 2, say=said.append)
+    assert reason in hello(remote, **changes)["reason"] and reason in said[-1]
+    assert remote.token not in said[-1]
+    remote.close()
+
+
+def test_the_client_says_why_it_was_refused():
+    remote = Remote(2, 2, say=lambda line: None)
+    with pytest.raises(RefusedError, match="wrong token"):
+        play(Point(), remote.url, token="guess", say=lambda line: None)
+    remote.close()
+
+
+def test_there_is_one_robot(pair):
+    own = pair(Point())
+    begin(own, 0)
+    assert "another robot" in hello(own.remote)["reason"]
+    assert move(own, RIGHT).obs[0] == 1
+
+
+def test_nonsense_changes_nothing(pair):
+    own = pair(Point())
+    begin(own, 0)
+    rng = np.random.default_rng(0)
+    good = pack("hello", version=1, token="x", robot="r", obs_size=2, action_size=2, period=None)
+    with contextlib.suppress(Exception):
+        for _ in range(20):
+            with connect(own.remote.url) as socket:
+                socket.send(rng.bytes(int(rng.integers(1, 200))))
+                socket.send("text")
+    for _ in range(2000):
+        cut = good[: rng.integers(0, len(good))] if rng.random() < 0.5 else rng.bytes(int(rng.integers(0, 300)))
+        with pytest.raises(ValueError, match="damaged"):
+            unpack(cut)
+    assert move(own, RIGHT).obs[0] == 1
+
+
+def test_messages_by_hand():
+    fields = unpack(pack("act", episode=3, step=4, action=np.array([0.5, -1.0])))
+    assert fields["type"] == "act" and array(fields["action"], 2, "x").tolist() == [0.5, -1.0]
+    for data, words in (
+        ("text", "is text"),
+        (b"x" * 70_000, "at most 65,536"),
+        (_signed(msgpack.packb([1])), "unknown type None"),
+        (_signed(msgpack.packb({"type": "fly"})), "unknown type 'fly'"),
+        (_signed(b"\xc1"), "is no msgpack"),
+        (pack("act", episode=3, step=4), "no proper 'action'"),
+        (pack("act", episode=3, step=True, action=b""), "no proper 'step'"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            unpack(data)
+    with pytest.raises(ValueError, match="has 2 numbers, expected 3"):
+        array(fields["action"], 3, "an action")
+
+
+def _signed(body):
+    return robot_client.zlib.crc32(body).to_bytes(4, "little") + body
+
+
+def test_every_command_is_on_disk_before_it_is_sent(pair, tmp_path):
+    driver, path = Point(), tmp_path / "commands"
+    step, lengths = driver.step, []
+    driver.step = lambda action: (lengths.append(len(list(read(path)))), step(action))[1]
+    own = pair(driver, log=path)
+    begin(own, 0)
+    for _ in range(2):
+        move(own, RIGHT)
+    assert lengths == [1, 2] and [x["step"] for x in read(path)] == [0, 1]
+
+
+def read(path):
+    with open(path, "rb") as file:
+        yield from msgpack.Unpacker(file)
+
+
+def test_a_port_that_is_taken_is_refused():
+    remote = Remote(2, 2, say=lambda line: None)
+    with pytest.raises(UserError, match="choose another port"):
+        Remote(2, 2, port=int(remote.url.rsplit(":", 1)[1]))
+    remote.close()
+
+
+def test_the_client_is_one_file_for_old_pythons():
+    tree = ast.parse(Path(robot_client.__file__).read_text(), feature_version=(3, 9))
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+    names = {
+        (node.module if isinstance(node, ast.ImportFrom) else node.names[0].name).split(".")[0] for node in imports
+    }
+    assert names - sys.stdlib_module_names == {"numpy", "msgpack", "websockets"}
