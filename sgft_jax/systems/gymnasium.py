@@ -24,9 +24,11 @@ class Gymnasium:
     """Gymnasium environments as the real systems of a task, one for each member; all take a step together.
 
     The environment moves, rewards and ends episodes. The task says how long an episode lasts at most, and what success
-    is where `info` has neither `is_success` nor `success`; imagined steps have its reward. Actions in [-1, 1] are
-    scaled to the bounds of the action space. `info["invalid"]`, or a number that is not finite, ends an episode like
-    exploded physics: the step is not learned from.
+    is where `info` has neither `is_success` nor `success`; imagined steps have its reward. Where an environment does
+    not know the reward (nan), the task says what the step earned and whether it ended the episode. Actions in [-1, 1]
+    are scaled to the bounds of the action space; what `info["sent"]` says was commanded instead is what is kept.
+    `info["invalid"]`, or a number that is not finite, ends an episode like exploded physics: the step is not learned
+    from. An environment with a method `rest` hears when its episode is over.
 
     env: the task. real: an environment, several, or a vector environment with one for each member. A vector environment
     also steps members whose episode is over. gamma: discount factor of the transitions, that of the prior.
@@ -49,6 +51,10 @@ class Gymnasium:
         self._low, self._high = _bounds(env, self._real)
         self._draw = jax.jit(jax.vmap(self._drawn))
         self._programs: dict[Callable[..., Any], Callable[..., tuple[Array, PyTree]]] = {}
+        self._judge = None
+        if env.reward is not None and env.terminated is not None:
+            reward, ended = env.reward, env.terminated
+            self._judge = jax.jit(jax.vmap(lambda *step: (reward(*step), ended(*step))))
         self._succeeds = None if env.success is None else jax.jit(jax.vmap(jax.vmap(env.success)))
 
     def play(self, policy: Any, states: PyTree, keys: Key, *, explore: bool) -> Episode:
@@ -82,12 +88,14 @@ class Gymnasium:
             action, carry = act(states, carry, seen, act_keys, t, explore)
             action = np.asarray(action)
             after = self._real.step(self._commanded(action), going)
+            action = self._sent(action, after.infos)
             actions = remember(actions, action)
             following = with_memory(env, self._measured(after.obs), actions)
-            going &= ~rows.put(t, going, seen, action, after, following)
+            going &= ~rows.put(t, going, seen, action, self._judged(after, seen, action, following), following)
             if not going.any():
                 break
             seen = following
+        self._real.rest()
         return self._episode(rows)
 
     def _program(self, policy: Any) -> Callable[..., tuple[Array, PyTree]]:
@@ -111,6 +119,28 @@ class Gymnasium:
     def _commanded(self, action: np.ndarray) -> np.ndarray:
         """[M, act_dim] from [-1, 1] to the bounds of the action space."""
         return (self._low + self._high) / 2 + action * ((self._high - self._low) / 2)
+
+    def _sent(self, action: np.ndarray, infos: "Sequence[Mapping[str, Any]]") -> np.ndarray:
+        """[M, act_dim] in [-1, 1], what was really commanded, as far as `infos` tell."""
+        middle, half = (self._low + self._high) / 2, (self._high - self._low) / 2
+        told = [
+            (info["sent"] - middle) / half if "sent" in info else own for own, info in zip(action, infos, strict=True)
+        ]
+        return np.stack(told).astype(np.float32)
+
+    def _judged(self, after: "_After", seen: np.ndarray, action: np.ndarray, following: np.ndarray) -> "_After":
+        """With what the task says of steps whose reward the environment does not know."""
+        unknown = np.isnan(after.reward) & np.array(["invalid" not in info for info in after.infos])
+        if not unknown.any():
+            return after
+        if self._judge is None:
+            raise UserError(
+                f"{self._real.name}: does not know its reward, and no function of observations is that of {self.env.name}"
+            )
+        reward, terminated = (np.asarray(x) for x in self._judge(seen, action, following))
+        return after._replace(
+            reward=np.where(unknown, reward, after.reward), terminated=np.where(unknown, terminated, after.terminated)
+        )
 
     def _measured(self, returned: Sequence[Any]) -> np.ndarray:
         """[M, measured_dim] of what every environment has returned."""
@@ -237,6 +267,10 @@ class _Real(Protocol):
         """actions: [M, act_dim]. going: [M], whose episode goes on; the others may stay as they are."""
         ...
 
+    def rest(self) -> None:
+        """No step follows before the next reset."""
+        ...
+
     def close(self) -> None:
         """The end."""
         ...
@@ -264,6 +298,10 @@ class _Each:
         ]
         self._obs, reward, terminated, truncated, infos = zip(*found, strict=True)
         return _After(self._obs, np.array(reward, np.float32), np.array(terminated), np.array(truncated), infos)
+
+    def rest(self) -> None:
+        for one in self.each:
+            getattr(one, "rest", _nothing)()
 
     def close(self) -> None:
         for one in self.each:
@@ -293,12 +331,19 @@ class _Vector:
         told = [{**own, **own.get("final_info", {})} for own in told]
         return _After(last, np.array(reward, np.float32), np.array(terminated), np.array(truncated), told)
 
+    def rest(self) -> None:
+        pass
+
     def close(self) -> None:
         self.real.close()
 
     def _split(self, obs: Any) -> list[Any]:
         """What each environment returned; copies, because a vector environment may write into its arrays again."""
         return [jax.tree.map(lambda x, i=i: np.array(x[i]), obs) for i in range(self.count)]
+
+
+def _nothing() -> None:
+    """What most environments do between episodes."""
 
 
 def _info(infos: Mapping[str, Any], i: int) -> dict[str, Any]:
