@@ -14,6 +14,7 @@ from .presets import PRESETS, PretrainConfig
 from .pretraining import PretrainState, pretrain, priors_of
 from .systems import System
 from .systems.gymnasium import Gymnasium
+from .systems.remote import Remote
 from .systems.simulated import Simulated
 from .train import FinetuneProgress, evaluate, finetune, simulate
 from .transforms import branch, clip, compose, relabel, shape, shaped_reward, shorten, stateless
@@ -38,11 +39,12 @@ from .types import (
 __all__ = [
     "PRESETS", "ActingPolicy", "Batch", "FinetuneProgress", "FinetuneState", "Finetuner", "Gymnasium", "IQLConfig",
     "IQLHyper", "IQLState", "Imagination", "Learner", "MPCConfig", "Method", "NetworkConfig", "Normalizer", "Parts",
-    "Policy", "PretrainConfig", "PretrainState", "Prior", "SACConfig", "SACHyper", "SACParams", "SACState", "Setup",
-    "Simulated", "SimulatedData", "Simulation", "Source", "System", "TDMPC2Config", "TDMPC2Hyper", "TDMPC2Params",
-    "TDMPC2State", "Task", "Transform", "Transition", "UserError", "all_methods", "assemble", "branch", "clip",
-    "compose", "evaluate", "evaluate_prior", "extract_params", "finetune", "finetuned_priors", "get_method",
-    "load_policy", "load_prior", "make_iql", "make_policy", "make_sac", "make_tdmpc2", "mpc_policy", "normalizer",
-    "pretrain", "priors_of", "relabel", "replay", "sac_finetuner", "sac_policy", "save_prior", "sequences", "setup",
-    "shape", "shaped_reward", "shorten", "simulate", "sources", "state_from_prior", "stateless", "tdmpc2_policy",
+    "Policy", "PretrainConfig", "PretrainState", "Prior", "Remote", "SACConfig", "SACHyper", "SACParams",
+    "SACState", "Setup", "Simulated", "SimulatedData", "Simulation", "Source", "System", "TDMPC2Config",
+    "TDMPC2Hyper", "TDMPC2Params", "TDMPC2State", "Task", "Transform", "Transition", "UserError", "all_methods",
+    "assemble", "branch", "clip", "compose", "evaluate", "evaluate_prior", "extract_params", "finetune",
+    "finetuned_priors", "get_method", "load_policy", "load_prior", "make_iql", "make_policy", "make_sac",
+    "make_tdmpc2", "mpc_policy", "normalizer", "pretrain", "priors_of", "relabel", "replay", "sac_finetuner",
+    "sac_policy", "save_prior", "sequences", "setup", "shape", "shaped_reward", "shorten", "simulate", "sources",
+    "state_from_prior", "stateless", "tdmpc2_policy",
 ]  # fmt: skip

@@ -135,7 +135,7 @@ class Gymnasium:
             return after
         if self._judge is None:
             raise UserError(
-                f"{self._real.name}: does not know its reward, and no function of observations is that of {self.env.name}"
+                f"{self._real.name}: does not know its reward, and {self.env.name} has none of what is observed"
             )
         reward, terminated = (np.asarray(x) for x in self._judge(seen, action, following))
         return after._replace(
