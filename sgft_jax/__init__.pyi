@@ -8,6 +8,7 @@ from .learners.tdmpc2 import TDMPC2Config, TDMPC2Hyper, TDMPC2Params, TDMPC2Stat
 from .methods import all_methods, get_method
 from .models import normalizer
 from .models.config import NetworkConfig
+from .models.ratio import RatioConfig
 from .planning.mpc import MPCConfig
 from .policies import make_policy, mpc_policy, sac_policy, tdmpc2_policy
 from .presets import PRESETS, PretrainConfig
@@ -17,7 +18,7 @@ from .systems.gymnasium import Gymnasium
 from .systems.remote import Remote
 from .systems.simulated import Simulated
 from .train import FinetuneProgress, evaluate, finetune, simulate
-from .transforms import branch, clip, compose, relabel, shape, shaped_reward, shorten, stateless
+from .transforms import branch, clip, compose, relabel, shape, shaped_reward, shorten, stateless, weigh
 from .types import (
     Batch,
     Finetuner,
@@ -39,12 +40,12 @@ from .types import (
 __all__ = [
     "PRESETS", "ActingPolicy", "Batch", "FinetuneProgress", "FinetuneState", "Finetuner", "Gymnasium", "IQLConfig",
     "IQLHyper", "IQLState", "Imagination", "Learner", "MPCConfig", "Method", "NetworkConfig", "Normalizer", "Parts",
-    "Policy", "PretrainConfig", "PretrainState", "Prior", "Remote", "SACConfig", "SACHyper", "SACParams",
-    "SACState", "Setup", "Simulated", "SimulatedData", "Simulation", "Source", "System", "TDMPC2Config",
-    "TDMPC2Hyper", "TDMPC2Params", "TDMPC2State", "Task", "Transform", "Transition", "UserError", "all_methods",
-    "assemble", "branch", "clip", "compose", "evaluate", "evaluate_prior", "extract_params", "finetune",
-    "finetuned_priors", "get_method", "load_policy", "load_prior", "make_iql", "make_policy", "make_sac",
-    "make_tdmpc2", "mpc_policy", "normalizer", "pretrain", "priors_of", "relabel", "replay", "sac_finetuner",
-    "sac_policy", "save_prior", "sequences", "setup", "shape", "shaped_reward", "shorten", "simulate", "sources",
-    "state_from_prior", "stateless", "tdmpc2_policy",
+    "Policy", "PretrainConfig", "PretrainState", "Prior", "RatioConfig", "Remote", "SACConfig", "SACHyper",
+    "SACParams", "SACState", "Setup", "Simulated", "SimulatedData", "Simulation", "Source", "System",
+    "TDMPC2Config", "TDMPC2Hyper", "TDMPC2Params", "TDMPC2State", "Task", "Transform", "Transition", "UserError",
+    "all_methods", "assemble", "branch", "clip", "compose", "evaluate", "evaluate_prior", "extract_params",
+    "finetune", "finetuned_priors", "get_method", "load_policy", "load_prior", "make_iql", "make_policy",
+    "make_sac", "make_tdmpc2", "mpc_policy", "normalizer", "pretrain", "priors_of", "relabel", "replay",
+    "sac_finetuner", "sac_policy", "save_prior", "sequences", "setup", "shape", "shaped_reward", "shorten",
+    "simulate", "sources", "state_from_prior", "stateless", "tdmpc2_policy", "weigh",
 ]  # fmt: skip

@@ -131,7 +131,7 @@ def assemble(
         known = None
         if parts.interface is not None and simulated is not None:
             known = parts.interface.start(params, simulated)
-        state = FinetuneState(learner, models, frozen, parts.transform.init(key_transform), empty, known)
+        state = FinetuneState(learner, models, frozen, parts.transform.init(params, key_transform), empty, known)
         # The caller may donate the state. The prior must survive that, and no two leaves may share a buffer.
         return jax.tree.map(jnp.copy, state)
 

@@ -1,8 +1,8 @@
-"""SGFT as transforms of a sampled batch: branch, relabel, shape, clip, shorten.
+"""SGFT as transforms of a sampled batch: relabel, branch, weigh, shape, clip, shorten.
 
-A method composes them in this order. Branching and relabelling come first, because they make rows. Shaping comes before
+A method composes them in this order. Relabelling and branching come first, because they make rows. Shaping comes before
 shortening, because it needs the discount of the whole task.
-Source: SGFT (Yin et al., ICLR 2025), section 4 and Algorithms 1 and 2.
+Source: SGFT (Yin et al., ICLR 2025), section 4 and Algorithms 1 and 2; for weights H2O+ (Niu et al. 2023).
 """
 
 from collections.abc import Callable
@@ -11,6 +11,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from sgft_jax.learners import losses
+from sgft_jax.models import ratio
 from sgft_jax.models.networks import add_noise
 from sgft_jax.types import Array, Batch, Imagination, Key, Metrics, PyTree, Transform
 
@@ -22,15 +24,17 @@ def stateless(apply: Callable[[Any, Batch, Key], Batch]) -> Transform:
         del batch, key
         return state, {}
 
-    return Transform(lambda key: (), lambda state, imagination, batch, key: apply(imagination, batch, key), update)
+    return Transform(
+        lambda params, key: (), lambda state, imagination, batch, key: apply(imagination, batch, key), update
+    )
 
 
 def compose(*transforms: Transform) -> Transform:
     """Applies transforms from left to right, each with its own key and state."""
     n = max(len(transforms), 1)
 
-    def init(key: Key) -> PyTree:
-        return tuple(one.init(sub) for one, sub in zip(transforms, jax.random.split(key, n), strict=False))
+    def init(params: PyTree, key: Key) -> PyTree:
+        return tuple(one.init(params, sub) for one, sub in zip(transforms, jax.random.split(key, n), strict=False))
 
     def apply(state: PyTree, imagination: Any, batch: Batch, key: Key) -> Batch:
         for one, own, sub in zip(transforms, state, jax.random.split(key, n), strict=False):
@@ -102,6 +106,37 @@ def shorten(horizon: int) -> Transform:
         )
 
     return stateless(apply)
+
+
+# --- weights ----------------------------------------------------------------------------------------------------------
+
+_LR_RATIO = 3e-4  # Adam's rate of the discriminators, as in the released code of H2O+
+
+
+def weigh(config: ratio.RatioConfig) -> Transform:
+    """Weighs every simulated row by w = min(P(s'|s, a) / P_sim(s'|s, a), 1), and every real one by 1.
+
+    w comes from two discriminators. In every update they first take a step on the rows as they were sampled: the real
+    replay against the simulator. They read observations that are standardised by the statistics of the prior.
+    After `relabel` or `branch`, s' is what the models expect. Then w says whether that looks like the real system or
+    like the simulator. Batches must say which rows are simulated. Source: H2O+ Eqs. (8), (9).
+    """
+    learner = ratio.make_ratio(config)
+
+    def init(params: PyTree, key: Key) -> ratio.RatioState:
+        state = learner.init(key)
+        return state if params is None else state._replace(normalizer=params.normalizer)
+
+    def apply(state: ratio.RatioState, imagination: Any, batch: Batch, key: Key) -> Batch:
+        del imagination, key
+        log_w = jax.vmap(learner.log_ratio, (None, 0, 0, 0))(state, batch.obs, batch.action, batch.next_obs)
+        return batch._replace(weight=jnp.where(losses.is_simulated(batch), jax.vmap(ratio.weight)(log_w), 1.0))
+
+    def update(state: ratio.RatioState, batch: Batch, key: Key) -> tuple[ratio.RatioState, Metrics]:
+        state, _, metrics = ratio.step(learner, state, batch, batch, key, rate=_LR_RATIO)
+        return state, metrics
+
+    return Transform(init, apply, update)
 
 
 # --- models -----------------------------------------------------------------------------------------------------------

@@ -56,7 +56,7 @@ class Batch(NamedTuple):
 
     Learners of sequences take windows: [B, H, ...], where `next_obs` of a step is `obs` of the next.
     valid: [B] or [B, H] bool, False for rows that must not count. Their values are finite.
-    weight: [B], how much each row counts in the losses (mean 1).
+    weight: [B], how much each row counts in the losses; None counts as 1.
     is_sim: [B] bool, True for rows of the simulator.
     context, next_context: [B, context_dim], further network inputs that go with `obs` and `next_obs` and are not part
         of the observation, such as the steps to go. Networks read them as they are, without normalisation.
@@ -142,7 +142,7 @@ class Imagination(NamedTuple):
 class Transform(NamedTuple):
     """A change of a sampled batch before the learner sees it.
 
-    init(key) -> state, () for a transform that does not learn.
+    init(params, key) -> state, () for a transform that does not learn. params: of the prior, None without one.
     apply(state, imagination, batch, key) -> Batch. imagination: an `Imagination`, or what else the method offers.
     update(state, batch, key) -> (state, metrics): learns from the batch as it was sampled.
     """

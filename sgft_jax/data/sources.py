@@ -25,7 +25,7 @@ def real_windows(n: int, length: int) -> Source:
 
 def simulated_rows(n: int) -> Source:
     """`n` rows of the simulator: what learns before the first real rollout."""
-    return Source(lambda state, key: Batch(*state[1].draw(key, n)), n_real=0, n_sim=n)
+    return Source(lambda state, key: Batch(*state[1].draw(key, n), is_sim=jnp.ones(n, bool)), n_real=0, n_sim=n)
 
 
 def mixture(n_real: int, n_sim: int) -> Source:

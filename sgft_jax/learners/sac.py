@@ -51,7 +51,8 @@ class SACConfig:
         None = all (REDQ, RLPD). actor_mean: the actor follows the members' mean, not their minimum (RLPD).
     entropy_in_target: False bootstraps from Q alone.
     critic_baseline: Q(s, a) = net(s, a) - V(s) with V frozen: what a kept critic means under shaped rewards.
-    actor_batch: leading rows of the batch that the actor learns from, None = all.
+    actor_batch: leading rows of the batch that the actor learns from, None = all. weighted_actor: these rows count in
+        the losses of actor, temperature and value as they weigh; False = alike, and weights are of TD errors alone.
     policy_delay: critic updates per update of actor and temperature. max_grad_norm: per network, None = no clipping.
     """
 
@@ -71,6 +72,7 @@ class SACConfig:
     entropy_in_target: bool = True
     critic_baseline: bool = False
     actor_batch: int | None = None
+    weighted_actor: bool = True
     anchored: bool = False
     policy_delay: int = 1
     max_grad_norm: float | None = None
@@ -259,6 +261,7 @@ def _update(config: SACConfig, parts: _Parts, state: SACState, batch: Batch, key
         members = _target_members(config, key_members)
         state, metrics = _update_critic(config, parts, state, batch, members, key_target, *key_term)
     rows = jax.tree.map(lambda x: x[: config.actor_batch], batch)
+    rows = rows if config.weighted_actor else rows._replace(weight=None)
     state, q, log_prob, more = _update_actor(config, parts, state, rows, key_actor)
     metrics |= more
     if config.tune_alpha:

@@ -19,6 +19,9 @@ class Config(sgft_sac.Config):
     them as it has real ones."""
     simulated_ladder: float = 0.6
     """Share of random actions in the last of these episodes; it grows from 0 in the first."""
+    ratio: bool = False
+    """Weigh rows that begin at the simulator's states by how much likelier their successors are in the real system than
+    in the simulator, at most by 1, as H2O+ does. Two discriminators learn to tell real from simulated rows."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -30,12 +33,14 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
     from sgft_jax.data import sources
     from sgft_jax.finetuner import sac_finetuner
-    from sgft_jax.transforms import branch, clip, relabel, shape, shorten
+    from sgft_jax.models.ratio import RatioConfig
+    from sgft_jax.transforms import branch, clip, relabel, shape, shorten, weigh
 
     source = sources.mixture(config.batch_size, config.batch_size)
     transforms = (
         relabel(source.n_real),
         branch(config.horizon, config.branches, noise=config.branch_noise),
+        *((weigh(RatioConfig(task.obs_dim, task.act_dim)),) if config.ratio else ()),
         shape,
         clip(config.clip_shaped),
         shorten(config.horizon),
@@ -45,6 +50,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
         value_baseline=True, source=lambda state: source,
         simulation=Simulation(config.simulated_transitions, config.simulated_ladder),
         actor_batch=source.n_real + source.n_sim if config.actor_real_only else None,
+        weighted_actor=False,
     )  # fmt: skip
 
 

@@ -13,16 +13,22 @@ from tuners import METHODS, T, bits, equal
 from sgft_jax.io import checkpoint
 from sgft_jax.policies import make_policy
 
+VARIANTS = ("sgft-relabel:ratio", "guarded:ratio")  # a method with an option on
 # Each shows what others are put together of; all of them are compiled in `make test-all`.
-FAST = {"sgft-sac", "sgft-relabel", "sgft-mpc", "sgft-tdmpc2", "rlpd", "iql"}
-each_method = pytest.mark.parametrize("name", tuners.slow_but(FAST, METHODS))
+FAST = {"sgft-sac", "sgft-relabel:ratio", "sgft-mpc", "sgft-tdmpc2", "rlpd", "iql"}
+each_method = pytest.mark.parametrize("name", tuners.slow_but(FAST, [*METHODS, *VARIANTS]))
 OBS = jnp.array([0.3, -0.8])
+
+
+def case_of(name):
+    method, _, option = name.partition(":")
+    return tuners.tuner(method, **({option: True} if option else {}))
 
 
 @functools.cache
 def two(name):
     """Two members of a method: their case, their states after some updates, and the program that both share."""
-    case = tuners.tuner(name)
+    case = case_of(name)
     together = jax.jit(jax.vmap(lambda state, key: case.fine.learn(state, key)))
     begin = jax.tree.map(lambda *x: jnp.stack(x), *(tuners.started(case, seed) for seed in (0, 1)))
     traced = case.traces[0]
@@ -62,7 +68,7 @@ def test_a_saved_state_goes_on_with_the_same_bits(name, key, tmp_path):
 def test_what_is_exported_acts_like_the_agent(name, key):
     """Also as loaded from a file, by the prior's card and what the method adds to it."""
     case, states, _ = two(name)
-    state, fine, card = member(states, 0), case.fine, tuners.prior(METHODS[name].prior).card
+    state, fine, card = member(states, 0), case.fine, tuners.prior(METHODS[name.partition(":")[0]].prior).card
     params = fine.export(state)
     for policy in (case.plain.policy, make_policy({**card, **case.plain.card}, tuners.TASK)):
         act = jax.jit(policy.act)
@@ -120,7 +126,7 @@ def test_members_together_equal_each_alone(name, key):
 
 @each_method
 def test_invalid_rows_are_not_stored_and_may_hold_anything(name):
-    case = tuners.tuner(name)
+    case = case_of(name)
     state = case.fine.init(case.params, jax.random.key(0))
     valid = jnp.arange(T) % 2 == 1
     torn = jax.tree.map(lambda x: x.at[::2].set(jnp.nan), tuners.episode(jax.random.key(0)))

@@ -9,7 +9,7 @@ import pytest
 import tuners
 from tuners import METHODS, NET, TASK, T, compiled, equal, prior, started, tuner
 
-from sgft_jax import finetuner
+from sgft_jax import finetuner, transforms
 from sgft_jax.data import sources
 from sgft_jax.finetuner import Parts, assemble
 from sgft_jax.learners import sac, tdmpc2_model
@@ -333,7 +333,7 @@ def counting(transform):
 def test_a_transform_that_learns_keeps_its_state():
     """It counts the updates that it saw, before each batch; the batches carry its count."""
     count = Transform(
-        init=lambda key: jnp.float32(0),
+        init=lambda params, key: jnp.float32(0),
         apply=lambda state, imagination, batch, key: batch._replace(reward=jnp.full_like(batch.reward, state)),
         update=lambda state, batch, key: (state + 1.0, {"transform/seen": state}),
     )
@@ -347,13 +347,28 @@ def test_a_transform_that_learns_keeps_its_state():
 
 def test_transforms_learn_from_the_batch_as_it_was_sampled():
     look = Transform(
-        init=lambda key: (),
+        init=lambda params, key: (),
         apply=lambda state, imagination, batch, key: batch._replace(reward=batch.reward + 50.0),
         update=lambda state, batch, key: (state, {"transform/reward": jnp.mean(batch.reward)}),
     )
     case = compiled(counting(compose(look, look)), None)
     _, metrics = case.fine.learn(started(case), jax.random.key(0), 3)
     assert metrics["transform/reward"] < 1 < 99 < metrics["batch/reward_mean"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["sgft-relabel", "guarded"])
+def test_the_ratio_weighs_what_the_critic_learns(name, monkeypatch):
+    """Other weights give another critic, and the same models and discriminators; these learn too."""
+    ends = []
+    for w in (1.0, 0.25):
+        monkeypatch.setattr(transforms.ratio, "weight", lambda log_w, w=w: jnp.full_like(log_w, w))
+        case = compiled(tuners.build(name, ratio=True, **{"guard": False} if name == "guarded" else {}), prior().params)
+        ends.append(case.fine.learn(started(case), jax.random.key(1), 1)[0])
+    one, other = ends
+    assert not equal(one.learner.critic, other.learner.critic)
+    assert equal((one.models, one.transform), (other.models, other.transform))
+    assert not equal(one.transform, case.fine.init(prior().params, jax.random.key(0)).transform)
 
 
 def test_means_of_a_batch_leave_invalid_rows_out():

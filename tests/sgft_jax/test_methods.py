@@ -8,7 +8,8 @@ import pytest
 import tuners
 from tuners import METHODS, T
 
-from sgft_jax import methods
+from sgft_jax import methods, transforms
+from sgft_jax.data import sources
 from sgft_jax.methods import options as rules
 from sgft_jax.methods import sgft_relabel, sgft_sac
 from sgft_jax.types import UserError
@@ -73,6 +74,7 @@ def test_sgft_relabel_is_sgft_sac_with_relabelled_rows_and_an_actor_that_does_no
     [
         ("sgft-sac", {"horizon": 0}, "horizon is 0: must be at least 1"),
         ("mbpo", {"branches": 0}, "branches is 0: must be at least 1"),
+        ("sac", {"ratio": True}, "ratio is True: must be off where simulated-share is 0"),
         ("rlpd", {"simulated_share": 1.5}, "simulated-share is 1.5: must be from 0 to 1"),
         ("sac", {"lr_warmup": -1}, "lr-warmup is -1: must be 0 or a positive number"),
         ("mbpo", {"dynamics_warmup": -1}, "dynamics-warmup is -1: must be 0 or a positive number"),
@@ -159,6 +161,7 @@ GIVEN = {
     "lr_warmup": {"reset_critic": False},
     "simulated_transitions": {"simulated_share": 0.5},
     "simulated_ladder": {"simulated_share": 0.5},
+    "ratio": {"simulated_share": 0.5},
 }
 
 
@@ -183,6 +186,24 @@ def program(case, state):
     rollout = tuners.episode(jax.random.key(0)), jnp.ones(T, bool), jnp.float32(0)
     seen = jax.make_jaxpr(case.plain.observe)(state, *rollout)
     return f"{seen} {learn(*args)} {act(state, case.plain.init_carry(), jnp.zeros(2), args[1])}"
+
+
+def test_without_the_ratio_sgft_relabel_is_what_it_was():
+    """The same program, to the letter, as one of the transforms that it had before the option."""
+    from sgft_jax.finetuner import sac_finetuner
+
+    case = tuners.tuner("sgft-relabel")
+    options, source = tuners.configure("sgft-relabel"), sources.mixture(8, 8)
+    parts = (transforms.relabel(8), transforms.branch(2, 2, noise=0.5), transforms.shape, transforms.clip(2.0))
+    before = sac_finetuner(
+        options, tuners.prior(), tuners.TASK, transforms=(*parts, transforms.shorten(2)), horizon_dim=2,
+        reset_critic=False, value_baseline=True, source=lambda state: source, simulation=case.plain.simulation,
+        actor_batch=16,
+    )  # fmt: skip
+    start = case.plain.init(case.params, jax.random.key(0), case.data)
+    assert program(case, start) == program(case._replace(plain=before), start)
+    on = case._replace(plain=tuners.build("sgft-relabel", ratio=True))
+    assert program(case, start) != program(on, on.plain.init(case.params, jax.random.key(0), case.data))
 
 
 def facts(fine):

@@ -1,6 +1,7 @@
-"""The transforms: telescoping, brute-force H-step targets, branches, relabelled rows, composition."""
+"""The transforms: telescoping, brute-force H-step targets, branches, relabelled rows, weights, composition."""
 
 import itertools
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,9 @@ import pytest
 
 from sgft_jax import transforms as sgft
 from sgft_jax.learners import losses
-from sgft_jax.types import Batch, Imagination
+from sgft_jax.models import ratio
+from sgft_jax.models.networks import NetworkConfig
+from sgft_jax.types import Batch, Imagination, Normalizer, UserError
 
 GAMMA = 0.9
 
@@ -39,7 +42,7 @@ def left(context):
 
 def run(transform, imagination, batch, key):
     """A transform that does not learn, applied to a batch."""
-    return transform.apply(transform.init(key), imagination, batch, key)
+    return transform.apply(transform.init(None, key), imagination, batch, key)
 
 
 def batch_of(obs, next_obs, reward, discount=None, steps_to_go=None, horizon=3):
@@ -239,6 +242,66 @@ def test_other_fields_of_a_row_go_with_it(make, key):
         np.testing.assert_array_equal(getattr(out, name), np.asarray(getattr(raw, name))[origin])
 
 
+# --- weights ----------------------------------------------------------------------------------------------------------
+
+
+def tilted(transform, state, *, joint, pair):
+    """Discriminators that say the same of every row: [2] logits given (s, a), and what s' adds to them."""
+    last = lambda fit, logits: fit._replace(  # noqa: E731
+        params=jax.tree.map(jnp.zeros_like, fit.params) | {"Dense_1": {
+            "kernel": jnp.zeros_like(fit.params["Dense_1"]["kernel"]), "bias": jnp.arctanh(jnp.asarray(logits) / 2),
+        }}
+    )  # fmt: skip
+    return state._replace(joint=last(state.joint, joint), pair=last(state.pair, pair))
+
+
+def test_weights_by_hand(key):
+    """The joint adds log-odds of -1.5 for real, so w = exp(-1.5) = 0.2231 whatever the pair says; of +1.5: capped."""
+    weigh = sgft.weigh(ratio.RatioConfig(1, 1, NetworkConfig((4,))))
+    raw = batch_of([0, 1, 2], [1, 2, 3], [0, 0, 0])._replace(is_sim=jnp.array([False, True, True]))
+    for joint, w in (([-0.5, 1.0], np.exp(-1.5)), ([1.0, -0.5], 1.0)):
+        state = tilted(weigh, weigh.init(None, key), joint=joint, pair=[1.2, -0.3])
+        out = weigh.apply(state, None, raw, key)
+        np.testing.assert_allclose(out.weight, [1, w, w], rtol=1e-5)
+        assert all(x is y for x, y in zip(out._replace(weight=None), raw, strict=True))
+
+
+@pytest.mark.slow
+def test_weights_of_two_gaussians_are_the_ratio_of_their_dynamics(key):
+    """s' = s + a / 2 + e with e from N(0, 1), one further in the simulator: w = min(exp(1/2 - e), 1).
+
+    States lie around 100; the statistics of the prior bring them near 0. The domains also differ in states, which w
+    ignores.
+    """
+    weigh = sgft.weigh(ratio.RatioConfig(1, 1, NetworkConfig((32, 32)), noise=0.0))
+    prior = SimpleNamespace(normalizer=Normalizer(jnp.array([100.0]), jnp.array([2.0])))
+
+    def rows(key):
+        keys, is_sim = jax.random.split(key, 3), jnp.arange(512) % 2 == 1
+        s = 100 + jax.random.normal(keys[0], (512,)) + is_sim - 0.5
+        a = jax.random.uniform(keys[1], (512,), minval=-1)
+        after = s + a / 2 + jax.random.normal(keys[2], (512,)) + is_sim
+        return Batch(s[:, None], a[:, None], s, s, after[:, None], is_sim=is_sim)
+
+    def step(state, key):
+        return weigh.update(state, rows(key), key)
+
+    state = weigh.init(prior, key)
+    state, metrics = jax.jit(lambda state, keys: jax.lax.scan(step, state, keys))(state, jax.random.split(key, 2500))
+    assert metrics["ratio/loss"][-200:].mean() < 0.9 * 4 * np.log(2) and state.normalizer is not None
+    batch = rows(jax.random.key(9))
+    weight = weigh.apply(state, None, batch, key).weight
+    e = (batch.next_obs - batch.obs - batch.action / 2)[1::2, 0]
+    np.testing.assert_array_equal(weight[::2], 1.0)
+    assert jnp.abs(weight[1::2] - jnp.minimum(jnp.exp(0.5 - e), 1)).mean() < 0.08
+
+
+def test_weights_need_to_know_which_rows_are_simulated(key):
+    weigh = sgft.weigh(ratio.RatioConfig(1, 1, NetworkConfig((4,))))
+    with pytest.raises(UserError, match="which rows are simulated"):
+        run(weigh, imagination(), batch_of([0], [1], [0]), key)
+
+
 # --- composition ------------------------------------------------------------------------------------------------------
 
 
@@ -251,13 +314,13 @@ def test_composition_runs_left_to_right_with_separate_keys_and_states(key):
             return batch
 
         learn = lambda state, batch, key: (state + name, {f"seen/{name}": key})  # noqa: E731
-        return sgft.Transform(lambda key: name, apply, learn)
+        return sgft.Transform(lambda params, key: name + params, apply, learn)
 
     both = sgft.compose(note("a"), note("b"))
-    assert both.init(key) == ("a", "b")
+    assert both.init("-prior", key) == ("a-prior", "b-prior")
     raw = batch_of([0], [0], [0])
     assert both.apply(("x", "y"), imagination(), raw, key) is raw
     assert [(name, state) for name, state, _ in seen] == [("a", "x"), ("b", "y")] and seen[0][2] != seen[1][2]
     state, metrics = both.update(("x", "y"), raw, key)
     assert state == ("xa", "yb") and metrics["seen/a"] != metrics["seen/b"]
-    assert run(sgft.compose(), imagination(), raw, key) is raw and sgft.compose().init(key) == ()
+    assert run(sgft.compose(), imagination(), raw, key) is raw and sgft.compose().init(None, key) == ()

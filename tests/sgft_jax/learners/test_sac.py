@@ -215,6 +215,19 @@ def test_actor_learns_from_the_leading_rows_only(key):
     assert not equal(a.actor, c.actor)
 
 
+def test_weights_of_the_actors_rows_may_be_left_out(key):
+    """The critic still counts rows as they weigh. That an actor else does so too says test_contract_learners.py."""
+    learner = sac.make_sac(dataclasses.replace(FULL, weighted_actor=False))
+    batch = probe(key, obs=[-1.0, 1.0], reward=lambda s, a: s * a)
+    state, update = learner.init(key), jax.jit(learner.update)
+    kept = state.replace(hyper=state.hyper._replace(lr_critic=jnp.float32(0)))
+    half = batch._replace(weight=jnp.arange(ROWS) % 2 * 2.0)
+    a, b = (update(kept, x, key)[0] for x in (batch, half))
+    for part in ("actor", "log_alpha", "value"):
+        assert equal(getattr(a, part), getattr(b, part))
+    assert not equal(a.critic.moments, b.critic.moments)
+
+
 def test_without_discount_the_target_ignores_target_network_and_successor(key):
     state, batch = FULL_LEARNER.init(key), probe(key, reward=lambda s, a: a)
     other_state = state.replace(target_critic=jax.tree.map(lambda p: p + 1, state.target_critic))
