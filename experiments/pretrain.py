@@ -43,7 +43,8 @@ class PretrainArgs:
     video: bool = True
     """Render an episode of the first prior, where MuJoCo can render."""
     real: str | None = None
-    """Expert: train on a "real" system instead of the simulator's domain, named by a gap or a .toml/.json file."""
+    """Expert: train in the system of a gap, by name or as a .toml/.json file, instead of the task's own domain: as in a
+    simulator that is wrong (fine-tune with --real sim), or on the "real" system to see what can be had there."""
     set: tuple[str, ...] = ()
     """Expert: changes to that system, e.g. --set latency=0.05 action_scale=[1,0.5]."""
     report: bool = True

@@ -15,7 +15,7 @@ import numpy as np
 import envs
 from envs.base import Env, World
 from envs.domains.actuators import with_actuators
-from envs.gaps import Gap
+from envs.gaps import SIM, Gap
 from envs.pools import heldout_worlds, load_gap, real_env, training_worlds
 from envs.rollout import Episode
 from envs.system import blurred, varying, with_system
@@ -307,5 +307,6 @@ class _Run:
         kind = "informed" if self.config.sees_system else self.config.algorithm
         method = {"sac": "", "informed": "sysid", "tdmpc2": "sgft-tdmpc2", "recurrent": "recurrent"}[kind]
         method = method and f" --method {method}"
+        method += "" if self.gap is None else f" --real {SIM}"
         out = "" if self.args.out == PretrainArgs.out else f" --out {self.args.out}"
         print(f"next: python -m experiments.finetune --task {self.args.task}{method} --prior {self.folder}{out}")

@@ -3,7 +3,7 @@
 The only module of this package that builds tasks; the others take an `Env` or less.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 
 import envs
 from envs.base import Env
-from envs.gaps import Gap
+from envs.gaps import Gap, from_dict
 from envs.history import remember, with_memory
-from envs.pools import heldout_worlds, real_env, real_worlds
+from envs.pools import heldout_worlds, real_env, real_worlds, training_worlds
 from envs.rollout import Episode
 from sgft_jax import train
 from sgft_jax.io.priors import load_prior, observed
@@ -94,8 +94,17 @@ def _simulated_rows(env: Env, finetuner: Finetuner, priors: list[Prior], stacked
     if finetuner.simulation is None:
         return None
     key, card = jax.random.key(_SIMULATION), priors[0].card
-    worlds = envs.sample_worlds(env, key, SIMULATED_WORLDS)
+    env, gap = _simulator(env, card)
+    worlds = training_worlds(env, gap, key, SIMULATED_WORLDS)
     return train.simulate(env, make_policy(card, env), worlds, stacked, key, finetuner.simulation, gamma=card["gamma"])
+
+
+def _simulator(env: Env, card: Mapping[str, Any]) -> tuple[Env, Gap | None]:
+    """What a prior was trained in: the task's own domain (None), or the system of the gap that its card names."""
+    if (named := card.get("gap")) is None:
+        return env, None
+    gap = from_dict(env, named["name"], {part: named[part] for part in ("params", "effects", "scene")})
+    return real_env(env, [gap]), gap
 
 
 def check_prior(prior: Prior, method: Method, env: Env) -> None:

@@ -118,6 +118,7 @@ def _structure(card: Mapping[str, Any]) -> dict[str, Any]:
         "gru": card["config"]["gru"] if algorithm_of(card) == "recurrent" else None,
         "previous_actions": card.get("previous_actions", 0),
         "system": card.get("system", []),
+        "gap": card.get("gap"),  # methods that ask for simulated data get that of one simulator
     }
 
 

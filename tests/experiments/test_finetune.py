@@ -24,7 +24,7 @@ from experiments import cli, evaluate, finetune, finetune_run
 from experiments.finetune_args import FinetuneArgs, arguments, run_folder
 from experiments.finetune_record import Record
 from experiments.recorded import Recorded
-from sgft_jax import train
+from sgft_jax import api, train
 from sgft_jax.analysis.curves import read_curve, training_score
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import read_jsonl
@@ -516,6 +516,18 @@ def agree(one, two, upto):
             assert a.keys() == b.keys()
             for key in a:
                 assert a[key] == pytest.approx(b[key], rel=1e-3, abs=1e-3), key
+
+
+def test_simulated_data_are_those_of_the_simulator_that_the_prior_comes_from(tmp_path):
+    """A mass of 3 kg without friction, where the task's own domain has 0.8 to 1.2 kg and 3.5 to 4.5 per second."""
+    gap = {"name": "wrong", "params": {"mass": 3.0, "friction": 0.0}, "effects": {"obs_noise": 0.0}, "scene": ""}
+    save_prior(tmp_path / "seed-0", 0, gap=gap | {"families": [], "stratum": ""})
+    prior, env = load_prior(tmp_path / "seed-0"), toy.make()
+    options = {"simulated_share": 0.5, "simulated_transitions": 200}
+    setup = api.setup(env, gaps.load(env, "sim"), prior, method="sac", **options)
+    rows = setup.simulated.of(0).draw(jax.random.key(0), 50)
+    gained = 0.1 * 4.0 * rows.action / 3.0  # dt times force over mass
+    np.testing.assert_allclose(rows.next_obs[:, 2:] - rows.obs[:, 2:], gained, atol=1e-5)
 
 
 def test_real_systems_together_are_what_each_is_alone(home, tmp_path, capsys):

@@ -132,8 +132,8 @@ def test_priors_that_are_used_together_have_one_structure(tmp_path):
     folders = [save(tmp_path / f"seed-{i}", float(i)) for i in range(2)]
     loaded = priors.load_priors(folders, env)
     assert [bits(prior.params) for prior in loaded] == [bits(make_prior(float(i)).params) for i in range(2)]
-    odd = save(tmp_path / "seed-2", gamma=0.5, network={"hidden": [9]}, plan={"horizon": 2})
-    with pytest.raises(UserError, match=r"seed-2: differs from .*seed-0 in gamma, network, plan; choose one"):
+    odd = save(tmp_path / "seed-2", gamma=0.5, network={"hidden": [9]}, plan={"horizon": 2}, gap={"name": "ice"})
+    with pytest.raises(UserError, match=r"seed-2: differs from .*seed-0 in gamma, gap, network, plan; choose one"):
         priors.load_priors([*folders, odd], env)
     with pytest.raises(UserError, match="act_dim=2 where act_dim=3 is needed"):
         priors.load_priors(folders, SimpleNamespace(name="hammer", obs_dim=4, act_dim=3))
