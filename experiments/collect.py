@@ -60,7 +60,12 @@ class CollectArgs:
 
 def name_of(args: CollectArgs, kind: str, seed: int) -> str:
     """What a data set is called: `halfcheetah-medium-regenerated-seed-0`."""
-    return f"{extend.name_of(args.task)}-{kind}-regenerated-seed-{seed}"
+    return f"{_system_name(args)}-{kind}-regenerated-seed-{seed}"
+
+
+def _system_name(args: CollectArgs) -> str:
+    """Of the real system: the task, and its gap if there is one."""
+    return extend.name_of(args.task) + ("" if args.real == SIM else f"-{title(args.real)}")
 
 
 def is_d4rls(args: CollectArgs) -> bool:
@@ -79,8 +84,8 @@ def targets(args: CollectArgs) -> list[Path]:
         name = f"{extend.name_of(args.task)}-{title(args.real)}-operator"
         return [args.out / f"{name}-seed-{seed}.txt" for seed in seed_list(args.seed, args.seeds)]
     if args.policy is not None:
-        kinds = [(extend.name_of(args.task), args.policy.parent.parent.name, args.policy.name)]
-        return [args.out / f"{'-'.join(filter(None, kinds[0]))}.hdf5"]
+        words = (_system_name(args), args.policy.parent.parent.name, args.policy.name)
+        return [args.out / f"{'-'.join(filter(None, words))}.hdf5"]
     seeds = seed_list(args.seed, args.seeds)
     return [args.out / f"{name_of(args, kind, seed)}.hdf5" for seed in seeds for kind in PAIR]
 

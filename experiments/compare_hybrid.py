@@ -50,6 +50,8 @@ class CompareHybridArgs:
     """The real data: D4RL or Minari files, folders of Minari sets, or logs of a wheel-legged robot."""
     real: str = SIM
     """The real system to evaluate in: sim for the task as it is, or a gap by name or as a file."""
+    previous_actions: int = 0
+    """Last actions that end the observation, for data of a policy that sees them."""
     seeds: int = 5
     """Number of seeds of each run."""
     schedule: Schedule = field(default_factory=Schedule)
@@ -158,8 +160,9 @@ def _runs(args: CompareHybridArgs, method: str, data: Path | None) -> list[Hybri
     kind = get_method(name).kind
     run = arguments(
         name, preset=preset, variant=preset, task=args.task, data=None if kind == "simulator" else data,
-        real=args.real, seeds=args.seeds, seed=args.seed, schedule=args.schedule, eval_every=args.eval_every,
-        eval_episodes=args.eval_episodes, impl=args.impl, out=args.out, video=False,
+        real=args.real, previous_actions=args.previous_actions, seeds=args.seeds, seed=args.seed,
+        schedule=args.schedule, eval_every=args.eval_every, eval_episodes=args.eval_episodes, impl=args.impl,
+        out=args.out, video=False,
     )  # fmt: skip
     return [replace(run, gap=(gap,)) for gap in ((SIM,) if kind == "offline" else args.gaps)]
 

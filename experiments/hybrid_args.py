@@ -35,6 +35,9 @@ class HybridArgs:
     wheel-legged robot."""
     real: str = SIM
     """The real system to evaluate in: sim for the task as it is, or a gap by name or as a file."""
+    previous_actions: int = 0
+    """Last actions that end the observation, for data of a policy that sees them, such as a prior of the preset
+    `robust`, which sees 2."""
     seeds: int = 5
     """Number of seeds."""
     out: Path = Path("runs")
@@ -89,6 +92,8 @@ def data_name(path: Path) -> str:
 def check(args: HybridArgs) -> tuple[HybridMethod, list[int]]:
     """The method and the seeds; raises UserError for what is wrong in the arguments and with the run folders."""
     at_least_one(args, "eval_every", "eval_episodes", "checkpoint_every")
+    if args.previous_actions < 0:
+        raise UserError(f"--previous-actions {args.previous_actions}: must be 0 or more")
     method, seeds = get_method(args.method), seed_list(args.seed, args.seeds)
     if not isinstance(args.options, type(method.config)):
         raise UserError(f"--method {method.name}: the options are those of another method")

@@ -14,7 +14,7 @@ import envs
 from envs import gaps
 from envs.base import Env, World
 from envs.gaps import SIM, Gap
-from envs.pools import real_worlds
+from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
 from experiments.evaluation import SCORES, play, scores
 from experiments.hybrid_args import NO_SIMULATOR, VOLATILE, HybridArgs, gaps_of, run_folder
@@ -41,7 +41,7 @@ _LATE = 10  # evaluations that a score averages, beside the last one
 
 def run(args: HybridArgs, method: HybridMethod, seeds: list[int]) -> list[dict[str, Any]]:
     """The runs with the simulators of `args`; returns their summaries."""
-    env = envs.make(args.task, args.impl)
+    env = envs.make(args.task, args.impl, previous_actions=args.previous_actions)
     named = gaps_of(args, method)
     found = [Gap(NO_SIMULATOR, {}, {}) if name == NO_SIMULATOR else gaps.load(env, name) for name in named]
     log = None if method.kind == "simulator" or args.data is None else _load(args, env)
@@ -65,7 +65,7 @@ def _read(args: HybridArgs, env: Env) -> logs.Log:
         return logs.load(args.data, gamma=gamma, successors=args.successors)  # pyright: ignore
     if not env.name.startswith("wheel-legged") or env.reward is None:
         raise UserError(f"{args.data}: tables are logs of a wheel-legged robot; {env.name} wants an HDF5 file")
-    return logs.load_table(args.data, gamma=gamma, obs_dim=env.obs_dim, reward=jax.vmap(env.reward))
+    return logs.load_table(args.data, gamma=gamma, obs_dim=env.measured_dim, reward=jax.vmap(env.reward))
 
 
 def _load(args: HybridArgs, env: Env) -> logs.Log:
@@ -73,9 +73,12 @@ def _load(args: HybridArgs, env: Env) -> logs.Log:
     log = _read(args, env)
     facts, sizes = log.facts, (log.rows.obs.shape[1], log.rows.action.shape[1])
     if sizes != (env.obs_dim, env.act_dim):
+        more, odd = divmod(sizes[0] - env.measured_dim, env.act_dim)
+        fits = sizes[1] == env.act_dim and more >= 0 and not odd
+        advice = f"--previous-actions {more} would fit" if fits else "name the task that it was recorded on"
         raise UserError(
             f"{args.data}: has {sizes[0]} observations and {sizes[1]} actions, {env.name} has {env.obs_dim} and "
-            f"{env.act_dim}; name the task that it was recorded on"
+            f"{env.act_dim}; {advice}"
         )
     print(
         f"data: {facts.path}, {facts.size:,} bytes, sha256 {facts.sha256[:12]}; {facts.transitions:,} transitions of "
@@ -92,15 +95,18 @@ class _Run:
         self, args: HybridArgs, method: HybridMethod, env: Env, found: list[Gap], seeds: list[int],
         log: logs.Log | None, folders: list[Path],
     ) -> None:  # fmt: skip
-        self.args, self.method, self.env, self.gaps, self.seeds = args, method, env, found, seeds
+        self.args, self.method, self.gaps, self.seeds = args, method, found, seeds
+        self.env = real_env(env, found)  # what the simulators share
         self.folders, self.data = folders, log
         self.agent = method.build(args.options, env)
         self.logs = [MetricsLog(folder) for folder in folders]
         self.last_good: Path | None = None
         self.expect = {"kind": "hybrid", "task": env.name, "method": method.name, "seeds": seeds}
         members = jnp.zeros(len(found) * len(seeds), jnp.int32)
-        real = real_worlds(env, [gaps.load(env, args.real)], jax.random.key(0))
-        self.system = Simulated(env, real, members, gamma=args.options.gamma)
+        gap = gaps.load(env, args.real)
+        real = real_env(env, [gap])
+        pools = real_worlds(real, [gap], jax.random.key(0))
+        self.system = Simulated(real, pools, members, gamma=args.options.gamma)
         self.chunk = args.schedule.updates_per_chunk
 
     def work(self) -> list[dict[str, Any]]:
@@ -231,6 +237,7 @@ class _Run:
     def _card(self, gap: Gap, seed: int) -> dict[str, Any]:
         env = self.env
         sizes = {"task": env.name, "obs_dim": env.obs_dim, "act_dim": env.act_dim, "control_dt": env.control_dt}
+        sizes |= {"previous_actions": env.previous_actions}
         layout = {"observation": [e._asdict() for e in env.observation], "action": [e._asdict() for e in env.action]}
         facts = {"method": self.method.name, "gap": gap._asdict(), "seed": seed, "data": self._facts()}
         return {**self.agent.card, **sizes, **layout, "hybrid": facts, "provenance": runs.provenance()}
@@ -264,7 +271,7 @@ class _Run:
     def _film(self, folder: Path, played: Episode) -> str:
         """An episode in the real system."""
         theta = self.system.pools.theta.params[0, played.world]
-        return film(self.env, theta, np.asarray(played.trace), folder / "videos" / f"seed-{self.seeds[0]}.mp4")
+        return film(self.system.env, theta, np.asarray(played.trace), folder / "videos" / f"seed-{self.seeds[0]}.mp4")
 
     def _say(self, folder: Path, gap: Gap, summary: dict[str, Any]) -> None:
         last, late = np.array(summary["last"]), np.array(summary["late"])

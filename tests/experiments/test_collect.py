@@ -1,5 +1,6 @@
 """Recording data sets of a real system on a point mass: both layouts, what SAC did and what it does then."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -244,6 +245,15 @@ def test_the_log_of_an_operator_resembles_the_published_one(task, reward, tmp_pa
     assert next(iter(facts["reward"].values())) == pytest.approx(reward, abs=0.3)
     (log,) = tmp_path.glob(f"{task}-robot-operator-seed-0.txt")
     assert facts["transitions"] == 6_000 and json.loads(log.with_suffix(".json").read_text())["std"] == facts["std"]
+
+
+def test_files_are_named_after_the_real_system(tmp_path):
+    args = collect.CollectArgs(task="push", out=tmp_path, policy=Path("docs/priors/push/seed-0"))
+    assert [path.name for path in collect.targets(args)] == ["push-priors-seed-0.hdf5"]
+    args = dataclasses.replace(args, real="sets/hard.toml:deep")
+    assert [path.name for path in collect.targets(args)] == ["push-deep-priors-seed-0.hdf5"]
+    names = [path.name for path in collect.targets(dataclasses.replace(args, policy=None))]
+    assert names == [f"push-deep-{kind}-regenerated-seed-0.hdf5" for kind in collect.PAIR]
 
 
 def test_files_are_not_replaced(tmp_path, capsys):

@@ -124,6 +124,7 @@ def test_sac_needs_no_data(tmp_path):
         (["--schedule.simulators", "0"], "option simulators is 0: must be at least 1"),
         (["--gap", "gravitiy"], "gravitiy"),
         (["--variant", "a/b"], "--variant 'a/b'"),
+        (["--previous-actions", "-1"], "--previous-actions -1: must be 0 or more"),
         (["--gap", "sim", "--successors", "next"], "successors: there is no 'next'"),
     ],
 )
@@ -136,10 +137,23 @@ def test_data_that_is_missing_or_of_another_task(tmp_path, capsys):
     assert "--data: h2oplus learns from real data" in complaint([*TINY, "--gap", "sim"], capsys)
     other = d4rl(tmp_path / "other.hdf5", 3, 2)
     error = complaint(words(tmp_path, other, "--gap", "sim"), capsys)
-    assert "other.hdf5: has 3 observations and 2 actions, toy has 4 and 2" in error
+    assert "other.hdf5: has 3 observations and 2 actions, toy has 4 and 2; name the task" in error
+    remembered = d4rl(tmp_path / "remembered.hdf5", 8, 2)
+    error = complaint(words(tmp_path, remembered, "--gap", "sim"), capsys)
+    assert "toy has 4 and 2; --previous-actions 2 would fit" in error
     table = tmp_path / "robot.txt"
     assert "tables are logs of a wheel-legged robot" in complaint(words(tmp_path, table, "--gap", "sim"), capsys)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_data_of_a_policy_that_saw_its_last_actions(tmp_path):
+    """Its observations end with two actions of two numbers; so do those of simulators, real system and new policy."""
+    data = d4rl(tmp_path / "remembered.hdf5", 4 + 2 * 2, 2)
+    hybrid.main(words(tmp_path, data, "--gap", "sim", "--previous-actions", "2"))
+    folder = tmp_path / "out/hybrid/toy/sim/remembered/h2oplus/seeds-0-1"
+    policy = sgft_jax.load_policy(folder / "policy/seed-0")
+    assert (policy.env.obs_dim, policy.env.previous_actions) == (8, 2)
 
 
 def test_other_data_are_refused_when_a_run_goes_on(tmp_path, data, capsys):
