@@ -1,4 +1,4 @@
-"""Run every method on every data set and simulator, cell by cell, and print tables of what there is.
+"""Run every method on every data set and simulator, cell by cell, and print tables and draw curves of what there is.
 
 A cell is one run of `experiments.hybrid` with all seeds. Methods without a simulator run once for each data set, those
 without data once for each simulator. Cells that are finished are left alone, begun ones go on where they stopped: the
@@ -14,17 +14,17 @@ from envs.gaps import SIM
 from experiments import cells, cli
 from experiments.cells import Cell, Kind, check_begun, complete
 from experiments.hybrid import arguments, hybrid
-from experiments.hybrid_args import DEFAULT, VOLATILE, HybridArgs, data_name, gaps_of, run_folder
+from experiments.hybrid_args import DEFAULT, NO_DATA, VOLATILE, HybridArgs, data_name, gaps_of, run_folder
 from experiments.options import Impl, at_least_one, check_task, seed_list, without_repeats
 from sgft_jax import extend
 from sgft_jax.hybrid.methods import NAMES, get_method
 from sgft_jax.hybrid.schedule import Schedule
 from sgft_jax.io.jsonfile import jsonable, read_json
-from sgft_jax.io.log import SUMMARY
+from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
 from sgft_jax.types import UserError, unknown
 
 if TYPE_CHECKING:
-    from sgft_jax.analysis.hybrid import Outcome
+    from sgft_jax.analysis.hybrid import Outcome, Results
 
 _SCORES = {"late": "mean of the last ten evaluations", "last": "last evaluation"}
 LEGEND = (
@@ -66,7 +66,7 @@ class CompareHybridArgs:
     dry: bool = False
     """Only list the runs and what is missing."""
     out: Path = Path("runs")
-    """Parent of all run folders; the tables also go to <out>/figures."""
+    """Parent of all run folders; the tables and the curves go to <out>/figures."""
     seed: int = 0
     """Expert: first seed."""
     eval_every: int = 10_000
@@ -113,7 +113,7 @@ HYBRID = Kind(
 
 
 def main(args: CompareHybridArgs) -> None:
-    """Runs what is missing, then prints tables; raises UserError in the end if some cells could not run."""
+    """Runs what is missing, then shows tables and curves; raises UserError in the end if some cells could not run."""
     args = replace(args, gaps=gaps.each(args.gaps or tuple(gaps.presets(extend.name_of(args.task)))))
     check(args)
     found = grid(args)
@@ -121,11 +121,8 @@ def main(args: CompareHybridArgs) -> None:
     failed = complete(found, args)
     if args.dry:
         return
-    if text := tables(args):
-        path = args.out / "figures" / f"hybrid-{extend.name_of(args.task)}-{gaps.title(args.real)}-{args.score}.md"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text + "\n")
-        print(f"{text}\n\nwritten: {path}")
+    if results := outcomes(args):
+        _show(args, results)
     if failed:
         raise UserError(f"{len(failed)} of the cells did not run: {'; '.join(failed)}")
 
@@ -167,32 +164,56 @@ def _runs(args: CompareHybridArgs, method: str, data: Path | None) -> list[Hybri
     return [replace(run, gap=(gap,)) for gap in ((SIM,) if kind == "offline" else args.gaps)]
 
 
-def tables(args: CompareHybridArgs) -> str:
-    """What has finished, as Markdown; "" if nothing has."""
-    from sgft_jax.analysis import hybrid as analysis
+def outcomes(args: CompareHybridArgs) -> "Results | None":
+    """What has finished; None if nothing has."""
+    from sgft_jax.analysis.hybrid import Results
 
     done = [cell for cell in grid(args) if cell.state == "finished"]
     if not done:
-        return ""
+        return None
     summaries = [read_json(cell.folder / SUMMARY) for cell in done]
     task, score = (summaries[0][name] for name in ("task", "score"))
-    outcomes = [_outcome(cell.args, one[args.score]) for cell, one in zip(done, summaries, strict=True)]
+    found = [_outcome(cell, one[args.score]) for cell, one in zip(done, summaries, strict=True)]
     data, systems = [data_name(path) for path in args.data] or [""], [gaps.title(gap) for gap in args.gaps]
-    results = analysis.Results(task, score, data, systems, args.methods, outcomes)
-    scale = " on D4RL's scale" if task in analysis.BOUNDS else ""
+    return Results(task, score, data, systems, args.methods, found)
+
+
+def _outcome(cell: Cell, scores: list[float]) -> "Outcome":
+    import numpy as np
+
+    from sgft_jax.analysis.hybrid import Outcome
+
+    lines, run = read_jsonl(cell.folder / EVAL), cell.args
+    updates, curve = (np.array([line[name] for line in lines]) for name in ("step", "score"))
+    return Outcome(_spec(run), _data_of(run), _gap_of(run), np.array(scores), updates, curve.T)
+
+
+def tables(args: CompareHybridArgs, results: "Results") -> str:
+    """The tables as Markdown."""
+    from sgft_jax.analysis import hybrid as analysis
+
+    scale = " on D4RL's scale" if results.task in analysis.BOUNDS else ""
     words = {"score": _SCORES[args.score], "seeds": args.seeds, "scale": scale, "reference": args.reference}
-    parts = [f"# {task}", LEGEND.format(**words), analysis.headline(results)]
+    parts = [f"# {results.task}", LEGEND.format(**words), analysis.headline(results)]
     if len(args.methods) > 1:
         parts.append(analysis.duels(results, args.reference))
     return "\n\n".join([*parts, analysis.cells(results)])
 
 
-def _outcome(run: HybridArgs, scores: list[float]) -> "Outcome":
-    import numpy as np
+def _show(args: CompareHybridArgs, results: "Results") -> None:
+    """Tables on the screen and in a file, and a figure of curves for each data set."""
+    from sgft_jax.analysis import figures
 
-    from sgft_jax.analysis.hybrid import Outcome
-
-    return Outcome(_spec(run), _data_of(run), _gap_of(run), np.array(scores))
+    folder, name = args.out / "figures", f"hybrid-{extend.name_of(args.task)}-{gaps.title(args.real)}"
+    folder.mkdir(parents=True, exist_ok=True)
+    path, text = folder / f"{name}-{args.score}.md", tables(args, results)
+    path.write_text(text + "\n")
+    print(f"{text}\n\nwritten: {path}")
+    for data in results.data:
+        if any(results.find(method, data, gap) for method in results.methods for gap in results.gaps):
+            title = " on ".join(filter(None, [results.task, data]))
+            drawn = figures.hybrid_curves(folder / f"{name}-{data or NO_DATA}.png", results, data, title=title)
+            print(f"written: {drawn}")
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ Okabe-Ito palette (safe for colour-blind readers).
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import ArrayLike
 
 from sgft_jax.analysis.curves import Curve, by_prior, spread
-from sgft_jax.analysis.stats import ENOUGH, Interval, iqm
+from sgft_jax.analysis.hybrid import Outcome, Results
+from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval
 from sgft_jax.analysis.verdict import Sign
+from sgft_jax.hybrid.methods import get_method
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MOST = len(PALETTE)
@@ -26,49 +29,109 @@ _INK, _GREY, _FAINT = "#333333", "#777777", "#B0B0B0"
 _FONT = {"size": 10, "color": _INK}
 
 
-def learning_curves(path: Path, panels: Mapping[str, Sequence[Curve]], *, title: str) -> Path:
-    """Scores over real rollouts: a panel for each entry, by its words; IQM over members with its 95 % bootstrap band.
+@dataclass(frozen=True, eq=False)
+class Line:
+    """One curve of a panel.
 
-    A panel with more than `MOST` curves becomes several; each shows the others in grey behind its own.
+    name: in the legend. family: what lines are grouped by where they need several panels. x: [evaluations]. band: IQM
+    over members [evaluations] with its interval, nan where there is none. score: its name. seeds: how many members.
+    by_prior: whether the interval draws priors before seeds.
     """
-    parts = [part for words, curves in panels.items() if curves for part in _split(words, curves)]
+
+    name: str
+    family: str
+    x: np.ndarray
+    band: Interval
+    score: str
+    seeds: int
+    by_prior: bool = False
+
+
+def learning_curves(path: Path, panels: Mapping[str, Sequence[Curve]], *, title: str) -> Path:
+    """Scores over real rollouts: a panel for each entry, by its words; see `lines`."""
+    drawn = {words: [_line(curve) for curve in curves] for words, curves in panels.items()}
+    return lines(path, drawn, {words: _rollouts(curves) for words, curves in panels.items() if curves}, title=title)
+
+
+def hybrid_curves(path: Path, results: Results, data: str, *, title: str) -> Path:
+    """Scores in the real system over updates on one data set: a panel for each simulator, a line for each method.
+
+    A method that sees no simulator, or no data, has the same line wherever it belongs.
+    """
+    panels = {}
+    for gap in results.gaps:
+        found = [results.find(method, data, gap) for method in results.methods]
+        panels[f"simulator: {gap}"] = [_line_of_updates(own, results.score) for own in found if own is not None]
+    return lines(path, panels, dict.fromkeys(panels, "updates"), title=title)
+
+
+def lines(path: Path, panels: Mapping[str, Sequence[Line]], labels: Mapping[str, str], *, title: str) -> Path:
+    """A panel for each entry, by its words: IQM over members with its 95 % bootstrap band. labels: of the x axes.
+
+    A panel with more than `MOST` lines becomes several; each shows the others in grey behind its own.
+    """
+    parts = [(entry, *part) for entry, own in panels.items() if own for part in _split(entry, own)]
     columns = min(len(parts), 2)
     figure, grid = _figure(
         5.6 * columns, 3.1 * math.ceil(len(parts) / columns) + 0.4, columns=columns, count=len(parts)
     )
-    colours = _colours(curve.name for _, own, _ in parts for curve in own)
-    for axes, (words, own, others) in zip(grid, parts, strict=True):
-        for curve in others:
-            axes.plot(curve.rollouts, iqm(curve.values), color=_FAINT, linewidth=0.8, zorder=1)
-        for curve, colour in zip(own, colours(own), strict=True):
-            _draw_curve(axes, curve, colour)
+    colours = _colours(line.name for _, _, own, _ in parts for line in own)
+    first: dict[str, Axes] = {}  # of the panels of an entry, which have one y axis
+    for axes, (entry, words, own, others) in zip(grid, parts, strict=True):
+        if first.setdefault(entry, axes) is not axes:
+            axes.sharey(first[entry])
+        for line in others:
+            axes.plot(line.x, line.band.estimate, color=_FAINT, linewidth=0.8, zorder=1)
+        for line, colour in zip(own, colours(own), strict=True):
+            _draw_line(axes, line, colour)
+        axes.set_xlabel(labels[entry], **{**_FONT, "size": 9})
         _dress(axes, words, [*own, *others])
     figure.suptitle(title, x=0.01, ha="left", size=12, weight="bold", color=_INK)
-    figure.supxlabel(_note([curve for _, own, _ in parts for curve in own]), size=8, color=_GREY)
+    figure.supxlabel(_note([line for _, _, own, _ in parts for line in own]), size=8, color=_GREY)
     return _save(figure, path)
 
 
-def _split(words: str, curves: Sequence[Curve]) -> list[tuple[str, Sequence[Curve], list[Curve]]]:
-    """(words, curves, others in grey) of each panel: families together, at most `MOST` curves in each."""
-    if len(curves) <= MOST:
-        return [(words, curves, [])]
-    ordered = sorted(curves, key=lambda curve: curve.family)
-    count = math.ceil(len(curves) / MOST)
+def _line(curve: Curve) -> Line:
+    band, factor = spread(curve, curve.values), by_prior(curve)
+    return Line(curve.name, curve.family, curve.rollouts, band, curve.score, len(curve.seeds), factor)
+
+
+def _line_of_updates(own: Outcome, score: str) -> Line:
+    kind = get_method(own.method.partition(":")[0]).kind
+    return Line(own.method, kind, own.updates, bootstrap_interval(own.curve), score, len(own.curve))
+
+
+def _rollouts(curves: Sequence[Curve]) -> str:
+    """What the x axis of curves over real rollouts says."""
+    longest = max(curves, key=lambda curve: curve.rollouts[-1])
+    if np.isnan(longest.minutes[-1]):  # of several tasks, whose rollouts differ in length
+        return "real rollouts"
+    each = max(int(longest.rollouts[-1]), 1)
+    seconds, steps = 60 * float(longest.minutes[-1]) / each, int(longest.transitions[-1]) // each
+    return f"real rollouts of {steps} transitions, {seconds:.3g} s"
+
+
+def _split(words: str, own: Sequence[Line]) -> list[tuple[str, Sequence[Line], list[Line]]]:
+    """(words, lines, others in grey) of each panel: families together, at most `MOST` lines in each."""
+    if len(own) <= MOST:
+        return [(words, own, [])]
+    ordered = sorted(own, key=lambda line: line.family)
+    count = math.ceil(len(own) / MOST)
     parts = [[ordered[i] for i in some] for some in np.array_split(np.arange(len(ordered)), count)]
     return [
-        (f"{words}, {i + 1} of {count}", part, [curve for curve in ordered if curve not in part])
+        (f"{words}, {i + 1} of {count}", part, [line for line in ordered if line not in part])
         for i, part in enumerate(parts)
     ]
 
 
-def _colours(names: Iterable[str]) -> Callable[[Sequence[Curve]], list[str]]:
-    """(curves) -> a colour for each, all distinct; a name keeps its colour from panel to panel where it can."""
+def _colours(names: Iterable[str]) -> Callable[[Sequence[Line]], list[str]]:
+    """(lines) -> a colour for each, all distinct; a name keeps its colour from panel to panel where it can."""
     place = {name: i for i, name in enumerate(dict.fromkeys(names))}
 
-    def of(curves: Sequence[Curve]) -> list[str]:
+    def of(own: Sequence[Line]) -> list[str]:
         free, chosen = list(PALETTE), []
-        for curve in curves:
-            wanted = PALETTE[place[curve.name] % len(PALETTE)]
+        for line in own:
+            wanted = PALETTE[place[line.name] % len(PALETTE)]
             chosen.append(wanted if wanted in free else free[0])
             free.remove(chosen[-1])
         return chosen
@@ -76,48 +139,39 @@ def _colours(names: Iterable[str]) -> Callable[[Sequence[Curve]], list[str]]:
     return of
 
 
-def _draw_curve(axes: Axes, curve: Curve, colour: str) -> None:
-    band = spread(curve, curve.values)
+def _draw_line(axes: Axes, line: Line, colour: str) -> None:
+    band = line.band
     if np.isfinite(band.low).all():
-        axes.fill_between(curve.rollouts, band.low, band.high, color=colour, alpha=0.13, linewidth=0)
-    marks = {"marker": "o", "markersize": 2.5} if len(curve.rollouts) < 25 else {}
-    axes.plot(curve.rollouts, band.estimate, color=colour, linewidth=1.8, label=curve.name, clip_on=False, **marks)
+        axes.fill_between(line.x, band.low, band.high, color=colour, alpha=0.13, linewidth=0)
+    marks = {"marker": "o", "markersize": 2.5} if len(line.x) < 25 else {}
+    axes.plot(line.x, band.estimate, color=colour, linewidth=1.8, label=line.name, clip_on=False, **marks)
 
 
-def _dress(axes: Axes, words: str, curves: Sequence[Curve]) -> None:
-    """Names, limits and a legend beside the panel, from the curve that ends highest to the one that ends lowest."""
+def _dress(axes: Axes, words: str, shown: Sequence[Line]) -> None:
+    """Names, limits and a legend beside the panel, from the line that ends highest to the one that ends lowest."""
     axes.set_title(words, **_FONT, loc="left")
-    axes.set_xlim(0, max(int(curve.rollouts[-1]) for curve in curves) or 1)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_ylabel(curves[0].score, **_FONT)
-    if curves[0].score == "success":
+    axes.set_xlim(0, max(int(line.x[-1]) for line in shown) or 1)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=6))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.set_ylabel(shown[0].score, **_FONT)
+    if shown[0].score == "success":
         axes.set_ylim(-0.03, 1.03)
-    longest = max(curves, key=lambda curve: curve.rollouts[-1])
-    axes.set_xlabel(f"real rollouts{_length(longest)}", **{**_FONT, "size": 9})
-    lines, names = axes.get_legend_handles_labels()
-    ends = [float(np.asarray(line.get_ydata())[-1]) for line in lines]  # pyright: ignore[reportAttributeAccessIssue]
+    handles, names = axes.get_legend_handles_labels()
+    ends = [float(np.asarray(line.get_ydata())[-1]) for line in handles]  # pyright: ignore[reportAttributeAccessIssue]
     order = np.argsort(ends, kind="stable")[::-1]
     axes.legend(
-        [lines[i] for i in order], [names[i] for i in order], loc="center left", bbox_to_anchor=(1.0, 0.5),
+        [handles[i] for i in order], [names[i] for i in order], loc="center left", bbox_to_anchor=(1.0, 0.5),
         frameon=False, fontsize=9, labelcolor=_INK, handlelength=1.4,
     )  # fmt: skip
 
 
-def _length(curve: Curve) -> str:
-    """How long a rollout is, in words; nothing where the curve does not know."""
-    if np.isnan(curve.minutes[-1]):
-        return ""
-    each = max(int(curve.rollouts[-1]), 1)
-    return f" of {int(curve.transitions[-1]) // each} transitions, {60 * float(curve.minutes[-1]) / each:.3g} s"
-
-
-def _note(curves: Sequence[Curve]) -> str:
+def _note(shown: Sequence[Line]) -> str:
     """What the lines and bands are."""
-    sizes = sorted({len(curve.seeds) for curve in curves})
+    sizes = sorted({line.seeds for line in shown})
     if sizes[-1] == 1:
         return "one seed"
     seeds = str(sizes[0]) if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}"
-    drawn = "priors, then seeds" if all(by_prior(curve) for curve in curves) else "seeds"
+    drawn = "priors, then seeds" if all(line.by_prior for line in shown) else "seeds"
     band = f"; band: 95 % bootstrap interval, drawing {drawn}" if sizes[-1] >= ENOUGH else ""
     return f"line: interquartile mean of {seeds} seeds{band}"
 

@@ -18,12 +18,17 @@ EVERY = ""  # data or simulator of a method that sees none
 
 
 class Outcome(NamedTuple):
-    """What one run scored in the real system. data, gap: names, or `EVERY`. scores: [seeds]."""
+    """What one run scored in the real system. data, gap: names, or `EVERY`. scores: [seeds], what tables show.
+
+    updates: [evaluations], curve: [seeds, evaluations] scores after so many, for figures.
+    """
 
     method: str
     data: str
     gap: str
     scores: np.ndarray
+    updates: np.ndarray = np.zeros(0)
+    curve: np.ndarray = np.zeros((0, 0))
 
 
 class Results(NamedTuple):
@@ -39,12 +44,17 @@ class Results(NamedTuple):
     methods: Sequence[str]
     outcomes: Sequence[Outcome]
 
-    def of(self, method: str, data: str, gap: str) -> np.ndarray | None:
-        """[seeds] scores in that cell; None where nothing has finished."""
+    def find(self, method: str, data: str, gap: str) -> Outcome | None:
+        """What stands in that cell; None where nothing has finished."""
         for own in self.outcomes:
             if own.method == method and own.data in (data, EVERY) and own.gap in (gap, EVERY):
-                return own.scores
+                return own
         return None
+
+    def of(self, method: str, data: str, gap: str) -> np.ndarray | None:
+        """[seeds] scores in that cell; None where nothing has finished."""
+        own = self.find(method, data, gap)
+        return None if own is None else own.scores
 
 
 def cells(results: Results) -> str:

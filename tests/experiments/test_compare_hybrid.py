@@ -39,6 +39,8 @@ def leave(args, scores):
     if scores:
         summary = {"task": "halfcheetah", "score": "return", "late": scores, "last": [-x for x in scores]}
         (folder / "summary.json").write_text(json.dumps(summary))
+        lines = [{"step": step, "score": scores} for step in (0, 1000)]
+        (folder / "eval.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
 @pytest.fixture
@@ -67,6 +69,9 @@ def test_each_method_runs_as_often_as_it_learns_from_other_things(grid, ran, cap
     assert "| replay | friction | 110 ± 8 | 110 ± 8 | 10 ± 8 | 10 ± 8 |" in said
     (table,) = (grid.out / "figures").glob("hybrid-halfcheetah-sim-late.md")
     assert table.read_text() in said
+    figures = {path.name for path in (grid.out / "figures").glob("*.png")}
+    assert figures == {"hybrid-halfcheetah-sim-medium.png", "hybrid-halfcheetah-sim-replay.png"}
+    assert "written: " + str(grid.out / "figures/hybrid-halfcheetah-sim-replay.png") in said
     # of 60 (mean over simulators) on D4RL's scale, -280 to 12,135: 2.7
     assert "| medium | 2.7 [2.7, 2.8] |" in said
     ran.clear()

@@ -4,11 +4,16 @@ import pytest
 from test_curves import curve
 
 from sgft_jax.analysis import figures
+from sgft_jax.analysis.hybrid import EVERY, Outcome, Results
 
 
 def curves(count, seeds=3):
     values = np.random.default_rng(0).uniform(0.2, 1.0, (count, seeds, 5))
     return [curve(x, np.arange(5), method=f"method-{i}") for i, x in enumerate(values)]
+
+
+def drawn(count, seeds=3):
+    return [figures._line(own) for own in curves(count, seeds)]
 
 
 def pixels(image, color):
@@ -31,16 +36,26 @@ def test_every_curve_has_a_colour_of_its_own(tmp_path, count):
 
 @pytest.mark.parametrize(("count", "sizes"), [(6, [6]), (7, [4, 3]), (13, [5, 4, 4])])
 def test_more_than_six_curves_become_small_multiples(count, sizes):
-    parts = figures._split("push", curves(count))
+    parts = figures._split("push", drawn(count))
     assert [len(own) for _, own, _ in parts] == sizes
     assert all(len(own) + len(others) == count or not others for _, own, others in parts)
-    assert len({curve.name for _, own, _ in parts for curve in own}) == count
+    assert len({line.name for _, own, _ in parts for line in own}) == count
     assert [words for words, *_ in parts][:1] == (["push"] if count == 6 else [f"push, 1 of {len(sizes)}"])
 
 
+def test_parts_of_a_panel_have_one_scale(tmp_path, monkeypatch):
+    """Seven returns, one of which is far above the others; a panel of its own has its own."""
+    seven = [curve([[10.0**i, 2.0 * 10**i]], (0, 1), method=f"m{i}", score="return") for i in range(7)]
+    figures_made, save = [], figures._save
+    monkeypatch.setattr(figures, "_save", lambda figure, path: figures_made.append(figure) or save(figure, path))
+    figures.learning_curves(tmp_path / "s.png", {"many": seven, "one": seven[:1]}, title="")
+    limits = [axes.get_ylim() for axes in figures_made[0].axes]
+    assert limits[0] == limits[1] and limits[0][1] >= 2e6 and limits[2][1] < 3
+
+
 def test_colours_are_distinct_in_a_panel_and_stay_from_panel_to_panel():
-    eight = curves(8)
-    colours = figures._colours(curve.name for curve in eight)
+    eight = drawn(8)
+    colours = figures._colours(line.name for line in eight)
     assert colours(eight[:3]) == list(figures.PALETTE[:3]) and colours(eight[1:2]) == [figures.PALETTE[1]]
     assert len(set(colours([eight[0], eight[6], eight[7]]))) == 3  # the seventh would have the first one's
 
@@ -52,9 +67,9 @@ def test_a_band_needs_three_seeds(tmp_path):
         for n in (1, 2)
     ]
     assert pixels(images[0], figures.PALETTE[0]) == pixels(images[1], figures.PALETTE[0])
-    assert figures._note(curves(1, seeds=1)) == "one seed"
-    assert figures._note(curves(1, seeds=2)) == "line: interquartile mean of 2 seeds"
-    assert "drawing seeds" in figures._note(curves(1, seeds=3))
+    assert figures._note(drawn(1, seeds=1)) == "one seed"
+    assert figures._note(drawn(1, seeds=2)) == "line: interquartile mean of 2 seeds"
+    assert "drawing seeds" in figures._note(drawn(1, seeds=3))
 
 
 def test_returns_are_drawn_too(tmp_path):
@@ -64,6 +79,33 @@ def test_returns_are_drawn_too(tmp_path):
 
 def test_a_run_without_a_real_rollout_is_drawn(tmp_path):
     assert figures.learning_curves(tmp_path / "z.png", {"": [curve([[0.5]], (0,))]}, title="").exists()
+
+
+def test_curves_over_updates(tmp_path, monkeypatch):
+    """A panel for each simulator; methods without one are in both, those that miss a run in none."""
+    updates, scores = np.array([0, 10_000, 20_000]), np.arange(9.0).reshape(3, 3)
+    places = [("h2oplus:released", "medium", "gravity"), ("iql", "medium", EVERY), ("sac", EVERY, "friction")]
+    found = [Outcome(*own, scores[:, -1], updates, scores + 5 * i) for i, own in enumerate(places)]
+    found.append(Outcome("iql", "replay", EVERY, scores[:, -1], updates, scores))
+    methods = [own.method for own in found[:3]]
+    results = Results("halfcheetah", "return", ("medium", "replay"), ("gravity", "friction"), methods, found)
+    seen, lines = {}, figures.lines
+
+    def draw(path, panels, labels, *, title):
+        seen.update(panels)
+        return lines(path, panels, labels, title=title)
+
+    monkeypatch.setattr(figures, "lines", draw)
+    image = read(figures.hybrid_curves(tmp_path / "h.png", results, "medium", title="Medium"))
+    assert [pixels(image, color) > 200 for color in figures.PALETTE[:4]] == [True] * 3 + [False]
+    names = {words: [line.name for line in own] for words, own in seen.items()}
+    assert names == {
+        "simulator: gravity": ["h2oplus:released", "iql"], "simulator: friction": ["iql", "sac"],
+    }  # fmt: skip
+    line = seen["simulator: friction"][1]
+    assert (line.family, line.seeds, line.x.tolist()) == ("simulator", 3, [0, 10_000, 20_000])
+    np.testing.assert_allclose(line.band.estimate, [13, 14, 15])  # of 10, 13, 16 and so on
+    assert (line.band.low < line.band.estimate).all()
 
 
 @pytest.mark.parametrize("n", [1, 200])
