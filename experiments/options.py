@@ -64,11 +64,12 @@ def prior_home(out: Path, task: str, preset: str) -> Path:
     return out / "pretrain" / task / preset
 
 
-def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str) -> list[Path]:
+def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str, option: str = "--prior") -> list[Path]:
     """Where priors are, in the order of their seeds; raises UserError if there is none.
 
     prior: a folder that is one, or that holds some as `seed-*`, `prior/seed-*`, `policy/seed-*` (what fine-tuning
     leaves, in the same form) or `*/prior/seed-*`; None looks in `prior_home`. task: as the user has typed it.
+    option: the one that names `prior`.
     """
     home = prior or prior_home(out, extend.name_of(task), preset)
     if (home / "prior.json").exists():
@@ -77,7 +78,7 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str) -> l
         card.parent for sub in ("", "prior/", "policy/", "*/prior/") for card in home.glob(f"{sub}seed-*/prior.json")
     ]
     if not found and prior:
-        raise UserError(f"--prior {prior}: {'holds no prior' if prior.is_dir() else 'no such folder'}")
+        raise UserError(f"{option} {prior}: {'holds no prior' if prior.is_dir() else 'no such folder'}")
     if not found and preset not in PRESETS:
         raise UserError(unknown("--preset", preset, PRESETS))
     if not found:

@@ -1,6 +1,7 @@
 from .api import ActingPolicy, Setup, evaluate_prior, finetuned_priors, load_policy, setup
 from .data import replay, sequences, sources
 from .finetuner import FinetuneState, Parts, assemble, sac_finetuner
+from .io.exported import save_exported
 from .io.priors import load_prior, save_prior
 from .learners.iql import IQLConfig, IQLHyper, IQLState, make_iql
 from .learners.sac import SACConfig, SACHyper, SACParams, SACState, extract_params, make_sac, state_from_prior
@@ -46,6 +47,6 @@ __all__ = [
     "all_methods", "assemble", "branch", "clip", "compose", "evaluate", "evaluate_prior", "extract_params",
     "finetune", "finetuned_priors", "get_method", "load_policy", "load_prior", "make_iql", "make_policy",
     "make_sac", "make_tdmpc2", "mpc_policy", "normalizer", "pretrain", "priors_of", "relabel", "replay",
-    "sac_finetuner", "sac_policy", "save_prior", "sequences", "setup", "shape", "shaped_reward", "shorten",
-    "simulate", "sources", "state_from_prior", "stateless", "tdmpc2_policy", "weigh",
+    "sac_finetuner", "sac_policy", "save_exported", "save_prior", "sequences", "setup", "shape", "shaped_reward",
+    "shorten", "simulate", "sources", "state_from_prior", "stateless", "tdmpc2_policy", "weigh",
 ]  # fmt: skip

@@ -18,6 +18,7 @@ COMMANDS = (
     "benchmark",
     "tasks",
     "diagnose",
+    "export",
 )
 MISTAKES = {
     "pretrain": "--config.gamma 2",
@@ -29,6 +30,7 @@ MISTAKES = {
     "tune": "--tasks hamer",
     "benchmark": "--worlds 0",
     "diagnose": "--rollouts 0",
+    "export": "--policy nowhere --to onnx",
 }
 LIGHT = ("sgft_jax", "sgft_jax.checks", "sgft_jax.models.config", "experiments.cli", "sgft_jax.presets")
 

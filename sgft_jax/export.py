@@ -1,0 +1,252 @@
+"""A policy as something to take away: one step as a graph of simple operators or as a JAX function, and its contract.
+
+A step takes what was measured and the state, and gives the action and the next state. Everything else that the policy
+needs is inside: previous actions, memory, observation statistics, what was identified of the system. Pure.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.base import Env
+from sgft_jax.io.priors import algorithm_of, digest
+from sgft_jax.models.config import NetworkConfig
+from sgft_jax.models.distortion import Distortion
+from sgft_jax.policies import make_policy, network_of
+from sgft_jax.types import Array, Prior, PyTree, UserError
+
+Format = Literal["onnx", "jax", "numpy"]
+MEASURED, ACTION, NEXT = "measured", "action", "next_"
+_PREVIOUS, _STEP = "previous_actions", "step"
+_SEED = 0  # of the random numbers of plans
+_MODE = "the mean action, without exploration: the same action for the same episode"
+_PLAN = "a plan at every step, without exploration; its random numbers are the same in every episode"
+
+
+class Slot(NamedTuple):
+    """A part of the state, which is zero at the start of an episode."""
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: str
+
+
+class Node(NamedTuple):
+    """One ONNX operator: what it is called, what it reads (inputs, constants or earlier outputs), what it writes.
+
+    `Concat` and `Gather` work along axis 0, `LayerNormalization` along the last one with epsilon 1e-6.
+    """
+
+    operator: str
+    inputs: tuple[str, ...]
+    output: str
+
+
+class Graph(NamedTuple):
+    """One step. inputs: `measured` and the state. constants: by name. outputs: `action`, and `next_` for each slot."""
+
+    inputs: tuple[Slot, ...]
+    constants: dict[str, np.ndarray]
+    nodes: tuple[Node, ...]
+    outputs: tuple[Slot, ...]
+
+
+# --- what is left over from step to step ------------------------------------------------------------------------------
+
+
+def slots_of(prior: Prior, env: Env) -> tuple[Slot, ...]:
+    """The state of a policy: previous actions, newest first; its memory; which step it is, if it plans."""
+    found = [Slot(_PREVIOUS, (env.previous_actions * env.act_dim,), "float32")] if env.previous_actions else []
+    carry = jax.tree.leaves(make_policy(prior.card, env).init_carry())
+    found += [Slot(_memory(i), leaf.shape, str(leaf.dtype)) for i, leaf in enumerate(carry)]
+    return (*found, Slot(_STEP, (), "int32")) if plans(prior.card) else tuple(found)
+
+
+def plans(card: Mapping[str, Any]) -> bool:
+    """Whether a policy searches for a plan at every step."""
+    return algorithm_of(card) == "tdmpc2" or bool(card.get("plan"))
+
+
+def _memory(i: int) -> str:
+    return f"memory_{i}"
+
+
+# --- as a JAX function ------------------------------------------------------------------------------------------------
+
+
+def stepping(prior: Prior, env: Env) -> Callable[[dict[str, Array]], dict[str, Array]]:
+    """One step of any policy, from its inputs by name to its outputs by name."""
+    policy = make_policy(prior.card, env)
+    structure = jax.tree.structure(policy.init_carry())
+
+    def step(inputs: dict[str, Array]) -> dict[str, Array]:
+        key, found = jax.random.key(_SEED), {}
+        if _STEP in inputs:
+            key = jax.random.fold_in(key, inputs[_STEP])
+            found[NEXT + _STEP] = inputs[_STEP] + 1
+        carry = jax.tree.unflatten(structure, [inputs[_memory(i)] for i in range(structure.num_leaves)])
+        previous = inputs.get(_PREVIOUS, jnp.zeros(0))
+        obs = jnp.concatenate([inputs[MEASURED], previous, jnp.zeros(len(env.system))])  # its own estimate counts
+        with jax.default_matmul_precision("highest"):
+            action, carry = policy.act(prior.params, carry, obs, key, explore=False)
+        if _PREVIOUS in inputs:
+            found[NEXT + _PREVIOUS] = jnp.concatenate([action, previous])[: previous.size]
+        memory = {NEXT + _memory(i): leaf for i, leaf in enumerate(jax.tree.leaves(carry))}
+        return {ACTION: action, **found, **memory}
+
+    return step
+
+
+# --- as a graph -------------------------------------------------------------------------------------------------------
+
+
+class _Writer:
+    """Collects constants and nodes. Called with an operator and its inputs, it returns the name of the output."""
+
+    def __init__(self) -> None:
+        self.constants: dict[str, np.ndarray] = {}
+        self.nodes: list[Node] = []
+
+    def __call__(self, operator: str, *inputs: Any, to: str | None = None) -> str:
+        names = tuple(x if isinstance(x, str) else self._constant(x) for x in inputs)
+        self.nodes.append(Node(operator, names, to or f"x{len(self.nodes)}"))
+        return self.nodes[-1].output
+
+    def _constant(self, value: Any) -> str:
+        array, name = np.asarray(value), f"c{len(self.constants)}"
+        self.constants[name] = array.astype(np.int64 if array.dtype.kind in "iu" else np.float32)
+        return name
+
+
+def graph_of(prior: Prior, env: Env) -> Graph:
+    """One step of a policy that acts by networks alone; raises UserError for one that plans."""
+    if plans(prior.card):
+        raise UserError(
+            "this policy plans at every step, which only --to jax can export; for numpy and onnx take a policy of a "
+            "method that does not plan, such as guarded"
+        )
+    params, write, slots = prior.params, _Writer(), slots_of(prior, env)
+    network, previous = network_of(prior.card), _PREVIOUS if env.previous_actions else None
+    obs = _observed(write, params, env, previous)
+    if algorithm_of(prior.card) == "recurrent":
+        hidden, handed = _remembered(write, params.actor["memory"], obs)
+        action = _action(write, params.actor["head"], handed, network, env.act_dim)
+        write("Identity", hidden, to=NEXT + _memory(0))
+        write("Identity", action, to=NEXT + _memory(1))
+    else:
+        actor = params.actor["body"] if prior.card.get("head") == "affine" else params.actor
+        action = _action(write, actor, obs, network, env.act_dim)
+    if (distortion := getattr(params, "distortion", None)) is not None:
+        action = _command(write, distortion, action)
+    write("Identity", action, to=ACTION)
+    if previous:
+        both = write("Concat", action, previous)
+        write("Gather", both, np.arange(env.previous_actions * env.act_dim), to=NEXT + previous)
+    given = Slot(MEASURED, (env.measured_dim,), "float32")
+    outputs = (Slot(ACTION, (env.act_dim,), "float32"), *(slot._replace(name=NEXT + slot.name) for slot in slots))
+    return Graph((given, *slots), write.constants, tuple(write.nodes), outputs)
+
+
+def _observed(write: _Writer, params: Any, env: Env, previous: str | None) -> str:
+    """What networks read: measurements, previous actions as they were meant, the system; normalised."""
+    parts: list[Any] = [MEASURED] + ([previous] if previous else [])
+    if (distortion := getattr(params, "distortion", None)) is not None:
+        parts[0] = write("Sub", MEASURED, distortion.offset)
+        if previous:
+            each, n = np.asarray(distortion.matrix), env.previous_actions
+            meant = write("MatMul", previous, np.kron(np.eye(n), each.T))
+            parts[1] = write("Add", meant, np.tile(np.asarray(distortion.bias), n))
+    if env.system:
+        parts.append(_told(params, env))
+    obs = write("Concat", *parts)
+    return write("Div", write("Sub", obs, params.normalizer.mean), params.normalizer.std)
+
+
+def _told(params: Any, env: Env) -> np.ndarray:
+    """What the policy is told of the system, [k]: what was identified, or the middle of every range."""
+    found = getattr(params, "system", None)
+    return np.zeros(len(env.system)) if found is None else np.asarray(found)
+
+
+def _action(write: _Writer, params: PyTree, x: str, network: NetworkConfig, act_dim: int) -> str:
+    """The mode of a tanh-Gaussian, or what a deterministic actor does."""
+    for i in range(len(network.hidden)):
+        x = _dense(write, params[f"Dense_{i}"], x)
+        if network.actor_layer_norm:
+            x = write("LayerNormalization", x, *(params[f"LayerNorm_{i}"][name] for name in ("scale", "bias")))
+        x = _ACTIVATIONS[network.activation](write, x)
+    outputs = _dense(write, params[f"Dense_{len(network.hidden)}"], x)
+    return write("Tanh", write("Gather", outputs, np.arange(act_dim)))
+
+
+_ACTIVATIONS: dict[str, Callable[[_Writer, str], str]] = {
+    "relu": lambda write, x: write("Relu", x),
+    "tanh": lambda write, x: write("Tanh", x),
+    "silu": lambda write, x: write("Mul", x, write("Sigmoid", x)),
+    "elu": lambda write, x: write("Elu", x),
+}
+
+
+def _dense(write: _Writer, params: PyTree, x: str) -> str:
+    return write("Add", write("MatMul", x, params["kernel"]), params["bias"])
+
+
+def _remembered(write: _Writer, params: PyTree, obs: str) -> tuple[str, str]:
+    """The next state of the GRU, and what it hands on; see `sgft_jax.models.gru`."""
+    units = params["recurrent"]["kernel"].shape[0]
+    third = lambda x, i: write("Gather", x, np.arange(i * units, (i + 1) * units))  # noqa: E731
+    seen = [write("Relu", _dense(write, params[name], x)) for name, x in (("action", _memory(1)), ("obs", obs))]
+    read = _dense(write, params["inputs"], write("Concat", *seen))
+    own = _dense(write, params["recurrent"], _memory(0))
+    reset, keep = (write("Sigmoid", write("Add", third(read, i), third(own, i))) for i in (0, 1))
+    new = write("Tanh", write("Add", third(read, 2), write("Mul", reset, third(own, 2))))
+    hidden = write("Add", new, write("Mul", keep, write("Sub", _memory(0), new)))
+    return hidden, write("Concat", hidden, write("Relu", _dense(write, params["shortcut"], obs)))
+
+
+def _command(write: _Writer, distortion: Distortion, action: str) -> str:
+    """As `Distortion.command`, with the inverse taken here."""
+    inverse = np.linalg.inv(np.asarray(distortion.matrix, np.float64))
+    exact = write("MatMul", write("Sub", action, distortion.bias), inverse.T)
+    return write("Clip", exact, -1.0, 1.0)
+
+
+# --- the contract -----------------------------------------------------------------------------------------------------
+
+
+def contract(prior: Prior, env: Env, to: Format) -> dict[str, Any]:
+    """What the caller and the policy promise each other, as JSON data; docs/export.md explains the keys."""
+    card, params = prior.card, prior.params
+    origin = {name: card[name] for name in ("preset", "finetuned", "hybrid") if name in card}
+    distortion = getattr(params, "distortion", None)
+    identified = None if distortion is None else {k: np.asarray(x) for k, x in distortion._asdict().items()}
+    told = [{**v._asdict(), "value": x} for v, x in zip(env.system, _told(params, env), strict=True)]
+    return {
+        "format": 1,
+        "to": to,
+        "task": env.name,
+        "policy": {"algorithm": algorithm_of(card), "digest": digest(prior), **origin},
+        "control_period_s": env.control_dt,
+        "episode_steps": env.episode_length,
+        "observation": _entries(env.measured),
+        "action": [{**entry, "low": -1.0, "high": 1.0} for entry in _entries(env.action)],
+        "action_is": _PLAN if plans(card) else _MODE,
+        "inside": {
+            "previous_actions": env.previous_actions,
+            "system": told,
+            "normalisation": {name: np.asarray(x) for name, x in params.normalizer._asdict().items()},
+            "identified": identified,
+        },
+        "state": slots_of(prior, env),
+    }
+
+
+def _entries(entries: tuple[Any, ...]) -> list[dict[str, Any]]:
+    """Names, units and places of the numbers of a vector."""
+    first = np.cumsum([0, *(e.size for e in entries)])
+    return [
+        {"name": e.name, "unit": e.unit, "first": int(i), "size": e.size} for e, i in zip(entries, first, strict=False)
+    ]
