@@ -115,7 +115,7 @@ def _as_onnx(prior: Prior, env: Env) -> dict[str, bytes]:
 
 def onnx_model(graph: Graph) -> bytes:
     """A graph as an ONNX model."""
-    from onnx import TensorProto, checker, helper, numpy_helper
+    from onnx import TensorProto, checker, helper, numpy_helper  # pyright: ignore[reportMissingImports] - an extra
 
     described = lambda slot: helper.make_tensor_value_info(slot.name, TensorProto.FLOAT, slot.shape)  # noqa: E731
     nodes = [

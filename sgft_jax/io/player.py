@@ -90,7 +90,7 @@ def _open_numpy(home: Path) -> Step:
 
 
 def _open_onnx(home: Path) -> Step:
-    import onnxruntime
+    import onnxruntime  # pyright: ignore[reportMissingImports] - an extra
 
     session = onnxruntime.InferenceSession(str(home / "policy.onnx"), providers=["CPUExecutionProvider"])
     outputs = [output.name for output in session.get_outputs()]
