@@ -10,7 +10,7 @@ NAME = "gymnasium:toy_gymnasium:Turned-v0"
 GAP = Gap("turned", {"mass": 2.0, "friction": 4.0}, {"action_rotation": 0.52})
 
 
-class Broken(Exception):
+class BrokenError(Exception):
     """Stands for whatever ends a process in the middle of an episode."""
 
 
@@ -32,7 +32,7 @@ class Turned(gymnasium.Wrapper):
         if Turned.breaks is not None:
             Turned.breaks -= 1
             if Turned.breaks < 0:
-                raise Broken
+                raise BrokenError
         return super().step(action)
 
 

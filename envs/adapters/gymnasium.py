@@ -1,7 +1,7 @@
 """Every task as a Gymnasium environment: one at a time, or many in one compiled program.
 
-Importing this module registers them, `sgft_jax/Push-v0` and so on. Gymnasium has had no registration by entry points
-since 1.0; the import is its own way, also inside a name: `gymnasium.make("envs.adapters.gymnasium:sgft_jax/Push-v0")`.
+Importing this module registers them, `sgft_jax/Push-v0` and so on. Gymnasium looks for no entry points of packages; the
+import is its own way, also inside a name: `gymnasium.make("envs.adapters.gymnasium:sgft_jax/Push-v0")`.
 """
 
 from collections.abc import Mapping

@@ -12,7 +12,7 @@ from priors_by_hand import save_prior
 pytest.importorskip("gymnasium", reason="make setup EXTRAS=dev, or pip install 'sgft-jax[gymnasium]'")
 
 import toy_gymnasium
-from toy_gymnasium import NAME, Broken, Turned
+from toy_gymnasium import NAME, BrokenError, Turned
 
 import envs
 from experiments import cli, diagnose, evaluate, finetune, real_systems
@@ -98,7 +98,7 @@ def test_what_was_played_before_a_break_is_never_played_again(priors, finished, 
     """A break in mid-episode costs that episode alone, and the run ends as if nothing had happened."""
     whole, seeds = finished
     Turned.breaks = steps
-    with pytest.raises(Broken):
+    with pytest.raises(BrokenError):
         run(priors, tmp_path)
     Turned.breaks = None
     folder = run(priors, tmp_path, "--resume")

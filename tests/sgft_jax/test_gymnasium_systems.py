@@ -219,6 +219,8 @@ def test_it_is_a_system_that_setup_takes():
     for state, metrics in finetune(*setup, rollouts=2):
         given = metrics.get("real/return", np.full(2, 2100.0))  # none before the first rollout
         assert given.tolist() == [2100.0, 2100.0] and int(state.rollouts) <= 2  # 10 + 20 + ... + 200
+    played = api.evaluate_prior(prior, env, Gymnasium(env, Spoken(), gamma=GAMMA), episodes=2)
+    assert played.total_reward.tolist() == [2100.0, 2100.0]
     tuned = api.finetuned_priors(setup, state, prior, best=False)[1]
     changed = jax.tree.map(lambda a, b: bool((a != b).any()), tuned.params.actor, params.actor)
     assert any(jax.tree.leaves(changed))
