@@ -147,7 +147,7 @@ class Transform(NamedTuple):
     update(state, batch, key) -> (state, metrics): learns from the batch as it was sampled.
     """
 
-    init: Callable[[Key], PyTree]
+    init: Callable[[PyTree, Key], PyTree]
     apply: Callable[[PyTree, Any, Batch, Key], Batch]
     update: Callable[[PyTree, Batch, Key], tuple[PyTree, Metrics]]
 
