@@ -122,7 +122,8 @@ class Record:
     def _real_steps(self) -> list[int]:
         """[S] all steps of the real system that are on disk, those of evaluations included."""
         stores = [self.real, *(RealStore(folder) for folder in sorted((self.folder / EVALUATION).glob("*")))]
-        return sum(store.load(i)["valid"].sum(1) for store in stores for i in range(len(store))).tolist()
+        each = [store.load(i)["valid"].sum(1) for store in stores for i in range(len(store))]
+        return np.sum(each, axis=0).tolist()
 
     def film(self, pool: World, play: Callable[[], Sequence[Episode]], rollouts: int) -> str:
         """An evaluation episode of the first seed before and after fine-tuning; says in one line how it went.

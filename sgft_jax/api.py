@@ -72,8 +72,9 @@ def setup(
         raise UserError(f"method {chosen.name} needs a prior of {chosen.prior}")
     finetuner = chosen.build(chosen.config(**options) if config is None else config, known[0] if known else None, env)
     numbers = range(seeds) if isinstance(seeds, int) else seeds
-    system, copies = real, 1
-    if not isinstance(real, System):
+    if isinstance(real, System):
+        system, copies = real, 1
+    else:
         found = [real] if isinstance(real, Gap) else list(real)
         gamma, copies = card_of(known[0] if known else None)["gamma"], len(found)
         system = _simulated_systems(env, found, len(numbers), gamma=gamma)

@@ -112,8 +112,8 @@ class TaskEnv(gymnasium.Env):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """A fresh start; without a seed the next one that the last seed leads to."""
         super().reset(seed=seed)
-        self._episode = self._begin(_seed(seed, self.np_random))
-        return np.array(self._episode.state.obs), {}
+        self._episode = start = self._begin(_seed(seed, self.np_random))
+        return np.array(start.state.obs), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One control step; action: [act_dim] in [-1, 1]."""
@@ -156,9 +156,9 @@ class TaskVectorEnv(VectorEnv):
             if own is not None:
                 self._generators[i] = seeding.np_random(own)[0]
         first = [_seed(own, generator) for own, generator in zip(seeds, self._generators, strict=True)]
-        self._episodes = self._begin(np.stack(first))
+        self._episodes = start = self._begin(np.stack(first))
         self._over = np.zeros(self.num_envs, bool)
-        return np.array(self._episodes.state.obs), {}
+        return np.array(start.state.obs), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control step everywhere; actions: [num_envs, act_dim] in [-1, 1]."""
@@ -193,8 +193,9 @@ def name_of(task: str) -> str:
 
 def register() -> None:
     """Makes all tasks known to `gymnasium.make` and `gymnasium.make_vec`."""
+    one, many = (f"{__name__}:{cls.__name__}" for cls in (TaskEnv, TaskVectorEnv))
     for task in envs.TASKS:
-        gymnasium.register(name_of(task), entry_point=TaskEnv, vector_entry_point=TaskVectorEnv, kwargs={"task": task})
+        gymnasium.register(name_of(task), entry_point=one, vector_entry_point=many, kwargs={"task": task})
 
 
 register()

@@ -242,7 +242,7 @@ class _Rows(NamedTuple):
             following[valid],
         )
         self.reward[valid, t], self.terminated[valid, t] = after.reward[valid], after.terminated[valid]
-        for i in np.flatnonzero(valid):
+        for i in np.flatnonzero(valid).tolist():
             told = [after.infos[i][name] for name in SUCCESS if name in after.infos[i]]
             self.success[i, t] = int(bool(told[0])) if told else -1
         return bad | after.terminated | after.truncated
@@ -285,9 +285,9 @@ class _Each:
         self.observation, self.action = first.observation_space, first.action_space
         if len({id(one) for one in each}) < len(each):
             raise UserError(f"{self.name}: the same environment is given twice; make one for each seed")
-        self._obs: list[Any] = []
+        self._obs: Sequence[Any] = []
 
-    def reset(self, seeds: list[int]) -> list[Any]:
+    def reset(self, seeds: list[int]) -> Sequence[Any]:
         self._obs = [one.reset(seed=seed)[0] for one, seed in zip(self.each, seeds, strict=True)]
         return self._obs
 
@@ -312,7 +312,8 @@ class _Vector:
     """A vector environment, in either way of beginning episodes anew by itself."""
 
     def __init__(self, real: "gymnasium.vector.VectorEnv") -> None:
-        self.real, self.count, self.name = real, real.num_envs, str(real.spec.id if real.spec else real)
+        self.real: Any = real  # Gymnasium's stub knows no list of seeds
+        self.count, self.name = real.num_envs, str(real.spec.id if real.spec else real)
         self.observation, self.action = real.single_observation_space, real.single_action_space
         mode = real.metadata.get("autoreset_mode")
         if getattr(mode, "name", None) not in ("NEXT_STEP", "SAME_STEP"):
@@ -348,9 +349,7 @@ def _nothing() -> None:
 
 def _info(infos: Mapping[str, Any], i: int) -> dict[str, Any]:
     """The `info` of environment i: a vector environment says beside every entry for which ones it is there."""
-    there = {
-        name: x for name, x in infos.items() if np.asarray(infos.get(f"_{name}", False)).any() and infos[f"_{name}"][i]
-    }
+    there = {name: x for name, x in infos.items() if f"_{name}" in infos and infos[f"_{name}"][i]}
     return {name: _info(x, i) if isinstance(x, Mapping) else x[i] for name, x in there.items()}
 
 
