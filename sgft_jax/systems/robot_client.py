@@ -58,7 +58,7 @@ _SHAPES: dict[str, dict[str, Any]] = {  # what each message holds; a tuple names
 def pack(kind: str, **fields: Any) -> bytes:
     """A message: a checksum, then a msgpack map. Arrays become little-endian float32."""
     fields = {name: _plain(x) for name, x in fields.items()}
-    body = msgpack.packb({"type": kind, **fields})
+    body = _encoded({"type": kind, **fields})
     return zlib.crc32(body).to_bytes(4, "little") + body
 
 
@@ -92,6 +92,10 @@ def array(data: bytes, size: int, what: str) -> np.ndarray:
     if not np.isfinite(values).all():
         raise ValueError(f"{what} holds a number that is not finite")
     return values
+
+
+def _encoded(fields: dict[str, Any]) -> bytes:
+    return bytes(msgpack.packb(fields) or b"")
 
 
 def _plain(value: Any) -> Any:
@@ -200,7 +204,7 @@ class _Log:
 
     def write(self, **fields: Any) -> None:
         if self._file is not None:
-            self._file.write(msgpack.packb({name: _plain(x) for name, x in fields.items()}))
+            self._file.write(_encoded({name: _plain(x) for name, x in fields.items()}))
             self._file.flush()
             os.fsync(self._file.fileno())
 
