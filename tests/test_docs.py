@@ -133,6 +133,7 @@ def test_the_gap_on_the_page_about_extending_loads(tmp_path):
     assert gap.effects == {**written["effects"], "latency": 0.08, "action_scale": [1.2, 0.9]}
 
 
+@pytest.mark.slow  # `make docs` does the same
 def test_the_site_builds_without_a_warning(tmp_path):
     """Dead links, dead anchors and pages that nobody can reach end the build."""
     pytest.importorskip("material", reason="make setup EXTRAS=dev,docs")

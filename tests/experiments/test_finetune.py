@@ -233,6 +233,7 @@ def test_a_planner_leaves_priors_that_plan(home, tmp_path):
     assert not load_prior(tmp_path / "finetune/toy/turned/sac/seeds-0-1/policy/seed-0").card["plan"]
 
 
+@pytest.mark.slow
 def test_without_a_prior(home, tmp_path):
     """The networks are RLPD's; what is left acts, and says what it is of."""
     finetune.main([*argv(home, "sac", "--rollouts", "2", seeds=1, out=tmp_path), "--prior", "none"])
@@ -530,6 +531,7 @@ def test_simulated_data_are_those_of_the_simulator_that_the_prior_comes_from(tmp
     np.testing.assert_allclose(rows.next_obs[:, 2:] - rows.obs[:, 2:], gained, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_real_systems_together_are_what_each_is_alone(home, tmp_path, capsys):
     both = [tmp_path / f"finetune/toy/{real}/sac/seeds-0-1" for real in ("heavy", "turned")]
     alone = run(home, "sac")

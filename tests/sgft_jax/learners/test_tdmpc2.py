@@ -97,7 +97,7 @@ def test_latents_are_groups_that_sum_to_one(key):
     assert not jnp.allclose(z, ahead)
 
 
-@pytest.mark.parametrize("name", tdmpc2_model.SIZES)
+@pytest.mark.parametrize("name", [name for name in tdmpc2_model.SIZES if name.endswith("M")])  # tests add others
 def test_published_sizes(name):
     """Parameters of a walker (24 observations, 6 actions) without the target critic, in millions."""
     config = tdmpc2.TDMPC2Config(24, 6, size=tdmpc2_model.SIZES[name])
