@@ -99,7 +99,7 @@ def test_the_transform_by_hand(key):
     bend = extend.load("method", METHOD, "bend").bend(2.0)
     zero = jnp.zeros(3)
     batch = Batch(zero, zero, jnp.array([0.01, -100.0, 2.0]), zero, zero)
-    bent = bend.apply(bend.init(key), None, batch, key)
+    bent = bend.apply(bend.init(None, key), None, batch, key)
     np.testing.assert_allclose(bent.reward, [0.01, -2.0, 2 * np.tanh(1.0)], rtol=1e-4)  # tanh(1) = 0.76
 
 
