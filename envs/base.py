@@ -178,7 +178,8 @@ class Env(NamedTuple):
         effects drawn as by `reset`, at rest where observations do not say how fast things move. None where nobody wrote
         it: then the simulator cannot be asked about recorded steps.
     reward, terminated: functions of (obs, action, next_obs), so true of imagined transitions too; success: function of
-        one observation. None where observations do not tell: then only `EnvState` knows.
+        one observation. None where observations do not tell: then only `EnvState` knows. A `reward` may approximate
+        what `EnvState` measures; the task's page says how well.
     success_anytime: whether success counts at any step or only at the last.
     score: what a run is judged by, "success" or "return".
     training: the simulator's own effects, by name: values or ranges, as in a gap.

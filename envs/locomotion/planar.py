@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -206,6 +207,43 @@ def run(
     """
     control = after.ctrl * torque(params)
     return Measured(reward=progress(before, after, dt=dt) + bonus - cost * jnp.sum(control**2))
+
+
+# --- the reward as observations tell it -------------------------------------------------------------------------------
+
+
+def seen_progress(
+    obs: Array, next_obs: Array, *, dt: float, late: float, lead: Callable[[Array], Array] = lambda pose: jnp.zeros(())
+) -> Array:
+    """`progress` [] m/s as observations before and after a step of `dt` s tell it, nearly.
+
+    The way of some point of the runner is dt times a mean of its speeds before and after; what that point has gained on
+    the root is seen. late: share of the speed after the step in that mean. lead(pose [7] of pitch and joints) -> [] m:
+    how far ahead of the root the point is; default the root itself.
+    """
+
+    def moving(obs: Array) -> tuple[Array, Array]:
+        ahead, drift = jax.jvp(lead, (obs[1 : NV - 1],), (obs[NV + 1 :],))
+        return ahead, obs[NV - 1] + drift
+
+    (ahead, speed), (ahead_after, speed_after) = moving(obs), moving(next_obs)
+    return (1 - late) * speed + late * speed_after - (ahead_after - ahead) / dt
+
+
+def seen_reward(
+    progress: Callable[[Array, Array], Array],
+    obs: Array,
+    action: Array,
+    next_obs: Array,
+    *,
+    bonus: float,
+    cost: float,
+) -> Array:
+    """What `run` measures [], nearly, of a transition that nobody measures, such as an imagined one.
+
+    progress: see `seen_progress`. The motors are nominal and get the action as it is.
+    """
+    return progress(obs, next_obs) + bonus - cost * jnp.sum(jnp.clip(action, -1.0, 1.0) ** 2)
 
 
 scene = functools.partial(

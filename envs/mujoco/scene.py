@@ -58,6 +58,7 @@ class Scene(NamedTuple):
     observe(params, state) -> [obs_dim] without measurement error, or a dict of vectors by entry name.
     reward, terminated, success, success_anytime, score, training, actuators, cartesian, check: see `Env`.
     measured(params, before, action, after) -> Measured: where reward, end or success are no functions of observations.
+        `reward` may then approximate it; what is measured is what counts.
     event(params, state) -> state: what happens between control steps (a fallen object stays down); default nothing.
     max_speed: m/s or rad/s, ten times what any joint or object reaches: beyond it the physics has exploded.
     engine: one of its own in place of MJX's JAX code, for scenes whose motion someone wrote down.
@@ -194,6 +195,8 @@ def _outcome(
         function, value = getattr(scene, name), getattr(measured, name)
         if function is None:
             return jnp.asarray(default if value is None else value)
+        if value is not None and name == "reward":
+            return value  # its function is an approximation, for transitions that nobody measures
         if value is not None:
             raise UserError(f"scene {scene.name} measures '{name}': then its function of observations must be None")
         return function(*given)

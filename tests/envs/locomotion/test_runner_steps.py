@@ -2,13 +2,14 @@
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
-from runners import TASKS, at_rest, begun, member, play, pool_of, thrown
+from runners import TASKS, at_rest, begun, compiled, member, play, pool_of, thrown
 
 import envs
 from envs import gaps
-from envs.locomotion import walker2d
+from envs.locomotion import halfcheetah, walker2d
 
 KEY = jax.random.key(0)
 
@@ -36,6 +37,39 @@ def test_the_reward_is_speed_and_bonus_less_control(task):
     params = jnp.ones(len(scene.parameters))
     wanted = {"halfcheetah": 0.3 - 0.129, "walker2d": 1.875 + 1.0 - 0.00129}[task]  # 0.015 / 0.05, 0.015 / 0.008
     np.testing.assert_allclose(scene.measured(params, before, None, after).reward, wanted, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("task", "way"), [("halfcheetah", 1.0 * 0.4 + 2.0 * 0.6), ("walker2d", 1.5)])
+def test_the_reward_of_what_is_seen_by_hand(task, way):
+    """From 1 to 2 m/s in one posture. Of five steps of Euler's each moves by its last speed: 1.2, ..., 2.0, on average
+    1.6. Controls of 0.5 and 2, the latter cut to 1: squares of 1.25. Other postures and speeds of joints: see below."""
+    cost, bonus = {"halfcheetah": (0.1, 0.0), "walker2d": (0.001, 1.0)}[task]
+    obs = jnp.zeros(17).at[1:8].set(0.3)
+    action = jnp.array([0.5, 0, 0, 0, 0, -2.0])
+    found = envs.make(task, "c").reward(obs.at[8].set(1.0), action, obs.at[8].set(2.0))
+    np.testing.assert_allclose(found, way + bonus - cost * 1.25, rtol=1e-5)
+
+
+def test_the_centre_of_mass_leads_the_root_as_mujoco_says():
+    model = compiled("halfcheetah")
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    for pose in rng.uniform(-1, 1, (4, 7)):
+        data.qpos[:] = [0.7, 0.2, *pose]
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(
+            halfcheetah.lead(jnp.asarray(pose, jnp.float32)), data.subtree_com[0, 0] - 0.7, atol=1e-5
+        )
+
+
+@pytest.mark.parametrize(("task", "least", "error"), [("halfcheetah", 0.99, 0.1), ("walker2d", 0.99, 0.06)])
+def test_the_reward_of_what_is_seen_is_nearly_what_is_measured(task, least, error):
+    """Their correlation, and the root mean square of what is between them, m/s, in a motion of the nominal runner."""
+    env = envs.make(task, "c")
+    states, actions = thrown(env, pool_of(env, [gaps.SIM]), 200)
+    alive = ~states.terminated[:-1, 0].astype(bool)
+    seen = jax.jit(jax.vmap(env.reward))(states.true_obs[:-1, 0], actions[:, 0], states.true_obs[1:, 0])
+    seen, measured = (np.asarray(x)[alive] for x in (seen, states.reward[1:, 0]))
+    assert np.corrcoef(seen, measured)[0, 1] > least and np.sqrt(np.mean((seen - measured) ** 2)) < error
 
 
 def test_stronger_thighs_cost_as_much_as_their_control():
