@@ -42,6 +42,18 @@ class Box(NamedTuple):
         return self.low.dtype
 
 
+class _Link(NamedTuple):
+    """A connection that was admitted, and the answers that came through it; the last one is `_GONE`."""
+
+    connection: ServerConnection
+    inbox: queue.SimpleQueue[Mapping[str, Any]]
+
+    def send(self, message: bytes) -> None:
+        """Sends; that a connection is closed is said by the thread that reads it."""
+        with contextlib.suppress(ConnectionClosed):
+            self.connection.send(message)
+
+
 class Remote:
     """One robot, at whatever computer, in the manner of a Gymnasium environment; waits for it as long as it takes.
 
@@ -61,12 +73,11 @@ class Remote:
     ) -> None:  # fmt: skip
         self.obs_size, self.action_size, self.token = obs_size, action_size, token or secrets.token_hex(16)
         self._again, self._say = again, say
-        self._lock, self._inbox = threading.Lock(), queue.SimpleQueue[Mapping[str, Any]]()
-        self._connection: ServerConnection | None = None
-        self._there = threading.Event()
+        self._lock, self._there = threading.Lock(), threading.Event()
+        self._link: _Link | None = None  # to the robot that is connected now
+        self._played: _Link | None = None  # to the one that began the episode: no other knows its steps
         self._episode, self._step = 0, 0
         self._obs = np.zeros(obs_size, np.float32)
-        self.period: float | None = None
         self.observation_space = Box(*(x * np.full(obs_size, np.inf, np.float32) for x in (-1, 1)))
         self.action_space = Box(*(x * np.ones(action_size, np.float32) for x in (-1, 1)))
         self.spec, self.unwrapped = None, self
@@ -83,7 +94,7 @@ class Remote:
     def reset(self, *, seed: int) -> tuple[np.ndarray, dict[str, Any]]:
         """Has the robot begin an episode; returns what it measures, [obs_size], and nothing else."""
         while True:
-            self._wait()
+            self._played = self._wait()
             self._episode, self._step = self._episode + 1, 0
             said = self._ask(pack("reset", episode=self._episode, seed=seed), "began")
             if said is not None:
@@ -98,48 +109,48 @@ class Remote:
         self._step += 1
         self._obs = said["obs"]
         reward = float("nan") if said["reward"] is None else said["reward"]
-        known = {} if said["success"] is None else {"is_success": said["success"]}
-        return (
-            self._obs,
-            reward,
-            said["terminated"],
-            said["truncated"],
-            {"sent": said["sent"], "late": said["late"], **known},
-        )
+        info = {"sent": said["sent"], "late": said["late"]}
+        if said["success"] is not None:
+            info["is_success"] = said["success"]
+        return self._obs, reward, said["terminated"], said["truncated"], info
 
     def rest(self) -> None:
         """Stops the robot until the next episode."""
-        self._send(pack("rest", episode=self._episode))
+        if self._played is not None:
+            self._played.send(pack("rest", episode=self._episode))
 
     def __str__(self) -> str:
         return f"robot at {self.url}"
 
     def close(self) -> None:
         """Ends the run on both sides."""
-        self._send(pack("end"))
+        if (link := self._link) is not None:
+            link.send(pack("end"))
         self._server.shutdown()
         self._thread.join()
 
     # ------------------------------------------------------------ asking
 
-    def _wait(self) -> None:
-        """Until a robot is connected."""
-        if not self._there.is_set():
+    def _wait(self) -> _Link:
+        """The link to a robot, once there is one."""
+        while not self._there.is_set() or (link := self._link) is None:
             self._say(f"waiting for a robot at {self.url}, token {self.token}")
             self._there.wait()
+        return link
 
     def _ask(self, message: bytes, answer: str) -> Mapping[str, Any] | None:
         """The answer to a message of this episode and step; None if the robot is gone or has failed."""
-        self._send(message)
+        assert self._played is not None, "call reset first"
+        link = self._played
+        link.send(message)
         while True:
             try:
-                said = self._inbox.get(timeout=self._again)
+                said = link.inbox.get(timeout=self._again)
             except queue.Empty:
-                if not self._there.is_set():
-                    return None
-                self._send(message)
+                link.send(message)
                 continue
-            if said["type"] == "gone":
+            if said is _GONE:
+                link.inbox.put(_GONE)  # it stays the last one
                 self._say(f"the robot is gone in episode {self._episode} before the outcome of step {self._step}")
                 return None
             if said["episode"] != self._episode:
@@ -159,25 +170,19 @@ class Remote:
         sizes = {"obs": self.obs_size, "sent": self.action_size}
         return {**said, **{name: array(said[name], n, name) for name, n in sizes.items() if name in said}}
 
-    def _send(self, message: bytes) -> None:
-        connection = self._connection
-        if connection is not None:
-            with contextlib.suppress(ConnectionClosed):  # the thread that reads says so
-                connection.send(message)
-
     # ------------------------------------------------------------ the server's threads
 
     def _serve(self, connection: ServerConnection) -> None:
         """One connection, from its first message to its end."""
-        reason = self._admit(connection)
+        link = _Link(connection, queue.SimpleQueue())
+        reason = self._admit(link)
         if reason is not None:
             self._say(f"refused a connection: {reason}")
-            with contextlib.suppress(ConnectionClosed):
-                connection.send(pack("refused", reason=reason[:500]))
+            link.send(pack("refused", reason=reason[:500]))
             return
-        connection.send(pack("welcome"))
-        self._there.set()
         try:
+            link.send(pack("welcome"))
+            self._there.set()
             for data in connection:
                 try:
                     message = unpack(data)
@@ -185,19 +190,19 @@ class Remote:
                     self._say(f"ignored: a message of the robot {error}")
                     continue
                 if message["type"] in ("began", "moved", "failed"):
-                    self._inbox.put(message)
+                    link.inbox.put(message)
         except ConnectionClosed:
             pass
         finally:
-            self._there.clear()
-            self._inbox.put(_GONE)
+            link.inbox.put(_GONE)
             with self._lock:
-                self._connection = None
+                self._there.clear()
+                self._link = None
 
-    def _admit(self, connection: ServerConnection) -> str | None:
+    def _admit(self, link: _Link) -> str | None:
         """Takes a robot that fits as the one robot; else says why not."""
         try:
-            said = unpack(connection.recv(timeout=_HELLO))
+            said = unpack(link.connection.recv(timeout=_HELLO))
         except (ValueError, TimeoutError) as error:
             return f"its first message {error or 'did not come'}"
         if said["type"] != "hello":
@@ -212,9 +217,7 @@ class Remote:
             if own != theirs:
                 return f"{said['robot']}: {name}: the robot has {theirs}, the learner {own}"
         with self._lock:
-            if self._connection is not None:
+            if self._link is not None:
                 return f"{said['robot']}: another robot is connected"
-            while not self._inbox.empty():
-                self._inbox.get_nowait()
-            self._connection, self.period = connection, said["period"]
+            self._link = link
         return None

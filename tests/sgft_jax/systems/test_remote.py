@@ -15,7 +15,7 @@ import pytest
 from websockets.sync.client import connect
 
 from sgft_jax.systems import robot_client
-from sgft_jax.systems.remote import Remote
+from sgft_jax.systems.remote import Remote, _Link
 from sgft_jax.systems.robot_client import Limits, RefusedError, array, pack, play, unpack
 from sgft_jax.types import UserError
 
@@ -154,8 +154,8 @@ def test_lost_doubled_and_damaged_messages_move_nothing_twice(pair, driver, monk
     options = {"period": 0.01, "answer_within": 0.009, "patience": 10**6} if driver is Arm else {}
     own = pair(driver(), again=0.02, **options)
     assert real is pack
-    send = own.remote._send
-    own.remote._send = lambda message: rng.random() < 0.25 or send(message)
+    send = _Link.send
+    monkeypatch.setattr(_Link, "send", lambda link, message: rng.random() < 0.25 or send(link, message))
     seen = []
     for episode in range(3):
         at = begin(own, episode)
@@ -167,7 +167,7 @@ def test_lost_doubled_and_damaged_messages_move_nothing_twice(pair, driver, monk
             seen.append(moved.info["sent"][0])
     if driver is Point:  # by the clock more steps may follow the last one that was asked for
         assert len(own.driver.moves) == 60 and own.driver.resets == [0, 1, 2]
-    own.remote._send = send
+    monkeypatch.setattr(_Link, "send", send)
     assert len(seen) == 60
 
 
@@ -225,6 +225,19 @@ def test_a_robot_that_dies_leaves_one_step_in_doubt(pair):
     again.start()
     np.testing.assert_array_equal(begin(own, 5), [0, 0])
     assert driver.resets == [5] and driver.stops
+
+
+def test_a_connection_lost_between_steps_ends_the_episode_though_the_robot_is_back(pair):
+    own = pair(Point(), again=0.05)
+    begin(own, 0)
+    move(own, RIGHT)
+    first = own.remote._link
+    first.connection.close()
+    while own.remote._link in (None, first):
+        time.sleep(0.01)
+    assert move(own, RIGHT).info["invalid"] and len(own.driver.moves) == 1
+    np.testing.assert_array_equal(begin(own, 1), [0, 0])
+    assert move(own, RIGHT).obs[0] == 1
 
 
 def hello(remote, **changes):
