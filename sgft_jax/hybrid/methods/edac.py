@@ -2,26 +2,16 @@
 
 from dataclasses import dataclass
 
-from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import OfflineOptions, agent_of, sac_numbers
+from sgft_jax.hybrid.methods.options import EnsembleOptions, OfflineOptions, agent_of, sac_numbers
 from sgft_jax.types import HybridAgent, HybridMethod, Task
 
 
 @dataclass(frozen=True)
-class Config(OfflineOptions):
-    """Options of `edac`."""
+class Config(OfflineOptions, EnsembleOptions):
+    """Options of `edac`; with diversity 0 it is SAC-N."""
 
     hidden: tuple[int, ...] = (256, 256, 256)
     """Widths of the hidden layers of actor and critics."""
-    critics: int = 10
-    """Critics; targets and actor take the minimum of all."""
-    diversity: float = 1.0
-    """Weight of what keeps the critics' gradients apart; 0 = SAC-N."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.at_least(self, 2, "critics")
-        checks.not_negative(self, "diversity")
 
 
 def build(config: Config, task: Task) -> HybridAgent:

@@ -2,24 +2,14 @@
 
 from dataclasses import dataclass
 
-from sgft_jax import checks
 from sgft_jax.hybrid.methods import h2oplus
+from sgft_jax.hybrid.methods.options import EnsembleOptions
 from sgft_jax.types import HybridAgent, HybridMethod, Task
 
 
 @dataclass(frozen=True)
-class Config(h2oplus.Config):
-    """Options of `h2oplus-edac`: those of `h2oplus`, and its ensemble's."""
-
-    critics: int = 10
-    """Critics; value, targets and actor take the minimum of all."""
-    diversity: float = 1.0
-    """Weight of what keeps the critics' gradients at real pairs apart. With 2 critics and 0 it is `h2oplus`."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.at_least(self, 2, "critics")
-        checks.not_negative(self, "diversity")
+class Config(h2oplus.Config, EnsembleOptions):
+    """Options of `h2oplus-edac`; with 2 critics and diversity 0 it is `h2oplus`."""
 
 
 def build(config: Config, task: Task) -> HybridAgent:

@@ -59,6 +59,21 @@ class HybridOptions(ActorCriticOptions):
         checks.at_least(self, 1, "rows", "ratio_rows")
 
 
+@dataclass(frozen=True)
+class EnsembleOptions(ActorCriticOptions):
+    """Options of methods whose many critics must not agree on how to leave the data, as in EDAC."""
+
+    critics: int = 10
+    """Critics; whatever reads values takes the minimum of all."""
+    diversity: float = 1.0
+    """Weight of what keeps the critics' gradients at the data's actions apart; 0 leaves it out."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.at_least(self, 2, "critics")
+        checks.not_negative(self, "diversity")
+
+
 def numbers_of[Hyper](kind: type[Hyper], config: ActorCriticOptions, *networks: str) -> Hyper:
     """The numbers of a learner: the rates of these networks are `lr`, others are the options of the same name."""
     rates = {f"lr_{name}": config.lr for name in networks}
