@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from sgft_jax.analysis.curves import Curve
     from sgft_jax.analysis.scoreboard import Row
 
+    Played = dict[str, dict[str, dict[str, Curve]]]  # by METHOD or METHOD:VARIANT, stratum and "task/gap"
+
 CONTROL = "no gap"
 _HEAD = (
     "stratum", "method", "gaps", "start", "area", "end", "90 % held", "deepest fall", "loss at the end", "training",
@@ -46,23 +48,22 @@ class ScoreboardArgs:
 
 def main(args: ScoreboardArgs) -> None:
     """Prints the tables, writes them, and draws every method on the gaps of each stratum."""
-    text = board(args)
+    played = played_on(args)
+    text = _tables(args, played)
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / "scoreboard.md").write_text(text + "\n")
-    picture = draw(args)
+    picture = _draw(args, played)
     print(f"{text}\n\nwritten: {args.out / 'scoreboard.md'}, {picture}")
 
 
 def board(args: ScoreboardArgs) -> str:
     """The tables; raises UserError where nobody ran on these gaps, or the reference did not."""
+    return _tables(args, played_on(args))
+
+
+def _tables(args: ScoreboardArgs, played: "Played") -> str:
     from sgft_jax.analysis import scoreboard, tables
 
-    strata = strata_of(args.gaps)
-    played = runs_on(args, strata)
-    if not played:
-        raise UserError(f"{args.data or args.out / 'finetune'}: holds no evaluated run on these gaps")
-    if args.reference not in played:
-        raise UserError(f"--reference {args.reference}: did not run on these gaps; there are: {', '.join(played)}")
     rows = [
         scoreboard.row(method, stratum, each[stratum])
         for stratum in (CONTROL, *STRATA)
@@ -79,11 +80,10 @@ def board(args: ScoreboardArgs) -> str:
     return "\n".join(said).rstrip()
 
 
-def draw(args: ScoreboardArgs) -> Path:
+def _draw(args: ScoreboardArgs, played: "Played") -> Path:
     """The picture of those methods that ran on all gaps of a stratum that the reference ran on: a panel a stratum."""
     from sgft_jax.analysis import figures, scoreboard
 
-    played = runs_on(args, strata_of(args.gaps))
     reference = played[args.reference]
     panels = {
         f"{stratum}, {len(own)} {'tasks' if stratum == CONTROL else 'gaps'}": [
@@ -106,12 +106,21 @@ def strata_of(files: tuple[Path, ...]) -> dict[str, str]:
     return found
 
 
-def runs_on(args: ScoreboardArgs, strata: Mapping[str, str]) -> "dict[str, dict[str, dict[str, Curve]]]":
-    """By METHOD or METHOD:VARIANT and stratum, the curves by "task/gap"."""
+def played_on(args: ScoreboardArgs) -> "Played":
+    """Everything that ran on these gaps; raises UserError where nobody did, or the reference did not."""
+    played = _runs_on(args, strata_of(args.gaps))
+    if not played:
+        raise UserError(f"{args.data or args.out / 'finetune'}: holds no evaluated run on these gaps")
+    if args.reference not in played:
+        raise UserError(f"--reference {args.reference}: did not run on these gaps; there are: {', '.join(played)}")
+    return played
+
+
+def _runs_on(args: ScoreboardArgs, strata: Mapping[str, str]) -> "Played":
     from sgft_jax.analysis.curves import read_data, read_runs
     from sgft_jax.analysis.tables import spec
 
-    found: dict[str, dict[str, dict[str, Curve]]] = {}
+    found: Played = {}
     for curve in (read_data(args.data) if args.data else read_runs(args.out)).curves:
         if curve.gap in strata and all(
             not wanted or own in wanted for own, wanted in ((curve.task, args.tasks), (curve.priors, args.priors))
