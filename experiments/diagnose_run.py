@@ -45,14 +45,15 @@ def diagnose(
     home = args.out / "diagnose" / env.name
     if recorded is None:
         count, name = args.rollouts or PLAYED, title(args.real)
-        where = "" if is_gymnasium(args.real) else "the gap "
         if is_gymnasium(args.real):
+            where = name
             real = _play_real(env, args.real, priors, count, args.seed, RealStore(home / name))
             simulated = play_simulated(env, priors, args.seed)
         else:
+            where = f"the gap {name}"
             real, simulated = _play_both(env, gaps.load(env, args.real), priors, count, args.seed)
         which = list(range(len(priors)))
-        what = f"{_rollouts(count)} of {_priors(len(priors))}, just played zero-shot on {where}{name}"
+        what = f"{_rollouts(count)} of {_priors(len(priors))}, just played zero-shot on {where}"
     else:
         real, which = read(recorded, env, priors, args.rollouts)
         simulated = play_simulated(env, priors, args.seed)

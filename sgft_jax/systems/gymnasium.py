@@ -48,7 +48,8 @@ class Gymnasium:
         self.env, self.gamma = env, gamma
         self._real = _played(real)
         self._observe = observe or _reader(env.measured, self._real)
-        self._low, self._high = _bounds(env, self._real)
+        low, high = _bounds(env, self._real)
+        self._middle, self._half = (low + high) / 2, (high - low) / 2  # what an action of 0 is, and one of 1 beyond it
         self._draw = jax.jit(jax.vmap(self._drawn))
         self._programs: dict[Callable[..., Any], Callable[..., tuple[Array, PyTree]]] = {}
         self._judge = None
@@ -118,13 +119,13 @@ class Gymnasium:
 
     def _commanded(self, action: np.ndarray) -> np.ndarray:
         """[M, act_dim] from [-1, 1] to the bounds of the action space."""
-        return (self._low + self._high) / 2 + action * ((self._high - self._low) / 2)
+        return self._middle + action * self._half
 
     def _sent(self, action: np.ndarray, infos: "Sequence[Mapping[str, Any]]") -> np.ndarray:
         """[M, act_dim] in [-1, 1], what was really commanded, as far as `infos` tell."""
-        middle, half = (self._low + self._high) / 2, (self._high - self._low) / 2
         told = [
-            (info["sent"] - middle) / half if "sent" in info else own for own, info in zip(action, infos, strict=True)
+            (info["sent"] - self._middle) / self._half if "sent" in info else own
+            for own, info in zip(action, infos, strict=True)
         ]
         return np.stack(told).astype(np.float32)
 

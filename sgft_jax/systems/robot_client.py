@@ -95,7 +95,7 @@ def array(data: bytes, size: int, what: str) -> np.ndarray:
 
 
 def _encoded(fields: dict[str, Any]) -> bytes:
-    return bytes(msgpack.packb(fields) or b"")
+    return msgpack.packb(fields) or b""  # of None, which it never is, only its types speak
 
 
 def _plain(value: Any) -> Any:
