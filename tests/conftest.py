@@ -1,6 +1,7 @@
 """CPU, MJX, two host devices, strict promotion: set before JAX starts."""
 
 import os
+from pathlib import Path
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("MUJOCO_GL", "disable")
@@ -27,6 +28,15 @@ def _strict_ranks():
     """Broadcasting [B] against [B, 1] is the classic silent bug of reinforcement learning."""
     with jax.numpy_rank_promotion("raise"):
         yield
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_programs():
+    """Compiled programs stay mapped into memory. Linux allows a process 65,530 mappings; beyond them XLA crashes."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_bytes().splitlines()) > 20_000:
+        jax.clear_caches()
 
 
 @pytest.fixture
