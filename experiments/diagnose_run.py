@@ -17,7 +17,7 @@ from experiments import stacking
 from experiments.cli import columns
 from experiments.diagnose import DiagnoseArgs, config_of
 from experiments.gaps_run import systems
-from experiments.real_systems import connect, is_gymnasium, title
+from experiments.real_systems import connect, is_robot, is_stepped, title
 from experiments.recorded import Recorded
 from sgft_jax import api
 from sgft_jax.analysis import figures, prediction, stats, tables, verdict
@@ -45,9 +45,9 @@ def diagnose(
     home = args.out / "diagnose" / env.name
     if recorded is None:
         count, name = args.rollouts or PLAYED, title(args.real)
-        if is_gymnasium(args.real):
+        if is_stepped(args.real):
             where = name
-            real = _play_real(env, args.real, priors, count, args.seed, RealStore(home / name))
+            real = _play_real(env, args, priors, count, RealStore(home / name))
             simulated = play_simulated(env, priors, args.seed)
         else:
             where = f"the gap {name}"
@@ -157,15 +157,17 @@ def _play_both(env: Env, gap: Gap, priors: list[Prior], n: int, seed: int) -> tu
     return [first(one, n) for one in real], [first(one, SIMULATED) for one in simulated]
 
 
-def _play_real(env: Env, real: str, priors: list[Prior], n: int, seed: int, store: RealStore) -> list[Rollouts]:
-    """Exploring rollouts [n] of every prior on a Gymnasium environment, each of them kept on disk."""
-    system = connect(env, [real], (), members=len(priors), gamma=priors[0].card["gamma"])
-    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(_SEED), seed), len(store))
+def _play_real(env: Env, args: DiagnoseArgs, priors: list[Prior], n: int, store: RealStore) -> list[Rollouts]:
+    """Exploring rollouts [n] of every prior on a robot or an environment, each of them kept on disk."""
+    system = connect(env, [args.real], (), members=len(priors), gamma=priors[0].card["gamma"], home=args.out)
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(_SEED), args.seed), len(store))
     keys = jnp.broadcast_to(jax.random.split(key, n), (len(priors), n))
     members = stacking.stack([prior.params for prior in priors])
-    kept = Recorded(system, [store], done=len(store))
-    played = kept.play(make_policy(priors[0].card, env), members, keys, explore=True)
-    system.close()
+    kept = Recorded(system, [store], done=len(store), sync_every=1 if is_robot(args.real) else None)
+    try:
+        played = kept.play(make_policy(priors[0].card, env), members, keys, explore=True)
+    finally:
+        system.close()
     return [rollouts_of(stacking.member(played, i)) for i in range(len(priors))]
 
 

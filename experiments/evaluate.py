@@ -1,5 +1,6 @@
 """Evaluate priors, or what fine-tuning has saved, in simulation or on "real" systems."""
 
+import contextlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ from envs import gaps
 from envs.gaps import SIM, Gap
 from experiments import cli
 from experiments.options import Impl, at_least_one, prior_folders, without_repeats
-from experiments.real_systems import TOGETHER, connect, described, is_gymnasium
+from experiments.real_systems import REMOTE, TOGETHER, connect, described, is_robot, is_stepped
 from experiments.real_systems import check as check_real
 from sgft_jax.io.jsonfile import read_json
 from sgft_jax.presets import DEFAULT_PRESET
@@ -33,7 +34,8 @@ class EvaluateArgs:
     """A task by name, or a Python file with a task of your own; default: the task of the prior."""
     real: tuple[str, ...] = (SIM,)
     """Where: sim (the training domain without sensor noise), gaps by name, or .toml/.json files: all gaps of a file, or
-    file.toml:name. Or gymnasium:NAME, where every episode is a real one (docs/gymnasium.md)."""
+    file.toml:name. Or gymnasium:NAME (docs/gymnasium.md) or remote[:HOST[:PORT]] (docs/real-robot.md), where every
+    episode is a real one. Those of a robot are kept in <out>/evaluate/<task>/remote/real."""
     set: tuple[str, ...] = ()
     """Changes to the real systems, e.g. --set latency=0.05 action_scale=[1,0.5]; of a Gymnasium environment keyword
     arguments of gymnasium.make."""
@@ -76,21 +78,28 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
 
     import envs
     from experiments.evaluation import describe, play
+    from experiments.recorded import Recorded
     from experiments.stacking import member, part, stack
     from sgft_jax.io.priors import load_priors, observed_by
+    from sgft_jax.io.real import RealStore
     from sgft_jax.policies import make_policy
 
     env = envs.make(task, args.impl, **observed_by(folders))
     found = [None if real == SIM else described(env, real, args.set) for real in args.real]
     priors = load_priors(folders, env)
-    card, stepped = priors[0].card, is_gymnasium(args.real[0])
+    card, stepped = priors[0].card, is_stepped(args.real[0])
     key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_SEED), args.seed))
-    if stepped:
-        system = connect(env, args.real, args.set, members=len(priors), gamma=card["gamma"])
-    else:
-        system = _simulated(env, found, key_worlds, args.episodes, members=len(priors), gamma=card["gamma"])
     members = stack([prior.params for prior in priors] * len(found))
-    played = play(system, make_policy(card, env), members, key_episodes, args.episodes)
+    with contextlib.ExitStack() as last:
+        if stepped:
+            system = connect(env, args.real, args.set, members=len(priors), gamma=card["gamma"], home=args.out)
+            last.callback(system.close)
+        else:
+            system = _simulated(env, found, key_worlds, args.episodes, members=len(priors), gamma=card["gamma"])
+        if is_robot(args.real[0]):  # what it does is kept
+            store = RealStore(args.out / "evaluate" / env.name / REMOTE)
+            system = Recorded(system, [store], done=len(store), explore=False, sync_every=1)
+        played = play(system, make_policy(card, env), members, key_episodes, args.episodes)
 
     def of_system(i: int) -> dict[str, Any]:
         own = part(played, i, len(priors))
@@ -128,7 +137,7 @@ def check(args: EvaluateArgs) -> tuple[list[Path], str]:
         raise UserError("--real: name at least one")
     without_repeats("--real", args.real)
     reals = [real for real in args.real if real != SIM]
-    if len(reals) < len(args.real) and any(map(is_gymnasium, reals)):
+    if len(reals) < len(args.real) and any(map(is_stepped, reals)):
         raise UserError(f"--real {' '.join(args.real)}: {TOGETHER}")
     if args.set and not reals:
         raise UserError(f"--set {args.set[0]}: changes a real system; name one with --real")

@@ -4,11 +4,11 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from experiments.options import Impl, at_least_one, prior_folders, seed_list, seeds_name, without_repeats
 from experiments.real_systems import check as check_real
-from experiments.real_systems import title
+from experiments.real_systems import is_robot, title
 from sgft_jax import extend
 from sgft_jax.io.runs import check_start
 from sgft_jax.methods import DEFAULT, get_method
@@ -16,7 +16,9 @@ from sgft_jax.presets import DEFAULT_PRESET, preset_of
 from sgft_jax.types import Method, UserError
 
 NO_PRIOR = Path("none")
-VOLATILE = ("resume", "overwrite", "rollouts", "devices", "video", "out", "tuned")  # may differ when a run goes on
+# What may differ when a run goes on:
+VOLATILE = ("resume", "overwrite", "rollouts", "devices", "video", "out", "tuned", "sync_every")
+EVALUATION_EPISODES = 50
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class FinetuneArgs:
     """The real system: a gap by name, a .toml/.json file of one gap (tables `params` and `effects`) or of several, then
     all of them, file.toml:name for one of several, or sim for no gap. Several are played together in one program,
     which takes little longer; each has a run folder of its own. Or gymnasium:NAME, an environment for each seed
-    (docs/gymnasium.md)."""
+    (docs/gymnasium.md). Or remote[:HOST[:PORT]], a robot that connects there (docs/real-robot.md)."""
     set: tuple[str, ...] = ()
     """Changes to the real systems, e.g. --set latency=0.05 action_scale=[1,0.5]; of a Gymnasium environment keyword
     arguments of gymnasium.make, e.g. --set frame_skip=5."""
@@ -56,9 +58,9 @@ class FinetuneArgs:
     """Expert: first seed."""
     eval_every: int = 5
     """Expert: rollouts between evaluations."""
-    eval_episodes: int = 50
+    eval_episodes: int | None = None
     """Expert: episodes per seed and evaluation, always the same ones; 0: no evaluation. They cost no real transitions,
-    except on Gymnasium environments, where they are counted and kept."""
+    except on robots and Gymnasium environments, where they are counted and kept. Default: 50, on a robot 0."""
     checkpoint_every: int = 10
     """Expert: rollouts between checkpoints."""
     tuned: bool = False
@@ -68,6 +70,13 @@ class FinetuneArgs:
     impl: Impl = "auto"
     devices: int | None = None
     """Expert: devices that share the seeds of all real systems; 0: all there are; default: one."""
+    hand_over: Literal["rollouts", "steps"] = "rollouts"
+    """Expert: when a robot gets a new policy. A process learns from a rollout while the robot is brought to the next
+    start. `rollouts`: the robot waits there until that is done. `steps`: it begins with the policy before, and the new
+    one takes over as soon as it is there; not for methods with a guard, which judges rollouts by one policy."""
+    sync_every: int = 1
+    """Expert: steps of a robot between two flushes to disk. A killed process loses no step in any case; a power cut
+    may lose so many less one."""
     video: bool = True
     """Expert: render an episode before and after fine-tuning side by side, where MuJoCo can render."""
 
@@ -97,8 +106,8 @@ def label(args: FinetuneArgs) -> str:
 
 def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
     """The method and the seeds; raises UserError for what is wrong in the arguments and with the run folders."""
-    at_least_one(args, "rollouts", "eval_every", "checkpoint_every")
-    if args.eval_episodes < 0:
+    at_least_one(args, "rollouts", "eval_every", "checkpoint_every", "sync_every")
+    if args.eval_episodes is not None and args.eval_episodes < 0:
         raise UserError(f"--eval-episodes is {args.eval_episodes}: must be at least 0")
     method, seeds = get_method(args.method), seed_list(args.seed, args.seeds)
     if not isinstance(args.options, method.config):
@@ -113,12 +122,33 @@ def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
         raise UserError("--real: name at least one")
     without_repeats("--real", args.real)
     check_real(args.task, args.real, args.set)
+    _check_robot(args)
     folders = [run_folder(args, real) for real in args.real]
     if twice := [folder for folder in folders if folders.count(folder) > 1]:
         raise UserError(f"--real {' '.join(args.real)}: two of them would share the folder {twice[0]}; name it once")
     for folder in folders:
         check_start(folder, resume=args.resume, overwrite=args.overwrite)
     return method, seeds
+
+
+def _check_robot(args: FinetuneArgs) -> None:
+    """Raises UserError for what a robot cannot do, or only a robot can."""
+    robot = is_robot(args.real[0])
+    if robot and args.seeds != 1:
+        raise UserError(f"--seeds {args.seeds}: one robot plays one seed; give --seeds 1")
+    if args.hand_over == "steps" and not robot:
+        raise UserError("--hand-over steps: only a robot plays while something learns; name it with --real remote")
+    if args.hand_over == "steps" and args.options.guard:
+        raise UserError(
+            "--hand-over steps: a guard judges rollouts by one policy; add --options.no-guard or leave it out"
+        )
+
+
+def evaluation_episodes(args: FinetuneArgs) -> int:
+    """The default costs a robot nothing."""
+    if args.eval_episodes is None:
+        return 0 if is_robot(args.real[0]) else EVALUATION_EPISODES
+    return args.eval_episodes
 
 
 def priors_of(args: FinetuneArgs) -> list[Path]:

@@ -1,9 +1,10 @@
 """Impure: a fine-tuning run, `train.finetune` with folders, checkpoints, logs, evaluations and videos around it."""
 
 import contextlib
+import dataclasses
 import functools
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 
 import envs
 from envs.rollout import Episode
-from experiments import real_systems
+from experiments import cli, real_systems
 from experiments.evaluation import scores
 from experiments.finetune_args import VOLATILE, FinetuneArgs, run_folder
 from experiments.finetune_record import Record
@@ -24,11 +25,13 @@ from sgft_jax.io import runs
 from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.io.progress import RunProgress
+from sgft_jax.learner_process import LearnerProcess
+from sgft_jax.methods import get_method
 from sgft_jax.methods.options import card_of
 from sgft_jax.systems.gymnasium import Gymnasium
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import FinetuneProgress
-from sgft_jax.types import Method, Metrics, PyTree, UserError
+from sgft_jax.types import Finetuner, Method, Metrics, Prior, PyTree, UserError
 
 _AFTER = "rollouts-"  # what the folder of an evaluation is called, before their number
 
@@ -43,7 +46,9 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
     for prior in priors:
         api.check_prior(prior, method, env)
     # Every folder is that of a run on its real system alone: either kind of run continues the other.
-    homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in args.real}
+    # A robot may come back at another address.
+    named = [real_systems.REMOTE if real_systems.is_robot(name) else name for name in args.real]
+    homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in named}
     opened = runs.open_runs(
         homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
         inputs={"priors": [digest(prior) for prior in priors]},
@@ -54,8 +59,10 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
             last.callback(own.close)
         last.enter_context(mesh.use(devices))
         playing, members, cost = found, seeds, None
-        if real_systems.is_gymnasium(args.real[0]):
-            playing = real_systems.connect(env, args.real, args.set, members=len(seeds), gamma=card["gamma"])
+        if real_systems.is_stepped(args.real[0]):
+            playing = real_systems.connect(
+                env, args.real, args.set, members=len(seeds), gamma=card["gamma"], home=args.out
+            )
             last.callback(playing.close)
             members, cost = seeds * len(args.real), args.eval_episodes
         setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
@@ -64,7 +71,28 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
             Record(own.folder, setup.system.env, gap, method.name, seeds, evaluations_cost=cost)
             for own, gap in zip(opened, found, strict=True)
         ]
-        return _Run(args, setup, setup.system, card, records).work()
+        learner = None
+        if real_systems.is_robot(args.real[0]):
+            which = train.prior_of(setup.priors, setup.seeds)
+            learner = LearnerProcess(_build(args, folders, priors), setup.seeds, which, setup.simulated)
+            last.callback(learner.close)
+        return _Run(args, setup, setup.system, card, records, learner).work()
+
+
+def _build(args: FinetuneArgs, folders: list[Path], priors: list[Prior]) -> Callable[[], Finetuner]:
+    """Makes the finetuner of the run again, in another process."""
+    options = {field.name: getattr(args.options, field.name) for field in dataclasses.fields(args.options)}
+    prior = jax.device_get(priors[0]) if priors else None
+    return functools.partial(build, args.task, args.impl, args.method, options, observed_by(folders), prior)
+
+
+def build(
+    task: str, impl: str, method: str, options: dict[str, Any], observed: dict[str, Any], prior: Prior | None
+) -> Finetuner:
+    """The finetuner of a run. Method and options are names and numbers, because a user's own file is no module."""
+    cli.set_up()
+    chosen = get_method(method)
+    return chosen.build(chosen.config(**options), prior, envs.make(task, impl, **observed))
 
 
 class _Run:
@@ -81,18 +109,24 @@ class _Run:
         system: Simulated | Gymnasium,
         card: dict[str, Any],
         records: list[Record],
+        learner: LearnerProcess | None,
     ) -> None:
+        self.learner, self.sync_every = learner, args.sync_every if learner else None
         self.args, self.setup, self.card, self.records = args, setup, card, records
         self.finetuner, self.system, self.seeds = setup.finetuner, system, setup.seeds
-        self.count = len(setup.seeds) // len(records)
+        self.count, self.episodes = len(setup.seeds) // len(records), args.eval_episodes or 0
         self.begin = functools.partial(train.begin, setup.finetuner, setup.priors, setup.seeds, setup.simulated)
 
     def work(self) -> list[dict[str, Any]]:
         """Everything, in order; returns the summaries."""
         progress = self._restore()
         done = int(progress.rollouts) if progress else 0
-        recorded = Recorded(self.system, [record.real for record in self.records], done=done)
-        steps = train.finetune(*self.setup._replace(system=recorded), rollouts=self.args.rollouts, progress=progress)
+        stores = [record.real for record in self.records]
+        recorded = Recorded(self.system, stores, done=done, sync_every=self.sync_every)
+        steps = train.finetune(
+            *self.setup._replace(system=recorded), rollouts=self.args.rollouts, progress=progress, learner=self.learner,
+            waits=self.args.hand_over == "rollouts",
+        )  # fmt: skip
         return self._finish(self._follow(steps, progress))
 
     def _restore(self) -> FinetuneProgress | None:
@@ -121,7 +155,7 @@ class _Run:
                 shown = self._log(done, values, time.perf_counter() - started)
                 if done == before and values:  # a part of the offline phase
                     self._checkpoint(progress)
-                elif self.args.eval_episodes and self._due(self.args.eval_every, before, done):
+                elif self.episodes and self._due(self.args.eval_every, before, done):
                     shown[f"{self.system.env.score}, evaluation"] = self._evaluate(progress, done)
                 if done and self._due(self.args.checkpoint_every, before, done):
                     self._checkpoint(progress)
@@ -147,8 +181,8 @@ class _Run:
         system = self.system
         if isinstance(system, Gymnasium):  # its episodes are real ones, and as dear as those of training
             stores = [record.evaluation_store(f"{_AFTER}{done:06d}") for record in self.records]
-            system = Recorded(system, stores, done=0, explore=False)
-        played = train.evaluate(self.finetuner, system, progress.agent, self.seeds, self.args.eval_episodes)
+            system = Recorded(system, stores, done=0, explore=False, sync_every=self.sync_every)
+        played = train.evaluate(self.finetuner, system, progress.agent, self.seeds, self.episodes)
         found = scores(played)
         for record, own in self._each(found):
             record.evaluation(done, own)
@@ -170,7 +204,7 @@ class _Run:
         card = {**self.card, "plan": None, **self.finetuner.card}  # the prior may be one that plans
         last = jax.jit(jax.vmap(self.finetuner.export))(progress.agent)
         facts = {"evidence": best.score, "rollouts": best.rollouts}
-        n = self.args.eval_episodes
+        n = self.episodes
         if n and isinstance(self.system, Simulated):
             played = train.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, n)
             facts["score"] = scores(played)["score"]
@@ -192,7 +226,7 @@ class _Run:
     def _before_and_after(self, progress: FinetuneProgress) -> list[Episode]:
         """The evaluation episodes [M, n] of the policy before the first real rollout and of the agent as it is now."""
         evaluate = functools.partial(train.evaluate, system=self.system, seeds=self.seeds)
-        n, initial = self.args.eval_episodes, self.finetuner.initial_policy
+        n, initial = self.episodes, self.finetuner.initial_policy
         if initial is None:
             before = evaluate(self.finetuner, states=jax.jit(self.begin)().agent, episodes=n)
         else:

@@ -1,11 +1,14 @@
-"""What `--real` may name: gaps, or Gymnasium environments. Imports neither JAX nor Gymnasium before one is made."""
+"""What `--real` may name: gaps, Gymnasium environments, or a robot. Imports nothing heavy before one is made."""
 
 from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import re
+import secrets
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from envs import gaps
@@ -18,35 +21,80 @@ if TYPE_CHECKING:
     from envs.base import Env
     from sgft_jax.systems.gymnasium import Gymnasium
 
-TOGETHER = "Gymnasium environments and simulations cannot be played together; run them one after another"
+TOGETHER = "a robot, Gymnasium environments and simulations cannot be played together; run them one after another"
 GYMNASIUM = "gymnasium:"  # then a name for `gymnasium.make`, which may begin with the module that registers it
+REMOTE = "remote"  # then perhaps where to listen, as `remote:HOST:PORT`
+_HOST, _PORT = "127.0.0.1", 8765
+_TOKEN = "robot-token"
 
 
-def is_gymnasium(real: str) -> bool:
-    """Whether a real system is a Gymnasium environment and no gap."""
-    return real.startswith(GYMNASIUM)
+def is_robot(real: str) -> bool:
+    """Whether a real system is a robot, or another process, behind a socket."""
+    return real == REMOTE or real.startswith(f"{REMOTE}:")
+
+
+def is_stepped(real: str) -> bool:
+    """Whether a real system is played step by step, and no gap of a simulation."""
+    return real.startswith(GYMNASIUM) or is_robot(real)
 
 
 def title(real: str) -> str:
-    """What folders call a real system: `gymnasium-HalfCheetah-v5`, or the name of the gap."""
-    if not is_gymnasium(real):
+    """What folders call a real system: `gymnasium-HalfCheetah-v5`, `remote`, or the name of the gap."""
+    if is_robot(real):
+        return REMOTE
+    if not is_stepped(real):
         return gaps.title(real)
     return "gymnasium-" + re.sub(r"[^\w.-]", "-", real.removeprefix(GYMNASIUM).rpartition(":")[2])
 
 
 def check(task: str, reals: Sequence[str], changes: Sequence[str] = ()) -> None:
     """Raises UserError where there is no such task or real system, or where they cannot be played by one command."""
-    stepped = [real for real in reals if is_gymnasium(real)]
-    check_task(task, [real for real in reals if not is_gymnasium(real)])
+    stepped, robots = ([real for real in reals if of(real)] for of in (is_stepped, is_robot))
+    check_task(task, [real for real in reals if not is_stepped(real)])
     if not stepped:
         return
-    if len(stepped) < len(reals):
+    if len(stepped) < len(reals) or 0 < len(robots) < len(reals):
         raise UserError(f"--real {' '.join(reals)}: {TOGETHER}")
+    if robots:
+        _check_robot(robots, changes)
+        return
     if importlib.util.find_spec("gymnasium") is None:
         raise UserError(f"--real {stepped[0]}: Gymnasium is not installed; pip install 'sgft-jax[gymnasium]'")
     if GYMNASIUM in stepped:
         raise UserError(f"--real {GYMNASIUM}: name an environment, e.g. {GYMNASIUM}HalfCheetah-v5")
     keywords(changes)
+
+
+def _check_robot(robots: Sequence[str], changes: Sequence[str]) -> None:
+    if len(robots) > 1:
+        raise UserError(f"--real {' '.join(robots)}: one robot at a time")
+    if changes:
+        raise UserError(f"--set {changes[0]}: nothing here can change a robot")
+    address(robots[0])
+
+
+def address(real: str) -> tuple[str, int]:
+    """The interface and the port of `remote[:HOST[:PORT]]`; default: this computer alone. UserError for no port."""
+    _, *rest = real.split(":")
+    host, port = (*rest, "", "")[:2]
+    if len(rest) > 2 or not (port or "0").isdigit():
+        raise UserError(f"--real {real}: write {REMOTE}, {REMOTE}:HOST or {REMOTE}:HOST:PORT")
+    return host or _HOST, int(port or _PORT)
+
+
+def token(home: Path) -> str:
+    """What a robot must know, from the file under `home` that only its owner reads; made where there is none.
+
+    It stays the same, so that a robot that waits for a run that was killed is taken again.
+    """
+    path = home / _TOKEN
+    if not path.exists():
+        home.mkdir(parents=True, exist_ok=True)
+        with open(os.open(path, os.O_WRONLY | os.O_CREAT, 0o600), "w") as file:
+            file.write(secrets.token_hex(16) + "\n")
+    if not (found := path.read_text().strip()):
+        raise UserError(f"{path}: is empty; write a token into it, or delete it for a new one")
+    return found
 
 
 def keywords(changes: Sequence[str]) -> dict[str, Any]:
@@ -64,16 +112,29 @@ def keywords(changes: Sequence[str]) -> dict[str, Any]:
 
 
 def described(env: Env, real: str, changes: Sequence[str]) -> Gap:
-    """The gap, changed; of a Gymnasium environment nobody knows what differs, so that it is a name alone."""
-    if not is_gymnasium(real):
+    """The gap, changed; of a robot or environment nobody knows what differs, so that it is a name alone."""
+    if not is_stepped(real):
         return gaps.load(env, real, changes)
-    return Gap("+".join([real, *changes]), {}, {})
+    return Gap(REMOTE if is_robot(real) else "+".join([real, *changes]), {}, {})
 
 
-def connect(env: Env, reals: Sequence[str], changes: Sequence[str], *, members: int, gamma: float) -> Gymnasium:
-    """So many environments of each name, all of the first one first. Raises UserError where one cannot be made."""
+def connect(
+    env: Env, reals: Sequence[str], changes: Sequence[str], *, members: int, gamma: float, home: Path
+) -> Gymnasium:
+    """The robot, or so many environments of each name, all of the first one first.
+
+    home: where the robot's token is. Raises UserError where an environment cannot be made, or one robot is not enough.
+    """
     from sgft_jax.systems.gymnasium import Gymnasium
 
+    if is_robot(reals[0]):
+        from sgft_jax.systems.remote import Remote
+
+        if members > 1:
+            raise UserError(f"--real {reals[0]}: one robot plays for {members}; choose one policy, or --seeds 1")
+        host, port = address(reals[0])
+        robot = Remote(env.measured_dim, env.act_dim, host=host, port=port, token=token(home))
+        return Gymnasium(env, robot, gamma=gamma)
     given = keywords(changes)
     return Gymnasium(env, [_make(real, given) for real in reals for _ in range(members)], gamma=gamma)
 

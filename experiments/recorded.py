@@ -1,5 +1,6 @@
 """Impure: a real system whose every episode is on disk before anything learns from it."""
 
+import contextlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,9 +12,12 @@ from envs.rollout import Episode
 from experiments.stacking import join, part
 from sgft_jax.io.real import RealStore
 from sgft_jax.systems import System
+from sgft_jax.systems.gymnasium import Gymnasium, Step
 from sgft_jax.types import Key, PyTree, Transition, UserError
 
 _FACTS = tuple(name for name in Episode._fields if name != "transitions")
+_BESIDE = ("asked", "late", "time")  # what is kept of a robot's steps beside transitions, see `Step`
+_BESIDE = ("asked", "late", "time")  # what is kept of the steps of a robot beside their transitions, see `Step`
 
 
 class Recorded:
@@ -23,11 +27,17 @@ class Recorded:
 
     inner: what plays. stores: one for each real system, whose members stand one after another. done: episodes behind
     the state that the run starts from. explore: whether exploring episodes are stored, or those without exploration;
-    the others are played and forgotten.
+    the others are played and forgotten. sync_every: for a robot: every step is on disk before the next one, and
+    flushed after so many. What a kill leaves of a rollout is kept as one that ended there. Its next step is in doubt,
+    because the robot may have made it: the rollout counts as broken off, and that step is not learned from.
     """
 
-    def __init__(self, inner: System, stores: Sequence[RealStore], *, done: int, explore: bool = True) -> None:
+    def __init__(
+        self, inner: System, stores: Sequence[RealStore], *, done: int, explore: bool = True,
+        sync_every: int | None = None,
+    ) -> None:  # fmt: skip
         self.inner, self.stores, self.rollout, self.explore = inner, stores, done, explore
+        self.sync_every = sync_every
         if short := [store for store in stores if len(store) < done]:
             raise UserError(f"{short[0].folder}: holds {len(short[0])} rollouts, the checkpoint remembers {done}")
 
@@ -44,12 +54,33 @@ class Recorded:
         missing = [store for store in self.stores if len(store) <= number]
         if not missing:
             return self._stored(number)
+        if self.sync_every is not None:
+            self._play_robot(number, policy, states, keys[:, 0])
+            return self._stored(number)
         episodes = self.inner.play(policy, states, keys, explore=self.explore)
         for i, store in enumerate(self.stores):
             if len(store) <= number:
                 store.append(_arrays(part(episodes, i, keys.shape[0] // len(self.stores))))
         # What a robot has done stands, also where the others had to play this rollout again.
         return episodes if len(missing) == len(self.stores) else self._stored(number)
+
+    def _play_robot(self, number: int, policy: Any, states: PyTree, keys: Key) -> None:
+        """Stores the rollout of a robot, played now or as far as a kill has let it come. keys: [1]."""
+        (store,), inner = self.stores, self.inner
+        assert isinstance(inner, Gymnasium)
+        journal = store.journal(number, sync_every=self.sync_every or 1)
+        made = [Step(**step) for step in journal.read()]
+        if made and not made[-1].over and len(made) < inner.env.episode_length:
+            made.append(made[-1].in_doubt())
+        elif not made:
+            steps = inner.steps(policy, states, keys, explore=self.explore)
+            with journal, contextlib.closing(steps):  # whatever happens, the robot rests
+                for step in steps:
+                    journal.append(step._asdict())
+                    made.append(step)
+        beside = {name: np.stack([getattr(step, name) for step in made], axis=1) for name in _BESIDE}
+        store.append({**_arrays(jax.tree.map(lambda x: x[:, None], inner.episode(made))), **beside})
+        journal.remove()
 
     def _stored(self, number: int) -> Episode:
         return join([_read(store.load(number)) for store in self.stores])

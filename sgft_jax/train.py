@@ -4,8 +4,8 @@ A yielded state is valid until the iterator's next step, which donates its array
 """
 
 import functools
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -78,6 +78,22 @@ class SimulatedRows(NamedTuple):
         return SimulatedData(draw, self.returns[which])
 
 
+class Beside(Protocol):
+    """A learner that works while the robot plays, such as a `LearnerProcess`."""
+
+    def submit(self, agent: PyTree, parts: Sequence[int], updates: int, *, offline: bool) -> None:
+        """Begins the learning phases `parts`, see `Updates`."""
+        ...
+
+    def ready(self) -> bool:
+        """Whether `result` would not wait."""
+        ...
+
+    def result(self) -> tuple[PyTree, Metrics]:
+        """What the phases have led to; the same until the next `submit`."""
+        ...
+
+
 # --- fine-tuning ------------------------------------------------------------------------------------------------------
 
 
@@ -90,17 +106,22 @@ def finetune(
     *,
     rollouts: int,
     progress: FinetuneProgress | None = None,
+    learner: Beside | None = None,
+    waits: bool = True,
 ) -> Iterator[tuple[FinetuneProgress, Metrics]]:
     """Fine-tunes M members, each a seed on a real system, until each has made `rollouts` real rollouts.
 
     priors: params [P, ...] of P priors, or None; the member with seed s starts from prior s modulo P.
     seeds: [M] uint32. simulated: see `simulate`, for methods that ask for it.
     progress: where an earlier run stopped, or None.
+    learner: what learns while the system plays, for systems that are stepped, see `Gymnasium.play`; None: this process
+    learns between rollouts. waits: a rollout begins, but makes no step before its policy has been learned: the same
+    results. False: it goes on with the policy before, and the new one takes over at the step at which it is there.
 
     Yields the fresh state with no metrics (unless `progress` is given), then once per part of the offline phase, then
-    once per real rollout, all initial ones together. Metrics are arrays [M]. Every random draw follows from (seed,
-    purpose, rollout), so a resumed run draws what an uninterrupted one would have drawn, and all methods meet the same
-    real starts.
+    once per real rollout, all initial ones together; with a `learner` after the next rollout has been played. Metrics
+    are arrays [M]. Every random draw follows from (seed, purpose, rollout), so a resumed run draws what an
+    uninterrupted one would have drawn, and all methods meet the same real starts.
     """
     step = _Steps(finetuner, system, priors, seeds, simulated)
     if progress is None:
@@ -108,8 +129,11 @@ def finetune(
         yield progress, {}
     updates = finetuner.simulation.offline_updates if finetuner.simulation else 0
     while (done := int(progress.offline)) < updates:
-        progress, metrics = step.offline(progress, done, min(OFFLINE_PART, updates - done))
+        progress, metrics = step.offline(progress, done, min(OFFLINE_PART, updates - done), learner)
         yield progress, metrics
+    if learner is not None:
+        yield from step.beside(progress, learner, rollouts, waits=waits)
+        return
     while (done := int(progress.rollouts)) < rollouts:
         progress, metrics = step.rollouts(progress, done, 1 if done else finetuner.initial_rollouts)
         yield progress, metrics
@@ -127,7 +151,7 @@ def begin(
     finetuner: Finetuner, priors: PyTree, seeds: Array, simulated: SimulatedRows | None = None
 ) -> FinetuneProgress:
     """The state that `finetune` starts from. `jax.eval_shape` of it says what a checkpoint is read into."""
-    which = _prior_of(priors, seeds)
+    which = prior_of(priors, seeds)
 
     def one(params: PyTree, seed: Array, which: Array, rows: SimulatedRows | None) -> PyTree:
         return finetuner.init(params, _key(seed, _INIT, 0), None if rows is None else rows.of(which))
@@ -142,6 +166,37 @@ def begin(
     return FinetuneProgress(agent, best, jnp.int32(0), jnp.int32(0))
 
 
+class Updates:
+    """Learning phases of M members, compiled.
+
+    seeds: [M] uint32. which: [M] the prior of each. simulated: see `finetune`.
+    """
+
+    def __init__(self, finetuner: Finetuner, seeds: Array, which: Array, simulated: SimulatedRows | None) -> None:
+        self.finetuner, self.seeds, self.which, self.simulated = finetuner, seeds, which, simulated
+        self._learn = jax.jit(self._update, static_argnums=(2, 4), donate_argnums=0)
+
+    def __call__(
+        self, agent: PyTree, parts: Sequence[int], updates: int, *, offline: bool = False
+    ) -> tuple[PyTree, Metrics]:
+        """So many updates in each part, a number from which their random draws follow; returns the mean metrics."""
+        learned = []
+        for part in parts:  # equal parts, so that one compiled program serves any number
+            keys = jax.vmap(lambda seed, part=part: _key(seed, _OFFLINE if offline else _LEARN, part))(self.seeds)
+            agent, metrics = self._learn(agent, keys, updates, self.simulated, offline)
+            learned.append(metrics)
+        return agent, jax.tree.map(_mean, *learned)
+
+    def _update(
+        self, states: PyTree, keys: Key, updates: int, simulated: SimulatedRows | None, offline: bool
+    ) -> tuple[PyTree, Metrics]:
+        def one(state: PyTree, key: Key, which: Array, rows: SimulatedRows | None) -> tuple[PyTree, Metrics]:
+            data = None if rows is None else rows.of(which)
+            return self.finetuner.learn(state, key, updates, data, offline=offline)
+
+        return split_vmap(one, (0, 0, 0, None))(states, keys, self.which, simulated)
+
+
 class _Steps:
     """The compiled steps of one run."""
 
@@ -152,64 +207,91 @@ class _Steps:
         self.priors, self.seeds = priors, seeds
         if finetuner.simulation is not None and simulated is None:
             raise UserError("this method also learns from simulated transitions: pass `simulated` (see `simulate`)")
+        self._learn = Updates(finetuner, seeds, prior_of(priors, seeds), simulated)
         self._store = jax.jit(split_vmap(self._observe), donate_argnums=0)
-        self._learn = jax.jit(self._update, static_argnums=(2, 4), donate_argnums=0)
         self._keep = jax.jit(functools.partial(_keep_best, finetuner), donate_argnums=0)
 
     def begin(self) -> FinetuneProgress:
         """The fresh state."""
         return jax.jit(functools.partial(begin, self.finetuner))(self.priors, self.seeds, self.simulated)
 
-    def offline(self, progress: FinetuneProgress, done: int, updates: int) -> tuple[FinetuneProgress, Metrics]:
+    def offline(
+        self, progress: FinetuneProgress, done: int, updates: int, learner: Beside | None
+    ) -> tuple[FinetuneProgress, Metrics]:
         """Updates on simulated transitions alone."""
-        agent, metrics = self._learn(progress.agent, self._keys(_OFFLINE, done), updates, self.simulated, True)
+        if learner is None:
+            agent, metrics = self._learn(progress.agent, [done], updates, offline=True)
+        else:
+            learner.submit(progress.agent, [done], updates, offline=True)
+            agent, metrics = learner.result()
         return progress._replace(agent=agent, offline=progress.offline + updates), metrics
 
     def rollouts(self, progress: FinetuneProgress, done: int, n: int) -> tuple[FinetuneProgress, Metrics]:
         """N real rollouts, one after another as on a robot, then the updates that they allow."""
+        played = self._play(progress.agent, done, n)
+        agent, best = self._take(progress.agent, progress.best, played, done)
+        agent, metrics = self._learn(agent, range(done, done + n), self.finetuner.updates_per_rollout)
+        return FinetuneProgress(agent, best, progress.rollouts + n, progress.offline), _real(played) | metrics
+
+    def beside(
+        self, progress: FinetuneProgress, learner: Beside, rollouts: int, *, waits: bool
+    ) -> Iterator[tuple[FinetuneProgress, Metrics]]:
+        """The same with a learner that works on one rollout while the next one is played."""
+        agent, best, done, offline = progress.agent, progress.best, int(progress.rollouts), progress.offline
+        latest: Callable[[], PyTree] = lambda: agent  # noqa: E731 - before anything has been submitted
+        before: list[Episode] = []
+        while before or done < rollouts:
+            n = 1 if done else self.finetuner.initial_rollouts
+            played = self._play(latest, done, n) if done < rollouts else []
+            if before:
+                agent, metrics = learner.result()
+                yield FinetuneProgress(agent, best, jnp.int32(done), offline), _real(before) | metrics
+            if played:
+                agent, best = self._take(agent, best, played, done)
+                learner.submit(agent, range(done, done + n), self.finetuner.updates_per_rollout, offline=False)
+                latest = functools.partial(_latest, learner, None if waits else agent)
+                done += n
+            before = played
+
+    def _play(self, agent: PyTree, done: int, n: int) -> list[Episode]:
+        """The next n rollouts [M, 1]. agent: or a function that returns it."""
         initial = self.finetuner.initial_policy if done == 0 else None
-        agent, best, played = progress.agent, progress.best, []
-        for rollout in range(done, done + n):
-            keys = _episode_keys(self.seeds, _COLLECT, rollout, 1)
-            if initial is None:
-                episodes = self.system.play(self.finetuner, agent, keys, explore=True)
+        who, states = (
+            (self.finetuner, agent) if initial is None else (initial, priors_of_members(self.priors, self.seeds))
+        )
+        keys = [_episode_keys(self.seeds, _COLLECT, rollout, 1) for rollout in range(done, done + n)]
+        return [self.system.play(who, states, key, explore=True) for key in keys]
+
+    def _take(self, agent: PyTree, best: Best, played: Sequence[Episode], done: int) -> tuple[PyTree, Best]:
+        """The agent with these rollouts, and what they say of it if it has played them."""
+        if done or self.finetuner.initial_policy is None:
+            for episodes in played:
                 best = self._keep(best, agent, episodes.score[:, 0], episodes.total_reward[:, 0], jnp.int32(done))
-            else:
-                own = priors_of_members(self.priors, self.seeds)
-                episodes = self.system.play(initial, own, keys, explore=True)
-            played.append(episodes)
         for episodes in played:
             agent = self._store(agent, episodes.transitions, episodes.valid, episodes.score)
-        learned = []
-        for rollout in range(done, done + n):  # equal parts, so that one compiled program serves any number
-            updates = self.finetuner.updates_per_rollout
-            agent, metrics = self._learn(agent, self._keys(_LEARN, rollout), updates, self.simulated, False)
-            learned.append(metrics)
-        mean = lambda *x: jnp.mean(jnp.stack(x), axis=0)  # noqa: E731
-        real = {
-            "real/return": mean(*[x.total_reward[:, 0] for x in played]),
-            "real/score": mean(*[x.score[:, 0] for x in played]),
-            "real/exploded": mean(*[x.exploded[:, 0].astype(jnp.float32) for x in played]),
-        }
-        metrics = real | jax.tree.map(mean, *learned)
-        return FinetuneProgress(agent, best, progress.rollouts + n, progress.offline), metrics
+        return agent, best
 
     def _observe(self, state: PyTree, transitions: Transition, valid: Array, score: Array) -> PyTree:
         """transitions, valid: [1, T, ...]. score: [1]."""
         return self.finetuner.observe(state, jax.tree.map(lambda x: x[0], transitions), valid[0], score[0])
 
-    def _update(
-        self, states: PyTree, keys: Key, updates: int, simulated: SimulatedRows | None, offline: bool
-    ) -> tuple[PyTree, Metrics]:
-        def one(state: PyTree, key: Key, which: Array, rows: SimulatedRows | None) -> tuple[PyTree, Metrics]:
-            data = None if rows is None else rows.of(which)
-            return self.finetuner.learn(state, key, updates, data, offline=offline)
 
-        which = _prior_of(self.priors, self.seeds)
-        return split_vmap(one, (0, 0, 0, None))(states, keys, which, simulated)
+def _latest(learner: Beside, meanwhile: PyTree | None) -> PyTree:
+    """The agent that acts now: what has been learned, or `meanwhile`, if there is that, until it is ready."""
+    return learner.result()[0] if meanwhile is None or learner.ready() else meanwhile
 
-    def _keys(self, purpose: int, part: int) -> Key:
-        return jax.vmap(lambda seed: _key(seed, purpose, part))(self.seeds)
+
+def _real(played: Sequence[Episode]) -> Metrics:
+    """[M] how rollouts [M, 1] went, on average."""
+    return {
+        "real/return": _mean(*[x.total_reward[:, 0] for x in played]),
+        "real/score": _mean(*[x.score[:, 0] for x in played]),
+        "real/exploded": _mean(*[x.exploded[:, 0].astype(jnp.float32) for x in played]),
+    }
+
+
+def _mean(*x: Array) -> Array:
+    return jnp.mean(jnp.stack(x), axis=0)
 
 
 def _keep_best(finetuner: Finetuner, best: Best, agent: PyTree, score: Array, total: Array, learned: Array) -> Best:
@@ -228,12 +310,12 @@ def _keep_best(finetuner: Finetuner, best: Best, agent: PyTree, score: Array, to
 
 def priors_of_members(priors: PyTree, seeds: Array) -> PyTree:
     """The params [M, ...] that each member starts from, of priors [P, ...]; None without priors. seeds: [M]."""
-    which = _prior_of(priors, seeds)
+    which = prior_of(priors, seeds)
     return jax.tree.map(lambda x: x[which], priors)
 
 
-def _prior_of(priors: PyTree, seeds: Array) -> Array:
-    """[M] the prior of each member."""
+def prior_of(priors: PyTree, seeds: Array) -> Array:
+    """[M] which of the priors [P, ...] each member starts from. seeds: [M]."""
     return seeds % (1 if priors is None else jax.tree.leaves(priors)[0].shape[0])
 
 

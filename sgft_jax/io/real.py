@@ -1,5 +1,7 @@
 """Impure: the real rollouts of a run on disk. What a robot did is never repeated, cut off or deleted."""
 
+import contextlib
+import json
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -9,7 +11,7 @@ import numpy as np
 
 from sgft_jax.types import UserError
 
-_REAL, _ROLLOUT, _HALF = "real", "rollout-", ".half"
+_REAL, _ROLLOUT, _HALF, _STEPS = "real", "rollout-", ".half", ".steps.jsonl"
 
 
 class RealStore:
@@ -58,8 +60,62 @@ class RealStore:
         except Exception as error:  # numpy raises half a dozen types for a damaged archive
             raise UserError(f"{path}: damaged: {error}") from error
 
+    def journal(self, number: int, *, sync_every: int = 1) -> "Journal":
+        """Where the steps of a rollout go while it is played."""
+        return Journal(self.folder / f"{_ROLLOUT}{number:06d}{_STEPS}", sync_every)
+
     def _path(self, number: int) -> Path:
         return self.folder / f"{_ROLLOUT}{number:06d}.npz"
+
+
+class Journal:
+    """The steps of one rollout, a line each. A line is with the operating system before the next step begins.
+
+    So a killed process loses none. sync_every: steps between two flushes to disk; a power cut loses fewer than that.
+    """
+
+    def __init__(self, path: Path, sync_every: int) -> None:
+        self.path, self._every, self._count = path, sync_every, 0
+        self._file: Any = None
+
+    def read(self) -> list[dict[str, np.ndarray]]:
+        """The steps so far; a last line that a kill has torn is left out. Raises UserError for a damaged file."""
+        if not self.path.exists():
+            return []
+        lines = self.path.read_text().split("\n")[:-1]  # what follows the last newline was never finished
+        try:
+            types, *steps = [json.loads(line) for line in lines] or [{}]
+            return [{name: np.array(x, types[name]) for name, x in step.items()} for step in steps]
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise UserError(f"{self.path}: damaged: {error}; move it away to go on without these steps") from error
+
+    def append(self, step: Mapping[str, np.ndarray]) -> None:
+        """Adds a step, {name: array}."""
+        if self._file is None:
+            self._file = open(self.path, "w")  # noqa: SIM115 - it stays open between steps
+            self._write({name: x.dtype.name for name, x in step.items()})
+            _sync_folder(self.path.parent)
+        self._count += 1
+        self._write({name: x.tolist() for name, x in step.items()})
+        if self._count % self._every == 0:
+            os.fsync(self._file.fileno())
+
+    def __enter__(self) -> "Journal":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Closes the file; it stays where it is."""
+        if self._file is not None:
+            self._file.close()
+
+    def remove(self) -> None:
+        """When the rollout is in the store."""
+        with contextlib.suppress(FileNotFoundError):
+            self.path.unlink()
+
+    def _write(self, line: Mapping[str, Any]) -> None:
+        self._file.write(json.dumps(line) + "\n")
+        self._file.flush()
 
 
 def _sync_folder(folder: Path) -> None:

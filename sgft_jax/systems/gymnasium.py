@@ -1,6 +1,7 @@
 """Impure: real systems that are Gymnasium environments, stepped from Python."""
 
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import jax
@@ -16,8 +17,39 @@ from sgft_jax.types import Array, Key, PyTree, Transition, UserError
 if TYPE_CHECKING:
     import gymnasium
 
+    from sgft_jax.systems.remote import Remote
+
 SUCCESS = ("is_success", "success")  # what `info` may call it; the first that is there counts
+_TRIES = 20  # actions that are timed before a robot with a clock moves
 Observe = Callable[[Any], Any]
+
+
+class Step(NamedTuple):
+    """One step of M members, on the host. Whose episode was over before has neither `valid` nor `invalid`.
+
+    obs, next_obs: [M, obs_dim], raw units. action: [M, act_dim] in [-1, 1], what was really commanded. asked:
+    [M, act_dim], what the policy wanted. reward: [M]. terminated, valid: [M] bool. success: [M] int8, -1 where nothing
+    tells it. invalid: [M] bool, a step that must not be learned from. over: [M] bool, no step follows. late: [M] bool,
+    no command came in time. time: [M] float64, seconds since the epoch when its outcome was there.
+    """
+
+    obs: np.ndarray
+    action: np.ndarray
+    asked: np.ndarray
+    reward: np.ndarray
+    terminated: np.ndarray
+    next_obs: np.ndarray
+    valid: np.ndarray
+    success: np.ndarray
+    invalid: np.ndarray
+    over: np.ndarray
+    late: np.ndarray
+    time: np.ndarray
+
+    def in_doubt(self) -> "Step":
+        """The step after this one, of which nobody knows whether it was made, or what came of it."""
+        blank = Step(*map(np.zeros_like, self))
+        return blank._replace(success=blank.success - 1, invalid=~self.over, over=np.ones_like(self.over))
 
 
 class Gymnasium:
@@ -30,8 +62,8 @@ class Gymnasium:
     `info["invalid"]`, or a number that is not finite, ends an episode like exploded physics: the step is not learned
     from. An environment with a method `rest` hears when its episode is over.
 
-    env: the task. real: an environment, several, or a vector environment with one for each member. A vector environment
-    also steps members whose episode is over. gamma: discount factor of the transitions, that of the prior.
+    env: the task. real: an environment, several, or a vector environment with one for each member; or a robot behind a
+    socket, `Remote`. A vector environment also steps members whose episode is over. gamma: discount factor of the transitions, that of the prior.
     observe: what an environment returns -> [measured_dim], in the order and units of `env.measured`. Default: a Box
     as it is, a Dict in the order of the task's entries, which must be its keys.
     Raises UserError for spaces that do not fit the task.
@@ -40,7 +72,7 @@ class Gymnasium:
     def __init__(
         self,
         env: Env,
-        real: "gymnasium.Env | Sequence[gymnasium.Env] | gymnasium.vector.VectorEnv",
+        real: "gymnasium.Env | Sequence[gymnasium.Env] | gymnasium.vector.VectorEnv | Remote",
         *,
         gamma: float,
         observe: Observe | None = None,
@@ -61,43 +93,86 @@ class Gymnasium:
     def play(self, policy: Any, states: PyTree, keys: Key, *, explore: bool) -> Episode:
         """Episodes [M, n, ...], see `System`, one after another.
 
-        The seed with which an environment is reset follows from its key, see `seeds_of`. Raises UserError where there
-        is not one environment for each member, or where the task is judged by success and nothing tells it.
+        states: also a function without arguments that returns them. It is asked once an episode has begun, and again
+        at every step: a learner that works meanwhile hands over what it has.
+        The seed with which an environment is reset follows from its key, see `seed_of`. Raises UserError where there
+        is not one environment for each member, where the task is judged by success and nothing tells it, or where a
+        robot has a clock and the policy is too slow for it.
         """
-        members, n = keys.shape
+        played = [self.episode(self.steps(policy, states, keys[:, i], explore=explore)) for i in range(keys.shape[1])]
+        return jax.tree.map(lambda *x: jnp.stack(x, axis=1), *played)
+
+    def steps(self, policy: Any, states: PyTree, keys: Key, *, explore: bool) -> Generator[Step]:
+        """One episode of every member, step by step as it happens. keys: [M]. The rest: see `play`.
+
+        Close it where you leave it early: the robot rests then.
+        """
+        env, members, latest = self.env, len(keys), states if callable(states) else lambda: states
         if members != self._real.count:
             given = self._real.count
             raise UserError(f"{self._real.name}: {given} for {members} members; give one environment for each seed")
-        played = [self._play(policy, states, keys[:, i], explore=explore) for i in range(n)]
-        return jax.tree.map(lambda *x: jnp.stack(x, axis=1), *played)
+        seeds, act_keys = self._draw(keys)
+        carry = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *jnp.shape(x))), policy.init_carry())
+        actions = np.zeros((members, env.previous_actions, env.act_dim), np.float32)
+        going = np.ones(members, bool)
+        new, act = policy.act not in self._programs, self._program(policy)
+        seen = with_memory(env, self._measured(self._real.reset(seeds.tolist())), actions)
+        try:
+            if new and self._real.answer_within is not None:
+                self._check_speed(lambda: act(latest(), carry, seen, act_keys, 0, explore), self._real.answer_within)
+            for t in range(env.episode_length):
+                wanted, carry = act(latest(), carry, seen, act_keys, t, explore)
+                asked = np.asarray(wanted)
+                after = self._real.step(self._commanded(asked), going)
+                action = self._sent(asked, after.infos)
+                actions = remember(actions, action)
+                following = with_memory(env, self._measured(after.obs), actions)
+                judged = self._judged(after, seen, action, following)
+                step = _step(going, seen, asked, action, judged, following)
+                yield step
+                going = ~step.over
+                if not going.any():
+                    return
+                seen = following
+        finally:
+            self._real.rest()
+
+    def episode(self, steps: Iterable[Step]) -> Episode:
+        """One episode of each member, [M, ...], from its steps; fewer than T of them if it ended before."""
+        env, made = self.env, list(steps)
+        rows = Step(*(_padded(np.stack(x, axis=1), env.episode_length) for x in zip(*made, strict=True)))
+        valid = jnp.asarray(rows.valid)
+        kept = lambda x: jnp.where(valid.reshape(*valid.shape, *[1] * (x.ndim - 2)), x, 0)  # noqa: E731
+        transitions = Transition(
+            kept(rows.obs), kept(rows.action), kept(rows.reward),
+            jnp.where(valid, self.gamma * (1 - rows.terminated), 0.0), kept(rows.next_obs),
+        )  # fmt: skip
+        succeeded, exploded = jnp.asarray(self._success(rows)), jnp.asarray(rows.invalid.any(1))
+        total = transitions.reward.sum(1)
+        return Episode(
+            transitions=transitions,
+            valid=valid,
+            total_reward=total,
+            success=succeeded & ~exploded,
+            exploded=exploded,
+            score=(succeeded & ~exploded).astype(jnp.float32) if env.score == "success" else total,
+            world=jnp.zeros(len(valid), jnp.int32),
+            trace=jnp.zeros((len(valid), env.episode_length + 1, 0)),
+        )
 
     def close(self) -> None:
         """Closes the environments."""
         self._real.close()
 
-    def _play(self, policy: Any, states: PyTree, keys: Key, *, explore: bool) -> Episode:
-        """One episode of each member, [M, ...]. keys: [M]."""
-        env, members = self.env, self._real.count
-        seeds, act_keys = self._draw(keys)
-        act = self._program(policy)
-        carry = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *jnp.shape(x))), policy.init_carry())
-        actions = np.zeros((members, env.previous_actions, env.act_dim), np.float32)
-        going = np.ones(members, bool)
-        seen = with_memory(env, self._measured(self._real.reset(seeds.tolist())), actions)
-        rows = _Rows.blank(env, members)
-        for t in range(env.episode_length):
-            action, carry = act(states, carry, seen, act_keys, t, explore)
-            action = np.asarray(action)
-            after = self._real.step(self._commanded(action), going)
-            action = self._sent(action, after.infos)
-            actions = remember(actions, action)
-            following = with_memory(env, self._measured(after.obs), actions)
-            going &= ~rows.put(t, going, seen, action, self._judged(after, seen, action, following), following)
-            if not going.any():
-                break
-            seen = following
-        self._real.rest()
-        return self._episode(rows)
+    def _check_speed(self, act: Callable[[], Any], allowed: float) -> None:
+        """Raises UserError where an action takes longer than a robot waits for it. The first call compiles."""
+        jax.block_until_ready(act())
+        taken = sorted(_seconds(act) for _ in range(_TRIES))[-2]  # the worst but one: anything may interrupt a process
+        if taken > allowed:
+            raise UserError(
+                f"{self._real.name}: waits {allowed:.3g} s for a command, the policy takes {taken:.3g} s for one; "
+                "choose a method that does not plan, a smaller plan, or a longer period"
+            )
 
     def _program(self, policy: Any) -> Callable[..., tuple[Array, PyTree]]:
         """The action of all members at a step, one compiled program."""
@@ -152,26 +227,7 @@ class Gymnasium:
             )
         return np.stack(found)
 
-    def _episode(self, rows: "_Rows") -> Episode:
-        env, valid = self.env, jnp.asarray(rows.valid)
-        transitions = Transition(
-            jnp.asarray(rows.obs), jnp.asarray(rows.action), jnp.asarray(rows.reward),
-            jnp.where(valid, self.gamma * (1 - rows.terminated), 0.0), jnp.asarray(rows.next_obs),
-        )  # fmt: skip
-        succeeded, exploded = jnp.asarray(self._success(rows)), jnp.asarray(rows.invalid.any(1))
-        total = transitions.reward.sum(1)
-        return Episode(
-            transitions=transitions,
-            valid=valid,
-            total_reward=total,
-            success=succeeded & ~exploded,
-            exploded=exploded,
-            score=(succeeded & ~exploded).astype(jnp.float32) if env.score == "success" else total,
-            world=jnp.zeros(len(valid), jnp.int32),
-            trace=jnp.zeros((len(valid), env.episode_length + 1, 0)),
-        )
-
-    def _success(self, rows: "_Rows") -> np.ndarray:
+    def _success(self, rows: Step) -> np.ndarray:
         """[M] bool, of the last step, or of any where that is what the task asks."""
         if (rows.success >= 0).any():
             each = rows.success > 0
@@ -193,7 +249,7 @@ def seed_of(key: Key) -> Array:
     return jax.random.bits(key, dtype=jnp.uint32) >> 1
 
 
-# --- rows -------------------------------------------------------------------------------------------------------------
+# --- steps ------------------------------------------------------------------------------------------------------------
 
 
 class _After(NamedTuple):
@@ -206,47 +262,36 @@ class _After(NamedTuple):
     infos: Sequence[Mapping[str, Any]]
 
 
-class _Rows(NamedTuple):
-    """One episode of M members on the host, [M, T, ...]; zeros where nothing happened.
+def _step(
+    going: np.ndarray, seen: np.ndarray, asked: np.ndarray, action: np.ndarray, after: _After, following: np.ndarray
+) -> Step:
+    """The step of the members that are `going` [M]."""
+    finite = np.isfinite(following).all(1) & np.isfinite(after.reward)
+    bad = ~finite | _flag("invalid", after.infos)
+    told = [[info[name] for name in SUCCESS if name in info] for info in after.infos]
+    success = [int(bool(own[0])) if own and on else -1 for own, on in zip(told, going & ~bad, strict=True)]
+    return Step(
+        seen, action, asked, after.reward, after.terminated, following, going & ~bad, np.array(success, np.int8),
+        going & bad, ~going | bad | after.terminated | after.truncated, going & _flag("late", after.infos),
+        np.full(len(going), time.time()),
+    )  # fmt: skip
 
-    success: int8, -1 where `info` did not say. invalid: steps that must not be learned from.
-    """
 
-    obs: np.ndarray
-    action: np.ndarray
-    reward: np.ndarray
-    terminated: np.ndarray
-    next_obs: np.ndarray
-    valid: np.ndarray
-    success: np.ndarray
-    invalid: np.ndarray
+def _flag(name: str, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
+    """[M] bool, False where `info` does not have it."""
+    return np.array([bool(info.get(name, False)) for info in infos])
 
-    @classmethod
-    def blank(cls, env: Env, members: int) -> "_Rows":
-        """No step yet."""
-        shape = members, env.episode_length
-        obs, action, reward = (np.zeros((*shape, *own), np.float32) for own in ((env.obs_dim,), (env.act_dim,), ()))
-        no = np.zeros(shape, bool)
-        return cls(obs, action, reward, no, obs.copy(), no.copy(), np.full(shape, -1, np.int8), no.copy())
 
-    def put(
-        self, t: int, going: np.ndarray, seen: np.ndarray, action: np.ndarray, after: _After, following: np.ndarray
-    ) -> np.ndarray:
-        """Writes step t of the members that are `going` [M]; returns which episodes are over [M]."""
-        finite = np.isfinite(following).all(1) & np.isfinite(after.reward)
-        bad = ~finite | np.array([bool(info.get("invalid", False)) for info in after.infos])
-        valid = going & ~bad
-        self.valid[:, t], self.invalid[:, t] = valid, going & bad
-        self.obs[valid, t], self.action[valid, t], self.next_obs[valid, t] = (
-            seen[valid],
-            action[valid],
-            following[valid],
-        )
-        self.reward[valid, t], self.terminated[valid, t] = after.reward[valid], after.terminated[valid]
-        for i in np.flatnonzero(valid).tolist():
-            told = [after.infos[i][name] for name in SUCCESS if name in after.infos[i]]
-            self.success[i, t] = int(bool(told[0])) if told else -1
-        return bad | after.terminated | after.truncated
+def _padded(rows: np.ndarray, length: int) -> np.ndarray:
+    """[M, T, ...] of [M, t, ...]: zeros where nothing happened; for `success` that is not told either way, -1."""
+    blank = -1 if rows.dtype == np.int8 else 0
+    return np.pad(rows, [(0, 0), (0, length - rows.shape[1]), *[(0, 0)] * (rows.ndim - 2)], constant_values=blank)
+
+
+def _seconds(act: Callable[[], Any]) -> float:
+    started = time.perf_counter()
+    jax.block_until_ready(act())
+    return time.perf_counter() - started
 
 
 # --- environments -----------------------------------------------------------------------------------------------------
@@ -259,6 +304,11 @@ class _Real(Protocol):
     count: int
     observation: Any
     action: Any
+
+    @property
+    def answer_within(self) -> float | None:
+        """Seconds that a robot with a clock waits for a command. It is known once an episode has begun."""
+        ...
 
     def reset(self, seeds: list[int]) -> Sequence[Any]:
         """What each one returns at its start."""
@@ -288,6 +338,10 @@ class _Each:
             raise UserError(f"{self.name}: the same environment is given twice; make one for each seed")
         self._obs: Sequence[Any] = []
 
+    @property
+    def answer_within(self) -> float | None:
+        return getattr(self.each[0], "answer_within", None)
+
     def reset(self, seeds: list[int]) -> Sequence[Any]:
         self._obs = [one.reset(seed=seed)[0] for one, seed in zip(self.each, seeds, strict=True)]
         return self._obs
@@ -311,6 +365,8 @@ class _Each:
 
 class _Vector:
     """A vector environment, in either way of beginning episodes anew by itself."""
+
+    answer_within = None
 
     def __init__(self, real: "gymnasium.vector.VectorEnv") -> None:
         self.real: Any = real  # Gymnasium's stub knows no list of seeds

@@ -11,6 +11,7 @@ import hmac
 import queue
 import secrets
 import threading
+import time
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -78,6 +79,7 @@ class Remote:
         self._played: _Link | None = None  # to the one that began the episode: no other knows its steps
         self._episode, self._step = 0, 0
         self._obs = np.zeros(obs_size, np.float32)
+        self.answer_within: float | None = None  # seconds in which the connected robot wants a command
         self.observation_space = Box(*(x * np.full(obs_size, np.inf, np.float32) for x in (-1, 1)))
         self.action_space = Box(*(x * np.ones(action_size, np.float32) for x in (-1, 1)))
         self.spec, self.unwrapped = None, self
@@ -100,6 +102,7 @@ class Remote:
             if said is not None:
                 self._obs = said["obs"]
                 return self._obs, {}
+            time.sleep(self._again)  # a robot that cannot begin now may be able to later
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Has the robot take a step: obs, reward, terminated, truncated, info. action: [action_size] in [-1, 1]."""
@@ -219,5 +222,5 @@ class Remote:
         with self._lock:
             if self._link is not None:
                 return f"{said['robot']}: another robot is connected"
-            self._link = link
+            self._link, self.answer_within = link, said["answer_within"]
         return None

@@ -11,8 +11,9 @@ one of
                                                 def stop(self): ...            # safe, at any time and repeatedly
 
 and call `play(driver, "ws://learner:8765", token=...)`. `step` returns what a Gymnasium environment's does: obs,
-reward, terminated, truncated, info. A driver with `read` and `send` is run by the clock: one step every `period`
-seconds, and `judge(obs)` may return reward, terminated and success of what was read. Actions lie in [-1, 1].
+reward, terminated, truncated, info. A driver with `read` and `send` is run by the clock: from the first command of an
+episode on one step every `period` seconds, and `judge(obs)` may return reward, terminated and success of what was
+read. Actions lie in [-1, 1].
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ LIMIT = 64 * 1024  # bytes of a message at most
 _SOME = object()
 _SHAPES: dict[str, dict[str, Any]] = {  # what each message holds; a tuple names types that are allowed
     "hello": {
-        "version": int, "token": str, "robot": str, "obs_size": int, "action_size": int, "period": (float, type(None)),
+        "version": int, "token": str, "robot": str, "obs_size": int, "action_size": int,
+        "answer_within": (float, type(None)),
     },
     "welcome": {},
     "refused": {"reason": str},
@@ -147,7 +149,8 @@ def play(
     """Plays episodes for a learner until it ends the run; returns how many steps there were and how many were late.
 
     driver: see the top of this file. url: of the learner. token: what it printed. period: seconds of a step, for a
-    driver with `read` and `send`. answer_within: seconds after which a command is too late, default half a period.
+    driver with `read` and `send`. answer_within: seconds after which a command is too late, default half a period; the
+    first of an episode may take as long as it wants, so `reset` must leave the robot where it can wait.
     late: what happens then: "hold" leaves the last command, an action is sent instead. patience: after so many late
     steps in a row the episode ends. log: a file to which every command is appended before it is sent. retry: seconds
     between attempts to connect. say: hears one line about everything unusual.
@@ -162,7 +165,7 @@ def play(
     robot = _Robot(driver, rhythm, limits, _Log(log))
     hello = pack(
         "hello", version=VERSION, token=token, robot=name, obs_size=int(driver.obs_size),
-        action_size=int(driver.action_size), period=float(period) if period else None,
+        action_size=int(driver.action_size), answer_within=float(rhythm.answer_within) if rhythm else None,
     )  # fmt: skip
     waiting = False
     try:
@@ -250,7 +253,7 @@ class _Robot:
         """The next message; None where the clock says that it is too late for one."""
         while True:
             wait = None
-            if self.rhythm is not None and not self._over:
+            if self.rhythm is not None and not self._over and len(self._answers) > 1:  # the first command is there
                 wait = max(self._tick + self.rhythm.answer_within - time.monotonic(), 1e-3)
             try:
                 return unpack(socket.recv(timeout=wait))
@@ -272,7 +275,6 @@ class _Robot:
         except Exception as error:
             self._fail(socket, error, say)
             return
-        self._tick = time.monotonic()
         self._tell(socket, pack("began", episode=self._episode, obs=obs))
 
     def _act(self, socket: Any, message: Mapping[str, Any], say: Callable[[str], None]) -> None:
@@ -304,7 +306,11 @@ class _Robot:
 
     def _move(self, socket: Any, action: np.ndarray, say: Callable[[str], None], *, late: bool) -> None:
         step = len(self._answers) - 1
-        self.log.write(episode=self._episode, step=step, action=action, late=late, time=time.time())
+        if step == 0:
+            self._tick = time.monotonic()
+        self.log.write(
+            episode=self._episode, step=step, action=action, late=late, time=time.time(), clock=time.monotonic()
+        )
         try:
             told = self._by_clock(action, late=late) if self.rhythm else self._at_once(action)
         except Exception as error:

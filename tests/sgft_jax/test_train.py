@@ -386,9 +386,9 @@ def test_members_share_simulated_rows():
     """No array of the compiled program holds a set of rows for each member."""
     fine, n, members = make(simulation=NEEDS), 1009, 7
     seeds, simulated = jnp.arange(members, dtype=jnp.uint32), rows_of(n)
-    steps = train._Steps(fine, Scripted([]), PRIORS, seeds, simulated)
+    learning = train.Updates(fine, seeds, train.prior_of(PRIORS, seeds), simulated)
     states = jax.eval_shape(lambda: train.begin(fine, PRIORS, seeds, simulated)).agent
-    program = steps._learn.lower(states, steps._keys(2, 0), 1, simulated, False).as_text()
+    program = learning._learn.lower(states, jax.random.split(jax.random.key(0), members), 1, simulated, False).as_text()
     assert set(re.findall(rf"tensor<([\dx]*){n}x", program)) == {"2x"}  # two priors, no member
 
 

@@ -191,6 +191,8 @@ def test_a_learner_that_does_not_answer_ends_the_episode(pair):
     own = pair(Arm(), period=0.01, patience=3)
     begin(own, 0)
     time.sleep(0.3)
+    assert not move(own, RIGHT).info["late"]  # the clock starts with the first command
+    time.sleep(0.3)
     moved = [move(own, RIGHT) for _ in range(3)]
     assert [x.truncated for x in moved] == [False, False, True] and all(x.info["late"] for x in moved)
     assert own.driver.stops and any("in a row" in line for line in own.said)
@@ -242,7 +244,8 @@ def test_a_connection_lost_between_steps_ends_the_episode_though_the_robot_is_ba
 
 def hello(remote, **changes):
     fields = {
-        "version": 1, "token": remote.token, "robot": "r", "obs_size": 2, "action_size": 2, "period": None, **changes,
+        "version": 1, "token": remote.token, "robot": "r", "obs_size": 2, "action_size": 2, "answer_within": None,
+        **changes,
     }  # fmt: skip
     with connect(remote.url) as socket:
         socket.send(pack("hello", **fields))
@@ -284,7 +287,7 @@ def test_nonsense_changes_nothing(pair):
     own = pair(Point())
     begin(own, 0)
     rng = np.random.default_rng(0)
-    good = pack("hello", version=1, token="x", robot="r", obs_size=2, action_size=2, period=None)
+    good = pack("hello", version=1, token="x", robot="r", obs_size=2, action_size=2, answer_within=None)
     with contextlib.suppress(Exception):
         for _ in range(20):
             with connect(own.remote.url) as socket:

@@ -1,0 +1,269 @@
+"""`--real remote`: a robot's every step is on disk, a kill loses and repeats nothing, another process learns."""
+
+import json
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import toy
+from priors_by_hand import save_prior
+
+pytest.importorskip("gymnasium", reason="make setup EXTRAS=dev, or pip install 'sgft-jax[gymnasium]'")
+
+from envs.adapters.gymnasium import TaskEnv
+from envs.gaps import Gap
+from experiments import cli, evaluate, finetune, finetune_args, real_systems
+from experiments.recorded import Recorded
+from sgft_jax.io.real import RealStore
+from sgft_jax.systems.gymnasium import Gymnasium
+from sgft_jax.systems.robot_client import play
+from sgft_jax.types import Policy, UserError
+
+TASK = str(Path(toy.__file__).resolve())
+T = 20
+OPTIONS = f"""--task {TASK} --method sac --seeds 1 --rollouts 3 --checkpoint-every 2 --options.initial-rollouts 1
+    --options.utd 0.2 --options.batch-size 8 --options.critic-warmup 0 --options.replay-capacity 128 --devices 1"""
+TURNED = Gap("turned", {}, {"action_rotation": 0.4})
+
+
+class Driver:
+    """A simulated robot; counts the steps that it makes."""
+
+    obs_size, action_size = 4, 2
+
+    def __init__(self):
+        self.env, self.starts, self.steps = TaskEnv(toy.make(), TURNED), [], 0
+
+    def reset(self, seed):
+        self.starts.append(seed)
+        return self.env.reset(seed=seed)[0]
+
+    def step(self, action):
+        self.steps += 1
+        return self.env.step(action)
+
+    def stop(self):
+        pass
+
+
+class Breaking(TaskEnv):
+    """A robot at whose n-th step the process that asks for it dies."""
+
+    def __init__(self, after):
+        super().__init__(toy.make(), TURNED)
+        self.left = after
+
+    def step(self, action):
+        self.left -= 1
+        if self.left < 0:
+            raise KeyboardInterrupt
+        return super().step(action)
+
+
+def still(actions):
+    return Policy(lambda: (), lambda state, carry, obs, key, *, explore: (state * obs[:actions], carry))
+
+
+# --- steps on disk ----------------------------------------------------------------------------------------------------
+
+
+def rollouts(folder, after, *, count, done=0):
+    """As many rollouts of a robot that breaks after so many steps."""
+    env = toy.make()
+    robot = Recorded(Gymnasium(env, Breaking(after), gamma=0.9), [RealStore(folder)], done=done, sync_every=1)
+    keys = jax.random.split(jax.random.key(0), (1, count))
+    return robot.play(still(env.act_dim), np.array([-0.5]), keys, explore=True)
+
+
+def test_what_a_kill_leaves_of_a_rollout_is_a_rollout_and_its_next_step_is_in_doubt(tmp_path):
+    whole = rollouts(tmp_path / "whole", 10**6, count=2)
+    with pytest.raises(KeyboardInterrupt):
+        rollouts(tmp_path / "cut", T + 7, count=2)
+    assert [path.suffix for path in sorted((tmp_path / "cut/real").iterdir())] == [".npz", ".jsonl"]
+    cut = rollouts(tmp_path / "cut", 0, count=2)  # nothing is played again
+    assert [path.suffix for path in sorted((tmp_path / "cut/real").iterdir())] == [".npz", ".npz"]
+    np.testing.assert_array_equal(cut.valid.sum(2), [[T, 7]])
+    np.testing.assert_array_equal(cut.exploded, [[False, True]])
+    for name in ("obs", "action", "reward", "discount", "next_obs"):
+        expected, found = (np.asarray(getattr(x.transitions, name)) for x in (whole, cut))
+        np.testing.assert_array_equal(found[0, 0], expected[0, 0])
+        np.testing.assert_array_equal(found[0, 1, :7], expected[0, 1, :7])
+        assert not found[0, 1, 7:].any()
+
+
+def test_a_rollout_that_was_over_when_its_writer_died_is_whole(tmp_path):
+    whole = rollouts(tmp_path, 10**6, count=1)
+    store = RealStore(tmp_path)
+    played = store.load(0)
+    steps = Gymnasium(toy.make(), Breaking(10**6), gamma=0.9).steps(
+        still(2), np.array([-0.5]), jax.random.split(jax.random.key(0), (1, 1))[:, 0], explore=True
+    )
+    with store.journal(1) as journal:
+        for step in steps:
+            journal.append(step._asdict())
+    again = rollouts(tmp_path, 0, count=1, done=1)
+    jax.tree.map(np.testing.assert_array_equal, again.transitions, whole.transitions)
+    assert not again.exploded.any() and len(store) == 2
+    assert played["asked"].shape == (1, T, 2) and played["late"].shape == played["time"].shape == (1, T)
+    assert (np.diff(played["time"]) >= 0).all()
+
+
+def test_a_torn_line_is_left_out_and_a_damaged_one_named(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        rollouts(tmp_path, 5, count=1)
+    path = next(tmp_path.glob("real/*.jsonl"))
+    text = path.read_text()
+    path.write_text(text[:-20])
+    assert len(RealStore(tmp_path).journal(0).read()) == 4
+    path.write_text(text.replace('"reward"', '"reward', 1))
+    with pytest.raises(UserError, match=r"steps\.jsonl: damaged: .*move it away"):
+        rollouts(tmp_path, 5, count=1)
+
+
+# --- the command ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def robot(monkeypatch, tmp_path):
+    """A robot that waits for a learner under tmp_path / runs, from now on."""
+    monkeypatch.setattr(cli, "set_up", lambda: None)
+    monkeypatch.setattr(os, "environ", os.environ.copy())
+    home, threads = tmp_path / "runs", []
+    token = real_systems.token(home)
+    assert stat.S_IMODE((home / "robot-token").stat().st_mode) == 0o600 and real_systems.token(home) == token
+
+    def start(port, **options):
+        driver = Driver()
+        given = {"token": token, "retry": 0.05, "say": lambda line: None, **options}
+        thread = threading.Thread(target=play, args=(driver, f"ws://127.0.0.1:{port}"), kwargs=given, daemon=True)
+        thread.start()
+        threads.append(thread)
+        return driver
+
+    yield start
+    for thread in threads:
+        thread.join(timeout=10)
+
+
+@pytest.fixture
+def port():
+    """A free one."""
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+def run(tmp_path, port, *more):
+    home = tmp_path / "runs"
+    if not (home / "prior/seed-0").exists():
+        save_prior(home / "prior/seed-0", 0)
+    given = ["--real", f"remote::{port}", "--prior", str(home / "prior"), "--out", str(home), *more]
+    finetune.main([*OPTIONS.split(), *given])
+    return home / "finetune/toy/remote/sac/seed-0"
+
+
+@pytest.mark.slow
+def test_a_robot_is_fine_tuned_and_costs_no_evaluation(robot, port, tmp_path):
+    driver = robot(port)
+    folder = run(tmp_path, port)
+    assert driver.steps == 3 * T and len(driver.starts) == len(set(driver.starts)) == 3
+    names = sorted(path.name for path in (folder / "real").iterdir())
+    assert names == [f"rollout-00000{i}.npz" for i in range(3)]
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["final"]["rollouts"] == 3 and summary["real_steps"] == [3 * T]
+    assert (folder / "best/seed-0/prior.json").exists() and not (folder / "evaluation").exists()
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert [line["rollouts"] for line in lines] == [1, 2, 3]
+    assert len(os.sched_getaffinity(0)) == len(os.sched_getaffinity(os.getppid()))  # nobody is pinned any longer
+
+
+@pytest.mark.slow
+def test_a_killed_learner_goes_on_with_what_the_robot_has_done(port, tmp_path):
+    """Kill -9 in the second rollout: its steps are kept, none is made twice, and the run has all three rollouts."""
+    home = tmp_path / "runs"
+    save_prior(home / "prior/seed-0", 0)
+    log = tmp_path / "commands.log"
+    code = (
+        "import sys; sys.path[:0] = [sys.argv[3], sys.argv[4]]; from test_remote_real import Driver; "
+        "from sgft_jax.systems.robot_client import play; import time\n"
+        "class Slow(Driver):\n"
+        "    def step(self, action):\n"
+        "        time.sleep(0.05); return super().step(action)\n"
+        "print(play(Slow(), sys.argv[1], token=sys.argv[2], retry=0.05, log=sys.argv[5]))"
+    )
+    tests = Path(__file__).parent
+    token, url = real_systems.token(home), f"ws://127.0.0.1:{port}"
+    client = subprocess.Popen([sys.executable, "-c", code, url, token, str(tests), str(tests.parent), str(log)])
+    command = [
+        sys.executable, "-m", "experiments.finetune", *OPTIONS.split(), "--real", f"remote::{port}", "--prior",
+        str(home / "prior"), "--out", str(home),
+    ]  # fmt: skip
+    first = subprocess.Popen(command)
+    folder = home / "finetune/toy/remote/sac/seed-0"
+    journal = folder / "real/rollout-000001.steps.jsonl"
+    while first.poll() is None and (not journal.exists() or journal.read_text().count("\n") < 8):
+        time.sleep(0.01)
+    first.send_signal(signal.SIGKILL)
+    assert first.wait() == -signal.SIGKILL
+    kept = journal.read_text().count("\n") - 1
+    subprocess.run([*command, "--resume"], check=True)
+    assert client.wait(timeout=30) == 0
+    store = RealStore(folder)
+    assert len(store) == 3 and [int(store.load(i)["valid"].sum()) for i in range(3)] == [T, kept, T]
+    import msgpack
+
+    with open(log, "rb") as file:
+        commanded = list(msgpack.Unpacker(file))
+    assert len(commanded) - (2 * T + kept) in (0, 1)  # at most one that the robot made and nobody learned from
+
+
+@pytest.mark.slow
+def test_a_policy_may_change_between_steps(robot, port, tmp_path):
+    robot(port)
+    folder = run(tmp_path, port, "--hand-over", "steps", "--eval-episodes", "1", "--eval-every", "2")
+    assert len(RealStore(folder)) == 3
+    assert sorted(path.name for path in (folder / "evaluation").iterdir()) == [
+        f"rollouts-00000{i}" for i in (0, 1, 2, 3)
+    ]
+
+
+@pytest.mark.slow
+def test_what_an_evaluation_makes_a_robot_do_is_kept(robot, port, tmp_path):
+    robot(port)
+    save_prior(tmp_path / "prior", 0)
+    args = evaluate.EvaluateArgs(
+        task=TASK, prior=tmp_path / "prior", real=(f"remote::{port}",), episodes=2, out=tmp_path / "runs"
+    )
+    (system,) = evaluate.evaluate(args)["systems"]
+    assert system["real_steps"] == 2 * T
+    assert len(RealStore(tmp_path / "runs/evaluate/toy/remote")) == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"seeds": 2}, "--seeds 2: one robot plays one seed"),
+        ({"real": ("remote", "default")}, "cannot be played together"),
+        ({"real": ("remote", "gymnasium:A-v0")}, "cannot be played together"),
+        ({"real": ("remote", "remote::1")}, "one robot at a time"),
+        ({"real": ("remote:here:there",)}, "write remote, remote:HOST or remote:HOST:PORT"),
+        ({"set": ("mass=2",)}, "nothing here can change a robot"),
+        ({"hand_over": "steps", "method": "guarded"}, "a guard judges rollouts by one policy"),
+        ({"hand_over": "steps", "real": ("sim",)}, "only a robot plays while something learns"),
+        ({"sync_every": 0}, "--sync-every is 0"),
+    ],
+    ids=str,
+)
+def test_what_a_robot_cannot_do_is_refused_in_one_line(changes, said, tmp_path):
+    given = {"task": "push", "method": "sac", "real": ("remote",), "seeds": 1, "out": tmp_path} | changes
+    with pytest.raises(UserError, match=said):
+        finetune_args.check(finetune_args.arguments(given.pop("method"), **given))

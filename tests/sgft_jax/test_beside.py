@@ -1,0 +1,110 @@
+"""A learner that works while the robot plays: the same results if the robot waits, and what it does if not."""
+
+import functools
+import os
+import signal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import test_train
+from test_train import FINE, PRIORS, SEEDS, make, run, simulated
+from tuners import bits
+
+from sgft_jax.learner_process import LearnerProcess, cores
+from sgft_jax.train import Updates, prior_of
+from sgft_jax.types import UserError
+
+WHICH = prior_of(PRIORS, SEEDS)
+
+
+class Inline:
+    """Learns at once, in this process; `result` is ready when a test says so."""
+
+    def __init__(self, finetuner, *, ready=True):
+        self.updates, self.is_ready, self.parts = Updates(finetuner, SEEDS, WHICH, None), ready, []
+
+    def submit(self, agent, parts, updates, *, offline):
+        self.parts.append(list(parts))
+        self.learned = self.updates(jax.tree.map(jnp.copy, agent), parts, updates, offline=offline)
+
+    def ready(self):
+        return self.is_ready
+
+    def result(self):
+        return self.learned
+
+
+class Stepped:
+    """The simulation as a system that asks for the agent; keeps what it was given."""
+
+    def __init__(self):
+        self.asked = []
+
+    def play(self, policy, states, keys, *, explore):
+        states = states() if callable(states) else states
+        self.asked.append(np.asarray(states.agent.learner if hasattr(states, "agent") else states.learner))
+        return simulated().play(policy, states, keys, explore=explore)
+
+
+@pytest.mark.parametrize("changes", [{}, {"initial_rollouts": 3}, {"guard": True}], ids=str)
+def test_a_robot_that_waits_for_its_policy_gives_the_same_bits(changes):
+    finetuner = make(**changes)
+    learner = Inline(finetuner, ready=False)
+    expected = run(finetuner, rollouts=5)
+    found = run(finetuner, Stepped(), rollouts=5, learner=learner)
+    assert len(found) == len(expected)
+    for own, other in zip(found, expected, strict=True):
+        assert bits(own) == bits(other)
+    first = changes.get("initial_rollouts", 1)
+    assert learner.parts == [list(range(first)), *[[i] for i in range(first, 5)]]
+
+
+def test_a_run_with_another_learner_goes_on_with_the_same_bits():
+    whole = run(rollouts=4)
+    rest = run(rollouts=4, system=Stepped(), learner=Inline(FINE), progress=jax.tree.map(jnp.asarray, whole[2][0]))
+    assert [int(p.rollouts) for p, _ in rest] == [3, 4] and bits(rest[-1]) == bits(whole[-1])
+
+
+def test_a_robot_that_does_not_wait_plays_with_what_there_is():
+    """Three updates a rollout, of one each: the first two rollouts are the fresh agent's, then it is one behind."""
+    system = Stepped()
+    found = run(system=system, rollouts=4, learner=Inline(FINE, ready=False), waits=False)
+    np.testing.assert_allclose([x[1] for x in system.asked], [0, 0, 3, 6], atol=0.1)
+    np.testing.assert_allclose([p.agent.learner[1] for p, _ in found], [0, 3, 6, 9, 12], atol=0.1)
+    ready = Stepped()
+    run(system=ready, rollouts=4, learner=Inline(FINE), waits=False)
+    np.testing.assert_allclose([x[1] for x in ready.asked], [0, 3, 6, 9], atol=0.1)
+
+
+# --- the process ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def process(monkeypatch):
+    """A learner in a process of its own, for the agent of these tests."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([os.path.dirname(test_train.__file__), *_paths()]))
+    before, made = cores(), LearnerProcess(make, SEEDS, WHICH, None)
+    yield made
+    made.close()
+    assert cores() == before
+
+
+def _paths():
+    return [os.path.dirname(os.path.dirname(test_train.__file__))]
+
+
+@pytest.mark.slow
+def test_a_process_learns_the_same(process):
+    expected, found = run(rollouts=3), run(system=Stepped(), rollouts=3, learner=process)
+    for own, other in zip(found, expected, strict=True):
+        jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-6), own, other)
+    assert len(cores()) == 1  # the others are for the learner
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_is_said_in_one_line(process):
+    os.kill(process._process.pid, signal.SIGKILL)
+    with pytest.raises(UserError, match=r"process is gone \(exit code -9\); nothing that the robot did is lost"):
+        run(system=Stepped(), rollouts=3, learner=process)
