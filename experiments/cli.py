@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import difflib
+import errno
 import importlib
 import logging
 import os
@@ -24,6 +25,7 @@ from tyro import _errors
 from sgft_jax.types import UserError, unknown
 
 BROKEN_PIPE, USER_ERROR, INTERRUPTED = 1, 2, 130
+_FULL = os.strerror(errno.ENOSPC)  # "No space left on device"
 _CACHE_VARIABLE = "SGFT_CACHE_DIR"
 _RENDER_PROBE = "import mujoco; c = mujoco.GLContext(16, 16); c.make_current(); c.free()"
 
@@ -56,10 +58,21 @@ def run_main[T](
         except UserError as error:
             fail(str(error))
         except Exception as error:
+            if said := _disk_trouble(error):
+                fail(f"{said}; when that is mended, the same command with --resume goes on")
             if not _is_out_of_memory(error):
                 raise
             said = (str(error).strip() or "MemoryError").splitlines()[0]
             fail(f"out of memory ({said}): lower the batch size, the number of environments or of seeds")
+
+
+def _disk_trouble(error: BaseException | None) -> str | None:
+    """What is wrong where a file could not be written; also as the cause of another error. None for anything else."""
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
+        return f"{error.filename or 'a file of the run'}: {(error.strerror or 'cannot be written').lower()}"
+    if _FULL in str(error):  # Orbax has another type for it
+        return f"a file of the run: {_FULL.lower()}"
+    return None if error is None else _disk_trouble(error.__cause__)
 
 
 def _is_out_of_memory(error: Exception) -> bool:

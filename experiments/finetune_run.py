@@ -63,7 +63,7 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
             playing = real_systems.connect(
                 env, args.real, args.set, members=len(seeds), gamma=card["gamma"], home=args.out
             )
-            last.callback(playing.close)
+            last.push(lambda error, *_: playing.close(over=error is None))
             members, cost = seeds * len(args.real), args.eval_episodes
         setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
         assert isinstance(setup.system, Simulated | Gymnasium)

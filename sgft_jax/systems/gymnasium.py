@@ -63,7 +63,8 @@ class Gymnasium:
     from. An environment with a method `rest` hears when its episode is over.
 
     env: the task. real: an environment, several, or a vector environment with one for each member; or a robot behind a
-    socket, `Remote`. A vector environment also steps members whose episode is over. gamma: discount factor of the transitions, that of the prior.
+    socket, `Remote`. A vector environment also steps members whose episode is over. gamma: discount factor of the
+    transitions, that of the prior.
     observe: what an environment returns -> [measured_dim], in the order and units of `env.measured`. Default: a Box
     as it is, a Dict in the order of the task's entries, which must be its keys.
     Raises UserError for spaces that do not fit the task.
@@ -160,9 +161,9 @@ class Gymnasium:
             trace=jnp.zeros((len(valid), env.episode_length + 1, 0)),
         )
 
-    def close(self) -> None:
-        """Closes the environments."""
-        self._real.close()
+    def close(self, *, over: bool = True) -> None:
+        """Closes the environments. over: False where the run goes on another time, for which a robot then waits."""
+        self._real.close(over=over)
 
     def _check_speed(self, act: Callable[[], Any], allowed: float) -> None:
         """Raises UserError where an action takes longer than a robot waits for it. The first call compiles."""
@@ -322,8 +323,8 @@ class _Real(Protocol):
         """No step follows before the next reset."""
         ...
 
-    def close(self) -> None:
-        """The end."""
+    def close(self, *, over: bool) -> None:
+        """The end, or, where it is not over, one on this side."""
         ...
 
 
@@ -358,9 +359,9 @@ class _Each:
         for one in self.each:
             getattr(one, "rest", _nothing)()
 
-    def close(self) -> None:
+    def close(self, *, over: bool) -> None:
         for one in self.each:
-            one.close()
+            getattr(one, "close" if over else "leave", one.close)()
 
 
 class _Vector:
@@ -392,7 +393,7 @@ class _Vector:
     def rest(self) -> None:
         pass
 
-    def close(self) -> None:
+    def close(self, *, over: bool) -> None:
         self.real.close()
 
     def _split(self, obs: Any) -> list[Any]:

@@ -23,6 +23,7 @@ from sgft_jax.systems.robot_client import LIMIT, VERSION, array, pack, unpack
 from sgft_jax.types import UserError
 
 _HELLO = 10.0  # seconds for the first message
+_SAY_EVERY = 10.0  # seconds between two lines about refused connections
 _GONE = {"type": "gone"}
 
 
@@ -41,6 +42,13 @@ class Box(NamedTuple):
     def dtype(self) -> np.dtype:
         """That of the bounds."""
         return self.low.dtype
+
+
+class _Refusal(NamedTuple):
+    """Why a robot is not taken. final: it need not try again."""
+
+    reason: str
+    final: bool
 
 
 class _Link(NamedTuple):
@@ -77,6 +85,7 @@ class Remote:
         self._lock, self._there = threading.Lock(), threading.Event()
         self._link: _Link | None = None  # to the robot that is connected now
         self._played: _Link | None = None  # to the one that began the episode: no other knows its steps
+        self._refused, self._said = 0, -_SAY_EVERY  # connections since the last line about them, and when that was
         self._episode, self._step = 0, 0
         self._obs = np.zeros(obs_size, np.float32)
         self.answer_within: float | None = None  # seconds in which the connected robot wants a command
@@ -129,6 +138,10 @@ class Remote:
         """Ends the run on both sides."""
         if (link := self._link) is not None:
             link.send(pack("end"))
+        self.leave()
+
+    def leave(self) -> None:
+        """Ends it on this side; the robot stops, and waits until somebody goes on with the run."""
         self._server.shutdown()
         self._thread.join()
 
@@ -178,10 +191,10 @@ class Remote:
     def _serve(self, connection: ServerConnection) -> None:
         """One connection, from its first message to its end."""
         link = _Link(connection, queue.SimpleQueue())
-        reason = self._admit(link)
-        if reason is not None:
-            self._say(f"refused a connection: {reason}")
-            link.send(pack("refused", reason=reason[:500]))
+        refusal = self._admit(link)
+        if refusal is not None:
+            self._say_refused(refusal.reason)
+            link.send(pack("refused", reason=refusal.reason[:500], final=refusal.final))
             return
         try:
             link.send(pack("welcome"))
@@ -202,25 +215,38 @@ class Remote:
                 self._there.clear()
                 self._link = None
 
-    def _admit(self, link: _Link) -> str | None:
+    def _say_refused(self, reason: str) -> None:
+        """One line, but not one for each of very many."""
+        with self._lock:
+            self._refused += 1
+            now, count = time.monotonic(), self._refused
+            if now - self._said < _SAY_EVERY:
+                return
+            self._refused, self._said = 0, now
+        more = f" ({count - 1} others before it)" if count > 1 else ""
+        self._say(f"refused a connection: {reason}{more}")
+
+    def _admit(self, link: _Link) -> _Refusal | None:
         """Takes a robot that fits as the one robot; else says why not."""
         try:
             said = unpack(link.connection.recv(timeout=_HELLO))
         except (ValueError, TimeoutError) as error:
-            return f"its first message {error or 'did not come'}"
+            return _Refusal(f"its first message {error or 'did not come'}", final=False)
+        except ConnectionClosed:
+            return _Refusal("it was closed before its first message", final=False)
         if said["type"] != "hello":
-            return f"its first message is {said['type']}, not hello"
+            return _Refusal(f"its first message is {said['type']}, not hello", final=True)
         if not hmac.compare_digest(said["token"].encode(), self.token.encode()):
-            return "wrong token"
+            return _Refusal("wrong token", final=True)
         for name, own, theirs in (
             ("protocol version", VERSION, said["version"]),
             ("numbers measured", self.obs_size, said["obs_size"]),
             ("numbers commanded", self.action_size, said["action_size"]),
         ):
             if own != theirs:
-                return f"{said['robot']}: {name}: the robot has {theirs}, the learner {own}"
+                return _Refusal(f"{said['robot']}: {name}: the robot has {theirs}, the learner {own}", final=True)
         with self._lock:
-            if self._link is not None:
-                return f"{said['robot']}: another robot is connected"
+            if self._link is not None:  # perhaps it is the same one, and its lost connection has not been noticed yet
+                return _Refusal(f"{said['robot']}: another robot is connected", final=False)
             self._link, self.answer_within = link, said["answer_within"]
         return None

@@ -40,7 +40,7 @@ _SHAPES: dict[str, dict[str, Any]] = {  # what each message holds; a tuple names
         "answer_within": (float, type(None)),
     },
     "welcome": {},
-    "refused": {"reason": str},
+    "refused": {"reason": str, "final": bool},
     "reset": {"episode": int, "seed": int},
     "began": {"episode": int, "obs": bytes},
     "act": {"episode": int, "step": int, "action": bytes},
@@ -176,7 +176,9 @@ def play(
                     socket.send(hello)
                     answer = unpack(socket.recv(timeout=10))
                     if answer["type"] == "refused":
-                        raise RefusedError(answer["reason"])
+                        if answer["final"]:
+                            raise RefusedError(answer["reason"])
+                        raise ValueError(answer["reason"])
                     say(f"connected to {url}")
                     robot.serve(socket, say)
                     return robot.counts

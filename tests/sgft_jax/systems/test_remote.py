@@ -264,7 +264,8 @@ def hello(remote, **changes):
 def test_a_robot_that_does_not_fit_is_refused(changes, reason):
     said = []
     remote = Remote(2, 2, say=said.append)
-    assert reason in hello(remote, **changes)["reason"] and reason in said[-1]
+    refused = hello(remote, **changes)
+    assert refused["final"] and reason in refused["reason"] and reason in said[-1]
     assert remote.token not in said[-1]
     remote.close()
 
@@ -279,8 +280,26 @@ def test_the_client_says_why_it_was_refused():
 def test_there_is_one_robot(pair):
     own = pair(Point())
     begin(own, 0)
-    assert "another robot" in hello(own.remote)["reason"]
+    refused = hello(own.remote)
+    assert "another robot" in refused["reason"] and not refused["final"]  # perhaps it is the same one, back again
     assert move(own, RIGHT).obs[0] == 1
+
+
+def test_connections_that_talk_nonsense_are_refused_in_one_line():
+    said = []
+    remote = Remote(2, 2, say=said.append)
+    for _ in range(30):
+        with connect(remote.url) as socket:
+            socket.send(b"nonsense")
+            assert not unpack(socket.recv(timeout=5))["final"]
+    assert sum("refused" in line for line in said) == 1
+    thread = threading.Thread(
+        target=play, args=(Point(), remote.url), kwargs={"token": remote.token, "say": lambda line: None}, daemon=True
+    )
+    thread.start()
+    remote.reset(seed=0)
+    remote.close()
+    thread.join(timeout=10)
 
 
 def test_nonsense_changes_nothing(pair):

@@ -1,0 +1,52 @@
+"""How well a robot's clock was kept, from the log of its commands."""
+
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from experiments.reliable.runs import Trial
+
+_BUSY = ("--options.utd", "400", "--hand-over", "steps")  # the learner never rests while the robot plays
+_PATIENCE = 600.0  # seconds for a run
+WHEEL_LEGGED = 4, 1  # numbers that the task measures and commands
+
+
+def kept_clock(
+    home: Path, *, period: float, rollouts: int, task: str | None = None, sizes: tuple[int, int] = (3, 1)
+) -> dict[str, Any]:
+    """A run with a busy learner on the same cores: lateness, and jitter of the period in ms."""
+    trial = Trial(home, period=period, rollouts=rollouts, sizes=sizes, more=_BUSY, **({"task": task} if task else {}))
+    try:
+        trial.start_robot()
+        trial.start_player()
+        trial.finish(_PATIENCE)
+    finally:
+        trial.stop()
+    log = home / "commands.log"
+    off = 1e3 * np.abs(periods(log) - period)
+    middle, most, worst = np.percentile(off, [50, 99, 100])
+    names = ("median ms", "99 % ms", "worst ms")
+    return {"Hz": 1 / period, "steps": len(off), **dict(zip(names, (middle, most, worst), strict=True)),
+            "late": late_share(log), **trial.audit()._asdict()}  # fmt: skip
+
+
+def commands(log: Path) -> Iterator[dict[str, Any]]:
+    """What the robot's client has written down before it sent it."""
+    with open(log, "rb") as file:
+        yield from msgpack.Unpacker(file)
+
+
+def late_share(log: Path) -> float:
+    """The share of steps for which no command came in time."""
+    return float(np.mean([one["late"] for one in commands(log)]))
+
+
+def periods(log: Path) -> np.ndarray:
+    """Seconds between the commands of every two steps that follow each other in an episode."""
+    pairs = itertools.pairwise(commands(log))
+    follow = [(a, b) for a, b in pairs if b["episode"] == a["episode"] and b["step"] == a["step"] + 1]
+    return np.array([b["clock"] - a["clock"] for a, b in follow])
