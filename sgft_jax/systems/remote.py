@@ -23,6 +23,7 @@ from sgft_jax.systems.robot_client import LIMIT, VERSION, array, pack, unpack
 from sgft_jax.types import UserError
 
 _HELLO = 10.0  # seconds for the first message
+_RESTS = 5  # times a robot is told to rest before it is left alone: without commands it stops by itself
 _SAY_EVERY = 10.0  # seconds between two lines about refused connections
 _GONE = {"type": "gone"}
 
@@ -70,16 +71,18 @@ class Remote:
     [action_size]; "late", if no command came in time; "is_success", if the robot knows; and "invalid" where the outcome
     is in doubt: that step is not to be learned from.
 
-    obs_size, action_size: of the task; a robot with others is refused. host: interface to listen at, default this
+    obs_size, action_size: of the task; a robot with others is refused. steps: after so many the robot ends an episode
+    by itself, so that it does not go on when messages are lost. host: interface to listen at, default this
     computer alone. port: 0 chooses a free one. token: what the robot must know, default a fresh one. again: seconds
     after which an unanswered message is repeated. say: hears one line about everything unusual.
     Raises UserError where the port is taken.
     """
 
     def __init__(
-        self, obs_size: int, action_size: int, *, host: str = "127.0.0.1", port: int = 0, token: str | None = None,
-        again: float = 1.0, say: Callable[[str], None] = print,
+        self, obs_size: int, action_size: int, *, steps: int | None = None, host: str = "127.0.0.1", port: int = 0,
+        token: str | None = None, again: float = 1.0, say: Callable[[str], None] = print,
     ) -> None:  # fmt: skip
+        self._steps = steps
         self.obs_size, self.action_size, self.token = obs_size, action_size, token or secrets.token_hex(16)
         self._again, self._say = again, say
         self._lock, self._there = threading.Lock(), threading.Event()
@@ -107,7 +110,7 @@ class Remote:
         while True:
             self._played = self._wait()
             self._episode, self._step = self._episode + 1, 0
-            said = self._ask(pack("reset", episode=self._episode, seed=seed), "began")
+            said = self._ask(pack("reset", episode=self._episode, seed=seed, steps=self._steps), "began")
             if said is not None:
                 self._obs = said["obs"]
                 return self._obs, {}
@@ -127,9 +130,9 @@ class Remote:
         return self._obs, reward, said["terminated"], said["truncated"], info
 
     def rest(self) -> None:
-        """Stops the robot until the next episode."""
+        """Stops the robot until the next episode; waits a moment for its answer."""
         if self._played is not None:
-            self._played.send(pack("rest", episode=self._episode))
+            self._ask(pack("rest", episode=self._episode), "rested", tries=_RESTS)
 
     def __str__(self) -> str:
         return f"robot at {self.url}"
@@ -154,8 +157,11 @@ class Remote:
             self._there.wait()
         return link
 
-    def _ask(self, message: bytes, answer: str) -> Mapping[str, Any] | None:
-        """The answer to a message of this episode and step; None if the robot is gone or has failed."""
+    def _ask(self, message: bytes, answer: str, tries: int | None = None) -> Mapping[str, Any] | None:
+        """The answer to a message of this episode and step; None if the robot is gone or has failed.
+
+        tries: how often it is said at most.
+        """
         assert self._played is not None, "call reset first"
         link = self._played
         link.send(message)
@@ -163,18 +169,21 @@ class Remote:
             try:
                 said = link.inbox.get(timeout=self._again)
             except queue.Empty:
+                if tries is not None and (tries := tries - 1) <= 0:
+                    return None
                 link.send(message)
                 continue
             if said is _GONE:
                 link.inbox.put(_GONE)  # it stays the last one
-                self._say(f"the robot is gone in episode {self._episode} before the outcome of step {self._step}")
+                if answer != "rested":
+                    self._say(f"the robot is gone in episode {self._episode} before the outcome of step {self._step}")
                 return None
             if said["episode"] != self._episode:
                 continue  # of before
-            if said["type"] == "failed":
+            if said["type"] == "failed" and answer != "rested":
                 self._say(f"the robot has stopped: {said['reason']}")
                 return None
-            if said["type"] == answer and said.get("step", 0) == self._step:
+            if said["type"] == answer and said.get("step", self._step) == self._step:
                 try:
                     return self._read(said)
                 except ValueError as error:
@@ -205,7 +214,7 @@ class Remote:
                 except ValueError as error:
                     self._say(f"ignored: a message of the robot {error}")
                     continue
-                if message["type"] in ("began", "moved", "failed"):
+                if message["type"] in ("began", "moved", "rested", "failed"):
                     link.inbox.put(message)
         except ConnectionClosed:
             pass

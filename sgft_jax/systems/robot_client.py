@@ -41,7 +41,7 @@ _SHAPES: dict[str, dict[str, Any]] = {  # what each message holds; a tuple names
     },
     "welcome": {},
     "refused": {"reason": str, "final": bool},
-    "reset": {"episode": int, "seed": int},
+    "reset": {"episode": int, "seed": int, "steps": (int, type(None))},
     "began": {"episode": int, "obs": bytes},
     "act": {"episode": int, "step": int, "action": bytes},
     "moved": {
@@ -49,6 +49,7 @@ _SHAPES: dict[str, dict[str, Any]] = {  # what each message holds; a tuple names
         "truncated": bool, "success": (bool, type(None)), "late": bool,
     },
     "rest": {"episode": int},
+    "rested": {"episode": int},
     "failed": {"episode": int, "reason": str},
     "end": {},
 }  # fmt: skip
@@ -232,7 +233,7 @@ class _Robot:
         self._failed: bytes | None = None
         self._last = np.zeros(driver.action_size, np.float32)
         self._tick = 0.0
-        self._lates = 0
+        self._lates, self._most = 0, None  # _most: steps after which an episode is over, whether it is told so or not
 
     def serve(self, socket: Any, say: Callable[[str], None]) -> None:
         """Answers until the learner ends the run."""
@@ -246,6 +247,7 @@ class _Robot:
             elif message["type"] == "rest":
                 self._over = True
                 self.driver.stop()
+                _send(socket, pack("rested", episode=message["episode"]))
             elif message["type"] == "reset":
                 self._reset(socket, message, say)
             elif message["type"] == "act":
@@ -270,6 +272,7 @@ class _Robot:
             return
         self.driver.stop()
         self._episode, self._over, self._lates = message["episode"], False, 0
+        self._most = message["steps"]
         self._answers, self._failed = [], None
         self._last = np.zeros(self.driver.action_size, np.float32)
         try:
@@ -325,6 +328,7 @@ class _Robot:
         if self.rhythm and self._lates >= self.rhythm.patience:
             say(f"{self._lates} steps in a row without a command in time; the episode ends here")
             told["truncated"] = True
+        told["truncated"] |= step + 1 == self._most
         if told["terminated"] or told["truncated"]:
             self._over = True
             self.driver.stop()

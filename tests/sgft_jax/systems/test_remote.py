@@ -63,7 +63,9 @@ class Pair:
 
     def __init__(self, driver, **options):
         self.said, self.driver = [], driver
-        self.remote = Remote(2, 2, again=options.pop("again", 5.0), say=self.said.append)
+        self.remote = Remote(
+            2, 2, steps=options.pop("steps", None), again=options.pop("again", 5.0), say=self.said.append
+        )
         self.counts, self.options = None, options
         self.thread = threading.Thread(target=self.run, daemon=True)
         self.thread.start()
@@ -196,6 +198,29 @@ def test_a_learner_that_does_not_answer_ends_the_episode(pair):
     moved = [move(own, RIGHT) for _ in range(3)]
     assert [x.truncated for x in moved] == [False, False, True] and all(x.info["late"] for x in moved)
     assert own.driver.stops and any("in a row" in line for line in own.said)
+
+
+def test_an_episode_is_over_after_its_steps_though_nobody_says_so(pair):
+    own = pair(Arm(), period=0.01, steps=3)
+    begin(own, 0)
+    assert not move(own, RIGHT).truncated
+    time.sleep(0.2)
+    assert [move(own, RIGHT).truncated for _ in range(2)] == [False, True]
+    assert own.counts is None and len(own.driver.resets) == 1
+    made = own.driver.at[0]
+    time.sleep(0.1)
+    assert own.driver.at[0] == made and own.driver.stops
+
+
+def test_rest_is_said_until_it_is_heard(pair, monkeypatch):
+    own = pair(Arm(), period=0.02, again=0.05, patience=10**6)
+    begin(own, 0)
+    move(own, RIGHT)
+    send, lost = _Link.send, []
+    monkeypatch.setattr(_Link, "send", lambda link, message: lost.append(1) if len(lost) < 2 else send(link, message))
+    stops = own.driver.stops
+    own.remote.rest()
+    assert len(lost) == 2 and own.driver.stops == stops + 1
 
 
 def test_a_driver_that_fails_is_stopped_and_its_step_is_in_doubt(pair):
