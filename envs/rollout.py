@@ -35,6 +35,7 @@ class Episode(NamedTuple):
     score: [] float, what the task is judged by: success or total_reward.
     world: [] int32, where it took place in the pool.
     trace: [T + 1, k] what a renderer needs of the start and of the state after each step, see `Env.trace`.
+    command: [T, act_dim] what the policy asked for, where something else may have been sent; else None.
     """
 
     transitions: Transition
@@ -45,6 +46,7 @@ class Episode(NamedTuple):
     score: Array
     world: Array
     trace: PyTree
+    command: Array | None = None
 
 
 def pick(pool: World, index: Array | tuple[Array, Array]) -> World:

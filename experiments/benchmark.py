@@ -6,6 +6,7 @@ updates: SAC updates of pretraining, with all its networks, against the same upd
 hybrid: updates of a hybrid run (H2O+ with its simulators), against its update written by hand in bare JAX, alone.
 plain: updates of plain SAC, against Stable-Baselines3 and SBX where they are installed.
 pretrain, finetune: seconds of the whole commands, with what the time goes into.
+system: a rollout of fine-tuning with its updates, against the same in one compiled program.
 devices: pretraining on several devices with as many times the environments and batches (weak scaling), against as many
 times one device.
 """
@@ -22,7 +23,7 @@ from sgft_jax.models.config import Precision
 from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError
 
-type Part = Literal["physics", "updates", "plain", "hybrid", "pretrain", "finetune", "devices"]
+type Part = Literal["physics", "updates", "plain", "hybrid", "pretrain", "finetune", "system", "devices"]
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class BenchmarkConfig:
     devices: tuple[int, ...] = (1,)
     """Numbers of devices; all are compared with the smallest."""
     prior: Path | None = None
-    """Folder of the priors that finetune starts from."""
+    """Folder of the priors that finetune and system start from."""
     rollouts: int = 30
     """Real rollouts, for finetune."""
     out: Path = Path("runs")
@@ -94,8 +95,9 @@ def _check(config: BenchmarkConfig) -> None:
     for name in ("worlds", "batches", "seeds", "devices"):
         if (least := min(getattr(config, name), default=0)) < 1:
             raise UserError(f"--{name} is {least}: must be at least 1")
-    if "finetune" in config.parts and config.prior is None:
-        raise UserError("--parts finetune needs --prior FOLDER, as made by python -m experiments.pretrain")
+    for part in {"finetune", "system"} & {*config.parts}:
+        if config.prior is None:
+            raise UserError(f"--parts {part} needs --prior FOLDER, as made by python -m experiments.pretrain")
 
 
 def _physics(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
@@ -149,6 +151,14 @@ def _finetune(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
         yield training.fine_tuning(task, impl, seeds, prior=config.prior, rollouts=config.rollouts)
 
 
+def _system(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    from experiments.bench import system
+
+    assert config.prior is not None  # checked before
+    for task, impl, seeds in product(config.tasks, config.impls, config.seeds):
+        yield system.speed(task, impl, seeds, prior=config.prior, real="default", repeats=config.repeats)
+
+
 def _devices(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
     from experiments.bench import training
 
@@ -164,6 +174,7 @@ _PARTS: dict[Part, Callable[[BenchmarkConfig], Iterator[dict[str, Any]]]] = {
     "hybrid": _hybrid,
     "pretrain": _pretrain,
     "finetune": _finetune,
+    "system": _system,
     "devices": _devices,
 }
 _TITLES = {
@@ -173,6 +184,7 @@ _TITLES = {
     "hybrid": "updates of hybrid runs",
     "pretrain": "pretraining",
     "finetune": "fine-tuning with SGFT-SAC",
+    "system": "fine-tuning through a real system",
     "devices": "pretraining on several devices",
 }
 

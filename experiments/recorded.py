@@ -16,8 +16,7 @@ from sgft_jax.systems.gymnasium import Gymnasium, Step
 from sgft_jax.types import Key, PyTree, Transition, UserError
 
 _FACTS = tuple(name for name in Episode._fields if name != "transitions")
-_BESIDE = ("asked", "late", "time")  # what is kept of a robot's steps beside transitions, see `Step`
-_BESIDE = ("asked", "late", "time")  # what is kept of the steps of a robot beside their transitions, see `Step`
+_BESIDE = ("late", "time")  # what is kept of a robot's steps beside transitions, see `Step`
 
 
 class Recorded:
@@ -89,11 +88,11 @@ class Recorded:
 def _arrays(episodes: Episode) -> dict[str, np.ndarray]:
     """Arrays [S, ...] of one rollout of every seed, as they are stored."""
     arrays = episodes.transitions._asdict() | {name: getattr(episodes, name) for name in _FACTS}
-    return {name: np.asarray(x[:, 0]) for name, x in arrays.items()}
+    return {name: np.asarray(x[:, 0]) for name, x in arrays.items() if x is not None}
 
 
 def _read(arrays: dict[str, np.ndarray]) -> Episode:
     """The inverse."""
     stored = {name: jnp.asarray(x)[:, None] for name, x in arrays.items()}
     transitions = Transition(*(stored[name] for name in Transition._fields))
-    return Episode(transitions=transitions, **{name: stored[name] for name in _FACTS})
+    return Episode(transitions=transitions, **{name: stored[name] for name in _FACTS if name in stored})

@@ -27,15 +27,15 @@ Observe = Callable[[Any], Any]
 class Step(NamedTuple):
     """One step of M members, on the host. Whose episode was over before has neither `valid` nor `invalid`.
 
-    obs, next_obs: [M, obs_dim], raw units. action: [M, act_dim] in [-1, 1], what was really commanded. asked:
-    [M, act_dim], what the policy wanted. reward: [M]. terminated, valid: [M] bool. success: [M] int8, -1 where nothing
-    tells it. invalid: [M] bool, a step that must not be learned from. over: [M] bool, no step follows. late: [M] bool,
-    no command came in time. time: [M] float64, seconds since the epoch when its outcome was there.
+    obs, next_obs: [M, obs_dim], raw units. action: [M, act_dim] in [-1, 1], what was really commanded. command:
+    [M, act_dim], what the policy asked for. reward: [M]. terminated, valid: [M] bool. success: [M] int8, -1 where
+    nothing tells it. invalid: [M] bool, a step that must not be learned from. over: [M] bool, no step follows.
+    late: [M] bool, no command came in time. time: [M] float64, seconds since the epoch when its outcome was there.
     """
 
     obs: np.ndarray
     action: np.ndarray
-    asked: np.ndarray
+    command: np.ndarray
     reward: np.ndarray
     terminated: np.ndarray
     next_obs: np.ndarray
@@ -123,13 +123,13 @@ class Gymnasium:
                 self._check_speed(lambda: act(latest(), carry, seen, act_keys, 0, explore), self._real.answer_within)
             for t in range(env.episode_length):
                 wanted, carry = act(latest(), carry, seen, act_keys, t, explore)
-                asked = np.asarray(wanted)
-                after = self._real.step(self._commanded(asked), going)
-                action = self._sent(asked, after.infos)
+                command = np.asarray(wanted)
+                after = self._real.step(self._commanded(command), going)
+                action = self._sent(command, after.infos)
                 actions = remember(actions, action)
                 following = with_memory(env, self._measured(after.obs), actions)
                 judged = self._judged(after, seen, action, following)
-                step = _step(going, seen, asked, action, judged, following)
+                step = _step(going, seen, command, action, judged, following)
                 yield step
                 going = ~step.over
                 if not going.any():
@@ -159,6 +159,7 @@ class Gymnasium:
             score=(succeeded & ~exploded).astype(jnp.float32) if env.score == "success" else total,
             world=jnp.zeros(len(valid), jnp.int32),
             trace=jnp.zeros((len(valid), env.episode_length + 1, 0)),
+            command=kept(rows.command),
         )
 
     def close(self, *, over: bool = True) -> None:
@@ -264,7 +265,7 @@ class _After(NamedTuple):
 
 
 def _step(
-    going: np.ndarray, seen: np.ndarray, asked: np.ndarray, action: np.ndarray, after: _After, following: np.ndarray
+    going: np.ndarray, seen: np.ndarray, command: np.ndarray, action: np.ndarray, after: _After, following: np.ndarray
 ) -> Step:
     """The step of the members that are `going` [M]."""
     finite = np.isfinite(following).all(1) & np.isfinite(after.reward)
@@ -272,7 +273,7 @@ def _step(
     told = [[info[name] for name in SUCCESS if name in info] for info in after.infos]
     success = [int(bool(own[0])) if own and on else -1 for own, on in zip(told, going & ~bad, strict=True)]
     return Step(
-        seen, action, asked, after.reward, after.terminated, following, going & ~bad, np.array(success, np.int8),
+        seen, action, command, after.reward, after.terminated, following, going & ~bad, np.array(success, np.int8),
         going & bad, ~going | bad | after.terminated | after.truncated, going & _flag("late", after.infos),
         np.full(len(going), time.time()),
     )  # fmt: skip

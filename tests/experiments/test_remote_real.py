@@ -113,7 +113,7 @@ def test_a_rollout_that_was_over_when_its_writer_died_is_whole(tmp_path):
     again = rollouts(tmp_path, 0, count=1, done=1)
     jax.tree.map(np.testing.assert_array_equal, again.transitions, whole.transitions)
     assert not again.exploded.any() and len(store) == 2
-    assert played["asked"].shape == (1, T, 2) and played["late"].shape == played["time"].shape == (1, T)
+    assert played["command"].shape == (1, T, 2) and played["late"].shape == played["time"].shape == (1, T)
     assert (np.diff(played["time"]) >= 0).all()
 
 

@@ -1,0 +1,55 @@
+"""Fine-tuning through a `System`, against the same rollout, updates and physics fused into one compiled program."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import envs
+from envs import gaps
+from envs.mujoco.worlds import Impl
+from envs.rollout import Episode
+from sgft_jax import api, train
+from sgft_jax.io.priors import load_priors, observed_by
+from sgft_jax.systems.simulated import Simulated
+from sgft_jax.types import Key, Metrics, PyTree
+
+
+def speed(task: str, impl: Impl, members: int, *, prior: Path, real: str, repeats: int) -> dict[str, Any]:
+    """Seconds of a rollout and its updates of the recommended method, by both; the fastest of `repeats`, in turns."""
+    env = envs.make(task, impl, **observed_by([prior]))
+    setup = api.setup(env, gaps.load(env, real), load_priors([prior], env), seeds=members)
+    assert isinstance(setup.system, Simulated)
+    through = train.finetune(*setup, rollouts=10**9)
+    progress, _ = next(through)
+    agent = jax.tree.map(lambda x: x.copy(), progress.agent)
+    fused = jax.jit(_fused(setup), donate_argnums=0)
+    own, theirs = [], []
+    for i in range(repeats + 1):  # the first one compiles
+        start = time.perf_counter()
+        jax.block_until_ready(next(through))
+        middle = time.perf_counter()
+        agent, _, _ = jax.block_until_ready(fused(agent, jax.random.key(i)))
+        own.append(middle - start)
+        theirs.append(time.perf_counter() - middle)
+    system_s, fused_s = min(own[1:]), min(theirs[1:])
+    return {
+        "task": task, "impl": env.impl, "seeds": members, "system_s": system_s, "fused_s": fused_s,
+        "fused/system": fused_s / system_s,
+    }  # fmt: skip
+
+
+def _fused(setup: api.Setup) -> Any:
+    """(agent, key) -> agent, episodes, metrics: what `train.finetune` does between two yields."""
+    finetuner, updates = setup.finetuner, setup.finetuner.updates_per_rollout
+    learn = train.Updates(finetuner, setup.seeds, train.prior_of(setup.priors, setup.seeds), setup.simulated)
+
+    def rollout(agent: PyTree, key: Key) -> tuple[PyTree, Episode, Metrics]:
+        keys = jax.random.split(key, (len(setup.seeds), 1))
+        played = setup.system.play(finetuner, agent, keys, explore=True)
+        first = jax.tree.map(lambda x: x[:, 0], (played.transitions, played.valid, played.score))
+        agent, metrics = learn(jax.vmap(finetuner.observe)(agent, *first), [0], updates)
+        return agent, played, metrics
+
+    return rollout
