@@ -8,7 +8,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from experiments.reliable.runs import Trial
+from experiments.reliable.runs import TASK, Trial
 
 _BUSY = ("--options.utd", "400", "--hand-over", "steps")  # the learner never rests while the robot plays
 _PATIENCE = 600.0  # seconds for a run
@@ -16,10 +16,10 @@ WHEEL_LEGGED = 4, 1  # numbers that the task measures and commands
 
 
 def kept_clock(
-    home: Path, *, period: float, rollouts: int, task: str | None = None, sizes: tuple[int, int] = (3, 1)
+    home: Path, *, period: float, rollouts: int, task: str = str(TASK), sizes: tuple[int, int] = (3, 1)
 ) -> dict[str, Any]:
     """A run with a busy learner on the same cores: lateness, and jitter of the period in ms."""
-    trial = Trial(home, period=period, rollouts=rollouts, sizes=sizes, more=_BUSY, **({"task": task} if task else {}))
+    trial = Trial(home, period=period, rollouts=rollouts, task=task, sizes=sizes, more=_BUSY)
     try:
         trial.start_robot()
         trial.start_player()
