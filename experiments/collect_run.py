@@ -167,7 +167,7 @@ def _write(args: CollectArgs, path: Path, episodes: Sequence[Recorded], *, kind:
     """
     author = "sgft_jax experiments.collect"
     write_d4rl(path, episodes, {"algorithm": "SAC", "task": args.task, "real": args.real, "author": author})
-    write_minari(path.with_name(f"{path.stem}-v0"), episodes, {"algorithm_name": "SAC", "author": author})
+    write_minari(path.with_name(f"{path.stem}-v0"), episodes, {"algorithm_name": "SAC", "author": [author]})
     facts = logs.load(path, gamma=1.0).facts
     steps = np.mean([len(own.reward) for own in episodes])
     print(

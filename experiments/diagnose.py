@@ -12,12 +12,10 @@ from pathlib import Path
 from experiments import cli
 from experiments.options import Impl, at_least_one, prior_folders
 from experiments.real_systems import check as check_real
+from experiments.rollouts import config_of, home_of
 from sgft_jax.io.jsonfile import read_json
 from sgft_jax.presets import DEFAULT_PRESET
 from sgft_jax.types import UserError
-
-_FOLDER = "real"  # of a run, or of a robot's recordings, with rollout-*.npz in it
-_CONFIG = "config.json"
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
     """The folders of the priors, the task, and where real/ is if --real is no gap; UserError for what is wrong."""
     if args.rollouts is not None:
         at_least_one(args, "rollouts")
-    recorded = home_of(Path(args.real)) if Path(args.real).is_dir() else None
+    recorded = home_of("--real", Path(args.real)) if Path(args.real).is_dir() else None
     config = config_of(recorded) if recorded else {}
     task, prior = args.task or config.get("task"), args.prior
     if task is not None:
@@ -87,24 +85,11 @@ def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
     return folders, task, recorded
 
 
-def home_of(folder: Path) -> Path:
-    """The folder that holds real/ with rollouts; raises UserError where there is none."""
-    home = folder.parent if folder.name == _FOLDER else folder
-    if not any((home / _FOLDER).glob("rollout-*.npz")):
-        raise UserError(f"--real {folder}: holds no recorded rollouts (real/rollout-*.npz)")
-    return home
-
-
-def config_of(home: Path) -> dict:
-    """The options of the run in a folder; none where a robot has recorded."""
-    return read_json(home / _CONFIG)["config"] if (home / _CONFIG).exists() else {}
-
-
 def find_runs(option: str, folders: Sequence[Path]) -> list[Path]:
     """The folders of fine-tuning runs with recorded rollouts and a curve; raises UserError where there is none."""
     found: dict[Path, None] = {}
     for folder in folders:
-        own = [path.parent for path in sorted(folder.rglob("eval.jsonl")) if (path.parent / _FOLDER).is_dir()]
+        own = [path.parent for path in sorted(folder.rglob("eval.jsonl")) if (path.parent / "real").is_dir()]
         if not own:
             raise UserError(
                 f"{option} {folder}: holds no fine-tuning run with recorded rollouts (eval.jsonl and real/)"

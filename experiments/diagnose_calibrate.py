@@ -9,9 +9,10 @@ import numpy as np
 
 from experiments import stacking
 from experiments.cli import columns
-from experiments.diagnose import DiagnoseArgs, config_of
+from experiments.diagnose import DiagnoseArgs
 from experiments.diagnose_run import load, play_simulated, read
 from experiments.options import prior_folders
+from experiments.rollouts import config_of
 from sgft_jax.analysis import prediction, tables
 from sgft_jax.analysis.curves import read_curve
 from sgft_jax.analysis.prediction import AHEAD, Cases, Inputs

@@ -15,10 +15,11 @@ from envs.gaps import SIM, Gap
 from envs.rollout import Episode
 from experiments import stacking
 from experiments.cli import columns
-from experiments.diagnose import DiagnoseArgs, config_of
+from experiments.diagnose import DiagnoseArgs
 from experiments.gaps_run import systems
 from experiments.real_systems import connect, is_robot, is_stepped, title
 from experiments.recorded import Recorded
+from experiments.rollouts import config_of
 from sgft_jax import api
 from sgft_jax.analysis import figures, prediction, stats, tables, verdict
 from sgft_jax.analysis.curves import last_start

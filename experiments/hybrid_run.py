@@ -16,6 +16,7 @@ from envs.base import Env, World
 from envs.gaps import SIM, Gap
 from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
+from experiments import logged
 from experiments.evaluation import SCORES, play, scores
 from experiments.hybrid_args import NO_SIMULATOR, VOLATILE, HybridArgs, gaps_of, run_folder
 from experiments.memory import reserve
@@ -44,7 +45,9 @@ def run(args: HybridArgs, method: HybridMethod, seeds: list[int]) -> list[dict[s
     env = envs.make(args.task, args.impl, previous_actions=args.previous_actions)
     named = gaps_of(args, method)
     found = [Gap(NO_SIMULATOR, {}, {}) if name == NO_SIMULATOR else gaps.load(env, name) for name in named]
-    log = None if method.kind == "simulator" or args.data is None else _load(args, env)
+    log = None
+    if method.kind != "simulator" and args.data is not None:
+        log = logged.read(args.data, env, gamma=args.options.gamma, successors=args.successors)
     homes = {run_folder(args, name): jsonable(args) | {"gap": name} for name in named}
     inputs = {"data": None if log is None else {"sha256": log.facts.sha256, "successors": log.facts.successors}}
     opened = runs.open_runs(
@@ -55,37 +58,6 @@ def run(args: HybridArgs, method: HybridMethod, seeds: list[int]) -> list[dict[s
     finally:
         for own in opened:
             own.close()
-
-
-def _read(args: HybridArgs, env: Env) -> logs.Log:
-    """The file, as its ending says."""
-    assert args.data is not None
-    gamma = args.options.gamma
-    if args.data.suffix not in (".txt", ".csv"):
-        return logs.load(args.data, gamma=gamma, successors=args.successors)  # pyright: ignore
-    if not env.name.startswith("wheel-legged") or env.reward is None:
-        raise UserError(f"{args.data}: tables are logs of a wheel-legged robot; {env.name} wants an HDF5 file")
-    return logs.load_table(args.data, gamma=gamma, obs_dim=env.measured_dim, reward=jax.vmap(env.reward))
-
-
-def _load(args: HybridArgs, env: Env) -> logs.Log:
-    """The real rows; says what they are, and raises UserError if they are not of this task."""
-    log = _read(args, env)
-    facts, sizes = log.facts, (log.rows.obs.shape[1], log.rows.action.shape[1])
-    if sizes != (env.obs_dim, env.act_dim):
-        more, odd = divmod(sizes[0] - env.measured_dim, env.act_dim)
-        fits = sizes[1] == env.act_dim and more >= 0 and not odd
-        advice = f"--previous-actions {more} would fit" if fits else "name the task that it was recorded on"
-        raise UserError(
-            f"{args.data}: has {sizes[0]} observations and {sizes[1]} actions, {env.name} has {env.obs_dim} and "
-            f"{env.act_dim}; {advice}"
-        )
-    print(
-        f"data: {facts.path}, {facts.size:,} bytes, sha256 {facts.sha256[:12]}; {facts.transitions:,} transitions of "
-        f"{facts.episodes:,} episodes, return {facts.return_mean:.0f} (std {facts.return_std:.0f}, "
-        f"{facts.return_min:.0f} to {facts.return_max:.0f})"
-    )
-    return log
 
 
 class _Run:

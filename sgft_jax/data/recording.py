@@ -12,6 +12,7 @@ import numpy as np
 
 from envs.rollout import Episode
 from sgft_jax.io.jsonfile import write_json
+from sgft_jax.io.real import Played
 from sgft_jax.types import Transition, UserError
 
 _SAME = 1e-4  # relative; compilers may round the two copies of an observation differently
@@ -40,7 +41,8 @@ class Recorded(NamedTuple):
     """One episode of T steps on the host, float32.
 
     obs: [T + 1, obs_dim]. action: [T, act_dim]. reward: [T]. terminated: whether the task ended it; else time did, or
-    the recording. joints: [T + 1, ...], log_prob: [T], see `Noted`.
+    the recording. joints: [T + 1, ...], log_prob: [T], see `Noted`. success: whether it ended well, None where nobody
+    knows.
     """
 
     obs: np.ndarray
@@ -49,6 +51,7 @@ class Recorded(NamedTuple):
     terminated: bool
     joints: Joints | None = None
     log_prob: np.ndarray | None = None
+    success: bool | None = None
 
 
 class _Rows(NamedTuple):
@@ -94,6 +97,21 @@ def of_episodes(played: Episode, noted: Noted | None = None) -> list[Recorded]:
     valid = np.asarray(played.valid)
     found = (jax.tree.map(lambda x, i=i: x[i][valid[i]], both) for i in range(len(valid)))
     return [_recorded(*own) for own in found if len(own[0].reward)]
+
+
+def of_stored(played: Sequence[Played], measured_dim: int) -> list[Recorded]:
+    """Rollouts as a run has stored them, of observations only what was measured: their first `measured_dim` numbers.
+
+    What a policy reads beyond that, such as its last actions, follows from the episode. Episodes without a valid step
+    are left out.
+    """
+    found = []
+    for own in played:
+        rows = _Rows(**own.rows)
+        if len(rows.reward):
+            rows = rows._replace(obs=rows.obs[:, :measured_dim], next_obs=rows.next_obs[:, :measured_dim])
+            found.append(_recorded(rows, None)._replace(success=own.success))
+    return found
 
 
 def _recorded(rows: _Rows, noted: Noted | None) -> Recorded:
@@ -182,11 +200,11 @@ def write_table(path: Path, episodes: Sequence[Recorded], *, scale: float) -> No
     part.replace(path)
 
 
-def write_minari(folder: Path, episodes: Sequence[Recorded], about: Mapping[str, str]) -> None:
+def write_minari(folder: Path, episodes: Sequence[Recorded], about: Mapping[str, Any]) -> None:
     """A data set in Minari's layout: `<folder>/data/main_data.hdf5` and `metadata.json`.
 
     folder: its name must end in a version, such as `-v0`; the data set is `sgft/<name>` for Minari. about: more of
-    `metadata.json`.
+    `metadata.json`. Whether an episode ended well is in its metadata, as `success`.
     """
     data = folder / "data"
     data.mkdir(parents=True, exist_ok=True)
@@ -194,6 +212,8 @@ def write_minari(folder: Path, episodes: Sequence[Recorded], about: Mapping[str,
         for number, own in enumerate(episodes):
             group = file.create_group(f"episode_{number}")
             group.attrs.update(id=number, total_steps=len(own.reward))
+            if own.success is not None:
+                group.attrs["success"] = own.success
             flat = _flat(own)
             arrays = {"observations": own.obs, "actions": own.action, "rewards": own.reward}
             arrays |= {"terminations": flat["terminals"], "truncations": flat["timeouts"], **_infos(own)}

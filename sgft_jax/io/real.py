@@ -5,13 +5,14 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sgft_jax.types import UserError
 
 _REAL, _ROLLOUT, _HALF, _STEPS = "real", "rollout-", ".half", ".steps.jsonl"
+_ROWS, _FACTS = ("obs", "action", "reward", "discount", "next_obs"), ("valid", "success")
 
 
 class RealStore:
@@ -116,6 +117,52 @@ class Journal:
     def _write(self, line: Mapping[str, Any]) -> None:
         self._file.write(json.dumps(line) + "\n")
         self._file.flush()
+
+
+class Played(NamedTuple):
+    """One stored episode of one seed.
+
+    seed: its place among the seeds of the run. number: of the rollout. rows: {name: [T, ...]} of a `Transition`, the
+    valid steps alone. command: [T, act_dim] what the policy asked for; None where it is what was sent. success:
+    whether it ended well. world: its number in the pool. trace: [steps + 1, k], see `Env.trace`; of all steps,
+    k = 0 where nothing was kept.
+    """
+
+    seed: int
+    number: int
+    rows: Mapping[str, np.ndarray]
+    command: np.ndarray | None
+    success: bool
+    world: int
+    trace: np.ndarray
+
+
+def home_of(folder: Path) -> Path | None:
+    """The folder whose `real/` holds rollouts: `folder`, or its parent where that is `real/` itself; else None."""
+    home = folder.parent if folder.name == _REAL else folder
+    return home if any((home / _REAL).glob(f"{_ROLLOUT}*.npz")) else None
+
+
+def played(home: Path) -> list[Played]:
+    """The episodes in `<home>/real/`, all of the first seed first; raises UserError for what is no rollout of ours."""
+    store = RealStore(home)
+    stored = [store.load(number) for number in range(len(store))]
+    for number, arrays in enumerate(stored):
+        if missing := {*_ROWS, *_FACTS} - set(arrays):
+            path = store.folder / f"{_ROLLOUT}{number:06d}.npz"
+            raise UserError(f"{path}: lacks {min(missing)}; docs/formats.md lists what a rollout holds")
+    seeds = range(len(stored[0]["valid"]))
+    return [_of_seed(arrays, seed, number) for seed in seeds for number, arrays in enumerate(stored)]
+
+
+def _of_seed(arrays: Mapping[str, np.ndarray], seed: int, number: int) -> Played:
+    """The episode of one seed in a rollout of all."""
+    valid = arrays["valid"][seed]
+    rows = {name: arrays[name][seed][valid] for name in _ROWS}
+    command = arrays["command"][seed][valid] if "command" in arrays else None
+    world = int(arrays["world"][seed]) if "world" in arrays else 0
+    trace = arrays["trace"][seed] if "trace" in arrays else np.zeros((len(valid) + 1, 0))
+    return Played(seed, number, rows, command, bool(arrays["success"][seed]), world, trace)
 
 
 def _sync_folder(folder: Path) -> None:

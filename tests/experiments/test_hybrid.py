@@ -140,7 +140,7 @@ def test_data_that_is_missing_or_of_another_task(tmp_path, capsys):
     assert "other.hdf5: has 3 observations and 2 actions, toy has 4 and 2; name the task" in error
     remembered = d4rl(tmp_path / "remembered.hdf5", 8, 2)
     error = complaint(words(tmp_path, remembered, "--gap", "sim"), capsys)
-    assert "toy has 4 and 2; --previous-actions 2 would fit" in error
+    assert "toy has 4 and 2; previous_actions=2 would fit" in error
     table = tmp_path / "robot.txt"
     assert "tables are logs of a wheel-legged robot" in complaint(words(tmp_path, table, "--gap", "sim"), capsys)
     assert not (tmp_path / "out").exists()

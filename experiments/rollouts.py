@@ -1,0 +1,43 @@
+"""The rollouts that a run has stored in real/, for commands that read them. Imports no JAX."""
+
+from pathlib import Path
+from typing import Any
+
+from experiments.options import check_task
+from sgft_jax.io import real
+from sgft_jax.io.jsonfile import read_json
+from sgft_jax.io.real import Played
+from sgft_jax.types import UserError
+
+_CONFIG = "config.json"
+
+
+def home_of(option: str, folder: Path) -> Path:
+    """The folder that holds real/ with rollouts, that itself or its parent; raises UserError where there is none."""
+    home = real.home_of(folder)
+    if home is None:
+        raise UserError(f"{option} {folder}: holds no recorded rollouts (real/rollout-*.npz)")
+    return home
+
+
+def config_of(home: Path) -> dict[str, Any]:
+    """The options of the run in a folder; none where a robot has recorded."""
+    return read_json(home / _CONFIG)["config"] if (home / _CONFIG).exists() else {}
+
+
+def task_of(home: Path, task: str | None) -> str:
+    """The task that was played: what the user says, or what the run says; raises UserError where nobody does."""
+    found = task or config_of(home).get("task")
+    if found is None:
+        raise UserError(f"{home}: does not say of which task it is; name it with --task")
+    check_task(found)
+    return found
+
+
+def episodes_of(home: Path, seed: int | None) -> list[Played]:
+    """The episodes of one seed of a run, or those of all; raises UserError for a seed that it does not have."""
+    found, first = real.played(home), config_of(home).get("seed", 0)
+    seeds = sorted({first + own.seed for own in found})
+    if seed is not None and seed not in seeds:
+        raise UserError(f"--seed {seed}: {home} has the seeds {', '.join(map(str, seeds))}")
+    return [own._replace(seed=first + own.seed) for own in found if seed in (None, first + own.seed)]

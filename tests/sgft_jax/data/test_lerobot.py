@@ -1,0 +1,203 @@
+"""Data sets in LeRobot's layout: every column of small sets, those of others, and what is not whole."""
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import toy
+
+from envs.history import with_previous_actions
+from sgft_jax.data import lerobot, logs
+from sgft_jax.data.recording import Recorded
+from sgft_jax.types import UserError
+
+pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'sgft-jax[lerobot]'")
+pq = pytest.importorskip("pyarrow.parquet")
+
+ENV = toy.make()
+CHECK = """
+import sys
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+found = LeRobotDataset("someone/toy", root=sys.argv[1], delta_timestamps={"action": [-0.1, 0.0, 0.1]})
+assert (found.num_episodes, found.num_frames, found.fps) == (2, 5, 10), found
+first, last = found[0], found[4]
+assert first["task"] == "toy" and first["action"].shape == (3, 2) and last["observation.state"].tolist() == [51.0] * 4
+assert first["action_is_pad"].tolist() == [True, False, False] and last["next.observation.state"].tolist() == [52.0] * 4
+assert [bool(found[i]["next.done"]) for i in range(5)] == [False, False, True, False, True]
+assert found.meta.names["observation.state"] == ["xy.0", "xy.1", "velocity.0", "velocity.1"]
+assert found.meta.stats["next.reward"]["mean"].tolist() == [1.0]
+only = LeRobotDataset("someone/toy", root=sys.argv[1], episodes=[1])
+assert len(only) == 2 and only[0]["action"].tolist() == [0.5, 0.5]
+"""
+
+
+def episode(first, steps, *, terminated=False, success=False):
+    """Observations that count up from `first`; actions are a hundredth of them."""
+    obs = np.repeat((first + np.arange(steps + 1.0))[:, None], 4, axis=1).astype(np.float32)
+    return Recorded(obs, obs[:-1, :2] / 100, np.ones(steps, np.float32), terminated, success=success)
+
+
+EPISODES = [episode(0, 3, terminated=True, success=True), episode(50, 2)]
+
+
+def write(folder, episodes=EPISODES):
+    lerobot.write(
+        folder, episodes, task="toy", control_dt=ENV.control_dt, observation=ENV.observation, action=ENV.action
+    )
+    return folder
+
+
+def changed(folder, drop=(), **columns):
+    """The set without some columns, or with others in their place, as others might have written it."""
+    path, info = folder / "data/chunk-000/file-000.parquet", json.loads((folder / "meta/info.json").read_text())
+    table = pq.read_table(path)
+    for name, values in columns.items():
+        name = name.replace("__", ".")
+        table = table.set_column(table.column_names.index(name), name, pa.array(values))
+    pq.write_table(table.drop_columns(list(drop)), path)
+    info["features"] = {name: about for name, about in info["features"].items() if name not in drop}
+    (folder / "meta/info.json").write_text(json.dumps(info))
+    return folder
+
+
+def refused(folder, **options):
+    with pytest.raises(UserError) as caught:
+        logs.load(folder, gamma=0.9, **options)
+    said = str(caught.value)
+    assert "\n" not in said and str(folder) in said
+    return said
+
+
+# --- what is written --------------------------------------------------------------------------------------------------
+
+
+def test_every_step_is_a_frame(tmp_path):
+    table = pq.read_table(write(tmp_path / "set") / "data/chunk-000/file-000.parquet")
+    columns = table.to_pydict()
+    assert columns["observation.state"][3] == [50.0] * 4 and columns["next.observation.state"][2] == [3.0] * 4
+    np.testing.assert_allclose(columns["action"][4], [0.51, 0.51])
+    assert columns["next.done"] == [False, False, True, False, True]
+    assert columns["next.truncated"] == [False, False, False, False, True]
+    assert columns["next.success"] == [False, False, True, False, False]
+    np.testing.assert_allclose(columns["timestamp"], [0, 0.1, 0.2, 0, 0.1], rtol=1e-6)
+    assert columns["frame_index"] == [0, 1, 2, 0, 1] and columns["episode_index"] == [0, 0, 0, 1, 1]
+    assert columns["index"] == [0, 1, 2, 3, 4] and columns["task_index"] == [0] * 5
+    assert table.schema.field("observation.state").type == pa.list_(pa.float32(), 4)
+    assert pq.ParquetFile(tmp_path / "set/data/chunk-000/file-000.parquet").num_row_groups == 2
+
+
+def test_names_units_and_counts_lie_beside_them(tmp_path):
+    folder = write(tmp_path / "set")
+    info = json.loads((folder / "meta/info.json").read_text())
+    assert (info["codebase_version"], info["fps"], info["total_episodes"], info["total_frames"]) == ("v3.0", 10, 2, 5)
+    state, action = info["features"]["observation.state"], info["features"]["action"]
+    assert state["names"] == ["xy.0", "xy.1", "velocity.0", "velocity.1"] and state["shape"] == [4]
+    assert state["info"]["units"] == ["m", "m", "m/s", "m/s"] and action["info"]["units"] == ["4 N", "4 N"]
+    (first, second) = pq.read_table(folder / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
+    assert (second["length"], second["dataset_from_index"], second["dataset_to_index"]) == (2, 3, 5)
+    assert first["tasks"] == ["toy"] and first["stats/observation.state/max"] == [2.0] * 4
+    stats = json.loads((folder / "meta/stats.json").read_text())["observation.state"]
+    assert stats["count"] == [5] and stats["q50"] == [2.0] * 4 and stats["mean"] == pytest.approx([20.8] * 4)
+    tasks = pq.read_table(folder / "meta/tasks.parquet")
+    assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["task"]
+    assert tasks.to_pylist() == [{"task_index": 0, "task": "toy"}]
+
+
+@pytest.mark.slow
+def test_lerobots_own_loader_opens_it(tmp_path):
+    """In an environment of its own: LeRobot needs other versions than we do, and PyTorch."""
+    python = os.environ.get("SGFT_LEROBOT_PYTHON")
+    if python is None:
+        pytest.skip("name the Python of an environment with lerobot[dataset] in SGFT_LEROBOT_PYTHON")
+    folder = write(tmp_path / "set")
+    alone = {"PATH": os.environ["PATH"], "HF_HOME": str(tmp_path / "hub"), "HF_HUB_OFFLINE": "1"}
+    subprocess.run([python, "-c", CHECK, str(folder)], check=True, env=alone, timeout=300)
+
+
+# --- what is read -----------------------------------------------------------------------------------------------------
+
+
+def test_what_is_written_is_read_again(tmp_path):
+    rows, facts, last = logs.load(write(tmp_path / "set"), gamma=0.9, env=ENV)
+    np.testing.assert_array_equal(rows.obs[:, 0], [0, 1, 2, 50, 51])
+    np.testing.assert_array_equal(rows.next_obs, rows.obs + 1)
+    np.testing.assert_allclose(rows.action, rows.obs[:, :2] / 100)
+    np.testing.assert_array_equal(rows.discount, np.float32([0.9, 0.9, 0.0, 0.9, 0.9]))
+    assert last.tolist() == [False, False, True, False, True]
+    assert (facts.layout, facts.successors, facts.dropped, facts.episodes) == ("lerobot", "stored", 0, 2)
+    assert (facts.return_max, facts.return_min, facts.terminal) == (3.0, 2.0, 1) and len(facts.sha256) == 64
+
+
+def test_frames_of_others_lack_the_last_successor(tmp_path):
+    """The frame below is the successor, so the last of an episode has none: [50, 51] is no step from [2, 3]."""
+    folder = changed(write(tmp_path / "set"), drop=["next.observation.state"])
+    rows, facts, last = logs.load(folder, gamma=0.9)
+    np.testing.assert_array_equal(rows.obs[:, 0], [0, 1, 50])
+    np.testing.assert_array_equal(rows.next_obs[:, 0], [1, 2, 51])
+    assert (facts.successors, facts.dropped) == ("shifted", 2) and last.tolist() == [False, True, True]
+
+
+def test_the_task_tells_rewards_and_ends_that_others_do_not(tmp_path):
+    folder = changed(write(tmp_path / "set"), drop=["next.reward", "next.truncated"])
+    log = logs.load(folder, gamma=0.9, env=ENV._replace(terminated=lambda obs, action, next_obs: next_obs[0] > 51.5))
+    np.testing.assert_allclose(log.rows.reward, -np.sqrt(2) * np.array([1, 2, 3, 51, 52]), rtol=1e-6)  # of xy alone
+    np.testing.assert_array_equal(log.rows.discount, np.float32([0.9, 0.9, 0.9, 0.9, 0.0]))
+    assert "tells no rewards, and neither does a task" in refused(folder)
+
+
+def test_done_alone_is_no_termination(tmp_path):
+    folder = changed(write(tmp_path / "set"), drop=["next.truncated"])
+    assert logs.load(folder, gamma=0.9).facts.terminal == 0
+
+
+def test_last_actions_are_added_for_a_policy_that_sees_them(tmp_path):
+    """The newest first, and zero before the first step of each episode."""
+    log = logs.load(write(tmp_path / "set"), gamma=0.9, env=with_previous_actions(ENV, 2))
+    assert log.rows.obs.shape == (5, 8)
+    np.testing.assert_allclose(log.rows.obs[:, 4::2], [[0, 0], [0, 0], [0.01, 0], [0, 0], [0.5, 0]], atol=1e-7)
+    np.testing.assert_allclose(log.rows.next_obs[:, 4::2], [[0, 0], [0.01, 0], [0.02, 0.01], [0.5, 0], [0.51, 0.5]])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"codebase_version": "v2.1"}, "is LeRobot v2.1; convert it to v3.0"),
+        ({"total_frames": 6}, "holds total_frames 5, but meta/info.json says 6"),
+        ({"total_episodes": 3}, "holds total_episodes 2, but meta/info.json says 3"),
+        ({"features": {"action": {}}}, "has no observation.state, only action"),
+        ({"fps": 30}, "has 30 steps a second, toy has 10; resample it"),
+    ],
+)
+def test_odd_sets_are_refused(change, said, tmp_path):
+    folder = write(tmp_path / "set")
+    info = json.loads((folder / "meta/info.json").read_text())
+    (folder / "meta/info.json").write_text(json.dumps(info | change))
+    assert said in refused(folder, env=ENV)
+
+
+def test_damaged_and_missing_frames_are_refused(tmp_path):
+    folder = changed(write(tmp_path / "set"), frame_index=[0, 1, 2, 1, 2])
+    assert "episode 1 has frame 1 where 0 is due" in refused(folder)
+    folder = changed(write(tmp_path / "other"), observation__state=[[0.0] * 4] * 4 + [[0.0] * 3])
+    assert "observation.state is no column of numbers" in refused(folder)
+    path = tmp_path / "set/data/chunk-000/file-000.parquet"
+    path.write_bytes(path.read_bytes()[:-40])
+    assert "damaged or cut off" in refused(tmp_path / "set")
+    path.unlink()
+    assert "holds no data/*/*.parquet" in refused(tmp_path / "set")
+
+
+def test_actions_in_other_units_are_refused(tmp_path):
+    """Degrees, say: clipped they would all be the same."""
+    folder = write(tmp_path / "set", [own._replace(action=own.action * 100 + 2) for own in EPISODES])
+    assert "most actions lie beyond [-1, 1]; scale them to what toy commands" in refused(folder, env=ENV)
+    assert logs.load(folder, gamma=0.9).facts.clipped == 5
+
+
+def test_without_pyarrow(tmp_path, monkeypatch):
+    folder = write(tmp_path / "set")
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    assert "needs pyarrow; pip install 'sgft-jax[lerobot]'" in refused(folder)
