@@ -16,8 +16,8 @@ from sgft_jax.presets import DEFAULT_PRESET, preset_of
 from sgft_jax.types import Method, UserError
 
 NO_PRIOR = Path("none")
-# What may differ when a run goes on:
-VOLATILE = ("resume", "overwrite", "rollouts", "devices", "video", "out", "tuned", "sync_every")
+# May differ when a run goes on; what is in the data may not.
+VOLATILE = ("resume", "overwrite", "rollouts", "devices", "video", "out", "tuned", "real_data", "sync_every")
 EVALUATION_EPISODES = 50
 
 
@@ -46,6 +46,9 @@ class FinetuneArgs:
     Default: <out>/pretrain/<task>/<preset>."""
     out: Path = Path("runs")
     """Parent of all run folders."""
+    real_data: tuple[Path, ...] = ()
+    """Logs of the real system to begin with: data sets of D4RL, Minari or LeRobot, or run folders with rollouts in
+    real/ (docs/data.md). Every seed keeps their episodes and learns from them before it plays."""
     resume: bool = False
     """Continue from the last checkpoint. Real rollouts that came after it are learned from, not repeated."""
     overwrite: bool = False
@@ -63,6 +66,9 @@ class FinetuneArgs:
     except on robots and Gymnasium environments, where they are counted and kept. Default: 50, on a robot 0."""
     checkpoint_every: int = 10
     """Expert: rollouts between checkpoints."""
+    real_updates: int | None = None
+    """Expert: updates on --real-data before the first rollout; default: as many as rollouts of so many transitions
+    allow."""
     tuned: bool = False
     """Expert: begin with what `experiments.tune` chose for this task and method, as the variant `tuned`."""
     variant: str = ""
@@ -118,6 +124,10 @@ def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
         raise UserError(f"--prior none: {method.name} needs a prior of {method.prior}")
     if not re.fullmatch(r"[\w.-]*", args.variant):
         raise UserError(f"--variant {args.variant!r}: letters, digits, '.', '_' and '-' only, it names a folder")
+    if missing := [path for path in args.real_data if not path.exists()]:
+        raise UserError(f"--real-data {missing[0]}: no such file or folder")
+    if args.real_updates is not None and (args.real_updates < 0 or not args.real_data):
+        raise UserError(f"--real-updates {args.real_updates}: 0 or more, and of --real-data, which must be named")
     if not args.real:
         raise UserError("--real: name at least one")
     without_repeats("--real", args.real)

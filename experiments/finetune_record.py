@@ -19,7 +19,7 @@ from sgft_jax.io import checkpoint
 from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
 from sgft_jax.io.priors import save_prior
 from sgft_jax.io.real import RealStore
-from sgft_jax.train import OFFLINE_PART, FinetuneProgress
+from sgft_jax.train import FinetuneProgress
 from sgft_jax.types import Metrics, Prior, PyTree
 
 EVALUATION = "evaluation"  # the folder of episodes that evaluations on a real system have cost
@@ -29,11 +29,21 @@ class Record:
     """The files of one run folder (docs/formats.md). Arrays and states have a leading axis of the seeds [S].
 
     evaluations_cost: real episodes that an evaluation costs every seed; None where episodes are simulated and free.
+    logged: real transitions that every seed began with and nobody has played here.
     """
 
     def __init__(
-        self, folder: Path, env: Env, gap: Gap, method: str, seeds: list[int], *, evaluations_cost: int | None = None
+        self,
+        folder: Path,
+        env: Env,
+        gap: Gap,
+        method: str,
+        seeds: list[int],
+        *,
+        evaluations_cost: int | None = None,
+        logged: int = 0,
     ) -> None:
+        self.logged = logged
         self.evaluations_cost, self.evaluated = evaluations_cost, 0  # episodes, `evaluated` by all so far
         self.folder, self.env, self.gap, self.method, self.seeds = folder, env, gap, method, seeds
         self.log, self.real = MetricsLog(folder), RealStore(folder)
@@ -52,9 +62,8 @@ class Record:
         self.last_good = checkpoint.path(self.folder, step)
         return progress
 
-    def checkpoint(self, progress: FinetuneProgress) -> None:
-        """The state, and how long the logs are."""
-        step = int(progress.rollouts) + -(-int(progress.offline) // OFFLINE_PART)
+    def checkpoint(self, progress: FinetuneProgress, step: int) -> None:
+        """The state, and how long the logs are. step: parts of the offline phase and rollouts behind it."""
         counts = {"rollouts": int(progress.rollouts), "evaluated": self.evaluated}
         meta = {**self.expect, **counts, "position": self.log.position()}
         self.last_good = checkpoint.save(self.folder, step, progress, meta=meta)
@@ -99,6 +108,8 @@ class Record:
         numbers = {"final": far, "seeds": len(self.seeds)} if curve is None else describe(curve)
         about = {"task": env.name, "method": self.method, "impl": env.impl, "gap": self.gap._asdict()}
         summary = about | {"score": env.score} | numbers | {"best": {k: x.tolist() for k, x in best.items()}}
+        if self.logged:
+            summary["logged"] = self.logged
         if self.evaluations_cost is not None:
             summary["real_steps"] = self._real_steps()
         write_summary(self.folder, summary)

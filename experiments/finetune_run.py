@@ -13,7 +13,7 @@ import numpy as np
 
 import envs
 from envs.rollout import Episode
-from experiments import cli, real_systems
+from experiments import cli, logged, real_systems
 from experiments.evaluation import scores
 from experiments.finetune_args import VOLATILE, FinetuneArgs, run_folder
 from experiments.finetune_record import Record
@@ -21,6 +21,7 @@ from experiments.recorded import Recorded
 from experiments.stacking import join, part
 from sgft_jax import api, mesh, train
 from sgft_jax.api import Setup
+from sgft_jax.data.logs import Log
 from sgft_jax.io import runs
 from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.priors import digest, load_priors, observed_by
@@ -30,7 +31,7 @@ from sgft_jax.methods import get_method
 from sgft_jax.methods.options import card_of
 from sgft_jax.systems.gymnasium import Gymnasium
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.train import FinetuneProgress
+from sgft_jax.train import FinetuneProgress, Logged
 from sgft_jax.types import Finetuner, Method, Metrics, Prior, PyTree, UserError
 
 _AFTER = "rollouts-"  # what the folder of an evaluation is called, before their number
@@ -45,15 +46,16 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
     priors = load_priors(folders, env)
     for prior in priors:
         api.check_prior(prior, method, env)
+    card = card_of(priors[0] if priors else None)
+    logs = [logged.read(path, env, gamma=card["gamma"]) for path in args.real_data]
     # Every folder is that of a run on its real system alone: either kind of run continues the other.
     # A robot may come back at another address.
     named = [real_systems.REMOTE if real_systems.is_robot(name) else name for name in args.real]
     homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in named}
     opened = runs.open_runs(
         homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
-        inputs={"priors": [digest(prior) for prior in priors]},
+        inputs={"priors": [digest(prior) for prior in priors], "real_data": [log.facts.sha256[:12] for log in logs]},
     )  # fmt: skip
-    card = card_of(priors[0] if priors else None)
     with contextlib.ExitStack() as last:
         for own in opened:
             last.callback(own.close)
@@ -68,15 +70,18 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
         setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
         assert isinstance(setup.system, Simulated | Gymnasium)
         records = [
-            Record(own.folder, setup.system.env, gap, method.name, seeds, evaluations_cost=cost)
+            Record(
+                own.folder, setup.system.env, gap, method.name, seeds, evaluations_cost=cost,
+                logged=logged.transitions(logs),
+            )
             for own, gap in zip(opened, found, strict=True)
-        ]
+        ]  # fmt: skip
         learner = None
         if real_systems.is_robot(args.real[0]):
             which = train.prior_of(setup.priors, setup.seeds)
             learner = LearnerProcess(_build(args, folders, priors), setup.seeds, which, setup.simulated)
             last.callback(learner.close)
-        return _Run(args, setup, setup.system, card, records, learner).work()
+        return _Run(args, setup, setup.system, card, records, logs, learner).work()
 
 
 def _build(args: FinetuneArgs, folders: list[Path], priors: list[Prior]) -> Callable[[], Finetuner]:
@@ -109,9 +114,10 @@ class _Run:
         system: Simulated | Gymnasium,
         card: dict[str, Any],
         records: list[Record],
+        logs: list[Log],
         learner: LearnerProcess | None,
     ) -> None:
-        self.learner, self.sync_every = learner, args.sync_every if learner else None
+        self.logs, self.learner, self.sync_every = logs, learner, args.sync_every if learner else None
         self.args, self.setup, self.card, self.records = args, setup, card, records
         self.finetuner, self.system, self.seeds = setup.finetuner, system, setup.seeds
         self.count, self.episodes = len(setup.seeds) // len(records), args.eval_episodes or 0
@@ -125,9 +131,16 @@ class _Run:
         recorded = Recorded(self.system, stores, done=done, sync_every=self.sync_every)
         steps = train.finetune(
             *self.setup._replace(system=recorded), rollouts=self.args.rollouts, progress=progress, learner=self.learner,
-            waits=self.args.hand_over == "rollouts",
+            waits=self.args.hand_over == "rollouts", logged=self._logged(),
         )  # fmt: skip
         return self._finish(self._follow(steps, progress))
+
+    def _logged(self) -> Logged | None:
+        """What the logs are for the members, None without logs."""
+        if not self.logs:
+            return None
+        capacity, updates = self.args.options.replay_capacity, self.args.real_updates
+        return logged.begin_with(self.logs, self.finetuner, self.system.env, capacity=capacity, updates=updates)
 
     def _restore(self) -> FinetuneProgress | None:
         """The state after the last checkpoint, None for a fresh start; raises UserError where real systems differ."""
@@ -189,8 +202,9 @@ class _Run:
         return float(found["score"].mean())
 
     def _checkpoint(self, progress: FinetuneProgress) -> None:
+        step = int(progress.rollouts) + train.offline_parts(self.finetuner, int(progress.offline))
         for i, record in enumerate(self.records):
-            record.checkpoint(_part(progress, i, self.count))
+            record.checkpoint(_part(progress, i, self.count), step)
 
     def _each(self, members: PyTree) -> Iterator[tuple[Record, PyTree]]:
         """Every real system's record and, [S], what belongs to it in a pytree over all members."""

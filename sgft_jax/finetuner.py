@@ -135,7 +135,7 @@ def assemble(
         # The caller may donate the state. The prior must survive that, and no two leaves may share a buffer.
         return jax.tree.map(jnp.copy, state)
 
-    def observe(state: FinetuneState, rows: Transition, valid: Array, score: Array) -> FinetuneState:
+    def observe(state: FinetuneState, rows: Transition, valid: Array, score: Array | None) -> FinetuneState:
         del score  # rewards are what is learned from
         state = parts.observed(state._replace(replay=parts.memory.add_episode(state.replay, rows, valid)))
         if parts.interface is None or state.interface is None:

@@ -125,7 +125,8 @@ def guarded(inner: Finetuner, first: Callable[[PyTree, PyTree], PyTree], *, scor
 
     first(params of a prior, what the fresh agent exports) -> params of the first reference, for `inner.policy`.
     score: what rollouts are judged by, "success" or "return". `learn` must follow each rollout once, as in
-    `train.finetune`. Metrics: guard/challenger, whether it is deployed next; guard/replaced; the expected scores.
+    `train.finetune`; what is learned before the first one, as from logs, deploys nothing. Metrics: guard/challenger,
+    whether it is deployed next; guard/replaced; the expected scores.
     """
 
     def init(params: PyTree, key: Key, simulated: SimulatedData | None = None) -> Guarded:
@@ -139,7 +140,9 @@ def guarded(inner: Finetuner, first: Callable[[PyTree, PyTree], PyTree], *, scor
     def act(state: Guarded, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         return inner.policy.act(export(state), carry, obs, key, explore=explore)
 
-    def observe(state: Guarded, rows: Transition, valid: Array, score: Array) -> Guarded:
+    def observe(state: Guarded, rows: Transition, valid: Array, score: Array | None) -> Guarded:
+        if score is None:  # neither of the two policies has played
+            return state._replace(agent=inner.observe(state.agent, rows, valid, None))
         guard = scored(state.guard, jnp.float32(score))
         # What has played: `inner.observe` may change the policy too, as identification does.
         reference = _choose(guard.replaced, inner.export(state.agent), state.reference)

@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.train import SimulatedRows, Updates
+from sgft_jax.train import Phase, SimulatedRows, Updates
 from sgft_jax.types import Array, Finetuner, Metrics, PyTree, UserError
 
 
@@ -37,10 +37,10 @@ class LearnerProcess:
         pin(self._cores[:1])
         self._result: tuple[PyTree, Metrics] | None = None
 
-    def submit(self, agent: PyTree, parts: Sequence[int], updates: int, *, offline: bool) -> None:
+    def submit(self, agent: PyTree, parts: Sequence[int], updates: int, phase: Phase) -> None:
         """Begins the learning phases `parts`; what came before must have been asked for with `result`."""
         self._result = None
-        self._talk(lambda: self._connection.send((jax.device_get(agent), list(parts), updates, offline)))
+        self._talk(lambda: self._connection.send((jax.device_get(agent), list(parts), updates, phase)))
 
     def ready(self) -> bool:
         """Whether `result` would not wait."""
@@ -96,10 +96,10 @@ def _work(
     updates: Updates | None = None
     try:
         while True:
-            agent, parts, count, offline = connection.recv()
+            agent, parts, count, phase = connection.recv()
             try:
                 updates = updates or Updates(build(), jnp.asarray(seeds), jnp.asarray(which), rows)
-                connection.send(jax.device_get(updates(agent, parts, count, offline=offline)))
+                connection.send(jax.device_get(updates(agent, parts, count, phase)))
             except Exception:
                 connection.send(traceback.format_exc())
     except (EOFError, OSError):

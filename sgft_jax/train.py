@@ -5,7 +5,7 @@ A yielded state is valid until the iterator's next step, which donates its array
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,7 @@ from sgft_jax.types import (
 )
 
 _INIT, _COLLECT, _LEARN, _EVALUATE, _OFFLINE = range(5)  # purposes, folded into a seed's key
+Phase = Literal["offline", "logged", "online"]  # of learning, see `Updates`
 OFFLINE_PART = 5_000  # updates of the offline phase between two yields
 WINDOW = 5  # real rollouts whose mean is the evidence for a policy
 _AT_ONCE = 1024  # simulated episodes played together
@@ -51,12 +52,28 @@ class Best(NamedTuple):
 
 
 class FinetuneProgress(NamedTuple):
-    """What a fine-tuning run needs to go on. agent: [M, ...]. rollouts, offline: int32 [], what lies behind it."""
+    """What a fine-tuning run needs to go on.
+
+    agent: [M, ...]. rollouts: int32 [], real ones behind it. offline: int32 [], updates before the first of them, on
+    simulated transitions, then on logs.
+    """
 
     agent: PyTree
     best: Best
     rollouts: Array
     offline: Array
+
+
+class Logged(NamedTuple):
+    """Episodes of the real system that something else has played, the same for all members.
+
+    transitions: [N, T, ...]. valid: [N, T] bool, the first steps of each episode. updates: gradient updates on them
+    before the first rollout.
+    """
+
+    transitions: Transition
+    valid: Array
+    updates: int
 
 
 class SimulatedRows(NamedTuple):
@@ -81,7 +98,7 @@ class SimulatedRows(NamedTuple):
 class Beside(Protocol):
     """A learner that works while the robot plays, such as a `LearnerProcess`."""
 
-    def submit(self, agent: PyTree, parts: Sequence[int], updates: int, *, offline: bool) -> None:
+    def submit(self, agent: PyTree, parts: Sequence[int], updates: int, phase: Phase) -> None:
         """Begins the learning phases `parts`, see `Updates`."""
         ...
 
@@ -108,12 +125,14 @@ def finetune(
     progress: FinetuneProgress | None = None,
     learner: Beside | None = None,
     waits: bool = True,
+    logged: Logged | None = None,
 ) -> Iterator[tuple[FinetuneProgress, Metrics]]:
     """Fine-tunes M members, each a seed on a real system, until each has made `rollouts` real rollouts.
 
     priors: params [P, ...] of P priors, or None; the member with seed s starts from prior s modulo P.
     seeds: [M] uint32. simulated: see `simulate`, for methods that ask for it.
-    progress: where an earlier run stopped, or None.
+    progress: where an earlier run stopped, or None. logged: logs to begin with: all members keep their episodes and
+    make `logged.updates` updates, as they learn from real rollouts, before they play.
     learner: what learns while the system plays, for systems that are stepped, see `Gymnasium.play`; None: this process
     learns between rollouts. waits: a rollout begins, but makes no step before its policy has been learned: the same
     results. False: it goes on with the policy before, and the new one takes over at the step at which it is there.
@@ -127,16 +146,34 @@ def finetune(
     if progress is None:
         progress = step.begin()
         yield progress, {}
-    updates = finetuner.simulation.offline_updates if finetuner.simulation else 0
-    while (done := int(progress.offline)) < updates:
-        progress, metrics = step.offline(progress, done, min(OFFLINE_PART, updates - done), learner)
+    simulated_updates = simulated_updates_of(finetuner)
+    while (done := int(progress.offline)) < simulated_updates:
+        progress, metrics = step.offline(progress, done, min(OFFLINE_PART, simulated_updates - done), learner)
         yield progress, metrics
+    if logged is not None:
+        if done == simulated_updates and not int(progress.rollouts):  # else they are kept already
+            progress = step.keep(progress, logged)
+        updates = simulated_updates + logged.updates
+        while (done := int(progress.offline)) < updates:
+            progress, metrics = step.offline(progress, done, min(OFFLINE_PART, updates - done), learner, logged=True)
+            yield progress, metrics
     if learner is not None:
         yield from step.beside(progress, learner, rollouts, waits=waits)
         return
     while (done := int(progress.rollouts)) < rollouts:
         progress, metrics = step.rollouts(progress, done, 1 if done else finetuner.initial_rollouts)
         yield progress, metrics
+
+
+def simulated_updates_of(finetuner: Finetuner) -> int:
+    """Updates on simulated transitions alone, before anything else."""
+    return finetuner.simulation.offline_updates if finetuner.simulation else 0
+
+
+def offline_parts(finetuner: Finetuner, offline: int) -> int:
+    """In how many parts so many updates before the first rollout have been yielded."""
+    simulated = min(offline, simulated_updates_of(finetuner))
+    return -(-simulated // OFFLINE_PART) - (simulated - offline) // OFFLINE_PART
 
 
 def evaluate(policy: Any, system: System, states: PyTree, seeds: Array, episodes: int) -> Episode:
@@ -177,13 +214,16 @@ class Updates:
         self._learn = jax.jit(self._update, static_argnums=(2, 4), donate_argnums=0)
 
     def __call__(
-        self, agent: PyTree, parts: Sequence[int], updates: int, *, offline: bool = False
+        self, agent: PyTree, parts: Sequence[int], updates: int, phase: Phase = "online"
     ) -> tuple[PyTree, Metrics]:
-        """So many updates in each part, a number from which their random draws follow; returns the mean metrics."""
-        learned = []
+        """So many updates in each part, a number from which their random draws follow; returns the mean metrics.
+
+        phase: "offline", on simulated transitions alone; "logged", before the first rollout; "online", after one.
+        """
+        purpose, learned = _LEARN if phase == "online" else _OFFLINE, []
         for part in parts:  # equal parts, so that one compiled program serves any number
-            keys = jax.vmap(lambda seed, part=part: _key(seed, _OFFLINE if offline else _LEARN, part))(self.seeds)
-            agent, metrics = self._learn(agent, keys, updates, self.simulated, offline)
+            keys = jax.vmap(lambda seed, part=part: _key(seed, purpose, part))(self.seeds)
+            agent, metrics = self._learn(agent, keys, updates, self.simulated, phase == "offline")
             learned.append(metrics)
         return agent, jax.tree.map(_mean, *learned)
 
@@ -209,20 +249,29 @@ class _Steps:
             raise UserError("this method also learns from simulated transitions: pass `simulated` (see `simulate`)")
         self._learn = Updates(finetuner, seeds, prior_of(priors, seeds), simulated)
         self._store = jax.jit(split_vmap(self._observe), donate_argnums=0)
+        self._keep_log = jax.jit(split_vmap(self._observe_log, (0, None, None)), donate_argnums=0)
         self._keep = jax.jit(functools.partial(_keep_best, finetuner), donate_argnums=0)
 
     def begin(self) -> FinetuneProgress:
         """The fresh state."""
         return jax.jit(functools.partial(begin, self.finetuner))(self.priors, self.seeds, self.simulated)
 
+    def keep(self, progress: FinetuneProgress, logged: Logged) -> FinetuneProgress:
+        """The episodes of a log, one after another, as if they had been played."""
+        agent = progress.agent
+        for i in range(len(logged.valid)):
+            agent = self._keep_log(agent, jax.tree.map(lambda x, i=i: x[i], logged.transitions), logged.valid[i])
+        return progress._replace(agent=agent)
+
     def offline(
-        self, progress: FinetuneProgress, done: int, updates: int, learner: Beside | None
+        self, progress: FinetuneProgress, done: int, updates: int, learner: Beside | None, *, logged: bool = False
     ) -> tuple[FinetuneProgress, Metrics]:
-        """Updates on simulated transitions alone."""
+        """Updates before the first rollout: on simulated transitions alone, or as after a rollout."""
+        phase: Phase = "logged" if logged else "offline"
         if learner is None:
-            agent, metrics = self._learn(progress.agent, [done], updates, offline=True)
+            agent, metrics = self._learn(progress.agent, [done], updates, phase)
         else:
-            learner.submit(progress.agent, [done], updates, offline=True)
+            learner.submit(progress.agent, [done], updates, phase)
             agent, metrics = learner.result()
         return progress._replace(agent=agent, offline=progress.offline + updates), metrics
 
@@ -248,7 +297,7 @@ class _Steps:
                 yield FinetuneProgress(agent, best, jnp.int32(done), offline), _real(before) | metrics
             if played:
                 agent, best = self._take(agent, best, played, done)
-                learner.submit(agent, range(done, done + n), self.finetuner.updates_per_rollout, offline=False)
+                learner.submit(agent, range(done, done + n), self.finetuner.updates_per_rollout, "online")
                 latest = functools.partial(_latest, learner, None if waits else agent)
                 done += n
             before = played
@@ -274,6 +323,11 @@ class _Steps:
     def _observe(self, state: PyTree, transitions: Transition, valid: Array, score: Array) -> PyTree:
         """transitions, valid: [1, T, ...]. score: [1]."""
         return self.finetuner.observe(state, jax.tree.map(lambda x: x[0], transitions), valid[0], score[0])
+
+    def _observe_log(self, state: PyTree, transitions: Transition, valid: Array) -> PyTree:
+        """transitions, valid: [T, ...]."""
+        return self.finetuner.observe(state, transitions, valid, None)
+
 
 
 def _latest(learner: Beside, meanwhile: PyTree | None) -> PyTree:

@@ -262,7 +262,7 @@ class Finetuner(NamedTuple):
     init_carry() -> carry of an episode.
     act(state, carry, obs [obs_dim], key, *, explore) -> (action [act_dim], carry); `explore` may be traced.
     observe(state, transitions [T, ...], valid [T], score []) -> state: keeps the rows of one episode, in order. score:
-        of the episode.
+        of the episode; None where something else has played it, which says nothing of the agent's policies.
     learn(state, key, updates, simulated, *, offline) -> (state, metrics averaged over the updates); `updates` and
         `offline` are static. offline: learn from the simulated transitions alone.
     export(state) -> params of the agent as it acts now.
@@ -277,7 +277,7 @@ class Finetuner(NamedTuple):
     init: Callable[[PyTree, Key, SimulatedData | None], PyTree]
     init_carry: Callable[[], PyTree]
     act: Callable[..., tuple[Array, PyTree]]
-    observe: Callable[[PyTree, Transition, Array, Array], PyTree]
+    observe: Callable[[PyTree, Transition, Array, Array | None], PyTree]
     learn: Callable[..., tuple[PyTree, Metrics]]
     export: Callable[[PyTree], PyTree]
     policy: Policy

@@ -47,7 +47,7 @@ START = """
 import os, signal, sys
 import envs
 envs.TASKS["toy"] = "toy"
-from experiments import finetune, finetune_record
+from experiments import finetune
 from experiments.finetune_record import Record
 from sgft_jax import train
 from sgft_jax.io.real import RealStore
@@ -70,10 +70,10 @@ def logged(self, done, values):
 Record.metrics = logged
 """
 OFFLINE = """
-train.OFFLINE_PART = finetune_record.OFFLINE_PART = 10
+train.OFFLINE_PART = 10
 checkpoint = Record.checkpoint
-def offline(self, progress):
-    checkpoint(self, progress)
+def offline(self, progress, step):
+    checkpoint(self, progress, step)
     if int(progress.offline) == 20:
         die()
 Record.checkpoint = offline
@@ -342,7 +342,6 @@ def test_a_guarded_run_killed_and_resumed_is_bit_for_bit_uninterrupted(home, tmp
 def test_killed_in_the_offline_phase_and_resumed_ends_as_if_uninterrupted(home, tmp_path, monkeypatch, capsys):
     """SIGKILL when one of two real systems has a checkpoint after 20 of 40 updates, the other only after 10."""
     monkeypatch.setattr(train, "OFFLINE_PART", 10)
-    monkeypatch.setattr("experiments.finetune_record.OFFLINE_PART", 10)
     more = ["--rollouts", "2", "--options.offline-updates", "40"]
     whole, parts = (argv(home, "iql", *more, out=tmp_path / o, reals=("turned", "heavy")) for o in ("whole", "parts"))
     finetune.main(whole)

@@ -25,9 +25,9 @@ class Inline:
     def __init__(self, finetuner, *, ready=True):
         self.updates, self.is_ready, self.parts = Updates(finetuner, SEEDS, WHICH, None), ready, []
 
-    def submit(self, agent, parts, updates, *, offline):
+    def submit(self, agent, parts, updates, phase):
         self.parts.append(list(parts))
-        self.learned = self.updates(jax.tree.map(jnp.copy, agent), parts, updates, offline=offline)
+        self.learned = self.updates(jax.tree.map(jnp.copy, agent), parts, updates, phase)
 
     def ready(self):
         return self.is_ready

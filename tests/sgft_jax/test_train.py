@@ -283,6 +283,71 @@ def test_a_guarded_run_that_was_stopped_goes_on_with_the_same_bits(tmp_path):
     assert bits(rest[-1]) == bits(whole[-1])
 
 
+# --- logs to begin with -----------------------------------------------------------------------------------------------
+
+
+def logs_of(*lengths, updates):
+    """Episodes of these lengths, whose observations are 10 * number + step."""
+    step, longest = np.arange(max(lengths), dtype=np.float32), max(lengths)
+    valid = step < np.array(lengths)[:, None]
+    obs = np.repeat((10.0 * np.arange(len(lengths))[:, None] + step)[..., None], 2, axis=-1).astype(np.float32)
+    paid = np.ones((len(lengths), longest), np.float32)
+    rows = Transition(obs, np.zeros((*paid.shape, 1), np.float32), paid, GAMMA * paid, obs + 1)
+    return train.Logged(jax.tree.map(jnp.asarray, rows), jnp.asarray(valid), updates)
+
+
+def test_logs_are_kept_by_all_and_learned_from_before_anything_is_played(monkeypatch):
+    """Seven updates in parts of five. Nobody has played yet, so no policy has evidence."""
+    monkeypatch.setattr(train, "OFFLINE_PART", 5)
+    system = Recorded(simulated())
+    yielded = run(system=system, rollouts=1, logged=logs_of(3, 2, updates=7))
+    assert [(int(p.offline), int(p.rollouts)) for p, _ in yielded] == [(0, 0), (5, 0), (7, 0), (7, 1)]
+    kept = yielded[2][0].agent.replay
+    assert kept.size.tolist() == [5, 5] and yielded[0][0].agent.replay.size.tolist() == [0, 0]
+    np.testing.assert_array_equal(kept.data.obs[:, :5, 0], [[0, 1, 2, 10, 11]] * 2)
+    np.testing.assert_allclose(yielded[2][0].agent.learner, [7.5, 7.0], atol=0.1)
+    assert yielded[2][0].best.count.tolist() == [0, 0] and len(system.played) == 1
+    assert yielded[3][0].agent.replay.size.min() > 5
+
+
+def test_logs_without_updates_are_kept_all_the_same():
+    yielded = run(rollouts=1, logged=logs_of(3, updates=0))
+    assert [int(p.rollouts) for p, _ in yielded] == [0, 1]
+    np.testing.assert_array_equal(yielded[1][0].agent.replay.data.obs[:, :3, 0], [[0, 1, 2]] * 2)
+
+
+def test_a_run_with_logs_goes_on_from_anywhere_with_the_same_bits(tmp_path, monkeypatch):
+    """After 6 and 12 updates on simulated rows, 6 and 8 on the logs, and a rollout: the logs are kept once."""
+    monkeypatch.setattr(train, "OFFLINE_PART", 6)
+    fine, logged = make(simulation=NEEDS), logs_of(3, 2, updates=8)
+    options = {"simulated": rows_of(10), "rollouts": 2, "logged": logged}
+    whole = run(fine, **options)
+    assert [int(p.offline) for p, _ in whole] == [0, 6, 12, 18, 20, 20, 20]
+    for i in range(1, 6):
+        state = jax.tree.map(jnp.asarray, copied(whole[i][0]))
+        rest = run(fine, progress=state, **options)
+        assert len(rest) == len(whole) - i - 1 and bits(rest[-1]) == bits(whole[-1]), i
+
+
+@pytest.mark.parametrize(("offline", "parts"), [(0, 0), (10, 1), (12, 2), (13, 3), (22, 3), (23, 4)])
+def test_parts_of_the_offline_phase_never_share_a_number(offline, parts, monkeypatch):
+    """Twelve updates on simulated rows, then those on logs, in parts of ten each."""
+    monkeypatch.setattr(train, "OFFLINE_PART", 10)
+    assert train.offline_parts(make(simulation=NEEDS), offline) == parts
+
+
+def test_a_log_is_no_evidence_for_the_guard():
+    """What it scored is not told; what was learned from it is not deployed before the reference has played."""
+    fine = make(guard=True)
+    yielded = run(fine, Scripted(RETURNS), rollouts=2, logged=logs_of(3, updates=4))
+    told = yielded[1][0].agent
+    assert told.guard.reference.weight.tolist() == told.guard.challenger.weight.tolist() == [0, 0]
+    assert told.guard.worst.tolist() == [np.inf] * 2 and told.guard.deployed.tolist() == [False] * 2
+    assert told.agent.replay.size.tolist() == [3, 3] and told.agent.learner.min() > 3.5
+    played = yielded[2][0].agent.guard
+    assert played.reference.total.tolist() == [5, 5] and played.worst.tolist() == [5, 5]
+
+
 # --- a system that is stepped from Python ---------------------------------------------------------------------------
 
 
