@@ -138,6 +138,14 @@ def test_actions_reach_the_bounds_of_the_space():
     np.testing.assert_allclose(episode.transitions.action[0], [0.5, -1.0])  # what the policy chose is what is kept
 
 
+def test_the_command_is_kept_beside_what_was_sent():
+    """Both in [-1, 1]: the middle of the bounds is 0."""
+    bounds = {"low": np.array([0, -3], np.float32), "high": np.array([4, 3], np.float32)}
+    episode = play(Spoken(ends="truncated", says={2: {"sent": np.array([2.0, 0.0])}}, **bounds))
+    np.testing.assert_allclose(episode.command[:4], [[0.5, -1.0]] * 3 + [[0.0, 0.0]])
+    np.testing.assert_allclose(episode.transitions.action[:3], [[0.5, -1.0], [0.0, 0.0], [0.5, -1.0]])
+
+
 def test_the_environments_own_reward_is_recorded():
     episode = play(Spoken(ends="truncated"))
     np.testing.assert_allclose(episode.transitions.reward[:4], [10.0, 20.0, 30.0, 0.0])
