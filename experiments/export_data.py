@@ -1,0 +1,80 @@
+"""Export the real rollouts of a run as a data set that others read: for Minari, or for LeRobot (v3).
+
+What is exported is what was measured, what was sent, and what the step led to. Episodes end where they ended, their
+last observation included. What a policy reads beyond measurements, such as its last actions, is left out.
+"""
+
+import importlib.util
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from experiments import cli
+from experiments.rollouts import config_of, episodes_of, home_of, task_of
+from sgft_jax.types import UserError
+
+_AUTHOR = "sgft_jax experiments.export_data"
+
+
+@dataclass(frozen=True)
+class ExportDataArgs:
+    """One data set of one run."""
+
+    run: Path
+    """Folder of a fine-tuning run, or any other with rollouts in real/ (docs/formats.md)."""
+    to: Literal["minari", "lerobot"]
+    """minari: a folder that Minari's library opens. lerobot: a folder that LeRobot's opens, version 3."""
+    seed: int | None = None
+    """One seed of the run; default: all, the episodes of the first one first."""
+    out: Path | None = None
+    """The new folder. Minari wants a version at the end of its name. Default: export/<to>/<run>-v0 inside --run."""
+    task: str | None = None
+    """A Python file with a task of your own; default: the task of the run."""
+
+
+def main(args: ExportDataArgs) -> None:
+    """Writes the data set and says where it is."""
+    home = home_of("--run", args.run)
+    task, folder = task_of(home, args.task), args.out or home / "export" / args.to / _name(home, args.seed)
+    if folder.exists():
+        raise UserError(f"{folder}: exists already; choose another --out, or remove it")
+    if args.to == "minari" and not re.search(r"-v\d+$", folder.name):
+        raise UserError(f"--out {folder}: Minari wants a version at the end, such as {folder.name}-v0")
+    if args.to == "lerobot" and importlib.util.find_spec("pyarrow") is None:
+        raise UserError("--to lerobot: pyarrow is not installed; pip install 'sgft-jax[lerobot]'")
+    stored = episodes_of(home, args.seed)
+    import envs
+    from sgft_jax.data import lerobot, recording
+
+    env = envs.make(task)
+    seen, commanded = (stored[0].rows[name].shape[1] for name in ("obs", "action"))
+    if seen < env.measured_dim or commanded != env.act_dim:
+        raise UserError(
+            f"{home}: has {seen} observations and {commanded} actions, {env.name} has {env.measured_dim} and "
+            f"{env.act_dim}; name its task with --task"
+        )
+    episodes = recording.of_stored(stored, env.measured_dim)
+    if not episodes:
+        raise UserError(f"{home}: holds no valid step")
+    if args.to == "minari":
+        entries = {"observation": [e._asdict() for e in env.measured], "action": [e._asdict() for e in env.action]}
+        about = {"algorithm_name": str(config_of(home).get("method", "")), "author": [_AUTHOR], "task": env.name}
+        recording.write_minari(folder, episodes, {**about, "control_dt": env.control_dt, **entries})
+    else:
+        lerobot.write(
+            folder, episodes, task=env.name, control_dt=env.control_dt, observation=env.measured, action=env.action
+        )
+    steps, won = sum(len(own.reward) for own in episodes), sum(bool(own.success) for own in episodes)
+    print(f"{folder}: {len(episodes)} episodes, {steps:,} transitions, {won} successes")
+
+
+def _name(home: Path, seed: int | None) -> str:
+    """What a data set is called: `push-default-guarded-seeds-0-9-v0`."""
+    words = home.absolute().parts[-4:-1] if config_of(home) else ()
+    which = home.name if seed is None else f"seed-{seed}"
+    return f"{re.sub(r'[^\w.-]', '-', '-'.join([*words, which]))}-v0"
+
+
+if __name__ == "__main__":
+    cli.run_main(main, ExportDataArgs, __doc__ or "")
