@@ -19,6 +19,8 @@ COMMANDS = (
     "tasks",
     "diagnose",
     "export",
+    "export_data",
+    "replay",
 )
 MISTAKES = {
     "pretrain": "--config.gamma 2",
@@ -31,6 +33,8 @@ MISTAKES = {
     "benchmark": "--worlds 0",
     "diagnose": "--rollouts 0",
     "export": "--policy nowhere --to onnx",
+    "export_data": "--run nowhere --to minari",
+    "replay": "--run nowhere",
 }
 LIGHT = ("sgft_jax", "sgft_jax.checks", "sgft_jax.models.config", "experiments.cli", "sgft_jax.presets")
 

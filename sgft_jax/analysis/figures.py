@@ -6,7 +6,7 @@ Okabe-Ito palette (safe for colour-blind readers).
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +45,22 @@ class Line:
     score: str
     seeds: int
     by_prior: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """One quantity over time.
+
+    time: [N] seconds. lines: {name: [N]}; dotted: others of the same names. nan leaves a gap. held: whether a value
+    stays until the next one.
+    """
+
+    name: str
+    unit: str
+    time: np.ndarray
+    lines: Mapping[str, np.ndarray]
+    dotted: Mapping[str, np.ndarray] = field(default_factory=dict)
+    held: bool = False
 
 
 def learning_curves(path: Path, panels: Mapping[str, Sequence[Curve]], *, title: str) -> Path:
@@ -257,6 +273,39 @@ def diagnosis(
     kinds.axvline(1.0, color=_GREY, linewidth=1)
     kinds.set_title("signs of the gap; one counts from 1 on", **_FONT, loc="left")
     figure.suptitle(title, x=0.005, ha="left", size=12, weight="bold", color=_INK)
+    return _save(figure, path)
+
+
+def rollouts(path: Path, panels: Sequence[Panel], episodes: Mapping[str, float], *, title: str) -> Path:
+    """Episodes over time, one after another: a panel for each quantity, all with one time axis.
+
+    episodes: by words, the time in seconds at which each ends.
+    """
+    figure, drawn = _figure(9.6, 1.15 * len(panels) + 0.9, columns=1, count=len(panels))
+    ends = list(episodes.values())
+    for axes, panel in zip(drawn, panels, strict=True):
+        style: dict[str, Any] = {"drawstyle": "steps-post"} if panel.held else {}
+        for i, (name, values) in enumerate(panel.lines.items()):
+            look = {"color": PALETTE[i % MOST], "linestyle": "-" if i < MOST else "--", **style}
+            axes.plot(panel.time, values, linewidth=1.4, label=name, **look)
+            if name in panel.dotted:
+                axes.plot(panel.time, panel.dotted[name], linewidth=1.0, **{**look, "linestyle": ":"})
+        for end in ends[:-1]:
+            axes.axvline(end, color=_GREY, linewidth=1)
+        axes.set_title(panel.name, **_FONT, loc="left")
+        axes.set_ylabel(panel.unit, **{**_FONT, "size": 9})
+        axes.set_xlim(0, ends[-1])
+        axes.tick_params(labelbottom=axes is drawn[-1])
+        if len(panel.lines) > 1:
+            axes.legend(
+                loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8, labelcolor=_INK,
+                handlelength=1.2, ncols=1 + (len(panel.lines) - 1) // 6,
+            )  # fmt: skip
+    for words, begin, end in zip(episodes, [0.0, *ends], ends, strict=False):
+        middle = (begin + end) / 2, 1.2
+        drawn[0].text(*middle, words, transform=drawn[0].get_xaxis_transform(), ha="center", size=9, color=_GREY)
+    drawn[-1].set_xlabel("seconds", **_FONT)
+    figure.suptitle(title, x=0.01, ha="left", size=12, weight="bold", color=_INK)
     return _save(figure, path)
 
 

@@ -1,0 +1,53 @@
+"""Look at real rollouts that a run has stored: a plot of what was measured, commanded and sent, and a video."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from experiments import cli
+from experiments.options import without_repeats
+from experiments.rollouts import episodes_of, home_of, task_of
+from sgft_jax.io.real import Played
+from sgft_jax.types import UserError
+
+
+@dataclass(frozen=True)
+class ReplayArgs:
+    """Some rollouts of one seed, one after another."""
+
+    run: Path
+    """Folder of a fine-tuning run, or any other with rollouts in real/ (docs/formats.md)."""
+    rollout: tuple[int, ...] = ()
+    """Their numbers, as those of the files, e.g. --rollout 0 19; default: the last one."""
+    seed: int | None = None
+    """Of which seed; default: the first one of the run."""
+    out: Path | None = None
+    """Folder for the pictures. Default: replay/ inside --run."""
+    video: bool = True
+    """Render each rollout too, where its states were stored and MuJoCo can render."""
+    task: str | None = None
+    """A Python file with a task of your own; default: the task of the run."""
+
+
+def main(args: ReplayArgs) -> None:
+    """Draws, and says where the pictures are."""
+    home = home_of("--run", args.run)
+    task, episodes = task_of(home, args.task), chosen(home, args)
+    from experiments.replay_draw import draw
+
+    print("\n".join(draw(home, task, episodes, args.out or home / "replay", video=args.video)))
+
+
+def chosen(home: Path, args: ReplayArgs) -> list[Played]:
+    """The rollouts that are asked for; raises UserError for numbers that there are not."""
+    without_repeats("--rollout", [str(n) for n in args.rollout])
+    found = episodes_of(home, args.seed)
+    own = {one.number: one for one in found if one.seed == found[0].seed and len(one.rows["reward"])}
+    if not own:
+        raise UserError(f"{home / 'real'}: holds no valid step")
+    if missing := [n for n in args.rollout if n not in own]:
+        raise UserError(f"--rollout {missing[0]}: {home / 'real'} has {min(own)} to {max(own)}")
+    return [own[n] for n in args.rollout or (max(own),)]
+
+
+if __name__ == "__main__":
+    cli.run_main(main, ReplayArgs, __doc__ or "")
