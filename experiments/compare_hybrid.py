@@ -47,7 +47,7 @@ class CompareHybridArgs:
     """How simulators differ from the real system: gaps by name, .toml/.json files, or sim for no gap; default: all that
     come with the task."""
     data: tuple[Path, ...] = ()
-    """The real data: D4RL or Minari files, folders of Minari sets, or logs of a wheel-legged robot."""
+    """The real data: files or folders, as `--data` of experiments.hybrid takes them (docs/data.md)."""
     real: str = SIM
     """The real system to evaluate in: sim for the task as it is, or a gap by name or as a file."""
     previous_actions: int = 0
@@ -140,7 +140,7 @@ def check(args: CompareHybridArgs) -> None:
         raise UserError(unknown("--reference", args.reference, args.methods))
     learning = [name for name in args.methods if get_method(name.partition(":")[0]).kind != "simulator"]
     if learning and not args.data:
-        raise UserError(f"--data: {learning[0]} learns from real data; name D4RL or Minari files")
+        raise UserError(f"--data: {learning[0]} learns from real data; name files or folders (docs/data.md)")
     if missing := [path for path in args.data if not path.exists()]:
         raise UserError(f"--data {missing[0]}: no such file")
 

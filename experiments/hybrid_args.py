@@ -31,8 +31,8 @@ class HybridArgs:
     """How the simulator differs from the real system: gaps by name, .toml/.json files, or sim for no gap. Several share
     one program; each has a run folder of its own. Methods without a simulator leave it out."""
     data: Path | None = None
-    """The real data: a D4RL or Minari HDF5 file, the folder of a Minari data set, or the .txt or .csv log of a
-    wheel-legged robot."""
+    """The real data: a D4RL or Minari HDF5 file, the folder of a Minari or LeRobot data set or of a run with rollouts
+    in real/, or the .txt or .csv log of a wheel-legged robot (docs/data.md)."""
     real: str = SIM
     """The real system to evaluate in: sim for the task as it is, or a gap by name or as a file."""
     previous_actions: int = 0
@@ -98,7 +98,7 @@ def check(args: HybridArgs) -> tuple[HybridMethod, list[int]]:
     if not isinstance(args.options, type(method.config)):
         raise UserError(f"--method {method.name}: the options are those of another method")
     if method.kind != "simulator" and args.data is None:
-        raise UserError(f"--data: {method.name} learns from real data; name a D4RL or Minari file")
+        raise UserError(f"--data: {method.name} learns from real data; name a file or folder (docs/data.md)")
     if not re.fullmatch(r"[\w.-]*", args.variant):
         raise UserError(f"--variant {args.variant!r}: letters, digits, '.', '_' and '-' only, it names a folder")
     if not args.gap:

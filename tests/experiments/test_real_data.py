@@ -17,6 +17,7 @@ from envs.history import with_previous_actions
 from envs.pools import real_worlds
 from experiments import cli, export_data, finetune, replay, replay_draw
 from experiments.rollouts import episodes_of
+from sgft_jax import train
 from sgft_jax.data import logs
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.real import RealStore
@@ -214,8 +215,9 @@ def test_logs_of_another_task_are_refused(words, tmp_path, capsys):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("updates", [20, 30])
-def test_killed_before_or_among_the_updates_on_logs(words, tmp_path, updates):
+def test_killed_before_or_among_the_updates_on_logs(words, tmp_path, updates, monkeypatch):
     """The end is the same to the bit; episodes of the logs are kept once."""
+    monkeypatch.setattr(train, "OFFLINE_PART", 10)
     simulated = ["--options.offline-updates", "20", "--options.simulated-transitions", "80", "--eval-episodes", "2"]
     more = ["--method", "iql", *simulated, "--real-updates", "20", "--out"]
     common = [word for word in words(seeds=2) if "critic-warmup" not in word]
