@@ -329,7 +329,6 @@ class _Steps:
         return self.finetuner.observe(state, transitions, valid, None)
 
 
-
 def _latest(learner: Beside, meanwhile: PyTree | None) -> PyTree:
     """The agent that acts now: what has been learned, or `meanwhile`, if there is that, until it is ready."""
     return learner.result()[0] if meanwhile is None or learner.ready() else meanwhile
