@@ -8,7 +8,7 @@ import dataclasses
 import hashlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple, cast, get_args
+from typing import Any, NamedTuple, cast, get_args
 
 import jax
 import numpy as np
@@ -182,7 +182,7 @@ def _fitted(path: Path, rows: Rows, env: Env) -> Rows:
 
 def _judged(path: Path, rows: Rows, env: Env | None) -> Rows:
     """With the task's rewards and terminations where the file tells none. Without a task episodes end by time alone."""
-    step = rows.obs, np.clip(rows.action, -1, 1), rows.next_obs
+    step: tuple[Any, ...] = rows.obs, np.clip(rows.action, -1, 1), rows.next_obs
     if rows.reward is None:
         if env is None or env.reward is None:
             raise UserError(f"{path}: tells no rewards, and neither does a task; record them as next.reward")
