@@ -290,6 +290,7 @@ def test_a_variant_has_a_folder_beside_its_method():
 # --- killed and resumed -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_was_stored_after_the_last_checkpoint_is_replayed_not_collected_again(home, tmp_path, explored):
     """SIGKILL when rollout 4 of 5 is on disk and the checkpoint is of rollout 3: one rollout is left to play."""
     arguments = argv(home, "sgft-sac", out=tmp_path)
@@ -468,6 +469,7 @@ def test_a_bad_command_is_one_line_and_code_2(home, tmp_path, more, words, capsy
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_training_that_diverges_stops_in_one_line(home, tmp_path, capsys):
     error = complaint([*argv(home, "sac", out=tmp_path), "--options.lr-critic", "1e30"], capsys)
     assert "training has diverged: " in error and "is not finite after 2 rollouts; there is no checkpoint" in error
@@ -518,6 +520,7 @@ def agree(one, two, upto):
                 assert a[key] == pytest.approx(b[key], rel=1e-3, abs=1e-3), key
 
 
+@pytest.mark.slow
 def test_simulated_data_are_those_of_the_simulator_that_the_prior_comes_from(tmp_path):
     """A mass of 3 kg without friction, where the task's own domain has 0.8 to 1.2 kg and 3.5 to 4.5 per second."""
     gap = {"name": "wrong", "params": {"mass": 3.0, "friction": 0.0}, "effects": {"obs_noise": 0.0}, "scene": ""}
@@ -593,6 +596,7 @@ def film(folder, monkeypatch, *, pushes=(0.0, 1.0), scene=None, reason=None):
     return record.film(pool, lambda: played, 7), played, pool
 
 
+@pytest.mark.slow
 def test_no_scene_no_renderer_or_a_broken_one_is_a_notice(tmp_path, monkeypatch):
     assert film(tmp_path, monkeypatch)[0] == "no video: toy has no scene to draw"
     scene = object()

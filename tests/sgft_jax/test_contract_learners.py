@@ -17,16 +17,20 @@ LATER = {"reward one step later", "time limit", "termination"}  # a memory must 
 QUICK = {
     "tdmpc2": set(),
     "sgft-tdmpc2": set(),
-    "sac, ten critics": {"reward one step later", "action decides"},
+    "sac, ten critics": set(),
     "h2oplus, four critics": set(),
     "h2o": set(),
     "darc": set(),
     "cql": set(),
     "edac": set(),
-    "rebrac": {"reward one step later"},
+    "rebrac": set(),
+    "recurrent": {"state and action decide"},
 }
 # Made of what the others are made of.
-SLOW = {"sac, ten critics", "h2oplus, four critics", "h2o", "darc", "cql", "edac", "sgft-tdmpc2"}
+SLOW = {
+    "sac, ten critics", "h2oplus, four critics", "h2o", "darc", "cql", "edac", "rebrac", "tdmpc2", "sgft-tdmpc2",
+    "recurrent",
+}  # fmt: skip
 
 
 def slow_if(slow, *values):

@@ -33,8 +33,8 @@ def act(case, state, obs=OBS, explore=False):
 @pytest.mark.parametrize(
     ("name", "moves"),
     [
-        ("sac", {"actor", "critic"}),
-        ("sgft", {"actor", "critic"}),
+        pytest.param("sac", {"actor", "critic"}, marks=pytest.mark.slow),
+        pytest.param("sgft", {"actor", "critic"}, marks=pytest.mark.slow),
         ("sgft-sac", {"actor", "critic", "models"}),
         ("frozen-critic", {"actor"}),
         ("sgft-mpc", {"models"}),
@@ -53,6 +53,7 @@ def test_what_moves_and_what_is_frozen(name, moves):
     assert all(jnp.isfinite(m) and m.shape == () for m in metrics.values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tdmpc2", "sgft-tdmpc2"])
 def test_what_moves_in_a_planner(name):
     case = tuner(name)
@@ -76,6 +77,7 @@ def test_the_released_code_learns_a_new_agent_from_shaped_rewards():
     assert abs(metrics["batch/reward_mean"] - raw) > 1e-3
 
 
+@pytest.mark.slow
 def test_frozen_models_and_a_warm_up_keep_their_bits():
     case = tuner("sgft-sac", train_dynamics=False, critic_warmup=2, reset_critic=True)
     state = started(case)
@@ -86,7 +88,9 @@ def test_frozen_models_and_a_warm_up_keep_their_bits():
     assert not equal(warm.learner.actor, moved.learner.actor)
 
 
-@pytest.mark.parametrize(("name", "models"), [("sgft-sac", 4), ("sgft-sac", 2), ("sgft-mpc", 2)])
+@pytest.mark.parametrize(
+    ("name", "models"), [pytest.param("sgft-sac", 4, marks=pytest.mark.slow), ("sgft-sac", 2), ("sgft-mpc", 2)]
+)
 def test_learning_rates_of_the_simulators_networks_rise_from_zero(name, models):
     """Adam's first step has the rate's length, so with a warm-up of 4 it is a quarter; models may have their own."""
     moved = {}
@@ -107,7 +111,9 @@ def test_learning_rates_of_the_simulators_networks_rise_from_zero(name, models):
 # --- from the prior to the agent ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["sac", "sgft-sac", "rlpd", "iql", "sgft-mpc", "sgft-tdmpc2-code"])
+@pytest.mark.parametrize(
+    "name", tuners.slow_but({"sac", "sgft-sac"}, ["sac", "sgft-sac", "rlpd", "iql", "sgft-mpc", "sgft-tdmpc2-code"])
+)
 def test_a_fresh_state_has_buffers_of_its_own(name):
     """Whoever gets it may donate it, and the prior survives."""
     case = tuner(name)
@@ -125,7 +131,7 @@ def test_the_first_action_is_the_simulators(name, horizon):
     np.testing.assert_allclose(got, jnp.tanh(moments[0]), rtol=1e-4)
 
 
-@pytest.mark.parametrize("name", tuners.slow_but({"sac", "sgft-mpc", "rlpd", "iql"}, METHODS))
+@pytest.mark.parametrize("name", tuners.slow_but({"sac", "iql"}, METHODS))
 def test_a_method_says_whether_it_begins_as_the_simulators_policy(name):
     case = tuner(name)
     acts = make_policy(prior(METHODS[name].prior).card, TASK)
@@ -144,7 +150,10 @@ def test_a_fresh_agent_takes_the_statistics_alone(name):
     assert not equal(own["Dense_0"]["kernel"], case.params.actor["Dense_0"]["kernel"])
 
 
-@pytest.mark.parametrize("name", [name for name, method in METHODS.items() if not method.needs_prior])
+NO_PRIOR = [name for name, method in METHODS.items() if not method.needs_prior]
+
+
+@pytest.mark.parametrize("name", tuners.slow_but({"sac"}, NO_PRIOR))
 def test_methods_that_need_no_prior_start_without_one(name, monkeypatch):
     """With networks of their own; made small here."""
     from sgft_jax.methods import options
@@ -242,6 +251,7 @@ def test_shaped_rewards_are_bounded_where_asked(name, bound):
     assert (metrics["batch/reward_std"] <= 0.011) == (bound is not None)
 
 
+@pytest.mark.slow
 def test_the_simulators_transitions_as_the_models_have_them(seen):
     """After the real rows come as many relabelled ones; branches begin at both, and the actor learns from both."""
     plain = tuners.build("sgft-relabel", clip_shaped=None, train_dynamics=False)
@@ -281,6 +291,7 @@ def test_imagined_steps_follow_every_model(monkeypatch):
     assert 0.2 < went_far.mean() < 0.8
 
 
+@pytest.mark.slow
 def test_models_learn_from_real_rows_alone():
     """The simulated rows of sgft-relabel, however odd, do not move the models."""
     case, data = tuner("sgft-relabel"), tuners.simulated().of(0)

@@ -204,6 +204,7 @@ def test_branches_draw_their_own_actions_and_know_the_steps_to_go(key):
     assert jnp.array_equal(jnp.floor(10 * imagined), jnp.tile(jnp.array([3.0, 2.0, 1.0]), 8))
 
 
+@pytest.mark.slow
 def test_branch_noise_spreads_the_imagined_actions_within_their_range(key):
     rest, zeros = imagination(policy=lambda obs, context, key: jnp.zeros(1)), np.zeros(40)
     quiet, spread, wide = (
@@ -255,6 +256,7 @@ def tilted(transform, state, *, joint, pair):
     return state._replace(joint=last(state.joint, joint), pair=last(state.pair, pair))
 
 
+@pytest.mark.slow
 def test_weights_by_hand(key):
     """The joint adds log-odds of -1.5 for real, so w = exp(-1.5) = 0.2231 whatever the pair says; of +1.5: capped."""
     weigh = sgft.weigh(ratio.RatioConfig(1, 1, NetworkConfig((4,))))

@@ -362,6 +362,7 @@ def moved(config, key, steps=3):
     return {*names} | (set() if same else {"value"})
 
 
+@pytest.mark.slow
 def test_what_learns(key):
     assert moved(PLAIN, key) == {*NETWORKS, "target_critic", "value"}
     assert moved(SGFT, key) == {"dynamics", "reward", "policy"}
