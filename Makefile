@@ -13,7 +13,7 @@ FLAGS = $(call flag,TASK,task) $(call flag,PRESET,preset) $(call flag,METHOD,met
 	$(call flag,PRIOR,prior) $(call flag,SEED,seed) $(call flag,SEEDS,seeds) $(ARGS)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup lint type test test-all demo bench gaps pretrain finetune evaluate figures frozen docs lock clean
+.PHONY: help setup lint type test test-all demo real-demo bench gaps pretrain finetune evaluate figures frozen docs lock clean
 
 help: ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-10s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -49,6 +49,9 @@ test-all: $(PY) ## every test that this machine can run
 
 demo: $(PY) ## the whole method in minutes on a CPU
 	$(PY) -m experiments.demo $(FLAGS)
+
+real-demo: $(PY) ## fine-tune in another engine, Bullet (needs a Python 3.11: PYTHON311=...)
+	$(PY) -m experiments.real_demo $(call flag,PRIOR,prior) $(call flag,METHOD,method) $(call flag,SEED,seed) $(ARGS)
 
 bench: $(PY) ## speeds next to their references
 	$(PY) -m experiments.benchmark $(ARGS)

@@ -27,6 +27,7 @@ TASKS = {
     "push-ball": "envs.franka.ball",
     "hammer": "envs.franka.hammer",
     "insert": "envs.franka.insert",
+    "panda-push": "envs.franka.panda_push",
     "halfcheetah": "envs.locomotion.halfcheetah",
     "walker2d": "envs.locomotion.walker2d",
     "wheel-legged": "envs.locomotion.wheel_legged",

@@ -39,17 +39,21 @@ def render_side_by_side(
     captions: Sequence[str],
     path: Path,
 ) -> None:
-    """Writes several episodes of one task as one video, side by side, each under its caption; see `render_episode`.
+    """Writes several episodes of one task as one video, side by side, each under its caption; see `render_episode`."""
+    write_side_by_side([list(_frames(scene, *own)) for own in zip(thetas, episodes, strict=True)], captions, path)
 
-    An episode that ends earlier shows its last frame until the end.
+
+def write_side_by_side(columns: Sequence[Sequence[np.ndarray]], captions: Sequence[str], path: Path) -> None:
+    """Writes columns of frames [*SIZE, 3] uint8, each under its caption, as one video, and its middle frame as .png.
+
+    A column that ends earlier shows its last frame until the end.
     """
-    columns = [
-        [np.concatenate([strip, frame]) for frame in _frames(scene, theta, qpos)]
-        for theta, qpos, strip in zip(thetas, episodes, map(_caption, captions), strict=True)
-    ]
-    length = max(map(len, columns))
-    frames = [np.concatenate([c[min(i, len(c) - 1)] for c in columns], axis=1) for i in range(length)]
-    _write(path, frames)
+    strips = list(map(_caption, captions))
+    rows = (
+        [np.concatenate([strip, own[min(i, len(own) - 1)]]) for strip, own in zip(strips, columns, strict=True)]
+        for i in range(max(map(len, columns)))
+    )
+    _write(path, [np.concatenate(row, axis=1) for row in rows])
 
 
 def smooth(qpos: np.ndarray, *, control_dt: float, fps: float) -> np.ndarray:

@@ -1,0 +1,240 @@
+"""Pushing a cube to a mark: a twin in MuJoCo of PandaPush of panda-gym, which Bullet simulates.
+
+An action of panda-gym moves the end effector, and an observation says nothing of joints. So there is no arm here: closed
+fingers hang on three slides, whose servos were fitted to how Bullet's arm moves (docs/physics.md). The table has no
+edges. The mark has two slides of its own that nothing moves, so that every episode may draw its place.
+"""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from envs.base import Entry, Env, Parameter
+from envs.franka.arm import NO_CONTACT
+from envs.mujoco.scene import Scene, View, make_env
+from envs.mujoco.worlds import PhysicsState
+from sgft_jax.types import Array, Key
+
+CONTROL_DT, SUBSTEPS = 0.04, 10  # s; physics steps in it
+CUBE_HALF = 0.02  # m
+SPREAD = 0.15  # m: half of the side of the square in which cube and mark start
+REACHED = 0.05  # m between the centres of cube and mark
+BEHIND = 0.04  # m: where the reward wants the fingertip, behind the cube's centre
+START = np.array([0.0384, 0.0, 0.1974])  # m, of the fingertip
+WORKSPACE = np.array([[-0.35, -0.45, 0.0], [0.2, 0.45, 0.5]])  # m, of where the fingertip may be sent
+FINGER_HALF = (0.0098, 0.0151, 0.025)  # m, of both closed fingers, with the 1 mm that Bullet keeps around them
+FINGER_LOW = 0.0072  # m that they reach below the fingertip
+TABLE_AT = 0.005  # m: the lowest place of the fingertip; Bullet's fingers are soft by some millimetres
+# Bullet's inverse kinematics ends short of where an action of 1 sends the fingertip, 5 cm away.
+STEP = 0.05 * np.array([0.6, 0.85, 0.9])  # m along x, y, z
+# A servo of Bullet takes a tenth of its way in 2 ms, as far as its force allows. The arm is stiff along x.
+RATE, DAMPING = 50.0, 200.0  # 1/s: speed for each m of way; how soon that speed is reached
+MASS = 5.0  # kg
+STRENGTH = np.array([60.0, 28.0, 20.0])  # m/s^2 of that mass along x, y, z; gravity is added
+
+PARAMETERS = (
+    Parameter("cube_mass", "kg", 1.0, 0.7, 1.4, minimum=0.01),
+    Parameter("table_friction", "", 0.25, 0.15, 0.4, minimum=0.0),
+    Parameter("finger_friction", "", 0.5, 0.3, 0.8, minimum=0.0),
+    Parameter("servo_rate", "", 1.0, 0.7, 1.3, minimum=0.05),
+    Parameter("servo_strength", "", 1.0, 0.7, 1.3, minimum=0.6),
+    # Random actions from far above would hardly ever touch the cube, whose motion then had no statistics.
+    Parameter("start_beside", "probability", 0.5, 0.5, 0.5, minimum=0.0, maximum=1.0),
+)
+_BESIDE = [p.name for p in PARAMETERS].index("start_beside")
+_CUBE, _MARK = [0.1, 0.7, 0.25, 1.0], [0.1, 0.7, 0.25, 0.3]
+
+
+def build(theta: dict[str, float]) -> mujoco.MjSpec:
+    """The scene for one theta. Where cube and mark start is part of the state, not of the model."""
+    spec = mujoco.MjSpec()
+    option = spec.option
+    option.timestep, option.integrator = CONTROL_DT / SUBSTEPS, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.solver, option.jacobian = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtJacobian.mjJAC_DENSE
+    # With pyramids for friction the same few iterations leave so large an error that a sliding cube trips over its edge.
+    option.cone, option.iterations, option.ls_iterations = mujoco.mjtCone.mjCONE_ELLIPTIC, 6, 8
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    spec.worldbody.add_geom(
+        name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1], rgba=[0, 0, 0, 0], **NO_CONTACT
+    )
+    _add_fingers(spec, rate=RATE * theta["servo_rate"], strength=theta["servo_strength"])
+    cube = spec.worldbody.add_body(name="cube")
+    cube.add_freejoint()
+    _add_box(cube, "cube", (CUBE_HALF,) * 3, mass=theta["cube_mass"], rgba=_CUBE)
+    _add_mark(spec)
+    _add_pair(spec, "table", "cube", theta["table_friction"])
+    _add_pair(spec, "fingers", "cube", theta["finger_friction"])
+    return spec
+
+
+def initial(params: Array, key: Key) -> PhysicsState:
+    """Cube and mark anywhere in their square; the fingers above the middle of the table, or beside the cube."""
+    key_places, key_beside, key_which = jax.random.split(key, 3)
+    cube, mark = jax.random.uniform(key_places, (2, 2), minval=-SPREAD, maxval=SPREAD)
+    tip = jnp.asarray(START, jnp.float32)
+    tip = jnp.where(jax.random.uniform(key_which) < params[_BESIDE], beside(cube, key_beside), tip)
+    lying = jnp.concatenate([cube, jnp.array([CUBE_HALF, 1.0, 0.0, 0.0, 0.0])])
+    return _state(tip, jnp.zeros(3), lying, jnp.zeros(6), mark)
+
+
+def beside(cube: Array, key: Key) -> Array:
+    """[3] m: a random place of the fingertip next to a cube at `cube` [2], not touching it."""
+    turn, away, height = jax.random.uniform(
+        key, (3,), minval=jnp.array([-jnp.pi, 0.05, 0.01]), maxval=jnp.array([jnp.pi, 0.09, 0.05])
+    )
+    return jnp.stack([cube[0] + away * jnp.cos(turn), cube[1] + away * jnp.sin(turn), height])
+
+
+def settled(params: Array, obs: Array) -> PhysicsState:
+    """The state that is seen, as if the servos had arrived. An observation tells all the rest."""
+    turn = _quaternion(obs[9:12])
+    spin = _turned(_inverse(turn), obs[15:18])  # MuJoCo tells it in the cube's own frame
+    cube, moving = jnp.concatenate([obs[6:9], turn]), jnp.concatenate([obs[12:15], spin])
+    return _state(obs[:3], obs[3:6], cube, moving, obs[18:20])
+
+
+def target(qpos: Array, action: Array) -> Array:
+    """[3] m: where the servos shall bring the fingertip, a step from where it is, within the workspace."""
+    goal = qpos[:3] + jnp.asarray(STEP, jnp.float32) * jnp.clip(action, -1.0, 1.0)
+    return jnp.clip(goal, jnp.asarray(WORKSPACE[0], jnp.float32), jnp.asarray(WORKSPACE[1], jnp.float32))
+
+
+def observe(params: Array, state: PhysicsState) -> dict[str, Array]:
+    """What panda-gym observes, in its order and units."""
+    turn = state.qpos[6:10]
+    return {
+        "tip_xyz": state.qpos[:3],
+        "tip_velocity": state.qvel[:3],
+        "cube_xyz": state.qpos[3:6],
+        "cube_rotation": euler(turn),
+        "cube_velocity": state.qvel[3:6],
+        "cube_spin": _turned(turn, state.qvel[6:9]),
+        "mark_xyz": jnp.append(state.qpos[10:12], CUBE_HALF),
+    }
+
+
+def reward(obs: Array, action: Array, next_obs: Array) -> Array:
+    """[]: minus the fingertip's distance from its place behind the cube, minus twice the cube's from the mark, plus 1 at
+    the mark and less around it, as a bell of 5 cm has it. With 1 inside of 5 cm and 0 outside, noise of the sensors
+    decides what a cube at the rim is worth, and a critic learns little else. Within the 5 cm the place moves into the
+    cube: no side of it is behind any more.
+    """
+    tip, cube, mark = next_obs[:3], next_obs[6:9], next_obs[18:21]
+    way = mark - cube
+    away = jnp.linalg.norm(way)
+    place = cube - BEHIND * way / jnp.maximum(away, REACHED)
+    return jnp.exp(-((away / REACHED) ** 2)) - 2.0 * away - jnp.linalg.norm(tip - place)
+
+
+def success(obs: Array) -> Array:
+    """[] bool: the cube's centre is less than 5 cm from the mark's."""
+    return jnp.linalg.norm(obs[6:9] - obs[18:21]) < REACHED
+
+
+def euler(turn: Array) -> Array:
+    """[3] rad, roll, pitch and yaw of a unit quaternion [4] w, x, y, z: turns about the fixed axes x, y, z in turn."""
+    w, x, y, z = turn
+    roll = jnp.arctan2(2 * (w * x + y * z), 1 - 2 * (x**2 + y**2))
+    pitch = jnp.arcsin(jnp.clip(2 * (w * y - z * x), -1.0, 1.0))
+    return jnp.stack([roll, pitch, jnp.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))])
+
+
+def dress(spec: mujoco.MjSpec) -> None:
+    """A table top and the hand above the fingers, which only a viewer sees."""
+    _add_box(spec.worldbody, "", (0.55, 0.35, 0.01), pos=(-0.3, 0.0, -0.0102), rgba=[0.9, 0.9, 0.88, 1])
+    _add_box(spec.body("fingers"), "", (0.03, 0.1, 0.03), pos=(0, 0, 0.072), rgba=[0.93, 0.94, 0.95, 1])
+
+
+SCENE = Scene(
+    name="panda-push",
+    observation=(
+        Entry("tip_xyz", "m", 3),
+        Entry("tip_velocity", "m/s", 3),
+        Entry("cube_xyz", "m", 3),
+        Entry("cube_rotation", "rad", 3),
+        Entry("cube_velocity", "m/s", 3),
+        Entry("cube_spin", "rad/s", 3),
+        Entry("mark_xyz", "m", 3),
+    ),
+    action=(Entry("tip_step", "5 cm", 3),),
+    parameters=PARAMETERS,
+    episode_length=50,
+    control_dt=CONTROL_DT,
+    substeps=SUBSTEPS,
+    cartesian=True,
+    build=build,
+    initial=initial,
+    settled=settled,
+    target=target,
+    observe=observe,
+    reward=reward,
+    success=success,
+    training={"obs_noise": 0.002, "obs_noise_prob": 0.3},
+    max_speed=500.0,
+    dress=dress,
+    view=View((-0.05, 0.0, 0.05), 0.9, 145.0, -30.0, -0.4),
+)
+
+
+def make(impl: str = "auto") -> Env:
+    """The task."""
+    return make_env(SCENE, impl)
+
+
+def _state(tip: Array, speed: Array, cube: Array, moving: Array, mark: Array) -> PhysicsState:
+    """Servos that have arrived. tip, speed: [3] of the fingertip. cube: [7], moving: [6], as MuJoCo has them."""
+    qvel = jnp.concatenate([speed, moving, jnp.zeros(2)])
+    return PhysicsState(jnp.concatenate([tip, cube, mark]), qvel, jnp.zeros(11), tip)
+
+
+def _add_fingers(spec: mujoco.MjSpec, *, rate: float, strength: float) -> None:
+    """The closed fingers on their slides. rate: 1/s. strength: share of `STRENGTH`."""
+    body = spec.worldbody.add_body(name="fingers")
+    for name, axis, limit in zip("xyz", np.eye(3), STRENGTH, strict=True):
+        joint = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+        if name == "z":
+            joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, [TABLE_AT, 1.0]
+            joint.solref_limit = [2 * spec.option.timestep, 1.0]  # as hard as the time step allows
+        servo = spec.add_actuator(
+            name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+        )  # fmt: skip
+        servo.gainprm[0] = MASS * DAMPING * rate
+        servo.biasprm[:3] = [0, -MASS * DAMPING * rate, -MASS * DAMPING]
+        servo.forcelimited, servo.forcerange = 1, [-MASS * limit * strength, MASS * limit * strength]
+    _add_box(body, "fingers", FINGER_HALF, pos=(0, 0, FINGER_HALF[2] - FINGER_LOW), mass=MASS, rgba=[0.3, 0.32, 0.35, 1])
+
+
+def _add_mark(spec: mujoco.MjSpec) -> None:
+    body = spec.worldbody.add_body(name="mark", pos=[0, 0, CUBE_HALF])
+    for axis in np.eye(3)[:2]:
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+    _add_box(body, "", (CUBE_HALF,) * 3, mass=1.0, rgba=_MARK)
+
+
+def _add_box(body: mujoco.MjsBody, name: str, half: tuple[float, float, float], **own: object) -> None:
+    """A box that touches only what a pair says; a name of "" is none."""
+    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=half, **own, **NO_CONTACT)
+
+
+def _add_pair(spec: mujoco.MjSpec, one: str, other: str, friction: float) -> None:
+    spec.add_pair(geomname1=one, geomname2=other, condim=3, friction=[friction, friction, 0.005, 1e-4, 1e-4])
+
+
+def _quaternion(angles: Array) -> Array:
+    """[4] w, x, y, z of roll, pitch and yaw [3] rad, see `euler`."""
+    (cr, cp, cy), (sr, sp, sy) = jnp.cos(angles / 2), jnp.sin(angles / 2)
+    w, x = cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy
+    y, z = cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
+    return jnp.stack([w, x, y, z])
+
+
+def _turned(turn: Array, vector: Array) -> Array:
+    """[3] a vector of a body's frame in that of the world. turn: [4] unit quaternion of the body."""
+    return vector + 2 * jnp.cross(turn[1:], jnp.cross(turn[1:], vector) + turn[0] * vector)
+
+
+def _inverse(turn: Array) -> Array:
+    """[4] of a unit quaternion."""
+    return turn * jnp.array([1.0, -1.0, -1.0, -1.0])
