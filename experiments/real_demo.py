@@ -6,7 +6,6 @@ Bullet needs Python 3.11 and therefore an environment of its own, which the firs
 import os
 import shutil
 import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,7 +27,7 @@ DRIVER = Path("docs/examples/panda_gym_robot.py")  # in the folder of the code, 
 PACKAGES = (
     "panda-gym==3.0.7", "pybullet==3.2.7", "gymnasium==1.4.0", "numpy==2.4.6", "msgpack==1.2.4", "websockets==17.4",
 )  # fmt: skip
-_FILMED = 6  # episodes of the first and of the last evaluation, to choose a telling one from
+_FILMED = 3  # episodes of the first and of the last evaluation, to choose a telling one from
 _CONNECT, _END = 60.0, 10.0  # seconds in which the robot's side must have connected, and ended
 
 
@@ -37,7 +36,7 @@ class RealDemoArgs:
     """A few minutes on two cores; everything but the environment of Bullet lands in one folder."""
 
     prior: Path = SHIPPED / TASK / "seed-0"
-    """Folder of a prior of panda-push."""
+    """Folder of a prior of panda-push. None comes with the code yet."""
     method: str = "guarded"
     """How to fine-tune."""
     rollouts: int = 8
@@ -71,6 +70,9 @@ def main(args: RealDemoArgs) -> None:
 def check(args: RealDemoArgs) -> None:
     """Raises UserError for all that is wrong with the options before anything is made."""
     at_least_one(args, "rollouts", "episodes")
+    if not (args.prior / "prior.json").exists():
+        command = f"python -m experiments.pretrain --task {TASK}"
+        raise UserError(f"--prior {args.prior}: holds no prior; make one with: {command}")
     if not DRIVER.exists():
         raise UserError(f"{DRIVER}: no such file; run this command in the folder of the code")
     if args.out.exists() and any(args.out.iterdir()) and not (args.out / "robot.log").exists():
@@ -241,7 +243,7 @@ def film(args: RealDemoArgs, evaluations: "dict[int, Episode]") -> str:
 
 
 def telling(first: "np.ndarray", last: "np.ndarray") -> int:
-    """Which of some episodes to show, [n] bool successes before and after: the first that was mended, else the first."""
+    """Which episode to show, of successes before and after, [n] bool: the first that was mended, else the first."""
     mended = (~first & last).nonzero()[0]
     return int(mended[0]) if len(mended) else 0
 

@@ -1,8 +1,8 @@
 """Pushing a cube to a mark: a twin in MuJoCo of PandaPush of panda-gym, which Bullet simulates.
 
-An action of panda-gym moves the end effector, and an observation says nothing of joints. So there is no arm here: closed
-fingers hang on three slides, whose servos were fitted to how Bullet's arm moves (docs/physics.md). The table has no
-edges. The mark has two slides of its own that nothing moves, so that every episode may draw its place.
+An action of panda-gym moves the end effector, and an observation says nothing of joints. So there is no arm here:
+closed fingers hang on three slides, whose servos were fitted to how Bullet's arm moves (docs/physics.md). The table has
+no edges. The mark has two slides of its own that nothing moves, so that every episode may draw its place.
 """
 
 import jax
@@ -52,7 +52,7 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     option = spec.option
     option.timestep, option.integrator = CONTROL_DT / SUBSTEPS, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.solver, option.jacobian = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtJacobian.mjJAC_DENSE
-    # With pyramids for friction the same few iterations leave so large an error that a sliding cube trips over its edge.
+    # With pyramids for friction as few iterations leave so large an error that a sliding cube trips over its edge.
     option.cone, option.iterations, option.ls_iterations = mujoco.mjtCone.mjCONE_ELLIPTIC, 6, 8
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     spec.worldbody.add_geom(
@@ -115,16 +115,16 @@ def observe(params: Array, state: PhysicsState) -> dict[str, Array]:
 
 
 def reward(obs: Array, action: Array, next_obs: Array) -> Array:
-    """[]: minus the fingertip's distance from its place behind the cube, minus twice the cube's from the mark, plus 1 at
-    the mark and less around it, as a bell of 5 cm has it. With 1 inside of 5 cm and 0 outside, noise of the sensors
-    decides what a cube at the rim is worth, and a critic learns little else. Within the 5 cm the place moves into the
+    """[]: minus the fingertip's distance from its place behind the cube, minus the cube's from the mark, plus 1 at the
+    mark and less around it, as a bell of 5 cm has it. With 1 inside of 5 cm and 0 outside, noise of the sensors
+    would decide what a cube at the rim is worth. Within the 5 cm the place moves into the
     cube: no side of it is behind any more.
     """
     tip, cube, mark = next_obs[:3], next_obs[6:9], next_obs[18:21]
     way = mark - cube
     away = jnp.linalg.norm(way)
     place = cube - BEHIND * way / jnp.maximum(away, REACHED)
-    return jnp.exp(-((away / REACHED) ** 2)) - 2.0 * away - jnp.linalg.norm(tip - place)
+    return jnp.exp(-((away / REACHED) ** 2)) - away - jnp.linalg.norm(tip - place)
 
 
 def success(obs: Array) -> Array:
@@ -203,7 +203,8 @@ def _add_fingers(spec: mujoco.MjSpec, *, rate: float, strength: float) -> None:
         servo.gainprm[0] = MASS * DAMPING * rate
         servo.biasprm[:3] = [0, -MASS * DAMPING * rate, -MASS * DAMPING]
         servo.forcelimited, servo.forcerange = 1, [-MASS * limit * strength, MASS * limit * strength]
-    _add_box(body, "fingers", FINGER_HALF, pos=(0, 0, FINGER_HALF[2] - FINGER_LOW), mass=MASS, rgba=[0.3, 0.32, 0.35, 1])
+    middle = (0, 0, FINGER_HALF[2] - FINGER_LOW)
+    _add_box(body, "fingers", FINGER_HALF, pos=middle, mass=MASS, rgba=[0.3, 0.32, 0.35, 1])
 
 
 def _add_mark(spec: mujoco.MjSpec) -> None:

@@ -13,7 +13,7 @@ NETWORK = NetworkConfig(hidden=(8,))
 
 def save_prior(folder, seed, **changes):
     """An untrained prior of the toy task; returns its parameters. changes: of its card."""
-    config = SACConfig(changes.get("obs_dim", 4), 2, network=NETWORK, ensemble_size=2)
+    config = SACConfig(changes.get("obs_dim", 4), changes.get("act_dim", 2), network=NETWORK, ensemble_size=2)
     params = extract_params(make_sac(config).init(jax.random.key(seed)))
     card = {"task": "toy", "obs_dim": 4, "act_dim": 2, "network": jsonable(NETWORK), "gamma": 0.9}
     priors.save_prior(folder, Prior(params, {**card, "ensemble_size": 2, "seed": seed, **changes}))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from priors_by_hand import save_prior
 
 from experiments import real_demo
 from experiments.real_demo import RealDemoArgs, Robot
@@ -14,12 +15,14 @@ from sgft_jax.systems.remote import Remote
 from sgft_jax.types import UserError
 
 ROOT = Path(__file__).parents[2]
+PRIOR = ROOT / "docs/priors/push/seed-0"  # of another task: it is only looked for
 BULLET = os.environ.get("SGFT_BULLET_PYTHON", str(ROOT / "build/panda-gym/bin/python"))
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
+        ({"prior": ROOT}, "holds no prior; make one with: python -m experiments.pretrain --task panda-push"),
         ({"rollouts": 0}, "--rollouts is 0: must be at least 1"),
         ({"episodes": 0}, "--episodes is 0: must be at least 1"),
         ({"python": "python3.99"}, r"python3.99 is no Python 3.11, .* name one with PYTHON311="),
@@ -29,24 +32,24 @@ BULLET = os.environ.get("SGFT_BULLET_PYTHON", str(ROOT / "build/panda-gym/bin/py
 def test_mistakes_are_found_before_anything_is_made(tmp_path, monkeypatch, options, words):
     monkeypatch.chdir(ROOT)
     with pytest.raises(UserError, match=words):
-        real_demo.main(RealDemoArgs(out=tmp_path / "out", home=tmp_path / "home", **options))
+        real_demo.main(RealDemoArgs(**{"prior": PRIOR, "out": tmp_path / "out", "home": tmp_path / "home", **options}))
     assert not list(tmp_path.iterdir())
 
 
 def test_it_runs_in_the_folder_of_the_code_and_overwrites_demos_alone(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(UserError, match=r"panda_gym_robot.py: no such file; run this command in the folder of the code"):
-        real_demo.check(RealDemoArgs())
+    with pytest.raises(UserError, match=r"panda_gym_robot.py: no such file; run this command in the folder"):
+        real_demo.check(RealDemoArgs(PRIOR))
     monkeypatch.chdir(ROOT)
     (tmp_path / "thesis.tex").touch()
     with pytest.raises(UserError, match="holds something that is no demo"):
-        real_demo.check(RealDemoArgs(out=tmp_path))
+        real_demo.check(RealDemoArgs(PRIOR, out=tmp_path))
     (tmp_path / "robot.log").touch()
-    real_demo.check(RealDemoArgs(out=tmp_path))
+    real_demo.check(RealDemoArgs(PRIOR, out=tmp_path))
 
 
 def fake_python(folder, code):
-    """An executable in the place of Python 3.11: answers the question for its version, else runs `code` in the shell."""
+    """An executable in the place of Python 3.11: says yes to every `-c`, else runs `code` in the shell."""
     path = folder / "python3.11"
     path.write_text(f'#!/bin/sh\ncase "$1" in -c) exit 0;; esac\n{code}\n')
     path.chmod(0o755)
@@ -55,7 +58,7 @@ def fake_python(folder, code):
 
 def test_the_environment_is_made_once_and_its_failure_is_one_line(tmp_path):
     home = tmp_path / "home"
-    makes = f"echo $2 >> {tmp_path}/calls; mkdir -p {home}/bin; ln -sf $0 {home}/bin/python"
+    makes = f"echo $2 >> {tmp_path}/calls; mkdir -p {home}/bin; ln -sf {tmp_path}/python3.11 {home}/bin/python"
     python = fake_python(tmp_path, makes)
     assert real_demo.bullet(home, python) == real_demo.bullet(home, python) == home / "bin" / "python"
     assert (tmp_path / "calls").read_text() == "venv\npip\n"
@@ -82,9 +85,9 @@ def test_the_robots_process_ends_with_the_learner(tmp_path, remote, monkeypatch)
 
 
 def test_a_robot_that_dies_is_an_error_and_no_endless_wait(tmp_path, remote):
-    with Robot(["sh", "-c", "echo no pybullet; exit 3"], tmp_path / "log") as robot:
-        with pytest.raises(UserError, match=r"the robot's side has ended with exit code 3; see .*log"):
-            robot.connect(remote)
+    dies, ended = ["sh", "-c", "echo no pybullet; exit 3"], r"the robot's side has ended with exit code 3; see .*log"
+    with pytest.raises(UserError, match=ended), Robot(dies, tmp_path / "log") as robot:
+        robot.connect(remote)
     assert "no pybullet" in (tmp_path / "log").read_text()
     with Robot(["sh", "-c", "echo connected to; sleep 0.2"], tmp_path / "log") as robot:
         robot.connect(remote)
@@ -103,7 +106,7 @@ def test_the_film_shows_an_episode_that_was_mended():
 def test_the_first_and_the_last_evaluation_are_filmed():
     """Of 0 to 19 before the first rollout, 4 rollouts, 20 more, 4 rollouts, the last evaluation is 48 to 67."""
     args = RealDemoArgs(rollouts=8, episodes=20)
-    assert real_demo._filmed(args, 3) == [(0, 1, 2, 3, 4, 5), (48, 49, 50, 51, 52, 53)]
+    assert real_demo._filmed(args, 3) == [(0, 1, 2), (48, 49, 50)]
 
 
 @pytest.mark.slow
@@ -111,8 +114,9 @@ def test_the_demo_in_bullet(tmp_path, monkeypatch, capsys):
     if real_demo._said(BULLET, "import panda_gym, msgpack, websockets") is None:
         pytest.skip("no panda-gym: run `make real-demo` once, or name a Python that has it in SGFT_BULLET_PYTHON")
     monkeypatch.chdir(ROOT)
+    save_prior(tmp_path / "prior", 0, task="panda-push", obs_dim=21, act_dim=3)
     monkeypatch.setattr(real_demo, "bullet", lambda home, python: Path(BULLET))
-    real_demo.main(RealDemoArgs(rollouts=2, episodes=3, out=tmp_path / "demo"))
+    real_demo.main(RealDemoArgs(tmp_path / "prior", "sac", rollouts=2, episodes=3, out=tmp_path / "demo"))
     said = capsys.readouterr().out
     assert "success in Bullet: " in said and "video: " in said
     for made in ("figures/curve.png", "videos/before-after.mp4", "policy/seed-0/prior.json"):
