@@ -171,7 +171,7 @@ def fine_tune(args: RealDemoArgs, python: Path) -> "dict[int, Episode]":
     command += ["--film", *map(str, sum(film, ()))] if film else []
     found: dict[int, Episode] = {}
     with Robot(command, args.out / "robot.log") as robot:
-        remote = sgft_jax.Remote(env.measured_dim, env.act_dim, say=robot.hear)
+        remote = sgft_jax.Remote(env.measured_dim, env.act_dim, steps=env.episode_length, say=robot.hear)
         try:
             robot.connect(remote)
             system = sgft_jax.Gymnasium(env, remote, gamma=prior.card["gamma"])
