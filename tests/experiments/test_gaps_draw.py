@@ -67,6 +67,7 @@ def call(home, *more):
     return json.loads((home / "gaps/toy_steps/seed-5.json").read_text())
 
 
+@pytest.mark.slow
 def test_drawn_gaps_are_written_measured_and_sorted(home, capsys, monkeypatch):
     found = call(home, "--draw", "6")["gaps"]
     file = home / "gaps/toy_steps/seed-5.toml"

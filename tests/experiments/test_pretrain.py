@@ -139,6 +139,7 @@ def test_sgft_recovers_from_a_turned_command_frame(finished):
     assert before.mean() < 0.2 and after.min() > 0.8 and best.mean() > 0.8
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_is_bit_for_bit_uninterrupted(finished, tmp_path, monkeypatch):
     argv = [*TINY, "--seeds", "2", "--out", str(tmp_path)]
     cut = tmp_path / "pretrain/toy/cpu/seeds-0-1"

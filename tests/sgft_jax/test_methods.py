@@ -20,6 +20,7 @@ each_method = pytest.mark.parametrize("name", METHODS)
 # --- the list -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_list_of_methods_is_complete():
     assert {name for name, method in METHODS.items() if not method.needs_prior} == {
         "sac", "rlpd", "iql", "tdmpc2",

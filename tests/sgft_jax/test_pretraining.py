@@ -111,9 +111,9 @@ def test_a_set_that_is_not_due_is_never_asked_for(counted):
     [
         ("sac", 0),
         ("sac", 1),
-        ("tdmpc2", 0),
+        pytest.param("tdmpc2", 0, marks=pytest.mark.slow),
         pytest.param("tdmpc2", 1, marks=pytest.mark.slow),
-        ("recurrent", 0),
+        pytest.param("recurrent", 0, marks=pytest.mark.slow),
         pytest.param("recurrent", 1, marks=pytest.mark.slow),
     ],
 )

@@ -316,6 +316,7 @@ def test_logs_without_updates_are_kept_all_the_same():
     np.testing.assert_array_equal(yielded[1][0].agent.replay.data.obs[:, :3, 0], [[0, 1, 2]] * 2)
 
 
+@pytest.mark.slow
 def test_a_run_with_logs_goes_on_from_anywhere_with_the_same_bits(tmp_path, monkeypatch):
     """After 6 and 12 updates on simulated rows, 6 and 8 on the logs, and a rollout: the logs are kept once."""
     monkeypatch.setattr(train, "OFFLINE_PART", 6)

@@ -23,6 +23,11 @@ def corners():
     return [low, high, low | {k: high[k] for k in place}, high | {k: low[k] for k in place}]
 
 
+def some_corners():
+    """The first two are quick enough for the fast tests."""
+    return [pytest.param(theta, marks=[pytest.mark.slow] * (i > 1)) for i, theta in enumerate(corners())]
+
+
 def start(theta, seed=0):
     return hammer.initial(as_params(theta), jax.random.key(seed))
 
@@ -95,7 +100,7 @@ def test_observation_of_a_start():
     np.testing.assert_allclose(obs[9:], [0.62, 0.32, 0.52], atol=1e-6)  # board: 0.62 - 2 * 0.05
 
 
-@pytest.mark.parametrize("theta", corners())
+@pytest.mark.parametrize("theta", some_corners())
 def test_start_is_above_the_nail_and_inside_the_limits(theta):
     params = as_params(theta)
     states = jax.vmap(lambda key: hammer.initial(params, key))(jax.random.split(jax.random.key(1), 200))
@@ -123,7 +128,7 @@ def test_nail_weighs_what_steel_weighs():
     np.testing.assert_allclose(heavier.body("link7").mass - model.body("link7").mass, 0.1, rtol=1e-6)
 
 
-@pytest.mark.parametrize("theta", corners())
+@pytest.mark.parametrize("theta", some_corners())
 def test_script_drives_every_extreme_nail_home(theta):
     theta = theta | {"nail_damping": 2500.0}
     episode = play_script(PROBE, theta, start(theta), steps=hammer.SCENE.episode_length)
@@ -171,7 +176,7 @@ def test_starts_touch_nothing():
         assert not any(touching(model, states.qpos[i]) for i in leaning)
 
 
-@pytest.mark.parametrize("theta", corners())
+@pytest.mark.parametrize("theta", some_corners())
 def test_arm_stays_out_of_the_board(theta):
     """Whatever all joints are told for 3 s: hammer, hand and wrist stay above its height, the arm outside of it."""
     model = hammer.build(theta).compile()

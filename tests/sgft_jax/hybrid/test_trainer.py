@@ -75,6 +75,7 @@ def test_each_round_collects_and_learns():
         assert all(np.isfinite(values).all() and values.shape == (1,) for values in metrics.values())
 
 
+@pytest.mark.slow
 def test_the_released_schedule_collects_long_and_then_learns_as_often():
     schedule = Schedule(updates=20, simulators=1, steps_per_round=10, buffer=100, chunk_updates=10)
     assert (schedule.updates_per_round, schedule.rounds_per_chunk, schedule.chunks) == (10, 1, 2)
