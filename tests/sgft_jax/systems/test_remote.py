@@ -200,6 +200,18 @@ def test_a_learner_that_does_not_answer_ends_the_episode(pair):
     assert own.driver.stops and any("in a row" in line for line in own.said)
 
 
+def test_a_wall_clock_that_jumps_changes_no_period(pair, monkeypatch):
+    """An hour forwards and backwards at every look; periods are still 20 ms, and nothing is late."""
+    real, jumps = time.time, iter([3600.0, -3600.0] * 1000)
+    own = pair(Arm(), period=0.02, answer_within=0.018)
+    begin(own, 0)
+    monkeypatch.setattr(robot_client.time, "time", lambda: real() + next(jumps))
+    started = time.monotonic()
+    moved = [move(own, RIGHT) for _ in range(10)]
+    assert 0.2 <= time.monotonic() - started < 2.0
+    assert not any(x.truncated or "invalid" in x.info for x in moved)
+
+
 def test_an_episode_is_over_after_its_steps_though_nobody_says_so(pair):
     own = pair(Arm(), period=0.01, steps=3)
     begin(own, 0)
