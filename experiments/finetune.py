@@ -6,7 +6,7 @@ from typing import Any
 
 from envs import gaps
 from experiments import cli
-from experiments.finetune_args import FinetuneArgs, arguments, check, evaluation_episodes, priors_of
+from experiments.finetune_args import FinetuneArgs, arguments, check, priors_of, resolved
 from sgft_jax.methods import DEFAULT, all_methods
 
 
@@ -34,7 +34,7 @@ def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:
     """Fine-tuning runs from (or back) to disk, one per real system; returns their summaries in the order of `real`."""
     args = replace(args, real=gaps.each(args.real))
     method, seeds = check(args)
-    args = replace(args, eval_episodes=evaluation_episodes(args))
+    args = resolved(args)
     priors = priors_of(args)
     from experiments.finetune_run import run  # JAX starts here
 

@@ -18,7 +18,7 @@ from sgft_jax.types import Method, UserError
 NO_PRIOR = Path("none")
 # May differ when a run goes on; what is in the data may not.
 VOLATILE = ("resume", "overwrite", "rollouts", "devices", "video", "out", "tuned", "real_data", "sync_every")
-EVALUATION_EPISODES = 50
+_EVALUATION_EPISODES = 50
 
 
 @dataclass(frozen=True)
@@ -154,11 +154,11 @@ def _check_robot(args: FinetuneArgs) -> None:
         )
 
 
-def evaluation_episodes(args: FinetuneArgs) -> int:
-    """The default costs a robot nothing."""
-    if args.eval_episodes is None:
-        return 0 if is_robot(args.real[0]) else EVALUATION_EPISODES
-    return args.eval_episodes
+def resolved(args: FinetuneArgs) -> FinetuneArgs:
+    """With every option that was left open, as the run folder has it. Evaluations cost a robot nothing by default."""
+    if args.eval_episodes is not None:
+        return args
+    return replace(args, eval_episodes=0 if is_robot(args.real[0]) else _EVALUATION_EPISODES)
 
 
 def priors_of(args: FinetuneArgs) -> list[Path]:

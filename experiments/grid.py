@@ -8,7 +8,7 @@ from envs import gaps
 from experiments import cells
 from experiments.cells import Cell, Kind
 from experiments.finetune import finetune
-from experiments.finetune_args import VOLATILE, FinetuneArgs, arguments, label, run_folder
+from experiments.finetune_args import VOLATILE, FinetuneArgs, arguments, label, resolved, run_folder
 from experiments.options import Impl, check_task, seed_list, without_repeats
 from sgft_jax import extend
 from sgft_jax.io.jsonfile import jsonable
@@ -75,7 +75,7 @@ FINETUNING = Kind(
     systems="real",
     run=lambda args: finetune(args),
     folder=lambda args: run_folder(args, *args.real),
-    config=lambda args: jsonable(args) | {"real": args.real[0]},
+    config=lambda args: jsonable(resolved(args)) | {"real": args.real[0]},
     title=lambda args: f"{extend.name_of(args.task)}/{gaps.title(args.real[0])}: {label(args)}",
     volatile=VOLATILE,
     finished=lambda args, summary: summary["final"]["rollouts"] >= args.rollouts,

@@ -21,7 +21,7 @@ pytest.importorskip("gymnasium", reason="make setup EXTRAS=dev, or pip install '
 
 from envs.adapters.gymnasium import TaskEnv
 from envs.gaps import Gap
-from experiments import cli, evaluate, finetune, finetune_args, real_systems
+from experiments import cli, evaluate, finetune, finetune_args, grid, real_systems
 from experiments.recorded import Recorded
 from sgft_jax.io.real import RealStore
 from sgft_jax.systems.gymnasium import Gymnasium
@@ -267,3 +267,12 @@ def test_what_a_robot_cannot_do_is_refused_in_one_line(changes, said, tmp_path):
     given = {"task": "push", "method": "sac", "real": ("remote",), "seeds": 1, "out": tmp_path} | changes
     with pytest.raises(UserError, match=said):
         finetune_args.check(finetune_args.arguments(given.pop("method"), **given))
+
+
+@pytest.mark.parametrize(("real", "given", "episodes"), [("default", None, 50), ("remote", None, 0), ("remote", 5, 5)])
+def test_evaluations_cost_a_robot_nothing_unless_asked_for(real, given, episodes):
+    args = finetune_args.arguments("sac", real=(real,), seeds=1, eval_episodes=given)
+    assert finetune_args.resolved(args).eval_episodes == episodes
+    assert (
+        grid.FINETUNING.config(args)["eval_episodes"] == episodes
+    )  # as the run's folder has it: a grid skips that run
