@@ -18,6 +18,7 @@ from sgft_jax.types import Array, Key
 
 CONTROL_DT, SUBSTEPS = 0.04, 10  # s; physics steps in it
 CUBE_HALF = 0.02  # m
+CUBE = CUBE_HALF, CUBE_HALF, CUBE_HALF
 SPREAD = 0.15  # m: half of the side of the square in which cube and mark start
 REACHED = 0.05  # m between the centres of cube and mark
 BEHIND = 0.04  # m: where the reward wants the fingertip, behind the cube's centre
@@ -61,7 +62,7 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     _add_fingers(spec, rate=RATE * theta["servo_rate"], strength=theta["servo_strength"])
     cube = spec.worldbody.add_body(name="cube")
     cube.add_freejoint()
-    _add_box(cube, "cube", (CUBE_HALF,) * 3, mass=theta["cube_mass"], rgba=_CUBE)
+    _add_box(cube, "cube", CUBE, mass=theta["cube_mass"], rgba=_CUBE)
     _add_mark(spec)
     _add_pair(spec, "table", "cube", theta["table_friction"])
     _add_pair(spec, "fingers", "cube", theta["finger_friction"])
@@ -211,7 +212,7 @@ def _add_mark(spec: mujoco.MjSpec) -> None:
     body = spec.worldbody.add_body(name="mark", pos=[0, 0, CUBE_HALF])
     for axis in np.eye(3)[:2]:
         body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-    _add_box(body, "", (CUBE_HALF,) * 3, mass=1.0, rgba=_MARK)
+    _add_box(body, "", CUBE, mass=1.0, rgba=_MARK)
 
 
 def _add_box(body: mujoco.MjsBody, name: str, half: tuple[float, float, float], **own: object) -> None:
