@@ -14,7 +14,7 @@ from priors_by_hand import save_prior
 import envs
 from envs import gaps
 from experiments import cli, compare, finetune, grid, spaces, tune, tuned
-from experiments.finetune_args import arguments, run_folder, with_settings
+from experiments.finetune_args import arguments, resolved, run_folder, with_settings
 from sgft_jax.io import checkpoint
 from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.runs import FORMAT
@@ -58,7 +58,7 @@ def leave(args, success, *, rollouts=(0, 5, 10)):
         "sgft_jax": "0",
         "format": FORMAT,
         "kind": "finetune",
-        "config": jsonable(args) | {"real": args.real[0]},
+        "config": jsonable(resolved(args)) | {"real": args.real[0]},
     }
     (folder / "config.json").write_text(json.dumps(config))
     final = {"final": {"rollouts": rollouts[-1]}, "gap": {"name": args.real[0]}}
