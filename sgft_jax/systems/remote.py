@@ -163,15 +163,17 @@ class Remote:
         tries: how often it is said at most.
         """
         assert self._played is not None, "call reset first"
-        link = self._played
-        link.send(message)
+        link, due = self._played, 0.0
         while True:
-            try:
-                said = link.inbox.get(timeout=self._again)
-            except queue.Empty:
-                if tries is not None and (tries := tries - 1) <= 0:
+            now = time.monotonic()
+            if now >= due:  # other messages may come all the time
+                if tries is not None and (tries := tries - 1) < 0:
                     return None
                 link.send(message)
+                due = now + self._again
+            try:
+                said = link.inbox.get(timeout=max(due - now, 0.0))
+            except queue.Empty:
                 continue
             if said is _GONE:
                 link.inbox.put(_GONE)  # it stays the last one
