@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -175,7 +176,7 @@ def test_mistakes_are_found_before_anything_is_made(real, changes, words):
 )
 def test_an_environment_that_cannot_be_made_or_played_is_one_line(name, changes, words):
     with pytest.raises(UserError, match=words) as stopped:
-        real_systems.connect(toy_gymnasium.toy.make(), [name], changes, members=1, gamma=0.9)
+        real_systems.connect(toy_gymnasium.toy.make(), [name], changes, members=1, gamma=0.9, home=Path())
     assert "\n" not in str(stopped.value)
 
 
