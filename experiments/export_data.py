@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from experiments import cli
-from experiments.rollouts import config_of, episodes_of, home_of, task_of
+from experiments.rollouts import check_sizes, config_of, episodes_of, home_of, task_of
 from sgft_jax.types import UserError
 
 _AUTHOR = "sgft_jax experiments.export_data"
@@ -48,12 +48,7 @@ def main(args: ExportDataArgs) -> None:
     from sgft_jax.data import lerobot, recording
 
     env = envs.make(task)
-    seen, commanded = (stored[0].rows[name].shape[1] for name in ("obs", "action"))
-    if seen < env.measured_dim or commanded != env.act_dim:
-        raise UserError(
-            f"{home}: has {seen} observations and {commanded} actions, {env.name} has {env.measured_dim} and "
-            f"{env.act_dim}; name its task with --task"
-        )
+    check_sizes(home, stored, env)
     episodes = recording.of_stored(stored, env.measured_dim)
     if not episodes:
         raise UserError(f"{home}: holds no valid step")

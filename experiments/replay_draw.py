@@ -11,12 +11,11 @@ import envs
 from envs import gaps
 from envs.base import Entry, Env
 from envs.pools import real_env, real_worlds
-from experiments.rollouts import config_of
+from experiments.rollouts import check_sizes, config_of
 from experiments.video import film
 from sgft_jax.analysis import figures
 from sgft_jax.analysis.figures import Panel
 from sgft_jax.io.real import Played
-from sgft_jax.types import UserError
 
 _WORDY = 5  # rollouts that have room for more than their numbers
 
@@ -24,12 +23,7 @@ _WORDY = 5  # rollouts that have room for more than their numbers
 def draw(home: Path, task: str, episodes: Sequence[Played], out: Path, *, video: bool) -> list[str]:
     """A plot of all these rollouts, and a video of each; says in a line for each where it is, or why there is none."""
     env = envs.make(task)
-    seen, commanded = (episodes[0].rows[name].shape[1] for name in ("obs", "action"))
-    if seen < env.measured_dim or commanded != env.act_dim:
-        raise UserError(
-            f"{home}: has {seen} observations and {commanded} actions, {env.name} has {env.measured_dim} and "
-            f"{env.act_dim}; name its task with --task"
-        )
+    check_sizes(home, episodes, env)
     seed, numbers = episodes[0].seed, [own.number for own in episodes]
     path = out / f"seed-{seed}-rollout-{'-'.join(map(str, numbers))}.png"
     ends = np.cumsum([len(own.rows["reward"]) for own in episodes]) * env.control_dt

@@ -1,13 +1,17 @@
 """The rollouts that a run has stored in real/, for commands that read them. Imports no JAX."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from experiments.options import check_task
 from sgft_jax.io import real
 from sgft_jax.io.jsonfile import read_json
 from sgft_jax.io.real import Played
 from sgft_jax.types import UserError
+
+if TYPE_CHECKING:
+    from envs.base import Env
 
 _CONFIG = "config.json"
 
@@ -41,3 +45,13 @@ def episodes_of(home: Path, seed: int | None) -> list[Played]:
     if seed is not None and seed not in seeds:
         raise UserError(f"--seed {seed}: {home} has the seeds {', '.join(map(str, seeds))}")
     return [own._replace(seed=first + own.seed) for own in found if seed in (None, first + own.seed)]
+
+
+def check_sizes(home: Path, episodes: Sequence[Played], env: "Env") -> None:
+    """Raises UserError for episodes of a task with other observations or actions."""
+    seen, commanded = (episodes[0].rows[name].shape[1] for name in ("obs", "action"))
+    if seen < env.measured_dim or commanded != env.act_dim:
+        raise UserError(
+            f"{home}: has {seen} observations and {commanded} actions, {env.name} has {env.measured_dim} and "
+            f"{env.act_dim}; name its task with --task"
+        )

@@ -9,7 +9,6 @@ from typing import Any
 from experiments.reliable.runs import Trial
 from sgft_jax.types import UserError
 
-_PATIENCE = 300.0  # seconds for a run
 _FULL, _ROOM = "1m", "64m"  # sizes of the file system, before and after somebody has made room
 
 
@@ -26,20 +25,17 @@ def read_only(home: Path, *, rollouts: int = 4) -> dict[str, Any]:
 def _stopped(home: Path, name: str, options: list[str], mended: str, rollouts: int) -> dict[str, Any]:
     out = home / name
     out.mkdir(parents=True, exist_ok=True)
-    with _mounted(out, options):
-        trial = Trial(home / f"{name}-run", period=0.05, rollouts=rollouts, out=out)
-        try:
-            if name == "full":
-                trial.start_robot()
-            trial.start_player()
-            code, lines = trial.wait(_PATIENCE), trial.said("player.txt").strip().splitlines()
-            _call(["mount", "-o", f"remount,{mended}", str(out)])
-            if trial.robot is None:
-                trial.start_robot()
-            trial.start_player()
-            trial.finish(_PATIENCE)
-        finally:
-            trial.stop()
+    own = Trial(home / f"{name}-run", period=0.05, rollouts=rollouts, patience=300.0, out=out)
+    with _mounted(out, options), own as trial:
+        if name == "full":
+            trial.start_robot()
+        trial.start_player()
+        code, lines = trial.wait(), trial.said("player.txt").strip().splitlines()
+        _call(["mount", "-o", f"remount,{mended}", str(out)])
+        if trial.robot is None:
+            trial.start_robot()
+        trial.start_player()
+        trial.finish()
         return {"disk": name, "exit code": code, "said": lines[-1] if lines else "", **trial.audit()._asdict()}
 
 

@@ -1,5 +1,7 @@
 """Kill -9 at random moments: of the process that plays, of its learner, and of the robot's."""
 
+import os
+import signal
 import time
 from collections import Counter
 from pathlib import Path
@@ -13,24 +15,19 @@ from sgft_jax.types import UserError
 _VICTIMS = ("player", "learner", "robot")
 _EARLY = 0.2  # share of the kills that come while the processes start, within so many seconds:
 _START, _PLAY = 8.0, 3.0  # and the others after the robot has begun to move
-_PATIENCE = 300.0  # seconds for what is left of a run when nobody is killed any more
 
 
 def run(home: Path, *, kills: int, seed: int, period: float = 0.05, rollouts: int = 20) -> dict[str, Any]:
     """One run with so many kills; what became of it. The run grows until all kills are done."""
     luck = np.random.default_rng(seed)
-    trial = Trial(home, period=period, rollouts=rollouts)
     killed: Counter[str] = Counter()
-    trial.start_robot()
-    trial.start_player()
-    try:
+    with Trial(home, period=period, rollouts=rollouts, patience=300.0) as trial:
+        trial.start()
         while killed.total() < kills:
             killed.update(_strike(trial, luck))
         if trial.player is None or trial.player.poll() is not None:
             trial.start_player()
-        trial.finish(_PATIENCE)
-    finally:
-        trial.stop()
+        trial.finish()
     return {"rollouts": trial.rollouts, **{name: killed[name] for name in _VICTIMS}, **trial.audit()._asdict()}
 
 
@@ -39,7 +36,7 @@ def _strike(trial: Trial, luck: np.random.Generator) -> list[str]:
     assert trial.player is not None and trial.robot is not None
     if luck.uniform() < _EARLY:
         trial.wait(luck.uniform(0.0, _START))
-    elif trial.wait_for_motion(_PATIENCE):
+    elif trial.wait_for_motion():
         trial.wait(luck.uniform(0.0, _PLAY))
     if trial.player.poll() == 0:
         trial.rollouts += 10  # it was done before all kills were
@@ -49,7 +46,7 @@ def _strike(trial: Trial, luck: np.random.Generator) -> list[str]:
     pid = {"player": trial.player.pid, "learner": trial.learner(), "robot": trial.robot.pid}[victim]
     if pid is None or trial.player.poll() is not None:
         return []
-    trial.kill(pid)
+    os.kill(pid, signal.SIGKILL)
     if victim == "robot":
         trial.robot.wait()
         time.sleep(luck.uniform(0.0, 1.0))

@@ -16,8 +16,6 @@ from experiments.reliable import timing
 from experiments.reliable.runs import Trial, free_port
 from sgft_jax.systems.robot_client import pack
 
-_PATIENCE = 600.0  # seconds for a run
-
 
 class Fate(NamedTuple):
     """Shares of the messages that are dropped, delayed by between `least` and `most` seconds, and damaged."""
@@ -39,8 +37,10 @@ class Proxy:
         self._server = serve(self._serve, "127.0.0.1", self.port, compression=None)
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
-    def close(self) -> None:
-        """Ends it."""
+    def __enter__(self) -> "Proxy":
+        return self
+
+    def __exit__(self, *error: object) -> None:
         self._server.shutdown()
 
     def _serve(self, near: ServerConnection) -> None:
@@ -74,16 +74,10 @@ class Proxy:
 
 def bad_network(home: Path, *, seed: int, period: float = 0.2, rollouts: int = 10) -> dict[str, Any]:
     """A run through the proxy; what became of it."""
-    trial = Trial(home, period=period, rollouts=rollouts)
-    proxy = Proxy(trial.port, Fate(), seed)
-    trial.via = proxy.port
-    try:
-        trial.start_robot()
-        trial.start_player()
-        trial.finish(_PATIENCE)
-    finally:
-        trial.stop()
-        proxy.close()
+    with Trial(home, period=period, rollouts=rollouts) as trial, Proxy(trial.port, Fate(), seed) as proxy:
+        trial.via = proxy.port
+        trial.start()
+        trial.finish()
     return {**proxy.counts, **trial.audit()._asdict(), "late": timing.late_share(home / "commands.log")}
 
 
@@ -91,16 +85,12 @@ def strangers(
     home: Path, *, seed: int, frames: int = 10_000, rate: float = 100.0, seconds: float = 10.0, rollouts: int = 10
 ) -> dict[str, Any]:
     """A run while strangers connect, with nonsense and with a wrong token; what became of it."""
-    luck, trial = np.random.default_rng(seed), Trial(home, period=0.2, rollouts=rollouts)
-    try:
-        trial.start_robot()
-        trial.start_player()
-        trial.wait_for_motion(_PATIENCE)
-        told = _nonsense(trial.port, frames, luck)
+    with Trial(home, period=0.2, rollouts=rollouts) as trial:
+        trial.start()
+        trial.wait_for_motion()
+        told = _nonsense(trial.port, frames, np.random.default_rng(seed))
         knocked = _knock(trial.port, rate, seconds)
-        trial.finish(_PATIENCE)
-    finally:
-        trial.stop()
+        trial.finish()
     lines = trial.said("player.txt").count("refused a connection")
     late = timing.late_share(home / "commands.log")
     return {"frames": told, "connections": knocked, "lines about them": lines, **trial.audit()._asdict(), "late": late}

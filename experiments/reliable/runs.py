@@ -1,8 +1,6 @@
 """Impure: the three processes of a run on the simulated robot: the one that plays, its learner, and the robot."""
 
-import os
 import shutil
-import signal
 import socket
 import subprocess
 import sys
@@ -27,15 +25,17 @@ def free_port() -> int:
 
 
 class Trial:
-    """One run in a folder of its own. period: of the robot's clock, in seconds. rollouts: of the run.
+    """One run in a folder of its own; what still runs ends with the `with` block.
 
-    out: parent of the run's folder, default in `home`. task: with numbers measured and commanded. more: options.
+    period: of the robot's clock, in seconds. rollouts: of the run. patience: seconds for it. out: parent of the run's
+    folder, default in `home`. task: with numbers measured and commanded. more: options.
     """
 
     def __init__(
-        self, home: Path, *, period: float, rollouts: int, out: Path | None = None, task: str = str(TASK),
-        sizes: tuple[int, int] = (3, 1), more: tuple[str, ...] = (),
+        self, home: Path, *, period: float, rollouts: int, patience: float = 600.0, out: Path | None = None,
+        task: str = str(TASK), sizes: tuple[int, int] = (3, 1), more: tuple[str, ...] = (),
     ) -> None:  # fmt: skip
+        self.patience = patience
         shutil.rmtree(home, ignore_errors=True)
         home.mkdir(parents=True)
         self.home, self.period, self.rollouts, self.out = home, period, rollouts, out or home / "runs"
@@ -44,10 +44,24 @@ class Trial:
         self.player: subprocess.Popen[str] | None = None
         self.robot: subprocess.Popen[str] | None = None
 
+    def __enter__(self) -> "Trial":
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for process in (self.player, self.robot):
+            if process is not None and process.poll() is None:
+                process.kill()
+                process.wait()
+
     @property
     def folder(self) -> Path:
         """Of the run."""
         return self.out / "finetune" / extend.name_of(self.task) / "remote/sac/seed-0"
+
+    def start(self) -> None:
+        """The robot, and the command of a user."""
+        self.start_robot()
+        self.start_player()
 
     def start_robot(self) -> None:
         """The robot's process; it waits for the learner."""
@@ -70,13 +84,9 @@ class Trial:
                 return int(child)
         return None
 
-    def kill(self, pid: int) -> None:
-        """Without a chance to clean up."""
-        os.kill(pid, signal.SIGKILL)
-
-    def finish(self, seconds: float) -> None:
+    def finish(self) -> None:
         """Waits for the end of the run; raises UserError where it does not come, or is none."""
-        if (code := self.wait(seconds)) != 0:
+        if (code := self.wait()) != 0:
             raise UserError(
                 f"{self.home / 'player.txt'}: the run has not ended well (exit code {code}); see what it said"
             )
@@ -86,28 +96,21 @@ class Trial:
         made, unread = ledger.read(self.home / "ledger.txt")
         return ledger.audit(made, ledger.stored_steps(self.folder), unread)
 
-    def wait(self, seconds: float) -> int | None:
-        """The exit code of the player if it ends by then."""
+    def wait(self, seconds: float | None = None) -> int | None:
+        """The exit code of the player if it ends by then, or before the patience ends."""
         assert self.player is not None
-        end = time.monotonic() + seconds
+        end = time.monotonic() + (self.patience if seconds is None else seconds)
         while time.monotonic() < end and self.player.poll() is None:
             time.sleep(0.02)
         return self.player.poll()
 
-    def wait_for_motion(self, seconds: float) -> bool:
+    def wait_for_motion(self) -> bool:
         """Whether the robot moves before the player ends."""
-        path, end = self.home / "ledger.txt", time.monotonic() + seconds
+        path, end = self.home / "ledger.txt", time.monotonic() + self.patience
         size = before = path.stat().st_size if path.exists() else 0
         while size == before and time.monotonic() < end and self.wait(0.02) is None:
             size = path.stat().st_size if path.exists() else 0
         return size > before
-
-    def stop(self) -> None:
-        """Ends what still runs."""
-        for process in (self.player, self.robot):
-            if process is not None and process.poll() is None:
-                process.kill()
-                process.wait()
 
     def said(self, name: str) -> str:
         """What `player.txt` or `robot.txt` holds."""

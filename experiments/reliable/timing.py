@@ -11,7 +11,6 @@ import numpy as np
 from experiments.reliable.runs import TASK, Trial
 
 _BUSY = ("--options.utd", "400", "--hand-over", "steps")  # the learner never rests while the robot plays
-_PATIENCE = 600.0  # seconds for a run
 WHEEL_LEGGED = 4, 1  # numbers that the task measures and commands
 
 
@@ -19,13 +18,9 @@ def kept_clock(
     home: Path, *, period: float, rollouts: int, task: str = str(TASK), sizes: tuple[int, int] = (3, 1)
 ) -> dict[str, Any]:
     """A run with a busy learner on the same cores: lateness, and jitter of the period in ms."""
-    trial = Trial(home, period=period, rollouts=rollouts, task=task, sizes=sizes, more=_BUSY)
-    try:
-        trial.start_robot()
-        trial.start_player()
-        trial.finish(_PATIENCE)
-    finally:
-        trial.stop()
+    with Trial(home, period=period, rollouts=rollouts, task=task, sizes=sizes, more=_BUSY) as trial:
+        trial.start()
+        trial.finish()
     log = home / "commands.log"
     off = 1e3 * np.abs(periods(log) - period)
     middle, most, worst = np.percentile(off, [50, 99, 100])
