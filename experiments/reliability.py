@@ -83,9 +83,9 @@ def _disk(args: ReliabilityArgs, home: Path) -> Iterator[dict[str, Any]]:
 def _clock(args: ReliabilityArgs, home: Path) -> Iterator[dict[str, Any]]:
     from experiments.reliable import timing
 
-    yield timing.kept_clock(home / "slow", period=0.2, rollouts=args.rollouts)
+    yield timing.kept_clock(home / "slow", period=0.2, rollouts=args.rollouts, utd=400)
     yield timing.kept_clock(
-        home / "fast", period=0.005, rollouts=args.rollouts, task="wheel-legged", sizes=timing.WHEEL_LEGGED
+        home / "fast", period=0.005, rollouts=args.rollouts, utd=6, task="wheel-legged", sizes=timing.WHEEL_LEGGED
     )
 
 

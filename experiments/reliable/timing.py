@@ -10,15 +10,18 @@ import numpy as np
 
 from experiments.reliable.runs import TASK, Trial
 
-_BUSY = ("--options.utd", "400", "--hand-over", "steps")  # the learner never rests while the robot plays
 WHEEL_LEGGED = 4, 1  # numbers that the task measures and commands
 
 
 def kept_clock(
-    home: Path, *, period: float, rollouts: int, task: str = str(TASK), sizes: tuple[int, int] = (3, 1)
+    home: Path, *, period: float, rollouts: int, utd: float, task: str = str(TASK), sizes: tuple[int, int] = (3, 1)
 ) -> dict[str, Any]:
-    """A run with a busy learner on the same cores: lateness, and jitter of the period in ms."""
-    with Trial(home, period=period, rollouts=rollouts, task=task, sizes=sizes, more=_BUSY) as trial:
+    """A run with a learner on the same cores: lateness, and jitter of the period in ms.
+
+    utd: updates for each step, enough to keep the learner busy for as long as the robot plays.
+    """
+    busy = ("--options.utd", str(utd), "--hand-over", "steps")
+    with Trial(home, period=period, rollouts=rollouts, task=task, sizes=sizes, more=busy) as trial:
         trial.start()
         trial.finish()
     log = home / "commands.log"
