@@ -81,6 +81,7 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
             which = train.prior_of(setup.priors, setup.seeds)
             learner = LearnerProcess(_build(args, folders, priors), setup.seeds, which, setup.simulated)
             last.callback(learner.close)
+            learner.wait()
         return _Run(args, setup, setup.system, card, records, logs, learner).work()
 
 

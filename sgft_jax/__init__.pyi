@@ -1,4 +1,4 @@
-from .api import ActingPolicy, Setup, evaluate_prior, finetuned_priors, load_policy, setup
+from .api import ActingPolicy, Setup, evaluate_prior, finetuned_priors, load_policy, make_env, setup
 from .data import replay, sequences, sources
 from .finetuner import FinetuneState, Parts, assemble, sac_finetuner
 from .io.exported import save_exported
@@ -45,7 +45,7 @@ __all__ = [
     "SACParams", "SACState", "Setup", "Simulated", "SimulatedData", "Simulation", "Source", "System",
     "TDMPC2Config", "TDMPC2Hyper", "TDMPC2Params", "TDMPC2State", "Task", "Transform", "Transition", "UserError",
     "all_methods", "assemble", "branch", "clip", "compose", "evaluate", "evaluate_prior", "extract_params",
-    "finetune", "finetuned_priors", "get_method", "load_policy", "load_prior", "make_iql", "make_policy",
+    "finetune", "finetuned_priors", "get_method", "load_policy", "load_prior", "make_env", "make_iql", "make_policy",
     "make_sac", "make_tdmpc2", "mpc_policy", "normalizer", "pretrain", "priors_of", "relabel", "replay",
     "sac_finetuner", "sac_policy", "save_exported", "save_prior", "sequences", "setup", "shape", "shaped_reward",
     "shorten", "simulate", "sources", "state_from_prior", "stateless", "tdmpc2_policy", "weigh",

@@ -118,6 +118,19 @@ def check_prior(prior: Prior, method: Method, env: Env) -> None:
         raise UserError(f"{method.name} needs a prior that was {told}; make one with: {command}")
     if prior.card["task"] != env.name:
         raise UserError(f"the prior is of the task {prior.card['task']!r}, not of {env.name!r}")
+    if prior.card["obs_dim"] != env.obs_dim:
+        raise UserError(
+            f"the policy of the prior observes {prior.card['obs_dim']} numbers, the task as it was made {env.obs_dim}; "
+            "make it with sgft_jax.make_env(prior)"
+        )
+
+
+def make_env(prior: Prior, *, task: str | None = None) -> Env:
+    """The task of a prior, with the observations that its policy reads: perhaps also its last actions.
+
+    task: where the file of a task of your own is; otherwise the prior's card names its task.
+    """
+    return envs.make(task or prior.card["task"], **observed(prior.card))
 
 
 def evaluate_prior(
@@ -188,5 +201,4 @@ def load_policy(folder: str | Path, *, task: str | None = None, seed: int = 0) -
     of plans. Raises UserError if there is no prior.
     """
     prior = load_prior(Path(folder))
-    env = envs.make(task or prior.card["task"], **observed(prior.card))
-    return ActingPolicy(prior, env, seed=seed)
+    return ActingPolicy(prior, make_env(prior, task=task), seed=seed)

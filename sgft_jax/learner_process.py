@@ -5,6 +5,7 @@ import os
 import signal
 import traceback
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -19,6 +20,7 @@ class LearnerProcess:
     """The learning phases of `finetune` in a process of its own, with cores of its own where there are enough.
 
     This process keeps the first core that it may use, and the learner gets the others. It ends with this process.
+    What has been learned is received in a thread, so that taking it over costs the one who plays no time.
 
     build() -> the finetuner. It is sent to the process, so it must be a function of a module, or a `functools.partial`
     of one. seeds: [M] uint32. which: [M] the prior of each. simulated: see `finetune`.
@@ -35,33 +37,41 @@ class LearnerProcess:
         self._process.start()
         theirs.close()
         pin(self._cores[:1])
-        self._result: tuple[PyTree, Metrics] | None = None
+        self._receiver = ThreadPoolExecutor(1, "learned")
+        self._result: Future[Any] = self._receiver.submit(self._receive)  # that it is up
+
+    def wait(self) -> None:
+        """Until the process is up, so that its start disturbs no robot. Raises UserError if it is gone."""
+        self._result.result()
 
     def submit(self, agent: PyTree, parts: Sequence[int], updates: int, phase: Phase) -> None:
         """Begins the learning phases `parts`; what came before must have been asked for with `result`."""
-        self._result = None
+        self.wait()
         self._talk(lambda: self._connection.send((jax.device_get(agent), list(parts), updates, phase)))
+        self._result = self._receiver.submit(self._receive)
 
     def ready(self) -> bool:
         """Whether `result` would not wait."""
-        return self._result is not None or self._talk(self._connection.poll)
+        return self._result.done()
 
     def result(self) -> tuple[PyTree, Metrics]:
         """What the phases have led to; the same until the next `submit`. Raises UserError if the process is gone."""
-        if self._result is None:
-            found = self._talk(self._connection.recv)
-            if isinstance(found, str):
-                raise RuntimeError(f"the learner's process has failed:\n{found}")
-            agent, metrics = jax.tree.map(jnp.asarray, found)
-            self._result = agent, metrics
-        return self._result
+        return self._result.result()
 
     def close(self) -> None:
         """Ends the process, whatever it does."""
         self._process.kill()
         self._process.join()
+        self._receiver.shutdown()
         self._connection.close()
         pin(self._cores)
+
+    def _receive(self) -> Any:
+        """The next message, on this process's device; in the thread."""
+        found = self._talk(self._connection.recv)
+        if isinstance(found, str):
+            raise RuntimeError(f"the learner's process has failed:\n{found}")
+        return jax.block_until_ready(jax.device_put(found))
 
     def _talk[T](self, say: Callable[[], T]) -> T:
         try:
@@ -93,14 +103,13 @@ def _work(
     pin(own)
     os.nice(5)
     rows = None if simulated is None else jax.tree.map(jnp.asarray, simulated)
-    updates: Updates | None = None
     try:
+        updates = Updates(build(), jnp.asarray(seeds), jnp.asarray(which), rows)
+        connection.send(None)
         while True:
             agent, parts, count, phase = connection.recv()
-            try:
-                updates = updates or Updates(build(), jnp.asarray(seeds), jnp.asarray(which), rows)
-                connection.send(jax.device_get(updates(agent, parts, count, phase)))
-            except Exception:
-                connection.send(traceback.format_exc())
+            connection.send(jax.device_get(updates(agent, parts, count, phase)))
     except (EOFError, OSError):
         return
+    except Exception:
+        connection.send(traceback.format_exc())

@@ -11,9 +11,10 @@ import pytest
 NOTEBOOK = Path(__file__).parent.parent / "docs/quickstart.ipynb"
 CHECKS = """
 zero_shot, *later = curve.values.mean(0)
-assert max(later) > zero_shot, (zero_shot, later)
+assert len(later) == 3 and later[-1] > zero_shot + 0.2, (zero_shot, later)
 assert {row["seed"] for row in rows} == set(setup.seeds.tolist()) and rows[-1]["success"] == curve.values[-1, -1]
-assert axes.lines and policy.act(np.array([-0.15, 0.0, 0.0])).shape == (1,)
+assert axes.lines and policy.act(np.zeros(policy.env.measured_dim)).shape == (policy.env.act_dim,)
+assert metrics["train/success"][0] > 0.3 and folder.exists()
 """
 
 
@@ -22,5 +23,6 @@ def test_the_notebook_runs_and_fine_tuning_helps():
     cells = [cell for cell in json.loads(NOTEBOOK.read_text())["cells"] if cell["cell_type"] == "code"]
     assert not any(cell["outputs"] for cell in cells), "commit it without outputs"
     program = "\n".join(["".join(cell["source"]) for cell in cells] + [CHECKS])
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg", "PYTHONPATH": str(NOTEBOOK.parent.parent)}
-    subprocess.run([sys.executable, "-c", program], cwd=NOTEBOOK.parent, env=environment, check=True, timeout=580)
+    users = {name: value for name, value in os.environ.items() if name not in ("XLA_FLAGS", "SGFT_IMPL")}
+    environment = {**users, "JAX_PLATFORMS": "cpu", "MPLBACKEND": "agg", "PYTHONPATH": str(NOTEBOOK.parent.parent)}
+    subprocess.run([sys.executable, "-c", program], cwd=NOTEBOOK.parent, env=environment, check=True, timeout=900)
