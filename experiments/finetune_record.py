@@ -25,6 +25,11 @@ from sgft_jax.types import Metrics, Prior, PyTree
 EVALUATION = "evaluation"  # the folder of episodes that evaluations on a real system have cost
 
 
+def evaluation_store(folder: Path, done: int) -> RealStore:
+    """The episodes of a run's evaluation after so many rollouts, where they are real ones."""
+    return RealStore(folder / EVALUATION / f"rollouts-{done:06d}")
+
+
 class Record:
     """The files of one run folder (docs/formats.md). Arrays and states have a leading axis of the seeds [S].
 
@@ -78,9 +83,9 @@ class Record:
         self.log.eval(self._transitions(done), {"rollouts": done, "robot_minutes": self._minutes(done), **scores})
         self.evaluated += self.evaluations_cost or 0
 
-    def evaluation_store(self, name: str) -> RealStore:
-        """Where the episodes of an evaluation go that costs real ones."""
-        return RealStore(self.folder / EVALUATION / name)
+    def evaluation_store(self, done: int) -> RealStore:
+        """Where the episodes of an evaluation after so many rollouts go, if it costs real ones."""
+        return evaluation_store(self.folder, done)
 
     def time(self, done: int, seconds: float) -> None:
         """Apart from the metrics, which must not depend on the clock."""

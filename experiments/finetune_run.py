@@ -34,8 +34,6 @@ from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import FinetuneProgress, Logged
 from sgft_jax.types import Finetuner, Method, Metrics, Prior, PyTree, UserError
 
-_AFTER = "rollouts-"  # what the folder of an evaluation is called, before their number
-
 
 def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path]) -> list[dict[str, Any]]:
     """The runs on the real systems of `args`; returns their summaries. folders: of the priors."""
@@ -194,7 +192,7 @@ class _Run:
     def _evaluate(self, progress: FinetuneProgress, done: int) -> float:
         system = self.system
         if isinstance(system, Gymnasium):  # its episodes are real ones, and as dear as those of training
-            stores = [record.evaluation_store(f"{_AFTER}{done:06d}") for record in self.records]
+            stores = [record.evaluation_store(done) for record in self.records]
             system = Recorded(system, stores, done=0, explore=False, sync_every=self.sync_every)
         played = train.evaluate(self.finetuner, system, progress.agent, self.seeds, self.episodes)
         found = scores(played)

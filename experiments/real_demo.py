@@ -1,26 +1,27 @@
 """Fine-tuning in another engine: a small prior of `panda-push` meets panda-gym, in Bullet, behind the socket.
 
-Bullet needs Python 3.11 and therefore an environment of its own, which the first run makes.
+Bullet needs Python 3.11 and therefore an environment of its own, which the first run makes. What follows are the two
+commands that a user would type: `experiments.finetune --real remote`, and the robot's driver.
 """
 
+import contextlib
 import os
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments import cli
+from experiments import cli, real_systems
+from experiments.finetune_args import arguments, run_folder
 from experiments.options import SHIPPED, at_least_one
 from sgft_jax.types import UserError
 
 if TYPE_CHECKING:
     import numpy as np
-
-    from envs.rollout import Episode
-    from sgft_jax.systems.remote import Remote
 
 TASK = "panda-push"
 DRIVER = Path("docs/examples/panda_gym_robot.py")  # in the folder of the code, as the priors are
@@ -28,7 +29,7 @@ PACKAGES = (
     "panda-gym==3.0.7", "pybullet==3.2.7", "gymnasium==1.4.0", "numpy==2.4.6", "msgpack==1.2.4", "websockets==17.4",
 )  # fmt: skip
 _FILMED = 3  # episodes of the first and of the last evaluation, to choose a telling one from
-_CONNECT, _END = 60.0, 10.0  # seconds in which the robot's side must have connected, and ended
+_END = 10.0  # seconds that a process has for its end
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class RealDemoArgs:
     rollouts: int = 8
     """Real rollouts."""
     episodes: int = 20
-    """Of each evaluation: before, half-way and after. They are the same ones each time."""
+    """Of each evaluation: before, after the first rollout and at the end. They are the same ones each time."""
     seed: int = 0
     """Of fine-tuning and of the episodes."""
     video: bool = True
@@ -62,8 +63,8 @@ def main(args: RealDemoArgs) -> None:
     python = bullet(args.home, args.python)
     shutil.rmtree(args.out, ignore_errors=True)
     args.out.mkdir(parents=True)
-    evaluations = fine_tune(args, python)
-    show(args, evaluations)
+    fine_tune(args, python)
+    show(args)
     print(f"{(time.monotonic() - started) / 60:.1f} minutes in all")
 
 
@@ -110,136 +111,107 @@ def _said(python: str, code: str) -> str | None:
     return None if done.returncode else done.stdout
 
 
-class Robot:
-    """The robot's side as a process of its own; ends with the `with` block, whatever happens in it.
+# --- both sides -------------------------------------------------------------------------------------------------------
 
-    command: what starts it, but for where the learner listens. log: file for what it says.
+
+def fine_tune(args: RealDemoArgs, python: Path) -> None:
+    """Runs learner and robot as processes, as a user would, until the learner is done.
+
+    Raises UserError where one of them fails; neither outlives this function.
     """
+    port, film = real_systems.free_port(), filmed(args)
+    learner = [
+        sys.executable, "-u", "-m", "experiments.finetune", "--task", TASK, "--prior", args.prior,
+        "--method", args.method, "--real", f"remote::{port}", "--seeds", 1, "--seed", args.seed,
+        "--rollouts", args.rollouts, "--eval-every", args.rollouts, "--eval-episodes", args.episodes,
+        "--out", args.out,
+    ]  # fmt: skip
+    robot = [python, "-u", DRIVER, "--url", f"ws://127.0.0.1:{port}", "--token", real_systems.token(args.out)]
+    if args.video:
+        robot += ["--into", args.out / "pictures", "--film", *film[0], *film[1]]
+    together(_texts(learner), _texts(robot), args.out / "robot.log")
 
-    def __init__(self, command: Sequence[str], log: Path) -> None:
-        self.command, self.log = list(command), log
-        self.process: subprocess.Popen[bytes] | None = None
 
-    def __enter__(self) -> "Robot":
-        return self
+def together(learner: Sequence[str], robot: Sequence[str], log: Path) -> None:
+    """Two processes, until the first one is done. log: file for what the second one says.
 
-    def connect(self, remote: "Remote") -> None:
-        """Starts it, and waits until it has found the learner. Raises UserError where it has ended before."""
-        reach = ["--url", remote.url, "--token", remote.token]
-        with open(self.log, "wb") as log:  # in a session of its own: Ctrl-C reaches the learner alone, which ends both
-            self.process = subprocess.Popen(
-                [*self.command, *reach], stdout=log, stderr=subprocess.STDOUT, start_new_session=True
-            )
-        until = time.monotonic() + _CONNECT
-        while b"connected to" not in self.log.read_bytes():
-            self.hear()
-            if time.monotonic() > until:
-                raise UserError(f"the robot's side has not connected within {_CONNECT:g} s; see {self.log}")
+    Raises UserError where the first one fails, or the second one ends before it. Neither outlives this function.
+    """
+    with contextlib.ExitStack() as last:
+        with open(log, "wb") as file:  # in a session of its own: Ctrl-C reaches the learner alone, which ends both
+            other = subprocess.Popen(robot, stdout=file, stderr=subprocess.STDOUT, start_new_session=True)
+        last.callback(_end, other)
+        first = subprocess.Popen(learner)
+        last.callback(_end, first)
+        while (code := first.poll()) is None:
+            if other.poll() not in (None, 0):
+                first.kill()  # it would wait for another robot
+                raise UserError(f"the robot's side has ended with exit code {other.returncode}; see {log}")
             time.sleep(0.1)
-
-    def hear(self, line: str = "") -> None:
-        """Prints what the learner says of its robot. Raises UserError where its process has ended."""
-        if self.process is not None and self.process.poll() is not None:
-            raise UserError(f"the robot's side has ended with exit code {self.process.returncode}; see {self.log}")
-        if line:
-            print(line)
-
-    def __exit__(self, *raised: object) -> None:
-        if self.process is None:
-            return
-        try:
-            self.process.wait(_END)  # the learner has told it to end
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
+        if code:
+            raise UserError(f"fine-tuning has ended with exit code {code}; it said why above")
 
 
-# --- the learner's side -----------------------------------------------------------------------------------------------
+def _end(process: "subprocess.Popen[bytes]") -> None:
+    """Gives a process some time to end by itself."""
+    try:
+        process.wait(_END)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
-def fine_tune(args: RealDemoArgs, python: Path) -> "dict[int, Episode]":
-    """Evaluations by the rollouts that were learned from; episodes [1, n]."""
-    import envs
-    import sgft_jax
-    from sgft_jax.io.priors import observed
-
-    prior = sgft_jax.load_prior(args.prior, task=TASK)
-    env = envs.make(TASK, **observed(prior.card))
-    at = sorted({0, args.rollouts // 2, args.rollouts})
-    film = _filmed(args, len(at)) if args.video else []
-    command = [str(python), "-u", str(DRIVER), "--into", str(args.out / "pictures")]
-    command += ["--film", *map(str, sum(film, ()))] if film else []
-    found: dict[int, Episode] = {}
-    with Robot(command, args.out / "robot.log") as robot:
-        remote = sgft_jax.Remote(env.measured_dim, env.act_dim, steps=env.episode_length, say=robot.hear)
-        try:
-            robot.connect(remote)
-            system = sgft_jax.Gymnasium(env, remote, gamma=prior.card["gamma"])
-            setup = sgft_jax.setup(env, system, prior, method=args.method, seeds=[args.seed])
-            for state, metrics in sgft_jax.finetune(*setup, rollouts=args.rollouts):
-                done = int(state.rollouts)
-                if metrics:
-                    print(f"rollout {done}: {'success' if metrics['real/score'][0] > 0.5 else 'failure'}", flush=True)
-                if done in at:
-                    found[done] = sgft_jax.evaluate(setup.finetuner, system, state.agent, setup.seeds, args.episodes)
-                    print(f"after {done} rollouts: success {_percent(found[done])}", flush=True)
-            tuned = sgft_jax.finetuned_priors(setup, state, prior, best=False)
-            sgft_jax.save_prior(args.out / "policy" / f"seed-{args.seed}", tuned[0])
-        finally:
-            remote.close()
-    return found
+def filmed(args: RealDemoArgs) -> tuple[range, range]:
+    """The first episodes of the first and of the last evaluation, as the robot counts its episodes."""
+    count, last = min(_FILMED, args.episodes), 2 * args.episodes + args.rollouts
+    return range(count), range(last, last + count)
 
 
-def _filmed(args: RealDemoArgs, evaluations: int) -> list[tuple[int, ...]]:
-    """Numbers of the first episodes of the first and of the last evaluation, as the robot counts them."""
-    count = min(_FILMED, args.episodes)
-    last = (evaluations - 1) * args.episodes + args.rollouts
-    return [tuple(range(count)), tuple(range(last, last + count))]
-
-
-def _percent(played: "Episode") -> str:
-    return f"{100 * float(played.score.mean()):.0f} %"
+def _texts(command: Sequence[object]) -> list[str]:
+    return [str(word) for word in command]
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------
 
 
-def show(args: RealDemoArgs, evaluations: "dict[int, Episode]") -> None:
+def show(args: RealDemoArgs) -> None:
     """The success before and after, and where the learning curve, the video and the policy are."""
-    import envs
-    from sgft_jax.analysis import curves, figures
+    from experiments.finetune_record import evaluation_store
 
-    curve = curves.make_curve(evaluations, envs.make(TASK), gap="Bullet", method=args.method, seeds=[args.seed])
-    picture = figures.learning_curves(
-        args.out / "figures" / "curve.png", {"panda-gym (Bullet)": [curve]}, title="fine-tuning in another engine"
-    )
-    first, *_, last = evaluations.values()
+    run = run_folder(arguments(args.method, task=TASK, seeds=1, seed=args.seed, out=args.out), "remote")
+    found = {}
+    for done in (0, args.rollouts):
+        store = evaluation_store(run, done)
+        found[done] = [bool(store.load(i)["success"][0]) for i in range(len(store))]
+    before, after = found.values()
     print(
-        f"\nsuccess in Bullet: {_percent(first)} before, {_percent(last)} after {args.rollouts} rollouts of "
+        f"\nsuccess in Bullet: {_percent(before)} before, {_percent(after)} after {args.rollouts} rollouts of "
         f"{args.method}; one seed, {args.episodes} episodes, in which the cube lay within 5 cm of the mark at the end"
     )
-    print(f"learning curve: {picture}")
-    print(film(args, evaluations) if args.video else "no video: not asked for")
-    print(f"policy: {args.out / 'policy' / f'seed-{args.seed}'}; what the robot's side said: {args.out / 'robot.log'}")
+    print(film(args, before, after) if args.video else "no video: not asked for")
+    print(f"learning curve: {run / 'figures/success.png'}; what the robot's side said: {args.out / 'robot.log'}")
 
 
-def film(args: RealDemoArgs, evaluations: "dict[int, Episode]") -> str:
+def film(args: RealDemoArgs, before: Sequence[bool], after: Sequence[bool]) -> str:
     """Puts the same episode before and after side by side; says in one line where, or why not."""
     import numpy as np
 
     from envs.mujoco.render import write_side_by_side
 
-    first, *_, last = (np.asarray(played.success[0]) for played in evaluations.values())
-    before, after = _filmed(args, len(evaluations))
-    i = telling(first[: len(before)], last[: len(before)])
-    path, captions = args.out / "videos" / "before-after.mp4", [_caption("before", first[i])]
-    captions.append(_caption(f"after {args.rollouts} rollouts", last[i]))
+    first, last = filmed(args)
+    i = telling(np.array(before[: len(first)]), np.array(after[: len(last)]))
+    path, captions = args.out / "videos" / "before-after.mp4", [_caption("before", before[i])]
+    captions.append(_caption(f"after {args.rollouts} rollouts", after[i]))
     try:
-        files = [args.out / "pictures" / f"episode-{numbers[i]}.npz" for numbers in (before, after)]
+        files = [args.out / "pictures" / f"episode-{numbers[i]}.npz" for numbers in (first, last)]
         write_side_by_side([np.load(file)["pictures"] for file in files], captions, path)
     except Exception as error:  # whatever a file or a video encoder raises: a demo does not fail for a picture
         return f"no video: {(str(error).strip() or type(error).__name__).splitlines()[0]}"
     return f"video: {path}"
+
+
+def _percent(succeeded: Sequence[bool]) -> str:
+    return f"{100 * sum(succeeded) / len(succeeded):.0f} %"
 
 
 def telling(first: "np.ndarray", last: "np.ndarray") -> int:

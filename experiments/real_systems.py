@@ -7,6 +7,7 @@ import json
 import os
 import re
 import secrets
+import socket
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -80,6 +81,13 @@ def address(real: str) -> tuple[str, int]:
     if len(rest) > 2 or not (port or "0").isdigit():
         raise UserError(f"--real {real}: write {REMOTE}, {REMOTE}:HOST or {REMOTE}:HOST:PORT")
     return host or _HOST, int(port or _PORT)
+
+
+def free_port() -> int:
+    """One of this computer at which nobody listens."""
+    with socket.socket() as one:
+        one.bind((_HOST, 0))
+        return one.getsockname()[1]
 
 
 def token(home: Path) -> str:

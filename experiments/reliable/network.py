@@ -12,8 +12,9 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import ClientConnection, connect
 from websockets.sync.server import ServerConnection, serve
 
+from experiments.real_systems import free_port
 from experiments.reliable import timing
-from experiments.reliable.runs import Trial, free_port
+from experiments.reliable.runs import Trial
 from sgft_jax.systems.robot_client import pack
 
 

@@ -1,13 +1,12 @@
 """Impure: the three processes of a run on the simulated robot: the one that plays, its learner, and the robot."""
 
 import shutil
-import socket
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-from experiments.real_systems import token
+from experiments.real_systems import free_port, token
 from experiments.reliable import ledger
 from sgft_jax import extend
 from sgft_jax.types import UserError
@@ -15,13 +14,6 @@ from sgft_jax.types import UserError
 TASK = Path(__file__).parents[2] / "docs/examples/own_task.py"
 _OPTIONS = """--method sac --prior none --seeds 1 --checkpoint-every 3 --options.initial-rollouts 1 --options.utd 1
     --options.batch-size 32 --options.critic-warmup 0 --options.replay-capacity 2048"""
-
-
-def free_port() -> int:
-    """One that nobody listens at."""
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return one.getsockname()[1]
 
 
 class Trial:

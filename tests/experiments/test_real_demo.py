@@ -10,8 +10,7 @@ import pytest
 from priors_by_hand import save_prior
 
 from experiments import real_demo
-from experiments.real_demo import RealDemoArgs, Robot
-from sgft_jax.systems.remote import Remote
+from experiments.real_demo import RealDemoArgs
 from sgft_jax.types import UserError
 
 ROOT = Path(__file__).parents[2]
@@ -67,34 +66,20 @@ def test_the_environment_is_made_once_and_its_failure_is_one_line(tmp_path):
         real_demo.bullet(tmp_path / "other", broken)
 
 
-@pytest.fixture
-def remote():
-    own = Remote(2, 1, say=lambda line: None)
-    yield own
-    own.close()
-
-
-def test_the_robots_process_ends_with_the_learner(tmp_path, remote, monkeypatch):
+def test_the_robots_process_ends_with_the_learner(tmp_path, monkeypatch):
     monkeypatch.setattr(real_demo, "_END", 0.1)
-    waits = ["sh", "-c", "echo connected to; exec sleep 60"]
-    with pytest.raises(KeyboardInterrupt), Robot(waits, tmp_path / "log") as robot:
-        robot.connect(remote)
-        assert robot.process is not None and robot.process.poll() is None
-        raise KeyboardInterrupt
-    assert robot.process.poll() is not None
+    real_demo.together(["true"], ["sh", "-c", f"echo $$ > {tmp_path}/pid; exec sleep 60"], tmp_path / "log")
+    with pytest.raises(ProcessLookupError):
+        os.kill(int((tmp_path / "pid").read_text()), 0)
 
 
-def test_a_robot_that_dies_is_an_error_and_no_endless_wait(tmp_path, remote):
-    dies, ended = ["sh", "-c", "echo no pybullet; exit 3"], r"the robot's side has ended with exit code 3; see .*log"
-    with pytest.raises(UserError, match=ended), Robot(dies, tmp_path / "log") as robot:
-        robot.connect(remote)
+def test_a_side_that_fails_is_an_error_and_no_endless_wait(tmp_path, monkeypatch):
+    monkeypatch.setattr(real_demo, "_END", 5.0)
+    with pytest.raises(UserError, match=r"the robot's side has ended with exit code 3; see .*log"):
+        real_demo.together(["sleep", "60"], ["sh", "-c", "echo no pybullet; exit 3"], tmp_path / "log")
     assert "no pybullet" in (tmp_path / "log").read_text()
-    with Robot(["sh", "-c", "echo connected to; sleep 0.2"], tmp_path / "log") as robot:
-        robot.connect(remote)
-        robot.hear("a line")
-        robot.process.wait()
-        with pytest.raises(UserError, match="exit code 0"):
-            robot.hear("waiting for a robot")  # what a learner says before it waits without end
+    with pytest.raises(UserError, match="fine-tuning has ended with exit code 2"):
+        real_demo.together(["sh", "-c", "exit 2"], ["sleep", "0.2"], tmp_path / "log")
 
 
 def test_the_film_shows_an_episode_that_was_mended():
@@ -104,9 +89,8 @@ def test_the_film_shows_an_episode_that_was_mended():
 
 
 def test_the_first_and_the_last_evaluation_are_filmed():
-    """Of 0 to 19 before the first rollout, 4 rollouts, 20 more, 4 rollouts, the last evaluation is 48 to 67."""
-    args = RealDemoArgs(rollouts=8, episodes=20)
-    assert real_demo._filmed(args, 3) == [(0, 1, 2), (48, 49, 50)]
+    """0 to 19 before the first rollout, 20 more after it, 8 rollouts: the last evaluation is 48 to 67."""
+    assert real_demo.filmed(RealDemoArgs(rollouts=8, episodes=20)) == (range(3), range(48, 51))
 
 
 @pytest.mark.slow
@@ -119,7 +103,8 @@ def test_the_demo_in_bullet(tmp_path, monkeypatch, capsys):
     real_demo.main(RealDemoArgs(tmp_path / "prior", "sac", rollouts=2, episodes=3, out=tmp_path / "demo"))
     said = capsys.readouterr().out
     assert "success in Bullet: " in said and "video: " in said
-    for made in ("figures/curve.png", "videos/before-after.mp4", "policy/seed-0/prior.json"):
+    run = "finetune/panda-push/remote/sac/seed-0"
+    for made in (f"{run}/figures/success.png", "videos/before-after.mp4", f"{run}/policy/seed-0/prior.json"):
         assert (tmp_path / "demo" / made).stat().st_size > 100
     assert "connected to" in (tmp_path / "demo" / "robot.log").read_text()
     assert not subprocess.run(["pgrep", "-f", str(tmp_path)], capture_output=True).stdout  # the robot's side has ended
