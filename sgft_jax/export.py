@@ -65,6 +65,12 @@ def slots_of(prior: Prior, env: Env) -> tuple[Slot, ...]:
     return (*found, Slot(_STEP, (), "int32")) if plans(prior.card) else tuple(found)
 
 
+def last_action_of(prior: Prior, env: Env) -> tuple[str, ...]:
+    """The parts of the state whose first numbers are the last action."""
+    own = (_memory(1),) if algorithm_of(prior.card) == "recurrent" else ()
+    return ((_PREVIOUS,) if env.previous_actions else ()) + own
+
+
 def plans(card: Mapping[str, Any]) -> bool:
     """Whether a policy searches for a plan at every step."""
     return algorithm_of(card) == "tdmpc2" or bool(card.get("plan"))
@@ -241,6 +247,7 @@ def contract(prior: Prior, env: Env, to: Format) -> dict[str, Any]:
             "identified": identified,
         },
         "state": slots_of(prior, env),
+        "last_action": last_action_of(prior, env),
     }
 
 

@@ -28,7 +28,7 @@ class Policy:
     def __init__(self, folder: str | Path | None = None) -> None:
         home = Path(__file__).parent if folder is None else Path(folder)
         self.contract = json.loads((home / "contract.json").read_text())
-        self._names = [f"{e['name']}[{i}]" for e in self.contract["observation"] for i in range(e["size"])]
+        self._names, self._commands = (_each(self.contract[kind]) for kind in ("observation", "action"))
         self._step = _OPENERS[self.contract["to"]](home)
         self.reset()
 
@@ -36,19 +36,37 @@ class Policy:
         """Forgets the episode; call it at the start of the next one."""
         self._state = {e["name"]: np.zeros(e["shape"], e["dtype"]) for e in self.contract["state"]}
 
-    def act(self, measured: Any) -> np.ndarray:
+    def act(self, measured: Any, sent: Any = None) -> np.ndarray:
         """The action [act_dim] in [-1, 1] for what was measured, in the order and the units of the contract.
 
+        sent: [act_dim] in [-1, 1], what the robot was really told last time, where something has changed the action,
+        such as a limit of force or workspace. Default: the action as it was. At the first step there was none.
         Raises ValueError for another number of entries, and for one that is not finite; nothing is remembered then.
         """
-        measured = np.asarray(measured, np.float32)
-        if measured.shape != (len(self._names),):
-            raise ValueError(f"the policy reads {len(self._names)} measured numbers, got shape {measured.shape}")
-        if odd := [name for name, ok in zip(self._names, np.isfinite(measured)) if not ok]:  # noqa: B905 - new in 3.10
-            raise ValueError(f"{odd[0]} is not a finite number")
-        found = self._step({"measured": measured, **self._state})
+        measured = _numbers(measured, self._names, "reads", "measured numbers")
+        state = self._state
+        if sent is not None:
+            sent = _numbers(sent, self._commands, "gives", "numbers, so many must have been sent")
+            corrected = self.contract["last_action"]
+            state = {**state, **{name: np.concatenate([sent, state[name][len(sent) :]]) for name in corrected}}
+        found = self._step({"measured": measured, **state})
         self._state = {name: found["next_" + name] for name in self._state}
         return np.asarray(found["action"])
+
+
+def _each(entries: list) -> list[str]:
+    """The name of every number."""
+    return [f"{e['name']}[{i}]" for e in entries for i in range(e["size"])]
+
+
+def _numbers(given: Any, names: list[str], does: str, what: str) -> np.ndarray:
+    """As an array; ValueError where their number is wrong or one is not finite."""
+    numbers = np.asarray(given, np.float32)
+    if numbers.shape != (len(names),):
+        raise ValueError(f"the policy {does} {len(names)} {what}, got shape {numbers.shape}")
+    if odd := [name for name, ok in zip(names, np.isfinite(numbers)) if not ok]:  # noqa: B905 - new in 3.10
+        raise ValueError(f"{odd[0]} is not a finite number")
+    return numbers
 
 
 def _layer_norm(x: np.ndarray, scale: np.ndarray, bias: np.ndarray) -> np.ndarray:

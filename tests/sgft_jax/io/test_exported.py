@@ -231,6 +231,26 @@ def test_bad_measurements_are_refused_and_not_remembered(tmp_path):
     np.testing.assert_allclose(policy.act(second), wanted[0, 1], atol=1e-5)
 
 
+@pytest.mark.parametrize("name", ["identified", "recurrent", "affine"])
+def test_what_was_really_sent_is_what_is_remembered(name, tmp_path):
+    """As if the policy had given that action itself; a policy without memory acts as before."""
+    env, prior = case(name)
+    save_exported(tmp_path / "out", prior, env, "numpy")
+    policy, other = player.Policy(tmp_path / "out"), player.Policy(tmp_path / "out")
+    first, second = recorded(name)[0][0, :2]
+    own = policy.act(first)
+    other.act(first)
+    sent = 0.5 * own
+    for remembered in policy.contract["last_action"]:
+        policy._state[remembered][: len(sent)] = sent
+    expected, plain = policy.act(second), player.Policy(tmp_path / "out")
+    np.testing.assert_array_equal(other.act(second, sent=sent), expected)
+    plain.act(first)
+    assert (np.abs(plain.act(second) - expected).max() > 1e-4) == (name != "affine")
+    with pytest.raises(ValueError, match=r"gives 2 numbers, so many must have been sent, got shape \(1,\)"):
+        other.act(second, sent=[0.0])
+
+
 def test_an_export_that_acts_differently_is_not_kept(tmp_path, monkeypatch):
     env, prior = case("affine")
     monkeypatch.setitem(player._OPERATORS, "Relu", lambda x: x)
