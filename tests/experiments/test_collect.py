@@ -9,8 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-import envs
-from experiments import cli, collect, hybrid
+from experiments import collect, hybrid
 from sgft_jax.data import acceptance, logs, recording
 from sgft_jax.data.recording import Joints, Noted, Recorded
 from sgft_jax.types import Transition, UserError
@@ -20,10 +19,7 @@ OPTIONS = """--task toy --level -100 --transitions 50 --seeds 2 --environments 3
 LEARN = OPTIONS.split()
 
 
-@pytest.fixture(autouse=True)
-def _toy(monkeypatch):
-    monkeypatch.setitem(envs.TASKS, "toy", "toy")
-    monkeypatch.setattr(cli, "set_up", lambda: None)
+pytestmark = pytest.mark.usefixtures("toy_task")
 
 
 def episode(first, steps, *, terminated=False):

@@ -5,15 +5,10 @@ import pytest
 from priors_by_hand import save_prior
 from runs_by_hand import save
 
-import envs
 from experiments import cli, diagnose
 from sgft_jax.io.real import RealStore
 
-
-@pytest.fixture(autouse=True)
-def _toy(monkeypatch):
-    monkeypatch.setitem(envs.TASKS, "toy", "toy")
-    monkeypatch.setattr(cli, "set_up", lambda: None)  # the tests have their own cache and environment
+pytestmark = pytest.mark.usefixtures("toy_task")
 
 
 @pytest.fixture

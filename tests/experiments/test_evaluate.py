@@ -4,14 +4,9 @@ import re
 import pytest
 from priors_by_hand import save_prior
 
-import envs
 from experiments import cli, evaluate
 
-
-@pytest.fixture(autouse=True)
-def _toy(monkeypatch):
-    monkeypatch.setitem(envs.TASKS, "toy", "toy")
-    monkeypatch.setattr(cli, "set_up", lambda: None)  # the tests have their own cache and environment
+pytestmark = pytest.mark.usefixtures("toy_task")
 
 
 @pytest.fixture

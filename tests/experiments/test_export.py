@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from priors_by_hand import save_prior
 
-import envs
 from experiments import cli, export
 from experiments.export import ExportArgs
 from sgft_jax import api
@@ -25,9 +24,7 @@ print(json.dumps([actions, others]))
 """
 
 
-@pytest.fixture(autouse=True)
-def _toy(monkeypatch):
-    monkeypatch.setitem(envs.TASKS, "toy", "toy")
+pytestmark = pytest.mark.usefixtures("toy_task")
 
 
 @pytest.fixture

@@ -80,11 +80,7 @@ Record.checkpoint = offline
 """
 
 
-@pytest.fixture(autouse=True)
-def _toy(monkeypatch):
-    monkeypatch.setitem(envs.TASKS, "toy", "toy")
-    monkeypatch.setattr(os, "environ", os.environ.copy())
-    monkeypatch.setattr(cli, "set_up", lambda: None)  # the tests have their own cache and environment
+pytestmark = pytest.mark.usefixtures("toy_task")
 
 
 @pytest.fixture(scope="module")

@@ -1,13 +1,11 @@
 """Admissibility of gaps, measured on a point mass: a gap that can be learned, and one that nobody can master."""
 
 import json
-import os
 
 import pytest
 from priors_by_hand import save_prior
 
-import envs
-from experiments import cli, gaps, gaps_run
+from experiments import gaps, gaps_run
 
 FILES = {
     "turned": "[params]\nmass = 1.0\nfriction = 4.0\n[effects]\naction_rotation = 0.3\n",
@@ -20,11 +18,7 @@ OPTIONS = """--task toy --preset cpu --config.n-envs 32 --config.worlds 16 --con
 TINY = OPTIONS.split()
 
 
-@pytest.fixture(autouse=True)
-def _toy(monkeypatch):
-    monkeypatch.setitem(envs.TASKS, "toy", "toy")
-    monkeypatch.setattr(os, "environ", os.environ.copy())
-    monkeypatch.setattr(cli, "set_up", lambda: None)
+pytestmark = pytest.mark.usefixtures("toy_task")
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """`--real gymnasium:NAME`: fine-tuning, evaluation and diagnosis on an environment that is stepped from Python."""
 
 import json
-import os
 import shutil
 from pathlib import Path
 
@@ -29,10 +28,7 @@ OPTIONS = f"""--task toy --method sac --seeds 2 --rollouts {ROLLOUTS} --eval-eve
 
 
 @pytest.fixture(autouse=True)
-def _toy(monkeypatch):
-    monkeypatch.setitem(envs.TASKS, "toy", "toy")
-    monkeypatch.setattr(os, "environ", os.environ.copy())
-    monkeypatch.setattr(cli, "set_up", lambda: None)
+def _toy(toy_task, monkeypatch):
     monkeypatch.setattr(Turned, "seeds", [])
     monkeypatch.setattr(Turned, "breaks", None)
 

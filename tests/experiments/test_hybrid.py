@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import toy
 
-import envs
 import sgft_jax
-from experiments import cli, hybrid
+from experiments import hybrid
 from experiments.hybrid_args import data_name, run_folder
 from sgft_jax.hybrid.scores import normalised
 from sgft_jax.io.log import MetricsLog, read_jsonl
@@ -22,10 +21,7 @@ OPTIONS = """--task toy --seeds 2 --no-video --schedule.updates 24 --schedule.si
 TINY = OPTIONS.split()
 
 
-@pytest.fixture(autouse=True)
-def _toy(monkeypatch):
-    monkeypatch.setitem(envs.TASKS, "toy", "toy")
-    monkeypatch.setattr(cli, "set_up", lambda: None)
+pytestmark = pytest.mark.usefixtures("toy_task")
 
 
 @pytest.fixture

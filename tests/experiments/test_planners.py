@@ -1,7 +1,6 @@
 """TD-MPC2 through the commands: pretraining, priors, fine-tuning and evaluation on a point mass."""
 
 import json
-import os
 
 import jax
 import jax.numpy as jnp
@@ -10,8 +9,7 @@ import pytest
 import toy
 from priors_by_hand import save_prior
 
-import envs
-from experiments import cli, evaluate, finetune, pretrain
+from experiments import evaluate, finetune, pretrain
 from sgft_jax import api
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.priors import load_prior
@@ -28,11 +26,8 @@ FINETUNE = """--task toy --no-video --seeds 2 --rollouts 4 --eval-every 1 --eval
 
 
 @pytest.fixture(autouse=True)
-def _toy(monkeypatch):
-    monkeypatch.setitem(envs.TASKS, "toy", "toy")
+def _toy(toy_task, monkeypatch):
     monkeypatch.setitem(tdmpc2_model.SIZES, "tiny", tdmpc2_model.Size(8, 8, 8, 2, 2))
-    monkeypatch.setattr(os, "environ", os.environ.copy())
-    monkeypatch.setattr(cli, "set_up", lambda: None)
 
 
 @pytest.fixture(scope="module")

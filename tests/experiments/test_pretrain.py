@@ -54,10 +54,7 @@ def interrupted(write, *, after):
     return metrics
 
 
-@pytest.fixture(autouse=True)
-def _toy(monkeypatch):
-    monkeypatch.setitem(envs.TASKS, "toy", "toy")
-    monkeypatch.setattr(os, "environ", os.environ.copy())
+pytestmark = pytest.mark.usefixtures("toy_task")
 
 
 @pytest.fixture(scope="module")

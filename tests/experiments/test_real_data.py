@@ -1,7 +1,6 @@
 """Real rollouts out of runs and logs into them: what is exported, what a run begins with, what a replay draws."""
 
 import json
-import os
 
 import h5py
 import jax
@@ -11,7 +10,6 @@ import toy
 from priors_by_hand import save_prior
 from test_finetune import complaint, killed, rollouts, same_results
 
-import envs
 from envs import gaps
 from envs.history import with_previous_actions
 from envs.pools import real_worlds
@@ -41,11 +39,7 @@ Record.checkpoint = offline
 """
 
 
-@pytest.fixture(autouse=True)
-def _toy(monkeypatch):
-    monkeypatch.setitem(envs.TASKS, "toy", "toy")
-    monkeypatch.setattr(os, "environ", os.environ.copy())
-    monkeypatch.setattr(cli, "set_up", lambda: None)
+pytestmark = pytest.mark.usefixtures("toy_task")
 
 
 def rollout(number):

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 from priors_by_hand import save_prior
 
-import envs
 from envs import gaps
 from experiments import cli, compare, finetune, grid, spaces, tune, tuned
 from experiments.finetune_args import arguments, resolved, run_folder, with_settings
@@ -26,10 +24,7 @@ SYSTEMS = ("mild", "soft", "default")
 
 
 @pytest.fixture(autouse=True)
-def _toy(monkeypatch):
-    monkeypatch.setitem(envs.TASKS, "toy", "toy")
-    monkeypatch.setattr(os, "environ", os.environ.copy())
-    monkeypatch.setattr(cli, "set_up", lambda: None)  # the tests have their own cache and environment
+def _toy(toy_task, monkeypatch):
     monkeypatch.setattr("envs.gaps.presets", lambda task: {name: gaps.Gap(name, {}, {}) for name in SYSTEMS})
 
 
