@@ -115,17 +115,28 @@ def _plain(value: Any) -> Any:
 class Limits:
     """What the robot may be told. Commands are brought within; what was sent is what is reported.
 
-    low, high: of every action. change: how far an action may be from the one before, at most.
+    low, high: of every action. change: how far an action may be from the one before, at most. workspace: the lowest
+    and the highest value of every number that is measured, infinite where any will do. Beyond them the robot is stopped
+    and the episode ends there; it cannot begin there either.
     """
 
     low: float | Sequence[float] = -1.0
     high: float | Sequence[float] = 1.0
     change: float | Sequence[float] = np.inf
+    workspace: tuple[Sequence[float], Sequence[float]] | None = None
 
     def of(self, action: np.ndarray, before: np.ndarray) -> np.ndarray:
         """The nearest action that is allowed. before: the last one sent, zeros at the start of an episode."""
         change = np.asarray(self.change)
         return np.clip(np.clip(action, before - change, before + change), self.low, self.high).astype(np.float32)
+
+    def left(self, obs: np.ndarray) -> str:
+        """What of a measurement lies beyond the workspace; nothing if all is well."""
+        if self.workspace is None:
+            return ""
+        low, high = (np.asarray(x) for x in self.workspace)
+        beyond = np.flatnonzero((obs < low) | (obs > high))
+        return f"measured number {beyond[0]} is {obs[beyond[0]]:.4g}, beyond the workspace" if len(beyond) else ""
 
 
 class RefusedError(Exception):
@@ -162,6 +173,10 @@ def play(
     timed = hasattr(driver, "send")
     if timed and not period:
         raise ValueError("a driver with `send` needs a period, in seconds")
+    if any(np.shape(bound) != (int(driver.obs_size),) for bound in limits.workspace or ()):
+        raise ValueError(
+            f"the workspace needs a lowest and a highest value for each of {driver.obs_size} measured numbers"
+        )
     rhythm = _Rhythm(period, answer_within or period / 2, late, patience) if timed and period else None
     robot = _Robot(driver, rhythm, limits, _Log(log))
     hello = pack(
@@ -277,6 +292,8 @@ class _Robot:
         self._last = np.zeros(self.driver.action_size, np.float32)
         try:
             obs = self._checked(self.driver.reset(message["seed"]))
+            if left := self.limits.left(obs):
+                raise ValueError(left)
         except Exception as error:
             self._fail(socket, error, say)
             return
@@ -327,6 +344,9 @@ class _Robot:
         self.counts["late"] += late
         if self.rhythm and self._lates >= self.rhythm.patience:
             say(f"{self._lates} steps in a row without a command in time; the episode ends here")
+            told["truncated"] = True
+        if left := self.limits.left(told["obs"]):
+            say(f"{left}; the robot is stopped, the episode ends here")
             told["truncated"] = True
         told["truncated"] |= step + 1 == self._most
         if told["terminated"] or told["truncated"]:

@@ -132,6 +132,26 @@ def test_commands_are_kept_within_limits_and_what_was_sent_is_said(pair):
     np.testing.assert_allclose([x[0] for x in own.driver.moves], sent)
 
 
+def test_an_episode_ends_where_the_workspace_does(pair):
+    own = pair(Point(), limits=Limits(workspace=([-np.inf, -1.0], [1.5, 1.0])))
+    begin(own, 0)
+    moved = [move(own, RIGHT) for _ in range(2)]
+    assert [x.truncated for x in moved] == [False, True] and [x.obs[0] for x in moved] == [1, 2]
+    assert own.driver.stops >= 2 and "invalid" not in moved[-1].info
+    assert any("measured number 0 is 2, beyond the workspace; the robot is stopped" in line for line in own.said)
+
+
+def test_no_episode_begins_beyond_the_workspace(pair):
+    driver = Point()
+    starts = iter([np.array([0.0, 3.0]), np.zeros(2)])
+    driver.reset = lambda seed: next(starts)
+    own = pair(driver, limits=Limits(workspace=([-1.0, -1.0], [1.0, 1.0])), again=0.05)
+    np.testing.assert_array_equal(begin(own, 0), [0, 0])
+    assert any("measured number 1 is 3, beyond the workspace" in line for line in own.said)
+    with pytest.raises(ValueError, match="a lowest and a highest value for each of 2 measured numbers"):
+        play(Point(), "ws://127.0.0.1:1", token="", limits=Limits(workspace=([0.0], [1.0])))
+
+
 @pytest.mark.parametrize("driver", [Point, Arm])
 def test_lost_doubled_and_damaged_messages_move_nothing_twice(pair, driver, monkeypatch):
     """Every fourth message is lost, some come twice, some are damaged, in both directions."""
