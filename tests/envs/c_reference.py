@@ -3,7 +3,8 @@
 Impure: C MuJoCo steps in place.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,8 @@ import numpy as np
 from envs.mujoco.scene import Scene
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array
+
+_COMPILED: dict[int, Any] = {}  # by the identity of a scene, which is kept beside, because it has no hash
 
 
 def play(
@@ -35,14 +38,25 @@ def play(
     model = spec.compile()
     data = mujoco.MjData(model)
     params = jnp.asarray(list(theta.values()), jnp.float32)
-    target, event = jax.jit(lambda s, a: scene.motors(params, s.ctrl, scene.target(s.qpos, a))), jax.jit(scene.event)
+    target, event = _compiled(scene)
     states, state = [], start
     for action in actions:
-        command = np.asarray(target(state, action))
+        command = np.asarray(target(params, state, action))
         after = _control_step(model, data, state, command, scene.substeps * refine, scene.ramp)
         state = event(params, after)
         states.append(state)
     return states
+
+
+def _compiled(scene: Scene) -> tuple[Callable[..., Array], Callable[..., PhysicsState]]:
+    """(params, state, action) -> command, and the scene's event; compiled once for a scene."""
+    if id(scene) not in _COMPILED:
+
+        def target(params: Array, state: PhysicsState, action: Array) -> Array:
+            return scene.motors(params, state.ctrl, scene.target(state.qpos, action))
+
+        _COMPILED[id(scene)] = scene, jax.jit(target), jax.jit(scene.event)
+    return _COMPILED[id(scene)][1:]
 
 
 def _control_step(

@@ -52,6 +52,7 @@ def test_a_gap_is_played_and_diagnosed_by_every_prior(priors, tmp_path, capsys):
     assert found["mean"][-1]["rollouts"] == 6
 
 
+@pytest.mark.slow
 def test_recordings_of_one_policy_are_looked_at_by_every_prior(priors, tmp_path, capsys):
     recorded = record(tmp_path / "robot", success=(1, 3))
 
@@ -83,6 +84,7 @@ def test_a_run_says_which_prior_each_seed_has(priors, tmp_path, capsys):
     assert [one["prior"][-6:] for one in found["priors"]] == ["seed-1", "seed-0"] and found["task"] == "toy"
 
 
+@pytest.mark.slow
 def test_calibration_and_its_check_on_other_runs(priors, tmp_path, capsys):
     runs = [
         run(tmp_path / "a", real, [[0.2, 0.1], [0.5, 0.4], after], priors)

@@ -43,6 +43,7 @@ def test_episodes_are_the_same_every_time_and_others_on_request(run, capsys):
     assert returns() == first != returns("--seed", 1)
 
 
+@pytest.mark.slow
 def test_several_systems_in_one_program_are_each_as_alone(run, capsys):
     def returns(*reals):
         call("--run", run, "--episodes", 10, "--json", "--real", *reals)

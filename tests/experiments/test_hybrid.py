@@ -79,9 +79,10 @@ def test_a_run_leaves_curves_policies_and_a_summary_for_each_simulator(tmp_path,
         assert action.shape == (2,) and (np.abs(action) < 1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "simulator"),
-    [("h2oplus", "sim"), pytest.param("iql", "no-simulator", marks=pytest.mark.slow)],  # its rate follows the updates
+    [("h2oplus", "sim"), ("iql", "no-simulator")],  # the rate of the second follows the updates
 )
 def test_an_interrupted_run_goes_on_and_ends_the_same(method, simulator, tmp_path, data, monkeypatch):
     ratio_rows = [] if method == "iql" else ["--options.ratio-rows", "8"]
@@ -105,6 +106,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(method, simulator, tmp_pat
         assert (whole / name).read_text() == (cut / name).read_text()
 
 
+@pytest.mark.slow
 def test_sac_needs_no_data(tmp_path):
     hybrid.main(words(tmp_path, None, "--method", "sac", "--gap", "sim"))
     folder = tmp_path / "out/hybrid/toy/sim/no-data/sac/seeds-0-1"

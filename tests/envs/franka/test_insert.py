@@ -12,6 +12,7 @@ from envs.franka import arm, insert, kinematics
 
 NOMINAL = {p.name: p.nominal for p in insert.PARAMETERS}
 PROBE = PROBES["insert"]
+INITIAL = jax.jit(insert.initial)
 
 
 def obs_at(dx, dy, dz):
@@ -59,7 +60,7 @@ def test_simulated_hole_is_the_observed_one(rotation):
 
 
 def test_observed_leg_is_the_simulated_one():
-    state = insert.initial(as_params(NOMINAL), jax.random.key(0))
+    state = INITIAL(as_params(NOMINAL), jax.random.key(0))
     model = insert.build(NOMINAL).compile()
     data = mujoco.MjData(model)
     data.qpos[:] = state.qpos
@@ -83,7 +84,7 @@ def test_script_inserts_for_every_theta():
     rng = np.random.default_rng(0)
     for seed in range(12):
         theta = sample_theta(insert.SCENE, rng)
-        start = insert.initial(as_params(theta), jax.random.key(seed))
+        start = INITIAL(as_params(theta), jax.random.key(seed))
         steps = play_script(PROBE, theta, start, steps=20)
         assert insert.success(insert.observe(as_params(theta), steps[-1].after))
 
@@ -92,7 +93,7 @@ def pressed(theta, aside, *, down, seed=0):
     """[T, 3] m: the tip relative to the hole's mouth while pressing `aside` m next to the hole's axis."""
     params = as_params(theta)
     observe = jax.jit(insert.observe)
-    state, seen = insert.initial(params, jax.random.key(seed)), []
+    state, seen = INITIAL(params, jax.random.key(seed)), []
     for t in range(20):
         obs = np.asarray(observe(params, state))
         aim = obs[6:8] + np.array([aside, 0.0]) - obs[3:5]
@@ -119,7 +120,7 @@ def test_clearance(hole_radius, clearance):
     """A light sideways push inside the hole ends at a wall."""
     theta = NOMINAL | {"hole_radius": hole_radius}
     params, observe = as_params(theta), jax.jit(insert.observe)
-    start = insert.initial(params, jax.random.key(0))
+    start = INITIAL(params, jax.random.key(0))
     state = play_script(PROBE, theta, start, steps=15)[-1].after
     for _ in range(3):
         state = c_reference.play(insert.SCENE, theta, state, [np.array([0.1, 0, 0], np.float32)])[0]  # 2 mm

@@ -218,6 +218,7 @@ def test_offline_methods_have_no_simulator(name):
     assert state.fleet is None and state.simulated is None and int(state.learner.step[0]) == 24
 
 
+@pytest.mark.slow
 def test_the_noise_of_h2o_has_the_spread_of_the_data():
     state = played(build("h2o"))[0][0]
     np.testing.assert_allclose(state.learner.spread[0], real_rows().rows.obs.std(0), rtol=1e-4)
