@@ -55,14 +55,14 @@ def seen(tip, cube, mark):
 @pytest.mark.parametrize(
     ("tip", "cube", "mark", "wanted"),
     [
-        # 10 cm to go along x: the place is 4 cm behind the cube, where the tip is: -0.1 + exp(-4)
-        ((-0.04, 0.0, 0.02), (0.0, 0.0, 0.02), (0.1, 0.0, 0.02), -0.081684),
-        # in front of it, 8 cm from that place
-        ((0.04, 0.0, 0.02), (0.0, 0.0, 0.02), (0.1, 0.0, 0.02), -0.161684),
-        # 3 cm high above the place of a cube that goes along -y
-        ((0.1, 0.24, 0.05), (0.1, 0.2, 0.02), (0.1, 0.0, 0.02), -0.23),
-        # 2.5 cm from the mark: half as far behind; exp(-1/4) - 0.025
-        ((-0.02, 0.0, 0.02), (0.0, 0.0, 0.02), (0.025, 0.0, 0.02), 0.753801),
+        # 10 cm to go along x; the tip is 2 cm from its place, 2 cm behind the cube: 1 - tanh(0.5) - tanh(0.2) / 2
+        ((-0.04, 0.0, 0.02), (0.0, 0.0, 0.02), (0.1, 0.0, 0.02), 0.439195),
+        # in front of it, 6 cm from that place
+        ((0.04, 0.0, 0.02), (0.0, 0.0, 0.02), (0.1, 0.0, 0.02), 0.269358),
+        # 3 cm above the place of a cube that has 20 cm to go along -y
+        ((0.1, 0.22, 0.05), (0.1, 0.2, 0.02), (0.1, 0.0, 0.02), 0.092750),
+        # 2.5 cm from the mark: the place is half as far behind, 1 cm from the tip
+        ((-0.02, 0.0, 0.02), (0.0, 0.0, 0.02), (0.025, 0.0, 0.02), 0.825813),
         ((0.0, 0.0, 0.02), (0.0, 0.0, 0.02), (0.0, 0.0, 0.02), 1.0),
     ],
 )
