@@ -82,7 +82,7 @@ def test_rows_that_do_not_count_change_nothing(found, prior):
     np.testing.assert_allclose(state.learner[1].mean, after.learner[1].mean, atol=1e-3)
 
 
-@pytest.mark.parametrize("fit", ["map", "dropo"])
+@pytest.mark.parametrize("fit", ["map", pytest.param("dropo", marks=pytest.mark.slow)])
 def test_the_simulator_tells_the_system_too(prior, fit, key):
     """Of steps with noise, played in the task itself; the prior's models, which know nothing, are not asked."""
     method = get_method("sysid")
@@ -141,6 +141,7 @@ def test_other_methods_refuse_such_a_prior_and_this_one_every_other(prior):
         api.check_prior(plain, get_method("sysid"), ENV)
 
 
+@pytest.mark.slow
 def test_nothing_of_the_true_system_reaches_the_method(prior):
     """The whole way from Python."""
     gap = envs.gaps.from_dict(ENV, "off", {"effects": {"action_scale": 0.7}})

@@ -63,6 +63,7 @@ def test_models_between_compiled_ones_are_the_compiler_s(task):
         np.testing.assert_allclose(found[name] / size, value / size, atol=0.03, err_msg=name)
 
 
+@pytest.mark.slow
 def test_one_rollout_of_push_tells_scale_and_rotation():
     """0.7 and 0.3 rad within 15 %, of steps with 1 mm of noise."""
     env = envs.make("push", "c")

@@ -53,6 +53,7 @@ def converging(scene):
     return scene._replace(build=build)
 
 
+@pytest.mark.slow
 def test_hammering():
     """0.2 mrad and 0.01 mm after 0.2 s with blows on nail and board and saturated servos; all worlds in one batch."""
     c, warp = (make_env(SCENES["hammer"], impl=impl) for impl in ("c", "warp"))
@@ -83,6 +84,7 @@ def test_arm_on_the_board():
         state = after
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DEFORMABLES)
 def test_pushing_what_deforms(name):
     """After 0.2 s in which a hard push moves it Warp is about as far from C MuJoCo as that is from itself if it begins
