@@ -61,6 +61,8 @@ class FinetuneArgs:
     """Expert: first seed."""
     eval_every: int = 5
     """Expert: rollouts between evaluations."""
+    eval_at: tuple[int, ...] = ()
+    """Expert: evaluate after these numbers of rollouts instead, e.g. 0 1 2 4 8 16."""
     eval_episodes: int | None = None
     """Expert: episodes per seed and evaluation, always the same ones; 0: no evaluation. They cost no real transitions,
     except on robots and Gymnasium environments, where they are counted and kept. Default: 50, on a robot 0."""
@@ -115,6 +117,8 @@ def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
     at_least_one(args, "rollouts", "eval_every", "checkpoint_every", "sync_every")
     if args.eval_episodes is not None and args.eval_episodes < 0:
         raise UserError(f"--eval-episodes is {args.eval_episodes}: must be at least 0")
+    if args.eval_at and min(args.eval_at) < 0:
+        raise UserError(f"--eval-at {' '.join(map(str, args.eval_at))}: numbers of rollouts, from 0 on")
     method, seeds = get_method(args.method), seed_list(args.seed, args.seeds)
     if not isinstance(args.options, method.config):
         raise UserError(f"--method {method.name}: the options are those of another method")

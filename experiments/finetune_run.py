@@ -99,6 +99,18 @@ def build(
     return chosen.build(chosen.config(**options), prior, envs.make(task, impl, **observed))
 
 
+def evaluates(args: FinetuneArgs, before: int, done: int) -> bool:
+    """Whether there is an evaluation after `done` rollouts; `before`: after how many the run was here last."""
+    if args.eval_at:
+        return any(before < n <= done for n in args.eval_at) or (done == 0 and 0 in args.eval_at)
+    return due(args, args.eval_every, before, done)
+
+
+def due(args: FinetuneArgs, every: int, before: int, done: int) -> bool:
+    """Whether something that happens every so many rollouts happens now: also at the start, the first and last."""
+    return before == 0 or done >= args.rollouts or done % every == 0
+
+
 class _Run:
     """What happens between compiled calls, on disk before in memory.
 
@@ -167,17 +179,13 @@ class _Run:
                 shown = self._log(done, values, time.perf_counter() - started)
                 if done == before and values:  # a part of the offline phase
                     self._checkpoint(progress)
-                elif self.episodes and self._due(self.args.eval_every, before, done):
+                elif self.episodes and evaluates(self.args, before, done):
                     shown[f"{self.system.env.score}, evaluation"] = self._evaluate(progress, done)
-                if done and self._due(self.args.checkpoint_every, before, done):
+                if done and due(self.args, self.args.checkpoint_every, before, done):
                     self._checkpoint(progress)
                 bar.advance(done - before, shown)
                 started = time.perf_counter()
         return progress
-
-    def _due(self, every: int, before: int, done: int) -> bool:
-        """Whether something that happens every so many rollouts happens now: also at the start, the first and last."""
-        return before == 0 or done >= self.args.rollouts or done % every == 0
 
     def _log(self, done: int, values: Mapping[str, np.ndarray], seconds: float) -> dict[str, float]:
         """Writes a line of metrics for each real system; returns what the progress bar shows."""

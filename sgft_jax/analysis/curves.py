@@ -316,8 +316,11 @@ def make_curve(
 
 
 def read_runs(out: Path) -> Found:
-    """Every run below <out>/finetune; of several that differ in seeds alone that with the most seeds, then rollouts."""
-    runs: dict[tuple[str, ...], tuple[Curve, Path]] = {}
+    """Every run below <out>/finetune. Runs that differ in seeds alone are one curve of all their seeds.
+
+    If seeds are in several of them, or evaluations differ, that with the most seeds counts, then with most rollouts.
+    """
+    runs: dict[tuple[str, ...], list[tuple[Curve, Path]]] = {}
     notes = []
     for folder in sorted(path for path in (out / "finetune").glob("*/*/*/*") if path.is_dir()):
         try:
@@ -325,16 +328,38 @@ def read_runs(out: Path) -> Found:
         except UserError as error:
             notes.append(str(error))
             continue
-        key = tuple(getattr(curve, name) for name in IDENTITY)
-        other = runs.get(key, (curve, folder))
-        less, more = sorted([(curve, folder), other], key=lambda run: (len(run[0].seeds), run[0].rollouts[-1]))
-        runs[key] = more
-        if less[1] != more[1]:
-            notes.append(f"{less[1]}: left out, {more[1].name} has more seeds or rollouts")
-    for curve, folder in runs.values():
+        runs.setdefault(tuple(getattr(curve, name) for name in IDENTITY), []).append((curve, folder))
         if (wanted := curve.facts.get("rollouts", 0)) > curve.rollouts[-1]:
             notes.append(f"{folder}: unfinished, {curve.rollouts[-1]} of {wanted} rollouts")
-    return Found([curve for curve, _ in runs.values()], notes)
+    together = [_together(same) for same in runs.values()]
+    return Found([curve for curve, _ in together], [*notes, *(note for _, more in together for note in more)])
+
+
+def _together(same: list[tuple[Curve, Path]]) -> tuple[Curve, list[str]]:
+    """The curve of runs that differ in seeds, and a line for each one that does not fit the largest."""
+    (first, home), *others = sorted(same, key=lambda run: (-len(run[0].seeds), -run[0].rollouts[-1]))
+    kept, notes, seeds = [first], [], set(first.seeds.tolist())
+    for curve, folder in others:
+        if seeds.isdisjoint(curve.seeds.tolist()) and np.array_equal(curve.rollouts, first.rollouts):
+            kept.append(curve)
+            seeds.update(curve.seeds.tolist())
+        else:
+            notes.append(f"{folder}: left out, {home.name} has more seeds or rollouts, and they cannot be put together")
+    return (joined(kept) if len(kept) > 1 else first), notes
+
+
+def joined(curves: Sequence[Curve]) -> Curve:
+    """One curve of the members of all, in the order of their seeds. They were evaluated after the same rollouts."""
+    order = np.argsort(np.concatenate([curve.seeds for curve in curves]), kind="stable")
+    rows = lambda each: np.concatenate(list(each))[order]  # noqa: E731
+    trained = [curve.training for curve in curves]
+    return replace(
+        curves[0],
+        seeds=rows(curve.seeds for curve in curves),
+        prior=rows(curve.prior for curve in curves),
+        scores={name: rows(curve.scores[name] for curve in curves) for name in curves[0].scores},
+        training=None if any(x is None for x in trained) else rows(x for x in trained if x is not None),
+    )
 
 
 def set_name(folder: Path, digests: Sequence[str]) -> str:

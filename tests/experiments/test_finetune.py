@@ -164,6 +164,20 @@ def same_results(one, two):
 # --- what a run leaves ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(
+    ("options", "wanted"),
+    [
+        ({"eval_every": 3}, [0, 2, 3, 6, 7]),  # also at the start, after the first rollouts, and at the end
+        ({"eval_at": (0, 1, 4, 7)}, [0, 2, 4, 7]),  # the first two rollouts come together
+        ({"eval_at": (5,)}, [5]),
+    ],
+)
+def test_when_runs_are_evaluated(options, wanted):
+    args = arguments("sac", rollouts=7, **options)
+    steps = [0, 0, *range(2, 8)]
+    assert [b for a, b in zip(steps, steps[1:], strict=False) if finetune_run.evaluates(args, a, b)] == wanted
+
+
 def test_a_run_leaves_curve_summary_policies_and_every_rollout(home):
     folder = run(home, "sgft-sac")
     curve = read_jsonl(folder / "eval.jsonl")
@@ -441,6 +455,7 @@ def test_no_rollout_of_a_real_system_is_replaced_because_another_lacks_it(tmp_pa
         (["--rolouts", "5"], "did you mean --rollouts?"),
         (["--rollouts", "1"], "--options.initial-rollouts 2 is more than --rollouts 1"),
         (["--eval-every", "0"], "--eval-every is 0: must be at least 1"),
+        (["--eval-at", "0", "-1"], "--eval-at 0 -1: numbers of rollouts, from 0 on"),
         (["--options.utd", "-1"], "utd is -1.0: must be a positive number"),
         (["--options.utd", "nan"], "utd is nan: must be a positive number"),
         (["--options.lr-actor", "inf"], "lr-actor is inf: must be a positive number"),

@@ -182,6 +182,17 @@ def test_of_several_runs_that_with_the_most_seeds(tmp_path):
     found, notes = read_runs(tmp_path)
     assert [len(c.seeds) for c in found] == [2]
     assert "holds no evaluation yet" in notes[0] and "seed-0: left out, seeds-0-1 has more seeds" in notes[1]
+
+
+def test_runs_of_other_seeds_are_one_curve(tmp_path):
+    """As those of a robot, which plays one seed at a time. Another grid of evaluations does not fit."""
+    save(tmp_path, "sac", [[0.2], [0.3]], rollouts=[0, 20], seeds="seed-7")
+    save(tmp_path, "sac", [[0.3, 0.4], [0.8, 1.0]], rollouts=[0, 20], seeds="seeds-3-4")
+    save(tmp_path, "sac", [[0.5], [0.6]], rollouts=[0, 10], seeds="seed-5")
+    (found,), (note,) = read_runs(tmp_path)
+    assert found.seeds.tolist() == [3, 4, 7] and len(found.prior) == 3
+    np.testing.assert_array_equal(found.values, [[0.3, 0.8], [0.4, 1.0], [0.2, 0.3]])
+    assert "seed-5: left out" in note and "cannot be put together" in note
     with pytest.raises(UserError, match="holds no evaluation yet"):
         read_curve(tmp_path / "finetune/toy/default/mbpo/seed-0")
 
