@@ -4,32 +4,23 @@ Bullet needs Python 3.11 and therefore an environment of its own, which the firs
 commands that a user would type: `experiments.finetune --real remote`, and the robot's driver.
 """
 
-import contextlib
-import os
 import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments import cli, real_systems
+from experiments import cli, panda_gym
 from experiments.finetune_args import arguments, run_folder
 from experiments.options import SHIPPED, at_least_one
+from experiments.panda_gym import HOME, PYTHON, TASK
 from sgft_jax.types import UserError
 
 if TYPE_CHECKING:
     import numpy as np
 
-TASK = "panda-push"
-DRIVER = Path("docs/examples/panda_gym_robot.py")  # in the folder of the code, as the priors are
-PACKAGES = (
-    "panda-gym==3.0.7", "pybullet==3.2.7", "gymnasium==1.4.0", "numpy==2.4.6", "msgpack==1.2.4", "websockets==17.4",
-)  # fmt: skip
 _FILMED = 3  # episodes of the first and of the last evaluation, to choose a telling one from
-_END = 10.0  # seconds that a process has for its end
 
 
 @dataclass(frozen=True)
@@ -50,9 +41,9 @@ class RealDemoArgs:
     """Film some episodes before and after."""
     out: Path = Path("runs/real-demo")
     """Folder of the demo; an earlier demo in it is replaced."""
-    home: Path = Path("build/panda-gym")
+    home: Path = HOME
     """Where the environment of Bullet is, or shall be made."""
-    python: str = os.environ.get("PYTHON311") or "python3.11"
+    python: str = PYTHON
     """What makes it: a Python 3.11, by default $PYTHON311 or python3.11."""
 
 
@@ -60,7 +51,7 @@ def main(args: RealDemoArgs) -> None:
     """Makes the second environment, plays, learns, plays again, and shows what came of it."""
     check(args)
     started = time.monotonic()
-    python = bullet(args.home, args.python)
+    python = panda_gym.bullet(args.home, args.python)
     shutil.rmtree(args.out, ignore_errors=True)
     args.out.mkdir(parents=True)
     fine_tune(args, python)
@@ -74,101 +65,30 @@ def check(args: RealDemoArgs) -> None:
     if not (args.prior / "prior.json").exists():
         command = f"python -m experiments.pretrain --task {TASK}"
         raise UserError(f"--prior {args.prior}: holds no prior; make one with: {command}")
-    if not DRIVER.exists():
-        raise UserError(f"{DRIVER}: no such file; run this command in the folder of the code")
+    panda_gym.check_driver()
     if args.out.exists() and any(args.out.iterdir()) and not (args.out / "robot.log").exists():
         raise UserError(f"--out {args.out}: holds something that is no demo; choose another folder")
 
 
-# --- the robot's side -------------------------------------------------------------------------------------------------
-
-
-def bullet(home: Path, python: str) -> Path:
-    """The Python of the environment with panda-gym in `home`, which is made where there is none.
-
-    Raises UserError where there is no Python 3.11, or where its packages cannot be had.
-    """
-    own = home / "bin" / "python"
-    if _said(str(own), "import panda_gym, msgpack, websockets") is not None:
-        return own
-    if _said(python, "import sys; sys.exit(sys.version_info[:2] != (3, 11))") is None:
-        raise UserError(f"{python} is no Python 3.11, for which pybullet has wheels; name one with PYTHON311=...")
-    print(f"making an environment for Bullet in {home}, once", flush=True)
-    for command in ([python, "-m", "venv", "--clear", str(home)], [str(own), "-m", "pip", "install", "-q", *PACKAGES]):
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode:
-            last = (done.stderr.strip() or f"exit code {done.returncode}").splitlines()[-1]
-            raise UserError(f"{' '.join(command[:4])} failed: {last}")
-    return own
-
-
-def _said(python: str, code: str) -> str | None:
-    """What Python prints for the code; None where it fails, or where there is no such Python."""
-    try:
-        done = subprocess.run([python, "-c", code], capture_output=True, text=True)
-    except OSError:
-        return None
-    return None if done.returncode else done.stdout
-
-
-# --- both sides -------------------------------------------------------------------------------------------------------
+# --- playing ----------------------------------------------------------------------------------------------------------
 
 
 def fine_tune(args: RealDemoArgs, python: Path) -> None:
-    """Runs learner and robot as processes, as a user would, until the learner is done.
-
-    Raises UserError where one of them fails; neither outlives this function.
-    """
-    port, film = real_systems.free_port(), filmed(args)
-    learner = [
-        sys.executable, "-u", "-m", "experiments.finetune", "--task", TASK, "--prior", args.prior,
-        "--method", args.method, "--real", f"remote::{port}", "--seeds", 1, "--seed", args.seed,
-        "--rollouts", args.rollouts, "--eval-every", args.rollouts, "--eval-episodes", args.episodes,
-        "--out", args.out,
-    ]  # fmt: skip
-    robot = [python, "-u", DRIVER, "--url", f"ws://127.0.0.1:{port}", "--token", real_systems.token(args.out)]
-    if args.video:
-        robot += ["--into", args.out / "pictures", "--film", *film[0], *film[1]]
-    together(_texts(learner), _texts(robot), args.out / "robot.log")
-
-
-def together(learner: Sequence[str], robot: Sequence[str], log: Path) -> None:
-    """Two processes, until the first one is done. log: file for what the second one says.
-
-    Raises UserError where the first one fails, or the second one ends before it. Neither outlives this function.
-    """
-    with contextlib.ExitStack() as last:
-        with open(log, "wb") as file:  # in a session of its own: Ctrl-C reaches the learner alone, which ends both
-            other = subprocess.Popen(robot, stdout=file, stderr=subprocess.STDOUT, start_new_session=True)
-        last.callback(_end, other)
-        first = subprocess.Popen(learner)
-        last.callback(_end, first)
-        while (code := first.poll()) is None:
-            if other.poll() not in (None, 0):
-                first.kill()  # it would wait for another robot
-                raise UserError(f"the robot's side has ended with exit code {other.returncode}; see {log}")
-            time.sleep(0.1)
-        if code:
-            raise UserError(f"fine-tuning has ended with exit code {code}; it said why above")
-
-
-def _end(process: "subprocess.Popen[bytes]") -> None:
-    """Gives a process some time to end by itself."""
-    try:
-        process.wait(_END)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+    """The run, with what is filmed of it."""
+    first, last = filmed(args)
+    panda_gym.fine_tune(
+        python, args.out,
+        ["--prior", args.prior, "--method", args.method, "--seed", args.seed, "--rollouts", args.rollouts,
+         "--eval-at", 0, 1, args.rollouts, "--eval-episodes", args.episodes],
+        log=args.out / "robot.log",
+        film=["--into", args.out / "pictures", "--film", *first, *last] if args.video else [],
+    )  # fmt: skip
 
 
 def filmed(args: RealDemoArgs) -> tuple[range, range]:
     """The first episodes of the first and of the last evaluation, as the robot counts its episodes."""
     count, last = min(_FILMED, args.episodes), 2 * args.episodes + args.rollouts
     return range(count), range(last, last + count)
-
-
-def _texts(command: Sequence[object]) -> list[str]:
-    return [str(word) for word in command]
 
 
 # --- pictures ---------------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import itertools
 import json
 import os
 import shutil
@@ -175,7 +176,7 @@ def same_results(one, two):
 def test_when_runs_are_evaluated(options, wanted):
     args = arguments("sac", rollouts=7, **options)
     steps = [0, 0, *range(2, 8)]
-    assert [b for a, b in zip(steps, steps[1:], strict=False) if finetune_run.evaluates(args, a, b)] == wanted
+    assert [b for a, b in itertools.pairwise(steps) if finetune_run.evaluates(args, a, b)] == wanted
 
 
 def test_a_run_leaves_curve_summary_policies_and_every_rollout(home):
