@@ -85,7 +85,7 @@ def _clock(args: ReliabilityArgs, home: Path) -> Iterator[dict[str, Any]]:
 
     yield timing.kept_clock(home / "slow", period=0.2, rollouts=args.rollouts, utd=400)
     yield timing.kept_clock(
-        home / "fast", period=0.005, rollouts=args.rollouts, utd=6, task="wheel-legged", sizes=timing.WHEEL_LEGGED
+        home / "fast", period=0.005, rollouts=args.rollouts, utd=2, task="wheel-legged", sizes=timing.WHEEL_LEGGED
     )
 
 

@@ -95,13 +95,24 @@ def pin(own: Sequence[int]) -> None:
         os.sched_setaffinity(0, own)
 
 
+def give_way() -> None:
+    """Lets this thread, and those that it starts from now on, run only while nothing else wants its core.
+
+    Being nice is not enough: a robot's process that wakes up on the same core would wait for some milliseconds.
+    """
+    if hasattr(os, "SCHED_IDLE"):
+        os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+    else:
+        os.nice(19)
+
+
 def _work(
     connection: Connection, build: Callable[[], Finetuner], seeds: Any, which: Any, simulated: Any, own: list[int]
 ) -> None:
     """What the process does until the other side of the connection is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the one that plays, which then ends this one
     pin(own)
-    os.nice(5)
+    give_way()
     rows = None if simulated is None else jax.tree.map(jnp.asarray, simulated)
     try:
         updates = Updates(build(), jnp.asarray(seeds), jnp.asarray(which), rows)

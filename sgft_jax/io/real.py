@@ -92,22 +92,22 @@ class Journal:
 
     def append(self, step: Mapping[str, np.ndarray]) -> None:
         """Adds a step, {name: array}."""
-        if self._file is None:
-            self._file = open(self.path, "w")  # noqa: SIM115 - it stays open between steps
+        if not self._count:
             self._write({name: x.dtype.name for name, x in step.items()})
-            _sync_folder(self.path.parent)
         self._count += 1
         self._write({name: x.tolist() for name, x in step.items()})
         if self._count % self._every == 0:
             os.fsync(self._file.fileno())
 
     def __enter__(self) -> "Journal":
+        """Opens the file before the robot moves: that takes longer than a step."""
+        self._file = open(self.path, "w")
+        _sync_folder(self.path.parent)
         return self
 
     def __exit__(self, *error: object) -> None:
         """Closes the file; it stays where it is."""
-        if self._file is not None:
-            self._file.close()
+        self._file.close()
 
     def remove(self) -> None:
         """When the rollout is in the store."""
