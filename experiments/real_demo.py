@@ -28,7 +28,7 @@ class RealDemoArgs:
     """A few minutes on two cores; everything but the environment of Bullet lands in one folder."""
 
     prior: Path = SHIPPED / TASK / "seed-0"
-    """Folder of a prior of panda-push. None comes with the code yet."""
+    """Folder of a prior of panda-push."""
     method: str = "guarded"
     """How to fine-tune."""
     rollouts: int = 8
