@@ -16,6 +16,7 @@ from experiments import cli, panda_gym
 from experiments.finetune_args import arguments, run_folder
 from experiments.options import SHIPPED, at_least_one, prior_folders, without_repeats
 from experiments.panda_gym import HOME, PYTHON, TASK
+from experiments.real_systems import REMOTE
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.methods import get_method
 
@@ -91,7 +92,7 @@ def runs(args: BulletArgs) -> Iterator[_Run]:
     for seed in range(args.seed, args.seed + args.seeds):
         for method in args.methods:
             own = arguments(method, task=TASK, seeds=1, seed=seed, out=args.out)
-            yield _Run(method, seed, run_folder(own, "remote"))
+            yield _Run(method, seed, run_folder(own, REMOTE))
 
 
 def options(args: BulletArgs, run: _Run) -> list[object]:

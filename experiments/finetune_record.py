@@ -83,10 +83,6 @@ class Record:
         self.log.eval(self._transitions(done), {"rollouts": done, "robot_minutes": self._minutes(done), **scores})
         self.evaluated += self.evaluations_cost or 0
 
-    def evaluation_store(self, done: int) -> RealStore:
-        """Where the episodes of an evaluation after so many rollouts go, if it costs real ones."""
-        return evaluation_store(self.folder, done)
-
     def time(self, done: int, seconds: float) -> None:
         """Apart from the metrics, which must not depend on the clock."""
         with open(self.folder / "timing.jsonl", "a") as file:

@@ -16,7 +16,7 @@ from envs.rollout import Episode
 from experiments import cli, logged, real_systems
 from experiments.evaluation import scores
 from experiments.finetune_args import VOLATILE, FinetuneArgs, run_folder
-from experiments.finetune_record import Record
+from experiments.finetune_record import Record, evaluation_store
 from experiments.recorded import Recorded
 from experiments.stacking import join, part
 from sgft_jax import api, mesh, train
@@ -200,7 +200,7 @@ class _Run:
     def _evaluate(self, progress: FinetuneProgress, done: int) -> float:
         system = self.system
         if isinstance(system, Gymnasium):  # its episodes are real ones, and as dear as those of training
-            stores = [record.evaluation_store(done) for record in self.records]
+            stores = [evaluation_store(record.folder, done) for record in self.records]
             system = Recorded(system, stores, done=0, explore=False, sync_every=self.sync_every)
         played = train.evaluate(self.finetuner, system, progress.agent, self.seeds, self.episodes)
         found = scores(played)

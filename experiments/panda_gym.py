@@ -80,19 +80,24 @@ def together(learner: Sequence[str], robot: Sequence[str], log: Path) -> None:
         last.callback(_end, other)
         first = subprocess.Popen(learner)
         last.callback(_end, first)
-        while (code := first.poll()) is None:
-            if other.poll() not in (None, 0):
-                first.kill()  # it would wait for another robot
-                raise UserError(f"the robot's side has ended with exit code {other.returncode}; see {log}")
+        while first.poll() is None and other.poll() is None:
             time.sleep(0.1)
-        if code:
-            raise UserError(f"fine-tuning has ended with exit code {code}; it said why above")
+        if first.poll() is None and (other.returncode or not _ends(first)):
+            first.kill()  # it would wait for another robot
+            raise UserError(f"the robot's side has ended with exit code {other.returncode}; see {log}")
+        if first.returncode:
+            raise UserError(f"fine-tuning has ended with exit code {first.returncode}; it said why above")
+
+
+def _ends(process: "subprocess.Popen[bytes]") -> bool:
+    """Whether a process ends by itself in the time that it has for that."""
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        process.wait(_END)
+    return process.poll() is not None
 
 
 def _end(process: "subprocess.Popen[bytes]") -> None:
-    """Gives a process some time to end by itself."""
-    try:
-        process.wait(_END)
-    except subprocess.TimeoutExpired:
+    """Ends a process that does not end by itself."""
+    if not _ends(process):
         process.kill()
         process.wait()

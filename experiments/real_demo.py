@@ -15,6 +15,7 @@ from experiments import cli, panda_gym
 from experiments.finetune_args import arguments, run_folder
 from experiments.options import SHIPPED, at_least_one
 from experiments.panda_gym import HOME, PYTHON, TASK
+from experiments.real_systems import REMOTE
 from sgft_jax.types import UserError
 
 if TYPE_CHECKING:
@@ -79,15 +80,20 @@ def fine_tune(args: RealDemoArgs, python: Path) -> None:
     panda_gym.fine_tune(
         python, args.out,
         ["--prior", args.prior, "--method", args.method, "--seed", args.seed, "--rollouts", args.rollouts,
-         "--eval-at", 0, 1, args.rollouts, "--eval-episodes", args.episodes],
+         "--eval-at", *evaluated(args), "--eval-episodes", args.episodes],
         log=args.out / "robot.log",
         film=["--into", args.out / "pictures", "--film", *first, *last] if args.video else [],
     )  # fmt: skip
 
 
+def evaluated(args: RealDemoArgs) -> list[int]:
+    """The numbers of rollouts after which there is an evaluation."""
+    return sorted({0, 1, args.rollouts})
+
+
 def filmed(args: RealDemoArgs) -> tuple[range, range]:
     """The first episodes of the first and of the last evaluation, as the robot counts its episodes."""
-    count, last = min(_FILMED, args.episodes), 2 * args.episodes + args.rollouts
+    count, last = min(_FILMED, args.episodes), (len(evaluated(args)) - 1) * args.episodes + args.rollouts
     return range(count), range(last, last + count)
 
 
@@ -98,7 +104,7 @@ def show(args: RealDemoArgs) -> None:
     """The success before and after, and where the learning curve, the video and the policy are."""
     from experiments.finetune_record import evaluation_store
 
-    run = run_folder(arguments(args.method, task=TASK, seeds=1, seed=args.seed, out=args.out), "remote")
+    run = run_folder(arguments(args.method, task=TASK, seeds=1, seed=args.seed, out=args.out), REMOTE)
     found = {}
     for done in (0, args.rollouts):
         store = evaluation_store(run, done)

@@ -45,7 +45,7 @@ class LearnerProcess:
         self._result.result()
 
     def submit(self, agent: PyTree, parts: Sequence[int], updates: int, phase: Phase) -> None:
-        """Begins the learning phases `parts`; what came before must have been asked for with `result`."""
+        """Begins the learning phases `parts`, when those before are done."""
         self.wait()
         self._talk(lambda: self._connection.send((jax.device_get(agent), list(parts), updates, phase)))
         self._result = self._receiver.submit(self._receive)

@@ -43,10 +43,10 @@ class Policy:
         such as a limit of force or workspace. Default: the action as it was. At the first step there was none.
         Raises ValueError for another number of entries, and for one that is not finite; nothing is remembered then.
         """
-        measured = _numbers(measured, self._names, "reads", "measured numbers")
+        measured = _numbers(measured, self._names, "the policy reads {} measured numbers")
         state = self._state
         if sent is not None:
-            sent = _numbers(sent, self._commands, "gives", "numbers, so many must have been sent")
+            sent = _numbers(sent, self._commands, "an action has {} numbers")
             corrected = self.contract["last_action"]
             state = {**state, **{name: np.concatenate([sent, state[name][len(sent) :]]) for name in corrected}}
         found = self._step({"measured": measured, **state})
@@ -59,11 +59,11 @@ def _each(entries: list) -> list[str]:
     return [f"{e['name']}[{i}]" for e in entries for i in range(e["size"])]
 
 
-def _numbers(given: Any, names: list[str], does: str, what: str) -> np.ndarray:
-    """As an array; ValueError where their number is wrong or one is not finite."""
+def _numbers(given: Any, names: list[str], wanted: str) -> np.ndarray:
+    """As an array; ValueError where their number is not what is `wanted`, or one is not finite."""
     numbers = np.asarray(given, np.float32)
     if numbers.shape != (len(names),):
-        raise ValueError(f"the policy {does} {len(names)} {what}, got shape {numbers.shape}")
+        raise ValueError(f"{wanted.format(len(names))}, got shape {numbers.shape}")
     if odd := [name for name, ok in zip(names, np.isfinite(numbers)) if not ok]:  # noqa: B905 - new in 3.10
         raise ValueError(f"{odd[0]} is not a finite number")
     return numbers

@@ -80,6 +80,10 @@ def test_a_side_that_fails_is_an_error_and_no_endless_wait(tmp_path, monkeypatch
     assert "no pybullet" in (tmp_path / "log").read_text()
     with pytest.raises(UserError, match="fine-tuning has ended with exit code 2"):
         panda_gym.together(["sh", "-c", "exit 2"], ["sleep", "0.2"], tmp_path / "log")
+    monkeypatch.setattr(panda_gym, "_END", 0.1)
+    with pytest.raises(UserError, match="the robot's side has ended with exit code 0"):
+        panda_gym.together(["sleep", "60"], ["true"], tmp_path / "log")  # a learner would wait without end
+    panda_gym.together(["sleep", "0.05"], ["true"], tmp_path / "log")  # the robot ends first where all is well
 
 
 def test_the_film_shows_an_episode_that_was_mended():
@@ -91,6 +95,7 @@ def test_the_film_shows_an_episode_that_was_mended():
 def test_the_first_and_the_last_evaluation_are_filmed():
     """0 to 19 before the first rollout, 20 more after it, 8 rollouts: the last evaluation is 48 to 67."""
     assert real_demo.filmed(RealDemoArgs(rollouts=8, episodes=20)) == (range(3), range(48, 51))
+    assert real_demo.filmed(RealDemoArgs(rollouts=1, episodes=2)) == (range(2), range(3, 5))  # two evaluations
 
 
 @pytest.mark.slow

@@ -247,7 +247,7 @@ def test_what_was_really_sent_is_what_is_remembered(name, tmp_path):
     np.testing.assert_array_equal(other.act(second, sent=sent), expected)
     plain.act(first)
     assert (np.abs(plain.act(second) - expected).max() > 1e-4) == (name != "affine")
-    with pytest.raises(ValueError, match=r"gives 2 numbers, so many must have been sent, got shape \(1,\)"):
+    with pytest.raises(ValueError, match=r"an action has 2 numbers, got shape \(1,\)"):
         other.act(second, sent=[0.0])
 
 
