@@ -124,6 +124,8 @@ def _rollouts(curves: Sequence[Curve]) -> str:
         return "real rollouts"
     each = max(int(longest.rollouts[-1]), 1)
     seconds, steps = 60 * float(longest.minutes[-1]) / each, int(longest.transitions[-1]) // each
+    if not np.array_equal(longest.transitions, steps * longest.rollouts):  # evaluations have cost transitions, too
+        return "real rollouts"
     return f"real rollouts of {steps} transitions, {seconds:.3g} s"
 
 

@@ -1,3 +1,5 @@
+import dataclasses
+
 import matplotlib.image
 import numpy as np
 import pytest
@@ -24,6 +26,15 @@ def pixels(image, color):
 
 def read(path):
     return matplotlib.image.imread(path)
+
+
+def test_the_axis_says_how_long_a_rollout_is_where_evaluations_are_free():
+    """On a robot they are real episodes, and transitions those of both."""
+    (own,) = curves(1)
+    steps = int(own.transitions[1])
+    assert figures._rollouts([own]).startswith(f"real rollouts of {steps} transitions, ")
+    dear = dataclasses.replace(own, transitions=own.transitions + 20 * steps * np.array([0, 1, 2, 2, 2]))
+    assert figures._rollouts([dear]) == "real rollouts"
 
 
 @pytest.mark.parametrize("count", [1, 2, 6])
