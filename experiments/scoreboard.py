@@ -107,8 +107,9 @@ def strata_of(files: tuple[Path, ...]) -> dict[str, str]:
 
 
 def played_on(args: ScoreboardArgs) -> "Played":
-    """Everything that ran on these gaps; raises UserError where nobody did, or the reference did not."""
-    played = _runs_on(args, strata_of(args.gaps))
+    """All that ran on these gaps, not on the control alone; UserError where nobody did, or the reference did not."""
+    found = _runs_on(args, strata_of(args.gaps))
+    played = {method: each for method, each in found.items() if set(each) - {CONTROL}}
     if not played:
         raise UserError(f"{args.data or args.out / 'finetune'}: holds no evaluated run on these gaps")
     if args.reference not in played:

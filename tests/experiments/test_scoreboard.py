@@ -30,6 +30,7 @@ def home(tmp_path):
         ("sac", "easy", ([0.9] * 4, [0.5] * 4, [0.8] * 4)),
         ("sac", "hard", ([0.1] * 4, [0.3] * 4, [0.5, 0.5, 0.6, 0.6])),
         ("sac", "elsewhere", ([0.0] * 4, [0.0] * 4, [0.0] * 4)),
+        ("mbpo", "sim", ([0.9] * 4, [0.9] * 4, [0.9] * 4)),  # on the control alone: no competitor
     ):
         digests = [f"p{i}" for i in range(4)]
         runs_by_hand.save(tmp_path, method, curve, rollouts=(0, 4, 8), real=gap, seeds="seeds-0-3", priors=digests)
@@ -42,7 +43,7 @@ def test_strata_falls_and_who_is_ahead(home, capsys):
     assert "| solved | guarded | 1 | 90 | 90 | 90 | 1 of 1 | 0 | 0 |" in said
     assert "| solved | sac | 1 | 90 | 68 | 80 | 0 of 1 | 40 (toy/easy) | 10 |" in said
     assert "| failed | guarded | 1 | 10 |" in said and "| 1 of 1 | 0 | 0 |" in said.split("failed | guarded")[1]
-    assert "| sac | 1 of 1 | 100 |" in said and "elsewhere" not in said
+    assert "| sac | 1 of 1 | 100 |" in said and "elsewhere" not in said and "mbpo" not in said
     assert (home / "scoreboard.md").read_text() in said and (home / "scoreboard.png").stat().st_size > 10_000
 
 
