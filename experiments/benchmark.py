@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from experiments import cli
-from experiments.options import Impl, at_least_one, check_task
+from experiments.options import Impl, at_least_one, check_task, prior_folders
 from sgft_jax.models.config import Precision
 from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError
@@ -154,9 +154,9 @@ def _finetune(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
 def _system(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
     from experiments.bench import system
 
-    assert config.prior is not None  # checked before
     for task, impl, seeds in product(config.tasks, config.impls, config.seeds):
-        yield system.speed(task, impl, seeds, prior=config.prior, real="default", repeats=config.repeats)
+        priors = prior_folders(config.prior, out=config.out, task=task, preset=config.preset)
+        yield system.speed(task, impl, seeds, priors=priors, repeats=config.repeats)
 
 
 def _devices(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:

@@ -1,6 +1,7 @@
 """Fine-tuning through a `System`, against the same rollout, updates and physics fused into one compiled program."""
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import jax
 
 import envs
 from envs import gaps
+from envs.gaps import SIM
 from envs.mujoco.worlds import Impl
 from envs.rollout import Episode
 from sgft_jax import api, train
@@ -16,10 +18,10 @@ from sgft_jax.systems.simulated import Simulated
 from sgft_jax.types import Key, Metrics, PyTree
 
 
-def speed(task: str, impl: Impl, members: int, *, prior: Path, real: str, repeats: int) -> dict[str, Any]:
+def speed(task: str, impl: Impl, members: int, *, priors: Sequence[Path], repeats: int) -> dict[str, Any]:
     """Seconds of a rollout and its updates of the recommended method, by both; the fastest of `repeats`, in turns."""
-    env = envs.make(task, impl, **observed_by([prior]))
-    setup = api.setup(env, gaps.load(env, real), load_priors([prior], env), seeds=members)
+    env = envs.make(task, impl, **observed_by(priors))
+    setup = api.setup(env, gaps.find(env.name, SIM), load_priors(priors, env), seeds=members)
     assert isinstance(setup.system, Simulated)
     through = train.finetune(*setup, rollouts=10**9)
     progress, _ = next(through)

@@ -53,6 +53,8 @@ def _strike(trial: Trial, luck: np.random.Generator) -> list[str]:
         trial.start_robot()
         return [victim]
     code = trial.wait(60.0)
+    if (victim, code) == ("learner", 0):  # it had learned all it was asked for
+        return [victim]
     if code != (-9 if victim == "player" else 2):
         raise UserError(f"{trial.home / 'player.txt'}: exit code {code} after a kill of the {victim}; see what it said")
     trial.start_player()

@@ -23,7 +23,7 @@ def test_summary_of_an_object_at_rest():
     assert summary.relative == 0.0
 
 
-@pytest.mark.parametrize("task", ["push", "insert"])
+@pytest.mark.parametrize("task", [pytest.param("push", marks=pytest.mark.slow), "insert"])
 def test_scripts_solve_the_nominal_task(task):
     probe = PROBES[task]
     theta = {p.name: p.nominal for p in probe.scene.parameters}

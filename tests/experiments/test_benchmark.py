@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from priors_by_hand import save_prior
 
 from envs.franka import hammer
 from envs.mujoco.worlds import PhysicsState
@@ -59,6 +60,16 @@ def test_a_hybrid_run_is_compared_with_its_hand_written_update(tmp_path):
         (line,) = main(config)["hybrid"]
     assert line["members"] == 1 and line["run/bare"] == pytest.approx(line["updates_per_s"] / line["bare_per_s"])
     assert line["simulators_share"] == pytest.approx(1 - line["run/bare"] / line["updates/bare"])
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("toy_task")
+def test_a_rollout_through_a_system_is_compared_with_a_fused_one(tmp_path):
+    for seed in (0, 1):
+        save_prior(tmp_path / "prior" / f"seed-{seed}", seed)
+    config = replace(SMALL, parts=("system",), tasks=("toy",), seeds=(2,), prior=tmp_path, out=tmp_path)
+    (line,) = main(config)["system"]
+    assert line["seeds"] == 2 and line["fused/system"] == pytest.approx(line["fused_s"] / line["system_s"])
 
 
 @pytest.mark.slow

@@ -56,7 +56,6 @@ def falls(prior, *, learner=False, **options):
     return (found[0] - found).max(0)
 
 
-@pytest.mark.slow
 def test_where_nothing_is_to_be_learned_nothing_is_lost(prior):
     """Neither by what the guard deploys nor, thanks to the anchor, by what learns behind it."""
     for success, total in falls(prior, learner=True, **SAFE):

@@ -110,7 +110,7 @@ def test_a_set_that_is_not_due_is_never_asked_for(counted):
     ("algorithm", "refresh_every"),
     [
         ("sac", 0),
-        ("sac", 1),
+        pytest.param("sac", 1, marks=pytest.mark.slow),
         pytest.param("tdmpc2", 0, marks=pytest.mark.slow),
         pytest.param("tdmpc2", 1, marks=pytest.mark.slow),
         pytest.param("recurrent", 0, marks=pytest.mark.slow),

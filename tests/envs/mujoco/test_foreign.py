@@ -101,7 +101,7 @@ def played(request):
         return env, jax.jit(play)(pool, jax.random.split(jax.random.key(1), 2))
 
 
-@pytest.mark.parametrize("i", range(2))
+@pytest.mark.parametrize("i", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_motion_and_sensors_are_those_of_mujoco(played, i):
     """Also where the lifting servo, geared by 2, is at its limit of force."""
     _, episodes = played

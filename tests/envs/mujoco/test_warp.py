@@ -128,6 +128,7 @@ def test_pushing_what_deforms(name):
     assert (np.median(bound, axis=1) < (1e-4, 3e-3)).all()  # what is wrong by more than rounding would not hide there
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "contacts"), [("towel", 72), ("ball", 87)])
 def test_more_contacts_than_pushes_ever_make(name, contacts):
     """All of the towel bundled up at a fingertip, or all pads drawn in at one and pressed on the table: 5 ms."""
