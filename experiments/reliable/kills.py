@@ -1,7 +1,9 @@
 """Kill -9 at random moments: of the process that plays, of its learner, and of the robot's."""
 
+import contextlib
 import os
 import signal
+import subprocess
 import time
 from collections import Counter
 from pathlib import Path
@@ -25,8 +27,6 @@ def run(home: Path, *, kills: int, seed: int, period: float = 0.05, rollouts: in
         trial.start()
         while killed.total() < kills:
             killed.update(_strike(trial, luck))
-        if trial.player is None or trial.player.poll() is not None:
-            trial.start_player()
         trial.finish()
     return {"rollouts": trial.rollouts, **{name: killed[name] for name in _VICTIMS}, **trial.audit()._asdict()}
 
@@ -40,6 +40,9 @@ def _strike(trial: Trial, luck: np.random.Generator) -> list[str]:
         trial.wait(luck.uniform(0.0, _PLAY))
     if trial.player.poll() == 0:
         trial.rollouts += 10  # it was done before all kills were
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            trial.robot.wait(10.0)  # it was told that the run is over, unless it had only just been started
+            trial.start_robot()
         trial.start_player()
         return []
     victim = _VICTIMS[luck.integers(len(_VICTIMS))]
