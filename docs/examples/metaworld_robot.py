@@ -83,7 +83,7 @@ class Hammer:
 
     def _look(self) -> None:
         if self.number in self.film:
-            self.pictures.append(self.env.render())
+            self.pictures.append(self.env.render()[::-1, ::-1])  # this camera of Meta-World is upside down
 
 
 def measured(first: np.ndarray, second: np.ndarray, now: np.ndarray, sent: np.ndarray) -> np.ndarray:
