@@ -262,6 +262,15 @@ def test_a_hammer_that_keeps_pushing_does_not_pull_the_nail_out(rig):
         assert after.min() > task.DRIVEN
 
 
+def test_a_turned_hammer_does_not_pull_the_nail_out_by_its_side(rig):
+    """A face that presses on the nail from below goes back by 6 cm; with friction of 1 the nail went with it."""
+    turn = np.array([0.981, -0.186, 0.048, 0.014])
+    obs = seen(hand=(0.036, 0.664, 0.107), apart=0.051, hammer=(0.072, 0.663, 0.079), turn=turn / 0.99970, depth=0.087)
+    obs = obs.at[3:6].set(jnp.array([0.044, 0.664, 0.137]))
+    shown = play(rig, obs, [(0, -1, 0, CLOSE)] * 5)
+    assert shown[-1, 12] < 0.61 and shown[-1, 24] > 0.07
+
+
 # --- the driver and the engines -------------------------------------------------------------------------------------
 
 
