@@ -105,13 +105,16 @@ def above(place: Array, key: Key) -> Array:
 
 
 def held(key: Key) -> PhysicsState:
-    """The hand holds the hammer somewhere between table and nail, upright, at rest."""
-    low, high = jnp.array([-0.12, 0.4, LYING + 0.01, -0.08]), jnp.array([0.12, 0.54, 0.15, 0.04])
-    x, y, z, along = jax.random.uniform(key, (4,), minval=low, maxval=high)
-    hammer = jnp.concatenate([jnp.stack([x, y]), _lying().at[0].set(z)])
-    hand = jnp.stack([x + along, y, z + 0.02])
+    """The hand holds the hammer, level and at rest, on some way from where a hammer can be to just before the nail."""
+    key_place, key_way, key_along = jax.random.split(key, 3)
+    low, high = jnp.array([-0.12, 0.4, LYING + 0.01]), jnp.array([0.12, 0.5, 0.15])
+    place, way = jax.random.uniform(key_place, (3,), minval=low, maxval=high), jax.random.uniform(key_way)
+    before_nail = jnp.asarray(NAIL - [HEAD_X, FACE_Y + 0.004, 0.0], jnp.float32)
+    place = place + way * (before_nail - place)
+    along = jax.random.uniform(key_along, minval=-0.08, maxval=0.04)
     closed = jnp.full(2, OPEN - INSIDE - HANDLE_RADIUS + 0.001)  # pads give way by a millimetre
-    return _state(hand + jnp.array([0.0, 0.0, SAG]), closed, hammer, effort=1.0)
+    sent = place + jnp.stack([along, 0.0, 0.02 + SAG])
+    return _state(sent, closed, jnp.concatenate([place, _lying()[1:]]), effort=1.0)
 
 
 def settled(params: Array, obs: Array) -> PhysicsState:
