@@ -28,6 +28,7 @@ TASKS = {
     "hammer": "envs.franka.hammer",
     "insert": "envs.franka.insert",
     "panda-push": "envs.franka.panda_push",
+    "metaworld-hammer": "envs.franka.metaworld_hammer",
     "halfcheetah": "envs.locomotion.halfcheetah",
     "walker2d": "envs.locomotion.walker2d",
     "wheel-legged": "envs.locomotion.wheel_legged",

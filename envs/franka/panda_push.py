@@ -12,6 +12,7 @@ import numpy as np
 
 from envs.base import Entry, Env, Parameter
 from envs.franka.arm import NO_CONTACT
+from envs.franka.rotations import inverse, turned
 from envs.mujoco.scene import Scene, View, make_env
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array, Key
@@ -90,7 +91,7 @@ def beside(cube: Array, key: Key) -> Array:
 def settled(params: Array, obs: Array) -> PhysicsState:
     """The state that is seen, as if the servos had arrived. An observation tells all the rest."""
     turn = _quaternion(obs[9:12])
-    spin = _turned(_inverse(turn), obs[15:18])  # MuJoCo tells it in the cube's own frame
+    spin = turned(inverse(turn), obs[15:18])  # MuJoCo tells it in the cube's own frame
     cube, moving = jnp.concatenate([obs[6:9], turn]), jnp.concatenate([obs[12:15], spin])
     return _state(obs[:3], obs[3:6], cube, moving, obs[18:20])
 
@@ -110,7 +111,7 @@ def observe(params: Array, state: PhysicsState) -> dict[str, Array]:
         "cube_xyz": state.qpos[3:6],
         "cube_rotation": euler(turn),
         "cube_velocity": state.qvel[3:6],
-        "cube_spin": _turned(turn, state.qvel[6:9]),
+        "cube_spin": turned(turn, state.qvel[6:9]),
         "mark_xyz": jnp.append(state.qpos[10:12], CUBE_HALF),
     }
 
@@ -232,13 +233,3 @@ def _quaternion(angles: Array) -> Array:
     w, x = cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy
     y, z = cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy
     return jnp.stack([w, x, y, z])
-
-
-def _turned(turn: Array, vector: Array) -> Array:
-    """[3] a vector of a body's frame in that of the world. turn: [4] unit quaternion of the body."""
-    return vector + 2 * jnp.cross(turn[1:], jnp.cross(turn[1:], vector) + turn[0] * vector)
-
-
-def _inverse(turn: Array) -> Array:
-    """[4] of a unit quaternion."""
-    return turn * jnp.array([1.0, -1.0, -1.0, -1.0])

@@ -175,7 +175,7 @@ def test_a_finished_run_is_neither_repeated_nor_changed(finished, out, capsys):
     [
         (
             ["--task", "toi"],
-            "task: there is no 'toi', did you mean 'toy'? Choose from: halfcheetah, hammer, insert, panda-push, push,",
+            "task: there is no 'toi', did you mean 'toy'? Choose from: halfcheetah, hammer, insert, metaworld-hammer,",
         ),
         (["--preset", "fats"], "--preset: there is no 'fats', did you mean 'fast'? Choose from: cpu, fast, informed"),
         (["--config.gama", "0.9"], "did you mean --config.gamma?"),
