@@ -13,6 +13,7 @@ import numpy as np
 
 from envs.base import Entry, Env, Parameter
 from envs.franka.arm import NO_CONTACT
+from envs.franka.armless import add_box, add_servo, table_spec
 from envs.franka.rotations import inverse, turned
 from envs.mujoco.scene import Scene, View, make_env
 from envs.mujoco.worlds import PhysicsState
@@ -64,15 +65,7 @@ _RED, _METAL, _WOOD = [0.65, 0.1, 0.1, 1.0], [0.6, 0.62, 0.65, 1.0], [0.72, 0.55
 
 def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The scene for one theta. Where the hammer starts is part of the state, not of the model."""
-    spec = mujoco.MjSpec()
-    option = spec.option
-    option.timestep, option.integrator = CONTROL_DT / SUBSTEPS, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.solver, option.jacobian = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtJacobian.mjJAC_DENSE
-    option.cone, option.iterations, option.ls_iterations = mujoco.mjtCone.mjCONE_ELLIPTIC, 6, 8
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-    spec.worldbody.add_geom(
-        name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1], rgba=[0, 0, 0, 0], **NO_CONTACT
-    )
+    spec = table_spec(CONTROL_DT / SUBSTEPS)
     _add_hand(spec, theta)
     _add_hammer(spec, theta["hammer_mass"])
     _add_nail(spec, theta["nail_damping"])
@@ -198,12 +191,12 @@ def face_of(obs: Array) -> Array:
 def dress(spec: mujoco.MjSpec) -> None:
     """A table top, the palm, and the block around the nail, which only a viewer sees."""
     world, hand = spec.worldbody, spec.body("hand")
-    _add_box(world, "", (0.7, 0.4, 0.01), pos=(0, 0.6, -0.0102), rgba=[0.9, 0.9, 0.88, 1])
-    _add_box(hand, "", (0.03, 0.07, 0.03), pos=(0, 0, 0.075), rgba=[0.3, 0.1, 0.1, 1])
+    add_box(world, "", (0.7, 0.4, 0.01), pos=(0, 0.6, -0.0102), rgba=[0.9, 0.9, 0.88, 1])
+    add_box(hand, "", (0.03, 0.07, 0.03), pos=(0, 0, 0.075), rgba=[0.3, 0.1, 0.1, 1])
     x, y, z = NAIL[0], BLOCK_Y + BLOCK_HALF[1], NAIL[2]
     for side in (-1, 1):
-        _add_box(world, "", (0.1, 0.1, 0.048), pos=(x, y, z + 0.062 * side), rgba=_WOOD)
-        _add_box(world, "", (0.042, 0.1, 0.014), pos=(x + 0.058 * side, y, z), rgba=_WOOD)
+        add_box(world, "", (0.1, 0.1, 0.048), pos=(x, y, z + 0.062 * side), rgba=_WOOD)
+        add_box(world, "", (0.042, 0.1, 0.014), pos=(x + 0.058 * side, y, z), rgba=_WOOD)
     for size, back in (((0.03, 0.009), 0.009), ((0.01, 0.06), 0.066)):
         spec.body("nail").add_geom(
             type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[*size, 0], pos=[0, back, 0], quat=[0.7071, 0.7071, 0, 0],
@@ -286,24 +279,16 @@ def _add_hand(spec: mujoco.MjSpec, theta: dict[str, float]) -> None:
     stiffness, damping = STIFFNESS * theta["hand_stiffness"], DAMPING * theta["hand_damping"]
     for name, axis, inertia in zip("xyz", np.eye(3), ARM_INERTIA, strict=True):
         hand.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis, armature=inertia)
-        _add_servo(spec, name, stiffness, damping)
+        add_servo(spec, name, stiffness, damping)
     for name, side, travel in zip(("right", "left"), (-1, 1), TRAVEL, strict=True):
         finger = hand.add_body(name=name, pos=[0, side * OPEN, 0])
         finger.add_joint(
             name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, -side, 0], armature=FINGER_INERTIA,
             damping=FINGER_DAMPING, limited=mujoco.mjtLimited.mjLIMITED_TRUE, range=[0, travel],
         )  # fmt: skip
-        _add_servo(spec, name, FINGER_FORCE * theta["finger_force"], 0.0)  # 1 m away is an effort of 1
+        add_servo(spec, name, FINGER_FORCE * theta["finger_force"], 0.0)  # 1 m away is an effort of 1
         middle = (0, -side * (INSIDE - FINGER_HALF[1]), 0)
-        _add_box(finger, name, FINGER_HALF, pos=middle, mass=FINGER_MASS, rgba=[0.85, 0.85, 0.88, 1])
-
-
-def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float) -> None:
-    servo = spec.add_actuator(
-        name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-        biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-    )  # fmt: skip
-    servo.gainprm[0], servo.biasprm[:3] = stiffness, [0, -stiffness, -damping]
+        add_box(finger, name, FINGER_HALF, pos=middle, mass=FINGER_MASS, rgba=[0.85, 0.85, 0.88, 1])
 
 
 def _add_hammer(spec: mujoco.MjSpec, mass: float) -> None:
@@ -337,17 +322,12 @@ def _add_nail(spec: mujoco.MjSpec, damping: float) -> None:
         solimp_limit=[0.99, 0.99, 0.01, 0.5, 2],
     )  # fmt: skip
     # It reaches far back, so that no ball gets behind it and pulls the nail out.
-    _add_box(nail, "nail", (NAIL_HALF, NAIL_BACK, NAIL_HALF), pos=(0, NAIL_BACK, 0), rgba=[0, 0, 0, 0])
+    add_box(nail, "nail", (NAIL_HALF, NAIL_BACK, NAIL_HALF), pos=(0, NAIL_BACK, 0), rgba=[0, 0, 0, 0])
     wide, deep, high = BLOCK_HALF
-    _add_box(
+    add_box(
         spec.worldbody, "block", (wide + HEAD_RADIUS, deep, high + HEAD_RADIUS),
         pos=(NAIL[0], BLOCK_Y + deep, NAIL[2]), rgba=[0, 0, 0, 0],
     )  # fmt: skip
-
-
-def _add_box(body: mujoco.MjsBody, name: str, half: tuple[float, float, float], **own: object) -> None:
-    """A box that touches only what a pair says; a name of "" is none."""
-    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=half, **own, **NO_CONTACT)
 
 
 def _add_pair(

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from envs.base import Entry, Env, Parameter
-from envs.franka.arm import NO_CONTACT
+from envs.franka.armless import add_box, add_servo, table_spec
 from envs.franka.rotations import inverse, turned
 from envs.mujoco.scene import Scene, View, make_env
 from envs.mujoco.worlds import PhysicsState
@@ -50,20 +50,11 @@ _CUBE, _MARK = [0.1, 0.7, 0.25, 1.0], [0.1, 0.7, 0.25, 0.3]
 
 def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The scene for one theta. Where cube and mark start is part of the state, not of the model."""
-    spec = mujoco.MjSpec()
-    option = spec.option
-    option.timestep, option.integrator = CONTROL_DT / SUBSTEPS, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    option.solver, option.jacobian = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtJacobian.mjJAC_DENSE
-    # With pyramids for friction as few iterations leave so large an error that a sliding cube trips over its edge.
-    option.cone, option.iterations, option.ls_iterations = mujoco.mjtCone.mjCONE_ELLIPTIC, 6, 8
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
-    spec.worldbody.add_geom(
-        name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1], rgba=[0, 0, 0, 0], **NO_CONTACT
-    )
+    spec = table_spec(CONTROL_DT / SUBSTEPS)
     _add_fingers(spec, rate=RATE * theta["servo_rate"], strength=theta["servo_strength"])
     cube = spec.worldbody.add_body(name="cube")
     cube.add_freejoint()
-    _add_box(cube, "cube", CUBE, mass=theta["cube_mass"], rgba=_CUBE)
+    add_box(cube, "cube", CUBE, mass=theta["cube_mass"], rgba=_CUBE)
     _add_mark(spec)
     _add_pair(spec, "table", "cube", theta["table_friction"])
     _add_pair(spec, "fingers", "cube", theta["finger_friction"])
@@ -146,8 +137,8 @@ def euler(turn: Array) -> Array:
 
 def dress(spec: mujoco.MjSpec) -> None:
     """A table top and the hand above the fingers, which only a viewer sees."""
-    _add_box(spec.worldbody, "", (0.55, 0.35, 0.01), pos=(-0.3, 0.0, -0.0102), rgba=[0.9, 0.9, 0.88, 1])
-    _add_box(spec.body("fingers"), "", (0.03, 0.1, 0.03), pos=(0, 0, 0.072), rgba=[0.93, 0.94, 0.95, 1])
+    add_box(spec.worldbody, "", (0.55, 0.35, 0.01), pos=(-0.3, 0.0, -0.0102), rgba=[0.9, 0.9, 0.88, 1])
+    add_box(spec.body("fingers"), "", (0.03, 0.1, 0.03), pos=(0, 0, 0.072), rgba=[0.93, 0.94, 0.95, 1])
 
 
 SCENE = Scene(
@@ -200,27 +191,17 @@ def _add_fingers(spec: mujoco.MjSpec, *, rate: float, strength: float) -> None:
         if name == "z":
             joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, [TABLE_AT, 1.0]
             joint.solref_limit = [2 * spec.option.timestep, 1.0]  # as hard as the time step allows
-        servo = spec.add_actuator(
-            name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT, gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-        )  # fmt: skip
-        servo.gainprm[0] = MASS * DAMPING * rate
-        servo.biasprm[:3] = [0, -MASS * DAMPING * rate, -MASS * DAMPING]
+        servo = add_servo(spec, name, MASS * DAMPING * rate, MASS * DAMPING)
         servo.forcelimited, servo.forcerange = 1, [-MASS * limit * strength, MASS * limit * strength]
     middle = (0, 0, FINGER_HALF[2] - FINGER_LOW)
-    _add_box(body, "fingers", FINGER_HALF, pos=middle, mass=MASS, rgba=[0.3, 0.32, 0.35, 1])
+    add_box(body, "fingers", FINGER_HALF, pos=middle, mass=MASS, rgba=[0.3, 0.32, 0.35, 1])
 
 
 def _add_mark(spec: mujoco.MjSpec) -> None:
     body = spec.worldbody.add_body(name="mark", pos=[0, 0, CUBE_HALF])
     for axis in np.eye(3)[:2]:
         body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-    _add_box(body, "", CUBE, mass=1.0, rgba=_MARK)
-
-
-def _add_box(body: mujoco.MjsBody, name: str, half: tuple[float, float, float], **own: object) -> None:
-    """A box that touches only what a pair says; a name of "" is none."""
-    body.add_geom(name=name, type=mujoco.mjtGeom.mjGEOM_BOX, size=half, **own, **NO_CONTACT)
+    add_box(body, "", CUBE, mass=1.0, rgba=_MARK)
 
 
 def _add_pair(spec: mujoco.MjSpec, one: str, other: str, friction: float) -> None:

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from envs.base import Env, World
 from envs.franka import hammer, insert, push
@@ -57,3 +58,17 @@ def push_hard(obs):
     off = obs[2:] - obs[:2]
     ahead = jnp.where(jnp.abs(off[1]) > 0.01, 0.0, push.EDGE - push.TOLERANCE / 2 - obs[2])
     return jnp.clip(jnp.stack([ahead, off[1]]) / push.STEP, -1.0, 1.0)
+
+
+def periods_apart(one: Bench, other: Bench, act: Callable, *, steps: int, key):
+    """[steps, obs_dim] how far two engines are apart after one period from each state of an episode of the first one,
+    and the state in which that ends. act(true observation [obs_dim]) -> action.
+    """
+    world, theirs, errors = member(one.worlds, 0), member(other.worlds, 0), []
+    state = one.reset(world, key)
+    for _ in range(steps):
+        action = jnp.asarray(act(np.asarray(state.true_obs)), jnp.float32)
+        found = other.step(theirs, state, action, key)
+        state = one.step(world, state, action, key)
+        errors.append(np.abs(found.true_obs - state.true_obs))
+    return np.stack(errors), state
