@@ -155,6 +155,7 @@ def test_the_gap_is_outside_the_training_range(key):
     assert len(np.unique(worlds.theta.params[:, 0])) == 3 and (worlds.theta.effects.low.action_scale == 1.25).all()
 
 
+@pytest.mark.slow
 def test_a_pretended_robot_teaches_a_policy(prior, capsys):
     example = extend.load("example", str(EXAMPLES / "own_gap.py"), "finetune")
     env = envs.make(TASK)

@@ -84,6 +84,7 @@ def test_the_simulator_says_what_a_recorded_step_does_in_the_system_that_is_told
     assert jnp.abs(change(other, action) - expected).max() > 1e-2
 
 
+@pytest.mark.slow
 def test_what_the_simulator_says_has_a_derivative_by_the_system(key):
     change, obs = SEEN.simulator(), SEEN.reset(world(EFFECTS), key).obs
     action = jnp.array([0.5, 0.25])

@@ -37,6 +37,7 @@ def record(folder, *, policies=1, rollouts=4, success=(), obs_dim=4, steps=20, w
     return folder
 
 
+@pytest.mark.slow
 def test_a_gap_is_played_and_diagnosed_by_every_prior(priors, tmp_path, capsys):
     gap = tmp_path / "weak.toml"
     gap.write_text("[effects]\naction_scale = 0.3\n")

@@ -72,6 +72,7 @@ def test_lines_for_people(run, capsys):
     assert len(lines) == 2 and all(re.search(r"seed-\d: success \d+\.\d % \[.*\], return -?\d", line) for line in lines)
 
 
+@pytest.mark.slow
 def test_the_best_policies_of_a_run(run, capsys):
     save_prior(run / "best" / "seed-0", 7)
     call("--run", run, "--best", "--episodes", 2)

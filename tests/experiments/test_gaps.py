@@ -52,6 +52,7 @@ def test_a_gap_is_admissible_if_it_is_open_and_can_be_learned(home, capsys):
     assert len((home / "gaps/toy/eval.jsonl").read_text().splitlines()) == 4  # 8 chunks, after every second one
 
 
+@pytest.mark.slow
 def test_without_training_the_answer_is_open(home, capsys):
     lines = call(home, "--no-train")["gaps"]
     assert [line["trained"] for line in lines] == [None, None] and [line["admissible"] for line in lines] == [

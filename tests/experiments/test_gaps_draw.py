@@ -131,6 +131,7 @@ def test_drawn_gaps_are_written_measured_and_sorted(home, capsys, monkeypatch):
     assert "seed-5.json: its toy_steps-5-00 is another gap; choose another --out" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_policies_are_trained_where_nothing_else_masters_the_gap(home, monkeypatch, capsys):
     monkeypatch.setattr(gaps_draw, "command_interface", blindly)
     trained = []

@@ -50,7 +50,7 @@ def on_two_hosts(*argv):
     return [process.returncode for process in started], said
 
 
-@pytest.mark.slow  # .ci/run runs it
+@pytest.mark.slow
 def test_two_hosts_continue_what_one_began(tmp_path, monkeypatch):
     """The second of two chunks, from the checkpoint after the first, is that of an uninterrupted run on one device."""
     monkeypatch.setitem(envs.TASKS, "toy", "toy")

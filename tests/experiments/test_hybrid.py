@@ -154,6 +154,7 @@ def test_data_of_a_policy_that_saw_its_last_actions(tmp_path):
     assert (policy.env.obs_dim, policy.env.previous_actions) == (8, 2)
 
 
+@pytest.mark.slow
 def test_other_data_are_refused_when_a_run_goes_on(tmp_path, data, capsys):
     hybrid.main(words(tmp_path, data, "--gap", "sim"))
     d4rl(data, 4, 2, n=70)

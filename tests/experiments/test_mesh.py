@@ -52,6 +52,7 @@ def agree(one, two, **tolerance):
         np.testing.assert_allclose(a, b, err_msg=jax.tree_util.keystr(path), **tolerance)
 
 
+@pytest.mark.slow
 def test_a_run_begins_alike_on_any_number_of_devices():
     """The random-action data are 4 steps of all environments, so their physics is compared, too."""
     agree(begun(1), begun(2), rtol=1e-5, atol=1e-5)

@@ -32,6 +32,7 @@ def with_step(change):
 
 
 @pytest.mark.parametrize("bias", [0.0, 4.0])
+@pytest.mark.slow
 def test_returns_look_past_the_time_limit(bias):
     """Reward 1 for ever at gamma 0.5: 20 steps and ceil(3 / 0.5) = 6 more, then V_sim stands for the rest.
 

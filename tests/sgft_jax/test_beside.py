@@ -48,7 +48,10 @@ class Stepped:
         return simulated().play(policy, states, keys, explore=explore)
 
 
-@pytest.mark.parametrize("changes", [{}, {"initial_rollouts": 3}, {"guard": True}], ids=str)
+_MORE = [pytest.param(x, marks=pytest.mark.slow, id=str(x)) for x in ({"initial_rollouts": 3}, {"guard": True})]
+
+
+@pytest.mark.parametrize("changes", [pytest.param({}, id="as it is"), *_MORE])
 def test_a_robot_that_waits_for_its_policy_gives_the_same_bits(changes):
     finetuner = make(**changes)
     learner = Inline(finetuner, ready=False)

@@ -201,6 +201,7 @@ def found(examined):
     return [own.found for own in examined]
 
 
+@pytest.mark.slow
 def test_an_examination_names_the_scale_and_counts_the_rollouts_it_is_given(examiner):
     weak = Distortion(jnp.diag(jnp.array([0.6, 1.0])), jnp.zeros(2), jnp.zeros(2))
     turned = Distortion(jnp.array([[0.0, -1.0], [1.0, 0.0]]), jnp.zeros(2), jnp.zeros(2))

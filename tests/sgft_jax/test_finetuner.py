@@ -88,9 +88,8 @@ def test_frozen_models_and_a_warm_up_keep_their_bits():
     assert not equal(warm.learner.actor, moved.learner.actor)
 
 
-@pytest.mark.parametrize(
-    ("name", "models"), [pytest.param("sgft-sac", 4, marks=pytest.mark.slow), ("sgft-sac", 2), ("sgft-mpc", 2)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "models"), [("sgft-sac", 4), ("sgft-sac", 2), ("sgft-mpc", 2)])
 def test_learning_rates_of_the_simulators_networks_rise_from_zero(name, models):
     """Adam's first step has the rate's length, so with a warm-up of 4 it is a quarter; models may have their own."""
     moved = {}

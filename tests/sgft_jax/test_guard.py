@@ -176,7 +176,7 @@ def test_a_challenger_that_proves_itself_becomes_the_reference_as_it_played(iden
 @pytest.mark.parametrize(
     "name",
     tuners.slow_but(
-        {"rlpd", "iql", "sgft-tdmpc2-code"},
+        {"rlpd", "iql"},
         [n for n, m in METHODS.items() if n != "sac" and hasattr(m.config, "guard")],
     ),
 )

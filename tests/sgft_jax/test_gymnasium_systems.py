@@ -57,7 +57,9 @@ REAL = {
 
 
 @pytest.mark.parametrize("real", REAL)
-@pytest.mark.parametrize(("make", "gap"), [(toy.make, TURNED), (toy_terminating.make, ALARM)])
+@pytest.mark.parametrize(
+    ("make", "gap"), [(toy_terminating.make, ALARM), pytest.param(toy.make, TURNED, marks=pytest.mark.slow)]
+)
 def test_out_and_in_again_plays_the_episodes_of_the_simulation(make, gap, real):
     """Also where policies see their last two actions, and where episodes end at different steps."""
     env = with_previous_actions(make(), 2)

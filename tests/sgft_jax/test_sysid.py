@@ -82,7 +82,8 @@ def test_rows_that_do_not_count_change_nothing(found, prior):
     np.testing.assert_allclose(state.learner[1].mean, after.learner[1].mean, atol=1e-3)
 
 
-@pytest.mark.parametrize("fit", ["map", pytest.param("dropo", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("fit", ["map", "dropo"])
 def test_the_simulator_tells_the_system_too(prior, fit, key):
     """Of steps with noise, played in the task itself; the prior's models, which know nothing, are not asked."""
     method = get_method("sysid")

@@ -129,6 +129,7 @@ def test_nail_weighs_what_steel_weighs():
 
 
 @pytest.mark.parametrize("theta", some_corners())
+@pytest.mark.slow
 def test_script_drives_every_extreme_nail_home(theta):
     theta = theta | {"nail_damping": 2500.0}
     episode = play_script(PROBE, theta, start(theta), steps=hammer.SCENE.episode_length)
@@ -197,6 +198,7 @@ def test_random_saturated_actions_never_explode():
         assert np.isfinite(speeds).all() and speeds.max() < 20.0
 
 
+@pytest.mark.slow
 def test_time_step_is_fine_enough():
     reference = reference_steps(PROBE, thetas=3, steps=15, seed=1)
     errors = measure(PROBE, reference, substeps=hammer.SUBSTEPS, iterations=0)

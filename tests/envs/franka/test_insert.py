@@ -80,6 +80,7 @@ def test_starts_lie_around_the_nominal_hole():
     assert (np.ptp(offset, axis=0) > 0.9 * (high - low)).all()
 
 
+@pytest.mark.slow
 def test_script_inserts_for_every_theta():
     rng = np.random.default_rng(0)
     for seed in range(12):
@@ -109,6 +110,7 @@ def test_surface_holds_beside_the_hole():
     assert heights[-1] < 1e-3  # and does touch
 
 
+@pytest.mark.slow
 def test_rounded_tip_slips_in_only_near_the_hole():
     """Friction 0.15: the tip slides where the rim is steeper than atan(0.15), within 0.5 + 3 (1 - 0.148) = 3.06 mm."""
     assert pressed(NOMINAL, 0.002, down=0.3)[-1, 2] < -0.015
@@ -128,11 +130,13 @@ def test_clearance(hole_radius, clearance):
     np.testing.assert_allclose(obs[3] - obs[6], clearance, atol=1.5e-4)
 
 
+@pytest.mark.slow
 def test_time_step_is_accurate():
     errors = measure(PROBE, reference_steps(PROBE, thetas=3, steps=10, seed=0), substeps=insert.SUBSTEPS, iterations=0)
     assert errors.p95 < 0.5  # mm after 0.2 s, at a quarter of the step and 100 iterations
 
 
+@pytest.mark.slow
 def test_target_keeps_the_leg_upright():
     tilted = jnp.asarray(insert.initial(as_params(NOMINAL), jax.random.key(0)).qpos).at[5].add(0.05)
     pose = kinematics.forward(insert.target(tilted, jnp.zeros(3)))

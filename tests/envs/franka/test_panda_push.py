@@ -88,6 +88,7 @@ def test_fingers_that_start_beside_the_cube_do_not_touch_it():
     assert 0.4 < (starts == np.float32(panda_push.START[2])).mean() < 0.6
 
 
+@pytest.mark.slow
 def test_starts_fill_the_square_and_the_mark_stays(rig):
     states = jax.vmap(lambda key: rig.env.reset(member(rig.worlds, 0), key).true_obs)(jax.random.split(KEY, 2000))
     for place in (slice(6, 8), slice(18, 20)):

@@ -17,7 +17,7 @@ from envs.mujoco.engines import warp as engine_warp
 KEY = jax.random.key(0)
 NAMES = (gaps.SIM, *gaps.presets("wheel-legged"))
 NOMINAL = {p.name: p.nominal for p in wheel_legged.PARAMETERS}
-ENGINES = ["c", "jax", *(["warp"] if engine_warp.available() else [])]
+ENGINES = ["c", "jax", *([pytest.param("warp", marks=pytest.mark.slow)] if engine_warp.available() else [])]
 
 
 def by_hand(theta):

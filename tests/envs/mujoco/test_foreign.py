@@ -77,7 +77,7 @@ SCENE = Scene(
     max_speed=5.0,
     view=View((0.0, 0.0, 0.0), 1.0, 90.0, -10.0),
 )
-ENGINES = ["jax", "c", *(["warp"] if engine_warp.available() else [])]
+ENGINES = ["c", "jax", *(["warp"] if engine_warp.available() else [])]
 ACTION = jnp.array([0.5, 0.8])
 
 
@@ -86,7 +86,7 @@ def worlds(env, *masses):
     return jax.tree.map(lambda *x: jnp.concatenate(x), *pools)
 
 
-@pytest.fixture(scope="module", params=ENGINES)
+@pytest.fixture(scope="module", params=[ENGINES[0], *(pytest.param(x, marks=pytest.mark.slow) for x in ENGINES[1:])])
 def played(request):
     """An episode [2] into the wall with a light and a heavy ball."""
     env = make_env(SCENE, request.param)

@@ -47,7 +47,8 @@ def play_in_mjx(rig, world, start):
     return np.array(seen)
 
 
-@pytest.mark.parametrize("i", [0, *(pytest.param(i, marks=pytest.mark.slow) for i in (1, 2))])
+@pytest.mark.slow
+@pytest.mark.parametrize("i", [0, 1, 2])
 def test_pushing(pushing, i):
     """0.5 mm, after up to 5 cm of pushing; at the end both pucks rest within 1 mm of where the script wants them."""
     world = member(pushing.worlds, i)

@@ -70,6 +70,7 @@ def test_hammering():
     assert (nail[:, 0] - nail[:, -1]).max() > 1e-3  # some blow drove a nail
 
 
+@pytest.mark.slow
 def test_arm_on_the_board():
     """0.1 mrad after 0.2 s under saturated commands that press hammer, wrist and elbow on the board."""
     c, warp = (make_env(SCENES["hammer"], impl=impl) for impl in ("c", "warp"))

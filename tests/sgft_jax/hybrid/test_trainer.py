@@ -93,6 +93,7 @@ def test_the_rows_are_those_of_the_members_own_simulator():
     np.testing.assert_allclose(gain, [0.1 * toy.FORCE / 0.5, 0.1 * toy.FORCE / 4.0], rtol=0.1)
 
 
+@pytest.mark.slow
 def test_members_do_what_they_would_do_alone():
     *_, (both, _) = played(build(), masses=(0.5, 4.0), seeds=(0, 1))
     *_, (alone, _) = played(build(), masses=(4.0,), seeds=(1,))
@@ -120,6 +121,7 @@ def plain_shapes(state):
     return state._replace(key=None)
 
 
+@pytest.mark.slow
 def test_discriminators_read_standardised_observations_only_if_asked_to():
     rows = real_rows()
     for asked, mean in ((False, np.zeros(4)), (True, rows.rows.obs.mean(0))):
@@ -127,6 +129,7 @@ def test_discriminators_read_standardised_observations_only_if_asked_to():
         np.testing.assert_allclose(state.learner.ratio.normalizer.mean[0], mean, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_sac_sees_no_real_row():
     def rows(sign):
         real = real_rows()
@@ -260,6 +263,7 @@ def test_an_exported_policy_acts_as_the_agent(name):
     np.testing.assert_allclose(again, own, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_notes_lie_beside_their_rows():
     """Also of the first batch, and after old rows were overwritten."""
     note = lambda learner, before, action, after: (before.obs, action, after.obs)  # noqa: E731

@@ -49,6 +49,7 @@ def test_the_penalty_is_an_integral(key):
     assert got == pytest.approx(np.log(6000 * 2 * np.sinh(1)) - 0.5, abs=0.02)
 
 
+@pytest.mark.slow
 def test_actions_that_the_data_lack_are_worth_less(key):
     batch, seen = batch_of(key, -0.5), {}
     for conservatism in (0.0, 1.0):

@@ -38,6 +38,7 @@ def test_a_flat_critic_does_no_harm():
     assert value == 0.0 and jnp.all(jnp.isfinite(grad))
 
 
+@pytest.mark.slow
 def test_diversity_keeps_gradients_apart(key):
     """Rewards are linear: without it all critics point the same way, at an alignment of 4."""
     batch, seen = batch_of(key), {}

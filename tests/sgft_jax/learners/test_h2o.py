@@ -81,6 +81,7 @@ def test_the_penalty_is_cut_off():
         assert h2o.penalty(jnp.array([[q], [0.0]]), jnp.array([0.0, -1e30]), batch) == expected
 
 
+@pytest.mark.slow
 def test_the_gap_grows_with_the_simulators_error(learner, key):
     """Its sign is that of KL(P_sim || P): the inverse, a known fault, would fall."""
     seen = []

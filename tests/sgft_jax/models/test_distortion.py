@@ -55,6 +55,7 @@ def test_a_system_that_takes_commands_as_they_are_meant_gives_no_evidence(key):
     assert evidence < 10
 
 
+@pytest.mark.slow
 def test_walls_tell_that_a_camera_is_off(key):
     """The hand stops where it should not: what is measured is not where it is."""
     truth = turned(0.1, 0.95, [0.0, 0.0], [0.06, 0.0])
@@ -68,6 +69,7 @@ def test_walls_tell_that_a_camera_is_off(key):
     np.testing.assert_array_equal(fit(rows)[0].offset, 0.0)
 
 
+@pytest.mark.slow
 def test_what_else_is_wrong_with_contacts_is_no_error_of_a_camera(key):
     """A real wall that stands elsewhere: errors of the camera would explain some of it, and are not believed."""
     rows = steps(turned(0.7, 0.6, [0.0, 0.0]), key)

@@ -35,6 +35,7 @@ def test_rollout_error_by_hand():
     np.testing.assert_allclose(error, np.array([1, 2, 3]) / np.sqrt(2), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_members_part_even_from_equal_weights(key):
     network = networks.make_dynamics(2, 1, networks.NetworkConfig((8,)), members=3)
     params = jax.tree.map(lambda p: jnp.broadcast_to(p[:1], p.shape), network.init(key))

@@ -135,6 +135,7 @@ def gradients(new):
     return [jax.tree.map(lambda m: 10 * m, optax.tree.get(fit.moments, "mu")) for fit in (new.joint, new.pair)]
 
 
+@pytest.mark.slow
 def test_the_pair_learns_from_both_losses_and_the_joint_from_its_own(key):
     learner = ratio.make_ratio(ratio.RatioConfig(2, 1, NetworkConfig((8,)), noise=0.0))
     state, batch = learner.init(key), small_batch(key)
