@@ -31,8 +31,8 @@ def with_step(change):
     return env._replace(step=lambda world, state, action, key: change(env.step(world, state, action, key)))
 
 
-@pytest.mark.parametrize("bias", [0.0, 4.0])
 @pytest.mark.slow
+@pytest.mark.parametrize("bias", [0.0, 4.0])
 def test_returns_look_past_the_time_limit(bias):
     """Reward 1 for ever at gamma 0.5: 20 steps and ceil(3 / 0.5) = 6 more, then V_sim stands for the rest.
 

@@ -48,10 +48,10 @@ class Stepped:
         return simulated().play(policy, states, keys, explore=explore)
 
 
-_MORE = [pytest.param(x, marks=pytest.mark.slow, id=str(x)) for x in ({"initial_rollouts": 3}, {"guard": True})]
+_SLOWER = [{"initial_rollouts": 3}, {"guard": True}]
 
 
-@pytest.mark.parametrize("changes", [pytest.param({}, id="as it is"), *_MORE])
+@pytest.mark.parametrize("changes", [{}, *(pytest.param(own, marks=pytest.mark.slow) for own in _SLOWER)], ids=str)
 def test_a_robot_that_waits_for_its_policy_gives_the_same_bits(changes):
     finetuner = make(**changes)
     learner = Inline(finetuner, ready=False)

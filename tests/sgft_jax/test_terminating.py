@@ -164,8 +164,8 @@ def test_a_fleet_begins_new_episodes_and_keeps_how_they_ended(algorithm):
 # --- fine-tuning ------------------------------------------------------------------------------------------------------
 
 
-@each_method
 @pytest.mark.slow
+@each_method
 def test_rows_up_to_the_end_of_an_episode_are_stored_and_no_others(name):
     run = finetuned(name)
     assert [int(progress.rollouts) for progress, _ in run.yielded if progress.rollouts] == [1, 2]

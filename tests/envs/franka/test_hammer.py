@@ -128,8 +128,8 @@ def test_nail_weighs_what_steel_weighs():
     np.testing.assert_allclose(heavier.body("link7").mass - model.body("link7").mass, 0.1, rtol=1e-6)
 
 
-@pytest.mark.parametrize("theta", some_corners())
 @pytest.mark.slow
+@pytest.mark.parametrize("theta", some_corners())
 def test_script_drives_every_extreme_nail_home(theta):
     theta = theta | {"nail_damping": 2500.0}
     episode = play_script(PROBE, theta, start(theta), steps=hammer.SCENE.episode_length)

@@ -172,12 +172,9 @@ def test_a_script_pushes_the_cube_to_the_mark(rig):
 @pytest.mark.slow
 @pytest.mark.parametrize("impl", ["jax", *(["warp"] if engine_warp.available() else [])])
 def test_engines_agree(rig, impl):
-    """One period from each state of a pushing episode: rounding where nothing is touched. Where the fingers slide along
-    a cube that stands on an edge, engines find other points of contact, and that period ends elsewhere: by up to two
-    millimetres, at speeds of up to 1 m/s.
+    """One period from each state of a pushing episode, where the cube meets the fingers: half a millimetre, typically
+    far less.
     """
     apart, _ = periods_apart(rig, rig_of(impl), push, steps=40, key=jax.random.key(3))
-    places, speeds = apart[:, [0, 1, 2, 6, 7, 8]].max(1), apart[:, 3:6].max(1)
-    assert np.median(places) < 1e-5 and np.median(speeds) < 1e-4
-    assert np.sort(places)[-4] < 5e-4 and np.max(places) < 2.5e-3
-    assert np.sort(speeds)[-4] < 3e-3 and np.max(speeds) < 0.04
+    errors = apart[:, :9].max(1)
+    assert np.median(errors) < 1e-4 and np.max(errors) < 3e-3

@@ -48,8 +48,8 @@ def test_observations_tell_what_the_next_step_does(played):
         assert (np.abs(step(restored(before.obs), action).true_obs - after.true_obs) < allowed).all()
 
 
-@pytest.mark.parametrize("task", TASKS)
 @pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
 def test_models_between_compiled_ones_are_the_compiler_s(task):
     env = envs.make(task)
     named = {"push": {"object_mass": [0.1, 0.3], "table_friction": [0.2, 0.5]}}

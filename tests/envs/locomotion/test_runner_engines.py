@@ -10,10 +10,8 @@ import envs
 from envs.mujoco.engines import warp as engine_warp
 
 STEPS = 24
-ENGINES = [
-    "c",
-    *(pytest.param(x, marks=pytest.mark.slow) for x in ("jax", "warp") if x == "jax" or engine_warp.available()),
-]
+SLOWER = ["jax", *(["warp"] if engine_warp.available() else [])]
+ENGINES = ["c", *(pytest.param(impl, marks=pytest.mark.slow) for impl in SLOWER)]
 
 
 @pytest.fixture(scope="module", params=TASKS)

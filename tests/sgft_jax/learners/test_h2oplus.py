@@ -7,6 +7,7 @@ import numpy as np
 import optax
 import pytest
 from keys import used_twice
+from tuners import slow_but
 
 from sgft_jax.learners import edac, h2oplus
 from sgft_jax.models import networks, normalizer, ratio
@@ -298,7 +299,7 @@ def test_diversity_counts_the_gradients_of_the_real_pairs_alone(key):
 # --- learning -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("backbone", ["iql", *(pytest.param(x, marks=pytest.mark.slow) for x in ("sql", "eql", "xql"))])
+@pytest.mark.parametrize("backbone", slow_but({"iql"}, ["iql", "sql", "eql", "xql"]))
 def test_losses_fall_on_a_fixed_batch(backbone, key):
     config = h2oplus.H2OPlusConfig(
         3, 2, network=BODY, ratio_network=BODY, value_loss=backbone, tune_alpha=False, ratio_noise=0.0
@@ -316,8 +317,8 @@ def test_losses_fall_on_a_fixed_batch(backbone, key):
     assert np.corrcoef(v, q)[0, 1] > 0.98
 
 
-@pytest.mark.parametrize(("with_ratio", "expected"), [(False, 0.45), (True, 0.02)])
 @pytest.mark.slow
+@pytest.mark.parametrize(("with_ratio", "expected"), [(False, 0.45), (True, 0.02)])
 def test_the_ratio_keeps_a_wrong_simulator_from_misleading(with_ratio, expected, key):
     """From 0 the real system goes to 1, which pays nothing, the simulator to 2, which pays 1; both end there.
 
