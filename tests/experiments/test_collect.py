@@ -211,9 +211,10 @@ def test_sets_made_in_another_way_are_not_judged(changes, judged):
     [
         (["--task", "toy"], "--level: say at which mean return learning stops"),
         (["--task", "toy", "--policy", "nowhere"], "--policy nowhere: no such folder"),
-        (
+        pytest.param(
             ["--task", "toy", "--level", "1e9", "--updates", "8", "--eval-every", "8"],
             "--level 1e+09: no seed reached it",
+            marks=pytest.mark.slow,
         ),
         (["--environments", "0"], "--environments is 0: must be at least 1"),
         (["--transitions", "0"], "--transitions is 0: must be at least 1"),

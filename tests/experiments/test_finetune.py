@@ -197,6 +197,7 @@ def test_a_run_leaves_curve_summary_policies_and_every_rollout(home):
     assert (folder / "figures/success.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["sgft-sac", "sac"])
 def test_value_and_statistics_of_the_prior_stay_frozen_and_its_actor_moves(home, method):
     for seed in (0, 1):

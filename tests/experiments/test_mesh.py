@@ -82,6 +82,7 @@ def test_training_is_the_same_on_any_number_of_devices():
     assert all(x.sharding.is_fully_replicated for x in jax.tree.leaves((run.learner, metrics)))
 
 
+@pytest.mark.slow
 def test_little_travels_between_devices():
     """A step of all environments: what they saw once to all, drawn rows summed, two sums of gradients an update."""
     random, state = begun(2)
@@ -122,6 +123,7 @@ def test_rows_are_counted_whole():
     assert counted.sharding.is_fully_replicated and "all-gather" in program.as_text()
 
 
+@pytest.mark.slow
 def test_what_one_device_left_two_continue():
     """A checkpoint holds whole arrays; `spread` lays them out."""
     random, state = begun(1)

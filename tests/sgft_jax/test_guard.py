@@ -139,7 +139,7 @@ def action(case, state, obs=OBS):
     return case.fine.act(state, case.fine.init_carry(), obs, jax.random.key(0), explore=jnp.bool_(False))[0]
 
 
-@pytest.mark.parametrize("name", ["sac", "sgft-mpc"])
+@pytest.mark.parametrize("name", tuners.slow_but({"sac"}, ["sac", "sgft-mpc"]))
 def test_failures_deploy_what_learned_and_a_failure_of_that_brings_the_reference_back(name):
     case, bare = tuners.tuner(name, guard=True), tuners.tuner(name)
     state = case.fine.init(case.params, jax.random.key(0))

@@ -94,7 +94,9 @@ def test_impossible_options_are_refused(name, options, words):
 def hyper(fine, name):
     """The learner's numbers at the start."""
     data = tuners.simulated().of(0) if fine.simulation else None
-    return fine.init(tuners.prior(METHODS[name].prior).params, jax.random.key(0), data).learner.hyper
+    params = tuners.prior(METHODS[name].prior).params
+    only = jax.jit(lambda key: fine.init(params, key, data).learner.hyper)  # quicker than all of the state
+    return only(jax.random.key(0))
 
 
 @pytest.mark.parametrize(
@@ -189,6 +191,7 @@ def program(case, state):
     return f"{seen} {learn(*args)} {act(state, case.plain.init_carry(), jnp.zeros(2), args[1])}"
 
 
+@pytest.mark.slow
 def test_without_the_ratio_sgft_relabel_is_what_it_was():
     """The same program, to the letter, as one of the transforms that it had before the option."""
     from sgft_jax.finetuner import sac_finetuner

@@ -167,6 +167,7 @@ def test_a_state_that_was_seen_is_restored(task):
     np.testing.assert_allclose(one.reward, other.reward, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_random_commands_earn_what_d4rl_says():
     """Its reference for a random policy is -280 on HalfCheetah and 1.6 on Walker2d, which soon falls."""
     for task, (low, high) in {"halfcheetah": (-400.0, -180.0), "walker2d": (-15.0, 30.0)}.items():

@@ -17,7 +17,8 @@ from envs.mujoco.engines import warp as engine_warp
 KEY = jax.random.key(0)
 NAMES = (gaps.SIM, *gaps.presets("wheel-legged"))
 NOMINAL = {p.name: p.nominal for p in wheel_legged.PARAMETERS}
-ENGINES = ["c", "jax", *([pytest.param("warp", marks=pytest.mark.slow)] if engine_warp.available() else [])]
+SLOWER = ["jax", *(["warp"] if engine_warp.available() else [])]
+ENGINES = ["c", *(pytest.param(impl, marks=pytest.mark.slow) for impl in SLOWER)]
 
 
 def by_hand(theta):

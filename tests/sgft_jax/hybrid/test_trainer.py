@@ -22,7 +22,7 @@ from sgft_jax.types import RealData, UserError
 
 ENV = toy.make()
 SMALL = {"hidden": (16,), "rows": 8}
-QUICK = {"h2oplus", "rebrac"}  # what the fast tests see of the methods
+QUICK = {"h2oplus"}  # what the fast tests see of the methods
 each_method = pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in NAMES]
 )
