@@ -28,8 +28,8 @@ QUICK = {
 }
 # Made of what the others are made of.
 SLOW = {
-    "sac, ten critics", "h2oplus, four critics", "h2o", "darc", "cql", "edac", "rebrac", "tdmpc2", "sgft-tdmpc2",
-    "recurrent",
+    "sac, ten critics", "h2oplus", "h2oplus, four critics", "h2o", "darc", "cql", "edac", "rebrac", "tdmpc2",
+    "sgft-tdmpc2", "recurrent",
 }  # fmt: skip
 
 

@@ -36,7 +36,7 @@ CONFIG = PretrainConfig(
     horizon=2, plan_samples=24, gru=4,
 )  # fmt: skip
 
-FAST = {"sgft-sac", "iql"}  # one for each learner but TD-MPC2, which takes as long as both
+FAST = {"sgft-sac"}
 each_method = pytest.mark.parametrize("name", tuners.slow_but(FAST, METHODS))
 each_algorithm = pytest.mark.parametrize("algorithm", tuners.slow_but({"sac"}, ["sac", "tdmpc2", "recurrent"]))
 

@@ -17,7 +17,7 @@ from sgft_jax.types import UserError
 N, STEPS = 3, 5
 
 
-@pytest.fixture(scope="module", params=SCENES)
+@pytest.fixture(scope="module", params=["push", "insert", pytest.param("hammer", marks=pytest.mark.slow)])
 def rig(request):
     """(scene, env, thetas, worlds [N] of these, their starts [N], actions [N, STEPS])."""
     scene, rng = SCENES[request.param], np.random.default_rng(1)

@@ -75,6 +75,7 @@ def test_the_entropy_is_not_in_the_target(key):
     assert targets[0] == targets[1] != 0
 
 
+@pytest.mark.slow
 def test_keys_are_used_once(key):
     fresh = cql.make_cql(cql.CQLConfig(1, 1, network=NET, samples=2))
     assert used_twice(lambda key, s, b: fresh.update(s, b, key), fresh.init(key), batch_of(key, 0.0)) == 0

@@ -66,6 +66,7 @@ def test_the_agent_learns_from_simulated_rows_alone(learner, key):
     assert not equal(one.sac.critic, other.sac.critic) and equal(one.ratio, other.ratio)
 
 
+@pytest.mark.slow
 def test_it_trains_from_buffers(key):
     """The published 256 simulated rows, and 256 of each for the discriminators."""
     source = darc.batches()
@@ -82,6 +83,7 @@ def test_it_trains_from_buffers(key):
         learner.update(state, batch_of(key), key)
 
 
+@pytest.mark.slow
 def test_keys_are_used_once(key):
     fresh = darc.make_darc(CONFIG)
     assert used_twice(lambda key, s, b: fresh.update(s, b, key), fresh.init(key), batch_of(key)) == 0

@@ -157,6 +157,7 @@ def test_options():
         h2o.H2OConfig(1, 1, successors=0)
 
 
+@pytest.mark.slow
 def test_keys_are_used_once_and_a_fresh_state_can_be_donated(key):
     fresh = h2o.make_h2o(CONFIG)
     assert used_twice(lambda key, s, b: fresh.update(s, b, key), fresh.init(key), batch_of(key)) == 0

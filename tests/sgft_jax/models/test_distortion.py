@@ -121,6 +121,7 @@ def test_it_is_what_effects_do_to_actions():
     np.testing.assert_allclose(own.meaning(action), envs.effects.distort(effects, action), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_one_rollout_of_pushing_tells_how_commands_are_turned_and_scaled():
     """Through a linear model of the free hand; a puck and the end of the workspace are in its way."""
     env = envs.make("push", "c")
