@@ -20,6 +20,7 @@ import envs
 from envs.base import Entry
 from envs.rollout import Episode
 from sgft_jax import pretraining, recipes, train
+from sgft_jax.guard import Guarded
 from sgft_jax.policies import make_policy
 from sgft_jax.presets import PretrainConfig
 from sgft_jax.systems.simulated import Simulated
@@ -117,6 +118,12 @@ def finetuned(name):
     return Run(fine, rows, [x for x, _ in system.played], yielded, train.evaluate(fine, system, agent, seeds, 1))
 
 
+def replay_of(run):
+    """Of all members at the end, behind a guard or not."""
+    agent = run.yielded[-1][0].agent
+    return (agent.agent if isinstance(agent, Guarded) else agent).replay
+
+
 def alarmed(rows):
     return np.asarray(rows.next_obs[..., 1] > 0.5)
 
@@ -169,11 +176,11 @@ def test_a_fleet_begins_new_episodes_and_keeps_how_they_ended(algorithm):
 def test_rows_up_to_the_end_of_an_episode_are_stored_and_no_others(name):
     run = finetuned(name)
     assert [int(progress.rollouts) for progress, _ in run.yielded if progress.rollouts] == [1, 2]
-    agent, how = run.yielded[-1][0].agent, []
+    how = []
     for m in range(M):
         played = [(episodes.transitions, episodes.valid) for episodes in run.played]
         rows, valid = jax.tree.map(lambda *x, m=m: np.concatenate([y[m, 0] for y in x]), *played)
-        memory = jax.tree.map(lambda x, m=m: x[m], agent.replay)
+        memory = jax.tree.map(lambda x, m=m: x[m], replay_of(run))
         held = jax.tree.map(lambda x, n=int(memory.size): x[:n], memory.data)
         assert memory.size == valid.sum()
         jax.tree.map(lambda x, y, v=valid: np.testing.assert_array_equal(x, y[v]), held, rows)
@@ -192,7 +199,7 @@ def test_whatever_is_learned_there_is_finite(name):
     learned = [metrics for _, metrics in run.yielded[1:]]
     assert all(x.shape == (M,) for metrics in learned for x in metrics.values()) and finite(learned)
     params = jax.vmap(run.fine.export)(progress.agent)
-    assert finite(params) and finite(progress.agent.replay.data)
+    assert finite(params) and finite(replay_of(run).data)
     same = tuners.equal(params, jax.vmap(run.fine.export)(run.yielded[0][0].agent))
     assert same == (name in {"sysid", "recurrent"})  # no system is told here, and nothing learned
     for rollout, played in enumerate(run.played):
