@@ -26,7 +26,7 @@ QUICK = {
     "rebrac": set(),
     "recurrent": set(),
 }
-# Made of what the others are made of.
+# Made of what the others are made of, or tested at length in a file of their own.
 SLOW = {
     "sac, ten critics", "h2oplus", "h2oplus, four critics", "h2o", "darc", "cql", "edac", "rebrac", "tdmpc2",
     "sgft-tdmpc2", "recurrent",

@@ -37,8 +37,7 @@ CONFIG = PretrainConfig(
     horizon=2, plan_samples=24, gru=4,
 )  # fmt: skip
 
-FAST = {"sgft-sac"}
-each_method = pytest.mark.parametrize("name", tuners.slow_but(FAST, METHODS))
+each_method = pytest.mark.parametrize("name", tuners.slow_but({"sgft-sac"}, METHODS))
 each_algorithm = pytest.mark.parametrize("algorithm", tuners.slow_but({"sac"}, ["sac", "tdmpc2", "recurrent"]))
 
 
@@ -220,7 +219,8 @@ def test_evaluated_episodes_are_as_long_as_they_last(name):
     np.testing.assert_allclose(run.evaluated.score[:, 0], earned, rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", tuners.slow_but(FAST, ["iql", "rlpd", "sac-online", "sgft-relabel"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["iql", "rlpd", "sac-online", "sgft-relabel"])
 def test_simulated_rows_end_where_their_episodes_do(name):
     held = finetuned(name).simulated.replay
     for p in range(2):

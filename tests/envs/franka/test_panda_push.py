@@ -173,9 +173,11 @@ def test_a_script_pushes_the_cube_to_the_mark(rig):
 @pytest.mark.parametrize("impl", ["jax", *(["warp"] if engine_warp.available() else [])])
 def test_engines_agree(rig, impl):
     """One period from each state of a pushing episode. Where fingers slide along the cube, the solver's few iterations
-    leave more than rounding, but less than the time step does (docs/physics.md): 6.5 mm, and 4 % of 0.6 m/s.
+    leave more than rounding, in three of forty periods at most, but less than the time step costs (docs/physics.md).
     """
     apart, _ = periods_apart(rig, rig_of(impl), push, steps=40, key=jax.random.key(3))
     places, speeds = apart[:, [0, 1, 2, 6, 7, 8]].max(1), apart[:, 3:6].max(1)
-    assert np.median(places) < 1e-5 and np.mean(places) < 2e-4 and np.max(places) < 3e-3
-    assert np.median(speeds) < 1e-4 and np.mean(speeds) < 1.5e-3 and np.max(speeds) < 0.03
+    assert np.median(places) < 1e-5 and np.mean(places) < 2e-4
+    assert np.median(speeds) < 1e-4 and np.mean(speeds) < 1.5e-3
+    assert np.sort(places)[-4] < 5e-4 and np.max(places) < 2.5e-3
+    assert np.sort(speeds)[-4] < 3e-3 and np.max(speeds) < 0.03

@@ -17,7 +17,7 @@ from sgft_jax.types import UserError
 N, STEPS = 3, 5
 
 
-@pytest.fixture(scope="module", params=["push", "insert", pytest.param("hammer", marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=[pytest.param(x, marks=[pytest.mark.slow] * (x == "hammer")) for x in SCENES])
 def rig(request):
     """(scene, env, thetas, worlds [N] of these, their starts [N], actions [N, STEPS])."""
     scene, rng = SCENES[request.param], np.random.default_rng(1)
