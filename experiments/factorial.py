@@ -1,10 +1,12 @@
 """What do SGFT's parts do? Shaping, shortening, their horizon, a new critic and warm-up, all combinations of them.
 
 Every cell is a run of `sgft-parts` with equal branches. Cells that are finished are left alone, begun ones go on where
-they stopped. When all are finished, the effects of each part on area, end and deepest fall are printed and drawn.
+they stopped. When all are finished, the learning curve of every cell and the effects of each part on area, end and
+deepest fall are printed, and the effects are drawn. With --data, nothing runs: the curves come from released tables.
 """
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +22,9 @@ from sgft_jax.types import UserError
 if TYPE_CHECKING:
     from sgft_jax.analysis.curves import Curve
     from sgft_jax.analysis.factorial import Factor, Levels
+
+    Place = tuple[str, str]  # a task, and a real system as the user gave it
+    Curves = dict[Place, dict[Levels, Curve]]
 
 METHOD, MEASURES = "sgft-parts", ("area", "end", "deepest fall")
 COLD = {"critic_warmup": 0, "lr_warmup": 0, "dynamics_warmup": 0, "actor_ramp": 0}  # as the paper prints it
@@ -51,6 +56,8 @@ class FactorialArgs(GridArgs):
     """Of all cells."""
     guard: bool = False
     """Of all cells."""
+    data: Path | None = None
+    """Folder of released tables to read instead of running the cells, such as docs/data."""
 
 
 def main(args: FactorialArgs) -> None:
@@ -58,6 +65,9 @@ def main(args: FactorialArgs) -> None:
     args = replace(args, reals=gaps.each(args.reals))
     check(args)
     places = [(task, real) for task in args.tasks for real in args.reals]
+    if args.data:
+        print(report(args, released(args, args.data, places)))
+        return
     cells = {place: cells_of(args, *place) for place in places}
     every = [cell for each in cells.values() for cell in each.values()]
     check_begun(every)  # the same folders with other options or priors
@@ -70,7 +80,10 @@ def main(args: FactorialArgs) -> None:
     if left := len(states) - states.count("finished"):
         print(f"{left} cells are not finished; the same command goes on")
         return
-    print(report(args, cells))
+    from sgft_jax.analysis.curves import read_curve
+
+    curves = {place: {at: read_curve(cell.folder) for at, cell in own.items()} for place, own in cells.items()}
+    print(report(args, curves))
 
 
 def check(args: FactorialArgs) -> None:
@@ -103,33 +116,66 @@ def settings(args: FactorialArgs, levels: "Levels") -> dict[str, Any]:
     return own | shared | ({} if warm else COLD)
 
 
+def variants(args: FactorialArgs) -> "dict[Levels, str]":
+    """Every combination of levels, and what its runs are called."""
+    names = [(factor.low, factor.high) for factor in factors(args)]
+    return {
+        levels: "-".join(name[high].replace(" ", ".") for name, high in zip(names, levels, strict=True))
+        for levels in itertools.product((False, True), repeat=len(names))
+    }
+
+
 def cells_of(args: FactorialArgs, task: str, real: str) -> "dict[Levels, Cell]":
     """Every combination of levels on a real system."""
-    names = [(factor.low, factor.high) for factor in factors(args)]
     found = {}
-    for levels in itertools.product((False, True), repeat=len(names)):
-        variant = "-".join(name[high].replace(" ", ".") for name, high in zip(names, levels, strict=True))
+    for levels, variant in variants(args).items():
         run = replace(grid.run_of(args, task, real, METHOD), prior=args.prior, variant=variant)
         found[levels] = grid.look_up(with_settings(run, settings(args, levels)))
     return found
 
 
-def report(args: FactorialArgs, cells: "dict[tuple[str, str], dict[Levels, Cell]]") -> str:
-    """Tables of the effects; writes factorial.json and factorial.png."""
+def released(args: FactorialArgs, folder: Path, places: "Sequence[Place]") -> "Curves":
+    """The curves of every cell in tables that `experiments.figures --export` wrote; UserError where one is missing."""
+    from sgft_jax.analysis.curves import read_data
+
+    found: dict[tuple[str, str, str], Curve] = {}
+    for curve in read_data(folder).curves:
+        if curve.method == METHOD:
+            name = (curve.task, curve.gap, curve.variant)
+            if name in found:
+                raise UserError(f"{folder}: {METHOD} {' '.join(name)} ran with several sets of priors; keep one")
+            found[name] = curve
+    wanted = {(task, real): variants(args) for task, real in places}
+    for (task, real), own in wanted.items():
+        for variant in own.values():
+            if (task, gaps.title(real), variant) not in found:
+                raise UserError(f"{folder}: has no run of {METHOD} on {task}, {gaps.title(real)}, variant {variant}")
+    return {
+        (task, real): {levels: found[task, gaps.title(real), variant] for levels, variant in own.items()}
+        for (task, real), own in wanted.items()
+    }
+
+
+def report(args: FactorialArgs, curves: "Curves") -> str:
+    """Tables of the cells and of the effects; writes factorial.json and factorial.png."""
     from sgft_jax.analysis import figures, tables
-    from sgft_jax.analysis.curves import by_prior, read_curve
+    from sgft_jax.analysis.curves import by_prior
     from sgft_jax.analysis.factorial import effects
 
-    folder, found, said = args.out / "factorial", {}, []
-    for (task, real), each in cells.items():
-        curves = {levels: read_curve(cell.folder) for levels, cell in each.items()}
-        scores = {levels: measures(curve) for levels, curve in curves.items()}
-        first = next(iter(curves.values()))
-        place, score, priors = f"{task}, {gaps.title(real)}", first.score, first.prior if by_prior(first) else None
+    folder, found, said, score = args.out / "factorial", {}, [], ""
+    for (task, real), each in curves.items():
+        scores = {levels: measures(curve) for levels, curve in each.items()}
+        first = next(iter(each.values()))
+        score, priors = first.score, first.prior if by_prior(first) else None
+        place = f"{task}, {gaps.title(real)}"
         found[place] = {
             what: effects({levels: own[what] for levels, own in scores.items()}, factors(args), priors=priors)
             for what in MEASURES
         }
+        rollouts = ", ".join(str(n) for n in first.rollouts)
+        said += [f"{place}, {tables.words(score)} after {rollouts} rollouts:", ""]
+        lines = [[variant, _means(each[levels])] for levels, variant in variants(args).items()]
+        said += [tables.markdown(("cell", "mean"), lines), ""]
         rows = [
             [name, *(tables.number(found[place][what][name], score) for what in MEASURES)]
             for name in found[place][MEASURES[0]]
@@ -137,8 +183,15 @@ def report(args: FactorialArgs, cells: "dict[tuple[str, str], dict[Levels, Cell]
         said += [f"{place}, effects on {tables.words(score)}:", "", tables.markdown(("effect of", *MEASURES), rows), ""]
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "factorial.json", jsonable(found))
-    figures.effects(folder / "factorial.png", found)
+    figures.effects(folder / "factorial.png", found, label=f"change of {score}")
     return "\n".join([*said, f"written: {folder}"])
+
+
+def _means(curve: "Curve") -> str:
+    """The mean at every evaluation, in the units of tables."""
+    from sgft_jax.analysis import tables
+
+    return " ".join(tables.plain(value, curve.score) for value in curve.values.mean(axis=0))
 
 
 def measures(curve: "Curve") -> dict[str, Any]:

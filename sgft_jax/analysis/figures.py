@@ -311,10 +311,10 @@ def rollouts(path: Path, panels: Sequence[Panel], episodes: Mapping[str, float],
     return _save(figure, path)
 
 
-def effects(path: Path, found: Mapping[str, Mapping[str, Mapping[str, Interval]]]) -> Path:
+def effects(path: Path, found: Mapping[str, Mapping[str, Mapping[str, Interval]]], *, label: str) -> Path:
     """A panel for each place: every effect as a dot with its interval, one colour for each measure.
 
-    found: by place, measure and name of the effect, see `factorial.effects`.
+    found: by place, measure and name of the effect, see `factorial.effects`. label: of the x-axis.
     """
     figure, panels = _figure(5.2 * len(found), 4.4, columns=len(found))
     for axes, (place, measures) in zip(panels, found.items(), strict=True):
@@ -328,6 +328,7 @@ def effects(path: Path, found: Mapping[str, Mapping[str, Mapping[str, Interval]]
         axes.invert_yaxis()
         axes.axvline(0.0, color=_GREY, linewidth=1)
         axes.set_title(place, **_FONT, loc="left")
+        axes.set_xlabel(label, **_FONT)
     panels[0].legend(frameon=False, fontsize=8, labelcolor=_INK)
     figure.suptitle("effect of each part, mean over all others", x=0.01, ha="left", size=12, weight="bold", color=_INK)
     return _save(figure, path)

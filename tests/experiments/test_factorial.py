@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import runs_by_hand
 
-from experiments import cli, factorial, grid
+from experiments import cli, factorial, figures, grid
 from experiments.factorial import FactorialArgs
 from sgft_jax.io import checkpoint
 from sgft_jax.types import UserError
@@ -67,3 +67,28 @@ def test_the_report_names_what_each_part_does(tmp_path, monkeypatch, capsys):
     found = json.loads((tmp_path / "factorial/factorial.json").read_text())
     np.testing.assert_allclose(found["push, default"]["end"]["shape"]["estimate"], 0.2)
     assert (tmp_path / "factorial/factorial.png").stat().st_size > 10_000
+
+
+def test_the_report_needs_only_released_tables(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(grid, "finetune", leave)
+    monkeypatch.setattr(cli, "set_up", lambda: None)
+    factorial.main(replace(ARGS, out=tmp_path / "runs"))
+    figures.main(figures.FiguresArgs(export=tmp_path / "data", out=tmp_path / "runs"))
+    capsys.readouterr()
+    args = replace(ARGS, out=tmp_path, data=tmp_path / "data")
+    factorial.main(args)
+    said = capsys.readouterr().out
+    assert "| shaped-short-4-new-warm | 10 60 |" in said and "| shape | 10 | 20 | 0 |" in said
+    with pytest.raises(UserError, match=r"no run of sgft-parts on push, sim, variant task.reward-infinite-1-kept-none"):
+        factorial.main(replace(args, reals=("sim",)))
+
+
+def test_released_tables_with_two_sets_of_priors_are_refused(tmp_path):
+    for seeds, priors in (("seeds-0-1", ("a" * 12, "b" * 12)), ("seeds-2-3", ("c" * 12, "d" * 12))):
+        runs_by_hand.save(
+            tmp_path / "runs", "sgft-parts_shaped-short-4-new-warm", [[0.1, 0.2]], rollouts=(0,), task="push",
+            seeds=seeds, priors=priors, variant="shaped-short-4-new-warm",
+        )  # fmt: skip
+    figures.main(figures.FiguresArgs(export=tmp_path / "data", out=tmp_path / "runs"))
+    with pytest.raises(UserError, match="ran with several sets of priors; keep one"):
+        factorial.main(replace(ARGS, out=tmp_path, data=tmp_path / "data"))
