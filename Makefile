@@ -42,10 +42,10 @@ type: $(PY) ## static types
 	$(PY) -m pyright
 
 test: $(PY) ## the fast tests
-	$(PY) -m pytest -q -n $(JOBS) --dist loadfile -m "not slow" $(ARGS)
+	$(PY) -m pytest -q -n $(JOBS) --dist worksteal -m "not slow" $(ARGS)
 
 test-all: $(PY) ## every test that this machine can run
-	$(PY) -m pytest -q -n $(JOBS) --dist loadfile $(ARGS)
+	$(PY) -m pytest -q -n $(JOBS) --dist worksteal $(ARGS)
 
 demo: $(PY) ## the whole method in minutes on a CPU
 	$(PY) -m experiments.demo $(FLAGS)

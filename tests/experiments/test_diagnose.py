@@ -78,6 +78,7 @@ def run(out, real, success, priors, **settings):
     return record(folder, policies=2, success=(0,) if "half" in real else ())
 
 
+@pytest.mark.slow
 def test_a_run_says_which_prior_each_seed_has(priors, tmp_path, capsys):
     folder = run(tmp_path, "half", [[0.1, 0.1]] * 3, priors, seeds="seeds-1-2")
     call("--real", folder, "--out", tmp_path / "runs", "--json")

@@ -161,6 +161,7 @@ def test_killed_and_resumed_is_bit_for_bit_uninterrupted(finished, tmp_path, mon
     jax.tree.map(np.testing.assert_array_equal, *priors)
 
 
+@pytest.mark.slow
 def test_a_finished_run_is_neither_repeated_nor_changed(finished, out, capsys):
     argv = [*TINY, "--seeds", "2", "--out", str(out)]
     assert "exists already" in complaint(argv, capsys)

@@ -88,7 +88,7 @@ def test_exploring_differs_and_the_best_action_follows_from_the_key(name, key):
     assert equal(best, again) and not jnp.allclose(best, explored, atol=1e-4)
 
 
-@each_method
+@pytest.mark.parametrize("name", tuners.slow_but({"sgft-mpc"}, [*METHODS, *VARIANTS]))
 def test_no_key_is_used_twice(name):
     """In acting, in learning and in the offline phase."""
     case, states, _ = two(name)

@@ -35,7 +35,7 @@ def act(case, state, obs=OBS, explore=False):
     [
         pytest.param("sac", {"actor", "critic"}, marks=pytest.mark.slow),
         pytest.param("sgft", {"actor", "critic"}, marks=pytest.mark.slow),
-        ("sgft-sac", {"actor", "critic", "models"}),
+        pytest.param("sgft-sac", {"actor", "critic", "models"}, marks=pytest.mark.slow),
         ("frozen-critic", {"actor"}),
         ("sgft-mpc", {"models"}),
     ],
@@ -209,7 +209,7 @@ def test_longer_horizons_tell_the_steps_to_go(seen):
 @pytest.mark.parametrize(
     ("name", "others", "parts"),
     [
-        ("mbpo", {}, {"shape": False, "shorten": False}),
+        pytest.param("mbpo", {}, {"shape": False, "shorten": False}, marks=pytest.mark.slow),
         ("sgft-sac", {"clip_shaped": None}, {"shape": True, "shorten": True}),
         ("sgft-sac", {"clip_shaped": None, "reset_critic": True, "horizon": 1}, {"shape": True, "shorten": True}),
         ("pbrs-branch", {"clip_shaped": None, "reset_critic": False}, {"shape": True, "shorten": False}),

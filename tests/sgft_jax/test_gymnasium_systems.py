@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import toy
 import toy_terminating
+import tuners
 
 from envs.base import Entry
 from envs.gaps import Gap
@@ -56,7 +57,7 @@ REAL = {
 }
 
 
-@pytest.mark.parametrize("real", REAL)
+@pytest.mark.parametrize("real", tuners.slow_but({"vector", "same step"}, REAL))
 @pytest.mark.parametrize(
     ("make", "gap"), [(toy_terminating.make, ALARM), pytest.param(toy.make, TURNED, marks=pytest.mark.slow)]
 )

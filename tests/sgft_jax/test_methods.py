@@ -110,8 +110,8 @@ def hyper(fine, name):
         ("pbrs", {"lr_warmup": 9, "reset_critic": True}, {"lr_warmup": 0}),
         ("pbrs", {"lr_warmup": 9, "reset_critic": False}, {"lr_warmup": 9}),
         ("rlpd", {}, {"lr_warmup": 0, "actor_start": 0}),
-        ("tdmpc2", {}, {"lr_warmup": 500}),
-        ("tdmpc2", {"lr_warmup": 4}, {"lr_warmup": 4}),
+        pytest.param("tdmpc2", {}, {"lr_warmup": 500}, marks=pytest.mark.slow),
+        pytest.param("tdmpc2", {"lr_warmup": 4}, {"lr_warmup": 4}, marks=pytest.mark.slow),
         ("sgft-tdmpc2-code", {}, {"lr_warmup": 0}),
     ],
 )

@@ -150,6 +150,7 @@ def equal(one, other):
         np.testing.assert_array_equal(a, b, err_msg=jax.tree_util.keystr(path))
 
 
+@pytest.mark.slow
 def test_random_actions_grow_along_the_fleet(key, monkeypatch):
     """A policy always says 2: the first environment obeys, the last acts at random, the middle one does both."""
     always = lambda agent, carry, obs, key: (jnp.full(2, 2.0), carry)  # noqa: E731

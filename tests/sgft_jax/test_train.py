@@ -431,6 +431,7 @@ def rows_of(n, p=2):
     return train.SimulatedRows(jax.tree.map(lambda *x: jnp.stack(x), *map(one, range(p))), jnp.ones((p, 3)))
 
 
+@pytest.mark.slow
 def test_the_offline_phase_comes_in_parts(monkeypatch):
     monkeypatch.setattr(train, "OFFLINE_PART", 5)
     fine = make(simulation=NEEDS)

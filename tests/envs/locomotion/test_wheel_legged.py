@@ -115,6 +115,7 @@ def episodes(env, names, act):
     return jax.jit(jax.vmap(one))(pool_of(env, names), jax.random.split(KEY, len(names)))
 
 
+@pytest.mark.slow
 def test_a_linear_controller_stands_in_every_gap_and_nothing_falls():
     """That of the nominal robot. Where the centre of mass is ahead or the floor is rough, it does not stay in place."""
     env, own = envs.make("wheel-legged", "c"), gain(NOMINAL)

@@ -59,6 +59,7 @@ def test_pushing(pushing, i):
     np.testing.assert_allclose(play_in_mjx(pushing, world, start)[-1, 2], wanted[-1, 2], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_saturated_servos(pushing):
     """A command 1 rad away drives every servo to its force limit at the start of the period."""
     world = member(pushing.worlds, 0)

@@ -250,7 +250,8 @@ def test_iql_scales_rewards_to_the_span_of_the_returns():
     np.testing.assert_allclose(iql.return_span(jax.tree.map(jnp.asarray, cut)), np.ptp(returns), rtol=1e-4)
 
 
-@each_method
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NAMES)
 def test_an_exported_policy_acts_as_the_agent(name):
     agent = build(name)
     state = jax.tree.map(lambda x: x[0], played(agent)[-1][0].learner)

@@ -299,6 +299,7 @@ def test_score_of_a_plan_against_a_loop(config, key):
     assert score == pytest.approx(float(total + 0.25 * end), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_plan_costs_two_heads_whatever_their_number(key):
     def flops(members):
         config = dataclasses.replace(PLAIN, size=dataclasses.replace(SIZE, members=members))
