@@ -112,7 +112,7 @@ def hyper(fine, name):
         ("rlpd", {}, {"lr_warmup": 0, "actor_start": 0}),
         pytest.param("tdmpc2", {}, {"lr_warmup": 500}, marks=pytest.mark.slow),
         pytest.param("tdmpc2", {"lr_warmup": 4}, {"lr_warmup": 4}, marks=pytest.mark.slow),
-        ("sgft-tdmpc2-code", {}, {"lr_warmup": 0}),
+        pytest.param("sgft-tdmpc2-code", {}, {"lr_warmup": 0}, marks=pytest.mark.slow),
     ],
 )
 def test_numbers_left_open_are_resolved_when_a_method_is_built(name, given, resolved):
