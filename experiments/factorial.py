@@ -138,22 +138,23 @@ def released(args: FactorialArgs, folder: Path, places: "Sequence[Place]") -> "C
     """The curves of every cell in tables that `experiments.figures --export` wrote; UserError where one is missing."""
     from sgft_jax.analysis.curves import read_data
 
-    found: dict[tuple[str, str, str], Curve] = {}
-    for curve in read_data(folder).curves:
-        if curve.method == METHOD:
-            name = (curve.task, curve.gap, curve.variant)
-            if name in found:
-                raise UserError(f"{folder}: {METHOD} {' '.join(name)} ran with several sets of priors; keep one")
-            found[name] = curve
-    wanted = {(task, real): variants(args) for task, real in places}
-    for (task, real), own in wanted.items():
-        for variant in own.values():
-            if (task, gaps.title(real), variant) not in found:
-                raise UserError(f"{folder}: has no run of {METHOD} on {task}, {gaps.title(real)}, variant {variant}")
-    return {
-        (task, real): {levels: found[task, gaps.title(real), variant] for levels, variant in own.items()}
-        for (task, real), own in wanted.items()
+    wanted = {
+        (task, gaps.title(real), variant): ((task, real), levels)
+        for task, real in places
+        for levels, variant in variants(args).items()
     }
+    found: Curves = {place: {} for place in places}
+    for curve in read_data(folder).curves:
+        name = (curve.task, curve.gap, curve.variant)
+        if curve.method == METHOD and name in wanted:
+            place, levels = wanted[name]
+            if levels in found[place]:
+                raise UserError(f"{folder}: {METHOD} {' '.join(name)} ran with several sets of priors; keep one")
+            found[place][levels] = curve
+    for name, (place, levels) in wanted.items():
+        if levels not in found[place]:
+            raise UserError(f"{folder}: has no run of {METHOD} on {name[0]}, {name[1]}, variant {name[2]}")
+    return found
 
 
 def report(args: FactorialArgs, curves: "Curves") -> str:
