@@ -173,14 +173,11 @@ def report(args: FactorialArgs, curves: "Curves") -> str:
             what: effects({levels: own[what] for levels, own in scores.items()}, factors(args), priors=priors)
             for what in MEASURES
         }
-        rollouts = ", ".join(str(n) for n in first.rollouts)
-        said += [f"{place}, {tables.words(score)} after {rollouts} rollouts:", ""]
-        lines = [[variant, _means(each[levels])] for levels, variant in variants(args).items()]
-        said += [tables.markdown(("cell", "mean"), lines), ""]
         rows = [
             [name, *(tables.number(found[place][what][name], score) for what in MEASURES)]
             for name in found[place][MEASURES[0]]
         ]
+        said += [f"{place}, {tables.words(score)}:", "", _cells(args, each), ""]
         said += [f"{place}, effects on {tables.words(score)}:", "", tables.markdown(("effect of", *MEASURES), rows), ""]
     folder.mkdir(parents=True, exist_ok=True)
     write_json(folder / "factorial.json", jsonable(found))
@@ -188,11 +185,29 @@ def report(args: FactorialArgs, curves: "Curves") -> str:
     return "\n".join([*said, f"written: {folder}"])
 
 
-def _means(curve: "Curve") -> str:
-    """The mean at every evaluation, in the units of tables."""
+def _cells(args: FactorialArgs, curves: "dict[Levels, Curve]") -> str:
+    """A line for each cell; its area also beside the cell with neither shaping nor shortening and all else equal."""
     from sgft_jax.analysis import tables
+    from sgft_jax.analysis.curves import by_prior, deepest_fall
+    from sgft_jax.analysis.stats import bootstrap_interval, mean
 
-    return " ".join(tables.plain(value, curve.score) for value in curve.values.mean(axis=0))
+    lines = []
+    for levels, variant in variants(args).items():
+        curve, neither = curves[levels], curves[(False, False, *levels[2:])]
+        area = measures(curve)["area"]
+        more = bootstrap_interval(
+            area - measures(neither)["area"], statistic=mean, priors=curve.prior if by_prior(curve) else None
+        )
+        lines.append([
+            variant,
+            " ".join(tables.plain(value, curve.score) for value in curve.values.mean(axis=0)),
+            tables.plain(area.mean(), curve.score),
+            tables.plain(deepest_fall(curve), curve.score),
+            tables.number(more, curve.score),
+        ])  # fmt: skip
+    rollouts = ", ".join(str(n) for n in curves[levels].rollouts)
+    head = ("cell", f"mean after {rollouts} rollouts", "area", "fall of the mean", "area more than with neither")
+    return tables.markdown(head, lines)
 
 
 def measures(curve: "Curve") -> dict[str, Any]:

@@ -63,6 +63,8 @@ def test_the_report_names_what_each_part_does(tmp_path, monkeypatch, capsys):
     factorial.main(replace(ARGS, out=tmp_path))
     said = capsys.readouterr().out
     assert "| shape | 10 | 20 | 0 |" in said and "| shorten | 0 | 0 | 0 |" in said
+    # From 10 to 60 %: an area of 35, where the cell without shaping ends at 40 % and has 25.
+    assert "| shaped-short-4-new-warm | 10 60 | 35 | 0 | 10 |" in said
     assert "push, default, effects on success in per cent" in said
     found = json.loads((tmp_path / "factorial/factorial.json").read_text())
     np.testing.assert_allclose(found["push, default"]["end"]["shape"]["estimate"], 0.2)
@@ -78,7 +80,7 @@ def test_the_report_needs_only_released_tables(tmp_path, monkeypatch, capsys):
     args = replace(ARGS, out=tmp_path, data=tmp_path / "data")
     factorial.main(args)
     said = capsys.readouterr().out
-    assert "| shaped-short-4-new-warm | 10 60 |" in said and "| shape | 10 | 20 | 0 |" in said
+    assert "| shaped-short-4-new-warm | 10 60 | 35 | 0 | 10 |" in said and "| shape | 10 | 20 | 0 |" in said
     with pytest.raises(UserError, match=r"no run of sgft-parts on push, sim, variant task.reward-infinite-1-kept-none"):
         factorial.main(replace(args, reals=("sim",)))
 

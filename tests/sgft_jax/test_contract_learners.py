@@ -146,11 +146,14 @@ def weighed(name, fields):
     return new, {loss: x for loss, x in metrics.items() if loss.endswith("loss")}
 
 
+each_flat_learner = pytest.mark.parametrize("name", [slow_if(name != "iql", name) for name in FLAT])
+
+
 def rows_where(mask, new, old):
     return jnp.where(jnp.expand_dims(mask, tuple(range(1, new.ndim))), new, old)
 
 
-@pytest.mark.parametrize("name", [slow_if(name != "iql", name) for name in FLAT])
+@each_flat_learner
 def test_invalid_rows_do_not_count(name):
     """Whatever finite numbers they hold."""
     valid = jnp.arange(probes.ROWS) < HALF
@@ -165,7 +168,7 @@ def test_invalid_rows_do_not_count(name):
     assert bits(clean) != bits(weighed(name, lambda batch: batch))
 
 
-@pytest.mark.parametrize("name", [slow_if(name != "iql", name) for name in FLAT])
+@each_flat_learner
 def test_a_row_of_weight_two_counts_twice(name):
     """Of weight 0 it does not count at all; weights of 1 change nothing."""
     twice = jnp.where(jnp.arange(probes.ROWS) < HALF, 2.0, 0.0)
