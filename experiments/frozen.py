@@ -9,10 +9,12 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import envs
 from envs import gaps
@@ -20,7 +22,7 @@ from envs.gaps import SIM
 from experiments import cli, grid
 from experiments.cells import Cell, complete
 from experiments.grid import GridArgs
-from experiments.options import at_least_one
+from experiments.options import at_least_one, prior_folders
 from experiments.pretrain import PretrainArgs, pretrain, run_folder
 from experiments.scoreboard import ScoreboardArgs, board
 from sgft_jax.io.runs import CONFIG
@@ -49,6 +51,9 @@ class FrozenArgs:
     """Processes at once on each GPU, or in all without --gpus. Four to eight keep an H100 busy."""
     gpus: int = 0
     """GPUs to share the processes; 0: the processes see whatever there is."""
+    split: int = 1
+    """Processes for each unit: they share the seeds of its priors, or the real systems of its run. With more GPUs than
+    units, a long unit ends sooner. Priors that an earlier command began in one process stay together."""
     minutes: float | None = None
     """Begin no new unit after so many minutes."""
     dry: bool = False
@@ -79,7 +84,7 @@ class Unit(NamedTuple):
 
 def main(args: FrozenArgs) -> None:
     """Does what is missing, then prints the scoreboard; raises UserError if some units failed."""
-    at_least_one(args, "jobs", "priors", "fewer")
+    at_least_one(args, "jobs", "split", "priors", "fewer")
     every = {unit.name: unit for unit in units(args)}
     if args.unit:
         cli.choose("--unit", args.unit, every).work()
@@ -90,7 +95,7 @@ def main(args: FrozenArgs) -> None:
     if args.dry:
         return
     failed = Pool(args, [unit for unit in chosen if unit.state() != "finished"]).work()
-    if any(every[f"{task}/{DEFAULT}"].state() == "finished" for task in TASKS):  # what others are compared with
+    if any(_finished(every, f"{task}/{DEFAULT}") for task in TASKS):  # what others are compared with
         files = tuple(_test_file(task) for task in TASKS)
         print(board(ScoreboardArgs(gaps=files, out=args.out)))
     if failed:
@@ -103,17 +108,19 @@ def main(args: FrozenArgs) -> None:
 def units(args: FrozenArgs) -> Iterator[Unit]:
     """All units, in the order in which they are begun."""
     for preset in dict.fromkeys(preset_of(get_method(method)) for method in EVERYWHERE):
-        for task in TASKS:
-            yield _prior_unit(args, task, preset)
-        if preset == DEFAULT_PRESET:
-            yield from (_prior_unit(args, task, preset) for task in SOFT)
+        for task in (*TASKS, *(SOFT if preset == DEFAULT_PRESET else ())):
+            yield from _prior_units(args, task, preset)
     for method in EVERYWHERE:
-        yield from (_run_unit(args, task, method, (SIM, _test_file(task))) for task in TASKS)
-    yield from (_run_unit(args, task, DEFAULT, (SIM, _test_file(task)), again=True) for task in TASKS)
+        for task in TASKS:
+            yield from _run_units(args, task, method, (SIM, _test_file(task)))
+    for task in TASKS:
+        yield from _run_units(args, task, DEFAULT, (SIM, _test_file(task)), again=True)
     for method in ON_SOFT:
-        yield from (_run_unit(args, task, method, ("default",), few=True) for task in SOFT)
+        for task in SOFT:
+            yield from _run_units(args, task, method, ("default",), few=True)
     for method in (name for name in NAMES if name not in (*EVERYWHERE, *LEFT_OUT)):
-        yield from (_run_unit(args, task, method, two_gaps(task), few=True) for task in TASKS)
+        for task in TASKS:
+            yield from _run_units(args, task, method, two_gaps(task), few=True)
 
 
 def two_gaps(task: str) -> tuple[str, str]:
@@ -129,50 +136,82 @@ def _test_file(task: str) -> Path:
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
-def _priors(args: FrozenArgs, task: str, preset: str) -> PretrainArgs:
+def _prior_sets(args: FrozenArgs, task: str, preset: str) -> list[PretrainArgs]:
+    """The runs that make the priors of a task, with consecutive seeds: one, or as many as --split says."""
     seeds = args.priors if preset == DEFAULT_PRESET and task in TASKS else args.fewer
-    return PretrainArgs(
+    whole = PretrainArgs(
         task=task, preset=preset, seeds=seeds, config=PRESETS[preset], video=False, impl=args.impl, out=args.out
     )
+    if args.split == 1 or (run_folder(whole) / CONFIG).exists():
+        return [whole]
+    bounds = [seeds * i // args.split for i in range(args.split + 1)]
+    return [replace(whole, seed=low, seeds=high - low) for low, high in pairwise(bounds) if high > low]
 
 
-def _prior_unit(args: FrozenArgs, task: str, preset: str) -> Unit:
-    own = _priors(args, task, preset)
-
-    def state() -> State:
-        if (run_folder(own) / _SUMMARY).exists():
-            return "finished"
-        return "unfinished" if (run_folder(own) / CONFIG).exists() else "missing"
-
-    return Unit(_prior_name(task, preset), (), state, lambda: pretrain(replace(own, resume=state() == "unfinished")))
+def _prior_units(args: FrozenArgs, task: str, preset: str) -> Iterator[Unit]:
+    sets = _prior_sets(args, task, preset)
+    for own, name in zip(sets, _part_names(_prior_name(task, preset), len(sets)), strict=True):
+        state = partial(_prior_state, run_folder(own))
+        yield Unit(name, (), state, partial(_make_priors, own, state))
 
 
-def _run_unit(
+def _prior_state(folder: Path) -> State:
+    if (folder / _SUMMARY).exists():
+        return "finished"
+    return "unfinished" if (folder / CONFIG).exists() else "missing"
+
+
+def _make_priors(own: PretrainArgs, state: Callable[[], State]) -> None:
+    pretrain(replace(own, resume=state() == "unfinished"))
+
+
+def _run_units(
     args: FrozenArgs, task: str, method: str, reals: Sequence[str | Path], *, again: bool = False, few: bool = False
-) -> Unit:
+) -> Iterator[Unit]:
     preset = preset_of(get_method(method))
-    own = _priors(args, task, preset)
-    seeds = min(own.seeds, args.fewer) if few else own.seeds
-    shared = GridArgs(
-        tasks=(task,), methods=(method,), reals=gaps.each(tuple(map(str, reals))), seeds=seeds,
-        seed=own.seeds if again else 0, rollouts=ROLLOUTS, eval_every=EVAL_EVERY, impl=args.impl, out=args.out,
-    )  # fmt: skip
+    sets = _prior_sets(args, task, preset)
+    needs = _part_names(_prior_name(task, preset), len(sets))
+    priors = sum(own.seeds for own in sets)
+    every = gaps.each(tuple(map(str, reals)))
+    shares = [every[i :: args.split] for i in range(min(args.split, len(every)))]
+    home = run_folder(sets[0]) if len(sets) == 1 else run_folder(sets[0]).parent
+    changes = {"prior": home, "variant": AGAIN if again else ""}
+    whole = f"{task}/{method}" + (f"-{AGAIN}" if again else "")
+    for share, name in zip(shares, _part_names(whole, len(shares)), strict=True):
+        shared = GridArgs(
+            tasks=(task,), methods=(method,), reals=share, seeds=min(priors, args.fewer) if few else priors,
+            seed=priors if again else 0, rollouts=ROLLOUTS, eval_every=EVAL_EVERY, impl=args.impl, out=args.out,
+        )  # fmt: skip
+        cells = partial(_cells, shared, changes)
+        yield Unit(name, needs, partial(_run_state, cells), partial(_complete, cells, shared, home, priors))
 
-    def cells() -> list[Cell]:
-        runs = (grid.run_of(shared, task, real, method) for real in shared.reals)
-        changes = {"prior": run_folder(own), "variant": AGAIN if again else ""}
-        return [grid.look_up(replace(run, **changes)) for run in runs]
 
-    def state() -> State:
-        states: set[State] = {cell.state for cell in cells()}
-        return states.pop() if len(states) == 1 else "unfinished"
+def _cells(shared: GridArgs, changes: Mapping[str, Any]) -> list[Cell]:
+    (task,), (method,) = shared.tasks, shared.methods
+    return [grid.look_up(replace(grid.run_of(shared, task, real, method), **changes)) for real in shared.reals]
 
-    def work() -> None:
-        if failed := complete(cells(), shared):
-            raise UserError("; ".join(failed))
 
-    name = f"{task}/{method}" + (f"-{AGAIN}" if again else "")
-    return Unit(name, (_prior_name(task, preset),), state, work)
+def _run_state(cells: Callable[[], list[Cell]]) -> State:
+    states: set[State] = {cell.state for cell in cells()}
+    return states.pop() if len(states) == 1 else "unfinished"
+
+
+def _complete(cells: Callable[[], list[Cell]], shared: GridArgs, home: Path, priors: int) -> None:
+    found = len(prior_folders(home, out=shared.out, task=shared.tasks[0], preset=""))
+    if found != priors:  # seeds would start from others than the same seeds of other methods
+        raise UserError(f"{home}: holds {found} priors, not {priors}; move those of other runs away")
+    if failed := complete(cells(), shared):
+        raise UserError("; ".join(failed))
+
+
+def _part_names(name: str, n: int) -> tuple[str, ...]:
+    """What the n processes of a unit are called: the name itself if there is one, else name.1, name.2, ..."""
+    return (name,) if n == 1 else tuple(f"{name}.{i + 1}" for i in range(n))
+
+
+def _finished(every: Mapping[str, Unit], name: str) -> bool:
+    """Whether all processes of a unit are done."""
+    return all(unit.state() == "finished" for own, unit in every.items() if own == name or own.startswith(f"{name}."))
 
 
 def _prior_name(task: str, preset: str) -> str:
@@ -253,7 +292,7 @@ class Pool:
             self._say(f"begun {unit.name}")
 
     def _process(self, unit: Unit, gpu: int) -> subprocess.Popen:
-        words = [f"--{name}={getattr(self.args, name)}" for name in ("priors", "fewer", "impl", "out")]
+        words = [f"--{name}={getattr(self.args, name)}" for name in ("split", "priors", "fewer", "impl", "out")]
         environment = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **os.environ}
         if self.args.gpus:
             environment["CUDA_VISIBLE_DEVICES"] = str(gpu)

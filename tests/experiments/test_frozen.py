@@ -38,10 +38,20 @@ def every(**changes):
     return {unit.name: unit for unit in frozen.units(frozen.FrozenArgs(**changes))}
 
 
+def have_priors(folder, seeds):
+    for seed in seeds:
+        (folder / f"prior/seed-{seed}").mkdir(parents=True)
+        (folder / f"prior/seed-{seed}/prior.json").touch()
+
+
 def played(tmp_path, ran, name, **changes):
     """The arguments of the one run of a unit."""
     unit = every(out=tmp_path, **changes)[name]
     assert unit.state() == "missing"
+    for prior in every(out=tmp_path, **changes).values():
+        if prior.name in unit.needs:
+            own = prior.work.args[0]
+            have_priors(frozen.run_folder(own), range(own.seed, own.seed + own.seeds))
     unit.work()
     assert unit.state() == "finished"
     (args,) = ran
@@ -113,6 +123,41 @@ def test_priors_go_on_where_they_stopped(tmp_path, monkeypatch):
     (folder / "summary.json").touch()
     assert unit.state() == "finished"
     assert [(args.preset, args.seeds, args.resume) for args in seen] == [("robust", 12, False), ("robust", 12, True)]
+
+
+def test_processes_share_the_seeds_of_priors_and_the_systems_of_a_run(tmp_path, ran):
+    found = every(out=tmp_path, split=2)
+    parts = [found[f"hammer/prior-robust-tdmpc2.{i}"].work.args[0] for i in (1, 2)]
+    assert [(own.seed, own.seeds) for own in parts] == [(0, 3), (3, 3)]
+    assert found["hammer/tdmpc2.2"].needs == ("hammer/prior-robust-tdmpc2.1", "hammer/prior-robust-tdmpc2.2")
+    first = played(tmp_path, ran, "hammer/tdmpc2.1", split=2)
+    found["hammer/tdmpc2.2"].work()
+    whole = ("sim", *(f"{frozen._test_file('hammer')}:{name}" for name in gaps.read_file(frozen._test_file("hammer"))))
+    assert sorted(real for args in ran for real in args.real) == sorted(whole) and len(ran) == 2
+    assert {args.seeds for args in ran} == {6} and first.prior == tmp_path / "pretrain/hammer/robust-tdmpc2"
+    assert frozen._finished(found, "hammer/tdmpc2") and not frozen._finished(found, "hammer/sgft-tdmpc2")
+    assert not any(unit.name.startswith("push-ball/mbpo.") for unit in found.values())  # one system
+
+
+def test_no_process_is_without_a_seed(tmp_path):
+    names = [name for name in every(out=tmp_path, split=4, fewer=3) if "push/prior-informed" in name]
+    assert names == [f"push/prior-informed.{i}" for i in (1, 2, 3)]
+
+
+def test_priors_that_one_process_has_begun_stay_together(tmp_path):
+    folder = tmp_path / "pretrain/push/robust/seeds-0-11"
+    folder.mkdir(parents=True)
+    (folder / "config.json").touch()
+    found = every(out=tmp_path, split=2)
+    assert found["push/prior-robust"].state() == "unfinished" and "push/prior-robust.1" not in found
+    assert found["push/sac.1"].needs == ("push/prior-robust",)
+
+
+def test_priors_of_other_runs_are_not_mixed_in(tmp_path, ran):
+    have_priors(tmp_path / "pretrain/insert/robust-tdmpc2/seed-0", [0])
+    with pytest.raises(UserError, match=r"robust-tdmpc2: holds 7 priors, not 6; move those of other runs away"):
+        played(tmp_path, ran, "insert/tdmpc2.1", split=2)
+    assert ran == []
 
 
 def test_a_part_comes_with_the_priors_that_it_needs():
@@ -197,13 +242,13 @@ def test_a_process_does_one_unit_on_its_gpu(tmp_path, monkeypatch):
         return Process(1, 0)
 
     monkeypatch.setattr(frozen.subprocess, "Popen", start)
-    args = frozen.FrozenArgs(out=tmp_path / "a b", gpus=1, priors=3)
-    unit = every(out=args.out)["push/sac"]
+    args = frozen.FrozenArgs(out=tmp_path / "a b", gpus=1, priors=3, split=2)
+    unit = every(out=args.out, split=2)["push/sac.1"]
     frozen.Pool(args, [unit]).work()
     assert seen["words"][1:3] == ["-m", "experiments.frozen"] and seen["env"]["CUDA_VISIBLE_DEVICES"] == "0"
     told = cli.parse(frozen.FrozenArgs, "", seen["words"][3:])
-    assert (told.unit, told.priors, told.out) == ("push/sac", 3, tmp_path / "a b")
-    assert Path(seen["stdout"].name) == args.out / "frozen/push-sac.log"
+    assert (told.unit, told.split, told.priors, told.out) == ("push/sac.1", 2, 3, tmp_path / "a b")
+    assert Path(seen["stdout"].name) == args.out / "frozen/push-sac.1.log"
 
 
 def test_the_command_ends_with_the_scoreboard_and_names_what_failed(tmp_path, ran, monkeypatch, capsys):
@@ -234,7 +279,7 @@ def test_without_the_method_that_others_are_compared_with_there_is_no_scoreboard
 
 def leave_prior(args):
     folder = frozen.run_folder(args)
-    folder.mkdir(parents=True)
+    have_priors(folder, range(args.seed, args.seed + args.seeds))
     (folder / "summary.json").touch()
 
 
@@ -242,6 +287,7 @@ def leave_prior(args):
     ("words", "said"),
     [
         (["--jobs", "0"], "--jobs is 0: must be at least 1"),
+        (["--split", "0"], "--split is 0: must be at least 1"),
         (["--unit", "push/sack"], "did you mean 'push/sac'"),
         (["--only", "pull"], "--only pull: no unit begins like this"),
     ],
