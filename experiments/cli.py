@@ -181,7 +181,8 @@ def set_up() -> None:
     """Compilation cache, GPU flags and quiet logs; before JAX starts. What the user has set stays."""
     if cache := cache_folder():
         os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
-        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "1")
+        # Small programs too: a command compiles hundreds, at 25 ms each.
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
         if (jax := sys.modules.get("jax")) and jax.config.jax_compilation_cache_dir is None:
             jax.config.update("jax_compilation_cache_dir", str(cache))  # it was imported before the environment was set
     # Lets XLA use Triton for any matrix product; without effect on a CPU.
