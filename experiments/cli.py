@@ -10,6 +10,7 @@ import os
 import select
 import subprocess
 import sys
+import traceback
 import typing
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -60,6 +61,9 @@ def run_main[T](
         except Exception as error:
             if said := _disk_trouble(error):
                 fail(f"{said}; when that is mended, the same command with --resume goes on")
+            if _in_renderer_choice(error):
+                chosen = f"MUJOCO_GL={os.environ['MUJOCO_GL']}"
+                fail(f"{chosen}: MuJoCo cannot use that here ({error}); unset it, or set it to disable")
             if not _is_out_of_memory(error):
                 raise
             said = (str(error).strip() or "MemoryError").splitlines()[0]
@@ -73,6 +77,12 @@ def _disk_trouble(error: BaseException | None) -> str | None:
     if _FULL in str(error):  # Orbax has another type for it
         return f"a file of the run: {_FULL.lower()}"
     return None if error is None else _disk_trouble(error.__cause__)
+
+
+def _in_renderer_choice(error: Exception) -> bool:
+    """Whether MuJoCo could not even be imported with the renderer that the user's MUJOCO_GL names."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return bool(os.environ.get("MUJOCO_GL")) and any(frame.filename.endswith("gl_context.py") for frame in frames)
 
 
 def _is_out_of_memory(error: Exception) -> bool:

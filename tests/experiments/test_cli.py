@@ -221,6 +221,16 @@ def test_no_cache_when_switched_off():
     assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
 
 
+def test_a_renderer_that_mujoco_cannot_import_is_one_line():
+    words = [sys.executable, "-m", "experiments.evaluate", "--task", "hammer", "--prior", "docs/priors/hammer/seed-0"]
+    environment = {**os.environ, "MUJOCO_GL": "crayon"}
+    done = subprocess.run(
+        words, env=environment, cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "error: MUJOCO_GL=crayon: MuJoCo cannot use that here (" in done.stderr
+
+
 def test_the_first_backend_that_renders_is_taken(monkeypatch):
     os.environ.pop("MUJOCO_GL", None)
     monkeypatch.setattr(cli, "_probe", {"egl": "no driver", "osmesa": None}.get)
