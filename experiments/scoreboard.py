@@ -13,6 +13,7 @@ from envs import gaps
 from envs.gaps import SIM
 from experiments import cli
 from experiments.gaps_choose import STRATA
+from experiments.options import at_least_one
 from sgft_jax.methods import DEFAULT
 from sgft_jax.types import UserError
 
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     Played = dict[str, dict[str, dict[str, Curve]]]  # by METHOD or METHOD:VARIANT, stratum and "task/gap"
 
 CONTROL = "no gap"
+_EACH = "Start: area / end / deepest fall of the mean below the start, for each gap:"
 _HEAD = (
     "stratum", "method", "gaps", "start", "area", "end", "90 % held", "deepest fall", "loss at the end", "training",
 )  # fmt: skip
@@ -40,6 +42,10 @@ class ScoreboardArgs:
     """Only these tasks; default: all that ran on these gaps."""
     priors: tuple[str, ...] = ()
     """Only runs from these sets of priors, as released tables name them; default: all."""
+    seeds: int | None = None
+    """Only the first so many seeds of each run: methods that ran with fewer are then compared from the same priors."""
+    each: bool = False
+    """Also a table with a line for each gap."""
     data: Path | None = None
     """Folder of released tables to read instead of runs, such as docs/data."""
     out: Path = Path("runs")
@@ -48,6 +54,8 @@ class ScoreboardArgs:
 
 def main(args: ScoreboardArgs) -> None:
     """Prints the tables, writes them, and draws every method on the gaps of each stratum."""
+    if args.seeds is not None:
+        at_least_one(args, "seeds")
     played = played_on(args)
     text = _tables(args, played)
     args.out.mkdir(parents=True, exist_ok=True)
@@ -77,7 +85,31 @@ def _tables(args: ScoreboardArgs, played: "Played") -> str:
         lines = [[d.other, f"{d.ahead} of {d.gaps}", tables.number(d.better)] for d in found]
         head = (f"{args.reference} against", "gaps with at least its area", "P(better), per cent")
         said += ["On gaps that are not solved:", "", tables.markdown(head, lines), ""]
+    if args.each:
+        said += [_EACH, "", _gap_by_gap(played), ""]
     return "\n".join(said).rstrip()
+
+
+def _gap_by_gap(played: "Played") -> str:
+    """A line for each gap, a column for each method, empty where it did not run."""
+    from sgft_jax.analysis import tables
+
+    lines = []
+    for stratum in (CONTROL, *STRATA):
+        runs = {method: each.get(stratum, {}) for method, each in played.items()}
+        for gap in sorted({gap for each in runs.values() for gap in each}):
+            lines.append([gap, stratum, *(_cell(each.get(gap)) for each in runs.values())])
+    return tables.markdown(("gap", "stratum", *played), lines)
+
+
+def _cell(curve: "Curve | None") -> str:
+    from sgft_jax.analysis import scoreboard, tables
+
+    if curve is None:
+        return ""
+    row = scoreboard.row(curve.method, "", {curve.gap: curve})
+    start, area, end = (tables.plain(float(band.estimate), curve.score) for band in (row.start, row.area, row.end))
+    return f"{start}: {area} / {end} / {tables.plain(row.fall, curve.score)}"
 
 
 def _draw(args: ScoreboardArgs, played: "Played") -> Path:
@@ -132,7 +164,7 @@ def _runs_on(args: ScoreboardArgs, strata: Mapping[str, str]) -> "Played":
                     f"{args.data or args.out}: {spec(curve)} ran on {name} with several sets of seeds or priors; keep "
                     "one, or choose with --priors"
                 )
-            own[name] = curve
+            own[name] = curve if args.seeds is None else curve.first(args.seeds)
     return found
 
 

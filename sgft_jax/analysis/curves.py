@@ -81,6 +81,12 @@ class Curve:
         """The same curve for another score; training rollouts are known by the run's own alone."""
         return replace(self, score=score, training=self.training if score == self.score else None)
 
+    def first(self, n: int) -> "Curve":
+        """The same curve with its first n members alone; with all of them where there are fewer."""
+        scores = {name: values[:n] for name, values in self.scores.items()}
+        training = None if self.training is None else self.training[:n]
+        return replace(self, seeds=self.seeds[:n], prior=self.prior[:n], scores=scores, training=training)
+
 
 class Found(NamedTuple):
     """Curves, and a line for each run that was left out or is unfinished."""

@@ -57,6 +57,20 @@ def test_released_tables_say_the_same(home):
         scoreboard.board(replace(args, data=home / "data", priors=("others",)))
 
 
+def test_each_gap_has_a_line_and_fewer_seeds_can_be_asked_for(home):
+    args = ScoreboardArgs((home / "set.toml",), out=home, each=True)
+    said = scoreboard.board(args)
+    assert "| gap | stratum | guarded | sac |" in said
+    assert "| toy/easy | solved | 90: 90 / 90 / 0 | 90: 68 / 80 / 40 |" in said
+    assert "| toy/hard | failed | 10: 75 / 100 / 0 | 10: 31 / 55 / 0 |" in said
+    assert "sim" not in said  # the control, where only a method ran that met no gap
+    first = scoreboard.board(replace(args, seeds=2))
+    assert "| toy/hard | failed | 10: 72 / 100 / 0 | 10: 30 / 50 / 0 |" in first
+    assert scoreboard.board(replace(args, seeds=9)) == said
+    with pytest.raises(UserError, match="--seeds is 0: must be at least 1"):
+        scoreboard.main(replace(args, seeds=0))
+
+
 def test_bad_input(home):
     args = ScoreboardArgs((home / "set.toml",), out=home)
     with pytest.raises(UserError, match=r"--reference mbpo: did not run on these gaps; there are: .*sac"):
