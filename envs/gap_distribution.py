@@ -1,4 +1,4 @@
-"""Distributions of gaps, as data, and drawing from them.
+"""Impure: distributions of gaps, read from TOML files, and drawing from them.
 
 A distribution is a TOML file with a table for each family of differences. A table holds items, domain parameters and
 effects by name, with what they are drawn from, uniformly:

@@ -1,4 +1,4 @@
-"""Gaps: how a "real" system differs from the simulator, as data. Reads TOML and JSON files, writes TOML.
+"""Impure: gaps, how a "real" system differs from the simulator, as data. Reads TOML and JSON files, writes TOML.
 
 A gap names only what differs; everything else stays as in training. `params` fixes domain parameters (or gives them
 another range), also outside the training range; `effects` distorts commands and measurements, see `envs.base.Effects`.

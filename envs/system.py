@@ -1,4 +1,4 @@
-"""Observations that tell which system an episode takes place in: for policies that are told what is identified."""
+"""Observations that end with the parameters of the system, for policies that read an estimate of them."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -35,9 +35,9 @@ def varying(
 
 
 def with_system(env: Env, system: tuple[Varying, ...]) -> Env:
-    """The same task with one more entry at the end of its observation: what `system` lists, as of this episode.
+    """The same task whose observation ends with the numbers listed in `system`, as drawn for the episode: [k].
 
-    Each number is scaled so that its range becomes [-1, 1], and clipped to that. () returns the task as it is.
+    Each number is scaled so that its range becomes [-1, 1], then clipped to it. () returns the task as it is.
     """
     if not system:
         return env
@@ -84,7 +84,7 @@ def blurred(env: Env, noise: float) -> Env:
 
 
 def concealed(env: Env) -> Env:
-    """The same task as a real system, which cannot tell what it is: it tells the middle of every range."""
+    """The same task as a real system, whose parameters are unknown: the last k entries of observations are 0."""
     if not env.system:
         return env
     own_dim = env.obs_dim - len(env.system)

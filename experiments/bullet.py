@@ -38,7 +38,7 @@ class BulletArgs:
     eval_at: tuple[int, ...] = (0, 1, 2, 4, 8, 16, 20)
     """Evaluate after these numbers of rollouts."""
     episodes: int = 50
-    """Of each evaluation, always the same ones."""
+    """Episodes of each evaluation, always the same ones."""
     jobs: int = 1
     """Runs at the same time; each needs a core for the learner and one for the engine."""
     minutes: float | None = None
@@ -46,9 +46,9 @@ class BulletArgs:
     out: Path = Path("runs/bullet")
     """Parent of all run folders."""
     home: Path = HOME
-    """Where the environment of Bullet is, or shall be made."""
+    """Folder of the Python environment with panda-gym; made if it does not exist."""
     python: str = PYTHON
-    """What makes it: a Python 3.11, by default $PYTHON311 or python3.11."""
+    """Python 3.11 that makes this environment, by default $PYTHON311 or python3.11."""
 
 
 class _Run(NamedTuple):

@@ -13,12 +13,12 @@ from sgft_jax.types import UserError
 
 
 class Kind(NamedTuple):
-    """A command whose runs are cells; `args` are its arguments, a frozen dataclass with the field `resume`.
+    """A command whose runs are cells of a grid; `args`: its arguments, a frozen dataclass with the field `resume`.
 
-    name: of its runs, as in their `config.json`. systems: the field of `args` with a tuple of systems: a cell has one,
-    several go into one program. run(args): does it; UserError where it cannot. folder(args), config(args), title(args):
-    of a cell, where its run is, its configuration as stored there, and what to call it. volatile: see `check_same`.
-    finished(args, summary): whether a run that left this `summary.json` is done.
+    name: `kind` in the `config.json` of its runs. systems: the field of `args` that holds a tuple of systems; a cell
+    has one, and one call may run several. run(args): runs them, raises UserError where it cannot. folder(args),
+    config(args), title(args): a cell's run folder, its stored configuration, its name. volatile: see `check_same`.
+    finished(args, summary): whether a run with this `summary.json` is complete.
     """
 
     name: str

@@ -1,9 +1,8 @@
-"""Record data sets of a real system: what a learning policy did up to some level, and what it does then.
+"""Record data sets of a real system in the layouts of D4RL and Minari.
 
-SAC learns in the system itself, in a few environments. When its exploring policy returns --level on average, its whole
-experience is written as `replay`, and episodes of that policy as `medium`: the sets of D4RL, made anew. With --policy
-nothing is learned, and episodes of that policy are written. Files are in the layouts of D4RL and of Minari. With
---operator someone keeps a wheel-legged robot up by hand, and the log is a text file.
+SAC learns in the system itself until its exploring policy returns --level on average. Its whole experience becomes
+`medium-replay`, episodes of the final policy become `medium`, as in D4RL. With --policy, episodes of an existing policy
+are recorded instead. With --operator, a noisy controller keeps a wheel-legged robot upright; its log is a text file.
 """
 
 from collections.abc import Sequence

@@ -37,7 +37,7 @@ class FactorialArgs(GridArgs):
     tasks: tuple[str, ...] = ("push",)
     """Tasks."""
     methods: tuple[str, ...] = (METHOD,)
-    """Has no other value."""
+    """Method of the cells: always sgft-parts."""
     reals: tuple[str, ...] = ("default", "sim")
     """Real systems of every task: gaps by name, sim for no gap, or .toml/.json files."""
     seeds: int = 12
@@ -49,13 +49,13 @@ class FactorialArgs(GridArgs):
     prior: Path | None = None
     """Folder of priors (prior/seed-*); default: those of <out>/pretrain/<task>/<preset>."""
     horizon: int = 4
-    """Horizon of the cells that do not have one of 1."""
+    """Horizon H that is compared with H = 1."""
     anchor: float = 0.0
-    """Of all cells, see `experiments.finetune --options.anchor`."""
+    """The same for all cells: price for leaving the simulator's policy (--options.anchor)."""
     identify: bool = False
-    """Of all cells."""
+    """The same for all cells: --options.identify."""
     guard: bool = False
-    """Of all cells."""
+    """The same for all cells: --options.guard."""
     data: Path | None = None
     """Folder of released tables to read instead of running the cells, such as docs/data."""
 

@@ -83,8 +83,8 @@ class FinetuneArgs:
     start. `rollouts`: the robot waits there until that is done. `steps`: it begins with the policy before, and the new
     one takes over as soon as it is there; not for methods with a guard, which judges rollouts by one policy."""
     sync_every: int = 1
-    """Expert: steps of a robot between two flushes to disk. A killed process loses no step in any case; a power cut
-    may lose so many less one."""
+    """Expert: steps of a robot between two flushes to disk. A killed process loses none; a power cut may lose up to
+    this number minus one."""
     video: bool = True
     """Expert: render an episode before and after fine-tuning side by side, where MuJoCo can render."""
 

@@ -35,17 +35,17 @@ class RealDemoArgs:
     rollouts: int = 8
     """Real rollouts."""
     episodes: int = 20
-    """Of each evaluation: before, after the first rollout and at the end. They are the same ones each time."""
+    """Episodes of each evaluation, always the same ones: before, after the first rollout and at the end."""
     seed: int = 0
-    """Of fine-tuning and of the episodes."""
+    """Seed of fine-tuning and of the episodes."""
     video: bool = True
     """Film some episodes before and after."""
     out: Path = Path("runs/real-demo")
     """Folder of the demo; an earlier demo in it is replaced."""
     home: Path = HOME
-    """Where the environment of Bullet is, or shall be made."""
+    """Folder of the Python environment with panda-gym; made if it does not exist."""
     python: str = PYTHON
-    """What makes it: a Python 3.11, by default $PYTHON311 or python3.11."""
+    """Python 3.11 that makes this environment, by default $PYTHON311 or python3.11."""
 
 
 def main(args: RealDemoArgs) -> None:

@@ -23,18 +23,18 @@ type Part = Literal["kills", "network", "strangers", "disk", "clock"]
 
 @dataclass(frozen=True)
 class ReliabilityArgs:
-    """What to try."""
+    """Which kinds of failure to cause, and how often."""
 
     parts: tuple[Part, ...] = ("kills", "network", "strangers", "disk", "clock")
-    """Kinds of trouble."""
+    """Kinds of failure; the head of this help explains them."""
     runs: int = 10
     """Runs with kills."""
     kills: int = 10
-    """Kills in each."""
+    """Kills in each of these runs."""
     rollouts: int = 10
     """Rollouts of the other runs."""
     seed: int = 0
-    """Of whatever is random."""
+    """Seed of all random choices."""
     out: Path = Path("runs")
     """The numbers go to <out>/reliability/summary.json, what the processes said beside it."""
 

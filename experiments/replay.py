@@ -19,7 +19,7 @@ class ReplayArgs:
     rollout: tuple[int, ...] = ()
     """Their numbers, as those of the files, e.g. --rollout 0 19; default: the last one."""
     seed: int | None = None
-    """Of which seed; default: the first one of the run."""
+    """Seed whose rollouts are shown; default: the first one of the run."""
     out: Path | None = None
     """Folder for the pictures. Default: replay/ inside --run."""
     video: bool = True

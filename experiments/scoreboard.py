@@ -32,7 +32,7 @@ _HEAD = (
 
 @dataclass(frozen=True)
 class ScoreboardArgs:
-    """Which gaps, and who is compared."""
+    """Gaps and methods to compare."""
 
     gaps: tuple[Path, ...]
     """Frozen sets, as `experiments.gaps --choose` writes them."""

@@ -35,9 +35,11 @@ _EVALUATION = 2**31 + 2  # held out from training and from the choice of the pri
 
 
 class Setup(NamedTuple):
-    """What `finetune(*setup, rollouts=...)` takes.
+    """What `finetune(*setup, rollouts=...)` takes, for M members.
 
-    Members [M = gaps * seeds] are the seeds of the first gap, then those of the next; of a `System` its seeds.
+    With gaps M = gaps * seeds: the seeds of the first gap, then those of the next. With a `System` M = seeds.
+    finetuner: the method. system: plays episodes. priors: params [P, ...], None without any. seeds: [M] uint32.
+    simulated: transitions of the simulator, None for a method that uses none.
     """
 
     finetuner: Finetuner
@@ -59,10 +61,11 @@ def setup(
 ) -> Setup:
     """Fine-tuning of seeds on real systems, ready to run.
 
-    real: gaps, which are simulated, or any other `System`, such as `Gymnasium`, with a member for each seed.
-    priors: [P], none of them to start from nothing; seed s starts from prior s modulo P. method: by name or file.
-    seeds: their number, or themselves. options: of the method, by name (`config` instead: all of them).
-    Raises UserError for a prior of another algorithm or task, and for options that do not fit.
+    real: gaps, which are simulated, or one `System`, such as `Gymnasium`, with a member for each seed.
+    priors: one or P of them, or [] to learn from nothing where the method can; seed s starts from prior s modulo P.
+    method: a name, or a Python file. seeds: how many, or a list of them. options: of the method, by name; config: all
+    of them as one object instead.
+    Raises UserError for a prior of another algorithm or task, for a missing prior, and for options that do not fit.
     """
     known = [priors] if isinstance(priors, Prior) else list(priors)
     chosen = get_method(method)

@@ -38,12 +38,12 @@ class Rollouts(NamedTuple):
 
 
 class Beliefs(NamedTuple):
-    """What a prior knows of the world, as closures for one example, in the simulator's observations and actions.
+    """What a prior predicts, as functions of one example, in the simulator's observations and actions.
 
-    value(obs) -> []: V_sim. wish(obs) -> [act_dim]: what its policy does. models: [members, ...], of which
-    after(model, obs, action) -> [obs_dim] is one's successor. drift(obs [k + 1, obs_dim], actions [k, act_dim]) -> [k]
-    error of open-loop predictions, in standard deviations of the observation. reward, terminated: of (obs, action,
-    next_obs). gamma: discount factor.
+    value(obs) -> []: V_sim. wish(obs) -> [act_dim]: the policy's mean action. models: [members, ...]; after(model, obs,
+    action) -> [obs_dim]: the successor that one of them predicts. drift(obs [k + 1, obs_dim], actions [k, act_dim]) ->
+    [k]: error of open-loop predictions, in standard deviations of the observation. reward, terminated: functions of
+    (obs, action, next_obs). gamma: discount factor.
     """
 
     value: Callable[[Array], Array]
@@ -85,13 +85,13 @@ def beliefs_of(params: Any, card: Mapping[str, Any], task: Task) -> Beliefs:
 
 
 def headroom(beliefs: Beliefs, known: Distortion, obs: Array, offsets: Array, horizon: int) -> Array:
-    """[horizon] by how much the best of many ways to act for 1, 2, ... steps exceeds V_sim, in units of reward.
+    """[horizon] by how much the best of n ways to act for 1, 2, ... steps exceeds V_sim(obs), in units of reward.
 
-    max over offsets of E[sum_{t<H} gamma^t r_t + gamma^H V_sim(s_H)] - V_sim(s): V_H^* of the paper over sampled
-    actions; H = 1 is Definition 1. The expectation is over the prior's models, which get what the real system makes of
-    commands, within their bounds. A way to act is the policy's command plus a constant offset.
+    For H steps: max over offsets of E[sum_{t<H} gamma^t r_t + gamma^H V_sim(s_H)] - V_sim(s), the paper's V_H^* over
+    sampled actions; H = 1 is Definition 1. A way to act adds one constant offset to every command of the policy, and
+    clips it to [-1, 1]. E is the mean over the prior's models, which get the action that `known` says a command causes.
 
-    obs: [obs_dim], the simulator's. offsets: [n, act_dim] of commands in [-1, 1].
+    obs: [obs_dim], in the simulator's terms. offsets: [n, act_dim].
     """
     start = beliefs.value(obs)
 

@@ -21,12 +21,13 @@ _AT_ONCE = 32  # of these states, which bounds memory
 
 
 class Look(NamedTuple):
-    """What one prior sees in n rollouts, before any statistics; see `diagnosis`.
+    """Measurements of one prior on n rollouts, before statistics; the functions of `diagnosis` make them.
 
-    known: what identification finds. nats: [] its evidence. values, returns, valid: [n, T]. best: [states, horizon].
-    surprise: [n * T]. errors, plain_errors: [n, windows, HORIZONS] with and without what is known. windows: [n,
-    windows]. late: with what is known. expected, change: [n * T, measured_dim], what a step changes by the model and in
-    fact. In simulation only `late` makes use of what is known. Arrays are JAX's within a program and NumPy's after it.
+    known: the identified distortion; nats: [] its evidence. values, returns, valid: [n, T]. best: [states, horizon] of
+    `headroom`. surprise: [n * T] of `surprises`. errors, plain_errors: [n, windows, HORIZONS] model errors with and
+    without the distortion; windows: [n, windows] bool, those that count. late: of `lateness`. expected, change:
+    [n * T, measured_dim] predicted and measured change of a step. On simulated rollouts only `late` uses the
+    distortion. Arrays are JAX's within a program and NumPy's after it.
     """
 
     known: Distortion

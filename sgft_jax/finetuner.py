@@ -47,9 +47,11 @@ _SIMULATION = Simulation(20_000, 0.6)  # simulated rows that identification comp
 
 
 class FinetuneState(NamedTuple):
-    """learner: the agent. models: the dynamics ensemble in training, or None. frozen: what stays of the prior, or None.
-    transform: the transforms' own state. replay: the real transitions. interface: what is known of how the real system
-    takes commands, or None.
+    """The state of one agent in fine-tuning.
+
+    learner: the agent. models: the dynamics ensemble in training, or None. frozen: parameters of the prior that do not
+    change, or None. transform: states of the transforms. replay: the real transitions. interface: how the real system
+    changes commands and measurements, as far as identified, or None.
     """
 
     learner: PyTree

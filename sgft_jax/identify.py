@@ -1,8 +1,6 @@
-"""What a real system makes of commands (scale, rotation, bias) and of measurements (a constant error), identified
-while something else learns on it.
+"""Identification of how a real system changes commands (scale, rotation, bias) and measurements (constant errors).
 
-The learner acts and learns in the simulator's actions and measurements. What it wants is turned into the command that
-stands for it.
+It runs while another part learns. The learner sees the simulator's actions and measurements; this module translates.
 """
 
 from collections.abc import Callable
@@ -24,9 +22,9 @@ Model = Callable[[PyTree, Array, Array], Array]  # (params, obs, action) -> [mea
 
 
 class Identified(NamedTuple):
-    """params: of the simulator's model. spread: [measured_dim] std of its residuals in simulation.
+    """params: of the simulator's model. spread: [measured_dim] std of its residuals in simulation, raw units.
 
-    distortion: what the real system makes of commands and measurements; none until data say otherwise.
+    distortion: the identified changes; none at all until the evidence exceeds 20 nats.
     """
 
     params: PyTree
@@ -35,10 +33,11 @@ class Identified(NamedTuple):
 
 
 class Interface(NamedTuple):
-    """A part that identifies.
+    """Identification as pure functions.
 
-    start(params of a prior, simulated) -> Identified. refit(identified, rows [n], held [n]) -> Identified after more
-    real rows. meant(identified, batch) -> the batch with its real rows as the simulator would have made them.
+    start(params of a prior, simulated) -> Identified, from simulated rows alone.
+    refit(identified, rows [n], held [n] bool) -> Identified, fitted to the rows that `held` marks.
+    meant(identified, batch) -> the batch, its real rows translated into the simulator's actions and measurements.
     """
 
     start: Callable[[PyTree, SimulatedData], Identified]
@@ -47,7 +46,7 @@ class Interface(NamedTuple):
 
 
 def interface(model: Model, kept: Callable[[PyTree], PyTree], task: Task) -> Interface:
-    """The part for a task. model: predicts its steps. kept: what the model needs of a prior's params."""
+    """Identification for a task. model(params, obs, action) -> [measured_dim]; kept(prior's params) -> its params."""
 
     def start(params: PyTree, simulated: SimulatedData) -> Identified:
         own, rows = jax.tree.map(jnp.copy, kept(params)), simulated.draw(jax.random.key(0), _SIMULATED)

@@ -18,8 +18,8 @@ class PretrainConfig:
     """Everything that decides the result of pretraining, apart from the task, the worlds and the seeds."""
 
     algorithm: Algorithm = "sac"
-    """What trains: SAC, whose V_sim and models SGFT-SAC needs, TD-MPC2 for the methods that plan, or recurrent SAC, for
-    the method of that name."""
+    """What is trained. sac: for all methods but these. tdmpc2: for `tdmpc2`, `sgft-tdmpc2` and `sgft-tdmpc2-code`.
+    recurrent: for `recurrent`."""
     env_steps: int = 8_000_000
     """Environment steps of training, after the random actions."""
     n_envs: int = 4096
@@ -163,8 +163,8 @@ _ROBUST = replace(
     eval_every=10,
 )
 
-# TD-MPC2 in many environments at once, for the methods that plan. Its own numbers but for what massive collection asks
-# for: larger batches, and the discount factor and the exploration of `fast`.
+# TD-MPC2 in many environments at once, for the methods with a world model. It has the authors' numbers, except that
+# many environments need larger batches; discount factor and exploration are those of `fast`.
 _TDMPC2 = PretrainConfig(
     algorithm="tdmpc2",
     n_envs=512,

@@ -133,9 +133,9 @@ def finetune(
     seeds: [M] uint32. simulated: see `simulate`, for methods that ask for it.
     progress: where an earlier run stopped, or None. logged: logs to begin with: all members keep their episodes and
     make `logged.updates` updates, as they learn from real rollouts, before they play.
-    learner: what learns while the system plays, for systems that are stepped, see `Gymnasium.play`; None: this process
-    learns between rollouts. waits: a rollout begins, but makes no step before its policy has been learned: the same
-    results. False: it goes on with the policy before, and the new one takes over at the step at which it is there.
+    learner: a process that learns while the system is reset, for systems that are stepped (`Gymnasium.play`); None:
+    this process learns between rollouts. waits: True holds the first step of a rollout until learning has finished, so
+    results are those without a `learner`. False plays with the old policy until the new one has been learned.
 
     Yields the fresh state with no metrics (unless `progress` is given), then once per part of the offline phase, then
     once per real rollout, all initial ones together; with a `learner` after the next rollout has been played. Metrics

@@ -262,7 +262,7 @@ class Finetuner(NamedTuple):
     init_carry() -> carry of an episode.
     act(state, carry, obs [obs_dim], key, *, explore) -> (action [act_dim], carry); `explore` may be traced.
     observe(state, transitions [T, ...], valid [T], score []) -> state: keeps the rows of one episode, in order. score:
-        of the episode; None where something else has played it, which says nothing of the agent's policies.
+        of the episode; None if another policy has played it, as in a log, so that a guard does not count it.
     learn(state, key, updates, simulated, *, offline) -> (state, metrics averaged over the updates); `updates` and
         `offline` are static. offline: learn from the simulated transitions alone.
     export(state) -> params of the agent as it acts now.

@@ -4,10 +4,11 @@ from envs.base import Env, Value
 
 
 def with_actuators(env: Env) -> Env:
-    """The task in a simulator whose actuators and sensors also differ between episodes, uniform in ranges.
+    """The task with actuators and sensors that differ between episodes, each effect uniform in a range.
 
-    The ranges are `env.actuators`, and for effects that it does not name: scale 0.7 to 1.4 of each command, bias up to
-    0.15, rotation up to 0.3 rad of Cartesian commands, latency up to 0.6 control periods with jitter up to 0.1.
+    `env.actuators` names ranges. Other effects get: scale 0.7 to 1.4 for each command entry, bias -0.15 to 0.15 of the
+    command range [-1, 1], rotation -0.3 to 0.3 rad (Cartesian commands only), latency 0 to 0.6 control periods, jitter
+    0 to 0.1 control periods.
     """
     n, period = env.act_dim, env.control_dt
     ranges: dict[str, Value] = {

@@ -6,8 +6,9 @@ the side of the base, so that the striking face is almost below joint 6: the wea
 below. Nail height means the underside of the head: it touches the board at 0. A head driven deeper sinks in until
 the hammer itself meets the board.
 
-The face meets the nail and the board; handle and wrist meet the board too, a plane, and what lies between them stays
-above it with them. The elbow starts beside high boards, below their height: for it the board is a block with an edge.
+The face meets the nail and the board. For handle and wrist the board is a plane; parts of the arm between the two need
+no contact of their own, because they stay above it. The elbow may start beside a high board and below its top, so for
+the elbow the board is a block with an edge.
 """
 
 import jax
@@ -239,9 +240,9 @@ def _add_rod(body: mujoco.MjsBody, start, end, radius: float, rgba: list[float])
 def _add_nail(spec: mujoco.MjSpec, theta: dict[str, float], board: float) -> None:
     """A nail on a vertical slide; its coordinate is the height of the head's underside above the board.
 
-    MuJoCo's contact solver does not see implicit damping: a nail of 0.05 kg in 2500 N s/m would be a feather to it, and
-    the hammer would sink through the head. Inertia of damping * 2 ms repairs that. The travel per blow does not
-    change, it is momentum / damping, only its first few milliseconds.
+    MuJoCo's contact solver does not see implicit damping. It expects almost no resistance from a nail of 0.05 kg in
+    2500 N s/m, and the hammer would sink through the head. Inertia of damping * 2 ms repairs that. It changes the first
+    few milliseconds of a blow, not its travel, which is momentum / damping.
     """
     half, radius, head = theta["nail_half_height"], theta["nail_radius"], theta["head_radius"]
     thickness, damping = theta["head_thickness"], theta["nail_damping"]

@@ -111,8 +111,10 @@ def held(key: Key) -> PhysicsState:
 
 
 def settled(params: Array, obs: Array) -> PhysicsState:
-    """The state that is seen. An observation tells neither where both fingers are together, which is around the handle
-    if it lies between them, nor the last effort, which the next one replaces.
+    """The state that an observation stands for.
+
+    It does not say by how much both fingers are shifted to one side; they are placed around the handle if it lies
+    between them. The last effort is unknown, too; the next command replaces it.
     """
     turn = obs[14:18] / jnp.linalg.norm(obs[14:18])
     fingers = OPEN - obs[9] / 2 + _shift(obs) * jnp.array([1.0, -1.0])
@@ -261,9 +263,9 @@ def _state(sent: Array, fingers: Array, hammer: Array, *, effort: float) -> Phys
 
 
 def _shift(obs: Array) -> Array:
-    """[] m: how far both fingers are to the left of where they would be alone, so that the handle is between them.
+    """[] m: shift of both fingers to the left that puts the handle between them; 0 where the handle is elsewhere.
 
-    The less, the better; none where the handle is elsewhere.
+    It is the smallest shift that does so.
     """
     axis = turned(obs[14:18], jnp.array([1.0, 0.0, 0.0]))
     off = obs[11:14] - obs[:3]

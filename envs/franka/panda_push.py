@@ -108,12 +108,11 @@ def observe(params: Array, state: PhysicsState) -> dict[str, Array]:
 
 
 def reward(obs: Array, action: Array, next_obs: Array) -> Array:
-    """[]: 1 where the cube is at the mark, less the further away it is, minus up to 0.5 for the fingertip's distance
-    from its place behind the cube. That place is inside of the cube, and within 5 cm of the mark in its middle: no
-    side of it is behind any more.
+    """[]: 1 - tanh(5 d) - tanh(10 e) / 2, for a cube d m from the mark and a fingertip e m from its place.
 
-    Both distances count by their hyperbolic tangent. With a bonus near the mark instead, the way to it was worth less
-    than what a critic errs by, and policies kept away from the cube.
+    That place lies `BEHIND` m behind the cube's centre, seen from the mark. Within 5 cm of the mark it moves to the
+    cube's centre, because no side is then behind the cube. With a bonus near the mark instead of tanh, the gain on the
+    way there was smaller than the critic's error, and policies stayed away from the cube.
     """
     tip, cube, mark = next_obs[:3], next_obs[6:9], next_obs[18:21]
     way = mark - cube

@@ -1,4 +1,4 @@
-"""HalfCheetah-v2 of OpenAI Gym, the system that D4RL was recorded on: half an animal runs along x.
+"""HalfCheetah-v2 of OpenAI Gym, which D4RL recorded: a planar torso with head and two legs runs along x.
 
 Two legs of three joints on a torso of one metre. It cannot fall over sideways, and an episode never ends early. All
 capsules have one density, that which makes the whole weigh 14 kg: a gap that resizes one link changes the mass of all.

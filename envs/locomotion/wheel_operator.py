@@ -1,4 +1,4 @@
-"""Someone who keeps the wheel-legged robot up by hand, badly: whose logs look like those that H2O+ learned from.
+"""A noisy controller that keeps the wheel-legged robot upright; its logs resemble those that H2O+ learned from.
 
 A linear-quadratic controller of the nominal robot aims at a place that wanders, and a correlated torque disturbs it. In
 the gap `robot` its log has about the statistics of the published one (H2O+, arXiv 2309.12716, 83 s of a standing

@@ -1,4 +1,4 @@
-"""Pictures and videos of episodes, drawn by C MuJoCo. Impure: uses a graphics context and writes files.
+"""Impure: pictures and videos of episodes, drawn by C MuJoCo with a graphics context.
 
 Rendering needs a graphics library but no screen: set MUJOCO_GL to egl or osmesa before MuJoCo is first imported.
 """

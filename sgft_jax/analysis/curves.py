@@ -1,4 +1,4 @@
-"""Learning curves: what fine-tuning runs scored on the real system. Reads run folders and released tables.
+"""Impure: learning curves, what fine-tuning runs scored on the real system; reads run folders and released tables.
 
 A curve holds any score (success, return) of several members, one for each seed. Curves as arrays are `Curve.scores`, as
 a flat table `rows`.

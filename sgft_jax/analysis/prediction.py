@@ -10,8 +10,8 @@ from scipy.optimize import nnls
 
 from sgft_jax.analysis.stats import Interval, bootstrap_interval, rank_correlation
 
-AHEAD, LEVEL = 20, 0.9  # rollouts after which the gain is meant, and success that counts as solved
-_SHORT = 40.0  # standard deviations, a shortfall as of a rollout that succeeds every other time
+AHEAD, LEVEL = 20, 0.9  # rollouts over which the gain is predicted; success that counts as solved
+_SHORT = 40.0  # shortfall, in standard deviations, at which the imagined rollout of `inputs_of` is half a success
 _BINS = (0.0, 0.05, 0.2, 0.5, 1.0)  # of predicted gain, for the calibration table
 _PACES = np.linspace(0.5, 20.0, 79)
 

@@ -39,10 +39,10 @@ class Row(NamedTuple):
 
 
 class Duel(NamedTuple):
-    """A reference against another method.
+    """A reference compared with another method.
 
-    gaps: those on which both ran. ahead: on how many of them the reference's mean area is at least the other's. better:
-    probability that a member of it has the larger area, mean over gaps.
+    gaps: number of gaps on which both ran. ahead: on how many the reference's mean area is at least the other's.
+    better: probability that a run of the reference has the larger area, over all pairs of runs, mean over gaps.
     """
 
     other: str
@@ -116,7 +116,7 @@ def _areas(played: Played, gaps: Sequence[str], grid: np.ndarray) -> np.ndarray:
 
 
 def improvement(above: np.ndarray, below: np.ndarray) -> Interval:
-    """P(above > below) of scores [gaps, members] of two methods; ties count half. Intervals draw members of either."""
+    """P(above > below) over all pairs of runs, mean over gaps; [gaps, members] each. Ties count half. Draws members."""
     a, b = above[:, :, None], below[:, None, :]
     wins = ((a > b) + 0.5 * (a == b)).mean(0)  # [members of one, members of the other], mean over gaps
     estimate = np.asarray(wins.mean())

@@ -109,7 +109,7 @@ def probability_of_improvement(above: ArrayLike, below: ArrayLike) -> float:
 def paired_improvement(
     above: ArrayLike, below: ArrayLike, above_priors: ArrayLike, below_priors: ArrayLike
 ) -> Interval:
-    """The same from one prior for both methods, as mean over the priors that they share, with its interval over these.
+    """`probability_of_improvement` within each prior that both methods share; mean over these priors, and its interval.
 
     above, below: [members] of either. above_priors, below_priors: the prior of each. Raises ValueError where none is
     shared.

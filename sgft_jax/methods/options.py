@@ -77,8 +77,8 @@ class KeptCriticOptions(SACOptions):
     """Price of the actor's divergence from the simulator's policy, in reward per nat; 0 = free. Where that policy is
     right already, 0.1 keeps it so (docs/protocol.md)."""
     identify: bool = False
-    """Fit what the real system makes of commands (scale, rotation, bias) to its rollouts, through the prior's models,
-    and command accordingly."""
+    """Estimate from real rollouts, through the prior's models, by which scale, rotation and bias the real system
+    changes commands and by which constant errors its sensors are wrong, and correct for both."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -15,7 +15,7 @@ class Config:
     """Options of `recurrent`."""
 
     initial_rollouts: int = 1
-    """Real rollouts before the first update, which changes nothing here."""
+    """Real rollouts before the first learning phase; the policy does not learn, so results do not depend on it."""
 
     def __post_init__(self) -> None:
         checks.at_least(self, 1, "initial_rollouts")

@@ -10,9 +10,10 @@ from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
 
 @dataclass(frozen=True)
 class Config(SACOptions):
-    """Options of `rlpd`; the defaults are Ball et al. 2023's, but for the temperature and what tuning found better.
+    """Options of `rlpd`; defaults of Ball et al. 2023, except for `alpha`, `lr_critic` and `target_critics`.
 
-    That is the critic's rate (3e-4 there) and the targets (the minimum of two there), see docs/protocol.md.
+    The paper has a critic rate of 3e-4 and targets from the minimum of two critics; tuning changed both
+    (docs/protocol.md). `alpha`: see there.
     """
 
     utd: float = 20.0

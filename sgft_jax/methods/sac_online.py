@@ -9,9 +9,9 @@ from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
 
 @dataclass(frozen=True)
 class Config(KeptCriticOptions):
-    """Options of `sac-online`; the defaults are As et al. 2026's, but for what tuning found better (docs/protocol.md).
+    """Options of `sac-online`; defaults of As et al. 2026, with four changes that tuning made (docs/protocol.md).
 
-    There are 5 updates per transition, rates of 1e-5 and 3e-4 and no `lr_warmup`.
+    The paper has 5 updates per transition, actor and critic rates of 1e-5 and 3e-4, and no `lr_warmup`.
     """
 
     utd: float = 2.0

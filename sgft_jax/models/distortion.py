@@ -47,14 +47,14 @@ class Distortion(NamedTuple):
 
 
 def undone[Rows: (Batch, Transition)](distortion: Distortion, rows: Rows) -> Rows:
-    """Real rows [n] as the simulator would have made them: what was meant and what there was."""
+    """Real rows [n] in the simulator's terms: commands as the actions that they cause, measurements without errors."""
     seen = jax.vmap(distortion.seen)
     action = jax.vmap(distortion.meaning)(rows.action)
     return rows._replace(obs=seen(rows.obs), action=action, next_obs=seen(rows.next_obs))
 
 
 def none(act_dim: int, measured_dim: int) -> Distortion:
-    """Commands are taken as they are meant, and sensors are right."""
+    """The distortion of a system that changes nothing: identity matrix, no bias, no sensor errors."""
     return Distortion(jnp.eye(act_dim), jnp.zeros(act_dim), jnp.zeros(measured_dim))
 
 

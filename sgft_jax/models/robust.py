@@ -9,12 +9,12 @@ import jax.numpy as jnp
 
 from sgft_jax.types import Array
 
-_GUESSES, _FOLLOWED = 128, 6  # begins of a search over entries with many valleys, and how many of them are followed
+_GUESSES, _FOLLOWED = 128, 6  # starting points where the cost has several minima; how many of the best are optimised
 _DEGREES = 3.0  # of freedom of Student's t: no model is right about every step
 
 
 class Found(NamedTuple):
-    """point: [p], the most probable one. evidence: [] nats by which it explains the rows better than 0 does."""
+    """point: [p] of highest posterior probability. evidence: [] nats by which it explains the rows better than 0."""
 
     point: Array
     evidence: Array
@@ -27,7 +27,10 @@ def robust_std(values: Array, held: Array) -> Array:
 
 
 def student_cost(missed: Array, held: Array, scale: Array) -> Array:
-    """[] nats of residuals [n, k] of the rows `held` [n] under Student's t with this scale [k], but for constants."""
+    """[] negative log-likelihood, nats, of residuals [n, k] over the rows `held` [n] under Student's t of scale [k].
+
+    Constants are left out.
+    """
     square = jnp.sum((missed / scale[None]) ** 2, axis=1)
     each = 0.5 * (_DEGREES + missed.shape[1]) * jnp.log1p(square / _DEGREES)
     return jnp.sum(jnp.where(held, each, 0.0))
@@ -49,12 +52,12 @@ def most_probable(
     bound: float | Array = inf,
     guessed: Sequence[int] = (),
 ) -> Found:
-    """The point that explains steps best, by Gauss and Newton under Student's t, whose scale is fitted along.
+    """Maximum a posteriori fit by Gauss-Newton steps under a Student t likelihood, whose scale is fitted too.
 
-    missed(point [p]) -> [n, k] residuals. starts: [s, p] where the search begins. belief: [p] std of the point around 0
-    before any data. change: [n, k] what the steps changed. held: [n] bool, which of them count. spread: [k] the least
-    std that residuals have. bound: on the size of every entry, [] or [p]. guessed: entries of the point in which the
-    cost may have many valleys; the search begins at many values of these, uniform in their bounds.
+    missed(point [p]) -> [n, k] residuals. starts: [s, p] starting points. belief: [p] std of the Gaussian prior around
+    0. change: [n, k] what the steps changed. held: [n] bool, rows that count. spread: [k] lower bound of the residuals'
+    std. bound: of the size of every entry, [] or [p]. guessed: entries in which the cost may have several minima; the
+    search also starts from values drawn uniformly within their bounds.
     """
     weight_of = lambda square: (_DEGREES + spread.shape[0]) / (_DEGREES + square)  # noqa: E731
 
@@ -65,7 +68,7 @@ def most_probable(
         return student_cost(counted(p), held, scale) + 0.5 * jnp.sum((p / belief) ** 2)
 
     def step(p: Array, scale: Array) -> Array:
-        """Of Gauss and Newton, with the weights that make least squares Student's t."""
+        """One Gauss-Newton step, with weights that turn least squares into the Student t likelihood."""
         residual, slope = counted(p) / scale[None], jax.jacfwd(counted)(p) / scale[None, :, None]
         heavy = weight_of(jnp.sum(residual**2, axis=1))[:, None, None] * slope
         with jax.default_matmul_precision("highest"):

@@ -1,4 +1,4 @@
-"""Which system real steps come from, told by a model that is told the system. Pure.
+"""Estimation of system parameters from real steps, by a model that reads the parameters. Pure.
 
 A system is [k] numbers in [-1, 1] with which observations end, see `envs.system`.
 """
@@ -22,19 +22,19 @@ Predict = Callable[[Array, Array], Array]  # (obs [obs_dim], action [act_dim]) -
 
 
 class Estimate(NamedTuple):
-    """mean: [k] of what the system is. std: [k], how sure that is; 0 where the fit does not say."""
+    """mean: [k] estimated parameters in [-1, 1]. std: [k] their uncertainty; 0 where the fit gives none."""
 
     mean: Array
     std: Array
 
 
 def told(obs: Array, system: Array) -> Array:
-    """The observation [obs_dim] with that system [k] at its end."""
+    """The observation [obs_dim] whose last k entries are replaced by the parameters `system` [k]."""
     return jnp.concatenate([obs[: obs.shape[0] - system.shape[0]], system])
 
 
 def unknown(size: int) -> Estimate:
-    """Before any data: the middle of every range."""
+    """The estimate before any data: 0, the middle of every range."""
     return Estimate(jnp.zeros(size), jnp.zeros(size))
 
 

@@ -26,7 +26,7 @@ Observe = Callable[[Any], Any]
 
 
 class Step(NamedTuple):
-    """One step of M members, on the host. Whose episode was over before has neither `valid` nor `invalid`.
+    """One step of M members, on the host. If a member's episode was over, its `valid` and `invalid` are both False.
 
     obs, next_obs: [M, obs_dim], raw units. action: [M, act_dim] in [-1, 1], what was really commanded. command:
     [M, act_dim], what the policy asked for. reward: [M]. terminated, valid: [M] bool. success: [M] int8, -1 where
