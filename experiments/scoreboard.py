@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 CONTROL = "no gap"
 _EACH = "Start: area / end / deepest fall of the mean below the start, for each gap:"
 _HEAD = (
-    "stratum", "method", "gaps", "start", "area", "end", "90 % held", "deepest fall", "loss at the end", "training",
+    "stratum", "method", "gaps", "start", "area", "end", "90 % held at the end", "90 % held ever, after transitions",
+    "deepest fall: zero-shot / own start", "loss at the end", "training",
 )  # fmt: skip
 
 
@@ -72,8 +73,9 @@ def board(args: ScoreboardArgs) -> str:
 def _tables(args: ScoreboardArgs, played: "Played") -> str:
     from sgft_jax.analysis import scoreboard, tables
 
+    curves = [curve for each in played.values() for own in each.values() for curve in own.values()]
     rows = [
-        scoreboard.row(method, stratum, each[stratum])
+        scoreboard.row(method, stratum, each[stratum], curves)
         for stratum in (CONTROL, *STRATA)
         for method, each in played.items()
         if stratum in each
@@ -172,10 +174,22 @@ def _line(row: "Row") -> list[str]:
     from sgft_jax.analysis import tables
 
     scores = [tables.number(band) for band in (row.start, row.area, row.end)]
-    worst = f"{100 * row.fall:.0f} ({row.worst})" if row.fall >= 0.005 else "0"
+    policy = tables.NONE if row.policy_fall != row.policy_fall else f"{100 * row.policy_fall:.0f}"
+    worst = f"{policy} / {100 * row.fall:.0f}" + (f" ({row.worst})" if row.fall >= 0.005 else "")
     training = "" if row.training != row.training else f"{100 * row.training:.0f}"
     held = f"{row.held} of {row.gaps}"
-    return [row.stratum, row.method, str(row.gaps), *scores, held, worst, f"{100 * max(row.loss, 0):.0f}", training]
+    ever = f"{row.reached} of {row.gaps}" + (f", {row.transitions:.0f}" if row.reached else "")
+    return [
+        row.stratum,
+        row.method,
+        str(row.gaps),
+        *scores,
+        held,
+        ever,
+        worst,
+        f"{100 * max(row.loss, 0):.0f}",
+        training,
+    ]
 
 
 if __name__ == "__main__":

@@ -3,13 +3,22 @@
 The prior is the random factor: member i of a curve began from prior i, on every gap, and intervals draw members.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from sgft_jax.analysis.curves import LEVEL, Curve, area, at, common_grid
+from sgft_jax.analysis.curves import (
+    LEVEL,
+    Curve,
+    area,
+    at,
+    common_grid,
+    deepest_fall,
+    transitions_until_held,
+    zero_shot,
+)
 from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean
 from sgft_jax.types import UserError
 
@@ -20,9 +29,11 @@ class Row(NamedTuple):
     """A method on the gaps of one stratum.
 
     gaps: their number. start, area, end: mean score over gaps, with its interval. held: gaps whose mean was at least
-    90 % at the last two evaluations. fall: how far the mean of any gap ever was below its start; worst: that gap.
-    loss: how far the mean of any gap ended below its start. training: mean score of the training rollouts, nan where
-    nobody kept them.
+    90 % at the last two evaluations. reached: gaps whose mean was at any two evaluations in a row; transitions: median
+    over these gaps of the real transitions until the first of the two, nan without any. fall: how far the mean of any
+    gap ever was below its start; worst: that gap. policy_fall: the same below the simulator's policy, nan where that
+    was not evaluated from these priors. loss: how far the mean of any gap ended below its start. training: mean score
+    of the training rollouts, nan where nobody kept them.
     """
 
     method: str
@@ -32,6 +43,9 @@ class Row(NamedTuple):
     area: Interval
     end: Interval
     held: int
+    reached: int
+    transitions: float
+    policy_fall: float
     fall: float
     worst: str
     loss: float
@@ -54,15 +68,20 @@ class Duel(NamedTuple):
 Played = Mapping[str, Curve]  # by gap
 
 
-def row(method: str, stratum: str, played: Played) -> Row:
-    """The line of a method on these gaps. Raises UserError where gaps have different numbers of members."""
-    curves = list(played.values())
+def row(method: str, stratum: str, played: Played, others: Iterable[Curve] = ()) -> Row:
+    """The line of a method on these gaps.
+
+    others: curves of other methods, in which the simulator's policy is looked up where this method begins with plans or
+    with another policy. Raises UserError where gaps have different numbers of members.
+    """
+    curves, others = list(played.values()), list(others)
     if len(sizes := sorted({len(curve.seeds) for curve in curves})) > 1:
         raise UserError(f"{method}: ran with {sizes[0]} seeds on some gaps and with {sizes[-1]} on others")
     grid = common_grid(curves)
     means = {gap: curve.values.mean(0) for gap, curve in played.items()}
     falls = {gap: float(each[0] - each.min()) for gap, each in means.items()}
     worst = max(falls, key=lambda gap: falls[gap])
+    taken = [n for curve in curves if (n := transitions_until_held(curve)) is not None]
     trained = [np.nanmean(curve.training) for curve in curves if curve.training is not None]
     over = lambda scores: bootstrap_interval(np.mean(scores, axis=0), statistic=mean)  # noqa: E731
     return Row(
@@ -73,11 +92,21 @@ def row(method: str, stratum: str, played: Played) -> Row:
         area=over(_areas(played, list(played), grid)),
         end=over([curve.values[:, -1] for curve in curves]),
         held=sum(bool((each[-2:] >= LEVEL).all()) for each in means.values()),
+        reached=len(taken),
+        transitions=float(np.median(taken)) if taken else np.nan,
+        policy_fall=max(_policy_fall(curve, others) for curve in curves),
         fall=falls[worst],
         worst=worst,
         loss=max(float(each[0] - each[-1]) for each in means.values()),
         training=float(np.mean(trained)) if trained else np.nan,
     )
+
+
+def _policy_fall(curve: Curve, others: Sequence[Curve]) -> float:
+    """How far the mean ever was below the simulator's policy; nan where that was not evaluated."""
+    system = lambda one: (one.task, one.gap, one.priors)  # noqa: E731
+    before = zero_shot(curve, [one for one in (curve, *others) if system(one) == system(curve)])
+    return np.nan if before is None else deepest_fall(curve, before)
 
 
 def duel(reference: Played, other: str, played: Played) -> Duel:

@@ -40,11 +40,26 @@ def home(tmp_path):
 def test_strata_falls_and_who_is_ahead(home, capsys):
     scoreboard.main(ScoreboardArgs((home / "set.toml",), out=home))
     said = capsys.readouterr().out
-    assert "| solved | guarded | 1 | 90 | 90 | 90 | 1 of 1 | 0 | 0 |" in said
-    assert "| solved | sac | 1 | 90 | 68 | 80 | 0 of 1 | 40 (toy/easy) | 10 |" in said
-    assert "| failed | guarded | 1 | 10 |" in said and "| 1 of 1 | 0 | 0 |" in said.split("failed | guarded")[1]
+    assert "| solved | guarded | 1 | 90 | 90 | 90 | 1 of 1 | 1 of 1, 0 | 0 / 0 | 0 |" in said
+    assert "| solved | sac | 1 | 90 | 68 | 80 | 0 of 1 | 0 of 1 | 40 / 40 (toy/easy) | 10 |" in said
+    assert "| failed | guarded | 1 | 10 |" in said
+    assert "| 1 of 1 | 1 of 1, 80 | 0 / 0 | 0 |" in said.split("failed | guarded")[1]  # four rollouts of 20 steps
     assert "| sac | 1 of 1 | 100 |" in said and "elsewhere" not in said and "mbpo" not in said
     assert (home / "scoreboard.md").read_text() in said and (home / "scoreboard.png").stat().st_size > 10_000
+
+
+def test_a_method_that_begins_with_plans_also_falls_below_the_policy(home):
+    digests = [f"p{i}" for i in range(4)]
+    curve = ([0.7] * 4, [0.5] * 4, [0.95] * 4)
+    runs_by_hand.save(home, "sgft-mpc", curve, rollouts=(0, 4, 8), real="easy", seeds="seeds-0-3", priors=digests)
+    args = ScoreboardArgs((home / "set.toml",), out=home)
+    assert "| solved | sgft-mpc | 1 | 70 | 66 | 95 | 0 of 1 | 0 of 1 | 40 / 20 (toy/easy) | 0 |" in scoreboard.board(
+        args
+    )
+    runs_by_hand.save(home, "sgft-tdmpc2", curve, rollouts=(0, 4, 8), real="easy", seeds="seeds-0-3", priors=["others"])
+    assert "| solved | sgft-tdmpc2 | 1 | 70 | 66 | 95 | 0 of 1 | 0 of 1 | - / 20 (toy/easy) | 0 |" in scoreboard.board(
+        args
+    )
 
 
 def test_released_tables_say_the_same(home):
