@@ -18,7 +18,6 @@ from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
 from experiments.collect import PAIR, CollectArgs, is_d4rls, name_of, targets, transitions_of
 from experiments.options import seed_list
-from experiments.stacking import member
 from sgft_jax.data import acceptance, logs
 from sgft_jax.data.recording import Joints, Noted, Recorded, cut, of_episodes, of_fleet, write_d4rl, write_minari
 from sgft_jax.hybrid import trainer
@@ -31,6 +30,7 @@ from sgft_jax.io.priors import load_prior, observed_by
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.policies import make_policy
 from sgft_jax.pretraining import seed_keys
+from sgft_jax.stacking import member
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.types import Array, HybridAgent, Policy, PyTree, Transition, UserError
 

@@ -7,12 +7,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import stacking
 from experiments.cli import columns
 from experiments.diagnose import DiagnoseArgs
 from experiments.diagnose_run import load, play_simulated, read
 from experiments.options import prior_folders
 from experiments.rollouts import config_of
+from sgft_jax import stacking
 from sgft_jax.analysis import prediction, tables
 from sgft_jax.analysis.curves import read_curve
 from sgft_jax.analysis.prediction import AHEAD, Cases, Inputs

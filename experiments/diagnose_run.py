@@ -13,14 +13,13 @@ from envs import gaps
 from envs.base import Env
 from envs.gaps import SIM, Gap
 from envs.rollout import Episode
-from experiments import stacking
 from experiments.cli import columns
 from experiments.diagnose import DiagnoseArgs
 from experiments.gaps_run import systems
 from experiments.real_systems import connect, is_robot, is_stepped, title
-from experiments.recorded import Recorded
+from experiments.recorded import RecordedSystem
 from experiments.rollouts import config_of
-from sgft_jax import api
+from sgft_jax import api, stacking
 from sgft_jax.analysis import figures, prediction, stats, tables, verdict
 from sgft_jax.analysis.curves import last_start
 from sgft_jax.analysis.verdict import Names
@@ -164,7 +163,7 @@ def _play_real(env: Env, args: DiagnoseArgs, priors: list[Prior], n: int, store:
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(_SEED), args.seed), len(store))
     keys = jnp.broadcast_to(jax.random.split(key, n), (len(priors), n))
     members = stacking.stack([prior.params for prior in priors])
-    kept = Recorded(system, [store], done=len(store), sync_every=1 if is_robot(args.real) else None)
+    kept = RecordedSystem(system, [store], done=len(store), sync_every=1 if is_robot(args.real) else None)
     try:
         played = kept.play(make_policy(priors[0].card, env), members, keys, explore=True)
     finally:

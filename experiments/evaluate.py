@@ -78,11 +78,11 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
 
     import envs
     from experiments.evaluation import describe, play
-    from experiments.recorded import Recorded
-    from experiments.stacking import member, part, stack
+    from experiments.recorded import RecordedSystem
     from sgft_jax.io.priors import load_priors, observed_by
     from sgft_jax.io.real import RealStore
     from sgft_jax.policies import make_policy
+    from sgft_jax.stacking import member, part, stack
 
     env = envs.make(task, args.impl, **observed_by(folders))
     found = [None if real == SIM else described(env, real, args.set) for real in args.real]
@@ -98,7 +98,7 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
             system = _simulated(env, found, key_worlds, args.episodes, members=len(priors), gamma=card["gamma"])
         if is_robot(args.real[0]):  # what it does is kept
             store = RealStore(args.out / "evaluate" / env.name / REMOTE)
-            system = Recorded(system, [store], done=len(store), explore=False, sync_every=1)
+            system = RecordedSystem(system, [store], done=len(store), explore=False, sync_every=1)
         played = play(system, make_policy(card, env), members, key_episodes, args.episodes)
 
     def of_system(i: int) -> dict[str, Any]:
@@ -116,7 +116,7 @@ def _simulated(env: Any, found: Sequence[Gap | None], key: Any, episodes: int, *
     import jax.numpy as jnp
 
     from envs.pools import heldout_worlds, padded, real_env
-    from experiments.stacking import stack
+    from sgft_jax.stacking import stack
     from sgft_jax.systems.simulated import Simulated
 
     real = real_env(env, [gap for gap in found if gap])

@@ -11,7 +11,6 @@ import numpy as np
 from envs.base import Env, World
 from envs.gaps import Gap
 from envs.rollout import Episode
-from experiments.stacking import member
 from experiments.video import before_and_after
 from sgft_jax.analysis import figures, tables
 from sgft_jax.analysis.curves import Curve, deepest_fall, describe, read_curve
@@ -19,6 +18,7 @@ from sgft_jax.io import checkpoint
 from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
 from sgft_jax.io.priors import save_prior
 from sgft_jax.io.real import RealStore
+from sgft_jax.stacking import member
 from sgft_jax.train import FinetuneProgress
 from sgft_jax.types import Metrics, Prior, PyTree
 

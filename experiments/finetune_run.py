@@ -17,8 +17,7 @@ from experiments import cli, logged, real_systems
 from experiments.evaluation import scores
 from experiments.finetune_args import VOLATILE, FinetuneArgs, run_folder
 from experiments.finetune_record import Record, evaluation_store
-from experiments.recorded import Recorded
-from experiments.stacking import join, part
+from experiments.recorded import RecordedSystem
 from sgft_jax import api, mesh, train
 from sgft_jax.api import Setup
 from sgft_jax.data.logs import Log
@@ -29,6 +28,7 @@ from sgft_jax.io.progress import RunProgress
 from sgft_jax.learner_process import LearnerProcess
 from sgft_jax.methods import get_method
 from sgft_jax.methods.options import card_of
+from sgft_jax.stacking import join, part
 from sgft_jax.systems.gymnasium import Gymnasium
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import FinetuneProgress, Logged
@@ -139,7 +139,7 @@ class _Run:
         progress = self._restore()
         done = int(progress.rollouts) if progress else 0
         stores = [record.real for record in self.records]
-        recorded = Recorded(self.system, stores, done=done, sync_every=self.sync_every)
+        recorded = RecordedSystem(self.system, stores, done=done, sync_every=self.sync_every)
         steps = train.finetune(
             *self.setup._replace(system=recorded), rollouts=self.args.rollouts, progress=progress, learner=self.learner,
             waits=self.args.hand_over == "rollouts", logged=self._logged(),
@@ -201,7 +201,7 @@ class _Run:
         system = self.system
         if isinstance(system, Gymnasium):  # its episodes are real ones, and as dear as those of training
             stores = [evaluation_store(record.folder, done) for record in self.records]
-            system = Recorded(system, stores, done=0, explore=False, sync_every=self.sync_every)
+            system = RecordedSystem(system, stores, done=0, explore=False, sync_every=self.sync_every)
         played = train.evaluate(self.finetuner, system, progress.agent, self.seeds, self.episodes)
         found = scores(played)
         for record, own in self._each(found):

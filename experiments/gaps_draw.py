@@ -15,12 +15,12 @@ from envs.gaps import SIM, Gap
 from envs.history import with_previous_actions
 from envs.rollout import Episode
 from envs.system import concealed
-from experiments import gaps_choose, stacking
+from experiments import gaps_choose
 from experiments.cli import columns
 from experiments.evaluation import play
 from experiments.gaps import GapsArgs
 from experiments.gaps_run import FINAL_SEED, episode_key, percent, rate, systems, train
-from sgft_jax import api
+from sgft_jax import api, stacking
 from sgft_jax.analysis import stats
 from sgft_jax.finetuner import command_interface
 from sgft_jax.identify import Identified, Interface

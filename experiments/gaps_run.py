@@ -14,11 +14,11 @@ from envs.base import Env, World
 from envs.gaps import Gap
 from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
-from experiments import stacking
 from experiments.cli import columns
 from experiments.evaluation import best_of, describe, play, scores
 from experiments.gaps import GapsArgs
 from experiments.memory import reserve
+from sgft_jax import stacking
 from sgft_jax.analysis import stats, tables
 from sgft_jax.io.log import MetricsLog, write_summary
 from sgft_jax.io.priors import load_priors, observed_by

@@ -20,7 +20,6 @@ from experiments import logged
 from experiments.evaluation import SCORES, play, scores
 from experiments.hybrid_args import NO_SIMULATOR, VOLATILE, HybridArgs, gaps_of, run_folder
 from experiments.memory import reserve
-from experiments.stacking import join, member, part
 from experiments.video import film
 from sgft_jax.data import logs
 from sgft_jax.hybrid import trainer
@@ -33,6 +32,7 @@ from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_su
 from sgft_jax.io.priors import save_prior
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.pretraining import seed_keys
+from sgft_jax.stacking import join, member, part
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.types import HybridMethod, Metrics, Prior, PyTree, RealData, UserError
 

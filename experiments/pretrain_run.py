@@ -19,13 +19,13 @@ from envs.gaps import SIM, Gap
 from envs.pools import heldout_worlds, load_gap, real_env, training_worlds
 from envs.rollout import Episode
 from envs.system import blurred, varying, with_system
-from experiments import hosts, stacking
+from experiments import hosts
 from experiments.evaluation import best_of, describe, play, scores
 from experiments.memory import reserve
 from experiments.pretrain import PretrainArgs, run_folder
 from experiments.report import Report, make_report, numbers
 from experiments.video import film
-from sgft_jax import mesh
+from sgft_jax import mesh, stacking
 from sgft_jax.analysis import figures
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.jsonfile import jsonable

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.rollout import Episode
-from experiments.stacking import join, part
 from sgft_jax.io.real import RealStore
+from sgft_jax.stacking import join, part
 from sgft_jax.systems import System
 from sgft_jax.systems.gymnasium import Gymnasium, Step
 from sgft_jax.types import Key, PyTree, Transition, UserError
@@ -19,7 +19,7 @@ _FACTS = tuple(name for name in Episode._fields if name != "transitions")
 _BESIDE = ("late", "time")  # what is kept of a robot's steps beside transitions, see `Step`
 
 
-class Recorded:
+class RecordedSystem:
     """A `System` that stores episodes, and replays those stored already instead of playing them again.
 
     A run that was killed after its last checkpoint learns from what the robot has done since, and repeats nothing.

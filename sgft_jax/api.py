@@ -24,6 +24,7 @@ from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.methods.options import card_of
 from sgft_jax.policies import make_policy
 from sgft_jax.presets import preset_of
+from sgft_jax.stacking import stack
 from sgft_jax.systems import System
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import FinetuneProgress, SimulatedRows
@@ -81,7 +82,7 @@ def setup(
         found = [real] if isinstance(real, Gap) else list(real)
         gamma, copies = card_of(known[0] if known else None)["gamma"], len(found)
         system = _simulated_systems(env, found, len(numbers), gamma=gamma)
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *[prior.params for prior in known]) if known else None
+    stacked = stack([prior.params for prior in known]) if known else None
     members = jnp.tile(jnp.array(list(numbers), jnp.uint32), copies)
     return Setup(finetuner, system, stacked, members, _simulated_rows(env, finetuner, known, stacked))
 

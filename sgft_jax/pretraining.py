@@ -19,6 +19,7 @@ from sgft_jax.models import normalizer
 from sgft_jax.models.networks import precision
 from sgft_jax.presets import PretrainConfig
 from sgft_jax.recipes import RECIPES
+from sgft_jax.stacking import stack
 from sgft_jax.types import Array, Batch, Key, Metrics, Prior, PyTree, Transition
 
 _WORLDS, _RANDOM, _START = range(3)  # purposes, folded into a seed's key
@@ -116,7 +117,7 @@ def training_pools(
     @functools.lru_cache(maxsize=1)  # worlds take long to compile
     def pools(number: int) -> World:
         keys = world_keys(seeds, number)
-        return _stack([env.make_worlds(domain.sample(domain.init(), key, config.worlds)) for key in keys])
+        return stack([env.make_worlds(domain.sample(domain.init(), key, config.worlds)) for key in keys])
 
     return pools
 
@@ -387,7 +388,3 @@ def _ended(after: EnvState) -> Array:
 def seed_keys(seeds: Sequence[int] | Array, purpose: int) -> Key:
     """Keys [M] that depend on nothing but the seed and a number that stands for the purpose."""
     return jax.vmap(lambda seed: jax.random.fold_in(jax.random.key(seed), purpose))(jnp.asarray(seeds, jnp.uint32))
-
-
-def _stack(trees: Sequence[PyTree]) -> PyTree:
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)

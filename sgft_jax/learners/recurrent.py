@@ -25,6 +25,7 @@ from sgft_jax.models.networks import (
     tanh_gaussian_action,
     tanh_gaussian_sample,
 )
+from sgft_jax.stacking import stack
 from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree
 
 
@@ -165,7 +166,7 @@ def _update(
 
     def remembered(*memories: PyTree) -> list[tuple[Array, Array]]:
         """For each memory what it hands on before and after each step, [B * T, features] each."""
-        stacked = jax.tree.map(lambda *x: jnp.stack(x), *memories)
+        stacked = stack(memories)
         windows = jax.vmap(parts.memory.along, (None, 0, 0))
         return [(_flat(x[:, :-1]), _flat(x[:, 1:])) for x in jax.vmap(windows, (0, None, None))(stacked, previous, obs)]
 
