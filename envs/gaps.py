@@ -39,11 +39,18 @@ class Gap(NamedTuple):
     stratum: str = ""
 
 
-def presets(task: str) -> dict[str, Gap]:
-    """The gaps that come with a task, by name; none if it has no file of them."""
-    file = resources.files("envs") / "gaps" / f"{task}.toml"
-    tables = tomllib.loads(file.read_text()) if file.is_file() else {}
-    return {name: _parse(name, table, where=f"{task}.toml [{name}]") for name, table in tables.items()}
+def presets(task: str, *, variants: bool = True) -> dict[str, Gap]:
+    """The gaps that come with a task, by name; none if it has no file of them.
+
+    variants: also those of envs/gaps/variants/, each another one of the task changed in a detail. Comparisons leave
+    them out unless they are named.
+    """
+    folder = resources.files("envs") / "gaps"
+    files = [folder / f"{task}.toml", *([folder / "variants" / f"{task}.toml"] if variants else [])]
+    tables = [tomllib.loads(file.read_text()) for file in files if file.is_file()]
+    return {
+        name: _parse(name, table, where=f"{task}.toml [{name}]") for found in tables for name, table in found.items()
+    }
 
 
 def read_file(path: str | Path) -> dict[str, Gap]:

@@ -155,6 +155,13 @@ def test_what_cannot_be_built_is_refused_before_it_is(scene, params, words):
         gaps.from_dict(env, "g", {"params": params})
 
 
+def test_variants_are_presets_that_can_be_left_out():
+    plain, every = gaps.presets("walker2d", variants=False), gaps.presets("walker2d")
+    assert [name for name in every if name not in plain] == ["broken-thigh-range-only", "flexible-thigh-range-only"]
+    assert gaps.find("walker2d", "broken-thigh-range-only").params == {"thigh_range": 0.5}
+    assert gaps.presets("halfcheetah", variants=False) == gaps.presets("halfcheetah")
+
+
 @pytest.mark.parametrize("task", envs.TASKS)
 def test_all_presets_are_possible(task):
     env = envs.make(task, "c")
