@@ -77,7 +77,8 @@ class H2OPlusHyper(NamedTuple):
     lr_*: Adam learning rates. tau: target averaging rate.
     alpha: initial (or fixed) temperature; entropy_per_dim: target entropy / act_dim, nats.
     value_share: lambda, share of the bootstrap from V; 0 is SAC on both sources, 1 never asks the policy.
-    expectile: of the value loss "iql". value_alpha: scale of the others, in units of return.
+    expectile: of the value loss "iql". value_alpha: scale of the others, in units of return. value_cut: largest
+    exponent of "eql" and "xql".
     """
 
     lr_actor: float | Array = 3e-4
@@ -91,6 +92,7 @@ class H2OPlusHyper(NamedTuple):
     value_share: float | Array = 0.1
     expectile: float | Array = 0.7
     value_alpha: float | Array = 1.0
+    value_cut: float | Array = 5.0
 
 
 class H2OPlusState(struct.PyTreeNode):
@@ -229,7 +231,10 @@ def _step_value(config: H2OPlusConfig, parts: _Parts, state: H2OPlusState, batch
 
     def loss(params: PyTree) -> tuple[Array, Array]:
         values = jax.vmap(parts.value.apply, (None, 0))(params, batch.obs)
-        each = value_loss(config.value_loss, values, q, counted, expectile=hyper.expectile, alpha=hyper.value_alpha)
+        each = value_loss(
+            config.value_loss, values, q, counted,
+            expectile=hyper.expectile, alpha=hyper.value_alpha, cut=hyper.value_cut,
+        )  # fmt: skip
         return losses.real_mean(each, batch), values
 
     (mean, values), grads = jax.value_and_grad(loss, has_aux=True)(state.value.params)

@@ -24,6 +24,8 @@ class Config(HybridOptions):
     """Of the value loss `iql`."""
     value_alpha: float = 1.0
     """Scale of the other value losses, in units of return."""
+    value_cut: float = 5.0
+    """Of the value losses `eql` and `xql`: the largest exponent, an advantage in units of that scale."""
     ratio: bool = True
     """Weigh simulated errors by the ratio of the dynamics; off: they count like real ones."""
     standardise: bool = False
@@ -32,7 +34,7 @@ class Config(HybridOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.share(self, "value_share", "expectile")
-        checks.positive(self, "value_alpha")
+        checks.positive(self, "value_alpha", "value_cut")
 
 
 def build(config: Config, task: Task, *, critics: int = 2, diversity: float = 0.0) -> HybridAgent:
@@ -58,6 +60,13 @@ def build(config: Config, task: Task, *, critics: int = 2, diversity: float = 0.
 
 
 _PAPER = Config()
+# With the numbers of their own authors' code for locomotion. XQL has some for each data set; these are its one setting
+# for all of them. Source: IVR (SQL, EQL: run_mujoco.sh), XQL (offline/reproduce/mujoco); cross_domain.md, section 4.
+_BACKBONES = {
+    "sql": replace(_PAPER, value_loss="sql", value_alpha=1.0),
+    "eql": replace(_PAPER, value_loss="eql", value_alpha=2.0, value_cut=5.0),
+    "xql": replace(_PAPER, value_loss="xql", value_alpha=2.0, value_cut=7.0),
+}
 METHOD = HybridMethod(
     "h2oplus",
     "hybrid",
@@ -67,6 +76,9 @@ METHOD = HybridMethod(
         "paper": _PAPER,
         "released": replace(_PAPER, value_share=0.5, expectile=0.5),
         "released-robot": replace(_PAPER, expectile=0.9, hidden=(32, 32), rows=16),
+        "no-ratio": replace(_PAPER, ratio=False),
+        **{f"lambda-{share:g}": replace(_PAPER, value_share=share) for share in (0.0, 0.2, 0.5, 1.0)},
+        **_BACKBONES,
     },
     build,
 )

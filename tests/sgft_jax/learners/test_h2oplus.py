@@ -296,6 +296,15 @@ def test_diversity_counts_the_gradients_of_the_real_pairs_alone(key):
     assert equal((without.actor, without.value), (apart.actor, apart.value))
 
 
+def test_the_cut_off_is_a_number_of_the_agent(key):
+    """Exponents that end at 0.5 give another value loss than those that end at 7."""
+    config = h2oplus.H2OPlusConfig(3, 2, network=BODY, ratio=False, tune_alpha=False, value_loss="xql")
+    learner, batch = compiled(config), batch_of(key)
+    state = told_apart(learner, key)
+    far, near = (learner.update(with_hyper(state, value_cut=cut), batch, key)[1]["value/loss"] for cut in (7.0, 0.5))
+    assert abs(far - near) > 0.01
+
+
 # --- learning -------------------------------------------------------------------------------------------------------
 
 

@@ -1,5 +1,7 @@
 """Value losses: numbers by hand, minimisers by their equations, and what cut-off and shift do to gradients."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +11,7 @@ from sgft_jax.learners import value_losses
 from sgft_jax.types import UserError
 
 f = jnp.float32
-NUMBERS = {"expectile": 0.7, "alpha": 1.0}
+NUMBERS = {"expectile": 0.7, "alpha": 1.0, "cut": 5.0}
 
 
 def of_row(kind, y, **numbers):
@@ -48,9 +50,9 @@ def test_sparse_by_hand():
 
 @pytest.mark.parametrize("loss", [value_losses.exponential_loss, value_losses.gumbel_loss])
 def test_exponential_by_hand(loss):
-    assert loss(f(1.0), f(1.0), f(0.0), alpha=2.0) == 1.0  # exp(0) - 0
-    assert loss(f(1.0), f(3.0), f(0.0), alpha=2.0) == pytest.approx(np.e - 1, rel=1e-6)  # 1.718
-    assert loss(f(1.0), f(3.0), f(1.0), alpha=2.0) == pytest.approx((np.e - 1) / np.e, rel=1e-6)
+    assert loss(f(1.0), f(1.0), f(0.0), alpha=2.0, cut=5.0) == 1.0  # exp(0) - 0
+    assert loss(f(1.0), f(3.0), f(0.0), alpha=2.0, cut=5.0) == pytest.approx(np.e - 1, rel=1e-6)  # 1.718
+    assert loss(f(1.0), f(3.0), f(1.0), alpha=2.0, cut=5.0) == pytest.approx((np.e - 1) / np.e, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -76,30 +78,30 @@ def test_the_shift_does_not_move_the_minimiser_and_bounds_the_loss(kind):
     """exp(y) of these rows would be 148; shifted, no row is above 1 + 5 exp(-5)."""
     each = value_losses.value_loss(kind, jnp.zeros(3), jnp.array([0.0, 4.0, 30.0]), jnp.ones(3, bool), **NUMBERS)
     assert jnp.all(each <= 1.0 + 1e-6)
-    shifts = [
-        value_losses.shift_of(jnp.zeros(2), jnp.array(q), jnp.ones(2, bool), alpha=1.0) for q in ([0.0, 3], [9.0, 0])
-    ]
+    shift = partial(value_losses.shift_of, alpha=1.0, cut=5.0)
+    shifts = [shift(jnp.zeros(2), jnp.array(q), jnp.ones(2, bool)) for q in ([0.0, 3], [9.0, 0])]
     assert [float(x) for x in shifts] == [3.0, 5.0]
-    far_below = value_losses.shift_of(jnp.zeros(2), jnp.full(2, -50.0), jnp.ones(2, bool), alpha=1.0)
+    far_below = shift(jnp.zeros(2), jnp.full(2, -50.0), jnp.ones(2, bool))
     assert far_below == -1.0 and np.isfinite(total(kind, f(0.0), [-50.0, -40.0]))
-    through = jax.grad(lambda v: value_losses.shift_of(v * jnp.ones(2), jnp.ones(2), jnp.ones(2, bool), alpha=1.0))
+    through = jax.grad(lambda v: shift(v * jnp.ones(2), jnp.ones(2), jnp.ones(2, bool)))
     assert through(f(0.0)) == 0.0
 
 
 def test_rows_that_do_not_count_do_not_shift():
     counted = jnp.array([True, False])
-    assert value_losses.shift_of(jnp.zeros(2), jnp.array([1.0, 4.0]), counted, alpha=1.0) == 1.0
+    assert value_losses.shift_of(jnp.zeros(2), jnp.array([1.0, 4.0]), counted, alpha=1.0, cut=5.0) == 1.0
 
 
-def test_gradients_above_the_cut():
-    """d/dV of EQL is exp(-shift) / alpha, of XQL nothing; a little below they agree: -exp(y) + 1."""
+@pytest.mark.parametrize("cut", [5.0, 7.0])
+def test_gradients_above_the_cut(cut):
+    """d/dV of EQL is exp(-shift) / alpha, of XQL nothing; below they agree: -exp(y) + 1."""
     slope = {
-        name: jax.grad(lambda v, loss=loss: loss(v, f(9.0), f(0.0), alpha=1.0))
+        name: jax.grad(lambda v, loss=loss: loss(v, f(9.0), f(0.0), alpha=1.0, cut=cut))
         for name, loss in (("eql", value_losses.exponential_loss), ("xql", value_losses.gumbel_loss))
     }
     assert slope["eql"](f(0.0)) == 1.0 and slope["xql"](f(0.0)) == 0.0
     for each in slope.values():
-        assert each(f(8.0)) == pytest.approx(1 - np.e, rel=1e-6)
+        assert each(f(9.1 - cut)) == pytest.approx(1 - np.exp(cut - 0.1), rel=1e-5)
         assert np.isfinite(each(f(-1000.0)))
 
 
