@@ -5,6 +5,7 @@ without data once for each simulator. Cells that are finished are left alone, be
 same command, given again, does what is missing. All simulators and seeds of a method and data set share one program.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -14,11 +15,21 @@ from envs.gaps import SIM
 from experiments import cells, cli
 from experiments.cells import Cell, Kind, check_begun, complete
 from experiments.hybrid import arguments, hybrid
-from experiments.hybrid_args import DEFAULT, NO_DATA, VOLATILE, HybridArgs, data_name, gaps_of, run_folder
+from experiments.hybrid_args import (
+    DEFAULT,
+    NO_DATA,
+    VOLATILE,
+    HybridArgs,
+    SchedulePreset,
+    data_name,
+    gaps_of,
+    run_folder,
+)
 from experiments.options import Impl, at_least_one, check_task, seed_list, without_repeats
 from sgft_jax import extend
 from sgft_jax.hybrid.methods import NAMES, get_method
-from sgft_jax.hybrid.schedule import Schedule
+from sgft_jax.hybrid.presets import say_preset
+from sgft_jax.hybrid.schedule import FLEET, SCHEDULES, Schedule, describe, name_of
 from sgft_jax.io.jsonfile import jsonable, read_json
 from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
 from sgft_jax.types import UserError, unknown
@@ -30,8 +41,9 @@ _SCORES = {"late": "mean of the last ten evaluations", "last": "last evaluation"
 LEGEND = (
     "Scores in the real system ({score}), mean and standard deviation over {seeds} seeds. Means over simulators{scale} "
     "have a 95 % bootstrap interval that draws seeds within every simulator. P(better): a random seed of {reference} "
-    "against one of the other method, mean over simulators. Intervals need three seeds. The data sets are what the "
-    "files hold: numbers on sets that were made anew do not belong beside published ones."
+    "against one of the other method, mean over simulators. Intervals need three seeds. Every run made {schedule}; "
+    "methods without a simulator made the updates alone. The data sets are what the files hold: numbers on sets that "
+    "were made anew do not belong beside published ones."
 )
 
 
@@ -42,10 +54,11 @@ class CompareHybridArgs:
     task: str = "halfcheetah"
     """A task by name, or a Python file with a task of your own."""
     methods: tuple[str, ...] = NAMES
-    """Methods in the order in which they run, as METHOD or METHOD:PRESET; the latter is a variant of that name."""
+    """Methods in the order in which they run, as METHOD or METHOD:PRESET; the latter is a variant of that name. rebrac
+    alone takes on each data set the preset that the file's name contains, if there is one."""
     gaps: tuple[str, ...] = ()
     """How simulators differ from the real system: gaps by name, .toml/.json files, or sim for no gap; default: all that
-    come with the task."""
+    come with the task but variants of others, for halfcheetah and walker2d H2O+'s nine and seven."""
     data: tuple[Path, ...] = ()
     """The real data: files or folders, as `--data` of experiments.hybrid takes them (docs/data.md)."""
     real: str = SIM
@@ -54,6 +67,7 @@ class CompareHybridArgs:
     """Last actions that end the observation, for data of a policy that sees them."""
     seeds: int = 5
     """Number of seeds of each run."""
+    schedule_preset: SchedulePreset = FLEET
     schedule: Schedule = field(default_factory=Schedule)
     score: Literal["late", "last"] = "late"
     """What tables show of a run: the mean of its last ten evaluations, or its last one."""
@@ -82,8 +96,9 @@ def _system(args: HybridArgs) -> str:
 
 
 def _title(args: HybridArgs) -> str:
-    learnt_from = [_gap_of(args), _data_of(args)]
-    return f"{'/'.join(filter(None, [extend.name_of(args.task), *learnt_from]))}: {_spec(args)}"
+    method, learnt_from = get_method(args.method), [_gap_of(args), _data_of(args)]
+    chosen = f", {say_preset(method, args.preset, _data_of(args))}" if method.by_data and not args.variant else ""
+    return f"{'/'.join(filter(None, [extend.name_of(args.task), *learnt_from]))}: {_spec(args)}{chosen}"
 
 
 def _spec(args: HybridArgs) -> str:
@@ -114,7 +129,7 @@ HYBRID = Kind(
 
 def main(args: CompareHybridArgs) -> None:
     """Runs what is missing, then shows tables and curves; raises UserError in the end if some cells could not run."""
-    args = replace(args, gaps=gaps.each(args.gaps or tuple(gaps.presets(extend.name_of(args.task)))))
+    args = replace(args, gaps=gaps.each(args.gaps or tuple(gaps.presets(extend.name_of(args.task), variants=False))))
     check(args)
     found = grid(args)
     check_begun(found)
@@ -125,6 +140,12 @@ def main(args: CompareHybridArgs) -> None:
         _show(args, results)
     if failed:
         raise UserError(f"{len(failed)} of the cells did not run: {'; '.join(failed)}")
+
+
+def defaults(argv: Sequence[str]) -> CompareHybridArgs:
+    """Those of the chosen schedule."""
+    name = cli.preview(argv, schedule_preset=FLEET).schedule_preset
+    return CompareHybridArgs(schedule_preset=name, schedule=cli.choose("--schedule-preset", name, SCHEDULES))
 
 
 def check(args: CompareHybridArgs) -> None:
@@ -158,8 +179,8 @@ def _runs(args: CompareHybridArgs, method: str, data: Path | None) -> list[Hybri
     run = arguments(
         name, preset=preset, variant=preset, task=args.task, data=None if kind == "simulator" else data,
         real=args.real, previous_actions=args.previous_actions, seeds=args.seeds, seed=args.seed,
-        schedule=args.schedule, eval_every=args.eval_every, eval_episodes=args.eval_episodes, impl=args.impl,
-        out=args.out, video=False,
+        schedule_preset=args.schedule_preset, schedule=args.schedule, eval_every=args.eval_every,
+        eval_episodes=args.eval_episodes, impl=args.impl, out=args.out, video=False,
     )  # fmt: skip
     return [replace(run, gap=(gap,)) for gap in ((SIM,) if kind == "offline" else args.gaps)]
 
@@ -194,6 +215,7 @@ def tables(args: CompareHybridArgs, results: "Results") -> str:
 
     scale = " on D4RL's scale" if results.task in analysis.BOUNDS else ""
     words = {"score": _SCORES[args.score], "seeds": args.seeds, "scale": scale, "reference": args.reference}
+    words["schedule"] = describe(args.schedule)
     parts = [f"# {results.task}", LEGEND.format(**words), analysis.headline(results)]
     if len(args.methods) > 1:
         parts.append(analysis.duels(results, args.reference))
@@ -211,10 +233,10 @@ def _show(args: CompareHybridArgs, results: "Results") -> None:
     print(f"{text}\n\nwritten: {path}")
     for data in results.data:
         if any(results.find(method, data, gap) for method in results.methods for gap in results.gaps):
-            title = " on ".join(filter(None, [results.task, data]))
+            title = f"{' on '.join(filter(None, [results.task, data]))}, schedule {name_of(args.schedule)}"
             drawn = figures.hybrid_curves(folder / f"{name}-{data or NO_DATA}.png", results, data, title=title)
             print(f"written: {drawn}")
 
 
 if __name__ == "__main__":
-    cli.run_main(main, CompareHybridArgs, __doc__ or "")
+    cli.run_main(main, CompareHybridArgs, __doc__ or "", default=defaults)

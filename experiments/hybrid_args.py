@@ -4,19 +4,30 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from tyro.conf import arg
 
 from envs.gaps import SIM, title
 from experiments.options import Impl, at_least_one, check_task, seed_list, seeds_name, without_repeats
 from sgft_jax import extend
 from sgft_jax.hybrid.methods import get_method
-from sgft_jax.hybrid.schedule import Schedule
+from sgft_jax.hybrid.schedule import FLEET, Schedule
 from sgft_jax.io.runs import check_start
 from sgft_jax.types import HybridMethod, UserError
 
 DEFAULT, NO_DATA = "h2oplus", "no-data"
 NO_SIMULATOR = "no-simulator"
-VOLATILE = ("resume", "overwrite", "out", "video", "data")  # may differ when a run goes on; what is in the data may not
+# These may differ when a run goes on. What is in the data may not, nor what a schedule has, whatever it is called.
+VOLATILE = ("resume", "overwrite", "out", "video", "data", "schedule_preset")
+
+SchedulePreset = Annotated[
+    str,
+    arg(
+        help="A schedule by name: fleet, 25 simulators that make one step each before 25 updates follow, or released, "
+        "that of H2O+'s code, one simulator that makes 1,000 steps before 1,000 updates follow."
+    ),
+]
 
 
 @dataclass(frozen=True)
@@ -47,9 +58,11 @@ class HybridArgs:
     overwrite: bool = False
     """Replace an earlier run of the same name."""
     preset: str = ""
-    """Named settings of the method, see its help; default: its first."""
+    """Named settings of the method, see the table at the top. Default: of rebrac those of the data set that the name of
+    --data contains, if there are any; else the method's first."""
     options: Any = None  # the `Config` of the method
     """Options of the method that --method names:"""
+    schedule_preset: SchedulePreset = FLEET
     schedule: Schedule = field(default_factory=Schedule)
     successors: str = "stored"
     """Expert: where the next observations of a D4RL file come from: stored, or shifted (the row below)."""

@@ -358,7 +358,7 @@ class HybridMethod(NamedTuple):
 
     kind: what it learns from: both, the real rows alone, or the simulator alone. description, source: one line each.
     config: a frozen dataclass whose fields carry their help. presets: named settings of it; the first is the default.
-    build(config, task) -> HybridAgent.
+    build(config, task) -> HybridAgent. by_data: whether presets are called after data sets, see `hybrid.presets`.
     """
 
     name: str
@@ -367,6 +367,7 @@ class HybridMethod(NamedTuple):
     source: str
     presets: Mapping[str, Any]
     build: Callable[[Any, Task], HybridAgent]
+    by_data: bool = False
 
     @property
     def config(self) -> Any:

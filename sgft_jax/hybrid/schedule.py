@@ -59,5 +59,22 @@ class Schedule:
         return self.chunks * self.updates_per_chunk
 
 
-# Of H2O+: what is stated wherever numbers are shown, and what its authors ran.
-SCHEDULES = {"fleet": Schedule(), "released": Schedule(simulators=1, steps_per_round=1_000)}
+FLEET = "fleet"  # the default
+SCHEDULES = {FLEET: Schedule(), "released": Schedule(simulators=1, steps_per_round=1_000)}  # ours; H2O+'s code's
+
+
+def name_of(schedule: Schedule) -> str:
+    """What `SCHEDULES` calls this rhythm of steps and updates, however many there are; "custom" for any other."""
+    return next((name for name, own in SCHEDULES.items() if _rhythm(own) == _rhythm(schedule)), "custom")
+
+
+def describe(schedule: Schedule) -> str:
+    """The rhythm and the number of updates in words, for what shows scores."""
+    return (
+        f"{schedule.updates_in_all:,} updates, schedule {name_of(schedule)} (simulators: {schedule.simulators:,}; "
+        f"steps of each per round: {schedule.steps_per_round:,}; updates per round: {schedule.updates_per_round:,})"
+    )
+
+
+def _rhythm(schedule: Schedule) -> tuple[float, ...]:
+    return (schedule.simulators, schedule.steps_per_round, schedule.updates_per_step)

@@ -93,14 +93,62 @@ def test_runs_with_other_settings_are_not_mixed(grid, ran, capsys):
         compare_hybrid.main(replace(own, schedule=replace(own.schedule, updates=500)))
 
 
+def test_rebrac_takes_the_preset_of_each_data_set(grid, ran, tmp_path, capsys):
+    names = ("halfcheetah-medium-replay-regenerated-seed-0", "halfcheetah_medium-v2", "mine")
+    data = tuple(tmp_path / f"{name}.hdf5" for name in names)
+    for path in data:
+        path.touch()
+    compare_hybrid.main(replace(grid, methods=("rebrac",), reference="rebrac", data=data))
+    presets = ["halfcheetah-medium-replay", "halfcheetah-medium", ""]
+    assert [(run.preset, run.variant) for run in ran] == [(preset, "") for preset in presets]
+    assert [run.options.critic_penalty for run in ran] == [0.001, 0.01, 0.001]
+    said = capsys.readouterr().out
+    assert f"missing    halfcheetah/{names[0]}: rebrac, preset halfcheetah-medium-replay\n" in said
+    assert f"missing    halfcheetah/{names[1]}: rebrac, preset halfcheetah-medium\n" in said
+    assert "halfcheetah/mine: rebrac, preset halfcheetah-medium-replay, as none is called after mine\n" in said
+    assert "| data | simulator | rebrac |\n" in said
+
+
+def test_tables_name_the_schedule_and_the_updates(grid, ran, capsys):
+    chosen = compare_hybrid.defaults(["--schedule-preset", "released"])
+    schedule = replace(chosen.schedule, updates=200_000)
+    own = replace(grid, methods=("sac",), reference="sac", data=())
+    own = replace(own, schedule_preset=chosen.schedule_preset, schedule=schedule)
+    compare_hybrid.main(own)
+    assert (ran[0].schedule_preset, ran[0].schedule) == ("released", schedule)
+    legend = "Every run made 200,000 updates, schedule released (simulators: 1; steps of each per round: 1,000; "
+    assert legend in capsys.readouterr().out
+    compare_hybrid.main(replace(own, schedule_preset="fleet"))  # the same numbers, typed by hand: the same runs
+    assert len(ran) == 1 and legend in capsys.readouterr().out
+
+
+def test_presets_of_one_method_are_rows_of_their_own(grid, ran, capsys):
+    methods = ("h2oplus", "h2oplus:lambda-0.2", "h2oplus:no-ratio", "h2oplus:xql")
+    compare_hybrid.main(replace(grid, methods=methods, gaps=("gravity",), data=grid.data[:1]))
+    assert [run.options.value_share for run in ran] == [0.1, 0.2, 0.1, 0.1]
+    assert [run.options.ratio for run in ran] == [True, True, False, True] and ran[3].options.value_cut == 7.0
+    assert f"| data | simulator | {' | '.join(methods)} |\n" in capsys.readouterr().out
+
+
 def test_dry_runs_nothing(grid, ran, capsys):
     compare_hybrid.main(replace(grid, dry=True))
     assert ran == [] and capsys.readouterr().out.count("missing") == 10 and not grid.out.exists()
 
 
-def test_by_default_all_simulators_of_the_task(grid, ran, capsys):
-    compare_hybrid.main(replace(grid, gaps=(), methods=("sac",), reference="sac", data=(), dry=True))
-    assert capsys.readouterr().out.count("missing") == 9
+@pytest.mark.parametrize(("task", "count"), [("halfcheetah", 9), ("walker2d", 7)])
+def test_by_default_the_simulators_of_the_papers_tables(task, count, grid, ran, capsys):
+    compare_hybrid.main(replace(grid, task=task, gaps=(), methods=("sac",), reference="sac", data=(), dry=True))
+    said = capsys.readouterr().out
+    assert said.count("missing") == count and "range-only" not in said
+
+
+def test_variants_of_gaps_run_where_they_are_named(grid, ran, capsys):
+    own = replace(grid, task="walker2d", gaps=("broken-thigh-range-only",), methods=("sac",), reference="sac", data=())
+    compare_hybrid.main(replace(own, dry=True))
+    assert "missing    walker2d/broken-thigh-range-only: sac\n" in capsys.readouterr().out
+
+
+def test_cells_have_their_folders(grid):
     folder = run_folder(compare_hybrid.grid(replace(grid, methods=("sac",), data=()))[0].args, "gravity")
     assert folder.relative_to(grid.out) == Path("hybrid/halfcheetah/gravity/no-data/sac/seeds-0-2")
 
@@ -114,13 +162,14 @@ def test_by_default_all_simulators_of_the_task(grid, ran, capsys):
         ("--data nowhere.hdf5", "--data nowhere.hdf5: no such file"),
         ("--gaps gravitiy --methods sac --reference sac", "gravitiy"),
         ("--seeds 0", "--seeds is 0: must be at least 1"),
+        ("--schedule-preset flet", "--schedule-preset: there is no 'flet', did you mean 'fleet'"),
     ],
 )
 def test_bad_input(words, said, tmp_path, ran, capsys):
     (tmp_path / "set.hdf5").touch()
     with pytest.raises(SystemExit) as stopped:
         cli.run_main(
-            compare_hybrid.main, compare_hybrid.CompareHybridArgs, "Compare.",
+            compare_hybrid.main, compare_hybrid.CompareHybridArgs, "Compare.", default=compare_hybrid.defaults,
             argv=[*words.replace("SET", f"{tmp_path}/set.hdf5").split(), "--out", str(tmp_path / "runs")],
         )  # fmt: skip
     error = capsys.readouterr().err

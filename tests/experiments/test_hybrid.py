@@ -120,6 +120,7 @@ def test_sac_needs_no_data(tmp_path):
         (["--preset", "papre"], "did you mean 'paper'"),
         (["--options.value-share", "2"], "option value-share is 2.0: must be from 0 to 1"),
         (["--schedule.simulators", "0"], "option simulators is 0: must be at least 1"),
+        (["--schedule-preset", "flet"], "--schedule-preset: there is no 'flet', did you mean 'fleet'"),
         (["--gap", "gravitiy"], "gravitiy"),
         (["--variant", "a/b"], "--variant 'a/b'"),
         (["--previous-actions", "-1"], "--previous-actions -1: must be 0 or more"),
@@ -164,6 +165,35 @@ def test_other_data_are_refused_when_a_run_goes_on(tmp_path, data, capsys):
 def test_presets_are_the_defaults_of_their_options():
     paper, released = (hybrid.arguments("h2oplus", preset=name).options for name in ("", "released"))
     assert (paper.value_share, released.value_share) == (0.1, 0.5)
+
+
+def parsed(words, monkeypatch):
+    """The arguments with which a command line runs, and what it says before JAX starts."""
+    seen = []
+    monkeypatch.setattr("experiments.hybrid_run.run", lambda args, method, seeds: seen.append(args))
+    hybrid.main(words.split())
+    return seen[0]
+
+
+def test_rebrac_takes_the_preset_of_the_data_set_unless_one_is_named(monkeypatch, capsys, tmp_path):
+    given = f"--task walker2d --method rebrac --data {tmp_path}/walker2d_medium-v2.hdf5 --out {tmp_path}"
+    found = parsed(given, monkeypatch)
+    assert (found.preset, found.options.critic_penalty, found.variant) == ("walker2d-medium", 0.1, "")
+    assert capsys.readouterr().out == "rebrac: preset walker2d-medium\n"
+    named = parsed(f"{given} --preset halfcheetah-medium --options.critic-penalty 0.5", monkeypatch)
+    assert (named.preset, named.options.actor_penalty, named.options.critic_penalty) == (
+        "halfcheetah-medium", 0.001, 0.5,
+    )  # fmt: skip
+    other = parsed(given.replace("_medium", "_mine"), monkeypatch)
+    assert other.preset == "" and other.options.actor_penalty == 0.01
+    assert "preset halfcheetah-medium-replay, as none is called after walker2d_mine-v2\n" in capsys.readouterr().out
+
+
+def test_a_schedule_by_name_gives_the_defaults_that_single_options_change(monkeypatch, capsys, tmp_path):
+    found = parsed(f"--method sac --schedule-preset released --schedule.updates 5000 --out {tmp_path}", monkeypatch)
+    assert (found.schedule.simulators, found.schedule.steps_per_round, found.schedule.updates) == (1, 1000, 5000)
+    assert "sac: 5,000 updates, schedule released (simulators: 1; " in capsys.readouterr().out
+    assert parsed(f"--method sac --out {tmp_path}", monkeypatch).schedule.simulators == 25
 
 
 def test_folders_are_named_after_what_a_method_learns_from(tmp_path):

@@ -52,4 +52,5 @@ METHOD = HybridMethod(
         "walker2d-medium": replace(_REPLAY, actor_penalty=0.05, critic_penalty=0.1),
     },
     build,
+    by_data=True,
 )  # fmt: skip

@@ -183,6 +183,34 @@ def test_presets_are_what_they_are_called():
     assert get_method("cql").config.conservatism == 2.0 and get_method("edac").config.critics == 10
 
 
+def test_presets_of_h2oplus_change_what_their_names_say_and_nothing_else():
+    """The paper's tables; the backbones' own numbers are those of their authors (value scale and cut-off)."""
+    presets = get_method("h2oplus").presets
+    paper = dataclasses.asdict(presets["paper"])
+    assert {name: dict(dataclasses.asdict(own).items() - paper.items()) for name, own in presets.items()} == {
+        "paper": {},
+        "released": {"value_share": 0.5, "expectile": 0.5},
+        "released-robot": {"expectile": 0.9, "hidden": (32, 32), "rows": 16},
+        "no-ratio": {"ratio": False},
+        "lambda-0": {"value_share": 0.0},
+        "lambda-0.2": {"value_share": 0.2},
+        "lambda-0.5": {"value_share": 0.5},
+        "lambda-1": {"value_share": 1.0},
+        "sql": {"value_loss": "sql"},
+        "eql": {"value_loss": "eql", "value_alpha": 2.0},
+        "xql": {"value_loss": "xql", "value_alpha": 2.0, "value_cut": 7.0},
+    }
+    assert (paper["value_alpha"], paper["value_cut"]) == (1.0, 5.0)
+
+
+@pytest.mark.parametrize("name", ["eql", "xql"])
+def test_scale_and_cut_off_of_a_backbone_reach_its_learner(name):
+    own = get_method("h2oplus").presets[name]
+    agent = build(value_loss=own.value_loss, value_alpha=own.value_alpha, value_cut=own.value_cut)
+    hyper = agent.learner.init(jax.random.key(0)).hyper
+    assert (hyper.value_alpha, hyper.value_cut) == (own.value_alpha, own.value_cut)
+
+
 def test_the_bytes_of_a_run_are_those_of_its_buffers_and_of_one_copy_of_the_data():
     """A row is 4 + 2 + 1 + 1 + 4 floats: 48 bytes. Two counters of 4 bytes go with each buffer."""
     assert trainer.memory(ENV, build(), SCHEDULE, real_rows()) == (64 * 48 + 8, 50 * 48 + 8)
