@@ -8,6 +8,7 @@ import pytest
 
 from experiments import cli, compare_hybrid
 from experiments.hybrid_args import run_folder
+from sgft_jax.analysis import figures
 from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.runs import FORMAT
 from sgft_jax.types import UserError
@@ -109,7 +110,9 @@ def test_rebrac_takes_the_preset_of_each_data_set(grid, ran, tmp_path, capsys):
     assert "| data | simulator | rebrac |\n" in said
 
 
-def test_tables_name_the_schedule_and_the_updates(grid, ran, capsys):
+def test_tables_and_curves_name_the_schedule_and_the_updates(grid, ran, monkeypatch, capsys):
+    titles = []
+    monkeypatch.setattr(figures, "hybrid_curves", lambda path, results, data, *, title: titles.append(title))
     chosen = compare_hybrid.defaults(["--schedule-preset", "released"])
     schedule = replace(chosen.schedule, updates=200_000)
     own = replace(grid, methods=("sac",), reference="sac", data=())
@@ -120,6 +123,7 @@ def test_tables_name_the_schedule_and_the_updates(grid, ran, capsys):
     assert legend in capsys.readouterr().out
     compare_hybrid.main(replace(own, schedule_preset="fleet"))  # the same numbers, typed by hand: the same runs
     assert len(ran) == 1 and legend in capsys.readouterr().out
+    assert titles == ["halfcheetah, schedule released"] * 2
 
 
 def test_presets_of_one_method_are_rows_of_their_own(grid, ran, capsys):
