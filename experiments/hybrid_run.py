@@ -18,9 +18,12 @@ from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
 from experiments import logged
 from experiments.evaluation import SCORES, play, scores
-from experiments.hybrid_args import NO_SIMULATOR, VOLATILE, HybridArgs, gaps_of, run_folder
+from experiments.hybrid_args import NO_SIMULATOR, VOLATILE, HybridArgs, data_name, gaps_of, run_folder
 from experiments.memory import reserve
 from experiments.video import film
+from sgft_jax.analysis import figures
+from sgft_jax.analysis.hybrid import Outcome, Results
+from sgft_jax.analysis.stats import bootstrap_interval, mean
 from sgft_jax.data import logs
 from sgft_jax.hybrid import trainer
 from sgft_jax.hybrid.robot import MEASURES
@@ -58,6 +61,21 @@ def run(args: HybridArgs, method: HybridMethod, seeds: list[int]) -> list[dict[s
     finally:
         for own in opened:
             own.close()
+
+
+def intervals(scores: dict[str, np.ndarray]) -> dict[str, list[float]]:
+    """By NAME/interval, the 95 % bootstrap interval [low, high] of the mean over seeds; none where seeds are too few.
+
+    scores: [seeds] each.
+    """
+    found = {f"{name}/interval": bootstrap_interval(own, statistic=mean) for name, own in scores.items()}
+    return {name: [float(own.low), float(own.high)] for name, own in found.items() if np.isfinite(own.low)}
+
+
+def in_words(scores: np.ndarray, bounds: list[float] | None) -> str:
+    """The mean over seeds with its interval [low, high], "20.5 [18, 22]"; alone where that says nothing."""
+    low, high = bounds or (0.0, 0.0)
+    return f"{scores.mean():.4g}" + (f" [{low:.4g}, {high:.4g}]" if low < high else "")
 
 
 class _Run:
@@ -190,7 +208,7 @@ class _Run:
     # ------------------------------------------------------------ what stays
 
     def _finish(self, state: HybridState) -> list[dict[str, Any]]:
-        """Policies, summaries and closing words. The last policy is the result: nothing real chose it."""
+        """Policies, summaries, curves and closing words. The last policy is the result: nothing real chose it."""
         params = jax.jit(jax.vmap(self.agent.export))(state.learner)
         filmed = functools.cache(lambda: self._play(state, 1))
         found = []
@@ -198,8 +216,10 @@ class _Run:
             self.logs[i].close()
             for k, seed in enumerate(self.seeds):
                 save_prior(folder / "policy" / f"seed-{seed}", Prior(member(own, k), self._card(gap, seed)))
-            summary = self._summary(folder, gap)
+            lines = read_jsonl(folder / EVAL)
+            summary = self._summary(lines, gap)
             write_summary(folder, summary)
+            self._draw(folder, lines, gap)
             if self.args.video:
                 print(self._film(folder, member(member(filmed(), i * len(self.seeds)), 0)))
             self._say(folder, gap, summary)
@@ -217,9 +237,8 @@ class _Run:
     def _facts(self) -> dict[str, Any] | None:
         return None if self.data is None else asdict(self.data.facts) | {"path": Path(self.data.facts.path).name}
 
-    def _summary(self, folder: Path, gap: Gap) -> dict[str, Any]:
-        """Score of each seed at the last evaluation, and the mean over the last ten."""
-        lines = read_jsonl(folder / EVAL)
+    def _summary(self, lines: list[dict[str, Any]], gap: Gap) -> dict[str, Any]:
+        """Score of each seed at the last evaluation, and the mean over the last ten. lines: the evaluations."""
         curve = np.array([line["score"] for line in lines])
         last, late = curve[-1], curve[-_LATE:].mean(0)
         others = {name: lines[-1][name] for name in lines[-1] if name not in ("step", *SCORES)}
@@ -236,9 +255,20 @@ class _Run:
             "seeds": self.seeds,
             "last": last.tolist(),
             "late": late.tolist(),
+            **intervals({"last": last, "late": late}),
             "normalised": [normalised(self.env.name, x) for x in last.tolist()],
             "measures": others,
         }
+
+    def _draw(self, folder: Path, lines: list[dict[str, Any]], gap: Gap) -> None:
+        """The learning curve. lines: the evaluations."""
+        updates, curve = (np.array([line[name] for line in lines]) for name in ("step", "score"))
+        data = "" if self.data is None or self.args.data is None else data_name(self.args.data)
+        name, simulator = self.method.name, "none" if gap.name == NO_SIMULATOR else gap.name
+        own = Outcome(name, data, simulator, curve[-1], updates, curve.T)
+        results = Results(self.env.name, self.env.score, [data], [simulator], [name], [own])
+        title = " on ".join(filter(None, [self.env.name, data]))
+        figures.hybrid_curves(folder / "figures" / "score.png", results, data, title=title)
 
     def _film(self, folder: Path, played: Episode) -> str:
         """An episode in the real system."""
@@ -250,9 +280,10 @@ class _Run:
         rescaled = [x for x in summary["normalised"] if x is not None]
         scale = f", {np.mean(rescaled):.1f} on D4RL's scale" if rescaled else ""
         print(
-            f"{gap.name}: {self.env.score} in the real system {last.mean():.4g} (std over seeds {last.std():.3g}) "
-            f"after {summary['updates']:,} updates{scale}; mean of the last {_LATE} evaluations {late.mean():.4g}"
+            f"{gap.name}: {self.env.score} in the real system {in_words(last, summary.get('last/interval'))} "
+            f"(std over seeds {last.std():.3g}) after {summary['updates']:,} updates{scale}; "
+            f"mean of the last {_LATE} evaluations {in_words(late, summary.get('late/interval'))}"
         )
         for name, values in summary["measures"].items():
             print(f"  {name}: {np.mean(values):.3g} (std over seeds {np.std(values):.2g})")
-        print(f"results: {folder}  (policy/, summary.json, eval.jsonl)")
+        print(f"results: {folder}  (policy/, summary.json, eval.jsonl, figures/)")

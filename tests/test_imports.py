@@ -21,6 +21,7 @@ COMMANDS = (
     "export",
     "export_data",
     "replay",
+    "hybrid",
 )
 MISTAKES = {
     "pretrain": "--config.gamma 2",
@@ -35,6 +36,7 @@ MISTAKES = {
     "export": "--policy nowhere --to onnx",
     "export_data": "--run nowhere --to minari",
     "replay": "--run nowhere",
+    "hybrid": "--gap sim --task halfcheetah",
 }
 LIGHT = ("sgft_jax", "sgft_jax.checks", "sgft_jax.models.config", "experiments.cli", "sgft_jax.presets")
 

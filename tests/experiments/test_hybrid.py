@@ -11,6 +11,8 @@ import toy
 import sgft_jax
 from experiments import hybrid
 from experiments.hybrid_args import data_name, run_folder
+from experiments.hybrid_run import in_words, intervals
+from sgft_jax.analysis import figures
 from sgft_jax.hybrid.scores import normalised
 from sgft_jax.io.log import MetricsLog, read_jsonl
 from sgft_jax.types import UserError
@@ -61,22 +63,49 @@ def complaint(argv, capsys):
     return error
 
 
-def test_a_run_leaves_curves_policies_and_a_summary_for_each_simulator(tmp_path, data, gap, capsys):
-    hybrid.main(words(tmp_path, data, "--gap", gap, "--variant", "w"))
+def test_a_run_leaves_curves_policies_and_a_summary_for_each_simulator(tmp_path, data, gap, capsys, monkeypatch):
+    drawn, draw = {}, figures.hybrid_curves
+    monkeypatch.setattr(figures, "hybrid_curves", lambda path, *a, **b: drawn.update({path: a}) or draw(path, *a, **b))
+    hybrid.main(words(tmp_path, data, "--gap", gap, "--variant", "w", "--seeds", "3"))
     said = capsys.readouterr().out
     assert "60 transitions of 3 episodes" in said and "heavy: success in the real system" in said
     for name in ("heavy", "slippery"):
-        folder = tmp_path / f"out/hybrid/toy/{name}/recorded-v2/h2oplus_w/seeds-0-1"
+        folder = tmp_path / f"out/hybrid/toy/{name}/recorded-v2/h2oplus_w/seeds-0-2"
         evaluations = read_jsonl(folder / "eval.jsonl")
-        assert [line["step"] for line in evaluations] == [0, 12, 24] and len(evaluations[0]["score"]) == 2
+        assert [line["step"] for line in evaluations] == [0, 12, 24] and len(evaluations[0]["score"]) == 3
         assert [line["step"] for line in read_jsonl(folder / "metrics.jsonl")] == [6, 12, 18, 24]
         summary = json.loads((folder / "summary.json").read_text())
         assert summary["last"] == evaluations[-1]["score"] and summary["updates"] == 24
         assert summary["data"]["transitions"] == 60 and summary["gap"]["name"] == name and not summary["measures"]
         np.testing.assert_allclose(summary["late"], np.mean([line["score"] for line in evaluations], axis=0))
+        assert {one: summary[one] for one in summary if "interval" in one} == intervals(
+            {one: np.array(summary[one]) for one in ("last", "late")}
+        )
+        for before, one in (("real system", "last"), ("the last 10 evaluations", "late")):
+            assert f"{before} {in_words(np.array(summary[one]), summary[f'{one}/interval'])}" in said
+        assert f"results: {folder}  (policy/, summary.json, eval.jsonl, figures/)" in said
+        assert (folder / "figures/score.png").stat().st_size > 5_000
+        results, shown = drawn[folder / "figures/score.png"]
+        own = results.find("h2oplus", shown, name)
+        assert shown == "recorded-v2" and own.updates.tolist() == [0, 12, 24]
+        np.testing.assert_array_equal(own.curve, np.transpose([line["score"] for line in evaluations]))
         policy = sgft_jax.load_policy(folder / "policy/seed-1")
         action = np.asarray(policy.act([0.5, 0.0, 0.0, 0.0]))
         assert action.shape == (2,) and (np.abs(action) < 1).all()
+
+
+def test_intervals_are_of_the_mean_over_seeds_and_need_three():
+    found = intervals({"last": np.array([0.0, 0.0, 3.0, 100.0]), "late": np.array([2.0, 2.0, 2.0])})
+    low, high = found["last/interval"]
+    assert low == 0 and 50 < high <= 100  # the interquartile mean of these is 1.5
+    assert found["late/interval"] == [2.0, 2.0]
+    assert intervals({"last": np.array([0.0, 1.0])}) == {}
+
+
+def test_scores_in_words():
+    scores = np.array([20.0, 21.0])
+    assert in_words(scores, [18.0, 22.25]) == "20.5 [18, 22.25]"
+    assert in_words(scores, None) == in_words(scores, [20.5, 20.5]) == "20.5"
 
 
 @pytest.mark.slow
@@ -104,13 +133,16 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(method, simulator, tmp_pat
     whole, cut = (tmp_path / out / home for out in ("whole", "cut"))
     for name in ("metrics.jsonl", "eval.jsonl"):
         assert (whole / name).read_text() == (cut / name).read_text()
+    assert (cut / "figures/score.png").exists()
 
 
 @pytest.mark.slow
 def test_sac_needs_no_data(tmp_path):
     hybrid.main(words(tmp_path, None, "--method", "sac", "--gap", "sim"))
     folder = tmp_path / "out/hybrid/toy/sim/no-data/sac/seeds-0-1"
-    assert json.loads((folder / "summary.json").read_text())["data"] is None and (folder / "policy/seed-1").exists()
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["data"] is None and not [name for name in summary if "interval" in name]  # of two seeds
+    assert (folder / "policy/seed-1").exists() and (folder / "figures/score.png").exists()
 
 
 @pytest.mark.parametrize(
