@@ -4,6 +4,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from keys import used_twice
 
@@ -124,6 +125,15 @@ def test_order_and_rows_of_the_update(learner, key):
     total = sum(float(metrics[f"critic/{part}"]) for part in ("real_loss", "sim_loss", "penalty"))
     assert metrics["critic/loss"] == pytest.approx(total, rel=1e-5)
     assert equal(state.log_alpha, new.log_alpha) and new.step == 1
+
+
+def test_both_discriminators_learn_once_in_every_update(learner, key):
+    """ODRL's H2O lets them learn at every tenth step alone, even where the real data are a file."""
+    state = learner.init(key)
+    for i in range(1, 4):
+        before, (state, _) = state, learner.update(state, batch_of(jax.random.fold_in(key, i)), key)
+        for old, new in ((before.ratio.joint, state.ratio.joint), (before.ratio.pair, state.ratio.pair)):
+            assert int(optax.tree.get(new.moments, "count")) == i and not equal(old.params, new.params)
 
 
 def test_the_spread_is_noise_on_successors(learner, key):
