@@ -10,6 +10,7 @@ import pytest
 import toy
 
 from envs import gaps
+from envs.control import cartpole
 from envs.gaps import Gap
 from envs.pools import real_worlds
 from sgft_jax.data import replay
@@ -26,13 +27,16 @@ QUICK = {"h2oplus"}  # what the fast tests see of the methods
 each_method = pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in NAMES]
 )
+PRESETS = [(name, preset) for name in NAMES for preset in get_method(name).presets]
+FIXED = {"hyper", "normalizer", "spread", "lr_ratio"}  # numbers and statistics, which no update moves
 SCHEDULE = Schedule(updates=24, simulators=3, buffer=64, chunk_updates=6)  # 4 chunks of 2 rounds
 
 
-def build(name="h2oplus", **changes):
+def build(name="h2oplus", preset=None, **changes):
     method = get_method(name)
-    own = {key: value for key, value in {**SMALL, "ratio_rows": 8}.items() if hasattr(method.config, key)}
-    return method.build(dataclasses.replace(method.config, **own | changes), ENV)
+    config = method.config if preset is None else method.presets[preset]
+    own = {key: value for key, value in {**SMALL, "ratio_rows": 8}.items() if hasattr(config, key)}
+    return method.build(dataclasses.replace(config, **own | changes), ENV)
 
 
 def real_rows(n=50):
@@ -91,6 +95,21 @@ def test_the_rows_are_those_of_the_members_own_simulator():
     pushed = np.asarray(rows.next_obs[:, held, 2:] - (1 - 0.1 * 4.0) * rows.obs[:, held, 2:])
     gain = [np.polyfit(np.asarray(rows.action[i, held]).ravel(), pushed[i].ravel(), 1)[0] for i in range(2)]
     np.testing.assert_allclose(gain, [0.1 * toy.FORCE / 0.5, 0.1 * toy.FORCE / 4.0], rtol=0.1)
+
+
+def test_the_buffer_keeps_the_actions_without_the_noise_of_the_gap():
+    """Under `action_noise` the motor gets clip(a + n), and a row holds a, as in H2O+'s simulators."""
+    env, noise = cartpole.make(), 0.2
+    pools = real_worlds(env, [gaps.from_dict(env, "shaky", {"effects": {"action_noise": noise}})], jax.random.key(0))
+    agent = get_method("sac").build(dataclasses.replace(get_method("sac").config, hidden=(16,)), env)
+    real, schedule = trainer.no_data(env), dataclasses.replace(SCHEDULE, simulators=32, buffer=512)
+    note = lambda learner, before, action, after: after.physics.ctrl  # noqa: E731
+    state, _ = next(trainer.train(env, agent, schedule, pools, real, keys_of(0), gamma=0.9, note=note))
+    held = slice(int(state.simulated.size[0]))
+    action, sent = (np.asarray(x)[0, held, 0] for x in (state.simulated.data.action, state.notes.data))
+    far = np.abs(action) < 0.5  # from the bounds, where clipping cuts the noise
+    assert held.stop == 256 and far.sum() > 60 and np.abs(sent).max() <= 1
+    assert (sent - action)[far].std() == pytest.approx(noise, rel=0.25)
 
 
 @pytest.mark.slow
@@ -209,6 +228,36 @@ def test_scale_and_cut_off_of_a_backbone_reach_its_learner(name):
     agent = build(value_loss=own.value_loss, value_alpha=own.value_alpha, value_cut=own.value_cut)
     hyper = agent.learner.init(jax.random.key(0)).hyper
     assert (hyper.value_alpha, hyper.value_cut) == (own.value_alpha, own.value_cut)
+
+
+def check_learning(chunks):
+    """Losses and numbers are finite, and every update has moved every part of the agent that learns."""
+    (start, _), *later = chunks
+    for _, metrics in later:
+        assert [name for name in metrics if name.endswith("loss")]
+        assert all(np.isfinite(values).all() for values in metrics.values())
+    leaves = [jax.tree_util.tree_leaves_with_path(plain(state).learner) for state in (start, later[-1][0])]
+    for (path, before), (_, after) in zip(*leaves, strict=True):
+        fixed = FIXED & {key.name for key in path if isinstance(key, jax.tree_util.GetAttrKey)}
+        assert np.isfinite(after).all() and (fixed or not np.array_equal(before, after)), jax.tree_util.keystr(path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "preset"), PRESETS)
+def test_every_preset_learns_as_it_stands(name, preset):
+    """At its own sizes: the released code of H2O+ has a preset of the robot that no one can start."""
+    agent = get_method(name).build(get_method(name).presets[preset], ENV)
+    schedule = Schedule(updates=4, simulators=2, buffer=600, chunk_updates=2)
+    chunks = played(agent, schedule)
+    check_learning(chunks)
+    assert len(chunks) == 3
+
+
+def test_a_preset_that_is_no_default_learns_with_its_own_numbers():
+    chunks = played(build("h2oplus", "released"))
+    check_learning(chunks)
+    hyper = chunks[-1][0].learner.hyper
+    assert (float(hyper.value_share[0]), float(hyper.expectile[0])) == (0.5, 0.5)
 
 
 def test_the_bytes_of_a_run_are_those_of_its_buffers_and_of_one_copy_of_the_data():
