@@ -16,12 +16,8 @@ from sgft_jax.data import sources
 from sgft_jax.learners import losses
 from sgft_jax.learners.sac import SACConfig, SACHyper, SACState, make_sac
 from sgft_jax.models import ratio
-from sgft_jax.models.networks import NetworkConfig
+from sgft_jax.models.config import NetworkConfig, two_layers
 from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Source
-
-
-def _wide() -> NetworkConfig:
-    return NetworkConfig((256, 256))
 
 
 @dataclass(frozen=True)
@@ -36,8 +32,8 @@ class DARCConfig:
 
     obs_dim: int
     act_dim: int
-    network: NetworkConfig = field(default_factory=_wide)
-    ratio_network: NetworkConfig = field(default_factory=_wide)
+    network: NetworkConfig = field(default_factory=two_layers)
+    ratio_network: NetworkConfig = field(default_factory=two_layers)
     ratio_noise: float = 0.1
     ratio_rows: int | None = None
     tune_alpha: bool = True

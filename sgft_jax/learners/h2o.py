@@ -17,22 +17,17 @@ from flax import struct
 from sgft_jax import checks
 from sgft_jax.learners import losses, optim, soft
 from sgft_jax.models import normalizer, ratio
+from sgft_jax.models.config import NetworkConfig, two_layers
 from sgft_jax.models.networks import (
     Network,
-    NetworkConfig,
     make_affine_actor,
     make_critic,
-    tanh_gaussian_action,
     tanh_gaussian_sample,
 )
 from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree
 
 GAP_MIN = 1e-6  # a pair that looks more real than simulated is not pushed; 1e-45, as published, may flush to 0 / 0
 PENALTY_MAX = 1000.0
-
-
-def _wide() -> NetworkConfig:
-    return NetworkConfig((256, 256))
 
 
 @dataclass(frozen=True)
@@ -48,8 +43,8 @@ class H2OConfig:
 
     obs_dim: int
     act_dim: int
-    network: NetworkConfig = field(default_factory=_wide)
-    ratio_network: NetworkConfig = field(default_factory=_wide)
+    network: NetworkConfig = field(default_factory=two_layers)
+    ratio_network: NetworkConfig = field(default_factory=two_layers)
     ratio_noise: float = 0.1
     ratio_rows: int | None = None
     successors: int = 10
@@ -167,17 +162,10 @@ def make_h2o(config: H2OConfig, hyper: H2OHyper | None = None) -> Learner:
             step=jnp.int32(0),
         )
 
-    def act(
-        state: H2OState, carry: tuple[()], obs: Array, key: Key, *, explore: bool | Array, context: Array | None = None
-    ) -> tuple[Array, tuple[()]]:
-        del context  # it reads the observation alone
-        moments = parts.actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
-        return tanh_gaussian_action(moments, key, explore=explore), carry
-
     def update(state: H2OState, batch: Batch, key: Key) -> tuple[H2OState, Metrics]:
         return _update(config, parts, state, batch, key)
 
-    return Learner(init, lambda: (), act, update)
+    return Learner(init, lambda: (), soft.make_act(parts.actor), update)
 
 
 # --- one update -------------------------------------------------------------------------------------------------------

@@ -20,20 +20,15 @@ from sgft_jax import checks
 from sgft_jax.learners import edac, iql, losses, optim, soft
 from sgft_jax.learners.value_losses import value_loss
 from sgft_jax.models import normalizer, ratio
+from sgft_jax.models.config import NetworkConfig, two_layers
 from sgft_jax.models.networks import (
     Network,
-    NetworkConfig,
     make_affine_actor,
     make_critic,
     make_value,
-    tanh_gaussian_action,
     tanh_gaussian_sample,
 )
 from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree, UserError, ValueLoss, unknown
-
-
-def _wide() -> NetworkConfig:
-    return NetworkConfig((256, 256))
 
 
 @dataclass(frozen=True)
@@ -52,13 +47,13 @@ class H2OPlusConfig:
 
     obs_dim: int
     act_dim: int
-    network: NetworkConfig = field(default_factory=_wide)
+    network: NetworkConfig = field(default_factory=two_layers)
     critics: int = 2
     diversity: float = 0.0
     value_loss: ValueLoss = "iql"
     tune_alpha: bool = True
     ratio: bool = True
-    ratio_network: NetworkConfig = field(default_factory=_wide)
+    ratio_network: NetworkConfig = field(default_factory=two_layers)
     ratio_noise: float = 0.1
     ratio_rows: int | None = None
 
@@ -174,23 +169,10 @@ def make_h2oplus(config: H2OPlusConfig, hyper: H2OPlusHyper | None = None) -> Le
             step=jnp.int32(0),
         )
 
-    def act(
-        state: H2OPlusState,
-        carry: tuple[()],
-        obs: Array,
-        key: Key,
-        *,
-        explore: bool | Array,
-        context: Array | None = None,
-    ) -> tuple[Array, tuple[()]]:
-        del context  # it reads the observation alone
-        moments = parts.actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
-        return tanh_gaussian_action(moments, key, explore=explore), carry
-
     def update(state: H2OPlusState, batch: Batch, key: Key) -> tuple[H2OPlusState, Metrics]:
         return _update(config, parts, state, batch, key)
 
-    return Learner(init, lambda: (), act, update)
+    return Learner(init, lambda: (), soft.make_act(parts.actor), update)
 
 
 # --- one update -------------------------------------------------------------------------------------------------------

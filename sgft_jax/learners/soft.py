@@ -9,10 +9,24 @@ import optax
 
 from sgft_jax.learners import losses, optim
 from sgft_jax.learners.sac import step_temperature
-from sgft_jax.models.networks import Network, tanh_gaussian_sample
+from sgft_jax.models import normalizer
+from sgft_jax.models.networks import Network, tanh_gaussian_action, tanh_gaussian_sample
 from sgft_jax.types import Array, Batch, Key, Metrics, PyTree
 
 OUTPUT_GAIN = 0.01  # of the last layers in the released codes: all values and means begin near 0
+
+
+def make_act(actor: Network) -> Callable[..., tuple[Array, tuple[()]]]:
+    """`Learner.act` of a tanh-Gaussian actor without memory. Its state has `actor` and `normalizer`."""
+
+    def act(
+        state: Any, carry: tuple[()], obs: Array, key: Key, *, explore: bool | Array, context: Array | None = None
+    ) -> tuple[Array, tuple[()]]:
+        del context  # the actor reads the observation alone
+        moments = actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
+        return tanh_gaussian_action(moments, key, explore=explore), carry
+
+    return act
 
 
 def step_policy(

@@ -26,3 +26,8 @@ class NetworkConfig:
         checks.layers(self, "hidden")
         if self.activation not in (known := get_args(Activation)):
             raise UserError(unknown("activation", self.activation, known))
+
+
+def two_layers() -> NetworkConfig:
+    """Two hidden layers of 256 units: the networks of H2O, H2O+ and their baselines."""
+    return NetworkConfig((256, 256))

@@ -189,12 +189,7 @@ def play(
             try:
                 with connect(url, max_size=LIMIT, compression=None, proxy=None, open_timeout=10) as socket:
                     waiting = False
-                    socket.send(hello)
-                    answer = unpack(socket.recv(timeout=10))
-                    if answer["type"] == "refused":
-                        if answer["final"]:
-                            raise RefusedError(answer["reason"])
-                        raise ValueError(answer["reason"])
+                    _introduce(socket, hello)
                     say(f"connected to {url}")
                     robot.serve(socket, say)
                     return robot.counts
@@ -207,6 +202,14 @@ def play(
     finally:
         driver.stop()
         robot.log.close()
+
+
+def _introduce(socket: Any, hello: bytes) -> None:
+    """Sends the first message. Raises RefusedError if the learner refuses for good, ValueError if for now."""
+    socket.send(hello)
+    answer = unpack(socket.recv(timeout=10))
+    if answer["type"] == "refused":
+        raise (RefusedError if answer["final"] else ValueError)(answer["reason"])
 
 
 @dataclass(frozen=True)
