@@ -4,8 +4,8 @@ A gap is worth studying only if pretraining alone does not bridge it and a polic
 zero-shot success is at most 40 % and training on the real system itself reaches 95 %.
 
 With --draw N, gaps are drawn from a distribution, written to a file and sorted: solved by the simulator's policy (80 %
-and more), partial, or failed (below 20 %); trivial where identifying scale, rotation and bias of commands from one
-rollout suffices. What the table beside the file holds already is not measured again.
+and more), partial, or failed (below 20 %); trivial where identifying commands (scale, rotation, bias) and constant
+errors of sensors from one rollout suffices (90 %). What the table beside the file holds already is not measured again.
 """
 
 from collections.abc import Sequence

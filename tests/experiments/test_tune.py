@@ -94,7 +94,7 @@ def test_settings_that_are_tried_first_differ_and_are_options_of_the_method(meth
         with_settings(arguments(method), settings)
 
 
-def test_warm_up_can_be_chosen_wherever_a_critic_learns():
+def test_warm_up_can_be_chosen_wherever_a_method_but_guarded_has_it():
     options = {name: dataclasses.asdict(get_method(name).config()) for name in spaces.SPACES if name != "guarded"}
     for warmup in ("critic_warmup", "lr_warmup"):
         having = {name for name, own in options.items() if warmup in own}
