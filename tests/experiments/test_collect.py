@@ -128,7 +128,7 @@ def test_a_table_is_read_again(tmp_path):
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # its advice on authors and links
 def test_minaris_own_library_opens_a_set(tmp_path, monkeypatch):
-    minari = pytest.importorskip("minari", reason="Minari's library is not installed: pip install 'sgft-jax[minari]'")
+    minari = pytest.importorskip("minari", reason="make setup EXTRAS=dev, or pip install 'sgft-jax[minari]'")
     recording.write_minari(tmp_path / "toy" / "point-v0", [episode(0, 3, terminated=True), episode(50, 2)], {})
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     found = list(minari.MinariDataset(tmp_path / "toy" / "point-v0" / "data").iterate_episodes())

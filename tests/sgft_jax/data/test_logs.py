@@ -275,7 +275,7 @@ def test_odd_minari_sets_are_refused(minari):
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # its advice on authors and links
 def test_what_minaris_own_library_writes_can_be_read(tmp_path, monkeypatch):
-    minari = pytest.importorskip("minari", reason="Minari's library is not installed: pip install 'sgft-jax[minari]'")
+    minari = pytest.importorskip("minari", reason="make setup EXTRAS=dev, or pip install 'sgft-jax[minari]'")
     import gymnasium
 
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
