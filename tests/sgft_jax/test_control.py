@@ -1,12 +1,12 @@
 """The control: where the real system is the simulator there is nothing to learn, and nothing may be lost.
 
-A small prior pushes a point home in every episode, for a return of about 13. Deepest fall below that in six rollouts,
-of the mean over seeds:
+A small prior pushes a point home in every episode, for a return of 13.3. Deepest fall below that in six rollouts,
+of the mean of six seeds:
 
-    method                                         seeds   return   success
-    sac, 24 updates per transition                     6      2.9      8 %
-    guarded, but without its guard                    12      0.3      0 %
-    guarded, the recommended method                   12      0.0      0 %
+    method                               return   success
+    sac, 24 updates per transition          2.9       8 %
+    guarded, but without its guard          0.4       0 %
+    guarded, the recommended method         0.0       0 %
 
 `guarded` has its own defaults but for the number of simulated transitions.
 """
@@ -21,8 +21,8 @@ from sgft_jax.methods import DEFAULT
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.presets import PretrainConfig
 
-ENV, ROLLOUTS, SEEDS = toy.make(), 6, 12
-MARGIN, RETURN_MARGIN = 0.03, 0.2  # how far mean success, and the mean return of 13, may ever fall
+ENV, ROLLOUTS, SEEDS = toy.make(), 6, 6
+MARGIN, RETURN_MARGIN = 0.03, 0.2  # how far mean success, and the mean return of 13.3, may ever fall
 SMALL = {"simulated_transitions": 4000}
 HARSH = {"utd": 24.0}  # for `sac`, whose own one update per transition loses little
 PRETRAIN = PretrainConfig(
@@ -40,9 +40,9 @@ def prior():
     return pretraining.priors_of(ENV, PRETRAIN, state)[0]
 
 
-def falls(prior, method, *, seeds=SEEDS, **options):
+def falls(prior, method, **options):
     """How far mean success and mean return of what is deployed ever fall below the start, on the simulator itself."""
-    setup = api.setup(ENV, gaps.load(ENV, "sim"), prior, method=method, seeds=seeds, **options)
+    setup = api.setup(ENV, gaps.load(ENV, "sim"), prior, method=method, seeds=SEEDS, **options)
     found = []
     for progress, _ in train.finetune(*setup, rollouts=ROLLOUTS):
         episodes = train.evaluate(setup.finetuner, setup.system, progress.agent, setup.seeds, 20)
@@ -59,8 +59,8 @@ def test_where_nothing_is_to_be_learned_the_recommended_method_loses_nothing(pri
 
 
 def test_without_protection_it_is_lost(prior):
-    """So the test above can fail: half of its seeds are enough to see it."""
-    success, total = falls(prior, "sac", seeds=SEEDS // 2, **HARSH)
+    """So the test above can fail."""
+    success, total = falls(prior, "sac", **HARSH)
     assert success > MARGIN and total > 4 * RETURN_MARGIN
 
 
@@ -69,5 +69,5 @@ def test_it_is_the_guard_that_holds_it(prior):
     """Without it the recommended method loses some of the return; with it alone what loses most loses nothing."""
     _, total = falls(prior, DEFAULT, guard=False, **SMALL)
     assert total > RETURN_MARGIN
-    success, total = falls(prior, "sac", seeds=SEEDS // 2, guard=True, **HARSH)
+    success, total = falls(prior, "sac", guard=True, **HARSH)
     assert success <= MARGIN and total <= RETURN_MARGIN
