@@ -1,4 +1,4 @@
-"""Impure: prints `name==version` of everything that pyproject.toml asks for, dev extra included, as installed here."""
+"""Impure: prints `name==version` of everything that pyproject.toml asks for, extras dev and export included, as installed here."""
 
 import importlib.metadata
 import re
@@ -36,5 +36,6 @@ def _canonical(name: str) -> str:
 if __name__ == "__main__":
     project = tomllib.loads(PYPROJECT.read_text())["project"]
     print("# Exact versions this project is tested with; `make lock` writes this file, `make setup` installs from it.")
-    for name, version in sorted(closure(project["dependencies"] + project["optional-dependencies"]["dev"]).items()):
+    extras = project["optional-dependencies"]
+    for name, version in sorted(closure(project["dependencies"] + extras["dev"] + extras["export"]).items()):
         print(f"{name}=={version}")
