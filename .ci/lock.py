@@ -1,4 +1,4 @@
-"""Impure: prints `name==version` of everything that pyproject.toml asks for, extras dev and export included, as installed here."""
+"""Impure: prints `name==version` of the requirements in pyproject.toml, with the extras dev and export, as installed."""
 
 import importlib.metadata
 import re

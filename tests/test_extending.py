@@ -51,6 +51,20 @@ def test_examples_are_short_and_explained():
         assert len(path.read_text().splitlines()) < 85 and f"(examples/{path.name})" in page
 
 
+@pytest.mark.slow
+def test_the_critic_of_the_example_prefers_what_the_policy_does(monkeypatch, capsys):
+    """Before anything is learned, and after a rollout too where the critic is kept."""
+    example = extend.load("example", str(EXAMPLES / "critic_against_returns.py"), "main")
+    for name, value in {"STARTS": 8, "ROLLOUTS": (0, 1), "SEEDS": 1}.items():
+        monkeypatch.setattr(example, name, value)
+    monkeypatch.chdir(ROOT)
+    example.main({"lr_critic": 1e-12})
+    lines = [[float(word) for word in line.split()] for line in capsys.readouterr().out.splitlines()[1:]]
+    assert [line[0] for line in lines] == [0, 1]
+    for _, q, earned, q_random, earned_by_random, share in lines:
+        assert q > q_random and earned > earned_by_random and share < 0.5
+
+
 # --- a task ---------------------------------------------------------------------------------------------------------
 
 

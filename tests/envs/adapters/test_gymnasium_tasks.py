@@ -177,3 +177,18 @@ def test_stable_baselines_trains_on_it_unchanged():
     agent.learn(1_500)
     after, _ = evaluate_policy(agent, other, n_eval_episodes=20)
     assert after > before + 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(envs.TASKS))
+def test_stable_baselines_trains_on_every_task_by_name(name):
+    """Its own check finds nothing, and 100 steps with updates run; their episodes are too few to learn from."""
+    sb3 = pytest.importorskip("stable_baselines3", reason="pip install stable-baselines3")
+    from stable_baselines3.common.env_checker import check_env as sb3_check
+
+    env = gymnasium.make(name_of(name), gap="sim", impl="c", worlds=1)
+    sb3_check(env)
+    agent = sb3.SAC("MlpPolicy", env, seed=0, device="cpu", learning_starts=50, policy_kwargs={"net_arch": [32]})
+    agent.learn(100)
+    action, _ = agent.predict(env.reset(seed=0)[0])
+    assert agent.num_timesteps == 100 and env.action_space.contains(action)
