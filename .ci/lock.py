@@ -1,4 +1,4 @@
-"""Impure: prints `name==version` of the requirements in pyproject.toml, with the extras dev and export, as installed."""
+"""Impure: prints `name==version` of the requirements in pyproject.toml, with extras dev and export, as installed."""
 
 import importlib.metadata
 import re
