@@ -18,6 +18,7 @@ from experiments.options import SHIPPED, at_least_one, prior_folders, without_re
 from experiments.panda_gym import HOME, PYTHON, TASK
 from experiments.real_systems import REMOTE
 from sgft_jax.io.log import SUMMARY
+from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import get_method
 
 
@@ -83,6 +84,7 @@ def check(args: BulletArgs) -> None:
     without_repeats("--methods", args.methods)
     for method in args.methods:
         get_method(method)
+    check_folder(args.out)
     prior_folders(args.prior, out=args.out, task=TASK, preset="")
     panda_gym.check_driver()
 

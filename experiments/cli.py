@@ -27,6 +27,10 @@ from sgft_jax.types import UserError, unknown
 
 BROKEN_PIPE, USER_ERROR, INTERRUPTED = 1, 2, 130
 _FULL = os.strerror(errno.ENOSPC)  # "No space left on device"
+_ON_DISK = (
+    errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EEXIST, errno.ENOTDIR, errno.EISDIR,
+    errno.ENAMETOOLONG,
+)  # fmt: skip
 _CACHE_VARIABLE = "SGFT_CACHE_DIR"
 _RENDER_PROBE = "import mujoco; c = mujoco.GLContext(16, 16); c.make_current(); c.free()"
 
@@ -71,8 +75,8 @@ def run_main[T](
 
 
 def _disk_trouble(error: BaseException | None) -> str | None:
-    """What is wrong where a file could not be written; also as the cause of another error. None for anything else."""
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES):
+    """What is wrong where a file could not be read or written; also as the cause of another error. Else None."""
+    if isinstance(error, OSError) and error.errno in _ON_DISK:
         return f"{error.filename or 'a file of the run'}: {(error.strerror or 'cannot be written').lower()}"
     if _FULL in str(error):  # Orbax has another type for it
         return f"a file of the run: {_FULL.lower()}"

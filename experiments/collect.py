@@ -14,6 +14,7 @@ from envs.gaps import SIM, title
 from experiments import cli
 from experiments.options import Impl, at_least_one, check_task, seed_list
 from sgft_jax import extend
+from sgft_jax.io.runs import check_folder
 from sgft_jax.types import UserError
 
 LEVELS = {"halfcheetah": 4770.0, "walker2d": 2850.0}  # mean returns of D4RL's medium sets, v2
@@ -104,6 +105,7 @@ def check(args: CollectArgs) -> float:
         raise UserError(f"--level: say at which mean return learning stops; only {', '.join(LEVELS)} have a default")
     if args.policy is not None and not args.policy.is_dir():
         raise UserError(f"--policy {args.policy}: no such folder")
+    check_folder(args.out)
     if there := [path for path in targets(args) if path.exists() and not args.overwrite]:
         raise UserError(f"{there[0]}: exists already; --overwrite replaces it, another --out keeps both")
     return level or 0.0

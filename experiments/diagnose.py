@@ -14,6 +14,7 @@ from experiments.options import Impl, at_least_one, prior_folders
 from experiments.real_systems import check as check_real
 from experiments.rollouts import config_of, home_of
 from sgft_jax.io.jsonfile import read_json
+from sgft_jax.io.runs import check_folder
 from sgft_jax.presets import DEFAULT_PRESET
 from sgft_jax.types import UserError
 
@@ -70,6 +71,7 @@ def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
     """The folders of the priors, the task, and where real/ is if --real is no gap; UserError for what is wrong."""
     if args.rollouts is not None:
         at_least_one(args, "rollouts")
+    check_folder(args.out / "diagnose")
     recorded = home_of("--real", Path(args.real)) if Path(args.real).is_dir() else None
     config = config_of(recorded) if recorded else {}
     task, prior = args.task or config.get("task"), args.prior

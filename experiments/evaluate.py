@@ -14,6 +14,7 @@ from experiments.options import Impl, at_least_one, prior_folders, without_repea
 from experiments.real_systems import REMOTE, TOGETHER, connect, described, is_robot, is_stepped
 from experiments.real_systems import check as check_real
 from sgft_jax.io.jsonfile import read_json
+from sgft_jax.io.runs import check_folder
 from sgft_jax.presets import DEFAULT_PRESET
 from sgft_jax.types import UserError
 
@@ -141,6 +142,8 @@ def check(args: EvaluateArgs) -> tuple[list[Path], str]:
         raise UserError(f"--real {' '.join(args.real)}: {TOGETHER}")
     if args.set and not reals:
         raise UserError(f"--set {args.set[0]}: changes a real system; name one with --real")
+    if reals and is_robot(reals[0]):
+        check_folder(args.out / "evaluate")
     if args.task is not None:
         check_real(args.task, reals, args.set)
     home = args.run / "best" if args.best and args.run else args.run or args.prior

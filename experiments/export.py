@@ -7,6 +7,7 @@ from typing import Literal
 from experiments import cli
 from experiments.options import check_task, prior_folders
 from sgft_jax.io.jsonfile import read_json
+from sgft_jax.io.runs import check_folder
 from sgft_jax.types import UserError
 
 
@@ -31,6 +32,7 @@ def main(args: ExportArgs) -> None:
     task = args.task or read_json(folders[0] / "prior.json")["task"]
     check_task(task)
     home = args.out or args.policy / "export" / args.to
+    check_folder(home)
     homes = [home if folder == args.policy else home / folder.name for folder in folders]
     if there := [one for one in homes if one.exists()]:
         raise UserError(f"{there[0]}: exists already; choose another --out, or remove it")

@@ -12,6 +12,7 @@ from typing import Literal
 
 from experiments import cli
 from experiments.rollouts import check_sizes, config_of, episodes_of, home_of, task_of
+from sgft_jax.io.runs import check_folder
 from sgft_jax.types import UserError
 
 _AUTHOR = "sgft_jax experiments.export_data"
@@ -37,6 +38,7 @@ def main(args: ExportDataArgs) -> None:
     """Writes the data set and says where it is."""
     home = home_of("--run", args.run)
     task, folder = task_of(home, args.task), args.out or home / "export" / args.to / _name(home, args.seed)
+    check_folder(folder)
     if folder.exists():
         raise UserError(f"{folder}: exists already; choose another --out, or remove it")
     if args.to == "minari" and not re.search(r"-v\d+$", folder.name):

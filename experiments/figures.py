@@ -5,6 +5,7 @@ from pathlib import Path
 
 from experiments import cli
 from sgft_jax import extend
+from sgft_jax.io.runs import check_folder
 from sgft_jax.types import UserError
 
 
@@ -35,6 +36,7 @@ class FiguresArgs:
 def main(args: FiguresArgs) -> None:
     """Draws, prints the tables, and says where they are; or exports."""
     if args.export is not None:
+        check_folder(args.export, "--export")
         from sgft_jax.analysis.release import export
 
         print("\n".join(f"written: {path}" for path in export(args.out, args.export)))
@@ -46,6 +48,7 @@ def main(args: FiguresArgs) -> None:
 
 def figures(args: FiguresArgs) -> Path:
     """The figures and tables.md, whose path is returned; raises UserError if there is no run to draw."""
+    check_folder(args.out / "figures")
     from sgft_jax.analysis.curves import read_data, read_runs
     from sgft_jax.analysis.results import select, write_results
 

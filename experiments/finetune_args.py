@@ -1,12 +1,19 @@
 """The options of fine-tuning, what can be wrong with them, and the folders that follow. Imports no JAX."""
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from experiments.options import Impl, at_least_one, prior_folders, seed_list, seeds_name, without_repeats
+from experiments.options import (
+    Impl,
+    at_least_one,
+    check_variant,
+    prior_folders,
+    seed_list,
+    seeds_name,
+    without_repeats,
+)
 from experiments.real_systems import check as check_real
 from experiments.real_systems import is_robot, title
 from sgft_jax import extend
@@ -126,8 +133,7 @@ def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
         raise UserError(f"--options.initial-rollouts {initial} is more than --rollouts {args.rollouts}")
     if args.prior == NO_PRIOR and method.needs_prior:
         raise UserError(f"--prior none: {method.name} needs a prior of {method.prior}")
-    if not re.fullmatch(r"[\w.-]*", args.variant):
-        raise UserError(f"--variant {args.variant!r}: letters, digits, '.', '_' and '-' only, it names a folder")
+    check_variant(args.variant)
     if missing := [path for path in args.real_data if not path.exists()]:
         raise UserError(f"--real-data {missing[0]}: no such file or folder")
     if args.real_updates is not None and (args.real_updates < 0 or not args.real_data):

@@ -17,6 +17,7 @@ from envs import gaps
 from experiments import cli
 from experiments.options import Impl, check_task, prior_folders, seed_list, without_repeats
 from sgft_jax import extend
+from sgft_jax.io.runs import check_folder
 from sgft_jax.presets import PRESETS, PretrainConfig
 from sgft_jax.types import UserError
 
@@ -94,6 +95,9 @@ def measure(args: GapsArgs) -> dict[str, Any]:
     _check_draw(args)
     args = replace(args, presets=gaps.each(args.presets))
     without_repeats("--presets", args.presets)
+    check_folder(args.out / "gaps")
+    if args.to:
+        check_folder(args.to.parent, "--to")
     seeds, task = seed_list(args.seed, args.seeds), extend.name_of(args.task)
     check_task(args.task, args.presets)
     if not (args.draw or args.presets or gaps.presets(task)):

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from tyro.conf import arg
 
 from envs.gaps import SIM, title
-from experiments.options import Impl, at_least_one, check_task, seed_list, seeds_name, without_repeats
+from experiments.options import Impl, at_least_one, check_task, check_variant, seed_list, seeds_name, without_repeats
 from sgft_jax import extend
 from sgft_jax.hybrid.methods import get_method
 from sgft_jax.hybrid.schedule import FLEET, Schedule
@@ -112,8 +112,7 @@ def check(args: HybridArgs) -> tuple[HybridMethod, list[int]]:
         raise UserError(f"--method {method.name}: the options are those of another method")
     if method.kind != "simulator" and args.data is None:
         raise UserError(f"--data: {method.name} learns from real data; name a file or folder (docs/data.md)")
-    if not re.fullmatch(r"[\w.-]*", args.variant):
-        raise UserError(f"--variant {args.variant!r}: letters, digits, '.', '_' and '-' only, it names a folder")
+    check_variant(args.variant)
     if not args.gap:
         raise UserError(f"--gap: name at least one, or {SIM} for no gap")
     without_repeats("--gap", args.gap)

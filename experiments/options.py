@@ -1,5 +1,6 @@
 """Options that several commands share, and what can be wrong with them. Imports neither JAX nor MuJoCo."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,6 +14,7 @@ from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError, unknown
 
 SHIPPED = Path("docs/priors")  # in the folder of the code, where commands are usually typed
+_LONGEST = 100  # bytes; a file system allows names of 255
 LAST_SEED = 2**31 - 1  # larger ones stand for held-out worlds and episodes
 
 Impl = Annotated[
@@ -42,6 +44,14 @@ def without_repeats(option: str, words: Sequence[str]) -> None:
     """Raise UserError for a word that is given twice."""
     if twice := [word for i, word in enumerate(words) if word in words[:i]]:
         raise UserError(f"{option} names {twice[0]} twice; name it once")
+
+
+def check_variant(variant: str) -> None:
+    """Raise UserError for a word that cannot be a part of a folder's name."""
+    if not re.fullmatch(r"[\w.-]*", variant):
+        raise UserError(f"--variant {variant!r}: letters, digits, '.', '_' and '-' only, it names a folder")
+    if len(variant.encode()) > _LONGEST:
+        raise UserError(f"--variant has {len(variant)} letters: choose a shorter word, it names a folder")
 
 
 def check_task(task: str, reals: Sequence[str] = ()) -> None:

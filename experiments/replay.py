@@ -7,6 +7,7 @@ from experiments import cli
 from experiments.options import without_repeats
 from experiments.rollouts import episodes_of, home_of, task_of
 from sgft_jax.io.real import Played
+from sgft_jax.io.runs import check_folder
 from sgft_jax.types import UserError
 
 
@@ -31,10 +32,12 @@ class ReplayArgs:
 def main(args: ReplayArgs) -> None:
     """Draws, and says where the pictures are."""
     home = home_of("--run", args.run)
+    out = args.out or home / "replay"
+    check_folder(out)
     task, episodes = task_of(home, args.task), chosen(home, args)
     from experiments.replay_draw import draw
 
-    print("\n".join(draw(home, task, episodes, args.out or home / "replay", video=args.video)))
+    print("\n".join(draw(home, task, episodes, out, video=args.video)))
 
 
 def chosen(home: Path, args: ReplayArgs) -> list[Played]:

@@ -14,6 +14,7 @@ from envs.gaps import SIM
 from experiments import cli
 from experiments.gaps_choose import STRATA
 from experiments.options import at_least_one
+from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import DEFAULT
 from sgft_jax.types import UserError
 
@@ -57,6 +58,7 @@ def main(args: ScoreboardArgs) -> None:
     """Prints the tables, writes them, and draws every method on the gaps of each stratum."""
     if args.seeds is not None:
         at_least_one(args, "seeds")
+    check_folder(args.out)
     played = played_on(args)
     text = _tables(args, played)
     args.out.mkdir(parents=True, exist_ok=True)

@@ -180,11 +180,7 @@ def check_start(folder: Path, *, resume: bool, overwrite: bool) -> bool:
     """
     if resume and overwrite:
         raise UserError("--resume and --overwrite exclude each other: keep the run or replace it")
-    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
-    if not there.is_dir():
-        raise UserError(f"{folder}: cannot be made, {there} is a file; choose another --out")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise UserError(f"{folder}: cannot be written, you may not write to {there}; choose another --out")
+    check_folder(folder)
     # A process killed while it made the folder leaves hidden files at most: nothing started yet.
     existing = folder.exists() and any(not p.name.startswith(".") for p in folder.iterdir())
     if existing:
@@ -192,6 +188,20 @@ def check_start(folder: Path, *, resume: bool, overwrite: bool) -> bool:
     elif resume and not folder.exists():
         raise UserError(f"{folder}: nothing to resume there; leave --resume out to start it")
     return existing
+
+
+def check_folder(folder: Path, option: str = "--out") -> None:
+    """Raises UserError, which names the option, where no folder can be made or written; makes nothing itself."""
+    try:
+        there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    except OSError as error:  # such as a name that is too long
+        raise UserError(
+            f"{folder}: cannot be made ({(error.strerror or '').lower()}); choose a shorter {option}"
+        ) from error
+    if not there.is_dir():
+        raise UserError(f"{folder}: cannot be made, {there} is a file; choose another {option}")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise UserError(f"{folder}: cannot be written, you may not write to {there}; choose another {option}")
 
 
 def _record(run: Run, kind: str, config: Mapping[str, Any], inputs: Mapping[str, Any]) -> None:

@@ -1,4 +1,5 @@
 import dataclasses
+import errno
 import os
 import subprocess
 import sys
@@ -126,6 +127,26 @@ def test_want_of_memory_is_one_line_and_code_2(capsys):
         said = capsys.readouterr().err
         assert stopped.value.code == 2 and said.count("\n") == 1
         assert words in said and "lower the batch size" in said
+
+
+def test_what_is_wrong_with_a_file_is_one_line_and_code_2(tmp_path, capsys):
+    (tmp_path / "file").touch()
+
+    def forbidden(config):
+        raise PermissionError(errno.EPERM, "Operation not permitted", "there")
+
+    for trouble in (
+        forbidden,
+        lambda config: (tmp_path / "file").mkdir(),
+        lambda config: (tmp_path / "file/x").write_text(""),
+        lambda config: tmp_path.write_text(""),
+        lambda config: (tmp_path / (300 * "n")).write_text(""),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            run(trouble)
+        said = capsys.readouterr().err
+        assert stopped.value.code == 2 and said.count("\n") == 1 and said.startswith("error: ")
+        assert str(tmp_path) in said or "there: operation not permitted" in said
 
 
 def test_an_interrupt_tells_how_to_go_on(capsys):
