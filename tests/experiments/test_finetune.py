@@ -24,7 +24,7 @@ from envs.rollout import Episode, play_episode
 from experiments import cli, evaluate, finetune, finetune_run
 from experiments.finetune_args import FinetuneArgs, arguments, run_folder
 from experiments.finetune_record import Record
-from experiments.recorded import Recorded
+from experiments.recorded import RecordedSystem
 from sgft_jax import api, train
 from sgft_jax.analysis.curves import read_curve, training_score
 from sgft_jax.io import checkpoint, runs
@@ -409,27 +409,27 @@ def play(system, *, explore=True):
 
 def test_a_recorded_system_plays_what_is_missing_and_no_more(tmp_path):
     store = RealStore(tmp_path)
-    first = Recorded(Counter(), [store], done=0)
+    first = RecordedSystem(Counter(), [store], done=0)
     assert [play(first), play(first, explore=False), play(first)] == [[11, 11.5], [12, 12.5], [13, 13.5]]
     assert len(store) == 2  # evaluations are not stored
     inner = Counter()
-    again = Recorded(inner, [store], done=1)
+    again = RecordedSystem(inner, [store], done=1)
     assert play(again) == [13, 13.5] and inner.played == []
     assert play(again) == [11, 11.5] and len(store) == 3
     with pytest.raises(UserError, match=r"real: holds 3 rollouts, the checkpoint remembers 4"):
-        Recorded(inner, [store], done=4)
+        RecordedSystem(inner, [store], done=4)
 
 
 def test_no_rollout_of_a_real_system_is_replaced_because_another_lacks_it(tmp_path):
     one, two = RealStore(tmp_path / "one"), RealStore(tmp_path / "two")
-    system = Recorded(Counter(), [one, two], done=0)
+    system = RecordedSystem(Counter(), [one, two], done=0)
     play(system)
     shutil.rmtree(two.folder)
     two = RealStore(tmp_path / "two")
     before = one.load(0)["obs"]
     later = Counter()
     later.played = [True] * 3
-    assert play(Recorded(later, [one, two], done=0)) == [11, 14.5]  # what is learned from is what is stored
+    assert play(RecordedSystem(later, [one, two], done=0)) == [11, 14.5]  # what is learned from is what is stored
     assert len(one) == len(two) == 1
     np.testing.assert_array_equal(one.load(0)["obs"], before)
     assert two.load(0)["obs"][0, 0, 0] == 14.5
