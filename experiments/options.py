@@ -14,6 +14,7 @@ from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError, unknown
 
 SHIPPED = Path("docs/priors")  # in the folder of the code, where commands are usually typed
+_LAST_PORT = 65_535
 _LONGEST = 100  # bytes; a file system allows names of 255
 LAST_SEED = 2**31 - 1  # larger ones stand for held-out worlds and episodes
 
@@ -31,7 +32,8 @@ def seed_list(first: int, count: int) -> list[int]:
     if count < 1:
         raise UserError(f"--seeds is {count}: must be at least 1")
     if not 0 <= first <= LAST_SEED - count + 1:
-        raise UserError(f"--seed is {first}: seeds go from 0 to {LAST_SEED}, and --seeds {count} of them are wanted")
+        more = f", and --seeds {count} of them are wanted" if count > 1 else ""
+        raise UserError(f"--seed is {first}: seeds go from 0 to {LAST_SEED}{more}")
     return list(range(first, first + count))
 
 
@@ -44,6 +46,11 @@ def without_repeats(option: str, words: Sequence[str]) -> None:
     """Raise UserError for a word that is given twice."""
     if twice := [word for i, word in enumerate(words) if word in words[:i]]:
         raise UserError(f"{option} names {twice[0]} twice; name it once")
+
+
+def port_of(text: str) -> int | None:
+    """The number of a port, None for what is none."""
+    return int(text) if text.isdecimal() and 0 < int(text) <= _LAST_PORT else None
 
 
 def check_variant(variant: str) -> None:

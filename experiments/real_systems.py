@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from envs import gaps
 from envs.gaps import Gap
-from experiments.options import check_task
+from experiments.options import check_task, port_of
 from sgft_jax import extend
 from sgft_jax.types import UserError
 
@@ -78,9 +78,10 @@ def address(real: str) -> tuple[str, int]:
     """The interface and the port of `remote[:HOST[:PORT]]`; default: this computer alone. UserError for no port."""
     _, *rest = real.split(":")
     host, port = (*rest, "", "")[:2]
-    if len(rest) > 2 or not (port or "0").isdigit():
-        raise UserError(f"--real {real}: write {REMOTE}, {REMOTE}:HOST or {REMOTE}:HOST:PORT")
-    return host or _HOST, int(port or _PORT)
+    number = port_of(port or str(_PORT))
+    if len(rest) > 2 or number is None:
+        raise UserError(f"--real {real}: write {REMOTE}, {REMOTE}:HOST or {REMOTE}:HOST:PORT, a port from 1 to 65535")
+    return host or _HOST, number
 
 
 def free_port() -> int:

@@ -82,6 +82,7 @@ def test_two_hosts_continue_what_one_began(tmp_path, monkeypatch):
         ("auto", "--hosts auto: "),
         ("node7", "must be 'auto' or ADDRESS:PORT,COUNT,INDEX"),
         ("node7:12,2", "must be 'auto' or ADDRESS:PORT,COUNT,INDEX"),
+        ("node7:99999,2,0", "the port of node7:99999 must be from 1 to 65535"),
         ("node7:12,2,2", "index 2 of 2 hosts; they are counted from 0"),
     ],
 )

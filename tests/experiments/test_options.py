@@ -21,13 +21,18 @@ def test_names_of_seeds():
     ("first", "count", "words"),
     [
         (0, 0, "--seeds is 0: must be at least 1"),
-        (-1, 1, "--seed is -1: seeds go from 0 to 2147483647"),
+        (-1, 1, "--seed is -1: seeds go from 0 to 2147483647$"),
         (2**31 - 1, 2, "--seed is 2147483647: seeds go from 0 to 2147483647, and --seeds 2"),
     ],
 )
 def test_seeds_out_of_range_are_named(first, count, words):
     with pytest.raises(UserError, match=words):
         seed_list(first, count)
+
+
+@pytest.mark.parametrize(("text", "number"), [("1", 1), ("65535", 65535), ("0", None), ("65536", None), ("-1", None)])
+def test_ports(text, number):
+    assert options.port_of(text) == number
 
 
 def test_small_checks_name_option_and_value(monkeypatch, tmp_path):

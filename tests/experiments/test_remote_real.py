@@ -22,7 +22,7 @@ pytest.importorskip("gymnasium", reason="make setup EXTRAS=dev, or pip install '
 from envs.adapters.gymnasium import TaskEnv
 from envs.gaps import Gap
 from experiments import cli, evaluate, finetune, finetune_args, grid, real_systems
-from experiments.recorded import Recorded
+from experiments.recorded import RecordedSystem
 from sgft_jax.io.real import RealStore
 from sgft_jax.systems.gymnasium import Gymnasium
 from sgft_jax.systems.robot_client import play
@@ -79,7 +79,7 @@ def still(actions):
 def rollouts(folder, after, *, count, done=0):
     """As many rollouts of a robot that breaks after so many steps."""
     env = toy.make()
-    robot = Recorded(Gymnasium(env, Breaking(after), gamma=0.9), [RealStore(folder)], done=done, sync_every=1)
+    robot = RecordedSystem(Gymnasium(env, Breaking(after), gamma=0.9), [RealStore(folder)], done=done, sync_every=1)
     keys = jax.random.split(jax.random.key(0), (1, count))
     return robot.play(still(env.act_dim), np.array([-0.5]), keys, explore=True)
 
@@ -256,6 +256,7 @@ def test_what_an_evaluation_makes_a_robot_do_is_kept(robot, port, tmp_path):
         ({"real": ("remote", "gymnasium:A-v0")}, "cannot be played together"),
         ({"real": ("remote", "remote::1")}, "one robot at a time"),
         ({"real": ("remote:here:there",)}, "write remote, remote:HOST or remote:HOST:PORT"),
+        ({"real": ("remote:127.0.0.1:99999",)}, "remote:HOST or remote:HOST:PORT, a port from 1 to 65535"),
         ({"set": ("mass=2",)}, "nothing here can change a robot"),
         ({"hand_over": "steps", "method": "guarded"}, "a guard judges rollouts by one policy"),
         ({"hand_over": "steps", "real": ("sim",)}, "only a robot plays while something learns"),
