@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments import cli
-from experiments.options import Impl, at_least_one, prior_folders
+from experiments.options import Impl, at_least_one, prior_folders, seed_list
 from experiments.real_systems import check as check_real
 from experiments.rollouts import config_of, home_of
 from sgft_jax.io.jsonfile import read_json
@@ -50,6 +50,7 @@ class DiagnoseArgs:
 
 def main(args: DiagnoseArgs) -> None:
     """Diagnoses or calibrates, and prints."""
+    seed_list(args.seed, 1)
     if args.check and not args.calibrate:
         raise UserError("--check: is for a prediction that --calibrate has fitted; name runs there too")
     if args.calibrate:

@@ -10,7 +10,7 @@ from typing import Any
 from envs import gaps
 from envs.gaps import SIM, Gap
 from experiments import cli
-from experiments.options import Impl, at_least_one, prior_folders, without_repeats
+from experiments.options import Impl, at_least_one, prior_folders, seed_list, without_repeats
 from experiments.real_systems import REMOTE, TOGETHER, connect, described, is_robot, is_stepped
 from experiments.real_systems import check as check_real
 from sgft_jax.io.jsonfile import read_json
@@ -134,6 +134,7 @@ def check(args: EvaluateArgs) -> tuple[list[Path], str]:
     if args.prior is None and args.run is None and args.task is None:
         raise UserError("nothing to evaluate: name a folder with --prior or --run, or a task with --task")
     at_least_one(args, "episodes")
+    seed_list(args.seed, 1)
     if not args.real:
         raise UserError("--real: name at least one")
     without_repeats("--real", args.real)

@@ -124,6 +124,7 @@ def test_calibration_and_its_check_on_other_runs(priors, tmp_path, capsys):
         (["--prior", "PRIOR", "--real", "torn"], "rollout-000000.npz: lacks valid"),
         (["--prior", "PRIOR", "--real", "three"], "holds rollouts of 3 policies"),
         (["--calibrate", "EMPTY"], "holds no fine-tuning run with recorded rollouts"),
+        (["--prior", "PRIOR", "--seed", "-1"], "--seed is -1: seeds go from 0 to 2147483647"),
         (["--check", "EMPTY"], "name runs there too"),
         (["--calibrate", "one", "--check", "one"], "is also in --calibrate"),
         (["--calibrate", "one"], "these runs are on one gap"),

@@ -92,6 +92,8 @@ def test_the_best_policies_of_a_run(run, capsys):
         (["--task", "toy", "--set", "mass=3"], "name one with --real"),
         (["--task", "toy", "--best"], "--best: name the fine-tuning run"),
         (["--task", "toy", "--episodes", "0"], "must be at least 1"),
+        (["--task", "toy", "--seed", "-5"], "--seed is -5: seeds go from 0 to 2147483647"),
+        (["--task", "toy", "--seed", "5000000000"], "--seed is 5000000000: seeds go from 0 to 2147483647"),
     ],
 )
 def test_a_bad_command_is_one_line_and_code_2(argv, words, capsys):
