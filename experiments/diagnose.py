@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments import cli
-from experiments.options import Impl, at_least_one, prior_folders, seed_list
+from experiments.options import Impl, at_least_one, prior_folders, seed_list, task_of_prior
 from experiments.real_systems import check as check_real
 from experiments.rollouts import config_of, home_of
-from sgft_jax.io.jsonfile import read_json
 from sgft_jax.io.runs import check_folder
 from sgft_jax.presets import DEFAULT_PRESET
 from sgft_jax.types import UserError
@@ -83,7 +82,7 @@ def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
     if prior is None and config.get("prior"):
         prior = Path(config["prior"])
     folders = prior_folders(prior, out=args.out, task=task or "", preset=config.get("preset") or args.preset)
-    task = task or read_json(folders[0] / "prior.json")["task"]
+    task = task or task_of_prior(folders[0])
     check_real(task, [] if recorded else [args.real])
     return folders, task, recorded
 

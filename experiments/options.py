@@ -10,6 +10,7 @@ from tyro.conf import arg
 import envs
 from envs import gaps
 from sgft_jax import extend
+from sgft_jax.io.jsonfile import read_object
 from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError, unknown
 
@@ -104,6 +105,11 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str, opti
         command = f"python -m experiments.pretrain --task {task} --preset {preset}"
         raise UserError(f"{home}: holds no prior; make one with: {command}{other}")
     return sorted(found, key=_seed_number)
+
+
+def task_of_prior(folder: Path) -> str:
+    """The task that the card of a prior names; raises UserError where it names none."""
+    return read_object(folder / "prior.json", {"task": str}, "name it with --task, or take another prior")["task"]
 
 
 def _seed_number(folder: Path) -> tuple[int, str]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from experiments.options import check_task
 from sgft_jax.io import real
-from sgft_jax.io.jsonfile import read_json
+from sgft_jax.io.jsonfile import read_object
 from sgft_jax.io.real import Played
 from sgft_jax.types import UserError
 
@@ -26,7 +26,9 @@ def home_of(option: str, folder: Path) -> Path:
 
 def config_of(home: Path) -> dict[str, Any]:
     """The options of the run in a folder; none where a robot has recorded."""
-    return read_json(home / _CONFIG)["config"] if (home / _CONFIG).exists() else {}
+    if not (home / _CONFIG).exists():
+        return {}
+    return read_object(home / _CONFIG, {"config": dict}, "put back the file that the run has written")["config"]
 
 
 def task_of(home: Path, task: str | None) -> str:

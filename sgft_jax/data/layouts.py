@@ -8,12 +8,12 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import h5py
 import numpy as np
 
-from sgft_jax.io.jsonfile import read_json
+from sgft_jax.io.jsonfile import read_object
 from sgft_jax.io.real import played
 from sgft_jax.types import UserError
 
@@ -102,6 +102,11 @@ def _table(file: Path) -> np.ndarray:
     return table
 
 
+def _card(folder: Path) -> dict[str, Any]:
+    """What Minari says of a data set."""
+    return read_object(folder / _METADATA, {}, "supply a whole data set")
+
+
 def _file_of(path: Path) -> Path:
     """The HDF5 file that `path` means."""
     if not path.exists():
@@ -111,7 +116,7 @@ def _file_of(path: Path) -> Path:
     for folder in (path / "data", path):
         if (folder / _MAIN).exists():
             return folder / _MAIN
-        if (folder / _METADATA).exists() and (kind := read_json(folder / _METADATA).get("data_format")) != "hdf5":
+        if (folder / _METADATA).exists() and (kind := _card(folder).get("data_format")) != "hdf5":
             raise UserError(f"{folder}: its data_format is {kind}; make the data set with data_format='hdf5'")
     raise UserError(f"{path}: holds no data/{_MAIN}; name an HDF5 file or the folder of a Minari data set")
 
@@ -165,7 +170,7 @@ def _read_minari(file: Path, content: h5py.File) -> Rows:
     groups = _episodes(content)
     each = [_read_episode(file, group) for group in groups]
     obs, action, reward, next_obs, terminal, ends = map(np.concatenate, zip(*each, strict=True))
-    card = read_json(file.with_name(_METADATA)) if file.with_name(_METADATA).exists() else {}
+    card = _card(file.parent) if file.with_name(_METADATA).exists() else {}
     for name, n in {"total_episodes": len(groups), "total_steps": len(reward)}.items():
         if (said := card.get(name, n)) != n:
             raise UserError(f"{file}: holds {name} {n}, but {_METADATA} says {said}; supply a whole data set")

@@ -16,7 +16,7 @@ import numpy as np
 from envs.base import Entry
 from sgft_jax.data.layouts import Rows
 from sgft_jax.data.recording import Recorded
-from sgft_jax.io.jsonfile import read_json, write_json
+from sgft_jax.io.jsonfile import read_object, write_json
 from sgft_jax.types import UserError
 
 INFO = Path("meta/info.json")
@@ -177,13 +177,15 @@ def read(folder: Path) -> Rows:
     `next.done` alone does not tell whether the task or the time ended an episode. Raises UserError for another
     version, without pyarrow, and where tables and `meta/info.json` disagree.
     """
-    info = read_json(folder / INFO)
+    info = read_object(folder / INFO, {"features": dict, "fps": float}, "supply a whole data set")
     version = str(info.get("codebase_version", ""))
     if not version.startswith("v3."):
         raise UserError(f"{folder}: is LeRobot {version}; convert it to {_VERSION} with LeRobot's own script")
     features = info["features"]
     if missing := [name for name in (_STATE, _ACTION) if name not in features]:
         raise UserError(f"{folder}: has no {missing[0]}, only {', '.join(sorted(features))}; record it as a vector")
+    if missing := [name for name in ("frame_index", "episode_index") if name not in features]:
+        raise UserError(f"{folder}: has no {missing[0]}; supply a whole data set")
     wanted = (_STATE, _ACTION, _SUCCESSOR, _REWARD, _DONE, _TRUNCATED, "frame_index", "episode_index")
     columns = _columns(folder, {name: features[name] for name in wanted if name in features})
     episode, frame = columns["episode_index"], columns["frame_index"]
@@ -209,7 +211,7 @@ def _columns(folder: Path, features: Mapping[str, Mapping[str, Any]]) -> dict[st
     try:
         table = pa.concat_tables([pq.read_table(path, columns=list(features)) for path in paths])
         return {name: _numbers(folder, name, table[name], about["shape"]) for name, about in features.items()}
-    except (pa.ArrowException, OSError, KeyError) as error:
+    except (pa.ArrowException, OSError, KeyError, TypeError) as error:
         said = str(error).splitlines()[0].strip("'\"")
         raise UserError(f"{folder}: damaged or cut off ({said}); supply a whole data set") from error
 

@@ -12,6 +12,8 @@ import numpy as np
 
 from sgft_jax.types import UserError
 
+_KINDS = {str: "a text", int: "a whole number", float: "a number", dict: "an object", list: "a list"}
+
 
 def jsonable(value: Any) -> Any:
     """Plain JSON data: dataclasses become objects with every field spelled out, arrays lists, array scalars numbers,
@@ -66,6 +68,19 @@ def read_json(path: Path) -> Any:
         raise UserError(f"{path}: no such file") from None
     except ValueError as error:
         raise UserError(f"{path}: not valid JSON ({error})") from error
+
+
+def read_object(path: Path, needed: Mapping[str, type], fix: str) -> dict[str, Any]:
+    """A JSON object that has these keys, each with a value of that type; raises UserError, with the fix, otherwise."""
+    found = read_json(path)
+    if not isinstance(found, dict):
+        raise UserError(f"{path}: is no JSON object; {fix}")
+    for key, kind in needed.items():
+        if key not in found:
+            raise UserError(f"{path}: lacks {key}; {fix}")
+        if not isinstance(found[key], (int, float) if kind is float else kind) or isinstance(found[key], bool):
+            raise UserError(f"{path}: {key} is {json.dumps(found[key])[:40]}, not {_KINDS[kind]}; {fix}")
+    return found
 
 
 def differences(old: Any, new: Any, *, name: str = "") -> list[tuple[str, Any, Any]]:

@@ -13,7 +13,7 @@ import numpy as np
 from envs.base import Varying
 from sgft_jax import mesh
 from sgft_jax.io import checkpoint
-from sgft_jax.io.jsonfile import differences, read_json, write_json
+from sgft_jax.io.jsonfile import differences, read_object, write_json
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.types import Normalizer, Prior, PyTree, UserError
 
@@ -47,7 +47,7 @@ def load_prior(
     UserError if the prior is missing, torn, or of another task, other sizes than asked for, or another version.
     """
     folder = _home(folder)
-    manifest, card = checkpoint.read_manifest(folder), read_json(folder / CARD)
+    manifest, card = checkpoint.read_manifest(folder), read_card(folder)
     asked = {"task": task, "obs_dim": obs_dim, "act_dim": act_dim}
     checkpoint.check_facts(folder, card, {name: value for name, value in asked.items() if value is not None})
     container = _container(folder, algorithm_of(card))
@@ -65,6 +65,11 @@ def load_prior(
     return Prior(container(**{name: tree.get(name) for name in container._fields}), card)
 
 
+def read_card(folder: Path) -> dict[str, Any]:
+    """What `prior.json` in a folder says; raises UserError where it is no card of a prior."""
+    return read_object(folder / CARD, {"task": str, "obs_dim": int, "act_dim": int}, "name the folder of a prior")
+
+
 def observed(card: Mapping[str, Any]) -> dict[str, Any]:
     """What the policy of a prior reads beside measurements, as arguments of `envs.make`."""
     system = tuple(Varying(**own) for own in card.get("system", []))
@@ -73,8 +78,8 @@ def observed(card: Mapping[str, Any]) -> dict[str, Any]:
 
 def observed_by(folders: Sequence[Path]) -> dict[str, Any]:
     """The same for priors in folders that are used together; nothing where there is no prior."""
-    card = _home(folders[0]) / CARD if folders else None
-    return observed(read_json(card) if card is not None and card.exists() else {})
+    home = _home(folders[0]) if folders else None
+    return observed(read_card(home) if home is not None and (home / CARD).exists() else {})
 
 
 def load_priors(folders: Sequence[Path], env: Any) -> list[Prior]:

@@ -148,11 +148,21 @@ def played(home: Path) -> list[Played]:
     store = RealStore(home)
     stored = [store.load(number) for number in range(len(store))]
     for number, arrays in enumerate(stored):
+        path = store.folder / f"{_ROLLOUT}{number:06d}.npz"
         if missing := {*_ROWS, *_FACTS} - set(arrays):
-            path = store.folder / f"{_ROLLOUT}{number:06d}.npz"
             raise UserError(f"{path}: lacks {min(missing)}; docs/formats.md lists what a rollout holds")
+        _check_shapes(path, arrays, stored[0])
     seeds = range(len(stored[0]["valid"]))
     return [_of_seed(arrays, seed, number) for seed in seeds for number, arrays in enumerate(stored)]
+
+
+def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray]) -> None:
+    """Raises UserError where an array of a rollout does not go with its `valid`, or with those of the first one."""
+    there = (*first["valid"].shape[:1], *arrays["valid"].shape[1:2])  # seeds and steps
+    for name in (*_ROWS, *_FACTS):
+        wanted = there[:1] if name == "success" else (*there, *first[name].shape[2:])
+        if len(there) < 2 or arrays[name].shape != wanted:
+            raise UserError(f"{path}: {name} has shape {list(arrays[name].shape)}, here {list(wanted)}; keep it apart")
 
 
 def _of_seed(arrays: Mapping[str, np.ndarray], seed: int, number: int) -> Played:

@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from sgft_jax.io.jsonfile import differences, read_json, write_json
+from sgft_jax.io.jsonfile import differences, read_json, read_object, write_json
 from sgft_jax.types import UserError
 
 CONFIG, PROVENANCE = "config.json", "provenance.json"
@@ -212,7 +212,10 @@ def _record(run: Run, kind: str, config: Mapping[str, Any], inputs: Mapping[str,
 
 
 def _starts(folder: Path) -> list[dict[str, Any]]:
-    return read_json(folder / PROVENANCE)["starts"] if (folder / PROVENANCE).exists() else []
+    if not (folder / PROVENANCE).exists():
+        return []
+    fix = "put back the file that the run has written, or begin again with --overwrite"
+    return read_object(folder / PROVENANCE, {"starts": list}, fix)["starts"]
 
 
 def _check_inputs(folder: Path, inputs: Mapping[str, Any]) -> None:

@@ -59,3 +59,30 @@ def test_names_that_no_file_system_has(tmp_path):
         check_variant(300 * "v")
     with pytest.raises(UserError, match=r"cannot be made \(file name too long\); choose a shorter --out"):
         figures.main(figures.FiguresArgs(out=tmp_path / (300 * "o")))
+
+
+PRIOR_READERS = {
+    "evaluate": lambda folder: evaluate.check(evaluate.EvaluateArgs(prior=folder)),
+    "export": lambda folder: export.main(export.ExportArgs(folder, "numpy")),
+    "diagnose": lambda folder: diagnose.check(diagnose.DiagnoseArgs(prior=folder)),
+}
+
+
+@pytest.mark.parametrize("command", PRIOR_READERS)
+@pytest.mark.parametrize(("content", "words"), [("{}", "lacks task"), ("[1]", "is no JSON object")])
+def test_a_prior_that_names_no_task(command, content, words, tmp_path):
+    (tmp_path / "prior.json").write_text(content)
+    with pytest.raises(UserError, match=f"prior.json: {words}; name it with --task, or take another prior"):
+        PRIOR_READERS[command](tmp_path)
+
+
+@pytest.mark.parametrize(("content", "words"), [("{}", "lacks config"), ("[1]", "is no JSON object")])
+def test_a_run_that_does_not_say_its_options(content, words, run):
+    (run / "config.json").write_text(content)
+    for call in (
+        lambda: export_data.main(export_data.ExportDataArgs(run, "minari")),
+        lambda: replay.main(replay.ReplayArgs(run)),
+        lambda: diagnose.check(diagnose.DiagnoseArgs(real=str(run))),
+    ):
+        with pytest.raises(UserError, match=f"config.json: {words}; put back the file"):
+            call()

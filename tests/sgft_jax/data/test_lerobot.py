@@ -63,6 +63,9 @@ def changed(folder, drop=(), **columns):
     return folder
 
 
+NEEDED = ("action", "observation.state", "frame_index", "episode_index")
+
+
 def refused(folder, **options):
     with pytest.raises(UserError) as caught:
         logs.load(folder, gamma=0.9, **options)
@@ -168,6 +171,10 @@ def test_last_actions_are_added_for_a_policy_that_sees_them(tmp_path):
         ({"total_frames": 6}, "holds total_frames 5, but meta/info.json says 6"),
         ({"total_episodes": 3}, "holds total_episodes 2, but meta/info.json says 3"),
         ({"features": {"action": {}}}, "has no observation.state, only action"),
+        ({"fps": "fast"}, 'info.json: fps is "fast", not a number; supply a whole data set'),
+        ({"features": []}, "info.json: features is [], not an object; supply a whole data set"),
+        ({"features": {"action": {}, "observation.state": {}}}, "has no frame_index; supply a whole data set"),
+        ({"features": dict.fromkeys(NEEDED, "vector")}, "damaged or cut off"),
         ({"fps": 30}, "has 30 steps a second, toy has 10; resample it"),
     ],
 )

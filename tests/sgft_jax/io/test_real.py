@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax.io.real import RealStore
+from sgft_jax.io.real import RealStore, played
 from sgft_jax.types import UserError
 
 
@@ -67,6 +67,38 @@ def test_a_damaged_or_missing_rollout_is_named_and_its_number_is_not_taken(tmp_p
     with pytest.raises(UserError, match="rollout 1 is missing"):
         store.load(1)
     assert len(store) == 3 and store.append(rollout(3)) == 3
+
+
+def whole(seeds=2, steps=3, width=4):
+    rows = {name: np.zeros((seeds, steps)) for name in ("reward", "discount")}
+    vectors = {name: np.zeros((seeds, steps, width)) for name in ("obs", "next_obs")}
+    facts = {"valid": np.ones((seeds, steps), bool), "success": np.zeros(seeds, bool)}
+    return {**rows, **vectors, **facts, "action": np.zeros((seeds, steps, 2))}
+
+
+def test_rollouts_that_do_not_go_together_are_refused(tmp_path):
+    for i, (odd, said) in enumerate(
+        [
+            (whole(seeds=1), r"obs has shape \[1, 3, 4\], here \[2, 3, 4\]; keep it apart"),
+            (whole(width=5), r"obs has shape \[2, 3, 5\], here \[2, 3, 4\]"),
+            (whole() | {"reward": np.zeros((2, 2))}, r"reward has shape \[2, 2\], here \[2, 3\]"),
+            (whole() | {"valid": np.ones(2, bool)}, "obs has shape"),
+        ]
+    ):
+        store = RealStore(tmp_path / str(i))
+        store.append(whole())
+        store.append(odd)
+        with pytest.raises(UserError, match=f"rollout-000001.npz: {said}"):
+            played(tmp_path / str(i))
+
+
+def test_rollouts_may_differ_in_length(tmp_path):
+    store = RealStore(tmp_path)
+    store.append(whole())
+    store.append(whole(steps=5))
+    assert [(one.seed, one.number, len(one.rows["obs"])) for one in played(tmp_path)] == [
+        (0, 0, 3), (0, 1, 5), (1, 0, 3), (1, 1, 5),
+    ]  # fmt: skip
 
 
 def test_nothing_is_pickled(tmp_path):
