@@ -11,6 +11,7 @@ import select
 import subprocess
 import sys
 import traceback
+import types
 import typing
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -119,8 +120,9 @@ def parse[T](
     """A frozen dataclass from the command line; raises UserError for a bad one."""
     spec = getattr(sys.modules["__main__"], "__spec__", None)
     prog = f"python -m {spec.name}" if spec else None
-    with _errors.on_parse_error(lambda event: _refuse(event, config_type, default)):
-        return cast(T, tyro.cli(config_type, prog=prog, description=description, args=argv, default=default))
+    words = list(sys.argv[1:] if argv is None else argv)
+    with _errors.on_parse_error(lambda event: _refuse(event, words, config_type, default)):
+        return cast(T, tyro.cli(config_type, prog=prog, description=description, args=words, default=default))
 
 
 def preview(argv: Sequence[str], **defaults: Any) -> SimpleNamespace:
@@ -130,35 +132,68 @@ def preview(argv: Sequence[str], **defaults: Any) -> SimpleNamespace:
     """
     fields = [(name, type(value), dataclasses.field(default=value)) for name, value in defaults.items()]
     chosen = dataclasses.make_dataclass("Options", fields)
-    with _errors.on_parse_error(lambda event: _refuse(event, chosen, None)):
+    with _errors.on_parse_error(lambda event: _refuse(event, argv, chosen, None)):
         found, _ = tyro.cli(chosen, args=list(argv), return_unknown_args=True, add_help=False)
     return SimpleNamespace(**vars(found))
 
 
-def _refuse(event: _errors.ParseErrorEvent, config_type: type, default: Any) -> None:
+def _refuse(event: _errors.ParseErrorEvent, argv: Sequence[str], config_type: type, default: Any) -> None:
     """Raise UserError with what is wrong in one line; other kinds of mistakes in tyro's words."""
     match event:
-        case _errors.UnrecognizedArgs(tokens=[first, *_]) if not first.startswith("-"):
-            raise UserError(f"unexpected word {first!r} on the command line; options begin with --")
-        case _errors.UnrecognizedArgs(tokens=[first, *_]):
-            option = first.partition("=")[0].replace("_", "-")
-            close = difflib.get_close_matches(option, option_names(config_type, default), n=1)
-            hint = f"did you mean {close[0]}?" if close else "--help lists them all"
-            raise UserError(f"there is no option {option}; {hint}")
+        case _errors.UnrecognizedArgs(tokens=[first, *_]) | _errors.MissingArgs(unrecognized_tokens=[first, *_]):
+            raise UserError(_unexpected(first, option_names(config_type, default)))
+        case _errors.MissingArgs():
+            missing = [one.arg.display_name() for one in event.missing_arguments]
+            raise UserError(f"{' and '.join(missing)} {'are' if len(missing) > 1 else 'is'} missing; see --help")
         case _errors.InvalidChoice():
             raise UserError(unknown(event.argument.display_name(), event.value, event.choices))
         case _errors.BadValue(reason="too_few_values"):
             raise UserError(f"{event.argument.display_name()}: needs a value")
         case _errors.InstantiationFailure():
-            raise UserError(_bad_value(event))
+            raise UserError(_bad_value(event, argv))
 
 
-def _bad_value(event: _errors.InstantiationFailure) -> str:
+def _unexpected(word: str, options: Sequence[str]) -> str:
+    """What to say of a word that is no option, or no value of one."""
+    if not word.startswith("-"):
+        return f"unexpected word {word!r} on the command line; options begin with --"
+    option = word.partition("=")[0].replace("_", "-")
+    close = difflib.get_close_matches(option, options, n=1)
+    return f"there is no option {option}; {f'did you mean {close[0]}?' if close else '--help lists them all'}"
+
+
+def _bad_value(event: _errors.InstantiationFailure, argv: Sequence[str]) -> str:
     """What is wrong with the value of an option, as far as tyro knows which."""
+    said = event.message.strip().splitlines()[0]
     if event.argument is None:
-        return event.message
-    kind = {int: "a whole number", float: "a number"}.get(event.argument.field.type_stripped, "something else")
-    return f"{event.argument.display_name()}: must be {kind} ({event.message})"
+        return said
+    option, kind = event.argument.display_name(), _in_words(event.argument.field.type_stripped)
+    return f"{' '.join([option, *_given(option, argv)])}: must be {kind or f'something else ({said})'}"
+
+
+def _in_words(hint: Any) -> str:
+    """What values of a type are called, "" where there is no word for them."""
+    words = {int: "a whole number", float: "a number", types.NoneType: "None"}
+    if typing.get_origin(hint) is tuple:
+        return {int: "whole numbers", float: "numbers"}.get(typing.get_args(hint)[0], "")
+    if parts := typing.get_args(hint):  # a union
+        each = [_in_words(part) for part in parts]
+        return " or ".join(each) if all(each) else ""
+    return words.get(hint, "")
+
+
+def _given(option: str, argv: Sequence[str]) -> list[str]:
+    """The values of an option on a command line, of the last one if it is there several times."""
+    found: list[str] = []
+    inside = False
+    for word in argv:
+        name, _, value = word.partition("=")
+        if word.startswith("--"):
+            inside = name.replace("_", "-") == option
+            found = ([value] if value else []) if inside else found
+        elif inside:
+            found.append(word)
+    return found
 
 
 def option_names(config_type: type, default: Any = None, *, prefix: str = "--") -> list[str]:

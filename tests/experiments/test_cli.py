@@ -24,6 +24,12 @@ class Config:
     task: Literal["hammer", "push", "insert"] = "hammer"
     """What to do."""
     steps: int = 3
+    devices: int | None = None
+    minutes: float | None = None
+    eval_at: tuple[int, ...] = ()
+    shares: tuple[float, ...] = ()
+    level: Literal["low", "high"] | None = None
+    named: tuple[tuple[str, int], ...] = ()
     inner: Inner = dataclasses.field(default_factory=Inner)
 
     def __post_init__(self):
@@ -44,7 +50,7 @@ def run(main, *argv):
 def test_main_gets_the_parsed_configuration():
     seen = []
     run(seen.append, "--task", "push", "--inner.learning-rate", "0.5")
-    assert seen == [Config("push", 3, Inner(0.5))]
+    assert seen == [Config("push", 3, inner=Inner(0.5))]
 
 
 @pytest.mark.parametrize(
@@ -55,7 +61,15 @@ def test_main_gets_the_parsed_configuration():
         (["--step", "3"], "there is no option --step; did you mean --steps?"),
         (["--steps=3", "--inner.learning_rat=1"], "--inner.learning-rat; did you mean --inner.learning-rate?"),
         (["--zzz"], "there is no option --zzz; --help lists them all"),
-        (["--steps", "many"], "--steps: must be a whole number (invalid literal for int() with base 10: 'many')"),
+        (["--steps", "many"], "--steps many: must be a whole number"),
+        (["--steps=many"], "--steps many: must be a whole number"),
+        (["--devices", "x", "--steps", "1"], "--devices x: must be a whole number or None"),
+        (["--devices", "1", "--devices", "2.5"], "--devices 2.5: must be a whole number or None"),
+        (["--minutes", "x"], "--minutes x: must be a number or None"),
+        (["--eval_at", "0", "1.5"], "--eval-at 0 1.5: must be whole numbers"),
+        (["--shares", "-1", "y"], "--shares -1 y: must be numbers"),
+        (["--level", "top"], "--level: there is no 'top'. Choose from: None, high, low"),
+        (["--named", "a", "b"], "--named a b: must be something else (Could not find valid parse"),
         (["--steps"], "--steps: needs a value"),
         (["push"], "unexpected word 'push' on the command line; options begin with --"),
     ],
@@ -66,6 +80,29 @@ def test_a_bad_command_line_is_one_line_and_code_2(argv, words, capsys):
     out, err = capsys.readouterr()
     assert stopped.value.code == 2 and out == ""
     assert err.startswith("error: ") and err.count("\n") == 1 and words in err
+
+
+@dataclasses.dataclass(frozen=True)
+class Needy:
+    policy: Path
+    """Where."""
+    to: str
+    """What."""
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        ([], "error: --policy and --to are missing; see --help\n"),
+        (["--policy", "a"], "error: --to is missing; see --help\n"),
+        (["--polcy", "a", "--to", "b"], "error: there is no option --polcy; did you mean --policy?\n"),
+        (["--policy", "a", "b"], "error: unexpected word 'b' on the command line; options begin with --\n"),
+    ],
+)
+def test_what_must_be_given_is_asked_for_in_one_line(argv, words, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        cli.run_main(pytest.fail, Needy, "Train.", argv=argv)
+    assert stopped.value.code == 2 and capsys.readouterr().err == words
 
 
 @pytest.mark.parametrize(

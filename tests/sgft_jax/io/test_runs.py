@@ -144,7 +144,7 @@ def test_a_run_goes_on_with_the_inputs_that_it_began_with(tmp_path):
     starts = json.loads((tmp_path / "x/provenance.json").read_text())["starts"]
     assert [start.get("maps") for start in starts] == [None, 3]
     (tmp_path / "x/provenance.json").write_text("{}")
-    with pytest.raises(UserError, match="provenance.json: lacks starts; put back the file that the run has written"):
+    with pytest.raises(UserError, match=r"provenance.json: lacks starts; put back the file that the run has written"):
         begin(resume=True)
     begin(overwrite=True, inputs={"priors": ["cd"]})
 
