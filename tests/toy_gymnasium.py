@@ -10,7 +10,7 @@ NAME = "gymnasium:toy_gymnasium:Turned-v0"
 GAP = Gap("turned", {"mass": 2.0, "friction": 4.0}, {"action_rotation": 0.52})
 
 
-class BrokenError(Exception):
+class BrokenError(BaseException):
     """Stands for whatever ends a process in the middle of an episode."""
 
 

@@ -1,5 +1,6 @@
 """Impure: real systems that are Gymnasium environments, stepped from Python."""
 
+import functools
 import statistics
 import time
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
@@ -12,6 +13,7 @@ import numpy as np
 from envs.base import Entry, Env
 from envs.history import remember, with_memory
 from envs.rollout import Episode, episode_keys
+from sgft_jax import extend
 from sgft_jax.mesh import split_vmap
 from sgft_jax.types import Array, Key, PyTree, Transition, UserError
 
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from sgft_jax.systems.remote import Remote
 
 SUCCESS = ("is_success", "success")  # what `info` may call it; the first that is there counts
+_RETURNED = {"reset": ("observation", "info"), "step": ("observation", "reward", "terminated", "truncated", "info")}
 _TRIES = 20  # actions that are timed before a robot with a clock moves
 Observe = Callable[[Any], Any]
 
@@ -351,12 +354,13 @@ class _Each:
         return getattr(self.each[0], "answer_within", None)
 
     def reset(self, seeds: list[int]) -> Sequence[Any]:
-        self._obs = [one.reset(seed=seed)[0] for one, seed in zip(self.each, seeds, strict=True)]
+        each = zip(self.each, seeds, strict=True)
+        self._obs = [_asked(self.name, one, "reset", seed=seed)[0] for one, seed in each]
         return self._obs
 
     def step(self, actions: np.ndarray, going: np.ndarray) -> _After:
         found = [
-            one.step(action.astype(self.action.dtype)) if on else (obs, 0.0, True, False, {})
+            _asked(self.name, one, "step", action.astype(self.action.dtype)) if on else (obs, 0.0, True, False, {})
             for one, action, on, obs in zip(self.each, actions, going, self._obs, strict=True)
         ]
         self._obs, reward, terminated, truncated, infos = zip(*found, strict=True)
@@ -388,10 +392,11 @@ class _Vector:
             )
 
     def reset(self, seeds: list[int]) -> list[Any]:
-        return self._split(self.real.reset(seed=seeds)[0])
+        return self._split(_asked(self.name, self.real, "reset", seed=seeds)[0])
 
     def step(self, actions: np.ndarray, going: np.ndarray) -> _After:
-        obs, reward, terminated, truncated, infos = self.real.step(actions.astype(self.action.dtype))
+        found = _asked(self.name, self.real, "step", actions.astype(self.action.dtype))
+        obs, reward, terminated, truncated, infos = found
         told = [_info(infos, i) for i in range(self.count)]
         last = [own.get("final_obs", seen) for own, seen in zip(told, self._split(obs), strict=True)]  # SAME_STEP
         told = [{**own, **own.get("final_info", {})} for own in told]
@@ -406,6 +411,16 @@ class _Vector:
     def _split(self, obs: Any) -> list[Any]:
         """What each environment returned; copies, because a vector environment may write into its arrays again."""
         return [jax.tree.map(lambda x, i=i: np.array(x[i]), obs) for i in range(self.count)]
+
+
+def _asked(name: str, real: Any, method: str, *given: Any, **named: Any) -> tuple[Any, ...]:
+    """What an environment returns; raises UserError, which says where, if it raises or returns other parts."""
+    parts = _RETURNED[method]
+    found = extend.guard(f"{method} of", name, functools.partial(getattr(real, method), *given, **named))()
+    if not isinstance(found, tuple) or len(found) != len(parts):
+        count = f"{len(found)} values" if isinstance(found, tuple) else f"a {type(found).__name__}"
+        raise UserError(f"{method} of {name}: returns {count}, not {', '.join(parts)}")
+    return found
 
 
 def _nothing() -> None:

@@ -272,6 +272,42 @@ def test_what_does_not_fit_is_one_line(real, words):
     assert words in str(stopped.value) and "\n" not in str(stopped.value)
 
 
+class Failing(Spoken):
+    """Raises or returns in `reset` or `step` what it is given."""
+
+    def __init__(self, method, does):
+        super().__init__()
+        setattr(self, method, does)
+
+
+def fails(*given, **named):
+    raise ValueError("no motor\nno battery")
+
+
+@pytest.mark.parametrize(
+    ("method", "does", "words"),
+    [
+        ("reset", fails, r"^reset of .*Failing.*: .*test_gymnasium_systems.py, line \d+: ValueError: no motor$"),
+        ("step", fails, r"^step of .*Failing.*: .*test_gymnasium_systems.py, line \d+: ValueError: no motor$"),
+        ("reset", lambda seed: np.zeros(4), r"^reset of .*: returns a ndarray, not observation, info$"),
+        (
+            "step",
+            lambda action: (np.zeros(4), 0.0, False, {}),
+            r"^step of .*: returns 4 values, not observation, reward, terminated, truncated, info$",
+        ),
+    ],
+)
+def test_an_environment_that_fails_is_one_line(method, does, words):
+    with pytest.raises(UserError, match=words):
+        play(Failing(method, does))
+
+
+def test_so_does_a_vector_environment():
+    with pytest.raises(UserError, match=r"step of .*: ValueError: no motor$"):
+        real = SyncVectorEnv([lambda: Failing("step", fails)], autoreset_mode=AutoresetMode.NEXT_STEP)
+        play(real)
+
+
 def test_the_number_of_actions_must_be_the_tasks():
     env = toy.make()._replace(action=(Entry("force", "N", 3),))
     with pytest.raises(UserError, match="takes 2 numbers as action, the task toy has 3"):
