@@ -59,13 +59,15 @@ def run_main[T](
             set_up()
             main(config)
         except KeyboardInterrupt:
-            print("\ninterrupted; the same command with --resume continues from the last checkpoint", file=sys.stderr)
+            more = "; the same command with --resume continues from the last checkpoint"
+            print(f"\ninterrupted{more if _has_resume(config_type) else ''}", file=sys.stderr)
             sys.exit(INTERRUPTED)
         except UserError as error:
             fail(str(error))
         except Exception as error:
             if said := _disk_trouble(error):
-                fail(f"{said}; when that is mended, the same command with --resume goes on")
+                again = _has_resume(config_type) and _in_a_run(error)
+                fail(f"{said}; mend that, then {'the same command with --resume goes on' if again else 'try again'}")
             if _in_renderer_choice(error):
                 chosen = f"MUJOCO_GL={os.environ['MUJOCO_GL']}"
                 fail(f"{chosen}: MuJoCo cannot use that here ({error}); unset it, or set it to disable")
@@ -82,6 +84,17 @@ def _disk_trouble(error: BaseException | None) -> str | None:
     if _FULL in str(error):  # Orbax has another type for it
         return f"a file of the run: {_FULL.lower()}"
     return None if error is None else _disk_trouble(error.__cause__)
+
+
+def _has_resume(config_type: type) -> bool:
+    return any(field.name == "resume" for field in dataclasses.fields(config_type))
+
+
+def _in_a_run(error: Exception) -> bool:
+    """Whether what went wrong with a file lies in a run folder, as far as the error says where."""
+    if (place := getattr(error, "filename", None)) is None:
+        return True
+    return any(os.path.exists(folder / "config.json") for folder in Path(str(place)).absolute().parents)
 
 
 def _in_renderer_choice(error: Exception) -> bool:

@@ -157,6 +157,8 @@ def check(args: CompareHybridArgs) -> None:
     for name, given in (("methods", args.methods), ("gaps", args.gaps), ("data", tuple(map(data_name, args.data)))):
         without_repeats(f"--{name}", given)
     check_task(args.task, args.gaps if args.real == SIM else (*args.gaps, args.real))
+    if odd := [one for one in args.methods if one.partition(":")[0] not in NAMES]:
+        raise UserError(unknown("--methods", odd[0], NAMES))
     if args.reference not in args.methods:
         raise UserError(unknown("--reference", args.reference, args.methods))
     learning = [name for name in args.methods if get_method(name.partition(":")[0]).kind != "simulator"]

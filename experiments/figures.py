@@ -54,11 +54,21 @@ def figures(args: FiguresArgs) -> Path:
 
     found = read_data(args.data) if args.data else read_runs(args.out)
     if not found.curves:
-        command = f"python -m experiments.finetune --task {args.task or 'push'}"
-        raise UserError(f"{args.out / 'finetune'}: holds no evaluated run to draw; make one with: {command}")
+        raise UserError(_nothing(args, found.notes))
     task = (extend.name_of(args.task),) if args.task else ()
     chosen = select(found, variants=args.variants, task=task, gap=args.gaps, method=args.methods, priors=args.priors)
     return write_results(chosen, args.out / "figures", reference=args.reference)
+
+
+def _nothing(args: FiguresArgs, notes: list[str]) -> str:
+    """Why there is nothing to draw. notes: a line for each run that was left out."""
+    if args.data:
+        command = f"python -m experiments.figures --export {args.data}"
+        return f"{args.data}: its curves-*.csv hold no run; write some with: {command}"
+    said = f"{args.out / 'finetune'}: holds no evaluated run to draw"
+    if notes:
+        return f"{said}: {notes[0]}" + (f"; and {len(notes) - 1} more" if len(notes) > 1 else "")
+    return f"{said}; make one with: python -m experiments.finetune --task {args.task or 'push'}"
 
 
 if __name__ == "__main__":

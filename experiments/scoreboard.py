@@ -16,7 +16,7 @@ from experiments.gaps_choose import STRATA
 from experiments.options import at_least_one
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import DEFAULT
-from sgft_jax.types import UserError
+from sgft_jax.types import UserError, unknown
 
 if TYPE_CHECKING:
     from sgft_jax.analysis.curves import Curve
@@ -157,18 +157,21 @@ def _runs_on(args: ScoreboardArgs, strata: Mapping[str, str]) -> "Played":
     from sgft_jax.analysis.curves import read_data, read_runs
     from sgft_jax.analysis.tables import spec
 
+    curves = [c for c in (read_data(args.data) if args.data else read_runs(args.out)).curves if c.gap in strata]
+    for option, field, wanted in (("--tasks", "task", args.tasks), ("--priors", "priors", args.priors)):
+        there = {getattr(curve, field) for curve in curves}
+        if there and (odd := [name for name in wanted if name not in there]):
+            raise UserError(unknown(option, odd[0], there))
+        curves = [curve for curve in curves if not wanted or getattr(curve, field) in wanted]
     found: Played = {}
-    for curve in (read_data(args.data) if args.data else read_runs(args.out)).curves:
-        if curve.gap in strata and all(
-            not wanted or own in wanted for own, wanted in ((curve.task, args.tasks), (curve.priors, args.priors))
-        ):
-            own = found.setdefault(spec(curve), {}).setdefault(strata[curve.gap], {})
-            if (name := f"{curve.task}/{curve.gap}") in own:
-                raise UserError(
-                    f"{args.data or args.out}: {spec(curve)} ran on {name} with several sets of seeds or priors; keep "
-                    "one, or choose with --priors"
-                )
-            own[name] = curve if args.seeds is None else curve.first(args.seeds)
+    for curve in curves:
+        own = found.setdefault(spec(curve), {}).setdefault(strata[curve.gap], {})
+        if (name := f"{curve.task}/{curve.gap}") in own:
+            raise UserError(
+                f"{args.data or args.out}: {spec(curve)} ran on {name} with several sets of seeds or priors; keep "
+                "one, or choose with --priors"
+            )
+        own[name] = curve if args.seeds is None else curve.first(args.seeds)
     return found
 
 

@@ -260,7 +260,7 @@ def read_curve(folder: Path) -> Curve:
     records = read_jsonl(folder / EVAL) if (folder / EVAL).exists() else []
     if not records:
         raise UserError(f"{folder / EVAL}: holds no evaluation yet")
-    stored = read_object(folder / CONFIG, {}, _PUT_BACK) if (folder / CONFIG).exists() else {}
+    stored = read_object(folder / CONFIG, {"config": dict}, _PUT_BACK) if (folder / CONFIG).exists() else {}
     summary = read_object(folder / SUMMARY, {}, _PUT_BACK) if (folder / SUMMARY).exists() else {}
     config, start = stored.get("config", {}), last_start(folder)
     column = lambda name: np.array([record[name] for record in records])  # noqa: E731

@@ -196,7 +196,7 @@ def check_folder(folder: Path, option: str = "--out") -> None:
         there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     except OSError as error:  # such as a name that is too long
         raise UserError(
-            f"{folder}: cannot be made ({(error.strerror or '').lower()}); choose a shorter {option}"
+            f"{folder}: cannot be made ({(error.strerror or '').lower()}); choose another {option}"
         ) from error
     if not there.is_dir():
         raise UserError(f"{folder}: cannot be made, {there} is a file; choose another {option}")

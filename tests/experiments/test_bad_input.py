@@ -57,7 +57,7 @@ def test_so_is_one_that_may_not_be_written(command, run, tmp_path, monkeypatch):
 def test_names_that_no_file_system_has(tmp_path):
     with pytest.raises(UserError, match="--variant has 300 letters: choose a shorter word"):
         check_variant(300 * "v")
-    with pytest.raises(UserError, match=r"cannot be made \(file name too long\); choose a shorter --out"):
+    with pytest.raises(UserError, match=r"cannot be made \(file name too long\); choose another --out"):
         figures.main(figures.FiguresArgs(out=tmp_path / (300 * "o")))
 
 

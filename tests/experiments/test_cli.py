@@ -186,14 +186,40 @@ def test_what_is_wrong_with_a_file_is_one_line_and_code_2(tmp_path, capsys):
         assert str(tmp_path) in said or "there: operation not permitted" in said
 
 
-def test_an_interrupt_tells_how_to_go_on(capsys):
+@dataclasses.dataclass(frozen=True)
+class Long:
+    resume: bool = False
+    """Continue."""
+
+
+def test_only_a_command_with_resume_and_a_run_is_told_to_resume(tmp_path, capsys):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/config.json").touch()
+
+    def said(config_type, place):
+        def main(config):
+            raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / place))
+
+        with pytest.raises(SystemExit):
+            cli.run_main(main, config_type, "Train.", argv=[])
+        return capsys.readouterr().err
+
+    going_on, again = "mend that, then the same command with --resume goes on\n", "mend that, then try again\n"
+    assert said(Long, "run/real/a.npz").endswith(f"run/real/a.npz: permission denied; {going_on}")
+    assert said(Config, "run/real/a.npz").endswith(f"run/real/a.npz: permission denied; {again}")
+    assert said(Long, "prior/prior.json").endswith(f"prior/prior.json: permission denied; {again}")
+
+
+@pytest.mark.parametrize(("config_type", "more"), [(Long, True), (Config, False)])
+def test_an_interrupt_tells_how_to_go_on(config_type, more, capsys):
     def main(config):
         raise KeyboardInterrupt
 
     with pytest.raises(SystemExit) as stopped:
-        run(main)
+        cli.run_main(main, config_type, "Train.", argv=[])
     assert stopped.value.code == 130
-    assert "--resume continues" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "interrupted" in said and ("--resume continues" in said) == more
 
 
 @pytest.mark.parametrize(

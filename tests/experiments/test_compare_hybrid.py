@@ -162,6 +162,8 @@ def test_cells_have_their_folders(grid):
     [
         ("--methods iql:papre --reference iql:papre --data SET", "--preset: there is no 'papre'"),
         ("--methods sac iql --reference sac", "--data: iql learns from real data"),
+        ("--methods foo", "--methods: there is no 'foo'"),
+        ("--methods sac foo:a --reference sac", "--methods: there is no 'foo:a'"),
         ("--methods sac", "--reference: there is no 'h2oplus'"),
         ("--data nowhere.hdf5", "--data nowhere.hdf5: no such file"),
         ("--gaps gravitiy --methods sac --reference sac", "gravitiy"),

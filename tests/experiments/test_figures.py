@@ -98,14 +98,22 @@ def test_real_figures_are_drawn(tmp_path):
         (["--task", "toy", "--gaps", "hard", "--methods", "sac"], "there is no 'sac'"),
         (["--data", "nowhere"], "nowhere: holds no curves-*.csv"),
         (["--out", "nowhere"], "holds no evaluated run to draw; make one with"),
+        (["--out", "broken"], "broken/finetune: holds no evaluated run to draw: broken/finetune/toy/default/mbpo/"),
+        (["--out", "broken"], "summary.json: not valid JSON (Expecting value: line 1 column 1 (char 0)); and 1 more"),
+        (["--data", "empty"], "empty: its curves-*.csv hold no run; write some with"),
         (["--out", "nowhere", "--export", "data"], "nowhere: holds no run"),
     ],
 )
 def test_a_bad_command_is_one_line_and_code_2(argv, words, tmp_path, capsys, monkeypatch):
     runs(tmp_path / "runs")
+    for method, name in (("mbpo", "summary.json"), ("sac", "config.json")):
+        (save(tmp_path / "broken", method, [[0.1, 0.2]], rollouts=[0]) / name).write_text("")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty/curves-toy.csv").touch()
+    before = sorted(tmp_path.rglob("*"))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as stopped:
         call(*argv)
     error = capsys.readouterr().err
     assert stopped.value.code == 2 and words in error and error.count("\n") == 1
-    assert [path.name for path in tmp_path.iterdir()] == ["runs"] and not (tmp_path / "runs/figures").exists()
+    assert sorted(tmp_path.rglob("*")) == before

@@ -68,7 +68,7 @@ def test_released_tables_say_the_same(home):
     args = ScoreboardArgs((home / "set.toml",), out=home)
     export(home, home / "data")
     assert scoreboard.board(replace(args, data=home / "data", out=home / "nothing")) == scoreboard.board(args)
-    with pytest.raises(UserError, match=r"data: holds no evaluated run"):
+    with pytest.raises(UserError, match="--priors: there is no 'others'"):
         scoreboard.board(replace(args, data=home / "data", priors=("others",)))
 
 
@@ -92,6 +92,10 @@ def test_bad_input(home):
         scoreboard.board(ScoreboardArgs(args.gaps, reference="mbpo", out=home))
     with pytest.raises(UserError, match="holds no evaluated run on these gaps"):
         scoreboard.board(ScoreboardArgs(args.gaps, out=home / "nothing"))
+    with pytest.raises(UserError, match=r"--tasks: there is no 'nope'\. Choose from: toy"):
+        scoreboard.board(replace(args, tasks=("toy", "nope")))
+    with pytest.raises(UserError, match=r"--priors: there is no 'nope'\. Choose from: fast-p0"):
+        scoreboard.board(replace(args, priors=("nope",)))
     (home / "set.toml").write_text("[easy.params]\nmass = 1.0\n[hard.params]\nmass = 2.0\n")
     with pytest.raises(UserError, match=r"set.toml \[easy\]: has no 'stratum'"):
         scoreboard.board(args)
