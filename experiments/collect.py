@@ -5,6 +5,7 @@ SAC learns in the system itself until its exploring policy returns --level on av
 are recorded instead. With --operator, a noisy controller keeps a wheel-legged robot upright; its log is a text file.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -100,6 +101,8 @@ def check(args: CollectArgs) -> float:
         raise UserError(f"--operator: {extend.name_of(args.task)} has none, only {', '.join(ROBOTS)}")
     if args.operator and args.policy is not None:
         raise UserError("--operator and --policy exclude each other: record one of them")
+    if args.level is not None:
+        _check_level(args.level, args)
     level = args.level if args.level is not None else LEVELS.get(extend.name_of(args.task))
     if args.policy is None and level is None and not args.operator:
         raise UserError(f"--level: say at which mean return learning stops; only {', '.join(LEVELS)} have a default")
@@ -109,6 +112,15 @@ def check(args: CollectArgs) -> float:
     if there := [path for path in targets(args) if path.exists() and not args.overwrite]:
         raise UserError(f"{there[0]}: exists already; --overwrite replaces it, another --out keeps both")
     return level or 0.0
+
+
+def _check_level(level: float, args: CollectArgs) -> None:
+    """Raises UserError where nothing learns until the level is reached, or where nothing reaches it."""
+    if args.policy is not None or args.operator:
+        other = "--operator" if args.operator else "--policy"
+        raise UserError(f"--level {level:g}: ends learning, and with {other} nothing learns; leave one of them out")
+    if not math.isfinite(level):
+        raise UserError(f"--level {level:g}: must be a finite number")
 
 
 def main(argv: Sequence[str] | None = None) -> None:

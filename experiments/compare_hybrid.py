@@ -25,7 +25,7 @@ from experiments.hybrid_args import (
     gaps_of,
     run_folder,
 )
-from experiments.options import Impl, at_least_one, check_task, seed_list, without_repeats
+from experiments.options import Impl, at_least_one, check_task, not_negative, seed_list, without_repeats
 from sgft_jax import extend
 from sgft_jax.hybrid.methods import NAMES, get_method
 from sgft_jax.hybrid.presets import say_preset
@@ -151,6 +151,7 @@ def defaults(argv: Sequence[str]) -> CompareHybridArgs:
 def check(args: CompareHybridArgs) -> None:
     """Raises UserError for what is wrong in the arguments alone."""
     at_least_one(args, "eval_every", "eval_episodes")
+    not_negative(args, "previous_actions", "minutes")
     seed_list(args.seed, args.seeds)
     if not args.gaps:
         raise UserError(f"--gaps: {extend.name_of(args.task)} comes with none; name some, or {SIM} for no gap")

@@ -9,6 +9,7 @@ from experiments.options import (
     Impl,
     at_least_one,
     check_variant,
+    not_negative,
     prior_folders,
     seed_list,
     seeds_name,
@@ -122,10 +123,7 @@ def label(args: FinetuneArgs) -> str:
 def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
     """The method and the seeds; raises UserError for what is wrong in the arguments and with the run folders."""
     at_least_one(args, "rollouts", "eval_every", "checkpoint_every", "sync_every")
-    if args.eval_episodes is not None and args.eval_episodes < 0:
-        raise UserError(f"--eval-episodes is {args.eval_episodes}: must be at least 0")
-    if args.eval_at and min(args.eval_at) < 0:
-        raise UserError(f"--eval-at {' '.join(map(str, args.eval_at))}: numbers of rollouts, from 0 on")
+    not_negative(args, "eval_episodes")
     method, seeds = get_method(args.method), seed_list(args.seed, args.seeds)
     if not isinstance(args.options, method.config):
         raise UserError(f"--method {method.name}: the options are those of another method")
@@ -143,12 +141,25 @@ def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
     without_repeats("--real", args.real)
     check_real(args.task, args.real, args.set)
     _check_robot(args)
+    if args.eval_at:
+        _check_eval_at(args)
     folders = [run_folder(args, real) for real in args.real]
     if twice := [folder for folder in folders if folders.count(folder) > 1]:
         raise UserError(f"--real {' '.join(args.real)}: two of them would share the folder {twice[0]}; name it once")
     for folder in folders:
         check_start(folder, resume=args.resume, overwrite=args.overwrite)
     return method, seeds
+
+
+def _check_eval_at(args: FinetuneArgs) -> None:
+    """Raises UserError for evaluations that would never be made."""
+    given = f"--eval-at {' '.join(map(str, args.eval_at))}"
+    if min(args.eval_at) < 0:
+        raise UserError(f"{given}: numbers of rollouts, from 0 on")
+    if min(args.eval_at) > args.rollouts:  # single ones may, for a run that --resume makes longer
+        raise UserError(f"{given}: no evaluation within --rollouts {args.rollouts}; name smaller numbers")
+    if not resolved(args).eval_episodes:
+        raise UserError(f"{given}: evaluations have no episodes; say how many with --eval-episodes")
 
 
 def _check_robot(args: FinetuneArgs) -> None:

@@ -22,7 +22,7 @@ from envs.gaps import SIM
 from experiments import cli, grid
 from experiments.cells import Cell, complete
 from experiments.grid import GridArgs
-from experiments.options import at_least_one, prior_folders
+from experiments.options import at_least_one, not_negative, prior_folders
 from experiments.pretrain import PretrainArgs, pretrain, run_folder
 from experiments.scoreboard import ScoreboardArgs, board
 from sgft_jax.io.runs import CONFIG
@@ -85,6 +85,7 @@ class Unit(NamedTuple):
 def main(args: FrozenArgs) -> None:
     """Does what is missing, then prints the scoreboard; raises UserError if some units failed."""
     at_least_one(args, "jobs", "split", "priors", "fewer")
+    not_negative(args, "gpus", "minutes")
     every = {unit.name: unit for unit in units(args)}
     if args.unit:
         cli.choose("--unit", args.unit, every).work()

@@ -9,7 +9,7 @@ from experiments import cells
 from experiments.cells import Cell, Kind
 from experiments.finetune import finetune
 from experiments.finetune_args import VOLATILE, FinetuneArgs, arguments, label, resolved, run_folder
-from experiments.options import Impl, at_least_one, check_task, seed_list, without_repeats
+from experiments.options import Impl, at_least_one, check_task, not_negative, seed_list, without_repeats
 from sgft_jax import extend
 from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.methods import NAMES, get_method
@@ -52,6 +52,7 @@ class GridArgs:
 def check(args: GridArgs) -> None:
     """Raises UserError for what is wrong in the arguments alone."""
     at_least_one(args, "rollouts", "eval_every")
+    not_negative(args, "minutes")
     for name, given in (("tasks", args.tasks), ("methods", args.methods), ("reals", args.reals)):
         if not given:
             raise UserError(f"--{name}: name at least one")

@@ -9,7 +9,16 @@ from typing import Annotated, Any
 from tyro.conf import arg
 
 from envs.gaps import SIM, title
-from experiments.options import Impl, at_least_one, check_task, check_variant, seed_list, seeds_name, without_repeats
+from experiments.options import (
+    Impl,
+    at_least_one,
+    check_task,
+    check_variant,
+    not_negative,
+    seed_list,
+    seeds_name,
+    without_repeats,
+)
 from sgft_jax import extend
 from sgft_jax.hybrid.methods import get_method
 from sgft_jax.hybrid.schedule import FLEET, Schedule
@@ -105,8 +114,7 @@ def data_name(path: Path) -> str:
 def check(args: HybridArgs) -> tuple[HybridMethod, list[int]]:
     """The method and the seeds; raises UserError for what is wrong in the arguments and with the run folders."""
     at_least_one(args, "eval_every", "eval_episodes", "checkpoint_every")
-    if args.previous_actions < 0:
-        raise UserError(f"--previous-actions {args.previous_actions}: must be 0 or more")
+    not_negative(args, "previous_actions")
     method, seeds = get_method(args.method), seed_list(args.seed, args.seeds)
     if not isinstance(args.options, type(method.config)):
         raise UserError(f"--method {method.name}: the options are those of another method")

@@ -77,6 +77,14 @@ def at_least_one(args: object, *names: str) -> None:
             raise UserError(f"--{name.replace('_', '-')} is {least}: must be at least 1")
 
 
+def not_negative(args: object, *names: str) -> None:
+    """Raise UserError for an option that is less than 0 or nan; one that is None was left out."""
+    for name in names:
+        value = getattr(args, name)
+        if value is not None and not value >= 0:
+            raise UserError(f"--{name.replace('_', '-')} is {value}: must be at least 0")
+
+
 def prior_home(out: Path, task: str, preset: str) -> Path:
     """Where the runs of pretraining are that leave the priors of a task."""
     return out / "pretrain" / task / preset

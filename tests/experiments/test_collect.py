@@ -216,6 +216,16 @@ def test_sets_made_in_another_way_are_not_judged(changes, judged):
             "--level 1e+09: no seed reached it",
             marks=pytest.mark.slow,
         ),
+        (["--task", "toy", "--level", "nan"], "--level nan: must be a finite number"),
+        (["--task", "toy", "--level", "inf"], "--level inf: must be a finite number"),
+        (
+            ["--task", "toy", "--policy", ".", "--level", "5"],
+            "--level 5: ends learning, and with --policy nothing learns",
+        ),
+        (
+            ["--task", "wheel-legged", "--operator", "--level", "5"],
+            "--level 5: ends learning, and with --operator nothing learns",
+        ),
         (["--environments", "0"], "--environments is 0: must be at least 1"),
         (["--transitions", "0"], "--transitions is 0: must be at least 1"),
         (["--operator"], "--operator: halfcheetah has none, only wheel-legged, wheel-legged-forward"),

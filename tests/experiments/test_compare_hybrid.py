@@ -162,6 +162,7 @@ def test_cells_have_their_folders(grid):
     [
         ("--methods iql:papre --reference iql:papre --data SET", "--preset: there is no 'papre'"),
         ("--methods sac iql --reference sac", "--data: iql learns from real data"),
+        ("--minutes -3 --methods sac --reference sac", "--minutes is -3.0: must be at least 0"),
         ("--methods foo", "--methods: there is no 'foo'"),
         ("--methods sac foo:a --reference sac", "--methods: there is no 'foo:a'"),
         ("--methods sac", "--reference: there is no 'h2oplus'"),

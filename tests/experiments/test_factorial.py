@@ -38,6 +38,7 @@ def test_every_combination_is_a_cell_of_its_own(tmp_path):
     [
         ({"methods": ("sac",)}, "--methods: the cells are all of sgft-parts"),
         ({"rollouts": 0}, "^--rollouts is 0: must be at least 1$"),
+        ({"minutes": float("nan")}, "^--minutes is nan: must be at least 0$"),
         ({"eval_every": 0}, "^--eval-every is 0: must be at least 1$"),
         ({"horizon": 1}, "--horizon is 1: must be at"),
     ],

@@ -287,6 +287,8 @@ def leave_prior(args):
     ("words", "said"),
     [
         (["--jobs", "0"], "--jobs is 0: must be at least 1"),
+        (["--gpus", "-1"], "--gpus is -1: must be at least 0"),
+        (["--minutes", "-3"], "--minutes is -3.0: must be at least 0"),
         (["--split", "0"], "--split is 0: must be at least 1"),
         (["--unit", "push/sack"], "did you mean 'push/sac'"),
         (["--only", "pull"], "--only pull: no unit begins like this"),

@@ -155,7 +155,7 @@ def test_sac_needs_no_data(tmp_path):
         (["--schedule-preset", "flet"], "--schedule-preset: there is no 'flet', did you mean 'fleet'"),
         (["--gap", "gravitiy"], "gravitiy"),
         (["--variant", "a/b"], "--variant 'a/b'"),
-        (["--previous-actions", "-1"], "--previous-actions -1: must be 0 or more"),
+        (["--previous-actions", "-1"], "--previous-actions is -1: must be at least 0"),
         (["--gap", "sim", "--successors", "next"], "successors: there is no 'next'"),
     ],
 )

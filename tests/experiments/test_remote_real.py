@@ -260,6 +260,7 @@ def test_what_an_evaluation_makes_a_robot_do_is_kept(robot, port, tmp_path):
         ({"set": ("mass=2",)}, "nothing here can change a robot"),
         ({"hand_over": "steps", "method": "guarded"}, "a guard judges rollouts by one policy"),
         ({"hand_over": "steps", "real": ("sim",)}, "only a robot plays while something learns"),
+        ({"eval_at": (0, 1, 2)}, "--eval-at 0 1 2: evaluations have no episodes; say how many with --eval-episodes"),
         ({"sync_every": 0}, "--sync-every is 0"),
     ],
     ids=str,
