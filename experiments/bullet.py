@@ -8,18 +8,28 @@ Runs that are finished are left alone, and unfinished ones go on, so the same co
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from experiments import cli, panda_gym
-from experiments.finetune_args import arguments, run_folder
-from experiments.options import SHIPPED, at_least_one, prior_folders, without_repeats
+from experiments import cli, finetune_args, panda_gym
+from experiments.finetune_args import FinetuneArgs
+from experiments.options import (
+    SHIPPED,
+    at_least_one,
+    card_of_prior,
+    not_negative,
+    prior_folders,
+    seed_list,
+    without_repeats,
+)
 from experiments.panda_gym import HOME, PYTHON, TASK
 from experiments.real_systems import REMOTE
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import get_method
+from sgft_jax.presets import check_card
+from sgft_jax.types import UserError
 
 
 @dataclass(frozen=True)
@@ -62,7 +72,7 @@ def main(args: BulletArgs) -> None:
     """Plays what is missing, and says how far it came."""
     check(args)
     python = panda_gym.bullet(args.home, args.python)
-    started, missing = time.monotonic(), [run for run in runs(args) if not (run.folder / SUMMARY).exists()]
+    started, missing = time.monotonic(), unfinished(args)
 
     def play(run: _Run) -> None:
         if args.minutes is None or time.monotonic() - started < 60 * args.minutes:
@@ -81,11 +91,19 @@ def main(args: BulletArgs) -> None:
 def check(args: BulletArgs) -> None:
     """Raises UserError for all that is wrong with the options before anything is made."""
     at_least_one(args, "seeds", "rollouts", "episodes", "jobs")
+    not_negative(args, "minutes")
+    seed_list(args.seed, args.seeds)
     without_repeats("--methods", args.methods)
-    for method in args.methods:
-        get_method(method)
     check_folder(args.out)
-    prior_folders(args.prior, out=args.out, task=TASK, preset="")
+    cards = {folder: card_of_prior(folder) for folder in prior_folders(args.prior, out=args.out, task=TASK, preset="")}
+    for method in map(get_method, args.methods):
+        for folder, card in cards.items():
+            try:
+                check_card(card, method, TASK)
+            except UserError as error:
+                raise UserError(f"--prior {folder}: {error}") from error
+    for run in unfinished(args):
+        finetune_args.check(replace(_arguments(args, run.method, run.seed), resume=run.folder.exists()))
     panda_gym.check_driver()
 
 
@@ -93,8 +111,20 @@ def runs(args: BulletArgs) -> Iterator[_Run]:
     """Every run: all methods of a seed, then the next seed, so that whatever there is can be compared."""
     for seed in range(args.seed, args.seed + args.seeds):
         for method in args.methods:
-            own = arguments(method, task=TASK, seeds=1, seed=seed, out=args.out)
-            yield _Run(method, seed, run_folder(own, REMOTE))
+            yield _Run(method, seed, finetune_args.run_folder(_arguments(args, method, seed), REMOTE))
+
+
+def unfinished(args: BulletArgs) -> list[_Run]:
+    """Those that are still to be played, or to go on."""
+    return [run for run in runs(args) if not (run.folder / SUMMARY).exists()]
+
+
+def _arguments(args: BulletArgs, method: str, seed: int) -> FinetuneArgs:
+    """What a run is, as `experiments.finetune` sees it."""
+    return finetune_args.arguments(
+        method, task=TASK, real=(REMOTE,), seeds=1, seed=seed, prior=args.prior, rollouts=args.rollouts,
+        eval_at=args.eval_at, eval_episodes=args.episodes, out=args.out,
+    )  # fmt: skip
 
 
 def options(args: BulletArgs, run: _Run) -> list[object]:

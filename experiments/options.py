@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
@@ -115,9 +115,14 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str, opti
     return sorted(found, key=_seed_number)
 
 
+def card_of_prior(folder: Path) -> dict[str, Any]:
+    """The card of a prior; raises UserError where it names no task."""
+    return read_object(folder / "prior.json", {"task": str}, "name it with --task, or take another prior")
+
+
 def task_of_prior(folder: Path) -> str:
     """The task that the card of a prior names; raises UserError where it names none."""
-    return read_object(folder / "prior.json", {"task": str}, "name it with --task, or take another prior")["task"]
+    return card_of_prior(folder)["task"]
 
 
 def _seed_number(folder: Path) -> tuple[int, str]:

@@ -23,7 +23,7 @@ from sgft_jax.io.priors import load_prior, observed
 from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.methods.options import card_of
 from sgft_jax.policies import make_policy
-from sgft_jax.presets import preset_of
+from sgft_jax.presets import check_card
 from sgft_jax.stacking import stack
 from sgft_jax.systems import System
 from sgft_jax.systems.simulated import Simulated
@@ -114,14 +114,7 @@ def _simulator(env: Env, card: Mapping[str, Any]) -> tuple[Env, Gap | None]:
 
 def check_prior(prior: Prior, method: Method, env: Env) -> None:
     """Raises UserError for a prior of another algorithm or task, or of a policy that is told more or less."""
-    command = f"python -m experiments.pretrain --task {env.name} --preset {preset_of(method)}"
-    if (found := prior.card.get("algorithm", "sac")) != method.prior:
-        raise UserError(f"the method needs a prior of {method.prior}, not of {found}; make one with: {command}")
-    if method.sees_system != bool(prior.card.get("system")):
-        told = f"{'' if method.sees_system else 'not '}told the system"
-        raise UserError(f"{method.name} needs a prior that was {told}; make one with: {command}")
-    if prior.card["task"] != env.name:
-        raise UserError(f"the prior is of the task {prior.card['task']!r}, not of {env.name!r}")
+    check_card(prior.card, method, env.name)
     if prior.card["obs_dim"] != env.obs_dim:
         raise UserError(
             f"the policy of the prior observes {prior.card['obs_dim']} numbers, the task as it was made {env.obs_dim}; "

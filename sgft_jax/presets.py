@@ -4,11 +4,13 @@ Command lines read this module, so it imports neither JAX nor MuJoCo.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 from sgft_jax import checks
 from sgft_jax.models.config import NetworkConfig, Precision
-from sgft_jax.types import Algorithm, Method
+from sgft_jax.types import Algorithm, Method, UserError
 
 DEFAULT_PRESET = "robust"
 
@@ -245,3 +247,15 @@ def preset_of(method: Method) -> str:
     if method.sees_system:
         return "informed"
     return {"sac": DEFAULT_PRESET, "tdmpc2": "robust-tdmpc2", "recurrent": "recurrent"}[method.prior]
+
+
+def check_card(card: Mapping[str, Any], method: Method, task: str) -> None:
+    """Raises UserError for the card of a prior of another algorithm or task, or of a policy told more or less."""
+    command = f"python -m experiments.pretrain --task {task} --preset {preset_of(method)}"
+    if (found := card.get("algorithm", "sac")) != method.prior:
+        raise UserError(f"{method.name} needs a prior of {method.prior}, not of {found}; make one with: {command}")
+    if method.sees_system != bool(card.get("system")):
+        told = f"{'' if method.sees_system else 'not '}told the system"
+        raise UserError(f"{method.name} needs a prior that was {told}; make one with: {command}")
+    if card["task"] != task:
+        raise UserError(f"the prior is of the task {card['task']!r}, not of {task!r}")

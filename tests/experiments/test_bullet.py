@@ -9,7 +9,7 @@ from experiments.bullet import BulletArgs
 from sgft_jax.types import UserError
 
 ROOT = Path(__file__).parents[2]
-PRIOR = ROOT / "docs/priors/push"  # of another task: it is only looked for
+PRIOR = ROOT / "docs/priors/panda-push"
 
 
 @pytest.fixture
@@ -59,6 +59,13 @@ def test_evaluations_and_an_end_of_the_time(played, tmp_path):
         ({"methods": ("sac", "sac")}, "--methods"),
         ({"methods": ("sacc",)}, "sacc"),
         ({"seeds": 0}, "--seeds is 0: must be at least 1"),
+        ({"seed": -1}, "--seed is -1: seeds go from 0 to"),
+        ({"minutes": -1.0}, "--minutes is -1.0: must be at least 0"),
+        ({"eval_at": (-1,)}, "--eval-at -1: numbers of rollouts, from 0 on"),
+        ({"eval_at": (500,)}, "--eval-at 500: no evaluation within --rollouts 20"),
+        ({"methods": ("sac", "tdmpc2")}, "seed-0: tdmpc2 needs a prior of tdmpc2, not of sac; make one with: python"),
+        ({"methods": ("sac", "sysid")}, "seed-0: sysid needs a prior that was told the system; make one with: python"),
+        ({"prior": Path("docs/priors/push")}, "seed-0: the prior is of the task 'push', not of 'panda-push'"),
         ({"prior": Path("nowhere")}, "--prior nowhere: no such folder"),
     ],
 )
