@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from experiments.options import (
     Impl,
+    Successors,
     at_least_one,
     check_variant,
     not_negative,
@@ -25,7 +26,9 @@ from sgft_jax.types import Method, UserError
 
 NO_PRIOR = Path("none")
 # May differ when a run goes on; what is in the data may not.
-VOLATILE = ("resume", "overwrite", "rollouts", "devices", "video", "out", "tuned", "real_data", "sync_every")
+VOLATILE = (
+    "resume", "overwrite", "rollouts", "devices", "video", "out", "tuned", "real_data", "successors", "sync_every",
+)  # fmt: skip
 _EVALUATION_EPISODES = 50
 
 
@@ -79,6 +82,7 @@ class FinetuneArgs:
     real_updates: int | None = None
     """Expert: updates on --real-data before the first rollout; default: as many as rollouts of so many transitions
     allow."""
+    successors: Successors = "stored"
     tuned: bool = False
     """Expert: begin with what `experiments.tune` chose for this task and method, as the variant `tuned`."""
     variant: str = ""
@@ -136,6 +140,8 @@ def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
         raise UserError(f"--real-data {missing[0]}: no such file or folder")
     if args.real_updates is not None and (args.real_updates < 0 or not args.real_data):
         raise UserError(f"--real-updates {args.real_updates}: 0 or more, and of --real-data, which must be named")
+    if args.successors != "stored" and not args.real_data:
+        raise UserError(f"--successors {args.successors}: is for --real-data, which must be named")
     if not args.real:
         raise UserError("--real: name at least one")
     without_repeats("--real", args.real)

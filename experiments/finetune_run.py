@@ -45,14 +45,18 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
     for prior in priors:
         api.check_prior(prior, method, env)
     card = card_of(priors[0] if priors else None)
-    logs = [logged.read(path, env, gamma=card["gamma"]) for path in args.real_data]
+    logs = [logged.read(path, env, gamma=card["gamma"], successors=args.successors) for path in args.real_data]
     # Every folder is that of a run on its real system alone: either kind of run continues the other.
     # A robot may come back at another address.
     named = [real_systems.REMOTE if real_systems.is_robot(name) else name for name in args.real]
     homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in named}
     opened = runs.open_runs(
         homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
-        inputs={"priors": [digest(prior) for prior in priors], "real_data": [log.facts.sha256[:12] for log in logs]},
+        inputs={
+            "priors": [digest(prior) for prior in priors],
+            "real_data": [log.facts.sha256[:12] for log in logs],
+            "successors": [log.facts.successors for log in logs],
+        },
     )  # fmt: skip
     with contextlib.ExitStack() as last:
         for own in opened:

@@ -11,6 +11,7 @@ from tyro.conf import arg
 from envs.gaps import SIM, title
 from experiments.options import (
     Impl,
+    Successors,
     at_least_one,
     check_task,
     check_variant,
@@ -73,8 +74,7 @@ class HybridArgs:
     """Options of the method that --method names:"""
     schedule_preset: SchedulePreset = FLEET
     schedule: Schedule = field(default_factory=Schedule)
-    successors: str = "stored"
-    """Expert: where the next observations of a D4RL file come from: stored, or shifted (the row below)."""
+    successors: Successors = "stored"
     seed: int = 0
     """Expert: first seed."""
     eval_every: int = 10_000

@@ -2,19 +2,19 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from envs.base import Env
 from sgft_jax.data import logs
+from sgft_jax.data.layouts import Successors
 from sgft_jax.data.logs import Log
 from sgft_jax.train import Logged
 from sgft_jax.types import Finetuner, UserError
 
 
-def read(path: Path, env: Env, *, gamma: float, successors: Any = "stored") -> Log:
+def read(path: Path, env: Env, *, gamma: float, successors: Successors = "stored") -> Log:
     """The real rows of a file or folder; says what they are. Raises UserError if they are not of this task."""
     log = logs.load(path, gamma=gamma, successors=successors, env=env)
     facts = log.facts

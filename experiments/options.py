@@ -27,6 +27,13 @@ Impl = Annotated[
     ),
 ]
 
+Successors = Annotated[
+    Literal["stored", "shifted"],
+    arg(
+        help="Expert: where the next observations of a D4RL file come from: stored, or shifted (the row below).",
+    ),
+]
+
 
 def seed_list(first: int, count: int) -> list[int]:
     """`count` seeds from `first` on; raises UserError for none, and for seeds that do not fit into 32 bits."""

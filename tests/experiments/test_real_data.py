@@ -192,11 +192,24 @@ def test_a_run_begins_with_logs(words, home, tmp_path, capsys):
     [
         (["--options.replay-capacity", "9"], "10 transitions, but an agent keeps 9; raise --options.replay-capacity"),
         (["--real-updates", "-1"], "--real-updates -1: 0 or more"),
+        (["--successors", "shift"], "--successors: there is no 'shift', did you mean 'shifted'?"),
         (["--real-data", "nowhere"], "--real-data nowhere: no such file or folder"),
     ],
 )
 def test_logs_that_cannot_be_begun_with(more, said, words, capsys):
     assert said in complaint(words(*more), capsys)
+
+
+def test_a_file_without_next_observations_is_read_with_shifted_ones(words, tmp_path, capsys):
+    with h5py.File(tmp_path / "bare.hdf5", "w") as file:
+        file["observations"], file["actions"] = np.zeros((6, 4)), np.zeros((6, 2))
+        file["rewards"], file["terminals"] = np.zeros(6), np.zeros(6, bool)
+        file["timeouts"] = np.arange(6) == 3
+    given = words("--options.replay-capacity", "3", data=[tmp_path / "bare.hdf5"])
+    assert "has no 'next_observations'; set successors to 'shifted'" in complaint(given, capsys)
+    assert "4 transitions, but an agent keeps 3" in complaint([*given, "--successors", "shifted"], capsys)
+    said = complaint([*words(data=[]), "--successors", "shifted"], capsys)
+    assert "--successors shifted: is for --real-data, which must be named" in said
 
 
 def test_logs_of_another_task_are_refused(words, tmp_path, capsys):
