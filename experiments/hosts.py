@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 
 from experiments.cli import USER_ERROR
-from experiments.options import port_of
+from experiments.options import hosts_of
 from sgft_jax import mesh
 from sgft_jax.types import UserError
 
@@ -36,15 +36,7 @@ def join(hosts: str | None) -> None:
         except (RuntimeError, ValueError) as error:
             raise UserError(f"--hosts auto: {str(error).splitlines()[0]}") from error
         return
-    address, *numbers = hosts.split(",")
-    if ":" not in address or len(numbers) != 2 or not all(n.isdecimal() for n in numbers):
-        raise UserError(f"--hosts {hosts}: must be 'auto' or ADDRESS:PORT,COUNT,INDEX")
-    if port_of(address.rpartition(":")[2]) is None:
-        raise UserError(f"--hosts {hosts}: the port of {address} must be from 1 to 65535")
-    count, index = map(int, numbers)
-    if index >= count:
-        raise UserError(f"--hosts {hosts}: index {index} of {count} hosts; they are counted from 0")
-    jax.distributed.initialize(address, count, index)
+    jax.distributed.initialize(*hosts_of(hosts))
 
 
 @contextlib.contextmanager

@@ -61,6 +61,19 @@ def port_of(text: str) -> int | None:
     return int(text) if text.isdecimal() and 0 < int(text) <= _LAST_PORT else None
 
 
+def hosts_of(hosts: str) -> tuple[str, int, int]:
+    """The address of the first host, how many there are, and which one this is; UserError for anything else."""
+    address, *numbers = hosts.split(",")
+    if ":" not in address or len(numbers) != 2 or not all(n.isdecimal() for n in numbers):
+        raise UserError(f"--hosts {hosts}: must be 'auto' or ADDRESS:PORT,COUNT,INDEX")
+    if port_of(address.rpartition(":")[2]) is None:
+        raise UserError(f"--hosts {hosts}: the port of {address} must be from 1 to 65535")
+    count, index = map(int, numbers)
+    if index >= count:
+        raise UserError(f"--hosts {hosts}: index {index} of {count} hosts; they are counted from 0")
+    return address, count, index
+
+
 def check_variant(variant: str) -> None:
     """Raise UserError for a word that cannot be a part of a folder's name."""
     if not re.fullmatch(r"[\w.-]*", variant):

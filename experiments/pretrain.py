@@ -13,7 +13,7 @@ from typing import Any
 from envs import gaps
 from envs.gaps import SIM
 from experiments import cli
-from experiments.options import Impl, check_task, seed_list, seeds_name
+from experiments.options import Impl, check_task, hosts_of, seed_list, seeds_name
 from sgft_jax import extend
 from sgft_jax.io.runs import check_start
 from sgft_jax.presets import DEFAULT_PRESET, PRESETS, PretrainConfig
@@ -86,6 +86,8 @@ def check(args: PretrainArgs) -> list[int]:
     if args.set and not real:
         raise UserError(f"--set {args.set[0]}: changes a real system; name one with --real")
     check_task(args.task, [str(args.real)] if real else [])
+    if args.hosts not in (None, "auto"):
+        hosts_of(args.hosts)
     # Of several hosts every one sees what is there now: the first changes nothing before it has met the others.
     check_start(run_folder(args), resume=args.resume, overwrite=args.overwrite)
     return seeds

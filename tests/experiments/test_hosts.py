@@ -91,6 +91,11 @@ def test_hosts_that_nobody_can_meet(given, words):
         hosts.join(given)
 
 
+def test_what_is_no_host_is_found_before_jax_starts():
+    with pytest.raises(UserError, match="the port of node7:0 must be from 1 to 65535"):
+        pretrain.check(pretrain.PretrainArgs(hosts="node7:0,2,0"))
+
+
 def test_several_hosts_work_with_all_their_devices(monkeypatch):
     monkeypatch.setattr(jax, "process_count", lambda: 2)
     assert mesh.devices(None, {}) == mesh.devices(0, {}) == 2
