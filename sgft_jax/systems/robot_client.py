@@ -113,17 +113,36 @@ def _plain(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Limits:
-    """What the robot may be told. Commands are brought within; what was sent is what is reported.
+    """What the robot may be told. Every command is brought within, also one for a late step; what was sent is reported.
 
-    low, high: of every action. change: how far an action may be from the one before, at most. workspace: the lowest
-    and the highest value of every number that is measured, infinite where any will do. Beyond them the robot is stopped
-    and the episode ends there; it cannot begin there either.
+    low, high: of every action, one number for all motors or one for each. change: how far an action may be from the one
+    before, at most; low and high come first where they contradict it. workspace: the lowest and the highest value of
+    every number that is measured, infinite where any will do. Beyond them the robot is stopped and the episode ends
+    there; it cannot begin there either.
     """
 
     low: float | Sequence[float] = -1.0
     high: float | Sequence[float] = 1.0
     change: float | Sequence[float] = np.inf
     workspace: tuple[Sequence[float], Sequence[float]] | None = None
+
+    def check(self, obs_size: int, action_size: int) -> None:
+        """Raises ValueError for a bound of the wrong size, one that is no number, and for one that allows nothing."""
+        if self.workspace is not None:
+            if [np.shape(bound) for bound in self.workspace] != 2 * [(obs_size,)]:
+                raise ValueError(
+                    f"the workspace needs a lowest and a highest value for each of {obs_size} measured numbers"
+                )
+            lowest, highest = np.asarray(self.workspace, float)
+            if not (lowest <= highest).all():  # nan is not
+                raise ValueError("limits: no lowest value of the workspace may be above the highest, and none nan")
+        low, high = (_motors(getattr(self, name), action_size, f"limits: {name}") for name in ("low", "high"))
+        if not np.isfinite([low, high]).all():
+            raise ValueError("limits: low and high need finite numbers, for example -1 and 1")
+        if not (low <= high).all():
+            raise ValueError("limits: low is above high; swap them")
+        if not (_motors(self.change, action_size, "limits: change") > 0).all():
+            raise ValueError("limits: change must be above 0; leave it out where any change is allowed")
 
     def of(self, action: np.ndarray, before: np.ndarray) -> np.ndarray:
         """The nearest action that is allowed. before: the last one sent, zeros at the start of an episode."""
@@ -137,6 +156,17 @@ class Limits:
         low, high = (np.asarray(x) for x in self.workspace)
         beyond = np.flatnonzero((obs < low) | (obs > high))
         return f"measured number {beyond[0]} is {obs[beyond[0]]:.4g}, beyond the workspace" if len(beyond) else ""
+
+
+def _motors(given: Any, action_size: int, what: str) -> np.ndarray:
+    """[action_size], of one number for all motors or one for each; ValueError for anything else."""
+    try:
+        values = np.asarray(given, float)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape not in ((), (action_size,)):
+        raise ValueError(f"{what} is {given!r}; give one number, or {action_size} of them, one for each motor")
+    return np.full(action_size, values)
 
 
 class RefusedError(Exception):
@@ -163,21 +193,17 @@ def play(
     driver: see the top of this file. url: of the learner. token: what it printed. period: seconds of a step, for a
     driver with `read` and `send`. answer_within: seconds after which a command is too late, default half a period; the
     first of an episode may take as long as it wants, so `reset` must leave the robot where it can wait.
-    late: what happens then: "hold" leaves the last command, an action is sent instead. patience: after so many late
-    steps in a row the episode ends. log: a file to which every command is appended before it is sent. retry: seconds
-    between attempts to connect. say: hears one line about everything unusual.
+    late: what happens then: "hold" leaves the last command, an action is sent instead, within `limits`. patience: after
+    so many late steps in a row the episode ends. log: a file to which every command is appended before it is sent.
+    retry: seconds between attempts to connect. say: hears one line about everything unusual.
 
     A lost connection stops the robot; it connects again and goes on with the next episode. Whatever happens, `stop` is
-    called before this returns or raises. Raises `RefusedError` if the learner says that the two do not fit.
+    called before this returns or raises. Raises `RefusedError` if the learner says that the two do not fit, ValueError
+    for an argument that cannot be right, before the robot moves.
     """
-    timed = hasattr(driver, "send")
-    if timed and not period:
-        raise ValueError("a driver with `send` needs a period, in seconds")
-    if any(np.shape(bound) != (int(driver.obs_size),) for bound in limits.workspace or ()):
-        raise ValueError(
-            f"the workspace needs a lowest and a highest value for each of {driver.obs_size} measured numbers"
-        )
-    rhythm = _Rhythm(period, answer_within or period / 2, late, patience) if timed and period else None
+    limits.check(int(driver.obs_size), int(driver.action_size))
+    instead = _instead(late, int(driver.action_size))
+    rhythm = _rhythm(period, answer_within, instead, patience) if hasattr(driver, "send") else None
     robot = _Robot(driver, rhythm, limits, _Log(log))
     hello = pack(
         "hello", version=VERSION, token=token, robot=name, obs_size=int(driver.obs_size),
@@ -214,10 +240,36 @@ def _introduce(socket: Any, hello: bytes) -> None:
 
 @dataclass(frozen=True)
 class _Rhythm:
+    """instead: what is sent where no command came in time, [action_size]; None leaves the last one."""
+
     period: float
     answer_within: float
-    late: str | Sequence[float]
+    instead: np.ndarray | None
     patience: int
+
+
+def _rhythm(period: float | None, answer_within: float | None, instead: np.ndarray | None, patience: int) -> _Rhythm:
+    """The clock of a driver with `send`; raises ValueError where no robot can keep it."""
+    if period is None:
+        raise ValueError("a driver with `send` needs a period, in seconds")
+    if not 0 < period < np.inf:  # nan is not
+        raise ValueError(f"period is {period}; give the seconds of a step, more than 0")
+    within = period / 2 if answer_within is None else answer_within
+    if not 0 < within <= period:
+        raise ValueError(f"answer_within is {within}; give seconds, more than 0 and at most the period of {period}")
+    if not patience >= 1:
+        raise ValueError(f"patience is {patience}; give a number of steps, 1 or more")
+    return _Rhythm(period, within, instead, patience)
+
+
+def _instead(late: str | Sequence[float], action_size: int) -> np.ndarray | None:
+    """The action that `late` names; None for "hold"; raises ValueError for anything else."""
+    if isinstance(late, str) and late == "hold":
+        return None
+    try:
+        return array(np.asarray(late, "<f4").tobytes(), action_size, "late")
+    except (TypeError, ValueError) as error:
+        raise ValueError(f'late is {late!r}; give "hold", or {action_size} finite numbers') from error
 
 
 class _Log:
@@ -316,20 +368,21 @@ class _Robot:
             except ValueError as error:
                 self._fail(socket, error, say)
                 return
-            self._move(socket, self.limits.of(action, self._last), say, late=False)
+            self._move(socket, action, say, late=False)
 
     def _hold(self, socket: Any, say: Callable[[str], None]) -> None:
         """A step for which no command came in time."""
         assert self.rhythm is not None
-        held = isinstance(self.rhythm.late, str)
-        action = self._last if held else np.asarray(self.rhythm.late, np.float32)
-        self._move(socket, action, say, late=True)
+        wanted = self._last if self.rhythm.instead is None else self.rhythm.instead
+        self._move(socket, wanted, say, late=True)
 
     def _tell(self, socket: Any, answer: bytes) -> None:
         self._answers.append(answer)
         _send(socket, answer)
 
-    def _move(self, socket: Any, action: np.ndarray, say: Callable[[str], None], *, late: bool) -> None:
+    def _move(self, socket: Any, wanted: np.ndarray, say: Callable[[str], None], *, late: bool) -> None:
+        """A step with the nearest command that is allowed. Nothing reaches the driver but through here."""
+        action = self.limits.of(wanted, self._last)
         step = len(self._answers) - 1
         if step == 0:
             self._tick = time.monotonic()
@@ -368,7 +421,7 @@ class _Robot:
     def _by_clock(self, action: np.ndarray, *, late: bool) -> dict[str, Any]:
         """Sends, waits for the end of the period, reads. The clock goes on from where it should be, not from now."""
         assert self.rhythm is not None
-        if not late or not isinstance(self.rhythm.late, str):
+        if not late or self.rhythm.instead is not None:
             self.driver.send(action)
         self._tick += self.rhythm.period
         time.sleep(max(self._tick - time.monotonic(), 0.0))

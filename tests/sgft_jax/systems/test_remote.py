@@ -148,8 +148,6 @@ def test_no_episode_begins_beyond_the_workspace(pair):
     own = pair(driver, limits=Limits(workspace=([-1.0, -1.0], [1.0, 1.0])), again=0.05)
     np.testing.assert_array_equal(begin(own, 0), [0, 0])
     assert any("measured number 1 is 3, beyond the workspace" in line for line in own.said)
-    with pytest.raises(ValueError, match="a lowest and a highest value for each of 2 measured numbers"):
-        play(Point(), "ws://127.0.0.1:1", token="", limits=Limits(workspace=([0.0], [1.0])))
 
 
 @pytest.mark.parametrize("driver", [Point, Arm])
@@ -207,6 +205,64 @@ def test_a_late_command_is_replaced_and_counted(pair):
     time.sleep(0.2)
     late = move(safe, -RIGHT)
     assert late.info["late"] and late.info["sent"][0] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("limits", "late", "first", "sent"),
+    [
+        (Limits(low=-0.2, high=0.2), [5.0, 0.0], 0.1, [0.2, 0.0]),
+        (Limits(change=0.1), [-1.0, 0.0], 0.1, [0.0, 0.0]),  # from what was sent last, not from zero
+        (Limits(low=[-0.5, -0.1], high=[0.5, 0.1], change=[1.0, 0.3]), [-1.0, 1.0], 0.4, [-0.5, 0.1]),
+    ],
+    ids=str,
+)
+def test_a_late_command_is_kept_within_limits(pair, limits, late, first, sent):
+    own = pair(Arm(), period=0.05, late=late, limits=limits)
+    begin(own, 0)
+    move(own, first * RIGHT)
+    time.sleep(0.08)
+    moved = move(own, RIGHT)
+    assert moved.info["late"]
+    np.testing.assert_allclose(moved.info["sent"], sent, atol=1e-6)
+    np.testing.assert_allclose(own.driver.moves[1], sent, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"late": "safe"}, "late is 'safe'; give \"hold\", or 2 finite numbers"),
+        ({"late": [0.0, 0.0, 0.0]}, "late is .*2 finite numbers"),
+        ({"late": [np.nan, 0.0]}, "late is .*2 finite numbers"),
+        ({"late": None}, "late is None; give"),
+        ({"limits": Limits(low=np.nan)}, "low and high need finite numbers"),
+        ({"limits": Limits(high=np.inf)}, "low and high need finite numbers"),
+        ({"limits": Limits(low=[0.0, 0.5], high=0.4)}, "low is above high"),
+        ({"limits": Limits(low=[0.0])}, r"low is \[0.0\]; give one number, or 2"),
+        ({"limits": Limits(high=[1.0, 1.0, 1.0])}, "limits: high is .*or 2 of them"),
+        ({"limits": Limits(high="much")}, "limits: high is 'much'; give one number"),
+        ({"limits": Limits(change=np.nan)}, "change must be above 0"),
+        ({"limits": Limits(change=[0.1, 0.0])}, "change must be above 0"),
+        ({"limits": Limits(change=[0.1, 0.1, 0.1])}, "limits: change is .*or 2 of them"),
+        ({"limits": Limits(workspace=([0.0], [1.0]))}, "a lowest and a highest value for each of 2 measured numbers"),
+        ({"limits": Limits(workspace=([0.0, 0.0], [1.0]))}, "a lowest and a highest value"),
+        ({"limits": Limits(workspace=([0.0, 0.0],))}, "a lowest and a highest value"),
+        ({"limits": Limits(workspace=([0.0, np.nan], [1.0, 1.0]))}, "lowest value of the workspace"),
+        ({"limits": Limits(workspace=([0.0, 2.0], [1.0, 1.0]))}, "lowest value of the workspace"),
+        ({"period": None}, "needs a period"),
+        ({"period": 0.0}, "period is 0.0; give the seconds"),
+        ({"period": np.nan}, "period is nan"),
+        ({"answer_within": 0.0}, "answer_within is 0.0; .*at most the period of 0.05"),
+        ({"answer_within": 0.06}, "answer_within is 0.06"),
+        ({"answer_within": np.nan}, "answer_within is nan"),
+        ({"patience": 0}, "patience is 0"),
+    ],
+    ids=str,
+)
+def test_arguments_that_cannot_be_right_are_refused_before_the_robot_moves(given, words):
+    driver = Arm()
+    with pytest.raises(ValueError, match=words):
+        play(driver, "ws://127.0.0.1:1", **{"token": "", "period": 0.05, **given})
+    assert not driver.resets and not driver.moves
 
 
 def test_a_learner_that_does_not_answer_ends_the_episode(pair):
