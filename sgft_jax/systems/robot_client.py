@@ -22,13 +22,13 @@ import contextlib
 import os
 import time
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import msgpack
 import numpy as np
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidMessage
 from websockets.sync.client import connect
 
 VERSION = 1
@@ -198,8 +198,9 @@ def play(
     retry: seconds between attempts to connect. say: hears one line about everything unusual.
 
     A lost connection stops the robot; it connects again and goes on with the next episode. Whatever happens, `stop` is
-    called before this returns or raises. Raises `RefusedError` if the learner says that the two do not fit, ValueError
-    for an argument that cannot be right, before the robot moves.
+    called before this returns or raises. Raises `RefusedError` if the learner says that the two do not fit; ValueError
+    for an argument that cannot be right, before the robot moves; OSError where the log cannot be written, before the
+    command is sent; and whatever the driver's `stop` raises.
     """
     limits.check(int(driver.obs_size), int(driver.action_size))
     instead = _instead(late, int(driver.action_size))
@@ -209,33 +210,55 @@ def play(
         "hello", version=VERSION, token=token, robot=name, obs_size=int(driver.obs_size),
         action_size=int(driver.action_size), answer_within=float(rhythm.answer_within) if rhythm else None,
     )  # fmt: skip
-    waiting = False
+    said = ""
     try:
         while True:
-            try:
-                with connect(url, max_size=LIMIT, compression=None, proxy=None, open_timeout=10) as socket:
-                    waiting = False
-                    _introduce(socket, hello)
+            with contextlib.ExitStack() as stack:
+                try:
+                    socket = _connected(stack, url, hello)
+                except (ConnectionClosed, InvalidMessage, OSError, ValueError) as error:  # a TimeoutError is an OSError
+                    lost = error
+                else:
                     say(f"connected to {url}")
-                    robot.serve(socket, say)
-                    return robot.counts
-            except (ConnectionClosed, OSError, TimeoutError, ValueError) as error:
-                driver.stop()
-                if not waiting:
-                    say(f"no connection to {url} ({error}); the robot is stopped, trying again")
-                waiting = True
-                time.sleep(retry)
+                    said, lost = "", _served(socket, robot, say)
+            if lost is None:
+                return robot.counts
+            driver.stop()
+            if (line := f"no connection to {url} ({lost}); the robot is stopped, trying again") != said:
+                say(line)
+            said = line
+            time.sleep(retry)
     finally:
         driver.stop()
         robot.log.close()
 
 
-def _introduce(socket: Any, hello: bytes) -> None:
-    """Sends the first message. Raises RefusedError if the learner refuses for good, ValueError if for now."""
+def _connected(stack: contextlib.ExitStack, url: str, hello: bytes) -> Any:
+    """A connection to a learner that takes this robot; `stack` closes it.
+
+    Raises RefusedError if it refuses for good, ValueError if for now, and what `connect` and `recv` raise.
+    """
+    socket = stack.enter_context(connect(url, max_size=LIMIT, compression=None, proxy=None, open_timeout=10))
     socket.send(hello)
     answer = unpack(socket.recv(timeout=10))
     if answer["type"] == "refused":
         raise (RefusedError if answer["final"] else ValueError)(answer["reason"])
+    return socket
+
+
+def _served(socket: Any, robot: _Robot, say: Callable[[str], None]) -> ConnectionClosed | None:
+    """Plays until the learner ends the run; returns how the connection was lost, if it was.
+
+    Raises what goes wrong on this side: another connection would not help. The robot stops at once, because closing a
+    connection takes seconds where the other side is gone.
+    """
+    try:
+        robot.serve(socket, say)
+    except ConnectionClosed as error:
+        return error
+    finally:
+        robot.driver.stop()
+    return None
 
 
 @dataclass(frozen=True)
@@ -273,20 +296,37 @@ def _instead(late: str | Sequence[float], action_size: int) -> np.ndarray | None
 
 
 class _Log:
-    """Commands on disk before they are sent, one msgpack map each; nothing without a path."""
+    """Commands on disk before they are sent, one msgpack map each; nothing without a path.
+
+    Raises OSError, with what to do, where the file cannot be opened or written.
+    """
 
     def __init__(self, path: str | os.PathLike[str] | None) -> None:
-        self._file = None if path is None else open(path, "ab")  # noqa: SIM115
+        self._path, self._file = path, None
+        if path is not None:
+            with self._explained():
+                self._file = open(path, "ab", buffering=0)  # noqa: SIM115
 
     def write(self, **fields: Any) -> None:
         if self._file is not None:
-            self._file.write(_encoded({name: _plain(x) for name, x in fields.items()}))
-            self._file.flush()
-            os.fsync(self._file.fileno())
+            line = memoryview(_encoded({name: _plain(x) for name, x in fields.items()}))
+            with self._explained():
+                while line:
+                    line = line[self._file.write(line) :]
+                os.fsync(self._file.fileno())
 
     def close(self) -> None:
         if self._file is not None:
             self._file.close()
+
+    @contextlib.contextmanager
+    def _explained(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise OSError(
+                f"the log {self._path}: {error.strerror}; the robot is stopped. Make room, or choose another file"
+            ) from error
 
 
 class _Robot:

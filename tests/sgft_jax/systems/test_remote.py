@@ -3,6 +3,7 @@
 import ast
 import contextlib
 import random
+import socket
 import sys
 import threading
 import time
@@ -463,6 +464,85 @@ def test_every_command_is_on_disk_before_it_is_sent(pair, tmp_path):
     for _ in range(2):
         move(own, RIGHT)
     assert lengths == [1, 2] and [x["step"] for x in read(path)] == [0, 1]
+
+
+def played_alone(driver, **options):
+    """What `play` raises for a learner that asks for one step, what the two said, and whether the step is in doubt."""
+    said, raised = [], []
+    remote = Remote(2, 2, again=0.05, say=said.append)
+
+    def run():
+        try:
+            play(driver, remote.url, token=remote.token, retry=0.01, say=said.append, **options)
+        except OSError as error:
+            raised.append((time.monotonic(), error))
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    remote.reset(seed=0)
+    doubt = remote.step(RIGHT)[-1].get("invalid", False)
+    if not doubt:
+        remote.rest()
+    thread.join(timeout=10)
+    assert not thread.is_alive()
+    remote.close()
+    return raised[0][1], said, doubt
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a disk that is always full is one of Linux")
+@pytest.mark.parametrize(("driver", "options"), [(Point, {}), (Arm, {"period": 0.02})])
+def test_a_log_that_cannot_be_written_stops_the_robot_and_is_no_lost_connection(driver, options):
+    own = driver()
+    error, said, doubt = played_alone(own, log="/dev/full", **options)
+    assert str(error).startswith("the log /dev/full: No space left on device; the robot is stopped. Make room")
+    assert doubt and own.stops and not own.moves and len(own.resets) == 1
+    assert not any("no connection" in line for line in said)
+
+
+def test_a_log_that_cannot_be_opened_is_said_before_the_robot_moves(tmp_path):
+    driver = Point()
+    with pytest.raises(OSError, match=r"the log .*nowhere/log: No such file or directory; .*choose another file"):
+        play(driver, "ws://127.0.0.1:1", token="", log=tmp_path / "nowhere/log")
+    assert not driver.resets
+
+
+def test_a_driver_that_cannot_stop_is_no_lost_connection():
+    driver = Point()
+    stops = iter([None])  # at the reset
+
+    def stop():
+        driver.stops += 1
+        if next(stops, 0) == 0:
+            raise OSError("the bus is off")
+
+    driver.stop = stop
+    error, said, doubt = played_alone(driver)
+    assert str(error) == "the bus is off" and not doubt and len(driver.resets) == 1
+    assert driver.stops == 4  # at the reset; told to rest; twice more on the way out
+    assert not any("no connection" in line for line in said)
+
+
+def test_a_learner_that_is_not_there_is_waited_for_and_said_once():
+    """First nobody listens, then somebody hangs up in the middle of the greeting, then the learner is there."""
+    listener, said = socket.socket(), []
+    listener.bind(("127.0.0.1", 0))
+    port = listener.getsockname()[1]
+    options = {"token": "t", "retry": 0.01, "say": said.append}
+    thread = threading.Thread(target=play, args=(Point(), f"ws://127.0.0.1:{port}"), kwargs=options, daemon=True)
+    thread.start()
+    time.sleep(0.2)
+    listener.listen()
+    for _ in range(2):
+        one, _ = listener.accept()
+        one.recv(10)
+        one.close()
+    listener.close()
+    remote = Remote(2, 2, port=port, token="t", say=lambda line: None)
+    remote.reset(seed=0)
+    remote.close()
+    thread.join(timeout=10)
+    assert not thread.is_alive() and said[-1].startswith("connected")
+    assert len(said) == len(set(said)) and all("trying again" in line for line in said[:-1])
 
 
 def read(path):
