@@ -142,7 +142,10 @@ def connect(
         if members > 1:
             raise UserError(f"--real {reals[0]}: one robot plays for {members}; choose one policy, or --seeds 1")
         host, port = address(reals[0])
-        robot = Remote(env.measured_dim, env.act_dim, steps=env.episode_length, host=host, port=port, token=token(home))
+        robot = Remote(
+            env.measured_dim, env.act_dim, period=env.control_dt, steps=env.episode_length, host=host, port=port,
+            token=token(home),
+        )  # fmt: skip
         return Gymnasium(env, robot, gamma=gamma)
     given = keywords(changes)
     return Gymnasium(env, [_make(real, given) for real in reals for _ in range(members)], gamma=gamma)

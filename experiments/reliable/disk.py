@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from experiments.reliable import quick_task
 from experiments.reliable.runs import Trial
 from sgft_jax.types import UserError
 
@@ -25,7 +26,10 @@ def read_only(home: Path, *, rollouts: int = 4) -> dict[str, Any]:
 def _stopped(home: Path, name: str, options: list[str], mended: str, rollouts: int) -> dict[str, Any]:
     out = home / name
     out.mkdir(parents=True, exist_ok=True)
-    own = Trial(home / f"{name}-run", period=0.05, rollouts=rollouts, patience=300.0, out=out)
+    own = Trial(
+        home / f"{name}-run", period=quick_task.PERIOD, rollouts=rollouts, patience=300.0, out=out,
+        task=quick_task.__file__,
+    )  # fmt: skip
     with _mounted(out, options), own as trial:
         if name == "full":
             trial.start_robot()

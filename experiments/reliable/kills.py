@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from experiments.reliable import quick_task
 from experiments.reliable.runs import Trial
 from sgft_jax.types import UserError
 
@@ -19,11 +20,11 @@ _EARLY = 0.2  # share of the kills that come while the processes start, within s
 _START, _PLAY = 8.0, 3.0  # and the others after the robot has begun to move
 
 
-def run(home: Path, *, kills: int, seed: int, period: float = 0.05, rollouts: int = 20) -> dict[str, Any]:
+def run(home: Path, *, kills: int, seed: int, rollouts: int = 20) -> dict[str, Any]:
     """One run with so many kills; what became of it. The run grows until all kills are done."""
     luck = np.random.default_rng(seed)
     killed: Counter[str] = Counter()
-    with Trial(home, period=period, rollouts=rollouts, patience=300.0) as trial:
+    with Trial(home, period=quick_task.PERIOD, rollouts=rollouts, patience=300.0, task=quick_task.__file__) as trial:
         trial.start()
         while killed.total() < kills:
             killed.update(_strike(trial, luck))

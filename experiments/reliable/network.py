@@ -15,7 +15,7 @@ from websockets.sync.server import ServerConnection, serve
 from experiments.real_systems import free_port
 from experiments.reliable import timing
 from experiments.reliable.runs import Trial
-from sgft_jax.systems.robot_client import pack
+from sgft_jax.systems.robot_client import VERSION, pack
 
 
 class Fate(NamedTuple):
@@ -99,7 +99,7 @@ def strangers(
 
 def _nonsense(port: int, frames: int, luck: np.random.Generator) -> int:
     """So many frames of random or truncated bytes: half of them no WebSocket at all; returns how many it sent."""
-    good, sent = pack("hello", version=1, token="x", robot="r", obs_size=3, action_size=1, answer_within=None), 0
+    good, sent = _hello("x"), 0
     while sent < frames:
         cut = luck.uniform() < 0.5
         data = good[: luck.integers(1, len(good))] if cut else luck.bytes(int(luck.integers(1, 300)))
@@ -117,13 +117,20 @@ def _nonsense(port: int, frames: int, luck: np.random.Generator) -> int:
 def _knock(port: int, rate: float, seconds: float) -> int:
     """Connections with a wrong token, at this rate; returns how many there were."""
     start, count = time.monotonic(), 0
-    hello = pack("hello", version=1, token="guess", robot="r", obs_size=3, action_size=1, answer_within=None)
+    hello = _hello("guess")
     while (now := time.monotonic()) < start + seconds:
         with _quietly(), connect(f"ws://127.0.0.1:{port}", compression=None, proxy=None, open_timeout=2) as one:
             one.send(hello)
         count += 1
         time.sleep(max(start + count / rate - now, 0.0))
     return count
+
+
+def _hello(token: str) -> bytes:
+    """The first message of a robot that would fit the task, if it knew the token."""
+    return pack(
+        "hello", version=VERSION, token=token, robot="r", obs_size=3, action_size=1, period=None, answer_within=None
+    )
 
 
 def _quietly() -> contextlib.suppress:

@@ -8,6 +8,7 @@ episode and is not learned from.
 
 import contextlib
 import hmac
+import math
 import queue
 import secrets
 import threading
@@ -19,11 +20,12 @@ import numpy as np
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
-from sgft_jax.systems.robot_client import LIMIT, VERSION, array, pack, unpack
+from sgft_jax.systems.robot_client import LIMIT, VersionError, array, pack, unpack
 from sgft_jax.types import UserError
 
 _HELLO = 10.0  # seconds for the first message
 _RESTS = 5  # times a robot is told to rest before it is left alone: without commands it stops by itself
+_SAME = 0.01  # share by which two periods may differ: 0.033 s is 1 / 30 s
 _SAY_EVERY = 10.0  # seconds between two lines about refused connections
 _GONE = {"type": "gone"}
 
@@ -71,18 +73,20 @@ class Remote:
     [action_size]; "late", if no command came in time; "is_success", if the robot knows; and "invalid" where the outcome
     is in doubt: that step is not to be learned from.
 
-    obs_size, action_size: of the task; a robot with others is refused. steps: after so many the robot ends an episode
-    by itself, so that it does not go on when messages are lost. host: interface to listen at, default this
+    obs_size, action_size: of the task; a robot with others is refused. period: seconds of a step of the task,
+    `env.control_dt`; a robot that says another is refused, and without it none is. steps: after so many the robot ends
+    an episode by itself, so that it does not go on when messages are lost. host: interface to listen at, default this
     computer alone. port: 0 chooses a free one. token: what the robot must know, default a fresh one. again: seconds
     after which an unanswered message is repeated. say: hears one line about everything unusual.
     Raises UserError where the port is taken.
     """
 
     def __init__(
-        self, obs_size: int, action_size: int, *, steps: int | None = None, host: str = "127.0.0.1", port: int = 0,
-        token: str | None = None, again: float = 1.0, say: Callable[[str], None] = print,
+        self, obs_size: int, action_size: int, *, period: float | None = None, steps: int | None = None,
+        host: str = "127.0.0.1", port: int = 0, token: str | None = None, again: float = 1.0,
+        say: Callable[[str], None] = print,
     ) -> None:  # fmt: skip
-        self._steps = steps
+        self._period, self._steps = period, steps
         self.obs_size, self.action_size, self.token = obs_size, action_size, token or secrets.token_hex(16)
         self._again, self._say = again, say
         self._lock, self._there = threading.Lock(), threading.Event()
@@ -241,6 +245,8 @@ class Remote:
         """Takes a robot that fits as the one robot; else says why not."""
         try:
             said = unpack(link.connection.recv(timeout=_HELLO))
+        except VersionError as error:
+            return _Refusal(str(error), final=True)
         except (ValueError, TimeoutError) as error:
             return _Refusal(f"its first message {error or 'did not come'}", final=False)
         except ConnectionClosed:
@@ -250,14 +256,24 @@ class Remote:
         if not hmac.compare_digest(said["token"].encode(), self.token.encode()):
             return _Refusal("wrong token", final=True)
         for name, own, theirs in (
-            ("protocol version", VERSION, said["version"]),
             ("numbers measured", self.obs_size, said["obs_size"]),
             ("numbers commanded", self.action_size, said["action_size"]),
         ):
             if own != theirs:
                 return _Refusal(f"{said['robot']}: {name}: the robot has {theirs}, the learner {own}", final=True)
+        if not _same(self._period, said["period"]):
+            return _Refusal(
+                f"{said['robot']}: seconds of a step: the robot has {said['period']:g}, the learner's task "
+                f"{self._period:g}; change the period of the robot, or the task",
+                final=True,
+            )
         with self._lock:
             if self._link is not None:  # perhaps it is the same one, and its lost connection has not been noticed yet
                 return _Refusal(f"{said['robot']}: another robot is connected", final=False)
             self._link, self.answer_within = link, said["answer_within"]
         return None
+
+
+def _same(own: float | None, theirs: float | None) -> bool:
+    """Whether two periods, in seconds, are the same, as far as both are known."""
+    return own is None or theirs is None or math.isclose(own, theirs, rel_tol=_SAME)

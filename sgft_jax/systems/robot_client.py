@@ -31,13 +31,13 @@ import numpy as np
 from websockets.exceptions import ConnectionClosed, InvalidMessage
 from websockets.sync.client import connect
 
-VERSION = 1
+VERSION = 2
 LIMIT = 64 * 1024  # bytes of a message at most
 _SOME = object()
 _SHAPES: dict[str, dict[str, Any]] = {  # what each message holds; a tuple names types that are allowed
     "hello": {
         "version": int, "token": str, "robot": str, "obs_size": int, "action_size": int,
-        "answer_within": (float, type(None)),
+        "period": (float, type(None)), "answer_within": (float, type(None)),
     },
     "welcome": {},
     "refused": {"reason": str, "final": bool},
@@ -65,6 +65,10 @@ def pack(kind: str, **fields: Any) -> bytes:
     return zlib.crc32(body).to_bytes(4, "little") + body
 
 
+class VersionError(ValueError):
+    """The robot speaks another version of the protocol than the learner."""
+
+
 def unpack(data: Any) -> dict[str, Any]:
     """The fields of a message, with its "type"; ValueError says what is wrong with it."""
     if not isinstance(data, bytes):
@@ -80,6 +84,11 @@ def unpack(data: Any) -> dict[str, Any]:
     kind = fields.get("type") if isinstance(fields, dict) else None
     if kind not in _SHAPES:
         raise ValueError(f"is of the unknown type {kind!r}")
+    version = fields.get("version")
+    if kind == "hello" and type(version) is int and version != VERSION:  # before its fields: they may be others
+        raise VersionError(
+            f"protocol version: the robot has {version}, the learner {VERSION}; give both the same robot_client.py"
+        )
     for name, wanted in _SHAPES[kind].items():
         value = fields.get(name, _SOME)
         if type(value) not in (wanted if isinstance(wanted, tuple) else (wanted,)):
@@ -190,9 +199,10 @@ def play(
 ) -> dict[str, int]:
     """Plays episodes for a learner until it ends the run; returns how many steps there were and how many were late.
 
-    driver: see the top of this file. url: of the learner. token: what it printed. period: seconds of a step, for a
-    driver with `read` and `send`. answer_within: seconds after which a command is too late, default half a period; the
-    first of an episode may take as long as it wants, so `reset` must leave the robot where it can wait.
+    driver: see the top of this file. url: of the learner. token: what it printed. period: seconds of a step. A driver
+    with `read` and `send` needs it; with `step` it is only compared with the learner's task. answer_within: seconds
+    after which a command is too late, default half a period; the first of an episode may take as long as it wants, so
+    `reset` must leave the robot where it can wait.
     late: what happens then: "hold" leaves the last command, an action is sent instead, within `limits`. patience: after
     so many late steps in a row the episode ends. log: a file to which every command is appended before it is sent.
     retry: seconds between attempts to connect. say: hears one line about everything unusual.
@@ -204,11 +214,13 @@ def play(
     """
     limits.check(int(driver.obs_size), int(driver.action_size))
     instead = _instead(late, int(driver.action_size))
-    rhythm = _rhythm(period, answer_within, instead, patience) if hasattr(driver, "send") else None
+    _check_period(period, needed=hasattr(driver, "send"))
+    rhythm = _rhythm(period, answer_within, instead, patience) if hasattr(driver, "send") and period else None
     robot = _Robot(driver, rhythm, limits, _Log(log))
     hello = pack(
         "hello", version=VERSION, token=token, robot=name, obs_size=int(driver.obs_size),
-        action_size=int(driver.action_size), answer_within=float(rhythm.answer_within) if rhythm else None,
+        action_size=int(driver.action_size), period=float(period) if period else None,
+        answer_within=float(rhythm.answer_within) if rhythm else None,
     )  # fmt: skip
     said = ""
     try:
@@ -271,12 +283,16 @@ class _Rhythm:
     patience: int
 
 
-def _rhythm(period: float | None, answer_within: float | None, instead: np.ndarray | None, patience: int) -> _Rhythm:
-    """The clock of a driver with `send`; raises ValueError where no robot can keep it."""
-    if period is None:
+def _check_period(period: float | None, *, needed: bool) -> None:
+    """Raises ValueError where it is no time that a step can take."""
+    if period is None and needed:
         raise ValueError("a driver with `send` needs a period, in seconds")
-    if not 0 < period < np.inf:  # nan is not
+    if period is not None and not 0 < period < np.inf:  # nan is not
         raise ValueError(f"period is {period}; give the seconds of a step, more than 0")
+
+
+def _rhythm(period: float, answer_within: float | None, instead: np.ndarray | None, patience: int) -> _Rhythm:
+    """The clock of a driver with `send`; raises ValueError where no robot can keep it."""
     within = period / 2 if answer_within is None else answer_within
     if not 0 < within <= period:
         raise ValueError(f"answer_within is {within}; give seconds, more than 0 and at most the period of {period}")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments import cli, reliability
-from experiments.reliable import ledger, timing
+from experiments.reliable import ledger, quick_task, timing
 from experiments.reliable.ledger import Made, audit
 from experiments.reliable.robot import Rail
 from sgft_jax.io.real import RealStore
@@ -53,6 +53,11 @@ def test_the_ledger_is_what_the_robot_did(tmp_path):
     commands = [np.frombuffer(step.action, np.float32).tolist() for step in made]
     assert commands == [[0.5, 0.0], [0.5, 0.0], [-0.25, 1.0]]
     assert seen[0][0] > -0.15 and robot.obs_size == 4
+
+
+def test_the_quick_task_has_the_period_of_its_robot():
+    """Otherwise the learner refuses the robot."""
+    assert quick_task.make().control_dt == quick_task.PERIOD
 
 
 def test_only_valid_steps_are_stored_ones(tmp_path):

@@ -25,7 +25,7 @@ from experiments import cli, evaluate, finetune, finetune_args, grid, real_syste
 from experiments.recorded import RecordedSystem
 from sgft_jax.io.real import RealStore
 from sgft_jax.systems.gymnasium import Gymnasium
-from sgft_jax.systems.robot_client import play
+from sgft_jax.systems.robot_client import RefusedError, play
 from sgft_jax.types import Policy, UserError
 
 TASK = str(Path(toy.__file__).resolve())
@@ -127,6 +127,19 @@ def test_a_torn_line_is_left_out_and_a_damaged_one_named(tmp_path):
     path.write_text(text.replace('"reward"', '"reward', 1))
     with pytest.raises(UserError, match=r"steps\.jsonl: damaged: .*move it away"):
         rollouts(tmp_path, 5, count=1)
+
+
+# --- what fits --------------------------------------------------------------------------------------------------------
+
+
+def test_a_robot_with_another_period_than_the_task_is_refused(port, tmp_path):
+    env = toy.make()
+    system = real_systems.connect(env, [f"remote::{port}"], (), members=1, gamma=0.9, home=tmp_path)
+    driver, given = Driver(), {"token": real_systems.token(tmp_path), "say": lambda line: None}
+    with pytest.raises(RefusedError, match="seconds of a step: the robot has"):
+        play(driver, f"ws://127.0.0.1:{port}", period=2 * env.control_dt, **given)
+    assert not driver.starts
+    system.close()
 
 
 # --- the command ------------------------------------------------------------------------------------------------------

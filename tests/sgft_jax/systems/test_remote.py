@@ -358,8 +358,8 @@ def test_a_connection_lost_between_steps_ends_the_episode_though_the_robot_is_ba
 
 def hello(remote, **changes):
     fields = {
-        "version": 1, "token": remote.token, "robot": "r", "obs_size": 2, "action_size": 2, "answer_within": None,
-        **changes,
+        "version": 2, "token": remote.token, "robot": "r", "obs_size": 2, "action_size": 2, "period": None,
+        "answer_within": None, **changes,
     }  # fmt: skip
     with connect(remote.url) as socket:
         socket.send(pack("hello", **fields))
@@ -370,24 +370,39 @@ def hello(remote, **changes):
     ("changes", "reason"),
     [
         ({"token": "guess"}, "wrong token"),
-        ({"version": 2}, "protocol version: the robot has 2, the learner 1"),
+        ({"version": 3}, "protocol version: the robot has 3, the learner 2; give both the same robot_client.py"),
+        ({"version": 1, "period": "as before there was one"}, "protocol version: the robot has 1, the learner 2"),
         ({"obs_size": 3}, "numbers measured: the robot has 3, the learner 2"),
         ({"action_size": 7}, "numbers commanded: the robot has 7, the learner 2"),
+        ({"period": 0.1}, "r: seconds of a step: the robot has 0.1, the learner's task 0.2; change the period"),
+        ({"period": 0.205}, "the robot has 0.205, the learner's task 0.2"),
+        ({"period": float("nan")}, "the robot has nan, the learner's task 0.2"),
     ],
 )
 def test_a_robot_that_does_not_fit_is_refused(changes, reason):
     said = []
-    remote = Remote(2, 2, say=said.append)
+    remote = Remote(2, 2, period=0.2, say=said.append)
     refused = hello(remote, **changes)
     assert refused["final"] and reason in refused["reason"] and reason in said[-1]
     assert remote.token not in said[-1]
     remote.close()
 
 
+@pytest.mark.parametrize(("own", "theirs"), [(0.2, None), (None, 0.1), (1 / 30, 0.0333), (0.2, 0.2)])
+def test_periods_that_are_the_same_or_not_known_on_both_sides_fit(own, theirs):
+    remote = Remote(2, 2, period=own, say=lambda line: None)
+    assert hello(remote, period=theirs)["type"] == "welcome"
+    remote.close()
+
+
 def test_the_client_says_why_it_was_refused():
-    remote = Remote(2, 2, say=lambda line: None)
+    remote = Remote(2, 2, period=0.2, say=lambda line: None)
     with pytest.raises(RefusedError, match="wrong token"):
         play(Point(), remote.url, token="guess", say=lambda line: None)
+    for driver in (Point(), Arm()):
+        with pytest.raises(RefusedError, match=r"the robot has 0.1, the learner's task 0.2"):
+            play(driver, remote.url, token=remote.token, period=0.1, say=lambda line: None)
+        assert driver.stops and not driver.resets
     remote.close()
 
 
@@ -420,7 +435,7 @@ def test_nonsense_changes_nothing(pair):
     own = pair(Point())
     begin(own, 0)
     rng = np.random.default_rng(0)
-    good = pack("hello", version=1, token="x", robot="r", obs_size=2, action_size=2, answer_within=None)
+    good = pack("hello", version=2, token="x", robot="r", obs_size=2, action_size=2, period=None, answer_within=None)
     with contextlib.suppress(Exception):
         for _ in range(20):
             with connect(own.remote.url) as socket:
