@@ -28,7 +28,8 @@ class RecordedSystem:
     the state that the run starts from. explore: whether exploring episodes are stored, or those without exploration;
     the others are played and forgotten. sync_every: for a robot: every step is on disk before the next one, and
     flushed after so many. What a kill leaves of a rollout is kept as one that ended there. Its next step is in doubt,
-    because the robot may have made it: the rollout counts as broken off, and that step is not learned from.
+    because the robot may have made it: the rollout counts as broken off, and that step is not learned from. The first
+    step is on disk before it is asked for; a rollout that was killed before that is begun again.
     """
 
     def __init__(
@@ -72,7 +73,8 @@ class RecordedSystem:
         if made and not made[-1].over and len(made) < inner.env.episode_length:
             made.append(made[-1].in_doubt())
         elif not made:
-            steps = inner.steps(policy, states, keys, explore=self.explore)
+            begin = lambda step: journal.begin(step._asdict())  # noqa: E731
+            steps = inner.steps(policy, states, keys, explore=self.explore, asked=begin)
             with journal, contextlib.closing(steps):  # whatever happens, the robot rests
                 for step in steps:
                     journal.append(step._asdict())

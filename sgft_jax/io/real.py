@@ -72,7 +72,8 @@ class RealStore:
 class Journal:
     """The steps of one rollout, a line each. A line is with the operating system before the next step begins.
 
-    So a killed process loses none. sync_every: steps between two flushes to disk; a power cut loses fewer than that.
+    So a killed process loses none. Before them stands the first step as it was asked for, so that a kill during it is
+    known. sync_every: steps between two flushes to disk; a power cut loses fewer than that.
     """
 
     def __init__(self, path: Path, sync_every: int) -> None:
@@ -80,20 +81,30 @@ class Journal:
         self._file: Any = None
 
     def read(self) -> list[dict[str, np.ndarray]]:
-        """The steps so far; a last line that a kill has torn is left out. Raises UserError for a damaged file."""
+        """The steps so far; the first one as it was asked for where it has no outcome, none where it was not asked for.
+
+        A last line that a kill has torn is left out. Raises UserError for a damaged file.
+        """
         if not self.path.exists():
             return []
         lines = self.path.read_text().split("\n")[:-1]  # what follows the last newline was never finished
+        if not lines:
+            return []
         try:
-            types, *steps = [json.loads(line) for line in lines] or [{}]
-            return [{name: np.array(x, types[name]) for name, x in step.items()} for step in steps]
+            first, *steps = [json.loads(line) for line in lines]
+            types = first["types"]
+            return [{name: np.array(x, types[name]) for name, x in step.items()} for step in steps or [first["asked"]]]
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise UserError(f"{self.path}: damaged: {error}; move it away to go on without these steps") from error
 
+    def begin(self, asked: Mapping[str, np.ndarray]) -> None:
+        """Says what the first step is asked to be, {name: array}, on disk before it is."""
+        types = {name: x.dtype.name for name, x in asked.items()}
+        self._write({"types": types, "asked": {name: x.tolist() for name, x in asked.items()}})
+        os.fsync(self._file.fileno())
+
     def append(self, step: Mapping[str, np.ndarray]) -> None:
-        """Adds a step, {name: array}."""
-        if not self._count:
-            self._write({name: x.dtype.name for name, x in step.items()})
+        """Adds a step with its outcome, {name: array}."""
         self._count += 1
         self._write({name: x.tolist() for name, x in step.items()})
         if self._count % self._every == 0:

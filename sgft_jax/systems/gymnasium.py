@@ -107,9 +107,13 @@ class Gymnasium:
         played = [self.episode(self.steps(policy, states, keys[:, i], explore=explore)) for i in range(keys.shape[1])]
         return jax.tree.map(lambda *x: jnp.stack(x, axis=1), *played)
 
-    def steps(self, policy: Any, states: PyTree, keys: Key, *, explore: bool) -> Generator[Step]:
+    def steps(
+        self, policy: Any, states: PyTree, keys: Key, *, explore: bool,
+        asked: Callable[[Step], None] = lambda step: None,
+    ) -> Generator[Step]:  # fmt: skip
         """One episode of every member, step by step as it happens. keys: [M]. The rest: see `play`.
 
+        asked: hears of the first step before an environment does: what the policy saw and wants, the rest in doubt.
         Close it where you leave it early: the robot rests then.
         """
         env, members, latest = self.env, len(keys), states if callable(states) else lambda: states
@@ -130,6 +134,8 @@ class Gymnasium:
             for t in range(env.episode_length):
                 wanted, carry = act(latest(), carry, seen, act_keys, t, explore)
                 command = np.asarray(wanted)
+                if t == 0:
+                    asked(_in_doubt(seen, command))
                 after = self._real.step(self._commanded(command), going)
                 action = self._sent(command, after.infos)
                 actions = remember(actions, action)
@@ -244,7 +250,7 @@ class Gymnasium:
             each = rows.success > 0
         elif self._succeeds is not None:
             each = np.asarray(self._succeeds(rows.next_obs)) & rows.valid
-        elif self.env.score == "success":
+        elif self.env.score == "success" and rows.valid.any():
             raise UserError(
                 f"{self._real.name}: nothing tells success, by which {self.env.name} is judged: `info` has no "
                 f"{' and no '.join(SUCCESS)}, and the task no function of observations; add one to `info`"
@@ -285,6 +291,15 @@ def _step(
         seen, action, command, after.reward, after.terminated, following, going & ~bad, np.array(success, np.int8),
         going & bad, ~going | bad | after.terminated | after.truncated, going & _flag("late", after.infos),
         np.full(len(going), time.time()),
+    )  # fmt: skip
+
+
+def _in_doubt(seen: np.ndarray, command: np.ndarray) -> Step:
+    """A first step of all members, of which nobody knows whether it was made."""
+    no, zero = np.zeros(len(seen), bool), np.zeros(len(seen), np.float32)
+    return Step(
+        seen, np.zeros_like(command), command, zero, no, np.zeros_like(seen), no, np.full(len(seen), -1, np.int8),
+        ~no, ~no, no, np.full(len(seen), time.time()),
     )  # fmt: skip
 
 

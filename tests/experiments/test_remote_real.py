@@ -41,7 +41,7 @@ class Driver:
     obs_size, action_size = 4, 2
 
     def __init__(self):
-        self.env, self.starts, self.steps = TaskEnv(toy.make(), TURNED), [], 0
+        self.env, self.starts, self.steps, self.fails = TaskEnv(toy.make(), TURNED), [], 0, 0
 
     def reset(self, seed):
         self.starts.append(seed)
@@ -49,6 +49,8 @@ class Driver:
 
     def step(self, action):
         self.steps += 1
+        if self.steps <= self.fails:
+            raise RuntimeError("not now")
         return self.env.step(action)
 
     def stop(self):
@@ -100,6 +102,48 @@ def test_what_a_kill_leaves_of_a_rollout_is_a_rollout_and_its_next_step_is_in_do
         assert not found[0, 1, 7:].any()
 
 
+def test_a_kill_in_the_first_step_of_a_rollout_leaves_it_in_doubt(tmp_path):
+    whole = rollouts(tmp_path / "whole", 10**6, count=1)
+    with pytest.raises(KeyboardInterrupt):
+        rollouts(tmp_path / "cut", T, count=2)
+    (asked,) = RealStore(tmp_path / "cut").journal(1).read()
+    assert asked["invalid"].all() and asked["over"].all() and not asked["valid"].any()
+    np.testing.assert_array_equal(asked["command"], -0.5 * asked["obs"][:, :2])  # what the policy wanted of what it saw
+    cut = rollouts(tmp_path / "cut", 0, count=2)  # nothing is played again
+    np.testing.assert_array_equal(cut.valid.sum(2), [[T, 0]])
+    np.testing.assert_array_equal(cut.exploded, [[False, True]])
+    assert not cut.success[0, 1] and not np.asarray(cut.transitions.obs[0, 1]).any()
+    np.testing.assert_array_equal(cut.transitions.obs[0, 0], whole.transitions.obs[0, 0])
+    assert [path.suffix for path in sorted((tmp_path / "cut/real").iterdir())] == [".npz", ".npz"]
+
+
+def test_a_rollout_that_was_killed_before_its_first_command_is_begun_again(tmp_path, monkeypatch):
+    def die(env, *, seed):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Breaking, "reset", die)
+        with pytest.raises(KeyboardInterrupt):
+            rollouts(tmp_path, 10**6, count=1)
+    (path,) = (tmp_path / "real").iterdir()
+    assert path.name == "rollout-000000.steps.jsonl"
+    path.write_text('{"types": {')  # or while the first line was written
+    again = rollouts(tmp_path, 10**6, count=1)
+    np.testing.assert_array_equal(again.valid.sum(2), [[T]])
+
+
+def test_the_first_step_is_on_disk_before_the_robot_is_asked_for_it(tmp_path, monkeypatch):
+    step, seen = TaskEnv.step, []
+
+    def look(env, action):
+        seen.append((tmp_path / "real/rollout-000000.steps.jsonl").read_text().count("\n"))
+        return step(env, action)
+
+    monkeypatch.setattr(TaskEnv, "step", look)
+    rollouts(tmp_path, 10**6, count=1)
+    assert seen == [1 + t for t in range(T)]
+
+
 def test_a_rollout_that_was_over_when_its_writer_died_is_whole(tmp_path):
     whole = rollouts(tmp_path, 10**6, count=1)
     store = RealStore(tmp_path)
@@ -108,7 +152,9 @@ def test_a_rollout_that_was_over_when_its_writer_died_is_whole(tmp_path):
         still(2), np.array([-0.5]), jax.random.split(jax.random.key(0), (1, 1))[:, 0], explore=True
     )
     with store.journal(1) as journal:
-        for step in steps:
+        for i, step in enumerate(steps):
+            if i == 0:
+                journal.begin(step._asdict())
             journal.append(step._asdict())
     again = rollouts(tmp_path, 0, count=1, done=1)
     jax.tree.map(np.testing.assert_array_equal, again.transitions, whole.transitions)
@@ -124,9 +170,13 @@ def test_a_torn_line_is_left_out_and_a_damaged_one_named(tmp_path):
     text = path.read_text()
     path.write_text(text[:-20])
     assert len(RealStore(tmp_path).journal(0).read()) == 4
-    path.write_text(text.replace('"reward"', '"reward', 1))
-    with pytest.raises(UserError, match=r"steps\.jsonl: damaged: .*move it away"):
-        rollouts(tmp_path, 5, count=1)
+    for damaged in (
+        text.replace('"reward"', '"reward', 1),
+        '{"obs": "float32"}\n',
+    ):  # the second is of a version before
+        path.write_text(damaged)
+        with pytest.raises(UserError, match=r"steps\.jsonl: damaged: .*move it away"):
+            rollouts(tmp_path, 5, count=1)
 
 
 # --- what fits --------------------------------------------------------------------------------------------------------
@@ -197,6 +247,15 @@ def test_a_robot_is_fine_tuned_and_costs_no_evaluation(robot, port, tmp_path):
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
     assert [line["rollouts"] for line in lines] == [1, 2, 3]
     assert len(os.sched_getaffinity(0)) == len(os.sched_getaffinity(os.getppid()))  # nobody is pinned any longer
+
+
+@pytest.mark.slow
+def test_a_robot_that_fails_in_its_first_steps_costs_these_rollouts(robot, port, tmp_path):
+    driver = robot(port)
+    driver.fails = 2  # among them the only one before learning begins
+    folder = run(tmp_path, port)
+    store = RealStore(folder)
+    assert [int(store.load(i)["valid"].sum()) for i in range(3)] == [0, 0, T] and driver.steps == T + 2
 
 
 @pytest.mark.slow

@@ -322,3 +322,9 @@ def test_a_function_that_maps_wrongly_is_one_line():
 def test_a_task_judged_by_success_must_be_told_of_it():
     with pytest.raises(UserError, match="nothing tells success, by which toy is judged"):
         play(Spoken(ends="truncated"), toy.make()._replace(success=None))
+
+
+def test_an_episode_whose_first_step_is_in_doubt_is_no_success_though_nothing_tells():
+    """The robot may tell of other episodes."""
+    episode = play(Spoken(says={1: {"invalid": True}}), toy.make()._replace(success=None))
+    assert episode.exploded and not episode.success and not episode.valid.any()
