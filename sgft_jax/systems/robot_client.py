@@ -371,8 +371,9 @@ class _Robot:
             elif message["type"] == "end":
                 return
             elif message["type"] == "rest":
-                self._over = True
-                self.driver.stop()
+                if message["episode"] == self._episode:  # a late one of an episode before must not end this one
+                    self._over = True
+                    self.driver.stop()
                 _send(socket, pack("rested", episode=message["episode"]))
             elif message["type"] == "reset":
                 self._reset(socket, message, say)

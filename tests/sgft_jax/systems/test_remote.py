@@ -312,6 +312,17 @@ def test_rest_is_said_until_it_is_heard(pair, monkeypatch):
     assert len(lost) == 2 and own.driver.stops == stops + 1
 
 
+def test_a_rest_that_comes_late_does_not_end_the_next_episode(pair):
+    """A slow network may bring it then; the robot would answer no command of that episode any more."""
+    own = pair(Point())
+    begin(own, 0)
+    late = pack("rest", episode=own.remote._episode)
+    begin(own, 1)
+    stops = own.driver.stops
+    own.remote._played.send(late)
+    assert move(own, RIGHT).obs[0] == 1 and own.driver.stops == stops
+
+
 def test_a_driver_that_fails_is_stopped_and_its_step_is_in_doubt(pair):
     driver = Point()
     driver.step = lambda action: (np.array([np.nan, 0]), 0.0, False, False, {})
