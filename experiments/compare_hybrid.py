@@ -203,13 +203,10 @@ def outcomes(args: CompareHybridArgs) -> "Results | None":
 
 
 def _outcome(cell: Cell, scores: list[float]) -> "Outcome":
-    import numpy as np
+    from sgft_jax.analysis.hybrid import outcome
 
-    from sgft_jax.analysis.hybrid import Outcome
-
-    lines, run = read_jsonl(cell.folder / EVAL), cell.args
-    updates, curve = (np.array([line[name] for line in lines]) for name in ("step", "score"))
-    return Outcome(_spec(run), _data_of(run), _gap_of(run), np.array(scores), updates, curve.T)
+    run = cell.args
+    return outcome(_spec(run), _data_of(run), _gap_of(run), read_jsonl(cell.folder / EVAL), scores)
 
 
 def tables(args: CompareHybridArgs, results: "Results") -> str:

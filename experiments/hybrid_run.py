@@ -22,7 +22,7 @@ from experiments.hybrid_args import NO_SIMULATOR, VOLATILE, HybridArgs, data_nam
 from experiments.memory import reserve
 from experiments.video import film
 from sgft_jax.analysis import figures
-from sgft_jax.analysis.hybrid import Outcome, Results
+from sgft_jax.analysis.hybrid import Results, outcome
 from sgft_jax.analysis.stats import bootstrap_interval, mean
 from sgft_jax.data import logs
 from sgft_jax.hybrid import trainer
@@ -262,10 +262,9 @@ class _Run:
 
     def _draw(self, folder: Path, lines: list[dict[str, Any]], gap: Gap) -> None:
         """The learning curve. lines: the evaluations."""
-        updates, curve = (np.array([line[name] for line in lines]) for name in ("step", "score"))
         data = "" if self.data is None or self.args.data is None else data_name(self.args.data)
         name, simulator = self.method.name, "none" if gap.name == NO_SIMULATOR else gap.name
-        own = Outcome(name, data, simulator, curve[-1], updates, curve.T)
+        own = outcome(name, data, simulator, lines)
         results = Results(self.env.name, self.env.score, [data], [simulator], [name], [own])
         title = " on ".join(filter(None, [self.env.name, data]))
         figures.hybrid_curves(folder / "figures" / "score.png", results, data, title=title)

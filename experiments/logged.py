@@ -8,10 +8,9 @@ import jax.numpy as jnp
 
 from envs.base import Env
 from sgft_jax.data import logs
-from sgft_jax.data.layouts import Successors
 from sgft_jax.data.logs import Log
 from sgft_jax.train import Logged
-from sgft_jax.types import Finetuner, UserError
+from sgft_jax.types import Finetuner, Successors, UserError
 
 
 def read(path: Path, env: Env, *, gamma: float, successors: Successors = "stored") -> Log:

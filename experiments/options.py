@@ -9,7 +9,7 @@ from tyro.conf import arg
 
 import envs
 from envs import gaps
-from sgft_jax import extend
+from sgft_jax import extend, types
 from sgft_jax.io.jsonfile import read_object
 from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError, unknown
@@ -28,10 +28,8 @@ Impl = Annotated[
 ]
 
 Successors = Annotated[
-    Literal["stored", "shifted"],
-    arg(
-        help="Expert: where the next observations of a D4RL file come from: stored, or shifted (the row below).",
-    ),
+    types.Successors,
+    arg(help="Expert: where the next observations of a D4RL file come from: stored, or shifted (the row below)."),
 ]
 
 

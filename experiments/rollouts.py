@@ -6,14 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 from experiments.options import check_task
 from sgft_jax.io import real
-from sgft_jax.io.jsonfile import read_object
 from sgft_jax.io.real import Played
+from sgft_jax.io.runs import CONFIG, read_own
 from sgft_jax.types import UserError
 
 if TYPE_CHECKING:
     from envs.base import Env
-
-_CONFIG = "config.json"
 
 
 def home_of(option: str, folder: Path) -> Path:
@@ -26,9 +24,7 @@ def home_of(option: str, folder: Path) -> Path:
 
 def config_of(home: Path) -> dict[str, Any]:
     """The options of the run in a folder; none where a robot has recorded."""
-    if not (home / _CONFIG).exists():
-        return {}
-    return read_object(home / _CONFIG, {"config": dict}, "put back the file that the run has written")["config"]
+    return read_own(home / CONFIG, {"config": dict}).get("config", {})
 
 
 def task_of(home: Path, task: str | None) -> str:

@@ -290,6 +290,7 @@ class Finetuner(NamedTuple):
 
 Algorithm = Literal["sac", "tdmpc2", "recurrent"]
 ValueLoss = Literal["iql", "sql", "eql", "xql"]
+Successors = Literal["stored", "shifted"]  # where next observations of a D4RL file come from, see `data.layouts`
 Family = Literal["sgft", "model-free", "model-based", "offline", "planning"]
 
 

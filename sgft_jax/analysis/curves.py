@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean, paired_improvement
-from sgft_jax.io.jsonfile import read_object
 from sgft_jax.io.log import EVAL, METRICS, SUMMARY, read_jsonl
-from sgft_jax.io.runs import CONFIG, PROVENANCE
+from sgft_jax.io.runs import CONFIG, PROVENANCE, read_own
 from sgft_jax.methods import NAMES, get_method
 from sgft_jax.types import UserError
 
@@ -26,9 +25,8 @@ LEVEL = 0.9  # success that counts as solved
 SCORES = ("success", "return")
 IDENTITY = ("task", "gap", "method", "variant", "priors")
 COLUMNS = (*IDENTITY, "prior", "seed", "rollouts", "transitions", "minutes", *SCORES, "training")
-# Of a run's options those that are in other columns, or say nothing about its outcome; paths of a machine above all.
-_PUT_BACK = "put back the file that the run has written"
 _UNNAMED = re.compile(r"prior|seeds?-\d+(-\d+)?")  # folders that name no set of priors
+# Of a run's options those that are in other columns, or say nothing about its outcome; paths of a machine above all.
 _LEFT_OUT = (
     "out", "prior", "resume", "overwrite", "video", "devices", "checkpoint_every", "task", "method", "variant", "real",
     "impl",
@@ -260,8 +258,7 @@ def read_curve(folder: Path) -> Curve:
     records = read_jsonl(folder / EVAL) if (folder / EVAL).exists() else []
     if not records:
         raise UserError(f"{folder / EVAL}: holds no evaluation yet")
-    stored = read_object(folder / CONFIG, {"config": dict}, _PUT_BACK) if (folder / CONFIG).exists() else {}
-    summary = read_object(folder / SUMMARY, {}, _PUT_BACK) if (folder / SUMMARY).exists() else {}
+    stored, summary = read_own(folder / CONFIG, {"config": dict}), read_own(folder / SUMMARY)
     config, start = stored.get("config", {}), last_start(folder)
     column = lambda name: np.array([record[name] for record in records])  # noqa: E731
     scores = {name: column(name).T for name in SCORES if name in records[0]}
@@ -380,8 +377,7 @@ def set_name(folder: Path, digests: Sequence[str]) -> str:
 
 def last_start(folder: Path) -> dict[str, Any]:
     """What the provenance of a run says of its last start; nothing where there is none."""
-    path = folder / PROVENANCE
-    starts = read_object(path, {}, _PUT_BACK).get("starts", []) if path.exists() else []
+    starts = read_own(folder / PROVENANCE).get("starts", [])
     return starts[-1] if starts else {}
 
 

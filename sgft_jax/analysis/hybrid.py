@@ -4,10 +4,11 @@ A method without a simulator has one outcome for each data set, a method without
 in every row that they belong to.
 """
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sgft_jax.analysis.scoreboard import improvement
 from sgft_jax.analysis.stats import Interval, bootstrap_interval, mean
@@ -29,6 +30,14 @@ class Outcome(NamedTuple):
     scores: np.ndarray
     updates: np.ndarray = np.zeros(0)
     curve: np.ndarray = np.zeros((0, 0))
+
+
+def outcome(
+    method: str, data: str, gap: str, lines: Sequence[Mapping[str, Any]], scores: ArrayLike | None = None
+) -> Outcome:
+    """What a run scored. lines: of its `eval.jsonl`. scores: [seeds], default those of the last evaluation."""
+    updates, curve = (np.array([line[name] for line in lines]) for name in ("step", "score"))
+    return Outcome(method, data, gap, curve[-1] if scores is None else np.asarray(scores), updates, curve.T)
 
 
 class Results(NamedTuple):

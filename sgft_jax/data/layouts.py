@@ -8,16 +8,14 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 
 from sgft_jax.io.jsonfile import read_object
 from sgft_jax.io.real import played
-from sgft_jax.types import UserError
-
-Successors = Literal["stored", "shifted"]
+from sgft_jax.types import Successors, UserError
 
 _COLUMNS, _TORQUE = 6, 3.0  # of a table; N m
 _MAIN, _METADATA = "main_data.hdf5", "metadata.json"

@@ -16,9 +16,9 @@ import numpy as np
 from envs.base import Env
 from envs.history import remember, with_memory
 from sgft_jax.data import layouts, lerobot
-from sgft_jax.data.layouts import Rows, Successors
+from sgft_jax.data.layouts import Rows
 from sgft_jax.io.real import home_of
-from sgft_jax.types import Array, Transition, UserError, unknown
+from sgft_jax.types import Array, Successors, Transition, UserError, unknown
 
 _TABLES = (".txt", ".csv")
 _SAME_RATE = 0.01  # relative; clocks and rounded rates differ by less

@@ -204,6 +204,17 @@ def check_folder(folder: Path, option: str = "--out") -> None:
         raise UserError(f"{folder}: cannot be written, you may not write to {there}; choose another {option}")
 
 
+def read_own(path: Path, needed: Mapping[str, type] | None = None, *, otherwise: str = "") -> dict[str, Any]:
+    """The JSON object that a run has written to a file, {} where there is no such file.
+
+    needed: as of `read_object`. otherwise: what else than putting the file back mends it. Raises UserError where it is
+    no such object.
+    """
+    if not path.exists():
+        return {}
+    return read_object(path, needed or {}, f"put back the file that the run has written{otherwise}")
+
+
 def _record(run: Run, kind: str, config: Mapping[str, Any], inputs: Mapping[str, Any]) -> None:
     """Write down the start with what it begins with, and the configuration if it is the first one."""
     if not run.resumed:
@@ -212,10 +223,8 @@ def _record(run: Run, kind: str, config: Mapping[str, Any], inputs: Mapping[str,
 
 
 def _starts(folder: Path) -> list[dict[str, Any]]:
-    if not (folder / PROVENANCE).exists():
-        return []
-    fix = "put back the file that the run has written, or begin again with --overwrite"
-    return read_object(folder / PROVENANCE, {"starts": list}, fix)["starts"]
+    found = read_own(folder / PROVENANCE, {"starts": list}, otherwise=", or begin again with --overwrite")
+    return found.get("starts", [])
 
 
 def _check_inputs(folder: Path, inputs: Mapping[str, Any]) -> None:

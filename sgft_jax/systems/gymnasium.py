@@ -52,8 +52,7 @@ class Step(NamedTuple):
 
     def in_doubt(self) -> "Step":
         """The step after this one, of which nobody knows whether it was made, or what came of it."""
-        blank = Step(*map(np.zeros_like, self))
-        return blank._replace(success=blank.success - 1, invalid=~self.over, over=np.ones_like(self.over))
+        return _in_doubt(np.zeros_like(self.obs), np.zeros_like(self.command), self.over, np.zeros_like(self.time))
 
 
 class Gymnasium:
@@ -135,7 +134,7 @@ class Gymnasium:
                 wanted, carry = act(latest(), carry, seen, act_keys, t, explore)
                 command = np.asarray(wanted)
                 if t == 0:
-                    asked(_in_doubt(seen, command))
+                    asked(_in_doubt(seen, command, ~going, np.full(members, time.time())))
                 after = self._real.step(self._commanded(command), going)
                 action = self._sent(command, after.infos)
                 actions = remember(actions, action)
@@ -294,12 +293,12 @@ def _step(
     )  # fmt: skip
 
 
-def _in_doubt(seen: np.ndarray, command: np.ndarray) -> Step:
-    """A first step of all members, of which nobody knows whether it was made."""
+def _in_doubt(seen: np.ndarray, command: np.ndarray, over: np.ndarray, when: np.ndarray) -> Step:
+    """A step of the members whose episode is not `over` [M] before it, of which nobody knows whether it was made."""
     no, zero = np.zeros(len(seen), bool), np.zeros(len(seen), np.float32)
     return Step(
         seen, np.zeros_like(command), command, zero, no, np.zeros_like(seen), no, np.full(len(seen), -1, np.int8),
-        ~no, ~no, no, np.full(len(seen), time.time()),
+        ~over, ~no, no, when,
     )  # fmt: skip
 
 

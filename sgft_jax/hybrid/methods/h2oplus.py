@@ -61,7 +61,7 @@ def build(config: Config, task: Task, *, critics: int = 2, diversity: float = 0.
 
 _PAPER = Config()
 # With the numbers of their own authors' code for locomotion. XQL has some for each data set; these are its one setting
-# for all of them. Source: IVR (SQL, EQL: run_mujoco.sh), XQL (offline/reproduce/mujoco); cross_domain.md, section 4.
+# for all of them. Source: IVR (SQL, EQL: run_mujoco.sh), XQL (offline/reproduce/mujoco).
 _BACKBONES = {
     "sql": replace(_PAPER, value_loss="sql", value_alpha=1.0),
     "eql": replace(_PAPER, value_loss="eql", value_alpha=2.0, value_cut=5.0),
