@@ -33,6 +33,7 @@ from websockets.sync.client import connect
 
 VERSION = 2
 LIMIT = 64 * 1024  # bytes of a message at most
+_PATIENCE = 10  # late steps in a row that end an episode
 _SOME = object()
 _SHAPES: dict[str, dict[str, Any]] = {  # what each message holds; a tuple names types that are allowed
     "hello": {
@@ -191,7 +192,7 @@ def play(
     period: float | None = None,
     answer_within: float | None = None,
     late: str | Sequence[float] = "hold",
-    patience: int = 10,
+    patience: int = _PATIENCE,
     limits: Limits = Limits(),
     log: str | os.PathLike[str] | None = None,
     retry: float = 1.0,
@@ -204,8 +205,9 @@ def play(
     after which a command is too late, default half a period; the first of an episode may take as long as it wants, so
     `reset` must leave the robot where it can wait.
     late: what happens then: "hold" leaves the last command, an action is sent instead, within `limits`. patience: after
-    so many late steps in a row the episode ends. log: a file to which every command is appended before it is sent.
-    retry: seconds between attempts to connect. say: hears one line about everything unusual.
+    so many late steps in a row the episode ends. These three are refused for a driver with `step`, which waits.
+    log: a file to which every command is appended before it is sent. retry: seconds between attempts to connect. say:
+    hears one line about everything unusual.
 
     A lost connection stops the robot; it connects again and goes on with the next episode. Whatever happens, `stop` is
     called before this returns or raises. Raises `RefusedError` if the learner says that the two do not fit; ValueError
@@ -215,7 +217,12 @@ def play(
     limits.check(int(driver.obs_size), int(driver.action_size))
     instead = _instead(late, int(driver.action_size))
     _check_period(period, needed=hasattr(driver, "send"))
-    rhythm = _rhythm(period, answer_within, instead, patience) if hasattr(driver, "send") and period else None
+    rhythm = None
+    if hasattr(driver, "send"):
+        assert period is not None
+        rhythm = _rhythm(period, answer_within, instead, patience)
+    else:
+        _check_waits(answer_within, instead, patience)
     robot = _Robot(driver, rhythm, limits, _Log(log))
     hello = pack(
         "hello", version=VERSION, token=token, robot=name, obs_size=int(driver.obs_size),
@@ -299,6 +306,13 @@ def _rhythm(period: float, answer_within: float | None, instead: np.ndarray | No
     if not patience >= 1:
         raise ValueError(f"patience is {patience}; give a number of steps, 1 or more")
     return _Rhythm(period, within, instead, patience)
+
+
+def _check_waits(answer_within: float | None, instead: np.ndarray | None, patience: int) -> None:
+    """A driver with `step` waits for its commands; raises ValueError where it is told what to do when one is late."""
+    given = {"answer_within": answer_within is not None, "late": instead is not None, "patience": patience != _PATIENCE}
+    if told := [name for name, is_given in given.items() if is_given]:
+        raise ValueError(f"{', '.join(told)}: no command is late for a driver with `step`; give it `read` and `send`")
 
 
 def _instead(late: str | Sequence[float], action_size: int) -> np.ndarray | None:
@@ -447,7 +461,8 @@ class _Robot:
             episode=self._episode, step=step, action=action, late=late, time=time.time(), clock=time.monotonic()
         )
         try:
-            told = self._by_clock(action, late=late) if self.rhythm else self._at_once(action)
+            own = action.copy()  # the driver may change its array; what is reported and stored stays
+            told = self._by_clock(own, late=late) if self.rhythm else self._at_once(own)
         except Exception as error:
             self._fail(socket, error, say)
             return

@@ -266,6 +266,34 @@ def test_arguments_that_cannot_be_right_are_refused_before_the_robot_moves(given
     assert not driver.resets and not driver.moves
 
 
+@pytest.mark.parametrize("given", [{"answer_within": 0.02}, {"late": [0.0, 0.0]}, {"patience": 3}], ids=str)
+def test_a_driver_that_waits_for_commands_is_not_told_what_to_do_about_late_ones(given):
+    driver = Point()
+    with pytest.raises(ValueError, match=f"{next(iter(given))}: no command is late for a driver with `step`"):
+        play(driver, "ws://127.0.0.1:1", token="", **given)
+    assert not driver.resets and not driver.moves
+
+
+@pytest.mark.parametrize("kind", [Point, Arm])
+def test_what_was_sent_is_reported_though_the_driver_changes_its_array(pair, kind):
+    class Scaling(kind):
+        def step(self, action):
+            action *= 100.0
+            return super().step(action)
+
+        def send(self, action):
+            action *= 100.0
+            super().send(action)
+
+    if kind is Point:
+        del Scaling.send
+    own = pair(Scaling(), period=0.02)
+    begin(own, 0)
+    moved = move(own, 0.5 * RIGHT)
+    assert own.driver.moves[0][0] == 50.0
+    np.testing.assert_array_equal(moved.info["sent"], 0.5 * RIGHT)
+
+
 def test_a_learner_that_does_not_answer_ends_the_episode(pair):
     own = pair(Arm(), period=0.01, patience=3)
     begin(own, 0)
