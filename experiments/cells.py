@@ -6,9 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
-from sgft_jax.io.jsonfile import read_json
 from sgft_jax.io.log import SUMMARY
-from sgft_jax.io.runs import CONFIG, InUseError, check_same, in_use
+from sgft_jax.io.runs import CONFIG, InUseError, check_same, in_use, read_own
 from sgft_jax.types import UserError
 
 
@@ -75,7 +74,8 @@ def look_up(kind: Kind, args: Any) -> Cell:
     folder = kind.folder(args)
     if not (folder / CONFIG).exists():
         return Cell(kind, args, "missing", 0)
-    done = (folder / SUMMARY).exists() and kind.finished(args, read_json(folder / SUMMARY))
+    summary = read_own(folder / SUMMARY)
+    done = bool(summary) and kind.finished(args, summary)
     last = checkpoint.latest(folder, say=lambda _: None) or 0
     return Cell(kind, args, "finished" if done else "unfinished", last)
 

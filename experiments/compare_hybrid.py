@@ -30,8 +30,9 @@ from sgft_jax import extend
 from sgft_jax.hybrid.methods import NAMES, get_method
 from sgft_jax.hybrid.presets import say_preset
 from sgft_jax.hybrid.schedule import FLEET, SCHEDULES, Schedule, describe, name_of
-from sgft_jax.io.jsonfile import jsonable, read_json
+from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
+from sgft_jax.io.runs import read_own
 from sgft_jax.types import UserError, unknown
 
 if TYPE_CHECKING:
@@ -195,7 +196,7 @@ def outcomes(args: CompareHybridArgs) -> "Results | None":
     done = [cell for cell in grid(args) if cell.state == "finished"]
     if not done:
         return None
-    summaries = [read_json(cell.folder / SUMMARY) for cell in done]
+    summaries = [read_own(cell.folder / SUMMARY, {"task": str, "score": str, args.score: list}) for cell in done]
     task, score = (summaries[0][name] for name in ("task", "score"))
     found = [_outcome(cell, one[args.score]) for cell, one in zip(done, summaries, strict=True)]
     data, systems = [data_name(path) for path in args.data] or [""], [gaps.title(gap) for gap in args.gaps]

@@ -80,7 +80,7 @@ FINETUNING = Kind(
     config=lambda args: jsonable(resolved(args)) | {"real": args.real[0]},
     title=lambda args: f"{extend.name_of(args.task)}/{gaps.title(args.real[0])}: {label(args)}",
     volatile=VOLATILE,
-    finished=lambda args, summary: summary["final"]["rollouts"] >= args.rollouts,
+    finished=lambda args, summary: summary.get("final", {}).get("rollouts", 0) >= args.rollouts,
 )
 
 

@@ -86,7 +86,7 @@ def _video(home: Path, task: str, own: Played, out: Path) -> str:
     config = config_of(home)
     if own.trace.size == 0:
         return f"no video of rollout {own.number}: its states were not stored; a simulated real system leaves them"
-    if "real" not in config:
+    if not {"impl", "real", "set"} <= set(config):
         return f"no video of rollout {own.number}: {home} does not say in which gap it was played"
     env = envs.make(task, config["impl"])
     gap = gaps.load(env, config["real"], config["set"])

@@ -28,7 +28,6 @@ from experiments.options import at_least_one, prior_home, seed_list
 from experiments.spaces import SPACES, first, space_of
 from sgft_jax import extend
 from sgft_jax.io import runs
-from sgft_jax.io.jsonfile import read_json
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.methods import NAMES
 from sgft_jax.types import UserError
@@ -268,7 +267,7 @@ def _result(args: TuneArgs, task: str, method: str, found: list[Outcome], chosen
     }  # fmt: skip
     return {
         "task": task, "method": method, "options": found[chosen].trial.settings, "trial": chosen, "budget": budget,
-        "gaps": [read_json(cell.folder / SUMMARY)["gap"] for cell in found[0].trial.cells],
+        "gaps": [runs.read_own(cell.folder / SUMMARY, {"gap": dict})["gap"] for cell in found[0].trial.cells],
         "space": space_of(method), "trials": tried, "provenance": runs.provenance(),
     }  # fmt: skip
 

@@ -24,7 +24,8 @@ from sgft_jax.types import UserError
 LEVEL = 0.9  # success that counts as solved
 SCORES = ("success", "return")
 IDENTITY = ("task", "gap", "method", "variant", "priors")
-COLUMNS = (*IDENTITY, "prior", "seed", "rollouts", "transitions", "minutes", *SCORES, "training")
+_NUMBERS = ("prior", "seed", "rollouts", "transitions", "minutes")
+COLUMNS = (*IDENTITY, *_NUMBERS, *SCORES, "training")
 _UNNAMED = re.compile(r"prior|seeds?-\d+(-\d+)?")  # folders that name no set of priors
 # Of a run's options those that are in other columns, or say nothing about its outcome; paths of a machine above all.
 _LEFT_OUT = (
@@ -463,17 +464,25 @@ def _curve(identity: tuple[str, ...], members: Mapping[int, list[Mapping[str, An
 
 
 def read_data(folder: Path) -> Found:
-    """The curves of released tables, `curves-*.csv`; raises UserError if there is none."""
+    """The curves of released tables, `curves-*.csv`; raises UserError if there is none, or if one is damaged."""
     files = sorted(folder.glob("curves-*.csv"))
     if not files:
         raise UserError(f"{folder}: holds no curves-*.csv; write some from runs with: "
                         f"python -m experiments.figures --export {folder}")  # fmt: skip
-    return Found(from_rows(row for path in files for row in read_csv(path)), [])
+    table = [row for path in files for row in read_csv(path, needed=(*IDENTITY, *_NUMBERS, SCORES[0]))]
+    try:
+        return Found(from_rows(table), [])
+    except ValueError as error:  # of int and float
+        raise UserError(f"{folder}/curves-*.csv: {error}; put the tables back as they were") from error
 
 
-def read_csv(path: Path) -> list[dict[str, str]]:
-    """The rows of a table; none if it does not exist."""
+def read_csv(path: Path, *, needed: Sequence[str] = ()) -> list[dict[str, str]]:
+    """The rows of a table; none if it does not exist; raises UserError where a row lacks one of the columns needed."""
     if not path.exists():
         return []
     with open(path, newline="") as file:
-        return list(csv.DictReader(file))
+        rows = list(csv.DictReader(file))
+    for i, row in enumerate(rows):
+        if absent := [name for name in needed if row.get(name) is None]:
+            raise UserError(f"{path}: row {i + 1} has no {absent[0]}; put the table back as it was")
+    return rows

@@ -96,7 +96,7 @@ def _merge(path: Path, new: Sequence[Mapping[str, Any]], key: Sequence[str]) -> 
         return None
     texts = [{name: _text(value) for name, value in row.items()} for row in new]
     replaced = {tuple(row[name] for name in key) for row in texts}
-    kept = [row for row in curves.read_csv(path) if tuple(row[name] for name in key) not in replaced]
+    kept = [row for row in curves.read_csv(path, needed=key) if tuple(row[name] for name in key) not in replaced]
     lines = sorted([*kept, *texts], key=lambda row: tuple(row[name] for name in key))  # stable: evaluations in order
     names = COLUMNS if set(lines[0]) <= set(COLUMNS) else dict.fromkeys(name for row in lines for name in row)
     with open(path, "w", newline="") as file:

@@ -23,11 +23,11 @@ CARD = "prior.json"
 def save_prior(folder: str | Path, prior: Prior) -> Path:
     """Write a prior to `folder`, replacing the one that may be there, and return the folder.
 
-    The card must have `task`, `obs_dim` and `act_dim`, which are checked on loading, and `algorithm` unless that is
-    SAC. Parameters must be NamedTuples and dicts of arrays: such a prior can be read without the code that describes
-    its networks. Raises ValueError or TypeError otherwise.
+    The card must have `task`, `obs_dim` and `act_dim`, which are checked on loading, `gamma` (the discount), and
+    `algorithm` unless that is SAC. Parameters must be NamedTuples and dicts of arrays: such a prior can be read without
+    the code that describes its networks. Raises ValueError or TypeError otherwise.
     """
-    if missing := {"task", "obs_dim", "act_dim"} - set(prior.card):
+    if missing := {"task", "obs_dim", "act_dim", "gamma"} - set(prior.card):
         raise ValueError(f"the prior's card lacks {sorted(missing)}")
     tree = _plain(prior.params)
     with checkpoint.replaced(Path(folder)) as temporary:
@@ -67,7 +67,8 @@ def load_prior(
 
 def read_card(folder: Path) -> dict[str, Any]:
     """What `prior.json` in a folder says; raises UserError where it is no card of a prior."""
-    return read_object(folder / CARD, {"task": str, "obs_dim": int, "act_dim": int}, "name the folder of a prior")
+    needed = {"task": str, "obs_dim": int, "act_dim": int, "gamma": float}
+    return read_object(folder / CARD, needed, "name the folder of a prior")
 
 
 def observed(card: Mapping[str, Any]) -> dict[str, Any]:

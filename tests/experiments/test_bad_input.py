@@ -5,11 +5,27 @@ from pathlib import Path
 
 import pytest
 
-from experiments import bullet, collect, diagnose, evaluate, export, export_data, figures, gaps, replay, scoreboard
+from experiments import (
+    bullet,
+    collect,
+    diagnose,
+    evaluate,
+    export,
+    export_data,
+    figures,
+    finetune,
+    gaps,
+    grid,
+    replay,
+    scoreboard,
+)  # fmt: skip
 from experiments.options import check_variant
 from sgft_jax.types import UserError
 
 PRIOR = Path(__file__).parents[2] / "docs/priors/push/seed-0"
+
+GAPS = PRIOR.parents[3] / "envs/gaps/test/push.toml"
+HEADER = "task,gap,method,variant,priors,prior,seed,rollouts,transitions,minutes,success,return,training"
 
 COMMANDS = {
     "collect": lambda run, out: collect.check(collect.CollectArgs(out=out)),
@@ -86,3 +102,29 @@ def test_a_run_that_does_not_say_its_options(content, words, run):
     ):
         with pytest.raises(UserError, match=f"config.json: {words}; put back the file"):
             call()
+
+
+@pytest.mark.parametrize(
+    ("lines", "words"),
+    [
+        (["task,gap", "push,hard"], "curves-push.csv: row 1 has no method; put the table back"),
+        ([HEADER, "push,hard,sac,,robust,0,0,0,0,0,1,2,", "push,hard,sac,,robust,0"], "row 2 has no seed"),
+        ([HEADER, "push,hard,sac,,robust,0,0,none,0,0,1,2,"], r"curves-\*.csv: .*'none'; put the tables back"),
+    ],
+    ids=["a column less", "a row cut off", "no number"],
+)
+def test_a_released_table_that_is_damaged(lines, words, tmp_path):
+    (tmp_path / "curves-push.csv").write_text("\n".join(lines) + "\n")
+    with pytest.raises(UserError, match=words):
+        scoreboard.main(scoreboard.ScoreboardArgs((GAPS,), data=tmp_path))
+
+
+@pytest.mark.parametrize(("content", "words"), [("[1]", "is no JSON object"), ("{", "not valid JSON")])
+def test_a_summary_that_is_damaged_is_named_by_commands_that_go_through_runs(content, words, tmp_path):
+    args = finetune.FinetuneArgs(method="sac", prior=PRIOR, out=tmp_path)
+    folder = grid.look_up(args).folder
+    folder.mkdir(parents=True)
+    for name in ("config.json", "summary.json"):
+        (folder / name).write_text(content)
+    with pytest.raises(UserError, match=rf"summary.json: {words}"):
+        grid.look_up(args)

@@ -122,6 +122,8 @@ def test_a_checkpoint_is_not_a_prior(tmp_path):
 def test_a_prior_needs_its_card_and_plain_dicts(tmp_path):
     with pytest.raises(ValueError, match="act_dim"):
         priors.save_prior(tmp_path / "prior", Prior(make_prior().params, {"task": "hammer", "obs_dim": 4}))
+    with pytest.raises(ValueError, match="gamma"):
+        priors.save_prior(tmp_path / "prior", Prior(make_prior().params, {k: CARD[k] for k in CARD if k != "gamma"}))
     with pytest.raises(TypeError, match="dicts of arrays"):
         priors.save_prior(tmp_path / "prior", Prior(make_prior().params._replace(dynamics=(jnp.ones(2),)), CARD))
     assert not list(tmp_path.iterdir())
