@@ -66,11 +66,11 @@ def teach(args: CollectArgs, level: float) -> list[dict[str, Any]]:
         raise UserError(f"--level {level:g}: no seed reached it; raise --updates or lower it")
     found = []
     for i, (params, rows, noted) in sorted(reached.items()):
-        old = of_fleet(rows, args.environments, noted)
-        new = _play(args, env, system, agent.policy, params, seeds[i])
-        for kind, episodes in zip(PAIR, (old, new), strict=True):
-            path = args.out / f"{name_of(args, kind, seeds[i])}.hdf5"
-            found.append(_write(args, path, episodes, kind=kind if is_d4rls(args) else ""))
+        replay, medium = (args.out / f"{name_of(args, kind, seeds[i])}.hdf5" for kind in PAIR)
+        judged = PAIR if is_d4rls(args) else ("", "")
+        # What took long to learn is on disk before the policy plays on.
+        found.append(_write(args, replay, of_fleet(rows, args.environments, noted), kind=judged[0]))
+        found.append(_write(args, medium, _play(args, env, system, agent.policy, params, seeds[i]), kind=judged[1]))
     return found
 
 
