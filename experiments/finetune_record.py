@@ -122,7 +122,7 @@ class Record:
         """The learning curve as a figure and in words. best: [S] scores of the best policies."""
         score = self.env.score
         title = f"{self.env.name} on the {self.gap.name} real system"
-        figures.learning_curves(self.folder / "figures" / "success.png", {self.method: [curve]}, title=title)
+        figures.learning_curves(self.folder / "figures" / "score.png", {self.method: [curve]}, title=title)
         before, after = (tables.middle(curve, curve.values[:, i]) for i in (0, -1))
         chosen = "" if best is None else f"; best policy by the training rollouts {tables.plain(best.mean(), score)}"
         print(

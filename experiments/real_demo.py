@@ -115,7 +115,7 @@ def show(args: RealDemoArgs) -> None:
         f"{args.method}; one seed, {args.episodes} episodes, in which the cube lay within 5 cm of the mark at the end"
     )
     print(film(args, before, after) if args.video else "no video: not asked for")
-    print(f"learning curve: {run / 'figures/success.png'}; what the robot's side said: {args.out / 'robot.log'}")
+    print(f"learning curve: {run / 'figures/score.png'}; what the robot's side said: {args.out / 'robot.log'}")
 
 
 def film(args: RealDemoArgs, before: Sequence[bool], after: Sequence[bool]) -> str:

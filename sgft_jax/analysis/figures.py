@@ -5,6 +5,7 @@ Okabe-Ito palette (safe for colour-blind readers).
 """
 
 import math
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -102,7 +103,7 @@ def lines(path: Path, panels: Mapping[str, Sequence[Line]], labels: Mapping[str,
             _draw_line(axes, line, colour)
         axes.set_xlabel(labels[entry], **{**_FONT, "size": 9})
         _dress(axes, words, [*own, *others])
-    figure.suptitle(title, x=0.01, ha="left", size=12, weight="bold", color=_INK)
+    _head(figure, title)
     figure.supxlabel(_note([line for _, _, own, _ in parts for line in own]), size=8, color=_GREY)
     return _save(figure, path)
 
@@ -223,7 +224,7 @@ def pretraining(
     _value_panel(panels[2], np.asarray(value), np.asarray(monte_carlo))
     if columns == 4:
         _dynamics_panel(panels[3], np.asarray(dynamics_error), baseline_error)
-    figure.suptitle(title, x=0.005, ha="left", size=12, weight="bold", color=_INK)
+    _head(figure, title)
     return _save(figure, path)
 
 
@@ -274,7 +275,7 @@ def diagnosis(
     kinds.set_xlim(0, 3)
     kinds.axvline(1.0, color=_GREY, linewidth=1)
     kinds.set_title("signs of the gap; one counts from 1 on", **_FONT, loc="left")
-    figure.suptitle(title, x=0.005, ha="left", size=12, weight="bold", color=_INK)
+    _head(figure, title)
     return _save(figure, path)
 
 
@@ -307,7 +308,7 @@ def rollouts(path: Path, panels: Sequence[Panel], episodes: Mapping[str, float],
         middle = (begin + end) / 2, 1.2
         drawn[0].text(*middle, words, transform=drawn[0].get_xaxis_transform(), ha="center", size=9, color=_GREY)
     drawn[-1].set_xlabel("seconds", **_FONT)
-    figure.suptitle(title, x=0.01, ha="left", size=12, weight="bold", color=_INK)
+    _head(figure, title)
     return _save(figure, path)
 
 
@@ -330,8 +331,14 @@ def effects(path: Path, found: Mapping[str, Mapping[str, Mapping[str, Interval]]
         axes.set_title(place, **_FONT, loc="left")
         axes.set_xlabel(label, **_FONT)
     panels[0].legend(frameon=False, fontsize=8, labelcolor=_INK)
-    figure.suptitle("effect of each part, mean over all others", x=0.01, ha="left", size=12, weight="bold", color=_INK)
+    _head(figure, "effect of each part, mean over all others")
     return _save(figure, path)
+
+
+def _head(figure: Figure, title: str) -> None:
+    """The title of a whole figure, in as many lines as its width needs."""
+    letters = int(9 * figure.get_figwidth())  # of this size that fit, nine an inch
+    figure.suptitle(textwrap.fill(title, letters), x=0.01, ha="left", size=12, weight="bold", color=_INK)
 
 
 def _value_panel(axes: Axes, value: np.ndarray, monte_carlo: np.ndarray) -> None:

@@ -194,7 +194,7 @@ def test_a_run_leaves_curve_summary_policies_and_every_rollout(home):
     assert summary["score"] == "success" and len(summary["best"]["score"]) == 2
     real = rollouts(folder)
     assert len(real) == 5 and real[0]["obs"].shape == (2, 20, 4) and real[0]["valid"].all()
-    assert (folder / "figures/success.png").stat().st_size > 10_000
+    assert (folder / "figures/score.png").stat().st_size > 10_000
 
 
 @pytest.mark.slow

@@ -109,7 +109,7 @@ def test_the_demo_in_bullet(tmp_path, monkeypatch, capsys):
     said = capsys.readouterr().out
     assert "success in Bullet: " in said and "video: " in said
     run = "finetune/panda-push/remote/sac/seed-0"
-    for made in (f"{run}/figures/success.png", "videos/before-after.mp4", f"{run}/policy/seed-0/prior.json"):
+    for made in (f"{run}/figures/score.png", "videos/before-after.mp4", f"{run}/policy/seed-0/prior.json"):
         assert (tmp_path / "demo" / made).stat().st_size > 100
     assert "connected to" in (tmp_path / "demo" / "robot.log").read_text()
     assert not subprocess.run(["pgrep", "-f", str(tmp_path)], capture_output=True).stdout  # the robot's side has ended

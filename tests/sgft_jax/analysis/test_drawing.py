@@ -45,6 +45,14 @@ def test_every_curve_has_a_colour_of_its_own(tmp_path, count):
     assert (image[[0, -1]] > 0.99).all() and (image[:, [0, -1]] > 0.99).all()  # nothing is cut off at the border
 
 
+@pytest.mark.parametrize("real", ["gymnasium:HalfCheetah-v5", "gymnasium:my_lab:Pusher-that-has-a-name-of-its-own-v0"])
+def test_a_long_title_is_not_cut_off(real, tmp_path):
+    title = f"halfcheetah on the {real} real system"
+    image = read(figures.learning_curves(tmp_path / "t.png", {"sac": curves(1)}, title=title))
+    assert (image[[0, -1]] > 0.99).all() and (image[:, [0, -1]] > 0.99).all()
+    assert pixels(image[:50], figures._INK) > 100  # it is there
+
+
 @pytest.mark.parametrize(("count", "sizes"), [(6, [6]), (7, [4, 3]), (13, [5, 4, 4])])
 def test_more_than_six_curves_become_small_multiples(count, sizes):
     parts = figures._split("push", drawn(count))
