@@ -143,7 +143,6 @@ def outcome(curves: Sequence[Curve]) -> str:
 
 
 def _row(curve: Curve, curves: Sequence[Curve], grid: np.ndarray) -> list[str]:
-    held = transitions_until_held(curve) if curve.score == "success" else None
     before = zero_shot(curve, curves)
     falls = [NONE if before is None else plain(deepest_fall(curve, before), curve.score)]
     falls.append(plain(deepest_fall(curve), curve.score))
@@ -155,8 +154,16 @@ def _row(curve: Curve, curves: Sequence[Curve], grid: np.ndarray) -> list[str]:
         f"{middle(curve, curve.values[:, -1])} ({curve.rollouts[-1]})",
         " / ".join(falls),
         middle(curve, training_score(curve)),
-        f"> {curve.transitions[-1]:,}" if held is None else f"{held:,}",
+        _held(curve),
     ]
+
+
+def _held(curve: Curve) -> str:
+    """Transitions until success was held; nothing of returns, which have no best value to come near."""
+    if curve.score != "success":
+        return NONE
+    held = transitions_until_held(curve)
+    return f"> {curve.transitions[-1]:,}" if held is None else f"{held:,}"
 
 
 def _against(curve: Curve, other: Curve, grid: np.ndarray) -> list[str]:

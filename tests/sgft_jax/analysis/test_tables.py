@@ -45,6 +45,12 @@ def test_a_row_says_what_the_curve_says():
     assert len(cells(tables.summary([often]))[0]) == 8  # nothing to compare with
 
 
+def test_a_return_is_never_held():
+    """It has no best value that a policy could come near."""
+    (row,) = cells(tables.summary([curve([[-300.0, 40.0, 40.0]], (0, 2, 4), score="return")]))[2:]
+    assert row[-1] == "-"
+
+
 def test_a_method_that_plans_is_held_against_the_policy_too():
     """Plans begin at 0.5 and fall to 0.4; the policy had 0.7. The robot lived through 0.25 while exploring."""
     plans = dataclasses.replace(curve([0.5, 0.4], (0, 4), method="sgft-mpc"), training=np.array([[np.nan, 0.25]]))
