@@ -417,15 +417,19 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def rows(curves: Iterable[Curve]) -> Iterator[dict[str, Any]]:
-    """The flat table: a row for each evaluation of each member, with the columns `COLUMNS`."""
+    """The flat table: a row for each evaluation of each member, with the columns `COLUMNS`.
+
+    A run that is judged by its return has no success: the first score of a row is the one that counts.
+    """
     for curve in curves:
+        scores = SCORES[SCORES.index(curve.score) :]
         identity = {name: getattr(curve, name) for name in IDENTITY}
         for i, (seed, prior) in enumerate(zip(curve.seeds.tolist(), curve.prior.tolist(), strict=True)):
             for j, (n, used, minutes) in enumerate(
                 zip(curve.rollouts.tolist(), curve.transitions.tolist(), curve.minutes.tolist(), strict=True)
             ):
                 axes = {"prior": prior, "seed": seed, "rollouts": n, "transitions": used, "minutes": minutes}
-                found = {name: float(values[i, j]) for name, values in curve.scores.items()}
+                found = {name: float(curve.scores[name][i, j]) for name in scores if name in curve.scores}
                 if curve.training is not None and np.isfinite(curve.training[i, j]):
                     found["training"] = float(curve.training[i, j])
                 yield {**identity, **axes, **found}

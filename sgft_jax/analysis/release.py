@@ -97,8 +97,9 @@ def _merge(path: Path, new: Sequence[Mapping[str, Any]], key: Sequence[str]) -> 
     texts = [{name: _text(value) for name, value in row.items()} for row in new]
     replaced = {tuple(row[name] for name in key) for row in texts}
     kept = [row for row in curves.read_csv(path, needed=key) if tuple(row[name] for name in key) not in replaced]
-    lines = sorted([*kept, *texts], key=lambda row: tuple(row[name] for name in key))  # stable: evaluations in order
-    names = COLUMNS if set(lines[0]) <= set(COLUMNS) else dict.fromkeys(name for row in lines for name in row)
+    every = [*kept, *texts]
+    names = COLUMNS if set(every[0]) <= set(COLUMNS) else dict.fromkeys(name for row in every for name in row)
+    lines = sorted(every, key=lambda row: tuple(row[name] for name in key))  # stable: evaluations in order
     with open(path, "w", newline="") as file:
         writer = csv.DictWriter(file, list(names), restval="", lineterminator="\n")
         writer.writeheader()
