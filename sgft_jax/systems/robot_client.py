@@ -217,11 +217,8 @@ def play(
     limits.check(int(driver.obs_size), int(driver.action_size))
     instead = _instead(late, int(driver.action_size))
     _check_period(period, needed=hasattr(driver, "send"))
-    rhythm = None
-    if hasattr(driver, "send"):
-        assert period is not None
-        rhythm = _rhythm(period, answer_within, instead, patience)
-    else:
+    rhythm = _rhythm(period, answer_within, instead, patience) if hasattr(driver, "send") and period else None
+    if rhythm is None:
         _check_waits(answer_within, instead, patience)
     robot = _Robot(driver, rhythm, limits, _Log(log))
     hello = pack(
