@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import collect, hybrid
+from experiments import collect, collect_run, hybrid
 from sgft_jax.data import acceptance, logs, recording
 from sgft_jax.data.recording import Joints, Noted, Recorded
 from sgft_jax.types import Transition, UserError
@@ -190,6 +190,16 @@ def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys, monkeypatch):
     assert logs.load(recorded, gamma=1.0).facts.transitions == 30
     with h5py.File(recorded) as file:
         assert {"qpos", "qvel", "action_log_probs"} == set(file["infos"])
+
+
+def test_what_was_learned_from_is_kept_if_recording_fails(tmp_path, monkeypatch):
+    def fail(*args):
+        raise UserError("no more")
+
+    monkeypatch.setattr(collect_run, "_play", fail)
+    with pytest.raises(SystemExit):
+        collect.main([*LEARN, "--out", str(tmp_path)])
+    assert logs.load(tmp_path / "toy-medium-replay-regenerated-seed-0.hdf5", gamma=0.99).facts.transitions > 256
 
 
 @pytest.mark.parametrize(
