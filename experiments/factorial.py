@@ -16,6 +16,7 @@ from experiments import cli, grid
 from experiments.cells import Cell, check_begun, complete
 from experiments.finetune_args import with_settings
 from experiments.grid import GridArgs
+from experiments.options import check_task, without_repeats
 from sgft_jax.io.jsonfile import jsonable, write_json
 from sgft_jax.types import UserError
 
@@ -39,7 +40,7 @@ class FactorialArgs(GridArgs):
     methods: tuple[str, ...] = (METHOD,)
     """Method of the cells: always sgft-parts."""
     reals: tuple[str, ...] = ("default", "sim")
-    """Real systems of every task: gaps by name, sim for no gap, or .toml/.json files."""
+    """Real systems: gaps by name, sim for no gap, or .toml/.json files; of every task, or as TASK=REAL of that one."""
     seeds: int = 12
     """Seeds of each run, all in one program."""
     rollouts: int = 12
@@ -62,9 +63,8 @@ class FactorialArgs(GridArgs):
 
 def main(args: FactorialArgs) -> None:
     """Runs what is missing, then says what the parts do."""
-    args = replace(args, reals=gaps.each(args.reals))
     check(args)
-    places = [(task, real) for task in args.tasks for real in args.reals]
+    places = [(task, real) for task in args.tasks for real in reals_of(args, task)]
     if args.data:
         print(report(args, released(args, args.data, places)))
         return
@@ -92,7 +92,25 @@ def check(args: FactorialArgs) -> None:
         raise UserError(f"--methods: the cells are all of {METHOD}")
     if args.horizon < 2:
         raise UserError(f"--horizon is {args.horizon}: must be at least 2, to differ from 1")
-    grid.check(args)
+    grid.check(replace(args, reals=(gaps.SIM,)))
+    for task in args.tasks:
+        reals = reals_of(args, task)
+        if not reals:
+            raise UserError(f"--reals: names no real system of {task}")
+        without_repeats("--reals", reals)
+        check_task(task, reals)
+
+
+def reals_of(args: FactorialArgs, task: str) -> tuple[str, ...]:
+    """The real systems of a task: those of every task and those that name it, one gap each."""
+    found = []
+    for text in args.reals:
+        name, equals, real = text.partition("=")
+        if not (equals and name in args.tasks):
+            found.append(text)
+        elif name == task:
+            found.append(real)
+    return gaps.each(found)
 
 
 def factors(args: FactorialArgs) -> "list[Factor]":

@@ -317,13 +317,15 @@ def effects(path: Path, found: Mapping[str, Mapping[str, Mapping[str, Interval]]
 
     found: by place, measure and name of the effect, see `factorial.effects`. label: of the x-axis.
     """
-    figure, panels = _figure(5.2 * len(found), 4.4, columns=len(found))
+    columns = min(len(found), 2)
+    rows = math.ceil(len(found) / columns)
+    figure, panels = _figure(5.2 * columns, 4.2 * rows + 0.2, columns=columns, count=len(found))
     for axes, (place, measures) in zip(panels, found.items(), strict=True):
         for i, (measure, own) in enumerate(measures.items()):
-            rows = np.arange(len(own)) + 0.22 * (i - (len(measures) - 1) / 2)
+            heights = np.arange(len(own)) + 0.22 * (i - (len(measures) - 1) / 2)
             estimate, low, high = (np.array([float(x) for x in bounds]) for bounds in zip(*own.values(), strict=True))
-            axes.hlines(rows, low, high, color=PALETTE[i], linewidth=1.5)
-            axes.plot(estimate, rows, "o", color=PALETTE[i], markersize=4, label=measure)
+            axes.hlines(heights, low, high, color=PALETTE[i], linewidth=1.5)
+            axes.plot(estimate, heights, "o", color=PALETTE[i], markersize=4, label=measure)
         names = list(next(iter(measures.values())))
         axes.set_yticks(np.arange(len(names)), names)
         axes.invert_yaxis()

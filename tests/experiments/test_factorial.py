@@ -41,11 +41,20 @@ def test_every_combination_is_a_cell_of_its_own(tmp_path):
         ({"minutes": float("nan")}, "^--minutes is nan: must be at least 0$"),
         ({"eval_every": 0}, "^--eval-every is 0: must be at least 1$"),
         ({"horizon": 1}, "--horizon is 1: must be at"),
+        ({"reals": ("sim", "push=sim")}, "^--reals names sim twice; name it once$"),
+        ({"tasks": ("push", "insert"), "reals": ("insert=sim",)}, "^--reals: names no real system of push$"),
+        ({"reals": ("insert=sim",)}, "there is no 'insert=sim'"),
     ],
 )
 def test_bad_input(changes, words):
     with pytest.raises(UserError, match=words):
         factorial.main(replace(ARGS, **changes))
+
+
+def test_a_real_system_may_be_of_one_task_alone():
+    args = replace(ARGS, tasks=("push", "insert"), reals=("push=mild", "sim", "insert=default"))
+    assert factorial.reals_of(args, "push") == ("mild", "sim")
+    assert factorial.reals_of(args, "insert") == ("sim", "default")
 
 
 def leave(args):
