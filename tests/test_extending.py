@@ -65,6 +65,16 @@ def test_the_critic_of_the_example_prefers_what_the_policy_does(monkeypatch, cap
         assert q > q_random and earned > earned_by_random and share < 0.5
 
 
+@pytest.mark.slow
+def test_exact_identification_solves_what_the_policy_alone_does_not(monkeypatch, capsys):
+    example = extend.load("example", str(EXAMPLES / "exact_identification.py"), "main")
+    monkeypatch.setattr(example, "EPISODES", 16)
+    monkeypatch.chdir(ROOT)
+    example.main(["hammer-2-19"], [])
+    alone, commands, both = (int(word) for word in re.findall(r" (\d+) \[", capsys.readouterr().out))
+    assert alone < commands < both == 100
+
+
 # --- a task ---------------------------------------------------------------------------------------------------------
 
 
