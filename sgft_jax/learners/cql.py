@@ -5,15 +5,16 @@ Source: Kumar et al. 2020, CQL(H) with importance-corrected samples and a fixed 
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 
 from sgft_jax import checks
 from sgft_jax.learners import losses
-from sgft_jax.learners.sac import CriticTerm, SACConfig, SACHyper, make_sac
+from sgft_jax.learners.sac import Critic, CriticTerm, SACConfig, SACHyper, make_sac
 from sgft_jax.models.networks import NetworkConfig
-from sgft_jax.types import Array, Batch, Key, Learner
+from sgft_jax.types import Array, Batch, Key, Learner, PyTree
 
 
 @dataclass(frozen=True)
@@ -57,8 +58,14 @@ def soft_maximum(q: Array, log_density: Array) -> Array:
 
 def _penalty(config: CQLConfig) -> CriticTerm:
     def term(
-        q: Callable[[Array, Array], Array], policy: Callable[[Array, Key], tuple[Array, Array]], batch: Batch, key: Key
+        critic: Critic,
+        params: PyTree,
+        policy: Callable[[Array, Key], tuple[Array, Array]],
+        batch: Batch,
+        key: Key,
     ) -> Array:
+        q = partial(critic, params)
+
         def one(row: Batch, key: Key) -> Array:
             key_uniform, key_here, key_next = jax.random.split(key, 3)
             uniform = jax.random.uniform(key_uniform, (config.samples, config.act_dim), minval=-1.0)

@@ -12,9 +12,9 @@ import jax.numpy as jnp
 
 from sgft_jax import checks
 from sgft_jax.learners import losses
-from sgft_jax.learners.sac import CriticTerm, SACConfig, SACHyper, make_sac
+from sgft_jax.learners.sac import Critic, CriticTerm, SACConfig, SACHyper, make_sac
 from sgft_jax.models.networks import NetworkConfig
-from sgft_jax.types import Array, Batch, Key, Learner
+from sgft_jax.types import Array, Batch, Key, Learner, PyTree
 
 NORM_MIN = 1e-10  # of a gradient; a critic that is flat points nowhere
 
@@ -59,20 +59,32 @@ def alignment(grads: Array) -> Array:
     return (jnp.sum(cosines) - jnp.trace(cosines)) / (grads.shape[0] - 1)
 
 
-def mean_alignment(q: Callable[[Array, Array], Array], batch: Batch) -> Array:
-    """Mean [] over the rows of a batch of the `alignment` of the gradients of q in the action.
+def mean_alignment(critic: Critic, params: PyTree, batch: Batch) -> Array:
+    """Mean [] over the rows of a batch of the `alignment` of the members' gradients in the action.
 
-    q(obs, action) -> [members]. batch: what the critics read.
+    params: of the critic, members leading. batch: what the critics read.
     """
-    grads = jax.vmap(jax.jacrev(q, argnums=1))(batch.obs, batch.action)
-    return losses.row_mean(jax.vmap(alignment)(grads), batch)
+
+    def gradients(obs: Array, action: Array) -> Array:
+        """[members, act_dim], one backward pass of each: a Jacobian would go through all members for every one."""
+
+        def value(member: PyTree, action: Array) -> Array:
+            return critic(jax.tree.map(lambda x: x[None], member), obs, action)[0]
+
+        return jax.vmap(jax.grad(value, argnums=1), (0, None))(params, action)
+
+    return losses.row_mean(jax.vmap(alignment)(jax.vmap(gradients)(batch.obs, batch.action)), batch)
 
 
 def _diversity(config: EDACConfig) -> CriticTerm:
     def term(
-        q: Callable[[Array, Array], Array], policy: Callable[[Array, Key], tuple[Array, Array]], batch: Batch, key: Key
+        critic: Critic,
+        params: PyTree,
+        policy: Callable[[Array, Key], tuple[Array, Array]],
+        batch: Batch,
+        key: Key,
     ) -> Array:
         del policy, key  # it looks at the data's own actions
-        return config.diversity * mean_alignment(q, batch)
+        return config.diversity * mean_alignment(critic, params, batch)
 
     return term

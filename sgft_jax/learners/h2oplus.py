@@ -8,7 +8,6 @@ code.
 """
 
 from dataclasses import dataclass, field
-from functools import partial
 from typing import NamedTuple, get_args
 
 import jax
@@ -241,7 +240,7 @@ def _step_critic(
     def crowding(params: PyTree, q: Array) -> Array:
         del q  # it looks at gradients alone
         real = batch._replace(valid=losses.real_rows(batch))  # the policy itself tries what lies beside simulated pairs
-        return config.diversity * edac.mean_alignment(partial(parts.critic.apply, params), real)
+        return config.diversity * edac.mean_alignment(parts.critic.apply, params, real)
 
     targets = jax.vmap(target)(batch, jax.random.split(key, batch.reward.shape[0]))
     return soft.step_critic(

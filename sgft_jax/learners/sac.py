@@ -6,7 +6,6 @@ so that learning rates and temperatures vmap like seeds do. Source: Haarnoja et 
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import NamedTuple, Protocol
 
 import jax
@@ -85,17 +84,21 @@ class SACConfig:
             raise checks.refusal("target_critics", self.target_critics, f"at most critics, {self.critics}")
 
 
+Critic = Callable[[PyTree, Array, Array], Array]  # (params of members, obs, action) -> [members]
+
+
 class CriticTerm(Protocol):
     """What is added to the critic's loss; `__call__` -> []."""
 
     def __call__(
         self,
-        q: Callable[[Array, Array], Array],
+        critic: Critic,
+        params: PyTree,
         policy: Callable[[Array, Key], tuple[Array, Array]],
         batch: Batch,
         key: Key,
     ) -> Array:
-        """q(obs, action) -> [members]; policy(obs, key) -> (action, log pi []). batch: what the networks read."""
+        """params: of the critic. policy(obs, key) -> (action, log pi []). batch: what the networks read."""
         ...
 
 
@@ -319,7 +322,7 @@ def _update_critic(
         if parts.critic_term is None or key_term is None:
             return error, q
         policy = lambda obs, key: tanh_gaussian_sample(parts.actor.apply(state.actor.params, obs), key)  # noqa: E731
-        return error + parts.critic_term(partial(critic, params), policy, batch, key_term), q
+        return error + parts.critic_term(critic, params, policy, batch, key_term), q
 
     (value, q), grads = jax.value_and_grad(loss, has_aux=True)(state.critic.params)
     rate = state.hyper.lr_critic * optim.warmup_factor(state.step, state.hyper.lr_warmup)
