@@ -170,10 +170,10 @@ def test_a_critic_term_joins_the_loss(key):
     config = sac.SACConfig(1, 1, network=NET, train_value=False, train_dynamics=False)
 
     def after(slope):
-        def term(q, policy, batch, key):
+        def term(critic, params, policy, batch, key):
             action, log_prob = policy(batch.obs[0], key)
             assert action.shape == (1,) and log_prob.shape == ()
-            return 3.0 + slope * jnp.mean(jax.vmap(q)(batch.obs, batch.action))
+            return 3.0 + slope * jnp.mean(jax.vmap(critic, (None, 0, 0))(params, batch.obs, batch.action))
 
         learner = sac.make_sac(config, critic_term=term)
         return jax.jit(learner.update)(learner.init(key), probe(key), key)
