@@ -16,7 +16,6 @@ from experiments import cli, grid
 from experiments.cells import Cell, check_begun, complete
 from experiments.finetune_args import with_settings
 from experiments.grid import GridArgs
-from experiments.options import check_task, without_repeats
 from sgft_jax.io.jsonfile import jsonable, write_json
 from sgft_jax.types import UserError
 
@@ -92,13 +91,12 @@ def check(args: FactorialArgs) -> None:
         raise UserError(f"--methods: the cells are all of {METHOD}")
     if args.horizon < 2:
         raise UserError(f"--horizon is {args.horizon}: must be at least 2, to differ from 1")
-    grid.check(replace(args, reals=(gaps.SIM,)))
+    grid.check(replace(args, reals=(gaps.SIM,)))  # all but the real systems, which may differ between tasks
     for task in args.tasks:
         reals = reals_of(args, task)
         if not reals:
             raise UserError(f"--reals: names no real system of {task}")
-        without_repeats("--reals", reals)
-        check_task(task, reals)
+        grid.check(replace(args, tasks=(task,), reals=reals))
 
 
 def reals_of(args: FactorialArgs, task: str) -> tuple[str, ...]:

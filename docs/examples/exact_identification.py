@@ -19,6 +19,7 @@ import envs
 import sgft_jax
 from envs.base import Env
 from envs.gaps import Gap
+from sgft_jax.analysis import tables
 from sgft_jax.analysis.stats import success_interval
 from sgft_jax.models.distortion import Distortion, turned_and_scaled
 
@@ -54,8 +55,7 @@ def played(prior: sgft_jax.Prior, env: Env, gap: Gap, distortion: Distortion | N
     """Success of the policy that knows the distortion, in per cent."""
     told = replace(prior, params=prior.params._replace(distortion=distortion))
     success = np.asarray(sgft_jax.evaluate_prior(told, env, gap, episodes=EPISODES).success)
-    found = success_interval(int(success.sum()), len(success))
-    return f"{100 * success.mean():.0f} [{100 * found.low:.0f}, {100 * found.high:.0f}]"
+    return tables.number(success_interval(int(success.sum()), len(success)))
 
 
 if __name__ == "__main__":
