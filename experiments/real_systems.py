@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import os
 import re
 import secrets
 import socket
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -94,13 +96,17 @@ def free_port() -> int:
 def token(home: Path) -> str:
     """What a robot must know, from the file under `home` that only its owner reads; made where there is none.
 
-    It stays the same, so that a robot that waits for a run that was killed is taken again.
+    It stays the same, so that a robot that waits for a run that was killed is taken again. Runs that begin at the same
+    moment agree on one: a file appears as a whole, and only where there is none.
     """
     path = home / _TOKEN
     if not path.exists():
         home.mkdir(parents=True, exist_ok=True)
-        with open(os.open(path, os.O_WRONLY | os.O_CREAT, 0o600), "w") as file:
+        with tempfile.NamedTemporaryFile("w", dir=home, prefix=f".tmp-{_TOKEN}-") as file:  # for its owner alone
             file.write(secrets.token_hex(16) + "\n")
+            file.flush()
+            with contextlib.suppress(FileExistsError):  # another run was faster
+                os.link(file.name, path)
     if not (found := path.read_text().strip()):
         raise UserError(f"{path}: is empty; write a token into it, or delete it for a new one")
     return found

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import jax
@@ -235,6 +236,19 @@ def run(tmp_path, port, *more):
 
 
 @pytest.mark.slow
+def test_runs_that_begin_together_agree_on_a_token(tmp_path):
+    start = threading.Barrier(8)
+
+    def ask(home):
+        start.wait()
+        return real_systems.token(home)
+
+    for home in (tmp_path / str(i) for i in range(20)):
+        with ThreadPoolExecutor(8) as pool:
+            assert len(set(pool.map(ask, [home] * 8))) == 1
+        assert [file.name for file in home.iterdir()] == ["robot-token"]
+
+
 def test_a_robot_is_fine_tuned_and_costs_no_evaluation(robot, port, tmp_path):
     driver = robot(port)
     folder = run(tmp_path, port)
