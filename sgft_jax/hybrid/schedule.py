@@ -20,7 +20,8 @@ class Schedule:
     buffer: int = 1_000_000
     """Simulated transitions kept; new ones replace the oldest."""
     chunk_updates: int = 5_000
-    """Updates of a compiled chunk, rounded to whole rounds; logs, evaluations and checkpoints come between chunks."""
+    """Updates of a compiled chunk, at most all of them, rounded to whole rounds; logs, evaluations and checkpoints come
+    between chunks."""
 
     def __post_init__(self) -> None:
         checks.at_least(self, 1, "updates", "simulators", "steps_per_round", "buffer", "chunk_updates")
@@ -41,7 +42,7 @@ class Schedule:
     @property
     def rounds_per_chunk(self) -> int:
         """Rounds of a chunk."""
-        return max(round(self.chunk_updates / self.updates_per_round), 1)
+        return max(round(min(self.chunk_updates, self.updates) / self.updates_per_round), 1)
 
     @property
     def updates_per_chunk(self) -> int:

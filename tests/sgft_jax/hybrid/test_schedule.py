@@ -26,3 +26,8 @@ def test_words_name_schedule_and_updates():
     )
     uneven = Schedule(updates=21, simulators=4, chunk_updates=4)  # the last chunk is whole
     assert describe(uneven).startswith("24 updates, schedule custom (simulators: 4; ")
+
+
+def test_a_chunk_is_no_longer_than_the_run():
+    assert Schedule(updates=2_000).updates_in_all == 2_000  # of 5,000 to a chunk
+    assert Schedule(updates=7_000).updates_in_all == 10_000
