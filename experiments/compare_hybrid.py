@@ -30,9 +30,10 @@ from sgft_jax import extend
 from sgft_jax.hybrid.methods import NAMES, get_method
 from sgft_jax.hybrid.presets import say_preset
 from sgft_jax.hybrid.schedule import FLEET, SCHEDULES, Schedule, describe, name_of
+from sgft_jax.hybrid.scores import late
 from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
-from sgft_jax.io.runs import read_own
+from sgft_jax.io.runs import PROVENANCE, check_folder, read_own
 from sgft_jax.types import UserError, unknown
 
 if TYPE_CHECKING:
@@ -45,6 +46,10 @@ LEGEND = (
     "against one of the other method, mean over simulators. Intervals need three seeds. Every run made {schedule}; "
     "methods without a simulator made the updates alone. The data sets are what the files hold: numbers on sets that "
     "were made anew do not belong beside published ones."
+)
+_RANKS = (
+    "Spearman's correlation of the methods' means here with those after {:,} updates (there), with a 95 % bootstrap "
+    "interval that draws seeds; methods in either order, the best first."
 )
 
 
@@ -80,6 +85,12 @@ class CompareHybridArgs:
     """Begin no new run after so many minutes."""
     dry: bool = False
     """Only list the runs and what is missing."""
+    export: Path | None = None
+    """Instead of running, write what has finished into hybrid.csv in this folder, which --released reads back."""
+    released: Path | None = None
+    """Instead of running, show what hybrid.csv in this folder holds of these runs, such as docs/data."""
+    beside: int | None = None
+    """With --released: also the rank correlation of the methods with those of runs of so many updates."""
     out: Path = Path("runs")
     """Parent of all run folders; the tables and the curves go to <out>/figures."""
     seed: int = 0
@@ -132,8 +143,14 @@ def main(args: CompareHybridArgs) -> None:
     """Runs what is missing, then shows tables and curves; raises UserError in the end if some cells could not run."""
     args = replace(args, gaps=gaps.each(args.gaps or tuple(gaps.presets(extend.name_of(args.task), variants=False))))
     check(args)
+    if args.released is not None:
+        _show(args, released(args, args.released))
+        return
     found = grid(args)
     check_begun(found)
+    if args.export is not None:
+        export(args, found, args.export)
+        return
     failed = complete(found, args)
     if args.dry:
         return
@@ -166,8 +183,12 @@ def check(args: CompareHybridArgs) -> None:
     learning = [name for name in args.methods if get_method(name.partition(":")[0]).kind != "simulator"]
     if learning and not args.data:
         raise UserError(f"--data: {learning[0]} learns from real data; name files or folders (docs/data.md)")
-    if missing := [path for path in args.data if not path.exists()]:
+    if args.released is None and (missing := [path for path in args.data if not path.exists()]):
         raise UserError(f"--data {missing[0]}: no such file")
+    if args.export is not None:
+        check_folder(args.export, "--export")
+    if args.beside is not None and args.released is None:
+        raise UserError("--beside: reads released tables; name their folder with --released")
 
 
 def grid(args: CompareHybridArgs) -> list[Cell]:
@@ -199,15 +220,72 @@ def outcomes(args: CompareHybridArgs) -> "Results | None":
     summaries = [read_own(cell.folder / SUMMARY, {"task": str, "score": str, args.score: list}) for cell in done]
     task, score = (summaries[0][name] for name in ("task", "score"))
     found = [_outcome(cell, one[args.score]) for cell, one in zip(done, summaries, strict=True)]
-    data, systems = [data_name(path) for path in args.data] or [""], [gaps.title(gap) for gap in args.gaps]
-    return Results(task, score, data, systems, args.methods, found)
+    return Results(task, score, *_columns(args), found)
 
 
-def _outcome(cell: Cell, scores: list[float]) -> "Outcome":
+def _columns(args: CompareHybridArgs) -> tuple[list[str], list[str], tuple[str, ...]]:
+    """What tables have: data sets, simulators and methods."""
+    data = [data_name(path) for path in args.data] or [""]
+    return data, [gaps.title(gap) for gap in args.gaps], args.methods
+
+
+def _outcome(cell: Cell, scores: list[float] | None = None) -> "Outcome":
     from sgft_jax.analysis.hybrid import outcome
 
     run = cell.args
     return outcome(_spec(run), _data_of(run), _gap_of(run), read_jsonl(cell.folder / EVAL), scores)
+
+
+def export(args: CompareHybridArgs, found: Sequence[Cell], to: Path) -> None:
+    """Writes the finished cells into hybrid.csv; raises UserError if there is none."""
+    from sgft_jax.analysis import hybrid_table
+    from sgft_jax.analysis.curves import origin
+
+    runs = []
+    for cell in found:
+        if cell.state == "finished":
+            summary = read_own(cell.folder / SUMMARY, {"task": str, "score": str, "seeds": list})
+            starts = read_own(cell.folder / PROVENANCE).get("starts", [{}])
+            task, score, seeds = (summary[name] for name in ("task", "score", "seeds"))
+            runs.append(hybrid_table.Run(
+                task, gaps.title(args.real), name_of(args.schedule), args.schedule.updates_in_all,
+                origin(starts[-1])["commit"], score, seeds, _outcome(cell),
+            ))  # fmt: skip
+    if not runs:
+        raise UserError(f"--export {to}: none of these runs has finished")
+    print(f"written: {hybrid_table.write(to, runs)}, {len(runs)} runs")
+
+
+def released(args: CompareHybridArgs, folder: Path) -> "Results":
+    """What the table in a folder holds of these runs; raises UserError if that is nothing, or if it lacks a seed."""
+    from sgft_jax.analysis.hybrid import EVERY, Results
+    from sgft_jax.analysis.hybrid_table import TABLE, read
+
+    wanted, columns = seed_list(args.seed, args.seeds), _columns(args)
+    data, systems, methods = columns
+    own = (extend.name_of(args.task), gaps.title(args.real), name_of(args.schedule), args.schedule.updates_in_all)
+    found = [
+        run
+        for run in read(folder)
+        if run[: len(own)] == own
+        and run.outcome.method in methods
+        and run.outcome.data in (*data, EVERY)
+        and run.outcome.gap in (*systems, EVERY)
+    ]
+    path = folder / TABLE
+    if not found:
+        raise UserError(f"{path}: has none of these runs, {own[3]:,} updates of {own[0]} with schedule {own[2]}")
+    for run in found:
+        if missing := sorted(set(wanted) - set(run.seeds)):
+            raise UserError(f"{path}: {run.outcome.method} has no seed {missing[0]}; name others with --seed, --seeds")
+    outcomes = [_chosen(run.outcome, [run.seeds.index(seed) for seed in wanted], args.score) for run in found]
+    return Results(own[0], found[0].score, *columns, outcomes)
+
+
+def _chosen(own: "Outcome", members: list[int], score: str) -> "Outcome":
+    """Of these members, with the scores that tables show."""
+    curve = own.curve[members]
+    return own._replace(curve=curve, scores=curve[:, -1] if score == "last" else late(curve.T))
 
 
 def tables(args: CompareHybridArgs, results: "Results") -> str:
@@ -220,7 +298,11 @@ def tables(args: CompareHybridArgs, results: "Results") -> str:
     parts = [f"# {results.task}", LEGEND.format(**words), analysis.headline(results)]
     if len(args.methods) > 1:
         parts.append(analysis.duels(results, args.reference))
-    return "\n\n".join([*parts, analysis.cells(results)])
+    parts.append(analysis.cells(results))
+    if args.released is not None and args.beside is not None:
+        others = replace(args, schedule=replace(args.schedule, updates=args.beside))
+        parts += [_RANKS.format(args.beside), analysis.ranks(results, released(others, args.released))]
+    return "\n\n".join(parts)
 
 
 def _show(args: CompareHybridArgs, results: "Results") -> None:

@@ -27,7 +27,7 @@ from sgft_jax.analysis.stats import bootstrap_interval, mean
 from sgft_jax.data import logs
 from sgft_jax.hybrid import trainer
 from sgft_jax.hybrid.robot import MEASURES
-from sgft_jax.hybrid.scores import normalised
+from sgft_jax.hybrid.scores import LATE, late, normalised
 from sgft_jax.hybrid.trainer import HybridState
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.jsonfile import jsonable
@@ -40,7 +40,6 @@ from sgft_jax.systems.simulated import Simulated
 from sgft_jax.types import HybridMethod, Metrics, Prior, PyTree, RealData, UserError
 
 _TRAINING, _EVALUATION = 11, 12  # purposes, folded into a seed's key
-_LATE = 10  # evaluations that a score averages, beside the last one
 
 
 def run(args: HybridArgs, method: HybridMethod, seeds: list[int]) -> list[dict[str, Any]]:
@@ -240,7 +239,7 @@ class _Run:
     def _summary(self, lines: list[dict[str, Any]], gap: Gap) -> dict[str, Any]:
         """Score of each seed at the last evaluation, and the mean over the last ten. lines: the evaluations."""
         curve = np.array([line["score"] for line in lines])
-        last, late = curve[-1], curve[-_LATE:].mean(0)
+        scores = {"last": curve[-1], "late": late(curve)}
         others = {name: lines[-1][name] for name in lines[-1] if name not in ("step", *SCORES)}
         return {
             "task": self.env.name,
@@ -253,10 +252,9 @@ class _Run:
             "updates": self.args.schedule.updates_in_all,
             "score": self.env.score,
             "seeds": self.seeds,
-            "last": last.tolist(),
-            "late": late.tolist(),
-            **intervals({"last": last, "late": late}),
-            "normalised": [normalised(self.env.name, x) for x in last.tolist()],
+            **{name: own.tolist() for name, own in scores.items()},
+            **intervals(scores),
+            "normalised": [normalised(self.env.name, x) for x in scores["last"].tolist()],
             "measures": others,
         }
 
@@ -275,13 +273,13 @@ class _Run:
         return film(self.system.env, theta, np.asarray(played.trace), folder / "videos" / f"seed-{self.seeds[0]}.mp4")
 
     def _say(self, folder: Path, gap: Gap, summary: dict[str, Any]) -> None:
-        last, late = np.array(summary["last"]), np.array(summary["late"])
+        last, mean = np.array(summary["last"]), np.array(summary["late"])
         rescaled = [x for x in summary["normalised"] if x is not None]
         scale = f", {np.mean(rescaled):.1f} on D4RL's scale" if rescaled else ""
         print(
             f"{gap.name}: {self.env.score} in the real system {in_words(last, summary.get('last/interval'))} "
             f"(std over seeds {last.std():.3g}) after {summary['updates']:,} updates{scale}; "
-            f"mean of the last {_LATE} evaluations {in_words(late, summary.get('late/interval'))}"
+            f"mean of the last {LATE} evaluations {in_words(mean, summary.get('late/interval'))}"
         )
         for name, values in summary["measures"].items():
             print(f"  {name}: {np.mean(values):.3g} (std over seeds {np.std(values):.2g})")

@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sgft_jax.analysis.scoreboard import improvement
-from sgft_jax.analysis.stats import Interval, bootstrap_interval, mean
+from sgft_jax.analysis.stats import Interval, bootstrap_interval, mean, rank_correlation
 from sgft_jax.analysis.tables import NONE, markdown, number, plain
 from sgft_jax.hybrid.scores import BOUNDS, normalised
 
 EVERY = ""  # data or simulator of a method that sees none
+_FEWEST = 3  # methods that have an order worth comparing
 
 
 class Outcome(NamedTuple):
@@ -93,6 +94,40 @@ def duels(results: Results, reference: str) -> str:
     others = [method for method in results.methods if method != reference]
     rows = [[data or NONE, *(_duel(results, reference, other, data) for other in others)] for data in results.data]
     return markdown([f"P({reference} better), per cent", *others], rows)
+
+
+def ranks(results: Results, others: Results) -> str:
+    """A row for each data set and simulator: do other runs, such as longer ones, put the methods in the same order?
+
+    Spearman's correlation of the methods' means, over the methods that have finished in both, with its bootstrap
+    interval over the seeds of each method; then the methods in the order of either, the best first. Rows with fewer
+    than three methods are left out.
+    """
+    rows = []
+    for data in results.data:
+        for gap in results.gaps:
+            both = [(m, results.of(m, data, gap), others.of(m, data, gap)) for m in results.methods]
+            found = {m: (own, theirs) for m, own, theirs in both if own is not None and theirs is not None}
+            if len(found) >= _FEWEST:
+                orders = [sorted(found, key=lambda m: -found[m][i].mean()) for i in (0, 1)]
+                words = [", ".join(order) for order in orders]
+                rows.append([data or NONE, gap, number(agreement(list(found.values())), "", digits=2), *words])
+    return markdown(["data", "simulator", "rank correlation", "order here", "order there"], rows)
+
+
+def agreement(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Interval:
+    """Spearman's correlation of means: of each method its scores [seeds] in either set of runs.
+
+    A resample draws seeds of each method, the same in both sets. Seeds that one of the two lacks are left out.
+    """
+    seeds = min(len(scores) for pair in pairs for scores in pair)
+    scores = np.concatenate([np.stack([own[:seeds], theirs[:seeds]], axis=-1) for own, theirs in pairs])
+
+    def correlation(scores: np.ndarray, *, axis: int = 0) -> np.ndarray:
+        each = scores.reshape(*scores.shape[:axis], len(pairs), seeds, 2)
+        return rank_correlation(each.mean(-2), axis=axis)
+
+    return bootstrap_interval(scores, statistic=correlation, strata=np.repeat(np.arange(len(pairs)), seeds))
 
 
 def overall(results: Results, method: str, data: str) -> Interval | None:

@@ -45,7 +45,7 @@ def export(out: Path, to: Path) -> list[Path]:
     }
     for task in sorted({curve.task for curve in found}):
         tables[f"curves-{task}"] = (curves.rows([curve for curve in found if curve.task == task]), IDENTITY)
-    written = [_merge(to / f"{name}.csv", list(new), key) for name, (new, key) in tables.items()]
+    written = [merge(to / f"{name}.csv", list(new), key) for name, (new, key) in tables.items()]
     return [path for path in written if path is not None]
 
 
@@ -90,7 +90,7 @@ def _set_of(folder: Path) -> dict[str, str]:
     return {"task": folder.parent.parent.name, "priors": curves.set_name(folder, digests)}
 
 
-def _merge(path: Path, new: Sequence[Mapping[str, Any]], key: Sequence[str]) -> Path | None:
+def merge(path: Path, new: Sequence[Mapping[str, Any]], key: Sequence[str]) -> Path | None:
     """Writes the rows into a table in place of those with the same key; None if there are none."""
     if not new:
         return None

@@ -38,7 +38,8 @@ def leave(args, scores):
     config = {"config": dict(compare_hybrid.HYBRID.config(args)), "kind": "hybrid", "sgft_jax": "0", "format": FORMAT}
     (folder / "config.json").write_text(json.dumps(jsonable(config)))
     if scores:
-        summary = {"task": "halfcheetah", "score": "return", "late": scores, "last": [-x for x in scores]}
+        summary = {"task": "halfcheetah", "score": "return", "seeds": [*range(args.seeds)], "late": scores}
+        summary["last"] = [-x for x in scores]
         (folder / "summary.json").write_text(json.dumps(summary))
         lines = [{"step": step, "score": scores} for step in (0, 1000)]
         (folder / "eval.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -182,3 +183,77 @@ def test_bad_input(words, said, tmp_path, ran, capsys):
     error = capsys.readouterr().err
     assert stopped.value.code == 2 and error.count("\n") == 1 and said in error
     assert ran == []
+
+
+# --- released tables --------------------------------------------------------------------------------------------------
+
+
+def test_a_released_table_says_what_the_runs_say(grid, ran, tmp_path, capsys):
+    compare_hybrid.main(grid)
+    ran.clear()
+    compare_hybrid.main(replace(grid, export=tmp_path / "tables"))
+    assert f"written: {tmp_path / 'tables/hybrid.csv'}, 10 runs\n" in capsys.readouterr().out
+    once = (tmp_path / "tables/hybrid.csv").read_text()
+    compare_hybrid.main(replace(grid, export=tmp_path / "tables"))
+    assert (tmp_path / "tables/hybrid.csv").read_text() == once  # rows of the same runs are replaced
+    for path in grid.data:
+        path.unlink()  # the data are not needed
+    capsys.readouterr()
+    compare_hybrid.main(replace(grid, released=tmp_path / "tables", out=tmp_path / "other"))
+    said = capsys.readouterr().out
+    assert ran == [] and "| replay | friction | 110 ± 8 | 110 ± 8 | 10 ± 8 | 10 ± 8 |" in said
+    assert (tmp_path / "other/figures/hybrid-halfcheetah-sim-replay.png").exists()
+    compare_hybrid.main(replace(grid, released=tmp_path / "tables", seeds=2))
+    assert "| replay | friction | 105 ± 5 | 105 ± 5 | 5 ± 5 | 5 ± 5 |" in capsys.readouterr().out
+
+
+def test_the_last_and_the_mean_of_ten_evaluations_come_from_the_curve(grid, ran, tmp_path, capsys):
+    own = replace(grid, methods=("sac",), reference="sac", data=(), gaps=("gravity",))
+    compare_hybrid.main(own)
+    (folder,) = (cell.folder for cell in compare_hybrid.grid(own))
+    lines = [{"step": 10 * i, "score": [float(i)] * 3} for i in range(21)]
+    (folder / "eval.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    compare_hybrid.main(replace(own, export=tmp_path))
+    for score, mean in (("last", "20"), ("late", "16")):  # 11 to 20: 15.5, to the even number
+        compare_hybrid.main(replace(own, released=tmp_path, score=score))
+        assert f"| - | gravity | {mean} ± 0 |" in capsys.readouterr().out
+
+
+def test_runs_of_two_lengths_are_compared_in_their_order(grid, ran, tmp_path, capsys):
+    own = replace(grid, methods=("iql", "cql", "edac"), reference="iql", data=grid.data[:1], gaps=("gravity",))
+    for updates, order in ((1000, (1.0, 2.0, 3.0)), (2000, (1.0, 3.0, 2.0))):
+        run = replace(own, schedule=replace(own.schedule, updates=updates), out=tmp_path / str(updates))
+        for cell, score in zip(compare_hybrid.grid(run), order, strict=True):
+            leave(cell.args, [score] * 3)
+            (cell.folder / "eval.jsonl").write_text(json.dumps({"step": updates, "score": [score] * 3}) + "\n")
+        compare_hybrid.main(replace(run, export=tmp_path))
+    compare_hybrid.main(replace(run, released=tmp_path, beside=1000))
+    said = capsys.readouterr().out
+    assert "| medium | gravity | 0.50 | cql, edac, iql | edac, cql, iql |" in said and "after 1,000 updates" in said
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"released": "none"}, r"hybrid\.csv: no such table; write one with: .*--export"),
+        ({"released": "tables", "seeds": 9}, r"hybrid\.csv: \w+ has no seed 3; name others with --seed, --seeds"),
+        ({"released": "tables", "task": "walker2d"}, r"has none of these runs, 1,000,000 updates of walker2d"),
+        ({"released": "tables", "beside": 500}, r"has none of these runs, 500 updates of halfcheetah"),
+        ({"beside": 500}, r"--beside: reads released tables"),
+        ({"export": "tables/hybrid.csv"}, r"hybrid\.csv is a file; choose another --export"),
+        ({"export": "new", "methods": ("edac",), "reference": "edac"}, r"--export .*: none of these runs has finished"),
+    ],
+)
+def test_what_released_tables_lack_is_one_line(changes, said, grid, ran, tmp_path):
+    compare_hybrid.main(grid)
+    compare_hybrid.main(replace(grid, export=tmp_path / "tables"))
+    given = {name: tmp_path / text if name in ("released", "export") else text for name, text in changes.items()}
+    with pytest.raises(UserError, match=said):
+        compare_hybrid.main(replace(grid, **given))
+
+
+def test_a_damaged_table_is_named(grid, tmp_path):
+    head = "task,real,data,gap,method,schedule,updates,commit,score,step,seed-0\n"
+    (tmp_path / "hybrid.csv").write_text(head + "halfcheetah,sim,,gravity,sac,fleet,1000,,return,0,x\n")
+    with pytest.raises(UserError, match=r"hybrid\.csv: could not convert string to float: 'x'; put the table back"):
+        compare_hybrid.main(replace(grid, released=tmp_path))

@@ -5,7 +5,7 @@ import pytest
 
 from sgft_jax.analysis import hybrid
 from sgft_jax.analysis.hybrid import EVERY, Outcome, Results
-from sgft_jax.hybrid.scores import BOUNDS
+from sgft_jax.hybrid.scores import BOUNDS, late
 
 LOW, HIGH = BOUNDS["halfcheetah"]
 
@@ -79,3 +79,24 @@ def test_tasks_without_a_scale_are_in_their_own():
     assert rows(hybrid.headline(found))[0][2].startswith("50 [")
     assert rows(hybrid.cells(found))[0][3] == "50 ± 20"
     assert rows(hybrid.cells(found))[2][3] == "-"
+
+
+def test_the_order_of_methods_in_two_sets_of_runs():
+    """Ranks 1, 2, 3 against 1, 3, 2: covariance 1 of variances 2, so a half. Seeds decide between h2oplus and iql."""
+    here = {"h2oplus": (50, 50, 50), "iql": (40, 40, 40), "sac": (0, 0, 0)}
+    there = {"h2oplus": (39, 39, 45), "iql": (42, 42, 42, 42), "sac": (0, 0, 0)}
+    ours, theirs = (
+        results(*(Outcome(m, "replay", "gravity", np.array(scores, float)) for m, scores in each.items()))
+        for each in (here, there)
+    )
+    assert rows(hybrid.ranks(ours, theirs)) == [
+        ["replay", "gravity", "0.50 [0.50, 1.00]", "h2oplus, iql, sac", "iql, h2oplus, sac"]
+    ]
+    pairs = [(own.scores, other.scores) for own, other in zip(ours.outcomes, ours.outcomes, strict=True)]
+    assert hybrid.agreement(pairs).estimate == pytest.approx(1)
+    assert rows(hybrid.ranks(ours, ours._replace(outcomes=ours.outcomes[:2]))) == []  # two methods have no order
+
+
+def test_the_last_ten_evaluations_of_each_seed():
+    curve = np.arange(24.0).reshape(12, 2)
+    np.testing.assert_allclose(late(curve), [13, 14])

@@ -1,0 +1,83 @@
+"""Impure: what runs on real data and a simulator scored, as a table that can be committed and read back.
+
+hybrid.csv has a row for each evaluation of each run: what was run (`IDENTITY`), the commit, whether scores are success
+or return, the updates before the evaluation (`step`), and a column for the score of each seed.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sgft_jax.analysis.curves import read_csv
+from sgft_jax.analysis.hybrid import Outcome
+from sgft_jax.analysis.release import merge
+from sgft_jax.types import UserError
+
+TABLE = "hybrid.csv"
+IDENTITY = ("task", "real", "data", "gap", "method", "schedule", "updates")
+_NEEDED = (*IDENTITY, "commit", "score", "step")
+_SEED = "seed-"
+
+
+class Run(NamedTuple):
+    """One run with all its seeds. real: where it was evaluated. schedule: its name. updates: of the whole run.
+
+    score: "success" or "return". seeds: [seeds], those of the outcome's curve.
+    """
+
+    task: str
+    real: str
+    schedule: str
+    updates: int
+    commit: str
+    score: str
+    seeds: list[int]
+    outcome: Outcome
+
+
+def write(to: Path, runs: Iterable[Run]) -> Path | None:
+    """Writes runs into hybrid.csv in the folder `to`, in place of rows of the same runs; None if there is no run."""
+    to.mkdir(parents=True, exist_ok=True)
+    return merge(to / TABLE, [row for run in runs for row in _rows(run)], IDENTITY)
+
+
+def read(folder: Path) -> list[Run]:
+    """The runs in hybrid.csv. Raises UserError if there is no such table, or if a cell of it cannot be read."""
+    path = folder / TABLE
+    if not path.exists():
+        raise UserError(
+            f"{path}: no such table; write one with: python -m experiments.compare_hybrid --export {folder}"
+        )
+    lines = groupby(read_csv(path, needed=_NEEDED), key=lambda row: tuple(row[name] for name in IDENTITY))
+    try:
+        return [_run(list(rows)) for _, rows in lines]
+    except ValueError as error:
+        raise UserError(f"{path}: {error}; put the table back as it was") from error
+
+
+def _rows(run: Run) -> Iterator[dict[str, Any]]:
+    own = run.outcome
+    named = {"task": run.task, "real": run.real, "data": own.data, "gap": own.gap, "method": own.method}
+    named |= {"schedule": run.schedule, "updates": run.updates, "commit": run.commit, "score": run.score}
+    for step, scores in zip(own.updates.tolist(), own.curve.T.tolist(), strict=True):
+        # Six digits: a mean over seeds is printed as it is in the run.
+        yield {**named, "step": step, **{f"{_SEED}{n}": f"{x:.6g}" for n, x in zip(run.seeds, scores, strict=True)}}
+
+
+def _run(rows: list[Mapping[str, str]]) -> Run:
+    first = rows[0]
+    columns = [name for name, text in first.items() if name.startswith(_SEED) and text]
+    curve = np.array([[float(row[name]) for name in columns] for row in rows]).T
+    own = Outcome(first["method"], first["data"], first["gap"], curve[:, -1], _numbers(rows, "step"), curve)
+    seeds = [int(name.removeprefix(_SEED)) for name in columns]
+    return Run(
+        first["task"], first["real"], first["schedule"], int(first["updates"]), first["commit"], first["score"], seeds,
+        own,
+    )  # fmt: skip
+
+
+def _numbers(rows: list[Mapping[str, str]], name: str) -> np.ndarray:
+    return np.array([int(row[name]) for row in rows])
