@@ -273,13 +273,13 @@ class _Run:
         return film(self.system.env, theta, np.asarray(played.trace), folder / "videos" / f"seed-{self.seeds[0]}.mp4")
 
     def _say(self, folder: Path, gap: Gap, summary: dict[str, Any]) -> None:
-        last, mean = np.array(summary["last"]), np.array(summary["late"])
+        last, average = np.array(summary["last"]), np.array(summary["late"])
         rescaled = [x for x in summary["normalised"] if x is not None]
         scale = f", {np.mean(rescaled):.1f} on D4RL's scale" if rescaled else ""
         print(
             f"{gap.name}: {self.env.score} in the real system {in_words(last, summary.get('last/interval'))} "
             f"(std over seeds {last.std():.3g}) after {summary['updates']:,} updates{scale}; "
-            f"mean of the last {LATE} evaluations {in_words(mean, summary.get('late/interval'))}"
+            f"mean of the last {LATE} evaluations {in_words(average, summary.get('late/interval'))}"
         )
         for name, values in summary["measures"].items():
             print(f"  {name}: {np.mean(values):.3g} (std over seeds {np.std(values):.2g})")

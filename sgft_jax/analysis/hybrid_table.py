@@ -5,14 +5,11 @@ or return, the updates before the evaluation (`step`), and a column for the scor
 """
 
 from collections.abc import Iterable, Iterator, Mapping
-from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from sgft_jax.analysis.curves import read_csv
-from sgft_jax.analysis.hybrid import Outcome
+from sgft_jax.analysis.hybrid import Outcome, outcome
 from sgft_jax.analysis.release import merge
 from sgft_jax.types import UserError
 
@@ -51,9 +48,11 @@ def read(folder: Path) -> list[Run]:
         raise UserError(
             f"{path}: no such table; write one with: python -m experiments.compare_hybrid --export {folder}"
         )
-    lines = groupby(read_csv(path, needed=_NEEDED), key=lambda row: tuple(row[name] for name in IDENTITY))
+    runs: dict[tuple[str, ...], list[Mapping[str, str]]] = {}
+    for row in read_csv(path, needed=_NEEDED):
+        runs.setdefault(tuple(row[name] for name in IDENTITY), []).append(row)
     try:
-        return [_run(list(rows)) for _, rows in lines]
+        return [_run(rows) for rows in runs.values()]
     except ValueError as error:
         raise UserError(f"{path}: {error}; put the table back as it was") from error
 
@@ -70,14 +69,10 @@ def _rows(run: Run) -> Iterator[dict[str, Any]]:
 def _run(rows: list[Mapping[str, str]]) -> Run:
     first = rows[0]
     columns = [name for name, text in first.items() if name.startswith(_SEED) and text]
-    curve = np.array([[float(row[name]) for name in columns] for row in rows]).T
-    own = Outcome(first["method"], first["data"], first["gap"], curve[:, -1], _numbers(rows, "step"), curve)
     seeds = [int(name.removeprefix(_SEED)) for name in columns]
+    lines = [{"step": int(row["step"]), "score": [float(row[name]) for name in columns]} for row in rows]
+    own = outcome(first["method"], first["data"], first["gap"], lines)
     return Run(
         first["task"], first["real"], first["schedule"], int(first["updates"]), first["commit"], first["score"], seeds,
         own,
     )  # fmt: skip
-
-
-def _numbers(rows: list[Mapping[str, str]], name: str) -> np.ndarray:
-    return np.array([int(row[name]) for row in rows])

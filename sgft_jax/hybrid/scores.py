@@ -3,7 +3,7 @@
 import numpy as np
 
 BOUNDS = {"halfcheetah": (-280.178953, 12135.0), "walker2d": (1.629008, 4592.3)}  # return at 0 and at 100
-LATE = 10  # evaluations
+LATE = 10  # evaluations that a score averages, beside the last one
 
 
 def normalised(task: str, total: float) -> float | None:
