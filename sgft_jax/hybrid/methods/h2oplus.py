@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import HybridOptions, agent_of, numbers_of, real_and_simulated
+from sgft_jax.hybrid.methods.options import HybridOptions, agent_of, numbers_of, real_and_simulated, return_scale
 from sgft_jax.types import HybridAgent, HybridMethod, Task, ValueLoss
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ class Config(HybridOptions):
     expectile: float = 0.7
     """Of the value loss `iql`."""
     value_alpha: float = 1.0
-    """Scale of the other value losses, in units of return."""
+    """Scale of the other value losses, in units of return, where the data's best and worst are 1,000 apart."""
     value_cut: float = 5.0
     """Of the value losses `eql` and `xql`: the largest exponent, an advantage in units of that scale."""
     ratio: bool = True
@@ -49,9 +49,11 @@ def build(config: Config, task: Task, *, critics: int = 2, diversity: float = 0.
     )  # fmt: skip
 
     def prepare(state: "H2OPlusState", real: "RealData", updates: int) -> "H2OPlusState":
-        if state.ratio is None or not config.standardise:
-            return state
-        return state.replace(ratio=state.ratio._replace(normalizer=normalizer.of(real.rows.obs)))
+        hyper = state.hyper
+        state = state.replace(hyper=hyper._replace(value_alpha=hyper.value_alpha / return_scale(real)))
+        if state.ratio is not None and config.standardise:
+            state = state.replace(ratio=state.ratio._replace(normalizer=normalizer.of(real.rows.obs)))
+        return state
 
     numbers = numbers_of(h2oplus.H2OPlusHyper, config, "actor", "critic", "value", "alpha", "ratio")
     learner = h2oplus.make_h2oplus(structure, numbers)
@@ -60,8 +62,10 @@ def build(config: Config, task: Task, *, critics: int = 2, diversity: float = 0.
 
 
 _PAPER = Config()
-# With the numbers of their own authors' code for locomotion. XQL has some for each data set; these are its one setting
-# for all of them. Source: IVR (SQL, EQL: run_mujoco.sh), XQL (offline/reproduce/mujoco).
+# With the numbers of their own authors' code for locomotion, which scales rewards so that returns span 1,000. In units
+# of the return itself EQL's diverges: where V is below a critic by more than the cut-off, the loss lowers V further.
+# XQL has numbers for each data set; these are its one setting for all of them. Source: IVR (SQL, EQL: run_mujoco.sh),
+# XQL (offline/reproduce/mujoco).
 _BACKBONES = {
     "sql": replace(_PAPER, value_loss="sql", value_alpha=1.0),
     "eql": replace(_PAPER, value_loss="eql", value_alpha=2.0, value_cut=5.0),

@@ -4,14 +4,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import OfflineOptions, agent_of, numbers_of
+from sgft_jax.hybrid.methods.options import OfflineOptions, agent_of, numbers_of, return_scale
 from sgft_jax.types import HybridAgent, HybridMethod, Task
 
 if TYPE_CHECKING:
     from sgft_jax.learners.iql import IQLState
-    from sgft_jax.types import Array, RealData
-
-_RETURN_SPAN = 1000.0  # of the scaled returns, as published for locomotion
+    from sgft_jax.types import RealData
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ def build(config: Config, task: Task) -> HybridAgent:
     def prepare(state: "IQLState", real: "RealData", updates: int) -> "IQLState":
         hyper = state.hyper
         if config.scale_rewards:
-            hyper = hyper._replace(reward_scale=_RETURN_SPAN / return_span(real))
+            hyper = hyper._replace(reward_scale=return_scale(real))
         if config.falling_rate:
             hyper = hyper._replace(actor_updates=jnp.float32(updates))
         return state.replace(hyper=hyper)
@@ -56,19 +54,6 @@ def build(config: Config, task: Task) -> HybridAgent:
     learner = iql.make_iql(structure, numbers_of(iql.IQLHyper, config, "actor", "critic", "value"))
     batches = sources.real_rows(config.rows)
     return agent_of(learner, config, task, batches, simulates=False, prepare=prepare, export=export)
-
-
-def return_span(real: "RealData") -> "Array":
-    """Best less worst undiscounted return [] of the recorded episodes; 1 where they do not differ."""
-    import jax
-    import jax.numpy as jnp
-
-    n = real.last.shape[0]
-    number = jnp.cumsum(real.last) - real.last  # of the episode of every row
-    returns = jax.ops.segment_sum(real.rows.reward, number, n)
-    there = jnp.arange(n) <= number[-1]
-    span = jnp.max(returns, where=there, initial=-jnp.inf) - jnp.min(returns, where=there, initial=jnp.inf)
-    return jnp.where(span > 0, span, 1.0)
 
 
 METHOD = HybridMethod(

@@ -5,12 +5,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from sgft_jax import checks
-from sgft_jax.types import HybridAgent, Learner, PyTree, RealData, Source, Task
+from sgft_jax.types import Array, HybridAgent, Learner, PyTree, RealData, Source, Task
 
 if TYPE_CHECKING:
     from sgft_jax.learners.actor import Head
     from sgft_jax.learners.sac import SACHyper
     from sgft_jax.models.config import NetworkConfig
+
+_RETURN_SPAN = 1000.0  # of scaled returns, as published for locomotion
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,23 @@ def sac_numbers(config: ActorCriticOptions) -> "SACHyper":
     from sgft_jax.learners.sac import SACHyper
 
     return numbers_of(SACHyper, config, "actor", "critic", "alpha")
+
+
+def return_scale(real: RealData) -> Array:
+    """What rewards are multiplied by [] so that the best and the worst recorded return are 1,000 apart.
+
+    Returns are undiscounted sums over the recorded episodes. 1,000 where they do not differ.
+    Source: IQL (Kostrikov et al. 2021), whose successors SQL, EQL and XQL scale rewards alike.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    n = real.last.shape[0]
+    number = jnp.cumsum(real.last) - real.last  # of the episode of every row
+    returns = jax.ops.segment_sum(real.rows.reward, number, n)
+    there = jnp.arange(n) <= number[-1]
+    span = jnp.max(returns, where=there, initial=-jnp.inf) - jnp.min(returns, where=there, initial=jnp.inf)
+    return _RETURN_SPAN / jnp.where(span > 0, span, 1.0)
 
 
 def real_and_simulated(config: HybridOptions) -> Source:

@@ -15,7 +15,8 @@ from envs.gaps import Gap
 from envs.pools import real_worlds
 from sgft_jax.data import replay
 from sgft_jax.hybrid import trainer
-from sgft_jax.hybrid.methods import NAMES, get_method, iql
+from sgft_jax.hybrid.methods import NAMES, get_method
+from sgft_jax.hybrid.methods.options import return_scale
 from sgft_jax.hybrid.schedule import Schedule
 from sgft_jax.policies import make_policy
 from sgft_jax.pretraining import over_members
@@ -324,7 +325,16 @@ def test_iql_scales_rewards_to_the_span_of_the_returns():
     state = played(build("iql"))[0][0]
     np.testing.assert_allclose(state.learner.hyper.reward_scale[0], 1000 / np.ptp(returns), rtol=1e-4)
     cut = RealData(rows.rows, rows.last & (np.arange(50) != 49))  # the last episode is cut off
-    np.testing.assert_allclose(iql.return_span(jax.tree.map(jnp.asarray, cut)), np.ptp(returns), rtol=1e-4)
+    np.testing.assert_allclose(return_scale(jax.tree.map(jnp.asarray, cut)), 1000 / np.ptp(returns), rtol=1e-4)
+
+
+def test_the_scale_of_a_backbone_is_one_of_returns_that_span_1000():
+    """alpha = 2 of these is 2 span / 1,000 of the returns that the critic learns."""
+    agent = build(value_loss="eql", value_alpha=2.0)
+    rows = real_rows()
+    state = agent.prepare(agent.learner.init(jax.random.key(0)), jax.tree.map(jnp.asarray, rows), 24)
+    span = np.ptp(rows.rows.reward.reshape(5, 10).sum(1))
+    np.testing.assert_allclose(state.hyper.value_alpha, 2 * span / 1000, rtol=1e-4)
 
 
 @pytest.mark.slow
