@@ -83,7 +83,8 @@ def headline(results: Results) -> str:
     A resample draws seeds within every simulator. A method stands only where it has finished on all of them.
     """
     rows = [[data or NONE, *(_overall(results, method, data) for method in results.methods)] for data in results.data]
-    return markdown([f"mean over {len(results.gaps)} simulators", *results.methods], rows)
+    number = len(results.gaps)
+    return markdown([f"mean over {number} simulators" if number > 1 else "one simulator", *results.methods], rows)
 
 
 def duels(results: Results, reference: str) -> str:
