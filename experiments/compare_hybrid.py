@@ -187,6 +187,8 @@ def check(args: CompareHybridArgs) -> None:
         raise UserError(f"--data {missing[0]}: no such file")
     if args.export is not None:
         check_folder(args.export, "--export")
+    if args.export is not None and args.released is not None:
+        raise UserError("--export and --released exclude each other: one writes hybrid.csv, the other shows it")
     if args.beside is not None and args.released is None:
         raise UserError("--beside: reads released tables; name their folder with --released")
 

@@ -241,6 +241,7 @@ def test_runs_of_two_lengths_are_compared_in_their_order(grid, ran, tmp_path, ca
         ({"released": "tables", "beside": 500}, r"has none of these runs, 500 updates of halfcheetah"),
         ({"beside": 500}, r"--beside: reads released tables"),
         ({"export": "tables/hybrid.csv"}, r"hybrid\.csv is a file; choose another --export"),
+        ({"export": "tables", "released": "tables"}, r"--export and --released exclude each other"),
         ({"export": "new", "methods": ("edac",), "reference": "edac"}, r"--export .*: none of these runs has finished"),
     ],
 )
