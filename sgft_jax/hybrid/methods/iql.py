@@ -23,7 +23,8 @@ class Config(OfflineOptions):
     falling_rate: bool = True
     """Let the actor's learning rate fall to 0 along a cosine over all updates of the run, as the authors do."""
     scale_rewards: bool = True
-    """Divide rewards by the span of the data's returns and multiply them by 1,000, as the authors do."""
+    """Divide rewards by the span of the data's returns and multiply them by 1,000, as the authors do. A log of one
+    episode keeps its rewards."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

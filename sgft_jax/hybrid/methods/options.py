@@ -92,7 +92,7 @@ def sac_numbers(config: ActorCriticOptions) -> "SACHyper":
 def return_scale(real: RealData) -> Array:
     """What rewards are multiplied by [] so that the best and the worst recorded return are 1,000 apart.
 
-    Returns are undiscounted sums over the recorded episodes. 1,000 where they do not differ.
+    Returns are undiscounted sums over the recorded episodes. 1 where they do not differ, as in a log of one episode.
     Source: IQL (Kostrikov et al. 2021), whose successors SQL, EQL and XQL scale rewards alike.
     """
     import jax
@@ -103,7 +103,7 @@ def return_scale(real: RealData) -> Array:
     returns = jax.ops.segment_sum(real.rows.reward, number, n)
     there = jnp.arange(n) <= number[-1]
     span = jnp.max(returns, where=there, initial=-jnp.inf) - jnp.min(returns, where=there, initial=jnp.inf)
-    return _RETURN_SPAN / jnp.where(span > 0, span, 1.0)
+    return jnp.where(span > 0, _RETURN_SPAN / span, 1.0)
 
 
 def real_and_simulated(config: HybridOptions) -> Source:

@@ -328,6 +328,11 @@ def test_iql_scales_rewards_to_the_span_of_the_returns():
     np.testing.assert_allclose(return_scale(jax.tree.map(jnp.asarray, cut)), 1000 / np.ptp(returns), rtol=1e-4)
 
 
+def test_a_log_of_one_episode_keeps_its_rewards():
+    one = RealData(real_rows().rows, np.arange(50) == 49)
+    assert return_scale(jax.tree.map(jnp.asarray, one)) == 1
+
+
 def test_the_scale_of_a_backbone_is_one_of_returns_that_span_1000():
     """alpha = 2 of these is 2 span / 1,000 of the returns that the critic learns."""
     agent = build(value_loss="eql", value_alpha=2.0)
