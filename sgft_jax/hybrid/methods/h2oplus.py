@@ -23,7 +23,8 @@ class Config(HybridOptions):
     expectile: float = 0.7
     """Of the value loss `iql`."""
     value_alpha: float = 1.0
-    """Scale of the other value losses, in units of return, where the data's best and worst are 1,000 apart."""
+    """Scale of the other value losses, in units of scaled return: the best and the worst episode of the data are 1,000
+    apart. Of return itself where the data are one episode."""
     value_cut: float = 5.0
     """Of the value losses `eql` and `xql`: the largest exponent, an advantage in units of that scale."""
     ratio: bool = True
@@ -49,7 +50,7 @@ def build(config: Config, task: Task, *, critics: int = 2, diversity: float = 0.
     )  # fmt: skip
 
     def prepare(state: "H2OPlusState", real: "RealData", updates: int) -> "H2OPlusState":
-        hyper = state.hyper
+        hyper = state.hyper  # the learner itself has alpha in units of return
         state = state.replace(hyper=hyper._replace(value_alpha=hyper.value_alpha / return_scale(real)))
         if state.ratio is not None and config.standardise:
             state = state.replace(ratio=state.ratio._replace(normalizer=normalizer.of(real.rows.obs)))
