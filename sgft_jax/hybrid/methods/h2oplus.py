@@ -23,8 +23,8 @@ class Config(HybridOptions):
     expectile: float = 0.7
     """Of the value loss `iql`."""
     value_alpha: float = 1.0
-    """Scale of the other value losses, in units of scaled return: the best and the worst episode of the data are 1,000
-    apart. Of return itself where the data are one episode."""
+    """Scale of the other value losses, in units of returns scaled until the best and the worst episode of the data are
+    1,000 apart. Returns are not scaled where the data are one episode."""
     value_cut: float = 5.0
     """Of the value losses `eql` and `xql`: the largest exponent, an advantage in units of that scale."""
     ratio: bool = True
