@@ -5,7 +5,7 @@ without data once for each simulator. Cells that are finished are left alone, be
 same command, given again, does what is missing. All simulators and seeds of a method and data set share one program.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -14,6 +14,7 @@ from envs import gaps
 from envs.gaps import SIM
 from experiments import cells, cli
 from experiments.cells import Cell, Kind, check_begun, complete
+from experiments.evaluation import measures
 from experiments.hybrid import arguments, hybrid
 from experiments.hybrid_args import (
     DEFAULT,
@@ -37,6 +38,8 @@ from sgft_jax.io.runs import PROVENANCE, check_folder, read_own
 from sgft_jax.types import UserError, unknown
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from sgft_jax.analysis.hybrid import Outcome, Results
 
 _SCORES = {"late": "mean of the last ten evaluations", "last": "last evaluation"}
@@ -47,6 +50,7 @@ LEGEND = (
     "methods without a simulator made the updates alone. The data sets are what the files hold: numbers on sets that "
     "were made anew do not belong beside published ones."
 )
+_MEASURED = "What else the task is judged by, in these evaluations: mean with a 95 % bootstrap interval over seeds."
 _RANKS = (
     "Spearman's correlation of the methods' means here with those after {:,} updates (there), with a 95 % bootstrap "
     "interval that draws seeds; methods in either order, the best first."
@@ -234,8 +238,8 @@ def _columns(args: CompareHybridArgs) -> tuple[list[str], list[str], tuple[str, 
 def _outcome(cell: Cell, scores: list[float] | None = None) -> "Outcome":
     from sgft_jax.analysis.hybrid import outcome
 
-    run = cell.args
-    return outcome(_spec(run), _data_of(run), _gap_of(run), read_jsonl(cell.folder / EVAL), scores)
+    run, lines = cell.args, read_jsonl(cell.folder / EVAL)
+    return outcome(_spec(run), _data_of(run), _gap_of(run), lines, scores, measures=measures(lines[0]))
 
 
 def export(args: CompareHybridArgs, found: Sequence[Cell], to: Path) -> None:
@@ -286,8 +290,13 @@ def released(args: CompareHybridArgs, folder: Path) -> "Results":
 
 def _chosen(own: "Outcome", members: list[int], score: str) -> "Outcome":
     """Of these members, with the scores that tables show."""
-    curve = own.curve[members]
-    return own._replace(curve=curve, scores=curve[:, -1] if score == "last" else late(curve.T))
+    curve, others = own.curve[members], {name: values[members] for name, values in own.measures.items()}
+    return own._replace(curve=curve, measures=others, scores=_reduce(score)(curve))
+
+
+def _reduce(score: str) -> "Callable[[np.ndarray], np.ndarray]":
+    """What tables show of a curve: [seeds, evaluations] to [seeds]."""
+    return (lambda curve: curve[:, -1]) if score == "last" else (lambda curve: late(curve.T))
 
 
 def tables(args: CompareHybridArgs, results: "Results") -> str:
@@ -301,6 +310,8 @@ def tables(args: CompareHybridArgs, results: "Results") -> str:
     if len(args.methods) > 1:
         parts.append(analysis.duels(results, args.reference))
     parts.append(analysis.cells(results))
+    if measured := analysis.measured(results, _reduce(args.score)):
+        parts += [_MEASURED, measured]
     if args.released is not None and args.beside is not None:
         others = replace(args, schedule=replace(args.schedule, updates=args.beside))
         parts += [_RANKS.format(args.beside), analysis.ranks(results, released(others, args.released))]

@@ -41,6 +41,8 @@ class EvaluateArgs:
     arguments of gymnasium.make."""
     episodes: int = 200
     """Episodes per policy and system."""
+    video: Path | None = None
+    """Also film the first episode of each policy, into this folder; only of simulated systems."""
     json: bool = False
     """Print one JSON object and nothing else."""
     out: Path = Path("runs")
@@ -68,6 +70,8 @@ def main(args: EvaluateArgs) -> None:
                 f"  {one['policy']}: success {100 * one['success']:.1f} % [{low:.1f}, {high:.1f}], "
                 f"return {one['return']:.3f}{exploded}"
             )
+            if "video" in one:
+                print(f"    {one['video']}")
 
 
 def evaluate(args: EvaluateArgs) -> dict[str, Any]:
@@ -101,14 +105,27 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
             system = RecordedSystem(system, [store], done=len(store), explore=False, sync_every=1)
         played = play(system, make_policy(card, env), members, key_episodes, args.episodes)
 
+    names = [SIM if gap is None else gap.name for gap in found]
+
     def of_system(i: int) -> dict[str, Any]:
         own = part(played, i, len(priors))
         policies = [{"policy": str(folder), **describe(member(own, k))} for k, folder in enumerate(folders)]
+        if args.video is not None:
+            for k, folder in enumerate(folders):
+                path = args.video / f"{names[i]}-{folder.name}.mp4"
+                policies[k]["video"] = _film(system, i, member(member(own, k), 0), path)
         return {"policies": policies, **({"real_steps": int(own.valid.sum())} if stepped else {})}
 
     where = ["in simulation" if gap is None else f"on the {gap.name} real system" for gap in found]
     systems = [{"where": name, **of_system(i)} for i, name in enumerate(where)]
     return {"task": env.name, "impl": env.impl, "episodes": args.episodes, "systems": systems}
+
+
+def _film(system: Any, i: int, played: Any, path: Path) -> str:
+    """Films one episode in the i-th of simulated systems; one line that says where, or why there is no video."""
+    from experiments.video import film
+
+    return film(system.env, system.pools.theta.params[i, played.world], played.trace, path)
 
 
 def _simulated(env: Any, found: Sequence[Gap | None], key: Any, episodes: int, *, members: int, gamma: float) -> Any:
@@ -144,6 +161,10 @@ def check(args: EvaluateArgs) -> tuple[list[Path], str]:
         raise UserError(f"--set {args.set[0]}: changes a real system; name one with --real")
     if reals and is_robot(reals[0]):
         check_folder(args.out / "evaluate")
+    if args.video is not None:
+        check_folder(args.video, "--video")
+        if any(map(is_stepped, reals)):
+            raise UserError(f"--video: films simulated systems, and {reals[0]} is not one; leave one of the two out")
     if args.task is not None:
         check_real(args.task, reals, args.set)
     home = args.run / "best" if args.best and args.run else args.run or args.prior

@@ -17,7 +17,7 @@ from envs.gaps import SIM, Gap
 from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
 from experiments import logged
-from experiments.evaluation import SCORES, play, scores
+from experiments.evaluation import measures, play, scores
 from experiments.hybrid_args import NO_SIMULATOR, VOLATILE, HybridArgs, data_name, gaps_of, run_folder
 from experiments.memory import reserve
 from experiments.video import film
@@ -240,7 +240,7 @@ class _Run:
         """Score of each seed at the last evaluation, and the mean over the last ten. lines: the evaluations."""
         curve = np.array([line["score"] for line in lines])
         scores = {"last": curve[-1], "late": late(curve)}
-        others = {name: lines[-1][name] for name in lines[-1] if name not in ("step", *SCORES)}
+        others = {name: lines[-1][name] for name in measures(lines[-1])}
         return {
             "task": self.env.name,
             "method": self.method.name,

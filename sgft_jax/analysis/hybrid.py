@@ -4,7 +4,8 @@ A method without a simulator has one outcome for each data set, a method without
 in every row that they belong to.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +23,8 @@ _FEWEST = 3  # methods that have an order worth comparing
 class Outcome(NamedTuple):
     """What one run scored in the real system. data, gap: names, or `EVERY`. scores: [seeds], what tables show.
 
-    updates: [evaluations], curve: [seeds, evaluations] scores after so many, for figures.
+    updates: [evaluations], curve: [seeds, evaluations] scores after so many, for figures. measures: what else the task
+    is judged by, by name, as `curve`.
     """
 
     method: str
@@ -31,14 +33,25 @@ class Outcome(NamedTuple):
     scores: np.ndarray
     updates: np.ndarray = np.zeros(0)
     curve: np.ndarray = np.zeros((0, 0))
+    measures: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 def outcome(
-    method: str, data: str, gap: str, lines: Sequence[Mapping[str, Any]], scores: ArrayLike | None = None
+    method: str,
+    data: str,
+    gap: str,
+    lines: Sequence[Mapping[str, Any]],
+    scores: ArrayLike | None = None,
+    *,
+    measures: Sequence[str] = (),
 ) -> Outcome:
-    """What a run scored. lines: of its `eval.jsonl`. scores: [seeds], default those of the last evaluation."""
-    updates, curve = (np.array([line[name] for line in lines]) for name in ("step", "score"))
-    return Outcome(method, data, gap, curve[-1] if scores is None else np.asarray(scores), updates, curve.T)
+    """What a run scored. lines: of its `eval.jsonl`. scores: [seeds], default those of the last evaluation.
+
+    measures: other names in the lines.
+    """
+    updates, curve, *others = (np.array([line[name] for line in lines]).T for name in ("step", "score", *measures))
+    shown = curve[:, -1] if scores is None else np.asarray(scores)
+    return Outcome(method, data, gap, shown, updates, curve, dict(zip(measures, others, strict=True)))
 
 
 class Results(NamedTuple):
@@ -95,6 +108,21 @@ def duels(results: Results, reference: str) -> str:
     others = [method for method in results.methods if method != reference]
     rows = [[data or NONE, *(_duel(results, reference, other, data) for other in others)] for data in results.data]
     return markdown([f"P({reference} better), per cent", *others], rows)
+
+
+def measured(results: Results, reduce: Callable[[np.ndarray], np.ndarray]) -> str | None:
+    """A row for each measure, data set and simulator: mean of every method with its bootstrap interval over seeds.
+
+    reduce: [seeds, evaluations] to [seeds], as scores come from curves. None where no run has a measure.
+    """
+    names = dict.fromkeys(name for own in results.outcomes for name in own.measures)
+    rows = []
+    for name in names:
+        for data in results.data:
+            for gap in results.gaps:
+                found = [results.find(method, data, gap) for method in results.methods]
+                rows.append([name, data or NONE, gap, *(_measured(own, name, reduce) for own in found)])
+    return markdown(["measure", "data", "simulator", *results.methods], rows) if rows else None
 
 
 def ranks(results: Results, others: Results) -> str:
@@ -159,6 +187,12 @@ def _spread(scores: np.ndarray | None, score: str) -> str:
 def _overall(results: Results, method: str, data: str) -> str:
     found = overall(results, method, data)
     return NONE if found is None else number(found, results.score)
+
+
+def _measured(own: Outcome | None, name: str, reduce: Callable[[np.ndarray], np.ndarray]) -> str:
+    if own is None or name not in own.measures:
+        return NONE
+    return number(bootstrap_interval(reduce(own.measures[name]), statistic=mean), name, digits=2)
 
 
 def _duel(results: Results, reference: str, other: str, data: str) -> str:

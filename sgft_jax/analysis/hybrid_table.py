@@ -1,14 +1,15 @@
 """Impure: what runs on real data and a simulator scored, as a table that can be committed and read back.
 
-hybrid.csv has a row for each evaluation of each run: what was run (`IDENTITY`), the commit, whether scores are success
-or return, the updates before the evaluation (`step`), and a column for the score of each seed.
+hybrid.csv has a row for each evaluation of each run: what was run (`IDENTITY`), the commit, what was measured (`score`:
+success or return), the updates before the evaluation (`step`), and a column with the number of each seed. What else the
+task is judged by has rows of its own.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sgft_jax.analysis.curves import read_csv
+from sgft_jax.analysis.curves import SCORES, read_csv
 from sgft_jax.analysis.hybrid import Outcome, outcome
 from sgft_jax.analysis.release import merge
 from sgft_jax.types import UserError
@@ -60,18 +61,30 @@ def read(folder: Path) -> list[Run]:
 def _rows(run: Run) -> Iterator[dict[str, Any]]:
     own = run.outcome
     named = {"task": run.task, "real": run.real, "data": own.data, "gap": own.gap, "method": own.method}
-    named |= {"schedule": run.schedule, "updates": run.updates, "commit": run.commit, "score": run.score}
-    for step, scores in zip(own.updates.tolist(), own.curve.T.tolist(), strict=True):
-        # Six digits: a mean over seeds is printed as it is in the run.
-        yield {**named, "step": step, **{f"{_SEED}{n}": f"{x:.6g}" for n, x in zip(run.seeds, scores, strict=True)}}
+    named |= {"schedule": run.schedule, "updates": run.updates, "commit": run.commit}
+    for measured, curve in {run.score: own.curve, **own.measures}.items():
+        for step, values in zip(own.updates.tolist(), curve.T.tolist(), strict=True):
+            # Six digits: a mean over seeds is printed as it is in the run.
+            numbers = {f"{_SEED}{n}": f"{x:.6g}" for n, x in zip(run.seeds, values, strict=True)}
+            yield {**named, "score": measured, "step": step, **numbers}
 
 
 def _run(rows: list[Mapping[str, str]]) -> Run:
-    first = rows[0]
+    first = next((row for row in rows if row["score"] in SCORES), None)
+    if first is None:
+        raise ValueError(f"a run of {rows[0]['method']} on {rows[0]['task']} has neither success nor return")
     columns = [name for name, text in first.items() if name.startswith(_SEED) and text]
     seeds = [int(name.removeprefix(_SEED)) for name in columns]
-    lines = [{"step": int(row["step"]), "score": [float(row[name]) for name in columns]} for row in rows]
-    own = outcome(first["method"], first["data"], first["gap"], lines)
+    lines: dict[int, dict[str, Any]] = {}
+    for row in rows:
+        name = "score" if row["score"] == first["score"] else row["score"]
+        line = lines.setdefault(int(row["step"]), {"step": int(row["step"])})
+        line[name] = [float(row[column]) for column in columns]
+    measures = [name for name in dict.fromkeys(row["score"] for row in rows) if name != first["score"]]
+    for name in ("score", *measures):
+        if any(name not in line for line in lines.values()):
+            raise ValueError(f"a run of {first['method']} on {first['task']} lacks rows of {name}")
+    own = outcome(first["method"], first["data"], first["gap"], [*lines.values()], measures=measures)
     return Run(
         first["task"], first["real"], first["schedule"], int(first["updates"]), first["commit"], first["score"], seeds,
         own,

@@ -219,6 +219,49 @@ def test_the_last_and_the_mean_of_ten_evaluations_come_from_the_curve(grid, ran,
         assert f"| - | gravity | {mean} ± 0 |" in capsys.readouterr().out
 
 
+@pytest.fixture
+def standing(grid, ran):
+    """A run that also says how long three robots stood, at two evaluations."""
+    own = replace(grid, methods=("sac",), reference="sac", data=(), gaps=("gravity",))
+    compare_hybrid.main(own)
+    (folder,) = (cell.folder for cell in compare_hybrid.grid(own))
+    seconds = {0: [1.0, 2.0, 3.0], 1000: [4.0, 6.0, 8.0]}
+    lines = [{"step": n, "exploded": [0.0] * 3, "score": [10.0] * 3, "upright_s": x} for n, x in seconds.items()]
+    (folder / "eval.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return own
+
+
+def test_tables_also_show_what_else_a_task_is_judged_by(standing, tmp_path, capsys):
+    head = "| measure | data | simulator | sac |\n"
+    for score, mean in (("last", "6.00 [4.00, 8.00]"), ("late", "4.00 [2.50, 5.50]")):
+        compare_hybrid.main(replace(standing, score=score))
+        said = capsys.readouterr().out
+        assert head in said and f"| upright_s | - | gravity | {mean} |" in said
+        compare_hybrid.main(replace(standing, export=tmp_path))
+        compare_hybrid.main(replace(standing, released=tmp_path, score=score))
+        assert f"| upright_s | - | gravity | {mean} |" in capsys.readouterr().out
+    compare_hybrid.main(replace(standing, released=tmp_path, score="last", seeds=2))
+    assert "| upright_s | - | gravity | 5.00 |" in capsys.readouterr().out  # two seeds have no interval
+    table = (tmp_path / "hybrid.csv").read_text().splitlines()
+    assert len(table) == 5 and sum(",upright_s," in line for line in table) == 2
+
+
+@pytest.mark.parametrize(
+    ("lost", "said"),
+    [
+        (",upright_s,1000,", "a run of sac on halfcheetah lacks rows of upright_s"),
+        (",return,0,", "a run of sac on halfcheetah lacks rows of score"),
+        (",return,", "a run of sac on halfcheetah has neither success nor return"),
+    ],
+)
+def test_a_table_without_some_of_its_rows_is_named(lost, said, standing, tmp_path):
+    compare_hybrid.main(replace(standing, export=tmp_path))
+    path = tmp_path / "hybrid.csv"
+    path.write_text("".join(line for line in path.read_text().splitlines(keepends=True) if lost not in line))
+    with pytest.raises(UserError, match=rf"hybrid\.csv: {said}; put the table back"):
+        compare_hybrid.main(replace(standing, released=tmp_path))
+
+
 def test_runs_of_two_lengths_are_compared_in_their_order(grid, ran, tmp_path, capsys):
     own = replace(grid, methods=("iql", "cql", "edac"), reference="iql", data=grid.data[:1], gaps=("gravity",))
     for updates, order in ((1000, (1.0, 2.0, 3.0)), (2000, (1.0, 3.0, 2.0))):

@@ -1,5 +1,6 @@
 import json
 import re
+from pathlib import Path
 
 import pytest
 from priors_by_hand import save_prior
@@ -72,6 +73,27 @@ def test_lines_for_people(run, capsys):
     assert len(lines) == 2 and all(re.search(r"seed-\d: success \d+\.\d % \[.*\], return -?\d", line) for line in lines)
 
 
+def test_a_task_without_a_scene_has_no_film(run, capsys):
+    call("--run", run, "--episodes", 2, "--video", run / "films")
+    assert capsys.readouterr().out.count("\n    no video: toy has no scene to draw\n") == 2
+    call("--run", run, "--episodes", 2, "--video", run / "films", "--json")
+    (system,) = json.loads(capsys.readouterr().out)["systems"]
+    assert [one["video"] for one in system["policies"]] == ["no video: toy has no scene to draw"] * 2
+
+
+@pytest.mark.slow
+def test_a_film_of_each_system(tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    if reason := cli.select_renderer():
+        pytest.skip(reason)
+    prior = Path(__file__).parents[2] / "docs/priors/push/seed-0"
+    call("--prior", prior, "--real", "sim", "mild", "--episodes", 2, "--impl", "c", "--video", tmp_path)
+    said = capsys.readouterr().out
+    for system in ("sim", "mild"):
+        path = tmp_path / f"{system}-seed-0.mp4"
+        assert f"    video: {path}\n" in said and path.stat().st_size > 10_000
+
+
 @pytest.mark.slow
 def test_the_best_policies_of_a_run(run, capsys):
     save_prior(run / "best" / "seed-0", 7)
@@ -90,6 +112,8 @@ def test_the_best_policies_of_a_run(run, capsys):
         (["--task", "toy", "--real", "sim", "sim"], "--real names sim twice"),
         (["--task", "toy", "--real", "strange"], "toy has no gap 'strange'"),
         (["--task", "toy", "--set", "mass=3"], "name one with --real"),
+        (["--task", "toy", "--real", "gymnasium:A", "--video", "v"], "--video: films simulated systems, and"),
+        (["--task", "toy", "--video", __file__], "is a file; choose another --video"),
         (["--task", "toy", "--best"], "--best: name the fine-tuning run"),
         (["--task", "toy", "--episodes", "0"], "must be at least 1"),
         (["--task", "toy", "--seed", "-5"], "--seed is -5: seeds go from 0 to 2147483647"),

@@ -97,6 +97,22 @@ def test_the_order_of_methods_in_two_sets_of_runs():
     assert rows(hybrid.ranks(ours, ours._replace(outcomes=ours.outcomes[:2]))) == []  # two methods have no order
 
 
+def test_what_else_a_task_is_judged_by():
+    """Seconds of two seeds at two evaluations, the last ones 8 and 9. Without a measure a cell is empty."""
+    standing = np.array([[1.0, 8.0], [2.0, 9.0]])
+    found = results(
+        Outcome("h2oplus", "replay", "gravity", np.zeros(2), measures={"upright_s": standing}),
+        Outcome("iql", "replay", EVERY, np.zeros(2), measures={"upright_s": standing, "speed_error": standing / 100}),
+    )
+    shown = hybrid.measured(found, lambda curve: curve[:, -1])
+    assert shown is not None and shown.startswith("| measure | data | simulator | h2oplus | iql | sac |\n")
+    assert rows(shown)[:2] == [
+        ["upright_s", "replay", "gravity", "8.50", "8.50", "-"], ["upright_s", "replay", "friction", "-", "8.50", "-"],
+    ]  # fmt: skip
+    assert ["speed_error", "replay", "gravity", "-", "0.08", "-"] in rows(shown)  # 0.085, to the even digit
+    assert hybrid.measured(FOUND, lambda curve: curve[:, -1]) is None
+
+
 def test_the_last_ten_evaluations_of_each_seed():
     curve = np.arange(24.0).reshape(12, 2)
     np.testing.assert_allclose(late(curve), [13, 14])
