@@ -5,7 +5,7 @@ without data once for each simulator. Cells that are finished are left alone, be
 same command, given again, does what is missing. All simulators and seeds of a method and data set share one program.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -14,7 +14,6 @@ from envs import gaps
 from envs.gaps import SIM
 from experiments import cells, cli
 from experiments.cells import Cell, Kind, check_begun, complete
-from experiments.evaluation import measures
 from experiments.hybrid import arguments, hybrid
 from experiments.hybrid_args import (
     DEFAULT,
@@ -31,15 +30,13 @@ from sgft_jax import extend
 from sgft_jax.hybrid.methods import NAMES, get_method
 from sgft_jax.hybrid.presets import say_preset
 from sgft_jax.hybrid.schedule import FLEET, SCHEDULES, Schedule, describe, name_of
-from sgft_jax.hybrid.scores import late
+from sgft_jax.hybrid.scores import measures, shown
 from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
 from sgft_jax.io.runs import PROVENANCE, check_folder, read_own
 from sgft_jax.types import UserError, unknown
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from sgft_jax.analysis.hybrid import Outcome, Results
 
 _SCORES = {"late": "mean of the last ten evaluations", "last": "last evaluation"}
@@ -291,12 +288,7 @@ def released(args: CompareHybridArgs, folder: Path) -> "Results":
 def _chosen(own: "Outcome", members: list[int], score: str) -> "Outcome":
     """Of these members, with the scores that tables show."""
     curve, others = own.curve[members], {name: values[members] for name, values in own.measures.items()}
-    return own._replace(curve=curve, measures=others, scores=_reduce(score)(curve))
-
-
-def _reduce(score: str) -> "Callable[[np.ndarray], np.ndarray]":
-    """What tables show of a curve: [seeds, evaluations] to [seeds]."""
-    return (lambda curve: curve[:, -1]) if score == "last" else (lambda curve: late(curve.T))
+    return own._replace(curve=curve, measures=others, scores=shown(curve.T, score))
 
 
 def tables(args: CompareHybridArgs, results: "Results") -> str:
@@ -310,7 +302,7 @@ def tables(args: CompareHybridArgs, results: "Results") -> str:
     if len(args.methods) > 1:
         parts.append(analysis.duels(results, args.reference))
     parts.append(analysis.cells(results))
-    if measured := analysis.measured(results, _reduce(args.score)):
+    if measured := analysis.measured(results, args.score):
         parts += [_MEASURED, measured]
     if args.released is not None and args.beside is not None:
         others = replace(args, schedule=replace(args.schedule, updates=args.beside))

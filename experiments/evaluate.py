@@ -42,7 +42,7 @@ class EvaluateArgs:
     episodes: int = 200
     """Episodes per policy and system."""
     video: Path | None = None
-    """Also film the first episode of each policy, into this folder; only of simulated systems."""
+    """Folder for films, SYSTEM-POLICY.mp4: the first episode of each policy in each simulated system."""
     json: bool = False
     """Print one JSON object and nothing else."""
     out: Path = Path("runs")
@@ -105,15 +105,12 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
             system = RecordedSystem(system, [store], done=len(store), explore=False, sync_every=1)
         played = play(system, make_policy(card, env), members, key_episodes, args.episodes)
 
-    names = [SIM if gap is None else gap.name for gap in found]
-
     def of_system(i: int) -> dict[str, Any]:
         own = part(played, i, len(priors))
-        policies = [{"policy": str(folder), **describe(member(own, k))} for k, folder in enumerate(folders)]
-        if args.video is not None:
-            for k, folder in enumerate(folders):
-                path = args.video / f"{names[i]}-{folder.name}.mp4"
-                policies[k]["video"] = _film(system, i, member(member(own, k), 0), path)
+        each = [(folder, member(own, k)) for k, folder in enumerate(folders)]
+        policies = [
+            {"policy": str(folder), **describe(one), **_filmed(args, system, i, one, folder)} for folder, one in each
+        ]
         return {"policies": policies, **({"real_steps": int(own.valid.sum())} if stepped else {})}
 
     where = ["in simulation" if gap is None else f"on the {gap.name} real system" for gap in found]
@@ -121,11 +118,15 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     return {"task": env.name, "impl": env.impl, "episodes": args.episodes, "systems": systems}
 
 
-def _film(system: Any, i: int, played: Any, path: Path) -> str:
-    """Films one episode in the i-th of simulated systems; one line that says where, or why there is no video."""
-    from experiments.video import film
+def _filmed(args: EvaluateArgs, system: Any, i: int, played: Any, folder: Path) -> dict[str, str]:
+    """How the film of the first of the episodes [n] of a policy, on the i-th real system, went; {} without --video."""
+    from experiments.video import film_episode
+    from sgft_jax.stacking import member
 
-    return film(system.env, system.pools.theta.params[i, played.world], played.trace, path)
+    if args.video is None:
+        return {}
+    path = args.video / f"{gaps.title(args.real[i])}-{folder.name}.mp4"
+    return {"video": film_episode(system.env, system.pools, i, member(played, 0), path)}
 
 
 def _simulated(env: Any, found: Sequence[Gap | None], key: Any, episodes: int, *, members: int, gamma: float) -> Any:
@@ -163,6 +164,7 @@ def check(args: EvaluateArgs) -> tuple[list[Path], str]:
         check_folder(args.out / "evaluate")
     if args.video is not None:
         check_folder(args.video, "--video")
+        without_repeats("--real", [gaps.title(real) for real in args.real])  # a film is called after its system
         if any(map(is_stepped, reals)):
             raise UserError(f"--video: films simulated systems, and {reals[0]} is not one; leave one of the two out")
     if args.task is not None:

@@ -1,6 +1,6 @@
 """Success and return of policies in held-out worlds, and how they are summarised."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -13,8 +13,6 @@ from sgft_jax.analysis import stats
 from sgft_jax.pretraining import Best, keep_better
 from sgft_jax.systems import System
 from sgft_jax.types import Array, Key, Metrics, Policy, PyTree
-
-_SCORES = ("score", "success", "return", "exploded")  # of every task, see `scores`
 
 
 def play(system: System, policy: Policy, params: PyTree, key: Key, episodes: int) -> Episode:
@@ -36,11 +34,6 @@ def scores(played: Episode) -> Metrics:
         "return": played.total_reward.mean(-1),
         "exploded": played.exploded.mean(-1),
     }
-
-
-def measures(line: Mapping[str, Any]) -> list[str]:
-    """The names of what else the task is judged by, in a line of `eval.jsonl`."""
-    return [name for name in line if name not in ("step", *_SCORES)]
 
 
 def describe(played: Episode) -> dict[str, Any]:

@@ -17,17 +17,17 @@ from envs.gaps import SIM, Gap
 from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
 from experiments import logged
-from experiments.evaluation import measures, play, scores
+from experiments.evaluation import play, scores
 from experiments.hybrid_args import NO_SIMULATOR, VOLATILE, HybridArgs, data_name, gaps_of, run_folder
 from experiments.memory import reserve
-from experiments.video import film
+from experiments.video import film_episode
 from sgft_jax.analysis import figures
 from sgft_jax.analysis.hybrid import Results, outcome
 from sgft_jax.analysis.stats import bootstrap_interval, mean
 from sgft_jax.data import logs
 from sgft_jax.hybrid import trainer
 from sgft_jax.hybrid.robot import MEASURES
-from sgft_jax.hybrid.scores import LATE, late, normalised
+from sgft_jax.hybrid.scores import LATE, late, measures, normalised
 from sgft_jax.hybrid.trainer import HybridState
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.jsonfile import jsonable
@@ -269,8 +269,8 @@ class _Run:
 
     def _film(self, folder: Path, played: Episode) -> str:
         """An episode in the real system."""
-        theta = self.system.pools.theta.params[0, played.world]
-        return film(self.system.env, theta, np.asarray(played.trace), folder / "videos" / f"seed-{self.seeds[0]}.mp4")
+        path = folder / "videos" / f"seed-{self.seeds[0]}.mp4"
+        return film_episode(self.system.env, self.system.pools, 0, played, path)
 
     def _say(self, folder: Path, gap: Gap, summary: dict[str, Any]) -> None:
         last, average = np.array(summary["last"]), np.array(summary["late"])

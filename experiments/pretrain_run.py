@@ -24,7 +24,7 @@ from experiments.evaluation import best_of, describe, play, scores
 from experiments.memory import reserve
 from experiments.pretrain import PretrainArgs, run_folder
 from experiments.report import Report, make_report, numbers
-from experiments.video import film
+from experiments.video import film_episode
 from sgft_jax import mesh, stacking
 from sgft_jax.analysis import figures
 from sgft_jax.io import checkpoint, runs
@@ -264,8 +264,8 @@ class _Run:
 
     def _film(self, played: Episode) -> str:
         """The first of the episodes [n] in the final worlds."""
-        theta = self.final.theta.params[0, played.world[0]]
-        return film(self.env, theta, np.asarray(played.trace[0]), self.folder / "videos" / f"seed-{self.seeds[0]}.mp4")
+        path = self.folder / "videos" / f"seed-{self.seeds[0]}.mp4"
+        return film_episode(self.env, self.final, 0, stacking.member(played, 0), path)
 
     def _chosen(self, best: Best) -> dict[str, float]:
         """Which evaluation the prior is from, and what that evaluation said."""

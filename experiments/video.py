@@ -46,6 +46,11 @@ def film(env: Env, theta: Array, qpos: np.ndarray, path: Path) -> str:
     return _draw(env, path, render)
 
 
+def film_episode(env: Env, pools: World, i: int, played: Episode, path: Path) -> str:
+    """Renders one episode in a world of the i-th of stacked pools; see `film`."""
+    return film(env, pools.theta.params[i, played.world], np.asarray(played.trace), path)
+
+
 def _draw(env: Env, path: Path, render: Callable[[Any], None]) -> str:
     """Calls `render` with the scene of the task, and says in one line where the video is, or why there is none."""
     scene = envs.scene(env.name, env.scene)

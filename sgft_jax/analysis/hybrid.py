@@ -4,7 +4,7 @@ A method without a simulator has one outcome for each data set, a method without
 in every row that they belong to.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from sgft_jax.analysis.scoreboard import improvement
 from sgft_jax.analysis.stats import Interval, bootstrap_interval, mean, rank_correlation
 from sgft_jax.analysis.tables import NONE, markdown, number, plain
-from sgft_jax.hybrid.scores import BOUNDS, normalised
+from sgft_jax.hybrid.scores import BOUNDS, normalised, shown
 
 EVERY = ""  # data or simulator of a method that sees none
 _FEWEST = 3  # methods that have an order worth comparing
@@ -110,10 +110,10 @@ def duels(results: Results, reference: str) -> str:
     return markdown([f"P({reference} better), per cent", *others], rows)
 
 
-def measured(results: Results, reduce: Callable[[np.ndarray], np.ndarray]) -> str | None:
+def measured(results: Results, score: str) -> str | None:
     """A row for each measure, data set and simulator: mean of every method with its bootstrap interval over seeds.
 
-    reduce: [seeds, evaluations] to [seeds], as scores come from curves. None where no run has a measure.
+    score: "last" or "late", which evaluations count. None where no run has a measure.
     """
     names = dict.fromkeys(name for own in results.outcomes for name in own.measures)
     rows = []
@@ -121,7 +121,7 @@ def measured(results: Results, reduce: Callable[[np.ndarray], np.ndarray]) -> st
         for data in results.data:
             for gap in results.gaps:
                 found = [results.find(method, data, gap) for method in results.methods]
-                rows.append([name, data or NONE, gap, *(_measured(own, name, reduce) for own in found)])
+                rows.append([name, data or NONE, gap, *(_measured(own, name, score) for own in found)])
     return markdown(["measure", "data", "simulator", *results.methods], rows) if rows else None
 
 
@@ -189,10 +189,10 @@ def _overall(results: Results, method: str, data: str) -> str:
     return NONE if found is None else number(found, results.score)
 
 
-def _measured(own: Outcome | None, name: str, reduce: Callable[[np.ndarray], np.ndarray]) -> str:
+def _measured(own: Outcome | None, name: str, score: str) -> str:
     if own is None or name not in own.measures:
         return NONE
-    return number(bootstrap_interval(reduce(own.measures[name]), statistic=mean), name, digits=2)
+    return number(bootstrap_interval(shown(own.measures[name].T, score), statistic=mean), name, digits=2)
 
 
 def _duel(results: Results, reference: str, other: str, data: str) -> str:

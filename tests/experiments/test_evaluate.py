@@ -114,6 +114,7 @@ def test_the_best_policies_of_a_run(run, capsys):
         (["--task", "toy", "--set", "mass=3"], "name one with --real"),
         (["--task", "toy", "--real", "gymnasium:A", "--video", "v"], "--video: films simulated systems, and"),
         (["--task", "toy", "--video", __file__], "is a file; choose another --video"),
+        (["--task", "toy", "--real", "a.toml:x", "b.toml:x", "--video", "v"], "--real names x twice"),
         (["--task", "toy", "--best"], "--best: name the fine-tuning run"),
         (["--task", "toy", "--episodes", "0"], "must be at least 1"),
         (["--task", "toy", "--seed", "-5"], "--seed is -5: seeds go from 0 to 2147483647"),

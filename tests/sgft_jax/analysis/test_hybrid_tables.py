@@ -104,13 +104,13 @@ def test_what_else_a_task_is_judged_by():
         Outcome("h2oplus", "replay", "gravity", np.zeros(2), measures={"upright_s": standing}),
         Outcome("iql", "replay", EVERY, np.zeros(2), measures={"upright_s": standing, "speed_error": standing / 100}),
     )
-    shown = hybrid.measured(found, lambda curve: curve[:, -1])
+    shown = hybrid.measured(found, "last")
     assert shown is not None and shown.startswith("| measure | data | simulator | h2oplus | iql | sac |\n")
     assert rows(shown)[:2] == [
         ["upright_s", "replay", "gravity", "8.50", "8.50", "-"], ["upright_s", "replay", "friction", "-", "8.50", "-"],
     ]  # fmt: skip
     assert ["speed_error", "replay", "gravity", "-", "0.08", "-"] in rows(shown)  # 0.085, to the even digit
-    assert hybrid.measured(FOUND, lambda curve: curve[:, -1]) is None
+    assert hybrid.measured(FOUND, "last") is None
 
 
 def test_the_last_ten_evaluations_of_each_seed():
