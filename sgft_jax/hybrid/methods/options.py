@@ -68,7 +68,8 @@ class EnsembleOptions(ActorCriticOptions):
     critics: int = 10
     """Critics; whatever reads values takes the minimum of all."""
     diversity: float = 1.0
-    """Weight of what keeps the critics' gradients at the data's actions apart; 0 leaves it out."""
+    """Weight of what keeps the critics' gradients at the data's actions apart; 0 leaves it out. It does nothing where a
+    task has one action, whose gradients have only a sign."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
