@@ -38,6 +38,11 @@ def test_a_flat_critic_does_no_harm():
     assert value == 0.0 and jnp.all(jnp.isfinite(grad))
 
 
+def test_the_gradients_of_one_action_cannot_be_turned():
+    """They have only a sign, so the diversity of a task with one action does nothing."""
+    assert jnp.allclose(jax.grad(edac.alignment)(jnp.array([[0.5], [-2.0], [3.0]])), 0.0, atol=1e-6)
+
+
 @pytest.mark.slow
 def test_diversity_keeps_gradients_apart(key):
     """Rewards are linear: without it all critics point the same way, at an alignment of 4."""
