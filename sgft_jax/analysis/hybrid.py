@@ -50,8 +50,8 @@ def outcome(
     measures: other names in the lines.
     """
     updates, curve, *others = (np.array([line[name] for line in lines]).T for name in ("step", "score", *measures))
-    shown = curve[:, -1] if scores is None else np.asarray(scores)
-    return Outcome(method, data, gap, shown, updates, curve, dict(zip(measures, others, strict=True)))
+    totals = shown(curve.T, "last") if scores is None else np.asarray(scores)
+    return Outcome(method, data, gap, totals, updates, curve, dict(zip(measures, others, strict=True)))
 
 
 class Results(NamedTuple):
