@@ -277,10 +277,16 @@ def read_curve(folder: Path) -> Curve:
         transitions=column("step"),
         minutes=column("robot_minutes"),
         scores=scores,
-        score=summary.get("score", next(iter(scores))),
+        score=summary.get("score") or _judged_by(records, list(scores)),
         facts=_facts(summary, config, start),
         training=_training(folder / METRICS, column("rollouts")),
     )
+
+
+def _judged_by(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
+    """By which score a run is judged that has no summary yet to name it: the one that `score` repeats."""
+    repeated = lambda name: all(record.get("score") == record[name] for record in records)  # noqa: E731
+    return next(filter(repeated, names), names[0])
 
 
 def _training(path: Path, rollouts: np.ndarray) -> np.ndarray | None:

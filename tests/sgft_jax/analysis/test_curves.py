@@ -175,6 +175,15 @@ def test_a_run_folder(tmp_path):
     assert notes == [f"{tmp_path / 'finetune/toy/default/my_own_v2/seeds-3-5'}: unfinished, 20 of 100 rollouts"]
 
 
+@pytest.mark.parametrize("score", ["success", "return"])
+def test_an_unfinished_run_is_judged_as_its_task_is(tmp_path, score):
+    """Its summary does not exist yet. A task such as halfcheetah never succeeds, and success says nothing of it."""
+    folder = save(tmp_path, "sac", [[0.2, 0.4], [0.8, 1.0]], rollouts=[0, 20], wanted=100)
+    lines = [json.loads(line) for line in (folder / "eval.jsonl").read_text().splitlines()]
+    (folder / "eval.jsonl").write_text("".join(json.dumps(line | {"score": line[score]}) + "\n" for line in lines))
+    assert read_curve(folder).score == score
+
+
 def test_of_several_runs_that_with_the_most_seeds(tmp_path):
     save(tmp_path, "sac", [[0.2], [0.3]], rollouts=[0, 90], seeds="seed-0")
     save(tmp_path, "sac", [[0.2, 0.4], [0.8, 1.0]], rollouts=[0, 20])
