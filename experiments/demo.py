@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from envs.files import read_json
 from experiments import cli
 from experiments.finetune import finetune
 from experiments.finetune_args import FinetuneArgs, arguments, check, run_folder
@@ -15,7 +16,6 @@ from experiments.options import check_task
 from experiments.pretrain import PretrainArgs, pretrain
 from experiments.pretrain import check as check_pretraining
 from sgft_jax import extend
-from sgft_jax.io.jsonfile import read_json
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.methods import get_method
 from sgft_jax.presets import PRESETS

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import envs
 from envs import gap_distribution, gaps
 from envs.base import Env
+from envs.files import read_json
 from envs.gaps import SIM, Gap
 from envs.history import with_previous_actions
 from envs.rollout import Episode
@@ -24,7 +25,7 @@ from sgft_jax import api, stacking
 from sgft_jax.analysis import stats
 from sgft_jax.finetuner import command_interface
 from sgft_jax.identify import Identified, Interface
-from sgft_jax.io.jsonfile import differences, jsonable, read_json, write_json
+from sgft_jax.io.jsonfile import differences, jsonable, write_json
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.methods import get_method
 from sgft_jax.models.distortion import Distortion, none

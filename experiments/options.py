@@ -9,8 +9,8 @@ from tyro.conf import arg
 
 import envs
 from envs import gaps
+from envs.files import read_object
 from sgft_jax import extend, types
-from sgft_jax.io.jsonfile import read_object
 from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError, unknown
 

@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Any
 
 from envs import gaps
+from envs.files import read_json
 from experiments.finetune_args import FinetuneArgs, with_settings
 from experiments.spaces import space_of
 from sgft_jax import extend
-from sgft_jax.io.jsonfile import read_json, write_json
+from sgft_jax.io.jsonfile import write_json
 from sgft_jax.methods import get_method
 from sgft_jax.types import UserError
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import h5py
 import numpy as np
 
-from sgft_jax.io.jsonfile import read_object
+from envs.files import read_object
 from sgft_jax.io.real import played
 from sgft_jax.types import Successors, UserError
 

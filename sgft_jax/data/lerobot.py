@@ -14,9 +14,10 @@ from typing import Any
 import numpy as np
 
 from envs.base import Entry
+from envs.files import read_object
 from sgft_jax.data.layouts import Rows
 from sgft_jax.data.recording import Recorded
-from sgft_jax.io.jsonfile import read_object, write_json
+from sgft_jax.io.jsonfile import write_json
 from sgft_jax.types import UserError
 
 INFO = Path("meta/info.json")

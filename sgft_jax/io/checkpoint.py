@@ -22,8 +22,9 @@ import jax.numpy as jnp
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
+from envs.files import read_json
 from sgft_jax import mesh
-from sgft_jax.io.jsonfile import jsonable, read_json, write_json
+from sgft_jax.io.jsonfile import jsonable, write_json
 from sgft_jax.types import PyTree, UserError
 
 FORMAT = 1

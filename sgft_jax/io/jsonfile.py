@@ -1,4 +1,4 @@
-"""Impure: reads and writes small JSON files, atomically and without the numbers that JSON does not know."""
+"""Impure: writes small JSON files, atomically and without the numbers that JSON does not know; `envs.files` reads."""
 
 import dataclasses
 import json
@@ -9,10 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from sgft_jax.types import UserError
-
-_KINDS = {str: "a text", int: "a whole number", float: "a number", dict: "an object", list: "a list"}
 
 
 def jsonable(value: Any) -> Any:
@@ -58,29 +54,6 @@ def write_json(path: Path, value: Any) -> None:
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(path)
-
-
-def read_json(path: Path) -> Any:
-    """The content of a JSON file; raises UserError if it is missing or is not JSON."""
-    try:
-        return json.loads(Path(path).read_text())
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file") from None
-    except ValueError as error:
-        raise UserError(f"{path}: not valid JSON ({error})") from error
-
-
-def read_object(path: Path, needed: Mapping[str, type], fix: str) -> dict[str, Any]:
-    """A JSON object that has these keys, each with a value of that type; raises UserError, with the fix, otherwise."""
-    found = read_json(path)
-    if not isinstance(found, dict):
-        raise UserError(f"{path}: is no JSON object; {fix}")
-    for key, kind in needed.items():
-        if key not in found:
-            raise UserError(f"{path}: lacks {key}; {fix}")
-        if not isinstance(found[key], (int, float) if kind is float else kind) or isinstance(found[key], bool):
-            raise UserError(f"{path}: {key} is {json.dumps(found[key])[:40]}, not {_KINDS[kind]}; {fix}")
-    return found
 
 
 def differences(old: Any, new: Any, *, name: str = "") -> list[tuple[str, Any, Any]]:

@@ -11,9 +11,10 @@ import jax
 import numpy as np
 
 from envs.base import Varying
+from envs.files import read_object
 from sgft_jax import mesh
 from sgft_jax.io import checkpoint
-from sgft_jax.io.jsonfile import differences, read_object, write_json
+from sgft_jax.io.jsonfile import differences, write_json
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.types import Normalizer, Prior, PyTree, UserError
 

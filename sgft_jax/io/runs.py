@@ -16,7 +16,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from sgft_jax.io.jsonfile import differences, read_json, read_object, write_json
+from envs.files import read_json, read_object
+from sgft_jax.io.jsonfile import differences, write_json
 from sgft_jax.types import UserError
 
 CONFIG, PROVENANCE = "config.json", "provenance.json"

@@ -11,11 +11,11 @@ from priors_by_hand import save_prior
 
 import envs
 from envs import gap_distribution, gaps
+from envs.files import read_json
 from experiments import cli, gaps_draw
 from experiments import gaps as command
 from sgft_jax import policies
 from sgft_jax.identify import interface
-from sgft_jax.io.jsonfile import read_json
 from sgft_jax.types import UserError
 
 TEXT = """

@@ -12,6 +12,7 @@ import tuners  # noqa: F401 - TD-MPC2 of size "tiny"
 
 import envs
 from envs.base import Varying
+from envs.files import read_json
 from envs.history import with_previous_actions
 from envs.rollout import play_episode
 from envs.system import concealed, with_system
@@ -19,7 +20,7 @@ from sgft_jax import api, export
 from sgft_jax.export import Graph, Node, Slot
 from sgft_jax.io import exported, player
 from sgft_jax.io.exported import save_exported
-from sgft_jax.io.jsonfile import jsonable, read_json
+from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.learners.actor import ACTORParams
 from sgft_jax.models import distortion

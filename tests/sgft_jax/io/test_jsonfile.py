@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax.io.jsonfile import differences, jsonable, read_json, read_object, write_json
-from sgft_jax.types import UserError
+from envs.files import read_json
+from sgft_jax.io.jsonfile import differences, jsonable, write_json
 
 
 class Pair(NamedTuple):
@@ -52,14 +52,6 @@ def test_write_is_atomic_and_readable(tmp_path):
     write_json(path, {"a": 2})
     assert read_json(path) == {"a": 2}
     assert [p.name for p in tmp_path.iterdir() if not p.name.startswith(".")] == ["x.json"]
-
-
-def test_read_says_what_is_wrong(tmp_path):
-    with pytest.raises(UserError, match=r"x.json: no such file"):
-        read_json(tmp_path / "x.json")
-    (tmp_path / "x.json").write_text('{"a": ')
-    with pytest.raises(UserError, match=r"x.json: not valid JSON"):
-        read_json(tmp_path / "x.json")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,28 +113,6 @@ def test_every_kind_of_field_becomes_plain_data():
 def test_every_field_is_spelled_out():
     assert jsonable(Config())["network"] == {"hidden": [256, 256], "activation": "relu"}
     assert set(jsonable(Config())) == {f.name for f in dataclasses.fields(Config)}
-
-
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        ("[1]", "is no JSON object; mend it"),
-        ("{}", "lacks task; mend it"),
-        ('{"task": 3, "fps": 1}', "task is 3, not a text; mend it"),
-        ('{"task": "push", "fps": "fast"}', 'fps is "fast", not a number; mend it'),
-        ('{"task": "push", "fps": true}', "fps is true, not a number; mend it"),
-    ],
-)
-def test_objects_without_a_key_or_of_another_type_are_refused(content, said, tmp_path):
-    (tmp_path / "a.json").write_text(content)
-    with pytest.raises(UserError) as refused:
-        read_object(tmp_path / "a.json", {"task": str, "fps": float}, "mend it")
-    assert str(refused.value) == f"{tmp_path / 'a.json'}: {said}"
-
-
-def test_an_object_with_all_keys_is_read(tmp_path):
-    (tmp_path / "a.json").write_text('{"task": "push", "fps": 10}')
-    assert read_object(tmp_path / "a.json", {"task": str, "fps": float}, "") == {"task": "push", "fps": 10}
 
 
 def test_differences_name_the_leaves():

@@ -1,0 +1,130 @@
+"""Impure: the one way in for text files, whoever wrote them: plain files of a bounded size, UTF-8, every value finite.
+
+Imports no JAX. Whatever is wrong with a file is a `UserError` with one line that names it.
+"""
+
+import json
+import math
+import os
+import re
+import stat
+import tomllib
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+from msgspec import Meta
+
+from sgft_jax.types import UserError
+
+LIMIT = 64 * 2**20  # bytes; no card, table or configuration comes near
+_LARGEST = 2**53  # every whole number below is a float too
+
+# Kinds of numbers for schemas.
+Count = Annotated[int, Meta(ge=0, le=_LARGEST)]
+Size = Annotated[int, Meta(ge=1, le=_LARGEST)]
+Positive = Annotated[float, Meta(gt=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
+Schema = type | Mapping[str, Any]  # a `msgspec.Struct`, a `TypedDict`, or types by key
+
+_WORDS = {
+    "str": "a text", "int": "a whole number", "float": "a number", "object": "an object", "array": "a list",
+    "bool": "true or false", "null": "null",
+}  # fmt: skip
+
+
+def read_text(path: Path | str, *, limit: int = LIMIT) -> str:
+    """The text of a plain file, without a byte order mark. limit: bytes; a larger file is refused."""
+    try:
+        with open(path, "rb", opener=_without_waiting) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise UserError(f"{path}: is no plain file")
+            content = file.read(limit + 1)
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({(error.strerror or str(error)).lower()})") from None
+    except ValueError:  # a zero byte
+        raise UserError(f"{str(path)!r}: is no name of a file") from None
+    if len(content) > limit:
+        raise UserError(f"{path}: is larger than {limit:,} bytes, more than such a file can need")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: is no UTF-8 text (byte {error.start}); save it as UTF-8") from None
+
+
+def read_json(path: Path | str, *, limit: int = LIMIT) -> Any:
+    """The content of a JSON file."""
+    return parse_json(read_text(path, limit=limit), path)
+
+
+def read_toml(path: Path | str) -> dict[str, Any]:
+    """The content of a TOML file."""
+    return _parsed(lambda text: tomllib.loads(text, parse_float=_finite), read_text(path), path, "TOML")
+
+
+def parse_json(text: str | bytes, where: Path | str) -> Any:
+    """What a JSON text says; `where` names it in errors. Keys that come twice and numbers beyond floats are refused."""
+    return _parsed(_loads, text, where, "JSON")
+
+
+def read_object(path: Path | str, schema: Schema, fix: str) -> dict[str, Any]:
+    """A JSON object that fits a schema; keys that the schema does not name are kept. fix: what the user can do."""
+    return checked(path, read_json(path), schema, fix)
+
+
+def checked(where: Path | str, data: Any, schema: Schema, fix: str) -> Any:
+    """`data` as it is, if it fits the schema. fix: what the user can do where it does not."""
+    kind = msgspec.defstruct("Object", list(schema.items())) if isinstance(schema, Mapping) else schema
+    try:
+        msgspec.convert(data, kind)
+    except msgspec.ValidationError as error:
+        raise UserError(f"{where}: {_in_words(str(error))}; {fix}") from None
+    return data
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    """A named pipe would wait for its other end."""
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
+def _parsed[T](parse: Callable[[Any], T], text: Any, where: Path | str, language: str) -> T:
+    try:
+        return parse(text)
+    except RecursionError:
+        raise UserError(f"{where}: not valid {language} (nested too deeply)") from None
+    except ValueError as error:  # of either parser, or of a number with thousands of digits
+        raise UserError(f"{where}: not valid {language} ({str(error).partition('; use sys')[0]})") from None
+
+
+def _loads(text: str | bytes) -> Any:
+    return json.loads(text, parse_float=_finite, parse_constant=_finite, object_pairs_hook=_unique)
+
+
+def _finite(text: str) -> float:
+    if not math.isfinite(number := float(text)):
+        raise ValueError(f"{text} is no finite number")
+    return number
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        twice = next(key for i, (key, _) in enumerate(pairs) if any(key == other for other, _ in pairs[:i]))
+        raise ValueError(f"{twice!r} stands there twice")
+    return table
+
+
+def _in_words(message: str) -> str:
+    """What msgspec says, as a sentence that begins with the key."""
+    complaint, _, place = message.partition(" - at `$")
+    key = place.rstrip("`").removeprefix(".")
+    if missing := re.fullmatch(r"Object missing required field `(.+)`", complaint):
+        return f"lacks {'.'.join(filter(None, [key, missing[1]]))}"
+    if kinds := re.fullmatch(r"Expected `(.+)`, got `(\w+)`", complaint):
+        wanted = " or ".join(_WORDS.get(kind, kind) for kind in kinds[1].split(" | "))
+        return f"{key} is {_WORDS.get(kinds[2], kinds[2])}, not {wanted}" if key else "is no JSON object"
+    plain = complaint.replace("`", "")
+    return f"{key}: {plain[:1].lower()}{plain[1:]}" if key else plain
