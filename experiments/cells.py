@@ -6,8 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 
+from sgft_jax.io.folders import InUseError, in_use
 from sgft_jax.io.log import SUMMARY
-from sgft_jax.io.runs import CONFIG, InUseError, check_same, in_use, read_own
+from sgft_jax.io.runs import CONFIG, check_same, read_own
 from sgft_jax.types import UserError
 
 

@@ -56,12 +56,12 @@ class Record:
         self.expect = {"kind": "finetune", "task": env.name, "method": method, "seeds": seeds}
 
     def latest(self) -> int | None:
-        """The step of the last checkpoint: parts of the offline phase and rollouts together; None without one."""
-        return checkpoint.latest(self.folder)
+        """The step of the last whole checkpoint: parts of the offline phase and rollouts together; None without any."""
+        return checkpoint.latest(self.folder, whole=True)
 
     def restore(self, like: FinetuneProgress, step: int) -> FinetuneProgress:
-        """The state of that checkpoint, to which the logs are cut back. What the robot did stays."""
-        progress, meta = checkpoint.restore(self.folder, like, step=step, expect=self.expect)
+        """The state of that checkpoint of `latest`, to which the logs are cut back. What the robot did stays."""
+        progress, meta = checkpoint.restore(self.folder, like, step=step, checked=True, expect=self.expect)
         self.log.truncate(meta["position"])
         self.evaluated = meta.get("evaluated", 0)
         self.last_good = checkpoint.path(self.folder, step)

@@ -1,64 +1,31 @@
 """Impure: the life of a run folder: made once, resumed or replaced on request, with its configuration and origin."""
 
 import dataclasses
-import fcntl
 import importlib.metadata
 import os
 import platform
 import re
 import shlex
-import shutil
 import subprocess
 import sys
-import weakref
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from envs.files import read_json, read_object
+from sgft_jax.io.folders import ASIDE, Lock, empty
 from sgft_jax.io.jsonfile import differences, write_json
 from sgft_jax.types import UserError
 
 CONFIG, PROVENANCE = "config.json", "provenance.json"
 ROOT = Path(__file__).parents[2]  # of the repository, in a checkout
-_LOCK = ".lock"
 _MARK = "sgft_jax"
 FORMAT = 2  # of run folders; a state saved by another format does not fit the code of this one
 # What a start has to show for itself; one that has failed before any of it is there can be forgotten.
-_RESULTS = ("checkpoints/[0-9]*", "real/*.npz", "evaluation/*/real/*.npz", "prior/*", "policy/*", "summary.json")
+_STEPS = ("checkpoints/[0-9]*", f"checkpoints/{ASIDE}[0-9]*")
+_RESULTS = (*_STEPS, "real/*.npz", "evaluation/*/real/*.npz", "prior/*", "policy/*", "summary.json")
 _PACKAGES = ("sgft-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
-
-
-class InUseError(UserError):
-    """Another process has the run folder open."""
-
-
-class Lock:
-    """An exclusive lock on a folder, held until `release()`, collection or the end of the process, however it ends.
-
-    Raises InUseError if another process, or another Run of this one, holds it.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        handle = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
-        self.release = weakref.finalize(self, os.close, handle)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self.release()
-            raise InUseError(f"{folder}: another process is writing to it") from None
-
-
-def in_use(folder: Path) -> bool:
-    """Whether somebody holds the lock of a run folder."""
-    if not (folder / _LOCK).exists():
-        return False
-    try:
-        Lock(folder).release()
-    except InUseError:
-        return True
-    return False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +78,7 @@ def open_runs(
         raise
     for run, config, there in zip(runs, configs.values(), existing, strict=True):
         if there and not resume:
-            _empty(run.folder)
+            empty(run.folder, last=CONFIG)
         _record(run, kind, config, inputs)
     return runs
 
@@ -271,12 +238,3 @@ def check_same(folder: Path, kind: str, wanted: Mapping[str, Any], volatile: tup
     if differing:
         listed = "; ".join(f"{name} was {old!r}, now {new!r}" for name, old, new in differing)
         raise UserError(f"{folder}: cannot resume with another configuration: {listed}")
-
-
-def _empty(folder: Path) -> None:
-    """Delete the content of a folder that `_check_ours` accepted, its mark last; links are removed, never followed."""
-    for path in sorted(folder.iterdir(), key=lambda p: p.name == CONFIG):
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        elif path.name != _LOCK:
-            path.unlink()
