@@ -42,6 +42,8 @@ def with_system(env: Env, system: tuple[Varying, ...]) -> Env:
     if not system:
         return env
     place = {name: i for i, name in enumerate(_names(env))}
+    if odd := [v for v in system if (v.name, v.index) not in place]:
+        raise UserError(f"{env.name}: has no parameter or effect {odd[0].name!r} with a number {odd[0].index}")
     where = np.array([place[v.name, v.index] for v in system])
     low, high = (np.array([getattr(v, end) for v in system], np.float32) for end in ("low", "high"))
 

@@ -17,7 +17,6 @@ from experiments.finetune_args import FinetuneArgs
 from experiments.options import (
     SHIPPED,
     at_least_one,
-    card_of_prior,
     not_negative,
     prior_folders,
     seed_list,
@@ -25,6 +24,7 @@ from experiments.options import (
 )
 from experiments.panda_gym import HOME, PYTHON, TASK
 from experiments.real_systems import REMOTE
+from sgft_jax.io.cards import read_card
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import get_method
@@ -95,7 +95,7 @@ def check(args: BulletArgs) -> None:
     seed_list(args.seed, args.seeds)
     without_repeats("--methods", args.methods)
     check_folder(args.out)
-    cards = {folder: card_of_prior(folder) for folder in prior_folders(args.prior, out=args.out, task=TASK, preset="")}
+    cards = {folder: read_card(folder) for folder in prior_folders(args.prior, out=args.out, task=TASK, preset="")}
     for method in map(get_method, args.methods):
         for folder, card in cards.items():
             try:

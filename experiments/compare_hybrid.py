@@ -33,7 +33,7 @@ from sgft_jax.hybrid.schedule import FLEET, SCHEDULES, Schedule, describe, name_
 from sgft_jax.hybrid.scores import measures, shown
 from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
-from sgft_jax.io.runs import PROVENANCE, check_folder, read_own
+from sgft_jax.io.runs import check_folder, read_own, read_starts
 from sgft_jax.types import UserError, unknown
 
 if TYPE_CHECKING:
@@ -220,7 +220,7 @@ def outcomes(args: CompareHybridArgs) -> "Results | None":
     done = [cell for cell in grid(args) if cell.state == "finished"]
     if not done:
         return None
-    summaries = [read_own(cell.folder / SUMMARY, {"task": str, "score": str, args.score: list}) for cell in done]
+    summaries = [read_own(cell.folder / SUMMARY, {"task": str, "score": str, args.score: list[float]}) for cell in done]
     task, score = (summaries[0][name] for name in ("task", "score"))
     found = [_outcome(cell, one[args.score]) for cell, one in zip(done, summaries, strict=True)]
     return Results(task, score, *_columns(args), found)
@@ -247,8 +247,8 @@ def export(args: CompareHybridArgs, found: Sequence[Cell], to: Path) -> None:
     runs = []
     for cell in found:
         if cell.state == "finished":
-            summary = read_own(cell.folder / SUMMARY, {"task": str, "score": str, "seeds": list})
-            starts = read_own(cell.folder / PROVENANCE).get("starts", [{}])
+            summary = read_own(cell.folder / SUMMARY, {"task": str, "score": str, "seeds": list[int]})
+            starts = read_starts(cell.folder) or [{}]
             task, score, seeds = (summary[name] for name in ("task", "score", "seeds"))
             runs.append(hybrid_table.Run(
                 task, gaps.title(args.real), name_of(args.schedule), args.schedule.updates_in_all,

@@ -18,7 +18,6 @@ from experiments.diagnose import DiagnoseArgs
 from experiments.gaps_run import systems
 from experiments.real_systems import connect, is_robot, is_stepped, title
 from experiments.recorded import RecordedSystem
-from experiments.rollouts import config_of
 from sgft_jax import api, stacking
 from sgft_jax.analysis import figures, prediction, stats, tables, verdict
 from sgft_jax.analysis.curves import last_start
@@ -28,6 +27,7 @@ from sgft_jax.examination import Examined, Examiner
 from sgft_jax.io.jsonfile import jsonable, write_json
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.io.real import RealStore
+from sgft_jax.io.runs import read_config
 from sgft_jax.methods import get_method
 from sgft_jax.policies import make_policy
 from sgft_jax.types import Prior, Transition, UserError
@@ -59,7 +59,7 @@ def diagnose(
         simulated = play_simulated(env, priors, args.seed)
         count, name = (
             real[0].valid.shape[0],
-            "_".join(recorded.parts[-3:] if config_of(recorded) else recorded.parts[-1:]),
+            "_".join(recorded.parts[-3:] if read_config(recorded) else recorded.parts[-1:]),
         )
         what = f"{_rollouts(count)} recorded in {recorded}"
     examiner, counts = Examiner(priors[0].card, env), counts_to(count)
@@ -192,7 +192,7 @@ def read(home: Path, env: Env, priors: Sequence[Prior], most: int | None) -> tup
     rows = Transition(*(joined[name] for name in Transition._fields))
     both = Rollouts(rows, joined["valid"].astype(bool), joined["success"].astype(bool))
     each = [stacking.member(both, s) for s in range(len(both.success))]
-    config, p = config_of(home), len(priors)
+    config, p = read_config(home), len(priors)
     if config:
         _check_digests(home, priors)
         return each, [(config.get("seed", 0) + s) % p for s in range(len(each))]

@@ -3,14 +3,15 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import arg
 
 import envs
 from envs import gaps
-from envs.files import read_object
 from sgft_jax import extend, types
+from sgft_jax.io.cards import CARD, known_task, read_card
+from sgft_jax.io.folders import ASIDE, present
 from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError, unknown
 
@@ -116,11 +117,15 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str, opti
     option: the one that names `prior`.
     """
     home = prior or prior_home(out, extend.name_of(task), preset)
-    if (home / "prior.json").exists():
+    if (present(home) / CARD).exists():
         return [home]
-    found = [
-        card.parent for sub in ("", "prior/", "policy/", "*/prior/") for card in home.glob(f"{sub}seed-*/prior.json")
+    cards = [
+        card
+        for sub in ("", "prior/", "policy/", "*/prior/")
+        for name in ("seed-*", f"{ASIDE}seed-*")  # the latter where a writer was killed
+        for card in home.glob(f"{sub}{name}/{CARD}")
     ]
+    found = {card.parent.with_name(card.parent.name.removeprefix(ASIDE)) for card in cards}
     if not found and prior:
         raise UserError(f"{option} {prior}: {'holds no prior' if prior.is_dir() else 'no such folder'}")
     if not found and preset not in PRESETS:
@@ -133,14 +138,9 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str, opti
     return sorted(found, key=_seed_number)
 
 
-def card_of_prior(folder: Path) -> dict[str, Any]:
-    """The card of a prior; raises UserError where it names no task."""
-    return read_object(folder / "prior.json", {"task": str}, "name it with --task, or take another prior")
-
-
 def task_of_prior(folder: Path) -> str:
-    """The task that the card of a prior names; raises UserError where it names none."""
-    return card_of_prior(folder)["task"]
+    """The task that the card of a prior names; raises UserError where that is none of ours."""
+    return known_task(folder / CARD, read_card(folder)["task"])
 
 
 def _seed_number(folder: Path) -> tuple[int, str]:

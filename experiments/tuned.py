@@ -3,10 +3,10 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, get_type_hints
 
 from envs import gaps
-from envs.files import read_json
+from envs.files import checked, read_object
 from experiments.finetune_args import FinetuneArgs, with_settings
 from experiments.spaces import space_of
 from sgft_jax import extend
@@ -15,6 +15,10 @@ from sgft_jax.methods import get_method
 from sgft_jax.types import UserError
 
 VARIANT = "tuned"
+
+
+class _Budget(TypedDict):
+    reals: list[str]
 
 
 def path_of(out: Path, task: str, method: str) -> Path:
@@ -38,11 +42,12 @@ def read(out: Path, task: str, method: str) -> dict[str, Any]:
     """What tuning has found; raises UserError, which names the command, if there is no such file."""
     _require(out, task, [method])
     path = path_of(out, task, method)
-    result = read_json(path)
-    if not isinstance(result, dict) or not {"budget", "options"} <= set(result):
-        raise UserError(f"{path}: was not written by experiments.tune")
+    again = f"tune again with: {_command(task, [method])}"
+    result = read_object(path, {"budget": _Budget, "options": dict}, again)
     if unknown := sorted(set(result["options"]) - set(space_of(method))):
-        raise UserError(f"{path}: there is no option {unknown[0]!r}; tune again with: {_command(task, [method])}")
+        raise UserError(f"{path}: there is no option {unknown[0]!r}; {again}")
+    types = get_type_hints(get_method(method).config)
+    checked(path, result["options"], {name: types[name] for name in result["options"]}, again)
     return result
 
 

@@ -19,6 +19,7 @@ from envs.history import remember, with_memory
 from envs.pools import heldout_worlds, real_env, real_worlds, training_worlds
 from envs.rollout import Episode
 from sgft_jax import train
+from sgft_jax.io.cards import known_task
 from sgft_jax.io.priors import load_prior, observed
 from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.methods.options import card_of
@@ -127,7 +128,8 @@ def make_env(prior: Prior, *, task: str | None = None) -> Env:
 
     task: where the file of a task of your own is; otherwise the prior's card names its task.
     """
-    return envs.make(task or prior.card["task"], **observed(prior.card))
+    named = task or known_task("the prior's card", prior.card["task"], "task=")
+    return envs.make(named, **observed(prior.card))
 
 
 def evaluate_prior(

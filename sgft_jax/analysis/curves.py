@@ -17,7 +17,7 @@ import numpy as np
 
 from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean, paired_improvement
 from sgft_jax.io.log import EVAL, METRICS, SUMMARY, read_jsonl
-from sgft_jax.io.runs import CONFIG, PROVENANCE, read_own
+from sgft_jax.io.runs import read_config, read_own, read_starts
 from sgft_jax.methods import NAMES, get_method
 from sgft_jax.types import UserError
 
@@ -259,8 +259,8 @@ def read_curve(folder: Path) -> Curve:
     records = read_jsonl(folder / EVAL) if (folder / EVAL).exists() else []
     if not records:
         raise UserError(f"{folder / EVAL}: holds no evaluation yet")
-    stored, summary = read_own(folder / CONFIG, {"config": dict}), read_own(folder / SUMMARY)
-    config, start = stored.get("config", {}), last_start(folder)
+    summary = read_own(folder / SUMMARY)
+    config, start = read_config(folder), last_start(folder)
     column = lambda name: np.array([record[name] for record in records])  # noqa: E731
     scores = {name: column(name).T for name in SCORES if name in records[0]}
     variant = config.get("variant") or ""
@@ -384,7 +384,7 @@ def set_name(folder: Path, digests: Sequence[str]) -> str:
 
 def last_start(folder: Path) -> dict[str, Any]:
     """What the provenance of a run says of its last start; nothing where there is none."""
-    starts = read_own(folder / PROVENANCE).get("starts", [])
+    starts = read_starts(folder)
     return starts[-1] if starts else {}
 
 

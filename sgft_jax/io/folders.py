@@ -63,8 +63,7 @@ def part_of(folder: Path) -> Path:
 
 def present(folder: Path) -> Path:
     """The folder, or what was there before, if a writer was killed while it put the new one in its place."""
-    aside = _aside_of(_real(folder))
-    return aside if not folder.exists() and aside.is_dir() else folder
+    return aside if not folder.exists() and (aside := _aside_of(_real(folder))).is_dir() else folder
 
 
 @contextlib.contextmanager
@@ -117,4 +116,5 @@ def _aside_of(folder: Path) -> Path:
 
 
 def _real(folder: Path) -> Path:
-    return Path(os.path.realpath(folder)) if folder.is_symlink() else folder
+    """With the last part as it is on disk: no link, no dot."""
+    return Path(os.path.realpath(folder)) if folder.is_symlink() or folder.name in ("", "..") else folder

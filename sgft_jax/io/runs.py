@@ -11,9 +11,11 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypedDict
 
-from envs.files import read_json, read_object
+from msgspec import Meta
+
+from envs.files import Schema, read_object
 from sgft_jax.io.folders import ASIDE, Lock, empty
 from sgft_jax.io.jsonfile import differences, write_json
 from sgft_jax.types import UserError
@@ -26,6 +28,32 @@ FORMAT = 2  # of run folders; a state saved by another format does not fit the c
 _STEPS = ("checkpoints/[0-9]*", f"checkpoints/{ASIDE}[0-9]*")
 _RESULTS = (*_STEPS, "real/*.npz", "evaluation/*/real/*.npz", "prior/*", "policy/*", "summary.json")
 _PACKAGES = ("sgft-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
+
+
+class Options(TypedDict, total=False):
+    """What readers ask of the options of a run, whatever command it is of."""
+
+    task: str
+    seed: Annotated[int, Meta(ge=0, le=2**31 - 1)]
+    method: str
+    real: str | None
+    set: list[str]
+    prior: str | None
+    preset: str | None
+    variant: str | None
+    impl: Literal["auto", "jax", "warp", "c"]
+
+
+class _Git(TypedDict):
+    commit: str
+
+
+class _Start(TypedDict, total=False):
+    started: str
+    git: _Git | None
+    versions: dict[str, str]
+    device: dict[str, Any]
+    priors: list[str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,32 +200,38 @@ def check_folder(folder: Path, option: str = "--out") -> None:
         raise UserError(f"{folder}: cannot be written, you may not write to {there}; choose another {option}")
 
 
-def read_own(path: Path, needed: Mapping[str, type] | None = None, *, otherwise: str = "") -> dict[str, Any]:
+def read_own(path: Path, needed: Schema | None = None, *, otherwise: str = "") -> dict[str, Any]:
     """The JSON object that a run has written to a file, {} where there is no such file.
 
-    needed: as of `read_object`. otherwise: what else than putting the file back mends it. Raises UserError where it is
-    no such object.
+    needed: the schema of `read_object`. otherwise: what else than putting the file back mends it. Raises UserError
+    where it is no such object.
     """
     if not path.exists():
         return {}
     return read_object(path, needed or {}, f"put back the file that the run has written{otherwise}")
 
 
+def read_config(folder: Path) -> dict[str, Any]:
+    """The options of the run in a folder, checked as `Options`; {} where a robot has recorded without a run."""
+    return read_own(folder / CONFIG, {"config": Options}).get("config", {})
+
+
+def read_starts(folder: Path) -> list[dict[str, Any]]:
+    """What the provenance of a run says of its starts; [] where there is none."""
+    begin = ", or begin again with --overwrite"
+    return read_own(folder / PROVENANCE, {"starts": list[_Start]}, otherwise=begin).get("starts", [])
+
+
 def _record(run: Run, kind: str, config: Mapping[str, Any], inputs: Mapping[str, Any]) -> None:
     """Write down the start with what it begins with, and the configuration if it is the first one."""
     if not run.resumed:
         write_json(run.folder / CONFIG, {_MARK: _version("sgft-jax"), "format": FORMAT, "kind": kind, "config": config})
-    write_json(run.folder / PROVENANCE, {"starts": [*_starts(run.folder), {**provenance(), **inputs}]})
-
-
-def _starts(folder: Path) -> list[dict[str, Any]]:
-    found = read_own(folder / PROVENANCE, {"starts": list}, otherwise=", or begin again with --overwrite")
-    return found.get("starts", [])
+    write_json(run.folder / PROVENANCE, {"starts": [*read_starts(run.folder), {**provenance(), **inputs}]})
 
 
 def _check_inputs(folder: Path, inputs: Mapping[str, Any]) -> None:
     """Raises UserError if the run began with others; runs of earlier versions do not say."""
-    for start in _starts(folder):
+    for start in read_starts(folder):
         for name, now in inputs.items():
             if (before := start.get(name, now)) != now:
                 raise UserError(
@@ -215,10 +249,8 @@ def _check_ours(folder: Path, *, resume: bool, overwrite: bool) -> None:
 
 
 def _stored(folder: Path) -> dict[str, Any]:
-    stored = read_json(folder / CONFIG)
-    if not isinstance(stored, dict) or not {_MARK, "kind", "config"} <= set(stored):
-        raise UserError(f"{folder / CONFIG}: was not written by this project")
-    return stored
+    schema = {_MARK: str, "kind": str, "config": dict}
+    return read_object(folder / CONFIG, schema, "it was not written by this project, or put it back")
 
 
 def check_same(folder: Path, kind: str, wanted: Mapping[str, Any], volatile: tuple[str, ...]) -> None:

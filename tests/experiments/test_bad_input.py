@@ -88,7 +88,7 @@ PRIOR_READERS = {
 @pytest.mark.parametrize(("content", "words"), [("{}", "lacks task"), ("[1]", "is no JSON object")])
 def test_a_prior_that_names_no_task(command, content, words, tmp_path):
     (tmp_path / "prior.json").write_text(content)
-    with pytest.raises(UserError, match=f"prior.json: {words}; name it with --task, or take another prior"):
+    with pytest.raises(UserError, match=f"prior.json: {words}; take another prior"):
         PRIOR_READERS[command](tmp_path)
 
 
