@@ -75,7 +75,10 @@ def replaced(folder: Path) -> Iterator[Path]:
     another process replaces the same folder.
     """
     part, folder = part_of(folder), _real(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise UserError(f"{folder}: cannot be made, something else than a folder is in its way") from None
     for path in (folder, part):
         if path.is_symlink() or (path.exists() and not path.is_dir()):
             raise UserError(f"{path}: is no folder, and stands where one has to be written; move it elsewhere")

@@ -189,7 +189,9 @@ def check_start(folder: Path, *, resume: bool, overwrite: bool) -> bool:
 def check_folder(folder: Path, option: str = "--out") -> None:
     """Raises UserError, which names the option, where no folder can be made or written; makes nothing itself."""
     try:
-        there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        there = next(path for path in (folder, *folder.absolute().parents) if path.is_symlink() or path.exists())
+        if not there.exists():
+            raise UserError(f"{folder}: cannot be made, {there} is a link that leads nowhere; choose another {option}")
     except OSError as error:  # such as a name that is too long
         raise UserError(
             f"{folder}: cannot be made ({(error.strerror or '').lower()}); choose another {option}"

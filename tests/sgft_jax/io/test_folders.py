@@ -86,6 +86,17 @@ def test_a_file_or_a_link_in_the_way_stays(tmp_path, name):
     assert os.listdir(tmp_path) == [name] and (tmp_path / name).read_text() == "mine"
 
 
+def test_a_file_above_is_named_in_one_line(tmp_path):
+    (tmp_path / "file").write_text("mine")
+    for folder in (tmp_path / "file" / "prior", tmp_path / "file" / "a" / "prior"):
+        with pytest.raises(UserError, match="prior: cannot be made, something else than a folder is in its way"):
+            write(folder, "new")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for folder in (tmp_path / "loop", tmp_path / "loop" / "prior"):
+        with pytest.raises(UserError, match=r"is no folder|something else than a folder"):
+            write(folder, "new")
+
+
 def test_a_link_stays_a_link(tmp_path):
     write(tmp_path / "here" / "prior", "old")
     (tmp_path / "prior").symlink_to(tmp_path / "here" / "prior")
