@@ -43,12 +43,12 @@ def read(out: Path, task: str, method: str) -> dict[str, Any]:
     _require(out, task, [method])
     path = path_of(out, task, method)
     again = f"tune again with: {_command(task, [method])}"
-    result = read_object(path, {"budget": _Budget, "options": dict}, again)
+    result = read_object(path, {"budget": dict, "options": dict}, again)
     if unknown := sorted(set(result["options"]) - set(space_of(method))):
         raise UserError(f"{path}: there is no option {unknown[0]!r}; {again}")
     types = get_type_hints(get_method(method).config)
     checked(path, result["options"], {name: types[name] for name in result["options"]}, again)
-    return result
+    return checked(path, result, {"budget": _Budget}, again)
 
 
 def _require(out: Path, task: str, methods: Iterable[str]) -> None:
