@@ -1,5 +1,6 @@
 """How the parameters of a prior act and value states, for each algorithm that leaves one."""
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -53,17 +54,16 @@ def check_parameters(card: Mapping[str, Any], params: Any) -> None:
     Parts that a prior does not have are None; all have statistics and what acts.
     """
     obs_dim, act_dim, entries = card["obs_dim"], card["act_dim"], len(card.get("system", []))
-    measured = obs_dim - card.get("previous_actions", 0) * act_dim - entries
     sizes = {
         "normalizer": ((obs_dim,), (obs_dim,)),
-        "distortion": ((act_dim, act_dim), (act_dim,), (measured,)),
+        "distortion": ((act_dim, act_dim), (act_dim,), (_offsets(params, obs_dim, act_dim),)),
         "system": (entries,),
         "scale": (),
     }
     if params.normalizer is None:
         raise UserError("not a prior: it has no observation statistics")
-    if params.normalizer.mean.shape != (obs_dim,):
-        raise UserError(f"its card says obs_dim={obs_dim}, the statistics have {list(params.normalizer.mean.shape)}")
+    if (shape := getattr(params.normalizer.mean, "shape", ())) != (obs_dim,):
+        raise UserError(f"its card says obs_dim={obs_dim}, the statistics have {' x '.join(map(str, shape))}")
     for name, wanted in sizes.items():
         part = getattr(params, name, None)
         if part is not None and (shapes := jax.tree.map(lambda x: x.shape, part)) != wanted:
@@ -72,6 +72,12 @@ def check_parameters(card: Mapping[str, Any], params: Any) -> None:
         check_params(name, network, part, "its card; take another prior")
     if odd := [path for path, x in jax.tree_util.tree_leaves_with_path(params) if x.dtype != jnp.float32]:
         raise UserError(f"{jax.tree_util.keystr(odd[0])} is not float32; take another prior")
+
+
+def _offsets(params: Any, obs_dim: int, act_dim: int) -> int:
+    """How many measurements a prior corrects, if whole actions then follow them in an observation; else none fit."""
+    count = sum(math.prod(x.shape) for x in jax.tree.leaves(getattr(getattr(params, "distortion", None), "offset", ())))
+    return count if count <= obs_dim and (obs_dim - count) % act_dim == 0 else -1
 
 
 def _networks_of(card: Mapping[str, Any], params: Any) -> Iterator[tuple[str, Network, PyTree]]:

@@ -98,7 +98,7 @@ def read_card(folder: Path) -> dict[str, Any]:
     card = checked(path, read_json(path), _Card, _FIX)
     algorithm = card.get("algorithm", "sac")
     if algorithm not in _SCHEMAS:
-        raise UserError(f"{path}: says algorithm={algorithm!r}, which this version does not know; {_FIX}")
+        raise UserError(f"{path} says algorithm={algorithm!r}, which this version does not know; {_FIX}")
     checked(path, card, _SCHEMAS[algorithm], _FIX)
     told = card.get("system", [])
     if odd := [entry["name"] for entry in told if not entry["low"] < entry["high"]]:

@@ -109,7 +109,7 @@ def test_a_foreign_prior_is_refused(tmp_path):
 @pytest.mark.parametrize("algorithm", ["ppo", "../x", "losses", "os"])
 def test_a_prior_of_an_unknown_algorithm_is_refused(tmp_path, algorithm):
     folder = save(tmp_path / "prior", algorithm=algorithm)
-    with pytest.raises(UserError, match=f"prior.json: says algorithm='{algorithm}', which this version does not know"):
+    with pytest.raises(UserError, match=f"prior.json says algorithm='{algorithm}', which this version does not know"):
         priors.load_prior(folder)
 
 
@@ -123,7 +123,7 @@ def test_a_prior_of_another_version_is_refused_in_one_line(tmp_path):
 
 
 def test_a_prior_whose_card_lies_is_refused(tmp_path):
-    with pytest.raises(UserError, match=r"prior: its card says obs_dim=3, the statistics have \[4\]"):
+    with pytest.raises(UserError, match=r"prior: its card says obs_dim=3, the statistics have 4"):
         priors.load_prior(save(tmp_path / "prior", obs_dim=3))
 
 
@@ -227,6 +227,11 @@ ODD = {
         {"distortion": Distortion(np.eye(3, dtype="f4"), ZEROS[:3], ZEROS)},
         "distortion has the shapes",
     ),
+    "offsets of 3": (
+        {"distortion": Distortion(np.eye(2, dtype="f4"), ZEROS[:2], ZEROS[:3])},
+        "distortion has the shapes",
+    ),
+    "mean of two parts": ({"normalizer": Normalizer({"x": ZEROS}, ZEROS)}, "the statistics have"),
     "system that nobody tells": ({"system": ZEROS}, "system has the shapes"),
 }
 
