@@ -183,14 +183,14 @@ def read(home: Path, env: Env, priors: Sequence[Prior], most: int | None) -> tup
     Raises UserError where rollouts are not those of the task, or priors not those of the run.
     """
     store = RealStore(home)
-    stored = [store.load(i) for i in range(min(len(store), most or len(store)))]
+    stored = [store.rollout(i) for i in range(min(len(store), most or len(store)))]
     for i, arrays in enumerate(stored):
         _check(home / "real", i, arrays, stored[0], env)
     joined = {name: jnp.stack([arrays[name] for arrays in stored], axis=1) for name in _READ}
     if not joined["valid"].any():
         raise UserError(f"{home / 'real'}: holds no valid step")
     rows = Transition(*(joined[name] for name in Transition._fields))
-    both = Rollouts(rows, joined["valid"].astype(bool), joined["success"].astype(bool))
+    both = Rollouts(rows, joined["valid"], joined["success"])
     each = [stacking.member(both, s) for s in range(len(both.success))]
     config, p = config_of(home), len(priors)
     if config:
@@ -209,8 +209,6 @@ def _check(
     folder: Path, number: int, arrays: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray], env: Env
 ) -> None:
     path = folder / f"rollout-{number:06d}.npz"
-    if missing := set(_READ) - set(arrays):
-        raise UserError(f"{path}: lacks {min(missing)}; docs/formats.md lists what a rollout holds")
     sizes = {"obs": env.obs_dim, "next_obs": env.obs_dim, "action": env.act_dim}
     for name, size in sizes.items():
         if arrays[name].ndim != 3 or arrays[name].shape[-1] != size:

@@ -231,7 +231,7 @@ def read(folder: Path) -> Rows:
 def _columns(folder: Path, shapes: Mapping[str, Sequence[int]]) -> dict[str, np.ndarray]:
     """[N] numbers or [N, k] vectors by name, from all files in their order."""
     pa, pq = _pyarrow(folder)
-    paths = [path for path in files_of(folder) if path.parents[1] == folder / "data" and path.suffix == ".parquet"]
+    paths = [path for path in files_of(folder) if path.parent.parent == folder / "data" and path.suffix == ".parquet"]
     if not paths:
         raise UserError(f"{folder}: holds no data/*/*.parquet; {_WHOLE}")
     parts: dict[str, list[np.ndarray]] = {name: [] for name in shapes}
