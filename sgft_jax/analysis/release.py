@@ -14,9 +14,10 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from envs.files import read_json
+from envs.files import Count, read_json
 from sgft_jax.analysis import curves
 from sgft_jax.analysis.curves import COLUMNS, IDENTITY, Curve
+from sgft_jax.io.csvfile import read_csv
 from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
 from sgft_jax.io.runs import CONFIG, PROVENANCE
 from sgft_jax.types import UserError
@@ -67,7 +68,7 @@ def _tuning(path: Path) -> Iterable[dict[str, Any]]:
 
 
 def _pretraining(folder: Path) -> Iterable[dict[str, Any]]:
-    for record in read_jsonl(folder / EVAL):
+    for record in read_jsonl(folder / EVAL, {"step": Count, "success": list[float], "return": list[float]}):
         for i, success in enumerate(record["success"]):
             scores = {"success": success, "return": record["return"][i]}
             yield {**_set_of(folder), "prior": i, "env_steps": record["step"], **scores}
@@ -96,7 +97,7 @@ def merge(path: Path, new: Sequence[Mapping[str, Any]], key: Sequence[str]) -> P
         return None
     texts = [{name: _text(value) for name, value in row.items()} for row in new]
     replaced = {tuple(row[name] for name in key) for row in texts}
-    kept = [row for row in curves.read_csv(path, needed=key) if tuple(row[name] for name in key) not in replaced]
+    kept = [row for row in read_csv(path, needed=key) if tuple(row[name] for name in key) not in replaced]
     every = [*kept, *texts]
     names = COLUMNS if set(every[0]) <= set(COLUMNS) else dict.fromkeys(name for row in every for name in row)
     lines = sorted(every, key=lambda row: tuple(row[name] for name in key))  # stable: evaluations in order
