@@ -223,7 +223,8 @@ def _typed(value: Any, kind: np.dtype) -> np.ndarray:
     plain = np.asarray(value).dtype.kind
     if kind.kind not in "biuf" or plain not in "biuf" or (kind.kind == "b") != (plain == "b"):
         raise ValueError(f"{value!r:.40} is no {kind}")
-    return np.array(value, kind)
+    with np.errstate(over="ignore"):
+        return np.array(value, kind)
 
 
 def _of_seed(arrays: Mapping[str, np.ndarray], seed: int, number: int) -> Played:
