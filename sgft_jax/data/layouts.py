@@ -194,8 +194,9 @@ def _columns(
     reward = content.array(group, "rewards", 1)
     names = (terminal, *([timeout] if content.has(group, timeout) else []))
     ends = {name: content.array(group, name, 1) for name in names}
-    _check_lengths(content.path, {"actions": action, "rewards": reward, **ends})
-    ends = {name: flags(content.path, name, x, (None,), fix=_FIX) for name, x in ends.items()}
+    where = content.path if group is None else f"{content.path}: {group.name}"
+    _check_lengths(where, {"actions": action, "rewards": reward, **ends})
+    ends = {name: flags(where, name, x, (None,), fix=_FIX) for name, x in ends.items()}
     return obs, action, reward, ends[terminal], ends.get(timeout)
 
 
@@ -217,7 +218,7 @@ def _time_limits(
     return np.zeros(len(obs), bool), f"{told} alone"
 
 
-def _check_lengths(where: Path, arrays: Mapping[str, np.ndarray]) -> None:
+def _check_lengths(where: Path | str, arrays: Mapping[str, np.ndarray]) -> None:
     lengths = {name: len(array) for name, array in arrays.items()}
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{name} {n}" for name, n in lengths.items())

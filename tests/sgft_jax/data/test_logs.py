@@ -427,7 +427,7 @@ def test_odd_minari_sets_are_refused(minari):
     ("changes", "words"),
     [
         ({"actions": np.zeros((2, 3))}, "/episode_3 has other sizes of observations or actions than /episode_0"),
-        ({"terminations": np.full(2, np.nan)}, "terminations of row 0 is nan, not 0 or 1"),
+        ({"terminations": np.full(2, np.nan)}, "/episode_3: terminations of row 0 is nan, not 0 or 1"),
         ({"truncations": np.array([0, 0.5])}, "truncations of row 1 is 0.5, not 0 or 1"),
         ({"truncations": np.zeros(3)}, "numbers of rows differ (actions 2, rewards 2, terminations 2, truncations 3)"),
         ({"rewards": np.array([0, 1e39])}, "reward of row 7 is too large for float32"),
