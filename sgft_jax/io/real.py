@@ -207,6 +207,9 @@ def _checked(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]
         read[name] = flags(path, name, arrays[name], (n,), fix=_FIX)
     for name in rows.keys() & arrays.keys():
         read[name] = numbers(path, name, arrays[name], rows[name], fix=_FIX, valid=valid)
+    for name, other in (("next_obs", "obs"), ("command", "action")):
+        if name in read and read[name].shape != read[other].shape:
+            raise UserError(f"{path}: {name} has {read[name].shape[2]} entries, {other} {read[other].shape[2]}; {_FIX}")
     for name in beside.keys() & arrays.keys():  # of an episode that exploded they may be anything
         numbers(path, name, arrays[name], beside[name], fix=_FIX, valid=np.zeros((), bool))
     if "trace" in arrays:

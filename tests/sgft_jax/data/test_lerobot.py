@@ -207,6 +207,18 @@ def test_hidden_files_are_no_part_of_a_set(tmp_path):
     assert logs.load(folder, gamma=0.9).facts == facts
 
 
+def test_folders_that_lie_elsewhere_are_neither_read_nor_in_the_digest(tmp_path):
+    """Links to files are followed: download tools keep their files so."""
+    folder, other = write(tmp_path / "set"), tmp_path / "other"
+    facts = logs.load(folder, gamma=0.9).facts
+    (folder / "data/chunk-000/file-000.parquet").rename(tmp_path / "blob")
+    (folder / "data/chunk-000/file-000.parquet").symlink_to(tmp_path / "blob")
+    assert logs.load(folder, gamma=0.9).facts == facts
+    (folder / "data/chunk-000").rename(other)
+    (folder / "data/chunk-000").symlink_to(other)
+    assert "holds no data/*/*.parquet" in refused(folder)
+
+
 def test_files_may_differ_in_the_types_of_their_columns(tmp_path):
     """Lists of any or of one length, numbers as float64 or float32, flags as any numbers, in files of one set."""
     one, two = (write(tmp_path / name) for name in ("one", "two"))

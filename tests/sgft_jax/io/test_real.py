@@ -105,6 +105,8 @@ def test_rollouts_that_do_not_go_together_are_refused(tmp_path):
         ("reward", np.full((2, 3), np.nan), "reward of row 0 is not finite"),
         ("discount", np.full((2, 3), 2.0), "discount is not between 0 and 1"),
         ("command", np.zeros((2, 2, 2)), r"command has shape \[2, 2, 2\], not \[2, 3, n\]"),
+        ("command", np.zeros((2, 3, 3)), "command has 3 entries, action 2"),
+        ("next_obs", np.zeros((2, 3, 3)), "next_obs has 3 entries, obs 4"),
         ("command", np.full((2, 3, 2), np.nan), "command of row 0 is not finite"),
         ("trace", np.zeros((2, 3, 1)), r"trace has shape \[2, 3, 1\], not \[2, 4, n\]"),
         ("trace", np.full((2, 4, 1), np.nan), "trace of row 0 is not finite"),
