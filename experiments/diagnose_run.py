@@ -190,7 +190,7 @@ def read(home: Path, env: Env, priors: Sequence[Prior], most: int | None) -> tup
     if not joined["valid"].any():
         raise UserError(f"{home / 'real'}: holds no valid step")
     rows = Transition(*(joined[name] for name in Transition._fields))
-    both = Rollouts(rows, joined["valid"], joined["success"])
+    both = Rollouts(rows, joined["valid"].astype(bool), joined["success"].astype(bool))
     each = [stacking.member(both, s) for s in range(len(both.success))]
     config, p = config_of(home), len(priors)
     if config:
