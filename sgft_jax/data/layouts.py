@@ -153,8 +153,6 @@ def _card(folder: Path) -> Mapping[str, Any]:
 
 def _file_of(path: Path) -> Path:
     """The HDF5 file that `path` means."""
-    if not path.exists():
-        raise UserError(f"{path}: no such file")
     if not path.is_dir():
         return path
     for folder in (path / "data", path):

@@ -6,7 +6,9 @@ be is a `UserError` with one line. Arrays are float32 on the host; `replay.full`
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Sequence
+import stat
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
 
@@ -137,7 +139,9 @@ def _borders(last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _read(path: Path, successors: Successors, env: Env | None) -> Rows:
     """What lies there."""
-    if path.is_dir():
+    with _readable(path):
+        folder = stat.S_ISDIR(path.stat().st_mode)
+    if folder:
         if (path / lerobot.INFO).exists():
             return lerobot.read(path)
         if (home := home_of(path)) is not None:
@@ -258,10 +262,22 @@ def _facts(rows: Rows) -> Facts:
     )
 
 
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except OSError as error:  # a name that is too long, a folder that is closed
+        raise UserError(f"{path}: cannot be read ({(error.strerror or str(error)).lower()})") from None
+    except ValueError:  # a zero byte
+        raise UserError(f"{str(path)!r}: is no name of a file") from None
+
+
 def _fingerprint(source: Path) -> tuple[int, str]:
     """Bytes of a file and their SHA-256; of a folder those of its files, in the order of their names."""
     if not source.is_dir():
-        with open(source, "rb") as stream:
+        with _readable(source), open(source, "rb") as stream:
             return source.stat().st_size, hashlib.file_digest(stream, "sha256").hexdigest()
     each = [(path.relative_to(source).as_posix(), *_fingerprint(path)) for path in layouts.files_of(source)]
     return sum(size for _, size, _ in each), hashlib.sha256(repr([one[::2] for one in each]).encode()).hexdigest()

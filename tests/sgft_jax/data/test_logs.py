@@ -147,6 +147,11 @@ def refused(path, **options):
 
 def test_a_missing_or_foreign_file_is_refused(tmp_path, write):
     assert "no such file" in refused(tmp_path / "absent.hdf5")
+    assert "cannot be read (file name too long)" in refused(tmp_path / ("x" * 300))
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    assert "cannot be read (too many levels of symbolic links)" in refused(tmp_path / "loop")
+    with pytest.raises(UserError, match="is no name of a file"):
+        logs.load("zero\0byte.hdf5", gamma=0.9)
     (tmp_path / "foreign.hdf5").write_text("<html>403 Forbidden</html>")
     assert "not an HDF5 file" in refused(tmp_path / "foreign.hdf5")
     assert "no 'observations' in /, only images" in refused(write({"images": np.zeros(3)}))
