@@ -202,18 +202,18 @@ def _time_limits(
     obs: np.ndarray, stored: np.ndarray | None, terminal: np.ndarray, limit: int | None
 ) -> tuple[np.ndarray, str]:
     """[N] rows that time has ended in a file without 'timeouts', and how that was known, in words."""
-    told = "has no 'timeouts': an episode is taken to end at a terminal row"
+    words = "has no 'timeouts': an episode is taken to end at a terminal row"
     if stored is not None and stored.shape == obs.shape:
         with np.errstate(invalid="ignore", over="ignore"):
             here, below = stored[:-1].astype(np.float64), obs[1:].astype(np.float64)
             jump = (np.abs(here - below) > _SAME * (1 + np.abs(below))).any(axis=1)
-        return np.append(jump, False)[: len(obs)] & ~terminal, f"{told}, and where the row below begins anew"
+        return np.append(jump, False)[: len(obs)] & ~terminal, f"{words}, and where the row below begins anew"
     if limit is not None:
         place = np.arange(len(obs))
         starts = np.concatenate([[True], terminal[:-1]])[: len(obs)]
         age = place - np.maximum.accumulate(np.where(starts, place, 0))
-        return ((age + 1) % limit == 0) & ~terminal, f"{told}, or after the {limit} steps of the task"
-    return np.zeros(len(obs), bool), f"{told} alone"
+        return ((age + 1) % limit == 0) & ~terminal, f"{words}, or after the {limit} steps of the task"
+    return np.zeros(len(obs), bool), f"{words} alone"
 
 
 def _check_lengths(where: Path | str, arrays: Mapping[str, np.ndarray]) -> None:
