@@ -315,7 +315,7 @@ def test_the_number_of_actions_must_be_the_tasks():
 
 
 def test_a_function_that_maps_wrongly_is_one_line():
-    with pytest.raises(UserError, match=r"observe: returns 1 numbers, the task toy measures 4: xy \[2\]"):
+    with pytest.raises(UserError, match=r"reset of .*: observes 1 numbers, the task toy measures 4: xy \[2\]"):
         play(Spoken(), observe=lambda obs: obs[:1])
 
 

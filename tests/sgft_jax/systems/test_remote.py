@@ -16,6 +16,7 @@ import pytest
 from websockets.sync.client import connect
 
 from sgft_jax.systems import robot_client
+from sgft_jax.systems.messages import Hello, read
 from sgft_jax.systems.remote import Remote, _Link
 from sgft_jax.systems.robot_client import Limits, RefusedError, array, pack, play, unpack
 from sgft_jax.types import UserError
@@ -161,7 +162,7 @@ def test_lost_doubled_and_damaged_messages_move_nothing_twice(pair, driver, monk
 
         def worse(data):
             luck = rng.random()
-            if luck < 0.25 and unpack(data)["type"] not in ("hello", "welcome", "end"):
+            if luck < 0.25 and not isinstance(read(data), Hello):
                 return
             if luck > 0.9:
                 send(data[:-1] + bytes([data[-1] ^ 255]))
@@ -512,12 +513,12 @@ def _signed(body):
 def test_every_command_is_on_disk_before_it_is_sent(pair, tmp_path):
     driver, path = Point(), tmp_path / "commands"
     step, lengths = driver.step, []
-    driver.step = lambda action: (lengths.append(len(list(read(path)))), step(action))[1]
+    driver.step = lambda action: (lengths.append(len(list(commands(path)))), step(action))[1]
     own = pair(driver, log=path)
     begin(own, 0)
     for _ in range(2):
         move(own, RIGHT)
-    assert lengths == [1, 2] and [x["step"] for x in read(path)] == [0, 1]
+    assert lengths == [1, 2] and [x["step"] for x in commands(path)] == [0, 1]
 
 
 def played_alone(driver, **options):
@@ -599,7 +600,7 @@ def test_a_learner_that_is_not_there_is_waited_for_and_said_once():
     assert len(said) == len(set(said)) and all("trying again" in line for line in said[:-1])
 
 
-def read(path):
+def commands(path):
     with open(path, "rb") as file:
         yield from msgpack.Unpacker(file)
 
