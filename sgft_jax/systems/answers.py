@@ -137,7 +137,8 @@ def _of_member(infos: Mapping[str, Any], i: int, count: int, names: Sequence[str
         if not flag(_column(there, count, f"info['_{name}']")[i], f"info['_{name}']"):
             continue
         if isinstance(values, Mapping):
-            found[name] = _of_member(values, i, count, list(values) if name == "final_obs" else _KNOWN)
+            inner = [part for part in values if f"_{part}" in values] if name == "final_obs" else _KNOWN
+            found[name] = _of_member(values, i, count, inner)
         else:
             found[name] = _column(values, count, f"info[{name!r}]")[i]
     return found

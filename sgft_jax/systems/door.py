@@ -10,7 +10,7 @@ from typing import Any
 
 from sgft_jax.types import UserError
 
-STRANGERS = 64  # connections that nobody has admitted yet; beyond them the oldest is closed
+STRANGERS = 32  # connections that nobody has admitted yet, of four files each; beyond them the oldest is closed
 _NAME = re.compile(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*\.?")
 _NUMBERS = re.compile(r"[0-9.]+")
 _LOOK = 1.0  # seconds after which a door that waits sees that it has been closed
@@ -47,7 +47,7 @@ class Door(socket.socket):
                 if self.fileno() < 0:
                     raise
                 if not isinstance(error, TimeoutError):  # no more files, or a connection that is gone already
-                    self._close_oldest(0)
+                    self._close_oldest(len(self._strangers) // 2)
                     time.sleep(0.01)
                 continue
             self._close_oldest(STRANGERS - 1)

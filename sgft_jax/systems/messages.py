@@ -7,7 +7,7 @@ import msgspec
 from msgspec import Meta
 
 from envs.files import Count, Positive, Size
-from sgft_jax.systems.robot_client import VERSION, unframed
+from sgft_jax.systems.robot_client import VERSION, printable, unframed
 
 Seconds = Annotated[Positive, Meta(le=3600)]
 
@@ -84,4 +84,4 @@ def read(data: Any) -> Message:
                 )
         return _MESSAGE.decode(body)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"does not fit the protocol ({error})") from None
+        raise ValueError(f"does not fit the protocol ({printable(error, 120)})") from None

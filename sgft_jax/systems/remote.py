@@ -308,8 +308,9 @@ class Remote:
         """The name that a connection was made to, if it is none of this computer's: a web page may have made it up."""
         headers = connection.request.headers.get_all("Host") if connection.request else []
         try:
-            name = urlsplit(f"//{headers[0]}").hostname or ""
-        except (IndexError, ValueError):
+            (host,) = headers
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:  # none, or several
             name = ""
         with contextlib.suppress(ValueError):
             ipaddress.ip_address(name)
