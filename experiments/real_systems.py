@@ -93,7 +93,7 @@ def address(real: str) -> tuple[str, int]:
     HOST may be an IPv6 address, in brackets where a port follows. Raises UserError for what is no host or port.
     """
     rest = real.removeprefix(REMOTE).removeprefix(":")
-    read = re.fullmatch(r"\[(?P<six>[^\]]*:[^\]]*)\](:(?P<port6>.*))?|(?P<host>[^:]*)(:(?P<port>[^:]*))?", rest)
+    read = re.fullmatch(r"\[(?P<six>[^\]]*:[^\]]*)\](:(?P<port6>[0-9]*))?|(?P<host>[^:]*)(:(?P<port>[0-9]*))?", rest)
     host, port = (read["six"] or read["host"], read["port6"] or read["port"]) if read else (rest, None)
     number = port_of(port or str(_PORT))
     try:

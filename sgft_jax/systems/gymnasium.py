@@ -155,7 +155,7 @@ class Gymnasium:
                 going = ~step.over
                 if not going.any():
                     return
-                seen = np.where(going[:, None], following, seen)
+                seen = following
         finally:
             self._real.rest()
 

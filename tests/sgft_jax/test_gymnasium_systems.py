@@ -332,10 +332,11 @@ def test_no_command_follows_a_start_that_is_not_finite(large, monkeypatch):
     real.reset = late
     episode = play(real, policy=WANTING)
     assert len(starts) == 4 and len(set(starts)) == 1 and np.isfinite(real.actions).all() and episode.valid.sum() == 3
-    blind, starts[:], real.actions[:] = 10, [], []
+    blind, starts[:], real.actions[:], rests = 10, [], [], []
+    real.rest = lambda: rests.append(1)
     with pytest.raises(UserError, match=r"^reset of .*: measured number 0 is .* after 4 tries; no episode can begin"):
         play(real, policy=WANTING)
-    assert len(starts) == 4 and not real.actions
+    assert len(starts) == 4 and not real.actions and rests == [1]
 
 
 @pytest.mark.parametrize("together", [False, True])
@@ -373,12 +374,11 @@ def test_a_measurement_too_large_for_arithmetic_ends_the_episode():
     ],
     ids=str,
 )
-@pytest.mark.parametrize("together", [False, True])
-def test_what_was_sent_is_what_is_kept_in_the_shape_of_the_space(space, sent, kept, together):
-    own = Spoken(ends="truncated")
-    own.action_space = space
-    real = SyncVectorEnv([lambda: own], autoreset_mode=AutoresetMode.NEXT_STEP) if together else own
-    episode = play(real)
+def test_what_was_sent_is_what_is_kept_in_the_shape_of_the_space(space, sent, kept):
+    own = acting(space)
+    own.ends = "truncated"
+    together = space.shape == (2, 1)
+    episode = play(SyncVectorEnv([lambda: own], autoreset_mode=AutoresetMode.NEXT_STEP) if together else own)
     assert own.actions[0].dtype == space.dtype and own.actions[0].tolist() == sent
     np.testing.assert_allclose(episode.transitions.action[0], kept, rtol=1e-6)
     np.testing.assert_array_equal(episode.command[0], [0.5, -1.0])
