@@ -720,6 +720,7 @@ def test_idle_strangers_cannot_keep_the_robot_out(pair):
         strangers.append(socket.create_connection(("127.0.0.1", port), timeout=5))
         if i % 2:
             strangers[-1].sendall(b"GET / HTTP/1.1\r\nHost: x\r\n")
+    assert "another robot" in hello(own.remote)["reason"]  # all before it have come in
     assert move(own, RIGHT).obs[0] == 1
     own.remote._link.connection.close()
     begin(own, 1)  # it is back
