@@ -47,7 +47,7 @@ def diagnose(
         count, name = args.rollouts or PLAYED, title(args.real)
         if is_stepped(args.real):
             where = name
-            real = _play_real(env, args, priors, count, RealStore(home / name))
+            real = _play_real(env, args, priors, count, home / name)
             simulated = play_simulated(env, priors, args.seed)
         else:
             where = f"the gap {name}"
@@ -157,14 +157,15 @@ def _play_both(env: Env, gap: Gap, priors: list[Prior], n: int, seed: int) -> tu
     return [first(one, n) for one in real], [first(one, SIMULATED) for one in simulated]
 
 
-def _play_real(env: Env, args: DiagnoseArgs, priors: list[Prior], n: int, store: RealStore) -> list[Rollouts]:
-    """Exploring rollouts [n] of every prior on a robot or an environment, each of them kept on disk."""
+def _play_real(env: Env, args: DiagnoseArgs, priors: list[Prior], n: int, home: Path) -> list[Rollouts]:
+    """Exploring rollouts [n] of every prior on a robot or an environment, each of them kept on disk in `home`."""
     system = connect(env, [args.real], (), members=len(priors), gamma=priors[0].card["gamma"], home=args.out)
-    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(_SEED), args.seed), len(store))
-    keys = jnp.broadcast_to(jax.random.split(key, n), (len(priors), n))
-    members = stacking.stack([prior.params for prior in priors])
-    kept = RecordedSystem(system, [store], done=len(store), sync_every=1 if is_robot(args.real) else None)
     try:
+        store = RealStore(home)  # after the connection, which may fail
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(_SEED), args.seed), len(store))
+        keys = jnp.broadcast_to(jax.random.split(key, n), (len(priors), n))
+        members = stacking.stack([prior.params for prior in priors])
+        kept = RecordedSystem(system, [store], done=len(store), sync_every=1 if is_robot(args.real) else None)
         played = kept.play(make_policy(priors[0].card, env), members, keys, explore=True)
     finally:
         system.close()
