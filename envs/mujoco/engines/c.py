@@ -23,12 +23,12 @@ import mujoco.rollout
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
-from envs.mujoco.engines import MEAN_INERTIA, Engine
+from envs.mujoco.engines import Engine
 from sgft_jax.types import Array, PyTree
 
 
 class _Slot(NamedTuple):
-    """What a thread steps worlds in, one after another. views: name of a field -> the array inside `model`."""
+    """What a thread steps worlds in, one after another. views: name of an array -> the array inside `model`."""
 
     rollout: mujoco.rollout.Rollout
     model: mujoco.MjModel
@@ -45,7 +45,8 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
     mujoco.set_mju_user_warning(_warn)
     nominal = copy.deepcopy(host)
     nominal.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    arrays = tuple(name for name in fields if name != MEAN_INERTIA)
+    _without_shortcuts(nominal, fields)
+    arrays = tuple(name for name in fields if isinstance(attrgetter(name)(nominal), np.ndarray))
     cores = os.cpu_count() or 1
     threads = concurrent.futures.ThreadPoolExecutor(cores)
     lock = threading.Lock()  # XLA may run two programs at once
@@ -108,13 +109,23 @@ def _warn(message: str) -> None:
         warnings.warn(message, RuntimeWarning, stacklevel=2)
 
 
+def _without_shortcuts(nominal: mujoco.MjModel, fields: tuple[str, ...]) -> None:
+    """Takes what the compiler derived for the nominal scene alone: trees of boxes, and frames that coincide there."""
+    if {"geom_size", "geom_aabb", "geom_pos", "geom_quat", "body_ipos", "body_iquat"}.intersection(fields):
+        nominal.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
+    for kind, poses in (("body", ()), ("geom", ("geom_pos", "geom_quat")), ("site", ("site_pos", "site_quat"))):
+        if {"body_ipos", "body_iquat", *poses}.intersection(fields):
+            getattr(nominal, f"{kind}_sameframe")[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
+
+
 def _enter(slot: _Slot, values: dict[str, np.ndarray]) -> None:
     """Make the slot's model that of one world."""
     for name, value in values.items():
-        if name == MEAN_INERTIA:
-            slot.model.stat.meaninertia = float(value)
-        else:
+        if name in slot.views:
             slot.views[name][...] = value
+        else:
+            part, _, last = name.rpartition(".")
+            setattr(getattr(slot.model, part), last, float(value))
 
 
 def _forward(slot: _Slot, state: Any, controls: np.ndarray) -> np.ndarray:

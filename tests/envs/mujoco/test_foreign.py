@@ -155,7 +155,7 @@ def test_what_observations_do_not_tell_the_simulator_measures():
         ends.append(states.terminated.tolist())
     first, second = (next(i for i, end in enumerate(ends) if end[k]) for k in range(2))
     assert first < second and not states.success.any()
-    with pytest.raises(UserError, match="scene bump measures 'terminated': then its function of observations must be"):
+    with pytest.raises(UserError, match="task bump measures 'terminated': then its function of observations must be"):
         double = make_env(SCENE._replace(measured=measured, reward=None), "c")
         double.step(jax.tree.map(lambda x: x[0], pool), jax.tree.map(lambda x: x[0], states), ACTION, jax.random.key(0))
 
