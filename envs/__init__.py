@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from envs import gaps
 from envs.base import Domain, EffectRange, Effects, Entry, Env, EnvState, Parameter, Theta, World, packed, unpack
-from envs.checks import check_description, check_effects, check_functions
+from envs.checks import check_description, check_effects, check_functions, with_finite_steps
 from envs.gaps import Gap
 from sgft_jax import extend
 from sgft_jax.types import UserError, unknown
@@ -91,7 +91,7 @@ def _make(task: str, impl: str, scene: str) -> Env:
     called = {name: getattr(env, name) for name in ("make_worlds", "reset", "step")}
     env = packed(env._replace(**{name: extend.guard("task", source, f) for name, f in called.items()}))
     check_functions(env, source)
-    return env
+    return with_finite_steps(env)
 
 
 def scene(task: str, real: str = "") -> Any:

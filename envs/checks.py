@@ -85,6 +85,21 @@ def check_functions(env: Env, source: str) -> None:
         raise wrong("reset", "must observe finite numbers", np.array2string(seen, threshold=8))
 
 
+def with_finite_steps(env: Env) -> Env:
+    """The task of somebody whose steps are invalid, too, where what they observe or reward is not finite.
+
+    The state of MuJoCo, by which ours judge, does not tell that.
+    """
+    import jax.numpy as jnp
+
+    def step(*given: Any) -> EnvState:
+        state = env.step(*given)
+        finite = jnp.isfinite(state.true_obs).all() & jnp.isfinite(state.reward)
+        return state._replace(invalid=state.invalid | ~finite)
+
+    return env._replace(step=step)
+
+
 def check_outcomes(task: Any, functions: dict[str, Callable], obs: Any, action: Any) -> None:
     """Raises UserError where reward, end or success as functions of observations are no number and no truth."""
     import jax

@@ -37,10 +37,11 @@ _CAMERAS, _RAYS = ("cam_", "ncam"), ("geom_rgba", "geom_matid", "mat_")
 _WORDS = (
     "vis light_ nlight tex_ ntex nmat skin_ nskin flex_rgba flex_texcoord nflextexcoord flex_elemtexcoord flex_matid",
     "flex_group flex_flatskin site_matid site_rgba tendon_matid tendon_rgba tendon_width geom_group site_group",
-    "jnt_group tendon_group mesh_texcoord mesh_facetexcoord nmeshtexcoord stat.meanmass stat.meansize stat.extent stat.center",
+    "jnt_group tendon_group mesh_texcoord mesh_facetexcoord nmeshtexcoord",
+    "stat.meanmass stat.meansize stat.extent stat.center",
     "name nnames path npaths text_ ntext tuple_ ntuple key_ nkey signature nbuffer",
     "body_user jnt_user geom_user site_user cam_user tendon_user actuator_user sensor_user nuser_",
-    "body_sameframe geom_sameframe site_sameframe bvh_ body_bvh",  # shortcuts, which `engines.c` does without
+    "body_sameframe geom_sameframe site_sameframe bvh_ body_bvh",  # shortcuts of C MuJoCo, see `with_shortcuts`
     "actuator_length0 dof_length",  # for the compiler, and for bodies that sleep
 )
 _UNREAD = (*_CAMERAS, *_RAYS, *" ".join(_WORDS).split())
@@ -65,6 +66,21 @@ def unread(host: mujoco.MjModel) -> tuple[str, ...]:
 def carried(host: mujoco.MjModel) -> tuple[str, ...]:
     """Names of the fields in which the worlds of that scene may differ."""
     return tuple(name for name in CARRIED if not name.startswith(unread(host)))
+
+
+def with_shortcuts(host: mujoco.MjModel, names: tuple[str, ...]) -> tuple[str, ...]:
+    """The names, and with those of poses the frames that C MuJoCo takes to coincide: they may part in some worlds only.
+
+    Its trees of bounding boxes, the other shortcut, `engines.c` does without where they would differ.
+    """
+    inertia = {"body_ipos", "body_iquat"}
+    sources = {
+        "body": inertia,
+        "geom": inertia | {"geom_pos", "geom_quat"},
+        "site": inertia | {"site_pos", "site_quat"},
+    }
+    frames = {f"{kind}_sameframe" for kind, poses in sources.items() if poses.intersection(names)}
+    return (*names, *(name for name in sorted(frames) if getattr(host, name).any()))
 
 
 def comparison(nominal: mujoco.MjModel, names: tuple[str, ...]) -> Callable[[mujoco.MjModel], list[str]]:

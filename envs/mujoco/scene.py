@@ -15,6 +15,7 @@ from envs.checks import check_description, check_effects
 from envs.mujoco import worlds as physics
 from envs.mujoco.checks import check_scene
 from envs.mujoco.engines import Engine
+from envs.mujoco.fields import with_shortcuts
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array, Key, UserError
 
@@ -174,7 +175,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
             terminated=terminated,
             truncated=time >= scene.episode_length,
             success=state.success | now if scene.success_anytime else now,
-            invalid=physics.exploded(after, max_speed=scene.max_speed) | ~_finite(true_obs, reward),
+            invalid=physics.exploded(after, max_speed=scene.max_speed),
             time=time,
             effects=own,
         )
@@ -203,15 +204,12 @@ def _outcome(
     def found(name: str, given: tuple[Array, ...], default: Any) -> Array:
         function, value = getattr(scene, name), getattr(measured, name)
         if value is not None:
-            return value  # the function of a reward is an approximation, for transitions that nobody measures
+            return jnp.asarray(
+                value
+            )  # the function of a reward is an approximation, for transitions that nobody measures
         return jnp.asarray(default) if function is None else function(*given)
 
     return found("reward", step, 0.0), found("terminated", step, False), found("success", (true_obs,), False)
-
-
-def _finite(*values: Array) -> Array:
-    """[] bool: what a scene observes and rewards is finite; MuJoCo's state alone does not tell."""
-    return jnp.stack([jnp.isfinite(x).all() for x in values]).all()
 
 
 def _varying(scene: Scene, host: mujoco.MjModel, nominal: dict[str, float]) -> tuple[str, ...]:
@@ -227,4 +225,4 @@ def _varying(scene: Scene, host: mujoco.MjModel, nominal: dict[str, float]) -> t
             found |= dict.fromkeys(fields)
             if fields:
                 break
-    return tuple(found)
+    return with_shortcuts(host, tuple(found))

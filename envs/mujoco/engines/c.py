@@ -45,7 +45,8 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
     mujoco.set_mju_user_warning(_warn)
     nominal = copy.deepcopy(host)
     nominal.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    _without_shortcuts(nominal, fields)
+    if {"geom_size", "geom_pos", "geom_quat", "body_ipos", "body_iquat"}.intersection(fields):
+        nominal.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE  # its boxes are those of the nominal scene
     arrays = tuple(name for name in fields if isinstance(attrgetter(name)(nominal), np.ndarray))
     cores = os.cpu_count() or 1
     threads = concurrent.futures.ThreadPoolExecutor(cores)
@@ -107,15 +108,6 @@ def _warn(message: str) -> None:
     """Instead of a log file in the working directory. The state itself shows what is unstable."""
     if "unstable" not in message:
         warnings.warn(message, RuntimeWarning, stacklevel=2)
-
-
-def _without_shortcuts(nominal: mujoco.MjModel, fields: tuple[str, ...]) -> None:
-    """Takes what the compiler derived for the nominal scene alone: trees of boxes, and frames that coincide there."""
-    if {"geom_size", "geom_aabb", "geom_pos", "geom_quat", "body_ipos", "body_iquat"}.intersection(fields):
-        nominal.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE
-    for kind, poses in (("body", ()), ("geom", ("geom_pos", "geom_quat")), ("site", ("site_pos", "site_quat"))):
-        if {"body_ipos", "body_iquat", *poses}.intersection(fields):
-            getattr(nominal, f"{kind}_sameframe")[:] = mujoco.mjtSameFrame.mjSAMEFRAME_NONE
 
 
 def _enter(slot: _Slot, values: dict[str, np.ndarray]) -> None:
