@@ -307,10 +307,13 @@ def unpack(entries: tuple[Entry, ...], vector: Array) -> dict[str, Array]:
 def packed(env: Env) -> Env:
     """The same task with observations as one vector [obs_dim], where `reset` and `step` may return dicts by entry name.
 
-    `step` gets states with packed observations; `reward`, `terminated` and `success` see packed ones too.
+    `step` gets states with packed observations; `reward`, `terminated` and `success` see packed ones too. Raises
+    UserError for what is no state.
     """
 
     def flat(state: EnvState) -> EnvState:
+        if not isinstance(state, EnvState):
+            raise UserError(f"task {env.name}: 'reset' and 'step' must return an EnvState, got {type(state).__name__}")
         return state._replace(obs=pack(env.observation, state.obs), true_obs=pack(env.observation, state.true_obs))
 
     restore = env.restore

@@ -69,17 +69,17 @@ def check_functions(env: Env, source: str) -> None:
     world = jax.tree.map(lambda x: x[0], worlds)
     obs, action = (jax.ShapeDtypeStruct((n,), jnp.float32) for n in (env.obs_dim, env.act_dim))
     start = jax.eval_shape(env.reset, world, key)
-    _check_state(wrong, "reset", start, env)
+    _check_state("reset", start, env)
     if type(start.physics).__module__ != "envs.mujoco.worlds":  # a scene's step was checked in parts, as is quicker
         after = jax.eval_shape(env.step, world, start, action, key)
-        _check_state(wrong, "step", after, env)
+        _check_state("step", after, env)
         if odd := _difference(after, start):
             raise wrong("step", "must return a state like that of 'reset'", odd)
     guarded = {name: getattr(env, name) for name in ("reward", "terminated", "success", "restore")}
     guarded = {name: extend.guard("task", source, f) for name, f in guarded.items() if f is not None}
     check_outcomes(env, guarded, obs, action)
     if "restore" in guarded:
-        _check_state(wrong, "restore", jax.eval_shape(guarded["restore"], world, obs, key), env)
+        _check_state("restore", jax.eval_shape(guarded["restore"], world, obs, key), env)
     seen = np.asarray(jax.jit(lambda *start: env.reset(*start).true_obs)(world, key))
     if not np.isfinite(seen).all():
         raise wrong("reset", "must observe finite numbers", np.array2string(seen, threshold=8))
@@ -162,9 +162,7 @@ def _check_names(wrong: Callable[..., UserError], field: str, names: Sequence[st
             raise wrong(field, "must have names that differ", name)
 
 
-def _check_state(wrong: Callable[..., UserError], field: str, state: Any, env: Env) -> None:
-    if not isinstance(state, EnvState):
-        raise wrong(field, "must return an EnvState", type(state).__name__)
+def _check_state(field: str, state: EnvState, env: Env) -> None:
     vector, number, truth = ("float32", (env.obs_dim,)), ("float32", ()), ("bool", ())
     kinds = {"obs": vector, "true_obs": vector, "reward": number, "time": ("int32", ())}
     kinds |= dict.fromkeys(("terminated", "truncated", "success", "invalid"), truth)

@@ -45,7 +45,7 @@ def numbers(value: Value) -> np.ndarray:
     """A value or range as an array; one of shape [0, 0, 0], which fits nowhere, if it holds anything but numbers."""
     try:
         return np.asarray(value, np.float64)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         return np.zeros((0, 0, 0))
 
 
