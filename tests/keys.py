@@ -14,10 +14,6 @@ Uses = collections.Counter[bytes]
 Late = Callable[[], Any]  # a value that is computed when something asks for it
 
 
-class _Unknown(Exception):
-    """A value that depends on data."""
-
-
 def used_twice(function: Callable[..., Any], *args: Any) -> int:
     """How many keys `function(key, *args)` uses more than once; draws and splits use a key up.
 
@@ -33,7 +29,7 @@ def used_twice(function: Callable[..., Any], *args: Any) -> int:
 
 
 def _unknown() -> Any:
-    raise _Unknown
+    raise LookupError("a key that depends on data")
 
 
 def _run(program: Any, args: Sequence[Late], uses: Uses) -> list[Late]:
@@ -65,8 +61,8 @@ def _results(eqn: Any, args: list[Late], uses: Uses) -> Sequence[Late]:
 
     @functools.cache
     def results() -> Any:
-        found = eqn.primitive.bind(*[arg() for arg in args], **params)
-        return found if several else [found]
+        out = eqn.primitive.bind(*[arg() for arg in args], **params)
+        return out if several else [out]
 
     return [lambda i=i: results()[i] for i in range(len(eqn.outvars))]
 
