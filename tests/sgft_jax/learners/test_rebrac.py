@@ -4,6 +4,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from sgft_jax.learners import rebrac
@@ -110,6 +111,23 @@ def test_the_actors_penalty_holds_it_to_the_data(penalty, low, high, key):
     fit = jax.jit(lambda s: jax.lax.scan(lambda s, k: learner.update(s, twice, k), s, jax.random.split(key, 600))[0])
     mode = learner.act(fit(learner.init(key)), (), jnp.ones(1), key, explore=False)[0]
     assert low < mode[0] < high
+
+
+def test_the_scale_of_q_is_a_constant_of_the_actors_loss(learner, key):
+    """Q is positive everywhere, so Q / mean |Q| is 1 for any actor; the actor follows Q all the same."""
+    state = learner.init(key)
+    params = {**state.critic.params, "Dense_1": jax.tree.map(lambda x: x + 5.0, state.critic.params["Dense_1"])}
+    new, metrics = learner.update(
+        state.replace(
+            hyper=state.hyper._replace(lr_critic=f(0), actor_penalty=f(0)),
+            critic=state.critic._replace(params=params),
+        ),
+        batch_of(key),
+        key,
+    )
+    assert metrics["actor/loss"] == pytest.approx(-1.0)
+    gradient = optax.tree.norm(optax.tree.get(new.actor.moments, "mu"))  # a tenth of it
+    assert gradient > 1e-3
 
 
 def test_exploring_adds_noise(learner, key):
