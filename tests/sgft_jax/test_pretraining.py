@@ -116,6 +116,21 @@ def test_no_key_is_used_twice(algorithm):
     assert keys.used_twice(whole) == 0
 
 
+def test_a_policy_remembers_the_random_action_that_replaced_its_choice(monkeypatch):
+    """Its choice is always 0.5; what it hands on is the action that was stored, or 0 at the start of an episode."""
+    chosen = lambda agent, carry, obs, key: (jnp.full(1, 0.5), jnp.float32(0.5))  # noqa: E731
+    recipe = lambda task, config: counting(task, config)._replace(  # noqa: E731
+        act=chosen, replaced=lambda carry, action: action[0]
+    )
+    monkeypatch.setattr(pretraining, "RECIPES", {"sac": recipe})
+    config = replace(CONFIG, chunk_steps=5, env_steps=5 * N, random_ladder=1.0)
+    *_, (state, _) = pretrain(toy_terminating.make(), config, [3])
+    done = state.replay.data.action[0, 4 * N : 5 * N, 0]
+    remembered, goes_on = state.fleet.carry[0], state.fleet.state.time[0] > 0
+    np.testing.assert_array_equal(remembered, jnp.where(goes_on, done, 0.0))
+    assert goes_on.any() and (done[goes_on] == 0.5).any() and (done[goes_on] != 0.5).any()
+
+
 def test_new_worlds_begin_new_episodes(counted):
     """Nothing ends the first set's episodes but time, everything those of the second."""
     state, metrics = counted([0.0, 1.0], refresh_every=1)[-1]

@@ -26,8 +26,8 @@ def fit(rows, slope, belief, held=None, bound=np.inf):
 
 def cost(p, rows, slope, belief):
     """Nats of p [] by SciPy's distributions, up to a constant."""
-    missed = stats.multivariate_t(shape=SCALE**2 * np.eye(rows.shape[1]), df=3)
-    return -np.sum(missed.logpdf(rows - p * slope)) - stats.norm.logpdf(p, scale=belief)
+    student = stats.multivariate_t(shape=SCALE**2 * np.eye(rows.shape[1]), df=3)
+    return -student.logpdf(rows - p * slope).sum() - stats.norm.logpdf(p, scale=belief)
 
 
 @pytest.mark.parametrize("belief", [10.0, 0.2])
