@@ -166,7 +166,8 @@ def models_of(env: Env, system: tuple[Varying, ...]) -> Callable[[Array], dict[s
     worlds = env.make_worlds(
         Theta(jnp.asarray(params), jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *x.shape)), ends))
     )
-    smooth = jax.vmap(with_tensors, axis_size=n)(worlds.model)
+    numbers = {k: x for k, x in worlds.model.items() if jnp.issubdtype(x.dtype, jnp.floating)}  # no codes of shortcuts
+    smooth = jax.vmap(with_tensors, axis_size=n)(numbers)
     seen = np.asarray(jax.vmap(features)(jnp.asarray(told)), np.float64)
 
     def fitted(values: Array) -> Array:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from envs import gaps
+from envs.files import Count
 from envs.gaps import SIM
 from experiments import cells, cli
 from experiments.cells import Cell, Kind, check_begun, complete
@@ -32,7 +33,7 @@ from sgft_jax.hybrid.presets import say_preset
 from sgft_jax.hybrid.schedule import FLEET, SCHEDULES, Schedule, describe, name_of
 from sgft_jax.hybrid.scores import measures, shown
 from sgft_jax.io.jsonfile import jsonable
-from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
+from sgft_jax.io.log import EVAL, SUMMARY, check_records, read_jsonl
 from sgft_jax.io.runs import check_folder, read_own, read_starts
 from sgft_jax.types import UserError, unknown
 
@@ -235,8 +236,10 @@ def _columns(args: CompareHybridArgs) -> tuple[list[str], list[str], tuple[str, 
 def _outcome(cell: Cell, scores: list[float] | None = None) -> "Outcome":
     from sgft_jax.analysis.hybrid import outcome
 
-    run, lines = cell.args, read_jsonl(cell.folder / EVAL)
-    return outcome(_spec(run), _data_of(run), _gap_of(run), lines, scores, measures=measures(lines[0]))
+    run, lines = cell.args, read_jsonl(cell.folder / EVAL, {"step": Count, "score": list[float]})
+    others = measures(lines[0])
+    check_records(cell.folder / EVAL, lines, {"score": list[float], **dict.fromkeys(others, list[float])})
+    return outcome(_spec(run), _data_of(run), _gap_of(run), lines, scores, measures=others)
 
 
 def export(args: CompareHybridArgs, found: Sequence[Cell], to: Path) -> None:

@@ -47,7 +47,7 @@ def diagnose(
         count, name = args.rollouts or PLAYED, title(args.real)
         if is_stepped(args.real):
             where = name
-            real = _play_real(env, args, priors, count, RealStore(home / name))
+            real = _play_real(env, args, priors, count, home / name)
             simulated = play_simulated(env, priors, args.seed)
         else:
             where = f"the gap {name}"
@@ -157,14 +157,15 @@ def _play_both(env: Env, gap: Gap, priors: list[Prior], n: int, seed: int) -> tu
     return [first(one, n) for one in real], [first(one, SIMULATED) for one in simulated]
 
 
-def _play_real(env: Env, args: DiagnoseArgs, priors: list[Prior], n: int, store: RealStore) -> list[Rollouts]:
-    """Exploring rollouts [n] of every prior on a robot or an environment, each of them kept on disk."""
+def _play_real(env: Env, args: DiagnoseArgs, priors: list[Prior], n: int, home: Path) -> list[Rollouts]:
+    """Exploring rollouts [n] of every prior on a robot or an environment, each of them kept on disk in `home`."""
     system = connect(env, [args.real], (), members=len(priors), gamma=priors[0].card["gamma"], home=args.out)
-    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(_SEED), args.seed), len(store))
-    keys = jnp.broadcast_to(jax.random.split(key, n), (len(priors), n))
-    members = stacking.stack([prior.params for prior in priors])
-    kept = RecordedSystem(system, [store], done=len(store), sync_every=1 if is_robot(args.real) else None)
     try:
+        store = RealStore(home)  # after the connection, which may fail
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(_SEED), args.seed), len(store))
+        keys = jnp.broadcast_to(jax.random.split(key, n), (len(priors), n))
+        members = stacking.stack([prior.params for prior in priors])
+        kept = RecordedSystem(system, [store], done=len(store), sync_every=1 if is_robot(args.real) else None)
         played = kept.play(make_policy(priors[0].card, env), members, keys, explore=True)
     finally:
         system.close()
@@ -183,7 +184,7 @@ def read(home: Path, env: Env, priors: Sequence[Prior], most: int | None) -> tup
     Raises UserError where rollouts are not those of the task, or priors not those of the run.
     """
     store = RealStore(home)
-    stored = [store.load(i) for i in range(min(len(store), most or len(store)))]
+    stored = [store.rollout(i) for i in range(min(len(store), most or len(store)))]
     for i, arrays in enumerate(stored):
         _check(home / "real", i, arrays, stored[0], env)
     joined = {name: jnp.stack([arrays[name] for arrays in stored], axis=1) for name in _READ}
@@ -209,8 +210,6 @@ def _check(
     folder: Path, number: int, arrays: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray], env: Env
 ) -> None:
     path = folder / f"rollout-{number:06d}.npz"
-    if missing := set(_READ) - set(arrays):
-        raise UserError(f"{path}: lacks {min(missing)}; docs/formats.md lists what a rollout holds")
     sizes = {"obs": env.obs_dim, "next_obs": env.obs_dim, "action": env.act_dim}
     for name, size in sizes.items():
         if arrays[name].ndim != 3 or arrays[name].shape[-1] != size:

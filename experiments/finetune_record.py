@@ -134,7 +134,7 @@ class Record:
     def _real_steps(self) -> list[int]:
         """[S] all steps of the real system that are on disk, those of evaluations included."""
         stores = [self.real, *(RealStore(folder) for folder in sorted((self.folder / EVALUATION).glob("*")))]
-        each = [store.load(i)["valid"].sum(1) for store in stores for i in range(len(store))]
+        each = [store.rollout(i)["valid"].sum(1) for store in stores for i in range(len(store))]
         return np.sum(each, axis=0).tolist()
 
     def film(self, pool: World, play: Callable[[], Sequence[Episode]], rollouts: int) -> str:

@@ -50,25 +50,25 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
     # A robot may come back at another address.
     named = [real_systems.REMOTE if real_systems.is_robot(name) else name for name in args.real]
     homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in named}
-    opened = runs.open_runs(
-        homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
-        inputs={
-            "priors": [digest(prior) for prior in priors],
-            "real_data": [log.facts.sha256[:12] for log in logs],
-            "successors": [log.facts.successors for log in logs],
-        },
-    )  # fmt: skip
     with contextlib.ExitStack() as last:
-        for own in opened:
-            last.callback(own.close)
-        last.enter_context(mesh.use(devices))
         playing, members, cost = found, seeds, None
-        if real_systems.is_stepped(args.real[0]):
+        if real_systems.is_stepped(args.real[0]):  # before there is a folder, because it may fail
             playing = real_systems.connect(
                 env, args.real, args.set, members=len(seeds), gamma=card["gamma"], home=args.out
             )
             last.push(lambda error, *_: playing.close(over=error is None))
             members, cost = seeds * len(args.real), args.eval_episodes
+        opened = runs.open_runs(
+            homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
+            inputs={
+                "priors": [digest(prior) for prior in priors],
+                "real_data": [log.facts.sha256[:12] for log in logs],
+                "successors": [log.facts.successors for log in logs],
+            },
+        )  # fmt: skip
+        for own in opened:
+            last.callback(own.close)
+        last.enter_context(mesh.use(devices))
         setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
         assert isinstance(setup.system, Simulated | Gymnasium)
         records = [

@@ -4,19 +4,21 @@ A curve holds any score (success, return) of several members, one for each seed.
 a flat table `rows`.
 """
 
-import csv
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from msgspec import Meta
 
+from envs.files import Count
 from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean, paired_improvement
-from sgft_jax.io.log import EVAL, METRICS, SUMMARY, read_jsonl
+from sgft_jax.io.csvfile import finite, read_csv, whole
+from sgft_jax.io.log import EVAL, METRICS, SUMMARY, check_records, read_jsonl
 from sgft_jax.io.runs import read_config, read_own, read_starts
 from sgft_jax.methods import NAMES, get_method
 from sgft_jax.types import UserError
@@ -26,6 +28,8 @@ SCORES = ("success", "return")
 IDENTITY = ("task", "gap", "method", "variant", "priors")
 _NUMBERS = ("prior", "seed", "rollouts", "transitions", "minutes")
 COLUMNS = (*IDENTITY, *_NUMBERS, *SCORES, "training")
+# Of a line of eval.jsonl, beside its scores.
+_EVALUATION = {"step": Count, "rollouts": Count, "robot_minutes": Annotated[float, Meta(ge=0)]}
 _UNNAMED = re.compile(r"prior|seeds?-\d+(-\d+)?")  # folders that name no set of priors
 # Of a run's options those that are in other columns, or say nothing about its outcome; paths of a machine above all.
 _LEFT_OUT = (
@@ -259,10 +263,14 @@ def read_curve(folder: Path) -> Curve:
     records = read_jsonl(folder / EVAL) if (folder / EVAL).exists() else []
     if not records:
         raise UserError(f"{folder / EVAL}: holds no evaluation yet")
+    names = [name for name in SCORES if name in records[0]] or [SCORES[0]]
+    check_records(folder / EVAL, records, _EVALUATION | dict.fromkeys(names, list[float]))
     summary = read_own(folder / SUMMARY)
+    if (score := summary.get("score") or _judged_by(records, names)) not in names:
+        raise UserError(f"{folder / SUMMARY}: score is {score!r}, {EVAL} has {', '.join(names)}; put the files back")
     config, start = read_config(folder), last_start(folder)
     column = lambda name: np.array([record[name] for record in records])  # noqa: E731
-    scores = {name: column(name).T for name in SCORES if name in records[0]}
+    scores = {name: column(name).T for name in names}
     variant = config.get("variant") or ""
     digests, seeds = start.get("priors", []), config.get("seed", 0) + np.arange(len(next(iter(scores.values()))))
     return Curve(
@@ -277,7 +285,7 @@ def read_curve(folder: Path) -> Curve:
         transitions=column("step"),
         minutes=column("robot_minutes"),
         scores=scores,
-        score=summary.get("score") or _judged_by(records, list(scores)),
+        score=score,
         facts=_facts(summary, config, start),
         training=_training(folder / METRICS, column("rollouts")),
     )
@@ -294,6 +302,7 @@ def _training(path: Path, rollouts: np.ndarray) -> np.ndarray | None:
     records = [record for record in (read_jsonl(path) if path.exists() else []) if "real/score" in record]
     if not records:
         return None
+    check_records(path, records, {"rollouts": Count, "real/score": list[float]})
     ends = np.array([record["rollouts"] for record in records])  # a record is the mean of all rollouts since the last
     counts, scores = np.diff(ends, prepend=0), np.array([record["real/score"] for record in records]).T
     means = np.full((len(scores), len(rollouts)), np.nan)
@@ -445,7 +454,7 @@ def from_rows(table: Iterable[Mapping[str, Any]]) -> list[Curve]:
     """The curves of a flat table; inverse of `rows`. Raises UserError where members differ in their evaluations."""
     runs: dict[tuple[str, ...], dict[int, list[Mapping[str, Any]]]] = defaultdict(lambda: defaultdict(list))
     for row in table:
-        runs[tuple(row[name] for name in IDENTITY)][int(row["seed"])].append(row)
+        runs[tuple(row[name] for name in IDENTITY)][whole("seed", row["seed"])].append(row)
     return [_curve(identity, members) for identity, members in runs.items()]
 
 
@@ -454,23 +463,39 @@ def _curve(identity: tuple[str, ...], members: Mapping[int, list[Mapping[str, An
         raise UserError(f"{'/'.join(identity)}: its seeds were not evaluated after the same rollouts")
     first, *_ = members.values()
 
-    def column(name: str) -> np.ndarray:
-        return np.array([[float(row[name]) for row in each] for each in members.values()])
+    def column(name: str, read: Callable[[str, Any], float] = finite) -> np.ndarray:
+        return np.array([[read(name, row[name]) for row in each] for each in members.values()])
 
     scores = {name: column(name) for name in SCORES if first[0].get(name) not in (None, "")}
+    if not scores:
+        raise ValueError(f"{'/'.join(identity)} has no score")
+    _check_ranges(scores.get("success"), minutes := column("minutes"))
     missing = lambda row: row.get("training") in (None, "")  # noqa: E731 - at the first evaluation, or everywhere
-    training = np.array([[np.nan if missing(r) else float(r["training"]) for r in each] for each in members.values()])
+    trained = lambda row: np.nan if missing(row) else finite("training", row["training"])  # noqa: E731
+    training = np.array([[trained(row) for row in each] for each in members.values()])
     return Curve(
         *identity,
         seeds=np.array(list(members)),
-        prior=np.array([int(each[0]["prior"]) for each in members.values()]),
-        rollouts=column("rollouts")[0].astype(int),
-        transitions=column("transitions")[0].astype(int),
-        minutes=column("minutes")[0],
+        prior=np.array([_prior(each[0]["prior"]) for each in members.values()]),
+        rollouts=column("rollouts", whole)[0],
+        transitions=column("transitions", whole)[0],
+        minutes=minutes[0],
         scores=scores,
         score=next(iter(scores)),
         training=training if np.isfinite(training).any() else None,
     )
+
+
+def _check_ranges(success: np.ndarray | None, minutes: np.ndarray) -> None:
+    if success is not None and ((success < 0) | (success > 1)).any():
+        raise ValueError(f"success is {success.min():g} to {success.max():g}, not a share")
+    if minutes.min() < 0:
+        raise ValueError(f"minutes is {minutes.min():g}, less than 0")
+
+
+def _prior(cell: Any) -> int:
+    """Index of a prior; -1: unknown."""
+    return whole("prior", float(cell) + 1) - 1
 
 
 def read_data(folder: Path) -> Found:
@@ -484,15 +509,3 @@ def read_data(folder: Path) -> Found:
         return Found(from_rows(table), [])
     except ValueError as error:  # of int and float
         raise UserError(f"{folder}/curves-*.csv: {error}; put the tables back as they were") from error
-
-
-def read_csv(path: Path, *, needed: Sequence[str] = ()) -> list[dict[str, str]]:
-    """The rows of a table; none if it does not exist; raises UserError where a row lacks one of the columns needed."""
-    if not path.exists():
-        return []
-    with open(path, newline="") as file:
-        rows = list(csv.DictReader(file))
-    for i, row in enumerate(rows):
-        if absent := [name for name in needed if row.get(name) is None]:
-            raise UserError(f"{path}: row {i + 1} has no {absent[0]}; put the table back as it was")
-    return rows

@@ -17,6 +17,7 @@ from typing import Any, NotRequired, TypedDict
 from envs.files import Count, read_object
 from sgft_jax.analysis import curves
 from sgft_jax.analysis.curves import COLUMNS, IDENTITY, Curve
+from sgft_jax.io.csvfile import read_csv
 from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
 from sgft_jax.io.runs import read_config, read_starts
 from sgft_jax.types import UserError
@@ -86,7 +87,7 @@ def _tuning(path: Path) -> Iterable[dict[str, Any]]:
 
 
 def _pretraining(folder: Path) -> Iterable[dict[str, Any]]:
-    for record in read_jsonl(folder / EVAL):
+    for record in read_jsonl(folder / EVAL, {"step": Count, "success": list[float], "return": list[float]}):
         for i, success in enumerate(record["success"]):
             scores = {"success": success, "return": record["return"][i]}
             yield {**_set_of(folder), "prior": i, "env_steps": record["step"], **scores}
@@ -118,7 +119,7 @@ def merge(path: Path, new: Sequence[Mapping[str, Any]], key: Sequence[str]) -> P
         return None
     texts = [{name: _text(value) for name, value in row.items()} for row in new]
     replaced = {tuple(row[name] for name in key) for row in texts}
-    kept = [row for row in curves.read_csv(path, needed=key) if tuple(row[name] for name in key) not in replaced]
+    kept = [row for row in read_csv(path, needed=key) if tuple(row[name] for name in key) not in replaced]
     every = [*kept, *texts]
     names = COLUMNS if set(every[0]) <= set(COLUMNS) else dict.fromkeys(name for row in every for name in row)
     lines = sorted(every, key=lambda row: tuple(row[name] for name in key))  # stable: evaluations in order

@@ -106,6 +106,19 @@ def test_a_process_learns_the_same(process):
     assert len(cores()) == 1  # the others are for the learner
 
 
+def mistaken():
+    raise UserError("--options.horizon: must be at least 1")
+
+
+@pytest.mark.slow
+def test_what_is_the_users_in_a_process_is_one_line_and_no_traceback(monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([os.path.dirname(__file__), *_paths()]))
+    made = LearnerProcess(mistaken, SEEDS, WHICH, None)
+    with pytest.raises(UserError, match=r"^--options.horizon: must be at least 1$"):
+        made.wait()
+    made.close()
+
+
 @pytest.mark.slow
 def test_a_process_that_dies_is_said_in_one_line(process):
     os.kill(process._process.pid, signal.SIGKILL)

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import keys
 import numpy as np
 import pytest
 import toy
@@ -28,6 +29,11 @@ CONFIG = PretrainConfig(
     replay_capacity=4 * N * STEPS, batch_size=8, updates_per_step=1, gamma=0.9,
     network=NetworkConfig(hidden=(8,)), ensemble_size=1, size="tiny", horizon=2, plan_samples=8, gru=4,
 )  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _tiny(monkeypatch):
+    monkeypatch.setitem(tdmpc2_model.SIZES, "tiny", tdmpc2_model.Size(8, 8, 8, 2, 2))
 
 
 class Agent(struct.PyTreeNode):
@@ -91,6 +97,40 @@ def test_episodes_end_and_begin_anew_with_their_carry(counted):
     assert metrics["train/exploded"][0] == metrics["train/success"][0] == 0
 
 
+@pytest.mark.parametrize("algorithm", ["sac", "recurrent", pytest.param("tdmpc2", marks=pytest.mark.slow)])
+def test_no_key_is_used_twice(algorithm):
+    """In random experience, the first state, a chunk of two steps and new worlds."""
+    env = toy_terminating.make()
+    config = replace(
+        CONFIG, algorithm=algorithm, n_envs=2, chunk_steps=2, random_transitions=2 * LENGTH, replay_capacity=80,
+        random_ladder=0.5, batch_size=4, updates_per_step=2,
+    )  # fmt: skip
+    trainer, pool = pretraining.make_pretrainer(env, config), envs.sample_worlds(env, jax.random.key(0), 2)
+
+    def whole(key):
+        key_random, key_start = jax.random.split(key)
+        random = trainer.collect_random(pool, key_random)
+        state, _ = trainer.chunk(pool, random, trainer.init(pool, random, key_start))
+        return jax.random.normal(trainer.renew(pool, state).key)
+
+    assert keys.used_twice(whole) == 0
+
+
+def test_a_policy_remembers_the_random_action_that_replaced_its_choice(monkeypatch):
+    """Its choice is always 0.5; what it hands on is the action that was stored, or 0 at the start of an episode."""
+    chosen = lambda agent, carry, obs, key: (jnp.full(1, 0.5), jnp.float32(0.5))  # noqa: E731
+    recipe = lambda task, config: counting(task, config)._replace(  # noqa: E731
+        act=chosen, replaced=lambda carry, action: action[0]
+    )
+    monkeypatch.setattr(pretraining, "RECIPES", {"sac": recipe})
+    config = replace(CONFIG, chunk_steps=5, env_steps=5 * N, random_ladder=1.0)
+    *_, (state, _) = pretrain(toy_terminating.make(), config, [3])
+    done = state.replay.data.action[0, 4 * N : 5 * N, 0]
+    remembered, goes_on = state.fleet.carry[0], state.fleet.state.time[0] > 0
+    np.testing.assert_array_equal(remembered, jnp.where(goes_on, done, 0.0))
+    assert goes_on.any() and (done[goes_on] == 0.5).any() and (done[goes_on] != 0.5).any()
+
+
 def test_new_worlds_begin_new_episodes(counted):
     """Nothing ends the first set's episodes but time, everything those of the second."""
     state, metrics = counted([0.0, 1.0], refresh_every=1)[-1]
@@ -117,8 +157,7 @@ def test_a_set_that_is_not_due_is_never_asked_for(counted):
         pytest.param("recurrent", 1, marks=pytest.mark.slow),
     ],
 )
-def test_resumed_is_bit_for_bit_uninterrupted(algorithm, refresh_every, monkeypatch):
-    monkeypatch.setitem(tdmpc2_model.SIZES, "tiny", tdmpc2_model.Size(8, 8, 8, 2, 2))
+def test_resumed_is_bit_for_bit_uninterrupted(algorithm, refresh_every):
     env, config = (
         toy_terminating.make(),
         replace(CONFIG, algorithm=algorithm, refresh_every=refresh_every, random_ladder=0.5),

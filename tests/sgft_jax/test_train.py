@@ -5,6 +5,7 @@ import re
 
 import jax
 import jax.numpy as jnp
+import keys
 import numpy as np
 import pytest
 import toy_terminating
@@ -72,6 +73,29 @@ def run(finetuner=FINE, system=None, rollouts=4, **options):
     system = simulated() if system is None else system
     steps = train.finetune(finetuner, system, PRIORS, SEEDS, rollouts=rollouts, **options)
     return [(copied(progress), metrics) for progress, metrics in steps]
+
+
+# --- keys ------------------------------------------------------------------------------------------------------------
+
+
+def test_every_purpose_of_every_member_draws_from_keys_that_no_other_uses():
+    """Beginning, updates before the first rollout and after two, what is played to learn and what to be judged."""
+    fine = make(simulation=NEEDS)
+    rows = rows_of(10)
+    learn = train.Updates(fine, SEEDS, train.prior_of(PRIORS, SEEDS), rows)
+
+    def whole(key):
+        agent = train.begin(fine._replace(init=drawn), PRIORS, SEEDS, rows).agent
+        for parts, phase in (([0], "offline"), ([1], "logged"), ([0, 1], "online")):
+            agent, _ = learn(agent, parts, 1, phase)
+        played = [train._episode_keys(SEEDS, purpose, 0, 2) for purpose in (train._COLLECT, train._EVALUATE)]
+        played.append(train._episode_keys(SEEDS, train._COLLECT, 1, 2))
+        return agent, [jax.vmap(jax.vmap(jax.random.normal))(x) for x in played], jax.random.normal(key)
+
+    def drawn(params, key, data):
+        return fine.init(params + jax.random.normal(key), jax.random.key(77), data)
+
+    assert keys.used_twice(whole) == 0
 
 
 # --- what it yields -------------------------------------------------------------------------------------------------
