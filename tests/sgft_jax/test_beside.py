@@ -81,6 +81,38 @@ def test_a_robot_that_does_not_wait_plays_with_what_there_is():
     np.testing.assert_allclose([x[1] for x in ready.asked], [0, 3, 6, 9], atol=0.1)
 
 
+class Handed(Stepped):
+    """Episodes of three steps, each of which asks for the agent; scores rise. Until step `late` there is the old one."""
+
+    def __init__(self, learner, late):
+        super().__init__()
+        self.learner, self.late = learner, late
+        self.system = test_train.Scripted(np.repeat(np.arange(6)[:, None], 2, 1))
+
+    def play(self, policy, states, keys, *, explore):
+        for t in range(3):
+            self.learner.is_ready = t >= self.late
+            self.asked.append(states().learner)
+        return self.system.play(policy, states, keys, explore=explore)
+
+
+@pytest.mark.parametrize(("late", "behind"), [(9, 1), (2, 1), (1, 0), (0, 0)])
+def test_what_was_played_speaks_for_who_made_most_of_the_steps(late, behind):
+    """Of three steps: all, two, one or none by the agent that has not learned from the rollout before."""
+    learner = Inline(FINE)
+    found = run(system=Handed(learner, late), rollouts=6, learner=learner, waits=False)
+    best, agents = found[-1][0].best, [progress.agent.learner for progress, _ in found]
+    np.testing.assert_array_equal(best.params, agents[5 - behind])
+    assert best.rollouts.tolist() == [5 - behind] * 2 and best.score.tolist() == [3, 3]
+
+
+def test_a_rollout_that_asked_nobody_speaks_for_nobody():
+    """As those that a resumed run reads from disk."""
+    system = test_train.Scripted(np.ones((3, 2)))
+    best = run(system=system, rollouts=3, learner=Inline(FINE), waits=False)[-1][0].best
+    assert best.count.tolist() == [3, 3] and np.isneginf(best.score).all() and best.params.tolist() == [0.5, 0.0]
+
+
 # --- the process ------------------------------------------------------------------------------------------------------
 
 
