@@ -42,6 +42,7 @@ from sgft_jax.types import Array, Finetuner, Key, Metrics, PyTree, SimulatedData
 
 _FADE = 0.8  # of the challenger's evidence per learning phase
 _CREDIT = 2.0  # imagined rollouts of the challenger
+_ROUNDING = 1e-5  # relative difference of scores that says nothing
 _TOLERATED = 0.1  # by how much its share of explosions may exceed the reference's
 
 
@@ -111,7 +112,7 @@ def scored(guard: Guard, score: Array, partial: Array | float = jnp.inf) -> Guar
     )
     reference, challenger = evidence(guard)
     proven = (challenger.total + guard.worst) / (challenger.weight + 1) > _mean(reference)
-    replaced, (ours, theirs) = guard.deployed & proven, guard.exploded
+    replaced, (ours, theirs) = guard.deployed & proven & ~exploded, guard.exploded
     return guard._replace(
         reference=_choose(replaced, guard.challenger, guard.reference),
         replaced=replaced,
@@ -125,7 +126,8 @@ def learned(guard: Guard) -> Guard:
     guard = guard._replace(challenger=challenger, exploded=(guard.exploded[0], _FADE * guard.exploded[1]))
     (reference, expected), (ours, theirs) = means(guard), guard.exploded
     more = theirs / (_CREDIT + challenger.weight) - ours / jnp.maximum(guard.reference.weight, 1e-6)
-    better = (expected > reference) | ((expected == reference) & (more < 0))
+    equal = expected >= reference - _ROUNDING * jnp.abs(reference)
+    better = (expected > reference) | (equal & (more < 0))
     return guard._replace(deployed=better & (more <= _TOLERATED))
 
 
@@ -161,12 +163,12 @@ def guarded(inner: Finetuner, first: Callable[[PyTree, PyTree], PyTree], *, scor
     `train.finetune`; what is learned before the first one, as from logs, deploys nothing. Metrics: guard/challenger,
     whether it is deployed next; guard/replaced; the expected scores.
     """
-    judged_by = score
+    kind = score
 
     def init(params: PyTree, key: Key, simulated: SimulatedData | None = None) -> Guarded:
         agent = inner.init(params, key, simulated)
         # A copy: the caller may donate the state, and the prior must survive that.
-        return Guarded(agent, jax.tree.map(jnp.copy, first(params, inner.export(agent))), start(judged_by))
+        return Guarded(agent, jax.tree.map(jnp.copy, first(params, inner.export(agent))), start(kind))
 
     def export(state: Guarded) -> PyTree:
         return _choose(state.guard.deployed, inner.export(state.agent), state.reference)
@@ -177,7 +179,7 @@ def guarded(inner: Finetuner, first: Callable[[PyTree, PyTree], PyTree], *, scor
     def observe(state: Guarded, rows: Transition, valid: Array, score: Array | None) -> Guarded:
         if score is None:  # neither of the two policies has played
             return state._replace(agent=inner.observe(state.agent, rows, valid, None))
-        if judged_by == "success":  # an explosion is a failure like others
+        if kind == "success":  # an explosion is a failure like others
             guard = scored(state.guard, jnp.maximum(jnp.float32(score), 0.0))
         else:
             guard = scored(state.guard, jnp.float32(score), jnp.sum(rows.reward, where=valid))

@@ -16,6 +16,7 @@ from envs.rollout import Episode, play_episode
 from sgft_jax import evidence
 from sgft_jax.data import replay
 from sgft_jax.evidence import Best
+from sgft_jax.guard import Guarded
 from sgft_jax.mesh import split_vmap
 from sgft_jax.systems import System
 from sgft_jax.types import (
@@ -149,6 +150,8 @@ def finetune(
             progress, metrics = step.offline(progress, done, min(OFFLINE_PART, updates - done), learner, logged=True)
             yield progress, metrics
     if learner is not None:
+        if not waits and isinstance(progress.agent, Guarded):
+            raise UserError("waits=False: a guard judges rollouts by one policy; leave one of the two out")
         yield from step.beside(progress, learner, rollouts, waits=waits)
         return
     while (done := int(progress.rollouts)) < rollouts:

@@ -126,11 +126,13 @@ def test_returns_need_no_scale():
 
 
 def trials(scores, rollouts=30):
-    """How often the challenger is deployed. scores(state, i) -> the score of the i-th rollout and its part."""
-    state, flags = guard.start("return"), []
+    """Which rollouts are played by what learns, or a copy of it. scores(whether so, i) -> score, what a part scored."""
+    state, copied, flags = guard.start("return"), False, []
     for i in range(rollouts):
-        flags.append(bool(state.deployed))
-        state = guard.learned(guard.scored(state, *map(jnp.float32, scores(state, i))))
+        flags.append(copied or bool(state.deployed))
+        state = guard.scored(state, *map(jnp.float32, scores(flags[-1], i)))
+        copied |= bool(state.replaced)
+        state = guard.learned(state)
     return flags, state
 
 
@@ -143,18 +145,18 @@ BOOM = (-np.inf, -2.0)  # an explosion after two steps
 
 def test_a_challenger_that_explodes_is_tried_and_given_up():
     """Rewards are costs, so that a part costs less than the whole; the worst score known is close to the others."""
-    flags, state = trials(lambda state, i: BOOM if state.deployed else whole(i))
-    assert any(flags) and sum(flags) <= 5 and state.worst > -12.2 and not state.replaced
-    won, _ = trials(lambda state, i: BOOM if state.deployed and i < 10 else whole(i - 5 * bool(state.deployed)))
-    assert sum(won[10:]) > sum(flags[10:])  # it may mend
+    flags, state = trials(lambda learns, i: BOOM if learns else whole(i))
+    assert any(flags) and sum(flags) <= 5 and state.worst > -12.2
+    mended, _ = trials(lambda learns, i: (-10, np.inf) if learns and i > 9 else BOOM if learns else whole(i))
+    assert sum(mended[10:]) > 10
 
 
 @pytest.mark.parametrize("part", [-2.0, 3.0])
 def test_where_the_reference_explodes_the_challenger_takes_over(part):
     """Also where nothing whole has ever been scored; and for good, if it is whole."""
-    flags, state = trials(lambda state, i: whole(i) if state.deployed else (-np.inf, part), 8)
+    flags, state = trials(lambda learns, i: whole(i) if learns else (-np.inf, part), 8)
     assert flags == [False] + [True] * 7 and all(np.isfinite(guard.means(state)))
-    flags, _ = trials(lambda state, i: (-np.inf, part), 8)
+    flags, _ = trials(lambda learns, i: (-np.inf, part), 8)
     assert flags == [False] + [True] * 7  # neither works, so the one that learns goes on
 
 
