@@ -24,7 +24,7 @@ CONFIG, PROVENANCE = "config.json", "provenance.json"
 ROOT = Path(__file__).parents[2]  # of the repository, in a checkout
 _LOCK = ".lock"
 _MARK = "sgft_jax"
-FORMAT = 2  # of run folders; a state saved by another format does not fit the code of this one
+FORMAT = 3  # of run folders; a state saved by another format does not fit the code of this one
 # What a start has to show for itself; one that has failed before any of it is there can be forgotten.
 _RESULTS = ("checkpoints/[0-9]*", "real/*.npz", "evaluation/*/real/*.npz", "prior/*", "policy/*", "summary.json")
 _PACKAGES = ("sgft-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")

@@ -211,6 +211,23 @@ def test_better_is_a_higher_score_then_a_higher_return():
     assert keep_better(old, best(0.1, 0.0, 2), 1.5).steps == 2, "an early evaluation does not compete"
 
 
+def test_a_policy_that_explodes_is_not_the_better_one():
+    """Costs of 12 or so for a whole episode; the worst known of both evaluations counts for those that exploded."""
+
+    def best(score, steps, exploded, worst):
+        score = jnp.float32(score)
+        return Best(jnp.int32(steps), score, score, jnp.int32(steps), jnp.float32(exploded), jnp.full(2, worst))
+
+    whole = best(-12.0, 1, 0.0, -13.0)
+    for score, exploded, worst in [(-2.0, 1.0, -2.0), (-11.0, 0.9, -11.0), (-12.0, 0.1, -12.0)]:
+        bursts = best(score, 2, exploded, worst)
+        assert keep_better(whole, bursts, 0.0).steps == 1 and keep_better(bursts, whole, 0.0).steps == 1
+    kept = keep_better(best(-11.0, 2, 0.5, -12.0), whole, 0.0)
+    assert kept.steps == 2 and kept.score == -11.5 and kept.worst.tolist() == [-13, -13]
+    same = best(-12.0, 2, 1.0, -12.0)
+    assert keep_better(same, best(-12.0, 1, 0.0, -12.0), 0.0).steps == 1  # at the same cost, whole
+
+
 @pytest.mark.parametrize("algorithm", ["sac", "tdmpc2", "recurrent"])
 def test_the_learning_rate_falls_linearly_to_its_end(algorithm):
     config = replace(PRESETS["cpu"], algorithm=algorithm, size="1M", n_envs=10, env_steps=1000, lr=1e-3, lr_end=0.1)
