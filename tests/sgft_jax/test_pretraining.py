@@ -131,6 +131,25 @@ def test_a_policy_remembers_the_random_action_that_replaced_its_choice(monkeypat
     assert goes_on.any() and (done[goes_on] == 0.5).any() and (done[goes_on] != 0.5).any()
 
 
+def test_statistics_are_those_of_the_steps_that_did_not_explode(monkeypatch):
+    """Half of the random steps explode, and leave the end of their buffer empty."""
+    monkeypatch.setattr(pretraining, "RECIPES", {"sac": counting})
+    env = toy_terminating.make()
+    step = lambda world, state, action, key: env.step(world, state, action, key)._replace(invalid=action[0] > 0)  # noqa: E731
+    trainer, pool = (
+        pretraining.make_pretrainer(env._replace(step=step), CONFIG),
+        envs.sample_worlds(env, jax.random.key(0), 4, params={"risk": 0.0}),
+    )
+    random = jax.jit(trainer.collect_random)(pool, jax.random.key(1))
+    held, rows = int(random.size), len(random.data.reward)
+    assert 0.4 * rows < held < 0.6 * rows
+    statistics = jax.jit(trainer.init)(pool, random, jax.random.key(2)).learner.normalizer
+    seen = np.asarray(random.data.obs)[:held, 0]
+    assert statistics.mean[0] == pytest.approx(seen.mean(), rel=1e-4)
+    assert statistics.std[0] == pytest.approx(seen.std(), rel=1e-4)
+    assert seen.mean() < -0.02
+
+
 def test_new_worlds_begin_new_episodes(counted):
     """Nothing ends the first set's episodes but time, everything those of the second."""
     state, metrics = counted([0.0, 1.0], refresh_every=1)[-1]
