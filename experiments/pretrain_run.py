@@ -143,7 +143,10 @@ class _Run:
     def _first_best(self, state: PretrainState) -> Best:
         """What any evaluation is better than."""
         none = jnp.full(len(self.seeds), -jnp.inf)
-        return Best(exported(self.env, self.config, state), none, none, state.steps)
+        unknown = jnp.full((len(self.seeds), 2), jnp.inf)
+        return Best(
+            exported(self.env, self.config, state), none, none, state.steps, jnp.zeros(len(self.seeds)), unknown
+        )
 
     def _random(self) -> PyTree:
         """Experience under random actions: collected once, then read from disk."""

@@ -44,10 +44,10 @@ class LearnerProcess:
         """Until the process is up, so that its start disturbs no robot. Raises UserError if it is gone, or its own."""
         self._result.result()
 
-    def submit(self, agent: PyTree, parts: Sequence[int], updates: int, phase: Phase) -> None:
+    def submit(self, agent: PyTree, parts: Sequence[int], updates: int | Array, phase: Phase) -> None:
         """Begins the learning phases `parts`, when those before are done."""
         self.wait()
-        self._talk(lambda: self._connection.send((jax.device_get(agent), list(parts), updates, phase)))
+        self._talk(lambda: self._connection.send((*jax.device_get((agent, list(parts), updates)), phase)))
         self._result = self._receiver.submit(self._receive)
 
     def ready(self) -> bool:

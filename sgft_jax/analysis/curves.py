@@ -313,24 +313,28 @@ def _training(path: Path, rollouts: np.ndarray) -> np.ndarray | None:
 
 
 def make_curve(
-    evaluations: Mapping[int, Any], task: Any, *, gap: str, method: str, seeds: Sequence[int], variant: str = ""
-) -> Curve:
+    evaluations: Mapping[int, Any], task: Any, *, gap: str, method: str, seeds: Sequence[int], variant: str = "",
+    transitions: Sequence[float] | None = None,
+) -> Curve:  # fmt: skip
     """A curve from Python alone, without a run folder.
 
     evaluations: the real rollouts made so far -> what `sgft_jax.evaluate` played then, episodes [members, n]. task: the
-    `Env`. gap, method, variant: names for tables and figures. seeds: [members].
+    `Env`. gap, method, variant: names for tables and figures. seeds: [members]. transitions: [evaluations] real ones
+    made so far, such as the mean of `FinetuneProgress.transitions`; None where no rollout ended early.
     """
+    from envs.rollout import counted  # brings JAX, which reading curves does without
+
     played, rollouts = list(evaluations.values()), np.array(list(evaluations))
-    mean_of = lambda name: np.stack([np.asarray(getattr(x, name)).mean(1) for x in played], axis=1)  # noqa: E731
-    transitions = rollouts * task.episode_length
+    mean_of = lambda each: np.stack([np.asarray(each(x)).mean(1) for x in played], axis=1)  # noqa: E731
+    made = rollouts * task.episode_length if transitions is None else np.rint(transitions).astype(int)
     return Curve(
         task.name, gap, method, variant, priors="",
         seeds=np.asarray(seeds),
         prior=np.full(len(seeds), -1),
         rollouts=rollouts,
-        transitions=transitions,
-        minutes=transitions * task.control_dt / 60,
-        scores={"success": mean_of("success"), "return": mean_of("total_reward")},
+        transitions=made,
+        minutes=made * task.control_dt / 60,
+        scores={"success": mean_of(lambda x: x.success), "return": mean_of(lambda x: counted(x)[1])},
         score=task.score,
     )  # fmt: skip
 

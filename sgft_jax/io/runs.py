@@ -23,7 +23,7 @@ from sgft_jax.types import UserError
 CONFIG, PROVENANCE = "config.json", "provenance.json"
 ROOT = Path(__file__).parents[2]  # of the repository, in a checkout
 _MARK = "sgft_jax"
-FORMAT = 2  # of run folders; a state saved by another format does not fit the code of this one
+FORMAT = 3  # of run folders; a state saved by another format does not fit the code of this one
 # What a start has to show for itself; one that has failed before any of it is there can be forgotten.
 _STEPS = ("checkpoints/[0-9]*", f"checkpoints/{ASIDE}[0-9]*")
 _RESULTS = (*_STEPS, "real/*.npz", "evaluation/*/real/*.npz", "prior/*", "policy/*", "summary.json")

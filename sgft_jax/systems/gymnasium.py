@@ -14,7 +14,7 @@ import numpy as np
 
 from envs.base import Entry, Env
 from envs.history import remember, with_memory
-from envs.rollout import Episode, episode_keys
+from envs.rollout import Episode, episode_keys, judged
 from sgft_jax import extend
 from sgft_jax.mesh import split_vmap
 from sgft_jax.systems import answers
@@ -177,7 +177,7 @@ class Gymnasium:
             total_reward=total,
             success=succeeded & ~exploded,
             exploded=exploded,
-            score=(succeeded & ~exploded).astype(jnp.float32) if env.score == "success" else total,
+            score=judged(env, total, succeeded & ~exploded, exploded),
             world=jnp.zeros(len(valid), jnp.int32),
             trace=jnp.zeros((len(valid), env.episode_length + 1, 0)),
             command=kept(rows.command),

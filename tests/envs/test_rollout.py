@@ -11,7 +11,7 @@ import toy
 import toy_terminating
 
 import envs
-from envs.rollout import launch, pick, play_episode, pool_size, step_fleet
+from envs.rollout import counted, launch, pick, play_episode, pool_size, step_fleet
 from sgft_jax.types import UserError
 
 N = 64
@@ -88,6 +88,39 @@ def test_an_explosion_after_the_end_is_none(key):
         pool = envs.sample_worlds(env, key, 1, params={"risk": risk})
         played = play_episode(late, pool, counting, jnp.int32(0), key, gamma=1.0)
         assert bool(played.exploded) == exploded and played.valid.sum() == 1
+
+
+@pytest.fixture(scope="module")
+def costly():
+    """Five episodes in which each step costs 1; all but one of them explode, later and later, one at once."""
+    env = toy_terminating.make()
+    pool = envs.sample_worlds(env, jax.random.key(0), 1, params={"risk": 0.0})
+
+    def play(boom):
+        def step(*given):
+            after = env.step(*given)
+            return after._replace(reward=jnp.float32(-1), invalid=after.time >= boom)
+
+        return play_episode(env._replace(step=step), pool, counting, jnp.int32(0), jax.random.key(1), gamma=1.0)
+
+    return jax.jit(jax.vmap(play))(jnp.array([1, 3, 99, 2, 12]))
+
+
+def test_an_episode_that_exploded_scores_less_than_any_whole_one(costly):
+    assert costly.total_reward.tolist() == [0, -2, -12, -1, -11]
+    assert costly.score.tolist() == [-np.inf, -np.inf, -12, -np.inf, -np.inf]
+    assert int(jnp.argmax(costly.score)) == 2
+
+
+@pytest.mark.parametrize("kind", [jnp.asarray, np.asarray])
+def test_explosions_count_as_the_worst_that_is_known(costly, kind):
+    episodes = jax.tree.map(kind, costly)
+    for found in counted(episodes):
+        assert found.tolist() == [-12] * 5 and isinstance(found, type(kind(0.0)))
+    score, total = counted(episodes, kind([[-20.0, -30.0]])[0])
+    assert score.tolist() == [-20, -20, -12, -20, -20] and total.tolist() == [-30, -30, -12, -30, -30]
+    burst = jax.tree.map(lambda x: x[:2], episodes)  # none is whole
+    assert counted(burst)[0].tolist() == [-2, -2]
 
 
 def test_a_fleet_starts_episodes_anew_with_their_carry():

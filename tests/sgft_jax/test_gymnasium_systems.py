@@ -214,6 +214,14 @@ def test_an_invalid_step_ends_the_episode_and_is_not_kept(bad):
     assert all(np.isfinite(x).all() for x in episode.transitions) and len(real.actions) == 2
 
 
+def test_an_episode_that_was_broken_off_scores_less_than_any_whole_one():
+    """Where the task is judged by its return, which may be less the longer an episode lasts."""
+    env = toy.make()._replace(score="return")
+    broken, whole = (play(Spoken(says={2: {"invalid": True}} if own else {}), env) for own in (True, False))
+    assert np.isneginf(broken.score) and broken.exploded and np.isfinite(broken.total_reward)
+    assert whole.score == whole.total_reward and not whole.exploded
+
+
 @pytest.mark.slow
 def test_it_is_a_system_that_setup_takes():
     """Two seeds learn on two environments; their policies part from the prior's."""

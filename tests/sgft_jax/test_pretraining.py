@@ -131,6 +131,25 @@ def test_a_policy_remembers_the_random_action_that_replaced_its_choice(monkeypat
     assert goes_on.any() and (done[goes_on] == 0.5).any() and (done[goes_on] != 0.5).any()
 
 
+def test_statistics_are_those_of_the_steps_that_did_not_explode(monkeypatch):
+    """Half of the random steps explode, and leave the end of their buffer empty."""
+    monkeypatch.setattr(pretraining, "RECIPES", {"sac": counting})
+    env = toy_terminating.make()
+    step = lambda world, state, action, key: env.step(world, state, action, key)._replace(invalid=action[0] > 0)  # noqa: E731
+    trainer, pool = (
+        pretraining.make_pretrainer(env._replace(step=step), CONFIG),
+        envs.sample_worlds(env, jax.random.key(0), 4, params={"risk": 0.0}),
+    )
+    random = jax.jit(trainer.collect_random)(pool, jax.random.key(1))
+    held, rows = int(random.size), len(random.data.reward)
+    assert 0.4 * rows < held < 0.6 * rows
+    statistics = jax.jit(trainer.init)(pool, random, jax.random.key(2)).learner.normalizer
+    seen = np.asarray(random.data.obs)[:held, 0]
+    assert statistics.mean[0] == pytest.approx(seen.mean(), rel=1e-4)
+    assert statistics.std[0] == pytest.approx(seen.std(), rel=1e-4)
+    assert seen.mean() < -0.02
+
+
 def test_new_worlds_begin_new_episodes(counted):
     """Nothing ends the first set's episodes but time, everything those of the second."""
     state, metrics = counted([0.0, 1.0], refresh_every=1)[-1]
@@ -209,6 +228,23 @@ def test_better_is_a_higher_score_then_a_higher_return():
         kept = keep_better(old, best(score, total, 2), 0.0)
         assert kept.steps == steps and kept.params["w"].tolist() == [steps, steps]
     assert keep_better(old, best(0.1, 0.0, 2), 1.5).steps == 2, "an early evaluation does not compete"
+
+
+def test_a_policy_that_explodes_is_not_the_better_one():
+    """Costs of 12 or so for a whole episode; the worst known of both evaluations counts for those that exploded."""
+
+    def best(score, steps, exploded, worst):
+        score = jnp.float32(score)
+        return Best(jnp.int32(steps), score, score, jnp.int32(steps), jnp.float32(exploded), jnp.full(2, worst))
+
+    whole = best(-12.0, 1, 0.0, -13.0)
+    for score, exploded, worst in [(-2.0, 1.0, -2.0), (-11.0, 0.9, -11.0), (-12.0, 0.1, -12.0)]:
+        bursts = best(score, 2, exploded, worst)
+        assert keep_better(whole, bursts, 0.0).steps == 1 and keep_better(bursts, whole, 0.0).steps == 1
+    kept = keep_better(best(-11.0, 2, 0.5, -12.0), whole, 0.0)
+    assert kept.steps == 2 and kept.score == -11.5 and kept.worst.tolist() == [-13, -13]
+    same = best(-12.0, 2, 1.0, -12.0)
+    assert keep_better(same, best(-12.0, 1, 0.0, -12.0), 0.0).steps == 1  # at the same cost, whole
 
 
 @pytest.mark.parametrize("algorithm", ["sac", "tdmpc2", "recurrent"])

@@ -3,11 +3,13 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from runs_by_hand import save
 
+from envs.rollout import Episode
 from sgft_jax.analysis.curves import (
     COLUMNS,
     Curve,
@@ -21,6 +23,7 @@ from sgft_jax.analysis.curves import (
     from_main_priors,
     from_rows,
     improvement,
+    make_curve,
     read_curve,
     read_data,
     read_runs,
@@ -271,3 +274,17 @@ def test_a_summary_of_another_score_is_refused(tmp_path):
     (folder / "summary.json").write_text('{"score": "fame"}')
     with pytest.raises(UserError, match=r"summary.json: score is 'fame', eval.jsonl has success, return"):
         read_curve(folder)
+
+
+def test_a_curve_from_python_counts_what_it_is_told():
+    """Two rollouts of seven steps together; of two episodes one exploded, and its part of the cost is no return."""
+    total, exploded = np.array([[-12.0, -2.0]]), np.array([[False, True]])
+    score, no = np.where(exploded, -np.inf, total), np.zeros((1, 2), bool)
+    task = SimpleNamespace(name="toy", episode_length=20, control_dt=0.1, score="return")
+    played = {0: Episode(None, None, total, no, no, total, None, None),
+              2: Episode(None, None, total, no, exploded, score, None, None)}  # fmt: skip
+    given = {"gap": "default", "method": "sac", "seeds": [0]}
+    found = make_curve(played, task, transitions=[0, 7], **given)
+    assert found.transitions.tolist() == [0, 7] and found.minutes[1] == pytest.approx(0.7 / 60)
+    assert found.values.tolist() == [[-7, -12]]
+    assert make_curve(played, task, **given).transitions.tolist() == [0, 40]

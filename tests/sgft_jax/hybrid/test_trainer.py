@@ -14,6 +14,7 @@ from envs import gaps
 from envs.control import cartpole
 from envs.gaps import Gap
 from envs.pools import real_worlds
+from envs.rollout import step_fleet
 from sgft_jax.data import replay
 from sgft_jax.hybrid import trainer
 from sgft_jax.hybrid.methods import NAMES, get_method
@@ -68,6 +69,20 @@ def played(agent, schedule=SCHEDULE, masses=(1.0,), seeds=(0,), **given):
 def plain(state):
     """Without random keys, which numpy cannot read."""
     return state._replace(key=jax.random.key_data(state.key), fleet=None)
+
+
+@pytest.mark.slow
+def test_nothing_is_learned_while_every_simulator_explodes(monkeypatch):
+    """No row is kept then, and an empty buffer gives zeros."""
+    monkeypatch.setattr(
+        trainer, "step_fleet", lambda env, *given, **more: step_fleet(
+            env._replace(step=lambda *step: env.step(*step)._replace(invalid=jnp.ones((), bool))), *given, **more
+        ),
+    )  # fmt: skip
+    (start, _), (state, metrics), *_ = played(build())
+    assert int(state.simulated.size[0]) == 0 and int(state.rounds[0]) == 2
+    chex.assert_trees_all_equal(state.learner, start.learner)
+    assert all(np.isnan(values).all() for values in metrics.values())
 
 
 def test_each_round_collects_and_learns():

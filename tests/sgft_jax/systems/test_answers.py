@@ -87,7 +87,7 @@ def test_what_was_sent_is_brought_within_the_bounds_by_rounding_alone():
         ([[1.0], [2.0, 3.0]], "not numbers alone"),
         ((np.zeros(2), {}), "not numbers alone"),
         (np.array([1j, 0]), "not numbers alone"),
-        (np.array([object(), 0]), "not numbers alone"),
+        (np.array([None, 0]), "not numbers alone"),
     ],
     ids=str,
 )
