@@ -201,7 +201,7 @@ def _checked(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]
         "reward": number,
         "discount": number,
     }
-    beside = {"total_reward": (n,), "score": (n,), "world": (n,), "late": number, "time": number}
+    beside = {"total_reward": (n,), "score": (n,), "world": (n,), "late": (n, None), "time": (n, None)}
     read = dict(arrays, valid=valid)
     for name in {"success", "exploded"} & set(arrays):
         read[name] = flags(path, name, arrays[name], (n,), fix=_FIX)

@@ -398,7 +398,8 @@ class Counter:
         obs = number + jnp.broadcast_to(jnp.array([0.0, 0.5])[:, None, None, None], (*shape, 2))
         rows = Transition(obs, jnp.zeros((*shape, 1)), jnp.ones(shape), jnp.ones(shape), obs)
         each, no = jnp.zeros(shape[:2]), jnp.zeros(shape[:2], bool)
-        return Episode(rows, jnp.ones(shape, bool), each, no, no, each, each.astype(int), jnp.zeros((*shape, 2)))
+        trace = jnp.zeros((*shape[:2], shape[2] + 1, 2))
+        return Episode(rows, jnp.ones(shape, bool), each, no, no, each, each.astype(int), trace)
 
 
 def play(system, *, explore=True):

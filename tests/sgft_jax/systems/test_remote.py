@@ -665,7 +665,7 @@ def test_a_permanent_mistake_of_the_driver_ends_in_one_line(pair, mistake, words
         for episode in range(9):
             begin(own, episode)
             assert move(own, RIGHT).info["invalid"]
-    assert len(driver.resets) == 5 and driver.stops >= 5
+    assert 5 <= len(driver.resets) < 9 and driver.stops >= 5  # a slow answer is asked for again
     assert all(line.isprintable() and len(line) <= 600 for line in [str(stopped.value)[:600], *own.said])
 
 
