@@ -149,19 +149,20 @@ class _Quiet:
     def __init__(self, hook: Callable[..., object]) -> None:
         self.hook = hook
 
-    def __call__(self, *failed: Any) -> None:
-        """Of a thread one object, else what `sys.excepthook` gets; both hold type, error and traceback."""
-        _, error, *_ = failed[0] if len(failed) == 1 else failed
+    def __call__(self, failed: Any) -> None:
+        """failed: one object that begins with type and error."""
+        _, error, *_ = failed
         # The second one is a checkpoint's writer that reports to a loop which has given up; it goes on after `main`.
         if _disk_trouble(error) is None and str(error) != "Event loop is closed":
-            self.hook(*failed)
+            self.hook(failed)
 
 
 def _quiet_threads() -> None:
     """Libraries write in threads of their own, each of which would print its own traceback."""
-    for module in (sys, threading):
-        if not isinstance(module.excepthook, _Quiet):
-            module.excepthook = _Quiet(module.excepthook)
+    if not isinstance(threading.excepthook, _Quiet):
+        threading.excepthook = _Quiet(threading.excepthook)
+    if not isinstance(sys.unraisablehook, _Quiet):
+        sys.unraisablehook = _Quiet(sys.unraisablehook)
 
 
 @contextlib.contextmanager
@@ -310,7 +311,7 @@ def set_up() -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # the C++ logs of XLA
     for name in ("jax", "tensorboardX"):
         logging.getLogger(name).setLevel(logging.ERROR)
-    for name in ("absl", "orbax"):  # they log the errors that they raise, with a traceback
+    for name in ("absl", "asyncio", "orbax"):  # they log the errors that they raise, with a traceback
         logging.getLogger(name).setLevel(logging.CRITICAL)
 
 

@@ -9,6 +9,7 @@ from experiments.options import (
     Impl,
     Successors,
     at_least_one,
+    check_prior,
     check_variant,
     not_negative,
     prior_folders,
@@ -114,20 +115,21 @@ def with_settings(args: FinetuneArgs, settings: Mapping[str, Any]) -> FinetuneAr
 
 def run_folder(args: FinetuneArgs, real: str) -> Path:
     """Where the run on that real system lives; the seeds of one call share a folder."""
-    system = "_".join([title(real), *(change.replace("/", "") for change in args.set)])
+    system = "_".join([title(real), *args.set]).replace("/", "")
+    extend.folder_name("--set", system)
     seeds = seeds_name(seed_list(args.seed, args.seeds))
     return args.out / "finetune" / extend.name_of(args.task) / system / label(args) / seeds
 
 
 def label(args: FinetuneArgs) -> str:
     """The method with its variant, as folders and figures name it."""
-    return "_".join(filter(None, [get_method(args.method).name, args.variant]))
+    return extend.folder_name("--variant", "_".join(filter(None, [get_method(args.method).name, args.variant])))
 
 
 def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
     """The method and the seeds; raises UserError for what is wrong in the arguments and with the run folders."""
     at_least_one(args, "rollouts", "eval_every", "checkpoint_every", "sync_every")
-    not_negative(args, "eval_episodes")
+    not_negative(args, "eval_episodes", "devices")
     method, seeds = get_method(args.method), seed_list(args.seed, args.seeds)
     if not isinstance(args.options, method.config):
         raise UserError(f"--method {method.name}: the options are those of another method")
@@ -192,4 +194,7 @@ def priors_of(args: FinetuneArgs) -> list[Path]:
     """The folders of the priors to start from, none where the user says so; raises UserError where there is none."""
     if args.prior == NO_PRIOR:
         return []
-    return prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
+    folders = prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
+    for folder in folders:
+        check_prior(folder, get_method(args.method), extend.name_of(args.task))
+    return folders

@@ -17,6 +17,7 @@ from experiments import cli, logged, real_systems
 from experiments.evaluation import scores
 from experiments.finetune_args import VOLATILE, FinetuneArgs, run_folder
 from experiments.finetune_record import Record, evaluation_store
+from experiments.memory import reserve
 from experiments.recorded import RecordedSystem
 from sgft_jax import api, mesh, train
 from sgft_jax.api import Setup
@@ -50,17 +51,7 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
     # A robot may come back at another address.
     named = [real_systems.REMOTE if real_systems.is_robot(name) else name for name in args.real]
     homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in named}
-    opened = runs.open_runs(
-        homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
-        inputs={
-            "priors": [digest(prior) for prior in priors],
-            "real_data": [log.facts.sha256[:12] for log in logs],
-            "successors": [log.facts.successors for log in logs],
-        },
-    )  # fmt: skip
     with contextlib.ExitStack() as last:
-        for own in opened:
-            last.callback(own.close)
         last.enter_context(mesh.use(devices))
         playing, members, cost = found, seeds, None
         if real_systems.is_stepped(args.real[0]):
@@ -71,6 +62,18 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
             members, cost = seeds * len(args.real), args.eval_episodes
         setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
         assert isinstance(setup.system, Simulated | Gymnasium)
+        _reserve(args, setup, devices)
+        # Last: what is wrong with a robot or with a method of the user's own leaves no folder behind.
+        opened = runs.open_runs(
+            homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
+            inputs={
+                "priors": [digest(prior) for prior in priors],
+                "real_data": [log.facts.sha256[:12] for log in logs],
+                "successors": [log.facts.successors for log in logs],
+            },
+        )  # fmt: skip
+        for own in opened:
+            last.callback(own.close)
         records = [
             Record(
                 own.folder, setup.system.env, gap, method.name, seeds, evaluations_cost=cost,
@@ -85,6 +88,15 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
             last.callback(learner.close)
             learner.wait()
         return _Run(args, setup, setup.system, card, records, logs, learner).work()
+
+
+def _reserve(args: FinetuneArgs, setup: Setup, devices: int) -> None:
+    """Raises UserError where the devices have no room for all members and their batches."""
+    begin = functools.partial(train.begin, setup.finetuner, setup.priors, setup.seeds, setup.simulated)
+    kept = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(begin)))
+    row = 4 * (2 * setup.system.env.obs_dim + setup.system.env.act_dim + 2)
+    batch = row * args.options.batch_size * len(setup.seeds)
+    reserve({"replay_capacity": kept, "batch_size": batch}, copies=1, devices=devices, settings="options")
 
 
 def _build(args: FinetuneArgs, folders: list[Path], priors: list[Prior]) -> Callable[[], Finetuner]:

@@ -52,7 +52,7 @@ class GridArgs:
 def check(args: GridArgs) -> None:
     """Raises UserError for what is wrong in the arguments alone."""
     at_least_one(args, "rollouts", "eval_every")
-    not_negative(args, "minutes")
+    not_negative(args, "minutes", "devices")
     for name, given in (("tasks", args.tasks), ("methods", args.methods), ("reals", args.reals)):
         if not given:
             raise UserError(f"--{name}: name at least one")

@@ -10,8 +10,8 @@ import envs
 from envs import gaps
 from envs.files import read_object
 from sgft_jax import checks, extend, types
-from sgft_jax.presets import PRESETS
-from sgft_jax.types import UserError, unknown
+from sgft_jax.presets import PRESETS, check_card
+from sgft_jax.types import Method, UserError, unknown
 
 SHIPPED = Path("docs/priors")  # in the folder of the code, where commands are usually typed
 _LAST_PORT = 65_535
@@ -81,11 +81,12 @@ def check_variant(variant: str) -> None:
         extend.folder_name("--variant", variant)
 
 
-def check_task(task: str, reals: Sequence[str] = ()) -> None:
-    """Raise UserError where there is no such task, or no such real system of it, by name or file."""
+def check_task(task: str, reals: Sequence[str] = (), changes: Sequence[str] = ()) -> None:
+    """Raise UserError where there is no such task, or no such real system of it, or for changes that set nothing."""
     name = envs.name_of(task)
     for real in reals:
         gaps.find(name, real)
+    gaps.changes(changes)
 
 
 def at_least_one(args: object, *names: str) -> None:
@@ -146,6 +147,14 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str, opti
 def card_of_prior(folder: Path) -> dict[str, Any]:
     """The card of a prior; raises UserError where it names no task."""
     return read_object(folder / "prior.json", {"task": str}, "name it with --task, or take another prior")
+
+
+def check_prior(folder: Path, method: Method, task: str) -> None:
+    """Raises UserError for a prior of another algorithm or task than the method needs, before anything is loaded."""
+    try:
+        check_card(card_of_prior(folder), method, task)
+    except UserError as error:
+        raise UserError(f"--prior {folder}: {error}") from error
 
 
 def task_of_prior(folder: Path) -> str:

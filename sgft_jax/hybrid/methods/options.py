@@ -73,7 +73,7 @@ class EnsembleOptions(ActorCriticOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.at_least(self, 2, "critics")
+        checks.few(self, 2, "critics")
         checks.not_negative(self, "diversity")
 
 
