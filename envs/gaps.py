@@ -64,7 +64,7 @@ def read_file(path: str | Path) -> dict[str, Gap]:
     path = Path(path)
     table = read_json(path) if path.suffix == ".json" else read_toml(path)
     if not _holds_several(table):
-        return {path.stem: _parse(extend.folder_name(f"{path}:", path.stem), table, where=str(path))}
+        return {path.stem: _parse(extend.folder_name(f"{path}: the name", path.stem), table, where=str(path))}
     for name in table:
         extend.folder_name(f"{path}: the gap", name)
     return {name: _parse(name, own, where=f"{path} [{name}]") for name, own in table.items()}

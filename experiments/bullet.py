@@ -91,6 +91,8 @@ def check(args: BulletArgs) -> None:
     at_least_one(args, "seeds", "rollouts", "episodes", "jobs")
     not_negative(args, "minutes")
     seed_list(args.seed, args.seeds)
+    if not args.methods:
+        raise UserError("--methods: name at least one")
     without_repeats("--methods", args.methods)
     check_folder(args.out)
     folders = prior_folders(args.prior, out=args.out, task=TASK, preset="")

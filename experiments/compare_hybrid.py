@@ -170,8 +170,11 @@ def defaults(argv: Sequence[str]) -> CompareHybridArgs:
 def check(args: CompareHybridArgs) -> None:
     """Raises UserError for what is wrong in the arguments alone."""
     at_least_one(args, "eval_every", "eval_episodes")
-    not_negative(args, "previous_actions", "minutes")
+    not_negative(args, "previous_actions", "minutes", "beside")
     seed_list(args.seed, args.seeds)
+    check_task(args.task)
+    if not args.methods:
+        raise UserError("--methods: name at least one")
     if not args.gaps:
         raise UserError(f"--gaps: {extend.name_of(args.task)} comes with none; name some, or {SIM} for no gap")
     for name, given in (("methods", args.methods), ("gaps", args.gaps), ("data", tuple(map(data_name, args.data)))):
@@ -186,6 +189,7 @@ def check(args: CompareHybridArgs) -> None:
         raise UserError(f"--data: {learning[0]} learns from real data; name files or folders (docs/data.md)")
     if args.released is None and (missing := [path for path in args.data if not path.exists()]):
         raise UserError(f"--data {missing[0]}: no such file")
+    check_folder(args.out)
     if args.export is not None:
         check_folder(args.export, "--export")
     if args.export is not None and args.released is not None:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments import cli
-from experiments.options import Impl, at_least_one, prior_folders, seed_list, task_of_prior
+from experiments.options import Impl, at_least_one, prior_folders, seed_list, task_of_priors
 from experiments.real_systems import check as check_real
-from experiments.rollouts import config_of, home_of
+from experiments.rollouts import config_of, home_of, task_of
 from sgft_jax.io.runs import check_folder
 from sgft_jax.presets import DEFAULT_PRESET
 from sgft_jax.types import UserError
@@ -74,7 +74,7 @@ def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
     check_folder(args.out / "diagnose")
     recorded = home_of("--real", Path(args.real)) if Path(args.real).is_dir() else None
     config = config_of(recorded) if recorded else {}
-    task, prior = args.task or config.get("task"), args.prior
+    task, prior = args.task or (task_of(recorded, None) if recorded and config else None), args.prior
     if task is not None:
         check_real(task, [] if recorded else [args.real])
     if prior is None and task is None:
@@ -82,7 +82,7 @@ def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
     if prior is None and config.get("prior"):
         prior = Path(config["prior"])
     folders = prior_folders(prior, out=args.out, task=task or "", preset=config.get("preset") or args.preset)
-    task = task or task_of_prior(folders[0])
+    task = task_of_priors(folders, task)
     check_real(task, [] if recorded else [args.real])
     return folders, task, recorded
 

@@ -11,7 +11,7 @@ from experiments.cli import columns
 from experiments.diagnose import DiagnoseArgs
 from experiments.diagnose_run import load, play_simulated, read
 from experiments.options import prior_folders
-from experiments.rollouts import config_of
+from experiments.rollouts import config_of, task_of
 from sgft_jax import stacking
 from sgft_jax.analysis import prediction, tables
 from sgft_jax.analysis.curves import read_curve
@@ -84,14 +84,14 @@ def gather(args: DiagnoseArgs, runs: Sequence[Path]) -> list[Cases]:
     played: list[list[float]] = [[] for _ in COUNTS]
     facts: list[tuple[Any, ...]] = []
     for run in runs:
-        config, curve = config_of(run), read_curve(run).of("success")
+        config, curve, task = config_of(run), read_curve(run).of("success"), task_of(run, args.task)
         folders = prior_folders(
             args.prior or (Path(config["prior"]) if config.get("prior") else None),
-            out=args.out, task=config["task"], preset=config.get("preset", args.preset),
+            out=args.out, task=task, preset=config.get("preset", args.preset),
         )  # fmt: skip
-        key = (config["task"], *folders)
+        key = (task, *folders)
         if key not in examiners:
-            env, priors = load(config["task"], args.impl, folders)
+            env, priors = load(task, args.impl, folders)
             examiner, simulated = Examiner(priors[0].card, env), play_simulated(env, priors, args.seed)
             params = stacking.stack([prior.params for prior in priors])
             examiners[key] = (env, priors, examiner, params, examiner.control(params, stacking.stack(simulated)))

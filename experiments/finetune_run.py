@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 import envs
+from envs.base import Env
 from envs.rollout import Episode
 from experiments import cli, logged, real_systems
 from experiments.evaluation import scores
@@ -41,6 +42,7 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
     sizes = {"--seeds" if len(args.real) == 1 else "the number of --real times --seeds": len(args.real) * args.seeds}
     devices = mesh.devices(args.devices, sizes)
     env = envs.make(args.task, args.impl, **observed_by(folders))
+    _reserve(args, env, len(folders), devices)
     found = [real_systems.described(env, name, args.set) for name in args.real]
     priors = load_priors(folders, env)
     for prior in priors:
@@ -62,7 +64,6 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
             members, cost = seeds * len(args.real), args.eval_episodes
         setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
         assert isinstance(setup.system, Simulated | Gymnasium)
-        _reserve(args, setup, devices)
         # Last: what is wrong with a robot or with a method of the user's own leaves no folder behind.
         opened = runs.open_runs(
             homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
@@ -90,13 +91,12 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
         return _Run(args, setup, setup.system, card, records, logs, learner).work()
 
 
-def _reserve(args: FinetuneArgs, setup: Setup, devices: int) -> None:
-    """Raises UserError where the devices have no room for all members and their batches."""
-    begin = functools.partial(train.begin, setup.finetuner, setup.priors, setup.seeds, setup.simulated)
-    kept = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(begin)))
-    row = 4 * (2 * setup.system.env.obs_dim + setup.system.env.act_dim + 2)
-    batch = row * args.options.batch_size * len(setup.seeds)
-    reserve({"replay_capacity": kept, "batch_size": batch}, copies=1, devices=devices, settings="options")
+def _reserve(args: FinetuneArgs, env: Env, priors: int, devices: int) -> None:
+    """Raises UserError where the devices have no room for the transitions of all members."""
+    row, members = 4 * (2 * env.obs_dim + env.act_dim + 2), args.seeds * len(args.real)
+    kept = {name: row * members * getattr(args.options, name) for name in ("replay_capacity", "batch_size")}
+    kept["simulated_transitions"] = row * priors * getattr(args.options, "simulated_transitions", 0)
+    reserve(kept, copies=1, devices=devices, settings="options")
 
 
 def _build(args: FinetuneArgs, folders: list[Path], priors: list[Prior]) -> Callable[[], Finetuner]:

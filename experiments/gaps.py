@@ -15,7 +15,16 @@ from typing import Any
 
 from envs import gaps
 from experiments import cli
-from experiments.options import Impl, check_task, prior_folders, seed_list, without_repeats
+from experiments.options import (
+    Impl,
+    at_least_one,
+    check_task,
+    not_negative,
+    prior_folders,
+    seed_list,
+    task_of_priors,
+    without_repeats,
+)
 from sgft_jax import extend
 from sgft_jax.io.runs import check_folder
 from sgft_jax.presets import PRESETS, PretrainConfig
@@ -90,6 +99,7 @@ def measure(args: GapsArgs) -> dict[str, Any]:
     """Measures, prints a table, writes and returns the summary."""
     for option in ("preset", "judge_preset"):
         cli.choose(f"--{option.replace('_', '-')}", getattr(args, option), PRESETS)
+    at_least_one(args, "episodes")
     if args.episodes < 200:
         raise UserError(f"--episodes is {args.episodes}: a success rate needs at least 200 to tell 40 % from 50 %")
     _check_draw(args)
@@ -103,6 +113,7 @@ def measure(args: GapsArgs) -> dict[str, Any]:
     if not (args.draw or args.presets or gaps.presets(task)):
         raise UserError(f"{task} comes with no gaps; name .toml or .json files with --presets")
     folders = prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
+    task_of_priors(folders, args.task)
     if args.draw:
         from experiments.gaps_draw import run
     else:
@@ -112,8 +123,7 @@ def measure(args: GapsArgs) -> dict[str, Any]:
 
 
 def _check_draw(args: GapsArgs) -> None:
-    if args.draw < 0:
-        raise UserError(f"--draw is {args.draw}: must be at least 1")
+    not_negative(args, "draw")
     if args.draw and args.presets:
         raise UserError(f"--presets {args.presets[0]}: names gaps, and --draw draws them; give one of the two")
     names = ("distribution", "plan", "judge", "choose", "to", "overwrite")

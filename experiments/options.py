@@ -157,9 +157,24 @@ def check_prior(folder: Path, method: Method, task: str) -> None:
         raise UserError(f"--prior {folder}: {error}") from error
 
 
-def task_of_prior(folder: Path) -> str:
-    """The task that the card of a prior names; raises UserError where it names none."""
-    return card_of_prior(folder)["task"]
+def task_of_priors(folders: Sequence[Path], task: str | None) -> str:
+    """The task that the user says, by name or file, or else the one that the cards of the priors name.
+
+    Raises UserError where a card names another, or, unless the user says it, none of ours.
+    """
+    named = {folder: card_of_prior(folder)["task"] for folder in folders}
+    chosen = task or ours(folders[0] / "prior.json", named[folders[0]])
+    for folder, other in named.items():
+        if other != extend.name_of(chosen):
+            raise UserError(f"{folder}: is a prior of the task {other!r}, not of {extend.name_of(chosen)!r}")
+    return chosen
+
+
+def ours(path: Path, task: str) -> str:
+    """The task that a file names. Raises UserError where that is code: only the user's own --task is executed."""
+    if extend.is_source(task):
+        raise UserError(f"{path}: its task is code, {task[:60]!r}; if you trust it, name it with --task")
+    return task
 
 
 def _seed_number(folder: Path) -> tuple[int, str]:

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from experiments.options import check_task
+from experiments.options import check_task, ours
 from sgft_jax.io import real
 from sgft_jax.io.real import Played
-from sgft_jax.io.runs import CONFIG, read_own
+from sgft_jax.io.runs import CONFIG, Options, read_own
 from sgft_jax.types import UserError
 
 if TYPE_CHECKING:
@@ -24,16 +24,17 @@ def home_of(option: str, folder: Path) -> Path:
 
 def config_of(home: Path) -> dict[str, Any]:
     """The options of the run in a folder; none where a robot has recorded."""
-    return read_own(home / CONFIG, {"config": dict}).get("config", {})
+    return read_own(home / CONFIG, {"config": Options}).get("config", {})
 
 
 def task_of(home: Path, task: str | None) -> str:
     """The task that was played: what the user says, or what the run says; raises UserError where nobody does."""
-    found = task or config_of(home).get("task")
-    if found is None:
-        raise UserError(f"{home}: does not say of which task it is; name it with --task")
-    check_task(found)
-    return found
+    if task is None:
+        if (task := config_of(home).get("task")) is None:
+            raise UserError(f"{home}: does not say of which task it is; name it with --task")
+        ours(home / CONFIG, task)
+    check_task(task)
+    return task
 
 
 def episodes_of(home: Path, seed: int | None) -> list[Played]:

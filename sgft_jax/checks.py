@@ -12,6 +12,7 @@ from typing import Any
 from sgft_jax.types import UserError
 
 MOST = 2**31 - 1  # what counts anything: devices count in 32 bits
+_LARGEST_BATCH = 2**20  # rows
 _WIDEST = 2**16  # units of a layer, and what else there are a few of
 
 
@@ -49,6 +50,11 @@ def at_least(config: Any, minimum: int, *names: str, most: int = MOST) -> None:
 def few(config: Any, minimum: int, *names: str) -> None:
     """The same of what nobody has many of, such as layers, units and models."""
     at_least(config, minimum, *names, most=_WIDEST)
+
+
+def rows(config: Any, *names: str) -> None:
+    """At least one, and no more than a batch can have."""
+    at_least(config, 1, *names, most=_LARGEST_BATCH)
 
 
 def layers(config: Any, *names: str) -> None:

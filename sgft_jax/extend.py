@@ -37,7 +37,7 @@ def folder_name(what: str, name: str) -> str:
         raise UserError(f"{what} has {size} bytes: choose a shorter word, it names a folder")
     blank, inside = name != name.strip() or not name, not name.startswith(".") and not set(name) & {"/", "\\"}
     if blank or not inside or not name.isprintable() or _RESERVED.fullmatch(name):
-        raise UserError(f"{what} {name!r}: cannot name a folder; take letters, digits, '.', '_' and '-', no '.' first")
+        raise UserError(f"{what} {name!r} cannot name a folder; take letters, digits, '.', '_' and '-', no '.' first")
     return name
 
 
@@ -47,7 +47,7 @@ def load(kind: str, source: str, attribute: str) -> ModuleType:
     kind: what it should hold, for messages. Raises UserError if there is no such file or module, if it fails, or if it
     lacks the attribute.
     """
-    folder_name(f"{kind} {source}:", name_of(source))
+    folder_name(f"{kind} {source}: the name", name_of(source))
     module = guard(kind, source, _from_file if source.endswith(".py") else _module)(source)
     if not hasattr(module, attribute):
         raise UserError(f"{kind} {source}: does not define `{attribute}`; see docs/extending.md")

@@ -5,6 +5,7 @@ a flat table `rows`.
 """
 
 import csv
+import functools
 import json
 import re
 from collections import defaultdict
@@ -17,7 +18,7 @@ import numpy as np
 
 from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean, paired_improvement
 from sgft_jax.io.log import EVAL, METRICS, SUMMARY, read_jsonl
-from sgft_jax.io.runs import CONFIG, PROVENANCE, read_own
+from sgft_jax.io.runs import CONFIG, PROVENANCE, Options, read_own
 from sgft_jax.methods import NAMES, get_method
 from sgft_jax.types import UserError
 
@@ -259,10 +260,12 @@ def read_curve(folder: Path) -> Curve:
     records = read_jsonl(folder / EVAL) if (folder / EVAL).exists() else []
     if not records:
         raise UserError(f"{folder / EVAL}: holds no evaluation yet")
-    stored, summary = read_own(folder / CONFIG, {"config": dict}), read_own(folder / SUMMARY)
+    stored, summary = read_own(folder / CONFIG, {"config": Options}), read_own(folder / SUMMARY)
     config, start = stored.get("config", {}), last_start(folder)
-    column = lambda name: np.array([record[name] for record in records])  # noqa: E731
+    column = functools.partial(_column, folder / EVAL, records)
     scores = {name: column(name).T for name in SCORES if name in records[0]}
+    if not scores:
+        raise UserError(f"{folder / EVAL}: has no {' or '.join(SCORES)}; put back the file that the run has written")
     variant = config.get("variant") or ""
     digests, seeds = start.get("priors", []), config.get("seed", 0) + np.arange(len(next(iter(scores.values()))))
     return Curve(
@@ -281,6 +284,14 @@ def read_curve(folder: Path) -> Curve:
         facts=_facts(summary, config, start),
         training=_training(folder / METRICS, column("rollouts")),
     )
+
+
+def _column(path: Path, records: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
+    """The numbers of that name in all lines of a log."""
+    try:
+        return np.array([record[name] for record in records]) + 0
+    except (KeyError, TypeError, ValueError):
+        raise UserError(f"{path}: not every line has numbers of {name!r}; put back the file of the run") from None
 
 
 def _judged_by(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:

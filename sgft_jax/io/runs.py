@@ -14,9 +14,9 @@ import weakref
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
-from envs.files import read_json, read_object
+from envs.files import Count, read_json, read_object
 from sgft_jax.io.jsonfile import differences, write_json
 from sgft_jax.types import UserError
 
@@ -194,15 +194,27 @@ def check_start(folder: Path, *, resume: bool, overwrite: bool) -> bool:
 def check_folder(folder: Path, option: str = "--out") -> None:
     """Raises UserError, which names the option, where no folder can be made or written; makes nothing itself."""
     try:
-        there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+        there = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
     except OSError as error:  # such as a name that is too long
         raise UserError(
             f"{folder}: cannot be made ({(error.strerror or '').lower()}); choose another {option}"
         ) from error
     if not there.is_dir():
-        raise UserError(f"{folder}: cannot be made, {there} is a file; choose another {option}")
+        what = "a file" if there.exists() else "a link that leads nowhere"
+        raise UserError(f"{folder}: cannot be made, {there} is {what}; choose another {option}")
     if not os.access(there, os.W_OK | os.X_OK):
         raise UserError(f"{folder}: cannot be written, you may not write to {there}; choose another {option}")
+
+
+class Options(TypedDict, total=False):
+    """What those who read a run know of its options; there are more."""
+
+    task: str
+    method: str
+    variant: str
+    preset: str
+    prior: str | None
+    seed: Count
 
 
 def read_own(path: Path, needed: Mapping[str, type] | None = None, *, otherwise: str = "") -> dict[str, Any]:

@@ -36,7 +36,8 @@ def get_method(name: str) -> Method:
     try:
         return _checked(name, module.METHOD)
     except UserError as error:
-        raise UserError(": ".join(filter(None, [f"method {name}", extend.line_of(module, "METHOD"), str(error)])))
+        place = extend.line_of(module, "METHOD")
+        raise UserError(": ".join(filter(None, [f"method {name}", place, str(error)]))) from error
 
 
 def _checked(source: str, method: Any) -> Method:
