@@ -28,6 +28,7 @@ from experiments.real_systems import REMOTE
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import get_method
+from sgft_jax.types import UserError
 
 
 @dataclass(frozen=True)

@@ -173,6 +173,8 @@ def check(args: EvaluateArgs) -> tuple[list[Path], str]:
     folders = prior_folders(home, out=args.out, task=args.task or "", preset=args.preset)
     task = task_of_priors(folders, args.task)
     check_real(task, reals, args.set)
+    if reals and not is_stepped(reals[0]):
+        gaps.changes(args.set)
     return folders, task
 
 

@@ -94,6 +94,8 @@ def check(args: FactorialArgs) -> None:
         raise UserError(f"--methods: the cells are all of {METHOD}")
     if args.horizon < 2:
         raise UserError(f"--horizon is {args.horizon}: must be at least 2, to differ from 1")
+    options = {"horizon": args.horizon, "anchor": args.anchor, "identify": args.identify, "guard": args.guard}
+    get_method(METHOD).config(**options)
     grid.check(replace(args, reals=(gaps.SIM,)))  # all but the real systems, which may differ between tasks
     for task in args.tasks:
         if args.prior is not None and args.data is None:

@@ -5,10 +5,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from envs import gaps
 from experiments.options import (
     Impl,
     Successors,
     at_least_one,
+    check_data,
     check_prior,
     check_variant,
     not_negative,
@@ -18,7 +20,7 @@ from experiments.options import (
     without_repeats,
 )
 from experiments.real_systems import check as check_real
-from experiments.real_systems import is_robot, title
+from experiments.real_systems import is_robot, is_stepped, title
 from sgft_jax import extend
 from sgft_jax.io.runs import check_start
 from sgft_jax.methods import DEFAULT, get_method
@@ -138,8 +140,8 @@ def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
     if args.prior == NO_PRIOR and method.needs_prior:
         raise UserError(f"--prior none: {method.name} needs a prior of {method.prior}")
     check_variant(args.variant)
-    if missing := [path for path in args.real_data if not path.exists()]:
-        raise UserError(f"--real-data {missing[0]}: no such file or folder")
+    for path in args.real_data:
+        check_data("--real-data", path)
     if args.real_updates is not None and (args.real_updates < 0 or not args.real_data):
         raise UserError(f"--real-updates {args.real_updates}: 0 or more, and of --real-data, which must be named")
     if args.successors != "stored" and not args.real_data:
@@ -148,6 +150,8 @@ def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
         raise UserError("--real: name at least one")
     without_repeats("--real", args.real)
     check_real(args.task, args.real, args.set)
+    if not is_stepped(args.real[0]):
+        gaps.changes(args.set)
     _check_robot(args)
     if args.eval_at:
         _check_eval_at(args)

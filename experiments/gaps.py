@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from envs import gaps
+from envs.files import read_toml
 from experiments import cli
 from experiments.options import (
     Impl,
@@ -129,6 +130,8 @@ def _check_draw(args: GapsArgs) -> None:
     names = ("distribution", "plan", "judge", "choose", "to", "overwrite")
     if odd := [name for name in names if getattr(args, name) and not args.draw]:
         raise UserError(f"--{odd[0]}: is for drawn gaps; say how many with --draw")
+    if args.distribution is not None:
+        read_toml(args.distribution)
     if not 0 <= args.choose <= args.draw:
         raise UserError(f"--choose is {args.choose}: must be from 1 to the {args.draw} of --draw")
     if bool(args.choose) != bool(args.to):

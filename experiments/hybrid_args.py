@@ -13,6 +13,7 @@ from experiments.options import (
     Impl,
     Successors,
     at_least_one,
+    check_data,
     check_task,
     check_variant,
     not_negative,
@@ -122,8 +123,8 @@ def check(args: HybridArgs) -> tuple[HybridMethod, list[int]]:
         raise UserError(f"--data: {method.name} learns from real data; name a file or folder (docs/data.md)")
     if method.kind == "simulator" and args.data is not None:
         raise UserError(f"--data {args.data}: {method.name} learns in the simulator alone; leave one of them out")
-    if args.data is not None and not args.data.exists():
-        raise UserError(f"--data {args.data}: no such file or folder")
+    if args.data is not None:
+        check_data("--data", args.data)
     check_variant(args.variant)
     if not args.gap:
         raise UserError(f"--gap: name at least one, or {SIM} for no gap")

@@ -81,6 +81,12 @@ def check_variant(variant: str) -> None:
         extend.folder_name("--variant", variant)
 
 
+def check_data(option: str, path: Path) -> None:
+    """Raises UserError where there are no recorded data."""
+    if not (path.is_file() or path.is_dir()):
+        raise UserError(f"{option} {path}: {'is no plain file' if path.exists() else 'no such file or folder'}")
+
+
 def check_task(task: str, reals: Sequence[str] = (), changes: Sequence[str] = ()) -> None:
     """Raise UserError where there is no such task, or no such real system of it, or for changes that set nothing."""
     name = envs.name_of(task)

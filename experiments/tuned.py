@@ -1,12 +1,13 @@
 """The options that tuning has chosen, one file for a task and method: read, written, and put into a run's arguments."""
 
+import typing
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from envs import gaps
-from envs.files import read_json
+from envs.files import checked, read_object
 from experiments.finetune_args import FinetuneArgs, with_settings
 from experiments.spaces import space_of
 from sgft_jax import extend
@@ -38,11 +39,11 @@ def read(out: Path, task: str, method: str) -> dict[str, Any]:
     """What tuning has found; raises UserError, which names the command, if there is no such file."""
     _require(out, task, [method])
     path = path_of(out, task, method)
-    result = read_json(path)
-    if not isinstance(result, dict) or not {"budget", "options"} <= set(result):
-        raise UserError(f"{path}: was not written by experiments.tune")
+    result = read_object(path, {"budget": dict, "options": dict}, "it is no file of experiments.tune")
     if unknown := sorted(set(result["options"]) - set(space_of(method))):
         raise UserError(f"{path}: there is no option {unknown[0]!r}; tune again with: {_command(task, [method])}")
+    hints = typing.get_type_hints(get_method(method).config)
+    checked(path, result["options"], {name: hints[name] for name in result["options"]}, "tune again")
     return result
 
 

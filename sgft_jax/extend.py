@@ -3,6 +3,7 @@
 import ast
 import importlib
 import importlib.util
+import os
 import re
 import sys
 import traceback
@@ -48,6 +49,8 @@ def load(kind: str, source: str, attribute: str) -> ModuleType:
     lacks the attribute.
     """
     folder_name(f"{kind} {source}: the name", name_of(source))
+    if source.endswith(".py") and os.path.lexists(source) and not Path(source).is_file():
+        raise UserError(f"{kind} {source}: is no plain file")
     module = guard(kind, source, _from_file if source.endswith(".py") else _module)(source)
     if not hasattr(module, attribute):
         raise UserError(f"{kind} {source}: does not define `{attribute}`; see docs/extending.md")
@@ -63,12 +66,12 @@ def guard[T](kind: str, source: str, function: Callable[..., T]) -> Callable[...
     def guarded(*args: Any) -> T:
         try:
             return function(*args)
-        except UserError:
+        except (UserError, KeyboardInterrupt):
             raise
         except SyntaxError as error:
             place = f" in line {error.lineno} of {error.filename}" if error.lineno else ""
             raise UserError(f"{kind} {source}: {error.msg}{place}") from error
-        except (Exception, SystemExit) as error:
+        except BaseException as error:  # `sys.exit` too: a file that is read must not end the command
             if isinstance(error, OSError) and error.filename == str(Path(source).resolve()):
                 raise UserError(f"{kind} {source}: {error.strerror}") from None
             said = (str(error).strip() or "no message").splitlines()[0]
@@ -111,14 +114,9 @@ def _module(source: str) -> ModuleType:
 
 
 def _from_file(source: str) -> ModuleType:
-    try:
-        name = str(Path(source).resolve())  # no other module can be called that
-    except (OSError, RuntimeError, ValueError) as error:  # a loop of links
-        raise UserError(f"{source}: cannot be found: {error}") from None
+    name = str(Path(source).resolve())  # no other module can be called that
     if name in sys.modules:
         return sys.modules[name]
-    if Path(name).exists() and not Path(name).is_file():
-        raise UserError(f"{source}: is no plain file")
     spec = importlib.util.spec_from_file_location(name, name)
     assert spec is not None and spec.loader is not None  # as for any name that ends in .py
     sys.modules[name] = module = importlib.util.module_from_spec(spec)

@@ -6,6 +6,7 @@ a flat table `rows`.
 
 import csv
 import functools
+import io
 import json
 import re
 from collections import defaultdict
@@ -16,6 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from envs.files import read_text
+from sgft_jax import extend
 from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean, paired_improvement
 from sgft_jax.io.log import EVAL, METRICS, SUMMARY, read_jsonl
 from sgft_jax.io.runs import CONFIG, PROVENANCE, Options, read_own
@@ -465,10 +468,19 @@ def _curve(identity: tuple[str, ...], members: Mapping[int, list[Mapping[str, An
         raise UserError(f"{'/'.join(identity)}: its seeds were not evaluated after the same rollouts")
     first, *_ = members.values()
 
+    for name, value in zip(IDENTITY, identity, strict=True):
+        if value:  # figures are called like these
+            extend.folder_name(f"the {name}", value)
+
     def column(name: str) -> np.ndarray:
-        return np.array([[float(row[name]) for row in each] for each in members.values()])
+        values = np.array([[float(row[name]) for row in each] for each in members.values()])
+        if not np.isfinite(values).all():
+            raise ValueError(f"{'/'.join(identity)} has {name} that are not finite")
+        return values
 
     scores = {name: column(name) for name in SCORES if first[0].get(name) not in (None, "")}
+    if not scores:
+        raise ValueError(f"{'/'.join(identity)} has no {' or '.join(SCORES)}")
     missing = lambda row: row.get("training") in (None, "")  # noqa: E731 - at the first evaluation, or everywhere
     training = np.array([[np.nan if missing(r) else float(r["training"]) for r in each] for each in members.values()])
     return Curve(
@@ -501,8 +513,10 @@ def read_csv(path: Path, *, needed: Sequence[str] = ()) -> list[dict[str, str]]:
     """The rows of a table; none if it does not exist; raises UserError where a row lacks one of the columns needed."""
     if not path.exists():
         return []
-    with open(path, newline="") as file:
-        rows = list(csv.DictReader(file))
+    try:
+        rows = list(csv.DictReader(io.StringIO(read_text(path, limit=2**30), newline="")))
+    except csv.Error as error:
+        raise UserError(f"{path}: {error}; put the table back as it was") from None
     for i, row in enumerate(rows):
         if absent := [name for name in needed if row.get(name) is None]:
             raise UserError(f"{path}: row {i + 1} has no {absent[0]}; put the table back as it was")

@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from envs.files import read_text
 from sgft_jax.io.jsonfile import jsonable, write_json
 from sgft_jax.types import UserError
 
 METRICS, EVAL, SUMMARY = "metrics.jsonl", "eval.jsonl", "summary.json"
+_LIMIT = 2**32  # bytes of a log
 
 
 class DivergedError(UserError):
@@ -113,11 +115,11 @@ def read_jsonl(path: Path) -> list[dict[str, Any]]:
     if not path.exists():
         raise UserError(f"{path}: no such file")
     records = []
-    lines = path.read_text().split("\n")
+    lines = read_text(path, limit=_LIMIT).split("\n")
     for number, line in enumerate(lines[:-1], start=1):  # whatever follows the last newline was never finished
         try:
             records.append({k: _floats(v) for k, v in json.loads(line).items()})
-        except (ValueError, AttributeError) as error:
+        except (ValueError, AttributeError, RecursionError) as error:
             raise UserError(f"{path}:{number}: not a JSON object") from error
     return records
 

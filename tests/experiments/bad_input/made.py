@@ -23,10 +23,13 @@ def make(home: Path) -> None:
     (home / "empty").mkdir()
     (home / "file").write_text("mine")
     (home / "binary").write_bytes(bytes(range(256)))
-    os.mkfifo(home / "fifo")
     (home / "piped").mkdir()
-    os.mkfifo(home / "piped/prior.json")
-    (home / "loop").symlink_to("loop")
+    (home / "folder.py").mkdir()
+    (home / "folder.toml").mkdir()
+    for name in ("fifo", "fifo.py", "fifo.toml", "piped/prior.json"):
+        os.mkfifo(home / name)
+    for name in ("loop", "loop.py", "loop.toml"):
+        (home / name).symlink_to(name)
     _run(home / "run")
     _set(home / "set.hdf5")
 

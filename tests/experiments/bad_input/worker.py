@@ -1,14 +1,16 @@
-"""Runs command lines one after another in this process, as `python -m experiments.<command>` would; no test itself.
+"""Runs command lines one after another, as `python -m experiments.<command>` would; no test itself.
 
-stdin: JSON rows {"words": [command, ...], "files": {path: text}}. stdout: for every row a line of
-JSON, what it did. The current
-folder is watched: what a command made, changed or removed in it is reported.
+stdin: JSON rows {"command": text, "files": {path: text}}. stdout: for every row a line of JSON, what it did, and what
+it made, changed or removed in the current folder. argv: `apart` gives every row a process of its own that may import
+nothing HEAVY; without it the rows share this one.
 """
 
 import contextlib
+import importlib
 import json
 import os
 import runpy
+import shlex
 import signal
 import sys
 import tempfile
@@ -16,27 +18,37 @@ import traceback
 import warnings
 from pathlib import Path
 
-PATIENCE = 30  # seconds for a row: what waits for ever is reported, too
+PATIENCE = 40  # seconds for a row: what waits for ever is reported, too
 HEAVY = ("jax", "flax", "mujoco", "matplotlib", "scipy", "orbax")
 
 
-def run(words, files):
+def run(command, files):
+    """What a row did."""
     for name, text in files.items():
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).write_bytes(text.encode("utf-8", "surrogateescape"))
-    before, heavy = contents(), loaded()
+    before = contents()
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         with standing_for(out, err):
-            code = call(words)
+            code = call(shlex.split(command))
         out.seek(0), err.seek(0)
         said = {"out": out.read().decode(errors="replace"), "err": err.read().decode(errors="replace")}
-    changed = sorted(name for name, _ in before ^ contents())
-    for name in files:
-        Path(name).unlink(missing_ok=True)
-    return {"code": code, **said, "changed": changed, "heavy": sorted(loaded() - heavy)}
+    changed = sorted({name for name, _ in before ^ contents()})
+    return {"code": code, **said, "changed": changed}
+
+
+def run_apart(command, files):
+    """The same in a process of its own."""
+    if child := os.fork():
+        os.waitpid(child, 0)
+        return
+    sys.modules |= dict.fromkeys(HEAVY)  # an import of one of them fails
+    print(json.dumps(run(command, files)), flush=True)
+    os._exit(0)
 
 
 def call(words):
+    """The exit code of a command."""
     sys.argv = words
     signal.alarm(PATIENCE)
     try:
@@ -76,8 +88,13 @@ def contents():
     }
 
 
-def loaded():
-    return {name for name in HEAVY if name in sys.modules}
+def forget(files):
+    """Removes the files of a row, and the folders that were made for them."""
+    for name in files:
+        Path(name).unlink(missing_ok=True)
+        for folder in list(Path(name).parents)[:-1]:
+            with contextlib.suppress(OSError):  # it holds more
+                folder.rmdir()
 
 
 def give_up(*_):
@@ -85,6 +102,14 @@ def give_up(*_):
 
 
 if __name__ == "__main__":
+    sys.dont_write_bytecode = True
     signal.signal(signal.SIGALRM, give_up)
-    for row in json.load(sys.stdin):
-        print(json.dumps(run(**row)), flush=True)  # at once: a row that kills the process is then the next one
+    rows, apart = json.load(sys.stdin), "apart" in sys.argv
+    for name in {row["command"].split()[0] for row in rows}:
+        importlib.import_module(f"experiments.{name}")
+    for row in rows:
+        if apart:
+            run_apart(**row)
+        else:
+            print(json.dumps(run(**row)), flush=True)  # at once: a row that kills the process is then the next one
+        forget(row["files"])
