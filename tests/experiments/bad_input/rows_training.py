@@ -14,7 +14,7 @@ ROWS = [
     ("pretrain --task empty", "task: there is no 'empty'"),
     ("pretrain --task file.py", "task file.py: No such file or directory"),
     ("pretrain --real nope", "gap of push: there is no 'nope'"),
-    ("pretrain --real " + 300 * "x", "gap of push: there is no ''"),
+    ("pretrain --real " + 300 * "x", "gap of push: there is no "),
     ("pretrain --set latency=0.1", "--set latency=0.1: changes a real system"),
     ("pretrain --real default --set latency", "'latency' does not set anything"),
     ("pretrain --real default --set latency=", "'latency=' does not set anything"),

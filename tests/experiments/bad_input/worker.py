@@ -6,7 +6,7 @@ nothing HEAVY; without it the rows share this one.
 """
 
 import contextlib
-import importlib
+import gc
 import json
 import os
 import runpy
@@ -42,7 +42,6 @@ def run_apart(command, files):
     if child := os.fork():
         os.waitpid(child, 0)
         return
-    sys.modules |= dict.fromkeys(HEAVY)  # an import of one of them fails
     print(json.dumps(run(command, files)), flush=True)
     os._exit(0)
 
@@ -105,8 +104,11 @@ if __name__ == "__main__":
     sys.dont_write_bytecode = True
     signal.signal(signal.SIGALRM, give_up)
     rows, apart = json.load(sys.stdin), "apart" in sys.argv
-    for name in {row["command"].split()[0] for row in rows}:
-        importlib.import_module(f"experiments.{name}")
+    if apart:
+        sys.modules |= dict.fromkeys(HEAVY)  # an import of one of them fails
+        for name in {row["command"].split()[0] for row in rows}:
+            run(f"{name} --no-such-option", {})  # what the rows then share: imports, what tyro knows of the options
+        gc.freeze()
     for row in rows:
         if apart:
             run_apart(**row)
