@@ -30,7 +30,7 @@ from sgft_jax.types import UserError, unknown
 
 BROKEN_PIPE, USER_ERROR = 1, 2
 _SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
-_FULL = os.strerror(errno.ENOSPC)  # "No space left on device"
+_FULL = [os.strerror(number) for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)]  # "No space left on device"
 _ON_DISK = (
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EEXIST, errno.ENOTDIR, errno.EISDIR,
     errno.ENAMETOOLONG, errno.EFBIG, errno.ELOOP, errno.EIO, errno.EMFILE, errno.ENFILE,
@@ -96,8 +96,8 @@ def _disk_trouble(error: BaseException | None) -> str | None:
     """What is wrong where a file could not be read or written; also as the cause of another error. Else None."""
     if isinstance(error, OSError) and error.errno in _ON_DISK:
         return f"{error.filename or 'a file of the run'}: {(error.strerror or 'cannot be written').lower()}"
-    if _FULL in str(error):  # Orbax has another type for it
-        return f"a file of the run: {_FULL.lower()}"
+    if words := [text for text in _FULL if text in str(error)]:  # Orbax has another type for it
+        return f"a file of the run: {words[0].lower()}"
     return None if error is None else _disk_trouble(error.__cause__)
 
 

@@ -171,14 +171,13 @@ ROWS = [
 ]
 
 HEAVY = [
-    ("pretrain --devices 100", "--devices 100: JAX sees 1 cpu device(s)"),
+    ("pretrain --devices 100", "--devices 100: JAX sees "),
     ("pretrain --real mild --task own_task.py", "own_task has no gap 'mild'"),
     ("finetune --prior prior --set nothing=1", "'nothing' is neither a parameter nor an effect of push"),
     (
         "finetune --prior prior --real gymnasium:Nope-v0 --seeds 1",
         "--real gymnasium:Nope-v0: Environment `Nope` doesn't exist",
     ),
-    ("finetune --prior prior --real remote:256.1.1.1:9999 --seeds 1", "256.1.1.1"),
     ("finetune --prior prior --real-data file", "file: is not an HDF5 file"),
     ("finetune --prior prior --seeds 1 --options.batch-size 2000000000", "lower --options.batch-size or train fewer"),
     (
