@@ -273,7 +273,7 @@ def test_a_checkpoint_that_does_not_fit_is_one_line(tmp_path):
         "import resource, pathlib, numpy; from sgft_jax.io import checkpoint; "
         "resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16)); "
         f"checkpoint.save(pathlib.Path({str(tmp_path)!r}), 0, "
-        "{i: numpy.random.default_rng(i).normal(size=50_000) for i in range(20)}, meta={})"
+        "{str(i): numpy.random.default_rng(i).random(50_000, 'f4') for i in range(20)}, meta={})"
     )
     ended, said = what_is_said(main)
     assert ended == 2 and said.count("\n") == 1 and "file too large; mend that" in said
