@@ -201,7 +201,7 @@ def _is_value(value: Any) -> bool:
 
 def changes(overrides: Sequence[str]) -> dict[str, Value]:
     """What overrides such as "latency=0.05" set, by name. Raises UserError where one sets nothing, or two the same."""
-    found: dict[str, Value] = {}
+    found: dict[str, Any] = {}
     for text in overrides:
         name, _, value = (part.strip() for part in text.partition("="))
         try:

@@ -73,6 +73,8 @@ def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
         at_least_one(args, "rollouts")
     check_folder(args.out / "diagnose")
     recorded = home_of("--real", Path(args.real)) if Path(args.real).is_dir() else None
+    if recorded and recorded.name in ("", ".."):
+        recorded = recorded.resolve()  # what is written is called like it
     config = config_of(recorded) if recorded else {}
     task, prior = args.task or (task_of(recorded, None) if recorded and config else None), args.prior
     if task is not None:

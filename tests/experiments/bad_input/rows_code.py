@@ -66,7 +66,7 @@ _METHODS = [
 
 ROWS = [
     *[(f"{command} --task mine.py", words, {"mine.py": text}) for command in ("pretrain",) for text, words in _TASKS],
-    *[("finetune --prior prior --method mine.py", words, {"mine.py": text}) for text, words in _METHODS],
+    *[("finetune --prior prior --method mine_{i}.py", words, {"mine.py": text}) for text, words in _METHODS],
     ("tasks mine.py", "task mine.py: line 1: SystemExit: None", {"mine.py": "exit()"}),
     ("evaluate --prior prior --task mine.py", "task mine.py: line 1: SystemExit", {"mine.py": "exit()"}),
     ("hybrid --method sac --gap sim --task mine.py", "task mine.py: line 1: SystemExit", {"mine.py": "exit()"}),
@@ -87,3 +87,18 @@ ROWS = [
     ("finetune --method fifo.py", "method fifo.py: is no plain file"),
     ("finetune --method nowhere.py", "method nowhere.py: No such file or directory"),
 ]
+
+_BUILDS = [
+    ("    1 / 0", ": line 8: ZeroDivisionError: division by zero"),
+    ("    exit(3)", ": line 8: SystemExit: 3"),
+    ("    return None", ": build returns a NoneType, not a sgft_jax.Finetuner"),
+]
+_ALONE = "METHOD = Method('m', 'sgft', 'a', 'b', Config, build, needs_prior=False)"
+
+HEAVY = [
+    (
+        f"finetune --task own_task.py --prior none --real sim --seeds 1 --method mine_{i}.py", words,
+        {f"mine_{i}.py": _method(_ALONE, f"def build(config, prior, task):\n{line}\n")},
+    )
+    for i, (line, words) in enumerate(_BUILDS)
+]  # fmt: skip
