@@ -71,7 +71,9 @@ def make(
     """
     from envs.history import with_previous_actions
     from envs.system import with_system
+    from sgft_jax.mesh import check_jax
 
+    check_jax()
     return with_system(with_previous_actions(_make(task, impl, scene), previous_actions), system)
 
 

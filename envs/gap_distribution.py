@@ -13,7 +13,6 @@ effects by name, with what they are drawn from, uniformly:
 A gap draws one to four of the families and of each of these one to all of its items, any number as likely as another.
 """
 
-import tomllib
 import zlib
 from collections.abc import Mapping
 from importlib import resources
@@ -24,6 +23,7 @@ import numpy as np
 
 from envs import gaps
 from envs.base import Effects, Entry, Env, Value, entries_of, misnamed
+from envs.files import read_toml
 from envs.gaps import Gap
 from sgft_jax.types import UserError, unknown
 
@@ -57,13 +57,9 @@ def load(env: Env, path: Path | None = None) -> Distribution:
     """The distribution of a file, by default that which comes with the task. Raises UserError naming file and item."""
     file = resources.files("envs") / "gaps" / "distributions" / f"{env.name}.toml" if path is None else path
     source = f"{env.name}.toml" if path is None else str(path)
-    try:
-        tables = tomllib.loads(file.read_text())
-    except OSError:
-        missing = f"{env.name} comes with no distribution of gaps; name a file of one"
-        raise UserError(missing if path is None else f"{path}: no such file") from None
-    except ValueError as error:
-        raise UserError(f"{source}: not valid TOML: {error}") from None
+    if path is None and not file.is_file():
+        raise UserError(f"{env.name} comes with no distribution of gaps; name a file of one")
+    tables = read_toml(str(file))
     if not tables:
         raise UserError(f"{source}: has no family; write a table for each, with items and their ranges")
     families, together = {}, set()

@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from envs.base import Effects, Env, Value, World
+from envs.files import parse_json, read_json, read_toml
+from sgft_jax import extend
 from sgft_jax.types import Key, UserError, unknown
 
 SIM = "sim"  # names the gap in which nothing differs: the real system is the training domain itself
@@ -56,13 +58,16 @@ def presets(task: str, *, variants: bool = True) -> dict[str, Gap]:
 def read_file(path: str | Path) -> dict[str, Gap]:
     """The gaps of a .toml/.json file by name. Raises UserError naming file and key.
 
-    A file holds either one gap, called like the file, or a table for each of several, called like the tables.
+    A file holds either one gap, called like the file, or a table for each of several, called like the tables. Run
+    folders are called so too, so a name must be one of a folder.
     """
     path = Path(path)
-    table = _content(path)
-    if _holds_several(table):
-        return {name: _parse(name, own, where=f"{path} [{name}]") for name, own in table.items()}
-    return {path.stem: _parse(path.stem, table, where=str(path))}
+    table = read_json(path) if path.suffix == ".json" else read_toml(path)
+    if not _holds_several(table):
+        return {path.stem: _parse(extend.folder_name(f"{path}: the name", path.stem), table, where=str(path))}
+    for name in table:
+        extend.folder_name(f"{path}: the gap", name)
+    return {name: _parse(name, own, where=f"{path} [{name}]") for name, own in table.items()}
 
 
 def find(task: str, source: str) -> Gap:
@@ -107,12 +112,12 @@ def title(source: str) -> str:
 
 def load(env: Env, source: str, overrides: Sequence[str] = ()) -> Gap:
     """The gap that `find` finds, changed by overrides such as "latency=0.05". Raises UserError naming file and key."""
-    gap, seen = find(env.name, source), set()
-    for text in overrides:
-        gap, name = _override(gap, text)
-        if name in seen:
-            raise UserError(f"'{text}': '{name}' is set twice; set it once")
-        seen.add(name)
+    gap = find(env.name, source)
+    params, effects = dict(gap.params), dict(gap.effects)
+    for name, value in changes(overrides).items():
+        (effects if name in Effects._fields else params)[name] = value
+    words = ["=".join(part.strip() for part in text.partition("=")[::2]) for text in overrides]
+    gap = gap._replace(name="+".join([gap.name, *words]), params=params, effects=effects)
     _check(env, gap)
     return gap
 
@@ -157,18 +162,6 @@ def _inline(value: Any) -> str:
     return json.dumps(value)
 
 
-def _content(path: Path) -> Any:
-    try:
-        data = path.read_text()
-        return json.loads(data) if path.suffix == ".json" else tomllib.loads(data)
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file") from None
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}") from None
-    except ValueError as error:  # both decoders raise subclasses of it
-        raise UserError(f"{path}: not valid {path.suffix[1:].upper()}: {error}") from None
-
-
 def _holds_several(table: Any) -> bool:
     if not isinstance(table, dict) or not table or set(table) & _KEYS:
         return False
@@ -206,18 +199,21 @@ def _is_value(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _override(gap: Gap, text: str) -> tuple[Gap, str]:
-    """The gap with what the text sets, and the name of that."""
-    name, equals, value = (part.strip() for part in text.partition("="))
-    try:
-        parsed = json.loads(value)
-    except ValueError:
-        parsed = None
-    if not equals or parsed is None or not _is_value(parsed):
-        raise UserError(f"'{text}' does not set anything; write name=number or name=[number,number]")
-    changed = gap._replace(name=f"{gap.name}+{name}={value}", params=dict(gap.params), effects=dict(gap.effects))
-    (changed.effects if name in Effects._fields else changed.params)[name] = parsed
-    return changed, name
+def changes(overrides: Sequence[str]) -> dict[str, Value]:
+    """What overrides such as "latency=0.05" set, by name. Raises UserError where one sets nothing, or two the same."""
+    found: dict[str, Any] = {}
+    for text in overrides:
+        name, _, value = (part.strip() for part in text.partition("="))
+        try:
+            parsed = parse_json(value, text[:60])
+        except UserError:
+            parsed = None
+        if not name or not _is_value(parsed):
+            raise UserError(f"{text[:60]!r} does not set anything; write name=number or name=[number,number]")
+        if name in found:
+            raise UserError(f"{text[:60]!r}: {name!r} is set twice; set it once")
+        found[name] = parsed
+    return found
 
 
 def _check(env: Env, gap: Gap) -> None:

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from experiments import cli
-from experiments.options import Impl, at_least_one, check_task, prior_folders
+from experiments.options import Impl, at_least_one, check_task, prior_folders, task_of_priors, without_repeats
+from sgft_jax.io.runs import check_folder
 from sgft_jax.models.config import Precision
 from sgft_jax.presets import PRESETS
 from sgft_jax.types import UserError
@@ -89,15 +90,23 @@ def main(config: BenchmarkConfig) -> dict[str, list[dict[str, Any]]]:
 
 def _check(config: BenchmarkConfig) -> None:
     cli.choose("--preset", config.preset, PRESETS)
+    for name in ("parts", "tasks", "impls", "precisions"):
+        if not getattr(config, name):
+            raise UserError(f"--{name}: name at least one")
+        without_repeats(f"--{name}", getattr(config, name))
     for task in config.tasks:
         check_task(task)
-    at_least_one(config, "control_steps", "width", "updates", "repeats")
-    for name in ("worlds", "batches", "seeds", "devices"):
-        if (least := min(getattr(config, name), default=0)) < 1:
-            raise UserError(f"--{name} is {least}: must be at least 1")
+    at_least_one(
+        config, "control_steps", "width", "updates", "repeats", "worlds", "batches", "seeds", "devices", "rollouts"
+    )
+    if config.env_steps is not None:
+        at_least_one(config, "env_steps")
+    check_folder(config.out / "benchmark")
     for part in {"finetune", "system"} & {*config.parts}:
         if config.prior is None:
             raise UserError(f"--parts {part} needs --prior FOLDER, as made by python -m experiments.pretrain")
+        for task in config.tasks:
+            task_of_priors(prior_folders(config.prior, out=config.out, task=task, preset=config.preset), task)
 
 
 def _physics(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:

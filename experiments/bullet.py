@@ -17,6 +17,7 @@ from experiments.finetune_args import FinetuneArgs
 from experiments.options import (
     SHIPPED,
     at_least_one,
+    check_prior,
     not_negative,
     prior_folders,
     seed_list,
@@ -24,11 +25,9 @@ from experiments.options import (
 )
 from experiments.panda_gym import HOME, PYTHON, TASK
 from experiments.real_systems import REMOTE
-from sgft_jax.io.cards import read_card
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import get_method
-from sgft_jax.presets import check_card
 from sgft_jax.types import UserError
 
 
@@ -93,15 +92,14 @@ def check(args: BulletArgs) -> None:
     at_least_one(args, "seeds", "rollouts", "episodes", "jobs")
     not_negative(args, "minutes")
     seed_list(args.seed, args.seeds)
+    if not args.methods:
+        raise UserError("--methods: name at least one")
     without_repeats("--methods", args.methods)
     check_folder(args.out)
-    cards = {folder: read_card(folder) for folder in prior_folders(args.prior, out=args.out, task=TASK, preset="")}
+    folders = prior_folders(args.prior, out=args.out, task=TASK, preset="")
     for method in map(get_method, args.methods):
-        for folder, card in cards.items():
-            try:
-                check_card(card, method, TASK)
-            except UserError as error:
-                raise UserError(f"--prior {folder}: {error}") from error
+        for folder in folders:
+            check_prior(folder, method, TASK)
     for run in unfinished(args):
         finetune_args.check(replace(_arguments(args, run.method, run.seed), resume=run.folder.exists()))
     panda_gym.check_driver()

@@ -79,13 +79,13 @@ class Cell(NamedTuple):
 
 def look_up(kind: Kind, args: Any) -> Cell:
     """How far the run with these arguments, of one system, has got."""
-    from sgft_jax.io import checkpoint
-
     folder = kind.folder(args)
     if not (folder / CONFIG).exists():
         return Cell(kind, args, "missing", 0)
     summary = read_own(folder / SUMMARY, _Summary)
     done = bool(summary) and kind.finished(args, summary)
+    from sgft_jax.io import checkpoint
+
     last = checkpoint.latest(folder, say=lambda _: None) or 0
     return Cell(kind, args, "finished" if done else "unfinished", last)
 

@@ -8,8 +8,10 @@ import importlib
 import logging
 import os
 import select
+import signal
 import subprocess
 import sys
+import threading
 import traceback
 import types
 import typing
@@ -26,14 +28,23 @@ from tyro import _errors
 
 from sgft_jax.types import UserError, unknown
 
-BROKEN_PIPE, USER_ERROR, INTERRUPTED = 1, 2, 130
-_FULL = os.strerror(errno.ENOSPC)  # "No space left on device"
+BROKEN_PIPE, USER_ERROR = 1, 2
+_SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
+_FULL = [os.strerror(number) for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)]  # "No space left on device"
 _ON_DISK = (
     errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EEXIST, errno.ENOTDIR, errno.EISDIR,
-    errno.ENAMETOOLONG,
+    errno.ENAMETOOLONG, errno.EFBIG, errno.ELOOP, errno.EIO, errno.EMFILE, errno.ENFILE,
 )  # fmt: skip
 _CACHE_VARIABLE = "SGFT_CACHE_DIR"
 _RENDER_PROBE = "import mujoco; c = mujoco.GLContext(16, 16); c.make_current(); c.free()"
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal that asks the process to end: handled as Ctrl-C is. number: of the signal."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
 
 
 def run_main[T](
@@ -48,20 +59,24 @@ def run_main[T](
 
     default(argv) -> the defaults of the options where some decide those of others, see `preview`.
     Exits with code 2 and one line `error: ...` on stderr for anything the user can mend (`UserError`, unknown options
-    or choices, a device without room), with 130 after an interrupt, with 1 and no message if the reader of its output
-    has gone, as after `| head`. Other exceptions are bugs and keep their traceback.
+    or choices, a device without room), with 130 after Ctrl-C, 143 after SIGTERM and 129 after SIGHUP, as shells count,
+    with 1 and no message if the reader of its output has gone, as after `| head`. Other exceptions are bugs and keep
+    their traceback.
     """
-    with _may_lose_its_reader():
+    with _may_lose_its_reader(), _stopped_by_signals():
         try:
             words = list(sys.argv[1:] if argv is None else argv)
             start = None if default is None else default(words)
             config = parse(config_type, description, words, default=start)  # a dataclass may refuse its values
             set_up()
+            _quiet_threads()
             main(config)
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as stopped:
+            number = getattr(stopped, "number", signal.SIGINT)
             more = "; the same command with --resume continues from the last checkpoint"
-            print(f"\ninterrupted{more if _has_resume(config_type) else ''}", file=sys.stderr)
-            sys.exit(INTERRUPTED)
+            with contextlib.suppress(OSError):  # the terminal that hung up
+                print(f"\n{_SIGNALS[number]}{more if _has_resume(config_type) else ''}", file=sys.stderr, flush=True)
+            sys.exit(128 + number)
         except UserError as error:
             fail(str(error))
         except Exception as error:
@@ -81,8 +96,8 @@ def _disk_trouble(error: BaseException | None) -> str | None:
     """What is wrong where a file could not be read or written; also as the cause of another error. Else None."""
     if isinstance(error, OSError) and error.errno in _ON_DISK:
         return f"{error.filename or 'a file of the run'}: {(error.strerror or 'cannot be written').lower()}"
-    if _FULL in str(error):  # Orbax has another type for it
-        return f"a file of the run: {_FULL.lower()}"
+    if words := [text for text in _FULL if text in str(error)]:  # Orbax has another type for it
+        return f"a file of the run: {words[0].lower()}"
     return None if error is None else _disk_trouble(error.__cause__)
 
 
@@ -106,6 +121,48 @@ def _in_renderer_choice(error: Exception) -> bool:
 def _is_out_of_memory(error: Exception) -> bool:
     """Whether the host or, as JAX says it, a device had no room for an array."""
     return isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
+
+
+@contextlib.contextmanager
+def _stopped_by_signals() -> Iterator[None]:
+    """SIGTERM and SIGHUP raise `Stopped`, where nobody has said otherwise (as `nohup` does); a second one kills."""
+
+    def stop(number: int, frame: object) -> NoReturn:
+        signal.signal(number, signal.SIG_DFL)
+        raise Stopped(number)
+
+    asked = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) == signal.SIG_DFL]
+    if threading.current_thread() is not threading.main_thread():
+        asked = []  # only the main thread may handle signals
+    for number in asked:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in asked:
+            signal.signal(number, signal.SIG_DFL)
+
+
+class _Quiet:
+    """What Python calls with an error that nobody catches, but for a disk that is full: the main thread says that."""
+
+    def __init__(self, hook: Callable[..., object]) -> None:
+        self.hook = hook
+
+    def __call__(self, failed: Any) -> None:
+        """failed: one object that begins with type and error."""
+        _, error, *_ = failed
+        # The second one is a checkpoint's writer that reports to a loop which has given up; it goes on after `main`.
+        if _disk_trouble(error) is None and str(error) != "Event loop is closed":
+            self.hook(failed)
+
+
+def _quiet_threads() -> None:
+    """Libraries write in threads of their own, each of which would print its own traceback."""
+    if not isinstance(threading.excepthook, _Quiet):
+        threading.excepthook = _Quiet(threading.excepthook)
+    if not isinstance(sys.unraisablehook, _Quiet):
+        sys.unraisablehook = _Quiet(sys.unraisablehook)
 
 
 @contextlib.contextmanager
@@ -252,8 +309,10 @@ def set_up() -> None:
     if "xla_gpu_triton_gemm_any" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_triton_gemm_any=true".strip()
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # the C++ logs of XLA
-    for name in ("absl", "jax", "orbax", "tensorboardX"):
+    for name in ("jax", "tensorboardX"):
         logging.getLogger(name).setLevel(logging.ERROR)
+    for name in ("absl", "asyncio", "orbax"):  # they log the errors that they raise, with a traceback
+        logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 def cache_folder() -> Path | None:

@@ -13,7 +13,7 @@ from typing import Any
 
 from envs.gaps import SIM, title
 from experiments import cli
-from experiments.options import Impl, at_least_one, check_task, seed_list
+from experiments.options import Impl, at_least_one, check_task, seed_list, task_of_priors
 from sgft_jax import extend
 from sgft_jax.io.runs import check_folder
 from sgft_jax.types import UserError
@@ -106,8 +106,12 @@ def check(args: CollectArgs) -> float:
     level = args.level if args.level is not None else LEVELS.get(extend.name_of(args.task))
     if args.policy is None and level is None and not args.operator:
         raise UserError(f"--level: say at which mean return learning stops; only {', '.join(LEVELS)} have a default")
-    if args.policy is not None and not args.policy.is_dir():
-        raise UserError(f"--policy {args.policy}: no such folder")
+    if args.policy is not None:
+        if not (args.policy / "prior.json").exists():
+            raise UserError(
+                f"--policy {args.policy}: {'holds no policy' if args.policy.is_dir() else 'no such folder'}"
+            )
+        task_of_priors([args.policy], args.task)
     check_folder(args.out)
     if there := [path for path in targets(args) if path.exists() and not args.overwrite]:
         raise UserError(f"{there[0]}: exists already; --overwrite replaces it, another --out keeps both")

@@ -6,6 +6,7 @@ given again, does what is missing. The real systems of a task that a method has 
 in one program.
 """
 
+import glob
 from dataclasses import dataclass, replace
 
 from envs import gaps
@@ -14,7 +15,8 @@ from experiments.cells import Cell, check_begun, complete
 from experiments.figures import FiguresArgs, figures
 from experiments.finetune_args import FinetuneArgs
 from experiments.grid import GridArgs
-from sgft_jax.types import UserError
+from sgft_jax.methods import DEFAULT, NAMES
+from sgft_jax.types import UserError, unknown
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,9 @@ def cells(args: CompareArgs) -> list[Cell]:
     """The grid, methods innermost, so that every task and real system is compared early."""
     args = replace(args, reals=gaps.each(args.reals))
     grid.check(args)
+    name = (args.reference or DEFAULT).partition(":")[0]
+    if name not in (*NAMES, *args.methods) and not any(args.out.glob(f"finetune/*/*/{glob.escape(name)}*")):
+        raise UserError(unknown("--reference", name, {*NAMES, *args.methods}))
     if args.tuned:
         for task in args.tasks:
             tuned.check_fair(args.out, task, args.methods, args.reals)

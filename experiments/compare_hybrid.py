@@ -26,7 +26,7 @@ from experiments.hybrid_args import (
     gaps_of,
     run_folder,
 )
-from experiments.options import Impl, at_least_one, check_task, not_negative, seed_list, without_repeats
+from experiments.options import Impl, at_least_one, check_data, check_task, not_negative, seed_list, without_repeats
 from sgft_jax import extend
 from sgft_jax.hybrid.methods import NAMES, get_method
 from sgft_jax.hybrid.presets import say_preset
@@ -171,8 +171,11 @@ def defaults(argv: Sequence[str]) -> CompareHybridArgs:
 def check(args: CompareHybridArgs) -> None:
     """Raises UserError for what is wrong in the arguments alone."""
     at_least_one(args, "eval_every", "eval_episodes")
-    not_negative(args, "previous_actions", "minutes")
+    not_negative(args, "previous_actions", "minutes", "beside")
     seed_list(args.seed, args.seeds)
+    check_task(args.task)
+    if not args.methods:
+        raise UserError("--methods: name at least one")
     if not args.gaps:
         raise UserError(f"--gaps: {extend.name_of(args.task)} comes with none; name some, or {SIM} for no gap")
     for name, given in (("methods", args.methods), ("gaps", args.gaps), ("data", tuple(map(data_name, args.data)))):
@@ -185,8 +188,9 @@ def check(args: CompareHybridArgs) -> None:
     learning = [name for name in args.methods if get_method(name.partition(":")[0]).kind != "simulator"]
     if learning and not args.data:
         raise UserError(f"--data: {learning[0]} learns from real data; name files or folders (docs/data.md)")
-    if args.released is None and (missing := [path for path in args.data if not path.exists()]):
-        raise UserError(f"--data {missing[0]}: no such file")
+    for path in args.data if args.released is None else ():
+        check_data("--data", path)
+    check_folder(args.out)
     if args.export is not None:
         check_folder(args.export, "--export")
     if args.export is not None and args.released is not None:

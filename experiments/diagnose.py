@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments import cli
-from experiments.options import Impl, at_least_one, prior_folders, seed_list, task_of_prior
+from experiments.options import Impl, at_least_one, prior_folders, seed_list, task_of_priors
 from experiments.real_systems import check as check_real
 from experiments.rollouts import home_of, task_of
 from sgft_jax.io.runs import check_folder, read_config
@@ -73,10 +73,10 @@ def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
         at_least_one(args, "rollouts")
     check_folder(args.out / "diagnose")
     recorded = home_of("--real", Path(args.real)) if Path(args.real).is_dir() else None
+    if recorded and recorded.name in ("", ".."):
+        recorded = recorded.resolve()  # what is written is called like it
     config = read_config(recorded) if recorded else {}
-    task, prior = args.task, args.prior
-    if task is None and recorded and "task" in config:
-        task = task_of(recorded, None)
+    task, prior = args.task or (task_of(recorded, None) if recorded and "task" in config else None), args.prior
     if task is not None:
         check_real(task, [] if recorded else [args.real])
     if prior is None and task is None:
@@ -84,7 +84,7 @@ def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
     if prior is None and config.get("prior"):
         prior = Path(config["prior"])
     folders = prior_folders(prior, out=args.out, task=task or "", preset=config.get("preset") or args.preset)
-    task = task or task_of_prior(folders[0])
+    task = task_of_priors(folders, task)
     check_real(task, [] if recorded else [args.real])
     return folders, task, recorded
 

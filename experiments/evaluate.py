@@ -10,7 +10,7 @@ from typing import Any
 from envs import gaps
 from envs.gaps import SIM, Gap
 from experiments import cli
-from experiments.options import Impl, at_least_one, prior_folders, seed_list, task_of_prior, without_repeats
+from experiments.options import Impl, at_least_one, prior_folders, seed_list, task_of_priors, without_repeats
 from experiments.real_systems import REMOTE, TOGETHER, connect, described, is_robot, is_stepped
 from experiments.real_systems import check as check_real
 from sgft_jax.io.runs import check_folder
@@ -171,8 +171,10 @@ def check(args: EvaluateArgs) -> tuple[list[Path], str]:
         check_real(args.task, reals, args.set)
     home = args.run / "best" if args.best and args.run else args.run or args.prior
     folders = prior_folders(home, out=args.out, task=args.task or "", preset=args.preset)
-    task = args.task or task_of_prior(folders[0])
+    task = task_of_priors(folders, args.task)
     check_real(task, reals, args.set)
+    if reals and not is_stepped(reals[0]):
+        gaps.changes(args.set)
     return folders, task
 
 

@@ -16,7 +16,10 @@ from experiments import cli, grid
 from experiments.cells import Cell, check_begun, complete
 from experiments.finetune_args import with_settings
 from experiments.grid import GridArgs
+from experiments.options import check_prior, prior_folders
+from sgft_jax import extend
 from sgft_jax.io.jsonfile import jsonable, write_json
+from sgft_jax.methods import get_method
 from sgft_jax.types import UserError
 
 if TYPE_CHECKING:
@@ -91,8 +94,13 @@ def check(args: FactorialArgs) -> None:
         raise UserError(f"--methods: the cells are all of {METHOD}")
     if args.horizon < 2:
         raise UserError(f"--horizon is {args.horizon}: must be at least 2, to differ from 1")
+    options = {"horizon": args.horizon, "anchor": args.anchor, "identify": args.identify, "guard": args.guard}
+    get_method(METHOD).config(**options)
     grid.check(replace(args, reals=(gaps.SIM,)))  # all but the real systems, which may differ between tasks
     for task in args.tasks:
+        if args.prior is not None and args.data is None:
+            for folder in prior_folders(args.prior, out=args.out, task=task, preset=""):
+                check_prior(folder, get_method(METHOD), extend.name_of(task))
         reals = reals_of(args, task)
         if not reals:
             raise UserError(f"--reals: names no real system of {task}")

@@ -5,10 +5,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from envs import gaps
 from experiments.options import (
     Impl,
     Successors,
     at_least_one,
+    check_data,
+    check_prior,
     check_variant,
     not_negative,
     prior_folders,
@@ -17,7 +20,7 @@ from experiments.options import (
     without_repeats,
 )
 from experiments.real_systems import check as check_real
-from experiments.real_systems import is_robot, title
+from experiments.real_systems import is_robot, is_stepped, title
 from sgft_jax import extend
 from sgft_jax.io.runs import check_start
 from sgft_jax.methods import DEFAULT, get_method
@@ -114,20 +117,21 @@ def with_settings(args: FinetuneArgs, settings: Mapping[str, Any]) -> FinetuneAr
 
 def run_folder(args: FinetuneArgs, real: str) -> Path:
     """Where the run on that real system lives; the seeds of one call share a folder."""
-    system = "_".join([title(real), *(change.replace("/", "") for change in args.set)])
+    system = "_".join([title(real), *args.set]).replace("/", "")
+    extend.folder_name("--set", system)
     seeds = seeds_name(seed_list(args.seed, args.seeds))
     return args.out / "finetune" / extend.name_of(args.task) / system / label(args) / seeds
 
 
 def label(args: FinetuneArgs) -> str:
     """The method with its variant, as folders and figures name it."""
-    return "_".join(filter(None, [get_method(args.method).name, args.variant]))
+    return extend.folder_name("--variant", "_".join(filter(None, [get_method(args.method).name, args.variant])))
 
 
 def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
     """The method and the seeds; raises UserError for what is wrong in the arguments and with the run folders."""
     at_least_one(args, "rollouts", "eval_every", "checkpoint_every", "sync_every")
-    not_negative(args, "eval_episodes")
+    not_negative(args, "eval_episodes", "devices")
     method, seeds = get_method(args.method), seed_list(args.seed, args.seeds)
     if not isinstance(args.options, method.config):
         raise UserError(f"--method {method.name}: the options are those of another method")
@@ -136,8 +140,8 @@ def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
     if args.prior == NO_PRIOR and method.needs_prior:
         raise UserError(f"--prior none: {method.name} needs a prior of {method.prior}")
     check_variant(args.variant)
-    if missing := [path for path in args.real_data if not path.exists()]:
-        raise UserError(f"--real-data {missing[0]}: no such file or folder")
+    for path in args.real_data:
+        check_data("--real-data", path)
     if args.real_updates is not None and (args.real_updates < 0 or not args.real_data):
         raise UserError(f"--real-updates {args.real_updates}: 0 or more, and of --real-data, which must be named")
     if args.successors != "stored" and not args.real_data:
@@ -146,6 +150,8 @@ def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
         raise UserError("--real: name at least one")
     without_repeats("--real", args.real)
     check_real(args.task, args.real, args.set)
+    if not is_stepped(args.real[0]):
+        gaps.changes(args.set)
     _check_robot(args)
     if args.eval_at:
         _check_eval_at(args)
@@ -192,4 +198,7 @@ def priors_of(args: FinetuneArgs) -> list[Path]:
     """The folders of the priors to start from, none where the user says so; raises UserError where there is none."""
     if args.prior == NO_PRIOR:
         return []
-    return prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
+    folders = prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
+    for folder in folders:
+        check_prior(folder, get_method(args.method), extend.name_of(args.task))
+    return folders

@@ -12,11 +12,13 @@ import jax
 import numpy as np
 
 import envs
+from envs.base import Env
 from envs.rollout import Episode
 from experiments import cli, logged, real_systems
 from experiments.evaluation import scores
 from experiments.finetune_args import VOLATILE, FinetuneArgs, run_folder
 from experiments.finetune_record import Record, evaluation_store
+from experiments.memory import reserve
 from experiments.recorded import RecordedSystem
 from sgft_jax import api, mesh, train
 from sgft_jax.api import Setup
@@ -40,6 +42,7 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
     sizes = {"--seeds" if len(args.real) == 1 else "the number of --real times --seeds": len(args.real) * args.seeds}
     devices = mesh.devices(args.devices, sizes)
     env = envs.make(args.task, args.impl, **observed_by(folders))
+    _reserve(args, env, len(folders), devices)
     found = [real_systems.described(env, name, args.set) for name in args.real]
     priors = load_priors(folders, env)
     for prior in priors:
@@ -51,13 +54,17 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
     named = [real_systems.REMOTE if real_systems.is_robot(name) else name for name in args.real]
     homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in named}
     with contextlib.ExitStack() as last:
+        last.enter_context(mesh.use(devices))
         playing, members, stepped = found, seeds, real_systems.is_stepped(args.real[0])
-        if stepped:  # before there is a folder, because it may fail
+        if stepped:
             playing = real_systems.connect(
                 env, args.real, args.set, members=len(seeds), gamma=card["gamma"], home=args.out
             )
             last.push(lambda error, *_: playing.close(over=error is None))
             members = seeds * len(args.real)
+        setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
+        assert isinstance(setup.system, Simulated | Gymnasium)
+        # Last: what is wrong with a robot or with a method of the user's own leaves no folder behind.
         opened = runs.open_runs(
             homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
             inputs={
@@ -68,9 +75,6 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
         )  # fmt: skip
         for own in opened:
             last.callback(own.close)
-        last.enter_context(mesh.use(devices))
-        setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
-        assert isinstance(setup.system, Simulated | Gymnasium)
         records = [
             Record(
                 own.folder, setup.system.env, gap, method.name, seeds, real_evaluations=stepped,
@@ -85,6 +89,14 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
             last.callback(learner.close)
             learner.wait()
         return _Run(args, setup, setup.system, card, records, logs, learner).work()
+
+
+def _reserve(args: FinetuneArgs, env: Env, priors: int, devices: int) -> None:
+    """Raises UserError where the devices have no room for the transitions of all members."""
+    row, members = 4 * (2 * env.obs_dim + env.act_dim + 2), args.seeds * len(args.real)
+    kept = {name: row * members * getattr(args.options, name) for name in ("replay_capacity", "batch_size")}
+    kept["simulated_transitions"] = row * priors * getattr(args.options, "simulated_transitions", 0)
+    reserve(kept, copies=1, devices=devices, settings="options")
 
 
 def _build(args: FinetuneArgs, folders: list[Path], priors: list[Prior]) -> Callable[[], Finetuner]:

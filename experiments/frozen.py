@@ -25,7 +25,7 @@ from experiments.grid import GridArgs
 from experiments.options import at_least_one, not_negative, prior_folders
 from experiments.pretrain import PretrainArgs, pretrain, run_folder
 from experiments.scoreboard import ScoreboardArgs, board
-from sgft_jax.io.runs import CONFIG
+from sgft_jax.io.runs import CONFIG, check_folder
 from sgft_jax.methods import DEFAULT, NAMES, get_method
 from sgft_jax.presets import DEFAULT_PRESET, PRESETS, preset_of
 from sgft_jax.types import UserError
@@ -86,6 +86,7 @@ def main(args: FrozenArgs) -> None:
     """Does what is missing, then prints the scoreboard; raises UserError if some units failed."""
     at_least_one(args, "jobs", "split", "priors", "fewer")
     not_negative(args, "gpus", "minutes")
+    check_folder(args.out / "frozen")
     every = {unit.name: unit for unit in units(args)}
     if args.unit:
         cli.choose("--unit", args.unit, every).work()

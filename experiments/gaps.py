@@ -14,8 +14,18 @@ from pathlib import Path
 from typing import Any
 
 from envs import gaps
+from envs.files import read_toml
 from experiments import cli
-from experiments.options import Impl, check_task, prior_folders, seed_list, without_repeats
+from experiments.options import (
+    Impl,
+    at_least_one,
+    check_task,
+    not_negative,
+    prior_folders,
+    seed_list,
+    task_of_priors,
+    without_repeats,
+)
 from sgft_jax import extend
 from sgft_jax.io.runs import check_folder
 from sgft_jax.presets import PRESETS, PretrainConfig
@@ -90,6 +100,7 @@ def measure(args: GapsArgs) -> dict[str, Any]:
     """Measures, prints a table, writes and returns the summary."""
     for option in ("preset", "judge_preset"):
         cli.choose(f"--{option.replace('_', '-')}", getattr(args, option), PRESETS)
+    at_least_one(args, "episodes")
     if args.episodes < 200:
         raise UserError(f"--episodes is {args.episodes}: a success rate needs at least 200 to tell 40 % from 50 %")
     _check_draw(args)
@@ -103,6 +114,7 @@ def measure(args: GapsArgs) -> dict[str, Any]:
     if not (args.draw or args.presets or gaps.presets(task)):
         raise UserError(f"{task} comes with no gaps; name .toml or .json files with --presets")
     folders = prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
+    task_of_priors(folders, args.task)
     if args.draw:
         from experiments.gaps_draw import run
     else:
@@ -112,13 +124,14 @@ def measure(args: GapsArgs) -> dict[str, Any]:
 
 
 def _check_draw(args: GapsArgs) -> None:
-    if args.draw < 0:
-        raise UserError(f"--draw is {args.draw}: must be at least 1")
+    not_negative(args, "draw")
     if args.draw and args.presets:
         raise UserError(f"--presets {args.presets[0]}: names gaps, and --draw draws them; give one of the two")
     names = ("distribution", "plan", "judge", "choose", "to", "overwrite")
     if odd := [name for name in names if getattr(args, name) and not args.draw]:
         raise UserError(f"--{odd[0]}: is for drawn gaps; say how many with --draw")
+    if args.distribution is not None:
+        read_toml(args.distribution)
     if not 0 <= args.choose <= args.draw:
         raise UserError(f"--choose is {args.choose}: must be from 1 to the {args.draw} of --draw")
     if bool(args.choose) != bool(args.to):

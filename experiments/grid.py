@@ -12,6 +12,7 @@ from experiments.finetune_args import VOLATILE, FinetuneArgs, arguments, label, 
 from experiments.options import Impl, at_least_one, check_task, not_negative, seed_list, without_repeats
 from sgft_jax import extend
 from sgft_jax.io.jsonfile import jsonable
+from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import NAMES, get_method
 from sgft_jax.types import UserError
 
@@ -52,7 +53,7 @@ class GridArgs:
 def check(args: GridArgs) -> None:
     """Raises UserError for what is wrong in the arguments alone."""
     at_least_one(args, "rollouts", "eval_every")
-    not_negative(args, "minutes")
+    not_negative(args, "minutes", "devices")
     for name, given in (("tasks", args.tasks), ("methods", args.methods), ("reals", args.reals)):
         if not given:
             raise UserError(f"--{name}: name at least one")
@@ -62,6 +63,7 @@ def check(args: GridArgs) -> None:
     for method in args.methods:
         get_method(method)
     seed_list(args.seed, args.seeds)
+    check_folder(args.out)
 
 
 def run_of(args: GridArgs, task: str, real: str, method: str) -> FinetuneArgs:

@@ -13,6 +13,7 @@ from experiments.options import (
     Impl,
     Successors,
     at_least_one,
+    check_data,
     check_task,
     check_variant,
     not_negative,
@@ -108,7 +109,7 @@ def run_folder(args: HybridArgs, gap: str) -> Path:
 def data_name(path: Path) -> str:
     """What a data set is called in folders: its file without the ending, or its folder."""
     inside = path.parent.parent if path.name == "main_data.hdf5" else path
-    return re.sub(r"[^\w.-]", "-", inside.name.removesuffix(".hdf5"))
+    return extend.folder_name("--data", re.sub(r"[^\w.-]", "-", inside.name.removesuffix(".hdf5")))
 
 
 def check(args: HybridArgs) -> tuple[HybridMethod, list[int]]:
@@ -120,6 +121,10 @@ def check(args: HybridArgs) -> tuple[HybridMethod, list[int]]:
         raise UserError(f"--method {method.name}: the options are those of another method")
     if method.kind != "simulator" and args.data is None:
         raise UserError(f"--data: {method.name} learns from real data; name a file or folder (docs/data.md)")
+    if method.kind == "simulator" and args.data is not None:
+        raise UserError(f"--data {args.data}: {method.name} learns in the simulator alone; leave one of them out")
+    if args.data is not None:
+        check_data("--data", args.data)
     check_variant(args.variant)
     if not args.gap:
         raise UserError(f"--gap: name at least one, or {SIM} for no gap")

@@ -52,11 +52,12 @@ def run(args: HybridArgs, method: HybridMethod, seeds: list[int]) -> list[dict[s
         log = logged.read(args.data, env, gamma=args.options.gamma, successors=args.successors)
     homes = {run_folder(args, name): jsonable(args) | {"gap": name} for name in named}
     inputs = {"data": None if log is None else {"sha256": log.facts.sha256, "successors": log.facts.successors}}
+    ready = _Run(args, method, env, found, seeds, log)  # refuses what it cannot play before a folder is made
     opened = runs.open_runs(
         homes, kind="hybrid", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE, inputs=inputs
     )
     try:
-        return _Run(args, method, env, found, seeds, log, [own.folder for own in opened]).work()
+        return ready.work([own.folder for own in opened])
     finally:
         for own in opened:
             own.close()
@@ -82,13 +83,12 @@ class _Run:
 
     def __init__(
         self, args: HybridArgs, method: HybridMethod, env: Env, found: list[Gap], seeds: list[int],
-        log: logs.Log | None, folders: list[Path],
+        log: logs.Log | None,
     ) -> None:  # fmt: skip
         self.args, self.method, self.gaps, self.seeds = args, method, found, seeds
         self.env = real_env(env, found)  # what the simulators share
-        self.folders, self.data = folders, log
+        self.data = log
         self.agent = method.build(args.options, env)
-        self.logs = [MetricsLog(folder) for folder in folders]
         self.last_good: Path | None = None
         self.expect = {"kind": "hybrid", "task": env.name, "method": method.name, "seeds": seeds}
         members = jnp.zeros(len(found) * len(seeds), jnp.int32)
@@ -97,14 +97,15 @@ class _Run:
         pools = real_worlds(real, [gap], jax.random.key(0))
         self.system = Simulated(real, pools, members, gamma=args.options.gamma)
         self.chunk = args.schedule.updates_per_chunk
+        self.inputs = (self._pools(), self._real(), self._keys())
+        self._reserve(self.inputs[1])
 
-    def work(self) -> list[dict[str, Any]]:
-        """Everything, in order; returns the summaries."""
-        inputs = (self._pools(), self._real(), self._keys())
-        self._reserve(inputs[1])
-        state = self._restore(*inputs)
+    def work(self, folders: list[Path]) -> list[dict[str, Any]]:
+        """Everything, in order; returns the summaries. folders: of the runs, one for each simulator."""
+        self.folders, self.logs = folders, [MetricsLog(folder) for folder in folders]
+        state = self._restore(*self.inputs)
         steps = trainer.train(
-            self.env, self.agent, self.args.schedule, *inputs, gamma=self.args.options.gamma, state=state
+            self.env, self.agent, self.args.schedule, *self.inputs, gamma=self.args.options.gamma, state=state
         )
         return self._finish(self._follow(steps))
 

@@ -1,6 +1,5 @@
 """Options that several commands share, and what can be wrong with them. Imports neither JAX nor MuJoCo."""
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,15 +8,15 @@ from tyro.conf import arg
 
 import envs
 from envs import gaps
-from sgft_jax import extend, types
+from sgft_jax import checks, extend, types
 from sgft_jax.io.cards import CARD, known_task, read_card
 from sgft_jax.io.folders import ASIDE, present
-from sgft_jax.presets import PRESETS
-from sgft_jax.types import UserError, unknown
+from sgft_jax.presets import PRESETS, check_card
+from sgft_jax.types import Method, UserError, unknown
 
 SHIPPED = Path("docs/priors")  # in the folder of the code, where commands are usually typed
 _LAST_PORT = 65_535
-_LONGEST = 100  # bytes; a file system allows names of 255
+_MOST_HOSTS, _MOST_SEEDS = 2**16, 2**16  # of one run
 LAST_SEED = 2**31 - 1  # larger ones stand for held-out worlds and episodes
 
 Impl = Annotated[
@@ -38,6 +37,8 @@ def seed_list(first: int, count: int) -> list[int]:
     """`count` seeds from `first` on; raises UserError for none, and for seeds that do not fit into 32 bits."""
     if count < 1:
         raise UserError(f"--seeds is {count}: must be at least 1")
+    if count > _MOST_SEEDS:
+        raise UserError(f"--seeds is {count}: must be at most {_MOST_SEEDS}")
     if not 0 <= first <= LAST_SEED - count + 1:
         more = f", and --seeds {count} of them are wanted" if count > 1 else ""
         raise UserError(f"--seed is {first}: seeds go from 0 to {LAST_SEED}{more}")
@@ -57,7 +58,7 @@ def without_repeats(option: str, words: Sequence[str]) -> None:
 
 def port_of(text: str) -> int | None:
     """The number of a port, None for what is none."""
-    return int(text) if text.isdecimal() and 0 < int(text) <= _LAST_PORT else None
+    return int(text) if text.isdecimal() and len(text) < 9 and 0 < int(text) <= _LAST_PORT else None
 
 
 def hosts_of(hosts: str) -> tuple[str, int, int]:
@@ -67,7 +68,9 @@ def hosts_of(hosts: str) -> tuple[str, int, int]:
         raise UserError(f"--hosts {hosts}: must be 'auto' or ADDRESS:PORT,COUNT,INDEX")
     if port_of(address.rpartition(":")[2]) is None:
         raise UserError(f"--hosts {hosts}: the port of {address} must be from 1 to 65535")
-    count, index = map(int, numbers)
+    count, index = (int(n) if len(n) < 9 else _MOST_HOSTS + 1 for n in numbers)
+    if count > _MOST_HOSTS:
+        raise UserError(f"--hosts {hosts}: at most {_MOST_HOSTS} of them")
     if index >= count:
         raise UserError(f"--hosts {hosts}: index {index} of {count} hosts; they are counted from 0")
     return address, count, index
@@ -75,25 +78,32 @@ def hosts_of(hosts: str) -> tuple[str, int, int]:
 
 def check_variant(variant: str) -> None:
     """Raise UserError for a word that cannot be a part of a folder's name."""
-    if not re.fullmatch(r"[\w.-]*", variant):
-        raise UserError(f"--variant {variant!r}: letters, digits, '.', '_' and '-' only, it names a folder")
-    if len(variant.encode()) > _LONGEST:
-        raise UserError(f"--variant has {len(variant)} letters: choose a shorter word, it names a folder")
+    if variant:
+        extend.folder_name("--variant", variant)
 
 
-def check_task(task: str, reals: Sequence[str] = ()) -> None:
-    """Raise UserError where there is no such task, or no such real system of it, by name or file."""
+def check_data(option: str, path: Path) -> None:
+    """Raises UserError where there are no recorded data."""
+    if not (path.is_file() or path.is_dir()):
+        raise UserError(f"{option} {path}: {'is no plain file' if path.exists() else 'no such file or folder'}")
+
+
+def check_task(task: str, reals: Sequence[str] = (), changes: Sequence[str] = ()) -> None:
+    """Raise UserError where there is no such task, or no such real system of it, or for changes that set nothing."""
     name = envs.name_of(task)
     for real in reals:
         gaps.find(name, real)
+    gaps.changes(changes)
 
 
 def at_least_one(args: object, *names: str) -> None:
     """Raise UserError for an option that is less than 1, or of several numbers has one that is, or has none."""
     for name in names:
         value = getattr(args, name)
-        if (least := min(value, default=0) if isinstance(value, tuple) else value) < 1:
+        several = value if isinstance(value, tuple) else (value,)
+        if (least := min(several, default=0)) < 1:
             raise UserError(f"--{name.replace('_', '-')} is {least}: must be at least 1")
+        _not_too_many(name, max(several))
 
 
 def not_negative(args: object, *names: str) -> None:
@@ -102,6 +112,13 @@ def not_negative(args: object, *names: str) -> None:
         value = getattr(args, name)
         if value is not None and not value >= 0:
             raise UserError(f"--{name.replace('_', '-')} is {value}: must be at least 0")
+        if isinstance(value, int):
+            _not_too_many(name, value)
+
+
+def _not_too_many(name: str, value: int) -> None:
+    if value > checks.MOST:
+        raise UserError(f"--{name.replace('_', '-')} is {value}: must be at most {checks.MOST}")
 
 
 def prior_home(out: Path, task: str, preset: str) -> Path:
@@ -138,9 +155,25 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str, opti
     return sorted(found, key=_seed_number)
 
 
-def task_of_prior(folder: Path) -> str:
-    """The task that the card of a prior names; raises UserError where that is none of ours."""
-    return known_task(folder / CARD, read_card(folder)["task"])
+def check_prior(folder: Path, method: Method, task: str) -> None:
+    """Raises UserError for a prior of another algorithm or task than the method needs, before anything is loaded."""
+    try:
+        check_card(read_card(folder), method, task)
+    except UserError as error:
+        raise UserError(f"--prior {folder}: {error}") from error
+
+
+def task_of_priors(folders: Sequence[Path], task: str | None) -> str:
+    """The task that the user says, by name or file, or else the one that the cards of the priors name.
+
+    Raises UserError where a card names another, or, unless the user says it, none of ours.
+    """
+    named = {folder: read_card(folder)["task"] for folder in folders}
+    chosen = task or known_task(folders[0] / CARD, named[folders[0]])
+    for folder, other in named.items():
+        if other != extend.name_of(chosen):
+            raise UserError(f"{folder}: is a prior of the task {other!r}, not of {extend.name_of(chosen)!r}")
+    return chosen
 
 
 def _seed_number(folder: Path) -> tuple[int, str]:

@@ -13,7 +13,7 @@ from typing import Any
 from envs import gaps
 from envs.gaps import SIM
 from experiments import cli
-from experiments.options import Impl, check_task, hosts_of, seed_list, seeds_name
+from experiments.options import Impl, check_task, hosts_of, not_negative, seed_list, seeds_name
 from sgft_jax import extend
 from sgft_jax.io.runs import check_start
 from sgft_jax.presets import DEFAULT_PRESET, PRESETS, PretrainConfig
@@ -85,7 +85,8 @@ def check(args: PretrainArgs) -> list[int]:
     seeds, real = seed_list(args.seed, args.seeds), args.real not in (None, SIM)
     if args.set and not real:
         raise UserError(f"--set {args.set[0]}: changes a real system; name one with --real")
-    check_task(args.task, [str(args.real)] if real else [])
+    not_negative(args, "devices")
+    check_task(args.task, [str(args.real)] if real else [], args.set)
     if args.hosts not in (None, "auto"):
         hosts_of(args.hosts)
     # Of several hosts every one sees what is there now: the first changes nothing before it has met the others.
@@ -98,7 +99,8 @@ def run_folder(args: PretrainArgs) -> Path:
     where, seeds = args.preset, seeds_name(seed_list(args.seed, args.seeds))
     if args.real not in (None, SIM):
         changes = ["=".join(word.strip() for word in change.partition("=")[::2]) for change in args.set]
-        where += "-on-" + "+".join([gaps.title(str(args.real)), *changes])
+        where += "-on-" + "+".join([gaps.title(str(args.real)), *changes]).replace("/", "")
+    extend.folder_name("--set", where)
     return args.out / "pretrain" / extend.name_of(args.task) / where / seeds
 
 

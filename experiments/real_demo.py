@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING
 
 from experiments import cli, panda_gym
 from experiments.finetune_args import arguments, run_folder
-from experiments.options import SHIPPED, at_least_one
+from experiments.options import SHIPPED, at_least_one, check_prior, seed_list
 from experiments.panda_gym import HOME, PYTHON, TASK
 from experiments.real_systems import REMOTE
+from sgft_jax.io.runs import check_folder
+from sgft_jax.methods import get_method
 from sgft_jax.types import UserError
 
 if TYPE_CHECKING:
@@ -63,9 +65,13 @@ def main(args: RealDemoArgs) -> None:
 def check(args: RealDemoArgs) -> None:
     """Raises UserError for all that is wrong with the options before anything is made."""
     at_least_one(args, "rollouts", "episodes")
+    seed_list(args.seed, 1)
+    method = get_method(args.method)
+    check_folder(args.out)
     if not (args.prior / "prior.json").exists():
         command = f"python -m experiments.pretrain --task {TASK}"
         raise UserError(f"--prior {args.prior}: holds no prior; make one with: {command}")
+    check_prior(args.prior, method, TASK)
     panda_gym.check_driver()
     if args.out.exists() and any(args.out.iterdir()) and not (args.out / "robot.log").exists():
         raise UserError(f"--out {args.out}: holds something that is no demo; choose another folder")

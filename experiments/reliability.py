@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from experiments import cli
-from experiments.options import at_least_one
+from experiments.options import at_least_one, seed_list, without_repeats
+from sgft_jax.io.runs import check_folder
+from sgft_jax.types import UserError
 
 type Part = Literal["kills", "network", "strangers", "disk", "clock"]
 
@@ -42,6 +44,11 @@ class ReliabilityArgs:
 def main(args: ReliabilityArgs) -> dict[str, list[dict[str, Any]]]:
     """Tries, prints a line for each run, writes the numbers and returns them by part."""
     at_least_one(args, "runs", "kills", "rollouts")
+    seed_list(args.seed, args.runs)
+    if not args.parts:
+        raise UserError("--parts: name at least one")
+    without_repeats("--parts", args.parts)
+    check_folder(args.out / "reliability")
     from sgft_jax.io import runs
     from sgft_jax.io.log import write_summary
 

@@ -3,6 +3,7 @@
 `experiments.evaluate` tells whether that matters. The priors in docs/priors were written by this command.
 """
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,8 @@ import numpy as np
 
 from experiments import cli
 from experiments.options import prior_folders
+from sgft_jax.io.cards import read_card
+from sgft_jax.io.runs import check_folder
 from sgft_jax.types import Prior, PyTree, UserError
 
 _FLOAT32 = 24  # significant bits
@@ -32,16 +35,21 @@ class ShareArgs:
 
 def main(args: ShareArgs) -> None:
     """Writes the copies and says how large they are."""
-    from sgft_jax.io.priors import load_prior, save_prior
-
     if not 2 <= args.bits <= _FLOAT32:
         raise UserError(f"--bits is {args.bits}: from 2 to {_FLOAT32}")
     folders = prior_folders(args.prior, out=Path(), task="", preset="")
     if not 1 <= args.count <= len(folders):
         raise UserError(f"--count is {args.count}: {args.prior} holds {len(folders)} priors")
-    for folder in folders[: args.count]:
-        if (copy := args.to / folder.name).exists():
+    check_folder(args.to, "--to")
+    chosen = folders[: args.count]
+    for folder in chosen:
+        read_card(folder)
+        if os.path.lexists(copy := args.to / folder.name):
             raise UserError(f"{copy}: exists already; choose another --to, or remove it")
+    from sgft_jax.io.priors import load_prior, save_prior
+
+    for folder in chosen:
+        copy = args.to / folder.name
         prior = load_prior(folder)
         card = {**prior.card, "significant_bits": args.bits}
         save_prior(copy, Prior(rounded(prior.params, args.bits), card))

@@ -290,9 +290,7 @@ def _table(title: str, found: Sequence[Outcome], chosen: int | None) -> Table:
 def _pairs(args: TuneArgs) -> list[tuple[str, str]]:
     """Tasks and methods, checked."""
     grid.check(args)
-    if args.trials < 1:
-        raise UserError(f"--trials is {args.trials}: must be at least 1")
-    at_least_one(args, "rollouts", "eval_every")
+    at_least_one(args, "trials")
     return [(task, method) for task in args.tasks for method in args.methods]
 
 

@@ -20,12 +20,25 @@ from sgft_jax.types import Array, PyTree, UserError
 DATA = "data"  # the mesh's only axis
 
 
+def check_jax() -> None:
+    """Raises UserError where JAX is set to compute otherwise than this project can, before anything slow."""
+    if jax.config.jax_enable_x64:
+        raise UserError("JAX_ENABLE_X64 is on (jax_enable_x64), and everything here is float32; switch it off")
+    try:
+        jax.local_devices()
+    except (RuntimeError, AssertionError) as error:  # JAX asserts, without words, that there is a plugin for cuda
+        reason = (str(error) or "no such device, or no plugin for it").splitlines()[0]
+        chosen = jax.config.jax_platforms
+        raise UserError(f"JAX_PLATFORMS={chosen}: {reason}; unset it, or set it to cpu") from error
+
+
 def devices(wanted: int | None, sizes: Mapping[str, int]) -> int:
     """How many devices `wanted` means: None is one, or all if there are several hosts, 0 all there are.
 
     sizes: what will be cut into as many equal pieces, by the name of the option. Raises UserError if there are fewer
     devices, if a size is not a multiple of their number, or if some of several hosts would have nothing to do.
     """
+    check_jax()
     there, hosts = jax.device_count(), jax.process_count()
     n = (1 if hosts == 1 else there) if wanted is None else wanted or there
     if not 1 <= n <= there:

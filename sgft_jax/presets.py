@@ -13,6 +13,7 @@ from sgft_jax.models.config import NetworkConfig, Precision
 from sgft_jax.types import Algorithm, Method, UserError
 
 DEFAULT_PRESET = "robust"
+SIZES = ("1M", "5M", "19M", "48M", "317M")  # of TD-MPC2's networks
 
 
 @dataclass(frozen=True)
@@ -100,11 +101,15 @@ class PretrainConfig:
 
     def __post_init__(self) -> None:
         checks.at_least(
-            self, 1, "n_envs", "worlds", "env_steps", "random_transitions", "updates_per_step", "batch_size",
-            "replay_capacity", "policy_delay", "ensemble_size", "gru", "horizon", "plan_samples", "chunk_steps",
-            "eval_every", "eval_episodes", "report_episodes", "checkpoint_every",
+            self, 1, "n_envs", "worlds", "random_transitions", "updates_per_step", "batch_size", "replay_capacity",
+            "plan_samples", "chunk_steps", "eval_every", "eval_episodes", "report_episodes", "checkpoint_every",
         )  # fmt: skip
-        checks.at_least(self, 0, "refresh_every", "previous_actions")
+        checks.at_least(self, 1, "env_steps", most=2**40)
+        checks.few(self, 1, "policy_delay", "ensemble_size", "gru", "horizon")
+        checks.at_least(self, 0, "refresh_every")
+        checks.few(self, 0, "previous_actions")
+        if self.size not in SIZES:
+            raise checks.refusal("size", self.size, f"one of {', '.join(SIZES)}")
         checks.positive(self, "lr", "tau", "alpha")
         checks.share(self, "random_ladder", "lr_end", "tau", "choose_from")
         checks.below_one(self, "gamma", "random_fraction")

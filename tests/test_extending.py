@@ -204,7 +204,7 @@ def test_a_pretended_robot_teaches_a_policy(prior, capsys):
         ("", "does not define `METHOD`"),
         ("METHOD = 3\n", "METHOD is a int, not a sgft_jax.Method"),
         ("import sgft_jax\nMETHOD = sgft_jax.get_method('sac')\n", "the name 'sac' is taken"),
-        ("import sgft_jax\nMETHOD = sgft_jax.get_method('sac')._replace(name='a/b')\n", "'a/b' is taken or names no"),
+        ("import sgft_jax\nMETHOD = sgft_jax.get_method('sac')._replace(name='a/b')\n", "'a/b' cannot name a folder"),
     ],
 )
 def test_a_bad_method_is_one_line_and_code_2(tmp_path, capsys, text, words):

@@ -16,6 +16,7 @@ import numpy as np
 from msgspec import Meta
 
 from envs.files import Count
+from sgft_jax import extend
 from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean, paired_improvement
 from sgft_jax.io.csvfile import finite, read_csv, whole
 from sgft_jax.io.log import EVAL, METRICS, SUMMARY, check_records, read_jsonl
@@ -467,12 +468,16 @@ def _curve(identity: tuple[str, ...], members: Mapping[int, list[Mapping[str, An
         raise UserError(f"{'/'.join(identity)}: its seeds were not evaluated after the same rollouts")
     first, *_ = members.values()
 
+    for name, value in zip(IDENTITY, identity, strict=True):
+        if value:  # figures are called like these
+            extend.folder_name(f"the {name}", value)
+
     def column(name: str, read: Callable[[str, Any], float] = finite) -> np.ndarray:
         return np.array([[read(name, row[name]) for row in each] for each in members.values()])
 
     scores = {name: column(name) for name in SCORES if first[0].get(name) not in (None, "")}
     if not scores:
-        raise ValueError(f"{'/'.join(identity)} has no score")
+        raise ValueError(f"{'/'.join(identity)} has no {' or '.join(SCORES)}")
     _check_ranges(scores.get("success"), minutes := column("minutes"))
     missing = lambda row: row.get("training") in (None, "")  # noqa: E731 - at the first evaluation, or everywhere
     trained = lambda row: np.nan if missing(row) else finite("training", row["training"])  # noqa: E731

@@ -197,7 +197,8 @@ def check_folder(folder: Path, option: str = "--out") -> None:
             f"{folder}: cannot be made ({(error.strerror or '').lower()}); choose another {option}"
         ) from error
     if not there.is_dir():
-        raise UserError(f"{folder}: cannot be made, {there} is a file; choose another {option}")
+        what = "a file" if there.exists() else "a link that leads nowhere"
+        raise UserError(f"{folder}: cannot be made, {there} is {what}; choose another {option}")
     if not os.access(there, os.W_OK | os.X_OK):
         raise UserError(f"{folder}: cannot be written, you may not write to {there}; choose another {option}")
 

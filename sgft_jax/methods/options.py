@@ -35,6 +35,7 @@ class LoopOptions:
 
     def __post_init__(self) -> None:
         checks.positive(self, "utd", "max_grad_norm")
+        checks.few(self, 0, "utd")
         checks.at_least(self, 1, "batch_size", "initial_rollouts", "replay_capacity")
 
 
@@ -63,7 +64,7 @@ class SACOptions(LoopOptions):
         checks.positive(self, "lr_actor", "lr_critic", "alpha")
         checks.share(self, "tau")
         checks.not_negative(self, "critic_warmup", "actor_ramp")
-        checks.at_least(self, 1, "policy_delay")
+        checks.few(self, 1, "policy_delay")
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ class ModelOptions(KeptCriticOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.at_least(self, 1, "horizon", "branches")
+        checks.few(self, 1, "horizon", "branches")
         checks.not_negative(self, "branch_noise", "dynamics_warmup")
         checks.positive(self, "lr_dynamics")
 

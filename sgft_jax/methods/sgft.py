@@ -21,7 +21,7 @@ class Config(KeptCriticOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.at_least(self, 1, "horizon")
+        checks.few(self, 1, "horizon")
         checks.positive(self, "clip_shaped")
 
 

@@ -30,7 +30,7 @@ class Config(LoopOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.at_least(self, 1, "horizon")
+        checks.few(self, 1, "horizon")
         checks.at_least(self, 8, "plan_samples")
         checks.not_negative(self, "plan_noise", "explore_noise", "dynamics_warmup")
         checks.positive(self, "lr_dynamics")

@@ -28,7 +28,7 @@ class PlannerOptions(LoopOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.at_least(self, 1, "horizon")
+        checks.few(self, 1, "horizon")
         checks.at_least(self, 8, "plan_samples")
         checks.positive(self, "lr")
         checks.share(self, "tau")

@@ -100,7 +100,7 @@ def test_in_the_gap_called_sim_nothing_differs(key):
         (["latency=[[1],2]"], "effect 'latency' needs one value"),
         (["mass=-2"], "parameter 'mass' must be at least 0.01, got -2"),
         (["latency=0.5"], "must be shorter than the control period of toy, 0.1 s"),
-        (["obs_noise=NaN"], "effect 'obs_noise' needs finite numbers"),
+        (["obs_noise=NaN"], "'obs_noise=NaN' does not set anything"),
         (['obs_bias={"yx": 0.1}'], "entry of effect 'obs_bias': there is no 'yx'. Choose from"),
         (['obs_bias={"xy": [1, 2, 3]}'], "effect 'obs_bias.xy' needs 2 values or a range"),
         (['latency={"xy": 0.1}'], "effect 'latency' needs one value or a range"),

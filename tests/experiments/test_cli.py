@@ -222,6 +222,63 @@ def test_an_interrupt_tells_how_to_go_on(config_type, more, capsys):
     assert "interrupted" in said and ("--resume continues" in said) == more
 
 
+PROGRAM = (
+    "import dataclasses, errno, os, signal, sys, threading, time\nfrom experiments import cli\n"
+    "@dataclasses.dataclass(frozen=True)\nclass Long:\n    resume: bool = False\n"
+    "def main(config):\n    {}\n"
+    "cli.run_main(main, Long, 'd', argv=[])\n"
+)
+
+
+def what_is_said(main, **more):
+    """Exit code and stderr of a command in a process of its own."""
+    done = subprocess.run([sys.executable, "-c", PROGRAM.format(main)], capture_output=True, text=True, **more)
+    return done.returncode, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "code", "word"), [("SIGTERM", 143, "terminated"), ("SIGHUP", 129, "hung up"), ("SIGINT", 130, "interrupt")]
+)
+def test_signals_end_a_command_as_ctrl_c_does(name, code, word):
+    ended, said = what_is_said(f"os.kill(os.getpid(), signal.{name}); time.sleep(60)")
+    assert ended == code and said.startswith(f"\n{word}") and said.count("\n") == 2
+    assert "; the same command with --resume continues from the last checkpoint" in said
+
+
+def test_who_ignores_a_signal_keeps_ignoring_it():
+    ignore = "trap '' HUP; exec"  # as nohup does
+    program = PROGRAM.format("os.kill(os.getpid(), signal.SIGHUP); print('goes on')")
+    done = subprocess.run(
+        ["sh", "-c", f'{ignore} "$0" -c "$1"', sys.executable, program], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "goes on\n", "")
+
+
+def test_a_full_disk_is_one_line_whatever_libraries_do_in_their_threads():
+    full = "raise OSError(errno.ENOSPC, 'No space left on device', 'x')"
+    thread = f"thread = threading.Thread(target=exec, args=[{full!r}, globals()]); thread.start(); thread.join()"
+    ended, said = what_is_said(f"{thread}; {full}")
+    assert (ended, said) == (2, "error: x: no space left on device; mend that, then try again\n")
+
+
+def test_what_else_goes_wrong_in_a_thread_is_said():
+    thread = "thread = threading.Thread(target=lambda: 1 / 0); thread.start(); thread.join()"
+    ended, said = what_is_said(thread)
+    assert ended == 0 and "ZeroDivisionError: division by zero" in said
+
+
+def test_a_checkpoint_that_does_not_fit_is_one_line(tmp_path):
+    """A limit on the size of files stands for a disk, which cannot be had everywhere."""
+    main = (
+        "import resource, pathlib, numpy; from sgft_jax.io import checkpoint; "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16)); "
+        f"checkpoint.save(pathlib.Path({str(tmp_path)!r}), 0, "
+        "{str(i): numpy.random.default_rng(i).random(50_000, 'f4') for i in range(20)}, meta={})"
+    )
+    ended, said = what_is_said(main)
+    assert ended == 2 and said.count("\n") == 1 and "file too large; mend that" in said
+
+
 @pytest.mark.parametrize(
     ("main", "argv", "read", "code", "words"),
     [

@@ -288,7 +288,7 @@ def test_seeds_together_are_seeds_one_by_one(home, tmp_path):
 def test_a_file_without_a_name_means_all_of_its_gaps(tmp_path, monkeypatch):
     file = tmp_path / "two.toml"
     file.write_text("[a.params]\nmass = 9.0\n[b.params]\nmass = 2.0\n")
-    save_prior(tmp_path / "prior/seed-0", 0)
+    save_prior(tmp_path / "prior/seed-0", 0, task="push")
     monkeypatch.setattr(finetune_run, "run", lambda args, *given: args.real)
     args = arguments("sac", prior=tmp_path / "prior", real=("sim", str(file)), out=tmp_path)
     assert finetune.finetune(args) == ("sim", f"{file}:a", f"{file}:b")
@@ -461,13 +461,13 @@ def test_no_rollout_of_a_real_system_is_replaced_because_another_lacks_it(tmp_pa
         (["--eval-at", "0", "-1"], "--eval-at 0 -1: numbers of rollouts, from 0 on"),
         (["--eval-at", "500"], "--eval-at 500: no evaluation within --rollouts 5; name smaller numbers"),
         (["--eval-at", "0", "--eval-episodes", "0"], "--eval-at 0: evaluations have no episodes; say how many with"),
-        (["--variant", 300 * "v"], "--variant has 300 letters: choose a shorter word"),
+        (["--variant", 300 * "v"], "--variant has 300 bytes: choose a shorter word"),
         (["--devices", "x"], "--devices x: must be a whole number or None"),
         (["--options.utd", "-1"], "utd is -1.0: must be a positive number"),
         (["--options.utd", "nan"], "utd is nan: must be a positive number"),
         (["--options.lr-actor", "inf"], "lr-actor is inf: must be a positive number"),
         (["--options.gamma", "0.9"], "--options.gamma"),
-        (["--variant", "a/b"], "--variant 'a/b': letters"),
+        (["--variant", "a/b"], "--variant 'a/b' cannot name a folder"),
         (["--seeds", "0"], "--seeds is 0: must be at least 1"),
         (["--seed", "4294967296"], "--seed is 4294967296: seeds go from 0 to"),
         (["--real"], "--real: name at least one"),

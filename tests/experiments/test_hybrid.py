@@ -172,7 +172,7 @@ def test_data_that_is_missing_or_of_another_task(tmp_path, capsys):
     remembered = d4rl(tmp_path / "remembered.hdf5", 8, 2)
     error = complaint(words(tmp_path, remembered, "--gap", "sim"), capsys)
     assert "toy has 4 and 2; previous_actions=2 would fit" in error
-    table = tmp_path / "robot.txt"
+    (table := tmp_path / "robot.txt").touch()
     assert "tables are logs of a wheel-legged robot" in complaint(words(tmp_path, table, "--gap", "sim"), capsys)
     assert not (tmp_path / "out").exists()
 
@@ -209,6 +209,8 @@ def parsed(words, monkeypatch):
 
 def test_rebrac_takes_the_preset_of_the_data_set_unless_one_is_named(monkeypatch, capsys, tmp_path):
     given = f"--task walker2d --method rebrac --data {tmp_path}/walker2d_medium-v2.hdf5 --out {tmp_path}"
+    for name in ("medium", "mine"):
+        (tmp_path / f"walker2d_{name}-v2.hdf5").touch()
     found = parsed(given, monkeypatch)
     assert (found.preset, found.options.critic_penalty, found.variant) == ("walker2d-medium", 0.1, "")
     assert capsys.readouterr().out == "rebrac: preset walker2d-medium\n"

@@ -18,7 +18,7 @@ from experiments import (
     replay,
     tuned,
 )
-from experiments.options import prior_folders, task_of_prior
+from experiments.options import prior_folders, task_of_priors
 from sgft_jax import api
 from sgft_jax.analysis import release
 from sgft_jax.io.folders import ASIDE
@@ -183,4 +183,4 @@ def test_priors_that_a_killed_writer_has_put_aside_are_found(tmp_path):
     folders = prior_folders(tmp_path / "run", out=tmp_path, task="", preset="")
     folders[0].rename(folders[0].with_name(f"{ASIDE}seed-0"))
     assert prior_folders(tmp_path / "run", out=tmp_path, task="", preset="") == folders
-    assert [task_of_prior(folder) for folder in folders] == ["toy", "toy"]
+    assert task_of_priors(folders, None) == "toy"

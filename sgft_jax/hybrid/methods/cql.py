@@ -19,7 +19,7 @@ class Config(OfflineOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.not_negative(self, "conservatism")
-        checks.at_least(self, 1, "samples")
+        checks.few(self, 1, "samples")
 
 
 def build(config: Config, task: Task) -> HybridAgent:

@@ -18,7 +18,7 @@ class Config(ActorCriticOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.at_least(self, 1, "rows", "ratio_rows")
+        checks.rows(self, "rows", "ratio_rows")
 
 
 def build(config: Config, task: Task) -> HybridAgent:

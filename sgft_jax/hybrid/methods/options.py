@@ -44,7 +44,7 @@ class OfflineOptions(ActorCriticOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.at_least(self, 1, "rows")
+        checks.rows(self, "rows")
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class HybridOptions(ActorCriticOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.at_least(self, 1, "rows", "ratio_rows")
+        checks.rows(self, "rows", "ratio_rows")
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class EnsembleOptions(ActorCriticOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.at_least(self, 2, "critics")
+        checks.few(self, 2, "critics")
         checks.not_negative(self, "diversity")
 
 

@@ -16,7 +16,7 @@ class Config(ActorCriticOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.at_least(self, 1, "rows")
+        checks.rows(self, "rows")
 
 
 def build(config: Config, task: Task) -> HybridAgent:
