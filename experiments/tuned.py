@@ -39,7 +39,7 @@ def read(out: Path, task: str, method: str) -> dict[str, Any]:
     """What tuning has found; raises UserError, which names the command, if there is no such file."""
     _require(out, task, [method])
     path = path_of(out, task, method)
-    result = read_object(path, {"budget": dict, "options": dict}, "it is no file of experiments.tune")
+    result = read_object(path, {"budget": dict, "options": dict}, "it was not written by experiments.tune")
     if unknown := sorted(set(result["options"]) - set(space_of(method))):
         raise UserError(f"{path}: there is no option {unknown[0]!r}; tune again with: {_command(task, [method])}")
     hints = typing.get_type_hints(get_method(method).config)
