@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from envs import gaps
 from envs.base import Domain, EffectRange, Effects, Entry, Env, EnvState, Parameter, Theta, World, packed, unpack
+from envs.checks import check_description, check_effects, check_functions, with_finite_steps
 from envs.gaps import Gap
 from sgft_jax import extend
 from sgft_jax.types import UserError, unknown
@@ -61,8 +62,9 @@ def make(
     """The task of that name, file or module, compiled; impl: its physics engine, see `worlds.choose_impl`.
 
     A file or module of your own must define `make(impl) -> Env`, with the file's name as the Env's name
-    (docs/extending.md). scene: that of a real system which is more than the simulated one with other numbers; "" for
-    the latter. What is observed, commanded and rewarded, and the parameters, are the same in all scenes of a task.
+    (docs/extending.md); what it says and returns is checked, see `envs.checks`. scene: that of a real system which is
+    more than the simulated one with other numbers; "" for the latter. What is observed, commanded and rewarded, and the
+    parameters, are the same in all scenes of a task.
     previous_actions: how many of the last actions the observation ends with, see `envs.history`. system: what it tells
     of the system after that, see `envs.system`.
     Raises UserError with the closest match for an unknown task or scene, and naming file and line for one that fails.
@@ -86,8 +88,12 @@ def _make(task: str, impl: str, scene: str) -> Env:
         raise UserError(f"task {task}: make(impl) returns a {type(env).__name__}, not an envs.Env")
     if env.name != name_of(task):
         raise UserError(f"task {task}: its Env is called {env.name!r}; call it {name_of(task)!r}, like the file")
+    check_description(env)
+    check_effects(env)
     called = {name: getattr(env, name) for name in ("make_worlds", "reset", "step")}
-    return packed(env._replace(**{name: extend.guard("task", source, f) for name, f in called.items()}))
+    env = packed(env._replace(**{name: extend.guard("task", source, f) for name, f in called.items()}))
+    check_functions(env, source)
+    return with_finite_steps(env)
 
 
 def scene(task: str, real: str = "") -> Any:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 Numbers = float | list[float] | list[list[float]]
 Value = Numbers | Mapping[str, Numbers]  # the latter by entry name, see `effects.make_range`
 NOTHING: Mapping[str, Value] = MappingProxyType({})
+_FARTHEST = 1000.0
 
 
 class Entry(NamedTuple):
@@ -37,7 +38,7 @@ class Entry(NamedTuple):
 class Parameter(NamedTuple):
     """One domain parameter: its nominal value and the uniform range [low, high] that pretraining draws it from.
 
-    minimum, maximum: physical bounds of any value that a user may name (a mass is positive).
+    minimum, maximum: physical bounds of any value that a user may name (a mass is positive); see `bounds`.
     """
 
     name: str
@@ -47,6 +48,15 @@ class Parameter(NamedTuple):
     high: float
     minimum: float = -inf
     maximum: float = inf
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Least and greatest value that a user may name. Where none is declared, 1,000 times what is known of it.
+
+        That is grams for kilograms: beyond it no system of the task is meant, and the physics would end as infinities.
+        """
+        most = _FARTHEST * (max(abs(self.nominal), abs(self.low), abs(self.high)) or 1.0)
+        return (self.minimum if self.minimum > -inf else -most), (self.maximum if self.maximum < inf else most)
 
 
 class Effects(NamedTuple):
@@ -297,10 +307,13 @@ def unpack(entries: tuple[Entry, ...], vector: Array) -> dict[str, Array]:
 def packed(env: Env) -> Env:
     """The same task with observations as one vector [obs_dim], where `reset` and `step` may return dicts by entry name.
 
-    `step` gets states with packed observations; `reward`, `terminated` and `success` see packed ones too.
+    `step` gets states with packed observations; `reward`, `terminated` and `success` see packed ones too. Raises
+    UserError for what is no state.
     """
 
     def flat(state: EnvState) -> EnvState:
+        if not isinstance(state, EnvState):
+            raise UserError(f"task {env.name}: 'reset' and 'step' must return an EnvState, got {type(state).__name__}")
         return state._replace(obs=pack(env.observation, state.obs), true_obs=pack(env.observation, state.true_obs))
 
     restore = env.restore

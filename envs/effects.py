@@ -11,6 +11,12 @@ from sgft_jax.types import Array, Key, UserError, unknown
 
 _DEFAULTS = {"action_scale": 1.0, "obs_noise_prob": 1.0}
 _NOT_NEGATIVE = ("latency", "latency_jitter", "obs_noise", "obs_noise_prob", "action_noise")
+# Beyond these nothing is left of a command, in ranges of it, of a turn, in rad, or of a measurement kept in float32.
+_MOST = {
+    **dict.fromkeys(("action_scale", "action_bias", "action_noise"), 100.0),
+    "action_rotation": 2 * np.pi,
+    **dict.fromkeys(("obs_noise", "obs_bias"), 1e6),
+}
 
 
 def make_range(env: Env, values: Mapping[str, Value]) -> EffectRange:
@@ -39,7 +45,7 @@ def numbers(value: Value) -> np.ndarray:
     """A value or range as an array; one of shape [0, 0, 0], which fits nowhere, if it holds anything but numbers."""
     try:
         return np.asarray(value, np.float64)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         return np.zeros((0, 0, 0))
 
 
@@ -75,6 +81,9 @@ def _check_possible(env: Env, low: Mapping[str, np.ndarray], high: Mapping[str, 
     for name in _NOT_NEGATIVE:
         if (least := np.min(low[name])) < 0:
             raise UserError(f"effect '{name}' must not be negative, got {least:g}")
+    for name, most in _MOST.items():
+        if (size := np.max(np.abs([low[name], high[name]]))) > most:
+            raise UserError(f"effect '{name}' must be at most {most:g} in size, got {size:g}")
     if high["obs_noise_prob"] > 1:
         raise UserError(f"effect 'obs_noise_prob' is a probability, at most 1, got {high['obs_noise_prob']:g}")
     latest = high["latency"] + high["latency_jitter"]

@@ -31,8 +31,9 @@ class Episode(NamedTuple):
 
     transitions: [T]; `valid`: [T] bool, False after the step that terminated the episode and from the first step with
         exploded physics on (such rows hold zeros).
-    total_reward: [] undiscounted, of the task, never reshaped. success, exploded: [] bool.
-    score: [] float, what the task is judged by: success or total_reward.
+    total_reward: [] undiscounted, of the task, never reshaped, of the valid steps. success, exploded: [] bool.
+    score: [] float, what the task is judged by: success, or total_reward, -inf if it exploded: what came before says
+        nothing of a whole episode and may be more, see `counted`.
     world: [] int32, where it took place in the pool.
     trace: [T + 1, k] what a renderer needs of the start and of the state after each step, see `Env.trace`.
     command: [T, act_dim] what the policy asked for, where something else may have been sent; else None.
@@ -161,10 +162,30 @@ def play_episode(
         total_reward=total,
         success=succeeded,
         exploded=failed,
-        score=succeeded.astype(jnp.float32) if env.score == "success" else total,
+        score=judged(env, total, succeeded, failed),
         world=index,
         trace=jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), env.trace(start.physics), trace),
     )
+
+
+def judged(env: Env, total: Array, success: Array, exploded: Array) -> Array:
+    """`Episode.score` of episodes, from what else is known of them (any shape)."""
+    return success.astype(jnp.float32) if env.score == "success" else jnp.where(exploded, -jnp.inf, total)
+
+
+def counted(episodes: Episode, worst: Array | None = None) -> tuple[Array, Array]:
+    """Scores and returns [..., n] of n episodes of one policy in which one that exploded counts as the worst known.
+
+    Its part until then is known too. worst: [..., 2] the lowest score and return of the policy's other episodes.
+    """
+    total, exploded = episodes.total_reward, episodes.exploded
+    xp = total.__array_namespace__()
+    found = []
+    for i, values in enumerate((xp.where(xp.isneginf(episodes.score), total, episodes.score), total)):
+        low = values.min(-1, keepdims=True)
+        low = low if worst is None else xp.minimum(low, worst[..., i, None])
+        found.append(xp.where(exploded, low, values))
+    return found[0], found[1]
 
 
 def _transition(before: EnvState, action: Array, after: EnvState, *, gamma: float | Array) -> Transition:

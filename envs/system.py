@@ -42,6 +42,8 @@ def with_system(env: Env, system: tuple[Varying, ...]) -> Env:
     if not system:
         return env
     place = {name: i for i, name in enumerate(_names(env))}
+    if odd := [v for v in system if (v.name, v.index) not in place]:
+        raise UserError(f"{env.name}: has no parameter or effect {odd[0].name!r} with a number {odd[0].index}")
     where = np.array([place[v.name, v.index] for v in system])
     low, high = (np.array([getattr(v, end) for v in system], np.float32) for end in ("low", "high"))
 
@@ -164,7 +166,8 @@ def models_of(env: Env, system: tuple[Varying, ...]) -> Callable[[Array], dict[s
     worlds = env.make_worlds(
         Theta(jnp.asarray(params), jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *x.shape)), ends))
     )
-    smooth = jax.vmap(with_tensors, axis_size=n)(worlds.model)
+    numbers = {k: x for k, x in worlds.model.items() if jnp.issubdtype(x.dtype, jnp.floating)}  # no codes of shortcuts
+    smooth = jax.vmap(with_tensors, axis_size=n)(numbers)
     seen = np.asarray(jax.vmap(features)(jnp.asarray(told)), np.float64)
 
     def fitted(values: Array) -> Array:

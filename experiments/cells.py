@@ -4,10 +4,12 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol, TypedDict
 
+from envs.files import Count
+from sgft_jax.io.folders import InUseError, in_use
 from sgft_jax.io.log import SUMMARY
-from sgft_jax.io.runs import CONFIG, InUseError, check_same, in_use, read_own
+from sgft_jax.io.runs import CONFIG, check_same, read_own
 from sgft_jax.types import UserError
 
 
@@ -28,6 +30,14 @@ class Kind(NamedTuple):
     title: Callable[[Any], str]
     volatile: tuple[str, ...]
     finished: Callable[[Any, Mapping[str, Any]], bool]
+
+
+class _Final(TypedDict):
+    rollouts: Count
+
+
+class _Summary(TypedDict, total=False):
+    final: _Final
 
 
 class Limits(Protocol):
@@ -72,7 +82,7 @@ def look_up(kind: Kind, args: Any) -> Cell:
     folder = kind.folder(args)
     if not (folder / CONFIG).exists():
         return Cell(kind, args, "missing", 0)
-    summary = read_own(folder / SUMMARY)
+    summary = read_own(folder / SUMMARY, _Summary)
     done = bool(summary) and kind.finished(args, summary)
     from sgft_jax.io import checkpoint
 

@@ -15,7 +15,7 @@ import envs
 from envs import gaps
 from envs.base import Env, EnvState
 from envs.pools import real_env, real_worlds
-from envs.rollout import Episode
+from envs.rollout import Episode, counted
 from experiments.collect import PAIR, CollectArgs, is_d4rls, name_of, targets, transitions_of
 from experiments.options import seed_list
 from sgft_jax.data import acceptance, logs
@@ -102,7 +102,7 @@ def _level(args: CollectArgs, agent: HybridAgent, system: Simulated, state: Hybr
     """Mean return [seeds] of the exploring policies."""
     params = jax.jit(jax.vmap(agent.export))(state.learner)
     played = _episodes(system, agent.policy, params, jax.random.key(_LEVEL), args.eval_episodes)
-    return np.asarray(played.total_reward).mean(axis=1)
+    return np.asarray(counted(played)[1]).mean(axis=1)
 
 
 def _episodes(system: Simulated, policy: Policy, params: PyTree, key: Any, n: int) -> Episode:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from envs import gaps
+from envs.files import Count
 from envs.gaps import SIM
 from experiments import cells, cli
 from experiments.cells import Cell, Kind, check_begun, complete
@@ -32,8 +33,8 @@ from sgft_jax.hybrid.presets import say_preset
 from sgft_jax.hybrid.schedule import FLEET, SCHEDULES, Schedule, describe, name_of
 from sgft_jax.hybrid.scores import measures, shown
 from sgft_jax.io.jsonfile import jsonable
-from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
-from sgft_jax.io.runs import PROVENANCE, check_folder, read_own
+from sgft_jax.io.log import EVAL, SUMMARY, check_records, read_jsonl
+from sgft_jax.io.runs import check_folder, read_own, read_starts
 from sgft_jax.types import UserError, unknown
 
 if TYPE_CHECKING:
@@ -224,7 +225,7 @@ def outcomes(args: CompareHybridArgs) -> "Results | None":
     done = [cell for cell in grid(args) if cell.state == "finished"]
     if not done:
         return None
-    summaries = [read_own(cell.folder / SUMMARY, {"task": str, "score": str, args.score: list}) for cell in done]
+    summaries = [read_own(cell.folder / SUMMARY, {"task": str, "score": str, args.score: list[float]}) for cell in done]
     task, score = (summaries[0][name] for name in ("task", "score"))
     found = [_outcome(cell, one[args.score]) for cell, one in zip(done, summaries, strict=True)]
     return Results(task, score, *_columns(args), found)
@@ -239,8 +240,10 @@ def _columns(args: CompareHybridArgs) -> tuple[list[str], list[str], tuple[str, 
 def _outcome(cell: Cell, scores: list[float] | None = None) -> "Outcome":
     from sgft_jax.analysis.hybrid import outcome
 
-    run, lines = cell.args, read_jsonl(cell.folder / EVAL)
-    return outcome(_spec(run), _data_of(run), _gap_of(run), lines, scores, measures=measures(lines[0]))
+    run, lines = cell.args, read_jsonl(cell.folder / EVAL, {"step": Count, "score": list[float]})
+    others = measures(lines[0])
+    check_records(cell.folder / EVAL, lines, {"score": list[float], **dict.fromkeys(others, list[float])})
+    return outcome(_spec(run), _data_of(run), _gap_of(run), lines, scores, measures=others)
 
 
 def export(args: CompareHybridArgs, found: Sequence[Cell], to: Path) -> None:
@@ -251,8 +254,8 @@ def export(args: CompareHybridArgs, found: Sequence[Cell], to: Path) -> None:
     runs = []
     for cell in found:
         if cell.state == "finished":
-            summary = read_own(cell.folder / SUMMARY, {"task": str, "score": str, "seeds": list})
-            starts = read_own(cell.folder / PROVENANCE).get("starts", [{}])
+            summary = read_own(cell.folder / SUMMARY, {"task": str, "score": str, "seeds": list[int]})
+            starts = read_starts(cell.folder) or [{}]
             task, score, seeds = (summary[name] for name in ("task", "score", "seeds"))
             runs.append(hybrid_table.Run(
                 task, gaps.title(args.real), name_of(args.schedule), args.schedule.updates_in_all,

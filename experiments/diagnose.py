@@ -12,8 +12,8 @@ from pathlib import Path
 from experiments import cli
 from experiments.options import Impl, at_least_one, prior_folders, seed_list, task_of_priors
 from experiments.real_systems import check as check_real
-from experiments.rollouts import config_of, home_of, task_of
-from sgft_jax.io.runs import check_folder
+from experiments.rollouts import home_of, task_of
+from sgft_jax.io.runs import check_folder, read_config
 from sgft_jax.presets import DEFAULT_PRESET
 from sgft_jax.types import UserError
 
@@ -75,8 +75,8 @@ def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
     recorded = home_of("--real", Path(args.real)) if Path(args.real).is_dir() else None
     if recorded and recorded.name in ("", ".."):
         recorded = recorded.resolve()  # what is written is called like it
-    config = config_of(recorded) if recorded else {}
-    task, prior = args.task or (task_of(recorded, None) if recorded and config else None), args.prior
+    config = read_config(recorded) if recorded else {}
+    task, prior = args.task or (task_of(recorded, None) if recorded and "task" in config else None), args.prior
     if task is not None:
         check_real(task, [] if recorded else [args.real])
     if prior is None and task is None:

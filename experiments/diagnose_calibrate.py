@@ -11,13 +11,14 @@ from experiments.cli import columns
 from experiments.diagnose import DiagnoseArgs
 from experiments.diagnose_run import load, play_simulated, read
 from experiments.options import prior_folders
-from experiments.rollouts import config_of, task_of
+from experiments.rollouts import task_of
 from sgft_jax import stacking
 from sgft_jax.analysis import prediction, tables
 from sgft_jax.analysis.curves import read_curve
 from sgft_jax.analysis.prediction import AHEAD, Cases, Inputs
 from sgft_jax.examination import Examiner
 from sgft_jax.io.jsonfile import jsonable
+from sgft_jax.io.runs import read_config
 from sgft_jax.types import UserError
 
 COUNTS = (1, 2, 4)  # rollouts that a prediction is made from
@@ -84,10 +85,10 @@ def gather(args: DiagnoseArgs, runs: Sequence[Path]) -> list[Cases]:
     played: list[list[float]] = [[] for _ in COUNTS]
     facts: list[tuple[Any, ...]] = []
     for run in runs:
-        config, curve, task = config_of(run), read_curve(run).of("success"), task_of(run, args.task)
+        config, curve, task = read_config(run), read_curve(run).of("success"), task_of(run, args.task)
         folders = prior_folders(
             args.prior or (Path(config["prior"]) if config.get("prior") else None),
-            out=args.out, task=task, preset=config.get("preset", args.preset),
+            out=args.out, task=task, preset=config.get("preset") or args.preset,
         )  # fmt: skip
         key = (task, *folders)
         if key not in examiners:

@@ -18,7 +18,6 @@ from experiments.diagnose import DiagnoseArgs
 from experiments.gaps_run import systems
 from experiments.real_systems import connect, is_robot, is_stepped, title
 from experiments.recorded import RecordedSystem
-from experiments.rollouts import config_of
 from sgft_jax import api, stacking
 from sgft_jax.analysis import figures, prediction, stats, tables, verdict
 from sgft_jax.analysis.curves import last_start
@@ -28,6 +27,7 @@ from sgft_jax.examination import Examined, Examiner
 from sgft_jax.io.jsonfile import jsonable, write_json
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.io.real import RealStore
+from sgft_jax.io.runs import read_config
 from sgft_jax.methods import get_method
 from sgft_jax.policies import make_policy
 from sgft_jax.types import Prior, Transition, UserError
@@ -47,7 +47,7 @@ def diagnose(
         count, name = args.rollouts or PLAYED, title(args.real)
         if is_stepped(args.real):
             where = name
-            real = _play_real(env, args, priors, count, RealStore(home / name))
+            real = _play_real(env, args, priors, count, home / name)
             simulated = play_simulated(env, priors, args.seed)
         else:
             where = f"the gap {name}"
@@ -59,7 +59,7 @@ def diagnose(
         simulated = play_simulated(env, priors, args.seed)
         count, name = (
             real[0].valid.shape[0],
-            "_".join(recorded.parts[-3:] if config_of(recorded) else recorded.parts[-1:]),
+            "_".join(recorded.parts[-3:] if read_config(recorded) else recorded.parts[-1:]),
         )
         what = f"{_rollouts(count)} recorded in {recorded}"
     examiner, counts = Examiner(priors[0].card, env), counts_to(count)
@@ -157,14 +157,15 @@ def _play_both(env: Env, gap: Gap, priors: list[Prior], n: int, seed: int) -> tu
     return [first(one, n) for one in real], [first(one, SIMULATED) for one in simulated]
 
 
-def _play_real(env: Env, args: DiagnoseArgs, priors: list[Prior], n: int, store: RealStore) -> list[Rollouts]:
-    """Exploring rollouts [n] of every prior on a robot or an environment, each of them kept on disk."""
+def _play_real(env: Env, args: DiagnoseArgs, priors: list[Prior], n: int, home: Path) -> list[Rollouts]:
+    """Exploring rollouts [n] of every prior on a robot or an environment, each of them kept on disk in `home`."""
     system = connect(env, [args.real], (), members=len(priors), gamma=priors[0].card["gamma"], home=args.out)
-    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(_SEED), args.seed), len(store))
-    keys = jnp.broadcast_to(jax.random.split(key, n), (len(priors), n))
-    members = stacking.stack([prior.params for prior in priors])
-    kept = RecordedSystem(system, [store], done=len(store), sync_every=1 if is_robot(args.real) else None)
     try:
+        store = RealStore(home)  # after the connection, which may fail
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(_SEED), args.seed), len(store))
+        keys = jnp.broadcast_to(jax.random.split(key, n), (len(priors), n))
+        members = stacking.stack([prior.params for prior in priors])
+        kept = RecordedSystem(system, [store], done=len(store), sync_every=1 if is_robot(args.real) else None)
         played = kept.play(make_policy(priors[0].card, env), members, keys, explore=True)
     finally:
         system.close()
@@ -183,7 +184,7 @@ def read(home: Path, env: Env, priors: Sequence[Prior], most: int | None) -> tup
     Raises UserError where rollouts are not those of the task, or priors not those of the run.
     """
     store = RealStore(home)
-    stored = [store.load(i) for i in range(min(len(store), most or len(store)))]
+    stored = [store.rollout(i) for i in range(min(len(store), most or len(store)))]
     for i, arrays in enumerate(stored):
         _check(home / "real", i, arrays, stored[0], env)
     joined = {name: jnp.stack([arrays[name] for arrays in stored], axis=1) for name in _READ}
@@ -192,7 +193,7 @@ def read(home: Path, env: Env, priors: Sequence[Prior], most: int | None) -> tup
     rows = Transition(*(joined[name] for name in Transition._fields))
     both = Rollouts(rows, joined["valid"].astype(bool), joined["success"].astype(bool))
     each = [stacking.member(both, s) for s in range(len(both.success))]
-    config, p = config_of(home), len(priors)
+    config, p = read_config(home), len(priors)
     if config:
         _check_digests(home, priors)
         return each, [(config.get("seed", 0) + s) % p for s in range(len(each))]
@@ -209,8 +210,6 @@ def _check(
     folder: Path, number: int, arrays: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray], env: Env
 ) -> None:
     path = folder / f"rollout-{number:06d}.npz"
-    if missing := set(_READ) - set(arrays):
-        raise UserError(f"{path}: lacks {min(missing)}; docs/formats.md lists what a rollout holds")
     sizes = {"obs": env.obs_dim, "next_obs": env.obs_dim, "action": env.act_dim}
     for name, size in sizes.items():
         if arrays[name].ndim != 3 or arrays[name].shape[-1] != size:

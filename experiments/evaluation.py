@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.rollout import Episode
+from envs.rollout import Episode, counted
 from sgft_jax import mesh
 from sgft_jax.analysis import stats
 from sgft_jax.pretraining import Best, keep_better
@@ -26,12 +26,16 @@ def play(system: System, policy: Policy, params: PyTree, key: Key, episodes: int
     return jax.tree.map(np.asarray, played)
 
 
-def scores(played: Episode) -> Metrics:
-    """Mean score, success, return and share of exploded episodes [M] of episodes [M, n]."""
+def scores(played: Episode, worst: Array | None = None) -> Metrics:
+    """Mean score, success, return and share of exploded episodes [M] of episodes [M, n].
+
+    worst: [M, 2] the lowest score and return of earlier episodes: one that exploded counts as the worst known.
+    """
+    score, total = counted(played, worst)
     return {
-        "score": played.score.mean(-1),
+        "score": score.mean(-1),
         "success": played.success.mean(-1),
-        "return": played.total_reward.mean(-1),
+        "return": total.mean(-1),
         "exploded": played.exploded.mean(-1),
     }
 
@@ -43,7 +47,7 @@ def describe(played: Episode) -> dict[str, Any]:
         "episodes": len(played.success),
         "success": float(interval.estimate),
         "success/interval": [float(interval.low), float(interval.high)],
-        "return": float(played.total_reward.mean()),
+        "return": float(counted(played)[1].mean()),
         "exploded": float(played.exploded.mean()),
     }
 
@@ -53,8 +57,10 @@ def best_of(best: Best | None, params: PyTree, played: Episode, steps: Array, *,
 
     params: [M, ...] what was evaluated, which may be donated afterwards. steps: [M]. since: see `keep_better`.
     """
-    score, total = (jnp.asarray(x.mean(-1), jnp.float32) for x in (played.score, played.total_reward))
-    now = Best(params, score, total, steps)
+    known = counted(played)
+    score, total = (jnp.asarray(x.mean(-1), jnp.float32) for x in known)
+    worst = jnp.stack([jnp.asarray(x.min(-1), jnp.float32) for x in known], axis=-1)
+    now = Best(params, score, total, steps, jnp.asarray(played.exploded.mean(-1), jnp.float32), worst)
     return jax.tree.map(jnp.copy, now) if best is None else _keep_better(best, now, since)
 
 

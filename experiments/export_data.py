@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Literal
 
 from experiments import cli
-from experiments.rollouts import check_sizes, config_of, episodes_of, home_of, task_of
-from sgft_jax.io.runs import check_folder
+from experiments.rollouts import check_sizes, episodes_of, home_of, task_of
+from sgft_jax.io.runs import check_folder, read_config
 from sgft_jax.types import UserError
 
 _AUTHOR = "sgft_jax experiments.export_data"
@@ -56,7 +56,7 @@ def main(args: ExportDataArgs) -> None:
         raise UserError(f"{home}: holds no valid step")
     if args.to == "minari":
         entries = {"observation": [e._asdict() for e in env.measured], "action": [e._asdict() for e in env.action]}
-        about = {"algorithm_name": str(config_of(home).get("method", "")), "author": [_AUTHOR], "task": env.name}
+        about = {"algorithm_name": str(read_config(home).get("method", "")), "author": [_AUTHOR], "task": env.name}
         recording.write_minari(folder, episodes, {**about, "control_dt": env.control_dt, **entries})
     else:
         lerobot.write(
@@ -68,7 +68,7 @@ def main(args: ExportDataArgs) -> None:
 
 def _name(home: Path, seed: int | None) -> str:
     """What a data set is called: `push-default-guarded-seeds-0-9-v0`."""
-    words = home.absolute().parts[-4:-1] if config_of(home) else ()
+    words = home.absolute().parts[-4:-1] if read_config(home) else ()
     which = home.name if seed is None else f"seed-{seed}"
     return f"{re.sub(r'[^\w.-]', '-', '-'.join([*words, which]))}-v0"
 

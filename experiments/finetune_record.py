@@ -33,7 +33,7 @@ def evaluation_store(folder: Path, done: int) -> RealStore:
 class Record:
     """The files of one run folder (docs/formats.md). Arrays and states have a leading axis of the seeds [S].
 
-    evaluations_cost: real episodes that an evaluation costs every seed; None where episodes are simulated and free.
+    real_evaluations: whether evaluations are played on the real system and cost transitions; simulated ones are free.
     logged: real transitions that every seed began with and nobody has played here.
     """
 
@@ -45,43 +45,49 @@ class Record:
         method: str,
         seeds: list[int],
         *,
-        evaluations_cost: int | None = None,
+        real_evaluations: bool = False,
         logged: int = 0,
     ) -> None:
-        self.logged = logged
-        self.evaluations_cost, self.evaluated = evaluations_cost, 0  # episodes, `evaluated` by all so far
+        self.logged, self.real_evaluations = logged, real_evaluations
+        self.played = self.evaluated = np.zeros(len(seeds), int)  # [S] real transitions of rollouts, of evaluations
         self.folder, self.env, self.gap, self.method, self.seeds = folder, env, gap, method, seeds
         self.log, self.real = MetricsLog(folder), RealStore(folder)
         self.last_good: Path | None = None  # the checkpoint to go back to when training diverges
         self.expect = {"kind": "finetune", "task": env.name, "method": method, "seeds": seeds}
 
     def latest(self) -> int | None:
-        """The step of the last checkpoint: parts of the offline phase and rollouts together; None without one."""
-        return checkpoint.latest(self.folder)
+        """The step of the last whole checkpoint: parts of the offline phase and rollouts together; None without any."""
+        return checkpoint.latest(self.folder, whole=True)
 
     def restore(self, like: FinetuneProgress, step: int) -> FinetuneProgress:
-        """The state of that checkpoint, to which the logs are cut back. What the robot did stays."""
-        progress, meta = checkpoint.restore(self.folder, like, step=step, expect=self.expect)
+        """The state of that checkpoint of `latest`, to which the logs are cut back. What the robot did stays."""
+        progress, meta = checkpoint.restore(self.folder, like, step=step, checked=True, expect=self.expect)
         self.log.truncate(meta["position"])
-        self.evaluated = meta.get("evaluated", 0)
+        self.played, self.evaluated = np.asarray(progress.transitions), np.asarray(meta["evaluated"])
         self.last_good = checkpoint.path(self.folder, step)
         return progress
 
     def checkpoint(self, progress: FinetuneProgress, step: int) -> None:
         """The state, and how long the logs are. step: parts of the offline phase and rollouts behind it."""
-        counts = {"rollouts": int(progress.rollouts), "evaluated": self.evaluated}
+        counts = {"rollouts": int(progress.rollouts), "evaluated": self.evaluated.tolist()}
         meta = {**self.expect, **counts, "position": self.log.position()}
         self.last_good = checkpoint.save(self.folder, step, progress, meta=meta)
 
     def metrics(self, done: int, values: Mapping[str, np.ndarray]) -> None:
-        """A line of one learning phase; raises DivergedError where a number is not finite."""
-        check_finite(values, done, unit="rollouts", last_good=self.last_good)
-        self.log.metrics(self._transitions(done), {"rollouts": done, **values})
+        """A line of one learning phase; raises DivergedError where a number is not finite though something learned."""
+        idle = values.get("updates", np.ones(len(self.seeds))) == 0
+        known = {name: np.where(idle, 0.0, x) for name, x in values.items()}
+        check_finite(known, done, unit="rollouts", last_good=self.last_good)
+        self.log.metrics(self._transitions(), {"rollouts": done, **values})
 
-    def evaluation(self, done: int, scores: Metrics) -> None:
-        """A line of the learning curve. Its step is what lies behind it; what it costs itself counts from then on."""
-        self.log.eval(self._transitions(done), {"rollouts": done, "robot_minutes": self._minutes(done), **scores})
-        self.evaluated += self.evaluations_cost or 0
+    def evaluation(self, done: int, scores: Metrics, cost: np.ndarray) -> None:
+        """A line of the learning curve. Its step is what lies behind it; what it costs itself counts from then on.
+
+        cost: [S] steps of its episodes.
+        """
+        self.log.eval(self._transitions(), {"rollouts": done, "robot_minutes": self._minutes(), **scores})
+        if self.real_evaluations:
+            self.evaluated = self.evaluated + cost
 
     def time(self, done: int, seconds: float) -> None:
         """Apart from the metrics, which must not depend on the clock."""
@@ -105,13 +111,13 @@ class Record:
         self.log.close()
         env, evaluated = self.env, read_jsonl(self.folder / EVAL) if (self.folder / EVAL).exists() else []
         curve = read_curve(self.folder).of(env.score) if evaluated else None
-        far = {"rollouts": done, "transitions": self._transitions(done), "robot_minutes": self._minutes(done)}
+        far = {"rollouts": done, "transitions": self._transitions(), "robot_minutes": self._minutes()}
         numbers = {"final": far, "seeds": len(self.seeds)} if curve is None else describe(curve)
         about = {"task": env.name, "method": self.method, "impl": env.impl, "gap": self.gap._asdict()}
         summary = about | {"score": env.score} | numbers | {"best": {k: x.tolist() for k, x in best.items()}}
         if self.logged:
             summary["logged"] = self.logged
-        if self.evaluations_cost is not None:
+        if self.real_evaluations:
             summary["real_steps"] = self._real_steps()
         write_summary(self.folder, summary)
         if curve is not None:
@@ -134,7 +140,7 @@ class Record:
     def _real_steps(self) -> list[int]:
         """[S] all steps of the real system that are on disk, those of evaluations included."""
         stores = [self.real, *(RealStore(folder) for folder in sorted((self.folder / EVALUATION).glob("*")))]
-        each = [store.load(i)["valid"].sum(1) for store in stores for i in range(len(store))]
+        each = [store.rollout(i)["valid"].sum(1) for store in stores for i in range(len(store))]
         return np.sum(each, axis=0).tolist()
 
     def film(self, pool: World, play: Callable[[], Sequence[Episode]], rollouts: int) -> str:
@@ -153,9 +159,9 @@ class Record:
         path = self.folder / "videos" / f"seed-{self.seeds[0]}.mp4"
         return before_and_after(self.env, pool, chosen, path, rollouts=rollouts)
 
-    def _transitions(self, rollouts: int) -> int:
-        """Real transitions per seed, those that evaluations have cost included."""
-        return (rollouts + self.evaluated) * self.env.episode_length
+    def _transitions(self) -> int:
+        """Real transitions of a seed so far, those that evaluations have cost included; the mean where seeds differ."""
+        return round(float(np.mean(self.played + self.evaluated)))
 
-    def _minutes(self, rollouts: int) -> float:
-        return self._transitions(rollouts) * self.env.control_dt / 60
+    def _minutes(self) -> float:
+        return self._transitions() * self.env.control_dt / 60

@@ -55,13 +55,13 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
     homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in named}
     with contextlib.ExitStack() as last:
         last.enter_context(mesh.use(devices))
-        playing, members, cost = found, seeds, None
-        if real_systems.is_stepped(args.real[0]):
+        playing, members, stepped = found, seeds, real_systems.is_stepped(args.real[0])
+        if stepped:
             playing = real_systems.connect(
                 env, args.real, args.set, members=len(seeds), gamma=card["gamma"], home=args.out
             )
             last.push(lambda error, *_: playing.close(over=error is None))
-            members, cost = seeds * len(args.real), args.eval_episodes
+            members = seeds * len(args.real)
         setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
         assert isinstance(setup.system, Simulated | Gymnasium)
         # Last: what is wrong with a robot or with a method of the user's own leaves no folder behind.
@@ -77,7 +77,7 @@ def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path
             last.callback(own.close)
         records = [
             Record(
-                own.folder, setup.system.env, gap, method.name, seeds, evaluations_cost=cost,
+                own.folder, setup.system.env, gap, method.name, seeds, real_evaluations=stepped,
                 logged=logged.transitions(logs),
             )
             for own, gap in zip(opened, found, strict=True)
@@ -191,6 +191,8 @@ class _Run:
         with bar:
             for progress, metrics in steps:
                 before, done = done, int(progress.rollouts)
+                for record, transitions in self._each(np.asarray(progress.transitions)):
+                    record.played = transitions
                 values = {name: np.asarray(x) for name, x in metrics.items()}
                 shown = self._log(done, values, time.perf_counter() - started)
                 if done == before and values:  # a part of the offline phase
@@ -219,9 +221,9 @@ class _Run:
             stores = [evaluation_store(record.folder, done) for record in self.records]
             system = RecordedSystem(system, stores, done=0, explore=False, sync_every=self.sync_every)
         played = train.evaluate(self.finetuner, system, progress.agent, self.seeds, self.episodes)
-        found = scores(played)
-        for record, own in self._each(found):
-            record.evaluation(done, own)
+        found = scores(played, progress.best.worst)
+        for record, (own, cost) in self._each((found, np.asarray(played.valid.sum((1, 2))))):
+            record.evaluation(done, own, cost)
         return float(found["score"].mean())
 
     def _checkpoint(self, progress: FinetuneProgress) -> None:
@@ -244,7 +246,7 @@ class _Run:
         n = self.episodes
         if n and isinstance(self.system, Simulated):
             played = train.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, n)
-            facts["score"] = scores(played)["score"]
+            facts["score"] = scores(played, best.worst)["score"]
         films = functools.cache(lambda: self._before_and_after(progress))
         summaries = []
         for i, record in enumerate(self.records):
@@ -272,15 +274,18 @@ class _Run:
         return [before, evaluate(self.finetuner, states=progress.agent, episodes=n)]
 
 
+_OF_MEMBERS = ("agent", "best", "transitions")  # of a state, what has an axis of members
+
+
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def _part(progress: FinetuneProgress, i: int, n: int) -> FinetuneProgress:
     """The members of the i-th real system."""
     own = functools.partial(part, i=i, n=n)
-    return progress._replace(agent=own(progress.agent), best=own(progress.best))
+    members = {name: own(getattr(progress, name)) for name in _OF_MEMBERS}
+    return progress._replace(**members)
 
 
 @jax.jit
 def _join(states: list[FinetuneProgress]) -> FinetuneProgress:
     """The states of all members from those of each real system."""
-    agent, best = (join([getattr(state, name) for state in states]) for name in ("agent", "best"))
-    return states[0]._replace(agent=agent, best=best)
+    return states[0]._replace(**{name: join([getattr(state, name) for state in states]) for name in _OF_MEMBERS})

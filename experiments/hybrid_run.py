@@ -133,7 +133,7 @@ class _Run:
 
     def _restore(self, pools: World, real: RealData, keys: Any) -> HybridState | None:
         """The state after the last checkpoint, None for a fresh start; raises UserError where simulators differ."""
-        steps = [checkpoint.latest(folder) for folder in self.folders]
+        steps = [checkpoint.latest(folder, whole=True) for folder in self.folders]
         if len(set(steps)) > 1:
             listed = ", ".join(f"{own} is at {n or 0} updates" for own, n in zip(self.folders, steps, strict=True))
             raise UserError(f"{listed}: they cannot go on together, resume them one at a time")
@@ -144,7 +144,8 @@ class _Run:
         first = len(self.seeds)  # of the members: those of one simulator
         own = jax.tree.map(lambda x: x[:first], pools)
         like = trainer.shape_of(self.env, self.agent, self.args.schedule, own, real, keys[:first])
-        found = [checkpoint.restore(folder, like, step=steps[0], expect=self.expect) for folder in self.folders]
+        restored = functools.partial(checkpoint.restore, like=like, step=steps[0], checked=True, expect=self.expect)
+        found = [restored(folder) for folder in self.folders]
         for log, (_, meta) in zip(self.logs, found, strict=True):
             log.truncate(meta["position"])
         return join([state for state, _ in found])

@@ -23,6 +23,8 @@ def read(path: Path, env: Env, *, gamma: float, successors: Successors = "stored
         f"{facts.episodes:,} episodes, return {facts.return_mean:.4g} (std {facts.return_std:.3g}, "
         f"{facts.return_min:.4g} to {facts.return_max:.4g}){clipped}"
     )
+    if facts.assumed:
+        print(f"{facts.path}: {facts.assumed}")
     return log
 
 

@@ -2,14 +2,15 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from tyro.conf import arg
 
 import envs
 from envs import gaps
-from envs.files import read_object
 from sgft_jax import checks, extend, types
+from sgft_jax.io.cards import CARD, known_task, read_card
+from sgft_jax.io.folders import ASIDE, present
 from sgft_jax.presets import PRESETS, check_card
 from sgft_jax.types import Method, UserError, unknown
 
@@ -133,11 +134,15 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str, opti
     option: the one that names `prior`.
     """
     home = prior or prior_home(out, extend.name_of(task), preset)
-    if (home / "prior.json").exists():
+    if (present(home) / CARD).exists():
         return [home]
-    found = [
-        card.parent for sub in ("", "prior/", "policy/", "*/prior/") for card in home.glob(f"{sub}seed-*/prior.json")
+    cards = [
+        card
+        for sub in ("", "prior/", "policy/", "*/prior/")
+        for name in ("seed-*", f"{ASIDE}seed-*")  # the latter where a writer was killed
+        for card in home.glob(f"{sub}{name}/{CARD}")
     ]
+    found = {card.parent.with_name(card.parent.name.removeprefix(ASIDE)) for card in cards}
     if not found and prior:
         raise UserError(f"{option} {prior}: {'holds no prior' if prior.is_dir() else 'no such folder'}")
     if not found and preset not in PRESETS:
@@ -150,15 +155,10 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str, opti
     return sorted(found, key=_seed_number)
 
 
-def card_of_prior(folder: Path) -> dict[str, Any]:
-    """The card of a prior; raises UserError where it names no task."""
-    return read_object(folder / "prior.json", {"task": str}, "name it with --task, or take another prior")
-
-
 def check_prior(folder: Path, method: Method, task: str) -> None:
     """Raises UserError for a prior of another algorithm or task than the method needs, before anything is loaded."""
     try:
-        check_card(card_of_prior(folder), method, task)
+        check_card(read_card(folder), method, task)
     except UserError as error:
         raise UserError(f"--prior {folder}: {error}") from error
 
@@ -168,20 +168,13 @@ def task_of_priors(folders: Sequence[Path], task: str | None) -> str:
 
     Raises UserError where a card names another, or, unless the user says it, none of ours.
     """
-    named = {folder: card_of_prior(folder)["task"] for folder in folders}
-    chosen = task or ours(folders[0] / "prior.json", named[folders[0]])
+    named = {folder: read_card(folder)["task"] for folder in folders}
+    chosen = task or known_task(folders[0] / CARD, named[folders[0]])
     check_task(chosen)
     for folder, other in named.items():
         if other != extend.name_of(chosen):
             raise UserError(f"{folder}: is a prior of the task {other!r}, not of {extend.name_of(chosen)!r}")
     return chosen
-
-
-def ours(path: Path, task: str) -> str:
-    """The task that a file names. Raises UserError where that is code: only the user's own --task is executed."""
-    if extend.is_source(task):
-        raise UserError(f"{path}: its task is code, {task[:60]!r}; if you trust it, name it with --task")
-    return task
 
 
 def _seed_number(folder: Path) -> tuple[int, str]:

@@ -114,13 +114,13 @@ class _Run:
                 for seed in (_HELDOUT_SEED, _FINAL_SEED)
             )
         self.heldout = Simulated(self.env, heldout, first, gamma=self.config.gamma)
-        step = checkpoint.latest(self.home)
+        step = checkpoint.latest(self.home, whole=True)
         self.last_good = None if step is None else checkpoint.path(self.home, step)
         if step is None:
             self.log.truncate({})
             saved, done = None, 0
         else:
-            saved, done = self._restore()
+            saved, done = self._restore(step)
         best = self._train(saved, done)
         summary = self._hand_over(best)
         self.log.close()
@@ -131,11 +131,11 @@ class _Run:
         keys = world_keys(self.seeds, number)
         return stacking.stack([training_worlds(self.env, self.gap, key, self.config.worlds) for key in keys])
 
-    def _restore(self) -> tuple[Saved, int]:
-        """The newest checkpoint and the chunks behind it."""
+    def _restore(self, step: int) -> tuple[Saved, int]:
+        """The checkpoint of a step, which is whole, and the chunks behind it."""
         state = self.shapes()[1]
         like = jax.eval_shape(lambda run: Saved(run, self._first_best(run)), state)
-        saved, meta = checkpoint.restore(self.home, like, expect=self.expect)
+        saved, meta = checkpoint.restore(self.home, like, step=step, checked=True, expect=self.expect)
         self.log.truncate(meta["position"])
         self.clock.seconds = meta["seconds"]
         return saved, meta["chunks"]
@@ -143,7 +143,10 @@ class _Run:
     def _first_best(self, state: PretrainState) -> Best:
         """What any evaluation is better than."""
         none = jnp.full(len(self.seeds), -jnp.inf)
-        return Best(exported(self.env, self.config, state), none, none, state.steps)
+        unknown = jnp.full((len(self.seeds), 2), jnp.inf)
+        return Best(
+            exported(self.env, self.config, state), none, none, state.steps, jnp.zeros(len(self.seeds)), unknown
+        )
 
     def _random(self) -> PyTree:
         """Experience under random actions: collected once, then read from disk."""

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import importlib.util
 import json
 import os
 import re
 import secrets
 import socket
+import stat
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from envs import gaps
+from envs.files import read_text
 from envs.gaps import Gap
 from experiments.options import check_task, port_of
 from sgft_jax import extend
+from sgft_jax.systems.door import bound, check_host
 from sgft_jax.types import UserError
 
 if TYPE_CHECKING:
@@ -29,6 +33,7 @@ GYMNASIUM = "gymnasium:"  # then a name for `gymnasium.make`, which may begin wi
 REMOTE = "remote"  # then perhaps where to listen, as `remote:HOST:PORT`
 _HOST, _PORT = "127.0.0.1", 8765
 _TOKEN = "robot-token"
+_LETTERS = re.compile(r"[!-~]{16,256}")  # of a token: so many cannot be guessed
 
 
 def is_robot(real: str) -> bool:
@@ -66,6 +71,8 @@ def check(task: str, reals: Sequence[str], changes: Sequence[str] = ()) -> None:
     if GYMNASIUM in stepped:
         raise UserError(f"--real {GYMNASIUM}: name an environment, e.g. {GYMNASIUM}HalfCheetah-v5")
     keywords(changes)
+    for real in stepped:
+        _explained(real, _registered)
 
 
 def _check_robot(robots: Sequence[str], changes: Sequence[str]) -> None:
@@ -73,16 +80,31 @@ def _check_robot(robots: Sequence[str], changes: Sequence[str]) -> None:
         raise UserError(f"--real {' '.join(robots)}: one robot at a time")
     if changes:
         raise UserError(f"--set {changes[0]}: nothing here can change a robot")
-    address(robots[0])
+    host, port = address(robots[0])
+    try:
+        bound(host, port).close()
+    except UserError as error:
+        raise UserError(f"--real {robots[0]}: {error}") from None
 
 
 def address(real: str) -> tuple[str, int]:
-    """The interface and the port of `remote[:HOST[:PORT]]`; default: this computer alone. UserError for no port."""
-    _, *rest = real.split(":")
-    host, port = (*rest, "", "")[:2]
+    """The interface and the port of `remote[:HOST[:PORT]]`; default: this computer alone.
+
+    HOST may be an IPv6 address, in brackets where a port follows. Raises UserError for what is no host or port.
+    """
+    rest = real.removeprefix(REMOTE).removeprefix(":")
+    read = re.fullmatch(r"\[(?P<six>[^\]]*:[^\]]*)\](:(?P<port6>[0-9]*))?|(?P<host>[^:]*)(:(?P<port>[0-9]*))?", rest)
+    host, port = (read["six"] or read["host"], read["port6"] or read["port"]) if read else (rest, None)
     number = port_of(port or str(_PORT))
-    if len(rest) > 2 or number is None:
-        raise UserError(f"--real {real}: write {REMOTE}, {REMOTE}:HOST or {REMOTE}:HOST:PORT, a port from 1 to 65535")
+    try:
+        check_host(host or _HOST)
+    except UserError:
+        number = None
+    if number is None:
+        raise UserError(
+            f"--real {real}: write {REMOTE}, {REMOTE}:HOST or {REMOTE}:HOST:PORT, a port from 1 to 65535, an IPv6 "
+            "address as [::1]"
+        )
     return host or _HOST, number
 
 
@@ -97,9 +119,12 @@ def token(home: Path) -> str:
     """What a robot must know, from the file under `home` that only its owner reads; made where there is none.
 
     It stays the same, so that a robot that waits for a run that was killed is taken again. Runs that begin at the same
-    moment agree on one: a file appears as a whole, and only where there is none.
+    moment agree on one: a file appears as a whole, and only where there is none. Raises UserError for a file that
+    others can read or have put there, and for a token that can be guessed; no message holds it.
     """
     path = home / _TOKEN
+    if path.is_symlink():
+        raise UserError(f"{path}: is a link; delete it for a new token")
     if not path.exists():
         home.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile("w", dir=home, prefix=f".tmp-{_TOKEN}-") as file:  # for its owner alone
@@ -107,9 +132,12 @@ def token(home: Path) -> str:
             file.flush()
             with contextlib.suppress(FileExistsError):  # another run was faster
                 os.link(file.name, path)
-    if not (found := path.read_text().strip()):
-        raise UserError(f"{path}: is empty; write a token into it, or delete it for a new one")
-    return found
+    content = read_text(path, limit=1024).strip()
+    if stat.S_IMODE(path.stat().st_mode) & 0o077:
+        raise UserError(f"{path}: others can read or write it; delete it for a new token, or chmod 600 it")
+    if not _LETTERS.fullmatch(content):
+        raise UserError(f"{path}: holds no token: 16 letters, digits or signs, or more; delete it for a new one")
+    return content
 
 
 def keywords(changes: Sequence[str]) -> dict[str, Any]:
@@ -150,7 +178,7 @@ def connect(
         host, port = address(reals[0])
         robot = Remote(
             env.measured_dim, env.act_dim, period=env.control_dt, steps=env.episode_length, host=host, port=port,
-            token=token(home),
+            token=token(home), token_in=str(home / _TOKEN),
         )  # fmt: skip
         return Gymnasium(env, robot, gamma=gamma)
     given = keywords(changes)
@@ -160,8 +188,25 @@ def connect(
 def _make(real: str, given: dict[str, Any]) -> Any:
     import gymnasium
 
+    return _explained(real, lambda name: gymnasium.make(name, **given))
+
+
+def _registered(name: str) -> None:
+    """Raises where Gymnasium knows no environment of that name. Imports the module that registers it."""
+    import gymnasium
+
+    module, _, name = name.rpartition(":")
+    if module:
+        importlib.import_module(module)
+    gymnasium.spec(name)
+
+
+def _explained[T](real: str, ask: Callable[[str], T]) -> T:
+    """What is made of an environment's name; raises UserError where there is none, or it fails."""
+    import gymnasium
+
     try:
-        return extend.guard("--real", real, lambda name: gymnasium.make(name, **given))(real.removeprefix(GYMNASIUM))
+        return extend.guard("--real", real, ask)(real.removeprefix(GYMNASIUM))
     except UserError as error:
         if isinstance(error.__cause__, gymnasium.error.Error):  # no such name: where that was found out says nothing
             raise UserError(f"--real {real}: {str(error.__cause__).splitlines()[0]}") from error

@@ -1,13 +1,15 @@
 """Impure: a real system whose every episode is on disk before anything learns from it."""
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.base import Env
 from envs.rollout import Episode
 from sgft_jax.io.real import RealStore
 from sgft_jax.stacking import join, part
@@ -69,7 +71,7 @@ class RecordedSystem:
         (store,), inner = self.stores, self.inner
         assert isinstance(inner, Gymnasium)
         journal = store.journal(number, sync_every=self.sync_every or 1)
-        made = [Step(**step) for step in journal.read()]
+        made = [_step(journal.path, step, inner.env) for step in journal.read()]
         if made and not made[-1].over and len(made) < inner.env.episode_length:
             made.append(made[-1].in_doubt())
         elif not made:
@@ -84,7 +86,16 @@ class RecordedSystem:
         journal.remove()
 
     def _stored(self, number: int) -> Episode:
-        return join([_read(store.load(number)) for store in self.stores])
+        return join([_read(store, number) for store in self.stores])
+
+
+def _step(path: Path, stored: Mapping[str, np.ndarray], env: Env) -> Step:
+    """A step of one member from a journal, which may be one of another task, or of a version before."""
+    widths = {"obs": env.obs_dim, "next_obs": env.obs_dim, "action": env.act_dim, "command": env.act_dim}
+    shapes = {name: (1, widths[name]) if name in widths else (1,) for name in Step._fields}
+    if {name: x.shape for name, x in stored.items()} != shapes:
+        raise UserError(f"{path}: holds no steps of {env.name}; move it away to go on without them")
+    return Step(**stored)
 
 
 def _arrays(episodes: Episode) -> dict[str, np.ndarray]:
@@ -93,8 +104,11 @@ def _arrays(episodes: Episode) -> dict[str, np.ndarray]:
     return {name: np.asarray(x[:, 0]) for name, x in arrays.items() if x is not None}
 
 
-def _read(arrays: dict[str, np.ndarray]) -> Episode:
+def _read(store: RealStore, number: int) -> Episode:
     """The inverse."""
+    arrays = store.rollout(number)
+    if missing := {name for name in _FACTS if name != "command"} - set(arrays):
+        raise UserError(f"{store.folder}: rollout {number} lacks {min(missing)}; docs/formats.md lists what it holds")
     stored = {name: jnp.asarray(x)[:, None] for name, x in arrays.items()}
     transitions = Transition(*(stored[name] for name in Transition._fields))
     return Episode(transitions=transitions, **{name: stored[name] for name in _FACTS if name in stored})

@@ -11,11 +11,12 @@ import envs
 from envs import gaps
 from envs.base import Entry, Env
 from envs.pools import real_env, real_worlds
-from experiments.rollouts import check_sizes, config_of
+from experiments.rollouts import check_sizes
 from experiments.video import film
 from sgft_jax.analysis import figures
 from sgft_jax.analysis.figures import Panel
 from sgft_jax.io.real import Played
+from sgft_jax.io.runs import read_config
 
 _WORDY = 5  # rollouts that have room for more than their numbers
 
@@ -83,10 +84,10 @@ def _joined(each: Sequence[np.ndarray]) -> np.ndarray:
 
 def _video(home: Path, task: str, own: Played, out: Path) -> str:
     """Films a rollout in the world in which it took place."""
-    config = config_of(home)
+    config = read_config(home)
     if own.trace.size == 0:
         return f"no video of rollout {own.number}: its states were not stored; a simulated real system leaves them"
-    if not {"impl", "real", "set"} <= set(config):
+    if any(config.get(name) is None for name in ("impl", "real", "set")):
         return f"no video of rollout {own.number}: {home} does not say in which gap it was played"
     env = envs.make(task, config["impl"])
     gap = gaps.load(env, config["real"], config["set"])

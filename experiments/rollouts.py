@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from experiments.options import check_task, ours
+from experiments.options import check_task
 from sgft_jax.io import real
+from sgft_jax.io.cards import known_task
 from sgft_jax.io.real import Played
-from sgft_jax.io.runs import CONFIG, Options, read_own
+from sgft_jax.io.runs import CONFIG, read_config
 from sgft_jax.types import UserError
 
 if TYPE_CHECKING:
@@ -22,24 +23,22 @@ def home_of(option: str, folder: Path) -> Path:
     return home
 
 
-def config_of(home: Path) -> dict[str, Any]:
-    """The options of the run in a folder; none where a robot has recorded."""
-    return read_own(home / CONFIG, {"config": Options}).get("config", {})
-
-
 def task_of(home: Path, task: str | None) -> str:
-    """The task that was played: what the user says, or what the run says; raises UserError where nobody does."""
+    """The task that was played: what the user says, or what the run says; raises UserError where nobody does.
+
+    A run names no code: one of a task of the user's own is of that task again where the user says so.
+    """
     if task is None:
-        if (task := config_of(home).get("task")) is None:
+        if (named := read_config(home).get("task")) is None:
             raise UserError(f"{home}: does not say of which task it is; name it with --task")
-        ours(home / CONFIG, task)
+        return known_task(home / CONFIG, named)
     check_task(task)
     return task
 
 
 def episodes_of(home: Path, seed: int | None) -> list[Played]:
     """The episodes of one seed of a run, or those of all; raises UserError for a seed that it does not have."""
-    found, first = real.played(home), config_of(home).get("seed", 0)
+    found, first = real.played(home), read_config(home).get("seed", 0)
     seeds = sorted({first + own.seed for own in found})
     if seed is not None and seed not in seeds:
         raise UserError(f"--seed {seed}: {home} has the seeds {', '.join(map(str, seeds))}")

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from experiments import cli
-from experiments.options import card_of_prior, prior_folders
+from experiments.options import prior_folders
+from sgft_jax.io.cards import read_card
 from sgft_jax.io.runs import check_folder
 from sgft_jax.types import Prior, PyTree, UserError
 
@@ -42,7 +43,7 @@ def main(args: ShareArgs) -> None:
     check_folder(args.to, "--to")
     chosen = folders[: args.count]
     for folder in chosen:
-        card_of_prior(folder)
+        read_card(folder)
         if os.path.lexists(copy := args.to / folder.name):
             raise UserError(f"{copy}: exists already; choose another --to, or remove it")
     from sgft_jax.io.priors import load_prior, save_prior

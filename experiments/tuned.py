@@ -1,10 +1,9 @@
 """The options that tuning has chosen, one file for a task and method: read, written, and put into a run's arguments."""
 
-import typing
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, get_type_hints
 
 from envs import gaps
 from envs.files import checked, read_object
@@ -16,6 +15,10 @@ from sgft_jax.methods import get_method
 from sgft_jax.types import UserError
 
 VARIANT = "tuned"
+
+
+class _Budget(TypedDict):
+    reals: list[str]
 
 
 def path_of(out: Path, task: str, method: str) -> Path:
@@ -39,12 +42,13 @@ def read(out: Path, task: str, method: str) -> dict[str, Any]:
     """What tuning has found; raises UserError, which names the command, if there is no such file."""
     _require(out, task, [method])
     path = path_of(out, task, method)
-    result = read_object(path, {"budget": dict, "options": dict}, "it was not written by experiments.tune")
+    again = f"tune again with: {_command(task, [method])}"
+    result = read_object(path, {"budget": dict, "options": dict}, again)
     if unknown := sorted(set(result["options"]) - set(space_of(method))):
-        raise UserError(f"{path}: there is no option {unknown[0]!r}; tune again with: {_command(task, [method])}")
-    hints = typing.get_type_hints(get_method(method).config)
-    checked(path, result["options"], {name: hints[name] for name in result["options"]}, "tune again")
-    return result
+        raise UserError(f"{path}: there is no option {unknown[0]!r}; {again}")
+    types = get_type_hints(get_method(method).config)
+    checked(path, result["options"], {name: types[name] for name in result["options"]}, again)
+    return checked(path, result, {"budget": _Budget}, again)
 
 
 def _require(out: Path, task: str, methods: Iterable[str]) -> None:

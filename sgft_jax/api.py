@@ -3,7 +3,7 @@
 The only module of this package that builds tasks; the others take an `Env` or less.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +19,8 @@ from envs.history import remember, with_memory
 from envs.pools import heldout_worlds, real_env, real_worlds, training_worlds
 from envs.rollout import Episode
 from sgft_jax import train
+from sgft_jax.io import player
+from sgft_jax.io.cards import known_task
 from sgft_jax.io.priors import load_prior, observed
 from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.methods.options import card_of
@@ -127,7 +129,8 @@ def make_env(prior: Prior, *, task: str | None = None) -> Env:
 
     task: where the file of a task of your own is; otherwise the prior's card names its task.
     """
-    return envs.make(task or prior.card["task"], **observed(prior.card))
+    named = task or known_task("the prior's card", prior.card["task"], "task=")
+    return envs.make(named, **observed(prior.card))
 
 
 def evaluate_prior(
@@ -181,14 +184,27 @@ class ActingPolicy:
         self._actions = np.zeros((self.env.previous_actions, self.env.act_dim), np.float32)
 
     def act(self, obs: ArrayLike, *, explore: bool = False) -> np.ndarray:
-        """The action [act_dim] in [-1, 1] for what was measured, [measured_dim] in raw units."""
-        if np.shape(obs) != (self.env.measured_dim,):
-            raise UserError(f"the policy reads {self.env.measured_dim} measured numbers, got shape {np.shape(obs)}")
-        seen = with_memory(self.env, np.asarray(obs), self._actions)  # of the system its own estimate counts
-        self._key, key = jax.random.split(self._key)
-        action, self._carry = self._act(self.prior.params, self._carry, seen, key, explore=explore)
-        self._actions = remember(self._actions, np.asarray(action))
+        """The action [act_dim] in [-1, 1] for what was measured, [measured_dim] in raw units.
+
+        Raises UserError for another number of entries, and for one that is no number, not finite or too large; nothing
+        is remembered then.
+        """
+        names = [f"{e.name}[{i}]" for e in self.env.measured for i in range(e.size)]
+        measured = _judged(player.numbers, obs, names, "the policy reads {} measured numbers")
+        seen = with_memory(self.env, measured, self._actions)  # of the system its own estimate counts
+        following, key = jax.random.split(self._key)
+        action, carry = self._act(self.prior.params, self._carry, seen, key, explore=explore)
+        _judged(player.check_answer, action, *jax.tree.leaves(carry))
+        self._key, self._carry, self._actions = following, carry, remember(self._actions, np.asarray(action))
         return np.asarray(action)
+
+
+def _judged[T](check: Callable[..., T], *args: Any) -> T:
+    """What a check of exported policies says, which know no UserError."""
+    try:
+        return check(*args)
+    except ValueError as error:
+        raise UserError(str(error)) from None
 
 
 def load_policy(folder: str | Path, *, task: str | None = None, seed: int = 0) -> ActingPolicy:

@@ -183,13 +183,27 @@ def assemble(
         return state._replace(learner=learner, transform=own), metrics
 
     def learn(
-        state: FinetuneState, key: Key, updates: int, simulated: SimulatedData | None = None, *, offline: bool = False
-    ) -> tuple[FinetuneState, Metrics]:
+        state: FinetuneState, key: Key, updates: int, simulated: SimulatedData | None = None, *, offline: bool = False,
+        limit: Array | None = None,
+    ) -> tuple[FinetuneState, Metrics]:  # fmt: skip
         if simulation is not None and simulated is None:
             raise UserError("this method learns from transitions of the simulator too: give it some (`SimulatedData`)")
         one = lambda state, key: update(state, key, simulated, offline)  # noqa: E731
-        state, metrics = jax.lax.scan(one, state, jax.random.split(key, updates))
-        return state, jax.tree.map(jnp.mean, metrics)
+        source, keys = (
+            parts.offline if offline and parts.offline else parts.source(state),
+            jax.random.split(key, updates),
+        )
+        # An empty replay is sampled as zeros, which nobody has lived through.
+        some = state.replay.size > 0 if source.n_real else jnp.ones((), bool)
+        made = jnp.where(some, updates if limit is None else limit, 0)
+        if limit is None:
+            learned, metrics = jax.lax.scan(one, state, keys)
+            learned = jax.tree.map(lambda new, old: jnp.where(some, new, old), _changing(learned), _changing(state))
+            metrics = jax.tree.map(jnp.mean, metrics)
+        else:
+            learned, metrics = _up_to(one, state, keys, made)
+        metrics = {name: jnp.where(made > 0, x, jnp.nan) for name, x in metrics.items()}
+        return state._replace(**learned), metrics | {"updates": made.astype(jnp.float32)}
 
     finetuner = Finetuner(
         init=init,
@@ -206,6 +220,27 @@ def assemble(
         card=card or {},
     )
     return guarded(finetuner, parts.reference, score=task.score) if options.guard else finetuner
+
+
+def _changing(state: FinetuneState) -> dict[str, PyTree]:
+    """What an update changes of a state: all but what is large."""
+    return {name: getattr(state, name) for name in ("learner", "models", "transform")}
+
+
+def _up_to(
+    update: Callable[[FinetuneState, Key], tuple[FinetuneState, Metrics]], state: FinetuneState, keys: Key, made: Array
+) -> tuple[dict[str, PyTree], Metrics]:
+    """What so many updates `made` [] with the first of the keys change, and their mean metrics."""
+
+    def one(i: Array, carry: tuple[dict[str, PyTree], Metrics]) -> tuple[dict[str, PyTree], Metrics]:
+        changed, sums = carry
+        new, metrics = update(state._replace(**changed), keys[i])
+        return _changing(new), {name: total + metrics[name] for name, total in sums.items()}
+
+    blank = jax.eval_shape(update, state, keys[0])[1]
+    sums = {name: jnp.zeros(x.shape, x.dtype) for name, x in blank.items()}
+    changed, sums = jax.lax.fori_loop(0, made, one, (_changing(state), sums))
+    return changed, {name: total / jnp.maximum(made, 1) for name, total in sums.items()}
 
 
 # --- SAC --------------------------------------------------------------------------------------------------------------

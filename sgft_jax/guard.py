@@ -4,6 +4,11 @@ The *reference* is at first the policy that a method begins with, the *challenge
 deployed: it plays the next training rollout and is what is evaluated and exported. Scores of training rollouts are the
 only evidence, so a guard costs no real transition.
 
+A rollout whose physics exploded, or that was broken off, is a failure. Where the score is a return it counts as the
+worst one known, also of rollouts that come later. That may be close to the others, so explosions count by themselves,
+too: a challenger whose share of them exceeds the reference's by more than a tenth is not deployed, and of two policies
+that are expected to score the same it is the one that explodes less.
+
 The rule compares means of scores, each with a few imagined rollouts as a prior. It is the same for success (a Beta
 posterior) and for returns (a normal one), as it needs no scale but the worst and the best score known: 0 and 1 for
 success, those seen so far for returns.
@@ -37,6 +42,8 @@ from sgft_jax.types import Array, Finetuner, Key, Metrics, PyTree, SimulatedData
 
 _FADE = 0.8  # of the challenger's evidence per learning phase
 _CREDIT = 2.0  # imagined rollouts of the challenger
+_ROUNDING = 1e-5  # relative difference of scores that says nothing
+_TOLERATED = 0.1  # by how much its share of explosions may exceed the reference's
 
 
 class Evidence(NamedTuple):
@@ -50,6 +57,7 @@ class Guard(NamedTuple):
     """reference, challenger: the evidence for either. worst, best: [] the extreme scores known.
 
     deployed: [] bool, whether the challenger is. replaced: [] bool, whether the last rollout made it the reference.
+    exploded: the weights [] in the evidence for either of rollouts that exploded, whose scores the totals leave out.
     """
 
     reference: Evidence
@@ -58,6 +66,7 @@ class Guard(NamedTuple):
     best: Array
     deployed: Array
     replaced: Array
+    exploded: tuple[Array, Array]
 
 
 class Guarded(NamedTuple):
@@ -81,33 +90,59 @@ def start(score: str) -> Guard:
         jnp.float32(best),
         jnp.zeros((), bool),
         jnp.zeros((), bool),
+        (jnp.float32(0), jnp.float32(0)),
     )
 
 
-def scored(guard: Guard, score: Array) -> Guard:
-    """After a training rollout with this score [] by the policy that is deployed.
+def scored(guard: Guard, score: Array, partial: Array | float = jnp.inf) -> Guard:
+    """After a training rollout with this score [] by the policy that is deployed; -inf for one that exploded.
 
-    If the challenger becomes the reference, as it was in this rollout, its evidence counts for both.
+    partial: [] what that one scored until then. If the challenger becomes the reference, as it was in this rollout, its
+    evidence counts for both.
     """
-    add = lambda evidence, mine: Evidence(evidence.total + mine * score, evidence.weight + mine)  # noqa: E731
-    mine = guard.deployed.astype(jnp.float32)
-    reference, challenger = add(guard.reference, 1 - mine), add(guard.challenger, mine)
-    worst, best = jnp.minimum(guard.worst, score), jnp.maximum(guard.best, score)
-    proven = (challenger.total + worst) / (challenger.weight + 1) > _mean(reference)
-    replaced = guard.deployed & proven
-    return Guard(_choose(replaced, challenger, reference), challenger, worst, best, guard.deployed, replaced)
+    exploded, mine = jnp.isneginf(score), guard.deployed.astype(jnp.float32)
+    known = jnp.where(exploded, 0.0, score)
+    add = lambda evidence, mine: Evidence(evidence.total + mine * known, evidence.weight + mine)  # noqa: E731
+    guard = guard._replace(
+        reference=add(guard.reference, 1 - mine),
+        challenger=add(guard.challenger, mine),
+        worst=jnp.minimum(guard.worst, jnp.where(exploded, partial, score)),
+        best=jnp.maximum(guard.best, score),
+        exploded=tuple(x + share * exploded for x, share in zip(guard.exploded, (1 - mine, mine), strict=True)),
+    )
+    reference, challenger = evidence(guard)
+    proven = (challenger.total + guard.worst) / (challenger.weight + 1) > _mean(reference)
+    replaced, (ours, theirs) = guard.deployed & proven & ~exploded, guard.exploded
+    return guard._replace(
+        reference=_choose(replaced, guard.challenger, guard.reference),
+        replaced=replaced,
+        exploded=(jnp.where(replaced, theirs, ours), theirs),
+    )
 
 
 def learned(guard: Guard) -> Guard:
     """The challenger has changed, which ages its evidence; who is deployed is decided anew."""
     challenger = Evidence(*(_FADE * x for x in guard.challenger))
-    reference, expected = means(guard._replace(challenger=challenger))
-    return guard._replace(challenger=challenger, deployed=expected > reference)
+    guard = guard._replace(challenger=challenger, exploded=(guard.exploded[0], _FADE * guard.exploded[1]))
+    (reference, expected), (ours, theirs) = means(guard), guard.exploded
+    more = theirs / (_CREDIT + challenger.weight) - ours / jnp.maximum(guard.reference.weight, 1e-6)
+    equal = expected >= reference - _ROUNDING * jnp.abs(reference)
+    better = (expected > reference) | (equal & (more < 0))
+    return guard._replace(deployed=better & (more <= _TOLERATED))
+
+
+def evidence(guard: Guard) -> tuple[Evidence, Evidence]:
+    """That for the reference and the challenger, rollouts that exploded at the worst score known, 0 before any is."""
+    worst = jnp.where(jnp.isfinite(guard.worst), guard.worst, 0.0)
+    policies = zip((guard.reference, guard.challenger), guard.exploded, strict=True)
+    reference, challenger = (Evidence(own.total + lost * worst, own.weight) for own, lost in policies)
+    return reference, challenger
 
 
 def means(guard: Guard) -> tuple[Array, Array]:
     """The scores [] that are expected of the reference and of the challenger."""
-    reference, (total, weight) = _mean(guard.reference), guard.challenger
+    ours, (total, weight) = evidence(guard)
+    reference = _mean(ours)
     credit = (reference + jnp.maximum(guard.best, reference)) / 2
     # As a distance from the reference, so that without evidence or shortfall they are equal to the bit.
     return reference, reference + (_CREDIT * (credit - reference) + total - weight * reference) / (_CREDIT + weight)
@@ -128,11 +163,12 @@ def guarded(inner: Finetuner, first: Callable[[PyTree, PyTree], PyTree], *, scor
     `train.finetune`; what is learned before the first one, as from logs, deploys nothing. Metrics: guard/challenger,
     whether it is deployed next; guard/replaced; the expected scores.
     """
+    kind = score
 
     def init(params: PyTree, key: Key, simulated: SimulatedData | None = None) -> Guarded:
         agent = inner.init(params, key, simulated)
         # A copy: the caller may donate the state, and the prior must survive that.
-        return Guarded(agent, jax.tree.map(jnp.copy, first(params, inner.export(agent))), start(score))
+        return Guarded(agent, jax.tree.map(jnp.copy, first(params, inner.export(agent))), start(kind))
 
     def export(state: Guarded) -> PyTree:
         return _choose(state.guard.deployed, inner.export(state.agent), state.reference)
@@ -143,15 +179,19 @@ def guarded(inner: Finetuner, first: Callable[[PyTree, PyTree], PyTree], *, scor
     def observe(state: Guarded, rows: Transition, valid: Array, score: Array | None) -> Guarded:
         if score is None:  # neither of the two policies has played
             return state._replace(agent=inner.observe(state.agent, rows, valid, None))
-        guard = scored(state.guard, jnp.float32(score))
+        if kind == "success":  # an explosion is a failure like others
+            guard = scored(state.guard, jnp.maximum(jnp.float32(score), 0.0))
+        else:
+            guard = scored(state.guard, jnp.float32(score), jnp.sum(rows.reward, where=valid))
         # What has played: `inner.observe` may change the policy too, as identification does.
         reference = _choose(guard.replaced, inner.export(state.agent), state.reference)
         return Guarded(inner.observe(state.agent, rows, valid, score), reference, guard)
 
     def learn(
-        state: Guarded, key: Key, updates: int, simulated: SimulatedData | None = None, *, offline: bool = False
-    ) -> tuple[Guarded, Metrics]:
-        agent, metrics = inner.learn(state.agent, key, updates, simulated, offline=offline)
+        state: Guarded, key: Key, updates: int, simulated: SimulatedData | None = None, *, offline: bool = False,
+        limit: Array | None = None,
+    ) -> tuple[Guarded, Metrics]:  # fmt: skip
+        agent, metrics = inner.learn(state.agent, key, updates, simulated, offline=offline, limit=limit)
         if offline:  # no rollout has been played
             return state._replace(agent=agent), metrics
         guard = learned(state.guard)

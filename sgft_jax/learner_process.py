@@ -41,13 +41,13 @@ class LearnerProcess:
         self._result: Future[Any] = self._receiver.submit(self._receive)  # that it is up
 
     def wait(self) -> None:
-        """Until the process is up, so that its start disturbs no robot. Raises UserError if it is gone."""
+        """Until the process is up, so that its start disturbs no robot. Raises UserError if it is gone, or its own."""
         self._result.result()
 
-    def submit(self, agent: PyTree, parts: Sequence[int], updates: int, phase: Phase) -> None:
+    def submit(self, agent: PyTree, parts: Sequence[int], updates: int | Array, phase: Phase) -> None:
         """Begins the learning phases `parts`, when those before are done."""
         self.wait()
-        self._talk(lambda: self._connection.send((jax.device_get(agent), list(parts), updates, phase)))
+        self._talk(lambda: self._connection.send((*jax.device_get((agent, list(parts), updates)), phase)))
         self._result = self._receiver.submit(self._receive)
 
     def ready(self) -> bool:
@@ -69,6 +69,8 @@ class LearnerProcess:
     def _receive(self) -> Any:
         """The next message, on this process's device; in the thread."""
         found = self._talk(self._connection.recv)
+        if isinstance(found, UserError):
+            raise found
         if isinstance(found, str):
             raise RuntimeError(f"the learner's process has failed:\n{found}")
         return jax.block_until_ready(jax.device_put(found))
@@ -120,7 +122,9 @@ def _work(
         while True:
             agent, parts, count, phase = connection.recv()
             connection.send(jax.device_get(updates(agent, parts, count, phase)))
-    except (EOFError, OSError):
+    except (EOFError, ConnectionError):
         return
+    except UserError as error:
+        connection.send(error)
     except Exception:
         connection.send(traceback.format_exc())

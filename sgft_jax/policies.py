@@ -1,17 +1,28 @@
 """How the parameters of a prior act and value states, for each algorithm that leaves one."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from sgft_jax.learners import recurrent, tdmpc2, tdmpc2_model
-from sgft_jax.learners.actor import actor_policy
+from sgft_jax.learners.actor import actor_policy, make_actor_of
 from sgft_jax.learners.sac import SACParams
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.config import NetworkConfig
-from sgft_jax.models.networks import add_noise, make_actor, make_dynamics, make_value, tanh_gaussian_action
+from sgft_jax.models.gru import GRU, make_gru
+from sgft_jax.models.networks import (
+    Network,
+    add_noise,
+    check_params,
+    make_actor,
+    make_critic,
+    make_dynamics,
+    make_value,
+    tanh_gaussian_action,
+)
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.models.system import told
 from sgft_jax.planning import mpc
@@ -25,10 +36,7 @@ def make_policy(card: Mapping[str, Any], task: Task) -> Policy:
     recurrent SAC), and `plan` for a prior of SAC that plans.
     """
     if card.get("algorithm", "sac") == "tdmpc2":
-        own = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
-        own["sgft"] = card["config"].get("sgft", False)
-        structure = tdmpc2_model.named_config(task.obs_dim, task.act_dim, **own)
-        return tdmpc2_policy(structure, tdmpc2.TDMPC2Hyper(gamma=card["gamma"]))
+        return tdmpc2_policy(_structure_of(card, task.obs_dim, task.act_dim), tdmpc2.TDMPC2Hyper(gamma=card["gamma"]))
     network = network_of(card)
     if card.get("algorithm") == "actor":
         return actor_policy(task.obs_dim, task.act_dim, network, card["head"])
@@ -38,6 +46,79 @@ def make_policy(card: Mapping[str, Any], task: Task) -> Policy:
         config = mpc.MPCConfig(task.obs_dim, task.act_dim, network, **plan, gamma=card["gamma"])
         return mpc_policy(config, task)
     return sac_policy(task.obs_dim, task.act_dim, network)
+
+
+def check_parameters(card: Mapping[str, Any], params: Any) -> None:
+    """Raises UserError where parameters, or their shapes, are not of the sizes and networks that a card describes.
+
+    Parts that a prior does not have are None; all have statistics and what acts.
+    """
+    obs_dim, act_dim, entries = card["obs_dim"], card["act_dim"], len(card.get("system", []))
+    sizes = {
+        "normalizer": ((obs_dim,), (obs_dim,)),
+        "distortion": ((act_dim, act_dim), (act_dim,), (_offsets(params, obs_dim, act_dim),)),
+        "system": (entries,),
+        "scale": (),
+    }
+    if params.normalizer is None:
+        raise UserError("not a prior: it has no observation statistics")
+    if (shape := getattr(params.normalizer.mean, "shape", ())) != (obs_dim,):
+        raise UserError(f"its card says obs_dim={obs_dim}, the statistics have {' x '.join(map(str, shape))}")
+    for name, wanted in sizes.items():
+        part = getattr(params, name, None)
+        if part is not None and (shapes := jax.tree.map(lambda x: x.shape, part)) != wanted:
+            raise UserError(f"{name} has the shapes {shapes}, by its card {wanted}; take another prior")
+    for name, network, part in _networks_of(card, params):
+        check_params(name, network, part, "its card; take another prior")
+    if odd := [path for path, x in jax.tree_util.tree_leaves_with_path(params) if x.dtype != jnp.float32]:
+        raise UserError(f"{jax.tree_util.keystr(odd[0])} is not float32; take another prior")
+
+
+def _offsets(params: Any, obs_dim: int, act_dim: int) -> int:
+    """How many measurements a prior corrects, if whole actions then follow them in an observation; else none fit."""
+    count = sum(math.prod(x.shape) for x in jax.tree.leaves(getattr(getattr(params, "distortion", None), "offset", ())))
+    return count if count <= obs_dim and (obs_dim - count) % act_dim == 0 else -1
+
+
+def _networks_of(card: Mapping[str, Any], params: Any) -> Iterator[tuple[str, Network, PyTree]]:
+    """The networks that a card describes, by name, each with what the prior has for it."""
+    sizes, algorithm = (card["obs_dim"], card["act_dim"]), card.get("algorithm", "sac")
+    if algorithm == "tdmpc2":
+        parts = tdmpc2_model.make_parts(_structure_of(card, *sizes))
+        yield from ((name, getattr(parts, name), getattr(params, name)) for name in tdmpc2_model.NETWORKS)
+        if params.anchor is not None:
+            yield "anchor", parts.policy, params.anchor
+        return
+    network = network_of(card)
+    if algorithm == "actor":
+        yield "actor", make_actor_of(card["head"], *sizes, network), params.actor
+    elif algorithm == "recurrent":
+        memory = make_gru(*sizes, card["config"]["gru"])
+        actor, critic = (make(memory.features, card["act_dim"], network) for make in (make_actor, make_critic))
+        yield "actor", _behind(memory, actor), params.actor
+        yield "critic", _behind(memory, critic), params.critic
+    else:
+        yield "actor", make_actor(*sizes, network), params.actor
+        if params.critic is not None:
+            yield "critic", make_critic(*sizes, network, members=_members(params.critic)), params.critic
+        if params.value is not None:
+            yield "value", make_value(sizes[0], network), params.value
+        if params.dynamics is not None:
+            yield "dynamics", make_dynamics(*sizes, network, members=_members(params.dynamics)), params.dynamics
+
+
+def _behind(memory: GRU, head: Network) -> Network:
+    return Network(lambda key: {"memory": memory.init(key), "head": head.init(key)}, head.apply)
+
+
+def _members(ensemble: PyTree) -> int:
+    """How many networks an ensemble has; methods may keep fewer or more than the prior had."""
+    return next(iter(jax.tree.leaves(ensemble)[0].shape), 1)
+
+
+def _structure_of(card: Mapping[str, Any], obs_dim: int, act_dim: int) -> tdmpc2.TDMPC2Config:
+    own = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
+    return tdmpc2_model.named_config(obs_dim, act_dim, **own, sgft=card["config"].get("sgft", False))
 
 
 def network_of(card: Mapping[str, Any]) -> NetworkConfig:

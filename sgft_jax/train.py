@@ -4,15 +4,19 @@ A yielded state is valid until the iterator's next step, which donates its array
 """
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from envs.base import Env, World
 from envs.rollout import Episode, play_episode
+from sgft_jax import evidence
 from sgft_jax.data import replay
+from sgft_jax.evidence import Best
+from sgft_jax.guard import Guarded
 from sgft_jax.mesh import split_vmap
 from sgft_jax.systems import System
 from sgft_jax.types import (
@@ -31,37 +35,21 @@ from sgft_jax.types import (
 _INIT, _COLLECT, _LEARN, _EVALUATE, _OFFLINE = range(5)  # purposes, folded into a seed's key
 Phase = Literal["offline", "logged", "online"]  # of learning, see `Updates`
 OFFLINE_PART = 5_000  # updates of the offline phase between two yields
-WINDOW = 5  # real rollouts whose mean is the evidence for a policy
 _AT_ONCE = 1024  # simulated episodes played together
-
-
-class Best(NamedTuple):
-    """The best policy by real evidence: the mean score, then the mean return, of WINDOW training rollouts in a row.
-
-    params: [M, ...] of the policy that played the last of them. score, total: [M] its evidence, -inf before there is
-    any. rollouts: [M] int32, the real rollouts it had learned from. recent: [M, WINDOW, 2], scores and returns of the
-    last rollouts. count: [M] int32, how many rollouts it has seen.
-    """
-
-    params: PyTree
-    score: Array
-    total: Array
-    rollouts: Array
-    recent: Array
-    count: Array
 
 
 class FinetuneProgress(NamedTuple):
     """What a fine-tuning run needs to go on.
 
     agent: [M, ...]. rollouts: int32 [], real ones behind it. offline: int32 [], updates before the first of them, on
-    simulated transitions, then on logs.
+    simulated transitions, then on logs. transitions: [M] int32, the real ones in the rollouts.
     """
 
     agent: PyTree
     best: Best
     rollouts: Array
     offline: Array
+    transitions: Array
 
 
 class Logged(NamedTuple):
@@ -98,7 +86,7 @@ class SimulatedRows(NamedTuple):
 class Beside(Protocol):
     """A learner that works while the robot plays, such as a `LearnerProcess`."""
 
-    def submit(self, agent: PyTree, parts: Sequence[int], updates: int, phase: Phase) -> None:
+    def submit(self, agent: PyTree, parts: Sequence[int], updates: int | Array, phase: Phase) -> None:
         """Begins the learning phases `parts`, see `Updates`."""
         ...
 
@@ -135,7 +123,11 @@ def finetune(
     make `logged.updates` updates, as they learn from real rollouts, before they play.
     learner: a process that learns while the system is reset, for systems that are stepped (`Gymnasium.play`); None:
     this process learns between rollouts. waits: True holds the first step of a rollout until learning has finished, so
-    results are those without a `learner`. False plays with the old policy until the new one has been learned.
+    results are those without a `learner`. False plays with the old policy until the new one has been learned; such a
+    rollout is evidence for the one that made more of its steps.
+
+    A rollout of full length is followed by `finetuner.updates_per_rollout` updates, a shorter one by its share, one at
+    least, and one without a valid step by none.
 
     Yields the fresh state with no metrics (unless `progress` is given), then once per part of the offline phase, then
     once per real rollout, all initial ones together; with a `learner` after the next rollout has been played. Metrics
@@ -158,6 +150,8 @@ def finetune(
             progress, metrics = step.offline(progress, done, min(OFFLINE_PART, updates - done), learner, logged=True)
             yield progress, metrics
     if learner is not None:
+        if not waits and isinstance(progress.agent, Guarded):
+            raise UserError("waits=False: a guard judges rollouts by one policy; leave one of the two out")
         yield from step.beside(progress, learner, rollouts, waits=waits)
         return
     while (done := int(progress.rollouts)) < rollouts:
@@ -195,12 +189,8 @@ def begin(
 
     agent = split_vmap(one, (0, 0, 0, None))(priors_of_members(priors, seeds), seeds, which, simulated)
     m = seeds.shape[0]
-    low = jnp.full(m, -jnp.inf, jnp.float32)
-    best = Best(
-        jax.tree.map(jnp.copy, jax.vmap(finetuner.export)(agent)), low, jnp.copy(low), jnp.zeros(m, jnp.int32),
-        jnp.zeros((m, WINDOW, 2)), jnp.zeros(m, jnp.int32),
-    )  # fmt: skip
-    return FinetuneProgress(agent, best, jnp.int32(0), jnp.int32(0))
+    best = evidence.nothing_known(jax.tree.map(jnp.copy, jax.vmap(finetuner.export)(agent)), m)
+    return FinetuneProgress(agent, best, jnp.int32(0), jnp.int32(0), jnp.zeros(m, jnp.int32))
 
 
 class Updates:
@@ -214,27 +204,34 @@ class Updates:
         self._learn = jax.jit(self._update, static_argnums=(2, 4), donate_argnums=0)
 
     def __call__(
-        self, agent: PyTree, parts: Sequence[int], updates: int, phase: Phase = "online"
+        self, agent: PyTree, parts: Sequence[int], updates: int | Array, phase: Phase = "online"
     ) -> tuple[PyTree, Metrics]:
         """So many updates in each part, a number from which their random draws follow; returns the mean metrics.
 
-        phase: "offline", on simulated transitions alone; "logged", before the first rollout; "online", after one.
+        updates: or [parts, M], of each part and member, up to `updates_per_rollout`. phase: "offline", on simulated
+        transitions alone; "logged", before the first rollout; "online", after one.
         """
         purpose, learned = _LEARN if phase == "online" else _OFFLINE, []
-        for part in parts:  # equal parts, so that one compiled program serves any number
+        most, limits = (updates, None) if isinstance(updates, int) else (self.finetuner.updates_per_rollout, updates)
+        for i, part in enumerate(parts):  # equal parts, so that one compiled program serves any number
             keys = jax.vmap(lambda seed, part=part: _key(seed, purpose, part))(self.seeds)
-            agent, metrics = self._learn(agent, keys, updates, self.simulated, phase == "offline")
+            limit = None if limits is None else limits[i]
+            agent, metrics = self._learn(agent, keys, most, self.simulated, phase == "offline", limit)
             learned.append(metrics)
-        return agent, jax.tree.map(_mean, *learned)
+        return agent, jax.tree.map(_mean, *learned) if limits is None else _mean_of_parts(learned)
 
     def _update(
-        self, states: PyTree, keys: Key, updates: int, simulated: SimulatedRows | None, offline: bool
-    ) -> tuple[PyTree, Metrics]:
-        def one(state: PyTree, key: Key, which: Array, rows: SimulatedRows | None) -> tuple[PyTree, Metrics]:
+        self, states: PyTree, keys: Key, updates: int, simulated: SimulatedRows | None, offline: bool,
+        limits: Array | None = None,
+    ) -> tuple[PyTree, Metrics]:  # fmt: skip
+        def one(state: PyTree, key: Key, which: Array, rows: SimulatedRows | None, limit: Array | None) -> Any:
             data = None if rows is None else rows.of(which)
-            return self.finetuner.learn(state, key, updates, data, offline=offline)
+            # Where no episode ends early the number is static: the program, and its bits, of a fixed length.
+            some = {} if limit is None else {"limit": limit}
+            return self.finetuner.learn(state, key, updates, data, offline=offline, **some)
 
-        return split_vmap(one, (0, 0, 0, None))(states, keys, self.which, simulated)
+        axes = (0, 0, 0, None, None if limits is None else 0)
+        return split_vmap(one, axes)(states, keys, self.which, simulated, limits)
 
 
 class _Steps:
@@ -250,7 +247,8 @@ class _Steps:
         self._learn = Updates(finetuner, seeds, prior_of(priors, seeds), simulated)
         self._store = jax.jit(split_vmap(self._observe), donate_argnums=0)
         self._keep_log = jax.jit(split_vmap(self._observe_log, (0, None, None)), donate_argnums=0)
-        self._keep = jax.jit(functools.partial(_keep_best, finetuner), donate_argnums=0)
+        self._witness = jax.jit(evidence.witnessed)
+        self._judge = jax.jit(functools.partial(evidence.judged, finetuner))
 
     def begin(self) -> FinetuneProgress:
         """The fresh state."""
@@ -278,28 +276,34 @@ class _Steps:
     def rollouts(self, progress: FinetuneProgress, done: int, n: int) -> tuple[FinetuneProgress, Metrics]:
         """N real rollouts, one after another as on a robot, then the updates that they allow."""
         played = self._play(progress.agent, done, n)
-        agent, best = self._take(progress.agent, progress.best, played, done)
-        agent, metrics = self._learn(agent, range(done, done + n), self.finetuner.updates_per_rollout)
-        return FinetuneProgress(agent, best, progress.rollouts + n, progress.offline), _real(played) | metrics
+        agent, best = self._take(progress.agent, progress.best, played, done, (progress.agent, done))
+        agent, metrics = self._learn(agent, range(done, done + n), self._updates(played))
+        progress = FinetuneProgress(
+            agent, best, progress.rollouts + n, progress.offline, progress.transitions + _transitions(played).sum(0)
+        )
+        return progress, _real(best, played) | metrics
 
     def beside(
         self, progress: FinetuneProgress, learner: Beside, rollouts: int, *, waits: bool
     ) -> Iterator[tuple[FinetuneProgress, Metrics]]:
         """The same with a learner that works on one rollout while the next one is played."""
-        agent, best, done, offline = progress.agent, progress.best, int(progress.rollouts), progress.offline
-        latest: Callable[[], PyTree] = lambda: agent  # noqa: E731 - before anything has been submitted
+        agent, best, done, offline, transitions = (
+            progress.agent, progress.best, int(progress.rollouts), progress.offline, progress.transitions,
+        )  # fmt: skip
+        acting = _Acting(agent, done, None, waits=waits)  # before anything has been submitted
         before: list[Episode] = []
         while before or done < rollouts:
             n = 1 if done else self.finetuner.initial_rollouts
-            played = self._play(latest, done, n) if done < rollouts else []
+            played = self._play(acting, done, n) if done < rollouts else []
             if before:
                 agent, metrics = learner.result()
-                yield FinetuneProgress(agent, best, jnp.int32(done), offline), _real(before) | metrics
+                real = _real(best, before)
+                yield FinetuneProgress(agent, best, jnp.int32(done), offline, transitions), real | metrics
             if played:
-                agent, best = self._take(agent, best, played, done)
-                learner.submit(agent, range(done, done + n), self.finetuner.updates_per_rollout, "online")
-                latest = functools.partial(_latest, learner, None if waits else agent)
-                done += n
+                agent, best = self._take(agent, best, played, done, acting.player(agent, done))
+                learner.submit(agent, range(done, done + n), self._updates(played), "online")
+                acting = _Acting(agent, done, learner, waits=waits)
+                done, transitions = done + n, transitions + _transitions(played).sum(0)
             before = played
 
     def _play(self, agent: PyTree, done: int, n: int) -> list[Episode]:
@@ -311,13 +315,30 @@ class _Steps:
         keys = [_episode_keys(self.seeds, _COLLECT, rollout, 1) for rollout in range(done, done + n)]
         return [self.system.play(who, states, key, explore=True) for key in keys]
 
-    def _take(self, agent: PyTree, best: Best, played: Sequence[Episode], done: int) -> tuple[PyTree, Best]:
-        """The agent with these rollouts, and what they say of it if it has played them."""
-        if done or self.finetuner.initial_policy is None:
-            for episodes in played:
-                best = self._keep(best, agent, episodes.score[:, 0], episodes.total_reward[:, 0], jnp.int32(done))
+    def _updates(self, played: Sequence[Episode]) -> int | Array:
+        """Gradient updates [n, M] after each of these rollouts; one number where all of them have their full length."""
+        full, length = self.finetuner.updates_per_rollout, played[0].valid.shape[-1]
+        made = np.asarray(_transitions(played))
+        if (made == length).all():
+            return full
+        return jnp.asarray(np.where(made, np.maximum(np.rint(full * made / length), 1), 0), jnp.int32)
+
+    def _take(
+        self, agent: PyTree, best: Best, played: Sequence[Episode], done: int, player: tuple[PyTree, int]
+    ) -> tuple[PyTree, Best]:
+        """The agent with these rollouts, and what they say of the one who played them.
+
+        player: that agent, or None, and the rollouts it had learned from.
+        """
         for episodes in played:
-            agent = self._store(agent, episodes.transitions, episodes.valid, episodes.score)
+            score, total, exploded = (x[:, 0] for x in (episodes.score, episodes.total_reward, episodes.exploded))
+            if done or self.finetuner.initial_policy is None:
+                best = self._judge(best, player[0], score, total, exploded, jnp.int32(player[1]))
+            else:
+                best = self._witness(best, score, total)
+        for episodes in played:
+            score = jnp.where(episodes.exploded, -jnp.inf, episodes.score)
+            agent = self._store(agent, episodes.transitions, episodes.valid, score)
         return agent, best
 
     def _observe(self, state: PyTree, transitions: Transition, valid: Array, score: Array) -> PyTree:
@@ -329,36 +350,57 @@ class _Steps:
         return self.finetuner.observe(state, transitions, valid, None)
 
 
-def _latest(learner: Beside, meanwhile: PyTree | None) -> PyTree:
-    """The agent that acts now: what has been learned, or `meanwhile`, if there is that, until it is ready."""
-    return learner.result()[0] if meanwhile is None or learner.ready() else meanwhile
+class _Acting:
+    """The agent that acts now, asked at every step: what has been learned or, if not `waits`, what there is until then.
+
+    before: the agent that has learned from `rollouts` rollouts. learner: None where nobody learns meanwhile.
+    """
+
+    def __init__(self, before: PyTree, rollouts: int, learner: Beside | None, *, waits: bool) -> None:
+        self.before, self.rollouts, self.learner, self.waits = before, rollouts, learner, waits
+        self.steps = {False: 0, True: 0}  # with the agent before and with what has been learned
+
+    def __call__(self) -> PyTree:
+        learner = self.learner if self.learner and (self.waits or self.learner.ready()) else None
+        self.steps[learner is not None] += 1
+        return learner.result()[0] if learner else self.before
+
+    def player(self, learned: PyTree, done: int) -> tuple[PyTree, int]:
+        """The agent that made more of the steps, and the rollouts it had learned from.
+
+        learned: the agent after `done` rollouts. None and no matter where that is not known: a rollout that a resumed
+        run reads from disk asks nobody.
+        """
+        if self.waits or self.steps[True] > self.steps[False]:
+            return learned, done
+        return (self.before, self.rollouts) if self.steps[False] else (None, done)
 
 
-def _real(played: Sequence[Episode]) -> Metrics:
-    """[M] how rollouts [M, 1] went, on average."""
+def _real(best: Best, played: Sequence[Episode]) -> Metrics:
+    """[M] how rollouts [M, 1] went, on average; one that exploded as `best` knows it."""
+    facts = [(x.score[:, 0], x.total_reward[:, 0], x.exploded[:, 0]) for x in played]
+    counted = [evidence.as_known(best, *own) for own in facts]
     return {
-        "real/return": _mean(*[x.total_reward[:, 0] for x in played]),
-        "real/score": _mean(*[x.score[:, 0] for x in played]),
-        "real/exploded": _mean(*[x.exploded[:, 0].astype(jnp.float32) for x in played]),
+        "real/return": _mean(*[total for _, total in counted]),
+        "real/score": _mean(*[score for score, _ in counted]),
+        "real/exploded": _mean(*[exploded.astype(jnp.float32) for *_, exploded in facts]),
     }
+
+
+def _transitions(played: Sequence[Episode]) -> Array:
+    """[n, M] valid steps of rollouts [M, 1]."""
+    return jnp.stack([x.valid[:, 0].sum(-1) for x in played]).astype(jnp.int32)
 
 
 def _mean(*x: Array) -> Array:
     return jnp.mean(jnp.stack(x), axis=0)
 
 
-def _keep_best(finetuner: Finetuner, best: Best, agent: PyTree, score: Array, total: Array, learned: Array) -> Best:
-    """`best` after one more rollout by `agent` [M], with its score and return [M]; learned: from so many rollouts."""
-    recent = jnp.concatenate([best.recent[:, 1:], jnp.stack([score, total], axis=1)[:, None]], axis=1)
-    mean_score, mean_total = jnp.mean(recent, axis=1).T
-    better = (mean_score > best.score) | ((mean_score == best.score) & (mean_total > best.total))
-    better &= best.count + 1 >= WINDOW
-    keep = lambda new, old: jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)  # noqa: E731
-    params = jax.tree.map(keep, jax.vmap(finetuner.export)(agent), best.params)
-    return Best(
-        params, keep(mean_score, best.score), keep(mean_total, best.total),
-        keep(jnp.broadcast_to(learned, better.shape), best.rollouts), recent, best.count + 1,
-    )  # fmt: skip
+def _mean_of_parts(parts: Sequence[Metrics]) -> Metrics:
+    """The mean [M] over the parts in which a member has made updates, nan without any; of `updates` over all."""
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *parts)
+    means = {name: jnp.mean(x, axis=0, where=stacked["updates"] > 0) for name, x in stacked.items()}
+    return means | {"updates": stacked["updates"].mean(0)}
 
 
 def priors_of_members(priors: PyTree, seeds: Array) -> PyTree:

@@ -124,7 +124,7 @@ class Normalizer(NamedTuple):
 class Imagination(NamedTuple):
     """What transforms may ask about the world: closures over the current fine-tuning state, for ONE example.
 
-    value(obs) -> []: the frozen, deterministic V_sim.
+    value(obs) -> []: the frozen, deterministic V_sim; of SAC's priors with the entropy bonus of later steps.
     policy(obs, context, key) -> [act_dim]: a sample of the current policy. context: None or [context_dim].
     dynamics(obs, action, key) -> [obs_dim]: one predicted successor.
     reward(obs, action, next_obs) -> []: the task's reward. terminated(obs, action, next_obs) -> [] bool.
@@ -262,12 +262,15 @@ class Finetuner(NamedTuple):
     init_carry() -> carry of an episode.
     act(state, carry, obs [obs_dim], key, *, explore) -> (action [act_dim], carry); `explore` may be traced.
     observe(state, transitions [T, ...], valid [T], score []) -> state: keeps the rows of one episode, in order. score:
-        of the episode; None if another policy has played it, as in a log, so that a guard does not count it.
-    learn(state, key, updates, simulated, *, offline) -> (state, metrics averaged over the updates); `updates` and
-        `offline` are static. offline: learn from the simulated transitions alone.
+        of the episode, -inf if its physics exploded; None if another policy has played it, as in a log, so that a guard
+        does not count it.
+    learn(state, key, updates, simulated, *, offline, limit=None) -> (state, metrics averaged over the updates);
+        `updates` and `offline` are static. offline: learn from the simulated transitions alone. limit: [] int32, no
+        more updates than that, for rollouts that ended early. The metric `updates` counts them; there is none, and the
+        other metrics are nan, while an agent that learns from real rows holds none.
     export(state) -> params of the agent as it acts now.
     policy: how exported params act.
-    updates_per_rollout: gradient updates that follow a real rollout.
+    updates_per_rollout: gradient updates that follow a real rollout of full length.
     initial_rollouts: real rollouts before the first update.
     initial_policy: what makes them, from the prior's params; None = the agent itself.
     simulation: the simulated data that the method needs, or None.

@@ -114,7 +114,7 @@ def main() -> None:
     """Plays until the learner ends the run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--url", required=True, help="where the learner listens, ws://HOST:PORT")
-    parser.add_argument("--token", required=True, help="what the learner has printed")
+    parser.add_argument("--token", required=True, help="what the file that the learner names holds")
     parser.add_argument("--film", type=int, nargs="*", default=(), help="numbers of the episodes to take pictures of")
     parser.add_argument("--into", type=Path, default=Path(), help="folder for the pictures")
     given = parser.parse_args()

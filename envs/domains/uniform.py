@@ -50,7 +50,7 @@ def parameter_ranges(env: Env, chosen: Mapping[str, Value]) -> np.ndarray:
     Raises UserError, which names parameter, value and bound.
     """
     ranges = {p.name: (p.low, p.high) for p in env.parameters}
-    bounds = {p.name: (p.minimum, p.maximum) for p in env.parameters}
+    bounds = {p.name: p.bounds for p in env.parameters}
     for name, value in chosen.items():
         if name not in ranges:
             raise misnamed(env, name)

@@ -120,6 +120,7 @@ def real_scene(
         variant=variant,
         build=build,
         initial=initial,
+        settled=None,  # four numbers do not tell how a soft body lies
         target=functools.partial(push.target, height=height),
         observe=lambda params, state: push.seen(state.qpos, place(state.qpos)),
         event=event,

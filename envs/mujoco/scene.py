@@ -1,7 +1,7 @@
 """From the parts in which tasks in MuJoCo differ, a `Scene`, to an Env."""
 
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -11,8 +11,11 @@ import numpy as np
 
 from envs import effects as env_effects
 from envs.base import NOTHING, Effects, Entry, Env, EnvState, Parameter, Theta, Value, World, never, pack
+from envs.checks import check_description, check_effects
 from envs.mujoco import worlds as physics
+from envs.mujoco.checks import check_scene
 from envs.mujoco.engines import Engine
+from envs.mujoco.fields import with_shortcuts
 from envs.mujoco.worlds import PhysicsState
 from sgft_jax.types import Array, Key, UserError
 
@@ -101,15 +104,20 @@ class Scene(NamedTuple):
 def make_env(scene: Scene, impl: str = "auto") -> Env:
     """Assembles the Env of a scene. impl: the physics engine, see `worlds.choose_impl`.
 
-    Raises UserError for a scene that these engines cannot step.
+    Raises UserError for a scene that is none (see `envs.checks`), or that this engine cannot step.
     """
+    check_description(scene)
     nominal = {p.name: p.nominal for p in scene.parameters}
     host = scene.build(nominal).compile()
     physics.check_supported(scene.name, host)
-    fields = physics.varying_fields(host, _perturbed(scene, nominal))
+    check_scene(scene, host)
     impl = physics.choose_impl(impl)
+    try:
+        fields = _varying(scene, host, nominal)
+        engine = scene.engine if impl == "jax" and scene.engine else physics.make_engine(host, fields, impl)
+    except UserError as error:
+        raise UserError(f"scene {scene.name}: {error}") from None
     settled = scene.settled
-    engine = scene.engine if impl == "jax" and scene.engine else physics.make_engine(host, fields, impl)
     seen = lambda params, state: pack(scene.observation, scene.observe(params, state))  # noqa: E731
 
     def make_worlds(theta: Theta) -> World:
@@ -172,7 +180,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
             effects=own,
         )
 
-    return Env(
+    env = Env(
         **{name: getattr(scene, name) for name in Env._fields if name in Scene._fields},
         make_worlds=make_worlds,
         reset=reset,
@@ -182,6 +190,8 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
         impl=impl,
         scene=scene.variant,
     )
+    check_effects(env)
+    return env
 
 
 def _outcome(
@@ -193,18 +203,26 @@ def _outcome(
 
     def found(name: str, given: tuple[Array, ...], default: Any) -> Array:
         function, value = getattr(scene, name), getattr(measured, name)
-        if function is None:
-            return jnp.asarray(default if value is None else value)
-        if value is not None and name == "reward":
-            return value  # its function is an approximation, for transitions that nobody measures
         if value is not None:
-            raise UserError(f"scene {scene.name} measures '{name}': then its function of observations must be None")
-        return function(*given)
+            return jnp.asarray(
+                value
+            )  # the function of a reward is an approximation, for transitions that nobody measures
+        return jnp.asarray(default) if function is None else function(*given)
 
     return found("reward", step, 0.0), found("terminated", step, False), found("success", (true_obs,), False)
 
 
-def _perturbed(scene: Scene, nominal: dict[str, float]) -> Iterator[mujoco.MjSpec]:
-    """Scenes with one domain parameter off its nominal value each, by little enough to stay buildable."""
-    for name, value in nominal.items():
-        yield scene.build({**nominal, name: value * 1.01 if value else 0.01})
+def _varying(scene: Scene, host: mujoco.MjModel, nominal: dict[str, float]) -> tuple[str, ...]:
+    """Fields in which scenes differ with one domain parameter off its nominal value each, by little enough to stay
+    buildable. A parameter that then changes nothing is asked at the ends of its range, too.
+    """
+    found: dict[str, None] = {}
+    for p in scene.parameters:
+        value = p.nominal * 1.01 if p.nominal else 0.01
+        near = value if p.minimum <= value <= p.maximum else 2 * p.nominal - value
+        for values in ([near], [x for x in (p.low, p.high) if x != p.nominal]):
+            fields = physics.varying_fields(host, (scene.build({**nominal, p.name: x}) for x in values))
+            found |= dict.fromkeys(fields)
+            if fields:
+                break
+    return with_shortcuts(host, tuple(found))

@@ -7,7 +7,7 @@ and all constants derived from them), because no derived field is ever recompute
 
 import importlib
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from operator import attrgetter
 from typing import Literal, NamedTuple, get_args
 
@@ -16,16 +16,21 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.mujoco.engines import NESTED, Engine
+from envs.mujoco.engines import Engine
+from envs.mujoco.fields import CARRIED, carried, comparison
 from sgft_jax.types import Array, UserError, unknown
 
-# Fields that only matter to a renderer: they may differ between worlds without being simulated.
-_COSMETIC = ("geom_rgba", "mat_", "light_", "cam_")
 Impl = Literal["auto", "jax", "warp", "c"]  # see `choose_impl`
 IMPL_VARIABLE = "SGFT_IMPL"
-_STRUCTURE = (
-    "body_parentid", "jnt_type", "geom_type", "geom_bodyid", "actuator_trnid", "pair_geom1", "pair_geom2", "pair_dim",
-)  # fmt: skip
+# MuJoCo's kinds of state that a step continues with a `PhysicsState`, or that no step of ours ever changes.
+_KEPT = ("TIME", "QPOS", "QVEL", "WARMSTART", "CTRL", "QFRC_APPLIED", "XFRC_APPLIED", "EQ_ACTIVE")
+_STATES = {
+    "ACT": "actuators with a state of their own (dyntype)",
+    "HISTORY": "delays of actuators or sensors (nsample)",
+    "MOCAP_POS": "mocap bodies",
+    "USERDATA": "user data (nuserdata)",
+    "PLUGIN": "plugins with a state",
+}
 
 
 class PhysicsState(NamedTuple):
@@ -51,10 +56,18 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...], impl: str) -> Eng
 
 
 def check_supported(name: str, host: mujoco.MjModel) -> None:
-    """Raises UserError for a scene whose state is more than a `PhysicsState`."""
-    for count, what in ((host.na, "actuators with a state of their own (dyntype)"), (host.nmocap, "mocap bodies")):
-        if count:
-            raise UserError(f"scene {name} has {what}, which no engine here carries from step to step")
+    """Raises UserError for a scene whose state is more than a `PhysicsState`, by MuJoCo's own list of states."""
+    states = mujoco.mjtState.__members__.items()
+    kinds = {k.removeprefix("mjSTATE_"): v for k, v in states if k.startswith("mjSTATE_") and int(v).bit_count() == 1}
+    more = [kind for kind, bit in kinds.items() if kind not in _KEPT and mujoco.mj_stateSize(host, int(bit))]
+    more = [_STATES.get(kind, f"a state {kind}") for kind in more]
+    if host.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        more.append("bodies that sleep (flag sleep)")
+    # Time begins anew in every control step.
+    if (host.sensor_interval[:, 0] > 0).any() or int(mujoco.mjtSensor.mjSENS_CLOCK) in host.sensor_type:
+        more.append("sensors that read the time (clock, interval)")
+    if more:
+        raise UserError(f"scene {name} has {more[0]}, which no engine here carries from step to step")
 
 
 def choose_impl(wanted: str = "auto") -> str:
@@ -84,15 +97,12 @@ def varying_fields(nominal: mujoco.MjModel, specs: Iterable[mujoco.MjSpec]) -> t
     """Names of the simulated fields in which any of the specs differs from the nominal scene.
 
     Found once per task from perturbed specs, so that all worlds of a task are pytrees of one structure: programs
-    compiled for one gap serve every other, and gaps can be vmapped over.
+    compiled for one gap serve every other, and gaps can be vmapped over. Raises UserError as `compile_worlds` does.
     """
-    from envs.mujoco.engines import mjx
-
-    model, _ = mjx.put(nominal)
-    names = [k for k, v in vars(model).items() if isinstance(v, jax.Array) and not k.startswith(_COSMETIC)]
+    names = carried(nominal)
     reference = _read(nominal, names)
-    others = [_read(spec.compile(), names) for spec in specs]
-    return tuple(k for k in reference if any(not np.array_equal(reference[k], fields[k]) for fields in others))
+    others = list(_compiled(nominal, specs, names))
+    return tuple(k for k in names if any(not np.array_equal(reference[k], fields[k]) for fields in others))
 
 
 def compile_worlds(
@@ -100,17 +110,10 @@ def compile_worlds(
 ) -> dict[str, np.ndarray]:
     """Compiles one model per spec and stacks the fields `names` (see `varying_fields`): name -> [n, ...].
 
-    Raises UserError when MuJoCo refuses a spec, or when one changes the structure of the scene (number or types of
-    elements), which a compiled program cannot follow.
+    Raises UserError when MuJoCo refuses a spec, or when one differs from the nominal scene in anything else that a step
+    reads: in its structure, which a compiled program cannot follow, or in what was the same in `varying_fields`.
     """
-    models = []
-    for spec in specs:
-        try:
-            host = spec.compile()
-        except ValueError as error:
-            raise UserError(f"MuJoCo cannot build these domain parameters: {str(error).splitlines()[0]}") from None
-        _check_structure(nominal, host)
-        models.append(_read(host, names))
+    models = list(_compiled(nominal, specs, names))
     return {k: np.stack([fields[k] for fields in models]) for k in names}
 
 
@@ -120,18 +123,53 @@ def exploded(state: PhysicsState, *, max_speed: float) -> Array:
     return ~(jnp.isfinite(state.qpos).all() & (speed < max_speed))  # NaN speeds compare false
 
 
+def _compiled(
+    nominal: mujoco.MjModel, specs: Iterable[mujoco.MjSpec], names: tuple[str, ...]
+) -> Iterator[dict[str, np.ndarray]]:
+    """The fields `names` of each spec's model; see `compile_worlds`."""
+    differing = comparison(nominal, names)
+    for spec in specs:
+        try:
+            host = spec.compile()
+        except ValueError as error:
+            raise UserError(f"MuJoCo cannot build these domain parameters: {str(error).splitlines()[0]}") from None
+        if odd := differing(host):
+            raise _uncarried(odd)
+        _check_kinds(nominal, host)
+        yield _read(host, names)
+
+
+def _uncarried(names: Sequence[str]) -> UserError:
+    """What to tell someone whose domain parameters change what worlds do not carry."""
+    fixed = [name for name in names if name not in CARRIED]
+    changed = f"domain parameters change {', '.join(map(repr, (fixed or names)[:3]))} of the scene"
+    if fixed:
+        return UserError(f"{changed}; they may change values that worlds carry, not its structure (docs/extending.md)")
+    return UserError(f"{changed}, but not near their nominal values: choose nominal values at which they do")
+
+
 def _read(host: mujoco.MjModel, names: Sequence[str]) -> dict[str, np.ndarray]:
-    """Fields of a compiled model in the precision MJX keeps them in, the nested ones always among them."""
-    fields = {name: np.array(attrgetter(name)(host)) for name in dict.fromkeys([*names, *NESTED])}
+    """Fields of a compiled model in the precision MJX keeps them in."""
+    fields = {name: np.array(attrgetter(name)(host)) for name in names}
     return {k: v.astype(np.float32) if v.dtype == np.float64 else v for k, v in fields.items()}
 
 
-def _check_structure(nominal: mujoco.MjModel, host: mujoco.MjModel) -> None:
-    for name in _STRUCTURE:
-        if not np.array_equal(getattr(nominal, name), getattr(host, name)):
-            raise UserError(
-                f"domain parameters change '{name}' of the scene; they may change values, not its structure"
-            )
-    for name in ("dof_frictionloss", "tendon_frictionloss"):  # MJX allocates constraint rows for non-zero ones only
+def _check_kinds(nominal: mujoco.MjModel, host: mujoco.MjModel) -> None:
+    """What MJX decides by values of the nominal model must be decided alike by those of every other."""
+    for name in ("dof_frictionloss", "tendon_frictionloss"):  # it allocates constraint rows for non-zero ones only
         if not np.array_equal(getattr(nominal, name) > 0, getattr(host, name) > 0):
             raise UserError(f"'{name}' must be positive for the same elements in the nominal and in every other model")
+    if not np.array_equal(_wraps_inside(nominal), _wraps_inside(host)):
+        raise UserError(
+            "the side of a geom on which a tendon wraps must be the same in the nominal and in every other model"
+        )
+
+
+def _wraps_inside(host: mujoco.MjModel) -> np.ndarray:
+    """[n] bool, of the geoms that tendons wrap around: whether they do so inside."""
+    round_geoms = np.isin(host.wrap_type, (mujoco.mjtWrap.mjWRAP_SPHERE, mujoco.mjtWrap.mjWRAP_CYLINDER))
+    geoms, sites = host.wrap_objid[round_geoms], host.wrap_prm[round_geoms].round().astype(int)
+    if not geoms.size or not host.nsite:
+        return np.zeros(0, bool)
+    distance = np.linalg.norm(host.site_pos[sites] - host.geom_pos[geoms], axis=1)
+    return (sites >= 0) & (distance < host.geom_size[geoms, 0])

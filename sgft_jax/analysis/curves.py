@@ -4,24 +4,23 @@ A curve holds any score (success, return) of several members, one for each seed.
 a flat table `rows`.
 """
 
-import csv
-import functools
-import io
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from msgspec import Meta
 
-from envs.files import read_text
+from envs.files import Count
 from sgft_jax import extend
 from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean, paired_improvement
-from sgft_jax.io.log import EVAL, METRICS, SUMMARY, read_jsonl
-from sgft_jax.io.runs import CONFIG, PROVENANCE, Options, read_own
+from sgft_jax.io.csvfile import finite, read_csv, whole
+from sgft_jax.io.log import EVAL, METRICS, SUMMARY, check_records, read_jsonl
+from sgft_jax.io.runs import read_config, read_own, read_starts
 from sgft_jax.methods import NAMES, get_method
 from sgft_jax.types import UserError
 
@@ -30,6 +29,8 @@ SCORES = ("success", "return")
 IDENTITY = ("task", "gap", "method", "variant", "priors")
 _NUMBERS = ("prior", "seed", "rollouts", "transitions", "minutes")
 COLUMNS = (*IDENTITY, *_NUMBERS, *SCORES, "training")
+# Of a line of eval.jsonl, beside its scores.
+_EVALUATION = {"step": Count, "rollouts": Count, "robot_minutes": Annotated[float, Meta(ge=0)]}
 _UNNAMED = re.compile(r"prior|seeds?-\d+(-\d+)?")  # folders that name no set of priors
 # Of a run's options those that are in other columns, or say nothing about its outcome; paths of a machine above all.
 _LEFT_OUT = (
@@ -263,12 +264,14 @@ def read_curve(folder: Path) -> Curve:
     records = read_jsonl(folder / EVAL) if (folder / EVAL).exists() else []
     if not records:
         raise UserError(f"{folder / EVAL}: holds no evaluation yet")
-    stored, summary = read_own(folder / CONFIG, {"config": Options}), read_own(folder / SUMMARY)
-    config, start = stored.get("config", {}), last_start(folder)
-    column = functools.partial(_column, folder / EVAL, records)
-    scores = {name: column(name).T for name in SCORES if name in records[0]}
-    if not scores:
-        raise UserError(f"{folder / EVAL}: has no {' or '.join(SCORES)}; put back the file that the run has written")
+    names = [name for name in SCORES if name in records[0]] or [SCORES[0]]
+    check_records(folder / EVAL, records, _EVALUATION | dict.fromkeys(names, list[float]))
+    summary = read_own(folder / SUMMARY)
+    if (score := summary.get("score") or _judged_by(records, names)) not in names:
+        raise UserError(f"{folder / SUMMARY}: score is {score!r}, {EVAL} has {', '.join(names)}; put the files back")
+    config, start = read_config(folder), last_start(folder)
+    column = lambda name: np.array([record[name] for record in records])  # noqa: E731
+    scores = {name: column(name).T for name in names}
     variant = config.get("variant") or ""
     digests, seeds = start.get("priors", []), config.get("seed", 0) + np.arange(len(next(iter(scores.values()))))
     return Curve(
@@ -283,18 +286,10 @@ def read_curve(folder: Path) -> Curve:
         transitions=column("step"),
         minutes=column("robot_minutes"),
         scores=scores,
-        score=summary.get("score") or _judged_by(records, list(scores)),
+        score=score,
         facts=_facts(summary, config, start),
         training=_training(folder / METRICS, column("rollouts")),
     )
-
-
-def _column(path: Path, records: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
-    """The numbers of that name in all lines of a log."""
-    try:
-        return np.array([record[name] for record in records]) + 0
-    except (KeyError, TypeError, ValueError):
-        raise UserError(f"{path}: not every line has numbers of {name!r}; put back the file of the run") from None
 
 
 def _judged_by(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
@@ -308,6 +303,7 @@ def _training(path: Path, rollouts: np.ndarray) -> np.ndarray | None:
     records = [record for record in (read_jsonl(path) if path.exists() else []) if "real/score" in record]
     if not records:
         return None
+    check_records(path, records, {"rollouts": Count, "real/score": list[float]})
     ends = np.array([record["rollouts"] for record in records])  # a record is the mean of all rollouts since the last
     counts, scores = np.diff(ends, prepend=0), np.array([record["real/score"] for record in records]).T
     means = np.full((len(scores), len(rollouts)), np.nan)
@@ -318,24 +314,28 @@ def _training(path: Path, rollouts: np.ndarray) -> np.ndarray | None:
 
 
 def make_curve(
-    evaluations: Mapping[int, Any], task: Any, *, gap: str, method: str, seeds: Sequence[int], variant: str = ""
-) -> Curve:
+    evaluations: Mapping[int, Any], task: Any, *, gap: str, method: str, seeds: Sequence[int], variant: str = "",
+    transitions: Sequence[float] | None = None,
+) -> Curve:  # fmt: skip
     """A curve from Python alone, without a run folder.
 
     evaluations: the real rollouts made so far -> what `sgft_jax.evaluate` played then, episodes [members, n]. task: the
-    `Env`. gap, method, variant: names for tables and figures. seeds: [members].
+    `Env`. gap, method, variant: names for tables and figures. seeds: [members]. transitions: [evaluations] real ones
+    made so far, such as the mean of `FinetuneProgress.transitions`; None where no rollout ended early.
     """
+    from envs.rollout import counted  # brings JAX, which reading curves does without
+
     played, rollouts = list(evaluations.values()), np.array(list(evaluations))
-    mean_of = lambda name: np.stack([np.asarray(getattr(x, name)).mean(1) for x in played], axis=1)  # noqa: E731
-    transitions = rollouts * task.episode_length
+    mean_of = lambda each: np.stack([np.asarray(each(x)).mean(1) for x in played], axis=1)  # noqa: E731
+    made = rollouts * task.episode_length if transitions is None else np.rint(transitions).astype(int)
     return Curve(
         task.name, gap, method, variant, priors="",
         seeds=np.asarray(seeds),
         prior=np.full(len(seeds), -1),
         rollouts=rollouts,
-        transitions=transitions,
-        minutes=transitions * task.control_dt / 60,
-        scores={"success": mean_of("success"), "return": mean_of("total_reward")},
+        transitions=made,
+        minutes=made * task.control_dt / 60,
+        scores={"success": mean_of(lambda x: x.success), "return": mean_of(lambda x: counted(x)[1])},
         score=task.score,
     )  # fmt: skip
 
@@ -398,7 +398,7 @@ def set_name(folder: Path, digests: Sequence[str]) -> str:
 
 def last_start(folder: Path) -> dict[str, Any]:
     """What the provenance of a run says of its last start; nothing where there is none."""
-    starts = read_own(folder / PROVENANCE).get("starts", [])
+    starts = read_starts(folder)
     return starts[-1] if starts else {}
 
 
@@ -459,7 +459,7 @@ def from_rows(table: Iterable[Mapping[str, Any]]) -> list[Curve]:
     """The curves of a flat table; inverse of `rows`. Raises UserError where members differ in their evaluations."""
     runs: dict[tuple[str, ...], dict[int, list[Mapping[str, Any]]]] = defaultdict(lambda: defaultdict(list))
     for row in table:
-        runs[tuple(row[name] for name in IDENTITY)][int(row["seed"])].append(row)
+        runs[tuple(row[name] for name in IDENTITY)][whole("seed", row["seed"])].append(row)
     return [_curve(identity, members) for identity, members in runs.items()]
 
 
@@ -472,28 +472,39 @@ def _curve(identity: tuple[str, ...], members: Mapping[int, list[Mapping[str, An
         if value:  # figures are called like these
             extend.folder_name(f"the {name}", value)
 
-    def column(name: str) -> np.ndarray:
-        values = np.array([[float(row[name]) for row in each] for each in members.values()])
-        if not np.isfinite(values).all():
-            raise ValueError(f"{'/'.join(identity)} has {name} that are not finite")
-        return values
+    def column(name: str, read: Callable[[str, Any], float] = finite) -> np.ndarray:
+        return np.array([[read(name, row[name]) for row in each] for each in members.values()])
 
     scores = {name: column(name) for name in SCORES if first[0].get(name) not in (None, "")}
     if not scores:
         raise ValueError(f"{'/'.join(identity)} has no {' or '.join(SCORES)}")
+    _check_ranges(scores.get("success"), minutes := column("minutes"))
     missing = lambda row: row.get("training") in (None, "")  # noqa: E731 - at the first evaluation, or everywhere
-    training = np.array([[np.nan if missing(r) else float(r["training"]) for r in each] for each in members.values()])
+    trained = lambda row: np.nan if missing(row) else finite("training", row["training"])  # noqa: E731
+    training = np.array([[trained(row) for row in each] for each in members.values()])
     return Curve(
         *identity,
         seeds=np.array(list(members)),
-        prior=np.array([int(each[0]["prior"]) for each in members.values()]),
-        rollouts=column("rollouts")[0].astype(int),
-        transitions=column("transitions")[0].astype(int),
-        minutes=column("minutes")[0],
+        prior=np.array([_prior(each[0]["prior"]) for each in members.values()]),
+        rollouts=column("rollouts", whole)[0],
+        transitions=column("transitions", whole)[0],
+        minutes=minutes[0],
         scores=scores,
         score=next(iter(scores)),
         training=training if np.isfinite(training).any() else None,
     )
+
+
+def _check_ranges(success: np.ndarray | None, minutes: np.ndarray) -> None:
+    if success is not None and ((success < 0) | (success > 1)).any():
+        raise ValueError(f"success is {success.min():g} to {success.max():g}, not a share")
+    if minutes.min() < 0:
+        raise ValueError(f"minutes is {minutes.min():g}, less than 0")
+
+
+def _prior(cell: Any) -> int:
+    """Index of a prior; -1: unknown."""
+    return whole("prior", float(cell) + 1) - 1
 
 
 def read_data(folder: Path) -> Found:
@@ -507,17 +518,3 @@ def read_data(folder: Path) -> Found:
         return Found(from_rows(table), [])
     except ValueError as error:  # of int and float
         raise UserError(f"{folder}/curves-*.csv: {error}; put the tables back as they were") from error
-
-
-def read_csv(path: Path, *, needed: Sequence[str] = ()) -> list[dict[str, str]]:
-    """The rows of a table; none if it does not exist; raises UserError where a row lacks one of the columns needed."""
-    if not path.exists():
-        return []
-    try:
-        rows = list(csv.DictReader(io.StringIO(read_text(path, limit=2**30), newline="")))
-    except csv.Error as error:
-        raise UserError(f"{path}: {error}; put the table back as it was") from None
-    for i, row in enumerate(rows):
-        if absent := [name for name in needed if row.get(name) is None]:
-            raise UserError(f"{path}: row {i + 1} has no {absent[0]}; put the table back as it was")
-    return rows

@@ -9,9 +9,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sgft_jax.analysis.curves import SCORES, read_csv
+from sgft_jax.analysis.curves import SCORES
 from sgft_jax.analysis.hybrid import Outcome, outcome
 from sgft_jax.analysis.release import merge
+from sgft_jax.io.csvfile import finite, read_csv, whole
 from sgft_jax.types import UserError
 
 TABLE = "hybrid.csv"
@@ -74,18 +75,21 @@ def _run(rows: list[Mapping[str, str]]) -> Run:
     if first is None:
         raise ValueError(f"a run of {rows[0]['method']} on {rows[0]['task']} has neither success nor return")
     columns = [name for name, text in first.items() if name.startswith(_SEED) and text]
-    seeds = [int(name.removeprefix(_SEED)) for name in columns]
+    seeds = [whole("a seed", name.removeprefix(_SEED)) for name in columns]
+    if not seeds:
+        raise ValueError(f"a run of {first['method']} on {first['task']} has no seed")
     lines: dict[int, dict[str, Any]] = {}
     for row in rows:
         name = "score" if row["score"] == first["score"] else row["score"]
-        line = lines.setdefault(int(row["step"]), {"step": int(row["step"])})
-        line[name] = [float(row[column]) for column in columns]
+        step = whole("step", row["step"])
+        line = lines.setdefault(step, {"step": step})
+        line[name] = [finite(column, row[column]) for column in columns]
     measures = [name for name in dict.fromkeys(row["score"] for row in rows) if name != first["score"]]
     for name in ("score", *measures):
         if any(name not in line for line in lines.values()):
             raise ValueError(f"a run of {first['method']} on {first['task']} lacks rows of {name}")
     own = outcome(first["method"], first["data"], first["gap"], [*lines.values()], measures=measures)
     return Run(
-        first["task"], first["real"], first["schedule"], int(first["updates"]), first["commit"], first["score"], seeds,
-        own,
+        first["task"], first["real"], first["schedule"], whole("updates", first["updates"]), first["commit"],
+        first["score"], seeds, own,
     )  # fmt: skip

@@ -12,17 +12,37 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
-from envs.files import read_json
+from envs.files import Count, read_object
 from sgft_jax.analysis import curves
 from sgft_jax.analysis.curves import COLUMNS, IDENTITY, Curve
+from sgft_jax.io.csvfile import read_csv
 from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
-from sgft_jax.io.runs import CONFIG, PROVENANCE
+from sgft_jax.io.runs import read_config, read_starts
 from sgft_jax.types import UserError
 
 _OF_PRIORS, _OF_TUNING = ("task", "priors"), ("task", "method")
+_Pretrained = TypedDict("_Pretrained", {"success/interval": tuple[float, float], "digest": NotRequired[str]})
 _DIGITS = 4  # significant ones of a number with a fraction
+
+
+class _Trial(TypedDict):
+    options: dict[str, Any]
+    rollouts: Count
+    area: float
+    final: float
+
+
+class _Tuning(TypedDict):
+    """What `experiments.tune` has chosen for one task and method, see docs/formats.md."""
+
+    task: str
+    method: str
+    trial: Count
+    trials: list[_Trial]
+    budget: dict[str, Any]
+    space: dict[str, Any]
 
 
 def export(out: Path, to: Path) -> list[Path]:
@@ -56,7 +76,7 @@ def _run(curve: Curve) -> dict[str, Any]:
 
 def _tuning(path: Path) -> Iterable[dict[str, Any]]:
     """What tuning of one method tried: options of each trial, its scores, and whether it was chosen."""
-    result = read_json(path)
+    result = read_object(path, _Tuning, "put back what experiments.tune has written")
     for number, trial in enumerate(result["trials"]):
         yield {
             "task": result["task"], "method": result["method"], "trial": number, "chosen": number == result["trial"],
@@ -67,15 +87,14 @@ def _tuning(path: Path) -> Iterable[dict[str, Any]]:
 
 
 def _pretraining(folder: Path) -> Iterable[dict[str, Any]]:
-    for record in read_jsonl(folder / EVAL):
+    for record in read_jsonl(folder / EVAL, {"step": Count, "success": list[float], "return": list[float]}):
         for i, success in enumerate(record["success"]):
             scores = {"success": success, "return": record["return"][i]}
             yield {**_set_of(folder), "prior": i, "env_steps": record["step"], **scores}
 
 
 def _priors(folder: Path) -> Iterable[dict[str, Any]]:
-    summary, stored = read_json(folder / SUMMARY), read_json(folder / CONFIG)["config"]
-    starts = read_json(folder / PROVENANCE)["starts"]
+    summary, stored, starts = _summary_of(folder), read_config(folder), read_starts(folder) or [{}]
     options = curves.flat({name: value for name, value in stored.items() if name in ("preset", "config")})
     times = {name: value for name, value in summary.items() if name.startswith("time/")}
     for i, one in enumerate(summary["seeds"]):
@@ -85,8 +104,12 @@ def _priors(folder: Path) -> Iterable[dict[str, Any]]:
         yield {**_set_of(folder), "prior": i, **scores, **bounds, **curves.origin(starts[-1]), **times, **options}
 
 
+def _summary_of(folder: Path) -> dict[str, Any]:
+    return read_object(folder / SUMMARY, {"seeds": list[_Pretrained]}, "put back what the run has written")
+
+
 def _set_of(folder: Path) -> dict[str, str]:
-    digests = [one.get("digest", "") for one in read_json(folder / SUMMARY)["seeds"]]
+    digests = [one.get("digest", "") for one in _summary_of(folder)["seeds"]]
     return {"task": folder.parent.parent.name, "priors": curves.set_name(folder, digests)}
 
 
@@ -96,7 +119,7 @@ def merge(path: Path, new: Sequence[Mapping[str, Any]], key: Sequence[str]) -> P
         return None
     texts = [{name: _text(value) for name, value in row.items()} for row in new]
     replaced = {tuple(row[name] for name in key) for row in texts}
-    kept = [row for row in curves.read_csv(path, needed=key) if tuple(row[name] for name in key) not in replaced]
+    kept = [row for row in read_csv(path, needed=key) if tuple(row[name] for name in key) not in replaced]
     every = [*kept, *texts]
     names = COLUMNS if set(every[0]) <= set(COLUMNS) else dict.fromkeys(name for row in every for name in row)
     lines = sorted(every, key=lambda row: tuple(row[name] for name in key))  # stable: evaluations in order

@@ -7,16 +7,18 @@ Layout: documentation of LeRobotDataset v3.0.
 """
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 
 from envs.base import Entry
-from envs.files import read_object
-from sgft_jax.data.layouts import Rows
+from envs.files import Count, Positive, Size, checked, read_object
+from sgft_jax.data.layouts import Rows, files_of
 from sgft_jax.data.recording import Recorded
+from sgft_jax.io.arrays import check_claim, flags
 from sgft_jax.io.jsonfile import write_json
 from sgft_jax.types import UserError
 
@@ -26,6 +28,25 @@ _STATE, _ACTION, _SUCCESSOR = "observation.state", "action", "next.observation.s
 _REWARD, _DONE, _TRUNCATED, _SUCCESS = "next.reward", "next.done", "next.truncated", "next.success"
 _INDICES = ("frame_index", "episode_index", "index", "task_index")
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+_WIDEST = 8  # bytes of a number
+_WHOLE = "supply a whole data set"
+
+
+class _Feature(TypedDict):
+    """What is read of a column's description."""
+
+    shape: list[Size]
+
+
+class _Info(TypedDict):
+    """What is read of `meta/info.json`."""
+
+    codebase_version: str
+    features: dict[str, Any]
+    fps: Positive
+    total_frames: NotRequired[Count]
+    total_episodes: NotRequired[Count]
+    data_path: NotRequired[str]
 
 
 def write(
@@ -178,68 +199,101 @@ def read(folder: Path) -> Rows:
     `next.done` alone does not tell whether the task or the time ended an episode. Raises UserError for another
     version, without pyarrow, and where tables and `meta/info.json` disagree.
     """
-    info = read_object(folder / INFO, {"features": dict, "fps": float}, "supply a whole data set")
-    version = str(info.get("codebase_version", ""))
+    info = read_object(folder / INFO, _Info, _WHOLE)
+    version, features = info["codebase_version"], info["features"]
     if not version.startswith("v3."):
         raise UserError(f"{folder}: is LeRobot {version}; convert it to {_VERSION} with LeRobot's own script")
-    features = info["features"]
+    path = info.get("data_path", "data/")
+    if not path.startswith("data/") or ".." in path:
+        raise UserError(f"{folder}: its data_path {path!r} is not in data/; {_WHOLE}")
     if missing := [name for name in (_STATE, _ACTION) if name not in features]:
         raise UserError(f"{folder}: has no {missing[0]}, only {', '.join(sorted(features))}; record it as a vector")
     if missing := [name for name in ("frame_index", "episode_index") if name not in features]:
-        raise UserError(f"{folder}: has no {missing[0]}; supply a whole data set")
+        raise UserError(f"{folder}: has no {missing[0]}; {_WHOLE}")
     wanted = (_STATE, _ACTION, _SUCCESSOR, _REWARD, _DONE, _TRUNCATED, "frame_index", "episode_index")
-    columns = _columns(folder, {name: features[name] for name in wanted if name in features})
-    episode, frame = columns["episode_index"], columns["frame_index"]
-    ends = np.append(np.diff(episode) != 0, True)
+    chosen = {name: features[name] for name in wanted if name in features}
+    shapes = {name: checked(f"{folder / INFO}: {name}", x, _Feature, _WHOLE)["shape"] for name, x in chosen.items()}
+    columns = _columns(folder, shapes)
+    episode, frame = (_whole(folder, name, columns[name]) for name in ("episode_index", "frame_index"))
+    ends = np.append(np.diff(episode) != 0, True)[: len(episode)]
     _check(folder, info, episode, frame, ends)
     obs, keep = columns[_STATE], np.ones(len(ends), bool)
     next_obs = columns.get(_SUCCESSOR)
     if next_obs is None:
         next_obs, keep = np.roll(obs, -1, axis=0), ~ends
-    terminal = columns[_DONE] & ~columns[_TRUNCATED] if {_DONE, _TRUNCATED} <= set(columns) else None
+    over = {n: flags(folder, n, columns[n], (None,), fix=_WHOLE) for n in (_DONE, _TRUNCATED) if n in columns}
+    terminal = over[_DONE] & ~over[_TRUNCATED] if len(over) == 2 else None
     return Rows(
         obs, columns[_ACTION], columns.get(_REWARD), next_obs, terminal, ends, keep, "lerobot",
         "stored" if _SUCCESSOR in columns else "shifted", folder, float(info["fps"]),
     )  # fmt: skip
 
 
-def _columns(folder: Path, features: Mapping[str, Mapping[str, Any]]) -> dict[str, np.ndarray]:
+def _columns(folder: Path, shapes: Mapping[str, Sequence[int]]) -> dict[str, np.ndarray]:
     """[N] numbers or [N, k] vectors by name, from all files in their order."""
     pa, pq = _pyarrow(folder)
-    paths = sorted(folder.glob("data/*/*.parquet"))
+    paths = [path for path in files_of(folder) if path.parent.parent == folder / "data" and path.suffix == ".parquet"]
     if not paths:
-        raise UserError(f"{folder}: holds no data/*/*.parquet; supply a whole data set")
-    try:
-        table = pa.concat_tables([pq.read_table(path, columns=list(features)) for path in paths])
-        return {name: _numbers(folder, name, table[name], about["shape"]) for name, about in features.items()}
-    except (pa.ArrowException, OSError, KeyError, TypeError) as error:
-        said = str(error).splitlines()[0].strip("'\"")
-        raise UserError(f"{folder}: damaged or cut off ({said}); supply a whole data set") from error
+        raise UserError(f"{folder}: holds no data/*/*.parquet; {_WHOLE}")
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in shapes}
+    for path in paths:
+        try:
+            with pq.ParquetFile(path) as file:
+                _check_size(path, file.metadata, shapes)
+                table = file.read(columns=list(shapes))
+            read = {name: _numbers(path, name, table[name], shape) for name, shape in shapes.items()}
+        except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError) as error:
+            message = str(error).splitlines()[0].strip("'\"")
+            raise UserError(f"{path}: damaged or cut off ({message}); {_WHOLE}") from error
+        for name, values in read.items():
+            parts[name].append(values)
+    return {name: np.concatenate(values) for name, values in parts.items()}
 
 
-def _numbers(folder: Path, name: str, column: Any, shape: Sequence[int]) -> np.ndarray:
-    """A column as its feature describes it."""
+def _check_size(path: Path, about: Any, shapes: Mapping[str, Sequence[int]]) -> None:
+    """Raises UserError where a file claims more numbers than it can hold.
+
+    Not by its columns, one by one: pyarrow ends the process where what a file says of them is damaged.
+    """
+    width = _WIDEST * sum(math.prod(shape) for shape in shapes.values())
+    groups = [about.row_group(i) for i in range(about.num_row_groups)]
+    claimed = sum(max(width * group.num_rows, group.total_byte_size) for group in groups)
+    check_claim(path, claimed, path.stat().st_size)
+
+
+def _numbers(path: Path, name: str, column: Any, shape: Sequence[int]) -> np.ndarray:
+    """A column as its feature describes it: every row a number or a list of so many, in whatever type of list."""
     values = column.combine_chunks()
-    flat = values.flatten() if hasattr(values, "flatten") and hasattr(values.type, "value_type") else values
-    found = flat.to_numpy(zero_copy_only=False)
-    vector = name in (_STATE, _ACTION, _SUCCESSOR)
-    if len(shape) != 1 or len(found) != len(column) * shape[0] or found.dtype.kind not in "biuf":
-        raise UserError(f"{folder}: {name} is no column of numbers [{shape}]; only vectors are read")
-    return found.reshape(len(column), -1) if vector else found
+    listed = hasattr(values.type, "value_type") and hasattr(values, "flatten")
+    flat = (values.flatten() if listed else values).to_numpy(zero_copy_only=False)
+    sizes = np.array(values.value_lengths()) if listed else np.ones(len(values), int)
+    if values.null_count or len(shape) != 1 or (sizes != shape[0]).any() or flat.dtype.kind not in "biuf":
+        raise UserError(f"{path}: {name} is no column of numbers {shape}; only vectors are read")
+    return flat.reshape(-1, shape[0]) if name in (_STATE, _ACTION, _SUCCESSOR) else flat.reshape(-1)
+
+
+def _whole(folder: Path, name: str, values: np.ndarray) -> np.ndarray:
+    """[N] int64."""
+    if values.dtype.kind not in "iu":
+        raise UserError(f"{folder}: {name} holds {values.dtype.name}, not whole numbers; {_WHOLE}")
+    return values.astype(np.int64)
 
 
 def _check(folder: Path, info: Mapping[str, Any], episode: np.ndarray, frame: np.ndarray, ends: np.ndarray) -> None:
     """Raise UserError where frames are missing or in another order."""
     for name, n in {"total_frames": len(frame), "total_episodes": len(np.unique(episode))}.items():
         if info.get(name, n) != n:
-            raise UserError(f"{folder}: holds {name} {n}, but {INFO} says {info[name]}; supply a whole data set")
-    starts = np.concatenate([[True], ends[:-1]])
-    wanted = np.arange(len(frame)) - np.maximum.accumulate(np.where(starts, np.arange(len(frame)), 0))
-    if (odd := frame != wanted).any():
+            raise UserError(f"{folder}: holds {name} {n}, but {INFO} says {info[name]}; {_WHOLE}")
+    place, starts = np.arange(len(frame)), np.append(True, ends[:-1])[: len(frame)]
+    if (odd := episode != np.cumsum(starts) - 1).any():
         i = int(np.argmax(odd))
         raise UserError(
-            f"{folder}: episode {episode[i]} has frame {frame[i]} where {wanted[i]} is due; supply a whole data set"
+            f"{folder}: row {i} is of episode {episode[i]} where {np.sum(starts[: i + 1]) - 1} is due; {_WHOLE}"
         )
+    wanted = place - np.maximum.accumulate(np.where(starts, place, 0))
+    if (odd := frame != wanted).any():
+        i = int(np.argmax(odd))
+        raise UserError(f"{folder}: episode {episode[i]} has frame {frame[i]} where {wanted[i]} is due; {_WHOLE}")
 
 
 def _pyarrow(folder: Path) -> tuple[Any, Any]:

@@ -6,7 +6,9 @@ be is a `UserError` with one line. Arrays are float32 on the host; `replay.full`
 
 import dataclasses
 import hashlib
-from collections.abc import Callable, Sequence
+import stat
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
 
@@ -17,6 +19,7 @@ from envs.base import Env
 from envs.history import remember, with_memory
 from sgft_jax.data import layouts, lerobot
 from sgft_jax.data.layouts import Rows
+from sgft_jax.io.arrays import numbers
 from sgft_jax.io.real import home_of
 from sgft_jax.types import Array, Successors, Transition, UserError, unknown
 
@@ -36,6 +39,7 @@ class Facts:
         is 0. clipped: returned rows with an action beyond [-1, 1].
     episodes: in the file, one that the end of the file cuts off included; whole_episodes: the others.
     return_*: undiscounted returns of the whole episodes, or of all if none is whole. std is that of the population.
+    assumed: what the file does not tell and was taken to be so, in words; "" where it tells all.
     """
 
     path: str
@@ -53,6 +57,7 @@ class Facts:
     return_std: float
     return_min: float
     return_max: float
+    assumed: str = ""
 
 
 class Log(NamedTuple):
@@ -90,7 +95,7 @@ def load(path: Path | str, *, gamma: float, successors: Successors = "stored", e
             task = "another task" if env is None else env.name
             raise UserError(f"{path}: tables are logs of a wheel-legged robot; {task} wants a data set")
         return load_table(path, gamma=gamma, obs_dim=env.measured_dim, reward=jax.vmap(env.reward), env=env)
-    return _log(path, _read(path, successors), gamma, env)
+    return _log(path, _read(path, successors, env), gamma, env)
 
 
 def load_table(
@@ -132,22 +137,24 @@ def _borders(last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([[0], ends[:-1]]), ends
 
 
-def _read(path: Path, successors: Successors) -> Rows:
+def _read(path: Path, successors: Successors, env: Env | None) -> Rows:
     """What lies there."""
-    if path.is_dir():
+    with _readable(path):
+        folder = stat.S_ISDIR(path.stat().st_mode)
+    if folder:
         if (path / lerobot.INFO).exists():
             return lerobot.read(path)
         if (home := home_of(path)) is not None:
             return layouts.read_rollouts(home)
-    return layouts.read_hdf5(path, successors)
+    return layouts.read_hdf5(path, successors, None if env is None else env.episode_length)
 
 
 def _log(path: Path, rows: Rows, gamma: float, env: Env | None) -> Log:
     """The transitions of what a file holds, as a task sees them."""
+    rows = layouts.check(path, rows)
     if env is not None:
         rows = _fitted(path, rows, env)
     rows = _judged(path, rows, env)
-    _check(path, rows)
     if env is not None:
         rows = _seen(rows, env)
     below = np.append(rows.keep[1:], False)
@@ -186,7 +193,10 @@ def _judged(path: Path, rows: Rows, env: Env | None) -> Rows:
     if rows.reward is None:
         if env is None or env.reward is None:
             raise UserError(f"{path}: tells no rewards, and neither does a task; record them as next.reward")
-        rows = rows._replace(reward=np.where(rows.keep, jax.vmap(env.reward)(*step), 0.0))
+        reward = np.where(rows.keep, jax.vmap(env.reward)(*step), 0.0)
+        rows = rows._replace(
+            reward=numbers(path, f"the reward of {env.name}", reward, (None,), fix="leave the row out")
+        )
     if rows.terminal is None:
         ended = np.zeros(len(rows.obs), bool)
         if env is not None and env.terminated is not None:
@@ -211,28 +221,7 @@ def _seen(rows: Rows, env: Env) -> Rows:
     )
 
 
-# --- checks and facts -------------------------------------------------------------------------------------------------
-
-
-def _check(path: Path, rows: Rows) -> None:
-    """Raise UserError unless all arrays have as many rows, some rows count, and all their numbers are finite."""
-    arrays = {name: array for name, array in rows._asdict().items() if isinstance(array, np.ndarray)}
-    lengths = {name: len(array) for name, array in arrays.items()}
-    if len(set(lengths.values())) > 1:
-        said = ", ".join(f"{name} {n}" for name, n in lengths.items())
-        raise UserError(f"{path}: the numbers of rows differ ({said}); supply a whole file")
-    if not np.any(rows.keep):
-        raise UserError(f"{path}: holds no transitions; supply another file")
-    if rows.next_obs.shape != rows.obs.shape:
-        raise UserError(
-            f"{path}: next observations are {list(rows.next_obs.shape)}, observations {list(rows.obs.shape)}; "
-            "supply another file or set successors to 'shifted'"
-        )
-    for name in ("obs", "action", "reward", "next_obs"):
-        array = arrays[name]
-        finite = np.isfinite(array) if array.ndim == 1 else np.isfinite(array).all(axis=1)
-        if not finite.all():
-            raise UserError(f"{path}: {name} of row {np.argmin(finite)} is not finite; leave the row out of the file")
+# --- facts ------------------------------------------------------------------------------------------------------------
 
 
 def _transitions(rows: Rows, gamma: float) -> Transition:
@@ -269,14 +258,26 @@ def _facts(rows: Rows) -> Facts:
         return_std=float(np.std(judged)),
         return_min=float(np.min(judged)),
         return_max=float(np.max(judged)),
+        assumed=rows.assumed,
     )
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except OSError as error:  # a name that is too long, a folder that is closed
+        raise UserError(f"{path}: cannot be read ({(error.strerror or str(error)).lower()})") from None
+    except ValueError:  # a zero byte
+        raise UserError(f"{str(path)!r}: is no name of a file") from None
 
 
 def _fingerprint(source: Path) -> tuple[int, str]:
     """Bytes of a file and their SHA-256; of a folder those of its files, in the order of their names."""
     if not source.is_dir():
-        with open(source, "rb") as stream:
+        with _readable(source), open(source, "rb") as stream:
             return source.stat().st_size, hashlib.file_digest(stream, "sha256").hexdigest()
-    files = sorted(path for path in source.rglob("*") if path.is_file())
-    each = [(path.relative_to(source).as_posix(), *_fingerprint(path)) for path in files]
+    each = [(path.relative_to(source).as_posix(), *_fingerprint(path)) for path in layouts.files_of(source)]
     return sum(size for _, size, _ in each), hashlib.sha256(repr([one[::2] for one in each]).encode()).hexdigest()

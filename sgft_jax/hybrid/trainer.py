@@ -157,26 +157,35 @@ def make_trainer(
             state = state._replace(notes=replay.init(example, schedule.buffer))
         return collect(pool, state, key_fill, -(-agent.batches.n_sim // schedule.simulators))
 
-    def update(memory: PyTree, state: HybridState, key: Key) -> tuple[PyTree, Metrics]:
+    def update(memory: PyTree, state: HybridState, key: Key) -> tuple[PyTree, Metrics, Array]:
+        """The learner after a round's updates, their metrics, and whether there was anything to learn from []."""
+
         def one(agent_state: PyTree, key: Key) -> tuple[PyTree, Metrics]:
             key_rows, key_update = jax.random.split(key)
             batch = agent.batches.sample((memory, state.simulated), key_rows)
             return learner.update(agent_state, batch, key_update)
 
-        return jax.lax.scan(one, state.learner, jax.random.split(key, schedule.updates_per_round))
+        learned, metrics = jax.lax.scan(one, state.learner, jax.random.split(key, schedule.updates_per_round))
+        if not agent.batches.n_sim:
+            return learned, metrics, jnp.ones((), bool)
+        # An empty buffer is sampled as zeros, which nobody has lived through: all simulators have exploded.
+        some = state.simulated.size > 0
+        return jax.tree.map(lambda new, old: jnp.where(some, new, old), learned, state.learner), metrics, some
 
-    def one_round(pool: World, memory: PyTree, state: HybridState) -> tuple[HybridState, Metrics]:
+    def one_round(pool: World, memory: PyTree, state: HybridState) -> tuple[HybridState, tuple[Metrics, Array]]:
         key, key_collect, key_update = jax.random.split(state.key, 3)
         if agent.simulates:
             state = collect(pool, state, key_collect, schedule.steps_per_round)
-        trained, metrics = update(memory, state, key_update)
+        trained, metrics, some = update(memory, state, key_update)
         averages = {name: x.mean() for name, x in metrics.items()}
-        return state._replace(learner=trained, key=key, rounds=state.rounds + 1), averages
+        return state._replace(learner=trained, key=key, rounds=state.rounds + 1), (averages, some)
 
     def chunk(pool: World, memory: PyTree, state: HybridState) -> tuple[HybridState, Metrics]:
         rounds = schedule.rounds_per_chunk
-        state, metrics = jax.lax.scan(lambda own, _: one_round(pool, memory, own), state, None, length=rounds)
-        return state, {name: x.mean() for name, x in metrics.items()}
+        state, (metrics, some) = jax.lax.scan(lambda own, _: one_round(pool, memory, own), state, None, length=rounds)
+        # Nan if no round has learned.
+        mean = lambda x: jnp.where(some.all(), x.mean(), jnp.mean(x, where=some))  # noqa: E731
+        return state, {name: mean(x) for name, x in metrics.items()}
 
     return Trainer(init, chunk)
 

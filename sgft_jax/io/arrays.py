@@ -18,13 +18,22 @@ _RATIO = 200  # packed data of real experiments stay below
 _PLAIN = "biufSU"  # kinds of numbers and texts; nothing that would have to be unpickled
 
 
-def numbers(where: Path | str, name: str, values: Any, shape: Sequence[int | None], *, fix: str) -> np.ndarray:
-    """[*shape] float32, every number finite after the cast. shape: None where any length will do."""
+def numbers(
+    where: Path | str, name: str, values: Any, shape: Sequence[int | None], *, fix: str, valid: np.ndarray | None = None
+) -> np.ndarray:
+    """[*shape] float32, every number finite after the cast. shape: None where any length will do.
+
+    valid: bool, of the first axes: the rows that count; default: all. Like all others, whole numbers beyond 2^24 are
+    rounded to what float32 can hold.
+    """
     array = _of_kind(where, name, values, "biuf", "numbers", fix)
     _check_shape(where, name, array, shape, fix)
     with np.errstate(over="ignore"):
         cast = array.astype(np.float32)
-    if not (good := np.isfinite(cast)).all():
+    good = np.isfinite(cast)
+    if valid is not None:
+        good |= ~valid.reshape(*valid.shape, *[1] * (cast.ndim - valid.ndim))
+    if not good.all():
         place = tuple(int(i) for i in np.argwhere(~good)[0])
         wrong = "is too large for float32" if np.isfinite(array[place]) else "is not finite"
         raise UserError(f"{where}: {name}{_of_row(place)} {wrong}; {fix}")

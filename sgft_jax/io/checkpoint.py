@@ -2,7 +2,7 @@
 
 A checkpoint is `<run>/checkpoints/<step>/` with `state/` (Orbax) and `manifest.json`. It is written under a temporary
 name, its manifest last, and then renamed: a process killed at any moment leaves either the previous checkpoint or a
-complete new one. Nothing here ever unpickles anything.
+complete new one, see `folders`. Nothing here ever unpickles anything.
 
 The steps are not Orbax's own `training.Checkpointer`. Of 0.12.8 it offers a step with a damaged file as the latest,
 keeps the later steps that a resume from an earlier one has abandoned, and refuses arrays without elements.
@@ -11,26 +11,42 @@ keeps the later steps that a resume from an earlier one has abandoned, and refus
 import contextlib
 import datetime
 import importlib.metadata
+import math
+import os
+import re
 import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, TypedDict
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
-from envs.files import read_json
+from envs import files
+from envs.files import Count
 from sgft_jax import mesh
+from sgft_jax.io import folders
 from sgft_jax.io.jsonfile import jsonable, write_json
 from sgft_jax.types import PyTree, UserError
 
 FORMAT = 1
-_CHECKPOINTS, _MANIFEST, _STATE, _TEMPORARY = "checkpoints", "manifest.json", "state", ".tmp-"
+MANIFEST = "manifest.json"
+_CHECKPOINTS, _STATE = "checkpoints", "state"
 _MARK = "commit_success.txt"
+_HIDDEN = re.compile(rf"{os.sep}\.")  # files that file managers and network disks leave
+_FIX = "put back what was written, or take another one"
 _PACKAGES = ("jax", "flax", "optax", "orbax-checkpoint", "numpy")
+
+
+class _Manifest(TypedDict):
+    """What `write_tree` writes, beside the facts."""
+
+    leaves: list[tuple[str, Literal["key", "jax"], list[Count], str]]
+    key_impls: dict[str, str]
+    files: dict[str, tuple[Count, Count]]
 
 
 class Leaf(NamedTuple):
@@ -64,22 +80,30 @@ def save(folder: Path, step: int, state: PyTree, *, meta: Mapping[str, Any], kee
     return root / str(step)
 
 
-def latest(folder: Path, *, say: Callable[[str], None] = print) -> int | None:
-    """The newest step with a complete checkpoint, or None; `say` hears of every torn one that was passed over."""
+def latest(folder: Path, *, whole: bool = False, say: Callable[[str], None] = print) -> int | None:
+    """The newest step with a complete checkpoint, or None without any; `say` hears of every one that was passed over.
+
+    whole: to go on from it; its files are read and compared with their checksums, and a UserError says where all are
+    damaged.
+    """
     root = Path(folder) / _CHECKPOINTS
-    for step in sorted(_steps(root), reverse=True):
+    for step in sorted(steps := _steps(root), reverse=True):
         try:
-            read_manifest(root / str(step))
+            manifest = read_manifest(path(folder, step))
+            if whole:
+                check_files(path(folder, step), manifest)
         except UserError as torn:
             say(f"skipped: {torn}")
         else:
             return step
+    if steps and whole:
+        raise UserError(f"{root}: holds nothing whole; remove it, then --resume begins again with what else is on disk")
     return None
 
 
 def path(folder: Path, step: int) -> Path:
     """Where the checkpoint of a step is."""
-    return Path(folder) / _CHECKPOINTS / str(step)
+    return folders.present(Path(folder) / _CHECKPOINTS / str(step))
 
 
 def restore(
@@ -87,23 +111,28 @@ def restore(
     like: PyTree,
     *,
     step: int | None = None,
+    checked: bool = False,
     expect: Mapping[str, Any] | None = None,
     say: Callable[[str], None] = print,
 ) -> tuple[PyTree, dict[str, Any]]:
-    """Read a checkpoint into the structure of `like` and return (state, meta); step None is the newest complete one.
+    """Read a checkpoint into the structure of `like` and return (state, meta); step None is the newest whole one.
 
-    like: a state, or `jax.eval_shape` of the function that makes one. expect: entries that the saved meta must have.
+    like: a state, or `jax.eval_shape` of the function that makes one. checked: its files have just been compared with
+    their checksums, see `latest`. expect: entries that the saved meta must have.
     Raises UserError if the checkpoint is missing, torn, or of another task, kind or shape.
     """
     if step is None:
-        step = latest(folder, say=say)
+        step, checked = latest(folder, whole=True, say=say), True
         if step is None:
             raise UserError(f"{folder}: holds no complete checkpoint to restore")
     where = path(folder, step)
     manifest = read_manifest(where)
-    check_facts(where, manifest["meta"], expect or {})
+    meta = files.checked(where / MANIFEST, manifest, {"meta": dict}, _FIX)["meta"]
+    check_facts(where, meta, expect or {})
     _check_leaves(where, leaves_of(manifest), [describe(p, x) for p, x in jax.tree_util.tree_leaves_with_path(like)])
-    return jax.tree.unflatten(jax.tree.structure(like), read_leaves(where, manifest)), manifest["meta"]
+    if not checked:
+        check_files(where, manifest)
+    return jax.tree.unflatten(jax.tree.structure(like), read_leaves(where, manifest)), meta
 
 
 def check_facts(where: Path, saved: Mapping[str, Any], expect: Mapping[str, Any]) -> None:
@@ -127,10 +156,13 @@ def _check_leaves(where: Path, saved: list[Leaf], wanted: list[Leaf]) -> None:
 
 def _prune(root: Path, *, newest: int, keep: int) -> None:
     """Delete all but the `keep` newest complete steps up to `newest`; a kill leaves none half deleted."""
-    steps = _steps(root)
+    for leftover in root.glob(f"{folders.NEW}*"):  # nobody else writes here
+        shutil.rmtree(leftover)
+    for step in (steps := _steps(root)):
+        folders.settle(root / str(step))
     complete = [step for step in sorted(steps, reverse=True) if step <= newest and _is_complete(root / str(step))]
-    for step in set(steps) - set(complete[: max(keep, 1)]):
-        doomed = root / f"{_TEMPORARY}old-{step}"
+    for step in steps - set(complete[: max(keep, 1)]):
+        doomed = folders.part_of(root / str(step))
         (root / str(step)).rename(doomed)
         shutil.rmtree(doomed)
 
@@ -142,8 +174,11 @@ def _is_complete(where: Path) -> bool:
         return False
 
 
-def _steps(root: Path) -> list[int]:
-    return [int(p.name) for p in root.iterdir() if p.name.isdigit() and p.is_dir()] if root.is_dir() else []
+def _steps(root: Path) -> set[int]:
+    """The steps of all folders, those included that a killed writer has put aside."""
+    paths = [path for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
+    names = {path.name.removeprefix(folders.ASIDE) for path in paths}
+    return {int(name) for name in names if name.isdecimal()}
 
 
 # --- one tree in one folder -------------------------------------------------------------------------------------------
@@ -151,19 +186,9 @@ def _steps(root: Path) -> list[int]:
 
 @contextlib.contextmanager
 def replaced(folder: Path) -> Iterator[Path]:
-    """Give a folder to fill, which then takes the place of `folder`."""
-    temporary, aside = (folder.with_name(f"{_TEMPORARY}{word}{folder.name}") for word in ("", "old-"))
-    if first_host():
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        for leftover in folder.parent.glob(f"{_TEMPORARY}*"):
-            shutil.rmtree(leftover)
-        temporary.mkdir()
-    yield temporary
-    if first_host():
-        if folder.exists():
-            folder.rename(aside)
-        temporary.rename(folder)
-        shutil.rmtree(aside, ignore_errors=True)
+    """Give a folder to fill, which then takes the place of `folder`: on the first host, where all write."""
+    with folders.replaced(folder) if first_host() else contextlib.nullcontext(folders.part_of(folder)) as part:
+        yield part
 
 
 def write_tree(where: Path, tree: PyTree, facts: Mapping[str, Any]) -> None:
@@ -179,7 +204,6 @@ def write_tree(where: Path, tree: PyTree, facts: Mapping[str, Any]) -> None:
         return
     # Orbax's own mark of completeness names the folders of this machine; ours is the manifest.
     (where / _STATE / _MARK).unlink(missing_ok=True)
-    files = [file for file in sorted(where.glob(f"{_STATE}/**/*")) if file.is_file()]
     manifest = {
         "format": FORMAT,
         **facts,
@@ -187,45 +211,91 @@ def write_tree(where: Path, tree: PyTree, facts: Mapping[str, Any]) -> None:
         "versions": {name: importlib.metadata.version(name) for name in _PACKAGES},
         "leaves": [list(leaf) for leaf in leaves],
         "key_impls": {_slot(i): str(jax.random.key_impl(x)) for i, (_, x) in enumerate(flat) if _is_key(x)},
-        "files": {str(file.relative_to(where)): _fingerprint(file) for file in files},
+        "files": {name: _fingerprint(where / name) for name in _files_of(where)},
     }
-    write_json(where / _MANIFEST, manifest)
+    write_json(where / MANIFEST, manifest)
 
 
 def read_manifest(where: Path) -> dict[str, Any]:
     """Read and check the manifest and that every file it lists is there in full size; raises UserError."""
     if not where.is_dir():
         raise UserError(f"{where}: no such folder")
-    if not (where / _MANIFEST).is_file():
-        raise UserError(f"{where}: not a complete checkpoint: {_MANIFEST} is missing")
+    if not (where / MANIFEST).is_file():
+        raise UserError(f"{where}: not a complete checkpoint: {MANIFEST} is missing")
     try:
-        manifest = read_json(where / _MANIFEST)
-        found = manifest["format"]
-    except (UserError, KeyError, TypeError):
-        raise UserError(f"{where}: torn: {_MANIFEST} is not readable") from None
-    if found != FORMAT:
-        raise UserError(f"{where}: written in format {found}, this version reads format {FORMAT}")
-    for file, (size, _) in manifest["files"].items():
-        if not (where / file).is_file():
-            raise UserError(f"{where}: torn: {file} is missing")
-        if (where / file).stat().st_size != size:
-            raise UserError(f"{where}: torn: {file} has {(where / file).stat().st_size} bytes, expected {size}")
+        manifest = files.read_object(where / MANIFEST, {"format": int}, _FIX)
+    except UserError:
+        raise UserError(f"{where}: torn: {MANIFEST} is not readable") from None
+    if manifest["format"] != FORMAT:
+        raise UserError(f"{where}: written in format {manifest['format']}, this version reads format {FORMAT}")
+    files.checked(where / MANIFEST, manifest, _Manifest, _FIX)
+    for name, (size, _) in manifest["files"].items():
+        file = where / name
+        if os.path.realpath(file) != f"{os.path.realpath(where)}{os.sep}{name}":
+            raise UserError(f"{where}: {MANIFEST} names {name}, which is not in that folder")
+        if not file.is_file():
+            raise UserError(f"{where}: torn: {name} is missing")
+        if file.stat().st_size != size:
+            raise UserError(f"{where}: torn: {name} has {file.stat().st_size} bytes, expected {size}")
+    if odd := [name for name in _files_of(where) if name not in manifest["files"] and not _HIDDEN.search(name)]:
+        raise UserError(f"{where}: {MANIFEST} has no checksum of {odd[0]}")
     return manifest
 
 
-def read_leaves(where: Path, manifest: Mapping[str, Any]) -> list[Any]:
-    """The arrays in order, after every file has been compared with its checksum."""
+def check_files(where: Path, manifest: Mapping[str, Any]) -> None:
+    """Raise UserError where a file differs from its checksum."""
     for name, (size, crc) in manifest["files"].items():
         if _fingerprint(where / name) != [size, crc]:
-            raise UserError(f"{where}: torn: {name} is damaged (checksum differs); use another checkpoint")
-    stored: dict[str, np.ndarray] = {}
-    if manifest["files"]:
-        try:
-            stored = ocp.load(str((where / _STATE).absolute()))
-        except Exception as error:
-            raise UserError(f"{where}: Orbax cannot read it: {str(error).splitlines()[0]}") from error
-    impls = manifest["key_impls"]
-    return [_from_numpy(leaf, stored.get(_slot(i)), impls.get(_slot(i))) for i, leaf in enumerate(leaves_of(manifest))]
+            raise UserError(f"{where}: damaged: {name} (checksum differs)")
+
+
+def read_leaves(where: Path, manifest: Mapping[str, Any]) -> list[Any]:
+    """The arrays in order. What is stored must be what the manifest says, which is known before numbers are read."""
+    impls, leaves = manifest["key_impls"], leaves_of(manifest)
+    wanted = {_slot(i): _stored(where, leaf, impls.get(_slot(i))) for i, leaf in enumerate(leaves)}
+    stored = _load(where, {slot: one for slot, one in wanted.items() if one.size})
+    return [_from_numpy(leaf, stored.get(_slot(i)), impls.get(_slot(i))) for i, leaf in enumerate(leaves)]
+
+
+def _stored(where: Path, leaf: Leaf, impl: str | None) -> jax.ShapeDtypeStruct:
+    """What stands on disk for an array, keys as their data; raises UserError for a kind that JAX does not know."""
+    with contextlib.suppress(TypeError, ValueError):
+        if leaf.kind == "key":
+            keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0, impl=impl), leaf.shape))
+            if impl is not None and str(keys.dtype) == leaf.dtype:
+                return jax.eval_shape(jax.random.key_data, keys)
+        else:
+            dtype = jnp.dtype(leaf.dtype)
+            kept = str(jax.dtypes.canonicalize_dtype(dtype)) == leaf.dtype
+            if kept and (jnp.issubdtype(dtype, jnp.number) or dtype.kind == "b"):
+                return jax.ShapeDtypeStruct(leaf.shape, dtype)
+    raise UserError(f"{where}: {MANIFEST} lists {leaf}, which this version does not know")
+
+
+def _load(where: Path, wanted: Mapping[str, jax.ShapeDtypeStruct]) -> dict[str, np.ndarray]:
+    """The arrays that Orbax has stored; raises UserError, before memory is taken, where they are not those wanted."""
+    if not wanted:
+        return {}
+    stored = _with_orbax(where, lambda state: {slot: _claim(one) for slot, one in ocp.metadata(state).metadata.items()})
+    for slot in sorted({*wanted, *stored}):
+        expected = (wanted[slot].shape, str(wanted[slot].dtype)) if slot in wanted else None
+        if stored.get(slot) != expected:
+            raise UserError(f"{where}: {MANIFEST} and {_STATE} differ in {slot}: {expected} and {stored.get(slot)}")
+    return _with_orbax(where, ocp.load)
+
+
+def _claim(about: Any) -> tuple[tuple[int, ...], str] | None:
+    """Shape and type of a stored array; None where its pieces are larger than the whole."""
+    pieces = about.storage_metadata.chunk_shape
+    return None if math.prod(pieces) > math.prod(about.shape) else (tuple(about.shape), str(about.dtype))
+
+
+def _with_orbax[T](where: Path, read: Callable[[str], T]) -> T:
+    try:
+        return read(str((where / _STATE).absolute()))
+    except Exception as error:  # dozens of types, for whatever is wrong with a file
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise UserError(f"{where}: Orbax cannot read it: {reason}") from error
 
 
 def leaves_of(manifest: Mapping[str, Any]) -> list[Leaf]:
@@ -248,6 +318,11 @@ def describe(path: tuple[Any, ...], leaf: Any) -> Leaf:
 def first_host() -> bool:
     """Of several hosts, which save together, the first one looks after the files."""
     return jax.process_index() == 0
+
+
+def _files_of(where: Path) -> list[str]:
+    """The files that hold the arrays, by their names in the folder."""
+    return [str(file.relative_to(where)) for file in sorted(where.glob(f"{_STATE}/**/*")) if file.is_file()]
 
 
 def _slot(index: int) -> str:

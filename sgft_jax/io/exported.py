@@ -65,7 +65,6 @@ def save_exported(folder: Path, prior: Prior, env: Env, to: Format) -> float:
         checked = {"observations": n, "largest_difference": worst, "limit": LIMIT}
         write_json(temporary / CONTRACT, {**contract, "checked": checked})
         if not worst <= LIMIT:
-            shutil.rmtree(temporary)
             raise UserError(f"{folder}: exported actions differ by {worst:.1e} from the policy's, {LIMIT:.0e} may be")
     return worst
 

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from sgft_jax.io.folders import NEW
+
 
 def jsonable(value: Any) -> Any:
     """Plain JSON data: dataclasses become objects with every field spelled out, arrays lists, array scalars numbers,
@@ -46,14 +48,18 @@ def _widened(array: np.ndarray) -> np.ndarray:
 
 def write_json(path: Path, value: Any) -> None:
     """Write `value` under a temporary name, flush it to disk, rename it to `path`."""
+    text = json.dumps(jsonable(value), indent=1, allow_nan=False) + "\n"
     path = Path(path)
-    temporary = path.with_name(f".tmp-{path.name}")
-    with open(temporary, "w") as file:
-        json.dump(jsonable(value), file, indent=1, allow_nan=False)
-        file.write("\n")
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    temporary = path.with_name(NEW + path.name)
+    try:
+        with open(temporary, "w", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def differences(old: Any, new: Any, *, name: str = "") -> list[tuple[str, Any, Any]]:

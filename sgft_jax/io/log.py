@@ -2,18 +2,19 @@
 
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from envs.files import read_text
+from envs.files import checked, kind_of, parse_json, read_text
 from sgft_jax.io.jsonfile import jsonable, write_json
 from sgft_jax.types import UserError
 
 METRICS, EVAL, SUMMARY = "metrics.jsonl", "eval.jsonl", "summary.json"
-_LIMIT = 2**32  # bytes of a log
+_LIMIT = 2**30  # bytes of a log
+_FIX = "put back the file that the run has written"
 
 
 class DivergedError(UserError):
@@ -109,19 +110,32 @@ class MetricsLog:
                 self._writer.add_scalar(f"{prefix}{tag}", float(numbers.mean()), int(step))
 
 
-def read_jsonl(path: Path) -> list[dict[str, Any]]:
-    """The records of a log, oldest first, "nan" and "inf" as floats again; a last line torn by a kill is left out."""
-    path = Path(path)
-    if not path.exists():
-        raise UserError(f"{path}: no such file")
-    records = []
+def read_jsonl(path: Path, needed: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
+    """The records of a log, oldest first, "nan" and "inf" as floats again; a last line torn by a kill is left out.
+
+    needed: see `check_records`. Raises UserError for a file that is no log.
+    """
     lines = read_text(path, limit=_LIMIT).split("\n")
-    for number, line in enumerate(lines[:-1], start=1):  # whatever follows the last newline was never finished
-        try:
-            records.append({k: _floats(v) for k, v in json.loads(line).items()})
-        except (ValueError, AttributeError, RecursionError) as error:
-            raise UserError(f"{path}:{number}: not a JSON object") from error
+    # Whatever follows the last newline was never finished.
+    records = [_record(f"{path}:{number}", line) for number, line in enumerate(lines[:-1], start=1)]
+    if needed is not None:
+        check_records(path, records, needed)
     return records
+
+
+def check_records(path: Path, records: Sequence[Mapping[str, Any]], needed: Mapping[str, Any]) -> None:
+    """Raises UserError unless there are records, and each has these keys with values of these types.
+
+    Lists under these keys, which have a number for each seed, are of one length in all records.
+    """
+    if not records:
+        raise UserError(f"{path}: holds no record; {_FIX}")
+    kind, lengths = kind_of(needed), set()
+    for number, record in enumerate(records, start=1):
+        checked(f"{path}:{number}", record, kind, _FIX)
+        lengths |= {len(record[name]) for name in needed if isinstance(record[name], list)}
+    if len(lengths) > 1 or 0 in lengths:
+        raise UserError(f"{path}: its records are of {' or '.join(map(str, sorted(lengths)))} seeds; {_FIX}")
 
 
 def write_summary(folder: Path, values: Mapping[str, Any]) -> Path:
@@ -129,6 +143,16 @@ def write_summary(folder: Path, values: Mapping[str, Any]) -> Path:
     path = Path(folder) / SUMMARY
     write_json(path, values)
     return path
+
+
+def _record(where: str, line: str) -> dict[str, Any]:
+    record = parse_json(line, where)
+    if not isinstance(record, dict):
+        raise UserError(f"{where}: is no JSON object; {_FIX}")
+    try:
+        return {key: _floats(value) for key, value in record.items()}
+    except RecursionError:
+        raise UserError(f"{where}: not valid JSON (nested too deeply)") from None
 
 
 def _floats(value: Any) -> Any:

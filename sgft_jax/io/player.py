@@ -17,6 +17,8 @@ from typing import Any, Callable  # noqa: UP035 - as Python 3.9 spells it
 import numpy as np
 
 Step = Callable[[dict], dict]
+LARGEST = 1e12  # no unit measures more, and its square, divided by the smallest std, is far from float32's largest
+_BEYOND = 1e-3  # how far rounding may lead an action out of [-1, 1]
 
 
 class Policy:
@@ -27,10 +29,14 @@ class Policy:
 
     def __init__(self, folder: str | Path | None = None) -> None:
         home = Path(__file__).parent if folder is None else Path(folder)
-        self.contract = json.loads((home / "contract.json").read_text())
-        self._names, self._commands = (_each(self.contract[kind]) for kind in ("observation", "action"))
-        self._step = _OPENERS[self.contract["to"]](home)
-        self.reset()
+        try:
+            self.contract = json.loads((home / "contract.json").read_text(encoding="utf-8"))
+            self._names, self._commands = (_each(self.contract[kind]) for kind in ("observation", "action"))
+            self._corrected, opener = list(self.contract["last_action"]), _OPENERS[self.contract["to"]]
+            self.reset()
+        except (KeyError, TypeError, ValueError, RecursionError) as error:
+            raise ValueError(f"{home / 'contract.json'}: is no contract of an exported policy ({error!r})") from None
+        self._step = opener(home)
 
     def reset(self) -> None:
         """Forgets the episode; call it at the start of the next one."""
@@ -41,17 +47,19 @@ class Policy:
 
         sent: [act_dim] in [-1, 1], what the robot was really told last time, where something has changed the action,
         such as a limit of force or workspace. Default: the action as it was. At the first step there was none.
-        Raises ValueError for another number of entries, and for one that is not finite; nothing is remembered then.
+        Raises ValueError for another number of entries, and for one that is no number, not finite or too large; nothing
+        is remembered then.
         """
-        measured = _numbers(measured, self._names, "the policy reads {} measured numbers")
+        measured = numbers(measured, self._names, "the policy reads {} measured numbers")
         state = self._state
         if sent is not None:
-            sent = _numbers(sent, self._commands, "an action has {} numbers")
-            corrected = self.contract["last_action"]
-            state = {**state, **{name: np.concatenate([sent, state[name][len(sent) :]]) for name in corrected}}
+            sent = numbers(sent, self._commands, "an action has {} numbers", largest=1 + _BEYOND)
+            state = {**state, **{name: np.concatenate([sent, state[name][len(sent) :]]) for name in self._corrected}}
         found = self._step({"measured": measured, **state})
-        self._state = {name: found["next_" + name] for name in self._state}
-        return np.asarray(found["action"])
+        action, state = np.asarray(found["action"]), {name: found["next_" + name] for name in self._state}
+        check_answer(action, *state.values())
+        self._state = state
+        return action
 
 
 def _each(entries: list) -> list[str]:
@@ -59,14 +67,28 @@ def _each(entries: list) -> list[str]:
     return [f"{e['name']}[{i}]" for e in entries for i in range(e["size"])]
 
 
-def _numbers(given: Any, names: list[str], wanted: str) -> np.ndarray:
-    """As an array; ValueError where their number is not what is `wanted`, or one is not finite."""
-    numbers = np.asarray(given, np.float32)
-    if numbers.shape != (len(names),):
-        raise ValueError(f"{wanted.format(len(names))}, got shape {numbers.shape}")
-    if odd := [name for name, ok in zip(names, np.isfinite(numbers)) if not ok]:  # noqa: B905 - new in 3.10
-        raise ValueError(f"{odd[0]} is not a finite number")
-    return numbers
+def numbers(values: Any, names: list[str], wanted: str, *, largest: float = LARGEST) -> np.ndarray:
+    """As an array float32; ValueError where their number is not what is `wanted`, or one is no number or too large."""
+    try:
+        array = np.asarray(values)
+    except ValueError:  # rows of different lengths
+        array = np.asarray(None)
+    if array.shape != (len(names),):
+        raise ValueError(f"{wanted.format(len(names))}, got shape {array.shape}")
+    if array.dtype.kind not in "biuf":
+        raise ValueError(f"{wanted.format(len(names))}, got {array.dtype.name}")
+    for name, value in zip(names, array):  # noqa: B905 - new in 3.10
+        if not np.isfinite(value):
+            raise ValueError(f"{name} is not a finite number")
+        if abs(value) > largest:
+            raise ValueError(f"{name} is {value:g}: too large, at most {largest:g}")
+    return array.astype(np.float32)
+
+
+def check_answer(*parts: Any) -> None:
+    """ValueError where an action, or what is to be remembered, is not finite."""
+    if not all(np.isfinite(np.asarray(part)).all() for part in parts):
+        raise ValueError("the policy has no finite answer to these measurements")
 
 
 def _layer_norm(x: np.ndarray, scale: np.ndarray, bias: np.ndarray) -> np.ndarray:

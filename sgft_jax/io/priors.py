@@ -2,7 +2,7 @@
 
 import hashlib
 import importlib
-import importlib.util
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,15 @@ import jax
 import numpy as np
 
 from envs.base import Varying
-from envs.files import read_object
 from sgft_jax import mesh
 from sgft_jax.io import checkpoint
+from sgft_jax.io.arrays import check_claim
+from sgft_jax.io.cards import CARD, read_card
+from sgft_jax.io.folders import present
 from sgft_jax.io.jsonfile import differences, write_json
 from sgft_jax.models.distortion import Distortion
+from sgft_jax.policies import check_parameters
 from sgft_jax.types import Normalizer, Prior, PyTree, UserError
-
-CARD = "prior.json"
 
 
 def save_prior(folder: str | Path, prior: Prior) -> Path:
@@ -26,17 +27,20 @@ def save_prior(folder: str | Path, prior: Prior) -> Path:
 
     The card must have `task`, `obs_dim` and `act_dim`, which are checked on loading, `gamma` (the discount), and
     `algorithm` unless that is SAC. Parameters must be NamedTuples and dicts of arrays: such a prior can be read without
-    the code that describes its networks. Raises ValueError or TypeError otherwise.
+    the code that describes its networks. Raises ValueError or TypeError otherwise, and UserError where `folder` holds
+    something else.
     """
     if missing := {"task", "obs_dim", "act_dim", "gamma"} - set(prior.card):
         raise ValueError(f"the prior's card lacks {sorted(missing)}")
-    tree = _plain(prior.params)
-    with checkpoint.replaced(Path(folder)) as temporary:
+    tree, folder = _plain(prior.params), Path(folder)
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / CARD).exists():
+        raise UserError(f"{folder}: holds something else than a prior; choose another folder")
+    with checkpoint.replaced(folder) as temporary:
         if checkpoint.first_host():
             write_json(temporary / CARD, prior.card)
         checkpoint.write_tree(temporary, tree, {})
     mesh.meet()
-    return Path(folder)
+    return folder
 
 
 def load_prior(
@@ -45,31 +49,42 @@ def load_prior(
     """Read a prior from its folder, or from the run folder that holds one as `prior/`.
 
     Its parameters are the `<ALGORITHM>Params` of `sgft_jax.learners.<algorithm>`, None where there are none. Raises
-    UserError if the prior is missing, torn, or of another task, other sizes than asked for, or another version.
+    UserError if the prior is missing, torn, or of another task, other sizes than asked for, or another version, or if
+    its numbers are not those of the networks that its card describes.
     """
     folder = _home(folder)
     manifest, card = checkpoint.read_manifest(folder), read_card(folder)
     asked = {"task": task, "obs_dim": obs_dim, "act_dim": act_dim}
     checkpoint.check_facts(folder, card, {name: value for name, value in asked.items() if value is not None})
-    container = _container(folder, algorithm_of(card))
-    paths = [leaf.path for leaf in checkpoint.leaves_of(manifest)]
-    tree = _nest(paths, checkpoint.read_leaves(folder, manifest))
+    leaves = checkpoint.leaves_of(manifest)
+    paths, shapes = [leaf.path for leaf in leaves], [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
+    try:  # before memory is taken for what a file claims
+        check_parameters(card, _params(card, paths, shapes))
+    except UserError as error:
+        raise UserError(f"{folder}: {error}") from None
+    check_claim(
+        folder, 4 * sum(math.prod(leaf.shape) for leaf in leaves), sum(n for n, _ in manifest["files"].values())
+    )
+    checkpoint.check_files(folder, manifest)
+    arrays = checkpoint.read_leaves(folder, manifest)
+    if odd := [path for path, x in zip(paths, arrays, strict=True) if not np.isfinite(x).all()]:
+        raise UserError(f"{folder}: {odd[0]} holds numbers that are not finite; take another prior, or pretrain again")
+    return Prior(_params(card, paths, arrays), card)
+
+
+def _params(card: Mapping[str, Any], paths: Sequence[str], leaves: Sequence[Any]) -> Any:
+    """The `<ALGORITHM>Params` that hold arrays, or shapes, with these paths."""
+    algorithm = algorithm_of(card)
+    container = getattr(importlib.import_module(f"sgft_jax.learners.{algorithm}"), f"{algorithm.upper()}Params")
+    tree = _nest(paths, leaves)
     if odd := sorted(set(tree) - set(container._fields)):
-        raise UserError(f"{folder}: holds {', '.join(odd)}, which this version does not know; pretrain again")
-    if set(tree.get("normalizer", {})) != set(Normalizer._fields):
-        raise UserError(f"{folder}: not a prior: it has no observation statistics")
-    tree["normalizer"] = statistics = Normalizer(**tree["normalizer"])
-    if distortion := tree.get("distortion"):
-        tree["distortion"] = Distortion(**distortion)
-    if statistics.mean.shape != (card["obs_dim"],):
-        raise UserError(f"{folder}: {CARD} says obs_dim={card['obs_dim']}, the statistics have {len(statistics.mean)}")
-    return Prior(container(**{name: tree.get(name) for name in container._fields}), card)
-
-
-def read_card(folder: Path) -> dict[str, Any]:
-    """What `prior.json` in a folder says; raises UserError where it is no card of a prior."""
-    needed = {"task": str, "obs_dim": int, "act_dim": int, "gamma": float}
-    return read_object(folder / CARD, needed, "name the folder of a prior")
+        raise UserError(f"holds {', '.join(odd)}, which this version does not know; pretrain again")
+    for name, kind in (("normalizer", Normalizer), ("distortion", Distortion)):
+        if (part := tree.get(name)) is not None:
+            if not isinstance(part, dict) or set(part) != set(kind._fields):
+                raise UserError(f"its {name} is not of {', '.join(kind._fields)}; pretrain again")
+            tree[name] = kind(**part)
+    return container(**{name: tree.get(name) for name in container._fields})
 
 
 def observed(card: Mapping[str, Any]) -> dict[str, Any]:
@@ -99,8 +114,8 @@ def load_priors(folders: Sequence[Path], env: Any) -> list[Prior]:
 
 def _home(folder: str | Path) -> Path:
     """The folder itself, or the prior inside a run folder."""
-    inside = Path(folder) / "prior"
-    return inside if not (Path(folder) / CARD).exists() and (inside / CARD).exists() else Path(folder)
+    home, inside = present(Path(folder)), present(Path(folder) / "prior")
+    return inside if not (home / CARD).exists() and (inside / CARD).exists() else home
 
 
 def digest(prior: Prior) -> str:
@@ -129,14 +144,6 @@ def _structure(card: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _container(folder: Path, algorithm: str) -> Any:
-    """The NamedTuple that holds the parameters of an algorithm."""
-    home = f"sgft_jax.learners.{algorithm}"
-    if not algorithm.isidentifier() or importlib.util.find_spec(home) is None:
-        raise UserError(f"{folder}: {CARD} says algorithm={algorithm!r}, which this version does not know")
-    return getattr(importlib.import_module(home), f"{algorithm.upper()}Params")
-
-
 def _plain(tree: PyTree) -> PyTree:
     """The same parameters as nested dicts, empty where there are none; raises TypeError for anything else."""
     if hasattr(tree, "_asdict"):
@@ -158,5 +165,9 @@ def _nest(paths: Sequence[str], leaves: Sequence[Any]) -> dict[str, Any]:
         node = tree
         for parent in parents:
             node = node.setdefault(parent, {})
+            if not isinstance(node, dict):
+                raise UserError(f"{parent} is an array, and holds others as {path}; take another prior")
+        if name in node:
+            raise UserError(f"{path} comes twice; take another prior")
         node[name] = leaf
     return tree

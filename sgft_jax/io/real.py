@@ -3,16 +3,21 @@
 import contextlib
 import json
 import os
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from envs.files import read_text
+from sgft_jax.io.arrays import flags, numbers, read_npz
 from sgft_jax.types import UserError
 
 _REAL, _ROLLOUT, _HALF, _STEPS = "real", "rollout-", ".half", ".steps.jsonl"
-_ROWS, _FACTS = ("obs", "action", "reward", "discount", "next_obs"), ("valid", "success")
+_ROWS = ("obs", "action", "reward", "discount", "next_obs")
+_LONGEST = 2**30  # bytes of a journal
+_FIX = "docs/formats.md lists what a rollout holds"
 
 
 class RealStore:
@@ -31,13 +36,12 @@ class RealStore:
 
     def __len__(self) -> int:
         """Rollouts on disk."""
-        numbers = [int(path.stem.removeprefix(_ROLLOUT)) for path in self.folder.glob(f"{_ROLLOUT}*.npz")]
-        return max(numbers, default=-1) + 1
+        return max(map(_number_of, self.folder.glob(f"{_ROLLOUT}*.npz")), default=-1) + 1
 
     def append(self, rollout: Mapping[str, Any]) -> int:
         """Store one rollout, {name: array [..., T, ...]}, and return its number once it is safely on disk."""
         arrays = {name: np.asarray(x) for name, x in rollout.items()}
-        if unfit := [name for name, x in arrays.items() if x.dtype.kind not in "biufcSU"]:
+        if unfit := [name for name, x in arrays.items() if x.dtype.kind not in "biufSU"]:
             raise TypeError(f"a rollout holds plain numeric arrays only, not {unfit}")
         number = len(self)
         path = self._path(number)
@@ -55,11 +59,11 @@ class RealStore:
         path = self._path(number)
         if not path.exists():
             raise UserError(f"{path}: rollout {number} is missing; this run cannot go on without it")
-        try:
-            with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
-                return {name: stored[name] for name in stored.files}
-        except Exception as error:  # numpy raises half a dozen types for a damaged archive
-            raise UserError(f"{path}: damaged: {error}") from error
+        return read_npz(path)
+
+    def rollout(self, number: int) -> dict[str, np.ndarray]:
+        """One rollout of [S] seeds and T steps, as docs/formats.md lists its arrays; UserError where it is none."""
+        return _checked(self._path(number), self.load(number))
 
     def journal(self, number: int, *, sync_every: int = 1) -> "Journal":
         """Where the steps of a rollout go while it is played."""
@@ -87,15 +91,18 @@ class Journal:
         """
         if not self.path.exists():
             return []
-        lines = self.path.read_text().split("\n")[:-1]  # what follows the last newline was never finished
+        lines = read_text(self.path, limit=_LONGEST).split("\n")[:-1]  # what follows the last newline is torn
         if not lines:
             return []
         try:
-            first, *steps = [json.loads(line) for line in lines]
-            types = first["types"]
-            return [{name: np.array(x, types[name]) for name, x in step.items()} for step in steps or [first["asked"]]]
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            first, *steps = [json.loads(line) for line in lines]  # an outcome that is nan or infinite is one, too
+            asked, types = first["asked"], {name: np.dtype(str(kind)) for name, kind in first["types"].items()}
+            read = [{name: _typed(step[name], kind) for name, kind in types.items()} for step in (asked, *steps)]
+            if any(x.shape != read[0][name].shape for step in read for name, x in step.items()):
+                raise ValueError("its steps differ in size")
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
             raise UserError(f"{self.path}: damaged: {error}; move it away to go on without these steps") from error
+        return read[1:] or read
 
     def begin(self, asked: Mapping[str, np.ndarray]) -> None:
         """Says what the first step is asked to be, {name: array}, on disk before it is."""
@@ -157,23 +164,70 @@ def home_of(folder: Path) -> Path | None:
 def played(home: Path) -> list[Played]:
     """The episodes in `<home>/real/`, all of the first seed first; raises UserError for what is no rollout of ours."""
     store = RealStore(home)
-    stored = [store.load(number) for number in range(len(store))]
+    stored = [store.rollout(number) for number in range(len(store))]
     for number, arrays in enumerate(stored):
-        path = store.folder / f"{_ROLLOUT}{number:06d}.npz"
-        if missing := {*_ROWS, *_FACTS} - set(arrays):
-            raise UserError(f"{path}: lacks {min(missing)}; docs/formats.md lists what a rollout holds")
-        _check_shapes(path, arrays, stored[0])
+        for name in _ROWS:
+            (seeds, steps), wanted = arrays["valid"].shape, stored[0][name].shape
+            here = [len(stored[0]["valid"]), steps, *wanted[2:]]
+            if list(arrays[name].shape) != here:
+                path = store.folder / f"{_ROLLOUT}{number:06d}.npz"
+                raise UserError(f"{path}: {name} has shape {list(arrays[name].shape)}, here {here}; keep it apart")
     seeds = range(len(stored[0]["valid"]))
     return [_of_seed(arrays, seed, number) for seed in seeds for number, arrays in enumerate(stored)]
 
 
-def _check_shapes(path: Path, arrays: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray]) -> None:
-    """Raises UserError where an array of a rollout does not go with its `valid`, or with those of the first one."""
-    there = (*first["valid"].shape[:1], *arrays["valid"].shape[1:2])  # seeds and steps
-    for name in (*_ROWS, *_FACTS):
-        wanted = there[:1] if name == "success" else (*there, *first[name].shape[2:])
-        if len(there) < 2 or arrays[name].shape != wanted:
-            raise UserError(f"{path}: {name} has shape {list(arrays[name].shape)}, here {list(wanted)}; keep it apart")
+def _number_of(path: Path) -> int:
+    """The number in the name of a stored rollout."""
+    match = re.fullmatch(rf"{_ROLLOUT}([0-9]{{6,12}})\.npz", path.name)
+    if match is None:
+        raise UserError(f"{path}: is no name of a rollout, such as {_ROLLOUT}000000.npz; move it away or rename it")
+    return int(match[1])
+
+
+def _checked(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The arrays of a rollout with flags as bool and rows as float32, of which the valid ones are finite."""
+    if missing := {*_ROWS, "valid", "success"} - set(arrays):
+        raise UserError(f"{path}: lacks {min(missing)}; {_FIX}")
+    valid = flags(path, "valid", arrays["valid"], (None, None), fix=_FIX)
+    n, steps = valid.shape
+    if not valid.size:
+        raise UserError(f"{path}: has no step; {_FIX}")
+    vector, number, before = (n, steps, None), (n, steps), np.pad(valid, ((0, 0), (0, 1)))
+    rows = {
+        "obs": vector,
+        "action": vector,
+        "next_obs": vector,
+        "command": vector,
+        "reward": number,
+        "discount": number,
+    }
+    beside = {"total_reward": (n,), "score": (n,), "world": (n,), "late": (n, None), "time": (n, None)}
+    read = dict(arrays, valid=valid)
+    for name in {"success", "exploded"} & set(arrays):
+        read[name] = flags(path, name, arrays[name], (n,), fix=_FIX)
+    for name in rows.keys() & arrays.keys():
+        read[name] = numbers(path, name, arrays[name], rows[name], fix=_FIX, valid=valid)
+    for name, other in (("next_obs", "obs"), ("command", "action")):
+        if name in read and read[name].shape != read[other].shape:
+            raise UserError(f"{path}: {name} has {read[name].shape[2]} entries, {other} {read[other].shape[2]}; {_FIX}")
+    for name in beside.keys() & arrays.keys():  # of an episode that exploded they may be anything
+        numbers(path, name, arrays[name], beside[name], fix=_FIX, valid=np.zeros((), bool))
+    if "trace" in arrays:
+        numbers(path, "trace", arrays["trace"], (n, steps + 1, None), fix=_FIX, valid=before)
+    if "world" in arrays and (arrays["world"].dtype.kind not in "iu" or (arrays["world"] < 0).any()):
+        raise UserError(f"{path}: world is {arrays['world'].tolist()}, no numbers of worlds; {_FIX}")
+    if ((discount := read["discount"][valid]) < 0).any() or (discount > 1).any():
+        raise UserError(f"{path}: discount is not between 0 and 1; {_FIX}")
+    return read
+
+
+def _typed(value: Any, kind: np.dtype) -> np.ndarray:
+    """What a line of a journal says, as it was; ValueError for what cannot have been written."""
+    plain = np.asarray(value).dtype.kind
+    if kind.kind not in "biuf" or plain not in "biuf" or (kind.kind == "b") != (plain == "b"):
+        raise ValueError(f"{value!r:.40} is no {kind}")
+    with np.errstate(over="ignore"):
+        return np.array(value, kind)
 
 
 def _of_seed(arrays: Mapping[str, np.ndarray], seed: int, number: int) -> Played:

@@ -1,64 +1,59 @@
 """Impure: the life of a run folder: made once, resumed or replaced on request, with its configuration and origin."""
 
 import dataclasses
-import fcntl
 import importlib.metadata
 import os
 import platform
 import re
 import shlex
-import shutil
 import subprocess
 import sys
-import weakref
 from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Annotated, Any, Literal, TypedDict
 
-from envs.files import Count, read_json, read_object
+from msgspec import Meta
+
+from envs.files import Schema, read_object
+from sgft_jax.io.folders import ASIDE, Lock, empty
 from sgft_jax.io.jsonfile import differences, write_json
 from sgft_jax.types import UserError
 
 CONFIG, PROVENANCE = "config.json", "provenance.json"
 ROOT = Path(__file__).parents[2]  # of the repository, in a checkout
-_LOCK = ".lock"
 _MARK = "sgft_jax"
-FORMAT = 2  # of run folders; a state saved by another format does not fit the code of this one
+FORMAT = 3  # of run folders; a state saved by another format does not fit the code of this one
 # What a start has to show for itself; one that has failed before any of it is there can be forgotten.
-_RESULTS = ("checkpoints/[0-9]*", "real/*.npz", "evaluation/*/real/*.npz", "prior/*", "policy/*", "summary.json")
+_STEPS = ("checkpoints/[0-9]*", f"checkpoints/{ASIDE}[0-9]*")
+_RESULTS = (*_STEPS, "real/*.npz", "evaluation/*/real/*.npz", "prior/*", "policy/*", "summary.json")
 _PACKAGES = ("sgft-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
-class InUseError(UserError):
-    """Another process has the run folder open."""
+class Options(TypedDict, total=False):
+    """What readers ask of the options of a run, whatever command it is of."""
+
+    task: str
+    seed: Annotated[int, Meta(ge=0, le=2**31 - 1)]
+    method: str
+    real: str | None
+    set: list[str]
+    prior: str | None
+    preset: str | None
+    variant: str | None
+    impl: Literal["auto", "jax", "warp", "c"]
 
 
-class Lock:
-    """An exclusive lock on a folder, held until `release()`, collection or the end of the process, however it ends.
-
-    Raises InUseError if another process, or another Run of this one, holds it.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        handle = os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o644)
-        self.release = weakref.finalize(self, os.close, handle)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self.release()
-            raise InUseError(f"{folder}: another process is writing to it") from None
+class _Git(TypedDict):
+    commit: str
 
 
-def in_use(folder: Path) -> bool:
-    """Whether somebody holds the lock of a run folder."""
-    if not (folder / _LOCK).exists():
-        return False
-    try:
-        Lock(folder).release()
-    except InUseError:
-        return True
-    return False
+class _Start(TypedDict, total=False):
+    started: str
+    git: _Git | None
+    versions: dict[str, str]
+    device: dict[str, Any]
+    priors: list[str]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,7 +106,7 @@ def open_runs(
         raise
     for run, config, there in zip(runs, configs.values(), existing, strict=True):
         if there and not resume:
-            _empty(run.folder)
+            empty(run.folder, last=CONFIG)
         _record(run, kind, config, inputs)
     return runs
 
@@ -194,7 +189,9 @@ def check_start(folder: Path, *, resume: bool, overwrite: bool) -> bool:
 def check_folder(folder: Path, option: str = "--out") -> None:
     """Raises UserError, which names the option, where no folder can be made or written; makes nothing itself."""
     try:
-        there = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
+        there = next(path for path in (folder, *folder.absolute().parents) if path.is_symlink() or path.exists())
+        if not there.exists():
+            raise UserError(f"{folder}: cannot be made, {there} is a link that leads nowhere; choose another {option}")
     except OSError as error:  # such as a name that is too long
         raise UserError(
             f"{folder}: cannot be made ({(error.strerror or '').lower()}); choose another {option}"
@@ -206,43 +203,38 @@ def check_folder(folder: Path, option: str = "--out") -> None:
         raise UserError(f"{folder}: cannot be written, you may not write to {there}; choose another {option}")
 
 
-class Options(TypedDict, total=False):
-    """What those who read a run know of its options; there are more."""
-
-    task: str
-    method: str
-    variant: str
-    preset: str
-    prior: str | None
-    seed: Count
-
-
-def read_own(path: Path, needed: Mapping[str, type] | None = None, *, otherwise: str = "") -> dict[str, Any]:
+def read_own(path: Path, needed: Schema | None = None, *, otherwise: str = "") -> dict[str, Any]:
     """The JSON object that a run has written to a file, {} where there is no such file.
 
-    needed: as of `read_object`. otherwise: what else than putting the file back mends it. Raises UserError where it is
-    no such object.
+    needed: the schema of `read_object`. otherwise: what else than putting the file back mends it. Raises UserError
+    where it is no such object.
     """
     if not path.exists():
         return {}
     return read_object(path, needed or {}, f"put back the file that the run has written{otherwise}")
 
 
+def read_config(folder: Path) -> dict[str, Any]:
+    """The options of the run in a folder, checked as `Options`; {} where a robot has recorded without a run."""
+    return read_own(folder / CONFIG, {"config": Options}).get("config", {})
+
+
+def read_starts(folder: Path) -> list[dict[str, Any]]:
+    """What the provenance of a run says of its starts; [] where there is none."""
+    begin = ", or begin again with --overwrite"
+    return read_own(folder / PROVENANCE, {"starts": list[_Start]}, otherwise=begin).get("starts", [])
+
+
 def _record(run: Run, kind: str, config: Mapping[str, Any], inputs: Mapping[str, Any]) -> None:
     """Write down the start with what it begins with, and the configuration if it is the first one."""
     if not run.resumed:
         write_json(run.folder / CONFIG, {_MARK: _version("sgft-jax"), "format": FORMAT, "kind": kind, "config": config})
-    write_json(run.folder / PROVENANCE, {"starts": [*_starts(run.folder), {**provenance(), **inputs}]})
-
-
-def _starts(folder: Path) -> list[dict[str, Any]]:
-    found = read_own(folder / PROVENANCE, {"starts": list}, otherwise=", or begin again with --overwrite")
-    return found.get("starts", [])
+    write_json(run.folder / PROVENANCE, {"starts": [*read_starts(run.folder), {**provenance(), **inputs}]})
 
 
 def _check_inputs(folder: Path, inputs: Mapping[str, Any]) -> None:
     """Raises UserError if the run began with others; runs of earlier versions do not say."""
-    for start in _starts(folder):
+    for start in read_starts(folder):
         for name, now in inputs.items():
             if (before := start.get(name, now)) != now:
                 raise UserError(
@@ -260,10 +252,8 @@ def _check_ours(folder: Path, *, resume: bool, overwrite: bool) -> None:
 
 
 def _stored(folder: Path) -> dict[str, Any]:
-    stored = read_json(folder / CONFIG)
-    if not isinstance(stored, dict) or not {_MARK, "kind", "config"} <= set(stored):
-        raise UserError(f"{folder / CONFIG}: was not written by this project")
-    return stored
+    schema = {_MARK: str, "kind": str, "config": dict}
+    return read_object(folder / CONFIG, schema, "it was not written by this project, or put it back")
 
 
 def check_same(folder: Path, kind: str, wanted: Mapping[str, Any], volatile: tuple[str, ...]) -> None:
@@ -283,12 +273,3 @@ def check_same(folder: Path, kind: str, wanted: Mapping[str, Any], volatile: tup
     if differing:
         listed = "; ".join(f"{name} was {old!r}, now {new!r}" for name, old, new in differing)
         raise UserError(f"{folder}: cannot resume with another configuration: {listed}")
-
-
-def _empty(folder: Path) -> None:
-    """Delete the content of a folder that `_check_ours` accepted, its mark last; links are removed, never followed."""
-    for path in sorted(folder.iterdir(), key=lambda p: p.name == CONFIG):
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        elif path.name != _LOCK:
-            path.unlink()

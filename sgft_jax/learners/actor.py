@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import (
+    Network,
     add_noise,
     make_actor,
     make_affine_actor,
@@ -32,6 +33,14 @@ class ACTORParams(NamedTuple):
     normalizer: Normalizer
 
 
+def make_actor_of(head: Head, obs_dim: int, act_dim: int, network: NetworkConfig) -> Network:
+    """The network of an actor whose last layer says what `head` names."""
+    if head == "deterministic":
+        return make_deterministic_actor(obs_dim, act_dim, network)
+    make = make_actor if head == "gaussian" else functools.partial(make_affine_actor, output_gain=1.0)
+    return make(obs_dim, act_dim, network)  # the gain only says where training begins
+
+
 def actor_policy(obs_dim: int, act_dim: int, network: NetworkConfig, head: Head) -> Policy:
     """How such an actor acts.
 
@@ -39,21 +48,19 @@ def actor_policy(obs_dim: int, act_dim: int, network: NetworkConfig, head: Head)
     explores with noise of std 0.1, which is cut off at the bounds, so its actions have no density.
     """
     log_prob: Callable[[ACTORParams, Array, Array], Array] | None = None
+    actor = make_actor_of(head, obs_dim, act_dim, network)
     if head == "deterministic":
-        point = make_deterministic_actor(obs_dim, act_dim, network)
 
         def choose(params: PyTree, obs: Array, key: Key, explore: bool | Array) -> Array:
-            return add_noise(point.apply(params, obs), jnp.where(explore, _EXPLORE_NOISE, 0.0), key)
+            return add_noise(actor.apply(params, obs), jnp.where(explore, _EXPLORE_NOISE, 0.0), key)
 
     else:
-        make = make_actor if head == "gaussian" else functools.partial(make_affine_actor, output_gain=1.0)
-        spread = make(obs_dim, act_dim, network)  # the gain only says where training begins
 
         def choose(params: PyTree, obs: Array, key: Key, explore: bool | Array) -> Array:
-            return tanh_gaussian_action(spread.apply(params, obs), key, explore=explore)
+            return tanh_gaussian_action(actor.apply(params, obs), key, explore=explore)
 
         def density(params: ACTORParams, obs: Array, action: Array) -> Array:
-            moments = spread.apply(params.actor, normalize(params.normalizer, obs))
+            moments = actor.apply(params.actor, normalize(params.normalizer, obs))
             return tanh_gaussian_log_prob(moments, untanh(action))
 
         log_prob = density

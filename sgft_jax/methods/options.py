@@ -117,7 +117,7 @@ class ModelOptions(KeptCriticOptions):
 
 
 def updates_per_rollout(options: LoopOptions, task: Task) -> int:
-    """Gradient updates that follow one real rollout."""
+    """Gradient updates that follow one real rollout of full length; `finetune` makes fewer after a shorter one."""
     return max(round(options.utd * task.episode_length), 1)
 
 

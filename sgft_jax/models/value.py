@@ -1,4 +1,7 @@
-"""V_sim: the frozen, deterministic value of the simulator's policy, and how well it predicts returns."""
+"""V_sim: the frozen, deterministic value of the simulator's policy, and how well it predicts returns.
+
+It is the mean of the critic over the policy's actions. A critic of SAC counts later entropy too, see `value_loss`.
+"""
 
 import jax
 import jax.numpy as jnp

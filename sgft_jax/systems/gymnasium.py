@@ -1,6 +1,8 @@
 """Impure: real systems that are Gymnasium environments, stepped from Python."""
 
+import contextlib
 import functools
+import itertools
 import statistics
 import time
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
@@ -12,9 +14,12 @@ import numpy as np
 
 from envs.base import Entry, Env
 from envs.history import remember, with_memory
-from envs.rollout import Episode, episode_keys
+from envs.rollout import Episode, episode_keys, judged
 from sgft_jax import extend
 from sgft_jax.mesh import split_vmap
+from sgft_jax.systems import answers
+from sgft_jax.systems.answers import Answer
+from sgft_jax.systems.robot_client import SUCCESS
 from sgft_jax.types import Array, Key, PyTree, Transition, UserError
 
 if TYPE_CHECKING:
@@ -22,9 +27,9 @@ if TYPE_CHECKING:
 
     from sgft_jax.systems.remote import Remote
 
-SUCCESS = ("is_success", "success")  # what `info` may call it; the first that is there counts
-_RETURNED = {"reset": ("observation", "info"), "step": ("observation", "reward", "terminated", "truncated", "info")}
 _TRIES = 20  # actions that are timed before a robot with a clock moves
+_STARTS, _PAUSE = 4, 0.5  # times that a start is asked for until all its numbers are finite, and seconds in between
+_BOUND = 1e9  # larger bounds of actions are those of a type of number, not of a machine
 Observe = Callable[[Any], Any]
 
 
@@ -61,9 +66,11 @@ class Gymnasium:
     The environment moves, rewards and ends episodes. The task says how long an episode lasts at most, and what success
     is where `info` has neither `is_success` nor `success`; imagined steps have its reward. Where an environment does
     not know the reward (nan), the task says what the step earned and whether it ended the episode. Actions in [-1, 1]
-    are scaled to the bounds of the action space; what `info["sent"]` says was commanded instead is what is kept.
-    `info["invalid"]`, or a number that is not finite, ends an episode like exploded physics: the step is not learned
-    from. An environment with a method `rest` hears when its episode is over.
+    are scaled to the bounds of the action space, and rounded where those are whole numbers; what was sent is what is
+    kept, also where `info["sent"]` says that something else was. `info["invalid"]`, a number that is not finite or
+    beyond 1e18, or an action that is not finite, which is not sent, ends an episode like exploded physics: the step is
+    not learned from. A start with such a number is asked for again, a few times. An environment with a method `rest`
+    hears when its episode is over, or when it has returned what cannot be used, which raises UserError.
 
     env: the task. real: an environment, several, or a vector environment with one for each member; or a robot behind a
     socket, `Remote`. A vector environment also steps members whose episode is over. gamma: discount factor of the
@@ -83,9 +90,10 @@ class Gymnasium:
     ) -> None:
         self.env, self.gamma = env, gamma
         self._real = _played(real)
-        self._observe = observe or _reader(env.measured, self._real)
-        low, high = _bounds(env, self._real)
+        self._observe = extend.guard("observe of", self._real.name, observe or _reader(env.measured, self._real))
+        self._low, self._high = low, high = _bounds(env, self._real)
         self._middle, self._half = (low + high) / 2, (high - low) / 2  # what an action of 0 is, and one of 1 beyond it
+        self._whole = np.dtype(self._real.action.dtype).kind in "iu"
         self._draw = jax.jit(jax.vmap(self._drawn))
         self._programs: dict[Callable[..., Any], Callable[..., tuple[Array, PyTree]]] = {}
         self._judge = None
@@ -124,23 +132,25 @@ class Gymnasium:
         actions = np.zeros((members, env.previous_actions, env.act_dim), np.float32)
         going = np.ones(members, bool)
         new, act = policy.act not in self._programs, self._program(policy)
-        seen = with_memory(env, self._measured(self._real.reset(seeds.tolist())), actions)
         try:
+            seen = with_memory(env, self._started(seeds.tolist()), actions)
             if new and self._real.answer_within is not None:
                 self._check_speed(lambda: act(latest(), carry, seen, act_keys, 0, explore), self._real.answer_within)
                 if self._judge is not None:  # compiled before the robot's clock runs
                     jax.block_until_ready(self._judge(seen, np.zeros((members, env.act_dim), np.float32), seen))
             for t in range(env.episode_length):
                 wanted, carry = act(latest(), carry, seen, act_keys, t, explore)
-                command = np.asarray(wanted)
+                wanted = np.asarray(wanted)
+                asks = np.isfinite(wanted).all(1)
+                command = np.where(asks[:, None], wanted, np.float32(0))
                 if t == 0:
                     asked(_in_doubt(seen, command, ~going, np.full(members, time.time())))
-                after = self._real.step(self._commanded(command), going)
-                action = self._sent(command, after.infos)
+                after = self._after(self._commanded(command), going & asks)
+                action = self._sent(command, after)
                 actions = remember(actions, action)
-                following = with_memory(env, self._measured(after.obs), actions)
+                following = with_memory(env, self._measured("step", after.obs), actions)
                 judged = self._judged(after, seen, action, following)
-                step = _step(going, seen, command, action, judged, following)
+                step = _step(going, asks, seen, command, action, judged, following)
                 yield step
                 going = ~step.over
                 if not going.any():
@@ -167,7 +177,7 @@ class Gymnasium:
             total_reward=total,
             success=succeeded & ~exploded,
             exploded=exploded,
-            score=(succeeded & ~exploded).astype(jnp.float32) if env.score == "success" else total,
+            score=judged(env, total, succeeded & ~exploded, exploded),
             world=jnp.zeros(len(valid), jnp.int32),
             trace=jnp.zeros((len(valid), env.episode_length + 1, 0)),
             command=kept(rows.command),
@@ -208,21 +218,45 @@ class Gymnasium:
         _, _, keys = episode_keys(jax.random.key(seed), self.env.episode_length)
         return seed, keys[:, 0]
 
+    def _started(self, seeds: list[int]) -> np.ndarray:
+        """[M, measured_dim] at the start of an episode. A camera may need a moment until it sees."""
+        for tries in itertools.count(1):
+            seen = self._measured("reset", self._real.reset(seeds))
+            if (sound := answers.sound(seen)).all():
+                return seen
+            if tries == _STARTS:
+                number = int(np.argwhere(~sound)[0, 1])
+                raise UserError(
+                    f"reset of {self._real.name}: measured number {number} is {seen[~sound][0]:g} after {tries} tries; "
+                    "no episode can begin there"
+                )
+            time.sleep(_PAUSE)
+        raise AssertionError
+
     def _commanded(self, action: np.ndarray) -> np.ndarray:
         """[M, act_dim] from [-1, 1] to the bounds of the action space."""
-        return self._middle + action * self._half
+        commanded = self._middle + action * self._half
+        return np.clip(np.rint(commanded), self._low, self._high) if self._whole else commanded
 
-    def _sent(self, action: np.ndarray, infos: "Sequence[Mapping[str, Any]]") -> np.ndarray:
-        """[M, act_dim] in [-1, 1], what was really commanded, as far as `infos` tell."""
-        told = [
-            (info["sent"] - self._middle) / self._half if "sent" in info else own
-            for own, info in zip(action, infos, strict=True)
+    def _after(self, commanded: np.ndarray, going: np.ndarray) -> "_After":
+        """What a step leads to. commanded: [M, act_dim]. going: [M], the members that take it."""
+        shape, dtype = self._real.action.shape, self._real.action.dtype
+        returned = self._real.step(commanded.reshape(-1, *shape).astype(dtype), going)
+        checked = [
+            answers.step(self._real.name, one, self._low, self._high) if on else answers.idle(one[0])
+            for one, on in zip(returned, going, strict=True)
         ]
-        return np.stack(told).astype(np.float32)
+        sent = [one.sent if one.sent is not None else asked for one, asked in zip(checked, commanded, strict=True)]
+        return _After.of(checked, np.stack(sent))
+
+    def _sent(self, action: np.ndarray, after: "_After") -> np.ndarray:
+        """[M, act_dim] in [-1, 1], what was really commanded; what was asked for unless that is known to differ."""
+        told = (after.sent - self._middle) / self._half
+        return np.where(after.differs[:, None] | self._whole, told, action).astype(np.float32)
 
     def _judged(self, after: "_After", seen: np.ndarray, action: np.ndarray, following: np.ndarray) -> "_After":
         """With what the task says of steps whose reward the environment does not know."""
-        unknown = np.isnan(after.reward) & np.array(["invalid" not in info for info in after.infos])
+        unknown = np.isnan(after.reward) & ~after.invalid
         if not unknown.any():
             return after
         if self._judge is None:
@@ -234,14 +268,11 @@ class Gymnasium:
             reward=np.where(unknown, reward, after.reward), terminated=np.where(unknown, terminated, after.terminated)
         )
 
-    def _measured(self, returned: Sequence[Any]) -> np.ndarray:
-        """[M, measured_dim] of what every environment has returned."""
-        found = [np.asarray(self._observe(one), np.float32).reshape(-1) for one in returned]
-        if found[0].size != self.env.measured_dim:
-            raise UserError(
-                f"observe: returns {found[0].size} numbers, the task {self.env.name} measures {_sizes(self.env)}"
-            )
-        return np.stack(found)
+    def _measured(self, method: str, returned: Sequence[Any]) -> np.ndarray:
+        """[M, measured_dim] of what a method of every environment has returned."""
+        where, sizes = f"{method} of {self._real.name}", f"the task {self.env.name} measures {_sizes(self.env)}"
+        size = self.env.measured_dim
+        return np.stack([answers.measured(where, self._observe(one), size, sizes) for one in returned])
 
     def _success(self, rows: Step) -> np.ndarray:
         """[M] bool, of the last step, or of any where that is what the task asks."""
@@ -269,27 +300,41 @@ def seed_of(key: Key) -> Array:
 
 
 class _After(NamedTuple):
-    """What a step of M environments returned. obs: M of what they return; arrays [M]; infos: M dicts."""
+    """What a step of M environments led to, see `Answer`. obs: M of what they return. differs: [M], known from them."""
 
     obs: Sequence[Any]
     reward: np.ndarray
     terminated: np.ndarray
     truncated: np.ndarray
-    infos: Sequence[Mapping[str, Any]]
+    success: np.ndarray
+    invalid: np.ndarray
+    late: np.ndarray
+    sent: np.ndarray
+    differs: np.ndarray
+
+    @classmethod
+    def of(cls, checked: Sequence[Answer], sent: np.ndarray) -> "_After":
+        """sent: [M, act_dim] what was commanded, in their units."""
+        obs, reward, terminated, truncated, success, invalid, late, told = zip(*checked, strict=True)
+        with np.errstate(over="ignore"):  # beyond float32 is as good as not finite
+            rewards = np.array(reward, np.float32)
+        return cls(
+            obs, rewards, np.array(terminated), np.array(truncated),
+            np.array([-1 if known is None else known for known in success], np.int8), np.array(invalid),
+            np.array(late), sent, np.array([own is not None for own in told]),
+        )  # fmt: skip
 
 
 def _step(
-    going: np.ndarray, seen: np.ndarray, command: np.ndarray, action: np.ndarray, after: _After, following: np.ndarray
-) -> Step:
-    """The step of the members that are `going` [M]."""
-    finite = np.isfinite(following).all(1) & np.isfinite(after.reward)
-    bad = ~finite | _flag("invalid", after.infos)
-    told = [[info[name] for name in SUCCESS if name in info] for info in after.infos]
-    success = [int(bool(own[0])) if own and on else -1 for own, on in zip(told, going & ~bad, strict=True)]
+    going: np.ndarray, asks: np.ndarray, seen: np.ndarray, command: np.ndarray, action: np.ndarray, after: _After,
+    following: np.ndarray,
+) -> Step:  # fmt: skip
+    """The step of the members that are `going` [M]; of those a policy `asks` [M] nothing of, no step was made."""
+    bad = ~asks | ~answers.sound(following).all(1) | ~answers.sound(after.reward) | after.invalid
     return Step(
-        seen, action, command, after.reward, after.terminated, following, going & ~bad, np.array(success, np.int8),
-        going & bad, ~going | bad | after.terminated | after.truncated, going & _flag("late", after.infos),
-        np.full(len(going), time.time()),
+        seen, action, command, after.reward, after.terminated, following, going & ~bad,
+        np.where(going & ~bad, after.success, np.int8(-1)), going & bad,
+        ~going | bad | after.terminated | after.truncated, going & after.late, np.full(len(going), time.time()),
     )  # fmt: skip
 
 
@@ -300,11 +345,6 @@ def _in_doubt(seen: np.ndarray, command: np.ndarray, over: np.ndarray, when: np.
         seen, np.zeros_like(command), command, zero, no, np.zeros_like(seen), no, np.full(len(seen), -1, np.int8),
         ~over, ~no, no, when,
     )  # fmt: skip
-
-
-def _flag(name: str, infos: Sequence[Mapping[str, Any]]) -> np.ndarray:
-    """[M] bool, False where `info` does not have it."""
-    return np.array([bool(info.get(name, False)) for info in infos])
 
 
 def _padded(rows: np.ndarray, length: int) -> np.ndarray:
@@ -339,8 +379,8 @@ class _Real(Protocol):
         """What each one returns at its start."""
         ...
 
-    def step(self, actions: np.ndarray, going: np.ndarray) -> _After:
-        """actions: [M, act_dim]. going: [M], whose episode goes on; the others may stay as they are."""
+    def step(self, actions: np.ndarray, going: np.ndarray) -> Sequence[tuple[Any, ...]]:
+        """Five parts from each one. actions: [M, *shape of an action]. going: [M]; the others may stay as they are."""
         ...
 
     def rest(self) -> None:
@@ -356,11 +396,15 @@ class _Each:
     """Environments of their own. Those whose episode is over are left alone."""
 
     def __init__(self, each: "Sequence[gymnasium.Env]") -> None:
+        if not each:
+            raise UserError("no environment is given; make one for each seed")
         first = each[0]
         self.each, self.count, self.name = each, len(each), str(first.spec.id if first.spec else first.unwrapped)
         self.observation, self.action = first.observation_space, first.action_space
         if len({id(one) for one in each}) < len(each):
             raise UserError(f"{self.name}: the same environment is given twice; make one for each seed")
+        if any((one.observation_space, one.action_space) != (self.observation, self.action) for one in each[1:]):
+            raise UserError(f"{self.name}: the spaces of its {len(each)} environments differ; make them alike")
         self._obs: Sequence[Any] = []
 
     @property
@@ -372,21 +416,25 @@ class _Each:
         self._obs = [_asked(self.name, one, "reset", seed=seed)[0] for one, seed in each]
         return self._obs
 
-    def step(self, actions: np.ndarray, going: np.ndarray) -> _After:
-        found = [
-            _asked(self.name, one, "step", action.astype(self.action.dtype)) if on else (obs, 0.0, True, False, {})
+    def step(self, actions: np.ndarray, going: np.ndarray) -> Sequence[tuple[Any, ...]]:
+        returned = [
+            _asked(self.name, one, "step", action) if on else (obs, 0.0, True, False, {})
             for one, action, on, obs in zip(self.each, actions, going, self._obs, strict=True)
         ]
-        self._obs, reward, terminated, truncated, infos = zip(*found, strict=True)
-        return _After(self._obs, np.array(reward, np.float32), np.array(terminated), np.array(truncated), infos)
+        self._obs = [one[0] for one in returned]
+        return returned
 
     def rest(self) -> None:
-        for one in self.each:
-            getattr(one, "rest", _nothing)()
+        self._end("rest", [getattr(one, "rest", _nothing) for one in self.each])
 
     def close(self, *, over: bool) -> None:
-        for one in self.each:
-            getattr(one, "close" if over else "leave", one.close)()
+        self._end("close", [getattr(one, "close" if over else "leave", one.close) for one in self.each])
+
+    def _end(self, method: str, endings: Sequence[Callable[[], None]]) -> None:
+        """All of them, also where one raises."""
+        with contextlib.ExitStack() as last:
+            for ending in reversed(endings):
+                last.callback(extend.guard(f"{method} of", self.name, ending))
 
 
 class _Vector:
@@ -406,15 +454,10 @@ class _Vector:
             )
 
     def reset(self, seeds: list[int]) -> list[Any]:
-        return self._split(_asked(self.name, self.real, "reset", seed=seeds)[0])
+        return answers.split(self.name, "reset", _asked(self.name, self.real, "reset", seed=seeds)[0], self.count)
 
-    def step(self, actions: np.ndarray, going: np.ndarray) -> _After:
-        found = _asked(self.name, self.real, "step", actions.astype(self.action.dtype))
-        obs, reward, terminated, truncated, infos = found
-        told = [_info(infos, i) for i in range(self.count)]
-        last = [own.get("final_obs", seen) for own, seen in zip(told, self._split(obs), strict=True)]  # SAME_STEP
-        told = [{**own, **own.get("final_info", {})} for own in told]
-        return _After(last, np.array(reward, np.float32), np.array(terminated), np.array(truncated), told)
+    def step(self, actions: np.ndarray, going: np.ndarray) -> list[tuple[Any, ...]]:
+        return answers.vector(self.name, _asked(self.name, self.real, "step", actions), self.count)
 
     def rest(self) -> None:
         pass
@@ -422,32 +465,21 @@ class _Vector:
     def close(self, *, over: bool) -> None:
         self.real.close()
 
-    def _split(self, obs: Any) -> list[Any]:
-        """What each environment returned; copies, because a vector environment may write into its arrays again."""
-        return [jax.tree.map(lambda x, i=i: np.array(x[i]), obs) for i in range(self.count)]
-
 
 def _asked(name: str, real: Any, method: str, *given: Any, **named: Any) -> tuple[Any, ...]:
     """What an environment returns; raises UserError, which says where, if it raises or returns other parts."""
-    parts = _RETURNED[method]
-    found = extend.guard(f"{method} of", name, functools.partial(getattr(real, method), *given, **named))()
-    if not isinstance(found, tuple) or len(found) != len(parts):
-        count = f"{len(found)} values" if isinstance(found, tuple) else f"a {type(found).__name__}"
-        raise UserError(f"{method} of {name}: returns {count}, not {', '.join(parts)}")
-    return found
+    ask = extend.guard(f"{method} of", name, functools.partial(getattr(real, method), *given, **named))
+    return answers.parts(name, method, ask())
 
 
 def _nothing() -> None:
     """What most environments do between episodes."""
 
 
-def _info(infos: Mapping[str, Any], i: int) -> dict[str, Any]:
-    """The `info` of environment i: a vector environment says beside every entry for which ones it is there."""
-    there = {name: x for name, x in infos.items() if f"_{name}" in infos and infos[f"_{name}"][i]}
-    return {name: _info(x, i) if isinstance(x, Mapping) else x[i] for name, x in there.items()}
-
-
 def _played(real: Any) -> _Real:
+    for one in real if isinstance(real, Sequence) else [real]:
+        if isinstance(one, type) or not hasattr(one, "step"):
+            raise UserError(f"{one!r} is no Gymnasium environment")
     if isinstance(real, Sequence):
         return _Each(real)
     return _Vector(real) if hasattr(real, "num_envs") else _Each([real])
@@ -463,11 +495,15 @@ def _bounds(env: Env, real: _Real) -> tuple[np.ndarray, np.ndarray]:
         raise UserError(f"{real.name}: its actions are {real.action}; only a Box can be commanded")
     if low.size != env.act_dim:
         raise UserError(f"{real.name}: takes {low.size} numbers as action, the task {env.name} has {env.act_dim}")
-    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+    low, high = (np.asarray(x, np.float64).reshape(-1) for x in (low, high))
+    if not (np.abs([low, high]) <= _BOUND).all():
         raise UserError(
-            f"{real.name}: its actions have no bounds; wrap it in gymnasium.wrappers.RescaleAction or similar"
+            f"{real.name}: its actions have no bounds below {_BOUND:g}; wrap it in gymnasium.wrappers.RescaleAction or "
+            "similar"
         )
-    return low.astype(np.float64).reshape(-1), high.astype(np.float64).reshape(-1)
+    if (fixed := np.flatnonzero(~(low < high))).size:
+        raise UserError(f"{real.name}: number {fixed[0]} of its action can only be {low[fixed[0]]:g}; leave it out")
+    return low, high
 
 
 def _reader(measured: tuple[Entry, ...], real: _Real) -> Observe:
@@ -478,12 +514,22 @@ def _reader(measured: tuple[Entry, ...], real: _Real) -> Observe:
         found = {name: int(np.prod(space.shape)) if space.shape is not None else 0 for name, space in parts.items()}
         if found != sizes:
             raise UserError(f"{real.name}: observes {found}, the task measures {sizes}; {help_}")
-        return lambda obs: np.concatenate([np.asarray(obs[name], np.float32).reshape(-1) for name in sizes])
+        return functools.partial(_joined, real.name, sizes)
     if not hasattr(real.observation, "low"):
         raise UserError(f"{real.name}: observes {real.observation}, neither a Box nor a Dict of them; {help_}")
     if (n := int(np.prod(real.observation.shape))) != sum(sizes.values()):
         raise UserError(f"{real.name}: observes {n} numbers, the task measures {sum(sizes.values())}: {sizes}; {help_}")
     return lambda obs: obs
+
+
+def _joined(name: str, sizes: Mapping[str, int], obs: Any) -> np.ndarray:
+    """The parts of a Dict, one after another."""
+    if not isinstance(obs, Mapping):
+        raise UserError(f"{name}: observes a {type(obs).__name__}, not a mapping with {', '.join(sizes)}")
+    return np.concatenate([
+        answers.measured(f"{part} of {name}", obs.get(part), size, f"its space has {size}")
+        for part, size in sizes.items()
+    ])  # fmt: skip
 
 
 def _sizes(env: Env) -> str:

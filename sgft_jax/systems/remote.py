@@ -8,26 +8,38 @@ episode and is not learned from.
 
 import contextlib
 import hmac
+import ipaddress
 import math
 import queue
 import secrets
+import socket
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, NamedTuple
+from urllib.parse import urlsplit
 
 import numpy as np
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
-from sgft_jax.systems.robot_client import LIMIT, VersionError, array, pack, unpack
+from sgft_jax.systems.door import Door, url
+from sgft_jax.systems.messages import Began, Failed, Hello, Message, Moved, Rested, VersionError, read
+from sgft_jax.systems.robot_client import LIMIT, array, pack, printable
 from sgft_jax.types import UserError
 
 _HELLO = 10.0  # seconds for the first message
 _RESTS = 5  # times a robot is told to rest before it is left alone: without commands it stops by itself
+_FAILURES = 5  # episodes in a row in which a driver fails before its first step is done; then it is not asked again
 _SAME = 0.01  # share by which two periods may differ: 0.033 s is 1 / 30 s
-_SAY_EVERY = 10.0  # seconds between two lines about refused connections
-_GONE = {"type": "gone"}
+_SAY_EVERY = 10.0  # seconds between two lines about refused connections, and about messages that are ignored
+_LINE, _NAME = 600, 40  # letters of a line, and of a robot's name, at most
+_WAITING = 64  # answers that nobody has asked for yet; more are lost, and asked for again
+_ROUNDING = 1e-6
+
+
+class _Gone:
+    """The last answer of a connection."""
 
 
 class Box(NamedTuple):
@@ -55,15 +67,36 @@ class _Refusal(NamedTuple):
 
 
 class _Link(NamedTuple):
-    """A connection that was admitted, and the answers that came through it; the last one is `_GONE`."""
+    """A connection that was admitted, and the answers that came through it; the last one is `_Gone`."""
 
     connection: ServerConnection
-    inbox: queue.SimpleQueue[Mapping[str, Any]]
+    inbox: queue.SimpleQueue[Message | _Gone]
 
     def send(self, message: bytes) -> None:
         """Sends; that a connection is closed is said by the thread that reads it."""
         with contextlib.suppress(ConnectionClosed):
             self.connection.send(message)
+
+    def put(self, message: Message) -> None:
+        """Another answer, unless very many have not been read."""
+        if self.inbox.qsize() < _WAITING:
+            self.inbox.put(message)
+
+
+class _Seldom:
+    """Says one line of a kind, but not one for each of very many."""
+
+    def __init__(self, say: Callable[[str], None]) -> None:
+        self._say, self._lock, self._unsaid, self._last = say, threading.Lock(), 0, -_SAY_EVERY
+
+    def __call__(self, line: str) -> None:
+        with self._lock:
+            now, others = time.monotonic(), self._unsaid
+            if now - self._last < _SAY_EVERY:
+                self._unsaid += 1
+                return
+            self._unsaid, self._last = 0, now
+        self._say(line + (f" ({others} others before it)" if others else ""))
 
 
 class Remote:
@@ -76,67 +109,77 @@ class Remote:
     obs_size, action_size: of the task; a robot with others is refused. period: seconds of a step of the task,
     `env.control_dt`; a robot that says another is refused, and without it none is. steps: after so many the robot ends
     an episode by itself, so that it does not go on when messages are lost. host: interface to listen at, default this
-    computer alone. port: 0 chooses a free one. token: what the robot must know, default a fresh one. again: seconds
-    after which an unanswered message is repeated. say: hears one line about everything unusual.
-    Raises UserError where the port is taken.
+    computer alone. port: 0 chooses a free one. token: what the robot must know, default a fresh one. token_in: where
+    people find it, because it is never printed. again: seconds after which an unanswered message is repeated. say:
+    hears one line about everything unusual.
+    Raises UserError where one cannot listen there, and for sizes and times that cannot be.
     """
 
     def __init__(
         self, obs_size: int, action_size: int, *, period: float | None = None, steps: int | None = None,
-        host: str = "127.0.0.1", port: int = 0, token: str | None = None, again: float = 1.0,
-        say: Callable[[str], None] = print,
+        host: str = "127.0.0.1", port: int = 0, token: str | None = None, token_in: str = "the attribute `token`",
+        again: float = 1.0, say: Callable[[str], None] = print,
     ) -> None:  # fmt: skip
+        if not (obs_size > 0 < action_size and 0 < again < math.inf and (steps is None or steps > 0)):
+            raise UserError("Remote: sizes, steps and `again` must be more than 0")
+        if period is not None and not 0 < period < math.inf:
+            raise UserError(f"Remote: a step cannot take {period} seconds")
         self._period, self._steps = period, steps
         self.obs_size, self.action_size, self.token = obs_size, action_size, token or secrets.token_hex(16)
-        self._again, self._say = again, say
+        self._again, self._say, self._token_in = again, lambda line: say(printable(line, _LINE)), token_in
+        self._refused, self._ignored = _Seldom(self._say), _Seldom(self._say)
         self._lock, self._there = threading.Lock(), threading.Event()
         self._link: _Link | None = None  # to the robot that is connected now
         self._played: _Link | None = None  # to the one that began the episode: no other knows its steps
-        self._refused, self._said = 0, -_SAY_EVERY  # connections since the last line about them, and when that was
-        self._episode, self._step = 0, 0
+        self._episode, self._step, self._failures, self._reason = 0, 0, 0, ""
         self._obs = np.zeros(obs_size, np.float32)
         self.answer_within: float | None = None  # seconds in which the connected robot wants a command
         self.observation_space = Box(*(x * np.full(obs_size, np.inf, np.float32) for x in (-1, 1)))
         self.action_space = Box(*(x * np.ones(action_size, np.float32) for x in (-1, 1)))
         self.spec, self.unwrapped = None, self
-        try:
-            self._server = serve(
-                self._serve, host, port, max_size=LIMIT, max_queue=16, compression=None, open_timeout=_HELLO
-            )
-        except OSError as error:
-            raise UserError(f"cannot listen at {host}:{port} ({error.strerror}); choose another port") from error
-        self.url = "ws://{}:{}".format(*self._server.socket.getsockname()[:2])
+        self._host, self._door = host, Door(host, port)
+        self._server = serve(
+            self._serve, sock=self._door, origins=[None], max_size=LIMIT, max_queue=16, compression=None,
+            open_timeout=_HELLO,
+        )  # fmt: skip
+        self.url = url(host, self._door.port)
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()
 
     def reset(self, *, seed: int) -> tuple[np.ndarray, dict[str, Any]]:
-        """Has the robot begin an episode; returns what it measures, [obs_size], and nothing else."""
-        while True:
+        """Has the robot begin an episode; returns what it measures, [obs_size], and nothing else.
+
+        Raises UserError where its driver has failed again and again.
+        """
+        pause = 0.0
+        while self._failures < _FAILURES:
+            time.sleep(pause)  # a robot that cannot begin now may be able to later
             self._played = self._wait()
             self._episode, self._step = self._episode + 1, 0
-            said = self._ask(pack("reset", episode=self._episode, seed=seed, steps=self._steps), "began")
-            if said is not None:
-                self._obs = said["obs"]
+            began = self._ask(pack("reset", episode=self._episode, seed=seed, steps=self._steps), Began)
+            if began is not None:
                 return self._obs, {}
-            time.sleep(self._again)  # a robot that cannot begin now may be able to later
+            pause = self._again * 2 ** max(self._failures - 1, 0)
+        raise UserError(
+            f"{self}: its driver has failed {self._failures} times in a row: {self._reason}; mend it, nothing is lost: "
+            "the same command with --resume goes on"
+        )
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Has the robot take a step: obs, reward, terminated, truncated, info. action: [action_size] in [-1, 1]."""
-        said = self._ask(pack("act", episode=self._episode, step=self._step, action=np.asarray(action)), "moved")
-        if said is None:
+        message = pack("act", episode=self._episode, step=self._step, action=np.asarray(action))
+        moved = self._ask(message, Moved)
+        if moved is None:
             return self._obs, float("nan"), False, True, {"invalid": True}
-        self._step += 1
-        self._obs = said["obs"]
-        reward = float("nan") if said["reward"] is None else said["reward"]
-        info = {"sent": said["sent"], "late": said["late"]}
-        if said["success"] is not None:
-            info["is_success"] = said["success"]
-        return self._obs, reward, said["terminated"], said["truncated"], info
+        self._step, self._failures = self._step + 1, 0
+        reward = float("nan") if moved.reward is None else moved.reward
+        info = {"sent": self._sent, "late": moved.late, "is_success": moved.success}
+        return self._obs, reward, moved.terminated, moved.truncated, info
 
     def rest(self) -> None:
         """Stops the robot until the next episode; waits a moment for its answer."""
         if self._played is not None:
-            self._ask(pack("rest", episode=self._episode), "rested", tries=_RESTS)
+            self._ask(pack("rest", episode=self._episode), Rested, tries=_RESTS)
 
     def __str__(self) -> str:
         return f"robot at {self.url}"
@@ -157,11 +200,11 @@ class Remote:
     def _wait(self) -> _Link:
         """The link to a robot, once there is one."""
         while not self._there.is_set() or (link := self._link) is None:
-            self._say(f"waiting for a robot at {self.url}, token {self.token}")
+            self._say(f"waiting for a robot at {self.url}; its token is in {self._token_in}")
             self._there.wait()
         return link
 
-    def _ask(self, message: bytes, answer: str, tries: int | None = None) -> Mapping[str, Any] | None:
+    def _ask[T: (Began, Moved, Rested)](self, message: bytes, answer: type[T], tries: int | None = None) -> T | None:
         """The answer to a message of this episode and step; None if the robot is gone or has failed.
 
         tries: how often it is said at most.
@@ -176,30 +219,38 @@ class Remote:
                 link.send(message)
                 due = now + self._again
             try:
-                said = link.inbox.get(timeout=max(due - now, 0.0))
+                heard = link.inbox.get(timeout=max(due - now, 0.0))
             except queue.Empty:
                 continue
-            if said is _GONE:
-                link.inbox.put(_GONE)  # it stays the last one
-                if answer != "rested":
+            if isinstance(heard, _Gone):
+                link.inbox.put(heard)  # it stays the last one
+                if answer is not Rested:
                     self._say(f"the robot is gone in episode {self._episode} before the outcome of step {self._step}")
                 return None
-            if said["episode"] != self._episode:
+            if isinstance(heard, Hello) or heard.episode != self._episode:
                 continue  # of before
-            if said["type"] == "failed" and answer != "rested":
-                self._say(f"the robot has stopped: {said['reason']}")
-                return None
-            if said["type"] == answer and said.get("step", self._step) == self._step:
+            if isinstance(heard, Failed) and answer is not Rested:
+                return self._fail(f"the robot has stopped: {heard.reason}")
+            if isinstance(heard, answer) and getattr(heard, "step", self._step) == self._step:
                 try:
-                    return self._read(said)
+                    self._read(heard)
                 except ValueError as error:
-                    self._say(f"the robot's {answer} of step {self._step}: {error}")
-                    return None
+                    return self._fail(f"the robot's {answer.__name__.lower()} of step {self._step}: {error}")
+                return heard
 
-    def _read(self, said: Mapping[str, Any]) -> Mapping[str, Any]:
-        """With its arrays as arrays; ValueError for wrong sizes and numbers."""
-        sizes = {"obs": self.obs_size, "sent": self.action_size}
-        return {**said, **{name: array(said[name], n, name) for name, n in sizes.items() if name in said}}
+    def _fail(self, reason: str) -> None:
+        self._failures, self._reason = self._failures + 1, reason
+        self._say(reason)
+
+    def _read(self, heard: Began | Moved | Rested) -> None:
+        """Keeps the arrays of an answer; ValueError for wrong sizes and numbers."""
+        if isinstance(heard, Moved):
+            sent = array(heard.sent, self.action_size, "sent")
+            if (np.abs(sent) > 1 + _ROUNDING).any():
+                raise ValueError("sent holds a command beyond [-1, 1]")
+            self._sent = sent
+        if not isinstance(heard, Rested):
+            self._obs = array(heard.obs, self.obs_size, "obs")
 
     # ------------------------------------------------------------ the server's threads
 
@@ -208,69 +259,83 @@ class Remote:
         link = _Link(connection, queue.SimpleQueue())
         refusal = self._admit(link)
         if refusal is not None:
-            self._say_refused(refusal.reason)
-            link.send(pack("refused", reason=refusal.reason[:500], final=refusal.final))
+            reason = printable(refusal.reason, _LINE)
+            self._refused(f"refused a connection: {reason}")
+            link.send(pack("refused", reason=reason, final=refusal.final))
             return
         try:
             link.send(pack("welcome"))
             self._there.set()
             for data in connection:
                 try:
-                    message = unpack(data)
+                    link.put(read(data))
                 except ValueError as error:
-                    self._say(f"ignored: a message of the robot {error}")
-                    continue
-                if message["type"] in ("began", "moved", "rested", "failed"):
-                    link.inbox.put(message)
+                    self._ignored(f"ignored: a message of the robot {error}")
         except ConnectionClosed:
             pass
         finally:
-            link.inbox.put(_GONE)
+            link.inbox.put(_Gone())
             with self._lock:
                 self._there.clear()
                 self._link = None
 
-    def _say_refused(self, reason: str) -> None:
-        """One line, but not one for each of very many."""
-        with self._lock:
-            self._refused += 1
-            now, count = time.monotonic(), self._refused
-            if now - self._said < _SAY_EVERY:
-                return
-            self._refused, self._said = 0, now
-        more = f" ({count - 1} others before it)" if count > 1 else ""
-        self._say(f"refused a connection: {reason}{more}")
-
     def _admit(self, link: _Link) -> _Refusal | None:
         """Takes a robot that fits as the one robot; else says why not."""
         try:
-            said = unpack(link.connection.recv(timeout=_HELLO))
+            hello = read(link.connection.recv(timeout=_HELLO))
         except VersionError as error:
             return _Refusal(str(error), final=True)
         except (ValueError, TimeoutError) as error:
             return _Refusal(f"its first message {error or 'did not come'}", final=False)
         except ConnectionClosed:
             return _Refusal("it was closed before its first message", final=False)
-        if said["type"] != "hello":
-            return _Refusal(f"its first message is {said['type']}, not hello", final=True)
-        if not hmac.compare_digest(said["token"].encode(), self.token.encode()):
+        if not isinstance(hello, Hello):
+            return _Refusal(f"its first message is {type(hello).__name__.lower()}, not hello", final=True)
+        if (name := self._foreign(link.connection)) is not None:
+            return _Refusal(f"it asked for the host {name!r}; connect to {self.url}, or to an address", final=True)
+        if not hmac.compare_digest(hello.token.encode(), self.token.encode()):
             return _Refusal("wrong token", final=True)
-        for name, own, theirs in (
-            ("numbers measured", self.obs_size, said["obs_size"]),
-            ("numbers commanded", self.action_size, said["action_size"]),
-        ):
-            if own != theirs:
-                return _Refusal(f"{said['robot']}: {name}: the robot has {theirs}, the learner {own}", final=True)
-        if not _same(self._period, said["period"]):
-            return _Refusal(
-                f"{said['robot']}: seconds of a step: the robot has {said['period']:g}, the learner's task "
-                f"{self._period:g}; change the period of the robot, or the task",
-                final=True,
-            )
+        if (difference := self._difference(hello)) is not None:
+            return _Refusal(f"{printable(hello.robot, _NAME)}: {difference}", final=True)
         with self._lock:
             if self._link is not None:  # perhaps it is the same one, and its lost connection has not been noticed yet
-                return _Refusal(f"{said['robot']}: another robot is connected", final=False)
-            self._link, self.answer_within = link, said["answer_within"]
+                return _Refusal(f"{printable(hello.robot, _NAME)}: another robot is connected", final=False)
+            self._link, self.answer_within = link, hello.answer_within
+        self._door.admit(link.connection.socket)
+        return None
+
+    def _foreign(self, connection: ServerConnection) -> str | None:
+        """The name that a connection was made to, if it is none of this computer's: a web page may have made it up."""
+        headers = connection.request.headers.get_all("Host") if connection.request else []
+        try:
+            (host,) = headers
+            name = urlsplit(f"//{host}").hostname or ""
+        except ValueError:  # none, or several
+            name = ""
+        with contextlib.suppress(ValueError):
+            ipaddress.ip_address(name)
+            return None
+        known = {self._host, "localhost", socket.gethostname(), socket.gethostname().partition(".")[0]}
+        plain = name.removesuffix(".").removesuffix(".local")
+        return None if {name, plain} & {other.lower() for other in known} else name
+
+    def _difference(self, hello: Hello) -> str | None:
+        """What of a robot does not fit, if anything."""
+        for name, ours, theirs in (
+            ("numbers measured", self.obs_size, hello.obs_size),
+            ("numbers commanded", self.action_size, hello.action_size),
+        ):
+            if ours != theirs:
+                return f"{name}: the robot has {theirs}, the learner {ours}"
+        if not _same(self._period, hello.period):
+            return (
+                f"seconds of a step: the robot has {hello.period:g}, the learner's task {self._period:g}; change the "
+                "period of the robot, or the task"
+            )
+        if hello.period is not None and not 0 < hello.period < math.inf:
+            return f"seconds of a step: the robot has {hello.period:g}, which cannot be"
+        if hello.answer_within is not None and not (hello.period and hello.answer_within <= hello.period):
+            return f"answer_within is {hello.answer_within:g}: give at most the period, {hello.period} s"
         return None
 
 

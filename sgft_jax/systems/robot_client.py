@@ -28,32 +28,24 @@ from typing import Any
 
 import msgpack
 import numpy as np
-from websockets.exceptions import ConnectionClosed, InvalidMessage
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.sync.client import connect
 
 VERSION = 2
 LIMIT = 64 * 1024  # bytes of a message at most
+LARGEST = 1e18  # of a measurement or reward: squares of larger ones are beyond float32
+SUCCESS = ("is_success", "success")  # what `info` may call it; the first that says something counts
+_REASON = 500  # letters of one at most
 _PATIENCE = 10  # late steps in a row that end an episode
 _SOME = object()
-_SHAPES: dict[str, dict[str, Any]] = {  # what each message holds; a tuple names types that are allowed
-    "hello": {
-        "version": int, "token": str, "robot": str, "obs_size": int, "action_size": int,
-        "period": (float, type(None)), "answer_within": (float, type(None)),
-    },
+_SHAPES: dict[str, dict[str, Any]] = {  # what the learner says, `messages` has the rest; a tuple: any of these types
     "welcome": {},
     "refused": {"reason": str, "final": bool},
     "reset": {"episode": int, "seed": int, "steps": (int, type(None))},
-    "began": {"episode": int, "obs": bytes},
     "act": {"episode": int, "step": int, "action": bytes},
-    "moved": {
-        "episode": int, "step": int, "sent": bytes, "obs": bytes, "reward": (float, type(None)), "terminated": bool,
-        "truncated": bool, "success": (bool, type(None)), "late": bool,
-    },
     "rest": {"episode": int},
-    "rested": {"episode": int},
-    "failed": {"episode": int, "reason": str},
     "end": {},
-}  # fmt: skip
+}
 
 
 # --- messages ---------------------------------------------------------------------------------------------------------
@@ -66,30 +58,27 @@ def pack(kind: str, **fields: Any) -> bytes:
     return zlib.crc32(body).to_bytes(4, "little") + body
 
 
-class VersionError(ValueError):
-    """The robot speaks another version of the protocol than the learner."""
-
-
-def unpack(data: Any) -> dict[str, Any]:
-    """The fields of a message, with its "type"; ValueError says what is wrong with it."""
+def unframed(data: Any) -> bytes:
+    """The msgpack map of a message; ValueError for what is none of ours, or was damaged on the way."""
     if not isinstance(data, bytes):
         raise ValueError("is text, not bytes")
     if len(data) > LIMIT:
         raise ValueError(f"has {len(data):,} bytes, at most {LIMIT:,} are allowed")
     if len(data) < 5 or zlib.crc32(data[4:]).to_bytes(4, "little") != data[:4]:
         raise ValueError("was damaged on the way")
+    return data[4:]
+
+
+def unpack(data: Any) -> dict[str, Any]:
+    """The fields of a message of the learner, with its "type"; ValueError says what is wrong with it."""
+    body = unframed(data)
     try:
-        fields = msgpack.unpackb(data[4:])
+        fields = msgpack.unpackb(body)
     except Exception as error:  # msgpack raises half a dozen types
         raise ValueError(f"is no msgpack ({type(error).__name__})") from error
     kind = fields.get("type") if isinstance(fields, dict) else None
-    if kind not in _SHAPES:
+    if not isinstance(kind, str) or kind not in _SHAPES:
         raise ValueError(f"is of the unknown type {kind!r}")
-    version = fields.get("version")
-    if kind == "hello" and type(version) is int and version != VERSION:  # before its fields: they may be others
-        raise VersionError(
-            f"protocol version: the robot has {version}, the learner {VERSION}; give both the same robot_client.py"
-        )
     for name, wanted in _SHAPES[kind].items():
         value = fields.get(name, _SOME)
         if type(value) not in (wanted if isinstance(wanted, tuple) else (wanted,)):
@@ -98,13 +87,54 @@ def unpack(data: Any) -> dict[str, Any]:
 
 
 def array(data: bytes, size: int, what: str) -> np.ndarray:
-    """[size] float32; ValueError where it has another size or a number is not finite."""
+    """[size] float32; ValueError where it has another size, or a number that is not finite or beyond `LARGEST`."""
     if len(data) != 4 * size:
         raise ValueError(f"{what} has {len(data) / 4:g} numbers, expected {size}")
     values = np.frombuffer(data, "<f4").astype(np.float32)
-    if not np.isfinite(values).all():
-        raise ValueError(f"{what} holds a number that is not finite")
+    if not (np.abs(values) <= LARGEST).all():  # nan is not
+        raise ValueError(f"{what} holds a number that is not finite, or beyond {LARGEST:g}")
     return values
+
+
+def number(value: Any, what: str) -> float:
+    """A number, also as an array of one; nan, which means unknown, for None. ValueError for anything else."""
+    return float("nan") if value is None else float(_single(value, what, "a number"))
+
+
+def flag(value: Any, what: str) -> bool:
+    """A truth value, 0 or 1, also as an array of one; ValueError for anything else."""
+    if (single := _single(value, what, "true or false")) not in (0, 1):
+        raise ValueError(f"{what} is {single!r}, not true or false")
+    return bool(single)
+
+
+def success_of(info: Mapping[str, Any]) -> bool | None:
+    """What `info` says of success; None where it says nothing. ValueError where that is no truth value."""
+    return next((flag(info[name], f"info[{name!r}]") for name in SUCCESS if info.get(name) is not None), None)
+
+
+def printable(text: object, length: int) -> str:
+    """One line that a terminal can show, whoever has written it."""
+    line = "".join(letter if letter.isprintable() else " " for letter in str(text)[: 4 * length])
+    return line if len(line) <= length else f"{line[: length - 3]}..."
+
+
+def numbers(value: Any, what: str, wanted: str = "numbers alone") -> np.ndarray:
+    """[n], in the type that they came in; ValueError where it is not `wanted`."""
+    try:
+        values = np.asarray(value).reshape(-1)
+    except (TypeError, ValueError, RuntimeError):  # rows of different lengths, a tensor of another device
+        values = np.empty(0, object)
+    if values.dtype.kind not in "biuf":
+        raise ValueError(f"{what} is {printable(repr(value), 60)}, not {wanted}")
+    return values
+
+
+def _single(value: Any, what: str, wanted: str) -> Any:
+    values = numbers(value, what, wanted)
+    if values.size != 1:
+        raise ValueError(f"{what} is {printable(repr(value), 60)}, not {wanted}")
+    return values.item()
 
 
 def _encoded(fields: dict[str, Any]) -> bytes:
@@ -151,13 +181,16 @@ class Limits:
             raise ValueError("limits: low and high need finite numbers, for example -1 and 1")
         if not (low <= high).all():
             raise ValueError("limits: low is above high; swap them")
+        if (low > 1).any() or (high < -1).any():
+            raise ValueError("limits: low and high allow no action in [-1, 1]")
         if not (_motors(self.change, action_size, "limits: change") > 0).all():
             raise ValueError("limits: change must be above 0; leave it out where any change is allowed")
 
     def of(self, action: np.ndarray, before: np.ndarray) -> np.ndarray:
         """The nearest action that is allowed. before: the last one sent, zeros at the start of an episode."""
         change = np.asarray(self.change)
-        return np.clip(np.clip(action, before - change, before + change), self.low, self.high).astype(np.float32)
+        near = np.clip(np.clip(action, before - change, before + change), self.low, self.high)
+        return np.clip(near, -1.0, 1.0).astype(np.float32)
 
     def left(self, obs: np.ndarray) -> str:
         """What of a measurement lies beyond the workspace; nothing if all is well."""
@@ -200,10 +233,10 @@ def play(
 ) -> dict[str, int]:
     """Plays episodes for a learner until it ends the run; returns how many steps there were and how many were late.
 
-    driver: see the top of this file. url: of the learner. token: what it printed. period: seconds of a step. A driver
-    with `read` and `send` needs it; with `step` it is only compared with the learner's task. answer_within: seconds
-    after which a command is too late, default half a period; the first of an episode may take as long as it wants, so
-    `reset` must leave the robot where it can wait.
+    driver: see the top of this file. url: of the learner. token: it says where that is. period: seconds of a step. A
+    driver with `read` and `send` needs it; with `step` it is only compared with the learner's task. answer_within:
+    seconds after which a command is too late, default half a period; the first of an episode may take as long as it
+    wants, so `reset` must leave the robot where it can wait.
     late: what happens then: "hold" leaves the last command, an action is sent instead, within `limits`. patience: after
     so many late steps in a row the episode ends. These three are refused for a driver with `step`, which waits.
     log: a file to which every command is appended before it is sent. retry: seconds between attempts to connect. say:
@@ -232,7 +265,7 @@ def play(
             with contextlib.ExitStack() as stack:
                 try:
                     socket = _connected(stack, url, hello)
-                except (ConnectionClosed, InvalidMessage, OSError, ValueError) as error:  # a TimeoutError is an OSError
+                except (ConnectionClosed, InvalidHandshake, OSError, ValueError) as error:  # OSError: also TimeoutError
                     lost = error
                 else:
                     say(f"connected to {url}")
@@ -240,7 +273,8 @@ def play(
             if lost is None:
                 return robot.counts
             driver.stop()
-            if (line := f"no connection to {url} ({lost}); the robot is stopped, trying again") != said:
+            reason = printable(lost, _REASON)
+            if (line := f"no connection to {url} ({reason}); the robot is stopped, trying again") != said:
                 say(line)
             said = line
             time.sleep(retry)
@@ -258,7 +292,7 @@ def _connected(stack: contextlib.ExitStack, url: str, hello: bytes) -> Any:
     socket.send(hello)
     answer = unpack(socket.recv(timeout=10))
     if answer["type"] == "refused":
-        raise (RefusedError if answer["final"] else ValueError)(answer["reason"])
+        raise (RefusedError if answer["final"] else ValueError)(printable(answer["reason"], _REASON))
     return socket
 
 
@@ -402,7 +436,7 @@ class _Robot:
             except TimeoutError:
                 return None
             except ValueError as error:
-                say(f"ignored: a message of the learner {error}")
+                say(f"ignored: a message of the learner {printable(error, _REASON)}")
 
     def _reset(self, socket: Any, message: Mapping[str, Any], say: Callable[[str], None]) -> None:
         if message["episode"] == self._episode and not self._over:
@@ -473,18 +507,20 @@ class _Robot:
         if left := self.limits.left(told["obs"]):
             say(f"{left}; the robot is stopped, the episode ends here")
             told["truncated"] = True
-        told["truncated"] |= step + 1 == self._most
+        told["truncated"] |= self._most is not None and step + 1 >= self._most
         if told["terminated"] or told["truncated"]:
             self._over = True
             self.driver.stop()
         self._tell(socket, pack("moved", episode=self._episode, step=step, sent=action, late=late, **told))
 
     def _at_once(self, action: np.ndarray) -> dict[str, Any]:
-        obs, reward, terminated, truncated, info = self.driver.step(action)
-        success = next((bool(info[name]) for name in ("is_success", "success") if name in info), None)
+        moved = self.driver.step(action)
+        if not isinstance(moved, tuple) or len(moved) != 5:
+            raise TypeError("step does not return obs, reward, terminated, truncated, info")
+        obs, reward, terminated, truncated, info = moved
         return {
-            "obs": self._checked(obs), "reward": float(reward), "terminated": bool(terminated),
-            "truncated": bool(truncated), "success": success,
+            "obs": self._checked(obs), "reward": number(reward, "reward"), "terminated": flag(terminated, "terminated"),
+            "truncated": flag(truncated, "truncated"), "success": success_of(info or {}),
         }  # fmt: skip
 
     def _by_clock(self, action: np.ndarray, *, late: bool) -> dict[str, Any]:
@@ -499,18 +535,19 @@ class _Robot:
         judge = getattr(self.driver, "judge", None)
         reward, terminated, success = (None, False, None) if judge is None else judge(obs)
         return {
-            "obs": obs, "reward": None if reward is None else float(reward), "terminated": bool(terminated),
-            "truncated": False, "success": None if success is None else bool(success),
+            "obs": obs, "reward": number(reward, "reward"), "terminated": flag(terminated, "terminated"),
+            "truncated": False, "success": success_of({"success": success}),
         }  # fmt: skip
 
     def _checked(self, obs: Any) -> np.ndarray:
-        obs = np.asarray(obs, np.float32).reshape(-1)
-        return array(obs.astype("<f4").tobytes(), self.driver.obs_size, "an observation")
+        with np.errstate(over="ignore"):
+            values = numbers(obs, "an observation").astype("<f4")
+        return array(values.tobytes(), self.driver.obs_size, "an observation")
 
     def _fail(self, socket: Any, error: Exception, say: Callable[[str], None]) -> None:
         self._over = True
         self.driver.stop()
-        reason = f"{type(error).__name__}: {error}"[:500]
+        reason = printable(f"{type(error).__name__}: {error}", _REASON)
         say(f"the robot is stopped: {reason}")
         self._failed = pack("failed", episode=self._episode, reason=reason)
         _send(socket, self._failed)

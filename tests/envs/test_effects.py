@@ -136,6 +136,10 @@ def toy_pool(env, effects):
             "'latency' with 'latency_jitter' comes to 0.3 s: it must be shorter than the control period",
         ),
         ({"latency": 0.15, "latency_jitter": 0.1}, "comes to 0.25 s.* of toy, 0.2 s"),
+        ({"action_scale": 1e38}, r"effect 'action_scale' must be at most 100 in size, got 1e\+38"),
+        ({"action_scale": 10**400}, "effect 'action_scale' needs 2 values"),
+        ({"action_bias": [0.0, -1e6]}, "effect 'action_bias' must be at most 100 in size"),
+        ({"obs_noise": 1e10}, r"effect 'obs_noise' must be at most 1e\+06 in size"),
     ],
 )
 def test_impossible_effects_are_named(values, message):

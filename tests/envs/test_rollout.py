@@ -4,13 +4,14 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import keys
 import numpy as np
 import pytest
 import toy
 import toy_terminating
 
 import envs
-from envs.rollout import launch, pick, play_episode, pool_size, step_fleet
+from envs.rollout import counted, launch, pick, play_episode, pool_size, step_fleet
 from sgft_jax.types import UserError
 
 N = 64
@@ -89,6 +90,39 @@ def test_an_explosion_after_the_end_is_none(key):
         assert bool(played.exploded) == exploded and played.valid.sum() == 1
 
 
+@pytest.fixture(scope="module")
+def costly():
+    """Five episodes in which each step costs 1; all but one of them explode, later and later, one at once."""
+    env = toy_terminating.make()
+    pool = envs.sample_worlds(env, jax.random.key(0), 1, params={"risk": 0.0})
+
+    def play(boom):
+        def step(*given):
+            after = env.step(*given)
+            return after._replace(reward=jnp.float32(-1), invalid=after.time >= boom)
+
+        return play_episode(env._replace(step=step), pool, counting, jnp.int32(0), jax.random.key(1), gamma=1.0)
+
+    return jax.jit(jax.vmap(play))(jnp.array([1, 3, 99, 2, 12]))
+
+
+def test_an_episode_that_exploded_scores_less_than_any_whole_one(costly):
+    assert costly.total_reward.tolist() == [0, -2, -12, -1, -11]
+    assert costly.score.tolist() == [-np.inf, -np.inf, -12, -np.inf, -np.inf]
+    assert int(jnp.argmax(costly.score)) == 2
+
+
+@pytest.mark.parametrize("kind", [jnp.asarray, np.asarray])
+def test_explosions_count_as_the_worst_that_is_known(costly, kind):
+    episodes = jax.tree.map(kind, costly)
+    for found in counted(episodes):
+        assert found.tolist() == [-12] * 5 and isinstance(found, type(kind(0.0)))
+    score, total = counted(episodes, kind([[-20.0, -30.0]])[0])
+    assert score.tolist() == [-20, -20, -12, -20, -20] and total.tolist() == [-30, -30, -12, -30, -30]
+    burst = jax.tree.map(lambda x: x[:2], episodes)  # none is whole
+    assert counted(burst)[0].tolist() == [-2, -2]
+
+
 def test_a_fleet_starts_episodes_anew_with_their_carry():
     """What `counting` remembers of an environment is always the age of its episode."""
     env = toy_terminating.make()
@@ -113,6 +147,48 @@ def test_a_fleet_starts_episodes_anew_with_their_carry():
     np.testing.assert_array_equal(rows.action[..., 0], before.state.time)
     np.testing.assert_allclose(rows.discount, 0.9 * (1.0 - ended.terminated), atol=1e-6)
     np.testing.assert_array_equal(rows.next_obs, ended.obs)  # the true successor, not the next start
+
+
+def test_no_key_is_used_twice_by_fleets_and_episodes(key):
+    """Worlds, starts, steps, measurements and resets draw apart, in several steps and in several environments."""
+    env = toy.make()
+    pool = envs.sample_worlds(env, key, 3)
+    act = lambda carry, obs, key: (jax.random.normal(key, (2,)), carry)  # noqa: E731
+
+    def whole(key):
+        key_launch, key_steps, key_episodes = jax.random.split(key, 3)
+        fleet = launch(env, pool, key_launch, 2, ())
+
+        def step(fleet, key):
+            return step_fleet(env, pool, fleet, jnp.zeros((2, 2)), (), key, initial_carry=(), gamma=0.9)[0], None
+
+        play = functools.partial(play_episode, env, pool, act, (), gamma=0.9, length=3)
+        played = jax.vmap(lambda key: play(key))(jax.random.split(key_episodes))
+        return jax.lax.scan(step, fleet, jax.random.split(key_steps))[0], played
+
+    assert keys.used_twice(whole) == 0
+
+
+def test_exploded_environments_of_a_fleet_begin_anew():
+    """Also those whose physics is broken for good; the others go on, and no row of an exploded step is valid."""
+    env = toy_terminating.make()
+    pool = envs.sample_worlds(env, jax.random.key(0), 1, params={"risk": 0.0})
+
+    def step(world, state, action, key):
+        after = env.step(world, state, action, key)
+        return after._replace(invalid=(action[0] > 0) | state.invalid)
+
+    fleet = launch(env, pool, jax.random.key(1), 4, jnp.int32(0))
+    for actions in ([-1.0, 1.0, -1.0, -1.0], [-1.0, -1.0, -1.0, 1.0]):
+        fleet, rows, valid, _ = step_fleet(
+            env._replace(step=step), pool, fleet, jnp.array(actions)[:, None], fleet.carry + 1, jax.random.key(2),
+            initial_carry=jnp.int32(0), gamma=0.9,
+        )  # fmt: skip
+        np.testing.assert_array_equal(valid, np.array(actions) < 0)
+        np.testing.assert_allclose(rows.reward, np.where(valid, 1 + fleet.state.obs[:, 0], 0), rtol=1e-6)
+    for ages in (fleet.state.time, fleet.carry):
+        np.testing.assert_array_equal(ages, [2, 1, 2, 0])
+    np.testing.assert_allclose(fleet.state.obs[:, 0], [-0.2, -0.1, -0.2, 0.0], rtol=1e-6)
 
 
 def test_dicts_are_packed_in_the_declared_order(key):

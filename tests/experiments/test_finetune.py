@@ -398,7 +398,8 @@ class Counter:
         obs = number + jnp.broadcast_to(jnp.array([0.0, 0.5])[:, None, None, None], (*shape, 2))
         rows = Transition(obs, jnp.zeros((*shape, 1)), jnp.ones(shape), jnp.ones(shape), obs)
         each, no = jnp.zeros(shape[:2]), jnp.zeros(shape[:2], bool)
-        return Episode(rows, jnp.ones(shape, bool), each, no, no, each, each.astype(int), jnp.zeros((*shape, 2)))
+        trace = jnp.zeros((*shape[:2], shape[2] + 1, 2))
+        return Episode(rows, jnp.ones(shape, bool), each, no, no, each, each.astype(int), trace)
 
 
 def play(system, *, explore=True):
@@ -611,6 +612,22 @@ def film(folder, monkeypatch, *, pushes=(0.0, 1.0), scene=None, reason=None):
     played = [jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1)]
     record = Record(folder, env, gaps.Gap("toy", {}, {}), "sac", [0])
     return record.film(pool, lambda: played, 7), played, pool
+
+
+def test_a_record_counts_the_steps_that_were_made(tmp_path):
+    """Of two seeds whose episodes end early; evaluations on the real system are steps too."""
+    record = Record(tmp_path, toy.make(), gaps.Gap("toy", {}, {}), "sac", [0, 1], real_evaluations=True)
+    record.played = np.array([7, 12])
+    record.evaluation(1, {"score": np.zeros(2)}, np.array([3, 2]))
+    record.metrics(1, {"real/return": np.zeros(2), "critic/loss": np.array([np.nan, 1.0]), "updates": np.array([0, 3])})
+    record.played = np.array([7, 20])
+    record.evaluation(2, {"score": np.zeros(2)}, np.array([1, 1]))
+    lines, (trained,) = (read_jsonl(tmp_path / name) for name in ("eval.jsonl", "metrics.jsonl"))
+    assert [line["step"] for line in lines] == [10, 16] and trained["step"] == 12
+    assert lines[1]["robot_minutes"] == pytest.approx(16 * toy.DT / 60)
+    assert np.isnan(trained["critic/loss"][0])  # a seed that has made no update has no loss
+    with pytest.raises(UserError, match="critic/loss of 1 of 2 members is not finite"):
+        record.metrics(2, {"critic/loss": np.array([np.nan, 1.0]), "updates": np.array([3, 3])})
 
 
 @pytest.mark.slow

@@ -153,6 +153,11 @@ def test_diagnosis_keeps_the_rollouts_that_it_plays(priors, tmp_path, capsys):
         (["gymnasium:"], (), "name an environment, e.g. gymnasium:HalfCheetah-v5"),
         ([NAME], ("rotation",), "--set 'rotation': write name=value, each name once"),
         ([NAME], ("rotation=1", "rotation=2"), "--set 'rotation=2': write name=value, each name once"),
+        (["gymnasium:Nope-v0"], (), "--real gymnasium:Nope-v0: Environment `Nope` doesn't exist"),
+        (["gymnasium:HalfCheetah-v99"], (), "version `v99` for environment `HalfCheetah` doesn't exist"),
+        (["gymnasium:nowhere:A-v0"], (), "ModuleNotFoundError: No module named 'nowhere'"),
+        (["gymnasium:json:A-v0"], (), "Environment `A` doesn't exist"),
+        (["gymnasium:a b"], (), "Malformed environment ID: a b"),
     ],
 )
 def test_mistakes_are_found_before_anything_is_made(real, changes, words):
@@ -174,6 +179,12 @@ def test_an_environment_that_cannot_be_made_or_played_is_one_line(name, changes,
     with pytest.raises(UserError, match=words) as stopped:
         real_systems.connect(toy_gymnasium.toy.make(), [name], changes, members=1, gamma=0.9, home=Path())
     assert "\n" not in str(stopped.value)
+
+
+def test_an_environment_that_cannot_be_made_leaves_no_folder(priors, tmp_path):
+    with pytest.raises(SystemExit) as stopped:
+        run(priors, tmp_path, "--set", "rotatoin=1")
+    assert stopped.value.code == 2 and not any(tmp_path.iterdir())
 
 
 def test_set_reads_json_and_text():

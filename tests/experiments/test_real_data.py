@@ -213,7 +213,7 @@ def test_a_file_without_next_observations_is_read_with_shifted_ones(words, tmp_p
 
 
 def test_logs_of_another_task_are_refused(words, tmp_path, capsys):
-    wide = {name: np.repeat(x, 2, axis=2) if name == "action" else x for name, x in rollout(0).items()}
+    wide = {name: np.repeat(x, 2, axis=2) if name in ("action", "command") else x for name, x in rollout(0).items()}
     RealStore(tmp_path / "wide").append(wide)
     error = complaint(words(data=[tmp_path / "wide"]), capsys)
     assert "wide: has 4 observations and 4 actions, toy has 4 and 2; name the task" in error

@@ -180,6 +180,127 @@ def test_a_torn_line_is_left_out_and_a_damaged_one_named(tmp_path):
             rollouts(tmp_path, 5, count=1)
 
 
+def test_steps_of_another_task_or_version_are_named(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        rollouts(tmp_path, 5, count=1)
+    journal = RealStore(tmp_path).journal(0)
+    steps = journal.read()
+    for change in (
+        lambda step: {name: x for name, x in step.items() if name != "late"},
+        lambda step: {**step, "more": step["late"]},
+        lambda step: {**step, "obs": step["obs"][:, :3]},
+        lambda step: {**step, "command": step["command"].repeat(2, axis=0)},
+        lambda step: {**step, "reward": step["obs"]},
+    ):
+        with journal:
+            journal.begin(change(steps[0]))
+            journal.append(change(steps[0]))
+        with pytest.raises(UserError, match=r"steps\.jsonl: holds no steps of toy; move it away to go on without them"):
+            rollouts(tmp_path, 5, count=1)
+
+
+# --- the token --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("content", "mode", "words"),
+    [
+        (b"abc", 0o600, "holds no token: 16 letters"),
+        (b"", 0o600, "holds no token"),
+        (b"a token of several words", 0o600, "holds no token"),
+        ("schlüsselschlüssel".encode(), 0o600, "holds no token"),
+        (b"0123456789abcdef\n0123456789abcdef", 0o600, "holds no token"),
+        (b"0123456789abcdef\xff", 0o600, "is no UTF-8 text"),
+        (b"0" * 5000, 0o600, "is larger than 1,024 bytes"),
+        *((b"0123456789abcdef", mode, "others can read or write it; delete it for a new token") for mode in
+          (0o666, 0o640, 0o604, 0o620)),
+    ],
+)  # fmt: skip
+def test_a_token_that_others_know_or_can_guess_is_refused(tmp_path, content, mode, words):
+    path = tmp_path / "robot-token"
+    path.write_bytes(content)
+    path.chmod(mode)
+    with pytest.raises(UserError, match=f"robot-token: {words}") as stopped:
+        real_systems.token(tmp_path)
+    assert not content or content[:16].decode(errors="replace") not in str(stopped.value)
+
+
+@pytest.mark.parametrize("target", ["elsewhere", "nowhere", "robot-token"])
+def test_a_token_behind_a_link_is_refused(tmp_path, target):
+    (tmp_path / "elsewhere").write_text("0123456789abcdef")
+    (tmp_path / "robot-token").symlink_to(tmp_path / target)
+    with pytest.raises(UserError, match="robot-token: is a link; delete it"):
+        real_systems.token(tmp_path)
+
+
+def test_a_token_that_is_no_file_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "robot-token", 0o600)
+    with pytest.raises(UserError, match="robot-token: is no plain file"):
+        real_systems.token(tmp_path)
+
+
+def test_a_token_of_ones_own_is_taken(tmp_path):
+    (tmp_path / "robot-token").write_text("\ufeff0123456789abcdef\r\n")
+    (tmp_path / "robot-token").chmod(0o600)
+    assert real_systems.token(tmp_path) == "0123456789abcdef"
+
+
+# --- where to listen --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("real", "address"),
+    [
+        ("remote", ("127.0.0.1", 8765)), ("remote:", ("127.0.0.1", 8765)), ("remote::99", ("127.0.0.1", 99)),
+        ("remote:lab", ("lab", 8765)), ("remote:10.0.0.7:99", ("10.0.0.7", 99)), ("remote:::1", ("::1", 8765)),
+        ("remote:[::1]", ("::1", 8765)), ("remote:[::1]:99", ("::1", 99)),
+        ("remote:[fe80::1%eth0]:9", ("fe80::1%eth0", 9)),
+    ],
+)  # fmt: skip
+def test_an_address_may_be_of_either_kind(real, address):
+    assert real_systems.address(real) == address
+
+
+@pytest.mark.parametrize(
+    "real",
+    [
+        "remote:lab:0", "remote:lab:80000", "remote:lab:http", "remote:lab: 99", "remote:lab:٣", "remote:a b:99",
+        "remote:256.1.1.1:99", "remote:[::1", "remote:[::1]99", "remote:[zz:1]:99", "remote:[10.0.0.7]:99",
+        "remote:here:there", "remote:1:2:3", "remote:lab:99\n", "remote:\x1b[31m", "remote:" + "x" * 300, "remote:a/b",
+    ],
+    ids=lambda real: repr(real[:30]),
+)  # fmt: skip
+def test_what_is_no_address_is_refused_in_one_line(real):
+    with pytest.raises(
+        UserError, match=r"write remote, remote:HOST or remote:HOST:PORT, .* an IPv6 address as \[::1\]"
+    ):
+        real_systems.check("push", [real])
+
+
+def test_a_place_where_one_cannot_listen_is_found_before_anything_is_made(tmp_path):
+    """Nothing of the run is there then: neither a folder, nor a token."""
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        taken = f"remote::{other.getsockname()[1]}"
+        for real in (taken, "remote:203.0.113.7:9999"):
+            given = [
+                "--task",
+                "push",
+                "--real",
+                real,
+                "--seeds",
+                "1",
+                "--prior",
+                "none",
+                "--out",
+                str(tmp_path / "runs"),
+            ]
+            with pytest.raises(SystemExit) as stopped:
+                finetune.main([*given, "--method", "sac"])
+            assert stopped.value.code == 2 and not (tmp_path / "runs").exists()
+
+
 # --- what fits --------------------------------------------------------------------------------------------------------
 
 

@@ -345,7 +345,7 @@ def test_a_tuned_comparison_must_be_fair(tmp_path, ran):
     with pytest.raises(UserError, match=rf"{path}: there is no option 'speed'; .*{command} sac"):
         tuned.read(tmp_path, "toy", "sac")
     path.write_text("[]")
-    with pytest.raises(UserError, match=r"was not written by experiments\.tune"):
+    with pytest.raises(UserError, match=r"sac\.json: is no JSON object; tune again with: "):
         tuned.read(tmp_path, "toy", "sac")
     assert ran == []
 

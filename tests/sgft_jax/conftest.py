@@ -1,1 +1,1 @@
-"""Its being here lets tests in the folders below import `probes`, `tuners` and `keys` when they run alone."""
+"""Its being here lets tests in the folders below import `probes` and `tuners` when they run alone."""

@@ -71,14 +71,53 @@ def test_a_run_with_another_learner_goes_on_with_the_same_bits():
 
 
 def test_a_robot_that_does_not_wait_plays_with_what_there_is():
-    """Three updates a rollout, of one each: the first two rollouts are the fresh agent's, then it is one behind."""
+    """An update counts one: the first two rollouts are the fresh agent's, then it is one behind."""
     system = Stepped()
     found = run(system=system, rollouts=4, learner=Inline(FINE, ready=False), waits=False)
-    np.testing.assert_allclose([x[1] for x in system.asked], [0, 0, 3, 6], atol=0.1)
-    np.testing.assert_allclose([p.agent.learner[1] for p, _ in found], [0, 3, 6, 9, 12], atol=0.1)
+    made = np.round([p.agent.learner[1] for p, _ in found])
+    assert (np.diff(made) > 0).all()
+    np.testing.assert_allclose([x[1] for x in system.asked], [0, *made[:3]], atol=0.1)
     ready = Stepped()
-    run(system=ready, rollouts=4, learner=Inline(FINE), waits=False)
-    np.testing.assert_allclose([x[1] for x in ready.asked], [0, 3, 6, 9], atol=0.1)
+    found = run(system=ready, rollouts=4, learner=Inline(FINE), waits=False)
+    np.testing.assert_allclose([x[1] for x in ready.asked], [p.agent.learner[1] for p, _ in found[:4]], atol=0.1)
+
+
+class Handed(Stepped):
+    """Episodes of three steps, each of which asks for the agent. Until step `late` there is the old one."""
+
+    def __init__(self, learner, late, scores):
+        super().__init__()
+        self.learner, self.late, self.system = learner, late, test_train.Scripted(scores)
+
+    def play(self, policy, states, keys, *, explore):
+        for t in range(3):
+            self.learner.is_ready = t >= self.late
+            states()
+        return self.system.play(policy, states, keys, explore=explore)
+
+
+@pytest.mark.parametrize(("late", "behind"), [(9, 1), (2, 1), (1, 0), (0, 0)])
+def test_what_was_played_speaks_for_who_made_most_of_the_steps(late, behind):
+    """Of three steps: all, two, one or none by the agent that has not learned from the rollout before."""
+    learner = Inline(FINE)
+    scores = np.repeat(np.arange(6)[:, None], 2, 1)
+    found = run(system=Handed(learner, late, scores), rollouts=6, learner=learner, waits=False)
+    best, agents = found[-1][0].best, [progress.agent.learner for progress, _ in found]
+    np.testing.assert_array_equal(best.params, agents[5 - behind])
+    assert best.rollouts.tolist() == [5 - behind] * 2 and best.score.tolist() == [3, 3]
+
+
+def test_a_rollout_that_asked_nobody_speaks_for_nobody():
+    """As those that a resumed run reads from disk."""
+    system = test_train.Scripted(np.ones((3, 2)))
+    best = run(system=system, rollouts=3, learner=Inline(FINE), waits=False)[-1][0].best
+    assert best.count.tolist() == [3, 3] and np.isneginf(best.score).all() and best.params.tolist() == [0.5, 0.0]
+
+
+def test_a_guard_needs_rollouts_by_one_policy():
+    fine = make(guard=True)
+    with pytest.raises(UserError, match="waits=False: a guard judges rollouts by one policy"):
+        run(fine, Stepped(), rollouts=1, learner=Inline(fine), waits=False)
 
 
 # --- the process ------------------------------------------------------------------------------------------------------
@@ -104,6 +143,19 @@ def test_a_process_learns_the_same(process):
     for own, other in zip(found, expected, strict=True):
         jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-6), own, other)
     assert len(cores()) == 1  # the others are for the learner
+
+
+def mistaken():
+    raise UserError("--options.horizon: must be at least 1")
+
+
+@pytest.mark.slow
+def test_what_is_the_users_in_a_process_is_one_line_and_no_traceback(monkeypatch):
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([os.path.dirname(__file__), *_paths()]))
+    made = LearnerProcess(mistaken, SEEDS, WHICH, None)
+    with pytest.raises(UserError, match=r"^--options.horizon: must be at least 1$"):
+        made.wait()
+    made.close()
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import chex
 import jax
 import jax.numpy as jnp
+import keys
 import numpy as np
 import probes
 import pytest
@@ -106,6 +107,20 @@ def test_the_best_action_is_deterministic_and_in_bounds(name, key):
             carry = case.learner.init_carry()
             other = case.learner.act(state, carry, probes.obs_of(s), jax.random.key(1), explore=False)[0]
             assert bits(action) == bits(other)
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_no_key_is_used_twice(name):
+    """In beginning, exploring and learning."""
+    learner = probes.case(name).learner
+
+    def whole(key):
+        key_init, key_rows, key_act, key_update = jax.random.split(key, 4)
+        state, batch = learner.init(key_init), probes.case(name).feed(probes.rows(PROBES["action decides"], key_rows))
+        action, _ = learner.act(state, learner.init_carry(), probes.obs_of(0.0), key_act, explore=True)
+        return action, learner.update(state, batch, key_update)
+
+    assert keys.used_twice(whole) == 0
 
 
 @pytest.mark.parametrize(

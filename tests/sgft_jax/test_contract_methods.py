@@ -88,29 +88,36 @@ def test_exploring_differs_and_the_best_action_follows_from_the_key(name, key):
     assert equal(best, again) and not jnp.allclose(best, explored, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", tuners.slow_but({"sgft-mpc"}, [*METHODS, *VARIANTS]))
+@pytest.mark.parametrize("name", [*METHODS, *VARIANTS])
 def test_no_key_is_used_twice(name):
-    """In acting, in learning and in the offline phase."""
-    case, states, _ = two(name)
-    plain, state = case.plain, member(states, 0)
+    """In beginning, acting, learning and the offline phase."""
+    case = case_of(name)
+    plain = case.plain
 
-    def whole(key, state):
+    def whole(key):
         parts = jax.random.split(key, 4)
-        learned = plain.learn(state, parts[0], 1, case.data)[0]
-        acted = plain.act(learned, plain.init_carry(), OBS, parts[1], explore=True)
-        fresh = plain.init(case.params, parts[2], case.data)
-        offline = plain.learn(fresh, parts[3], 1, case.data, offline=True) if case.data else ()
-        return learned, acted, fresh, offline
+        state = plain.init(case.params, parts[0], case.data)
+        offline = plain.learn(state, parts[1], 1, case.data, offline=True) if case.data else ()
+        learned = plain.learn(state, parts[2], 1, case.data)
+        return offline, learned, plain.act(state, plain.init_carry(), OBS, parts[3], explore=True)
 
-    assert keys.used_twice(whole, state) == 0
+    assert keys.used_twice(whole) == 0
 
 
 def test_the_check_of_keys_finds_them():
-    """A loop over one key, and a key derived twice: `split(key)[1]` is `fold_in(key, 1)`."""
-    loop = lambda key: jax.lax.scan(lambda x, _: (x + jax.random.normal(key), None), 0.0, length=3)[0]  # noqa: E731
-    twins = lambda key: [jax.random.normal(k) for k in (jax.random.split(key)[1], jax.random.fold_in(key, 1))]  # noqa: E731
-    assert keys.used_twice(loop) == 1 and keys.used_twice(twins) == 1
-    assert keys.used_twice(lambda key: jax.vmap(jax.random.normal)(jax.random.split(key, 5))) == 0
+    """A loop over one key, a key derived twice (`split(key)[1]` is `fold_in(key, 1)`), one used by a loop and after it;
+    of two branches only one is taken.
+    """
+    normal, split, scan = jax.random.normal, jax.random.split, jax.lax.scan
+    loop = lambda key: scan(lambda x, _: (x + normal(key), None), 0.0, length=3)[0]  # noqa: E731
+    twins = lambda key: [normal(k) for k in (split(key)[1], jax.random.fold_in(key, 1))]  # noqa: E731
+    chain = lambda key: scan(lambda k, _: tuple(split(k)), key, length=2)  # noqa: E731
+    either = lambda key, x: jax.lax.cond(x > 0, normal, lambda k: normal(split(k)[0]), key)  # noqa: E731
+    assert keys.used_twice(loop) == keys.used_twice(twins) == 1
+    assert keys.used_twice(lambda key: (chain(key), normal(key))) == 1
+    assert keys.used_twice(lambda key: jax.vmap(normal)(chain(key)[1])) == 0
+    assert keys.used_twice(lambda key, x: (either(key, x), normal(key)), 1.0) == 1
+    assert keys.used_twice(lambda key: jax.vmap(normal)(split(key, 5))) == keys.used_twice(either, 1.0) == 0
 
 
 @pytest.mark.slow

@@ -51,9 +51,9 @@ def test_a_bad_task_is_one_line(tmp_path, name, text, words):
 @pytest.mark.parametrize("name", ["reset", "step", "make_worlds"])
 def test_a_task_that_fails_while_it_runs_is_one_line(tmp_path, name, key):
     (tmp_path / "mine.py").write_text(TOY.format(name=name))
-    env = envs.make(str(tmp_path / "mine.py"))
 
     def play():
+        env = envs.make(str(tmp_path / "mine.py"))
         pool = envs.sample_worlds(env, key, 1)
         act = lambda carry, obs, key: (jnp.zeros(2), carry)  # noqa: E731
         jax.jit(lambda key: envs.play_episode(env, pool, act, (), key, gamma=0.9))(key)

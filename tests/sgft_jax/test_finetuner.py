@@ -53,6 +53,27 @@ def test_what_moves_and_what_is_frozen(name, moves):
     assert all(jnp.isfinite(m) and m.shape == () for m in metrics.values())
 
 
+# Rows, rows with simulated ones beside them, windows, models alone, a fit
+@pytest.mark.parametrize("name", tuners.slow_but({"sac", "sgft-mpc"}, ["sac", "rlpd", "tdmpc2", "sgft-mpc", "sysid"]))
+def test_nothing_is_learned_from_an_empty_replay(name):
+    """The first rollout has no valid step. What an empty replay gives are zeros."""
+    case = tuner(name)
+    state = case.fine.init(case.params, jax.random.key(0))
+    torn = jax.tree.map(jnp.zeros_like, tuners.episode(jax.random.key(0)))
+    state = case.fine.observe(state, torn, jnp.zeros(T, bool), jnp.float32(0))
+    new, metrics = case.fine.learn(state, jax.random.key(1), 2)
+    assert equal(new, state) and metrics["updates"] == 0 and jnp.isnan(metrics["batch/reward_mean"])
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(case.fine.export(new)))
+
+
+@pytest.mark.slow
+def test_what_learns_from_simulated_rows_needs_no_real_ones():
+    case = tuner("iql")
+    state = case.fine.init(case.params, jax.random.key(0))
+    new, metrics = case.fine.learn(state, jax.random.key(1), 2, offline=True)
+    assert metrics["updates"] == 2 and not equal(new.learner, state.learner)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["tdmpc2", "sgft-tdmpc2"])
 def test_what_moves_in_a_planner(name):
@@ -354,6 +375,27 @@ def test_a_transform_that_learns_keeps_its_state():
         state, metrics = case.fine.learn(state, jax.random.key(calls), 3)
         assert state.transform == ((), 3.0 * calls) and metrics["batch/reward_mean"] == mean
         assert metrics["transform/seen"] == mean - 1.0
+
+
+def test_updates_stop_at_their_limit():
+    """With the keys of the first ones; metrics are means over those that were made."""
+    add = Transform(
+        init=lambda params, key: jnp.float32(0),
+        apply=lambda state, imagination, batch, key: batch,
+        update=lambda state, batch, key: (state + jax.random.uniform(key), {"transform/seen": state}),
+    )
+    plain = counting(compose(add))
+    learn, state = jax.jit(plain.learn, static_argnums=2), started(compiled(plain, None))
+    for limit in (0, 2, 3):
+        new, metrics = learn(state, jax.random.key(1), 3, limit=jnp.int32(limit))
+        same, means = learn(state, jax.random.key(1), 3)
+        assert metrics["updates"] == limit and equal(new.replay, state.replay)
+        assert (float(new.transform[0]) == float(same.transform[0])) == (limit == 3)
+    np.testing.assert_allclose(metrics["transform/seen"], means["transform/seen"], rtol=1e-6)
+    two, metrics = learn(state, jax.random.key(1), 3, limit=jnp.int32(2))
+    one, _ = learn(state, jax.random.key(1), 3, limit=jnp.int32(1))
+    np.testing.assert_allclose(metrics["transform/seen"], one.transform[0] / 2, rtol=1e-6)
+    assert 0 < two.transform[0] < same.transform[0]
 
 
 def test_transforms_learn_from_the_batch_as_it_was_sampled():

@@ -125,6 +125,50 @@ def test_returns_need_no_scale():
     assert not play(state, 20).deployed and play(state, 51).deployed
 
 
+def trials(scores, rollouts=30):
+    """Which rollouts are played by what learns, or a copy of it. scores(whether so, i) -> score, what a part scored."""
+    state, copied, flags = guard.start("return"), False, []
+    for i in range(rollouts):
+        flags.append(copied or bool(state.deployed))
+        state = guard.scored(state, *map(jnp.float32, scores(flags[-1], i)))
+        copied |= bool(state.replaced)
+        state = guard.learned(state)
+    return flags, state
+
+
+def whole(i):
+    return -12.0 + 0.1 * (-1) ** i, np.inf
+
+
+BOOM = (-np.inf, -2.0)  # an explosion after two steps
+
+
+def test_a_challenger_that_explodes_is_tried_and_given_up():
+    """Rewards are costs, so that a part costs less than the whole; the worst score known is close to the others."""
+    flags, state = trials(lambda learns, i: BOOM if learns else whole(i))
+    assert any(flags) and sum(flags) <= 5 and state.worst > -12.2
+    mended, _ = trials(lambda learns, i: (-10, np.inf) if learns and i > 9 else BOOM if learns else whole(i))
+    assert sum(mended[10:]) > 10
+
+
+@pytest.mark.parametrize("part", [-2.0, 3.0])
+def test_where_the_reference_explodes_the_challenger_takes_over(part):
+    """Also where nothing whole has ever been scored; and for good, if it is whole."""
+    flags, state = trials(lambda learns, i: whole(i) if learns else (-np.inf, part), 8)
+    assert flags == [False] + [True] * 7 and all(np.isfinite(guard.means(state)))
+    flags, _ = trials(lambda learns, i: (-np.inf, part), 8)
+    assert flags == [False] + [True] * 7  # neither works, so the one that learns goes on
+
+
+def test_what_an_explosion_had_earned_is_known_too():
+    """Rewards of either sign."""
+    state = play(guard.start("return"), 10, 12)
+    assert state.deployed
+    lost = guard.learned(guard.scored(state, -jnp.inf, jnp.float32(-50)))
+    assert lost.worst == -50 and not lost.deployed
+    np.testing.assert_allclose(guard.means(lost), (11, 11 + (2 * 0.5 - 0.8 * 61) / 2.8), rtol=1e-6)
+
+
 # --- around a finetuner -----------------------------------------------------------------------------------------------
 
 

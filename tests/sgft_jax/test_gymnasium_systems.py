@@ -214,6 +214,14 @@ def test_an_invalid_step_ends_the_episode_and_is_not_kept(bad):
     assert all(np.isfinite(x).all() for x in episode.transitions) and len(real.actions) == 2
 
 
+def test_an_episode_that_was_broken_off_scores_less_than_any_whole_one():
+    """Where the task is judged by its return, which may be less the longer an episode lasts."""
+    env = toy.make()._replace(score="return")
+    broken, whole = (play(Spoken(says={2: {"invalid": True}} if own else {}), env) for own in (True, False))
+    assert np.isneginf(broken.score) and broken.exploded and np.isfinite(broken.total_reward)
+    assert whole.score == whole.total_reward and not whole.exploded
+
+
 @pytest.mark.slow
 def test_it_is_a_system_that_setup_takes():
     """Two seeds learn on two environments; their policies part from the prior's."""
@@ -237,6 +245,153 @@ def test_it_is_a_system_that_setup_takes():
     assert any(jax.tree.leaves(changed))
 
 
+# --- what an environment returns --------------------------------------------------------------------------------------
+
+
+def answering(reward=10.0, terminated=False, truncated=False, info=()):
+    """An environment whose every step is this; it ends with the third."""
+    real = Spoken()
+
+    def step(action):
+        real.time += 1
+        real.actions.append(action)
+        return real.seen(), reward, terminated, truncated or real.time == 3, info if info is None else dict(info)
+
+    real.step = step
+    return real
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        {"reward": np.full(1, 10.0)}, {"terminated": np.zeros(1, bool)}, {"truncated": np.int64(0)}, {"info": None},
+        {"info": {"is_success": np.ones(1)}}, {"reward": np.float64(10.0), "info": {"invalid": False, "late": None}},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_answers_in_other_types_are_the_same(answer):
+    episode = play(answering(**answer))
+    assert episode.valid.sum() == 3 and episode.total_reward == 30.0 and not episode.exploded
+
+
+@pytest.mark.parametrize("answer", [{"reward": "much"}, {"terminated": None}, {"info": {"sent": [9.0, 0.0]}}], ids=str)
+def test_an_environment_is_stopped_where_its_answer_cannot_be_used(answer):
+    real, rests = answering(**answer), []
+    real.rest = lambda: rests.append(real.time)
+    with pytest.raises(UserError, match=r"^step of .*Spoken.*: .* (is|beyond) "):
+        play(real)
+    assert rests == [1]
+
+
+def test_all_environments_rest_where_one_of_them_cannot():
+    several, rests = [Spoken(), Spoken()], []
+    several[0].rest = fails
+    several[1].rest = lambda: rests.append(1)
+    with pytest.raises(UserError, match=r"^rest of .*ValueError: no motor$"):
+        play(several, members=2)
+    assert rests == [1]
+
+
+@pytest.mark.parametrize("invalid", [{}, {"invalid": False}, {"invalid": np.zeros(1)}], ids=str)
+def test_an_unknown_reward_is_the_tasks_also_where_info_says_that_nothing_is_invalid(invalid):
+    env = toy.make()._replace(reward=lambda obs, action, following: following[0])
+    episode = play(answering(reward=np.nan, info=invalid), env)
+    assert episode.valid.sum() == 3 and not episode.exploded and episode.total_reward == 6.0
+
+
+def test_observations_of_another_size_in_a_later_episode_are_one_line():
+    real = Spoken()
+    real.seen = lambda: np.zeros(4 + len(real.actions) // 3, np.float32)
+    system, keys = Gymnasium(toy.make(), real, gamma=GAMMA), jax.random.split(jax.random.key(0), (1, 2))
+    with pytest.raises(UserError, match=r"^step of .*Spoken.*: observes 5 numbers, the task toy measures 4: xy \[2\]"):
+        system.play(STILL, jnp.zeros(1), keys, explore=False)
+
+
+@pytest.mark.parametrize(
+    ("seen", "words"),
+    [
+        ({"xy": np.zeros(2)}, "velocity of .*: the observation is None, not numbers alone"),
+        ({"xy": np.zeros(1), "velocity": np.zeros(3)}, "xy of .*: observes 1 numbers, its space has 2"),
+        (np.zeros(4), "observes a ndarray, not a mapping with xy, velocity"),
+    ],
+)
+def test_a_dict_with_other_parts_than_its_space_is_one_line(seen, words):
+    real = Parts()
+    real.seen = lambda: seen
+    with pytest.raises(UserError, match=words):
+        play(real)
+
+
+WANTING = Policy(lambda: (), lambda state, carry, obs, key, *, explore: (jnp.tanh(obs[2:]), carry))  # what it sees
+
+
+@pytest.mark.parametrize("large", [np.nan, np.inf, 3e38])
+def test_no_command_follows_a_start_that_is_not_finite(large, monkeypatch):
+    """It is asked for again; the policy sees the first one that is."""
+    monkeypatch.setattr("sgft_jax.systems.gymnasium._PAUSE", 0.0)
+    real, starts = Spoken(ends="truncated"), []
+    reset, blind = real.reset, 3
+
+    def late(*, seed=None):
+        starts.append(seed)
+        obs, info = reset(seed=seed)
+        return np.where(len(starts) <= blind, np.float32(large), obs), info
+
+    real.reset = late
+    episode = play(real, policy=WANTING)
+    assert len(starts) == 4 and len(set(starts)) == 1 and np.isfinite(real.actions).all() and episode.valid.sum() == 3
+    blind, starts[:], real.actions[:], rests = 10, [], [], []
+    real.rest = lambda: rests.append(1)
+    with pytest.raises(UserError, match=r"^reset of .*: measured number 0 is .* after 4 tries; no episode can begin"):
+        play(real, policy=WANTING)
+    assert len(starts) == 4 and not real.actions and rests == [1]
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_an_action_that_is_not_finite_is_not_sent_and_ends_that_members_episode(together):
+    policy = Policy(lambda: (), lambda state, carry, obs, key, *, explore: (jnp.full(2, state), carry))
+    several = [Spoken(ends="truncated") for _ in range(2)]
+    make = [lambda own=own: own for own in several]
+    real = SyncVectorEnv(make, autoreset_mode=AutoresetMode.NEXT_STEP) if together else several
+    keys = jax.random.split(jax.random.key(0), (2, 1))
+    episode = Gymnasium(toy.make(), real, gamma=GAMMA).play(policy, jnp.array([0.5, jnp.nan]), keys, explore=False)
+    assert episode.valid.sum(2).tolist() == [[3], [0]] and episode.exploded.tolist() == [[False], [True]]
+    assert all(np.isfinite(own.actions).all() for own in several) and len(several[1].actions) == (3 if together else 0)
+
+
+def test_a_measurement_too_large_for_arithmetic_ends_the_episode():
+    real = Spoken()
+    real.seen = lambda: np.full(4, 3e38 if real.time == 2 else 1.0, np.float32)
+    episode = play(real)
+    assert episode.valid.tolist() == [True] + [False] * 19 and episode.exploded
+
+
+# --- action spaces ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("space", "sent", "kept"),
+    [
+        (spaces.Box(-10, 10, (2,), np.int64), [5, -10], [0.5, -1.0]),
+        (spaces.Box(-7, 7, (2,), np.int16), [4, -7], [4 / 7, -1.0]),  # 3.5: to the even one, as NumPy rounds
+        (spaces.Box(0, 1, (2,), np.int8), [1, 0], [1.0, -1.0]),
+        (spaces.Box(0, 255, (2,), np.uint8), [191, 0], [127 / 255, -1.0]),
+        (spaces.Box(-1, 1, (2, 1), np.float32), [[0.5], [-1.0]], [0.5, -1.0]),
+        (spaces.Box(-1, 1, (1, 2), np.float64), [[0.5, -1.0]], [0.5, -1.0]),
+        (spaces.Box(0, 4, (2, 1), np.int32), [[3], [0]], [0.5, -1.0]),
+    ],
+    ids=str,
+)
+def test_what_was_sent_is_what_is_kept_in_the_shape_of_the_space(space, sent, kept):
+    own = acting(space)
+    own.ends = "truncated"
+    together = space.shape == (2, 1)
+    episode = play(SyncVectorEnv([lambda: own], autoreset_mode=AutoresetMode.NEXT_STEP) if together else own)
+    assert own.actions[0].dtype == space.dtype and own.actions[0].tolist() == sent
+    np.testing.assert_allclose(episode.transitions.action[0], kept, rtol=1e-6)
+    np.testing.assert_array_equal(episode.command[0], [0.5, -1.0])
+
+
 # --- what does not fit ------------------------------------------------------------------------------------------------
 
 
@@ -244,6 +399,12 @@ class Buttons(Spoken):
     def __init__(self):
         super().__init__()
         self.action_space = spaces.Discrete(3)
+
+
+def acting(space):
+    real = Spoken()
+    real.action_space = space
+    return real
 
 
 def box(*shape):
@@ -255,6 +416,13 @@ def box(*shape):
     [
         (Buttons, "its actions are Discrete(3); only a Box can be commanded"),
         (lambda: Spoken(low=-np.inf), "its actions have no bounds"),
+        (lambda: Spoken(low=np.finfo(np.float32).min, high=np.finfo(np.float32).max), "no bounds below 1e+09"),
+        (lambda: acting(spaces.Box(np.iinfo(np.int64).min, 0, (2,), np.int64)), "no bounds below 1e+09"),
+        (lambda: acting(spaces.MultiBinary(2)), "its actions are MultiBinary(2); only a Box can be commanded"),
+        (lambda: acting(spaces.Box(0, np.float32([1, 0]))), "number 1 of its action can only be 0; leave it out"),
+        (lambda: [], "no environment is given"),
+        (lambda: [Spoken(), Spoken(high=2.0)], "the spaces of its 2 environments differ; make them alike"),
+        (lambda: Spoken, "is no Gymnasium environment"),
         (lambda: box(3), "observes 3 numbers, the task measures 4: {'xy': 2, 'velocity': 2}; pass observe="),
         (lambda: Spoken(spaces.Discrete(4)), "observes Discrete(4), neither a Box nor a Dict"),
         (
@@ -315,7 +483,7 @@ def test_the_number_of_actions_must_be_the_tasks():
 
 
 def test_a_function_that_maps_wrongly_is_one_line():
-    with pytest.raises(UserError, match=r"observe: returns 1 numbers, the task toy measures 4: xy \[2\]"):
+    with pytest.raises(UserError, match=r"reset of .*: observes 1 numbers, the task toy measures 4: xy \[2\]"):
         play(Spoken(), observe=lambda obs: obs[:1])
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import keys
 import numpy as np
 import pytest
 import toy
@@ -28,6 +29,11 @@ CONFIG = PretrainConfig(
     replay_capacity=4 * N * STEPS, batch_size=8, updates_per_step=1, gamma=0.9,
     network=NetworkConfig(hidden=(8,)), ensemble_size=1, size="tiny", horizon=2, plan_samples=8, gru=4,
 )  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _tiny(monkeypatch):
+    monkeypatch.setitem(tdmpc2_model.SIZES, "tiny", tdmpc2_model.Size(8, 8, 8, 2, 2))
 
 
 class Agent(struct.PyTreeNode):
@@ -91,6 +97,59 @@ def test_episodes_end_and_begin_anew_with_their_carry(counted):
     assert metrics["train/exploded"][0] == metrics["train/success"][0] == 0
 
 
+@pytest.mark.parametrize("algorithm", ["sac", "recurrent", pytest.param("tdmpc2", marks=pytest.mark.slow)])
+def test_no_key_is_used_twice(algorithm):
+    """In random experience, the first state, a chunk of two steps and new worlds."""
+    env = toy_terminating.make()
+    config = replace(
+        CONFIG, algorithm=algorithm, n_envs=2, chunk_steps=2, random_transitions=2 * LENGTH, replay_capacity=80,
+        random_ladder=0.5, batch_size=4, updates_per_step=2,
+    )  # fmt: skip
+    trainer, pool = pretraining.make_pretrainer(env, config), envs.sample_worlds(env, jax.random.key(0), 2)
+
+    def whole(key):
+        key_random, key_start = jax.random.split(key)
+        random = trainer.collect_random(pool, key_random)
+        state, _ = trainer.chunk(pool, random, trainer.init(pool, random, key_start))
+        return jax.random.normal(trainer.renew(pool, state).key)
+
+    assert keys.used_twice(whole) == 0
+
+
+def test_a_policy_remembers_the_random_action_that_replaced_its_choice(monkeypatch):
+    """Its choice is always 0.5; what it hands on is the action that was stored, or 0 at the start of an episode."""
+    chosen = lambda agent, carry, obs, key: (jnp.full(1, 0.5), jnp.float32(0.5))  # noqa: E731
+    recipe = lambda task, config: counting(task, config)._replace(  # noqa: E731
+        act=chosen, replaced=lambda carry, action: action[0]
+    )
+    monkeypatch.setattr(pretraining, "RECIPES", {"sac": recipe})
+    config = replace(CONFIG, chunk_steps=5, env_steps=5 * N, random_ladder=1.0)
+    *_, (state, _) = pretrain(toy_terminating.make(), config, [3])
+    done = state.replay.data.action[0, 4 * N : 5 * N, 0]
+    remembered, goes_on = state.fleet.carry[0], state.fleet.state.time[0] > 0
+    np.testing.assert_array_equal(remembered, jnp.where(goes_on, done, 0.0))
+    assert goes_on.any() and (done[goes_on] == 0.5).any() and (done[goes_on] != 0.5).any()
+
+
+def test_statistics_are_those_of_the_steps_that_did_not_explode(monkeypatch):
+    """Half of the random steps explode, and leave the end of their buffer empty."""
+    monkeypatch.setattr(pretraining, "RECIPES", {"sac": counting})
+    env = toy_terminating.make()
+    step = lambda world, state, action, key: env.step(world, state, action, key)._replace(invalid=action[0] > 0)  # noqa: E731
+    trainer, pool = (
+        pretraining.make_pretrainer(env._replace(step=step), CONFIG),
+        envs.sample_worlds(env, jax.random.key(0), 4, params={"risk": 0.0}),
+    )
+    random = jax.jit(trainer.collect_random)(pool, jax.random.key(1))
+    held, rows = int(random.size), len(random.data.reward)
+    assert 0.4 * rows < held < 0.6 * rows
+    statistics = jax.jit(trainer.init)(pool, random, jax.random.key(2)).learner.normalizer
+    seen = np.asarray(random.data.obs)[:held, 0]
+    assert statistics.mean[0] == pytest.approx(seen.mean(), rel=1e-4)
+    assert statistics.std[0] == pytest.approx(seen.std(), rel=1e-4)
+    assert seen.mean() < -0.02
+
+
 def test_new_worlds_begin_new_episodes(counted):
     """Nothing ends the first set's episodes but time, everything those of the second."""
     state, metrics = counted([0.0, 1.0], refresh_every=1)[-1]
@@ -117,8 +176,7 @@ def test_a_set_that_is_not_due_is_never_asked_for(counted):
         pytest.param("recurrent", 1, marks=pytest.mark.slow),
     ],
 )
-def test_resumed_is_bit_for_bit_uninterrupted(algorithm, refresh_every, monkeypatch):
-    monkeypatch.setitem(tdmpc2_model.SIZES, "tiny", tdmpc2_model.Size(8, 8, 8, 2, 2))
+def test_resumed_is_bit_for_bit_uninterrupted(algorithm, refresh_every):
     env, config = (
         toy_terminating.make(),
         replace(CONFIG, algorithm=algorithm, refresh_every=refresh_every, random_ladder=0.5),
@@ -170,6 +228,23 @@ def test_better_is_a_higher_score_then_a_higher_return():
         kept = keep_better(old, best(score, total, 2), 0.0)
         assert kept.steps == steps and kept.params["w"].tolist() == [steps, steps]
     assert keep_better(old, best(0.1, 0.0, 2), 1.5).steps == 2, "an early evaluation does not compete"
+
+
+def test_a_policy_that_explodes_is_not_the_better_one():
+    """Costs of 12 or so for a whole episode; the worst known of both evaluations counts for those that exploded."""
+
+    def best(score, steps, exploded, worst):
+        score = jnp.float32(score)
+        return Best(jnp.int32(steps), score, score, jnp.int32(steps), jnp.float32(exploded), jnp.full(2, worst))
+
+    whole = best(-12.0, 1, 0.0, -13.0)
+    for score, exploded, worst in [(-2.0, 1.0, -2.0), (-11.0, 0.9, -11.0), (-12.0, 0.1, -12.0)]:
+        bursts = best(score, 2, exploded, worst)
+        assert keep_better(whole, bursts, 0.0).steps == 1 and keep_better(bursts, whole, 0.0).steps == 1
+    kept = keep_better(best(-11.0, 2, 0.5, -12.0), whole, 0.0)
+    assert kept.steps == 2 and kept.score == -11.5 and kept.worst.tolist() == [-13, -13]
+    same = best(-12.0, 2, 1.0, -12.0)
+    assert keep_better(same, best(-12.0, 1, 0.0, -12.0), 0.0).steps == 1  # at the same cost, whole
 
 
 @pytest.mark.parametrize("algorithm", ["sac", "tdmpc2", "recurrent"])

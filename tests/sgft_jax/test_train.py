@@ -5,6 +5,7 @@ import re
 
 import jax
 import jax.numpy as jnp
+import keys
 import numpy as np
 import pytest
 import toy_terminating
@@ -74,24 +75,88 @@ def run(finetuner=FINE, system=None, rollouts=4, **options):
     return [(copied(progress), metrics) for progress, metrics in steps]
 
 
+# --- keys ------------------------------------------------------------------------------------------------------------
+
+
+def test_every_purpose_of_every_member_draws_from_keys_that_no_other_uses():
+    """Beginning, updates before the first rollout and after two, what is played to learn and what to be judged."""
+    fine = make(simulation=NEEDS)
+    rows = rows_of(10)
+    learn = train.Updates(fine, SEEDS, train.prior_of(PRIORS, SEEDS), rows)
+
+    def whole(key):
+        agent = train.begin(fine._replace(init=drawn), PRIORS, SEEDS, rows).agent
+        for parts, phase in (([0], "offline"), ([1], "logged"), ([0, 1], "online")):
+            agent, _ = learn(agent, parts, 1, phase)
+        played = [train._episode_keys(SEEDS, purpose, 0, 2) for purpose in (train._COLLECT, train._EVALUATE)]
+        played.append(train._episode_keys(SEEDS, train._COLLECT, 1, 2))
+        return agent, [jax.vmap(jax.vmap(jax.random.normal))(x) for x in played], jax.random.normal(key)
+
+    def drawn(params, key, data):
+        return fine.init(params + jax.random.normal(key), jax.random.key(77), data)
+
+    assert keys.used_twice(whole) == 0
+
+
 # --- what it yields -------------------------------------------------------------------------------------------------
 
 
+def updates_of(system):
+    """[rollouts, M] of what was played: three for a whole rollout, in proportion for a shorter one, one at least."""
+    lengths = np.stack([np.asarray(episodes.valid.sum((1, 2))) for episodes, _ in system.played])
+    return np.maximum(np.rint(PER_ROLLOUT * lengths / LENGTH), 1)
+
+
 def test_the_fresh_state_comes_first_then_one_a_rollout():
-    yielded = run(rollouts=3)
+    system = Recorded(simulated())
+    yielded = run(system=system, rollouts=3)
     assert [int(p.rollouts) for p, _ in yielded] == [0, 1, 2, 3] and yielded[0][1] == {}
     assert {"real/return", "real/score", "real/exploded", "learner/state", "batch/reward_mean"} <= set(yielded[1][1])
     assert all(x.shape == (2,) and jnp.isfinite(x).all() for _, metrics in yielded[1:] for x in metrics.values())
     # seed 3 starts from prior 1, seed 8 from prior 0
     np.testing.assert_array_equal(yielded[0][0].agent.learner, [0.5, 0.0])
-    np.testing.assert_allclose(yielded[3][0].agent.learner, [0.5 + 9, 9.0], atol=0.1)
+    np.testing.assert_allclose(yielded[3][0].agent.learner, np.add([0.5, 0.0], updates_of(system).sum(0)), atol=0.1)
+
+
+def test_updates_and_transitions_are_those_of_the_steps_that_were_made():
+    """Members differ, as their episodes end early; metrics are means over the updates of each."""
+    system = Recorded(simulated())
+    yielded = run(system=system, rollouts=4)
+    updates, valid = updates_of(system), np.stack([np.asarray(x.valid.sum((1, 2))) for x, _ in system.played])
+    assert len(np.unique(updates)) == PER_ROLLOUT and (updates[:, 0] != updates[:, 1]).any()
+    for i, (progress, metrics) in enumerate(yielded[1:], 1):
+        np.testing.assert_array_equal(progress.transitions, valid[:i].sum(0))
+        np.testing.assert_array_equal(metrics["updates"], updates[i - 1])
+        before = yielded[i - 1][0].agent.learner
+        np.testing.assert_allclose(progress.agent.learner, before + updates[i - 1], atol=0.02)
+        np.testing.assert_allclose(metrics["learner/state"], before + (updates[i - 1] - 1) / 2, atol=0.02)
 
 
 def test_initial_rollouts_come_together_and_each_brings_its_updates():
-    yielded = run(make(initial_rollouts=3), rollouts=4)
+    system = Recorded(simulated())
+    yielded = run(make(initial_rollouts=3), system, rollouts=4)
     assert [int(p.rollouts) for p, _ in yielded] == [0, 3, 4]
-    np.testing.assert_allclose(yielded[1][0].agent.learner, [0.5 + 9, 9.0], atol=0.1)
-    assert run(make(initial_rollouts=3), rollouts=3)[-1][0].rollouts == 3
+    updates = updates_of(system)[:3]
+    np.testing.assert_allclose(yielded[1][0].agent.learner, np.add([0.5, 0.0], updates.sum(0)), atol=0.1)
+    np.testing.assert_allclose(yielded[1][1]["updates"], updates.mean(0))
+
+
+def test_a_rollout_without_a_valid_step_is_learned_nothing_from():
+    """The first two have none. Then there is something in the replay again."""
+    yielded = run(system=Scripted(np.zeros((3, 2)), made=[0, 0, LENGTH]), rollouts=3)
+    for progress, metrics in yielded[1:3]:
+        assert equal(progress.agent, yielded[0][0].agent) and metrics["updates"].tolist() == [0, 0]
+        assert np.isnan(metrics["learner/state"]).all()
+    last, metrics = yielded[3]
+    assert metrics["updates"].tolist() == [PER_ROLLOUT] * 2 and last.transitions.tolist() == [LENGTH] * 2
+    np.testing.assert_allclose(last.agent.learner, [0.5 + 3, 3.0], atol=0.1)
+
+
+def test_a_log_without_a_valid_step_is_learned_nothing_from():
+    log = logs_of(3, 2, updates=4)
+    yielded = run(rollouts=0, logged=log._replace(valid=jnp.zeros_like(log.valid)))
+    assert int(yielded[1][0].offline) == 4 and yielded[1][1]["updates"].tolist() == [0, 0]
+    assert equal(yielded[1][0].agent, yielded[0][0].agent)
 
 
 def test_a_resumed_run_goes_on_with_the_same_bits(tmp_path):
@@ -167,27 +232,31 @@ def test_terminations_and_time_limits_are_stored_as_what_they_are():
 
 
 class Scripted:
-    """A system whose episodes have scores and returns [rollouts, M] as written; every other row is invalid."""
+    """A system whose episodes have scores and returns [rollouts, M] as written.
 
-    def __init__(self, scores, returns=None):
-        self.scores, self.calls = np.asarray(scores, np.float32), 0
+    made: [rollouts] steps before the physics explodes. torn: every other row is invalid.
+    """
+
+    def __init__(self, scores, returns=None, made=None, *, torn=False):
+        self.scores, self.calls, self.torn = np.asarray(scores, np.float32), 0, torn
         self.returns = self.scores if returns is None else np.asarray(returns, np.float32)
+        self.made = [LENGTH] * len(self.scores) if made is None else made
 
     def play(self, policy, states, keys, *, explore):
         assert keys.shape == (2, 1)
         score, total = (jnp.asarray(x[self.calls])[:, None] for x in (self.scores, self.returns))
+        shape, no, steps = (2, 1, LENGTH), jnp.zeros((2, 1), bool), jnp.arange(LENGTH)
+        valid = jnp.broadcast_to((steps < self.made[self.calls]) & ~(self.torn & (steps % 2 == 1)), shape)
         self.calls += 1
-        shape, no = (2, 1, LENGTH), jnp.zeros((2, 1), bool)
-        valid = jnp.broadcast_to(jnp.arange(LENGTH) % 2 == 0, shape)
         obs = jnp.where(valid[..., None], 1.0, jnp.nan) * jnp.ones((*shape, 2))
         rows = Transition(obs, jnp.zeros((*shape, 1)), jnp.ones(shape), jnp.ones(shape), obs)
         return Episode(rows, valid, total, no, ~valid.all(-1), score, jnp.zeros((2, 1), int), jnp.zeros((*shape, 0)))
 
 
 def test_rows_with_exploded_physics_are_not_stored():
-    *_, (last, metrics) = run(system=Scripted(np.zeros((3, 2))), rollouts=3)
+    *_, (last, metrics) = run(system=Scripted(np.zeros((3, 2)), torn=True), rollouts=3)
     assert last.agent.replay.size.tolist() == [3 * LENGTH // 2] * 2
-    assert all(np.isfinite(x).all() for x in jax.tree.leaves(last)[1:] if x.dtype == np.float32 and x.size > 2)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(last.agent) if x.dtype == np.float32 and x.size > 2)
     assert np.isfinite(last.agent.learner).all() and metrics["real/exploded"].tolist() == [1, 1]
 
 
@@ -199,7 +268,7 @@ def test_the_policy_of_the_best_five_rollouts_is_kept():
     rise = [0, 0, 1, 1, 1, 1, 1, 0, 0, 0, 1, 1]
     late = [0, 0, 0, 0, 0, 0, 1, 0, 1, 1, 1, 1]
     yielded = run(system=Scripted(np.stack([rise, late], 1)), rollouts=12)
-    assert np.isneginf(yielded[4][0].best.score).all()  # four rollouts are no evidence
+    assert yielded[4][0].best.score.tolist() == [0.5, 0.0]  # of four rollouts, as there are no more
     best, played = (
         yielded[-1][0].best,
         [7 - 1, 11 - 1],
@@ -220,6 +289,15 @@ def test_the_best_policy_had_learned_from_what_came_before_it():
     """Six rollouts at once, by one policy that had learned from none."""
     best = run(make(initial_rollouts=6), Scripted(np.ones((6, 2))), rollouts=6)[-1][0].best
     assert best.rollouts.tolist() == [0, 0] and best.params.tolist() == [0.5, 0.0]
+
+
+def test_an_explosion_is_reported_as_the_worst_that_is_known():
+    """Rewards are costs: two steps cost 2, a whole rollout 12 or 10."""
+    scores = np.repeat([[-12.0], [-2.0], [-10.0]], 2, 1)
+    yielded = run(system=Scripted(scores, made=[LENGTH, 2, LENGTH]), rollouts=3)
+    assert [metrics["real/score"].tolist() for _, metrics in yielded[1:]] == [[-12] * 2, [-12] * 2, [-10] * 2]
+    assert yielded[2][1]["real/return"].tolist() == [-12] * 2 and yielded[2][1]["real/exploded"].tolist() == [1, 1]
+    assert yielded[3][0].best.score.tolist() == pytest.approx([-34 / 3] * 2)
 
 
 def test_rollouts_of_an_initial_policy_are_no_evidence_for_the_agent():

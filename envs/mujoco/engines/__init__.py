@@ -5,9 +5,6 @@ from typing import NamedTuple
 
 from sgft_jax.types import Array, PyTree
 
-MEAN_INERTIA, GRAVITY = "stat.meaninertia", "opt.gravity"
-NESTED = (MEAN_INERTIA, GRAVITY)  # fields that worlds may differ in, though MuJoCo does not keep them with the others
-
 
 class Engine(NamedTuple):
     """What steps a scene, for one world; vmap over worlds.

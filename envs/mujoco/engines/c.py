@@ -23,12 +23,12 @@ import mujoco.rollout
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
-from envs.mujoco.engines import MEAN_INERTIA, Engine
+from envs.mujoco.engines import Engine
 from sgft_jax.types import Array, PyTree
 
 
 class _Slot(NamedTuple):
-    """What a thread steps worlds in, one after another. views: name of a field -> the array inside `model`."""
+    """What a thread steps worlds in, one after another. views: name of an array -> the array inside `model`."""
 
     rollout: mujoco.rollout.Rollout
     model: mujoco.MjModel
@@ -45,7 +45,9 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
     mujoco.set_mju_user_warning(_warn)
     nominal = copy.deepcopy(host)
     nominal.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    arrays = tuple(name for name in fields if name != MEAN_INERTIA)
+    if {"geom_size", "geom_pos", "geom_quat", "body_ipos", "body_iquat"}.intersection(fields):
+        nominal.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_MIDPHASE  # its boxes are those of the nominal scene
+    arrays = tuple(name for name in fields if isinstance(attrgetter(name)(nominal), np.ndarray))
     cores = os.cpu_count() or 1
     threads = concurrent.futures.ThreadPoolExecutor(cores)
     lock = threading.Lock()  # XLA may run two programs at once
@@ -111,10 +113,11 @@ def _warn(message: str) -> None:
 def _enter(slot: _Slot, values: dict[str, np.ndarray]) -> None:
     """Make the slot's model that of one world."""
     for name, value in values.items():
-        if name == MEAN_INERTIA:
-            slot.model.stat.meaninertia = float(value)
-        else:
+        if name in slot.views:
             slot.views[name][...] = value
+        else:
+            part, _, last = name.rpartition(".")
+            setattr(getattr(slot.model, part), last, float(value))
 
 
 def _forward(slot: _Slot, state: Any, controls: np.ndarray) -> np.ndarray:

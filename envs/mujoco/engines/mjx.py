@@ -13,17 +13,24 @@ with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that 
     from mujoco import mjx
 
 import envs.mujoco.engines.fences  # noqa: F401 - a repair of mjx, before its first use
-from envs.mujoco.engines import NESTED, Engine
-from sgft_jax.types import Array
+from envs.mujoco.engines import Engine
+from envs.mujoco.engines.features import check_features
+from envs.mujoco.fields import FLUID, POLYNOMIAL
+from sgft_jax.types import Array, UserError
 
 
 def make_engine(host: mujoco.MjModel, fields: tuple[str, ...] = ()) -> Engine:
-    """The engine of a compiled scene. fields: not needed here, every field may be set.
+    """The engine of a compiled scene. fields: names that a world may set in the model.
 
     Between substeps only the minimal state is carried: it keeps the loop's memory traffic small. Matrix products run in
-    full float32: TF32 is not enough for contact dynamics.
+    full float32: TF32 is not enough for contact dynamics. Raises UserError for what MJX cannot step as MuJoCo does.
     """
+    check_features("jax", host)
+    _check_fields(host, fields)
     nominal, blank = put(host)
+    if set(FLUID) & set(fields):
+        option = nominal.opt
+        nominal = nominal.replace(opt=option.replace(_impl=option._impl.replace(has_fluid_params=True)))
     servos = joint_servos(host)
 
     def enter(state: Any, ctrl: Array) -> mjx.Data:
@@ -53,19 +60,40 @@ def put(host: mujoco.MjModel) -> tuple[mjx.Model, mjx.Data]:
     """A compiled scene and its blank data for MJX's own code, on a device of this process.
 
     Left to itself MJX takes the first device of all, which may be another host's: programs cannot hold its arrays.
+    Raises UserError for a scene with something that MJX does not have.
     """
     device = jax.local_devices()[0]
-    return mjx.put_model(host, device=device, impl="jax"), mjx.make_data(host, device=device, impl="jax")
+    try:
+        return mjx.put_model(host, device=device, impl="jax"), mjx.make_data(host, device=device, impl="jax")
+    except NotImplementedError as error:
+        raise UserError(f"MJX cannot step it: {error}; the engine c can (--impl c)") from None
 
 
 def with_fields(model: mjx.Model, fields: dict[str, Array]) -> mjx.Model:
-    """The model of one world: the nominal one with the fields of that world, in the shapes that its engine uses."""
-    fields = dict(fields)
-    for part, own in (name.split(".") for name in NESTED if name in fields):
-        changed = getattr(model, part).replace(**{own: fields.pop(f"{part}.{own}")})
-        model = model.replace(**{part: changed})
-    fields = {name: x.reshape(getattr(model, name).shape) for name, x in fields.items()}
-    return model.replace(**fields)
+    """The model of one world: the nominal one with the fields of that world, in the shapes that its engine uses.
+
+    What only C MuJoCo reads is left out: MJX has it as a constant.
+    """
+    parts: dict[str, dict[str, Array]] = {"": {}}
+    for name, value in fields.items():
+        part, _, last = name.rpartition(".")
+        nominal = getattr(getattr(model, part) if part else model, last)
+        if isinstance(nominal, jax.Array):
+            parts.setdefault(part, {})[last] = value.reshape(nominal.shape)
+    own = parts.pop("")
+    return model.replace(**own, **{part: getattr(model, part).replace(**changed) for part, changed in parts.items()})
+
+
+def _check_fields(host: mujoco.MjModel, fields: tuple[str, ...]) -> None:
+    """Raises UserError where worlds differ in what MJX's JAX code takes from the nominal model, or does not read."""
+    fast = host.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for names, why in (
+        (POLYNOMIAL, "MJX does not read it"),
+        (FLUID if fast else (), "with the integrator implicitfast MJX has no fluids"),
+        (("geom_rbound",) if host.nhfield else (), "beside a height field MJX has one size of geoms for all worlds"),
+    ):
+        if odd := [name for name in names if name in fields]:
+            raise UserError(f"worlds that differ in '{odd[0]}' need the engine c (--impl c): {why}")
 
 
 def joint_servos(host: mujoco.MjModel) -> np.ndarray:

@@ -16,6 +16,7 @@ import mujoco
 import numpy as np
 
 from envs.mujoco.engines import Engine
+from envs.mujoco.engines.features import check_features
 from envs.mujoco.engines.mjx import mjx, put, with_fields
 from sgft_jax.types import Array, PyTree, UserError
 
@@ -27,11 +28,16 @@ _POSES = ("xpos", "xquat", "xmat", "xipos", "ximat", "geom_xpos", "geom_xmat")
 
 
 def make_engine(host: mujoco.MjModel, fields: tuple[str, ...] = ()) -> Engine:
-    """The engine of a compiled scene. fields: not needed here. Raises UserError where Warp is not installed."""
+    """The engine of a compiled scene. fields: names that a world may set in the model.
+
+    Raises UserError where Warp is not installed, and for what it cannot step.
+    """
     if not available():
         raise UserError("the engine warp needs the package warp-lang: install sgft-jax[warp]")
     from envs.mujoco.engines import warp_worlds
 
+    check_features("warp", host)
+    warp_worlds.check(host, fields)
     contacts, rows = budget(host)
     still, at_rest = put(host)
     ends = np.cumsum([host.nq, host.nv, host.nv])
@@ -53,7 +59,7 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...] = ()) -> Engine:
         n = len(controls)
         parts = {"qpos": state.qpos, "qvel": state.qvel, "qacc_warmstart": state.warmstart}
         parts |= jax.vmap(placed)(values, state.qpos)
-        parts |= {name: x for name, x in values.items() if warp_worlds.reads(name)}
+        parts |= warp_worlds.as_read(values)
         packed = jnp.concatenate([x.reshape(n, -1) for x in parts.values()], axis=1)
         qpos, qvel, warmstart, sensordata = jnp.split(call(tuple(parts), move)(packed, controls), ends, axis=1)
         return type(state)(qpos, qvel, warmstart, controls[:, -1], sensordata)

@@ -7,14 +7,14 @@ the worlds' own, so it never has to be captured again.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import mujoco
 import warp as wp
 from mujoco.mjx.third_party import mujoco_warp as mjw
 
-from envs.mujoco.engines import GRAVITY
+from envs.mujoco.fields import FLUID
 from sgft_jax.types import Array, UserError
 
 wp.config.log_level = wp.LOG_WARNING  # no report on every kernel it loads
@@ -23,9 +23,41 @@ wp.config.log_level = wp.LOG_WARNING  # no report on every kernel it loads
 _LOSSES = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS))
 
 
-def reads(name: str) -> bool:
-    """Whether that field of a model means anything to Warp."""
-    return name in mjw.Model.__dataclass_fields__ or name == GRAVITY
+# What Warp's kernels leave out where the nominal scene has none of it, by the flag that says so.
+_FLAGS = {
+    "has_fluid": FLUID,
+    "has_tendon_stiffness": ("tendon_stiffness", "tendon_stiffnesspoly"),
+    "has_tendon_damping": ("tendon_damping", "tendon_dampingpoly"),
+    "has_efm_actuator": ("actuator_gainprm", "actuator_biasprm"),
+}
+
+
+def as_read(fields: Mapping[str, Array]) -> dict[str, Array]:
+    """The fields of models that mean anything to Warp, as it keeps them."""
+    fields = dict(fields)
+    if "opt.impratio" in fields:
+        fields["opt.impratio_invsqrt"] = fields.pop("opt.impratio") ** -0.5
+    return {name: x for name, x in fields.items() if _type(name) is not None}
+
+
+def check(host: mujoco.MjModel, fields: Sequence[str]) -> None:
+    """Raises UserError for a scene that Warp cannot step, or whose worlds differ in what it has once for all."""
+    try:
+        mjw.put_model(host)
+    except (NotImplementedError, ValueError) as error:
+        raise UserError(f"MuJoCo Warp cannot step it: {error}; the engine c can (--impl c)") from None
+    for name in fields:
+        kind = _type(name)
+        if kind is not None and kind.shape[0] != "*":
+            raise UserError(f"worlds that differ in '{name}' need another engine: MuJoCo Warp has one for all of them")
+
+
+def _type(name: str) -> Any:
+    """How Warp's model keeps that field: as an array, of shape ("*", ...) where worlds may differ; None: not at all."""
+    part, _, last = name.rpartition(".")
+    owner = {"": mjw.Model, "opt": mjw.Option}.get(part)
+    field = None if owner is None else owner.__dataclass_fields__.get(last)
+    return None if field is None else field.type
 
 
 class Worlds:
@@ -40,6 +72,9 @@ class Worlds:
         self.model, self.graph, self.stream = mjw.put_model(host), None, None
         self.model.opt.iterations = iterations
         self.model.opt.warn_overflow = False  # messages printed from inside kernels would stall the GPU
+        for flag, names in _FLAGS.items():
+            if set(names) & set(layout):
+                setattr(self.model, flag, True)
         self.data = mjw.make_data(host, nworld=n, naconmax=n * contacts, njmax=rows)
         self.lost = wp.zeros(n, dtype=int)
         self.places = []
@@ -95,8 +130,6 @@ class Worlds:
             part, _, last = name.rpartition(".")
             owner = getattr(self.model, part) if part else self.model
             shared = getattr(owner, last)
-            if shared.shape[0] != 1:
-                raise UserError(f"MuJoCo Warp has one '{name}' for all worlds: it cannot be a domain parameter")
             array = wp.empty((n, *shared.shape[1:]), dtype=shared.dtype)
             setattr(owner, last, array)
         count = math.prod(array.shape[1:]) * wp.types.type_size_in_bytes(array.dtype) // 4

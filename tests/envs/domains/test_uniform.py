@@ -53,6 +53,8 @@ def test_worlds_can_be_made_of_any_theta():
         ({"friction": float("nan")}, "parameter 'friction' needs a value"),
         ({"friction": [1.0, 2.0, 3.0]}, "parameter 'friction' needs a value"),
         ({"friction": "high"}, "parameter 'friction' needs a value"),
+        ({"friction": 1e30}, "parameter 'friction' must be at most 4500, got 1e"),
+        ({"mass": [1.0, 1e6]}, "parameter 'mass' must be at most 1200, got"),
     ],
 )
 def test_impossible_parameters_are_named(params, message):

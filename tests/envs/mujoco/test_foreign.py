@@ -155,7 +155,7 @@ def test_what_observations_do_not_tell_the_simulator_measures():
         ends.append(states.terminated.tolist())
     first, second = (next(i for i, end in enumerate(ends) if end[k]) for k in range(2))
     assert first < second and not states.success.any()
-    with pytest.raises(UserError, match="scene bump measures 'terminated': then its function of observations must be"):
+    with pytest.raises(UserError, match="task bump measures 'terminated': then its function of observations must be"):
         double = make_env(SCENE._replace(measured=measured, reward=None), "c")
         double.step(jax.tree.map(lambda x: x[0], pool), jax.tree.map(lambda x: x[0], states), ACTION, jax.random.key(0))
 
@@ -172,12 +172,73 @@ def test_only_joint_servos_are_held():
     [
         ("<motor", '<intvelocity joint="z" actrange="-1 1"/><motor', "actuators with a state of their own"),
         ("<worldbody>", '<worldbody><body mocap="true"/>', "mocap bodies"),
+        ("<motor", '<motor delay="0.1" nsample="9"', "delays of actuators or sensors"),
+        ("<jointvel", '<jointvel delay="0.1" nsample="9"', "delays of actuators or sensors"),
+        ("<jointvel", '<jointvel interval="0.1 0"', "sensors that read the time"),
+        ("<jointvel", "<clock/><jointvel", "sensors that read the time"),
+        ("<worldbody>", '<size nuserdata="3"/><worldbody>', "user data"),
+        ("<default>", '<option><flag sleep="enable"/></option><default>', "bodies that sleep"),
     ],
 )
 def test_what_no_engine_carries_is_refused(old, new, words):
     mjcf = MJCF.replace(old, new)
     with pytest.raises(UserError, match=f"scene bump has {words}"):
         make_env(SCENE._replace(build=lambda theta: mujoco.MjSpec.from_string(mjcf), parameters=()), "c")
+
+
+FEATURES = {
+    "IMPLICIT": ('integrator="implicitfast"', 'integrator="implicit"'),
+    "PGS": ("<option", '<option solver="PGS"'),
+    "USER": ("<touch", '<user dim="1"/><touch'),
+    "Flex": (
+        "<geom name=",
+        '<flexcomp name="c" type="grid" count="2 2 1" spacing=".1 .1 .1" mass="1" dim="2" radius=".01" pos="0 3 0">'
+        '<edge equality="true"/></flexcomp><geom name=',
+    ),
+    "BODY": ("<motor", '<adhesion body="held" gain="1" ctrlrange="0 1"/><motor'),
+    "surfaces that move": ("<geom name=", '<geom surfacevel="1 0 0 0 0 0" size="1"/><geom name='),
+    "geoms that stick": ("<geom name=", '<geom adhesion="1" size="1"/><geom name='),
+    "higher order": ('stiffness="9"', 'stiffness="9 2 0"'),
+    "around ellipsoids": ('type="sphere"', 'type="sphere" fluidshape="ellipsoid"'),
+    "noslip": ("<option", '<option noslip_iterations="3"'),
+    "armature of actuators": ("<motor", '<motor armature="1"'),
+    "damping or armature": ("<motor", '<motor damping="1"'),
+    "disabled groups": ("<option", '<option actuatorgroupdisable="0"'),
+    "max_contact_points": ("<actuator>", '<custom><numeric name="max_contact_points" data="1"/></custom><actuator>'),
+}
+
+
+@pytest.mark.filterwarnings("ignore:flex")
+@pytest.mark.parametrize("feature", FEATURES)
+def test_the_c_engine_steps_what_mjx_does_not(feature, monkeypatch):
+    """It never asks MJX; MJX's own code refuses in one line, also what it would leave out without a word."""
+    mjcf = MJCF.replace("<body>", '<body name="held">').replace(*FEATURES[feature], 1)
+    host = mujoco.MjSpec.from_string(mjcf).compile()
+    scene = SCENE._replace(
+        build=lambda theta: mujoco.MjSpec.from_string(mjcf),
+        parameters=(),
+        initial=lambda params, key: PhysicsState(*map(jnp.zeros, (host.nq, host.nv, host.nv, host.nu))),
+        target=lambda qpos, action: jnp.resize(action, host.nu),
+        observe=lambda params, state: {"x": state.qpos[:1], "touch": state.sensordata[:1], "speed": state.qvel[:1]},
+    )
+    with monkeypatch.context() as alone:
+        alone.setattr(engine_jax, "put", None)
+        env = make_env(scene, "c")
+    theta = envs.uniform(env).sample((), jax.random.key(0), 1)
+    world = jax.tree.map(lambda x: x[0], env.make_worlds(theta))
+    after = env.step(world, env.reset(world, jax.random.key(0)), ACTION, jax.random.key(1)).physics
+    np.testing.assert_allclose(after.qpos, stepped(host, jnp.resize(ACTION, host.nu)), atol=1e-5)
+    with pytest.raises(UserError, match=rf"scene bump: .*{feature}.*--impl c"):
+        make_env(scene, "jax")
+
+
+def stepped(host, ctrl):
+    """[nq] where MuJoCo itself is after a control period from rest."""
+    data = mujoco.MjData(host)
+    data.qpos[:], data.ctrl[:] = 0.0, ctrl
+    for _ in range(SCENE.substeps):
+        mujoco.mj_step(host, data)
+    return data.qpos
 
 
 def test_the_picture_shows_this_task_and_nothing_else(tmp_path, monkeypatch):

@@ -3,12 +3,15 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from runs_by_hand import save
 
+from envs.rollout import Episode
 from sgft_jax.analysis.curves import (
+    COLUMNS,
     Curve,
     area,
     at,
@@ -20,7 +23,9 @@ from sgft_jax.analysis.curves import (
     from_main_priors,
     from_rows,
     improvement,
+    make_curve,
     read_curve,
+    read_data,
     read_runs,
     rows,
     set_name,
@@ -219,3 +224,67 @@ def test_a_flat_table_and_back():
     np.testing.assert_array_equal(from_rows(table)[1].training, original[1].training)
     with pytest.raises(UserError, match="not evaluated after the same rollouts"):
         from_rows(table[:7])
+
+
+@pytest.mark.parametrize(
+    ("name", "cell", "words"),
+    [
+        ("success", "nan", "success is nan, not a finite number"),
+        ("success", "1.5", "success is 0 to 1.5, not a share"),
+        ("success", "-0.5", "success is -0.5 to 0, not a share"),
+        ("minutes", "inf", "minutes is inf, not a finite number"),
+        ("minutes", "-1", "minutes is -1, less than 0"),
+        ("rollouts", "0.5", "rollouts is 0.5, not a whole number from 0 on"),
+        ("transitions", "1e30", "transitions is 1e30, not a whole number from 0 on"),
+        ("seed", "-1", "seed is -1, not a whole number from 0 on"),
+        ("prior", "-2", "prior is -1.0, not a whole number from 0 on"),
+        ("training", "inf", "training is inf, not a finite number"),
+        ("success", "", "toy/default/sac//fast has no score"),
+    ],
+)
+def test_tables_with_odd_numbers_are_refused(name, cell, words, tmp_path):
+    table = list(rows([dataclasses.replace(curve([0.0, 0.0], (0, 1)))]))
+    odd = [{**dict.fromkeys(COLUMNS, ""), **row, name: cell} for row in table[:1]] + table[1:]
+    lines = [",".join(str(row.get(column, "")) for column in COLUMNS) for row in odd]
+    (tmp_path / "curves-toy.csv").write_text("\n".join([",".join(COLUMNS), *lines]) + "\n")
+    with pytest.raises(UserError, match=f"curves-.*csv: {words}; put the tables back as they were"):
+        read_data(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"success": [0.1]}, "its records are of 1 or 2 seeds"),
+        ({"success": None}, "success is null, not a list"),
+        ({"rollouts": "20"}, "rollouts is a text"),
+        ({"robot_minutes": -1}, "robot_minutes: expected float >= 0"),
+    ],
+)
+def test_evaluations_that_no_run_has_written_are_refused(change, words, tmp_path):
+    folder = save(tmp_path, "sac", [[0.2, 0.4], [0.8, 1.0]], rollouts=[0, 20])
+    lines = [json.loads(line) for line in (folder / "eval.jsonl").read_text().splitlines()]
+    lines[1] |= change
+    (folder / "eval.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    with pytest.raises(UserError, match=words):
+        read_curve(folder)
+
+
+def test_a_summary_of_another_score_is_refused(tmp_path):
+    folder = save(tmp_path, "sac", [[0.2, 0.4], [0.8, 1.0]], rollouts=[0, 20])
+    (folder / "summary.json").write_text('{"score": "fame"}')
+    with pytest.raises(UserError, match=r"summary.json: score is 'fame', eval.jsonl has success, return"):
+        read_curve(folder)
+
+
+def test_a_curve_from_python_counts_what_it_is_told():
+    """Two rollouts of seven steps together; of two episodes one exploded, and its part of the cost is no return."""
+    total, exploded = np.array([[-12.0, -2.0]]), np.array([[False, True]])
+    score, no = np.where(exploded, -np.inf, total), np.zeros((1, 2), bool)
+    task = SimpleNamespace(name="toy", episode_length=20, control_dt=0.1, score="return")
+    played = {0: Episode(None, None, total, no, no, total, None, None),
+              2: Episode(None, None, total, no, exploded, score, None, None)}  # fmt: skip
+    given = {"gap": "default", "method": "sac", "seeds": [0]}
+    found = make_curve(played, task, transitions=[0, 7], **given)
+    assert found.transitions.tolist() == [0, 7] and found.minutes[1] == pytest.approx(0.7 / 60)
+    assert found.values.tolist() == [[-7, -12]]
+    assert make_curve(played, task, **given).transitions.tolist() == [0, 40]

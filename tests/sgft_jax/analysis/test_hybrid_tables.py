@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from sgft_jax.analysis import hybrid
+from sgft_jax.analysis import hybrid, hybrid_table
 from sgft_jax.analysis.hybrid import EVERY, Outcome, Results
 from sgft_jax.hybrid.scores import BOUNDS, late
+from sgft_jax.types import UserError
 
 LOW, HIGH = BOUNDS["halfcheetah"]
 
@@ -116,3 +117,20 @@ def test_what_else_a_task_is_judged_by():
 def test_the_last_ten_evaluations_of_each_seed():
     curve = np.arange(24.0).reshape(12, 2)
     np.testing.assert_allclose(late(curve), [13, 14])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"seed-0": "nan"}, "seed-0 is nan, not a finite number"),
+        ({"step": "0.5"}, "step is 0.5, not a whole number from 0 on"),
+        ({"updates": "-1"}, "updates is -1, not a whole number from 0 on"),
+        ({"seed-0": ""}, "a run of iql on toy has no seed"),
+    ],
+)
+def test_tables_with_odd_numbers_are_refused(change, words, tmp_path):
+    cells = dict.fromkeys(hybrid_table.IDENTITY, "x") | {"task": "toy", "method": "iql", "commit": "c", "updates": "5"}
+    cells |= {"score": "success", "step": "5", "seed-0": "0.5", **change}
+    (tmp_path / "hybrid.csv").write_text(",".join(cells) + "\n" + ",".join(cells.values()) + "\n")
+    with pytest.raises(UserError, match=f"hybrid.csv: {words}; put the table back as it was"):
+        hybrid_table.read(tmp_path)

@@ -12,6 +12,7 @@ import toy
 from envs.history import with_previous_actions
 from sgft_jax.data import lerobot, logs
 from sgft_jax.data.recording import Recorded
+from sgft_jax.io import arrays
 from sgft_jax.types import UserError
 
 pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'sgft-jax[lerobot]'")
@@ -171,10 +172,20 @@ def test_last_actions_are_added_for_a_policy_that_sees_them(tmp_path):
         ({"total_frames": 6}, "holds total_frames 5, but meta/info.json says 6"),
         ({"total_episodes": 3}, "holds total_episodes 2, but meta/info.json says 3"),
         ({"features": {"action": {}}}, "has no observation.state, only action"),
-        ({"fps": "fast"}, 'info.json: fps is "fast", not a number; supply a whole data set'),
-        ({"features": []}, "info.json: features is [], not an object; supply a whole data set"),
+        ({"fps": "fast"}, "info.json: fps is a text, not a number; supply a whole data set"),
+        ({"features": []}, "info.json: features is a list, not an object; supply a whole data set"),
         ({"features": {"action": {}, "observation.state": {}}}, "has no frame_index; supply a whole data set"),
-        ({"features": dict.fromkeys(NEEDED, "vector")}, "damaged or cut off"),
+        ({"features": dict.fromkeys(NEEDED, "vector")}, "info.json: observation.state: is no JSON object"),
+        ({"fps": 0}, "info.json: fps: expected float > 0"),
+        ({"fps": True}, "info.json: fps is true or false, not a number"),
+        ({"codebase_version": 3}, "info.json: codebase_version is a whole number, not a text"),
+        ({"total_frames": -1}, "info.json: total_frames: expected int >= 0"),
+        ({"data_path": "../../other/{chunk_index}.parquet"}, "is not in data/"),
+        ({"data_path": "data/../../{chunk_index}.parquet"}, "is not in data/"),
+        ({"features": {key: {"shape": []} for key in NEEDED}}, "is no column of numbers []; only vectors are read"),
+        ({"features": {key: {"shape": [4, 1]} for key in NEEDED}}, "is no column of numbers [4, 1]"),
+        ({"features": {key: {"shape": [0]} for key in NEEDED}}, "shape[0]: expected int >= 1"),
+        ({"features": {key: {"shape": [7]} for key in NEEDED}}, "is no column of numbers [7]"),
         ({"fps": 30}, "has 30 steps a second, toy has 10; resample it"),
     ],
 )
@@ -183,6 +194,95 @@ def test_odd_sets_are_refused(change, said, tmp_path):
     info = json.loads((folder / "meta/info.json").read_text())
     (folder / "meta/info.json").write_text(json.dumps(info | change))
     assert said in refused(folder, env=ENV)
+
+
+def test_hidden_files_are_no_part_of_a_set(tmp_path):
+    """What macOS and download tools leave beside files: neither read nor in the digest."""
+    folder = write(tmp_path / "set")
+    facts = logs.load(folder, gamma=0.9).facts
+    (folder / ".DS_Store").write_text("x")
+    (folder / "data/chunk-000/._file-000.parquet").write_bytes(b"\0\5\26\7")
+    (folder / ".cache/data/chunk-000").mkdir(parents=True)
+    (folder / ".cache/data/chunk-000/file-000.parquet").write_text("x")
+    assert logs.load(folder, gamma=0.9).facts == facts
+
+
+def test_folders_that_lie_elsewhere_are_neither_read_nor_in_the_digest(tmp_path):
+    """Links to files are followed: download tools keep their files so."""
+    folder, other = write(tmp_path / "set"), tmp_path / "other"
+    facts = logs.load(folder, gamma=0.9).facts
+    (folder / "data/chunk-000/file-000.parquet").rename(tmp_path / "blob")
+    (folder / "data/chunk-000/file-000.parquet").symlink_to(tmp_path / "blob")
+    assert logs.load(folder, gamma=0.9).facts == facts
+    (folder / "data/chunk-000").rename(other)
+    (folder / "data/chunk-000").symlink_to(other)
+    assert "holds no data/*/*.parquet" in refused(folder)
+
+
+def test_files_may_differ_in_the_types_of_their_columns(tmp_path):
+    """Lists of any or of one length, numbers as float64 or float32, flags as any numbers, in files of one set."""
+    one, two = (write(tmp_path / name) for name in ("one", "two"))
+    rows = logs.load(one, gamma=0.9).rows
+    path = two / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    pq.write_table(table.slice(0, 3), path)
+    for name, kind in (("action", pa.list_(pa.float64())), ("observation.state", pa.large_list(pa.float32()))):
+        values = pa.array(table[name].to_pylist(), kind)
+        table = table.set_column(table.column_names.index(name), name, values)
+    for name in ("next.done", "next.truncated"):
+        values = table[name].to_numpy().astype(np.float32)
+        table = table.set_column(table.column_names.index(name), name, pa.array(values))
+    pq.write_table(table.slice(3), path.with_name("file-001.parquet"))
+    for x, y in zip(logs.load(two, gamma=0.9).rows, rows, strict=True):
+        np.testing.assert_array_equal(x, y)
+
+
+def test_info_may_begin_with_a_byte_order_mark(tmp_path):
+    folder = write(tmp_path / "set")
+    (folder / "meta/info.json").write_bytes(b"\xef\xbb\xbf" + (folder / "meta/info.json").read_bytes())
+    assert logs.load(folder, gamma=0.9).facts.transitions == 5
+
+
+@pytest.mark.parametrize(
+    ("columns", "words"),
+    [
+        ({"next__done": [0.0, 0.0, float("nan"), 0.0, 1.0]}, "next.done of row 2 is nan, not 0 or 1"),
+        ({"next__truncated": [0, 0, 0, 0, 2]}, "next.truncated of row 4 is 2, not 0 or 1"),
+        ({"next__done": [False, None, True, False, True]}, "next.done is no column of numbers [1]"),
+        ({"next__reward": [0.0, 1e39, 0.0, 0.0, 0.0]}, "reward of row 1 is too large for float32"),
+        ({"action": [[0.0, 1e39]] * 5}, "action of row 0 is too large for float32"),
+        ({"next__reward": ["a"] * 5}, "next.reward is no column of numbers [1]"),
+        ({"next__reward": [{"a": 1.0}] * 5}, "next.reward is no column of numbers [1]"),
+        ({"observation__state": [[[0.0] * 2] * 2] * 5}, "observation.state is no column of numbers [4]"),
+        ({"observation__state": [[0.0] * 3] + [[0.0] * 5] + [[0.0] * 4] * 3}, "observation.state is no column of"),
+        ({"observation__state": [None] + [[0.0] * 8] + [[0.0] * 4] * 3}, "observation.state is no column of numbers"),
+        ({"episode_index": [0, 0, 0, 2, 2]}, "row 3 is of episode 2 where 1 is due"),
+        ({"episode_index": [1, 1, 1, 0, 0]}, "row 0 is of episode 1 where 0 is due"),
+        ({"episode_index": [0.0, 0.0, 0.0, 1.0, 1.0]}, "episode_index holds float64, not whole numbers"),
+        ({"frame_index": [0, 1, None, 0, 1]}, "frame_index is no column of numbers [1]"),
+    ],
+)
+def test_odd_columns_are_refused(columns, words, tmp_path):
+    assert words in refused(changed(write(tmp_path / "set"), **columns))
+
+
+@pytest.mark.parametrize("drop", ["next.reward", "action", "episode_index"])
+def test_a_column_that_info_names_and_no_file_has(drop, tmp_path):
+    folder = write(tmp_path / "set")
+    info = (folder / "meta/info.json").read_text()
+    (changed(folder, drop=[drop]) / "meta/info.json").write_text(info)
+    assert drop in refused(folder)
+
+
+def test_a_file_that_claims_more_than_it_can_hold_is_refused(tmp_path, monkeypatch):
+    folder = write(tmp_path / "set")
+    path = folder / "data/chunk-000/file-000.parquet"
+    table = pq.read_table(path)
+    pq.write_table(pa.table({name: pa.chunked_array([table[name].chunk(0)] * 9) for name in table.column_names}), path)
+    monkeypatch.setattr(arrays, "_FREE", 0)
+    monkeypatch.setattr(arrays, "_RATIO", 0.01)
+    monkeypatch.setattr(lerobot, "_numbers", None)  # nothing is unpacked
+    assert "claim to hold" in refused(folder)
 
 
 def test_damaged_and_missing_frames_are_refused(tmp_path):

@@ -3,13 +3,17 @@
 import dataclasses
 import hashlib
 import json
+import os
 
 import h5py
 import jax
 import numpy as np
 import pytest
+import toy
 
+from experiments import logged
 from sgft_jax.data import logs, replay, sequences, sources
+from sgft_jax.io import arrays, hdf5
 from sgft_jax.types import SimulatedData, Transition, UserError
 
 # Row by row: an episode that ends by falling, one that the time limit ends, one that falls at its time limit, and one
@@ -143,6 +147,11 @@ def refused(path, **options):
 
 def test_a_missing_or_foreign_file_is_refused(tmp_path, write):
     assert "no such file" in refused(tmp_path / "absent.hdf5")
+    assert "cannot be read (file name too long)" in refused(tmp_path / ("x" * 300))
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    assert "cannot be read (too many levels of symbolic links)" in refused(tmp_path / "loop")
+    with pytest.raises(UserError, match="is no name of a file"):
+        logs.load("zero\0byte.hdf5", gamma=0.9)
     (tmp_path / "foreign.hdf5").write_text("<html>403 Forbidden</html>")
     assert "not an HDF5 file" in refused(tmp_path / "foreign.hdf5")
     assert "no 'observations' in /, only images" in refused(write({"images": np.zeros(3)}))
@@ -174,14 +183,22 @@ def test_damaged_chunks_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"timeouts": None}, "no 'timeouts'"),
         ({"next_observations": None}, "set successors to 'shifted'"),
-        ({"rewards": REWARD[:-1]}, "rows differ (obs 7, action 7, reward 6"),
+        ({"rewards": REWARD[:-1]}, "numbers of rows differ (actions 7, rewards 6, terminals 7"),
+        ({"terminals": TERMINAL[:-1]}, "numbers of rows differ (actions 7, rewards 7, terminals 6, timeouts 7)"),
+        ({"timeouts": TIMEOUT[:-1]}, "numbers of rows differ (actions 7, rewards 7, terminals 7, timeouts 6)"),
+        ({"observations": numbers(0)[:-1]}, "numbers of rows differ (observations 6, rewards 7"),
+        ({"next_observations": numbers(0)[:-1]}, "rewards 7, next_observations 6)"),
         ({"next_observations": numbers(0, width=3)}, "next observations are [7, 3], observations [7, 2]"),
         ({"observations": np.where(np.arange(N)[:, None] == 4, np.nan, numbers(0))}, "obs of row 4 is not finite"),
         ({"rewards": np.where(np.arange(N) == 2, np.inf, REWARD)}, "reward of row 2 is not finite"),
         ({"observations": np.zeros((N, 8, 8, 3))}, "not numbers [rows, entries]; supply another file"),
-        ({"rewards": REWARD[:, None]}, "not numbers [rows]"),
+        ({"rewards": np.stack([REWARD, REWARD], axis=1)}, "not numbers [rows]"),
+        ({"rewards": np.float32(1)}, "/rewards is float32 [], not numbers [rows]"),
+        ({"rewards": h5py.Empty("f8")}, "/rewards is float64 nothing, not numbers [rows]"),
+        ({"rewards": np.zeros(N, [("x", "f4")])}, "not numbers [rows]"),
+        ({"rewards": REWARD * 1j}, "not numbers [rows]"),
+        ({"observations": np.zeros((N, 0))}, "not numbers [rows, entries]"),
         ({"actions": np.full((N, 1), b"left")}, "not numbers [rows, entries]; supply another file"),
         ({"observations/state": numbers(0), "observations": None}, "/observations is a group"),
         ({name: array[:0] for name, array in d4rl().items() if array.shape}, "holds no transitions"),
@@ -189,6 +206,144 @@ def test_damaged_chunks_are_refused(tmp_path):
 )
 def test_odd_arrays_are_refused(write, changes, said):
     assert said in refused(write(d4rl(**changes)))
+
+
+@pytest.mark.parametrize("name", ["observations", "actions", "next_observations", "rewards"])
+def test_numbers_are_finite_after_the_cast(write, name):
+    """1e39 is a number in float64 and infinite in what is learned from."""
+    large = d4rl()[name].astype(np.float64)
+    large[3] = -1e39
+    assert "of row 3 is too large for float32; leave the row out of the file" in refused(write(d4rl(**{name: large})))
+
+
+@pytest.mark.parametrize("flag", [np.nan, -1, 0.5, 2, np.inf])
+@pytest.mark.parametrize("name", ["terminals", "timeouts"])
+def test_flags_are_0_or_1(write, name, flag):
+    odd = d4rl()[name].astype(np.float64)
+    odd[4] = flag
+    assert f"{name} of row 4 is {flag:g}, not 0 or 1" in refused(write(d4rl(**{name: odd})))
+
+
+@pytest.mark.parametrize("dtype", [bool, np.int8, np.uint64, np.float32])
+def test_columns_may_have_any_type_and_an_axis_of_one(write, dtype):
+    """As the data sets of OTDF have them."""
+    column = {"rewards": REWARD, "terminals": TERMINAL.astype(dtype), "timeouts": TIMEOUT.astype(dtype)}
+    rows, facts, _ = logs.load(write(d4rl(**{name: x[:, None] for name, x in column.items()})), gamma=0.9)
+    jax.tree.map(np.testing.assert_array_equal, rows, logs.load(write(d4rl(), "same.hdf5"), gamma=0.9).rows)
+    assert facts.terminal == 2 and not facts.assumed
+
+
+# --- files without time limits ----------------------------------------------------------------------------------------
+
+CHAINED = np.append(numbers(1)[:-1], numbers(50)[:1], axis=0)  # what follows is the row below, except after the last
+
+
+def test_without_timeouts_an_episode_ends_where_the_row_below_begins_anew(write):
+    """After row 3 the robot is elsewhere; rows 1 and 5 are terminal, the file ends with row 6."""
+    follows = CHAINED.copy()
+    follows[3] += 5
+    log = logs.load(write(d4rl(timeouts=None, next_observations=follows)), gamma=0.9)
+    assert log.last.tolist() == [False, True, False, True, False, True, True]
+    assert (log.facts.episodes, log.facts.whole_episodes, log.facts.dropped) == (4, 3, 0)
+    assert log.facts.assumed.startswith("has no 'timeouts': ") and log.facts.assumed.endswith("begins anew")
+    # shifted: the row that time has ended has no successor, as D4RL's own reader has it, and so has the last
+    shifted = logs.load(write(d4rl(timeouts=None, next_observations=follows)), gamma=0.9, successors="shifted")
+    assert shifted.rows.reward.tolist() == [1, 2, 3, 5, 6] and shifted.facts.dropped == 2
+
+
+def test_without_timeouts_and_successors_the_task_tells_how_long_an_episode_lasts(write):
+    """Rows 1 and 5 are terminal; the third step after the first of them is the last of its episode."""
+    sizes = {"observations": numbers(0, width=4), "actions": np.zeros((N, 2))}
+    path = write(d4rl(timeouts=None, next_observations=None, **sizes))
+    log = logs.load(path, gamma=0.9, successors="shifted", env=toy.make()._replace(episode_length=3))
+    assert log.rows.reward.tolist() == [1, 2, 3, 4, 6]
+    assert log.facts.assumed.endswith("or after the 3 steps of the task")
+    alone = logs.load(path, gamma=0.9, successors="shifted")
+    assert alone.rows.reward.tolist() == [1, 2, 3, 4, 5, 6] and alone.facts.assumed.endswith("a terminal row alone")
+
+
+def test_a_command_says_what_was_assumed(write, capsys):
+    sizes = {"observations": numbers(0, width=4), "next_observations": numbers(9, width=4), "actions": np.zeros((N, 2))}
+    logged.read(write(d4rl(timeouts=None, **sizes)), toy.make(), gamma=0.9)
+    assert "some.hdf5: has no 'timeouts': an episode is taken to end" in capsys.readouterr().out
+
+
+# --- files that read others, run code, or claim any size --------------------------------------------------------------
+
+
+def with_rewards(tmp_path, make):
+    """A file whose rewards are made by another hand."""
+    with h5py.File(tmp_path / "odd.hdf5", "w") as file:
+        for name, array in d4rl(rewards=None).items():
+            file[name] = array
+        make(file)
+    return tmp_path / "odd.hdf5"
+
+
+def test_numbers_that_lie_in_other_files_are_refused(tmp_path, write):
+    """A log that somebody sends may not read what lies on this machine."""
+    (tmp_path / "secret").write_bytes(bytes(8 * N))
+    outside = [("secret", 0, 8 * N)]
+    virtual = h5py.VirtualLayout((N,), "f8")
+    virtual[:] = h5py.VirtualSource(write(d4rl()), "rewards", (N,))
+    for make, words in (
+        (lambda file: file.create_dataset("rewards", (N,), "f8", external=outside), "takes its numbers from other"),
+        (lambda file: file.create_virtual_dataset("rewards", virtual), "takes its numbers from other files"),
+        (lambda file: file.__setitem__("rewards", h5py.ExternalLink("some.hdf5", "/rewards")), "rewards is a link"),
+        (lambda file: file.__setitem__("rewards", h5py.SoftLink("/next_observations")), "rewards is a link"),
+    ):
+        assert words in refused(with_rewards(tmp_path, make))
+    (tmp_path / "walk-v0").mkdir()
+    with h5py.File(tmp_path / "walk-v0/main_data.hdf5", "w") as file:
+        file["episode_0"] = h5py.ExternalLink("../some.hdf5", "/")
+    assert "episode_0 is a link" in refused(tmp_path / "walk-v0")
+
+
+def packed(file, *filters):
+    """Rewards that need these filters; none of them is there."""
+    about = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    about.set_chunk((N,))
+    for code in filters:
+        about.set_filter(code, h5py.h5z.FLAG_OPTIONAL)
+    h5py.h5d.create(file.id, b"rewards", h5py.h5t.IEEE_F64LE, h5py.h5s.create_simple((N,)), about)
+
+
+@pytest.mark.parametrize("filters", [(32015,), (1, 1)])
+def test_filters_from_outside_and_packed_packages_are_refused(tmp_path, filters):
+    """HDF5 would load the code of the first from a folder of plug-ins; the second unpacks a million to one."""
+    assert f"is packed by the filters {list(filters)}" in refused(with_rewards(tmp_path, lambda f: packed(f, *filters)))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"shape": (10**12,)},
+        {"shape": (10**12,), "chunks": (1000,)},
+        {"shape": (N,), "chunks": (2**28,), "maxshape": (None,)},
+        {"data": np.zeros(10**7 + 1), "compression": "gzip", "chunks": (10**7 + 1,)},
+    ],
+)
+def test_a_file_that_claims_more_than_it_can_hold_is_refused(tmp_path, options):
+    assert "claim to hold" in refused(
+        with_rewards(tmp_path, lambda f: f.create_dataset("rewards", dtype="f8", **options))
+    )
+
+
+def test_one_array_under_many_names_counts_each_time(write, monkeypatch):
+    monkeypatch.setattr(arrays, "_FREE", 0)
+    monkeypatch.setattr(arrays, "_RATIO", 1)
+    with hdf5.opened(write({"x": np.ones(1000)})) as content:
+        content.array(None, "x", 1)
+        with pytest.raises(UserError, match="claim to hold 16,000"):
+            content.array(None, "x", 1)
+
+
+def test_what_is_no_plain_file_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "pipe.hdf5")
+    os.mkfifo(tmp_path / "pipe.csv")
+    assert "is no plain file" in refused(tmp_path / "pipe.hdf5")
+    with pytest.raises(UserError, match="is no plain file"):
+        logs.load_table(tmp_path / "pipe.csv", gamma=0.9, obs_dim=4, reward=lambda *step: step[0][:, 0])
 
 
 def test_an_unknown_convention_is_refused(write):
@@ -273,6 +428,37 @@ def test_odd_minari_sets_are_refused(minari):
         logs.load(folder, gamma=0.9)
 
 
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"actions": np.zeros((2, 3))}, "/episode_3 has other sizes of observations or actions than /episode_0"),
+        ({"terminations": np.full(2, np.nan)}, "/episode_3: terminations of row 0 is nan, not 0 or 1"),
+        ({"truncations": np.array([0, 0.5])}, "truncations of row 1 is 0.5, not 0 or 1"),
+        ({"truncations": np.zeros(3)}, "numbers of rows differ (actions 2, rewards 2, terminations 2, truncations 3)"),
+        ({"rewards": np.array([0, 1e39])}, "reward of row 7 is too large for float32"),
+        ({"rewards": None}, "there is no 'rewards' in /episode_3"),
+        ({"total_steps": "two"}, "total_steps of /episode_3 is no whole number"),
+        ({"total_steps": [2, 2]}, "total_steps of /episode_3 is no whole number"),
+    ],
+)
+def test_odd_minari_episodes_are_refused(minari, changes, words):
+    def change(file):
+        for name, values in changes.items():
+            if name == "total_steps":
+                file["episode_3"].attrs[name] = values
+            else:
+                del file[f"episode_3/{name}"]
+                if values is not None:
+                    file[f"episode_3/{name}"] = values
+
+    assert words in refused(minari(change))
+
+
+@pytest.mark.parametrize("value", [0, None, "0.1", -1, [], float("nan")])
+def test_the_length_of_a_step_is_a_positive_number(minari, value):
+    assert "metadata.json: " in refused(minari(control_dt=value))
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")  # its advice on authors and links
 def test_what_minaris_own_library_writes_can_be_read(tmp_path, monkeypatch):
     minari = pytest.importorskip("minari", reason="make setup EXTRAS=dev, or pip install 'sgft-jax[minari]'")
@@ -332,6 +518,13 @@ def test_tables_drop_strong_torques_of_both_signs_and_split_there(ending, delimi
     assert (facts.layout, facts.transitions, facts.dropped, facts.terminal, facts.episodes) == ("table", 5, 5, 1, 3)
 
 
+def test_a_table_may_begin_with_a_byte_order_mark(tmp_path):
+    np.savetxt(tmp_path / "log.csv", TABLE, delimiter=",")
+    (tmp_path / "log.csv").write_bytes(b"\xef\xbb\xbf" + (tmp_path / "log.csv").read_bytes())
+    log = logs.load_table(tmp_path / "log.csv", gamma=0.9, obs_dim=4, reward=lambda *step: step[0][:, 0])
+    assert log.facts.transitions == 5
+
+
 def test_tables_without_position(tmp_path):
     np.savetxt(tmp_path / "log.txt", TABLE)
     log = logs.load_table(tmp_path / "log.txt", gamma=0.9, obs_dim=3, reward=lambda obs, action, next_obs: obs[:, 0])
@@ -344,7 +537,12 @@ def test_tables_without_position(tmp_path):
         ("x v\n1 2\n", "is not a table of numbers .*; supply six columns without a head"),
         ("1 2 3\n4 5 6\n", "has 3 columns, not x, v, pitch, its velocity, torque and done"),
         ("0 0 0 0 9 0\n0 0 0 0 9 0\n", "holds no transitions"),
-        ("0 0 0 nan 1 0\n0 0 0 0 1 0\n", "obs of row 0 is not finite"),
+        ("0 0 0 nan 1 0\n0 0 0 0 1 0\n", "a number of row 0 is not finite"),
+        ("0 0 0 0 1 0\n0 0 0 1e39 1 0\n", "a number of row 1 is too large for float32"),
+        ("0 0 0 0 1 0\n0 0 0 0 1 0.5\n", "done of row 1 is 0.5, not 0 or 1"),
+        ("0 0 0 0 1 0\n0 0 0 0 1\n", "is not a table of numbers"),
+        ("0 0 0 0 1 \x00\n", "is not a table of numbers"),
+        ("\n", "holds no transitions"),
     ],
 )
 def test_odd_tables_are_refused(text, words, tmp_path):

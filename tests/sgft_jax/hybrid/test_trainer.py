@@ -5,6 +5,7 @@ import dataclasses
 import chex
 import jax
 import jax.numpy as jnp
+import keys
 import numpy as np
 import pytest
 import toy
@@ -13,6 +14,7 @@ from envs import gaps
 from envs.control import cartpole
 from envs.gaps import Gap
 from envs.pools import real_worlds
+from envs.rollout import step_fleet
 from sgft_jax.data import replay
 from sgft_jax.hybrid import trainer
 from sgft_jax.hybrid.methods import NAMES, get_method
@@ -69,6 +71,20 @@ def plain(state):
     return state._replace(key=jax.random.key_data(state.key), fleet=None)
 
 
+@pytest.mark.slow
+def test_nothing_is_learned_while_every_simulator_explodes(monkeypatch):
+    """No row is kept then, and an empty buffer gives zeros."""
+    monkeypatch.setattr(
+        trainer, "step_fleet", lambda env, *given, **more: step_fleet(
+            env._replace(step=lambda *step: env.step(*step)._replace(invalid=jnp.ones((), bool))), *given, **more
+        ),
+    )  # fmt: skip
+    (start, _), (state, metrics), *_ = played(build())
+    assert int(state.simulated.size[0]) == 0 and int(state.rounds[0]) == 2
+    chex.assert_trees_all_equal(state.learner, start.learner)
+    assert all(np.isnan(values).all() for values in metrics.values())
+
+
 def test_each_round_collects_and_learns():
     (start, none), *chunks = played(build())
     assert none == {} and len(chunks) == 4
@@ -78,6 +94,21 @@ def test_each_round_collects_and_learns():
         assert int(state.rounds[0]) == 2 * i and int(state.learner.step[0]) == 6 * i
         assert int(state.simulated.size[0]) == min(fill + 6 * i, 64)
         assert all(np.isfinite(values).all() and values.shape == (1,) for values in metrics.values())
+
+
+@each_method
+def test_no_key_is_used_twice(name):
+    """In filling the buffer, in rounds of steps and in updates. The learners alone: test_contract_learners.py."""
+    agent, real = build(name), jax.tree.map(jnp.asarray, real_rows())
+    schedule = Schedule(updates=2, simulators=2, buffer=64, chunk_updates=2)
+    made = trainer.make_trainer(ENV, agent, schedule, gamma=0.9)
+    pool = jax.tree.map(lambda x: x[0], pools_of(1.0))
+
+    def whole(key):
+        state, _ = made.chunk(pool, agent.keep(real), made.init(pool, real, key))
+        return jax.random.normal(state.key)
+
+    assert keys.used_twice(whole) == 0
 
 
 @pytest.mark.slow

@@ -150,7 +150,7 @@ def test_a_torn_checkpoint_takes_nobodys_place(saved):
 
 
 def test_a_leftover_of_a_killed_save_is_ignored_then_removed(saved):
-    shutil.copytree(saved / "checkpoints" / "20", saved / "checkpoints" / ".tmp-30")
+    shutil.copytree(saved / "checkpoints" / "20", saved / "checkpoints" / ".sgft-new-30")
     assert checkpoint.latest(saved) == 20
     checkpoint.save(saved, 30, make_state(2), meta=META)
     assert sorted(os.listdir(saved / "checkpoints")) == ["20", "30"]
@@ -192,13 +192,126 @@ def test_torn_checkpoints_are_refused_and_the_older_one_is_used(saved, damage, w
     assert len(heard) == 1 and heard[0].startswith("skipped: ") and "checkpoints/20" in heard[0]
 
 
-def test_a_flipped_byte_is_noticed(saved):
-    file = biggest(saved / "checkpoints" / "20")
+def damage_flip(folder):
+    file = biggest(folder)
     content = bytearray(file.read_bytes())
     content[len(content) // 2] ^= 1
     file.write_bytes(bytes(content))
-    with pytest.raises(UserError, match="checksum differs"):
-        checkpoint.restore(saved, make_state())
+
+
+def test_a_flipped_byte_is_noticed_and_the_older_one_is_used(saved):
+    damage_flip(saved / "checkpoints" / "20")
+    with pytest.raises(UserError, match=r"checkpoints/20: damaged: .* \(checksum differs\)$"):
+        checkpoint.restore(saved, make_state(), step=20)
+    heard = []
+    assert checkpoint.latest(saved) == 20  # complete, as far as sizes tell
+    assert checkpoint.latest(saved, whole=True, say=heard.append) == 10
+    assert bits(checkpoint.restore(saved, make_state(), say=heard.append)[0]) == bits(make_state(0))
+    assert len(heard) == 2 and all("skipped: " in line and "checksum differs" in line for line in heard)
+    damage_flip(saved / "checkpoints" / "10")
+    with pytest.raises(UserError, match=r"checkpoints: holds nothing whole; remove it, then --resume begins again"):
+        checkpoint.latest(saved, whole=True, say=heard.append)
+
+
+def test_checksums_are_compared_once(saved, monkeypatch):
+    read = []
+    fingerprint = checkpoint._fingerprint
+    monkeypatch.setattr(checkpoint, "_fingerprint", lambda file: read.append(file) or fingerprint(file))
+    checkpoint.restore(saved, make_state())
+    assert read and len(set(read)) == len(read)
+    count = len(read)
+    step = checkpoint.latest(saved, whole=True)
+    checkpoint.restore(saved, make_state(), step=step, checked=True)
+    assert len(read) == 2 * count
+
+
+@pytest.mark.parametrize("second", [False, True])
+def test_a_kill_while_a_checkpoint_is_overwritten_leaves_it(saved, monkeypatch, second):
+    """Dies at the second rename, where the old one is put aside; or when that, put back, is to be deleted."""
+    shutil.rmtree(saved / "checkpoints" / "10")
+    moved = []
+
+    def dying(path, target):
+        moved.append(target)
+        if len(moved) == 2:
+            raise KeyboardInterrupt
+        os.rename(path, target)
+
+    monkeypatch.setattr(type(saved), "rename", dying)
+    monkeypatch.setattr(checkpoint.folders, "settle", lambda folder: None)
+    with pytest.raises(KeyboardInterrupt):
+        checkpoint.save(saved, 20, make_state(5), meta=META)
+    monkeypatch.undo()
+    assert os.listdir(saved / "checkpoints") == [".sgft-old-20"] and checkpoint.latest(saved, whole=True) == 20
+    assert bits(checkpoint.restore(saved, make_state())[0]) == bits(make_state(1))
+    checkpoint.save(saved, 20 if second else 30, make_state(6), meta=META)
+    assert sorted(os.listdir(saved / "checkpoints")) == (["20"] if second else ["20", "30"])
+    assert bits(checkpoint.restore(saved, make_state())[0]) == bits(make_state(6))
+
+
+# ---------------------------------------------------------------- manifests that lie
+
+
+def of_first_leaf(**changes):
+    """The manifest with another path, kind, shape or dtype of its first array."""
+
+    def change(manifest):
+        leaf = dict(zip(("path", "kind", "shape", "dtype"), manifest["leaves"][0], strict=True)) | changes
+        return manifest | {"leaves": [list(leaf.values()), *manifest["leaves"][1:]]}
+
+    return change
+
+
+def without(key):
+    return lambda manifest: {name: value for name, value in manifest.items() if name != key}
+
+
+def of_files(change):
+    return lambda manifest: manifest | {"files": change(manifest["files"])}
+
+
+LIES = {
+    "no files": (of_files(lambda files: {}), "has no checksum of state/"),
+    "another shape": (of_first_leaf(shape=[3, 2]), r"differ in leaf_00000: .*\(3, 2\).*\(2, 3\)"),
+    "a huge shape": (of_first_leaf(shape=[2**20, 2**20]), "differ in leaf_00000"),
+    "another type": (of_first_leaf(dtype="int32"), "differ in leaf_00000: .*int32.*float32"),
+    "a type that nobody knows": (of_first_leaf(dtype="complex7"), "lists a complex7.*does not know"),
+    "objects": (of_first_leaf(dtype="object"), "does not know"),
+    "objects of which there are none": (of_first_leaf(dtype="object", shape=[0]), "does not know"),
+    "what JAX does not keep": (of_first_leaf(dtype="float64"), "does not know"),
+    "a key without its kind": (of_first_leaf(kind="key"), "does not know"),
+    "no such kind": (of_first_leaf(kind="pickle"), "pickle"),
+    "a negative size": (of_first_leaf(shape=[-1, 3]), r"leaves\[0\]\[2\]\[0\]: expected int >= 0"),
+    "too few arrays": (lambda manifest: manifest | {"leaves": manifest["leaves"][:1]}, "differ in leaf_00001: None"),
+    "no leaves": (without("leaves"), "lacks leaves"),
+    "no list of files": (without("files"), "lacks files"),
+    "no kinds of keys": (without("key_impls"), "lacks key_impls"),
+    "kinds that nobody knows": (lambda manifest: manifest | {"key_impls": {"leaf_00001": "dice"}}, "does not know"),
+    "a folder above": (of_files(lambda files: {"../secret": [1, 1]} | files), "names ../secret, which is not in"),
+    "an absolute path": (of_files(lambda files: {"/etc/hostname": [1, 1]} | files), "names /etc/hostname, which is"),
+    "a file without checksum": (of_files(lambda files: dict([*files.items()][1:])), "has no checksum of state/"),
+    "a link": (of_files(lambda files: {"state/.link": [1, 1]} | files), "names state/.link, which is not in"),
+    "a folder": (of_files(lambda files: {"state": [1, 1]} | files), "torn: state is missing"),
+    "a size below 0": (of_files(lambda files: {"state/.x": [-1, 1]} | files), "expected int >= 0"),
+    "a size as a text": (of_files(lambda files: {"state/.x": ["1", 1]} | files), "is a text, not a whole number"),
+    "null": (lambda manifest: None, "is not readable"),
+    "a list": (lambda manifest: [manifest], "is not readable"),
+    "too deep": (lambda manifest: "[" * 100_000, "is not readable"),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_manifest_that_lies_is_refused_before_numbers_are_read(tmp_path, lie, monkeypatch):
+    change, words = LIES[lie]
+    where = checkpoint.save(tmp_path, 1, {"a": jnp.ones((2, 3)), "k": jax.random.key(0)}, meta={})
+    (where / "state/.link").symlink_to("/etc/hostname")
+    changed = change(json.loads((where / "manifest.json").read_text()))
+    (where / "manifest.json").write_text(changed if isinstance(changed, str) else json.dumps(changed))
+    monkeypatch.setattr(checkpoint.ocp, "load", lambda path: pytest.fail("numbers were read"))
+    with pytest.raises(UserError, match=words) as refused:
+        manifest = checkpoint.read_manifest(where)
+        checkpoint.read_leaves(where, manifest)
+    assert "\n" not in str(refused.value) and str(where) in str(refused.value)
 
 
 def test_no_complete_checkpoint(tmp_path):

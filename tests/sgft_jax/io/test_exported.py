@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import json
 
 import jax
 import jax.numpy as jnp
@@ -219,17 +220,88 @@ def test_the_contract_says_what_goes_in_and_out():
     ]
 
 
-def test_bad_measurements_are_refused_and_not_remembered(tmp_path):
+BAD = [
+    ([0.0, 0.0, 0.0], "reads 4 measured numbers, got shape \\(3,\\)"),
+    ([[0.0] * 4], "reads 4 measured numbers, got shape \\(1, 4\\)"),
+    ([[0.0, 0.0], [0.0]], "reads 4 measured numbers, got shape \\(\\)"),
+    (None, "reads 4 measured numbers, got shape \\(\\)"),
+    ("1234", "reads 4 measured numbers, got shape \\(\\)"),
+    ({"xy": 0.0}, "reads 4 measured numbers, got shape \\(\\)"),
+    (["a", 0, 0, 0], "reads 4 measured numbers, got str"),
+    (["1", "2", "3", "4"], "reads 4 measured numbers, got str"),
+    ([None, 0.0, 0.0, 0.0], "reads 4 measured numbers, got object"),
+    ([1j, 0.0, 0.0, 0.0], "reads 4 measured numbers, got complex128"),
+    ([0.0, 0.0, 0.0, np.nan], r"velocity\[1\] is not a finite number"),
+    ([0.0, -np.inf, 0.0, 0.0], r"xy\[1\] is not a finite number"),
+    ([0.0, 0.0, 1e300, 0.0], r"velocity\[0\] is 1e\+300: too large, at most 1e\+12"),
+    ([0.0, 0.0, -1e38, 0.0], r"velocity\[0\] is -1e\+38: too large"),  # its square is not finite
+    ([10**30, 0, 0, 0], "reads 4 measured numbers, got object"),
+]
+
+
+@pytest.mark.parametrize("explore", [False, True])
+def test_bad_measurements_are_refused_and_not_remembered(tmp_path, explore):
     env, prior = case("recurrent")
     save_exported(tmp_path / "out", prior, env, "numpy")
-    policy, (measured, wanted) = player.Policy(tmp_path / "out"), recorded("recurrent")
-    first, second = measured[0, :2]
-    policy.act(first)
-    with pytest.raises(ValueError, match="reads 4 measured numbers, got shape \\(3,\\)"):
-        policy.act(second[:3])
-    with pytest.raises(ValueError, match=r"velocity\[1\] is not a finite number"):
-        policy.act([0.0, 0.0, 0.0, np.nan])
-    np.testing.assert_allclose(policy.act(second), wanted[0, 1], atol=1e-5)
+    policy, measured = player.Policy(tmp_path / "out"), recorded("recurrent")[0]
+    acting, untroubled = (api.ActingPolicy(prior, env) for _ in range(2))
+    wanted = [untroubled.act(row, explore=explore) for row in measured[0, :2]]
+    exact = [policy.act(row) for row in measured[0, :2]]
+    policy.reset()
+    np.testing.assert_array_equal(acting.act(measured[0, 0], explore=explore), wanted[0])
+    policy.act(measured[0, 0])
+    for bad, words in BAD:
+        with pytest.raises(ValueError, match=words):
+            policy.act(bad)
+        with pytest.raises(UserError, match=words):
+            acting.act(bad, explore=explore)
+    np.testing.assert_array_equal(acting.act(measured[0, 1], explore=explore), wanted[1])
+    np.testing.assert_array_equal(policy.act(measured[0, 1]), exact[1])
+
+
+@pytest.mark.parametrize("sent", [[np.nan, 0.0], [0.0, 1e30], [0.0, -1.5], ["a", 0.0], [0.0, 0.0, 0.0], [None, 0.0]])
+def test_what_cannot_have_been_sent_is_refused_and_not_remembered(tmp_path, sent):
+    env, prior = case("identified")
+    save_exported(tmp_path / "out", prior, env, "numpy")
+    policy, other = player.Policy(tmp_path / "out"), player.Policy(tmp_path / "out")
+    first, second = recorded("identified")[0][0, :2]
+    policy.act(first), other.act(first)
+    with pytest.raises(ValueError, match=r"force\[\d\] is|an action has 2 numbers"):
+        policy.act(second, sent=sent)
+    np.testing.assert_array_equal(policy.act(second, sent=[1.0, -1.0]), other.act(second, sent=[1.0, -1.0]))
+
+
+def test_an_answer_that_is_not_finite_is_given_by_nobody(tmp_path):
+    """A policy whose numbers were damaged, on a good measurement."""
+    env, prior = case("identified")
+    save_exported(tmp_path / "out", prior, env, "numpy")
+    policy = player.Policy(tmp_path / "out")
+    policy._step = lambda inputs: {"action": np.full(2, np.nan), "next_previous_actions": np.zeros(6)}
+    broken = jax.tree.map(lambda x: x * jnp.nan, prior.params.actor)
+    acting = api.ActingPolicy(Prior(prior.params._replace(actor=broken), prior.card), env)
+    for one, kind in ((policy, ValueError), (acting, UserError)):
+        with pytest.raises(kind, match="the policy has no finite answer to these measurements"):
+            one.act(np.zeros(4))
+    assert not acting._actions.any() and not policy._state["previous_actions"].any()
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["", "[" * 100_000, "null", "[]", "{}", '{"to": "wasm"}', "\xff", "WHOLE without state", "WHOLE to pickle"],
+)
+def test_a_contract_that_is_none_is_one_line(tmp_path, content):
+    contract = jsonable(export.contract(*reversed(case("plain")), "numpy"))
+    if content.startswith("WHOLE"):
+        changed = (
+            {name: x for name, x in contract.items() if name != "state"}
+            if "state" in content
+            else contract | {"to": "pickle"}
+        )
+        content = json.dumps(changed)
+    (tmp_path / "contract.json").write_text(content, encoding="latin1")
+    with pytest.raises(ValueError, match=r"contract.json: is no contract of an exported policy") as refused:
+        player.Policy(tmp_path)
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.parametrize("name", ["identified", "recurrent", "affine"])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from envs.files import read_json
+from sgft_jax.io import jsonfile
 from sgft_jax.io.jsonfile import differences, jsonable, write_json
 
 
@@ -51,7 +52,17 @@ def test_write_is_atomic_and_readable(tmp_path):
     assert read_json(path) == {"a": 1}
     write_json(path, {"a": 2})
     assert read_json(path) == {"a": 2}
-    assert [p.name for p in tmp_path.iterdir() if not p.name.startswith(".")] == ["x.json"]
+    assert [p.name for p in tmp_path.iterdir()] == ["x.json"]
+
+
+def test_a_write_that_fails_leaves_nothing_behind(tmp_path, monkeypatch):
+    def full(handle):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(jsonfile.os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        write_json(tmp_path / "x.json", {"a": 1})
+    assert not list(tmp_path.iterdir())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from envs.files import Count
 from sgft_jax.io import log
 from sgft_jax.io.log import DivergedError, MetricsLog, check_finite, read_jsonl, write_summary
 from sgft_jax.types import UserError
@@ -66,7 +67,7 @@ def test_reading_stops_before_a_torn_line_and_names_a_bad_one(tmp_path):
     path.write_text('{"step": 1}\n{"step": 2, "lo')
     assert read_jsonl(path) == [{"step": 1}]
     path.write_text('{"step": 1}\nnonsense\n')
-    with pytest.raises(UserError, match=r"metrics.jsonl:2: not a JSON object"):
+    with pytest.raises(UserError, match=r"metrics.jsonl:2: not valid JSON"):
         read_jsonl(path)
     with pytest.raises(UserError, match="no such file"):
         read_jsonl(tmp_path / "other.jsonl")
@@ -113,3 +114,38 @@ def test_without_a_checkpoint_it_says_so_and_finite_metrics_pass():
     check_finite({"critic/loss": jnp.ones(3), "step": 3}, 1, unit="steps", last_good=None)
     with pytest.raises(DivergedError, match="there is no checkpoint from before"):
         check_finite({"critic/loss": jnp.float32(jnp.nan)}, 1, unit="steps", last_good=None)
+
+
+# ---------------------------------------------------------------- logs that nobody wrote
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"\xff\xfe\n", "is no UTF-8 text"),
+        (b"[1]\n", "eval.jsonl:1: is no JSON object"),
+        (b'{"step": 1, "score": [1]}\nnull\n', "eval.jsonl:2: is no JSON object"),
+        (b'{"step": 1, "score": [1], "deep": ' + b"[" * 100_000 + b"]" * 100_000 + b"}\n", "nested too deeply"),
+        (b'{"step": 1, "score": [1], "deep": ' + b"[" * 3000 + b"]" * 3000 + b"}\n", "nested too deeply"),
+        (b'{"step": 1, "score": [NaN]}\n', "NaN is no finite number"),
+        (b'{"step": 1}\n', "eval.jsonl:1: lacks score"),
+        (b'{"step": "1", "score": [1]}\n', "eval.jsonl:1: step is a text, not a whole number"),
+        (b'{"step": -1, "score": [1]}\n', "eval.jsonl:1: step: expected int >= 0"),
+        (b'{"step": 1, "score": 1}\n', "eval.jsonl:1: score is a whole number, not a list"),
+        (b'{"step": 1, "score": [null]}\n', "is null, not a number"),
+        (b'{"step": 1, "score": []}\n', "its records are of 0 seeds"),
+        (b'{"step": 1, "score": [1]}\n{"step": 2, "score": [1, 2]}\n', "its records are of 1 or 2 seeds"),
+        (b"", "holds no record"),
+    ],
+)
+def test_records_that_no_run_has_written_are_refused(content, words, tmp_path):
+    (tmp_path / "eval.jsonl").write_bytes(content)
+    with pytest.raises(UserError, match=words) as error:
+        read_jsonl(tmp_path / "eval.jsonl", {"step": Count, "score": list[float]})
+    assert "\n" not in str(error.value)
+
+
+def test_records_may_hold_more_and_numbers_that_are_not_finite(tmp_path):
+    (tmp_path / "eval.jsonl").write_text('{"step": 1, "real/score": ["nan", 2], "more": {}}\n')
+    (record,) = read_jsonl(tmp_path / "eval.jsonl", {"step": Count, "real/score": list[float]})
+    assert np.isnan(record["real/score"][0]) and record["more"] == {}

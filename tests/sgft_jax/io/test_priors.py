@@ -6,27 +6,38 @@ from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
-from test_checkpoint import bits, damage_truncate
+import tuners  # noqa: F401 - TD-MPC2 of size "tiny"
+from test_checkpoint import bits, damage_flip, damage_truncate
 
 from sgft_jax.io import checkpoint, priors
-from sgft_jax.learners.sac import SACParams
-from sgft_jax.learners.tdmpc2_model import TDMPC2Params
+from sgft_jax.io.folders import ASIDE
+from sgft_jax.io.jsonfile import jsonable
+from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
+from sgft_jax.learners.actor import ACTORParams, make_actor_of
+from sgft_jax.models.config import NetworkConfig
+from sgft_jax.models.distortion import Distortion
 from sgft_jax.types import Normalizer, Prior, UserError
 
-CARD = {"task": "hammer", "obs_dim": 4, "act_dim": 2, "gamma": 0.99, "metrics": {"success": float("nan")}}
+KEY = jax.random.key(0)
+NETWORK = NetworkConfig(hidden=(3,))
+CARD = {
+    "task": "hammer", "obs_dim": 4, "act_dim": 2, "gamma": 0.99, "network": jsonable(NETWORK),
+    "metrics": {"success": float("nan")},
+}  # fmt: skip
 
 
-def make_prior(scale=1.0, **changes):
-    dense = {"Dense_0": {"kernel": scale * jnp.arange(12.0).reshape(4, 3), "bias": jnp.zeros(3)}}
-    params = SACParams(
-        actor=dense,
-        critic=jax.tree.map(lambda x: jnp.stack([x, x]), dense),
-        value=dense,
-        dynamics=None,
-        normalizer=Normalizer(jnp.zeros(4), jnp.ones(4)),
-    )
-    return Prior(params, CARD | changes)
+def drawn(init):
+    """Numbers in the shapes of what `init` makes, which is not compiled."""
+    return jax.tree.map(lambda x: jnp.arange(x.size, dtype=x.dtype).reshape(x.shape), jax.eval_shape(init, KEY))
+
+
+def make_prior(scale=1.0, network=NETWORK, **changes):
+    learner = sac.make_sac(sac.SACConfig(4, 2, network=network, ensemble_size=2))
+    params = jax.tree.map(lambda x: scale * x, drawn(lambda key: sac.extract_params(learner.init(key))))
+    statistics = Normalizer(jnp.zeros(4), jnp.ones(4))
+    return Prior(params._replace(normalizer=statistics, dynamics=None), CARD | {"network": jsonable(network)} | changes)
 
 
 def save(folder, *args, **changes):
@@ -43,10 +54,22 @@ def test_prior_round_trip(tmp_path):
 
 
 def test_every_learner_that_leaves_a_prior_names_its_container(tmp_path):
-    fields: dict = {name: {"kernel": jnp.ones(2) * i} for i, name in enumerate(TDMPC2Params._fields)}
-    params = TDMPC2Params(**fields | {"normalizer": Normalizer(jnp.zeros(4), jnp.ones(4)), "scale": jnp.float32(3)})
-    folder = priors.save_prior(tmp_path / "prior", Prior(params, CARD | {"algorithm": "tdmpc2"}))
-    assert bits(priors.load_prior(folder).params) == bits(params)
+    planner = {"size": "tiny", "plan_samples": 24, "horizon": 2}
+    learner = tdmpc2.make_tdmpc2(tdmpc2_model.named_config(4, 2, **planner))
+    memory = recurrent.make_recurrent(recurrent.RecurrentConfig(4, 2, NETWORK, 6))
+    params = drawn(lambda key: tdmpc2.extract_params(learner.init(key)))
+    every = {
+        "tdmpc2": (params, {"config": planner}),
+        "anchored": (params._replace(anchor=params.policy), {"config": planner, "algorithm": "tdmpc2"}),
+        "recurrent": (drawn(lambda key: recurrent.extract_params(memory.init(key))), {"config": {"gru": 6}}),
+        "actor": (
+            ACTORParams(drawn(make_actor_of("affine", 4, 2, NETWORK).init), make_prior().params.normalizer),
+            {"head": "affine"},
+        ),
+    }
+    for name, (parameters, says) in every.items():
+        folder = priors.save_prior(tmp_path / name, Prior(parameters, CARD | {"algorithm": name} | says))
+        assert bits(priors.load_prior(folder).params) == bits(parameters)
 
 
 def test_what_a_prior_does_not_have_is_none(tmp_path):
@@ -83,7 +106,7 @@ def test_a_foreign_prior_is_refused(tmp_path):
         priors.load_prior(folder, obs_dim=5)
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "../x"])
+@pytest.mark.parametrize("algorithm", ["ppo", "../x", "losses", "os"])
 def test_a_prior_of_an_unknown_algorithm_is_refused(tmp_path, algorithm):
     folder = save(tmp_path / "prior", algorithm=algorithm)
     with pytest.raises(UserError, match=f"prior.json says algorithm='{algorithm}', which this version does not know"):
@@ -100,14 +123,173 @@ def test_a_prior_of_another_version_is_refused_in_one_line(tmp_path):
 
 
 def test_a_prior_whose_card_lies_is_refused(tmp_path):
-    with pytest.raises(UserError, match="says obs_dim=3, the statistics have 4"):
+    with pytest.raises(UserError, match=r"prior: its card says obs_dim=3, the statistics have 4"):
         priors.load_prior(save(tmp_path / "prior", obs_dim=3))
+
+
+BODY = {"hidden": [3]}
+LIES = {
+    "algorithm null": {"algorithm": None},
+    "algorithm a number": {"algorithm": 3},
+    "another algorithm": {"algorithm": "tdmpc2", "config": {"size": "tiny", "plan_samples": 24, "horizon": 2}},
+    "no head": {"algorithm": "actor"},
+    "head": {"algorithm": "actor", "head": "hydra"},
+    "no memory": {"algorithm": "recurrent"},
+    "memory null": {"algorithm": "recurrent", "config": {"gru": None}},
+    "memory without units": {"algorithm": "recurrent", "config": {"gru": 0}},
+    "no planner": {"algorithm": "tdmpc2", "config": {}},
+    "size": {"algorithm": "tdmpc2", "config": {"size": "6M", "plan_samples": 24, "horizon": 2}},
+    "task null": {"task": None},
+    "task a number": {"task": 3},
+    "network null": {"network": None},
+    "network a list": {"network": [3]},
+    "no widths": {"network": {}},
+    "widths empty": {"network": {"hidden": []}},
+    "width 0": {"network": {"hidden": [0]}},
+    "width a float": {"network": {"hidden": [2.5]}},
+    "width a text": {"network": {"hidden": ["3"]}},
+    "widths a number": {"network": {"hidden": 3}},
+    "another width": {"network": {"hidden": [4]}},
+    "another depth": {"network": {"hidden": [3, 3]}},
+    "layer norm": {"network": BODY | {"layer_norm": True}},
+    "layer norm a text": {"network": BODY | {"layer_norm": "yes"}},
+    "activation": {"network": BODY | {"activation": "gelu"}},
+    "unknown key": {"network": BODY | {"dropout": 0.1}},
+    "obs_dim null": {"obs_dim": None},
+    "obs_dim negative": {"obs_dim": -4},
+    "obs_dim true": {"obs_dim": True},
+    "act_dim 0": {"act_dim": 0},
+    "act_dim another": {"act_dim": 3},
+    "act_dim huge": {"act_dim": 10**15},
+    "gamma 1": {"gamma": 1.0},
+    "gamma negative": {"gamma": -0.1},
+    "gamma nan": {"gamma": "nan"},
+    "gamma null": {"gamma": None},
+    "previous_actions null": {"previous_actions": None},
+    "previous_actions negative": {"previous_actions": -1},
+    "previous_actions too many": {"previous_actions": 2},
+    "previous_actions very many": {"previous_actions": 10**9},
+    "system null": {"system": None},
+    "system a text": {"system": "mass"},
+    "system of nothing": {"system": [{}]},
+    "system of more": {"system": [{"name": "mass", "index": 0, "low": 0, "high": 1, "unit": "kg"}]},
+    "system upside down": {"system": [{"name": "mass", "index": 0, "low": 1, "high": 0}]},
+    "system too long": {"system": 4 * [{"name": "mass", "index": 0, "low": 0, "high": 1}]},
+    "gap a text": {"gap": "ice"},
+    "gap without a name": {"gap": {"params": {}, "effects": {}, "scene": ""}},
+    "gap with a scene that is none": {"gap": {"name": "ice", "params": {}, "effects": {}, "scene": None}},
+    "gap with a list of params": {"gap": {"name": "ice", "params": [], "effects": {}, "scene": ""}},
+    "plan a number": {"plan": 3},
+    "plan of more": {"plan": {"horizon": 2, "gamma": 0.5}},
+    "plan without end": {"plan": {"horizon": 10**12}},
+    "ensemble_size 0": {"ensemble_size": 0},
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_a_card_that_lies_is_refused_in_one_line(shared, lie):
+    (shared / "prior.json").write_text(json.dumps(jsonable(CARD | LIES[lie])))
+    with pytest.raises(UserError, match="prior") as refused:
+        priors.load_prior(shared)
+    assert "\n" not in str(refused.value) and str(shared) in str(refused.value)
+
+
+@pytest.mark.parametrize("content", ["", "[" * 100_000, "null", "3", '{"task": "push", "task": "hammer"}', "\xff"])
+def test_a_card_that_is_no_object_is_refused_in_one_line(shared, content):
+    (shared / "prior.json").write_text(content, encoding="latin1")
+    with pytest.raises(UserError, match=r"prior\.json: ") as refused:
+        priors.load_prior(shared)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    """A whole prior, whose card the tests write."""
+    return save(tmp_path_factory.mktemp("shared") / "prior")
+
+
+ZEROS = np.zeros(4, np.float32)
+ODD = {
+    "no actor": ({"actor": None}, "prior actor.* has shape None, expected"),
+    "actor of one array": ({"actor": ZEROS}, "prior actor.* has shape"),
+    "critic of one number": ({"critic": {"Dense_0": np.zeros((), np.float32)}}, "prior critic"),
+    "half a value": ({"value": {"Dense_0": {"kernel": np.zeros((4, 3), np.float32)}}}, "prior value"),
+    "no statistics": ({"normalizer": None}, "not a prior: it has no observation statistics"),
+    "half of them": ({"normalizer": {"mean": ZEROS}}, "its normalizer is not of mean, std"),
+    "std of 3": ({"normalizer": Normalizer(ZEROS, ZEROS[:3])}, "normalizer has the shapes"),
+    "std nan": (
+        {"normalizer": Normalizer(ZEROS, ZEROS + np.float32("nan"))},
+        "normalizer/std holds numbers that are not",
+    ),
+    "std whole": ({"normalizer": Normalizer(ZEROS, np.ones(4, np.int32))}, "normalizer.std is not float32"),
+    "distortion of one array": ({"distortion": ZEROS}, "its distortion is not of matrix, bias, offset"),
+    "distortion of 3": (
+        {"distortion": Distortion(np.eye(3, dtype="f4"), ZEROS[:3], ZEROS)},
+        "distortion has the shapes",
+    ),
+    "offsets of 3": (
+        {"distortion": Distortion(np.eye(2, dtype="f4"), ZEROS[:2], ZEROS[:3])},
+        "distortion has the shapes",
+    ),
+    "mean of two parts": ({"normalizer": Normalizer({"x": ZEROS}, ZEROS)}, "the statistics have"),
+    "system that nobody tells": ({"system": ZEROS}, "system has the shapes"),
+}
+
+
+@pytest.mark.parametrize("odd", ODD)
+def test_numbers_that_are_not_those_of_the_card_are_refused(tmp_path, odd):
+    changes, words = ODD[odd]
+    changes = jax.tree.map(jnp.asarray, changes)
+    folder = priors.save_prior(tmp_path / "prior", Prior(make_prior().params._replace(**changes), CARD))
+    with pytest.raises(UserError, match=f"prior: .*{words}"):
+        priors.load_prior(folder)
+
+
+def test_no_memory_is_taken_for_what_few_bytes_claim(tmp_path, monkeypatch):
+    """A card and a manifest that agree on networks of a gigabyte, with some kB behind them."""
+    folder, network = save(tmp_path / "prior"), NetworkConfig(hidden=(2**12, 2**14))
+    wide = jax.eval_shape(lambda: make_prior(network=network).params)
+    leaves = [checkpoint.describe(path, x) for path, x in jax.tree_util.tree_leaves_with_path(wide)]
+    manifest = json.loads((folder / "manifest.json").read_text())
+    (folder / "manifest.json").write_text(json.dumps(manifest | {"leaves": [list(leaf) for leaf in leaves]}))
+    (folder / "prior.json").write_text(json.dumps(jsonable(CARD | {"network": jsonable(network)})))
+    monkeypatch.setattr(checkpoint.ocp, "load", lambda path: pytest.fail("numbers were read"))
+    with pytest.raises(UserError, match=r"prior: [\d,]+ bytes claim to hold 1,\d{3},\d{3},\d{3}; no real data pack so"):
+        priors.load_prior(folder)
+
+
+def test_a_folder_of_something_else_is_not_replaced(tmp_path):
+    save(tmp_path / "run/seed-0")
+    (tmp_path / "run/notes.txt").write_text("mine")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(UserError, match="run: holds something else than a prior; choose another folder"):
+        save(tmp_path / "run")
+    assert sorted(tmp_path.rglob("*")) == before
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(UserError, match="file: is no folder"):
+        save(tmp_path / "file")
+    (tmp_path / "empty").mkdir()
+    assert priors.load_prior(save(tmp_path / "empty")).card["task"] == "hammer"
+
+
+def test_a_prior_that_a_killed_writer_has_put_aside_is_read(tmp_path):
+    for folder in (tmp_path / "seed-0", tmp_path / "run" / "prior"):
+        save(folder, 2.0)
+        folder.rename(folder.with_name(f"{ASIDE}{folder.name}"))
+    for folder in (tmp_path / "seed-0", tmp_path / "run"):
+        assert bits(priors.load_prior(folder).params) == bits(make_prior(2.0).params)
+        assert priors.observed_by([folder]) == {"previous_actions": 0, "system": ()}
+    save(tmp_path / "seed-0", 3.0)
+    assert sorted(os.listdir(tmp_path)) == ["run", "seed-0"]
 
 
 def test_a_torn_prior_is_refused(tmp_path):
     folder = save(tmp_path / "prior")
     damage_truncate(folder)
     with pytest.raises(UserError, match="torn"):
+        priors.load_prior(folder)
+    damage_flip(save(folder))
+    with pytest.raises(UserError, match=r"prior: damaged: .* \(checksum differs\)$"):
         priors.load_prior(folder)
     with pytest.raises(UserError, match="no such folder"):
         priors.load_prior(tmp_path / "elsewhere")
@@ -134,7 +316,8 @@ def test_priors_that_are_used_together_have_one_structure(tmp_path):
     folders = [save(tmp_path / f"seed-{i}", float(i)) for i in range(2)]
     loaded = priors.load_priors(folders, env)
     assert [bits(prior.params) for prior in loaded] == [bits(make_prior(float(i)).params) for i in range(2)]
-    odd = save(tmp_path / "seed-2", gamma=0.5, network={"hidden": [9]}, plan={"horizon": 2}, gap={"name": "ice"})
+    ice = {"name": "ice", "params": {}, "effects": {}, "scene": ""}
+    odd = save(tmp_path / "seed-2", network=NetworkConfig(hidden=(9,)), gamma=0.5, plan={"horizon": 2}, gap=ice)
     with pytest.raises(UserError, match=r"seed-2: differs from .*seed-0 in gamma, gap, network, plan; choose one"):
         priors.load_priors([*folders, odd], env)
     with pytest.raises(UserError, match="act_dim=2 where act_dim=3 is needed"):

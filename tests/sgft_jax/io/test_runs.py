@@ -79,10 +79,18 @@ def test_a_folder_that_cannot_be_made_is_named_before_anything_is(tmp_path, monk
     (tmp_path / "file").write_text("mine")
     with pytest.raises(UserError, match=r"cannot be made, .*/file is a file; choose another --out"):
         start(tmp_path / "file" / "a" / "b")
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
+    for name in ("loop", "dangling"):
+        for folder in (tmp_path / name, tmp_path / name / "a" / "b"):
+            with pytest.raises(UserError, match=f"cannot be made, .*/{name} is a link that leads nowhere"):
+                start(folder)
+    (tmp_path / "sound").symlink_to(tmp_path)
+    runs.check_folder(tmp_path / "sound" / "a" / "b")
     monkeypatch.setattr(os, "access", lambda path, mode: False)  # root may write anywhere
     with pytest.raises(UserError, match="you may not write to"):
         start(tmp_path / "a" / "b")
-    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["dangling", "file", "loop", "sound"]
 
 
 def test_a_run_of_an_earlier_format_is_not_continued_but_may_be_replaced(tmp_path):

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from keys import used_twice
 
 from sgft_jax.learners import cql, sac
 from sgft_jax.models import networks
@@ -74,12 +73,6 @@ def test_the_entropy_is_not_in_the_target(key):
         learner = cql.make_cql(cql.CQLConfig(1, 1, network=NET), sac.SACHyper(alpha=alpha))
         targets.append(float(jax.jit(learner.update)(learner.init(key), batch, key)[1]["critic/target_mean"]))
     assert targets[0] == targets[1] != 0
-
-
-@pytest.mark.slow
-def test_keys_are_used_once(key):
-    fresh = cql.make_cql(cql.CQLConfig(1, 1, network=NET, samples=2))
-    assert used_twice(lambda key, s, b: fresh.update(s, b, key), fresh.init(key), batch_of(key, 0.0)) == 0
 
 
 def test_defaults_and_options():

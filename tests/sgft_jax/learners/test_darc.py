@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from keys import used_twice
 
 from sgft_jax.data import replay
 from sgft_jax.learners import darc
@@ -81,10 +80,3 @@ def test_it_trains_from_buffers(key):
     assert state.sac.step == 1 and all(jnp.isfinite(m) for m in metrics.values())
     with pytest.raises(UserError, match="option ratio-rows is 12: must be less than the batch, 12"):
         learner.update(state, batch_of(key), key)
-
-
-@pytest.mark.slow
-def test_keys_are_used_once(key):
-    fresh = darc.make_darc(CONFIG)
-    assert used_twice(lambda key, s, b: fresh.update(s, b, key), fresh.init(key), batch_of(key)) == 0
-    assert used_twice(fresh.init) == 0

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from keys import used_twice
 from tuners import slow_but
 
 from sgft_jax.learners import edac, h2oplus
@@ -356,14 +355,7 @@ def test_options_are_checked():
         h2oplus.H2OPlusConfig(3, 2, critics=1, diversity=1.0)
 
 
-# --- keys and buffers -------------------------------------------------------------------------------------------------
-
-
-def test_keys_are_used_once(key):
-    fresh = h2oplus.make_h2oplus(CONFIG)
-    state = fresh.init(key)
-    assert used_twice(lambda key, s, b: fresh.update(s, b, key), state, batch_of(key)) == 0
-    assert used_twice(fresh.init) == 0
+# --- buffers ----------------------------------------------------------------------------------------------------------
 
 
 def test_a_fresh_state_can_be_donated(key):

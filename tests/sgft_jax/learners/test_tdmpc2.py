@@ -265,6 +265,15 @@ def test_invalid_rows_do_not_matter(config, key):
     assert not equal(UPDATE[config](state, seen, key)[0].reward, a.reward)
 
 
+def test_the_policy_learns_where_the_last_valid_step_led_and_no_further(key):
+    """Of three latents of a window whose first step alone is valid, the first two count."""
+    state, zs, valid = shaken(PLAIN, key), jnp.full((2, 3, 16), 0.25), jnp.array([[True, False], [True, True]])
+    parts = tdmpc2_model.make_parts(PLAIN)
+    loss = jax.jit(lambda zs: tdmpc2._update_policy(PLAIN, parts, state, zs, valid, None, key)[1]["actor/loss"])
+    changed = [loss(zs.at[0, step, 0].add(1.0)) != loss(zs) for step in range(3)]
+    assert changed == [True, True, False]
+
+
 def test_scale_follows_the_range_of_values(key):
     fresh = INIT(key)
     fresh = fresh.replace(scale=jnp.float32(5.0), hyper=fresh.hyper._replace(tau=jnp.float32(0.25)))
@@ -416,18 +425,6 @@ def test_hyperparameters_vmap(key):
     new = jax.jit(jax.vmap(step))(rates)
     assert equal(jax.tree.map(lambda x: x[0], new.critic.params), state.critic.params)
     assert not equal(jax.tree.map(lambda x: x[1], new.critic.params), state.critic.params)
-
-
-@pytest.mark.slow
-def test_keys_are_used_once(key):
-    state, batch = INIT(key), windows(key)
-    with jax.debug_key_reuse(True):
-        fresh = tdmpc2.make_tdmpc2(dataclasses.replace(PLAIN, dropout=0.5))
-        state = jax.jit(fresh.init)(jax.random.key(3))
-        jax.jit(fresh.update)(state, batch, jax.random.key(2))
-        jax.jit(fresh.act, static_argnames="explore")(
-            state, fresh.init_carry(), jnp.ones(2), jax.random.key(4), explore=True
-        )
 
 
 # --- between simulation and reality ---------------------------------------------------------------------------------

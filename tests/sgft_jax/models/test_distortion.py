@@ -69,6 +69,23 @@ def test_walls_tell_that_a_camera_is_off(key):
     np.testing.assert_array_equal(fit(rows)[0].offset, 0.0)
 
 
+@pytest.mark.parametrize(
+    ("commands", "both", "believed"),
+    [(0.0, 19.0, False), (0.0, 21.0, True), (30.0, 49.0, False), (30.0, 51.0, True), (100.0, 149.0, False),
+     (100.0, 151.0, True)],
+)  # fmt: skip
+def test_errors_of_sensors_must_earn_their_place(commands, both, believed, monkeypatch):
+    """20 nats and half as many again as the commands alone explain; else the fit of the commands stands."""
+    plain, wide = turned(0.1, 1.0, [0.0, 0.0]), turned(0.2, 1.0, [0.0, 0.0], [0.06, 0.0])
+    search = lambda *given, errors, turns: (wide, jnp.float32(both)) if any(errors) else (plain, jnp.float32(commands))  # noqa: E731
+    monkeypatch.setattr(distortion, "_fit", search)
+    fitted, evidence = distortion.fit(walled, None, None, None, turns=True, errors=(0.05, 0.0))
+    assert evidence == (both if believed else commands)
+    np.testing.assert_array_equal(fitted.offset, (wide if believed else plain).offset)
+    np.testing.assert_array_equal(fitted.matrix, (wide if believed else plain).matrix)
+    assert distortion.fit(walled, None, None, None, turns=True, errors=(0.0, 0.0))[1] == commands
+
+
 @pytest.mark.slow
 def test_what_else_is_wrong_with_contacts_is_no_error_of_a_camera(key):
     """A real wall that stands elsewhere: errors of the camera would explain some of it, and are not believed."""

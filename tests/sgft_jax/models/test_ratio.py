@@ -130,6 +130,15 @@ def small_batch(key):
     return Batch(obs, action, zero, zero, next_obs, is_sim=jnp.array([0, 0, 1, 1, 1, 1], bool))
 
 
+def test_both_domains_count_alike_however_many_rows_each_has(key):
+    """Four copies of a simulated row weigh as much as one of them."""
+    learner = ratio.make_ratio(ratio.RatioConfig(2, 1, NetworkConfig((8,)), noise=0.0))
+    batch = jax.tree.map(lambda x: x[jnp.array([0, 1, 2, 2, 2, 2])], small_batch(key))
+    state, loss = learner.init(key), jax.jit(lambda *x: learner.update(*x, rate=1e-3)[1]["ratio/loss"])
+    copies, alone = (loss(state, batch._replace(valid=jnp.arange(6) < n), key) for n in (6, 3))
+    assert copies == pytest.approx(float(alone), rel=1e-5)
+
+
 def gradients(new):
     """Adam's first mean is a tenth of the gradient."""
     return [jax.tree.map(lambda m: 10 * m, optax.tree.get(fit.moments, "mu")) for fit in (new.joint, new.pair)]

@@ -91,7 +91,10 @@ def test_what_comes_later_is_discounted(plan):
 
 
 def test_proposals_follow_every_model(monkeypatch):
-    """The policy goes up to where it believes to be and one step on; each plan's proposals follow one model."""
+    """The policy goes up to where it believes to be and one step on; each plan's proposals follow one model.
+
+    Policy and models read (s - 0.5) / 2, and a model's change counts in units of 2.
+    """
     model = networks.Network(lambda key: None, lambda gains, obs, action: gains[:, None] * action[None])
     up = networks.Network(lambda key: None, lambda params, obs: jnp.array([[0.2 + obs[0]], [-20.0]]))
     monkeypatch.setattr(mpc, "make_dynamics", lambda *_: model)
@@ -99,13 +102,15 @@ def test_proposals_follow_every_model(monkeypatch):
     monkeypatch.setattr(mpc.mppi, "plan", lambda config, hyper, rate, proposals, *_, explore: proposals)
     act = mpc.make_act(mpc.MPCConfig(1, 1, NET, horizon=2, noise=0.0), reward=nothing, terminated=never)
     gains = jnp.array([0.0, 1.0, 2.0])
-    params = sac.SACParams(None, None, None, gains, STILL)
+    params = sac.SACParams(None, None, None, gains, Normalizer(jnp.array([0.5]), jnp.array([2.0])))
     keys = jax.random.split(jax.random.key(0), 20)
     proposed = jax.vmap(lambda key: act(params, None, jnp.zeros(1), key, explore=False))(keys)[..., 0]
-    first = np.tanh(0.2)
+    first = np.tanh(0.2 - 0.25)
     np.testing.assert_allclose(proposed[:, :, 0], first, rtol=1e-5)
     np.testing.assert_allclose(proposed[:, :, 1], np.tile(proposed[:, :1, 1], (1, proposed.shape[1])), rtol=1e-5)
-    np.testing.assert_allclose(np.unique(np.round(proposed[:, 0, 1], 4)), np.tanh(0.2 + gains * first), atol=1e-4)
+    np.testing.assert_allclose(
+        np.unique(np.round(proposed[:, 0, 1], 4)), np.sort(np.tanh(-0.05 + gains * first)), atol=1e-4
+    )
 
 
 @pytest.mark.parametrize("options", [{"horizon": 0}, {"samples": 7}])

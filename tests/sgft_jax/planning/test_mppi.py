@@ -68,6 +68,15 @@ def test_weights_choice_and_noise_by_hand(key, explore):
     assert explore or set(actions.flatten().tolist()) == {float(np.float32(0.1)), float(np.float32(-0.1))}
 
 
+def test_noise_is_that_of_the_first_step_of_a_plan(key):
+    """The elites agree on the first step, so its spread is the floor, 0.05; they differ by 2 in the second one."""
+    apart = jnp.array([[[0.1], [-1.0]], [[0.1], [1.0]]])
+    score = lambda sequence: jnp.where((sequence[0, 0] == 0.1) & (jnp.abs(sequence[1, 0]) == 1.0), 0.0, -1e6)  # noqa: E731
+    plan = run(score, config=mppi.MPPIConfig(samples=8, elites=2, iterations=2), proposals=apart, explore=True)
+    actions = jax.vmap(plan)(jax.random.split(key, 1000))[0]
+    assert actions.std() == pytest.approx(0.05, rel=0.1)
+
+
 def test_spread_has_a_floor(key):
     one = mppi.MPPIConfig(samples=8, elites=1, iterations=2)
     plan = run(pair_score, config=one, proposals=PAIR, explore=True)

@@ -7,15 +7,19 @@ import socket
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
 import msgpack
 import numpy as np
 import pytest
+from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from sgft_jax.systems import robot_client
+from sgft_jax.systems.door import STRANGERS
+from sgft_jax.systems.messages import Hello, read
 from sgft_jax.systems.remote import Remote, _Link
 from sgft_jax.systems.robot_client import Limits, RefusedError, array, pack, play, unpack
 from sgft_jax.types import UserError
@@ -161,7 +165,7 @@ def test_lost_doubled_and_damaged_messages_move_nothing_twice(pair, driver, monk
 
         def worse(data):
             luck = rng.random()
-            if luck < 0.25 and unpack(data)["type"] not in ("hello", "welcome", "end"):
+            if luck < 0.25 and not isinstance(read(data), Hello):
                 return
             if luck > 0.9:
                 send(data[:-1] + bytes([data[-1] ^ 255]))
@@ -487,37 +491,31 @@ def test_nonsense_changes_nothing(pair):
     assert move(own, RIGHT).obs[0] == 1
 
 
-def test_messages_by_hand():
+def test_messages_of_the_learner_by_hand():
     fields = unpack(pack("act", episode=3, step=4, action=np.array([0.5, -1.0])))
     assert fields["type"] == "act" and array(fields["action"], 2, "x").tolist() == [0.5, -1.0]
     for data, words in (
         ("text", "is text"),
         (b"x" * 70_000, "at most 65,536"),
-        (_signed(msgpack.packb([1])), "unknown type None"),
-        (_signed(msgpack.packb({"type": "fly"})), "unknown type 'fly'"),
-        (_signed(b"\xc1"), "is no msgpack"),
         (pack("act", episode=3, step=4), "no proper 'action'"),
         (pack("act", episode=3, step=True, action=b""), "no proper 'step'"),
     ):
         with pytest.raises(ValueError, match=words):
             unpack(data)
-    with pytest.raises(ValueError, match="has 2 numbers, expected 3"):
-        array(fields["action"], 3, "an action")
-
-
-def _signed(body):
-    return robot_client.zlib.crc32(body).to_bytes(4, "little") + body
+    for size, words in ((3, "has 2 numbers, expected 3"), (2, "not finite, or beyond 1e")):
+        with pytest.raises(ValueError, match=words):
+            array(np.float32([0.0, 3e38]).tobytes(), size, "an action")
 
 
 def test_every_command_is_on_disk_before_it_is_sent(pair, tmp_path):
     driver, path = Point(), tmp_path / "commands"
     step, lengths = driver.step, []
-    driver.step = lambda action: (lengths.append(len(list(read(path)))), step(action))[1]
+    driver.step = lambda action: (lengths.append(len(list(commands(path)))), step(action))[1]
     own = pair(driver, log=path)
     begin(own, 0)
     for _ in range(2):
         move(own, RIGHT)
-    assert lengths == [1, 2] and [x["step"] for x in read(path)] == [0, 1]
+    assert lengths == [1, 2] and [x["step"] for x in commands(path)] == [0, 1]
 
 
 def played_alone(driver, **options):
@@ -599,15 +597,265 @@ def test_a_learner_that_is_not_there_is_waited_for_and_said_once():
     assert len(said) == len(set(said)) and all("trying again" in line for line in said[:-1])
 
 
-def read(path):
+def commands(path):
     with open(path, "rb") as file:
         yield from msgpack.Unpacker(file)
 
 
-def test_a_port_that_is_taken_is_refused():
+def test_ports_sizes_and_times_that_cannot_be_are_refused():
     remote = Remote(2, 2, say=lambda line: None)
-    with pytest.raises(UserError, match="choose another port"):
-        Remote(2, 2, port=int(remote.url.rsplit(":", 1)[1]))
+    port = int(remote.url.rsplit(":", 1)[1])
+    for given, words in (
+        ({"port": port}, "choose another port"),
+        ({"port": 80_000}, "port 80000: ports go from 1 to 65535"),
+        ({"host": "256.1.1.1"}, "neither a name nor an address"),
+        ({"period": float("nan")}, "a step cannot take nan seconds"),
+        ({"steps": 0}, "must be more than 0"),
+        ({"again": float("nan")}, "must be more than 0"),
+    ):
+        with pytest.raises(UserError, match=words):
+            Remote(2, 2, **given)
+    remote.close()
+
+
+# --- drivers that fail ------------------------------------------------------------------------------------------------
+
+
+def as_an_environment(driver):
+    driver.reset = lambda seed: (driver.resets.append(seed), (np.zeros(2), {}))[1]
+
+
+def fails_at_every_start(driver):
+    def reset(seed):
+        driver.resets.append(seed)
+        raise TypeError("no such motor\n\x1b[31m" + 60_000 * "x")
+
+    driver.reset = reset
+
+
+def returns(*moved):
+    def change(driver):
+        driver.step = lambda action: moved
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("mistake", "words"),
+    [
+        (as_an_environment, "an observation is .*not numbers alone"),
+        (fails_at_every_start, "TypeError: no such motor"),
+        (returns(np.zeros(2), np.ones(2), False, False, {}), "reward is array"),
+        (returns(np.zeros(2), "much", False, False, {}), "reward is 'much'"),
+        (returns(np.zeros(2), 0.0, None, False, {}), "terminated is None"),
+        (returns(np.zeros(2), 0.0, False, "no", {}), "truncated is 'no'"),
+        (returns(np.zeros(2), 0.0, False, False, {"success": np.ones(2)}), "info.*success.* is array"),
+        (returns(np.zeros(2), 0.0, False, {}), "step does not return obs, reward, terminated, truncated, info"),
+        (returns(np.full(2, 3e38), 0.0, False, False, {}), "not finite, or beyond 1e"),
+        (returns(np.zeros(3), 0.0, False, False, {}), "has 3 numbers, expected 2"),
+        (returns("ab", 0.0, False, False, {}), "an observation is 'ab'"),
+    ],
+    ids=lambda x: x if isinstance(x, str) else "",
+)
+def test_a_permanent_mistake_of_the_driver_ends_in_one_line(pair, mistake, words):
+    driver = Point()
+    mistake(driver)
+    own = pair(driver, again=0.001)
+    with pytest.raises(UserError, match=f"^robot at .* has failed 5 times in a row: .*{words}") as stopped:
+        for episode in range(9):
+            begin(own, episode)
+            assert move(own, RIGHT).info["invalid"]
+    assert 5 <= len(driver.resets) < 9 and driver.stops >= 5  # a slow answer is asked for again
+    assert all(line.isprintable() and len(line) <= 600 for line in [str(stopped.value)[:600], *own.said])
+
+
+def test_a_driver_that_fails_now_and_then_goes_on(pair):
+    """Four times in a row, again and again: a step that is made is a new beginning."""
+    driver, own = Point(), None
+    step, fail = driver.step, []
+
+    def now_and_then(action):
+        if fail:
+            raise OSError(fail.pop())
+        return step(action)
+
+    driver.step = now_and_then
+    own = pair(driver, again=0.001)
+    for _ in range(3):
+        fail.extend(["busy"] * 4)
+        for episode in range(5):
+            begin(own, episode)
+            assert move(own, 0.1 * RIGHT).info.get("invalid", False) == (episode < 4)
+    assert len(driver.resets) == 15
+
+
+@pytest.mark.parametrize("outcome", [(np.ones(1), None, np.ones(1, bool)), (None, False, None)])
+def test_a_judge_may_return_arrays_of_one_and_none(pair, outcome):
+    driver = Arm()
+    driver.judge = lambda obs: (outcome[0], outcome[1] or np.zeros(1), outcome[2])
+    own = pair(driver, period=0.01)
+    begin(own, 0)
+    moved = move(own, RIGHT)
+    assert moved.reward == 1.0 or np.isnan(moved.reward)
+    assert moved.terminated is False and moved.info["is_success"] is (True if outcome[0] is not None else None)
+
+
+def test_late_commands_and_limits_beyond_an_action_are_kept_within_it():
+    limits = Limits(low=-3.0, high=[0.5, 9.0])
+    np.testing.assert_array_equal(limits.of(np.array([-5.0, 5.0]), np.zeros(2)), [-1.0, 1.0])
+    for wrong in (Limits(low=2.0, high=3.0), Limits(high=[1.0, -2.0], low=-3.0)):
+        with pytest.raises(ValueError, match="allow no action"):
+            wrong.check(2, 2)
+
+
+# --- strangers --------------------------------------------------------------------------------------------------------
+
+
+def test_idle_strangers_cannot_keep_the_robot_out(pair):
+    """Those that say nothing, and those that have begun to speak; the driver comes last."""
+    own, strangers = pair(Point()), []
+    begin(own, 0)
+    port = own.remote._door.port
+    for i in range(3 * STRANGERS):
+        strangers.append(socket.create_connection(("127.0.0.1", port), timeout=5))
+        if i % 2:
+            strangers[-1].sendall(b"GET / HTTP/1.1\r\nHost: x\r\n")
+    assert "another robot" in hello(own.remote)["reason"]  # all before it have come in
+    assert move(own, RIGHT).obs[0] == 1
+    own.remote._link.connection.close()
+    begin(own, 1)  # it is back
+    assert move(own, RIGHT).obs[0] == 1
+    for one in strangers:
+        one.close()
+
+
+@pytest.mark.parametrize(
+    ("host", "refused"),
+    [
+        ("evil.example", True), ("", True), ("a b", True), ("[::1", True), ("localhost:1", False), ("[::1]:4", False),
+        ("10.0.0.7", False), (socket.gethostname(), False), (f"{socket.gethostname()}.local:8765", False),
+    ],
+)  # fmt: skip
+def test_a_foreign_host_is_refused(host, refused, monkeypatch):
+    remote = Remote(2, 2, say=lambda line: None)
+    monkeypatch.setattr("websockets.client.build_host", lambda *given, **more: host)
+    answer = hello(remote)
+    assert (answer["type"] == "refused") == refused and (not refused or "it asked for the host" in answer["reason"])
+    remote.close()
+
+
+def test_a_web_page_is_refused():
+    remote = Remote(2, 2, say=lambda line: None)
+    with pytest.raises(InvalidStatus, match="403"), connect(remote.url, origin="http://evil.example"):
+        pass
+    remote.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"robot": "\x1b[31m\n" * 9000, "obs_size": 3}, "...: numbers measured: the robot has 3"),
+        ({"period": 0.2, "answer_within": 0.3}, "r: answer_within is 0.3: give at most the period"),
+        ({"answer_within": 0.1}, "r: answer_within is 0.1"),
+        ({"period": -1.0}, "r: seconds of a step: the robot has -1, which cannot be"),
+        ({"period": float("nan")}, "the robot has nan, which cannot be"),
+        ({"answer_within": float("nan")}, "its first message does not fit the protocol"),
+        ({"token": b"\xff"}, "its first message does not fit the protocol"),
+        ({"obs_size": [1]}, "its first message does not fit the protocol"),
+    ],
+    ids=str,
+)
+def test_a_greeting_that_cannot_be_is_refused_in_a_short_line(changes, reason):
+    said = []
+    remote = Remote(2, 2, say=said.append)
+    refused = hello(remote, **changes)["reason"]
+    assert reason in refused and refused.isprintable() and len(refused) < 250 and refused in said[-1]
+    remote.close()
+
+
+@contextlib.contextmanager
+def robot_by_hand(said=None):
+    """A learner, a robot that it has taken, and what answers the learner's next question."""
+    remote = Remote(2, 2, again=0.2, say=[].append if said is None else said.append)
+    fields = {"obs_size": 2, "action_size": 2, "period": None, "answer_within": None}
+    with connect(remote.url) as robot:
+        robot.send(pack("hello", version=2, token=remote.token, robot="r", **fields))
+        assert unpack(robot.recv(timeout=5))["type"] == "welcome"
+
+        def answered(ask, kind, **fields):
+            with ThreadPoolExecutor(1) as pool:
+                asked = pool.submit(ask)
+                while not asked.done():  # it asks again where an answer was dropped
+                    with contextlib.suppress(TimeoutError):
+                        message = unpack(robot.recv(timeout=0.05))
+                        same = {name: message[name] for name in ("episode", "step") if name in message}
+                        robot.send(pack(kind, **{**same, **fields}))
+                return asked.result()
+
+        answered(lambda: remote.reset(seed=0), "began", obs=np.zeros(2))
+        yield remote, robot, answered
+    remote.close()
+
+
+MOVED = {
+    "sent": np.zeros(2), "obs": np.ones(2), "reward": 1.0, "terminated": False, "truncated": False, "success": None,
+    "late": False,
+}  # fmt: skip
+
+
+def test_messages_that_a_robot_cannot_mean_are_dropped_and_nothing_is_lost():
+    said = []
+    bodies = (msgpack.packb({"type": [1]}), b"\x80", b"\xc1", b"\x82\xa4type\xa6rested\xa1z" + b"\x91" * 60_000)
+    with robot_by_hand(said) as (remote, robot, answered):
+        for body in bodies:
+            robot.send(robot_client.zlib.crc32(body).to_bytes(4, "little") + body)
+        robot.send("text")
+        for _ in range(500):
+            robot.send(pack("rested", episode=1))
+        obs, reward, *_ = answered(lambda: remote.step(np.zeros(2)), "moved", **MOVED)
+    assert obs.tolist() == [1.0, 1.0] and reward == 1.0
+    ignored = [line for line in said if "ignored" in line]
+    assert len(ignored) == 1 and "does not fit the protocol" in ignored[0]
+
+
+def test_answers_that_nobody_has_asked_for_take_no_memory():
+    with robot_by_hand() as (remote, robot, answered):
+        for _ in range(2000):
+            robot.send(pack("rested", episode=1))
+        answered(lambda: remote.step(np.zeros(2)), "moved", **MOVED)
+        for _ in range(2000):
+            robot.send(pack("rested", episode=1))
+        robot.ping().wait(5)
+        assert remote._link.inbox.qsize() <= 64
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"sent": np.array([1e30, 0])}, {"sent": np.array([1.1, 0])}, {"obs": np.array([3e38, 0])}, {"obs": np.zeros(3)},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_step_with_numbers_that_cannot_be_is_in_doubt(wrong):
+    with robot_by_hand() as (remote, _, answered):
+        assert answered(lambda: remote.step(np.zeros(2)), "moved", **{**MOVED, **wrong})[-1] == {"invalid": True}
+
+
+def test_the_token_is_in_no_line(pair):
+    own = pair(Point())
+    begin(own, 0)
+    lines = [*own.said, str(own.remote)]
+    assert any("its token is in the attribute `token`" in line for line in lines)
+    assert not any(own.remote.token in line for line in lines)
+
+
+@pytest.mark.skipif(not socket.has_ipv6, reason="this Python has no IPv6")
+def test_a_learner_listens_at_an_ipv6_address():
+    try:
+        remote = Remote(2, 2, host="::1", say=lambda line: None)
+    except UserError:
+        pytest.skip("this computer has no IPv6")
+    assert remote.url.startswith("ws://[::1]:") and hello(remote)["type"] == "welcome"
     remote.close()
 
 

@@ -1,0 +1,152 @@
+"""The one checked way in for what an environment or a robot returns, whatever its kind.
+
+A number may be Python's, NumPy's or an array of one, `info` may be None, and None means that something is not known.
+Anything else raises UserError: one line with the environment, its method, and the value.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sgft_jax.systems.robot_client import LARGEST, SUCCESS, flag, number, numbers, printable, success_of
+from sgft_jax.types import UserError
+
+_PARTS = {"reset": ("observation", "info"), "step": ("observation", "reward", "terminated", "truncated", "info")}
+_KNOWN = (*SUCCESS, "invalid", "late", "sent", "final_obs", "final_info")  # of `info`
+_ROUNDING = 1e-4  # by which, as a share of the half range, what was sent may lie beyond the bounds
+
+
+class Answer(NamedTuple):
+    """One environment's answer to a step.
+
+    obs: as it came. reward: nan where it does not know it. success: None where it does not tell. sent: [act_dim] what
+    was really commanded, in its units; None where that is what was asked for.
+    """
+
+    obs: Any
+    reward: float
+    terminated: bool
+    truncated: bool
+    success: bool | None
+    invalid: bool
+    late: bool
+    sent: np.ndarray | None
+
+
+def idle(obs: Any) -> Answer:
+    """Of an environment whose episode is over."""
+    return Answer(obs, 0.0, True, False, None, False, False, None)
+
+
+def parts(name: str, method: str, returned: Any) -> tuple[Any, ...]:
+    """What a method returns, if it is a tuple of as many parts as it should be."""
+    wanted = _PARTS[method]
+    if not isinstance(returned, tuple) or len(returned) != len(wanted):
+        count = f"{len(returned)} values" if isinstance(returned, tuple) else f"a {type(returned).__name__}"
+        raise UserError(f"{method} of {name}: returns {count}, not {', '.join(wanted)}")
+    return returned
+
+
+def step(name: str, returned: tuple[Any, ...], low: np.ndarray, high: np.ndarray) -> Answer:
+    """The answer to a step, see `parts`. low, high: [act_dim] bounds of what can have been sent."""
+    obs, reward, terminated, truncated, info = returned
+    with _explained(f"step of {name}"):
+        info = _mapping(info)
+        return Answer(
+            obs, number(reward, "reward"), flag(terminated, "terminated"), flag(truncated, "truncated"),
+            success_of(info), _told(info, "invalid"), _told(info, "late"), _sent(info.get("sent"), low, high),
+        )  # fmt: skip
+
+
+def vector(name: str, returned: tuple[Any, ...], count: int) -> list[tuple[Any, ...]]:
+    """The parts that each of `count` environments of a vector environment returns; in `final_obs` what came last."""
+    obs, *columns, info = returned
+    with _explained(f"step of {name}"):
+        infos = [_of_member(_mapping(info), i, count, _KNOWN) for i in range(count)]
+        names = _PARTS["step"][1:-1]
+        rows = zip(*(_column(x, count, part) for x, part in zip(columns, names, strict=True)), strict=True)
+    last = [own.get("final_obs", seen) for own, seen in zip(infos, split(name, "step", obs, count), strict=True)]
+    return [
+        (seen, *row, {**own, **own.get("final_info", {})}) for seen, row, own in zip(last, rows, infos, strict=True)
+    ]
+
+
+def split(name: str, method: str, obs: Any, count: int) -> list[Any]:
+    """What each environment observes; copies, because a vector environment may write into its arrays again."""
+    if isinstance(obs, Mapping):
+        columns = {key: split(name, method, x, count) for key, x in obs.items()}
+        return [{key: x[i] for key, x in columns.items()} for i in range(count)]
+    with _explained(f"{method} of {name}"):
+        return [np.array(x) for x in _column(obs, count, "observation")]
+
+
+def measured(where: str, values: Any, size: int, sizes: str) -> np.ndarray:
+    """[size] float32 of what is observed. sizes: in words. It need not be `sound`."""
+    with _explained(where), np.errstate(over="ignore"):
+        vector = numbers(values, "the observation").astype(np.float32)
+    if vector.size != size:
+        raise UserError(f"{where}: observes {vector.size} numbers, {sizes}")
+    return vector
+
+
+def sound(x: np.ndarray) -> np.ndarray:
+    """Whether numbers are finite, and small enough for float32 arithmetic; nan is not."""
+    return np.abs(x) <= LARGEST
+
+
+def _mapping(info: Any) -> Mapping[str, Any]:
+    if info is not None and not isinstance(info, Mapping):
+        raise ValueError(f"info is {printable(repr(info), 60)}, no mapping")
+    return info or {}
+
+
+def _told(info: Mapping[str, Any], name: str) -> bool:
+    return info.get(name) is not None and flag(info[name], f"info[{name!r}]")
+
+
+def _sent(values: Any, low: np.ndarray, high: np.ndarray) -> np.ndarray | None:
+    if values is None:
+        return None
+    sent = numbers(values, "info['sent']")
+    if sent.size != low.size:
+        raise ValueError(f"info['sent'] has {sent.size} numbers, not {low.size}")
+    room = _ROUNDING * (high - low) / 2
+    if not ((low - room <= sent) & (sent <= high + room)).all():  # nan is not
+        raise ValueError(f"info['sent'] is {printable(sent, 60)}, beyond the bounds of the action space")
+    return np.clip(sent, low, high)
+
+
+def _column(values: Any, count: int, name: str) -> Sequence[Any]:
+    """One part of a vector environment's answer, an entry for each of its environments."""
+    try:
+        fits = len(values) == count
+    except TypeError:
+        fits = False
+    if not fits:
+        raise ValueError(f"{name} is {printable(repr(values), 60)}, not one for each of {count} environments")
+    return values
+
+
+def _of_member(infos: Mapping[str, Any], i: int, count: int, names: Sequence[str]) -> dict[str, Any]:
+    """The `info` of environment i. Beside an entry may stand for which environments it is there."""
+    found = {}
+    for name in (name for name in names if name in infos):
+        values, there = infos[name], infos.get(f"_{name}", [True] * count)
+        if not flag(_column(there, count, f"info['_{name}']")[i], f"info['_{name}']"):
+            continue
+        if isinstance(values, Mapping):
+            inner = [part for part in values if f"_{part}" in values] if name == "final_obs" else _KNOWN
+            found[name] = _of_member(values, i, count, inner)
+        else:
+            found[name] = _column(values, count, f"info[{name!r}]")[i]
+    return found
+
+
+@contextmanager
+def _explained(where: str) -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        raise UserError(f"{where}: {error}") from None
