@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from experiments import cli
-from experiments.options import check_task, prior_folders, task_of_priors
+from experiments.options import prior_folders, task_of_priors
 from sgft_jax.io.runs import check_folder
 from sgft_jax.types import UserError
 
@@ -29,7 +29,6 @@ def main(args: ExportArgs) -> None:
     """Writes the exports and says where they are and how exact."""
     folders = prior_folders(args.policy, out=Path(), task="", preset="", option="--policy")
     task = task_of_priors(folders, args.task)
-    check_task(task)
     home = args.out or args.policy / "export" / args.to
     check_folder(home)
     homes = [home if folder == args.policy else home / folder.name for folder in folders]

@@ -170,6 +170,7 @@ def task_of_priors(folders: Sequence[Path], task: str | None) -> str:
     """
     named = {folder: read_card(folder)["task"] for folder in folders}
     chosen = task or known_task(folders[0] / CARD, named[folders[0]])
+    check_task(chosen)
     for folder, other in named.items():
         if other != extend.name_of(chosen):
             raise UserError(f"{folder}: is a prior of the task {other!r}, not of {extend.name_of(chosen)!r}")

@@ -215,7 +215,7 @@ def test_any_measurement_may_show_that_a_gap_can_be_mastered(what):
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (["--draw", "-1"], "--draw is -1: must be at least 1"),
+        (["--draw", "-1"], "--draw is -1: must be at least 0"),
         (["--draw", "2", "--presets", "mild"], "--presets mild: names gaps, and --draw draws them"),
         (["--judge"], "--judge: is for drawn gaps"),
         (["--choose", "2"], "--choose: is for drawn gaps"),

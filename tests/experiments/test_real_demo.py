@@ -14,7 +14,7 @@ from experiments.real_demo import RealDemoArgs
 from sgft_jax.types import UserError
 
 ROOT = Path(__file__).parents[2]
-PRIOR = ROOT / "docs/priors/push/seed-0"  # of another task: it is only looked for
+PRIOR = ROOT / "docs/priors/panda-push/seed-0"  # it is only looked for
 BULLET = os.environ.get("SGFT_BULLET_PYTHON", str(ROOT / "build/panda-gym/bin/python"))
 
 

@@ -66,7 +66,7 @@ _METHODS = [
 
 ROWS = [
     *[(f"{command} --task mine.py", words, {"mine.py": text}) for command in ("pretrain",) for text, words in _TASKS],
-    *[("finetune --prior prior --method mine_{i}.py", words, {"mine.py": text}) for text, words in _METHODS],
+    *[("finetune --prior prior --method mine.py", words, {"mine.py": text}) for text, words in _METHODS],
     ("tasks mine.py", "task mine.py: line 1: SystemExit: None", {"mine.py": "exit()"}),
     ("evaluate --prior prior --task mine.py", "task mine.py: line 1: SystemExit", {"mine.py": "exit()"}),
     ("hybrid --method sac --gap sim --task mine.py", "task mine.py: line 1: SystemExit", {"mine.py": "exit()"}),

@@ -33,7 +33,7 @@ ROWS = [
     ("export --policy prior --to numpy --out empty", "empty: exists already"),
     ("export --policy prior --to numpy --out loop", "loop is a link that leads nowhere"),
     ("export --policy prior --to numpy --task hammer", "prior: is a prior of the task 'push', not of 'hammer'"),
-    ("export --policy prior --to numpy --task nope", "prior: is a prior of the task 'push', not of 'nope'"),
+    ("export --policy prior --to numpy --task nope", "task: there is no 'nope'"),
     ("export --policy piped --to numpy", "piped/prior.json: is no plain file"),
     ("share --prior prior", "--to is missing"),
     ("export_data --run nowhere --to minari", "--run nowhere: holds no recorded rollouts (real/rollout-*.npz)"),
@@ -94,7 +94,7 @@ ROWS = [
 HEAVY = [
     ("export_data --run run --to minari --task hammer", "run: has 4 observations and 2 actions, hammer has"),
     ("replay --run run --task hammer", "run: has 4 observations and 2 actions, hammer has"),
-    ("diagnose --calibrate run", "run/eval.jsonl: not every line has numbers of 'rollouts'"),
+    ("diagnose --calibrate run", "run/eval.jsonl:1: lacks rollouts"),
     ("figures", "runs/finetune: holds no evaluated run to draw"),
     ("figures --out empty", "empty/finetune: holds no evaluated run to draw"),
     ("figures --data nowhere", "nowhere: holds no curves-*.csv"),

@@ -6,7 +6,9 @@ _DEEP = 100_000 * "["
 
 
 def _card(**changes):
-    return json.dumps({"task": "push", "algorithm": "sac", "obs_dim": 8, "act_dim": 2, "gamma": 0.97, **changes})
+    network = {"hidden": [8], "layer_norm": True, "actor_layer_norm": False, "activation": "relu"}
+    sizes = {"obs_dim": 8, "act_dim": 2, "previous_actions": 2, "ensemble_size": 5, "gamma": 0.97}
+    return json.dumps({"task": "push", "algorithm": "sac", "network": network, **sizes, **changes})
 
 
 def _config(**changes):
@@ -23,12 +25,12 @@ _CARDS = [
     ("{}", "bad/prior.json: lacks task"),
     (_card(task=3), "bad/prior.json: task is a whole number, not a text"),
     (_card(task=None), "bad/prior.json: task is null, not a text"),
-    (_card(task="nope"), "there is no 'nope'"),
-    (_card(task="mine.py"), "bad/prior.json: its task is code, 'mine.py'; if you trust it, name it with --task"),
-    (_card(task="/tmp/mine.py"), "bad/prior.json: its task is code, '/tmp/mine.py'"),
-    (_card(task="os.path"), "bad/prior.json: its task is code, 'os.path'"),
-    (_card(task="envs.franka.push"), "bad/prior.json: its task is code, 'envs.franka.push'"),
-    (_card(task="../x"), "bad/prior.json: its task is code, '../x'"),
+    (_card(task="nope"), "bad/prior.json: is of the task 'nope', which does not come with this code"),
+    (_card(task="mine.py"), "bad/prior.json: is of the task 'mine.py', which does not come with this code"),
+    (_card(task="/tmp/mine.py"), "bad/prior.json: is of the task '/tmp/mine.py'"),
+    (_card(task="os.path"), "bad/prior.json: is of the task 'os.path'"),
+    (_card(task="envs.franka.push"), "bad/prior.json: is of the task 'envs.franka.push'"),
+    (_card(task="../x"), "bad/prior.json: is of the task '../x'"),
 ]
 _READ_CARDS = ("evaluate --prior bad", "export --policy bad --to numpy", "diagnose --prior bad")
 
@@ -42,22 +44,25 @@ _CONFIGS = [
     (_config(seed="0"), "bad/config.json: config.seed is a text, not a whole number"),
     (_config(seed=-1), "bad/config.json: config.seed: "),
     (_config(seed=0.5), "bad/config.json: config.seed is a number, not a whole number"),
-    (_config(task="nope"), "there is no 'nope'"),
-    (_config(task="mine.py"), "bad/config.json: its task is code, 'mine.py'; if you trust it, name it with --task"),
-    (_config(task="os.path"), "bad/config.json: its task is code, 'os.path'"),
+    (_config(task="nope"), "bad/config.json: is of the task 'nope', which does not come with this code"),
+    (_config(task="mine.py"), "bad/config.json: is of the task 'mine.py', which does not come with this code"),
+    (_config(task="os.path"), "bad/config.json: is of the task 'os.path'"),
 ]
 _READ_CONFIGS = ("replay --run bad", "export_data --run bad --to minari --out x-v0", "diagnose --real bad")
 _ROLLOUT = {"bad/real/rollout-000000.npz": ""}
 
 _LINES = [
-    ("{}\n", "has no success or return"),
-    ("[1]\n", "eval.jsonl:1: not a JSON object"),
-    ("{\n", "eval.jsonl:1: not a JSON object"),
-    (_DEEP + "\n", "eval.jsonl:1: not a JSON object"),
-    ('{"step": 0, "success": [0.0]}\n', "not every line has numbers of 'rollouts'"),
-    ('{"step": 0, "rollouts": 0, "robot_minutes": 0, "success": ["x"]}\n', "numbers of 'success'"),
-    ('{"step": 0, "rollouts": 0, "robot_minutes": 0, "success": null}\n', "numbers of 'success'"),
-    ('{"step": 0, "rollouts": 0, "robot_minutes": 0, "success": [0]}\n{"success": [0, 1]}\n', "numbers of 'success'"),
+    ("{}\n", "eval.jsonl:1: lacks step"),
+    ("[1]\n", "eval.jsonl:1: is no JSON object"),
+    ("{\n", "eval.jsonl:1: not valid JSON ("),
+    (_DEEP + "\n", "eval.jsonl:1: not valid JSON (nested too deeply)"),
+    ('{"step": 0, "success": [0.0]}\n', "eval.jsonl:1: lacks rollouts"),
+    ('{"step": 0, "rollouts": 0, "robot_minutes": 0, "success": ["x"]}\n', "eval.jsonl:1: success[0] is a text"),
+    ('{"step": 0, "rollouts": 0, "robot_minutes": 0, "success": null}\n', "eval.jsonl:1: success is null"),
+    (
+        '{"step": 0, "rollouts": 0, "robot_minutes": 0, "success": [0]}\n{"success": [0, 1]}\n',
+        "eval.jsonl:2: lacks step",
+    ),
 ]
 _HEAD = "task,gap,method,variant,priors,prior,seed,rollouts,transitions,minutes,success,return,training\n"
 _TABLES = [
@@ -67,8 +72,8 @@ _TABLES = [
     (_HEAD + "push,hard,sac,,robust,0,0,none,0,0,1,2,\n", "'none'; put the tables back"),
     (_HEAD + "push,hard,sac,,robust,0,0,0,0,0,1,nan,\n\udcff\n", "curves-push.csv: is no UTF-8 text"),
     (_HEAD + "push,hard,sac,,robust,0,0,0,0,0,,,\n", "has no success or return"),
-    (_HEAD + "push,hard,sac,,robust,0,0,0,0,0,nan,2,\n", "has success that are not finite"),
-    (_HEAD + "push,hard,sac,,robust,0,0,inf,0,0,1,2,\n", "has rollouts that are not finite"),
+    (_HEAD + "push,hard,sac,,robust,0,0,0,0,0,nan,2,\n", "success is nan, not a finite number"),
+    (_HEAD + "push,hard,sac,,robust,0,0,inf,0,0,1,2,\n", "rollouts is inf, not a finite number"),
     (_HEAD + "push,../../x,sac,,robust,0,0,0,0,0,1,2,\n", "the gap '../../x' cannot name a folder"),
     (_HEAD + "../push,hard,sac,,robust,0,0,0,0,0,1,2,\n", "the task '../push' cannot name a folder"),
 ]
@@ -78,9 +83,9 @@ ROWS = [
     *[(command, words, {"bad/prior.json": text}) for command in _READ_CARDS for text, words in _CARDS],
     *[(command, words, {"bad/config.json": text, **_ROLLOUT}) for command in _READ_CONFIGS for text, words in _CONFIGS],
     ("finetune --prior bad", "prior.json: task is null, not a text", {"bad/prior.json": _card(task=None)}),
-    ("finetune --prior bad", "needs a prior of sac, not of None", {"bad/prior.json": _card(algorithm=None)}),
-    ("finetune --prior bad", "needs a prior of sac, not of losses", {"bad/prior.json": _card(algorithm="losses")}),
-    ("finetune --prior bad", "needs a prior that was not told", {"bad/prior.json": _card(system=[[1]])}),
+    ("finetune --prior bad", "algorithm is null, not a text", {"bad/prior.json": _card(algorithm=None)}),
+    ("finetune --prior bad", "algorithm='losses', which this", {"bad/prior.json": _card(algorithm="losses")}),
+    ("finetune --prior bad", "system[0] is a list, not an object", {"bad/prior.json": _card(system=[[1]])}),
     ("collect --policy bad --task push", "bad/prior.json: lacks task", {"bad/prior.json": "{}"}),
     ("bullet --prior bad", "bad/prior.json: lacks task", {"bad/prior.json": "{}"}),
     ("real_demo --prior bad", "bad/prior.json: lacks task", {"bad/prior.json": "{}"}),
@@ -115,7 +120,7 @@ HEAVY = [
     *[("figures --data bad --out bad", words, {"bad/curves-push.csv": text}) for text, words in _TABLES],
     (
         "diagnose --calibrate bad",
-        "not every line has numbers",
+        "eval.jsonl:1: lacks rollouts",
         {f"bad/{_OWN}-0/eval.jsonl": _LINES[4][0], f"bad/{_OWN}-0/real/rollout-000000.npz": ""},
     ),
 ]

@@ -30,7 +30,8 @@ def faults(rows, folder, *argv):
     """What is wrong with what the commands did, a line for each row."""
     made.make(folder)
     given = [{"command": command, "files": dict(*files)} for command, _, *files in rows]
-    environment = {**os.environ, "PYTHONPATH": str(made.ROOT), "JAX_PLATFORMS": "cpu"}
+    cache = {"JAX_COMPILATION_CACHE_DIR": str(made.ROOT / ".cache/jax")}
+    environment = {**os.environ, **cache, "PYTHONPATH": str(made.ROOT), "JAX_PLATFORMS": "cpu"}
     done = subprocess.run(
         [sys.executable, WORKER, *argv], input=json.dumps(given), env=environment, cwd=folder, capture_output=True,
         text=True, timeout=600,
