@@ -9,11 +9,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sgft_jax import checks
-from sgft_jax.models.config import NetworkConfig, Precision
-from sgft_jax.types import Algorithm, Method, UserError
+from sgft_jax.models.config import SIZES, NetworkConfig, Precision
+from sgft_jax.types import Algorithm, Method, UserError, unknown
 
 DEFAULT_PRESET = "robust"
-SIZES = ("1M", "5M", "19M", "48M", "317M")  # of TD-MPC2's networks
 
 
 @dataclass(frozen=True)
@@ -109,7 +108,7 @@ class PretrainConfig:
         checks.at_least(self, 0, "refresh_every")
         checks.few(self, 0, "previous_actions")
         if self.size not in SIZES:
-            raise checks.refusal("size", self.size, f"one of {', '.join(SIZES)}")
+            raise UserError(unknown("size", self.size, SIZES))
         checks.positive(self, "lr", "tau", "alpha")
         checks.share(self, "random_ladder", "lr_end", "tau", "choose_from")
         checks.below_one(self, "gamma", "random_fraction")

@@ -17,36 +17,13 @@ from flax import struct
 from sgft_jax import checks
 from sgft_jax.learners import optim
 from sgft_jax.models import normalizer, twohot
+from sgft_jax.models.config import SIZES, Size
 from sgft_jax.models.networks import Network, precision, tanh_gaussian_action
 from sgft_jax.planning import mppi
 from sgft_jax.types import Array, Key, Normalizer, PyTree, UserError, unknown
 
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
 NETWORKS = ("encoder", "dynamics", "reward", "policy", "critic")
-
-
-@dataclass(frozen=True)
-class Size:
-    """Widths of the networks.
-
-    encoder: hidden layers of the encoder, which has `encoder_layers` linear layers. mlp: the two hidden layers of every
-    other network. latent: entries of the latent state. members: heads of the critic.
-    """
-
-    encoder: int = 256
-    mlp: int = 512
-    latent: int = 512
-    encoder_layers: int = 2
-    members: int = 5
-
-
-SIZES = {
-    "1M": Size(256, 384, 128, 2, 2),
-    "5M": Size(256, 512, 512, 2, 5),
-    "19M": Size(1024, 1024, 768, 3, 5),
-    "48M": Size(1792, 1792, 768, 4, 5),
-    "317M": Size(4096, 4096, 1376, 5, 8),
-}
 
 
 @dataclass(frozen=True)

@@ -31,3 +31,27 @@ class NetworkConfig:
 def two_layers() -> NetworkConfig:
     """Two hidden layers of 256 units: the networks of H2O, H2O+ and their baselines."""
     return NetworkConfig((256, 256))
+
+
+@dataclass(frozen=True)
+class Size:
+    """Widths of the networks of TD-MPC2.
+
+    encoder: hidden layers of the encoder, which has `encoder_layers` linear layers. mlp: the two hidden layers of every
+    other network. latent: entries of the latent state. members: heads of the critic.
+    """
+
+    encoder: int = 256
+    mlp: int = 512
+    latent: int = 512
+    encoder_layers: int = 2
+    members: int = 5
+
+
+SIZES = {  # by their published number of parameters
+    "1M": Size(256, 384, 128, 2, 2),
+    "5M": Size(256, 512, 512, 2, 5),
+    "19M": Size(1024, 1024, 768, 3, 5),
+    "48M": Size(1792, 1792, 768, 4, 5),
+    "317M": Size(4096, 4096, 1376, 5, 8),
+}
