@@ -90,5 +90,5 @@ def test_methods_refuse_the_other_algorithms_priors(tmp_path, capsys):
         finetune.main(["--method", "sgft-tdmpc2", *common])
     assert stopped.value.code == 2
     error = capsys.readouterr().err
-    assert error.startswith("error: sgft-tdmpc2 needs a prior of tdmpc2, not of sac") and error.count("\n") == 1
+    assert "seed-0: sgft-tdmpc2 needs a prior of tdmpc2, not of sac" in error and error.count("\n") == 1
     assert "--preset robust-tdmpc2" in error

@@ -239,7 +239,7 @@ def test_a_flat_table_and_back():
         ("seed", "-1", "seed is -1, not a whole number from 0 on"),
         ("prior", "-2", "prior is -1.0, not a whole number from 0 on"),
         ("training", "inf", "training is inf, not a finite number"),
-        ("success", "", "toy/default/sac//fast has no score"),
+        ("success", "", "toy/default/sac//fast has no success or return"),
     ],
 )
 def test_tables_with_odd_numbers_are_refused(name, cell, words, tmp_path):
