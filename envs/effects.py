@@ -44,9 +44,10 @@ def make_range(env: Env, values: Mapping[str, Value]) -> EffectRange:
 def numbers(value: Value) -> np.ndarray:
     """A value or range as an array; one of shape [0, 0, 0], which fits nowhere, if it holds anything but numbers."""
     try:
-        return np.asarray(value, np.float64)
-    except (ValueError, TypeError, OverflowError):
-        return np.zeros((0, 0, 0))
+        array = np.asarray(value)
+    except (ValueError, TypeError):
+        array = np.empty(0, object)
+    return array.astype(np.float64) if array.dtype.kind in "iuf" else np.zeros((0, 0, 0))
 
 
 def _ends_by_entry(

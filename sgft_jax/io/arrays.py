@@ -13,6 +13,7 @@ import numpy as np
 
 from sgft_jax.types import UserError
 
+LARGEST = 1e18  # of what is learned from: squares of larger ones are beyond float32, as `robot_client` has it
 _FREE = 64 * 2**20  # bytes that anything may unpack to
 _RATIO = 200  # packed data of real experiments stay below
 _PLAIN = "biufSU"  # kinds of numbers and texts; nothing that would have to be unpickled
@@ -21,7 +22,7 @@ _PLAIN = "biufSU"  # kinds of numbers and texts; nothing that would have to be u
 def numbers(
     where: Path | str, name: str, values: Any, shape: Sequence[int | None], *, fix: str, valid: np.ndarray | None = None
 ) -> np.ndarray:
-    """[*shape] float32, every number finite after the cast. shape: None where any length will do.
+    """[*shape] float32, every number finite and at most `LARGEST` in size. shape: None where any length will do.
 
     valid: bool, of the first axes: the rows that count; default: all. Like all others, whole numbers beyond 2^24 are
     rounded to what float32 can hold.
@@ -30,7 +31,7 @@ def numbers(
     _check_shape(where, name, array, shape, fix)
     with np.errstate(over="ignore"):
         cast = array.astype(np.float32)
-    good = np.isfinite(cast)
+    good = np.abs(cast) <= LARGEST  # nan is not
     if valid is not None:
         good |= ~valid.reshape(*valid.shape, *[1] * (cast.ndim - valid.ndim))
     if not good.all():

@@ -192,6 +192,8 @@ def _checked(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]
     n, steps = valid.shape
     if not valid.size:
         raise UserError(f"{path}: has no step; {_FIX}")
+    if (valid[:, 1:] & ~valid[:, :-1]).any():
+        raise UserError(f"{path}: valid goes on after a step that is not valid, which ends an episode; {_FIX}")
     vector, number, before = (n, steps, None), (n, steps), np.pad(valid, ((0, 0), (0, 1)))
     rows = {
         "obs": vector,

@@ -60,13 +60,19 @@ def step(name: str, returned: tuple[Any, ...], low: np.ndarray, high: np.ndarray
         )  # fmt: skip
 
 
-def vector(name: str, returned: tuple[Any, ...], count: int) -> list[tuple[Any, ...]]:
-    """The parts that each of `count` environments of a vector environment returns; in `final_obs` what came last."""
+def vector(name: str, returned: tuple[Any, ...], count: int, *, same_step: bool) -> list[tuple[Any, ...]]:
+    """The parts that each of `count` environments of a vector environment returns; in `final_obs` what came last.
+
+    same_step: whether it begins the next episode in the step that ends one. Then `final_obs` must be there.
+    """
     obs, *columns, info = returned
     with _explained(f"step of {name}"):
         infos = [_of_member(_mapping(info), i, count, _KNOWN) for i in range(count)]
         names = _PARTS["step"][1:-1]
-        rows = zip(*(_column(x, count, part) for x, part in zip(columns, names, strict=True)), strict=True)
+        rows = list(zip(*(_column(x, count, part) for x, part in zip(columns, names, strict=True)), strict=True))
+        for (_, terminated, truncated), own in zip(rows, infos, strict=True):
+            if same_step and "final_obs" not in own and (flag(terminated, names[1]) or flag(truncated, names[2])):
+                raise ValueError("an episode has ended, but info has no 'final_obs' of it, only the next one's start")
     last = [own.get("final_obs", seen) for own, seen in zip(infos, split(name, "step", obs, count), strict=True)]
     return [
         (seen, *row, {**own, **own.get("final_info", {})}) for seen, row, own in zip(last, rows, infos, strict=True)
@@ -96,9 +102,9 @@ def sound(x: np.ndarray) -> np.ndarray:
     return np.abs(x) <= LARGEST
 
 
-def _mapping(info: Any) -> Mapping[str, Any]:
+def _mapping(info: Any, name: str = "info") -> Mapping[str, Any]:
     if info is not None and not isinstance(info, Mapping):
-        raise ValueError(f"info is {printable(repr(info), 60)}, no mapping")
+        raise ValueError(f"{name} is {printable(repr(info), 60)}, no mapping")
     return info or {}
 
 
@@ -140,7 +146,8 @@ def _of_member(infos: Mapping[str, Any], i: int, count: int, names: Sequence[str
             inner = [part for part in values if f"_{part}" in values] if name == "final_obs" else _KNOWN
             found[name] = _of_member(values, i, count, inner)
         else:
-            found[name] = _column(values, count, f"info[{name!r}]")[i]
+            value = _column(values, count, f"info[{name!r}]")[i]
+            found[name] = _mapping(value, f"info[{name!r}]") if name == "final_info" else value
     return found
 
 

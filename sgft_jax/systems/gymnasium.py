@@ -65,11 +65,11 @@ class Gymnasium:
 
     The environment moves, rewards and ends episodes. The task says how long an episode lasts at most, and what success
     is where `info` has neither `is_success` nor `success`; imagined steps have its reward. Where an environment does
-    not know the reward (nan), the task says what the step earned and whether it ended the episode. Actions in [-1, 1]
-    are scaled to the bounds of the action space, and rounded where those are whole numbers; what was sent is what is
-    kept, also where `info["sent"]` says that something else was. `info["invalid"]`, a number that is not finite or
-    beyond 1e18, or an action that is not finite, which is not sent, ends an episode like exploded physics: the step is
-    not learned from. A start with such a number is asked for again, a few times. An environment with a method `rest`
+    not know the reward (nan), the task says what the step earned and whether it ended the episode. Actions, clipped to
+    [-1, 1], are scaled to the bounds of the action space, and rounded where those are whole numbers; what was sent is
+    what is kept, also where `info["sent"]` says that something else was. `info["invalid"]`, a number that is not finite
+    or beyond 1e18, or an action that is not finite, which is not sent, ends an episode like exploded physics: the step
+    is not learned from. A start with such a number is asked for again, a few times. An environment with a method `rest`
     hears when its episode is over, or when it has returned what cannot be used, which raises UserError.
 
     env: the task. real: an environment, several, or a vector environment with one for each member; or a robot behind a
@@ -235,7 +235,7 @@ class Gymnasium:
 
     def _commanded(self, action: np.ndarray) -> np.ndarray:
         """[M, act_dim] from [-1, 1] to the bounds of the action space."""
-        commanded = self._middle + action * self._half
+        commanded = self._middle + np.clip(action, -1, 1) * self._half
         return np.clip(np.rint(commanded), self._low, self._high) if self._whole else commanded
 
     def _after(self, commanded: np.ndarray, going: np.ndarray) -> "_After":
@@ -252,7 +252,7 @@ class Gymnasium:
     def _sent(self, action: np.ndarray, after: "_After") -> np.ndarray:
         """[M, act_dim] in [-1, 1], what was really commanded; what was asked for unless that is known to differ."""
         told = (after.sent - self._middle) / self._half
-        return np.where(after.differs[:, None] | self._whole, told, action).astype(np.float32)
+        return np.where(after.differs[:, None] | self._whole, told, np.clip(action, -1, 1)).astype(np.float32)
 
     def _judged(self, after: "_After", seen: np.ndarray, action: np.ndarray, following: np.ndarray) -> "_After":
         """With what the task says of steps whose reward the environment does not know."""
@@ -447,6 +447,7 @@ class _Vector:
         self.count, self.name = real.num_envs, str(real.spec.id if real.spec else real)
         self.observation, self.action = real.single_observation_space, real.single_action_space
         mode = real.metadata.get("autoreset_mode")
+        self._same_step = getattr(mode, "name", None) == "SAME_STEP"
         if getattr(mode, "name", None) not in ("NEXT_STEP", "SAME_STEP"):
             raise UserError(
                 f"{self.name}: its autoreset mode is {mode}; make it with AutoresetMode.NEXT_STEP, or give a list of "
@@ -457,7 +458,8 @@ class _Vector:
         return answers.split(self.name, "reset", _asked(self.name, self.real, "reset", seed=seeds)[0], self.count)
 
     def step(self, actions: np.ndarray, going: np.ndarray) -> list[tuple[Any, ...]]:
-        return answers.vector(self.name, _asked(self.name, self.real, "step", actions), self.count)
+        returned = _asked(self.name, self.real, "step", actions)
+        return answers.vector(self.name, returned, self.count, same_step=self._same_step)
 
     def rest(self) -> None:
         pass

@@ -141,6 +141,15 @@ def test_actions_reach_the_bounds_of_the_space():
     np.testing.assert_allclose(episode.transitions.action[0], [0.5, -1.0])  # what the policy chose is what is kept
 
 
+def test_no_action_goes_beyond_the_bounds_of_the_space():
+    """Whatever the policy asks for; what was sent is learned from, and remembered."""
+    far = Policy(lambda: (), lambda state, carry, obs, key, *, explore: (jnp.array([7.0, -9.0]), carry))
+    real = Spoken(low=np.array([0, -3], np.float32), high=np.array([4, 3], np.float32), ends="truncated")
+    episode = play(real, policy=far)
+    assert real.actions[0].tolist() == [4.0, -3.0]
+    assert episode.transitions.action[0].tolist() == [1.0, -1.0] and episode.command[0].tolist() == [7.0, -9.0]
+
+
 def test_the_command_is_kept_beside_what_was_sent():
     """Both in [-1, 1]: the middle of the bounds is 0."""
     bounds = {"low": np.array([0, -3], np.float32), "high": np.array([4, 3], np.float32)}

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sgft_jax.io import arrays
+from sgft_jax.systems import robot_client
 from sgft_jax.types import UserError
 
 FIX = "mend it"
@@ -30,6 +31,7 @@ def test_numbers_become_float32():
     ("values", "words"),
     [
         ([[0, 0], [0, 1e39]], "obs of row 1 is too large for float32"),
+        ([[0, 0], [0, -2e18]], "obs of row 1 is too large for float32"),  # its square is
         ([[0, np.nan], [0, 0]], "obs of row 0 is not finite"),
         ([[0, 0], [-np.inf, 0]], "obs of row 1 is not finite"),
         ([0, 1], "obs has shape [2], not [n, 2]"),
@@ -42,6 +44,11 @@ def test_numbers_become_float32():
 )
 def test_other_numbers_are_refused(values, words):
     assert refusal(arrays.numbers, "a", "obs", values, (None, 2), fix=FIX) == f"a: {words}; {FIX}"
+
+
+def test_files_and_robots_have_the_same_bound():
+    assert arrays.LARGEST == robot_client.LARGEST and np.isfinite(np.float32(arrays.LARGEST) ** 2)
+    assert arrays.numbers("a", "reward", arrays.LARGEST, (), fix=FIX) == np.float32(arrays.LARGEST)
 
 
 def test_flags_are_0_or_1_and_nothing_else():

@@ -98,6 +98,7 @@ def test_rollouts_that_do_not_go_together_are_refused(tmp_path):
         ("valid", np.full((2, 3), 0.5), "valid of row 0 is 0.5, not 0 or 1"),
         ("valid", np.full((2, 3), np.nan), "valid of row 0 is nan, not 0 or 1"),
         ("valid", np.ones((2, 0)), "has no step"),
+        ("valid", np.array([[1, 1, 0], [1, 0, 1]]), "valid goes on after a step that is not valid"),
         ("success", np.array([0, -1]), "success of row 1 is -1, not 0 or 1"),
         ("exploded", np.zeros(3), r"exploded has shape \[3\], not \[2\]"),
         ("obs", np.full((2, 3, 4), "a"), "obs holds str32, not numbers"),

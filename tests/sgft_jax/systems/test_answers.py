@@ -105,8 +105,11 @@ def test_numbers_too_large_for_arithmetic_are_not_sound(large):
 # --- vector environments ----------------------------------------------------------------------------------------------
 
 
-def vector(obs=((0.0,), (1.0,)), reward=(1.0, 2.0), terminated=(False, True), truncated=(False, False), infos=None):
-    return answers.vector("arms", (np.array(obs), reward, terminated, truncated, infos), 2)
+def vector(
+    obs=((0.0,), (1.0,)), reward=(1.0, 2.0), terminated=(False, True), truncated=(False, False), infos=None,
+    same_step=False,
+):  # fmt: skip
+    return answers.vector("arms", (np.array(obs), reward, terminated, truncated, infos), 2, same_step=same_step)
 
 
 def test_a_vector_environment_answers_for_each_of_its_environments():
@@ -144,6 +147,7 @@ def test_parts_of_observations_are_split_and_copied():
         ({"truncated": True}, "truncated is True, not one for each"),
         ({"obs": np.zeros((3, 1))}, "observation is .*not one for each"),
         ({"infos": [{}, {}]}, r"info is \[{}, {}\], no mapping"),
+        ({"infos": {"final_info": ["x", "y"]}}, r"info\['final_info'\] is 'x', no mapping"),
         ({"infos": {"invalid": True}}, r"info\['invalid'\] is True, not one for each"),
         ({"infos": {"invalid": np.ones(2), "_invalid": True}}, r"info\['_invalid'\] is True, not one for each"),
     ],
@@ -152,6 +156,15 @@ def test_parts_of_observations_are_split_and_copied():
 def test_a_vector_environment_that_answers_for_others_is_one_line(changes, words):
     with pytest.raises(UserError, match=f"^step of arms: {words}"):
         vector(**changes)
+
+
+@pytest.mark.parametrize("over", ["terminated", "truncated"])
+def test_the_start_of_the_next_episode_is_never_taken_for_the_end_of_this_one(over):
+    ended = {"terminated": (False, False), over: (False, True), "same_step": True}
+    with pytest.raises(UserError, match=r"^step of arms: an episode has ended, but info has no 'final_obs'"):
+        vector(**ended, infos={"final_obs": np.array([np.ones(1), None], object), "_final_obs": [True, False]})
+    last = {"final_obs": np.array([None, np.full(1, 7.0)], object), "_final_obs": [False, True]}
+    assert vector(**ended, infos=last)[1][0] == 7.0 and vector(**ended | {"same_step": False})[1][0] == 1.0
 
 
 def test_a_line_is_printable_and_short():
