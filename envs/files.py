@@ -19,6 +19,7 @@ from msgspec import Meta
 from sgft_jax.types import UserError
 
 LIMIT = 64 * 2**20  # bytes; no card, table or configuration comes near
+_DEPTH = 100  # of lists and objects within each other; what reads them may recurse
 _LARGEST = 2**53  # every whole number below is a float too
 
 # Kinds of numbers for schemas.
@@ -96,11 +97,23 @@ def _without_waiting(path: str, flags: int) -> int:
 
 def _parsed[T](parse: Callable[[Any], T], text: Any, where: Path | str, language: str) -> T:
     try:
-        return parse(text)
+        parsed = parse(text)
+        _check_depth(parsed)
+        return parsed
     except RecursionError:
         raise UserError(f"{where}: not valid {language} (nested too deeply)") from None
     except ValueError as error:  # of either parser, or of a number with thousands of digits
         raise UserError(f"{where}: not valid {language} ({str(error).partition('; use sys')[0]})") from None
+
+
+def _check_depth(value: Any) -> None:
+    """Raises RecursionError, as parsers do; dotted keys of TOML nest without one."""
+    level = [value]
+    for _ in range(_DEPTH):
+        tables = (part.values() if isinstance(part, dict) else part for part in level if isinstance(part, dict | list))
+        if not (level := [part for table in tables for part in table]):
+            return
+    raise RecursionError
 
 
 def _loads(text: str | bytes) -> Any:
@@ -116,7 +129,8 @@ def _finite(text: str) -> float:
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     table = dict(pairs)
     if len(table) < len(pairs):
-        twice = next(key for i, (key, _) in enumerate(pairs) if any(key == other for other, _ in pairs[:i]))
+        keys = set[str]()
+        twice = next(key for key, _ in pairs if key in keys or keys.add(key))
         raise ValueError(f"{twice!r} stands there twice")
     return table
 

@@ -50,11 +50,12 @@ def figures(args: FiguresArgs) -> Path:
     """The figures and tables.md, whose path is returned; raises UserError if there is no run to draw."""
     check_folder(args.out / "figures")
     from sgft_jax.analysis.curves import read_data, read_runs
-    from sgft_jax.analysis.results import select, write_results
 
     found = read_data(args.data) if args.data else read_runs(args.out)
     if not found.curves:
         raise UserError(_nothing(args, found.notes))
+    from sgft_jax.analysis.results import select, write_results  # brings Matplotlib
+
     task = (extend.name_of(args.task),) if args.task else ()
     chosen = select(found, variants=args.variants, task=task, gap=args.gaps, method=args.methods, priors=args.priors)
     return write_results(chosen, args.out / "figures", reference=args.reference)

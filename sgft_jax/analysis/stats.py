@@ -8,7 +8,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
 
 ENOUGH = 3  # members (seeds or priors) below which a bootstrap interval says nothing about spread
 
@@ -26,6 +25,8 @@ def iqm(scores: ArrayLike, *, axis: int = 0) -> np.ndarray:
 
     Source: Agarwal et al. 2021, "Deep reinforcement learning at the edge of the statistical precipice".
     """
+    from scipy import stats
+
     return np.asarray(stats.trim_mean(np.asarray(scores, np.float64), 0.25, axis=axis))
 
 
@@ -39,6 +40,8 @@ def rank_correlation(pairs: ArrayLike, *, axis: int = 0) -> np.ndarray:
 
     axis: along which the pairs are; the two members of a pair are along the last one.
     """
+    from scipy import stats
+
     ranks = stats.rankdata(np.asarray(pairs, np.float64), axis=axis)
     centred = ranks - ranks.mean(axis=axis, keepdims=True)
     own, other = (np.square(centred[..., i]).sum(axis) for i in (0, 1))
@@ -102,6 +105,8 @@ def probability_of_improvement(above: ArrayLike, below: ArrayLike) -> float:
     above, below: [members] of either, not necessarily equally many. Source: Agarwal et al. 2021 (Mann-Whitney U).
     """
     above, below = np.asarray(above, np.float64), np.asarray(below, np.float64)
+    from scipy import stats
+
     found: Any = stats.mannwhitneyu(above, below, method="asymptotic")
     return float(found.statistic) / (len(above) * len(below))
 
@@ -124,6 +129,8 @@ def success_interval(
     successes: int, trials: int, *, level: float = 0.95, method: Literal["wilson", "exact"] = "wilson"
 ) -> Interval:
     """Success rate of `trials` independent episodes with its interval; "exact" is Clopper-Pearson (conservative)."""
+    from scipy import stats
+
     bounds = stats.binomtest(int(successes), int(trials)).proportion_ci(confidence_level=level, method=method)
     return Interval(np.asarray(successes / trials), np.asarray(bounds.low), np.asarray(bounds.high))
 

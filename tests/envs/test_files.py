@@ -1,6 +1,7 @@
 """Text files from anybody: what is no plain, bounded, finite, UTF-8 text is refused in one line."""
 
 import os
+import time
 from typing import Literal, TypedDict
 
 import pytest
@@ -54,6 +55,7 @@ def test_a_byte_order_mark_is_no_part_of_the_text(path):
     [
         ('{"a": ', "Expecting value"),
         (DEEP, "nested too deeply"),
+        (200 * "[" + 200 * "]", "nested too deeply"),
         ('{"a": NaN}', "NaN is no finite number"),
         ('{"a": -Infinity}', "-Infinity is no finite number"),
         ('{"a": 1e999}', "1e999 is no finite number"),
@@ -67,7 +69,19 @@ def test_json_that_no_reader_can_rely_on(path, text, words):
     assert message.startswith(f"{path}: not valid JSON (") and words in message
 
 
-@pytest.mark.parametrize("text", ["a = ", f"a = {DEEP}", "a = inf", "a = nan", "a = 1e999", "a = 1\na = 2"])
+def test_a_key_that_stands_twice_is_named_soon_among_very_many():
+    begun = time.process_time()
+    pairs = [*((str(n), 1) for n in range(10_000)), ("b", 1), ("b", 2)]
+    assert "'b' stands there twice" in refusal(
+        files.parse_json, "{" + ",".join(f'"{k}": {v}' for k, v in pairs) + "}", "a"
+    )
+    assert time.process_time() - begun < 0.5
+
+
+_DOTTED = ".".join(200 * ["a"]) + " = 1"
+
+
+@pytest.mark.parametrize("text", ["a = ", f"a = {DEEP}", _DOTTED, "a = inf", "a = nan", "a = 1e999", "a = 1\na = 2"])
 def test_toml_that_no_reader_can_rely_on(path, text):
     path.write_text(text)
     assert refusal(files.read_toml, path).startswith(f"{path}: not valid TOML (")

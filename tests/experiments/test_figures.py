@@ -1,5 +1,8 @@
 """The command that draws: figures and tables from run folders made by hand and from released tables."""
 
+import subprocess
+import sys
+
 import pytest
 from runs_by_hand import save
 
@@ -117,3 +120,13 @@ def test_a_bad_command_is_one_line_and_code_2(argv, words, tmp_path, capsys, mon
     error = capsys.readouterr().err
     assert stopped.value.code == 2 and words in error and error.count("\n") == 1
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_that_there_is_nothing_to_draw_is_said_without_what_draws(tmp_path):
+    """SciPy and Matplotlib take seconds."""
+    code = (
+        "import runpy, sys; sys.modules |= dict.fromkeys(('jax', 'matplotlib', 'scipy')); "
+        "sys.argv = ['figures', '--out', sys.argv[1]]; runpy.run_module('experiments.figures', run_name='__main__')"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True)
+    assert done.returncode == 2 and "holds no evaluated run to draw" in done.stderr
