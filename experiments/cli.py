@@ -86,6 +86,8 @@ def run_main[T](
             if _in_renderer_choice(error):
                 chosen = f"MUJOCO_GL={os.environ['MUJOCO_GL']}"
                 fail(f"{chosen}: MuJoCo cannot use that here ({error}); unset it, or set it to disable")
+            if isinstance(error, ValueError) and " for environment 'JAX_" in str(error):  # as JAX is imported
+                fail(f"{error}; unset it")
             if not _is_out_of_memory(error):
                 raise
             said = (str(error).strip() or "MemoryError").splitlines()[0]

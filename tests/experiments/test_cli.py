@@ -391,3 +391,14 @@ def test_no_renderer_is_one_line_with_the_reasons(monkeypatch):
 def test_the_users_backend_is_tried_alone_and_for_real():
     os.environ["MUJOCO_GL"] = "disable"
     assert cli.select_renderer().startswith("MuJoCo cannot render here (disable: AttributeError")
+
+
+def test_a_variable_that_jax_cannot_read_is_named_in_one_line():
+    code = (
+        "from experiments import cli, demo; "
+        "cli.run_main(lambda args: __import__('jax'), demo.DemoArgs, 'Tries.', argv=[])"
+    )
+    environ = os.environ | {"JAX_ENABLE_X64": "banana"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environ)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
+    assert "'banana' for environment 'JAX_ENABLE_X64'; unset it" in done.stderr
