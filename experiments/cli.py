@@ -130,12 +130,16 @@ def _stopped_by_signals() -> Iterator[None]:
     """SIGTERM and SIGHUP raise `Stopped`, where nobody has said otherwise (as `nohup` does); a second one kills."""
 
     def stop(number: int, frame: object) -> NoReturn:
-        signal.signal(number, signal.SIG_DFL)
         raise Stopped(number)
 
     asked = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) == signal.SIG_DFL]
-    if threading.current_thread() is not threading.main_thread():
-        asked = []  # only the main thread may handle signals
+    if not asked or threading.current_thread() is not threading.main_thread():  # no other may handle signals
+        yield
+        return
+    heard, tell = os.pipe()
+    os.set_blocking(tell, False)
+    threading.Thread(target=_end_at_the_second, args=(heard, asked), daemon=True).start()
+    before = signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
     for number in asked:
         signal.signal(number, stop)
     try:
@@ -143,6 +147,18 @@ def _stopped_by_signals() -> Iterator[None]:
     finally:
         for number in asked:
             signal.signal(number, signal.SIG_DFL)
+        signal.set_wakeup_fd(before)
+        os.close(tell)
+
+
+def _end_at_the_second(heard: int, asked: Sequence[int]) -> None:
+    """Ends the process at the second of these signals. The main thread sees none while a compiled program runs."""
+    with open(heard, "rb", buffering=0) as pipe:
+        count = 0
+        while byte := pipe.read(1):
+            count += byte[0] in asked
+            if count == 2:
+                os._exit(128 + byte[0])
 
 
 class _Quiet:

@@ -245,6 +245,15 @@ def test_signals_end_a_command_as_ctrl_c_does(name, code, word):
     assert "; the same command with --resume continues from the last checkpoint" in said
 
 
+def test_a_second_signal_ends_what_python_cannot_interrupt():
+    """As a compiled program is: minutes in C."""
+    twice = "threading.Thread(target=lambda: [(time.sleep(0.2), os.kill(os.getpid(), signal.SIGTERM)) for _ in '12'])"
+    ended, said = what_is_said(
+        f"import hashlib; {twice}.start(); hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)", timeout=60
+    )
+    assert (ended, said) == (143, "")
+
+
 def test_who_ignores_a_signal_keeps_ignoring_it():
     ignore = "trap '' HUP; exec"  # as nohup does
     program = PROGRAM.format("os.kill(os.getpid(), signal.SIGHUP); print('goes on')")
