@@ -17,10 +17,8 @@ def test_float64_is_refused_before_a_task_is_made():
         envs.make("push")
 
 
-@pytest.mark.parametrize("platform", ["cuda", "nonsense"])
+@pytest.mark.parametrize("platform", ["rocm", "nonsense"]  # of a maker whose devices no machine of ours has)
 def test_so_is_a_platform_that_is_not_there(platform):
-    if any(device.platform == "gpu" for device in jax.devices()):
-        pytest.skip("there is a GPU")
     program = "from sgft_jax import mesh, types\ntry: mesh.check_jax()\nexcept types.UserError as error: print(error)\n"
     environment = {**os.environ, "JAX_PLATFORMS": platform}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
