@@ -72,7 +72,7 @@ figures: $(PY) ## draw the figures again from the runs
 	$(PY) -m experiments.figures $(FLAGS)
 
 frozen: $(PY) ## every run of the frozen test, then its table (ARGS='--gpus 2 --jobs 6')
-	$(PY) -m experiments.frozen $(ARGS)
+	$(PY) -m experiments.studies.frozen $(ARGS)
 
 docs: $(PY) ## build the documentation site in build/site (EXTRAS=dev,docs)
 	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict --quiet

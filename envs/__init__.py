@@ -9,12 +9,11 @@ import importlib
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from envs import gaps
+from envs import extend, gaps
 from envs.base import Domain, EffectRange, Effects, Entry, Env, EnvState, Parameter, Theta, World, packed, unpack
 from envs.checks import check_description, check_effects, check_functions, with_finite_steps
 from envs.gaps import Gap
-from sgft_jax import extend
-from sgft_jax.types import UserError, unknown
+from envs.types import UserError, unknown
 
 if TYPE_CHECKING:
     from envs import effects, rollout
@@ -70,8 +69,8 @@ def make(
     Raises UserError with the closest match for an unknown task or scene, and naming file and line for one that fails.
     """
     from envs.history import with_previous_actions
+    from envs.mesh import check_jax
     from envs.system import with_system
-    from sgft_jax.mesh import check_jax
 
     check_jax()
     return with_system(with_previous_actions(_make(task, impl, scene), previous_actions), system)

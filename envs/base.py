@@ -11,10 +11,10 @@ from math import inf
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 if TYPE_CHECKING:
-    from sgft_jax.types import Array, Key, PyTree
+    from envs.types import Array, Key, PyTree
 
 Numbers = float | list[float] | list[list[float]]
 Value = Numbers | Mapping[str, Numbers]  # the latter by entry name, see `effects.make_range`

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from envs import extend
 from envs.base import Effects, Entry, Env, EnvState, Parameter, Theta, World
-from sgft_jax import extend
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 if TYPE_CHECKING:
     from envs.mujoco.scene import Scene

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import EffectRange, Effects, Entry, Env, Numbers, Value, entries_of, misnamed
-from sgft_jax.types import Array, Key, UserError, unknown
+from envs.types import Array, Key, UserError, unknown
 
 _DEFAULTS = {"action_scale": 1.0, "obs_noise_prob": 1.0}
 _NOT_NEGATIVE = ("latency", "latency_jitter", "obs_noise", "obs_noise_prob", "action_noise")

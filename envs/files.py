@@ -16,7 +16,7 @@ from typing import Annotated, Any, TypedDict, cast
 import msgspec
 from msgspec import Meta
 
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 LIMIT = 64 * 2**20  # bytes; no card, table or configuration comes near
 _DEPTH = 100  # of lists and objects within each other; what reads them may recurse

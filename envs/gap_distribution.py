@@ -25,7 +25,7 @@ from envs import gaps
 from envs.base import Effects, Entry, Env, Value, entries_of, misnamed
 from envs.files import read_toml
 from envs.gaps import Gap
-from sgft_jax.types import UserError, unknown
+from envs.types import UserError, unknown
 
 MOST_FAMILIES = 4
 ATTEMPTS = 100  # to draw a gap that is possible

@@ -15,10 +15,10 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from envs import extend
 from envs.base import Effects, Env, Value, World
 from envs.files import parse_json, read_json, read_toml
-from sgft_jax import extend
-from sgft_jax.types import Key, UserError, unknown
+from envs.types import Key, UserError, unknown
 
 SIM = "sim"  # names the gap in which nothing differs: the real system is the training domain itself
 _KEYS = frozenset({"params", "effects", "scene", "families", "stratum"})

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Entry, Env, EnvState, World
-from sgft_jax.types import Array, Key, PyTree
+from envs.types import Array, Key, PyTree
 
 
 def with_previous_actions(env: Env, n: int) -> Env:

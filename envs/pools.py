@@ -12,7 +12,7 @@ from envs.domains.uniform import sample_worlds
 from envs.gaps import SIM, Gap
 from envs.rollout import pool_size
 from envs.system import concealed
-from sgft_jax.types import Key, UserError
+from envs.types import Key, UserError
 
 
 def load_gap(env: Env, real: str | None, overrides: Sequence[str]) -> Gap | None:

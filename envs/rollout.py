@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from envs.base import Env, EnvState, World
-from sgft_jax.mesh import split_vmap
-from sgft_jax.types import Array, Key, PyTree, Transition
+from envs.mesh import split_vmap
+from envs.types import Array, Key, PyTree, Transition
 
 # act(carry, obs, key) -> (action, carry), for one environment
 Act = Callable[[PyTree, Array, Key], tuple[Array, PyTree]]

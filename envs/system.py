@@ -12,7 +12,7 @@ from envs.base import NOTHING, EffectRange, Effects, Entry, Env, EnvState, Theta
 from envs.domains.uniform import parameter_ranges
 from envs.effects import make_range
 from envs.history import extended
-from sgft_jax.types import Array, Key, UserError
+from envs.types import Array, Key, UserError
 
 
 def varying(

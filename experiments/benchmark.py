@@ -17,12 +17,12 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-from experiments import cli
-from experiments.options import Impl, at_least_one, check_task, prior_folders, task_of_priors, without_repeats
+from envs.types import UserError
+from experiments.runner import cli
+from experiments.runner.options import Impl, at_least_one, check_task, prior_folders, task_of_priors, without_repeats
 from sgft_jax.io.runs import check_folder
 from sgft_jax.models.config import Precision
 from sgft_jax.presets import PRESETS
-from sgft_jax.types import UserError
 
 type Part = Literal["physics", "updates", "plain", "hybrid", "pretrain", "finetune", "system", "devices"]
 

@@ -11,12 +11,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from envs import extend
 from envs.gaps import SIM, title
-from experiments import cli
-from experiments.options import Impl, at_least_one, check_task, seed_list, task_of_priors
-from sgft_jax import extend
+from envs.types import UserError
+from experiments.runner import cli
+from experiments.runner.options import Impl, at_least_one, check_task, seed_list, task_of_priors
 from sgft_jax.io.runs import check_folder
-from sgft_jax.types import UserError
 
 LEVELS = {"halfcheetah": 4770.0, "walker2d": 2850.0}  # mean returns of D4RL's medium sets, v2
 PAIR = ("medium-replay", "medium")
@@ -139,7 +139,7 @@ def collect(args: CollectArgs) -> list[dict[str, Any]]:
         from experiments.collect_operator import operate  # JAX starts here
 
         return operate(args)
-    from experiments.collect_run import record, teach  # JAX starts here
+    from experiments.runner.collect_run import record, teach  # JAX starts here
 
     return teach(args, level) if args.policy is None else record(args)
 

@@ -16,11 +16,11 @@ from envs.locomotion.wheel_operator import nominal_gain, operator
 from envs.pools import real_env, real_worlds
 from envs.rollout import play_episode
 from experiments.collect import ROBOTS, CollectArgs, targets, transitions_of
-from experiments.options import seed_list
-from sgft_jax.data import logs
-from sgft_jax.data.recording import Recorded, cut, of_episodes, write_table
+from experiments.runner.options import seed_list
+from sgft_jax.datasets import logs
+from sgft_jax.datasets.recording import Recorded, cut, of_episodes, write_table
+from sgft_jax.files.jsonfile import write_json
 from sgft_jax.io import runs
-from sgft_jax.io.jsonfile import write_json
 from sgft_jax.stacking import member
 
 _NAMES = ("v", "pitch", "pitch velocity", "torque")  # columns 1 to 4

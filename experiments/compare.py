@@ -1,7 +1,8 @@
 """Run every method on every task and real system, cell by cell, and draw what there is.
 
 A cell is one fine-tuning run of all seeds, with the method's own defaults or, with --tuned, the options that
-`experiments.tune` chose. Cells that are finished are left alone, begun ones go on where they stopped: the same command,
+`experiments.studies.tune` chose.
+Cells that are finished are left alone, begun ones go on where they stopped: the same command,
 given again, does what is missing. The real systems of a task that a method has got equally far on are stepped together
 in one program.
 """
@@ -10,13 +11,13 @@ import glob
 from dataclasses import dataclass, replace
 
 from envs import gaps
-from experiments import cli, grid, tuned
-from experiments.cells import Cell, check_begun, complete
+from envs.types import UserError, unknown
 from experiments.figures import FiguresArgs, figures
-from experiments.finetune_args import FinetuneArgs
-from experiments.grid import GridArgs
+from experiments.runner import cli, grid, tuned
+from experiments.runner.cells import Cell, check_begun, complete
+from experiments.runner.finetune_args import FinetuneArgs
+from experiments.runner.grid import GridArgs
 from sgft_jax.methods import DEFAULT, NAMES
-from sgft_jax.types import UserError, unknown
 
 
 @dataclass(frozen=True)
@@ -24,8 +25,8 @@ class CompareArgs(GridArgs):
     """A grid of fine-tuning runs; everything not named here is as `experiments.finetune` has it."""
 
     tuned: bool = False
-    """Start from the options that `experiments.tune` chose for each task and method; the runs are a variant of their
-    own, `tuned`, beside those with the defaults."""
+    """Start from the options that `experiments.studies.tune` chose for each task and method; the runs are a variant
+    of their own, `tuned`, beside those with the defaults."""
     reference: str | None = None
     """Compare the others with METHOD or METHOD:VARIANT; default: with the best of each table."""
 

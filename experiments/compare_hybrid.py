@@ -10,13 +10,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from envs import gaps
+from envs import extend, gaps
 from envs.files import Count
 from envs.gaps import SIM
-from experiments import cells, cli
-from experiments.cells import Cell, Kind, check_begun, complete
+from envs.types import UserError, unknown
 from experiments.hybrid import arguments, hybrid
-from experiments.hybrid_args import (
+from experiments.runner import cells, cli
+from experiments.runner.cells import Cell, Kind, check_begun, complete
+from experiments.runner.hybrid_args import (
     DEFAULT,
     NO_DATA,
     VOLATILE,
@@ -26,16 +27,22 @@ from experiments.hybrid_args import (
     gaps_of,
     run_folder,
 )
-from experiments.options import Impl, at_least_one, check_data, check_task, not_negative, seed_list, without_repeats
-from sgft_jax import extend
+from experiments.runner.options import (
+    Impl,
+    at_least_one,
+    check_data,
+    check_task,
+    not_negative,
+    seed_list,
+    without_repeats,
+)
+from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.hybrid.methods import NAMES, get_method
 from sgft_jax.hybrid.presets import say_preset
 from sgft_jax.hybrid.schedule import FLEET, SCHEDULES, Schedule, describe, name_of
 from sgft_jax.hybrid.scores import measures, shown
-from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.log import EVAL, SUMMARY, check_records, read_jsonl
 from sgft_jax.io.runs import check_folder, read_own, read_starts
-from sgft_jax.types import UserError, unknown
 
 if TYPE_CHECKING:
     from sgft_jax.analysis.hybrid import Outcome, Results

@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from envs import extend
 from envs.files import read_json
-from experiments import cli
+from envs.types import UserError
 from experiments.finetune import finetune
-from experiments.finetune_args import FinetuneArgs, arguments, check, run_folder
-from experiments.options import check_task
 from experiments.pretrain import PretrainArgs, pretrain
 from experiments.pretrain import check as check_pretraining
-from sgft_jax import extend
+from experiments.runner import cli
+from experiments.runner.finetune_args import FinetuneArgs, arguments, check, run_folder
+from experiments.runner.options import check_task
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.methods import get_method
 from sgft_jax.presets import PRESETS
-from sgft_jax.types import UserError
 
 if TYPE_CHECKING:
     from sgft_jax.analysis.curves import Curve

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments import cli
-from experiments.options import Impl, at_least_one, prior_folders, seed_list, task_of_priors
-from experiments.real_systems import check as check_real
-from experiments.rollouts import home_of, task_of
+from envs.types import UserError
+from experiments.runner import cli
+from experiments.runner.options import Impl, at_least_one, prior_folders, seed_list, task_of_priors
+from experiments.runner.real_systems import check as check_real
+from experiments.runner.rollouts import home_of, task_of
 from sgft_jax.io.runs import check_folder, read_config
 from sgft_jax.presets import DEFAULT_PRESET
-from sgft_jax.types import UserError
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,12 @@ def main(args: DiagnoseArgs) -> None:
         runs = [find_runs("--calibrate", args.calibrate), find_runs("--check", args.check)]
         if shared := set(runs[0]) & set(runs[1]):
             raise UserError(f"--check: {min(shared)} is also in --calibrate; what was fitted cannot check the fit")
-        from experiments.diagnose_calibrate import calibrate
+        from experiments.studies.diagnose_calibrate import calibrate
 
         found, lines = calibrate(args, *runs)
     else:
         folders, task, recorded = check(args)
-        from experiments.diagnose_run import diagnose
+        from experiments.runner.diagnose_run import diagnose
 
         found, lines = diagnose(args, folders, task, recorded)
     print(json.dumps(found) if args.json else "\n".join(lines))

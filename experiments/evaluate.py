@@ -9,13 +9,13 @@ from typing import Any
 
 from envs import gaps
 from envs.gaps import SIM, Gap
-from experiments import cli
-from experiments.options import Impl, at_least_one, prior_folders, seed_list, task_of_priors, without_repeats
-from experiments.real_systems import REMOTE, TOGETHER, connect, described, is_robot, is_stepped
-from experiments.real_systems import check as check_real
+from envs.types import UserError
+from experiments.runner import cli
+from experiments.runner.options import Impl, at_least_one, prior_folders, seed_list, task_of_priors, without_repeats
+from experiments.runner.real_systems import REMOTE, TOGETHER, connect, described, is_robot, is_stepped
+from experiments.runner.real_systems import check as check_real
 from sgft_jax.io.runs import check_folder
 from sgft_jax.presets import DEFAULT_PRESET
-from sgft_jax.types import UserError
 
 _SEED = 2**31 + 2  # held out from training and from the choice of the prior
 
@@ -81,8 +81,8 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     import jax
 
     import envs
-    from experiments.evaluation import describe, play
-    from experiments.recorded import RecordedSystem
+    from experiments.runner.evaluation import describe, play
+    from experiments.runner.recorded import RecordedSystem
     from sgft_jax.io.priors import load_priors, observed_by
     from sgft_jax.io.real import RealStore
     from sgft_jax.policies import make_policy
@@ -120,7 +120,7 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
 
 def _filmed(args: EvaluateArgs, system: Any, i: int, played: Any, folder: Path) -> dict[str, str]:
     """How the film of the first of the episodes [n] of a policy, on the i-th real system, went; {} without --video."""
-    from experiments.video import film_episode
+    from experiments.runner.video import film_episode
     from sgft_jax.stacking import member
 
     if args.video is None:

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from experiments import cli
-from experiments.options import prior_folders, task_of_priors
+from envs.types import UserError
+from experiments.runner import cli
+from experiments.runner.options import prior_folders, task_of_priors
 from sgft_jax.io.runs import check_folder
-from sgft_jax.types import UserError
 
 
 @dataclass(frozen=True)

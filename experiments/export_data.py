@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from experiments import cli
-from experiments.rollouts import check_sizes, episodes_of, home_of, task_of
+from envs.types import UserError
+from experiments.runner import cli
+from experiments.runner.rollouts import check_sizes, episodes_of, home_of, task_of
 from sgft_jax.io.runs import check_folder, read_config
-from sgft_jax.types import UserError
 
 _AUTHOR = "sgft_jax experiments.export_data"
 
@@ -47,7 +47,7 @@ def main(args: ExportDataArgs) -> None:
         raise UserError("--to lerobot: pyarrow is not installed; pip install 'sgft-jax[lerobot]'")
     stored = episodes_of(home, args.seed)
     import envs
-    from sgft_jax.data import lerobot, recording
+    from sgft_jax.datasets import lerobot, recording
 
     env = envs.make(task)
     check_sizes(home, stored, env)

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments import cli
-from sgft_jax import extend
+from envs import extend
+from envs.types import UserError
+from experiments.runner import cli
 from sgft_jax.io.runs import check_folder
-from sgft_jax.types import UserError
 
 
 @dataclass(frozen=True)

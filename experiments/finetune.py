@@ -5,8 +5,8 @@ from dataclasses import replace
 from typing import Any
 
 from envs import gaps
-from experiments import cli
-from experiments.finetune_args import FinetuneArgs, arguments, check, priors_of, resolved
+from experiments.runner import cli
+from experiments.runner.finetune_args import FinetuneArgs, arguments, check, priors_of, resolved
 from sgft_jax.methods import DEFAULT, all_methods
 
 
@@ -17,7 +17,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def _defaults(argv: Sequence[str]) -> FinetuneArgs:
     """Those of the chosen method, with the options that tuning chose for the task if `--tuned` asks for them."""
-    from experiments import tuned
+    from experiments.runner import tuned
 
     chosen = cli.preview(argv, method=DEFAULT, tuned=False, task=FinetuneArgs.task, out=FinetuneArgs.out)
     default = arguments(chosen.method)
@@ -36,7 +36,7 @@ def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:
     method, seeds = check(args)
     args = resolved(args)
     priors = priors_of(args)
-    from experiments.finetune_run import run  # JAX starts here
+    from experiments.runner.finetune_run import run  # JAX starts here
 
     return run(args, method, seeds, priors)
 

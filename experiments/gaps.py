@@ -13,10 +13,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from envs import gaps
+from envs import extend, gaps
 from envs.files import read_toml
-from experiments import cli
-from experiments.options import (
+from envs.types import UserError
+from experiments.runner import cli
+from experiments.runner.options import (
     Impl,
     at_least_one,
     check_task,
@@ -26,10 +27,8 @@ from experiments.options import (
     task_of_priors,
     without_repeats,
 )
-from sgft_jax import extend
 from sgft_jax.io.runs import check_folder
 from sgft_jax.presets import PRESETS, PretrainConfig
-from sgft_jax.types import UserError
 
 PLAIN = "fast"  # strata are those of priors that know the task's own domain alone
 
@@ -116,9 +115,9 @@ def measure(args: GapsArgs) -> dict[str, Any]:
     folders = prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
     task_of_priors(folders, args.task)
     if args.draw:
-        from experiments.gaps_draw import run
+        from experiments.studies.gaps_draw import run
     else:
-        from experiments.gaps_run import run
+        from experiments.runner.gaps_run import run
 
     return run(args, seeds, folders)
 

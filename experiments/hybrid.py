@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from envs import gaps
-from experiments import cli
-from experiments.hybrid_args import DEFAULT, HybridArgs, check, data_name
+from experiments.runner import cli
+from experiments.runner.hybrid_args import DEFAULT, HybridArgs, check, data_name
 from sgft_jax.hybrid.methods import NAMES, get_method
 from sgft_jax.hybrid.presets import preset_for, say_preset
 from sgft_jax.hybrid.schedule import FLEET, SCHEDULES, describe
@@ -60,7 +60,7 @@ def hybrid(args: HybridArgs) -> list[dict[str, Any]]:
     method, seeds = check(args)
     for line in _choices(args, method):
         print(line)
-    from experiments.hybrid_run import run  # JAX starts here
+    from experiments.runner.hybrid_run import run  # JAX starts here
 
     return run(args, method, seeds)
 

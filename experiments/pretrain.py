@@ -10,14 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from envs import gaps
+from envs import extend, gaps
 from envs.gaps import SIM
-from experiments import cli
-from experiments.options import Impl, check_task, hosts_of, not_negative, seed_list, seeds_name
-from sgft_jax import extend
+from envs.types import UserError
+from experiments.runner import cli
+from experiments.runner.options import Impl, check_task, hosts_of, not_negative, seed_list, seeds_name
 from sgft_jax.io.runs import check_start
 from sgft_jax.presets import DEFAULT_PRESET, PRESETS, PretrainConfig
-from sgft_jax.types import UserError
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ def _defaults(argv: Sequence[str]) -> PretrainArgs:
 def pretrain(args: PretrainArgs) -> dict[str, Any]:
     """One run from (or back) to disk; returns its summary."""
     seeds = check(args)
-    from experiments.pretrain_run import run  # JAX starts here
+    from experiments.runner.pretrain_run import run  # JAX starts here
 
     return run(args, seeds)
 

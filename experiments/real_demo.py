@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from experiments import cli, panda_gym
-from experiments.finetune_args import arguments, run_folder
-from experiments.options import SHIPPED, at_least_one, check_prior, seed_list
-from experiments.panda_gym import HOME, PYTHON, TASK
-from experiments.real_systems import REMOTE
+from envs.types import UserError
+from experiments.runner import cli, panda_gym
+from experiments.runner.finetune_args import arguments, run_folder
+from experiments.runner.options import SHIPPED, at_least_one, check_prior, seed_list
+from experiments.runner.panda_gym import HOME, PYTHON, TASK
+from experiments.runner.real_systems import REMOTE
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import get_method
-from sgft_jax.types import UserError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -108,7 +108,7 @@ def filmed(args: RealDemoArgs) -> tuple[range, range]:
 
 def show(args: RealDemoArgs) -> None:
     """The success before and after, and where the learning curve, the video and the policy are."""
-    from experiments.finetune_record import evaluation_store
+    from experiments.runner.finetune_record import evaluation_store
 
     run = run_folder(arguments(args.method, task=TASK, seeds=1, seed=args.seed, out=args.out), REMOTE)
     found = {}

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from experiments import cli
-from experiments.options import without_repeats
-from experiments.rollouts import episodes_of, home_of, task_of
+from envs.types import UserError
+from experiments.runner import cli
+from experiments.runner.options import without_repeats
+from experiments.runner.rollouts import episodes_of, home_of, task_of
 from sgft_jax.io.real import Played
 from sgft_jax.io.runs import check_folder
-from sgft_jax.types import UserError
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ def main(args: ReplayArgs) -> None:
     out = args.out or home / "replay"
     check_folder(out)
     task, episodes = task_of(home, args.task), chosen(home, args)
-    from experiments.replay_draw import draw
+    from experiments.runner.replay_draw import draw
 
     print("\n".join(draw(home, task, episodes, out, video=args.video)))
 

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from experiments import cli
-from experiments.options import prior_folders
+from envs.types import PyTree, UserError
+from experiments.runner import cli
+from experiments.runner.options import prior_folders
 from sgft_jax.io.cards import read_card
 from sgft_jax.io.runs import check_folder
-from sgft_jax.types import Prior, PyTree, UserError
+from sgft_jax.types import Prior
 
 _FLOAT32 = 24  # significant bits
 

@@ -16,8 +16,8 @@ import tyro
 import envs
 from envs import gaps
 from envs.base import Effects, Value
-from experiments import cli
-from experiments.cli import columns
+from experiments.runner import cli
+from experiments.runner.cli import columns
 
 
 @dataclass(frozen=True)

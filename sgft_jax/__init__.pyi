@@ -13,12 +13,12 @@ from .models.ratio import RatioConfig
 from .planning.mpc import MPCConfig
 from .policies import make_policy, mpc_policy, sac_policy, tdmpc2_policy
 from .presets import PRESETS, PretrainConfig
-from .pretraining import PretrainState, pretrain, priors_of
 from .systems import System
 from .systems.gymnasium import Gymnasium
 from .systems.remote import Remote
 from .systems.simulated import Simulated
-from .train import FinetuneProgress, evaluate, finetune, simulate
+from .train.finetuning import FinetuneProgress, evaluate, finetune, simulate
+from .train.pretraining import PretrainState, pretrain, priors_of
 from .transforms import branch, clip, compose, relabel, shape, shaped_reward, shorten, stateless, weigh
 from .types import (
     Batch,

@@ -18,7 +18,7 @@ from envs.gaps import Gap, from_dict
 from envs.history import remember, with_memory
 from envs.pools import heldout_worlds, real_env, real_worlds, training_worlds
 from envs.rollout import Episode
-from sgft_jax import train
+from envs.types import Array, Policy, PyTree, UserError
 from sgft_jax.io import player
 from sgft_jax.io.cards import known_task
 from sgft_jax.io.priors import load_prior, observed
@@ -29,8 +29,9 @@ from sgft_jax.presets import check_card
 from sgft_jax.stacking import stack
 from sgft_jax.systems import System
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.train import FinetuneProgress, SimulatedRows
-from sgft_jax.types import Array, Finetuner, Method, Policy, Prior, PyTree, UserError
+from sgft_jax.train import finetuning
+from sgft_jax.train.finetuning import FinetuneProgress, SimulatedRows
+from sgft_jax.types import Finetuner, Method, Prior
 
 SIMULATED_WORLDS = 256
 _SIMULATION = 2**31  # seed of what happens in them, the same for every run
@@ -103,7 +104,9 @@ def _simulated_rows(env: Env, finetuner: Finetuner, priors: list[Prior], stacked
     key, card = jax.random.key(_SIMULATION), priors[0].card
     env, gap = _simulator(env, card)
     worlds = training_worlds(env, gap, key, SIMULATED_WORLDS)
-    return train.simulate(env, make_policy(card, env), worlds, stacked, key, finetuner.simulation, gamma=card["gamma"])
+    return finetuning.simulate(
+        env, make_policy(card, env), worlds, stacked, key, finetuner.simulation, gamma=card["gamma"]
+    )
 
 
 def _simulator(env: Env, card: Mapping[str, Any]) -> tuple[Env, Gap | None]:

@@ -9,7 +9,7 @@ import struct
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 MOST = 2**31 - 1  # what counts anything: devices count in 32 bits
 _LARGEST_BATCH = 2**20  # rows

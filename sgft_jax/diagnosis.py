@@ -11,13 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sgft_jax.analysis.stats import rank_correlation
+from envs.types import Array, Key, PyTree, Transition, UserError
+from sgft_jax.math.stats import rank_correlation
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.distortion import Distortion, none, residuals
 from sgft_jax.models.networks import make_dynamics
 from sgft_jax.models.robust import robust_std, student_cost
 from sgft_jax.policies import network_of, sac_policy
-from sgft_jax.types import Array, Key, PyTree, Task, Transition, UserError
+from sgft_jax.types import Task
 
 HORIZONS = (1, 2, 4, 8)  # steps ahead
 _SHARES = np.linspace(-0.5, 1.0, 61)  # of a command that may come from the step before

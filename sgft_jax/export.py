@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Env
+from envs.types import Array, PyTree, UserError
 from sgft_jax.io.priors import algorithm_of, digest
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.policies import make_policy, network_of
-from sgft_jax.types import Array, Prior, PyTree, UserError
+from sgft_jax.types import Prior
 
 Format = Literal["onnx", "jax", "numpy"]
 MEASURED, ACTION, NEXT = "measured", "action", "next_"

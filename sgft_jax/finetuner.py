@@ -1,7 +1,7 @@
 """The one generic finetuner: sample a batch, transform it, learn from it. Methods choose the parts.
 
 `assemble` puts parts together; `sac_finetuner` chooses them for methods whose learner is SAC. The caller owns the loop
-(`train.finetune`) and vmaps over seeds and real systems.
+(`train.finetuning.finetune`) and vmaps over seeds and real systems.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,36 +11,32 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from envs.types import Array, Key, Policy, PyTree, Transition, UserError
 from sgft_jax.data import replay, sources
-from sgft_jax.guard import guarded
 from sgft_jax.identify import Identified, Interface, interface
-from sgft_jax.learners import optim, sac
+from sgft_jax.learners import sac
+from sgft_jax.math import optim
 from sgft_jax.methods import options as rules
 from sgft_jax.methods.options import KeptCriticOptions, LoopOptions, ModelOptions, SACOptions
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import fix_first_layer, make_dynamics, make_value
 from sgft_jax.policies import network_of, sac_policy
+from sgft_jax.train.guard import guarded
 from sgft_jax.transforms import compose, steps_to_go
 from sgft_jax.types import (
-    Array,
     Batch,
     Finetuner,
     Imagination,
-    Key,
     Learner,
     Metrics,
     Normalizer,
-    Policy,
     Prior,
-    PyTree,
     SimulatedData,
     Simulation,
     Source,
     Task,
     Transform,
-    Transition,
-    UserError,
 )
 
 _SIMULATION = Simulation(20_000, 0.6)  # simulated rows that identification compares with

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from envs.types import Array, PyTree, Transition
 from sgft_jax.models import distortion
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.models.robust import spread_of
-from sgft_jax.types import Array, Batch, PyTree, SimulatedData, Task, Transition
+from sgft_jax.types import Batch, SimulatedData, Task
 
 _SIMULATED = 2048  # rows that tell how far the model is off in simulation
 _ROWS = 320  # real ones that are fitted, the first 8 rollouts or so; more of them add little

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from envs.types import Array, Key, Policy, PyTree, UserError
 from sgft_jax.learners import recurrent, tdmpc2, tdmpc2_model
 from sgft_jax.learners.actor import actor_policy, make_actor_of
 from sgft_jax.learners.sac import SACParams
@@ -26,7 +27,7 @@ from sgft_jax.models.networks import (
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.models.system import told
 from sgft_jax.planning import mpc
-from sgft_jax.types import Array, Key, Policy, PyTree, Task, UserError
+from sgft_jax.types import Task
 
 
 def make_policy(card: Mapping[str, Any], task: Task) -> Policy:

@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from envs.types import UserError, unknown
 from sgft_jax import checks
 from sgft_jax.models.config import SIZES, NetworkConfig, Precision
-from sgft_jax.types import Algorithm, Method, UserError, unknown
+from sgft_jax.types import Algorithm, Method
 
 DEFAULT_PRESET = "robust"
 

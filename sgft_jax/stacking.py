@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.types import Array, PyTree
+from envs.types import Array, PyTree
 
 
 def stack(trees: Sequence[PyTree]) -> PyTree:

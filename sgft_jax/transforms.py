@@ -11,10 +11,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.learners import losses
+from envs.types import Array, Key, PyTree
+from sgft_jax.math import losses
 from sgft_jax.models import ratio
 from sgft_jax.models.networks import add_noise
-from sgft_jax.types import Array, Batch, Imagination, Key, Metrics, PyTree, Transform
+from sgft_jax.types import Batch, Imagination, Metrics, Transform
 
 
 def stateless(apply: Callable[[Any, Batch, Key], Batch]) -> Transform:

@@ -1,54 +1,19 @@
-"""The nouns that every other module uses. Imports nothing of ours, and JAX for type checkers alone."""
+"""The nouns of learning and fine-tuning. Imports no JAX."""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
-if TYPE_CHECKING:
-    import jax
+from envs.types import Array, Key, Policy, PyTree, Transition, UserError
 
-    Array = jax.Array
-    Key = jax.Array
-else:  # command lines read this module; JAX takes seconds to import
-    Array = Key = Any
+__all__ = ["Policy", "Transition", "UserError"]  # of `envs.types`, public here too
 
-PyTree = Any
 Metrics = dict[str, Array]
 
 
-class UserError(Exception):
-    """Bad input: one line that names the file, key or option and says how to fix it. Commands exit with code 2."""
-
-
-def unknown(kind: str, name: str, options: Iterable[str]) -> str:
-    """What to tell someone who asked for a `kind` called `name` where only `options` exist."""
-    listed = sorted(options)
-    close = difflib.get_close_matches(name, listed, n=1)
-    hint = f", did you mean {close[0]!r}?" if close else "."
-    return f"{kind}: there is no {name!r}{hint} Choose from: {', '.join(listed)}"
-
-
 # --- experience -----------------------------------------------------------------------------------------------------
-
-
-class Transition(NamedTuple):
-    """One step of experience as it is stored, or many of them with leading axes.
-
-    obs: [obs_dim] observation before the action, raw units.
-    action: [act_dim] in [-1, 1], as the policy chose it (before any effect of the system on it).
-    reward: [] task reward of arriving in `next_obs`; transforms reshape rewards, storage never does.
-    discount: [] gamma * (1 - terminated). A time limit never zeroes it.
-    next_obs: [obs_dim] the true successor, also at the end of an episode.
-    """
-
-    obs: Array
-    action: Array
-    reward: Array
-    discount: Array
-    next_obs: Array
 
 
 class Batch(NamedTuple):
@@ -223,23 +188,6 @@ class Prior:
 
     params: PyTree
     card: Mapping[str, Any]
-
-
-class Policy(NamedTuple):
-    """How the parameters of a prior act, for one example.
-
-    init_carry() -> carry. act(params, carry, obs, key, *, explore) -> (action, carry); `explore` may be traced.
-    value(params, obs) -> []: V_sim, deterministic; None where an observation does not decide the value.
-    model_error(params, obs [T + 1, obs_dim], actions [T, act_dim]) -> [T]: how far its model drifts from a trajectory,
-        in standard deviations of the observation; None where the model does not predict observations.
-    log_prob(params, obs, action) -> []: log density of an exploring action; None where it has none, or nobody wrote it.
-    """
-
-    init_carry: Callable[[], PyTree]
-    act: Callable[..., tuple[Array, PyTree]]
-    value: Callable[[PyTree, Array], Array] | None = None
-    model_error: Callable[[PyTree, Array, Array], Array] | None = None
-    log_prob: Callable[[PyTree, Array, Array], Array] | None = None
 
 
 class Simulation(NamedTuple):

@@ -12,10 +12,11 @@ import numpy as np
 import pytest
 
 import envs
-from envs import gaps
-from experiments import cli, figures, finetune, pretrain
-from sgft_jax import Batch, NetworkConfig, Prior, extend, get_method
-from sgft_jax.io.jsonfile import jsonable
+from envs import extend, gaps
+from experiments import figures, finetune, pretrain
+from experiments.runner import cli
+from sgft_jax import Batch, NetworkConfig, Prior, get_method
+from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io.priors import load_prior, save_prior
 from sgft_jax.learners import sac
 from sgft_jax.methods import sgft_sac

@@ -15,7 +15,7 @@ COMMANDS = (
     "compare",
     "compare_hybrid",
     "gaps",
-    "tune",
+    "studies.tune",
     "benchmark",
     "tasks",
     "diagnose",
@@ -32,7 +32,7 @@ MISTAKES = {
     "compare": "--methods sac sac",
     "compare_hybrid": "--methods sac foo --reference sac",
     "gaps": "--episodes 3",
-    "tune": "--tasks hamer",
+    "studies.tune": "--tasks hamer",
     "benchmark": "--worlds 0",
     "diagnose": "--rollouts 0",
     "export": "--policy nowhere --to onnx",
@@ -40,7 +40,7 @@ MISTAKES = {
     "replay": "--run nowhere",
     "hybrid": "--gap sim --task halfcheetah",
 }
-LIGHT = ("sgft_jax", "sgft_jax.checks", "sgft_jax.models.config", "experiments.cli", "sgft_jax.presets")
+LIGHT = ("sgft_jax", "sgft_jax.checks", "sgft_jax.models.config", "experiments.runner.cli", "sgft_jax.presets")
 
 
 def imported(program):

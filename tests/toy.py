@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from envs.base import Entry, Env, EnvState, Parameter, World
 from envs.effects import distort, draw, measure
-from sgft_jax.types import Array, Key
+from envs.types import Array, Key
 
 DT, FORCE, TOLERANCE = 0.1, 4.0, 0.15  # s, N at full action, m
 PARAMETERS = (Parameter("mass", "kg", 1.0, 0.8, 1.2, 0.01), Parameter("friction", "1/s", 4.0, 3.5, 4.5, 0.0))

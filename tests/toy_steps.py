@@ -5,7 +5,7 @@ import jax.numpy as jnp
 
 from envs.base import Entry, Env, EnvState, Parameter, World
 from envs.effects import distort, draw, measure
-from sgft_jax.types import Array, Key
+from envs.types import Array, Key
 
 STEP, TOLERANCE, LENGTH = 0.1, 0.05, 20  # m at full action, m, control steps
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from envs.base import Entry, Env, EnvState, Parameter, Theta, World, packed
 from envs.effects import distort, draw, measure
-from sgft_jax.types import Array, Key
+from envs.types import Array, Key
 
 STEP, LENGTH = 0.1, 12
 OBSERVATION = (Entry("position", "m", 1), Entry("alarm", "", 1))

@@ -20,7 +20,7 @@ import sgft_jax
 from envs.base import Env
 from envs.gaps import Gap
 from sgft_jax.analysis import tables
-from sgft_jax.analysis.stats import success_interval
+from sgft_jax.math.stats import success_interval
 from sgft_jax.models.distortion import Distortion, turned_and_scaled
 
 GAPS = ("push-2-00", "insert-2-00", "hammer-2-14", "hammer-2-19", "hammer-2-28")  # where `guarded` ends below 90 %

@@ -7,7 +7,7 @@ import mujoco
 from envs import Entry, Env, Parameter
 from envs.mujoco.scene import Scene, View, make_env
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array, Key
+from envs.types import Array, Key
 
 MARK, TOLERANCE, STEP = 0.3, 0.03, 0.08  # m: where the puck should stop, how exactly, pusher's way per step at |a| = 1
 MJCF = """

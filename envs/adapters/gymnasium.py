@@ -22,7 +22,7 @@ from envs.base import Env, EnvState, World
 from envs.gaps import SIM, Gap
 from envs.pools import real_env, real_worlds
 from envs.rollout import begin_episode, episode_keys, select
-from sgft_jax.types import Array, Key
+from envs.types import Array, Key
 
 NAMESPACE, VERSION = "sgft_jax", 0
 _SEEDS = 2**31  # episodes after a seeded one draw theirs from below this

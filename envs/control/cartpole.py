@@ -14,7 +14,7 @@ from envs.base import Entry, Env, Parameter
 from envs.mujoco.engines import Engine
 from envs.mujoco.scene import Scene, View, make_env
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array, Key
+from envs.types import Array, Key
 
 FRAME, REPEAT = 0.01, 2  # s; frames per action
 CONTROL_DT = FRAME * REPEAT

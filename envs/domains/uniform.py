@@ -9,7 +9,7 @@ import numpy as np
 
 from envs import effects as env_effects
 from envs.base import NOTHING, Domain, Env, Theta, Value, World, misnamed
-from sgft_jax.types import Array, Key, UserError
+from envs.types import Array, Key, UserError
 
 
 def uniform(env: Env, params: Mapping[str, Value] = NOTHING, effects: Mapping[str, Value] = NOTHING) -> Domain:

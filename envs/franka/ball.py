@@ -15,7 +15,7 @@ from envs.franka.arm import NO_CONTACT
 from envs.franka.workcell import at_rest
 from envs.mujoco.scene import Scene, make_env
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array, Key
+from envs.types import Array, Key
 
 RADIUS = 0.035  # m
 PAD = 0.0095  # m, radius of the pads: their neighbours are 0.014 m away

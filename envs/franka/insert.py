@@ -25,7 +25,7 @@ from envs.franka.kinematics import DOWN, Pose
 from envs.franka.workcell import at_rest, clip_joints, new_spec
 from envs.mujoco.scene import View, make_env
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array, Key
+from envs.types import Array, Key
 
 SUBSTEPS = 40
 STEP = 0.02  # m per control step at |action| = 1

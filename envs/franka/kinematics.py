@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.franka import arm
-from sgft_jax.types import Array
+from envs.types import Array
 
 # Gripper pointing down, fingers opening along y of the base.
 DOWN = np.diag([1.0, -1.0, -1.0])

@@ -17,7 +17,7 @@ from envs.franka.armless import add_box, add_servo, table_spec
 from envs.franka.rotations import inverse, turned
 from envs.mujoco.scene import Scene, View, make_env
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array, Key
+from envs.types import Array, Key
 
 CONTROL_DT, SUBSTEPS = 0.025, 10  # s: two frames of Meta-World; physics steps in it
 STEP = 0.02  # m: how far an action of 1 moves where the hand is sent

@@ -15,7 +15,7 @@ from envs.franka.armless import add_box, add_servo, table_spec
 from envs.franka.rotations import inverse, turned
 from envs.mujoco.scene import Scene, View, make_env
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array, Key
+from envs.types import Array, Key
 
 CONTROL_DT, SUBSTEPS = 0.04, 10  # s; physics steps in it
 CUBE_HALF = 0.02  # m

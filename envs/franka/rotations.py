@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from sgft_jax.types import Array
+from envs.types import Array
 
 
 def turned(turn: Array, vector: Array) -> Array:

@@ -20,7 +20,7 @@ from envs.franka.arm import NO_CONTACT
 from envs.franka.workcell import new_spec
 from envs.mujoco.scene import Scene, View
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array
+from envs.types import Array
 
 TABLE = "table"
 TIP = 0.009  # m above the table: the middle of the round ends of the fingertips

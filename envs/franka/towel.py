@@ -15,7 +15,7 @@ from envs.franka.arm import NO_CONTACT
 from envs.franka.workcell import at_rest
 from envs.mujoco.scene import Scene, make_env
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array, Key
+from envs.types import Array, Key
 
 N = 6  # points along a side
 SIDE = 0.08  # m: a small towel, folded

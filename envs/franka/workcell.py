@@ -10,7 +10,7 @@ from envs.franka import arm
 from envs.franka.arm import NO_CONTACT
 from envs.mujoco.scene import Scene
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array
+from envs.types import Array
 
 CONTROL_DT = 0.2  # s, 5 Hz as in the paper
 RAMP = 0.1  # s: the servo's target moves linearly to its new value, then rests, so the arm has settled at the next step

@@ -17,7 +17,7 @@ import numpy as np
 from envs.base import Entry, Parameter
 from envs.mujoco.scene import Measured, Scene, View
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array
+from envs.types import Array
 
 N_ROOT, N_JOINTS = 3, 6  # x, z, pitch; three joints of either leg
 NV = N_ROOT + N_JOINTS

@@ -16,7 +16,7 @@ from envs.locomotion import planar
 from envs.locomotion.planar import NV, Capsule, Link, multiple
 from envs.mujoco.scene import make_env
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array, Key
+from envs.types import Array, Key
 
 FRAME, SUBSTEPS = 0.002, 4  # s; physics steps per action
 CONTROL_DT = FRAME * SUBSTEPS

@@ -10,7 +10,7 @@ from envs.locomotion import wheel_legged
 from envs.locomotion.wheel_legged import ENTRIES, fallen, state_of, torque
 from envs.mujoco.scene import make_env
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array
+from envs.types import Array
 
 SPEED = 0.2  # m/s
 ALIVE = 15.0

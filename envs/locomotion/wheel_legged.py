@@ -17,7 +17,7 @@ from envs.base import Entry, Env, Parameter
 from envs.locomotion.planar import BLUE, LIGHT, NO_CONTACT, ORANGE
 from envs.mujoco.scene import Scene, View, make_env
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array, Key
+from envs.types import Array, Key
 
 CONTROL_DT, SUBSTEPS = 0.005, 2  # s; physics steps in it
 EPISODE_LENGTH = 2_000  # 10 s

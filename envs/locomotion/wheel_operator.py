@@ -22,7 +22,7 @@ from envs.locomotion.wheel_legged import (
     WHEEL_MASS,
     WHEEL_RADIUS,
 )
-from sgft_jax.types import Array, Key, Policy
+from envs.types import Array, Key, Policy
 
 COST = np.diag([4.0, 1.0, 1.0, 1.0])  # of x (m), v (m/s), pitch (rad), its speed (rad/s), squared
 TORQUE_COST = 1.0  # of N m, squared

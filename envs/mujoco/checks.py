@@ -11,7 +11,7 @@ import mujoco
 from envs.base import pack
 from envs.checks import check_array, check_outcomes, is_count, is_number
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 if TYPE_CHECKING:
     from envs.mujoco.scene import Scene

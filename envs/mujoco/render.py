@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from envs.mujoco.scene import Scene, View
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 FPS = 10
 SPEED = 2  # times real time: a graphics library without a graphics card needs 0.2 s a frame

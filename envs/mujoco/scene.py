@@ -17,7 +17,7 @@ from envs.mujoco.checks import check_scene
 from envs.mujoco.engines import Engine
 from envs.mujoco.fields import with_shortcuts
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array, Key, UserError
+from envs.types import Array, Key, UserError
 
 
 class View(NamedTuple):

@@ -18,7 +18,7 @@ import numpy as np
 
 from envs.mujoco.engines import Engine
 from envs.mujoco.fields import CARRIED, carried, comparison
-from sgft_jax.types import Array, UserError, unknown
+from envs.types import Array, UserError, unknown
 
 Impl = Literal["auto", "jax", "warp", "c"]  # see `choose_impl`
 IMPL_VARIABLE = "SGFT_IMPL"

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from envs.types import Array, Key, PyTree, Transition
 from sgft_jax.learners.sac import LOG_ALPHA_MIN, SACHyper
 from sgft_jax.models.networks import LOG_STD_MAX, LOG_STD_MIN, NetworkConfig
-from sgft_jax.types import Array, Key, PyTree, Transition
 
 
 class Noise(NamedTuple):

@@ -12,6 +12,7 @@ from envs import gaps
 from envs.base import Env, World
 from envs.gaps import SIM
 from envs.pools import real_worlds
+from envs.types import Key, PyTree
 from experiments.bench import bare_h2oplus
 from experiments.bench.timing import Compiled, ahead, fastest_in_turns
 from experiments.bench.updates import REPLAY, rows
@@ -19,8 +20,8 @@ from sgft_jax.hybrid.methods import get_method
 from sgft_jax.hybrid.schedule import Schedule
 from sgft_jax.hybrid.trainer import make_trainer
 from sgft_jax.learners.h2oplus import H2OPlusHyper
-from sgft_jax.pretraining import over_members
-from sgft_jax.types import HybridAgent, Key, PyTree, RealData
+from sgft_jax.train.pretraining import over_members
+from sgft_jax.types import HybridAgent, RealData
 
 METHOD = "h2oplus"
 

@@ -24,8 +24,8 @@ from envs.base import Env, World
 from envs.mujoco.engines import warp as engine_warp
 from envs.mujoco.worlds import PhysicsState
 from envs.rollout import Fleet, launch, step_fleet
+from envs.types import Array, Key
 from experiments.bench.timing import Timing, ahead, fastest, measure
-from sgft_jax.types import Array, Key
 
 POOL = 256  # domain parameter vectors, so that a batch really differs from world to world
 

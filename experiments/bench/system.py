@@ -12,10 +12,12 @@ from envs import gaps
 from envs.gaps import SIM
 from envs.mujoco.worlds import Impl
 from envs.rollout import Episode
-from sgft_jax import api, train
+from envs.types import Key, PyTree
+from sgft_jax import api
 from sgft_jax.io.priors import load_priors, observed_by
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.types import Key, Metrics, PyTree
+from sgft_jax.train import finetuning
+from sgft_jax.types import Metrics
 
 
 def speed(task: str, impl: Impl, members: int, *, priors: Sequence[Path], repeats: int) -> dict[str, Any]:
@@ -23,7 +25,7 @@ def speed(task: str, impl: Impl, members: int, *, priors: Sequence[Path], repeat
     env = envs.make(task, impl, **observed_by(priors))
     setup = api.setup(env, gaps.find(env.name, SIM), load_priors(priors, env), seeds=members)
     assert isinstance(setup.system, Simulated)
-    through = train.finetune(*setup, rollouts=10**9)
+    through = finetuning.finetune(*setup, rollouts=10**9)
     progress, _ = next(through)
     agent = jax.tree.map(lambda x: x.copy(), progress.agent)
     fused = jax.jit(_fused(setup), donate_argnums=0)
@@ -43,9 +45,9 @@ def speed(task: str, impl: Impl, members: int, *, priors: Sequence[Path], repeat
 
 
 def _fused(setup: api.Setup) -> Any:
-    """(agent, key) -> agent, episodes, metrics: what `train.finetune` does between two yields."""
+    """(agent, key) -> agent, episodes, metrics: what `finetuning.finetune` does between two yields."""
     finetuner, updates = setup.finetuner, setup.finetuner.updates_per_rollout
-    learn = train.Updates(finetuner, setup.seeds, train.prior_of(setup.priors, setup.seeds), setup.simulated)
+    learn = finetuning.Updates(finetuner, setup.seeds, finetuning.prior_of(setup.priors, setup.seeds), setup.simulated)
 
     def rollout(agent: PyTree, key: Key) -> tuple[PyTree, Episode, Metrics]:
         keys = jax.random.split(key, (len(setup.seeds), 1))

@@ -14,8 +14,8 @@ from typing import Any
 
 from envs.mujoco.worlds import Impl
 from experiments.finetune import finetune
-from experiments.finetune_args import arguments, run_folder
 from experiments.pretrain import PretrainArgs, pretrain
+from experiments.runner.finetune_args import arguments, run_folder
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.presets import PRESETS
 

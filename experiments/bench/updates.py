@@ -6,12 +6,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from envs.types import Key, PyTree, Transition
 from experiments.bench import bare_sac, other_sac
 from experiments.bench.timing import Timing, fastest, measure
 from sgft_jax.data import replay
 from sgft_jax.learners.sac import SACConfig, SACHyper, make_sac
 from sgft_jax.models.networks import NetworkConfig, Precision, precision
-from sgft_jax.types import Batch, Key, PyTree, Transition
+from sgft_jax.types import Batch
 
 OBS_DIM, ACT_DIM, MEMBERS = 12, 3, 5  # sizes of the updates, a manipulation task's
 REPLAY = 100_000  # rows that batches of plain SAC are drawn from

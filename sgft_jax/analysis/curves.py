@@ -15,14 +15,14 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from msgspec import Meta
 
+from envs import extend
 from envs.files import Count
-from sgft_jax import extend
-from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean, paired_improvement
-from sgft_jax.io.csvfile import finite, read_csv, whole
+from envs.types import UserError
+from sgft_jax.files.csvfile import finite, read_csv, whole
 from sgft_jax.io.log import EVAL, METRICS, SUMMARY, check_records, read_jsonl
 from sgft_jax.io.runs import read_config, read_own, read_starts
+from sgft_jax.math.stats import ENOUGH, Interval, bootstrap_interval, mean, paired_improvement
 from sgft_jax.methods import NAMES, get_method
-from sgft_jax.types import UserError
 
 LEVEL = 0.9  # success that counts as solved
 SCORES = ("success", "return")

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sgft_jax.analysis.stats import Interval, bootstrap_interval, mean
+from sgft_jax.math.stats import Interval, bootstrap_interval, mean
 
 
 class Factor(NamedTuple):

@@ -20,9 +20,9 @@ from numpy.typing import ArrayLike
 
 from sgft_jax.analysis.curves import Curve, by_prior, spread
 from sgft_jax.analysis.hybrid import Outcome, Results
-from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval
 from sgft_jax.analysis.verdict import Sign
 from sgft_jax.hybrid.methods import get_method
+from sgft_jax.math.stats import ENOUGH, Interval, bootstrap_interval
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MOST = len(PALETTE)

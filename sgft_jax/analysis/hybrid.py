@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sgft_jax.analysis.scoreboard import improvement
-from sgft_jax.analysis.stats import Interval, bootstrap_interval, mean, rank_correlation
 from sgft_jax.analysis.tables import NONE, markdown, number, plain
 from sgft_jax.hybrid.scores import BOUNDS, normalised, shown
+from sgft_jax.math.stats import Interval, bootstrap_interval, mean, rank_correlation
 
 EVERY = ""  # data or simulator of a method that sees none
 _FEWEST = 3  # methods that have an order worth comparing

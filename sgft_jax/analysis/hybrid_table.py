@@ -9,11 +9,11 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from envs.types import UserError
 from sgft_jax.analysis.curves import SCORES
 from sgft_jax.analysis.hybrid import Outcome, outcome
 from sgft_jax.analysis.release import merge
-from sgft_jax.io.csvfile import finite, read_csv, whole
-from sgft_jax.types import UserError
+from sgft_jax.files.csvfile import finite, read_csv, whole
 
 TABLE = "hybrid.csv"
 IDENTITY = ("task", "real", "data", "gap", "method", "schedule", "updates")

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import nnls
 
-from sgft_jax.analysis.stats import Interval, bootstrap_interval, rank_correlation
+from sgft_jax.math.stats import Interval, bootstrap_interval, rank_correlation
 
 AHEAD, LEVEL = 20, 0.9  # rollouts over which the gain is predicted; success that counts as solved
 _SHORT = 40.0  # shortfall, in standard deviations, at which the imagined rollout of `inputs_of` is half a success

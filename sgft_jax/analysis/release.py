@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
 from envs.files import Count, read_object
+from envs.types import UserError
 from sgft_jax.analysis import curves
 from sgft_jax.analysis.curves import COLUMNS, IDENTITY, Curve
-from sgft_jax.io.csvfile import read_csv
+from sgft_jax.files.csvfile import read_csv
 from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
 from sgft_jax.io.runs import read_config, read_starts
-from sgft_jax.types import UserError
 
 _OF_PRIORS, _OF_TUNING = ("task", "priors"), ("task", "method")
 _Pretrained = TypedDict("_Pretrained", {"success/interval": tuple[float, float], "digest": NotRequired[str]})
@@ -35,7 +35,7 @@ class _Trial(TypedDict):
 
 
 class _Tuning(TypedDict):
-    """What `experiments.tune` has chosen for one task and method, see docs/formats.md."""
+    """What `experiments.studies.tune` has chosen for one task and method, see docs/formats.md."""
 
     task: str
     method: str
@@ -76,7 +76,7 @@ def _run(curve: Curve) -> dict[str, Any]:
 
 def _tuning(path: Path) -> Iterable[dict[str, Any]]:
     """What tuning of one method tried: options of each trial, its scores, and whether it was chosen."""
-    result = read_object(path, _Tuning, "put back what experiments.tune has written")
+    result = read_object(path, _Tuning, "put back what experiments.studies.tune has written")
     for number, trial in enumerate(result["trials"]):
         yield {
             "task": result["task"], "method": result["method"], "trial": number, "chosen": number == result["trial"],

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from envs.types import UserError, unknown
 from sgft_jax.analysis import figures, tables
 from sgft_jax.analysis.curves import Curve, Found, by_priors, from_main_priors
-from sgft_jax.types import UserError, unknown
 
 
 def select(found: Found, *, variants: bool = True, **wanted: Sequence[str]) -> Found:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from envs.types import UserError
 from sgft_jax.analysis.curves import (
     LEVEL,
     Curve,
@@ -19,8 +20,7 @@ from sgft_jax.analysis.curves import (
     transitions_until_held,
     zero_shot,
 )
-from sgft_jax.analysis.stats import ENOUGH, Interval, bootstrap_interval, mean
-from sgft_jax.types import UserError
+from sgft_jax.math.stats import ENOUGH, Interval, bootstrap_interval, mean
 
 _RESAMPLES = 1000
 

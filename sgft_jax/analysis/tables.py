@@ -19,7 +19,7 @@ from sgft_jax.analysis.curves import (
     transitions_until_held,
     zero_shot,
 )
-from sgft_jax.analysis.stats import Interval, bootstrap_interval, difference_interval
+from sgft_jax.math.stats import Interval, bootstrap_interval, difference_interval
 
 NONE = "-"
 LEGEND = (

@@ -5,8 +5,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.mesh import running_count, set_rows
-from sgft_jax.types import Array, Batch, Key, PyTree, Transition, UserError
+from envs.mesh import running_count, set_rows
+from envs.types import Array, Key, PyTree, Transition, UserError
+from sgft_jax.types import Batch
 
 
 class ReplayState(NamedTuple):

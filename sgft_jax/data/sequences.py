@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from sgft_jax.mesh import running_count, set_rows
-from sgft_jax.types import Array, Batch, Key, Transition, UserError
+from envs.mesh import running_count, set_rows
+from envs.types import Array, Key, Transition, UserError
+from sgft_jax.types import Batch
 
 
 class SequenceState(struct.PyTreeNode):

@@ -7,8 +7,9 @@ come first, but for `beside`.
 import jax
 import jax.numpy as jnp
 
+from envs.types import Array, Key
 from sgft_jax.data import replay, sequences
-from sgft_jax.types import Array, Batch, Key, Source
+from sgft_jax.types import Batch, Source
 
 State = tuple  # (ReplayState or SequenceState, SimulatedData or None)
 

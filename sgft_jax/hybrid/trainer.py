@@ -14,11 +14,12 @@ import jax.numpy as jnp
 
 from envs.base import Env, EnvState, World
 from envs.rollout import Fleet, launch, step_fleet
+from envs.types import Array, Key, PyTree
 from sgft_jax.data import replay
 from sgft_jax.data.replay import ReplayState
 from sgft_jax.hybrid.schedule import Schedule
-from sgft_jax.pretraining import over_members
-from sgft_jax.types import Array, HybridAgent, Key, Metrics, PyTree, RealData
+from sgft_jax.train.pretraining import over_members
+from sgft_jax.types import HybridAgent, Metrics, RealData
 
 # note(learner's state, before, action, after) -> what is kept of one simulated step beside its row
 Note = Callable[[PyTree, EnvState, Array, EnvState], PyTree]

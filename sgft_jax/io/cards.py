@@ -10,8 +10,8 @@ from msgspec import Meta, Struct
 
 import envs
 from envs.files import Count, checked, read_json
-from sgft_jax.io.folders import present
-from sgft_jax.types import UserError
+from envs.types import UserError
+from sgft_jax.files.folders import present
 
 CARD = "prior.json"
 _FIX = "take another prior, or pretrain again"

@@ -25,12 +25,11 @@ import jax.numpy as jnp
 import numpy as np
 from orbax.checkpoint import v1 as ocp
 
-from envs import files
+from envs import files, mesh
 from envs.files import Count
-from sgft_jax import mesh
-from sgft_jax.io import folders
-from sgft_jax.io.jsonfile import jsonable, write_json
-from sgft_jax.types import PyTree, UserError
+from envs.types import PyTree, UserError
+from sgft_jax.files import folders
+from sgft_jax.files.jsonfile import jsonable, write_json
 
 FORMAT = 1
 MANIFEST = "manifest.json"

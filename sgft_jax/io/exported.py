@@ -17,11 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Env
+from envs.types import UserError
 from sgft_jax import export
 from sgft_jax.export import Format, Graph
+from sgft_jax.files.jsonfile import write_json
 from sgft_jax.io import checkpoint, player
-from sgft_jax.io.jsonfile import write_json
-from sgft_jax.types import Prior, UserError
+from sgft_jax.types import Prior
 
 CONTRACT, PLAYER = "contract.json", "policy.py"
 LIMIT = 1e-5  # how far an exported action may be from the trained policy's

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from envs.files import checked, kind_of, parse_json, read_text
-from sgft_jax.io.jsonfile import jsonable, write_json
-from sgft_jax.types import UserError
+from envs.types import UserError
+from sgft_jax.files.jsonfile import jsonable, write_json
 
 METRICS, EVAL, SUMMARY = "metrics.jsonl", "eval.jsonl", "summary.json"
 _LIMIT = 2**30  # bytes of a log

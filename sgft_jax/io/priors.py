@@ -10,16 +10,17 @@ from typing import Any
 import jax
 import numpy as np
 
+from envs import mesh
 from envs.base import Varying
-from sgft_jax import mesh
+from envs.types import PyTree, UserError
+from sgft_jax.files.arrays import check_claim
+from sgft_jax.files.folders import present
+from sgft_jax.files.jsonfile import differences, write_json
 from sgft_jax.io import checkpoint
-from sgft_jax.io.arrays import check_claim
 from sgft_jax.io.cards import CARD, read_card
-from sgft_jax.io.folders import present
-from sgft_jax.io.jsonfile import differences, write_json
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.policies import check_parameters
-from sgft_jax.types import Normalizer, Prior, PyTree, UserError
+from sgft_jax.types import Normalizer, Prior
 
 
 def save_prior(folder: str | Path, prior: Prior) -> Path:

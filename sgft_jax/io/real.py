@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from envs.files import read_text
-from sgft_jax.io.arrays import flags, numbers, read_npz
-from sgft_jax.types import UserError
+from envs.types import UserError
+from sgft_jax.files.arrays import flags, numbers, read_npz
 
 _REAL, _ROLLOUT, _HALF, _STEPS = "real", "rollout-", ".half", ".steps.jsonl"
 _ROWS = ("obs", "action", "reward", "discount", "next_obs")

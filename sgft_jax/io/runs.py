@@ -16,9 +16,9 @@ from typing import Annotated, Any, Literal, TypedDict
 from msgspec import Meta
 
 from envs.files import Schema, read_object
-from sgft_jax.io.folders import ASIDE, Lock, empty
-from sgft_jax.io.jsonfile import differences, write_json
-from sgft_jax.types import UserError
+from envs.types import UserError
+from sgft_jax.files.folders import ASIDE, Lock, empty
+from sgft_jax.files.jsonfile import differences, write_json
 
 CONFIG, PROVENANCE = "config.json", "provenance.json"
 ROOT = Path(__file__).parents[2]  # of the repository, in a checkout

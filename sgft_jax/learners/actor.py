@@ -7,7 +7,8 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.io.jsonfile import jsonable
+from envs.types import Array, Key, Policy, PyTree
+from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import (
     Network,
@@ -20,7 +21,7 @@ from sgft_jax.models.networks import (
     untanh,
 )
 from sgft_jax.models.normalizer import normalize
-from sgft_jax.types import Array, Key, Normalizer, Policy, PyTree
+from sgft_jax.types import Normalizer
 
 _EXPLORE_NOISE = 0.1
 Head = Literal["affine", "gaussian", "deterministic"]

@@ -11,13 +11,14 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from envs.types import Array, Key
 from sgft_jax import checks
 from sgft_jax.data import sources
-from sgft_jax.learners import losses
 from sgft_jax.learners.sac import SACConfig, SACHyper, SACState, make_sac
+from sgft_jax.math import losses
 from sgft_jax.models import ratio
 from sgft_jax.models.config import NetworkConfig, two_layers
-from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Source
+from sgft_jax.types import Batch, Learner, Metrics, Source
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,12 @@ from dataclasses import dataclass, field
 import jax
 import jax.numpy as jnp
 
+from envs.types import Array, Key, PyTree
 from sgft_jax import checks
-from sgft_jax.learners import losses
 from sgft_jax.learners.sac import Critic, CriticTerm, SACConfig, SACHyper, make_sac
+from sgft_jax.math import losses
 from sgft_jax.models.networks import NetworkConfig
-from sgft_jax.types import Array, Batch, Key, Learner, PyTree
+from sgft_jax.types import Batch, Learner
 
 NORM_MIN = 1e-10  # of a gradient; a critic that is flat points nowhere
 

@@ -14,8 +14,10 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from envs.types import Array, Key, PyTree
 from sgft_jax import checks
-from sgft_jax.learners import losses, optim, soft
+from sgft_jax.learners import soft
+from sgft_jax.math import losses, optim
 from sgft_jax.models import normalizer, ratio
 from sgft_jax.models.config import NetworkConfig, two_layers
 from sgft_jax.models.networks import (
@@ -24,7 +26,7 @@ from sgft_jax.models.networks import (
     make_critic,
     tanh_gaussian_sample,
 )
-from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree
+from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
 GAP_MIN = 1e-6  # a pair that looks more real than simulated is not pushed; 1e-45, as published, may flush to 0 / 0
 PENALTY_MAX = 1000.0

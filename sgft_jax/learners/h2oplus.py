@@ -15,9 +15,11 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from envs.types import Array, Key, PyTree, UserError, unknown
 from sgft_jax import checks
-from sgft_jax.learners import edac, iql, losses, optim, soft
-from sgft_jax.learners.value_losses import value_loss
+from sgft_jax.learners import edac, iql, soft
+from sgft_jax.math import losses, optim
+from sgft_jax.math.value_losses import value_loss
 from sgft_jax.models import normalizer, ratio
 from sgft_jax.models.config import NetworkConfig, two_layers
 from sgft_jax.models.networks import (
@@ -27,7 +29,7 @@ from sgft_jax.models.networks import (
     make_value,
     tanh_gaussian_sample,
 )
-from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree, UserError, ValueLoss, unknown
+from sgft_jax.types import Batch, Learner, Metrics, Normalizer, ValueLoss
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 from typing import Any
 
-from sgft_jax.types import Array, Batch, Key, Learner, Metrics, PyTree, UserError
+from envs.types import Array, Key, PyTree, UserError
+from sgft_jax.types import Batch, Learner, Metrics
 
 
 def _act(state: PyTree, carry: PyTree, obs: Array, key: Key, **options: Any) -> tuple[Array, PyTree]:

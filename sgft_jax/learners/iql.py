@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from sgft_jax.learners import losses, optim
+from envs.types import Array, Key, PyTree
+from sgft_jax.math import losses, optim
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import (
     LOG_STD_MAX,
@@ -27,7 +28,7 @@ from sgft_jax.models.networks import (
     make_critic,
     make_value,
 )
-from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree
+from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
 ACTION_MAX = 1 - 1e-5  # a mean that ends in tanh never reaches 1: it would chase such an action forever
 

@@ -13,11 +13,12 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from envs.types import Array, Key, PyTree, UserError
 from sgft_jax import checks
-from sgft_jax.learners import losses, optim
+from sgft_jax.math import losses, optim
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import Network, NetworkConfig, add_noise, make_critic, make_deterministic_actor
-from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree, UserError
+from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
 
 @dataclass(frozen=True)

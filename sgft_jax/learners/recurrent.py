@@ -13,8 +13,10 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from envs.types import Array, Key, PyTree
 from sgft_jax import checks
-from sgft_jax.learners import losses, optim, sac
+from sgft_jax.learners import sac
+from sgft_jax.math import losses, optim
 from sgft_jax.models import normalizer
 from sgft_jax.models.gru import GRU, make_gru
 from sgft_jax.models.networks import (
@@ -26,7 +28,7 @@ from sgft_jax.models.networks import (
     tanh_gaussian_sample,
 )
 from sgft_jax.stacking import stack
-from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree
+from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
 
 @dataclass(frozen=True)

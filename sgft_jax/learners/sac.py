@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from envs.types import Array, Key, PyTree, UserError
 from sgft_jax import checks
-from sgft_jax.learners import losses, optim
+from sgft_jax.math import losses, optim
 from sgft_jax.models import dynamics, normalizer
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.models.networks import (
@@ -31,7 +32,7 @@ from sgft_jax.models.networks import (
     tanh_gaussian_divergence,
     tanh_gaussian_sample,
 )
-from sgft_jax.types import Array, Batch, Key, Learner, Metrics, Normalizer, PyTree, UserError
+from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
 LOG_ALPHA_MIN = -10.0  # dense negative rewards would drive an auto-tuned temperature to zero
 

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from sgft_jax.learners import losses, optim
+from envs.types import Array, Key, PyTree
 from sgft_jax.learners.sac import step_temperature
+from sgft_jax.math import losses, optim
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import Network, tanh_gaussian_action, tanh_gaussian_sample
-from sgft_jax.types import Array, Batch, Key, Metrics, PyTree
+from sgft_jax.types import Batch, Metrics
 
 OUTPUT_GAIN = 0.01  # of the last layers in the released codes: all values and means begin near 0
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from sgft_jax.learners import optim
+from envs.types import Array, Key, PyTree, UserError
 from sgft_jax.learners.tdmpc2_model import (
     NETWORKS,
     Parts,
@@ -27,10 +27,11 @@ from sgft_jax.learners.tdmpc2_model import (
     two_heads,
     v_sim,
 )
+from sgft_jax.math import optim
 from sgft_jax.models import normalizer, twohot
 from sgft_jax.models.networks import check_params, tanh_gaussian_action
 from sgft_jax.planning import mppi
-from sgft_jax.types import Array, Batch, Key, Learner, Metrics, PyTree, UserError
+from sgft_jax.types import Batch, Learner, Metrics
 
 # --- acting ---------------------------------------------------------------------------------------------------------
 

@@ -14,13 +14,14 @@ import optax
 from flax import linen as nn
 from flax import struct
 
+from envs.types import Array, Key, PyTree, UserError, unknown
 from sgft_jax import checks
-from sgft_jax.learners import optim
+from sgft_jax.math import optim
 from sgft_jax.models import normalizer, twohot
 from sgft_jax.models.config import SIZES, Size
 from sgft_jax.models.networks import Network, precision, tanh_gaussian_action
 from sgft_jax.planning import mppi
-from sgft_jax.types import Array, Key, Normalizer, PyTree, UserError, unknown
+from sgft_jax.types import Normalizer
 
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
 NETWORKS = ("encoder", "dynamics", "reward", "policy", "critic")

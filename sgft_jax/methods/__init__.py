@@ -7,9 +7,10 @@ import pkgutil
 from functools import cache
 from typing import Any, get_args
 
-from sgft_jax import extend
+from envs import extend
+from envs.types import UserError, unknown
 from sgft_jax.methods.options import LoopOptions
-from sgft_jax.types import Algorithm, Family, Finetuner, Method, Prior, Task, UserError, unknown
+from sgft_jax.types import Algorithm, Family, Finetuner, Method, Prior, Task
 
 # The order of tables and figures: the ones to try first stand first, what is not listed last.
 _ORDER = (

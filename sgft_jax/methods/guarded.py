@@ -30,7 +30,7 @@ class Config(sac.Config):
     """Share of each batch that is simulated, as in RLPD (Ball et al. 2023); 0 = none."""
     guard: bool = True
     """Deploy what learns only while its real rollouts say that it is better than the policy that it began with, or
-    than its own best since (sgft_jax/guard.py). That policy then plays the training rollouts too."""
+    than its own best since (sgft_jax/train/guard.py). That policy then plays the training rollouts too."""
 
 
 METHOD = Method(

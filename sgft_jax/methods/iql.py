@@ -44,6 +44,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner; the simulator's policy makes data and the initial rollouts, the agent starts from nothing."""
     import jax.numpy as jnp
 
+    from envs.types import Array, Key, PyTree
     from sgft_jax.data import sources
     from sgft_jax.finetuner import FinetuneState, Parts, agents_own, assemble, simulators_actor
     from sgft_jax.learners import iql
@@ -51,7 +52,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.methods.options import card_of
     from sgft_jax.policies import network_of, sac_policy
     from sgft_jax.transforms import compose
-    from sgft_jax.types import Array, Key, PyTree, SimulatedData
+    from sgft_jax.types import SimulatedData
 
     network = network_of(card_of(prior))
     hyper = iql.IQLHyper(

@@ -31,7 +31,7 @@ class LoopOptions:
     """Bound on the norm of each network's gradient; None = no bound."""
     guard: bool = False
     """Deploy what learns only while its real rollouts say that it is better than the policy that it began with, or
-    than its own best since (sgft_jax/guard.py). That policy then plays the training rollouts too."""
+    than its own best since (sgft_jax/train/guard.py). That policy then plays the training rollouts too."""
 
     def __post_init__(self) -> None:
         checks.positive(self, "utd", "max_grad_norm")

@@ -23,13 +23,13 @@ class Config:
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
+    from envs.types import Array, Key, PyTree
     from sgft_jax.data import sources
     from sgft_jax.finetuner import FinetuneState, Parts, assemble
     from sgft_jax.learners.idle import IDLE
     from sgft_jax.methods.options import card_of
     from sgft_jax.policies import make_policy
     from sgft_jax.transforms import compose
-    from sgft_jax.types import Array, Key, PyTree
 
     policy = make_policy(card_of(prior), task)
     loop = LoopOptions(initial_rollouts=config.initial_rollouts)

@@ -38,6 +38,7 @@ class Config(LoopOptions):
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
+    from envs.types import Array, Key, PyTree
     from sgft_jax.data import sources
     from sgft_jax.finetuner import FinetuneState, Parts, assemble, dynamics_models
     from sgft_jax.learners.idle import IDLE
@@ -46,7 +47,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.planning.mpc import MPCConfig
     from sgft_jax.policies import mpc_policy, network_of
     from sgft_jax.transforms import compose
-    from sgft_jax.types import Array, Key, PyTree, SimulatedData
+    from sgft_jax.types import SimulatedData
 
     card = card_of(prior)
     network = network_of(card)

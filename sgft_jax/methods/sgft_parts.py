@@ -1,4 +1,4 @@
-"""SGFT-SAC with each of its parts on or off and all else equal, for `experiments.factorial`.
+"""SGFT-SAC with each of its parts on or off and all else equal, for `experiments.studies.factorial`.
 
 What a kept critic means depends on the parts. Shaped, it is read as Q(s, a) - V_sim(s), which is exact in simulation.
 Unshaped, it is the simulator's Q. Unshaped and shortened, it begins too high, because it promises what comes after the

@@ -8,9 +8,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+from envs.types import Array, UserError
 from sgft_jax import checks
 from sgft_jax.methods.options import LoopOptions
-from sgft_jax.types import Array, Finetuner, Method, Prior, Simulation, Task, UserError
+from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
 
 _ROWS, _FEW = 320, 80  # what `rows` is if it is left open; DROPO takes two trajectories, and so does the slow simulator
 _SIMULATED = 2048  # rows that tell how far the models are off in simulation
@@ -31,7 +32,7 @@ class Config:
     """Real rollouts before the first fit."""
     guard: bool = False
     """Deploy a fit only while its real rollouts say that it is better than the policy that knows nothing of the system,
-    or than the best fit since (sgft_jax/guard.py)."""
+    or than the best fit since (sgft_jax/train/guard.py)."""
 
     def __post_init__(self) -> None:
         checks.at_least(self, 1, "rows", "initial_rollouts")
@@ -42,6 +43,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     import jax
     import jax.numpy as jnp
 
+    from envs.types import Key, PyTree
     from sgft_jax.data import sources
     from sgft_jax.finetuner import FinetuneState, Parts, assemble
     from sgft_jax.learners.idle import IDLE
@@ -52,7 +54,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.models.robust import spread_of
     from sgft_jax.policies import network_of, sac_policy
     from sgft_jax.transforms import compose
-    from sgft_jax.types import Batch, Key, Metrics, PyTree, SimulatedData
+    from sgft_jax.types import Batch, Metrics, SimulatedData
 
     card = card_of(prior)
     network, varying = network_of(card), card.get("system", [])

@@ -68,6 +68,7 @@ def planner(
     """
     import jax
 
+    from envs.types import Array, Key, PyTree
     from sgft_jax.data import sequences, sources
     from sgft_jax.finetuner import FinetuneState, Parts, agents_own, assemble
     from sgft_jax.learners import tdmpc2, tdmpc2_model
@@ -75,7 +76,7 @@ def planner(
     from sgft_jax.methods.options import card_of, warmup
     from sgft_jax.policies import tdmpc2_policy
     from sgft_jax.transforms import compose, stateless
-    from sgft_jax.types import Array, Batch, Key, PyTree, SimulatedData
+    from sgft_jax.types import Batch, SimulatedData
 
     card = card_of(prior)
     plan = {"horizon": config.horizon, "plan_samples": config.plan_samples}

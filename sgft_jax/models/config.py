@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from envs.types import UserError, unknown
 from sgft_jax import checks
-from sgft_jax.types import UserError, unknown
 
 type Precision = Literal["default", "float32", "bfloat16"]
 Activation = Literal["relu", "tanh", "silu", "elu"]

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.types import Array, Transition
 from sgft_jax.models.robust import most_probable
-from sgft_jax.types import Array, Batch, Transition
+from sgft_jax.types import Batch
 
 _TURN, _SCALE, _BIAS = 0.6, 0.4, 0.2  # std of the rotation (rad), log-scales and biases before any data
 _FURTHEST = 2.0  # std of a sensor's error

@@ -4,10 +4,11 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from sgft_jax.learners import losses, optim
+from envs.types import Array, Key, PyTree
+from sgft_jax.math import losses, optim
 from sgft_jax.models.networks import Network
 from sgft_jax.models.normalizer import normalize
-from sgft_jax.types import Array, Batch, Key, Metrics, Normalizer, PyTree
+from sgft_jax.types import Batch, Metrics, Normalizer
 
 
 def predict(network: Network, params: PyTree, normalizer: Normalizer, obs: Array, action: Array) -> Array:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from sgft_jax.types import Array, Key, PyTree
+from envs.types import Array, Key, PyTree
 
 _ACTION, _OBS = 16, 32  # units of the embeddings
 

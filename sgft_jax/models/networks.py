@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
+from envs.types import Array, Key, PyTree, UserError
 from sgft_jax.models.config import NetworkConfig, Precision
-from sgft_jax.types import Array, Key, PyTree, UserError
 
 LOG_STD_MIN, LOG_STD_MAX = -5.0, 2.0
 

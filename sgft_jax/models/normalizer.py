@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 from brax.training.acme import running_statistics
 
-from sgft_jax.types import Array, Normalizer
+from envs.types import Array
+from sgft_jax.types import Normalizer
 
 Statistics = running_statistics.RunningStatisticsState
 

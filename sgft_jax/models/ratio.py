@@ -13,11 +13,12 @@ import chex
 import jax
 import jax.numpy as jnp
 
+from envs.types import Array, Key, PyTree, UserError
 from sgft_jax import checks
-from sgft_jax.learners import losses, optim
+from sgft_jax.math import losses, optim
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import MLP, Network, NetworkConfig
-from sgft_jax.types import Array, Batch, Key, Metrics, Normalizer, PyTree, UserError
+from sgft_jax.types import Batch, Metrics, Normalizer
 
 REAL, SIM = 0, 1  # the two logits of a discriminator
 

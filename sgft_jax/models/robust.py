@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from sgft_jax.types import Array
+from envs.types import Array
 
 _GUESSES, _FOLLOWED = 128, 6  # starting points where the cost has several minima; how many of the best are optimised
 _DEGREES = 3.0  # of freedom of Student's t: no model is right about every step

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs.types import Array, Key, Transition
 from sgft_jax.models.robust import most_probable
-from sgft_jax.types import Array, Key, Transition
 
 _BELIEF = 3**-0.5  # std of a number uniform in [-1, 1]
 _STARTS = 4  # of the search: the middle, and others drawn once

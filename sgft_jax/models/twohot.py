@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from sgft_jax.types import Array, UserError
+from envs.types import Array, UserError
 
 
 @dataclass(frozen=True)

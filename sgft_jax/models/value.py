@@ -6,9 +6,10 @@ It is the mean of the critic over the policy's actions. A critic of SAC counts l
 import jax
 import jax.numpy as jnp
 
+from envs.types import Array, PyTree
 from sgft_jax.models.networks import Network, precision
 from sgft_jax.models.normalizer import normalize
-from sgft_jax.types import Array, Metrics, Normalizer, PyTree
+from sgft_jax.types import Metrics, Normalizer
 
 
 def predict(network: Network, params: PyTree, normalizer: Normalizer, obs: Array) -> Array:

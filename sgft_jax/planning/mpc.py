@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 
+from envs.types import Array, Key, PyTree
 from sgft_jax import checks
 from sgft_jax.learners.sac import SACParams
 from sgft_jax.models import dynamics, value
@@ -23,7 +24,6 @@ from sgft_jax.models.networks import (
 )
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.planning import mppi
-from sgft_jax.types import Array, Key, PyTree
 
 _ITERATIONS = 3  # of the search: half of TD-MPC2's, for plans a quarter as long
 _PROPOSALS, _ELITES = 4, 8  # one of so many samples is the policy's, and an elite

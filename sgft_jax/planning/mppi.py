@@ -10,9 +10,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from envs.types import Array, Key, UserError
 from sgft_jax import checks
 from sgft_jax.models.networks import add_noise
-from sgft_jax.types import Array, Key, UserError
 
 _WORST = -1e9  # finite, so that weights stay defined where no score is
 

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
-from sgft_jax.types import Key, PyTree
+from envs.types import Key, PyTree
 
 if TYPE_CHECKING:
     from envs.rollout import Episode

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from envs.types import UserError
 from sgft_jax.systems.robot_client import LARGEST, SUCCESS, flag, number, numbers, printable, success_of
-from sgft_jax.types import UserError
 
 _PARTS = {"reset": ("observation", "info"), "step": ("observation", "reward", "terminated", "truncated", "info")}
 _KNOWN = (*SUCCESS, "invalid", "late", "sent", "final_obs", "final_info")  # of `info`

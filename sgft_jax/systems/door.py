@@ -8,7 +8,7 @@ import threading
 import time
 from typing import Any
 
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 STRANGERS = 32  # connections that nobody has admitted yet, of four files each; beyond them the oldest is closed
 _NAME = re.compile(r"[A-Za-z0-9_-]+(\.[A-Za-z0-9_-]+)*\.?")

@@ -12,15 +12,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from envs import extend
 from envs.base import Entry, Env
 from envs.history import remember, with_memory
+from envs.mesh import split_vmap
 from envs.rollout import Episode, episode_keys, judged
-from sgft_jax import extend
-from sgft_jax.mesh import split_vmap
+from envs.types import Array, Key, PyTree, Transition, UserError
 from sgft_jax.systems import answers
 from sgft_jax.systems.answers import Answer
 from sgft_jax.systems.robot_client import SUCCESS
-from sgft_jax.types import Array, Key, PyTree, Transition, UserError
 
 if TYPE_CHECKING:
     import gymnasium

@@ -23,10 +23,10 @@ import numpy as np
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
+from envs.types import UserError
 from sgft_jax.systems.door import Door, url
 from sgft_jax.systems.messages import Began, Failed, Hello, Message, Moved, Rested, VersionError, read
 from sgft_jax.systems.robot_client import LIMIT, array, pack, printable
-from sgft_jax.types import UserError
 
 _HELLO = 10.0  # seconds for the first message
 _RESTS = 5  # times a robot is told to rest before it is left alone: without commands it stops by itself

@@ -6,9 +6,9 @@ from typing import Any
 import jax
 
 from envs.base import Env, World
+from envs.mesh import split_vmap
 from envs.rollout import Episode, play_episode
-from sgft_jax.mesh import split_vmap
-from sgft_jax.types import Array, Key, PyTree
+from envs.types import Array, Key, PyTree
 
 
 class Simulated:

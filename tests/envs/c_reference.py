@@ -13,7 +13,7 @@ import numpy as np
 
 from envs.mujoco.scene import Scene
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array
+from envs.types import Array
 
 _COMPILED: dict[int, Any] = {}  # by the identity of a scene, which is kept beside, because it has no hash
 

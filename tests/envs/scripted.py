@@ -17,7 +17,7 @@ import numpy as np
 from envs.franka import arm, hammer, insert, kinematics, push
 from envs.mujoco.scene import Scene
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import Array
+from envs.types import Array
 
 REFERENCE_REFINE, REFERENCE_ITERATIONS = 4, 100
 MOVING = 1.0  # mm: control periods in which the object moved less say little about relative error

@@ -9,7 +9,7 @@ import toy
 import envs
 from envs import effects as env_effects
 from envs.base import Entry
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 KEY = jax.random.key(0)
 ENV = toy.make()._replace(observation=(Entry("xyz", "m", 3),), control_dt=0.2)  # actions [2]

@@ -7,7 +7,7 @@ from typing import Literal, TypedDict
 import pytest
 
 from envs import files
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 DEEP = "[" * 100_000
 

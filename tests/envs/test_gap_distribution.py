@@ -10,7 +10,7 @@ import toy
 import envs
 from envs import gap_distribution, gaps
 from envs.base import Effects
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 ENV = toy.make()
 TEXT = """

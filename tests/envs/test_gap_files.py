@@ -10,7 +10,7 @@ from envs import effects, gaps
 from envs.base import Entry
 from envs.franka import hammer, insert
 from envs.gaps import Gap
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 ENV = toy.make()
 

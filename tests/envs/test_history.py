@@ -9,7 +9,7 @@ import toy
 import envs
 from envs.history import with_previous_actions
 from envs.rollout import play_episode
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 N, TOY = 2, toy.make()
 

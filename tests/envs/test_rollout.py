@@ -12,7 +12,7 @@ import toy_terminating
 
 import envs
 from envs.rollout import counted, launch, pick, play_episode, pool_size, step_fleet
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 N = 64
 

@@ -13,7 +13,7 @@ from envs import gaps
 from envs.base import EnvState
 from envs.franka import arm, ball, push, towel
 from envs.pools import real_env
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 KEY = jax.random.key(0)
 NAMES = {"push-towel": "towel", "push-ball": "ball"}

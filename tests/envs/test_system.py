@@ -11,7 +11,7 @@ from envs.base import Varying
 from envs.history import with_previous_actions
 from envs.rollout import play_episode
 from envs.system import blurred, concealed, models_of, varying, with_system
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 TOY = toy.make()
 EFFECTS = {"action_scale": [[0.5, 1.0], [1.5, 1.0]], "action_rotation": [-0.4, 0.4], "obs_noise": 0.01}

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import pytest
 
 import envs
+from envs import extend
 from envs.base import Entry, Parameter, World
 from envs.mujoco.scene import Measured, make_env
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax import extend
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 EXAMPLE = extend.load("task", str(Path(__file__).parents[2] / "docs/examples/own_task.py"), "make")
 SCENE = EXAMPLE.SCENE

@@ -5,7 +5,7 @@ import os
 import pytest
 
 import envs
-from experiments import cli
+from experiments.runner import cli
 
 
 @pytest.fixture

@@ -2,8 +2,8 @@
 
 import jax
 
+from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io import priors
-from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.learners.sac import SACConfig, extract_params, make_sac
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.types import Prior

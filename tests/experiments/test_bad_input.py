@@ -5,19 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from experiments import (
-    bullet,
-    collect,
-    diagnose,
-    evaluate,
-    export,
-    export_data,
-    figures,
-    gaps,
-    replay,
-    scoreboard,
-)  # fmt: skip
-from sgft_jax.types import UserError
+from envs.types import UserError
+from experiments import collect, diagnose, evaluate, export, export_data, figures, gaps, replay
+from experiments.studies import bullet, scoreboard  # fmt: skip
 
 PRIOR = Path(__file__).parents[2] / "docs/priors/push/seed-0"
 

@@ -13,10 +13,10 @@ from priors_by_hand import save_prior
 
 from envs.franka import hammer
 from envs.mujoco.worlds import PhysicsState
+from envs.types import UserError
 from experiments.bench import other_sac, physics, training, updates
 from experiments.bench.timing import fastest, fastest_in_turns, measure
 from experiments.benchmark import BenchmarkConfig, main
-from sgft_jax.types import UserError
 
 
 def test_the_fastest_call_counts_without_the_first(monkeypatch):

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from experiments import bullet, panda_gym
-from experiments.bullet import BulletArgs
-from sgft_jax.types import UserError
+from envs.types import UserError
+from experiments.runner import panda_gym
+from experiments.studies import bullet
+from experiments.studies.bullet import BulletArgs
 
 ROOT = Path(__file__).parents[2]
 PRIOR = ROOT / "docs/priors/panda-push"

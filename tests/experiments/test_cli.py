@@ -9,8 +9,8 @@ from typing import Literal
 import jax
 import pytest
 
-from experiments import cli
-from sgft_jax.types import UserError
+from envs.types import UserError
+from experiments.runner import cli
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,7 +223,7 @@ def test_an_interrupt_tells_how_to_go_on(config_type, more, capsys):
 
 
 PROGRAM = (
-    "import dataclasses, errno, os, signal, sys, threading, time\nfrom experiments import cli\n"
+    "import dataclasses, errno, os, signal, sys, threading, time\nfrom experiments.runner import cli\n"
     "@dataclasses.dataclass(frozen=True)\nclass Long:\n    resume: bool = False\n"
     "def main(config):\n    {}\n"
     "cli.run_main(main, Long, 'd', argv=[])\n"
@@ -304,7 +304,7 @@ def test_who_reads_the_output_may_leave(main, argv, read, code, words):
     120 is Python's own code where it cannot print what is left.
     """
     program = (
-        "import dataclasses, os; from experiments import cli\n"
+        "import dataclasses, os; from experiments.runner import cli\n"
         "@dataclasses.dataclass(frozen=True)\nclass C:\n    x: int = 1\n"
         "reader, other = os.pipe(); os.close(reader)\n"
         f"cli.run_main({main}, C, 'd', argv={argv})\n"
@@ -404,7 +404,7 @@ def test_the_users_backend_is_tried_alone_and_for_real():
 
 def test_a_variable_that_jax_cannot_read_is_named_in_one_line():
     code = (
-        "from experiments import cli, demo; "
+        "from experiments import demo; from experiments.runner import cli; "
         "cli.run_main(lambda args: __import__('jax'), demo.DemoArgs, 'Tries.', argv=[])"
     )
     environ = os.environ | {"JAX_ENABLE_X64": "banana"}

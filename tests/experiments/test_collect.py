@@ -9,10 +9,11 @@ import jax
 import numpy as np
 import pytest
 
-from experiments import collect, collect_run, hybrid
-from sgft_jax.data import acceptance, logs, recording
-from sgft_jax.data.recording import Joints, Noted, Recorded
-from sgft_jax.types import Transition, UserError
+from envs.types import Transition, UserError
+from experiments import collect, hybrid
+from experiments.runner import collect_run
+from sgft_jax.datasets import acceptance, logs, recording
+from sgft_jax.datasets.recording import Joints, Noted, Recorded
 
 OPTIONS = """--task toy --level -100 --transitions 50 --seeds 2 --environments 3 --updates 60 --eval-every 30
     --eval-episodes 2"""

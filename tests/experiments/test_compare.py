@@ -6,10 +6,11 @@ from dataclasses import replace
 import pytest
 
 import envs
-from experiments import cli, compare, grid
+from envs.types import UserError
+from experiments import compare
+from experiments.runner import cli, grid
 from sgft_jax.io import checkpoint
 from sgft_jax.io.runs import Lock
-from sgft_jax.types import UserError
 
 GRID = {"tasks": ("push", "insert"), "methods": ("sgft-sac", "rlpd"), "seeds": 2, "rollouts": 10}
 

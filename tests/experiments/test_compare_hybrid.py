@@ -6,12 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from experiments import cli, compare_hybrid
-from experiments.hybrid_args import run_folder
+from envs.types import UserError
+from experiments import compare_hybrid
+from experiments.runner import cli
+from experiments.runner.hybrid_args import run_folder
 from sgft_jax.analysis import figures
-from sgft_jax.io.jsonfile import jsonable
+from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io.runs import FORMAT
-from sgft_jax.types import UserError
 
 METHODS = ("h2oplus", "sac", "iql", "rebrac:walker2d-medium")
 

@@ -6,9 +6,9 @@ import pytest
 from runs_by_hand import save
 
 import envs
+from envs.types import UserError
 from experiments import demo
 from sgft_jax.analysis.curves import read_runs
-from sgft_jax.types import UserError
 
 
 class Beside:

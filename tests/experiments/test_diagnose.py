@@ -5,7 +5,8 @@ import pytest
 from priors_by_hand import save_prior
 from runs_by_hand import save
 
-from experiments import cli, diagnose
+from experiments import diagnose
+from experiments.runner import cli
 from sgft_jax.io.real import RealStore
 
 pytestmark = pytest.mark.usefixtures("toy_task")

@@ -9,7 +9,8 @@ import pytest
 from priors_by_hand import save_prior
 
 from envs.rollout import Episode
-from experiments import cli, evaluate, evaluation
+from experiments import evaluate
+from experiments.runner import cli, evaluation
 
 pytestmark = pytest.mark.usefixtures("toy_task")
 

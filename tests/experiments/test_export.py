@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from priors_by_hand import save_prior
 
-from experiments import cli, export
+from experiments import export
 from experiments.export import ExportArgs
+from experiments.runner import cli
 from sgft_jax import api
 
 PLAY = """

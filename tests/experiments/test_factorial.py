@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 import runs_by_hand
 
-from experiments import cli, factorial, figures, grid
-from experiments.factorial import FactorialArgs
+from envs.types import UserError
+from experiments import figures
+from experiments.runner import cli, grid
+from experiments.studies import factorial
+from experiments.studies.factorial import FactorialArgs
 from sgft_jax.io import checkpoint
-from sgft_jax.types import UserError
 
 ARGS = FactorialArgs(tasks=("push",), reals=("default",), seeds=4, rollouts=4)
 

@@ -6,7 +6,8 @@ import sys
 import pytest
 from runs_by_hand import save
 
-from experiments import cli, figures
+from experiments import figures
+from experiments.runner import cli
 from sgft_jax.analysis import figures as drawing
 
 

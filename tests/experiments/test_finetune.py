@@ -21,11 +21,13 @@ from priors_by_hand import save_prior
 import envs
 from envs import gaps
 from envs.rollout import Episode, play_episode
-from experiments import cli, evaluate, finetune, finetune_run
-from experiments.finetune_args import FinetuneArgs, arguments, run_folder
-from experiments.finetune_record import Record
-from experiments.recorded import RecordedSystem
-from sgft_jax import api, train
+from envs.types import Transition, UserError
+from experiments import evaluate, finetune
+from experiments.runner import cli, finetune_run
+from experiments.runner.finetune_args import FinetuneArgs, arguments, run_folder
+from experiments.runner.finetune_record import Record
+from experiments.runner.recorded import RecordedSystem
+from sgft_jax import api
 from sgft_jax.analysis.curves import read_curve, training_score
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import read_jsonl
@@ -34,7 +36,7 @@ from sgft_jax.io.real import RealStore
 from sgft_jax.methods import get_method
 from sgft_jax.policies import make_policy
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.types import Transition, UserError
+from sgft_jax.train import finetuning
 
 TESTS = Path(__file__).parent.parent
 GAP = "[params]\nmass = 2.0\nfriction = 4.0\n[effects]\naction_rotation = 0.52\n"
@@ -49,8 +51,8 @@ import os, signal, sys
 import envs
 envs.TASKS["toy"] = "toy"
 from experiments import finetune
-from experiments.finetune_record import Record
-from sgft_jax import train
+from experiments.runner.finetune_record import Record
+from sgft_jax.train import finetuning
 from sgft_jax.io.real import RealStore
 def die():
     os.kill(os.getpid(), signal.SIGKILL)
@@ -71,7 +73,7 @@ def logged(self, done, values):
 Record.metrics = logged
 """
 OFFLINE = """
-train.OFFLINE_PART = 10
+finetuning.OFFLINE_PART = 10
 checkpoint = Record.checkpoint
 def offline(self, progress, step):
     checkpoint(self, progress, step)
@@ -354,7 +356,7 @@ def test_a_guarded_run_killed_and_resumed_is_bit_for_bit_uninterrupted(home, tmp
 @pytest.mark.slow
 def test_killed_in_the_offline_phase_and_resumed_ends_as_if_uninterrupted(home, tmp_path, monkeypatch, capsys):
     """SIGKILL when one of two real systems has a checkpoint after 20 of 40 updates, the other only after 10."""
-    monkeypatch.setattr(train, "OFFLINE_PART", 10)
+    monkeypatch.setattr(finetuning, "OFFLINE_PART", 10)
     more = ["--rollouts", "2", "--options.offline-updates", "40"]
     whole, parts = (argv(home, "iql", *more, out=tmp_path / o, reals=("turned", "heavy")) for o in ("whole", "parts"))
     finetune.main(whole)
@@ -379,7 +381,7 @@ def test_a_rollout_is_on_disk_before_learning_from_it(home, tmp_path, monkeypatc
     def crash(*_):
         raise RuntimeError("the learner died")
 
-    monkeypatch.setattr(train._Steps, "_observe", crash)
+    monkeypatch.setattr(finetuning._Steps, "_observe", crash)
     with pytest.raises(RuntimeError, match="the learner died"):
         finetune.main(argv(home, "sac", out=tmp_path))
     real = rollouts(tmp_path / "finetune/toy/turned/sac/seeds-0-1")

@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 
 from envs import gaps
-from experiments import cli, frozen, grid
+from envs.types import UserError
+from experiments.runner import cli, grid
+from experiments.studies import frozen
 from sgft_jax.methods import NAMES
-from sgft_jax.types import UserError
 
 
 @pytest.fixture(autouse=True)
@@ -245,7 +246,7 @@ def test_a_process_does_one_unit_on_its_gpu(tmp_path, monkeypatch):
     args = frozen.FrozenArgs(out=tmp_path / "a b", gpus=1, priors=3, split=2)
     unit = every(out=args.out, split=2)["push/sac.1"]
     frozen.Pool(args, [unit]).work()
-    assert seen["words"][1:3] == ["-m", "experiments.frozen"] and seen["env"]["CUDA_VISIBLE_DEVICES"] == "0"
+    assert seen["words"][1:3] == ["-m", "experiments.studies.frozen"] and seen["env"]["CUDA_VISIBLE_DEVICES"] == "0"
     told = cli.parse(frozen.FrozenArgs, "", seen["words"][3:])
     assert (told.unit, told.split, told.priors, told.out) == ("push/sac.1", 2, 3, tmp_path / "a b")
     assert Path(seen["stdout"].name) == args.out / "frozen/push-sac.1.log"

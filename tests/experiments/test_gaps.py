@@ -5,7 +5,8 @@ import json
 import pytest
 from priors_by_hand import save_prior
 
-from experiments import gaps, gaps_run
+from experiments import gaps
+from experiments.runner import gaps_run
 
 FILES = {
     "turned": "[params]\nmass = 1.0\nfriction = 4.0\n[effects]\naction_rotation = 0.3\n",

@@ -4,8 +4,8 @@ import pytest
 
 from envs import gaps
 from envs.gaps import Gap
-from experiments import gaps_choose
-from sgft_jax.types import UserError
+from envs.types import UserError
+from experiments.studies import gaps_choose
 
 
 def line(stratum, *families, admitted=None):

@@ -12,11 +12,12 @@ from priors_by_hand import save_prior
 import envs
 from envs import gap_distribution, gaps
 from envs.files import read_json
-from experiments import cli, gaps_draw
+from envs.types import UserError
 from experiments import gaps as command
+from experiments.runner import cli
+from experiments.studies import gaps_draw
 from sgft_jax import policies
 from sgft_jax.identify import interface
-from sgft_jax.types import UserError
 
 TEXT = """
 [actuation]

@@ -15,11 +15,12 @@ import toy_gymnasium
 from toy_gymnasium import NAME, BrokenError, Turned
 
 import envs
-from experiments import cli, diagnose, evaluate, finetune, real_systems
+from envs.types import UserError
+from experiments import diagnose, evaluate, finetune
+from experiments.runner import cli, real_systems
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.priors import load_prior
 from sgft_jax.io.real import RealStore
-from sgft_jax.types import UserError
 
 T, ROLLOUTS, EPISODES = 20, 4, 3  # steps of an episode, rollouts of a run, episodes of an evaluation
 OPTIONS = f"""--task toy --method sac --seeds 2 --rollouts {ROLLOUTS} --eval-every 2 --eval-episodes {EPISODES}

@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 import envs
-from experiments import hosts, pretrain
-from sgft_jax import mesh
+from envs import mesh
+from envs.types import UserError
+from experiments import pretrain
+from experiments.runner import hosts
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.priors import load_prior
-from sgft_jax.types import UserError
 
 TESTS = Path(__file__).parent.parent
 OPTIONS = """--task toy --preset cpu --no-video --no-report --config.n-envs 32 --config.worlds 16

@@ -9,13 +9,13 @@ import pytest
 import toy
 
 import sgft_jax
+from envs.types import UserError
 from experiments import hybrid
-from experiments.hybrid_args import data_name, run_folder
-from experiments.hybrid_run import in_words, intervals
+from experiments.runner.hybrid_args import data_name, run_folder
+from experiments.runner.hybrid_run import in_words, intervals
 from sgft_jax.analysis import figures
 from sgft_jax.hybrid.scores import normalised
 from sgft_jax.io.log import MetricsLog, read_jsonl
-from sgft_jax.types import UserError
 
 OPTIONS = """--task toy --seeds 2 --no-video --schedule.updates 24 --schedule.simulators 2 --schedule.buffer 64
     --schedule.chunk-updates 6 --eval-every 12 --eval-episodes 2 --checkpoint-every 6 --options.hidden 16
@@ -202,7 +202,7 @@ def test_presets_are_the_defaults_of_their_options():
 def parsed(words, monkeypatch):
     """The arguments with which a command line runs, and what it says before JAX starts."""
     seen = []
-    monkeypatch.setattr("experiments.hybrid_run.run", lambda args, method, seeds: seen.append(args))
+    monkeypatch.setattr("experiments.runner.hybrid_run.run", lambda args, method, seeds: seen.append(args))
     hybrid.main(words.split())
     return seen[0]
 

@@ -12,15 +12,16 @@ import toy
 from jax.sharding import PartitionSpec
 
 import envs
+from envs import mesh
 from envs.mujoco.engines import c as engine_c
 from envs.mujoco.worlds import PhysicsState
-from experiments import cli, pretrain
-from sgft_jax import mesh
+from envs.types import UserError
+from experiments import pretrain
+from experiments.runner import cli
 from sgft_jax.data import replay
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.presets import PretrainConfig
-from sgft_jax.pretraining import make_programs, spread_replay, training_pools
-from sgft_jax.types import UserError
+from sgft_jax.train.pretraining import make_programs, spread_replay, training_pools
 
 CONFIG = PretrainConfig(
     n_envs=16, worlds=8, random_transitions=64, replay_capacity=128, batch_size=32, updates_per_step=2, chunk_steps=24,

@@ -7,23 +7,14 @@ import pytest
 from priors_by_hand import save_prior
 
 import envs
-from experiments import (
-    cli,
-    diagnose,
-    evaluate,
-    export,
-    export_data,
-    finetune_args,
-    grid,
-    replay,
-    tuned,
-)
-from experiments.options import prior_folders, task_of_priors
+from envs.types import UserError
+from experiments import diagnose, evaluate, export, export_data, replay
+from experiments.runner import cli, finetune_args, grid, tuned
+from experiments.runner.options import prior_folders, task_of_priors
 from sgft_jax import api
 from sgft_jax.analysis import release
-from sgft_jax.io.folders import ASIDE
+from sgft_jax.files.folders import ASIDE
 from sgft_jax.io.priors import load_prior
-from sgft_jax.types import UserError
 
 pytestmark = pytest.mark.usefixtures("toy_task")
 

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 import pytest
 from priors_by_hand import save_prior
 
-from experiments import memory, options
-from experiments.memory import reserve
-from experiments.options import prior_folders, seed_list, seeds_name
-from sgft_jax.types import UserError
+from envs.types import UserError
+from experiments.runner import memory, options
+from experiments.runner.memory import reserve
+from experiments.runner.options import prior_folders, seed_list, seeds_name
 
 
 def test_names_of_seeds():

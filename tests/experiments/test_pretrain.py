@@ -15,11 +15,12 @@ import toy
 import envs
 from envs import gaps
 from experiments import pretrain
-from sgft_jax import api, train
+from sgft_jax import api
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import MetricsLog, read_jsonl
 from sgft_jax.io.priors import load_prior
 from sgft_jax.presets import PRESETS
+from sgft_jax.train import finetuning
 
 TESTS = Path(__file__).parent.parent
 OPTIONS = """--task toy --preset cpu --no-video --config.n-envs 32 --config.worlds 16 --config.env-steps 10240
@@ -126,9 +127,9 @@ def test_sgft_recovers_from_a_turned_command_frame(finished):
     tuning = api.setup(env, gap, priors, method="sgft-sac", seeds=4, critic_warmup=100, actor_ramp=0, **options)
 
     def success(policy, states):
-        return np.asarray(train.evaluate(policy, tuning.system, states, tuning.seeds, 16).success.mean(1))
+        return np.asarray(finetuning.evaluate(policy, tuning.system, states, tuning.seeds, 16).success.mean(1))
 
-    steps = train.finetune(*tuning, rollouts=8)
+    steps = finetuning.finetune(*tuning, rollouts=8)
     begun, _ = next(steps)
     before = success(tuning.finetuner, begun.agent)
     *_, (ended, _) = steps

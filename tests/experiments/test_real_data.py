@@ -13,13 +13,14 @@ from test_finetune import complaint, killed, rollouts, same_results
 from envs import gaps
 from envs.history import with_previous_actions
 from envs.pools import real_worlds
-from experiments import cli, export_data, finetune, replay, replay_draw
-from experiments.rollouts import episodes_of
-from sgft_jax import train
-from sgft_jax.data import logs
+from envs.types import UserError
+from experiments import export_data, finetune, replay
+from experiments.runner import cli, replay_draw
+from experiments.runner.rollouts import episodes_of
+from sgft_jax.datasets import logs
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.real import RealStore
-from sgft_jax.types import UserError
+from sgft_jax.train import finetuning
 
 ENV, STEPS = toy.make(), 5
 GAP = "[params]\nmass = 2.0\n[effects]\naction_rotation = 0.52\n"
@@ -29,7 +30,7 @@ OPTIONS = """--task toy --method sac --rollouts 2 --checkpoint-every 1 --no-vide
     --options.replay-capacity 64"""
 # iql learns from the simulator first: killed in that phase, then among the updates on logs.
 KILL = """
-train.OFFLINE_PART = 10
+finetuning.OFFLINE_PART = 10
 checkpoint = Record.checkpoint
 def offline(self, progress, step):
     checkpoint(self, progress, step)
@@ -224,7 +225,7 @@ def test_logs_of_another_task_are_refused(words, tmp_path, capsys):
 @pytest.mark.parametrize("updates", [20, 30])
 def test_killed_before_or_among_the_updates_on_logs(words, tmp_path, updates, monkeypatch):
     """The end is the same to the bit; episodes of the logs are kept once."""
-    monkeypatch.setattr(train, "OFFLINE_PART", 10)
+    monkeypatch.setattr(finetuning, "OFFLINE_PART", 10)
     simulated = ["--options.offline-updates", "20", "--options.simulated-transitions", "80", "--eval-episodes", "2"]
     more = ["--method", "iql", *simulated, "--real-updates", "20", "--out"]
     common = [word for word in words(seeds=2) if "critic-warmup" not in word]

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from priors_by_hand import save_prior
 
-from experiments import panda_gym, real_demo
+from envs.types import UserError
+from experiments import real_demo
 from experiments.real_demo import RealDemoArgs
-from sgft_jax.types import UserError
+from experiments.runner import panda_gym
 
 ROOT = Path(__file__).parents[2]
 PRIOR = ROOT / "docs/priors/panda-push/seed-0"  # it is only looked for

@@ -1,16 +1,17 @@
-"""The trouble that `experiments.reliability` makes, and how it counts what became of it."""
+"""The trouble that `experiments.studies.reliability` makes, and how it counts what became of it."""
 
 import errno
 
 import numpy as np
 import pytest
 
-from experiments import cli, reliability
-from experiments.reliable import ledger, quick_task, timing
-from experiments.reliable.ledger import Made, audit
-from experiments.reliable.robot import Rail
+from envs.types import UserError
+from experiments.runner import cli
+from experiments.studies import reliability
+from experiments.studies.reliable import ledger, quick_task, timing
+from experiments.studies.reliable.ledger import Made, audit
+from experiments.studies.reliable.robot import Rail
 from sgft_jax.io.real import RealStore
-from sgft_jax.types import UserError
 
 
 def steps(*numbers):

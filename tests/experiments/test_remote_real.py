@@ -22,12 +22,13 @@ pytest.importorskip("gymnasium", reason="make setup EXTRAS=dev, or pip install '
 
 from envs.adapters.gymnasium import TaskEnv
 from envs.gaps import Gap
-from experiments import cli, evaluate, finetune, finetune_args, grid, real_systems
-from experiments.recorded import RecordedSystem
+from envs.types import Policy, UserError
+from experiments import evaluate, finetune
+from experiments.runner import cli, finetune_args, grid, real_systems
+from experiments.runner.recorded import RecordedSystem
 from sgft_jax.io.real import RealStore
 from sgft_jax.systems.gymnasium import Gymnasium
 from sgft_jax.systems.robot_client import RefusedError, play
-from sgft_jax.types import Policy, UserError
 
 TASK = str(Path(toy.__file__).resolve())
 T = 20

@@ -5,7 +5,7 @@ import pytest
 import toy
 
 import envs
-from experiments.report import make_report, numbers
+from experiments.runner.report import make_report, numbers
 from sgft_jax.learners.sac import SACConfig, extract_params, make_sac
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.policies import sac_policy

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import runs_by_hand
 
-from experiments import scoreboard
-from experiments.scoreboard import ScoreboardArgs
-from sgft_jax.types import UserError
+from envs.types import UserError
+from experiments.studies import scoreboard
+from experiments.studies.scoreboard import ScoreboardArgs
 
 SET = """
 [easy]

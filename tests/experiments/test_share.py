@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from priors_by_hand import save_prior
 
+from envs.types import UserError
 from experiments import share
 from experiments.share import ShareArgs, rounded
 from sgft_jax.io.priors import load_prior
-from sgft_jax.types import UserError
 
 ROOT = Path(__file__).parents[2]
 

@@ -10,8 +10,8 @@ import toy_terminating
 import envs
 from envs import gaps
 from envs.franka import insert
+from envs.types import UserError
 from experiments import tasks
-from sgft_jax.types import UserError
 
 
 def said(capsys, *given, **options):

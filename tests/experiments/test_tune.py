@@ -11,13 +11,15 @@ import pytest
 from priors_by_hand import save_prior
 
 from envs import gaps
-from experiments import cli, compare, finetune, grid, spaces, tune, tuned
-from experiments.finetune_args import arguments, resolved, run_folder, with_settings
+from envs.types import UserError
+from experiments import compare, finetune
+from experiments.runner import cli, grid, tuned
+from experiments.runner.finetune_args import arguments, resolved, run_folder, with_settings
+from experiments.studies import spaces, tune
+from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io import checkpoint
-from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.runs import FORMAT
 from sgft_jax.methods import get_method
-from sgft_jax.types import UserError
 
 STEPS = 20  # of an episode
 SYSTEMS = ("mild", "soft", "default")
@@ -332,7 +334,7 @@ def test_a_comparison_of_tuned_methods(tmp_path, ran):
 
 
 def test_a_tuned_comparison_must_be_fair(tmp_path, ran):
-    command = r"python -m experiments.tune --tasks toy --methods"
+    command = r"python -m experiments.studies.tune --tasks toy --methods"
     with pytest.raises(UserError, match=rf"tuned/toy holds no options for sac, sgft-sac; .*{command} sac sgft-sac$"):
         compare.compare(grid_of(tmp_path))
     choose(tmp_path, "sac")

@@ -12,9 +12,9 @@ import test_train
 from test_train import FINE, PRIORS, SEEDS, make, run, simulated
 from tuners import bits
 
-from sgft_jax.learner_process import LearnerProcess, cores
-from sgft_jax.train import Updates, prior_of
-from sgft_jax.types import UserError
+from envs.types import UserError
+from sgft_jax.train.finetuning import Updates, prior_of
+from sgft_jax.train.learner_process import LearnerProcess, cores
 
 WHICH = prior_of(PRIORS, SEEDS)
 

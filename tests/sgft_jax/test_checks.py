@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
+from envs.types import UserError
 from sgft_jax import checks
-from sgft_jax.types import UserError
 
 
 @dataclasses.dataclass

@@ -16,10 +16,11 @@ import pytest
 import toy
 
 from envs import gaps
-from sgft_jax import api, pretraining, train
+from sgft_jax import api
 from sgft_jax.methods import DEFAULT
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.presets import PretrainConfig
+from sgft_jax.train import finetuning, pretraining
 
 ENV, ROLLOUTS, SEEDS = toy.make(), 6, 6
 MARGIN, RETURN_MARGIN = 0.03, 0.2  # how far mean success, and the mean return of 13.3, may ever fall
@@ -44,8 +45,8 @@ def falls(prior, method, **options):
     """How far mean success and mean return of what is deployed ever fall below the start, on the simulator itself."""
     setup = api.setup(ENV, gaps.load(ENV, "sim"), prior, method=method, seeds=SEEDS, **options)
     found = []
-    for progress, _ in train.finetune(*setup, rollouts=ROLLOUTS):
-        episodes = train.evaluate(setup.finetuner, setup.system, progress.agent, setup.seeds, 20)
+    for progress, _ in finetuning.finetune(*setup, rollouts=ROLLOUTS):
+        episodes = finetuning.evaluate(setup.finetuner, setup.system, progress.agent, setup.seeds, 20)
         found.append([episodes.success.mean(), episodes.total_reward.mean()])
     found = np.array(found)  # [evaluations, 2]
     assert len(found) == 1 + ROLLOUTS and found[0, 0] > 0.97  # else there is nothing to lose

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax import evidence
+from sgft_jax.train import evidence
 
 AGENT = SimpleNamespace(export=lambda agent: agent)
 BOOM = None  # a rollout that exploded, after two steps of -1

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import pytest
 
 import envs
-from sgft_jax import extend
-from sgft_jax.types import UserError
+from envs import extend
+from envs.types import UserError
 
 OWN = "from envs.franka import push\nmake = push.make\n"
 TOY = """import jax.numpy as jnp

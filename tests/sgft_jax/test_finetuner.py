@@ -9,6 +9,7 @@ import pytest
 import tuners
 from tuners import METHODS, NET, TASK, T, compiled, equal, prior, started, tuner
 
+from envs.types import Policy, UserError
 from sgft_jax import finetuner, transforms
 from sgft_jax.data import sources
 from sgft_jax.finetuner import Parts, assemble
@@ -17,7 +18,7 @@ from sgft_jax.methods.options import LoopOptions
 from sgft_jax.models import dynamics, networks, normalizer
 from sgft_jax.policies import make_policy
 from sgft_jax.transforms import compose, stateless
-from sgft_jax.types import Learner, Policy, Transform, UserError
+from sgft_jax.types import Learner, Transform
 
 OBS = jnp.array([0.3, -0.4])
 

@@ -9,7 +9,7 @@ import pytest
 import tuners
 from tuners import METHODS, T, bits, equal, prior
 
-from sgft_jax import guard
+from sgft_jax.train import guard
 
 RUNS, ROLLOUTS = 4000, 20
 OBS = jnp.array([0.3, -0.8])

@@ -14,14 +14,15 @@ from envs.base import Entry
 from envs.gaps import Gap
 from envs.history import with_previous_actions
 from envs.pools import real_worlds
+from envs.types import Policy, UserError
 from sgft_jax import api
 from sgft_jax.learners.sac import SACConfig, extract_params, make_sac
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.systems import System
 from sgft_jax.systems.gymnasium import Gymnasium, seed_of
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.train import finetune
-from sgft_jax.types import Policy, Prior, UserError
+from sgft_jax.train.finetuning import finetune
+from sgft_jax.types import Prior
 
 gymnasium = pytest.importorskip("gymnasium", reason="make setup EXTRAS=dev, or pip install 'sgft-jax[gymnasium]'")
 

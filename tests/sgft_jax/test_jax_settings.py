@@ -8,8 +8,8 @@ import jax
 import pytest
 
 import envs
-from sgft_jax import mesh
-from sgft_jax.types import UserError
+from envs import mesh
+from envs.types import UserError
 
 
 def test_float64_is_refused_before_a_task_is_made():
@@ -19,7 +19,7 @@ def test_float64_is_refused_before_a_task_is_made():
 
 @pytest.mark.parametrize("platform", ["rocm", "nonsense"])  # no machine of ours has devices of that maker
 def test_so_is_a_platform_that_is_not_there(platform):
-    program = "from sgft_jax import mesh, types\ntry: mesh.check_jax()\nexcept types.UserError as error: print(error)\n"
+    program = "from envs import mesh, types\ntry: mesh.check_jax()\nexcept types.UserError as error: print(error)\n"
     environment = {**os.environ, "JAX_PLATFORMS": platform}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
     assert done.stdout.startswith(f"JAX_PLATFORMS={platform}: ") and done.stdout.count("\n") == 1

@@ -8,11 +8,11 @@ import pytest
 import tuners
 from tuners import METHODS, T
 
+from envs.types import UserError
 from sgft_jax import methods, transforms
 from sgft_jax.data import sources
 from sgft_jax.methods import options as rules
 from sgft_jax.methods import sgft_relabel, sgft_sac
-from sgft_jax.types import UserError
 
 each_method = pytest.mark.parametrize("name", METHODS)
 

@@ -13,15 +13,16 @@ import toy_terminating
 from flax import struct
 
 import envs
-from sgft_jax import pretraining, recipes
+from envs.types import UserError
 from sgft_jax.data import replay
 from sgft_jax.learners import tdmpc2_model
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.policies import make_policy
 from sgft_jax.presets import PRESETS, PretrainConfig
-from sgft_jax.pretraining import Best, keep_better, over_members, pretrain, priors_of
-from sgft_jax.types import Learner, UserError
+from sgft_jax.train import pretraining, recipes
+from sgft_jax.train.pretraining import Best, keep_better, over_members, pretrain, priors_of
+from sgft_jax.types import Learner
 
 N, STEPS, LENGTH = 16, 30, toy_terminating.LENGTH
 CONFIG = PretrainConfig(

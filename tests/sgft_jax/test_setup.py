@@ -6,7 +6,7 @@ import pytest
 
 import envs
 import sgft_jax
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 SHIPPED = Path(__file__).parents[2] / "docs/priors/hammer/seed-0"
 

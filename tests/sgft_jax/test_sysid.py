@@ -13,8 +13,9 @@ import envs
 from envs.base import Varying
 from envs.rollout import play_episode
 from envs.system import concealed, with_system
+from envs.types import Transition, UserError
 from sgft_jax import api
-from sgft_jax.io.jsonfile import jsonable
+from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io.priors import load_prior, observed, save_prior
 from sgft_jax.learners import sac
 from sgft_jax.methods import get_method
@@ -22,8 +23,8 @@ from sgft_jax.models import dynamics, system
 from sgft_jax.models.networks import make_dynamics
 from sgft_jax.policies import make_policy, network_of
 from sgft_jax.presets import PretrainConfig
-from sgft_jax.pretraining import prior_card
-from sgft_jax.types import Normalizer, Prior, SimulatedData, Transition, UserError
+from sgft_jax.train.pretraining import prior_card
+from sgft_jax.types import Normalizer, Prior, SimulatedData
 
 SYSTEM = (Varying("action_scale", 0, 0.5, 1.5), Varying("action_rotation", 0, -0.5, 0.5))
 ENV = with_system(toy.make(), SYSTEM)

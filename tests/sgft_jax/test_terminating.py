@@ -19,12 +19,13 @@ from tuners import METHODS, NET, Recorded, copied
 import envs
 from envs.base import Entry
 from envs.rollout import Episode
-from sgft_jax import pretraining, recipes, train
-from sgft_jax.guard import Guarded
+from envs.types import UserError
 from sgft_jax.policies import make_policy
 from sgft_jax.presets import PretrainConfig
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.types import Finetuner, UserError
+from sgft_jax.train import finetuning, pretraining, recipes
+from sgft_jax.train.guard import Guarded
+from sgft_jax.types import Finetuner
 
 BASE = toy_terminating.make()
 ENV = BASE._replace(action=(*BASE.action, Entry("count", "episodes", 1)))
@@ -108,13 +109,13 @@ def finetuned(name):
     rows = None
     if fine.simulation is not None:
         policy = make_policy(priors[0].card, ENV)
-        rows = train.simulate(ENV, policy, pools, params, jax.random.key(1), fine.simulation, gamma=GAMMA)
+        rows = finetuning.simulate(ENV, policy, pools, params, jax.random.key(1), fine.simulation, gamma=GAMMA)
     stacked, seeds = jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), pools), jnp.arange(M, dtype=jnp.uint32)
     system = Recorded(Simulated(ENV, stacked, seeds // (M // 2), gamma=GAMMA))
-    steps = train.finetune(fine, system, params, seeds, rows, rollouts=2)
+    steps = finetuning.finetune(fine, system, params, seeds, rows, rollouts=2)
     yielded = [(copied(progress), metrics) for progress, metrics in steps]
     agent = jax.tree.map(jnp.asarray, yielded[-1][0].agent)
-    return Run(fine, rows, [x for x, _ in system.played], yielded, train.evaluate(fine, system, agent, seeds, 1))
+    return Run(fine, rows, [x for x, _ in system.played], yielded, finetuning.evaluate(fine, system, agent, seeds, 1))
 
 
 def replay_of(run):

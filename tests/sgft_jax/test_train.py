@@ -13,14 +13,15 @@ from tuners import Recorded, bits, copied, equal
 
 import envs
 from envs.rollout import Episode
-from sgft_jax import train
+from envs.types import Policy, Transition, UserError
 from sgft_jax.data import replay, sources
 from sgft_jax.finetuner import Parts, assemble
 from sgft_jax.io import checkpoint
 from sgft_jax.methods.options import LoopOptions
 from sgft_jax.systems.simulated import Simulated
+from sgft_jax.train import finetuning
 from sgft_jax.transforms import compose
-from sgft_jax.types import Learner, Policy, Simulation, Transition, UserError
+from sgft_jax.types import Learner, Simulation
 
 ENV, GAMMA = toy_terminating.make(), 0.9
 LENGTH = ENV.episode_length
@@ -71,7 +72,7 @@ def simulated():
 def run(finetuner=FINE, system=None, rollouts=4, **options):
     """All that a run yields."""
     system = simulated() if system is None else system
-    steps = train.finetune(finetuner, system, PRIORS, SEEDS, rollouts=rollouts, **options)
+    steps = finetuning.finetune(finetuner, system, PRIORS, SEEDS, rollouts=rollouts, **options)
     return [(copied(progress), metrics) for progress, metrics in steps]
 
 
@@ -82,14 +83,16 @@ def test_every_purpose_of_every_member_draws_from_keys_that_no_other_uses():
     """Beginning, updates before the first rollout and after two, what is played to learn and what to be judged."""
     fine = make(simulation=NEEDS)
     rows = rows_of(10)
-    learn = train.Updates(fine, SEEDS, train.prior_of(PRIORS, SEEDS), rows)
+    learn = finetuning.Updates(fine, SEEDS, finetuning.prior_of(PRIORS, SEEDS), rows)
 
     def whole(key):
-        agent = train.begin(fine._replace(init=drawn), PRIORS, SEEDS, rows).agent
+        agent = finetuning.begin(fine._replace(init=drawn), PRIORS, SEEDS, rows).agent
         for parts, phase in (([0], "offline"), ([1], "logged"), ([0, 1], "online")):
             agent, _ = learn(agent, parts, 1, phase)
-        played = [train._episode_keys(SEEDS, purpose, 0, 2) for purpose in (train._COLLECT, train._EVALUATE)]
-        played.append(train._episode_keys(SEEDS, train._COLLECT, 1, 2))
+        played = [
+            finetuning._episode_keys(SEEDS, purpose, 0, 2) for purpose in (finetuning._COLLECT, finetuning._EVALUATE)
+        ]
+        played.append(finetuning._episode_keys(SEEDS, finetuning._COLLECT, 1, 2))
         return agent, [jax.vmap(jax.vmap(jax.random.normal))(x) for x in played], jax.random.normal(key)
 
     def drawn(params, key, data):
@@ -162,7 +165,7 @@ def test_a_log_without_a_valid_step_is_learned_nothing_from():
 def test_a_resumed_run_goes_on_with_the_same_bits(tmp_path):
     whole = run(rollouts=5)
     checkpoint.save(tmp_path, 3, whole[3][0], meta={})
-    like = jax.eval_shape(functools.partial(train.begin, FINE), PRIORS, SEEDS)
+    like = jax.eval_shape(functools.partial(finetuning.begin, FINE), PRIORS, SEEDS)
     restored, _ = checkpoint.restore(tmp_path, like)
     rest = run(rollouts=5, progress=jax.tree.map(jnp.asarray, restored))
     assert [int(p.rollouts) for p, _ in rest] == [4, 5]
@@ -192,7 +195,7 @@ def steps_of(episodes):
 def test_the_carry_is_threaded_and_begins_anew_with_each_episode():
     system = Recorded(simulated())
     *_, (last, _) = run(system=system, rollouts=3)
-    system.play(FINE, jax.tree.map(jnp.asarray, last.agent), train._episode_keys(SEEDS, 3, 0, 4), explore=False)
+    system.play(FINE, jax.tree.map(jnp.asarray, last.agent), finetuning._episode_keys(SEEDS, 3, 0, 4), explore=False)
     assert len(system.played) == 4 and any(len(steps) > 5 for steps in steps_of(system.played[-1][0]))
     for episodes, _ in system.played:
         for steps in steps_of(episodes):
@@ -203,11 +206,11 @@ def test_evaluation_repeats_a_fixed_series_without_exploring():
     *_, (last, _) = run(rollouts=1)
     agent = jax.tree.map(jnp.asarray, last.agent)
     system = Recorded(simulated())
-    few, more, again = (train.evaluate(FINE, system, agent, SEEDS, n) for n in (2, 5, 5))
+    few, more, again = (finetuning.evaluate(FINE, system, agent, SEEDS, n) for n in (2, 5, 5))
     assert equal(more, again) and equal(few, jax.tree.map(lambda x: x[:, :2], more))
     assert [explore for _, explore in system.played] == [False] * 3
     other = jax.tree.map(lambda x: x[::-1], agent)
-    same_starts = train.evaluate(FINE, system, other, SEEDS, 5)
+    same_starts = finetuning.evaluate(FINE, system, other, SEEDS, 5)
     assert equal(same_starts.world, more.world)
 
 
@@ -356,7 +359,7 @@ def test_a_guarded_run_that_was_stopped_goes_on_with_the_same_bits(tmp_path):
     whole = run(fine, rollouts=6)
     assert len({tuple(metrics["guard/challenger"].tolist()) for _, metrics in whole[1:]}) > 1
     checkpoint.save(tmp_path, 3, whole[3][0], meta={})
-    restored, _ = checkpoint.restore(tmp_path, jax.eval_shape(functools.partial(train.begin, fine), PRIORS, SEEDS))
+    restored, _ = checkpoint.restore(tmp_path, jax.eval_shape(functools.partial(finetuning.begin, fine), PRIORS, SEEDS))
     rest = run(fine, rollouts=6, progress=jax.tree.map(jnp.asarray, restored))
     assert bits(rest[-1]) == bits(whole[-1])
 
@@ -371,12 +374,12 @@ def logs_of(*lengths, updates):
     obs = np.repeat((10.0 * np.arange(len(lengths))[:, None] + step)[..., None], 2, axis=-1).astype(np.float32)
     paid = np.ones((len(lengths), longest), np.float32)
     rows = Transition(obs, np.zeros((*paid.shape, 1), np.float32), paid, GAMMA * paid, obs + 1)
-    return train.Logged(jax.tree.map(jnp.asarray, rows), jnp.asarray(valid), updates)
+    return finetuning.Logged(jax.tree.map(jnp.asarray, rows), jnp.asarray(valid), updates)
 
 
 def test_logs_are_kept_by_all_and_learned_from_before_anything_is_played(monkeypatch):
     """Seven updates in parts of five. Nobody has played yet, so no policy has evidence."""
-    monkeypatch.setattr(train, "OFFLINE_PART", 5)
+    monkeypatch.setattr(finetuning, "OFFLINE_PART", 5)
     system = Recorded(simulated())
     yielded = run(system=system, rollouts=1, logged=logs_of(3, 2, updates=7))
     assert [(int(p.offline), int(p.rollouts)) for p, _ in yielded] == [(0, 0), (5, 0), (7, 0), (7, 1)]
@@ -397,7 +400,7 @@ def test_logs_without_updates_are_kept_all_the_same():
 @pytest.mark.slow
 def test_a_run_with_logs_goes_on_from_anywhere_with_the_same_bits(tmp_path, monkeypatch):
     """After 6 and 12 updates on simulated rows, 6 and 8 on the logs, and a rollout: the logs are kept once."""
-    monkeypatch.setattr(train, "OFFLINE_PART", 6)
+    monkeypatch.setattr(finetuning, "OFFLINE_PART", 6)
     fine, logged = make(simulation=NEEDS), logs_of(3, 2, updates=8)
     options = {"simulated": rows_of(10), "rollouts": 2, "logged": logged}
     whole = run(fine, **options)
@@ -411,8 +414,8 @@ def test_a_run_with_logs_goes_on_from_anywhere_with_the_same_bits(tmp_path, monk
 @pytest.mark.parametrize(("offline", "parts"), [(0, 0), (10, 1), (12, 2), (13, 3), (22, 3), (23, 4)])
 def test_parts_of_the_offline_phase_never_share_a_number(offline, parts, monkeypatch):
     """Twelve updates on simulated rows, then those on logs, in parts of ten each."""
-    monkeypatch.setattr(train, "OFFLINE_PART", 10)
-    assert train.offline_parts(make(simulation=NEEDS), offline) == parts
+    monkeypatch.setattr(finetuning, "OFFLINE_PART", 10)
+    assert finetuning.offline_parts(make(simulation=NEEDS), offline) == parts
 
 
 def test_a_log_is_no_evidence_for_the_guard():
@@ -506,12 +509,12 @@ def rows_of(n, p=2):
         rows = jax.tree.map(lambda x: jnp.full((n, *x.shape), 100.0 * (i + 1)), example)
         return replay.add_batch(replay.init(example, n), rows)
 
-    return train.SimulatedRows(jax.tree.map(lambda *x: jnp.stack(x), *map(one, range(p))), jnp.ones((p, 3)))
+    return finetuning.SimulatedRows(jax.tree.map(lambda *x: jnp.stack(x), *map(one, range(p))), jnp.ones((p, 3)))
 
 
 @pytest.mark.slow
 def test_the_offline_phase_comes_in_parts(monkeypatch):
-    monkeypatch.setattr(train, "OFFLINE_PART", 5)
+    monkeypatch.setattr(finetuning, "OFFLINE_PART", 5)
     fine = make(simulation=NEEDS)
     yielded = run(fine, rollouts=1, simulated=rows_of(10))
     assert [(int(p.offline), int(p.rollouts)) for p, _ in yielded] == [(0, 0), (5, 0), (10, 0), (12, 0), (12, 1)]
@@ -531,8 +534,8 @@ def test_members_share_simulated_rows():
     """No array of the compiled program holds a set of rows for each member."""
     fine, n, members = make(simulation=NEEDS), 1009, 7
     seeds, simulated = jnp.arange(members, dtype=jnp.uint32), rows_of(n)
-    learning = train.Updates(fine, seeds, train.prior_of(PRIORS, seeds), simulated)
-    states = jax.eval_shape(lambda: train.begin(fine, PRIORS, seeds, simulated)).agent
+    learning = finetuning.Updates(fine, seeds, finetuning.prior_of(PRIORS, seeds), simulated)
+    states = jax.eval_shape(lambda: finetuning.begin(fine, PRIORS, seeds, simulated)).agent
     program = learning._learn.lower(states, jax.random.split(jax.random.key(0), members), 1, simulated, False).as_text()
     assert set(re.findall(rf"tensor<([\dx]*){n}x", program)) == {"2x"}  # two priors, no member
 
@@ -540,7 +543,7 @@ def test_members_share_simulated_rows():
 def test_simulate_plays_whole_episodes_with_more_and_more_random_actions():
     pool = envs.sample_worlds(ENV, jax.random.key(0), 4)
     still = Policy(lambda: (), lambda params, carry, obs, key, *, explore: (params[None], carry), lambda *_: 0.0)
-    made = train.simulate(ENV, still, pool, PRIORS, jax.random.key(1), Simulation(600, 0.8), gamma=GAMMA)
+    made = finetuning.simulate(ENV, still, pool, PRIORS, jax.random.key(1), Simulation(600, 0.8), gamma=GAMMA)
     assert made.returns.shape == (2, 50) and (made.replay.size > 100).all()
     for p, own in enumerate(PRIORS):
         data = made.of(p).draw(jax.random.key(2), 4000)

@@ -8,11 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from envs.types import UserError
 from sgft_jax import transforms as sgft
-from sgft_jax.learners import losses
+from sgft_jax.math import losses
 from sgft_jax.models import ratio
 from sgft_jax.models.networks import NetworkConfig
-from sgft_jax.types import Batch, Imagination, Normalizer, UserError
+from sgft_jax.types import Batch, Imagination, Normalizer
 
 GAMMA = 0.9
 

@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax import methods, train
+from envs.types import Transition
+from sgft_jax import methods
 from sgft_jax.data import replay
-from sgft_jax.io.jsonfile import jsonable
+from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.models.config import NetworkConfig
-from sgft_jax.types import Finetuner, Normalizer, Prior, Transition
+from sgft_jax.train import finetuning
+from sgft_jax.types import Finetuner, Normalizer, Prior
 
 T = 12  # steps of an episode
 NET = NetworkConfig(hidden=(8,))
@@ -137,7 +139,7 @@ def simulated():
     """The simulator's transitions for one prior: rewards are 100, returns 100 to 300."""
     rows = episode(jax.random.key(5), 24)._replace(reward=jnp.full(24, 100.0))
     buffer = replay.add_batch(replay.init(replay.blank(2, 2), 24), rows)
-    return train.SimulatedRows(jax.tree.map(lambda x: x[None], buffer), jnp.array([[100.0, 300.0]]))
+    return finetuning.SimulatedRows(jax.tree.map(lambda x: x[None], buffer), jnp.array([[100.0, 300.0]]))
 
 
 def episode(key, n=T):

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-from sgft_jax.types import Array, PyTree
+from envs.types import Array, PyTree
 
 
 class Engine(NamedTuple):

@@ -24,7 +24,7 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 
 from envs.mujoco.engines import Engine
-from sgft_jax.types import Array, PyTree
+from envs.types import Array, PyTree
 
 
 class _Slot(NamedTuple):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import mujoco
 
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 
 class Feature(NamedTuple):

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import jax
 from mujoco.mjx._src import scan
 
-from sgft_jax.types import PyTree
+from envs.types import PyTree
 
 _map_level = scan._nvmap
 

@@ -16,7 +16,7 @@ import envs.mujoco.engines.fences  # noqa: F401 - a repair of mjx, before its fi
 from envs.mujoco.engines import Engine
 from envs.mujoco.engines.features import check_features
 from envs.mujoco.fields import FLUID, POLYNOMIAL
-from sgft_jax.types import Array, UserError
+from envs.types import Array, UserError
 
 
 def make_engine(host: mujoco.MjModel, fields: tuple[str, ...] = ()) -> Engine:

@@ -18,7 +18,7 @@ import numpy as np
 from envs.mujoco.engines import Engine
 from envs.mujoco.engines.features import check_features
 from envs.mujoco.engines.mjx import mjx, put, with_fields
-from sgft_jax.types import Array, PyTree, UserError
+from envs.types import Array, PyTree, UserError
 
 # Newton iterations beyond the scene's. After the hardest pushes on the puck, one control step in a hundred, 4 of them
 # leave MuJoCo and MJX together 0.7 mm from the converged solution and Warp elsewhere, 0.9 mm from theirs; with 6 it has

@@ -15,7 +15,7 @@ import warp as wp
 from mujoco.mjx.third_party import mujoco_warp as mjw
 
 from envs.mujoco.fields import FLUID
-from sgft_jax.types import Array, UserError
+from envs.types import Array, UserError
 
 wp.config.log_level = wp.LOG_WARNING  # no report on every kernel it loads
 

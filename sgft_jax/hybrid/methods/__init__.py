@@ -3,7 +3,8 @@
 import importlib
 import pkgutil
 
-from sgft_jax.types import HybridMethod, UserError, unknown
+from envs.types import UserError, unknown
+from sgft_jax.types import HybridMethod
 
 _ORDER = ("h2oplus", "h2oplus-edac", "h2o", "darc", "sac", "iql", "cql", "rebrac", "edac")  # of tables and figures
 _FILES = [module.name.replace("_", "-") for module in pkgutil.iter_modules(__path__) if module.name != "options"]

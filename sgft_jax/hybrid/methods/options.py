@@ -4,8 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from envs.types import Array, PyTree
 from sgft_jax import checks
-from sgft_jax.types import Array, HybridAgent, Learner, PyTree, RealData, Source, Task
+from sgft_jax.types import HybridAgent, Learner, RealData, Source, Task
 
 if TYPE_CHECKING:
     from sgft_jax.learners.actor import Head

@@ -13,7 +13,7 @@ import envs
 from envs.gaps import Gap
 from envs.pools import real_worlds
 from envs.rollout import play_episode
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 gymnasium = pytest.importorskip("gymnasium", reason="make setup EXTRAS=dev, or pip install 'sgft-jax[gymnasium]'")
 

@@ -8,7 +8,7 @@ import toy
 
 import envs
 from envs.domains.uniform import parameter_ranges, uniform
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 ENV = toy.make()  # mass in [0.8, 1.2], friction in [3.5, 4.5]
 

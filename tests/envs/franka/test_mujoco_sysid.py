@@ -15,8 +15,8 @@ import envs
 from envs.base import Varying
 from envs.franka import arm, hammer
 from envs.system import with_system
+from envs.types import Transition
 from sgft_jax.models.system import most_probable_system
-from sgft_jax.types import Transition
 
 pytest.importorskip("mujoco.sysid.report.defaults", reason="make setup EXTRAS=dev, or pip install 'mujoco[sysid]'")
 from mujoco import sysid

@@ -11,8 +11,8 @@ import pytest
 
 from envs.franka import hammer, insert, push
 from envs.mujoco import render
-from experiments.cli import select_renderer
-from sgft_jax.types import UserError
+from envs.types import UserError
+from experiments.runner.cli import select_renderer
 
 SCENES = {"push": push.SCENE, "hammer": hammer.SCENE, "insert": insert.SCENE}
 

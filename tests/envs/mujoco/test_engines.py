@@ -12,7 +12,7 @@ from envs.mujoco import worlds as physics
 from envs.mujoco.engines import mjx as engine_jax
 from envs.mujoco.engines import warp as engine_warp
 from envs.mujoco.scene import make_env
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 N, STEPS = 3, 5
 

@@ -19,7 +19,7 @@ from envs.mujoco.engines import warp as engine_warp
 from envs.mujoco.fields import CARRIED, POLYNOMIAL, all_fields, comparison, unread
 from envs.mujoco.scene import Scene, make_env
 from envs.mujoco.worlds import PhysicsState
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 # Fields that must be the same in all worlds. What is new to MuJoCo has to be put here or into `envs.mujoco.fields`.
 REFUSED = """

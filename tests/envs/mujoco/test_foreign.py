@@ -21,8 +21,8 @@ from envs.mujoco.engines import mjx as engine_jax
 from envs.mujoco.engines import warp as engine_warp
 from envs.mujoco.scene import Measured, Scene, View, make_env
 from envs.mujoco.worlds import PhysicsState
-from experiments.cli import select_renderer
-from sgft_jax.types import UserError
+from envs.types import UserError
+from experiments.runner.cli import select_renderer
 
 WALL = 0.2  # m
 MJCF = """

@@ -11,7 +11,7 @@ from envs.domains.uniform import uniform
 from envs.mujoco import worlds as physics
 from envs.mujoco.engines import mjx as engine_jax
 from envs.mujoco.scene import make_env
-from sgft_jax.types import UserError
+from envs.types import UserError
 
 # MJX reads none of them: shortcuts of C MuJoCo, statistics, where a light is drawn, a copy only height fields need.
 UNUSED = {"body_sameframe", "meanmass", "meansize", "center", "extent", "light_poscom0", "geom_rbound_hfield"}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.options import SHIPPED
+from experiments.runner.options import SHIPPED
 
 ROOT = Path(__file__).parents[3]
 OBS, ACT, STEPS = 4, 2, 3  # of push, as it is measured

@@ -78,9 +78,9 @@ ROWS = [
             "diagnose --prior prior --real",
             "gaps --presets",
             "compare --tasks push --reals",
-            "tune --tasks push --reals",
-            "factorial --reals",
-            "scoreboard --gaps",
+            "studies.tune --tasks push --reals",
+            "studies.factorial --reals",
+            "studies.scoreboard --gaps",
             "collect --level 1 --task push --real",
             "compare_hybrid --methods sac --reference sac --task push --gaps",
             "demo --real",
@@ -94,7 +94,7 @@ ROWS = [
     ("evaluate --prior prior --real fifo.toml", "fifo.toml: is no plain file"),
     ("evaluate --prior prior --real loop.toml", "loop.toml: cannot be read (too many levels of symbolic links)"),
     ("evaluate --prior prior --real folder.toml", "folder.toml: cannot be read (is a directory)"),
-    ("scoreboard --gaps gap.toml", "gap.toml [gap]: has no 'stratum'", {"gap.toml": "effects = {}"}),
+    ("studies.scoreboard --gaps gap.toml", "gap.toml [gap]: has no 'stratum'", {"gap.toml": "effects = {}"}),
 ]
 
 HEAVY = [

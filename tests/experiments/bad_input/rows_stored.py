@@ -87,7 +87,7 @@ ROWS = [
     ("finetune --prior bad", "algorithm='losses', which this", {"bad/prior.json": _card(algorithm="losses")}),
     ("finetune --prior bad", "system[0] is a list, not an object", {"bad/prior.json": _card(system=[[1]])}),
     ("collect --policy bad --task push", "bad/prior.json: lacks task", {"bad/prior.json": "{}"}),
-    ("bullet --prior bad", "bad/prior.json: lacks task", {"bad/prior.json": "{}"}),
+    ("studies.bullet --prior bad", "bad/prior.json: lacks task", {"bad/prior.json": "{}"}),
     ("real_demo --prior bad", "bad/prior.json: lacks task", {"bad/prior.json": "{}"}),
     ("gaps --prior bad", "bad/prior.json: lacks task", {"bad/prior.json": "{}"}),
     ("benchmark --parts system --prior bad", "bad/prior.json: lacks task", {"bad/prior.json": "{}"}),

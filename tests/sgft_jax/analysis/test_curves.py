@@ -10,6 +10,7 @@ import pytest
 from runs_by_hand import save
 
 from envs.rollout import Episode
+from envs.types import UserError
 from sgft_jax.analysis.curves import (
     COLUMNS,
     Curve,
@@ -34,7 +35,6 @@ from sgft_jax.analysis.curves import (
     transitions_until_held,
     zero_shot,
 )
-from sgft_jax.types import UserError
 
 
 def curve(values, rollouts=(0, 1, 2, 4), *, method="sac", variant="", priors="fast", prior=None, score="success"):

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from envs.types import UserError
 from sgft_jax.analysis import hybrid, hybrid_table
 from sgft_jax.analysis.hybrid import EVERY, Outcome, Results
 from sgft_jax.hybrid.scores import BOUNDS, late
-from sgft_jax.types import UserError
 
 LOW, HIGH = BOUNDS["halfcheetah"]
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from runs_by_hand import pretrained, save
 
+from envs.types import UserError
 from sgft_jax.analysis.curves import COLUMNS, area, read_data, read_runs
 from sgft_jax.analysis.release import export
-from sgft_jax.io.csvfile import read_csv
-from sgft_jax.types import UserError
+from sgft_jax.files.csvfile import read_csv
 
 DATA = Path(__file__).parents[3] / "docs" / "data"
 PRIORS = ("aaaaaaaaaaaa", "bbbbbbbbbbbb")

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy import stats as scipy_stats
 
-from sgft_jax.analysis.stats import (
+from sgft_jax.math.stats import (
     bootstrap_interval,
     difference_interval,
     iqm,

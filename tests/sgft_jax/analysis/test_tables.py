@@ -8,7 +8,7 @@ import pytest
 from test_curves import curve
 
 from sgft_jax.analysis import tables
-from sgft_jax.analysis.stats import Interval
+from sgft_jax.math.stats import Interval
 
 
 def cells(table):

@@ -4,8 +4,8 @@ import dataclasses
 
 import pytest
 
-from sgft_jax.data import acceptance
-from sgft_jax.data.logs import Facts
+from sgft_jax.datasets import acceptance
+from sgft_jax.datasets.logs import Facts
 
 NONE = Facts("", "d4rl", 0, "", "stored", 0, 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0)
 

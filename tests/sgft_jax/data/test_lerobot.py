@@ -10,10 +10,10 @@ import pytest
 import toy
 
 from envs.history import with_previous_actions
-from sgft_jax.data import lerobot, logs
-from sgft_jax.data.recording import Recorded
-from sgft_jax.io import arrays
-from sgft_jax.types import UserError
+from envs.types import UserError
+from sgft_jax.datasets import lerobot, logs
+from sgft_jax.datasets.recording import Recorded
+from sgft_jax.files import arrays
 
 pa = pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'sgft-jax[lerobot]'")
 pq = pytest.importorskip("pyarrow.parquet")

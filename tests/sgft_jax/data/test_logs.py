@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 import toy
 
-from experiments import logged
-from sgft_jax.data import logs, replay, sequences, sources
-from sgft_jax.io import arrays, hdf5
-from sgft_jax.types import SimulatedData, Transition, UserError
+from envs.types import Transition, UserError
+from experiments.runner import logged
+from sgft_jax.data import replay, sequences, sources
+from sgft_jax.datasets import logs
+from sgft_jax.files import arrays, hdf5
+from sgft_jax.types import SimulatedData
 
 # Row by row: an episode that ends by falling, one that the time limit ends, one that falls at its time limit, and one
 # that the end of the file cuts off.

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from envs.types import Transition, UserError
 from sgft_jax.data import replay
-from sgft_jax.types import Transition, UserError
 
 
 def rows(values):

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from envs.types import Transition, UserError
 from sgft_jax.data import sequences
-from sgft_jax.types import Transition, UserError
 
 LENGTH, DRAWS = 4, 300
 

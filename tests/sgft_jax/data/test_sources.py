@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from envs.types import Transition
 from sgft_jax.data import replay, sequences, sources
-from sgft_jax.types import SimulatedData, Transition
+from sgft_jax.types import SimulatedData
 
 REAL, SIM = 1.0, 100.0
 

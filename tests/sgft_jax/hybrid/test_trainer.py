@@ -15,14 +15,15 @@ from envs.control import cartpole
 from envs.gaps import Gap
 from envs.pools import real_worlds
 from envs.rollout import step_fleet
+from envs.types import UserError
 from sgft_jax.data import replay
 from sgft_jax.hybrid import trainer
 from sgft_jax.hybrid.methods import NAMES, get_method
 from sgft_jax.hybrid.methods.options import return_scale
 from sgft_jax.hybrid.schedule import Schedule
 from sgft_jax.policies import make_policy
-from sgft_jax.pretraining import over_members
-from sgft_jax.types import RealData, UserError
+from sgft_jax.train.pretraining import over_members
+from sgft_jax.types import RealData
 
 ENV = toy.make()
 SMALL = {"hidden": (16,), "rows": 8}

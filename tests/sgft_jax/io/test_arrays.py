@@ -6,9 +6,9 @@ import zipfile
 import numpy as np
 import pytest
 
-from sgft_jax.io import arrays
+from envs.types import UserError
+from sgft_jax.files import arrays
 from sgft_jax.systems import robot_client
-from sgft_jax.types import UserError
 
 FIX = "mend it"
 

@@ -14,8 +14,8 @@ import optax
 import pytest
 from flax import struct
 
+from envs.types import UserError
 from sgft_jax.io import checkpoint
-from sgft_jax.types import UserError
 
 META = {"kind": "pretrain", "task": "hammer", "position": {"metrics.jsonl": 12}}
 

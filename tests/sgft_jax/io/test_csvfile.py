@@ -2,8 +2,8 @@
 
 import pytest
 
-from sgft_jax.io.csvfile import finite, read_csv, whole
-from sgft_jax.types import UserError
+from envs.types import UserError
+from sgft_jax.files.csvfile import finite, read_csv, whole
 
 
 def test_a_table_comes_back_by_its_head(tmp_path):

@@ -17,17 +17,18 @@ from envs.files import read_json
 from envs.history import with_previous_actions
 from envs.rollout import play_episode
 from envs.system import concealed, with_system
+from envs.types import UserError
 from sgft_jax import api, export
 from sgft_jax.export import Graph, Node, Slot
+from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io import exported, player
 from sgft_jax.io.exported import save_exported
-from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.learners.actor import ACTORParams
 from sgft_jax.models import distortion
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import make_actor, make_affine_actor, make_deterministic_actor
-from sgft_jax.types import Normalizer, Prior, UserError
+from sgft_jax.types import Normalizer, Prior
 
 EPISODES, STEPS = 50, 20
 TOLD = (Varying("mass", 0, 0.8, 1.2), Varying("action_scale", 1, 0.5, 1.5))

@@ -5,8 +5,8 @@ import os
 
 import pytest
 
-from sgft_jax.io.folders import NEW, InUseError, Lock, present, replaced
-from sgft_jax.types import UserError
+from envs.types import UserError
+from sgft_jax.files.folders import NEW, InUseError, Lock, present, replaced
 
 CHANGES = ("mkdir", "rename", "replace", "rmdir", "unlink")
 

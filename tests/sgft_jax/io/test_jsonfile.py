@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from envs.files import read_json
-from sgft_jax.io import jsonfile
-from sgft_jax.io.jsonfile import differences, jsonable, write_json
+from sgft_jax.files import jsonfile
+from sgft_jax.files.jsonfile import differences, jsonable, write_json
 
 
 class Pair(NamedTuple):

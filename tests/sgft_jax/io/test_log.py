@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from envs.files import Count
+from envs.types import UserError
 from sgft_jax.io import log
 from sgft_jax.io.log import DivergedError, MetricsLog, check_finite, read_jsonl, write_summary
-from sgft_jax.types import UserError
 
 # ---------------------------------------------------------------- metrics
 

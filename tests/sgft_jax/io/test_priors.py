@@ -11,14 +11,15 @@ import pytest
 import tuners  # noqa: F401 - TD-MPC2 of size "tiny"
 from test_checkpoint import bits, damage_flip, damage_truncate
 
+from envs.types import UserError
+from sgft_jax.files.folders import ASIDE
+from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io import checkpoint, priors
-from sgft_jax.io.folders import ASIDE
-from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.learners.actor import ACTORParams, make_actor_of
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.distortion import Distortion
-from sgft_jax.types import Normalizer, Prior, UserError
+from sgft_jax.types import Normalizer, Prior
 
 KEY = jax.random.key(0)
 NETWORK = NetworkConfig(hidden=(3,))

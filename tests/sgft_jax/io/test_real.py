@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from envs.types import UserError
 from sgft_jax.io.real import RealStore, played
-from sgft_jax.types import UserError
 
 
 def rollout(number, length=3):

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from envs.types import UserError
+from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io import runs
-from sgft_jax.io.jsonfile import jsonable
 from sgft_jax.io.runs import Lock, open_runs, plain_path, provenance
-from sgft_jax.types import UserError
 
 
 @dataclasses.dataclass(frozen=True)

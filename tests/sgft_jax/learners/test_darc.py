@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from envs.types import Transition, UserError
 from sgft_jax.data import replay
 from sgft_jax.learners import darc
 from sgft_jax.models.networks import NetworkConfig
-from sgft_jax.types import Batch, Transition, UserError
+from sgft_jax.types import Batch
 
 NET = NetworkConfig((16,))
 CONFIG = darc.DARCConfig(2, 1, network=NET, ratio_network=NET)

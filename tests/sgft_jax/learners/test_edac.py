@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from envs.types import UserError
 from sgft_jax.learners import edac, sac
 from sgft_jax.models import networks
-from sgft_jax.types import Batch, UserError
+from sgft_jax.types import Batch
 
 NET = networks.NetworkConfig((16,))
 ROWS = 16

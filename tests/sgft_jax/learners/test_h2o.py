@@ -7,9 +7,10 @@ import numpy as np
 import optax
 import pytest
 
+from envs.types import UserError
 from sgft_jax.learners import h2o
 from sgft_jax.models import networks, ratio
-from sgft_jax.types import Batch, UserError
+from sgft_jax.types import Batch
 
 BODY = networks.NetworkConfig((16,))
 ROWS = 12

@@ -8,9 +8,10 @@ import optax
 import pytest
 from tuners import slow_but
 
+from envs.types import UserError
 from sgft_jax.learners import edac, h2oplus
 from sgft_jax.models import networks, normalizer, ratio
-from sgft_jax.types import Batch, UserError
+from sgft_jax.types import Batch
 
 f = jnp.float32
 BODY = networks.NetworkConfig((16,))

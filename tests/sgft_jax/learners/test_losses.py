@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from sgft_jax.learners import losses
+from sgft_jax.math import losses
 from sgft_jax.types import Batch
 
 f = jnp.float32

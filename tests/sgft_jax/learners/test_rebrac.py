@@ -7,9 +7,10 @@ import numpy as np
 import optax
 import pytest
 
+from envs.types import UserError
 from sgft_jax.learners import rebrac
 from sgft_jax.models import networks
-from sgft_jax.types import Batch, UserError
+from sgft_jax.types import Batch
 
 f = jnp.float32
 NET = networks.NetworkConfig((16,), layer_norm=True)

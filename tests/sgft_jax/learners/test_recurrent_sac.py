@@ -16,7 +16,7 @@ from sgft_jax.models.gru import make_gru
 from sgft_jax.models.networks import NetworkConfig, make_actor, make_critic, tanh_gaussian_sample
 from sgft_jax.policies import recurrent_policy
 from sgft_jax.presets import PretrainConfig
-from sgft_jax.pretraining import pretrain, priors_of
+from sgft_jax.train.pretraining import pretrain, priors_of
 from sgft_jax.types import Batch, Normalizer
 
 B, T, OBS, ACT, UNITS = 3, 5, 2, 1, 6

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from envs.types import UserError
 from sgft_jax.learners import sac
 from sgft_jax.models import networks, normalizer
-from sgft_jax.types import Batch, UserError
+from sgft_jax.types import Batch
 
 NET = networks.NetworkConfig(hidden=(32,))
 CONFIG = sac.SACConfig(1, 1, network=NET, tune_alpha=False, train_dynamics=False)

@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 from probes import PLAIN, ROWS, SIZE, case
 
+from envs.types import Transition, UserError
 from sgft_jax.data import sequences
-from sgft_jax.learners import optim, tdmpc2, tdmpc2_model
+from sgft_jax.learners import tdmpc2, tdmpc2_model
+from sgft_jax.math import optim
 from sgft_jax.models import normalizer, twohot
-from sgft_jax.types import Batch, Transition, UserError
+from sgft_jax.types import Batch
 
 SGFT = dataclasses.replace(PLAIN, sgft=True)
 NETWORKS = ("encoder", "dynamics", "reward", "policy", "critic")

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax.learners import value_losses
-from sgft_jax.types import UserError
+from envs.types import UserError
+from sgft_jax.math import value_losses
 
 f = jnp.float32
 NUMBERS = {"expectile": 0.7, "alpha": 1.0, "cut": 5.0}

@@ -8,9 +8,9 @@ import pytest
 import envs
 from envs import gaps
 from envs.rollout import play_episode
+from envs.types import Transition
 from sgft_jax.models import distortion
 from sgft_jax.models.distortion import Distortion
-from sgft_jax.types import Transition
 
 STEP, WALL = 0.05, 0.3  # m at full action, m
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax.learners import optim
+from sgft_jax.math import optim
 from sgft_jax.models import dynamics, networks
 from sgft_jax.types import Batch, Normalizer
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from envs.types import UserError
 from sgft_jax.models import networks
-from sgft_jax.types import UserError
 
 TINY = networks.NetworkConfig(hidden=(8, 8))
 

@@ -7,9 +7,10 @@ import numpy as np
 import optax
 import pytest
 
+from envs.types import UserError
 from sgft_jax.models import normalizer, ratio
 from sgft_jax.models.networks import NetworkConfig
-from sgft_jax.types import Batch, UserError
+from sgft_jax.types import Batch
 
 f = jnp.float32
 SMALL = ratio.RatioConfig(2, 1, NetworkConfig((8,)))

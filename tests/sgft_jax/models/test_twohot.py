@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from envs.types import UserError
 from sgft_jax.models import twohot
-from sgft_jax.types import UserError
 
 BINS = twohot.Bins()
 FIVE = twohot.Bins(5, -2.0, 2.0)  # centres -2, -1, 0, 1, 2

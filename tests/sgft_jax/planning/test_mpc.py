@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax.io.jsonfile import jsonable
+from envs.types import Transition, UserError
+from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.learners import sac
 from sgft_jax.methods import sgft_mpc
 from sgft_jax.models import networks
 from sgft_jax.planning import mpc
-from sgft_jax.types import Normalizer, Prior, Task, Transition, UserError
+from sgft_jax.types import Normalizer, Prior, Task
 
 NET = networks.NetworkConfig(hidden=(8,))
 STILL = Normalizer(jnp.zeros(1), jnp.ones(1))

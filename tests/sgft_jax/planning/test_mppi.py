@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from envs.types import UserError
 from sgft_jax.planning import mppi
-from sgft_jax.types import UserError
 
 CONFIG, HYPER = mppi.MPPIConfig(samples=256, elites=32, iterations=10), mppi.MPPIHyper()
 TARGET = jnp.array([[0.6, -0.4], [-0.7, 0.2], [0.1, 0.9]])  # [H, act_dim]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from envs.types import UserError
 from sgft_jax.systems import answers
 from sgft_jax.systems.robot_client import printable
-from sgft_jax.types import UserError
 
 OBS, LOW, HIGH = np.zeros(2), np.array([-1.0, 0.0]), np.array([1.0, 4.0])
 

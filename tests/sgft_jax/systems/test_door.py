@@ -6,8 +6,8 @@ import socket
 
 import pytest
 
+from envs.types import UserError
 from sgft_jax.systems.door import STRANGERS, Door, bound, check_host, url
-from sgft_jax.types import UserError
 
 
 @pytest.fixture

@@ -11,11 +11,11 @@ import toy
 
 from envs.gaps import Gap
 from envs.pools import real_worlds
+from envs.types import Policy, UserError
 from sgft_jax.systems.gymnasium import Gymnasium, seed_of
 from sgft_jax.systems.remote import Remote
 from sgft_jax.systems.robot_client import Limits, play
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.types import Policy, UserError
 
 pytest.importorskip("gymnasium", reason="make setup EXTRAS=dev, or pip install 'sgft-jax[gymnasium]'")
 

@@ -1,1 +1,0 @@
-"""What `experiments.reliability` does to a run on a simulated robot, and how it finds out what became of it."""

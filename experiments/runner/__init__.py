@@ -1,0 +1,1 @@
+"""How commands run: start, follow, evaluate, checkpoint, resume, record, report."""

@@ -1,0 +1,373 @@
+"""Impure: what every command shares: parsing, error messages, exit codes, caches, quiet logs. Imports nothing heavy."""
+
+import contextlib
+import dataclasses
+import difflib
+import errno
+import importlib
+import logging
+import os
+import select
+import signal
+import subprocess
+import sys
+import threading
+import traceback
+import types
+import typing
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NoReturn, cast
+
+import tyro
+
+# What went wrong, as data. Not yet a public part of tyro (pyproject.toml keeps to versions that have it); the
+# alternative is to read the frames that it draws.
+from tyro import _errors
+
+from envs.types import UserError, unknown
+
+BROKEN_PIPE, USER_ERROR = 1, 2
+_SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
+_FULL = [os.strerror(number) for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)]  # "No space left on device"
+_ON_DISK = (
+    errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EEXIST, errno.ENOTDIR, errno.EISDIR,
+    errno.ENAMETOOLONG, errno.EFBIG, errno.ELOOP, errno.EIO, errno.EMFILE, errno.ENFILE,
+)  # fmt: skip
+_CACHE_VARIABLE = "SGFT_CACHE_DIR"
+_RENDER_PROBE = "import mujoco; c = mujoco.GLContext(16, 16); c.make_current(); c.free()"
+
+
+class Stopped(KeyboardInterrupt):
+    """A signal that asks the process to end: handled as Ctrl-C is. number: of the signal."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__()
+        self.number = number
+
+
+def run_main[T](
+    main: Callable[[T], object],
+    config_type: type[T],
+    description: str,
+    *,
+    argv: Sequence[str] | None = None,
+    default: Callable[[Sequence[str]], T] | None = None,
+) -> None:
+    """Parse the command line into `config_type` and call `main` with it.
+
+    default(argv) -> the defaults of the options where some decide those of others, see `preview`.
+    Exits with code 2 and one line `error: ...` on stderr for anything the user can mend (`UserError`, unknown options
+    or choices, a device without room), with 130 after Ctrl-C, 143 after SIGTERM and 129 after SIGHUP, as shells count,
+    with 1 and no message if the reader of its output has gone, as after `| head`. Other exceptions are bugs and keep
+    their traceback.
+    """
+    with _may_lose_its_reader(), _stopped_by_signals():
+        try:
+            words = list(sys.argv[1:] if argv is None else argv)
+            start = None if default is None else default(words)
+            config = parse(config_type, description, words, default=start)  # a dataclass may refuse its values
+            set_up()
+            _quiet_threads()
+            main(config)
+        except KeyboardInterrupt as stopped:
+            number = getattr(stopped, "number", signal.SIGINT)
+            more = "; the same command with --resume continues from the last checkpoint"
+            with contextlib.suppress(OSError):  # the terminal that hung up
+                print(f"\n{_SIGNALS[number]}{more if _has_resume(config_type) else ''}", file=sys.stderr, flush=True)
+            sys.exit(128 + number)
+        except UserError as error:
+            fail(str(error))
+        except Exception as error:
+            if said := _disk_trouble(error):
+                again = _has_resume(config_type) and _in_a_run(error)
+                fail(f"{said}; mend that, then {'the same command with --resume goes on' if again else 'try again'}")
+            if _in_renderer_choice(error):
+                chosen = f"MUJOCO_GL={os.environ['MUJOCO_GL']}"
+                fail(f"{chosen}: MuJoCo cannot use that here ({error}); unset it, or set it to disable")
+            if isinstance(error, ValueError) and " for environment 'JAX_" in str(error):  # as JAX is imported
+                fail(f"{error}; unset it")
+            if not _is_out_of_memory(error):
+                raise
+            said = (str(error).strip() or "MemoryError").splitlines()[0]
+            fail(f"out of memory ({said}): lower the batch size, the number of environments or of seeds")
+
+
+def _disk_trouble(error: BaseException | None) -> str | None:
+    """What is wrong where a file could not be read or written; also as the cause of another error. Else None."""
+    if isinstance(error, OSError) and error.errno in _ON_DISK:
+        return f"{error.filename or 'a file of the run'}: {(error.strerror or 'cannot be written').lower()}"
+    if words := [text for text in _FULL if text in str(error)]:  # Orbax has another type for it
+        return f"a file of the run: {words[0].lower()}"
+    return None if error is None else _disk_trouble(error.__cause__)
+
+
+def _has_resume(config_type: type) -> bool:
+    return any(field.name == "resume" for field in dataclasses.fields(config_type))
+
+
+def _in_a_run(error: Exception) -> bool:
+    """Whether what went wrong with a file lies in a run folder, as far as the error says where."""
+    if (place := getattr(error, "filename", None)) is None:
+        return True
+    return any(os.path.exists(folder / "config.json") for folder in Path(str(place)).absolute().parents)
+
+
+def _in_renderer_choice(error: Exception) -> bool:
+    """Whether MuJoCo could not even be imported with the renderer that the user's MUJOCO_GL names."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return bool(os.environ.get("MUJOCO_GL")) and any(frame.filename.endswith("gl_context.py") for frame in frames)
+
+
+def _is_out_of_memory(error: Exception) -> bool:
+    """Whether the host or, as JAX says it, a device had no room for an array."""
+    return isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
+
+
+@contextlib.contextmanager
+def _stopped_by_signals() -> Iterator[None]:
+    """SIGTERM and SIGHUP raise `Stopped`, where nobody has said otherwise (as `nohup` does); a second one kills."""
+
+    def stop(number: int, frame: object) -> NoReturn:
+        raise Stopped(number)
+
+    asked = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) == signal.SIG_DFL]
+    if not asked or threading.current_thread() is not threading.main_thread():  # no other may handle signals
+        yield
+        return
+    heard, tell = os.pipe()
+    os.set_blocking(tell, False)
+    threading.Thread(target=_end_at_the_second, args=(heard, asked), daemon=True).start()
+    before = signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
+    for number in asked:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        for number in asked:
+            signal.signal(number, signal.SIG_DFL)
+        signal.set_wakeup_fd(before)
+        os.close(tell)
+
+
+def _end_at_the_second(heard: int, asked: Sequence[int]) -> None:
+    """Ends the process at the second of these signals. The main thread sees none while a compiled program runs."""
+    with open(heard, "rb", buffering=0) as pipe:
+        count = 0
+        while byte := pipe.read(1):
+            count += byte[0] in asked
+            if count == 2:
+                os._exit(128 + byte[0])
+
+
+class _Quiet:
+    """What Python calls with an error that nobody catches, but for a disk that is full: the main thread says that."""
+
+    def __init__(self, hook: Callable[..., object]) -> None:
+        self.hook = hook
+
+    def __call__(self, failed: Any) -> None:
+        """failed: one object that begins with type and error."""
+        _, error, *_ = failed
+        # The second one is a checkpoint's writer that reports to a loop which has given up; it goes on after `main`.
+        if _disk_trouble(error) is None and str(error) != "Event loop is closed":
+            self.hook(failed)
+
+
+def _quiet_threads() -> None:
+    """Libraries write in threads of their own, each of which would print its own traceback."""
+    if not isinstance(threading.excepthook, _Quiet):
+        threading.excepthook = _Quiet(threading.excepthook)
+    if not isinstance(sys.unraisablehook, _Quiet):
+        sys.unraisablehook = _Quiet(sys.unraisablehook)
+
+
+@contextlib.contextmanager
+def _may_lose_its_reader() -> Iterator[None]:
+    """Ends the process without a traceback if stdout is a pipe that is read no more."""
+    try:
+        try:
+            yield
+        except SystemExit:
+            sys.stdout.flush()  # what Python would do when it exits, where nobody could catch it
+            raise
+        sys.stdout.flush()
+    except BrokenPipeError:
+        poll = select.poll()
+        poll.register(sys.stdout, 0)
+        if not poll.poll(0):
+            raise  # it was another pipe: that to a program which writes videos, say
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for the rest, which is flushed at the exit
+        sys.exit(BROKEN_PIPE)
+
+
+def parse[T](
+    config_type: type[T], description: str, argv: Sequence[str] | None = None, *, default: T | None = None
+) -> T:
+    """A frozen dataclass from the command line; raises UserError for a bad one."""
+    spec = getattr(sys.modules["__main__"], "__spec__", None)
+    prog = f"python -m {spec.name}" if spec else None
+    words = list(sys.argv[1:] if argv is None else argv)
+    with _errors.on_parse_error(lambda event: _refuse(event, words, config_type, default)):
+        return cast(T, tyro.cli(config_type, prog=prog, description=description, args=words, default=default))
+
+
+def preview(argv: Sequence[str], **defaults: Any) -> SimpleNamespace:
+    """The values of the options that decide the defaults of all others; what else is in `argv` is left to `parse`.
+
+    defaults: by name with underscores, e.g. preset="fast". Raises UserError for a bad value.
+    """
+    fields = [(name, type(value), dataclasses.field(default=value)) for name, value in defaults.items()]
+    chosen = dataclasses.make_dataclass("Options", fields)
+    with _errors.on_parse_error(lambda event: _refuse(event, argv, chosen, None)):
+        found, _ = tyro.cli(chosen, args=list(argv), return_unknown_args=True, add_help=False)
+    return SimpleNamespace(**vars(found))
+
+
+def _refuse(event: _errors.ParseErrorEvent, argv: Sequence[str], config_type: type, default: Any) -> None:
+    """Raise UserError with what is wrong in one line; other kinds of mistakes in tyro's words."""
+    match event:
+        case _errors.UnrecognizedArgs(tokens=[first, *_]) | _errors.MissingArgs(unrecognized_tokens=[first, *_]):
+            raise UserError(_unexpected(first, option_names(config_type, default)))
+        case _errors.MissingArgs():
+            missing = [one.arg.display_name() for one in event.missing_arguments]
+            raise UserError(f"{' and '.join(missing)} {'are' if len(missing) > 1 else 'is'} missing; see --help")
+        case _errors.InvalidChoice():
+            raise UserError(unknown(event.argument.display_name(), event.value, event.choices))
+        case _errors.BadValue(reason="too_few_values"):
+            raise UserError(f"{event.argument.display_name()}: needs a value")
+        case _errors.InstantiationFailure():
+            raise UserError(_bad_value(event, argv))
+
+
+def _unexpected(word: str, options: Sequence[str]) -> str:
+    """What to say of a word that is no option, or no value of one."""
+    if not word.startswith("-"):
+        return f"unexpected word {word!r} on the command line; options begin with --"
+    option = word.partition("=")[0].replace("_", "-")
+    close = difflib.get_close_matches(option, options, n=1)
+    return f"there is no option {option}; {f'did you mean {close[0]}?' if close else '--help lists them all'}"
+
+
+def _bad_value(event: _errors.InstantiationFailure, argv: Sequence[str]) -> str:
+    """What is wrong with the value of an option, as far as tyro knows which."""
+    said = event.message.strip().splitlines()[0]
+    if event.argument is None:
+        return said
+    option, kind = event.argument.display_name(), _in_words(event.argument.field.type_stripped)
+    return f"{' '.join([option, *_given(option, argv)])}: must be {kind or f'something else ({said})'}"
+
+
+def _in_words(hint: Any) -> str:
+    """What values of a type are called, "" where there is no word for them."""
+    words = {int: "a whole number", float: "a number", types.NoneType: "None"}
+    if typing.get_origin(hint) is tuple:
+        return {int: "whole numbers", float: "numbers"}.get(typing.get_args(hint)[0], "")
+    if parts := typing.get_args(hint):  # a union
+        each = [_in_words(part) for part in parts]
+        return " or ".join(each) if all(each) else ""
+    return words.get(hint, "")
+
+
+def _given(option: str, argv: Sequence[str]) -> list[str]:
+    """The values of an option on a command line, of the last one if it is there several times."""
+    found: list[str] = []
+    inside = False
+    for word in argv:
+        name, _, value = word.partition("=")
+        if word.startswith("--"):
+            inside = name.replace("_", "-") == option
+            found = ([value] if value else []) if inside else found
+        elif inside:
+            found.append(word)
+    return found
+
+
+def option_names(config_type: type, default: Any = None, *, prefix: str = "--") -> list[str]:
+    """`--task`, `--config.batch-size`, ...: the options of a dataclass and of those in it."""
+    hints, found = typing.get_type_hints(config_type), []
+    for one in dataclasses.fields(config_type):
+        value = getattr(default, one.name, None)
+        kind = type(value) if dataclasses.is_dataclass(value) else hints[one.name]
+        name = prefix + one.name.replace("_", "-")
+        found += option_names(kind, value, prefix=f"{name}.") if dataclasses.is_dataclass(kind) else [name]
+    return found
+
+
+def fail(message: str) -> NoReturn:
+    """End the process as every user error does."""
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(USER_ERROR)
+
+
+def columns(rows: Sequence[Sequence[str]]) -> list[str]:
+    """A line for each row of a table, cells of a column below each other."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+
+
+def choose[V](kind: str, name: str, options: dict[str, V]) -> V:
+    """`options[name]`; raises UserError with the closest match and the list of what exists."""
+    if name in options:
+        return options[name]
+    raise UserError(unknown(kind, name, options))
+
+
+def set_up() -> None:
+    """Compilation cache, GPU flags and quiet logs; before JAX starts. What the user has set stays."""
+    if cache := cache_folder():
+        os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache))
+        # Small programs too: a command compiles hundreds, at 25 ms each.
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+        if (jax := sys.modules.get("jax")) and jax.config.jax_compilation_cache_dir is None:
+            jax.config.update("jax_compilation_cache_dir", str(cache))  # it was imported before the environment was set
+    # Lets XLA use Triton for any matrix product; without effect on a CPU.
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_gpu_triton_gemm_any" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_triton_gemm_any=true".strip()
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # the C++ logs of XLA
+    for name in ("jax", "tensorboardX"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    for name in ("absl", "asyncio", "orbax"):  # they log the errors that they raise, with a traceback
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+
+
+def cache_folder() -> Path | None:
+    """Where compiled programs are kept: $SGFT_CACHE_DIR, by default ~/.cache/sgft_jax/jax; None if it is "off"."""
+    chosen = os.environ.get(_CACHE_VARIABLE, "")
+    if chosen.lower() in ("off", "none", "0"):
+        return None
+    return Path(chosen) if chosen else Path.home() / ".cache" / "sgft_jax" / "jax"
+
+
+def select_renderer() -> str | None:
+    """Make MuJoCo able to render without a screen by setting MUJOCO_GL; None on success, else one line why not.
+
+    Call it only if pictures are wanted: it tries egl and osmesa, each in a process of its own, because a failed attempt
+    cannot be undone. A value that the user has set is tried alone.
+    """
+    chosen = os.environ.get("MUJOCO_GL")
+    reasons = []
+    for backend in [chosen] if chosen else ["egl", "osmesa"]:
+        reason = _probe(backend)
+        if reason is None:
+            os.environ["MUJOCO_GL"] = backend
+            if module := sys.modules.get("mujoco.rendering.classic.gl_context"):
+                importlib.reload(module)  # MuJoCo was imported already and has read the old value
+            return None
+        reasons.append(f"{backend}: {reason}")
+    return f"MuJoCo cannot render here ({'; '.join(reasons)}); install libegl1 or libosmesa6"
+
+
+def _probe(backend: str) -> str | None:
+    """None if MuJoCo makes an off-screen context with this backend, else the last line it said."""
+    command, environment = [sys.executable, "-c", _RENDER_PROBE], {**os.environ, "MUJOCO_GL": backend}
+    try:
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
+    except subprocess.TimeoutExpired:
+        return "no answer within 60 s"
+    if done.returncode == 0:
+        return None
+    said = [line for line in done.stderr.splitlines() if line.strip()]
+    return said[-1].strip()[:120] if said else f"exit code {done.returncode}"

@@ -1,0 +1,274 @@
+"""Impure: a diagnosis of one real system by every prior. `experiments.diagnose` is its command."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from envs import gaps
+from envs.base import Env
+from envs.gaps import SIM, Gap
+from envs.rollout import Episode
+from envs.types import Transition, UserError
+from experiments.diagnose import DiagnoseArgs
+from experiments.runner.cli import columns
+from experiments.runner.gaps_run import systems
+from experiments.runner.real_systems import connect, is_robot, is_stepped, title
+from experiments.runner.recorded import RecordedSystem
+from sgft_jax import api, stacking
+from sgft_jax.analysis import figures, prediction, tables, verdict
+from sgft_jax.analysis.curves import last_start
+from sgft_jax.analysis.verdict import Names
+from sgft_jax.diagnosis import Rollouts
+from sgft_jax.examination import Examined, Examiner
+from sgft_jax.files.jsonfile import jsonable, write_json
+from sgft_jax.io.priors import digest, load_priors, observed_by
+from sgft_jax.io.real import RealStore
+from sgft_jax.io.runs import read_config
+from sgft_jax.math import stats
+from sgft_jax.methods import get_method
+from sgft_jax.policies import make_policy
+from sgft_jax.types import Prior
+
+SIMULATED, PLAYED = 32, 4  # rollouts of every prior in simulation, and on a gap unless the user says otherwise
+_SEED = 2**31 + 7  # of all of them
+_READ = (*Transition._fields, "valid", "success")  # arrays of a recorded rollout
+
+
+def diagnose(
+    args: DiagnoseArgs, folders: list[Path], task: str, recorded: Path | None
+) -> tuple[dict[str, Any], list[str]]:
+    """The diagnosis as JSON data and as lines for people; writes the picture and the numbers."""
+    env, priors = load(task, args.impl, folders)
+    home = args.out / "diagnose" / env.name
+    if recorded is None:
+        count, name = args.rollouts or PLAYED, title(args.real)
+        if is_stepped(args.real):
+            where = name
+            real = _play_real(env, args, priors, count, home / name)
+            simulated = play_simulated(env, priors, args.seed)
+        else:
+            where = f"the gap {name}"
+            real, simulated = _play_both(env, gaps.load(env, args.real), priors, count, args.seed)
+        which = list(range(len(priors)))
+        what = f"{_rollouts(count)} of {_priors(len(priors))}, just played zero-shot on {where}"
+    else:
+        real, which = read(recorded, env, priors, args.rollouts)
+        simulated = play_simulated(env, priors, args.seed)
+        count, name = (
+            real[0].valid.shape[0],
+            "_".join(recorded.parts[-3:] if read_config(recorded) else recorded.parts[-1:]),
+        )
+        what = f"{_rollouts(count)} recorded in {recorded}"
+    examiner, counts = Examiner(priors[0].card, env), counts_to(count)
+    params = stacking.stack([prior.params for prior in priors])
+    control = examiner.control(params, stacking.stack(simulated))
+    own, usual = (stacking.member(x, jnp.array(which)) for x in (params, control))
+    each = examiner.examine(own, usual, stacking.stack(real), counts)
+    labels, same = [str(folders[p]) for p in which], all(own is real[0] for own in real)
+    found = {
+        "task": env.name,
+        "data": what,
+        "priors": [{"prior": label, "found": one.found} for label, one in zip(labels, each, strict=True)],
+        "mean": [average([one.found[i] for one in each], same=same) for i in range(len(counts))],
+    }
+    mean, names = found["mean"][-1], names_of(env)
+    found["signs"] = jsonable(verdict.signs(mean, names))
+    found["verdict"] = verdict.verdict(mean, names)
+    found["prediction"] = predicted(mean)
+    home /= name
+    home.mkdir(parents=True, exist_ok=True)
+    picture = figures.diagnosis(
+        home / "diagnosis.png", mean, verdict.signs(mean, names), _points(each), title=f"{env.name}: {what}"
+    )
+    write_json(home / "diagnosis.json", found)
+    lines = [f"{env.name}: {what}", *_lines(labels, each, mean), "", *found["verdict"], ""]
+    return jsonable(found), [*lines, f"picture: {picture}", f"numbers: {home / 'diagnosis.json'}"]
+
+
+def load(task: str, impl: Any, folders: Sequence[Path]) -> tuple[Env, list[Prior]]:
+    """The task as these priors see it, and the priors; raises UserError for those without V_sim or models."""
+    env = envs.make(task, impl, **observed_by(folders))
+    priors = load_priors(folders, env)
+    for prior in priors:
+        api.check_prior(prior, get_method("sgft"), env)
+    return env, priors
+
+
+def counts_to(n: int) -> list[int]:
+    """1, 2, 4, ... and n."""
+    return sorted({*(2**i for i in range(n.bit_length())), n})
+
+
+def names_of(env: Env) -> Names:
+    """What people call the numbers of a task."""
+    label = lambda e, i: f"{e.name}[{i}]" if e.size > 1 else e.name  # noqa: E731
+    return Names(
+        action=[label(e, i) for e in env.action for i in range(e.size)],
+        sensors=[(label(e, i), e.unit) for e in env.measured for i in range(e.size)],
+        errors=env.sensor_errors,
+        dt=env.control_dt,
+    )
+
+
+def average(found: Sequence[Mapping[str, Any]], *, same: bool) -> dict[str, Any]:
+    """The mean of every number of several diagnoses; their rollouts are added up unless they are the same ones."""
+    mean = jax.tree.map(lambda *x: x[0] if len(set(x)) == 1 else float(np.mean(x)), *found)
+    return mean if same else {**mean, "rollouts": sum(one["rollouts"] for one in found)}
+
+
+def predicted(found: Mapping[str, Any]) -> dict[str, Any]:
+    """The prediction for one diagnosis, as JSON data."""
+    x = prediction.inputs_of(found)
+    return {
+        "inputs": jsonable(x),
+        "gain": float(prediction.gain(x)),
+        "rollouts": prediction.AHEAD,
+        "until": {"level": prediction.LEVEL, "rollouts": prediction.rollouts_until(x)},
+    }
+
+
+# --- rollouts ---------------------------------------------------------------------------------------------------------
+
+
+def play(env: Env, found: Sequence[Gap], priors: list[Prior], n: int, seed: int) -> list[Rollouts]:
+    """Exploring rollouts [n] of every prior on every gap: [gaps * priors], all priors on the first gap first."""
+    system, members = systems(env, found, priors, max(n, 64))
+    key = jax.random.fold_in(jax.random.key(_SEED), seed)
+    keys = jnp.broadcast_to(jax.random.split(key, n), (len(found) * len(priors), n))
+    played = system.play(make_policy(priors[0].card, system.env), members, keys, explore=True)
+    return [rollouts_of(jax.tree.map(np.asarray, stacking.member(played, i))) for i in range(len(keys))]
+
+
+def play_simulated(env: Env, priors: list[Prior], seed: int) -> list[Rollouts]:
+    """Exploring rollouts [SIMULATED] of every prior where nothing differs."""
+    return play(env, [gaps.find(env.name, SIM)], priors, SIMULATED, seed)
+
+
+def _play_both(env: Env, gap: Gap, priors: list[Prior], n: int, seed: int) -> tuple[list[Rollouts], list[Rollouts]]:
+    """Rollouts [n] of every prior on a gap, and [SIMULATED] in simulation; one program plays both where it can."""
+    if gap.scene:
+        return play(env, [gap], priors, n, seed), play_simulated(env, priors, seed)
+    both = play(env, [gap, gaps.find(env.name, SIM)], priors, max(n, SIMULATED), seed)
+    first = lambda rollouts, k: jax.tree.map(lambda x: x[:k], rollouts)  # noqa: E731
+    real, simulated = both[: len(priors)], both[len(priors) :]
+    return [first(one, n) for one in real], [first(one, SIMULATED) for one in simulated]
+
+
+def _play_real(env: Env, args: DiagnoseArgs, priors: list[Prior], n: int, home: Path) -> list[Rollouts]:
+    """Exploring rollouts [n] of every prior on a robot or an environment, each of them kept on disk in `home`."""
+    system = connect(env, [args.real], (), members=len(priors), gamma=priors[0].card["gamma"], home=args.out)
+    try:
+        store = RealStore(home)  # after the connection, which may fail
+        key = jax.random.fold_in(jax.random.fold_in(jax.random.key(_SEED), args.seed), len(store))
+        keys = jnp.broadcast_to(jax.random.split(key, n), (len(priors), n))
+        members = stacking.stack([prior.params for prior in priors])
+        kept = RecordedSystem(system, [store], done=len(store), sync_every=1 if is_robot(args.real) else None)
+        played = kept.play(make_policy(priors[0].card, env), members, keys, explore=True)
+    finally:
+        system.close()
+    return [rollouts_of(stacking.member(played, i)) for i in range(len(priors))]
+
+
+def rollouts_of(episodes: Episode) -> Rollouts:
+    """Of episodes [n], what a diagnosis reads."""
+    return Rollouts(episodes.transitions, episodes.valid, episodes.success)
+
+
+def read(home: Path, env: Env, priors: Sequence[Prior], most: int | None) -> tuple[list[Rollouts], list[int]]:
+    """The recorded rollouts [n] of every member, at most so many, and which prior looks at each.
+
+    Of a run every seed has its prior. What was recorded without a run is looked at by all priors, or by one each.
+    Raises UserError where rollouts are not those of the task, or priors not those of the run.
+    """
+    store = RealStore(home)
+    stored = [store.rollout(i) for i in range(min(len(store), most or len(store)))]
+    for i, arrays in enumerate(stored):
+        _check(home / "real", i, arrays, stored[0], env)
+    joined = {name: jnp.stack([arrays[name] for arrays in stored], axis=1) for name in _READ}
+    if not joined["valid"].any():
+        raise UserError(f"{home / 'real'}: holds no valid step")
+    rows = Transition(*(joined[name] for name in Transition._fields))
+    both = Rollouts(rows, joined["valid"].astype(bool), joined["success"].astype(bool))
+    each = [stacking.member(both, s) for s in range(len(both.success))]
+    config, p = read_config(home), len(priors)
+    if config:
+        _check_digests(home, priors)
+        return each, [(config.get("seed", 0) + s) % p for s in range(len(each))]
+    if len(each) == 1:
+        return each * p, list(range(p))
+    if len(each) != p:
+        raise UserError(
+            f"{home}: holds rollouts of {len(each)} policies; name one prior for each with --prior, not {p}"
+        )
+    return each, list(range(p))
+
+
+def _check(
+    folder: Path, number: int, arrays: Mapping[str, np.ndarray], first: Mapping[str, np.ndarray], env: Env
+) -> None:
+    path = folder / f"rollout-{number:06d}.npz"
+    sizes = {"obs": env.obs_dim, "next_obs": env.obs_dim, "action": env.act_dim}
+    for name, size in sizes.items():
+        if arrays[name].ndim != 3 or arrays[name].shape[-1] != size:
+            raise UserError(
+                f"{path}: {name} has shape {list(arrays[name].shape)}, these priors of {env.name} need "
+                f"[seeds, steps, {size}]"
+            )
+    if arrays["obs"].shape != first["obs"].shape:
+        raise UserError(f"{path}: has another number of seeds or steps than the first rollout")
+
+
+def _check_digests(home: Path, priors: Sequence[Prior]) -> None:
+    """Raises UserError where a run says that it began with other priors."""
+    known = last_start(home).get("priors", [])
+    if known and known != [digest(prior) for prior in priors]:
+        raise UserError(f"{home}: began with other priors than these; name them with --prior")
+
+
+# --- for people -------------------------------------------------------------------------------------------------------
+
+
+def _points(each: Sequence[Examined]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """All priors' V_sim and returns, at most 1,000 of each kind."""
+    found = {}
+    for where in ("real", "simulated"):
+        value, returns = (np.concatenate([one.points[where][i] for one in each]) for i in (0, 1))
+        some = np.random.default_rng(0).permutation(len(value))[:1000]
+        found[where] = (value[some], returns[some])
+    return found
+
+
+def _rollouts(n: int) -> str:
+    return f"{n} rollout{'s' * (n > 1)}"
+
+
+def _priors(n: int) -> str:
+    return "one prior" if n == 1 else f"each of {n} priors"
+
+
+def _lines(labels: Sequence[str], each: Sequence[Examined], mean: Mapping[str, Any]) -> list[str]:
+    """One line for each prior, and one for their mean."""
+    rows = [(label, one.found[-1]) for label, one in zip(labels, each, strict=True)]
+    rows += [("mean", mean)] * (len(each) > 1)
+    head = ("prior", "success %", "improvable %", "V_sim short by", "rank", "model error -> identified (sim)", "gain")
+    return columns([head, *(_row(label, found) for label, found in rows)])
+
+
+def _row(label: str, found: Mapping[str, Any]) -> tuple[str, ...]:
+    n, value, errors = found["rollouts"], found["value"], found["model_error"]
+    ahead = found["horizons"].index(4)
+    four = {where: f"{values[ahead]:.2f}" for where, values in errors.items()}
+    return (
+        label,
+        tables.number(stats.success_interval(round(n * found["success"]), n)),
+        f"{100 * value['real'][0]['improvable']:.0f}",
+        f"{value['shortfall']:.1f} sd",
+        f"{value['rank_correlation']:.2f}",
+        f"{four['real']} -> {four['identified']} ({four['simulated']})",
+        f"{100 * prediction.gain(prediction.inputs_of(found)):+.0f}",
+    )

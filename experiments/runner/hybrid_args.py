@@ -1,0 +1,145 @@
+"""The options of learning from real data and a simulator, what can be wrong with them, and the folders that follow."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+from tyro.conf import arg
+
+from envs import extend
+from envs.gaps import SIM, title
+from envs.types import UserError
+from experiments.runner.options import (
+    Impl,
+    Successors,
+    at_least_one,
+    check_data,
+    check_task,
+    check_variant,
+    not_negative,
+    seed_list,
+    seeds_name,
+    without_repeats,
+)
+from sgft_jax.hybrid.methods import get_method
+from sgft_jax.hybrid.schedule import FLEET, Schedule
+from sgft_jax.io.runs import check_start
+from sgft_jax.types import HybridMethod
+
+DEFAULT, NO_DATA = "h2oplus", "no-data"
+NO_SIMULATOR = "no-simulator"
+# These may differ when a run goes on. What is in the data may not, nor what a schedule has, whatever it is called.
+VOLATILE = ("resume", "overwrite", "out", "video", "data", "schedule_preset")
+
+SchedulePreset = Annotated[
+    str,
+    arg(
+        help="A schedule by name: fleet, 25 simulators that make one step each before 25 updates follow, or released, "
+        "that of H2O+'s code, one simulator that makes 1,000 steps before 1,000 updates follow."
+    ),
+]
+
+
+@dataclass(frozen=True)
+class HybridArgs:
+    """Several seeds for one or more simulators at once, all in one compiled program."""
+
+    task: str = "halfcheetah"
+    """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
+    method: str = DEFAULT
+    """A method from the table at the top."""
+    gap: tuple[str, ...] = ("gravity",)
+    """How the simulator differs from the real system: gaps by name, .toml/.json files, or sim for no gap. Several share
+    one program; each has a run folder of its own. Methods without a simulator leave it out."""
+    data: Path | None = None
+    """The real data: a D4RL or Minari HDF5 file, the folder of a Minari or LeRobot data set or of a run with rollouts
+    in real/, or the .txt or .csv log of a wheel-legged robot (docs/data.md)."""
+    real: str = SIM
+    """The real system to evaluate in: sim for the task as it is, or a gap by name or as a file."""
+    previous_actions: int = 0
+    """Last actions that end the observation, for data of a policy that sees them, such as a prior of the preset
+    `robust`, which sees 2."""
+    seeds: int = 5
+    """Number of seeds."""
+    out: Path = Path("runs")
+    """Parent of all run folders."""
+    resume: bool = False
+    """Continue from the last checkpoint."""
+    overwrite: bool = False
+    """Replace an earlier run of the same name."""
+    preset: str = ""
+    """Named settings of the method, see the table at the top. Default: of rebrac those of the data set that the name of
+    --data contains, if there are any; else the method's first."""
+    options: Any = None  # the `Config` of the method
+    """Options of the method that --method names:"""
+    schedule_preset: SchedulePreset = FLEET
+    schedule: Schedule = field(default_factory=Schedule)
+    successors: Successors = "stored"
+    seed: int = 0
+    """Expert: first seed."""
+    eval_every: int = 10_000
+    """Expert: updates between evaluations in the real system, rounded to whole chunks. No choice depends on them."""
+    eval_episodes: int = 10
+    """Expert: episodes per seed and evaluation, without exploration."""
+    checkpoint_every: int = 100_000
+    """Expert: updates between checkpoints, rounded to whole chunks."""
+    variant: str = ""
+    """Expert: a word for these options. The run gets a folder of its own beside the method's."""
+    impl: Impl = "auto"
+    video: bool = True
+    """Expert: render an episode of the first seed in the real system, where MuJoCo can render."""
+
+
+def gaps_of(args: HybridArgs, method: HybridMethod) -> tuple[str, ...]:
+    """The simulators, or the one word that stands for none."""
+    return (NO_SIMULATOR,) if method.kind == "offline" else args.gap
+
+
+def run_folder(args: HybridArgs, gap: str) -> Path:
+    """Where the run with that simulator lives; the seeds of one call share a folder."""
+    method = get_method(args.method)
+    data = NO_DATA if method.kind == "simulator" or args.data is None else data_name(args.data)
+    label = "_".join(filter(None, [method.name, args.variant]))
+    seeds = seeds_name(seed_list(args.seed, args.seeds))
+    systems = title(gap) if args.real == SIM else f"{title(gap)}-for-{title(args.real)}"
+    return args.out / "hybrid" / extend.name_of(args.task) / systems / data / label / seeds
+
+
+def data_name(path: Path) -> str:
+    """What a data set is called in folders: its file without the ending, or its folder."""
+    inside = path.parent.parent if path.name == "main_data.hdf5" else path
+    return extend.folder_name("--data", re.sub(r"[^\w.-]", "-", inside.name.removesuffix(".hdf5")))
+
+
+def check(args: HybridArgs) -> tuple[HybridMethod, list[int]]:
+    """The method and the seeds; raises UserError for what is wrong in the arguments and with the run folders."""
+    at_least_one(args, "eval_every", "eval_episodes", "checkpoint_every")
+    not_negative(args, "previous_actions")
+    method, seeds = get_method(args.method), seed_list(args.seed, args.seeds)
+    if not isinstance(args.options, type(method.config)):
+        raise UserError(f"--method {method.name}: the options are those of another method")
+    if method.kind != "simulator" and args.data is None:
+        raise UserError(f"--data: {method.name} learns from real data; name a file or folder (docs/data.md)")
+    if method.kind == "simulator" and args.data is not None:
+        raise UserError(f"--data {args.data}: {method.name} learns in the simulator alone; leave one of them out")
+    if args.data is not None:
+        check_data("--data", args.data)
+    check_variant(args.variant)
+    if not args.gap:
+        raise UserError(f"--gap: name at least one, or {SIM} for no gap")
+    without_repeats("--gap", args.gap)
+    systems = () if method.kind == "offline" else args.gap
+    check_task(args.task, systems if args.real == SIM else (*systems, args.real))
+    for folder in folders(args, method):
+        check_start(folder, resume=args.resume, overwrite=args.overwrite)
+    return method, seeds
+
+
+def folders(args: HybridArgs, method: HybridMethod) -> Sequence[Path]:
+    """The run folders of all simulators; raises UserError where two would share one."""
+    found = [run_folder(args, gap) for gap in gaps_of(args, method)]
+    if twice := [folder for folder in found if found.count(folder) > 1]:
+        raise UserError(f"--gap {' '.join(args.gap)}: two of them would share the folder {twice[0]}; name it once")
+    return found

@@ -1,0 +1,317 @@
+"""Impure: one run of pretraining: folders, logs, evaluations and checkpoints around `sgft_jax.pretrain`.
+
+`experiments.pretrain` is its command.
+"""
+
+import functools
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import envs
+from envs import mesh
+from envs.base import Env, World
+from envs.domains.actuators import with_actuators
+from envs.gaps import SIM, Gap
+from envs.pools import heldout_worlds, load_gap, real_env, training_worlds
+from envs.rollout import Episode
+from envs.system import blurred, varying, with_system
+from envs.types import Key, PyTree
+from experiments.pretrain import PretrainArgs, run_folder
+from experiments.runner import hosts
+from experiments.runner.evaluation import best_of, describe, play, scores
+from experiments.runner.memory import reserve
+from experiments.runner.report import Report, make_report, numbers
+from experiments.runner.video import film_episode
+from sgft_jax import stacking
+from sgft_jax.analysis import figures
+from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.io import checkpoint, runs
+from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
+from sgft_jax.io.priors import digest, save_prior
+from sgft_jax.io.progress import Clock, RunProgress
+from sgft_jax.policies import make_policy
+from sgft_jax.systems.simulated import Simulated
+from sgft_jax.train.pretraining import (
+    Best,
+    PretrainState,
+    collect_random,
+    exported,
+    memory,
+    pretrain,
+    prior_card,
+    seed_keys,
+    shapes,
+    world_keys,
+)
+from sgft_jax.types import Metrics, Prior
+
+_REPORT = 3  # purpose, folded into a seed's key
+_CUT = ("n_envs", "replay_capacity", "batch_size")  # sizes that devices share
+_HELDOUT_SEED, _FINAL_SEED = 2**31, 2**31 + 1  # held-out worlds and episodes, the same for every run
+
+
+class Saved(NamedTuple):
+    """What a checkpoint holds, with a leading seeds axis: the run itself and the best policy so far."""
+
+    run: PretrainState
+    best: Best
+
+
+def run(args: PretrainArgs, seeds: list[int]) -> dict[str, Any]:
+    """One run from (or back) to disk; returns its summary."""
+    hosts.join(args.hosts)
+    env = envs.make(args.task, args.impl, previous_actions=args.config.previous_actions)
+    gap = load_gap(env, args.real, args.set)
+    env = real_env(env, [gap] if gap else [])
+    env = with_actuators(env) if args.config.actuators else env
+    if args.config.sees_system:
+        told = with_system(env, varying(env, gap.params, gap.effects) if gap else varying(env))
+        env = blurred(told, args.config.system_noise)
+    sizes = memory(env, args.config)  # what does not fit is reported before anything is written
+    devices = mesh.devices(args.devices, {f"--config.{n.replace('_', '-')}": getattr(args.config, n) for n in _CUT})
+    home = run_folder(args)
+    with hosts.own(home) as folder, mesh.use(devices):
+        reserve(sizes, copies=args.seeds, devices=devices)
+        (opened,) = runs.open_runs(
+            {folder: jsonable(args)}, kind="pretrain", resume=args.resume, overwrite=args.overwrite,
+            volatile=("resume", "overwrite", "devices", "hosts", "report", "video", "out"),
+        )  # fmt: skip
+        mesh.meet()  # nobody looks for checkpoints before the first host has emptied a folder that is to be replaced
+        try:
+            return _Run(args, env, gap, seeds, opened.folder, home).work()
+        finally:
+            opened.close()
+
+
+class _Run:
+    """What happens between chunks.
+
+    folder, home: for logs, and for checkpoints and priors; they differ on all but the first of several hosts.
+    """
+
+    def __init__(
+        self, args: PretrainArgs, env: Env, gap: Gap | None, seeds: list[int], folder: Path, home: Path
+    ) -> None:
+        self.args, self.env, self.gap, self.seeds, self.folder = args, env, gap, seeds, folder
+        self.home, self.config = home, args.config
+        self.clock, self.log = Clock(), MetricsLog(folder)
+        self.expect = {"kind": "pretrain", "task": env.name, "seeds": seeds}
+        self.card = prior_card(env, self.config)
+        self.policy = make_policy(self.card, env)
+        self.pools = functools.lru_cache(maxsize=1)(self._pools)  # worlds take long to compile
+        self.shapes = functools.cache(lambda: shapes(env, self.config, seeds, self.pools(0)))
+
+    def work(self) -> dict[str, Any]:
+        """Everything, in order."""
+        n, first = self.config.eval_episodes, jnp.zeros(len(self.seeds), jnp.int32)
+        with self.clock("worlds"):
+            self.pools(0)
+            heldout, self.final = (
+                stacking.stack([heldout_worlds(self.env, self.gap, jax.random.key(seed), n)])
+                for seed in (_HELDOUT_SEED, _FINAL_SEED)
+            )
+        self.heldout = Simulated(self.env, heldout, first, gamma=self.config.gamma)
+        step = checkpoint.latest(self.home, whole=True)
+        self.last_good = None if step is None else checkpoint.path(self.home, step)
+        if step is None:
+            self.log.truncate({})
+            saved, done = None, 0
+        else:
+            saved, done = self._restore(step)
+        best = self._train(saved, done)
+        summary = self._hand_over(best)
+        self.log.close()
+        return summary
+
+    def _pools(self, number: int) -> World:
+        """The worlds [seeds, W] of a set."""
+        keys = world_keys(self.seeds, number)
+        return stacking.stack([training_worlds(self.env, self.gap, key, self.config.worlds) for key in keys])
+
+    def _restore(self, step: int) -> tuple[Saved, int]:
+        """The checkpoint of a step, which is whole, and the chunks behind it."""
+        state = self.shapes()[1]
+        like = jax.eval_shape(lambda run: Saved(run, self._first_best(run)), state)
+        saved, meta = checkpoint.restore(self.home, like, step=step, checked=True, expect=self.expect)
+        self.log.truncate(meta["position"])
+        self.clock.seconds = meta["seconds"]
+        return saved, meta["chunks"]
+
+    def _first_best(self, state: PretrainState) -> Best:
+        """What any evaluation is better than."""
+        none = jnp.full(len(self.seeds), -jnp.inf)
+        unknown = jnp.full((len(self.seeds), 2), jnp.inf)
+        return Best(
+            exported(self.env, self.config, state), none, none, state.steps, jnp.zeros(len(self.seeds)), unknown
+        )
+
+    def _random(self) -> PyTree:
+        """Experience under random actions: collected once, then read from disk."""
+        folder = self.home / "random"
+        if checkpoint.latest(folder) is not None:
+            return checkpoint.restore(folder, self.shapes()[0], expect=self.expect)[0]
+        with self.clock("random"):
+            random = jax.block_until_ready(collect_random(self.env, self.config, self.seeds, self.pools(0)))
+        checkpoint.save(folder, 0, mesh.local(random), meta=self.expect)
+        return random
+
+    def _train(self, saved: Saved | None, done: int) -> Best:
+        """Chunk after chunk, with evaluations and checkpoints between them; returns the best policies."""
+        random, state, best = self._random(), saved and saved.run, saved and saved.best
+        steps = pretrain(self.env, self.config, self.seeds, pools=self.pools, random=random, state=state)
+        with self.clock("compile"):
+            state, _ = jax.block_until_ready(next(steps))
+        if best is None:
+            best, _ = self._evaluate(state, best, 0)
+        chunks, size = self.config.chunks, self.config.chunk_env_steps
+        title, total = f"pretrain {self.env.name}", chunks * size
+        with RunProgress(title, total=total, unit="env steps", done=done * size) as progress:
+            while done < chunks:
+                with self.clock("train"):
+                    state, metrics = next(steps)
+                    metrics = {name: np.asarray(x) for name, x in metrics.items()}
+                done += 1
+                self.log.metrics(done * size, metrics)
+                check_finite(metrics, done * size, unit="env steps", last_good=self.last_good)
+                # Episodes begin together, so in some chunks none ends.
+                ended = metrics["train/episodes"].all()
+                shown = {"success, exploring": float(metrics["train/success"].mean())} if ended else {}
+                if done % self.config.eval_every == 0 or done == chunks:
+                    best, found = self._evaluate(state, best, done)
+                    shown |= {f"{name}, evaluation": float(found[name].mean()) for name in ("success", "return")}
+                if done % self.config.checkpoint_every == 0 or done == chunks:
+                    self._checkpoint(Saved(state, best), done)
+                progress.advance(size, shown)
+        return best
+
+    def _evaluate(self, state: PretrainState, best: Best | None, done: int) -> tuple[Best, Metrics]:
+        """Every evaluation plays the same episodes in the same held-out worlds."""
+        params = exported(self.env, self.config, state)
+        with self.clock("evaluate"):
+            played = self._play(self.heldout, params, jax.random.fold_in(jax.random.key(_HELDOUT_SEED), 1))
+        found = scores(played)
+        self.log.eval(done * self.config.chunk_env_steps, found)
+        since = self.config.choose_from * self.config.chunks * self.config.chunk_steps
+        return best_of(best, params, played, state.steps, since=since), found
+
+    def _checkpoint(self, saved: Saved, done: int) -> None:
+        meta = {**self.expect, "chunks": done, "position": self.log.position(), "seconds": self.clock.seconds}
+        with self.clock("checkpoint"):
+            self.last_good = checkpoint.save(self.home, done, mesh.local(saved), meta=meta)
+
+    # ------------------------------------------------------------ what stays
+
+    def _hand_over(self, best: Best) -> dict[str, Any]:
+        """Priors with their cards, report, figures, summary, closing words."""
+        with self.clock("report"):
+            report = self._report(best.params) if self.args.report and self.policy.value else None
+            played = self._final_episodes(best.params)
+        results = []
+        for i, seed in enumerate(self.seeds):
+            own = stacking.member(best, i)
+            name = digest(Prior(own.params, {}))  # by which runs of fine-tuning tell which priors they began from
+            found = {"seed": seed, "digest": name, **describe(stacking.member(played, i)), **self._chosen(own)}
+            if report is not None:
+                found |= numbers(stacking.member(report, i))
+                self._save_report(seed, stacking.member(report, i), i)
+            save_prior(self.home / "prior" / f"seed-{seed}", Prior(own.params, self._card(found)))
+            results.append(found)
+        summary = {
+            "task": self.env.name,
+            "preset": self.args.preset,
+            "impl": self.env.impl,
+            "gap": None if self.gap is None else self.gap._asdict(),
+            "env_steps": self.config.chunks * self.config.chunk_env_steps,
+            "updates": self.config.chunks * self.config.chunk_steps * self.config.updates_per_step,
+            "seeds": results,
+            **self.clock.record(),
+        }
+        write_summary(self.folder, summary)
+        if self.args.video:
+            print(self._film(stacking.member(played, 0)))
+        self._say(results)
+        return summary
+
+    def _card(self, found: dict[str, Any]) -> dict[str, Any]:
+        """What a prior says of itself; found: its numbers."""
+        late = f"{self.config.choose_from:.0%} of training"
+        return {
+            **self.card,
+            "gap": None if self.gap is None else self.gap._asdict(),
+            "preset": self.args.preset,
+            "chosen": f"the best evaluation in held-out worlds after {late}: {self.env.score}, then return",
+            "metrics": found,
+            "provenance": runs.provenance(),
+        }
+
+    def _final_episodes(self, params: PyTree) -> Episode:
+        """[seeds, >= report_episodes] new episodes in worlds that neither training nor the choice has seen."""
+        system = self.heldout.moved(self.final, self.heldout.which)
+        rounds = math.ceil(self.config.report_episodes / self.config.eval_episodes)
+        keys = jax.random.split(jax.random.fold_in(jax.random.key(_FINAL_SEED), 1), rounds)
+        return jax.tree.map(lambda *x: np.concatenate(x, axis=1), *[self._play(system, params, key) for key in keys])
+
+    def _play(self, system: Simulated, params: PyTree, key: Key) -> Episode:
+        return play(system, self.policy, params, key, self.config.eval_episodes)
+
+    def _report(self, params: PyTree) -> Report:
+        """[seeds] measurements, as NumPy arrays."""
+        measure = functools.partial(
+            make_report, self.env, self.policy, gamma=self.config.gamma, trajectories=self.config.eval_episodes
+        )
+        report = jax.jit(jax.vmap(measure))(self.pools(0), params, seed_keys(self.seeds, _REPORT))
+        return jax.tree.map(np.asarray, mesh.local(report))
+
+    def _film(self, played: Episode) -> str:
+        """The first of the episodes [n] in the final worlds."""
+        path = self.folder / "videos" / f"seed-{self.seeds[0]}.mp4"
+        return film_episode(self.env, self.final, 0, stacking.member(played, 0), path)
+
+    def _chosen(self, best: Best) -> dict[str, float]:
+        """Which evaluation the prior is from, and what that evaluation said."""
+        steps = int(best.steps) * self.config.n_envs
+        return {"best/env_steps": steps, f"best/{self.env.score}": float(best.score), "best/return": float(best.total)}
+
+    def _save_report(self, seed: int, report: Report, i: int) -> None:
+        """The arrays behind the figure, and the figure."""
+        curve = read_jsonl(self.folder / EVAL)
+        some = np.flatnonzero(report.counts)[:: max(1, report.counts.sum() // 2000)]  # points that a figure can show
+        (self.folder / "report").mkdir(exist_ok=True)
+        np.savez(self.folder / "report" / f"seed-{seed}.npz", allow_pickle=False, **report._asdict())
+        if not some.size:
+            return  # every trajectory exploded: there is nothing to draw
+        figures.pretraining(
+            self.folder / "figures" / f"seed-{seed}.png",
+            title=f"pretraining {self.env.name}, preset {self.args.preset}, seed {seed}",
+            steps=[line["step"] for line in curve],
+            success=[line["success"][i] for line in curve],
+            returns=[line["return"][i] for line in curve],
+            value=report.values[some],
+            monte_carlo=report.returns[some],
+            dynamics_error=report.model_error,
+            baseline_error=report.still_error,
+        )
+
+    def _say(self, results: list[dict[str, Any]]) -> None:
+        for found in results:
+            low, high = found["success/interval"]
+            said = f"success {found['success']:.3f} [{low:.3f}, {high:.3f}]"
+            said = said if self.env.score == "success" else f"return {found['return']:.3f}"
+            line = f"seed {found['seed']}: {said} in {found['episodes']} fresh episodes"
+            if "value/explained_variance" in found:
+                line += f"; V_sim explains {found['value/explained_variance']:.2f} of the variance of returns, "
+                line += f"rank correlation {found['value/rank_correlation']:.2f}, bias {found['value/bias']:+.2f}"
+            print(line)
+        left = ", ".join(name for name in ("prior/", "summary.json", "figures/") if (self.folder / name).exists())
+        print(f"results: {self.folder}  ({left})")
+        kind = "informed" if self.config.sees_system else self.config.algorithm
+        method = {"sac": "", "informed": "sysid", "tdmpc2": "sgft-tdmpc2", "recurrent": "recurrent"}[kind]
+        method = method and f" --method {method}"
+        method += "" if self.gap is None else f" --real {SIM}"
+        out = "" if self.args.out == PretrainArgs.out else f" --out {self.args.out}"
+        print(f"next: python -m experiments.finetune --task {self.args.task}{method} --prior {self.folder}{out}")

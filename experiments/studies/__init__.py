@@ -1,0 +1,1 @@
+"""What reproduces a page of results; no command imports it."""

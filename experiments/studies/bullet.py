@@ -1,0 +1,137 @@
+"""Methods against each other in another engine: `panda-push` on panda-gym, in Bullet, one run for each seed.
+
+Each run is the command of a user, `experiments.finetune --real remote`, and panda-gym's driver (docs/real-robot.md).
+Runs that are finished are left alone, and unfinished ones go on, so the same command continues after any interruption.
+`python -m experiments.figures --out <out>` draws what there is.
+"""
+
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+from envs.types import UserError
+from experiments.runner import cli, finetune_args, panda_gym
+from experiments.runner.finetune_args import FinetuneArgs
+from experiments.runner.options import (
+    SHIPPED,
+    at_least_one,
+    check_prior,
+    not_negative,
+    prior_folders,
+    seed_list,
+    without_repeats,
+)
+from experiments.runner.panda_gym import HOME, PYTHON, TASK
+from experiments.runner.real_systems import REMOTE
+from sgft_jax.io.log import SUMMARY
+from sgft_jax.io.runs import check_folder
+from sgft_jax.methods import get_method
+
+
+@dataclass(frozen=True)
+class BulletArgs:
+    """Methods, seeds and evaluations. All methods meet the same starts and evaluation episodes."""
+
+    methods: tuple[str, ...] = ("guarded", "sgft-sac", "mbpo", "sac")
+    """Methods that start from priors of SAC, in the order in which they run."""
+    prior: Path = SHIPPED / TASK
+    """Folder of a prior of panda-push, or of several; seed i starts from prior i modulo their number."""
+    seed: int = 0
+    """First seed."""
+    seeds: int = 10
+    """Seeds of each method."""
+    rollouts: int = 20
+    """Real rollouts of each run."""
+    eval_at: tuple[int, ...] = (0, 1, 2, 4, 8, 16, 20)
+    """Evaluate after these numbers of rollouts."""
+    episodes: int = 50
+    """Episodes of each evaluation, always the same ones."""
+    jobs: int = 1
+    """Runs at the same time; each needs a core for the learner and one for the engine."""
+    minutes: float | None = None
+    """Begin no new run after so many minutes."""
+    out: Path = Path("runs/bullet")
+    """Parent of all run folders."""
+    home: Path = HOME
+    """Folder of the Python environment with panda-gym; made if it does not exist."""
+    python: str = PYTHON
+    """Python 3.11 that makes this environment, by default $PYTHON311 or python3.11."""
+
+
+class _Run(NamedTuple):
+    method: str
+    seed: int
+    folder: Path
+
+
+def main(args: BulletArgs) -> None:
+    """Plays what is missing, and says how far it came."""
+    check(args)
+    python = panda_gym.bullet(args.home, args.python)
+    started, missing = time.monotonic(), unfinished(args)
+
+    def play(run: _Run) -> None:
+        if args.minutes is None or time.monotonic() - started < 60 * args.minutes:
+            panda_gym.fine_tune(
+                python, args.out, options(args, run), log=args.out / f"robot-{run.method}-{run.seed}.log"
+            )
+
+    args.out.mkdir(parents=True, exist_ok=True)
+    with ThreadPoolExecutor(args.jobs) as pool:
+        list(pool.map(play, missing))  # the first error ends it
+    every = list(runs(args))
+    print(f"{sum((run.folder / SUMMARY).exists() for run in every)} of {len(every)} runs are finished")
+    print(f"next: python -m experiments.figures --out {args.out}")
+
+
+def check(args: BulletArgs) -> None:
+    """Raises UserError for all that is wrong with the options before anything is made."""
+    at_least_one(args, "seeds", "rollouts", "episodes", "jobs")
+    not_negative(args, "minutes")
+    seed_list(args.seed, args.seeds)
+    if not args.methods:
+        raise UserError("--methods: name at least one")
+    without_repeats("--methods", args.methods)
+    check_folder(args.out)
+    folders = prior_folders(args.prior, out=args.out, task=TASK, preset="")
+    for method in map(get_method, args.methods):
+        for folder in folders:
+            check_prior(folder, method, TASK)
+    for run in unfinished(args):
+        finetune_args.check(replace(_arguments(args, run.method, run.seed), resume=run.folder.exists()))
+    panda_gym.check_driver()
+
+
+def runs(args: BulletArgs) -> Iterator[_Run]:
+    """Every run: all methods of a seed, then the next seed, so that whatever there is can be compared."""
+    for seed in range(args.seed, args.seed + args.seeds):
+        for method in args.methods:
+            yield _Run(method, seed, finetune_args.run_folder(_arguments(args, method, seed), REMOTE))
+
+
+def unfinished(args: BulletArgs) -> list[_Run]:
+    """Those that are still to be played, or to go on."""
+    return [run for run in runs(args) if not (run.folder / SUMMARY).exists()]
+
+
+def _arguments(args: BulletArgs, method: str, seed: int) -> FinetuneArgs:
+    """What a run is, as `experiments.finetune` sees it."""
+    return finetune_args.arguments(
+        method, task=TASK, real=(REMOTE,), seeds=1, seed=seed, prior=args.prior, rollouts=args.rollouts,
+        eval_at=args.eval_at, eval_episodes=args.episodes, out=args.out,
+    )  # fmt: skip
+
+
+def options(args: BulletArgs, run: _Run) -> list[object]:
+    """Of `experiments.finetune`."""
+    return [
+        "--method", run.method, "--seed", run.seed, "--prior", args.prior, "--rollouts", args.rollouts,
+        "--eval-episodes", args.episodes, "--eval-at", *args.eval_at, *(["--resume"] if run.folder.exists() else []),
+    ]  # fmt: skip
+
+
+if __name__ == "__main__":
+    cli.run_main(main, BulletArgs, __doc__ or "")

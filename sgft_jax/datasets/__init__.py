@@ -1,0 +1,1 @@
+"""Recorded data: reading, writing, layouts of others."""

@@ -1,0 +1,265 @@
+"""Impure: what lies in recorded files, as rows: HDF5 of D4RL and Minari, tables of a robot, rollouts of our own runs.
+
+A reader tells what is there and changes nothing; `check` is the one judge of all rows, and `data.logs` makes
+transitions of them. What is not as its layout says is a `UserError` with one line.
+"""
+
+import io
+import re
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, TypedDict
+
+import h5py
+import numpy as np
+
+from envs.files import Count, Positive, read_object, read_text
+from envs.types import UserError
+from sgft_jax.files.arrays import flags, numbers
+from sgft_jax.files.hdf5 import Reader, opened
+from sgft_jax.io.real import played
+from sgft_jax.types import Successors
+
+_COLUMNS, _TORQUE = 6, 3.0  # of a table; N m
+_MAIN, _METADATA = "main_data.hdf5", "metadata.json"
+_LONGEST = 2**30  # bytes of a table
+_SAME = 1e-4  # relative; what two copies of an observation differ by
+_FIX = "leave the row out of the file"
+
+
+class Rows(NamedTuple):
+    """All rows [N, ...] of a file, in its order.
+
+    reward, terminal: None where the file does not tell. ends: [N] bool, last row of an episode. keep: [N] bool, rows
+    whose successor is known. layout: its name. successors: where next observations come from. rate: steps per second,
+    None where the file does not tell. source: the file that stands for all, or the folder. assumed: what the file does
+    not tell and was taken to be so, in words.
+    """
+
+    obs: np.ndarray
+    action: np.ndarray
+    reward: np.ndarray | None
+    next_obs: np.ndarray
+    terminal: np.ndarray | None
+    ends: np.ndarray
+    keep: np.ndarray
+    layout: str
+    successors: str
+    source: Path
+    rate: float | None = None
+    assumed: str = ""
+
+
+class _Card(TypedDict, total=False):
+    """What is read of Minari's card."""
+
+    data_format: str
+    total_episodes: Count
+    total_steps: Count
+    control_dt: Positive
+
+
+def check(path: Path, rows: Rows) -> Rows:
+    """The rows as float32, all finite; raises UserError where they are not, or where they are no transitions."""
+    if not np.any(rows.keep):
+        raise UserError(f"{path}: holds no transitions; supply another file")
+    if rows.next_obs.shape != rows.obs.shape:
+        raise UserError(
+            f"{path}: next observations are {list(rows.next_obs.shape)}, observations {list(rows.obs.shape)}; "
+            "supply another file or set successors to 'shifted'"
+        )
+    n = len(rows.keep)
+    shapes = {"obs": (n, None), "action": (n, None), "next_obs": (n, None)}
+    shapes |= {} if rows.reward is None else {"reward": (n,)}
+    return rows._replace(
+        **{name: numbers(path, name, getattr(rows, name), shape, fix=_FIX) for name, shape in shapes.items()}
+    )
+
+
+def files_of(folder: Path) -> list[Path]:
+    """The files in a folder, in the order of their names. Hidden ones are left out: systems leave them everywhere."""
+    paths = (path for path in folder.rglob("*") if path.is_file())
+    return sorted(path for path in paths if not any(part[0] == "." for part in path.relative_to(folder).parts))
+
+
+def read_hdf5(path: Path, successors: Successors, limit: int | None = None) -> Rows:
+    """The rows of a D4RL file, or of a Minari data set: its folder, or the `main_data.hdf5` inside.
+
+    limit: steps after which the task ends an episode, for a file that does not tell where episodes end.
+    """
+    file = _file_of(path)
+    with opened(file) as content:
+        groups = _episodes(content)
+        if not groups:
+            return _read_d4rl(content, successors, limit)
+        if successors == "shifted":
+            raise UserError(f"{file}: Minari episodes hold their last observation; leave successors at 'stored'")
+        return _read_minari(content, groups)
+
+
+def read_table(path: Path, measured_dim: int) -> tuple[Rows, int]:
+    """The rows of a wheel-legged robot's log, without rewards, and how many rows it has in all.
+
+    measured_dim: 4 reads x, v, pitch and its velocity as the observation, 3 leaves x out. See `logs.load_table`.
+    """
+    table = _table(path)
+    state, torque = table[:, 4 - measured_dim : 4], table[:, 4:5]
+    done = flags(path, "done", table[:, 5], (None,), fix=_FIX)
+    small = np.abs(torque[:, 0]) <= _TORQUE
+    rows = np.flatnonzero((small & ~done)[:-1] & (small | done)[1:])
+    if not len(rows):
+        raise UserError(f"{path}: holds no transitions; supply another file")
+    terminal, apart = done[rows + 1], np.diff(rows, append=rows[-1:]) > 1
+    found = Rows(
+        state[rows], torque[rows] / _TORQUE, None, state[rows + 1], terminal, terminal | apart,
+        np.ones(len(rows), bool), "table", "stored", path,
+    )  # fmt: skip
+    return found, len(table)
+
+
+def read_rollouts(home: Path) -> Rows:
+    """The valid steps of the rollouts in `<home>/real/`, all of the first seed first."""
+    each = [own.rows for own in played(home) if len(own.rows["reward"])]
+    if not each:
+        raise UserError(f"{home / 'real'}: holds no valid step")
+    joined = {name: np.concatenate([rows[name] for rows in each]) for name in each[0]}
+    last = np.cumsum([len(rows["reward"]) for rows in each]) - 1
+    ends = np.isin(np.arange(last[-1] + 1), last)
+    return Rows(
+        joined["obs"], joined["action"], joined["reward"], joined["next_obs"], joined["discount"] == 0, ends,
+        np.ones(len(ends), bool), "rollouts", "stored", home / "real",
+    )  # fmt: skip
+
+
+def _table(file: Path) -> np.ndarray:
+    """[N, 6] numbers of a text file."""
+    text = read_text(file, limit=_LONGEST)
+    delimiter = "," if "," in text.partition("\n")[0] else None
+    try:
+        with warnings.catch_warnings(action="ignore"):  # of no rows
+            table = np.loadtxt(io.StringIO(text), ndmin=2, delimiter=delimiter)
+    except ValueError as error:
+        message = str(error).splitlines()[0]
+        raise UserError(f"{file}: is not a table of numbers ({message}); supply six columns without a head") from error
+    if table.size and table.shape[1] != _COLUMNS:
+        raise UserError(f"{file}: has {table.shape[1]} columns, not x, v, pitch, its velocity, torque and done")
+    return numbers(file, "a number", table.reshape(-1, _COLUMNS), (None, None), fix=_FIX)
+
+
+def _card(folder: Path) -> Mapping[str, Any]:
+    """What Minari says of a data set."""
+    return read_object(folder / _METADATA, _Card, "supply a whole data set")
+
+
+def _file_of(path: Path) -> Path:
+    """The HDF5 file that `path` means."""
+    if not path.is_dir():
+        return path
+    for folder in (path / "data", path):
+        if (folder / _MAIN).exists():
+            return folder / _MAIN
+        if (folder / _METADATA).exists() and (kind := _card(folder).get("data_format")) != "hdf5":
+            raise UserError(f"{folder}: its data_format is {kind}; make the data set with data_format='hdf5'")
+    raise UserError(f"{path}: holds no data/{_MAIN}; name an HDF5 file or the folder of a Minari data set")
+
+
+def _read_d4rl(content: Reader, successors: Successors, limit: int | None) -> Rows:
+    file, stored = content.path, None
+    obs, action, reward, terminal, timeout = _columns(content, None, "terminals", "timeouts")
+    known = content.has(None, "next_observations")
+    if successors == "stored" and not known:
+        raise UserError(f"{file}: has no 'next_observations'; set successors to 'shifted'")
+    if known and (successors == "stored" or timeout is None):
+        stored = content.array(None, "next_observations", 2)
+    below = {} if stored is None else {"next_observations": stored}
+    _check_lengths(file, {"observations": obs, "rewards": reward, **below})
+    assumed = ""
+    if timeout is None:
+        timeout, assumed = _time_limits(obs, stored, terminal, limit)
+    keep = np.ones(len(obs), bool)
+    if stored is None or successors == "shifted":
+        stored, keep = np.roll(obs, -1, axis=0), ~timeout
+        keep[-1:] = False
+    ends = terminal | timeout
+    return Rows(obs, action, reward, stored, terminal, ends, keep, "d4rl", successors, file, assumed=assumed)
+
+
+def _columns(
+    content: Reader, group: h5py.Group | None, terminal: str, timeout: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray | None]:
+    """Observations, actions, rewards and the flags of that name; None in place of time limits that are not there."""
+    obs, action = content.array(group, "observations", 2), content.array(group, "actions", 2)
+    reward = content.array(group, "rewards", 1)
+    names = (terminal, *([timeout] if content.has(group, timeout) else []))
+    ends = {name: content.array(group, name, 1) for name in names}
+    where = content.path if group is None else f"{content.path}: {group.name}"
+    _check_lengths(where, {"actions": action, "rewards": reward, **ends})
+    ends = {name: flags(where, name, x, (None,), fix=_FIX) for name, x in ends.items()}
+    return obs, action, reward, ends[terminal], ends.get(timeout)
+
+
+def _time_limits(
+    obs: np.ndarray, stored: np.ndarray | None, terminal: np.ndarray, limit: int | None
+) -> tuple[np.ndarray, str]:
+    """[N] rows that time has ended in a file without 'timeouts', and how that was known, in words."""
+    words = "has no 'timeouts': an episode is taken to end at a terminal row"
+    if stored is not None and stored.shape == obs.shape:
+        with np.errstate(invalid="ignore", over="ignore"):
+            here, below = stored[:-1].astype(np.float64), obs[1:].astype(np.float64)
+            jump = (np.abs(here - below) > _SAME * (1 + np.abs(below))).any(axis=1)
+        return np.append(jump, False)[: len(obs)] & ~terminal, f"{words}, and where the row below begins anew"
+    if limit is not None:
+        place = np.arange(len(obs))
+        starts = np.concatenate([[True], terminal[:-1]])[: len(obs)]
+        age = place - np.maximum.accumulate(np.where(starts, place, 0))
+        return ((age + 1) % limit == 0) & ~terminal, f"{words}, or after the {limit} steps of the task"
+    return np.zeros(len(obs), bool), f"{words} alone"
+
+
+def _check_lengths(where: Path | str, arrays: Mapping[str, np.ndarray]) -> None:
+    lengths = {name: len(array) for name, array in arrays.items()}
+    if len(set(lengths.values())) > 1:
+        listed = ", ".join(f"{name} {n}" for name, n in lengths.items())
+        raise UserError(f"{where}: the numbers of rows differ ({listed}); supply a whole file")
+
+
+def _read_minari(content: Reader, groups: list[h5py.Group]) -> Rows:
+    file = content.path
+    episodes = [_read_episode(content, group) for group in groups]
+    sizes = [[x.shape[1:] for x in rows] for rows in episodes]
+    if odd := [group.name for group, size in zip(groups, sizes, strict=True) if size != sizes[0]]:
+        raise UserError(
+            f"{file}: {odd[0]} has other sizes of observations or actions than {groups[0].name}; "
+            "supply episodes of one task"
+        )
+    obs, action, reward, next_obs, terminal, ends = map(np.concatenate, zip(*episodes, strict=True))
+    card = _card(file.parent) if file.with_name(_METADATA).exists() else {}
+    for name, n in {"total_episodes": len(groups), "total_steps": len(reward)}.items():
+        if (stated := card.get(name, n)) != n:
+            raise UserError(f"{file}: holds {name} {n}, but {_METADATA} says {stated}; supply a whole data set")
+    rate = 1 / card["control_dt"] if "control_dt" in card else None
+    keep = np.ones(len(reward), bool)
+    return Rows(obs, action, reward, next_obs, terminal, ends, keep, "minari", "episode", file, rate)
+
+
+def _episodes(content: Reader) -> list[h5py.Group]:
+    """The groups `episode_0`, `episode_1`, ... of a Minari file, in the order of their numbers."""
+    numbered = {
+        int(m[1]): m[0] for name in content.names() if (m := re.fullmatch(r"episode_(0|[1-9][0-9]{0,17})", name))
+    }
+    groups = [content.group(name) for _, name in sorted(numbered.items())]
+    return [group for group in groups if group is not None]
+
+
+def _read_episode(content: Reader, group: h5py.Group) -> tuple[np.ndarray, ...]:
+    """The T rows of one episode, which has T + 1 observations: obs, action, reward, next_obs, terminal, ends."""
+    obs, action, reward, terminal, _ = _columns(content, group, "terminations", "truncations")
+    steps, stated = len(reward), content.attribute(group, "total_steps")
+    if len(obs) != steps + 1 or stated not in (None, steps):
+        raise UserError(
+            f"{content.path}: {group.name} has {len(obs)} observations for {steps} of "
+            f"{steps if stated is None else stated} rewards; every episode needs one observation more than rewards: "
+            "supply a whole file"
+        )
+    return obs[:-1], action, reward, obs[1:], terminal, np.arange(steps) == steps - 1

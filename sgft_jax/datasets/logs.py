@@ -1,0 +1,284 @@
+"""Impure: recorded transitions as data to learn from, whatever their layout, in memory.
+
+Nothing is downloaded: the user supplies the file, and its `Facts` say what it holds. A file that is not what it should
+be is a `UserError` with one line. Arrays are float32 on the host; `replay.full` makes them a buffer to sample.
+"""
+
+import dataclasses
+import hashlib
+import stat
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple, cast, get_args
+
+import jax
+import numpy as np
+
+from envs.base import Env
+from envs.history import remember, with_memory
+from envs.types import Array, Transition, UserError, unknown
+from sgft_jax.datasets import layouts, lerobot
+from sgft_jax.datasets.layouts import Rows
+from sgft_jax.files.arrays import numbers
+from sgft_jax.io.real import home_of
+from sgft_jax.types import Successors
+
+_TABLES = (".txt", ".csv")
+_SAME_RATE = 0.01  # relative; clocks and rounded rates differ by less
+_BEYOND = 1.01  # an action that no rounding explains
+
+
+@dataclasses.dataclass(frozen=True)
+class Facts:
+    """What a file held, for provenance and for a look before training.
+
+    path: of the file, or of the folder. layout: "d4rl", "minari", "lerobot", "table" or "rollouts" (of a run of ours).
+    size: bytes. sha256: of its bytes, of a folder of all its files, hex.
+    successors: where next observations come from; "episode" for Minari, whose episodes hold one observation more.
+    transitions: rows that are returned; dropped: rows of the file that are not. terminal: returned rows whose discount
+        is 0. clipped: returned rows with an action beyond [-1, 1].
+    episodes: in the file, one that the end of the file cuts off included; whole_episodes: the others.
+    return_*: undiscounted returns of the whole episodes, or of all if none is whole. std is that of the population.
+    assumed: what the file does not tell and was taken to be so, in words; "" where it tells all.
+    """
+
+    path: str
+    layout: str
+    size: int
+    sha256: str
+    successors: str
+    transitions: int
+    dropped: int
+    terminal: int
+    clipped: int
+    episodes: int
+    whole_episodes: int
+    return_mean: float
+    return_std: float
+    return_min: float
+    return_max: float
+    assumed: str = ""
+
+
+class Log(NamedTuple):
+    """rows: [N, ...] transitions in the order of the file, float32 on the host. facts: where they come from.
+
+    last: [N] bool, the rows that the row below does not follow: what `sequences.full` needs.
+    """
+
+    rows: Transition
+    facts: Facts
+    last: np.ndarray
+
+
+def load(path: Path | str, *, gamma: float, successors: Successors = "stored", env: Env | None = None) -> Log:
+    """The transitions of a D4RL file; of a data set of Minari or LeRobot v3, by its folder; of the rollouts of a run of
+    ours, by the run's folder or its `real/`; or of a robot's table, see `load_table`.
+
+    gamma: a row's discount is gamma, or 0 where it is terminal. A time limit is never terminal: it only ends episodes,
+        and so does an end whose reason the file does not tell. Actions are clipped to [-1, 1].
+    successors: of D4RL files. "stored" takes `next_observations` and keeps every row. "shifted" takes the observation
+        of the row below and drops the rows of time limits and the last row, as D4RL's own `qlearning_dataset` does.
+        The successor of a shifted terminal row is the start of the next episode: a discount of 0 hides it from
+        critics, but not from a discriminator.
+    env: the task that was recorded. Then observations may be what its sensors measure: what a policy reads beyond, such
+        as the last actions, is added episode by episode. Rewards and terminations that the file does not tell are the
+        task's. Sizes and the length of a step are checked.
+    Raises UserError for a file that is missing, cut off, of another layout or task, or holds numbers that are not
+    finite.
+    """
+    if successors not in (known := get_args(Successors)):
+        raise UserError(unknown("successors", successors, known))
+    path = Path(path)
+    if path.suffix in _TABLES:
+        if env is None or not env.name.startswith("wheel-legged") or env.reward is None:
+            task = "another task" if env is None else env.name
+            raise UserError(f"{path}: tables are logs of a wheel-legged robot; {task} wants a data set")
+        return load_table(path, gamma=gamma, obs_dim=env.measured_dim, reward=jax.vmap(env.reward), env=env)
+    return _log(path, _read(path, successors, env), gamma, env)
+
+
+def load_table(
+    path: Path | str, *, gamma: float, obs_dim: int, reward: Callable[..., Array], env: Env | None = None
+) -> Log:
+    """The transitions of a wheel-legged robot's log: text, a row each control period, with these six columns.
+
+    x (m), v (m/s), pitch (rad), pitch velocity (rad/s), torque (N m), done. obs_dim: 4 reads the first four as the
+    observation, 3 leaves x out. reward(obs [N, obs_dim], action [N, 1], next_obs [N, obs_dim]) -> [N], of the task.
+    Rows with a torque beyond +-3 N m are dropped, whatever its sign, and an episode ends before each of them. A row
+    whose successor is done is terminal; rows that are done are dropped. Source: H2O+'s log of the standing robot, whose
+    released loader keeps torques below -3 and joins what lies on both sides of a dropped row. env: see `load`.
+    Raises UserError for a file that is missing, has other columns, numbers that are not finite, or no transition.
+    """
+    rows, count = layouts.read_table(Path(path), obs_dim)
+    rows = rows._replace(reward=np.asarray(reward(rows.obs, rows.action, rows.next_obs)))
+    log = _log(Path(path), rows, gamma, env)
+    return log._replace(facts=dataclasses.replace(log.facts, dropped=count - len(rows.obs)))
+
+
+def episodes(found: Sequence[Log]) -> tuple[Transition, np.ndarray]:
+    """All episodes of some logs, one after another: transitions [N, T, ...] and which of them are valid [N, T].
+
+    T is the length of the longest; behind the end of an episode are zeros. A gap where rows were dropped ends one too.
+    """
+    each = [
+        jax.tree.map(lambda x, a=a, b=b: np.asarray(x)[a:b], log.rows)
+        for log in found
+        for a, b in zip(*_borders(log.last), strict=True)
+    ]
+    longest = max(len(rows.reward) for rows in each)
+    padded = lambda *x: np.stack([np.pad(own, [(0, longest - len(own))] + [(0, 0)] * (own.ndim - 1)) for own in x])  # noqa: E731
+    return jax.tree.map(padded, *each), padded(*[np.ones(len(rows.reward), bool) for rows in each])
+
+
+def _borders(last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The first row of every episode, and the row behind it."""
+    ends = np.flatnonzero(np.append(last[:-1], True)) + 1
+    return np.concatenate([[0], ends[:-1]]), ends
+
+
+def _read(path: Path, successors: Successors, env: Env | None) -> Rows:
+    """What lies there."""
+    with _readable(path):
+        folder = stat.S_ISDIR(path.stat().st_mode)
+    if folder:
+        if (path / lerobot.INFO).exists():
+            return lerobot.read(path)
+        if (home := home_of(path)) is not None:
+            return layouts.read_rollouts(home)
+    return layouts.read_hdf5(path, successors, None if env is None else env.episode_length)
+
+
+def _log(path: Path, rows: Rows, gamma: float, env: Env | None) -> Log:
+    """The transitions of what a file holds, as a task sees them."""
+    rows = layouts.check(path, rows)
+    if env is not None:
+        rows = _fitted(path, rows, env)
+    rows = _judged(path, rows, env)
+    if env is not None:
+        rows = _seen(rows, env)
+    below = np.append(rows.keep[1:], False)
+    return Log(_transitions(rows, gamma), _facts(rows), (rows.ends | ~below)[rows.keep])
+
+
+# --- what a task makes of it ------------------------------------------------------------------------------------------
+
+
+def _fitted(path: Path, rows: Rows, env: Env) -> Rows:
+    """With the task's sizes; raises UserError where they are others, or where a step lasts longer or shorter."""
+    if rows.layout == "rollouts":  # of a run whose policy may have seen more, or less, than this one
+        n = env.measured_dim
+        rows = rows._replace(obs=rows.obs[:, :n], next_obs=rows.next_obs[:, :n])
+    seen, commanded = rows.obs.shape[1], rows.action.shape[1]
+    if commanded != env.act_dim or seen not in (env.measured_dim, env.obs_dim):
+        more, odd = divmod(seen - env.measured_dim, env.act_dim)
+        fits = commanded == env.act_dim and more >= 0 and not odd
+        advice = f"previous_actions={more} would fit" if fits else "name the task that it was recorded on"
+        raise UserError(
+            f"{path}: has {seen} observations and {commanded} actions, {env.name} has {env.obs_dim} and "
+            f"{env.act_dim}; {advice}"
+        )
+    if np.mean((np.abs(rows.action) > _BEYOND).any(axis=1)) > 0.5:
+        raise UserError(f"{path}: most actions lie beyond [-1, 1]; scale them to what {env.name} commands")
+    if rows.rate is not None and abs(rows.rate * env.control_dt - 1) > _SAME_RATE:
+        raise UserError(
+            f"{path}: has {rows.rate:g} steps a second, {env.name} has {1 / env.control_dt:g}; resample it to that"
+        )
+    return rows
+
+
+def _judged(path: Path, rows: Rows, env: Env | None) -> Rows:
+    """With the task's rewards and terminations where the file tells none. Without a task episodes end by time alone."""
+    step: tuple[Any, ...] = rows.obs, np.clip(rows.action, -1, 1), rows.next_obs
+    if rows.reward is None:
+        if env is None or env.reward is None:
+            raise UserError(f"{path}: tells no rewards, and neither does a task; record them as next.reward")
+        reward = np.where(rows.keep, jax.vmap(env.reward)(*step), 0.0)
+        rows = rows._replace(
+            reward=numbers(path, f"the reward of {env.name}", reward, (None,), fix="leave the row out")
+        )
+    if rows.terminal is None:
+        ended = np.zeros(len(rows.obs), bool)
+        if env is not None and env.terminated is not None:
+            ended = rows.ends & np.asarray(jax.vmap(env.terminated)(*step))
+        rows = rows._replace(terminal=ended)
+    return rows
+
+
+def _seen(rows: Rows, env: Env) -> Rows:
+    """With what a policy reads beyond measurements, as `envs.history.with_memory` makes it."""
+    if rows.obs.shape[1] == env.obs_dim:
+        return rows
+    action, place = np.clip(rows.action, -1, 1).astype(np.float32), np.arange(len(rows.ends))
+    starts = np.concatenate([[True], rows.ends[:-1]])
+    age = place - np.maximum.accumulate(np.where(starts, place, 0))  # steps since the episode began
+    memory = np.zeros((len(action), env.previous_actions, env.act_dim), np.float32)
+    for k in range(env.previous_actions):
+        known = age > k
+        memory[known, k] = action[place[known] - 1 - k]
+    return rows._replace(
+        obs=with_memory(env, rows.obs, memory), next_obs=with_memory(env, rows.next_obs, remember(memory, action))
+    )
+
+
+# --- facts ------------------------------------------------------------------------------------------------------------
+
+
+def _transitions(rows: Rows, gamma: float) -> Transition:
+    def kept(array: np.ndarray) -> np.ndarray:
+        return np.ascontiguousarray(array[rows.keep], np.float32)
+
+    assert rows.reward is not None and rows.terminal is not None
+    action = np.clip(kept(rows.action), -1.0, 1.0)
+    discount = kept(np.where(rows.terminal, 0.0, gamma))
+    found = kept(rows.obs), action, kept(rows.reward), discount, kept(rows.next_obs)
+    return Transition(*cast(tuple[Array, ...], found))
+
+
+def _facts(rows: Rows) -> Facts:
+    assert rows.reward is not None and rows.terminal is not None
+    size, digest = _fingerprint(rows.source)
+    keep, whole = rows.keep, int(np.sum(rows.ends))
+    number = np.cumsum(rows.ends) - rows.ends  # of the episode of every row
+    returns = np.bincount(number, weights=rows.reward.astype(np.float64))
+    judged = returns[:whole] if whole else returns
+    return Facts(
+        path=str(rows.source),
+        layout=rows.layout,
+        size=size,
+        sha256=digest,
+        successors=rows.successors,
+        transitions=int(np.sum(keep)),
+        dropped=int(np.sum(~keep)),
+        terminal=int(np.sum(rows.terminal & keep)),
+        clipped=int(np.sum((np.abs(rows.action) > 1).any(axis=1) & keep)),
+        episodes=len(returns),
+        whole_episodes=whole,
+        return_mean=float(np.mean(judged)),
+        return_std=float(np.std(judged)),
+        return_min=float(np.min(judged)),
+        return_max=float(np.max(judged)),
+        assumed=rows.assumed,
+    )
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except OSError as error:  # a name that is too long, a folder that is closed
+        raise UserError(f"{path}: cannot be read ({(error.strerror or str(error)).lower()})") from None
+    except ValueError:  # a zero byte
+        raise UserError(f"{str(path)!r}: is no name of a file") from None
+
+
+def _fingerprint(source: Path) -> tuple[int, str]:
+    """Bytes of a file and their SHA-256; of a folder those of its files, in the order of their names."""
+    if not source.is_dir():
+        with _readable(source), open(source, "rb") as stream:
+            return source.stat().st_size, hashlib.file_digest(stream, "sha256").hexdigest()
+    each = [(path.relative_to(source).as_posix(), *_fingerprint(path)) for path in layouts.files_of(source)]
+    return sum(size for _, size, _ in each), hashlib.sha256(repr([one[::2] for one in each]).encode()).hexdigest()

@@ -1,0 +1,1 @@
+"""What nets, learners and analysis share: losses, optimisers, statistics."""

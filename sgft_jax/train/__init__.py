@@ -1,0 +1,1 @@
+"""Training: in simulation, on the real system, and what chooses policies."""

@@ -1,0 +1,459 @@
+"""Training as iterators. They yield (state, metrics), print nothing and touch no files; the caller does both.
+
+A yielded state is valid until the iterator's next step, which donates its arrays: copy it to keep it longer.
+"""
+
+import functools
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from envs.base import Env, World
+from envs.mesh import split_vmap
+from envs.rollout import Episode, play_episode
+from envs.types import Array, Key, Policy, PyTree, Transition, UserError
+from sgft_jax.data import replay
+from sgft_jax.systems import System
+from sgft_jax.train import evidence
+from sgft_jax.train.evidence import Best
+from sgft_jax.train.guard import Guarded
+from sgft_jax.types import Finetuner, Metrics, SimulatedData, Simulation
+
+_INIT, _COLLECT, _LEARN, _EVALUATE, _OFFLINE = range(5)  # purposes, folded into a seed's key
+Phase = Literal["offline", "logged", "online"]  # of learning, see `Updates`
+OFFLINE_PART = 5_000  # updates of the offline phase between two yields
+_AT_ONCE = 1024  # simulated episodes played together
+
+
+class FinetuneProgress(NamedTuple):
+    """What a fine-tuning run needs to go on.
+
+    agent: [M, ...]. rollouts: int32 [], real ones behind it. offline: int32 [], updates before the first of them, on
+    simulated transitions, then on logs. transitions: [M] int32, the real ones in the rollouts.
+    """
+
+    agent: PyTree
+    best: Best
+    rollouts: Array
+    offline: Array
+    transitions: Array
+
+
+class Logged(NamedTuple):
+    """Episodes of the real system that something else has played, the same for all members.
+
+    transitions: [N, T, ...]. valid: [N, T] bool, the first steps of each episode. updates: gradient updates on them
+    before the first rollout.
+    """
+
+    transitions: Transition
+    valid: Array
+    updates: int
+
+
+class SimulatedRows(NamedTuple):
+    """Transitions of the simulator, one set for each of P priors, shared by all members.
+
+    replay: [P, ...]. returns: [P, episodes] of the task, undiscounted.
+    """
+
+    replay: replay.ReplayState
+    returns: Array
+
+    def of(self, which: Array) -> SimulatedData:
+        """The set of prior `which` [], without a copy of it."""
+
+        def draw(key: Key, n: int) -> Transition:
+            rows = jax.random.randint(key, (n,), 0, jnp.maximum(self.replay.size[which], 1))
+            return jax.tree.map(lambda x: x[which, rows], self.replay.data)
+
+        return SimulatedData(draw, self.returns[which])
+
+
+class Beside(Protocol):
+    """A learner that works while the robot plays, such as a `LearnerProcess`."""
+
+    def submit(self, agent: PyTree, parts: Sequence[int], updates: int | Array, phase: Phase) -> None:
+        """Begins the learning phases `parts`, see `Updates`."""
+        ...
+
+    def ready(self) -> bool:
+        """Whether `result` would not wait."""
+        ...
+
+    def result(self) -> tuple[PyTree, Metrics]:
+        """What the phases have led to; the same until the next `submit`."""
+        ...
+
+
+# --- fine-tuning ------------------------------------------------------------------------------------------------------
+
+
+def finetune(
+    finetuner: Finetuner,
+    system: System,
+    priors: PyTree,
+    seeds: Array,
+    simulated: SimulatedRows | None = None,
+    *,
+    rollouts: int,
+    progress: FinetuneProgress | None = None,
+    learner: Beside | None = None,
+    waits: bool = True,
+    logged: Logged | None = None,
+) -> Iterator[tuple[FinetuneProgress, Metrics]]:
+    """Fine-tunes M members, each a seed on a real system, until each has made `rollouts` real rollouts.
+
+    priors: params [P, ...] of P priors, or None; the member with seed s starts from prior s modulo P.
+    seeds: [M] uint32. simulated: see `simulate`, for methods that ask for it.
+    progress: where an earlier run stopped, or None. logged: logs to begin with: all members keep their episodes and
+    make `logged.updates` updates, as they learn from real rollouts, before they play.
+    learner: a process that learns while the system is reset, for systems that are stepped (`Gymnasium.play`); None:
+    this process learns between rollouts. waits: True holds the first step of a rollout until learning has finished, so
+    results are those without a `learner`. False plays with the old policy until the new one has been learned; such a
+    rollout is evidence for the one that made more of its steps.
+
+    A rollout of full length is followed by `finetuner.updates_per_rollout` updates, a shorter one by its share, one at
+    least, and one without a valid step by none.
+
+    Yields the fresh state with no metrics (unless `progress` is given), then once per part of the offline phase, then
+    once per real rollout, all initial ones together; with a `learner` after the next rollout has been played. Metrics
+    are arrays [M]. Every random draw follows from (seed, purpose, rollout), so a resumed run draws what an
+    uninterrupted one would have drawn, and all methods meet the same real starts.
+    """
+    step = _Steps(finetuner, system, priors, seeds, simulated)
+    if progress is None:
+        progress = step.begin()
+        yield progress, {}
+    simulated_updates = simulated_updates_of(finetuner)
+    while (done := int(progress.offline)) < simulated_updates:
+        progress, metrics = step.offline(progress, done, min(OFFLINE_PART, simulated_updates - done), learner)
+        yield progress, metrics
+    if logged is not None:
+        if done == simulated_updates and not int(progress.rollouts):  # else they are kept already
+            progress = step.keep(progress, logged)
+        updates = simulated_updates + logged.updates
+        while (done := int(progress.offline)) < updates:
+            progress, metrics = step.offline(progress, done, min(OFFLINE_PART, updates - done), learner, logged=True)
+            yield progress, metrics
+    if learner is not None:
+        if not waits and isinstance(progress.agent, Guarded):
+            raise UserError("waits=False: a guard judges rollouts by one policy; leave one of the two out")
+        yield from step.beside(progress, learner, rollouts, waits=waits)
+        return
+    while (done := int(progress.rollouts)) < rollouts:
+        progress, metrics = step.rollouts(progress, done, 1 if done else finetuner.initial_rollouts)
+        yield progress, metrics
+
+
+def simulated_updates_of(finetuner: Finetuner) -> int:
+    """Updates on simulated transitions alone, before anything else."""
+    return finetuner.simulation.offline_updates if finetuner.simulation else 0
+
+
+def offline_parts(finetuner: Finetuner, offline: int) -> int:
+    """In how many parts so many updates before the first rollout have been yielded."""
+    simulated = min(offline, simulated_updates_of(finetuner))
+    return -(-simulated // OFFLINE_PART) - (simulated - offline) // OFFLINE_PART
+
+
+def evaluate(policy: Any, system: System, states: PyTree, seeds: Array, episodes: int) -> Episode:
+    """Episodes [M, episodes] without exploration, the same ones at every call: a fixed series for each seed.
+
+    policy, states: see `System.play`; for a `Finetuner` the states are `FinetuneProgress.agent`.
+    """
+    return system.play(policy, states, _episode_keys(seeds, _EVALUATE, 0, episodes), explore=False)
+
+
+def begin(
+    finetuner: Finetuner, priors: PyTree, seeds: Array, simulated: SimulatedRows | None = None
+) -> FinetuneProgress:
+    """The state that `finetune` starts from. `jax.eval_shape` of it says what a checkpoint is read into."""
+    which = prior_of(priors, seeds)
+
+    def one(params: PyTree, seed: Array, which: Array, rows: SimulatedRows | None) -> PyTree:
+        return finetuner.init(params, _key(seed, _INIT, 0), None if rows is None else rows.of(which))
+
+    agent = split_vmap(one, (0, 0, 0, None))(priors_of_members(priors, seeds), seeds, which, simulated)
+    m = seeds.shape[0]
+    best = evidence.nothing_known(jax.tree.map(jnp.copy, jax.vmap(finetuner.export)(agent)), m)
+    return FinetuneProgress(agent, best, jnp.int32(0), jnp.int32(0), jnp.zeros(m, jnp.int32))
+
+
+class Updates:
+    """Learning phases of M members, compiled.
+
+    seeds: [M] uint32. which: [M] the prior of each. simulated: see `finetune`.
+    """
+
+    def __init__(self, finetuner: Finetuner, seeds: Array, which: Array, simulated: SimulatedRows | None) -> None:
+        self.finetuner, self.seeds, self.which, self.simulated = finetuner, seeds, which, simulated
+        self._learn = jax.jit(self._update, static_argnums=(2, 4), donate_argnums=0)
+
+    def __call__(
+        self, agent: PyTree, parts: Sequence[int], updates: int | Array, phase: Phase = "online"
+    ) -> tuple[PyTree, Metrics]:
+        """So many updates in each part, a number from which their random draws follow; returns the mean metrics.
+
+        updates: or [parts, M], of each part and member, up to `updates_per_rollout`. phase: "offline", on simulated
+        transitions alone; "logged", before the first rollout; "online", after one.
+        """
+        purpose, learned = _LEARN if phase == "online" else _OFFLINE, []
+        most, limits = (updates, None) if isinstance(updates, int) else (self.finetuner.updates_per_rollout, updates)
+        for i, part in enumerate(parts):  # equal parts, so that one compiled program serves any number
+            keys = jax.vmap(lambda seed, part=part: _key(seed, purpose, part))(self.seeds)
+            limit = None if limits is None else limits[i]
+            agent, metrics = self._learn(agent, keys, most, self.simulated, phase == "offline", limit)
+            learned.append(metrics)
+        return agent, jax.tree.map(_mean, *learned) if limits is None else _mean_of_parts(learned)
+
+    def _update(
+        self, states: PyTree, keys: Key, updates: int, simulated: SimulatedRows | None, offline: bool,
+        limits: Array | None = None,
+    ) -> tuple[PyTree, Metrics]:  # fmt: skip
+        def one(state: PyTree, key: Key, which: Array, rows: SimulatedRows | None, limit: Array | None) -> Any:
+            data = None if rows is None else rows.of(which)
+            # Where no episode ends early the number is static: the program, and its bits, of a fixed length.
+            some = {} if limit is None else {"limit": limit}
+            return self.finetuner.learn(state, key, updates, data, offline=offline, **some)
+
+        axes = (0, 0, 0, None, None if limits is None else 0)
+        return split_vmap(one, axes)(states, keys, self.which, simulated, limits)
+
+
+class _Steps:
+    """The compiled steps of one run."""
+
+    def __init__(
+        self, finetuner: Finetuner, system: System, priors: PyTree, seeds: Array, simulated: SimulatedRows | None
+    ) -> None:
+        self.finetuner, self.system, self.simulated = finetuner, system, simulated
+        self.priors, self.seeds = priors, seeds
+        if finetuner.simulation is not None and simulated is None:
+            raise UserError("this method also learns from simulated transitions: pass `simulated` (see `simulate`)")
+        self._learn = Updates(finetuner, seeds, prior_of(priors, seeds), simulated)
+        self._store = jax.jit(split_vmap(self._observe), donate_argnums=0)
+        self._keep_log = jax.jit(split_vmap(self._observe_log, (0, None, None)), donate_argnums=0)
+        self._witness = jax.jit(evidence.witnessed)
+        self._judge = jax.jit(functools.partial(evidence.judged, finetuner))
+
+    def begin(self) -> FinetuneProgress:
+        """The fresh state."""
+        return jax.jit(functools.partial(begin, self.finetuner))(self.priors, self.seeds, self.simulated)
+
+    def keep(self, progress: FinetuneProgress, logged: Logged) -> FinetuneProgress:
+        """The episodes of a log, one after another, as if they had been played."""
+        agent = progress.agent
+        for i in range(len(logged.valid)):
+            agent = self._keep_log(agent, jax.tree.map(lambda x, i=i: x[i], logged.transitions), logged.valid[i])
+        return progress._replace(agent=agent)
+
+    def offline(
+        self, progress: FinetuneProgress, done: int, updates: int, learner: Beside | None, *, logged: bool = False
+    ) -> tuple[FinetuneProgress, Metrics]:
+        """Updates before the first rollout: on simulated transitions alone, or as after a rollout."""
+        phase: Phase = "logged" if logged else "offline"
+        if learner is None:
+            agent, metrics = self._learn(progress.agent, [done], updates, phase)
+        else:
+            learner.submit(progress.agent, [done], updates, phase)
+            agent, metrics = learner.result()
+        return progress._replace(agent=agent, offline=progress.offline + updates), metrics
+
+    def rollouts(self, progress: FinetuneProgress, done: int, n: int) -> tuple[FinetuneProgress, Metrics]:
+        """N real rollouts, one after another as on a robot, then the updates that they allow."""
+        played = self._play(progress.agent, done, n)
+        agent, best = self._take(progress.agent, progress.best, played, done, (progress.agent, done))
+        agent, metrics = self._learn(agent, range(done, done + n), self._updates(played))
+        progress = FinetuneProgress(
+            agent, best, progress.rollouts + n, progress.offline, progress.transitions + _transitions(played).sum(0)
+        )
+        return progress, _real(best, played) | metrics
+
+    def beside(
+        self, progress: FinetuneProgress, learner: Beside, rollouts: int, *, waits: bool
+    ) -> Iterator[tuple[FinetuneProgress, Metrics]]:
+        """The same with a learner that works on one rollout while the next one is played."""
+        agent, best, done, offline, transitions = (
+            progress.agent, progress.best, int(progress.rollouts), progress.offline, progress.transitions,
+        )  # fmt: skip
+        acting = _Acting(agent, done, None, waits=waits)  # before anything has been submitted
+        before: list[Episode] = []
+        while before or done < rollouts:
+            n = 1 if done else self.finetuner.initial_rollouts
+            played = self._play(acting, done, n) if done < rollouts else []
+            if before:
+                agent, metrics = learner.result()
+                real = _real(best, before)
+                yield FinetuneProgress(agent, best, jnp.int32(done), offline, transitions), real | metrics
+            if played:
+                agent, best = self._take(agent, best, played, done, acting.player(agent, done))
+                learner.submit(agent, range(done, done + n), self._updates(played), "online")
+                acting = _Acting(agent, done, learner, waits=waits)
+                done, transitions = done + n, transitions + _transitions(played).sum(0)
+            before = played
+
+    def _play(self, agent: PyTree, done: int, n: int) -> list[Episode]:
+        """The next n rollouts [M, 1]. agent: or a function that returns it."""
+        initial = self.finetuner.initial_policy if done == 0 else None
+        who, states = (
+            (self.finetuner, agent) if initial is None else (initial, priors_of_members(self.priors, self.seeds))
+        )
+        keys = [_episode_keys(self.seeds, _COLLECT, rollout, 1) for rollout in range(done, done + n)]
+        return [self.system.play(who, states, key, explore=True) for key in keys]
+
+    def _updates(self, played: Sequence[Episode]) -> int | Array:
+        """Gradient updates [n, M] after each of these rollouts; one number where all of them have their full length."""
+        full, length = self.finetuner.updates_per_rollout, played[0].valid.shape[-1]
+        made = np.asarray(_transitions(played))
+        if (made == length).all():
+            return full
+        return jnp.asarray(np.where(made, np.maximum(np.rint(full * made / length), 1), 0), jnp.int32)
+
+    def _take(
+        self, agent: PyTree, best: Best, played: Sequence[Episode], done: int, player: tuple[PyTree, int]
+    ) -> tuple[PyTree, Best]:
+        """The agent with these rollouts, and what they say of the one who played them.
+
+        player: that agent, or None, and the rollouts it had learned from.
+        """
+        for episodes in played:
+            score, total, exploded = (x[:, 0] for x in (episodes.score, episodes.total_reward, episodes.exploded))
+            if done or self.finetuner.initial_policy is None:
+                best = self._judge(best, player[0], score, total, exploded, jnp.int32(player[1]))
+            else:
+                best = self._witness(best, score, total)
+        for episodes in played:
+            score = jnp.where(episodes.exploded, -jnp.inf, episodes.score)
+            agent = self._store(agent, episodes.transitions, episodes.valid, score)
+        return agent, best
+
+    def _observe(self, state: PyTree, transitions: Transition, valid: Array, score: Array) -> PyTree:
+        """transitions, valid: [1, T, ...]. score: [1]."""
+        return self.finetuner.observe(state, jax.tree.map(lambda x: x[0], transitions), valid[0], score[0])
+
+    def _observe_log(self, state: PyTree, transitions: Transition, valid: Array) -> PyTree:
+        """transitions, valid: [T, ...]."""
+        return self.finetuner.observe(state, transitions, valid, None)
+
+
+class _Acting:
+    """The agent that acts now, asked at every step: what has been learned or, if not `waits`, what there is until then.
+
+    before: the agent that has learned from `rollouts` rollouts. learner: None where nobody learns meanwhile.
+    """
+
+    def __init__(self, before: PyTree, rollouts: int, learner: Beside | None, *, waits: bool) -> None:
+        self.before, self.rollouts, self.learner, self.waits = before, rollouts, learner, waits
+        self.steps = {False: 0, True: 0}  # with the agent before and with what has been learned
+
+    def __call__(self) -> PyTree:
+        learner = self.learner if self.learner and (self.waits or self.learner.ready()) else None
+        self.steps[learner is not None] += 1
+        return learner.result()[0] if learner else self.before
+
+    def player(self, learned: PyTree, done: int) -> tuple[PyTree, int]:
+        """The agent that made more of the steps, and the rollouts it had learned from.
+
+        learned: the agent after `done` rollouts. None and no matter where that is not known: a rollout that a resumed
+        run reads from disk asks nobody.
+        """
+        if self.waits or self.steps[True] > self.steps[False]:
+            return learned, done
+        return (self.before, self.rollouts) if self.steps[False] else (None, done)
+
+
+def _real(best: Best, played: Sequence[Episode]) -> Metrics:
+    """[M] how rollouts [M, 1] went, on average; one that exploded as `best` knows it."""
+    facts = [(x.score[:, 0], x.total_reward[:, 0], x.exploded[:, 0]) for x in played]
+    counted = [evidence.as_known(best, *own) for own in facts]
+    return {
+        "real/return": _mean(*[total for _, total in counted]),
+        "real/score": _mean(*[score for score, _ in counted]),
+        "real/exploded": _mean(*[exploded.astype(jnp.float32) for *_, exploded in facts]),
+    }
+
+
+def _transitions(played: Sequence[Episode]) -> Array:
+    """[n, M] valid steps of rollouts [M, 1]."""
+    return jnp.stack([x.valid[:, 0].sum(-1) for x in played]).astype(jnp.int32)
+
+
+def _mean(*x: Array) -> Array:
+    return jnp.mean(jnp.stack(x), axis=0)
+
+
+def _mean_of_parts(parts: Sequence[Metrics]) -> Metrics:
+    """The mean [M] over the parts in which a member has made updates, nan without any; of `updates` over all."""
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *parts)
+    means = {name: jnp.mean(x, axis=0, where=stacked["updates"] > 0) for name, x in stacked.items()}
+    return means | {"updates": stacked["updates"].mean(0)}
+
+
+def priors_of_members(priors: PyTree, seeds: Array) -> PyTree:
+    """The params [M, ...] that each member starts from, of priors [P, ...]; None without priors. seeds: [M]."""
+    which = prior_of(priors, seeds)
+    return jax.tree.map(lambda x: x[which], priors)
+
+
+def prior_of(priors: PyTree, seeds: Array) -> Array:
+    """[M] which of the priors [P, ...] each member starts from. seeds: [M]."""
+    return seeds % (1 if priors is None else jax.tree.leaves(priors)[0].shape[0])
+
+
+def _key(seed: Array, purpose: int | Array, part: int | Array) -> Key:
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), purpose), part)
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _episode_keys(seeds: Array, purpose: Array, rollout: Array, n: int) -> Key:
+    """Keys [M, n]; the first ones are the same for every n."""
+    each = lambda seed, i: jax.random.fold_in(_key(seed, purpose, rollout), i)  # noqa: E731
+    return jax.vmap(lambda seed: jax.vmap(lambda i: each(seed, i))(jnp.arange(n)))(seeds)
+
+
+# --- simulated data ---------------------------------------------------------------------------------------------------
+
+
+def simulate(
+    env: Env, policy: Policy, pool: World, priors: PyTree, key: Key, needs: Simulation, *, gamma: float
+) -> SimulatedRows:
+    """Whole episodes of every prior's exploring policy in simulated worlds.
+
+    pool: worlds [W] of the training domain. priors: params [P, ...]. needs: how many transitions, and the largest share
+    of random actions: in the i-th of n episodes a share i / (n - 1) * needs.ladder of the actions is uniformly random.
+    """
+    keys = jax.random.split(key, jax.tree.leaves(priors)[0].shape[0])
+    one = functools.partial(_simulate, env, policy, pool, needs=needs, gamma=gamma)
+    return SimulatedRows(*jax.jit(jax.vmap(one))(priors, keys))
+
+
+def _simulate(
+    env: Env, policy: Policy, pool: World, params: PyTree, key: Key, *, needs: Simulation, gamma: float
+) -> tuple[replay.ReplayState, Array]:
+    n = -(-needs.transitions // env.episode_length)
+    at_once = min(n, _AT_ONCE)
+    parts = -(-n // at_once)
+
+    def play(key: Key, share: Array) -> Episode:
+        def act(carry: PyTree, obs: Array, key: Key) -> tuple[Array, PyTree]:
+            key_policy, key_replace, key_random = jax.random.split(key, 3)
+            action, carry = policy.act(params, carry, obs, key_policy, explore=True)
+            random = jax.random.uniform(key_random, (env.act_dim,), minval=-1.0, maxval=1.0)
+            return jnp.where(jax.random.uniform(key_replace) < share, random, action), carry
+
+        return play_episode(env, pool, act, policy.init_carry(), key, gamma=gamma)
+
+    def part(buffer: replay.ReplayState, inputs: tuple[Key, Array]) -> tuple[replay.ReplayState, Array]:
+        key, shares = inputs
+        episodes = jax.vmap(play)(jax.random.split(key, at_once), shares)
+        rows, valid = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (episodes.transitions, episodes.valid))
+        return replay.add_batch(buffer, rows, valid), episodes.total_reward
+
+    empty = replay.init(replay.blank(env.obs_dim, env.act_dim), parts * at_once * env.episode_length)
+    shares = jnp.linspace(0.0, needs.ladder, parts * at_once).reshape(parts, at_once)
+    buffer, returns = jax.lax.scan(part, empty, (jax.random.split(key, parts), shares))
+    return buffer, returns.reshape(-1)
