@@ -50,7 +50,8 @@ import test_pretraining as pretraining_tests  # isort: skip - `tuners` makes the
 
 # The project
 from envs import gaps
-from sgft_jax import api, pretraining, train
+from sgft_jax import api
+from sgft_jax.train import finetuning, pretraining
 from sgft_jax.learners import tdmpc2_model
 from sgft_jax.planning import mpc, mppi
 from sgft_jax.types import Batch
@@ -192,9 +193,9 @@ def finetune(resume=False):
     env = toy.make()
     gap = gaps.from_dict(env, "heavy", {"params": {"mass": 1.4}, "effects": {"latency": 0.03}})
     setup = api.setup(env, gap, [], method="sac", seeds=2)
-    *_, (progress, metrics) = train.finetune(*setup, rollouts=2 if resume else 3)
+    *_, (progress, metrics) = finetuning.finetune(*setup, rollouts=2 if resume else 3)
     if resume:
-        *_, (progress, metrics) = train.finetune(*setup, rollouts=3, progress=copy_of(progress))
+        *_, (progress, metrics) = finetuning.finetune(*setup, rollouts=3, progress=copy_of(progress))
     return jax.vmap(setup.finetuner.export)(progress.agent), metrics["real/score"]
 
 

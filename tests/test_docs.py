@@ -25,7 +25,7 @@ MAKEFILE = (ROOT / "Makefile").read_text()
 DOCS = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
 SHELL = "".join(re.findall(r"^```bash\n(.*?)^```$", README, re.M | re.S))
 COMMANDS = [shlex.split(line, comments=True) for line in SHELL.splitlines() if line.startswith(("make ", "python "))]
-MODULES = sorted(set(re.findall(r"-m (experiments\.\w+)", MAKEFILE + "".join(path.read_text() for path in DOCS))))
+MODULES = sorted(set(re.findall(r"-m (experiments[.\w]*\w)", MAKEFILE + "".join(path.read_text() for path in DOCS))))
 
 
 @functools.cache

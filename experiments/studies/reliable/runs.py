@@ -11,7 +11,7 @@ from envs.types import UserError
 from experiments.runner.real_systems import free_port, token
 from experiments.studies.reliable import ledger
 
-TASK = Path(__file__).parents[2] / "docs/examples/own_task.py"
+TASK = Path(__file__).parents[3] / "docs/examples/own_task.py"
 _OPTIONS = """--method sac --prior none --seeds 1 --checkpoint-every 3 --options.initial-rollouts 1 --options.utd 1
     --options.batch-size 32 --options.critic-warmup 0 --options.replay-capacity 2048"""
 
