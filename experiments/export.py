@@ -35,7 +35,7 @@ def main(args: ExportArgs) -> None:
     if there := [one for one in homes if one.exists()]:
         raise UserError(f"{there[0]}: exists already; choose another --out, or remove it")
     import envs
-    from sgft_jax.io.exported import save_exported
+    from sgft_jax.export.folder import save_exported
     from sgft_jax.io.priors import load_prior, observed_by
 
     for folder, own in zip(folders, homes, strict=True):

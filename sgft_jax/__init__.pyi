@@ -1,7 +1,7 @@
 from .api import ActingPolicy, Setup, evaluate_prior, finetuned_priors, load_policy, make_env, setup
 from .data import replay, sequences, sources
+from .export.folder import save_exported
 from .finetuner import FinetuneState, Parts, assemble, sac_finetuner
-from .io.exported import save_exported
 from .io.priors import load_prior, save_prior
 from .learners.iql import IQLConfig, IQLHyper, IQLState, make_iql
 from .learners.sac import SACConfig, SACHyper, SACParams, SACState, extract_params, make_sac, state_from_prior

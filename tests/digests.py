@@ -51,9 +51,9 @@ import test_pretraining as pretraining_tests  # isort: skip - `tuners` makes the
 # The project
 from envs import gaps
 from sgft_jax import api
-from sgft_jax.train import finetuning, pretraining
 from sgft_jax.learners import tdmpc2_model
 from sgft_jax.planning import mpc, mppi
+from sgft_jax.train import finetuning, pretraining
 from sgft_jax.types import Batch
 
 # --- digests --------------------------------------------------------------------------------------------------------

@@ -16,7 +16,7 @@ import optax
 from flax import struct
 
 from envs.types import Array, Key, PyTree
-from sgft_jax.math import losses, optim
+from sgft_jax.math import losses, optim, value_losses
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import (
     LOG_STD_MAX,
@@ -126,18 +126,6 @@ def gaussian_action(moments: Array, key: Key, *, explore: bool | Array) -> Array
 # --- losses of one transition -----------------------------------------------------------------------------------------
 
 
-def expectile_loss(value: Array, q: Array, *, expectile: Array | float) -> Array:
-    """Squared error that counts `expectile` where V is below Q and 1 - `expectile` where it is above.
-
-    value, q: []; q is min_i Q_target_i(s, a) of the data's action, a constant for gradients.
-    Source: Kostrikov et al. 2021. The minimiser over V is the expectile of Q over the data's actions.
-    """
-    chex.assert_rank([value, q], 0)
-    chex.assert_type([value, q], float)
-    error = jax.lax.stop_gradient(q) - value
-    return jnp.where(error < 0, 1 - expectile, expectile) * error**2
-
-
 def advantage_weight(value: Array, q: Array, *, beta: Array | float, max_weight: Array | float) -> Array:
     """How much the policy should imitate a data action: min(exp(beta (Q - V)), max_weight). value, q: [], constants.
 
@@ -234,7 +222,7 @@ def _update(parts: _Parts, state: IQLState, batch: Batch) -> tuple[IQLState, Met
 def _update_value(parts: _Parts, state: IQLState, batch: Batch, q: Array) -> tuple[IQLState, Metrics]:
     def loss(params: PyTree) -> tuple[Array, Array]:
         values = jax.vmap(parts.value.apply, (None, 0))(params, batch.obs)
-        each = jax.vmap(lambda v, q: expectile_loss(v, q, expectile=state.hyper.expectile))(values, q)
+        each = jax.vmap(lambda v, q: value_losses.expectile_loss(v, q, expectile=state.hyper.expectile))(values, q)
         return losses.row_mean(each, batch), values
 
     (mean, values), grads = jax.value_and_grad(loss, has_aux=True)(state.value.params)

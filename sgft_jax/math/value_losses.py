@@ -12,10 +12,21 @@ import jax
 import jax.numpy as jnp
 
 from envs.types import Array, UserError, unknown
-from sgft_jax.learners.iql import expectile_loss
 from sgft_jax.types import ValueLoss
 
 SHIFT_MIN = -1.0  # the shift of a batch in which V is far above every Q would make exp(-shift) overflow
+
+
+def expectile_loss(value: Array, q: Array, *, expectile: Array | float) -> Array:
+    """Squared error that counts `expectile` where V is below Q and 1 - `expectile` where it is above.
+
+    value, q: []; q is min_i Q_target_i(s, a) of the data's action, a constant for gradients.
+    Source: Kostrikov et al. 2021. The minimiser over V is the expectile of Q over the data's actions.
+    """
+    chex.assert_rank([value, q], 0)
+    chex.assert_type([value, q], float)
+    error = jax.lax.stop_gradient(q) - value
+    return jnp.where(error < 0, 1 - expectile, expectile) * error**2
 
 
 def sparse_loss(value: Array, q: Array, *, alpha: Array | float) -> Array:

@@ -16,14 +16,6 @@ f = jnp.float32
 # --- losses by hand -------------------------------------------------------------------------------------------------
 
 
-def test_expectile_loss_by_hand():
-    assert iql.expectile_loss(f(0.0), f(2.0), expectile=0.75) == 3.0  # V below Q: 0.75 * 2^2
-    assert iql.expectile_loss(f(2.0), f(0.0), expectile=0.75) == 1.0  # V above Q: 0.25 * 2^2
-    # d/dV = -2 * 0.75 * 2, and Q is a constant
-    grads = jax.grad(lambda v, q: iql.expectile_loss(v, q, expectile=0.75), argnums=(0, 1))(f(0.0), f(2.0))
-    assert grads == (-3.0, 0.0)
-
-
 def test_advantage_weight_by_hand_and_its_cap():
     def weight(q, beta):
         return iql.advantage_weight(f(1.0), f(q), beta=beta, max_weight=100.0)
@@ -70,8 +62,6 @@ def test_td_target_by_hand():
 
 
 def test_losses_refuse_a_batch():
-    with pytest.raises(AssertionError):
-        iql.expectile_loss(jnp.ones(3), f(1.0), expectile=0.7)
     with pytest.raises(AssertionError):
         iql.advantage_weight(f(1.0), jnp.ones(3), beta=3.0, max_weight=100.0)
     with pytest.raises(AssertionError):

@@ -42,6 +42,19 @@ def test_expectile_by_hand():
     assert of_row("iql", -2.0, expectile=0.5) == of_row("iql", 2.0, expectile=0.5) == 2.0
 
 
+def test_expectile_of_one_pair():
+    assert value_losses.expectile_loss(f(0.0), f(2.0), expectile=0.75) == 3.0  # V below Q: 0.75 * 2^2
+    assert value_losses.expectile_loss(f(2.0), f(0.0), expectile=0.75) == 1.0  # V above Q: 0.25 * 2^2
+    # d/dV = -2 * 0.75 * 2, and Q is a constant
+    grads = jax.grad(lambda v, q: value_losses.expectile_loss(v, q, expectile=0.75), argnums=(0, 1))(f(0.0), f(2.0))
+    assert grads == (-3.0, 0.0)
+
+
+def test_expectile_refuses_a_batch():
+    with pytest.raises(AssertionError):
+        value_losses.expectile_loss(jnp.ones(3), f(1.0), expectile=0.7)
+
+
 def test_sparse_by_hand():
     assert of_row("sql", 1.0) == pytest.approx(1.25)  # 1.5^2 - 1
     assert of_row("sql", -3.0) == pytest.approx(3.0)  # the bracket is negative: only -y is left

@@ -18,10 +18,10 @@ import numpy as np
 
 from envs.base import Env
 from envs.types import UserError
-from sgft_jax import export
-from sgft_jax.export import Format, Graph
+from sgft_jax.export import graph, player
+from sgft_jax.export.graph import Format, Graph
 from sgft_jax.files.jsonfile import write_json
-from sgft_jax.io import checkpoint, player
+from sgft_jax.io import checkpoint
 from sgft_jax.types import Prior
 
 CONTRACT, PLAYER = "contract.json", "policy.py"
@@ -59,9 +59,9 @@ def save_exported(folder: Path, prior: Prior, env: Env, to: Format) -> float:
         for name, data in content.items():
             (temporary / name).write_bytes(data)
         shutil.copyfile(player.__file__, temporary / PLAYER)
-        contract = export.contract(prior, env, to)
+        contract = graph.contract(prior, env, to)
         write_json(temporary / CONTRACT, contract)
-        n = _PLANNED if export.plans(prior.card) else _CHECKED
+        n = _PLANNED if graph.plans(prior.card) else _CHECKED
         worst = _difference(player.Policy(temporary), prior, env, n)
         checked = {"observations": n, "largest_difference": worst, "limit": LIMIT}
         write_json(temporary / CONTRACT, {**contract, "checked": checked})
@@ -88,14 +88,14 @@ def _actions(prior: Prior, env: Env, episodes: np.ndarray) -> np.ndarray:
 
     Step by step, as a robot asks: in a larger program sums round differently, which may tip the choice of a plan.
     """
-    step, slots = jax.jit(export.stepping(prior, env)), export.slots_of(prior, env)
+    step, slots = jax.jit(graph.stepping(prior, env)), graph.slots_of(prior, env)
 
     def play(episode: np.ndarray) -> Iterator[np.ndarray]:
         state = {slot.name: jnp.zeros(slot.shape, slot.dtype) for slot in slots}
         for measured in episode:
-            found = step({export.MEASURED: measured, **state})
-            state = {name: found[export.NEXT + name] for name in state}
-            yield np.asarray(found[export.ACTION])
+            found = step({graph.MEASURED: measured, **state})
+            state = {name: found[graph.NEXT + name] for name in state}
+            yield np.asarray(found[graph.ACTION])
 
     return np.array([list(play(episode)) for episode in episodes])
 
@@ -104,26 +104,26 @@ def _actions(prior: Prior, env: Env, episodes: np.ndarray) -> np.ndarray:
 
 
 def _as_numpy(prior: Prior, env: Env) -> dict[str, bytes]:
-    graph, file = export.graph_of(prior, env), io.BytesIO()
-    np.savez(file, allow_pickle=False, nodes=np.array(json.dumps(graph.nodes)), **graph.constants)
+    whole, file = graph.graph_of(prior, env), io.BytesIO()
+    np.savez(file, allow_pickle=False, nodes=np.array(json.dumps(whole.nodes)), **whole.constants)
     return {"policy.npz": file.getvalue()}
 
 
 def _as_onnx(prior: Prior, env: Env) -> dict[str, bytes]:
-    return {"policy.onnx": onnx_model(export.graph_of(prior, env))}
+    return {"policy.onnx": onnx_model(graph.graph_of(prior, env))}
 
 
-def onnx_model(graph: Graph) -> bytes:
+def onnx_model(policy: Graph) -> bytes:
     """A graph as an ONNX model."""
     from onnx import TensorProto, checker, helper, numpy_helper  # pyright: ignore[reportMissingImports] - an extra
 
     described = lambda slot: helper.make_tensor_value_info(slot.name, TensorProto.FLOAT, slot.shape)  # noqa: E731
     nodes = [
         helper.make_node(node.operator, node.inputs, [node.output], **_ATTRIBUTES.get(node.operator, {}))
-        for node in graph.nodes
+        for node in policy.nodes
     ]
-    constants = [numpy_helper.from_array(value, name) for name, value in graph.constants.items()]
-    inputs, outputs = ([described(slot) for slot in slots] for slots in (graph.inputs, graph.outputs))
+    constants = [numpy_helper.from_array(value, name) for name, value in policy.constants.items()]
+    inputs, outputs = ([described(slot) for slot in slots] for slots in (policy.inputs, policy.outputs))
     whole = helper.make_graph(nodes, "policy", inputs, outputs, constants)
     model = helper.make_model(whole, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR)
     checker.check_model(model, full_check=True)
@@ -131,9 +131,9 @@ def onnx_model(graph: Graph) -> bytes:
 
 
 def _as_jax(prior: Prior, env: Env) -> dict[str, bytes]:
-    given = {slot.name: jax.ShapeDtypeStruct(slot.shape, slot.dtype) for slot in export.slots_of(prior, env)}
-    given[export.MEASURED] = jax.ShapeDtypeStruct((env.measured_dim,), "float32")
-    step = jax.jit(export.stepping(prior, env))
+    given = {slot.name: jax.ShapeDtypeStruct(slot.shape, slot.dtype) for slot in graph.slots_of(prior, env)}
+    given[graph.MEASURED] = jax.ShapeDtypeStruct((env.measured_dim,), "float32")
+    step = jax.jit(graph.stepping(prior, env))
     return {"policy.jax": bytes(jax.export.export(step, platforms=_PLATFORMS)(given).serialize())}
 
 
