@@ -14,8 +14,9 @@ from typing import Any
 
 from envs.mujoco.worlds import Impl
 from experiments.finetune import finetune
-from experiments.pretrain import PretrainArgs, pretrain
+from experiments.pretrain import pretrain
 from experiments.runner.finetune_args import arguments, run_folder
+from experiments.runner.pretrain_args import PretrainArgs
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.presets import PRESETS
 

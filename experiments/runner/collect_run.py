@@ -17,7 +17,7 @@ from envs.base import Env, EnvState
 from envs.pools import real_env, real_worlds
 from envs.rollout import Episode, counted
 from envs.types import Array, Policy, PyTree, Transition, UserError
-from experiments.collect import PAIR, CollectArgs, is_d4rls, name_of, targets, transitions_of
+from experiments.runner.collect_args import PAIR, CollectArgs, is_d4rls, name_of, targets, transitions_of
 from experiments.runner.options import seed_list
 from sgft_jax.datasets import acceptance, logs
 from sgft_jax.datasets.recording import Joints, Noted, Recorded, cut, of_episodes, of_fleet, write_d4rl, write_minari

@@ -21,10 +21,10 @@ from envs.pools import heldout_worlds, load_gap, real_env, training_worlds
 from envs.rollout import Episode
 from envs.system import blurred, varying, with_system
 from envs.types import Key, PyTree
-from experiments.pretrain import PretrainArgs, run_folder
 from experiments.runner import hosts
 from experiments.runner.evaluation import best_of, describe, play, scores
 from experiments.runner.memory import reserve
+from experiments.runner.pretrain_args import PretrainArgs, run_folder
 from experiments.runner.report import Report, make_report, numbers
 from experiments.runner.video import film_episode
 from sgft_jax import stacking

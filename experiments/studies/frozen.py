@@ -20,11 +20,12 @@ import envs
 from envs import gaps
 from envs.gaps import SIM
 from envs.types import UserError
-from experiments.pretrain import PretrainArgs, pretrain, run_folder
+from experiments.pretrain import pretrain
 from experiments.runner import cli, grid
 from experiments.runner.cells import Cell, complete
 from experiments.runner.grid import GridArgs
 from experiments.runner.options import at_least_one, not_negative, prior_folders
+from experiments.runner.pretrain_args import PretrainArgs, run_folder
 from experiments.studies.scoreboard import ScoreboardArgs, board
 from sgft_jax.io.runs import CONFIG, check_folder
 from sgft_jax.methods import DEFAULT, NAMES, get_method

@@ -6,13 +6,14 @@ from pathlib import Path
 import pytest
 
 from envs.types import UserError
-from experiments import collect, diagnose, evaluate, export, export_data, figures, gaps, replay
-from experiments.studies import bullet, scoreboard  # fmt: skip
+from experiments import diagnose, evaluate, export, export_data, figures, gaps, replay
+from experiments.runner import collect_args
+from experiments.studies import bullet, scoreboard
 
 PRIOR = Path(__file__).parents[2] / "docs/priors/push/seed-0"
 
 COMMANDS = {
-    "collect": lambda run, out: collect.check(collect.CollectArgs(out=out)),
+    "collect": lambda run, out: collect_args.check(collect_args.CollectArgs(out=out)),
     "diagnose": lambda run, out: diagnose.check(diagnose.DiagnoseArgs(prior=PRIOR, out=out)),
     "evaluate": lambda run, out: evaluate.check(evaluate.EvaluateArgs(prior=PRIOR, real=("remote",), out=out)),
     "replay": lambda run, out: replay.main(replay.ReplayArgs(run, task="push", out=out)),

@@ -11,7 +11,7 @@ import pytest
 
 from envs.types import Transition, UserError
 from experiments import collect, hybrid
-from experiments.runner import collect_run
+from experiments.runner import collect_args, collect_run
 from sgft_jax.datasets import acceptance, logs, recording
 from sgft_jax.datasets.recording import Joints, Noted, Recorded
 
@@ -139,7 +139,7 @@ def test_minaris_own_library_opens_a_set(tmp_path, monkeypatch):
 
 
 def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(collect.LEVELS, "toy", -100.0)
+    monkeypatch.setitem(collect_args.LEVELS, "toy", -100.0)
     monkeypatch.setattr(acceptance, "BANDS", {"toy-medium-replay": {"transitions": acceptance.Band(300, 0.25)}})
     out = tmp_path / "data"
     collect.main([*LEARN, "--out", str(out)])
@@ -214,7 +214,7 @@ def test_what_was_learned_from_is_kept_if_recording_fails(tmp_path, monkeypatch)
     ],
 )
 def test_sets_made_in_another_way_are_not_judged(changes, judged):
-    assert collect.is_d4rls(collect.CollectArgs(**changes)) == judged
+    assert collect_args.is_d4rls(collect_args.CollectArgs(**changes)) == judged
 
 
 @pytest.mark.parametrize(
@@ -255,7 +255,7 @@ def test_bad_input(words, said, tmp_path, capsys):
 @pytest.mark.parametrize(("task", "reward"), [("wheel-legged", 29.0), ("wheel-legged-forward", 14.4)])
 def test_the_log_of_an_operator_resembles_the_published_one(task, reward, tmp_path):
     """Spread within a factor of two of that of H2O+'s log, reward of a step within 1 % or 0.3."""
-    args = collect.CollectArgs(task=task, real="robot", operator=True, transitions=6_000, out=tmp_path, impl="c")
+    args = collect_args.CollectArgs(task=task, real="robot", operator=True, transitions=6_000, out=tmp_path, impl="c")
     (facts,) = collect.collect(args)
     published = {"v": 0.197, "pitch": 0.0475, "pitch velocity": 0.534, "torque": 0.719}
     for name, value in published.items():
@@ -266,12 +266,12 @@ def test_the_log_of_an_operator_resembles_the_published_one(task, reward, tmp_pa
 
 
 def test_files_are_named_after_the_real_system(tmp_path):
-    args = collect.CollectArgs(task="push", out=tmp_path, policy=Path("docs/priors/push/seed-0"))
-    assert [path.name for path in collect.targets(args)] == ["push-priors-seed-0.hdf5"]
+    args = collect_args.CollectArgs(task="push", out=tmp_path, policy=Path("docs/priors/push/seed-0"))
+    assert [path.name for path in collect_args.targets(args)] == ["push-priors-seed-0.hdf5"]
     args = dataclasses.replace(args, real="sets/hard.toml:deep")
-    assert [path.name for path in collect.targets(args)] == ["push-deep-priors-seed-0.hdf5"]
-    names = [path.name for path in collect.targets(dataclasses.replace(args, policy=None))]
-    assert names == [f"push-deep-{kind}-regenerated-seed-0.hdf5" for kind in collect.PAIR]
+    assert [path.name for path in collect_args.targets(args)] == ["push-deep-priors-seed-0.hdf5"]
+    names = [path.name for path in collect_args.targets(dataclasses.replace(args, policy=None))]
+    assert names == [f"push-deep-{kind}-regenerated-seed-0.hdf5" for kind in collect_args.PAIR]
 
 
 def test_files_are_not_replaced(tmp_path, capsys):

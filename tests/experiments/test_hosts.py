@@ -15,7 +15,7 @@ import envs
 from envs import mesh
 from envs.types import UserError
 from experiments import pretrain
-from experiments.runner import hosts
+from experiments.runner import hosts, pretrain_args
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.priors import load_prior
@@ -94,7 +94,7 @@ def test_hosts_that_nobody_can_meet(given, words):
 
 def test_what_is_no_host_is_found_before_jax_starts():
     with pytest.raises(UserError, match="the port of node7:0 must be from 1 to 65535"):
-        pretrain.check(pretrain.PretrainArgs(hosts="node7:0,2,0"))
+        pretrain_args.check(pretrain_args.PretrainArgs(hosts="node7:0,2,0"))
 
 
 def test_several_hosts_work_with_all_their_devices(monkeypatch):

@@ -15,7 +15,7 @@ from envs.locomotion import wheel_forward, wheel_legged
 from envs.locomotion.wheel_operator import nominal_gain, operator
 from envs.pools import real_env, real_worlds
 from envs.rollout import play_episode
-from experiments.collect import ROBOTS, CollectArgs, targets, transitions_of
+from experiments.runner.collect_args import ROBOTS, CollectArgs, targets, transitions_of
 from experiments.runner.options import seed_list
 from sgft_jax.datasets import logs
 from sgft_jax.datasets.recording import Recorded, cut, of_episodes, write_table
