@@ -78,11 +78,11 @@ def make(
 
 def _make(task: str, impl: str, scene: str) -> Env:
     module = _module(task)
-    given = (impl, _real(task, scene)) if scene else (impl,)
+    arguments = (impl, _real(task, scene)) if scene else (impl,)
     if module.__name__ in _OURS:
-        return packed(module.make(*given))
+        return packed(module.make(*arguments))
     source = task if extend.is_source(task) else module.__name__
-    env = extend.guard("task", source, module.make)(*given)
+    env = extend.guard("task", source, module.make)(*arguments)
     if not isinstance(env, Env):
         raise UserError(f"task {task}: make(impl) returns a {type(env).__name__}, not an envs.Env")
     if env.name != name_of(task):

@@ -112,9 +112,9 @@ def check_outcomes(task: Any, functions: dict[str, Callable], obs: Any, action: 
 
 def check_array(task: Any, field: str, value: Any, shape: tuple[int, ...], dtype: str = "float32") -> None:
     """Raises UserError, which names task and field, unless a value (or what stands for it) has that shape and type."""
-    found = f"{value.dtype}{list(value.shape)}" if hasattr(value, "dtype") else type(value).__name__
-    if found != f"{dtype}{list(shape)}":
-        raise _refusal(task)(field, f"must be a {dtype} of shape {list(shape)}", found)
+    kind = f"{value.dtype}{list(value.shape)}" if hasattr(value, "dtype") else type(value).__name__
+    if kind != f"{dtype}{list(shape)}":
+        raise _refusal(task)(field, f"must be a {dtype} of shape {list(shape)}", kind)
 
 
 def is_number(value: Any) -> bool:

@@ -32,11 +32,11 @@ def make_range(env: Env, values: Mapping[str, Value]) -> EffectRange:
     low, high = ({}, {})
     for name in Effects._fields:
         default, entries = _DEFAULTS.get(name, 0.0), entries_of(env, name)
-        given = values.get(name, default)
-        if isinstance(given, Mapping):
-            low[name], high[name] = _ends_by_entry(name, given, entries, default)
+        value = values.get(name, default)
+        if isinstance(value, Mapping):
+            low[name], high[name] = _ends_by_entry(name, value, entries, default)
         else:
-            low[name], high[name] = _ends(name, given, (sum(e.size for e in entries),) if entries else ())
+            low[name], high[name] = _ends(name, value, (sum(e.size for e in entries),) if entries else ())
     _check_possible(env, low, high)
     return EffectRange(*(Effects(**{k: jnp.asarray(v, jnp.float32) for k, v in end.items()}) for end in (low, high)))
 
@@ -67,13 +67,13 @@ def _ends_by_entry(
 
 
 def _ends(name: str, value: Numbers, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    given = numbers(value)
-    if given.shape not in ((), shape, (2, *shape)):
+    values = numbers(value)
+    if values.shape not in ((), shape, (2, *shape)):
         needs = f"{shape[0]} values" if shape else "one value"
         ends = "[[low, ...], [high, ...]]" if shape else "[low, high]"
         raise UserError(f"effect '{name}' needs {needs} or a range {ends}, got {value}")
-    low, high = given if given.shape == (2, *shape) else (given, given)
-    if not np.isfinite(given).all() or (low > high).any():
+    low, high = values if values.shape == (2, *shape) else (values, values)
+    if not np.isfinite(values).all() or (low > high).any():
         raise UserError(f"effect '{name}' needs finite numbers, low before high, got {value}")
     return np.broadcast_to(low, shape), np.broadcast_to(high, shape)
 

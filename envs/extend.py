@@ -74,8 +74,8 @@ def guard[T](kind: str, source: str, function: Callable[..., T]) -> Callable[...
         except BaseException as error:  # `sys.exit` too: a file that is read must not end the command
             if isinstance(error, OSError) and error.filename == str(Path(source).resolve()):
                 raise UserError(f"{kind} {source}: {error.strerror}") from None
-            said = (str(error).strip() or "no message").splitlines()[0]
-            raise UserError(f"{kind} {source}: {_place(source, error)}: {type(error).__name__}: {said}") from error
+            message = (str(error).strip() or "no message").splitlines()[0]
+            raise UserError(f"{kind} {source}: {_place(source, error)}: {type(error).__name__}: {message}") from error
 
     return guarded
 
@@ -97,9 +97,9 @@ def line_of(module: ModuleType, attribute: str) -> str:
 
 def _place(source: str, error: BaseException) -> str:
     """Where it failed: the line of the user's file, or file and line of what it called."""
-    own = str(Path(source).resolve()) if source.endswith(".py") else getattr(sys.modules.get(source), "__file__", None)
+    file = str(Path(source).resolve()) if source.endswith(".py") else getattr(sys.modules.get(source), "__file__", None)
     frames = traceback.extract_tb(error.__traceback__)
-    if lines := [frame.lineno for frame in frames if frame.filename == own]:
+    if lines := [frame.lineno for frame in frames if frame.filename == file]:
         return f"line {lines[-1]}"
     return f"{frames[-1].filename}, line {frames[-1].lineno}"
 

@@ -64,10 +64,10 @@ def load(env: Env, path: Path | None = None) -> Distribution:
         raise UserError(f"{source}: has no family; write a table for each, with items and their ranges")
     families, together = {}, set()
     for family, table in tables.items():
-        items = {name: given for name, given in table.items() if name != _TOGETHER} if isinstance(table, dict) else {}
+        items = {name: ranges for name, ranges in table.items() if name != _TOGETHER} if isinstance(table, dict) else {}
         if not items:
             raise UserError(f"{source}: '{family}' must be a table of items and their ranges, got {table!r}")
-        families[family] = {name: _item(env, name, given, f"{source} [{family}]") for name, given in items.items()}
+        families[family] = {name: _item(env, name, ranges, f"{source} [{family}]") for name, ranges in items.items()}
         if not isinstance(whole := table.get(_TOGETHER, False), bool):
             raise UserError(f"{source} [{family}]: '{_TOGETHER}' must be true or false, got {whole!r}")
         together |= {family} if whole else set()
@@ -115,7 +115,7 @@ def _value(rng: np.random.Generator, ways: Mapping[str, Range], entries: tuple[E
     """What a gap says of an item."""
     if not set(ways) & {_COMMON, _EACH}:
         sizes = {e.name: e.size for e in entries}
-        return {name: _numbers(rng, given, sizes[name]) for name, given in ways.items()}
+        return {name: _numbers(rng, ranges, sizes[name]) for name, ranges in ways.items()}
     way = list(ways)[rng.integers(len(ways))]
     return _numbers(rng, ways[way], 1 if way == _COMMON else sum(e.size for e in entries))
 

@@ -51,7 +51,9 @@ def presets(task: str, *, variants: bool = True) -> dict[str, Gap]:
     files = [folder / f"{task}.toml", *([folder / "variants" / f"{task}.toml"] if variants else [])]
     tables = [tomllib.loads(file.read_text()) for file in files if file.is_file()]
     return {
-        name: _parse(name, table, where=f"{task}.toml [{name}]") for found in tables for name, table in found.items()
+        name: _parse(name, table, where=f"{task}.toml [{name}]")
+        for content in tables
+        for name, table in content.items()
     }
 
 
@@ -67,7 +69,7 @@ def read_file(path: str | Path) -> dict[str, Gap]:
         return {path.stem: _parse(extend.folder_name(f"{path}: the name", path.stem), table, where=str(path))}
     for name in table:
         extend.folder_name(f"{path}: the gap", name)
-    return {name: _parse(name, own, where=f"{path} [{name}]") for name, own in table.items()}
+    return {name: _parse(name, gap, where=f"{path} [{name}]") for name, gap in table.items()}
 
 
 def find(task: str, source: str) -> Gap:
@@ -79,13 +81,13 @@ def find(task: str, source: str) -> Gap:
         return Gap(SIM, {}, {})
     if match := _FILE.fullmatch(source):
         path, name = match.groups()
-        found = read_file(path)
-        if name is None and len(found) > 1:
-            raise UserError(f"{path} holds {len(found)} gaps; name one of them, e.g. {path}:{next(iter(found))}")
-        name = name or next(iter(found))
-        if name not in found:
-            raise UserError(unknown(f"gap in {path}", name, found))
-        return found[name]
+        content = read_file(path)
+        if name is None and len(content) > 1:
+            raise UserError(f"{path} holds {len(content)} gaps; name one of them, e.g. {path}:{next(iter(content))}")
+        name = name or next(iter(content))
+        if name not in content:
+            raise UserError(unknown(f"gap in {path}", name, content))
+        return content[name]
     if source in (known := presets(task)):
         return known[source]
     if known:
@@ -100,8 +102,8 @@ def each(sources: Iterable[str]) -> tuple[str, ...]:
 
 def _each(source: str) -> list[str]:
     match = _FILE.fullmatch(source)
-    found = {} if match is None or match[2] else read_file(source)
-    return [f"{source}:{name}" for name in found] if len(found) > 1 else [source]
+    content = {} if match is None or match[2] else read_file(source)
+    return [f"{source}:{name}" for name in content] if len(content) > 1 else [source]
 
 
 def title(source: str) -> str:
@@ -158,14 +160,14 @@ def _key(name: str) -> str:
 def _inline(value: Any) -> str:
     """What is not a table reads the same in TOML as in JSON."""
     if isinstance(value, Mapping):
-        return f"{{ {', '.join(f'{_key(name)} = {_inline(own)}' for name, own in value.items())} }}"
+        return f"{{ {', '.join(f'{_key(name)} = {_inline(item)}' for name, item in value.items())} }}"
     return json.dumps(value)
 
 
 def _holds_several(table: Any) -> bool:
     if not isinstance(table, dict) or not table or set(table) & _KEYS:
         return False
-    return all(isinstance(own, dict) and not set(own) - _KEYS for own in table.values())
+    return all(isinstance(gap, dict) and not set(gap) - _KEYS for gap in table.values())
 
 
 def _parse(name: str, table: Any, *, where: str) -> Gap:

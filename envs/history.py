@@ -46,11 +46,11 @@ def extended(
     own_dim = env.obs_dim
 
     def outside(world: World, state: EnvState, memory: PyTree) -> EnvState:
-        told = tell(world, state, memory)
+        facts = tell(world, state, memory)
         return state._replace(
             physics=(state.physics, memory),
-            obs=jnp.concatenate([state.obs, told]),
-            true_obs=jnp.concatenate([state.true_obs, told]),
+            obs=jnp.concatenate([state.obs, facts]),
+            true_obs=jnp.concatenate([state.true_obs, facts]),
         )
 
     def reset(world: World, key: Key) -> EnvState:
@@ -58,8 +58,8 @@ def extended(
 
     def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
         physics, memory = state.physics
-        own = state._replace(physics=physics, obs=state.obs[:own_dim], true_obs=state.true_obs[:own_dim])
-        return outside(world, env.step(world, own, action, key), remember(memory, action))
+        inner = state._replace(physics=physics, obs=state.obs[:own_dim], true_obs=state.true_obs[:own_dim])
+        return outside(world, env.step(world, inner, action, key), remember(memory, action))
 
     def of_transition(function: Callable[..., Array] | None) -> Callable[..., Array] | None:
         if function is None:
@@ -87,9 +87,9 @@ def with_memory(env: Env, measured: np.ndarray, actions: np.ndarray) -> np.ndarr
     measured: [..., measured_dim]. actions: [..., previous_actions, act_dim], the last ones, the newest first. Of the
     system it tells the middle of every range, see `envs.system.concealed`.
     """
-    told = actions.reshape(*measured.shape[:-1], -1)
+    memory = actions.reshape(*measured.shape[:-1], -1)
     return np.concatenate(
-        [measured, told, np.zeros((*measured.shape[:-1], len(env.system)))], axis=-1, dtype=np.float32
+        [measured, memory, np.zeros((*measured.shape[:-1], len(env.system)))], axis=-1, dtype=np.float32
     )
 
 

@@ -39,12 +39,12 @@ def devices(wanted: int | None, sizes: Mapping[str, int]) -> int:
     devices, if a size is not a multiple of their number, or if some of several hosts would have nothing to do.
     """
     check_jax()
-    there, hosts = jax.device_count(), jax.process_count()
-    n = (1 if hosts == 1 else there) if wanted is None else wanted or there
-    if not 1 <= n <= there:
-        raise UserError(f"--devices {n}: JAX sees {there} {jax.default_backend()} device(s)")
-    if hosts > 1 and n < there:
-        raise UserError(f"--devices {n}: {hosts} hosts work with all their {there} devices; leave it out")
+    count, hosts = jax.device_count(), jax.process_count()
+    n = (1 if hosts == 1 else count) if wanted is None else wanted or count
+    if not 1 <= n <= count:
+        raise UserError(f"--devices {n}: JAX sees {count} {jax.default_backend()} device(s)")
+    if hosts > 1 and n < count:
+        raise UserError(f"--devices {n}: {hosts} hosts work with all their {count} devices; leave it out")
     for name, size in sizes.items():
         if size % n:
             raise UserError(f"{name} is {size}: not a multiple of the {n} devices; change it or --devices")

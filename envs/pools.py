@@ -34,8 +34,8 @@ def real_env(env: Env, found: Sequence[Gap]) -> Env:
     scenes = {gap.scene: gap.name for gap in found}
     if len(scenes) > 1:
         (one, first), (other, second) = sorted(scenes.items())[:2]
-        said = f"{first} is in {f"scene '{one}'" if one else 'the simulated scene'} and {second} in scene '{other}'"
-        raise UserError(f"{said}: real systems of different scenes cannot share a program, run them one at a time")
+        differ = f"{first} is in {f"scene '{one}'" if one else 'the simulated scene'} and {second} in scene '{other}'"
+        raise UserError(f"{differ}: real systems of different scenes cannot share a program, run them one at a time")
     scene = "".join(scenes)
     return concealed(envs.make(env.name, env.impl, scene, env.previous_actions, env.system) if scene else env)
 

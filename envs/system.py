@@ -28,10 +28,10 @@ def varying(
         np.concatenate([own, *(np.ravel(x) for x in end)]) for own, end in ((low, ends.low), (high, ends.high))
     )
     named = zip(_names(env), low, high, strict=True)
-    found = tuple(Varying(*name, float(a), float(b)) for name, a, b in named if a < b)
-    if not found:
+    entries = tuple(Varying(*name, float(a), float(b)) for name, a, b in named if a < b)
+    if not entries:
         raise UserError(f"{env.name}: no parameter and no effect varies; name a domain with --real FILE:NAME")
-    return found
+    return entries
 
 
 def with_system(env: Env, system: tuple[Varying, ...]) -> Env:
@@ -71,8 +71,8 @@ def blurred(env: Env, noise: float) -> Env:
     own_dim = env.obs_dim - len(env.system)
 
     def blur(state: EnvState, key: Key) -> EnvState:
-        told = noise * jax.random.normal(key, (len(env.system),))
-        return state._replace(obs=state.obs.at[own_dim:].add(told), true_obs=state.true_obs.at[own_dim:].add(told))
+        error = noise * jax.random.normal(key, (len(env.system),))
+        return state._replace(obs=state.obs.at[own_dim:].add(error), true_obs=state.true_obs.at[own_dim:].add(error))
 
     def reset(world: World, key: Key) -> EnvState:
         key_own, key_noise = jax.random.split(key)
@@ -128,17 +128,17 @@ def simulator(
 
     def world_of(told: Array) -> World:
         params, *parts = jnp.split(nominal.at[where].set(low + 0.5 * (1.0 + told) * (high - low)), sizes)
-        own = Effects(*(part.reshape(x.shape) for part, x in zip(parts, usual, strict=True)))
-        own = own._replace(latency_jitter=jnp.zeros(()))
-        return World(Theta(params, EffectRange(own, own)), model_of(told))
+        drawn = Effects(*(part.reshape(x.shape) for part, x in zip(parts, usual, strict=True)))
+        drawn = drawn._replace(latency_jitter=jnp.zeros(()))
+        return World(Theta(params, EffectRange(drawn, drawn)), model_of(told))
 
     @jax.custom_jvp
     def change(obs: Array, action: Array) -> Array:
         world = world_of(obs[own_dim:])
         before = restore(world, obs[:own_dim], key)
         after = env.step(world, before, action, key)
-        there = after.true_obs[:measured] + after.effects.obs_bias
-        return jnp.where(after.invalid, 0.0, there - obs[:measured])
+        measured_state = after.true_obs[:measured] + after.effects.obs_bias
+        return jnp.where(after.invalid, 0.0, measured_state - obs[:measured])
 
     @change.defjvp
     def differences(given: tuple[Array, Array], along: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -155,20 +155,20 @@ def models_of(env: Env, system: tuple[Varying, ...]) -> Callable[[Array], dict[s
     low, high = (np.array([getattr(system[i], end) for i in which]) for end in ("low", "high"))
     pairs = np.triu_indices(len(which))
 
-    def features(told: Array) -> Array:
-        return jnp.concatenate([jnp.ones(1), told, jnp.outer(told, told)[pairs]])
+    def features(points: Array) -> Array:
+        return jnp.concatenate([jnp.ones(1), points, jnp.outer(points, points)[pairs]])
 
     n = 2 * (1 + len(which) + len(pairs[0]))
-    told = np.random.default_rng(0).uniform(-1.0, 1.0, (n, len(which))).astype(np.float32)
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, (n, len(which))).astype(np.float32)
     params = np.tile([p.nominal for p in env.parameters], (n, 1))
-    params[:, [names.index(system[i].name) for i in which]] = low + 0.5 * (1.0 + told) * (high - low)
+    params[:, [names.index(system[i].name) for i in which]] = low + 0.5 * (1.0 + points) * (high - low)
     ends = make_range(env, env.training)
     worlds = env.make_worlds(
         Theta(jnp.asarray(params), jax.tree.map(lambda x: jnp.broadcast_to(x, (n, *x.shape)), ends))
     )
     numbers = {k: x for k, x in worlds.model.items() if jnp.issubdtype(x.dtype, jnp.floating)}  # no codes of shortcuts
     smooth = jax.vmap(with_tensors, axis_size=n)(numbers)
-    seen = np.asarray(jax.vmap(features)(jnp.asarray(told)), np.float64)
+    seen = np.asarray(jax.vmap(features)(jnp.asarray(points)), np.float64)
 
     def fitted(values: Array) -> Array:
         flat = np.asarray(values, np.float64).reshape(n, -1)
@@ -176,11 +176,11 @@ def models_of(env: Env, system: tuple[Varying, ...]) -> Callable[[Array], dict[s
 
     weights = jax.tree.map(fitted, smooth)
 
-    def model(told: Array) -> dict[str, Array]:
-        given = features(told[which])
+    def model(points: Array) -> dict[str, Array]:
+        inputs = features(points[which])
         with jax.default_matmul_precision("highest"):
-            found = {k: (given @ weights[k]).reshape(x.shape[1:]).astype(x.dtype) for k, x in smooth.items()}
-        return _with_axes(found)
+            fields = {k: (inputs @ weights[k]).reshape(x.shape[1:]).astype(x.dtype) for k, x in smooth.items()}
+        return _with_axes(fields)
 
     return model
 

@@ -34,8 +34,8 @@ _THICK = 0.1  # m, half of the table's: nothing passes through
 
 def simulated(name: str, *, mass: float) -> Scene:
     """The scene to pretrain in: pushing a puck of that mass, kg, which leaves room for the larger real object."""
-    own = {"object_x": (0.25, *NEAREST_FARTHEST), "object_mass": (mass, mass, mass)}
-    parameters = tuple(Parameter(p.name, p.unit, *own.get(p.name, p[2:5]), *p[5:]) for p in push.PARAMETERS)
+    ranges = {"object_x": (0.25, *NEAREST_FARTHEST), "object_mass": (mass, mass, mass)}
+    parameters = tuple(Parameter(p.name, p.unit, *ranges.get(p.name, p[2:5]), *p[5:]) for p in push.PARAMETERS)
     # From the front, all of the edge in sight: the hand, which comes from behind, hides nothing of what it pushes.
     view = View((0.58, 0.0, 0.045), 0.87, 172.0, -33.0, workcell.FLOOR)
     return push.SCENE._replace(name=name, parameters=parameters, view=view)

@@ -98,12 +98,12 @@ def lead(pose: Array) -> Array:
     speeds.
     """
     frames = {"torso": (jnp.zeros(2), pose[0])}  # origin (x, z) and turn of every body
-    moments = [own.volume * _turned(own.center, pose[0])[0] for own in (TORSO, HEAD)]
+    moments = [capsule.volume * _turned(capsule.center, pose[0])[0] for capsule in (TORSO, HEAD)]
     for link, angle in zip(LINKS, pose[1:], strict=True):
         origin, turn = frames[link.parent]
         frames[link.name] = origin, turn = origin + _turned(link.position, turn), turn + angle
         moments.append(link.capsule.volume * (origin + _turned(link.capsule.center, turn))[0])
-    volumes = [own.volume for own in (TORSO, HEAD, *(link.capsule for link in LINKS))]
+    volumes = [capsule.volume for capsule in (TORSO, HEAD, *(link.capsule for link in LINKS))]
     return jnp.sum(jnp.stack(moments)) / sum(volumes)
 
 

@@ -65,8 +65,8 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     grip = FRICTION * theta["friction"]
     planar.add_capsule(spec, torso, "torso", TORSO, density=DENSITY, friction=grip)
     for link in LINKS:
-        own = LEFT_FOOT_FRICTION * theta["friction"] if link.name == "foot_left" else grip
-        planar.add_link(spec, _changed(link, theta), axis=-1, armature=ARMATURE, density=DENSITY, friction=own)
+        friction = LEFT_FOOT_FRICTION * theta["friction"] if link.name == "foot_left" else grip
+        planar.add_link(spec, _changed(link, theta), axis=-1, armature=ARMATURE, density=DENSITY, friction=friction)
     return spec
 
 

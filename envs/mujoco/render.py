@@ -40,7 +40,9 @@ def render_side_by_side(
     path: Path,
 ) -> None:
     """Writes several episodes of one task as one video, side by side, each under its caption; see `render_episode`."""
-    write_side_by_side([list(_frames(scene, *own)) for own in zip(thetas, episodes, strict=True)], captions, path)
+    write_side_by_side(
+        [list(_frames(scene, *episode)) for episode in zip(thetas, episodes, strict=True)], captions, path
+    )
 
 
 def write_side_by_side(columns: Sequence[Sequence[np.ndarray]], captions: Sequence[str], path: Path) -> None:
@@ -50,7 +52,10 @@ def write_side_by_side(columns: Sequence[Sequence[np.ndarray]], captions: Sequen
     """
     strips = list(map(_caption, captions))
     rows = (
-        [np.concatenate([strip, own[min(i, len(own) - 1)]]) for strip, own in zip(strips, columns, strict=True)]
+        [
+            np.concatenate([strip, column[min(i, len(column) - 1)]])
+            for strip, column in zip(strips, columns, strict=True)
+        ]
         for i in range(max(map(len, columns)))
     )
     _write(path, [np.concatenate(row, axis=1) for row in rows])

@@ -128,14 +128,14 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
 
     def reset(world: World, key: Key) -> EnvState:
         key_start, key_noise, key_effects = jax.random.split(key, 3)
-        own = env_effects.draw(world.theta.effects, key_effects)
-        return begin(world, scene.initial(world.theta.params, key_start), own, key_noise)
+        drawn = env_effects.draw(world.theta.effects, key_effects)
+        return begin(world, scene.initial(world.theta.params, key_start), drawn, key_noise)
 
     def restore(settled: Callable[[Array, Array], PhysicsState], world: World, obs: Array, key: Key) -> EnvState:
         key_noise, key_effects = jax.random.split(key)
-        own = env_effects.draw(world.theta.effects, key_effects)
-        state = settled(world.theta.params, obs - own.obs_bias)
-        return begin(world, state, own, key_noise)._replace(obs=obs)
+        drawn = env_effects.draw(world.theta.effects, key_effects)
+        state = settled(world.theta.params, obs - drawn.obs_bias)
+        return begin(world, state, drawn, key_noise)._replace(obs=obs)
 
     def begin(world: World, state: PhysicsState, own: Effects, key_noise: Key) -> EnvState:
         if host.nsensordata:
@@ -157,11 +157,11 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
 
     def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
         key_latency, key_noise, key_action = jax.random.split(key, 3)
-        params, own, before = world.theta.params, state.effects, state.physics
-        command = env_effects.shake(own, env_effects.distort(own, action), key_action)
+        params, episode, before = world.theta.params, state.effects, state.physics
+        command = env_effects.shake(episode, env_effects.distort(episode, action), key_action)
         target = scene.motors(params, before.ctrl, scene.target(before.qpos, command))
         dt = scene.control_dt / scene.substeps
-        control = env_effects.ramp(own, before.ctrl, target, key_latency, dt=dt, duration=scene.ramp)
+        control = env_effects.ramp(episode, before.ctrl, target, key_latency, dt=dt, duration=scene.ramp)
         controls = jax.vmap(control)(jnp.arange(scene.substeps))
         after = scene.event(params, engine.advance(world.model, before, controls))
         true_obs = seen(params, after)
@@ -169,7 +169,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
         time = state.time + 1
         return EnvState(
             physics=after,
-            obs=env_effects.measure(own, true_obs, key_noise),
+            obs=env_effects.measure(episode, true_obs, key_noise),
             true_obs=true_obs,
             reward=reward,
             terminated=terminated,
@@ -177,7 +177,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
             success=state.success | now if scene.success_anytime else now,
             invalid=physics.exploded(after, max_speed=scene.max_speed),
             time=time,
-            effects=own,
+            effects=episode,
         )
 
     env = Env(

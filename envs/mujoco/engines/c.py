@@ -86,8 +86,8 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
     def call(values: dict[str, Array], state: PyTree, controls: Array, *, move: bool) -> PyTree:
         """A scene without sensors hands none over: a callback has no use for empty arrays."""
         sensors = jax.ShapeDtypeStruct((host.nsensordata,), np.float32) if host.nsensordata else None
-        given = state._replace(sensordata=None)
-        shape = jax.eval_shape(lambda: given)._replace(sensordata=sensors)
+        start = state._replace(sensordata=None)
+        shape = jax.eval_shape(lambda: start)._replace(sensordata=sensors)
         work = functools.partial(on_host, move=move)
 
         def in_place(context: Any, after: Any, *args: Any) -> None:
@@ -95,7 +95,7 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
 
         on_cpu = buffer_callback(in_place, shape, vmap_method="broadcast_all")
         elsewhere = functools.partial(jax.pure_callback, work, shape, vmap_method="broadcast_all")
-        after = jax.lax.platform_dependent(values, given, controls, cpu=on_cpu, default=elsewhere)
+        after = jax.lax.platform_dependent(values, start, controls, cpu=on_cpu, default=elsewhere)
         return after if host.nsensordata else after._replace(sensordata=state.sensordata)
 
     def sense(values: dict[str, Array], state: PyTree) -> PyTree:

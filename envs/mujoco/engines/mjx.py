@@ -80,8 +80,8 @@ def with_fields(model: mjx.Model, fields: dict[str, Array]) -> mjx.Model:
         nominal = getattr(getattr(model, part) if part else model, last)
         if isinstance(nominal, jax.Array):
             parts.setdefault(part, {})[last] = value.reshape(nominal.shape)
-    own = parts.pop("")
-    return model.replace(**own, **{part: getattr(model, part).replace(**changed) for part, changed in parts.items()})
+    direct = parts.pop("")
+    return model.replace(**direct, **{part: getattr(model, part).replace(**changed) for part, changed in parts.items()})
 
 
 def _check_fields(host: mujoco.MjModel, fields: tuple[str, ...]) -> None:
