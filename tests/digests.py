@@ -51,9 +51,9 @@ import test_pretraining as pretraining_tests  # isort: skip - `tuners` makes the
 # The project
 from envs import gaps
 from sgft_jax import api
-from sgft_jax.train import finetuning, pretraining
 from sgft_jax.learners import tdmpc2_model
 from sgft_jax.planning import mpc, mppi
+from sgft_jax.train import finetuning, pretraining
 from sgft_jax.types import Batch
 
 # --- digests --------------------------------------------------------------------------------------------------------
@@ -206,7 +206,7 @@ def runs(prefix, run, names):
 RUNS = {
     **runs("learner", learner, probes.MAKERS),
     **runs("method", method, tuners.METHODS),
-    **runs("hybrid", hybrid, hybrid_tests.NAMES),
+    **runs("hybrid", hybrid, hybrid_tests.FIXED_NAMES),
     "planner/mppi": planner_mppi,
     "planner/mpc": planner_mpc,
     "planner/tdmpc2": planner_tdmpc2,
