@@ -37,12 +37,12 @@ from experiments.runner.options import (
     without_repeats,
 )
 from sgft_jax.files.jsonfile import jsonable
-from sgft_jax.hybrid.methods import NAMES, get_method
 from sgft_jax.hybrid.presets import say_preset
 from sgft_jax.hybrid.schedule import FLEET, SCHEDULES, Schedule, describe, name_of
 from sgft_jax.hybrid.scores import measures, shown
 from sgft_jax.io.log import EVAL, SUMMARY, check_records, read_jsonl
 from sgft_jax.io.runs import check_folder, read_own, read_starts
+from sgft_jax.methods import FIXED_NAMES, get_method
 
 if TYPE_CHECKING:
     from sgft_jax.analysis.hybrid import Outcome, Results
@@ -68,7 +68,7 @@ class CompareHybridArgs:
 
     task: str = "halfcheetah"
     """A task by name, or a Python file with a task of your own."""
-    methods: tuple[str, ...] = NAMES
+    methods: tuple[str, ...] = FIXED_NAMES
     """Methods in the order in which they run, as METHOD or METHOD:PRESET; the latter is a variant of that name. rebrac
     alone takes on each data set the preset that the file's name contains, if there is one."""
     gaps: tuple[str, ...] = ()
@@ -113,11 +113,11 @@ class CompareHybridArgs:
 
 def _system(args: HybridArgs) -> str:
     """The one simulator, or what stands for none."""
-    return gaps_of(args, get_method(args.method))[0]
+    return gaps_of(args, get_method(args.method, "fixed"))[0]
 
 
 def _title(args: HybridArgs) -> str:
-    method, learnt_from = get_method(args.method), [_gap_of(args), _data_of(args)]
+    method, learnt_from = get_method(args.method, "fixed"), [_gap_of(args), _data_of(args)]
     chosen = f", {say_preset(method, args.preset, _data_of(args))}" if method.by_data and not args.variant else ""
     return f"{'/'.join(filter(None, [extend.name_of(args.task), *learnt_from]))}: {_spec(args)}{chosen}"
 
@@ -133,7 +133,7 @@ def _data_of(args: HybridArgs) -> str:
 
 def _gap_of(args: HybridArgs) -> str:
     """The name of the simulator, "" of a method without."""
-    return "" if get_method(args.method).kind == "offline" else gaps.title(args.gap[0])
+    return "" if get_method(args.method, "fixed").kind == "offline" else gaps.title(args.gap[0])
 
 
 HYBRID = Kind(
@@ -188,11 +188,11 @@ def check(args: CompareHybridArgs) -> None:
     for name, given in (("methods", args.methods), ("gaps", args.gaps), ("data", tuple(map(data_name, args.data)))):
         without_repeats(f"--{name}", given)
     check_task(args.task, args.gaps if args.real == SIM else (*args.gaps, args.real))
-    if odd := [one for one in args.methods if one.partition(":")[0] not in NAMES]:
-        raise UserError(unknown("--methods", odd[0], NAMES))
+    if odd := [one for one in args.methods if one.partition(":")[0] not in FIXED_NAMES]:
+        raise UserError(unknown("--methods", odd[0], FIXED_NAMES))
     if args.reference not in args.methods:
         raise UserError(unknown("--reference", args.reference, args.methods))
-    learning = [name for name in args.methods if get_method(name.partition(":")[0]).kind != "simulator"]
+    learning = [name for name in args.methods if get_method(name.partition(":")[0], "fixed").kind != "simulator"]
     if learning and not args.data:
         raise UserError(f"--data: {learning[0]} learns from real data; name files or folders (docs/data.md)")
     for path in args.data if args.released is None else ():
@@ -215,7 +215,7 @@ def grid(args: CompareHybridArgs) -> list[Cell]:
 def _runs(args: CompareHybridArgs, method: str, data: Path | None) -> list[HybridArgs]:
     """Of one method on one data set, a run for each simulator."""
     name, _, preset = method.partition(":")
-    kind = get_method(name).kind
+    kind = get_method(name, "fixed").kind
     run = arguments(
         name, preset=preset, variant=preset, task=args.task, data=None if kind == "simulator" else data,
         real=args.real, previous_actions=args.previous_actions, seeds=args.seeds, seed=args.seed,

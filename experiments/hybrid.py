@@ -8,10 +8,10 @@ from typing import Any
 from envs import gaps
 from experiments.runner import cli
 from experiments.runner.hybrid_args import DEFAULT, HybridArgs, check, data_name
-from sgft_jax.hybrid.methods import NAMES, get_method
 from sgft_jax.hybrid.presets import preset_for, say_preset
 from sgft_jax.hybrid.schedule import FLEET, SCHEDULES, describe
-from sgft_jax.types import HybridMethod
+from sgft_jax.methods import FIXED_NAMES, get_method
+from sgft_jax.types import Fixed
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -34,7 +34,7 @@ def arguments(method: str, *, preset: str = "", data: Path | None = None, **chan
 
     preset: "" for the one that suits the data, if the method has presets by data set, else the first.
     """
-    found = get_method(method)
+    found = get_method(method, "fixed")
     preset = preset or ("" if data is None else preset_for(found, data_name(data)))
     options = cli.choose("--preset", preset or next(iter(found.presets)), dict(found.presets))
     return HybridArgs(**{"method": method, "preset": preset, "options": options, "data": data, **changes})
@@ -42,12 +42,12 @@ def arguments(method: str, *, preset: str = "", data: Path | None = None, **chan
 
 def _table() -> str:
     """The methods, a line each."""
-    found = [get_method(name) for name in NAMES]
+    found = [get_method(name, "fixed") for name in FIXED_NAMES]
     rows = [("", m.name, m.kind, f"{m.description} ({m.source}); presets: {', '.join(m.presets)}") for m in found]
     return "\n".join(["methods:", *cli.columns(rows)])
 
 
-def _choices(args: HybridArgs, method: HybridMethod) -> list[str]:
+def _choices(args: HybridArgs, method: Fixed) -> list[str]:
     """What was chosen by name or by data, in words."""
     preset = say_preset(method, args.preset, data_name(args.data)) if method.by_data and args.data else ""
     schedule = "" if method.kind == "offline" else describe(args.schedule)

@@ -1,7 +1,6 @@
 from .api import ActingPolicy, Setup, evaluate_prior, finetuned_priors, load_policy, make_env, setup
 from .data import replay, sequences, sources
 from .export.folder import save_exported
-from .finetuner import FinetuneState, Parts, assemble, sac_finetuner
 from .io.priors import load_prior, save_prior
 from .learners.iql import IQLConfig, IQLHyper, IQLState, make_iql
 from .learners.sac import SACConfig, SACHyper, SACParams, SACState, extract_params, make_sac, state_from_prior
@@ -17,16 +16,20 @@ from .systems import System
 from .systems.gymnasium import Gymnasium
 from .systems.remote import Remote
 from .systems.simulated import Simulated
+from .train.finetuner import FinetuneState, Parts, assemble, sac_finetuner
 from .train.finetuning import FinetuneProgress, evaluate, finetune, simulate
 from .train.pretraining import PretrainState, pretrain, priors_of
 from .transforms import branch, clip, compose, relabel, shape, shaped_reward, shorten, stateless, weigh
 from .types import (
     Batch,
     Finetuner,
+    Fixed,
+    HybridAgent,
     Imagination,
     Learner,
     Method,
     Normalizer,
+    Online,
     Policy,
     Prior,
     SimulatedData,
@@ -39,8 +42,9 @@ from .types import (
 )
 
 __all__ = [
-    "PRESETS", "ActingPolicy", "Batch", "FinetuneProgress", "FinetuneState", "Finetuner", "Gymnasium", "IQLConfig",
-    "IQLHyper", "IQLState", "Imagination", "Learner", "MPCConfig", "Method", "NetworkConfig", "Normalizer", "Parts",
+    "PRESETS", "ActingPolicy", "Batch", "FinetuneProgress", "FinetuneState", "Finetuner", "Fixed", "Gymnasium",
+    "HybridAgent", "IQLConfig", "IQLHyper", "IQLState", "Imagination", "Learner", "MPCConfig", "Method",
+    "NetworkConfig", "Normalizer", "Online", "Parts",
     "Policy", "PretrainConfig", "PretrainState", "Prior", "RatioConfig", "Remote", "SACConfig", "SACHyper",
     "SACParams", "SACState", "Setup", "Simulated", "SimulatedData", "Simulation", "Source", "System",
     "TDMPC2Config", "TDMPC2Hyper", "TDMPC2Params", "TDMPC2State", "Task", "Transform", "Transition", "UserError",

@@ -23,7 +23,6 @@ from sgft_jax.export import player
 from sgft_jax.io.cards import known_task
 from sgft_jax.io.priors import load_prior, observed
 from sgft_jax.methods import DEFAULT, get_method
-from sgft_jax.methods.options import card_of
 from sgft_jax.policies import make_policy
 from sgft_jax.presets import check_card
 from sgft_jax.stacking import stack
@@ -31,7 +30,8 @@ from sgft_jax.systems import System
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import finetuning
 from sgft_jax.train.finetuning import FinetuneProgress, SimulatedRows
-from sgft_jax.types import Finetuner, Method, Prior
+from sgft_jax.train.options import card_of
+from sgft_jax.types import Finetuner, Online, Prior
 
 SIMULATED_WORLDS = 256
 _SIMULATION = 2**31  # seed of what happens in them, the same for every run
@@ -117,7 +117,7 @@ def _simulator(env: Env, card: Mapping[str, Any]) -> tuple[Env, Gap | None]:
     return real_env(env, [gap]), gap
 
 
-def check_prior(prior: Prior, method: Method, env: Env) -> None:
+def check_prior(prior: Prior, method: Online, env: Env) -> None:
     """Raises UserError for a prior of another algorithm or task, or of a policy that is told more or less."""
     check_card(prior.card, method, env.name)
     if prior.card["obs_dim"] != env.obs_dim:

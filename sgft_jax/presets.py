@@ -11,7 +11,7 @@ from typing import Any
 from envs.types import UserError, unknown
 from sgft_jax import checks
 from sgft_jax.models.config import SIZES, NetworkConfig, Precision
-from sgft_jax.types import Algorithm, Method
+from sgft_jax.types import Algorithm, Online
 
 DEFAULT_PRESET = "robust"
 
@@ -247,14 +247,14 @@ PRESETS: dict[str, PretrainConfig] = {
 }
 
 
-def preset_of(method: Method) -> str:
+def preset_of(method: Online) -> str:
     """The preset that makes the priors which a method needs."""
     if method.sees_system:
         return "informed"
     return {"sac": DEFAULT_PRESET, "tdmpc2": "robust-tdmpc2", "recurrent": "recurrent"}[method.prior]
 
 
-def check_card(card: Mapping[str, Any], method: Method, task: str) -> None:
+def check_card(card: Mapping[str, Any], method: Online, task: str) -> None:
     """Raises UserError for the card of a prior of another algorithm or task, or of a policy told more or less."""
     command = f"python -m experiments.pretrain --task {task} --preset {preset_of(method)}"
     if (found := card.get("algorithm", "sac")) != method.prior:

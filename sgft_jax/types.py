@@ -243,29 +243,7 @@ Algorithm = Literal["sac", "tdmpc2", "recurrent"]
 ValueLoss = Literal["iql", "sql", "eql", "xql"]
 Successors = Literal["stored", "shifted"]  # where next observations of a D4RL file come from, see `data.layouts`
 Family = Literal["sgft", "model-free", "model-based", "offline", "planning"]
-
-
-class Method(NamedTuple):
-    """A way to fine-tune. `sgft_jax/methods/` has one file for each.
-
-    family: the kind of method, for tables and figures. description, source: one line each.
-    config: a frozen dataclass whose fields carry their help; its defaults are the method's own settings.
-    build(config, prior, task) -> Finetuner. Every option left open (None) is resolved here.
-    prior: the algorithm of the priors that it starts from. needs_prior: False where it can start without one.
-    zero_shot: whether it begins as its prior acts; False where it plans otherwise or begins from nothing.
-    sees_system: True where these priors must see which system they are in, as no others may.
-    """
-
-    name: str
-    family: Family
-    description: str
-    source: str
-    config: type[Any]
-    build: Callable[[Any, Prior | None, Task], Finetuner]
-    prior: Algorithm = "sac"
-    needs_prior: bool = True
-    zero_shot: bool = True
-    sees_system: bool = False
+FixedKind = Literal["hybrid", "offline", "simulator"]
 
 
 # --- from a fixed set of real data and a simulator ------------------------------------------------------------------
@@ -302,26 +280,64 @@ class HybridAgent(NamedTuple):
     card: Mapping[str, Any]
 
 
-HybridKind = Literal["hybrid", "offline", "simulator"]
+# --- methods --------------------------------------------------------------------------------------------------------
 
 
-class HybridMethod(NamedTuple):
-    """A way to learn without touching the real system. `sgft_jax/hybrid/methods/` has one file for each.
+class Online(NamedTuple):
+    """How a method learns from rollouts of the real system: fine-tuning.
 
-    kind: what it learns from: both, the real rows alone, or the simulator alone. description, source: one line each.
-    config: a frozen dataclass whose fields carry their help. presets: named settings of it; the first is the default.
-    build(config, task) -> HybridAgent. by_data: whether presets are called after data sets, see `hybrid.presets`.
+    family: the kind of method, for tables and figures. description, source: one line each.
+    config: a frozen dataclass whose fields carry their help; its defaults are the method's settings.
+    build(config, prior, task) -> Finetuner. Every option left open (None) is resolved here.
+    prior: the algorithm of the priors that it starts from. needs_prior: False where it can start without one.
+    zero_shot: whether it begins as its prior acts; False where it plans otherwise or begins from nothing.
+    sees_system: True where these priors must see which system they are in, as no others may.
+    name: of the method; `methods.get_method` fills it in.
     """
 
-    name: str
-    kind: HybridKind
+    family: Family
+    description: str
+    source: str
+    config: type[Any]
+    build: Callable[[Any, Prior | None, Task], Finetuner]
+    prior: Algorithm = "sac"
+    needs_prior: bool = True
+    zero_shot: bool = True
+    sees_system: bool = False
+    name: str = ""
+
+
+class Fixed(NamedTuple):
+    """How a method learns without touching the real system.
+
+    kind: what it learns from: real rows and a simulator, the real rows alone, or the simulator alone.
+    description, source: one line each. presets: settings by name, frozen dataclasses that derive from
+    `methods.options.ActorCriticOptions` and whose fields carry their help; the first is the default.
+    build(config, task) -> HybridAgent. by_data: whether presets are called after data sets, see `hybrid.presets`.
+    name: of the method; `methods.get_method` fills it in.
+    """
+
+    kind: FixedKind
     description: str
     source: str
     presets: Mapping[str, Any]
     build: Callable[[Any, Task], HybridAgent]
     by_data: bool = False
+    name: str = ""
 
     @property
     def config(self) -> Any:
         """The default settings."""
         return next(iter(self.presets.values()))
+
+
+class Method(NamedTuple):
+    """A method and what it can learn from; each file of `sgft_jax/methods/` has one.
+
+    name: of folders and tables. online: how it fine-tunes, None if it does not. fixed: how it learns from a fixed set
+    of real data, a simulator or both, None if it does not.
+    """
+
+    name: str
+    online: Online | None = None
+    fixed: Fixed | None = None

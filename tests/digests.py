@@ -206,7 +206,7 @@ def runs(prefix, run, names):
 RUNS = {
     **runs("learner", learner, probes.MAKERS),
     **runs("method", method, tuners.METHODS),
-    **runs("hybrid", hybrid, hybrid_tests.NAMES),
+    **runs("hybrid", hybrid, hybrid_tests.FIXED_NAMES),
     "planner/mppi": planner_mppi,
     "planner/mpc": planner_mpc,
     "planner/tdmpc2": planner_tdmpc2,

@@ -6,6 +6,7 @@ import os
 import re
 from pathlib import Path
 
+import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 
 import envs
 from envs import extend, gaps
-from experiments import figures, finetune, pretrain
+from experiments import figures, finetune, hybrid, pretrain
 from experiments.runner import cli
 from sgft_jax import Batch, NetworkConfig, Prior, get_method
 from sgft_jax.files.jsonfile import jsonable
@@ -23,7 +24,9 @@ from sgft_jax.methods import sgft_sac
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "docs/examples"
-TASK, METHOD, GAP = (str(EXAMPLES / name) for name in ("own_task.py", "own_method.py", "own_gap.toml"))
+TASK, METHOD, FIXED_METHOD, GAP = (
+    str(EXAMPLES / name) for name in ("own_task.py", "own_method.py", "own_fixed_method.py", "own_gap.toml")
+)
 NETWORK = NetworkConfig(hidden=(8,))
 
 
@@ -167,6 +170,49 @@ def test_the_method_and_the_gap_run_in_a_command_and_are_drawn(prior, tmp_path):
     assert "| sgft-bent | 1 |" in figures.figures(figures.FiguresArgs(task=TASK, out=tmp_path)).read_text()
 
 
+# --- a method of fixed data -----------------------------------------------------------------------------------------
+
+
+def test_the_method_of_fixed_data_is_read_with_its_presets():
+    method = get_method(FIXED_METHOD, "fixed")
+    assert (method.name, method.kind, method.config.rows) == ("sac-both", "hybrid", 128)
+    args = hybrid.arguments(FIXED_METHOD, preset="small")
+    assert (args.options.rows, args.options.hidden) == (16, (32, 32))
+
+
+@pytest.mark.slow
+def test_the_method_of_fixed_data_learns_from_both_kinds_of_rows_in_a_command(tmp_path):
+    episodes = np.random.default_rng(0)
+    log, n = tmp_path / "log.hdf5", 40
+    with h5py.File(log, "w") as file:
+        file["observations"] = episodes.normal(size=(n, 3)).astype(np.float32)
+        file["next_observations"] = episodes.normal(size=(n, 3)).astype(np.float32)
+        file["actions"] = episodes.uniform(-1, 1, (n, 1)).astype(np.float32)
+        file["rewards"] = episodes.normal(size=n).astype(np.float32)
+        file["terminals"], file["timeouts"] = np.zeros(n, bool), np.arange(n) % 20 == 19
+    options = """--gap sim --preset small --options.hidden 8 --options.rows 4 --seeds 1 --no-video
+        --schedule.updates 12 --schedule.chunk-updates 6 --schedule.simulators 2 --schedule.buffer 64
+        --eval-every 6 --eval-episodes 2"""
+    hybrid.main(
+        ["--task", TASK, "--method", FIXED_METHOD, "--data", str(log), *options.split(), "--out", str(tmp_path)]
+    )
+    run = tmp_path / "hybrid/own_task/sim/log/sac-both/seed-0"
+    assert (run / "summary.json").exists() and '"rows": 4' in (run / "config.json").read_text()
+
+
+@pytest.mark.parametrize(
+    ("command", "file", "words"),
+    [
+        (finetune, FIXED_METHOD, "sac-both has nothing for fine-tuning: `online` is None"),
+        (hybrid, METHOD, "sgft-bent has nothing for learning from a fixed set of data or a simulator: `fixed` is None"),
+    ],
+)
+def test_a_method_of_the_other_kind_is_refused(command, file, words, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        command.main(["--method", file])
+    assert stopped.value.code == 2 and words in capsys.readouterr().err
+
+
 # --- a real system --------------------------------------------------------------------------------------------------
 
 
@@ -204,8 +250,8 @@ def test_a_pretended_robot_teaches_a_policy(prior, capsys):
     [
         ("", "does not define `METHOD`"),
         ("METHOD = 3\n", "METHOD is a int, not a sgft_jax.Method"),
-        ("import sgft_jax\nMETHOD = sgft_jax.get_method('sac')\n", "the name 'sac' is taken"),
-        ("import sgft_jax\nMETHOD = sgft_jax.get_method('sac')._replace(name='a/b')\n", "'a/b' cannot name a folder"),
+        ("import sgft_jax\nMETHOD = sgft_jax.Method('sac', sgft_jax.get_method('sac'))\n", "the name 'sac' is taken"),
+        ("import sgft_jax\nMETHOD = sgft_jax.Method('a/b', sgft_jax.get_method('sac'))\n", "cannot name a folder"),
     ],
 )
 def test_a_bad_method_is_one_line_and_code_2(tmp_path, capsys, text, words):

@@ -6,7 +6,7 @@ Commands read this file before they start JAX, so JAX is imported where it is us
 from dataclasses import dataclass
 
 from sgft_jax.methods import sgft_sac
-from sgft_jax.types import Finetuner, Method, Prior, Task, Transform
+from sgft_jax.types import Finetuner, Method, Online, Prior, Task, Transform
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 
 METHOD = Method(  # what `--method docs/examples/own_method.py` looks for
-    "sgft-bent", "sgft", "SGFT-SAC with bent instead of clipped rewards", "docs/extending.md", Config, build
+    "sgft-bent", Online("sgft", "SGFT-SAC with bent instead of clipped rewards", "docs/extending.md", Config, build)
 )
 
 

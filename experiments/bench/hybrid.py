@@ -16,10 +16,10 @@ from envs.types import Key, PyTree
 from experiments.bench import bare_h2oplus
 from experiments.bench.timing import Compiled, ahead, fastest_in_turns
 from experiments.bench.updates import REPLAY, rows
-from sgft_jax.hybrid.methods import get_method
 from sgft_jax.hybrid.schedule import Schedule
 from sgft_jax.hybrid.trainer import make_trainer
 from sgft_jax.learners.h2oplus import H2OPlusHyper
+from sgft_jax.methods import get_method
 from sgft_jax.train.pretraining import over_members
 from sgft_jax.types import HybridAgent, RealData
 
@@ -32,7 +32,7 @@ def speed(task: str, impl: str, members: int, *, width: int, updates: int, repea
     A run steps its simulators, 25 by default, once before as many updates follow. updates/bare: of a run that learns
     from what its simulators left before. simulators_share: of a run's time, by how much that one is faster.
     """
-    env, method = envs.make(task, impl), get_method(METHOD)
+    env, method = envs.make(task, impl), get_method(METHOD, "fixed")
     agent = method.build(replace(method.config, hidden=(width, width)), env)
     schedule = Schedule(buffer=REPLAY, chunk_updates=updates)
     pools = real_worlds(env, [gaps.load(env, SIM)] * members, jax.random.key(0))

@@ -23,12 +23,12 @@ from sgft_jax.datasets import acceptance, logs
 from sgft_jax.datasets.recording import Joints, Noted, Recorded, cut, of_episodes, of_fleet, write_d4rl, write_minari
 from sgft_jax.files.jsonfile import write_json
 from sgft_jax.hybrid import trainer
-from sgft_jax.hybrid.methods import get_method
 from sgft_jax.hybrid.schedule import Schedule
 from sgft_jax.hybrid.trainer import HybridState
 from sgft_jax.io import runs
 from sgft_jax.io.priors import load_prior, observed_by
 from sgft_jax.io.progress import RunProgress
+from sgft_jax.methods import get_method
 from sgft_jax.policies import make_policy
 from sgft_jax.stacking import member
 from sgft_jax.systems.simulated import Simulated
@@ -41,7 +41,7 @@ _AT_ONCE = 50  # episodes of one recording call
 
 def teach(args: CollectArgs, level: float) -> list[dict[str, Any]]:
     """SAC in the system itself, all seeds in one program; the pair of sets of each seed."""
-    method = get_method("sac")
+    method = get_method("sac", "fixed")
     env, system = _system(args, envs.make(args.task, args.impl), args.seeds, method.config.gamma)
     agent, schedule = method.build(method.config, env), _schedule(args)
     seeds = seed_list(args.seed, args.seeds)

@@ -25,7 +25,7 @@ from experiments.runner.real_systems import is_robot, is_stepped, title
 from sgft_jax.io.runs import check_start
 from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.presets import DEFAULT_PRESET, preset_of
-from sgft_jax.types import Method
+from sgft_jax.types import Online
 
 NO_PRIOR = Path("none")
 # May differ when a run goes on; what is in the data may not.
@@ -128,7 +128,7 @@ def label(args: FinetuneArgs) -> str:
     return extend.folder_name("--variant", "_".join(filter(None, [get_method(args.method).name, args.variant])))
 
 
-def check(args: FinetuneArgs) -> tuple[Method, list[int]]:
+def check(args: FinetuneArgs) -> tuple[Online, list[int]]:
     """The method and the seeds; raises UserError for what is wrong in the arguments and with the run folders."""
     at_least_one(args, "rollouts", "eval_every", "checkpoint_every", "sync_every")
     not_negative(args, "eval_episodes", "devices")

@@ -30,17 +30,17 @@ from sgft_jax.io import runs
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.methods import get_method
-from sgft_jax.methods.options import card_of
 from sgft_jax.stacking import join, part
 from sgft_jax.systems.gymnasium import Gymnasium
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import finetuning
 from sgft_jax.train.finetuning import FinetuneProgress, Logged
 from sgft_jax.train.learner_process import LearnerProcess
-from sgft_jax.types import Finetuner, Method, Metrics, Prior
+from sgft_jax.train.options import card_of
+from sgft_jax.types import Finetuner, Metrics, Online, Prior
 
 
-def run(args: FinetuneArgs, method: Method, seeds: list[int], folders: list[Path]) -> list[dict[str, Any]]:
+def run(args: FinetuneArgs, method: Online, seeds: list[int], folders: list[Path]) -> list[dict[str, Any]]:
     """The runs on the real systems of `args`; returns their summaries. folders: of the priors."""
     sizes = {"--seeds" if len(args.real) == 1 else "the number of --real times --seeds": len(args.real) * args.seeds}
     devices = mesh.devices(args.devices, sizes)

@@ -23,10 +23,10 @@ from experiments.runner.options import (
     seeds_name,
     without_repeats,
 )
-from sgft_jax.hybrid.methods import get_method
 from sgft_jax.hybrid.schedule import FLEET, Schedule
 from sgft_jax.io.runs import check_start
-from sgft_jax.types import HybridMethod
+from sgft_jax.methods import get_method
+from sgft_jax.types import Fixed
 
 DEFAULT, NO_DATA = "h2oplus", "no-data"
 NO_SIMULATOR = "no-simulator"
@@ -92,14 +92,14 @@ class HybridArgs:
     """Expert: render an episode of the first seed in the real system, where MuJoCo can render."""
 
 
-def gaps_of(args: HybridArgs, method: HybridMethod) -> tuple[str, ...]:
+def gaps_of(args: HybridArgs, method: Fixed) -> tuple[str, ...]:
     """The simulators, or the one word that stands for none."""
     return (NO_SIMULATOR,) if method.kind == "offline" else args.gap
 
 
 def run_folder(args: HybridArgs, gap: str) -> Path:
     """Where the run with that simulator lives; the seeds of one call share a folder."""
-    method = get_method(args.method)
+    method = get_method(args.method, "fixed")
     data = NO_DATA if method.kind == "simulator" or args.data is None else data_name(args.data)
     label = "_".join(filter(None, [method.name, args.variant]))
     seeds = seeds_name(seed_list(args.seed, args.seeds))
@@ -113,11 +113,11 @@ def data_name(path: Path) -> str:
     return extend.folder_name("--data", re.sub(r"[^\w.-]", "-", inside.name.removesuffix(".hdf5")))
 
 
-def check(args: HybridArgs) -> tuple[HybridMethod, list[int]]:
+def check(args: HybridArgs) -> tuple[Fixed, list[int]]:
     """The method and the seeds; raises UserError for what is wrong in the arguments and with the run folders."""
     at_least_one(args, "eval_every", "eval_episodes", "checkpoint_every")
     not_negative(args, "previous_actions")
-    method, seeds = get_method(args.method), seed_list(args.seed, args.seeds)
+    method, seeds = get_method(args.method, "fixed"), seed_list(args.seed, args.seeds)
     if not isinstance(args.options, type(method.config)):
         raise UserError(f"--method {method.name}: the options are those of another method")
     if method.kind != "simulator" and args.data is None:
@@ -137,7 +137,7 @@ def check(args: HybridArgs) -> tuple[HybridMethod, list[int]]:
     return method, seeds
 
 
-def folders(args: HybridArgs, method: HybridMethod) -> Sequence[Path]:
+def folders(args: HybridArgs, method: Fixed) -> Sequence[Path]:
     """The run folders of all simulators; raises UserError where two would share one."""
     found = [run_folder(args, gap) for gap in gaps_of(args, method)]
     if twice := [folder for folder in found if found.count(folder) > 1]:

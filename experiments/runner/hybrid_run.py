@@ -38,12 +38,12 @@ from sgft_jax.math.stats import bootstrap_interval, mean
 from sgft_jax.stacking import join, member, part
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train.pretraining import seed_keys
-from sgft_jax.types import HybridMethod, Metrics, Prior, RealData
+from sgft_jax.types import Fixed, Metrics, Prior, RealData
 
 _TRAINING, _EVALUATION = 11, 12  # purposes, folded into a seed's key
 
 
-def run(args: HybridArgs, method: HybridMethod, seeds: list[int]) -> list[dict[str, Any]]:
+def run(args: HybridArgs, method: Fixed, seeds: list[int]) -> list[dict[str, Any]]:
     """The runs with the simulators of `args`; returns their summaries."""
     env = envs.make(args.task, args.impl, previous_actions=args.previous_actions)
     named = gaps_of(args, method)
@@ -83,7 +83,7 @@ class _Run:
     """What happens between chunks. Members [M = G * S] are the seeds of the first simulator, then those of the next."""
 
     def __init__(
-        self, args: HybridArgs, method: HybridMethod, env: Env, found: list[Gap], seeds: list[int],
+        self, args: HybridArgs, method: Fixed, env: Env, found: list[Gap], seeds: list[int],
         log: logs.Log | None,
     ) -> None:  # fmt: skip
         self.args, self.method, self.gaps, self.seeds = args, method, found, seeds

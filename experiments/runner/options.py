@@ -13,7 +13,7 @@ from sgft_jax import checks, types
 from sgft_jax.files.folders import ASIDE, present
 from sgft_jax.io.cards import CARD, known_task, read_card
 from sgft_jax.presets import PRESETS, check_card
-from sgft_jax.types import Method
+from sgft_jax.types import Online
 
 SHIPPED = Path("docs/priors")  # in the folder of the code, where commands are usually typed
 _LAST_PORT = 65_535
@@ -156,7 +156,7 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str, opti
     return sorted(found, key=_seed_number)
 
 
-def check_prior(folder: Path, method: Method, task: str) -> None:
+def check_prior(folder: Path, method: Online, task: str) -> None:
     """Raises UserError for a prior of another algorithm or task than the method needs, before anything is loaded."""
     try:
         check_card(read_card(folder), method, task)

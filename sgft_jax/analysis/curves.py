@@ -140,7 +140,7 @@ def zero_shot(curve: Curve, others: Iterable[Curve]) -> np.ndarray | None:
     """[members] scores of the simulator's policy before any fine-tuning, with the same seeds and priors.
 
     others: curves of the same task, gap and set of priors, to look it up where the method itself begins otherwise (see
-    `Method.zero_shot`). None if it was not evaluated there.
+    `Online.zero_shot`). None if it was not evaluated there.
     """
     for other in sorted(others, key=lambda other: other is not curve):
         if other.method in NAMES and get_method(other.method).zero_shot and other.rollouts[0] == 0:

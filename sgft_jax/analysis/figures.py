@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike
 from sgft_jax.analysis.curves import Curve, by_prior, spread
 from sgft_jax.analysis.hybrid import Outcome, Results
 from sgft_jax.analysis.verdict import Sign
-from sgft_jax.hybrid.methods import get_method
 from sgft_jax.math.stats import ENOUGH, Interval, bootstrap_interval
+from sgft_jax.methods import FIXED_NAMES, get_method
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MOST = len(PALETTE)
@@ -114,7 +114,8 @@ def _line(curve: Curve) -> Line:
 
 
 def _line_of_updates(own: Outcome, score: str) -> Line:
-    kind = get_method(own.method.partition(":")[0]).kind
+    name = own.method.partition(":")[0]
+    kind = get_method(name, "fixed").kind if name in FIXED_NAMES else "own"
     return Line(own.method, kind, own.updates, bootstrap_interval(own.curve), score, len(own.curve))
 
 

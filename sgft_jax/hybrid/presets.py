@@ -2,12 +2,12 @@
 
 import re
 
-from sgft_jax.types import HybridMethod
+from sgft_jax.types import Fixed
 
 _GOES_ON = r"(?!-(?:replay|expert)\b)"  # halfcheetah-medium-replay and -medium-expert are not halfcheetah-medium
 
 
-def preset_for(method: HybridMethod, data: str) -> str:
+def preset_for(method: Fixed, data: str) -> str:
     """The preset of a method with presets `by_data` that is called after this data set; "" for its first one.
 
     data: a name such as `walker2d_medium-v2`, in which the data set stands between other words. The longest fits best.
@@ -16,7 +16,7 @@ def preset_for(method: HybridMethod, data: str) -> str:
     return max(found, key=len, default="")
 
 
-def say_preset(method: HybridMethod, preset: str, data: str) -> str:
+def say_preset(method: Fixed, preset: str, data: str) -> str:
     """Which preset a method with presets `by_data` uses, in words. preset: its name, "" for the first."""
     if preset:
         return f"preset {preset}"

@@ -4,8 +4,8 @@ import dataclasses
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import LoopOptions, SACOptions
-from sgft_jax.types import Finetuner, Method, Prior, Task
+from sgft_jax.train.options import LoopOptions, SACOptions
+from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,13 @@ class Config(LoopOptions):
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
-    from sgft_jax.finetuner import sac_finetuner
+    from sgft_jax.train.finetuner import sac_finetuner
 
     options = SACOptions(**dataclasses.asdict(config), critic_warmup=0)
     return sac_finetuner(options, prior, task, train_critic=False)
 
 
 METHOD = Method(
-    "frozen-critic", "model-free", "the actor alone learns, from the simulator's critic", "SGFT 2025, reviews", Config,
-    build,
-)  # fmt: skip
+    "frozen-critic",
+    Online("model-free", "the actor alone learns, from the simulator's critic", "SGFT 2025, reviews", Config, build),
+)

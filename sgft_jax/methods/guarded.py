@@ -14,7 +14,7 @@ price for leaving the simulator's policy (`anchor`): behind the guard it cost mo
 from dataclasses import dataclass
 
 from sgft_jax.methods import sac
-from sgft_jax.types import Method
+from sgft_jax.types import Method, Online
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,11 @@ class Config(sac.Config):
 
 METHOD = Method(
     "guarded",
-    "sgft",
-    "recommended: SAC in identified commands, half simulated, deployed by a guard",
-    "ours",
-    Config,
-    sac.build,
+    Online(
+        "sgft",
+        "recommended: SAC in identified commands, half simulated, deployed by a guard",
+        "ours",
+        Config,
+        sac.build,
+    ),
 )

@@ -1,10 +1,20 @@
-"""IQL: in-sample learning, offline from simulated data, then with real transitions in half of each batch."""
+"""IQL: in-sample learning (Kostrikov et al. 2021), from the data's actions, without asking what another is worth.
+
+From simulated data, then with real transitions in half of each batch; or from a fixed set of real data alone.
+"""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from sgft_jax import checks
-from sgft_jax.methods.options import LoopOptions
-from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
+from sgft_jax.methods.options import OfflineOptions, agent_of, return_scale
+from sgft_jax.train.options import LoopOptions
+from sgft_jax.types import Finetuner, Fixed, HybridAgent, Method, Online, Prior, Simulation, Task
+
+if TYPE_CHECKING:
+    from sgft_jax.learners.actor import ACTORParams
+    from sgft_jax.learners.iql import IQLState
+    from sgft_jax.types import RealData
 
 
 @dataclass(frozen=True)
@@ -46,11 +56,11 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
     from envs.types import Array, Key, PyTree
     from sgft_jax.data import sources
-    from sgft_jax.finetuner import FinetuneState, Parts, agents_own, assemble, simulators_actor
     from sgft_jax.learners import iql
     from sgft_jax.learners.sac import SACParams
-    from sgft_jax.methods.options import card_of
     from sgft_jax.policies import network_of, sac_policy
+    from sgft_jax.train.finetuner import FinetuneState, Parts, agents_own, assemble, simulators_actor
+    from sgft_jax.train.options import card_of
     from sgft_jax.transforms import compose
     from sgft_jax.types import SimulatedData
 
@@ -108,7 +118,75 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class FixedConfig(OfflineOptions):
+    """Options of `iql` from a fixed set of real data; the published ones for locomotion."""
+
+    expectile: float = 0.7
+    """V is the mean of the data's actions at 0.5 and their best towards 1."""
+    beta: float = 3.0
+    """Inverse temperature of the advantage weights; 0 clones the data."""
+    falling_rate: bool = True
+    """Let the actor's learning rate fall to 0 along a cosine over all updates of the run, as the authors do."""
+    scale_rewards: bool = True
+    """Divide rewards by the span of the data's returns and multiply them by 1,000, as the authors do. A log of one
+    episode keeps its rewards."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.share(self, "expectile")
+        checks.not_negative(self, "beta")
+
+
+def build_fixed(config: FixedConfig, task: Task) -> HybridAgent:
+    """The agent."""
+    import jax.numpy as jnp
+
+    from sgft_jax.data import sources
+    from sgft_jax.learners import actor, iql
+    from sgft_jax.models.config import NetworkConfig
+
+    def prepare(state: "IQLState", real: "RealData", updates: int) -> "IQLState":
+        hyper = state.hyper
+        if config.scale_rewards:
+            hyper = hyper._replace(reward_scale=return_scale(real))
+        if config.falling_rate:
+            hyper = hyper._replace(actor_updates=jnp.float32(updates))
+        return state.replace(hyper=hyper)
+
+    def export(state: "IQLState") -> "ACTORParams":
+        return actor.ACTORParams(iql.as_tanh_gaussian(state.actor.params), actor.exported(state).normalizer)
+
+    structure = iql.IQLConfig(task.obs_dim, task.act_dim, NetworkConfig(config.hidden))
+    hyper = iql.IQLHyper(
+        lr_actor=config.lr,
+        lr_critic=config.lr,
+        lr_value=config.lr,
+        tau=config.tau,
+        expectile=config.expectile,
+        beta=config.beta,
+    )
+    learner = iql.make_iql(structure, hyper)
+    batches = sources.real_rows(config.rows)
+    return agent_of(learner, config, task, batches, simulates=False, prepare=prepare, export=export)
+
+
 METHOD = Method(
-    "iql", "offline", "in-sample learning: offline from simulated data, then online", "Kostrikov 2022", Config, build,
-    needs_prior=False, zero_shot=False,
-)  # fmt: skip
+    "iql",
+    Online(
+        "offline",
+        "in-sample learning: offline from simulated data, then online",
+        "Kostrikov 2022",
+        Config,
+        build,
+        needs_prior=False,
+        zero_shot=False,
+    ),
+    Fixed(
+        "offline",
+        "the best of the data's own actions",
+        "Kostrikov et al. 2021",
+        {"default": FixedConfig()},
+        build_fixed,
+    ),
+)

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from sgft_jax.methods.options import ModelOptions
-from sgft_jax.types import Finetuner, Method, Prior, Task
+from sgft_jax.train.options import ModelOptions
+from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
@@ -13,7 +13,7 @@ class Config(ModelOptions):
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
-    from sgft_jax.finetuner import sac_finetuner
+    from sgft_jax.train.finetuner import sac_finetuner
     from sgft_jax.transforms import branch
 
     transforms = (branch(config.horizon, config.branches, noise=config.branch_noise, segments=False),)
@@ -21,4 +21,4 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     return sac_finetuner(config, prior, task, transforms=transforms, actor_batch=rows)
 
 
-METHOD = Method("mbpo", "model-based", "SAC with branches of the models", "Janner 2019", Config, build)
+METHOD = Method("mbpo", Online("model-based", "SAC with branches of the models", "Janner 2019", Config, build))

@@ -1,142 +1,144 @@
-"""Options that several methods share, each with its help, and the rules for those left open.
+"""What methods of fixed data share: options, each with its help, and their agent. Imports no JAX at the top."""
 
-Command lines read this module and the method files: they import neither JAX nor Flax at the top.
-"""
-
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING
 
+from envs.types import Array, PyTree
 from sgft_jax import checks
-from sgft_jax.types import Prior, Task
+from sgft_jax.types import HybridAgent, Learner, RealData, Source, Task
 
-_WARMUP_TRANSITIONS = 1000  # real transitions over which learning rates of kept networks rise: 20 to 25 rollouts here
-_BODY = {"hidden": [256, 256], "layer_norm": True, "actor_layer_norm": False, "activation": "relu"}
-_WITHOUT_PRIOR = {"algorithm": "sac", "network": _BODY, "gamma": 0.99}
+if TYPE_CHECKING:
+    from sgft_jax.learners.actor import Head
+    from sgft_jax.learners.sac import SACHyper
+    from sgft_jax.models.config import NetworkConfig
 
-
-@dataclass(frozen=True)
-class LoopOptions:
-    """Options of every method."""
-
-    utd: float = 8.0
-    """Gradient updates per real transition."""
-    batch_size: int = 256
-    """Real transitions in a batch (windows of them for TD-MPC2)."""
-    initial_rollouts: int = 1
-    """Real rollouts before the first update, by the simulator's policy, or by plans if the method plans. The paper
-    makes 20; with one, every method here reaches its level as early or earlier (docs/history.md)."""
-    replay_capacity: int = 20_000
-    """Real transitions that the replay holds; 20,000 are more than an hour of a robot at 5 Hz."""
-    max_grad_norm: float | None = None
-    """Bound on the norm of each network's gradient; None = no bound."""
-    guard: bool = False
-    """Deploy what learns only while its real rollouts say that it is better than the policy that it began with, or
-    than its own best since (sgft_jax/train/guard.py). That policy then plays the training rollouts too."""
-
-    def __post_init__(self) -> None:
-        checks.positive(self, "utd", "max_grad_norm")
-        checks.few(self, 0, "utd")
-        checks.at_least(self, 1, "batch_size", "initial_rollouts", "replay_capacity")
+_RETURN_SPAN = 1000.0  # of scaled returns, as published for locomotion
 
 
 @dataclass(frozen=True)
-class SACOptions(LoopOptions):
-    """Options of methods whose learner is SAC."""
+class ActorCriticOptions:
+    """Options of soft actor-critics; the defaults are those of H2O+'s released code."""
 
-    lr_actor: float = 1e-4
-    """Adam learning rate of the actor."""
-    lr_critic: float = 3e-4
-    """Adam learning rate of the critic."""
+    lr: float = 3e-4
+    """Adam learning rate of every network."""
     tau: float = 0.005
-    """Averaging rate of the target critic."""
-    alpha: float = 0.01
-    """Entropy temperature."""
-    critic_warmup: int | None = None
-    """Updates at the start in which the critic alone learns. The first real data are the simulator's policy's own; they
-    do not say what another action would do. None = the updates that follow the initial rollouts; the paper has 0."""
-    actor_ramp: int = 1000
-    """Updates over which the actor's learning rate then rises from 0, for the same reason."""
-    policy_delay: int | None = 1
-    """Critic updates per update of the actor; None = `utd`, one actor update per real transition (RLPD)."""
+    """Averaging rate of the target critics."""
+    hidden: tuple[int, ...] = (256, 256)
+    """Widths of the hidden layers of actor, critics and value."""
+    gamma: float = 0.99
+    """Discount factor per control step."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.positive(self, "lr_actor", "lr_critic", "alpha")
+        checks.positive(self, "lr")
         checks.share(self, "tau")
-        checks.not_negative(self, "critic_warmup", "actor_ramp")
-        checks.few(self, 1, "policy_delay")
+        checks.layers(self, "hidden")
+        checks.below_one(self, "gamma")
 
 
 @dataclass(frozen=True)
-class KeptCriticOptions(SACOptions):
-    """Options of methods that may go on with the simulator's critic."""
+class OfflineOptions(ActorCriticOptions):
+    """Options of methods that learn from the real rows alone."""
 
-    lr_warmup: int | None = None
-    """Updates over which the learning rate of a critic kept from the simulator rises from 0. Adam's first steps are as
-    long as its rate in every weight, however small the gradient. None = the updates of 1,000 real transitions."""
-    anchor: float = 0.0
-    """Price of the actor's divergence from the simulator's policy, in reward per nat; 0 = free. Where that policy is
-    right already, 0.1 keeps it so (docs/protocol.md)."""
-    identify: bool = False
-    """Estimate from real rollouts, through the prior's models, by which scale, rotation and bias the real system
-    changes commands and by which constant errors its sensors are wrong, and correct for both."""
+    rows: int = 256
+    """Real rows of a batch."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.not_negative(self, "lr_warmup", "anchor")
+        checks.rows(self, "rows")
 
 
 @dataclass(frozen=True)
-class ModelOptions(KeptCriticOptions):
-    """Options of methods that branch with dynamics models."""
+class HybridOptions(ActorCriticOptions):
+    """Options of methods whose critic learns from real and simulated rows, which discriminators tell apart."""
 
-    horizon: int = 1
-    """Steps of an imagined branch; with shortening also of a segment (the paper's H)."""
-    branches: int = 5
-    """Imagined branches from each real row of a batch."""
-    branch_noise: float = 0.5
-    """Std of Gaussian noise on imagined actions, in units of the action's range; 0 as in the paper. Without noise the
-    critic never hears of actions better than the policy's (docs/history.md)."""
-    lr_dynamics: float = 3e-4
-    """Adam learning rate of the dynamics ensemble, which trains on real rows."""
-    dynamics_warmup: int | None = None
-    """Updates over which that rate rises from 0; None = the updates of 1,000 real transitions."""
-    train_dynamics: bool = True
-    """Fit the models to real rows; False keeps the simulator's."""
-    actor_real_only: bool = True
-    """The actor learns from the sampled rows alone, the critic from the imagined ones too."""
+    rows: int = 128
+    """Real rows of a batch; it has as many simulated ones."""
+    ratio_rows: int = 256
+    """The same for the discriminators, which have batches of their own."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.few(self, 1, "horizon", "branches")
-        checks.not_negative(self, "branch_noise", "dynamics_warmup")
-        checks.positive(self, "lr_dynamics")
+        checks.rows(self, "rows", "ratio_rows")
 
 
-# --- options left open ------------------------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class EnsembleOptions(ActorCriticOptions):
+    """Options of methods whose many critics must not agree on how to leave the data, as in EDAC."""
+
+    critics: int = 10
+    """Critics; whatever reads values takes the minimum of all."""
+    diversity: float = 1.0
+    """Weight of what keeps the critics' gradients at the data's actions apart; 0 leaves it out. It does nothing where a
+    task has one action, whose gradients have only a sign."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.few(self, 2, "critics")
+        checks.not_negative(self, "diversity")
 
 
-def updates_per_rollout(options: LoopOptions, task: Task) -> int:
-    """Gradient updates that follow one real rollout of full length; `finetune` makes fewer after a shorter one."""
-    return max(round(options.utd * task.episode_length), 1)
+def sac_numbers(config: ActorCriticOptions) -> "SACHyper":
+    """The numbers of methods that are made of SAC."""
+    from sgft_jax.learners.sac import SACHyper
+
+    return SACHyper(lr_actor=config.lr, lr_critic=config.lr, lr_alpha=config.lr, tau=config.tau)
 
 
-def critic_warmup(options: SACOptions, task: Task) -> int:
-    """Critic-only updates at the start."""
-    follow = options.initial_rollouts * updates_per_rollout(options, task)
-    return follow if options.critic_warmup is None else options.critic_warmup
+def return_scale(real: RealData) -> Array:
+    """What rewards are multiplied by [] so that the best and the worst recorded return are 1,000 apart.
+
+    Returns are undiscounted sums over the recorded episodes. 1 where they do not differ, as in a log of one episode.
+    Source: IQL (Kostrikov et al. 2021), whose successors SQL, EQL and XQL scale rewards alike.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    n = real.last.shape[0]
+    number = jnp.cumsum(real.last) - real.last  # of the episode of every row
+    returns = jax.ops.segment_sum(real.rows.reward, number, n)
+    recorded = jnp.arange(n) <= number[-1]
+    span = jnp.max(returns, where=recorded, initial=-jnp.inf) - jnp.min(returns, where=recorded, initial=jnp.inf)
+    return jnp.where(span > 0, _RETURN_SPAN / span, 1.0)
 
 
-def warmup(options: LoopOptions, updates: int | None) -> int:
-    """Updates over which a learning rate rises."""
-    return round(_WARMUP_TRANSITIONS * options.utd) if updates is None else updates
+def real_and_simulated(config: HybridOptions) -> Source:
+    """Rows of both origins for actor, critic and value, then those of the discriminators."""
+    from sgft_jax.data import sources
+
+    return sources.beside(*(sources.two_buffers(n, n) for n in (config.rows, config.ratio_rows)))
 
 
-def policy_delay(options: SACOptions) -> int:
-    """Critic updates per update of the actor."""
-    return max(round(options.utd), 1) if options.policy_delay is None else options.policy_delay
+def agent_of(
+    learner: Learner,
+    config: ActorCriticOptions,
+    task: Task,
+    batches: Source,
+    *,
+    simulates: bool,
+    head: "Head" = "gaussian",
+    network: "NetworkConfig | None" = None,
+    keep: Callable[[RealData], PyTree] | None = None,
+    prepare: Callable[[PyTree, RealData, int], PyTree] = lambda state, real, updates: state,
+    export: Callable[[PyTree], PyTree] | None = None,
+) -> HybridAgent:
+    """The agent of a learner.
 
+    head, network: of its actor, see `learners.actor.actor_policy`; by default layers of `hidden`. keep, prepare,
+    export: see `HybridAgent`; by default single rows, nothing, and the actor and statistics of the learner's state.
+    """
+    from sgft_jax.data import replay
+    from sgft_jax.learners import actor
+    from sgft_jax.models.config import NetworkConfig
 
-def card_of(prior: Prior | None) -> dict[str, Any]:
-    """What a prior says of its networks and its discount factor; without one, RLPD's critic body and gamma 0.99."""
-    return dict(_WITHOUT_PRIOR if prior is None else prior.card)
+    network = network or NetworkConfig(config.hidden)
+    return HybridAgent(
+        learner=learner,
+        keep=keep or (lambda real: replay.full(real.rows)),
+        batches=batches,
+        simulates=simulates,
+        prepare=prepare,
+        export=export or actor.exported,
+        policy=actor.actor_policy(task.obs_dim, task.act_dim, network, head),
+        card=actor.card(network, head, config.gamma),
+    )

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import KeptCriticOptions
-from sgft_jax.types import Finetuner, Method, Prior, Task
+from sgft_jax.train.options import KeptCriticOptions
+from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Config(KeptCriticOptions):
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
-    from sgft_jax.finetuner import sac_finetuner
+    from sgft_jax.train.finetuner import sac_finetuner
     from sgft_jax.transforms import clip, shape
 
     transforms = (shape, clip(config.clip_shaped))
@@ -33,4 +33,6 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     )
 
 
-METHOD = Method("pbrs", "model-free", "SAC on shaped rewards, infinite horizon, critic kept", "Ng 1999", Config, build)
+METHOD = Method(
+    "pbrs", Online("model-free", "SAC on shaped rewards, infinite horizon, critic kept", "Ng 1999", Config, build)
+)

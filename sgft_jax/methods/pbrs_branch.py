@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import ModelOptions
-from sgft_jax.types import Finetuner, Method, Prior, Task
+from sgft_jax.train.options import ModelOptions
+from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Config(ModelOptions):
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
-    from sgft_jax.finetuner import sac_finetuner
+    from sgft_jax.train.finetuner import sac_finetuner
     from sgft_jax.transforms import branch, clip, shape
 
     imagined = branch(config.horizon, config.branches, noise=config.branch_noise, segments=False)
@@ -34,6 +34,6 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 
 METHOD = Method(
-    "pbrs-branch", "model-based", "shaped rewards and branches, infinite horizon, new critic", "SGFT 2025", Config,
-    build,
-)  # fmt: skip
+    "pbrs-branch",
+    Online("model-based", "shaped rewards and branches, infinite horizon, new critic", "SGFT 2025", Config, build),
+)

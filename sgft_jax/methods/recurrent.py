@@ -6,8 +6,8 @@ Nothing learns from real rollouts. Source: Ni et al. 2022 (pomdp-baselines), wit
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import LoopOptions
-from sgft_jax.types import Finetuner, Method, Prior, Task
+from sgft_jax.train.options import LoopOptions
+from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
@@ -25,10 +25,10 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
     from envs.types import Array, Key, PyTree
     from sgft_jax.data import sources
-    from sgft_jax.finetuner import FinetuneState, Parts, assemble
     from sgft_jax.learners.idle import IDLE
-    from sgft_jax.methods.options import card_of
     from sgft_jax.policies import make_policy
+    from sgft_jax.train.finetuner import FinetuneState, Parts, assemble
+    from sgft_jax.train.options import card_of
     from sgft_jax.transforms import compose
 
     policy = make_policy(card_of(prior), task)
@@ -53,6 +53,13 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 
 METHOD = Method(
-    "recurrent", "model-free", "zero-shot: a policy with memory, from a simulator whose actuators and sensors differ",
-    "Ni 2022", Config, build, prior="recurrent",
-)  # fmt: skip
+    "recurrent",
+    Online(
+        "model-free",
+        "zero-shot: a policy with memory, from a simulator whose actuators and sensors differ",
+        "Ni 2022",
+        Config,
+        build,
+        prior="recurrent",
+    ),
+)

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, field
 
 from sgft_jax import checks
-from sgft_jax.methods.options import SACOptions
 from sgft_jax.models.config import NetworkConfig
-from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
+from sgft_jax.train.options import SACOptions
+from sgft_jax.types import Finetuner, Method, Online, Prior, Simulation, Task
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Config(SACOptions):
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner; without a prior it learns from real data alone."""
     from sgft_jax.data import sources
-    from sgft_jax.finetuner import sac_finetuner
+    from sgft_jax.train.finetuner import sac_finetuner
 
     simulated = round(config.simulated_share * config.batch_size) if prior is not None else 0
     source = sources.mixture(config.batch_size - simulated, simulated)
@@ -74,6 +74,14 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 
 METHOD = Method(
-    "rlpd", "model-free", "from nothing; ten normalised critics, half of each batch simulated", "Ball 2023", Config,
-    build, needs_prior=False, zero_shot=False,
-)  # fmt: skip
+    "rlpd",
+    Online(
+        "model-free",
+        "from nothing; ten normalised critics, half of each batch simulated",
+        "Ball 2023",
+        Config,
+        build,
+        needs_prior=False,
+        zero_shot=False,
+    ),
+)

@@ -1,10 +1,11 @@
-"""SAC on the task reward, from the simulator's actor and critic."""
+"""SAC on the task reward: from the simulator's actor and critic, or in a simulator alone, without any real data."""
 
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import KeptCriticOptions
-from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
+from sgft_jax.methods.options import ActorCriticOptions, agent_of, sac_numbers
+from sgft_jax.train.options import KeptCriticOptions
+from sgft_jax.types import Finetuner, Fixed, HybridAgent, Method, Online, Prior, Simulation, Task
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,8 @@ class Config(KeptCriticOptions):
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner; without a prior it learns from nothing."""
     from sgft_jax.data import sources
-    from sgft_jax.finetuner import sac_finetuner
     from sgft_jax.models.ratio import RatioConfig
+    from sgft_jax.train.finetuner import sac_finetuner
     from sgft_jax.transforms import weigh
 
     simulated = round(config.simulated_share * config.batch_size) if prior is not None else 0
@@ -50,6 +51,39 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class SimulatorConfig(ActorCriticOptions):
+    """Options of `sac` in a simulator alone."""
+
+    rows: int = 256
+    """Simulated rows of a batch."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.rows(self, "rows")
+
+
+def build_fixed(config: SimulatorConfig, task: Task) -> HybridAgent:
+    """The agent: what the imperfect simulator is worth without any real data."""
+    from sgft_jax.data import sources
+    from sgft_jax.learners.sac import SACConfig, make_sac
+    from sgft_jax.models.config import NetworkConfig
+
+    structure = SACConfig(
+        task.obs_dim, task.act_dim, network=NetworkConfig(config.hidden), train_value=False, train_dynamics=False
+    )
+    learner = make_sac(structure, sac_numbers(config))
+    return agent_of(learner, config, task, sources.two_buffers(0, config.rows), simulates=True)
+
+
 METHOD = Method(
-    "sac", "model-free", "SAC on the task reward, critic kept", "Haarnoja 2018", Config, build, needs_prior=False
+    "sac",
+    Online("model-free", "SAC on the task reward, critic kept", "Haarnoja 2018", Config, build, needs_prior=False),
+    Fixed(
+        "simulator",
+        "SAC in the simulator alone",
+        "Haarnoja et al. 2018",
+        {"default": SimulatorConfig()},
+        build_fixed,
+    ),
 )

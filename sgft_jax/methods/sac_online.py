@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import KeptCriticOptions
-from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
+from sgft_jax.train.options import KeptCriticOptions
+from sgft_jax.types import Finetuner, Method, Online, Prior, Simulation, Task
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     import jax.numpy as jnp
 
     from sgft_jax.data import sources
-    from sgft_jax.finetuner import FinetuneState, sac_finetuner
+    from sgft_jax.train.finetuner import FinetuneState, sac_finetuner
     from sgft_jax.types import Source
 
     both = sources.mixture(config.batch_size, config.batch_size)
@@ -63,5 +63,6 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 
 METHOD = Method(
-    "sac-online", "model-free", "SAC from kept networks and simulated data, slow actor", "As 2026", Config, build
+    "sac-online",
+    Online("model-free", "SAC from kept networks and simulated data, slow actor", "As 2026", Config, build),
 )

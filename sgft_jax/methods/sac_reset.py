@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from sgft_jax.methods.options import SACOptions
-from sgft_jax.types import Finetuner, Method, Prior, Task
+from sgft_jax.train.options import SACOptions
+from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
@@ -13,9 +13,9 @@ class Config(SACOptions):
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
-    from sgft_jax.finetuner import sac_finetuner
+    from sgft_jax.train.finetuner import sac_finetuner
 
     return sac_finetuner(config, prior, task, reset_critic=True)
 
 
-METHOD = Method("sac-reset", "model-free", "SAC on the task reward, new critic", "Haarnoja 2018", Config, build)
+METHOD = Method("sac-reset", Online("model-free", "SAC on the task reward, new critic", "Haarnoja 2018", Config, build))

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import KeptCriticOptions
-from sgft_jax.types import Finetuner, Method, Prior, Task
+from sgft_jax.train.options import KeptCriticOptions
+from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,11 @@ class Config(KeptCriticOptions):
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
-    from sgft_jax.finetuner import sac_finetuner
+    from sgft_jax.train.finetuner import sac_finetuner
     from sgft_jax.transforms import clip, shape, shorten
 
     transforms = (shape, clip(config.clip_shaped), shorten(config.horizon))
     return sac_finetuner(config, prior, task, transforms=transforms, horizon_dim=config.horizon, value_baseline=True)
 
 
-METHOD = Method("sgft", "sgft", "shaped rewards over short horizons, no models", "SGFT 2025", Config, build)
+METHOD = Method("sgft", Online("sgft", "shaped rewards over short horizons, no models", "SGFT 2025", Config, build))

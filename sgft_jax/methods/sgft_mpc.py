@@ -6,8 +6,8 @@ Source: SGFT (Yin et al., ICLR 2025), Algorithm 3. The paper plans in TD-MPC2's 
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import LoopOptions
-from sgft_jax.types import Finetuner, Method, Prior, Task
+from sgft_jax.train.options import LoopOptions
+from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,12 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
     from envs.types import Array, Key, PyTree
     from sgft_jax.data import sources
-    from sgft_jax.finetuner import FinetuneState, Parts, assemble, dynamics_models
     from sgft_jax.learners.idle import IDLE
     from sgft_jax.learners.sac import SACParams
-    from sgft_jax.methods.options import card_of
     from sgft_jax.planning.mpc import MPCConfig
     from sgft_jax.policies import mpc_policy, network_of
+    from sgft_jax.train.finetuner import FinetuneState, Parts, assemble, dynamics_models
+    from sgft_jax.train.options import card_of
     from sgft_jax.transforms import compose
     from sgft_jax.types import SimulatedData
 
@@ -82,6 +82,6 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 
 METHOD = Method(
-    "sgft-mpc", "sgft", "plans of H steps by learning models, ended by V_sim", "SGFT 2025", Config, build,
-    zero_shot=False,
-)  # fmt: skip
+    "sgft-mpc",
+    Online("sgft", "plans of H steps by learning models, ended by V_sim", "SGFT 2025", Config, build, zero_shot=False),
+)

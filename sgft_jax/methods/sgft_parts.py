@@ -7,8 +7,8 @@ segment too; that is a property of shortening without V_sim, and stays as it is.
 
 from dataclasses import dataclass
 
-from sgft_jax.methods.options import ModelOptions
-from sgft_jax.types import Finetuner, Method, Prior, Task
+from sgft_jax.train.options import ModelOptions
+from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Config(ModelOptions):
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
-    from sgft_jax.finetuner import sac_finetuner
+    from sgft_jax.train.finetuner import sac_finetuner
     from sgft_jax.transforms import branch, shape, shorten
 
     imagined = branch(config.horizon, config.branches, noise=config.branch_noise, segments=config.shorten)
@@ -38,5 +38,6 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 
 METHOD = Method(
-    "sgft-parts", "sgft", "SGFT-SAC with shaping and shortening on or off, for comparisons", "SGFT 2025", Config, build
+    "sgft-parts",
+    Online("sgft", "SGFT-SAC with shaping and shortening on or off, for comparisons", "SGFT 2025", Config, build),
 )

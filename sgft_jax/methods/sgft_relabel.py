@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from sgft_jax import checks
 from sgft_jax.methods import sgft_sac
-from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
+from sgft_jax.types import Finetuner, Method, Online, Prior, Simulation, Task
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class Config(sgft_sac.Config):
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
     from sgft_jax.data import sources
-    from sgft_jax.finetuner import sac_finetuner
     from sgft_jax.models.ratio import RatioConfig
+    from sgft_jax.train.finetuner import sac_finetuner
     from sgft_jax.transforms import branch, clip, relabel, shape, shorten, weigh
 
     source = sources.mixture(config.batch_size, config.batch_size)
@@ -55,5 +55,6 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 
 METHOD = Method(
-    "sgft-relabel", "sgft", "SGFT-SAC that also learns at the simulator's states", "SGFT 2025, ours", Config, build
+    "sgft-relabel",
+    Online("sgft", "SGFT-SAC that also learns at the simulator's states", "SGFT 2025, ours", Config, build),
 )

@@ -8,8 +8,8 @@ the agent never takes a step that costs V_sim now and pays later, and the critic
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import ModelOptions
-from sgft_jax.types import Finetuner, Method, Prior, Task
+from sgft_jax.train.options import ModelOptions
+from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Config(ModelOptions):
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
-    from sgft_jax.finetuner import sac_finetuner
+    from sgft_jax.train.finetuner import sac_finetuner
     from sgft_jax.transforms import branch, clip, shape, shorten
 
     transforms = (
@@ -51,5 +51,5 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 
 METHOD = Method(
-    "sgft-sac", "sgft", "branches of the models, shaped rewards, short horizons", "SGFT 2025", Config, build
+    "sgft-sac", Online("sgft", "branches of the models, shaped rewards, short horizons", "SGFT 2025", Config, build)
 )

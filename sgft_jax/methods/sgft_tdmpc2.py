@@ -6,7 +6,7 @@ Source: SGFT (Yin et al., ICLR 2025), Algorithm 3.
 from dataclasses import dataclass
 
 from sgft_jax.methods import tdmpc2
-from sgft_jax.types import Finetuner, Method, Prior, Task
+from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,14 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 
 METHOD = Method(
-    "sgft-tdmpc2", "sgft", "TD-MPC2 whose plans of H steps end in a frozen V_sim", "SGFT 2025", Config, build,
-    prior="tdmpc2", zero_shot=False,
-)  # fmt: skip
+    "sgft-tdmpc2",
+    Online(
+        "sgft",
+        "TD-MPC2 whose plans of H steps end in a frozen V_sim",
+        "SGFT 2025",
+        Config,
+        build,
+        prior="tdmpc2",
+        zero_shot=False,
+    ),
+)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sgft_jax.methods import tdmpc2
-from sgft_jax.types import Finetuner, Method, Prior, Task
+from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,14 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 
 METHOD = Method(
-    "sgft-tdmpc2-code", "sgft", "TD-MPC2 from nothing with shaped rewards", "SGFT 2025, released code", Config, build,
-    prior="tdmpc2", zero_shot=False,
-)  # fmt: skip
+    "sgft-tdmpc2-code",
+    Online(
+        "sgft",
+        "TD-MPC2 from nothing with shaped rewards",
+        "SGFT 2025, released code",
+        Config,
+        build,
+        prior="tdmpc2",
+        zero_shot=False,
+    ),
+)

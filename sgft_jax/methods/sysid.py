@@ -10,8 +10,8 @@ from typing import Literal
 
 from envs.types import Array, UserError
 from sgft_jax import checks
-from sgft_jax.methods.options import LoopOptions
-from sgft_jax.types import Finetuner, Method, Prior, Simulation, Task
+from sgft_jax.train.options import LoopOptions
+from sgft_jax.types import Finetuner, Method, Online, Prior, Simulation, Task
 
 _ROWS, _FEW = 320, 80  # what `rows` is if it is left open; DROPO takes two trajectories, and so does the slow simulator
 _SIMULATED = 2048  # rows that tell how far the models are off in simulation
@@ -45,14 +45,14 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
     from envs.types import Key, PyTree
     from sgft_jax.data import sources
-    from sgft_jax.finetuner import FinetuneState, Parts, assemble
     from sgft_jax.learners.idle import IDLE
     from sgft_jax.learners.sac import SACParams
-    from sgft_jax.methods.options import card_of
     from sgft_jax.models import dynamics, system
     from sgft_jax.models.networks import make_dynamics
     from sgft_jax.models.robust import spread_of
     from sgft_jax.policies import network_of, sac_policy
+    from sgft_jax.train.finetuner import FinetuneState, Parts, assemble
+    from sgft_jax.train.options import card_of
     from sgft_jax.transforms import compose
     from sgft_jax.types import Batch, Metrics, SimulatedData
 
@@ -132,6 +132,13 @@ def _simulator(task: Task) -> Callable[[Array, Array], Array]:
 
 
 METHOD = Method(
-    "sysid", "model-based", "fits parameters and effects, and tells them to a policy that knows them",
-    "DROPO (Tiboni 2023)", Config, build, sees_system=True,
-)  # fmt: skip
+    "sysid",
+    Online(
+        "model-based",
+        "fits parameters and effects, and tells them to a policy that knows them",
+        "DROPO (Tiboni 2023)",
+        Config,
+        build,
+        sees_system=True,
+    ),
+)

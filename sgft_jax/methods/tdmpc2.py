@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from math import inf
 
 from sgft_jax import checks
-from sgft_jax.methods.options import LoopOptions
-from sgft_jax.types import Finetuner, Method, Prior, Task
+from sgft_jax.train.options import LoopOptions
+from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
@@ -70,11 +70,11 @@ def planner(
 
     from envs.types import Array, Key, PyTree
     from sgft_jax.data import sequences, sources
-    from sgft_jax.finetuner import FinetuneState, Parts, agents_own, assemble
     from sgft_jax.learners import tdmpc2, tdmpc2_model
     from sgft_jax.learners.tdmpc2_model import TDMPC2Params
-    from sgft_jax.methods.options import card_of, warmup
     from sgft_jax.policies import tdmpc2_policy
+    from sgft_jax.train.finetuner import FinetuneState, Parts, agents_own, assemble
+    from sgft_jax.train.options import card_of, warmup
     from sgft_jax.transforms import compose, stateless
     from sgft_jax.types import Batch, SimulatedData
 
@@ -137,6 +137,14 @@ def planner(
 
 
 METHOD = Method(
-    "tdmpc2", "planning", "plans with the simulator's world model, and all of it learns", "Hansen 2024", Config, build,
-    prior="tdmpc2", needs_prior=False,
-)  # fmt: skip
+    "tdmpc2",
+    Online(
+        "planning",
+        "plans with the simulator's world model, and all of it learns",
+        "Hansen 2024",
+        Config,
+        build,
+        prior="tdmpc2",
+        needs_prior=False,
+    ),
+)

@@ -11,8 +11,8 @@ from tuners import METHODS, T
 from envs.types import UserError
 from sgft_jax import methods, transforms
 from sgft_jax.data import sources
-from sgft_jax.methods import options as rules
 from sgft_jax.methods import sgft_relabel, sgft_sac
+from sgft_jax.train import options as rules
 
 each_method = pytest.mark.parametrize("name", METHODS)
 
@@ -194,7 +194,7 @@ def program(case, state):
 @pytest.mark.slow
 def test_without_the_ratio_sgft_relabel_is_what_it_was():
     """The same program, to the letter, as one of the transforms that it had before the option."""
-    from sgft_jax.finetuner import sac_finetuner
+    from sgft_jax.train.finetuner import sac_finetuner
 
     case = tuners.tuner("sgft-relabel")
     options, source = tuners.configure("sgft-relabel"), sources.mixture(8, 8)

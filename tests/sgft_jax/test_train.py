@@ -15,11 +15,11 @@ import envs
 from envs.rollout import Episode
 from envs.types import Policy, Transition, UserError
 from sgft_jax.data import replay, sources
-from sgft_jax.finetuner import Parts, assemble
 from sgft_jax.io import checkpoint
-from sgft_jax.methods.options import LoopOptions
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import finetuning
+from sgft_jax.train.finetuner import Parts, assemble
+from sgft_jax.train.options import LoopOptions
 from sgft_jax.transforms import compose
 from sgft_jax.types import Learner, Simulation
 

@@ -2,10 +2,10 @@
 
 import pytest
 
-from sgft_jax.hybrid.methods import NAMES, get_method
 from sgft_jax.hybrid.presets import preset_for, say_preset
+from sgft_jax.methods import FIXED_NAMES, get_method
 
-REBRAC = get_method("rebrac")
+REBRAC = get_method("rebrac", "fixed")
 
 
 @pytest.mark.parametrize(
@@ -31,8 +31,8 @@ def test_the_preset_whose_data_set_the_name_contains(data, preset):
 
 
 def test_methods_whose_presets_are_no_data_sets_ignore_names():
-    assert [name for name in NAMES if get_method(name).by_data] == ["rebrac"]
-    assert preset_for(get_method("h2oplus"), "sql-released") == ""
+    assert [name for name in FIXED_NAMES if get_method(name, "fixed").by_data] == ["rebrac"]
+    assert preset_for(get_method("h2oplus", "fixed"), "sql-released") == ""
 
 
 def test_what_is_used_is_said():

@@ -18,9 +18,9 @@ from envs.rollout import step_fleet
 from envs.types import UserError
 from sgft_jax.data import replay
 from sgft_jax.hybrid import trainer
-from sgft_jax.hybrid.methods import NAMES, get_method
-from sgft_jax.hybrid.methods.options import return_scale
 from sgft_jax.hybrid.schedule import Schedule
+from sgft_jax.methods import FIXED_NAMES, get_method
+from sgft_jax.methods.options import return_scale
 from sgft_jax.policies import make_policy
 from sgft_jax.train.pretraining import over_members
 from sgft_jax.types import RealData
@@ -29,15 +29,15 @@ ENV = toy.make()
 SMALL = {"hidden": (16,), "rows": 8}
 QUICK = {"h2oplus"}  # what the fast tests see of the methods
 each_method = pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in NAMES]
+    "name", [pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow]) for name in FIXED_NAMES]
 )
-PRESETS = [(name, preset) for name in NAMES for preset in get_method(name).presets]
+PRESETS = [(name, preset) for name in FIXED_NAMES for preset in get_method(name, "fixed").presets]
 FIXED = {"hyper", "normalizer", "spread", "lr_ratio"}  # numbers and statistics, which no update moves
 SCHEDULE = Schedule(updates=24, simulators=3, buffer=64, chunk_updates=6)  # 4 chunks of 2 rounds
 
 
 def build(name="h2oplus", preset=None, **changes):
-    method = get_method(name)
+    method = get_method(name, "fixed")
     config = method.config if preset is None else method.presets[preset]
     own = {key: value for key, value in {**SMALL, "ratio_rows": 8}.items() if hasattr(config, key)}
     return method.build(dataclasses.replace(config, **own | changes), ENV)
@@ -134,7 +134,7 @@ def test_the_buffer_keeps_the_actions_without_the_noise_of_the_gap():
     """Under `action_noise` the motor gets clip(a + n), and a row holds a, as in H2O+'s simulators."""
     env, noise = cartpole.make(), 0.2
     pools = real_worlds(env, [gaps.from_dict(env, "shaky", {"effects": {"action_noise": noise}})], jax.random.key(0))
-    agent = get_method("sac").build(dataclasses.replace(get_method("sac").config, hidden=(16,)), env)
+    agent = get_method("sac", "fixed").build(dataclasses.replace(get_method("sac", "fixed").config, hidden=(16,)), env)
     real, schedule = trainer.no_data(env), dataclasses.replace(SCHEDULE, simulators=32, buffer=512)
     note = lambda learner, before, action, after: after.physics.ctrl  # noqa: E731
     state, _ = next(trainer.train(env, agent, schedule, pools, real, keys_of(0), gamma=0.9, note=note))
@@ -210,7 +210,9 @@ def test_bad_schedules(changes, words):
 
 def test_presets_are_what_they_are_called():
     """Section 3 of the paper, and the released code, which differs from it."""
-    paper, released, robot = (get_method("h2oplus").presets[name] for name in ("paper", "released", "released-robot"))
+    paper, released, robot = (
+        get_method("h2oplus", "fixed").presets[name] for name in ("paper", "released", "released-robot")
+    )
     assert (paper.value_share, paper.value_loss, paper.ratio, paper.rows) == (0.1, "iql", True, 128)
     assert (released.value_share, released.expectile) == (0.5, 0.5)
     assert (robot.value_share, robot.expectile, robot.hidden, robot.rows, robot.ratio_rows) == (
@@ -220,24 +222,26 @@ def test_presets_are_what_they_are_called():
         16,
         256,
     )
-    h2o = get_method("h2o").presets
+    h2o = get_method("h2o", "fixed").presets
     assert (h2o["paper"].conservatism, h2o["paper"].spread_scale) == (0.01, 1.0)
     assert h2o["released"].spread_scale == pytest.approx(np.sqrt(1 / 11), abs=2e-3)  # one row in eleven is not padding
-    penalties = {name: (own.actor_penalty, own.critic_penalty) for name, own in get_method("rebrac").presets.items()}
+    penalties = {
+        name: (own.actor_penalty, own.critic_penalty) for name, own in get_method("rebrac", "fixed").presets.items()
+    }
     assert penalties == {
         "halfcheetah-medium-replay": (0.01, 0.001),
         "halfcheetah-medium": (0.001, 0.01),
         "walker2d-medium-replay": (0.05, 0.01),
         "walker2d-medium": (0.05, 0.1),
     }
-    ensemble = get_method("h2oplus-edac").config
+    ensemble = get_method("h2oplus-edac", "fixed").config
     assert (ensemble.critics, ensemble.diversity, ensemble.value_share, ensemble.expectile) == (10, 1.0, 0.1, 0.7)
-    assert get_method("cql").config.conservatism == 2.0 and get_method("edac").config.critics == 10
+    assert get_method("cql", "fixed").config.conservatism == 2.0 and get_method("edac", "fixed").config.critics == 10
 
 
 def test_presets_of_h2oplus_change_what_their_names_say_and_nothing_else():
     """The paper's tables; the backbones' own numbers are those of their authors (value scale and cut-off)."""
-    presets = get_method("h2oplus").presets
+    presets = get_method("h2oplus", "fixed").presets
     paper = dataclasses.asdict(presets["paper"])
     assert {name: dict(dataclasses.asdict(own).items() - paper.items()) for name, own in presets.items()} == {
         "paper": {},
@@ -257,7 +261,7 @@ def test_presets_of_h2oplus_change_what_their_names_say_and_nothing_else():
 
 @pytest.mark.parametrize("name", ["eql", "xql"])
 def test_scale_and_cut_off_of_a_backbone_reach_its_learner(name):
-    own = get_method("h2oplus").presets[name]
+    own = get_method("h2oplus", "fixed").presets[name]
     agent = build(value_loss=own.value_loss, value_alpha=own.value_alpha, value_cut=own.value_cut)
     hyper = agent.learner.init(jax.random.key(0)).hyper
     assert (hyper.value_alpha, hyper.value_cut) == (own.value_alpha, own.value_cut)
@@ -279,7 +283,7 @@ def check_learning(chunks):
 @pytest.mark.parametrize(("name", "preset"), PRESETS)
 def test_every_preset_learns_as_it_stands(name, preset):
     """At its own sizes: the released code of H2O+ has a preset of the robot that no one can start."""
-    agent = get_method(name).build(get_method(name).presets[preset], ENV)
+    agent = get_method(name, "fixed").build(get_method(name, "fixed").presets[preset], ENV)
     schedule = Schedule(updates=4, simulators=2, buffer=600, chunk_updates=2)
     chunks = played(agent, schedule)
     check_learning(chunks)
@@ -375,7 +379,7 @@ def test_the_scale_of_a_backbone_is_one_of_returns_that_span_1000():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", FIXED_NAMES)
 def test_an_exported_policy_acts_as_the_agent(name):
     agent = build(name)
     state = jax.tree.map(lambda x: x[0], played(agent)[-1][0].learner)

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import ActorCriticOptions, agent_of, sac_numbers
-from sgft_jax.types import HybridAgent, HybridMethod, Task
+from sgft_jax.methods.options import ActorCriticOptions, agent_of, sac_numbers
+from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,13 @@ def build(config: Config, task: Task) -> HybridAgent:
     return agent_of(learner, config, task, batches, simulates=True, export=export)
 
 
-METHOD = HybridMethod(
-    "darc", "hybrid", "SAC in the simulator, paid less where the real system would act otherwise",
-    "Eysenbach et al. 2021", {"default": Config()}, build,
-)  # fmt: skip
+METHOD = Method(
+    "darc",
+    fixed=Fixed(
+        "hybrid",
+        "SAC in the simulator, paid less where the real system would act otherwise",
+        "Eysenbach et al. 2021",
+        {"default": Config()},
+        build,
+    ),
+)

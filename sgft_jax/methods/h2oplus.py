@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import HybridOptions, agent_of, numbers_of, real_and_simulated, return_scale
-from sgft_jax.types import HybridAgent, HybridMethod, Task, ValueLoss
+from sgft_jax.methods.options import HybridOptions, agent_of, real_and_simulated, return_scale
+from sgft_jax.types import Fixed, HybridAgent, Method, Task, ValueLoss
 
 if TYPE_CHECKING:
     from sgft_jax.learners.h2oplus import H2OPlusState
@@ -50,14 +50,25 @@ def build(config: Config, task: Task, *, critics: int = 2, diversity: float = 0.
     )  # fmt: skip
 
     def prepare(state: "H2OPlusState", real: "RealData", updates: int) -> "H2OPlusState":
-        hyper = state.hyper  # the learner itself has alpha in units of return
-        state = state.replace(hyper=hyper._replace(value_alpha=hyper.value_alpha / return_scale(real)))
+        alpha = state.hyper.value_alpha / return_scale(real)  # the learner itself has it in units of return
+        state = state.replace(hyper=state.hyper._replace(value_alpha=alpha))
         if state.ratio is not None and config.standardise:
             state = state.replace(ratio=state.ratio._replace(normalizer=normalizer.of(real.rows.obs)))
         return state
 
-    numbers = numbers_of(h2oplus.H2OPlusHyper, config, "actor", "critic", "value", "alpha", "ratio")
-    learner = h2oplus.make_h2oplus(structure, numbers)
+    hyper = h2oplus.H2OPlusHyper(
+        lr_actor=config.lr,
+        lr_critic=config.lr,
+        lr_value=config.lr,
+        lr_alpha=config.lr,
+        lr_ratio=config.lr,
+        tau=config.tau,
+        value_share=config.value_share,
+        expectile=config.expectile,
+        value_alpha=config.value_alpha,
+        value_cut=config.value_cut,
+    )
+    learner = h2oplus.make_h2oplus(structure, hyper)
     batches = real_and_simulated(config)
     return agent_of(learner, config, task, batches, simulates=True, head="affine", prepare=prepare)
 
@@ -72,18 +83,20 @@ _BACKBONES = {
     "eql": replace(_PAPER, value_loss="eql", value_alpha=2.0, value_cut=5.0),
     "xql": replace(_PAPER, value_loss="xql", value_alpha=2.0, value_cut=7.0),
 }
-METHOD = HybridMethod(
+METHOD = Method(
     "h2oplus",
-    "hybrid",
-    "in-sample value of the data and SAC in the simulator, weighted by a ratio of dynamics",
-    "Niu et al. 2023",
-    {
-        "paper": _PAPER,
-        "released": replace(_PAPER, value_share=0.5, expectile=0.5),
-        "released-robot": replace(_PAPER, expectile=0.9, hidden=(32, 32), rows=16),
-        "no-ratio": replace(_PAPER, ratio=False),
-        **{f"lambda-{share:g}": replace(_PAPER, value_share=share) for share in (0.0, 0.2, 0.5, 1.0)},
-        **_BACKBONES,
-    },
-    build,
+    fixed=Fixed(
+        "hybrid",
+        "in-sample value of the data and SAC in the simulator, weighted by a ratio of dynamics",
+        "Niu et al. 2023",
+        {
+            "paper": _PAPER,
+            "released": replace(_PAPER, value_share=0.5, expectile=0.5),
+            "released-robot": replace(_PAPER, expectile=0.9, hidden=(32, 32), rows=16),
+            "no-ratio": replace(_PAPER, ratio=False),
+            **{f"lambda-{share:g}": replace(_PAPER, value_share=share) for share in (0.0, 0.2, 0.5, 1.0)},
+            **_BACKBONES,
+        },
+        build,
+    ),
 )

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import OfflineOptions, agent_of, numbers_of
-from sgft_jax.types import HybridAgent, HybridMethod, Task
+from sgft_jax.methods.options import OfflineOptions, agent_of
+from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
 @dataclass(frozen=True)
@@ -35,22 +35,39 @@ def build(config: Config, task: Task) -> HybridAgent:
 
     network = NetworkConfig(config.hidden, layer_norm=True)
     structure = rebrac.ReBRACConfig(task.obs_dim, task.act_dim, network)
+    hyper = rebrac.ReBRACHyper(
+        lr_actor=config.lr,
+        lr_critic=config.lr,
+        tau=config.tau,
+        actor_penalty=config.actor_penalty,
+        critic_penalty=config.critic_penalty,
+    )
     return agent_of(
-        rebrac.make_rebrac(structure, numbers_of(rebrac.ReBRACHyper, config, "actor", "critic")), config, task,
-        sources.real_windows(config.rows, 2), simulates=False, head="deterministic", network=network,
+        rebrac.make_rebrac(structure, hyper),
+        config,
+        task,
+        sources.real_windows(config.rows, 2),
+        simulates=False,
+        head="deterministic",
+        network=network,
         keep=lambda real: sequences.full(real.rows, real.last),
-    )  # fmt: skip
+    )
 
 
 _REPLAY = Config()  # the published penalties, by data set
-METHOD = HybridMethod(
-    "rebrac", "offline", "TD3 whose actor and critic pay for leaving the data", "Tarasov et al. 2023",
-    {
-        "halfcheetah-medium-replay": _REPLAY,
-        "halfcheetah-medium": replace(_REPLAY, actor_penalty=0.001, critic_penalty=0.01),
-        "walker2d-medium-replay": replace(_REPLAY, actor_penalty=0.05, critic_penalty=0.01),
-        "walker2d-medium": replace(_REPLAY, actor_penalty=0.05, critic_penalty=0.1),
-    },
-    build,
-    by_data=True,
-)  # fmt: skip
+METHOD = Method(
+    "rebrac",
+    fixed=Fixed(
+        "offline",
+        "TD3 whose actor and critic pay for leaving the data",
+        "Tarasov et al. 2023",
+        {
+            "halfcheetah-medium-replay": _REPLAY,
+            "halfcheetah-medium": replace(_REPLAY, actor_penalty=0.001, critic_penalty=0.01),
+            "walker2d-medium-replay": replace(_REPLAY, actor_penalty=0.05, critic_penalty=0.01),
+            "walker2d-medium": replace(_REPLAY, actor_penalty=0.05, critic_penalty=0.1),
+        },
+        build,
+        by_data=True,
+    ),
+)

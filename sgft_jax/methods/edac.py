@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from sgft_jax.hybrid.methods.options import EnsembleOptions, OfflineOptions, agent_of, sac_numbers
-from sgft_jax.types import HybridAgent, HybridMethod, Task
+from sgft_jax.methods.options import EnsembleOptions, OfflineOptions, agent_of, sac_numbers
+from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,13 @@ def build(config: Config, task: Task) -> HybridAgent:
     return agent_of(learner, config, task, sources.real_rows(config.rows), simulates=False)
 
 
-METHOD = HybridMethod(
+METHOD = Method(
     "edac",
-    "offline",
-    "SAC whose many critics must not agree on how to leave the data",
-    "An et al. 2021",
-    {"default": Config()},
-    build,
+    fixed=Fixed(
+        "offline",
+        "SAC whose many critics must not agree on how to leave the data",
+        "An et al. 2021",
+        {"default": Config()},
+        build,
+    ),
 )

@@ -16,13 +16,13 @@ from sgft_jax.data import replay, sources
 from sgft_jax.identify import Identified, Interface, interface
 from sgft_jax.learners import sac
 from sgft_jax.math import optim
-from sgft_jax.methods import options as rules
-from sgft_jax.methods.options import KeptCriticOptions, LoopOptions, ModelOptions, SACOptions
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import fix_first_layer, make_dynamics, make_value
 from sgft_jax.policies import network_of, sac_policy
+from sgft_jax.train import options as rules
 from sgft_jax.train.guard import guarded
+from sgft_jax.train.options import KeptCriticOptions, LoopOptions, ModelOptions, SACOptions
 from sgft_jax.transforms import compose, steps_to_go
 from sgft_jax.types import (
     Batch,

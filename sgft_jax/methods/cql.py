@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import OfflineOptions, agent_of, sac_numbers
-from sgft_jax.types import HybridAgent, HybridMethod, Task
+from sgft_jax.methods.options import OfflineOptions, agent_of, sac_numbers
+from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,13 @@ def build(config: Config, task: Task) -> HybridAgent:
     return agent_of(learner, config, task, sources.real_rows(config.rows), simulates=False)
 
 
-METHOD = HybridMethod(
+METHOD = Method(
     "cql",
-    "offline",
-    "SAC whose critic is pushed down where the data do not go",
-    "Kumar et al. 2020",
-    {"default": Config()},
-    build,
+    fixed=Fixed(
+        "offline",
+        "SAC whose critic is pushed down where the data do not go",
+        "Kumar et al. 2020",
+        {"default": Config()},
+        build,
+    ),
 )

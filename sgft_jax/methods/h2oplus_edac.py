@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass
 
-from sgft_jax.hybrid.methods import h2oplus
-from sgft_jax.hybrid.methods.options import EnsembleOptions
-from sgft_jax.types import HybridAgent, HybridMethod, Task
+from sgft_jax.methods import h2oplus
+from sgft_jax.methods.options import EnsembleOptions
+from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,13 @@ def build(config: Config, task: Task) -> HybridAgent:
     return h2oplus.build(config, task, critics=config.critics, diversity=config.diversity)
 
 
-METHOD = HybridMethod(
-    "h2oplus-edac", "hybrid", "H2O+ with ten critics that must not agree on how to leave the data",
-    "Niu et al. 2023, An et al. 2021", {"default": Config()}, build,
-)  # fmt: skip
+METHOD = Method(
+    "h2oplus-edac",
+    fixed=Fixed(
+        "hybrid",
+        "H2O+ with ten critics that must not agree on how to leave the data",
+        "Niu et al. 2023, An et al. 2021",
+        {"default": Config()},
+        build,
+    ),
+)

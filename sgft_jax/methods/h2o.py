@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from sgft_jax import checks
-from sgft_jax.hybrid.methods.options import HybridOptions, agent_of, numbers_of, real_and_simulated
-from sgft_jax.types import HybridAgent, HybridMethod, Task
+from sgft_jax.methods.options import HybridOptions, agent_of, real_and_simulated
+from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 if TYPE_CHECKING:
     from sgft_jax.learners.h2o import H2OState
@@ -41,14 +41,28 @@ def build(config: Config, task: Task) -> HybridAgent:
     def prepare(state: "H2OState", real: "RealData", updates: int) -> "H2OState":
         return state.replace(spread=replay.obs_std(replay.full(real.rows)))
 
-    numbers = numbers_of(h2o.H2OHyper, config, "actor", "critic", "alpha", "ratio")
-    learner = h2o.make_h2o(structure, numbers)
+    hyper = h2o.H2OHyper(
+        lr_actor=config.lr,
+        lr_critic=config.lr,
+        lr_alpha=config.lr,
+        lr_ratio=config.lr,
+        tau=config.tau,
+        conservatism=config.conservatism,
+        spread_scale=config.spread_scale,
+    )
+    learner = h2o.make_h2o(structure, hyper)
     batches = real_and_simulated(config)
     return agent_of(learner, config, task, batches, simulates=True, head="affine", prepare=prepare)
 
 
 _PAPER = Config()
-METHOD = HybridMethod(
-    "h2o", "hybrid", "one critic, pushed down where the simulator is wrong", "Niu et al. 2022",
-    {"paper": _PAPER, "released": replace(_PAPER, spread_scale=0.3)}, build,
-)  # fmt: skip
+METHOD = Method(
+    "h2o",
+    fixed=Fixed(
+        "hybrid",
+        "one critic, pushed down where the simulator is wrong",
+        "Niu et al. 2022",
+        {"paper": _PAPER, "released": replace(_PAPER, spread_scale=0.3)},
+        build,
+    ),
+)

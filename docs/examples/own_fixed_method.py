@@ -1,0 +1,45 @@
+"""A method of your own for a fixed set of real data: SAC whose batches are half real and half simulated rows.
+
+Commands read this file before they start JAX, so JAX is imported where it is used.
+"""
+
+from dataclasses import dataclass
+
+from sgft_jax import checks
+from sgft_jax.methods.options import ActorCriticOptions, agent_of, sac_numbers
+from sgft_jax.types import Fixed, HybridAgent, Method, Task
+
+
+@dataclass(frozen=True)
+class Config(ActorCriticOptions):
+    """Options of `sac-both`: learning rate, widths and discount factor, and what is written here."""
+
+    rows: int = 128
+    """Real rows of a batch; it has as many simulated ones."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.rows(self, "rows")
+
+
+def build(config: Config, task: Task) -> HybridAgent:
+    """Which learner it is, and what its batches are made of."""
+    from sgft_jax import NetworkConfig, SACConfig, make_sac
+    from sgft_jax.data import sources
+
+    network = NetworkConfig(config.hidden)
+    structure = SACConfig(task.obs_dim, task.act_dim, network=network, train_value=False, train_dynamics=False)
+    batches = sources.two_buffers(config.rows, config.rows)
+    return agent_of(make_sac(structure, sac_numbers(config)), config, task, batches, simulates=True)
+
+
+METHOD = Method(  # what `--method docs/examples/own_fixed_method.py` looks for
+    "sac-both",
+    fixed=Fixed(
+        "hybrid",
+        "SAC on real and simulated rows alike",
+        "docs/extending.md",
+        {"default": Config(), "small": Config(hidden=(32, 32), rows=16)},
+        build,
+    ),
+)
