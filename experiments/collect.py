@@ -16,6 +16,7 @@ from envs.gaps import SIM, title
 from envs.types import UserError
 from experiments.runner import cli
 from experiments.runner.options import Impl, at_least_one, check_task, seed_list, task_of_priors
+from sgft_jax.io.cards import resolve_shipped
 from sgft_jax.io.runs import check_folder
 
 LEVELS = {"halfcheetah": 4770.0, "walker2d": 2850.0}  # mean returns of D4RL's medium sets, v2
@@ -134,6 +135,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def collect(args: CollectArgs) -> list[dict[str, Any]]:
     """Records and writes; returns what each file holds."""
+    args = replace(args, policy=args.policy and resolve_shipped(args.policy))
     level = check(args)
     if args.operator:
         from experiments.collect_operator import operate  # JAX starts here
