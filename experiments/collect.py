@@ -6,10 +6,12 @@ are recorded instead. With --operator, a noisy controller keeps a wheel-legged r
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from experiments.runner import cli
 from experiments.runner.collect_args import CollectArgs, check
+from sgft_jax.io.cards import resolve_shipped
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -19,6 +21,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def collect(args: CollectArgs) -> list[dict[str, Any]]:
     """Records and writes; returns what each file holds."""
+    args = replace(args, policy=args.policy and resolve_shipped(args.policy))
     level = check(args)
     if args.operator:
         from experiments.runner.collect_operator import operate  # JAX starts here

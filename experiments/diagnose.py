@@ -1,11 +1,9 @@
 """Say from a few real rollouts what kind of gap this is, whether fine-tuning will help, and how soon.
 
-Draws four panels, writes the numbers as JSON, and prints a verdict in words (docs/diagnose.md). With --calibrate it
-measures on finished fine-tuning runs how well that verdict predicts what they have gained.
+Draws four panels, writes the numbers as JSON, and prints a verdict in words (docs/diagnose.md).
 """
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +18,7 @@ from sgft_jax.presets import DEFAULT_PRESET
 
 @dataclass(frozen=True)
 class DiagnoseArgs:
-    """One diagnosis, by every prior; or the calibration of all."""
+    """One diagnosis, by every prior."""
 
     task: str | None = None
     """A task by name, or a Python file with a task of your own; default: the task of the prior."""
@@ -32,10 +30,6 @@ class DiagnoseArgs:
     name, a .toml/.json file, file.toml:name, or gymnasium:NAME, on which the policies then play zero-shot."""
     rollouts: int | None = None
     """Only the first so many recorded rollouts; default: all. On a gap: how many to play, default 4."""
-    calibrate: tuple[Path, ...] = ()
-    """Fit the prediction to these finished fine-tuning runs instead: their folders, or folders that hold some."""
-    check: tuple[Path, ...] = ()
-    """With --calibrate: other runs, on which the fitted prediction is then checked."""
     json: bool = False
     """Print one JSON object and nothing else."""
     out: Path = Path("runs")
@@ -48,23 +42,13 @@ class DiagnoseArgs:
 
 
 def main(args: DiagnoseArgs) -> None:
-    """Diagnoses or calibrates, and prints."""
+    """Diagnoses and prints."""
     seed_list(args.seed, 1)
-    if args.check and not args.calibrate:
-        raise UserError("--check: is for a prediction that --calibrate has fitted; name runs there too")
-    if args.calibrate:
-        runs = [find_runs("--calibrate", args.calibrate), find_runs("--check", args.check)]
-        if shared := set(runs[0]) & set(runs[1]):
-            raise UserError(f"--check: {min(shared)} is also in --calibrate; what was fitted cannot check the fit")
-        from experiments.studies.diagnose_calibrate import calibrate
+    folders, task, recorded = check(args)
+    from experiments.runner.diagnose_run import diagnose
 
-        found, lines = calibrate(args, *runs)
-    else:
-        folders, task, recorded = check(args)
-        from experiments.runner.diagnose_run import diagnose
-
-        found, lines = diagnose(args, folders, task, recorded)
-    print(json.dumps(found) if args.json else "\n".join(lines))
+    summary, lines = diagnose(args, folders, task, recorded)
+    print(json.dumps(summary) if args.json else "\n".join(lines))
 
 
 def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
@@ -87,19 +71,6 @@ def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
     task = task_of_priors(folders, task)
     check_real(task, [] if recorded else [args.real])
     return folders, task, recorded
-
-
-def find_runs(option: str, folders: Sequence[Path]) -> list[Path]:
-    """The folders of fine-tuning runs with recorded rollouts and a curve; raises UserError where there is none."""
-    found: dict[Path, None] = {}
-    for folder in folders:
-        own = [path.parent for path in sorted(folder.rglob("eval.jsonl")) if (path.parent / "real").is_dir()]
-        if not own:
-            raise UserError(
-                f"{option} {folder}: holds no fine-tuning run with recorded rollouts (eval.jsonl and real/)"
-            )
-        found |= dict.fromkeys(own)
-    return list(found)
 
 
 if __name__ == "__main__":

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING
 from envs.types import UserError
 from experiments.runner import cli, panda_gym
 from experiments.runner.finetune_args import arguments, run_folder
-from experiments.runner.options import SHIPPED, at_least_one, check_prior, seed_list
+from experiments.runner.options import at_least_one, check_prior, seed_list
 from experiments.runner.panda_gym import HOME, PYTHON, TASK
 from experiments.runner.real_systems import REMOTE
+from sgft_jax.io.cards import resolve_shipped
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import get_method
 
@@ -30,7 +31,7 @@ _FILMED = 3  # episodes of the first and of the last evaluation, to choose a tel
 class RealDemoArgs:
     """A few minutes on two cores; everything but the environment of Bullet lands in one folder."""
 
-    prior: Path = SHIPPED / TASK / "seed-0"
+    prior: Path = Path(f"shipped:{TASK}/seed-0")
     """Folder of a prior of panda-push."""
     method: str = "guarded"
     """How to fine-tune."""
@@ -68,10 +69,10 @@ def check(args: RealDemoArgs) -> None:
     seed_list(args.seed, 1)
     method = get_method(args.method)
     check_folder(args.out)
-    if not (args.prior / "prior.json").exists():
+    if not (resolve_shipped(args.prior) / "prior.json").exists():
         command = f"python -m experiments.pretrain --task {TASK}"
         raise UserError(f"--prior {args.prior}: holds no prior; make one with: {command}")
-    check_prior(args.prior, method, TASK)
+    check_prior(resolve_shipped(args.prior), method, TASK)
     panda_gym.check_driver()
     if args.out.exists() and any(args.out.iterdir()) and not (args.out / "robot.log").exists():
         raise UserError(f"--out {args.out}: holds something that is no demo; choose another folder")

@@ -1,6 +1,6 @@
 """Write priors small enough to share: the same numbers, rounded to fewer digits, which compress better.
 
-`experiments.evaluate` tells whether that matters. The priors in docs/priors were written by this command.
+`experiments.evaluate` tells whether that matters. The priors in sgft_jax/priors were written by this command.
 """
 
 import os

@@ -3,8 +3,8 @@
     python docs/examples/critic_against_returns.py                   # eight updates per real transition
     python docs/examples/critic_against_returns.py lr_critic=1e-12   # the simulator's critic stays as it is
 
-The real system is the simulator of push, the prior the one in docs/priors/push. After 0, 1, 2, 4, 8 and 16 rollouts the
-policy begins 256 episodes from the same starts twice: with its own first action, and with a uniformly random one.
+The real system is the simulator of push, the prior the one in sgft_jax/priors/push. After 0, 1, 2, 4, 8 and 16 rollouts
+the policy begins 256 episodes from the same starts twice: with its own first action, and with a uniformly random one.
 Printed, as means over starts and three seeds: Q of both first actions, what they returned on average, and the share of
 starts in which the critic prefers the random action. Returns are discounted, and their episodes are twice as long as
 the task's, so that little is cut off.
@@ -33,7 +33,7 @@ HEAD = ("rollouts", "Q of its action", "return", "Q of a random one", "return", 
 
 def main(options: Mapping[str, float]) -> None:
     """Prints a line for each number of rollouts. options: of the method `sac`."""
-    prior = sgft_jax.load_prior("docs/priors/push/seed-0")
+    prior = sgft_jax.load_prior("shipped:push/seed-0")
     env = sgft_jax.make_env(prior)
     setup = sgft_jax.setup(env, envs.gaps.load(env, "sim"), prior, method="sac", seeds=SEEDS, **{"utd": 8.0, **options})
     look = jax.jit(partial(compare, setup, prior.card))

@@ -2,7 +2,7 @@
 
     python docs/examples/exact_identification.py push-2-00 insert-2-00      # test gaps; default: the ones named below
 
-The prior in docs/priors plays every gap three times: as it is; told exactly what the gap makes of its commands; and
+The prior in sgft_jax/priors plays every gap three times: as it is; told exactly what the gap makes of its commands; and
 told its constant sensor errors too. Printed is the success of 200 episodes with its 95 % Wilson interval. Commands
 stay in [-1, 1], so what the real robot cannot do remains. With folders of priors after `--priors`, these play instead.
 """
@@ -31,7 +31,7 @@ def main(names: list[str], folders: list[str]) -> None:
     """Prints a line for each gap and prior."""
     for name in names or GAPS:
         task = name.partition("-")[0]
-        for folder in folders or [f"docs/priors/{task}/seed-0"]:
+        for folder in folders or [f"shipped:{task}/seed-0"]:
             prior = sgft_jax.load_prior(folder)
             env = sgft_jax.make_env(prior)
             gap = envs.gaps.load(env, f"envs/gaps/test/{task}.toml:{name}")

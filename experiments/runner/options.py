@@ -11,11 +11,10 @@ from envs import extend, gaps
 from envs.types import UserError, unknown
 from sgft_jax import checks, types
 from sgft_jax.files.folders import ASIDE, present
-from sgft_jax.io.cards import CARD, known_task, read_card
+from sgft_jax.io.cards import CARD, SHIPPED, known_task, read_card, resolve_shipped
 from sgft_jax.presets import PRESETS, check_card
 from sgft_jax.types import Online
 
-SHIPPED = Path("docs/priors")  # in the folder of the code, where commands are usually typed
 _LAST_PORT = 65_535
 _MOST_HOSTS, _MOST_SEEDS = 2**16, 2**16  # of one run
 LAST_SEED = 2**31 - 1  # larger ones stand for held-out worlds and episodes
@@ -131,10 +130,10 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str, opti
     """Where priors are, in the order of their seeds; raises UserError if there is none.
 
     prior: a folder that is one, or that holds some as `seed-*`, `prior/seed-*`, `policy/seed-*` (what fine-tuning
-    leaves, in the same form) or `*/prior/seed-*`; None looks in `prior_home`. task: as the user has typed it.
-    option: the one that names `prior`.
+    leaves, in the same form) or `*/prior/seed-*`, or `shipped:TASK`; None looks in `prior_home`. task: as the user has
+    typed it. option: the one that names `prior`.
     """
-    home = prior or prior_home(out, extend.name_of(task), preset)
+    home = resolve_shipped(prior) if prior else prior_home(out, extend.name_of(task), preset)
     if (present(home) / CARD).exists():
         return [home]
     cards = [
@@ -149,8 +148,8 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str, opti
     if not found and preset not in PRESETS:
         raise UserError(unknown("--preset", preset, PRESETS))
     if not found:
-        shipped = SHIPPED / extend.name_of(task)
-        other = f", or take --prior {shipped}, which comes with the code" if shipped.exists() else ""
+        shipped = (SHIPPED / extend.name_of(task)).is_dir()
+        other = f", or take --prior shipped:{extend.name_of(task)}, which comes with the code" if shipped else ""
         command = f"python -m experiments.pretrain --task {task} --preset {preset}"
         raise UserError(f"{home}: holds no prior; make one with: {command}{other}")
     return sorted(found, key=_seed_number)

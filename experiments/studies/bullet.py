@@ -16,7 +16,6 @@ from envs.types import UserError
 from experiments.runner import cli, finetune_args, panda_gym
 from experiments.runner.finetune_args import FinetuneArgs
 from experiments.runner.options import (
-    SHIPPED,
     at_least_one,
     check_prior,
     not_negative,
@@ -37,7 +36,7 @@ class BulletArgs:
 
     methods: tuple[str, ...] = ("guarded", "sgft-sac", "mbpo", "sac")
     """Methods that start from priors of SAC, in the order in which they run."""
-    prior: Path = SHIPPED / TASK
+    prior: Path = Path(f"shipped:{TASK}")
     """Folder of a prior of panda-push, or of several; seed i starts from prior i modulo their number."""
     seed: int = 0
     """First seed."""

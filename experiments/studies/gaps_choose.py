@@ -17,14 +17,14 @@ Lines = Mapping[str, Mapping[str, Any]]
 def choose(lines: Lines, n: int) -> list[str]:
     """Names of n gaps of a table, in its order; the same table gives the same names.
 
-    lines: {name: line of `experiments.studies.gaps_draw.Table`}. The strata take turns, and one that has no gap
+    lines: {name: line of `experiments.studies.gaps_drawn.Table`}. The strata take turns, and one that has no gap
     left passes its turn on. In its turn a stratum gives the gap that keeps the numbers of gaps per family closest to
     each other, of several such gaps the first. Never chosen: SIM, a gap without a stratum, a gap that a policy trained
     there did not master. Raises UserError if fewer than n gaps are left.
     """
     left = _by_stratum(lines)
     if (most := sum(map(len, left.values()))) < n:
-        raise UserError(f"--choose {n}: only {most} of the gaps may be chosen; draw more with --draw")
+        raise UserError(f"--choose {n}: only {most} of the gaps may be chosen; draw more with --count")
     counts = dict.fromkeys((family for names in left.values() for name in names for family in _of(lines, name)), 0)
     chosen: set[str] = set()
     while len(chosen) < n:

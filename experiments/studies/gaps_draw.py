@@ -1,286 +1,106 @@
-"""Impure: draws gaps and measures them, with a table on disk that grows. `experiments.gaps --draw` is its command."""
+"""Draw gaps from a distribution, write them to a file, measure and sort them, and choose a frozen set of them.
 
-import functools
-from collections.abc import Mapping, Sequence
+Solved by the simulator's policy (80 % and more), partial, or failed (below 20 %); trivial where identifying commands
+(scale, rotation, bias) and constant errors of sensors from one rollout suffices (90 %). What the table beside the file
+holds already is not measured again.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
+import tyro
 
-import envs
-from envs import gap_distribution, gaps
-from envs.base import Env
-from envs.files import read_json
-from envs.gaps import SIM, Gap
-from envs.history import with_previous_actions
-from envs.rollout import Episode
-from envs.system import concealed
-from envs.types import PyTree, Transition, UserError
-from experiments.gaps import GapsArgs
-from experiments.runner.cli import columns
-from experiments.runner.evaluation import play
-from experiments.runner.gaps_run import FINAL_SEED, episode_key, percent, rate, systems, train
-from experiments.studies import gaps_choose
-from sgft_jax import api, stacking
-from sgft_jax.files.jsonfile import differences, jsonable, write_json
-from sgft_jax.identify import Identified, Interface
-from sgft_jax.io.priors import digest, load_priors, observed_by
-from sgft_jax.math import stats
-from sgft_jax.methods import get_method
-from sgft_jax.models.distortion import Distortion, none
-from sgft_jax.policies import make_policy, network_of
-from sgft_jax.train.finetuner import command_interface
-from sgft_jax.types import Prior, SimulatedData
-
-SOLVED_AT_LEAST, FAILED_BELOW, TRIVIAL_AT_LEAST, ADMITTED_AT_LEAST = 0.8, 0.2, 0.9, 0.9
-PLANNER = "sgft-mpc"
-PREVIOUS_ACTIONS = 2  # that the judge sees: a command that comes late is still in force, or was when the step began
-_ROLLOUT_SEED = 2**31 + 6  # of the rollouts that distortions are fitted to
-_MEASURED = {"zero_shot": ("zero_shot", "fit"), "plan": ("plan",), "judge": ("judge",)}  # of a line, by measurement
-_MASTERED = {"zero_shot": "zero-shot", "fit": "after fit", "plan": "by plan", "judge": "after training"}
-_ELSE = "choose another --out, or remove the table"
-_SIMULATED = 8  # rollouts that tell how far the model is off in simulation; the real system is fitted to one
+from envs.files import read_toml
+from envs.types import UserError
+from experiments.gaps import PLAIN, check_episodes, folders_of_priors
+from experiments.runner import cli
+from experiments.runner.options import Impl, at_least_one, check_task, seed_list
+from sgft_jax.io.runs import check_folder
+from sgft_jax.presets import PRESETS, PretrainConfig
 
 
-def run(args: GapsArgs, seeds: list[int], folders: list[Path]) -> dict[str, Any]:
-    """Draws, writes and measures gaps; prints and returns the table. folders: of the priors."""
-    task = envs.name_of(args.task)
-    env = concealed(envs.make(args.task, args.impl, **observed_by(folders)))
-    found = gap_distribution.draw(env, gap_distribution.load(env, args.distribution), args.seed, args.draw)
-    path = args.out / "gaps" / task / f"seed-{args.seed}.toml"
-    write_gaps(path, found)
-    priors = load_priors(folders, env)
-    everywhere = [gaps.find(task, SIM), *found]
-    table = Table(path.with_suffix(".json"), {"task": task, "seed": args.seed}, everywhere)
-    settings = _settings(env, args, priors, seeds)
-    for what in settings:
-        table.settle(what, settings[what], again=args.overwrite)
-    if missing := [gap for gap in table.without("zero_shot", everywhere) if gap.name != SIM]:
-        table.add(_zero_shot(env, missing, priors, args.episodes))
-    if args.plan and (missing := table.without("plan", everywhere)):
-        table.add(_plan(env, missing, priors, args.episodes))
-    if args.judge and (missing := table.to_judge(found)):
-        table.add(_judge(env, args, missing, seeds, path.with_suffix("")))
-    print("\n".join(lines([gap.name for gap in everywhere], table.found["gaps"])))
-    print(f"gaps: {path}\ntable: {table.path}")
-    if args.choose and args.to:
-        _choose(args, args.to, found, table.found["gaps"])
-    return table.found
+@dataclass(frozen=True)
+class DrawArgs:
+    """One table: a line per drawn gap of a task."""
+
+    count: int
+    """How many gaps; they go to <out>/gaps/<task>/seed-<seed>.toml. Gap i of a seed is always the same."""
+    task: str = "push"
+    """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
+    distribution: Path | None = None
+    """A .toml file of families to draw from; default: the one that comes with the task."""
+    plan: bool = False
+    """Also measure what sgft-mpc does at its start, plans by the prior's models."""
+    judge: bool = False
+    """Also train policies that see their previous actions, in one program, on every gap that nothing measured so far
+    masters (90 %): a gap counts only if something does."""
+    judge_preset: str = PLAIN
+    """Pretraining preset of that training; --config.* changes it."""
+    choose: int = 0
+    """Choose so many of the measured gaps for a frozen set, evenly over strata and families. A gap that a policy
+    trained there (--judge) did not master is never chosen."""
+    to: Path | None = None
+    """With --choose: the .toml file of the frozen set; one that holds other gaps is never replaced."""
+    overwrite: bool = False
+    """Measure again what the table holds with other settings; default: refuse."""
+    prior: Path | None = None
+    """Folder of a prior, or of several (prior/seed-*); default: those of <out>/pretrain/<task>/<preset>."""
+    preset: str = PLAIN
+    """Pretraining preset of the priors."""
+    seeds: int = 1
+    """Policies trained per gap with --judge; the best one counts."""
+    episodes: int = 256
+    """Evaluation episodes per policy and gap, at least 200."""
+    out: Path = Path("runs")
+    """Parent of all run folders."""
+    seed: int = 0
+    """What is drawn; also the first seed of the training on real systems."""
+    impl: Impl = "auto"
+    config: PretrainConfig = field(default_factory=lambda: PRESETS[PLAIN])
+    """Expert: single settings of that training; the defaults are those of --judge-preset."""
 
 
-def _choose(args: GapsArgs, path: Path, found: Sequence[Gap], known: Mapping[str, Mapping[str, Any]]) -> None:
-    """Writes a frozen set of the gaps that were asked for and says what is to know of it."""
-    drawn = {gap.name: gap for gap in found}
-    lines = {name: known[name] for name in drawn}
-    names = gaps_choose.choose(lines, args.choose)
-    words = [", ".join([f"zero-shot {_success(known[name])} %", *_marks(known[name])]) for name in names]
-    chosen = [drawn[name]._replace(stratum=known[name]["stratum"]) for name in names]
-    gaps_choose.write(path, chosen, words, _command(args))
-    print("\n".join([*gaps_choose.remarks(lines, names), f"chosen: {path}"]))
+def main(argv: Sequence[str] | None = None) -> None:
+    """The command line."""
+    cli.run_main(draw, DrawArgs, __doc__ or "", argv=argv, default=_defaults)
 
 
-def _success(line: Mapping[str, Any]) -> str:
-    return f"{100 * line['zero_shot']['success']:.0f}"
+def _defaults(argv: Sequence[str]) -> DrawArgs:
+    """The defaults of the preset; `draw` refuses a preset that does not exist."""
+    judge_preset = cli.preview(argv, judge_preset=PLAIN).judge_preset
+    return DrawArgs(tyro.MISSING, judge_preset=judge_preset, config=PRESETS.get(judge_preset, PRESETS[PLAIN]))
 
 
-def _command(args: GapsArgs) -> str:
-    """What draws and chooses the same gaps, where the same priors are."""
-    own = [f"--distribution {args.distribution}"] if args.distribution else []
-    flags = [f"--{name}" for name in ("plan", "judge") if getattr(args, name)]
-    given = [f"--task {args.task} --draw {args.draw} --seed {args.seed}", *own, *flags]
-    return f"python -m experiments.gaps {' '.join(given)} --choose {args.choose} --to {args.to}"
+def draw(args: DrawArgs) -> dict[str, Any]:
+    """Draws, measures, prints a table, writes and returns it. Raises UserError for what is wrong with the options."""
+    cli.choose("--judge-preset", args.judge_preset, PRESETS)
+    at_least_one(args, "count")
+    check_episodes(args)
+    _check_choice(args)
+    if args.distribution is not None:
+        read_toml(args.distribution)
+    check_folder(args.out / "gaps")
+    seeds = seed_list(args.seed, args.seeds)
+    check_task(args.task)
+    folders = folders_of_priors(args.prior, args.out, args.task, args.preset)
+    from experiments.studies.gaps_drawn import run
+
+    return run(args, seeds, folders)
 
 
-def write_gaps(path: Path, found: Sequence[Gap]) -> None:
-    """Writes drawn gaps as one file. It only grows: raises UserError if it holds others under these names."""
-    old = list(gaps.read_file(path).values()) if path.exists() else []
-    if odd := [gap.name for gap, now in zip(old, found, strict=False) if gap != now]:
-        raise UserError(f"{path}: {odd[0]} is not what is drawn now; choose another --seed or --out")
-    if len(found) > len(old):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(f"# Drawn by python -m experiments.gaps --draw {len(found)}\n\n{gaps.to_toml(found)}")
+def _check_choice(args: DrawArgs) -> None:
+    """Raises UserError for a frozen set of more gaps than are drawn, or one that cannot be written."""
+    if not 0 <= args.choose <= args.count:
+        raise UserError(f"--choose is {args.choose}: must be from 1 to the {args.count} of --count")
+    if bool(args.choose) != bool(args.to):
+        raise UserError("--choose N and --to FILE.toml: give both, the number of gaps and where they go")
+    if args.to and args.to.suffix != ".toml":
+        raise UserError(f"--to {args.to}: must end in .toml")
+    if args.to:
+        check_folder(args.to.parent, "--to")
 
 
-def _settings(env: Env, args: GapsArgs, priors: Sequence[Prior], seeds: Sequence[int]) -> dict[str, dict[str, Any]]:
-    """What decides each of the measurements that are asked for, see `Table.settle`."""
-    played = {"impl": env.impl, "episodes": args.episodes}
-    own = {**played, "priors": [digest(prior) for prior in priors]}
-    judge = {
-        "preset": args.judge_preset,
-        "config": args.config,
-        "seeds": seeds,
-        "previous_actions": env.previous_actions or PREVIOUS_ACTIONS,
-        **played,
-    }
-    asked = {"zero_shot": own}
-    if args.plan:
-        asked["plan"] = {**own, "method": PLANNER, "options": get_method(PLANNER).config()}
-    if args.judge:
-        asked["judge"] = judge
-    return asked
-
-
-class Table:
-    """What is known of drawn gaps, on disk as soon as it is known.
-
-    found: {**of, "about": settings by measurement, "gaps": by name the gap and what was measured on it}. of: what the
-    table is of. Raises UserError for a table of something else, or of other gaps under these names.
-    """
-
-    def __init__(self, path: Path, of: Mapping[str, Any], gaps: Sequence[Gap]) -> None:
-        self.path = path
-        self.found = read_json(path) if path.exists() else {**of, "about": {}, "gaps": {}}
-        if odd := differences({name: self.found.get(name) for name in of}, dict(of)):
-            raise UserError(f"{path}: is a table of another {odd[0][0]}; {_ELSE}")
-        if not isinstance(self.found.get("about"), dict):
-            raise UserError(f"{path}: does not say how it was measured, an earlier version wrote it; {_ELSE}")
-        for gap in gaps:
-            line = self.found["gaps"].setdefault(gap.name, {"gap": jsonable(gap)})
-            if line["gap"] != jsonable(gap):
-                raise UserError(f"{path}: its {gap.name} is another gap; {_ELSE}")
-            line |= labels(line)
-
-    def settle(self, what: str, settings: Mapping[str, Any], *, again: bool) -> None:
-        """Says what decides a measurement. again: forget what other settings gave; else that raises UserError."""
-        about, now = self.found["about"], jsonable(settings)
-        if (old := about.get(what, now)) != now and not again:
-            how = f"{what.replace('_', '-')} was measured with other {differences(old, now)[0][0]}, see its 'about'"
-            raise UserError(f"{self.path}: {how}; --overwrite measures it again, another --out keeps both")
-        if old != now:
-            for line in self.found["gaps"].values():
-                for gone in _MEASURED[what]:
-                    line.pop(gone, None)
-                line |= labels(line)
-        about[what] = now
-
-    def without(self, what: str, found: Sequence[Gap]) -> list[Gap]:
-        """Those of which this is not known yet."""
-        return [gap for gap in found if what not in self.found["gaps"][gap.name]]
-
-    def to_judge(self, found: Sequence[Gap]) -> list[Gap]:
-        """Those that nothing has mastered yet and on which no policy was trained: training is the dear measurement."""
-        return [gap for gap in found if self.found["gaps"][gap.name]["admitted"] is None]
-
-    def add(self, lines: Mapping[str, Mapping[str, Any]]) -> None:
-        """Writes what has been found of gaps, by name."""
-        for name, line in lines.items():
-            self.found["gaps"][name] |= line
-            self.found["gaps"][name] |= labels(self.found["gaps"][name])
-        write_json(self.path, self.found)
-
-
-def labels(line: Mapping[str, Any]) -> dict[str, Any]:
-    """What follows from the measurements of a gap; None where they are missing.
-
-    admitted: whether something masters the gap. mastered_by: the measurement that shows it.
-    """
-    success = line["zero_shot"]["success"] if "zero_shot" in line else None
-    fit, mastered_by = line.get("fit"), _mastered_by(line)
-    stratum = None
-    if success is not None:
-        stratum = "solved" if success >= SOLVED_AT_LEAST else "failed" if success < FAILED_BELOW else "partial"
-    return {
-        "stratum": stratum,
-        "trivial": None if fit is None else fit["success"] >= TRIVIAL_AT_LEAST,
-        "admitted": True if mastered_by else False if "judge" in line else None,
-        "mastered_by": mastered_by,
-    }
-
-
-def _mastered_by(line: Mapping[str, Any]) -> str | None:
-    """The first measurement in which a gap is mastered: one policy that succeeds shows that there is a way."""
-    best = {what: max(one["success"] for one in line[what]["policies"]) for what in _MASTERED if what in line}
-    return next((what for what, success in best.items() if success >= ADMITTED_AT_LEAST), None)
-
-
-def lines(names: Sequence[str], known: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The table for people, success in per cent with 95 % intervals."""
-    rows = [("gap", "families", "zero-shot %", "plan %", "after fit %", "trained there %", "stratum", "labels")]
-    for name in names:
-        line = known[name]
-        zero, plan, fit, judge = (percent(line.get(what)) for what in ("zero_shot", "plan", "fit", "judge"))
-        families = " ".join(line["gap"]["families"]) or "none"
-        rows.append((name, families, zero, plan, fit, judge, line["stratum"], ", ".join(_marks(line))))
-    return columns(rows)
-
-
-def _marks(line: Mapping[str, Any]) -> list[str]:
-    """The labels of a gap for people."""
-    marks = ["trivial"] if line["trivial"] else []
-    if line["mastered_by"]:
-        marks.append(f"mastered {_MASTERED[line['mastered_by']]}")
-    return [*marks, "not mastered"] if line["admitted"] is False else marks
-
-
-# --- measurements -----------------------------------------------------------------------------------------------------
-
-
-def _zero_shot(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: int) -> dict[str, dict[str, Any]]:
-    """Success of the priors' policies on gaps and without one, as they are and after one rollout of identification."""
-    everywhere = [gaps.find(env.name, SIM), *found]
-    system, members = systems(env, everywhere, priors, episodes)
-    policy = make_policy(priors[0].card, env)
-    count = len(everywhere) * len(priors)
-    nothing = jax.tree.map(lambda x: jnp.broadcast_to(x, (count, *x.shape)), none(env.act_dim, env.measured_dim))
-
-    def rates(known: Distortion) -> list[dict[str, Any]]:
-        played = play(system, policy, members._replace(distortion=known), episode_key(FINAL_SEED), episodes)
-        return _rates(played, len(everywhere), len(priors))
-
-    plain = rates(nothing)
-    keys = jnp.broadcast_to(jax.random.split(episode_key(_ROLLOUT_SEED), _SIMULATED), (count, _SIMULATED))
-    explored = system.play(policy, members._replace(distortion=nothing), keys, explore=True)
-    part = command_interface(network_of(priors[0].card), env)
-    fitted = rates(jax.jit(functools.partial(_identified, part, len(priors)))(members, explored))
-    return {
-        gap.name: {"zero_shot": before, "fit": after}
-        for gap, before, after in zip(everywhere, plain, fitted, strict=True)
-    }
-
-
-def _identified(part: Interface, priors: int, members: PyTree, explored: Episode) -> Distortion:
-    """What each policy [members] finds of each system, of which the first is the simulator.
-
-    explored: [members, rollouts, T]; of real systems only the first rollout counts.
-    """
-    rows, held = explored.transitions, explored.valid
-
-    def start(params: PyTree, rows: Transition) -> Identified:
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
-        draw = lambda key, n: jax.tree.map(  # noqa: E731
-            lambda x: x[jax.random.randint(key, (n,), 0, flat.reward.shape[0])], flat
-        )
-        return part.start(params, SimulatedData(draw, jnp.zeros(1)))
-
-    sim = jax.vmap(start)(*jax.tree.map(lambda x: x[:priors], (members, rows)))
-    own = jax.tree.map(lambda x: jnp.tile(x, (len(held) // priors, *[1] * (x.ndim - 1))), sim)
-    return jax.vmap(part.refit)(own, *jax.tree.map(lambda x: x[:, 0], (rows, held))).distortion
-
-
-def _plan(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: int) -> dict[str, dict[str, Any]]:
-    """Success of what the planning method does before it has learned anything."""
-    method = get_method(PLANNER)
-    for prior in priors:
-        api.check_prior(prior, method, env)
-    policy = method.build(method.config(), priors[0], env).policy
-    system, members = systems(env, found, priors, episodes)
-    played = play(system, policy, members, episode_key(FINAL_SEED), episodes)
-    return {gap.name: {"plan": own} for gap, own in _each(found, _rates(played, len(found), len(priors)))}
-
-
-def _judge(env: Env, args: GapsArgs, found: Sequence[Gap], seeds: list[int], folder: Path) -> dict[str, dict[str, Any]]:
-    """Success of policies that were trained on the gaps themselves and see their previous actions."""
-    seen = env if env.previous_actions else with_previous_actions(env, PREVIOUS_ACTIONS)
-    played = train(env, args.config, found, seeds, folder, episodes=args.episodes, seen=seen)
-    rates = [rate(own, stats.mean) for own in played]
-    return {gap.name: {"judge": own} for gap, own in _each(found, rates)}
-
-
-def _rates(played: Episode, systems: int, policies: int) -> list[dict[str, Any]]:
-    """Mean success over policies on each system, of episodes [systems * policies, n]."""
-    return [rate(stacking.part(played, i, policies), stats.mean) for i in range(systems)]
-
-
-def _each(found: Sequence[Gap], rates: Sequence[dict[str, Any]]) -> list[tuple[Gap, dict[str, Any]]]:
-    return list(zip(found, rates, strict=True))
+if __name__ == "__main__":
+    main()

@@ -37,7 +37,7 @@ class ScoreboardArgs:
     """Gaps and methods to compare."""
 
     gaps: tuple[Path, ...]
-    """Frozen sets, as `experiments.gaps --choose` writes them."""
+    """Frozen sets, as `experiments.studies.gaps_draw` writes them."""
     reference: str = DEFAULT
     """Compare the others with METHOD or METHOD:VARIANT."""
     tasks: tuple[str, ...] = ()
@@ -137,7 +137,7 @@ def strata_of(files: tuple[Path, ...]) -> dict[str, str]:
     for file in files:
         for gap in gaps.read_file(file).values():
             if not gap.stratum:
-                raise UserError(f"{file} [{gap.name}]: has no 'stratum'; sets are written by experiments.gaps --choose")
+                raise UserError(f"{file} [{gap.name}]: has no 'stratum'; experiments.studies.gaps_draw writes sets")
             found[gap.name] = gap.stratum
     return found
 

@@ -393,7 +393,7 @@ def set_name(folder: Path, digests: Sequence[str]) -> str:
     A pretraining run lives in <preset>/<seeds>/prior: there the preset is the name.
     """
     parts = [part for part in folder.parts if not _UNNAMED.fullmatch(part)]
-    return "-".join([*parts[-1:], *(digest[:6] for digest in digests[:1])])
+    return "-".join([*(part.removeprefix("shipped:") for part in parts[-1:]), *(digest[:6] for digest in digests[:1])])
 
 
 def last_start(folder: Path) -> dict[str, Any]:

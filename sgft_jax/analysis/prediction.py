@@ -17,7 +17,7 @@ _PACES = np.linspace(0.5, 20.0, 79)
 
 
 class Coefficients(NamedTuple):
-    """What `experiments.diagnose --calibrate` fits; base, improvable and explained are never negative.
+    """What `experiments.studies.diagnose_calibrate` fits; base, improvable and explained are never negative.
 
     The share of what is missing to full success that fine-tuning gains in AHEAD rollouts is
     base + improvable * (share of improvable states) + explained * (share of the models' error that identification

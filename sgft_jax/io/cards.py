@@ -10,10 +10,12 @@ from msgspec import Meta, Struct
 
 import envs
 from envs.files import Count, checked, read_json
-from envs.types import UserError
+from envs.types import UserError, unknown
 from sgft_jax.files.folders import present
 
 CARD = "prior.json"
+SHIPPED = Path(__file__).parents[1] / "priors"  # those that come with the code, a folder for each task
+_SHIPPED_BY_NAME = "shipped:"
 _FIX = "take another prior, or pretrain again"
 _Width = Annotated[int, Meta(ge=1, le=2**20)]  # no number of units, samples or models comes near
 
@@ -90,6 +92,21 @@ class _OfTDMPC2(_Card):
 
 
 _SCHEMAS = {"sac": _OfSAC, "actor": _OfActor, "recurrent": _OfRecurrent, "tdmpc2": _OfTDMPC2}
+
+
+def resolve_shipped(folder: str | Path) -> Path:
+    """Where a prior is: `shipped:push` and `shipped:push/seed-0` lie in the package, all else is a path as it stands.
+
+    Raises UserError where the package has no such prior.
+    """
+    if not str(folder).startswith(_SHIPPED_BY_NAME):
+        return Path(folder)
+    name = str(folder).removeprefix(_SHIPPED_BY_NAME).strip("/")
+    priors = [path.parent for path in SHIPPED.glob(f"*/*/{CARD}")]
+    names = {str(path.relative_to(SHIPPED)) for prior in priors for path in (prior, prior.parent)}
+    if name not in names:
+        raise UserError(unknown("shipped prior", name, names))
+    return SHIPPED / name
 
 
 def read_card(folder: Path) -> dict[str, Any]:

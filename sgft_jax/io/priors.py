@@ -17,7 +17,7 @@ from sgft_jax.files.arrays import check_claim
 from sgft_jax.files.folders import present
 from sgft_jax.files.jsonfile import differences, write_json
 from sgft_jax.io import checkpoint
-from sgft_jax.io.cards import CARD, read_card
+from sgft_jax.io.cards import CARD, read_card, resolve_shipped
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.policies import check_parameters
 from sgft_jax.types import Normalizer, Prior
@@ -47,7 +47,7 @@ def save_prior(folder: str | Path, prior: Prior) -> Path:
 def load_prior(
     folder: str | Path, *, task: str | None = None, obs_dim: int | None = None, act_dim: int | None = None
 ) -> Prior:
-    """Read a prior from its folder, or from the run folder that holds one as `prior/`.
+    """Read a prior from its folder, from the run folder that holds one as `prior/`, or by name: `shipped:push/seed-0`.
 
     Its parameters are the `<ALGORITHM>Params` of `sgft_jax.learners.<algorithm>`, None where there are none. Raises
     UserError if the prior is missing, torn, or of another task, other sizes than asked for, or another version, or if
@@ -115,7 +115,8 @@ def load_priors(folders: Sequence[Path], env: Any) -> list[Prior]:
 
 def _home(folder: str | Path) -> Path:
     """The folder itself, or the prior inside a run folder."""
-    home, inside = present(Path(folder)), present(Path(folder) / "prior")
+    folder = resolve_shipped(folder)
+    home, inside = present(folder), present(folder / "prior")
     return inside if not (home / CARD).exists() and (inside / CARD).exists() else home
 
 

@@ -8,9 +8,9 @@ import pytest
 from envs.types import UserError
 from experiments import diagnose, evaluate, export, export_data, figures, gaps, replay
 from experiments.runner import collect_args
-from experiments.studies import bullet, scoreboard
+from experiments.studies import bullet, gaps_draw, scoreboard
 
-PRIOR = Path(__file__).parents[2] / "docs/priors/push/seed-0"
+PRIOR = Path(__file__).parents[2] / "sgft_jax/priors/push/seed-0"
 
 COMMANDS = {
     "collect": lambda run, out: collect_args.check(collect_args.CollectArgs(out=out)),
@@ -22,12 +22,12 @@ COMMANDS = {
     "figures": lambda run, out: figures.main(figures.FiguresArgs(out=out)),
     "scoreboard": lambda run, out: scoreboard.main(scoreboard.ScoreboardArgs((), out=out)),
     "gaps": lambda run, out: gaps.measure(gaps.GapsArgs(prior=PRIOR, out=out)),
-    "gaps --draw": lambda run, out: gaps.measure(gaps.GapsArgs(prior=PRIOR, draw=1, out=out)),
+    "gaps_draw": lambda run, out: gaps_draw.draw(gaps_draw.DrawArgs(1, prior=PRIOR, out=out)),
     "bullet": lambda run, out: bullet.check(bullet.BulletArgs(out=out)),
 }
 OTHER = {
     "--export": lambda run, out: figures.main(figures.FiguresArgs(export=out)),
-    "--to": lambda run, out: gaps.measure(gaps.GapsArgs(draw=1, choose=1, to=out / "set.toml", out=run)),
+    "--to": lambda run, out: gaps_draw.draw(gaps_draw.DrawArgs(1, choose=1, to=out / "set.toml", out=run)),
 }
 
 

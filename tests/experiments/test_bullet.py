@@ -10,7 +10,7 @@ from experiments.studies import bullet
 from experiments.studies.bullet import BulletArgs
 
 ROOT = Path(__file__).parents[2]
-PRIOR = ROOT / "docs/priors/panda-push"
+PRIOR = ROOT / "sgft_jax/priors/panda-push"
 
 
 @pytest.fixture
@@ -66,7 +66,7 @@ def test_evaluations_and_an_end_of_the_time(played, tmp_path):
         ({"eval_at": (500,)}, "--eval-at 500: no evaluation within --rollouts 20"),
         ({"methods": ("sac", "tdmpc2")}, "seed-0: tdmpc2 needs a prior of tdmpc2, not of sac; make one with: python"),
         ({"methods": ("sac", "sysid")}, "seed-0: sysid needs a prior that was told the system; make one with: python"),
-        ({"prior": Path("docs/priors/push")}, "seed-0: the prior is of the task 'push', not of 'panda-push'"),
+        ({"prior": Path("shipped:push")}, "seed-0: the prior is of the task 'push', not of 'panda-push'"),
         ({"prior": Path("nowhere")}, "--prior nowhere: no such folder"),
     ],
 )

@@ -372,7 +372,7 @@ def test_no_cache_when_switched_off():
 
 
 def test_a_renderer_that_mujoco_cannot_import_is_one_line():
-    words = [sys.executable, "-m", "experiments.evaluate", "--task", "hammer", "--prior", "docs/priors/hammer/seed-0"]
+    words = [sys.executable, "-m", "experiments.evaluate", "--task", "hammer", "--prior", "shipped:hammer/seed-0"]
     environment = {**os.environ, "MUJOCO_GL": "crayon"}
     done = subprocess.run(
         words, env=environment, cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=120

@@ -266,7 +266,7 @@ def test_the_log_of_an_operator_resembles_the_published_one(task, reward, tmp_pa
 
 
 def test_files_are_named_after_the_real_system(tmp_path):
-    args = collect_args.CollectArgs(task="push", out=tmp_path, policy=Path("docs/priors/push/seed-0"))
+    args = collect_args.CollectArgs(task="push", out=tmp_path, policy=Path("shipped:push/seed-0"))
     assert [path.name for path in collect_args.targets(args)] == ["push-priors-seed-0.hdf5"]
     args = dataclasses.replace(args, real="sets/hard.toml:deep")
     assert [path.name for path in collect_args.targets(args)] == ["push-deep-priors-seed-0.hdf5"]

@@ -7,6 +7,7 @@ from runs_by_hand import save
 
 from experiments import diagnose
 from experiments.runner import cli
+from experiments.studies import diagnose_calibrate
 from sgft_jax.io.real import RealStore
 
 pytestmark = pytest.mark.usefixtures("toy_task")
@@ -21,6 +22,11 @@ def priors(tmp_path):
 
 def call(*argv):
     cli.run_main(diagnose.main, diagnose.DiagnoseArgs, "Diagnose.", argv=[str(a) for a in argv])
+
+
+def calibrate(*argv):
+    main, kind = diagnose_calibrate.main, diagnose_calibrate.CalibrateArgs
+    cli.run_main(main, kind, "Calibrate.", argv=[str(a) for a in argv])
 
 
 def record(folder, *, policies=1, rollouts=4, success=(), obs_dim=4, steps=20, without=()):
@@ -98,17 +104,17 @@ def test_calibration_and_its_check_on_other_runs(priors, tmp_path, capsys):
             ("none-2", [0.9, 0.8]),
         )
     ]
-    call("--calibrate", tmp_path / "a", "--json")
+    calibrate("--runs", tmp_path / "a", "--json")
     found = json.loads(capsys.readouterr().out)
     assert sorted(found["runs"]) == sorted(map(str, runs)) and found["members"] == 4
     assert all(value >= 0 for value in found["coefficients"].values())
     # Held out, of each kind one: gains 0.2, 0.2 of half a success and 0.7, 0.7 of none: less success, more gain.
     assert found["rank_correlation"]["100 - success of the same 4 rollouts"]["estimate"] == pytest.approx(1.0)
     other = run(tmp_path / "b", "other", [[0.0, 0.0], [0.0, 0.0], [1.0, 0.5]], priors)
-    call("--calibrate", tmp_path / "a", "--check", other)
+    calibrate("--runs", tmp_path / "a", "--check", other)
     text = capsys.readouterr().out
     assert "1 other runs, predicted from 4: 2 members, 1 gaps" in text and "are +75 points" in text
-    assert "coefficients from 4 rollouts of all of --calibrate: base" in text
+    assert "coefficients from 4 rollouts of all of --runs: base" in text
 
 
 @pytest.mark.parametrize(
@@ -124,11 +130,7 @@ def test_calibration_and_its_check_on_other_runs(priors, tmp_path, capsys):
         ),
         (["--prior", "PRIOR", "--real", "torn"], "rollout-000000.npz: lacks valid"),
         (["--prior", "PRIOR", "--real", "three"], "holds rollouts of 3 policies"),
-        (["--calibrate", "EMPTY"], "holds no fine-tuning run with recorded rollouts"),
         (["--prior", "PRIOR", "--seed", "-1"], "--seed is -1: seeds go from 0 to 2147483647"),
-        (["--check", "EMPTY"], "name runs there too"),
-        (["--calibrate", "one", "--check", "one"], "is also in --calibrate"),
-        (["--calibrate", "one"], "these runs are on one gap"),
     ],
 )
 def test_a_bad_command_is_one_line_and_code_2(argv, words, priors, tmp_path, capsys, monkeypatch):
@@ -137,9 +139,28 @@ def test_a_bad_command_is_one_line_and_code_2(argv, words, priors, tmp_path, cap
     record(tmp_path / "torn", without=("valid",))
     record(tmp_path / "three", policies=3)
     (tmp_path / "empty").mkdir()
-    if "one" in argv:
-        run(tmp_path / "one", "half", [[0.1, 0.1]] * 3, priors)
     with pytest.raises(SystemExit) as stopped:
         call(*[{"PRIOR": priors, "EMPTY": tmp_path / "empty"}.get(word, word) for word in argv])
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and words in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        ([], "--runs is missing"),
+        (["--runs"], "--runs: name at least one"),
+        (["--check", "one"], "--runs is missing"),
+        (["--runs", "empty"], "holds no fine-tuning run with recorded rollouts"),
+        (["--runs", "one", "--check", "one"], "is also in --runs"),
+        (["--runs", "one"], "these runs are on one gap"),
+    ],
+)
+def test_a_bad_calibration_is_one_line_and_code_2(argv, words, priors, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    run(tmp_path / "one", "half", [[0.1, 0.1]] * 3, priors)
+    with pytest.raises(SystemExit) as stopped:
+        calibrate(*argv)
     error = capsys.readouterr().err
     assert stopped.value.code == 2 and words in error and error.count("\n") == 1

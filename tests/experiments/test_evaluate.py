@@ -118,7 +118,7 @@ def test_a_film_of_each_system(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     if reason := cli.select_renderer():
         pytest.skip(reason)
-    prior = Path(__file__).parents[2] / "docs/priors/push/seed-0"
+    prior = Path(__file__).parents[2] / "sgft_jax/priors/push/seed-0"
     call("--prior", prior, "--real", "sim", "mild", "--episodes", 2, "--impl", "c", "--video", tmp_path)
     said = capsys.readouterr().out
     for system in ("sim", "mild"):

@@ -71,6 +71,13 @@ def test_the_limits(zero_shot, trained, answer):
     assert gaps_run.admissible(zero_shot, trained) is answer
 
 
+def test_the_settings_of_the_training_are_those_of_the_preset(monkeypatch):
+    seen = []
+    monkeypatch.setattr(gaps, "measure", seen.append)
+    gaps.main(["--preset", "cpu"])
+    assert [args.config.n_envs for args in seen] == [32]
+
+
 @pytest.mark.parametrize(
     ("argv", "words"),
     [

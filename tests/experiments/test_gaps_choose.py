@@ -32,7 +32,7 @@ def test_a_stratum_with_too_few_gaps_passes_its_turn_on_and_says_so():
     lines = table(solved=1, failed=6)
     assert gaps_choose.choose(lines, 4) == ["s0", "f0", "f1", "f2"]
     assert "solved has 1 of 2, partial has 0 of 1;" in gaps_choose.remarks(lines, ["s0", "f0", "f1", "f2"])[0]
-    with pytest.raises(UserError, match="--choose 8: only 7 of the gaps may be chosen; draw more with --draw"):
+    with pytest.raises(UserError, match="--choose 8: only 7 of the gaps may be chosen; draw more with --count"):
         gaps_choose.choose(lines, 8)
 
 

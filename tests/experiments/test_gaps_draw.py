@@ -13,9 +13,9 @@ import envs
 from envs import gap_distribution, gaps
 from envs.files import read_json
 from envs.types import UserError
-from experiments import gaps as command
 from experiments.runner import cli
-from experiments.studies import gaps_draw
+from experiments.studies import gaps_draw as command
+from experiments.studies import gaps_drawn
 from sgft_jax import policies
 from sgft_jax.identify import interface
 
@@ -55,8 +55,8 @@ def home(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "environ", os.environ.copy())
     monkeypatch.setattr(cli, "set_up", lambda: None)
     by_hand = lambda card, env: policies.make_policy(card, env)._replace(act=straight)  # noqa: E731
-    monkeypatch.setattr(gaps_draw, "make_policy", by_hand)
-    monkeypatch.setattr(gaps_draw, "command_interface", exactly)
+    monkeypatch.setattr(gaps_drawn, "make_policy", by_hand)
+    monkeypatch.setattr(gaps_drawn, "command_interface", exactly)
     for seed in (0, 1):
         save_prior(tmp_path / f"pretrain/toy_steps/cpu/seeds-0-1/prior/seed-{seed}", seed, task="toy_steps")
     (tmp_path / "families.toml").write_text(TEXT)
@@ -70,7 +70,7 @@ def call(home, *more):
 
 @pytest.mark.slow
 def test_drawn_gaps_are_written_measured_and_sorted(home, capsys, monkeypatch):
-    found = call(home, "--draw", "6")["gaps"]
+    found = call(home, "--count", "6")["gaps"]
     file = home / "gaps/toy_steps/seed-5.toml"
     env = envs.make("toy_steps")
     drawn = gap_distribution.draw(env, gap_distribution.load(env, home / "families.toml"), 5, 6)
@@ -78,7 +78,7 @@ def test_drawn_gaps_are_written_measured_and_sorted(home, capsys, monkeypatch):
     assert found["sim"]["stratum"] == "solved" and found["sim"]["zero_shot"]["success"] > 0.95
     for gap in drawn:
         line = found[gap.name]
-        assert gaps_draw.jsonable(gap) == line["gap"] and len(line["zero_shot"]["policies"]) == 2
+        assert gaps_drawn.jsonable(gap) == line["gap"] and len(line["zero_shot"]["policies"]) == 2
         turned = "actuation" in gap.families  # the hand comes half the way in the time there is
         assert line["stratum"] == ("failed" if turned else "solved")
         assert line["fit"]["success"] > 0.9 and line["trivial"] is True
@@ -91,50 +91,52 @@ def test_drawn_gaps_are_written_measured_and_sorted(home, capsys, monkeypatch):
         and rows[-1] == f"table: {file.with_suffix('.json')}"
     )
 
-    measured, whole = [], gaps_draw._zero_shot
+    measured, whole = [], gaps_drawn._zero_shot
 
     def noted(env, missing, *given):
         measured.append([gap.name for gap in missing])
         return whole(env, missing, *given)
 
-    monkeypatch.setattr(gaps_draw, "_zero_shot", noted)
+    monkeypatch.setattr(gaps_drawn, "_zero_shot", noted)
     frozen = home / "frozen.toml"
     to = ["--choose", "4", "--to", str(frozen)]
-    assert call(home, "--draw", "4")["gaps"] == call(home, "--draw", "6", *to)["gaps"] == found and measured == []
+    assert call(home, "--count", "4")["gaps"] == call(home, "--count", "6", *to)["gaps"] == found and measured == []
     chosen = gaps.read_file(frozen)
     assert list(chosen.values()) == [
         gap._replace(stratum=found[gap.name]["stratum"]) for gap in drawn if gap.name in chosen
     ]
     head, *text = frozen.read_text().splitlines()
-    assert head.startswith("# Chosen by python -m experiments.gaps --task toy_steps --draw 6 --seed 5 --distribution ")
+    assert head.startswith(
+        "# Chosen by python -m experiments.studies.gaps_draw --task toy_steps --count 6 --seed 5 --distribution "
+    )
     comments = [line for line in text if line.startswith("# ")]
     assert len(comments) == 4 and re.fullmatch(r"# zero-shot \d+ %, trivial, mastered after fit", comments[0])
     few, last = capsys.readouterr().out.splitlines()[-2:]
     assert few.startswith("too few gaps: ") and "partial has 0 of 1;" in few and last == f"chosen: {frozen}"
     with pytest.raises(SystemExit):
-        call(home, "--draw", "6", "--choose", "3", "--to", str(frozen))
+        call(home, "--count", "6", "--choose", "3", "--to", str(frozen))
     assert "frozen.toml: holds other gaps; a frozen set is never replaced" in capsys.readouterr().err
-    more = call(home, "--draw", "7")["gaps"]
+    more = call(home, "--count", "7")["gaps"]
     assert measured == [["toy_steps-5-06"]] and len(gaps.read_file(file)) == 7
     assert {name: more[name] for name in found} == found
 
     save_prior(home / "other/seed-3", 3, task="toy_steps")
     with pytest.raises(SystemExit):
-        call(home, "--draw", "4", "--prior", str(home / "other"))
+        call(home, "--count", "4", "--prior", str(home / "other"))
     assert "seed-5.json: zero-shot was measured with other priors, see its 'about'; --over" in capsys.readouterr().err
     (home / "families.toml").write_text(TEXT.replace("1.4", "1.5").replace("0.1", "0.2"))
     with pytest.raises(SystemExit):
-        call(home, "--draw", "4")
+        call(home, "--count", "4")
     assert "toy_steps-5-00 is not what is drawn now" in capsys.readouterr().err
     file.unlink()
     with pytest.raises(SystemExit):
-        call(home, "--draw", "4")
+        call(home, "--count", "4")
     assert "seed-5.json: its toy_steps-5-00 is another gap; choose another --out" in capsys.readouterr().err
 
 
 @pytest.mark.slow
 def test_policies_are_trained_where_nothing_else_masters_the_gap(home, monkeypatch, capsys):
-    monkeypatch.setattr(gaps_draw, "command_interface", blindly)
+    monkeypatch.setattr(gaps_drawn, "command_interface", blindly)
     trained = []
 
     def judge(env, args, found, seeds, folder):
@@ -142,9 +144,9 @@ def test_policies_are_trained_where_nothing_else_masters_the_gap(home, monkeypat
         reached = zip(trained[-1], [0.95, *[0.5] * (len(found) - 1)], strict=True)
         return {n: {"judge": {"success": s, "interval": [s, s], "policies": [{"success": s}]}} for n, s in reached}
 
-    monkeypatch.setattr(gaps_draw, "_judge", judge)
+    monkeypatch.setattr(gaps_drawn, "_judge", judge)
     (home / "families.toml").write_text(TEXT.replace("1.2", "0.0"))  # some are turned too little to matter
-    found = call(home, "--draw", "6", "--judge")["gaps"]
+    found = call(home, "--count", "6", "--judge")["gaps"]
     del found["sim"]
     hard = [name for name, line in found.items() if line["zero_shot"]["success"] < 0.9]
     assert trained == [hard] and 1 < len(hard) < 6
@@ -155,29 +157,29 @@ def test_policies_are_trained_where_nothing_else_masters_the_gap(home, monkeypat
     assert {*rows} >= {"mastered after training", "not mastered"} and "judge" not in found[
         (set(found) - set(hard)).pop()
     ]
-    call(home, "--draw", "6", "--judge")
+    call(home, "--count", "6", "--judge")
     assert len(trained) == 1
 
 
 @pytest.mark.slow
 def test_the_plan_and_the_judge_are_measured_where_they_are_missing(home, monkeypatch, capsys):
-    seen, train = [], gaps_draw.train
+    seen, train = [], gaps_drawn.train
 
     def noted(env, config, found, *given, **more):
         seen.append((more["seen"].obs_dim, config.batch_size, [gap.name for gap in found]))
         return train(env, config, found, *given, **more)
 
-    monkeypatch.setattr(gaps_draw, "train", noted)
-    monkeypatch.setattr(gaps_draw, "command_interface", blindly)
-    call(home, "--draw", "1")
-    found = call(home, "--draw", "2", "--plan", "--judge", "--judge-preset", "cpu", "--seeds", "2")["gaps"]
+    monkeypatch.setattr(gaps_drawn, "train", noted)
+    monkeypatch.setattr(gaps_drawn, "command_interface", blindly)
+    call(home, "--count", "1")
+    found = call(home, "--count", "2", "--plan", "--judge", "--judge-preset", "cpu", "--seeds", "2")["gaps"]
     assert seen == [(8, 16, ["toy_steps-5-00", "toy_steps-5-01"])]
     assert all(0 <= line["plan"]["success"] <= 1 for line in found.values()) and "judge" not in found["sim"]
     for name in seen[0][2]:
         assert (
             len(found[name]["judge"]["policies"]) == 2 and found[name]["admitted"] is False
         )  # one update teaches nothing
-    same = ["--draw", "2", "--plan", "--judge", "--judge-preset", "cpu", "--seeds"]
+    same = ["--count", "2", "--plan", "--judge", "--judge-preset", "cpu", "--seeds"]
     assert call(home, *same, "2")["gaps"] == found and len(seen) == 1
     with pytest.raises(SystemExit):
         call(home, *same, "1")
@@ -193,38 +195,36 @@ def test_the_plan_and_the_judge_are_measured_where_they_are_missing(home, monkey
     ("success", "stratum"), [(1.0, "solved"), (0.8, "solved"), (0.79, "partial"), (0.2, "partial"), (0.19, "failed")]
 )
 def test_strata(success, stratum):
-    assert gaps_draw.labels({"zero_shot": rate(success)})["stratum"] == stratum
+    assert gaps_drawn.labels({"zero_shot": rate(success)})["stratum"] == stratum
 
 
 def test_labels_say_what_is_known():
     some, most = rate(0.8, 0.88), rate(0.8, 0.9)
-    assert gaps_draw.labels({}) == {"stratum": None, "trivial": None, "admitted": None, "mastered_by": None}
-    known = gaps_draw.labels({"zero_shot": some, "fit": some})
+    assert gaps_drawn.labels({}) == {"stratum": None, "trivial": None, "admitted": None, "mastered_by": None}
+    known = gaps_drawn.labels({"zero_shot": some, "fit": some})
     assert known == {"stratum": "solved", "trivial": False, "admitted": None, "mastered_by": None}
-    judged = gaps_draw.labels({"zero_shot": some, "fit": some, "judge": most})
+    judged = gaps_drawn.labels({"zero_shot": some, "fit": some, "judge": most})
     assert judged == {**known, "admitted": True, "mastered_by": "judge"}  # the best policy counts
 
 
 @pytest.mark.parametrize("what", ["zero_shot", "fit", "plan"])
 def test_any_measurement_may_show_that_a_gap_can_be_mastered(what):
     line = {"judge": rate(0.5), "zero_shot": rate(0.1), "fit": rate(0.0, 0.89)}
-    assert gaps_draw.labels(line)["admitted"] is False and gaps_draw.labels(line)["mastered_by"] is None
-    found = gaps_draw.labels({**line, what: rate(0.2, 0.9)})
+    assert gaps_drawn.labels(line)["admitted"] is False and gaps_drawn.labels(line)["mastered_by"] is None
+    found = gaps_drawn.labels({**line, what: rate(0.2, 0.9)})
     assert found["admitted"] is True and found["mastered_by"] == what
 
 
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (["--draw", "-1"], "--draw is -1: must be at least 0"),
-        (["--draw", "2", "--presets", "mild"], "--presets mild: names gaps, and --draw draws them"),
-        (["--judge"], "--judge: is for drawn gaps"),
-        (["--choose", "2"], "--choose: is for drawn gaps"),
-        (["--draw", "2", "--choose", "3", "--to", "f.toml"], "--choose is 3: must be from 1 to the 2 of --draw"),
-        (["--draw", "2", "--choose", "1"], "--choose N and --to FILE.toml: give both"),
-        (["--draw", "2", "--choose", "1", "--to", "f.json"], "--to f.json: must end in .toml"),
-        (["--draw", "2", "--judge-preset", "fats"], "--judge-preset: there is no 'fats', did you mean 'fast'?"),
-        (["--draw", "2"], "toy_steps comes with no distribution of gaps; name a file of one"),
+        (["--count", "0"], "--count is 0: must be at least 1"),
+        (["--judge"], "--count is missing"),
+        (["--count", "2", "--choose", "3", "--to", "f.toml"], "--choose is 3: must be from 1 to the 2 of --count"),
+        (["--count", "2", "--choose", "1"], "--choose N and --to FILE.toml: give both"),
+        (["--count", "2", "--choose", "1", "--to", "f.json"], "--to f.json: must end in .toml"),
+        (["--count", "2", "--judge-preset", "fats"], "--judge-preset: there is no 'fats', did you mean 'fast'?"),
+        (["--count", "2"], "toy_steps comes with no distribution of gaps; name a file of one"),
     ],
 )
 def test_a_bad_command_is_one_line_and_code_2(home, more, words, capsys):
@@ -237,10 +237,9 @@ def test_a_bad_command_is_one_line_and_code_2(home, more, words, capsys):
 
 def test_the_settings_of_the_training_are_those_of_the_preset_that_trains(monkeypatch):
     seen = []
-    monkeypatch.setattr(command, "measure", seen.append)
-    command.main(["--draw", "2", "--preset", "cpu", "--judge-preset", "paper"])
-    command.main(["--preset", "cpu"])
-    assert [args.config.n_envs for args in seen] == [64, 32]
+    monkeypatch.setattr(command, "draw", seen.append)
+    command.main(["--count", "2", "--preset", "cpu", "--judge-preset", "paper"])
+    assert [args.config.n_envs for args in seen] == [64]
 
 
 GAPS = [gaps.Gap(name, {}, {}) for name in ("a", "b")]
@@ -253,7 +252,7 @@ def rate(*successes):
 
 def begun(path):
     """A table of two gaps, judged and not."""
-    table = gaps_draw.Table(path, {"task": "toy"}, GAPS)
+    table = gaps_drawn.Table(path, {"task": "toy"}, GAPS)
     table.settle("zero_shot", {"episodes": 200}, again=False)
     table.settle("judge", {"config": {"rate": 0.1}, "seeds": [0]}, again=False)
     some, most = rate(0.85), rate(0.95)
@@ -265,17 +264,17 @@ def test_a_table_is_only_continued_as_it_was_begun(tmp_path):
     path = tmp_path / "t.json"
     begun(path)
     assert read_json(path)["gaps"]["a"]["mastered_by"] == "judge"
-    table = gaps_draw.Table(path, {"task": "toy"}, GAPS)
+    table = gaps_drawn.Table(path, {"task": "toy"}, GAPS)
     table.settle("zero_shot", {"episodes": 200}, again=False)
     with pytest.raises(UserError, match=r"t.json: judge was measured with other config.rate, see its 'about'; --over"):
         table.settle("judge", {"config": {"rate": 0.2}, "seeds": [0]}, again=False)
     with pytest.raises(UserError, match="is a table of another task"):
-        gaps_draw.Table(path, {"task": "push"}, GAPS)
+        gaps_drawn.Table(path, {"task": "push"}, GAPS)
     with pytest.raises(UserError, match="its b is another gap"):
-        gaps_draw.Table(path, {"task": "toy"}, [GAPS[0], GAPS[1]._replace(effects={"latency": 0.1})])
+        gaps_drawn.Table(path, {"task": "toy"}, [GAPS[0], GAPS[1]._replace(effects={"latency": 0.1})])
     (tmp_path / "old.json").write_text('{"task": "toy", "gaps": {}}')
     with pytest.raises(UserError, match=r"old.json: does not say how it was measured"):
-        gaps_draw.Table(tmp_path / "old.json", {"task": "toy"}, GAPS)
+        gaps_drawn.Table(tmp_path / "old.json", {"task": "toy"}, GAPS)
 
 
 def test_other_settings_of_the_judge_forget_what_it_said_and_nothing_else(tmp_path):

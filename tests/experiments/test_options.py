@@ -1,5 +1,6 @@
 """What commands share: seeds, where priors are, trees over seeds, and whether a run fits into memory."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -9,6 +10,7 @@ from envs.types import UserError
 from experiments.runner import memory, options
 from experiments.runner.memory import reserve
 from experiments.runner.options import prior_folders, seed_list, seeds_name
+from sgft_jax.io.cards import resolve_shipped
 
 
 def test_names_of_seeds():
@@ -65,11 +67,22 @@ def test_priors_are_found_in_order(tmp_path):
     assert [len(find(home / p)) for p in ("", "a", "a/prior", "a/prior/seed-9")] == [3, 2, 2, 1]
 
 
+def test_shipped_priors_have_names(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (folder,) = prior_folders(Path("shipped:push"), out=tmp_path, task="push", preset="robust")
+    assert folder == resolve_shipped("shipped:push/seed-0") and (folder / "prior.json").is_file()
+    assert resolve_shipped("push") == Path("push")
+    with pytest.raises(UserError, match="shipped prior: there is no 'psh', did you mean 'push'"):
+        resolve_shipped("shipped:psh")
+    with pytest.raises(UserError, match=r"shipped prior: there is no '\.\./x'"):
+        resolve_shipped("shipped:../x")
+
+
 def test_advice_where_there_is_no_prior_fits_what_was_asked(tmp_path):
     """Of a task that is a file it repeats the file; where the user names a folder it proposes no task."""
     with pytest.raises(UserError, match=r"toy/cpu: holds no prior; make one with: .*--task my/toy.py --preset cpu"):
         prior_folders(None, out=tmp_path, task="my/toy.py", preset="cpu")
-    with pytest.raises(UserError, match=r"--task push --preset robust, or take --prior docs/priors/push"):
+    with pytest.raises(UserError, match=r"--task push --preset robust, or take --prior shipped:push, which"):
         prior_folders(None, out=tmp_path, task="push", preset="robust")
     with pytest.raises(UserError, match=r"--preset: there is no 'cpus', did you mean 'cpu'"):
         prior_folders(None, out=tmp_path, task="toy", preset="cpus")

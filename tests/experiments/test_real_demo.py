@@ -15,7 +15,7 @@ from experiments.real_demo import RealDemoArgs
 from experiments.runner import panda_gym
 
 ROOT = Path(__file__).parents[2]
-PRIOR = ROOT / "docs/priors/panda-push/seed-0"  # it is only looked for
+PRIOR = ROOT / "sgft_jax/priors/panda-push/seed-0"  # it is only looked for
 BULLET = os.environ.get("SGFT_BULLET_PYTHON", str(ROOT / "build/panda-gym/bin/python"))
 
 

@@ -43,14 +43,14 @@ def test_copies_are_loaded_like_their_originals(tmp_path, capsys):
 
 
 def test_the_priors_that_come_with_the_code_are_small_and_whole():
-    folders = sorted((ROOT / "docs/priors").glob("*/seed-*"))
+    folders = sorted((ROOT / "sgft_jax/priors").glob("*/seed-*"))
     found = {folder.parent.name: load_prior(folder, task=folder.parent.name).card["preset"] for folder in folders}
     assert found == {"hammer": "robust", "insert": "robust", "panda-push": "cpu", "push": "robust"}
-    assert sum(file.stat().st_size for file in (ROOT / "docs/priors").rglob("*") if file.is_file()) < 5e6
+    assert sum(file.stat().st_size for file in (ROOT / "sgft_jax/priors").rglob("*") if file.is_file()) < 5e6
 
 
 def test_no_file_of_a_prior_names_a_folder_of_the_machine(tmp_path):
     save_prior(tmp_path / "prior/seed-0", 0)
     for file in [path for path in (tmp_path / "prior").rglob("*") if path.is_file()]:
         assert str(tmp_path).encode() not in file.read_bytes(), file
-    assert not list((ROOT / "docs/priors").rglob("commit_success.txt"))  # Orbax's mark, which does
+    assert not list((ROOT / "sgft_jax/priors").rglob("commit_success.txt"))  # Orbax's mark, which does

@@ -1,14 +1,12 @@
 """The short way in from Python."""
 
-from pathlib import Path
-
 import pytest
 
 import envs
 import sgft_jax
 from envs.types import UserError
 
-SHIPPED = Path(__file__).parents[2] / "docs/priors/hammer/seed-0"
+SHIPPED = "shipped:hammer/seed-0"
 
 
 def test_a_prior_says_how_its_task_is_made():

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.runner.options import SHIPPED
+from sgft_jax.io.cards import SHIPPED
 
 ROOT = Path(__file__).parents[3]
 OBS, ACT, STEPS = 4, 2, 3  # of push, as it is measured
@@ -15,9 +15,9 @@ OBS, ACT, STEPS = 4, 2, 3  # of push, as it is measured
 
 def make(home: Path) -> None:
     """Priors, a run with rollouts, files of gaps, tasks and methods, and things that are none of these."""
-    shutil.copytree(ROOT / SHIPPED / "push/seed-0", home / "prior")
+    shutil.copytree(SHIPPED / "push/seed-0", home / "prior")
     for task in ("hammer", "panda-push"):
-        shutil.copytree(ROOT / SHIPPED / f"{task}/seed-0", home / f"prior-{task}")
+        shutil.copytree(SHIPPED / f"{task}/seed-0", home / f"prior-{task}")
     for name in ("own_task.py", "own_method.py"):
         shutil.copy(ROOT / "docs/examples" / name, home)
     (home / "empty").mkdir()

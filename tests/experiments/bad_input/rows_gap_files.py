@@ -98,5 +98,6 @@ ROWS = [
 ]
 
 HEAVY = [
-    ("gaps --prior prior --draw 3 --distribution d.toml", words, {"d.toml": text}) for text, words in _DISTRIBUTIONS
+    ("studies.gaps_draw --prior prior --count 3 --distribution d.toml", words, {"d.toml": text})
+    for text, words in _DISTRIBUTIONS
 ]

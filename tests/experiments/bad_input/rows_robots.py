@@ -25,7 +25,7 @@ ROWS = [
     ("collect --out file", "file is a file"),
     ("collect --out loop", "loop is a link that leads nowhere"),
     ("collect --out " + 300 * "x", "file name too long"),
-    ("studies.bullet --methods nope", "--prior docs/priors/panda-push: no such folder"),
+    ("studies.bullet --methods nope", "method: there is no 'nope'"),
     ("studies.bullet --methods", "--methods: name at least one"),
     ("studies.bullet --methods sac sac", "--methods names sac twice"),
     (

@@ -156,7 +156,7 @@ def test_a_set_of_priors_is_named_like_its_preset(folder):
 
 
 def test_a_set_of_priors_without_a_folder_or_a_digest():
-    assert set_name(Path("docs/priors/push"), []) == "push" and set_name(Path(), ["aaaaaaaaaaaa"]) == "aaaaaa"
+    assert set_name(Path("shipped:push"), []) == "push" and set_name(Path(), ["aaaaaaaaaaaa"]) == "aaaaaa"
 
 
 def test_a_run_folder(tmp_path):

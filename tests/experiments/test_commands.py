@@ -1,0 +1,30 @@
+"""The list of commands, and running one by its name."""
+
+import pytest
+
+from experiments import __main__ as commands
+
+
+def test_the_list_names_every_command_in_a_line(capsys):
+    commands.main([])
+    listed = capsys.readouterr().out
+    commands.main(["--help"])
+    assert capsys.readouterr().out == listed
+    rows = [line.split(maxsplit=1) for line in listed.splitlines()[2:]]
+    assert {"pretrain", "finetune", "gaps"} <= {name for name, _ in rows} and all(words for _, words in rows)
+    assert not {"__main__", "collect_operator", "studies"} & {name for name, _ in rows}
+
+
+def test_a_command_that_does_not_exist_is_one_line_and_code_2(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        commands.main(["pretrian"])
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and "there is no 'pretrian', did you mean 'pretrain'?" in error
+    assert error.count("\n") == 1
+
+
+def test_a_command_gets_the_words_that_follow(capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["sgft"])
+    with pytest.raises(SystemExit) as stopped:
+        commands.main(["tasks", "nope"])
+    assert stopped.value.code == 2 and "task: there is no 'nope'" in capsys.readouterr().err
