@@ -86,7 +86,8 @@ def targets(args: CollectArgs) -> list[Path]:
         name = f"{extend.name_of(args.task)}-{title(args.real)}-operator"
         return [args.out / f"{name}-seed-{seed}.txt" for seed in seed_list(args.seed, args.seeds)]
     if args.policy is not None:
-        words = (_system_name(args), args.policy.parent.parent.name, args.policy.name)
+        policy = resolve_shipped(args.policy)
+        words = (_system_name(args), policy.parent.parent.name, policy.name)
         return [args.out / f"{'-'.join(filter(None, words))}.hdf5"]
     seeds = seed_list(args.seed, args.seeds)
     return [args.out / f"{name_of(args, kind, seed)}.hdf5" for seed in seeds for kind in PAIR]
