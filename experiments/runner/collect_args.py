@@ -8,6 +8,7 @@ from envs import extend
 from envs.gaps import SIM, title
 from envs.types import UserError
 from experiments.runner.options import Impl, at_least_one, check_task, seed_list, task_of_priors
+from sgft_jax.io.cards import resolve_shipped
 from sgft_jax.io.runs import check_folder
 
 LEVELS = {"halfcheetah": 4770.0, "walker2d": 2850.0}  # mean returns of D4RL's medium sets, v2
@@ -77,7 +78,8 @@ def targets(args: CollectArgs) -> list[Path]:
         name = f"{extend.name_of(args.task)}-{title(args.real)}-operator"
         return [args.out / f"{name}-seed-{seed}.txt" for seed in seed_list(args.seed, args.seeds)]
     if args.policy is not None:
-        words = (_system_name(args), args.policy.parent.parent.name, args.policy.name)
+        policy = resolve_shipped(args.policy)
+        words = (_system_name(args), policy.parent.parent.name, policy.name)
         return [args.out / f"{'-'.join(filter(None, words))}.hdf5"]
     seeds = seed_list(args.seed, args.seeds)
     return [args.out / f"{name_of(args, kind, seed)}.hdf5" for seed in seeds for kind in PAIR]

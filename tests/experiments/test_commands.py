@@ -1,5 +1,7 @@
 """The list of commands, and running one by its name."""
 
+import sys
+
 import pytest
 
 from experiments import __main__ as commands
@@ -25,6 +27,7 @@ def test_a_command_that_does_not_exist_is_one_line_and_code_2(capsys):
 
 def test_a_command_gets_the_words_that_follow(capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["sgft"])
+    monkeypatch.delitem(sys.modules, "experiments.tasks", raising=False)  # of another test
     with pytest.raises(SystemExit) as stopped:
         commands.main(["tasks", "nope"])
     assert stopped.value.code == 2 and "task: there is no 'nope'" in capsys.readouterr().err
