@@ -16,7 +16,7 @@ PACKAGES = ("envs", "sgft_jax", "experiments")
 FINETUNE = """finetune --task push --prior shipped:push --method sac --real default --seeds 1 --rollouts 2 --no-video
     --eval-every 2 --eval-episodes 2 --options.utd 0.02 --options.batch-size 16 --out runs"""
 
-pytestmark = pytest.mark.slow  # .ci/run runs it
+pytestmark = pytest.mark.slow  # .ci/run runs all but the last
 
 
 @pytest.fixture(scope="module")

@@ -66,7 +66,7 @@ def main() -> None:
         reward=lambda obs, action, next_obs: -jnp.abs(next_obs[0]),
         terminated=lambda obs, action, next_obs: jnp.bool_(False),
     )  # fmt: skip
-    tuner = METHOD.build(Config(batch_size=16, replay_capacity=64), prior, line)
+    tuner = METHOD.online.build(Config(batch_size=16, replay_capacity=64), prior, line)
     obs, action = jax.random.uniform(jax.random.key(1), (2, 32, 1), minval=-1)
     next_obs = obs + 0.1 * action
     rows = sgft_jax.Transition(obs, action, -jnp.abs(next_obs[:, 0]), jnp.full(32, 0.9), next_obs)

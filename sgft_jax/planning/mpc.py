@@ -6,13 +6,13 @@ observations: an ensemble of models, the task's reward, V_sim, and a policy that
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 
 from envs.types import Array, Key, PyTree
 from sgft_jax import checks
-from sgft_jax.learners.sac import SACParams
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.networks import (
     NetworkConfig,
@@ -24,6 +24,7 @@ from sgft_jax.models.networks import (
 )
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.planning import mppi
+from sgft_jax.types import Normalizer
 
 _ITERATIONS = 3  # of the search: half of TD-MPC2's, for plans a quarter as long
 _PROPOSALS, _ELITES = 4, 8  # one of so many samples is the policy's, and an elite
@@ -51,6 +52,30 @@ class MPCConfig:
         checks.at_least(self, _ELITES, "samples")
 
 
+class PlanningParams(Protocol):
+    """What a plan reads of a prior's parameters, see `SACParams`: dynamics [members, ...], the rest of one network."""
+
+    @property
+    def actor(self) -> PyTree:
+        """Of the policy that proposes."""
+        ...
+
+    @property
+    def value(self) -> PyTree:
+        """Of V_sim."""
+        ...
+
+    @property
+    def dynamics(self) -> PyTree:
+        """Of the ensemble."""
+        ...
+
+    @property
+    def normalizer(self) -> Normalizer:
+        """Statistics of the observations."""
+        ...
+
+
 def init_carry(config: MPCConfig) -> Array:
     """The plan [H, act_dim] of a step that never was, for the first step of an episode."""
     return jnp.zeros((config.horizon, config.act_dim))
@@ -73,7 +98,7 @@ def make_act(
     model = make_dynamics(config.obs_dim, config.act_dim, config.network)
     search = mppi.MPPIConfig(config.samples, config.samples // _ELITES, _ITERATIONS)
 
-    def score(params: SACParams, obs: Array, sequence: Array) -> Array:
+    def score(params: PlanningParams, obs: Array, sequence: Array) -> Array:
         members = jax.tree.leaves(params.dynamics)[0].shape[0]
 
         def step(carry: tuple[Array, Array, Array], action: Array) -> tuple[tuple[Array, Array, Array], None]:
@@ -88,7 +113,7 @@ def make_act(
         left = jax.vmap(lambda obs: value.predict(value_net, params.value, params.normalizer, obs))(end)
         return jnp.mean(total + discount * left)
 
-    def propose(params: SACParams, member: PyTree, obs: Array, key: Key) -> Array:
+    def propose(params: PlanningParams, member: PyTree, obs: Array, key: Key) -> Array:
         """[H, act_dim]: the policy with noise, followed by one member of the ensemble."""
 
         def step(obs: Array, key: Key) -> tuple[Array, Array]:
@@ -100,7 +125,9 @@ def make_act(
 
         return jax.lax.scan(step, obs, jax.random.split(key, config.horizon))[1]
 
-    def act(params: SACParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
+    def act(
+        params: PlanningParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
+    ) -> tuple[Array, PyTree]:
         key_member, key_propose, key_search = jax.random.split(key, 3)
         member = dynamics.draw_member(params.dynamics, key_member)
         keys = jax.random.split(key_propose, config.samples // _PROPOSALS)

@@ -88,7 +88,7 @@ def test_exploring_differs_and_the_best_action_follows_from_the_key(name, key):
     assert equal(best, again) and not jnp.allclose(best, explored, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", [*METHODS, *VARIANTS])
+@each_method
 def test_no_key_is_used_twice(name):
     """In beginning, acting, learning and the offline phase."""
     case = case_of(name)

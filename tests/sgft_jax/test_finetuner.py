@@ -179,7 +179,7 @@ NO_PRIOR = [name for name, method in METHODS.items() if not method.needs_prior]
 @pytest.mark.parametrize("name", tuners.slow_but({"sac"}, NO_PRIOR))
 def test_methods_that_need_no_prior_start_without_one(name, monkeypatch):
     """With networks of their own; made small here."""
-    from sgft_jax.methods import options
+    from sgft_jax.train import options
 
     small = {"hidden": [8], "layer_norm": False, "actor_layer_norm": False, "activation": "relu"}
     monkeypatch.setitem(options._WITHOUT_PRIOR, "network", small)
