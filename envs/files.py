@@ -37,6 +37,11 @@ _WORDS = {
 
 def read_text(path: Path | str, *, limit: int = LIMIT) -> str:
     """The text of a plain file, without a byte order mark. limit: bytes; a larger file is refused."""
+    return decoded(read_bytes(path, limit=limit), path)
+
+
+def read_bytes(path: Path | str, *, limit: int = LIMIT) -> bytes:
+    """The content of a plain file. limit: bytes; a larger file is refused."""
     try:
         with open(path, "rb", opener=_without_waiting) as file:
             if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
@@ -50,6 +55,11 @@ def read_text(path: Path | str, *, limit: int = LIMIT) -> str:
         raise UserError(f"{str(path)!r}: is no name of a file") from None
     if len(content) > limit:
         raise UserError(f"{path}: is larger than {limit:,} bytes, more than such a file can need")
+    return content
+
+
+def decoded(content: bytes, path: Path | str) -> str:
+    """UTF-8 text without a byte order mark; `path` names it in errors."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:

@@ -277,6 +277,7 @@ def released(args: CompareHybridArgs, folder: Path) -> "Results":
     """What the table in a folder holds of these runs; raises UserError if that is nothing, or if it lacks a seed."""
     from sgft_jax.analysis.hybrid import EVERY, Results
     from sgft_jax.analysis.hybrid_table import TABLE, read
+    from sgft_jax.files.csvfile import table_file
 
     wanted, columns = seed_list(args.seed, args.seeds), _columns(args)
     data, systems, methods = columns
@@ -289,7 +290,7 @@ def released(args: CompareHybridArgs, folder: Path) -> "Results":
         and run.outcome.data in (*data, EVERY)
         and run.outcome.gap in (*systems, EVERY)
     ]
-    path = folder / TABLE
+    path = table_file(folder, TABLE)
     if not found:
         raise UserError(f"{path}: has none of these runs, {own[3]:,} updates of {own[0]} with schedule {own[2]}")
     for run in found:

@@ -18,7 +18,7 @@ from msgspec import Meta
 from envs import extend
 from envs.files import Count
 from envs.types import UserError
-from sgft_jax.files.csvfile import finite, read_csv, whole
+from sgft_jax.files.csvfile import finite, read_csv, table_file, whole
 from sgft_jax.io.log import EVAL, METRICS, SUMMARY, check_records, read_jsonl
 from sgft_jax.io.runs import read_config, read_own, read_starts
 from sgft_jax.math.stats import ENOUGH, Interval, bootstrap_interval, mean, paired_improvement
@@ -508,8 +508,9 @@ def _prior(cell: Any) -> int:
 
 
 def read_data(folder: Path) -> Found:
-    """The curves of released tables, `curves-*.csv`; raises UserError if there is none, or if one is damaged."""
-    files = sorted(folder.glob("curves-*.csv"))
+    """The curves of released tables, `curves-*.csv.gz` or `.csv`; raises UserError for none, or a damaged one."""
+    names = sorted({path.name.partition(".csv")[0] for path in folder.glob("curves-*.csv*")})
+    files = [table_file(folder, name) for name in names]
     if not files:
         raise UserError(f"{folder}: holds no curves-*.csv; write some from runs with: "
                         f"python -m experiments.figures --export {folder}")  # fmt: skip

@@ -1,8 +1,8 @@
 """Impure: what runs on real data and a simulator scored, as a table that can be committed and read back.
 
-hybrid.csv has a row for each evaluation of each run: what was run (`IDENTITY`), the commit, what was measured (`score`:
-success or return), the updates before the evaluation (`step`), and a column with the number of each seed. What else the
-task is judged by has rows of its own.
+hybrid.csv.gz has a row for each evaluation of each run: what was run (`IDENTITY`), the commit, what was measured
+(`score`: success or return), the updates before the evaluation (`step`), and a column with the number of each seed.
+What else the task is judged by has rows of its own.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -13,9 +13,9 @@ from envs.types import UserError
 from sgft_jax.analysis.curves import SCORES
 from sgft_jax.analysis.hybrid import Outcome, outcome
 from sgft_jax.analysis.release import merge
-from sgft_jax.files.csvfile import finite, read_csv, whole
+from sgft_jax.files.csvfile import finite, read_csv, table_file, whole
 
-TABLE = "hybrid.csv"
+TABLE = "hybrid"
 IDENTITY = ("task", "real", "data", "gap", "method", "schedule", "updates")
 _NEEDED = (*IDENTITY, "commit", "score", "step")
 _SEED = "seed-"
@@ -40,15 +40,16 @@ class Run(NamedTuple):
 def write(to: Path, runs: Iterable[Run]) -> Path | None:
     """Writes runs into hybrid.csv in the folder `to`, in place of rows of the same runs; None if there is no run."""
     to.mkdir(parents=True, exist_ok=True)
-    return merge(to / TABLE, [row for run in runs for row in _rows(run)], IDENTITY)
+    return merge(table_file(to, TABLE), [row for run in runs for row in _rows(run)], IDENTITY)
 
 
 def read(folder: Path) -> list[Run]:
     """The runs in hybrid.csv. Raises UserError if there is no such table, or if a cell of it cannot be read."""
-    path = folder / TABLE
+    path = table_file(folder, TABLE)
     if not path.exists():
         raise UserError(
-            f"{path}: no such table; write one with: python -m experiments.compare_hybrid --export {folder}"
+            f"{folder / TABLE}.csv: no such table; "
+            f"write one with: python -m experiments.compare_hybrid --export {folder}"
         )
     runs: dict[tuple[str, ...], list[Mapping[str, str]]] = {}
     for row in read_csv(path, needed=_NEEDED):

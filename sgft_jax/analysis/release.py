@@ -1,13 +1,12 @@
 """Impure: writes what runs say as CSV tables that can be committed, opened in a spreadsheet, and read back.
 
-curves-<task>.csv   a row for each evaluation of each seed (`curves.COLUMNS`)
-runs.csv            a row for each of these runs: commit, hardware, options
-pretraining.csv     a row for each evaluation of each prior while it was trained
-priors.csv          a row for each prior: final evaluation, V_sim, commit, hardware, options
-tuning.csv          a row for each trial of tuning; trials.csv: the curves of the trials
+curves-<task>.csv.gz   a row for each evaluation of each seed (`curves.COLUMNS`)
+runs.csv.gz            a row for each of these runs: commit, hardware, options
+pretraining.csv.gz     a row for each evaluation of each prior while it was trained
+priors.csv.gz          a row for each prior: final evaluation, V_sim, commit, hardware, options
+tuning.csv.gz          a row for each trial of tuning; trials.csv.gz: the curves of the trials
 """
 
-import csv
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
@@ -18,7 +17,7 @@ from envs.files import Count, read_object
 from envs.types import UserError
 from sgft_jax.analysis import curves
 from sgft_jax.analysis.curves import COLUMNS, IDENTITY, Curve
-from sgft_jax.files.csvfile import read_csv
+from sgft_jax.files.csvfile import read_csv, table_file, write_csv
 from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
 from sgft_jax.io.runs import read_config, read_starts
 
@@ -65,7 +64,7 @@ def export(out: Path, to: Path) -> list[Path]:
     }
     for task in sorted({curve.task for curve in found}):
         tables[f"curves-{task}"] = (curves.rows([curve for curve in found if curve.task == task]), IDENTITY)
-    written = [merge(to / f"{name}.csv", list(new), key) for name, (new, key) in tables.items()]
+    written = [merge(table_file(to, name), list(new), key) for name, (new, key) in tables.items()]
     return [path for path in written if path is not None]
 
 
@@ -123,10 +122,7 @@ def merge(path: Path, new: Sequence[Mapping[str, Any]], key: Sequence[str]) -> P
     every = [*kept, *texts]
     names = COLUMNS if set(every[0]) <= set(COLUMNS) else dict.fromkeys(name for row in every for name in row)
     lines = sorted(every, key=lambda row: tuple(row[name] for name in key))  # stable: evaluations in order
-    with open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, list(names), restval="", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(lines)
+    write_csv(path, list(names), lines)
     return path
 
 

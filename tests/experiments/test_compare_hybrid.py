@@ -1,5 +1,6 @@
 """The grid of methods, data sets and simulators: what runs together, what is left alone, what the tables say."""
 
+import gzip
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -193,10 +194,10 @@ def test_a_released_table_says_what_the_runs_say(grid, ran, tmp_path, capsys):
     compare_hybrid.main(grid)
     ran.clear()
     compare_hybrid.main(replace(grid, export=tmp_path / "tables"))
-    assert f"written: {tmp_path / 'tables/hybrid.csv'}, 10 runs\n" in capsys.readouterr().out
-    once = (tmp_path / "tables/hybrid.csv").read_text()
+    assert f"written: {tmp_path / 'tables/hybrid.csv.gz'}, 10 runs\n" in capsys.readouterr().out
+    once = (tmp_path / "tables/hybrid.csv.gz").read_bytes()
     compare_hybrid.main(replace(grid, export=tmp_path / "tables"))
-    assert (tmp_path / "tables/hybrid.csv").read_text() == once  # rows of the same runs are replaced
+    assert (tmp_path / "tables/hybrid.csv.gz").read_bytes() == once  # rows of the same runs are replaced
     for path in grid.data:
         path.unlink()  # the data are not needed
     capsys.readouterr()
@@ -243,7 +244,7 @@ def test_tables_also_show_what_else_a_task_is_judged_by(standing, tmp_path, caps
         assert f"| upright_s | - | gravity | {mean} |" in capsys.readouterr().out
     compare_hybrid.main(replace(standing, released=tmp_path, score="last", seeds=2))
     assert "| upright_s | - | gravity | 5.00 |" in capsys.readouterr().out  # two seeds have no interval
-    table = (tmp_path / "hybrid.csv").read_text().splitlines()
+    table = gzip.decompress((tmp_path / "hybrid.csv.gz").read_bytes()).decode().splitlines()
     assert len(table) == 5 and sum(",upright_s," in line for line in table) == 2
 
 
@@ -257,9 +258,10 @@ def test_tables_also_show_what_else_a_task_is_judged_by(standing, tmp_path, caps
 )
 def test_a_table_without_some_of_its_rows_is_named(lost, said, standing, tmp_path):
     compare_hybrid.main(replace(standing, export=tmp_path))
-    path = tmp_path / "hybrid.csv"
-    path.write_text("".join(line for line in path.read_text().splitlines(keepends=True) if lost not in line))
-    with pytest.raises(UserError, match=rf"hybrid\.csv: {said}; put the table back"):
+    path = tmp_path / "hybrid.csv.gz"
+    lines = gzip.decompress(path.read_bytes()).decode().splitlines(keepends=True)
+    path.write_bytes(gzip.compress("".join(line for line in lines if lost not in line).encode()))
+    with pytest.raises(UserError, match=rf"hybrid\.csv\.gz: {said}; put the table back"):
         compare_hybrid.main(replace(standing, released=tmp_path))
 
 
@@ -280,11 +282,11 @@ def test_runs_of_two_lengths_are_compared_in_their_order(grid, ran, tmp_path, ca
     ("changes", "said"),
     [
         ({"released": "none"}, r"hybrid\.csv: no such table; write one with: .*--export"),
-        ({"released": "tables", "seeds": 9}, r"hybrid\.csv: \w+ has no seed 3; name others with --seed, --seeds"),
+        ({"released": "tables", "seeds": 9}, r"hybrid\.csv\.gz: \w+ has no seed 3; name others with --seed, --seeds"),
         ({"released": "tables", "task": "walker2d"}, r"has none of these runs, 1,000,000 updates of walker2d"),
         ({"released": "tables", "beside": 500}, r"has none of these runs, 500 updates of halfcheetah"),
         ({"beside": 500}, r"--beside: reads released tables"),
-        ({"export": "tables/hybrid.csv"}, r"hybrid\.csv is a file; choose another --export"),
+        ({"export": "tables/hybrid.csv.gz"}, r"hybrid\.csv\.gz is a file; choose another --export"),
         ({"export": "tables", "released": "tables"}, r"--export and --released exclude each other"),
         ({"export": "new", "methods": ("edac",), "reference": "edac"}, r"--export .*: none of these runs has finished"),
     ],

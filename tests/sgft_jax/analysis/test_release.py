@@ -1,6 +1,7 @@
 """Tables that are written from runs, read back, and those that come with the project."""
 
 import csv
+import gzip
 import json
 from pathlib import Path
 
@@ -22,7 +23,7 @@ def test_runs_become_tables_and_the_same_curves_again(tmp_path):
     save(out, "sac", [[0.2, 1 / 3], [0.8, 1.0]], rollouts=[0, 20], priors=PRIORS)
     save(out, "sac_slow", [[0.0, 0.1], [0.1, 0.2]], rollouts=[0, 5], real="hard", variant="slow")
     save(out, "mbpo", [[0.5], [0.6]], rollouts=[0, 5], task="other", seeds="seed-4")
-    assert sorted(path.name for path in export(out, to)) == ["curves-other.csv", "curves-toy.csv", "runs.csv"]
+    assert sorted(path.name for path in export(out, to)) == ["curves-other.csv.gz", "curves-toy.csv.gz", "runs.csv.gz"]
     before, after = ({(c.task, c.gap, c.name): c for c in found.curves} for found in (read_runs(out), read_data(to)))
     assert before.keys() == after.keys()
     for key, curve in before.items():
@@ -30,7 +31,7 @@ def test_runs_become_tables_and_the_same_curves_again(tmp_path):
             np.testing.assert_array_equal(getattr(after[key], name), getattr(curve, name))
         for score in ("success", "return"):
             np.testing.assert_allclose(after[key].of(score).values, curve.of(score).values, rtol=5e-4)
-    runs = {row["method"] + row["variant"]: row for row in read_csv(to / "runs.csv")}
+    runs = {row["method"] + row["variant"]: row for row in read_csv(to / "runs.csv.gz")}
     assert runs["sac"]["commit"] == "0123456789ab" and runs["sac"]["priors"] == "fast-aaaaaa"
     assert runs["sacslow"]["options.horizon"] == "4"
 
@@ -50,12 +51,26 @@ def test_what_is_there_already_stays_and_the_same_run_is_replaced(tmp_path):
     save(first, "mbpo", [[0.2, 0.2], [0.4, 0.4]], rollouts=[0, 20])
     save(second, "sac", [[0.2, 0.2], [0.5, 0.5], [0.6, 0.6]], rollouts=[0, 20, 40])
     export(first, to)
-    once = {path.name: path.read_text() for path in to.iterdir()}
+    once = {path.name: path.read_bytes() for path in to.iterdir()}
     export(first, to)
-    assert {path.name: path.read_text() for path in to.iterdir()} == once
+    assert {path.name: path.read_bytes() for path in to.iterdir()} == once
     export(second, to)
     assert {c.method: c.rollouts[-1] for c in read_data(to).curves} == {"sac": 40, "mbpo": 20}
-    assert len(read_csv(to / "runs.csv")) == 2
+    assert len(read_csv(to / "runs.csv.gz")) == 2
+
+
+def test_a_plain_table_stays_plain_and_two_of_a_name_are_refused(tmp_path):
+    save(tmp_path / "runs", "sac", [[0.2, 0.2]], rollouts=[0])
+    to = tmp_path / "data"
+    export(tmp_path / "runs", to)
+    (before,) = read_data(to).curves
+    (to / "curves-toy.csv").write_bytes(gzip.decompress((to / "curves-toy.csv.gz").read_bytes()))
+    with pytest.raises(UserError, match=r"curves-toy.csv: curves-toy.csv.gz lies beside it; keep one of the two"):
+        read_data(to)
+    (to / "curves-toy.csv.gz").unlink()
+    export(tmp_path / "runs", to)
+    assert sorted(path.name for path in to.iterdir()) == ["curves-toy.csv", "runs.csv.gz"]
+    np.testing.assert_array_equal(read_data(to).curves[0].values, before.values)
 
 
 def test_columns_stay_where_they_are_and_new_ones_follow(tmp_path):
@@ -63,13 +78,13 @@ def test_columns_stay_where_they_are_and_new_ones_follow(tmp_path):
     to = tmp_path / "data"
     save(tmp_path / "a", "sac", [[0.2, 0.2]], rollouts=[0])
     export(tmp_path / "a", to)
-    head = list(read_csv(to / "runs.csv")[0])
+    head = list(read_csv(to / "runs.csv.gz")[0])
     folder = save(tmp_path / "b", "mbpo", [[0.2, 0.2]], rollouts=[0], task="ahead")
     stored = json.loads((folder / "config.json").read_text())
     stored["config"]["options"] = {"another": 1}
     (folder / "config.json").write_text(json.dumps(stored))
     export(tmp_path / "b", to)
-    (first, second) = read_csv(to / "runs.csv")
+    (first, second) = read_csv(to / "runs.csv.gz")
     assert list(first) == [*head, "options.another"] and (first["task"], second["task"]) == ("ahead", "toy")
 
 
@@ -83,13 +98,13 @@ def test_pretraining_and_tuning(tmp_path):
     (out / "tuned/toy").mkdir(parents=True)
     (out / "tuned/toy/sac.json").write_text(json.dumps(chosen))
     written = {path.name: path for path in export(out, to)}
-    assert sorted(written) == ["pretraining.csv", "priors.csv", "trials.csv", "tuning.csv"]
-    assert [row["success"] for row in read_csv(written["pretraining.csv"])] == ["0", "0", "0.4", "0.8"]
-    prior = read_csv(written["priors.csv"])[1]
+    assert sorted(written) == ["pretraining.csv.gz", "priors.csv.gz", "trials.csv.gz", "tuning.csv.gz"]
+    assert [row["success"] for row in read_csv(written["pretraining.csv.gz"])] == ["0", "0", "0.4", "0.8"]
+    prior = read_csv(written["priors.csv.gz"])[1]
     assert (prior["success"], prior["success/low"], prior["time/train_s"]) == ("0.9", "0.3", "12.5")
-    trial = read_csv(written["tuning.csv"])[0]
+    trial = read_csv(written["tuning.csv.gz"])[0]
     assert (trial["chosen"], trial["rollouts"]) == ("True", "20")
-    assert not any("/home/somebody" in path.read_text() for path in written.values())
+    assert not any(b"/home/somebody" in gzip.decompress(path.read_bytes()) for path in written.values())
 
 
 def test_nothing_to_write_or_read(tmp_path):
@@ -100,15 +115,15 @@ def test_nothing_to_write_or_read(tmp_path):
 
 
 def test_the_released_tables():
-    """At most 30 files and 8 MB, readable by anything that reads CSV, and every curve is the run of some row."""
+    """At most 30 files and 1 MB, readable by anything that reads CSV, and every curve is the run of some row."""
     files = [path for path in DATA.rglob("*") if path.is_file()]
-    assert len(files) <= 30 and sum(path.stat().st_size for path in files) <= 8_000_000
-    with open(DATA / "curves-push.csv", newline="") as file:
+    assert len(files) <= 30 and sum(path.stat().st_size for path in files) <= 1_000_000
+    with gzip.open(DATA / "curves-push.csv.gz", "rt", newline="") as file:
         head = next(csv.reader(file))
     assert head == list(COLUMNS[: len(head)])  # those from before lack the last column
     curves = read_data(DATA).curves
     identity = ("task", "gap", "method", "variant", "priors")
-    runs = {tuple(row[name] for name in identity) for row in read_csv(DATA / "runs.csv")}
+    runs = {tuple(row[name] for name in identity) for row in read_csv(DATA / "runs.csv.gz")}
     assert runs == {tuple(getattr(c, name) for name in identity) for c in curves} and len(runs) == len(curves)
     judged_by_return = {"halfcheetah"}
     assert all((c.score == "return") == (c.task in judged_by_return) for c in curves)
@@ -119,8 +134,8 @@ def test_tuning_tells_the_areas_of_its_trials():
     """What tuning.csv says of a trial follows from trials.csv: the mean area up to the budget's rollouts."""
     from sgft_jax.analysis.curves import from_rows
 
-    trials = {(c.method, c.variant): c for c in from_rows(read_csv(DATA / "trials.csv"))}
-    told = read_csv(DATA / "tuning.csv")
+    trials = {(c.method, c.variant): c for c in from_rows(read_csv(DATA / "trials.csv.gz"))}
+    told = read_csv(DATA / "tuning.csv.gz")
     assert len(told) == len(trials) == 16
     for row in told:
         curve = trials[row["method"], f"trial-{row['trial']}"]
