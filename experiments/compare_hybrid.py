@@ -38,11 +38,11 @@ from experiments.runner.options import (
 )
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.hybrid.presets import say_preset
-from sgft_jax.hybrid.schedule import FLEET, SCHEDULES, Schedule, describe, name_of
 from sgft_jax.hybrid.scores import measures, shown
 from sgft_jax.io.log import EVAL, SUMMARY, check_records, read_jsonl
 from sgft_jax.io.runs import check_folder, read_own, read_starts
 from sgft_jax.methods import FIXED_NAMES, get_method
+from sgft_jax.train.schedule import FLEET, SCHEDULES, Schedule, describe, name_of
 
 if TYPE_CHECKING:
     from sgft_jax.analysis.hybrid import Outcome, Results

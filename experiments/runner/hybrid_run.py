@@ -1,4 +1,4 @@
-"""Impure: a run of `sgft_jax.hybrid.trainer` with data, folders, checkpoints, logs and evaluations around it."""
+"""Impure: a run of `sgft_jax.train.hybrid` with data, folders, checkpoints, logs and evaluations around it."""
 
 import functools
 from collections.abc import Iterator
@@ -26,21 +26,19 @@ from sgft_jax.analysis import figures
 from sgft_jax.analysis.hybrid import Results, outcome
 from sgft_jax.datasets import logs
 from sgft_jax.files.jsonfile import jsonable
-from sgft_jax.hybrid import trainer
 from sgft_jax.hybrid.robot import MEASURES
 from sgft_jax.hybrid.scores import LATE, late, measures, normalised
-from sgft_jax.hybrid.trainer import HybridState
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
 from sgft_jax.io.priors import save_prior
 from sgft_jax.io.progress import RunProgress
+from sgft_jax.keys import FromLog, seed_keys
 from sgft_jax.math.stats import bootstrap_interval, mean
 from sgft_jax.stacking import join, member, part
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.train.pretraining import seed_keys
+from sgft_jax.train import hybrid
+from sgft_jax.train.fleet import FleetState
 from sgft_jax.types import Fixed, Metrics, Prior, RealData
-
-_TRAINING, _EVALUATION = 11, 12  # purposes, folded into a seed's key
 
 
 def run(args: HybridArgs, method: Fixed, seeds: list[int]) -> list[dict[str, Any]]:
@@ -105,16 +103,15 @@ class _Run:
         """Everything, in order; returns the summaries. folders: of the runs, one for each simulator."""
         self.folders, self.logs = folders, [MetricsLog(folder) for folder in folders]
         state = self._restore(*self.inputs)
-        steps = trainer.train(
+        steps = hybrid.train(
             self.env, self.agent, self.args.schedule, *self.inputs, gamma=self.args.options.gamma, state=state
         )
         return self._finish(self._follow(steps))
 
     def _reserve(self, real: RealData) -> None:
         """Says how much memory the rows take; raises UserError where there is not as much."""
-        kept = trainer.memory(self.env, self.agent, self.args.schedule, real)
-        members = len(self.gaps) * len(self.seeds)
-        reserve({"buffer": kept.buffer}, copies=members, shared=kept.data, settings="schedule")
+        kept, data = hybrid.memory(self.env, self.agent, self.args.schedule, real)
+        reserve({"buffer": kept}, copies=len(self.gaps) * len(self.seeds), shared=data, settings="schedule")
 
     def _pools(self) -> World:
         """The worlds [M, W] of each member's simulator; those of the real system where there is none."""
@@ -125,14 +122,14 @@ class _Run:
     def _real(self) -> RealData:
         """The real data, or what stands for it."""
         if self.data is None:
-            return trainer.no_data(self.env)
+            return hybrid.no_data(self.env)
         return RealData(self.data.rows, jnp.asarray(self.data.last))
 
     def _keys(self) -> Any:
         """[M]: a seed gives the same draws whichever simulators share the program."""
-        return jnp.concatenate([seed_keys(self.seeds, _TRAINING)] * len(self.gaps))
+        return jnp.concatenate([seed_keys(self.seeds, FromLog.TRAINING)] * len(self.gaps))
 
-    def _restore(self, pools: World, real: RealData, keys: Any) -> HybridState | None:
+    def _restore(self, pools: World, real: RealData, keys: Any) -> FleetState | None:
         """The state after the last checkpoint, None for a fresh start; raises UserError where simulators differ."""
         steps = [checkpoint.latest(folder, whole=True) for folder in self.folders]
         if len(set(steps)) > 1:
@@ -144,18 +141,18 @@ class _Run:
             return None
         first = len(self.seeds)  # of the members: those of one simulator
         own = jax.tree.map(lambda x: x[:first], pools)
-        like = trainer.shape_of(self.env, self.agent, self.args.schedule, own, real, keys[:first])
+        like = hybrid.shape_of(self.env, self.agent, self.args.schedule, own, real, keys[:first])
         restored = functools.partial(checkpoint.restore, like=like, step=steps[0], checked=True, expect=self.expect)
         found = [restored(folder) for folder in self.folders]
         for log, (_, meta) in zip(self.logs, found, strict=True):
             log.truncate(meta["position"])
         return join([state for state, _ in found])
 
-    def _follow(self, steps: Iterator[tuple[HybridState, Metrics]]) -> HybridState:
+    def _follow(self, steps: Iterator[tuple[FleetState, Metrics]]) -> FleetState:
         """Logs, evaluates and checkpoints what the iterator yields; returns its last state."""
         schedule, names = self.args.schedule, "+".join(gap.name for gap in self.gaps)
         state, _ = next(steps)
-        done = trainer.chunks_done(state, schedule)
+        done = hybrid.make_plan(self.env, self.agent, schedule).chunks_done(state)
         if done == 0:
             self._evaluate(state, 0)
         title = f"{self.method.name} on {self.env.name}/{names}"
@@ -178,7 +175,7 @@ class _Run:
         """Whether something that happens every so many updates happens after this chunk: also after the last."""
         return before // every != done * self.chunk // every or done == self.args.schedule.chunks
 
-    def _evaluate(self, state: HybridState, done: int) -> float:
+    def _evaluate(self, state: FleetState, done: int) -> float:
         played = self._play(state, self.args.eval_episodes)
         found = scores(played) | self._measures(played)
         for log, own in zip(self.logs, self._each(found), strict=True):
@@ -193,12 +190,12 @@ class _Run:
         found = measure(played.transitions.next_obs, played.valid, dt=self.env.control_dt)
         return {name: values.mean(-1) for name, values in found.items()}
 
-    def _play(self, state: HybridState, episodes: int) -> Episode:
+    def _play(self, state: FleetState, episodes: int) -> Episode:
         """Episodes [M, episodes] in the real system, always the same starts."""
         params = jax.jit(jax.vmap(self.agent.export))(state.learner)
-        return play(self.system, self.agent.policy, params, jax.random.key(_EVALUATION), episodes)
+        return play(self.system, self.agent.policy, params, jax.random.key(FromLog.EVALUATION), episodes)
 
-    def _checkpoint(self, state: HybridState, done: int) -> None:
+    def _checkpoint(self, state: FleetState, done: int) -> None:
         for folder, log, own in zip(self.folders, self.logs, self._each(state), strict=True):
             meta = {**self.expect, "position": log.position()}
             self.last_good = checkpoint.save(folder, done * self.chunk, own, meta=meta)
@@ -209,7 +206,7 @@ class _Run:
 
     # ------------------------------------------------------------ what stays
 
-    def _finish(self, state: HybridState) -> list[dict[str, Any]]:
+    def _finish(self, state: FleetState) -> list[dict[str, Any]]:
         """Policies, summaries, curves and closing words. The last policy is the result: nothing real chose it."""
         params = jax.jit(jax.vmap(self.agent.export))(state.learner)
         filmed = functools.cache(lambda: self._play(state, 1))

@@ -34,23 +34,22 @@ from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
 from sgft_jax.io.priors import digest, save_prior
 from sgft_jax.io.progress import Clock, RunProgress
+from sgft_jax.keys import Pretraining, seed_keys
 from sgft_jax.policies import make_policy
 from sgft_jax.systems.simulated import Simulated
+from sgft_jax.train.fleet import FleetState
 from sgft_jax.train.pretraining import (
     Best,
-    PretrainState,
     collect_random,
     exported,
     memory,
     pretrain,
     prior_card,
-    seed_keys,
     shapes,
     world_keys,
 )
 from sgft_jax.types import Metrics, Prior
 
-_REPORT = 3  # purpose, folded into a seed's key
 _CUT = ("n_envs", "replay_capacity", "batch_size")  # sizes that devices share
 _HELDOUT_SEED, _FINAL_SEED = 2**31, 2**31 + 1  # held-out worlds and episodes, the same for every run
 
@@ -58,7 +57,7 @@ _HELDOUT_SEED, _FINAL_SEED = 2**31, 2**31 + 1  # held-out worlds and episodes, t
 class Saved(NamedTuple):
     """What a checkpoint holds, with a leading seeds axis: the run itself and the best policy so far."""
 
-    run: PretrainState
+    run: FleetState
     best: Best
 
 
@@ -142,12 +141,12 @@ class _Run:
         self.clock.seconds = meta["seconds"]
         return saved, meta["chunks"]
 
-    def _first_best(self, state: PretrainState) -> Best:
+    def _first_best(self, state: FleetState) -> Best:
         """What any evaluation is better than."""
         none = jnp.full(len(self.seeds), -jnp.inf)
         unknown = jnp.full((len(self.seeds), 2), jnp.inf)
         return Best(
-            exported(self.env, self.config, state), none, none, state.steps, jnp.zeros(len(self.seeds)), unknown
+            exported(self.env, self.config, state), none, none, state.rounds, jnp.zeros(len(self.seeds)), unknown
         )
 
     def _random(self) -> PyTree:
@@ -189,7 +188,7 @@ class _Run:
                 progress.advance(size, shown)
         return best
 
-    def _evaluate(self, state: PretrainState, best: Best | None, done: int) -> tuple[Best, Metrics]:
+    def _evaluate(self, state: FleetState, best: Best | None, done: int) -> tuple[Best, Metrics]:
         """Every evaluation plays the same episodes in the same held-out worlds."""
         params = exported(self.env, self.config, state)
         with self.clock("evaluate"):
@@ -197,7 +196,7 @@ class _Run:
         found = scores(played)
         self.log.eval(done * self.config.chunk_env_steps, found)
         since = self.config.choose_from * self.config.chunks * self.config.chunk_steps
-        return best_of(best, params, played, state.steps, since=since), found
+        return best_of(best, params, played, state.rounds, since=since), found
 
     def _checkpoint(self, saved: Saved, done: int) -> None:
         meta = {**self.expect, "chunks": done, "position": self.log.position(), "seconds": self.clock.seconds}
@@ -264,7 +263,7 @@ class _Run:
         measure = functools.partial(
             make_report, self.env, self.policy, gamma=self.config.gamma, trajectories=self.config.eval_episodes
         )
-        report = jax.jit(jax.vmap(measure))(self.pools(0), params, seed_keys(self.seeds, _REPORT))
+        report = jax.jit(jax.vmap(measure))(self.pools(0), params, seed_keys(self.seeds, Pretraining.REPORT))
         return jax.tree.map(np.asarray, mesh.local(report))
 
     def _film(self, played: Episode) -> str:
