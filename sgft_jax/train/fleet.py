@@ -17,6 +17,7 @@ from envs.mesh import split, whole
 from envs.rollout import Fleet, launch, step_fleet
 from envs.types import Array, Key, PyTree, Transition
 from sgft_jax.data import replay
+from sgft_jax.data.replay import ReplayState
 from sgft_jax.models.networks import Precision, precision
 from sgft_jax.types import Batch, Learner, Metrics, Task
 
@@ -137,7 +138,7 @@ class Collected(NamedTuple):
 
     fleet: Fleet
     replay: PyTree
-    notes: replay.ReplayState | None = None
+    notes: ReplayState | None = None
 
 
 def collect(
