@@ -214,7 +214,7 @@ class _Run(Training):
         best = progress.best
         card = {**self.card, "plan": None, **self.finetuner.card}  # the prior may be one that plans
         last = jax.jit(jax.vmap(self.finetuner.export))(progress.agent)
-        facts = {"evidence": best.score, "rollouts": best.rollouts}
+        facts = {"evidence": best.score, "rollouts": best.age}
         n = self.episodes
         if n and isinstance(self.system, Simulated):
             played = finetuning.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, n)

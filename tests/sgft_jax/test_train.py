@@ -277,7 +277,7 @@ def test_the_policy_of_the_best_five_rollouts_is_kept():
         yielded[-1][0].best,
         [7 - 1, 11 - 1],
     )  # rollouts by the policies that are kept; of equal ones the first
-    assert best.rollouts.tolist() == played and best.score.tolist() == pytest.approx([1.0, 0.8])
+    assert best.age.tolist() == played and best.score.tolist() == pytest.approx([1.0, 0.8])
     before = np.stack([p.agent.learner for p, _ in yielded])
     np.testing.assert_array_equal(best.params, [before[played[0], 0], before[played[1], 1]])
     assert best.count.tolist() == [12, 12]
@@ -286,13 +286,13 @@ def test_the_policy_of_the_best_five_rollouts_is_kept():
 def test_equal_scores_are_told_apart_by_returns():
     returns = np.stack([[1] * 5 + [2] * 5, [2] * 5 + [1] * 5], 1)
     best = run(system=Scripted(np.ones((10, 2)), returns), rollouts=10)[-1][0].best
-    assert best.rollouts.tolist() == [9, 4] and best.total.tolist() == [2, 2]
+    assert best.age.tolist() == [9, 4] and best.total.tolist() == [2, 2]
 
 
 def test_the_best_policy_had_learned_from_what_came_before_it():
     """Six rollouts at once, by one policy that had learned from none."""
     best = run(make(initial_rollouts=6), Scripted(np.ones((6, 2))), rollouts=6)[-1][0].best
-    assert best.rollouts.tolist() == [0, 0] and best.params.tolist() == [0.5, 0.0]
+    assert best.age.tolist() == [0, 0] and best.params.tolist() == [0.5, 0.0]
 
 
 def test_an_explosion_is_reported_as_the_worst_that_is_known():
