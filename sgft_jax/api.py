@@ -33,6 +33,8 @@ from sgft_jax.train.finetuning import FinetuneProgress, SimulatedRows
 from sgft_jax.train.options import card_of
 from sgft_jax.types import Finetuner, Online, Prior
 
+__all__ = ["ActingPolicy", "Setup", "evaluate_prior", "finetuned_priors", "load_policy", "make_env", "setup"]
+
 SIMULATED_WORLDS = 256
 _SIMULATION = 2**31  # seed of what happens in them, the same for every run
 _EVALUATION = 2**31 + 2  # held out from training and from the choice of the prior

@@ -12,6 +12,8 @@ from envs.mesh import running_count, set_rows
 from envs.types import Array, Key, Transition, UserError
 from sgft_jax.types import Batch
 
+__all__ = ["SequenceState", "add", "add_episode", "end_episodes", "full", "init", "sample", "sample_episodes"]
+
 
 class SequenceState(struct.PyTreeNode):
     """A ring of `slots` time slots for `n_envs` environments; row = slot * n_envs + environment.

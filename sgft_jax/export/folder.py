@@ -24,6 +24,8 @@ from sgft_jax.files.jsonfile import write_json
 from sgft_jax.io import checkpoint
 from sgft_jax.types import Prior
 
+__all__ = ["save_exported"]
+
 CONTRACT, PLAYER = "contract.json", "policy.py"
 LIMIT = 1e-5  # how far an exported action may be from the trained policy's
 _CHECKED, _PLANNED = 1000, 50  # random observations that an export is played on; a plan takes longer than an action

@@ -32,7 +32,7 @@ from sgft_jax.files import folders
 from sgft_jax.files.arrays import damage
 from sgft_jax.files.jsonfile import jsonable, write_json
 
-FORMAT = 1
+FORMAT = 1  # of checkpoints and priors, see docs/design.md
 MANIFEST = "manifest.json"
 _CHECKPOINTS, _STATE = "checkpoints", "state"
 _MARK = "commit_success.txt"
@@ -226,7 +226,10 @@ def read_manifest(where: Path) -> dict[str, Any]:
     except UserError:
         raise UserError(f"{where}: torn: {MANIFEST} is not readable") from None
     if manifest["format"] != FORMAT:
-        raise UserError(f"{where}: written in format {manifest['format']}, this version reads format {FORMAT}")
+        raise UserError(
+            f"{where}: written in format {manifest['format']}, this version reads format {FORMAT} alone; begin again, "
+            "or use the version that wrote it"
+        )
     files.checked(where / MANIFEST, manifest, _Manifest, _FIX)
     for name, (size, _) in manifest["files"].items():
         file = where / name

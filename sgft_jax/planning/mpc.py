@@ -26,6 +26,8 @@ from sgft_jax.models.normalizer import normalize
 from sgft_jax.planning import mppi
 from sgft_jax.types import Normalizer
 
+__all__ = ["MPCConfig"]
+
 _ITERATIONS = 3  # of the search: half of TD-MPC2's, for plans a quarter as long
 _PROPOSALS, _ELITES = 4, 8  # one of so many samples is the policy's, and an elite
 # TD-MPC2 averages over elites that differ by some units of return; here a plan is a step or a few, a tenth is a lot.

@@ -7,6 +7,8 @@ from envs.types import Key, PyTree
 if TYPE_CHECKING:
     from envs.rollout import Episode
 
+__all__ = ["System"]
+
 
 @runtime_checkable
 class System(Protocol):

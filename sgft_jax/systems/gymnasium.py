@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
     from sgft_jax.systems.remote import Remote
 
+__all__ = ["Gymnasium"]
+
 _TRIES = 20  # actions that are timed before a robot with a clock moves
 _STARTS, _PAUSE = 4, 0.5  # times that a start is asked for until all its numbers are finite, and seconds in between
 _BOUND = 1e9  # larger bounds of actions are those of a type of number, not of a machine

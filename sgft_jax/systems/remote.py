@@ -28,6 +28,8 @@ from sgft_jax.systems.door import Door, url
 from sgft_jax.systems.messages import Began, Failed, Hello, Message, Moved, Rested, VersionError, read
 from sgft_jax.systems.robot_client import LIMIT, array, pack, printable
 
+__all__ = ["Remote"]
+
 _HELLO = 10.0  # seconds for the first message
 _RESTS = 5  # times a robot is told to rest before it is left alone: without commands it stops by itself
 _FAILURES = 5  # episodes in a row in which a driver fails before its first step is done; then it is not asked again

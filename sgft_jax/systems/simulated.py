@@ -10,6 +10,8 @@ from envs.mesh import split_vmap
 from envs.rollout import Episode, play_episode
 from envs.types import Array, Key, PyTree
 
+__all__ = ["Simulated"]
+
 
 class Simulated:
     """Perturbed simulations.

@@ -22,6 +22,8 @@ from sgft_jax.train.evidence import Best
 from sgft_jax.train.guard import Guarded
 from sgft_jax.types import Finetuner, Metrics, SimulatedData, Simulation
 
+__all__ = ["FinetuneProgress", "evaluate", "finetune", "simulate"]
+
 _INIT, _COLLECT, _LEARN, _EVALUATE, _OFFLINE = range(5)  # purposes, folded into a seed's key
 Phase = Literal["offline", "logged", "online"]  # of learning, see `Updates`
 OFFLINE_PART = 5_000  # updates of the offline phase between two yields

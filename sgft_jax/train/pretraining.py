@@ -23,6 +23,8 @@ from sgft_jax.stacking import stack
 from sgft_jax.train.recipes import RECIPES
 from sgft_jax.types import Batch, Metrics, Prior
 
+__all__ = ["PretrainState", "pretrain", "priors_of"]
+
 _WORLDS, _RANDOM, _START = range(3)  # purposes, folded into a seed's key
 
 Pools = Callable[[int], World]  # number of a set of worlds -> its worlds [M, W], a pool for each member

@@ -114,6 +114,18 @@ def test_a_prior_of_an_unknown_algorithm_is_refused(tmp_path, algorithm):
         priors.load_prior(folder)
 
 
+def test_a_prior_of_another_format_is_refused_in_one_line(tmp_path):
+    folder = save(tmp_path / "prior")
+    path, number = folder / "manifest.json", checkpoint.FORMAT - 1
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": number}))
+    with pytest.raises(UserError) as refused:
+        priors.load_prior(folder)
+    assert str(refused.value) == (
+        f"{folder}: written in format {number}, this version reads format {checkpoint.FORMAT} alone; begin again, or "
+        "use the version that wrote it"
+    )
+
+
 def test_a_prior_of_another_version_is_refused_in_one_line(tmp_path):
     folder = save(tmp_path / "prior")
     manifest = json.loads((folder / "manifest.json").read_text())
