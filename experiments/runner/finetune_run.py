@@ -31,8 +31,7 @@ from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.methods import get_method
 from sgft_jax.stacking import join, part
-from sgft_jax.systems.gymnasium import Gymnasium
-from sgft_jax.systems.simulated import Simulated
+from sgft_jax.systems import Known, System
 from sgft_jax.train import finetuning
 from sgft_jax.train.finetuning import FinetuneProgress, Logged
 from sgft_jax.train.learner_process import LearnerProcess
@@ -66,7 +65,7 @@ def run(args: FinetuneArgs, method: Online, seeds: list[int], folders: list[Path
             last.push(lambda error, *_: playing.close(over=error is None))
             members = seeds * len(args.real)
         setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
-        assert isinstance(setup.system, Simulated | Gymnasium)
+        assert isinstance(setup.system, Known)
         # Last: what is wrong with a robot or with a method of the user's own leaves no folder behind.
         opened = runs.open_runs(
             homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
@@ -141,7 +140,7 @@ class _Run:
         self,
         args: FinetuneArgs,
         setup: Setup,
-        system: Simulated | Gymnasium,
+        system: Known,
         card: dict[str, Any],
         records: list[Record],
         logs: list[Log],
@@ -219,8 +218,8 @@ class _Run:
         return {} if real is None else {f"{self.system.env.score}, exploring": float(real.mean())}
 
     def _evaluate(self, progress: FinetuneProgress, done: int) -> float:
-        system = self.system
-        if isinstance(system, Gymnasium):  # its episodes are real ones, and as dear as those of training
+        system: System = self.system
+        if self.system.pools is None:  # its episodes are real ones, and as dear as those of training
             stores = [evaluation_store(record.folder, done) for record in self.records]
             system = RecordedSystem(system, stores, done=0, explore=False, sync_every=self.sync_every)
         played = finetuning.evaluate(self.finetuner, system, progress.agent, self.seeds, self.episodes)
@@ -247,7 +246,7 @@ class _Run:
         last = jax.jit(jax.vmap(self.finetuner.export))(progress.agent)
         facts = {"evidence": best.score, "rollouts": best.rollouts}
         n = self.episodes
-        if n and isinstance(self.system, Simulated):
+        if n and self.system.pools is not None:
             played = finetuning.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, n)
             facts["score"] = scores(played, best.worst)["score"]
         films = functools.cache(lambda: self._before_and_after(progress))
@@ -258,7 +257,7 @@ class _Run:
             record.save_policies("best", own(best.params), card)
             rollouts, chosen = int(progress.rollouts), {name: np.asarray(own(x)) for name, x in facts.items()}
             summaries.append(record.summarise(rollouts, chosen))
-            if self.args.video and n and isinstance(self.system, Simulated):
+            if self.args.video and n and self.system.pools is not None:
                 pool = jax.tree.map(lambda x, i=i: x[i], self.system.pools)
                 print(record.film(pool, lambda own=own: [own(x) for x in films()], rollouts))
             print(f"results: {record.folder}  (policy/, best/, real/, summary.json, figures/)")

@@ -210,7 +210,9 @@ def read(folder: Path) -> Rows:
     path = info.get("data_path", "data/")
     if not path.startswith("data/") or ".." in path:
         raise UserError(f"{folder}: its data_path {path!r} is not in data/; {_WHOLE}")
-    needed = dict.fromkeys((_STATE, _ACTION), f", only {', '.join(sorted(features))}; record it as a vector")
+    needed: dict[str, str] = dict.fromkeys(
+        (_STATE, _ACTION), f", only {', '.join(sorted(features))}; record it as a vector"
+    )
     needed |= dict.fromkeys(("frame_index", "episode_index"), f"; {_WHOLE}")
     if missing := [name for name in needed if name not in features]:
         raise UserError(f"{folder}: has no {missing[0]}{needed[missing[0]]}")

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import h5py
 import jax
@@ -96,9 +96,9 @@ def of_stored(played: Sequence[Played], measured_dim: int) -> list[Recorded]:
     """
     recorded = []
     for episode in played:
-        measured = {name: episode.rows[name][:, :measured_dim] for name in ("obs", "next_obs")}
-        if len(episode.rows["reward"]):
-            rows = Transition(**{**episode.rows, **measured})
+        rows: Any = Transition(**cast(Any, episode.rows))
+        if len(rows.reward):
+            rows = rows._replace(obs=rows.obs[:, :measured_dim], next_obs=rows.next_obs[:, :measured_dim])
             recorded.append(_recorded(rows, None)._replace(success=episode.success))
     return recorded
 

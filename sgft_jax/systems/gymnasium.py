@@ -96,7 +96,7 @@ class Gymnasium:
         gamma: float,
         observe: Observe | None = None,
     ) -> None:
-        self.env, self.gamma = env, gamma
+        self.env, self.pools, self.gamma = env, None, gamma
         self._real = _played(real)
         self._observe = extend.guard("observe of", self._real.name, observe or _reader(env.measured, self._real))
         self._low, self._high = low, high = _bounds(env, self._real)
@@ -335,7 +335,7 @@ class _Separate:
     def __init__(self, real: "Sequence[gymnasium.Env]") -> None:
         if not real:
             raise UserError("no environment is given; make one for each seed")
-        first = real[0]
+        first: Any = real[0]
         self.real, self.count, self.name = real, len(real), str(first.spec.id if first.spec else first.unwrapped)
         self.observation, self.action = first.observation_space, first.action_space
         if len(set(map(id, real))) < len(real):
@@ -386,7 +386,7 @@ class _Vector:
     def __init__(self, real: "gymnasium.vector.VectorEnv") -> None:
         self.real: Any = real  # Gymnasium's stub knows no list of seeds
         self.count, self.name = real.num_envs, str(real.spec.id if real.spec else real)
-        self.observation, self.action = real.single_observation_space, real.single_action_space
+        self.observation, self.action = self.real.single_observation_space, self.real.single_action_space
         mode = getattr(shown := real.metadata.get("autoreset_mode"), "name", None)
         self._same_step = mode == "SAME_STEP"
         if mode not in ("NEXT_STEP", "SAME_STEP"):
@@ -426,7 +426,7 @@ def _played(real: Any) -> _Real:
     several = real if isinstance(real, Sequence) else [real]
     if unfit := [env for env in several if isinstance(env, type) or not hasattr(env, "step")]:
         raise UserError(f"{unfit[0]!r} is no Gymnasium environment")
-    return _Vector(real) if hasattr(real, "num_envs") else _Separate(several)
+    return _Vector(several[0]) if hasattr(real, "num_envs") else _Separate(several)
 
 
 # --- spaces -----------------------------------------------------------------------------------------------------------
