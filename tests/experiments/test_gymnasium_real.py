@@ -96,7 +96,7 @@ def test_what_was_played_before_a_break_is_never_played_again(priors, finished, 
     """A break in mid-episode costs that episode alone, and the run ends as if nothing had happened."""
     whole, seeds = finished
     Turned.breaks = steps
-    with pytest.raises(BrokenError):
+    with pytest.raises(SystemExit):
         run(priors, tmp_path)
     Turned.breaks = None
     folder = run(priors, tmp_path, "--resume")
