@@ -29,6 +29,8 @@ from sgft_jax.models.system import told
 from sgft_jax.planning import mpc
 from sgft_jax.types import Task
 
+__all__ = ["make_policy", "mpc_policy", "sac_policy", "tdmpc2_policy"]
+
 
 def make_policy(card: Mapping[str, Any], task: Task) -> Policy:
     """How the prior with this card acts. task: its task; policies that plan ask it for rewards.

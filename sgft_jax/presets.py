@@ -13,6 +13,8 @@ from sgft_jax import checks
 from sgft_jax.models.config import SIZES, NetworkConfig, Precision
 from sgft_jax.types import Algorithm, Online
 
+__all__ = ["PRESETS", "PretrainConfig"]
+
 DEFAULT_PRESET = "robust"
 
 

@@ -1,5 +1,6 @@
 """Every public name is there, once, and explains itself; docs/api.md gets its list of them from the same function."""
 
+import ast
 import importlib.util
 import inspect
 from pathlib import Path
@@ -24,6 +25,22 @@ names = load_hook()
 PUBLIC = [(f"{package}.{name}", thing) for package in names.PACKAGES for name, thing in names.public(package)]
 
 
+def public_modules():
+    """The modules that public names are of, with these names; learners are public module by module."""
+    modules = {}
+    for node in ast.parse(Path(sgft_jax.__file__).with_suffix(".pyi").read_text()).body:
+        if isinstance(node, ast.ImportFrom) and not node.module.startswith("learners"):
+            for name in (alias.name for alias in node.names):
+                if isinstance(thing := getattr(sgft_jax, name), ModuleType):
+                    prefix = f"sgft_jax.{name}."
+                    modules[thing.__name__] = [
+                        full.removeprefix(prefix) for full, _ in PUBLIC if full.startswith(prefix)
+                    ]
+                else:
+                    modules.setdefault(f"sgft_jax.{node.module}", []).append(name)
+    return modules
+
+
 @pytest.mark.parametrize(("name", "thing"), PUBLIC, ids=[name for name, _ in PUBLIC])
 def test_public_names_explain_themselves(name, thing):
     if inspect.isroutine(thing) or inspect.isclass(thing) or isinstance(thing, ModuleType):
@@ -34,6 +51,12 @@ def test_public_names_explain_themselves(name, thing):
 @pytest.mark.parametrize("package", [sgft_jax, envs], ids=lambda package: package.__name__)
 def test_public_names_are_listed_once(package):
     assert len(set(package.__all__)) == len(package.__all__)
+
+
+@pytest.mark.parametrize("module", sorted(public_modules()))
+def test_a_public_module_lists_what_is_public(module):
+    """Its `__all__` is what the stub of the package takes from it, or for a public module what docs/api.md lists."""
+    assert sorted(importlib.import_module(module).__all__) == sorted(public_modules()[module])
 
 
 def test_the_page_lists_them_with_what_they_are():

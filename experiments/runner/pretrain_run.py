@@ -77,7 +77,7 @@ def run(args: PretrainArgs, seeds: list[int]) -> dict[str, Any]:
     sizes = memory(env, args.config)  # what does not fit is reported before anything is written
     devices = mesh.devices(args.devices, {f"--config.{n.replace('_', '-')}": getattr(args.config, n) for n in _CUT})
     home = run_folder(args)
-    with hosts.own(home) as folder, mesh.use(devices):
+    with hosts.run_folder(home) as folder, mesh.use(devices):
         reserve(sizes, copies=args.seeds, devices=devices)
         with opened(
             {folder: jsonable(args)}, kind="pretrain", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE

@@ -22,6 +22,8 @@ from sgft_jax.models.distortion import Distortion
 from sgft_jax.policies import check_parameters
 from sgft_jax.types import Normalizer, Prior
 
+__all__ = ["load_prior", "save_prior"]
+
 
 def save_prior(folder: str | Path, prior: Prior) -> Path:
     """Write a prior to `folder`, replacing the one that may be there, and return the folder.

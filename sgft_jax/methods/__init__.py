@@ -14,6 +14,8 @@ from sgft_jax.methods.options import ActorCriticOptions
 from sgft_jax.train.options import LoopOptions
 from sgft_jax.types import Algorithm, Family, Finetuner, Fixed, FixedKind, HybridAgent, Method, Online
 
+__all__ = ["all_methods", "get_method"]
+
 Kind = Literal["online", "fixed"]
 
 # Of tables and figures: the ones to try first stand first, what is not listed last.

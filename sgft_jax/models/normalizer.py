@@ -9,6 +9,8 @@ from brax.training.acme import running_statistics
 from envs.types import Array
 from sgft_jax.types import Normalizer
 
+__all__ = ["finish", "identity", "init", "normalize", "of", "update"]
+
 Statistics = running_statistics.RunningStatisticsState
 
 # Raw units are metres and radians. Entries that random actions hardly move (a nail, a far puck) would otherwise turn

@@ -39,6 +39,8 @@ from sgft_jax.types import (
     Transform,
 )
 
+__all__ = ["FinetuneState", "Parts", "assemble", "sac_finetuner"]
+
 _SIMULATION = Simulation(20_000, 0.6)  # simulated rows that identification compares with
 
 

@@ -22,6 +22,8 @@ from sgft_jax.train.fleet import Collected, FleetState, Plan, RoundKeys, StartKe
 from sgft_jax.train.recipes import RECIPES
 from sgft_jax.types import Batch, Metrics, Prior
 
+__all__ = ["pretrain", "priors_of"]
+
 Pools = Callable[[int], World]  # number of a set of worlds -> its worlds [M, W], a pool for each member
 
 
