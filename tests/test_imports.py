@@ -52,7 +52,7 @@ ROOT = Path(__file__).parents[1]
 # The rooms of a package, a file or a folder each, lowest first: a room imports only rooms before it. "" is the package.
 ORDER = {
     "envs": (
-        *("types", "files", "extend", "mesh", "base", "effects", "history", "domains", "system", "gaps"),
+        *("types", "scales", "files", "extend", "mesh", "base", "effects", "history", "domains", "system", "gaps"),
         *(
             "gap_distribution",
             "rollout",

@@ -16,6 +16,7 @@ from envs.base import Env, World
 from envs.gaps import SIM, Gap
 from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
+from envs.scales import normalised
 from envs.types import PyTree, UserError
 from experiments.runner import logged
 from experiments.runner.evaluation import play, scores
@@ -27,8 +28,7 @@ from sgft_jax.analysis.hybrid import Results, outcome
 from sgft_jax.datasets import logs
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.hybrid import trainer
-from sgft_jax.hybrid.robot import MEASURES
-from sgft_jax.hybrid.scores import LATE, late, measures, normalised
+from sgft_jax.hybrid.scores import LATE, late, measures
 from sgft_jax.hybrid.trainer import HybridState
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
@@ -187,11 +187,8 @@ class _Run:
 
     def _measures(self, played: Episode) -> dict[str, Any]:
         """What else the task is judged by, [M] means over episodes."""
-        measure = MEASURES.get(self.env.name)
-        if measure is None:
-            return {}
-        found = measure(played.transitions.next_obs, played.valid, dt=self.env.control_dt)
-        return {name: values.mean(-1) for name, values in found.items()}
+        measured = self.env.measures(played.transitions.next_obs, played.valid)
+        return {name: values.mean(-1) for name, values in measured.items()}
 
     def _play(self, state: HybridState, episodes: int) -> Episode:
         """Episodes [M, episodes] in the real system, always the same starts."""
