@@ -17,9 +17,18 @@ import numpy as np
 
 from envs.base import Entry, Env, Parameter
 from envs.franka import arm, kinematics, workcell
-from envs.franka.arm import NO_CONTACT
 from envs.franka.kinematics import DOWN, Pose
 from envs.franka.workcell import at_rest, clip_joints, new_spec
+from envs.mujoco.parts import (
+    INVISIBLE,
+    add_box,
+    add_capsule,
+    add_cylinder,
+    add_hinge,
+    add_plane,
+    add_slide,
+    add_sphere,
+)
 from envs.mujoco.scene import View, make_env
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
@@ -60,9 +69,7 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
     for side in FINGERS:
         _add_finger(link, side)
-    spec.worldbody.add_geom(
-        name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1], rgba=[0, 0, 0, 0], **NO_CONTACT
-    )
+    add_plane(spec, "table")
     add_scenery(spec)
     _add_puck(spec, theta["object_mass"])
     _add_pair(spec, "table", "puck_base", theta["table_friction"], spin=theta["table_friction"] * PUCK_RADIUS * 2 / 3)
@@ -183,55 +190,25 @@ def finger_xy(side: int) -> tuple[float, float]:
 
 
 def _add_finger(link: mujoco.MjsBody, side: int) -> None:
-    x, y = finger_xy(side)
-    link.add_geom(
-        name=FINGERS[side],
-        type=mujoco.mjtGeom.mjGEOM_SPHERE,
-        pos=[x, y, arm.TCP],
-        size=[FINGER_RADIUS, 0, 0],
-        mass=0.015,
-        rgba=[0.1, 0.1, 0.12, 1],
-        **NO_CONTACT,
-    )
-    link.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-        fromto=[x, y, arm.FLANGE + 0.07, x, y, arm.TCP],
-        size=[FINGER_RADIUS, 0, 0],
-        mass=0,
-        rgba=[0.1, 0.1, 0.12, 1],
-        **NO_CONTACT,
-    )
+    (x, y), dark = finger_xy(side), [0.1, 0.1, 0.12, 1]
+    add_sphere(link, FINGER_RADIUS, name=FINGERS[side], pos=[x, y, arm.TCP], mass=0.015, rgba=dark)
+    add_capsule(link, FINGER_RADIUS, fromto=[x, y, arm.FLANGE + 0.07, x, y, arm.TCP], mass=0, rgba=dark)
 
 
 def _add_puck(spec: mujoco.MjSpec, mass: float) -> None:
     """A disc that slides and spins but does not tilt: one contact with torsional friction stands for its whole face."""
     body = spec.worldbody.add_body(name="puck", pos=[0, 0, PUCK_HALF_HEIGHT])
     for axis in np.eye(3)[:2]:
-        body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+        add_slide(body, axis)
     # Weight, in a scene without gravity: a spring of 1 N/m whose rest length is mass * g away.
-    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], stiffness=1.0, springref=-mass * GRAVITY)
-    body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
-    body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        size=[PUCK_RADIUS, PUCK_HALF_HEIGHT, 0],
-        mass=mass,
-        rgba=[0.85, 0.25, 0.2, 1],
-        **NO_CONTACT,
-    )
-    invisible = {"mass": 0, "rgba": [0, 0, 0, 0], **NO_CONTACT}
-    foot = PUCK_HALF_HEIGHT / 2
-    body.add_geom(
-        name="puck_base",
-        type=mujoco.mjtGeom.mjGEOM_SPHERE,
-        pos=[0, 0, foot - PUCK_HALF_HEIGHT],
-        size=[foot, 0, 0],
-        **invisible,
-    )
+    add_slide(body, [0, 0, 1], stiffness=1.0, springref=-mass * GRAVITY)
+    add_hinge(body, [0, 0, 1])
+    add_cylinder(body, PUCK_RADIUS, PUCK_HALF_HEIGHT, mass=mass, rgba=[0.85, 0.25, 0.2, 1])
+    hidden, foot = {"mass": 0, "rgba": INVISIBLE}, PUCK_HALF_HEIGHT / 2
+    add_sphere(body, foot, name="puck_base", pos=[0, 0, foot - PUCK_HALF_HEIGHT], **hidden)
     # The side as the fingers feel it: a sphere against a vertical capsule is exact in every backend, a sphere against a
     # cylinder is not.
-    body.add_geom(
-        name="puck_side", type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[PUCK_RADIUS, PUCK_HALF_HEIGHT, 0], **invisible
-    )
+    add_capsule(body, PUCK_RADIUS, PUCK_HALF_HEIGHT, name="puck_side", **hidden)
 
 
 def _add_pair(spec: mujoco.MjSpec, geom1: str, geom2: str, friction: float, *, spin: float = 0.0) -> None:
@@ -246,9 +223,6 @@ def add_scenery(spec: mujoco.MjSpec) -> None:
     """What only a viewer sees of the table: its top, which ends at the edge, and the line of the goal."""
     half = (TABLE_ORIGIN + EDGE + 0.25) / 2
     wood, line = [0.78, 0.66, 0.5, 1], [0.95, 0.85, 0.2, 1]
-    box = mujoco.mjtGeom.mjGEOM_BOX
-    world = spec.worldbody
-    size = [half, TABLE_HALF_WIDTH, 0.0199]
-    world.add_geom(type=box, pos=[half - 0.25, 0, -0.02], size=size, rgba=wood, **NO_CONTACT)
+    add_box(spec.worldbody, [half, TABLE_HALF_WIDTH, 0.0199], pos=[half - 0.25, 0, -0.02], rgba=wood)
     x = TABLE_ORIGIN + EDGE - TOLERANCE / 2
-    world.add_geom(type=box, pos=[x, 0, 0], size=[TOLERANCE / 2, TABLE_HALF_WIDTH, 0.0005], rgba=line, **NO_CONTACT)
+    add_box(spec.worldbody, [TOLERANCE / 2, TABLE_HALF_WIDTH, 0.0005], pos=[x, 0, 0], rgba=line)
