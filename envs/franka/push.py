@@ -131,8 +131,8 @@ def ready(key: Key, height: float = HEIGHT) -> Array:
 def target(qpos: Array, action: Array, height: float = HEIGHT) -> Array:
     """[7] joint targets that move the hand by `action` * 5 cm from where it is, in its plane and workspace."""
     joints = qpos[: arm.N_JOINTS]
-    here = kinematics.forward(joints).position[:2] - jnp.array([TABLE_ORIGIN, 0.0])
-    goal = jnp.clip(here + STEP * action, jnp.asarray(WORKSPACE[0]), jnp.asarray(WORKSPACE[1]))
+    hand = kinematics.forward(joints).position[:2] - jnp.array([TABLE_ORIGIN, 0.0])
+    goal = jnp.clip(hand + STEP * action, jnp.asarray(WORKSPACE[0]), jnp.asarray(WORKSPACE[1]))
     return clip_joints(kinematics.solve(joints, _pose(goal, height), iterations=3, posture=0.05))
 
 
