@@ -33,8 +33,8 @@ def speed(task: str, impl: Impl, members: int, *, width: int, updates: int, repe
     A run steps its simulators, 25 by default, once before as many updates follow. updates/bare: of a run that learns
     from what its simulators left before. simulators_share: of a run's time, by how much that one is faster.
     """
-    impl = choose_impl(impl)
-    env, method = envs.make(task, impl), get_method(METHOD, "fixed")
+    engine = choose_impl(impl)
+    env, method = envs.make(task, engine), get_method(METHOD, "fixed")
     agent = method.build(replace(method.config, hidden=(width, width)), env)
     schedule = Schedule(buffer=REPLAY, chunk_updates=updates)
     pools = real_worlds(env, [gaps.load(env, SIM)] * members, jax.random.key(0))
@@ -44,7 +44,7 @@ def speed(task: str, impl: Impl, members: int, *, width: int, updates: int, repe
     bare = _by_hand(env, method.config, width, keys, schedule.updates_per_chunk)
     run_s, idle_s, bare_s = fastest_in_turns((run, idle, bare), repeats=repeats)
     count = members * schedule.updates_per_chunk
-    line = {"task": task, "impl": impl, "members": members, "width": width}
+    line = {"task": task, "impl": engine, "members": members, "width": width}
     line |= {"updates_per_s": count / run_s, "bare_per_s": count / bare_s, "run/bare": bare_s / run_s}
     line |= {"updates/bare": bare_s / idle_s, "simulators_share": 1 - idle_s / run_s}
     return line | {"compile_s": compiled.compile_s, "memory_mb": compiled.memory_mb}

@@ -45,8 +45,8 @@ def speed(task: str, impl: Impl, worlds: int, *, control_steps: int, repeats: in
     `mjx.step` (impl jax), of MuJoCo Warp without JAX (warp), of `mujoco.rollout` on all cores (c). mjx_per_s: with
     Warp, also of `mjx.step(impl="warp")`.
     """
-    began, impl = time.perf_counter(), choose_impl(impl)
-    env, scene = envs.make(task, impl), envs.scene(task)
+    began, engine = time.perf_counter(), choose_impl(impl)
+    env, scene = envs.make(task, engine), envs.scene(task)
     pool = envs.sample_worlds(env, jax.random.key(0), POOL)
     reset = ahead(lambda pool, key: launch(env, pool, key, worlds, ()), (pool, jax.random.key(1)))
     fresh = reset.call(pool, jax.random.key(1))
@@ -59,17 +59,17 @@ def speed(task: str, impl: Impl, worlds: int, *, control_steps: int, repeats: in
     reset_s = fastest(lambda: reset.call(pool, jax.random.key(1)), repeats=repeats)
     steps = worlds * control_steps * scene.substeps
     episode_s = env.episode_length / control_steps * play_s + reset_s
-    line: dict[str, Any] = {"task": task, "impl": impl, "worlds": worlds}
+    line: dict[str, Any] = {"task": task, "impl": engine, "worlds": worlds}
     line["env_per_s"] = worlds * env.episode_length * scene.substeps / episode_s
     host = scene.build({p.name: p.nominal for p in scene.parameters}).compile()
-    if impl == "warp":
+    if engine == "warp":
         host.opt.iterations = engine_warp.iterations(host)  # the references solve as exactly as the environment does
-    if impl != "c":
+    if engine != "c":
         with _nothing_collected():
-            mjx_per_s = steps / _mjx_alone(host, impl, window, scene.substeps, repeats).seconds
-        line |= {"mjx_per_s": mjx_per_s} if impl == "warp" else {"bare_per_s": mjx_per_s}
-    if impl != "jax":
-        alone = {"c": _c_alone, "warp": _warp_alone}[impl]
+            mjx_per_s = steps / _mjx_alone(host, engine, window, scene.substeps, repeats).seconds
+        line |= {"mjx_per_s": mjx_per_s} if engine == "warp" else {"bare_per_s": mjx_per_s}
+    if engine != "jax":
+        alone = {"c": _c_alone, "warp": _warp_alone}[engine]
         line["bare_per_s"] = steps / alone(host, window, scene.substeps, repeats)
     line["env/bare"] = line["env_per_s"] / line["bare_per_s"]
     line |= {"reset_s": reset_s, "compile_s": play.compile_s, "memory_mb": play.memory_mb}
@@ -153,7 +153,8 @@ def _warp_alone(host: mujoco.MjModel, window: Window, substeps: int, repeats: in
     if wp.get_device().is_cuda:
         with wp.ScopedCapture() as capture:
             step()
-        step = functools.partial(wp.capture_launch, capture.graph)
+        graph: Any = capture.graph
+        step = functools.partial(wp.capture_launch, graph)
 
     def run() -> None:
         for place, values in zip((data.qpos, data.qvel, data.qacc_warmstart), start, strict=True):
