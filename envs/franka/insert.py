@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Entry, Env, Parameter
+from envs.base import Entry, Parameter
 from envs.franka import arm, kinematics, workcell
 from envs.franka.kinematics import DOWN, Pose
 from envs.franka.workcell import at_rest, clip_joints, new_spec
-from envs.mujoco.parts import INVISIBLE, add_box, add_cylinder, add_sphere
-from envs.mujoco.scene import View, make_env
+from envs.mujoco.parts import INVISIBLE, add_box, add_cylinder, add_pair, add_sphere
+from envs.mujoco.scene import View
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -47,6 +47,10 @@ START_LOW, START_HIGH = np.array([-0.05, -0.05, 0.05]), np.array([0.05, 0.05, 0.
 # s, servo damping over stiffness, more than the other tasks': the joints of a soft servo lag unequally, and a straight
 # descent of 2 cm then bends sideways by 2 mm (1/20 s), 1.3 mm (1/16 s) or 1 mm (1/12 s, which reaches only 17 mm).
 DAMPING_TIME = 1 / 16
+# The contact stiffens over 0.5 mm behind the surface, so the opening keeps its size for a leg that does not press, and
+# 100 N sink in by 0.4 mm. Newton's method then converges in 4 iterations; over 0.2 mm it needs 20, and with 4 the leg
+# sinks in by 3 mm.
+WOOD = (0.0, 0.9, 0.0005, 0.5, 2.0)
 NV = arm.N_JOINTS
 
 PARAMETERS = (
@@ -71,7 +75,7 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     _add_part(spec, theta)
     for ball in ("tip", "shaft"):
         for wall in range(4):
-            _add_pair(spec, ball, f"wall{wall}", theta["part_friction"])
+            add_pair(spec, ball, f"wall{wall}", theta["part_friction"], solimp=WOOD)
     return spec
 
 
@@ -156,11 +160,6 @@ SCENE = workcell.scene(
 )
 
 
-def make(impl: str = "auto") -> Env:
-    """The insertion task."""
-    return make_env(SCENE, impl)
-
-
 def _tip(joints: Array) -> Array:
     """[3] m, base frame: the leg's tip."""
     return kinematics.forward(joints, jnp.array([0.0, 0.0, arm.TCP + GRASP])).position
@@ -221,11 +220,3 @@ def _add_scenery(spec: mujoco.MjSpec, hole: mujoco.MjsBody, hole_radius: float) 
     add_box(spec.worldbody, [0.5, 0.45, 0.02], pos=[0.3, 0, -0.024], rgba=bench)
     add_box(hole, [PART_HALF, PART_HALF, 0.01], pos=[*-HOLE_OFFSET, -0.0105], mass=0, rgba=part)
     add_cylinder(hole, hole_radius, 0.005, pos=[0, 0, -0.0052], mass=0, rgba=dark)
-
-
-def _add_pair(spec: mujoco.MjSpec, ball: str, wall: str, friction: float) -> None:
-    pair = spec.add_pair(geomname1=ball, geomname2=wall, condim=3, friction=[friction, friction, 0.0, 1e-4, 1e-4])
-    # The contact stiffens over 0.5 mm behind the surface, so the opening keeps its size for a leg that does not press,
-    # and 100 N sink in by 0.4 mm. Newton's method then converges in 4 iterations; over 0.2 mm it needs 20, and with 4
-    # the leg sinks in by 3 mm.
-    pair.solimp = [0.0, 0.9, 0.0005, 0.5, 2.0]

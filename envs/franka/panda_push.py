@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Entry, Env, Parameter
+from envs.base import Entry, Parameter
 from envs.franka.armless import table_spec
 from envs.franka.rotations import inverse, turned
-from envs.mujoco.parts import add_box, add_servo, add_slide
-from envs.mujoco.scene import Scene, View, make_env
+from envs.mujoco.parts import add_box, add_pair, add_servo, add_slide
+from envs.mujoco.scene import Scene, View
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -57,8 +57,8 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     cube.add_freejoint()
     add_box(cube, CUBE, name="cube", mass=theta["cube_mass"], rgba=_CUBE)
     _add_mark(spec)
-    _add_pair(spec, "table", "cube", theta["table_friction"])
-    _add_pair(spec, "fingers", "cube", theta["finger_friction"])
+    add_pair(spec, "table", "cube", theta["table_friction"], 0.005)
+    add_pair(spec, "fingers", "cube", theta["finger_friction"], 0.005)
     return spec
 
 
@@ -172,11 +172,6 @@ SCENE = Scene(
 )
 
 
-def make(impl: str = "auto") -> Env:
-    """The task."""
-    return make_env(SCENE, impl)
-
-
 def _state(tip: Array, speed: Array, cube: Array, moving: Array, mark: Array) -> PhysicsState:
     """Servos that have arrived. tip, speed: [3] of the fingertip. cube: [7], moving: [6], as MuJoCo has them."""
     qvel = jnp.concatenate([speed, moving, jnp.zeros(2)])
@@ -202,10 +197,6 @@ def _add_mark(spec: mujoco.MjSpec) -> None:
     for axis in np.eye(3)[:2]:
         add_slide(body, axis)
     add_box(body, CUBE, mass=1.0, rgba=_MARK)
-
-
-def _add_pair(spec: mujoco.MjSpec, one: str, other: str, friction: float) -> None:
-    spec.add_pair(geomname1=one, geomname2=other, condim=3, friction=[friction, friction, 0.005, 1e-4, 1e-4])
 
 
 def _quaternion(angles: Array) -> Array:

@@ -9,11 +9,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Env
 from envs.franka import arm, push, soft
 from envs.franka.workcell import at_rest
 from envs.mujoco.parts import INVISIBLE, add_slide, add_sphere
-from envs.mujoco.scene import Scene, make_env
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -123,8 +121,3 @@ REAL = {
         SCENE, "towel", height=push.HEIGHT, build=build, initial=initial, place=_place, lie=_lie, dress=dress
     )
 }
-
-
-def make(impl: str = "auto", scene: Scene = SCENE) -> Env:
-    """The task, in simulation or in its real scene."""
-    return make_env(scene, impl)

@@ -46,6 +46,14 @@ def add_plane(spec: mujoco.MjSpec, name: str, **more: Any) -> None:
     spec.worldbody.add_geom(name=name, type=plane, size=[2, 2, 0.1], rgba=INVISIBLE, **more, **NO_CONTACT)
 
 
+def add_pair(
+    spec: mujoco.MjSpec, one: str, other: str, sliding: float, spin: float = 0.0, condim: int = 3, **more: Any
+) -> None:
+    """Lets two geoms touch. sliding: friction. spin: m, torsional friction, with a `condim` of 4."""
+    friction = [sliding, sliding, spin, 1e-4, 1e-4]
+    spec.add_pair(geomname1=one, geomname2=other, condim=condim, friction=friction, **more)
+
+
 def add_slide(body: mujoco.MjsBody, axis: Any, **more: Any) -> mujoco.MjsJoint:
     """A joint along an axis [3]."""
     return body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis, **more)
