@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Literal
 from envs import extend, gaps
 from envs.files import Count
 from envs.gaps import SIM
+from envs.scales import D4RL
 from envs.types import UserError, unknown
 from experiments.hybrid import arguments, hybrid
 from experiments.runner import cells, cli
@@ -310,7 +311,7 @@ def tables(args: CompareHybridArgs, results: "Results") -> str:
     """The tables as Markdown."""
     from sgft_jax.analysis import hybrid as analysis
 
-    scale = " on D4RL's scale" if results.task in analysis.BOUNDS else ""
+    scale = " on D4RL's scale" if results.task in D4RL else ""
     words = {"score": _SCORES[args.score], "seeds": args.seeds, "scale": scale, "reference": args.reference}
     words["schedule"] = describe(args.schedule)
     parts = [f"# {results.task}", LEGEND.format(**words), analysis.headline(results)]

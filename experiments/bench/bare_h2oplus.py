@@ -5,6 +5,7 @@ depends on is left out: each network reads only the rows whose errors count. A t
 parameters as the learner.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -44,8 +45,8 @@ class Bare(NamedTuple):
 def init(key: Key, hidden: tuple[int, ...], obs_dim: int, act_dim: int) -> Bare:
     """A fresh agent of those sizes."""
     keys, both = jax.random.split(key, 5), obs_dim + act_dim
-    plain = lambda key, inputs, outputs: layers(key, inputs, outputs, hidden, layer_norm=False)  # noqa: E731
-    critic = layers(keys[1], both, 1, hidden, layer_norm=False, stack=2)
+    plain = functools.partial(layers, hidden=hidden, layer_norm=False)
+    critic = plain(keys[1], both, 1, stack=2)
     return Bare(
         actor=trained((plain(keys[0], obs_dim, 2 * act_dim), jnp.float32(1.0), jnp.float32(-1.0))),
         critic=trained(critic),

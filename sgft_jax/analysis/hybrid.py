@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from envs.scales import D4RL, normalised
 from sgft_jax.analysis.scoreboard import improvement
 from sgft_jax.analysis.tables import NONE, markdown, number, plain
-from sgft_jax.hybrid.scores import BOUNDS, normalised, shown
+from sgft_jax.hybrid.scores import shown
 from sgft_jax.math.stats import Interval, bootstrap_interval, mean, rank_correlation
 
 EVERY = ""  # data or simulator of a method that sees none
@@ -173,7 +174,7 @@ def overall(results: Results, method: str, data: str) -> Interval | None:
 
 def rescaled(task: str, scores: np.ndarray) -> np.ndarray:
     """[n] on D4RL's scale, unchanged for a task that has none."""
-    return np.array([normalised(task, x) for x in scores.tolist()]) if task in BOUNDS else scores
+    return np.array([normalised(task, x) for x in scores.tolist()]) if task in D4RL else scores
 
 
 def _spread(scores: np.ndarray | None, score: str) -> str:
