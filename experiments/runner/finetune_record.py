@@ -134,7 +134,7 @@ class Record:
         chosen = "" if best is None else f"; best policy by the training rollouts {tables.plain(best.mean(), score)}"
         print(
             f"{self.gap.name}: {tables.words(score)} on the real system {before} before -> {after} after "
-            f"{curve.rollouts[-1]} rollouts; deepest fall below the start {tables.plain(deepest_fall(curve), score)}"
+            f"{curve.x[-1]} rollouts; deepest fall below the start {tables.plain(deepest_fall(curve), score)}"
             f"{chosen}"
         )
 

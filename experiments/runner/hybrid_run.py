@@ -19,11 +19,11 @@ from envs.rollout import Episode
 from envs.types import PyTree, UserError
 from experiments.runner import logged
 from experiments.runner.evaluation import play, scores
-from experiments.runner.hybrid_args import NO_SIMULATOR, VOLATILE, HybridArgs, data_name, gaps_of, run_folder
+from experiments.runner.hybrid_args import VOLATILE, HybridArgs, gaps_of, run_folder
 from experiments.runner.memory import reserve
 from experiments.runner.video import film_episode
 from sgft_jax.analysis import figures
-from sgft_jax.analysis.hybrid import Results, outcome
+from sgft_jax.analysis.curves import read_curve
 from sgft_jax.datasets import logs
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.hybrid import trainer
@@ -34,6 +34,7 @@ from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
 from sgft_jax.io.priors import save_prior
 from sgft_jax.io.progress import RunProgress
+from sgft_jax.io.runs import NO_SIMULATOR
 from sgft_jax.math.stats import bootstrap_interval, mean
 from sgft_jax.stacking import join, member, part
 from sgft_jax.systems.simulated import Simulated
@@ -221,7 +222,7 @@ class _Run:
             lines = read_jsonl(folder / EVAL)
             summary = self._summary(lines, gap)
             write_summary(folder, summary)
-            self._draw(folder, lines, gap)
+            _draw(folder)
             if self.args.video:
                 print(self._film(folder, member(member(filmed(), i * len(self.seeds)), 0)))
             self._say(folder, gap, summary)
@@ -261,15 +262,6 @@ class _Run:
             "measures": others,
         }
 
-    def _draw(self, folder: Path, lines: list[dict[str, Any]], gap: Gap) -> None:
-        """The learning curve. lines: the evaluations."""
-        data = "" if self.data is None or self.args.data is None else data_name(self.args.data)
-        name, simulator = self.method.name, "none" if gap.name == NO_SIMULATOR else gap.name
-        own = outcome(name, data, simulator, lines)
-        results = Results(self.env.name, self.env.score, [data], [simulator], [name], [own])
-        title = " on ".join(filter(None, [self.env.name, data]))
-        figures.hybrid_curves(folder / "figures" / "score.png", results, data, title=title)
-
     def _film(self, folder: Path, played: Episode) -> str:
         """An episode in the real system."""
         path = folder / "videos" / f"seed-{self.seeds[0]}.mp4"
@@ -287,3 +279,10 @@ class _Run:
         for name, values in summary["measures"].items():
             print(f"  {name}: {np.mean(values):.3g} (std over seeds {np.std(values):.2g})")
         print(f"results: {folder}  (policy/, summary.json, eval.jsonl, figures/)")
+
+
+def _draw(folder: Path) -> None:
+    """The learning curve of a finished run."""
+    curve = read_curve(folder)
+    title = " on ".join(filter(None, [curve.task, curve.data]))
+    figures.learning_curves(folder / "figures/score.png", {f"simulator: {curve.gap or 'none'}": [curve]}, title=title)

@@ -228,7 +228,7 @@ def _cells(args: FactorialArgs, curves: "dict[Levels, Curve]") -> str:
             tables.plain(deepest_fall(curve), curve.score),
             tables.number(more, curve.score),
         ])  # fmt: skip
-    rollouts = ", ".join(str(n) for n in curves[levels].rollouts)
+    rollouts = ", ".join(str(n) for n in curves[levels].x)
     head = ("cell", f"mean after {rollouts} rollouts", "area", "fall of the mean", "area more than with neither")
     return tables.markdown(head, lines)
 

@@ -155,7 +155,6 @@ def played_on(args: ScoreboardArgs) -> "Played":
 
 def _runs_on(args: ScoreboardArgs, strata: Mapping[str, str]) -> "Played":
     from sgft_jax.analysis.curves import read_data, read_runs
-    from sgft_jax.analysis.tables import spec
 
     curves = [c for c in (read_data(args.data) if args.data else read_runs(args.out)).curves if c.gap in strata]
     for option, field, wanted in (("--tasks", "task", args.tasks), ("--priors", "priors", args.priors)):
@@ -165,10 +164,10 @@ def _runs_on(args: ScoreboardArgs, strata: Mapping[str, str]) -> "Played":
         curves = [curve for curve in curves if not wanted or getattr(curve, field) in wanted]
     found: Played = {}
     for curve in curves:
-        own = found.setdefault(spec(curve), {}).setdefault(strata[curve.gap], {})
+        own = found.setdefault(curve.spec, {}).setdefault(strata[curve.gap], {})
         if (name := f"{curve.task}/{curve.gap}") in own:
             raise UserError(
-                f"{args.data or args.out}: {spec(curve)} ran on {name} with several sets of seeds or priors; keep "
+                f"{args.data or args.out}: {curve.spec} ran on {name} with several sets of seeds or priors; keep "
                 "one, or choose with --priors"
             )
         own[name] = curve if args.seeds is None else curve.first(args.seeds)

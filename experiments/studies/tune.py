@@ -198,8 +198,8 @@ def score(trial: Trial, rollouts: int) -> Score | None:
     areas, finals = {}, []
     for cell in trial.cells:
         curve = read_curve(cell.folder)
-        inside = curve.rollouts <= rollouts
-        found = area(curve, curve.rollouts[inside])
+        inside = curve.x <= rollouts
+        found = area(curve, curve.x[inside])
         assert found is not None  # a finished run has been evaluated twice at least
         areas[gaps.title(*cell.args.real)] = found.tolist()
         finals.append(curve.values[:, inside][:, -1].mean())

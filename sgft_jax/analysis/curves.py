@@ -1,4 +1,4 @@
-"""Impure: learning curves, what fine-tuning runs scored on the real system; reads run folders and released tables.
+"""Impure: learning curves, what runs of any kind scored in the real system; reads run folders and released tables.
 
 A curve holds any score (success, return) of several members, one for each seed. Curves as arrays are `Curve.scores`, as
 a flat table `rows`.
@@ -10,19 +10,21 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from msgspec import Meta
 
-from envs import extend
+from envs import extend, gaps
 from envs.files import Count
 from envs.types import UserError
 from sgft_jax.files.csvfile import finite, read_csv, table_file, whole
+from sgft_jax.hybrid.schedule import Schedule, name_of
+from sgft_jax.hybrid.scores import measures
 from sgft_jax.io.log import EVAL, METRICS, SUMMARY, check_records, read_jsonl
-from sgft_jax.io.runs import read_config, read_own, read_starts
+from sgft_jax.io.runs import CONFIG, NO_DATA, NO_SIMULATOR, read_config, read_own, read_starts
 from sgft_jax.math.stats import ENOUGH, Interval, bootstrap_interval, mean, paired_improvement
-from sgft_jax.methods import NAMES, get_method
+from sgft_jax.methods import FIXED_NAMES, NAMES, get_method
 
 LEVEL = 0.9  # success that counts as solved
 SCORES = ("success", "return")
@@ -33,23 +35,23 @@ COLUMNS = (*IDENTITY, *_NUMBERS, *SCORES, "training")
 _EVALUATION = {"step": Count, "rollouts": Count, "robot_minutes": Annotated[float, Meta(ge=0)]}
 _UNNAMED = re.compile(r"prior|seeds?-\d+(-\d+)?")  # folders that name no set of priors
 # Of a run's options those that are in other columns, or say nothing about its outcome; paths of a machine above all.
-_LEFT_OUT = (
-    "out", "prior", "resume", "overwrite", "video", "devices", "checkpoint_every", "task", "method", "variant", "real",
-    "impl",
-)  # fmt: skip
+_LEFT_OUT = {"out", "prior", "resume", "overwrite", "video", "devices", "checkpoint_every", "impl"}
+_LEFT_OUT |= {"task", "method", "variant", "real"}
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Evaluations of one fine-tuning run on the real system; the first one is zero-shot.
+    """Evaluations of one run in the real system; the first one is before it learns anything.
 
-    task, gap, method, variant ("" for a method's defaults): what was run. priors: name of the set of priors that the
-    members began from; curves are comparable member by member where it is the same. seeds: [members]. prior: [members]
-    index into the set, -1 where unknown. rollouts, transitions: [evaluations] real ones used so far. minutes:
-    [evaluations] of robot time without resets. scores: by name, [members, evaluations], the task's own, never reshaped.
-    score: the one that summaries are of. facts: commit, hardware and options of the run, for tables of runs.
-    training: [members, evaluations] mean score of the training rollouts since the evaluation before, nan where there
-    were none; None where it is not known.
+    task, method, variant ("" for a method's defaults): what was run. gap: the real system of fine-tuning, or the
+    simulator of learning from a log, "" where the method sees none. data: the log, "" without one. priors: name of the
+    set of priors that the members began from; curves are comparable member by member where it is the same. seeds:
+    [members]. prior: [members] index into the set, -1 where unknown. x: [evaluations], in `unit`: real rollouts or
+    updates so far. transitions: [evaluations] real ones used so far, nan where nothing real is collected. minutes:
+    [evaluations] of robot time without resets. scores: by name, [members, evaluations], the task's own, never reshaped,
+    and what else it is judged by. score: the one that summaries are of. facts: commit, hardware and options of the run,
+    for tables of runs. training: [members, evaluations] mean score of the training rollouts since the evaluation
+    before, nan where there were none; None where it is not known.
     """
 
     task: str
@@ -59,13 +61,15 @@ class Curve:
     priors: str
     seeds: np.ndarray
     prior: np.ndarray
-    rollouts: np.ndarray
+    x: np.ndarray
     transitions: np.ndarray
     minutes: np.ndarray
     scores: Mapping[str, np.ndarray]
     score: str = "success"
     facts: Mapping[str, Any] = field(default_factory=dict)
     training: np.ndarray | None = None
+    data: str = ""
+    unit: Literal["rollouts", "updates"] = "rollouts"
 
     @property
     def values(self) -> np.ndarray:
@@ -73,13 +77,20 @@ class Curve:
         return self.scores[self.score]
 
     @property
+    def spec(self) -> str:
+        """The method with its variant, as commands take it: METHOD or METHOD:VARIANT."""
+        return ":".join(filter(None, [self.method, self.variant]))
+
+    @property
     def name(self) -> str:
-        """The method, with its variant if it has one."""
-        return " ".join(filter(None, [self.method, self.variant]))
+        """The method with its variant, as tables and legends have it; over updates that is a preset, as typed."""
+        return self.spec if self.unit == "updates" else self.spec.replace(":", " ", 1)
 
     @property
     def family(self) -> str:
         """The kind of method; "own" for one that does not come with the library."""
+        if self.unit == "updates":
+            return get_method(self.method, "fixed").kind if self.method in FIXED_NAMES else "own"
         return get_method(self.method).family if self.method in NAMES else "own"
 
     def of(self, score: str) -> "Curve":
@@ -88,9 +99,14 @@ class Curve:
 
     def first(self, n: int) -> "Curve":
         """The same curve with its first n members alone; with all of them where there are fewer."""
-        scores = {name: values[:n] for name, values in self.scores.items()}
-        training = None if self.training is None else self.training[:n]
-        return replace(self, seeds=self.seeds[:n], prior=self.prior[:n], scores=scores, training=training)
+        return self.members(range(min(n, len(self.seeds))))
+
+    def members(self, indices: Sequence[int]) -> "Curve":
+        """The same curve of these members, in this order."""
+        chosen = np.asarray(indices, int)
+        scores = {name: values[chosen] for name, values in self.scores.items()}
+        training = None if self.training is None else self.training[chosen]
+        return replace(self, seeds=self.seeds[chosen], prior=self.prior[chosen], scores=scores, training=training)
 
 
 class Found(NamedTuple):
@@ -104,21 +120,21 @@ class Found(NamedTuple):
 
 
 def common_grid(curves: Iterable[Curve]) -> np.ndarray:
-    """Rollouts at which every one of the curves was evaluated, in order."""
-    first, *others = (set(curve.rollouts.tolist()) for curve in curves)
+    """The x at which every one of the curves was evaluated, in order."""
+    first, *others = (set(curve.x.tolist()) for curve in curves)
     return np.array(sorted(first.intersection(*others)), int)
 
 
-def at(curve: Curve, rollouts: int) -> np.ndarray | None:
-    """[members] score at the evaluation after exactly so many rollouts; None where there was none."""
-    (index,) = np.nonzero(curve.rollouts == rollouts)
+def at(curve: Curve, x: int) -> np.ndarray | None:
+    """[members] score at the evaluation at exactly this x; None where there was none."""
+    (index,) = np.nonzero(curve.x == x)
     return curve.values[:, index[-1]] if index.size else None
 
 
 def area(curve: Curve, grid: Sequence[int] | np.ndarray) -> np.ndarray | None:
-    """[members] mean score over the rollouts from the first to the last of a grid: area by trapezoids over length.
+    """[members] mean score from the first to the last x of a grid: area by trapezoids over length.
 
-    grid: rollouts, increasing, the same for all curves that are compared; None unless the curve was evaluated at two or
+    grid: of x, increasing, the same for all curves that are compared; None unless the curve was evaluated at two or
     more of them and at all of them. High where learning is early and lasts.
     """
     points = [point for n in grid if (point := at(curve, int(n))) is not None]
@@ -143,7 +159,7 @@ def zero_shot(curve: Curve, others: Iterable[Curve]) -> np.ndarray | None:
     `Online.zero_shot`). None if it was not evaluated there.
     """
     for other in sorted(others, key=lambda other: other is not curve):
-        if other.method in NAMES and get_method(other.method).zero_shot and other.rollouts[0] == 0:
+        if other.method in NAMES and get_method(other.method).zero_shot and other.x[0] == 0:
             found = dict(zip(other.seeds.tolist(), other.values[:, 0].tolist(), strict=True))
             if set(curve.seeds.tolist()) <= found.keys():
                 return np.array([found[seed] for seed in curve.seeds.tolist()])
@@ -154,7 +170,7 @@ def training_score(curve: Curve) -> np.ndarray | None:
     """[members] mean score of all training rollouts: what the robot lived through. None where it is not known."""
     if curve.training is None:
         return None
-    weights = np.diff(curve.rollouts, prepend=0) * np.isfinite(curve.training)
+    weights = np.diff(curve.x, prepend=0) * np.isfinite(curve.training)
     played = weights.sum(1)
     return np.nansum(curve.training * weights, axis=1) / played if played.all() else None
 
@@ -212,7 +228,7 @@ def describe(curve: Curve) -> dict[str, Any]:
 
 def _point(curve: Curve, i: int) -> dict[str, Any]:
     found: dict[str, Any] = {
-        "rollouts": int(curve.rollouts[i]),
+        "rollouts": int(curve.x[i]),
         "transitions": int(curve.transitions[i]),
         "robot_minutes": float(curve.minutes[i]),
     }
@@ -260,20 +276,31 @@ def _rank(curve: Curve) -> tuple[bool, int, str]:
 
 
 def read_curve(folder: Path) -> Curve:
-    """The learning curve of one fine-tuning run <task>/<gap>/<method>[_<variant>]/<seeds>; UserError if it has none."""
+    """The learning curve of one run of `experiments.finetune` or `experiments.hybrid`; UserError if it has none.
+
+    Their folders are finetune/<task>/<gap>/<method>[_<variant>]/<seeds> and
+    hybrid/<task>/<simulator>/<data>/<method>[_<preset>]/<seeds>.
+    """
     records = read_jsonl(folder / EVAL) if (folder / EVAL).exists() else []
     if not records:
         raise UserError(f"{folder / EVAL}: holds no evaluation yet")
+    config, start = read_config(folder), last_start(folder)
+    read = _over_updates if read_own(folder / CONFIG).get("kind") == "hybrid" else _over_rollouts
+    return read(folder, records, config, start)
+
+
+def _over_rollouts(
+    folder: Path, records: list[dict[str, Any]], config: Mapping[str, Any], start: Mapping[str, Any]
+) -> Curve:
+    """The curve of a fine-tuning run. records: of `eval.jsonl`. config: its options. start: its last one."""
     names = [name for name in SCORES if name in records[0]] or [SCORES[0]]
     check_records(folder / EVAL, records, _EVALUATION | dict.fromkeys(names, list[float]))
     summary = read_own(folder / SUMMARY)
     if (score := summary.get("score") or _judged_by(records, names)) not in names:
         raise UserError(f"{folder / SUMMARY}: score is {score!r}, {EVAL} has {', '.join(names)}; put the files back")
-    config, start = read_config(folder), last_start(folder)
-    column = lambda name: np.array([record[name] for record in records])  # noqa: E731
-    scores = {name: column(name).T for name in names}
-    variant = config.get("variant") or ""
-    digests, seeds = start.get("priors", []), config.get("seed", 0) + np.arange(len(next(iter(scores.values()))))
+    scores = {name: _column(records, name).T for name in names}
+    variant, rollouts = config.get("variant") or "", _column(records, "rollouts")
+    digests, seeds = start.get("priors", []), config.get("seed", 0) + np.arange(len(scores[score]))
     return Curve(
         task=folder.parent.parent.parent.name,
         gap=folder.parent.parent.name,
@@ -282,20 +309,92 @@ def read_curve(folder: Path) -> Curve:
         priors=set_name(Path(config.get("prior") or config.get("preset") or ""), digests),
         seeds=seeds,
         prior=seeds % len(digests) if digests else np.full(len(seeds), -1),
-        rollouts=column("rollouts"),
-        transitions=column("step"),
-        minutes=column("robot_minutes"),
+        x=rollouts,
+        transitions=_column(records, "step"),
+        minutes=_column(records, "robot_minutes"),
         scores=scores,
         score=score,
         facts=_facts(summary, config, start),
-        training=_training(folder / METRICS, column("rollouts")),
+        training=_training(folder / METRICS, rollouts),
+    )
+
+
+def _over_updates(
+    folder: Path, records: list[dict[str, Any]], config: Mapping[str, Any], start: Mapping[str, Any]
+) -> Curve:
+    """The curve of a run from a fixed log; arguments as in `_over_rollouts`. Raises UserError for an unfinished one."""
+    others = measures(records[0])
+    check_records(folder / EVAL, records, {"step": Count, **dict.fromkeys(("score", *others), list[float])})
+    summary = read_own(
+        folder / SUMMARY, {"task": str, "score": str, "seeds": list[int], "last": list[float], "late": list[float]}
+    )
+    if not summary:
+        raise UserError(f"{folder}: unfinished, {records[-1]['step']} updates")
+    schedule, variant = Schedule(**config["schedule"]), config["variant"]
+    data = folder.parent.parent.name
+    return updates_curve(
+        summary["task"],
+        "" if config["gap"] == NO_SIMULATOR else gaps.title(config["gap"]),
+        folder.parent.name.removesuffix(f"_{variant}"),
+        variant,
+        data="" if data == NO_DATA else data,
+        seeds=summary["seeds"],
+        updates=_column(records, "step"),
+        scores={summary["score"]: _column(records, "score").T, **{name: _column(records, name).T for name in others}},
+        facts={
+            **origin(start),
+            "real": gaps.title(config["real"]),
+            "schedule": name_of(schedule),
+            "updates": schedule.updates_in_all,
+        },
+    )
+
+
+def _column(records: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
+    """[records, ...] of one name."""
+    return np.array([record[name] for record in records])
+
+
+def updates_curve(
+    task: str,
+    gap: str,
+    method: str,
+    variant: str,
+    *,
+    data: str,
+    seeds: Sequence[int],
+    updates: np.ndarray,
+    scores: Mapping[str, np.ndarray],
+    facts: Mapping[str, Any] | None = None,
+) -> Curve:
+    """The curve of a run that collects nothing real. scores: [members, evaluations], the first one is what counts.
+
+    updates: [evaluations]. The others as in `Curve`.
+    """
+    unknown, nothing = np.full(len(seeds), -1), np.full(len(updates), np.nan)
+    return Curve(
+        task=task,
+        gap=gap,
+        method=method,
+        variant=variant,
+        priors="",
+        seeds=np.asarray(seeds),
+        prior=unknown,
+        x=updates,
+        transitions=nothing,
+        minutes=nothing,
+        scores=scores,
+        score=next(iter(scores)),
+        facts=facts or {},
+        data=data,
+        unit="updates",
     )
 
 
 def _judged_by(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
     """By which score a run is judged that has no summary yet to name it: the one that `score` repeats."""
-    repeated = lambda name: all(record.get("score") == record[name] for record in records)  # noqa: E731
-    return next(filter(repeated, names), names[0])
+    repeated = (name for name in names if all(record.get("score") == record[name] for record in records))
+    return next(repeated, names[0])
 
 
 def _training(path: Path, rollouts: np.ndarray) -> np.ndarray | None:
@@ -314,9 +413,15 @@ def _training(path: Path, rollouts: np.ndarray) -> np.ndarray | None:
 
 
 def make_curve(
-    evaluations: Mapping[int, Any], task: Any, *, gap: str, method: str, seeds: Sequence[int], variant: str = "",
+    evaluations: Mapping[int, Any],
+    task: Any,
+    *,
+    gap: str,
+    method: str,
+    seeds: Sequence[int],
+    variant: str = "",
     transitions: Sequence[float] | None = None,
-) -> Curve:  # fmt: skip
+) -> Curve:
     """A curve from Python alone, without a run folder.
 
     evaluations: the real rollouts made so far -> what `sgft_jax.evaluate` played then, episodes [members, n]. task: the
@@ -326,18 +431,25 @@ def make_curve(
     from envs.rollout import counted  # brings JAX, which reading curves does without
 
     played, rollouts = list(evaluations.values()), np.array(list(evaluations))
-    mean_of = lambda each: np.stack([np.asarray(each(x)).mean(1) for x in played], axis=1)  # noqa: E731
+
+    def mean_of(score: Callable[[Any], Any]) -> np.ndarray:
+        return np.stack([np.asarray(score(episodes)).mean(1) for episodes in played], axis=1)
+
     made = rollouts * task.episode_length if transitions is None else np.rint(transitions).astype(int)
     return Curve(
-        task.name, gap, method, variant, priors="",
+        task=task.name,
+        gap=gap,
+        method=method,
+        variant=variant,
+        priors="",
         seeds=np.asarray(seeds),
         prior=np.full(len(seeds), -1),
-        rollouts=rollouts,
+        x=rollouts,
         transitions=made,
         minutes=made * task.control_dt / 60,
         scores={"success": mean_of(lambda x: x.success), "return": mean_of(lambda x: counted(x)[1])},
         score=task.score,
-    )  # fmt: skip
+    )
 
 
 def read_runs(out: Path) -> Found:
@@ -354,18 +466,18 @@ def read_runs(out: Path) -> Found:
             notes.append(str(error))
             continue
         runs.setdefault(tuple(getattr(curve, name) for name in IDENTITY), []).append((curve, folder))
-        if (wanted := curve.facts.get("rollouts", 0)) > curve.rollouts[-1]:
-            notes.append(f"{folder}: unfinished, {curve.rollouts[-1]} of {wanted} rollouts")
+        if (wanted := curve.facts.get("rollouts", 0)) > curve.x[-1]:
+            notes.append(f"{folder}: unfinished, {curve.x[-1]} of {wanted} rollouts")
     together = [_together(same) for same in runs.values()]
     return Found([curve for curve, _ in together], [*notes, *(note for _, more in together for note in more)])
 
 
 def _together(same: list[tuple[Curve, Path]]) -> tuple[Curve, list[str]]:
     """The curve of runs that differ in seeds, and a line for each one that does not fit the largest."""
-    (first, home), *others = sorted(same, key=lambda run: (-len(run[0].seeds), -run[0].rollouts[-1]))
+    (first, home), *others = sorted(same, key=lambda run: (-len(run[0].seeds), -run[0].x[-1]))
     kept, notes, seeds = [first], [], set(first.seeds.tolist())
     for curve, folder in others:
-        if seeds.isdisjoint(curve.seeds.tolist()) and np.array_equal(curve.rollouts, first.rollouts):
+        if seeds.isdisjoint(curve.seeds.tolist()) and np.array_equal(curve.x, first.x):
             kept.append(curve)
             seeds.update(curve.seeds.tolist())
         else:
@@ -376,14 +488,17 @@ def _together(same: list[tuple[Curve, Path]]) -> tuple[Curve, list[str]]:
 def joined(curves: Sequence[Curve]) -> Curve:
     """One curve of the members of all, in the order of their seeds. They were evaluated after the same rollouts."""
     order = np.argsort(np.concatenate([curve.seeds for curve in curves]), kind="stable")
-    rows = lambda each: np.concatenate(list(each))[order]  # noqa: E731
-    trained = [curve.training for curve in curves]
+    trained = [curve.training for curve in curves if curve.training is not None]
+
+    def rows(parts: Iterable[np.ndarray]) -> np.ndarray:
+        return np.concatenate(list(parts))[order]
+
     return replace(
         curves[0],
         seeds=rows(curve.seeds for curve in curves),
         prior=rows(curve.prior for curve in curves),
         scores={name: rows(curve.scores[name] for curve in curves) for name in curves[0].scores},
-        training=None if any(x is None for x in trained) else rows(x for x in trained if x is not None),
+        training=rows(trained) if len(trained) == len(curves) else None,
     )
 
 
@@ -446,7 +561,7 @@ def rows(curves: Iterable[Curve]) -> Iterator[dict[str, Any]]:
         identity = {name: getattr(curve, name) for name in IDENTITY}
         for i, (seed, prior) in enumerate(zip(curve.seeds.tolist(), curve.prior.tolist(), strict=True)):
             for j, (n, used, minutes) in enumerate(
-                zip(curve.rollouts.tolist(), curve.transitions.tolist(), curve.minutes.tolist(), strict=True)
+                zip(curve.x.tolist(), curve.transitions.tolist(), curve.minutes.tolist(), strict=True)
             ):
                 axes = {"prior": prior, "seed": seed, "rollouts": n, "transitions": used, "minutes": minutes}
                 found = {name: float(curve.scores[name][i, j]) for name in scores if name in curve.scores}
@@ -479,20 +594,23 @@ def _curve(identity: tuple[str, ...], members: Mapping[int, list[Mapping[str, An
     if not scores:
         raise ValueError(f"{'/'.join(identity)} has no {' or '.join(SCORES)}")
     _check_ranges(scores.get("success"), minutes := column("minutes"))
-    missing = lambda row: row.get("training") in (None, "")  # noqa: E731 - at the first evaluation, or everywhere
-    trained = lambda row: np.nan if missing(row) else finite("training", row["training"])  # noqa: E731
-    training = np.array([[trained(row) for row in each] for each in members.values()])
+    training = np.array([[_trained(row) for row in rows] for rows in members.values()])
     return Curve(
         *identity,
         seeds=np.array(list(members)),
         prior=np.array([_prior(each[0]["prior"]) for each in members.values()]),
-        rollouts=column("rollouts", whole)[0],
+        x=column("rollouts", whole)[0],
         transitions=column("transitions", whole)[0],
         minutes=minutes[0],
         scores=scores,
         score=next(iter(scores)),
         training=training if np.isfinite(training).any() else None,
     )
+
+
+def _trained(row: Mapping[str, Any]) -> float:
+    """The score of training rollouts; nan where a cell has none: at the first evaluation, or everywhere."""
+    return np.nan if row.get("training") in (None, "") else finite("training", row["training"])
 
 
 def _check_ranges(success: np.ndarray | None, minutes: np.ndarray) -> None:
@@ -512,8 +630,8 @@ def read_data(folder: Path) -> Found:
     names = sorted({path.name.partition(".csv")[0] for path in folder.glob("curves-*.csv*")})
     files = [table_file(folder, name) for name in names]
     if not files:
-        raise UserError(f"{folder}: holds no curves-*.csv; write some from runs with: "
-                        f"python -m experiments.figures --export {folder}")  # fmt: skip
+        command = f"python -m experiments.figures --export {folder}"
+        raise UserError(f"{folder}: holds no curves-*.csv; write some from runs with: {command}")
     table = [row for path in files for row in read_csv(path, needed=(*IDENTITY, *_NUMBERS, SCORES[0]))]
     try:
         return Found(from_rows(table), [])

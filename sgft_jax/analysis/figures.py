@@ -19,10 +19,8 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import ArrayLike
 
 from sgft_jax.analysis.curves import Curve, by_prior, spread
-from sgft_jax.analysis.hybrid import Outcome, Results
 from sgft_jax.analysis.verdict import Sign
-from sgft_jax.math.stats import ENOUGH, Interval, bootstrap_interval
-from sgft_jax.methods import FIXED_NAMES, get_method
+from sgft_jax.math.stats import ENOUGH, Interval
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MOST = len(PALETTE)
@@ -65,21 +63,9 @@ class Panel:
 
 
 def learning_curves(path: Path, panels: Mapping[str, Sequence[Curve]], *, title: str) -> Path:
-    """Scores over real rollouts: a panel for each entry, by its words; see `lines`."""
+    """Scores over real rollouts or over updates: a panel for each entry, by its words; see `lines`."""
     drawn = {words: [_line(curve) for curve in curves] for words, curves in panels.items()}
-    return lines(path, drawn, {words: _rollouts(curves) for words, curves in panels.items() if curves}, title=title)
-
-
-def hybrid_curves(path: Path, results: Results, data: str, *, title: str) -> Path:
-    """Scores in the real system over updates on one data set: a panel for each simulator, a line for each method.
-
-    A method that sees no simulator, or no data, has the same line wherever it belongs.
-    """
-    panels = {}
-    for gap in results.gaps:
-        found = [results.find(method, data, gap) for method in results.methods]
-        panels[f"simulator: {gap}"] = [_line_of_updates(own, results.score) for own in found if own is not None]
-    return lines(path, panels, dict.fromkeys(panels, "updates"), title=title)
+    return lines(path, drawn, {words: _unit(curves) for words, curves in panels.items() if curves}, title=title)
 
 
 def lines(path: Path, panels: Mapping[str, Sequence[Line]], labels: Mapping[str, str], *, title: str) -> Path:
@@ -110,23 +96,19 @@ def lines(path: Path, panels: Mapping[str, Sequence[Line]], labels: Mapping[str,
 
 def _line(curve: Curve) -> Line:
     band, factor = spread(curve, curve.values), by_prior(curve)
-    return Line(curve.name, curve.family, curve.rollouts, band, curve.score, len(curve.seeds), factor)
+    return Line(curve.name, curve.family, curve.x, band, curve.score, len(curve.seeds), factor)
 
 
-def _line_of_updates(own: Outcome, score: str) -> Line:
-    name = own.method.partition(":")[0]
-    kind = get_method(name, "fixed").kind if name in FIXED_NAMES else "own"
-    return Line(own.method, kind, own.updates, bootstrap_interval(own.curve), score, len(own.curve))
-
-
-def _rollouts(curves: Sequence[Curve]) -> str:
-    """What the x axis of curves over real rollouts says."""
-    longest = max(curves, key=lambda curve: curve.rollouts[-1])
+def _unit(curves: Sequence[Curve]) -> str:
+    """What the x axis says."""
+    longest = max(curves, key=lambda curve: curve.x[-1])
+    if longest.unit == "updates":
+        return "updates"
     if np.isnan(longest.minutes[-1]):  # of several tasks, whose rollouts differ in length
         return "real rollouts"
-    each = max(int(longest.rollouts[-1]), 1)
-    seconds, steps = 60 * float(longest.minutes[-1]) / each, int(longest.transitions[-1]) // each
-    if not np.array_equal(longest.transitions, steps * longest.rollouts):  # evaluations have cost transitions, too
+    count = max(int(longest.x[-1]), 1)
+    seconds, steps = 60 * float(longest.minutes[-1]) / count, int(longest.transitions[-1]) // count
+    if not np.array_equal(longest.transitions, steps * longest.x):  # evaluations have cost transitions, too
         return "real rollouts"
     return f"real rollouts of {steps} transitions, {seconds:.3g} s"
 

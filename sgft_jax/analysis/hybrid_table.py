@@ -7,11 +7,12 @@ What else the task is judged by has rows of its own.
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
+
+import numpy as np
 
 from envs.types import UserError
-from sgft_jax.analysis.curves import SCORES
-from sgft_jax.analysis.hybrid import Outcome, outcome
+from sgft_jax.analysis.curves import SCORES, Curve, updates_curve
 from sgft_jax.analysis.release import merge
 from sgft_jax.files.csvfile import finite, read_csv, table_file, whole
 
@@ -21,57 +22,42 @@ _NEEDED = (*IDENTITY, "commit", "score", "step")
 _SEED = "seed-"
 
 
-class Run(NamedTuple):
-    """One run with all its seeds. real: where it was evaluated. schedule: its name. updates: of the whole run.
+def write(to: Path, curves: Iterable[Curve]) -> Path | None:
+    """Writes runs into hybrid.csv in the folder `to`, in place of rows of the same runs; None if there is no run.
 
-    score: "success" or "return". seeds: [seeds], those of the outcome's curve.
+    curves: over updates, as `curves.read_curve` reads them.
     """
-
-    task: str
-    real: str
-    schedule: str
-    updates: int
-    commit: str
-    score: str
-    seeds: list[int]
-    outcome: Outcome
-
-
-def write(to: Path, runs: Iterable[Run]) -> Path | None:
-    """Writes runs into hybrid.csv in the folder `to`, in place of rows of the same runs; None if there is no run."""
     to.mkdir(parents=True, exist_ok=True)
-    return merge(table_file(to, TABLE), [row for run in runs for row in _rows(run)], IDENTITY)
+    return merge(table_file(to, TABLE), [row for curve in curves for row in _rows(curve)], IDENTITY)
 
 
-def read(folder: Path) -> list[Run]:
+def read(folder: Path) -> list[Curve]:
     """The runs in hybrid.csv. Raises UserError if there is no such table, or if a cell of it cannot be read."""
     path = table_file(folder, TABLE)
     if not path.exists():
-        raise UserError(
-            f"{folder / TABLE}.csv: no such table; "
-            f"write one with: python -m experiments.compare_hybrid --export {folder}"
-        )
+        command = f"python -m experiments.compare hybrid --export {folder}"
+        raise UserError(f"{folder / TABLE}.csv: no such table; write one with: {command}")
     runs: dict[tuple[str, ...], list[Mapping[str, str]]] = {}
     for row in read_csv(path, needed=_NEEDED):
         runs.setdefault(tuple(row[name] for name in IDENTITY), []).append(row)
     try:
-        return [_run(rows) for rows in runs.values()]
+        return [_curve(rows) for rows in runs.values()]
     except ValueError as error:
         raise UserError(f"{path}: {error}; put the table back as it was") from error
 
 
-def _rows(run: Run) -> Iterator[dict[str, Any]]:
-    own = run.outcome
-    named = {"task": run.task, "real": run.real, "data": own.data, "gap": own.gap, "method": own.method}
-    named |= {"schedule": run.schedule, "updates": run.updates, "commit": run.commit}
-    for measured, curve in {run.score: own.curve, **own.measures}.items():
-        for step, values in zip(own.updates.tolist(), curve.T.tolist(), strict=True):
+def _rows(curve: Curve) -> Iterator[dict[str, Any]]:
+    facts = curve.facts
+    named = {"task": curve.task, "real": facts["real"], "data": curve.data, "gap": curve.gap, "method": curve.spec}
+    named |= {name: facts[name] for name in ("schedule", "updates", "commit")}
+    for score, values in curve.scores.items():
+        for step, numbers in zip(curve.x.tolist(), values.T.tolist(), strict=True):
             # Six digits: a mean over seeds is printed as it is in the run.
-            numbers = {f"{_SEED}{n}": f"{x:.6g}" for n, x in zip(run.seeds, values, strict=True)}
-            yield {**named, "score": measured, "step": step, **numbers}
+            members = {f"{_SEED}{n}": f"{x:.6g}" for n, x in zip(curve.seeds.tolist(), numbers, strict=True)}
+            yield {**named, "score": score, "step": step, **members}
 
 
-def _run(rows: list[Mapping[str, str]]) -> Run:
+def _curve(rows: list[Mapping[str, str]]) -> Curve:
     first = next((row for row in rows if row["score"] in SCORES), None)
     if first is None:
         raise ValueError(f"a run of {rows[0]['method']} on {rows[0]['task']} has neither success nor return")
@@ -79,18 +65,25 @@ def _run(rows: list[Mapping[str, str]]) -> Run:
     seeds = [whole("a seed", name.removeprefix(_SEED)) for name in columns]
     if not seeds:
         raise ValueError(f"a run of {first['method']} on {first['task']} has no seed")
-    lines: dict[int, dict[str, Any]] = {}
+    scores: dict[str, dict[int, list[float]]] = {first["score"]: {}}  # by name and step
     for row in rows:
-        name = "score" if row["score"] == first["score"] else row["score"]
-        step = whole("step", row["step"])
-        line = lines.setdefault(step, {"step": step})
-        line[name] = [finite(column, row[column]) for column in columns]
-    measures = [name for name in dict.fromkeys(row["score"] for row in rows) if name != first["score"]]
-    for name in ("score", *measures):
-        if any(name not in line for line in lines.values()):
-            raise ValueError(f"a run of {first['method']} on {first['task']} lacks rows of {name}")
-    own = outcome(first["method"], first["data"], first["gap"], [*lines.values()], measures=measures)
-    return Run(
-        first["task"], first["real"], first["schedule"], whole("updates", first["updates"]), first["commit"],
-        first["score"], seeds, own,
-    )  # fmt: skip
+        numbers = [finite(column, row[column]) for column in columns]
+        scores.setdefault(row["score"], {})[whole("step", row["step"])] = numbers
+    steps = list(dict.fromkeys(step for lines in scores.values() for step in lines))
+    for name, lines in scores.items():
+        if len(lines) < len(steps):
+            lacking = "score" if name == first["score"] else name
+            raise ValueError(f"a run of {first['method']} on {first['task']} lacks rows of {lacking}")
+    method, _, variant = first["method"].partition(":")
+    return updates_curve(
+        first["task"],
+        first["gap"],
+        method,
+        variant,
+        data=first["data"],
+        seeds=seeds,
+        updates=np.array(steps),
+        scores={name: np.array([lines[step] for step in steps]).T for name, lines in scores.items()},
+        facts={name: first[name] for name in ("real", "schedule", "commit")}
+        | {"updates": whole("updates", first["updates"])},
+    )

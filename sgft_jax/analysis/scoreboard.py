@@ -83,14 +83,13 @@ def row(method: str, stratum: str, played: Played, others: Iterable[Curve] = ())
     worst = max(falls, key=lambda gap: falls[gap])
     taken = [n for curve in curves if (n := transitions_until_held(curve)) is not None]
     trained = [np.nanmean(curve.training) for curve in curves if curve.training is not None]
-    over = lambda scores: bootstrap_interval(np.mean(scores, axis=0), statistic=mean)  # noqa: E731
     return Row(
         method,
         stratum,
         len(curves),
-        start=over([curve.values[:, 0] for curve in curves]),
-        area=over(_areas(played, list(played), grid)),
-        end=over([curve.values[:, -1] for curve in curves]),
+        start=_over([curve.values[:, 0] for curve in curves]),
+        area=_over(_areas(played, list(played), grid)),
+        end=_over([curve.values[:, -1] for curve in curves]),
         held=sum(bool((each[-2:] >= LEVEL).all()) for each in means.values()),
         reached=len(taken),
         transitions=float(np.median(taken)) if taken else np.nan,
@@ -102,10 +101,15 @@ def row(method: str, stratum: str, played: Played, others: Iterable[Curve] = ())
     )
 
 
+def _over(scores: Sequence[np.ndarray] | np.ndarray) -> Interval:
+    """The mean over gaps of scores [gaps, members], with its interval over members."""
+    return bootstrap_interval(np.mean(scores, axis=0), statistic=mean)
+
+
 def _policy_fall(curve: Curve, others: Sequence[Curve]) -> float:
     """How far the mean ever was below the simulator's policy; nan where that was not evaluated."""
-    system = lambda one: (one.task, one.gap, one.priors)  # noqa: E731
-    before = zero_shot(curve, [one for one in (curve, *others) if system(one) == system(curve)])
+    begun = (curve.task, curve.gap, curve.priors)
+    before = zero_shot(curve, [one for one in (curve, *others) if (one.task, one.gap, one.priors) == begun])
     return np.nan if before is None else deepest_fall(curve, before)
 
 
@@ -132,9 +136,7 @@ def pooled(played: Played) -> Curve:
     points = (at(curve, n) for n in grid for curve in curves)
     each = np.stack([point for point in points if point is not None])  # of a common grid none is
     values = each.reshape(len(grid), len(curves), -1).mean(1).T
-    return replace(
-        curves[0], rollouts=grid, scores={score: values}, transitions=nothing, minutes=nothing, training=None
-    )
+    return replace(curves[0], x=grid, scores={score: values}, transitions=nothing, minutes=nothing, training=None)
 
 
 def _areas(played: Played, gaps: Sequence[str], grid: np.ndarray) -> np.ndarray:

@@ -108,4 +108,4 @@ def test_pooled_curves_are_means_over_gaps_member_by_member(home):
     sac = {curve.gap: curve for curve in read_runs(home).curves if curve.method == "sac" and curve.gap != "elsewhere"}
     one = pooled(sac)
     np.testing.assert_allclose(one.values, [[0.5, 0.4, 0.65], [0.5, 0.4, 0.65], [0.5, 0.4, 0.7], [0.5, 0.4, 0.7]])
-    assert one.rollouts.tolist() == [0, 4, 8] and np.isnan(one.minutes).all()
+    assert one.x.tolist() == [0, 4, 8] and np.isnan(one.minutes).all()

@@ -319,7 +319,7 @@ def grid_of(out, **changes):
 def test_a_comparison_of_tuned_methods(tmp_path, ran):
     for method in ("sac", "sgft-sac"):
         choose(tmp_path, method)
-    assert compare.compare(grid_of(tmp_path)) == []
+    assert compare.work(grid_of(tmp_path)) == []
     assert {(run.options.utd, run.options.lr_actor) for run in ran} == {(2.0, 3e-4)}
     assert (tmp_path / "finetune/toy/default/sac_tuned/seeds-0-9").is_dir()
     assert [str(cell) for cell in compare.cells(grid_of(tmp_path))] == [
@@ -330,19 +330,19 @@ def test_a_comparison_of_tuned_methods(tmp_path, ran):
         tmp_path, "toy", "sac", {"budget": tuned.read(tmp_path, "toy", "sac")["budget"], "options": {"utd": 20}}
     )
     with pytest.raises(UserError, match=r"sac_tuned.*options.utd was 2\.0, now 20"):  # tuned again since
-        compare.compare(grid_of(tmp_path))
+        compare.work(grid_of(tmp_path))
 
 
 def test_a_tuned_comparison_must_be_fair(tmp_path, ran):
     command = r"python -m experiments.studies.tune --tasks toy --methods"
     with pytest.raises(UserError, match=rf"tuned/toy holds no options for sac, sgft-sac; .*{command} sac sgft-sac$"):
-        compare.compare(grid_of(tmp_path))
+        compare.work(grid_of(tmp_path))
     choose(tmp_path, "sac")
     choose(tmp_path, "sgft-sac", trials=16)
     with pytest.raises(UserError, match=rf"sac and sgft-sac had different budgets \(trials 8 and 16\); .*{command}"):
-        compare.compare(grid_of(tmp_path))
+        compare.work(grid_of(tmp_path))
     with pytest.raises(UserError, match=r"--reals mild: the options were tuned there"):
-        compare.compare(grid_of(tmp_path, methods=("sac",), reals=("default", "mild")))
+        compare.work(grid_of(tmp_path, methods=("sac",), reals=("default", "mild")))
     path = tuned.write(tmp_path, "toy", "sac", {"budget": {}, "options": {"speed": 1}})
     with pytest.raises(UserError, match=rf"{path}: there is no option 'speed'; .*{command} sac"):
         tuned.read(tmp_path, "toy", "sac")
@@ -386,7 +386,7 @@ def test_tuned_runs_on_a_point_mass(tmp_path, monkeypatch):
     assert result["gaps"][0]["name"] == "heavy"
     assert all(np.shape(trial["areas"]["heavy"]) == (2,) for trial in result["trials"])
     real = str(tmp_path / "light.toml")
-    compare.main(compare.CompareArgs(tuned=True, reals=(real,), out=tmp_path, **sizes))
+    compare.compare(compare.CompareArgs(tuned=True, reals=(real,), out=tmp_path, **sizes))
     (cell,) = compare.cells(compare.CompareArgs(tuned=True, reals=(real,), out=tmp_path, **sizes))
     assert cell.state == "finished" and checkpoint.latest(cell.folder) == 2
     stored = json.loads((cell.folder / "config.json").read_text())["config"]["options"]

@@ -218,7 +218,7 @@ def test_a_flat_table_and_back():
     assert len(table) == 8 + 4 and table[1]["rollouts"] == 1 and table[1]["success"] == 0.2
     for one, other in zip(original, from_rows(table), strict=True):
         assert (one.name, one.priors, one.score) == (other.name, other.priors, other.score)
-        for name in ("seeds", "prior", "rollouts", "transitions", "minutes", "values"):
+        for name in ("seeds", "prior", "x", "transitions", "minutes", "values"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
         assert (one.training is None) == (other.training is None)
     np.testing.assert_array_equal(from_rows(table)[1].training, original[1].training)

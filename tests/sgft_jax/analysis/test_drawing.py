@@ -6,7 +6,8 @@ import pytest
 from test_curves import curve
 
 from sgft_jax.analysis import figures
-from sgft_jax.analysis.hybrid import EVERY, Outcome, Results
+from sgft_jax.analysis.curves import updates_curve
+from sgft_jax.analysis.hybrid import Results
 
 
 def curves(count, seeds=3):
@@ -32,9 +33,9 @@ def test_the_axis_says_how_long_a_rollout_is_where_evaluations_are_free():
     """On a robot they are real episodes, and transitions those of both."""
     (own,) = curves(1)
     steps = int(own.transitions[1])
-    assert figures._rollouts([own]).startswith(f"real rollouts of {steps} transitions, ")
+    assert figures._unit([own]).startswith(f"real rollouts of {steps} transitions, ")
     dear = dataclasses.replace(own, transitions=own.transitions + 20 * steps * np.array([0, 1, 2, 2, 2]))
-    assert figures._rollouts([dear]) == "real rollouts"
+    assert figures._unit([dear]) == "real rollouts"
 
 
 @pytest.mark.parametrize("count", [1, 2, 6])
@@ -103,11 +104,23 @@ def test_a_run_without_a_real_rollout_is_drawn(tmp_path):
 def test_curves_over_updates(tmp_path, monkeypatch):
     """A panel for each simulator; methods without one are in both, those that miss a run in none."""
     updates, scores = np.array([0, 10_000, 20_000]), np.arange(9.0).reshape(3, 3)
-    places = [("h2oplus:released", "medium", "gravity"), ("iql", "medium", EVERY), ("sac", EVERY, "friction")]
-    found = [Outcome(*own, scores[:, -1], updates, scores + 5 * i) for i, own in enumerate(places)]
-    found.append(Outcome("iql", "replay", EVERY, scores[:, -1], updates, scores))
-    methods = [own.method for own in found[:3]]
-    results = Results("halfcheetah", "return", ("medium", "replay"), ("gravity", "friction"), methods, found)
+    places = [("h2oplus", "released", "medium", "gravity"), ("iql", "", "medium", ""), ("sac", "", "", "friction")]
+    places.append(("iql", "", "replay", ""))
+    curves = [
+        updates_curve(
+            "halfcheetah",
+            gap,
+            method,
+            preset,
+            data=data,
+            seeds=range(3),
+            updates=updates,
+            scores={"return": scores + 5 * (i % 3)},
+        )
+        for i, (method, preset, data, gap) in enumerate(places)
+    ]
+    methods = [curve.spec for curve in curves[:3]]
+    results = Results(("medium", "replay"), ("gravity", "friction"), methods, curves)
     seen, lines = {}, figures.lines
 
     def draw(path, panels, labels, *, title):
@@ -115,7 +128,7 @@ def test_curves_over_updates(tmp_path, monkeypatch):
         return lines(path, panels, labels, title=title)
 
     monkeypatch.setattr(figures, "lines", draw)
-    image = read(figures.hybrid_curves(tmp_path / "h.png", results, "medium", title="Medium"))
+    image = read(figures.learning_curves(tmp_path / "h.png", results.panels("medium"), title="Medium"))
     assert [pixels(image, color) > 200 for color in figures.PALETTE[:4]] == [True] * 3 + [False]
     names = {words: [line.name for line in own] for words, own in seen.items()}
     assert names == {
