@@ -49,7 +49,8 @@ def main(args: FiguresArgs) -> None:
 def figures(args: FiguresArgs) -> Path:
     """The figures and tables.md, whose path is returned; raises UserError if there is no run to draw."""
     check_folder(args.out / "figures")
-    from sgft_jax.analysis.curves import read_data, read_runs
+    from sgft_jax.analysis.reading import read_runs
+    from sgft_jax.analysis.release import read_data
 
     found = read_data(args.data) if args.data else read_runs(args.out)
     if not found.curves:

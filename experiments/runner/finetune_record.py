@@ -14,7 +14,8 @@ from envs.rollout import Episode
 from envs.types import PyTree
 from experiments.runner.video import before_and_after
 from sgft_jax.analysis import figures, tables
-from sgft_jax.analysis.curves import Curve, deepest_fall, describe, read_curve
+from sgft_jax.analysis.curves import Curve, deepest_fall, describe
+from sgft_jax.analysis.reading import read_curve
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
 from sgft_jax.io.priors import save_prior

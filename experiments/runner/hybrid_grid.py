@@ -190,39 +190,38 @@ def results(args: HybridGridArgs, curves: "Sequence[Curve]") -> "Results":
 
 def finished(args: HybridGridArgs) -> "list[Curve]":
     """The curves of the cells that have finished."""
-    from sgft_jax.analysis.curves import read_curve
+    from sgft_jax.analysis.reading import read_curve
 
     return [read_curve(cell.folder) for cell in cells_of(args) if cell.state == "finished"]
 
 
 def export(args: HybridGridArgs, to: Path) -> None:
     """Writes the finished cells into hybrid.csv; raises UserError if there is none."""
-    from sgft_jax.analysis import hybrid_table
+    from sgft_jax.analysis.release import write_hybrid
 
     curves = finished(args)
     if not curves:
         raise UserError(f"--export {to}: none of these runs has finished")
-    print(f"written: {hybrid_table.write(to, curves)}, {len(curves)} runs")
+    print(f"written: {write_hybrid(to, curves)}, {len(curves)} runs")
 
 
 def released(args: HybridGridArgs, folder: Path) -> "Results":
     """What the table in a folder holds of these runs; raises UserError if that is nothing, or if it lacks a seed."""
-    from sgft_jax.analysis.hybrid_table import TABLE, read
-    from sgft_jax.files.csvfile import table_file
+    from sgft_jax.analysis.release import hybrid_table, read_hybrid
 
     wanted, columns = seed_list(args.seed, args.seeds), results(args, ())
     task, schedule, updates = extend.name_of(args.task), name_of(args.schedule), args.schedule.updates_in_all
     facts = {"real": gaps.title(args.real), "schedule": schedule, "updates": updates}
     curves = [
         curve
-        for curve in read(folder)
+        for curve in read_hybrid(folder)
         if curve.task == task
         and facts.items() <= curve.facts.items()
         and curve.spec in columns.methods
         and curve.data in (*columns.data, "")
         and curve.gap in (*columns.gaps, "")
     ]
-    path = table_file(folder, TABLE)
+    path = hybrid_table(folder)
     if not curves:
         raise UserError(f"{path}: has none of these runs, {updates:,} updates of {task} with schedule {schedule}")
     for curve in curves:

@@ -23,7 +23,7 @@ from experiments.runner.hybrid_args import VOLATILE, HybridArgs, gaps_of, run_fo
 from experiments.runner.memory import reserve
 from experiments.runner.video import film_episode
 from sgft_jax.analysis import figures
-from sgft_jax.analysis.curves import read_curve
+from sgft_jax.analysis.reading import read_curve
 from sgft_jax.datasets import logs
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.hybrid import trainer

@@ -15,8 +15,8 @@ from experiments.runner.rollouts import task_of
 from experiments.studies.diagnose_calibrate import CalibrateArgs
 from sgft_jax import stacking
 from sgft_jax.analysis import prediction, tables
-from sgft_jax.analysis.curves import read_curve
 from sgft_jax.analysis.prediction import AHEAD, Cases, Inputs
+from sgft_jax.analysis.reading import read_curve
 from sgft_jax.examination import Examiner
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io.runs import read_config

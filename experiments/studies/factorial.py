@@ -81,7 +81,7 @@ def main(args: FactorialArgs) -> None:
     if left := len(states) - states.count("finished"):
         print(f"{left} cells are not finished; the same command goes on")
         return
-    from sgft_jax.analysis.curves import read_curve
+    from sgft_jax.analysis.reading import read_curve
 
     curves = {place: {at: read_curve(cell.folder) for at, cell in own.items()} for place, own in cells.items()}
     print(report(args, curves))
@@ -159,7 +159,7 @@ def cells_of(args: FactorialArgs, task: str, real: str) -> "dict[Levels, Cell]":
 
 def released(args: FactorialArgs, folder: Path, places: "Sequence[Place]") -> "Curves":
     """The curves of every cell in tables that `experiments.figures --export` wrote; UserError where one is missing."""
-    from sgft_jax.analysis.curves import read_data
+    from sgft_jax.analysis.release import read_data
 
     wanted = {
         (task, gaps.title(real), variant): ((task, real), levels)

@@ -154,7 +154,8 @@ def played_on(args: ScoreboardArgs) -> "Played":
 
 
 def _runs_on(args: ScoreboardArgs, strata: Mapping[str, str]) -> "Played":
-    from sgft_jax.analysis.curves import read_data, read_runs
+    from sgft_jax.analysis.reading import read_runs
+    from sgft_jax.analysis.release import read_data
 
     curves = [c for c in (read_data(args.data) if args.data else read_runs(args.out)).curves if c.gap in strata]
     for option, field, wanted in (("--tasks", "task", args.tasks), ("--priors", "priors", args.priors)):

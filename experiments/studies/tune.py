@@ -191,7 +191,8 @@ def keep(scores: Sequence[Score], count: int) -> list[int]:
 
 def score(trial: Trial, rollouts: int) -> Score | None:
     """How its runs went up to so many rollouts; None if one is not finished."""
-    from sgft_jax.analysis.curves import area, read_curve
+    from sgft_jax.analysis.curves import area
+    from sgft_jax.analysis.reading import read_curve
 
     if any(cell.state != "finished" for cell in trial.cells):
         return None

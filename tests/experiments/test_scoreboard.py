@@ -102,7 +102,7 @@ def test_bad_input(home):
 
 
 def test_pooled_curves_are_means_over_gaps_member_by_member(home):
-    from sgft_jax.analysis.curves import read_runs
+    from sgft_jax.analysis.reading import read_runs
     from sgft_jax.analysis.scoreboard import pooled
 
     sac = {curve.gap: curve for curve in read_runs(home).curves if curve.method == "sac" and curve.gap != "elsewhere"}

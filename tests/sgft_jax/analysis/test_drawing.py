@@ -6,7 +6,7 @@ import pytest
 from test_curves import curve
 
 from sgft_jax.analysis import figures
-from sgft_jax.analysis.curves import updates_curve
+from sgft_jax.analysis.curves import Curve
 from sgft_jax.analysis.hybrid import Results
 
 
@@ -103,15 +103,17 @@ def test_curves_over_updates(tmp_path, monkeypatch):
     places = [("h2oplus", "released", "medium", "gravity"), ("iql", "", "medium", ""), ("sac", "", "", "friction")]
     places.append(("iql", "", "replay", ""))
     curves = [
-        updates_curve(
+        Curve(
             "halfcheetah",
             gap,
             method,
             preset,
-            data=data,
-            seeds=range(3),
-            updates=updates,
+            seeds=np.arange(3),
+            x=updates,
             scores={"return": scores + 5 * (i % 3)},
+            score="return",
+            data=data,
+            unit="updates",
         )
         for i, (method, preset, data, gap) in enumerate(places)
     ]

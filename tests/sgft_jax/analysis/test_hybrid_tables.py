@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from envs.types import UserError
-from sgft_jax.analysis import hybrid, hybrid_table
-from sgft_jax.analysis.curves import updates_curve
+from sgft_jax.analysis import hybrid, release
+from sgft_jax.analysis.curves import Curve
 from sgft_jax.analysis.hybrid import Results
 from sgft_jax.hybrid.scores import BOUNDS, late
 
@@ -20,8 +20,8 @@ def of_scale(*scores):
 def run(method, data, gap, scores, *, task="halfcheetah", score="return", **measures):
     """A curve whose last evaluation has these scores [seeds]. measures: [seeds, evaluations]."""
     curves = {name: np.asarray(values, float) for name, values in {score: np.transpose([scores]), **measures}.items()}
-    updates, seeds = np.arange(curves[score].shape[1]), range(len(scores))
-    return updates_curve(task, gap, method, "", data=data, seeds=seeds, updates=updates, scores=curves)
+    updates, seeds = np.arange(curves[score].shape[1]), np.arange(len(scores))
+    return Curve(task, gap, method, seeds=seeds, x=updates, scores=curves, score=score, data=data, unit="updates")
 
 
 def results(*curves, methods=("h2oplus", "iql", "sac")):
@@ -136,8 +136,8 @@ def test_the_last_ten_evaluations_of_each_seed():
     ],
 )
 def test_tables_with_odd_numbers_are_refused(change, words, tmp_path):
-    cells = dict.fromkeys(hybrid_table.IDENTITY, "x") | {"task": "toy", "method": "iql", "commit": "c", "updates": "5"}
+    cells = dict.fromkeys(release.RUN, "x") | {"task": "toy", "method": "iql", "commit": "c", "updates": "5"}
     cells |= {"score": "success", "step": "5", "seed-0": "0.5", **change}
     (tmp_path / "hybrid.csv").write_text(",".join(cells) + "\n" + ",".join(cells.values()) + "\n")
     with pytest.raises(UserError, match=f"hybrid.csv: {words}; put the table back as it was"):
-        hybrid_table.read(tmp_path)
+        release.read_hybrid(tmp_path)

@@ -10,8 +10,9 @@ import pytest
 from runs_by_hand import pretrained, save
 
 from envs.types import UserError
-from sgft_jax.analysis.curves import COLUMNS, area, read_data, read_runs
-from sgft_jax.analysis.release import export
+from sgft_jax.analysis.curves import area
+from sgft_jax.analysis.reading import read_runs
+from sgft_jax.analysis.release import COLUMNS, export, read_data
 from sgft_jax.files.csvfile import read_csv
 
 DATA = Path(__file__).parents[3] / "docs" / "data"
@@ -132,7 +133,7 @@ def test_the_released_tables():
 
 def test_tuning_tells_the_areas_of_its_trials():
     """What tuning.csv says of a trial follows from trials.csv: the mean area up to the budget's rollouts."""
-    from sgft_jax.analysis.curves import from_rows
+    from sgft_jax.analysis.release import from_rows
 
     trials = {(c.method, c.variant): c for c in from_rows(read_csv(DATA / "trials.csv.gz"))}
     told = read_csv(DATA / "tuning.csv.gz")
