@@ -10,6 +10,7 @@ in one program.
 """
 
 import glob
+import itertools
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,8 +20,7 @@ from envs import extend, gaps
 from envs.types import UserError, unknown
 from experiments.figures import FiguresArgs, figures
 from experiments.runner import cli, grid, hybrid_grid, tuned
-from experiments.runner.cells import Cell, check_begun, complete
-from experiments.runner.finetune_args import FinetuneArgs
+from experiments.runner.cells import Cell, check_begun, work
 from experiments.runner.grid import GridArgs
 from experiments.runner.hybrid_grid import HybridGridArgs
 from sgft_jax.hybrid.schedule import describe, name_of
@@ -65,20 +65,14 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 def compare(args: CompareArgs) -> None:
     """Runs what is missing, then draws; raises UserError in the end if some cells could not run."""
-    failed = work(args)
-    if args.dry:
-        return
-    if any(cell.done for cell in cells(args)):
-        print(figures(FiguresArgs(out=args.out, reference=args.reference)).read_text())
-    _refuse(failed)
-
-
-def work(args: CompareArgs) -> list[str]:
-    """Works through the cells in order; returns a line for each that could not run."""
     chosen = cells(args)
     if args.tuned:
         check_begun(chosen)  # tuning may have chosen again since
-    return complete(chosen, args)
+    work(chosen, args, lambda cells: _draw(args) if any(cell.done for cell in cells) else None)
+
+
+def _draw(args: CompareArgs) -> None:
+    print(figures(FiguresArgs(out=args.out, reference=args.reference)).read_text())
 
 
 def cells(args: CompareArgs) -> list[Cell]:
@@ -91,18 +85,8 @@ def cells(args: CompareArgs) -> list[Cell]:
     if args.tuned:
         for task in args.tasks:
             tuned.check_fair(args.out, task, args.methods, args.reals)
-    places = [(task, real, method) for task in args.tasks for real in args.reals for method in args.methods]
-    return [grid.look_up(_run_of(args, *place)) for place in places]
-
-
-def _run_of(args: CompareArgs, task: str, real: str, method: str) -> FinetuneArgs:
-    run = grid.run_of(args, task, real, method)
-    return tuned.apply(run) if args.tuned else run
-
-
-def _refuse(failed: Sequence[str]) -> None:
-    if failed:
-        raise UserError(f"{len(failed)} of the cells did not run: {'; '.join(failed)}")
+    runs = [grid.run_of(args, *place) for place in itertools.product(args.tasks, args.reals, args.methods)]
+    return [grid.look_up(tuned.apply(run) if args.tuned else run) for run in runs]
 
 
 def compare_hybrid(args: HybridGridArgs) -> None:
@@ -114,14 +98,9 @@ def compare_hybrid(args: HybridGridArgs) -> None:
     chosen = hybrid_grid.cells_of(args)
     check_begun(chosen)
     if args.export is not None:
-        hybrid_grid.export(args, args.export)
+        hybrid_grid.export(args.export, chosen)
         return
-    failed = complete(chosen, args)
-    if args.dry:
-        return
-    if curves := hybrid_grid.finished(args):
-        _show(args, hybrid_grid.results(args, curves))
-    _refuse(failed)
+    work(chosen, args, lambda cells: _show(args, hybrid_grid.results(args, hybrid_grid.finished(cells))))
 
 
 def tables(args: HybridGridArgs, results: "Results") -> str:
@@ -136,7 +115,9 @@ def tables(args: HybridGridArgs, results: "Results") -> str:
 
 
 def _show(args: HybridGridArgs, results: "Results") -> None:
-    """Tables on the screen and in a file, and a figure of curves for each data set."""
+    """Tables on the screen and in a file, and a figure of curves for each data set; nothing without any curve."""
+    if not results.curves:
+        return
     from sgft_jax.analysis.figures import learning_curves
 
     folder, name = args.out / "figures", f"hybrid-{extend.name_of(args.task)}-{gaps.title(args.real)}"

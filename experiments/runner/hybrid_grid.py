@@ -14,7 +14,7 @@ from envs.gaps import SIM
 from envs.types import UserError, unknown
 from experiments.hybrid import arguments, hybrid
 from experiments.runner import cells, cli
-from experiments.runner.cells import Cell, Kind
+from experiments.runner.cells import Cell, Kind, WorkArgs
 from experiments.runner.hybrid_args import (
     DEFAULT,
     VOLATILE,
@@ -25,7 +25,6 @@ from experiments.runner.hybrid_args import (
     run_folder,
 )
 from experiments.runner.options import (
-    Impl,
     at_least_one,
     check_data,
     check_task,
@@ -45,8 +44,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class HybridGridArgs:
-    """A grid of runs; everything not named here is as `experiments.hybrid` has it."""
+class _Systems:
+    """What the cells are of, and what is shown of them."""
 
     task: str = "halfcheetah"
     """A task by name, or a Python file with a task of your own."""
@@ -70,27 +69,23 @@ class HybridGridArgs:
     """What tables show of a run: the mean of its last ten evaluations, or its last one."""
     reference: str = DEFAULT
     """Compare the others with this METHOD or METHOD:PRESET."""
-    together: bool = True
-    """Step the simulators of a method together; --no-together: one after another, in less memory but more time."""
-    minutes: float | None = None
-    """Begin no new run after so many minutes."""
-    dry: bool = False
-    """Only list the runs and what is missing."""
     export: Path | None = None
     """Instead of running, write what has finished into hybrid.csv in this folder, which --released reads back."""
     released: Path | None = None
     """Instead of running, show what hybrid.csv in this folder holds of these runs, such as docs/data."""
     beside: int | None = None
     """With --released: also the rank correlation of the methods with those of runs of so many updates."""
-    out: Path = Path("runs")
-    """Parent of all run folders; the tables and the curves go to <out>/figures."""
     seed: int = 0
     """Expert: first seed."""
     eval_every: int = 10_000
     """Expert: updates between evaluations in the real system."""
     eval_episodes: int = 10
     """Expert: episodes per seed and evaluation."""
-    impl: Impl = "auto"
+
+
+@dataclass(frozen=True)
+class HybridGridArgs(WorkArgs, _Systems):  # this order puts the fields of the latter first
+    """A grid of runs; everything not named here is as `experiments.hybrid` has it."""
 
 
 def _title(args: HybridArgs) -> str:
@@ -188,18 +183,18 @@ def results(args: HybridGridArgs, curves: "Sequence[Curve]") -> "Results":
     return Results(data, [gaps.title(gap) for gap in args.gaps], args.methods, curves, args.score)
 
 
-def finished(args: HybridGridArgs) -> "list[Curve]":
+def finished(cells: Sequence[Cell]) -> "list[Curve]":
     """The curves of the cells that have finished."""
     from sgft_jax.analysis.reading import read_curve
 
-    return [read_curve(cell.folder) for cell in cells_of(args) if cell.state == "finished"]
+    return [read_curve(cell.folder) for cell in cells if cell.state == "finished"]
 
 
-def export(args: HybridGridArgs, to: Path) -> None:
+def export(to: Path, cells: Sequence[Cell]) -> None:
     """Writes the finished cells into hybrid.csv; raises UserError if there is none."""
     from sgft_jax.analysis.release import write_hybrid
 
-    curves = finished(args)
+    curves = finished(cells)
     if not curves:
         raise UserError(f"--export {to}: none of these runs has finished")
     print(f"written: {write_hybrid(to, curves)}, {len(curves)} runs")
