@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from sgft_jax.math.stats import ENOUGH, Interval, bootstrap_interval, mean, paired_improvement
+from sgft_jax.math.stats import ENOUGH, Interval, bootstrap_interval, iqm, mean, paired_improvement
 from sgft_jax.methods import FIXED_NAMES, NAMES, get_method
 
 LEVEL = 0.9  # success that counts as solved
@@ -232,12 +232,12 @@ def by_prior(curve: Curve) -> bool:
     return bool((curve.prior >= 0).all()) and len(np.unique(curve.prior)) >= ENOUGH
 
 
-def spread(curve: Curve, scores: np.ndarray) -> Interval:
-    """Interquartile mean over members with its interval, pointwise: hierarchical by prior if `by_prior`, else by seed.
+def spread(curve: Curve, scores: np.ndarray, statistic: Callable[..., np.ndarray] = iqm) -> Interval:
+    """A statistic over members with its interval, pointwise: hierarchical by prior if `by_prior`, else by seed.
 
     scores: [members, ...], such as those at one evaluation.
     """
-    return bootstrap_interval(scores, priors=curve.prior if by_prior(curve) else None)
+    return bootstrap_interval(scores, statistic=statistic, priors=curve.prior if by_prior(curve) else None)
 
 
 def describe(curve: Curve) -> dict[str, Any]:
