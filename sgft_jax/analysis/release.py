@@ -221,6 +221,11 @@ def _prior(cell: Any) -> int:
     return whole("prior", float(cell) + 1) - 1
 
 
+def read(out: Path, data: Path | None) -> Found:
+    """The curves of released tables in the folder `data` or, without one, of the fine-tuning runs below `out`."""
+    return read_data(data) if data else reading.read_runs(out)
+
+
 def read_data(folder: Path) -> Found:
     """The curves of released tables, `curves-*.csv.gz` or `.csv`; raises UserError for none, or a damaged one."""
     names = sorted({path.name.partition(".csv")[0] for path in folder.glob("curves-*.csv*")})
