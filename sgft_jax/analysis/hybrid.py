@@ -4,7 +4,8 @@ A method without a simulator has one outcome for each data set, a method without
 in every row that they belong to.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -77,25 +78,17 @@ class Results(NamedTuple):
 
 def summary(results: Results, *, reference: str, seeds: int, schedule: str) -> list[str]:
     """The tables and their legend, a text for each. schedule: what every run made, in words."""
-    scale = " on D4RL's scale" if results.task in BOUNDS else ""
-    legend = LEGEND.format(
-        score=_SCORES[results.shown], seeds=seeds, scale=scale, reference=reference, schedule=schedule
-    )
-    texts = [f"# {results.task}", legend, headline(results)]
-    if len(results.methods) > 1:
-        texts.append(duels(results, reference))
-    texts.append(cells(results))
+    scale, score = " on D4RL's scale" if results.task in BOUNDS else "", _SCORES[results.shown]
+    legend = LEGEND.format(score=score, seeds=seeds, scale=scale, reference=reference, schedule=schedule)
+    against = [duels(results, reference)] if len(results.methods) > 1 else []
     others = measured(results)
+    texts = [f"# {results.task}", legend, headline(results), *against, cells(results)]
     return texts if others is None else [*texts, _MEASURED, others]
 
 
 def cells(results: Results) -> str:
     """A row for each data set and simulator: mean of every method with its standard deviation over seeds."""
-    rows = [
-        [data or NONE, gap, *(_spread(results.of(method, data, gap), results.score) for method in results.methods)]
-        for data, gap in results.places()
-    ]
-    return markdown(["data", "simulator", *results.methods], rows)
+    return _table(("data", "simulator"), results.places(), results.methods, partial(_spread, results))
 
 
 def headline(results: Results) -> str:
@@ -103,9 +96,9 @@ def headline(results: Results) -> str:
 
     A resample draws seeds within every simulator. A method stands only where it has finished on all of them.
     """
-    rows = [[data or NONE, *(_overall(results, method, data) for method in results.methods)] for data in results.data]
-    number = len(results.gaps)
-    return markdown([f"mean over {number} simulators" if number > 1 else "one simulator", *results.methods], rows)
+    count = len(results.gaps)
+    head = f"mean over {count} simulators" if count > 1 else "one simulator"
+    return _table((head,), [(data,) for data in results.data], results.methods, partial(_overall, results))
 
 
 def duels(results: Results, reference: str) -> str:
@@ -114,8 +107,8 @@ def duels(results: Results, reference: str) -> str:
     It is the mean over the simulators on which both have finished, in per cent, with its bootstrap interval over seeds.
     """
     others = [method for method in results.methods if method != reference]
-    rows = [[data or NONE, *(_duel(results, reference, other, data) for other in others)] for data in results.data]
-    return markdown([f"P({reference} better), per cent", *others], rows)
+    head = f"P({reference} better), per cent"
+    return _table((head,), [(data,) for data in results.data], others, partial(_duel, results, reference))
 
 
 def measured(results: Results) -> str | None:
@@ -124,12 +117,17 @@ def measured(results: Results) -> str | None:
     None where no run has a measure.
     """
     names = dict.fromkeys(name for curve in results.curves for name in curve.scores if name not in SCORES)
-    rows = [
-        [name, data or NONE, gap, *(_measured(results.of(method, data, gap, name), name) for method in results.methods)]
-        for name in names
-        for data, gap in results.places()
-    ]
-    return markdown(["measure", "data", "simulator", *results.methods], rows) if rows else None
+    places = [(name, *place) for name in names for place in results.places()]
+    head = ("measure", "data", "simulator")
+    return _table(head, places, results.methods, partial(_measured, results)) if places else None
+
+
+def _table(
+    head: Sequence[str], places: Iterable[Sequence[str]], methods: Sequence[str], cell: Callable[..., str]
+) -> str:
+    """A row for each place, which begins with its names, and a column for each method. cell: of (method, *place)."""
+    rows = [[*(name or NONE for name in place), *(cell(method, *place) for method in methods)] for place in places]
+    return markdown([*head, *methods], rows)
 
 
 def ranks(results: Results, others: Results) -> str:
@@ -180,12 +178,13 @@ def rescaled(task: str, scores: np.ndarray) -> np.ndarray:
     return np.array([normalised(task, x) for x in scores.tolist()]) if task in BOUNDS else scores
 
 
-def _spread(scores: np.ndarray | None, score: str) -> str:
+def _spread(results: Results, method: str, data: str, gap: str) -> str:
+    scores = results.of(method, data, gap)
     if scores is None:
         return NONE
-    middle = plain(float(scores.mean()), score) if score == "success" else f"{scores.mean():,.0f}"
-    spread = plain(float(scores.std()), score) if score == "success" else f"{scores.std():,.0f}"
-    return middle if len(scores) == 1 else f"{middle} ± {spread}"
+    numbers = [float(scores.mean()), float(scores.std())][: len(scores)]  # one seed has no deviation
+    success = results.score == "success"
+    return " ± ".join(plain(x, results.score) if success else f"{x:,.0f}" for x in numbers)
 
 
 def _overall(results: Results, method: str, data: str) -> str:
@@ -193,7 +192,8 @@ def _overall(results: Results, method: str, data: str) -> str:
     return NONE if band is None else number(band, results.score)
 
 
-def _measured(values: np.ndarray | None, name: str) -> str:
+def _measured(results: Results, method: str, name: str, data: str, gap: str) -> str:
+    values = results.of(method, data, gap, name)
     return NONE if values is None else number(bootstrap_interval(values, statistic=mean), name, digits=2)
 
 
