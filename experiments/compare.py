@@ -23,9 +23,9 @@ from experiments.runner import cli, grid, hybrid_grid, tuned
 from experiments.runner.cells import Cell, check_begun, work
 from experiments.runner.grid import GridArgs
 from experiments.runner.hybrid_grid import HybridGridArgs
-from sgft_jax.hybrid.schedule import describe, name_of
 from sgft_jax.io.runs import NO_DATA
 from sgft_jax.methods import DEFAULT, NAMES
+from sgft_jax.train.schedule import describe, name_of
 
 if TYPE_CHECKING:
     from sgft_jax.analysis.hybrid import Results

@@ -18,7 +18,7 @@ from .systems.remote import Remote
 from .systems.simulated import Simulated
 from .train.finetuner import FinetuneState, Parts, assemble, sac_finetuner
 from .train.finetuning import FinetuneProgress, evaluate, finetune, simulate
-from .train.pretraining import PretrainState, pretrain, priors_of
+from .train.pretraining import pretrain, priors_of
 from .transforms import branch, clip, compose, relabel, shape, shaped_reward, shorten, stateless, weigh
 from .types import (
     Batch,
@@ -45,7 +45,7 @@ __all__ = [
     "PRESETS", "ActingPolicy", "Batch", "FinetuneProgress", "FinetuneState", "Finetuner", "Fixed", "Gymnasium",
     "HybridAgent", "IQLConfig", "IQLHyper", "IQLState", "Imagination", "Learner", "MPCConfig", "Method",
     "NetworkConfig", "Normalizer", "Online", "Parts",
-    "Policy", "PretrainConfig", "PretrainState", "Prior", "RatioConfig", "Remote", "SACConfig", "SACHyper",
+    "Policy", "PretrainConfig", "Prior", "RatioConfig", "Remote", "SACConfig", "SACHyper",
     "SACParams", "SACState", "Setup", "Simulated", "SimulatedData", "Simulation", "Source", "System",
     "TDMPC2Config", "TDMPC2Hyper", "TDMPC2Params", "TDMPC2State", "Task", "Transform", "Transition", "UserError",
     "all_methods", "assemble", "branch", "clip", "compose", "evaluate", "evaluate_prior", "extract_params",

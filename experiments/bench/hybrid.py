@@ -16,11 +16,11 @@ from envs.types import Key, PyTree
 from experiments.bench import bare_h2oplus
 from experiments.bench.timing import Compiled, ahead, fastest_in_turns
 from experiments.bench.updates import REPLAY, rows
-from sgft_jax.hybrid.schedule import Schedule
-from sgft_jax.hybrid.trainer import make_trainer
 from sgft_jax.learners.h2oplus import H2OPlusHyper
 from sgft_jax.methods import get_method
-from sgft_jax.train.pretraining import over_members
+from sgft_jax.train import hybrid
+from sgft_jax.train.fleet import make_programs, make_trainer, over_members
+from sgft_jax.train.schedule import Schedule
 from sgft_jax.types import HybridAgent, RealData
 
 METHOD = "h2oplus"
@@ -55,9 +55,10 @@ def _run(
 ) -> tuple[Callable[[], None], Compiled]:
     """(What makes one more chunk of all members, its program), without steps of the simulators where asked."""
     members, real = keys.shape[0], _recorded(env)
-    init = over_members(make_trainer(env, agent, schedule, gamma=0.99).init, members, shared=(1,))
-    state, memory = jax.jit(init)(pools, real, keys), agent.keep(real)
-    trainer = make_trainer(env, agent._replace(simulates=simulates), schedule, gamma=0.99)
+    plan = hybrid.make_plan(env, agent, schedule)
+    programs = make_programs(make_trainer(env, plan, gamma=0.99), members, shared=True)
+    state, memory = programs.begin(pools, real, keys), agent.keep(real)
+    trainer = make_trainer(env, plan if simulates else plan._replace(simulators=0), gamma=0.99)
     made = ahead(over_members(trainer.chunk, members, shared=(1,)), (pools, memory, state), donate=(2,))
 
     def chunk() -> None:

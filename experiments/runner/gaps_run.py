@@ -153,7 +153,7 @@ def train(
                 params = exported(seen, config, state)
                 played = play(heldout, policy, params, episode_key(_HELDOUT_SEED), config.eval_episodes)
                 log.eval(done * size, scores(played))
-                best = best_of(best, params, played, state.steps)
+                best = best_of(best, params, played, state.rounds)
                 shown["success"] = float(played.success.mean())
             progress.advance(size, shown)
     log.close()

@@ -23,9 +23,9 @@ from experiments.runner.options import (
     seeds_name,
     without_repeats,
 )
-from sgft_jax.hybrid.schedule import FLEET, Schedule
 from sgft_jax.io.runs import NO_DATA, NO_SIMULATOR, check_start
 from sgft_jax.methods import get_method
+from sgft_jax.train.schedule import FLEET, Schedule
 from sgft_jax.types import Fixed
 
 DEFAULT = "h2oplus"

@@ -34,9 +34,9 @@ from experiments.runner.options import (
 )
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.hybrid.presets import say_preset
-from sgft_jax.hybrid.schedule import FLEET, SCHEDULES, Schedule, name_of
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import FIXED_NAMES, get_method
+from sgft_jax.train.schedule import FLEET, SCHEDULES, Schedule, name_of
 
 if TYPE_CHECKING:
     from sgft_jax.analysis.curves import Curve

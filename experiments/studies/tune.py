@@ -277,13 +277,13 @@ def _table(tried: Sequence[Outcome], chosen: int | None) -> list[str]:
     """The trials with the options in which they differ, and their scores, a line each; the chosen one is marked."""
     options = [outcome.trial.settings for outcome in tried]
     differ = [name for name in options[0] if len({settings[name] for settings in options}) > 1]
-    rows = [("trial", *differ, "rollouts", "area", "final %", "")]
+    rows = [["trial", *differ, "rollouts", "area", "final %", ""]]
     for trial, rollouts, scored in tried:
         cells = ("-", "-") if scored is None else (f"{scored.area:.3f}", f"{100 * scored.final:.0f}")
         note = "chosen" if trial.number == chosen else "defaults" if trial.number == 0 else ""
         values = [trial.settings[name] for name in differ]
         words = (f"{value:g}" if isinstance(value, float) else str(value) for value in values)
-        rows.append((str(trial.number), *words, str(rollouts), *cells, note))
+        rows.append([str(trial.number), *words, str(rollouts), *cells, note])
     return cli.columns(rows)
 
 

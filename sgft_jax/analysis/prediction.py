@@ -105,9 +105,10 @@ class Cases(NamedTuple):
 
     def of(self, held: np.ndarray) -> "Cases":
         """Those members, [m] bool."""
-        curves = list(itertools.compress(self.curves, held))
-        inputs, arrays = Inputs(*(x[held] for x in self.inputs)), (self.played, self.zero_shot, self.gains)
-        return Cases(inputs, *(x[held] for x in arrays), curves, self.gaps[held], self.priors[held])
+        arrays = ("played", "zero_shot", "gains", "gaps", "priors")
+        chosen = {name: getattr(self, name)[held] for name in arrays}
+        inputs, curves = Inputs(*(x[held] for x in self.inputs)), list(itertools.compress(self.curves, held))
+        return self._replace(inputs=inputs, curves=curves, **chosen)
 
 
 def fit(cases: Cases) -> Coefficients:

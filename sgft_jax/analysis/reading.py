@@ -14,10 +14,10 @@ from envs import gaps
 from envs.files import Count
 from envs.types import UserError
 from sgft_jax.analysis.curves import SCORES, Curve, Found
-from sgft_jax.hybrid.schedule import Schedule, name_of
 from sgft_jax.hybrid.scores import measures
 from sgft_jax.io.log import EVAL, METRICS, SUMMARY, check_records, read_jsonl
 from sgft_jax.io.runs import CONFIG, NO_DATA, NO_SIMULATOR, read_config, read_own, read_starts
+from sgft_jax.train.schedule import Schedule, name_of
 
 # Of a line of eval.jsonl, beside its scores.
 _EVALUATION = {"step": Count, "rollouts": Count, "robot_minutes": Annotated[float, Meta(ge=0)]}

@@ -1,5 +1,6 @@
 """The iterator of pretraining: fleets that reset, worlds that are renewed, resuming, what it leaves."""
 
+import functools
 from dataclasses import replace
 from typing import Any
 
@@ -15,13 +16,15 @@ from flax import struct
 import envs
 from envs.types import UserError
 from sgft_jax.data import replay
+from sgft_jax.keys import seed_keys
 from sgft_jax.learners import tdmpc2_model
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.policies import make_policy
 from sgft_jax.presets import PRESETS, PretrainConfig
 from sgft_jax.train import pretraining, recipes
-from sgft_jax.train.pretraining import Best, keep_better, over_members, pretrain, priors_of
+from sgft_jax.train.fleet import over_members
+from sgft_jax.train.pretraining import Best, keep_better, pretrain, priors_of
 from sgft_jax.types import Learner
 
 N, STEPS, LENGTH = 16, 30, toy_terminating.LENGTH
@@ -106,11 +109,11 @@ def test_no_key_is_used_twice(algorithm):
         CONFIG, algorithm=algorithm, n_envs=2, chunk_steps=2, random_transitions=2 * LENGTH, replay_capacity=80,
         random_ladder=0.5, batch_size=4, updates_per_step=2,
     )  # fmt: skip
-    trainer, pool = pretraining.make_pretrainer(env, config), envs.sample_worlds(env, jax.random.key(0), 2)
+    trainer, pool = pretraining.make_trainer(env, config), envs.sample_worlds(env, jax.random.key(0), 2)
 
     def whole(key):
         key_random, key_start = jax.random.split(key)
-        random = trainer.collect_random(pool, key_random)
+        random = pretraining.random_experience(env, config, pool, key_random)
         state, _ = trainer.chunk(pool, random, trainer.init(pool, random, key_start))
         return jax.random.normal(trainer.renew(pool, state).key)
 
@@ -136,12 +139,10 @@ def test_statistics_are_those_of_the_steps_that_did_not_explode(monkeypatch):
     """Half of the random steps explode, and leave the end of their buffer empty."""
     monkeypatch.setattr(pretraining, "RECIPES", {"sac": counting})
     env = toy_terminating.make()
-    step = lambda world, state, action, key: env.step(world, state, action, key)._replace(invalid=action[0] > 0)  # noqa: E731
-    trainer, pool = (
-        pretraining.make_pretrainer(env._replace(step=step), CONFIG),
-        envs.sample_worlds(env, jax.random.key(0), 4, params={"risk": 0.0}),
-    )
-    random = jax.jit(trainer.collect_random)(pool, jax.random.key(1))
+    pool, step = envs.sample_worlds(env, jax.random.key(0), 4, params={"risk": 0.0}), env.step
+    env = env._replace(step=lambda *now: step(*now)._replace(invalid=now[2][0] > 0))
+    trainer = pretraining.make_trainer(env, CONFIG)
+    random = jax.jit(functools.partial(pretraining.random_experience, env, CONFIG))(pool, jax.random.key(1))
     held, rows = int(random.size), len(random.data.reward)
     assert 0.4 * rows < held < 0.6 * rows
     statistics = jax.jit(trainer.init)(pool, random, jax.random.key(2)).learner.normalizer
@@ -184,7 +185,7 @@ def test_resumed_is_bit_for_bit_uninterrupted(algorithm, refresh_every):
     )
     seeds = [3, 4]
     states = [jax.tree.map(jnp.copy, state) for state, _ in pretrain(env, config, seeds)]
-    assert [pretraining.chunks_done(state, config) for state in states] == [0, 1, 2]
+    assert [pretraining.make_plan(env, config).chunks_done(state) for state in states] == [0, 1, 2]
     _, (end, metrics) = pretrain(env, config, seeds, state=jax.tree.map(jnp.copy, states[1]))
     equal(end, states[2])
     assert all(np.isfinite(x).all() and x.shape == (2,) for x in metrics.values())
@@ -302,10 +303,10 @@ def test_settings_that_make_no_sense_are_refused(changes, words):
 def test_recurrent_policies_need_room_for_whole_episodes():
     config = replace(CONFIG, algorithm="recurrent", random_transitions=(LENGTH - 1) * N)
     with pytest.raises(UserError, match=r"--config\.random-transitions 176: .* 16 environments need at least 192"):
-        pretraining.make_pretrainer(toy_terminating.make(), config)
+        pretraining.make_trainer(toy_terminating.make(), config)
 
 
 def test_keys_depend_on_seed_and_purpose_alone():
-    keys = jax.random.key_data(pretraining.seed_keys([0, 1, 2], 5))
-    np.testing.assert_array_equal(keys[1:], jax.random.key_data(pretraining.seed_keys([1, 2], 5)))
-    assert len(np.unique(np.concatenate([keys, jax.random.key_data(pretraining.seed_keys([0, 1, 2], 6))]), axis=0)) == 6
+    keys = jax.random.key_data(seed_keys([0, 1, 2], 5))
+    np.testing.assert_array_equal(keys[1:], jax.random.key_data(seed_keys([1, 2], 5)))
+    assert len(np.unique(np.concatenate([keys, jax.random.key_data(seed_keys([0, 1, 2], 6))]), axis=0)) == 6

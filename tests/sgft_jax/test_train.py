@@ -16,6 +16,7 @@ from envs.rollout import Episode
 from envs.types import Policy, Transition, UserError
 from sgft_jax.data import replay, sources
 from sgft_jax.io import checkpoint
+from sgft_jax.keys import Finetuning
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import finetuning
 from sgft_jax.train.finetuner import Parts, assemble
@@ -90,9 +91,9 @@ def test_every_purpose_of_every_member_draws_from_keys_that_no_other_uses():
         for parts, phase in (([0], "offline"), ([1], "logged"), ([0, 1], "online")):
             agent, _ = learn(agent, parts, 1, phase)
         played = [
-            finetuning._episode_keys(SEEDS, purpose, 0, 2) for purpose in (finetuning._COLLECT, finetuning._EVALUATE)
+            finetuning._episode_keys(SEEDS, purpose, 0, 2) for purpose in (Finetuning.COLLECT, Finetuning.EVALUATE)
         ]
-        played.append(finetuning._episode_keys(SEEDS, finetuning._COLLECT, 1, 2))
+        played.append(finetuning._episode_keys(SEEDS, Finetuning.COLLECT, 1, 2))
         return agent, [jax.vmap(jax.vmap(jax.random.normal))(x) for x in played], jax.random.normal(key)
 
     def drawn(params, key, data):
