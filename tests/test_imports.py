@@ -16,7 +16,7 @@ COMMANDS = (
     "demo",
     "figures",
     "compare",
-    "compare_hybrid",
+    "compare hybrid",
     "gaps",
     "studies.tune",
     "studies.gaps_draw",
@@ -35,7 +35,7 @@ MISTAKES = {
     "evaluate": "--task hamer",
     "demo": "--seeds 0",
     "compare": "--methods sac sac",
-    "compare_hybrid": "--methods sac foo --reference sac",
+    "compare hybrid": "--methods sac foo --reference sac",
     "gaps": "--episodes 3",
     "studies.tune": "--tasks hamer",
     "studies.gaps_draw": "--count 0",
@@ -146,10 +146,11 @@ def test_modules_that_define_options_are_light(module):
 
 
 def ends(command, *argv, code):
-    """What a command imports until it ends with that exit code."""
+    """What a command imports until it ends with that exit code. command: with its subcommand if it has one."""
+    module, *more = command.split()
     return imported(
-        f"import runpy; sys.argv = {['x', *argv]}\n"
-        f"try: runpy.run_module('experiments.{command}', run_name='__main__')\n"
+        f"import runpy; sys.argv = {['x', *more, *argv]}\n"
+        f"try: runpy.run_module('experiments.{module}', run_name='__main__')\n"
         f"except SystemExit as stopped: assert (stopped.code or 0) == {code}"
     )
 

@@ -21,7 +21,7 @@ from experiments.runner.real_systems import connect, is_robot, is_stepped, title
 from experiments.runner.recorded import RecordedSystem
 from sgft_jax import api, stacking
 from sgft_jax.analysis import figures, prediction, tables, verdict
-from sgft_jax.analysis.curves import last_start
+from sgft_jax.analysis.reading import last_start
 from sgft_jax.analysis.verdict import Names
 from sgft_jax.diagnosis import Rollouts
 from sgft_jax.examination import Examined, Examiner

@@ -15,7 +15,8 @@ from envs.types import PyTree
 from experiments.runner.training import Record
 from experiments.runner.video import before_and_after
 from sgft_jax.analysis import figures, tables
-from sgft_jax.analysis.curves import Curve, deepest_fall, describe, read_curve
+from sgft_jax.analysis.curves import Curve, deepest_fall, describe
+from sgft_jax.analysis.reading import read_curve
 from sgft_jax.io.log import EVAL, check_finite, read_jsonl, write_summary
 from sgft_jax.io.real import RealStore
 from sgft_jax.stacking import member
@@ -117,7 +118,7 @@ class FinetuneRecord(Record):
         chosen = "" if best is None else f"; best policy by the training rollouts {tables.plain(best.mean(), score)}"
         print(
             f"{self.gap.name}: {tables.words(score)} on the real system {before} before -> {after} after "
-            f"{curve.rollouts[-1]} rollouts; deepest fall below the start {tables.plain(deepest_fall(curve), score)}"
+            f"{curve.x[-1]} rollouts; deepest fall below the start {tables.plain(deepest_fall(curve), score)}"
             f"{chosen}"
         )
 

@@ -19,17 +19,18 @@ from envs.scales import normalised
 from envs.types import Key
 from experiments.runner import logged
 from experiments.runner.evaluation import play, scores
-from experiments.runner.hybrid_args import NO_SIMULATOR, VOLATILE, HybridArgs, data_name, gaps_of, run_folder
+from experiments.runner.hybrid_args import VOLATILE, HybridArgs, gaps_of, run_folder
 from experiments.runner.memory import reserve
 from experiments.runner.training import Record, Training, opened
 from experiments.runner.video import film_episode
 from sgft_jax.analysis import figures
-from sgft_jax.analysis.hybrid import Results, outcome
+from sgft_jax.analysis.reading import read_curve
 from sgft_jax.datasets import logs
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.hybrid.scores import LATE, late, measures
 from sgft_jax.io import runs
 from sgft_jax.io.log import EVAL, read_jsonl, write_summary
+from sgft_jax.io.runs import NO_SIMULATOR
 from sgft_jax.keys import FromLog, seed_keys
 from sgft_jax.math.stats import bootstrap_interval, mean
 from sgft_jax.stacking import join, member
@@ -182,7 +183,7 @@ class _Run(Training):
             lines = read_jsonl(folder / EVAL)
             summary = self._summary(lines, gap)
             write_summary(folder, summary)
-            self._draw(folder, lines, gap)
+            _draw(folder)
             if self.args.video:
                 print(self._film(folder, member(member(filmed(), i * self.count), 0)))
             self._say(folder, gap, summary)
@@ -226,15 +227,6 @@ class _Run(Training):
             "measures": others,
         }
 
-    def _draw(self, folder: Path, lines: list[dict[str, Any]], gap: Gap) -> None:
-        """The learning curve. lines: the evaluations."""
-        data = "" if self.setup.log is None or self.args.data is None else data_name(self.args.data)
-        name, simulator = self.setup.method.name, "none" if gap.name == NO_SIMULATOR else gap.name
-        own = outcome(name, data, simulator, lines)
-        results = Results(self.env.name, self.env.score, [data], [simulator], [name], [own])
-        title = " on ".join(filter(None, [self.env.name, data]))
-        figures.hybrid_curves(folder / "figures" / "score.png", results, data, title=title)
-
     def _film(self, folder: Path, played: Episode) -> str:
         """An episode in the real system."""
         path = folder / "videos" / f"seed-{self.setup.seeds[0]}.mp4"
@@ -252,3 +244,10 @@ class _Run(Training):
         for name, values in summary["measures"].items():
             print(f"  {name}: {np.mean(values):.3g} (std over seeds {np.std(values):.2g})")
         print(f"results: {folder}  (policy/, summary.json, eval.jsonl, figures/)")
+
+
+def _draw(folder: Path) -> None:
+    """The learning curve of a finished run."""
+    curve = read_curve(folder)
+    title = " on ".join(filter(None, [curve.task, curve.data]))
+    figures.learning_curves(folder / "figures/score.png", {f"simulator: {curve.gap or 'none'}": [curve]}, title=title)

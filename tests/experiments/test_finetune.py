@@ -28,7 +28,8 @@ from experiments.runner.finetune_args import FinetuneArgs, arguments, run_folder
 from experiments.runner.finetune_record import FinetuneRecord
 from experiments.runner.recorded import RecordedSystem
 from sgft_jax import api
-from sgft_jax.analysis.curves import read_curve, training_score
+from sgft_jax.analysis.curves import training_score
+from sgft_jax.analysis.reading import read_curve
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.priors import load_prior
