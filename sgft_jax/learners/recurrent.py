@@ -15,7 +15,7 @@ from flax import struct
 
 from envs.types import Array, Key, PyTree
 from sgft_jax import checks
-from sgft_jax.learners import sac
+from sgft_jax.learners import steps
 from sgft_jax.math import losses, optim
 from sgft_jax.models import normalizer
 from sgft_jax.models.gru import GRU, make_gru
@@ -204,7 +204,7 @@ def _update(
     learned, hyper = (state.actor, state.critic), state.hyper
     grads, (metrics, log_prob) = jax.grad(loss, (0, 1), has_aux=True)(*(fit.params for fit in learned))
     actor, critic = (optim.step(parts.optimiser, fit, g, hyper.lr) for fit, g in zip(learned, grads, strict=True))
-    log_alpha = sac.step_temperature(
+    log_alpha = steps.step_temperature(
         parts.optimiser, state.log_alpha, rows, log_prob, target=hyper.entropy_per_dim * config.act_dim, rate=hyper.lr
     )
     average = optax.incremental_update(critic.params, state.target_critic, hyper.tau)
@@ -231,7 +231,7 @@ def make_recurrent(config: RecurrentConfig, hyper: RecurrentHyper | None = None)
             actor=optim.start(parts.optimiser, actor),
             critic=optim.start(parts.optimiser, critic),
             target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
-            log_alpha=optim.start(parts.optimiser, jnp.maximum(jnp.log(numbers.alpha), sac.LOG_ALPHA_MIN)),
+            log_alpha=optim.start(parts.optimiser, jnp.maximum(jnp.log(numbers.alpha), steps.LOG_ALPHA_MIN)),
             normalizer=normalizer.identity(config.obs_dim),
             hyper=numbers,
         )

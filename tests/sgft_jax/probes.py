@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -100,6 +101,12 @@ def counted(learner, **case):
     act = jax.jit(learner.act, static_argnames="explore")
     compiled = learner._replace(init=jax.jit(learner.init), update=jax.jit(update), act=act)
     return Case(**{"learner": compiled, "start": compiled.init, "traces": traces, **case})
+
+
+def compiled_once(learner):
+    """A learner whose compiled `update` may be traced once."""
+    update = chex.assert_max_traces(lambda state, batch, key: learner.update(state, batch, key), n=1)
+    return learner._replace(init=jax.jit(learner.init), update=jax.jit(update))
 
 
 # alpha 1e-4: entropy changes the answers by less than their tolerance
