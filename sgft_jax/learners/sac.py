@@ -223,7 +223,7 @@ def update(
 
     metrics: Metrics = {}
     if config.train_critic:
-        term = critic_term and partial(_term, nets, state, critic_term, batch, *key_term)
+        term = partial(_term, nets, state, critic_term, batch, *key_term) if critic_term else None
         state, metrics = _update_critic(nets, state, batch, _target_members(config, key_members), key_target, term)
     rows = jax.tree.map(lambda x: x[: config.actor_batch], batch)
     rows = rows if config.weighted_actor else rows._replace(weight=None)
