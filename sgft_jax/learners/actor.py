@@ -27,7 +27,7 @@ _EXPLORE_NOISE = 0.1
 Head = Literal["affine", "gaussian", "deterministic"]
 
 
-class ACTORParams(NamedTuple):
+class ActorParams(NamedTuple):
     """actor: parameters of the network. normalizer: of the observations that it reads."""
 
     actor: PyTree
@@ -48,7 +48,7 @@ def actor_policy(obs_dim: int, act_dim: int, network: NetworkConfig, head: Head)
     head: what its last layer says: that of `make_affine_actor`, `make_actor` or `make_deterministic_actor`. The last
     explores with noise of std 0.1, which is cut off at the bounds, so its actions have no density.
     """
-    log_prob: Callable[[ACTORParams, Array, Array], Array] | None = None
+    log_prob: Callable[[ActorParams, Array, Array], Array] | None = None
     actor = make_actor_of(head, obs_dim, act_dim, network)
     if head == "deterministic":
 
@@ -60,21 +60,21 @@ def actor_policy(obs_dim: int, act_dim: int, network: NetworkConfig, head: Head)
         def choose(params: PyTree, obs: Array, key: Key, explore: bool | Array) -> Array:
             return tanh_gaussian_action(actor.apply(params, obs), key, explore=explore)
 
-        def density(params: ACTORParams, obs: Array, action: Array) -> Array:
+        def density(params: ActorParams, obs: Array, action: Array) -> Array:
             moments = actor.apply(params.actor, normalize(params.normalizer, obs))
             return tanh_gaussian_log_prob(moments, untanh(action))
 
         log_prob = density
 
-    def act(params: ACTORParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
+    def act(params: ActorParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         return choose(params.actor, normalize(params.normalizer, obs), key, explore), carry
 
     return Policy(lambda: (), act, log_prob=log_prob)
 
 
-def exported(state: PyTree) -> ACTORParams:
+def exported(state: PyTree) -> ActorParams:
     """Copies of the actor and the statistics of a learner's state, which may be donated afterwards."""
-    return ACTORParams(*jax.tree.map(lambda x: x + 0, (state.actor.params, state.normalizer)))
+    return ActorParams(*jax.tree.map(lambda x: x + 0, (state.actor.params, state.normalizer)))
 
 
 def card(network: NetworkConfig, head: Head, gamma: float) -> dict[str, Any]:
