@@ -56,10 +56,11 @@ def main() -> None:
     import jax.numpy as jnp
 
     import sgft_jax
+    from sgft_jax.learners import sac
 
     network = sgft_jax.NetworkConfig(hidden=(16,))
-    agent = sgft_jax.make_sac(sgft_jax.SACConfig(1, 1, network=network))
-    params = sgft_jax.extract_params(jax.jit(agent.init)(jax.random.key(0)))
+    agent = sac.make_sac(sac.SACConfig(1, 1, network=network))
+    params = sac.extract_params(jax.jit(agent.init)(jax.random.key(0)))
     prior = Prior(params, {"algorithm": "sac", "network": {**asdict(network), "hidden": [16]}, "gamma": 0.9})
     line = SimpleNamespace(
         obs_dim=1, act_dim=1, previous_actions=0, episode_length=32,

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from envs.types import Array, Key, PyTree, Transition
 from experiments.bench.bare_sac import Trained, adam, forward, layers, squashed, trained
 from sgft_jax.learners.h2oplus import H2OPlusHyper
-from sgft_jax.learners.sac import LOG_ALPHA_MIN
+from sgft_jax.learners.steps import LOG_ALPHA_MIN
 from sgft_jax.models.networks import LOG_STD_MAX
 
 BOUND, RATIO_NOISE = 2.0, 0.1  # of the discriminators' logits and inputs

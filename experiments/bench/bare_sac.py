@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from envs.types import Array, Key, PyTree, Transition
-from sgft_jax.learners.sac import LOG_ALPHA_MIN, SACHyper
+from sgft_jax.learners.sac import SACHyper
+from sgft_jax.learners.steps import LOG_ALPHA_MIN
 from sgft_jax.models.networks import LOG_STD_MAX, LOG_STD_MIN, NetworkConfig
 
 

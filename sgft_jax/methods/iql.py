@@ -12,7 +12,7 @@ from sgft_jax.train.options import LoopOptions
 from sgft_jax.types import Finetuner, Fixed, HybridAgent, Method, Online, Prior, Simulation, Task
 
 if TYPE_CHECKING:
-    from sgft_jax.learners.actor import ACTORParams
+    from sgft_jax.learners.actor import ActorParams
     from sgft_jax.learners.iql import IQLState
     from sgft_jax.types import RealData
 
@@ -154,8 +154,8 @@ def build_fixed(config: FixedConfig, task: Task) -> HybridAgent:
             hyper = hyper._replace(actor_updates=jnp.float32(updates))
         return state.replace(hyper=hyper)
 
-    def export(state: "IQLState") -> "ACTORParams":
-        return actor.ACTORParams(iql.as_tanh_gaussian(state.actor.params), actor.exported(state).normalizer)
+    def export(state: "IQLState") -> "ActorParams":
+        return actor.ActorParams(iql.as_tanh_gaussian(state.actor.params), actor.exported(state).normalizer)
 
     structure = iql.IQLConfig(task.obs_dim, task.act_dim, NetworkConfig(config.hidden))
     hyper = iql.IQLHyper(
