@@ -32,14 +32,8 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
     bent = () if config.clip_shaped is None else (bend(config.clip_shaped),)
     imagined = branch(config.horizon, config.branches, noise=config.branch_noise)
-    return sac_finetuner(
-        config, prior, task,
-        transforms=(imagined, shape, *bent, shorten(config.horizon)),
-        horizon_dim=config.horizon,
-        reset_critic=config.reset_critic,
-        value_baseline=True,
-        actor_batch=config.batch_size if config.actor_real_only else None,
-    )  # fmt: skip
+    transforms = (imagined, shape, *bent, shorten(config.horizon))
+    return sac_finetuner(config, prior, task, transforms=transforms, horizon_dim=config.horizon, value_baseline=True)
 
 
 METHOD = Method(  # what `--method docs/examples/own_method.py` looks for

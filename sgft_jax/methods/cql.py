@@ -26,12 +26,11 @@ def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
     from sgft_jax.data import sources
     from sgft_jax.learners import cql
-    from sgft_jax.models.config import NetworkConfig
 
     structure = cql.CQLConfig(
         task.obs_dim,
         task.act_dim,
-        NetworkConfig(config.hidden),
+        config.network,
         conservatism=config.conservatism,
         samples=config.samples,
     )

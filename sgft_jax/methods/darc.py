@@ -24,15 +24,11 @@ class Config(ActorCriticOptions):
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
     from sgft_jax.learners import actor, darc
-    from sgft_jax.models.config import NetworkConfig
 
-    structure = darc.DARCConfig(
-        task.obs_dim, task.act_dim, NetworkConfig(config.hidden), ratio_rows=2 * config.ratio_rows
-    )
+    structure = darc.DARCConfig(task.obs_dim, task.act_dim, config.network, ratio_rows=2 * config.ratio_rows)
     learner = darc.make_darc(structure, sac_numbers(config), lr_ratio=config.lr)
     batches = darc.batches(config.rows, config.ratio_rows)
-    export = lambda state: actor.exported(state.sac)  # noqa: E731
-    return agent_of(learner, config, task, batches, simulates=True, export=export)
+    return agent_of(learner, config, task, batches, simulates=True, export=lambda state: actor.exported(state.sac))
 
 
 METHOD = Method(

@@ -11,17 +11,15 @@ class Config(OfflineOptions, EnsembleOptions):
     """Options of `edac`; with diversity 0 it is SAC-N."""
 
     hidden: tuple[int, ...] = (256, 256, 256)
-    """Widths of the hidden layers of actor and critics."""
 
 
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
     from sgft_jax.data import sources
     from sgft_jax.learners import edac
-    from sgft_jax.models.config import NetworkConfig
 
     structure = edac.EDACConfig(
-        task.obs_dim, task.act_dim, NetworkConfig(config.hidden), critics=config.critics, diversity=config.diversity
+        task.obs_dim, task.act_dim, config.network, critics=config.critics, diversity=config.diversity
     )
     learner = edac.make_edac(structure, sac_numbers(config))
     return agent_of(learner, config, task, sources.real_rows(config.rows), simulates=False)

@@ -5,11 +5,10 @@ from typing import TYPE_CHECKING
 
 from sgft_jax import checks
 from sgft_jax.methods.options import HybridOptions, agent_of, real_and_simulated, return_scale
-from sgft_jax.types import Fixed, HybridAgent, Method, Task, ValueLoss
+from sgft_jax.types import Fixed, HybridAgent, Method, RealData, Task, ValueLoss
 
 if TYPE_CHECKING:
     from sgft_jax.learners.h2oplus import H2OPlusState
-    from sgft_jax.types import RealData
 
 
 @dataclass(frozen=True)
@@ -42,14 +41,19 @@ def build(config: Config, task: Task, *, critics: int = 2, diversity: float = 0.
     """The agent. critics, diversity: of its ensemble, see `H2OPlusConfig`."""
     from sgft_jax.learners import h2oplus
     from sgft_jax.models import normalizer
-    from sgft_jax.models.config import NetworkConfig
 
     structure = h2oplus.H2OPlusConfig(
-        task.obs_dim, task.act_dim, NetworkConfig(config.hidden), critics=critics, diversity=diversity,
-        value_loss=config.value_loss, ratio=config.ratio, ratio_rows=2 * config.ratio_rows,
-    )  # fmt: skip
+        task.obs_dim,
+        task.act_dim,
+        config.network,
+        critics=critics,
+        diversity=diversity,
+        value_loss=config.value_loss,
+        ratio=config.ratio,
+        ratio_rows=2 * config.ratio_rows,
+    )
 
-    def prepare(state: "H2OPlusState", real: "RealData", updates: int) -> "H2OPlusState":
+    def prepare(state: "H2OPlusState", real: RealData, updates: int) -> "H2OPlusState":
         alpha = state.hyper.value_alpha / return_scale(real)  # the learner itself has it in units of return
         state = state.replace(hyper=state.hyper._replace(value_alpha=alpha))
         if state.ratio is not None and config.standardise:
