@@ -67,10 +67,6 @@ METHOD = Method(
     "sac",
     Online("model-free", "SAC on the task reward, critic kept", "Haarnoja 2018", Config, build, needs_prior=False),
     Fixed(
-        "simulator",
-        "SAC in the simulator alone",
-        "Haarnoja et al. 2018",
-        {"default": SimulatorConfig()},
-        build_fixed,
+        "simulator", "SAC in the simulator alone", "Haarnoja et al. 2018", {"default": SimulatorConfig()}, build_fixed
     ),
 )
