@@ -4,7 +4,6 @@ From simulated data, then with real transitions in half of each batch; or from a
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from envs.types import Array, Key, PyTree
 from sgft_jax import checks
@@ -24,10 +23,6 @@ from sgft_jax.types import (
     Simulation,
     Task,
 )
-
-if TYPE_CHECKING:
-    from sgft_jax.learners.actor import ACTORParams
-    from sgft_jax.learners.iql import IQLState
 
 
 @dataclass(frozen=True)
@@ -148,7 +143,7 @@ def build_fixed(config: FixedConfig, task: Task) -> HybridAgent:
     from sgft_jax.data import sources
     from sgft_jax.learners import actor, iql
 
-    def prepare(state: "IQLState", real: RealData, updates: int) -> "IQLState":
+    def prepare(state: iql.IQLState, real: RealData, updates: int) -> iql.IQLState:
         hyper = state.hyper
         if config.scale_rewards:
             hyper = hyper._replace(reward_scale=return_scale(real))
@@ -156,7 +151,7 @@ def build_fixed(config: FixedConfig, task: Task) -> HybridAgent:
             hyper = hyper._replace(actor_updates=jnp.float32(updates))
         return state.replace(hyper=hyper)
 
-    def export(state: "IQLState") -> "ACTORParams":
+    def export(state: iql.IQLState) -> actor.ACTORParams:
         return actor.ACTORParams(iql.as_tanh_gaussian(state.actor.params), actor.exported(state).normalizer)
 
     learner = _learner(config, task, config.network, config.lr, config.lr)

@@ -44,7 +44,6 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     import jax
     import jax.numpy as jnp
 
-    from sgft_jax.learners.idle import IDLE
     from sgft_jax.learners.sac import SACParams
     from sgft_jax.models import dynamics, system
     from sgft_jax.models.networks import make_dynamics
@@ -98,8 +97,9 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
             metrics[f"system/{v['name']}_{v['index']}"] = v["low"] + 0.5 * (1.0 + mean) * (v["high"] - v["low"])
         return learner, metrics
 
-    parts = unlearned(sac_policy(task.obs_dim, task.act_dim, network), start, export)._replace(
-        learner=IDLE._replace(update=report), observed=observed, simulation=Simulation(20_000, 0.6)
+    parts = unlearned(sac_policy(task.obs_dim, task.act_dim, network), start, export)
+    parts = parts._replace(
+        learner=parts.learner._replace(update=report), observed=observed, simulation=Simulation(20_000, 0.6)
     )
     # One update after a rollout says what was fitted; more would say it again.
     return assemble(parts, loop, task)._replace(updates_per_rollout=1)

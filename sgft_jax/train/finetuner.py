@@ -15,7 +15,6 @@ from envs.types import Array, Key, Policy, PyTree, Transition, UserError
 from sgft_jax.data import replay, sources
 from sgft_jax.identify import Identified, Interface, interface
 from sgft_jax.learners import sac
-from sgft_jax.learners.idle import IDLE
 from sgft_jax.math import optim
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.config import NetworkConfig
@@ -251,12 +250,15 @@ def unlearned(
 ) -> Parts:
     """Parts of a method whose policy never learns: it acts as what is exported, whatever else adapts."""
 
+    def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
+        return state, {}
+
     def act(
         state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
     ) -> tuple[Array, PyTree]:
         return policy.act(export(state), carry, obs, key, explore=explore)
 
-    return Parts(IDLE, start, export, policy, act)
+    return Parts(Learner(lambda key: (), policy.init_carry, act, update), start, export, policy, act)
 
 
 # --- SAC --------------------------------------------------------------------------------------------------------------
