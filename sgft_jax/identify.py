@@ -50,21 +50,19 @@ def interface(model: Model, kept: Callable[[PyTree], PyTree], task: Task) -> Int
     """Identification for a task. model(params, obs, action) -> [measured_dim]; kept(prior's params) -> its params."""
 
     def start(params: PyTree, simulated: SimulatedData) -> Identified:
-        own, rows = jax.tree.map(jnp.copy, kept(params)), simulated.draw(jax.random.key(0), _SIMULATED)
+        simulator, rows = jax.tree.map(jnp.copy, kept(params)), simulated.draw(jax.random.key(0), _SIMULATED)
         nothing, held = distortion.none(task.act_dim, task.measured_dim), jnp.ones(_SIMULATED, bool)
-        missed = distortion.residuals(lambda *x: model(own, *x), rows, nothing)
+        missed = distortion.residuals(lambda *x: model(simulator, *x), rows, nothing)
         change = (rows.next_obs - rows.obs)[:, : missed.shape[1]]
-        return Identified(own, spread_of(missed, change, held), nothing)
+        return Identified(simulator, spread_of(missed, change, held), nothing)
 
     def refit(known: Identified, rows: Transition, held: Array) -> Identified:
         rows, held = jax.tree.map(lambda x: x[:_ROWS], (rows, held))
-        found, evidence = distortion.fit(
-            lambda *x: model(known.params, *x), rows, held, known.spread, turns=task.cartesian,
-            errors=task.sensor_errors,
-        )  # fmt: skip
+        options = {"turns": task.cartesian, "errors": task.sensor_errors}
+        fitted, evidence = distortion.fit(lambda *x: model(known.params, *x), rows, held, known.spread, **options)
         nothing = distortion.none(task.act_dim, task.measured_dim)
         return known._replace(
-            distortion=jax.tree.map(lambda a, b: jnp.where(evidence > _EVIDENCE, a, b), found, nothing)
+            distortion=jax.tree.map(lambda a, b: jnp.where(evidence > _EVIDENCE, a, b), fitted, nothing)
         )
 
     def meant(known: Identified, batch: Batch) -> Batch:

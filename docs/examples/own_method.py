@@ -56,10 +56,13 @@ def main() -> None:
     params = sgft_jax.extract_params(jax.jit(agent.init)(jax.random.key(0)))
     prior = Prior(params, {"algorithm": "sac", "network": {**asdict(network), "hidden": [16]}, "gamma": 0.9})
     line = SimpleNamespace(
-        obs_dim=1, act_dim=1, previous_actions=0, episode_length=32,
+        obs_dim=1,
+        act_dim=1,
+        previous_actions=0,
+        episode_length=32,
         reward=lambda obs, action, next_obs: -jnp.abs(next_obs[0]),
         terminated=lambda obs, action, next_obs: jnp.bool_(False),
-    )  # fmt: skip
+    )
     tuner = METHOD.online.build(Config(batch_size=16, replay_capacity=64), prior, line)
     obs, action = jax.random.uniform(jax.random.key(1), (2, 32, 1), minval=-1)
     next_obs = obs + 0.1 * action
