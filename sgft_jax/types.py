@@ -129,42 +129,52 @@ class Task(Protocol):
     @property
     def obs_dim(self) -> int:
         """Length of the observation vector."""
+        ...
 
     @property
     def act_dim(self) -> int:
         """Length of the action vector."""
+        ...
 
     @property
     def measured_dim(self) -> int:
         """How many numbers of the observation are measured."""
+        ...
 
     @property
     def sensor_errors(self) -> tuple[float, ...]:
         """[measured_dim] how far off each sensor of a real system may be for good, as a std in its own unit."""
+        ...
 
     @property
     def cartesian(self) -> bool:
         """Whether the first two actions are x and y of one frame."""
+        ...
 
     @property
     def episode_length(self) -> int:
         """Control steps until the time limit."""
+        ...
 
     @property
     def score(self) -> str:
         """What a run is judged by, "success" or "return"."""
+        ...
 
     @property
     def simulator(self) -> Callable[[], Callable[[Array, Array], Array]] | None:
         """Compiles (obs, action) -> [measured_dim], what a step changes in the system that `obs` tells."""
+        ...
 
     @property
     def reward(self) -> Callable[[Array, Array, Array], Array] | None:
         """Task reward []."""
+        ...
 
     @property
     def terminated(self) -> Callable[[Array, Array, Array], Array] | None:
         """Whether the episode ends for good, [] bool."""
+        ...
 
 
 @dataclass(frozen=True)
