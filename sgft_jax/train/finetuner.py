@@ -58,6 +58,9 @@ class FinetuneState(NamedTuple):
     interface: Identified | None = None
 
 
+Update = Callable[[FinetuneState, Key], tuple[FinetuneState, Metrics]]
+
+
 class Models(NamedTuple):
     """A part that fits dynamics models: start(params) -> fit; update(fit, normalizer, batch, key) -> (fit, metrics)."""
 
@@ -130,21 +133,16 @@ def assemble(parts: Parts, options: LoopOptions, task: Task) -> Finetuner:
         held = jnp.arange(options.replay_capacity) < state.replay.size
         return state._replace(interface=parts.interface.refit(state.interface, state.replay.data, held))
 
-    def act_of_learner(
-        state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
-    ) -> tuple[Array, PyTree]:
-        return parts.learner.act(state.learner, carry, obs, key, explore=explore)
-
-    simulated_act = parts.act or act_of_learner
-
     def act(
         state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
     ) -> tuple[Array, PyTree]:
-        if state.interface is None:
-            return simulated_act(state, carry, obs, key, explore=explore)
-        obs = state.interface.distortion.seen(obs)
-        action, carry = simulated_act(state, carry, obs, key, explore=explore)
-        return state.interface.distortion.command(action), carry
+        interface = state.interface
+        obs = obs if interface is None else interface.distortion.seen(obs)
+        if parts.act is None:
+            action, carry = parts.learner.act(state.learner, carry, obs, key, explore=explore)
+        else:
+            action, carry = parts.act(state, carry, obs, key, explore=explore)
+        return action if interface is None else interface.distortion.command(action), carry
 
     def export(state: FinetuneState) -> PyTree:
         params = parts.export(state)
@@ -165,18 +163,9 @@ def assemble(parts: Parts, options: LoopOptions, task: Task) -> Finetuner:
         def one(state: FinetuneState, key: Key) -> tuple[FinetuneState, Metrics]:
             return _update(parts, source_of(state, offline), state, key, simulated)
 
-        keys = jax.random.split(key, updates)
         # An empty replay is sampled as zeros, which nobody has lived through.
         some = state.replay.size > 0 if source_of(state, offline).n_real else jnp.ones((), bool)
-        made = jnp.where(some, updates if limit is None else limit, 0)
-        if limit is None:
-            learned, metrics = jax.lax.scan(one, state, keys)
-            learned = jax.tree.map(lambda new, old: jnp.where(some, new, old), _changing(learned), _changing(state))
-            metrics = jax.tree.map(jnp.mean, metrics)
-        else:
-            learned, metrics = _up_to(one, state, keys, made)
-        metrics = {name: jnp.where(made > 0, x, jnp.nan) for name, x in metrics.items()}
-        return state._replace(**learned), metrics | {"updates": made.astype(jnp.float32)}
+        return _learn(one, state, jax.random.split(key, updates), some, limit)
 
     finetuner = Finetuner(
         init=init,
@@ -222,14 +211,27 @@ def _update(
     return state._replace(learner=learner, transform=transform), metrics
 
 
+def _learn(
+    update: Update, state: FinetuneState, keys: Key, some: Array, limit: Array | None
+) -> tuple[FinetuneState, Metrics]:
+    """An update with each of the keys, the first `limit` [] of them if given, or none unless `some` []."""
+    made = jnp.where(some, keys.shape[0] if limit is None else limit, 0)
+    if limit is None:
+        learned, metrics = jax.lax.scan(update, state, keys)
+        changed = jax.tree.map(lambda new, old: jnp.where(some, new, old), _changing(learned), _changing(state))
+        metrics = jax.tree.map(jnp.mean, metrics)
+    else:
+        changed, metrics = _up_to(update, state, keys, made)
+    metrics = {name: jnp.where(made > 0, x, jnp.nan) for name, x in metrics.items()}
+    return state._replace(**changed), metrics | {"updates": made.astype(jnp.float32)}
+
+
 def _changing(state: FinetuneState) -> dict[str, PyTree]:
     """What an update changes of a state: all but what is large."""
     return {name: getattr(state, name) for name in ("learner", "models", "transform")}
 
 
-def _up_to(
-    update: Callable[[FinetuneState, Key], tuple[FinetuneState, Metrics]], state: FinetuneState, keys: Key, made: Array
-) -> tuple[dict[str, PyTree], Metrics]:
+def _up_to(update: Update, state: FinetuneState, keys: Key, made: Array) -> tuple[dict[str, PyTree], Metrics]:
     """What so many updates `made` [] with the first of the keys change, and their mean metrics."""
 
     def one(i: Array, carry: tuple[dict[str, PyTree], Metrics]) -> tuple[dict[str, PyTree], Metrics]:
