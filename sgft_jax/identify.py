@@ -10,10 +10,12 @@ import jax
 import jax.numpy as jnp
 
 from envs.types import Array, PyTree, Transition
-from sgft_jax.models import distortion
+from sgft_jax.models import distortion, dynamics
+from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.distortion import Distortion
+from sgft_jax.models.networks import make_dynamics
 from sgft_jax.models.robust import spread_of
-from sgft_jax.types import Batch, SimulatedData, Task
+from sgft_jax.types import Batch, Normalizer, SimulatedData, Task
 
 _SIMULATED = 2048  # rows that tell how far the model is off in simulation
 _ROWS = 320  # real ones that are fitted, the first 8 rollouts or so; more of them add little
@@ -72,3 +74,18 @@ def interface(model: Model, kept: Callable[[PyTree], PyTree], task: Task) -> Int
         return jax.tree.map(lambda a, b: jnp.where(simulated.reshape(-1, *[1] * (a.ndim - 1)), a, b), batch, new)
 
     return Interface(start, refit, meant)
+
+
+def command_interface(network: NetworkConfig, task: Task) -> Interface:
+    """Identification through one model of the prior's ensemble, as the simulator left it."""
+    model = make_dynamics(task.obs_dim, task.act_dim, network)
+
+    def change(kept: tuple[PyTree, Normalizer], obs: Array, action: Array) -> Array:
+        member, statistics = kept
+        after = dynamics.predict(model, member, statistics, obs, action)[0]
+        return (after - obs)[: task.measured_dim]
+
+    def kept(params: PyTree) -> tuple[PyTree, Normalizer]:
+        return jax.tree.map(lambda x: x[:1], params.dynamics), params.normalizer
+
+    return interface(change, kept, task)

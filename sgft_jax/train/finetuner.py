@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from envs.types import Array, Key, Policy, PyTree, Transition, UserError
 from sgft_jax.data import replay, sources
-from sgft_jax.identify import Identified, Interface, interface
+from sgft_jax.identify import Identified, Interface, command_interface
 from sgft_jax.learners import sac
 from sgft_jax.math import optim
 from sgft_jax.models import dynamics, value
@@ -409,21 +409,6 @@ def dynamics_models(options: Any, network: NetworkConfig, task: Task) -> Models:
         return dynamics.update(model, optimiser, fit, normalizer, batch, key, rate=rate)
 
     return Models(lambda params: optim.start(optimiser, params.dynamics), update)
-
-
-def command_interface(network: NetworkConfig, task: Task) -> Interface:
-    """Identification through one model of the prior's ensemble, as the simulator left it."""
-    model = make_dynamics(task.obs_dim, task.act_dim, network)
-
-    def change(kept: tuple[PyTree, Normalizer], obs: Array, action: Array) -> Array:
-        member, statistics = kept
-        after = dynamics.predict(model, member, statistics, obs, action)[0]
-        return (after - obs)[: task.measured_dim]
-
-    def kept(params: PyTree) -> tuple[PyTree, Normalizer]:
-        return jax.tree.map(lambda x: x[:1], params.dynamics), params.normalizer
-
-    return interface(change, kept, task)
 
 
 def _imagine(
