@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import OfflineOptions, agent_of, sac_numbers
+from sgft_jax.methods.options import RowsOptions, agent_of, sac_numbers
 from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
 @dataclass(frozen=True)
-class Config(OfflineOptions):
+class Config(RowsOptions):
     """Options of `cql`."""
 
     conservatism: float = 2.0

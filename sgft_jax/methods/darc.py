@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import ActorCriticOptions, agent_of, sac_numbers
+from sgft_jax.methods.options import RowsOptions, agent_of, sac_numbers
 from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
 @dataclass(frozen=True)
-class Config(ActorCriticOptions):
+class Config(RowsOptions):
     """Options of `darc`; the defaults are those of the baseline of H2O+, with a fixed set of real data."""
 
     rows: int = 256
@@ -18,7 +18,7 @@ class Config(ActorCriticOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.rows(self, "rows", "ratio_rows")
+        checks.rows(self, "ratio_rows")
 
 
 def build(config: Config, task: Task) -> HybridAgent:

@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
-from sgft_jax.methods.options import EnsembleOptions, OfflineOptions, agent_of, sac_numbers
+from sgft_jax.methods.options import EnsembleOptions, RowsOptions, agent_of, sac_numbers
 from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
 @dataclass(frozen=True)
-class Config(OfflineOptions, EnsembleOptions):
+class Config(RowsOptions, EnsembleOptions):
     """Options of `edac`; with diversity 0 it is SAC-N."""
 
     hidden: tuple[int, ...] = (256, 256, 256)

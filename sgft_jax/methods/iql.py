@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from envs.types import Array, Key, PyTree
 from sgft_jax import checks
-from sgft_jax.methods.options import OfflineOptions, agent_of, return_scale
+from sgft_jax.methods.options import RowsOptions, agent_of, return_scale
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.train.options import MixedOptions
 from sgft_jax.types import (
@@ -117,7 +117,7 @@ def _learner(
 
 
 @dataclass(frozen=True)
-class FixedConfig(OfflineOptions):
+class FixedConfig(RowsOptions):
     """Options of `iql` from a fixed set of real data; the published ones for locomotion."""
 
     expectile: float = 0.7

@@ -42,8 +42,8 @@ class ActorCriticOptions:
 
 
 @dataclass(frozen=True)
-class OfflineOptions(ActorCriticOptions):
-    """Options of methods that learn from the real rows alone."""
+class RowsOptions(ActorCriticOptions):
+    """Options of methods whose batches are of one kind of rows, real ones unless a method says otherwise."""
 
     rows: int = 256
     """Real rows of a batch."""

@@ -3,13 +3,13 @@
 from dataclasses import dataclass, replace
 
 from sgft_jax import checks
-from sgft_jax.methods.options import OfflineOptions, agent_of
+from sgft_jax.methods.options import RowsOptions, agent_of
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
 @dataclass(frozen=True)
-class Config(OfflineOptions):
+class Config(RowsOptions):
     """Options of `rebrac`."""
 
     lr: float = 1e-3

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import ActorCriticOptions, agent_of, sac_numbers
+from sgft_jax.methods.options import RowsOptions, agent_of, sac_numbers
 from sgft_jax.train.options import KeptCriticOptions, MixedOptions
 from sgft_jax.types import Finetuner, Fixed, HybridAgent, Method, Online, Prior, Task
 
@@ -42,15 +42,11 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
 
 @dataclass(frozen=True)
-class SimulatorConfig(ActorCriticOptions):
+class SimulatorConfig(RowsOptions):
     """Options of `sac` in a simulator alone."""
 
     rows: int = 256
     """Simulated rows of a batch."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.rows(self, "rows")
 
 
 def build_fixed(config: SimulatorConfig, task: Task) -> HybridAgent:
