@@ -121,15 +121,14 @@ def _members(ensemble: PyTree) -> int:
 
 
 def _structure_of(card: Mapping[str, Any], obs_dim: int, act_dim: int) -> tdmpc2.TDMPC2Config:
-    own = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
-    return tdmpc2_model.named_config(obs_dim, act_dim, **own, sgft=card["config"].get("sgft", False))
+    numbers = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
+    return tdmpc2_model.named_config(obs_dim, act_dim, **numbers, sgft=card["config"].get("sgft", False))
 
 
 def network_of(card: Mapping[str, Any]) -> NetworkConfig:
     """The networks of a prior of SAC; raises UserError where this version knows no such network."""
     try:
-        own: dict[str, Any] = {**card["network"], "hidden": tuple(card["network"]["hidden"])}
-        return NetworkConfig(**own)
+        return NetworkConfig(**{**card["network"], "hidden": tuple(card["network"]["hidden"])})
     except (TypeError, KeyError):
         raise UserError(f"this version knows no such network: {card['network']}; pretrain again") from None
 

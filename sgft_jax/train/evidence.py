@@ -107,8 +107,8 @@ def _keep(best: Best, params: PyTree, window: Array, age: Array, better: Array) 
     def keep(new: Array, old: Array) -> Array:
         return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
-    now = params, jnp.broadcast_to(age, better.shape), window
-    return Best(*jax.tree.map(keep, now, best[:3]), *best[3:])
+    now = {"params": params, "age": jnp.broadcast_to(age, better.shape), "kept": window}
+    return best._replace(**{name: jax.tree.map(keep, x, getattr(best, name)) for name, x in now.items()})
 
 
 def _better(new: Array, best: Best) -> Array:

@@ -21,7 +21,6 @@ from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import finetuning
 from sgft_jax.train.finetuner import Parts, assemble
 from sgft_jax.train.options import LoopOptions
-from sgft_jax.transforms import compose
 from sgft_jax.types import Learner, Simulation
 
 ENV, GAMMA = toy_terminating.make(), 0.9
@@ -48,16 +47,14 @@ def make(initial_policy=None, simulation=None, initial_rollouts=1, guard=False):
     parts = Parts(
         learner=learner,
         start=lambda params, key, simulated: (jnp.float32(0) if params is None else params, None),
-        init_carry=learner.init_carry,
-        act=lambda state, *step, explore: act(state.learner, *step, explore=explore),
         export=lambda state: state.learner,
         policy=Policy(learner.init_carry, act, lambda params, obs: params),
         source=lambda state: sources.mixture(4, 2) if simulation else sources.real_rows(4),
         offline=sources.simulated_rows(4),
-        transform=compose(),
+        simulation=simulation,
     )
     options = LoopOptions(utd=PER_ROLLOUT / LENGTH, initial_rollouts=initial_rollouts, replay_capacity=200, guard=guard)
-    return assemble(parts, options, ENV, initial_policy=initial_policy, simulation=simulation)
+    return assemble(parts, options, ENV)._replace(initial_policy=initial_policy)
 
 
 FINE = make()
