@@ -31,7 +31,7 @@ from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.methods import get_method
 from sgft_jax.stacking import join, part
-from sgft_jax.systems import Known, System
+from sgft_jax.systems import KnownSystem, System
 from sgft_jax.train import finetuning
 from sgft_jax.train.finetuning import FinetuneProgress, Logged
 from sgft_jax.train.learner_process import LearnerProcess
@@ -65,7 +65,7 @@ def run(args: FinetuneArgs, method: Online, seeds: list[int], folders: list[Path
             last.push(lambda error, *_: playing.close(over=error is None))
             members = seeds * len(args.real)
         setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
-        assert isinstance(setup.system, Known)
+        assert isinstance(setup.system, KnownSystem)
         # Last: what is wrong with a robot or with a method of the user's own leaves no folder behind.
         opened = runs.open_runs(
             homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
@@ -140,7 +140,7 @@ class _Run:
         self,
         args: FinetuneArgs,
         setup: Setup,
-        system: Known,
+        system: KnownSystem,
         card: dict[str, Any],
         records: list[Record],
         logs: list[Log],
