@@ -111,10 +111,9 @@ def show(args: RealDemoArgs) -> None:
     run = run_folder(arguments(args.method, task=TASK, seeds=1, seed=args.seed, out=args.out), REMOTE)
     stores = [evaluation_store(run, done) for done in (0, args.rollouts)]
     before, after = ([bool(store.load(i)["success"][0]) for i in range(len(store))] for store in stores)
-    print(
-        f"\nsuccess in Bullet: {_percent(before)} before, {_percent(after)} after {args.rollouts} rollouts of "
-        f"{args.method}; one seed, {args.episodes} episodes, in which the cube lay within 5 cm of the mark at the end"
-    )
+    rates = f"{_percent(before)} before, {_percent(after)} after {args.rollouts} rollouts of {args.method}"
+    played = f"{args.episodes} episodes, in which the cube lay within 5 cm of the mark at the end"
+    print(f"\nsuccess in Bullet: {rates}; one seed, {played}")
     print(film(args, before, after) if args.video else "no video: not asked for")
     print(f"learning curve: {run / 'figures/score.png'}; what the robot's side said: {args.out / 'robot.log'}")
 

@@ -106,9 +106,8 @@ def _simulated_rows(env: Env, finetuner: Finetuner, priors: list[Prior], stacked
     key, card = jax.random.key(_SIMULATION), priors[0].card
     env, gap = _simulator(env, card)
     worlds = training_worlds(env, gap, key, SIMULATED_WORLDS)
-    return finetuning.simulate(
-        env, make_policy(card, env), worlds, stacked, key, finetuner.simulation, gamma=card["gamma"]
-    )
+    policy, simulation = make_policy(card, env), finetuner.simulation
+    return finetuning.simulate(env, policy, worlds, stacked, key, simulation, gamma=card["gamma"])
 
 
 def _simulator(env: Env, card: Mapping[str, Any]) -> tuple[Env, Gap | None]:
@@ -123,10 +122,8 @@ def check_prior(prior: Prior, method: Online, env: Env) -> None:
     """Raises UserError for a prior of another algorithm or task, or of a policy that is told more or less."""
     check_card(prior.card, method, env.name)
     if prior.card["obs_dim"] != env.obs_dim:
-        raise UserError(
-            f"the policy of the prior observes {prior.card['obs_dim']} numbers, the task as it was made {env.obs_dim}; "
-            "make it with sgft_jax.make_env(prior)"
-        )
+        sizes = f"{prior.card['obs_dim']} numbers, the task as it was made {env.obs_dim}"
+        raise UserError(f"the policy of the prior observes {sizes}; make it with sgft_jax.make_env(prior)")
 
 
 def make_env(prior: Prior, *, task: str | None = None) -> Env:

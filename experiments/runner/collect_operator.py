@@ -71,9 +71,7 @@ def _write(args: CollectArgs, env: Env, path: Path, episodes: list[Recorded]) ->
     }
     spreads = ", ".join(f"{name} {value:.3g}" for name, value in facts["std"].items())
     earned = ", ".join(f"{value:.2f} {name}" for name, value in facts["reward"].items())
-    print(
-        f"{path}: {log.facts.transitions:,} transitions, {log.facts.terminal} falls; std of {spreads}; "
-        f"reward of a step {earned}"
-    )
+    rows = f"{log.facts.transitions:,} transitions, {log.facts.terminal} falls"
+    print(f"{path}: {rows}; std of {spreads}; reward of a step {earned}")
     write_json(path.with_suffix(".json"), {**facts, "real": args.real, "provenance": runs.provenance()})
     return facts

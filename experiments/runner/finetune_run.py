@@ -28,7 +28,7 @@ from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.methods import get_method
 from sgft_jax.stacking import join, part
-from sgft_jax.systems import Known, System
+from sgft_jax.systems import KnownSystem, System
 from sgft_jax.train import finetuning
 from sgft_jax.train.finetuning import FinetuneProgress, Logged
 from sgft_jax.train.learner_process import LearnerProcess
@@ -62,7 +62,7 @@ def run(args: FinetuneArgs, method: Online, seeds: list[int], folders: list[Path
             last.push(lambda error, *_: playing.close(over=error is None))
             members = seeds * len(args.real)
         setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
-        assert isinstance(setup.system, Known)
+        assert isinstance(setup.system, KnownSystem)
         # Last: what is wrong with a robot or with a method of the user's own leaves no folder behind.
         inputs = {
             "priors": [digest(prior) for prior in priors],
@@ -134,7 +134,7 @@ class _Run(Training):
         self,
         args: FinetuneArgs,
         setup: Setup,
-        system: Known,
+        system: KnownSystem,
         card: dict[str, Any],
         records: list[FinetuneRecord],
         logs: list[Log],

@@ -19,11 +19,10 @@ def read(path: Path, env: Env, *, gamma: float, successors: Successors = "stored
     log = datasets.load(path, gamma=gamma, successors=successors, env=env)
     facts = log.facts
     clipped = f"; {facts.clipped:,} actions beyond [-1, 1] were clipped" if facts.clipped else ""
-    print(
-        f"data: {facts.path}, {facts.size:,} bytes, sha256 {facts.sha256[:12]}; {facts.transitions:,} transitions of "
-        f"{facts.episodes:,} episodes, return {facts.return_mean:.4g} (std {facts.return_std:.3g}, "
-        f"{facts.return_min:.4g} to {facts.return_max:.4g}){clipped}"
-    )
+    rows = f"{facts.transitions:,} transitions of {facts.episodes:,} episodes"
+    spread = f"std {facts.return_std:.3g}, {facts.return_min:.4g} to {facts.return_max:.4g}"
+    returns = f"return {facts.return_mean:.4g} ({spread})"
+    print(f"data: {facts.path}, {facts.size:,} bytes, sha256 {facts.sha256[:12]}; {rows}, {returns}{clipped}")
     if facts.assumed:
         print(f"{facts.path}: {facts.assumed}")
     return log
@@ -37,9 +36,8 @@ def begin_with(logs: Sequence[Log], finetuner: Finetuner, env: Env, *, capacity:
     """
     count = transitions(logs)
     if count > capacity:
-        raise UserError(
-            f"--real-data: {count:,} transitions, but an agent keeps {capacity:,}; raise --options.replay-capacity"
-        )
+        room = f"an agent keeps {capacity:,}; raise --options.replay-capacity"
+        raise UserError(f"--real-data: {count:,} transitions, but {room}")
     rows, valid = jax.tree.map(jnp.asarray, datasets.episodes(logs))
     made = round(finetuner.updates_per_rollout * count / env.episode_length) if updates is None else updates
     return Logged(rows, valid, made)

@@ -101,10 +101,8 @@ def address(real: str) -> tuple[str, int]:
     except UserError:
         number = None
     if number is None:
-        raise UserError(
-            f"--real {real}: write {REMOTE}, {REMOTE}:HOST or {REMOTE}:HOST:PORT, a port from 1 to 65535, an IPv6 "
-            "address as [::1]"
-        )
+        forms = f"{REMOTE}, {REMOTE}:HOST or {REMOTE}:HOST:PORT"
+        raise UserError(f"--real {real}: write {forms}, a port from 1 to 65535, an IPv6 address as [::1]")
     return host or _HOST, number
 
 

@@ -14,7 +14,7 @@ from envs.rollout import Episode
 from envs.types import Key, PyTree, Transition, UserError
 from sgft_jax.io.real import RealStore
 from sgft_jax.stacking import join, part
-from sgft_jax.systems import Stepped, System
+from sgft_jax.systems import SteppedSystem, System
 from sgft_jax.systems.gymnasium import Step
 
 _FACTS = tuple(name for name in Episode._fields if name != "transitions")
@@ -74,7 +74,7 @@ class RecordedSystem:
     def _play_robot(self, number: int, policy: Any, states: PyTree, keys: Key) -> None:
         """Stores the rollout of a robot, played now or as far as a kill has let it come. keys: [1]."""
         (store,), inner = self.stores, self.inner
-        assert isinstance(inner, Stepped)
+        assert isinstance(inner, SteppedSystem)
         journal = store.journal(number, sync_every=self.sync_every or 1)
         made = [_step(journal.path, step, inner.env) for step in journal.read()]
         if made and not made[-1].over and len(made) < inner.env.episode_length:

@@ -65,16 +65,13 @@ def check(path: Path, rows: Rows) -> Rows:
     if not np.any(rows.keep):
         raise UserError(f"{path}: holds no transitions; supply another file")
     if rows.next_obs.shape != rows.obs.shape:
-        raise UserError(
-            f"{path}: next observations are {list(rows.next_obs.shape)}, observations {list(rows.obs.shape)}; "
-            "supply another file or set successors to 'shifted'"
-        )
+        sizes = f"next observations are {list(rows.next_obs.shape)}, observations {list(rows.obs.shape)}"
+        raise UserError(f"{path}: {sizes}; supply another file or set successors to 'shifted'")
     n = len(rows.keep)
     shapes = {"obs": (n, None), "action": (n, None), "next_obs": (n, None)}
     shapes |= {} if rows.reward is None else {"reward": (n,)}
-    return rows._replace(
-        **{name: numbers(path, name, getattr(rows, name), shape, fix=_FIX) for name, shape in shapes.items()}
-    )
+    columns = {name: numbers(path, name, getattr(rows, name), shape, fix=_FIX) for name, shape in shapes.items()}
+    return rows._replace(**columns)
 
 
 def ages(ends: np.ndarray) -> np.ndarray:
@@ -228,10 +225,8 @@ def _read_minari(content: Reader, groups: list[h5py.Group]) -> Rows:
     episodes = [_read_episode(content, group) for group in groups]
     sizes = [[x.shape[1:] for x in rows] for rows in episodes]
     if odd := [group.name for group, size in zip(groups, sizes, strict=True) if size != sizes[0]]:
-        raise UserError(
-            f"{file}: {odd[0]} has other sizes of observations or actions than {groups[0].name}; "
-            "supply episodes of one task"
-        )
+        other = f"other sizes of observations or actions than {groups[0].name}"
+        raise UserError(f"{file}: {odd[0]} has {other}; supply episodes of one task")
     obs, action, reward, next_obs, terminal, ends = map(np.concatenate, zip(*episodes, strict=True))
     card = _card(file.parent) if file.with_name(_METADATA).exists() else {}
     for name, n in {"total_episodes": len(groups), "total_steps": len(reward)}.items():
@@ -244,9 +239,8 @@ def _read_minari(content: Reader, groups: list[h5py.Group]) -> Rows:
 
 def _episodes(content: Reader) -> list[h5py.Group]:
     """The groups `episode_0`, `episode_1`, ... of a Minari file, in the order of their numbers."""
-    numbered = {
-        int(m[1]): m[0] for name in content.names() if (m := re.fullmatch(r"episode_(0|[1-9][0-9]{0,17})", name))
-    }
+    matches = (re.fullmatch(r"episode_(0|[1-9][0-9]{0,17})", name) for name in content.names())
+    numbered = {int(match[1]): match[0] for match in matches if match}
     groups = [content.group(name) for _, name in sorted(numbered.items())]
     return [group for group in groups if group is not None]
 
@@ -256,9 +250,7 @@ def _read_episode(content: Reader, group: h5py.Group) -> tuple[np.ndarray, ...]:
     obs, action, reward, terminal, _ = _columns(content, group, "terminations", "truncations")
     steps, stated = len(reward), content.attribute(group, "total_steps")
     if len(obs) != steps + 1 or stated not in (None, steps):
-        raise UserError(
-            f"{content.path}: {group.name} has {len(obs)} observations for {steps} of "
-            f"{steps if stated is None else stated} rewards; every episode needs one observation more than rewards: "
-            "supply a whole file"
-        )
+        counts = f"{len(obs)} observations for {steps} of {steps if stated is None else stated} rewards"
+        rule = "every episode needs one observation more than rewards: supply a whole file"
+        raise UserError(f"{content.path}: {group.name} has {counts}; {rule}")
     return obs[:-1], action, reward, obs[1:], terminal, np.arange(steps) == steps - 1

@@ -80,22 +80,11 @@ def write(
     pq.write_table(_tasks(pa, task), folder / "meta/tasks.parquet")
     joined = {name: np.concatenate([columns[name] for columns in frames]) for name in features}
     write_json(folder / "meta/stats.json", {name: _statistics(values) for name, values in joined.items()})
-    info = {
-        "codebase_version": _VERSION,
-        "robot_type": None,
-        "total_episodes": len(episodes),
-        "total_frames": int(starts[-1]),
-        "total_tasks": 1,
-        "chunks_size": 1000,
-        "data_files_size_in_mb": 100,
-        "video_files_size_in_mb": 200,
-        "fps": rate,
-        "splits": {"train": f"0:{len(episodes)}"},
-        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-        "video_path": None,
-        "features": features,
-    }
-    write_json(folder / INFO, info)
+    counts = {"total_episodes": len(episodes), "total_frames": int(starts[-1]), "total_tasks": 1}
+    limits = {"chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
+    paths = {"data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet", "video_path": None}
+    info = {"codebase_version": _VERSION, "robot_type": None, **counts, **limits, "fps": rate}
+    write_json(folder / INFO, {**info, "splits": {"train": f"0:{len(episodes)}"}, **paths, "features": features})
 
 
 def _features(observation: Sequence[Entry], action: Sequence[Entry]) -> dict[str, dict[str, Any]]:
@@ -105,15 +94,9 @@ def _features(observation: Sequence[Entry], action: Sequence[Entry]) -> dict[str
     def number(dtype: str) -> dict[str, Any]:
         return {"dtype": dtype, "shape": [1], "names": None}
 
-    return {
-        _STATE: state,
-        _ACTION: command,
-        _SUCCESSOR: state,
-        _REWARD: number("float32"),
-        **{name: number("bool") for name in (_DONE, _TRUNCATED, _SUCCESS)},
-        "timestamp": number("float32"),
-        **{name: number("int64") for name in _INDICES},
-    }
+    step = {_STATE: state, _ACTION: command, _SUCCESSOR: state, _REWARD: number("float32")}
+    ends = dict.fromkeys((_DONE, _TRUNCATED, _SUCCESS), number("bool"))
+    return {**step, **ends, "timestamp": number("float32"), **dict.fromkeys(_INDICES, number("int64"))}
 
 
 def _vector(entries: Sequence[Entry]) -> dict[str, Any]:
@@ -126,38 +109,21 @@ def _frames(episode: Recorded, number: int, first: int, rate: float) -> dict[str
     """The columns [T, ...] of one episode. first: index of its first frame in the data set."""
     steps = np.arange(len(episode.reward))
     last = steps == len(steps) - 1
-    return {
-        _STATE: episode.obs[:-1],
-        _ACTION: episode.action,
-        _SUCCESSOR: episode.obs[1:],
-        _REWARD: episode.reward,
-        _DONE: last,
-        _TRUNCATED: last & (not episode.terminated),
-        _SUCCESS: last & bool(episode.success),
-        "timestamp": (steps / rate).astype(np.float32),
-        "frame_index": steps,
-        "episode_index": np.full_like(steps, number),
-        "index": first + steps,
-        "task_index": np.zeros_like(steps),
-    }
+    moved = {_STATE: episode.obs[:-1], _ACTION: episode.action, _SUCCESSOR: episode.obs[1:], _REWARD: episode.reward}
+    ends = {_DONE: last, _TRUNCATED: last & (not episode.terminated), _SUCCESS: last & bool(episode.success)}
+    places = {"timestamp": (steps / rate).astype(np.float32), "frame_index": steps}
+    places |= {"episode_index": np.full_like(steps, number), "index": first + steps, "task_index": np.zeros_like(steps)}
+    return {**moved, **ends, **places}
 
 
 def _episode_row(frames: Mapping[str, np.ndarray], task: str, number: int, first: int) -> dict[str, Any]:
     """What `meta/episodes` says of one episode."""
     length = len(frames["index"])
     stats = {f"stats/{name}/{key}": x for name, values in frames.items() for key, x in _statistics(values).items()}
-    return {
-        "episode_index": number,
-        "tasks": [task],
-        "length": length,
-        "data/chunk_index": 0,
-        "data/file_index": 0,
-        "dataset_from_index": first,
-        "dataset_to_index": first + length,
-        "meta/episodes/chunk_index": 0,
-        "meta/episodes/file_index": 0,
-        **stats,
-    }
+    episode = {"episode_index": number, "tasks": [task], "length": length}
+    rows = {"dataset_from_index": first, "dataset_to_index": first + length}
+    data, meta = ({f"{part}/chunk_index": 0, f"{part}/file_index": 0} for part in ("data", "meta/episodes"))
+    return {**episode, **data, **rows, **meta, **stats}
 
 
 def _statistics(values: np.ndarray) -> dict[str, list[float]]:

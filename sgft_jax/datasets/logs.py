@@ -178,16 +178,13 @@ def _fitted(path: Path, rows: Rows, env: Env) -> Rows:
         more, odd = divmod(seen - env.measured_dim, env.act_dim)
         fits = commanded == env.act_dim and more >= 0 and not odd
         advice = f"previous_actions={more} would fit" if fits else "name the task that it was recorded on"
-        raise UserError(
-            f"{path}: has {seen} observations and {commanded} actions, {env.name} has {env.obs_dim} and "
-            f"{env.act_dim}; {advice}"
-        )
+        task = f"{env.name} has {env.obs_dim} and {env.act_dim}"
+        raise UserError(f"{path}: has {seen} observations and {commanded} actions, {task}; {advice}")
     if np.mean((np.abs(rows.action) > _BEYOND).any(axis=1)) > 0.5:
         raise UserError(f"{path}: most actions lie beyond [-1, 1]; scale them to what {env.name} commands")
     if rows.rate is not None and abs(rows.rate * env.control_dt - 1) > _SAME_RATE:
-        raise UserError(
-            f"{path}: has {rows.rate:g} steps a second, {env.name} has {1 / env.control_dt:g}; resample it to that"
-        )
+        rate = f"{env.name} has {1 / env.control_dt:g}"
+        raise UserError(f"{path}: has {rows.rate:g} steps a second, {rate}; resample it to that")
     return rows
 
 
@@ -198,9 +195,8 @@ def _judged(path: Path, rows: Rows, env: Env | None) -> Rows:
         if env is None or env.reward is None:
             raise UserError(f"{path}: tells no rewards, and neither does a task; record them as next.reward")
         reward = np.where(rows.keep, jax.vmap(env.reward)(*step), 0.0)
-        rows = rows._replace(
-            reward=numbers(path, f"the reward of {env.name}", reward, (None,), fix="leave the row out")
-        )
+        reward = numbers(path, f"the reward of {env.name}", reward, (None,), fix="leave the row out")
+        rows = rows._replace(reward=reward)
     if rows.terminal is None:
         ended = np.zeros(len(rows.obs), bool)
         if env is not None and env.terminated is not None:
@@ -218,9 +214,8 @@ def _seen(rows: Rows, env: Env) -> Rows:
     for k in range(env.previous_actions):
         known = np.flatnonzero(age > k)
         memory[known, k] = action[known - 1 - k]
-    return rows._replace(
-        obs=with_memory(env, rows.obs, memory), next_obs=with_memory(env, rows.next_obs, remember(memory, action))
-    )
+    next_obs = with_memory(env, rows.next_obs, remember(memory, action))
+    return rows._replace(obs=with_memory(env, rows.obs, memory), next_obs=next_obs)
 
 
 # --- facts ------------------------------------------------------------------------------------------------------------
@@ -244,21 +239,12 @@ def _facts(rows: Rows) -> Facts:
     number = np.cumsum(rows.ends) - rows.ends  # of the episode of every row
     returns = np.bincount(number, weights=rows.reward.astype(np.float64))
     judged = returns[:whole] if whole else returns
-    return Facts(
-        path=str(rows.source),
-        layout=rows.layout,
-        size=size,
-        sha256=digest,
-        successors=rows.successors,
-        transitions=int(np.sum(keep)),
-        dropped=int(np.sum(~keep)),
-        terminal=int(np.sum(rows.terminal & keep)),
-        clipped=int(np.sum((np.abs(rows.action) > 1).any(axis=1) & keep)),
-        episodes=len(returns),
-        whole_episodes=whole,
-        **{f"return_{name}": float(getattr(np, name)(judged)) for name in ("mean", "std", "min", "max")},
-        assumed=rows.assumed,
-    )
+    clipped = (np.abs(rows.action) > 1).any(axis=1) & keep
+    counts = {"transitions": keep, "dropped": ~keep, "terminal": rows.terminal & keep, "clipped": clipped}
+    facts: dict[str, Any] = {name: int(np.sum(which)) for name, which in counts.items()}
+    facts |= {f"return_{name}": float(getattr(np, name)(judged)) for name in ("mean", "std", "min", "max")}
+    facts |= {"episodes": len(returns), "whole_episodes": whole}
+    return Facts(str(rows.source), rows.layout, size, digest, rows.successors, **facts, assumed=rows.assumed)
 
 
 def _fingerprint(source: Path) -> tuple[int, str]:

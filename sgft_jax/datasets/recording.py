@@ -152,15 +152,9 @@ def write_d4rl(path: Path, episodes: Sequence[Recorded], about: Mapping[str, str
 def _flat(episode: Recorded) -> dict[str, np.ndarray]:
     """The arrays [T, ...] of one episode."""
     last = np.arange(len(episode.reward)) == len(episode.reward) - 1
-    return {
-        "observations": episode.obs[:-1],
-        "actions": episode.action,
-        "next_observations": episode.obs[1:],
-        "rewards": episode.reward,
-        "terminals": last & episode.terminated,
-        "timeouts": last & (not episode.terminated),
-        **{name: x[:-1] for name, x in _infos(episode).items()},
-    }
+    step = {"observations": episode.obs[:-1], "actions": episode.action, "next_observations": episode.obs[1:]}
+    ends = {"terminals": last & episode.terminated, "timeouts": last & (not episode.terminated)}
+    return {**step, "rewards": episode.reward, **ends, **{name: x[:-1] for name, x in _infos(episode).items()}}
 
 
 def _infos(episode: Recorded) -> dict[str, np.ndarray]:
@@ -204,16 +198,11 @@ def write_minari(folder: Path, episodes: Sequence[Recorded], about: Mapping[str,
             for name, values in arrays.items():
                 group.create_dataset(name, data=values, compression="gzip")
     obs, action = episodes[0].obs.shape[1], episodes[0].action.shape[1]
-    facts = {
-        "data_format": "hdf5",
-        "total_episodes": len(episodes),
-        "total_steps": sum(len(episode.reward) for episode in episodes),
-        "observation_space": _box(-np.inf, np.inf, obs),
-        "action_space": _box(-1.0, 1.0, action),
-        "dataset_id": f"sgft/{folder.name}",
-        "minari_version": "0.5.3",
-    }
-    write_json(data / "metadata.json", {**facts, **about})
+    steps = sum(len(episode.reward) for episode in episodes)
+    counts = {"data_format": "hdf5", "total_episodes": len(episodes), "total_steps": steps}
+    spaces = {"observation_space": _box(-np.inf, np.inf, obs), "action_space": _box(-1.0, 1.0, action)}
+    origin = {"dataset_id": f"sgft/{folder.name}", "minari_version": "0.5.3"}
+    write_json(data / "metadata.json", {**counts, **spaces, **origin, **about})
 
 
 def _box(low: float, high: float, size: int) -> str:

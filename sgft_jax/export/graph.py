@@ -131,10 +131,8 @@ class _Writer:
 def graph_of(prior: Prior, env: Env) -> Graph:
     """One step of a policy that acts by networks alone; raises UserError for one that plans."""
     if plans(prior.card):
-        raise UserError(
-            "this policy plans at every step, which only --to jax can export; for numpy and onnx take a policy of a "
-            "method that does not plan, such as guarded"
-        )
+        advice = "for numpy and onnx take a policy of a method that does not plan, such as guarded"
+        raise UserError(f"this policy plans at every step, which only --to jax can export; {advice}")
     params, write, slots = prior.params, _Writer(), slots_of(prior, env)
     network, previous = network_of(prior.card), _PREVIOUS if env.previous_actions else None
     obs = _observed(write, params, env, previous)
@@ -234,25 +232,16 @@ def contract(prior: Prior, env: Env, to: Format) -> dict[str, Any]:
     distortion = getattr(params, "distortion", None)
     identified = None if distortion is None else {k: np.asarray(x) for k, x in distortion._asdict().items()}
     system = [{**v._asdict(), "value": x} for v, x in zip(env.system, _system(params, env), strict=True)]
-    return {
-        "format": 1,
-        "to": to,
-        "task": env.name,
-        "policy": {"algorithm": algorithm_of(card), "digest": digest(prior), **origin},
-        "control_period_s": env.control_dt,
-        "episode_steps": env.episode_length,
-        "observation": _entries(env.measured),
-        "action": [{**entry, "low": -1.0, "high": 1.0} for entry in _entries(env.action)],
-        "action_is": _PLAN if plans(card) else _MODE,
-        "inside": {
-            "previous_actions": env.previous_actions,
-            "system": system,
-            "normalisation": {name: np.asarray(x) for name, x in params.normalizer._asdict().items()},
-            "identified": identified,
-        },
-        "state": slots_of(prior, env),
-        "last_action": last_action_of(prior, env),
-    }
+    policy = {"algorithm": algorithm_of(card), "digest": digest(prior), **origin}
+    times = {"control_period_s": env.control_dt, "episode_steps": env.episode_length}
+    actions = [{**entry, "low": -1.0, "high": 1.0} for entry in _entries(env.action)]
+    spaces = {"observation": _entries(env.measured), "action": actions}
+    normalisation = {name: np.asarray(x) for name, x in params.normalizer._asdict().items()}
+    inside = {"previous_actions": env.previous_actions, "system": system}
+    inside |= {"normalisation": normalisation, "identified": identified}
+    kind = {"format": 1, "to": to, "task": env.name, "policy": policy, **times, **spaces}
+    kind |= {"action_is": _PLAN if plans(card) else _MODE, "inside": inside}
+    return {**kind, "state": slots_of(prior, env), "last_action": last_action_of(prior, env)}
 
 
 def _entries(entries: tuple[Any, ...]) -> list[dict[str, Any]]:

@@ -76,9 +76,8 @@ class Reader:
             if not self.has(group, name):
                 names = [member if member.isprintable() else repr(member) for member in sorted(group)]
                 others = ", ".join(names[:_SHOWN]) + ", ..." * (len(names) > _SHOWN) or "nothing"
-                raise UserError(
-                    f"{self.path}: there is no {name!r} in {group.name}, only {others}; supply a D4RL or Minari file"
-                )
+                missing = f"there is no {name!r} in {group.name}, only {others}"
+                raise UserError(f"{self.path}: {missing}; supply a D4RL or Minari file")
             if group.id.links.get_info(name.encode()).type != _HARD:
                 raise UserError(f"{self.path}: {name} is a link; {_COPY}")
             return group[name]

@@ -131,8 +131,6 @@ def known_task(where: Path | str, task: str, option: str = "--task") -> str:
     where: the file. option: how the user names a file with a task. Raises UserError for any other.
     """
     if task not in envs.TASKS:
-        raise UserError(
-            f"{where}: is of the task {task!r}, which does not come with this code; if it is yours, name its file with "
-            f"{option}"
-        )
+        advice = f"if it is yours, name its file with {option}"
+        raise UserError(f"{where}: is of the task {task!r}, which does not come with this code; {advice}")
     return task

@@ -226,10 +226,8 @@ def read_manifest(where: Path) -> dict[str, Any]:
     except UserError:
         raise UserError(f"{where}: torn: {MANIFEST} is not readable") from None
     if manifest["format"] != FORMAT:
-        raise UserError(
-            f"{where}: written in format {manifest['format']}, this version reads format {FORMAT} alone; begin again, "
-            "or use the version that wrote it"
-        )
+        formats = f"written in format {manifest['format']}, this version reads format {FORMAT} alone"
+        raise UserError(f"{where}: {formats}; begin again, or use the version that wrote it")
     files.checked(where / MANIFEST, manifest, _Manifest, _FIX)
     for name, (size, _) in manifest["files"].items():
         file = where / name

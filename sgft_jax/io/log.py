@@ -34,10 +34,9 @@ def check_finite(metrics: Mapping[str, Any], step: int, *, unit: str, last_good:
         if bad.any():
             members = f" of {int(bad.sum())} of {bad.size} members" if bad.size > 1 else ""
             good = f"the last good checkpoint is {last_good}" if last_good else "there is no checkpoint from before"
-            raise DivergedError(
-                f"training has diverged: {name}{members} is not finite after {step:,} {unit}; {good}. Lower learning "
-                "rates or clip gradients, and begin again with --overwrite"
-            )
+            advice = "Lower learning rates or clip gradients, and begin again with --overwrite"
+            where = f"{name}{members} is not finite after {step:,} {unit}"
+            raise DivergedError(f"training has diverged: {where}; {good}. {advice}")
 
 
 class MetricsLog:

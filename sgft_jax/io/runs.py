@@ -118,14 +118,10 @@ def provenance() -> dict[str, Any]:
 
     device = jax.devices()[0]
     words = [plain_path(word, [Path.cwd(), ROOT]) for word in sys.argv[1:]]
-    return {
-        "command": shlex.join([Path(sys.argv[0]).name, *words]),
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "git": _git_state(ROOT),
-        "python": platform.python_version(),
-        "versions": {name: _version(name) for name in _PACKAGES},
-        "device": {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()},
-    }
+    command, started = shlex.join([Path(sys.argv[0]).name, *words]), datetime.now(UTC).isoformat(timespec="seconds")
+    devices = {"platform": device.platform, "kind": device.device_kind, "count": jax.device_count()}
+    versions = {"python": platform.python_version(), "versions": {name: _version(name) for name in _PACKAGES}}
+    return {"command": command, "started": started, "git": _git_state(ROOT), **versions, "device": devices}
 
 
 def plain_path(word: str, bases: Sequence[Path]) -> str:
@@ -235,10 +231,8 @@ def _check_inputs(folder: Path, inputs: Mapping[str, Any]) -> None:
     for start in read_starts(folder):
         for name, now in inputs.items():
             if (before := start.get(name, now)) != now:
-                raise UserError(
-                    f"{folder}: cannot resume with other {name}: they were {before}, now {now}; put the first ones "
-                    "back, or begin again with --overwrite"
-                )
+                advice = "put the first ones back, or begin again with --overwrite"
+                raise UserError(f"{folder}: cannot resume with other {name}: they were {before}, now {now}; {advice}")
 
 
 def _check_ours(folder: Path, *, resume: bool, overwrite: bool) -> None:
@@ -261,10 +255,8 @@ def check_same(folder: Path, kind: str, wanted: Mapping[str, Any], volatile: tup
     """
     stored = _stored(folder)
     if (saved := stored.get("format", 1)) != FORMAT:
-        raise UserError(
-            f"{folder}: is a run of sgft_jax {stored[_MARK]} in format {saved}; this version continues format {FORMAT} "
-            "alone. Begin again with --overwrite"
-        )
+        advice = f"this version continues format {FORMAT} alone. Begin again with --overwrite"
+        raise UserError(f"{folder}: is a run of sgft_jax {stored[_MARK]} in format {saved}; {advice}")
     if stored["kind"] != kind:
         raise UserError(f"{folder}: is a {stored['kind']} run, not a {kind} run")
     changes = [change for change in differences(stored["config"], wanted) if change[0] not in volatile]

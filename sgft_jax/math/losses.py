@@ -8,14 +8,14 @@ from envs.types import Array, UserError
 from sgft_jax.types import Batch
 
 
-def row_mean(each: Array, batch: Batch) -> Array:
-    """Mean [] of one loss per row, each [B], over the valid rows of a batch, weighted where it has weights."""
+def row_mean(row_losses: Array, batch: Batch) -> Array:
+    """Mean [] of one loss per row, row_losses [B], over the valid rows of a batch, weighted where it has weights."""
     if batch.valid is None and batch.weight is None:
-        return jnp.mean(each)
-    ones = jnp.ones_like(each)
-    valid = ones if batch.valid is None else batch.valid.astype(each.dtype)
+        return jnp.mean(row_losses)
+    ones = jnp.ones_like(row_losses)
+    valid = ones if batch.valid is None else batch.valid.astype(row_losses.dtype)
     weight = ones if batch.weight is None else batch.weight
-    return jnp.sum(jnp.where(valid > 0, each, 0.0) * weight) / jnp.maximum(jnp.sum(valid), 1.0)
+    return jnp.sum(jnp.where(valid > 0, row_losses, 0.0) * weight) / jnp.maximum(jnp.sum(valid), 1.0)
 
 
 def is_simulated(batch: Batch) -> Array:
@@ -25,14 +25,14 @@ def is_simulated(batch: Batch) -> Array:
     return batch.is_sim
 
 
-def real_mean(each: Array, batch: Batch) -> Array:
+def real_mean(row_losses: Array, batch: Batch) -> Array:
     """`row_mean` [] over the rows of the real system alone."""
-    return row_mean(each, batch._replace(valid=real_rows(batch)))
+    return row_mean(row_losses, batch._replace(valid=real_rows(batch)))
 
 
-def sim_mean(each: Array, batch: Batch) -> Array:
+def sim_mean(row_losses: Array, batch: Batch) -> Array:
     """`row_mean` [] over the simulator's rows alone."""
-    return row_mean(each, batch._replace(valid=sim_rows(batch)))
+    return row_mean(row_losses, batch._replace(valid=sim_rows(batch)))
 
 
 def real_rows(batch: Batch) -> Array:

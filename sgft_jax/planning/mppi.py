@@ -90,12 +90,8 @@ def plan(
         best, index = jax.lax.top_k(jnp.concatenate([known, rate(drawn)]), config.elites)
         return _fit(candidates[index], hyper.temperature * (best - best[0]), hyper), None
 
-    start = _Search(
-        mean=jnp.concatenate([previous[1:], jnp.zeros_like(previous[:1])]),
-        std=jnp.full(previous.shape, hyper.std_max),
-        elites=jnp.zeros((config.elites, *previous.shape)),
-        logits=jnp.zeros(config.elites),
-    )
+    mean, std = jnp.concatenate([previous[1:], jnp.zeros_like(previous[:1])]), jnp.full(previous.shape, hyper.std_max)
+    start = _Search(mean, std, jnp.zeros((config.elites, *previous.shape)), jnp.zeros(config.elites))
     end, _ = jax.lax.scan(refine, start, jax.random.split(key_search, config.iterations))
     action = end.elites[jax.random.categorical(key_pick, end.logits), 0]
     return add_noise(action, jnp.where(explore, end.std[0], 0.0), key_noise), end.mean

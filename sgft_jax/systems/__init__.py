@@ -30,7 +30,7 @@ class System(Protocol):
 
 
 @runtime_checkable
-class Known(System, Protocol):
+class KnownSystem(System, Protocol):
     """A system as commands use it.
 
     env: the task, in the scene of the system. pools: worlds [G, W] of simulated systems, which can be drawn, and played
@@ -42,7 +42,7 @@ class Known(System, Protocol):
 
 
 @runtime_checkable
-class Stepped(Known, Protocol):
+class SteppedSystem(KnownSystem, Protocol):
     """A system whose episodes can be kept step by step."""
 
     def steps(

@@ -131,10 +131,8 @@ class Gymnasium:
         Close it where you leave it early: the robot rests then.
         """
         env, members, latest = self.env, len(keys), states if callable(states) else lambda: states
-        if members != self._real.count:
-            raise UserError(
-                f"{self._real.name}: {self._real.count} for {members} members; give one environment for each seed"
-            )
+        if members != (count := self._real.count):
+            raise UserError(f"{self._real.name}: {count} for {members} members; give one environment for each seed")
         seeds, act_keys = self._draw(keys)
         carry = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *jnp.shape(x))), policy.init_carry())
         actions = np.zeros((members, env.previous_actions, env.act_dim), np.float32)
@@ -180,17 +178,9 @@ class Gymnasium:
         transitions = Transition(kept(rows.obs), kept(rows.action), kept(rows.reward), discount, kept(rows.next_obs))
         exploded = jnp.asarray(rows.invalid.any(1))
         success, total = jnp.asarray(self._success(rows)) & ~exploded, transitions.reward.sum(1)
-        return Episode(
-            transitions,
-            valid,
-            total,
-            success,
-            exploded,
-            score=judged(env, total, success, exploded),
-            world=jnp.zeros(len(valid), jnp.int32),
-            trace=jnp.zeros((len(valid), env.episode_length + 1, 0)),
-            command=kept(rows.command),
-        )
+        score, world = judged(env, total, success, exploded), jnp.zeros(len(valid), jnp.int32)
+        trace = jnp.zeros((len(valid), env.episode_length + 1, 0))
+        return Episode(transitions, valid, total, success, exploded, score, world, trace, kept(rows.command))
 
     def close(self, *, over: bool = True) -> None:
         """Closes the environments. over: False where the run goes on another time, for which a robot then waits."""
@@ -204,10 +194,9 @@ class Gymnasium:
         jax.block_until_ready(act())
         taken = statistics.median(_seconds(act) for _ in range(_TRIES))
         if taken > allowed:
-            raise UserError(
-                f"{self._real.name}: waits {allowed:.3g} s for a command, the policy takes {taken:.3g} s for one; "
-                "choose a method that does not plan, a smaller plan, or a longer period"
-            )
+            times = f"waits {allowed:.3g} s for a command, the policy takes {taken:.3g} s for one"
+            advice = "choose a method that does not plan, a smaller plan, or a longer period"
+            raise UserError(f"{self._real.name}: {times}; {advice}")
 
     def _program(self, policy: Any) -> Callable[..., tuple[Array, PyTree]]:
         """The action of all members at a step, one compiled program."""
@@ -231,10 +220,8 @@ class Gymnasium:
         while not (sound := answers.sound(seen := self._measured("reset", self._real.reset(seeds)))).all():
             if tries == _STARTS:
                 number = int(np.argwhere(~sound)[0, 1])
-                raise UserError(
-                    f"reset of {self._real.name}: measured number {number} is {seen[~sound][0]:g} after {tries} tries; "
-                    "no episode can begin there"
-                )
+                reading = f"measured number {number} is {seen[~sound][0]:g} after {tries} tries"
+                raise UserError(f"reset of {self._real.name}: {reading}; no episode can begin there")
             tries += 1
             time.sleep(_PAUSE)
         return seen
@@ -266,9 +253,8 @@ class Gymnasium:
         if not unknown.any():
             return answer
         if self._judge is None:
-            raise UserError(
-                f"{self._real.name}: does not know its reward, and {self.env.name} has none of what is observed"
-            )
+            task = f"{self.env.name} has none of what is observed"
+            raise UserError(f"{self._real.name}: does not know its reward, and {task}")
         reward, terminated = (np.asarray(x) for x in self._judge(seen, action, following))
         terminated = np.where(unknown, terminated, answer.terminated)
         return answer._replace(reward=np.where(unknown, reward, answer.reward), terminated=terminated)
@@ -390,10 +376,8 @@ class _Vector:
         mode = getattr(shown := real.metadata.get("autoreset_mode"), "name", None)
         self._same_step = mode == "SAME_STEP"
         if mode not in ("NEXT_STEP", "SAME_STEP"):
-            raise UserError(
-                f"{self.name}: its autoreset mode is {shown}; make it with AutoresetMode.NEXT_STEP, or give a list of "
-                "environments"
-            )
+            advice = "make it with AutoresetMode.NEXT_STEP, or give a list of environments"
+            raise UserError(f"{self.name}: its autoreset mode is {shown}; {advice}")
 
     def reset(self, seeds: list[int]) -> list[Any]:
         return answers.split(self.name, "reset", _call(self.name, self.real, "reset", seed=seeds)[0], self.count)
@@ -441,10 +425,8 @@ def _bounds(env: Env, real: _Real) -> tuple[np.ndarray, np.ndarray]:
         raise UserError(f"{real.name}: takes {low.size} numbers as action, the task {env.name} has {env.act_dim}")
     low, high = (np.asarray(x, np.float64).reshape(-1) for x in (low, high))
     if not (np.abs([low, high]) <= _BOUND).all():
-        raise UserError(
-            f"{real.name}: its actions have no bounds below {_BOUND:g}; wrap it in gymnasium.wrappers.RescaleAction or "
-            "similar"
-        )
+        advice = "wrap it in gymnasium.wrappers.RescaleAction or similar"
+        raise UserError(f"{real.name}: its actions have no bounds below {_BOUND:g}; {advice}")
     if (fixed := np.flatnonzero(~(low < high))).size:
         raise UserError(f"{real.name}: number {fixed[0]} of its action can only be {low[fixed[0]]:g}; leave it out")
     return low, high

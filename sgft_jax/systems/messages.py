@@ -78,10 +78,8 @@ def read(data: Any) -> Message:
     try:
         with contextlib.suppress(msgspec.MsgspecError):  # before the other fields of a greeting: they may be others
             if (version := _VERSION.decode(body).version) != VERSION:
-                raise VersionError(
-                    f"protocol version: the robot has {version}, the learner {VERSION}; give both the same "
-                    "robot_client.py"
-                )
+                versions = f"the robot has {version}, the learner {VERSION}"
+                raise VersionError(f"protocol version: {versions}; give both the same robot_client.py")
         return _MESSAGE.decode(body)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise ValueError(f"does not fit the protocol ({printable(error, 120)})") from None

@@ -169,10 +169,8 @@ class Remote:
             if began is not None:
                 return self._obs, {}
             pause = self._again * 2 ** max(self._failures - 1, 0)
-        raise UserError(
-            f"{self}: its driver has failed {self._failures} times in a row: {self._reason}; mend it, nothing is lost: "
-            "the same command with --resume goes on"
-        )
+        advice = "mend it, nothing is lost: the same command with --resume goes on"
+        raise UserError(f"{self}: its driver has failed {self._failures} times in a row: {self._reason}; {advice}")
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Has the robot take a step: obs, reward, terminated, truncated, info. action: [action_size] in [-1, 1]."""
@@ -336,10 +334,8 @@ class Remote:
             if ours != theirs:
                 return f"{name}: the robot has {theirs}, the learner {ours}"
         if period is not None and self._period is not None and not math.isclose(period, self._period, rel_tol=_SAME):
-            return (
-                f"seconds of a step: the robot has {period:g}, the learner's task {self._period:g}; change the "
-                "period of the robot, or the task"
-            )
+            seconds = f"the robot has {period:g}, the learner's task {self._period:g}"
+            return f"seconds of a step: {seconds}; change the period of the robot, or the task"
         if period is not None and not 0 < period < math.inf:
             return f"seconds of a step: the robot has {period:g}, which cannot be"
         if hello.answer_within is not None and not (period and hello.answer_within <= period):

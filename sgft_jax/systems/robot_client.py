@@ -171,9 +171,8 @@ class Limits:
         """Raises ValueError for a bound of the wrong size, one that is no number, and for one that allows nothing."""
         if self.workspace is not None:
             if [np.shape(bound) for bound in self.workspace] != 2 * [(obs_size,)]:
-                raise ValueError(
-                    f"the workspace needs a lowest and a highest value for each of {obs_size} measured numbers"
-                )
+                bounds = f"a lowest and a highest value for each of {obs_size} measured numbers"
+                raise ValueError(f"the workspace needs {bounds}")
             lowest, highest = np.asarray(self.workspace, float)
             if not (lowest <= highest).all():  # nan is not
                 raise ValueError("limits: no lowest value of the workspace may be above the highest, and none nan")
@@ -328,9 +327,8 @@ def _rhythm(
     if not hasattr(driver, "send"):
         late = {"answer_within": answer_within is not None, "late": instead is not None}
         if names := [name for name, is_set in {**late, "patience": patience != _PATIENCE}.items() if is_set]:
-            raise ValueError(
-                f"{', '.join(names)}: no command is late for a driver with `step`; give it `read` and `send`"
-            )
+            waits = "no command is late for a driver with `step`; give it `read` and `send`"
+            raise ValueError(f"{', '.join(names)}: {waits}")
         return None
     if period is None:
         raise ValueError("a driver with `send` needs a period, in seconds")
@@ -381,9 +379,8 @@ class _Log:
         try:
             yield
         except OSError as error:
-            raise OSError(
-                f"the log {self._path}: {error.strerror}; the robot is stopped. Make room, or choose another file"
-            ) from error
+            advice = "the robot is stopped. Make room, or choose another file"
+            raise OSError(f"the log {self._path}: {error.strerror}; {advice}") from error
 
 
 class _Robot:
@@ -484,9 +481,8 @@ class _Robot:
         step = len(self._answers) - 1
         if step == 0:
             self._tick = time.monotonic()
-        self.log.write(
-            episode=self._episode, step=step, action=action, late=late, time=time.time(), clock=time.monotonic()
-        )
+        when = {"time": time.time(), "clock": time.monotonic()}
+        self.log.write(episode=self._episode, step=step, action=action, late=late, **when)
         try:
             sent = action.copy()  # the driver may change its array; what is reported and stored stays
             moved = self._by_clock(sent, late=late) if self.rhythm else self._at_once(sent)
