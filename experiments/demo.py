@@ -85,7 +85,8 @@ def outcome(curves: "Sequence[Curve]", summaries: dict[str, dict[str, Any]]) -> 
 
     first, *_ = curves
     score = tables.words(first.score)
-    mean = {name: sum(own["best"]["score"]) / len(own["best"]["score"]) for name, own in summaries.items()}
+    best_scores = {name: summary["best"]["score"] for name, summary in summaries.items()}
+    mean = {name: sum(scores) / len(scores) for name, scores in best_scores.items()}
     best = [f"{name} {tables.plain(score, first.score)}" for name, score in mean.items()]
     return (
         f"{score.capitalize()} on the {first.gap} real system of {first.task} without exploration, interquartile mean "

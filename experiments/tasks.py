@@ -32,11 +32,9 @@ class TasksArgs:
 
 def main(args: TasksArgs) -> None:
     """Prints what is asked for."""
-    if args.task is None:
-        found, lines = listing(), _list_lines
-    else:
-        found, lines = describe(args.task), _task_lines
-    print(json.dumps(found) if args.json else "\n".join(lines(found)))
+    facts = listing() if args.task is None else describe(args.task)
+    lines = _list_lines if args.task is None else _task_lines
+    print(json.dumps(facts) if args.json else "\n".join(lines(facts)))
 
 
 def listing() -> dict[str, Any]:
@@ -49,22 +47,22 @@ def listing() -> dict[str, Any]:
 def describe(task: str) -> dict[str, Any]:
     """One task as JSON data. A task in MuJoCo is not compiled for it."""
     name = envs.name_of(task)
-    it: Any = envs.scene(task) or envs.make(task)  # both have the fields below
-    sizes = {"act_dim": sum(e.size for e in it.action), "measured_dim": sum(e.size for e in it.observation)}
-    named = gaps.presets(name)
+    env: Any = envs.scene(task) or envs.make(task)  # both have the fields below
+    sizes = {"act_dim": sum(e.size for e in env.action), "measured_dim": sum(e.size for e in env.observation)}
     return {
         "name": name,
         "about": _first_line(envs.TASKS[name]),
-        "observation": [e._asdict() for e in it.observation],
-        "action": [e._asdict() for e in it.action],
-        "control_dt": it.control_dt,
-        "episode_length": it.episode_length,
-        "score": it.score,
-        "success_anytime": it.success_anytime,
-        "parameters": [_finite(p._asdict()) for p in it.parameters],
-        "effects": _effects(it.training, sizes, cartesian=it.cartesian),
-        "gaps": {gap: {k: v for k, v in named[gap]._asdict().items() if v and k != "name"} for gap in named},
+        **{field: [e._asdict() for e in getattr(env, field)] for field in ("observation", "action")},
+        **{field: getattr(env, field) for field in ("control_dt", "episode_length", "score", "success_anytime")},
+        "parameters": [_finite(p._asdict()) for p in env.parameters],
+        "effects": _effects(env.training, sizes, cartesian=env.cartesian),
+        "gaps": {name: _differences(gap._asdict()) for name, gap in gaps.presets(name).items()},
     }
+
+
+def _differences(gap: dict[str, Any]) -> dict[str, Any]:
+    """What a gap says, without its name."""
+    return {name: value for name, value in gap.items() if value and name != "name"}
 
 
 def _finite(facts: dict[str, Any]) -> dict[str, Any]:
@@ -75,13 +73,13 @@ def _finite(facts: dict[str, Any]) -> dict[str, Any]:
 def _effects(training: Any, sizes: dict[str, int], *, cartesian: bool) -> list[dict[str, Any]]:
     """Every effect of that task, in the words of `Effects`, and its value in the simulator, None for no effect."""
     doc = inspect.getdoc(Effects) or ""
-    found = []
+    effects = []
     for name in Effects._fields if cartesian else [x for x in Effects._fields if x != "action_rotation"]:
         match = re.search(rf"^{name}: \[(\w*)\] (.*(?:\n    .*)*)", doc, re.M)
         assert match is not None  # tested: all of them explain themselves
         about = " ".join(match[2].split()).split(". ")[0].rstrip(".")
-        found.append({"name": name, "size": sizes.get(match[1], 1), "about": about, "simulator": training.get(name)})
-    return found
+        effects.append({"name": name, "size": sizes.get(match[1], 1), "about": about, "simulator": training.get(name)})
+    return effects
 
 
 def _first_line(module: str) -> str:
@@ -95,46 +93,34 @@ def _first_line(module: str) -> str:
 # --- for people -----------------------------------------------------------------------------------------------------
 
 
-def _list_lines(found: dict[str, Any]) -> list[str]:
+def _list_lines(tasks: dict[str, Any]) -> list[str]:
     rows = [("task", "what it is", "gaps")]
-    rows += [(name, task["about"], ", ".join(task["gaps"]) or "none") for name, task in found.items()]
+    rows += [(name, task["about"], ", ".join(task["gaps"]) or "none") for name, task in tasks.items()]
     return [*columns(rows), "", "one of them in full: python -m experiments.tasks push"]
 
 
-def _task_lines(found: dict[str, Any]) -> list[str]:
-    seconds = found["episode_length"] * found["control_dt"]
-    when = "at any step" if found["success_anytime"] else "at the last step"
-    score = f"success {when}" if found["score"] == "success" else "return, the sum of rewards"
+def _task_lines(facts: dict[str, Any]) -> list[str]:
+    seconds = facts["episode_length"] * facts["control_dt"]
+    when = "at any step" if facts["success_anytime"] else "at the last step"
+    score = f"success {when}" if facts["score"] == "success" else "return, the sum of rewards"
     parameters = [("parameter", "unit", "nominal", "training range", "bounds")]
-    for p in found["parameters"]:
+    for p in facts["parameters"]:
         drawn = "fixed" if p["low"] == p["high"] else _range(p["low"], p["high"])
         parameters.append((p["name"], p["unit"], f"{p['nominal']:.4g}", drawn, _range(p["minimum"], p["maximum"])))
     effects = [("effect", "numbers", "simulator", "what it does")]
-    for e in found["effects"]:
+    for e in facts["effects"]:
         effects.append((e["name"], str(e["size"]), _value(e["simulator"]), e["about"]))
     reals = [("gap", "what differs from the simulator")]
-    for name, gap in found["gaps"].items():
+    for name, gap in facts["gaps"].items():
         scene = [f"scene {gap['scene']}"] if "scene" in gap else []
         values = {**gap.get("params", {}), **gap.get("effects", {})}
         reals.append((name, "; ".join([*scene, *(f"{k} {_value(v)}" for k, v in values.items())])))
-    return [
-        f"{found['name']}: {found['about']}",
-        "",
-        *columns(
-            [
-                ("observation", _entries(found["observation"])),
-                ("action", _entries(found["action"])),
-                ("episode", f"{found['episode_length']} steps of {found['control_dt']:g} s = {seconds:g} s"),
-                ("judged by", score),
-            ]
-        ),
-        "",
-        *columns(parameters),
-        "",
-        *columns(effects),
-        "",
-        *(columns(reals) if found["gaps"] else ["no gaps come with this task; write one: docs/extending.md"]),
-    ]
+    length = f"{facts['episode_length']} steps of {facts['control_dt']:g} s = {seconds:g} s"
+    head = [(part, _entries(facts[part])) for part in ("observation", "action")]
+    head += [("episode", length), ("judged by", score)]
+    last = columns(reals) if facts["gaps"] else ["no gaps come with this task; write one: docs/extending.md"]
+    parts = ([f"{facts['name']}: {facts['about']}"], columns(head), columns(parameters), columns(effects), last)
+    return [line for part in parts for line in ("", *part)][1:]
 
 
 def _entries(entries: Iterable[dict[str, Any]]) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 
 import envs
 from envs import gaps
-from envs.base import Env
+from envs.base import Entry, Env
 from envs.gaps import SIM, Gap
 from envs.rollout import Episode
 from envs.types import Transition, UserError
@@ -45,49 +45,56 @@ def diagnose(
     """The diagnosis as JSON data and as lines for people; writes the picture and the numbers."""
     env, priors = load(task, args.impl, folders)
     home = args.out / "diagnose" / env.name
-    if recorded is None:
-        count, name = args.rollouts or PLAYED, title(args.real)
+    if recorded is not None:
+        real, which = read(recorded, env, priors, args.rollouts)
+        simulated = play_simulated(env, priors, args.seed)
+        count = real[0].valid.shape[0]
+        name = "_".join(recorded.parts[-3:] if read_config(recorded) else recorded.parts[-1:])
+        what = f"{_rollouts(count)} recorded in {recorded}"
+    else:
+        count, name, which = args.rollouts or PLAYED, title(args.real), list(range(len(priors)))
         if is_stepped(args.real):
-            where = name
             real = _play_real(env, args, priors, count, home / name)
             simulated = play_simulated(env, priors, args.seed)
         else:
-            where = f"the gap {name}"
             real, simulated = _play_both(env, gaps.load(env, args.real), priors, count, args.seed)
-        which = list(range(len(priors)))
+        where = name if is_stepped(args.real) else f"the gap {name}"
         what = f"{_rollouts(count)} of {_priors(len(priors))}, just played zero-shot on {where}"
-    else:
-        real, which = read(recorded, env, priors, args.rollouts)
-        simulated = play_simulated(env, priors, args.seed)
-        count, name = (
-            real[0].valid.shape[0],
-            "_".join(recorded.parts[-3:] if read_config(recorded) else recorded.parts[-1:]),
-        )
-        what = f"{_rollouts(count)} recorded in {recorded}"
-    examiner, counts = Examiner(priors[0].card, env), counts_to(count)
-    params = stacking.stack([prior.params for prior in priors])
-    control = examiner.control(params, stacking.stack(simulated))
-    own, usual = (stacking.member(x, jnp.array(which)) for x in (params, control))
-    each = examiner.examine(own, usual, stacking.stack(real), counts)
-    labels, same = [str(folders[p]) for p in which], all(own is real[0] for own in real)
-    found = {
+    labels = [str(folders[p]) for p in which]
+    examined, mean = _examine(env, priors, real, simulated, which)
+    names = names_of(env)
+    signs, header = verdict.signs(mean[-1], names), f"{env.name}: {what}"
+    findings = {
         "task": env.name,
         "data": what,
-        "priors": [{"prior": label, "found": one.found} for label, one in zip(labels, each, strict=True)],
-        "mean": [average([one.found[i] for one in each], same=same) for i in range(len(counts))],
+        "priors": [{"prior": label, "found": one.found} for label, one in zip(labels, examined, strict=True)],
+        "mean": mean,
+        "signs": jsonable(signs),
+        "verdict": verdict.verdict(mean[-1], names),
+        "prediction": predicted(mean[-1]),
     }
-    mean, names = found["mean"][-1], names_of(env)
-    found["signs"] = jsonable(verdict.signs(mean, names))
-    found["verdict"] = verdict.verdict(mean, names)
-    found["prediction"] = predicted(mean)
     home /= name
     home.mkdir(parents=True, exist_ok=True)
-    picture = figures.diagnosis(
-        home / "diagnosis.png", mean, verdict.signs(mean, names), _points(each), title=f"{env.name}: {what}"
-    )
-    write_json(home / "diagnosis.json", found)
-    lines = [f"{env.name}: {what}", *_lines(labels, each, mean), "", *found["verdict"], ""]
-    return jsonable(found), [*lines, f"picture: {picture}", f"numbers: {home / 'diagnosis.json'}"]
+    picture = figures.diagnosis(home / "diagnosis.png", mean[-1], signs, _points(examined), title=header)
+    write_json(home / "diagnosis.json", findings)
+    lines = [header, *_lines(labels, examined, mean[-1]), "", *findings["verdict"], ""]
+    return jsonable(findings), [*lines, f"picture: {picture}", f"numbers: {home / 'diagnosis.json'}"]
+
+
+def _examine(
+    env: Env, priors: Sequence[Prior], real: Sequence[Rollouts], simulated: Sequence[Rollouts], which: Sequence[int]
+) -> tuple[list[Examined], list[dict[str, Any]]]:
+    """What real rollouts tell, by each prior that looks at them, and the means after 1, 2, 4, ... and all rollouts.
+
+    simulated: of every prior. which: the prior that looks at each of `real`.
+    """
+    examiner, counts = Examiner(priors[0].card, env), counts_to(real[0].valid.shape[0])
+    params = stacking.stack([prior.params for prior in priors])
+    control = examiner.control(params, stacking.stack(simulated))
+    chosen, usual = (stacking.member(x, jnp.array(which)) for x in (params, control))
+    examined = examiner.examine(chosen, usual, stacking.stack(real), counts)
+    same = all(rollouts is real[0] for rollouts in real)
+    return examined, [average([one.found[i] for one in examined], same=same) for i in range(len(counts))]
 
 
 def load(task: str, impl: Any, folders: Sequence[Path]) -> tuple[Env, list[Prior]]:
@@ -106,24 +113,25 @@ def counts_to(n: int) -> list[int]:
 
 def names_of(env: Env) -> Names:
     """What people call the numbers of a task."""
-    label = lambda e, i: f"{e.name}[{i}]" if e.size > 1 else e.name  # noqa: E731
-    return Names(
-        action=[label(e, i) for e in env.action for i in range(e.size)],
-        sensors=[(label(e, i), e.unit) for e in env.measured for i in range(e.size)],
-        errors=env.sensor_errors,
-        dt=env.control_dt,
-    )
+    action, sensors = ([label for e in entries for label in _labels(e)] for entries in (env.action, env.measured))
+    units = [e.unit for e in env.measured for _ in range(e.size)]
+    return Names(action, list(zip(sensors, units, strict=True)), env.sensor_errors, env.control_dt)
 
 
-def average(found: Sequence[Mapping[str, Any]], *, same: bool) -> dict[str, Any]:
+def _labels(entry: Entry) -> list[str]:
+    """What the numbers of an entry are called."""
+    return [f"{entry.name}[{i}]" for i in range(entry.size)] if entry.size > 1 else [entry.name]
+
+
+def average(diagnoses: Sequence[Mapping[str, Any]], *, same: bool) -> dict[str, Any]:
     """The mean of every number of several diagnoses; their rollouts are added up unless they are the same ones."""
-    mean = jax.tree.map(lambda *x: x[0] if len(set(x)) == 1 else float(np.mean(x)), *found)
-    return mean if same else {**mean, "rollouts": sum(one["rollouts"] for one in found)}
+    mean = jax.tree.map(lambda *x: x[0] if len(set(x)) == 1 else float(np.mean(x)), *diagnoses)
+    return mean if same else {**mean, "rollouts": sum(diagnosis["rollouts"] for diagnosis in diagnoses)}
 
 
-def predicted(found: Mapping[str, Any]) -> dict[str, Any]:
+def predicted(diagnosis: Mapping[str, Any]) -> dict[str, Any]:
     """The prediction for one diagnosis, as JSON data."""
-    x = prediction.inputs_of(found)
+    x = prediction.inputs_of(diagnosis)
     return {
         "inputs": jsonable(x),
         "gain": float(prediction.gain(x)),
@@ -135,11 +143,11 @@ def predicted(found: Mapping[str, Any]) -> dict[str, Any]:
 # --- rollouts ---------------------------------------------------------------------------------------------------------
 
 
-def play(env: Env, found: Sequence[Gap], priors: list[Prior], n: int, seed: int) -> list[Rollouts]:
+def play(env: Env, reals: Sequence[Gap], priors: list[Prior], n: int, seed: int) -> list[Rollouts]:
     """Exploring rollouts [n] of every prior on every gap: [gaps * priors], all priors on the first gap first."""
-    system, members = systems(env, found, priors, max(n, 64))
+    system, members = systems(env, reals, priors, max(n, 64))
     key = jax.random.fold_in(jax.random.key(_SEED), seed)
-    keys = jnp.broadcast_to(jax.random.split(key, n), (len(found) * len(priors), n))
+    keys = jnp.broadcast_to(jax.random.split(key, n), (len(reals) * len(priors), n))
     played = system.play(make_policy(priors[0].card, system.env), members, keys, explore=True)
     return [rollouts_of(jax.tree.map(np.asarray, stacking.member(played, i))) for i in range(len(keys))]
 
@@ -154,9 +162,8 @@ def _play_both(env: Env, gap: Gap, priors: list[Prior], n: int, seed: int) -> tu
     if gap.scene:
         return play(env, [gap], priors, n, seed), play_simulated(env, priors, seed)
     both = play(env, [gap, gaps.find(env.name, SIM)], priors, max(n, SIMULATED), seed)
-    first = lambda rollouts, k: jax.tree.map(lambda x: x[:k], rollouts)  # noqa: E731
     real, simulated = both[: len(priors)], both[len(priors) :]
-    return [first(one, n) for one in real], [first(one, SIMULATED) for one in simulated]
+    return jax.tree.map(lambda x: x[:n], real), jax.tree.map(lambda x: x[:SIMULATED], simulated)
 
 
 def _play_real(env: Env, args: DiagnoseArgs, priors: list[Prior], n: int, home: Path) -> list[Rollouts]:
@@ -194,18 +201,17 @@ def read(home: Path, env: Env, priors: Sequence[Prior], most: int | None) -> tup
         raise UserError(f"{home / 'real'}: holds no valid step")
     rows = Transition(*(joined[name] for name in Transition._fields))
     both = Rollouts(rows, joined["valid"].astype(bool), joined["success"].astype(bool))
-    each = [stacking.member(both, s) for s in range(len(both.success))]
-    config, p = read_config(home), len(priors)
+    real, config, p = [stacking.member(both, s) for s in range(len(both.success))], read_config(home), len(priors)
     if config:
         _check_digests(home, priors)
-        return each, [(config.get("seed", 0) + s) % p for s in range(len(each))]
-    if len(each) == 1:
-        return each * p, list(range(p))
-    if len(each) != p:
+        return real, [(config.get("seed", 0) + s) % p for s in range(len(real))]
+    if len(real) == 1:
+        real *= p
+    if len(real) != p:
         raise UserError(
-            f"{home}: holds rollouts of {len(each)} policies; name one prior for each with --prior, not {p}"
+            f"{home}: holds rollouts of {len(real)} policies; name one prior for each with --prior, not {p}"
         )
-    return each, list(range(p))
+    return real, list(range(p))
 
 
 def _check(
@@ -233,14 +239,14 @@ def _check_digests(home: Path, priors: Sequence[Prior]) -> None:
 # --- for people -------------------------------------------------------------------------------------------------------
 
 
-def _points(each: Sequence[Examined]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+def _points(examined: Sequence[Examined]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """All priors' V_sim and returns, at most 1,000 of each kind."""
-    found = {}
+    points = {}
     for where in ("real", "simulated"):
-        value, returns = (np.concatenate([one.points[where][i] for one in each]) for i in (0, 1))
+        value, returns = (np.concatenate([one.points[where][i] for one in examined]) for i in (0, 1))
         some = np.random.default_rng(0).permutation(len(value))[:1000]
-        found[where] = (value[some], returns[some])
-    return found
+        points[where] = (value[some], returns[some])
+    return points
 
 
 def _rollouts(n: int) -> str:
@@ -251,24 +257,24 @@ def _priors(n: int) -> str:
     return "one prior" if n == 1 else f"each of {n} priors"
 
 
-def _lines(labels: Sequence[str], each: Sequence[Examined], mean: Mapping[str, Any]) -> list[str]:
+def _lines(labels: Sequence[str], examined: Sequence[Examined], mean: Mapping[str, Any]) -> list[str]:
     """One line for each prior, and one for their mean."""
-    rows = [(label, one.found[-1]) for label, one in zip(labels, each, strict=True)]
-    rows += [("mean", mean)] * (len(each) > 1)
+    rows = [(label, one.found[-1]) for label, one in zip(labels, examined, strict=True)]
+    rows += [("mean", mean)] * (len(examined) > 1)
     head = ("prior", "success %", "improvable %", "V_sim short by", "rank", "model error -> identified (sim)", "gain")
-    return columns([head, *(_row(label, found) for label, found in rows)])
+    return columns([head, *(_row(*row) for row in rows)])
 
 
-def _row(label: str, found: Mapping[str, Any]) -> tuple[str, ...]:
-    n, value, errors = found["rollouts"], found["value"], found["model_error"]
-    ahead = found["horizons"].index(4)
+def _row(label: str, diagnosis: Mapping[str, Any]) -> tuple[str, ...]:
+    n, value, errors = diagnosis["rollouts"], diagnosis["value"], diagnosis["model_error"]
+    ahead = diagnosis["horizons"].index(4)
     four = {where: f"{values[ahead]:.2f}" for where, values in errors.items()}
     return (
         label,
-        tables.number(stats.success_interval(round(n * found["success"]), n)),
+        tables.number(stats.success_interval(round(n * diagnosis["success"]), n)),
         f"{100 * value['real'][0]['improvable']:.0f}",
         f"{value['shortfall']:.1f} sd",
         f"{value['rank_correlation']:.2f}",
         f"{four['real']} -> {four['identified']} ({four['simulated']})",
-        f"{100 * prediction.gain(prediction.inputs_of(found)):+.0f}",
+        f"{100 * prediction.gain(prediction.inputs_of(diagnosis)):+.0f}",
     )

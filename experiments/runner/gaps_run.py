@@ -39,18 +39,18 @@ def run(args: GapsArgs, seeds: list[int], folders: list[Path]) -> dict[str, Any]
     """Measures, prints a table, writes and returns the summary. folders: of the priors."""
     task = envs.name_of(args.task)
     env = envs.make(args.task, args.impl, **observed_by(folders))
-    found = [gaps.load(env, name) for name in args.presets or gaps.presets(task)]
-    env = real_env(env, found)
+    reals = [gaps.load(env, name) for name in args.presets or gaps.presets(task)]
+    env = real_env(env, reals)
     folder = args.out / "gaps" / task
     priors = load_priors(folders, env)
-    system, members = systems(env, found, priors, args.episodes)
+    system, members = systems(env, reals, priors, args.episodes)
     played = play(system, make_policy(priors[0].card, env), members, episode_key(FINAL_SEED), args.episodes)
-    here = [stacking.part(played, i, len(priors)) for i in range(len(found))]
+    zero_shot = [stacking.part(played, i, len(priors)) for i in range(len(reals))]
     about = {"task": task, "impl": env.impl, "preset": args.preset, "priors": [str(prior) for prior in folders]}
-    summary = _report(folder, about, [_line(gap, here[i], None) for i, gap in enumerate(found)])
+    summary = _report(folder, about, [_line(*row, None) for row in zip(reals, zero_shot, strict=True)])
     if args.train:  # the long part: what is known already is on disk
-        there = train(env, args.config, found, seeds, folder, episodes=args.episodes)
-        summary = _report(folder, about, [_line(gap, here[i], there[i]) for i, gap in enumerate(found)])
+        trained = train(env, args.config, reals, seeds, folder, episodes=args.episodes)
+        summary = _report(folder, about, [_line(*row) for row in zip(reals, zero_shot, trained, strict=True)])
     return summary
 
 
@@ -81,11 +81,11 @@ def table(lines: Sequence[dict[str, Any]]) -> list[str]:
     return columns(rows)
 
 
-def percent(found: dict[str, Any] | None) -> str:
-    """What `rate` has found, for people; a dash for what has not been measured."""
-    if found is None:
+def percent(rated: dict[str, Any] | None) -> str:
+    """What `rate` says, for people; a dash for what has not been measured."""
+    if rated is None:
         return "-"
-    band = (np.asarray(x, float) for x in (found["success"], *found["interval"]))  # files spell NaN as a word
+    band = (np.asarray(x, float) for x in (rated["success"], *rated["interval"]))  # files spell NaN as a word
     return tables.number(stats.Interval(*band))
 
 
@@ -97,25 +97,27 @@ def _line(gap: Gap, zero_shot: Episode, trained: Episode | None) -> dict[str, An
 
 def rate(played: Episode, statistic: Callable[..., np.ndarray] = stats.iqm) -> dict[str, Any]:
     """Success of policies, [policies, episodes]: of one with its Wilson interval, of several a statistic over them."""
-    each = [describe(stacking.member(played, i)) for i in range(len(played.success))]
-    if len(each) == 1:
-        return {"success": each[0]["success"], "interval": each[0]["success/interval"], "policies": each}
-    band = stats.bootstrap_interval(np.array([one["success"] for one in each]), statistic=statistic)
-    return {"success": float(band.estimate), "interval": [float(band.low), float(band.high)], "policies": each}
+    policies = [describe(stacking.member(played, i)) for i in range(len(played.success))]
+    if len(policies) == 1:
+        success, interval = policies[0]["success"], policies[0]["success/interval"]
+    else:
+        band = stats.bootstrap_interval(np.array([policy["success"] for policy in policies]), statistic=statistic)
+        success, interval = float(band.estimate), [float(band.low), float(band.high)]
+    return {"success": success, "interval": interval, "policies": policies}
 
 
-def systems(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: int) -> tuple[Simulated, PyTree]:
+def systems(env: Env, reals: Sequence[Gap], priors: list[Prior], episodes: int) -> tuple[Simulated, PyTree]:
     """The real systems of gaps and the parameters of who plays there: members [gaps * priors], all priors on each."""
-    pools = real_worlds(env, found, jax.random.key(FINAL_SEED), episodes)
-    which = jnp.repeat(jnp.arange(len(found)), len(priors))
-    members = stacking.stack([prior.params for prior in priors] * len(found))
+    pools = real_worlds(env, reals, jax.random.key(FINAL_SEED), episodes)
+    which = jnp.repeat(jnp.arange(len(reals)), len(priors))
+    members = stacking.stack([prior.params for prior in priors] * len(reals))
     return Simulated(env, pools, which, gamma=priors[0].card["gamma"]), members
 
 
 def train(
     env: Env,
     config: PretrainConfig,
-    found: Sequence[Gap],
+    reals: Sequence[Gap],
     seeds: list[int],
     folder: Path,
     *,
@@ -129,20 +131,20 @@ def train(
     """
     seen = seen or env
     policy, best = make_policy(prior_card(seen, config), seen), None
-    which = jnp.repeat(jnp.arange(len(found)), len(seeds))
+    which = jnp.repeat(jnp.arange(len(reals)), len(seeds))
     reserve(memory(seen, config), copies=len(which))
 
     def pools(number: int) -> World:
         """All seeds of a gap live in the same worlds."""
-        there = real_worlds(env, found, jax.random.fold_in(jax.random.key(seeds[0]), number), config.worlds)
-        return jax.tree.map(lambda x: x[which], there)
+        worlds = real_worlds(env, reals, jax.random.fold_in(jax.random.key(seeds[0]), number), config.worlds)
+        return jax.tree.map(lambda x: x[which], worlds)
 
     def system(seed: int, episodes: int) -> Simulated:
-        return Simulated(seen, real_worlds(env, found, jax.random.key(seed), episodes), which, gamma=config.gamma)
+        return Simulated(seen, real_worlds(env, reals, jax.random.key(seed), episodes), which, gamma=config.gamma)
 
     log, heldout, size = MetricsLog(folder), system(_HELDOUT_SEED, config.eval_episodes), config.chunk_env_steps
     log.truncate({})
-    steps = pretrain(seen, config, seeds * len(found), pools=pools)
+    steps = pretrain(seen, config, seeds * len(reals), pools=pools)
     next(steps)
     with RunProgress("train on the real systems", total=config.chunks * size, unit="env steps") as progress:
         for done, (state, metrics) in enumerate(steps, start=1):
@@ -159,7 +161,7 @@ def train(
     log.close()
     assert best is not None
     played = play(system(FINAL_SEED, episodes), policy, best.params, episode_key(FINAL_SEED), episodes)
-    return [stacking.part(played, i, len(seeds)) for i in range(len(found))]
+    return [stacking.part(played, i, len(seeds)) for i in range(len(reals))]
 
 
 def episode_key(seed: int) -> Key:

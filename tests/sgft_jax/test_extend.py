@@ -10,7 +10,7 @@ import envs
 from envs import extend
 from envs.types import UserError
 
-OWN = "from envs.franka import push\nmake = push.make\n"
+OWN = "import envs\n\ndef make(impl):\n    return envs.make('push', impl)\n"
 TOY = """import jax.numpy as jnp
 import toy
 def make(impl):
