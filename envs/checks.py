@@ -33,7 +33,7 @@ def check_description(task: Env | Scene) -> None:
         raise wrong("control_dt", "must be a number of seconds above 0", task.control_dt)
     if task.score not in SCORES:
         raise wrong("score", f"must be one of {', '.join(SCORES)}", task.score)
-    for field in ("success_anytime", "cartesian"):
+    for field in ("success_anytime", "cartesian", "table"):
         if not isinstance(getattr(task, field), bool):
             raise wrong(field, "must be True or False", getattr(task, field))
     if task.cartesian and sum(entry.size for entry in task.action) < 2:

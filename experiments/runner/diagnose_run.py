@@ -14,8 +14,8 @@ from envs.base import Env
 from envs.gaps import SIM, Gap
 from envs.rollout import Episode
 from envs.types import Transition, UserError
-from experiments.diagnose import DiagnoseArgs
 from experiments.runner.cli import columns
+from experiments.runner.diagnose_args import DiagnoseArgs
 from experiments.runner.gaps_run import systems
 from experiments.runner.real_systems import connect, is_robot, is_stepped, title
 from experiments.runner.recorded import RecordedSystem

@@ -15,6 +15,7 @@ from envs.base import Env, World
 from envs.gaps import SIM, Gap
 from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
+from envs.scales import normalised
 from envs.types import Key
 from experiments.runner import logged
 from experiments.runner.evaluation import play, scores
@@ -26,8 +27,7 @@ from sgft_jax.analysis import figures
 from sgft_jax.analysis.reading import read_curve
 from sgft_jax.datasets import logs
 from sgft_jax.files.jsonfile import jsonable
-from sgft_jax.hybrid.robot import MEASURES
-from sgft_jax.hybrid.scores import LATE, late, measures, normalised
+from sgft_jax.hybrid.scores import LATE, late, measures
 from sgft_jax.io import runs
 from sgft_jax.io.log import EVAL, read_jsonl, write_summary
 from sgft_jax.io.runs import NO_SIMULATOR
@@ -161,11 +161,8 @@ class _Run(Training):
 
     def _measures(self, played: Episode) -> dict[str, Any]:
         """What else the task is judged by, [M] means over episodes."""
-        measure = MEASURES.get(self.env.name)
-        if measure is None:
-            return {}
-        values = measure(played.transitions.next_obs, played.valid, dt=self.env.control_dt)
-        return {name: x.mean(-1) for name, x in values.items()}
+        measured = self.env.measures(played.transitions.next_obs, played.valid)
+        return {name: values.mean(-1) for name, values in measured.items()}
 
     def _play(self, state: FleetState, episodes: int) -> Episode:
         """Episodes [M, episodes] in the real system, always the same starts."""

@@ -10,10 +10,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from envs.scales import D4RL, normalised
 from sgft_jax.analysis.curves import SCORES, Curve
 from sgft_jax.analysis.scoreboard import improvement
 from sgft_jax.analysis.tables import NONE, markdown, number, plain
-from sgft_jax.hybrid.scores import BOUNDS, normalised, shown
+from sgft_jax.hybrid.scores import shown
 from sgft_jax.math.stats import Interval, bootstrap_interval, mean, rank_correlation
 
 LEGEND = (
@@ -78,7 +79,7 @@ class Results(NamedTuple):
 
 def summary(results: Results, *, reference: str, seeds: int, schedule: str) -> list[str]:
     """The tables and their legend, a text for each. schedule: what every run made, in words."""
-    scale, score = " on D4RL's scale" if results.task in BOUNDS else "", _SCORES[results.shown]
+    scale, score = " on D4RL's scale" if results.task in D4RL else "", _SCORES[results.shown]
     legend = LEGEND.format(score=score, seeds=seeds, scale=scale, reference=reference, schedule=schedule)
     against = [duels(results, reference)] if len(results.methods) > 1 else []
     others = measured(results)
@@ -175,7 +176,7 @@ def overall(results: Results, method: str, data: str) -> Interval | None:
 
 def rescaled(task: str, scores: np.ndarray) -> np.ndarray:
     """[n] on D4RL's scale, unchanged for a task that has none."""
-    return np.array([normalised(task, x) for x in scores.tolist()]) if task in BOUNDS else scores
+    return np.array([normalised(task, x) for x in scores.tolist()]) if task in D4RL else scores
 
 
 def _spread(results: Results, method: str, data: str, gap: str) -> str:

@@ -9,12 +9,12 @@ import pytest
 import toy
 
 import sgft_jax
+from envs.scales import normalised
 from envs.types import UserError
 from experiments import hybrid
 from experiments.runner.hybrid_args import data_name, run_folder
 from experiments.runner.hybrid_run import in_words, intervals
 from sgft_jax.analysis import figures
-from sgft_jax.hybrid.scores import normalised
 from sgft_jax.io.log import MetricsLog, read_jsonl
 
 OPTIONS = """--task toy --seeds 2 --no-video --schedule.updates 24 --schedule.simulators 2 --schedule.buffer 64

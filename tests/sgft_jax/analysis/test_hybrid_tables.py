@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
+from envs.scales import D4RL
 from envs.types import UserError
 from sgft_jax.analysis import hybrid, release
 from sgft_jax.analysis.curves import Curve
 from sgft_jax.analysis.hybrid import Results
-from sgft_jax.hybrid.scores import BOUNDS, late
+from sgft_jax.hybrid.scores import late
 
-LOW, HIGH = BOUNDS["halfcheetah"]
+LOW, HIGH = D4RL["halfcheetah"]
 
 
 def of_scale(*scores):
