@@ -323,7 +323,7 @@ def packed(env: Env) -> Env:
 
     restore = env.restore
     return env._replace(
-        reset=lambda *given: flat(env.reset(*given)),
-        step=lambda *given: flat(env.step(*given)),
-        restore=None if restore is None else lambda *given: flat(restore(*given)),
+        reset=lambda *args: flat(env.reset(*args)),
+        step=lambda *args: flat(env.step(*args)),
+        restore=None if restore is None else lambda *args: flat(restore(*args)),
     )

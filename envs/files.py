@@ -9,7 +9,8 @@ import os
 import re
 import stat
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, TypedDict, cast
 
@@ -29,10 +30,8 @@ Positive = Annotated[float, Meta(gt=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 Schema = type | Mapping[str, Any]  # a `msgspec.Struct`, a `TypedDict`, or types by key
 
-_WORDS = {
-    "str": "a text", "int": "a whole number", "float": "a number", "object": "an object", "array": "a list",
-    "bool": "true or false", "null": "null",
-}  # fmt: skip
+_WORDS = dict(str="a text", int="a whole number", float="a number", object="an object", array="a list")
+_WORDS |= {"bool": "true or false", "null": "null"}
 
 
 def read_text(path: Path | str, *, limit: int = LIMIT) -> str:
@@ -42,20 +41,26 @@ def read_text(path: Path | str, *, limit: int = LIMIT) -> str:
 
 def read_bytes(path: Path | str, *, limit: int = LIMIT) -> bytes:
     """The content of a plain file. limit: bytes; a larger file is refused."""
-    try:
-        with open(path, "rb", opener=_without_waiting) as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise UserError(f"{path}: is no plain file")
-            content = file.read(limit + 1)
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file") from None
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({(error.strerror or str(error)).lower()})") from None
-    except ValueError:  # a zero byte
-        raise UserError(f"{str(path)!r}: is no name of a file") from None
+    with readable(path), open(path, "rb", opener=_without_waiting) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise UserError(f"{path}: is no plain file")
+        content = file.read(limit + 1)
     if len(content) > limit:
         raise UserError(f"{path}: is larger than {limit:,} bytes, more than such a file can need")
     return content
+
+
+@contextmanager
+def readable(path: Path | str) -> Iterator[None]:
+    """Around what opens a file or folder; raises UserError where there is none, or none that can be read."""
+    try:
+        yield
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except OSError as error:  # a name that is too long, a folder that is closed
+        raise UserError(f"{path}: cannot be read ({(error.strerror or str(error)).lower()})") from None
+    except ValueError:  # a zero byte
+        raise UserError(f"{str(path)!r}: is no name of a file") from None
 
 
 def decoded(content: bytes, path: Path | str) -> str:

@@ -32,17 +32,17 @@ def main(args: ExportArgs) -> None:
     home = args.out or args.policy / "export" / args.to
     check_folder(home)
     homes = [home if folder == args.policy else home / folder.name for folder in folders]
-    if there := [one for one in homes if one.exists()]:
-        raise UserError(f"{there[0]}: exists already; choose another --out, or remove it")
+    if existing := [path for path in homes if path.exists()]:
+        raise UserError(f"{existing[0]}: exists already; choose another --out, or remove it")
     import envs
     from sgft_jax.export.folder import save_exported
     from sgft_jax.io.priors import load_prior, observed_by
 
-    for folder, own in zip(folders, homes, strict=True):
+    for folder, path in zip(folders, homes, strict=True):
         env = envs.make(task, **observed_by([folder]))
         prior = load_prior(folder, task=env.name, obs_dim=env.obs_dim, act_dim=env.act_dim)
-        worst = save_exported(own, prior, env, args.to)
-        print(f"{own}: actions differ from the policy's by {worst:.1e} at most")
+        worst = save_exported(path, prior, env, args.to)
+        print(f"{path}: actions differ from the policy's by {worst:.1e} at most")
 
 
 if __name__ == "__main__":

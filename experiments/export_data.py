@@ -59,11 +59,10 @@ def main(args: ExportDataArgs) -> None:
         about = {"algorithm_name": str(read_config(home).get("method", "")), "author": [_AUTHOR], "task": env.name}
         recording.write_minari(folder, episodes, {**about, "control_dt": env.control_dt, **entries})
     else:
-        lerobot.write(
-            folder, episodes, task=env.name, control_dt=env.control_dt, observation=env.measured, action=env.action
-        )
-    steps, won = sum(len(own.reward) for own in episodes), sum(bool(own.success) for own in episodes)
-    print(f"{folder}: {len(episodes)} episodes, {steps:,} transitions, {won} successes")
+        spaces = {"observation": env.measured, "action": env.action}
+        lerobot.write(folder, episodes, task=env.name, control_dt=env.control_dt, **spaces)
+    steps, successes = sum(len(e.reward) for e in episodes), sum(bool(e.success) for e in episodes)
+    print(f"{folder}: {len(episodes)} episodes, {steps:,} transitions, {successes} successes")
 
 
 def _name(home: Path, seed: int | None) -> str:

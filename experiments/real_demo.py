@@ -84,13 +84,10 @@ def check(args: RealDemoArgs) -> None:
 def fine_tune(args: RealDemoArgs, python: Path) -> None:
     """The run, with what is filmed of it."""
     first, last = filmed(args)
-    panda_gym.fine_tune(
-        python, args.out,
-        ["--prior", args.prior, "--method", args.method, "--seed", args.seed, "--rollouts", args.rollouts,
-         "--eval-at", *evaluated(args), "--eval-episodes", args.episodes],
-        log=args.out / "robot.log",
-        film=["--into", args.out / "pictures", "--film", *first, *last] if args.video else [],
-    )  # fmt: skip
+    options = ["--prior", args.prior, "--method", args.method, "--seed", args.seed, "--rollouts", args.rollouts]
+    options += ["--eval-at", *evaluated(args), "--eval-episodes", args.episodes]
+    film = ["--into", args.out / "pictures", "--film", *first, *last] if args.video else []
+    panda_gym.fine_tune(python, args.out, options, log=args.out / "robot.log", film=film)
 
 
 def evaluated(args: RealDemoArgs) -> list[int]:
@@ -112,11 +109,8 @@ def show(args: RealDemoArgs) -> None:
     from experiments.runner.finetune_record import evaluation_store
 
     run = run_folder(arguments(args.method, task=TASK, seeds=1, seed=args.seed, out=args.out), REMOTE)
-    found = {}
-    for done in (0, args.rollouts):
-        store = evaluation_store(run, done)
-        found[done] = [bool(store.load(i)["success"][0]) for i in range(len(store))]
-    before, after = found.values()
+    stores = [evaluation_store(run, done) for done in (0, args.rollouts)]
+    before, after = ([bool(store.load(i)["success"][0]) for i in range(len(store))] for store in stores)
     print(
         f"\nsuccess in Bullet: {_percent(before)} before, {_percent(after)} after {args.rollouts} rollouts of "
         f"{args.method}; one seed, {args.episodes} episodes, in which the cube lay within 5 cm of the mark at the end"
@@ -133,8 +127,8 @@ def film(args: RealDemoArgs, before: Sequence[bool], after: Sequence[bool]) -> s
 
     first, last = filmed(args)
     i = telling(np.array(before[: len(first)]), np.array(after[: len(last)]))
-    path, captions = args.out / "videos" / "before-after.mp4", [_caption("before", before[i])]
-    captions.append(_caption(f"after {args.rollouts} rollouts", after[i]))
+    path, outcome = args.out / "videos" / "before-after.mp4", ("failure", "success")
+    captions = [f"before: {outcome[before[i]]}", f"after {args.rollouts} rollouts: {outcome[after[i]]}"]
     try:
         files = [args.out / "pictures" / f"episode-{numbers[i]}.npz" for numbers in (first, last)]
         write_side_by_side([np.load(file)["pictures"] for file in files], captions, path)
@@ -151,10 +145,6 @@ def telling(first: "np.ndarray", last: "np.ndarray") -> int:
     """Which episode to show, of successes before and after, [n] bool: the first that was mended, else the first."""
     mended = (~first & last).nonzero()[0]
     return int(mended[0]) if len(mended) else 0
-
-
-def _caption(when: str, success: bool) -> str:
-    return f"{when}: {'success' if success else 'failure'}"
 
 
 if __name__ == "__main__":

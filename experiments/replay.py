@@ -43,13 +43,13 @@ def main(args: ReplayArgs) -> None:
 def chosen(home: Path, args: ReplayArgs) -> list[Played]:
     """The rollouts that are asked for; raises UserError for numbers that there are not."""
     without_repeats("--rollout", [str(n) for n in args.rollout])
-    found = episodes_of(home, args.seed)
-    own = {one.number: one for one in found if one.seed == found[0].seed and len(one.rows["reward"])}
-    if not own:
+    stored = episodes_of(home, args.seed)
+    episodes = {e.number: e for e in stored if e.seed == stored[0].seed and len(e.rows["reward"])}
+    if not episodes:
         raise UserError(f"{home / 'real'}: holds no valid step")
-    if missing := [n for n in args.rollout if n not in own]:
-        raise UserError(f"--rollout {missing[0]}: {home / 'real'} has {min(own)} to {max(own)}")
-    return [own[n] for n in args.rollout or (max(own),)]
+    if missing := [n for n in args.rollout if n not in episodes]:
+        raise UserError(f"--rollout {missing[0]}: {home / 'real'} has {min(episodes)} to {max(episodes)}")
+    return [episodes[n] for n in args.rollout or (max(episodes),)]
 
 
 if __name__ == "__main__":

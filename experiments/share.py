@@ -62,14 +62,14 @@ def rounded(tree: PyTree, bits: int) -> PyTree:
     """The same arrays with so many significant bits in each float, as NumPy arrays; integers stay as they are."""
     import jax
 
-    def one(x: Any) -> np.ndarray:
+    def rounded_array(x: Any) -> np.ndarray:
         values = np.asarray(x)
         if not np.issubdtype(values.dtype, np.floating):
             return values
         mantissa, exponent = np.frexp(values)
         return np.ldexp(np.rint(np.ldexp(mantissa, bits)), exponent - bits).astype(values.dtype)
 
-    return jax.tree.map(one, tree)
+    return jax.tree.map(rounded_array, tree)
 
 
 if __name__ == "__main__":

@@ -25,13 +25,15 @@ from sgft_jax.io.priors import load_prior, observed
 from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.policies import make_policy
 from sgft_jax.presets import check_card
-from sgft_jax.stacking import stack
+from sgft_jax.stacking import member, stack
 from sgft_jax.systems import System
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import finetuning
 from sgft_jax.train.finetuning import FinetuneProgress, SimulatedRows
 from sgft_jax.train.options import card_of
 from sgft_jax.types import Finetuner, Online, Prior
+
+__all__ = ["ActingPolicy", "Setup", "evaluate_prior", "finetuned_priors", "load_policy", "make_env", "setup"]
 
 SIMULATED_WORLDS = 256
 _SIMULATION = 2**31  # seed of what happens in them, the same for every run
@@ -82,19 +84,19 @@ def setup(
     if isinstance(real, System):
         system, copies = real, 1
     else:
-        found = [real] if isinstance(real, Gap) else list(real)
-        gamma, copies = card_of(known[0] if known else None)["gamma"], len(found)
-        system = _simulated_systems(env, found, len(numbers), gamma=gamma)
+        gaps = [real] if isinstance(real, Gap) else list(real)
+        gamma, copies = card_of(known[0] if known else None)["gamma"], len(gaps)
+        system = _simulated_systems(env, gaps, len(numbers), gamma=gamma)
     stacked = stack([prior.params for prior in known]) if known else None
     members = jnp.tile(jnp.array(list(numbers), jnp.uint32), copies)
     return Setup(finetuner, system, stacked, members, _simulated_rows(env, finetuner, known, stacked))
 
 
-def _simulated_systems(env: Env, found: Sequence[Gap], seeds: int, *, gamma: float) -> Simulated:
+def _simulated_systems(env: Env, gaps: Sequence[Gap], seeds: int, *, gamma: float) -> Simulated:
     """The real systems of gaps with so many seeds on each."""
-    real = real_env(env, found)
-    which = jnp.repeat(jnp.arange(len(found)), seeds)
-    return Simulated(real, real_worlds(real, found, jax.random.key(0)), which, gamma=gamma)
+    real = real_env(env, gaps)
+    which = jnp.repeat(jnp.arange(len(gaps)), seeds)
+    return Simulated(real, real_worlds(real, gaps, jax.random.key(0)), which, gamma=gamma)
 
 
 def _simulated_rows(env: Env, finetuner: Finetuner, priors: list[Prior], stacked: PyTree) -> SimulatedRows | None:
@@ -147,13 +149,11 @@ def evaluate_prior(
     key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_EVALUATION), seed))
     system = real
     if not isinstance(system, System):
-        there = real_env(env, [] if system is None else [system])
-        pool = jax.tree.map(lambda x: x[None], heldout_worlds(there, system, key_worlds, episodes))
-        system = Simulated(there, pool, jnp.zeros(1, int), gamma=prior.card["gamma"])
-    one = jax.tree.map(lambda x: x[None], prior.params)
+        scene = real_env(env, [] if system is None else [system])
+        pool = stack([heldout_worlds(scene, system, key_worlds, episodes)])
+        system = Simulated(scene, pool, jnp.zeros(1, int), gamma=prior.card["gamma"])
     keys = jax.random.split(key_episodes, (1, episodes))
-    played = system.play(make_policy(prior.card, env), one, keys, explore=False)
-    return jax.tree.map(lambda x: x[0], played)
+    return member(system.play(make_policy(prior.card, env), stack([prior.params]), keys, explore=False), 0)
 
 
 def finetuned_priors(setup: Setup, state: FinetuneProgress, prior: Prior, *, best: bool = True) -> list[Prior]:
@@ -164,8 +164,8 @@ def finetuned_priors(setup: Setup, state: FinetuneProgress, prior: Prior, *, bes
     """
     params = state.best.params if best else jax.vmap(setup.finetuner.export)(state.agent)
     card = {**prior.card, **setup.finetuner.card}
-    own = lambda i: jax.tree.map(lambda x: jnp.copy(x[i]), params)  # noqa: E731 - the state's arrays may be donated
-    return [Prior(own(i), card) for i in range(len(setup.seeds))]
+    copied = jax.tree.map(jnp.copy, params)  # the state's arrays may be donated
+    return [Prior(member(copied, i), card) for i in range(len(setup.seeds))]
 
 
 class ActingPolicy:

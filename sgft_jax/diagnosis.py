@@ -151,12 +151,12 @@ def honesty(real: tuple[np.ndarray, ...], simulated: tuple[np.ndarray, ...]) -> 
     constant. shortfall: by how much more a real rollout falls short of V_sim than a simulated one, in standard
     deviations over simulated rollouts.
     """
-    (values, returns, valid), each = real, [_by_rollout(*x) for x in (real, simulated)]
-    own, theirs = values[valid], returns[valid]
+    promised, earned = (x[real[2]] for x in real[:2])
+    fall, usual = (_by_rollout(*rollouts) for rollouts in (real, simulated))
     return {
-        "bias": float((own - theirs).mean()),
-        "rank_correlation": float(rank_correlation(np.stack([own, theirs], axis=1))),
-        "shortfall": float((each[0].mean() - each[1].mean()) / max(each[1].std(), 1e-9)),
+        "bias": float((promised - earned).mean()),
+        "rank_correlation": float(rank_correlation(np.stack([promised, earned], axis=1))),
+        "shortfall": float((fall.mean() - usual.mean()) / max(usual.std(), 1e-9)),
     }
 
 

@@ -11,10 +11,10 @@ import numpy as np
 from envs.types import Array, Key, Transition
 from sgft_jax import diagnosis
 from sgft_jax.diagnosis import HORIZONS, Lateness, Rollouts
-from sgft_jax.identify import Identified
+from sgft_jax.identify import Identified, command_interface
 from sgft_jax.models.distortion import Distortion, none, residuals, undone
 from sgft_jax.policies import network_of
-from sgft_jax.train.finetuner import command_interface
+from sgft_jax.stacking import member
 from sgft_jax.types import SimulatedData, Task
 
 _STATES, _OFFSETS = 256, 32  # visited states that are looked at, and ways to act that are tried in each
@@ -82,12 +82,12 @@ class Examiner:
 
     def _of(self, i: int, counts: Sequence[int], looks: Sequence[Look], seen: Look, success: np.ndarray) -> "Examined":
         """What was found of member i; looks, seen: [M, ...]."""
-        own, *each = (jax.tree.map(lambda x: x[i], look) for look in (seen, *looks))
-        found = [
-            describe(look, own, success[i, :count], turns=self.task.cartesian)
-            for count, look in zip(counts, each, strict=True)
+        simulated, *real = (member(look, i) for look in (seen, *looks))
+        statistics = [
+            describe(look, simulated, success[i, :count], turns=self.task.cartesian)
+            for count, look in zip(counts, real, strict=True)
         ]
-        return Examined(found, {"real": _points(each[-1]), "simulated": _points(own)})
+        return Examined(statistics, {"real": _points(real[-1]), "simulated": _points(simulated)})
 
 
 class Control(NamedTuple):
@@ -133,9 +133,9 @@ def _look(
     nothing = none(task.act_dim, task.measured_dim)
     known = command_interface(network_of(card), task).refit(begun, rows, valid).distortion
     meant = rollouts._replace(transitions=jax.vmap(functools.partial(undone, known))(rollouts.transitions))
-    own, acted = (meant, known) if real else (rollouts, nothing)
-    flat, _ = own.flat()
-    first = jax.tree.map(lambda x: x[0], params.dynamics)
+    judged, acted = (meant, known) if real else (rollouts, nothing)
+    flat, _ = judged.flat()
+    first = member(params.dynamics, 0)
 
     def change(obs: Array, action: Array) -> Array:
         return (beliefs.after(first, obs, action) - obs)[: task.measured_dim]
@@ -146,8 +146,8 @@ def _look(
     best = jax.lax.map(
         lambda obs: diagnosis.headroom(beliefs, acted, obs, offsets, HORIZONS[-1]), flat.obs[which], batch_size=_AT_ONCE
     )
-    values, returns = diagnosis.promises(beliefs, own)
-    errors, windows = diagnosis.model_errors(beliefs, own)
+    values, returns = diagnosis.promises(beliefs, judged)
+    errors, windows = diagnosis.model_errors(beliefs, judged)
     return Look(
         known=known,
         nats=diagnosis.evidence(residuals(change, rows, nothing), residuals(change, rows, known), valid, begun.spread),

@@ -17,6 +17,8 @@ from sgft_jax.models import ratio
 from sgft_jax.models.networks import add_noise
 from sgft_jax.types import Batch, Imagination, Metrics, Transform
 
+__all__ = ["branch", "clip", "compose", "relabel", "shape", "shaped_reward", "shorten", "stateless", "weigh"]
+
 
 def stateless(apply: Callable[[Any, Batch, Key], Batch]) -> Transform:
     """A transform that learns nothing."""

@@ -8,7 +8,9 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 from envs.types import Array, Key, Policy, PyTree, Transition, UserError
 
-__all__ = ["Policy", "Transition", "UserError"]  # of `envs.types`, public here too
+__all__ = ["Batch", "Finetuner", "Fixed", "HybridAgent", "Imagination", "Learner", "Method", "Normalizer", "Online"]
+__all__ += ["Prior", "SimulatedData", "Simulation", "Source", "Task", "Transform"]
+__all__ += ["Policy", "Transition", "UserError"]  # of `envs.types`, public here too
 
 Metrics = dict[str, Array]
 
@@ -182,7 +184,7 @@ class Prior:
     """What pretraining hands to fine-tuning.
 
     params: the networks' parameters and the observation statistics (`SACParams`, `TDMPC2Params` or
-        `RECURRENTParams`).
+        `RecurrentParams`).
     card: JSON data: task, algorithm, network, gamma, and the numbers that were measured.
     """
 

@@ -46,7 +46,7 @@ import test_hybrid_training as hybrid_tests
 import toy
 import toy_terminating
 import tuners
-import test_pretraining as pretraining_tests  # isort: skip - `tuners` makes the size that it names
+import test_pretraining as pretraining_tests
 
 # The project
 from envs import gaps

@@ -1,7 +1,12 @@
 """Every public name is there, once, and explains itself; docs/api.md gets its list of them from the same function."""
 
+import ast
 import importlib.util
 import inspect
+import json
+import re
+import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -24,6 +29,22 @@ names = load_hook()
 PUBLIC = [(f"{package}.{name}", thing) for package in names.PACKAGES for name, thing in names.public(package)]
 
 
+def public_modules():
+    """The modules that public names are of, with these names; learners are public module by module."""
+    modules = {}
+    for node in ast.parse(Path(sgft_jax.__file__).with_suffix(".pyi").read_text()).body:
+        if isinstance(node, ast.ImportFrom) and not node.module.startswith("learners"):
+            for name in (alias.name for alias in node.names):
+                if isinstance(thing := getattr(sgft_jax, name), ModuleType):
+                    prefix = f"sgft_jax.{name}."
+                    modules[thing.__name__] = [
+                        full.removeprefix(prefix) for full, _ in PUBLIC if full.startswith(prefix)
+                    ]
+                else:
+                    modules.setdefault(f"sgft_jax.{node.module}", []).append(name)
+    return modules
+
+
 @pytest.mark.parametrize(("name", "thing"), PUBLIC, ids=[name for name, _ in PUBLIC])
 def test_public_names_explain_themselves(name, thing):
     if inspect.isroutine(thing) or inspect.isclass(thing) or isinstance(thing, ModuleType):
@@ -34,6 +55,12 @@ def test_public_names_explain_themselves(name, thing):
 @pytest.mark.parametrize("package", [sgft_jax, envs], ids=lambda package: package.__name__)
 def test_public_names_are_listed_once(package):
     assert len(set(package.__all__)) == len(package.__all__)
+
+
+@pytest.mark.parametrize("module", sorted(public_modules()))
+def test_a_public_module_lists_what_is_public(module):
+    """Its `__all__` is what the stub of the package takes from it, or for a public module what docs/api.md lists."""
+    assert sorted(importlib.import_module(module).__all__) == sorted(public_modules()[module])
 
 
 def test_the_page_lists_them_with_what_they_are():
@@ -49,3 +76,37 @@ def test_a_name_is_explained_by_its_first_sentence():
 
     assert names.summary(twice) == "Returns a \\| b in one line"
     assert names.summary({"no": "docstring"}) == "data"
+
+
+# --- a loop of a user's own -------------------------------------------------------------------------------------------
+
+
+def first_example():
+    """The first program of the page."""
+    return re.search(r"```python\n(.*?)```", (HOOK.parent.parent / "docs/api.md").read_text(), re.S).group(1)
+
+
+def test_a_users_own_loop_learns(capsys):
+    """Twenty lines beside the imports, compiled once: losses of four seeds, which differ."""
+    scope = {}
+    exec(compile(first_example(), "docs/api.md", "exec"), scope)
+    assert len(capsys.readouterr().out.splitlines()) == 4
+    assert scope["learn"]._cache_size() == 1
+    losses = scope["metrics"]["critic/loss"]
+    assert losses.shape == (20, 4) and bool((losses[-1] < 1).all()) and len(set(losses[-1].tolist())) == 4
+
+
+@pytest.mark.slow
+def test_it_has_the_types_of_the_library(tmp_path):
+    """As a user's editor checks it, and not without reading the signatures: a wrong argument is found."""
+    program = first_example()
+    (tmp_path / "good.py").write_text(program)
+    (tmp_path / "bad.py").write_text(
+        program + "\nsac.update(config, states, 3, jax.random.key(0))\nsac.renew(config)\n"
+    )
+    # An editable install may be found by a hook alone, which no type checker runs.
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps({"extraPaths": [str(HOOK.parent.parent)]}))
+    check = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "--project", str(tmp_path)]
+    report = subprocess.run(check, cwd=tmp_path, capture_output=True, text=True).stdout
+    errors = [line for line in report.splitlines() if " error: " in line]
+    assert len(errors) == 2 and all("bad.py" in line for line in errors), report

@@ -167,4 +167,4 @@ def test_the_list_of_commands_is_light():
 
 def test_a_public_name_is_imported_when_it_is_used():
     assert imported("import sgft_jax; sgft_jax.NetworkConfig") == []
-    assert "jax" in imported("import sgft_jax; sgft_jax.make_sac")
+    assert "jax" in imported("import sgft_jax; sgft_jax.learners.sac")

@@ -6,10 +6,8 @@ The robot is that of `envs.locomotion.wheel_legged`.
 import jax.numpy as jnp
 import numpy as np
 
-from envs.base import Env
 from envs.locomotion import wheel_legged
 from envs.locomotion.wheel_legged import ENTRIES, FALLEN, fallen, seconds_until, state_of, torque
-from envs.mujoco.scene import make_env
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array
 
@@ -59,8 +57,3 @@ SCENE = wheel_legged.SCENE._replace(
     terminated=terminated,
     measures=measures,
 )
-
-
-def make(impl: str = "auto") -> Env:
-    """The task of moving forward."""
-    return make_env(SCENE, impl)

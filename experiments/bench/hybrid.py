@@ -11,6 +11,7 @@ import envs
 from envs import gaps
 from envs.base import Env, World
 from envs.gaps import SIM
+from envs.mujoco.worlds import Impl, choose_impl
 from envs.pools import real_worlds
 from envs.types import Key, PyTree
 from experiments.bench import bare_h2oplus
@@ -26,13 +27,14 @@ from sgft_jax.types import HybridAgent, RealData
 METHOD = "h2oplus"
 
 
-def speed(task: str, impl: str, members: int, *, width: int, updates: int, repeats: int) -> dict[str, Any]:
+def speed(task: str, impl: Impl, members: int, *, width: int, updates: int, repeats: int) -> dict[str, Any]:
     """Updates per second over all members (pairs of a seed and a gap): of a run, and of the hand-written update.
 
     A run steps its simulators, 25 by default, once before as many updates follow. updates/bare: of a run that learns
     from what its simulators left before. simulators_share: of a run's time, by how much that one is faster.
     """
-    env, method = envs.make(task, impl), get_method(METHOD, "fixed")
+    engine = choose_impl(impl)
+    env, method = envs.make(task, engine), get_method(METHOD, "fixed")
     agent = method.build(replace(method.config, hidden=(width, width)), env)
     schedule = Schedule(buffer=REPLAY, chunk_updates=updates)
     pools = real_worlds(env, [gaps.load(env, SIM)] * members, jax.random.key(0))
@@ -42,12 +44,10 @@ def speed(task: str, impl: str, members: int, *, width: int, updates: int, repea
     bare = _by_hand(env, method.config, width, keys, schedule.updates_per_chunk)
     run_s, idle_s, bare_s = fastest_in_turns((run, idle, bare), repeats=repeats)
     count = members * schedule.updates_per_chunk
-    return {
-        "task": task, "impl": impl, "members": members, "width": width,
-        "updates_per_s": count / run_s, "bare_per_s": count / bare_s, "run/bare": bare_s / run_s,
-        "updates/bare": bare_s / idle_s, "simulators_share": 1 - idle_s / run_s,
-        "compile_s": compiled.compile_s, "memory_mb": compiled.memory_mb,
-    }  # fmt: skip
+    line = {"task": task, "impl": engine, "members": members, "width": width}
+    line |= {"updates_per_s": count / run_s, "bare_per_s": count / bare_s, "run/bare": bare_s / run_s}
+    line |= {"updates/bare": bare_s / idle_s, "simulators_share": 1 - idle_s / run_s}
+    return line | {"compile_s": compiled.compile_s, "memory_mb": compiled.memory_mb}
 
 
 def _run(

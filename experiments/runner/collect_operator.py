@@ -1,6 +1,7 @@
 """Impure: logs of someone who keeps a wheel-legged robot up by hand. `experiments.collect --operator` writes them."""
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -33,25 +34,23 @@ def operate(args: CollectArgs) -> list[dict[str, Any]]:
     env = real_env(env, [gap])
     pool = member(real_worlds(env, [gap], jax.random.key(0)), 0)
     policy, gain = operator(ROBOTS[args.task]), jnp.asarray(nominal_gain(), jnp.float32)
-    act = lambda carry, obs, key: policy.act(gain, carry, obs, key, explore=True)  # noqa: E731
-
-    def play(key: Any) -> Any:
-        return play_episode(env, pool, act, policy.init_carry(), key, gamma=1.0, length=transitions_of(args))
-
-    play = jax.jit(jax.vmap(play))
+    act, length = functools.partial(policy.act, gain, explore=True), transitions_of(args)
+    play = jax.jit(
+        jax.vmap(lambda key: play_episode(env, pool, act, policy.init_carry(), key, gamma=1.0, length=length))
+    )
     return [
-        _write(args, env, path, _enough(play, transitions_of(args), seed))
+        _write(args, env, path, _enough(play, length, seed))
         for path, seed in zip(targets(args), seed_list(args.seed, args.seeds), strict=True)
     ]
 
 
 def _enough(play: Any, transitions: int, seed: int) -> list[Recorded]:
     """Episodes until there are transitions enough: a robot that has fallen is put up again."""
-    key, found = jax.random.key(seed), []
-    while sum(len(own.reward) for own in found) < transitions:
+    key, episodes = jax.random.key(seed), []
+    while sum(len(episode.reward) for episode in episodes) < transitions:
         key, key_now = jax.random.split(key)
-        found += of_episodes(play(key_now[None]))
-    return cut(found, transitions)
+        episodes += of_episodes(play(key_now[None]))
+    return cut(episodes, transitions)
 
 
 def _write(args: CollectArgs, env: Env, path: Path, episodes: list[Recorded]) -> dict[str, Any]:
@@ -59,8 +58,8 @@ def _write(args: CollectArgs, env: Env, path: Path, episodes: list[Recorded]) ->
     write_table(path, episodes, scale=wheel_legged.TORQUE)
     assert env.reward is not None
     log = logs.load_table(path, gamma=1.0, obs_dim=env.obs_dim, reward=jax.vmap(env.reward))
-    rows, seen = log.rows, np.asarray(log.rows.obs)
-    spread = [*seen[:, 1:].std(0), wheel_legged.TORQUE * np.asarray(rows.action).std()]
+    rows, obs = log.rows, np.asarray(log.rows.obs)
+    spread = [*obs[:, 1:].std(0), wheel_legged.TORQUE * np.asarray(rows.action).std()]
     rewards = {"moving": jax.vmap(wheel_forward.reward)(rows.obs[:, 1:], rows.action, rows.next_obs[:, 1:])}
     if not ROBOTS[args.task]:  # a robot that moves on has left its place
         rewards = {"standing": rows.reward, **rewards}
@@ -70,10 +69,10 @@ def _write(args: CollectArgs, env: Env, path: Path, episodes: list[Recorded]) ->
         "std": dict(zip(_NAMES, map(float, spread), strict=True)),
         "reward": {name: float(np.mean(values)) for name, values in rewards.items()},
     }
-    said = ", ".join(f"{name} {value:.3g}" for name, value in facts["std"].items())
+    spreads = ", ".join(f"{name} {value:.3g}" for name, value in facts["std"].items())
     earned = ", ".join(f"{value:.2f} {name}" for name, value in facts["reward"].items())
     print(
-        f"{path}: {log.facts.transitions:,} transitions, {log.facts.terminal} falls; std of {said}; "
+        f"{path}: {log.facts.transitions:,} transitions, {log.facts.terminal} falls; std of {spreads}; "
         f"reward of a step {earned}"
     )
     write_json(path.with_suffix(".json"), {**facts, "real": args.real, "provenance": runs.provenance()})

@@ -28,8 +28,7 @@ from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.methods import get_method
 from sgft_jax.stacking import join, part
-from sgft_jax.systems.gymnasium import Gymnasium
-from sgft_jax.systems.simulated import Simulated
+from sgft_jax.systems import Known, System
 from sgft_jax.train import finetuning
 from sgft_jax.train.finetuning import FinetuneProgress, Logged
 from sgft_jax.train.learner_process import LearnerProcess
@@ -63,7 +62,7 @@ def run(args: FinetuneArgs, method: Online, seeds: list[int], folders: list[Path
             last.push(lambda error, *_: playing.close(over=error is None))
             members = seeds * len(args.real)
         setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
-        assert isinstance(setup.system, Simulated | Gymnasium)
+        assert isinstance(setup.system, Known)
         # Last: what is wrong with a robot or with a method of the user's own leaves no folder behind.
         inputs = {
             "priors": [digest(prior) for prior in priors],
@@ -135,7 +134,7 @@ class _Run(Training):
         self,
         args: FinetuneArgs,
         setup: Setup,
-        system: Simulated | Gymnasium,
+        system: Known,
         card: dict[str, Any],
         records: list[FinetuneRecord],
         logs: list[Log],
@@ -188,8 +187,8 @@ class _Run(Training):
         return bool(self.episodes) and not offline and evaluates(self.args, before, done)
 
     def evaluate(self, state: FinetuneProgress, done: int) -> dict[str, float]:
-        system = self.system
-        if isinstance(system, Gymnasium):  # its episodes are real ones, and as dear as those of training
+        system: System = self.system
+        if self.system.pools is None:  # its episodes are real ones, and as dear as those of training
             stores = [evaluation_store(record.folder, done) for record in self.records]
             system = RecordedSystem(system, stores, done=0, explore=False, sync_every=self.sync_every)
         played = finetuning.evaluate(self.finetuner, system, state.agent, self.seeds, self.episodes)
@@ -214,9 +213,9 @@ class _Run(Training):
         best = progress.best
         card = {**self.card, "plan": None, **self.finetuner.card}  # the prior may be one that plans
         last = jax.jit(jax.vmap(self.finetuner.export))(progress.agent)
-        facts = {"evidence": best.score, "rollouts": best.rollouts}
+        facts = {"evidence": best.score, "rollouts": best.age}
         n = self.episodes
-        if n and isinstance(self.system, Simulated):
+        if n and self.system.pools is not None:
             played = finetuning.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, n)
             facts["score"] = scores(played, best.worst)["score"]
         films = functools.cache(lambda: self._before_and_after(progress))
@@ -227,7 +226,7 @@ class _Run(Training):
             record.save("best", own(best.params), card)
             rollouts, chosen = int(progress.rollouts), {name: np.asarray(own(x)) for name, x in facts.items()}
             summaries.append(record.summarise(rollouts, chosen))
-            if self.args.video and n and isinstance(self.system, Simulated):
+            if self.args.video and n and self.system.pools is not None:
                 pool = jax.tree.map(lambda x, i=i: x[i], self.system.pools)
                 print(record.film(pool, lambda own=own: [own(x) for x in films()], rollouts))
             print(f"results: {record.folder}  (policy/, best/, real/, summary.json, figures/)")

@@ -40,7 +40,7 @@ def join(hosts: str | None) -> None:
 
 
 @contextlib.contextmanager
-def own(folder: Path) -> Iterator[Path]:
+def run_folder(folder: Path) -> Iterator[Path]:
     """Where this host writes the run of that folder: there on the first host, elsewhere and silently on the others.
 
     They begin with a copy of its logs, so that all can resume. Checkpoints and priors are not for here: hosts save and

@@ -15,9 +15,8 @@ TASK = "panda-push"
 HOME = Path("build/panda-gym")  # where the environment is, or shall be made
 PYTHON = os.environ.get("PYTHON311") or "python3.11"  # what makes it
 DRIVER = Path("docs/examples/panda_gym_robot.py")  # in the folder of the code, as the priors are
-PACKAGES = (
-    "panda-gym==3.0.7", "pybullet==3.2.7", "gymnasium==1.4.0", "numpy==2.4.6", "msgpack==1.2.4", "websockets==17.4",
-)  # fmt: skip
+PACKAGES = ("panda-gym==3.0.7", "pybullet==3.2.7", "gymnasium==1.4.0", "numpy==2.4.6", "msgpack==1.2.4")
+PACKAGES += ("websockets==17.4",)
 _END = 10.0  # seconds that a process has for its end
 
 
@@ -32,21 +31,22 @@ def bullet(home: Path, python: str) -> Path:
 
     Raises UserError where there is no Python 3.11, or where its packages cannot be had.
     """
-    own = home / "bin" / "python"
-    if said(str(own), "import panda_gym, msgpack, websockets") is not None:
-        return own
-    if said(python, "import sys; sys.exit(sys.version_info[:2] != (3, 11))") is None:
+    bullet_python = home / "bin" / "python"
+    if output(str(bullet_python), "import panda_gym, msgpack, websockets") is not None:
+        return bullet_python
+    if output(python, "import sys; sys.exit(sys.version_info[:2] != (3, 11))") is None:
         raise UserError(f"{python} is no Python 3.11, for which pybullet has wheels; name one with PYTHON311=...")
     print(f"making an environment for Bullet in {home}, once", flush=True)
-    for command in ([python, "-m", "venv", "--clear", str(home)], [str(own), "-m", "pip", "install", "-q", *PACKAGES]):
+    install = [str(bullet_python), "-m", "pip", "install", "-q", *PACKAGES]
+    for command in ([python, "-m", "venv", "--clear", str(home)], install):
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode:
             last = (done.stderr.strip() or f"exit code {done.returncode}").splitlines()[-1]
             raise UserError(f"{' '.join(command[:4])} failed: {last}")
-    return own
+    return bullet_python
 
 
-def said(python: str, code: str) -> str | None:
+def output(python: str, code: str) -> str | None:
     """What Python prints for the code; None where it fails, or where there is no such Python."""
     try:
         done = subprocess.run([python, "-c", code], capture_output=True, text=True)

@@ -38,9 +38,10 @@ from sgft_jax.keys import Pretraining, seed_keys
 from sgft_jax.methods import DEFAULT, all_methods
 from sgft_jax.policies import make_policy
 from sgft_jax.systems.simulated import Simulated
+from sgft_jax.train import evidence
+from sgft_jax.train.evidence import Best
 from sgft_jax.train.fleet import FleetState
 from sgft_jax.train.pretraining import (
-    Best,
     collect_random,
     exported,
     memory,
@@ -76,7 +77,7 @@ def run(args: PretrainArgs, seeds: list[int]) -> dict[str, Any]:
     sizes = memory(env, args.config)  # what does not fit is reported before anything is written
     devices = mesh.devices(args.devices, {f"--config.{n.replace('_', '-')}": getattr(args.config, n) for n in _CUT})
     home = run_folder(args)
-    with hosts.own(home) as folder, mesh.use(devices):
+    with hosts.run_folder(home) as folder, mesh.use(devices):
         reserve(sizes, copies=args.seeds, devices=devices)
         with opened(
             {folder: jsonable(args)}, kind="pretrain", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE
@@ -133,10 +134,9 @@ class _Run(Training):
         return stacking.stack([training_worlds(self.env, self.gap, key, self.config.worlds) for key in keys])
 
     def _saved(self, state: FleetState) -> Saved:
-        """What a first checkpoint holds: any evaluation is better than its best."""
-        none, unknown = jnp.full(len(self.seeds), -jnp.inf), jnp.full((len(self.seeds), 2), jnp.inf)
+        """What a first checkpoint holds."""
         params = exported(self.env, self.config, state)
-        return Saved(state, Best(params, none, none, state.rounds, jnp.zeros(len(self.seeds)), unknown))
+        return Saved(state, evidence.nothing_known(params, len(self.seeds), self.config.eval_episodes))
 
     def _random(self) -> PyTree:
         """Experience under random actions: collected once, then read from disk."""
@@ -250,7 +250,7 @@ class _Run(Training):
 
     def _chosen(self, best: Best) -> dict[str, float]:
         """Which evaluation the prior is from, and what that evaluation said."""
-        steps = int(best.steps) * self.config.n_envs
+        steps = int(best.age) * self.config.n_envs
         return {"best/env_steps": steps, f"best/{self.env.score}": float(best.score), "best/return": float(best.total)}
 
     def _save_report(self, seed: int, report: Report, i: int) -> None:

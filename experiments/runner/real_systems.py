@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import importlib.util
 import json
@@ -56,7 +57,7 @@ def title(real: str) -> str:
 
 def check(task: str, reals: Sequence[str], changes: Sequence[str] = ()) -> None:
     """Raises UserError where there is no such task or real system, or where they cannot be played by one command."""
-    stepped, robots = ([real for real in reals if of(real)] for of in (is_stepped, is_robot))
+    stepped, robots = ([real for real in reals if is_kind(real)] for is_kind in (is_stepped, is_robot))
     check_task(task, [real for real in reals if not is_stepped(real)])
     if not stepped:
         return
@@ -109,9 +110,9 @@ def address(real: str) -> tuple[str, int]:
 
 def free_port() -> int:
     """One of this computer at which nobody listens."""
-    with socket.socket() as one:
-        one.bind((_HOST, 0))
-        return one.getsockname()[1]
+    with socket.socket() as listener:
+        listener.bind((_HOST, 0))
+        return listener.getsockname()[1]
 
 
 def token(home: Path) -> str:
@@ -141,16 +142,15 @@ def token(home: Path) -> str:
 
 def keywords(changes: Sequence[str]) -> dict[str, Any]:
     """What `--set` passes to `gymnasium.make`: JSON where it reads as such, else text; UserError for no name=value."""
-    found: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     for text in changes:
         name, equals, value = (part.strip() for part in text.partition("="))
-        if not equals or not name.isidentifier() or name in found:
+        if not equals or not name.isidentifier() or name in options:
             raise UserError(f"--set '{text}': write name=value, each name once")
-        try:
-            found[name] = json.loads(value)
-        except ValueError:
-            found[name] = value
-    return found
+        options[name] = value
+        with contextlib.suppress(ValueError):
+            options[name] = json.loads(value)
+    return options
 
 
 def described(env: Env, real: str, changes: Sequence[str]) -> Gap:
@@ -175,19 +175,13 @@ def connect(
         if members > 1:
             raise UserError(f"--real {reals[0]}: one robot plays for {members}; choose one policy, or --seeds 1")
         host, port = address(reals[0])
-        robot = Remote(
-            env.measured_dim, env.act_dim, period=env.control_dt, steps=env.episode_length, host=host, port=port,
-            token=token(home), token_in=str(home / _TOKEN),
-        )  # fmt: skip
-        return Gymnasium(env, robot, gamma=gamma)
-    given = keywords(changes)
-    return Gymnasium(env, [_make(real, given) for real in reals for _ in range(members)], gamma=gamma)
-
-
-def _make(real: str, given: dict[str, Any]) -> Any:
+        door: dict[str, Any] = {"host": host, "port": port, "token": token(home), "token_in": str(home / _TOKEN)}
+        times = {"period": env.control_dt, "steps": env.episode_length}
+        return Gymnasium(env, Remote(env.measured_dim, env.act_dim, **times, **door), gamma=gamma)
     import gymnasium
 
-    return _explained(real, lambda name: gymnasium.make(name, **given))
+    make = functools.partial(gymnasium.make, **keywords(changes))
+    return Gymnasium(env, [_explained(real, make) for real in reals for _ in range(members)], gamma=gamma)
 
 
 def _registered(name: str) -> None:

@@ -14,8 +14,8 @@ from envs.rollout import Episode
 from envs.types import Key, PyTree, Transition, UserError
 from sgft_jax.io.real import RealStore
 from sgft_jax.stacking import join, part
-from sgft_jax.systems import System
-from sgft_jax.systems.gymnasium import Gymnasium, Step
+from sgft_jax.systems import Stepped, System
+from sgft_jax.systems.gymnasium import Step
 
 _FACTS = tuple(name for name in Episode._fields if name != "transitions")
 _BESIDE = ("late", "time")  # what is kept of a robot's steps beside transitions, see `Step`
@@ -35,9 +35,14 @@ class RecordedSystem:
     """
 
     def __init__(
-        self, inner: System, stores: Sequence[RealStore], *, done: int, explore: bool = True,
+        self,
+        inner: System,
+        stores: Sequence[RealStore],
+        *,
+        done: int,
+        explore: bool = True,
         sync_every: int | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.inner, self.stores, self.rollout, self.explore = inner, stores, done, explore
         self.sync_every = sync_every
         if short := [store for store in stores if len(store) < done]:
@@ -69,14 +74,15 @@ class RecordedSystem:
     def _play_robot(self, number: int, policy: Any, states: PyTree, keys: Key) -> None:
         """Stores the rollout of a robot, played now or as far as a kill has let it come. keys: [1]."""
         (store,), inner = self.stores, self.inner
-        assert isinstance(inner, Gymnasium)
+        assert isinstance(inner, Stepped)
         journal = store.journal(number, sync_every=self.sync_every or 1)
         made = [_step(journal.path, step, inner.env) for step in journal.read()]
         if made and not made[-1].over and len(made) < inner.env.episode_length:
             made.append(made[-1].in_doubt())
         elif not made:
-            begin = lambda step: journal.begin(step._asdict())  # noqa: E731
-            steps = inner.steps(policy, states, keys, explore=self.explore, asked=begin)
+            steps = inner.steps(
+                policy, states, keys, explore=self.explore, asked=lambda step: journal.begin(step._asdict())
+            )
             with journal, contextlib.closing(steps):  # whatever happens, the robot rests
                 for step in steps:
                     journal.append(step._asdict())

@@ -62,6 +62,5 @@ def _draw(env: Env, path: Path, render: Callable[[Any], None]) -> str:
         path.parent.mkdir(parents=True, exist_ok=True)
         render(scene)
     except Exception as error:  # whatever a graphics driver or a video encoder raises
-        said = (str(error).strip() or type(error).__name__).splitlines()[0]
-        return f"no video: {said}"
+        return f"no video: {(str(error).strip() or type(error).__name__).splitlines()[0]}"
     return f"video: {path}"

@@ -9,6 +9,8 @@ from envs.mesh import running_count, set_rows
 from envs.types import Array, Key, PyTree, Transition, UserError
 from sgft_jax.types import Batch
 
+__all__ = ["ReplayState", "add_batch", "add_episode", "blank", "full", "init", "obs_std", "sample"]
+
 
 class ReplayState(NamedTuple):
     """data: rows on a leading [capacity] axis, transitions or what is kept beside them.

@@ -12,6 +12,8 @@ from envs.mesh import running_count, set_rows
 from envs.types import Array, Key, Transition, UserError
 from sgft_jax.types import Batch
 
+__all__ = ["SequenceState", "add", "add_episode", "end_episodes", "full", "init", "sample", "sample_episodes"]
+
 
 class SequenceState(struct.PyTreeNode):
     """A ring of `slots` time slots for `n_envs` environments; row = slot * n_envs + environment.
@@ -150,5 +152,9 @@ def _window(state: SequenceState, start: Array, some: Array, length: int) -> Bat
     index = (slot + steps) % state.slots * state.n_envs + env
     follows = jnp.concatenate([jnp.ones(1, bool), ~state.last[index][:-1]])
     valid = jnp.cumprod(some & (age + steps < state.size) & state.valid[index] & follows).astype(bool)
-    blank = lambda x: jnp.where(jnp.expand_dims(valid, tuple(range(1, x.ndim))), x, jnp.zeros_like(x))  # noqa: E731
-    return Batch(*jax.tree.map(lambda d: blank(d[index]), state.data), valid=valid)
+
+    def rows_of(column: Array) -> Array:
+        rows = column[index]
+        return jnp.where(jnp.expand_dims(valid, tuple(range(1, rows.ndim))), rows, jnp.zeros_like(rows))
+
+    return Batch(*jax.tree.map(rows_of, state.data), valid=valid)

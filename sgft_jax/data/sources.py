@@ -11,6 +11,8 @@ from envs.types import Array, Key
 from sgft_jax.data import replay, sequences
 from sgft_jax.types import Batch, Source
 
+__all__ = ["beside", "blend", "mixture", "real_rows", "real_windows", "simulated_rows", "two_buffers"]
+
 State = tuple  # (ReplayState or SequenceState, SimulatedData or None)
 
 

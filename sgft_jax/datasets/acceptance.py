@@ -35,8 +35,8 @@ class Verdict(NamedTuple):
         return self.low <= self.value <= self.high
 
     def __str__(self) -> str:
-        said = "pass" if self.passed else "FAIL"
-        return f"{said}: {self.criterion} {self.value:,.0f}, accepted from {self.low:,.0f} to {self.high:,.0f}"
+        verdict = "pass" if self.passed else "FAIL"
+        return f"{verdict}: {self.criterion} {self.value:,.0f}, accepted from {self.low:,.0f} to {self.high:,.0f}"
 
 
 # A walker that never falls would walk 1,000 steps, one that falls twice as often as D4RL's 420: 15 % tells both apart.
@@ -55,6 +55,6 @@ def judge(name: str, facts: Facts, *, mean_length: float) -> Sequence[Verdict]:
     """
     values = {_MEAN: facts.return_mean, _STD: facts.return_std, _SIZE: facts.transitions, LENGTH: mean_length}
     return [
-        Verdict(criterion, float(values[criterion]), own.published * (1 - own.share), own.published * (1 + own.share))
-        for criterion, own in BANDS.get(name, {}).items()
+        Verdict(criterion, float(values[criterion]), published * (1 - share), published * (1 + share))
+        for criterion, (published, share) in BANDS.get(name, {}).items()
     ]

@@ -77,6 +77,12 @@ def check(path: Path, rows: Rows) -> Rows:
     )
 
 
+def ages(ends: np.ndarray) -> np.ndarray:
+    """[N] the steps since its episode began of every row. ends: [N] bool, the rows that are the last of one."""
+    place, starts = np.arange(len(ends)), np.append(True, ends[:-1])[: len(ends)]
+    return place - np.maximum.accumulate(np.where(starts, place, 0))
+
+
 def files_of(folder: Path) -> list[Path]:
     """The files in a folder, in the order of their names. Hidden ones are left out: systems leave them everywhere."""
     paths = (path for path in folder.rglob("*") if path.is_file())
@@ -110,26 +116,22 @@ def read_table(path: Path, measured_dim: int) -> tuple[Rows, int]:
     rows = np.flatnonzero((small & ~done)[:-1] & (small | done)[1:])
     if not len(rows):
         raise UserError(f"{path}: holds no transitions; supply another file")
-    terminal, apart = done[rows + 1], np.diff(rows, append=rows[-1:]) > 1
-    found = Rows(
-        state[rows], torque[rows] / _TORQUE, None, state[rows + 1], terminal, terminal | apart,
-        np.ones(len(rows), bool), "table", "stored", path,
-    )  # fmt: skip
-    return found, len(table)
+    obs, action, next_obs, terminal = state[rows], torque[rows] / _TORQUE, state[rows + 1], done[rows + 1]
+    ends, keep = terminal | (np.diff(rows, append=rows[-1:]) > 1), np.ones(len(rows), bool)
+    return Rows(obs, action, None, next_obs, terminal, ends, keep, "table", "stored", path), len(table)
 
 
 def read_rollouts(home: Path) -> Rows:
     """The valid steps of the rollouts in `<home>/real/`, all of the first seed first."""
-    each = [own.rows for own in played(home) if len(own.rows["reward"])]
-    if not each:
+    episodes = [episode.rows for episode in played(home) if len(episode.rows["reward"])]
+    if not episodes:
         raise UserError(f"{home / 'real'}: holds no valid step")
-    joined = {name: np.concatenate([rows[name] for rows in each]) for name in each[0]}
-    last = np.cumsum([len(rows["reward"]) for rows in each]) - 1
-    ends = np.isin(np.arange(last[-1] + 1), last)
-    return Rows(
-        joined["obs"], joined["action"], joined["reward"], joined["next_obs"], joined["discount"] == 0, ends,
-        np.ones(len(ends), bool), "rollouts", "stored", home / "real",
-    )  # fmt: skip
+    obs, action, reward, discount, next_obs = map(
+        np.concatenate, zip(*(rows.values() for rows in episodes), strict=True)
+    )
+    ends, keep = np.zeros(len(reward), bool), np.ones(len(reward), bool)
+    ends[np.cumsum([len(rows["reward"]) for rows in episodes]) - 1] = True
+    return Rows(obs, action, reward, next_obs, discount == 0, ends, keep, "rollouts", "stored", home / "real")
 
 
 def _table(file: Path) -> np.ndarray:
@@ -210,10 +212,7 @@ def _time_limits(
             jump = (np.abs(here - below) > _SAME * (1 + np.abs(below))).any(axis=1)
         return np.append(jump, False)[: len(obs)] & ~terminal, f"{words}, and where the row below begins anew"
     if limit is not None:
-        place = np.arange(len(obs))
-        starts = np.concatenate([[True], terminal[:-1]])[: len(obs)]
-        age = place - np.maximum.accumulate(np.where(starts, place, 0))
-        return ((age + 1) % limit == 0) & ~terminal, f"{words}, or after the {limit} steps of the task"
+        return ((ages(terminal) + 1) % limit == 0) & ~terminal, f"{words}, or after the {limit} steps of the task"
     return np.zeros(len(obs), bool), f"{words} alone"
 
 

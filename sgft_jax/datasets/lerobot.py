@@ -17,9 +17,9 @@ import numpy as np
 from envs.base import Entry
 from envs.files import Count, Positive, Size, checked, read_object
 from envs.types import UserError
-from sgft_jax.datasets.layouts import Rows, files_of
+from sgft_jax.datasets.layouts import Rows, ages, files_of
 from sgft_jax.datasets.recording import Recorded
-from sgft_jax.files.arrays import check_claim, flags
+from sgft_jax.files.arrays import check_claim, damage, flags
 from sgft_jax.files.jsonfile import write_json
 
 INFO = Path("meta/info.json")
@@ -67,18 +67,18 @@ def write(
     rate = 1 / control_dt
     rate = round(rate) if abs(rate - round(rate)) < 1e-6 * rate else rate
     features = _features(observation, action)
-    starts = np.cumsum([0, *(len(own.reward) for own in episodes)])
-    each = [_frames(own, i, int(starts[i]), rate) for i, own in enumerate(episodes)]
+    starts = np.cumsum([0, *(len(episode.reward) for episode in episodes)])
+    frames = [_frames(episode, i, int(starts[i]), rate) for i, episode in enumerate(episodes)]
     schema = pa.schema([(name, _type_of(pa, about)) for name, about in features.items()])
     for part in ("data/chunk-000", "meta/episodes/chunk-000"):
         (folder / part).mkdir(parents=True, exist_ok=True)
     with pq.ParquetWriter(folder / "data" / _FILE, schema) as file:
-        for frames in each:  # a row group for each episode, so that one can be read alone
-            file.write_table(pa.table({name: _column(pa, frames[name]) for name in features}, schema=schema))
-    about = [_episode_row(frames, task, i, int(starts[i])) for i, frames in enumerate(each)]
+        for columns in frames:  # a row group for each episode, so that one can be read alone
+            file.write_table(pa.table({name: _column(pa, columns[name]) for name in features}, schema=schema))
+    about = [_episode_row(columns, task, i, int(starts[i])) for i, columns in enumerate(frames)]
     pq.write_table(pa.Table.from_pylist(about), folder / "meta/episodes" / _FILE)
     pq.write_table(_tasks(pa, task), folder / "meta/tasks.parquet")
-    joined = {name: np.concatenate([frames[name] for frames in each]) for name in features}
+    joined = {name: np.concatenate([columns[name] for columns in frames]) for name in features}
     write_json(folder / "meta/stats.json", {name: _statistics(values) for name, values in joined.items()})
     info = {
         "codebase_version": _VERSION,
@@ -101,7 +101,10 @@ def write(
 def _features(observation: Sequence[Entry], action: Sequence[Entry]) -> dict[str, dict[str, Any]]:
     """What `meta/info.json` says of every column."""
     state, command = _vector(observation), _vector(action)
-    number = lambda dtype: {"dtype": dtype, "shape": [1], "names": None}  # noqa: E731
+
+    def number(dtype: str) -> dict[str, Any]:
+        return {"dtype": dtype, "shape": [1], "names": None}
+
     return {
         _STATE: state,
         _ACTION: command,
@@ -119,18 +122,18 @@ def _vector(entries: Sequence[Entry]) -> dict[str, Any]:
     return {"dtype": "float32", "shape": [len(names)], "names": names, "info": {"units": units}}
 
 
-def _frames(own: Recorded, number: int, first: int, rate: float) -> dict[str, np.ndarray]:
+def _frames(episode: Recorded, number: int, first: int, rate: float) -> dict[str, np.ndarray]:
     """The columns [T, ...] of one episode. first: index of its first frame in the data set."""
-    steps = np.arange(len(own.reward))
+    steps = np.arange(len(episode.reward))
     last = steps == len(steps) - 1
     return {
-        _STATE: own.obs[:-1],
-        _ACTION: own.action,
-        _SUCCESSOR: own.obs[1:],
-        _REWARD: own.reward,
+        _STATE: episode.obs[:-1],
+        _ACTION: episode.action,
+        _SUCCESSOR: episode.obs[1:],
+        _REWARD: episode.reward,
         _DONE: last,
-        _TRUNCATED: last & (not own.terminated),
-        _SUCCESS: last & bool(own.success),
+        _TRUNCATED: last & (not episode.terminated),
+        _SUCCESS: last & bool(episode.success),
         "timestamp": (steps / rate).astype(np.float32),
         "frame_index": steps,
         "episode_index": np.full_like(steps, number),
@@ -160,9 +163,9 @@ def _episode_row(frames: Mapping[str, np.ndarray], task: str, number: int, first
 def _statistics(values: np.ndarray) -> dict[str, list[float]]:
     """Of a column [N, ...], for each of its numbers."""
     x = values.astype(np.float64).reshape(len(values), -1)
-    found = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0), "count": np.array([len(x)])}
-    found |= {name: np.quantile(x, share, axis=0) for name, share in _QUANTILES.items()}
-    return {name: own.tolist() for name, own in found.items()}
+    facts = {"min": x.min(0), "max": x.max(0), "mean": x.mean(0), "std": x.std(0), "count": np.array([len(x)])}
+    facts |= {name: np.quantile(x, share, axis=0) for name, share in _QUANTILES.items()}
+    return {name: fact.tolist() for name, fact in facts.items()}
 
 
 def _type_of(pa: Any, about: Mapping[str, Any]) -> Any:
@@ -180,10 +183,11 @@ def _column(pa: Any, values: np.ndarray) -> Any:
 
 def _tasks(pa: Any, task: str) -> Any:
     """The table of tasks. LeRobot reads it with pandas, whose index the column `task` must be."""
-    told = lambda name, kind, numpy: {  # noqa: E731
-        "name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None,
-    }  # fmt: skip
-    columns = [told("task_index", "int64", "int64"), told("task", "unicode", "object")]
+    kinds = {"task_index": ("int64", "int64"), "task": ("unicode", "object")}
+    columns = [
+        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
+        for name, (kind, numpy) in kinds.items()
+    ]
     about = {"index_columns": ["task"], "column_indexes": [], "columns": columns, "pandas_version": "2.0.0"}
     table = pa.table({"task_index": pa.array([0], pa.int64()), "task": pa.array([task], pa.string())})
     return table.replace_schema_metadata({"pandas": json.dumps(about)})
@@ -206,10 +210,12 @@ def read(folder: Path) -> Rows:
     path = info.get("data_path", "data/")
     if not path.startswith("data/") or ".." in path:
         raise UserError(f"{folder}: its data_path {path!r} is not in data/; {_WHOLE}")
-    if missing := [name for name in (_STATE, _ACTION) if name not in features]:
-        raise UserError(f"{folder}: has no {missing[0]}, only {', '.join(sorted(features))}; record it as a vector")
-    if missing := [name for name in ("frame_index", "episode_index") if name not in features]:
-        raise UserError(f"{folder}: has no {missing[0]}; {_WHOLE}")
+    needed: dict[str, str] = dict.fromkeys(
+        (_STATE, _ACTION), f", only {', '.join(sorted(features))}; record it as a vector"
+    )
+    needed |= dict.fromkeys(("frame_index", "episode_index"), f"; {_WHOLE}")
+    if missing := [name for name in needed if name not in features]:
+        raise UserError(f"{folder}: has no {missing[0]}{needed[missing[0]]}")
     wanted = (_STATE, _ACTION, _SUCCESSOR, _REWARD, _DONE, _TRUNCATED, "frame_index", "episode_index")
     chosen = {name: features[name] for name in wanted if name in features}
     shapes = {name: checked(f"{folder / INFO}: {name}", x, _Feature, _WHOLE)["shape"] for name, x in chosen.items()}
@@ -217,36 +223,29 @@ def read(folder: Path) -> Rows:
     episode, frame = (_whole(folder, name, columns[name]) for name in ("episode_index", "frame_index"))
     ends = np.append(np.diff(episode) != 0, True)[: len(episode)]
     _check(folder, info, episode, frame, ends)
-    obs, keep = columns[_STATE], np.ones(len(ends), bool)
-    next_obs = columns.get(_SUCCESSOR)
+    obs, next_obs, keep, successors = columns[_STATE], columns.get(_SUCCESSOR), np.ones(len(ends), bool), "stored"
     if next_obs is None:
-        next_obs, keep = np.roll(obs, -1, axis=0), ~ends
+        next_obs, keep, successors = np.roll(obs, -1, axis=0), ~ends, "shifted"
     over = {n: flags(folder, n, columns[n], (None,), fix=_WHOLE) for n in (_DONE, _TRUNCATED) if n in columns}
     terminal = over[_DONE] & ~over[_TRUNCATED] if len(over) == 2 else None
-    return Rows(
-        obs, columns[_ACTION], columns.get(_REWARD), next_obs, terminal, ends, keep, "lerobot",
-        "stored" if _SUCCESSOR in columns else "shifted", folder, float(info["fps"]),
-    )  # fmt: skip
+    step, facts = (obs, columns[_ACTION], columns.get(_REWARD), next_obs), (folder, float(info["fps"]))
+    return Rows(*step, terminal, ends, keep, "lerobot", successors, *facts)
 
 
 def _columns(folder: Path, shapes: Mapping[str, Sequence[int]]) -> dict[str, np.ndarray]:
     """[N] numbers or [N, k] vectors by name, from all files in their order."""
-    pa, pq = _pyarrow(folder)
+    _, pq = _pyarrow(folder)
     paths = [path for path in files_of(folder) if path.parent.parent == folder / "data" and path.suffix == ".parquet"]
     if not paths:
         raise UserError(f"{folder}: holds no data/*/*.parquet; {_WHOLE}")
     parts: dict[str, list[np.ndarray]] = {name: [] for name in shapes}
     for path in paths:
-        try:
+        with damage(path, _WHOLE):
             with pq.ParquetFile(path) as file:
                 _check_size(path, file.metadata, shapes)
                 table = file.read(columns=list(shapes))
-            read = {name: _numbers(path, name, table[name], shape) for name, shape in shapes.items()}
-        except (pa.ArrowException, OSError, KeyError, UnicodeDecodeError) as error:
-            message = str(error).splitlines()[0].strip("'\"")
-            raise UserError(f"{path}: damaged or cut off ({message}); {_WHOLE}") from error
-        for name, values in read.items():
-            parts[name].append(values)
+            for name, shape in shapes.items():
+                parts[name].append(_numbers(path, name, table[name], shape))
     return {name: np.concatenate(values) for name, values in parts.items()}
 
 
@@ -284,16 +283,13 @@ def _check(folder: Path, info: Mapping[str, Any], episode: np.ndarray, frame: np
     for name, n in {"total_frames": len(frame), "total_episodes": len(np.unique(episode))}.items():
         if info.get(name, n) != n:
             raise UserError(f"{folder}: holds {name} {n}, but {INFO} says {info[name]}; {_WHOLE}")
-    place, starts = np.arange(len(frame)), np.append(True, ends[:-1])[: len(frame)]
-    if (odd := episode != np.cumsum(starts) - 1).any():
-        i = int(np.argmax(odd))
-        raise UserError(
-            f"{folder}: row {i} is of episode {episode[i]} where {np.sum(starts[: i + 1]) - 1} is due; {_WHOLE}"
-        )
-    wanted = place - np.maximum.accumulate(np.where(starts, place, 0))
-    if (odd := frame != wanted).any():
-        i = int(np.argmax(odd))
-        raise UserError(f"{folder}: episode {episode[i]} has frame {frame[i]} where {wanted[i]} is due; {_WHOLE}")
+    due, due_frame = np.cumsum(ends) - ends, ages(ends)
+    if len(odd := np.flatnonzero(episode != due)):
+        i = odd[0]
+        raise UserError(f"{folder}: row {i} is of episode {episode[i]} where {due[i]} is due; {_WHOLE}")
+    if len(odd := np.flatnonzero(frame != due_frame)):
+        i = odd[0]
+        raise UserError(f"{folder}: episode {episode[i]} has frame {frame[i]} where {due_frame[i]} is due; {_WHOLE}")
 
 
 def _pyarrow(folder: Path) -> tuple[Any, Any]:

@@ -7,8 +7,7 @@ be is a `UserError` with one line. Arrays are float32 on the host; `replay.full`
 import dataclasses
 import hashlib
 import stat
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
 
@@ -16,10 +15,11 @@ import jax
 import numpy as np
 
 from envs.base import Env
+from envs.files import readable
 from envs.history import remember, with_memory
 from envs.types import Array, Transition, UserError, unknown
 from sgft_jax.datasets import layouts, lerobot
-from sgft_jax.datasets.layouts import Rows
+from sgft_jax.datasets.layouts import Rows, ages
 from sgft_jax.files.arrays import numbers
 from sgft_jax.io.real import home_of
 from sgft_jax.types import Successors
@@ -117,19 +117,22 @@ def load_table(
     return log._replace(facts=dataclasses.replace(log.facts, dropped=count - len(rows.obs)))
 
 
-def episodes(found: Sequence[Log]) -> tuple[Transition, np.ndarray]:
+def episodes(logs: Sequence[Log]) -> tuple[Transition, np.ndarray]:
     """All episodes of some logs, one after another: transitions [N, T, ...] and which of them are valid [N, T].
 
     T is the length of the longest; behind the end of an episode are zeros. A gap where rows were dropped ends one too.
     """
-    each = [
-        jax.tree.map(lambda x, a=a, b=b: np.asarray(x)[a:b], log.rows)
-        for log in found
+    separate = [
+        jax.tree.map(lambda x, a=a, b=b: np.asarray(x)[a:b], (log.rows, np.ones(len(log.last), bool)))
+        for log in logs
         for a, b in zip(*_borders(log.last), strict=True)
     ]
-    longest = max(len(rows.reward) for rows in each)
-    padded = lambda *x: np.stack([np.pad(own, [(0, longest - len(own))] + [(0, 0)] * (own.ndim - 1)) for own in x])  # noqa: E731
-    return jax.tree.map(padded, *each), padded(*[np.ones(len(rows.reward), bool) for rows in each])
+    longest = max(len(valid) for _, valid in separate)
+
+    def padded(*columns: np.ndarray) -> np.ndarray:
+        return np.stack([np.pad(x, [(0, longest - len(x))] + [(0, 0)] * (x.ndim - 1)) for x in columns])
+
+    return jax.tree.map(padded, *separate)
 
 
 def _borders(last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -140,7 +143,7 @@ def _borders(last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _read(path: Path, successors: Successors, env: Env | None) -> Rows:
     """What lies there."""
-    with _readable(path):
+    with readable(path):
         folder = stat.S_ISDIR(path.stat().st_mode)
     if folder:
         if (path / lerobot.INFO).exists():
@@ -210,13 +213,11 @@ def _seen(rows: Rows, env: Env) -> Rows:
     """With what a policy reads beyond measurements, as `envs.history.with_memory` makes it."""
     if rows.obs.shape[1] == env.obs_dim:
         return rows
-    action, place = np.clip(rows.action, -1, 1).astype(np.float32), np.arange(len(rows.ends))
-    starts = np.concatenate([[True], rows.ends[:-1]])
-    age = place - np.maximum.accumulate(np.where(starts, place, 0))  # steps since the episode began
+    action, age = np.clip(rows.action, -1, 1).astype(np.float32), ages(rows.ends)
     memory = np.zeros((len(action), env.previous_actions, env.act_dim), np.float32)
     for k in range(env.previous_actions):
-        known = age > k
-        memory[known, k] = action[place[known] - 1 - k]
+        known = np.flatnonzero(age > k)
+        memory[known, k] = action[known - 1 - k]
     return rows._replace(
         obs=with_memory(env, rows.obs, memory), next_obs=with_memory(env, rows.next_obs, remember(memory, action))
     )
@@ -232,8 +233,8 @@ def _transitions(rows: Rows, gamma: float) -> Transition:
     assert rows.reward is not None and rows.terminal is not None
     action = np.clip(kept(rows.action), -1.0, 1.0)
     discount = kept(np.where(rows.terminal, 0.0, gamma))
-    found = kept(rows.obs), action, kept(rows.reward), discount, kept(rows.next_obs)
-    return Transition(*cast(tuple[Array, ...], found))
+    columns = kept(rows.obs), action, kept(rows.reward), discount, kept(rows.next_obs)
+    return Transition(*cast(tuple[Array, ...], columns))
 
 
 def _facts(rows: Rows) -> Facts:
@@ -255,30 +256,16 @@ def _facts(rows: Rows) -> Facts:
         clipped=int(np.sum((np.abs(rows.action) > 1).any(axis=1) & keep)),
         episodes=len(returns),
         whole_episodes=whole,
-        return_mean=float(np.mean(judged)),
-        return_std=float(np.std(judged)),
-        return_min=float(np.min(judged)),
-        return_max=float(np.max(judged)),
+        **{f"return_{name}": float(getattr(np, name)(judged)) for name in ("mean", "std", "min", "max")},
         assumed=rows.assumed,
     )
-
-
-@contextmanager
-def _readable(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except FileNotFoundError:
-        raise UserError(f"{path}: no such file") from None
-    except OSError as error:  # a name that is too long, a folder that is closed
-        raise UserError(f"{path}: cannot be read ({(error.strerror or str(error)).lower()})") from None
-    except ValueError:  # a zero byte
-        raise UserError(f"{str(path)!r}: is no name of a file") from None
 
 
 def _fingerprint(source: Path) -> tuple[int, str]:
     """Bytes of a file and their SHA-256; of a folder those of its files, in the order of their names."""
     if not source.is_dir():
-        with _readable(source), open(source, "rb") as stream:
+        with readable(source), open(source, "rb") as stream:
             return source.stat().st_size, hashlib.file_digest(stream, "sha256").hexdigest()
-    each = [(path.relative_to(source).as_posix(), *_fingerprint(path)) for path in layouts.files_of(source)]
-    return sum(size for _, size, _ in each), hashlib.sha256(repr([one[::2] for one in each]).encode()).hexdigest()
+    files = [(path.relative_to(source).as_posix(), *_fingerprint(path)) for path in layouts.files_of(source)]
+    names = repr([(name, digest) for name, _, digest in files])
+    return sum(size for _, size, _ in files), hashlib.sha256(names.encode()).hexdigest()

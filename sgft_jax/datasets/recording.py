@@ -1,10 +1,9 @@
 """Impure: writes recorded episodes as D4RL and Minari HDF5 files, which `data.logs` and their own libraries read."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import h5py
 import jax
@@ -12,6 +11,7 @@ import numpy as np
 
 from envs.rollout import Episode
 from envs.types import Transition, UserError
+from sgft_jax.files.folders import written
 from sgft_jax.files.jsonfile import write_json
 from sgft_jax.io.real import Played
 
@@ -54,16 +54,6 @@ class Recorded(NamedTuple):
     success: bool | None = None
 
 
-class _Rows(NamedTuple):
-    """A `Transition` on the host."""
-
-    obs: np.ndarray
-    action: np.ndarray
-    reward: np.ndarray
-    discount: np.ndarray
-    next_obs: np.ndarray
-
-
 def of_fleet(rows: Transition, environments: int, noted: Noted | None = None) -> list[Recorded]:
     """The episodes of environments that were stepped together, in the order in which they ended.
 
@@ -73,19 +63,19 @@ def of_fleet(rows: Transition, environments: int, noted: Noted | None = None) ->
     """
     steps = len(rows.reward) // environments
     both = jax.tree.map(
-        lambda x: np.asarray(x)[: steps * environments].reshape(steps, environments, *x.shape[1:]),
-        (_Rows(*map(np.asarray, rows)), noted),
+        lambda x: np.asarray(x)[: steps * environments].reshape(steps, environments, *x.shape[1:]), (rows, noted)
     )
-    shaped = both[0]
-    jump = np.abs(shaped.next_obs[:-1] - shaped.obs[1:]) > _SAME * (1 + np.abs(shaped.obs[1:]))
+    obs, next_obs, discount = both[0].obs, both[0].next_obs, both[0].discount
+    jump = np.abs(next_obs[:-1] - obs[1:]) > _SAME * (1 + np.abs(obs[1:]))
     ended = np.ones((steps, environments), bool)
-    ended[:-1] = (shaped.discount[:-1] == 0) | jump.any(axis=2)
-    found = []
+    ended[:-1] = (discount[:-1] == 0) | jump.any(axis=2)
+    recorded = []
     for i in range(environments):
         ends = np.flatnonzero(ended[:, i])
-        for start, end in zip(np.concatenate([[0], ends[:-1] + 1]), ends, strict=True):
-            found.append((end, i, jax.tree.map(lambda x, own=slice(start, end + 1), i=i: x[own, i], both)))
-    return [_recorded(*own) for _, _, own in sorted(found, key=lambda each: each[:2])]
+        for start, end in zip(np.append(0, ends[:-1] + 1), ends, strict=True):
+            rows_of, noted_of = jax.tree.map(lambda x, start=start, end=end, i=i: x[start : end + 1, i], both)
+            recorded.append((end, i, _recorded(rows_of, noted_of)))
+    return [episode for _, _, episode in sorted(recorded, key=lambda entry: entry[:2])]
 
 
 def of_episodes(played: Episode, noted: Noted | None = None) -> list[Recorded]:
@@ -93,10 +83,9 @@ def of_episodes(played: Episode, noted: Noted | None = None) -> list[Recorded]:
 
     noted: [n, T, ...], of their rows.
     """
-    both = _Rows(*map(np.asarray, played.transitions)), jax.tree.map(np.asarray, noted)
-    valid = np.asarray(played.valid)
-    found = (jax.tree.map(lambda x, i=i: x[i][valid[i]], both) for i in range(len(valid)))
-    return [_recorded(*own) for own in found if len(own[0].reward)]
+    both, valid = jax.tree.map(np.asarray, (played.transitions, noted)), np.asarray(played.valid)
+    rows = (jax.tree.map(lambda x, i=i: x[i][valid[i]], both) for i in np.flatnonzero(valid.any(1)))
+    return [_recorded(*pair) for pair in rows]
 
 
 def of_stored(played: Sequence[Played], measured_dim: int) -> list[Recorded]:
@@ -105,45 +94,42 @@ def of_stored(played: Sequence[Played], measured_dim: int) -> list[Recorded]:
     What a policy reads beyond that, such as its last actions, follows from the episode. Episodes without a valid step
     are left out.
     """
-    found = []
-    for own in played:
-        rows = _Rows(**own.rows)
+    recorded = []
+    for episode in played:
+        rows: Any = Transition(**cast(Any, episode.rows))
         if len(rows.reward):
             rows = rows._replace(obs=rows.obs[:, :measured_dim], next_obs=rows.next_obs[:, :measured_dim])
-            found.append(_recorded(rows, None)._replace(success=own.success))
-    return found
+            recorded.append(_recorded(rows, None)._replace(success=episode.success))
+    return recorded
 
 
-def _recorded(rows: _Rows, noted: Noted | None) -> Recorded:
+def _recorded(rows: Transition, noted: Noted | None) -> Recorded:
     """The episode of its rows [T]."""
-    chained = lambda first, then: np.concatenate([first, then[-1:]]).astype(np.float32)  # noqa: E731
+
+    def chained(first: Any, then: Any) -> np.ndarray:
+        return np.concatenate([first, then[-1:]]).astype(np.float32)
+
     joints = None if noted is None else jax.tree.map(chained, noted.before, noted.after)
     log_prob = None if noted is None or noted.log_prob is None else np.asarray(noted.log_prob, np.float32)
-    return Recorded(
-        chained(rows.obs, rows.next_obs), np.asarray(rows.action, np.float32), np.asarray(rows.reward, np.float32),
-        terminated=bool(rows.discount[-1] == 0), joints=joints, log_prob=log_prob,
-    )  # fmt: skip
+    action, reward = np.asarray(rows.action, np.float32), np.asarray(rows.reward, np.float32)
+    return Recorded(chained(rows.obs, rows.next_obs), action, reward, bool(rows.discount[-1] == 0), joints, log_prob)
 
 
 def cut(episodes: Sequence[Recorded], transitions: int) -> list[Recorded]:
     """The first so many transitions; the last episode may lose its end. Raises UserError where there are fewer."""
-    found, left = [], transitions
-    for own in episodes:
-        n = min(len(own.reward), left)
-        found.append(_first(own, n))
-        left -= n
-        if not left:
-            return found
-    raise UserError(f"{transitions - left:,} transitions were recorded, {transitions:,} are wanted")
+    ends = np.cumsum([len(episode.reward) for episode in episodes])
+    if not len(ends) or ends[-1] < transitions:
+        raise UserError(f"{sum(ends[-1:]):,} transitions were recorded, {transitions:,} are wanted")
+    whole = int(np.searchsorted(ends, transitions))  # episodes before the last one
+    return [*episodes[:whole], _first(episodes[whole], transitions - sum(ends[:whole][-1:]))]
 
 
-def _first(own: Recorded, n: int) -> Recorded:
+def _first(episode: Recorded, n: int) -> Recorded:
     """The first n steps of an episode."""
-    return Recorded(
-        own.obs[: n + 1], own.action[:n], own.reward[:n], own.terminated and n == len(own.reward),
-        joints=jax.tree.map(lambda x: x[: n + 1], own.joints),
-        log_prob=None if own.log_prob is None else own.log_prob[:n],
-    )  # fmt: skip
+    joints, log_prob = jax.tree.map(lambda x: x[: n + 1], episode.joints), episode.log_prob
+    terminated = episode.terminated and n == len(episode.reward)
+    log_prob = None if log_prob is None else log_prob[:n]
+    return Recorded(episode.obs[: n + 1], episode.action[:n], episode.reward[:n], terminated, joints, log_prob)
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -155,34 +141,34 @@ def write_d4rl(path: Path, episodes: Sequence[Recorded], about: Mapping[str, str
     about: strings for `metadata/`. The file appears when it is whole.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    rows = [_flat(own) for own in episodes]
-    with _new(path) as file:
+    rows = [_flat(episode) for episode in episodes]
+    with written(path) as part, h5py.File(part, "w") as file:
         for name in rows[0]:
-            file.create_dataset(name, data=np.concatenate([own[name] for own in rows]), compression="gzip")
-        for name, said in about.items():
-            file[f"metadata/{name}"] = np.bytes_(said)
+            file.create_dataset(name, data=np.concatenate([arrays[name] for arrays in rows]), compression="gzip")
+        for name, text in about.items():
+            file[f"metadata/{name}"] = np.bytes_(text)
 
 
-def _flat(own: Recorded) -> dict[str, np.ndarray]:
+def _flat(episode: Recorded) -> dict[str, np.ndarray]:
     """The arrays [T, ...] of one episode."""
-    last = np.arange(len(own.reward)) == len(own.reward) - 1
+    last = np.arange(len(episode.reward)) == len(episode.reward) - 1
     return {
-        "observations": own.obs[:-1],
-        "actions": own.action,
-        "next_observations": own.obs[1:],
-        "rewards": own.reward,
-        "terminals": last & own.terminated,
-        "timeouts": last & (not own.terminated),
-        **{name: x[:-1] for name, x in _infos(own).items()},
+        "observations": episode.obs[:-1],
+        "actions": episode.action,
+        "next_observations": episode.obs[1:],
+        "rewards": episode.reward,
+        "terminals": last & episode.terminated,
+        "timeouts": last & (not episode.terminated),
+        **{name: x[:-1] for name, x in _infos(episode).items()},
     }
 
 
-def _infos(own: Recorded) -> dict[str, np.ndarray]:
+def _infos(episode: Recorded) -> dict[str, np.ndarray]:
     """The arrays [T + 1, ...] of one episode under D4RL's names; no action follows the last row: there it is nan."""
-    found = {} if own.joints is None else {"infos/qpos": own.joints.qpos, "infos/qvel": own.joints.qvel}
-    if own.log_prob is not None:
-        found["infos/action_log_probs"] = np.append(own.log_prob, np.float32(np.nan))
-    return found
+    infos = {} if episode.joints is None else {f"infos/{name}": x for name, x in episode.joints._asdict().items()}
+    if episode.log_prob is not None:
+        infos["infos/action_log_probs"] = np.append(episode.log_prob, np.float32(np.nan))
+    return infos
 
 
 def write_table(path: Path, episodes: Sequence[Recorded], *, scale: float) -> None:
@@ -191,13 +177,11 @@ def write_table(path: Path, episodes: Sequence[Recorded], *, scale: float) -> No
     scale: N m at an action of 1. The state in which an episode ended is a row of its own, with `done` where it fell.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    rows = [
-        np.column_stack([own.obs, np.append(scale * own.action[:, 0], 0.0), np.append(0 * own.reward, own.terminated)])
-        for own in episodes
-    ]
-    part = path.with_name(f".{path.name}.part")
-    np.savetxt(part, np.concatenate(rows), fmt="%.8g")
-    part.replace(path)
+    tables = []
+    for obs, action, reward, terminated, *_ in episodes:
+        tables.append(np.column_stack([obs, np.append(scale * action[:, 0], 0.0), np.append(0 * reward, terminated)]))
+    with written(path) as part:
+        np.savetxt(part, np.concatenate(tables), fmt="%.8g")
 
 
 def write_minari(folder: Path, episodes: Sequence[Recorded], about: Mapping[str, Any]) -> None:
@@ -208,22 +192,22 @@ def write_minari(folder: Path, episodes: Sequence[Recorded], about: Mapping[str,
     """
     data = folder / "data"
     data.mkdir(parents=True, exist_ok=True)
-    with _new(data / "main_data.hdf5") as file:
-        for number, own in enumerate(episodes):
+    with written(data / "main_data.hdf5") as part, h5py.File(part, "w") as file:
+        for number, episode in enumerate(episodes):
             group = file.create_group(f"episode_{number}")
-            group.attrs.update(id=number, total_steps=len(own.reward))
-            if own.success is not None:
-                group.attrs["success"] = own.success
-            flat = _flat(own)
-            arrays = {"observations": own.obs, "actions": own.action, "rewards": own.reward}
-            arrays |= {"terminations": flat["terminals"], "truncations": flat["timeouts"], **_infos(own)}
+            group.attrs.update(id=number, total_steps=len(episode.reward))
+            if episode.success is not None:
+                group.attrs["success"] = episode.success
+            flat = _flat(episode)
+            arrays = {"observations": episode.obs, "actions": episode.action, "rewards": episode.reward}
+            arrays |= {"terminations": flat["terminals"], "truncations": flat["timeouts"], **_infos(episode)}
             for name, values in arrays.items():
                 group.create_dataset(name, data=values, compression="gzip")
     obs, action = episodes[0].obs.shape[1], episodes[0].action.shape[1]
     facts = {
         "data_format": "hdf5",
         "total_episodes": len(episodes),
-        "total_steps": sum(len(own.reward) for own in episodes),
+        "total_steps": sum(len(episode.reward) for episode in episodes),
         "observation_space": _box(-np.inf, np.inf, obs),
         "action_space": _box(-1.0, 1.0, action),
         "dataset_id": f"sgft/{folder.name}",
@@ -236,15 +220,3 @@ def _box(low: float, high: float, size: int) -> str:
     """A Gymnasium box as Minari writes it down."""
     bounds = {"low": [low] * size, "high": [high] * size}
     return json.dumps({"type": "Box", "dtype": "float32", "shape": [size], **bounds})
-
-
-@contextmanager
-def _new(path: Path) -> Iterator[h5py.File]:
-    """A file that gets its name when it is whole."""
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with h5py.File(part, "w") as file:
-            yield file
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)

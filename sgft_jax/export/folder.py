@@ -24,6 +24,8 @@ from sgft_jax.files.jsonfile import write_json
 from sgft_jax.io import checkpoint
 from sgft_jax.types import Prior
 
+__all__ = ["save_exported"]
+
 CONTRACT, PLAYER = "contract.json", "policy.py"
 LIMIT = 1e-5  # how far an exported action may be from the trained policy's
 _CHECKED, _PLANNED = 1000, 50  # random observations that an export is played on; a plan takes longer than an action
@@ -78,8 +80,8 @@ def _difference(exported: player.Policy, prior: Prior, env: Env, n: int) -> floa
     worst = 0.0
     for episode, wanted in zip(episodes, _actions(prior, env, episodes), strict=True):
         exported.reset()
-        found = np.stack([exported.act(measured) for measured in episode])
-        worst = max(worst, float(np.abs(found - wanted).max()))
+        actions = np.stack([exported.act(measured) for measured in episode])
+        worst = max(worst, float(np.abs(actions - wanted).max()))
     return worst
 
 
@@ -93,9 +95,9 @@ def _actions(prior: Prior, env: Env, episodes: np.ndarray) -> np.ndarray:
     def play(episode: np.ndarray) -> Iterator[np.ndarray]:
         state = {slot.name: jnp.zeros(slot.shape, slot.dtype) for slot in slots}
         for measured in episode:
-            found = step({graph.MEASURED: measured, **state})
-            state = {name: found[graph.NEXT + name] for name in state}
-            yield np.asarray(found[graph.ACTION])
+            values = step({graph.MEASURED: measured, **state})
+            state = {name: values[graph.NEXT + name] for name in state}
+            yield np.asarray(values[graph.ACTION])
 
     return np.array([list(play(episode)) for episode in episodes])
 
@@ -117,13 +119,15 @@ def onnx_model(policy: Graph) -> bytes:
     """A graph as an ONNX model."""
     from onnx import TensorProto, checker, helper, numpy_helper  # pyright: ignore[reportMissingImports] - an extra
 
-    described = lambda slot: helper.make_tensor_value_info(slot.name, TensorProto.FLOAT, slot.shape)  # noqa: E731
     nodes = [
         helper.make_node(node.operator, node.inputs, [node.output], **_ATTRIBUTES.get(node.operator, {}))
         for node in policy.nodes
     ]
     constants = [numpy_helper.from_array(value, name) for name, value in policy.constants.items()]
-    inputs, outputs = ([described(slot) for slot in slots] for slots in (policy.inputs, policy.outputs))
+    inputs, outputs = (
+        [helper.make_tensor_value_info(slot.name, TensorProto.FLOAT, slot.shape) for slot in slots]
+        for slots in (policy.inputs, policy.outputs)
+    )
     whole = helper.make_graph(nodes, "policy", inputs, outputs, constants)
     model = helper.make_model(whole, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR)
     checker.check_model(model, full_check=True)
@@ -131,10 +135,10 @@ def onnx_model(policy: Graph) -> bytes:
 
 
 def _as_jax(prior: Prior, env: Env) -> dict[str, bytes]:
-    given = {slot.name: jax.ShapeDtypeStruct(slot.shape, slot.dtype) for slot in graph.slots_of(prior, env)}
-    given[graph.MEASURED] = jax.ShapeDtypeStruct((env.measured_dim,), "float32")
+    inputs = {slot.name: jax.ShapeDtypeStruct(slot.shape, slot.dtype) for slot in graph.slots_of(prior, env)}
+    inputs[graph.MEASURED] = jax.ShapeDtypeStruct((env.measured_dim,), "float32")
     step = jax.jit(graph.stepping(prior, env))
-    return {"policy.jax": bytes(jax.export.export(step, platforms=_PLATFORMS)(given).serialize())}
+    return {"policy.jax": bytes(jax.export.export(step, platforms=_PLATFORMS)(inputs).serialize())}
 
 
 _WRITERS = {"numpy": _as_numpy, "onnx": _as_onnx, "jax": _as_jax}

@@ -60,16 +60,16 @@ class Graph(NamedTuple):
 
 def slots_of(prior: Prior, env: Env) -> tuple[Slot, ...]:
     """The state of a policy: previous actions, newest first; its memory; which step it is, if it plans."""
-    found = [Slot(_PREVIOUS, (env.previous_actions * env.act_dim,), "float32")] if env.previous_actions else []
+    slots = [Slot(_PREVIOUS, (env.previous_actions * env.act_dim,), "float32")] if env.previous_actions else []
     carry = jax.tree.leaves(make_policy(prior.card, env).init_carry())
-    found += [Slot(_memory(i), leaf.shape, str(leaf.dtype)) for i, leaf in enumerate(carry)]
-    return (*found, Slot(_STEP, (), "int32")) if plans(prior.card) else tuple(found)
+    slots += [Slot(_memory(i), leaf.shape, str(leaf.dtype)) for i, leaf in enumerate(carry)]
+    return (*slots, Slot(_STEP, (), "int32")) if plans(prior.card) else tuple(slots)
 
 
 def last_action_of(prior: Prior, env: Env) -> tuple[str, ...]:
     """The parts of the state whose first numbers are the last action."""
-    own = (_memory(1),) if algorithm_of(prior.card) == "recurrent" else ()
-    return ((_PREVIOUS,) if env.previous_actions else ()) + own
+    memory = (_memory(1),) if algorithm_of(prior.card) == "recurrent" else ()
+    return ((_PREVIOUS,) if env.previous_actions else ()) + memory
 
 
 def plans(card: Mapping[str, Any]) -> bool:
@@ -90,19 +90,19 @@ def stepping(prior: Prior, env: Env) -> Callable[[dict[str, Array]], dict[str, A
     structure = jax.tree.structure(policy.init_carry())
 
     def step(inputs: dict[str, Array]) -> dict[str, Array]:
-        key, found = jax.random.key(_SEED), {}
+        key, outputs = jax.random.key(_SEED), {}
         if _STEP in inputs:
             key = jax.random.fold_in(key, inputs[_STEP])
-            found[NEXT + _STEP] = inputs[_STEP] + 1
+            outputs[NEXT + _STEP] = inputs[_STEP] + 1
         carry = jax.tree.unflatten(structure, [inputs[_memory(i)] for i in range(structure.num_leaves)])
         previous = inputs.get(_PREVIOUS, jnp.zeros(0))
         obs = jnp.concatenate([inputs[MEASURED], previous, jnp.zeros(len(env.system))])  # its own estimate counts
         with jax.default_matmul_precision("highest"):
             action, carry = policy.act(prior.params, carry, obs, key, explore=False)
         if _PREVIOUS in inputs:
-            found[NEXT + _PREVIOUS] = jnp.concatenate([action, previous])[: previous.size]
+            outputs[NEXT + _PREVIOUS] = jnp.concatenate([action, previous])[: previous.size]
         memory = {NEXT + _memory(i): leaf for i, leaf in enumerate(jax.tree.leaves(carry))}
-        return {ACTION: action, **found, **memory}
+        return {ACTION: action, **outputs, **memory}
 
     return step
 
@@ -139,8 +139,8 @@ def graph_of(prior: Prior, env: Env) -> Graph:
     network, previous = network_of(prior.card), _PREVIOUS if env.previous_actions else None
     obs = _observed(write, params, env, previous)
     if algorithm_of(prior.card) == "recurrent":
-        hidden, handed = _remembered(write, params.actor["memory"], obs)
-        action = _action(write, params.actor["head"], handed, network, env.act_dim)
+        hidden, features = _remembered(write, params.actor["memory"], obs)
+        action = _action(write, params.actor["head"], features, network, env.act_dim)
         write("Identity", hidden, to=NEXT + _memory(0))
         write("Identity", action, to=NEXT + _memory(1))
     else:
@@ -152,9 +152,9 @@ def graph_of(prior: Prior, env: Env) -> Graph:
     if previous:
         both = write("Concat", action, previous)
         write("Gather", both, np.arange(env.previous_actions * env.act_dim), to=NEXT + previous)
-    given = Slot(MEASURED, (env.measured_dim,), "float32")
+    measured = Slot(MEASURED, (env.measured_dim,), "float32")
     outputs = (Slot(ACTION, (env.act_dim,), "float32"), *(slot._replace(name=NEXT + slot.name) for slot in slots))
-    return Graph((given, *slots), write.constants, tuple(write.nodes), outputs)
+    return Graph((measured, *slots), write.constants, tuple(write.nodes), outputs)
 
 
 def _observed(write: _Writer, params: Any, env: Env, previous: str | None) -> str:
@@ -163,19 +163,19 @@ def _observed(write: _Writer, params: Any, env: Env, previous: str | None) -> st
     if (distortion := getattr(params, "distortion", None)) is not None:
         parts[0] = write("Sub", MEASURED, distortion.offset)
         if previous:
-            each, n = np.asarray(distortion.matrix), env.previous_actions
-            meant = write("MatMul", previous, np.kron(np.eye(n), each.T))
+            matrix, n = np.asarray(distortion.matrix), env.previous_actions
+            meant = write("MatMul", previous, np.kron(np.eye(n), matrix.T))
             parts[1] = write("Add", meant, np.tile(np.asarray(distortion.bias), n))
     if env.system:
-        parts.append(_told(params, env))
+        parts.append(_system(params, env))
     obs = write("Concat", *parts)
     return write("Div", write("Sub", obs, params.normalizer.mean), params.normalizer.std)
 
 
-def _told(params: Any, env: Env) -> np.ndarray:
-    """What the policy is told of the system, [k]: what was identified, or the middle of every range."""
-    found = getattr(params, "system", None)
-    return np.zeros(len(env.system)) if found is None else np.asarray(found)
+def _system(params: Any, env: Env) -> np.ndarray:
+    """What the policy reads of the system, [k]: what was identified, or the middle of every range."""
+    identified = getattr(params, "system", None)
+    return np.zeros(len(env.system)) if identified is None else np.asarray(identified)
 
 
 def _action(write: _Writer, params: PyTree, x: str, network: NetworkConfig, act_dim: int) -> str:
@@ -204,12 +204,15 @@ def _dense(write: _Writer, params: PyTree, x: str) -> str:
 def _remembered(write: _Writer, params: PyTree, obs: str) -> tuple[str, str]:
     """The next state of the GRU, and what it hands on; see `sgft_jax.models.gru`."""
     units = params["recurrent"]["kernel"].shape[0]
-    third = lambda x, i: write("Gather", x, np.arange(i * units, (i + 1) * units))  # noqa: E731
+
+    def third(x: str, i: int) -> str:
+        return write("Gather", x, np.arange(i * units, (i + 1) * units))
+
     seen = [write("Relu", _dense(write, params[name], x)) for name, x in (("action", _memory(1)), ("obs", obs))]
     read = _dense(write, params["inputs"], write("Concat", *seen))
-    own = _dense(write, params["recurrent"], _memory(0))
-    reset, keep = (write("Sigmoid", write("Add", third(read, i), third(own, i))) for i in (0, 1))
-    new = write("Tanh", write("Add", third(read, 2), write("Mul", reset, third(own, 2))))
+    before = _dense(write, params["recurrent"], _memory(0))
+    reset, keep = (write("Sigmoid", write("Add", third(read, i), third(before, i))) for i in (0, 1))
+    new = write("Tanh", write("Add", third(read, 2), write("Mul", reset, third(before, 2))))
     hidden = write("Add", new, write("Mul", keep, write("Sub", _memory(0), new)))
     return hidden, write("Concat", hidden, write("Relu", _dense(write, params["shortcut"], obs)))
 
@@ -230,7 +233,7 @@ def contract(prior: Prior, env: Env, to: Format) -> dict[str, Any]:
     origin = {name: card[name] for name in ("preset", "finetuned", "hybrid") if name in card}
     distortion = getattr(params, "distortion", None)
     identified = None if distortion is None else {k: np.asarray(x) for k, x in distortion._asdict().items()}
-    told = [{**v._asdict(), "value": x} for v, x in zip(env.system, _told(params, env), strict=True)]
+    system = [{**v._asdict(), "value": x} for v, x in zip(env.system, _system(params, env), strict=True)]
     return {
         "format": 1,
         "to": to,
@@ -243,7 +246,7 @@ def contract(prior: Prior, env: Env, to: Format) -> dict[str, Any]:
         "action_is": _PLAN if plans(card) else _MODE,
         "inside": {
             "previous_actions": env.previous_actions,
-            "system": told,
+            "system": system,
             "normalisation": {name: np.asarray(x) for name, x in params.normalizer._asdict().items()},
             "identified": identified,
         },

@@ -11,8 +11,9 @@ onnxruntime for policy.onnx; JAX for policy.jax.
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Callable  # noqa: UP035 - as Python 3.9 spells it
+from typing import Any
 
 import numpy as np
 
@@ -31,7 +32,7 @@ class Policy:
         home = Path(__file__).parent if folder is None else Path(folder)
         try:
             self.contract = json.loads((home / "contract.json").read_text(encoding="utf-8"))
-            self._names, self._commands = (_each(self.contract[kind]) for kind in ("observation", "action"))
+            self._names, self._commands = (_names(self.contract[kind]) for kind in ("observation", "action"))
             self._corrected, opener = list(self.contract["last_action"]), _OPENERS[self.contract["to"]]
             self.reset()
         except (KeyError, TypeError, ValueError, RecursionError) as error:
@@ -55,14 +56,14 @@ class Policy:
         if sent is not None:
             sent = numbers(sent, self._commands, "an action has {} numbers", largest=1 + _BEYOND)
             state = {**state, **{name: np.concatenate([sent, state[name][len(sent) :]]) for name in self._corrected}}
-        found = self._step({"measured": measured, **state})
-        action, state = np.asarray(found["action"]), {name: found["next_" + name] for name in self._state}
+        values = self._step({"measured": measured, **state})
+        action, state = np.asarray(values["action"]), {name: values["next_" + name] for name in self._state}
         check_answer(action, *state.values())
         self._state = state
         return action
 
 
-def _each(entries: list) -> list[str]:
+def _names(entries: list) -> list[str]:
     """The name of every number."""
     return [f"{e['name']}[{i}]" for e in entries for i in range(e["size"])]
 
@@ -77,7 +78,7 @@ def numbers(values: Any, names: list[str], wanted: str, *, largest: float = LARG
         raise ValueError(f"{wanted.format(len(names))}, got shape {array.shape}")
     if array.dtype.kind not in "biuf":
         raise ValueError(f"{wanted.format(len(names))}, got {array.dtype.name}")
-    for name, value in zip(names, array):  # noqa: B905 - new in 3.10
+    for name, value in zip(names, array):
         if not np.isfinite(value):
             raise ValueError(f"{name} is not a finite number")
         if abs(value) > largest:
@@ -134,7 +135,7 @@ def _open_onnx(home: Path) -> Step:
 
     session = onnxruntime.InferenceSession(str(home / "policy.onnx"), providers=["CPUExecutionProvider"])
     outputs = [output.name for output in session.get_outputs()]
-    return lambda inputs: dict(zip(outputs, session.run(outputs, inputs)))  # noqa: B905 - new in 3.10
+    return lambda inputs: dict(zip(outputs, session.run(outputs, inputs)))
 
 
 def _open_jax(home: Path) -> Step:

@@ -5,7 +5,8 @@
 
 import math
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -27,15 +28,14 @@ def numbers(
     valid: bool, of the first axes: the rows that count; default: all. Like all others, whole numbers beyond 2^24 are
     rounded to what float32 can hold.
     """
-    array = _of_kind(where, name, values, "biuf", "numbers", fix)
-    _check_shape(where, name, array, shape, fix)
+    array = _array(where, name, values, "numbers", shape, fix)
     with np.errstate(over="ignore"):
         cast = array.astype(np.float32)
     good = np.abs(cast) <= LARGEST  # nan is not
     if valid is not None:
         good |= ~valid.reshape(*valid.shape, *[1] * (cast.ndim - valid.ndim))
-    if not good.all():
-        place = tuple(int(i) for i in np.argwhere(~good)[0])
+    if len(odd := np.argwhere(~good)):
+        place = tuple(odd[0])
         wrong = "is too large for float32" if np.isfinite(array[place]) else "is not finite"
         raise UserError(f"{where}: {name}{_of_row(place)} {wrong}; {fix}")
     return cast
@@ -43,10 +43,9 @@ def numbers(
 
 def flags(where: Path | str, name: str, values: Any, shape: Sequence[int | None], *, fix: str) -> np.ndarray:
     """[*shape] bool, from truth values or from numbers that are 0 or 1 and nothing else."""
-    array = _of_kind(where, name, values, "biuf", "0 or 1", fix)
-    _check_shape(where, name, array, shape, fix)
-    if not (good := (array == 0) | (array == 1)).all():
-        place = tuple(int(i) for i in np.argwhere(~good)[0])
+    array = _array(where, name, values, "0 or 1", shape, fix)
+    if len(odd := np.argwhere((array != 0) & (array != 1))):
+        place = tuple(odd[0])
         raise UserError(f"{where}: {name}{_of_row(place)} is {array[place]:g}, not 0 or 1; {fix}")
     return array.astype(bool)
 
@@ -59,18 +58,29 @@ def check_claim(where: Path | str, claimed: int, stored: int) -> None:
 
 def read_npz(path: Path) -> dict[str, np.ndarray]:
     """The plain arrays of an .npz file, by name; sizes are checked before memory is taken for them."""
+    check_plain(path)
+    with damage(path, "put back what was written"), zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        check_claim(path, sum(member.file_size for member in members), path.stat().st_size)
+        return {member.filename.removesuffix(".npy"): _read_member(archive, member) for member in members}
+
+
+def check_plain(path: Path) -> None:
+    """Raises UserError for what is no plain file."""
     if not path.is_file():
         raise UserError(f"{path}: {'is no plain file' if path.exists() else 'no such file'}")
+
+
+@contextmanager
+def damage(path: Path, fix: str = "supply a whole file") -> Iterator[None]:
+    """Around a library that reads a file; raises UserError for the dozen types that it may raise for a damaged one."""
     try:
-        with zipfile.ZipFile(path) as archive:
-            check_claim(path, sum(member.file_size for member in archive.infolist()), path.stat().st_size)
-            return {
-                member.filename.removesuffix(".npy"): _read_member(archive, member) for member in archive.infolist()
-            }
+        yield
     except UserError:
         raise
-    except Exception as error:  # zipfile, zlib and NumPy raise half a dozen types for a damaged archive
-        raise UserError(f"{path}: damaged: {str(error) or type(error).__name__}") from error
+    except Exception as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0].strip("'\"")
+        raise UserError(f"{path}: damaged or cut off ({reason}); {fix}") from error
 
 
 def _read_member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
@@ -91,21 +101,18 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype]:
     return shape, dtype
 
 
-def _of_kind(where: Path | str, name: str, values: Any, kinds: str, wanted: str, fix: str) -> np.ndarray:
+def _array(where: Path | str, name: str, values: Any, wanted: str, shape: Sequence[int | None], fix: str) -> np.ndarray:
+    """Numbers or truth values of a shape, in the type that they came in."""
     try:
         array = np.asarray(values)
     except (TypeError, ValueError):  # rows of different lengths
         raise UserError(f"{where}: {name} holds rows of different lengths; {fix}") from None
-    if array.dtype.kind not in kinds:
+    if array.dtype.kind not in "biuf":
         raise UserError(f"{where}: {name} holds {array.dtype.name}, not {wanted}; {fix}")
+    if len(shape) != array.ndim or any(n not in (None, size) for n, size in zip(shape, array.shape, strict=True)):
+        sizes = ", ".join("n" if n is None else str(n) for n in shape)
+        raise UserError(f"{where}: {name} has shape {list(array.shape)}, not [{sizes}]; {fix}")
     return array
-
-
-def _check_shape(where: Path | str, name: str, array: np.ndarray, shape: Sequence[int | None], fix: str) -> None:
-    fits = len(shape) == array.ndim and all(n is None or n == size for n, size in zip(shape, array.shape, strict=True))
-    if not fits:
-        wanted = ", ".join("n" if n is None else str(n) for n in shape)
-        raise UserError(f"{where}: {name} has shape {list(array.shape)}, not [{wanted}]; {fix}")
 
 
 def _of_row(place: tuple[int, ...]) -> str:

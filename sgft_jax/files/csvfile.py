@@ -11,6 +11,7 @@ from typing import Any
 
 from envs.files import decoded, read_bytes
 from envs.types import UserError
+from sgft_jax.files.folders import written
 
 _LIMIT = 2**30  # bytes
 _LARGEST = 2**53
@@ -31,7 +32,8 @@ def write_csv(path: Path, names: Sequence[str], rows: Iterable[Mapping[str, str]
     writer.writeheader()
     writer.writerows(rows)
     content = text.getvalue().encode()
-    path.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
+    with written(path) as part:
+        part.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
 
 
 def read_csv(path: Path, *, needed: Sequence[str] = ()) -> list[dict[str, str]]:

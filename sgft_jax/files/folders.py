@@ -1,4 +1,4 @@
-"""Impure: folders that one process writes at a time, and that take the place of others whole. Imports no JAX."""
+"""Impure: files and folders that appear whole, and folders that one process writes at a time. Imports no JAX."""
 
 import contextlib
 import fcntl
@@ -53,6 +53,33 @@ def empty(folder: Path, *, last: str = "") -> None:
             shutil.rmtree(path)
         elif path.name != _LOCK:
             path.unlink()
+
+
+@contextlib.contextmanager
+def written(path: Path, part: Path | None = None) -> Iterator[Path]:
+    """Give a path to write a file to, which then takes the place of `path`, flushed to disk.
+
+    A process killed at any moment leaves the old file or the new one, and perhaps a part; an error leaves the old one.
+    part: where to write, by default hidden beside `path`.
+    """
+    part = part or path.with_name(NEW + path.name)
+    try:
+        yield part
+        sync(part)
+        part.replace(path)
+        sync(path.parent)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+def sync(path: Path) -> None:
+    """Flush a file to disk, or of a folder the names in it, so that they survive a power cut."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def part_of(folder: Path) -> Path:

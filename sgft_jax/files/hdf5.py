@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 
 from envs.types import UserError
-from sgft_jax.files.arrays import check_claim
+from sgft_jax.files.arrays import check_claim, check_plain, damage
 
 # Codes of HDF5's own filters: shuffle and checksums; deflate, szip, n-bit, scale-offset, and h5py's LZF.
 _REORDERING, _PACKING = {2, 3}, {1, 4, 5, 6, 32000}
@@ -31,12 +31,12 @@ class Reader:
 
     def names(self) -> list[str]:
         """What lies in the root."""
-        with _damage(self.path):
+        with damage(self.path):
             return sorted(self.content)
 
     def has(self, group: h5py.Group | None, name: str) -> bool:
         """Whether something has that name in a group, None for the root."""
-        with _damage(self.path):
+        with damage(self.path):
             return (self.content if group is None else group).id.links.exists(name.encode())
 
     def group(self, name: str) -> h5py.Group | None:
@@ -50,7 +50,7 @@ class Reader:
         name = str(data.name)
         if not isinstance(data, h5py.Dataset):
             raise UserError(f"{self.path}: {name} is a group; only vectors are read, so flatten it before recording")
-        with _damage(self.path):
+        with damage(self.path):
             shape: tuple[int, ...] | None = data.shape  # None: an empty data set
             kind = data.dtype
             fits = shape is not None and (len(shape) == rank or (rank == 1 and shape[1:] == (1,)))
@@ -64,7 +64,7 @@ class Reader:
 
     def attribute(self, group: h5py.Group, name: str) -> int | None:
         """A whole number beside a group; None where there is none."""
-        with _damage(self.path):
+        with damage(self.path):
             value = np.asarray(group.attrs[name]) if name in group.attrs else None
         if value is not None and (value.shape != () or value.dtype.kind not in "iu"):
             raise UserError(f"{self.path}: {name} of {group.name} is no whole number; supply a whole file")
@@ -72,9 +72,9 @@ class Reader:
 
     def _member(self, group: h5py.Group, name: str) -> Any:
         """What lies in the file under that name; a link is not followed."""
-        with _damage(self.path):
+        with damage(self.path):
             if not self.has(group, name):
-                names = [shown if shown.isprintable() else repr(shown) for shown in sorted(group)]
+                names = [member if member.isprintable() else repr(member) for member in sorted(group)]
                 others = ", ".join(names[:_SHOWN]) + ", ..." * (len(names) > _SHOWN) or "nothing"
                 raise UserError(
                     f"{self.path}: there is no {name!r} in {group.name}, only {others}; supply a D4RL or Minari file"
@@ -105,23 +105,10 @@ _COPY = "copy the numbers into the file, such as with h5repack"
 @contextmanager
 def opened(path: Path) -> Iterator[Reader]:
     """A plain file; raises UserError for what is none, or no HDF5."""
-    if not path.is_file():
-        raise UserError(f"{path}: {'is no plain file' if path.exists() else 'no such file'}")
+    check_plain(path)
     if not h5py.is_hdf5(path):
         raise UserError(f"{path}: is not an HDF5 file; supply the .hdf5 of D4RL or of Minari")
-    with _damage(path):
+    with damage(path):
         content = h5py.File(path, "r")
     with content:
         yield Reader(path, content)
-
-
-@contextmanager
-def _damage(path: Path) -> Iterator[None]:
-    """Around calls of h5py, which raises half a dozen types for a damaged file."""
-    try:
-        yield
-    except UserError:
-        raise
-    except Exception as error:
-        message = (str(error).splitlines() or [type(error).__name__])[0].strip("'\"")
-        raise UserError(f"{path}: damaged or cut off ({message}); supply a whole file") from error

@@ -1,16 +1,16 @@
 """Impure: writes small JSON files, atomically and without the numbers that JSON does not know; `envs.files` reads."""
 
 import dataclasses
+import itertools
 import json
 import math
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sgft_jax.files.folders import NEW
+from sgft_jax.files.folders import written
 
 
 def jsonable(value: Any) -> Any:
@@ -49,24 +49,14 @@ def _widened(array: np.ndarray) -> np.ndarray:
 def write_json(path: Path, value: Any) -> None:
     """Write `value` under a temporary name, flush it to disk, rename it to `path`."""
     text = json.dumps(jsonable(value), indent=1, allow_nan=False) + "\n"
-    path = Path(path)
-    temporary = path.with_name(NEW + path.name)
-    try:
-        with open(temporary, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with written(Path(path)) as part:
+        part.write_text(text, encoding="utf-8")
 
 
 def differences(old: Any, new: Any, *, name: str = "") -> list[tuple[str, Any, Any]]:
     """(dotted name, old, new) of every leaf that differs between two pieces of JSON data."""
     if isinstance(old, dict) and isinstance(new, dict):
-        found: list[tuple[str, Any, Any]] = []
-        for key in [*old, *(k for k in new if k not in old)]:
-            found += differences(old.get(key), new.get(key), name=f"{name}.{key}" if name else key)
-        return found
+        keys = dict.fromkeys([*old, *new])
+        inner = (differences(old.get(key), new.get(key), name=f"{name}.{key}" if name else key) for key in keys)
+        return list(itertools.chain.from_iterable(inner))
     return [] if old == new else [(name, old, new)]

@@ -117,10 +117,10 @@ def read_card(folder: Path) -> dict[str, Any]:
     if algorithm not in _SCHEMAS:
         raise UserError(f"{path} says algorithm={algorithm!r}, which this version does not know; {_FIX}")
     checked(path, card, _SCHEMAS[algorithm], _FIX)
-    told = card.get("system", [])
-    if odd := [entry["name"] for entry in told if not entry["low"] < entry["high"]]:
+    system = card.get("system", [])
+    if odd := [entry["name"] for entry in system if not entry["low"] < entry["high"]]:
         raise UserError(f"{path}: the range of {odd[0]!r} in system is empty; {_FIX}")
-    if card.get("previous_actions", 0) * card["act_dim"] + len(told) >= card["obs_dim"]:
+    if card.get("previous_actions", 0) * card["act_dim"] + len(system) >= card["obs_dim"]:
         raise UserError(f"{path}: obs_dim={card['obs_dim']} leaves no measurement beside what it says; {_FIX}")
     return card
 

@@ -29,9 +29,10 @@ from envs import files, mesh
 from envs.files import Count
 from envs.types import PyTree, UserError
 from sgft_jax.files import folders
+from sgft_jax.files.arrays import damage
 from sgft_jax.files.jsonfile import jsonable, write_json
 
-FORMAT = 1
+FORMAT = 1  # of checkpoints and priors, see docs/design.md
 MANIFEST = "manifest.json"
 _CHECKPOINTS, _STATE = "checkpoints", "state"
 _MARK = "commit_success.txt"
@@ -167,10 +168,9 @@ def _prune(root: Path, *, newest: int, keep: int) -> None:
 
 
 def _is_complete(where: Path) -> bool:
-    try:
+    with contextlib.suppress(UserError):
         return bool(read_manifest(where))
-    except UserError:
-        return False
+    return False
 
 
 def _steps(root: Path) -> set[int]:
@@ -226,7 +226,10 @@ def read_manifest(where: Path) -> dict[str, Any]:
     except UserError:
         raise UserError(f"{where}: torn: {MANIFEST} is not readable") from None
     if manifest["format"] != FORMAT:
-        raise UserError(f"{where}: written in format {manifest['format']}, this version reads format {FORMAT}")
+        raise UserError(
+            f"{where}: written in format {manifest['format']}, this version reads format {FORMAT} alone; begin again, "
+            "or use the version that wrote it"
+        )
     files.checked(where / MANIFEST, manifest, _Manifest, _FIX)
     for name, (size, _) in manifest["files"].items():
         file = where / name
@@ -252,7 +255,7 @@ def read_leaves(where: Path, manifest: Mapping[str, Any]) -> list[Any]:
     """The arrays in order. What is stored must be what the manifest says, which is known before numbers are read."""
     impls, leaves = manifest["key_impls"], leaves_of(manifest)
     wanted = {_slot(i): _stored(where, leaf, impls.get(_slot(i))) for i, leaf in enumerate(leaves)}
-    stored = _load(where, {slot: one for slot, one in wanted.items() if one.size})
+    stored = _load(where, {slot: array for slot, array in wanted.items() if array.size})
     return [_from_numpy(leaf, stored.get(_slot(i)), impls.get(_slot(i))) for i, leaf in enumerate(leaves)]
 
 
@@ -275,26 +278,20 @@ def _load(where: Path, wanted: Mapping[str, jax.ShapeDtypeStruct]) -> dict[str, 
     """The arrays that Orbax has stored; raises UserError, before memory is taken, where they are not those wanted."""
     if not wanted:
         return {}
-    stored = _with_orbax(where, lambda state: {slot: _claim(one) for slot, one in ocp.metadata(state).metadata.items()})
-    for slot in sorted({*wanted, *stored}):
-        expected = (wanted[slot].shape, str(wanted[slot].dtype)) if slot in wanted else None
-        if stored.get(slot) != expected:
-            raise UserError(f"{where}: {MANIFEST} and {_STATE} differ in {slot}: {expected} and {stored.get(slot)}")
-    return _with_orbax(where, ocp.load)
+    expected = {slot: (array.shape, str(array.dtype)) for slot, array in wanted.items()}
+    with damage(where / _STATE, _FIX):
+        state = str((where / _STATE).absolute())
+        stored = {slot: _claim(about) for slot, about in ocp.metadata(state).metadata.items()}
+        if odd := sorted(slot for slot in {*expected, *stored} if stored.get(slot) != expected.get(slot)):
+            differing = f"{odd[0]}: {expected.get(odd[0])} and {stored.get(odd[0])}"
+            raise UserError(f"{where}: {MANIFEST} and {_STATE} differ in {differing}")
+        return ocp.load(state)
 
 
 def _claim(about: Any) -> tuple[tuple[int, ...], str] | None:
     """Shape and type of a stored array; None where its pieces are larger than the whole."""
     pieces = about.storage_metadata.chunk_shape
     return None if math.prod(pieces) > math.prod(about.shape) else (tuple(about.shape), str(about.dtype))
-
-
-def _with_orbax[T](where: Path, read: Callable[[str], T]) -> T:
-    try:
-        return read(str((where / _STATE).absolute()))
-    except Exception as error:  # dozens of types, for whatever is wrong with a file
-        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise UserError(f"{where}: Orbax cannot read it: {reason}") from error
 
 
 def leaves_of(manifest: Mapping[str, Any]) -> list[Leaf]:

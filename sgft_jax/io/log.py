@@ -10,6 +10,7 @@ import numpy as np
 
 from envs.files import checked, kind_of, parse_json, read_text
 from envs.types import UserError
+from sgft_jax.files.folders import sync
 from sgft_jax.files.jsonfile import jsonable, write_json
 
 METRICS, EVAL, SUMMARY = "metrics.jsonl", "eval.jsonl", "summary.json"
@@ -68,8 +69,7 @@ class MetricsLog:
         for name in (METRICS, EVAL):
             path = self._folder / name
             if path.exists():
-                with open(path, "rb") as file:
-                    os.fsync(file.fileno())
+                sync(path)
             sizes[name] = path.stat().st_size if path.exists() else 0
         return sizes
 
@@ -88,7 +88,7 @@ class MetricsLog:
         """Flush and close the TensorBoard writer; the log can still be appended to."""
         if self._writer is not None:
             self._writer.close()
-            self._writer = None
+        self._writer = None
 
     def _append(self, name: str, step: int, values: Mapping[str, Any], *, prefix: str) -> None:
         record = {"step": int(step), **jsonable(values)}

@@ -42,13 +42,13 @@ class RunProgress:
     ) -> None:
         if self._live is not None:
             self._live.stop()
-            self._live = None
+        self._live = None
 
     def advance(self, amount: int, info: Mapping[str, float] | None = None) -> None:
         """Count `amount` more units; `info` is shown behind them, by name."""
         self._done += amount
-        said = [f"{name} {value:.3g}" for name, value in (info or {}).items()]
-        words = "  ".join([", ".join([self._counts(), *self._speed(amount)]), *said])
+        values = [f"{name} {value:.3g}" for name, value in (info or {}).items()]
+        words = "  ".join([", ".join([self._counts(), *self._speed(amount)]), *values])
         if self._live is not None:
             self._live.update(self._live.task_ids[0], completed=self._done, words=words)
         else:

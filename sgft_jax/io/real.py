@@ -13,6 +13,7 @@ import numpy as np
 from envs.files import read_text
 from envs.types import UserError
 from sgft_jax.files.arrays import flags, numbers, read_npz
+from sgft_jax.files.folders import sync, written
 
 _REAL, _ROLLOUT, _HALF, _STEPS = "real", "rollout-", ".half", ".steps.jsonl"
 _ROWS = ("obs", "action", "reward", "discount", "next_obs")
@@ -45,13 +46,8 @@ class RealStore:
             raise TypeError(f"a rollout holds plain numeric arrays only, not {unfit}")
         number = len(self)
         path = self._path(number)
-        half = path.with_suffix(_HALF)
-        with open(half, "wb") as file:
+        with written(path, path.with_suffix(_HALF)) as half, open(half, "wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        half.rename(path)
-        _sync_folder(self.folder)
         return number
 
     def load(self, number: int) -> dict[str, np.ndarray]:
@@ -120,7 +116,7 @@ class Journal:
     def __enter__(self) -> "Journal":
         """Opens the file before the robot moves: that takes longer than a step."""
         self._file = open(self.path, "w")
-        _sync_folder(self.path.parent)
+        sync(self.path.parent)
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -194,28 +190,21 @@ def _checked(path: Path, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]
         raise UserError(f"{path}: has no step; {_FIX}")
     if (valid[:, 1:] & ~valid[:, :-1]).any():
         raise UserError(f"{path}: valid goes on after a step that is not valid, which ends an episode; {_FIX}")
-    vector, number, before = (n, steps, None), (n, steps), np.pad(valid, ((0, 0), (0, 1)))
-    rows = {
-        "obs": vector,
-        "action": vector,
-        "next_obs": vector,
-        "command": vector,
-        "reward": number,
-        "discount": number,
-    }
+    shapes = dict.fromkeys(("obs", "action", "next_obs", "command"), (n, steps, None))
+    shapes |= {"reward": (n, steps), "discount": (n, steps), "trace": (n, steps + 1, None)}
     beside = {"total_reward": (n,), "score": (n,), "world": (n,), "late": (n, None), "time": (n, None)}
+    # Which numbers count; of an episode that exploded those beside its rows may be anything.
+    counts = {"trace": np.pad(valid, ((0, 0), (0, 1))), **dict.fromkeys(beside, np.zeros((), bool))}
     read = dict(arrays, valid=valid)
     for name in {"success", "exploded"} & set(arrays):
         read[name] = flags(path, name, arrays[name], (n,), fix=_FIX)
-    for name in rows.keys() & arrays.keys():
-        read[name] = numbers(path, name, arrays[name], rows[name], fix=_FIX, valid=valid)
+    for name, shape in {**shapes, **beside}.items():
+        if name in arrays:
+            values = numbers(path, name, arrays[name], shape, fix=_FIX, valid=counts.get(name, valid))
+            read[name] = arrays[name] if name in counts else values
     for name, other in (("next_obs", "obs"), ("command", "action")):
         if name in read and read[name].shape != read[other].shape:
             raise UserError(f"{path}: {name} has {read[name].shape[2]} entries, {other} {read[other].shape[2]}; {_FIX}")
-    for name in beside.keys() & arrays.keys():  # of an episode that exploded they may be anything
-        numbers(path, name, arrays[name], beside[name], fix=_FIX, valid=np.zeros((), bool))
-    if "trace" in arrays:
-        numbers(path, "trace", arrays["trace"], (n, steps + 1, None), fix=_FIX, valid=before)
     if "world" in arrays and (arrays["world"].dtype.kind not in "iu" or (arrays["world"] < 0).any()):
         raise UserError(f"{path}: world is {arrays['world'].tolist()}, no numbers of worlds; {_FIX}")
     if ((discount := read["discount"][valid]) < 0).any() or (discount > 1).any():
@@ -240,12 +229,3 @@ def _of_seed(arrays: Mapping[str, np.ndarray], seed: int, number: int) -> Played
     world = int(arrays["world"][seed]) if "world" in arrays else 0
     trace = arrays["trace"][seed] if "trace" in arrays else np.zeros((len(valid) + 1, 0))
     return Played(seed, number, rows, command, bool(arrays["success"][seed]), world, trace)
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make a rename in `folder` survive a power cut."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

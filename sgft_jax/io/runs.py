@@ -92,21 +92,21 @@ def open_runs(
     inputs = inputs or {}
     for folder in configs:
         say(f"run folder: {folder}")
-    existing = [check_start(folder, resume=resume, overwrite=overwrite) for folder in configs]
+    begun = [check_start(folder, resume=resume, overwrite=overwrite) for folder in configs]
     runs: list[Run] = []
     try:
-        for (folder, config), there in zip(configs.items(), existing, strict=True):
+        for (folder, config), earlier in zip(configs.items(), begun, strict=True):
             folder.mkdir(parents=True, exist_ok=True)
-            runs.append(Run(folder, resumed=there and resume, lock=Lock(folder)))
-            if there and resume:
+            runs.append(Run(folder, resumed=earlier and resume, lock=Lock(folder)))
+            if earlier and resume:
                 check_same(folder, kind, config, volatile)
                 _check_inputs(folder, inputs)
     except UserError:
         for run in runs:
             run.close()  # the traceback would keep the locks alive
         raise
-    for run, config, there in zip(runs, configs.values(), existing, strict=True):
-        if there and not resume:
+    for run, config, earlier in zip(runs, configs.values(), begun, strict=True):
+        if earlier and not resume:
             empty(run.folder, last=CONFIG)
         _record(run, kind, config, inputs)
     return runs
@@ -134,10 +134,10 @@ def plain_path(word: str, bases: Sequence[Path]) -> str:
     An absolute path, alone or behind `option=`, becomes relative to the first of the folders `bases` that it lies in;
     of one that lies in none `.../` and the last name are left. Everything else stays as it is.
     """
-    found = re.fullmatch(r"([\w.-]+=)?(~?/.*)", word, re.DOTALL)
-    if found is None:
+    absolute = re.fullmatch(r"([\w.-]+=)?(~?/.*)", word, re.DOTALL)
+    if absolute is None:
         return word
-    option, path = found[1] or "", Path(found[2])
+    option, path = absolute[1] or "", Path(absolute[2])
     inside = [path.relative_to(base) for base in bases if path.is_relative_to(base)]
     return option + (str(inside[0]) if inside else f".../{path.name}")
 
@@ -190,18 +190,15 @@ def check_start(folder: Path, *, resume: bool, overwrite: bool) -> bool:
 def check_folder(folder: Path, option: str = "--out") -> None:
     """Raises UserError, which names the option, where no folder can be made or written; makes nothing itself."""
     try:
-        there = next(path for path in (folder, *folder.absolute().parents) if path.is_symlink() or path.exists())
-        if not there.exists():
-            raise UserError(f"{folder}: cannot be made, {there} is a link that leads nowhere; choose another {option}")
+        base = next(path for path in (folder, *folder.absolute().parents) if path.is_symlink() or path.exists())
+        kind = "" if base.is_dir() else "a file" if base.exists() else "a link that leads nowhere"
     except OSError as error:  # such as a name that is too long
-        raise UserError(
-            f"{folder}: cannot be made ({(error.strerror or '').lower()}); choose another {option}"
-        ) from error
-    if not there.is_dir():
-        what = "a file" if there.exists() else "a link that leads nowhere"
-        raise UserError(f"{folder}: cannot be made, {there} is {what}; choose another {option}")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise UserError(f"{folder}: cannot be written, you may not write to {there}; choose another {option}")
+        reason = (error.strerror or "").lower()
+        raise UserError(f"{folder}: cannot be made ({reason}); choose another {option}") from error
+    if kind:
+        raise UserError(f"{folder}: cannot be made, {base} is {kind}; choose another {option}")
+    if not os.access(base, os.W_OK | os.X_OK):
+        raise UserError(f"{folder}: cannot be written, you may not write to {base}; choose another {option}")
 
 
 def read_own(path: Path, needed: Schema | None = None, *, otherwise: str = "") -> dict[str, Any]:
@@ -263,14 +260,14 @@ def check_same(folder: Path, kind: str, wanted: Mapping[str, Any], volatile: tup
     wanted: JSON data. volatile: dotted names that may differ.
     """
     stored = _stored(folder)
-    if (found := stored.get("format", 1)) != FORMAT:
+    if (saved := stored.get("format", 1)) != FORMAT:
         raise UserError(
-            f"{folder}: is a run of sgft_jax {stored[_MARK]} in format {found}; this version continues format {FORMAT} "
+            f"{folder}: is a run of sgft_jax {stored[_MARK]} in format {saved}; this version continues format {FORMAT} "
             "alone. Begin again with --overwrite"
         )
     if stored["kind"] != kind:
         raise UserError(f"{folder}: is a {stored['kind']} run, not a {kind} run")
-    differing = [d for d in differences(stored["config"], wanted) if d[0] not in volatile]
-    if differing:
-        listed = "; ".join(f"{name} was {old!r}, now {new!r}" for name, old, new in differing)
+    changes = [change for change in differences(stored["config"], wanted) if change[0] not in volatile]
+    if changes:
+        listed = "; ".join(f"{name} was {old!r}, now {new!r}" for name, old, new in changes)
         raise UserError(f"{folder}: cannot resume with another configuration: {listed}")

@@ -44,8 +44,8 @@ def rank_correlation(pairs: ArrayLike, *, axis: int = 0) -> np.ndarray:
 
     ranks = stats.rankdata(np.asarray(pairs, np.float64), axis=axis)
     centred = ranks - ranks.mean(axis=axis, keepdims=True)
-    own, other = (np.square(centred[..., i]).sum(axis) for i in (0, 1))
-    return np.prod(centred, axis=-1).sum(axis) / np.maximum(np.sqrt(own * other), 1e-9)
+    first, second = (np.square(centred[..., i]).sum(axis) for i in (0, 1))
+    return np.prod(centred, axis=-1).sum(axis) / np.maximum(np.sqrt(first * second), 1e-9)
 
 
 def bootstrap_interval(
@@ -107,8 +107,8 @@ def probability_of_improvement(above: ArrayLike, below: ArrayLike) -> float:
     above, below = np.asarray(above, np.float64), np.asarray(below, np.float64)
     from scipy import stats
 
-    found: Any = stats.mannwhitneyu(above, below, method="asymptotic")
-    return float(found.statistic) / (len(above) * len(below))
+    test: Any = stats.mannwhitneyu(above, below, method="asymptotic")
+    return float(test.statistic) / (len(above) * len(below))
 
 
 def paired_improvement(
@@ -121,8 +121,8 @@ def paired_improvement(
     """
     above, below, above_priors, below_priors = map(np.asarray, (above, below, above_priors, below_priors))
     shared = np.intersect1d(above_priors, below_priors)
-    each = [probability_of_improvement(above[above_priors == p], below[below_priors == p]) for p in shared]
-    return bootstrap_interval(each, statistic=mean)
+    of_priors = [probability_of_improvement(above[above_priors == p], below[below_priors == p]) for p in shared]
+    return bootstrap_interval(of_priors, statistic=mean)
 
 
 def success_interval(

@@ -6,6 +6,8 @@ from typing import Literal, get_args
 from envs.types import UserError, unknown
 from sgft_jax import checks
 
+__all__ = ["NetworkConfig"]
+
 type Precision = Literal["default", "float32", "bfloat16"]
 Activation = Literal["relu", "tanh", "silu", "elu"]
 

@@ -20,6 +20,8 @@ from sgft_jax.models import normalizer
 from sgft_jax.models.networks import MLP, Network, NetworkConfig
 from sgft_jax.types import Batch, Metrics, Normalizer
 
+__all__ = ["RatioConfig"]
+
 REAL, SIM = 0, 1  # the two logits of a discriminator
 
 

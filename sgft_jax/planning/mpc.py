@@ -4,6 +4,7 @@ The paper plans in the latent space of TD-MPC2 (`tdmpc2.py`). A prior of SAC has
 observations: an ensemble of models, the task's reward, V_sim, and a policy that proposes.
 """
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -25,6 +26,8 @@ from sgft_jax.models.networks import (
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.planning import mppi
 from sgft_jax.types import Normalizer
+
+__all__ = ["MPCConfig"]
 
 _ITERATIONS = 3  # of the search: half of TD-MPC2's, for plans a quarter as long
 _PROPOSALS, _ELITES = 4, 8  # one of so many samples is the policy's, and an elite
@@ -102,16 +105,17 @@ def make_act(
         members = jax.tree.leaves(params.dynamics)[0].shape[0]
 
         def step(carry: tuple[Array, Array, Array], action: Array) -> tuple[tuple[Array, Array, Array], None]:
-            now, discount, total = carry  # each of every member: [members, obs_dim], [members], [members]
-            then = dynamics.predict_each(model, params.dynamics, params.normalizer, now, action)
-            ask = lambda question: jax.vmap(question, (0, None, 0))(now, action, then)  # noqa: E731
-            goes_on = config.gamma * (1.0 - ask(terminated).astype(jnp.float32))
-            return (then, discount * goes_on, total + discount * ask(reward)), None
+            obs, discount, total = carry  # of every member: [members, obs_dim], [members], [members]
+            next_obs = dynamics.predict_each(model, params.dynamics, params.normalizer, obs, action)
+            moved = obs, action, next_obs
+            goes_on = config.gamma * (1.0 - jax.vmap(terminated, (0, None, 0))(*moved).astype(jnp.float32))
+            earned = discount * jax.vmap(reward, (0, None, 0))(*moved)
+            return (next_obs, discount * goes_on, total + earned), None
 
         start = (jnp.tile(obs, (members, 1)), jnp.ones(members), jnp.zeros(members))
         (end, discount, total), _ = jax.lax.scan(step, start, sequence)
-        left = jax.vmap(lambda obs: value.predict(value_net, params.value, params.normalizer, obs))(end)
-        return jnp.mean(total + discount * left)
+        to_go = jax.vmap(lambda obs: value.predict(value_net, params.value, params.normalizer, obs))(end)
+        return jnp.mean(total + discount * to_go)
 
     def propose(params: PlanningParams, member: PyTree, obs: Array, key: Key) -> Array:
         """[H, act_dim]: the policy with noise, followed by one member of the ensemble."""
@@ -132,7 +136,7 @@ def make_act(
         member = dynamics.draw_member(params.dynamics, key_member)
         keys = jax.random.split(key_propose, config.samples // _PROPOSALS)
         proposals = jax.vmap(lambda key: propose(params, member, obs, key))(keys)
-        rate = lambda sequence: score(params, obs, sequence)  # noqa: E731
+        rate = functools.partial(score, params, obs)
         return mppi.plan(search, _SEARCH, rate, proposals, carry, key_search, explore=explore)
 
     return act

@@ -96,9 +96,9 @@ def plan(
         elites=jnp.zeros((config.elites, *previous.shape)),
         logits=jnp.zeros(config.elites),
     )
-    found, _ = jax.lax.scan(refine, start, jax.random.split(key_search, config.iterations))
-    action = found.elites[jax.random.categorical(key_pick, found.logits), 0]
-    return add_noise(action, jnp.where(explore, found.std[0], 0.0), key_noise), found.mean
+    end, _ = jax.lax.scan(refine, start, jax.random.split(key_search, config.iterations))
+    action = end.elites[jax.random.categorical(key_pick, end.logits), 0]
+    return add_noise(action, jnp.where(explore, end.std[0], 0.0), key_noise), end.mean
 
 
 def _fit(elites: Array, logits: Array, hyper: MPPIHyper) -> _Search:

@@ -19,20 +19,21 @@ _ROUNDING = 1e-4  # by which, as a share of the half range, what was sent may li
 
 
 class Answer(NamedTuple):
-    """One environment's answer to a step.
+    """One environment's answer to a step, or those of several, see `stacked`.
 
-    obs: as it came. reward: nan where it does not know it. success: None where it does not tell. sent: [act_dim] what
-    was really commanded, in its units; None where that is what was asked for.
+    obs: as it came. reward: float, nan where it does not know it. terminated, truncated, invalid, late: bool. success:
+    bool, None where it does not tell. sent: [act_dim] what was really commanded, in its units; None where that is what
+    was asked for.
     """
 
     obs: Any
-    reward: float
-    terminated: bool
-    truncated: bool
-    success: bool | None
-    invalid: bool
-    late: bool
-    sent: np.ndarray | None
+    reward: Any
+    terminated: Any
+    truncated: Any
+    success: Any
+    invalid: Any
+    late: Any
+    sent: Any
 
 
 def idle(obs: Any) -> Answer:
@@ -54,10 +55,24 @@ def step(name: str, returned: tuple[Any, ...], low: np.ndarray, high: np.ndarray
     obs, reward, terminated, truncated, info = returned
     with _explained(f"step of {name}"):
         info = _mapping(info)
-        return Answer(
-            obs, number(reward, "reward"), flag(terminated, "terminated"), flag(truncated, "truncated"),
-            success_of(info), _told(info, "invalid"), _told(info, "late"), _sent(info.get("sent"), low, high),
-        )  # fmt: skip
+        ends = number(reward, "reward"), flag(terminated, "terminated"), flag(truncated, "truncated")
+        facts = success_of(info), _flag(info, "invalid"), _flag(info, "late"), _sent(info.get("sent"), low, high)
+        return Answer(obs, *ends, *facts)
+
+
+def stacked(steps: Sequence[Answer], act_dim: int) -> Answer:
+    """The answers of M environments as arrays [M, ...], `obs` as M of them; what is None is -1 in `success`, else nan.
+
+    reward: float32. success: int8.
+    """
+    obs, reward, terminated, truncated, success, invalid, late, sent = zip(*steps, strict=True)
+    with np.errstate(over="ignore"):  # beyond float32 is as good as not finite
+        reward = np.array(reward, np.float32)
+    success = np.array([-1 if known is None else known for known in success], np.int8)
+    sent = np.stack([np.full(act_dim, np.nan) if known is None else known for known in sent])
+    return Answer(
+        obs, reward, np.array(terminated), np.array(truncated), success, np.array(invalid), np.array(late), sent
+    )
 
 
 def vector(name: str, returned: tuple[Any, ...], count: int, *, same_step: bool) -> list[tuple[Any, ...]]:
@@ -70,12 +85,12 @@ def vector(name: str, returned: tuple[Any, ...], count: int, *, same_step: bool)
         infos = [_of_member(_mapping(info), i, count, _KNOWN) for i in range(count)]
         names = _PARTS["step"][1:-1]
         rows = list(zip(*(_column(x, count, part) for x, part in zip(columns, names, strict=True)), strict=True))
-        for (_, terminated, truncated), own in zip(rows, infos, strict=True):
-            if same_step and "final_obs" not in own and (flag(terminated, names[1]) or flag(truncated, names[2])):
+        for (_, terminated, truncated), facts in zip(rows, infos, strict=True):
+            if same_step and "final_obs" not in facts and (flag(terminated, names[1]) or flag(truncated, names[2])):
                 raise ValueError("an episode has ended, but info has no 'final_obs' of it, only the next one's start")
-    last = [own.get("final_obs", seen) for own, seen in zip(infos, split(name, "step", obs, count), strict=True)]
     return [
-        (seen, *row, {**own, **own.get("final_info", {})}) for seen, row, own in zip(last, rows, infos, strict=True)
+        (facts.get("final_obs", seen), *row, {**facts, **facts.get("final_info", {})})
+        for seen, row, facts in zip(split(name, "step", obs, count), rows, infos, strict=True)
     ]
 
 
@@ -108,7 +123,7 @@ def _mapping(info: Any, name: str = "info") -> Mapping[str, Any]:
     return info or {}
 
 
-def _told(info: Mapping[str, Any], name: str) -> bool:
+def _flag(info: Mapping[str, Any], name: str) -> bool:
     return info.get(name) is not None and flag(info[name], f"info[{name!r}]")
 
 
@@ -137,18 +152,18 @@ def _column(values: Any, count: int, name: str) -> Sequence[Any]:
 
 def _of_member(infos: Mapping[str, Any], i: int, count: int, names: Sequence[str]) -> dict[str, Any]:
     """The `info` of environment i. Beside an entry may stand for which environments it is there."""
-    found = {}
+    info = {}
     for name in (name for name in names if name in infos):
-        values, there = infos[name], infos.get(f"_{name}", [True] * count)
-        if not flag(_column(there, count, f"info['_{name}']")[i], f"info['_{name}']"):
+        values, present = infos[name], infos.get(f"_{name}", [True] * count)
+        if not flag(_column(present, count, f"info['_{name}']")[i], f"info['_{name}']"):
             continue
         if isinstance(values, Mapping):
             inner = [part for part in values if f"_{part}" in values] if name == "final_obs" else _KNOWN
-            found[name] = _of_member(values, i, count, inner)
+            info[name] = _of_member(values, i, count, inner)
         else:
             value = _column(values, count, f"info[{name!r}]")[i]
-            found[name] = _mapping(value, f"info[{name!r}]") if name == "final_info" else value
-    return found
+            info[name] = _mapping(value, f"info[{name!r}]") if name == "final_info" else value
+    return info
 
 
 @contextmanager

@@ -80,14 +80,14 @@ def bound(host: str, port: int) -> socket.socket:
         raise UserError(f"port {port!r}: ports go from 1 to 65535, 0 chooses a free one")
     check_host(host)
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    one = socket.socket(family, socket.SOCK_STREAM)
+    listener = socket.socket(family, socket.SOCK_STREAM)
     try:
-        one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        one.bind((host, port))
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind((host, port))
     except (OSError, UnicodeError) as error:
-        one.close()
+        listener.close()
         raise _taken(host, port, error) from None
-    return one
+    return listener
 
 
 def check_host(host: str) -> None:

@@ -2,11 +2,10 @@
 
 import contextlib
 import functools
-import itertools
 import statistics
 import time
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +25,8 @@ if TYPE_CHECKING:
     import gymnasium
 
     from sgft_jax.systems.remote import Remote
+
+__all__ = ["Gymnasium"]
 
 _TRIES = 20  # actions that are timed before a robot with a clock moves
 _STARTS, _PAUSE = 4, 0.5  # times that a start is asked for until all its numbers are finite, and seconds in between
@@ -55,9 +56,16 @@ class Step(NamedTuple):
     late: np.ndarray
     time: np.ndarray
 
+    @classmethod
+    def begun(cls, obs: np.ndarray, command: np.ndarray, over: np.ndarray, when: np.ndarray) -> "Step":
+        """A step of the members whose episode is not `over` before it. Nobody knows whether it was made."""
+        no, reward, unknown = np.zeros(len(obs), bool), np.zeros(len(obs), np.float32), np.full(len(obs), -1, np.int8)
+        outcome = reward, no, np.zeros_like(obs), no, unknown, ~over, ~no, no, when
+        return cls(obs, np.zeros_like(command), command, *outcome)
+
     def in_doubt(self) -> "Step":
         """The step after this one, of which nobody knows whether it was made, or what came of it."""
-        return _in_doubt(np.zeros_like(self.obs), np.zeros_like(self.command), self.over, np.zeros_like(self.time))
+        return self.begun(np.zeros_like(self.obs), np.zeros_like(self.command), self.over, np.zeros_like(self.time))
 
 
 class Gymnasium:
@@ -88,7 +96,7 @@ class Gymnasium:
         gamma: float,
         observe: Observe | None = None,
     ) -> None:
-        self.env, self.gamma = env, gamma
+        self.env, self.pools, self.gamma = env, None, gamma
         self._real = _played(real)
         self._observe = extend.guard("observe of", self._real.name, observe or _reader(env.measured, self._real))
         self._low, self._high = low, high = _bounds(env, self._real)
@@ -115,9 +123,8 @@ class Gymnasium:
         return jax.tree.map(lambda *x: jnp.stack(x, axis=1), *played)
 
     def steps(
-        self, policy: Any, states: PyTree, keys: Key, *, explore: bool,
-        asked: Callable[[Step], None] = lambda step: None,
-    ) -> Generator[Step]:  # fmt: skip
+        self, policy: Any, states: PyTree, keys: Key, *, explore: bool, asked: Callable[[Step], None] | None = None
+    ) -> Generator[Step]:
         """One episode of every member, step by step as it happens. keys: [M]. The rest: see `play`.
 
         asked: hears of the first step before an environment does: what the policy saw and wants, the rest in doubt.
@@ -125,8 +132,9 @@ class Gymnasium:
         """
         env, members, latest = self.env, len(keys), states if callable(states) else lambda: states
         if members != self._real.count:
-            given = self._real.count
-            raise UserError(f"{self._real.name}: {given} for {members} members; give one environment for each seed")
+            raise UserError(
+                f"{self._real.name}: {self._real.count} for {members} members; give one environment for each seed"
+            )
         seeds, act_keys = self._draw(keys)
         carry = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *jnp.shape(x))), policy.init_carry())
         actions = np.zeros((members, env.previous_actions, env.act_dim), np.float32)
@@ -143,19 +151,19 @@ class Gymnasium:
                 wanted = np.asarray(wanted)
                 asks = np.isfinite(wanted).all(1)
                 command = np.where(asks[:, None], wanted, np.float32(0))
-                if t == 0:
-                    asked(_in_doubt(seen, command, ~going, np.full(members, time.time())))
-                after = self._after(self._commanded(command), going & asks)
-                action = self._sent(command, after)
+                step = Step.begun(seen, command, ~going, np.full(members, time.time()))
+                if asked is not None and t == 0:
+                    asked(step)
+                commanded = self._commanded(command)
+                answer = self._answered(commanded, going & asks)
+                action = self._sent(command, commanded, answer.sent)
                 actions = remember(actions, action)
-                following = with_memory(env, self._measured("step", after.obs), actions)
-                judged = self._judged(after, seen, action, following)
-                step = _step(going, asks, seen, command, action, judged, following)
+                following = with_memory(env, self._measured("step", answer.obs), actions)
+                step = _outcome(step, asks, action, self._judged(answer, seen, action, following), following)
                 yield step
-                going = ~step.over
+                going, seen = ~step.over, following
                 if not going.any():
                     return
-                seen = following
         finally:
             self._real.rest()
 
@@ -164,20 +172,21 @@ class Gymnasium:
         env, made = self.env, list(steps)
         rows = Step(*(_padded(np.stack(x, axis=1), env.episode_length) for x in zip(*made, strict=True)))
         valid = jnp.asarray(rows.valid)
-        kept = lambda x: jnp.where(valid.reshape(*valid.shape, *[1] * (x.ndim - 2)), x, 0)  # noqa: E731
-        transitions = Transition(
-            kept(rows.obs), kept(rows.action), kept(rows.reward),
-            jnp.where(valid, self.gamma * (1 - rows.terminated), 0.0), kept(rows.next_obs),
-        )  # fmt: skip
-        succeeded, exploded = jnp.asarray(self._success(rows)), jnp.asarray(rows.invalid.any(1))
-        total = transitions.reward.sum(1)
+
+        def kept(x: np.ndarray) -> Array:
+            return jnp.where(valid.reshape(*valid.shape, *[1] * (x.ndim - 2)), x, 0)
+
+        discount = jnp.where(valid, self.gamma * (1 - rows.terminated), 0.0)
+        transitions = Transition(kept(rows.obs), kept(rows.action), kept(rows.reward), discount, kept(rows.next_obs))
+        exploded = jnp.asarray(rows.invalid.any(1))
+        success, total = jnp.asarray(self._success(rows)) & ~exploded, transitions.reward.sum(1)
         return Episode(
-            transitions=transitions,
-            valid=valid,
-            total_reward=total,
-            success=succeeded & ~exploded,
-            exploded=exploded,
-            score=judged(env, total, succeeded & ~exploded, exploded),
+            transitions,
+            valid,
+            total,
+            success,
+            exploded,
+            score=judged(env, total, success, exploded),
             world=jnp.zeros(len(valid), jnp.int32),
             trace=jnp.zeros((len(valid), env.episode_length + 1, 0)),
             command=kept(rows.command),
@@ -203,13 +212,11 @@ class Gymnasium:
     def _program(self, policy: Any) -> Callable[..., tuple[Array, PyTree]]:
         """The action of all members at a step, one compiled program."""
         if policy.act not in self._programs:
-
-            def act(
-                state: PyTree, carry: PyTree, obs: Array, keys: Key, t: Array, explore: Array
-            ) -> tuple[Array, PyTree]:
-                return policy.act(state, carry, obs, keys[t], explore=explore)
-
-            self._programs[policy.act] = jax.jit(split_vmap(act, (0, 0, 0, 0, None, None)))
+            act = split_vmap(
+                lambda state, carry, obs, keys, t, explore: policy.act(state, carry, obs, keys[t], explore=explore),
+                (0, 0, 0, 0, None, None),
+            )
+            self._programs[policy.act] = jax.jit(act)
         return self._programs[policy.act]
 
     def _drawn(self, key: Key) -> tuple[Array, Key]:
@@ -220,75 +227,73 @@ class Gymnasium:
 
     def _started(self, seeds: list[int]) -> np.ndarray:
         """[M, measured_dim] at the start of an episode. A camera may need a moment until it sees."""
-        for tries in itertools.count(1):
-            seen = self._measured("reset", self._real.reset(seeds))
-            if (sound := answers.sound(seen)).all():
-                return seen
+        tries = 1
+        while not (sound := answers.sound(seen := self._measured("reset", self._real.reset(seeds)))).all():
             if tries == _STARTS:
                 number = int(np.argwhere(~sound)[0, 1])
                 raise UserError(
                     f"reset of {self._real.name}: measured number {number} is {seen[~sound][0]:g} after {tries} tries; "
                     "no episode can begin there"
                 )
+            tries += 1
             time.sleep(_PAUSE)
-        raise AssertionError
+        return seen
 
     def _commanded(self, action: np.ndarray) -> np.ndarray:
         """[M, act_dim] from [-1, 1] to the bounds of the action space."""
         commanded = self._middle + np.clip(action, -1, 1) * self._half
         return np.clip(np.rint(commanded), self._low, self._high) if self._whole else commanded
 
-    def _after(self, commanded: np.ndarray, going: np.ndarray) -> "_After":
-        """What a step leads to. commanded: [M, act_dim]. going: [M], the members that take it."""
+    def _answered(self, commanded: np.ndarray, going: np.ndarray) -> Answer:
+        """What a step leads to, `answers.stacked`. commanded: [M, act_dim]. going: [M], the members that take it."""
         shape, dtype = self._real.action.shape, self._real.action.dtype
         returned = self._real.step(commanded.reshape(-1, *shape).astype(dtype), going)
-        checked = [
-            answers.step(self._real.name, one, self._low, self._high) if on else answers.idle(one[0])
-            for one, on in zip(returned, going, strict=True)
+        steps = [
+            answers.step(self._real.name, parts, self._low, self._high) if on else answers.idle(parts[0])
+            for parts, on in zip(returned, going, strict=True)
         ]
-        sent = [one.sent if one.sent is not None else asked for one, asked in zip(checked, commanded, strict=True)]
-        return _After.of(checked, np.stack(sent))
+        return answers.stacked(steps, commanded.shape[1])
 
-    def _sent(self, action: np.ndarray, after: "_After") -> np.ndarray:
+    def _sent(self, action: np.ndarray, commanded: np.ndarray, sent: np.ndarray) -> np.ndarray:
         """[M, act_dim] in [-1, 1], what was really commanded; what was asked for unless that is known to differ."""
-        told = (after.sent - self._middle) / self._half
-        return np.where(after.differs[:, None] | self._whole, told, np.clip(action, -1, 1)).astype(np.float32)
+        unknown = np.isnan(sent)
+        exact = (np.where(unknown, commanded, sent) - self._middle) / self._half
+        return np.where(~unknown | self._whole, exact, np.clip(action, -1, 1)).astype(np.float32)
 
-    def _judged(self, after: "_After", seen: np.ndarray, action: np.ndarray, following: np.ndarray) -> "_After":
+    def _judged(self, answer: Answer, seen: np.ndarray, action: np.ndarray, following: np.ndarray) -> Answer:
         """With what the task says of steps whose reward the environment does not know."""
-        unknown = np.isnan(after.reward) & ~after.invalid
+        unknown = np.isnan(answer.reward) & ~answer.invalid
         if not unknown.any():
-            return after
+            return answer
         if self._judge is None:
             raise UserError(
                 f"{self._real.name}: does not know its reward, and {self.env.name} has none of what is observed"
             )
         reward, terminated = (np.asarray(x) for x in self._judge(seen, action, following))
-        return after._replace(
-            reward=np.where(unknown, reward, after.reward), terminated=np.where(unknown, terminated, after.terminated)
-        )
+        terminated = np.where(unknown, terminated, answer.terminated)
+        return answer._replace(reward=np.where(unknown, reward, answer.reward), terminated=terminated)
 
     def _measured(self, method: str, returned: Sequence[Any]) -> np.ndarray:
         """[M, measured_dim] of what a method of every environment has returned."""
         where, sizes = f"{method} of {self._real.name}", f"the task {self.env.name} measures {_sizes(self.env)}"
         size = self.env.measured_dim
-        return np.stack([answers.measured(where, self._observe(one), size, sizes) for one in returned])
+        return np.stack([answers.measured(where, self._observe(obs), size, sizes) for obs in returned])
 
     def _success(self, rows: Step) -> np.ndarray:
         """[M] bool, of the last step, or of any where that is what the task asks."""
         if (rows.success >= 0).any():
-            each = rows.success > 0
+            success = rows.success > 0
         elif self._succeeds is not None:
-            each = np.asarray(self._succeeds(rows.next_obs)) & rows.valid
+            success = np.asarray(self._succeeds(rows.next_obs)) & rows.valid
         elif self.env.score == "success" and rows.valid.any():
             raise UserError(
                 f"{self._real.name}: nothing tells success, by which {self.env.name} is judged: `info` has no "
                 f"{' and no '.join(SUCCESS)}, and the task no function of observations; add one to `info`"
             )
         else:
-            each = np.zeros_like(rows.valid)
+            success = np.zeros_like(rows.valid)
         last = np.maximum(rows.valid.sum(1) - 1, 0)
-        return each.any(1) if self.env.success_anytime else each[np.arange(len(last)), last]
+        return success.any(1) if self.env.success_anytime else success[np.arange(len(last)), last]
 
 
 def seed_of(key: Key) -> Array:
@@ -299,52 +304,14 @@ def seed_of(key: Key) -> Array:
 # --- steps ------------------------------------------------------------------------------------------------------------
 
 
-class _After(NamedTuple):
-    """What a step of M environments led to, see `Answer`. obs: M of what they return. differs: [M], known from them."""
-
-    obs: Sequence[Any]
-    reward: np.ndarray
-    terminated: np.ndarray
-    truncated: np.ndarray
-    success: np.ndarray
-    invalid: np.ndarray
-    late: np.ndarray
-    sent: np.ndarray
-    differs: np.ndarray
-
-    @classmethod
-    def of(cls, checked: Sequence[Answer], sent: np.ndarray) -> "_After":
-        """sent: [M, act_dim] what was commanded, in their units."""
-        obs, reward, terminated, truncated, success, invalid, late, told = zip(*checked, strict=True)
-        with np.errstate(over="ignore"):  # beyond float32 is as good as not finite
-            rewards = np.array(reward, np.float32)
-        return cls(
-            obs, rewards, np.array(terminated), np.array(truncated),
-            np.array([-1 if known is None else known for known in success], np.int8), np.array(invalid),
-            np.array(late), sent, np.array([own is not None for own in told]),
-        )  # fmt: skip
-
-
-def _step(
-    going: np.ndarray, asks: np.ndarray, seen: np.ndarray, command: np.ndarray, action: np.ndarray, after: _After,
-    following: np.ndarray,
-) -> Step:  # fmt: skip
-    """The step of the members that are `going` [M]; of those a policy `asks` [M] nothing of, no step was made."""
-    bad = ~asks | ~answers.sound(following).all(1) | ~answers.sound(after.reward) | after.invalid
-    return Step(
-        seen, action, command, after.reward, after.terminated, following, going & ~bad,
-        np.where(going & ~bad, after.success, np.int8(-1)), going & bad,
-        ~going | bad | after.terminated | after.truncated, going & after.late, np.full(len(going), time.time()),
-    )  # fmt: skip
-
-
-def _in_doubt(seen: np.ndarray, command: np.ndarray, over: np.ndarray, when: np.ndarray) -> Step:
-    """A step of the members whose episode is not `over` [M] before it, of which nobody knows whether it was made."""
-    no, zero = np.zeros(len(seen), bool), np.zeros(len(seen), np.float32)
-    return Step(
-        seen, np.zeros_like(command), command, zero, no, np.zeros_like(seen), no, np.full(len(seen), -1, np.int8),
-        ~over, ~no, no, when,
-    )  # fmt: skip
+def _outcome(begun: Step, asks: np.ndarray, action: np.ndarray, answer: Answer, following: np.ndarray) -> Step:
+    """What came of a step, see `answers.stacked`; of members of which a policy `asks` [M] nothing none was made."""
+    going, when = begun.invalid, np.full(len(asks), time.time())
+    bad = ~asks | ~answers.sound(following).all(1) | ~answers.sound(answer.reward) | answer.invalid
+    valid, over = going & ~bad, ~going | bad | answer.terminated | answer.truncated
+    success = np.where(valid, answer.success, np.int8(-1))
+    facts = valid, success, going & bad, over, going & answer.late, when
+    return Step(begun.obs, action, begun.command, answer.reward, answer.terminated, following, *facts)
 
 
 def _padded(rows: np.ndarray, length: int) -> np.ndarray:
@@ -362,73 +329,47 @@ def _seconds(act: Callable[[], Any]) -> float:
 # --- environments -----------------------------------------------------------------------------------------------------
 
 
-class _Real(Protocol):
-    """M environments that are reset and stepped together."""
+class _Separate:
+    """Environments, one for each member. Those whose episode is over are left alone."""
 
-    name: str
-    count: int
-    observation: Any
-    action: Any
-
-    @property
-    def answer_within(self) -> float | None:
-        """Seconds that a robot with a clock waits for a command. It is known once an episode has begun."""
-        ...
-
-    def reset(self, seeds: list[int]) -> Sequence[Any]:
-        """What each one returns at its start."""
-        ...
-
-    def step(self, actions: np.ndarray, going: np.ndarray) -> Sequence[tuple[Any, ...]]:
-        """Five parts from each one. actions: [M, *shape of an action]. going: [M]; the others may stay as they are."""
-        ...
-
-    def rest(self) -> None:
-        """No step follows before the next reset."""
-        ...
-
-    def close(self, *, over: bool) -> None:
-        """The end, or, where it is not over, one on this side."""
-        ...
-
-
-class _Each:
-    """Environments of their own. Those whose episode is over are left alone."""
-
-    def __init__(self, each: "Sequence[gymnasium.Env]") -> None:
-        if not each:
+    def __init__(self, real: "Sequence[gymnasium.Env]") -> None:
+        if not real:
             raise UserError("no environment is given; make one for each seed")
-        first = each[0]
-        self.each, self.count, self.name = each, len(each), str(first.spec.id if first.spec else first.unwrapped)
+        first: Any = real[0]
+        self.real, self.count, self.name = real, len(real), str(first.spec.id if first.spec else first.unwrapped)
         self.observation, self.action = first.observation_space, first.action_space
-        if len({id(one) for one in each}) < len(each):
+        if len(set(map(id, real))) < len(real):
             raise UserError(f"{self.name}: the same environment is given twice; make one for each seed")
-        if any((one.observation_space, one.action_space) != (self.observation, self.action) for one in each[1:]):
-            raise UserError(f"{self.name}: the spaces of its {len(each)} environments differ; make them alike")
+        if any((env.observation_space, env.action_space) != (self.observation, self.action) for env in real):
+            raise UserError(f"{self.name}: the spaces of its {len(real)} environments differ; make them alike")
         self._obs: Sequence[Any] = []
 
     @property
     def answer_within(self) -> float | None:
-        return getattr(self.each[0], "answer_within", None)
+        """Seconds that a robot with a clock waits for a command. It is known once an episode has begun."""
+        return getattr(self.real[0], "answer_within", None)
 
     def reset(self, seeds: list[int]) -> Sequence[Any]:
-        each = zip(self.each, seeds, strict=True)
-        self._obs = [_asked(self.name, one, "reset", seed=seed)[0] for one, seed in each]
+        """What each environment returns at its start."""
+        self._obs = [_call(self.name, env, "reset", seed=s)[0] for env, s in zip(self.real, seeds, strict=True)]
         return self._obs
 
     def step(self, actions: np.ndarray, going: np.ndarray) -> Sequence[tuple[Any, ...]]:
+        """Five parts from each. actions: [M, *shape of an action]. going: [M]; the others may stay as they are."""
         returned = [
-            _asked(self.name, one, "step", action) if on else (obs, 0.0, True, False, {})
-            for one, action, on, obs in zip(self.each, actions, going, self._obs, strict=True)
+            _call(self.name, env, "step", action) if on else (obs, 0.0, True, False, {})
+            for env, action, on, obs in zip(self.real, actions, going, self._obs, strict=True)
         ]
-        self._obs = [one[0] for one in returned]
+        self._obs = [parts[0] for parts in returned]
         return returned
 
     def rest(self) -> None:
-        self._end("rest", [getattr(one, "rest", _nothing) for one in self.each])
+        """No step follows before the next reset."""
+        self._end("rest", [getattr(env, "rest", _nothing) for env in self.real])
 
     def close(self, *, over: bool) -> None:
-        self._end("close", [getattr(one, "close" if over else "leave", one.close) for one in self.each])
+        """The end, or, where it is not over, one on this side."""
+        self._end("close", [getattr(env, "close" if over else "leave", env.close) for env in self.real])
 
     def _end(self, method: str, endings: Sequence[Callable[[], None]]) -> None:
         """All of them, also where one raises."""
@@ -438,27 +379,27 @@ class _Each:
 
 
 class _Vector:
-    """A vector environment, in either way of beginning episodes anew by itself."""
+    """The same of a vector environment, in either way of beginning episodes anew by itself."""
 
     answer_within = None
 
     def __init__(self, real: "gymnasium.vector.VectorEnv") -> None:
         self.real: Any = real  # Gymnasium's stub knows no list of seeds
         self.count, self.name = real.num_envs, str(real.spec.id if real.spec else real)
-        self.observation, self.action = real.single_observation_space, real.single_action_space
-        mode = real.metadata.get("autoreset_mode")
-        self._same_step = getattr(mode, "name", None) == "SAME_STEP"
-        if getattr(mode, "name", None) not in ("NEXT_STEP", "SAME_STEP"):
+        self.observation, self.action = self.real.single_observation_space, self.real.single_action_space
+        mode = getattr(shown := real.metadata.get("autoreset_mode"), "name", None)
+        self._same_step = mode == "SAME_STEP"
+        if mode not in ("NEXT_STEP", "SAME_STEP"):
             raise UserError(
-                f"{self.name}: its autoreset mode is {mode}; make it with AutoresetMode.NEXT_STEP, or give a list of "
+                f"{self.name}: its autoreset mode is {shown}; make it with AutoresetMode.NEXT_STEP, or give a list of "
                 "environments"
             )
 
     def reset(self, seeds: list[int]) -> list[Any]:
-        return answers.split(self.name, "reset", _asked(self.name, self.real, "reset", seed=seeds)[0], self.count)
+        return answers.split(self.name, "reset", _call(self.name, self.real, "reset", seed=seeds)[0], self.count)
 
     def step(self, actions: np.ndarray, going: np.ndarray) -> list[tuple[Any, ...]]:
-        returned = _asked(self.name, self.real, "step", actions)
+        returned = _call(self.name, self.real, "step", actions)
         return answers.vector(self.name, returned, self.count, same_step=self._same_step)
 
     def rest(self) -> None:
@@ -468,23 +409,24 @@ class _Vector:
         self.real.close()
 
 
-def _asked(name: str, real: Any, method: str, *given: Any, **named: Any) -> tuple[Any, ...]:
+def _call(name: str, real: Any, method: str, *args: Any, **options: Any) -> tuple[Any, ...]:
     """What an environment returns; raises UserError, which says where, if it raises or returns other parts."""
-    ask = extend.guard(f"{method} of", name, functools.partial(getattr(real, method), *given, **named))
-    return answers.parts(name, method, ask())
+    call = extend.guard(f"{method} of", name, functools.partial(getattr(real, method), *args, **options))
+    return answers.parts(name, method, call())
 
 
 def _nothing() -> None:
     """What most environments do between episodes."""
 
 
+_Real = _Separate | _Vector
+
+
 def _played(real: Any) -> _Real:
-    for one in real if isinstance(real, Sequence) else [real]:
-        if isinstance(one, type) or not hasattr(one, "step"):
-            raise UserError(f"{one!r} is no Gymnasium environment")
-    if isinstance(real, Sequence):
-        return _Each(real)
-    return _Vector(real) if hasattr(real, "num_envs") else _Each([real])
+    several = real if isinstance(real, Sequence) else [real]
+    if unfit := [env for env in several if isinstance(env, type) or not hasattr(env, "step")]:
+        raise UserError(f"{unfit[0]!r} is no Gymnasium environment")
+    return _Vector(several[0]) if hasattr(real, "num_envs") else _Separate(several)
 
 
 # --- spaces -----------------------------------------------------------------------------------------------------------
@@ -513,9 +455,9 @@ def _reader(measured: tuple[Entry, ...], real: _Real) -> Observe:
     parts, help_ = getattr(real.observation, "spaces", None), "pass observe= to map them"
     sizes = {e.name: e.size for e in measured}
     if isinstance(parts, Mapping):
-        found = {name: int(np.prod(space.shape)) if space.shape is not None else 0 for name, space in parts.items()}
-        if found != sizes:
-            raise UserError(f"{real.name}: observes {found}, the task measures {sizes}; {help_}")
+        seen = {name: int(np.prod(space.shape)) if space.shape is not None else 0 for name, space in parts.items()}
+        if seen != sizes:
+            raise UserError(f"{real.name}: observes {seen}, the task measures {sizes}; {help_}")
         return functools.partial(_joined, real.name, sizes)
     if not hasattr(real.observation, "low"):
         raise UserError(f"{real.name}: observes {real.observation}, neither a Box nor a Dict of them; {help_}")
@@ -528,10 +470,8 @@ def _joined(name: str, sizes: Mapping[str, int], obs: Any) -> np.ndarray:
     """The parts of a Dict, one after another."""
     if not isinstance(obs, Mapping):
         raise UserError(f"{name}: observes a {type(obs).__name__}, not a mapping with {', '.join(sizes)}")
-    return np.concatenate([
-        answers.measured(f"{part} of {name}", obs.get(part), size, f"its space has {size}")
-        for part, size in sizes.items()
-    ])  # fmt: skip
+    parts = ((f"{part} of {name}", obs.get(part), size) for part, size in sizes.items())
+    return np.concatenate([answers.measured(where, part, size, f"its space has {size}") for where, part, size in parts])
 
 
 def _sizes(env: Env) -> str:

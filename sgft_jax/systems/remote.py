@@ -28,6 +28,8 @@ from sgft_jax.systems.door import Door, url
 from sgft_jax.systems.messages import Began, Failed, Hello, Message, Moved, Rested, VersionError, read
 from sgft_jax.systems.robot_client import LIMIT, array, pack, printable
 
+__all__ = ["Remote"]
+
 _HELLO = 10.0  # seconds for the first message
 _RESTS = 5  # times a robot is told to rest before it is left alone: without commands it stops by itself
 _FAILURES = 5  # episodes in a row in which a driver fails before its first step is done; then it is not asked again
@@ -36,6 +38,7 @@ _SAY_EVERY = 10.0  # seconds between two lines about refused connections, and ab
 _LINE, _NAME = 600, 40  # letters of a line, and of a robot's name, at most
 _WAITING = 64  # answers that nobody has asked for yet; more are lost, and asked for again
 _ROUNDING = 1e-6
+_SERVER: dict[str, Any] = {"max_size": LIMIT, "max_queue": 16, "compression": None, "open_timeout": _HELLO}
 
 
 class _Gone:
@@ -116,10 +119,19 @@ class Remote:
     """
 
     def __init__(
-        self, obs_size: int, action_size: int, *, period: float | None = None, steps: int | None = None,
-        host: str = "127.0.0.1", port: int = 0, token: str | None = None, token_in: str = "the attribute `token`",
-        again: float = 1.0, say: Callable[[str], None] = print,
-    ) -> None:  # fmt: skip
+        self,
+        obs_size: int,
+        action_size: int,
+        *,
+        period: float | None = None,
+        steps: int | None = None,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        token: str | None = None,
+        token_in: str = "the attribute `token`",
+        again: float = 1.0,
+        say: Callable[[str], None] = print,
+    ) -> None:
         if not (obs_size > 0 < action_size and 0 < again < math.inf and (steps is None or steps > 0)):
             raise UserError("Remote: sizes, steps and `again` must be more than 0")
         if period is not None and not 0 < period < math.inf:
@@ -128,7 +140,7 @@ class Remote:
         self.obs_size, self.action_size, self.token = obs_size, action_size, token or secrets.token_hex(16)
         self._again, self._say, self._token_in = again, lambda line: say(printable(line, _LINE)), token_in
         self._refused, self._ignored = _Seldom(self._say), _Seldom(self._say)
-        self._lock, self._there = threading.Lock(), threading.Event()
+        self._lock, self._connected = threading.Lock(), threading.Event()
         self._link: _Link | None = None  # to the robot that is connected now
         self._played: _Link | None = None  # to the one that began the episode: no other knows its steps
         self._episode, self._step, self._failures, self._reason = 0, 0, 0, ""
@@ -138,10 +150,7 @@ class Remote:
         self.action_space = Box(*(x * np.ones(action_size, np.float32) for x in (-1, 1)))
         self.spec, self.unwrapped = None, self
         self._host, self._door = host, Door(host, port)
-        self._server = serve(
-            self._serve, sock=self._door, origins=[None], max_size=LIMIT, max_queue=16, compression=None,
-            open_timeout=_HELLO,
-        )  # fmt: skip
+        self._server = serve(self._serve, sock=self._door, origins=[None], **_SERVER)
         self.url = url(host, self._door.port)
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()
@@ -199,12 +208,12 @@ class Remote:
 
     def _wait(self) -> _Link:
         """The link to a robot, once there is one."""
-        while not self._there.is_set() or (link := self._link) is None:
+        while not self._connected.is_set() or (link := self._link) is None:
             self._say(f"waiting for a robot at {self.url}; its token is in {self._token_in}")
-            self._there.wait()
+            self._connected.wait()
         return link
 
-    def _ask[T: (Began, Moved, Rested)](self, message: bytes, answer: type[T], tries: int | None = None) -> T | None:
+    def _ask[T: (Began, Moved, Rested)](self, message: bytes, kind: type[T], tries: int | None = None) -> T | None:
         """The answer to a message of this episode and step; None if the robot is gone or has failed.
 
         tries: how often it is said at most.
@@ -219,38 +228,38 @@ class Remote:
                 link.send(message)
                 due = now + self._again
             try:
-                heard = link.inbox.get(timeout=max(due - now, 0.0))
+                answer = link.inbox.get(timeout=max(due - now, 0.0))
             except queue.Empty:
                 continue
-            if isinstance(heard, _Gone):
-                link.inbox.put(heard)  # it stays the last one
-                if answer is not Rested:
+            if isinstance(answer, _Gone):
+                link.inbox.put(answer)  # it stays the last one
+                if kind is not Rested:
                     self._say(f"the robot is gone in episode {self._episode} before the outcome of step {self._step}")
                 return None
-            if isinstance(heard, Hello) or heard.episode != self._episode:
+            if isinstance(answer, Hello) or answer.episode != self._episode:
                 continue  # of before
-            if isinstance(heard, Failed) and answer is not Rested:
-                return self._fail(f"the robot has stopped: {heard.reason}")
-            if isinstance(heard, answer) and getattr(heard, "step", self._step) == self._step:
+            if isinstance(answer, Failed) and kind is not Rested:
+                return self._fail(f"the robot has stopped: {answer.reason}")
+            if isinstance(answer, kind) and getattr(answer, "step", self._step) == self._step:
                 try:
-                    self._read(heard)
+                    self._read(answer)
                 except ValueError as error:
-                    return self._fail(f"the robot's {answer.__name__.lower()} of step {self._step}: {error}")
-                return heard
+                    return self._fail(f"the robot's {kind.__name__.lower()} of step {self._step}: {error}")
+                return answer
 
     def _fail(self, reason: str) -> None:
         self._failures, self._reason = self._failures + 1, reason
         self._say(reason)
 
-    def _read(self, heard: Began | Moved | Rested) -> None:
+    def _read(self, answer: Began | Moved | Rested) -> None:
         """Keeps the arrays of an answer; ValueError for wrong sizes and numbers."""
-        if isinstance(heard, Moved):
-            sent = array(heard.sent, self.action_size, "sent")
+        if isinstance(answer, Moved):
+            sent = array(answer.sent, self.action_size, "sent")
             if (np.abs(sent) > 1 + _ROUNDING).any():
                 raise ValueError("sent holds a command beyond [-1, 1]")
             self._sent = sent
-        if not isinstance(heard, Rested):
-            self._obs = array(heard.obs, self.obs_size, "obs")
+        if not isinstance(answer, Rested):
+            self._obs = array(answer.obs, self.obs_size, "obs")
 
     # ------------------------------------------------------------ the server's threads
 
@@ -265,7 +274,7 @@ class Remote:
             return
         try:
             link.send(pack("welcome"))
-            self._there.set()
+            self._connected.set()
             for data in connection:
                 try:
                     link.put(read(data))
@@ -276,7 +285,7 @@ class Remote:
         finally:
             link.inbox.put(_Gone())
             with self._lock:
-                self._there.clear()
+                self._connected.clear()
                 self._link = None
 
     def _admit(self, link: _Link) -> _Refusal | None:
@@ -321,24 +330,18 @@ class Remote:
 
     def _difference(self, hello: Hello) -> str | None:
         """What of a robot does not fit, if anything."""
-        for name, ours, theirs in (
-            ("numbers measured", self.obs_size, hello.obs_size),
-            ("numbers commanded", self.action_size, hello.action_size),
-        ):
+        period, sizes = hello.period, (hello.obs_size, hello.action_size)
+        wanted = {"numbers measured": self.obs_size, "numbers commanded": self.action_size}
+        for (name, ours), theirs in zip(wanted.items(), sizes, strict=True):
             if ours != theirs:
                 return f"{name}: the robot has {theirs}, the learner {ours}"
-        if not _same(self._period, hello.period):
+        if period is not None and self._period is not None and not math.isclose(period, self._period, rel_tol=_SAME):
             return (
-                f"seconds of a step: the robot has {hello.period:g}, the learner's task {self._period:g}; change the "
+                f"seconds of a step: the robot has {period:g}, the learner's task {self._period:g}; change the "
                 "period of the robot, or the task"
             )
-        if hello.period is not None and not 0 < hello.period < math.inf:
-            return f"seconds of a step: the robot has {hello.period:g}, which cannot be"
-        if hello.answer_within is not None and not (hello.period and hello.answer_within <= hello.period):
-            return f"answer_within is {hello.answer_within:g}: give at most the period, {hello.period} s"
+        if period is not None and not 0 < period < math.inf:
+            return f"seconds of a step: the robot has {period:g}, which cannot be"
+        if hello.answer_within is not None and not (period and hello.answer_within <= period):
+            return f"answer_within is {hello.answer_within:g}: give at most the period, {period} s"
         return None
-
-
-def _same(own: float | None, theirs: float | None) -> bool:
-    """Whether two periods, in seconds, are the same, as far as both are known."""
-    return own is None or theirs is None or math.isclose(own, theirs, rel_tol=_SAME)

@@ -19,6 +19,7 @@ read. Actions lie in [-1, 1].
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import time
 import zlib
@@ -37,7 +38,7 @@ LARGEST = 1e18  # of a measurement or reward: squares of larger ones are beyond 
 SUCCESS = ("is_success", "success")  # what `info` may call it; the first that says something counts
 _REASON = 500  # letters of one at most
 _PATIENCE = 10  # late steps in a row that end an episode
-_SOME = object()
+_ABSENT = object()
 _SHAPES: dict[str, dict[str, Any]] = {  # what the learner says, `messages` has the rest; a tuple: any of these types
     "welcome": {},
     "refused": {"reason": str, "final": bool},
@@ -80,7 +81,7 @@ def unpack(data: Any) -> dict[str, Any]:
     if not isinstance(kind, str) or kind not in _SHAPES:
         raise ValueError(f"is of the unknown type {kind!r}")
     for name, wanted in _SHAPES[kind].items():
-        value = fields.get(name, _SOME)
+        value = fields.get(name, _ABSENT)
         if type(value) not in (wanted if isinstance(wanted, tuple) else (wanted,)):
             raise ValueError(f"{kind} has no proper {name!r}")
     return fields
@@ -192,7 +193,7 @@ class Limits:
         near = np.clip(np.clip(action, before - change, before + change), self.low, self.high)
         return np.clip(near, -1.0, 1.0).astype(np.float32)
 
-    def left(self, obs: np.ndarray) -> str:
+    def beyond(self, obs: np.ndarray) -> str:
         """What of a measurement lies beyond the workspace; nothing if all is well."""
         if self.workspace is None:
             return ""
@@ -201,14 +202,14 @@ class Limits:
         return f"measured number {beyond[0]} is {obs[beyond[0]]:.4g}, beyond the workspace" if len(beyond) else ""
 
 
-def _motors(given: Any, action_size: int, what: str) -> np.ndarray:
+def _motors(bound: Any, action_size: int, what: str) -> np.ndarray:
     """[action_size], of one number for all motors or one for each; ValueError for anything else."""
     try:
-        values = np.asarray(given, float)
+        values = np.asarray(bound, float)
     except (TypeError, ValueError):
         values = np.empty(0)
     if values.shape not in ((), (action_size,)):
-        raise ValueError(f"{what} is {given!r}; give one number, or {action_size} of them, one for each motor")
+        raise ValueError(f"{what} is {bound!r}; give one number, or {action_size} of them, one for each motor")
     return np.full(action_size, values)
 
 
@@ -247,19 +248,13 @@ def play(
     for an argument that cannot be right, before the robot moves; OSError where the log cannot be written, before the
     command is sent; and whatever the driver's `stop` raises.
     """
-    limits.check(int(driver.obs_size), int(driver.action_size))
-    instead = _instead(late, int(driver.action_size))
-    _check_period(period, needed=hasattr(driver, "send"))
-    rhythm = _rhythm(period, answer_within, instead, patience) if hasattr(driver, "send") and period else None
-    if rhythm is None:
-        _check_waits(answer_within, instead, patience)
+    sizes = {"obs_size": int(driver.obs_size), "action_size": int(driver.action_size)}
+    limits.check(**sizes)
+    rhythm = _rhythm(driver, period, answer_within, _instead(late, sizes["action_size"]), patience)
     robot = _Robot(driver, rhythm, limits, _Log(log))
-    hello = pack(
-        "hello", version=VERSION, token=token, robot=name, obs_size=int(driver.obs_size),
-        action_size=int(driver.action_size), period=float(period) if period else None,
-        answer_within=float(rhythm.answer_within) if rhythm else None,
-    )  # fmt: skip
-    said = ""
+    times = {"period": period and float(period), "answer_within": rhythm and float(rhythm.answer_within)}
+    hello = pack("hello", version=VERSION, token=token, robot=name, **sizes, **times)
+    last_line = ""
     try:
         while True:
             with contextlib.ExitStack() as stack:
@@ -269,14 +264,14 @@ def play(
                     lost = error
                 else:
                     say(f"connected to {url}")
-                    said, lost = "", _served(socket, robot, say)
+                    last_line, lost = "", _served(socket, robot, say)
             if lost is None:
                 return robot.counts
             driver.stop()
             reason = printable(lost, _REASON)
-            if (line := f"no connection to {url} ({reason}); the robot is stopped, trying again") != said:
+            if (line := f"no connection to {url} ({reason}); the robot is stopped, trying again") != last_line:
                 say(line)
-            said = line
+            last_line = line
             time.sleep(retry)
     finally:
         driver.stop()
@@ -321,29 +316,30 @@ class _Rhythm:
     patience: int
 
 
-def _check_period(period: float | None, *, needed: bool) -> None:
-    """Raises ValueError where it is no time that a step can take."""
-    if period is None and needed:
-        raise ValueError("a driver with `send` needs a period, in seconds")
+def _rhythm(
+    driver: Any, period: float | None, answer_within: float | None, instead: np.ndarray | None, patience: int
+) -> _Rhythm | None:
+    """The clock of a driver with `send`; None for one with `step`, which waits for its commands.
+
+    Raises ValueError for times that no robot can keep, and where one that waits is told what to do when it is late.
+    """
     if period is not None and not 0 < period < np.inf:  # nan is not
         raise ValueError(f"period is {period}; give the seconds of a step, more than 0")
-
-
-def _rhythm(period: float, answer_within: float | None, instead: np.ndarray | None, patience: int) -> _Rhythm:
-    """The clock of a driver with `send`; raises ValueError where no robot can keep it."""
+    if not hasattr(driver, "send"):
+        late = {"answer_within": answer_within is not None, "late": instead is not None}
+        if names := [name for name, is_set in {**late, "patience": patience != _PATIENCE}.items() if is_set]:
+            raise ValueError(
+                f"{', '.join(names)}: no command is late for a driver with `step`; give it `read` and `send`"
+            )
+        return None
+    if period is None:
+        raise ValueError("a driver with `send` needs a period, in seconds")
     within = period / 2 if answer_within is None else answer_within
     if not 0 < within <= period:
         raise ValueError(f"answer_within is {within}; give seconds, more than 0 and at most the period of {period}")
     if not patience >= 1:
         raise ValueError(f"patience is {patience}; give a number of steps, 1 or more")
     return _Rhythm(period, within, instead, patience)
-
-
-def _check_waits(answer_within: float | None, instead: np.ndarray | None, patience: int) -> None:
-    """A driver with `step` waits for its commands; raises ValueError where it is told what to do when one is late."""
-    given = {"answer_within": answer_within is not None, "late": instead is not None, "patience": patience != _PATIENCE}
-    if told := [name for name, is_given in given.items() if is_given]:
-        raise ValueError(f"{', '.join(told)}: no command is late for a driver with `step`; give it `read` and `send`")
 
 
 def _instead(late: str | Sequence[float], action_size: int) -> np.ndarray | None:
@@ -366,7 +362,7 @@ class _Log:
         self._path, self._file = path, None
         if path is not None:
             with self._explained():
-                self._file = open(path, "ab", buffering=0)  # noqa: SIM115
+                self._file = io.FileIO(os.fspath(path), "ab")
 
     def write(self, **fields: Any) -> None:
         if self._file is not None:
@@ -449,8 +445,8 @@ class _Robot:
         self._last = np.zeros(self.driver.action_size, np.float32)
         try:
             obs = self._checked(self.driver.reset(message["seed"]))
-            if left := self.limits.left(obs):
-                raise ValueError(left)
+            if beyond := self.limits.beyond(obs):
+                raise ValueError(beyond)
         except Exception as error:
             self._fail(socket, error, say)
             return
@@ -492,8 +488,8 @@ class _Robot:
             episode=self._episode, step=step, action=action, late=late, time=time.time(), clock=time.monotonic()
         )
         try:
-            own = action.copy()  # the driver may change its array; what is reported and stored stays
-            told = self._by_clock(own, late=late) if self.rhythm else self._at_once(own)
+            sent = action.copy()  # the driver may change its array; what is reported and stored stays
+            moved = self._by_clock(sent, late=late) if self.rhythm else self._at_once(sent)
         except Exception as error:
             self._fail(socket, error, say)
             return
@@ -503,25 +499,22 @@ class _Robot:
         self.counts["late"] += late
         if self.rhythm and self._lates >= self.rhythm.patience:
             say(f"{self._lates} steps in a row without a command in time; the episode ends here")
-            told["truncated"] = True
-        if left := self.limits.left(told["obs"]):
-            say(f"{left}; the robot is stopped, the episode ends here")
-            told["truncated"] = True
-        told["truncated"] |= self._most is not None and step + 1 >= self._most
-        if told["terminated"] or told["truncated"]:
+            moved["truncated"] = True
+        if beyond := self.limits.beyond(moved["obs"]):
+            say(f"{beyond}; the robot is stopped, the episode ends here")
+            moved["truncated"] = True
+        moved["truncated"] |= self._most is not None and step + 1 >= self._most
+        if moved["terminated"] or moved["truncated"]:
             self._over = True
             self.driver.stop()
-        self._tell(socket, pack("moved", episode=self._episode, step=step, sent=action, late=late, **told))
+        self._tell(socket, pack("moved", episode=self._episode, step=step, sent=action, late=late, **moved))
 
     def _at_once(self, action: np.ndarray) -> dict[str, Any]:
         moved = self.driver.step(action)
         if not isinstance(moved, tuple) or len(moved) != 5:
             raise TypeError("step does not return obs, reward, terminated, truncated, info")
         obs, reward, terminated, truncated, info = moved
-        return {
-            "obs": self._checked(obs), "reward": number(reward, "reward"), "terminated": flag(terminated, "terminated"),
-            "truncated": flag(truncated, "truncated"), "success": success_of(info or {}),
-        }  # fmt: skip
+        return _moved(self._checked(obs), reward, terminated, truncated, info or {})
 
     def _by_clock(self, action: np.ndarray, *, late: bool) -> dict[str, Any]:
         """Sends, waits for the end of the period, reads. The clock goes on from where it should be, not from now."""
@@ -534,10 +527,7 @@ class _Robot:
         obs = self._checked(self.driver.read())
         judge = getattr(self.driver, "judge", None)
         reward, terminated, success = (None, False, None) if judge is None else judge(obs)
-        return {
-            "obs": obs, "reward": number(reward, "reward"), "terminated": flag(terminated, "terminated"),
-            "truncated": False, "success": success_of({"success": success}),
-        }  # fmt: skip
+        return _moved(obs, reward, terminated, False, {"success": success})
 
     def _checked(self, obs: Any) -> np.ndarray:
         with np.errstate(over="ignore"):
@@ -551,6 +541,13 @@ class _Robot:
         say(f"the robot is stopped: {reason}")
         self._failed = pack("failed", episode=self._episode, reason=reason)
         _send(socket, self._failed)
+
+
+def _moved(obs: np.ndarray, reward: Any, terminated: Any, truncated: Any, info: Mapping[str, Any]) -> dict[str, Any]:
+    """What a step led to, as the fields of a message; ValueError for what is no number or truth value."""
+    earned = {"obs": obs, "reward": number(reward, "reward")}
+    ends = {"terminated": flag(terminated, "terminated"), "truncated": flag(truncated, "truncated")}
+    return {**earned, **ends, "success": success_of(info)}
 
 
 def _send(socket: Any, message: bytes) -> None:

@@ -10,6 +10,8 @@ from envs.mesh import split_vmap
 from envs.rollout import Episode, play_episode
 from envs.types import Array, Key, PyTree
 
+__all__ = ["Simulated"]
+
 
 class Simulated:
     """Perturbed simulations.
@@ -36,11 +38,12 @@ class Simulated:
 
     def _player(self, policy: Any) -> Callable[..., Episode]:
         def play(state: PyTree, pools: World, which: Array, keys: Key, explore: Array) -> Episode:
-            act = lambda carry, obs, key: policy.act(state, carry, obs, key, explore=explore)  # noqa: E731
+            def act(carry: PyTree, obs: Array, key: Key) -> tuple[Array, PyTree]:
+                return policy.act(state, carry, obs, key, explore=explore)
 
-            def one(key: Key) -> Episode:
+            def episode(key: Key) -> Episode:
                 return play_episode(self.env, pools, act, policy.init_carry(), key, gamma=self.gamma, which=which)
 
-            return split_vmap(one)(keys)
+            return split_vmap(episode)(keys)
 
         return play

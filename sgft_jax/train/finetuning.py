@@ -23,6 +23,8 @@ from sgft_jax.train.evidence import Best
 from sgft_jax.train.guard import Guarded
 from sgft_jax.types import Finetuner, Metrics, SimulatedData, Simulation
 
+__all__ = ["FinetuneProgress", "evaluate", "finetune", "simulate"]
+
 Phase = Literal["offline", "logged", "online"]  # of learning, see `Updates`
 OFFLINE_PART = 5_000  # updates of the offline phase between two yields
 _AT_ONCE = 1024  # simulated episodes played together

@@ -21,6 +21,8 @@ from sgft_jax.data.replay import ReplayState
 from sgft_jax.models.networks import Precision, precision
 from sgft_jax.types import Batch, Learner, Metrics, Task
 
+__all__ = ["FleetState"]
+
 # explore(fleet, key) -> (actions [n, act_dim], carries [n] of the policy)
 Explore = Callable[[Fleet, Key], tuple[Array, PyTree]]
 # note(learner's state, before, action, after) -> what is kept of one simulated step beside its row

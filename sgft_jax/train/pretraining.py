@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,22 +22,9 @@ from sgft_jax.train.fleet import Collected, FleetState, Plan, RoundKeys, StartKe
 from sgft_jax.train.recipes import RECIPES
 from sgft_jax.types import Batch, Metrics, Prior
 
+__all__ = ["pretrain", "priors_of"]
+
 Pools = Callable[[int], World]  # number of a set of worlds -> its worlds [M, W], a pool for each member
-
-
-class Best(NamedTuple):
-    """The best policy by evaluation, of one member.
-
-    params: what it leaves. score, total: [] mean score and return of that evaluation. steps: [] int32, when it was.
-    exploded: [] share of its episodes that exploded: they count as the worst known. worst: [2] that score and return.
-    """
-
-    params: PyTree
-    score: Array
-    total: Array
-    steps: Array
-    exploded: Array | float = 0.0
-    worst: Array | float = jnp.inf
 
 
 # --- the iterator -----------------------------------------------------------------------------------------------------
@@ -114,26 +101,6 @@ def world_keys(seeds: Sequence[int] | Array, number: int = 0) -> Key:
 def exported(env: Env, config: PretrainConfig, state: FleetState) -> PyTree:
     """Params [M, ...] of the agents as they are now."""
     return RECIPES[config.algorithm](env, config).extract(state.learner)
-
-
-def keep_better(old: Best, new: Best, since: float | Array) -> Best:
-    """The one with the higher score, then fewer explosions, then the higher return; the old one if they tie.
-
-    since: [] steps before which nothing competes: an old one from before it always gives way.
-    """
-    worst = jnp.minimum(old.worst, new.worst)
-    old, new = _at_worst(old, worst), _at_worst(new, worst)
-    better = new.total > old.total
-    for less, more in [(old.exploded, new.exploded)[::-1], (old.score, new.score)]:
-        better = (more > less) | ((more == less) & better)
-    better |= old.steps < since
-    return jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
-
-
-def _at_worst(best: Best, worst: Array) -> Best:
-    """The same evaluation now that `worst` is known; its explosions counted as `best.worst`."""
-    shift = jnp.where(best.exploded > 0, best.exploded * (worst - best.worst), 0.0) * jnp.ones(2)
-    return best._replace(score=best.score + shift[0], total=best.total + shift[1], worst=worst)
 
 
 def prior_card(env: Env, config: PretrainConfig) -> dict[str, Any]:

@@ -27,9 +27,13 @@ def episode(first, steps, *, terminated=False):
     """Observations that count up from `first`."""
     obs = (first + np.arange(steps + 1))[:, None].astype(np.float32)
     return Recorded(
-        obs, obs[:-1] / 100, np.ones(steps, np.float32), terminated,
-        joints=Joints(obs + 0.5, -np.tile(obs, 2)), log_prob=obs[:-1, 0] / 10,
-    )  # fmt: skip
+        obs,
+        obs[:-1] / 100,
+        np.ones(steps, np.float32),
+        terminated,
+        joints=Joints(obs + 0.5, -np.tile(obs, 2)),
+        log_prob=obs[:-1, 0] / 10,
+    )
 
 
 def noted_of(*episodes):
@@ -45,10 +49,12 @@ def rows_of(*episodes):
     """Transitions [T] of episodes of one environment, one after the other."""
     discount = [np.append(np.full(len(e.reward) - 1, 0.9), 0.0 if e.terminated else 0.9) for e in episodes]
     return Transition(
-        np.concatenate([e.obs[:-1] for e in episodes]), np.concatenate([e.action for e in episodes]),
-        np.concatenate([e.reward for e in episodes]), np.concatenate(discount),
+        np.concatenate([e.obs[:-1] for e in episodes]),
+        np.concatenate([e.action for e in episodes]),
+        np.concatenate([e.reward for e in episodes]),
+        np.concatenate(discount),
         np.concatenate([e.obs[1:] for e in episodes]),
-    )  # fmt: skip
+    )
 
 
 def same(a, b):
@@ -59,7 +65,10 @@ def test_episodes_of_a_fleet_are_found_again_in_the_order_of_their_ends():
     """Two environments, eight steps: one falls after three; the recording cuts off both last episodes."""
     one = [episode(0, 3, terminated=True), episode(50, 5)]
     two = [episode(200, 6), episode(300, 2)]
-    mixed = lambda a, b: np.stack([a, b], 1).reshape(16, *a.shape[1:])  # noqa: E731
+
+    def mixed(a, b):
+        return np.stack([a, b], 1).reshape(16, *a.shape[1:])
+
     rows, noted = (jax.tree.map(mixed, of(*one), of(*two)) for of in (rows_of, noted_of))
     found = recording.of_fleet(rows, 2, noted)
     for got, wanted in zip(found, [one[0], two[0], one[1], two[1]], strict=True):

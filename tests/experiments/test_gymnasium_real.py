@@ -12,7 +12,7 @@ from priors_by_hand import save_prior
 pytest.importorskip("gymnasium", reason="make setup EXTRAS=dev, or pip install 'sgft-jax[gymnasium]'")
 
 import toy_gymnasium
-from toy_gymnasium import NAME, BrokenError, Turned
+from toy_gymnasium import NAME, Turned
 
 import envs
 from envs.types import UserError
@@ -84,7 +84,10 @@ def test_a_run_keeps_every_episode_and_counts_those_of_evaluations(finished):
 
 def test_evaluations_play_the_same_starts_and_rollouts_play_others(finished):
     folder, _ = finished
-    starts = lambda where: np.stack([one["obs"][:, 0] for one in stored(where)])  # noqa: E731
+
+    def starts(where):
+        return np.stack([one["obs"][:, 0] for one in stored(where)])
+
     first, last = (starts(folder / f"evaluation/rollouts-00000{n}") for n in (0, 4))
     np.testing.assert_array_equal(first, last)
     assert len(np.unique(starts(folder).reshape(-1, 4), axis=0)) == 2 * ROLLOUTS
@@ -96,7 +99,7 @@ def test_what_was_played_before_a_break_is_never_played_again(priors, finished, 
     """A break in mid-episode costs that episode alone, and the run ends as if nothing had happened."""
     whole, seeds = finished
     Turned.breaks = steps
-    with pytest.raises(BrokenError):
+    with pytest.raises(SystemExit):
         run(priors, tmp_path)
     Turned.breaks = None
     folder = run(priors, tmp_path, "--resume")
@@ -133,7 +136,10 @@ def test_evaluation_says_what_it_has_cost(priors):
 def test_diagnosis_keeps_the_rollouts_that_it_plays(priors, tmp_path, capsys):
     """So that another diagnosis needs none: read from disk, it says the same of them."""
     given = ["--task", "toy", "--prior", str(priors), "--out", str(tmp_path), "--json"]
-    call = lambda *more: cli.run_main(diagnose.main, diagnose.DiagnoseArgs, "", argv=[*given, *more])  # noqa: E731
+
+    def call(*more):
+        return cli.run_main(diagnose.main, diagnose.DiagnoseArgs, "", argv=[*given, *more])
+
     call("--real", NAME, "--rollouts", "2")
     first = json.loads(capsys.readouterr().out)
     assert len(Turned.seeds) == 4

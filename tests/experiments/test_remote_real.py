@@ -213,10 +213,12 @@ def test_steps_of_another_task_or_version_are_named(tmp_path):
         (b"0123456789abcdef\n0123456789abcdef", 0o600, "holds no token"),
         (b"0123456789abcdef\xff", 0o600, "is no UTF-8 text"),
         (b"0" * 5000, 0o600, "is larger than 1,024 bytes"),
-        *((b"0123456789abcdef", mode, "others can read or write it; delete it for a new token") for mode in
-          (0o666, 0o640, 0o604, 0o620)),
+        *(
+            (b"0123456789abcdef", mode, "others can read or write it; delete it for a new token")
+            for mode in (0o666, 0o640, 0o604, 0o620)
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_token_that_others_know_or_can_guess_is_refused(tmp_path, content, mode, words):
     path = tmp_path / "robot-token"
     path.write_bytes(content)
@@ -252,12 +254,17 @@ def test_a_token_of_ones_own_is_taken(tmp_path):
 @pytest.mark.parametrize(
     ("real", "address"),
     [
-        ("remote", ("127.0.0.1", 8765)), ("remote:", ("127.0.0.1", 8765)), ("remote::99", ("127.0.0.1", 99)),
-        ("remote:lab", ("lab", 8765)), ("remote:10.0.0.7:99", ("10.0.0.7", 99)), ("remote:::1", ("::1", 8765)),
-        ("remote:[::1]", ("::1", 8765)), ("remote:[::1]:99", ("::1", 99)),
+        ("remote", ("127.0.0.1", 8765)),
+        ("remote:", ("127.0.0.1", 8765)),
+        ("remote::99", ("127.0.0.1", 99)),
+        ("remote:lab", ("lab", 8765)),
+        ("remote:10.0.0.7:99", ("10.0.0.7", 99)),
+        ("remote:::1", ("::1", 8765)),
+        ("remote:[::1]", ("::1", 8765)),
+        ("remote:[::1]:99", ("::1", 99)),
         ("remote:[fe80::1%eth0]:9", ("fe80::1%eth0", 9)),
     ],
-)  # fmt: skip
+)
 def test_an_address_may_be_of_either_kind(real, address):
     assert real_systems.address(real) == address
 
@@ -265,12 +272,26 @@ def test_an_address_may_be_of_either_kind(real, address):
 @pytest.mark.parametrize(
     "real",
     [
-        "remote:lab:0", "remote:lab:80000", "remote:lab:http", "remote:lab: 99", "remote:lab:٣", "remote:a b:99",
-        "remote:256.1.1.1:99", "remote:[::1", "remote:[::1]99", "remote:[zz:1]:99", "remote:[10.0.0.7]:99",
-        "remote:here:there", "remote:1:2:3", "remote:lab:99\n", "remote:\x1b[31m", "remote:" + "x" * 300, "remote:a/b",
+        "remote:lab:0",
+        "remote:lab:80000",
+        "remote:lab:http",
+        "remote:lab: 99",
+        "remote:lab:٣",
+        "remote:a b:99",
+        "remote:256.1.1.1:99",
+        "remote:[::1",
+        "remote:[::1]99",
+        "remote:[zz:1]:99",
+        "remote:[10.0.0.7]:99",
+        "remote:here:there",
+        "remote:1:2:3",
+        "remote:lab:99\n",
+        "remote:\x1b[31m",
+        "remote:" + "x" * 300,
+        "remote:a/b",
     ],
     ids=lambda real: repr(real[:30]),
-)  # fmt: skip
+)
 def test_what_is_no_address_is_refused_in_one_line(real):
     with pytest.raises(
         UserError, match=r"write remote, remote:HOST or remote:HOST:PORT, .* an IPv6 address as \[::1\]"
@@ -412,9 +433,17 @@ def test_a_killed_learner_goes_on_with_what_the_robot_has_done(port, tmp_path):
     token, url = real_systems.token(home), f"ws://127.0.0.1:{port}"
     client = subprocess.Popen([sys.executable, "-c", code, url, token, str(tests), str(tests.parent), str(log)])
     command = [
-        sys.executable, "-m", "experiments.finetune", *OPTIONS.split(), "--real", f"remote::{port}", "--prior",
-        str(home / "prior"), "--out", str(home),
-    ]  # fmt: skip
+        sys.executable,
+        "-m",
+        "experiments.finetune",
+        *OPTIONS.split(),
+        "--real",
+        f"remote::{port}",
+        "--prior",
+        str(home / "prior"),
+        "--out",
+        str(home),
+    ]
     first = subprocess.Popen(command)
     folder = home / "finetune/toy/remote/sac/seed-0"
     journal = folder / "real/rollout-000001.steps.jsonl"

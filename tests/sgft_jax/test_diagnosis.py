@@ -41,9 +41,10 @@ def best(beliefs, known=NOTHING, horizon=3):
 
 
 @pytest.mark.parametrize(
-    ("value", "improvable", "improving"), [(2.0, 1.0, 0.0), (1.0, 1.0, 1.0), (4.0, 0.0, 0.0)],
+    ("value", "improvable", "improving"),
+    [(2.0, 1.0, 0.0), (1.0, 1.0, 1.0), (4.0, 0.0, 0.0)],
     ids=["optimal", "pessimistic", "promises too much"],
-)  # fmt: skip
+)
 def test_what_the_best_action_does_for_v_sim(value, improvable, improving):
     """After H steps of reward 1 at gamma 0.5: 2 (1 - 0.5^H) + 0.5^H V - V = (2 - V)(1 - 0.5^H)."""
     found = best(believing(value))
@@ -133,7 +134,9 @@ def moved(share, key, *, jitter=0.003, usual=0.0):
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.8])
 def test_a_delay_is_found_and_its_evidence(share):
-    change = lambda obs, action: action  # noqa: E731
+    def change(obs, action):
+        return action
+
     late = diagnosis.lateness(change, moved(share, jax.random.key(1)), jnp.full(2, 0.01))
     assert late.share == pytest.approx(share, abs=0.02)
     assert late.nats > 50 if share else late.nats < 1

@@ -1,6 +1,7 @@
 """Gymnasium environments as real systems: the episodes of `Simulated`, stepped from Python."""
 
 import functools
+import importlib
 
 import jax
 import jax.numpy as jnp
@@ -26,10 +27,9 @@ from sgft_jax.types import Prior
 
 gymnasium = pytest.importorskip("gymnasium", reason="make setup EXTRAS=dev, or pip install 'sgft-jax[gymnasium]'")
 
-from gymnasium import spaces  # noqa: E402
-from gymnasium.vector import AutoresetMode, SyncVectorEnv  # noqa: E402
-
-from envs.adapters.gymnasium import TaskEnv, TaskVectorEnv  # noqa: E402
+adapters = importlib.import_module("envs.adapters.gymnasium")
+spaces, TaskEnv, TaskVectorEnv = gymnasium.spaces, adapters.TaskEnv, adapters.TaskVectorEnv
+AutoresetMode, SyncVectorEnv = gymnasium.vector.AutoresetMode, gymnasium.vector.SyncVectorEnv
 
 GAMMA, MEMBERS, EPISODES = 0.9, 2, 2
 TURNED = Gap("turned", {"mass": [0.8, 2.0]}, {"action_rotation": 0.4, "obs_noise": 0.02})
@@ -89,7 +89,9 @@ class Spoken(gymnasium.Env):
         self.ends, self.says, self.actions = ends, dict(says), []
 
     def seen(self):
-        full = lambda space: np.full(space.shape, float(self.time), space.dtype)  # noqa: E731
+        def full(space):
+            return np.full(space.shape, float(self.time), space.dtype)
+
         return full(self.observation_space)
 
     def reset(self, *, seed=None, options=None):
@@ -274,11 +276,15 @@ def answering(reward=10.0, terminated=False, truncated=False, info=()):
 @pytest.mark.parametrize(
     "answer",
     [
-        {"reward": np.full(1, 10.0)}, {"terminated": np.zeros(1, bool)}, {"truncated": np.int64(0)}, {"info": None},
-        {"info": {"is_success": np.ones(1)}}, {"reward": np.float64(10.0), "info": {"invalid": False, "late": None}},
+        {"reward": np.full(1, 10.0)},
+        {"terminated": np.zeros(1, bool)},
+        {"truncated": np.int64(0)},
+        {"info": None},
+        {"info": {"is_success": np.ones(1)}},
+        {"reward": np.float64(10.0), "info": {"invalid": False, "late": None}},
     ],
     ids=str,
-)  # fmt: skip
+)
 def test_answers_in_other_types_are_the_same(answer):
     episode = play(answering(**answer))
     assert episode.valid.sum() == 3 and episode.total_reward == 30.0 and not episode.exploded

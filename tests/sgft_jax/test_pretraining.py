@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import toy
 import toy_terminating
+import tuners
 from flax import struct
 
 import envs
@@ -24,20 +25,20 @@ from sgft_jax.policies import make_policy
 from sgft_jax.presets import PRESETS, PretrainConfig
 from sgft_jax.train import pretraining, recipes
 from sgft_jax.train.fleet import over_members
-from sgft_jax.train.pretraining import Best, keep_better, pretrain, priors_of
+from sgft_jax.train.pretraining import pretrain, priors_of
 from sgft_jax.types import Learner
 
 N, STEPS, LENGTH = 16, 30, toy_terminating.LENGTH
 CONFIG = PretrainConfig(
     n_envs=N, chunk_steps=STEPS, env_steps=2 * N * STEPS, worlds=4, random_transitions=LENGTH * N,
     replay_capacity=4 * N * STEPS, batch_size=8, updates_per_step=1, gamma=0.9,
-    network=NetworkConfig(hidden=(8,)), ensemble_size=1, size="tiny", horizon=2, plan_samples=8, gru=4,
+    network=NetworkConfig(hidden=(8,)), ensemble_size=1, size=tuners.TINY, horizon=2, plan_samples=8, gru=4,
 )  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
 def _tiny(monkeypatch):
-    monkeypatch.setitem(tdmpc2_model.SIZES, "tiny", tdmpc2_model.Size(8, 8, 8, 2, 2))
+    monkeypatch.setitem(tdmpc2_model.SIZES, tuners.TINY, tdmpc2_model.Size(8, 8, 8, 2, 2))
 
 
 class Agent(struct.PyTreeNode):
@@ -219,34 +220,6 @@ def test_random_actions_grow_along_the_fleet(key, monkeypatch):
     *_, (state, _) = pretrain(toy.make(), config, [0])
     obeyed = (state.replay.data.action[0, : 3 * 60].reshape(60, 3, 2) > 1).all(-1).mean(0)
     assert obeyed[0] == 1 and obeyed[2] == 0 and 0.25 < obeyed[1] < 0.75
-
-
-def test_better_is_a_higher_score_then_a_higher_return():
-    def best(score, total, steps):
-        return Best({"w": jnp.full(2, float(steps))}, jnp.float32(score), jnp.float32(total), jnp.int32(steps))
-
-    old = best(0.5, 3.0, 1)
-    for score, total, steps in [(0.6, -9.0, 2), (0.5, 3.1, 2), (0.5, 3.0, 1), (0.5, 2.9, 1), (0.4, 9.0, 1)]:
-        kept = keep_better(old, best(score, total, 2), 0.0)
-        assert kept.steps == steps and kept.params["w"].tolist() == [steps, steps]
-    assert keep_better(old, best(0.1, 0.0, 2), 1.5).steps == 2, "an early evaluation does not compete"
-
-
-def test_a_policy_that_explodes_is_not_the_better_one():
-    """Costs of 12 or so for a whole episode; the worst known of both evaluations counts for those that exploded."""
-
-    def best(score, steps, exploded, worst):
-        score = jnp.float32(score)
-        return Best(jnp.int32(steps), score, score, jnp.int32(steps), jnp.float32(exploded), jnp.full(2, worst))
-
-    whole = best(-12.0, 1, 0.0, -13.0)
-    for score, exploded, worst in [(-2.0, 1.0, -2.0), (-11.0, 0.9, -11.0), (-12.0, 0.1, -12.0)]:
-        bursts = best(score, 2, exploded, worst)
-        assert keep_better(whole, bursts, 0.0).steps == 1 and keep_better(bursts, whole, 0.0).steps == 1
-    kept = keep_better(best(-11.0, 2, 0.5, -12.0), whole, 0.0)
-    assert kept.steps == 2 and kept.score == -11.5 and kept.worst.tolist() == [-13, -13]
-    same = best(-12.0, 2, 1.0, -12.0)
-    assert keep_better(same, best(-12.0, 1, 0.0, -12.0), 0.0).steps == 1  # at the same cost, whole
 
 
 @pytest.mark.parametrize("algorithm", ["sac", "tdmpc2", "recurrent"])

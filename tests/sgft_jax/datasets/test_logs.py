@@ -474,9 +474,12 @@ def test_what_minaris_own_library_writes_can_be_read(tmp_path, monkeypatch):
         arrays.pop("infos/qpos")
         episodes.append(minari.data_collector.EpisodeBuffer(id=number, infos={}, **arrays))
     minari.create_dataset_from_buffers(
-        "toy/walk-v0", episodes, observation_space=box, action_space=gymnasium.spaces.Box(-1, 1, (1,), np.float64),
+        "toy/walk-v0",
+        episodes,
+        observation_space=box,
+        action_space=gymnasium.spaces.Box(-1, 1, (1,), np.float64),
         data_format="hdf5",
-    )  # fmt: skip
+    )
     rows, facts, _ = logs.load(tmp_path / "toy" / "walk-v0", gamma=0.9)
     np.testing.assert_array_equal(rows.obs[:, 0], [10 * number + step for number in range(3) for step in range(4)])
     np.testing.assert_array_equal(rows.next_obs, rows.obs + 1)

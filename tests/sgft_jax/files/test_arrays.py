@@ -99,4 +99,4 @@ def test_what_is_no_archive(tmp_path):
     assert refusal(arrays.read_npz, tmp_path / "pipe.npz").endswith("is no plain file")
     assert refusal(arrays.read_npz, tmp_path / "none.npz").endswith("no such file")
     (tmp_path / "text.npz").write_text("text")
-    assert "damaged: File is not a zip file" in refusal(arrays.read_npz, tmp_path / "text.npz")
+    assert "damaged or cut off (File is not a zip file)" in refusal(arrays.read_npz, tmp_path / "text.npz")

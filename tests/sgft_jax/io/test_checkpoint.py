@@ -381,8 +381,14 @@ def test_other_shapes_are_refused(tmp_path, like, words):
         checkpoint.restore(tmp_path, like)
 
 
-def test_another_format_is_refused(saved):
-    path = saved / "checkpoints" / "20" / "manifest.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": 99}))
-    with pytest.raises(UserError, match="written in format 99, this version reads format 1"):
+@pytest.mark.parametrize("number", [checkpoint.FORMAT - 1, 99])
+def test_another_format_is_refused_in_one_line(saved, number):
+    folder = saved / "checkpoints" / "20"
+    path = folder / "manifest.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": number}))
+    with pytest.raises(UserError) as refused:
         checkpoint.restore(saved, make_state(), step=20)
+    assert str(refused.value) == (
+        f"{folder}: written in format {number}, this version reads format {checkpoint.FORMAT} alone; begin again, or "
+        "use the version that wrote it"
+    )

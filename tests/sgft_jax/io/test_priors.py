@@ -16,7 +16,7 @@ from sgft_jax.files.folders import ASIDE
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io import checkpoint, priors
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
-from sgft_jax.learners.actor import ACTORParams, make_actor_of
+from sgft_jax.learners.actor import ActorParams, make_actor_of
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.types import Normalizer, Prior
@@ -24,9 +24,13 @@ from sgft_jax.types import Normalizer, Prior
 KEY = jax.random.key(0)
 NETWORK = NetworkConfig(hidden=(3,))
 CARD = {
-    "task": "hammer", "obs_dim": 4, "act_dim": 2, "gamma": 0.99, "network": jsonable(NETWORK),
+    "task": "hammer",
+    "obs_dim": 4,
+    "act_dim": 2,
+    "gamma": 0.99,
+    "network": jsonable(NETWORK),
     "metrics": {"success": float("nan")},
-}  # fmt: skip
+}
 
 
 def drawn(init):
@@ -64,7 +68,7 @@ def test_every_learner_that_leaves_a_prior_names_its_container(tmp_path):
         "anchored": (params._replace(anchor=params.policy), {"config": planner, "algorithm": "tdmpc2"}),
         "recurrent": (drawn(lambda key: recurrent.extract_params(memory.init(key))), {"config": {"gru": 6}}),
         "actor": (
-            ACTORParams(drawn(make_actor_of("affine", 4, 2, NETWORK).init), make_prior().params.normalizer),
+            ActorParams(drawn(make_actor_of("affine", 4, 2, NETWORK).init), make_prior().params.normalizer),
             {"head": "affine"},
         ),
     }
@@ -112,6 +116,18 @@ def test_a_prior_of_an_unknown_algorithm_is_refused(tmp_path, algorithm):
     folder = save(tmp_path / "prior", algorithm=algorithm)
     with pytest.raises(UserError, match=f"prior.json says algorithm='{algorithm}', which this version does not know"):
         priors.load_prior(folder)
+
+
+def test_a_prior_of_another_format_is_refused_in_one_line(tmp_path):
+    folder = save(tmp_path / "prior")
+    path, number = folder / "manifest.json", checkpoint.FORMAT - 1
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"format": number}))
+    with pytest.raises(UserError) as refused:
+        priors.load_prior(folder)
+    assert str(refused.value) == (
+        f"{folder}: written in format {number}, this version reads format {checkpoint.FORMAT} alone; begin again, or "
+        "use the version that wrote it"
+    )
 
 
 def test_a_prior_of_another_version_is_refused_in_one_line(tmp_path):

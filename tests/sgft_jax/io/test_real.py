@@ -194,8 +194,11 @@ def test_rollouts_may_differ_in_length(tmp_path):
     store.append(whole())
     store.append(whole(steps=5))
     assert [(one.seed, one.number, len(one.rows["obs"])) for one in played(tmp_path)] == [
-        (0, 0, 3), (0, 1, 5), (1, 0, 3), (1, 1, 5),
-    ]  # fmt: skip
+        (0, 0, 3),
+        (0, 1, 5),
+        (1, 0, 3),
+        (1, 1, 5),
+    ]
 
 
 def test_nothing_is_pickled(tmp_path):

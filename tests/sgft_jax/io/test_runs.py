@@ -142,7 +142,10 @@ def test_of_several_runs_all_open_or_none(tmp_path):
 
 def test_a_run_goes_on_with_the_inputs_that_it_began_with(tmp_path):
     given = {tmp_path / "x": {"task": "hammer"}}
-    begin = lambda **more: open_runs(given, kind="finetune", say=lambda _: None, **more)[0].close()  # noqa: E731
+
+    def begin(**more):
+        open_runs(given, kind="finetune", say=lambda _: None, **more)[0].close()
+
     begin(inputs={"priors": ["ab"]})
     begin(resume=True, inputs={"priors": ["ab"], "maps": 3})  # the first start did not tell of maps
     with pytest.raises(UserError, match=r"other priors: they were \['ab'\], now \['cd'\]"):

@@ -46,7 +46,10 @@ def plan(monkeypatch):
         act = mpc.make_act(config, reward=reward, terminated=terminated)
         params = sac.SACParams(None, None, None, jnp.array(gains), STILL)
         keys = jax.random.split(jax.random.key(0), 20)
-        one = lambda key: act(params, mpc.init_carry(config), jnp.array([obs]), key, explore=False)[0][0]  # noqa: E731
+
+        def one(key):
+            return act(params, mpc.init_carry(config), jnp.array([obs]), key, explore=False)[0][0]
+
         return jax.jit(jax.vmap(one))(keys)
 
     return found
@@ -70,23 +73,36 @@ def test_rewards_on_the_way_count(plan):
 
 def test_a_longer_plan_crosses_a_valley(plan):
     """Value falls before it rises: one step stays, two go through, to either side."""
-    value = lambda s: jnp.where(jnp.abs(s) > 1.5, 1.0, -(s**2))  # noqa: E731
+
+    def value(s):
+        return jnp.where(jnp.abs(s) > 1.5, 1.0, -(s**2))
+
     assert (jnp.abs(plan(value, horizon=1)) < 0.2).all()
     assert (jnp.abs(plan(value, horizon=2)) > 0.5).all()
 
 
 def test_nothing_comes_after_a_termination(plan):
     """The highest value lies where the episode ends, and so counts for nothing."""
-    ends = lambda obs, action, after: after[0] > 0.5  # noqa: E731
-    goal = lambda s: 1.0 + s  # noqa: E731
+
+    def ends(obs, action, after):
+        return after[0] > 0.5
+
+    def goal(s):
+        return 1.0 + s
+
     assert (plan(goal) > 0.9).all()
     assert (plan(goal, terminated=ends) <= 0.5).all() and (plan(goal, terminated=ends) > 0.3).all()
 
 
 def test_what_comes_later_is_discounted(plan):
     """0.5 for staying or 1 for going, one step later: worth less at gamma 0.4."""
-    pays = lambda obs, action, after: jnp.where(jnp.abs(after[0]) < 0.1, 0.5, 0.0)  # noqa: E731
-    value = lambda s: jnp.where(s > 0.5, 1.0, 0.0)  # noqa: E731
+
+    def pays(obs, action, after):
+        return jnp.where(jnp.abs(after[0]) < 0.1, 0.5, 0.0)
+
+    def value(s):
+        return jnp.where(s > 0.5, 1.0, 0.0)
+
     assert (plan(value, reward=pays, gamma=0.9) > 0.5).all()
     assert (jnp.abs(plan(value, reward=pays, gamma=0.4)) < 0.1).all()
 
@@ -153,7 +169,10 @@ def test_the_models_learn_and_all_else_stays():
     assert state.replay.size == 63
     new, metrics = tuner().learn(state, jax.random.key(2), 300)
     before, after = prior(), tuner().export(new)
-    same = lambda a, b: jax.tree.map(np.testing.assert_array_equal, a, b)  # noqa: E731
+
+    def same(a, b):
+        return jax.tree.map(np.testing.assert_array_equal, a, b)
+
     same(before._replace(dynamics=None), after._replace(dynamics=None))
     assert metrics["dynamics/mse"].shape == ()
     assert tuner().learn(new, jax.random.key(3), 1)[1]["dynamics/mse"] < metrics["dynamics/mse"]

@@ -71,7 +71,10 @@ def test_weights_choice_and_noise_by_hand(key, explore):
 def test_noise_is_that_of_the_first_step_of_a_plan(key):
     """The elites agree on the first step, so its spread is the floor, 0.05; they differ by 2 in the second one."""
     apart = jnp.array([[[0.1], [-1.0]], [[0.1], [1.0]]])
-    score = lambda sequence: jnp.where((sequence[0, 0] == 0.1) & (jnp.abs(sequence[1, 0]) == 1.0), 0.0, -1e6)  # noqa: E731
+
+    def score(sequence):
+        return jnp.where((sequence[0, 0] == 0.1) & (jnp.abs(sequence[1, 0]) == 1.0), 0.0, -1e6)
+
     plan = run(score, config=mppi.MPPIConfig(samples=8, elites=2, iterations=2), proposals=apart, explore=True)
     actions = jax.vmap(plan)(jax.random.split(key, 1000))[0]
     assert actions.std() == pytest.approx(0.05, rel=0.1)
@@ -98,7 +101,9 @@ def test_no_score_at_all_gives_a_finite_plan(key):
 
 
 def test_a_good_proposal_is_taken(key):
-    needle = lambda s: 50 * jnp.all(s == TARGET) - jnp.sum(s**2)  # noqa: E731
+    def needle(s):
+        return 50 * jnp.all(s == TARGET) - jnp.sum(s**2)
+
     action, mean = run(needle, proposals=TARGET[None])(key)
     np.testing.assert_allclose(action, TARGET[0])
     np.testing.assert_allclose(mean, TARGET, atol=1e-4)
@@ -116,7 +121,10 @@ def test_vmap_equals_a_loop_and_keys_decide(key):
 
 def test_hyperparameters_vmap(key):
     greed = jnp.array([1e-6, 100.0])
-    plan = lambda t: mppi.plan(CONFIG, HYPER._replace(temperature=t), quadratic, NONE, TARGET, key, explore=False)  # noqa: E731
+
+    def plan(t):
+        return mppi.plan(CONFIG, HYPER._replace(temperature=t), quadratic, NONE, TARGET, key, explore=False)
+
     error = jnp.abs(jax.jit(jax.vmap(plan))(greed)[1] - TARGET[None]).max((1, 2))
     assert error[0] != error[1]
 

@@ -106,24 +106,36 @@ def test_numbers_too_large_for_arithmetic_are_not_sound(large):
 
 
 def vector(
-    obs=((0.0,), (1.0,)), reward=(1.0, 2.0), terminated=(False, True), truncated=(False, False), infos=None,
+    obs=((0.0,), (1.0,)),
+    reward=(1.0, 2.0),
+    terminated=(False, True),
+    truncated=(False, False),
+    infos=None,
     same_step=False,
-):  # fmt: skip
+):
     return answers.vector("arms", (np.array(obs), reward, terminated, truncated, infos), 2, same_step=same_step)
 
 
 def test_a_vector_environment_answers_for_each_of_its_environments():
     infos = {
-        "is_success": np.array([True, False]), "_is_success": np.array([True, False]), "invalid": np.array([[0], [1]]),
-        "final_obs": np.array([None, np.array([7.0])], object), "_final_obs": np.array([False, True]),
-        "final_info": {"success": np.array([0, 1]), "_success": [False, True]}, "_final_info": [False, True],
-        "clock": 3.0, "names": "ab",
-    }  # fmt: skip
+        "is_success": np.array([True, False]),
+        "_is_success": np.array([True, False]),
+        "invalid": np.array([[0], [1]]),
+        "final_obs": np.array([None, np.array([7.0])], object),
+        "_final_obs": np.array([False, True]),
+        "final_info": {"success": np.array([0, 1]), "_success": [False, True]},
+        "_final_info": [False, True],
+        "clock": 3.0,
+        "names": "ab",
+    }
     first, second = vector(reward=np.array([[1.0], [2.0]]), infos=infos)
     assert first[0] == 0.0 and second[0] == 7.0 and first[2] is False and second[2] is True
     assert first[4].keys() == {"is_success", "invalid"} and second[4].keys() == {
-        "invalid", "final_obs", "final_info", "success",
-    }  # fmt: skip
+        "invalid",
+        "final_obs",
+        "final_info",
+        "success",
+    }
     pair = [answers.step("arms", one, LOW, HIGH) for one in (first, second)]
     assert [one.reward for one in pair] == [1.0, 2.0] and [one.invalid for one in pair] == [False, True]
     assert [one.success for one in pair] == [True, True]

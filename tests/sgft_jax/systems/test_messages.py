@@ -9,12 +9,25 @@ from sgft_jax.systems.messages import Began, Hello, Moved, VersionError, read
 from sgft_jax.systems.robot_client import pack, unpack
 
 HELLO = {
-    "version": 2, "token": "t", "robot": "r", "obs_size": 2, "action_size": 1, "period": 0.1, "answer_within": 0.05,
-}  # fmt: skip
+    "version": 2,
+    "token": "t",
+    "robot": "r",
+    "obs_size": 2,
+    "action_size": 1,
+    "period": 0.1,
+    "answer_within": 0.05,
+}
 MOVED = {
-    "episode": 1, "step": 0, "sent": b"", "obs": b"", "reward": None, "terminated": False, "truncated": False,
-    "success": None, "late": False,
-}  # fmt: skip
+    "episode": 1,
+    "step": 0,
+    "sent": b"",
+    "obs": b"",
+    "reward": None,
+    "terminated": False,
+    "truncated": False,
+    "success": None,
+    "late": False,
+}
 
 
 def signed(body):
@@ -30,23 +43,51 @@ def test_messages_by_hand():
 @pytest.mark.parametrize(
     "data",
     [
-        "text", b"", b"nonsense", b"x" * 70_000, signed(b"\xc1"), signed(b"\x80"), signed(msgpack.packb([1])),
+        "text",
+        b"",
+        b"nonsense",
+        b"x" * 70_000,
+        signed(b"\xc1"),
+        signed(b"\x80"),
+        signed(msgpack.packb([1])),
         *(signed(msgpack.packb({"type": kind})) for kind in ([1], {}, None, 7, "fly", "reset", "x" * 60_000)),
-        signed(b"\x81\xa4type\xa2\xff\xfe"), signed(b"\x82\xa4type\xa6rested\xa1z" + b"\x91" * 60_000),
-        signed(b"\xdd\xff\xff\xff\xff"), signed(b"\x82\xa4type\xa6rested\xa7episode\xc6\xff\xff\xff\xff"),
+        signed(b"\x81\xa4type\xa2\xff\xfe"),
+        signed(b"\x82\xa4type\xa6rested\xa1z" + b"\x91" * 60_000),
+        signed(b"\xdd\xff\xff\xff\xff"),
+        signed(b"\x82\xa4type\xa6rested\xa7episode\xc6\xff\xff\xff\xff"),
         signed(msgpack.packb({"type": "rested", "episode": msgpack.ExtType(5, b"x")})),
-        signed(msgpack.packb({"type": "rested", "episode": msgpack.Timestamp(0)})), pack("rested", episode=-1),
-        *(pack("hello", **{**HELLO, **more}) for more in (
-            {"answer_within": float("nan")}, {"answer_within": -1.0}, {"answer_within": 1e9}, {"token": b"t"},
-            {"obs_size": -1}, {"obs_size": True}, {"obs_size": 1.5}, {"period": "0.1"}, {"version": "2"},
-        )),
-        *(pack("moved", **{**MOVED, **more}) for more in (
-            {"obs": "text"}, {"reward": "much"}, {"terminated": None}, {"terminated": 1}, {"success": 0}, {"step": 1.0},
-        )),
-        pack("failed", episode=1), pack("failed", episode=1, reason=None),
+        signed(msgpack.packb({"type": "rested", "episode": msgpack.Timestamp(0)})),
+        pack("rested", episode=-1),
+        *(
+            pack("hello", **{**HELLO, **more})
+            for more in (
+                {"answer_within": float("nan")},
+                {"answer_within": -1.0},
+                {"answer_within": 1e9},
+                {"token": b"t"},
+                {"obs_size": -1},
+                {"obs_size": True},
+                {"obs_size": 1.5},
+                {"period": "0.1"},
+                {"version": "2"},
+            )
+        ),
+        *(
+            pack("moved", **{**MOVED, **more})
+            for more in (
+                {"obs": "text"},
+                {"reward": "much"},
+                {"terminated": None},
+                {"terminated": 1},
+                {"success": 0},
+                {"step": 1.0},
+            )
+        ),
+        pack("failed", episode=1),
+        pack("failed", episode=1, reason=None),
     ],
     ids=lambda data: repr(data[4:40]),
-)  # fmt: skip
+)
 def test_what_is_no_message_is_one_line(data):
     with pytest.raises(ValueError, match=r"^(is|has|was|does) ") as stopped:
         read(data)

@@ -401,9 +401,15 @@ def test_a_connection_lost_between_steps_ends_the_episode_though_the_robot_is_ba
 
 def hello(remote, **changes):
     fields = {
-        "version": 2, "token": remote.token, "robot": "r", "obs_size": 2, "action_size": 2, "period": None,
-        "answer_within": None, **changes,
-    }  # fmt: skip
+        "version": 2,
+        "token": remote.token,
+        "robot": "r",
+        "obs_size": 2,
+        "action_size": 2,
+        "period": None,
+        "answer_within": None,
+        **changes,
+    }
     with connect(remote.url) as socket:
         socket.send(pack("hello", **fields))
         return unpack(socket.recv(timeout=5))
@@ -732,10 +738,17 @@ def test_idle_strangers_cannot_keep_the_robot_out(pair):
 @pytest.mark.parametrize(
     ("host", "refused"),
     [
-        ("evil.example", True), ("", True), ("a b", True), ("[::1", True), ("localhost:1", False), ("[::1]:4", False),
-        ("10.0.0.7", False), (socket.gethostname(), False), (f"{socket.gethostname()}.local:8765", False),
+        ("evil.example", True),
+        ("", True),
+        ("a b", True),
+        ("[::1", True),
+        ("localhost:1", False),
+        ("[::1]:4", False),
+        ("10.0.0.7", False),
+        (socket.gethostname(), False),
+        (f"{socket.gethostname()}.local:8765", False),
     ],
-)  # fmt: skip
+)
 def test_a_foreign_host_is_refused(host, refused, monkeypatch):
     remote = Remote(2, 2, say=lambda line: None)
     monkeypatch.setattr("websockets.client.build_host", lambda *given, **more: host)
@@ -798,9 +811,14 @@ def robot_by_hand(said=None):
 
 
 MOVED = {
-    "sent": np.zeros(2), "obs": np.ones(2), "reward": 1.0, "terminated": False, "truncated": False, "success": None,
+    "sent": np.zeros(2),
+    "obs": np.ones(2),
+    "reward": 1.0,
+    "terminated": False,
+    "truncated": False,
+    "success": None,
     "late": False,
-}  # fmt: skip
+}
 
 
 def test_messages_that_a_robot_cannot_mean_are_dropped_and_nothing_is_lost():
@@ -832,10 +850,13 @@ def test_answers_that_nobody_has_asked_for_take_no_memory():
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"sent": np.array([1e30, 0])}, {"sent": np.array([1.1, 0])}, {"obs": np.array([3e38, 0])}, {"obs": np.zeros(3)},
+        {"sent": np.array([1e30, 0])},
+        {"sent": np.array([1.1, 0])},
+        {"obs": np.array([3e38, 0])},
+        {"obs": np.zeros(3)},
     ],
     ids=str,
-)  # fmt: skip
+)
 def test_a_step_with_numbers_that_cannot_be_is_in_doubt(wrong):
     with robot_by_hand() as (remote, _, answered):
         assert answered(lambda: remote.step(np.zeros(2)), "moved", **{**MOVED, **wrong})[-1] == {"invalid": True}
