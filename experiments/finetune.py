@@ -2,11 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
-from envs import gaps
 from experiments.runner import cli
-from experiments.runner.finetune_args import FinetuneArgs, arguments, check, priors_of, resolved
+from experiments.runner.finetune_args import FinetuneArgs, arguments
+from experiments.runner.start import finetune
 from sgft_jax.methods import DEFAULT, all_methods
 
 
@@ -28,17 +27,6 @@ def _table() -> str:
     """The methods, a line each."""
     rows = [("", m.name, f"{m.description} ({m.source}); prior: {m.prior}") for m in all_methods().values()]
     return "\n".join(["methods:", *cli.columns(rows)])
-
-
-def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:
-    """Fine-tuning runs from (or back) to disk, one per real system; returns their summaries in the order of `real`."""
-    args = replace(args, real=gaps.each(args.real))
-    method, seeds = check(args)
-    args = resolved(args)
-    priors = priors_of(args)
-    from experiments.runner.finetune_run import run  # JAX starts here
-
-    return run(args, method, seeds, priors)
 
 
 if __name__ == "__main__":

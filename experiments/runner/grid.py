@@ -7,7 +7,6 @@ from typing import Any
 import envs
 from envs import extend, gaps
 from envs.types import UserError
-from experiments.finetune import finetune
 from experiments.runner import cells
 from experiments.runner.cells import Cell, Kind, WorkArgs
 from experiments.runner.finetune_args import (
@@ -20,6 +19,7 @@ from experiments.runner.finetune_args import (
     with_settings,
 )
 from experiments.runner.options import at_least_one, check_task, not_negative, seed_list, without_repeats
+from experiments.runner.start import finetune
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import NAMES, get_method

@@ -11,6 +11,7 @@ from tyro.conf import arg
 from envs import extend
 from envs.gaps import SIM, title
 from envs.types import UserError
+from experiments.runner import cli
 from experiments.runner.options import (
     Impl,
     Successors,
@@ -23,9 +24,10 @@ from experiments.runner.options import (
     seeds_name,
     without_repeats,
 )
+from sgft_jax.hybrid.presets import preset_for, say_preset
 from sgft_jax.io.runs import NO_DATA, NO_SIMULATOR, check_start
 from sgft_jax.methods import get_method
-from sgft_jax.train.schedule import FLEET, Schedule
+from sgft_jax.train.schedule import FLEET, Schedule, describe
 from sgft_jax.types import Fixed
 
 DEFAULT = "h2oplus"
@@ -91,6 +93,24 @@ class HybridArgs:
     """Expert: render an episode of the first seed in the real system, where MuJoCo can render."""
 
 
+def arguments(method: str, *, preset: str = "", data: Path | None = None, **changes: Any) -> HybridArgs:
+    """The arguments with which a method runs unless the user says otherwise, and any changes to these.
+
+    preset: "" for the one that suits the data, if the method has presets by data set, else the first.
+    """
+    chosen = get_method(method, "fixed")
+    preset = preset or ("" if data is None else preset_for(chosen, data_name(data)))
+    options = cli.choose("--preset", preset or next(iter(chosen.presets)), dict(chosen.presets))
+    return HybridArgs(**{"method": method, "preset": preset, "options": options, "data": data, **changes})
+
+
+def choices(args: HybridArgs, method: Fixed) -> list[str]:
+    """What was chosen by name or by data, in words."""
+    preset = say_preset(method, args.preset, data_name(args.data)) if method.by_data and args.data else ""
+    schedule = "" if method.kind == "offline" else describe(args.schedule)
+    return [f"{method.name}: {words}" for words in (preset, schedule) if words]
+
+
 def gaps_of(args: HybridArgs, method: Fixed) -> tuple[str, ...]:
     """The simulators, or the one word that stands for none."""
     return (NO_SIMULATOR,) if method.kind == "offline" else args.gap
@@ -138,7 +158,7 @@ def check(args: HybridArgs) -> tuple[Fixed, list[int]]:
 
 def folders(args: HybridArgs, method: Fixed) -> Sequence[Path]:
     """The run folders of all simulators; raises UserError where two would share one."""
-    found = [run_folder(args, gap) for gap in gaps_of(args, method)]
-    if twice := [folder for folder in found if found.count(folder) > 1]:
+    paths = [run_folder(args, gap) for gap in gaps_of(args, method)]
+    if twice := [path for path in paths if paths.count(path) > 1]:
         raise UserError(f"--gap {' '.join(args.gap)}: two of them would share the folder {twice[0]}; name it once")
-    return found
+    return paths

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Literal
 from envs import extend, gaps
 from envs.gaps import SIM
 from envs.types import UserError, unknown
-from experiments.hybrid import arguments, hybrid
 from experiments.runner import cells, cli
 from experiments.runner.cells import Cell, Kind, WorkArgs
 from experiments.runner.hybrid_args import (
@@ -20,6 +19,7 @@ from experiments.runner.hybrid_args import (
     VOLATILE,
     HybridArgs,
     SchedulePreset,
+    arguments,
     data_name,
     gaps_of,
     run_folder,
@@ -32,6 +32,7 @@ from experiments.runner.options import (
     seed_list,
     without_repeats,
 )
+from experiments.runner.start import hybrid
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.hybrid.presets import say_preset
 from sgft_jax.io.runs import check_folder

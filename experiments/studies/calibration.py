@@ -12,7 +12,7 @@ from experiments.runner.cli import columns
 from experiments.runner.diagnose_run import load, play_simulated, read
 from experiments.runner.options import prior_folders
 from experiments.runner.rollouts import task_of
-from experiments.studies.diagnose_calibrate import CalibrateArgs
+from experiments.studies.calibrate_args import CalibrateArgs
 from sgft_jax import stacking
 from sgft_jax.analysis import prediction, tables
 from sgft_jax.analysis.prediction import AHEAD, Cases, Inputs
@@ -31,14 +31,14 @@ def calibrate(args: CalibrateArgs, runs: list[Path], checked: list[Path]) -> tup
     """
     if not checked and len({(curve.task, curve.gap) for curve in map(read_curve, runs)}) < 2:
         raise UserError("--runs: these runs are on one gap; name runs on others too, or some with --check")
-    own = gather(args, runs)
-    coefficients = prediction.fit(own[-1])
+    cases = gather(args, runs)
+    coefficients = prediction.fit(cases[-1])
     if checked:
-        fitted, held = own, gather(args, checked)
+        fitted, held = cases, gather(args, checked)
         words = f"{len(checked)} other runs, predicted from {len(runs)}"
     else:
-        out = prediction.held_out(own[-1].gaps)
-        fitted, held = ([case.of(some) for case in own] for some in (~out, out))
+        out = prediction.held_out(cases[-1].gaps)
+        fitted, held = ([case.of(members) for case in cases] for members in (~out, out))
         words = f"every second gap of {len(runs)} runs, predicted from the other gaps"
     fits = [prediction.gain(new.inputs, prediction.fit(old)) for old, new in zip(fitted, held, strict=True)]
     final = held[-1]
@@ -48,7 +48,7 @@ def calibrate(args: CalibrateArgs, runs: list[Path], checked: list[Path]) -> tup
     lines[f"100 - success of the same {COUNTS[-1]} rollouts"] = (1.0 - final.played, final)
     bands = {name: prediction.agreement(*pair) for name, pair in lines.items()}
     rows = prediction.table(fits[-1], final)
-    found = {
+    summary = {
         "runs": [str(run) for run in runs],
         "checked": [str(run) for run in checked],
         "members": len(final.gains),
@@ -56,26 +56,29 @@ def calibrate(args: CalibrateArgs, runs: list[Path], checked: list[Path]) -> tup
         "rank_correlation": {name: jsonable(band) for name, band in bands.items()},
         "table": [dict(zip(("low", "high", "members", "predicted", "measured"), row, strict=True)) for row in rows],
     }
-    return jsonable(found), _lines(words, final, coefficients, bands, rows)
+    return jsonable(summary), _lines(words, final, coefficients, bands, rows)
 
 
 def _lines(
     words: str, cases: Cases, coefficients: prediction.Coefficients, bands: dict, rows: Sequence[tuple]
 ) -> list[str]:
-    names = (f"{name} {value:.3f}" for name, value in coefficients._asdict().items())
-    table = [(f"{100 * low:.0f} to {100 * high:.0f}", str(n), f"{100 * guess:+.0f}", f"{100 * real:+.0f}")
-             for low, high, n, guess, real in rows]  # fmt: skip
+    sizes = f"{len(cases.gains)} members, {len(set(cases.gaps))} gaps, {len(set(cases.priors))} priors"
+    gain = f"mean gain in {AHEAD} rollouts or all there are {100 * cases.gains.mean():+.0f} points"
+    correlations = [(name, tables.number(band, "correlation", digits=2)) for name, band in bands.items()]
+    table = [
+        (f"{100 * low:.0f} to {100 * high:.0f}", str(n), f"{100 * predicted:+.0f}", f"{100 * measured:+.0f}")
+        for low, high, n, predicted, measured in rows
+    ]
+    values = ", ".join(f"{name} {value:.3f}" for name, value in coefficients._asdict().items())
     return [
-        f"{words}: {len(cases.gains)} members, {len(set(cases.gaps))} gaps, {len(set(cases.priors))} priors; mean gain "
-        f"in {AHEAD} rollouts or all there are {100 * cases.gains.mean():+.0f} points",
+        f"{words}: {sizes}; {gain}",
         "",
-        *columns([("rank correlation with the gain", "[95 %, priors drawn first]"),
-                  *((name, tables.number(band, "correlation", digits=2)) for name, band in bands.items())]),
+        *columns([("rank correlation with the gain", "[95 %, priors drawn first]"), *correlations]),
         "",
         *columns([("predicted gain, points", "members", "mean predicted", "mean measured"), *table]),
         "",
-        f"coefficients from {COUNTS[-1]} rollouts of all of --runs: {', '.join(names)}",
-    ]  # fmt: skip
+        f"coefficients from {COUNTS[-1]} rollouts of all of --runs: {values}",
+    ]
 
 
 def gather(args: CalibrateArgs, runs: Sequence[Path]) -> list[Cases]:
@@ -86,10 +89,8 @@ def gather(args: CalibrateArgs, runs: Sequence[Path]) -> list[Cases]:
     facts: list[tuple[Any, ...]] = []
     for run in runs:
         config, curve, task = read_config(run), read_curve(run).of("success"), task_of(run, args.task)
-        folders = prior_folders(
-            args.prior or (Path(config["prior"]) if config.get("prior") else None),
-            out=args.out, task=task, preset=config.get("preset") or args.preset,
-        )  # fmt: skip
+        begun, preset = Path(config["prior"]) if config.get("prior") else None, config.get("preset") or args.preset
+        folders = prior_folders(args.prior or begun, out=args.out, task=task, preset=preset)
         key = (task, *folders)
         if key not in examiners:
             env, priors = load(task, args.impl, folders)
@@ -98,13 +99,13 @@ def gather(args: CalibrateArgs, runs: Sequence[Path]) -> list[Cases]:
             examiners[key] = (env, priors, examiner, params, examiner.control(params, stacking.stack(simulated)))
         env, priors, examiner, *known = examiners[key]
         rollouts, which = read(run, env, priors, COUNTS[-1])
-        if (there := rollouts[0].valid.shape[0]) < COUNTS[-1]:
-            raise UserError(f"{run}: holds {there} recorded rollouts, a calibration needs {COUNTS[-1]}")
+        if (count := rollouts[0].valid.shape[0]) < COUNTS[-1]:
+            raise UserError(f"{run}: holds {count} recorded rollouts, a calibration needs {COUNTS[-1]}")
         held = curve.x <= AHEAD
         params, control = (stacking.member(x, jnp.array(which)) for x in known)
         examined = examiner.examine(params, control, stacking.stack(rollouts), COUNTS)
-        for member, (own, p) in enumerate(zip(examined, which, strict=True)):
-            for i, found in enumerate(own.found):
+        for member, (diagnosis, p) in enumerate(zip(examined, which, strict=True)):
+            for i, found in enumerate(diagnosis.found):
                 inputs[i].append(prediction.inputs_of(found))
                 played[i].append(found["success"])
             success = curve.values[member, held]
@@ -115,4 +116,4 @@ def gather(args: CalibrateArgs, runs: Sequence[Path]) -> list[Cases]:
             print(f"diagnosed: {run}", flush=True)
     zero_shot, gains, curves, names, priors = zip(*facts, strict=True)
     rest = (np.array(zero_shot), np.array(gains), curves, np.array(names), np.array(priors))
-    return [Cases(Inputs(*np.array(x).T), np.array(own), *rest) for x, own in zip(inputs, played, strict=True)]
+    return [Cases(Inputs(*np.array(x).T), np.array(success), *rest) for x, success in zip(inputs, played, strict=True)]

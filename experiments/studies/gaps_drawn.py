@@ -21,7 +21,7 @@ from experiments.runner.cli import columns
 from experiments.runner.evaluation import play
 from experiments.runner.gaps_run import FINAL_SEED, episode_key, percent, rate, systems, train
 from experiments.studies import gaps_choose
-from experiments.studies.gaps_draw import DrawArgs
+from experiments.studies.gaps_draw_args import DrawArgs
 from sgft_jax import api, stacking
 from sgft_jax.files.jsonfile import differences, jsonable, write_json
 from sgft_jax.identify import Identified, Interface, command_interface

@@ -13,24 +13,21 @@ from envs.types import UserError
 from sgft_jax.methods import get_method
 
 _UTD = (2.0, 8.0, 20.0)  # from an update or two per step to RLPD's and MBPO's twenty
-_RATES = {"lr_actor": (3e-5, 1e-4, 3e-4), "lr_critic": (1e-4, 3e-4, 1e-3)}
+_ACTOR, _CRITIC = (3e-5, 1e-4, 3e-4), (1e-4, 3e-4, 1e-3)  # rates
+_RATES = {"lr_actor": _ACTOR, "lr_critic": _CRITIC}
 _WARMUP = (None, 0, 5_000)  # as long as argued here, as printed in the paper, longer
 _SWITCHED = {"critic_warmup": (None, 0), "lr_warmup": (None, 0)}  # as argued here, or none
 _ALPHA = (0.003, 0.01, 0.03)
-_SHARE = (0.25, 0.5, 0.75)
+_SHARE = {"simulated_share": (0.25, 0.5, 0.75)}
+_BATCH = {"batch_size": (128, 256, 512)}
 _SHORT = {"utd": _UTD, **_RATES, "horizon": (1, 2, 4), **_SWITCHED}
-_SHAPED = {
-    "utd": _UTD, "lr_actor": (1e-4, 3e-4), "lr_critic": _RATES["lr_critic"], "reset_critic": (True, False), **_SWITCHED,
-}  # fmt: skip
-_PLANNER = {
-    "utd": (1.0, 2.0, 8.0), "lr": (1e-4, 3e-4, 1e-3), "horizon": (2, 3, 4), "batch_size": (128, 256, 512),
-    "plan_samples": (256, 512, 1024),
-}  # fmt: skip
+_SHAPED = {"utd": _UTD, "lr_actor": (1e-4, 3e-4), "lr_critic": _CRITIC, "reset_critic": (True, False), **_SWITCHED}
+_PLANNER = {"utd": (1.0, 2.0, 8.0), "lr": _CRITIC, "horizon": (2, 3, 4), **_BATCH, "plan_samples": (256, 512, 1024)}
 _TDMPC2 = {**_PLANNER, "utd": (1.0, 8.0), "lr_warmup": (None, 0)}  # 8 and none are what `sgft-mpc` has
 
 SPACES: dict[str, dict[str, tuple[Any, ...]]] = {
     "sac": {"utd": (1.0, 2.0, 8.0), **_RATES, "critic_warmup": _WARMUP, "lr_warmup": (None, 0, 1_000)},
-    "guarded": {"utd": _UTD, **_RATES, "anchor": (0.0, 0.03, 0.1), "simulated_share": _SHARE},
+    "guarded": {"utd": _UTD, **_RATES, "anchor": (0.0, 0.03, 0.1), **_SHARE},
     "sac-reset": {"utd": _UTD, **_RATES, "alpha": _ALPHA, "critic_warmup": _WARMUP},
     "pbrs": {**_SHAPED, "clip_shaped": (None, 2.0)},
     "mbpo": _SHORT,
@@ -39,37 +36,28 @@ SPACES: dict[str, dict[str, tuple[Any, ...]]] = {
     "sgft-relabel": _SHORT,
     "sgft-parts": _SHORT,
     "sgft": _SHORT,
-    "frozen-critic": {
-        "utd": _UTD, "lr_actor": _RATES["lr_actor"], "alpha": _ALPHA, "actor_ramp": (0, 1_000, 5_000),
-        "batch_size": (128, 256, 512),
-    },
+    "frozen-critic": {"utd": _UTD, "lr_actor": _ACTOR, "alpha": _ALPHA, "actor_ramp": (0, 1_000, 5_000), **_BATCH},
     "sac-online": {
-        "utd": (2.0, 5.0, 10.0), "lr_actor": (1e-5, 3e-5, 1e-4), "lr_critic": _RATES["lr_critic"],
-        "simulated_share": _SHARE, **_SWITCHED,
+        "utd": (2.0, 5.0, 10.0),
+        "lr_actor": (1e-5, 3e-5, 1e-4),
+        "lr_critic": _CRITIC,
+        **_SHARE,
+        **_SWITCHED,
     },
-    "rlpd": {
-        "utd": (10.0, 20.0, 40.0), "lr_actor": (1e-4, 3e-4, 1e-3), "lr_critic": _RATES["lr_critic"],
-        "target_critics": (1, 2), "simulated_share": _SHARE, "critic_warmup": (None, 0),
-    },
-    "iql": {
-        "utd": _UTD, "lr_actor": (1e-4, 3e-4, 1e-3), "expectile": (0.7, 0.8, 0.9), "beta": (1.0, 3.0, 10.0),
-        "simulated_share": _SHARE,
-    },
+    "rlpd": {"utd": (10.0, 20.0, 40.0), "lr_actor": _CRITIC, "lr_critic": _CRITIC, "target_critics": (1, 2), **_SHARE}
+    | {"critic_warmup": (None, 0)},
+    "iql": {"utd": _UTD, "lr_actor": _CRITIC, "expectile": (0.7, 0.8, 0.9), "beta": (1.0, 3.0, 10.0), **_SHARE},
     "tdmpc2": _TDMPC2,
     "sgft-tdmpc2": _TDMPC2,
     "sgft-tdmpc2-code": _PLANNER,
-    "sgft-mpc": {
-        "utd": _UTD, "lr_dynamics": (1e-4, 3e-4, 1e-3), "horizon": (1, 2, 4), "plan_noise": (0.25, 0.5, 1.0),
-        "plan_samples": (64, 128, 256),
-    },
-}  # fmt: skip
+    "sgft-mpc": {"utd": _UTD, "lr_dynamics": _CRITIC, "horizon": (1, 2, 4), "plan_noise": (0.25, 0.5, 1.0)}
+    | {"plan_samples": (64, 128, 256)},
+}
 
 # Tried before others, if there are trials enough: what papers print, what practice here has shown.
-_AS_PRINTED = {
-    "reset_critic": True, "clip_shaped": None, "branch_noise": 0.0, "critic_warmup": 0, "lr_warmup": 0,
-    "dynamics_warmup": 0, "actor_ramp": 0,
-}  # fmt: skip
 _COLD = {"critic_warmup": 0, "lr_warmup": 0}
+_AS_PRINTED = {"reset_critic": True, "clip_shaped": None, "branch_noise": 0.0, **_COLD}
+_AS_PRINTED |= {"dynamics_warmup": 0, "actor_ramp": 0}
 FIRST: dict[str, tuple[dict[str, Any], ...]] = {
     "guarded": ({"anchor": 0.1}, {"utd": 1.0}),
     "sac": ({"utd": 8.0}, _COLD),

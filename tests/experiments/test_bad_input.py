@@ -22,12 +22,12 @@ COMMANDS = {
     "figures": lambda run, out: figures.main(figures.FiguresArgs(out=out)),
     "scoreboard": lambda run, out: scoreboard.main(scoreboard.ScoreboardArgs((), out=out)),
     "gaps": lambda run, out: gaps.measure(gaps.GapsArgs(prior=PRIOR, out=out)),
-    "gaps_draw": lambda run, out: gaps_draw.draw(gaps_draw.DrawArgs(1, prior=PRIOR, out=out)),
+    "gaps_draw": lambda run, out: gaps_draw.draw(gaps_draw.DrawArgs(count=1, prior=PRIOR, out=out)),
     "bullet": lambda run, out: bullet.check(bullet.BulletArgs(out=out)),
 }
 OTHER = {
     "--export": lambda run, out: figures.main(figures.FiguresArgs(export=out)),
-    "--to": lambda run, out: gaps_draw.draw(gaps_draw.DrawArgs(1, choose=1, to=out / "set.toml", out=run)),
+    "--to": lambda run, out: gaps_draw.draw(gaps_draw.DrawArgs(count=1, choose=1, to=out / "set.toml", out=run)),
 }
 
 
