@@ -130,7 +130,7 @@ class _Networks(NamedTuple):
     config: H2OConfig
     actor: Network
     critic: Network
-    ratio: ratio.Ratio
+    ratio: ratio.RatioConfig
     optimiser: optax.GradientTransformation
 
 
@@ -140,7 +140,7 @@ def _networks(config: H2OConfig) -> _Networks:
         config=config,
         actor=make_affine_actor(*sizes, config.network, output_gain=gain),
         critic=make_critic(*sizes, config.network, output_gain=gain),
-        ratio=ratio.make_ratio(ratio.RatioConfig(*sizes, config.ratio_network, noise=config.ratio_noise)),
+        ratio=ratio.RatioConfig(*sizes, config.ratio_network, noise=config.ratio_noise),
         optimiser=optim.adam(),
     )
 
@@ -154,7 +154,7 @@ def init(config: H2OConfig, key: Key, hyper: H2OHyper | None = None) -> H2OState
         critic=optim.start(nets.optimiser, critic),
         target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
         log_alpha=optim.start(nets.optimiser, jnp.log(numbers.alpha)),
-        ratio=nets.ratio.init(keys[2]),
+        ratio=ratio.init(nets.ratio, keys[2]),
         spread=jnp.zeros(config.obs_dim),
         normalizer=normalizer.identity(config.obs_dim),
         hyper=numbers,
@@ -210,7 +210,7 @@ def make_h2o(config: H2OConfig, hyper: H2OHyper | None = None) -> Learner:
 
 def _gaps(nets: _Networks, state: H2OState, batch: Batch, key: Key) -> Array:
     """KL(P_sim || P) at every pair [B], nats: the mean of log P_sim / P over noisy copies of its successor."""
-    std, log_ratio = state.hyper.spread_scale * state.spread, partial(nets.ratio.log_ratio, state.ratio)
+    std, log_ratio = state.hyper.spread_scale * state.spread, partial(ratio.log_ratio, nets.ratio, state.ratio)
 
     def gap(row: Batch, key: Key) -> Array:
         noise = jax.random.normal(key, (nets.config.successors, nets.config.obs_dim))

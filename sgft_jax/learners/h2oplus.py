@@ -140,7 +140,7 @@ class _Networks(NamedTuple):
     actor: Network
     critic: Network
     value: Network
-    ratio: ratio.Ratio
+    ratio: ratio.RatioConfig
     optimiser: optax.GradientTransformation
 
 
@@ -151,7 +151,7 @@ def _networks(config: H2OPlusConfig) -> _Networks:
         actor=make_affine_actor(*sizes, config.network, output_gain=gain),
         critic=make_critic(*sizes, config.network, members=config.critics, output_gain=gain),
         value=make_value(config.obs_dim, config.network, output_gain=gain),
-        ratio=ratio.make_ratio(ratio.RatioConfig(*sizes, config.ratio_network, noise=config.ratio_noise)),
+        ratio=ratio.RatioConfig(*sizes, config.ratio_network, noise=config.ratio_noise),
         optimiser=optim.adam(),
     )
 
@@ -166,7 +166,7 @@ def init(config: H2OPlusConfig, key: Key, hyper: H2OPlusHyper | None = None) -> 
         target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
         value=optim.start(nets.optimiser, nets.value.init(keys[2])),
         log_alpha=optim.start(nets.optimiser, jnp.log(numbers.alpha)),
-        ratio=nets.ratio.init(keys[3]) if config.ratio else None,
+        ratio=ratio.init(nets.ratio, keys[3]) if config.ratio else None,
         normalizer=normalizer.identity(config.obs_dim),
         hyper=numbers,
         step=jnp.int32(0),
