@@ -166,7 +166,7 @@ def act(
     config: H2OConfig, state: H2OState, carry: tuple[()], obs: Array, key: Key, *, explore: bool | Array
 ) -> tuple[Array, tuple[()]]:
     """Action [act_dim] in [-1, 1] for a raw obs [obs_dim], and the carry as it was."""
-    return steps.act(_networks(config).actor, state, obs, key, explore=explore), carry
+    return steps.act(_networks(config), state, obs, key, explore=explore), carry
 
 
 def update(config: H2OConfig, state: H2OState, batch: Batch, key: Key) -> tuple[H2OState, Metrics]:
@@ -183,20 +183,13 @@ def update(config: H2OConfig, state: H2OState, batch: Batch, key: Key) -> tuple[
     shares, weights = log_shares(gaps, batch), jax.vmap(ratio.weight)(log_w)
     batch = normalizer.normalize_rows(state.normalizer, batch)
 
-    entropy = hyper.entropy_per_dim * config.act_dim if config.tune_alpha else None
-    actor, log_alpha, of_actor = steps.step_policy(
-        nets.actor, nets.critic, nets.optimiser, state, batch, key_actor, target_entropy=entropy
-    )
-    critic, of_critic = steps.step_mixed_critic(
-        nets.critic.apply,
-        nets.optimiser,
-        state.critic,
-        batch,
-        _targets(nets, state, batch, key_target),
-        weights,
-        rate=hyper.lr_critic,
-        penalty=lambda params, q: hyper.conservatism * penalty(q, shares, batch),
-    )
+    def push_down(params: PyTree, q: Array) -> Array:
+        del params
+        return hyper.conservatism * penalty(q, shares, batch)
+
+    actor, log_alpha, of_actor = steps.step_policy(nets, state, batch, key_actor)
+    targets = steps.soft_targets(nets, state, batch, key_target, alpha=0.0)  # without the entropy
+    critic, of_critic = steps.step_mixed_critic(nets, state, batch, targets, weights, penalty=push_down)
     target = optax.incremental_update(critic.params, state.target_critic, hyper.tau)
     metrics |= of_actor | of_critic | {"ratio/gap_sim": losses.sim_mean(gaps, batch)}
     state = state.replace(actor=actor, log_alpha=log_alpha, critic=critic, target_critic=target, step=state.step + 1)
@@ -218,9 +211,3 @@ def _gaps(nets: _Networks, state: H2OState, batch: Batch, key: Key) -> Array:
         return -jnp.mean(jax.vmap(log_ratio, (None, None, 0))(row.obs, row.action, successors))
 
     return jax.lax.stop_gradient(jax.vmap(gap)(batch, jax.random.split(key, batch.reward.shape[0])))
-
-
-def _targets(nets: _Networks, state: H2OState, batch: Batch, key: Key) -> Array:
-    """Targets r + discount min_i Q_i(s', a') [B], without the entropy."""
-    policy, critic = partial(nets.actor.apply, state.actor.params), partial(nets.critic.apply, state.target_critic)
-    return steps.soft_targets(policy, critic, batch, key, alpha=0.0)
