@@ -87,11 +87,9 @@ def _networks_of(card: Mapping[str, Any], params: Any) -> Iterator[tuple[str, Ne
         yield "actor", make_actor_of(card["head"], *sizes, network), params.actor
     elif algorithm == "recurrent":
         memory = make_gru(*sizes, card["config"]["gru"])
-        actor, critic = (
-            make(memory.features, card["act_dim"], network) for make in (networks.make_actor, networks.make_critic)
-        )
-        yield "actor", _behind(memory, actor), params.actor
-        yield "critic", _behind(memory, critic), params.critic
+        sizes = memory.features, card["act_dim"], network
+        yield "actor", _behind(memory, networks.make_actor(*sizes)), params.actor
+        yield "critic", _behind(memory, networks.make_critic(*sizes)), params.critic
     else:
         yield "actor", networks.make_actor(*sizes, network), params.actor
         if params.critic is not None:
@@ -99,11 +97,8 @@ def _networks_of(card: Mapping[str, Any], params: Any) -> Iterator[tuple[str, Ne
         if params.value is not None:
             yield "value", networks.make_value(sizes[0], network), params.value
         if params.dynamics is not None:
-            yield (
-                "dynamics",
-                networks.make_dynamics(*sizes, network, members=_members(params.dynamics)),
-                params.dynamics,
-            )
+            ensemble = networks.make_dynamics(*sizes, network, members=_members(params.dynamics))
+            yield "dynamics", ensemble, params.dynamics
 
 
 def _behind(memory: GRU, head: Network) -> Network:
@@ -116,15 +111,15 @@ def _members(ensemble: PyTree) -> int:
 
 
 def _structure_of(card: Mapping[str, Any], obs_dim: int, act_dim: int) -> tdmpc2.TDMPC2Config:
-    own = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
-    return tdmpc2_model.named_config(obs_dim, act_dim, **own, sgft=card["config"].get("sgft", False))
+    structure = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
+    return tdmpc2_model.named_config(obs_dim, act_dim, **structure, sgft=card["config"].get("sgft", False))
 
 
 def network_of(card: Mapping[str, Any]) -> NetworkConfig:
     """The networks of a prior of SAC; raises UserError where this version knows no such network."""
     try:
-        own: dict[str, Any] = {**card["network"], "hidden": tuple(card["network"]["hidden"])}
-        return NetworkConfig(**own)
+        fields: dict[str, Any] = {**card["network"], "hidden": tuple(card["network"]["hidden"])}
+        return NetworkConfig(**fields)
     except (TypeError, KeyError):
         raise UserError(f"this version knows no such network: {card['network']}; pretrain again") from None
 
