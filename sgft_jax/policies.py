@@ -12,19 +12,10 @@ from envs.types import Array, Key, Policy, PyTree, UserError
 from sgft_jax.learners import recurrent, tdmpc2, tdmpc2_model
 from sgft_jax.learners.actor import actor_policy, make_actor_of
 from sgft_jax.learners.sac import SACParams
-from sgft_jax.models import dynamics, value
+from sgft_jax.models import dynamics, networks, value
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.gru import GRU, make_gru
-from sgft_jax.models.networks import (
-    Network,
-    add_noise,
-    check_params,
-    make_actor,
-    make_critic,
-    make_dynamics,
-    make_value,
-    tanh_gaussian_action,
-)
+from sgft_jax.models.networks import Network
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.models.system import told
 from sgft_jax.planning import mpc
@@ -73,7 +64,7 @@ def check_parameters(card: Mapping[str, Any], params: Any) -> None:
         if part is not None and (shapes := jax.tree.map(lambda x: x.shape, part)) != wanted:
             raise UserError(f"{name} has the shapes {shapes}, by its card {wanted}; take another prior")
     for name, network, part in _networks_of(card, params):
-        check_params(name, network, part, "its card; take another prior")
+        networks.check_params(name, network, part, "its card; take another prior")
     if odd := [path for path, x in jax.tree_util.tree_leaves_with_path(params) if x.dtype != jnp.float32]:
         raise UserError(f"{jax.tree_util.keystr(odd[0])} is not float32; take another prior")
 
@@ -98,17 +89,18 @@ def _networks_of(card: Mapping[str, Any], params: Any) -> Iterator[tuple[str, Ne
         yield "actor", make_actor_of(card["head"], *sizes, network), params.actor
     elif algorithm == "recurrent":
         memory = make_gru(*sizes, card["config"]["gru"])
-        actor, critic = (make(memory.features, card["act_dim"], network) for make in (make_actor, make_critic))
-        yield "actor", _behind(memory, actor), params.actor
-        yield "critic", _behind(memory, critic), params.critic
+        sizes = memory.features, card["act_dim"], network
+        yield "actor", _behind(memory, networks.make_actor(*sizes)), params.actor
+        yield "critic", _behind(memory, networks.make_critic(*sizes)), params.critic
     else:
-        yield "actor", make_actor(*sizes, network), params.actor
+        yield "actor", networks.make_actor(*sizes, network), params.actor
         if params.critic is not None:
-            yield "critic", make_critic(*sizes, network, members=_members(params.critic)), params.critic
+            yield "critic", networks.make_critic(*sizes, network, members=_members(params.critic)), params.critic
         if params.value is not None:
-            yield "value", make_value(sizes[0], network), params.value
+            yield "value", networks.make_value(sizes[0], network), params.value
         if params.dynamics is not None:
-            yield "dynamics", make_dynamics(*sizes, network, members=_members(params.dynamics)), params.dynamics
+            ensemble = networks.make_dynamics(*sizes, network, members=_members(params.dynamics))
+            yield "dynamics", ensemble, params.dynamics
 
 
 def _behind(memory: GRU, head: Network) -> Network:
@@ -121,30 +113,31 @@ def _members(ensemble: PyTree) -> int:
 
 
 def _structure_of(card: Mapping[str, Any], obs_dim: int, act_dim: int) -> tdmpc2.TDMPC2Config:
-    numbers = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
-    return tdmpc2_model.named_config(obs_dim, act_dim, **numbers, sgft=card["config"].get("sgft", False))
+    structure = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
+    return tdmpc2_model.named_config(obs_dim, act_dim, **structure, sgft=card["config"].get("sgft", False))
 
 
 def network_of(card: Mapping[str, Any]) -> NetworkConfig:
     """The networks of a prior of SAC; raises UserError where this version knows no such network."""
     try:
-        return NetworkConfig(**{**card["network"], "hidden": tuple(card["network"]["hidden"])})
+        fields: dict[str, Any] = {**card["network"], "hidden": tuple(card["network"]["hidden"])}
+        return NetworkConfig(**fields)
     except (TypeError, KeyError):
         raise UserError(f"this version knows no such network: {card['network']}; pretrain again") from None
 
 
 def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig) -> Policy:
     """Actor, V_sim and dynamics ensemble of `SACParams`."""
-    actor = make_actor(obs_dim, act_dim, network)
-    value_net = make_value(obs_dim, network)
-    model = make_dynamics(obs_dim, act_dim, network)
+    actor = networks.make_actor(obs_dim, act_dim, network)
+    value_net = networks.make_value(obs_dim, network)
+    model = networks.make_dynamics(obs_dim, act_dim, network)
 
     def act(params: SACParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         if params.distortion is not None:
             obs = params.distortion.seen(obs)
         if params.system is not None:
             obs = told(obs, params.system)
-        action = tanh_gaussian_action(
+        action = networks.tanh_gaussian_action(
             actor.apply(params.actor, normalize(params.normalizer, obs)), key, explore=explore
         )
         return action if params.distortion is None else params.distortion.command(action), carry
@@ -168,7 +161,7 @@ def mpc_policy(config: mpc.MPCConfig, task: Task, *, explore_noise: float = 0.0)
     def act(params: SACParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         key_plan, key_noise = jax.random.split(key)
         action, carry = plan(params, carry, obs, key_plan, explore=explore)
-        return add_noise(action, jnp.where(explore, explore_noise, 0.0), key_noise), carry
+        return networks.add_noise(action, jnp.where(explore, explore_noise, 0.0), key_noise), carry
 
     return sac_policy(config.obs_dim, config.act_dim, config.network)._replace(
         init_carry=lambda: mpc.init_carry(config), act=act

@@ -37,17 +37,18 @@ def compose(*transforms: Transform) -> Transform:
     n = max(len(transforms), 1)
 
     def init(params: PyTree, key: Key) -> PyTree:
-        return tuple(one.init(params, sub) for one, sub in zip(transforms, jax.random.split(key, n), strict=False))
+        keys = jax.random.split(key, n)
+        return tuple(transform.init(params, sub) for transform, sub in zip(transforms, keys, strict=False))
 
-    def apply(state: PyTree, imagination: Any, batch: Batch, key: Key) -> Batch:
-        for one, own, sub in zip(transforms, state, jax.random.split(key, n), strict=False):
-            batch = one.apply(own, imagination, batch, sub)
+    def apply(states: PyTree, imagination: Any, batch: Batch, key: Key) -> Batch:
+        for transform, state, sub in zip(transforms, states, jax.random.split(key, n), strict=False):
+            batch = transform.apply(state, imagination, batch, sub)
         return batch
 
-    def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
-        keys = jax.random.split(key, n)
-        done = [one.update(own, batch, sub) for one, own, sub in zip(transforms, state, keys, strict=False)]
-        return tuple(own for own, _ in done), {name: x for _, metrics in done for name, x in metrics.items()}
+    def update(states: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
+        members = zip(transforms, states, jax.random.split(key, n), strict=False)
+        done = [transform.update(state, batch, sub) for transform, state, sub in members]
+        return tuple(state for state, _ in done), {name: x for _, metrics in done for name, x in metrics.items()}
 
     return Transform(init, apply, update)
 
@@ -124,19 +125,18 @@ def weigh(config: ratio.RatioConfig) -> Transform:
     After `relabel` or `branch`, s' is what the models expect. Then w says whether that looks like the real system or
     like the simulator. Batches must say which rows are simulated. Source: H2O+ Eqs. (8), (9).
     """
-    learner = ratio.make_ratio(config)
 
     def init(params: PyTree, key: Key) -> ratio.RatioState:
-        state = learner.init(key)
+        state = ratio.init(config, key)
         return state if params is None else state._replace(normalizer=params.normalizer)
 
     def apply(state: ratio.RatioState, imagination: Any, batch: Batch, key: Key) -> Batch:
         del imagination, key
-        log_w = jax.vmap(learner.log_ratio, (None, 0, 0, 0))(state, batch.obs, batch.action, batch.next_obs)
-        return batch._replace(weight=jnp.where(losses.is_simulated(batch), jax.vmap(ratio.weight)(log_w), 1.0))
+        weights = jax.vmap(ratio.weight)(ratio.log_ratios(config, state, batch))
+        return batch._replace(weight=jnp.where(losses.is_simulated(batch), weights, 1.0))
 
     def update(state: ratio.RatioState, batch: Batch, key: Key) -> tuple[ratio.RatioState, Metrics]:
-        state, _, metrics = ratio.step(learner, state, batch, batch, key, rate=_LR_RATIO)
+        state, _, metrics = ratio.step(config, state, batch, batch, key, rate=_LR_RATIO)
         return state, metrics
 
     return Transform(init, apply, update)

@@ -8,17 +8,9 @@ import jax.numpy as jnp
 
 from envs.types import Array, Key, Policy, PyTree
 from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.models import networks
 from sgft_jax.models.config import NetworkConfig
-from sgft_jax.models.networks import (
-    Network,
-    add_noise,
-    make_actor,
-    make_affine_actor,
-    make_deterministic_actor,
-    tanh_gaussian_action,
-    tanh_gaussian_log_prob,
-    untanh,
-)
+from sgft_jax.models.networks import Network
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.types import Normalizer
 
@@ -36,8 +28,8 @@ class ActorParams(NamedTuple):
 def make_actor_of(head: Head, obs_dim: int, act_dim: int, network: NetworkConfig) -> Network:
     """The network of an actor whose last layer says what `head` names."""
     if head == "deterministic":
-        return make_deterministic_actor(obs_dim, act_dim, network)
-    make = make_actor if head == "gaussian" else functools.partial(make_affine_actor, output_gain=1.0)
+        return networks.make_deterministic_actor(obs_dim, act_dim, network)
+    make = networks.make_actor if head == "gaussian" else functools.partial(networks.make_affine_actor, output_gain=1.0)
     return make(obs_dim, act_dim, network)  # the gain only says where training begins
 
 
@@ -54,11 +46,11 @@ def actor_policy(obs_dim: int, act_dim: int, network: NetworkConfig, head: Head)
 
     def act(params: ActorParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         if head == "deterministic":
-            return add_noise(output(params, obs), jnp.where(explore, _EXPLORE_NOISE, 0.0), key), carry
-        return tanh_gaussian_action(output(params, obs), key, explore=explore), carry
+            return networks.add_noise(output(params, obs), jnp.where(explore, _EXPLORE_NOISE, 0.0), key), carry
+        return networks.tanh_gaussian_action(output(params, obs), key, explore=explore), carry
 
     def log_prob(params: ActorParams, obs: Array, action: Array) -> Array:
-        return tanh_gaussian_log_prob(output(params, obs), untanh(action))
+        return networks.tanh_gaussian_log_prob(output(params, obs), networks.untanh(action))
 
     return Policy(lambda: (), act, log_prob=None if head == "deterministic" else log_prob)
 

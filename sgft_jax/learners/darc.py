@@ -76,16 +76,15 @@ def _sac_of(config: DARCConfig) -> SACConfig:
     return SACConfig(*sizes, tune_alpha=config.tune_alpha, train_value=False, train_dynamics=False)
 
 
-def _ratio_of(config: DARCConfig) -> ratio.Ratio:
-    sizes = config.obs_dim, config.act_dim, config.ratio_network
-    return ratio.make_ratio(ratio.RatioConfig(*sizes, noise=config.ratio_noise))
+def _ratio_of(config: DARCConfig) -> ratio.RatioConfig:
+    return ratio.RatioConfig(config.obs_dim, config.act_dim, config.ratio_network, noise=config.ratio_noise)
 
 
 def init(config: DARCConfig, key: Key, hyper: SACHyper | None = None, *, lr_ratio: float = 3e-4) -> DARCState:
     """A fresh agent. lr_ratio: Adam learning rate of the discriminators."""
     key_sac, key_ratio = jax.random.split(key)
     agent = sac.init(_sac_of(config), key_sac, hyper)
-    return DARCState(agent, _ratio_of(config).init(key_ratio), jnp.float32(lr_ratio))
+    return DARCState(agent, ratio.init(_ratio_of(config), key_ratio), jnp.float32(lr_ratio))
 
 
 def act(

@@ -130,7 +130,7 @@ class _Networks(NamedTuple):
     config: H2OConfig
     actor: Network
     critic: Network
-    ratio: ratio.Ratio
+    ratio: ratio.RatioConfig
     optimiser: optax.GradientTransformation
 
 
@@ -140,7 +140,7 @@ def _networks(config: H2OConfig) -> _Networks:
         config=config,
         actor=make_affine_actor(*sizes, config.network, output_gain=gain),
         critic=make_critic(*sizes, config.network, output_gain=gain),
-        ratio=ratio.make_ratio(ratio.RatioConfig(*sizes, config.ratio_network, noise=config.ratio_noise)),
+        ratio=ratio.RatioConfig(*sizes, config.ratio_network, noise=config.ratio_noise),
         optimiser=optim.adam(),
     )
 
@@ -154,7 +154,7 @@ def init(config: H2OConfig, key: Key, hyper: H2OHyper | None = None) -> H2OState
         critic=optim.start(nets.optimiser, critic),
         target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
         log_alpha=optim.start(nets.optimiser, jnp.log(numbers.alpha)),
-        ratio=nets.ratio.init(keys[2]),
+        ratio=ratio.init(nets.ratio, keys[2]),
         spread=jnp.zeros(config.obs_dim),
         normalizer=normalizer.identity(config.obs_dim),
         hyper=numbers,
@@ -166,7 +166,7 @@ def act(
     config: H2OConfig, state: H2OState, carry: tuple[()], obs: Array, key: Key, *, explore: bool | Array
 ) -> tuple[Array, tuple[()]]:
     """Action [act_dim] in [-1, 1] for a raw obs [obs_dim], and the carry as it was."""
-    return steps.act(_networks(config).actor, state, obs, key, explore=explore), carry
+    return steps.act(_networks(config), state, obs, key, explore=explore), carry
 
 
 def update(config: H2OConfig, state: H2OState, batch: Batch, key: Key) -> tuple[H2OState, Metrics]:
@@ -183,20 +183,13 @@ def update(config: H2OConfig, state: H2OState, batch: Batch, key: Key) -> tuple[
     shares, weights = log_shares(gaps, batch), jax.vmap(ratio.weight)(log_w)
     batch = normalizer.normalize_rows(state.normalizer, batch)
 
-    entropy = hyper.entropy_per_dim * config.act_dim if config.tune_alpha else None
-    actor, log_alpha, of_actor = steps.step_policy(
-        nets.actor, nets.critic, nets.optimiser, state, batch, key_actor, target_entropy=entropy
-    )
-    critic, of_critic = steps.step_mixed_critic(
-        nets.critic.apply,
-        nets.optimiser,
-        state.critic,
-        batch,
-        _targets(nets, state, batch, key_target),
-        weights,
-        rate=hyper.lr_critic,
-        penalty=lambda params, q: hyper.conservatism * penalty(q, shares, batch),
-    )
+    def push_down(params: PyTree, q: Array) -> Array:
+        del params
+        return hyper.conservatism * penalty(q, shares, batch)
+
+    actor, log_alpha, of_actor = steps.step_policy(nets, state, batch, key_actor)
+    targets = steps.soft_targets(nets, state, batch, key_target, alpha=0.0)  # without the entropy
+    critic, of_critic = steps.step_mixed_critic(nets, state, batch, targets, weights, penalty=push_down)
     target = optax.incremental_update(critic.params, state.target_critic, hyper.tau)
     metrics |= of_actor | of_critic | {"ratio/gap_sim": losses.sim_mean(gaps, batch)}
     state = state.replace(actor=actor, log_alpha=log_alpha, critic=critic, target_critic=target, step=state.step + 1)
@@ -210,7 +203,7 @@ def make_h2o(config: H2OConfig, hyper: H2OHyper | None = None) -> Learner:
 
 def _gaps(nets: _Networks, state: H2OState, batch: Batch, key: Key) -> Array:
     """KL(P_sim || P) at every pair [B], nats: the mean of log P_sim / P over noisy copies of its successor."""
-    std, log_ratio = state.hyper.spread_scale * state.spread, partial(nets.ratio.log_ratio, state.ratio)
+    std, log_ratio = state.hyper.spread_scale * state.spread, partial(ratio.log_ratio, nets.ratio, state.ratio)
 
     def gap(row: Batch, key: Key) -> Array:
         noise = jax.random.normal(key, (nets.config.successors, nets.config.obs_dim))
@@ -218,9 +211,3 @@ def _gaps(nets: _Networks, state: H2OState, batch: Batch, key: Key) -> Array:
         return -jnp.mean(jax.vmap(log_ratio, (None, None, 0))(row.obs, row.action, successors))
 
     return jax.lax.stop_gradient(jax.vmap(gap)(batch, jax.random.split(key, batch.reward.shape[0])))
-
-
-def _targets(nets: _Networks, state: H2OState, batch: Batch, key: Key) -> Array:
-    """Targets r + discount min_i Q_i(s', a') [B], without the entropy."""
-    policy, critic = partial(nets.actor.apply, state.actor.params), partial(nets.critic.apply, state.target_critic)
-    return steps.soft_targets(policy, critic, batch, key, alpha=0.0)

@@ -23,13 +23,7 @@ from sgft_jax.math import losses, optim
 from sgft_jax.math.value_losses import value_loss
 from sgft_jax.models import normalizer, ratio
 from sgft_jax.models.config import NetworkConfig, two_layers
-from sgft_jax.models.networks import (
-    Network,
-    make_affine_actor,
-    make_critic,
-    make_value,
-    tanh_gaussian_sample,
-)
+from sgft_jax.models.networks import Network, make_affine_actor, make_critic, make_value
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer, ValueLoss
 
 
@@ -140,7 +134,7 @@ class _Networks(NamedTuple):
     actor: Network
     critic: Network
     value: Network
-    ratio: ratio.Ratio
+    ratio: ratio.RatioConfig
     optimiser: optax.GradientTransformation
 
 
@@ -151,7 +145,7 @@ def _networks(config: H2OPlusConfig) -> _Networks:
         actor=make_affine_actor(*sizes, config.network, output_gain=gain),
         critic=make_critic(*sizes, config.network, members=config.critics, output_gain=gain),
         value=make_value(config.obs_dim, config.network, output_gain=gain),
-        ratio=ratio.make_ratio(ratio.RatioConfig(*sizes, config.ratio_network, noise=config.ratio_noise)),
+        ratio=ratio.RatioConfig(*sizes, config.ratio_network, noise=config.ratio_noise),
         optimiser=optim.adam(),
     )
 
@@ -166,7 +160,7 @@ def init(config: H2OPlusConfig, key: Key, hyper: H2OPlusHyper | None = None) -> 
         target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
         value=optim.start(nets.optimiser, nets.value.init(keys[2])),
         log_alpha=optim.start(nets.optimiser, jnp.log(numbers.alpha)),
-        ratio=nets.ratio.init(keys[3]) if config.ratio else None,
+        ratio=ratio.init(nets.ratio, keys[3]) if config.ratio else None,
         normalizer=normalizer.identity(config.obs_dim),
         hyper=numbers,
         step=jnp.int32(0),
@@ -177,7 +171,7 @@ def act(
     config: H2OPlusConfig, state: H2OPlusState, carry: tuple[()], obs: Array, key: Key, *, explore: bool | Array
 ) -> tuple[Array, tuple[()]]:
     """Action [act_dim] in [-1, 1] for a raw obs [obs_dim], and the carry as it was."""
-    return steps.act(_networks(config).actor, state, obs, key, explore=explore), carry
+    return steps.act(_networks(config), state, obs, key, explore=explore), carry
 
 
 def update(config: H2OPlusConfig, state: H2OPlusState, batch: Batch, key: Key) -> tuple[H2OPlusState, Metrics]:
@@ -194,10 +188,7 @@ def update(config: H2OPlusConfig, state: H2OPlusState, batch: Batch, key: Key) -
         state, weights = state.replace(ratio=fit), jax.vmap(ratio.weight)(log_w)
     batch = normalizer.normalize_rows(state.normalizer, batch)
 
-    entropy = hyper.entropy_per_dim * config.act_dim if config.tune_alpha else None
-    actor, log_alpha, of_actor = steps.step_policy(
-        nets.actor, nets.critic, nets.optimiser, state, batch, key_actor, target_entropy=entropy
-    )
+    actor, log_alpha, of_actor = steps.step_policy(nets, state, batch, key_actor)
     value, of_value = _step_value(nets, state, batch)
     critic, of_critic = _step_critic(nets, state, batch, weights, key_target)
     target = optax.incremental_update(critic.params, state.target_critic, hyper.tau)
@@ -237,7 +228,7 @@ def _step_critic(
     hyper, alpha, diversity = state.hyper, jnp.exp(state.log_alpha.params), nets.config.diversity
 
     def target(row: Batch, key: Key) -> Array:
-        action, log_prob = tanh_gaussian_sample(nets.actor.apply(state.actor.params, row.next_obs), key)
+        action, log_prob = steps.sample(nets, state, row.next_obs, key)
         next_q = nets.critic.apply(state.target_critic, row.next_obs, action)
         next_value = nets.value.apply(state.value.params, row.next_obs)
         return mixed_target(
@@ -250,13 +241,5 @@ def _step_critic(
         return diversity * edac.mean_alignment(nets.critic.apply, params, real)
 
     targets = jax.vmap(target)(batch, jax.random.split(key, batch.reward.shape[0]))
-    return steps.step_mixed_critic(
-        nets.critic.apply,
-        nets.optimiser,
-        state.critic,
-        batch,
-        targets,
-        weights,
-        rate=hyper.lr_critic,
-        penalty=crowding if diversity else None,
-    )
+    penalty = crowding if diversity else None
+    return steps.step_mixed_critic(nets, state, batch, targets, weights, penalty=penalty)

@@ -19,17 +19,8 @@ from flax import struct
 from envs.types import Array, Key, PyTree
 from sgft_jax.learners import steps
 from sgft_jax.math import losses, optim, value_losses
-from sgft_jax.models import normalizer
-from sgft_jax.models.networks import (
-    LOG_STD_MAX,
-    LOG_STD_MIN,
-    Network,
-    NetworkConfig,
-    add_noise,
-    make_critic,
-    make_mlp,
-    make_value,
-)
+from sgft_jax.models import networks, normalizer
+from sgft_jax.models.networks import Network, NetworkConfig
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
 ACTION_MAX = 1 - 1e-5  # a mean that ends in tanh never reaches 1: it would chase such an action forever
@@ -92,7 +83,7 @@ def make_gaussian_actor(obs_dim: int, act_dim: int, config: NetworkConfig) -> Ne
 
     tanh bounds the mean alone, not what is drawn around it.
     """
-    body = make_mlp(obs_dim, act_dim, config, layer_norm=config.actor_layer_norm)
+    body = networks.make_mlp(obs_dim, act_dim, config, layer_norm=config.actor_layer_norm)
 
     def init(key: Key) -> PyTree:
         return {"mean": body.init(key), "log_std": jnp.zeros(act_dim)}
@@ -121,7 +112,7 @@ def gaussian_log_prob(moments: Array, action: Array) -> Array:
 def gaussian_action(moments: Array, key: Key, *, explore: bool | Array) -> Array:
     """[act_dim] in [-1, 1]: a draw, clipped, to explore, else the mean. moments: [2, act_dim] mean and log-std."""
     mean, log_std = moments
-    return jnp.where(explore, add_noise(mean, jnp.exp(log_std), key), mean)
+    return jnp.where(explore, networks.add_noise(mean, jnp.exp(log_std), key), mean)
 
 
 # --- losses of one transition -----------------------------------------------------------------------------------------
@@ -163,8 +154,8 @@ class _Networks(NamedTuple):
 
 def _networks(config: IQLConfig) -> _Networks:
     sizes = config.obs_dim, config.act_dim, config.network
-    value = make_value(config.obs_dim, config.network)
-    return _Networks(make_gaussian_actor(*sizes), make_critic(*sizes), value, optim.adam(config.max_grad_norm))
+    value = networks.make_value(config.obs_dim, config.network)
+    return _Networks(make_gaussian_actor(*sizes), networks.make_critic(*sizes), value, optim.adam(config.max_grad_norm))
 
 
 def init(config: IQLConfig, key: Key, hyper: IQLHyper | None = None) -> IQLState:
@@ -249,7 +240,7 @@ def _update_actor(nets: _Networks, state: IQLState, batch: Batch, q: Array) -> t
     rate = hyper.lr_actor * optim.cosine_factor(state.step, hyper.actor_updates)
     fit, mean, _ = optim.minimise(nets.optimiser, loss, state.actor, rate)
     # The parameter itself is kept in bounds: a bound in `apply` has no gradient beyond it, and would hold it for ever.
-    log_std = jnp.clip(fit.params["log_std"], LOG_STD_MIN, LOG_STD_MAX)
+    log_std = jnp.clip(fit.params["log_std"], networks.LOG_STD_MIN, networks.LOG_STD_MAX)
     metrics = {
         "actor/loss": mean,
         "actor/lr": rate,
@@ -264,7 +255,5 @@ def _update_critic(nets: _Networks, state: IQLState, batch: Batch) -> tuple[IQLS
     next_values = jax.vmap(nets.value.apply, (None, 0))(state.value.params, batch.next_obs)
     target = partial(td_target, reward_scale=state.hyper.reward_scale)
     targets = jax.vmap(target)(batch.reward, batch.discount, next_values)
-    fit, metrics = steps.step_critic(
-        nets.critic.apply, nets.optimiser, state.critic, batch, targets, rate=state.hyper.lr_critic
-    )
+    fit, metrics = steps.step_critic(nets, state, batch, targets, rate=state.hyper.lr_critic)
     return state.replace(critic=fit), metrics

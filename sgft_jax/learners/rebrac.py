@@ -175,9 +175,7 @@ def _update_critic(
 
     targets = jax.vmap(target)(rows, next_action, follows, jax.random.split(key, rows.reward.shape[0]))
 
-    fit, metrics = steps.step_critic(
-        nets.critic.apply, nets.optimiser, state.critic, rows, targets, rate=hyper.lr_critic
-    )
+    fit, metrics = steps.step_critic(nets, state, rows, targets, rate=hyper.lr_critic)
     return state.replace(critic=fit), metrics
 
 

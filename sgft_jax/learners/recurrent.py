@@ -18,16 +18,9 @@ from envs.types import Array, Key, PyTree
 from sgft_jax import checks
 from sgft_jax.learners import steps
 from sgft_jax.math import losses, optim
-from sgft_jax.models import normalizer
+from sgft_jax.models import networks, normalizer
 from sgft_jax.models.gru import GRU, make_gru
-from sgft_jax.models.networks import (
-    Network,
-    NetworkConfig,
-    make_actor,
-    make_critic,
-    tanh_gaussian_action,
-    tanh_gaussian_sample,
-)
+from sgft_jax.models.networks import Network, NetworkConfig
 from sgft_jax.stacking import stack
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
@@ -107,7 +100,7 @@ class _Networks(NamedTuple):
 def _networks(config: RecurrentConfig) -> _Networks:
     memory = make_gru(config.obs_dim, config.act_dim, config.gru)
     sizes = memory.features, config.act_dim, config.network
-    return _Networks(memory, make_actor(*sizes), make_critic(*sizes), optim.adam())
+    return _Networks(memory, networks.make_actor(*sizes), networks.make_critic(*sizes), optim.adam())
 
 
 def init(config: RecurrentConfig, key: Key, hyper: RecurrentHyper | None = None) -> RecurrentState:
@@ -143,7 +136,7 @@ def policy_action(
     """The same of an agent's parameters alone."""
     nets, obs = _networks(config), normalizer.normalize(params.normalizer, obs)
     hidden, features = nets.memory.step(params.actor["memory"], carry.hidden, carry.action, obs)
-    action = tanh_gaussian_action(nets.actor.apply(params.actor["head"], features), key, explore=explore)
+    action = networks.tanh_gaussian_action(nets.actor.apply(params.actor["head"], features), key, explore=explore)
     return action, Carry(hidden, action)
 
 
@@ -169,20 +162,20 @@ def update(config: RecurrentConfig, state: RecurrentState, batch: Batch, key: Ke
         )
 
         def target(row: Batch, seen: Array, judged: Array, key: Key) -> Array:
-            action, log_prob = tanh_gaussian_sample(nets.actor.apply(actor["head"], seen), key)
+            action, log_prob = networks.tanh_gaussian_sample(nets.actor.apply(actor["head"], seen), key)
             next_q = nets.critic.apply(state.target_critic["head"], judged, action)
             return losses.td_target(row.reward, row.discount, next_q, log_prob, alpha=alpha)
 
         def follow(seen: Array, judged: Array, key: Key) -> tuple[Array, Array]:
-            action, log_prob = tanh_gaussian_sample(nets.actor.apply(actor["head"], seen), key)
+            action, log_prob = networks.tanh_gaussian_sample(nets.actor.apply(actor["head"], seen), key)
             q = nets.critic.apply(*jax.lax.stop_gradient((critic["head"], judged)), action)
             return losses.actor_loss(log_prob, q, alpha=alpha), log_prob
 
         targets = jax.vmap(target)(rows, acting_next, judging_next, keys[0])
         q = jax.vmap(nets.critic.apply, (None, 0, 0))(critic["head"], judging, rows.action)
         of_critic = losses.row_mean(jax.vmap(losses.critic_loss)(q, targets), rows)
-        each, log_prob = jax.vmap(follow)(acting, judging, keys[1])
-        of_actor, where = losses.row_mean(each, rows), rows.valid
+        values, log_prob = jax.vmap(follow)(acting, judging, keys[1])
+        of_actor, where = losses.row_mean(values, rows), rows.valid
         metrics = {
             "critic/loss": of_critic,
             "critic/q_mean": jnp.mean(q.mean(axis=1), where=where),
@@ -196,7 +189,7 @@ def update(config: RecurrentConfig, state: RecurrentState, batch: Batch, key: Ke
     grads, (metrics, log_prob) = jax.grad(loss, (0, 1), has_aux=True)(*(fit.params for fit in learned))
     actor, critic = (optim.step(nets.optimiser, fit, g, hyper.lr) for fit, g in zip(learned, grads, strict=True))
     log_alpha = steps.step_temperature(
-        nets.optimiser, state.log_alpha, rows, log_prob, target=hyper.entropy_per_dim * config.act_dim, rate=hyper.lr
+        nets, state, rows, log_prob, target=hyper.entropy_per_dim * config.act_dim, rate=hyper.lr
     )
     average = optax.incremental_update(critic.params, state.target_critic, hyper.tau)
     state = state.replace(actor=actor, critic=critic, target_critic=average, log_alpha=log_alpha)

@@ -19,22 +19,9 @@ from sgft_jax import checks
 from sgft_jax.learners import steps
 from sgft_jax.learners.steps import Critic
 from sgft_jax.math import losses, optim
-from sgft_jax.models import dynamics, normalizer
+from sgft_jax.models import dynamics, networks, normalizer
 from sgft_jax.models.distortion import Distortion
-from sgft_jax.models.networks import (
-    Network,
-    NetworkConfig,
-    check_params,
-    make_actor,
-    make_critic,
-    make_dynamics,
-    make_value,
-    pad_first_layer,
-    precision,
-    tanh_gaussian_action,
-    tanh_gaussian_divergence,
-    tanh_gaussian_sample,
-)
+from sgft_jax.models.networks import Network, NetworkConfig
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
 
@@ -176,10 +163,10 @@ def _networks(config: SACConfig) -> _Networks:
     inputs, act_dim, body = config.obs_dim + config.context_dim, config.act_dim, config.network
     return _Networks(
         config=config,
-        actor=make_actor(inputs, act_dim, body),
-        critic=make_critic(inputs, act_dim, config.critic_network or body, members=config.critics),
-        value=make_value(config.obs_dim, body),
-        dynamics=make_dynamics(config.obs_dim, act_dim, body, members=config.ensemble_size),
+        actor=networks.make_actor(inputs, act_dim, body),
+        critic=networks.make_critic(inputs, act_dim, config.critic_network or body, members=config.critics),
+        value=networks.make_value(config.obs_dim, body),
+        dynamics=networks.make_dynamics(config.obs_dim, act_dim, body, members=config.ensemble_size),
         optimiser=optim.adam(config.max_grad_norm),
     )
 
@@ -204,7 +191,7 @@ def act(
 ) -> tuple[Array, tuple[()]]:
     """Action [act_dim] in [-1, 1], and the carry as it was. obs: [obs_dim] raw. context: [context_dim]."""
     moments = _networks(config).actor.apply(state.actor.params, network_input(state.normalizer, obs, context))
-    return tanh_gaussian_action(moments, key, explore=explore), carry
+    return networks.tanh_gaussian_action(moments, key, explore=explore), carry
 
 
 def update(
@@ -215,7 +202,7 @@ def update(
     batch: [B, ...] raw. critic_term: what other algorithms add to the critic's loss. metrics: [] each.
     """
     key_target, key_actor, key_dynamics, key_members, *key_term = jax.random.split(key, 5 if critic_term else 4)
-    nets, raw, read = _networks(config), batch, jax.vmap(network_input, (None, 0, 0))
+    nets, raw, read = _relative(_networks(config), state), batch, jax.vmap(network_input, (None, 0, 0))
     batch = batch._replace(
         obs=read(state.normalizer, batch.obs, batch.context),
         next_obs=read(state.normalizer, batch.next_obs, batch.next_context),
@@ -223,8 +210,9 @@ def update(
 
     metrics: Metrics = {}
     if config.train_critic:
-        term = partial(_term, nets, state, critic_term, batch, *key_term) if critic_term else None
-        state, metrics = _update_critic(nets, state, batch, _target_members(config, key_members), key_target, term)
+        members = _target_members(config, key_members)
+        term = partial(_term, critic_term, nets, state, batch, *key_term) if critic_term else None
+        state, metrics = _update_critic(nets, state, batch, members, key_target, term)
     rows = jax.tree.map(lambda x: x[: config.actor_batch], batch)
     rows = rows if config.weighted_actor else rows._replace(weight=None)
     state, q, log_prob, of_actor = _update_actor(nets, state, rows, key_actor)
@@ -235,15 +223,8 @@ def update(
         state, of_value = _update_value(nets, state, rows, q)
         metrics |= of_value
     if config.train_dynamics:
-        fit, of_models = dynamics.update(
-            nets.dynamics,
-            nets.optimiser,
-            state.dynamics,
-            state.normalizer,
-            raw,
-            key_dynamics,
-            rate=state.hyper.lr_dynamics,
-        )
+        step = partial(dynamics.update, nets.dynamics, nets.optimiser, rate=state.hyper.lr_dynamics)
+        fit, of_models = step(state.dynamics, state.normalizer, raw, key_dynamics)
         state, metrics = state.replace(dynamics=fit), metrics | of_models
     metrics["actor/alpha"] = jnp.exp(state.log_alpha.params)
     return state.replace(step=state.step + 1), metrics
@@ -282,47 +263,37 @@ def _assemble(
 # --- one update -------------------------------------------------------------------------------------------------------
 
 
-def _critic_of(nets: _Networks, state: SACState) -> Critic:
-    """The critic (params, obs, action) -> [members], relative to the frozen value where a baseline is asked for."""
+def _relative(nets: _Networks, state: SACState) -> _Networks:
+    """The networks, of which the critic is relative to the frozen value where a baseline is asked for."""
     if not nets.config.critic_baseline:
-        return nets.critic.apply
+        return nets
 
     def relative(params: PyTree, obs: Array, action: Array) -> Array:
-        with precision("float32"):  # as in value.predict: the difference of two large numbers
+        with networks.precision("float32"):  # as in value.predict: the difference of two large numbers
             value = nets.value.apply(state.value.params, obs[: nets.config.obs_dim])
             return nets.critic.apply(params, obs, action) - value
 
-    return relative
+    return nets._replace(critic=nets.critic._replace(apply=relative))
 
 
-def _term(nets: _Networks, state: SACState, critic_term: CriticTerm, batch: Batch, key: Key, params: PyTree) -> Array:
+def _term(critic_term: CriticTerm, nets: _Networks, state: SACState, batch: Batch, key: Key, params: PyTree) -> Array:
     """A critic term [] of the critic's parameters."""
-
-    def policy(obs: Array, key: Key) -> tuple[Array, Array]:
-        return tanh_gaussian_sample(nets.actor.apply(state.actor.params, obs), key)
-
-    return critic_term(_critic_of(nets, state), params, policy, batch, key)
+    return critic_term(nets.critic.apply, params, partial(steps.sample, nets, state), batch, key)
 
 
 def _update_critic(
     nets: _Networks,
     state: SACState,
     batch: Batch,
-    counted: Array | slice,
+    members: Array | slice,
     key: Key,
     term: Callable[[PyTree], Array] | None,
 ) -> tuple[SACState, Metrics]:
-    """counted: the members that a target is the minimum of. term: of the parameters, beside the critic's error."""
-    critic, alpha = _critic_of(nets, state), jnp.exp(state.log_alpha.params)
-    targets = steps.soft_targets(
-        partial(nets.actor.apply, state.actor.params),
-        lambda obs, action: critic(state.target_critic, obs, action)[counted],
-        batch,
-        key,
-        alpha=alpha if nets.config.entropy_in_target else 0.0,
-    )
+    """members: which ones a target is the minimum of. term: of the parameters, beside the critic's error."""
+    alpha = jnp.exp(state.log_alpha.params) if nets.config.entropy_in_target else 0.0
+    targets = steps.soft_targets(nets, state, batch, key, alpha=alpha, members=members)
     rate = state.hyper.lr_critic * optim.warmup_factor(state.step, state.hyper.lr_warmup)
-    fit, metrics = steps.step_critic(critic, nets.optimiser, state.critic, batch, targets, rate=rate, term=term)
+    fit, metrics = steps.step_critic(nets, state, batch, targets, rate=rate, term=term)
     average = optax.incremental_update(fit.params, state.target_critic, state.hyper.tau)
     return state.replace(critic=fit, target_critic=average), metrics
 
@@ -340,28 +311,21 @@ def _update_actor(nets: _Networks, state: SACState, rows: Batch, key: Key) -> tu
 
     def divergence(params: PyTree, obs: Array) -> Array:
         anchor = nets.actor.apply(state.anchor, obs)
-        return hyper.anchor * tanh_gaussian_divergence(nets.actor.apply(params, obs), anchor)
+        return hyper.anchor * networks.tanh_gaussian_divergence(nets.actor.apply(params, obs), anchor)
 
-    fit, q, log_prob, metrics = steps.step_actor(
-        nets.actor,
-        partial(_critic_of(nets, state), state.critic.params),
-        nets.optimiser,
-        state.actor,
-        rows,
-        key,
-        alpha=jnp.exp(state.log_alpha.params),
-        rate=hyper.lr_actor * optim.warmup_factor(since, hyper.actor_ramp),
-        mean=config.actor_mean,
-        penalty=divergence if config.anchored else None,
+    rate, penalty = (
+        hyper.lr_actor * optim.warmup_factor(since, hyper.actor_ramp),
+        divergence if config.anchored else None,
     )
+    step = steps.step_actor(nets, state, rows, key, rate=rate, mean=config.actor_mean, penalty=penalty)
+    fit, q, log_prob, metrics = step
     fit = optax.tree.where((since >= 0) & _policy_turn(config, state), fit, state.actor)
     return state.replace(actor=fit), q, log_prob, metrics
 
 
 def _update_temperature(nets: _Networks, state: SACState, rows: Batch, log_prob: Array) -> SACState:
-    target = state.hyper.entropy_per_dim * nets.config.act_dim
-    rate = state.hyper.lr_alpha
-    fit = steps.step_temperature(nets.optimiser, state.log_alpha, rows, log_prob, target=target, rate=rate)
+    target, rate = state.hyper.entropy_per_dim * nets.config.act_dim, state.hyper.lr_alpha
+    fit = steps.step_temperature(nets, state, rows, log_prob, target=target, rate=rate)
     return state.replace(log_alpha=optax.tree.where(_policy_turn(nets.config, state), fit, state.log_alpha))
 
 
@@ -405,7 +369,7 @@ def state_from_prior(
     params = jax.tree.map(jnp.copy, params)  # the caller may donate the state; the prior must survive it
 
     def pad(network: PyTree) -> PyTree:
-        return pad_first_layer(network, config.obs_dim, config.context_dim)
+        return networks.pad_first_layer(network, config.obs_dim, config.context_dim)
 
     critic = nets.critic.init(key) if reset_critic else pad(params.critic)
     value = params.value if config.train_value or config.critic_baseline else None
@@ -419,6 +383,6 @@ def check_params_of_prior(config: SACConfig, params: SACParams, *, critic: bool)
     """Raise UserError where a network of the prior is not the one that `config` describes."""
     body = {"network": config.network, "critic_network": config.critic_network, "critics": config.critics}
     nets = _networks(SACConfig(config.obs_dim, config.act_dim, **body))
-    owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, hidden {config.network.hidden}"
+    owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, hidden {config.network.hidden}: use the prior's own"
     for name in ("actor", "value", *(["critic"] if critic else [])):
-        check_params(name, getattr(nets, name), getattr(params, name), f"{owner}: use the prior's own task and network")
+        networks.check_params(name, getattr(nets, name), getattr(params, name), f"{owner} task and network")

@@ -9,12 +9,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 
 from envs.types import Array, Key, PyTree
 from sgft_jax.math import losses, optim
-from sgft_jax.models import normalizer
-from sgft_jax.models.networks import Network, tanh_gaussian_action, tanh_gaussian_sample
+from sgft_jax.models import networks, normalizer
 from sgft_jax.types import Batch, Metrics
 
 LOG_ALPHA_MIN = -10.0  # dense negative rewards would drive an auto-tuned temperature to zero
@@ -23,40 +21,43 @@ OUTPUT_GAIN = 0.01  # of the last layers in the released codes of H2O: all value
 Critic = Callable[[PyTree, Array, Array], Array]  # (params of members, obs, action) -> [members]
 
 
-def act(actor: Network, state: Any, obs: Array, key: Key, *, explore: bool | Array) -> Array:
-    """Action [act_dim] of a tanh-Gaussian actor. state: with `actor` and `normalizer`. obs: [obs_dim] raw."""
-    moments = actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
-    return tanh_gaussian_action(moments, key, explore=explore)
+# In this file `nets` are the networks of a learner, with `actor`, `critic` and `optimiser`, and `state` is its state,
+# with a network in training for either, the temperature `log_alpha`, and `normalizer`, `hyper`.
+
+
+def act(nets: Any, state: Any, obs: Array, key: Key, *, explore: bool | Array) -> Array:
+    """Action [act_dim] of a tanh-Gaussian actor. obs: [obs_dim] raw."""
+    moments = nets.actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
+    return networks.tanh_gaussian_action(moments, key, explore=explore)
 
 
 # --- critics ----------------------------------------------------------------------------------------------------------
 
 
+def sample(nets: Any, state: Any, obs: Array, key: Key) -> tuple[Array, Array]:
+    """An action [act_dim] of the policy and its log pi []. obs: what the actor reads."""
+    return networks.tanh_gaussian_sample(nets.actor.apply(state.actor.params, obs), key)
+
+
 def soft_targets(
-    policy: Callable[[Array], Array],
-    target_critic: Callable[[Array, Array], Array],
-    batch: Batch,
-    key: Key,
-    *,
-    alpha: Array | float,
+    nets: Any, state: Any, batch: Batch, key: Key, *, alpha: Array | float, members: Array | slice = slice(None)
 ) -> Array:
     """Targets r + discount (min_i Q_i(s', a') - alpha log pi(a'|s')) [B] with a' ~ pi.
 
-    policy(obs) -> moments [2, act_dim]. target_critic(obs, action) -> [members]. batch: what both read.
+    batch: what the networks read. members: of the target critic, over which the minimum is taken.
     """
 
     def target(row: Batch, key: Key) -> Array:
-        action, log_prob = tanh_gaussian_sample(policy(row.next_obs), key)
-        next_q = target_critic(row.next_obs, action)
+        action, log_prob = sample(nets, state, row.next_obs, key)
+        next_q = nets.critic.apply(state.target_critic, row.next_obs, action)[members]
         return losses.td_target(row.reward, row.discount, next_q, log_prob, alpha=alpha)
 
     return jax.vmap(target)(batch, jax.random.split(key, batch.reward.shape[0]))
 
 
 def step_critic(
-    critic: Critic,
-    optimiser: optax.GradientTransformation,
-    fit: optim.Fit,
+    nets: Any,
+    state: Any,
     batch: Batch,
     targets: Array,
     *,
@@ -66,23 +67,21 @@ def step_critic(
     """The critics after a step on their squared errors. targets: [B]. term(params) -> [] joins the loss."""
 
     def loss(params: PyTree) -> tuple[Array, Array]:
-        q = jax.vmap(critic, (None, 0, 0))(params, batch.obs, batch.action)
+        q = jax.vmap(nets.critic.apply, (None, 0, 0))(params, batch.obs, batch.action)
         error = losses.row_mean(jax.vmap(losses.critic_loss)(q, targets), batch)
         return error if term is None else error + term(params), q
 
-    fit, value, q = optim.minimise(optimiser, loss, fit, rate)
+    fit, value, q = optim.minimise(nets.optimiser, loss, state.critic, rate)
     return fit, {"critic/loss": value, "critic/q_mean": jnp.mean(q), "critic/target_mean": jnp.mean(targets)}
 
 
 def step_mixed_critic(
-    critic: Critic,
-    optimiser: optax.GradientTransformation,
-    fit: optim.Fit,
+    nets: Any,
+    state: Any,
     batch: Batch,
     targets: Array,
     weights: Array,
     *,
-    rate: Array | float,
     penalty: Callable[[PyTree, Array], Array] | None = None,
 ) -> tuple[optim.Fit, Metrics]:
     """The critics after a step on real and weighted simulated errors, a mean of each. Source: H2O+ Eq. (8).
@@ -92,7 +91,7 @@ def step_mixed_critic(
     """
 
     def loss(params: PyTree) -> tuple[Array, Metrics]:
-        q = jax.vmap(critic, (None, 0, 0))(params, batch.obs, batch.action)
+        q = jax.vmap(nets.critic.apply, (None, 0, 0))(params, batch.obs, batch.action)
         errors = jax.vmap(losses.critic_loss)(q, targets)
         real, simulated = losses.real_mean(errors, batch), losses.sim_mean(weights * errors, batch)
         metrics = {"critic/real_loss": real, "critic/sim_loss": simulated, "critic/q_mean": jnp.mean(q)}
@@ -101,7 +100,7 @@ def step_mixed_critic(
         metrics["critic/penalty"] = penalty(params, q)
         return real + simulated + metrics["critic/penalty"], metrics
 
-    fit, total, metrics = optim.minimise(optimiser, loss, fit, rate)
+    fit, total, metrics = optim.minimise(nets.optimiser, loss, state.critic, state.hyper.lr_critic)
     return fit, metrics | {"critic/loss": total, "critic/target_mean": jnp.mean(targets)}
 
 
@@ -109,28 +108,25 @@ def step_mixed_critic(
 
 
 def step_actor(
-    actor: Network,
-    critic: Callable[[Array, Array], Array],
-    optimiser: optax.GradientTransformation,
-    fit: optim.Fit,
+    nets: Any,
+    state: Any,
     rows: Batch,
     key: Key,
     *,
-    alpha: Array,
     rate: Array | float,
     mean: bool = False,
     penalty: Callable[[PyTree, Array], Array] | None = None,
 ) -> tuple[optim.Fit, Array, Array, Metrics]:
     """The actor after a step on alpha log pi(a|s) - min_i Q_i(s, a) with a ~ pi. Source: H2O+ Eq. (10).
 
-    Also returns q [B, members] and log pi [B] of the actions drawn. critic(obs, action) -> [members]. mean: follow the
-    members' mean, not their minimum. penalty(params, obs) -> [] joins the loss of each row.
+    Also returns q [B, members] and log pi [B] of the actions drawn. mean: follow the members' mean, not their minimum.
+    penalty(params, obs) -> [] joins the loss of each row.
     """
-    keys = jax.random.split(key, rows.reward.shape[0])
+    alpha, keys = jnp.exp(state.log_alpha.params), jax.random.split(key, rows.reward.shape[0])
 
     def row_loss(params: PyTree, obs: Array, key: Key) -> tuple[Array, Array, Array]:
-        action, log_prob = tanh_gaussian_sample(actor.apply(params, obs), key)
-        q = critic(obs, action)
+        action, log_prob = networks.tanh_gaussian_sample(nets.actor.apply(params, obs), key)
+        q = nets.critic.apply(state.critic.params, obs, action)
         loss = losses.actor_loss(log_prob, jnp.mean(q, keepdims=True) if mean else q, alpha=alpha)
         return loss if penalty is None else loss + penalty(params, obs), q, log_prob
 
@@ -138,51 +134,22 @@ def step_actor(
         values, q, log_prob = jax.vmap(row_loss, (None, 0, 0))(params, rows.obs, keys)
         return losses.row_mean(values, rows), (q, log_prob)
 
-    fit, value, (q, log_prob) = optim.minimise(optimiser, loss, fit, rate)
+    fit, value, (q, log_prob) = optim.minimise(nets.optimiser, loss, state.actor, rate)
     return fit, q, log_prob, {"actor/loss": value, "actor/entropy": -jnp.mean(log_prob)}
 
 
-def step_policy(
-    actor: Network,
-    critic: Network,
-    optimiser: optax.GradientTransformation,
-    state: Any,
-    batch: Batch,
-    key: Key,
-    *,
-    target_entropy: Array | float | None,
-) -> tuple[optim.Fit, optim.Fit, Metrics]:
-    """Actor and temperature after a step on the states of all rows.
-
-    state: of a learner, with `actor`, `critic`, `log_alpha` and the rates of `hyper`. batch: what its networks read.
-    target_entropy: [] nats of a whole action; None keeps the temperature.
-    """
-    fit, _, log_prob, metrics = step_actor(
-        actor,
-        partial(critic.apply, state.critic.params),
-        optimiser,
-        state.actor,
-        batch,
-        key,
-        alpha=jnp.exp(state.log_alpha.params),
-        rate=state.hyper.lr_actor,
-    )
+def step_policy(nets: Any, state: Any, batch: Batch, key: Key) -> tuple[optim.Fit, optim.Fit, Metrics]:
+    """Actor, and temperature where `nets.config.tune_alpha`, after a step on the states of all rows."""
+    fit, _, log_prob, metrics = step_actor(nets, state, batch, key, rate=state.hyper.lr_actor)
     log_alpha = state.log_alpha
-    if target_entropy is not None:  # the released loss has log alpha in the place of alpha: with Adam nearly the same
-        log_alpha = step_temperature(
-            optimiser, log_alpha, batch, log_prob, target=target_entropy, rate=state.hyper.lr_alpha
-        )
+    if nets.config.tune_alpha:  # the released loss has log alpha in the place of alpha: with Adam nearly the same
+        target, rate = state.hyper.entropy_per_dim * nets.config.act_dim, state.hyper.lr_alpha
+        log_alpha = step_temperature(nets, state, batch, log_prob, target=target, rate=rate)
     return fit, log_alpha, metrics | {"actor/alpha": jnp.exp(log_alpha.params)}
 
 
 def step_temperature(
-    optimiser: optax.GradientTransformation,
-    log_alpha: optim.Fit,
-    rows: Batch,
-    log_prob: Array,
-    *,
-    target: float | Array,
-    rate: float | Array,
+    nets: Any, state: Any, rows: Batch, log_prob: Array, *, target: float | Array, rate: float | Array
 ) -> optim.Fit:
     """One step of the temperature's logarithm. log_prob: [B] of the actions drawn. target: [] entropy, nats."""
 
@@ -190,5 +157,5 @@ def step_temperature(
         row_loss = partial(losses.temperature_loss, log_alpha, target_entropy=target)
         return losses.row_mean(jax.vmap(row_loss)(log_prob), rows), ()
 
-    fit, _, _ = optim.minimise(optimiser, loss, log_alpha, rate)
+    fit, _, _ = optim.minimise(nets.optimiser, loss, state.log_alpha, rate)
     return fit._replace(params=jnp.maximum(fit.params, LOG_ALPHA_MIN))

@@ -13,21 +13,8 @@ import jax.numpy as jnp
 import optax
 
 from envs.types import Array, Key, PyTree, UserError
-from sgft_jax.learners.tdmpc2_model import (
-    NETWORKS,
-    Networks,
-    TDMPC2Config,
-    TDMPC2Hyper,
-    TDMPC2Params,
-    TDMPC2State,
-    encode,
-    heads_of,
-    make_networks,
-    q_values,
-    reward_of,
-    two_heads,
-    v_sim,
-)
+from sgft_jax.learners import tdmpc2_model as model
+from sgft_jax.learners.tdmpc2_model import NETWORKS, Networks, TDMPC2Config, TDMPC2Hyper, TDMPC2Params, TDMPC2State
 from sgft_jax.math import optim
 from sgft_jax.models import normalizer, twohot
 from sgft_jax.models.networks import check_params, tanh_gaussian_action
@@ -39,7 +26,7 @@ from sgft_jax.types import Batch, Learner, Metrics
 
 def init(config: TDMPC2Config, key: Key, hyper: TDMPC2Hyper | None = None) -> TDMPC2State:
     """A fresh agent. Set the observation statistics with `state.replace(normalizer=...)`."""
-    nets, keys = make_networks(config), dict(zip(NETWORKS, jax.random.split(key, len(NETWORKS)), strict=True))
+    nets, keys = model.make_networks(config), dict(zip(NETWORKS, jax.random.split(key, len(NETWORKS)), strict=True))
     params = {name: getattr(nets, name).init(keys[name]) for name in NETWORKS}
     statistics = normalizer.identity(config.obs_dim)
     prior = TDMPC2Params(**params, normalizer=statistics, scale=jnp.float32(1))
@@ -58,8 +45,8 @@ def act(
 
     obs: [obs_dim] raw. carry: the mean of the plan before.
     """
-    nets, (key_policy, key_score, key_search) = make_networks(config), jax.random.split(key, 3)
-    z = encode(nets, state, obs)
+    nets, (key_policy, key_score, key_search) = model.make_networks(config), jax.random.split(key, 3)
+    z = model.encode(nets, state, obs)
     keys = jax.random.split(key_policy, (config.horizon, config.policy_samples))
     proposals = jax.vmap(lambda keys: _proposal(nets, state, z, keys), in_axes=1)(keys)
     score = _score(nets, state, z, key_score)
@@ -73,7 +60,7 @@ def update(config: TDMPC2Config, state: TDMPC2State, batch: Batch, key: Key) -> 
     """
     if batch.reward.shape[1] != config.horizon:
         raise UserError(f"TD-MPC2 windows have {batch.reward.shape[1]} steps: must be {config.horizon}, the horizon")
-    nets, (key_model, key_policy) = make_networks(config), jax.random.split(key)
+    nets, (key_model, key_policy) = model.make_networks(config), jax.random.split(key)
     valid = jnp.ones(batch.reward.shape, bool) if batch.valid is None else batch.valid
     batch = jax.vmap(normalizer.normalize_rows, (None, 0))(state.normalizer, batch)
 
@@ -96,8 +83,8 @@ def make_tdmpc2(config: TDMPC2Config, hyper: TDMPC2Hyper | None = None) -> Learn
 
 def policy_action(config: TDMPC2Config, state: TDMPC2State, obs: Array, key: Key, *, explore: bool | Array) -> Array:
     """Action [act_dim] of the policy alone, some thousand times cheaper than a plan. obs: [obs_dim] raw."""
-    nets = make_networks(config)
-    moments = nets.policy.apply(state.policy.params, encode(nets, state, obs))
+    nets = model.make_networks(config)
+    moments = nets.policy.apply(state.policy.params, model.encode(nets, state, obs))
     return tanh_gaussian_action(moments, key, explore=explore)
 
 
@@ -118,18 +105,18 @@ def _score(nets: Networks, state: TDMPC2State, z: Array, key: Key) -> Callable[[
     of a plan, where the original draws for each, so that they differ by their actions alone.
     """
     key_heads, key_action = jax.random.split(key)
-    critic, gamma = heads_of(state.critic.params, two_heads(nets.config, key_heads)), state.hyper.gamma
+    critic, gamma = model.heads_of(state.critic.params, model.two_heads(nets.config, key_heads)), state.hyper.gamma
     noise = jax.random.normal(key_action, (nets.config.act_dim,))
 
     def final(z: Array) -> Array:
         if nets.config.sgft:
-            return v_sim(nets, state, z)
+            return model.v_sim(nets, state, z)
         mean, log_std = nets.policy.apply(state.policy.params, z)
-        return jnp.mean(q_values(nets, critic, z, jnp.tanh(mean + jnp.exp(log_std) * noise)))
+        return jnp.mean(model.q_values(nets, critic, z, jnp.tanh(mean + jnp.exp(log_std) * noise)))
 
     def step(carry: tuple[Array, Array], action: Array) -> tuple[tuple[Array, Array], Array]:
         z, weight = carry
-        reward = weight * reward_of(nets, state, z, action)
+        reward = weight * model.reward_of(nets, state, z, action)
         return (nets.dynamics.apply(state.dynamics.params, z, action), weight * gamma), reward
 
     def score(actions: Array) -> Array:
@@ -154,13 +141,13 @@ def _update_model(
 ) -> tuple[TDMPC2State, Array, Metrics]:
     """Also returns the latents [B, H + 1, latent] rolled out by the model as it was."""
     key_heads, key_action, key_dropout = jax.random.split(key, 3)
-    judges, hyper = heads_of(state.target_critic, two_heads(nets.config, key_heads)), state.hyper
+    judges, hyper = model.heads_of(state.target_critic, model.two_heads(nets.config, key_heads)), state.hyper
 
     def target(next_obs: Array, reward: Array, discount: Array, key: Key) -> tuple[Array, Array]:
         # The successor's latent is encoded, while losses are taken at rolled-out ones.
         ahead = nets.encoder.apply(state.encoder.params, next_obs)
         action = tanh_gaussian_action(nets.policy.apply(state.policy.params, ahead), key, explore=True)
-        return ahead, reward + discount * jnp.min(q_values(nets, judges, ahead, action))
+        return ahead, reward + discount * jnp.min(model.q_values(nets, judges, ahead, action))
 
     keys = jax.random.split(key_action, valid.shape)
     ahead, q_target = jax.vmap(jax.vmap(target))(batch.next_obs, batch.reward, batch.discount, keys)
@@ -243,17 +230,16 @@ def _update_policy(
 ) -> tuple[TDMPC2State, Metrics]:
     """zs: [B, H + 1, latent]; valid: [B, H] of the steps between them; weight: [B] or None."""
     key_heads, key_action, key_dropout = jax.random.split(key, 3)
-    heads, hyper = two_heads(nets.config, key_heads), state.hyper
+    heads, hyper = model.two_heads(nets.config, key_heads), state.hyper
     reached = jnp.concatenate([valid[:, :1], valid], axis=1)
     keys = jax.random.split(key_action, reached.shape), jax.random.split(key_dropout, reached.shape)
 
-    def one(params: PyTree, z: Array, key: Key, dropout: Key) -> tuple[Array, Array]:
+    def promise(params: PyTree, z: Array, key: Key, dropout: Key) -> tuple[Array, Array]:
         action, entropy = scaled_entropy_sample(nets.policy.apply(params, z), key)
         return _promise(nets, state, z, action, heads, dropout), entropy
 
     def loss(params: PyTree) -> tuple[Array, tuple[Array, Array, Array]]:
-        each = jax.vmap(jax.vmap(one, (None, 0, 0, 0)), (None, 0, 0, 0))
-        value, entropy = each(params, zs, *keys)
+        value, entropy = jax.vmap(jax.vmap(partial(promise, params)))(zs, *keys)
         low, high = jnp.quantile(jax.lax.stop_gradient(value[:, 0]), jnp.array([0.05, 0.95]))
         scale = state.scale + hyper.tau * (jnp.maximum(high - low, 1.0) - state.scale)
         losses = -value / scale - hyper.entropy * entropy
@@ -276,9 +262,9 @@ def _promise(nets: Networks, state: TDMPC2State, z: Array, action: Array, heads:
     """What the policy maximises []: Q by two random heads, or one step of the model to V_sim."""
     if not nets.config.sgft:
         keys = jax.random.split(dropout, nets.config.size.members)[heads]
-        return jnp.mean(q_values(nets, heads_of(state.critic.params, heads), z, action, keys))
+        return jnp.mean(model.q_values(nets, model.heads_of(state.critic.params, heads), z, action, keys))
     ahead = nets.dynamics.apply(state.dynamics.params, z, action)
-    return reward_of(nets, state, z, action) + state.hyper.gamma * v_sim(nets, state, ahead)
+    return model.reward_of(nets, state, z, action) + state.hyper.gamma * model.v_sim(nets, state, ahead)
 
 
 def scaled_entropy_sample(moments: Array, key: Key) -> tuple[Array, Array]:
@@ -326,12 +312,12 @@ def state_from_prior(config: TDMPC2Config, hyper: TDMPC2Hyper, params: TDMPC2Par
     """
     check_params_of_prior(config, params)
     params = jax.tree.map(jnp.copy, params)  # the caller may donate the state; the prior must survive it
-    return _assemble(make_networks(config), hyper, params)
+    return _assemble(model.make_networks(config), hyper, params)
 
 
 def check_params_of_prior(config: TDMPC2Config, params: TDMPC2Params) -> None:
     """Raise UserError where a network of the prior is not the one that `config` describes."""
-    nets = make_networks(config)
+    nets = model.make_networks(config)
     owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, {config.size}"
     for name in NETWORKS:
         check_params(name, getattr(nets, name), getattr(params, name), f"{owner}: use the prior's own task and size")

@@ -7,7 +7,7 @@ import optax
 from envs.types import Array, Key, PyTree
 from sgft_jax.math import losses, optim
 from sgft_jax.models.networks import Network
-from sgft_jax.models.normalizer import normalize
+from sgft_jax.models.normalizer import normalize, normalize_rows
 from sgft_jax.types import Batch, Metrics, Normalizer
 
 
@@ -19,8 +19,11 @@ def predict(network: Network, params: PyTree, normalizer: Normalizer, obs: Array
 
 def predict_each(network: Network, params: PyTree, normalizer: Normalizer, obs: Array, action: Array) -> Array:
     """Successors of members that each are somewhere else. obs: [members, obs_dim] raw; action: [act_dim] of all."""
-    own = lambda p, o: predict(network, jax.tree.map(lambda x: x[None], p), normalizer, o, action)[0]  # noqa: E731
-    return jax.vmap(own)(params, obs)
+
+    def successor(member: PyTree, obs: Array) -> Array:
+        return predict(network, jax.tree.map(lambda x: x[None], member), normalizer, obs, action)[0]
+
+    return jax.vmap(successor)(params, obs)
 
 
 def draw_member(params: PyTree, key: Key) -> PyTree:
@@ -47,18 +50,17 @@ def update(
     """
     members = jax.tree.leaves(fit.params)[0].shape[0]
     weights = jax.random.exponential(key, (batch.reward.shape[0], members))
-    normal = jax.vmap(normalize, (None, 0))
-    obs, next_obs = normal(normalizer, batch.obs), normal(normalizer, batch.next_obs)
+    rows = normalize_rows(normalizer, batch)
 
     def loss(params: PyTree) -> tuple[Array, Array]:
-        predictions = jax.vmap(network.apply, (None, 0, 0))(params, obs, batch.action)
-        errors = jax.vmap(jax.vmap(losses.dynamics_loss, (0, None)))(predictions, next_obs - obs)
+        predictions = jax.vmap(network.apply, (None, 0, 0))(params, rows.obs, rows.action)
+        errors = jax.vmap(jax.vmap(losses.dynamics_loss, (0, None)))(predictions, rows.next_obs - rows.obs)
         # Sum over members: their parameters are disjoint, so each follows its own mean.
-        each = jax.vmap(losses.row_mean, (1, None))(weights * errors, batch)
-        return jnp.sum(each), losses.row_mean(jnp.mean(errors, axis=1), batch)
+        means = jax.vmap(losses.row_mean, (1, None))(weights * errors, batch)
+        return jnp.sum(means), losses.row_mean(jnp.mean(errors, axis=1), batch)
 
-    grads, error = jax.grad(loss, has_aux=True)(fit.params)
-    return optim.step(optimiser, fit, grads, rate), {"dynamics/mse": error}
+    fit, _, error = optim.minimise(optimiser, loss, fit, rate)
+    return fit, {"dynamics/mse": error}
 
 
 def rollout_error(network: Network, params: PyTree, normalizer: Normalizer, obs: Array, actions: Array) -> Array:

@@ -5,9 +5,9 @@ Everything is in logarithms. Source: DARC (Eysenbach et al. 2021); H2O+ (Niu et 
 inverse, while Eq. (8) needs P / P_sim.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple, cast
+from functools import partial
+from typing import NamedTuple
 
 import chex
 import jax
@@ -17,7 +17,8 @@ from envs.types import Array, Key, PyTree, UserError
 from sgft_jax import checks
 from sgft_jax.math import losses, optim
 from sgft_jax.models import normalizer
-from sgft_jax.models.networks import MLP, Network, NetworkConfig
+from sgft_jax.models.config import NetworkConfig, two_layers
+from sgft_jax.models.networks import Network, make_mlp
 from sgft_jax.types import Batch, Metrics, Normalizer
 
 __all__ = ["RatioConfig"]
@@ -36,7 +37,7 @@ class RatioConfig:
 
     obs_dim: int
     act_dim: int
-    network: NetworkConfig = field(default_factory=lambda: NetworkConfig((256, 256)))
+    network: NetworkConfig = field(default_factory=two_layers)
     bound: float = 2.0
     noise: float = 0.1
 
@@ -57,24 +58,10 @@ class RatioState(NamedTuple):
     normalizer: Normalizer
 
 
-class Ratio(NamedTuple):
-    """Two discriminators as pure functions.
-
-    init(key) -> RatioState.
-    update(state, batch, key, *, rate) -> (state, metrics): one Adam step of both; `batch.is_sim` says which rows are
-        the simulator's. Both domains count alike, however many rows each has.
-    log_ratio(state, obs [obs_dim], action [act_dim], next_obs [obs_dim]) -> []: log P / P_sim, without noise.
-    """
-
-    init: Callable[[Key], RatioState]
-    update: Callable[..., tuple[RatioState, Metrics]]
-    log_ratio: Callable[[RatioState, Array, Array, Array], Array]
-
-
 # --- one transition -----------------------------------------------------------------------------------------------
 
 
-def log_ratio(joint: Array, pair: Array) -> Array:
+def difference(joint: Array, pair: Array) -> Array:
     """The difference [] of log p(real|.) / p(sim|.) given (s, a, s') and given (s, a): log P / P_sim.
 
     joint, pair: [2] logits given (s, a, s') and given (s, a). Source: H2O+ Eq. (9).
@@ -100,54 +87,67 @@ def domain_loss(joint: Array, pair: Array, is_sim: Array) -> Array:
 
 def make_discriminator(inputs: int, config: NetworkConfig, *, bound: float) -> Network:
     """apply(params, *parts) -> [2] logits in (-bound, bound); the parts, joined, are [inputs]."""
-    body = MLP(config.hidden, 2, config.layer_norm, config.activation)
-
-    def apply(params: PyTree, *parts: Array) -> Array:
-        return bound * jnp.tanh(cast(Array, body.apply({"params": params}, jnp.concatenate(parts))))
-
-    return Network(lambda key: body.init(key, jnp.zeros(inputs))["params"], apply)
+    body = make_mlp(inputs, 2, config, layer_norm=config.layer_norm)
+    return Network(body.init, lambda params, *parts: bound * jnp.tanh(body.apply(params, *parts)))
 
 
-def make_ratio(config: RatioConfig) -> Ratio:
-    """The discriminators of a configuration."""
+def _discriminators(config: RatioConfig) -> tuple[Network, Network]:
+    """Of (s, a, s') and of (s, a)."""
     pair_dim = config.obs_dim + config.act_dim
     joint = make_discriminator(pair_dim + config.obs_dim, config.network, bound=config.bound)
-    pair = make_discriminator(pair_dim, config.network, bound=config.bound)
-    optimiser = optim.adam()
+    return joint, make_discriminator(pair_dim, config.network, bound=config.bound)
 
-    def init(key: Key) -> RatioState:
-        key_joint, key_pair = jax.random.split(key)
-        fits = optim.start(optimiser, joint.init(key_joint)), optim.start(optimiser, pair.init(key_pair))
-        return RatioState(*fits, normalizer=normalizer.identity(config.obs_dim))
 
-    def logits(params: tuple[PyTree, PyTree], obs: Array, action: Array, next_obs: Array) -> tuple[Array, Array]:
-        """Of both, given what the networks read. The joint ones build upon the pair's, as in the authors' code."""
-        of_pair = pair.apply(params[1], obs, action)
-        return joint.apply(params[0], obs, action, next_obs) + of_pair, of_pair
+def _logits(config: RatioConfig, params: tuple[PyTree, PyTree], *row: Array) -> tuple[Array, Array]:
+    """Of both, given what the networks read of a row. The joint ones build upon the pair's, as in the authors' code."""
+    (joint, pair), (obs, action, next_obs) = _discriminators(config), row
+    of_pair = pair.apply(params[1], obs, action)
+    return joint.apply(params[0], obs, action, next_obs) + of_pair, of_pair
 
-    def ratio_of(state: RatioState, obs: Array, action: Array, next_obs: Array) -> Array:
-        obs, next_obs = (normalizer.normalize(state.normalizer, x) for x in (obs, next_obs))
-        return log_ratio(*logits((state.joint.params, state.pair.params), obs, action, next_obs))
 
-    def loss_of(params: tuple[PyTree, PyTree], statistics: Normalizer, row: Batch, key: Key) -> Array:
-        obs, next_obs = (normalizer.normalize(statistics, x) for x in (row.obs, row.next_obs))
+def init(config: RatioConfig, key: Key) -> RatioState:
+    """Fresh discriminators, which read observations as they are until `normalizer` is set."""
+    fits = (
+        optim.start(optim.adam(), network.init(key))
+        for network, key in zip(_discriminators(config), jax.random.split(key), strict=True)
+    )
+    return RatioState(*fits, normalizer=normalizer.identity(config.obs_dim))
+
+
+def log_ratio(config: RatioConfig, state: RatioState, obs: Array, action: Array, next_obs: Array) -> Array:
+    """Log P / P_sim [] of a transition, without noise. obs, next_obs: [obs_dim] raw; action: [act_dim]."""
+    obs, next_obs = (normalizer.normalize(state.normalizer, x) for x in (obs, next_obs))
+    return difference(*_logits(config, (state.joint.params, state.pair.params), obs, action, next_obs))
+
+
+def update(
+    config: RatioConfig, state: RatioState, batch: Batch, key: Key, *, rate: Array | float
+) -> tuple[RatioState, Metrics]:
+    """One Adam step of both on rows [B, ...] raw, of which `batch.is_sim` says which are the simulator's.
+
+    Both domains count alike, however many rows there are of either. rate: [] learning rate.
+    """
+    keys = jax.random.split(key, batch.reward.shape[0])
+
+    def row_loss(params: tuple[PyTree, PyTree], row: Batch, key: Key) -> Array:
+        obs, next_obs = (normalizer.normalize(state.normalizer, x) for x in (row.obs, row.next_obs))
         noisy = _with_noise((obs, row.action, next_obs), key, config.noise)
-        return domain_loss(*logits(params, *noisy), losses.is_simulated(row))
+        return domain_loss(*_logits(config, params, *noisy), losses.is_simulated(row))
 
-    def update(state: RatioState, batch: Batch, key: Key, *, rate: Array | float) -> tuple[RatioState, Metrics]:
-        keys = jax.random.split(key, batch.reward.shape[0])
+    def loss(params: tuple[PyTree, PyTree]) -> Array:
+        values = jax.vmap(row_loss, (None, 0, 0))(params, batch, keys)
+        return losses.real_mean(values, batch) + losses.sim_mean(values, batch)
 
-        def loss(params: tuple[PyTree, PyTree]) -> Array:
-            each = jax.vmap(loss_of, (None, None, 0, 0))(params, state.normalizer, batch, keys)
-            return losses.real_mean(each, batch) + losses.sim_mean(each, batch)
+    value, grads = jax.value_and_grad(loss)((state.joint.params, state.pair.params))
+    fits = (
+        optim.step(optim.adam(), fit, grad, rate) for fit, grad in zip((state.joint, state.pair), grads, strict=True)
+    )
+    return RatioState(*fits, state.normalizer), {"ratio/loss": value}
 
-        value, grads = jax.value_and_grad(loss)((state.joint.params, state.pair.params))
-        joint_fit, pair_fit = (
-            optim.step(optimiser, fit, grad, rate) for fit, grad in zip((state.joint, state.pair), grads, strict=True)
-        )
-        return RatioState(joint_fit, pair_fit, state.normalizer), {"ratio/loss": value}
 
-    return Ratio(init, update, ratio_of)
+def log_ratios(config: RatioConfig, state: RatioState, batch: Batch) -> Array:
+    """`log_ratio` of every row [B]."""
+    return jax.vmap(partial(log_ratio, config, state))(batch.obs, batch.action, batch.next_obs)
 
 
 def split_rows(batch: Batch, last: int | None) -> tuple[Batch, Batch]:
@@ -161,11 +161,11 @@ def split_rows(batch: Batch, last: int | None) -> tuple[Batch, Batch]:
 
 
 def step(
-    ratio: Ratio, state: RatioState, batch: Batch, for_ratio: Batch, key: Key, *, rate: Array | float
+    config: RatioConfig, state: RatioState, batch: Batch, for_ratio: Batch, key: Key, *, rate: Array | float
 ) -> tuple[RatioState, Array, Metrics]:
     """Discriminators after a step on `for_ratio`, and log w [B] of the rows of `batch` by the new ones, a constant."""
-    state, metrics = ratio.update(state, for_ratio, key, rate=rate)
-    log_w = jax.vmap(ratio.log_ratio, (None, 0, 0, 0))(state, batch.obs, batch.action, batch.next_obs)
+    state, metrics = update(config, state, for_ratio, key, rate=rate)
+    log_w = log_ratios(config, state, batch)
     for name, mean in (("real", losses.real_mean), ("sim", losses.sim_mean)):
         metrics[f"ratio/log_{name}"] = mean(log_w, batch)
         metrics[f"ratio/weight_{name}"] = mean(jax.vmap(weight)(log_w), batch)

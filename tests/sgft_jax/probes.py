@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from sgft_jax.learners import cql, darc, edac, h2o, h2oplus, iql, rebrac, recurrent, sac, tdmpc2, tdmpc2_model
-from sgft_jax.models import gru, networks
+from sgft_jax.models import gru, networks, ratio
 from sgft_jax.types import Batch, Learner
 
 ROWS = 32
@@ -101,6 +101,19 @@ def counted(learner, **case):
     act = jax.jit(learner.act, static_argnames="explore")
     compiled = learner._replace(init=jax.jit(learner.init), update=jax.jit(update), act=act)
     return Case(**{"learner": compiled, "start": compiled.init, "traces": traces, **case})
+
+
+class Ratio(NamedTuple):
+    """The functions of `models.ratio`, bound to a configuration."""
+
+    init: Callable
+    update: Callable
+    log_ratio: Callable
+
+
+def make_ratio(config):
+    """Of a configuration."""
+    return Ratio(*(functools.partial(function, config) for function in (ratio.init, ratio.update, ratio.log_ratio)))
 
 
 def compiled_once(learner):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from probes import compiled_once
+from probes import compiled_once, make_ratio
 
 from envs.types import UserError
 from sgft_jax.learners import h2o
@@ -18,7 +18,7 @@ SIM = jnp.arange(ROWS) % 2 == 1
 CONFIG = h2o.H2OConfig(3, 2, network=BODY, ratio_network=BODY, tune_alpha=False)
 CRITIC = networks.make_critic(3, 2, BODY)
 ACTOR = networks.make_affine_actor(3, 2, BODY, output_gain=0.01)
-RATIO = ratio.make_ratio(ratio.RatioConfig(3, 2, BODY))
+RATIO = make_ratio(ratio.RatioConfig(3, 2, BODY))
 
 
 @pytest.fixture(scope="module")

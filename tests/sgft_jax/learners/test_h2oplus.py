@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from probes import compiled_once
+from probes import compiled_once, make_ratio
 from tuners import slow_but
 
 from envs.types import UserError
@@ -20,7 +20,7 @@ ROWS = 12
 CONFIG = h2oplus.H2OPlusConfig(3, 2, network=BODY, ratio_network=BODY)
 ACTOR = networks.make_affine_actor(3, 2, BODY, output_gain=0.01)
 CRITIC, VALUE = networks.make_critic(3, 2, BODY), networks.make_value(3, BODY)
-RATIO = ratio.make_ratio(ratio.RatioConfig(3, 2, BODY))
+RATIO = make_ratio(ratio.RatioConfig(3, 2, BODY))
 
 
 def compiled(config, **numbers):

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from probes import make_ratio
 
 from envs.types import UserError
 from sgft_jax.models import normalizer, ratio
@@ -26,10 +27,10 @@ def logits(p_real):
 
 def test_the_ratio_by_hand():
     """p(real|s,a) = .6, p(real|s,a,s') = .2: (.2 / .8) / (.6 / .4) = 1/6."""
-    log_w = ratio.log_ratio(logits(0.2), logits(0.6))
+    log_w = ratio.difference(logits(0.2), logits(0.6))
     assert log_w == pytest.approx(-1.7918, abs=1e-4) and ratio.weight(log_w) == pytest.approx(1 / 6, rel=1e-5)
     # the other way round it is above 1, and capped
-    assert ratio.log_ratio(logits(0.6), logits(0.2)) == pytest.approx(np.log(6), rel=1e-5)
+    assert ratio.difference(logits(0.6), logits(0.2)) == pytest.approx(np.log(6), rel=1e-5)
     assert ratio.weight(f(np.log(6))) == 1.0
 
 
@@ -73,7 +74,7 @@ def rows(key, *, shift, apart):
 @pytest.fixture(scope="module")
 def learned():
     """Discriminators after 2,000 steps, and the statistics that they read with, for a shift of 1 and states 1 apart."""
-    learner = ratio.make_ratio(ratio.RatioConfig(1, 1, NetworkConfig((64, 64)), noise=0.0))
+    learner = make_ratio(ratio.RatioConfig(1, 1, NetworkConfig((64, 64)), noise=0.0))
 
     @jax.jit
     def train(key):
@@ -133,7 +134,7 @@ def small_batch(key):
 
 def test_both_domains_count_alike_however_many_rows_each_has(key):
     """Four copies of a simulated row weigh as much as one of them."""
-    learner = ratio.make_ratio(ratio.RatioConfig(2, 1, NetworkConfig((8,)), noise=0.0))
+    learner = make_ratio(ratio.RatioConfig(2, 1, NetworkConfig((8,)), noise=0.0))
     batch = jax.tree.map(lambda x: x[jnp.array([0, 1, 2, 2, 2, 2])], small_batch(key))
     state, loss = learner.init(key), jax.jit(lambda *x: learner.update(*x, rate=1e-3)[1]["ratio/loss"])
     copies, alone = (loss(state, batch._replace(valid=jnp.arange(6) < n), key) for n in (6, 3))
@@ -147,7 +148,7 @@ def gradients(new):
 
 @pytest.mark.slow
 def test_the_pair_learns_from_both_losses_and_the_joint_from_its_own(key):
-    learner = ratio.make_ratio(ratio.RatioConfig(2, 1, NetworkConfig((8,)), noise=0.0))
+    learner = make_ratio(ratio.RatioConfig(2, 1, NetworkConfig((8,)), noise=0.0))
     state, batch = learner.init(key), small_batch(key)
     new, metrics = learner.update(state, batch, key, rate=1e-3)
     joint, pair = (ratio.make_discriminator(n, SMALL.network, bound=2.0) for n in (5, 3))
@@ -170,11 +171,11 @@ def test_the_pair_learns_from_both_losses_and_the_joint_from_its_own(key):
 
 def test_noise_is_there_in_training_alone(key):
     batch, other = small_batch(key), jax.random.key(1)
-    noisy = ratio.make_ratio(SMALL)
+    noisy = make_ratio(SMALL)
     state = noisy.init(key)
     steps = [noisy.update(state, batch, k, rate=1e-3)[1]["ratio/loss"] for k in (key, other)]
     assert steps[0] != steps[1]
-    quiet = ratio.make_ratio(ratio.RatioConfig(2, 1, NetworkConfig((8,)), noise=0.0))
+    quiet = make_ratio(ratio.RatioConfig(2, 1, NetworkConfig((8,)), noise=0.0))
     steps = [quiet.update(state, batch, k, rate=1e-3)[1]["ratio/loss"] for k in (key, other)]
     assert steps[0] == steps[1]
     row = batch.obs[0], batch.action[0], batch.next_obs[0]
@@ -192,7 +193,7 @@ def test_every_part_of_a_row_gets_noise(key):
 def test_standardised_inputs(key):
     """With the statistics of the data, rows in any unit give the same step."""
     statistics = normalizer.Normalizer(jnp.array([3.0, -20.0]), jnp.array([0.1, 10.0]))
-    learner, batch = ratio.make_ratio(SMALL), small_batch(key)
+    learner, batch = make_ratio(SMALL), small_batch(key)
     state = learner.init(key)
     to_raw = jax.vmap(lambda z: z * statistics.std + statistics.mean)
     raw = batch._replace(obs=to_raw(batch.obs), next_obs=to_raw(batch.next_obs))
@@ -207,7 +208,7 @@ def test_standardised_inputs(key):
 
 
 def test_invalid_rows_do_not_count_and_origin_is_needed(key):
-    learner, batch = ratio.make_ratio(SMALL), small_batch(key)
+    learner, batch = make_ratio(SMALL), small_batch(key)
     state, valid = learner.init(key), jnp.array([1, 0, 1, 1, 0, 1], bool)
     other = batch._replace(obs=jnp.where(valid[:, None], batch.obs, 7.0))
     one, two = (learner.update(state, b._replace(valid=valid), key, rate=1e-3) for b in (batch, other))
@@ -218,7 +219,7 @@ def test_invalid_rows_do_not_count_and_origin_is_needed(key):
 
 def test_real_and_simulated_are_not_exchanged(key):
     """A few steps on rows that only s' tells apart: the ratio of real rows rises, that of simulated ones falls."""
-    learner = ratio.make_ratio(SMALL)
+    learner = make_ratio(SMALL)
     batch = small_batch(key)
     batch = batch._replace(next_obs=jnp.where(batch.is_sim[:, None], 2.0, -2.0) * jnp.ones((6, 2)))
     state = start = learner.init(key)
