@@ -1,68 +1,37 @@
 """Checks of options that people set: each raises UserError, one line with the option, its value and what it must be.
 
-For the `__post_init__` of a config, e.g. `checks.positive(self, "lr", "tau")`. A field that is None is not checked, of
-a tuple every entry is. Imports neither JAX nor MuJoCo.
+What a field must be is part of its type: `lr: checks.Positive = 3e-4` in a dataclass that derives from `Checked`. The
+functions are for the `__post_init__` of other configs: `checks.positive(self, "lr")`. A field that is None is not
+checked, of a tuple every entry is. Imports neither JAX nor MuJoCo.
 """
 
+import functools
+import inspect
 import math
 import struct
 from collections.abc import Callable, Iterator
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any, get_args, get_origin
 
 from envs.types import UserError
 
 MOST = 2**31 - 1  # what counts anything: devices count in 32 bits
-_LARGEST_BATCH = 2**20  # rows
-_WIDEST = 2**16  # units of a layer, and what else there are a few of
 
 
-def finite(config: Any, *names: str) -> None:
-    """Neither infinite nor NaN, also as float32."""
-    _check(config, names, lambda x: math.isfinite(_float32(x)), "finite")
+@dataclass(frozen=True)
+class Rule:
+    """What every number of a field must be, and the same in words; called with a config, it checks those fields."""
 
+    holds: Callable[[Any], bool]
+    wanted: str
 
-def positive(config: Any, *names: str) -> None:
-    """Finite and above 0, also as float32."""
-    _check(config, names, lambda x: 0 < _float32(x) < math.inf, "a positive number")
-
-
-def not_negative(config: Any, *names: str) -> None:
-    """Finite, also as float32, and at least 0."""
-    _check(config, names, lambda x: 0 <= _float32(x) < math.inf, "0 or a positive number")
-
-
-def share(config: Any, *names: str) -> None:
-    """From 0 to 1, both allowed."""
-    _check(config, names, lambda x: 0 <= x <= 1, "from 0 to 1")
-
-
-def below_one(config: Any, *names: str) -> None:
-    """From 0 up to, but not, 1: a discount factor."""
-    _check(config, names, lambda x: 0 <= x < 1, "at least 0 and less than 1")
-
-
-def at_least(config: Any, minimum: int, *names: str, most: int = MOST) -> None:
-    """No less than the minimum, and no more than can be counted."""
-    _check(config, names, lambda x: x >= minimum, f"at least {minimum}")
-    _check(config, names, lambda x: x <= most, f"at most {most}")
-
-
-def few(config: Any, minimum: int, *names: str) -> None:
-    """The same of what nobody has many of, such as layers, units and models."""
-    at_least(config, minimum, *names, most=_WIDEST)
-
-
-def rows(config: Any, *names: str) -> None:
-    """At least one, and no more than a batch can have."""
-    at_least(config, 1, *names, most=_LARGEST_BATCH)
-
-
-def layers(config: Any, *names: str) -> None:
-    """At least one layer, each at least one unit wide."""
-    for name in names:
-        if not getattr(config, name):
-            raise refusal(name, "empty", "one or more layers of at least 1 unit")
-    few(config, 1, *names)
+    def __call__(self, config: Any, *names: str) -> None:
+        """Raises UserError for the first of the fields that is something else."""
+        for name in names:
+            value = getattr(config, name)
+            for number in value if isinstance(value, tuple) else (value,):
+                if number is not None and not self.holds(number):
+                    raise refusal(name, number, self.wanted)
 
 
 def refusal(name: str, value: Any, wanted: str) -> UserError:
@@ -78,15 +47,75 @@ def _float32(value: float) -> float:
         return math.inf if value > 0 else -math.inf
 
 
-def _check(config: Any, names: tuple[str, ...], holds: Callable[[float], bool], wanted: str) -> None:
+# Neither infinite nor NaN, also as float32
+finite = Rule(lambda x: math.isfinite(_float32(x)), "finite")
+positive = Rule(lambda x: 0 < _float32(x) < math.inf, "a positive number")
+not_negative = Rule(lambda x: 0 <= _float32(x) < math.inf, "0 or a positive number")
+share = Rule(lambda x: 0 <= x <= 1, "from 0 to 1")
+below_one = Rule(lambda x: 0 <= x < 1, "at least 0 and less than 1")  # a discount factor
+
+
+def least(minimum: int) -> Rule:
+    """No less than the minimum."""
+    return Rule(lambda x: x >= minimum, f"at least {minimum}")
+
+
+def greatest(maximum: int) -> Rule:
+    """No more than the maximum."""
+    return Rule(lambda x: x <= maximum, f"at most {maximum}")
+
+
+def at_least(config: Any, minimum: int, *names: str) -> None:
+    """No less than the minimum, and no more than can be counted."""
+    least(minimum)(config, *names)
+    countable(config, *names)
+
+
+def layers(config: Any, *names: str) -> None:
+    """At least one layer, each at least one unit wide."""
     for name in names:
-        for value in _entries(getattr(config, name)):
-            if not holds(value):
-                raise refusal(name, value, wanted)
+        if not getattr(config, name):
+            raise refusal(name, "empty", "one or more layers of at least 1 unit")
+    least(1)(config, *names)
+    few(config, *names)
 
 
-def _entries(value: Any) -> Iterator[float]:
-    if isinstance(value, tuple):
-        yield from value
-    elif value is not None:
-        yield value
+countable = greatest(MOST)
+few = greatest(2**16)  # units of a layer, and what else nobody has many of, such as models
+batch = greatest(2**20)  # rows
+
+# Types of fields
+Finite = Annotated[float, finite]
+Positive = Annotated[float, positive]
+NotNegative = Annotated[float, not_negative]
+Share = Annotated[float, share]
+BelowOne = Annotated[float, below_one]
+Updates = Annotated[int, not_negative]  # how many, also none
+Count = Annotated[int, least(1), countable]
+Few = Annotated[int, least(1), few]
+Rows = Annotated[int, least(1), batch]
+
+
+class Checked:
+    """A dataclass whose fields are checked when it is made: by their types, and by those of fields that they override.
+
+    A subclass with a `__post_init__` of its own calls this one's. UserError says which field is wrong.
+    """
+
+    def __post_init__(self) -> None:
+        for name, rule in _rules_of(type(self)):
+            rule(self, name)
+
+
+@functools.cache
+def _rules_of(kind: type) -> tuple[tuple[str, Rule], ...]:
+    hints = (pair for base in reversed(kind.__mro__) for pair in inspect.get_annotations(base).items())
+    return tuple((name, rule) for name, hint in hints for rule in _rules_in(hint))
+
+
+def _rules_in(hint: Any) -> Iterator[Rule]:
+    if get_origin(hint) is Annotated:
+        yield from (x for x in hint.__metadata__ if isinstance(x, Rule))
+    else:
+        for part in get_args(hint):
+            yield from _rules_in(part)

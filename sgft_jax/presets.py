@@ -6,7 +6,7 @@ Command lines read this module, so it imports neither JAX nor MuJoCo.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 from envs.types import UserError, unknown
 from sgft_jax import checks
@@ -19,23 +19,23 @@ DEFAULT_PRESET = "robust"
 
 
 @dataclass(frozen=True)
-class PretrainConfig:
+class PretrainConfig(checks.Checked):
     """Everything that decides the result of pretraining, apart from the task, the worlds and the seeds."""
 
     algorithm: Algorithm = "sac"
     """What is trained. sac: for all methods but these. tdmpc2: for `tdmpc2`, `sgft-tdmpc2` and `sgft-tdmpc2-code`.
     recurrent: for `recurrent`."""
-    env_steps: int = 8_000_000
+    env_steps: Annotated[int, checks.least(1), checks.greatest(2**40)] = 8_000_000
     """Environment steps of training, after the random actions."""
-    n_envs: int = 4096
+    n_envs: checks.Count = 4096
     """Environments stepped together."""
-    updates_per_step: int = 16
+    updates_per_step: checks.Count = 16
     """Gradient steps per step of all environments."""
-    batch_size: int = 4096
+    batch_size: checks.Count = 4096
     """Transitions in a batch (TD-MPC2: windows of `horizon` steps; recurrent SAC: episodes)."""
-    gamma: float = 0.99
+    gamma: checks.BelowOne = 0.99
     """Discount factor per control step."""
-    previous_actions: int = 0
+    previous_actions: Annotated[int, checks.least(0), checks.few] = 0
     """Last actions that end the observation of all networks. Where commands arrive late, measurements alone do not say
     what will happen next."""
     actuators: bool = False
@@ -44,78 +44,67 @@ class PretrainConfig:
     sees_system: bool = False
     """End the observation of all networks with what varies between episodes of the training domain, parameters and
     effects. Such a prior is for the method `sysid`, which tells it what it has identified."""
-    system_noise: float = 0.3
+    system_noise: checks.NotNegative = 0.3
     """Std of the noise on that in training, where each number's range is [-1, 1]; new at every step. Without it,
     networks of few episodes learn to tell these apart (docs/methods.md)."""
-    lr: float = 3e-4
+    lr: checks.Positive = 3e-4
     """Adam learning rate of every network at the start."""
-    lr_end: float = 1.0
+    lr_end: checks.Share = 1.0
     """Share of the learning rate that is left at the end; it falls linearly. A falling rate settles V_sim."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     """Networks of SAC; of recurrent SAC what follows the GRUs."""
-    gru: int = 128
+    gru: checks.Few = 128
     """Units of the GRUs of recurrent SAC."""
-    worlds: int = 2048
+    worlds: checks.Count = 2048
     """Worlds compiled for each seed; every episode takes place in a random one."""
-    refresh_every: int = 0
+    refresh_every: Annotated[int, checks.least(0), checks.countable] = 0
     """Chunks after which new worlds are drawn and all environments start new episodes; 0 keeps the first worlds."""
-    replay_capacity: int = 1_000_000
+    replay_capacity: checks.Count = 1_000_000
     """Transitions kept; new ones replace the oldest."""
-    random_transitions: int = 500_000
+    random_transitions: checks.Count = 500_000
     """Transitions under random actions, collected first: they give the observation statistics and a part of every
     batch."""
-    random_fraction: float = 0.5
+    random_fraction: checks.BelowOne = 0.5
     """Share of each batch that comes from the random actions (paper: 0.5)."""
-    random_ladder: float = 0.0
+    random_ladder: checks.Share = 0.0
     """Environment i of n replaces a share i / (n - 1) * random_ladder of its actions by random ones. V_sim then also
     knows states beside the policy's own path, where a real system leads; 0 replaces none."""
-    tau: float = 0.005
+    tau: Annotated[float, checks.positive, checks.share] = 0.005
     """Averaging rate of the target critic."""
-    alpha: float = 1.0
+    alpha: checks.Positive = 1.0
     """Initial temperature of SAC; training adapts it to the target entropy."""
-    entropy_per_dim: float = -1.0
+    entropy_per_dim: checks.Finite = -1.0
     """Target entropy of SAC per action dimension, nats."""
-    policy_delay: int = 1
+    policy_delay: checks.Few = 1
     """Critic updates of SAC per actor update."""
-    ensemble_size: int = 5
+    ensemble_size: checks.Few = 5
     """Dynamics models that SAC trains alongside."""
     precision: Precision = "default"
     """Matrix products of the updates on GPUs. V_sim is always evaluated in float32."""
     size: str = "5M"
     """TD-MPC2's networks by their published number of parameters: 1M, 5M, 19M, 48M or 317M."""
-    horizon: int = 3
+    horizon: checks.Few = 3
     """Steps of TD-MPC2's plans and training windows."""
-    plan_samples: int = 512
+    plan_samples: checks.Count = 512
     """Action sequences that TD-MPC2 samples in each iteration of a plan; it plans in evaluations alone."""
-    chunk_steps: int = 50
+    chunk_steps: checks.Count = 50
     """Steps of all environments per compiled chunk; logs, evaluations and checkpoints come between chunks."""
-    eval_every: int = 4
+    eval_every: checks.Count = 4
     """Chunks between evaluations."""
-    eval_episodes: int = 256
+    eval_episodes: checks.Count = 256
     """Episodes of an evaluation, in worlds that training does not see."""
-    choose_from: float = 0.75
+    choose_from: checks.Share = 0.75
     """Share of training after which evaluations compete for the prior. Earlier policies may succeed while their critic
     still promises twice what can be had."""
-    report_episodes: int = 256
+    report_episodes: checks.Count = 256
     """Fresh episodes that measure the prior, at least; 256 give a 95 % interval of +-6 points at worst."""
-    checkpoint_every: int = 8
+    checkpoint_every: checks.Count = 8
     """Chunks between checkpoints."""
 
     def __post_init__(self) -> None:
-        checks.at_least(self, 1, "n_envs", "worlds", "random_transitions", "updates_per_step", "batch_size")
-        checks.at_least(self, 1, "replay_capacity", "plan_samples", "chunk_steps", "checkpoint_every")
-        checks.at_least(self, 1, "eval_every", "eval_episodes", "report_episodes")
-        checks.at_least(self, 1, "env_steps", most=2**40)
-        checks.few(self, 1, "policy_delay", "ensemble_size", "gru", "horizon")
-        checks.at_least(self, 0, "refresh_every")
-        checks.few(self, 0, "previous_actions")
+        super().__post_init__()
         if self.size not in SIZES:
             raise UserError(unknown("size", self.size, SIZES))
-        checks.positive(self, "lr", "tau", "alpha")
-        checks.share(self, "random_ladder", "lr_end", "tau", "choose_from")
-        checks.below_one(self, "gamma", "random_fraction")
-        checks.finite(self, "entropy_per_dim")
-        checks.not_negative(self, "system_noise")
         if self.sees_system and self.algorithm != "sac":
             wanted = f"off for a prior of {self.algorithm}, which no method could tell anything"
             raise checks.refusal("sees_system", True, wanted)

@@ -14,12 +14,8 @@ from sgft_jax.types import Fixed, HybridAgent, Method, Task
 class Config(ActorCriticOptions):
     """Options of `sac-both`: learning rate, widths and discount factor, and what is written here."""
 
-    rows: int = 128
+    rows: checks.Rows = 128
     """Real rows of a batch; it has as many simulated ones."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.rows(self, "rows")
 
 
 def build(config: Config, task: Task) -> HybridAgent:

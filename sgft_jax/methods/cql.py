@@ -11,15 +11,10 @@ from sgft_jax.types import Fixed, HybridAgent, Method, Task
 class Config(RowsOptions):
     """Options of `cql`."""
 
-    conservatism: float = 2.0
+    conservatism: checks.NotNegative = 2.0
     """Weight of the push, in units of return. Others use 5 or 10."""
-    samples: int = 10
+    samples: checks.Few = 10
     """Actions drawn from each of the uniform distribution and the policy at s and at s'."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.not_negative(self, "conservatism")
-        checks.few(self, 1, "samples")
 
 
 def build(config: Config, task: Task) -> HybridAgent:

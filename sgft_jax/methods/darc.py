@@ -13,12 +13,8 @@ class Config(RowsOptions):
 
     rows: int = 256
     """Simulated rows of a batch."""
-    ratio_rows: int = 256
+    ratio_rows: checks.Rows = 256
     """Real rows for the discriminators; they have as many simulated ones."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.rows(self, "ratio_rows")
 
 
 def build(config: Config, task: Task) -> HybridAgent:

@@ -11,16 +11,11 @@ from sgft_jax.types import Fixed, HybridAgent, Method, RealData, Task
 class Config(HybridOptions):
     """Options of `h2o`."""
 
-    conservatism: float = 0.01
+    conservatism: checks.NotNegative = 0.01
     """Weight of the push on the critic, in units of return."""
-    spread_scale: float = 1.0
+    spread_scale: checks.Positive = 1.0
     """Factor on the spread of the data over which a pair's gap of the dynamics is averaged. The released code takes
     the spread over a buffer padded with zeros, which makes it 0.3."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.not_negative(self, "conservatism")
-        checks.positive(self, "spread_scale")
 
 
 def build(config: Config, task: Task) -> HybridAgent:

@@ -17,24 +17,19 @@ class Config(HybridOptions):
 
     value_loss: ValueLoss = "iql"
     """What the value of the real data is: IQL's expectile, or that of SQL, EQL or XQL."""
-    value_share: float = 0.1
+    value_share: checks.Share = 0.1
     """Lambda: share of the target's bootstrap that comes from that value; 0 is SAC on both kinds of rows."""
-    expectile: float = 0.7
+    expectile: checks.Share = 0.7
     """Of the value loss `iql`."""
-    value_alpha: float = 1.0
+    value_alpha: checks.Positive = 1.0
     """Scale of the other value losses, in units of returns scaled until the best and the worst episode of the data are
     1,000 apart. Returns are not scaled where the data are one episode."""
-    value_cut: float = 5.0
+    value_cut: checks.Positive = 5.0
     """Of the value losses `eql` and `xql`: the largest exponent, an advantage in units of that scale."""
     ratio: bool = True
     """Weigh simulated errors by the ratio of the dynamics; off: they count like real ones."""
     standardise: bool = False
     """Let the discriminators of that ratio read standardised observations. The released code does not."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.share(self, "value_share", "expectile")
-        checks.positive(self, "value_alpha", "value_cut")
 
 
 def build(config: Config, task: Task) -> HybridAgent:

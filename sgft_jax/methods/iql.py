@@ -29,29 +29,23 @@ from sgft_jax.types import (
 class Config(MixedOptions):
     """Options of `iql`; the defaults are Kostrikov et al. 2022's for locomotion."""
 
-    lr_actor: float = 3e-4
+    lr_actor: checks.Positive = 3e-4
     """Adam learning rate of the actor."""
-    lr_critic: float = 3e-4
+    lr_critic: checks.Positive = 3e-4
     """Adam learning rate of critic and value."""
-    tau: float = 0.005
+    tau: checks.Share = 0.005
     """Averaging rate of the target critic."""
-    expectile: float = 0.7
+    expectile: checks.Share = 0.7
     """V is the mean of the data's actions at 0.5 and tends to their best towards 1."""
-    beta: float = 3.0
+    beta: checks.NotNegative = 3.0
     """Inverse temperature of the advantage weights; 0 clones the data."""
-    reward_scale: float | None = None
+    reward_scale: checks.Positive | None = None
     """Factor on every reward; None = episode length / (best - worst return of the simulated episodes)."""
     simulated_share: float = 0.5
     """Share of each batch that is simulated, once there are real transitions."""
     simulated_transitions: int = 1_000_000
-    offline_updates: int = 500_000
+    offline_updates: checks.Updates = 500_000
     """Updates on the simulated transitions alone, before the first real rollout."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.positive(self, "lr_actor", "lr_critic", "reward_scale")
-        checks.not_negative(self, "beta", "offline_updates")
-        checks.share(self, "tau", "expectile")
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
@@ -120,20 +114,15 @@ def _learner(
 class FixedConfig(RowsOptions):
     """Options of `iql` from a fixed set of real data; the published ones for locomotion."""
 
-    expectile: float = 0.7
+    expectile: checks.Share = 0.7
     """V is the mean of the data's actions at 0.5 and their best towards 1."""
-    beta: float = 3.0
+    beta: checks.NotNegative = 3.0
     """Inverse temperature of the advantage weights; 0 clones the data."""
     falling_rate: bool = True
     """Let the actor's learning rate fall to 0 along a cosine over all updates of the run, as the authors do."""
     scale_rewards: bool = True
     """Divide rewards by the span of the data's returns and multiply them by 1,000, as the authors do. A log of one
     episode keeps its rewards."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.share(self, "expectile")
-        checks.not_negative(self, "beta")
 
 
 def build_fixed(config: FixedConfig, task: Task) -> HybridAgent:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from envs.types import Array, PyTree
 from sgft_jax import checks
@@ -17,23 +17,21 @@ _RETURN_SPAN = 1000.0  # of scaled returns, as published for locomotion
 
 
 @dataclass(frozen=True)
-class ActorCriticOptions:
+class ActorCriticOptions(checks.Checked):
     """Options of soft actor-critics; the defaults are those of H2O+'s released code."""
 
-    lr: float = 3e-4
+    lr: checks.Positive = 3e-4
     """Adam learning rate of every network."""
-    tau: float = 0.005
+    tau: checks.Share = 0.005
     """Averaging rate of the target critics."""
     hidden: tuple[int, ...] = (256, 256)
     """Widths of the hidden layers of every network."""
-    gamma: float = 0.99
+    gamma: checks.BelowOne = 0.99
     """Discount factor per control step."""
 
     def __post_init__(self) -> None:
-        checks.positive(self, "lr")
-        checks.share(self, "tau")
+        super().__post_init__()
         checks.layers(self, "hidden")
-        checks.below_one(self, "gamma")
 
     @property
     def network(self) -> NetworkConfig:
@@ -45,42 +43,29 @@ class ActorCriticOptions:
 class RowsOptions(ActorCriticOptions):
     """Options of methods whose batches are of one kind of rows, real ones unless a method says otherwise."""
 
-    rows: int = 256
+    rows: checks.Rows = 256
     """Real rows of a batch."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.rows(self, "rows")
 
 
 @dataclass(frozen=True)
 class HybridOptions(ActorCriticOptions):
     """Options of methods whose critic learns from real and simulated rows, which discriminators tell apart."""
 
-    rows: int = 128
+    rows: checks.Rows = 128
     """Real rows of a batch; it has as many simulated ones."""
-    ratio_rows: int = 256
+    ratio_rows: checks.Rows = 256
     """The same for the discriminators, which have batches of their own."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.rows(self, "rows", "ratio_rows")
 
 
 @dataclass(frozen=True)
 class EnsembleOptions(ActorCriticOptions):
     """Options of methods whose many critics must not agree on how to leave the data, as in EDAC."""
 
-    critics: int = 10
+    critics: Annotated[int, checks.least(2), checks.few] = 10
     """Critics; whatever reads values takes the minimum of all."""
-    diversity: float = 1.0
+    diversity: checks.NotNegative = 1.0
     """Weight of what keeps the critics' gradients at the data's actions apart; 0 leaves it out. It does nothing where a
     task has one action, whose gradients have only a sign."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.few(self, 2, "critics")
-        checks.not_negative(self, "diversity")
 
 
 def sac_numbers(config: ActorCriticOptions) -> "SACHyper":

@@ -16,14 +16,10 @@ class Config(RowsOptions):
     hidden: tuple[int, ...] = (256, 256, 256)
     rows: int = 1024
     """Real rows of a batch, each with the action that followed it."""
-    actor_penalty: float = 0.01
+    actor_penalty: checks.NotNegative = 0.01
     """Weight of the squared distance of the actor's action from the data's."""
-    critic_penalty: float = 0.001
+    critic_penalty: checks.NotNegative = 0.001
     """The same in targets, in units of return."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.not_negative(self, "actor_penalty", "critic_penalty")
 
     @property
     def network(self) -> NetworkConfig:

@@ -11,14 +11,11 @@ from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(checks.Checked):
     """Options of `recurrent`."""
 
-    initial_rollouts: int = 1
+    initial_rollouts: checks.Count = 1
     """Real rollouts before the first learning phase; the policy does not learn, so results do not depend on it."""
-
-    def __post_init__(self) -> None:
-        checks.at_least(self, 1, "initial_rollouts")
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:

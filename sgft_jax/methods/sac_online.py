@@ -24,15 +24,10 @@ class Config(KeptCriticOptions, MixedOptions):
     actor_ramp: int = 0
     simulated_share: float = 0.5
     """Share of each batch that is simulated, at the start."""
-    simulated_share_end: float = 0.0
+    simulated_share_end: checks.Share = 0.0
     """The same after `simulated_anneal` updates; it changes linearly."""
-    simulated_anneal: int = 10_000
+    simulated_anneal: checks.Count = 10_000
     """Updates over which the share changes."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.share(self, "simulated_share_end")
-        checks.at_least(self, 1, "simulated_anneal")
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:

@@ -11,15 +11,11 @@ from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 class Config(ShapedOptions):
     """Options of `sgft`."""
 
-    horizon: int = 1
+    horizon: checks.Few = 1
     """Steps of a segment, the paper's H."""
     lr_warmup: int | None = 0
     """Updates over which the critic's learning rate rises from 0. V_sim stands at the end of every segment and
     protects the critic already."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.few(self, 1, "horizon")
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:

@@ -4,6 +4,7 @@ Source: SGFT (Yin et al., ICLR 2025), Algorithm 3. The paper plans in TD-MPC2's 
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from envs.types import Key, PyTree
 from sgft_jax import checks
@@ -15,22 +16,16 @@ from sgft_jax.types import Finetuner, Method, Online, Prior, SimulatedData, Task
 class Config(DynamicsOptions):
     """Options of `sgft-mpc`."""
 
-    horizon: int = 1
+    horizon: checks.Few = 1
     """Steps of a plan, the paper's H."""
-    plan_samples: int = 128
+    plan_samples: Annotated[int, checks.least(8), checks.countable] = 128
     """Action sequences that a plan tries in each of its iterations."""
-    plan_noise: float = 0.5
+    plan_noise: checks.NotNegative = 0.5
     """Std of the noise on what the policy proposes, in units of the action's range."""
-    explore_noise: float = 0.4
+    explore_noise: checks.NotNegative = 0.4
     """Std of the noise on what a plan does in a training rollout. A plan does much the same in the same state, and from
     such data no model learns what actions do."""
     dynamics_warmup: int | None = 0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.few(self, 1, "horizon")
-        checks.at_least(self, 8, "plan_samples")
-        checks.not_negative(self, "plan_noise", "explore_noise")
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:

@@ -19,7 +19,7 @@ _SIMULATED = 2048  # rows that tell how far the models are off in simulation
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(checks.Checked):
     """Options of `sysid`."""
 
     fit: Literal["map", "dropo"] = "map"
@@ -27,16 +27,13 @@ class Config:
     through: Literal["models", "simulator"] = "models"
     """What is asked about real steps: the prior's dynamics models, or the simulator, set to what was measured before
     each step. The simulator is right about itself and slower."""
-    rows: int | None = None
+    rows: checks.Count | None = None
     """Real transitions that are fitted, the first ones; None = 320 for map through models, else 80."""
-    initial_rollouts: int = 1
+    initial_rollouts: checks.Count = 1
     """Real rollouts before the first fit."""
     guard: bool = False
     """Deploy a fit only while its real rollouts say that it is better than the policy that knows nothing of the system,
     or than the best fit since (sgft_jax/train/guard.py)."""
-
-    def __post_init__(self) -> None:
-        checks.at_least(self, 1, "rows", "initial_rollouts")
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:

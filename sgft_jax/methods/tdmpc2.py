@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 from envs.types import Array, Key, PyTree
 from sgft_jax import checks
@@ -25,36 +25,25 @@ class PlannerOptions(LoopOptions):
     lr_warmup: ClassVar[int | None] = 0
 
     utd: float = 1.0
-    horizon: int = 4
+    horizon: checks.Few = 4
     """Steps of a plan and of a training window."""
-    plan_samples: int = 512
+    plan_samples: Annotated[int, checks.least(8), checks.countable] = 512
     """Action sequences that a plan tries in each of its iterations."""
-    lr: float = 3e-4
+    lr: checks.Positive = 3e-4
     """Adam learning rate of all networks; the encoder's is 0.3 of it."""
-    tau: float = 0.01
+    tau: checks.Share = 0.01
     """Averaging rate of the target critic and of the range of values that scales the policy's loss."""
     max_grad_norm: float | None = 20.0
     """Bound on the norm of the gradient of world model with critic, and of the policy's; None = no bound."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.few(self, 1, "horizon")
-        checks.at_least(self, 8, "plan_samples")
-        checks.positive(self, "lr")
-        checks.share(self, "tau")
 
 
 @dataclass(frozen=True)
 class Config(PlannerOptions):
     """Options of `tdmpc2`."""
 
-    lr_warmup: int | None = None
+    lr_warmup: checks.Updates | None = None
     """Updates over which the rate rises from 0; None = the updates of 1,000 real transitions. 40 updates at full rate
     took plans that pushed a towel home in 93 % of all episodes to 4 % (docs/history.md)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.not_negative(self, "lr_warmup")
 
 
 def build(config: PlannerOptions, prior: Prior | None, task: Task) -> Finetuner:

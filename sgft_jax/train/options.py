@@ -4,7 +4,7 @@ Command lines read this module and the method files: they import neither JAX nor
 """
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from sgft_jax import checks
 from sgft_jax.models.config import NetworkConfig
@@ -16,70 +16,51 @@ _WITHOUT_PRIOR = {"algorithm": "sac", "network": _BODY, "gamma": 0.99}
 
 
 @dataclass(frozen=True)
-class LoopOptions:
+class LoopOptions(checks.Checked):
     """Options of every method."""
 
-    utd: float = 8.0
+    utd: Annotated[float, checks.positive, checks.few] = 8.0
     """Gradient updates per real transition."""
-    batch_size: int = 256
+    batch_size: checks.Count = 256
     """Real transitions in a batch (windows of them for TD-MPC2)."""
-    initial_rollouts: int = 1
+    initial_rollouts: checks.Count = 1
     """Real rollouts before the first update, by the simulator's policy, or by plans if the method plans. The paper
     makes 20; with one, every method here reaches its level as early or earlier (docs/history.md)."""
-    replay_capacity: int = 20_000
+    replay_capacity: checks.Count = 20_000
     """Real transitions that the replay holds; 20,000 are more than an hour of a robot at 5 Hz."""
-    max_grad_norm: float | None = None
+    max_grad_norm: checks.Positive | None = None
     """Bound on the norm of each network's gradient; None = no bound."""
     guard: bool = False
     """Deploy what learns only while its real rollouts say that it is better than the policy that it began with, or
     than its own best since (sgft_jax/train/guard.py). That policy then plays the training rollouts too."""
-
-    def __post_init__(self) -> None:
-        checks.positive(self, "utd", "max_grad_norm")
-        checks.few(self, 0, "utd")
-        checks.at_least(self, 1, "batch_size", "initial_rollouts", "replay_capacity")
 
 
 @dataclass(frozen=True)
 class SimulatedOptions(LoopOptions):
     """Options of methods that also learn from transitions of the simulator."""
 
-    simulated_transitions: int = 200_000
+    simulated_transitions: checks.Count = 200_000
     """Simulated transitions, of the simulator's policy with more and more random actions."""
-    simulated_ladder: float = 0.6
+    simulated_ladder: checks.Share = 0.6
     """Share of random actions in the last of these episodes; it grows from 0 in the first."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.at_least(self, 1, "simulated_transitions")
-        checks.share(self, "simulated_ladder")
 
 
 @dataclass(frozen=True)
 class MixedOptions(SimulatedOptions):
     """Options of methods whose batches are partly simulated."""
 
-    simulated_share: float = 0.5
+    simulated_share: checks.Share = 0.5
     """Share of each batch that is simulated."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.share(self, "simulated_share")
 
 
 @dataclass(frozen=True)
 class DynamicsOptions(LoopOptions):
     """Options of methods that train a dynamics ensemble."""
 
-    lr_dynamics: float = 3e-4
+    lr_dynamics: checks.Positive = 3e-4
     """Adam learning rate of the dynamics ensemble, which trains on real rows."""
-    dynamics_warmup: int | None = None
+    dynamics_warmup: checks.Updates | None = None
     """Updates over which that rate rises from 0; None = the updates of 1,000 real transitions."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.positive(self, "lr_dynamics")
-        checks.not_negative(self, "dynamics_warmup")
 
 
 @dataclass(frozen=True)
@@ -112,81 +93,60 @@ class ActorOptions(LoopOptions):
     identify: ClassVar[bool] = False
     train_dynamics: ClassVar[bool] = False
 
-    lr_actor: float = 1e-4
+    lr_actor: checks.Positive = 1e-4
     """Adam learning rate of the actor."""
-    alpha: float = 0.01
+    alpha: checks.Positive = 0.01
     """Entropy temperature."""
-    actor_ramp: int = 1000
+    actor_ramp: checks.Updates = 1000
     """Updates over which the actor's learning rate rises from 0."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.positive(self, "lr_actor", "alpha")
-        checks.not_negative(self, "actor_ramp")
 
 
 @dataclass(frozen=True)
 class SACOptions(ActorOptions):
     """Options of methods whose learner is SAC."""
 
-    lr_critic: float = 3e-4
+    lr_critic: checks.Positive = 3e-4
     """Adam learning rate of the critic."""
-    tau: float = 0.005
+    tau: checks.Share = 0.005
     """Averaging rate of the target critic."""
-    critic_warmup: int | None = None
+    critic_warmup: checks.Updates | None = None
     """Updates at the start in which the critic alone learns. The first real data are the simulator's policy's own; they
     do not say what another action would do; `actor_ramp` follows for the same reason. None = the updates that follow
     the initial rollouts; the paper has 0."""
-    policy_delay: int | None = 1
+    policy_delay: checks.Few | None = 1
     """Critic updates per update of the actor; None = `utd`, one actor update per real transition (RLPD)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.positive(self, "lr_critic")
-        checks.share(self, "tau")
-        checks.not_negative(self, "critic_warmup")
-        checks.few(self, 1, "policy_delay")
 
 
 @dataclass(frozen=True)
 class KeptCriticOptions(SACOptions):
     """Options of methods that may go on with the simulator's critic."""
 
-    lr_warmup: int | None = None
+    lr_warmup: checks.Updates | None = None
     """Updates over which the learning rate of a critic kept from the simulator rises from 0. Adam's first steps are as
     long as its rate in every weight, however small the gradient. None = the updates of 1,000 real transitions."""
-    anchor: float = 0.0
+    anchor: checks.NotNegative = 0.0
     """Price of the actor's divergence from the simulator's policy, in reward per nat; 0 = free. Where that policy is
     right already, 0.1 keeps it so (docs/protocol.md)."""
     identify: bool = False
     """Estimate from real rollouts, through the prior's models, by which scale, rotation and bias the real system
     changes commands and by which constant errors its sensors are wrong, and correct for both."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.not_negative(self, "lr_warmup", "anchor")
-
 
 @dataclass(frozen=True)
 class ModelOptions(KeptCriticOptions, DynamicsOptions):
     """Options of methods that branch with dynamics models."""
 
-    horizon: int = 1
+    horizon: checks.Few = 1
     """Steps of an imagined branch; with shortening also of a segment (the paper's H)."""
-    branches: int = 5
+    branches: checks.Few = 5
     """Imagined branches from each real row of a batch."""
-    branch_noise: float = 0.5
+    branch_noise: checks.NotNegative = 0.5
     """Std of Gaussian noise on imagined actions, in units of the action's range; 0 as in the paper. Without noise the
     critic never hears of actions better than the policy's (docs/history.md)."""
     train_dynamics: bool = True
     """Fit the models to real rows; False keeps the simulator's."""
     actor_real_only: bool = True
     """The actor learns from the sampled rows alone, the critic from the imagined ones too."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.few(self, 1, "horizon", "branches")
-        checks.not_negative(self, "branch_noise")
 
     @property
     def actor_batch(self) -> int | None:
@@ -198,12 +158,8 @@ class ModelOptions(KeptCriticOptions, DynamicsOptions):
 class ShapedOptions(KeptCriticOptions):
     """Options of methods that shape rewards by V_sim."""
 
-    clip_shaped: float | None = 2.0
+    clip_shaped: checks.Positive | None = 2.0
     """Bound on the shaped reward; None = no bound, as in the paper."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.positive(self, "clip_shaped")
 
 
 # --- options left open ------------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
 
@@ -62,3 +62,43 @@ def test_layers():
     for value, words in (((), "empty: must be one or more layers"), ((8, 0), "0: must be at least 1"), ((-1,), "-1")):
         with pytest.raises(UserError, match=f"is {words}"):
             checks.layers(Config(value), "learning_rate")
+
+
+# --- by the types of fields -------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Typed(checks.Checked):
+    rate: checks.Positive = 1.0
+    updates: checks.Updates | None = None
+    models: Annotated[int, checks.least(2), checks.few] = 3
+    free: float = -1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Overridden(Typed):
+    rate: float = 2.0
+    share: checks.Share = 0.5
+
+
+@pytest.mark.parametrize("kind", [Typed, Overridden])
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        ({"rate": 0.0}, "option rate is 0.0: must be a positive number"),
+        ({"updates": -1}, "option updates is -1: must be 0 or a positive number"),
+        ({"models": 1}, "option models is 1: must be at least 2"),
+        ({"models": 70_000}, "option models is 70000: must be at most 65536"),
+    ],
+)
+def test_types_of_fields_say_what_they_must_be(kind, given, line):
+    """Also where a class that derives from another gives a field a plain type and another default."""
+    with pytest.raises(UserError) as refused:
+        kind(**given)
+    assert str(refused.value) == line
+    assert kind(updates=0).updates == 0 and kind().updates is None
+
+
+def test_a_class_adds_fields_to_those_that_it_derives_from():
+    with pytest.raises(UserError, match="option share is 2: must be from 0 to 1"):
+        Overridden(share=2)
