@@ -315,7 +315,7 @@ class Fixed(NamedTuple):
     kind: what it learns from: real rows and a simulator, the real rows alone, or the simulator alone.
     description, source: one line each. presets: settings by name, frozen dataclasses that derive from
     `methods.options.ActorCriticOptions` and whose fields carry their help; the first is the default.
-    build(config, task) -> HybridAgent. by_data: whether presets are called after data sets, see `hybrid.presets`.
+    build(config, task) -> HybridAgent. by_data: whether presets are called after data sets, see `presets.preset_for`.
     name: of the method; `methods.get_method` fills it in.
     """
 

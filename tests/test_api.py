@@ -30,10 +30,10 @@ PUBLIC = [(f"{package}.{name}", thing) for package in names.PACKAGES for name, t
 
 
 def public_modules():
-    """The modules that public names are of, with these names; learners are public module by module."""
+    """The modules that public names are of, with these names; learners are a package with a stub of its own."""
     modules = {}
     for node in ast.parse(Path(sgft_jax.__file__).with_suffix(".pyi").read_text()).body:
-        if isinstance(node, ast.ImportFrom) and not node.module.startswith("learners"):
+        if isinstance(node, ast.ImportFrom) and node.module:
             for name in (alias.name for alias in node.names):
                 if isinstance(thing := getattr(sgft_jax, name), ModuleType):
                     prefix = f"sgft_jax.{name}."

@@ -24,9 +24,9 @@ from experiments.runner.options import (
     seeds_name,
     without_repeats,
 )
-from sgft_jax.hybrid.presets import preset_for, say_preset
 from sgft_jax.io.runs import NO_DATA, NO_SIMULATOR, check_start
 from sgft_jax.methods import get_method
+from sgft_jax.presets import preset_for, say_preset
 from sgft_jax.train.schedule import FLEET, Schedule, describe
 from sgft_jax.types import Fixed
 

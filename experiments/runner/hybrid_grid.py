@@ -34,9 +34,9 @@ from experiments.runner.options import (
 )
 from experiments.runner.start import hybrid
 from sgft_jax.files.jsonfile import jsonable
-from sgft_jax.hybrid.presets import say_preset
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import FIXED_NAMES, get_method
+from sgft_jax.presets import say_preset
 from sgft_jax.train.schedule import FLEET, SCHEDULES, Schedule, name_of
 
 if TYPE_CHECKING:

@@ -24,10 +24,10 @@ from experiments.runner.memory import reserve
 from experiments.runner.training import Record, Training, opened
 from experiments.runner.video import film_episode
 from sgft_jax.analysis import figures
-from sgft_jax.analysis.reading import read_curve
+from sgft_jax.analysis.hybrid import LATE, late
+from sgft_jax.analysis.reading import measures, read_curve
 from sgft_jax.datasets import logs
 from sgft_jax.files.jsonfile import jsonable
-from sgft_jax.hybrid.scores import LATE, late, measures
 from sgft_jax.io import runs
 from sgft_jax.io.log import EVAL, read_jsonl, write_summary
 from sgft_jax.io.runs import NO_SIMULATOR

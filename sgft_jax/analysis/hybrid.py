@@ -14,7 +14,6 @@ from envs.scales import D4RL, normalised
 from sgft_jax.analysis.curves import SCORES, Curve
 from sgft_jax.analysis.scoreboard import improvement
 from sgft_jax.analysis.tables import NONE, markdown, number, plain
-from sgft_jax.hybrid.scores import shown
 from sgft_jax.math.stats import Interval, bootstrap_interval, mean, rank_correlation
 
 LEGEND = (
@@ -24,9 +23,20 @@ LEGEND = (
     "methods without a simulator made the updates alone. The data sets are what the files hold: numbers on sets that "
     "were made anew do not belong beside published ones."
 )
+LATE = 10  # evaluations that a score averages, beside the last one
 _SCORES = {"late": "mean of the last ten evaluations", "last": "last evaluation"}
 _MEASURED = "What else the task is judged by, in these evaluations: mean with a 95 % bootstrap interval over seeds."
 _FEWEST = 3  # methods that have an order worth comparing
+
+
+def late(curve: np.ndarray) -> np.ndarray:
+    """[seeds], the mean of the last ten evaluations. curve: [evaluations, seeds]."""
+    return curve[-LATE:].mean(0)
+
+
+def shown(curve: np.ndarray, score: str) -> np.ndarray:
+    """[seeds], what tables show of a curve [evaluations, seeds]. score: "last" or "late", see `late`."""
+    return curve[-1] if score == "last" else late(curve)
 
 
 class Results(NamedTuple):

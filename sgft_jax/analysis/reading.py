@@ -14,17 +14,22 @@ from envs import gaps
 from envs.files import Count
 from envs.types import UserError
 from sgft_jax.analysis.curves import SCORES, Curve, Found
-from sgft_jax.hybrid.scores import measures
 from sgft_jax.io.log import EVAL, METRICS, SUMMARY, check_records, read_jsonl
 from sgft_jax.io.runs import CONFIG, NO_DATA, NO_SIMULATOR, read_config, read_own, read_starts
 from sgft_jax.train.schedule import Schedule, name_of
 
 # Of a line of eval.jsonl, beside its scores.
 _EVALUATION = {"step": Count, "rollouts": Count, "robot_minutes": Annotated[float, Meta(ge=0)]}
+_ALWAYS = ("step", "score", "success", "return", "exploded")  # in the evaluations of every task
 _UNNAMED = re.compile(r"prior|seeds?-\d+(-\d+)?")  # folders that name no set of priors
 # Of a run's options those that are in other columns, or say nothing about its outcome; paths of a machine above all.
 _LEFT_OUT = {"out", "prior", "resume", "overwrite", "video", "devices", "checkpoint_every", "impl"}
 _LEFT_OUT |= {"task", "method", "variant", "real"}
+
+
+def measures(line: Mapping[str, Any]) -> list[str]:
+    """The names of what else the task is judged by, in a line of `eval.jsonl`."""
+    return [name for name in line if name not in _ALWAYS]
 
 
 def read_curve(folder: Path) -> Curve:

@@ -7,8 +7,7 @@ from envs.scales import D4RL
 from envs.types import UserError
 from sgft_jax.analysis import hybrid, release
 from sgft_jax.analysis.curves import Curve
-from sgft_jax.analysis.hybrid import Results
-from sgft_jax.hybrid.scores import late
+from sgft_jax.analysis.hybrid import Results, late
 
 LOW, HIGH = D4RL["halfcheetah"]
 

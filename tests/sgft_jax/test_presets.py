@@ -2,8 +2,8 @@
 
 import pytest
 
-from sgft_jax.hybrid.presets import preset_for, say_preset
 from sgft_jax.methods import FIXED_NAMES, get_method
+from sgft_jax.presets import preset_for, say_preset
 
 REBRAC = get_method("rebrac", "fixed")
 
