@@ -1,6 +1,8 @@
 """MkDocs hook: fills the list of public names of docs/api.md in, from the docstrings."""
 
+import importlib
 import inspect
+from collections.abc import Iterator
 from types import ModuleType
 from typing import Any
 
@@ -21,12 +23,19 @@ def table(package: str) -> str:
 
 def public(package: str) -> list[tuple[str, Any]]:
     """The public names of a package with what they stand for; of its public modules, what they define themselves."""
-    module = __import__(package)
-    found = [(name, getattr(module, name)) for name in module.__all__]
-    for name, sub in list(found):
-        if isinstance(sub, ModuleType):
-            found += [(f"{name}.{key}", thing) for key, thing in vars(sub).items() if _own(key, thing, sub)]
-    return sorted(found)
+    return sorted(_members(importlib.import_module(package), ""))
+
+
+def _members(module: ModuleType, prefix: str) -> Iterator[tuple[str, Any]]:
+    package = hasattr(module, "__path__")
+    names = (
+        module.__all__ if package else [key for key, thing in vars(module).items() if _defined_in(key, thing, module)]
+    )
+    for name in names:
+        thing = getattr(module, name)
+        yield prefix + name, thing
+        if isinstance(thing, ModuleType):
+            yield from _members(thing, f"{prefix}{name}.")
 
 
 def summary(thing: Any) -> str:
@@ -37,6 +46,6 @@ def summary(thing: Any) -> str:
     return text.partition(". ")[0].rstrip(".").replace("|", "\\|")
 
 
-def _own(key: str, thing: Any, module: ModuleType) -> bool:
+def _defined_in(key: str, thing: Any, module: ModuleType) -> bool:
     written = inspect.isroutine(thing) or inspect.isclass(thing)
     return written and not key.startswith("_") and thing.__module__ == module.__name__

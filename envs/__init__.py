@@ -78,9 +78,11 @@ def make(
 
 def _make(task: str, impl: str, scene: str) -> Env:
     module = _module(task)
-    arguments = (impl, _real(task, scene)) if scene else (impl,)
     if module.__name__ in _OURS:
-        return packed(module.make(*arguments))
+        from envs.mujoco.scene import make_env
+
+        return packed(make_env(_real(task, scene) if scene else module.SCENE, impl))
+    arguments = (impl, _real(task, scene)) if scene else (impl,)
     source = task if extend.is_source(task) else module.__name__
     env = extend.guard("task", source, module.make)(*arguments)
     if not isinstance(env, Env):
@@ -112,8 +114,8 @@ def name_of(task: str) -> str:
 
 
 def _module(task: str) -> ModuleType:
-    if task in TASKS:
-        return importlib.import_module(TASKS[task])
+    if task in TASKS or task in _OURS:
+        return importlib.import_module(TASKS.get(task, task))
     if not extend.is_source(task):
         raise UserError(f"{unknown('task', task, TASKS)}; or name a file, e.g. my_{task}.py")
     module, name = extend.load("task", task, "make"), extend.name_of(task)

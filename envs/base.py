@@ -203,6 +203,9 @@ class Env(NamedTuple):
     system: what the observation then tells of the system that the episode takes place in, see `envs.system`.
     simulator() -> (obs, action) -> [measured_dim] what a step changes in the system that `obs` tells. None where it
         tells none or the task has no `restore`.
+    measures(next_obs [..., T, measured_dim], valid [..., T]) -> {name: [...]}: what else whole episodes are judged by,
+        in numpy. The steps that are not valid come last.
+    table: whether six-column text files, the logs of a wheel-legged robot (docs/hybrid.md), are records of it.
     impl: the physics engine. scene: the name of a real system's own scene, "" for the one to pretrain in.
     """
 
@@ -229,6 +232,8 @@ class Env(NamedTuple):
     previous_actions: int = 0
     system: tuple[Varying, ...] = ()
     simulator: Callable[[], Callable[[Array, Array], Array]] | None = None
+    measures: Callable[[Any, Any], dict[str, Any]] = lambda next_obs, valid: {}
+    table: bool = False
     impl: str = "jax"
     scene: str = ""
 
@@ -318,7 +323,7 @@ def packed(env: Env) -> Env:
 
     restore = env.restore
     return env._replace(
-        reset=lambda *given: flat(env.reset(*given)),
-        step=lambda *given: flat(env.step(*given)),
-        restore=None if restore is None else lambda *given: flat(restore(*given)),
+        reset=lambda *args: flat(env.reset(*args)),
+        step=lambda *args: flat(env.step(*args)),
+        restore=None if restore is None else lambda *args: flat(restore(*args)),
     )

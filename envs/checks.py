@@ -33,7 +33,7 @@ def check_description(task: Env | Scene) -> None:
         raise wrong("control_dt", "must be a number of seconds above 0", task.control_dt)
     if task.score not in SCORES:
         raise wrong("score", f"must be one of {', '.join(SCORES)}", task.score)
-    for field in ("success_anytime", "cartesian"):
+    for field in ("success_anytime", "cartesian", "table"):
         if not isinstance(getattr(task, field), bool):
             raise wrong(field, "must be True or False", getattr(task, field))
     if task.cartesian and sum(entry.size for entry in task.action) < 2:
@@ -92,8 +92,8 @@ def with_finite_steps(env: Env) -> Env:
     """
     import jax.numpy as jnp
 
-    def step(*given: Any) -> EnvState:
-        state = env.step(*given)
+    def step(*args: Any) -> EnvState:
+        state = env.step(*args)
         finite = jnp.isfinite(state.true_obs).all() & jnp.isfinite(state.reward)
         return state._replace(invalid=state.invalid | ~finite)
 
@@ -128,7 +128,7 @@ def is_count(value: Any) -> bool:
 
 
 def _refusal(task: Any) -> Callable[[str, str, Any], UserError]:
-    return lambda field, need, found: UserError(f"task {task.name}: '{field}' {need}, got {found!s:.120}")
+    return lambda field, need, value: UserError(f"task {task.name}: '{field}' {need}, got {value!s:.120}")
 
 
 def _check_entries(wrong: Callable[..., UserError], field: str, entries: Sequence[Entry]) -> None:

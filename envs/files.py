@@ -30,10 +30,8 @@ Positive = Annotated[float, Meta(gt=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 Schema = type | Mapping[str, Any]  # a `msgspec.Struct`, a `TypedDict`, or types by key
 
-_WORDS = {
-    "str": "a text", "int": "a whole number", "float": "a number", "object": "an object", "array": "a list",
-    "bool": "true or false", "null": "null",
-}  # fmt: skip
+_WORDS = dict(str="a text", int="a whole number", float="a number", object="an object", array="a list")
+_WORDS |= {"bool": "true or false", "null": "null"}
 
 
 def read_text(path: Path | str, *, limit: int = LIMIT) -> str:

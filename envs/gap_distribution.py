@@ -120,35 +120,35 @@ def _value(rng: np.random.Generator, ways: Mapping[str, Range], entries: tuple[E
     return _numbers(rng, ways[way], 1 if way == _COMMON else sum(e.size for e in entries))
 
 
-def _numbers(rng: np.random.Generator, given: Range, size: int) -> float | list[float]:
-    drawn = rng.uniform(given.low, given.high, 1 if given.of_length else size)
-    if given.of_length:
+def _numbers(rng: np.random.Generator, bounds: Range, size: int) -> float | list[float]:
+    drawn = rng.uniform(bounds.low, bounds.high, 1 if bounds.of_length else size)
+    if bounds.of_length:
         direction = rng.normal(size=size)
         drawn = drawn * direction / np.linalg.norm(direction)
     rounded = [float(f"{x:.{DIGITS}g}") for x in drawn]
     return rounded if size > 1 else rounded[0]
 
 
-def _item(env: Env, name: str, given: Any, where: str) -> dict[str, Range]:
+def _item(env: Env, name: str, table: Any, where: str) -> dict[str, Range]:
     """How an item is drawn. Raises UserError for an unknown name and for what is no range."""
     if name not in Effects._fields and name not in [p.name for p in env.parameters]:
         raise UserError(f"{where}: {misnamed(env, name)}")
-    ways, entries = given if isinstance(given, dict) else {_COMMON: given}, [e.name for e in entries_of(env, name)]
+    ways, entries = table if isinstance(table, dict) else {_COMMON: table}, [e.name for e in entries_of(env, name)]
     allowed = [_COMMON, *([_EACH, *entries] if entries else [])]
     for way in ways:
         if way not in allowed:
             raise UserError(f"{where} {unknown(name, way, allowed)}")
     if not ways or (set(ways) & {_COMMON, _EACH} and set(ways) & set(entries)):
-        raise UserError(f"{where}: '{name}' needs ranges of '{_COMMON}' and '{_EACH}', or of entries, got {given!r}")
+        raise UserError(f"{where}: '{name}' needs ranges of '{_COMMON}' and '{_EACH}', or of entries, got {table!r}")
     return {way: _range(ends, f"{where}: '{name}'", named=way in entries) for way, ends in ways.items()}
 
 
-def _range(given: Any, where: str, *, named: bool) -> Range:
+def _range(table: Any, where: str, *, named: bool) -> Range:
     """named: of an entry, of which the length may be given."""
-    of_length = named and isinstance(given, dict) and set(given) == {_LENGTH}
-    ends = given[_LENGTH] if of_length else given
+    of_length = named and isinstance(table, dict) and set(table) == {_LENGTH}
+    ends = table[_LENGTH] if of_length else table
     if not _is_range(ends):
-        raise UserError(f"{where} needs a range [low, high], got {given!r}")
+        raise UserError(f"{where} needs a range [low, high], got {table!r}")
     if of_length and ends[0] < 0:
         raise UserError(f"{where}: a length must not be negative, got {ends!r}")
     return Range(float(ends[0]), float(ends[1]), of_length)

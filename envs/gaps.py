@@ -139,16 +139,13 @@ def worlds(env: Env, gap: Gap, key: Key, n: int = 256) -> World:
     return sample_worlds(env, key, n if (low < high).any() else 1, params=gap.params, effects=gap.effects)
 
 
-def to_toml(found: Iterable[Gap]) -> str:
+def to_toml(listed: Iterable[Gap]) -> str:
     """Gaps as the text of a file that holds several, for people too. `read_file` gives back the same gaps."""
-    return "\n".join(_table(gap) for gap in found)
+    return "\n".join(_table(gap) for gap in listed)
 
 
 def _table(gap: Gap) -> str:
-    values = {
-        "stratum": gap.stratum, "scene": gap.scene, "families": list(gap.families), "params": gap.params,
-        "effects": gap.effects,
-    }  # fmt: skip
+    values = {name: getattr(gap, name) for name in ("stratum", "scene", "families", "params", "effects")}
     lines = [f"{_key(name)} = {_inline(value)}" for name, value in values.items() if value]
     return "\n".join([f"[{_key(gap.name)}]", *lines, ""])
 
@@ -203,7 +200,7 @@ def _is_value(value: Any) -> bool:
 
 def changes(overrides: Sequence[str]) -> dict[str, Value]:
     """What overrides such as "latency=0.05" set, by name. Raises UserError where one sets nothing, or two the same."""
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for text in overrides:
         name, _, value = (part.strip() for part in text.partition("="))
         try:
@@ -212,10 +209,10 @@ def changes(overrides: Sequence[str]) -> dict[str, Value]:
             parsed = None
         if not name or not _is_value(parsed):
             raise UserError(f"{text[:60]!r} does not set anything; write name=number or name=[number,number]")
-        if name in found:
+        if name in values:
             raise UserError(f"{text[:60]!r}: {name!r} is set twice; set it once")
-        found[name] = parsed
-    return found
+        values[name] = parsed
+    return values
 
 
 def _check(env: Env, gap: Gap) -> None:

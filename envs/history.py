@@ -24,7 +24,7 @@ def with_previous_actions(env: Env, n: int) -> Env:
         tell=lambda world, state, actions: actions.reshape(-1),
         start=lambda: jnp.zeros((n, env.act_dim)),
         remember=lambda actions, action: jnp.concatenate([action[None], actions[:-1]]),
-        recall=lambda told: told.reshape(n, env.act_dim),
+        recall=lambda facts: facts.reshape(n, env.act_dim),
     )
     return longer._replace(previous_actions=n)
 
@@ -43,7 +43,7 @@ def extended(
     tell(world, state of `env`, memory) -> [entry.size]. start() -> memory of an episode. remember(memory, action) ->
     memory. recall(what was told [entry.size]) -> memory.
     """
-    own_dim = env.obs_dim
+    inner_dim = env.obs_dim
 
     def outside(world: World, state: EnvState, memory: PyTree) -> EnvState:
         facts = tell(world, state, memory)
@@ -58,13 +58,13 @@ def extended(
 
     def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
         physics, memory = state.physics
-        inner = state._replace(physics=physics, obs=state.obs[:own_dim], true_obs=state.true_obs[:own_dim])
+        inner = state._replace(physics=physics, obs=state.obs[:inner_dim], true_obs=state.true_obs[:inner_dim])
         return outside(world, env.step(world, inner, action, key), remember(memory, action))
 
     def of_transition(function: Callable[..., Array] | None) -> Callable[..., Array] | None:
         if function is None:
             return None
-        return lambda obs, action, next_obs: function(obs[:own_dim], action, next_obs[:own_dim])
+        return lambda obs, action, next_obs: function(obs[:inner_dim], action, next_obs[:inner_dim])
 
     success, restore = env.success, env.restore
     return env._replace(
@@ -73,10 +73,10 @@ def extended(
         step=step,
         restore=None
         if restore is None
-        else lambda world, obs, key: outside(world, restore(world, obs[:own_dim], key), recall(obs[own_dim:])),
+        else lambda world, obs, key: outside(world, restore(world, obs[:inner_dim], key), recall(obs[inner_dim:])),
         reward=of_transition(env.reward),
         terminated=of_transition(env.terminated),
-        success=None if success is None else lambda obs: success(obs[:own_dim]),
+        success=None if success is None else lambda obs: success(obs[:inner_dim]),
         trace=lambda physics: env.trace(physics[0]),
     )
 

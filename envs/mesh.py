@@ -118,13 +118,13 @@ def set_rows(data: PyTree, rows: Array, batch: PyTree) -> PyTree:
     if n == 1 or length % n:
         return _set_rows(data, rows, batch)
 
-    def own(data: PyTree, rows: Array, batch: PyTree) -> PyTree:
-        here = rows - jax.lax.axis_index(DATA) * (length // n)
-        mine = (here >= 0) & (here < length // n)
-        return _set_rows(data, jnp.where(mine, here, length // n), batch)
+    def set_local(data: PyTree, rows: Array, batch: PyTree) -> PyTree:
+        local_rows = rows - jax.lax.axis_index(DATA) * (length // n)
+        mine = (local_rows >= 0) & (local_rows < length // n)
+        return _set_rows(data, jnp.where(mine, local_rows, length // n), batch)
 
     specs = PartitionSpec(DATA), PartitionSpec(), PartitionSpec()
-    return jax.shard_map(own, in_specs=specs, out_specs=PartitionSpec(DATA), check_vma=False)(data, rows, batch)
+    return jax.shard_map(set_local, in_specs=specs, out_specs=PartitionSpec(DATA), check_vma=False)(data, rows, batch)
 
 
 def running_count(mask: Array) -> Array:

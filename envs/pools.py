@@ -24,14 +24,14 @@ def load_gap(env: Env, real: str | None, overrides: Sequence[str]) -> Gap | None
     return gaps.load(env, real, overrides)
 
 
-def real_env(env: Env, found: Sequence[Gap]) -> Env:
+def real_env(env: Env, real_gaps: Sequence[Gap]) -> Env:
     """The Env of these real systems: that of the simulator, or of the other scene that they name.
 
     None of them tells what system it is, see `envs.system.concealed`.
 
     Raises UserError where they name several, which no one program can step.
     """
-    scenes = {gap.scene: gap.name for gap in found}
+    scenes = {gap.scene: gap.name for gap in real_gaps}
     if len(scenes) > 1:
         (one, first), (other, second) = sorted(scenes.items())[:2]
         differ = f"{first} is in {f"scene '{one}'" if one else 'the simulated scene'} and {second} in scene '{other}'"
@@ -45,9 +45,9 @@ def training_worlds(env: Env, gap: Gap | None, key: Key, n: int) -> World:
     return sample_worlds(env, key, n) if gap is None else gaps.worlds(env, gap, key, n)
 
 
-def real_worlds(env: Env, found: Sequence[Gap], key: Key, n: int = 256) -> World:
+def real_worlds(env: Env, real_gaps: Sequence[Gap], key: Key, n: int = 256) -> World:
     """The real systems of gaps as pools of one size, [gaps, n]; [gaps, 1] where nothing varies in any of them."""
-    pools = [gaps.worlds(env, gap, key, n) for gap in found]
+    pools = [gaps.worlds(env, gap, key, n) for gap in real_gaps]
     size = max(map(pool_size, pools))
     return jax.tree.map(lambda *x: jnp.stack(x), *[padded(pool, size) for pool in pools])
 

@@ -180,12 +180,12 @@ def counted(episodes: Episode, worst: Array | None = None) -> tuple[Array, Array
     """
     total, exploded = episodes.total_reward, episodes.exploded
     xp = total.__array_namespace__()
-    found = []
+    results = []
     for i, values in enumerate((xp.where(xp.isneginf(episodes.score), total, episodes.score), total)):
         low = values.min(-1, keepdims=True)
         low = low if worst is None else xp.minimum(low, worst[..., i, None])
-        found.append(xp.where(exploded, low, values))
-    return found[0], found[1]
+        results.append(xp.where(exploded, low, values))
+    return results[0], results[1]
 
 
 def _transition(before: EnvState, action: Array, after: EnvState, *, gamma: float | Array) -> Transition:

@@ -25,7 +25,7 @@ def varying(
     low, high = parameter_ranges(env, params).T
     ends = make_range(env, {**env.training, **effects})
     low, high = (
-        np.concatenate([own, *(np.ravel(x) for x in end)]) for own, end in ((low, ends.low), (high, ends.high))
+        np.concatenate([ranges, *(np.ravel(x) for x in end)]) for ranges, end in ((low, ends.low), (high, ends.high))
     )
     named = zip(_names(env), low, high, strict=True)
     entries = tuple(Varying(*name, float(a), float(b)) for name, a, b in named if a < b)
@@ -57,10 +57,10 @@ def with_system(env: Env, system: tuple[Varying, ...]) -> Env:
         tell=tell,
         start=lambda: (),
         remember=lambda memory, action: memory,
-        recall=lambda told: (),
+        recall=lambda facts: (),
     )
-    asked = None if env.restore is None else functools.partial(simulator, env, env.restore, system)
-    return longer._replace(system=system, simulator=asked)
+    make_simulator = None if env.restore is None else functools.partial(simulator, env, env.restore, system)
+    return longer._replace(system=system, simulator=make_simulator)
 
 
 def blurred(env: Env, noise: float) -> Env:
@@ -68,11 +68,11 @@ def blurred(env: Env, noise: float) -> Env:
 
     Without it, networks tell the episodes of training apart by numbers that stay the same for a whole one.
     """
-    own_dim = env.obs_dim - len(env.system)
+    first = env.obs_dim - len(env.system)
 
     def blur(state: EnvState, key: Key) -> EnvState:
         error = noise * jax.random.normal(key, (len(env.system),))
-        return state._replace(obs=state.obs.at[own_dim:].add(error), true_obs=state.true_obs.at[own_dim:].add(error))
+        return state._replace(obs=state.obs.at[first:].add(error), true_obs=state.true_obs.at[first:].add(error))
 
     def reset(world: World, key: Key) -> EnvState:
         key_own, key_noise = jax.random.split(key)
@@ -89,11 +89,10 @@ def concealed(env: Env) -> Env:
     """The same task as a real system, whose parameters are unknown: the last k entries of observations are 0."""
     if not env.system:
         return env
-    own_dim = env.obs_dim - len(env.system)
-    silent = lambda obs: obs.at[own_dim:].set(0.0)  # noqa: E731
+    first = env.obs_dim - len(env.system)
 
     def hide(state: EnvState) -> EnvState:
-        return state._replace(obs=silent(state.obs), true_obs=silent(state.true_obs))
+        return state._replace(obs=state.obs.at[first:].set(0.0), true_obs=state.true_obs.at[first:].set(0.0))
 
     def reset(world: World, key: Key) -> EnvState:
         return hide(env.reset(world, key))
@@ -116,7 +115,7 @@ def simulator(
     Worlds are compiled on the host, which no jitted search can ask for. So some are compiled now, and every field of
     their models becomes a quadratic function of the domain parameters.
     """
-    own_dim, measured = env.obs_dim, env.measured_dim
+    first, measured = env.obs_dim, env.measured_dim
     model_of, key = models_of(env, system), jax.random.key(0)
     place = {name: i for i, name in enumerate(_names(env))}
     where = np.array([place[v.name, v.index] for v in system])
@@ -126,23 +125,23 @@ def simulator(
     nominal = jnp.concatenate([jnp.array([p.nominal for p in env.parameters]), *(jnp.ravel(x) for x in usual)])
     sizes = np.cumsum([len(env.parameters), *(x.size for x in usual)])[:-1]
 
-    def world_of(told: Array) -> World:
-        params, *parts = jnp.split(nominal.at[where].set(low + 0.5 * (1.0 + told) * (high - low)), sizes)
+    def world_of(point: Array) -> World:
+        params, *parts = jnp.split(nominal.at[where].set(low + 0.5 * (1.0 + point) * (high - low)), sizes)
         drawn = Effects(*(part.reshape(x.shape) for part, x in zip(parts, usual, strict=True)))
         drawn = drawn._replace(latency_jitter=jnp.zeros(()))
-        return World(Theta(params, EffectRange(drawn, drawn)), model_of(told))
+        return World(Theta(params, EffectRange(drawn, drawn)), model_of(point))
 
     @jax.custom_jvp
     def change(obs: Array, action: Array) -> Array:
-        world = world_of(obs[own_dim:])
-        before = restore(world, obs[:own_dim], key)
+        world = world_of(obs[first:])
+        before = restore(world, obs[:first], key)
         after = env.step(world, before, action, key)
         measured_state = after.true_obs[:measured] + after.effects.obs_bias
         return jnp.where(after.invalid, 0.0, measured_state - obs[:measured])
 
     @change.defjvp
-    def differences(given: tuple[Array, Array], along: tuple[Array, Array]) -> tuple[Array, Array]:
-        (obs, action), step = given, 0.05 * along[0].at[:own_dim].set(0.0)
+    def differences(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+        (obs, action), step = primals, 0.05 * tangents[0].at[:first].set(0.0)
         return change(obs, action), 10.0 * (change(obs + step, action) - change(obs - step, action))
 
     return change

@@ -11,11 +11,12 @@ devices: pretraining on several devices with as many times the environments and 
 times one device.
 """
 
-from collections.abc import Callable, Iterator
+import importlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from envs.types import UserError
 from experiments.runner import cli
@@ -67,16 +68,18 @@ class BenchmarkConfig:
     """The numbers go to <out>/benchmark/summary.json."""
 
 
-def main(config: BenchmarkConfig) -> dict[str, list[dict[str, Any]]]:
+def main(config: BenchmarkConfig) -> dict[Part, list[dict[str, Any]]]:
     """Measures, prints tables, writes the numbers and returns them by kind of measurement."""
     _check(config)
     from sgft_jax.io import runs
     from sgft_jax.io.log import write_summary
 
-    measured: dict[str, list[dict[str, Any]]] = {}
+    measured: dict[Part, list[dict[str, Any]]] = {}
     for part in config.parts:
         measured[part] = []
-        for line in _PARTS[part](config):
+        if part == "physics":
+            _check_steps(config)
+        for line in _lines(_KINDS[part], config):
             measured[part].append(line)
             print("  ".join(f"{name} {_text(x)}" for name, x in line.items()), flush=True)
     folder = config.out / "benchmark"
@@ -109,102 +112,63 @@ def _check(config: BenchmarkConfig) -> None:
             task_of_priors(prior_folders(config.prior, out=config.out, task=task, preset=config.preset), task)
 
 
-def _physics(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+class _Kind(NamedTuple):
+    """A kind of measurements. title: of its table. function: what measures one line or several, in `experiments.bench`.
+
+    axes: argument -> option, all of whose values are combined. options: passed on as they are, by name.
+    """
+
+    title: str
+    function: str
+    axes: dict[str, str]
+    options: tuple[str, ...]
+
+
+_UPDATES = ("width", "updates", "repeats")
+_TASK = {"task": "tasks", "impl": "impls"}
+_SEEDS = {**_TASK, "seeds": "seeds"}
+_DEVICES = {**_TASK, "worlds": "worlds", "batch": "batches"}
+_NETWORKS = {"exact": "precisions", "batch": "batches", "seeds": "seeds"}
+_KINDS: dict[Part, _Kind] = {
+    "physics": _Kind("environments", "physics.speed", {**_TASK, "worlds": "worlds"}, ("control_steps", "repeats")),
+    "updates": _Kind("updates of pretraining", "updates.speed", _NETWORKS, _UPDATES),
+    "plain": _Kind("updates of plain SAC", "updates.plain_speed", {"batch": "batches"}, _UPDATES),
+    "hybrid": _Kind("updates of hybrid runs", "hybrid.speed", {**_TASK, "members": "seeds"}, _UPDATES),
+    "pretrain": _Kind("pretraining", "training.pretraining", _SEEDS, ("preset", "env_steps")),
+    "finetune": _Kind("fine-tuning with SGFT-SAC", "training.fine_tuning", _SEEDS, ("prior", "rollouts")),
+    "system": _Kind("fine-tuning through a real system", "system.speed", _SEEDS, ("prior", "repeats")),
+    "devices": _Kind(
+        "pretraining on several devices", "training.weak_scaling", _DEVICES, ("devices", "preset", "env_steps")
+    ),
+}
+
+
+def _lines(kind: _Kind, config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
+    """The measurements of one kind, one after another."""
+    module, _, name = kind.function.partition(".")
+    function = getattr(importlib.import_module(f"experiments.bench.{module}"), name)
+    options = {option: getattr(config, option) for option in kind.options}
+    for values in product(*(getattr(config, option) for option in kind.axes.values())):
+        measured = function(**dict(zip(kind.axes, values, strict=True)), **options)
+        yield from measured if isinstance(measured, list) else [measured]
+
+
+def _check_steps(config: BenchmarkConfig) -> None:
+    """Raises UserError for timed calls that are longer than half an episode of a task."""
     import envs
-    from envs.mujoco.worlds import choose_impl
-    from experiments.bench import physics
 
     for task in config.tasks:
         if 2 * config.control_steps > envs.scene(task).episode_length:
             raise UserError(f"--control-steps {config.control_steps} is more than half an episode of {task}")
-    for task, impl, n in product(config.tasks, map(choose_impl, config.impls), config.worlds):
-        yield physics.speed(task, impl, n, control_steps=config.control_steps, repeats=config.repeats)
 
 
-def _updates(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
-    from experiments.bench import updates
-
-    size = {"width": config.width, "updates": config.updates, "repeats": config.repeats}
-    for exact, batch, seeds in product(config.precisions, config.batches, config.seeds):
-        yield updates.speed(batch, seeds, exact=exact, **size)
-
-
-def _plain(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
-    from experiments.bench import updates
-
-    for batch in config.batches:
-        yield updates.plain_speed(batch, width=config.width, updates=config.updates, repeats=config.repeats)
-
-
-def _hybrid(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
-    from envs.mujoco.worlds import choose_impl
-    from experiments.bench import hybrid
-
-    size = {"width": config.width, "updates": config.updates, "repeats": config.repeats}
-    for task, impl, members in product(config.tasks, map(choose_impl, config.impls), config.seeds):
-        yield hybrid.speed(task, impl, members, **size)
-
-
-def _pretrain(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
-    from experiments.bench import training
-
-    for task, impl, seeds in product(config.tasks, config.impls, config.seeds):
-        yield training.pretraining(task, impl, seeds, preset=config.preset, env_steps=config.env_steps)
-
-
-def _finetune(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
-    from experiments.bench import training
-
-    assert config.prior is not None  # checked before
-    for task, impl, seeds in product(config.tasks, config.impls, config.seeds):
-        yield training.fine_tuning(task, impl, seeds, prior=config.prior, rollouts=config.rollouts)
-
-
-def _system(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
-    from experiments.bench import system
-
-    for task, impl, seeds in product(config.tasks, config.impls, config.seeds):
-        priors = prior_folders(config.prior, out=config.out, task=task, preset=config.preset)
-        yield system.speed(task, impl, seeds, priors=priors, repeats=config.repeats)
-
-
-def _devices(config: BenchmarkConfig) -> Iterator[dict[str, Any]]:
-    from experiments.bench import training
-
-    for task, impl, worlds, batch in product(config.tasks, config.impls, config.worlds, config.batches):
-        size = {"worlds": worlds, "batch": batch, "preset": config.preset, "env_steps": config.env_steps}
-        yield from training.weak_scaling(task, impl, config.devices, **size)
-
-
-_PARTS: dict[Part, Callable[[BenchmarkConfig], Iterator[dict[str, Any]]]] = {
-    "physics": _physics,
-    "updates": _updates,
-    "plain": _plain,
-    "hybrid": _hybrid,
-    "pretrain": _pretrain,
-    "finetune": _finetune,
-    "system": _system,
-    "devices": _devices,
-}
-_TITLES = {
-    "physics": "environments",
-    "updates": "updates of pretraining",
-    "plain": "updates of plain SAC",
-    "hybrid": "updates of hybrid runs",
-    "pretrain": "pretraining",
-    "finetune": "fine-tuning with SGFT-SAC",
-    "system": "fine-tuning through a real system",
-    "devices": "pretraining on several devices",
-}
-
-
-def table(part: str, lines: list[dict[str, Any]]) -> str:
+def table(part: Part, lines: list[dict[str, Any]]) -> str:
     """The lines of one kind as a table."""
     from sgft_jax.analysis import tables
 
     names = list(dict.fromkeys(name for line in lines for name in line))
     rows = [[_text(line.get(name, "-")) for name in names] for line in lines]
-    return f"{_TITLES[part]}\n\n{tables.markdown([name.replace('_', ' ') for name in names], rows)}\n"
+    return f"{_KINDS[part].title}\n\n{tables.markdown([name.replace('_', ' ') for name in names], rows)}\n"
 
 
 def _text(x: Any) -> str:

@@ -56,7 +56,7 @@ def main(args: DemoArgs) -> None:
     _finetune_all(*runs)
     summaries = {run.method: read_json(run_folder(run, args.real) / SUMMARY) for run in runs}
     from experiments.figures import FiguresArgs, figures
-    from sgft_jax.analysis.curves import read_runs
+    from sgft_jax.analysis.reading import read_runs
 
     results = figures(FiguresArgs(task=extend.name_of(args.task), out=args.out))
     folder = run_folder(runs[0], args.real).parent.parent

@@ -49,9 +49,9 @@ def main(args: FiguresArgs) -> None:
 def figures(args: FiguresArgs) -> Path:
     """The figures and tables.md, whose path is returned; raises UserError if there is no run to draw."""
     check_folder(args.out / "figures")
-    from sgft_jax.analysis.curves import read_data, read_runs
+    from sgft_jax.analysis.release import read
 
-    found = read_data(args.data) if args.data else read_runs(args.out)
+    found = read(args.out, args.data)
     if not found.curves:
         raise UserError(_nothing(args, found.notes))
     from sgft_jax.analysis.results import select, write_results  # brings Matplotlib

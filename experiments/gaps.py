@@ -5,54 +5,11 @@ zero-shot success is at most 40 % and training on the real system itself reaches
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
-from envs import extend, gaps
-from envs.types import UserError
 from experiments.runner import cli
-from experiments.runner.options import (
-    Impl,
-    at_least_one,
-    check_task,
-    prior_folders,
-    seed_list,
-    task_of_priors,
-    without_repeats,
-)
-from sgft_jax.io.runs import check_folder
-from sgft_jax.presets import PRESETS, PretrainConfig
-
-PLAIN = "fast"  # strata are those of priors that know the task's own domain alone
-
-
-@dataclass(frozen=True)
-class GapsArgs:
-    """One table: a line per gap of a task."""
-
-    task: str = "push"
-    """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
-    presets: tuple[str, ...] = ()
-    """Gaps to measure, by name or as .toml/.json files (all gaps of a file, or file.toml:name); default: all that come
-    with the task."""
-    prior: Path | None = None
-    """Folder of a prior, or of several (prior/seed-*); default: those of <out>/pretrain/<task>/<preset>."""
-    preset: str = PLAIN
-    """Pretraining preset of the priors, and of the training on the real systems; --config.* changes the latter."""
-    train: bool = True
-    """Also train on every real system, all of them in one program; --no-train measures zero-shot success only."""
-    seeds: int = 1
-    """Policies trained per gap."""
-    episodes: int = 256
-    """Evaluation episodes per policy and gap, at least 200."""
-    out: Path = Path("runs")
-    """Parent of all run folders; the summary goes to <out>/gaps/<task>/summary.json."""
-    seed: int = 0
-    """The first seed of the training on real systems."""
-    impl: Impl = "auto"
-    config: PretrainConfig = field(default_factory=lambda: PRESETS[PLAIN])
-    """Expert: single settings of that training; the defaults are those of the preset."""
+from experiments.runner.gaps_args import PLAIN, GapsArgs, check
+from sgft_jax.presets import PRESETS
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -68,33 +25,10 @@ def _defaults(argv: Sequence[str]) -> GapsArgs:
 
 def measure(args: GapsArgs) -> dict[str, Any]:
     """Measures, prints a table, writes and returns the summary. Raises UserError for what is wrong with the options."""
-    cli.choose("--preset", args.preset, PRESETS)
-    check_episodes(args)
-    args = replace(args, presets=gaps.each(args.presets))
-    without_repeats("--presets", args.presets)
-    check_folder(args.out / "gaps")
-    seeds, task = seed_list(args.seed, args.seeds), extend.name_of(args.task)
-    check_task(args.task, args.presets)
-    if not (args.presets or gaps.presets(task)):
-        raise UserError(f"{task} comes with no gaps; name .toml or .json files with --presets")
-    folders = folders_of_priors(args.prior, args.out, args.task, args.preset)
+    checked = check(args)
     from experiments.runner.gaps_run import run
 
-    return run(args, seeds, folders)
-
-
-def check_episodes(args: Any) -> None:
-    """Raises UserError for too few evaluation episodes to tell gaps apart, or too many. args: with `episodes`."""
-    at_least_one(args, "episodes")
-    if args.episodes < 200:
-        raise UserError(f"--episodes is {args.episodes}: a success rate needs at least 200 to tell 40 % from 50 %")
-
-
-def folders_of_priors(prior: Path | None, out: Path, task: str, preset: str) -> list[Path]:
-    """The folders of the priors that play; raises UserError where there are none, or they are of another task."""
-    folders = prior_folders(prior, out=out, task=task, preset=preset)
-    task_of_priors(folders, task)
-    return folders
+    return run(*checked)
 
 
 if __name__ == "__main__":

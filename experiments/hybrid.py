@@ -9,8 +9,8 @@ from envs import gaps
 from experiments.runner import cli
 from experiments.runner.hybrid_args import DEFAULT, HybridArgs, check, data_name
 from sgft_jax.hybrid.presets import preset_for, say_preset
-from sgft_jax.hybrid.schedule import FLEET, SCHEDULES, describe
 from sgft_jax.methods import FIXED_NAMES, get_method
+from sgft_jax.train.schedule import FLEET, SCHEDULES, describe
 from sgft_jax.types import Fixed
 
 

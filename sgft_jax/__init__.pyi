@@ -1,12 +1,10 @@
+from . import learners
 from .api import ActingPolicy, Setup, evaluate_prior, finetuned_priors, load_policy, make_env, setup
 from .data import replay, sequences, sources
 from .export.folder import save_exported
 from .io.priors import load_prior, save_prior
-from .learners.iql import IQLConfig, IQLHyper, IQLState, make_iql
-from .learners.sac import SACConfig, SACHyper, SACParams, SACState, extract_params, make_sac, state_from_prior
-from .learners.tdmpc2 import TDMPC2Config, TDMPC2Hyper, TDMPC2Params, TDMPC2State, make_tdmpc2
 from .methods import all_methods, get_method
-from .models import normalizer
+from .models import dynamics, normalizer, ratio, value
 from .models.config import NetworkConfig
 from .models.ratio import RatioConfig
 from .planning.mpc import MPCConfig
@@ -16,9 +14,11 @@ from .systems import System
 from .systems.gymnasium import Gymnasium
 from .systems.remote import Remote
 from .systems.simulated import Simulated
+from .train import guard
 from .train.finetuner import FinetuneState, Parts, assemble, sac_finetuner
 from .train.finetuning import FinetuneProgress, evaluate, finetune, simulate
-from .train.pretraining import PretrainState, pretrain, priors_of
+from .train.fleet import FleetState
+from .train.pretraining import pretrain, priors_of
 from .transforms import branch, clip, compose, relabel, shape, shaped_reward, shorten, stateless, weigh
 from .types import (
     Batch,
@@ -42,15 +42,76 @@ from .types import (
 )
 
 __all__ = [
-    "PRESETS", "ActingPolicy", "Batch", "FinetuneProgress", "FinetuneState", "Finetuner", "Fixed", "Gymnasium",
-    "HybridAgent", "IQLConfig", "IQLHyper", "IQLState", "Imagination", "Learner", "MPCConfig", "Method",
-    "NetworkConfig", "Normalizer", "Online", "Parts",
-    "Policy", "PretrainConfig", "PretrainState", "Prior", "RatioConfig", "Remote", "SACConfig", "SACHyper",
-    "SACParams", "SACState", "Setup", "Simulated", "SimulatedData", "Simulation", "Source", "System",
-    "TDMPC2Config", "TDMPC2Hyper", "TDMPC2Params", "TDMPC2State", "Task", "Transform", "Transition", "UserError",
-    "all_methods", "assemble", "branch", "clip", "compose", "evaluate", "evaluate_prior", "extract_params",
-    "finetune", "finetuned_priors", "get_method", "load_policy", "load_prior", "make_env", "make_iql", "make_policy",
-    "make_sac", "make_tdmpc2", "mpc_policy", "normalizer", "pretrain", "priors_of", "relabel", "replay",
-    "sac_finetuner", "sac_policy", "save_exported", "save_prior", "sequences", "setup", "shape", "shaped_reward",
-    "shorten", "simulate", "sources", "state_from_prior", "stateless", "tdmpc2_policy", "weigh",
-]  # fmt: skip
+    "PRESETS",
+    "ActingPolicy",
+    "Batch",
+    "FinetuneProgress",
+    "FinetuneState",
+    "Finetuner",
+    "Fixed",
+    "FleetState",
+    "Gymnasium",
+    "HybridAgent",
+    "Imagination",
+    "Learner",
+    "MPCConfig",
+    "Method",
+    "NetworkConfig",
+    "Normalizer",
+    "Online",
+    "Parts",
+    "Policy",
+    "PretrainConfig",
+    "Prior",
+    "RatioConfig",
+    "Remote",
+    "Setup",
+    "Simulated",
+    "SimulatedData",
+    "Simulation",
+    "Source",
+    "System",
+    "Task",
+    "Transform",
+    "Transition",
+    "UserError",
+    "all_methods",
+    "assemble",
+    "branch",
+    "clip",
+    "compose",
+    "dynamics",
+    "evaluate",
+    "evaluate_prior",
+    "finetune",
+    "finetuned_priors",
+    "get_method",
+    "guard",
+    "learners",
+    "load_policy",
+    "load_prior",
+    "make_env",
+    "make_policy",
+    "mpc_policy",
+    "normalizer",
+    "pretrain",
+    "priors_of",
+    "ratio",
+    "relabel",
+    "replay",
+    "sac_finetuner",
+    "sac_policy",
+    "save_exported",
+    "save_prior",
+    "sequences",
+    "setup",
+    "shape",
+    "shaped_reward",
+    "shorten",
+    "simulate",
+    "sources",
+    "stateless",
+    "tdmpc2_policy",
+    "value",
+    "weigh",
+]

@@ -11,11 +11,10 @@ import numpy as np
 from envs.types import Array, Key, Transition
 from sgft_jax import diagnosis
 from sgft_jax.diagnosis import HORIZONS, Lateness, Rollouts
-from sgft_jax.identify import Identified
+from sgft_jax.identify import Identified, command_interface
 from sgft_jax.models.distortion import Distortion, none, residuals, undone
 from sgft_jax.policies import network_of
 from sgft_jax.stacking import member
-from sgft_jax.train.finetuner import command_interface
 from sgft_jax.types import SimulatedData, Task
 
 _STATES, _OFFSETS = 256, 32  # visited states that are looked at, and ways to act that are tried in each

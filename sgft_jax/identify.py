@@ -10,10 +10,12 @@ import jax
 import jax.numpy as jnp
 
 from envs.types import Array, PyTree, Transition
-from sgft_jax.models import distortion
+from sgft_jax.models import distortion, dynamics
+from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.distortion import Distortion
+from sgft_jax.models.networks import make_dynamics
 from sgft_jax.models.robust import spread_of
-from sgft_jax.types import Batch, SimulatedData, Task
+from sgft_jax.types import Batch, Normalizer, SimulatedData, Task
 
 _SIMULATED = 2048  # rows that tell how far the model is off in simulation
 _ROWS = 320  # real ones that are fitted, the first 8 rollouts or so; more of them add little
@@ -50,21 +52,19 @@ def interface(model: Model, kept: Callable[[PyTree], PyTree], task: Task) -> Int
     """Identification for a task. model(params, obs, action) -> [measured_dim]; kept(prior's params) -> its params."""
 
     def start(params: PyTree, simulated: SimulatedData) -> Identified:
-        own, rows = jax.tree.map(jnp.copy, kept(params)), simulated.draw(jax.random.key(0), _SIMULATED)
+        simulator, rows = jax.tree.map(jnp.copy, kept(params)), simulated.draw(jax.random.key(0), _SIMULATED)
         nothing, held = distortion.none(task.act_dim, task.measured_dim), jnp.ones(_SIMULATED, bool)
-        missed = distortion.residuals(lambda *x: model(own, *x), rows, nothing)
+        missed = distortion.residuals(lambda *x: model(simulator, *x), rows, nothing)
         change = (rows.next_obs - rows.obs)[:, : missed.shape[1]]
-        return Identified(own, spread_of(missed, change, held), nothing)
+        return Identified(simulator, spread_of(missed, change, held), nothing)
 
     def refit(known: Identified, rows: Transition, held: Array) -> Identified:
         rows, held = jax.tree.map(lambda x: x[:_ROWS], (rows, held))
-        found, evidence = distortion.fit(
-            lambda *x: model(known.params, *x), rows, held, known.spread, turns=task.cartesian,
-            errors=task.sensor_errors,
-        )  # fmt: skip
+        options = {"turns": task.cartesian, "errors": task.sensor_errors}
+        fitted, evidence = distortion.fit(lambda *x: model(known.params, *x), rows, held, known.spread, **options)
         nothing = distortion.none(task.act_dim, task.measured_dim)
         return known._replace(
-            distortion=jax.tree.map(lambda a, b: jnp.where(evidence > _EVIDENCE, a, b), found, nothing)
+            distortion=jax.tree.map(lambda a, b: jnp.where(evidence > _EVIDENCE, a, b), fitted, nothing)
         )
 
     def meant(known: Identified, batch: Batch) -> Batch:
@@ -74,3 +74,18 @@ def interface(model: Model, kept: Callable[[PyTree], PyTree], task: Task) -> Int
         return jax.tree.map(lambda a, b: jnp.where(simulated.reshape(-1, *[1] * (a.ndim - 1)), a, b), batch, new)
 
     return Interface(start, refit, meant)
+
+
+def command_interface(network: NetworkConfig, task: Task) -> Interface:
+    """Identification through one model of the prior's ensemble, as the simulator left it."""
+    model = make_dynamics(task.obs_dim, task.act_dim, network)
+
+    def change(kept: tuple[PyTree, Normalizer], obs: Array, action: Array) -> Array:
+        member, statistics = kept
+        after = dynamics.predict(model, member, statistics, obs, action)[0]
+        return (after - obs)[: task.measured_dim]
+
+    def kept(params: PyTree) -> tuple[PyTree, Normalizer]:
+        return jax.tree.map(lambda x: x[:1], params.dynamics), params.normalizer
+
+    return interface(change, kept, task)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import jax
@@ -87,10 +88,10 @@ def _networks_of(card: Mapping[str, Any], params: Any) -> Iterator[tuple[str, Ne
     """The networks that a card describes, by name, each with what the prior has for it."""
     sizes, algorithm = (card["obs_dim"], card["act_dim"]), card.get("algorithm", "sac")
     if algorithm == "tdmpc2":
-        parts = tdmpc2_model.make_parts(_structure_of(card, *sizes))
-        yield from ((name, getattr(parts, name), getattr(params, name)) for name in tdmpc2_model.NETWORKS)
+        nets = tdmpc2_model.make_networks(_structure_of(card, *sizes))
+        yield from ((name, getattr(nets, name), getattr(params, name)) for name in tdmpc2_model.NETWORKS)
         if params.anchor is not None:
-            yield "anchor", parts.policy, params.anchor
+            yield "anchor", nets.policy, params.anchor
         return
     network = network_of(card)
     if algorithm == "actor":
@@ -120,15 +121,14 @@ def _members(ensemble: PyTree) -> int:
 
 
 def _structure_of(card: Mapping[str, Any], obs_dim: int, act_dim: int) -> tdmpc2.TDMPC2Config:
-    own = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
-    return tdmpc2_model.named_config(obs_dim, act_dim, **own, sgft=card["config"].get("sgft", False))
+    numbers = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
+    return tdmpc2_model.named_config(obs_dim, act_dim, **numbers, sgft=card["config"].get("sgft", False))
 
 
 def network_of(card: Mapping[str, Any]) -> NetworkConfig:
     """The networks of a prior of SAC; raises UserError where this version knows no such network."""
     try:
-        own: dict[str, Any] = {**card["network"], "hidden": tuple(card["network"]["hidden"])}
-        return NetworkConfig(**own)
+        return NetworkConfig(**{**card["network"], "hidden": tuple(card["network"]["hidden"])})
     except (TypeError, KeyError):
         raise UserError(f"this version knows no such network: {card['network']}; pretrain again") from None
 
@@ -176,14 +176,8 @@ def mpc_policy(config: mpc.MPCConfig, task: Task, *, explore_noise: float = 0.0)
 
 
 def recurrent_policy(config: recurrent.RecurrentConfig) -> Policy:
-    """The actor of `RECURRENTParams`, which remembers the episode."""
-
-    def act(
-        params: recurrent.RECURRENTParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
-    ) -> tuple[Array, PyTree]:
-        return recurrent.act(config, params.actor, params.normalizer, carry, obs, key, explore=explore)
-
-    return Policy(lambda: recurrent.init_carry(config), act)
+    """The actor of `RecurrentParams`, which remembers the episode."""
+    return Policy(partial(recurrent.init_carry, config), partial(recurrent.policy_action, config))
 
 
 def tdmpc2_policy(config: tdmpc2.TDMPC2Config, hyper: tdmpc2.TDMPC2Hyper) -> Policy:

@@ -102,10 +102,9 @@ class PretrainConfig:
     """Chunks between checkpoints."""
 
     def __post_init__(self) -> None:
-        checks.at_least(
-            self, 1, "n_envs", "worlds", "random_transitions", "updates_per_step", "batch_size", "replay_capacity",
-            "plan_samples", "chunk_steps", "eval_every", "eval_episodes", "report_episodes", "checkpoint_every",
-        )  # fmt: skip
+        checks.at_least(self, 1, "n_envs", "worlds", "random_transitions", "updates_per_step", "batch_size")
+        checks.at_least(self, 1, "replay_capacity", "plan_samples", "chunk_steps", "checkpoint_every")
+        checks.at_least(self, 1, "eval_every", "eval_episodes", "report_episodes")
         checks.at_least(self, 1, "env_steps", most=2**40)
         checks.few(self, 1, "policy_delay", "ensemble_size", "gru", "horizon")
         checks.at_least(self, 0, "refresh_every")
@@ -259,10 +258,10 @@ def preset_of(method: Online) -> str:
 def check_card(card: Mapping[str, Any], method: Online, task: str) -> None:
     """Raises UserError for the card of a prior of another algorithm or task, or of a policy told more or less."""
     command = f"python -m experiments.pretrain --task {task} --preset {preset_of(method)}"
-    if (found := card.get("algorithm", "sac")) != method.prior:
-        raise UserError(f"{method.name} needs a prior of {method.prior}, not of {found}; make one with: {command}")
+    if (algorithm := card.get("algorithm", "sac")) != method.prior:
+        raise UserError(f"{method.name} needs a prior of {method.prior}, not of {algorithm}; make one with: {command}")
     if method.sees_system != bool(card.get("system")):
-        told = f"{'' if method.sees_system else 'not '}told the system"
-        raise UserError(f"{method.name} needs a prior that was {told}; make one with: {command}")
+        negation = "" if method.sees_system else "not "
+        raise UserError(f"{method.name} needs a prior that was {negation}told the system; make one with: {command}")
     if card["task"] != task:
         raise UserError(f"the prior is of the task {card['task']!r}, not of {task!r}")

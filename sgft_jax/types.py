@@ -184,7 +184,7 @@ class Prior:
     """What pretraining hands to fine-tuning.
 
     params: the networks' parameters and the observation statistics (`SACParams`, `TDMPC2Params` or
-        `RECURRENTParams`).
+        `RecurrentParams`).
     card: JSON data: task, algorithm, network, gamma, and the numbers that were measured.
     """
 

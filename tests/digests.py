@@ -28,7 +28,7 @@ from unittest import mock
 ROOT = Path(__file__).resolve().parent.parent
 FILE = ROOT / "tests" / "digests.json"
 # This checkout, wherever an editable install points to
-sys.path[:0] = [str(ROOT / part) for part in ("tests", "", "tests/sgft_jax", "tests/sgft_jax/hybrid")]
+sys.path[:0] = [str(ROOT / part) for part in ("tests", "", "tests/sgft_jax", "tests/sgft_jax/train")]
 for variable in [name for name in os.environ if name.startswith(("JAX_", "XLA_"))]:
     del os.environ[variable]
 os.environ["JAX_PLATFORMS"] = "cpu"
@@ -42,11 +42,11 @@ import numpy as np
 
 # Helpers of the tests
 import probes
-import test_trainer as hybrid_tests
+import test_hybrid_training as hybrid_tests
 import toy
 import toy_terminating
 import tuners
-import test_pretraining as pretraining_tests  # isort: skip - `tuners` makes the size that it names
+import test_pretraining as pretraining_tests
 
 # The project
 from envs import gaps

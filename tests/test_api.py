@@ -3,6 +3,10 @@
 import ast
 import importlib.util
 import inspect
+import json
+import re
+import subprocess
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -72,3 +76,37 @@ def test_a_name_is_explained_by_its_first_sentence():
 
     assert names.summary(twice) == "Returns a \\| b in one line"
     assert names.summary({"no": "docstring"}) == "data"
+
+
+# --- a loop of a user's own -------------------------------------------------------------------------------------------
+
+
+def first_example():
+    """The first program of the page."""
+    return re.search(r"```python\n(.*?)```", (HOOK.parent.parent / "docs/api.md").read_text(), re.S).group(1)
+
+
+def test_a_users_own_loop_learns(capsys):
+    """Twenty lines beside the imports, compiled once: losses of four seeds, which differ."""
+    scope = {}
+    exec(compile(first_example(), "docs/api.md", "exec"), scope)
+    assert len(capsys.readouterr().out.splitlines()) == 4
+    assert scope["learn"]._cache_size() == 1
+    losses = scope["metrics"]["critic/loss"]
+    assert losses.shape == (20, 4) and bool((losses[-1] < 1).all()) and len(set(losses[-1].tolist())) == 4
+
+
+@pytest.mark.slow
+def test_it_has_the_types_of_the_library(tmp_path):
+    """As a user's editor checks it, and not without reading the signatures: a wrong argument is found."""
+    program = first_example()
+    (tmp_path / "good.py").write_text(program)
+    (tmp_path / "bad.py").write_text(
+        program + "\nsac.update(config, states, 3, jax.random.key(0))\nsac.renew(config)\n"
+    )
+    # An editable install may be found by a hook alone, which no type checker runs.
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps({"extraPaths": [str(HOOK.parent.parent)]}))
+    check = [sys.executable, "-m", "pyright", "--pythonpath", sys.executable, "--project", str(tmp_path)]
+    report = subprocess.run(check, cwd=tmp_path, capture_output=True, text=True).stdout
+    errors = [line for line in report.splitlines() if " error: " in line]
+    assert len(errors) == 2 and all("bad.py" in line for line in errors), report

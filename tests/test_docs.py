@@ -140,7 +140,7 @@ def test_the_site_builds_without_a_warning(tmp_path):
     build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path)]
     subprocess.run(build, cwd=ROOT, check=True, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"})
     html = (tmp_path / "api.html").read_text()
-    assert "sgft_jax.make_sac" in html
+    assert "sgft_jax.learners.sac.make_sac" in html
     assert not re.search(r'(src|rel="stylesheet" href)="(https?:)?//', html), (
         "the page loads something from the network"
     )

@@ -50,13 +50,15 @@ def compare(setup: sgft_jax.Setup, card: Mapping[str, Any], agents: PyTree) -> A
     keys = jax.random.split(jax.random.key(0), STARTS)
 
     def one(agent: PyTree) -> Array:
-        own, chance = (
+        policy, chance = (
             jax.vmap(partial(first_step, setup, card["gamma"], agent, random=random))(keys) for random in (False, True)
         )
-        q_own, q_chance = (
-            jax.vmap(partial(value, critic, agent.learner))(obs, action) for obs, action, _ in (own, chance)
+        q_policy, q_chance = (
+            jax.vmap(partial(value, critic, agent.learner))(obs, action) for obs, action, _ in (policy, chance)
         )
-        return jnp.stack([q_own.mean(), own[2].mean(), q_chance.mean(), chance[2].mean(), (q_chance > q_own).mean()])
+        return jnp.stack(
+            [q_policy.mean(), policy[2].mean(), q_chance.mean(), chance[2].mean(), (q_chance > q_policy).mean()]
+        )
 
     return jax.lax.map(one, agents)
 

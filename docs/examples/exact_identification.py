@@ -36,9 +36,9 @@ def main(names: list[str], folders: list[str]) -> None:
             env = sgft_jax.make_env(prior)
             gap = envs.gaps.load(env, f"envs/gaps/test/{task}.toml:{name}")
             commands, both = exact(env, gap)
-            told = {"as it is": None, "commands": commands, "commands and sensors": both}
-            said = [f"{what} {played(prior, env, gap, distortion)}" for what, distortion in told.items()]
-            print(f"{name}, {Path(folder).name}: {', '.join(said)}")
+            known = {"as it is": None, "commands": commands, "commands and sensors": both}
+            results = [f"{what} {played(prior, env, gap, distortion)}" for what, distortion in known.items()]
+            print(f"{name}, {Path(folder).name}: {', '.join(results)}")
 
 
 def exact(env: Env, gap: Gap) -> tuple[Distortion, Distortion]:
@@ -53,8 +53,8 @@ def exact(env: Env, gap: Gap) -> tuple[Distortion, Distortion]:
 
 def played(prior: sgft_jax.Prior, env: Env, gap: Gap, distortion: Distortion | None) -> str:
     """Success of the policy that knows the distortion, in per cent."""
-    told = replace(prior, params=prior.params._replace(distortion=distortion))
-    success = np.asarray(sgft_jax.evaluate_prior(told, env, gap, episodes=EPISODES).success)
+    corrected = replace(prior, params=prior.params._replace(distortion=distortion))
+    success = np.asarray(sgft_jax.evaluate_prior(corrected, env, gap, episodes=EPISODES).success)
     return tables.number(success_interval(int(success.sum()), len(success)))
 
 

@@ -58,15 +58,15 @@ class Hammer:
         self.number += 1
         self.env.seed(seed)
         self.env.reset()
-        found = self._frames(np.array([0.0, 0.0, 0.0, -1.0]), SETTLE)
+        measurement = self._frames(np.array([0.0, 0.0, 0.0, -1.0]), SETTLE)
         self._look()
-        return found
+        return measurement
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One step; whether the nail is driven in is in the last of what is returned."""
-        found = self._frames(np.clip(action, -1.0, 1.0).astype(np.float64), FRAMES)
+        measurement = self._frames(np.clip(action, -1.0, 1.0).astype(np.float64), FRAMES)
         self._look()
-        return found, float("nan"), False, False, {"is_success": bool(found[24] > DRIVEN)}
+        return measurement, float("nan"), False, False, {"is_success": bool(measurement[24] > DRIVEN)}
 
     def stop(self) -> None:
         """A simulation stands still by itself. The pictures of an episode that is over go to disk."""
@@ -77,9 +77,9 @@ class Hammer:
 
     def _frames(self, action: np.ndarray, count: int) -> np.ndarray:
         for _ in range(count - 1):
-            found = self.env.step(action)[0]
+            before = self.env.step(action)[0]
         now = self.env.step(action)[0][:18]
-        return measured(found[18:36], found[:18], now, self.env.data.mocap_pos[0])
+        return measured(before[18:36], before[:18], now, self.env.data.mocap_pos[0])
 
     def _look(self) -> None:
         if self.number in self.film:

@@ -32,14 +32,8 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
     bent = () if config.clip_shaped is None else (bend(config.clip_shaped),)
     imagined = branch(config.horizon, config.branches, noise=config.branch_noise)
-    return sac_finetuner(
-        config, prior, task,
-        transforms=(imagined, shape, *bent, shorten(config.horizon)),
-        horizon_dim=config.horizon,
-        reset_critic=config.reset_critic,
-        value_baseline=True,
-        actor_batch=config.batch_size if config.actor_real_only else None,
-    )  # fmt: skip
+    transforms = (imagined, shape, *bent, shorten(config.horizon))
+    return sac_finetuner(config, prior, task, transforms=transforms, horizon_dim=config.horizon, value_baseline=True)
 
 
 METHOD = Method(  # what `--method docs/examples/own_method.py` looks for
@@ -56,16 +50,20 @@ def main() -> None:
     import jax.numpy as jnp
 
     import sgft_jax
+    from sgft_jax.learners import sac
 
     network = sgft_jax.NetworkConfig(hidden=(16,))
-    agent = sgft_jax.make_sac(sgft_jax.SACConfig(1, 1, network=network))
-    params = sgft_jax.extract_params(jax.jit(agent.init)(jax.random.key(0)))
+    agent = sac.make_sac(sac.SACConfig(1, 1, network=network))
+    params = sac.extract_params(jax.jit(agent.init)(jax.random.key(0)))
     prior = Prior(params, {"algorithm": "sac", "network": {**asdict(network), "hidden": [16]}, "gamma": 0.9})
     line = SimpleNamespace(
-        obs_dim=1, act_dim=1, previous_actions=0, episode_length=32,
+        obs_dim=1,
+        act_dim=1,
+        previous_actions=0,
+        episode_length=32,
         reward=lambda obs, action, next_obs: -jnp.abs(next_obs[0]),
         terminated=lambda obs, action, next_obs: jnp.bool_(False),
-    )  # fmt: skip
+    )
     tuner = METHOD.online.build(Config(batch_size=16, replay_capacity=64), prior, line)
     obs, action = jax.random.uniform(jax.random.key(1), (2, 32, 1), minval=-1)
     next_obs = obs + 0.1 * action

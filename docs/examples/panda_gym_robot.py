@@ -7,17 +7,19 @@ the repository. Nothing else of the project, and no JAX.
 """
 
 import argparse
+import importlib
 import sys
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
-import panda_gym  # noqa: F401 - registers its tasks
 
 sys.path.append(str(Path(__file__).parents[2] / "sgft_jax" / "systems"))  # last: a module there is named gymnasium
 
 import robot_client
+
+importlib.import_module("panda_gym")  # registers its tasks
 
 PICTURE = {"render_width": 480, "render_height": 360, "render_distance": 0.9, "render_yaw": 60, "render_pitch": -30}
 
@@ -44,15 +46,15 @@ class PandaPush:
     def reset(self, seed: int) -> np.ndarray:
         """The arm at its start, cube and mark where the seed says."""
         self.number += 1
-        found = self.env.reset(seed=seed)[0]
+        observed = self.env.reset(seed=seed)[0]
         self._look()
-        return measured(found)
+        return measured(observed)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One step; whether the cube is within 5 cm of the mark is in the last of what is returned."""
-        found, _, _, _, info = self.env.step(action)
+        observed, _, _, _, info = self.env.step(action)
         self._look()
-        return measured(found), float("nan"), False, False, info
+        return measured(observed), float("nan"), False, False, info
 
     def stop(self) -> None:
         """A simulation stands still by itself. The pictures of an episode that is over go to disk."""
@@ -66,9 +68,9 @@ class PandaPush:
             self.pictures.append(self.env.render())
 
 
-def measured(found: dict[str, np.ndarray]) -> np.ndarray:
+def measured(observed: dict[str, np.ndarray]) -> np.ndarray:
     """[21]; where the cube is (`achieved_goal`) is among the 18 numbers of `observation`."""
-    return np.concatenate([found["observation"], found["desired_goal"]])
+    return np.concatenate([observed["observation"], observed["desired_goal"]])
 
 
 def main() -> None:

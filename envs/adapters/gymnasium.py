@@ -5,7 +5,7 @@ import is its own way, also inside a name: `gymnasium.make("envs.adapters.gymnas
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 import jax
@@ -55,9 +55,9 @@ class _Played:
 
     def __init__(self, task: str | Env, gap: str | Gap, impl: str, worlds: int) -> None:
         env = envs.make(task, impl) if isinstance(task, str) else task
-        found = gaps.load(env, gap) if isinstance(gap, str) else gap
-        self.env = real_env(env, [found])
-        self.pool = jax.tree.map(lambda x: x[0], real_worlds(self.env, [found], jax.random.key(0), worlds))
+        real_gap = gaps.load(env, gap) if isinstance(gap, str) else gap
+        self.env = real_env(env, [real_gap])
+        self.pool = jax.tree.map(lambda x: x[0], real_worlds(self.env, [real_gap], jax.random.key(0), worlds))
         self.observation = spaces.Box(-np.inf, np.inf, (self.env.obs_dim,), np.float32)
         self.action = spaces.Box(-1.0, 1.0, (self.env.act_dim,), np.float32)
 
@@ -71,15 +71,18 @@ class _Played:
         """One control step. Exploded physics ends an episode by truncation, with the last observation and no reward."""
         before = episode.state
         state = self.env.step(episode.world, before, action, episode.keys[before.time])
-        safe = lambda new, old: jnp.where(state.invalid, old, new)  # noqa: E731
+        valid = ~state.invalid
         after = _After(
-            safe(state.obs, before.obs), safe(state.reward, jnp.zeros_like(state.reward)),
-            state.terminated & ~state.invalid, state.truncated | state.invalid, state.success & ~state.invalid,
-            state.invalid,
-        )  # fmt: skip
+            obs=jnp.where(valid, state.obs, before.obs),
+            reward=jnp.where(valid, state.reward, jnp.zeros_like(state.reward)),
+            terminated=state.terminated & valid,
+            truncated=state.truncated | state.invalid,
+            success=state.success & valid,
+            invalid=state.invalid,
+        )
         return episode._replace(state=state), after
 
-    def told(self, after: _After) -> dict[str, Any]:
+    def info(self, after: _After) -> dict[str, Any]:
         """What `info` says of steps; success only where the task has it."""
         known = {"invalid": np.asarray(after.invalid)}
         if self.env.score == "success" or self.env.success is not None:
@@ -99,7 +102,7 @@ class TaskEnv(gymnasium.Env):
     Raises UserError for a task or gap that does not exist.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012 - as Gymnasium declares it
+    metadata: ClassVar = {"render_modes": []}
 
     def __init__(self, task: str | Env, gap: str | Gap = SIM, *, impl: str = "auto", worlds: int = 256) -> None:
         self._played = _Played(task, gap, impl, worlds)
@@ -120,8 +123,8 @@ class TaskEnv(gymnasium.Env):
         assert self._episode is not None, "call reset first"
         self._episode, after = self._step(self._episode, jnp.asarray(action, jnp.float32))
         after = jax.device_get(after)
-        told = {name: bool(x) for name, x in self._played.told(after).items()}
-        return np.array(after.obs), float(after.reward), bool(after.terminated), bool(after.truncated), told
+        info = {name: bool(x) for name, x in self._played.info(after).items()}
+        return np.array(after.obs), float(after.reward), bool(after.terminated), bool(after.truncated), info
 
 
 class TaskVectorEnv(VectorEnv):
@@ -131,7 +134,7 @@ class TaskVectorEnv(VectorEnv):
     the next step, whose action is ignored and whose reward is 0 (`AutoresetMode.NEXT_STEP`). Arguments: see `TaskEnv`.
     """
 
-    metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012 - see above
+    metadata: ClassVar = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
 
     def __init__(
         self, task: str | Env, gap: str | Gap = SIM, *, num_envs: int = 1, impl: str = "auto", worlds: int = 256
@@ -152,10 +155,10 @@ class TaskVectorEnv(VectorEnv):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Fresh starts everywhere; seed: of each environment, or an int for seed, seed + 1, and so on."""
         seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed or [None] * self.num_envs
-        for i, own in enumerate(seeds):
-            if own is not None:
-                self._generators[i] = seeding.np_random(own)[0]
-        first = [_seed(own, generator) for own, generator in zip(seeds, self._generators, strict=True)]
+        for i, chosen in enumerate(seeds):
+            if chosen is not None:
+                self._generators[i] = seeding.np_random(chosen)[0]
+        first = [_seed(chosen, generator) for chosen, generator in zip(seeds, self._generators, strict=True)]
         self._episodes = start = self._begin(np.stack(first))
         self._over = np.zeros(self.num_envs, bool)
         return np.array(start.state.obs), {}
@@ -173,8 +176,8 @@ class TaskVectorEnv(VectorEnv):
         reward = np.where(over, 0.0, after.reward)
         terminated, truncated = (np.asarray(x) & ~over for x in (after.terminated, after.truncated))
         self._over = terminated | truncated
-        told = self._played.told(after)
-        return obs, reward, terminated, truncated, told | {f"_{name}": ~over for name in told}
+        info = self._played.info(after)
+        return obs, reward, terminated, truncated, info | {f"_{name}": ~over for name in info}
 
 
 def _seed(seed: int | None, generator: np.random.Generator) -> np.uint32:

@@ -12,6 +12,7 @@ import numpy as np
 
 from envs.base import Entry, Env, Parameter
 from envs.mujoco.engines import Engine
+from envs.mujoco.parts import add_hinge, add_motor, add_slide, empty_spec
 from envs.mujoco.scene import Scene, View, make_env
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
@@ -35,28 +36,18 @@ PARAMETERS = (
 
 def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The scene for one theta."""
-    spec = mujoco.MjSpec()
-    option = spec.option
-    option.timestep, option.integrator = FRAME, mujoco.mjtIntegrator.mjINT_RK4
-    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    option.iterations, option.ls_iterations = 2, 4  # one constraint, the end of the rail: two are exact
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
+    spec = empty_spec(FRAME, mujoco.mjtIntegrator.mjINT_RK4)
+    spec.option.iterations, spec.option.ls_iterations = 2, 4  # one constraint, the end of the rail: two are exact
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     cart = spec.worldbody.add_body(name="cart", pos=[0, 0, 1])
-    cart.add_joint(
-        name="slider", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[1, 0, 0], limited=True, range=[-RAIL, RAIL],
-        solref_limit=[STOP_TIME, 1.0], damping=DAMPING[0],
-    )  # fmt: skip
+    slider = add_slide(cart, [1, 0, 0], name="slider", solref_limit=[STOP_TIME, 1.0], damping=DAMPING[0])
+    slider.limited, slider.range = True, [-RAIL, RAIL]
     cart.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.2, 0.15, 0.1], mass=theta["cart_mass"])
     pole = cart.add_body(name="pole")
-    pole.add_joint(name="hinge", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 1, 0], damping=DAMPING[1])
-    pole.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0, 0, 0, theta["pole_length"]], size=[0.045, 0, 0],
-        mass=theta["pole_mass"],
-    )  # fmt: skip
-    spec.add_actuator(
-        name="motor", target="slider", trntype=mujoco.mjtTrn.mjTRN_JOINT, gear=[theta["force"], 0, 0, 0, 0, 0],
-        ctrllimited=True, ctrlrange=[-1, 1],
-    )  # fmt: skip
+    add_hinge(pole, [0, 1, 0], name="hinge", damping=DAMPING[1])
+    ends, capsule = [0, 0, 0, 0, 0, theta["pole_length"]], mujoco.mjtGeom.mjGEOM_CAPSULE
+    pole.add_geom(type=capsule, fromto=ends, size=[0.045, 0, 0], mass=theta["pole_mass"])
+    add_motor(spec, "motor", "slider", theta["force"])
     return spec
 
 
@@ -131,11 +122,15 @@ def frame_reward(x: Array, upright: Array, spin: Array, action: Array) -> Array:
 
     x, upright (a cosine), spin: [] after the frame; action: [1].
     """
-    tail = lambda distance: jnp.exp(jnp.log(0.1) * distance**2)  # noqa: E731 - a bell that is 0.1 at distance 1
-    centred = (1 + tail(x / CART_MARGIN)) / 2
-    calm = (1 + tail(spin / SPIN_MARGIN)) / 2
+    centred = (1 + _tail(x / CART_MARGIN)) / 2
+    calm = (1 + _tail(spin / SPIN_MARGIN)) / 2
     gentle = (4 + jnp.maximum(1 - action[0] ** 2, 0.0)) / 5
     return (upright + 1) / 2 * centred * calm * gentle
+
+
+def _tail(distance: Array) -> Array:
+    """A bell that is 0.1 at distance 1."""
+    return jnp.exp(jnp.log(0.1) * distance**2)
 
 
 def halfway(obs: Array, next_obs: Array) -> tuple[Array, Array, Array]:

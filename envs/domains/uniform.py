@@ -54,8 +54,8 @@ def parameter_ranges(env: Env, chosen: Mapping[str, Value]) -> np.ndarray:
     for name, value in chosen.items():
         if name not in ranges:
             raise misnamed(env, name)
-        given = env_effects.numbers(value)
-        pair = np.broadcast_to(given, (2,)) if given.shape in ((), (2,)) else np.array([np.nan])
+        array = env_effects.numbers(value)
+        pair = np.broadcast_to(array, (2,)) if array.shape in ((), (2,)) else np.array([np.nan])
         if not np.isfinite(pair).all() or pair[0] > pair[1]:
             raise UserError(f"parameter '{name}' needs a value or a range [low, high], got {value}")
         low, high = bounds[name]

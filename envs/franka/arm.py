@@ -3,12 +3,13 @@
 Kinematics: modified Denavit-Hartenberg table of the manufacturer. Limits: the manufacturer's position limits (the
 narrower box of constant velocity limits cannot point the gripper down closer than 0.3 m to the base). Link inertias
 follow from capsules of the published link masses; reflected motor inertia (armature) dominates the wrist. The arm
-touches nothing: only a task's tool has contacts, declared pair by pair, so that the simulator's contact buffers stay
-small.
+touches nothing: only a task's tool has contacts, declared pair by pair.
 """
 
 import mujoco
 import numpy as np
+
+from envs.mujoco.parts import add_box, add_capsule, add_hinge, add_servo
 
 N_JOINTS = 7
 # a [m], d [m], alpha [rad] of the transform from frame i-1 to frame i; the flange is a fixed eighth frame.
@@ -52,13 +53,16 @@ def add_arm(spec: mujoco.MjSpec, *, stiffness: float = 1.0) -> mujoco.MjsBody:
     stiffness: multiplies the servo stiffness (and damping) of every joint.
     Tool geoms belong on the returned body: the flange is at (0, 0, FLANGE), the tool centre point at (0, 0, TCP).
     """
-    _add_visual(spec.worldbody, (0, 0, 0.0), (0, 0, 0.16), 0.075, _GREY)
+    add_capsule(spec.worldbody, 0.075, fromto=[0, 0, 0, 0, 0, 0.16], mass=0, rgba=_GREY)
     body = spec.worldbody
     for i in range(N_JOINTS):
         body = _add_link(body, i)
-        _add_servo(spec, i, stiffness)
-    _add_visual(body, (0, 0, FLANGE), (0, 0, FLANGE + 0.02), 0.04, _DARK)
-    _add_hand(body)
+        kp, most = float(STIFFNESS[i]) * stiffness, TORQUE_MAX[i]
+        servo = add_servo(spec, f"joint{i + 1}", kp, kp * DAMPING_TIME, name=f"servo{i + 1}")
+        servo.forcelimited, servo.forcerange = 1, [-most, most]
+    add_capsule(body, 0.04, fromto=[0, 0, FLANGE, 0, 0, FLANGE + 0.02], mass=0, rgba=_DARK)
+    place, turn = [0, 0, FLANGE + 0.045], tool_quaternion()
+    add_box(body, [0.025, 0.1, 0.03], pos=place, quat=turn, mass=HAND_MASS, rgba=_DARK)
     return body
 
 
@@ -69,58 +73,9 @@ def tool_quaternion() -> np.ndarray:
 
 def _add_link(parent: mujoco.MjsBody, i: int) -> mujoco.MjsBody:
     alpha, a, d = DH_ALPHA[i], DH_A[i], DH_D[i]
-    body = parent.add_body(
-        name=f"link{i + 1}",
-        pos=[a, -np.sin(alpha) * d, np.cos(alpha) * d],
-        quat=[np.cos(alpha / 2), np.sin(alpha / 2), 0, 0],
-    )
-    body.add_joint(
-        name=f"joint{i + 1}",
-        type=mujoco.mjtJoint.mjJNT_HINGE,
-        axis=[0, 0, 1],
-        armature=ARMATURE[i],
-        damping=JOINT_DAMPING,
-    )
+    pos, quat = [a, -np.sin(alpha) * d, np.cos(alpha) * d], [np.cos(alpha / 2), np.sin(alpha / 2), 0, 0]
+    body = parent.add_body(name=f"link{i + 1}", pos=pos, quat=quat)
+    add_hinge(body, [0, 0, 1], name=f"joint{i + 1}", armature=ARMATURE[i], damping=JOINT_DAMPING)
     start, end, radius = _SHAPES[i]
-    _add_visual(body, start, end, radius, _WHITE if i % 2 else _GREY, mass=LINK_MASS[i])
+    add_capsule(body, radius, fromto=[*start, *end], mass=LINK_MASS[i], rgba=_WHITE if i % 2 else _GREY)
     return body
-
-
-def _add_visual(body: mujoco.MjsBody, start, end, radius: float, rgba, mass: float = 0.0) -> None:  # noqa: ANN001
-    body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-        fromto=[*start, *end],
-        size=[radius, 0, 0],
-        mass=mass,
-        rgba=rgba,
-        **NO_CONTACT,
-    )
-
-
-def _add_hand(body: mujoco.MjsBody) -> None:
-    body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=[0, 0, FLANGE + 0.045],
-        quat=tool_quaternion(),
-        size=[0.025, 0.1, 0.03],
-        mass=HAND_MASS,
-        rgba=_DARK,
-        **NO_CONTACT,
-    )
-
-
-def _add_servo(spec: mujoco.MjSpec, i: int, stiffness: float) -> None:
-    kp = float(STIFFNESS[i]) * stiffness
-    actuator = spec.add_actuator(
-        name=f"servo{i + 1}",
-        target=f"joint{i + 1}",
-        trntype=mujoco.mjtTrn.mjTRN_JOINT,
-        gaintype=mujoco.mjtGain.mjGAIN_FIXED,
-        biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-    )
-    actuator.gainprm[0] = kp
-    actuator.biasprm[:3] = [0, -kp, -kp * DAMPING_TIME]
-    actuator.forcelimited, actuator.forcerange = 1, [-TORQUE_MAX[i], TORQUE_MAX[i]]
-
-
-NO_CONTACT = {"contype": 0, "conaffinity": 0}

@@ -9,11 +9,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Env
 from envs.franka import arm, push, soft
-from envs.franka.arm import NO_CONTACT
 from envs.franka.workcell import at_rest
-from envs.mujoco.scene import Scene, make_env
+from envs.mujoco.parts import INVISIBLE, add_slide, add_sphere
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -64,14 +62,13 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     spec = soft.stage(theta, height=HEIGHT, iterations=ITERATIONS)
     core = spec.worldbody.add_body(name="ball", pos=[0, 0, RADIUS])
     core.add_freejoint()
-    look = {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "rgba": [0.95, 0.75, 0.2, 1], **NO_CONTACT}
-    core.add_geom(name="core", size=[CORE * RADIUS, 0, 0], mass=(1 - SHELL) * theta["object_mass"], **look)
+    mass, yellow = theta["object_mass"], [0.95, 0.75, 0.2, 1]
+    add_sphere(core, CORE * RADIUS, name="core", mass=(1 - SHELL) * mass, rgba=yellow)
     soft.touch(spec, "core", theta)
     for i, direction in enumerate(DIRECTIONS):
         pad = core.add_body(name=_name(i), pos=direction * (RADIUS - PAD))
-        joint = pad.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=direction, stiffness=STIFFNESS, damping=DAMPING)
-        joint.armature = ARMATURE
-        pad.add_geom(name=_name(i), size=[PAD, 0, 0], mass=SHELL * theta["object_mass"] / len(DIRECTIONS), **look)
+        add_slide(pad, direction, stiffness=STIFFNESS, damping=DAMPING, armature=ARMATURE)
+        add_sphere(pad, PAD, name=_name(i), mass=SHELL * mass / len(DIRECTIONS), rgba=yellow)
         soft.touch(spec, _name(i), theta, rolling=ROLLING)
     return spec
 
@@ -92,7 +89,7 @@ def dress(spec: mujoco.MjSpec) -> None:
     bones = [(_name(i), direction * (RADIUS - PAD)) for i, direction in enumerate(DIRECTIONS)]
     soft.add_material(spec, "ball", (3.0, 1.0), ((0.95, 0.75, 0.2), (0.25, 0.5, 0.8)))
     soft.add_skin(spec, points * RADIUS, faces, weights, bones, texture=texture, material="ball")
-    spec.geom("core").rgba = [0] * 4
+    spec.geom("core").rgba = INVISIBLE
 
 
 def _place(qpos: Array) -> Array:
@@ -113,8 +110,3 @@ REAL = {
         SCENE, "ball", height=HEIGHT, build=build, initial=initial, place=_place, lie=_lie, dress=dress
     )
 }
-
-
-def make(impl: str = "auto", scene: Scene = SCENE) -> Env:
-    """The task, in simulation or in its real scene."""
-    return make_env(scene, impl)

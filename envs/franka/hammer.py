@@ -16,12 +16,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Entry, Env, Parameter
+from envs.base import Entry, Parameter
 from envs.franka import arm, kinematics, workcell
-from envs.franka.arm import NO_CONTACT
 from envs.franka.kinematics import DOWN, Pose
 from envs.franka.workcell import at_rest, clip_joints, new_spec
-from envs.mujoco.scene import View, make_env
+from envs.mujoco import parts
+from envs.mujoco.scene import View
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -50,7 +50,6 @@ PAIRS = (
     *((name, "block") for name in ELBOW),
 )
 BOARD_THICKNESS = 0.06  # m
-INVISIBLE = [0, 0, 0, 0]
 NV = arm.N_JOINTS + 1
 
 PARAMETERS = (
@@ -75,7 +74,7 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     _add_hammer(link, theta["hammer_mass"])
     spec.body("link6").geoms[0].name = "wrist"  # the link's capsule, as drawn
     for name, center in ELBOW.items():
-        _add_sphere(spec.body("link4"), name, center, ELBOW_RADIUS, INVISIBLE)
+        parts.add_sphere(spec.body("link4"), ELBOW_RADIUS, name=name, pos=center, mass=0, rgba=parts.INVISIBLE)
     board = theta["nail_z"] - 2 * theta["nail_half_height"]
     _add_board(spec, theta["nail_x"], board)
     _add_nail(spec, theta, board)
@@ -166,11 +165,6 @@ SCENE = workcell.scene(
 )
 
 
-def make(impl: str = "auto") -> Env:
-    """The hammering task."""
-    return make_env(SCENE, impl)
-
-
 def tool() -> np.ndarray:
     """[3] m: the centre of the striking face in the frame of the last link."""
     return np.array([*_across(-HEAD_BACK, 0.0), arm.TCP + FACE])
@@ -204,37 +198,14 @@ def _add_hammer(link: mujoco.MjsBody, mass: float) -> None:
     wood, steel, dark = [0.72, 0.52, 0.3, 1], [0.45, 0.47, 0.5, 1], [0.1, 0.1, 0.12, 1]
     axis, tip = arm.TCP, arm.TCP + FACE
     head = _across(-HEAD_BACK, 0.0)
-    _add_sphere(link, "face", (*head, tip - FACE_RADIUS), FACE_RADIUS, steel, mass=mass)
+    parts.add_sphere(link, FACE_RADIUS, name="face", pos=[*head, tip - FACE_RADIUS], mass=mass, rgba=steel)
     end = (*_across(HANDLE, 0.0), axis)
-    _add_sphere(link, "handle", end, HANDLE_RADIUS, wood)
-    _add_rod(link, (*head, axis - 0.045), (*head, tip - FACE_RADIUS), 0.0165, steel)
-    _add_rod(link, (*_across(-HEAD_BACK, 0), axis), end, HANDLE_RADIUS, wood)
+    parts.add_sphere(link, HANDLE_RADIUS, name="handle", pos=end, mass=0, rgba=wood)
+    parts.add_cylinder(link, 0.0165, fromto=[*head, axis - 0.045, *head, tip - FACE_RADIUS], mass=0, rgba=steel)
+    parts.add_cylinder(link, HANDLE_RADIUS, fromto=[*head, axis, *end], mass=0, rgba=wood)
     for side in (-1, 1):
-        y = side * 0.019
-        _add_rod(link, (*_across(0, y), arm.FLANGE + 0.07), (*_across(0, y), axis), 0.008, dark)
-
-
-def _add_sphere(body: mujoco.MjsBody, name: str, center, radius: float, rgba, mass: float = 0.0) -> None:  # noqa: ANN001
-    body.add_geom(
-        name=name,
-        type=mujoco.mjtGeom.mjGEOM_SPHERE,
-        pos=center,
-        size=[radius, 0, 0],
-        mass=mass,
-        rgba=rgba,
-        **NO_CONTACT,
-    )
-
-
-def _add_rod(body: mujoco.MjsBody, start, end, radius: float, rgba: list[float]) -> None:  # noqa: ANN001
-    body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        fromto=[*start, *end],
-        size=[radius, 0, 0],
-        mass=0,
-        rgba=rgba,
-        **NO_CONTACT,
-    )
+        xy = _across(0, side * 0.019)
+        parts.add_cylinder(link, 0.008, fromto=[*xy, arm.FLANGE + 0.07, *xy, axis], mass=0, rgba=dark)
 
 
 def _add_nail(spec: mujoco.MjSpec, theta: dict[str, float], board: float) -> None:
@@ -248,35 +219,14 @@ def _add_nail(spec: mujoco.MjSpec, theta: dict[str, float], board: float) -> Non
     thickness, damping = theta["head_thickness"], theta["nail_damping"]
     steel = [0.7, 0.72, 0.75, 1]
     body = spec.worldbody.add_body(name="nail", pos=[theta["nail_x"], 0, board])
-    body.add_joint(
-        name="nail",
-        type=mujoco.mjtJoint.mjJNT_SLIDE,
-        axis=[0, 0, 1],
-        damping=damping,
-        frictionloss=theta["nail_friction"],
-        armature=damping * REACTION_TIME,
-    )
-    cylinder = mujoco.mjtGeom.mjGEOM_CYLINDER
-    body.add_geom(type=cylinder, pos=[0, 0, -half], size=[radius, half, 0], density=STEEL, rgba=steel, **NO_CONTACT)
-    body.add_geom(
-        type=cylinder,
-        pos=[0, 0, thickness / 2],
-        size=[head, thickness / 2, 0],
-        density=STEEL,
-        rgba=steel,
-        **NO_CONTACT,
-    )
+    nail = parts.add_slide(body, [0, 0, 1], name="nail", damping=damping, frictionloss=theta["nail_friction"])
+    nail.armature = damping * REACTION_TIME
+    parts.add_cylinder(body, radius, half, pos=[0, 0, -half], density=STEEL, rgba=steel)
+    parts.add_cylinder(body, head, thickness / 2, pos=[0, 0, thickness / 2], density=STEEL, rgba=steel)
     # What the hammer feels: a block as wide as the head that reaches far down, so a fast hammer cannot pass a thin head
     # or lift it from below.
-    body.add_geom(
-        name="nail",
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=[0, 0, thickness - DEPTH / 2],
-        size=[head, head, DEPTH / 2],
-        mass=0,
-        rgba=INVISIBLE,
-        **NO_CONTACT,
-    )
+    place = [0, 0, thickness - DEPTH / 2]
+    parts.add_box(body, [head, head, DEPTH / 2], name="nail", pos=place, mass=0, rgba=parts.INVISIBLE)
 
 
 def _add_board(spec: mujoco.MjSpec, x: float, height: float) -> None:
@@ -284,14 +234,9 @@ def _add_board(spec: mujoco.MjSpec, x: float, height: float) -> None:
 
     What is drawn is a board on a stand.
     """
-    world, box, plane = spec.worldbody, mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_PLANE
-    hidden = {"rgba": INVISIBLE, **NO_CONTACT}
-    world.add_geom(name="board", type=plane, pos=[0, 0, height], size=[2, 2, 0.1], **hidden)
+    world, half, stand = spec.worldbody, BOARD_THICKNESS / 2, (height - BOARD_THICKNESS) / 2
+    parts.add_plane(spec, "board", pos=[0, 0, height])
     center = [x - EDGE + 1, 0, height - DEPTH / 2]
-    world.add_geom(name="block", type=box, pos=center, size=[1, 1, DEPTH / 2], **hidden)
-    wood, dark = [0.78, 0.62, 0.42, 1], [0.35, 0.37, 0.4, 1]
-    half = BOARD_THICKNESS / 2
-    size = [EDGE, 0.16, half - 1e-4]
-    world.add_geom(type=box, pos=[x, 0, height - half], size=size, rgba=wood, **NO_CONTACT)
-    stand = (height - BOARD_THICKNESS) / 2
-    world.add_geom(type=box, pos=[x, 0, stand], size=[0.05, 0.09, stand], rgba=dark, **NO_CONTACT)
+    parts.add_box(world, [1, 1, DEPTH / 2], name="block", pos=center, rgba=parts.INVISIBLE)
+    parts.add_box(world, [EDGE, 0.16, half - 1e-4], pos=[x, 0, height - half], rgba=[0.78, 0.62, 0.42, 1])
+    parts.add_box(world, [0.05, 0.09, stand], pos=[x, 0, stand], rgba=[0.35, 0.37, 0.4, 1])

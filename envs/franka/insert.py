@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Entry, Env, Parameter
+from envs.base import Entry, Parameter
 from envs.franka import arm, kinematics, workcell
-from envs.franka.arm import NO_CONTACT
 from envs.franka.kinematics import DOWN, Pose
 from envs.franka.workcell import at_rest, clip_joints, new_spec
-from envs.mujoco.scene import View, make_env
+from envs.mujoco.parts import INVISIBLE, add_box, add_cylinder, add_pair, add_sphere
+from envs.mujoco.scene import View
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -47,6 +47,10 @@ START_LOW, START_HIGH = np.array([-0.05, -0.05, 0.05]), np.array([0.05, 0.05, 0.
 # s, servo damping over stiffness, more than the other tasks': the joints of a soft servo lag unequally, and a straight
 # descent of 2 cm then bends sideways by 2 mm (1/20 s), 1.3 mm (1/16 s) or 1 mm (1/12 s, which reaches only 17 mm).
 DAMPING_TIME = 1 / 16
+# The contact stiffens over 0.5 mm behind the surface, so the opening keeps its size for a leg that does not press, and
+# 100 N sink in by 0.4 mm. Newton's method then converges in 4 iterations; over 0.2 mm it needs 20, and with 4 the leg
+# sinks in by 3 mm.
+WOOD = (0.0, 0.9, 0.0005, 0.5, 2.0)
 NV = arm.N_JOINTS
 
 PARAMETERS = (
@@ -71,7 +75,7 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     _add_part(spec, theta)
     for ball in ("tip", "shaft"):
         for wall in range(4):
-            _add_pair(spec, ball, f"wall{wall}", theta["part_friction"])
+            add_pair(spec, ball, f"wall{wall}", theta["part_friction"], solimp=WOOD)
     return spec
 
 
@@ -156,11 +160,6 @@ SCENE = workcell.scene(
 )
 
 
-def make(impl: str = "auto") -> Env:
-    """The insertion task."""
-    return make_env(SCENE, impl)
-
-
 def _tip(joints: Array) -> Array:
     """[3] m, base frame: the leg's tip."""
     return kinematics.forward(joints, jnp.array([0.0, 0.0, arm.TCP + GRASP])).position
@@ -179,33 +178,22 @@ def _ready() -> np.ndarray:
 def _add_leg(link: mujoco.MjsBody, peg_radius: float) -> None:
     """A square leg that ends in a round peg, and the two balls that feel the hole."""
     tip = arm.TCP + GRASP
-    look = {"rgba": LEG_COLOUR, "quat": arm.tool_quaternion(), **NO_CONTACT}
-    box, cylinder, sphere = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_SPHERE
+    look = {"rgba": LEG_COLOUR, "quat": arm.tool_quaternion()}
     half = (LEG_LENGTH - DEPTH) / 2
-    link.add_geom(
-        type=box, pos=[0, 0, tip - DEPTH - half], size=[LEG_HALF_WIDTH, LEG_HALF_WIDTH, half], mass=LEG_MASS, **look
-    )
-    link.add_geom(type=cylinder, pos=[0, 0, tip - DEPTH / 2], size=[peg_radius, DEPTH / 2, 0], mass=0, **look)
+    place = [0, 0, tip - DEPTH - half]
+    add_box(link, [LEG_HALF_WIDTH, LEG_HALF_WIDTH, half], pos=place, mass=LEG_MASS, **look)
+    add_cylinder(link, peg_radius, DEPTH / 2, pos=[0, 0, tip - DEPTH / 2], mass=0, **look)
     for name, height in (("tip", 0.0), ("shaft", UPPER_BALL)):
-        pos = [0, 0, tip - TIP_ROUNDING - height]
-        link.add_geom(
-            name=name, type=sphere, pos=pos, size=[TIP_ROUNDING, 0, 0], mass=0, rgba=[0, 0, 0, 0], **NO_CONTACT
-        )
+        place = [0, 0, tip - TIP_ROUNDING - height]
+        add_sphere(link, TIP_ROUNDING, name=name, pos=place, mass=0, rgba=INVISIBLE)
 
 
 def _add_fingers(link: mujoco.MjsBody) -> None:
-    yaw = arm.HAND_YAW
+    yaw, look = arm.HAND_YAW, {"quat": arm.tool_quaternion(), "rgba": [0.1, 0.1, 0.12, 1]}
     for side in (-1, 1):
         offset = side * (LEG_HALF_WIDTH + FINGER_HALF[1])
-        link.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=[-np.sin(yaw) * offset, np.cos(yaw) * offset, arm.TCP - 0.015],
-            quat=arm.tool_quaternion(),
-            size=FINGER_HALF,
-            mass=0.015,
-            rgba=[0.1, 0.1, 0.12, 1],
-            **NO_CONTACT,
-        )
+        place = [-np.sin(yaw) * offset, np.cos(yaw) * offset, arm.TCP - 0.015]
+        add_box(link, FINGER_HALF, pos=place, mass=0.015, **look)
 
 
 def _add_part(spec: mujoco.MjSpec, theta: dict[str, float]) -> None:
@@ -218,33 +206,17 @@ def _add_part(spec: mujoco.MjSpec, theta: dict[str, float]) -> None:
     x, y = WALL_HALF[0] + opening, WALL_HALF[1] - opening
     for i in range(4):  # each wall covers one side and one corner of the opening, like the blades of a pinwheel
         c, s = np.cos(i * np.pi / 2), np.sin(i * np.pi / 2)
-        hole.add_geom(
-            name=f"wall{i}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=[c * x - s * y, s * x + c * y, -WALL_HALF[2]],
-            quat=[np.cos(i * np.pi / 4), 0, 0, np.sin(i * np.pi / 4)],
-            size=WALL_HALF,
-            rgba=[0, 0, 0, 0],
-            mass=0,
-            **NO_CONTACT,
+        place, turn = (
+            [c * x - s * y, s * x + c * y, -WALL_HALF[2]],
+            [np.cos(i * np.pi / 4), 0, 0, np.sin(i * np.pi / 4)],
         )
+        add_box(hole, WALL_HALF, name=f"wall{i}", pos=place, quat=turn, rgba=INVISIBLE, mass=0)
     _add_scenery(spec, hole, theta["hole_radius"])
 
 
 def _add_scenery(spec: mujoco.MjSpec, hole: mujoco.MjsBody, hole_radius: float) -> None:
     """What a viewer sees: the bench 4 mm below the surface of contact, the table top and its hole just below it."""
-    box, cylinder = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
     bench, part, dark = [0.62, 0.64, 0.66, 1], [0.80, 0.62, 0.42, 1], [0.05, 0.04, 0.04, 1]
-    spec.worldbody.add_geom(type=box, pos=[0.3, 0, -0.024], size=[0.5, 0.45, 0.02], rgba=bench, **NO_CONTACT)
-    look = {"mass": 0, **NO_CONTACT}
-    size = [PART_HALF, PART_HALF, 0.01]
-    hole.add_geom(type=box, pos=[*-HOLE_OFFSET, -0.0105], size=size, rgba=part, **look)
-    hole.add_geom(type=cylinder, pos=[0, 0, -0.0052], size=[hole_radius, 0.005, 0], rgba=dark, **look)
-
-
-def _add_pair(spec: mujoco.MjSpec, ball: str, wall: str, friction: float) -> None:
-    pair = spec.add_pair(geomname1=ball, geomname2=wall, condim=3, friction=[friction, friction, 0.0, 1e-4, 1e-4])
-    # The contact stiffens over 0.5 mm behind the surface, so the opening keeps its size for a leg that does not press,
-    # and 100 N sink in by 0.4 mm. Newton's method then converges in 4 iterations; over 0.2 mm it needs 20, and with 4
-    # the leg sinks in by 3 mm.
-    pair.solimp = [0.0, 0.9, 0.0005, 0.5, 2.0]
+    add_box(spec.worldbody, [0.5, 0.45, 0.02], pos=[0.3, 0, -0.024], rgba=bench)
+    add_box(hole, [PART_HALF, PART_HALF, 0.01], pos=[*-HOLE_OFFSET, -0.0105], mass=0, rgba=part)
+    add_cylinder(hole, hole_radius, 0.005, pos=[0, 0, -0.0052], mass=0, rgba=dark)

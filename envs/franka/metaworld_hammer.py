@@ -6,16 +6,18 @@ how far Meta-World's hand lags behind (docs/physics.md). It does not turn. Finge
 hammer's face touches the nail, and nothing touches the block.
 """
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Entry, Env, Parameter
-from envs.franka.arm import NO_CONTACT
-from envs.franka.armless import add_box, add_servo, table_spec
+from envs.base import Entry, Parameter
+from envs.franka.armless import table_spec
 from envs.franka.rotations import inverse, turned
-from envs.mujoco.scene import Scene, View, make_env
+from envs.mujoco import parts
+from envs.mujoco.scene import Scene, View
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -70,12 +72,12 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     _add_hammer(spec, theta["hammer_mass"])
     _add_nail(spec, theta["nail_damping"])
     for part in ("handle", "head"):
-        _add_pair(spec, "table", part, theta["table_friction"], (0.015, 1.0), (0.945, 0.97, 0.0055))
-    for finger in ("right", "left"):
-        _add_pair(spec, finger, "handle", theta["finger_friction"], (0.01, 1.0), (0.97, 0.99, 0.01), 4)
+        _add_pair(spec, "table", part, theta["table_friction"], 0.015, (0.945, 0.97, 0.0055))
+    for finger in ("right", "left"):  # whose friction also resists a turn about the contact's normal: it holds level
+        _add_pair(spec, finger, "handle", theta["finger_friction"], 0.01, (0.97, 0.99, 0.01), condim=4)
     for what in ("nail", "block"):
         # Hardly any friction, or a face that slides along the nail's side would pull it out.
-        _add_pair(spec, "face", what, 0.01, (0.01, 1.0), (0.99, 0.99, 0.01))
+        _add_pair(spec, "face", what, 0.01, 0.01, (0.99, 0.99, 0.01))
     return spec
 
 
@@ -193,17 +195,15 @@ def face_of(obs: Array) -> Array:
 def dress(spec: mujoco.MjSpec) -> None:
     """A table top, the palm, and the block around the nail, which only a viewer sees."""
     world, hand = spec.worldbody, spec.body("hand")
-    add_box(world, "", (0.7, 0.4, 0.01), pos=(0, 0.6, -0.0102), rgba=[0.9, 0.9, 0.88, 1])
-    add_box(hand, "", (0.03, 0.07, 0.03), pos=(0, 0, 0.075), rgba=[0.3, 0.1, 0.1, 1])
+    parts.add_box(world, (0.7, 0.4, 0.01), pos=(0, 0.6, -0.0102), rgba=[0.9, 0.9, 0.88, 1])
+    parts.add_box(hand, (0.03, 0.07, 0.03), pos=(0, 0, 0.075), rgba=[0.3, 0.1, 0.1, 1])
     x, y, z = NAIL[0], BLOCK_Y + BLOCK_HALF[1], NAIL[2]
     for side in (-1, 1):
-        add_box(world, "", (0.1, 0.1, 0.048), pos=(x, y, z + 0.062 * side), rgba=_WOOD)
-        add_box(world, "", (0.042, 0.1, 0.014), pos=(x + 0.058 * side, y, z), rgba=_WOOD)
-    for size, back in (((0.03, 0.009), 0.009), ((0.01, 0.06), 0.066)):
-        spec.body("nail").add_geom(
-            type=mujoco.mjtGeom.mjGEOM_CYLINDER, size=[*size, 0], pos=[0, back, 0], quat=[0.7071, 0.7071, 0, 0],
-            rgba=_METAL, mass=0, **NO_CONTACT,
-        )  # fmt: skip
+        parts.add_box(world, (0.1, 0.1, 0.048), pos=(x, y, z + 0.062 * side), rgba=_WOOD)
+        parts.add_box(world, (0.042, 0.1, 0.014), pos=(x + 0.058 * side, y, z), rgba=_WOOD)
+    for radius, half, back in ((0.03, 0.009, 0.009), (0.01, 0.06, 0.066)):
+        turn = [0.7071, 0.7071, 0, 0]
+        parts.add_cylinder(spec.body("nail"), radius, half, pos=[0, back, 0], quat=turn, rgba=_METAL, mass=0)
 
 
 SCENE = Scene(
@@ -243,11 +243,6 @@ SCENE = Scene(
 )
 
 
-def make(impl: str = "auto") -> Env:
-    """The task."""
-    return make_env(SCENE, impl)
-
-
 def _lying() -> Array:
     """[5]: height and rotation of a hammer that lies on the table."""
     return jnp.array([LYING, np.cos(TILT / 2), 0.0, -np.sin(TILT / 2), 0.0], jnp.float32)
@@ -280,17 +275,15 @@ def _add_hand(spec: mujoco.MjSpec, theta: dict[str, float]) -> None:
     hand = spec.worldbody.add_body(name="hand", mass=HAND_MASS, inertia=[0.01] * 3, explicitinertial=True)
     stiffness, damping = STIFFNESS * theta["hand_stiffness"], DAMPING * theta["hand_damping"]
     for name, axis, inertia in zip("xyz", np.eye(3), ARM_INERTIA, strict=True):
-        hand.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis, armature=inertia)
-        add_servo(spec, name, stiffness, damping)
+        parts.add_slide(hand, axis, name=name, armature=inertia)
+        parts.add_servo(spec, name, stiffness, damping)
     for name, side, travel in zip(("right", "left"), (-1, 1), TRAVEL, strict=True):
         finger = hand.add_body(name=name, pos=[0, side * OPEN, 0])
-        finger.add_joint(
-            name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, -side, 0], armature=FINGER_INERTIA,
-            damping=FINGER_DAMPING, limited=mujoco.mjtLimited.mjLIMITED_TRUE, range=[0, travel],
-        )  # fmt: skip
-        add_servo(spec, name, FINGER_FORCE * theta["finger_force"], 0.0)  # 1 m away is an effort of 1
+        slide = parts.add_slide(finger, [0, -side, 0], name=name, armature=FINGER_INERTIA, damping=FINGER_DAMPING)
+        slide.limited, slide.range = mujoco.mjtLimited.mjLIMITED_TRUE, [0, travel]
+        parts.add_servo(spec, name, FINGER_FORCE * theta["finger_force"], 0.0)  # 1 m away is an effort of 1
         middle = (0, -side * (INSIDE - FINGER_HALF[1]), 0)
-        add_box(finger, name, FINGER_HALF, pos=middle, mass=FINGER_MASS, rgba=[0.85, 0.85, 0.88, 1])
+        parts.add_box(finger, FINGER_HALF, name=name, pos=middle, mass=FINGER_MASS, rgba=[0.85, 0.85, 0.88, 1])
 
 
 def _add_hammer(spec: mujoco.MjSpec, mass: float) -> None:
@@ -299,18 +292,10 @@ def _add_hammer(spec: mujoco.MjSpec, mass: float) -> None:
         name="hammer", mass=mass, ipos=[HAMMER_COM, 0, 0], inertia=mass * HAMMER_INERTIA, explicitinertial=True
     )
     hammer.add_freejoint()
-    capsule, sphere = mujoco.mjtGeom.mjGEOM_CAPSULE, mujoco.mjtGeom.mjGEOM_SPHERE
     end, across = HANDLE_HALF, FACE_Y - HEAD_RADIUS
-    hammer.add_geom(
-        name="handle", type=capsule, fromto=[-end, 0, 0, end, 0, 0], size=[HANDLE_RADIUS, 0, 0], rgba=_RED, **NO_CONTACT
-    )
-    hammer.add_geom(
-        name="head", type=capsule, fromto=[HEAD_X, -across, 0, HEAD_X, across, 0], size=[HEAD_RADIUS, 0, 0],
-        rgba=_METAL, **NO_CONTACT,
-    )  # fmt: skip
-    hammer.add_geom(
-        name="face", type=sphere, pos=[HEAD_X, FACE_Y - BALL, 0], size=[BALL, 0, 0], rgba=_METAL, **NO_CONTACT
-    )
+    parts.add_capsule(hammer, HANDLE_RADIUS, name="handle", fromto=[-end, 0, 0, end, 0, 0], rgba=_RED)
+    parts.add_capsule(hammer, HEAD_RADIUS, name="head", fromto=[HEAD_X, -across, 0, HEAD_X, across, 0], rgba=_METAL)
+    parts.add_sphere(hammer, BALL, name="face", pos=[HEAD_X, FACE_Y - BALL, 0], rgba=_METAL)
 
 
 def _add_nail(spec: mujoco.MjSpec, damping: float) -> None:
@@ -318,26 +303,19 @@ def _add_nail(spec: mujoco.MjSpec, damping: float) -> None:
     nail = spec.worldbody.add_body(
         name="nail", pos=NAIL, mass=NAIL_MASS, inertia=[1e-4] * 3, ipos=[0, 0.05, 0], explicitinertial=True
     )
-    nail.add_joint(
-        name="nail", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 1, 0], damping=damping,
-        limited=mujoco.mjtLimited.mjLIMITED_TRUE, range=[0, DEEP], solref_limit=[0.01, 1.0],
-        solimp_limit=[0.99, 0.99, 0.01, 0.5, 2],
-    )  # fmt: skip
+    slide = parts.add_slide(nail, [0, 1, 0], name="nail", damping=damping)
+    slide.limited, slide.range = mujoco.mjtLimited.mjLIMITED_TRUE, [0, DEEP]
+    slide.solref_limit, slide.solimp_limit = [0.01, 1.0], [0.99, 0.99, 0.01, 0.5, 2]
     # It reaches far back, so that no ball gets behind it and pulls the nail out.
-    add_box(nail, "nail", (NAIL_HALF, NAIL_BACK, NAIL_HALF), pos=(0, NAIL_BACK, 0), rgba=[0, 0, 0, 0])
+    parts.add_box(nail, [NAIL_HALF, NAIL_BACK, NAIL_HALF], name="nail", pos=[0, NAIL_BACK, 0], rgba=parts.INVISIBLE)
     wide, deep, high = BLOCK_HALF
-    add_box(
-        spec.worldbody, "block", (wide + HEAD_RADIUS, deep, high + HEAD_RADIUS),
-        pos=(NAIL[0], BLOCK_Y + deep, NAIL[2]), rgba=[0, 0, 0, 0],
-    )  # fmt: skip
+    half, place = [wide + HEAD_RADIUS, deep, high + HEAD_RADIUS], [NAIL[0], BLOCK_Y + deep, NAIL[2]]
+    parts.add_box(spec.worldbody, half, name="block", pos=place, rgba=parts.INVISIBLE)
 
 
 def _add_pair(
-    spec: mujoco.MjSpec, one: str, other: str, friction: float, solref: tuple[float, ...], solimp: tuple[float, ...],
-    condim: int = 3,
-) -> None:  # fmt: skip
-    """condim: with 4, friction also resists a turn about the contact's normal, which holds a hammer level."""
-    spec.add_pair(
-        geomname1=one, geomname2=other, condim=condim, friction=[friction, friction, 0.05 * friction, 1e-4, 1e-4],
-        solref=solref, solimp=[*solimp, 0.5, 2],
-    )  # fmt: skip
+    spec: mujoco.MjSpec, one: str, other: str, friction: float, time: float, impedance: Sequence[float], condim: int = 3
+) -> None:
+    """time: s, that of the contact's spring. impedance: the first three of MuJoCo's five numbers."""
+    solver = {"solref": [time, 1.0], "solimp": [*impedance, 0.5, 2]}
+    parts.add_pair(spec, one, other, friction, 0.05 * friction, condim, **solver)

@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Entry, Env, Parameter
-from envs.franka.armless import add_box, add_servo, table_spec
+from envs.base import Entry, Parameter
+from envs.franka.armless import table_spec
 from envs.franka.rotations import inverse, turned
-from envs.mujoco.scene import Scene, View, make_env
+from envs.mujoco.parts import add_box, add_pair, add_servo, add_slide
+from envs.mujoco.scene import Scene, View
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -54,10 +55,10 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     _add_fingers(spec, rate=RATE * theta["servo_rate"], strength=theta["servo_strength"])
     cube = spec.worldbody.add_body(name="cube")
     cube.add_freejoint()
-    add_box(cube, "cube", CUBE, mass=theta["cube_mass"], rgba=_CUBE)
+    add_box(cube, CUBE, name="cube", mass=theta["cube_mass"], rgba=_CUBE)
     _add_mark(spec)
-    _add_pair(spec, "table", "cube", theta["table_friction"])
-    _add_pair(spec, "fingers", "cube", theta["finger_friction"])
+    add_pair(spec, "table", "cube", theta["table_friction"], 0.005)
+    add_pair(spec, "fingers", "cube", theta["finger_friction"], 0.005)
     return spec
 
 
@@ -136,8 +137,8 @@ def euler(turn: Array) -> Array:
 
 def dress(spec: mujoco.MjSpec) -> None:
     """A table top and the hand above the fingers, which only a viewer sees."""
-    add_box(spec.worldbody, "", (0.55, 0.35, 0.01), pos=(-0.3, 0.0, -0.0102), rgba=[0.9, 0.9, 0.88, 1])
-    add_box(spec.body("fingers"), "", (0.03, 0.1, 0.03), pos=(0, 0, 0.072), rgba=[0.93, 0.94, 0.95, 1])
+    add_box(spec.worldbody, (0.55, 0.35, 0.01), pos=(-0.3, 0.0, -0.0102), rgba=[0.9, 0.9, 0.88, 1])
+    add_box(spec.body("fingers"), (0.03, 0.1, 0.03), pos=(0, 0, 0.072), rgba=[0.93, 0.94, 0.95, 1])
 
 
 SCENE = Scene(
@@ -171,11 +172,6 @@ SCENE = Scene(
 )
 
 
-def make(impl: str = "auto") -> Env:
-    """The task."""
-    return make_env(SCENE, impl)
-
-
 def _state(tip: Array, speed: Array, cube: Array, moving: Array, mark: Array) -> PhysicsState:
     """Servos that have arrived. tip, speed: [3] of the fingertip. cube: [7], moving: [6], as MuJoCo has them."""
     qvel = jnp.concatenate([speed, moving, jnp.zeros(2)])
@@ -186,25 +182,21 @@ def _add_fingers(spec: mujoco.MjSpec, *, rate: float, strength: float) -> None:
     """The closed fingers on their slides. rate: 1/s. strength: share of `STRENGTH`."""
     body = spec.worldbody.add_body(name="fingers")
     for name, axis, limit in zip("xyz", np.eye(3), STRENGTH, strict=True):
-        joint = body.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+        joint = add_slide(body, axis, name=name)
         if name == "z":
             joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, [TABLE_AT, 1.0]
             joint.solref_limit = [2 * spec.option.timestep, 1.0]  # as hard as the time step allows
         servo = add_servo(spec, name, MASS * DAMPING * rate, MASS * DAMPING)
         servo.forcelimited, servo.forcerange = 1, [-MASS * limit * strength, MASS * limit * strength]
     middle = (0, 0, FINGER_HALF[2] - FINGER_LOW)
-    add_box(body, "fingers", FINGER_HALF, pos=middle, mass=MASS, rgba=[0.3, 0.32, 0.35, 1])
+    add_box(body, FINGER_HALF, name="fingers", pos=middle, mass=MASS, rgba=[0.3, 0.32, 0.35, 1])
 
 
 def _add_mark(spec: mujoco.MjSpec) -> None:
     body = spec.worldbody.add_body(name="mark", pos=[0, 0, CUBE_HALF])
     for axis in np.eye(3)[:2]:
-        body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-    add_box(body, "", CUBE, mass=1.0, rgba=_MARK)
-
-
-def _add_pair(spec: mujoco.MjSpec, one: str, other: str, friction: float) -> None:
-    spec.add_pair(geomname1=one, geomname2=other, condim=3, friction=[friction, friction, 0.005, 1e-4, 1e-4])
+        add_slide(body, axis)
+    add_box(body, CUBE, mass=1.0, rgba=_MARK)
 
 
 def _quaternion(angles: Array) -> Array:

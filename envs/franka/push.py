@@ -9,18 +9,19 @@ observation alone.
 """
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Entry, Env, Parameter
+from envs.base import Entry, Parameter
 from envs.franka import arm, kinematics, workcell
-from envs.franka.arm import NO_CONTACT
 from envs.franka.kinematics import DOWN, Pose
 from envs.franka.workcell import at_rest, clip_joints, new_spec
-from envs.mujoco.scene import View, make_env
+from envs.mujoco import parts
+from envs.mujoco.scene import View
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -60,14 +61,15 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
     for side in FINGERS:
         _add_finger(link, side)
-    spec.worldbody.add_geom(
-        name="table", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.1], rgba=[0, 0, 0, 0], **NO_CONTACT
-    )
+    parts.add_plane(spec, "table")
     add_scenery(spec)
     _add_puck(spec, theta["object_mass"])
-    _add_pair(spec, "table", "puck_base", theta["table_friction"], spin=theta["table_friction"] * PUCK_RADIUS * 2 / 3)
+    friction = theta["table_friction"]
+    spin = friction * PUCK_RADIUS * 2 / 3  # of a disc under uniform pressure
+    kind: dict[str, Any] = {"condim": 4} if friction else {"solimp": RUBBER}
+    parts.add_pair(spec, "table", "puck_base", friction, spin, **kind)
     for finger in FINGERS.values():
-        _add_pair(spec, finger, "puck_side", theta["finger_friction"])
+        parts.add_pair(spec, finger, "puck_side", theta["finger_friction"], solimp=RUBBER)
     return spec
 
 
@@ -124,8 +126,8 @@ def ready(key: Key, height: float = HEIGHT) -> Array:
 def target(qpos: Array, action: Array, height: float = HEIGHT) -> Array:
     """[7] joint targets that move the hand by `action` * 5 cm from where it is, in its plane and workspace."""
     joints = qpos[: arm.N_JOINTS]
-    here = kinematics.forward(joints).position[:2] - jnp.array([TABLE_ORIGIN, 0.0])
-    goal = jnp.clip(here + STEP * action, jnp.asarray(WORKSPACE[0]), jnp.asarray(WORKSPACE[1]))
+    hand = kinematics.forward(joints).position[:2] - jnp.array([TABLE_ORIGIN, 0.0])
+    goal = jnp.clip(hand + STEP * action, jnp.asarray(WORKSPACE[0]), jnp.asarray(WORKSPACE[1]))
     return clip_joints(kinematics.solve(joints, _pose(goal, height), iterations=3, posture=0.05))
 
 
@@ -160,11 +162,6 @@ SCENE = workcell.scene(
 )
 
 
-def make(impl: str = "auto") -> Env:
-    """The pushing task."""
-    return make_env(SCENE, impl)
-
-
 def _pose(xy: Array, height: float) -> Pose:
     return Pose(
         jnp.concatenate([xy + jnp.array([TABLE_ORIGIN, 0.0]), jnp.array([height])]), jnp.asarray(DOWN, jnp.float32)
@@ -183,72 +180,31 @@ def finger_xy(side: int) -> tuple[float, float]:
 
 
 def _add_finger(link: mujoco.MjsBody, side: int) -> None:
-    x, y = finger_xy(side)
-    link.add_geom(
-        name=FINGERS[side],
-        type=mujoco.mjtGeom.mjGEOM_SPHERE,
-        pos=[x, y, arm.TCP],
-        size=[FINGER_RADIUS, 0, 0],
-        mass=0.015,
-        rgba=[0.1, 0.1, 0.12, 1],
-        **NO_CONTACT,
-    )
-    link.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-        fromto=[x, y, arm.FLANGE + 0.07, x, y, arm.TCP],
-        size=[FINGER_RADIUS, 0, 0],
-        mass=0,
-        rgba=[0.1, 0.1, 0.12, 1],
-        **NO_CONTACT,
-    )
+    (x, y), dark = finger_xy(side), [0.1, 0.1, 0.12, 1]
+    parts.add_sphere(link, FINGER_RADIUS, name=FINGERS[side], pos=[x, y, arm.TCP], mass=0.015, rgba=dark)
+    parts.add_capsule(link, FINGER_RADIUS, fromto=[x, y, arm.FLANGE + 0.07, x, y, arm.TCP], mass=0, rgba=dark)
 
 
 def _add_puck(spec: mujoco.MjSpec, mass: float) -> None:
     """A disc that slides and spins but does not tilt: one contact with torsional friction stands for its whole face."""
     body = spec.worldbody.add_body(name="puck", pos=[0, 0, PUCK_HALF_HEIGHT])
     for axis in np.eye(3)[:2]:
-        body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+        parts.add_slide(body, axis)
     # Weight, in a scene without gravity: a spring of 1 N/m whose rest length is mass * g away.
-    body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, 1], stiffness=1.0, springref=-mass * GRAVITY)
-    body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1])
-    body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        size=[PUCK_RADIUS, PUCK_HALF_HEIGHT, 0],
-        mass=mass,
-        rgba=[0.85, 0.25, 0.2, 1],
-        **NO_CONTACT,
-    )
-    invisible = {"mass": 0, "rgba": [0, 0, 0, 0], **NO_CONTACT}
-    foot = PUCK_HALF_HEIGHT / 2
-    body.add_geom(
-        name="puck_base",
-        type=mujoco.mjtGeom.mjGEOM_SPHERE,
-        pos=[0, 0, foot - PUCK_HALF_HEIGHT],
-        size=[foot, 0, 0],
-        **invisible,
-    )
+    parts.add_slide(body, [0, 0, 1], stiffness=1.0, springref=-mass * GRAVITY)
+    parts.add_hinge(body, [0, 0, 1])
+    parts.add_cylinder(body, PUCK_RADIUS, PUCK_HALF_HEIGHT, mass=mass, rgba=[0.85, 0.25, 0.2, 1])
+    hidden, foot = {"mass": 0, "rgba": parts.INVISIBLE}, PUCK_HALF_HEIGHT / 2
+    parts.add_sphere(body, foot, name="puck_base", pos=[0, 0, foot - PUCK_HALF_HEIGHT], **hidden)
     # The side as the fingers feel it: a sphere against a vertical capsule is exact in every backend, a sphere against a
     # cylinder is not.
-    body.add_geom(
-        name="puck_side", type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[PUCK_RADIUS, PUCK_HALF_HEIGHT, 0], **invisible
-    )
-
-
-def _add_pair(spec: mujoco.MjSpec, geom1: str, geom2: str, friction: float, *, spin: float = 0.0) -> None:
-    """spin: m, torsional friction; 2/3 of friction times radius is a disc under uniform pressure."""
-    friction_5d = [friction, friction, spin, 1e-4, 1e-4]
-    pair = spec.add_pair(geomname1=geom1, geomname2=geom2, condim=4 if spin else 3, friction=friction_5d)
-    if not spin:
-        pair.solimp = RUBBER
+    parts.add_capsule(body, PUCK_RADIUS, PUCK_HALF_HEIGHT, name="puck_side", **hidden)
 
 
 def add_scenery(spec: mujoco.MjSpec) -> None:
     """What only a viewer sees of the table: its top, which ends at the edge, and the line of the goal."""
     half = (TABLE_ORIGIN + EDGE + 0.25) / 2
     wood, line = [0.78, 0.66, 0.5, 1], [0.95, 0.85, 0.2, 1]
-    box = mujoco.mjtGeom.mjGEOM_BOX
-    world = spec.worldbody
-    size = [half, TABLE_HALF_WIDTH, 0.0199]
-    world.add_geom(type=box, pos=[half - 0.25, 0, -0.02], size=size, rgba=wood, **NO_CONTACT)
+    parts.add_box(spec.worldbody, [half, TABLE_HALF_WIDTH, 0.0199], pos=[half - 0.25, 0, -0.02], rgba=wood)
     x = TABLE_ORIGIN + EDGE - TOLERANCE / 2
-    world.add_geom(type=box, pos=[x, 0, 0], size=[TOLERANCE / 2, TABLE_HALF_WIDTH, 0.0005], rgba=line, **NO_CONTACT)
+    parts.add_box(spec.worldbody, [TOLERANCE / 2, TABLE_HALF_WIDTH, 0.0005], pos=[x, 0, 0], rgba=line)

@@ -16,8 +16,8 @@ import numpy as np
 
 from envs.base import Parameter
 from envs.franka import arm, push, workcell
-from envs.franka.arm import NO_CONTACT
 from envs.franka.workcell import new_spec
+from envs.mujoco.parts import INVISIBLE, add_box, add_capsule
 from envs.mujoco.scene import Scene, View
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array
@@ -53,20 +53,13 @@ def stage(theta: dict[str, float], *, height: float, iterations: int) -> mujoco.
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
     for side, name in push.FINGERS.items():
         x, y = push.finger_xy(side)
-        link.add_geom(
-            name=name,
-            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-            fromto=[x, y, arm.FLANGE + 0.07, x, y, arm.TCP + height - TIP],
-            size=[push.FINGER_RADIUS, 0, 0],
-            mass=0.015,
-            rgba=[0.1, 0.1, 0.12, 1],
-            **NO_CONTACT,
-        )
+        ends = [x, y, arm.FLANGE + 0.07, x, y, arm.TCP + height - TIP]
+        add_capsule(link, push.FINGER_RADIUS, name=name, fromto=ends, mass=0.015, rgba=[0.1, 0.1, 0.12, 1])
     for body in spec.bodies:
         body.gravcomp = float(body.name.startswith("link"))
     half = (push.TABLE_ORIGIN + push.EDGE + 0.25) / 2
-    box, size = mujoco.mjtGeom.mjGEOM_BOX, [half, push.TABLE_HALF_WIDTH, _THICK]
-    spec.worldbody.add_geom(name=TABLE, type=box, pos=[half - 0.25, 0, -_THICK], size=size, rgba=[0] * 4, **NO_CONTACT)
+    size, place = [half, push.TABLE_HALF_WIDTH, _THICK], [half - 0.25, 0, -_THICK]
+    add_box(spec.worldbody, size, name=TABLE, pos=place, rgba=INVISIBLE)
     push.add_scenery(spec)
     return spec
 
@@ -147,7 +140,7 @@ def add_skin(
     names = {name for name, _ in bones}
     for body in spec.bodies:
         for geom in body.geoms if body.name in names else ():
-            geom.rgba = [0] * 4
+            geom.rgba = INVISIBLE
     moved = [np.flatnonzero(column) for column in weights.T]
     spec.add_skin(
         vert=vertices.ravel().tolist(),

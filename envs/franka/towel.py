@@ -9,11 +9,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Env
 from envs.franka import arm, push, soft
-from envs.franka.arm import NO_CONTACT
 from envs.franka.workcell import at_rest
-from envs.mujoco.scene import Scene, make_env
+from envs.mujoco.parts import INVISIBLE, add_slide, add_sphere
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -39,17 +37,9 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     for i, place in enumerate(POINTS):
         body = spec.worldbody.add_body(name=_name(i), pos=place)
         for axis in np.eye(3):
-            body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-        size, mass = [RADIUS, 0, 0], theta["object_mass"] / len(POINTS)
-        body.add_geom(
-            name=_name(i),
-            type=mujoco.mjtGeom.mjGEOM_SPHERE,
-            size=size,
-            mass=mass,
-            rgba=[0.8, 0.3, 0.25, 1],
-            **NO_CONTACT,
-        )
-        body.add_site(name=_name(i), rgba=[0] * 4)
+            add_slide(body, axis)
+        add_sphere(body, RADIUS, name=_name(i), mass=theta["object_mass"] / len(POINTS), rgba=[0.8, 0.3, 0.25, 1])
+        body.add_site(name=_name(i), rgba=INVISIBLE)
         soft.touch(spec, _name(i), theta, fingers=FELT)
     for span, stiffness in STIFFNESS.items():
         _add_springs(spec, span, stiffness)
@@ -78,21 +68,12 @@ def dress(spec: mujoco.MjSpec) -> None:
     faces = np.concatenate([top, top[:, ::-1] + under, side])
     at = np.linspace(0, 1, m)
     texture = np.stack(np.meshgrid(at, at, indexing="ij"), axis=-1).reshape(-1, 2)
-    twice = lambda x: np.concatenate([x, x])  # noqa: E731 - both faces of the cloth
+    vertices, weights, texture = (np.concatenate([x, x]) for x in (weights @ POINTS, weights, texture))  # both faces
     bones = [(_name(i), place) for i, place in enumerate(POINTS)]
     soft.add_material(spec, "towel", (4.0, 0.01), ((0.80, 0.27, 0.22), (0.95, 0.93, 0.9)))
-    soft.add_skin(
-        spec,
-        twice(weights @ POINTS),
-        faces,
-        twice(weights),
-        bones,
-        texture=twice(texture),
-        material="towel",
-        inflate=0.004,
-    )
+    soft.add_skin(spec, vertices, faces, weights, bones, texture=texture, material="towel", inflate=0.004)
     for tendon in spec.tendons:
-        tendon.rgba = [0] * 4
+        tendon.rgba = INVISIBLE
 
 
 def _add_springs(spec: mujoco.MjSpec, span: tuple[int, int], stiffness: float) -> None:
@@ -140,8 +121,3 @@ REAL = {
         SCENE, "towel", height=push.HEIGHT, build=build, initial=initial, place=_place, lie=_lie, dress=dress
     )
 }
-
-
-def make(impl: str = "auto", scene: Scene = SCENE) -> Env:
-    """The task, in simulation or in its real scene."""
-    return make_env(scene, impl)

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 
 from envs.franka import arm
-from envs.franka.arm import NO_CONTACT
+from envs.mujoco.parts import add_box, add_cylinder, empty_spec
 from envs.mujoco.scene import Scene
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array
@@ -24,12 +24,9 @@ _WHITE, _GREY, _DARK = [0.93, 0.94, 0.95, 1.0], [0.60, 0.62, 0.65, 1.0], [0.20, 
 
 def new_spec(*, substeps: int, iterations: int, ls_iterations: int) -> mujoco.MjSpec:
     """An empty scene with the solver settings all tasks share; contacts only where a task declares a pair."""
-    spec = mujoco.MjSpec()
+    spec = empty_spec(CONTROL_DT / substeps, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
     option = spec.option
-    option.timestep = CONTROL_DT / substeps
-    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
-    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     option.iterations, option.ls_iterations = iterations, ls_iterations
     # The robot compensates its own weight, which is the same as none, and MuJoCo's per-body compensation costs a
     # quarter of the simulation speed. A task gives weight to the objects that need it, see `push`.
@@ -52,16 +49,15 @@ def dress(spec: mujoco.MjSpec, *, table: tuple[float, float, float] | None = Non
     """The robot's pedestal and livery, and the legs of the table it stands on: x of the back and the front ones and
     how far they stand to the sides, m.
     """
-    cylinder, box, world = mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_BOX, spec.worldbody
     for body in spec.bodies:
         if body.name.startswith("link"):
             _paint_link(body)
-    world.add_geom(type=cylinder, size=[0.11, 0.015, 0], pos=[0, 0, 0.015], rgba=_DARK, **NO_CONTACT)
-    world.add_geom(type=cylinder, size=[0.09, 0.09, 0], pos=[0, 0, 0.09], rgba=_WHITE, **NO_CONTACT)
+    add_cylinder(spec.worldbody, 0.11, 0.015, pos=[0, 0, 0.015], rgba=_DARK)
+    add_cylinder(spec.worldbody, 0.09, 0.09, pos=[0, 0, 0.09], rgba=_WHITE)
     half = -(FLOOR + 0.04) / 2
     for x in table[:2] if table else ():
         for y in (-table[2], table[2]) if table else ():
-            world.add_geom(type=box, size=[0.02, 0.02, half], pos=[x, y, -0.04 - half], rgba=_DARK, **NO_CONTACT)
+            add_box(spec.worldbody, [0.02, 0.02, half], pos=[x, y, -0.04 - half], rgba=_DARK)
     spec.stat.extent, spec.stat.center = 1.5, [0.3, 0, 0.3]
 
 
@@ -69,5 +65,5 @@ def _paint_link(body: mujoco.MjsBody) -> None:
     """White links with a grey ring at each joint; the first geom of a link is its capsule."""
     capsule = body.geoms[0]
     capsule.rgba = _WHITE
-    radius, cylinder = 1.06 * capsule.size[0], mujoco.mjtGeom.mjGEOM_CYLINDER
-    body.add_geom(type=cylinder, size=[radius, 0.35 * radius, 0], rgba=_GREY, mass=0, **NO_CONTACT)
+    radius = 1.06 * capsule.size[0]
+    add_cylinder(body, radius, 0.35 * radius, rgba=_GREY, mass=0)

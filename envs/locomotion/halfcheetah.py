@@ -11,10 +11,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Env
 from envs.locomotion import planar
 from envs.locomotion.planar import NV, Capsule, Link, multiple
-from envs.mujoco.scene import make_env
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -127,8 +125,3 @@ SCENE = planar.scene(
     reward=functools.partial(planar.seen_reward, progress, bonus=0.0, cost=CONTROL_COST),
     measured=functools.partial(planar.run, dt=CONTROL_DT, bonus=0.0, cost=CONTROL_COST),
 )
-
-
-def make(impl: str = "auto") -> Env:
-    """The running task. Its nominal system is Gym's."""
-    return make_env(SCENE, impl)

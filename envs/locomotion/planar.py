@@ -15,6 +15,8 @@ import mujoco
 import numpy as np
 
 from envs.base import Entry, Parameter
+from envs.mujoco import parts
+from envs.mujoco.parts import INVISIBLE, NO_CONTACT, add_hinge, add_motor, add_slide, empty_spec
 from envs.mujoco.scene import Measured, Scene, View
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array
@@ -25,7 +27,6 @@ GRAVITY = 9.81  # m/s^2
 VIEW = View((0.0, 0.0, -0.35), 3.6, 90.0, -12.0, floor=0.0, follow="torso")
 FLOOR = "floor"
 ROLLING = [0.1, 0.1, 0.1]  # torsional and rolling friction, which contacts of three dimensions do not feel
-NO_CONTACT = {"contype": 0, "conaffinity": 0}  # geoms touch only in pairs that are declared
 NO_MORE: Mapping[str, Sequence[float]] = MappingProxyType({})
 LIGHT, ORANGE, BLUE = [0.85, 0.86, 0.88, 1.0], [0.87, 0.52, 0.25, 1.0], [0.30, 0.46, 0.68, 1.0]
 
@@ -79,10 +80,8 @@ def new_spec(*, timestep: float, integrator: mujoco.mjtIntegrator, gravity: floa
 
     MuJoCo's defaults are Gym's solver settings: Newton's method, 100 iterations, pyramidal friction cones.
     """
-    spec = mujoco.MjSpec()
+    spec = empty_spec(timestep, integrator)
     spec.compiler.degree = False
-    spec.option.timestep, spec.option.integrator = timestep, integrator
-    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
     spec.option.gravity = [0.0, 0.0, -GRAVITY * gravity]
     return spec
 
@@ -90,16 +89,15 @@ def new_spec(*, timestep: float, integrator: mujoco.mjtIntegrator, gravity: floa
 def add_floor(spec: mujoco.MjSpec) -> None:
     """The floor at z = 0. Viewers see the one of `VIEW`."""
     plane = mujoco.mjtGeom.mjGEOM_PLANE
-    spec.worldbody.add_geom(name=FLOOR, type=plane, size=[0, 0, 1], rgba=[0, 0, 0, 0], **NO_CONTACT)
+    spec.worldbody.add_geom(name=FLOOR, type=plane, size=[0, 0, 1], rgba=INVISIBLE, **NO_CONTACT)
 
 
 def add_torso(spec: mujoco.MjSpec, height: float, *, ref: float) -> mujoco.MjsBody:
     """The root at that height, m: free to slide along x and z, where z reads `ref` m there, and to pitch."""
     torso = spec.worldbody.add_body(name="torso", pos=[0, 0, height])
-    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
-    torso.add_joint(name="root_x", type=slide, axis=[1, 0, 0])
-    torso.add_joint(name="root_z", type=slide, axis=[0, 0, 1], ref=ref)
-    torso.add_joint(name="root_pitch", type=hinge, axis=[0, 1, 0])
+    add_slide(torso, [1, 0, 0], name="root_x")
+    add_slide(torso, [0, 0, 1], name="root_z", ref=ref)
+    add_hinge(torso, [0, 1, 0], name="root_pitch")
     return torso
 
 
@@ -118,11 +116,8 @@ def add_capsule(
     friction: of the contact, in MuJoCo the larger of both geoms. contact: its `solref` and `solimp`.
     """
     radius, half, (x, z), turn = capsule
-    body.add_geom(
-        name=name, type=mujoco.mjtGeom.mjGEOM_CAPSULE, size=[radius, half, 0], pos=[x, 0, z],
-        quat=[np.cos(turn / 2), 0, np.sin(turn / 2), 0], density=density, rgba=_tint(name),
-        **NO_CONTACT,
-    )  # fmt: skip
+    quat = [np.cos(turn / 2), 0, np.sin(turn / 2), 0]
+    parts.add_capsule(body, radius, half, name=name, pos=[x, 0, z], quat=quat, density=density, rgba=_tint(name))
     spec.add_pair(geomname1=FLOOR, geomname2=name, condim=3, friction=[friction, friction, *ROLLING], **contact)
 
 
@@ -143,15 +138,11 @@ def add_link(
     """
     (x, z), (anchor_x, anchor_z) = link.position, link.anchor
     body = spec.body(link.parent).add_body(name=link.name, pos=[x, 0, z])
-    body.add_joint(
-        name=link.name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, axis, 0], pos=[anchor_x, 0, anchor_z], limited=True,
-        range=link.range, stiffness=link.stiffness, damping=link.damping, armature=armature, **limit,
-    )  # fmt: skip
+    spring = {"stiffness": link.stiffness, "damping": link.damping, "armature": armature}
+    hinge = add_hinge(body, [0, axis, 0], name=link.name, pos=[anchor_x, 0, anchor_z], **spring, **limit)
+    hinge.limited, hinge.range = True, link.range
     add_capsule(spec, body, link.name, link.capsule, density=density, friction=friction, contact=contact)
-    spec.add_actuator(
-        name=link.name, target=link.name, trntype=mujoco.mjtTrn.mjTRN_JOINT, gear=[link.gear, 0, 0, 0, 0, 0],
-        ctrllimited=True, ctrlrange=[-1, 1],
-    )  # fmt: skip
+    add_motor(spec, link.name, link.name, link.gear)
 
 
 def _tint(name: str) -> list[float]:

@@ -11,10 +11,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Env
 from envs.locomotion import planar
 from envs.locomotion.planar import NV, Capsule, Link, multiple
-from envs.mujoco.scene import make_env
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -111,8 +109,3 @@ SCENE = planar.scene(
     reward=functools.partial(planar.seen_reward, progress, bonus=ALIVE, cost=CONTROL_COST),
     measured=functools.partial(planar.run, dt=CONTROL_DT, bonus=ALIVE, cost=CONTROL_COST, torque=torque),
 )
-
-
-def make(impl: str = "auto") -> Env:
-    """The walking task. Its nominal system is Gym's."""
-    return make_env(SCENE, impl)

@@ -4,11 +4,10 @@ The robot is that of `envs.locomotion.wheel_legged`.
 """
 
 import jax.numpy as jnp
+import numpy as np
 
-from envs.base import Env
 from envs.locomotion import wheel_legged
-from envs.locomotion.wheel_legged import ENTRIES, fallen, state_of, torque
-from envs.mujoco.scene import make_env
+from envs.locomotion.wheel_legged import ENTRIES, FALLEN, fallen, seconds_until, state_of, torque
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array
 
@@ -36,6 +35,19 @@ def terminated(obs: Array, action: Array, next_obs: Array) -> Array:
     return fallen(next_obs[1])
 
 
+def measures(next_obs: np.ndarray, valid: np.ndarray) -> dict[str, np.ndarray]:
+    """Of episodes, next_obs [..., T, 3] and valid [..., T].
+
+    upright_s: as of the standing robot. speed_error: [...] m/s, root mean square of v - 0.2 m/s while it is upright;
+    that of the first step for a robot that is never upright.
+    """
+    upright = np.cumprod(valid & (np.abs(next_obs[..., 1]) <= FALLEN), axis=-1).astype(bool)
+    counted = upright.copy()
+    counted[..., 0] = True
+    squares = np.where(counted, (next_obs[..., 0] - SPEED) ** 2, 0.0).sum(-1) / counted.sum(-1)
+    return {"upright_s": seconds_until(upright), "speed_error": np.sqrt(squares)}
+
+
 SCENE = wheel_legged.SCENE._replace(
     name="wheel-legged-forward",
     observation=(ENTRIES["velocity"], ENTRIES["pitch"], ENTRIES["pitch_velocity"]),
@@ -43,9 +55,5 @@ SCENE = wheel_legged.SCENE._replace(
     settled=settled,
     reward=reward,
     terminated=terminated,
+    measures=measures,
 )
-
-
-def make(impl: str = "auto") -> Env:
-    """The task of moving forward."""
-    return make_env(SCENE, impl)

@@ -13,9 +13,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Entry, Env, Parameter
-from envs.locomotion.planar import BLUE, LIGHT, NO_CONTACT, ORANGE
-from envs.mujoco.scene import Scene, View, make_env
+from envs.base import Entry, Parameter
+from envs.locomotion.planar import BLUE, LIGHT, ORANGE
+from envs.mujoco import parts
+from envs.mujoco.scene import Scene, View
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -26,6 +27,7 @@ WHEEL_RADIUS, WHEEL_MASS = 0.065, 1.5  # m; kg of both wheels
 WHEEL_INERTIA = WHEEL_MASS * WHEEL_RADIUS**2 / 2  # kg m^2, of solid discs
 BODY_HALF = (0.1, 0.12, 0.15)  # m, of a homogeneous box around the centre of mass
 FALLEN = np.radians(30.0)  # rad
+PLACE = 0.2  # m from x = 0: farther away it does not stand in its place
 ALIVE = 30.0  # reward of a step in which nothing moves
 START = np.array([0.05, 0.05, 0.05, 0.1])  # m, rad, m/s, rad/s: half-widths of a uniform draw
 ENTRIES = {
@@ -47,31 +49,21 @@ _LAG = [p.name for p in PARAMETERS].index("motor_lag")
 
 def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The scene for one theta. The lag of the motors is no part of it, see `follow`."""
-    spec = mujoco.MjSpec()
-    option = spec.option
-    option.timestep, option.integrator = CONTROL_DT / SUBSTEPS, mujoco.mjtIntegrator.mjINT_EULER
-    option.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
-    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    spec = parts.empty_spec(CONTROL_DT / SUBSTEPS, mujoco.mjtIntegrator.mjINT_EULER)
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     axle = spec.worldbody.add_body(name="axle", pos=[0, 0, WHEEL_RADIUS])
-    # Wheels that roll turn with x: their inertia adds to the mass that x moves.
-    axle.add_joint(
-        name="x", type=slide, axis=[1, 0, 0], armature=WHEEL_INERTIA / WHEEL_RADIUS**2,
-        frictionloss=theta["wheel_friction"] / WHEEL_RADIUS,
-    )  # fmt: skip
+    rolling = parts.add_slide(axle, [1, 0, 0], name="x", frictionloss=theta["wheel_friction"] / WHEEL_RADIUS)
+    rolling.armature = WHEEL_INERTIA / WHEEL_RADIUS**2  # wheels turn with x: their inertia adds to what x moves
     _add_wheels(axle)
     body = axle.add_body(name="body")
-    body.add_joint(name="pitch", type=hinge, axis=[0, 1, 0])
+    parts.add_hinge(body, [0, 1, 0], name="pitch")
     com, mass = [theta["com_x"], 0, theta["com_height"]], theta["mass"] - WHEEL_MASS
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=com, size=BODY_HALF, mass=mass, rgba=LIGHT)
     _add_legs(body, theta["com_height"])
     wheel = spec.add_tendon(name="wheel")
     wheel.wrap_joint("x", 1 / WHEEL_RADIUS)
     wheel.wrap_joint("pitch", -1.0)
-    spec.add_actuator(
-        name="motor", target="wheel", trntype=mujoco.mjtTrn.mjTRN_TENDON, gear=[TORQUE, 0, 0, 0, 0, 0],
-        ctrllimited=True, ctrlrange=[-1, 1],
-    )  # fmt: skip
+    parts.add_motor(spec, "motor", "wheel", TORQUE, mujoco.mjtTrn.mjTRN_TENDON)
     return spec
 
 
@@ -121,11 +113,26 @@ def fallen(pitch: Array) -> Array:
     return jnp.abs(pitch) > FALLEN
 
 
+def measures(next_obs: np.ndarray, valid: np.ndarray) -> dict[str, np.ndarray]:
+    """What H2O+ reports of episodes, next_obs [..., T, 4] and valid [..., T]; they last longer than ours, whose end
+    bounds all times here.
+
+    upright_s: [...] s until it pitches by more than 30 degrees. in_place_s: [...] s until it does or is more than 0.2 m
+    from x = 0, whichever is first. Source: H2O+, real-world experiments.
+    """
+    upright = valid & (np.abs(next_obs[..., 2]) <= FALLEN)
+    in_place = upright & (np.abs(next_obs[..., 0]) <= PLACE)
+    return {"upright_s": seconds_until(upright), "in_place_s": seconds_until(in_place)}
+
+
+def seconds_until(holds: np.ndarray) -> np.ndarray:
+    """[...] s until `holds` [..., T] is false for the first time."""
+    return np.cumprod(holds, axis=-1).sum(-1) * CONTROL_DT
+
+
 def mark(spec: mujoco.MjSpec) -> None:
     """A line on the floor at x = 0, the place to stand at."""
-    spec.worldbody.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX, pos=[0, 0, 0], size=[0.008, 0.3, 0.002], rgba=ORANGE, **NO_CONTACT,
-    )  # fmt: skip
+    parts.add_box(spec.worldbody, [0.008, 0.3, 0.002], pos=[0, 0, 0], rgba=ORANGE)
 
 
 SCENE = Scene(
@@ -145,32 +152,21 @@ SCENE = Scene(
     reward=reward,
     terminated=terminated,
     score="return",
+    measures=measures,
+    table=True,
     max_speed=500.0,
     dress=mark,
     view=View((0.0, 0.0, 0.12), 1.25, 118.0, -14.0, floor=0.0, follow="axle"),
 )
 
 
-def make(impl: str = "auto") -> Env:
-    """The task of standing still."""
-    return make_env(SCENE, impl)
-
-
 def _add_wheels(axle: mujoco.MjsBody) -> None:
-    cylinder, dark = mujoco.mjtGeom.mjGEOM_CYLINDER, [0.20, 0.21, 0.24, 1]
-    sideways = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
+    dark, sideways = [0.20, 0.21, 0.24, 1], [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
     for y in (-0.15, 0.15):
-        axle.add_geom(
-            type=cylinder, pos=[0, y, 0], size=[WHEEL_RADIUS, 0.02, 0], quat=sideways, mass=WHEEL_MASS / 2, rgba=dark,
-            **NO_CONTACT,
-        )  # fmt: skip
+        parts.add_cylinder(axle, WHEEL_RADIUS, 0.02, pos=[0, y, 0], quat=sideways, mass=WHEEL_MASS / 2, rgba=dark)
 
 
 def _add_legs(body: mujoco.MjsBody, height: float) -> None:
     """What only a viewer sees."""
-    capsule = mujoco.mjtGeom.mjGEOM_CAPSULE
     for y in (-0.12, 0.12):
-        body.add_geom(
-            type=capsule, fromto=[0, y, 0, 0, y, height], size=[0.015, 0, 0], mass=0, rgba=BLUE,
-            **NO_CONTACT,
-        )  # fmt: skip
+        parts.add_capsule(body, 0.015, fromto=[0, y, 0, 0, y, height], mass=0, rgba=BLUE)

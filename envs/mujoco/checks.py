@@ -65,7 +65,7 @@ def _check_times(scene: Scene, host: mujoco.MjModel) -> None:
 
 def _observed(scene: Scene, params: Any, state: PhysicsState) -> Any:
     try:
-        return jax.eval_shape(lambda *given: pack(scene.observation, scene.observe(*given)), params, state)
+        return jax.eval_shape(lambda *args: pack(scene.observation, scene.observe(*args)), params, state)
     except UserError as error:
         raise UserError(f"task {scene.name}: 'observe': {error}") from None
 

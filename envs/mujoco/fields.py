@@ -97,8 +97,8 @@ def comparison(nominal: mujoco.MjModel, names: tuple[str, ...]) -> Callable[[muj
     keys = [_key(x) for x in get_arrays(nominal)]
 
     def differing(host: mujoco.MjModel) -> list[str]:
-        if (found := get_sizes(host)) != wanted_sizes:
-            return [name for name, a, b in zip(sizes, found, wanted_sizes, strict=True) if a != b]
+        if (counts := get_sizes(host)) != wanted_sizes:
+            return [name for name, a, b in zip(sizes, counts, wanted_sizes, strict=True) if a != b]
         rows = zip(arrays, get_arrays(host), wanted, keys, strict=True)
         return [name for name, x, y, key in rows if _key(x) != key and not _same(x, y)]
 

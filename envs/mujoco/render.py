@@ -9,6 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from envs.mujoco.parts import NO_CONTACT
 from envs.mujoco.scene import Scene, View
 from envs.types import UserError
 
@@ -20,7 +21,6 @@ JUMP = 0.5  # m or rad in one control step: an event, such as a puck that fell, 
 SUPERSAMPLING = 2  # drawn so many times larger, then averaged: smooth edges on every backend
 TILE, TILES = 0.75, 16  # m, of a tile of the floor; how many there are along each side
 _GROUND = "ground"
-_NO_CONTACT = {"contype": 0, "conaffinity": 0}
 
 
 def render_episode(scene: Scene, theta: Mapping[str, float] | Sequence[float], qpos: np.ndarray, path: Path) -> None:
@@ -127,7 +127,7 @@ def _add_surroundings(spec: mujoco.MjSpec, view: View | None) -> None:
     tiles.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = "tiles"
     ground = spec.worldbody.add_body(name=_GROUND, mocap=True, pos=[0, 0, view.floor])
     half = TILE * TILES / 2
-    ground.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[half, half, 0.1], material="tiles", **_NO_CONTACT)
+    ground.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[half, half, 0.1], material="tiles", **NO_CONTACT)
 
 
 def _add_lights(spec: mujoco.MjSpec, *, follow: str) -> None:
@@ -138,10 +138,8 @@ def _add_lights(spec: mujoco.MjSpec, *, follow: str) -> None:
     add = spec.worldbody.add_light
     home = spec.body(follow) if follow else spec.worldbody
     track = mujoco.mjtCamLight.mjCAMLIGHT_TRACK if follow else mujoco.mjtCamLight.mjCAMLIGHT_FIXED
-    home.add_light(
-        type=sun, mode=track, pos=[0.9, -1.0, 2.5], dir=[-0.35, 0.4, -1.0], diffuse=[0.5] * 3, specular=[0.2] * 3,
-        castshadow=True,
-    )  # fmt: skip
+    bright = {"diffuse": [0.5] * 3, "specular": [0.2] * 3, "castshadow": True}
+    home.add_light(type=sun, mode=track, pos=[0.9, -1.0, 2.5], dir=[-0.35, 0.4, -1.0], **bright)
     add(type=sun, pos=[0.5, 1.5, 2.0], dir=[0.3, -0.7, -0.6], diffuse=[0.2] * 3, specular=[0.0] * 3, castshadow=False)
     spec.visual.headlight.ambient, spec.visual.headlight.diffuse = [0.35] * 3, [0.2] * 3
 

@@ -59,7 +59,8 @@ class Scene(NamedTuple):
     motors(params, previous, target) -> [nu] the control that follows the last one, `previous` [nu], where motors are
         slower than a control period; default `target` at once.
     observe(params, state) -> [obs_dim] without measurement error, or a dict of vectors by entry name.
-    reward, terminated, success, success_anytime, score, training, actuators, cartesian, check: see `Env`.
+    reward, terminated, success, success_anytime, score, training, actuators, cartesian, check, measures, table: see
+        `Env`.
     measured(params, before, action, after) -> Measured: where reward, end or success are no functions of observations.
         `reward` may then approximate it; what is measured is what counts.
     event(params, state) -> state: what happens between control steps (a fallen object stays down); default nothing.
@@ -94,6 +95,8 @@ class Scene(NamedTuple):
     training: Mapping[str, Value] = NOTHING
     actuators: Mapping[str, Value] = NOTHING
     check: Callable[[dict[str, float]], str | None] = lambda theta: None
+    measures: Callable[[np.ndarray, np.ndarray], dict[str, np.ndarray]] = lambda next_obs, valid: {}
+    table: bool = False
     max_speed: float = 50.0
     engine: Engine | None = None
     variant: str = ""
@@ -118,7 +121,9 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
     except UserError as error:
         raise UserError(f"scene {scene.name}: {error}") from None
     settled = scene.settled
-    seen = lambda params, state: pack(scene.observation, scene.observe(params, state))  # noqa: E731
+
+    def observe(params: Array, state: PhysicsState) -> Array:
+        return pack(scene.observation, scene.observe(params, state))
 
     def make_worlds(theta: Theta) -> World:
         rows = np.asarray(theta.params, np.float64)
@@ -137,14 +142,14 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
         state = settled(world.theta.params, obs - drawn.obs_bias)
         return begin(world, state, drawn, key_noise)._replace(obs=obs)
 
-    def begin(world: World, state: PhysicsState, own: Effects, key_noise: Key) -> EnvState:
+    def begin(world: World, state: PhysicsState, episode: Effects, key_noise: Key) -> EnvState:
         if host.nsensordata:
             state = engine.sense(world.model, state)
-        true_obs = seen(world.theta.params, state)
+        true_obs = observe(world.theta.params, state)
         no = jnp.zeros((), bool)
         return EnvState(
             physics=state,
-            obs=env_effects.measure(own, true_obs, key_noise),
+            obs=env_effects.measure(episode, true_obs, key_noise),
             true_obs=true_obs,
             reward=jnp.zeros((), jnp.float32),
             terminated=no,
@@ -152,7 +157,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
             success=no,
             invalid=no,
             time=jnp.zeros((), jnp.int32),
-            effects=own,
+            effects=episode,
         )
 
     def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
@@ -164,7 +169,7 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
         control = env_effects.ramp(episode, before.ctrl, target, key_latency, dt=dt, duration=scene.ramp)
         controls = jax.vmap(control)(jnp.arange(scene.substeps))
         after = scene.event(params, engine.advance(world.model, before, controls))
-        true_obs = seen(params, after)
+        true_obs = observe(params, after)
         reward, terminated, now = _outcome(scene, params, state, action, after, true_obs)
         time = state.time + 1
         return EnvState(
@@ -201,28 +206,26 @@ def _outcome(
     measured = scene.measured(params, before.physics, action, after)
     step = before.true_obs, action, true_obs
 
-    def found(name: str, given: tuple[Array, ...], default: Any) -> Array:
+    def outcome(name: str, args: tuple[Array, ...], default: Any) -> Array:
         function, value = getattr(scene, name), getattr(measured, name)
-        if value is not None:
-            return jnp.asarray(
-                value
-            )  # the function of a reward is an approximation, for transitions that nobody measures
-        return jnp.asarray(default) if function is None else function(*given)
+        if value is not None:  # the function of a reward is an approximation, for transitions that nobody measures
+            return jnp.asarray(value)
+        return jnp.asarray(default) if function is None else function(*args)
 
-    return found("reward", step, 0.0), found("terminated", step, False), found("success", (true_obs,), False)
+    return outcome("reward", step, 0.0), outcome("terminated", step, False), outcome("success", (true_obs,), False)
 
 
 def _varying(scene: Scene, host: mujoco.MjModel, nominal: dict[str, float]) -> tuple[str, ...]:
     """Fields in which scenes differ with one domain parameter off its nominal value each, by little enough to stay
     buildable. A parameter that then changes nothing is asked at the ends of its range, too.
     """
-    found: dict[str, None] = {}
+    varying: dict[str, None] = {}
     for p in scene.parameters:
         value = p.nominal * 1.01 if p.nominal else 0.01
         near = value if p.minimum <= value <= p.maximum else 2 * p.nominal - value
         for values in ([near], [x for x in (p.low, p.high) if x != p.nominal]):
             fields = physics.varying_fields(host, (scene.build({**nominal, p.name: x}) for x in values))
-            found |= dict.fromkeys(fields)
+            varying |= dict.fromkeys(fields)
             if fields:
                 break
-    return with_shortcuts(host, tuple(found))
+    return with_shortcuts(host, tuple(varying))

@@ -5,6 +5,7 @@ depends on is left out: each network reads only the rows whose errors count. A t
 parameters as the learner.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 from envs.types import Array, Key, PyTree, Transition
 from experiments.bench.bare_sac import Trained, adam, forward, layers, squashed, trained
 from sgft_jax.learners.h2oplus import H2OPlusHyper
-from sgft_jax.learners.sac import LOG_ALPHA_MIN
+from sgft_jax.learners.steps import LOG_ALPHA_MIN
 from sgft_jax.models.networks import LOG_STD_MAX
 
 BOUND, RATIO_NOISE = 2.0, 0.1  # of the discriminators' logits and inputs
@@ -44,8 +45,8 @@ class Bare(NamedTuple):
 def init(key: Key, hidden: tuple[int, ...], obs_dim: int, act_dim: int) -> Bare:
     """A fresh agent of those sizes."""
     keys, both = jax.random.split(key, 5), obs_dim + act_dim
-    plain = lambda key, inputs, outputs: layers(key, inputs, outputs, hidden, layer_norm=False)  # noqa: E731
-    critic = layers(keys[1], both, 1, hidden, layer_norm=False, stack=2)
+    plain = functools.partial(layers, hidden=hidden, layer_norm=False)
+    critic = plain(keys[1], both, 1, stack=2)
     return Bare(
         actor=trained((plain(keys[0], obs_dim, 2 * act_dim), jnp.float32(1.0), jnp.float32(-1.0))),
         critic=trained(critic),

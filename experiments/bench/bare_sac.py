@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from envs.types import Array, Key, PyTree, Transition
-from sgft_jax.learners.sac import LOG_ALPHA_MIN, SACHyper
+from sgft_jax.learners.sac import SACHyper
+from sgft_jax.learners.steps import LOG_ALPHA_MIN
 from sgft_jax.models.networks import LOG_STD_MAX, LOG_STD_MIN, NetworkConfig
 
 
@@ -147,8 +148,8 @@ def squashed(mean: Array, log_std: Array, noise: Array) -> tuple[Array, Array]:
 
 def trained(params: PyTree) -> Trained:
     """Parameters with fresh moments."""
-    zeros = lambda: jax.tree.map(jnp.zeros_like, params)  # noqa: E731
-    return Trained(params, zeros(), zeros(), jnp.int32(0))
+    first, second = (jax.tree.map(jnp.zeros_like, params) for _ in range(2))
+    return Trained(params, first, second, jnp.int32(0))
 
 
 def adam(old: Trained, grads: PyTree, rate: Any) -> Trained:
@@ -157,5 +158,8 @@ def adam(old: Trained, grads: PyTree, rate: Any) -> Trained:
     first = jax.tree.map(lambda m, g: 0.9 * m + 0.1 * g, old.first, grads)
     second = jax.tree.map(lambda v, g: 0.999 * v + 0.001 * g**2, old.second, grads)
     scale = jnp.sqrt(1 - 0.999**count) / (1 - 0.9**count)
-    step = lambda p, m, v: p - rate * scale * m / (jnp.sqrt(v) + 1e-8 * jnp.sqrt(1 - 0.999**count))  # noqa: E731
+
+    def step(p: Array, m: Array, v: Array) -> Array:
+        return p - rate * scale * m / (jnp.sqrt(v) + 1e-8 * jnp.sqrt(1 - 0.999**count))
+
     return Trained(jax.tree.map(step, old.params, first, second), first, second, count)

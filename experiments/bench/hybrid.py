@@ -11,28 +11,30 @@ import envs
 from envs import gaps
 from envs.base import Env, World
 from envs.gaps import SIM
+from envs.mujoco.worlds import Impl, choose_impl
 from envs.pools import real_worlds
 from envs.types import Key, PyTree
 from experiments.bench import bare_h2oplus
 from experiments.bench.timing import Compiled, ahead, fastest_in_turns
 from experiments.bench.updates import REPLAY, rows
-from sgft_jax.hybrid.schedule import Schedule
-from sgft_jax.hybrid.trainer import make_trainer
 from sgft_jax.learners.h2oplus import H2OPlusHyper
 from sgft_jax.methods import get_method
-from sgft_jax.train.pretraining import over_members
+from sgft_jax.train import hybrid
+from sgft_jax.train.fleet import make_programs, make_trainer, over_members
+from sgft_jax.train.schedule import Schedule
 from sgft_jax.types import HybridAgent, RealData
 
 METHOD = "h2oplus"
 
 
-def speed(task: str, impl: str, members: int, *, width: int, updates: int, repeats: int) -> dict[str, Any]:
+def speed(task: str, impl: Impl, members: int, *, width: int, updates: int, repeats: int) -> dict[str, Any]:
     """Updates per second over all members (pairs of a seed and a gap): of a run, and of the hand-written update.
 
     A run steps its simulators, 25 by default, once before as many updates follow. updates/bare: of a run that learns
     from what its simulators left before. simulators_share: of a run's time, by how much that one is faster.
     """
-    env, method = envs.make(task, impl), get_method(METHOD, "fixed")
+    engine = choose_impl(impl)
+    env, method = envs.make(task, engine), get_method(METHOD, "fixed")
     agent = method.build(replace(method.config, hidden=(width, width)), env)
     schedule = Schedule(buffer=REPLAY, chunk_updates=updates)
     pools = real_worlds(env, [gaps.load(env, SIM)] * members, jax.random.key(0))
@@ -42,12 +44,10 @@ def speed(task: str, impl: str, members: int, *, width: int, updates: int, repea
     bare = _by_hand(env, method.config, width, keys, schedule.updates_per_chunk)
     run_s, idle_s, bare_s = fastest_in_turns((run, idle, bare), repeats=repeats)
     count = members * schedule.updates_per_chunk
-    return {
-        "task": task, "impl": impl, "members": members, "width": width,
-        "updates_per_s": count / run_s, "bare_per_s": count / bare_s, "run/bare": bare_s / run_s,
-        "updates/bare": bare_s / idle_s, "simulators_share": 1 - idle_s / run_s,
-        "compile_s": compiled.compile_s, "memory_mb": compiled.memory_mb,
-    }  # fmt: skip
+    line = {"task": task, "impl": engine, "members": members, "width": width}
+    line |= {"updates_per_s": count / run_s, "bare_per_s": count / bare_s, "run/bare": bare_s / run_s}
+    line |= {"updates/bare": bare_s / idle_s, "simulators_share": 1 - idle_s / run_s}
+    return line | {"compile_s": compiled.compile_s, "memory_mb": compiled.memory_mb}
 
 
 def _run(
@@ -55,9 +55,10 @@ def _run(
 ) -> tuple[Callable[[], None], Compiled]:
     """(What makes one more chunk of all members, its program), without steps of the simulators where asked."""
     members, real = keys.shape[0], _recorded(env)
-    init = over_members(make_trainer(env, agent, schedule, gamma=0.99).init, members, shared=(1,))
-    state, memory = jax.jit(init)(pools, real, keys), agent.keep(real)
-    trainer = make_trainer(env, agent._replace(simulates=simulates), schedule, gamma=0.99)
+    plan = hybrid.make_plan(env, agent, schedule)
+    programs = make_programs(make_trainer(env, plan, gamma=0.99), members, shared=True)
+    state, memory = programs.begin(pools, real, keys), agent.keep(real)
+    trainer = make_trainer(env, plan if simulates else plan._replace(simulators=0), gamma=0.99)
     made = ahead(over_members(trainer.chunk, members, shared=(1,)), (pools, memory, state), donate=(2,))
 
     def chunk() -> None:

@@ -5,6 +5,7 @@ observation, reward, automatic reset, random actions. The references start from 
 follow the commands they gave, in the nominal scene, so all of them meet the same contacts.
 """
 
+import functools
 import gc
 import os
 import time
@@ -22,7 +23,7 @@ from mujoco import mjx
 import envs
 from envs.base import Env, World
 from envs.mujoco.engines import warp as engine_warp
-from envs.mujoco.worlds import PhysicsState
+from envs.mujoco.worlds import Impl, PhysicsState, choose_impl
 from envs.rollout import Fleet, launch, step_fleet
 from envs.types import Array, Key
 from experiments.bench.timing import Timing, ahead, fastest, measure
@@ -37,42 +38,42 @@ class Window(NamedTuple):
     commands: Array
 
 
-def speed(task: str, impl: str, worlds: int, *, control_steps: int, repeats: int) -> dict[str, Any]:
+def speed(task: str, impl: Impl, worlds: int, *, control_steps: int, repeats: int) -> dict[str, Any]:
     """Physics steps per second of whole environments and of the bare engines.
 
     env_per_s: over whole episodes; the reset at their end is timed apart and counted once an episode. bare_per_s: of
     `mjx.step` (impl jax), of MuJoCo Warp without JAX (warp), of `mujoco.rollout` on all cores (c). mjx_per_s: with
     Warp, also of `mjx.step(impl="warp")`.
     """
-    began = time.perf_counter()
-    env, scene = envs.make(task, impl), envs.scene(task)
+    began, engine = time.perf_counter(), choose_impl(impl)
+    env, scene = envs.make(task, engine), envs.scene(task)
     pool = envs.sample_worlds(env, jax.random.key(0), POOL)
     reset = ahead(lambda pool, key: launch(env, pool, key, worlds, ()), (pool, jax.random.key(1)))
     fresh = reset.call(pool, jax.random.key(1))
     play = ahead(lambda *state: _play(env, *state, control_steps=control_steps), (pool, fresh, jax.random.key(2)))
     middle, _ = play.call(pool, fresh, jax.random.key(2))  # into the episode, where things touch
-    given = (pool, middle, jax.random.key(3))
-    window = Window(middle.state.physics, play.call(*given)[1])
+    arguments = (pool, middle, jax.random.key(3))
+    window = Window(middle.state.physics, play.call(*arguments)[1])
 
-    play_s = fastest(lambda: play.call(*given), repeats=repeats)
+    play_s = fastest(lambda: play.call(*arguments), repeats=repeats)
     reset_s = fastest(lambda: reset.call(pool, jax.random.key(1)), repeats=repeats)
     steps = worlds * control_steps * scene.substeps
     episode_s = env.episode_length / control_steps * play_s + reset_s
-    found: dict[str, Any] = {"task": task, "impl": impl, "worlds": worlds}
-    found["env_per_s"] = worlds * env.episode_length * scene.substeps / episode_s
+    line: dict[str, Any] = {"task": task, "impl": engine, "worlds": worlds}
+    line["env_per_s"] = worlds * env.episode_length * scene.substeps / episode_s
     host = scene.build({p.name: p.nominal for p in scene.parameters}).compile()
-    if impl == "warp":
+    if engine == "warp":
         host.opt.iterations = engine_warp.iterations(host)  # the references solve as exactly as the environment does
-    if impl != "c":
+    if engine != "c":
         with _nothing_collected():
-            mjx_per_s = steps / _mjx_alone(host, impl, window, scene.substeps, repeats).seconds
-        found |= {"mjx_per_s": mjx_per_s} if impl == "warp" else {"bare_per_s": mjx_per_s}
-    if impl != "jax":
-        alone = {"c": _c_alone, "warp": _warp_alone}[impl]
-        found["bare_per_s"] = steps / alone(host, window, scene.substeps, repeats)
-    found["env/bare"] = found["env_per_s"] / found["bare_per_s"]
-    found |= {"reset_s": reset_s, "compile_s": play.compile_s, "memory_mb": play.memory_mb}
-    return found | {"measured_in_s": time.perf_counter() - began}
+            mjx_per_s = steps / _mjx_alone(host, engine, window, scene.substeps, repeats).seconds
+        line |= {"mjx_per_s": mjx_per_s} if engine == "warp" else {"bare_per_s": mjx_per_s}
+    if engine != "jax":
+        alone = {"c": _c_alone, "warp": _warp_alone}[engine]
+        line["bare_per_s"] = steps / alone(host, window, scene.substeps, repeats)
+    line["env/bare"] = line["env_per_s"] / line["bare_per_s"]
+    line |= {"reset_s": reset_s, "compile_s": play.compile_s, "memory_mb": play.memory_mb}
+    return line | {"measured_in_s": time.perf_counter() - began}
 
 
 def _play(env: Env, pool: World, fleet: Fleet, key: Key, *, control_steps: int) -> tuple[Fleet, Array]:
@@ -130,11 +131,11 @@ def _mjx_alone(host: mujoco.MjModel, impl: str, window: Window, substeps: int, r
 
 def _room_for(data: mjx.Data, worlds: int) -> mjx.Data:
     """Data [] of one world for `impl="warp"`, its list of contacts, which all worlds share, long enough for so many."""
-    own = data._impl
-    lists = {name: x for name, x in vars(own).items() if name.startswith("contact__") and x.shape[0]}
+    inner = data._impl
+    lists = {name: x for name, x in vars(inner).items() if name.startswith("contact__") and x.shape[0]}
     longer = {name: jnp.broadcast_to(x[:1], (worlds * x.shape[0], *x.shape[1:])) for name, x in lists.items()}
-    sizes = {name: worlds * getattr(own, name) for name in ("naconmax", "naccdmax")}
-    return data.replace(_impl=own.replace(**longer, **sizes))
+    sizes = {name: worlds * getattr(inner, name) for name in ("naconmax", "naccdmax")}
+    return data.replace(_impl=inner.replace(**longer, **sizes))
 
 
 def _warp_alone(host: mujoco.MjModel, window: Window, substeps: int, repeats: int) -> float:
@@ -147,13 +148,13 @@ def _warp_alone(host: mujoco.MjModel, window: Window, substeps: int, repeats: in
     model.opt.warn_overflow = False
     start = [wp.array(np.asarray(x), dtype=float) for x in window.start[:3]]
     commands = [wp.array(np.asarray(x), dtype=float) for x in window.commands]
-    step = lambda: mjw.step(model, data)  # noqa: E731
+    step = functools.partial(mjw.step, model, data)
     step()
     if wp.get_device().is_cuda:
         with wp.ScopedCapture() as capture:
             step()
         graph: Any = capture.graph
-        step = lambda: wp.capture_launch(graph)  # noqa: E731
+        step = functools.partial(wp.capture_launch, graph)
 
     def run() -> None:
         for place, values in zip((data.qpos, data.qvel, data.qacc_warmstart), start, strict=True):

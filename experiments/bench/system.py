@@ -1,7 +1,6 @@
 """Fine-tuning through a `System`, against the same rollout, updates and physics fused into one compiled program."""
 
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from envs.gaps import SIM
 from envs.mujoco.worlds import Impl
 from envs.rollout import Episode
 from envs.types import Key, PyTree
+from experiments.runner.options import prior_folders
 from sgft_jax import api
 from sgft_jax.io.priors import load_priors, observed_by
 from sgft_jax.systems.simulated import Simulated
@@ -20,28 +20,27 @@ from sgft_jax.train import finetuning
 from sgft_jax.types import Metrics
 
 
-def speed(task: str, impl: Impl, members: int, *, priors: Sequence[Path], repeats: int) -> dict[str, Any]:
+def speed(task: str, impl: Impl, seeds: int, *, prior: Path, repeats: int) -> dict[str, Any]:
     """Seconds of a rollout and its updates of the recommended method, by both; the fastest of `repeats`, in turns."""
-    env = envs.make(task, impl, **observed_by(priors))
-    setup = api.setup(env, gaps.find(env.name, SIM), load_priors(priors, env), seeds=members)
+    folders = prior_folders(prior, out=prior, task=task, preset="")
+    env = envs.make(task, impl, **observed_by(folders))
+    setup = api.setup(env, gaps.find(env.name, SIM), load_priors(folders, env), seeds=seeds)
     assert isinstance(setup.system, Simulated)
     through = finetuning.finetune(*setup, rollouts=10**9)
     progress, _ = next(through)
     agent = jax.tree.map(lambda x: x.copy(), progress.agent)
     fused = jax.jit(_fused(setup), donate_argnums=0)
-    own, theirs = [], []
+    through_s, fused_s = [], []
     for i in range(repeats + 1):  # the first one compiles
         start = time.perf_counter()
         jax.block_until_ready(next(through))
         middle = time.perf_counter()
         agent, _, _ = jax.block_until_ready(fused(agent, jax.random.key(i)))
-        own.append(middle - start)
-        theirs.append(time.perf_counter() - middle)
-    system_s, fused_s = min(own[1:]), min(theirs[1:])
-    return {
-        "task": task, "impl": env.impl, "seeds": members, "system_s": system_s, "fused_s": fused_s,
-        "fused/system": fused_s / system_s,
-    }  # fmt: skip
+        through_s.append(middle - start)
+        fused_s.append(time.perf_counter() - middle)
+    line = {"task": task, "impl": env.impl, "seeds": seeds}
+    fastest = {"system_s": min(through_s[1:]), "fused_s": min(fused_s[1:])}
+    return line | fastest | {"fused/system": fastest["fused_s"] / fastest["system_s"]}
 
 
 def _fused(setup: api.Setup) -> Any:

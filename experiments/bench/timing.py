@@ -30,7 +30,7 @@ def ahead(function: Callable[..., Any], arguments: Sequence[Any], *, donate: Seq
     start = time.perf_counter()
     compiled = jax.jit(function, donate_argnums=donate).lower(*arguments).compile()
     compile_s = time.perf_counter() - start
-    return Compiled(lambda *given: jax.block_until_ready(compiled(*given)), compile_s, _memory(compiled))
+    return Compiled(lambda *args: jax.block_until_ready(compiled(*args)), compile_s, _memory(compiled))
 
 
 def measure(function: Callable[..., Any], arguments: Sequence[Any], *, repeats: int) -> Timing:
@@ -50,11 +50,11 @@ def fastest_in_turns(calls: Sequence[Callable[[], Any]], *, repeats: int) -> lis
         call()
     times: list[list[float]] = [[] for _ in calls]
     for _ in range(repeats):
-        for call, own in zip(calls, times, strict=True):
+        for call, seconds in zip(calls, times, strict=True):
             start = time.perf_counter()
             call()
-            own.append(time.perf_counter() - start)
-    return [min(own) for own in times]
+            seconds.append(time.perf_counter() - start)
+    return [min(seconds) for seconds in times]
 
 
 def _memory(compiled: Any) -> float:

@@ -28,18 +28,16 @@ def pretraining(task: str, impl: Impl, seeds: int, *, preset: str, env_steps: in
     config = PRESETS[preset] if env_steps is None else replace(PRESETS[preset], env_steps=env_steps)
 
     def run(out: Path) -> dict[str, Any]:
-        return pretrain(
-            PretrainArgs(task=task, preset=preset, config=config, seeds=seeds, impl=impl, video=False, out=out)
-        )
+        args = PretrainArgs(task=task, preset=preset, config=config, seeds=seeds, impl=impl, video=False, out=out)
+        return pretrain(args)
 
     first_s, (summary, seconds) = _twice(run)
-    return {
-        "task": task, "impl": summary["impl"], "seeds": seeds, "env_steps": summary["env_steps"],
-        "seconds": seconds, "first_run_s": first_s,
-        "success": min(seed["success"] for seed in summary["seeds"]),
-        "explained_variance": min(seed["value/explained_variance"] for seed in summary["seeds"]),
-        **{f"{part}_s": summary[f"time/{part}_s"] for part in ("worlds", "random", "train", "evaluate", "report")},
-    }  # fmt: skip
+    line = {"task": task, "impl": summary["impl"], "seeds": seeds, "env_steps": summary["env_steps"]}
+    line |= {"seconds": seconds, "first_run_s": first_s}
+    for name, value in (("success", "success"), ("explained_variance", "value/explained_variance")):
+        line[name] = min(seed[value] for seed in summary["seeds"])
+    parts = ("worlds", "random", "train", "evaluate", "report")
+    return line | {f"{part}_s": summary[f"time/{part}_s"] for part in parts}
 
 
 def weak_scaling(
@@ -51,55 +49,46 @@ def weak_scaling(
     as many times the speed of the smallest number; the ratio of both is `env/ideal`.
     """
     base = PRESETS[preset]
-    found = {}
+    summaries = {}
     for n in devices:
-        config = replace(
-            base, n_envs=n * worlds, batch_size=n * batch, env_steps=n * (env_steps or base.env_steps),
-            replay_capacity=n * base.replay_capacity, random_transitions=n * max(base.random_transitions, worlds),
-            eval_every=_NEVER, checkpoint_every=_NEVER,
-        )  # fmt: skip
+        sizes = {"n_envs": n * worlds, "batch_size": n * batch, "env_steps": n * (env_steps or base.env_steps)}
+        sizes["random_transitions"] = n * max(base.random_transitions, worlds)
+        sizes |= {"replay_capacity": n * base.replay_capacity, "eval_every": _NEVER, "checkpoint_every": _NEVER}
+        config = replace(base, **sizes)
+        args = PretrainArgs(task=task, preset=preset, config=config, impl=impl, devices=n, report=False, video=False)
         with tempfile.TemporaryDirectory() as out:
-            found[n] = pretrain(
-                PretrainArgs(
-                    task=task, preset=preset, config=config, impl=impl, devices=n,
-                    report=False, video=False, out=Path(out),
-                )
-            )  # fmt: skip
-    speed = {n: summary["env_steps"] / summary["time/train_s"] for n, summary in found.items()}
+            summaries[n] = pretrain(replace(args, out=Path(out)))
+    speed = {n: summary["env_steps"] / summary["time/train_s"] for n, summary in summaries.items()}
     alone = speed[min(speed)] / min(speed)
-    return [
-        {
-            "task": task, "impl": found[n]["impl"], "devices": n, "worlds": worlds, "batch": batch,
-            "env_per_s": speed[n], "ideal_per_s": n * alone, "env/ideal": speed[n] / (n * alone),
-            "compile_s": found[n]["time/compile_s"],
-        }
-        for n in sorted(speed)
-    ]  # fmt: skip
+    lines = []
+    for n in sorted(speed):
+        line = {"task": task, "impl": summaries[n]["impl"], "devices": n, "worlds": worlds, "batch": batch}
+        line |= {"env_per_s": speed[n], "ideal_per_s": n * alone, "env/ideal": speed[n] / (n * alone)}
+        lines.append(line | {"compile_s": summaries[n]["time/compile_s"]})
+    return lines
 
 
 def fine_tuning(task: str, impl: Impl, seeds: int, *, prior: Path, rollouts: int) -> dict[str, Any]:
     """Seconds of SGFT-SAC from that prior, its curve included, and those of the median rollout with its updates."""
 
     def run(out: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        own = {"task": task, "seeds": seeds, "rollouts": rollouts, "prior": prior, "impl": impl}
-        args = arguments("sgft-sac", **own, video=False, out=out)
+        chosen = {"task": task, "seeds": seeds, "rollouts": rollouts, "prior": prior, "impl": impl}
+        args = arguments("sgft-sac", **chosen, video=False, out=out)
         (summary,) = finetune(args)
         return summary, read_jsonl(run_folder(args, *args.real) / "timing.jsonl")
 
     first_s, ((summary, timing), seconds) = _twice(run)
     rollout_s = statistics.median(line["time/rollout_s"] for line in timing[1:])
-    return {
-        "task": task, "impl": summary["impl"], "seeds": seeds, "rollouts": rollouts,
-        "seconds": seconds, "first_run_s": first_s, "rollout_s": rollout_s,
-    }  # fmt: skip
+    line = {"task": task, "impl": summary["impl"], "seeds": seeds, "rollouts": rollouts}
+    return line | {"seconds": seconds, "first_run_s": first_s, "rollout_s": rollout_s}
 
 
 def _twice(run: Callable[[Path], Any]) -> tuple[float, tuple[Any, float]]:
     """(Seconds of the first run, (what the second returned, its seconds))."""
-    done = []
+    runs = []
     for _ in range(2):
         with tempfile.TemporaryDirectory() as out:
             start = time.perf_counter()
-            found = run(Path(out))
-            done.append((found, time.perf_counter() - start))
-    return done[0][1], done[1]
+            result = run(Path(out))
+            runs.append((result, time.perf_counter() - start))
+    return runs[0][1], runs[1]

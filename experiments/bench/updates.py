@@ -39,12 +39,10 @@ def speed(
             _repeated(agent, batch, keys, updates, repeats) for agent in (_library(network), _by_hand(network, batch))
         )
     moved, per_s = _bytes(_library(network), batch, keys), count / library.seconds
-    return {
-        "batch": batch, "seeds": seeds, "width": width, "precision": exact,
-        "updates_per_s": per_s, "bare_per_s": count / bare.seconds, "updates/bare": bare.seconds / library.seconds,
-        "gb_per_update": moved / 1e9, "tb_per_s": per_s * moved / 1e12,
-        "compile_s": library.compile_s, "memory_mb": library.memory_mb,
-    }  # fmt: skip
+    line = {"batch": batch, "seeds": seeds, "width": width, "precision": exact}
+    line |= {"updates_per_s": per_s, "bare_per_s": count / bare.seconds, "updates/bare": bare.seconds / library.seconds}
+    line |= {"gb_per_update": moved / 1e9, "tb_per_s": per_s * moved / 1e12}
+    return line | {"compile_s": library.compile_s, "memory_mb": library.memory_mb}
 
 
 def plain_speed(batch: int, *, width: int, updates: int, repeats: int) -> dict[str, Any]:
@@ -60,13 +58,13 @@ def plain_speed(batch: int, *, width: int, updates: int, repeats: int) -> dict[s
 
         return jax.lax.scan(update, agent, jax.random.split(key, updates))[0]
 
-    own = measure(run, (learner.init(jax.random.key(1)), buffer, jax.random.key(2)), repeats=repeats)
-    found = {"batch": batch, "width": width, "updates_per_s": updates / own.seconds}
+    ours = measure(run, (learner.init(jax.random.key(1)), buffer, jax.random.key(2)), repeats=repeats)
+    line = {"batch": batch, "width": width, "updates_per_s": updates / ours.seconds}
     for name in other_sac.importable():
         train = other_sac.make(name, batch, width, OBS_DIM, ACT_DIM, REPLAY)
         per_s = updates / fastest(lambda train=train: train(updates), repeats=repeats)
-        found |= {f"{name}_per_s": per_s, f"updates/{name}": found["updates_per_s"] / per_s}
-    return found | {"compile_s": own.compile_s}
+        line |= {f"{name}_per_s": per_s, f"updates/{name}": line["updates_per_s"] / per_s}
+    return line | {"compile_s": ours.compile_s}
 
 
 def rows(key: Key, batch: int, obs_dim: int = OBS_DIM, act_dim: int = ACT_DIM) -> Transition:

@@ -2,12 +2,13 @@
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Protocol, TypedDict
+from typing import Any, Literal, NamedTuple, TypedDict
 
 from envs.files import Count
 from envs.types import UserError
+from experiments.runner.options import Impl
 from sgft_jax.files.folders import InUseError, in_use
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.io.runs import CONFIG, check_same, read_own
@@ -40,19 +41,20 @@ class _Summary(TypedDict, total=False):
     final: _Final
 
 
-class Limits(Protocol):
-    """Options of a command that works through cells.
+@dataclass(frozen=True)
+class WorkArgs:
+    """Options of a command that works through cells."""
 
-    together: cells that differ in their systems alone share a program. minutes: begin none after so many, None for no
-    limit. dry: only list them.
-    """
-
-    @property
-    def together(self) -> bool: ...  # noqa: D102
-    @property
-    def minutes(self) -> float | None: ...  # noqa: D102
-    @property
-    def dry(self) -> bool: ...  # noqa: D102
+    together: bool = True
+    """Step the systems of cells that differ in nothing else together; --no-together: one after another, in less memory
+    but more time."""
+    minutes: float | None = None
+    """Begin no new run after so many minutes."""
+    dry: bool = False
+    """Only list the runs and what is missing."""
+    impl: Impl = "auto"
+    out: Path = Path("runs")
+    """Parent of all run folders."""
 
 
 class Cell(NamedTuple):
@@ -65,6 +67,10 @@ class Cell(NamedTuple):
 
     def __str__(self) -> str:
         return self.kind.title(self.args)
+
+    def now(self) -> "Cell":
+        """The same cell as it is on disk by now."""
+        return look_up(self.kind, self.args)
 
     @property
     def folder(self) -> Path:
@@ -83,11 +89,10 @@ def look_up(kind: Kind, args: Any) -> Cell:
     if not (folder / CONFIG).exists():
         return Cell(kind, args, "missing", 0)
     summary = read_own(folder / SUMMARY, _Summary)
-    done = bool(summary) and kind.finished(args, summary)
     from sgft_jax.io import checkpoint
 
     last = checkpoint.latest(folder, say=lambda _: None) or 0
-    return Cell(kind, args, "finished" if done else "unfinished", last)
+    return Cell(kind, args, "finished" if summary and kind.finished(args, summary) else "unfinished", last)
 
 
 def check_begun(cells: Iterable[Cell]) -> None:
@@ -97,7 +102,24 @@ def check_begun(cells: Iterable[Cell]) -> None:
             check_same(cell.folder, cell.kind.name, cell.kind.config(cell.args), cell.kind.volatile)
 
 
-def complete(cells: Sequence[Cell], limits: Limits, *, started: float | None = None) -> list[str]:
+def work(cells: Sequence[Cell], args: WorkArgs, show: Callable[[list[Cell]], None] = lambda cells: None) -> None:
+    """Completes the cells, then shows them as they are by then, and in the end raises UserError for those that failed.
+
+    show: is not called where cells are only listed.
+    """
+    failed = complete(cells, args)
+    if not args.dry:
+        show([cell.now() for cell in cells])
+    refuse(failed, "cells")
+
+
+def refuse(failed: Sequence[str], noun: str) -> None:
+    """Raises UserError if some could not run. failed: as `complete` returns it."""
+    if failed:
+        raise UserError(f"{len(failed)} of the {noun} did not run: {'; '.join(failed)}")
+
+
+def complete(cells: Sequence[Cell], args: WorkArgs, *, started: float | None = None) -> list[str]:
     """Lists the cells, then runs those that are missing, in order; returns a line for each that could not run.
 
     Several processes may work on one grid: each skips cells that another has finished or is running.
@@ -106,17 +128,15 @@ def complete(cells: Sequence[Cell], limits: Limits, *, started: float | None = N
     started, failed = time.monotonic() if started is None else started, []
     for cell in cells:
         print(f"{cell.state:10} {cell}" + (f", step {cell.done}" if cell.done else ""))
-    if limits.dry:
-        return []
-    for batch in _batches(cells, together=limits.together):
-        if limits.minutes is not None and time.monotonic() - started > 60 * limits.minutes:
-            print(f"stopped after {limits.minutes:g} minutes; the same command goes on")
+    for batch in [] if args.dry else _batches(cells, args):
+        if args.minutes is not None and time.monotonic() - started > 60 * args.minutes:
+            print(f"stopped after {args.minutes:g} minutes; the same command goes on")
             break
-        now = [look_up(cell.kind, cell.args) for cell in batch]  # others may have got further since
-        theirs = [cell for cell in now if in_use(cell.folder)]
-        for cell in theirs:
+        now = [cell.now() for cell in batch]  # others may have got further since
+        taken = [cell for cell in now if in_use(cell.folder)]
+        for cell in taken:
             _leave(cell)
-        for group in _batches([cell for cell in now if cell not in theirs], together=limits.together):
+        for group in _batches([cell for cell in now if cell not in taken], args):
             failed += _run(group)
     return failed
 
@@ -130,11 +150,11 @@ def _with(cell: Cell, systems: tuple[str, ...], **changes: Any) -> Any:
     return replace(cell.args, **{cell.kind.systems: systems}, **changes)
 
 
-def _batches(cells: Sequence[Cell], *, together: bool) -> list[list[Cell]]:
+def _batches(cells: Sequence[Cell], args: WorkArgs) -> list[list[Cell]]:
     """The cells that are not finished, in their order; those that one call can do follow their first one."""
     batches: dict[Any, list[Cell]] = {}
     for cell in [cell for cell in cells if cell.state != "finished"]:
-        key = _with(cell, ()) if together else cell.args
+        key = _with(cell, ()) if args.together else cell.args
         batches.setdefault((key, cell.state, cell.done), []).append(cell)
     return list(batches.values())
 
@@ -147,13 +167,12 @@ def _run(batch: Sequence[Cell]) -> list[str]:
     try:
         first.kind.run(_with(first, systems, resume=first.state == "unfinished"))
     except UserError as error:
-        if len(batch) > 1:
-            print(f"error: {error}")
-            # The others may have what one of them lacks; how far each has got is looked up again.
-            return [line for cell in batch for line in _run([look_up(cell.kind, cell.args)])]
-        if isinstance(error, InUseError):
+        if len(batch) == 1 and isinstance(error, InUseError):
             _leave(first)
             return []
         print(f"error: {error}")
-        return [f"{first}: {error}"]
+        if len(batch) == 1:
+            return [f"{first}: {error}"]
+        # The others may have what one of them lacks; how far each has got is looked up again.
+        return [line for cell in batch for line in _run([cell.now()])]
     return []

@@ -206,11 +206,17 @@ def parse[T](
     config_type: type[T], description: str, argv: Sequence[str] | None = None, *, default: T | None = None
 ) -> T:
     """A frozen dataclass from the command line; raises UserError for a bad one."""
-    spec = getattr(sys.modules["__main__"], "__spec__", None)
-    prog = f"python -m {spec.name}" if spec else None
     words = list(sys.argv[1:] if argv is None else argv)
     with _errors.on_parse_error(lambda event: _refuse(event, words, config_type, default)):
-        return cast(T, tyro.cli(config_type, prog=prog, description=description, args=words, default=default))
+        return cast(T, tyro.cli(config_type, prog=_program(), description=description, args=words, default=default))
+
+
+def _program() -> str | None:
+    """What a user types before the options: `sgft NAME` where that script was started; None for tyro's own guess."""
+    if (spec := getattr(sys.modules["__main__"], "__spec__", None)) is None:
+        return None
+    by_script = any(Path(word).stem == "sgft" for word in sys.orig_argv[1:3])  # the second one behind an option
+    return f"sgft {spec.name.rpartition('.')[2]}" if by_script else f"python -m {spec.name}"
 
 
 def preview(argv: Sequence[str], **defaults: Any) -> SimpleNamespace:

@@ -22,20 +22,19 @@ from experiments.runner.options import seed_list
 from sgft_jax.datasets import acceptance, logs
 from sgft_jax.datasets.recording import Joints, Noted, Recorded, cut, of_episodes, of_fleet, write_d4rl, write_minari
 from sgft_jax.files.jsonfile import write_json
-from sgft_jax.hybrid import trainer
-from sgft_jax.hybrid.schedule import Schedule
-from sgft_jax.hybrid.trainer import HybridState
 from sgft_jax.io import runs
 from sgft_jax.io.priors import load_prior, observed_by
 from sgft_jax.io.progress import RunProgress
+from sgft_jax.keys import FromLog, seed_keys
 from sgft_jax.methods import get_method
 from sgft_jax.policies import make_policy
 from sgft_jax.stacking import member
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.train.pretraining import seed_keys
+from sgft_jax.train import hybrid
+from sgft_jax.train.fleet import FleetState
+from sgft_jax.train.schedule import Schedule
 from sgft_jax.types import HybridAgent
 
-_TRAINING, _LEVEL, _RECORDING = 21, 22, 23  # purposes, folded into a seed's key
 _AT_ONCE = 50  # episodes of one recording call
 
 
@@ -46,10 +45,8 @@ def teach(args: CollectArgs, level: float) -> list[dict[str, Any]]:
     agent, schedule = method.build(method.config, env), _schedule(args)
     seeds = seed_list(args.seed, args.seeds)
     pools = jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), system.pools)
-    steps = trainer.train(
-        env, agent, schedule, pools, trainer.no_data(env), seed_keys(seeds, _TRAINING), gamma=method.config.gamma,
-        note=functools.partial(_note, agent),
-    )  # fmt: skip
+    keys, note = seed_keys(seeds, FromLog.COLLECTION), functools.partial(_note, agent)
+    steps = hybrid.train(env, agent, schedule, pools, hybrid.no_data(env), keys, gamma=method.config.gamma, note=note)
     reached: dict[int, tuple[PyTree, Transition, Noted]] = {}
     with RunProgress(f"SAC on {env.name}", total=schedule.chunks * args.eval_every, unit="updates") as progress:
         for state, metrics in steps:
@@ -99,10 +96,10 @@ def _schedule(args: CollectArgs) -> Schedule:
     return Schedule(args.updates, args.environments, buffer=room, chunk_updates=args.eval_every)
 
 
-def _level(args: CollectArgs, agent: HybridAgent, system: Simulated, state: HybridState) -> np.ndarray:
+def _level(args: CollectArgs, agent: HybridAgent, system: Simulated, state: FleetState) -> np.ndarray:
     """Mean return [seeds] of the exploring policies."""
     params = jax.jit(jax.vmap(agent.export))(state.learner)
-    played = _episodes(system, agent.policy, params, jax.random.key(_LEVEL), args.eval_episodes)
+    played = _episodes(system, agent.policy, params, jax.random.key(FromLog.LEVEL), args.eval_episodes)
     return np.asarray(counted(played)[1]).mean(axis=1)
 
 
@@ -136,10 +133,10 @@ def _noted(policy: Policy, params: PyTree, played: Episode) -> Noted:
     return Noted(before, after, log_prob)
 
 
-def _snapshot(agent: HybridAgent, state: HybridState, i: int) -> tuple[PyTree, Transition, Noted]:
+def _snapshot(agent: HybridAgent, state: FleetState, i: int) -> tuple[PyTree, Transition, Noted]:
     """The policy of a seed and all that it has experienced, on the host."""
-    held = int(state.simulated.size[i])
-    kept = state.simulated.data, state.notes.data
+    held = int(state.replay.size[i])
+    kept = state.replay.data, state.notes.data
     rows, noted = jax.tree.map(lambda x: np.asarray(x[i, :held]), kept)
     return jax.tree.map(np.asarray, agent.export(member(state.learner, i))), rows, noted
 
@@ -148,7 +145,7 @@ def _play(args: CollectArgs, env: Env, system: Simulated, policy: Policy, params
     """Exploring episodes of one policy, until there are transitions enough."""
     alone = system.moved(system.pools, jnp.zeros(1, jnp.int32))
     params = jax.tree.map(lambda x: jnp.asarray(x)[None], params)
-    key, found, held = jax.random.fold_in(jax.random.key(seed), _RECORDING), [], 0
+    key, found, held = jax.random.fold_in(jax.random.key(seed), FromLog.RECORDING), [], 0
     wanted = transitions_of(args)
     at_once = min(_AT_ONCE, math.ceil(wanted / env.episode_length))
     while held < wanted:

@@ -14,14 +14,14 @@ from envs.base import Env
 from envs.gaps import SIM, Gap
 from envs.rollout import Episode
 from envs.types import Transition, UserError
-from experiments.diagnose import DiagnoseArgs
 from experiments.runner.cli import columns
+from experiments.runner.diagnose_args import DiagnoseArgs
 from experiments.runner.gaps_run import systems
 from experiments.runner.real_systems import connect, is_robot, is_stepped, title
 from experiments.runner.recorded import RecordedSystem
 from sgft_jax import api, stacking
 from sgft_jax.analysis import figures, prediction, tables, verdict
-from sgft_jax.analysis.curves import last_start
+from sgft_jax.analysis.reading import last_start
 from sgft_jax.analysis.verdict import Names
 from sgft_jax.diagnosis import Rollouts
 from sgft_jax.examination import Examined, Examiner

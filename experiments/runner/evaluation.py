@@ -12,7 +12,8 @@ from envs.rollout import Episode, counted
 from envs.types import Array, Key, Policy, PyTree
 from sgft_jax.math import stats
 from sgft_jax.systems import System
-from sgft_jax.train.pretraining import Best, keep_better
+from sgft_jax.train import evidence
+from sgft_jax.train.evidence import Best
 from sgft_jax.types import Metrics
 
 
@@ -53,16 +54,13 @@ def describe(played: Episode) -> dict[str, Any]:
     }
 
 
-def best_of(best: Best | None, params: PyTree, played: Episode, steps: Array, *, since: float = 0.0) -> Best:
-    """The best [M] of an earlier evaluation, if there was one, and of this one, by the task's score, then by return.
+def best_of(best: Best | None, params: PyTree, played: Episode, age: Array, *, since: float = 0) -> Best:
+    """The best [M] of an earlier evaluation, if there was one, and of this one of `params` [M, ...]; see `Best`.
 
-    params: [M, ...] what was evaluated, which may be donated afterwards. steps: [M]. since: see `keep_better`.
+    params may be donated afterwards. age: [M]. since: see `evidence.evaluated`.
     """
-    known = counted(played)
-    score, total = (jnp.asarray(x.mean(-1), jnp.float32) for x in known)
-    worst = jnp.stack([jnp.asarray(x.min(-1), jnp.float32) for x in known], axis=-1)
-    now = Best(params, score, total, steps, jnp.asarray(played.exploded.mean(-1), jnp.float32), worst)
-    return jax.tree.map(jnp.copy, now) if best is None else _keep_better(best, now, since)
+    best = evidence.nothing_known(params, *played.exploded.shape) if best is None else best
+    return _evaluated(best, params, played.score, played.total_reward, played.exploded, age, since)
 
 
-_keep_better: Callable[..., Best] = jax.jit(jax.vmap(keep_better, (0, 0, None)))
+_evaluated: Callable[..., Best] = jax.jit(evidence.evaluated)

@@ -12,16 +12,16 @@ from envs.base import Env, World
 from envs.gaps import Gap
 from envs.rollout import Episode
 from envs.types import PyTree
+from experiments.runner.training import Record
 from experiments.runner.video import before_and_after
 from sgft_jax.analysis import figures, tables
-from sgft_jax.analysis.curves import Curve, deepest_fall, describe, read_curve
-from sgft_jax.io import checkpoint
-from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
-from sgft_jax.io.priors import save_prior
+from sgft_jax.analysis.curves import Curve, deepest_fall, describe
+from sgft_jax.analysis.reading import read_curve
+from sgft_jax.io.log import EVAL, check_finite, read_jsonl, write_summary
 from sgft_jax.io.real import RealStore
 from sgft_jax.stacking import member
 from sgft_jax.train.finetuning import FinetuneProgress
-from sgft_jax.types import Metrics, Prior
+from sgft_jax.types import Metrics
 
 EVALUATION = "evaluation"  # the folder of episodes that evaluations on a real system have cost
 
@@ -31,8 +31,8 @@ def evaluation_store(folder: Path, done: int) -> RealStore:
     return RealStore(folder / EVALUATION / f"rollouts-{done:06d}")
 
 
-class Record:
-    """The files of one run folder (docs/formats.md). Arrays and states have a leading axis of the seeds [S].
+class FinetuneRecord(Record):
+    """The files of a run on one real system.
 
     real_evaluations: whether evaluations are played on the real system and cost transitions; simulated ones are free.
     logged: real transitions that every seed began with and nobody has played here.
@@ -49,30 +49,16 @@ class Record:
         real_evaluations: bool = False,
         logged: int = 0,
     ) -> None:
+        super().__init__(folder, {"kind": "finetune", "task": env.name, "method": method, "seeds": seeds})
         self.logged, self.real_evaluations = logged, real_evaluations
         self.played = self.evaluated = np.zeros(len(seeds), int)  # [S] real transitions of rollouts, of evaluations
-        self.folder, self.env, self.gap, self.method, self.seeds = folder, env, gap, method, seeds
-        self.log, self.real = MetricsLog(folder), RealStore(folder)
-        self.last_good: Path | None = None  # the checkpoint to go back to when training diverges
-        self.expect = {"kind": "finetune", "task": env.name, "method": method, "seeds": seeds}
+        self.env, self.gap, self.method, self.real = env, gap, method, RealStore(folder)
 
-    def latest(self) -> int | None:
-        """The step of the last whole checkpoint: parts of the offline phase and rollouts together; None without any."""
-        return checkpoint.latest(self.folder, whole=True)
-
-    def restore(self, like: FinetuneProgress, step: int) -> FinetuneProgress:
-        """The state of that checkpoint of `latest`, to which the logs are cut back. What the robot did stays."""
-        progress, meta = checkpoint.restore(self.folder, like, step=step, checked=True, expect=self.expect)
-        self.log.truncate(meta["position"])
+    def restore(self, like: FinetuneProgress, step: int) -> tuple[FinetuneProgress, dict[str, Any]]:
+        """The state of a checkpoint, to which the logs are cut back. What the robot did stays."""
+        progress, meta = super().restore(like, step)
         self.played, self.evaluated = np.asarray(progress.transitions), np.asarray(meta["evaluated"])
-        self.last_good = checkpoint.path(self.folder, step)
-        return progress
-
-    def checkpoint(self, progress: FinetuneProgress, step: int) -> None:
-        """The state, and how long the logs are. step: parts of the offline phase and rollouts behind it."""
-        counts = {"rollouts": int(progress.rollouts), "evaluated": self.evaluated.tolist()}
-        meta = {**self.expect, **counts, "position": self.log.position()}
-        self.last_good = checkpoint.save(self.folder, step, progress, meta=meta)
+        return progress, meta
 
     def metrics(self, done: int, values: Mapping[str, np.ndarray]) -> None:
         """A line of one learning phase; raises DivergedError where a number is not finite though something learned."""
@@ -95,13 +81,11 @@ class Record:
         with open(self.folder / "timing.jsonl", "a") as file:
             file.write(json.dumps({"rollouts": done, "time/rollout_s": round(seconds, 3)}) + "\n")
 
-    def save_policies(self, kind: str, params: PyTree, card: Mapping[str, Any]) -> None:
-        """Policies [S] in the form of priors: <kind>/seed-<k>. kind: `policy`, the last ones, or `best`."""
-        own = {"task": self.env.name, "obs_dim": self.env.obs_dim, "act_dim": self.env.act_dim}
-        for i, seed in enumerate(self.seeds):
-            facts = {"method": self.method, "gap": self.gap._asdict(), "seed": seed, "which": kind}
-            prior = Prior(member(params, i), {**card, **own, "finetuned": facts})
-            save_prior(self.folder / kind / f"seed-{seed}", prior)
+    def save(self, kind: str, params: PyTree, card: Mapping[str, Any]) -> None:
+        """Policies [S], `policy` (the last ones) or `best`, whose cards add to `card`."""
+        env = {"task": self.env.name, "obs_dim": self.env.obs_dim, "act_dim": self.env.act_dim}
+        facts = {"method": self.method, "gap": self.gap._asdict(), "which": kind}
+        self.save_policies(kind, params, lambda seed: {**card, **env, "finetuned": {**facts, "seed": seed}})
 
     def summarise(self, done: int, best: Mapping[str, np.ndarray]) -> dict[str, Any]:
         """summary.json, the learning curve and the closing words; the log ends here.
@@ -134,15 +118,15 @@ class Record:
         chosen = "" if best is None else f"; best policy by the training rollouts {tables.plain(best.mean(), score)}"
         print(
             f"{self.gap.name}: {tables.words(score)} on the real system {before} before -> {after} after "
-            f"{curve.rollouts[-1]} rollouts; deepest fall below the start {tables.plain(deepest_fall(curve), score)}"
+            f"{curve.x[-1]} rollouts; deepest fall below the start {tables.plain(deepest_fall(curve), score)}"
             f"{chosen}"
         )
 
     def _real_steps(self) -> list[int]:
         """[S] all steps of the real system that are on disk, those of evaluations included."""
         stores = [self.real, *(RealStore(folder) for folder in sorted((self.folder / EVALUATION).glob("*")))]
-        each = [store.rollout(i)["valid"].sum(1) for store in stores for i in range(len(store))]
-        return np.sum(each, axis=0).tolist()
+        steps = [store.rollout(i)["valid"].sum(1) for store in stores for i in range(len(store))]
+        return np.sum(steps, axis=0).tolist()
 
     def film(self, pool: World, play: Callable[[], Sequence[Episode]], rollouts: int) -> str:
         """An evaluation episode of the first seed before and after fine-tuning; says in one line how it went.

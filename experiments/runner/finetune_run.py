@@ -3,8 +3,7 @@
 import contextlib
 import dataclasses
 import functools
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,20 +14,18 @@ import envs
 from envs import mesh
 from envs.base import Env
 from envs.rollout import Episode
-from envs.types import PyTree, UserError
 from experiments.runner import cli, logged, real_systems
 from experiments.runner.evaluation import scores
 from experiments.runner.finetune_args import VOLATILE, FinetuneArgs, run_folder
-from experiments.runner.finetune_record import Record, evaluation_store
+from experiments.runner.finetune_record import FinetuneRecord, evaluation_store
 from experiments.runner.memory import reserve
 from experiments.runner.recorded import RecordedSystem
+from experiments.runner.training import Training, opened
 from sgft_jax import api
 from sgft_jax.api import Setup
 from sgft_jax.datasets.logs import Log
 from sgft_jax.files.jsonfile import jsonable
-from sgft_jax.io import runs
 from sgft_jax.io.priors import digest, load_priors, observed_by
-from sgft_jax.io.progress import RunProgress
 from sgft_jax.methods import get_method
 from sgft_jax.stacking import join, part
 from sgft_jax.systems import KnownSystem, System
@@ -36,7 +33,7 @@ from sgft_jax.train import finetuning
 from sgft_jax.train.finetuning import FinetuneProgress, Logged
 from sgft_jax.train.learner_process import LearnerProcess
 from sgft_jax.train.options import card_of
-from sgft_jax.types import Finetuner, Metrics, Online, Prior
+from sgft_jax.types import Finetuner, Online, Prior
 
 
 def run(args: FinetuneArgs, method: Online, seeds: list[int], folders: list[Path]) -> list[dict[str, Any]]:
@@ -45,7 +42,7 @@ def run(args: FinetuneArgs, method: Online, seeds: list[int], folders: list[Path
     devices = mesh.devices(args.devices, sizes)
     env = envs.make(args.task, args.impl, **observed_by(folders))
     _reserve(args, env, len(folders), devices)
-    found = [real_systems.described(env, name, args.set) for name in args.real]
+    systems = [real_systems.described(env, name, args.set) for name in args.real]
     priors = load_priors(folders, env)
     for prior in priors:
         api.check_prior(prior, method, env)
@@ -57,7 +54,7 @@ def run(args: FinetuneArgs, method: Online, seeds: list[int], folders: list[Path
     homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in named}
     with contextlib.ExitStack() as last:
         last.enter_context(mesh.use(devices))
-        playing, members, stepped = found, seeds, real_systems.is_stepped(args.real[0])
+        playing, members, stepped = systems, seeds, real_systems.is_stepped(args.real[0])
         if stepped:
             playing = real_systems.connect(
                 env, args.real, args.set, members=len(seeds), gamma=card["gamma"], home=args.out
@@ -67,23 +64,18 @@ def run(args: FinetuneArgs, method: Online, seeds: list[int], folders: list[Path
         setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
         assert isinstance(setup.system, KnownSystem)
         # Last: what is wrong with a robot or with a method of the user's own leaves no folder behind.
-        opened = runs.open_runs(
-            homes, kind="finetune", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE,
-            inputs={
-                "priors": [digest(prior) for prior in priors],
-                "real_data": [log.facts.sha256[:12] for log in logs],
-                "successors": [log.facts.successors for log in logs],
-            },
-        )  # fmt: skip
-        for own in opened:
-            last.callback(own.close)
+        inputs = {
+            "priors": [digest(prior) for prior in priors],
+            "real_data": [log.facts.sha256[:12] for log in logs],
+            "successors": [log.facts.successors for log in logs],
+        }
+        options = {"resume": args.resume, "overwrite": args.overwrite, "volatile": VOLATILE, "inputs": inputs}
+        folders_of_runs = last.enter_context(opened(homes, kind="finetune", **options))
+        record = functools.partial(FinetuneRecord, real_evaluations=stepped, logged=logged.transitions(logs))
         records = [
-            Record(
-                own.folder, setup.system.env, gap, method.name, seeds, real_evaluations=stepped,
-                logged=logged.transitions(logs),
-            )
-            for own, gap in zip(opened, found, strict=True)
-        ]  # fmt: skip
+            record(folder, setup.system.env, gap, method.name, seeds)
+            for folder, gap in zip(folders_of_runs, systems, strict=True)
+        ]
         learner = None
         if real_systems.is_robot(args.real[0]):
             which = finetuning.prior_of(setup.priors, setup.seeds)
@@ -129,12 +121,14 @@ def due(args: FinetuneArgs, every: int, before: int, done: int) -> bool:
     return before == 0 or done >= args.rollouts or done % every == 0
 
 
-class _Run:
-    """What happens between compiled calls, on disk before in memory.
+class _Run(Training):
+    """A run on all its real systems.
 
-    The real systems are played together, because physics takes as long as its longest chain of steps and hardly longer
-    for more worlds. Members [M = G * S] are the seeds of the first real system, then those of the next.
+    They are played together, because physics takes as long as its longest chain of steps and hardly longer for more
+    worlds. Members [M = G * S] are the seeds of the first real system, then those of the next.
     """
+
+    unit = "rollouts"
 
     def __init__(
         self,
@@ -142,27 +136,30 @@ class _Run:
         setup: Setup,
         system: KnownSystem,
         card: dict[str, Any],
-        records: list[Record],
+        records: list[FinetuneRecord],
         logs: list[Log],
         learner: LearnerProcess | None,
     ) -> None:
+        names = "+".join(record.gap.name for record in records)
+        super().__init__(records, f"{records[0].method} on {system.env.name}/{names}", args.rollouts)
         self.logs, self.learner, self.sync_every = logs, learner, args.sync_every if learner else None
-        self.args, self.setup, self.card, self.records = args, setup, card, records
+        self.args, self.setup, self.card = args, setup, card
         self.finetuner, self.system, self.seeds = setup.finetuner, system, setup.seeds
-        self.count, self.episodes = len(setup.seeds) // len(records), args.eval_episodes or 0
+        self.episodes = args.eval_episodes or 0
         self.begin = functools.partial(finetuning.begin, setup.finetuner, setup.priors, setup.seeds, setup.simulated)
 
     def work(self) -> list[dict[str, Any]]:
         """Everything, in order; returns the summaries."""
-        progress = self._restore()
-        done = int(progress.rollouts) if progress else 0
+        restored = self.restore(lambda: jax.eval_shape(lambda: _part(self.begin(), 0, self.count)))
+        progress = _join([progress for progress, _ in restored]) if restored else None
+        done = self.done(progress) if progress else 0
         stores = [record.real for record in self.records]
         recorded = RecordedSystem(self.system, stores, done=done, sync_every=self.sync_every)
         steps = finetuning.finetune(
             *self.setup._replace(system=recorded), rollouts=self.args.rollouts, progress=progress, learner=self.learner,
             waits=self.args.hand_over == "rollouts", logged=self._logged(),
         )  # fmt: skip
-        return self._finish(self._follow(steps, progress))
+        return self._finish(self.follow(steps, done))
 
     def _logged(self) -> Logged | None:
         """What the logs are for the members, None without logs."""
@@ -171,71 +168,43 @@ class _Run:
         capacity, updates = self.args.options.replay_capacity, self.args.real_updates
         return logged.begin_with(self.logs, self.finetuner, self.system.env, capacity=capacity, updates=updates)
 
-    def _restore(self) -> FinetuneProgress | None:
-        """The state after the last checkpoint, None for a fresh start; raises UserError where real systems differ."""
-        steps = [record.latest() for record in self.records]
-        if len(set(steps)) > 1:
-            listed = ", ".join(f"{own.folder} is at step {n or 0}" for own, n in zip(self.records, steps, strict=True))
-            raise UserError(f"{listed}: they cannot go on together, resume them one at a time")
-        if steps[0] is None:
-            for record in self.records:
-                record.log.truncate({})
-            return None
-        like = jax.eval_shape(lambda: _part(self.begin(), 0, self.count))
-        return _join([record.restore(like, step) for record, step in zip(self.records, steps, strict=True) if step])
+    # ------------------------------------------------------------ between rollouts
 
-    def _follow(self, steps: Iterator[tuple[FinetuneProgress, Metrics]], progress: Any) -> FinetuneProgress:
-        """Logs, evaluates and checkpoints what the iterator yields; returns its last state."""
-        done, started = int(progress.rollouts) if progress else 0, time.perf_counter()
-        systems = "+".join(record.gap.name for record in self.records)
-        title = f"{self.records[0].method} on {self.system.env.name}/{systems}"
-        bar = RunProgress(title, total=self.args.rollouts, unit="rollouts", done=done)
-        with bar:
-            for progress, metrics in steps:
-                before, done = done, int(progress.rollouts)
-                for record, transitions in self._each(np.asarray(progress.transitions)):
-                    record.played = transitions
-                values = {name: np.asarray(x) for name, x in metrics.items()}
-                shown = self._log(done, values, time.perf_counter() - started)
-                if done == before and values:  # a part of the offline phase
-                    self._checkpoint(progress)
-                elif self.episodes and evaluates(self.args, before, done):
-                    shown[f"{self.system.env.score}, evaluation"] = self._evaluate(progress, done)
-                if done and due(self.args, self.args.checkpoint_every, before, done):
-                    self._checkpoint(progress)
-                bar.advance(done - before, shown)
-                started = time.perf_counter()
-        return progress
+    def done(self, state: FinetuneProgress) -> int:
+        return int(state.rollouts)
 
-    def _log(self, done: int, values: Mapping[str, np.ndarray], seconds: float) -> dict[str, float]:
-        """Writes a line of metrics for each real system; returns what the progress bar shows."""
-        if not values:
-            return {}
-        for record, own in self._each(values):
-            record.metrics(done, own)
+    def log(self, state: FinetuneProgress, values: dict[str, np.ndarray], seconds: float) -> dict[str, float]:
+        done = self.done(state)
+        for record, (metrics, transitions) in self.each((values, np.asarray(state.transitions))):
+            record.played = transitions
+            record.metrics(done, metrics)
             record.time(done, seconds)
         real = values.get("real/score")
         return {} if real is None else {f"{self.system.env.score}, exploring": float(real.mean())}
 
-    def _evaluate(self, progress: FinetuneProgress, done: int) -> float:
+    def evaluates(self, before: int, done: int, *, learned: bool) -> bool:
+        offline = learned and done == before  # a part of the offline phase
+        return bool(self.episodes) and not offline and evaluates(self.args, before, done)
+
+    def evaluate(self, state: FinetuneProgress, done: int) -> dict[str, float]:
         system: System = self.system
         if self.system.pools is None:  # its episodes are real ones, and as dear as those of training
             stores = [evaluation_store(record.folder, done) for record in self.records]
             system = RecordedSystem(system, stores, done=0, explore=False, sync_every=self.sync_every)
-        played = finetuning.evaluate(self.finetuner, system, progress.agent, self.seeds, self.episodes)
-        found = scores(played, progress.best.worst)
-        for record, (own, cost) in self._each((found, np.asarray(played.valid.sum((1, 2))))):
-            record.evaluation(done, own, cost)
-        return float(found["score"].mean())
+        played = finetuning.evaluate(self.finetuner, system, state.agent, self.seeds, self.episodes)
+        values = scores(played, state.best.worst)
+        for record, (score, cost) in self.each((values, np.asarray(played.valid.sum((1, 2))))):
+            record.evaluation(done, score, cost)
+        return {f"{self.system.env.score}, evaluation": float(values["score"].mean())}
 
-    def _checkpoint(self, progress: FinetuneProgress) -> None:
-        step = int(progress.rollouts) + finetuning.offline_parts(self.finetuner, int(progress.offline))
+    def checkpoints(self, before: int, done: int, *, learned: bool) -> bool:
+        offline = learned and done == before
+        return offline or (done > 0 and due(self.args, self.args.checkpoint_every, before, done))
+
+    def checkpoint(self, state: FinetuneProgress, done: int) -> None:
+        step = done + finetuning.offline_parts(self.finetuner, int(state.offline))
         for i, record in enumerate(self.records):
-            record.checkpoint(_part(progress, i, self.count), step)
-
-    def _each(self, members: PyTree) -> Iterator[tuple[Record, PyTree]]:
-        """Every real system's record and, [S], what belongs to it in a pytree over all members."""
-        return ((record, part(members, i, self.count)) for i, record in enumerate(self.records))
+            record.checkpoint(_part(state, i, self.count), step, rollouts=done, evaluated=record.evaluated.tolist())
 
     # ------------------------------------------------------------ what stays
 
@@ -244,7 +213,7 @@ class _Run:
         best = progress.best
         card = {**self.card, "plan": None, **self.finetuner.card}  # the prior may be one that plans
         last = jax.jit(jax.vmap(self.finetuner.export))(progress.agent)
-        facts = {"evidence": best.score, "rollouts": best.rollouts}
+        facts = {"evidence": best.score, "rollouts": best.age}
         n = self.episodes
         if n and self.system.pools is not None:
             played = finetuning.evaluate(self.finetuner.policy, self.system, best.params, self.seeds, n)
@@ -253,8 +222,8 @@ class _Run:
         summaries = []
         for i, record in enumerate(self.records):
             own = lambda tree, i=i: part(tree, i, self.count)  # noqa: E731
-            record.save_policies("policy", own(last), card)
-            record.save_policies("best", own(best.params), card)
+            record.save("policy", own(last), card)
+            record.save("best", own(best.params), card)
             rollouts, chosen = int(progress.rollouts), {name: np.asarray(own(x)) for name, x in facts.items()}
             summaries.append(record.summarise(rollouts, chosen))
             if self.args.video and n and self.system.pools is not None:

@@ -15,9 +15,9 @@ from envs.gaps import Gap
 from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
 from envs.types import Key, PyTree
-from experiments.gaps import GapsArgs
 from experiments.runner.cli import columns
 from experiments.runner.evaluation import best_of, describe, play, scores
+from experiments.runner.gaps_args import GapsArgs
 from experiments.runner.memory import reserve
 from sgft_jax import stacking
 from sgft_jax.analysis import tables
@@ -153,7 +153,7 @@ def train(
                 params = exported(seen, config, state)
                 played = play(heldout, policy, params, episode_key(_HELDOUT_SEED), config.eval_episodes)
                 log.eval(done * size, scores(played))
-                best = best_of(best, params, played, state.steps)
+                best = best_of(best, params, played, state.rounds)
                 shown["success"] = float(played.success.mean())
             progress.advance(size, shown)
     log.close()

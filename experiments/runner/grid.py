@@ -1,24 +1,33 @@
 """A grid of fine-tuning runs: its options, its cells and how far each has got."""
 
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
 
 import envs
 from envs import extend, gaps
 from envs.types import UserError
 from experiments.finetune import finetune
 from experiments.runner import cells
-from experiments.runner.cells import Cell, Kind
-from experiments.runner.finetune_args import VOLATILE, FinetuneArgs, arguments, label, resolved, run_folder
-from experiments.runner.options import Impl, at_least_one, check_task, not_negative, seed_list, without_repeats
+from experiments.runner.cells import Cell, Kind, WorkArgs
+from experiments.runner.finetune_args import (
+    VOLATILE,
+    FinetuneArgs,
+    arguments,
+    label,
+    resolved,
+    run_folder,
+    with_settings,
+)
+from experiments.runner.options import at_least_one, check_task, not_negative, seed_list, without_repeats
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import NAMES, get_method
 
 
 @dataclass(frozen=True)
-class GridArgs:
-    """A grid of fine-tuning runs; everything not named here is as `experiments.finetune` has it."""
+class _Systems:
+    """What the cells are of."""
 
     tasks: tuple[str, ...] = tuple(task for task in envs.TASKS if "default" in gaps.presets(task))
     """Tasks, by default all that have a real system called default."""
@@ -35,18 +44,13 @@ class GridArgs:
     """Real rollouts per seed, the initial ones included; may grow later."""
     eval_every: int = 5
     """Rollouts between evaluations."""
-    together: bool = True
-    """Step the real systems of a task together; --no-together: one after another, in less memory but more time."""
-    minutes: float | None = None
-    """Begin no new run after so many minutes."""
-    dry: bool = False
-    """Only list the runs and what is missing."""
-    impl: Impl = "auto"
-    """Physics engine, as in fine-tuning."""
     devices: int | None = None
     """Devices that share the seeds; 0: all there are; default: one."""
-    out: Path = Path("runs")
-    """Parent of all run folders."""
+
+
+@dataclass(frozen=True)
+class GridArgs(WorkArgs, _Systems):  # this order puts the fields of the latter first
+    """A grid of fine-tuning runs; everything not named here is as `experiments.finetune` has it."""
 
 
 def check(args: GridArgs) -> None:
@@ -65,14 +69,6 @@ def check(args: GridArgs) -> None:
     check_folder(args.out)
 
 
-def run_of(args: GridArgs, task: str, real: str, method: str) -> FinetuneArgs:
-    """The run of one cell, with the method's own defaults."""
-    return arguments(
-        method, task=task, real=(real,), seed=args.seed, seeds=args.seeds, rollouts=args.rollouts,
-        eval_every=args.eval_every, impl=args.impl, devices=args.devices, video=False, out=args.out,
-    )  # fmt: skip
-
-
 FINETUNING = Kind(
     name="finetune",
     systems="real",
@@ -83,6 +79,23 @@ FINETUNING = Kind(
     volatile=VOLATILE,
     finished=lambda args, summary: summary.get("final", {}).get("rollouts", 0) >= args.rollouts,
 )
+
+
+def cell_of(
+    args: GridArgs, task: str, real: str, method: str, settings: Mapping[str, Any] | None = None, **changes: Any
+) -> Cell:
+    """The run of one cell, and how far it has got.
+
+    It has the method's own defaults but for `settings`, the options of the grid, and these `changes` of its arguments.
+    """
+    return look_up(with_settings(replace(run_of(args, task, real, method), **changes), settings or {}))
+
+
+def run_of(args: GridArgs, task: str, real: str, method: str) -> FinetuneArgs:
+    """The arguments of one cell, with the method's own defaults."""
+    shared = ("seed", "seeds", "rollouts", "eval_every", "impl", "devices", "out")
+    given = {name: getattr(args, name) for name in shared}
+    return arguments(method, task=task, real=(real,), video=False, **given)
 
 
 def look_up(run: FinetuneArgs) -> Cell:

@@ -23,13 +23,12 @@ from experiments.runner.options import (
     seeds_name,
     without_repeats,
 )
-from sgft_jax.hybrid.schedule import FLEET, Schedule
-from sgft_jax.io.runs import check_start
+from sgft_jax.io.runs import NO_DATA, NO_SIMULATOR, check_start
 from sgft_jax.methods import get_method
+from sgft_jax.train.schedule import FLEET, Schedule
 from sgft_jax.types import Fixed
 
-DEFAULT, NO_DATA = "h2oplus", "no-data"
-NO_SIMULATOR = "no-simulator"
+DEFAULT = "h2oplus"
 # These may differ when a run goes on. What is in the data may not, nor what a schedule has, whatever it is called.
 VOLATILE = ("resume", "overwrite", "out", "video", "data", "schedule_preset")
 

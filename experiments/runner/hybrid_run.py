@@ -1,10 +1,9 @@
-"""Impure: a run of `sgft_jax.hybrid.trainer` with data, folders, checkpoints, logs and evaluations around it."""
+"""Impure: a run of `sgft_jax.train.hybrid` with data, folders, checkpoints, logs and evaluations around it."""
 
 import functools
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,52 +15,46 @@ from envs.base import Env, World
 from envs.gaps import SIM, Gap
 from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
-from envs.types import PyTree, UserError
+from envs.scales import normalised
+from envs.types import Key
 from experiments.runner import logged
 from experiments.runner.evaluation import play, scores
-from experiments.runner.hybrid_args import NO_SIMULATOR, VOLATILE, HybridArgs, data_name, gaps_of, run_folder
+from experiments.runner.hybrid_args import VOLATILE, HybridArgs, gaps_of, run_folder
 from experiments.runner.memory import reserve
+from experiments.runner.training import Record, Training, opened
 from experiments.runner.video import film_episode
 from sgft_jax.analysis import figures
-from sgft_jax.analysis.hybrid import Results, outcome
+from sgft_jax.analysis.reading import read_curve
 from sgft_jax.datasets import logs
 from sgft_jax.files.jsonfile import jsonable
-from sgft_jax.hybrid import trainer
-from sgft_jax.hybrid.robot import MEASURES
-from sgft_jax.hybrid.scores import LATE, late, measures, normalised
-from sgft_jax.hybrid.trainer import HybridState
-from sgft_jax.io import checkpoint, runs
-from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
-from sgft_jax.io.priors import save_prior
-from sgft_jax.io.progress import RunProgress
+from sgft_jax.hybrid.scores import LATE, late, measures
+from sgft_jax.io import runs
+from sgft_jax.io.log import EVAL, read_jsonl, write_summary
+from sgft_jax.io.runs import NO_SIMULATOR
+from sgft_jax.keys import FromLog, seed_keys
 from sgft_jax.math.stats import bootstrap_interval, mean
-from sgft_jax.stacking import join, member, part
+from sgft_jax.stacking import join, member
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.train.pretraining import seed_keys
-from sgft_jax.types import Fixed, Metrics, Prior, RealData
-
-_TRAINING, _EVALUATION = 11, 12  # purposes, folded into a seed's key
+from sgft_jax.train import hybrid
+from sgft_jax.train.fleet import FleetState
+from sgft_jax.types import Fixed, HybridAgent, RealData
 
 
 def run(args: HybridArgs, method: Fixed, seeds: list[int]) -> list[dict[str, Any]]:
     """The runs with the simulators of `args`; returns their summaries."""
     env = envs.make(args.task, args.impl, previous_actions=args.previous_actions)
     named = gaps_of(args, method)
-    found = [Gap(NO_SIMULATOR, {}, {}) if name == NO_SIMULATOR else gaps.load(env, name) for name in named]
+    simulators = [Gap(NO_SIMULATOR, {}, {}) if name == NO_SIMULATOR else gaps.load(env, name) for name in named]
     log = None
     if method.kind != "simulator" and args.data is not None:
         log = logged.read(args.data, env, gamma=args.options.gamma, successors=args.successors)
     homes = {run_folder(args, name): jsonable(args) | {"gap": name} for name in named}
     inputs = {"data": None if log is None else {"sha256": log.facts.sha256, "successors": log.facts.successors}}
-    ready = _Run(args, method, env, found, seeds, log)  # refuses what it cannot play before a folder is made
-    opened = runs.open_runs(
+    setup = _set_up(args, method, env, simulators, seeds, log)  # refuses what it cannot play before a folder is made
+    with opened(
         homes, kind="hybrid", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE, inputs=inputs
-    )
-    try:
-        return ready.work([own.folder for own in opened])
-    finally:
-        for own in opened:
-            own.close()
+    ) as folders:
+        return _Run(setup, folders).work()
 
 
 def intervals(scores: dict[str, np.ndarray]) -> dict[str, list[float]]:
@@ -69,8 +62,8 @@ def intervals(scores: dict[str, np.ndarray]) -> dict[str, list[float]]:
 
     scores: [seeds] each.
     """
-    found = {f"{name}/interval": bootstrap_interval(own, statistic=mean) for name, own in scores.items()}
-    return {name: [float(own.low), float(own.high)] for name, own in found.items() if np.isfinite(own.low)}
+    bounds = {f"{name}/interval": bootstrap_interval(values, statistic=mean) for name, values in scores.items()}
+    return {name: [float(x.low), float(x.high)] for name, x in bounds.items() if np.isfinite(x.low)}
 
 
 def in_words(scores: np.ndarray, bounds: list[float] | None) -> str:
@@ -79,165 +72,138 @@ def in_words(scores: np.ndarray, bounds: list[float] | None) -> str:
     return f"{scores.mean():.4g}" + (f" [{low:.4g}, {high:.4g}]" if low < high else "")
 
 
-class _Run:
-    """What happens between chunks. Members [M = G * S] are the seeds of the first simulator, then those of the next."""
+class _Setup(NamedTuple):
+    """What a run trains with. Members [M] are the seeds of the first simulator, then those of the next.
 
-    def __init__(
-        self, args: HybridArgs, method: Fixed, env: Env, found: list[Gap], seeds: list[int],
-        log: logs.Log | None,
-    ) -> None:  # fmt: skip
-        self.args, self.method, self.gaps, self.seeds = args, method, found, seeds
-        self.env = real_env(env, found)  # what the simulators share
-        self.data = log
-        self.agent = method.build(args.options, env)
-        self.last_good: Path | None = None
-        self.expect = {"kind": "hybrid", "task": env.name, "method": method.name, "seeds": seeds}
-        members = jnp.zeros(len(found) * len(seeds), jnp.int32)
-        gap = gaps.load(env, args.real)
-        real = real_env(env, [gap])
-        pools = real_worlds(real, [gap], jax.random.key(0))
-        self.system = Simulated(real, pools, members, gamma=args.options.gamma)
-        self.chunk = args.schedule.updates_per_chunk
-        self.inputs = (self._pools(), self._real(), self._keys())
-        self._reserve(self.inputs[1])
+    env: what the simulators share. gaps: these, one for each run folder. log: the real data, None without any. system:
+    the real one, [M]. pools, real, keys: as `hybrid.train` takes them.
+    """
 
-    def work(self, folders: list[Path]) -> list[dict[str, Any]]:
-        """Everything, in order; returns the summaries. folders: of the runs, one for each simulator."""
-        self.folders, self.logs = folders, [MetricsLog(folder) for folder in folders]
-        state = self._restore(*self.inputs)
-        steps = trainer.train(
-            self.env, self.agent, self.args.schedule, *self.inputs, gamma=self.args.options.gamma, state=state
-        )
-        return self._finish(self._follow(steps))
+    args: HybridArgs
+    method: Fixed
+    env: Env
+    gaps: list[Gap]
+    seeds: list[int]
+    log: logs.Log | None
+    agent: HybridAgent
+    system: Simulated
+    pools: World
+    real: RealData
+    keys: Key
 
-    def _reserve(self, real: RealData) -> None:
-        """Says how much memory the rows take; raises UserError where there is not as much."""
-        kept = trainer.memory(self.env, self.agent, self.args.schedule, real)
-        members = len(self.gaps) * len(self.seeds)
-        reserve({"buffer": kept.buffer}, copies=members, shared=kept.data, settings="schedule")
 
-    def _pools(self) -> World:
-        """The worlds [M, W] of each member's simulator; those of the real system where there is none."""
-        found = [gaps.load(self.env, SIM) if gap.name == NO_SIMULATOR else gap for gap in self.gaps]
-        pools = real_worlds(self.env, found, jax.random.key(1))
-        return jax.tree.map(lambda x: jnp.repeat(x, len(self.seeds), axis=0), pools)
+def _set_up(
+    args: HybridArgs, method: Fixed, task: Env, simulators: list[Gap], seeds: list[int], log: logs.Log | None
+) -> _Setup:
+    """Says how much memory the rows take; raises UserError where there is not as much."""
+    env, gap = real_env(task, simulators), gaps.load(task, args.real)
+    agent = method.build(args.options, env)
+    world = real_env(env, [gap])
+    members = jnp.zeros(len(simulators) * len(seeds), jnp.int32)
+    system = Simulated(world, real_worlds(world, [gap], jax.random.key(0)), members, gamma=args.options.gamma)
+    real = hybrid.no_data(env) if log is None else RealData(log.rows, jnp.asarray(log.last))
+    # Where there is no simulator, the real system's worlds stand for it.
+    played = [gaps.load(env, SIM) if gap.name == NO_SIMULATOR else gap for gap in simulators]
+    pools = jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), real_worlds(env, played, jax.random.key(1)))
+    # A seed gives the same draws whichever simulators share the program.
+    keys = jnp.concatenate([seed_keys(seeds, FromLog.TRAINING)] * len(simulators))
+    kept, data = hybrid.memory(env, agent, args.schedule, real)
+    reserve({"buffer": kept}, copies=len(members), shared=data, settings="schedule")
+    return _Setup(args, method, env, simulators, seeds, log, agent, system, pools, real, keys)
 
-    def _real(self) -> RealData:
-        """The real data, or what stands for it."""
-        if self.data is None:
-            return trainer.no_data(self.env)
-        return RealData(self.data.rows, jnp.asarray(self.data.last))
 
-    def _keys(self) -> Any:
-        """[M]: a seed gives the same draws whichever simulators share the program."""
-        return jnp.concatenate([seed_keys(self.seeds, _TRAINING)] * len(self.gaps))
+class _Run(Training):
+    """A run on all simulators of a setup. folders: of the runs, one for each simulator."""
 
-    def _restore(self, pools: World, real: RealData, keys: Any) -> HybridState | None:
-        """The state after the last checkpoint, None for a fresh start; raises UserError where simulators differ."""
-        steps = [checkpoint.latest(folder, whole=True) for folder in self.folders]
-        if len(set(steps)) > 1:
-            listed = ", ".join(f"{own} is at {n or 0} updates" for own, n in zip(self.folders, steps, strict=True))
-            raise UserError(f"{listed}: they cannot go on together, resume them one at a time")
-        if steps[0] is None:
-            for log in self.logs:
-                log.truncate({})
-            return None
-        first = len(self.seeds)  # of the members: those of one simulator
-        own = jax.tree.map(lambda x: x[:first], pools)
-        like = trainer.shape_of(self.env, self.agent, self.args.schedule, own, real, keys[:first])
-        restored = functools.partial(checkpoint.restore, like=like, step=steps[0], checked=True, expect=self.expect)
-        found = [restored(folder) for folder in self.folders]
-        for log, (_, meta) in zip(self.logs, found, strict=True):
-            log.truncate(meta["position"])
-        return join([state for state, _ in found])
+    unit = "updates"
 
-    def _follow(self, steps: Iterator[tuple[HybridState, Metrics]]) -> HybridState:
-        """Logs, evaluates and checkpoints what the iterator yields; returns its last state."""
-        schedule, names = self.args.schedule, "+".join(gap.name for gap in self.gaps)
-        state, _ = next(steps)
-        done = trainer.chunks_done(state, schedule)
-        if done == 0:
-            self._evaluate(state, 0)
-        title = f"{self.method.name} on {self.env.name}/{names}"
-        with RunProgress(title, total=schedule.updates_in_all, unit="updates", done=done * self.chunk) as progress:
-            for state, metrics in steps:
-                before, done = done * self.chunk, done + 1
-                values = {name: np.asarray(x) for name, x in metrics.items()}
-                check_finite(values, done * self.chunk, unit="updates", last_good=self.last_good)
-                for log, own in zip(self.logs, self._each(values), strict=True):
-                    log.metrics(done * self.chunk, own)
-                shown = {}
-                if self._due(self.args.eval_every, before, done):
-                    shown = {f"{self.env.score}, real system": self._evaluate(state, done)}
-                if self._due(self.args.checkpoint_every, before, done):
-                    self._checkpoint(state, done)
-                progress.advance(self.chunk, shown)
-        return state
+    def __init__(self, setup: _Setup, folders: list[Path]) -> None:
+        self.setup, self.args, self.env, self.agent = setup, setup.args, setup.env, setup.agent
+        names = "+".join(gap.name for gap in setup.gaps)
+        expect = {"kind": "hybrid", "task": self.env.name, "method": setup.method.name, "seeds": setup.seeds}
+        title = f"{setup.method.name} on {self.env.name}/{names}"
+        super().__init__([Record(folder, expect) for folder in folders], title, self.args.schedule.updates_in_all)
 
-    def _due(self, every: int, before: int, done: int) -> bool:
-        """Whether something that happens every so many updates happens after this chunk: also after the last."""
-        return before // every != done * self.chunk // every or done == self.args.schedule.chunks
+    def work(self) -> list[dict[str, Any]]:
+        """Everything, in order; returns the summaries."""
+        setup, schedule = self.setup, self.args.schedule
+        count = self.count
+        first = jax.tree.map(lambda x: x[:count], setup.pools), setup.real, setup.keys[:count]  # of one simulator
+        restored = self.restore(lambda: hybrid.shape_of(self.env, self.agent, schedule, *first))
+        state = join([state for state, _ in restored]) if restored else None
+        steps = hybrid.train(
+            self.env, self.agent, schedule, setup.pools, setup.real, setup.keys, gamma=self.args.options.gamma,
+            state=state,
+        )  # fmt: skip
+        return self._finish(self.follow(steps, 0 if state is None else self.done(state)))
 
-    def _evaluate(self, state: HybridState, done: int) -> float:
+    # ------------------------------------------------------------ between chunks
+
+    def done(self, state: FleetState) -> int:
+        return int(jax.device_get(state.rounds)[0]) * self.args.schedule.updates_per_round
+
+    def evaluates(self, before: int, done: int, *, learned: bool) -> bool:
+        return done == 0 or self.due(self.args.eval_every, before, done)
+
+    def evaluate(self, state: FleetState, done: int) -> dict[str, float]:
         played = self._play(state, self.args.eval_episodes)
-        found = scores(played) | self._measures(played)
-        for log, own in zip(self.logs, self._each(found), strict=True):
-            log.eval(done * self.chunk, own)
-        return float(found["score"].mean())
+        values = scores(played) | self._measures(played)
+        for record, part in self.each(values):
+            record.log.eval(done, part)
+        return {f"{self.env.score}, real system": float(values["score"].mean())}
+
+    def checkpoints(self, before: int, done: int, *, learned: bool) -> bool:
+        return self.due(self.args.checkpoint_every, before, done)
+
+    def checkpoint(self, state: FleetState, done: int) -> None:
+        for record, part in self.each(state):
+            record.checkpoint(part, done)
 
     def _measures(self, played: Episode) -> dict[str, Any]:
         """What else the task is judged by, [M] means over episodes."""
-        measure = MEASURES.get(self.env.name)
-        if measure is None:
-            return {}
-        found = measure(played.transitions.next_obs, played.valid, dt=self.env.control_dt)
-        return {name: values.mean(-1) for name, values in found.items()}
+        measured = self.env.measures(played.transitions.next_obs, played.valid)
+        return {name: values.mean(-1) for name, values in measured.items()}
 
-    def _play(self, state: HybridState, episodes: int) -> Episode:
+    def _play(self, state: FleetState, episodes: int) -> Episode:
         """Episodes [M, episodes] in the real system, always the same starts."""
         params = jax.jit(jax.vmap(self.agent.export))(state.learner)
-        return play(self.system, self.agent.policy, params, jax.random.key(_EVALUATION), episodes)
-
-    def _checkpoint(self, state: HybridState, done: int) -> None:
-        for folder, log, own in zip(self.folders, self.logs, self._each(state), strict=True):
-            meta = {**self.expect, "position": log.position()}
-            self.last_good = checkpoint.save(folder, done * self.chunk, own, meta=meta)
-
-    def _each(self, members: PyTree) -> Iterator[PyTree]:
-        """Of each simulator, [S], what belongs to it in a pytree over all members."""
-        return (part(members, i, len(self.seeds)) for i in range(len(self.gaps)))
+        return play(self.setup.system, self.agent.policy, params, jax.random.key(FromLog.EVALUATION), episodes)
 
     # ------------------------------------------------------------ what stays
 
-    def _finish(self, state: HybridState) -> list[dict[str, Any]]:
+    def _finish(self, state: FleetState) -> list[dict[str, Any]]:
         """Policies, summaries, curves and closing words. The last policy is the result: nothing real chose it."""
         params = jax.jit(jax.vmap(self.agent.export))(state.learner)
         filmed = functools.cache(lambda: self._play(state, 1))
-        found = []
-        for i, (folder, gap, own) in enumerate(zip(self.folders, self.gaps, self._each(params), strict=True)):
-            self.logs[i].close()
-            for k, seed in enumerate(self.seeds):
-                save_prior(folder / "policy" / f"seed-{seed}", Prior(member(own, k), self._card(gap, seed)))
+        summaries = []
+        for i, (record, policies) in enumerate(self.each(params)):
+            gap, folder = self.setup.gaps[i], record.folder
+            record.log.close()
+            record.save_policies("policy", policies, functools.partial(self._card, gap))
             lines = read_jsonl(folder / EVAL)
             summary = self._summary(lines, gap)
             write_summary(folder, summary)
-            self._draw(folder, lines, gap)
+            _draw(folder)
             if self.args.video:
-                print(self._film(folder, member(member(filmed(), i * len(self.seeds)), 0)))
+                print(self._film(folder, member(member(filmed(), i * self.count), 0)))
             self._say(folder, gap, summary)
-            found.append(summary)
-        return found
+            summaries.append(summary)
+        return summaries
 
     def _card(self, gap: Gap, seed: int) -> dict[str, Any]:
         env = self.env
         sizes = {"task": env.name, "obs_dim": env.obs_dim, "act_dim": env.act_dim, "control_dt": env.control_dt}
         sizes |= {"previous_actions": env.previous_actions}
         layout = {"observation": [e._asdict() for e in env.observation], "action": [e._asdict() for e in env.action]}
-        facts = {"method": self.method.name, "gap": gap._asdict(), "seed": seed, "data": self._facts()}
+        facts = {"method": self.setup.method.name, "gap": gap._asdict(), "seed": seed, "data": self._facts()}
         return {**self.agent.card, **sizes, **layout, "hybrid": facts, "provenance": runs.provenance()}
 
     def _facts(self) -> dict[str, Any] | None:
-        return None if self.data is None else asdict(self.data.facts) | {"path": Path(self.data.facts.path).name}
+        return (
+            None
+            if self.setup.log is None
+            else asdict(self.setup.log.facts) | {"path": Path(self.setup.log.facts.path).name}
+        )
 
     def _summary(self, lines: list[dict[str, Any]], gap: Gap) -> dict[str, Any]:
         """Score of each seed at the last evaluation, and the mean over the last ten. lines: the evaluations."""
@@ -246,7 +212,7 @@ class _Run:
         others = {name: lines[-1][name] for name in measures(lines[-1])}
         return {
             "task": self.env.name,
-            "method": self.method.name,
+            "method": self.setup.method.name,
             "gap": gap._asdict(),
             "real": self.args.real,
             "impl": self.env.impl,
@@ -254,26 +220,17 @@ class _Run:
             "schedule": jsonable(self.args.schedule),
             "updates": self.args.schedule.updates_in_all,
             "score": self.env.score,
-            "seeds": self.seeds,
-            **{name: own.tolist() for name, own in scores.items()},
+            "seeds": self.setup.seeds,
+            **{name: values.tolist() for name, values in scores.items()},
             **intervals(scores),
             "normalised": [normalised(self.env.name, x) for x in scores["last"].tolist()],
             "measures": others,
         }
 
-    def _draw(self, folder: Path, lines: list[dict[str, Any]], gap: Gap) -> None:
-        """The learning curve. lines: the evaluations."""
-        data = "" if self.data is None or self.args.data is None else data_name(self.args.data)
-        name, simulator = self.method.name, "none" if gap.name == NO_SIMULATOR else gap.name
-        own = outcome(name, data, simulator, lines)
-        results = Results(self.env.name, self.env.score, [data], [simulator], [name], [own])
-        title = " on ".join(filter(None, [self.env.name, data]))
-        figures.hybrid_curves(folder / "figures" / "score.png", results, data, title=title)
-
     def _film(self, folder: Path, played: Episode) -> str:
         """An episode in the real system."""
-        path = folder / "videos" / f"seed-{self.seeds[0]}.mp4"
-        return film_episode(self.system.env, self.system.pools, 0, played, path)
+        path = folder / "videos" / f"seed-{self.setup.seeds[0]}.mp4"
+        return film_episode(self.setup.system.env, self.setup.system.pools, 0, played, path)
 
     def _say(self, folder: Path, gap: Gap, summary: dict[str, Any]) -> None:
         last, average = np.array(summary["last"]), np.array(summary["late"])
@@ -287,3 +244,10 @@ class _Run:
         for name, values in summary["measures"].items():
             print(f"  {name}: {np.mean(values):.3g} (std over seeds {np.std(values):.2g})")
         print(f"results: {folder}  (policy/, summary.json, eval.jsonl, figures/)")
+
+
+def _draw(folder: Path) -> None:
+    """The learning curve of a finished run."""
+    curve = read_curve(folder)
+    title = " on ".join(filter(None, [curve.task, curve.data]))
+    figures.learning_curves(folder / "figures/score.png", {f"simulator: {curve.gap or 'none'}": [curve]}, title=title)

@@ -26,31 +26,33 @@ from experiments.runner.evaluation import best_of, describe, play, scores
 from experiments.runner.memory import reserve
 from experiments.runner.pretrain_args import PretrainArgs, run_folder
 from experiments.runner.report import Report, make_report, numbers
+from experiments.runner.training import Record, Training, opened
 from experiments.runner.video import film_episode
 from sgft_jax import stacking
 from sgft_jax.analysis import figures
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io import checkpoint, runs
-from sgft_jax.io.log import EVAL, MetricsLog, check_finite, read_jsonl, write_summary
-from sgft_jax.io.priors import digest, save_prior
-from sgft_jax.io.progress import Clock, RunProgress
+from sgft_jax.io.log import EVAL, read_jsonl, write_summary
+from sgft_jax.io.priors import digest
+from sgft_jax.keys import Pretraining, seed_keys
+from sgft_jax.methods import DEFAULT, all_methods
 from sgft_jax.policies import make_policy
 from sgft_jax.systems.simulated import Simulated
+from sgft_jax.train import evidence
+from sgft_jax.train.evidence import Best
+from sgft_jax.train.fleet import FleetState
 from sgft_jax.train.pretraining import (
-    Best,
-    PretrainState,
     collect_random,
     exported,
     memory,
     pretrain,
     prior_card,
-    seed_keys,
     shapes,
     world_keys,
 )
-from sgft_jax.types import Metrics, Prior
+from sgft_jax.types import Prior
 
-_REPORT = 3  # purpose, folded into a seed's key
+VOLATILE = ("resume", "overwrite", "devices", "hosts", "report", "video", "out")
 _CUT = ("n_envs", "replay_capacity", "batch_size")  # sizes that devices share
 _HELDOUT_SEED, _FINAL_SEED = 2**31, 2**31 + 1  # held-out worlds and episodes, the same for every run
 
@@ -58,7 +60,7 @@ _HELDOUT_SEED, _FINAL_SEED = 2**31, 2**31 + 1  # held-out worlds and episodes, t
 class Saved(NamedTuple):
     """What a checkpoint holds, with a leading seeds axis: the run itself and the best policy so far."""
 
-    run: PretrainState
+    run: FleetState
     best: Best
 
 
@@ -70,41 +72,41 @@ def run(args: PretrainArgs, seeds: list[int]) -> dict[str, Any]:
     env = real_env(env, [gap] if gap else [])
     env = with_actuators(env) if args.config.actuators else env
     if args.config.sees_system:
-        told = with_system(env, varying(env, gap.params, gap.effects) if gap else varying(env))
-        env = blurred(told, args.config.system_noise)
+        seeing = with_system(env, varying(env, gap.params, gap.effects) if gap else varying(env))
+        env = blurred(seeing, args.config.system_noise)
     sizes = memory(env, args.config)  # what does not fit is reported before anything is written
     devices = mesh.devices(args.devices, {f"--config.{n.replace('_', '-')}": getattr(args.config, n) for n in _CUT})
     home = run_folder(args)
     with hosts.run_folder(home) as folder, mesh.use(devices):
         reserve(sizes, copies=args.seeds, devices=devices)
-        (opened,) = runs.open_runs(
-            {folder: jsonable(args)}, kind="pretrain", resume=args.resume, overwrite=args.overwrite,
-            volatile=("resume", "overwrite", "devices", "hosts", "report", "video", "out"),
-        )  # fmt: skip
-        mesh.meet()  # nobody looks for checkpoints before the first host has emptied a folder that is to be replaced
-        try:
-            return _Run(args, env, gap, seeds, opened.folder, home).work()
-        finally:
-            opened.close()
+        with opened(
+            {folder: jsonable(args)}, kind="pretrain", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE
+        ) as (folder,):
+            mesh.meet()  # nobody looks for checkpoints before the first host has emptied a folder to be replaced
+            return _Run(args, env, gap, seeds, folder, home).work()
 
 
-class _Run:
-    """What happens between chunks.
+class _Run(Training):
+    """Pretraining of the seeds [S].
 
     folder, home: for logs, and for checkpoints and priors; they differ on all but the first of several hosts.
     """
+
+    unit = "env steps"
 
     def __init__(
         self, args: PretrainArgs, env: Env, gap: Gap | None, seeds: list[int], folder: Path, home: Path
     ) -> None:
         self.args, self.env, self.gap, self.seeds, self.folder = args, env, gap, seeds, folder
         self.home, self.config = home, args.config
-        self.clock, self.log = Clock(), MetricsLog(folder)
         self.expect = {"kind": "pretrain", "task": env.name, "seeds": seeds}
+        record, size = Record(folder, self.expect, home), self.config.chunk_env_steps
+        super().__init__([record], f"pretrain {env.name}", self.config.chunks * size)
         self.card = prior_card(env, self.config)
         self.policy = make_policy(self.card, env)
         self.pools = functools.lru_cache(maxsize=1)(self._pools)  # worlds take long to compile
         self.shapes = functools.cache(lambda: shapes(env, self.config, seeds, self.pools(0)))
+        self.best: Best | None = None
 
     def work(self) -> dict[str, Any]:
         """Everything, in order."""
@@ -116,16 +118,14 @@ class _Run:
                 for seed in (_HELDOUT_SEED, _FINAL_SEED)
             )
         self.heldout = Simulated(self.env, heldout, first, gamma=self.config.gamma)
-        step = checkpoint.latest(self.home, whole=True)
-        self.last_good = None if step is None else checkpoint.path(self.home, step)
-        if step is None:
-            self.log.truncate({})
-            saved, done = None, 0
-        else:
-            saved, done = self._restore(step)
-        best = self._train(saved, done)
-        summary = self._hand_over(best)
-        self.log.close()
+        state, done = None, 0
+        for saved, meta in self.restore(lambda: jax.eval_shape(self._saved, self.shapes()[1])):
+            (state, self.best), self.clock.seconds, done = saved, meta["seconds"], meta["env_steps"]
+        steps = pretrain(self.env, self.config, self.seeds, pools=self.pools, random=self._random(), state=state)
+        self.follow(steps, done)
+        assert self.best is not None  # evaluated before the first chunk
+        summary = self._hand_over(self.best)
+        self.records[0].log.close()
         return summary
 
     def _pools(self, number: int) -> World:
@@ -133,22 +133,10 @@ class _Run:
         keys = world_keys(self.seeds, number)
         return stacking.stack([training_worlds(self.env, self.gap, key, self.config.worlds) for key in keys])
 
-    def _restore(self, step: int) -> tuple[Saved, int]:
-        """The checkpoint of a step, which is whole, and the chunks behind it."""
-        state = self.shapes()[1]
-        like = jax.eval_shape(lambda run: Saved(run, self._first_best(run)), state)
-        saved, meta = checkpoint.restore(self.home, like, step=step, checked=True, expect=self.expect)
-        self.log.truncate(meta["position"])
-        self.clock.seconds = meta["seconds"]
-        return saved, meta["chunks"]
-
-    def _first_best(self, state: PretrainState) -> Best:
-        """What any evaluation is better than."""
-        none = jnp.full(len(self.seeds), -jnp.inf)
-        unknown = jnp.full((len(self.seeds), 2), jnp.inf)
-        return Best(
-            exported(self.env, self.config, state), none, none, state.steps, jnp.zeros(len(self.seeds)), unknown
-        )
+    def _saved(self, state: FleetState) -> Saved:
+        """What a first checkpoint holds."""
+        params = exported(self.env, self.config, state)
+        return Saved(state, evidence.nothing_known(params, len(self.seeds), self.config.eval_episodes))
 
     def _random(self) -> PyTree:
         """Experience under random actions: collected once, then read from disk."""
@@ -160,49 +148,36 @@ class _Run:
         checkpoint.save(folder, 0, mesh.local(random), meta=self.expect)
         return random
 
-    def _train(self, saved: Saved | None, done: int) -> Best:
-        """Chunk after chunk, with evaluations and checkpoints between them; returns the best policies."""
-        random, state, best = self._random(), saved and saved.run, saved and saved.best
-        steps = pretrain(self.env, self.config, self.seeds, pools=self.pools, random=random, state=state)
-        with self.clock("compile"):
-            state, _ = jax.block_until_ready(next(steps))
-        if best is None:
-            best, _ = self._evaluate(state, best, 0)
-        chunks, size = self.config.chunks, self.config.chunk_env_steps
-        title, total = f"pretrain {self.env.name}", chunks * size
-        with RunProgress(title, total=total, unit="env steps", done=done * size) as progress:
-            while done < chunks:
-                with self.clock("train"):
-                    state, metrics = next(steps)
-                    metrics = {name: np.asarray(x) for name, x in metrics.items()}
-                done += 1
-                self.log.metrics(done * size, metrics)
-                check_finite(metrics, done * size, unit="env steps", last_good=self.last_good)
-                # Episodes begin together, so in some chunks none ends.
-                ended = metrics["train/episodes"].all()
-                shown = {"success, exploring": float(metrics["train/success"].mean())} if ended else {}
-                if done % self.config.eval_every == 0 or done == chunks:
-                    best, found = self._evaluate(state, best, done)
-                    shown |= {f"{name}, evaluation": float(found[name].mean()) for name in ("success", "return")}
-                if done % self.config.checkpoint_every == 0 or done == chunks:
-                    self._checkpoint(Saved(state, best), done)
-                progress.advance(size, shown)
-        return best
+    # ------------------------------------------------------------ between chunks
 
-    def _evaluate(self, state: PretrainState, best: Best | None, done: int) -> tuple[Best, Metrics]:
+    def done(self, state: FleetState) -> int:
+        return int(jax.device_get(state.rounds)[0]) * self.config.n_envs
+
+    def log(self, state: FleetState, values: dict[str, np.ndarray], seconds: float) -> dict[str, float]:
+        super().log(state, values, seconds)
+        ended = values["train/episodes"].all()  # episodes begin together, so in some chunks none ends
+        return {"success, exploring": float(values["train/success"].mean())} if ended else {}
+
+    def evaluates(self, before: int, done: int, *, learned: bool) -> bool:
+        return done == 0 or self.due(self.config.eval_every * self.config.chunk_env_steps, before, done)
+
+    def evaluate(self, state: FleetState, done: int) -> dict[str, float]:
         """Every evaluation plays the same episodes in the same held-out worlds."""
         params = exported(self.env, self.config, state)
-        with self.clock("evaluate"):
-            played = self._play(self.heldout, params, jax.random.fold_in(jax.random.key(_HELDOUT_SEED), 1))
-        found = scores(played)
-        self.log.eval(done * self.config.chunk_env_steps, found)
+        played = self._play(self.heldout, params, jax.random.fold_in(jax.random.key(_HELDOUT_SEED), 1))
+        values = scores(played)
+        self.records[0].log.eval(done, values)
         since = self.config.choose_from * self.config.chunks * self.config.chunk_steps
-        return best_of(best, params, played, state.steps, since=since), found
+        self.best = best_of(self.best, params, played, state.rounds, since=since)
+        return {f"{name}, evaluation": float(values[name].mean()) for name in ("success", "return")}
 
-    def _checkpoint(self, saved: Saved, done: int) -> None:
-        meta = {**self.expect, "chunks": done, "position": self.log.position(), "seconds": self.clock.seconds}
-        with self.clock("checkpoint"):
-            self.last_good = checkpoint.save(self.home, done, mesh.local(saved), meta=meta)
+    def checkpoints(self, before: int, done: int, *, learned: bool) -> bool:
+        return self.due(self.config.checkpoint_every * self.config.chunk_env_steps, before, done)
+
+    def checkpoint(self, state: FleetState, done: int) -> None:
+        assert self.best is not None  # evaluated before the first chunk
+        step = done // self.config.chunk_env_steps
+        self.records[0].checkpoint(Saved(state, self.best), step, env_steps=done, seconds=self.clock.seconds)
 
     # ------------------------------------------------------------ what stays
 
@@ -213,14 +188,15 @@ class _Run:
             played = self._final_episodes(best.params)
         results = []
         for i, seed in enumerate(self.seeds):
-            own = stacking.member(best, i)
-            name = digest(Prior(own.params, {}))  # by which runs of fine-tuning tell which priors they began from
-            found = {"seed": seed, "digest": name, **describe(stacking.member(played, i)), **self._chosen(own)}
+            chosen = stacking.member(best, i)
+            name = digest(Prior(chosen.params, {}))  # by which runs of fine-tuning tell which priors they began from
+            facts = {"seed": seed, "digest": name, **describe(stacking.member(played, i)), **self._chosen(chosen)}
             if report is not None:
-                found |= numbers(stacking.member(report, i))
+                facts |= numbers(stacking.member(report, i))
                 self._save_report(seed, stacking.member(report, i), i)
-            save_prior(self.home / "prior" / f"seed-{seed}", Prior(own.params, self._card(found)))
-            results.append(found)
+            results.append(facts)
+        cards = {facts["seed"]: self._card(facts) for facts in results}
+        self.records[0].save_policies("prior", best.params, cards.__getitem__)
         summary = {
             "task": self.env.name,
             "preset": self.args.preset,
@@ -237,15 +213,15 @@ class _Run:
         self._say(results)
         return summary
 
-    def _card(self, found: dict[str, Any]) -> dict[str, Any]:
-        """What a prior says of itself; found: its numbers."""
+    def _card(self, facts: dict[str, Any]) -> dict[str, Any]:
+        """What a prior says of itself; facts: its numbers."""
         late = f"{self.config.choose_from:.0%} of training"
         return {
             **self.card,
             "gap": None if self.gap is None else self.gap._asdict(),
             "preset": self.args.preset,
             "chosen": f"the best evaluation in held-out worlds after {late}: {self.env.score}, then return",
-            "metrics": found,
+            "metrics": facts,
             "provenance": runs.provenance(),
         }
 
@@ -264,7 +240,7 @@ class _Run:
         measure = functools.partial(
             make_report, self.env, self.policy, gamma=self.config.gamma, trajectories=self.config.eval_episodes
         )
-        report = jax.jit(jax.vmap(measure))(self.pools(0), params, seed_keys(self.seeds, _REPORT))
+        report = jax.jit(jax.vmap(measure))(self.pools(0), params, seed_keys(self.seeds, Pretraining.REPORT))
         return jax.tree.map(np.asarray, mesh.local(report))
 
     def _film(self, played: Episode) -> str:
@@ -274,7 +250,7 @@ class _Run:
 
     def _chosen(self, best: Best) -> dict[str, float]:
         """Which evaluation the prior is from, and what that evaluation said."""
-        steps = int(best.steps) * self.config.n_envs
+        steps = int(best.age) * self.config.n_envs
         return {"best/env_steps": steps, f"best/{self.env.score}": float(best.score), "best/return": float(best.total)}
 
     def _save_report(self, seed: int, report: Report, i: int) -> None:
@@ -298,20 +274,21 @@ class _Run:
         )
 
     def _say(self, results: list[dict[str, Any]]) -> None:
-        for found in results:
-            low, high = found["success/interval"]
-            said = f"success {found['success']:.3f} [{low:.3f}, {high:.3f}]"
-            said = said if self.env.score == "success" else f"return {found['return']:.3f}"
-            line = f"seed {found['seed']}: {said} in {found['episodes']} fresh episodes"
-            if "value/explained_variance" in found:
-                line += f"; V_sim explains {found['value/explained_variance']:.2f} of the variance of returns, "
-                line += f"rank correlation {found['value/rank_correlation']:.2f}, bias {found['value/bias']:+.2f}"
+        for facts in results:
+            low, high = facts["success/interval"]
+            score = f"return {facts['return']:.3f}"
+            if self.env.score == "success":
+                score = f"success {facts['success']:.3f} [{low:.3f}, {high:.3f}]"
+            line = f"seed {facts['seed']}: {score} in {facts['episodes']} fresh episodes"
+            if "value/explained_variance" in facts:
+                line += f"; V_sim explains {facts['value/explained_variance']:.2f} of the variance of returns, "
+                line += f"rank correlation {facts['value/rank_correlation']:.2f}, bias {facts['value/bias']:+.2f}"
             print(line)
-        left = ", ".join(name for name in ("prior/", "summary.json", "figures/") if (self.folder / name).exists())
-        print(f"results: {self.folder}  ({left})")
-        kind = "informed" if self.config.sees_system else self.config.algorithm
-        method = {"sac": "", "informed": "sysid", "tdmpc2": "sgft-tdmpc2", "recurrent": "recurrent"}[kind]
-        method = method and f" --method {method}"
+        files = ", ".join(name for name in ("prior/", "summary.json", "figures/") if (self.folder / name).exists())
+        print(f"results: {self.folder}  ({files})")
+        wanted = self.config.algorithm, self.config.sees_system
+        method = next(name for name, way in all_methods().items() if (way.prior, way.sees_system) == wanted)
+        method = "" if method == DEFAULT else f" --method {method}"
         method += "" if self.gap is None else f" --real {SIM}"
         out = "" if self.args.out == PretrainArgs.out else f" --out {self.args.out}"
         print(f"next: python -m experiments.finetune --task {self.args.task}{method} --prior {self.folder}{out}")

@@ -15,8 +15,8 @@ from experiments.runner.rollouts import task_of
 from experiments.studies.diagnose_calibrate import CalibrateArgs
 from sgft_jax import stacking
 from sgft_jax.analysis import prediction, tables
-from sgft_jax.analysis.curves import read_curve
 from sgft_jax.analysis.prediction import AHEAD, Cases, Inputs
+from sgft_jax.analysis.reading import read_curve
 from sgft_jax.examination import Examiner
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io.runs import read_config
@@ -100,7 +100,7 @@ def gather(args: CalibrateArgs, runs: Sequence[Path]) -> list[Cases]:
         rollouts, which = read(run, env, priors, COUNTS[-1])
         if (there := rollouts[0].valid.shape[0]) < COUNTS[-1]:
             raise UserError(f"{run}: holds {there} recorded rollouts, a calibration needs {COUNTS[-1]}")
-        held = curve.rollouts <= AHEAD
+        held = curve.x <= AHEAD
         params, control = (stacking.member(x, jnp.array(which)) for x in known)
         examined = examiner.examine(params, control, stacking.stack(rollouts), COUNTS)
         for member, (own, p) in enumerate(zip(examined, which, strict=True)):
@@ -110,7 +110,7 @@ def gather(args: CalibrateArgs, runs: Sequence[Path]) -> list[Cases]:
             success = curve.values[member, held]
             gained = round(success[-1] - success[0], 6)  # equal ones must tie
             names = (f"{env.name} {curve.gap}", f"{env.name} {folders[p]}")
-            facts.append((success[0], gained, (curve.rollouts[held], success), *names))
+            facts.append((success[0], gained, (curve.x[held], success), *names))
         if not args.json:
             print(f"diagnosed: {run}", flush=True)
     zero_shot, gains, curves, names, priors = zip(*facts, strict=True)

@@ -6,7 +6,7 @@ deepest fall are printed, and the effects are drawn. With --data, nothing runs: 
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 from envs import extend, gaps
 from envs.types import UserError
 from experiments.runner import cli, grid
-from experiments.runner.cells import Cell, check_begun, complete
-from experiments.runner.finetune_args import with_settings
+from experiments.runner.cells import Cell, check_begun, work
 from experiments.runner.grid import GridArgs
 from experiments.runner.options import check_prior, prior_folders
 from sgft_jax.files.jsonfile import jsonable, write_json
@@ -23,7 +22,7 @@ from sgft_jax.methods import get_method
 
 if TYPE_CHECKING:
     from sgft_jax.analysis.curves import Curve
-    from sgft_jax.analysis.factorial import Factor, Levels
+    from sgft_jax.analysis.factorial import Levels
 
     Place = tuple[str, str]  # a task, and a real system as the user gave it
     Curves = dict[Place, dict[Levels, Curve]]
@@ -69,22 +68,18 @@ def main(args: FactorialArgs) -> None:
     if args.data:
         print(report(args, released(args, args.data, places)))
         return
-    cells = {place: cells_of(args, *place) for place in places}
-    every = [cell for each in cells.values() for cell in each.values()]
-    check_begun(every)  # the same folders with other options or priors
-    failed = complete(every, args)
-    if args.dry:
-        return
-    if failed:
-        raise UserError(f"{len(failed)} of the cells did not run: {'; '.join(failed)}")
-    states = [grid.look_up(cell.args).state for cell in every]
-    if left := len(states) - states.count("finished"):
-        print(f"{left} cells are not finished; the same command goes on")
-        return
-    from sgft_jax.analysis.curves import read_curve
+    cells = {(place, levels): cell for place in places for levels, cell in cells_of(args, *place).items()}
+    check_begun(cells.values())  # the same folders with other options or priors
+    work(list(cells.values()), args, lambda now: print(_conclusion(args, dict(zip(cells, now, strict=True)))))
 
-    curves = {place: {at: read_curve(cell.folder) for at, cell in own.items()} for place, own in cells.items()}
-    print(report(args, curves))
+
+def _conclusion(args: FactorialArgs, cells: "dict[tuple[Place, Levels], Cell]") -> str:
+    """The report, or how many cells it waits for."""
+    from sgft_jax.analysis.reading import read_curve
+
+    if unfinished := sum(cell.state != "finished" for cell in cells.values()):
+        return f"{unfinished} cells are not finished; the same command goes on"
+    return report(args, _by_place({place: read_curve(cell.folder) for place, cell in cells.items()}))
 
 
 def check(args: FactorialArgs) -> None:
@@ -108,76 +103,71 @@ def check(args: FactorialArgs) -> None:
 
 def reals_of(args: FactorialArgs, task: str) -> tuple[str, ...]:
     """The real systems of a task: those of every task and those that name it, one gap each."""
-    found = []
-    for text in args.reals:
-        name, equals, real = text.partition("=")
-        if not (equals and name in args.tasks):
-            found.append(text)
-        elif name == task:
-            found.append(real)
-    return gaps.each(found)
+    pairs = [text.partition("=") for text in args.reals]
+    named = [(of, real) if equals and of in args.tasks else (task, of + equals + real) for of, equals, real in pairs]
+    return gaps.each([real for of, real in named if of == task])
 
 
-def factors(args: FactorialArgs) -> "list[Factor]":
-    """What varies, in the order of `Levels`."""
-    from sgft_jax.analysis.factorial import Factor
-
-    return [
-        Factor("shape", "task reward", "shaped"),
-        Factor("shorten", "infinite", "short"),
-        Factor("horizon", "1", str(args.horizon)),
-        Factor("new critic", "kept", "new"),
-        Factor("warm-up", "none", "warm"),
-    ]
+def factors(args: FactorialArgs) -> dict[str, tuple[str, str]]:
+    """What varies, in the order of `Levels`: words for the low and the high level of each factor."""
+    return {
+        "shape": ("task reward", "shaped"),
+        "shorten": ("infinite", "short"),
+        "horizon": ("1", str(args.horizon)),
+        "new critic": ("kept", "new"),
+        "warm-up": ("none", "warm"),
+    }
 
 
 def settings(args: FactorialArgs, levels: "Levels") -> dict[str, Any]:
     """The options of a cell."""
     shape, shorten, horizon, new, warm = levels
-    own = {"shape": shape, "shorten": shorten, "horizon": args.horizon if horizon else 1, "reset_critic": new}
+    varied = {"shape": shape, "shorten": shorten, "horizon": args.horizon if horizon else 1, "reset_critic": new}
     shared = {"anchor": args.anchor, "identify": args.identify, "guard": args.guard}
-    return own | shared | ({} if warm else COLD)
+    return varied | shared | ({} if warm else COLD)
 
 
 def variants(args: FactorialArgs) -> "dict[Levels, str]":
     """Every combination of levels, and what its runs are called."""
-    names = [(factor.low, factor.high) for factor in factors(args)]
-    return {
-        levels: "-".join(name[high].replace(" ", ".") for name, high in zip(names, levels, strict=True))
-        for levels in itertools.product((False, True), repeat=len(names))
-    }
+    words = [[word.replace(" ", ".") for word in pair] for pair in factors(args).values()]
+    combinations = itertools.product((False, True), repeat=len(words))
+    return dict(zip(combinations, map("-".join, itertools.product(*words)), strict=True))
 
 
 def cells_of(args: FactorialArgs, task: str, real: str) -> "dict[Levels, Cell]":
     """Every combination of levels on a real system."""
-    found = {}
-    for levels, variant in variants(args).items():
-        run = replace(grid.run_of(args, task, real, METHOD), prior=args.prior, variant=variant)
-        found[levels] = grid.look_up(with_settings(run, settings(args, levels)))
-    return found
+    return {
+        levels: grid.cell_of(args, task, real, METHOD, settings(args, levels), prior=args.prior, variant=variant)
+        for levels, variant in variants(args).items()
+    }
 
 
 def released(args: FactorialArgs, folder: Path, places: "Sequence[Place]") -> "Curves":
     """The curves of every cell in tables that `experiments.figures --export` wrote; UserError where one is missing."""
-    from sgft_jax.analysis.curves import read_data
+    from sgft_jax.analysis.release import read_data
 
-    wanted = {
-        (task, gaps.title(real), variant): ((task, real), levels)
-        for task, real in places
-        for levels, variant in variants(args).items()
+    names = {
+        (place, levels): (place[0], gaps.title(place[1]), variant)
+        for place, (levels, variant) in itertools.product(places, variants(args).items())
     }
-    found: Curves = {place: {} for place in places}
+    runs: dict[tuple[str, ...], Curve] = {}
     for curve in read_data(folder).curves:
         name = (curve.task, curve.gap, curve.variant)
-        if curve.method == METHOD and name in wanted:
-            place, levels = wanted[name]
-            if levels in found[place]:
+        if curve.method == METHOD and name in names.values():
+            if name in runs:
                 raise UserError(f"{folder}: {METHOD} {' '.join(name)} ran with several sets of priors; keep one")
-            found[place][levels] = curve
-    for name, (place, levels) in wanted.items():
-        if levels not in found[place]:
-            raise UserError(f"{folder}: has no run of {METHOD} on {name[0]}, {name[1]}, variant {name[2]}")
-    return found
+            runs[name] = curve
+    if missing := [name for name in names.values() if name not in runs]:
+        task, gap, variant = missing[0]
+        raise UserError(f"{folder}: has no run of {METHOD} on {task}, {gap}, variant {variant}")
+    return _by_place({cell: runs[name] for cell, name in names.items()})
+
+
+def _by_place(curves: "Mapping[tuple[Place, Levels], Curve]") -> "Curves":
+    places: Curves = {}
+    for (place, levels), curve in curves.items():
+        places.setdefault(place, {})[levels] = curve
+    return places
 
 
 def report(args: FactorialArgs, curves: "Curves") -> str:
@@ -186,51 +176,46 @@ def report(args: FactorialArgs, curves: "Curves") -> str:
     from sgft_jax.analysis.curves import by_prior
     from sgft_jax.analysis.factorial import effects
 
-    folder, found, said, score = args.out / "factorial", {}, [], ""
-    for (task, real), each in curves.items():
-        scores = {levels: measures(curve) for levels, curve in each.items()}
-        first = next(iter(each.values()))
+    folder, names, by_place, texts, score = args.out / "factorial", list(factors(args)), {}, [], ""
+    for (task, real), runs in curves.items():
+        first = next(iter(runs.values()))
         score, priors = first.score, first.prior if by_prior(first) else None
-        place = f"{task}, {gaps.title(real)}"
-        found[place] = {
-            what: effects({levels: own[what] for levels, own in scores.items()}, factors(args), priors=priors)
-            for what in MEASURES
+        scores = {levels: measures(curve) for levels, curve in runs.items()}
+        by_measure = {
+            name: effects({levels: numbers[name] for levels, numbers in scores.items()}, names, priors=priors)
+            for name in MEASURES
         }
         rows = [
-            [name, *(tables.number(found[place][what][name], score) for what in MEASURES)]
-            for name in found[place][MEASURES[0]]
+            [effect, *(tables.number(bands[effect], score) for bands in by_measure.values())]
+            for effect in by_measure[MEASURES[0]]
         ]
-        said += [f"{place}, {tables.words(score)}:", "", _cells(args, each), ""]
-        said += [f"{place}, effects on {tables.words(score)}:", "", tables.markdown(("effect of", *MEASURES), rows), ""]
+        place = f"{task}, {gaps.title(real)}"
+        by_place[place] = by_measure
+        texts += [f"{place}, {tables.words(score)}:", _cells(args, runs)]
+        texts += [f"{place}, effects on {tables.words(score)}:", tables.markdown(("effect of", *MEASURES), rows)]
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "factorial.json", jsonable(found))
-    figures.effects(folder / "factorial.png", found, label=f"change of {score}")
-    return "\n".join([*said, f"written: {folder}"])
+    write_json(folder / "factorial.json", jsonable(by_place))
+    figures.effects(folder / "factorial.png", by_place, label=f"change of {score}")
+    return "\n\n".join([*texts, f"written: {folder}"])
 
 
 def _cells(args: FactorialArgs, curves: "dict[Levels, Curve]") -> str:
     """A line for each cell; its area also beside the cell with neither shaping nor shortening and all else equal."""
     from sgft_jax.analysis import tables
-    from sgft_jax.analysis.curves import by_prior, deepest_fall
-    from sgft_jax.math.stats import bootstrap_interval, mean
+    from sgft_jax.analysis.curves import deepest_fall, spread
+    from sgft_jax.math.stats import mean
 
-    lines = []
+    rows = []
     for levels, variant in variants(args).items():
         curve, neither = curves[levels], curves[(False, False, *levels[2:])]
-        area = measures(curve)["area"]
-        more = bootstrap_interval(
-            area - measures(neither)["area"], statistic=mean, priors=curve.prior if by_prior(curve) else None
-        )
-        lines.append([
-            variant,
-            " ".join(tables.plain(value, curve.score) for value in curve.values.mean(axis=0)),
-            tables.plain(area.mean(), curve.score),
-            tables.plain(deepest_fall(curve), curve.score),
-            tables.number(more, curve.score),
-        ])  # fmt: skip
-    rollouts = ", ".join(str(n) for n in curves[levels].rollouts)
+        area, score = measures(curve)["area"], curve.score
+        more = spread(curve, area - measures(neither)["area"], mean)
+        means = " ".join(tables.plain(value, score) for value in curve.values.mean(axis=0))
+        fall = tables.plain(deepest_fall(curve), score)
+        rows.append([variant, means, tables.plain(area.mean(), score), fall, tables.number(more, score)])
+    rollouts = ", ".join(str(n) for n in curves[levels].x)
     head = ("cell", f"mean after {rollouts} rollouts", "area", "fall of the mean", "area more than with neither")
-    return tables.markdown(head, lines)
+    return tables.markdown(head, rows)
 
 
 def measures(curve: "Curve") -> dict[str, Any]:

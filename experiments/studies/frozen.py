@@ -22,11 +22,12 @@ from envs.gaps import SIM
 from envs.types import UserError
 from experiments.pretrain import pretrain
 from experiments.runner import cli, grid
-from experiments.runner.cells import Cell, complete
+from experiments.runner.cells import Cell, work
 from experiments.runner.grid import GridArgs
-from experiments.runner.options import at_least_one, not_negative, prior_folders
+from experiments.runner.options import Impl, at_least_one, not_negative, prior_folders
 from experiments.runner.pretrain_args import PretrainArgs, run_folder
 from experiments.studies.scoreboard import ScoreboardArgs, board
+from sgft_jax.io.log import SUMMARY
 from sgft_jax.io.runs import CONFIG, check_folder
 from sgft_jax.methods import DEFAULT, NAMES, get_method
 from sgft_jax.presets import DEFAULT_PRESET, PRESETS, preset_of
@@ -38,7 +39,6 @@ ON_SOFT = (DEFAULT, "sac", "mbpo", "sgft-sac")
 LEFT_OUT = ("sgft-parts",)  # SGFT-SAC by default; experiments.studies.factorial takes it apart
 AGAIN = "again"  # the default method twice, with the same priors and other seeds: how far apart chance sets two rows
 ROLLOUTS, EVAL_EVERY = 20, 2
-_SUMMARY = "summary.json"
 _PAUSE = 1.0  # seconds between looks at the processes
 
 
@@ -65,8 +65,7 @@ class FrozenArgs:
     """The same for methods that need priors of their own, for towel and ball, and for runs on two gaps a task."""
     unit: str = ""
     """Expert: do this one unit in this process, and nothing else."""
-    impl: grid.Impl = "auto"
-    """Physics engine, as in fine-tuning."""
+    impl: Impl = "auto"
     out: Path = Path("runs")
     """Parent of all run folders; what the processes print goes to <out>/frozen."""
 
@@ -128,8 +127,8 @@ def units(args: FrozenArgs) -> Iterator[Unit]:
 
 def two_gaps(task: str) -> tuple[str, str]:
     """The first partial and the first failed test gap of a task."""
-    found = list(gaps.read_file(_test_file(task)).values())
-    first = [next(gap.name for gap in found if gap.stratum == stratum) for stratum in ("partial", "failed")]
+    test = list(gaps.read_file(_test_file(task)).values())
+    first = [next(gap.name for gap in test if gap.stratum == stratum) for stratum in ("partial", "failed")]
     return f"{_test_file(task)}:{first[0]}", f"{_test_file(task)}:{first[1]}"
 
 
@@ -153,19 +152,19 @@ def _prior_sets(args: FrozenArgs, task: str, preset: str) -> list[PretrainArgs]:
 
 def _prior_units(args: FrozenArgs, task: str, preset: str) -> Iterator[Unit]:
     sets = _prior_sets(args, task, preset)
-    for own, name in zip(sets, _part_names(_prior_name(task, preset), len(sets)), strict=True):
-        state = partial(_prior_state, run_folder(own))
-        yield Unit(name, (), state, partial(_make_priors, own, state))
+    for run, name in zip(sets, _part_names(_prior_name(task, preset), len(sets)), strict=True):
+        state = partial(_prior_state, run_folder(run))
+        yield Unit(name, (), state, partial(_make_priors, run, state))
 
 
 def _prior_state(folder: Path) -> State:
-    if (folder / _SUMMARY).exists():
+    if (folder / SUMMARY).exists():
         return "finished"
     return "unfinished" if (folder / CONFIG).exists() else "missing"
 
 
-def _make_priors(own: PretrainArgs, state: Callable[[], State]) -> None:
-    pretrain(replace(own, resume=state() == "unfinished"))
+def _make_priors(run: PretrainArgs, state: Callable[[], State]) -> None:
+    pretrain(replace(run, resume=state() == "unfinished"))
 
 
 def _run_units(
@@ -174,24 +173,23 @@ def _run_units(
     preset = preset_of(get_method(method))
     sets = _prior_sets(args, task, preset)
     needs = _part_names(_prior_name(task, preset), len(sets))
-    priors = sum(own.seeds for own in sets)
-    every = gaps.each(tuple(map(str, reals)))
-    shares = [every[i :: args.split] for i in range(min(args.split, len(every)))]
+    priors = sum(run.seeds for run in sets)
+    systems = gaps.each(tuple(map(str, reals)))
+    shares = [systems[i :: args.split] for i in range(min(args.split, len(systems)))]
     home = run_folder(sets[0]) if len(sets) == 1 else run_folder(sets[0]).parent
     changes = {"prior": home, "variant": AGAIN if again else ""}
     whole = f"{task}/{method}" + (f"-{AGAIN}" if again else "")
+    base = GridArgs(rollouts=ROLLOUTS, eval_every=EVAL_EVERY, impl=args.impl, out=args.out)
+    seeds = min(priors, args.fewer) if few else priors
     for share, name in zip(shares, _part_names(whole, len(shares)), strict=True):
-        shared = GridArgs(
-            tasks=(task,), methods=(method,), reals=share, seeds=min(priors, args.fewer) if few else priors,
-            seed=priors if again else 0, rollouts=ROLLOUTS, eval_every=EVAL_EVERY, impl=args.impl, out=args.out,
-        )  # fmt: skip
+        shared = replace(base, tasks=(task,), methods=(method,), reals=share, seeds=seeds, seed=priors if again else 0)
         cells = partial(_cells, shared, changes)
         yield Unit(name, needs, partial(_run_state, cells), partial(_complete, cells, shared, home, priors))
 
 
-def _cells(shared: GridArgs, changes: Mapping[str, Any]) -> list[Cell]:
-    (task,), (method,) = shared.tasks, shared.methods
-    return [grid.look_up(replace(grid.run_of(shared, task, real, method), **changes)) for real in shared.reals]
+def _cells(args: GridArgs, changes: Mapping[str, Any]) -> list[Cell]:
+    (task,), (method,) = args.tasks, args.methods
+    return [grid.cell_of(args, task, real, method, **changes) for real in args.reals]
 
 
 def _run_state(cells: Callable[[], list[Cell]]) -> State:
@@ -200,11 +198,10 @@ def _run_state(cells: Callable[[], list[Cell]]) -> State:
 
 
 def _complete(cells: Callable[[], list[Cell]], shared: GridArgs, home: Path, priors: int) -> None:
-    found = len(prior_folders(home, out=shared.out, task=shared.tasks[0], preset=""))
-    if found != priors:  # seeds would start from others than the same seeds of other methods
-        raise UserError(f"{home}: holds {found} priors, not {priors}; move those of other runs away")
-    if failed := complete(cells(), shared):
-        raise UserError("; ".join(failed))
+    count = len(prior_folders(home, out=shared.out, task=shared.tasks[0], preset=""))
+    if count != priors:  # seeds would start from others than the same seeds of other methods
+        raise UserError(f"{home}: holds {count} priors, not {priors}; move those of other runs away")
+    work(cells(), shared)
 
 
 def _part_names(name: str, n: int) -> tuple[str, ...]:
@@ -214,7 +211,7 @@ def _part_names(name: str, n: int) -> tuple[str, ...]:
 
 def _finished(every: Mapping[str, Unit], name: str) -> bool:
     """Whether all processes of a unit are done."""
-    return all(unit.state() == "finished" for own, unit in every.items() if own == name or own.startswith(f"{name}."))
+    return all(unit.state() == "finished" for unit in every.values() if f"{unit.name}.".startswith(f"{name}."))
 
 
 def _prior_name(task: str, preset: str) -> str:
@@ -262,16 +259,16 @@ class Pool:
                 self._begin()
                 time.sleep(_PAUSE)
         finally:
-            for own in self.running.values():
-                own.process.terminate()
+            for running in self.running.values():
+                running.process.terminate()
         return self.failed
 
     def _collect(self) -> None:
         """Takes note of the processes that have ended."""
-        for name in [name for name, own in self.running.items() if own.process.poll() is not None]:
-            own = self.running.pop(name)
-            self.failed += [name] if own.process.returncode else []
-            self._say(f"{'failed' if own.process.returncode else 'done'} {name}, {time.monotonic() - own.since:.0f} s")
+        for name in [name for name, running in self.running.items() if running.process.poll() is not None]:
+            process, _, since = self.running.pop(name)
+            self.failed += [name] if process.returncode else []
+            self._say(f"{'failed' if process.returncode else 'done'} {name}, {time.monotonic() - since:.0f} s")
 
     def _give_up(self) -> None:
         """Drops what needs a unit that failed, and all that waits when the time is up."""
@@ -289,21 +286,19 @@ class Pool:
         gpus = range(max(self.args.gpus, 1))
         ready = [unit for unit in self.waiting if not set(unit.needs) & unfinished]
         for unit in ready[: len(gpus) * self.args.jobs - len(self.running)]:
-            gpu = min(gpus, key=[own.gpu for own in self.running.values()].count)
+            gpu = min(gpus, key=[running.gpu for running in self.running.values()].count)
             self.waiting.remove(unit)
             self.running[unit.name] = _Running(self._process(unit, gpu), gpu, time.monotonic())
             self._say(f"begun {unit.name}")
 
     def _process(self, unit: Unit, gpu: int) -> subprocess.Popen:
-        words = [f"--{name}={getattr(self.args, name)}" for name in ("split", "priors", "fewer", "impl", "out")]
+        command = [sys.executable, "-m", "experiments.studies.frozen", "--unit", unit.name]
+        command += [f"--{name}={getattr(self.args, name)}" for name in ("split", "priors", "fewer", "impl", "out")]
         environment = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **os.environ}
         if self.args.gpus:
             environment["CUDA_VISIBLE_DEVICES"] = str(gpu)
         with (self.folder / f"{unit.name.replace('/', '-')}.log").open("w") as log:
-            return subprocess.Popen(
-                [sys.executable, "-m", "experiments.studies.frozen", "--unit", unit.name, *words],
-                env=environment, stdout=log, stderr=subprocess.STDOUT,
-            )  # fmt: skip
+            return subprocess.Popen(command, env=environment, stdout=log, stderr=subprocess.STDOUT)
 
     def _say(self, words: str) -> None:
         print(f"{time.monotonic() - self.started:6.0f} s  {words}", flush=True)

@@ -14,8 +14,8 @@ import tyro
 
 from envs.files import read_toml
 from envs.types import UserError
-from experiments.gaps import PLAIN, check_episodes, folders_of_priors
 from experiments.runner import cli
+from experiments.runner.gaps_args import PLAIN, check_episodes, folders_of_priors
 from experiments.runner.options import Impl, at_least_one, check_task, seed_list
 from sgft_jax.io.runs import check_folder
 from sgft_jax.presets import PRESETS, PretrainConfig

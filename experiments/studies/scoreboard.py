@@ -4,7 +4,7 @@ Reads what fine-tuning has left in <out>/finetune for the gaps of these files, a
 released tables.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,16 +20,12 @@ from sgft_jax.methods import DEFAULT
 
 if TYPE_CHECKING:
     from sgft_jax.analysis.curves import Curve
-    from sgft_jax.analysis.scoreboard import Row
 
     Played = dict[str, dict[str, dict[str, Curve]]]  # by METHOD or METHOD:VARIANT, stratum and "task/gap"
 
 CONTROL = "no gap"
+ORDER = (CONTROL, *STRATA)
 _EACH = "Start: area / end / deepest fall of the mean below the start, for each gap:"
-_HEAD = (
-    "stratum", "method", "gaps", "start", "area", "end", "90 % held at the end", "90 % held ever, after transitions",
-    "deepest fall: zero-shot / own start", "loss at the end", "training",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -73,79 +69,65 @@ def board(args: ScoreboardArgs) -> str:
 
 
 def _tables(args: ScoreboardArgs, played: "Played") -> str:
-    from sgft_jax.analysis import scoreboard, tables
+    from sgft_jax.analysis import scoreboard
+    from sgft_jax.analysis.tables import markdown
 
-    curves = [curve for each in played.values() for own in each.values() for curve in own.values()]
+    curves = [curve for strata in played.values() for runs in strata.values() for curve in runs.values()]
     rows = [
-        scoreboard.row(method, stratum, each[stratum], curves)
-        for stratum in (CONTROL, *STRATA)
-        for method, each in played.items()
-        if stratum in each
+        scoreboard.row(method, stratum, strata[stratum], curves)
+        for stratum in ORDER
+        for method, strata in played.items()
+        if stratum in strata
     ]
-    said = ["Success in per cent, mean over gaps.", "", tables.markdown(_HEAD, [_line(row) for row in rows]), ""]
-    hard = {method: {**each.get("partial", {}), **each.get("failed", {})} for method, each in played.items()}
-    if len(played) > 1 and (own := hard.pop(args.reference)):
-        found = [scoreboard.duel(own, method, each) for method, each in hard.items() if set(own) & set(each)]
-        lines = [[d.other, f"{d.ahead} of {d.gaps}", tables.number(d.better)] for d in found]
+    texts = ["Success in per cent, mean over gaps.", markdown(scoreboard.HEAD, rows)]
+    hard = {method: strata.get("partial", {}) | strata.get("failed", {}) for method, strata in played.items()}
+    if len(played) > 1 and (reference := hard.pop(args.reference)):
+        duels = [scoreboard.duel(reference, method, runs) for method, runs in hard.items()]
         head = (f"{args.reference} against", "gaps with at least its area", "P(better), per cent")
-        said += ["On gaps that are not solved:", "", tables.markdown(head, lines), ""]
+        texts += ["On gaps that are not solved:", markdown(head, [cells for cells in duels if cells])]
     if args.each:
-        said += [_EACH, "", _gap_by_gap(played), ""]
-    return "\n".join(said).rstrip()
+        texts += [_EACH, markdown(("gap", "stratum", *played), _gap_by_gap(played))]
+    return "\n\n".join(texts)
 
 
-def _gap_by_gap(played: "Played") -> str:
+def _gap_by_gap(played: "Played") -> Iterator[list[str]]:
     """A line for each gap, a column for each method, empty where it did not run."""
-    from sgft_jax.analysis import tables
+    from sgft_jax.analysis.scoreboard import brief
 
-    lines = []
-    for stratum in (CONTROL, *STRATA):
-        runs = {method: each.get(stratum, {}) for method, each in played.items()}
-        for gap in sorted({gap for each in runs.values() for gap in each}):
-            lines.append([gap, stratum, *(_cell(each.get(gap)) for each in runs.values())])
-    return tables.markdown(("gap", "stratum", *played), lines)
-
-
-def _cell(curve: "Curve | None") -> str:
-    from sgft_jax.analysis import scoreboard, tables
-
-    if curve is None:
-        return ""
-    row = scoreboard.row(curve.method, "", {curve.gap: curve})
-    start, area, end = (tables.plain(float(band.estimate), curve.score) for band in (row.start, row.area, row.end))
-    return f"{start}: {area} / {end} / {tables.plain(row.fall, curve.score)}"
+    for stratum in ORDER:
+        columns = [strata.get(stratum, {}) for strata in played.values()]
+        for gap in sorted({gap for runs in columns for gap in runs}):
+            yield [gap, stratum, *(brief(runs.get(gap)) for runs in columns)]
 
 
 def _draw(args: ScoreboardArgs, played: "Played") -> Path:
     """The picture of those methods that ran on all gaps of a stratum that the reference ran on: a panel a stratum."""
     from sgft_jax.analysis import figures, scoreboard
 
-    reference = played[args.reference]
-    panels = {
-        f"{stratum}, {len(own)} {'tasks' if stratum == CONTROL else 'gaps'}": [
-            scoreboard.pooled(each[stratum]) for each in played.values() if set(each.get(stratum, ())) >= set(own)
-        ]
-        for stratum in (CONTROL, *STRATA)
-        if (own := reference.get(stratum))
-    }
+    panels = {}
+    for stratum in ORDER:
+        if gaps := played[args.reference].get(stratum, {}).keys():
+            runs = [strata.get(stratum, {}) for strata in played.values()]
+            words = f"{stratum}, {len(gaps)} {'tasks' if stratum == CONTROL else 'gaps'}"
+            panels[words] = [scoreboard.pooled(curves) for curves in runs if curves.keys() >= gaps]
     return figures.learning_curves(args.out / "scoreboard.png", panels, title="Mean over the gaps of a stratum")
 
 
 def strata_of(files: tuple[Path, ...]) -> dict[str, str]:
     """The stratum of every gap by name, the control first; raises UserError for a gap that has none."""
-    found = {SIM: CONTROL}
+    strata = {SIM: CONTROL}
     for file in files:
         for gap in gaps.read_file(file).values():
             if not gap.stratum:
                 raise UserError(f"{file} [{gap.name}]: has no 'stratum'; experiments.studies.gaps_draw writes sets")
-            found[gap.name] = gap.stratum
-    return found
+            strata[gap.name] = gap.stratum
+    return strata
 
 
 def played_on(args: ScoreboardArgs) -> "Played":
     """All that ran on these gaps, not on the control alone; UserError where nobody did, or the reference did not."""
-    found = _runs_on(args, strata_of(args.gaps))
-    played = {method: each for method, each in found.items() if set(each) - {CONTROL}}
+    runs = _runs_on(args, strata_of(args.gaps))
+    played = {method: strata for method, strata in runs.items() if set(strata) - {CONTROL}}
     if not played:
         raise UserError(f"{args.data or args.out / 'finetune'}: holds no evaluated run on these gaps")
     if args.reference not in played:
@@ -154,47 +136,22 @@ def played_on(args: ScoreboardArgs) -> "Played":
 
 
 def _runs_on(args: ScoreboardArgs, strata: Mapping[str, str]) -> "Played":
-    from sgft_jax.analysis.curves import read_data, read_runs
-    from sgft_jax.analysis.tables import spec
+    from sgft_jax.analysis.release import read
 
-    curves = [c for c in (read_data(args.data) if args.data else read_runs(args.out)).curves if c.gap in strata]
+    curves = [curve for curve in read(args.out, args.data).curves if curve.gap in strata]
     for option, field, wanted in (("--tasks", "task", args.tasks), ("--priors", "priors", args.priors)):
-        there = {getattr(curve, field) for curve in curves}
-        if there and (odd := [name for name in wanted if name not in there]):
-            raise UserError(unknown(option, odd[0], there))
+        names = {getattr(curve, field) for curve in curves}
+        if names and (odd := [name for name in wanted if name not in names]):
+            raise UserError(unknown(option, odd[0], names))
         curves = [curve for curve in curves if not wanted or getattr(curve, field) in wanted]
-    found: Played = {}
+    played: Played = {}
     for curve in curves:
-        own = found.setdefault(spec(curve), {}).setdefault(strata[curve.gap], {})
-        if (name := f"{curve.task}/{curve.gap}") in own:
-            raise UserError(
-                f"{args.data or args.out}: {spec(curve)} ran on {name} with several sets of seeds or priors; keep "
-                "one, or choose with --priors"
-            )
-        own[name] = curve if args.seeds is None else curve.first(args.seeds)
-    return found
-
-
-def _line(row: "Row") -> list[str]:
-    from sgft_jax.analysis import tables
-
-    scores = [tables.number(band) for band in (row.start, row.area, row.end)]
-    policy = tables.NONE if row.policy_fall != row.policy_fall else f"{100 * row.policy_fall:.0f}"
-    worst = f"{policy} / {100 * row.fall:.0f}" + (f" ({row.worst})" if row.fall >= 0.005 else "")
-    training = "" if row.training != row.training else f"{100 * row.training:.0f}"
-    held = f"{row.held} of {row.gaps}"
-    ever = f"{row.reached} of {row.gaps}" + (f", {row.transitions:.0f}" if row.reached else "")
-    return [
-        row.stratum,
-        row.method,
-        str(row.gaps),
-        *scores,
-        held,
-        ever,
-        worst,
-        f"{100 * max(row.loss, 0):.0f}",
-        training,
-    ]
+        runs = played.setdefault(curve.spec, {}).setdefault(strata[curve.gap], {})
+        if (name := f"{curve.task}/{curve.gap}") in runs:
+            several = f"{curve.spec} ran on {name} with several sets of seeds or priors"
+            raise UserError(f"{args.data or args.out}: {several}; keep one, or choose with --priors")
+        runs[name] = curve if args.seeds is None else curve.first(args.seeds)
+    return played
 
 
 if __name__ == "__main__":

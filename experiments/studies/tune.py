@@ -13,23 +13,22 @@ import time
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from envs import extend, gaps
 from envs.types import UserError
 from experiments.runner import cli, grid, tuned
-from experiments.runner.cells import Cell, check_begun, complete
-from experiments.runner.finetune_args import with_settings
+from experiments.runner.cells import Cell, check_begun, complete, refuse
 from experiments.runner.grid import GridArgs
 from experiments.runner.options import at_least_one, prior_home, seed_list
 from experiments.studies.spaces import SPACES, first, space_of
 from sgft_jax.io import runs
 from sgft_jax.io.log import SUMMARY
-from sgft_jax.methods import NAMES
+from sgft_jax.methods import NAMES, get_method
+from sgft_jax.presets import preset_of
 
 FOLDER = "tune"  # the trials have a tree of their own, which figures of the comparison do not look into
 
@@ -69,6 +68,11 @@ class Trial(NamedTuple):
     settings: dict[str, Any]
     cells: list[Cell]
 
+    @property
+    def folders(self) -> list[Path]:
+        """Of the runs."""
+        return [cell.folder for cell in self.cells]
+
 
 class Score(NamedTuple):
     """Of a trial, means over seeds and real systems, and the areas of every seed by real system.
@@ -81,25 +85,21 @@ class Score(NamedTuple):
     areas: dict[str, list[float]]
 
 
-def main(args: TuneArgs) -> None:
-    """Runs what is missing, then chooses; raises UserError in the end if some trials could not run."""
-    if failed := tune(args):
-        raise UserError(f"{len(failed)} of the trials did not run: {'; '.join(failed)}")
-
-
-def tune(args: TuneArgs) -> list[str]:
-    """Works through the trials, then writes and prints the results; returns a line for each run that failed."""
+def tune(args: TuneArgs) -> None:
+    """Works through the trials, then writes and prints the results; raises UserError in the end if some did not run."""
     args = replace(args, reals=gaps.each(args.reals))
-    pairs, started, failed = _pairs(args), time.monotonic(), []
+    grid.check(args)
+    at_least_one(args, "trials")
+    pairs, started, failed = list(itertools.product(args.tasks, args.methods)), time.monotonic(), []
     print(f"budget of each method on each task: {_budget_words(args)}")
     for i in range(len(rungs(args))):
-        found = [stages(args, *pair)[i:] for pair in pairs]  # empty where the rung before is not finished
-        cells = [cell for stage in found for trial in (stage[0] if stage else []) for cell in trial.cells]
+        begun = [stages(args, *pair)[i:] for pair in pairs]  # empty where the rung before is not finished
+        cells = [cell for stage in begun for trial in (stage[0] if stage else []) for cell in trial.cells]
         check_begun(cells)
         failed += complete(cells, args, started=started)
     for task, method in pairs:
         _conclude(args, task, method)
-    return failed
+    refuse(failed, "trials")
 
 
 def rungs(args: TuneArgs) -> list[Rung]:
@@ -121,17 +121,16 @@ def rungs(args: TuneArgs) -> list[Rung]:
     return list(itertools.starmap(Rung, zip(counts, ends, strict=True)))
 
 
-def real_rollouts(found: Sequence[Rung]) -> int:
+def real_rollouts(steps: Sequence[Rung]) -> int:
     """Real rollouts of one seed on one real system in all trials; those that go on begin where they stopped."""
-    before = [0, *(rung.rollouts for rung in found)]
-    return sum(rung.trials * (rung.rollouts - done) for rung, done in zip(found, before, strict=False))
+    before = [0, *(rung.rollouts for rung in steps)]
+    return sum(rung.trials * (rung.rollouts - done) for rung, done in zip(steps, before, strict=False))
 
 
 def _budget_words(args: TuneArgs) -> str:
-    found = rungs(args)
-    steps = ", ".join(f"{rung.trials} trials to {rung.rollouts} rollouts" for rung in found)
-    total = real_rollouts(found) * args.seeds * len(args.reals)
-    return f"{steps}; seeds: {args.seeds}, real systems: {len(args.reals)}; {total:,} real rollouts in all"
+    words = ", ".join(f"{trials} trials to {rollouts} rollouts" for trials, rollouts in rungs(args))
+    total = real_rollouts(rungs(args)) * args.seeds * len(args.reals)
+    return f"{words}; seeds: {args.seeds}, real systems: {len(args.reals)}; {total:,} real rollouts in all"
 
 
 def draw(
@@ -141,8 +140,8 @@ def draw(
 
     key: what the draw depends on; of the same key, more trials begin with the same ones.
     """
-    every = [leading[0] | dict(zip(space, values, strict=True)) for values in itertools.product(*space.values())]
-    others = [settings for settings in every if settings not in leading]
+    product = (leading[0] | dict(zip(space, values, strict=True)) for values in itertools.product(*space.values()))
+    others = [settings for settings in product if settings not in leading]
     order = np.random.default_rng(key).permutation(len(others))
     return [*leading, *(others[i] for i in order)][:trials]
 
@@ -153,34 +152,29 @@ def trials(args: TuneArgs, task: str, method: str) -> list[Trial]:
     drawn = draw(space_of(method), first(method), args.trials, key=key)
     if len(drawn) < args.trials:
         raise UserError(f"--trials is {args.trials}: {method} has only {len(drawn)} different ones")
-    return [
-        Trial(k, settings, [_look_up(args, task, real, method, k, settings) for real in args.reals])
-        for k, settings in enumerate(drawn)
-    ]
+    prior = prior_home(args.out, extend.name_of(task), preset_of(get_method(method)))
 
+    def cell(real: str, k: int, settings: dict[str, Any]) -> Cell:
+        changes = {"prior": prior, "variant": f"trial-{k}", "out": args.out / FOLDER}
+        return grid.cell_of(args, task, real, method, settings, **changes)
 
-def _look_up(args: TuneArgs, task: str, real: str, method: str, number: int, settings: dict[str, Any]) -> Cell:
-    run = grid.run_of(args, task, real, method)
-    priors = prior_home(args.out, extend.name_of(task), run.preset)
-    run = replace(run, prior=priors, variant=f"trial-{number}", out=args.out / FOLDER)
-    return grid.look_up(with_settings(run, settings))
+    return [Trial(k, settings, [cell(real, k, settings) for real in args.reals]) for k, settings in enumerate(drawn)]
 
 
 def stages(args: TuneArgs, task: str, method: str) -> list[list[Trial]]:
     """The trials of each rung, as far as it is known: who goes on is decided when a rung is finished."""
-    found: list[list[Trial]] = []
+    known: list[list[Trial]] = []
     numbers, before = list(range(args.trials)), 0
     for rung in rungs(args):
-        if found:
-            scores = [score(trial, before) for trial in found[-1]]
-            finished = [each for each in scores if each is not None]
-            if len(finished) < len(scores):
+        if known:
+            scores = [value for trial in known[-1] if (value := score(trial, before)) is not None]
+            if len(scores) < len(known[-1]):
                 break
-            numbers = [numbers[i] for i in keep(finished, rung.trials)]
-        every = trials(replace(args, rollouts=rung.rollouts), task, method)
-        found.append([every[number] for number in numbers])
+            numbers = [numbers[i] for i in keep(scores, rung.trials)]
+        drawn = trials(replace(args, rollouts=rung.rollouts), task, method)
+        known.append([drawn[number] for number in numbers])
         before = rung.rollouts
-    return found
+    return known
 
 
 def keep(scores: Sequence[Score], count: int) -> list[int]:
@@ -191,17 +185,18 @@ def keep(scores: Sequence[Score], count: int) -> list[int]:
 
 def score(trial: Trial, rollouts: int) -> Score | None:
     """How its runs went up to so many rollouts; None if one is not finished."""
-    from sgft_jax.analysis.curves import area, read_curve
+    from sgft_jax.analysis.curves import area
+    from sgft_jax.analysis.reading import read_curve
 
     if any(cell.state != "finished" for cell in trial.cells):
         return None
     areas, finals = {}, []
     for cell in trial.cells:
         curve = read_curve(cell.folder)
-        inside = curve.rollouts <= rollouts
-        found = area(curve, curve.rollouts[inside])
-        assert found is not None  # a finished run has been evaluated twice at least
-        areas[gaps.title(*cell.args.real)] = found.tolist()
+        inside = curve.x <= rollouts
+        by_seed = area(curve, curve.x[inside])
+        assert by_seed is not None  # a finished run has been evaluated twice at least
+        areas[gaps.title(*cell.args.real)] = by_seed.tolist()
         finals.append(curve.values[:, inside][:, -1].mean())
     return Score(float(np.mean(list(areas.values()))), float(np.mean(finals)), areas)
 
@@ -235,63 +230,62 @@ def outcomes(args: TuneArgs, task: str, method: str) -> list[Outcome]:
 
 def _conclude(args: TuneArgs, task: str, method: str) -> None:
     """Prints the trials of one method and, if all are finished, writes down which is best."""
-    found = outcomes(args, task, method)
-    finished = sum(each.score is not None for each in found)
-    finalists = {each.trial.number: each.score for each in found if each.rollouts == args.rollouts and each.score}
-    complete = finished == len(found) and len(finalists) == rungs(args)[-1].trials
+    tried = outcomes(args, task, method)
+    finished = sum(outcome.score is not None for outcome in tried)
+    finalists = {trial.number: scored for trial, rollouts, scored in tried if rollouts == args.rollouts and scored}
+    complete = finished == len(tried) and len(finalists) == rungs(args)[-1].trials
     chosen = list(finalists)[best(list(finalists.values()))] if complete else None
-    Console(width=120).print(_table(f"{method} on {task}", found, chosen))
+    print("\n".join([f"{method} on {task}", *_table(tried, chosen)]))
     if args.dry:
         return
     if chosen is None:
-        print(f"{task}/{method}: {finished} of {len(found)} trials are finished; nothing is chosen before all are")
+        print(f"{task}/{method}: {finished} of {len(tried)} trials are finished; nothing is chosen before all are")
         return
-    path = tuned.write(args.out, task, method, _result(args, task, method, found, chosen))
+    path = tuned.write(args.out, task, method, _result(args, task, method, tried, chosen))
     print(f"written: {path}; next: python -m experiments.compare --tuned --tasks {task} --methods {method}")
 
 
-def _result(args: TuneArgs, task: str, method: str, found: list[Outcome], chosen: int) -> dict[str, Any]:
+def _result(args: TuneArgs, task: str, method: str, tried: list[Outcome], chosen: int) -> dict[str, Any]:
     """The file of one method, see docs/formats.md."""
-    tried = [
+    trials = [
         {
-            "options": trial.settings, "rollouts": rollouts, **each._asdict(),
-            "folders": [cell.folder for cell in trial.cells],
+            "options": trial.settings,
+            "rollouts": rollouts,
+            **scored._asdict(),
+            "folders": [c.folder for c in trial.cells],
         }
-        for trial, rollouts, each in found if each is not None
-    ]  # fmt: skip
-    budget = {
-        "trials": args.trials, "reals": [gaps.title(real) for real in args.reals],
-        "seeds": seed_list(args.seed, args.seeds), "rollouts": args.rollouts,
-        "eval_every": args.eval_every, "halve": args.halve,
-    }  # fmt: skip
+        for trial, rollouts, scored in tried
+        if scored is not None
+    ]
+    reals = [gaps.title(real) for real in args.reals]
+    budget = {"trials": args.trials, "reals": reals, "seeds": seed_list(args.seed, args.seeds)}
+    budget |= {name: getattr(args, name) for name in ("rollouts", "eval_every", "halve")}
     return {
-        "task": task, "method": method, "options": found[chosen].trial.settings, "trial": chosen, "budget": budget,
-        "gaps": [runs.read_own(cell.folder / SUMMARY, {"gap": dict})["gap"] for cell in found[0].trial.cells],
-        "space": space_of(method), "trials": tried, "provenance": runs.provenance(),
-    }  # fmt: skip
+        "task": task,
+        "method": method,
+        "options": tried[chosen].trial.settings,
+        "trial": chosen,
+        "budget": budget,
+        "gaps": [runs.read_own(cell.folder / SUMMARY, {"gap": dict})["gap"] for cell in tried[0].trial.cells],
+        "space": space_of(method),
+        "trials": trials,
+        "provenance": runs.provenance(),
+    }
 
 
-def _table(title: str, found: Sequence[Outcome], chosen: int | None) -> Table:
-    """The trials with the options in which they differ, and their scores; the chosen one is marked."""
-    table = Table(title=title)
-    differ = [name for name in found[0].trial.settings if len({each.trial.settings[name] for each in found}) > 1]
-    for column in ("trial", *differ, "rollouts", "area", "final %", ""):
-        table.add_column(column, justify="right")
-    for trial, rollouts, each in found:
-        cells = ("-", "-") if each is None else (f"{each.area:.3f}", f"{100 * each.final:.0f}")
+def _table(tried: Sequence[Outcome], chosen: int | None) -> list[str]:
+    """The trials with the options in which they differ, and their scores, a line each; the chosen one is marked."""
+    options = [outcome.trial.settings for outcome in tried]
+    differ = [name for name in options[0] if len({settings[name] for settings in options}) > 1]
+    rows = [["trial", *differ, "rollouts", "area", "final %", ""]]
+    for trial, rollouts, scored in tried:
+        cells = ("-", "-") if scored is None else (f"{scored.area:.3f}", f"{100 * scored.final:.0f}")
         note = "chosen" if trial.number == chosen else "defaults" if trial.number == 0 else ""
-        own = (trial.settings[name] for name in differ)
-        values = (f"{value:g}" if isinstance(value, float) else str(value) for value in own)
-        table.add_row(str(trial.number), *values, str(rollouts), *cells, note)
-    return table
-
-
-def _pairs(args: TuneArgs) -> list[tuple[str, str]]:
-    """Tasks and methods, checked."""
-    grid.check(args)
-    at_least_one(args, "trials")
-    return [(task, method) for task in args.tasks for method in args.methods]
+        values = [trial.settings[name] for name in differ]
+        words = (f"{value:g}" if isinstance(value, float) else str(value) for value in values)
+        rows.append([str(trial.number), *words, str(rollouts), *cells, note])
+    return cli.columns(rows)
 
 
 if __name__ == "__main__":
-    cli.run_main(main, TuneArgs, __doc__ or "")
+    cli.run_main(tune, TuneArgs, __doc__ or "")

@@ -1,71 +1,66 @@
-"""Impure: learning curves, what fine-tuning runs scored on the real system; reads run folders and released tables.
+"""Learning curves: what runs of any kind scored in the real system, what a curve says, which are comparable. Pure.
 
-A curve holds any score (success, return) of several members, one for each seed. Curves as arrays are `Curve.scores`, as
-a flat table `rows`.
+A curve holds any score (success, return) of several members, one for each seed, as arrays in `Curve.scores`. `reading`
+makes curves of run folders, `release` of released tables.
 """
 
-import json
-import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from msgspec import Meta
 
-from envs import extend
-from envs.files import Count
-from envs.types import UserError
-from sgft_jax.files.csvfile import finite, read_csv, table_file, whole
-from sgft_jax.io.log import EVAL, METRICS, SUMMARY, check_records, read_jsonl
-from sgft_jax.io.runs import read_config, read_own, read_starts
-from sgft_jax.math.stats import ENOUGH, Interval, bootstrap_interval, mean, paired_improvement
-from sgft_jax.methods import NAMES, get_method
+from sgft_jax.math.stats import ENOUGH, Interval, bootstrap_interval, iqm, mean, paired_improvement
+from sgft_jax.methods import FIXED_NAMES, NAMES, get_method
 
 LEVEL = 0.9  # success that counts as solved
 SCORES = ("success", "return")
 IDENTITY = ("task", "gap", "method", "variant", "priors")
-_NUMBERS = ("prior", "seed", "rollouts", "transitions", "minutes")
-COLUMNS = (*IDENTITY, *_NUMBERS, *SCORES, "training")
-# Of a line of eval.jsonl, beside its scores.
-_EVALUATION = {"step": Count, "rollouts": Count, "robot_minutes": Annotated[float, Meta(ge=0)]}
-_UNNAMED = re.compile(r"prior|seeds?-\d+(-\d+)?")  # folders that name no set of priors
-# Of a run's options those that are in other columns, or say nothing about its outcome; paths of a machine above all.
-_LEFT_OUT = (
-    "out", "prior", "resume", "overwrite", "video", "devices", "checkpoint_every", "task", "method", "variant", "real",
-    "impl",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Evaluations of one fine-tuning run on the real system; the first one is zero-shot.
+    """Evaluations of one run in the real system; the first one is before it learns anything.
 
-    task, gap, method, variant ("" for a method's defaults): what was run. priors: name of the set of priors that the
-    members began from; curves are comparable member by member where it is the same. seeds: [members]. prior: [members]
-    index into the set, -1 where unknown. rollouts, transitions: [evaluations] real ones used so far. minutes:
-    [evaluations] of robot time without resets. scores: by name, [members, evaluations], the task's own, never reshaped.
-    score: the one that summaries are of. facts: commit, hardware and options of the run, for tables of runs.
-    training: [members, evaluations] mean score of the training rollouts since the evaluation before, nan where there
-    were none; None where it is not known.
+    task, method, variant ("" for a method's defaults): what was run. gap: the real system of fine-tuning, or the
+    simulator of learning from a log, "" where the method sees none. data: the log, "" without one. priors: name of the
+    set of priors that the members began from; curves are comparable member by member where it is the same. seeds:
+    [members]. prior: [members] index into the set, -1 where unknown. x: [evaluations], in `unit`: real rollouts or
+    updates so far. transitions: [evaluations] real ones used so far, nan where nothing real is collected. minutes:
+    [evaluations] of robot time without resets. scores: by name, [members, evaluations], the task's own, never reshaped,
+    and what else it is judged by. score: the one that summaries are of. facts: commit, hardware and options of the run,
+    for tables of runs. training: [members, evaluations] mean score of the training rollouts since the evaluation
+    before, nan where there were none; None where it is not known.
     """
 
     task: str
     gap: str
     method: str
-    variant: str
-    priors: str
+    variant: str = ""
+    priors: str = ""
+    _: KW_ONLY
     seeds: np.ndarray
-    prior: np.ndarray
-    rollouts: np.ndarray
-    transitions: np.ndarray
-    minutes: np.ndarray
+    x: np.ndarray
     scores: Mapping[str, np.ndarray]
     score: str = "success"
+    prior: np.ndarray = field(default_factory=lambda: np.array(-1))
+    transitions: np.ndarray = field(default_factory=lambda: np.array(np.nan))
+    minutes: np.ndarray = field(default_factory=lambda: np.array(np.nan))
     facts: Mapping[str, Any] = field(default_factory=dict)
     training: np.ndarray | None = None
+    data: str = ""
+    unit: Literal["rollouts", "updates"] = "rollouts"
+
+    def __post_init__(self) -> None:
+        """What nobody knows is so for every member and evaluation."""
+        for name, like in (("prior", self.seeds), ("transitions", self.x), ("minutes", self.x)):
+            object.__setattr__(self, name, np.broadcast_to(getattr(self, name), like.shape))
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """What tells runs over real rollouts apart but for their seeds, see `IDENTITY`."""
+        return {name: getattr(self, name) for name in IDENTITY}
 
     @property
     def values(self) -> np.ndarray:
@@ -73,13 +68,20 @@ class Curve:
         return self.scores[self.score]
 
     @property
+    def spec(self) -> str:
+        """The method with its variant, as commands take it: METHOD or METHOD:VARIANT."""
+        return ":".join(filter(None, [self.method, self.variant]))
+
+    @property
     def name(self) -> str:
-        """The method, with its variant if it has one."""
-        return " ".join(filter(None, [self.method, self.variant]))
+        """The method with its variant, as tables and legends have it; over updates that is a preset, as typed."""
+        return self.spec if self.unit == "updates" else self.spec.replace(":", " ", 1)
 
     @property
     def family(self) -> str:
         """The kind of method; "own" for one that does not come with the library."""
+        if self.unit == "updates":
+            return get_method(self.method, "fixed").kind if self.method in FIXED_NAMES else "own"
         return get_method(self.method).family if self.method in NAMES else "own"
 
     def of(self, score: str) -> "Curve":
@@ -88,9 +90,14 @@ class Curve:
 
     def first(self, n: int) -> "Curve":
         """The same curve with its first n members alone; with all of them where there are fewer."""
-        scores = {name: values[:n] for name, values in self.scores.items()}
-        training = None if self.training is None else self.training[:n]
-        return replace(self, seeds=self.seeds[:n], prior=self.prior[:n], scores=scores, training=training)
+        return self.members(range(min(n, len(self.seeds))))
+
+    def members(self, indices: Sequence[int]) -> "Curve":
+        """The same curve of these members, in this order."""
+        chosen = np.asarray(indices, int)
+        scores = {name: values[chosen] for name, values in self.scores.items()}
+        training = None if self.training is None else self.training[chosen]
+        return replace(self, seeds=self.seeds[chosen], prior=self.prior[chosen], scores=scores, training=training)
 
 
 class Found(NamedTuple):
@@ -100,25 +107,63 @@ class Found(NamedTuple):
     notes: list[str]
 
 
+def make_curve(
+    evaluations: Mapping[int, Any],
+    task: Any,
+    *,
+    gap: str,
+    method: str,
+    seeds: Sequence[int],
+    variant: str = "",
+    transitions: Sequence[float] | None = None,
+) -> Curve:
+    """A curve from Python alone, without a run folder.
+
+    evaluations: the real rollouts made so far -> what `sgft_jax.evaluate` played then, episodes [members, n]. task: the
+    `Env`. gap, method, variant: names for tables and figures. seeds: [members]. transitions: [evaluations] real ones
+    made so far, such as the mean of `FinetuneProgress.transitions`; None where no rollout ended early.
+    """
+    from envs.rollout import counted  # brings JAX, which reading curves does without
+
+    played, rollouts = list(evaluations.values()), np.array(list(evaluations))
+
+    def mean_of(score: Callable[[Any], Any]) -> np.ndarray:
+        return np.stack([np.asarray(score(episodes)).mean(1) for episodes in played], axis=1)
+
+    made = rollouts * task.episode_length if transitions is None else np.rint(transitions).astype(int)
+    return Curve(
+        task.name,
+        gap,
+        method,
+        variant,
+        seeds=np.asarray(seeds),
+        x=rollouts,
+        transitions=made,
+        minutes=made * task.control_dt / 60,
+        scores={"success": mean_of(lambda x: x.success), "return": mean_of(lambda x: counted(x)[1])},
+        score=task.score,
+    )
+
+
 # ---------------------------------------------------------------- metrics
 
 
 def common_grid(curves: Iterable[Curve]) -> np.ndarray:
-    """Rollouts at which every one of the curves was evaluated, in order."""
-    first, *others = (set(curve.rollouts.tolist()) for curve in curves)
+    """The x at which every one of the curves was evaluated, in order."""
+    first, *others = (set(curve.x.tolist()) for curve in curves)
     return np.array(sorted(first.intersection(*others)), int)
 
 
-def at(curve: Curve, rollouts: int) -> np.ndarray | None:
-    """[members] score at the evaluation after exactly so many rollouts; None where there was none."""
-    (index,) = np.nonzero(curve.rollouts == rollouts)
+def at(curve: Curve, x: int) -> np.ndarray | None:
+    """[members] score at the evaluation at exactly this x; None where there was none."""
+    (index,) = np.nonzero(curve.x == x)
     return curve.values[:, index[-1]] if index.size else None
 
 
 def area(curve: Curve, grid: Sequence[int] | np.ndarray) -> np.ndarray | None:
-    """[members] mean score over the rollouts from the first to the last of a grid: area by trapezoids over length.
+    """[members] mean score from the first to the last x of a grid: area by trapezoids over length.
 
-    grid: rollouts, increasing, the same for all curves that are compared; None unless the curve was evaluated at two or
+    grid: of x, increasing, the same for all curves that are compared; None unless the curve was evaluated at two or
     more of them and at all of them. High where learning is early and lasts.
     """
     points = [point for n in grid if (point := at(curve, int(n))) is not None]
@@ -143,10 +188,10 @@ def zero_shot(curve: Curve, others: Iterable[Curve]) -> np.ndarray | None:
     `Online.zero_shot`). None if it was not evaluated there.
     """
     for other in sorted(others, key=lambda other: other is not curve):
-        if other.method in NAMES and get_method(other.method).zero_shot and other.rollouts[0] == 0:
-            found = dict(zip(other.seeds.tolist(), other.values[:, 0].tolist(), strict=True))
-            if set(curve.seeds.tolist()) <= found.keys():
-                return np.array([found[seed] for seed in curve.seeds.tolist()])
+        if other.method in NAMES and get_method(other.method).zero_shot and other.x[0] == 0:
+            place = {seed: i for i, seed in enumerate(other.seeds.tolist())}
+            if set(curve.seeds.tolist()) <= place.keys():
+                return other.values[[place[seed] for seed in curve.seeds.tolist()], 0]
     return None
 
 
@@ -154,7 +199,7 @@ def training_score(curve: Curve) -> np.ndarray | None:
     """[members] mean score of all training rollouts: what the robot lived through. None where it is not known."""
     if curve.training is None:
         return None
-    weights = np.diff(curve.rollouts, prepend=0) * np.isfinite(curve.training)
+    weights = np.diff(curve.x, prepend=0) * np.isfinite(curve.training)
     played = weights.sum(1)
     return np.nansum(curve.training * weights, axis=1) / played if played.all() else None
 
@@ -164,12 +209,12 @@ def improvement(curve: Curve, over: Curve, grid: Sequence[int] | np.ndarray) -> 
 
     The prior is the random factor; where priors are unknown, the seed. None where there is nothing to compare.
     """
-    own, other = area(curve, grid), area(over, grid)
-    if own is None or other is None:
+    areas, others = area(curve, grid), area(over, grid)
+    if areas is None or others is None:
         return None
     known = bool((curve.prior >= 0).all() and (over.prior >= 0).all())
     labels = (curve.prior, over.prior) if known else (curve.seeds, over.seeds)
-    return paired_improvement(own, other, *labels) if np.intersect1d(*labels).size else None
+    return paired_improvement(areas, others, *labels) if np.intersect1d(*labels).size else None
 
 
 def transitions_until_held(curve: Curve, level: float = LEVEL) -> int | None:
@@ -177,8 +222,8 @@ def transitions_until_held(curve: Curve, level: float = LEVEL) -> int | None:
 
     None if that never happened; a single evaluation says too little, as success often falls again after it.
     """
-    there = curve.values.mean(0) >= level - 1e-9  # a mean that is 0.9 in exact arithmetic is often a little less
-    held = there[:-1] & there[1:]
+    reached = curve.values.mean(0) >= level - 1e-9  # a mean that is 0.9 in exact arithmetic is often a little less
+    held = reached[:-1] & reached[1:]
     return int(curve.transitions[np.argmax(held)]) if held.any() else None
 
 
@@ -187,12 +232,12 @@ def by_prior(curve: Curve) -> bool:
     return bool((curve.prior >= 0).all()) and len(np.unique(curve.prior)) >= ENOUGH
 
 
-def spread(curve: Curve, scores: np.ndarray) -> Interval:
-    """Interquartile mean over members with its interval, pointwise: hierarchical by prior if `by_prior`, else by seed.
+def spread(curve: Curve, scores: np.ndarray, statistic: Callable[..., np.ndarray] = iqm) -> Interval:
+    """A statistic over members with its interval, pointwise: hierarchical by prior if `by_prior`, else by seed.
 
     scores: [members, ...], such as those at one evaluation.
     """
-    return bootstrap_interval(scores, priors=curve.prior if by_prior(curve) else None)
+    return bootstrap_interval(scores, statistic=statistic, priors=curve.prior if by_prior(curve) else None)
 
 
 def describe(curve: Curve) -> dict[str, Any]:
@@ -211,16 +256,16 @@ def describe(curve: Curve) -> dict[str, Any]:
 
 
 def _point(curve: Curve, i: int) -> dict[str, Any]:
-    found: dict[str, Any] = {
-        "rollouts": int(curve.rollouts[i]),
+    point: dict[str, Any] = {
+        "rollouts": int(curve.x[i]),
         "transitions": int(curve.transitions[i]),
         "robot_minutes": float(curve.minutes[i]),
     }
     for name, values in curve.scores.items():
         band = spread(curve, values[:, i])
         bounds = {"iqm": band.estimate, "low": band.low, "high": band.high, "mean": mean(values[:, i])}
-        found[name] = {key: float(value) for key, value in bounds.items()}
-    return found
+        point[name] = {key: float(value) for key, value in bounds.items()}
+    return point
 
 
 # ---------------------------------------------------------------- choosing what to compare
@@ -254,268 +299,3 @@ def _kind(curve: Curve) -> str:
 def _rank(curve: Curve) -> tuple[bool, int, str]:
     place = NAMES.index(curve.method) if curve.method in NAMES else len(NAMES)
     return (curve.variant != "", place, curve.name)
-
-
-# ---------------------------------------------------------------- run folders
-
-
-def read_curve(folder: Path) -> Curve:
-    """The learning curve of one fine-tuning run <task>/<gap>/<method>[_<variant>]/<seeds>; UserError if it has none."""
-    records = read_jsonl(folder / EVAL) if (folder / EVAL).exists() else []
-    if not records:
-        raise UserError(f"{folder / EVAL}: holds no evaluation yet")
-    names = [name for name in SCORES if name in records[0]] or [SCORES[0]]
-    check_records(folder / EVAL, records, _EVALUATION | dict.fromkeys(names, list[float]))
-    summary = read_own(folder / SUMMARY)
-    if (score := summary.get("score") or _judged_by(records, names)) not in names:
-        raise UserError(f"{folder / SUMMARY}: score is {score!r}, {EVAL} has {', '.join(names)}; put the files back")
-    config, start = read_config(folder), last_start(folder)
-    column = lambda name: np.array([record[name] for record in records])  # noqa: E731
-    scores = {name: column(name).T for name in names}
-    variant = config.get("variant") or ""
-    digests, seeds = start.get("priors", []), config.get("seed", 0) + np.arange(len(next(iter(scores.values()))))
-    return Curve(
-        task=folder.parent.parent.parent.name,
-        gap=folder.parent.parent.name,
-        method=folder.parent.name.removesuffix(f"_{variant}"),
-        variant=variant,
-        priors=set_name(Path(config.get("prior") or config.get("preset") or ""), digests),
-        seeds=seeds,
-        prior=seeds % len(digests) if digests else np.full(len(seeds), -1),
-        rollouts=column("rollouts"),
-        transitions=column("step"),
-        minutes=column("robot_minutes"),
-        scores=scores,
-        score=score,
-        facts=_facts(summary, config, start),
-        training=_training(folder / METRICS, column("rollouts")),
-    )
-
-
-def _judged_by(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
-    """By which score a run is judged that has no summary yet to name it: the one that `score` repeats."""
-    repeated = lambda name: all(record.get("score") == record[name] for record in records)  # noqa: E731
-    return next(filter(repeated, names), names[0])
-
-
-def _training(path: Path, rollouts: np.ndarray) -> np.ndarray | None:
-    """`Curve.training` of a run that was evaluated after so many rollouts, from its metrics."""
-    records = [record for record in (read_jsonl(path) if path.exists() else []) if "real/score" in record]
-    if not records:
-        return None
-    check_records(path, records, {"rollouts": Count, "real/score": list[float]})
-    ends = np.array([record["rollouts"] for record in records])  # a record is the mean of all rollouts since the last
-    counts, scores = np.diff(ends, prepend=0), np.array([record["real/score"] for record in records]).T
-    means = np.full((len(scores), len(rollouts)), np.nan)
-    for i, (before, now) in enumerate(zip([0, *rollouts[:-1]], rollouts, strict=True)):
-        if (since := (ends > before) & (ends <= now)).any():
-            means[:, i] = np.average(scores[:, since], axis=1, weights=counts[since])
-    return means
-
-
-def make_curve(
-    evaluations: Mapping[int, Any], task: Any, *, gap: str, method: str, seeds: Sequence[int], variant: str = "",
-    transitions: Sequence[float] | None = None,
-) -> Curve:  # fmt: skip
-    """A curve from Python alone, without a run folder.
-
-    evaluations: the real rollouts made so far -> what `sgft_jax.evaluate` played then, episodes [members, n]. task: the
-    `Env`. gap, method, variant: names for tables and figures. seeds: [members]. transitions: [evaluations] real ones
-    made so far, such as the mean of `FinetuneProgress.transitions`; None where no rollout ended early.
-    """
-    from envs.rollout import counted  # brings JAX, which reading curves does without
-
-    played, rollouts = list(evaluations.values()), np.array(list(evaluations))
-    mean_of = lambda each: np.stack([np.asarray(each(x)).mean(1) for x in played], axis=1)  # noqa: E731
-    made = rollouts * task.episode_length if transitions is None else np.rint(transitions).astype(int)
-    return Curve(
-        task.name, gap, method, variant, priors="",
-        seeds=np.asarray(seeds),
-        prior=np.full(len(seeds), -1),
-        rollouts=rollouts,
-        transitions=made,
-        minutes=made * task.control_dt / 60,
-        scores={"success": mean_of(lambda x: x.success), "return": mean_of(lambda x: counted(x)[1])},
-        score=task.score,
-    )  # fmt: skip
-
-
-def read_runs(out: Path) -> Found:
-    """Every run below <out>/finetune. Runs that differ in seeds alone are one curve of all their seeds.
-
-    If seeds are in several of them, or evaluations differ, that with the most seeds counts, then with most rollouts.
-    """
-    runs: dict[tuple[str, ...], list[tuple[Curve, Path]]] = {}
-    notes = []
-    for folder in sorted(path for path in (out / "finetune").glob("*/*/*/*") if path.is_dir()):
-        try:
-            curve = read_curve(folder)
-        except UserError as error:
-            notes.append(str(error))
-            continue
-        runs.setdefault(tuple(getattr(curve, name) for name in IDENTITY), []).append((curve, folder))
-        if (wanted := curve.facts.get("rollouts", 0)) > curve.rollouts[-1]:
-            notes.append(f"{folder}: unfinished, {curve.rollouts[-1]} of {wanted} rollouts")
-    together = [_together(same) for same in runs.values()]
-    return Found([curve for curve, _ in together], [*notes, *(note for _, more in together for note in more)])
-
-
-def _together(same: list[tuple[Curve, Path]]) -> tuple[Curve, list[str]]:
-    """The curve of runs that differ in seeds, and a line for each one that does not fit the largest."""
-    (first, home), *others = sorted(same, key=lambda run: (-len(run[0].seeds), -run[0].rollouts[-1]))
-    kept, notes, seeds = [first], [], set(first.seeds.tolist())
-    for curve, folder in others:
-        if seeds.isdisjoint(curve.seeds.tolist()) and np.array_equal(curve.rollouts, first.rollouts):
-            kept.append(curve)
-            seeds.update(curve.seeds.tolist())
-        else:
-            notes.append(f"{folder}: left out, {home.name} has more seeds or rollouts, and they cannot be put together")
-    return (joined(kept) if len(kept) > 1 else first), notes
-
-
-def joined(curves: Sequence[Curve]) -> Curve:
-    """One curve of the members of all, in the order of their seeds. They were evaluated after the same rollouts."""
-    order = np.argsort(np.concatenate([curve.seeds for curve in curves]), kind="stable")
-    rows = lambda each: np.concatenate(list(each))[order]  # noqa: E731
-    trained = [curve.training for curve in curves]
-    return replace(
-        curves[0],
-        seeds=rows(curve.seeds for curve in curves),
-        prior=rows(curve.prior for curve in curves),
-        scores={name: rows(curve.scores[name] for curve in curves) for name in curves[0].scores},
-        training=None if any(x is None for x in trained) else rows(x for x in trained if x is not None),
-    )
-
-
-def set_name(folder: Path, digests: Sequence[str]) -> str:
-    """Names a set of priors: its folder and, where known, what tells it from another set trained into that folder.
-
-    A pretraining run lives in <preset>/<seeds>/prior: there the preset is the name.
-    """
-    parts = [part for part in folder.parts if not _UNNAMED.fullmatch(part)]
-    return "-".join([*(part.removeprefix("shipped:") for part in parts[-1:]), *(digest[:6] for digest in digests[:1])])
-
-
-def last_start(folder: Path) -> dict[str, Any]:
-    """What the provenance of a run says of its last start; nothing where there is none."""
-    starts = read_starts(folder)
-    return starts[-1] if starts else {}
-
-
-def _facts(summary: Mapping[str, Any], config: Mapping[str, Any], start: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        **origin(start),
-        "gap_definition": json.dumps(summary.get("gap", {})),
-        "impl": summary.get("impl", ""),
-        **flat({name: value for name, value in config.items() if name not in _LEFT_OUT}),
-    }
-
-
-def origin(start: Mapping[str, Any]) -> dict[str, Any]:
-    """Commit, time, versions and hardware of one start of a run, from its provenance."""
-    device, versions = start.get("device", {}), start.get("versions", {})
-    return {
-        "commit": (start.get("git") or {}).get("commit", "")[:12],
-        "started": start.get("started", ""),
-        "hardware": " ".join(f"{device.get('count', '')} {device.get('kind', '')}".split()),
-        **{name: versions.get(name, "") for name in ("jax", "mujoco")},
-    }
-
-
-def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested options as one level with dotted names; lists become words."""
-    found: dict[str, Any] = {}
-    for name, value in tree.items():
-        if isinstance(value, Mapping):
-            found |= flat(value, f"{prefix}{name}.")
-        else:
-            found[prefix + name] = " ".join(map(str, value)) if isinstance(value, (list, tuple)) else value
-    return found
-
-
-# ---------------------------------------------------------------- flat tables
-
-
-def rows(curves: Iterable[Curve]) -> Iterator[dict[str, Any]]:
-    """The flat table: a row for each evaluation of each member, with the columns `COLUMNS`.
-
-    A run that is judged by its return has no success: the first score of a row is the one that counts.
-    """
-    for curve in curves:
-        scores = SCORES[SCORES.index(curve.score) :]
-        identity = {name: getattr(curve, name) for name in IDENTITY}
-        for i, (seed, prior) in enumerate(zip(curve.seeds.tolist(), curve.prior.tolist(), strict=True)):
-            for j, (n, used, minutes) in enumerate(
-                zip(curve.rollouts.tolist(), curve.transitions.tolist(), curve.minutes.tolist(), strict=True)
-            ):
-                axes = {"prior": prior, "seed": seed, "rollouts": n, "transitions": used, "minutes": minutes}
-                found = {name: float(curve.scores[name][i, j]) for name in scores if name in curve.scores}
-                if curve.training is not None and np.isfinite(curve.training[i, j]):
-                    found["training"] = float(curve.training[i, j])
-                yield {**identity, **axes, **found}
-
-
-def from_rows(table: Iterable[Mapping[str, Any]]) -> list[Curve]:
-    """The curves of a flat table; inverse of `rows`. Raises UserError where members differ in their evaluations."""
-    runs: dict[tuple[str, ...], dict[int, list[Mapping[str, Any]]]] = defaultdict(lambda: defaultdict(list))
-    for row in table:
-        runs[tuple(row[name] for name in IDENTITY)][whole("seed", row["seed"])].append(row)
-    return [_curve(identity, members) for identity, members in runs.items()]
-
-
-def _curve(identity: tuple[str, ...], members: Mapping[int, list[Mapping[str, Any]]]) -> Curve:
-    if len({tuple(row["rollouts"] for row in each) for each in members.values()}) > 1:
-        raise UserError(f"{'/'.join(identity)}: its seeds were not evaluated after the same rollouts")
-    first, *_ = members.values()
-
-    for name, value in zip(IDENTITY, identity, strict=True):
-        if value:  # figures are called like these
-            extend.folder_name(f"the {name}", value)
-
-    def column(name: str, read: Callable[[str, Any], float] = finite) -> np.ndarray:
-        return np.array([[read(name, row[name]) for row in each] for each in members.values()])
-
-    scores = {name: column(name) for name in SCORES if first[0].get(name) not in (None, "")}
-    if not scores:
-        raise ValueError(f"{'/'.join(identity)} has no {' or '.join(SCORES)}")
-    _check_ranges(scores.get("success"), minutes := column("minutes"))
-    missing = lambda row: row.get("training") in (None, "")  # noqa: E731 - at the first evaluation, or everywhere
-    trained = lambda row: np.nan if missing(row) else finite("training", row["training"])  # noqa: E731
-    training = np.array([[trained(row) for row in each] for each in members.values()])
-    return Curve(
-        *identity,
-        seeds=np.array(list(members)),
-        prior=np.array([_prior(each[0]["prior"]) for each in members.values()]),
-        rollouts=column("rollouts", whole)[0],
-        transitions=column("transitions", whole)[0],
-        minutes=minutes[0],
-        scores=scores,
-        score=next(iter(scores)),
-        training=training if np.isfinite(training).any() else None,
-    )
-
-
-def _check_ranges(success: np.ndarray | None, minutes: np.ndarray) -> None:
-    if success is not None and ((success < 0) | (success > 1)).any():
-        raise ValueError(f"success is {success.min():g} to {success.max():g}, not a share")
-    if minutes.min() < 0:
-        raise ValueError(f"minutes is {minutes.min():g}, less than 0")
-
-
-def _prior(cell: Any) -> int:
-    """Index of a prior; -1: unknown."""
-    return whole("prior", float(cell) + 1) - 1
-
-
-def read_data(folder: Path) -> Found:
-    """The curves of released tables, `curves-*.csv.gz` or `.csv`; raises UserError for none, or a damaged one."""
-    names = sorted({path.name.partition(".csv")[0] for path in folder.glob("curves-*.csv*")})
-    files = [table_file(folder, name) for name in names]
-    if not files:
-        raise UserError(f"{folder}: holds no curves-*.csv; write some from runs with: "
-                        f"python -m experiments.figures --export {folder}")  # fmt: skip
-    table = [row for path in files for row in read_csv(path, needed=(*IDENTITY, *_NUMBERS, SCORES[0]))]
-    try:
-        return Found(from_rows(table), [])
-    except ValueError as error:  # of int and float
-        raise UserError(f"{folder}/curves-*.csv: {error}; put the tables back as they were") from error

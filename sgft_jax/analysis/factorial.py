@@ -2,27 +2,17 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from sgft_jax.math.stats import Interval, bootstrap_interval, mean
 
-
-class Factor(NamedTuple):
-    """name; low and high: words for its two levels."""
-
-    name: str
-    low: str
-    high: str
-
-
 Levels = tuple[bool, ...]  # of every factor, whether it is high
 
 
 def effects(
-    cells: Mapping[Levels, ArrayLike], factors: Sequence[Factor], *, priors: ArrayLike | None = None
+    cells: Mapping[Levels, ArrayLike], factors: Sequence[str], *, priors: ArrayLike | None = None
 ) -> dict[str, Interval]:
     """Main effects by name of the factor, and two-way interactions as "one x other".
 
@@ -31,14 +21,15 @@ def effects(
     other factor is high. Intervals draw members, or priors [members] first where they are given. Raises ValueError
     for a combination that is missing.
     """
-    wanted = list(itertools.product((False, True), repeat=len(factors)))
-    if missing := [levels for levels in wanted if levels not in cells]:
+    combinations = list(itertools.product((False, True), repeat=len(factors)))
+    if missing := [levels for levels in combinations if levels not in cells]:
         raise ValueError(f"no scores of the cell {missing[0]}")
-    signs = np.where(np.array(wanted), 1.0, -1.0)  # [cells, factors]
-    scores = np.stack([np.asarray(cells[levels], np.float64) for levels in wanted])  # [cells, members]
-    contrasts = {factor.name: signs[:, i] for i, factor in enumerate(factors)}
-    for (i, one), (j, other) in itertools.combinations(enumerate(factors), 2):
-        contrasts[f"{one.name} x {other.name}"] = signs[:, i] * signs[:, j]
-    half = len(wanted) / 2
-    own = {name: each @ scores / half for name, each in contrasts.items()}
-    return {name: bootstrap_interval(each, statistic=mean, priors=priors) for name, each in own.items()}
+    signs = dict(zip(factors, np.where(np.array(combinations), 1.0, -1.0).T, strict=True))  # of each factor [cells]
+    scores = np.stack([np.asarray(cells[levels], np.float64) for levels in combinations])  # [cells, members]
+    pairs = itertools.combinations(factors, 2)
+    contrasts = signs | {f"{one} x {other}": signs[one] * signs[other] for one, other in pairs}
+    half = len(combinations) / 2
+    return {
+        name: bootstrap_interval(contrast @ scores / half, statistic=mean, priors=priors)
+        for name, contrast in contrasts.items()
+    }

@@ -19,33 +19,13 @@ from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import ArrayLike
 
 from sgft_jax.analysis.curves import Curve, by_prior, spread
-from sgft_jax.analysis.hybrid import Outcome, Results
 from sgft_jax.analysis.verdict import Sign
-from sgft_jax.math.stats import ENOUGH, Interval, bootstrap_interval
-from sgft_jax.methods import FIXED_NAMES, get_method
+from sgft_jax.math.stats import ENOUGH, Interval, iqm
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MOST = len(PALETTE)
 _INK, _GREY, _FAINT = "#333333", "#777777", "#B0B0B0"
 _FONT = {"size": 10, "color": _INK}
-
-
-@dataclass(frozen=True, eq=False)
-class Line:
-    """One curve of a panel.
-
-    name: in the legend. family: what lines are grouped by where they need several panels. x: [evaluations]. band: IQM
-    over members [evaluations] with its interval, nan where there is none. score: its name. seeds: how many members.
-    by_prior: whether the interval draws priors before seeds.
-    """
-
-    name: str
-    family: str
-    x: np.ndarray
-    band: Interval
-    score: str
-    seeds: int
-    by_prior: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,93 +45,64 @@ class Panel:
 
 
 def learning_curves(path: Path, panels: Mapping[str, Sequence[Curve]], *, title: str) -> Path:
-    """Scores over real rollouts: a panel for each entry, by its words; see `lines`."""
-    drawn = {words: [_line(curve) for curve in curves] for words, curves in panels.items()}
-    return lines(path, drawn, {words: _rollouts(curves) for words, curves in panels.items() if curves}, title=title)
+    """Scores over real rollouts or over updates, a panel for each entry, by its words: IQM over members with its band.
 
-
-def hybrid_curves(path: Path, results: Results, data: str, *, title: str) -> Path:
-    """Scores in the real system over updates on one data set: a panel for each simulator, a line for each method.
-
-    A method that sees no simulator, or no data, has the same line wherever it belongs.
+    A panel with more than `MOST` curves becomes several; each shows the others in grey behind its own.
     """
-    panels = {}
-    for gap in results.gaps:
-        found = [results.find(method, data, gap) for method in results.methods]
-        panels[f"simulator: {gap}"] = [_line_of_updates(own, results.score) for own in found if own is not None]
-    return lines(path, panels, dict.fromkeys(panels, "updates"), title=title)
-
-
-def lines(path: Path, panels: Mapping[str, Sequence[Line]], labels: Mapping[str, str], *, title: str) -> Path:
-    """A panel for each entry, by its words: IQM over members with its 95 % bootstrap band. labels: of the x axes.
-
-    A panel with more than `MOST` lines becomes several; each shows the others in grey behind its own.
-    """
-    parts = [(entry, *part) for entry, own in panels.items() if own for part in _split(entry, own)]
+    parts = [(entry, *part) for entry, curves in panels.items() if curves for part in _split(entry, curves)]
     columns = min(len(parts), 2)
-    figure, grid = _figure(
-        5.6 * columns, 3.1 * math.ceil(len(parts) / columns) + 0.4, columns=columns, count=len(parts)
-    )
-    colours = _colours(line.name for _, _, own, _ in parts for line in own)
+    figure, grid = _figure(5.6 * columns, 3.1 * math.ceil(len(parts) / columns) + 0.4, columns, len(parts))
+    colours = _colours(curve.name for _, _, curves, _ in parts for curve in curves)
     first: dict[str, Axes] = {}  # of the panels of an entry, which have one y axis
-    for axes, (entry, words, own, others) in zip(grid, parts, strict=True):
+    for axes, (entry, words, curves, others) in zip(grid, parts, strict=True):
         if first.setdefault(entry, axes) is not axes:
             axes.sharey(first[entry])
-        for line in others:
-            axes.plot(line.x, line.band.estimate, color=_FAINT, linewidth=0.8, zorder=1)
-        for line, colour in zip(own, colours(own), strict=True):
-            _draw_line(axes, line, colour)
-        axes.set_xlabel(labels[entry], **{**_FONT, "size": 9})
-        _dress(axes, words, [*own, *others])
+        for curve in others:
+            axes.plot(curve.x, iqm(curve.values), color=_FAINT, linewidth=0.8, zorder=1)
+        for curve, colour in zip(curves, colours(curves), strict=True):
+            _draw_curve(axes, curve, colour)
+        axes.set_xlabel(_unit(panels[entry]), **{**_FONT, "size": 9})
+        _dress(axes, words, [*curves, *others])
     _head(figure, title)
-    figure.supxlabel(_note([line for _, _, own, _ in parts for line in own]), size=8, color=_GREY)
+    figure.supxlabel(_note([curve for _, _, curves, _ in parts for curve in curves]), size=8, color=_GREY)
     return _save(figure, path)
 
 
-def _line(curve: Curve) -> Line:
-    band, factor = spread(curve, curve.values), by_prior(curve)
-    return Line(curve.name, curve.family, curve.rollouts, band, curve.score, len(curve.seeds), factor)
-
-
-def _line_of_updates(own: Outcome, score: str) -> Line:
-    name = own.method.partition(":")[0]
-    kind = get_method(name, "fixed").kind if name in FIXED_NAMES else "own"
-    return Line(own.method, kind, own.updates, bootstrap_interval(own.curve), score, len(own.curve))
-
-
-def _rollouts(curves: Sequence[Curve]) -> str:
-    """What the x axis of curves over real rollouts says."""
-    longest = max(curves, key=lambda curve: curve.rollouts[-1])
+def _unit(curves: Sequence[Curve]) -> str:
+    """What the x axis says."""
+    longest = max(curves, key=lambda curve: curve.x[-1])
+    if longest.unit == "updates":
+        return "updates"
     if np.isnan(longest.minutes[-1]):  # of several tasks, whose rollouts differ in length
         return "real rollouts"
-    each = max(int(longest.rollouts[-1]), 1)
-    seconds, steps = 60 * float(longest.minutes[-1]) / each, int(longest.transitions[-1]) // each
-    if not np.array_equal(longest.transitions, steps * longest.rollouts):  # evaluations have cost transitions, too
+    count = max(int(longest.x[-1]), 1)
+    seconds, steps = 60 * float(longest.minutes[-1]) / count, int(longest.transitions[-1]) // count
+    if not np.array_equal(longest.transitions, steps * longest.x):  # evaluations have cost transitions, too
         return "real rollouts"
     return f"real rollouts of {steps} transitions, {seconds:.3g} s"
 
 
-def _split(words: str, own: Sequence[Line]) -> list[tuple[str, Sequence[Line], list[Line]]]:
-    """(words, lines, others in grey) of each panel: families together, at most `MOST` lines in each."""
-    if len(own) <= MOST:
-        return [(words, own, [])]
-    ordered = sorted(own, key=lambda line: line.family)
-    count = math.ceil(len(own) / MOST)
-    parts = [[ordered[i] for i in some] for some in np.array_split(np.arange(len(ordered)), count)]
+def _split(words: str, curves: Sequence[Curve]) -> list[tuple[str, Sequence[Curve], list[Curve]]]:
+    """(words, curves, others in grey) of each panel: families together, at most `MOST` curves in each."""
+    if len(curves) <= MOST:
+        return [(words, curves, [])]
+    ordered = sorted(curves, key=lambda curve: curve.family)
+    count = math.ceil(len(curves) / MOST)
+    parts = [[ordered[i] for i in indices] for indices in np.array_split(np.arange(len(ordered)), count)]
     return [
-        (f"{words}, {i + 1} of {count}", part, [line for line in ordered if line not in part])
+        (f"{words}, {i + 1} of {count}", part, [curve for other in parts if other is not part for curve in other])
         for i, part in enumerate(parts)
     ]
 
 
-def _colours(names: Iterable[str]) -> Callable[[Sequence[Line]], list[str]]:
-    """(lines) -> a colour for each, all distinct; a name keeps its colour from panel to panel where it can."""
+def _colours(names: Iterable[str]) -> Callable[[Sequence[Curve]], list[str]]:
+    """(curves) -> a colour for each, all distinct; a name keeps its colour from panel to panel where it can."""
     place = {name: i for i, name in enumerate(dict.fromkeys(names))}
 
-    def of(own: Sequence[Line]) -> list[str]:
+    def of(curves: Sequence[Curve]) -> list[str]:
         free, chosen = list(PALETTE), []
-        for line in own:
-            wanted = PALETTE[place[line.name] % len(PALETTE)]
+        for curve in curves:
+            wanted = PALETTE[place[curve.name] % len(PALETTE)]
             chosen.append(wanted if wanted in free else free[0])
             free.remove(chosen[-1])
         return chosen
@@ -159,39 +110,40 @@ def _colours(names: Iterable[str]) -> Callable[[Sequence[Line]], list[str]]:
     return of
 
 
-def _draw_line(axes: Axes, line: Line, colour: str) -> None:
-    band = line.band
+def _draw_curve(axes: Axes, curve: Curve, colour: str) -> None:
+    band = spread(curve, curve.values)
     if np.isfinite(band.low).all():
-        axes.fill_between(line.x, band.low, band.high, color=colour, alpha=0.13, linewidth=0)
-    marks = {"marker": "o", "markersize": 2.5} if len(line.x) < 25 else {}
-    axes.plot(line.x, band.estimate, color=colour, linewidth=1.8, label=line.name, clip_on=False, **marks)
+        axes.fill_between(curve.x, band.low, band.high, color=colour, alpha=0.13, linewidth=0)
+    marks = {"marker": "o", "markersize": 2.5} if len(curve.x) < 25 else {}
+    axes.plot(curve.x, band.estimate, color=colour, linewidth=1.8, label=curve.name, clip_on=False, **marks)
 
 
-def _dress(axes: Axes, words: str, shown: Sequence[Line]) -> None:
-    """Names, limits and a legend beside the panel, from the line that ends highest to the one that ends lowest."""
+def _dress(axes: Axes, words: str, curves: Sequence[Curve]) -> None:
+    """Names, limits and a legend beside the panel, from the curve that ends highest to the one that ends lowest."""
     axes.set_title(words, **_FONT, loc="left")
-    axes.set_xlim(0, max(int(line.x[-1]) for line in shown) or 1)
+    axes.set_xlim(0, max(int(curve.x[-1]) for curve in curves) or 1)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=6))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.set_ylabel(shown[0].score, **_FONT)
-    if shown[0].score == "success":
+    axes.set_ylabel(curves[0].score, **_FONT)
+    if curves[0].score == "success":
         axes.set_ylim(-0.03, 1.03)
-    handles, names = axes.get_legend_handles_labels()
-    ends = [float(np.asarray(line.get_ydata())[-1]) for line in handles]  # pyright: ignore[reportAttributeAccessIssue]
-    order = np.argsort(ends, kind="stable")[::-1]
-    axes.legend(
-        [handles[i] for i in order], [names[i] for i in order], loc="center left", bbox_to_anchor=(1.0, 0.5),
-        frameon=False, fontsize=9, labelcolor=_INK, handlelength=1.4,
-    )  # fmt: skip
+    named = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
+    ordered = sorted(named, key=lambda line: float(np.asarray(line.get_ydata())[-1]))[::-1]
+    _legend(axes, handles=ordered, fontsize=9, handlelength=1.4)
 
 
-def _note(shown: Sequence[Line]) -> str:
-    """What the lines and bands are."""
-    sizes = sorted({line.seeds for line in shown})
+def _legend(axes: Axes, **look: Any) -> None:
+    """A legend beside the panel."""
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, labelcolor=_INK, **look)
+
+
+def _note(curves: Sequence[Curve]) -> str:
+    """What the curves and bands are."""
+    sizes = sorted({len(curve.seeds) for curve in curves})
     if sizes[-1] == 1:
         return "one seed"
     seeds = str(sizes[0]) if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}"
-    drawn = "priors, then seeds" if all(line.by_prior for line in shown) else "seeds"
+    drawn = "priors, then seeds" if all(map(by_prior, curves)) else "seeds"
     band = f"; band: 95 % bootstrap interval, drawing {drawn}" if sizes[-1] >= ENOUGH else ""
     return f"line: interquartile mean of {seeds} seeds{band}"
 
@@ -215,7 +167,7 @@ def pretraining(
     1, 2, ... steps ahead; baseline_error: the same for predicting that nothing changes.
     """
     columns = 4 if np.size(dynamics_error) else 3
-    figure, panels = _figure(3.0 * columns, 3.2, columns=columns)
+    figure, panels = _figure(3.0 * columns, 3.2, columns)
     for axes, values, name in zip(panels, (success, returns), ("success rate", "return"), strict=False):
         axes.plot(np.asarray(steps) / 1e6, np.asarray(values), color=PALETTE[0], linewidth=2)
         axes.set_title(name, **_FONT, loc="left")
@@ -242,7 +194,7 @@ def diagnosis(
     found: see `examination.describe`. signs: see `verdict.signs`. points: ([n] V_sim, [n] returns) by "real" and
     "simulated".
     """
-    figure, (states, promise, model, kinds) = _figure(10.4, 6.6, columns=2, count=4)
+    figure, (states, promise, model, kinds) = _figure(10.4, 6.6, 2, 4)
     horizons = found["horizons"]
     for where, colour in (("simulated", _FAINT), ("real", PALETTE[0])):
         for name, dash in (("improvable", "-"), ("improving", ":")):
@@ -285,7 +237,7 @@ def rollouts(path: Path, panels: Sequence[Panel], episodes: Mapping[str, float],
 
     episodes: by words, the time in seconds at which each ends.
     """
-    figure, drawn = _figure(9.6, 1.15 * len(panels) + 0.9, columns=1, count=len(panels))
+    figure, drawn = _figure(9.6, 1.15 * len(panels) + 0.9, 1, len(panels))
     ends = list(episodes.values())
     for axes, panel in zip(drawn, panels, strict=True):
         style: dict[str, Any] = {"drawstyle": "steps-post"} if panel.held else {}
@@ -301,10 +253,7 @@ def rollouts(path: Path, panels: Sequence[Panel], episodes: Mapping[str, float],
         axes.set_xlim(0, ends[-1])
         axes.tick_params(labelbottom=axes is drawn[-1])
         if len(panel.lines) > 1:
-            axes.legend(
-                loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False, fontsize=8, labelcolor=_INK,
-                handlelength=1.2, ncols=1 + (len(panel.lines) - 1) // 6,
-            )  # fmt: skip
+            _legend(axes, fontsize=8, handlelength=1.2, ncols=1 + (len(panel.lines) - 1) // 6)
     for words, begin, end in zip(episodes, [0.0, *ends], ends, strict=False):
         middle = (begin + end) / 2, 1.2
         drawn[0].text(*middle, words, transform=drawn[0].get_xaxis_transform(), ha="center", size=9, color=_GREY)
@@ -320,7 +269,7 @@ def effects(path: Path, found: Mapping[str, Mapping[str, Mapping[str, Interval]]
     """
     columns = min(len(found), 2)
     rows = math.ceil(len(found) / columns)
-    figure, panels = _figure(5.2 * columns, 4.2 * rows + 0.2, columns=columns, count=len(found))
+    figure, panels = _figure(5.2 * columns, 4.2 * rows + 0.2, columns, len(found))
     for axes, (place, measures) in zip(panels, found.items(), strict=True):
         for i, (measure, own) in enumerate(measures.items()):
             heights = np.arange(len(own)) + 0.22 * (i - (len(measures) - 1) / 2)
@@ -373,7 +322,7 @@ def _dynamics_panel(axes: Axes, error: np.ndarray, baseline: ArrayLike | None) -
 # ---------------------------------------------------------------- the look
 
 
-def _figure(width: float, height: float, *, columns: int, count: int | None = None) -> tuple[Figure, Sequence[Axes]]:
+def _figure(width: float, height: float, columns: int, count: int | None = None) -> tuple[Figure, Sequence[Axes]]:
     """A figure without pyplot (no global state, no window), axes without frame. count: of panels; default one row."""
     figure = Figure(figsize=(width, height), dpi=120, layout="constrained")
     FigureCanvasAgg(figure)

@@ -4,90 +4,92 @@ A method without a simulator has one outcome for each data set, a method without
 in every row that they belong to.
 """
 
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from envs.scales import D4RL, normalised
+from sgft_jax.analysis.curves import SCORES, Curve
 from sgft_jax.analysis.scoreboard import improvement
 from sgft_jax.analysis.tables import NONE, markdown, number, plain
-from sgft_jax.hybrid.scores import BOUNDS, normalised, shown
+from sgft_jax.hybrid.scores import shown
 from sgft_jax.math.stats import Interval, bootstrap_interval, mean, rank_correlation
 
-EVERY = ""  # data or simulator of a method that sees none
+LEGEND = (
+    "Scores in the real system ({score}), mean and standard deviation over {seeds} seeds. Means over simulators{scale} "
+    "have a 95 % bootstrap interval that draws seeds within every simulator. P(better): a random seed of {reference} "
+    "against one of the other method, mean over simulators. Intervals need three seeds. Every run made {schedule}; "
+    "methods without a simulator made the updates alone. The data sets are what the files hold: numbers on sets that "
+    "were made anew do not belong beside published ones."
+)
+_SCORES = {"late": "mean of the last ten evaluations", "last": "last evaluation"}
+_MEASURED = "What else the task is judged by, in these evaluations: mean with a 95 % bootstrap interval over seeds."
 _FEWEST = 3  # methods that have an order worth comparing
 
 
-class Outcome(NamedTuple):
-    """What one run scored in the real system. data, gap: names, or `EVERY`. scores: [seeds], what tables show.
-
-    updates: [evaluations], curve: [seeds, evaluations] scores after so many, for figures. measures: what else the task
-    is judged by, by name, as `curve`.
-    """
-
-    method: str
-    data: str
-    gap: str
-    scores: np.ndarray
-    updates: np.ndarray = np.zeros(0)
-    curve: np.ndarray = np.zeros((0, 0))
-    measures: Mapping[str, np.ndarray] = MappingProxyType({})
-
-
-def outcome(
-    method: str,
-    data: str,
-    gap: str,
-    lines: Sequence[Mapping[str, Any]],
-    scores: ArrayLike | None = None,
-    *,
-    measures: Sequence[str] = (),
-) -> Outcome:
-    """What a run scored. lines: of its `eval.jsonl`. scores: [seeds], default those of the last evaluation.
-
-    measures: other names in the lines.
-    """
-    updates, curve, *others = (np.array([line[name] for line in lines]).T for name in ("step", "score", *measures))
-    totals = shown(curve.T, "last") if scores is None else np.asarray(scores)
-    return Outcome(method, data, gap, totals, updates, curve, dict(zip(measures, others, strict=True)))
-
-
 class Results(NamedTuple):
-    """The outcomes of one task, and what the tables have: data sets, simulators and methods in their order.
+    """Curves over updates of one task, and what the tables have: data sets, simulators and methods in their order.
 
-    score: "success" or "return".
+    methods: as METHOD or METHOD:PRESET. shown: which evaluations of a curve count, the last or the last ten.
     """
 
-    task: str
-    score: str
     data: Sequence[str]
     gaps: Sequence[str]
     methods: Sequence[str]
-    outcomes: Sequence[Outcome]
+    curves: Sequence[Curve]
+    shown: Literal["late", "last"] = "late"
 
-    def find(self, method: str, data: str, gap: str) -> Outcome | None:
+    @property
+    def task(self) -> str:
+        """The one task."""
+        return self.curves[0].task
+
+    @property
+    def score(self) -> str:
+        """What counts: success or return."""
+        return self.curves[0].score
+
+    def find(self, method: str, data: str, gap: str) -> Curve | None:
         """What stands in that cell; None where nothing has finished."""
-        for own in self.outcomes:
-            if own.method == method and own.data in (data, EVERY) and own.gap in (gap, EVERY):
-                return own
+        for curve in self.curves:
+            if curve.spec == method and curve.data in (data, "") and curve.gap in (gap, ""):
+                return curve
         return None
 
-    def of(self, method: str, data: str, gap: str) -> np.ndarray | None:
-        """[seeds] scores in that cell; None where nothing has finished."""
-        own = self.find(method, data, gap)
-        return None if own is None else own.scores
+    def of(self, method: str, data: str, gap: str, score: str | None = None) -> np.ndarray | None:
+        """[seeds] scores in that cell, default the one that counts; None where nothing has finished."""
+        curve = self.find(method, data, gap)
+        values = None if curve is None else curve.scores.get(score or curve.score)
+        return None if values is None else shown(values.T, self.shown)
+
+    def panels(self, data: str) -> dict[str, list[Curve]]:
+        """What a figure of one data set shows, see `figures.learning_curves`: simulators with the methods on each.
+
+        A method that sees no simulator, or no data, has the same line wherever it belongs.
+        """
+        cells = {gap: [self.find(method, data, gap) for method in self.methods] for gap in self.gaps}
+        return {f"simulator: {gap}": [curve for curve in row if curve is not None] for gap, row in cells.items()}
+
+    def places(self) -> list[tuple[str, str]]:
+        """Data sets and simulators, the rows of tables."""
+        return [(data, gap) for data in self.data for gap in self.gaps]
+
+
+def summary(results: Results, *, reference: str, seeds: int, schedule: str) -> list[str]:
+    """The tables and their legend, a text for each. schedule: what every run made, in words."""
+    scale, score = " on D4RL's scale" if results.task in D4RL else "", _SCORES[results.shown]
+    legend = LEGEND.format(score=score, seeds=seeds, scale=scale, reference=reference, schedule=schedule)
+    against = [duels(results, reference)] if len(results.methods) > 1 else []
+    others = measured(results)
+    texts = [f"# {results.task}", legend, headline(results), *against, cells(results)]
+    return texts if others is None else [*texts, _MEASURED, others]
 
 
 def cells(results: Results) -> str:
     """A row for each data set and simulator: mean of every method with its standard deviation over seeds."""
-    rows = [
-        [data or NONE, gap, *(_spread(results.of(method, data, gap), results.score) for method in results.methods)]
-        for data in results.data
-        for gap in results.gaps
-    ]
-    return markdown(["data", "simulator", *results.methods], rows)
+    return _table(("data", "simulator"), results.places(), results.methods, partial(_spread, results))
 
 
 def headline(results: Results) -> str:
@@ -95,9 +97,9 @@ def headline(results: Results) -> str:
 
     A resample draws seeds within every simulator. A method stands only where it has finished on all of them.
     """
-    rows = [[data or NONE, *(_overall(results, method, data) for method in results.methods)] for data in results.data]
-    number = len(results.gaps)
-    return markdown([f"mean over {number} simulators" if number > 1 else "one simulator", *results.methods], rows)
+    count = len(results.gaps)
+    head = f"mean over {count} simulators" if count > 1 else "one simulator"
+    return _table((head,), [(data,) for data in results.data], results.methods, partial(_overall, results))
 
 
 def duels(results: Results, reference: str) -> str:
@@ -106,23 +108,27 @@ def duels(results: Results, reference: str) -> str:
     It is the mean over the simulators on which both have finished, in per cent, with its bootstrap interval over seeds.
     """
     others = [method for method in results.methods if method != reference]
-    rows = [[data or NONE, *(_duel(results, reference, other, data) for other in others)] for data in results.data]
-    return markdown([f"P({reference} better), per cent", *others], rows)
+    head = f"P({reference} better), per cent"
+    return _table((head,), [(data,) for data in results.data], others, partial(_duel, results, reference))
 
 
-def measured(results: Results, score: str) -> str | None:
+def measured(results: Results) -> str | None:
     """A row for each measure, data set and simulator: mean of every method with its bootstrap interval over seeds.
 
-    score: "last" or "late", which evaluations count. None where no run has a measure.
+    None where no run has a measure.
     """
-    names = dict.fromkeys(name for own in results.outcomes for name in own.measures)
-    rows = []
-    for name in names:
-        for data in results.data:
-            for gap in results.gaps:
-                found = [results.find(method, data, gap) for method in results.methods]
-                rows.append([name, data or NONE, gap, *(_measured(own, name, score) for own in found)])
-    return markdown(["measure", "data", "simulator", *results.methods], rows) if rows else None
+    names = dict.fromkeys(name for curve in results.curves for name in curve.scores if name not in SCORES)
+    places = [(name, *place) for name in names for place in results.places()]
+    head = ("measure", "data", "simulator")
+    return _table(head, places, results.methods, partial(_measured, results)) if places else None
+
+
+def _table(
+    head: Sequence[str], places: Iterable[Sequence[str]], methods: Sequence[str], cell: Callable[..., str]
+) -> str:
+    """A row for each place, which begins with its names, and a column for each method. cell: of (method, *place)."""
+    rows = [[*(name or NONE for name in place), *(cell(method, *place) for method in methods)] for place in places]
+    return markdown([*head, *methods], rows)
 
 
 def ranks(results: Results, others: Results) -> str:
@@ -133,14 +139,12 @@ def ranks(results: Results, others: Results) -> str:
     than three methods are left out.
     """
     rows = []
-    for data in results.data:
-        for gap in results.gaps:
-            both = [(m, results.of(m, data, gap), others.of(m, data, gap)) for m in results.methods]
-            found = {m: (own, theirs) for m, own, theirs in both if own is not None and theirs is not None}
-            if len(found) >= _FEWEST:
-                orders = [sorted(found, key=lambda m: -found[m][i].mean()) for i in (0, 1)]
-                words = [", ".join(order) for order in orders]
-                rows.append([data or NONE, gap, number(agreement(list(found.values())), "", digits=2), *words])
+    for data, gap in results.places():
+        pairs = {m: (results.of(m, data, gap), others.of(m, data, gap)) for m in results.methods}
+        both = {m: (here, there) for m, (here, there) in pairs.items() if here is not None and there is not None}
+        if len(both) >= _FEWEST:
+            words = [", ".join(sorted(both, key=lambda m: -both[m][i].mean())) for i in (0, 1)]
+            rows.append([data or NONE, gap, number(agreement(list(both.values())), "", digits=2), *words])
     return markdown(["data", "simulator", "rank correlation", "order here", "order there"], rows)
 
 
@@ -150,55 +154,51 @@ def agreement(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Interval:
     A resample draws seeds of each method, the same in both sets. Seeds that one of the two lacks are left out.
     """
     seeds = min(len(scores) for pair in pairs for scores in pair)
-    scores = np.concatenate([np.stack([own[:seeds], theirs[:seeds]], axis=-1) for own, theirs in pairs])
+    scores = np.concatenate([np.stack([here[:seeds], there[:seeds]], axis=-1) for here, there in pairs])
 
     def correlation(scores: np.ndarray, *, axis: int = 0) -> np.ndarray:
-        each = scores.reshape(*scores.shape[:axis], len(pairs), seeds, 2)
-        return rank_correlation(each.mean(-2), axis=axis)
+        by_method = scores.reshape(*scores.shape[:axis], len(pairs), seeds, 2)
+        return rank_correlation(by_method.mean(-2), axis=axis)
 
     return bootstrap_interval(scores, statistic=correlation, strata=np.repeat(np.arange(len(pairs)), seeds))
 
 
 def overall(results: Results, method: str, data: str) -> Interval | None:
     """What `headline` shows in a cell; None where a simulator is missing."""
-    found = [results.of(method, data, gap) for gap in results.gaps]
-    each = [own for own in found if own is not None]
-    if len(each) < len(found):
+    scores = [values for gap in results.gaps if (values := results.of(method, data, gap)) is not None]
+    if len(scores) < len(results.gaps):
         return None
-    if any(own.method == method and own.gap == EVERY for own in results.outcomes):
-        each = each[:1]  # the same run in every row: more of it would say that there are more seeds
-    strata = np.repeat(np.arange(len(each)), [len(own) for own in each])
-    return bootstrap_interval(rescaled(results.task, np.concatenate(each)), statistic=mean, strata=strata)
+    if any(curve.spec == method and not curve.gap for curve in results.curves):
+        scores = scores[:1]  # the same run in every row: more of it would say that there are more seeds
+    strata = np.repeat(np.arange(len(scores)), [len(values) for values in scores])
+    return bootstrap_interval(rescaled(results.task, np.concatenate(scores)), statistic=mean, strata=strata)
 
 
 def rescaled(task: str, scores: np.ndarray) -> np.ndarray:
     """[n] on D4RL's scale, unchanged for a task that has none."""
-    return np.array([normalised(task, x) for x in scores.tolist()]) if task in BOUNDS else scores
+    return np.array([normalised(task, x) for x in scores.tolist()]) if task in D4RL else scores
 
 
-def _spread(scores: np.ndarray | None, score: str) -> str:
+def _spread(results: Results, method: str, data: str, gap: str) -> str:
+    scores = results.of(method, data, gap)
     if scores is None:
         return NONE
-    middle = plain(float(scores.mean()), score) if score == "success" else f"{scores.mean():,.0f}"
-    spread = plain(float(scores.std()), score) if score == "success" else f"{scores.std():,.0f}"
-    return middle if len(scores) == 1 else f"{middle} ± {spread}"
+    numbers = [float(scores.mean()), float(scores.std())][: len(scores)]  # one seed has no deviation
+    success = results.score == "success"
+    return " ± ".join(plain(x, results.score) if success else f"{x:,.0f}" for x in numbers)
 
 
 def _overall(results: Results, method: str, data: str) -> str:
-    found = overall(results, method, data)
-    return NONE if found is None else number(found, results.score)
+    band = overall(results, method, data)
+    return NONE if band is None else number(band, results.score)
 
 
-def _measured(own: Outcome | None, name: str, score: str) -> str:
-    if own is None or name not in own.measures:
-        return NONE
-    return number(bootstrap_interval(shown(own.measures[name].T, score), statistic=mean), name, digits=2)
+def _measured(results: Results, method: str, name: str, data: str, gap: str) -> str:
+    values = results.of(method, data, gap, name)
+    return NONE if values is None else number(bootstrap_interval(values, statistic=mean), name, digits=2)
 
 
 def _duel(results: Results, reference: str, other: str, data: str) -> str:
     pairs = [(results.of(reference, data, gap), results.of(other, data, gap)) for gap in results.gaps]
-    both = [(own, theirs) for own, theirs in pairs if own is not None and theirs is not None]
-    if not both:
-        return NONE
-    above, below = (np.stack(scores) for scores in zip(*both, strict=True))
-    return number(improvement(above, below))
+    both = [(above, below) for above, below in pairs if above is not None and below is not None]
+    return number(improvement(*(np.stack(scores) for scores in zip(*both, strict=True)))) if both else NONE

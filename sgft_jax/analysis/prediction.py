@@ -80,8 +80,8 @@ def progress(rollouts: Any, pace: Any, ahead: int = AHEAD) -> Any:
 
 def rollouts_until(x: Inputs, level: float = LEVEL, c: Coefficients = COEFFICIENTS) -> int | None:
     """The first number of rollouts after which that success is expected; None if it takes more than AHEAD."""
-    there = np.flatnonzero(success_after(x, np.arange(AHEAD + 1), c) >= level)
-    return int(there[0]) if there.size else None
+    reached = np.flatnonzero(success_after(x, np.arange(AHEAD + 1), c) >= level)
+    return int(reached[0]) if reached.size else None
 
 
 # --- calibration ------------------------------------------------------------------------------------------------------
@@ -105,11 +105,10 @@ class Cases(NamedTuple):
 
     def of(self, held: np.ndarray) -> "Cases":
         """Those members, [m] bool."""
-        curves = [curve for curve, one in zip(self.curves, held, strict=True) if one]
-        return Cases(
-            Inputs(*(x[held] for x in self.inputs)), self.played[held], self.zero_shot[held], self.gains[held], curves,
-            self.gaps[held], self.priors[held],
-        )  # fmt: skip
+        arrays = ("played", "zero_shot", "gains", "gaps", "priors")
+        chosen = {name: getattr(self, name)[held] for name in arrays}
+        inputs, curves = Inputs(*(x[held] for x in self.inputs)), list(itertools.compress(self.curves, held))
+        return self._replace(inputs=inputs, curves=curves, **chosen)
 
 
 def fit(cases: Cases) -> Coefficients:
@@ -122,7 +121,7 @@ def fit(cases: Cases) -> Coefficients:
 
 def _pace(cases: Cases) -> float:
     """That which describes the curves best, of members that gained something."""
-    gained = [curve for curve, own in zip(cases.curves, cases.gains, strict=True) if own > 0.1]
+    gained = [curve for curve, gain in zip(cases.curves, cases.gains, strict=True) if gain > 0.1]
     if not gained:
         return COEFFICIENTS.pace
     missed = np.zeros(len(_PACES))
@@ -151,7 +150,8 @@ def table(predicted: np.ndarray, cases: Cases) -> list[tuple[float, float, int, 
     """The calibration table: (low, high, members, mean predicted, mean measured gain) of each range that has any."""
     rows = []
     for low, high in itertools.pairwise(_BINS):
-        own = (predicted >= low) & ((predicted < high) | (high == _BINS[-1]))
-        if own.any():
-            rows.append((low, high, int(own.sum()), float(predicted[own].mean()), float(cases.gains[own].mean())))
+        inside = (predicted >= low) & ((predicted < high) | (high == _BINS[-1]))
+        if inside.any():
+            means = float(predicted[inside].mean()), float(cases.gains[inside].mean())
+            rows.append((low, high, int(inside.sum()), *means))
     return rows

@@ -1,29 +1,40 @@
 """Impure: writes what runs say as CSV tables that can be committed, opened in a spreadsheet, and read back.
 
-curves-<task>.csv.gz   a row for each evaluation of each seed (`curves.COLUMNS`)
-runs.csv.gz            a row for each of these runs: commit, hardware, options
+curves-<task>.csv.gz   a row for each evaluation of each seed (`COLUMNS`)
+hybrid.csv.gz          a row for each evaluation and score of each run over updates (`RUN`), a column for each seed
+runs.csv.gz            a row for each run over real rollouts: commit, hardware, options
 pretraining.csv.gz     a row for each evaluation of each prior while it was trained
 priors.csv.gz          a row for each prior: final evaluation, V_sim, commit, hardware, options
 tuning.csv.gz          a row for each trial of tuning; trials.csv.gz: the curves of the trials
 """
 
+import itertools
 import json
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import chain
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
+import numpy as np
+
+from envs import extend
 from envs.files import Count, read_object
 from envs.types import UserError
-from sgft_jax.analysis import curves
-from sgft_jax.analysis.curves import COLUMNS, IDENTITY, Curve
-from sgft_jax.files.csvfile import read_csv, table_file, write_csv
+from sgft_jax.analysis import reading
+from sgft_jax.analysis.curves import IDENTITY, SCORES, Curve, Found
+from sgft_jax.files.csvfile import finite, read_csv, table_file, whole, write_csv
 from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
 from sgft_jax.io.runs import read_config, read_starts
 
+_AXES = ("prior", "seed", "rollouts", "transitions", "minutes")
+COLUMNS = (*IDENTITY, *_AXES, *SCORES, "training")
+RUN = ("task", "real", "data", "gap", "method", "schedule", "updates")
+_SEED = "seed-"
 _OF_PRIORS, _OF_TUNING = ("task", "priors"), ("task", "method")
 _Pretrained = TypedDict("_Pretrained", {"success/interval": tuple[float, float], "digest": NotRequired[str]})
 _DIGITS = 4  # significant ones of a number with a fraction
+
+
+type Row = Mapping[str, Any]
 
 
 class _Trial(TypedDict):
@@ -50,39 +61,38 @@ def export(out: Path, to: Path) -> list[Path]:
     Rows of other runs that the tables hold already stay, those of the same runs are replaced. Raises UserError if there
     is no run.
     """
-    found, trials = curves.read_runs(out).curves, curves.read_runs(out / "tune").curves
+    curves, trials = reading.read_runs(out).curves, reading.read_runs(out / "tune").curves
     pretrained = sorted(path.parent for path in (out / "pretrain").glob(f"*/*/*/{SUMMARY}"))
-    if not (found or trials or pretrained):
+    if not (curves or trials or pretrained):
         raise UserError(f"{out}: holds no run; --out names the parent of finetune/ and pretrain/")
     to.mkdir(parents=True, exist_ok=True)
     tables: dict[str, tuple[Iterable[Mapping[str, Any]], tuple[str, ...]]] = {
-        "runs": (map(_run, found), IDENTITY),
-        "trials": (curves.rows(trials), IDENTITY),
-        "tuning": (chain.from_iterable(map(_tuning, sorted((out / "tuned").glob("*/*.json")))), _OF_TUNING),
-        "pretraining": (chain.from_iterable(map(_pretraining, pretrained)), _OF_PRIORS),
-        "priors": (chain.from_iterable(map(_priors, pretrained)), _OF_PRIORS),
+        "runs": (map(_run, curves), IDENTITY),
+        "trials": (rows(trials), IDENTITY),
+        "tuning": (itertools.chain.from_iterable(map(_tuning, sorted((out / "tuned").glob("*/*.json")))), _OF_TUNING),
+        "pretraining": (itertools.chain.from_iterable(map(_pretraining, pretrained)), _OF_PRIORS),
+        "priors": (itertools.chain.from_iterable(map(_priors, pretrained)), _OF_PRIORS),
     }
-    for task in sorted({curve.task for curve in found}):
-        tables[f"curves-{task}"] = (curves.rows([curve for curve in found if curve.task == task]), IDENTITY)
+    for task in sorted({curve.task for curve in curves}):
+        tables[f"curves-{task}"] = (rows([curve for curve in curves if curve.task == task]), IDENTITY)
     written = [merge(table_file(to, name), list(new), key) for name, (new, key) in tables.items()]
     return [path for path in written if path is not None]
 
 
 def _run(curve: Curve) -> dict[str, Any]:
     members = {"seeds": len(curve.seeds), "number_of_priors": len(set(curve.prior.tolist()))}
-    return {name: getattr(curve, name) for name in IDENTITY} | dict(curve.facts) | members
+    return curve.identity | dict(curve.facts) | members
 
 
 def _tuning(path: Path) -> Iterable[dict[str, Any]]:
     """What tuning of one method tried: options of each trial, its scores, and whether it was chosen."""
     result = read_object(path, _Tuning, "put back what experiments.studies.tune has written")
     for number, trial in enumerate(result["trials"]):
-        yield {
-            "task": result["task"], "method": result["method"], "trial": number, "chosen": number == result["trial"],
-            "rollouts": trial["rollouts"], "area": trial["area"], "final": trial["final"],
-            "options": json.dumps(trial["options"]),
-            "budget": json.dumps(result["budget"]), "space": json.dumps(result["space"]),
-        }  # fmt: skip
+        identity = {"task": result["task"], "method": result["method"], "trial": number}
+        scores = {name: trial[name] for name in ("rollouts", "area", "final")}
+        texts = {"options": trial["options"], "budget": result["budget"], "space": result["space"]}
+        chosen = {"chosen": number == result["trial"]}
+        yield identity | chosen | scores | {name: json.dumps(value) for name, value in texts.items()}
 
 
 def _pretraining(folder: Path) -> Iterable[dict[str, Any]]:
@@ -94,13 +104,13 @@ def _pretraining(folder: Path) -> Iterable[dict[str, Any]]:
 
 def _priors(folder: Path) -> Iterable[dict[str, Any]]:
     summary, stored, starts = _summary_of(folder), read_config(folder), read_starts(folder) or [{}]
-    options = curves.flat({name: value for name, value in stored.items() if name in ("preset", "config")})
+    options = reading.flat({name: value for name, value in stored.items() if name in ("preset", "config")})
     times = {name: value for name, value in summary.items() if name.startswith("time/")}
     for i, one in enumerate(summary["seeds"]):
         low, high = one["success/interval"]
-        scores = {name: value for name, value in curves.flat(one).items() if name != "success/interval"}
+        scores = {name: value for name, value in reading.flat(one).items() if name != "success/interval"}
         bounds = {"success/low": low, "success/high": high}
-        yield {**_set_of(folder), "prior": i, **scores, **bounds, **curves.origin(starts[-1]), **times, **options}
+        yield {**_set_of(folder), "prior": i, **scores, **bounds, **reading.origin(starts[-1]), **times, **options}
 
 
 def _summary_of(folder: Path) -> dict[str, Any]:
@@ -109,7 +119,7 @@ def _summary_of(folder: Path) -> dict[str, Any]:
 
 def _set_of(folder: Path) -> dict[str, str]:
     digests = [one.get("digest", "") for one in _summary_of(folder)["seeds"]]
-    return {"task": folder.parent.parent.name, "priors": curves.set_name(folder, digests)}
+    return {"task": folder.parent.parent.name, "priors": reading.set_name(folder, digests)}
 
 
 def merge(path: Path, new: Sequence[Mapping[str, Any]], key: Sequence[str]) -> Path | None:
@@ -119,9 +129,9 @@ def merge(path: Path, new: Sequence[Mapping[str, Any]], key: Sequence[str]) -> P
     texts = [{name: _text(value) for name, value in row.items()} for row in new]
     replaced = {tuple(row[name] for name in key) for row in texts}
     kept = [row for row in read_csv(path, needed=key) if tuple(row[name] for name in key) not in replaced]
-    every = [*kept, *texts]
-    names = COLUMNS if set(every[0]) <= set(COLUMNS) else dict.fromkeys(name for row in every for name in row)
-    lines = sorted(every, key=lambda row: tuple(row[name] for name in key))  # stable: evaluations in order
+    table = [*kept, *texts]
+    names = COLUMNS if set(table[0]) <= set(COLUMNS) else dict.fromkeys(name for row in table for name in row)
+    lines = sorted(table, key=lambda row: tuple(row[name] for name in key))  # stable: evaluations in order
     write_csv(path, list(names), lines)
     return path
 
@@ -130,3 +140,177 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.{_DIGITS}g}"
     return "" if value is None else str(value)
+
+
+# ---------------------------------------------------------------- curves over real rollouts
+
+
+def rows(curves: Iterable[Curve]) -> Iterator[dict[str, Any]]:
+    """The flat table: a row for each evaluation of each member, with the columns `COLUMNS`.
+
+    A run that is judged by its return has no success: the first score of a row is the one that counts.
+    """
+    for curve in curves:
+        values = {name: curve.scores[name] for name in SCORES[SCORES.index(curve.score) :] if name in curve.scores}
+        members = zip(curve.prior.tolist(), curve.seeds.tolist(), strict=True)
+        points = list(zip(curve.x.tolist(), curve.transitions.tolist(), curve.minutes.tolist(), strict=True))
+        for (i, member), (j, point) in itertools.product(enumerate(members), enumerate(points)):
+            scores = {name: float(array[i, j]) for name, array in values.items()}
+            if curve.training is not None and np.isfinite(curve.training[i, j]):
+                scores["training"] = float(curve.training[i, j])
+            yield {**curve.identity, **dict(zip(_AXES, (*member, *point), strict=True)), **scores}
+
+
+def from_rows(table: Iterable[Mapping[str, Any]]) -> list[Curve]:
+    """The curves of a flat table; inverse of `rows`. Raises UserError where members differ in their evaluations."""
+    runs = _grouped(table, lambda row: tuple(row[name] for name in IDENTITY))
+    return [_curve(name, _grouped(lines, lambda row: whole("seed", row["seed"]))) for name, lines in runs.items()]
+
+
+def _grouped[T](table: Iterable[Row], key: Callable[[Row], T]) -> dict[T, list[Row]]:
+    """The rows of each key, in their order."""
+    groups: dict[T, list[Row]] = {}
+    for row in table:
+        groups.setdefault(key(row), []).append(row)
+    return groups
+
+
+def _curve(identity: tuple[str, ...], members: Mapping[int, list[Row]]) -> Curve:
+    if len({tuple(row["rollouts"] for row in lines) for lines in members.values()}) > 1:
+        raise UserError(f"{'/'.join(identity)}: its seeds were not evaluated after the same rollouts")
+    for name, value in zip(IDENTITY, identity, strict=True):
+        if value:  # figures are called like these
+            extend.folder_name(f"the {name}", value)
+
+    def column(name: str, read: Callable[[str, Any], float] = finite) -> np.ndarray:
+        return np.array([[read(name, row[name]) for row in lines] for lines in members.values()])
+
+    first, *_ = next(iter(members.values()))
+    scores = {name: column(name) for name in SCORES if first.get(name) not in (None, "")}
+    if not scores:
+        raise ValueError(f"{'/'.join(identity)} has no {' or '.join(SCORES)}")
+    _check_ranges(scores.get("success"), minutes := column("minutes"))
+    training = np.array([[_trained(row) for row in lines] for lines in members.values()])
+    return Curve(
+        *identity,
+        seeds=np.array(list(members)),
+        prior=np.array([_prior(lines[0]["prior"]) for lines in members.values()]),
+        x=column("rollouts", whole)[0],
+        transitions=column("transitions", whole)[0],
+        minutes=minutes[0],
+        scores=scores,
+        score=next(iter(scores)),
+        training=training if np.isfinite(training).any() else None,
+    )
+
+
+def _trained(row: Row) -> float:
+    """The score of training rollouts; nan where a cell has none: at the first evaluation, or everywhere."""
+    return np.nan if row.get("training") in (None, "") else finite("training", row["training"])
+
+
+def _check_ranges(success: np.ndarray | None, minutes: np.ndarray) -> None:
+    if success is not None and ((success < 0) | (success > 1)).any():
+        raise ValueError(f"success is {success.min():g} to {success.max():g}, not a share")
+    if minutes.min() < 0:
+        raise ValueError(f"minutes is {minutes.min():g}, less than 0")
+
+
+def _prior(cell: Any) -> int:
+    """Index of a prior; -1: unknown."""
+    return whole("prior", float(cell) + 1) - 1
+
+
+def read(out: Path, data: Path | None) -> Found:
+    """The curves of released tables in the folder `data` or, without one, of the fine-tuning runs below `out`."""
+    return read_data(data) if data else reading.read_runs(out)
+
+
+def read_data(folder: Path) -> Found:
+    """The curves of released tables, `curves-*.csv.gz` or `.csv`; raises UserError for none, or a damaged one."""
+    names = sorted({path.name.partition(".csv")[0] for path in folder.glob("curves-*.csv*")})
+    files = [table_file(folder, name) for name in names]
+    if not files:
+        command = f"python -m experiments.figures --export {folder}"
+        raise UserError(f"{folder}: holds no curves-*.csv; write some from runs with: {command}")
+    table = [row for path in files for row in read_csv(path, needed=(*IDENTITY, *_AXES, SCORES[0]))]
+    try:
+        return Found(from_rows(table), [])
+    except ValueError as error:  # of int and float
+        raise UserError(f"{folder}/curves-*.csv: {error}; put the tables back as they were") from error
+
+
+# ---------------------------------------------------------------- curves over updates
+
+
+def hybrid_table(folder: Path) -> Path:
+    """Where the table of runs over updates is or goes, see `csvfile.table_file`."""
+    return table_file(folder, "hybrid")
+
+
+def write_hybrid(to: Path, curves: Iterable[Curve]) -> Path | None:
+    """Writes runs into hybrid.csv in the folder `to`, in place of rows of the same runs; None if there is no run.
+
+    curves: over updates, as `reading.read_curve` reads them.
+    """
+    to.mkdir(parents=True, exist_ok=True)
+    return merge(hybrid_table(to), [row for curve in curves for row in _updates_rows(curve)], RUN)
+
+
+def read_hybrid(folder: Path) -> list[Curve]:
+    """The runs in hybrid.csv. Raises UserError if there is no such table, or if a cell of it cannot be read."""
+    path = hybrid_table(folder)
+    if not path.exists():
+        command = f"python -m experiments.compare hybrid --export {folder}"
+        raise UserError(f"{folder / 'hybrid'}.csv: no such table; write one with: {command}")
+    table = read_csv(path, needed=(*RUN, "commit", "score", "step"))
+    try:
+        return [
+            _updates_curve(lines) for lines in _grouped(table, lambda row: tuple(row[name] for name in RUN)).values()
+        ]
+    except ValueError as error:
+        raise UserError(f"{path}: {error}; put the table back as it was") from error
+
+
+def _updates_rows(curve: Curve) -> Iterator[dict[str, Any]]:
+    facts = curve.facts
+    named = {"task": curve.task, "real": facts["real"], "data": curve.data, "gap": curve.gap, "method": curve.spec}
+    named |= {name: facts[name] for name in ("schedule", "updates", "commit")}
+    for score, values in curve.scores.items():
+        for step, numbers in zip(curve.x.tolist(), values.T.tolist(), strict=True):
+            # Six digits: a mean over seeds is printed as it is in the run.
+            members = {f"{_SEED}{n}": f"{x:.6g}" for n, x in zip(curve.seeds.tolist(), numbers, strict=True)}
+            yield {**named, "score": score, "step": step, **members}
+
+
+def _updates_curve(lines: Sequence[Row]) -> Curve:
+    first = next((row for row in lines if row["score"] in SCORES), None)
+    if first is None:
+        raise ValueError(f"a run of {lines[0]['method']} on {lines[0]['task']} has neither success nor return")
+    run = f"a run of {first['method']} on {first['task']}"
+    columns = [name for name, text in first.items() if name.startswith(_SEED) and text]
+    seeds = [whole("a seed", name.removeprefix(_SEED)) for name in columns]
+    if not seeds:
+        raise ValueError(f"{run} has no seed")
+    scores: dict[str, dict[int, list[float]]] = {first["score"]: {}}  # by name and step
+    for row in lines:
+        numbers = [finite(column, row[column]) for column in columns]
+        scores.setdefault(row["score"], {})[whole("step", row["step"])] = numbers
+    steps = list(dict.fromkeys(step for values in scores.values() for step in values))
+    if lacking := [name for name, values in scores.items() if len(values) < len(steps)]:
+        raise ValueError(f"{run} lacks rows of {'score' if lacking[0] == first['score'] else lacking[0]}")
+    method, _, variant = first["method"].partition(":")
+    made = {"updates": whole("updates", first["updates"])}
+    return Curve(
+        first["task"],
+        first["gap"],
+        method,
+        variant,
+        seeds=np.array(seeds),
+        x=np.array(steps),
+        scores={name: np.array([values[step] for step in steps]).T for name, values in scores.items()},
+        score=first["score"],
+        facts={name: first[name] for name in ("real", "schedule", "commit")} | made,
+        data=first["data"],
+        unit="updates",
+    )

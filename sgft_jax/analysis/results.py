@@ -29,7 +29,7 @@ def write_results(found: Found, target: Path, *, reference: str | None = None) -
 
     reference: METHOD or METHOD:VARIANT that the others are compared with, see `tables.summary`; UserError without it.
     """
-    if reference and reference not in (names := {tables.spec(curve) for curve in found.curves}):
+    if reference and reference not in (names := {curve.spec for curve in found.curves}):
         raise UserError(unknown("--reference", reference, names))
     sections = ["# Fine-tuning results", tables.LEGEND]
     for gap in dict.fromkeys(curve.gap for curve in found.curves):

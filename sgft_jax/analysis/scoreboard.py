@@ -5,7 +5,6 @@ The prior is the random factor: member i of a curve began from prior i, on every
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -20,56 +19,24 @@ from sgft_jax.analysis.curves import (
     transitions_until_held,
     zero_shot,
 )
+from sgft_jax.analysis.tables import NONE, number, plain
 from sgft_jax.math.stats import ENOUGH, Interval, bootstrap_interval, mean
 
+HEAD = ("stratum", "method", "gaps", "start", "area", "end", "90 % held at the end")
+HEAD += ("90 % held ever, after transitions", "deepest fall: zero-shot / own start", "loss at the end", "training")
 _RESAMPLES = 1000
-
-
-class Row(NamedTuple):
-    """A method on the gaps of one stratum.
-
-    gaps: their number. start, area, end: mean score over gaps, with its interval. held: gaps whose mean was at least
-    90 % at the last two evaluations. reached: gaps whose mean was at any two evaluations in a row; transitions: median
-    over these gaps of the real transitions until the first of the two, nan without any. fall: how far the mean of any
-    gap ever was below its start; worst: that gap. policy_fall: the same below the simulator's policy, nan where that
-    was not evaluated from these priors. loss: how far the mean of any gap ended below its start. training: mean score
-    of the training rollouts, nan where nobody kept them.
-    """
-
-    method: str
-    stratum: str
-    gaps: int
-    start: Interval
-    area: Interval
-    end: Interval
-    held: int
-    reached: int
-    transitions: float
-    policy_fall: float
-    fall: float
-    worst: str
-    loss: float
-    training: float
-
-
-class Duel(NamedTuple):
-    """A reference compared with another method.
-
-    gaps: number of gaps on which both ran. ahead: on how many the reference's mean area is at least the other's.
-    better: probability that a run of the reference has the larger area, over all pairs of runs, mean over gaps.
-    """
-
-    other: str
-    gaps: int
-    ahead: int
-    better: Interval
-
 
 Played = Mapping[str, Curve]  # by gap
 
 
-def row(method: str, stratum: str, played: Played, others: Iterable[Curve] = ()) -> Row:
-    """The line of a method on these gaps.
+def row(method: str, stratum: str, played: Played, others: Iterable[Curve] = ()) -> list[str]:
+    """The line of a method on the gaps of one stratum, a cell for each of HEAD.
+
+    Start, area and end: mean score over gaps, with its interval. Held at the end: gaps whose mean was at least 90 % at
+    the last two evaluations. Held ever: gaps whose mean was at any two evaluations in a row, and the median over these
+    gaps of the real transitions until the first of the two. Deepest fall: how far the mean of any gap ever was below
+    the simulator's policy, where that was evaluated from these priors, and below its start, with the gap. Loss: how far
+    the mean of any gap ended below its start. Training: mean score of the training rollouts, if anybody kept them.
 
     others: curves of other methods, in which the simulator's policy is looked up where this method begins with plans or
     with another policy. Raises UserError where gaps have different numbers of members.
@@ -77,47 +44,65 @@ def row(method: str, stratum: str, played: Played, others: Iterable[Curve] = ())
     curves, others = list(played.values()), list(others)
     if len(sizes := sorted({len(curve.seeds) for curve in curves})) > 1:
         raise UserError(f"{method}: ran with {sizes[0]} seeds on some gaps and with {sizes[-1]} on others")
-    grid = common_grid(curves)
     means = {gap: curve.values.mean(0) for gap, curve in played.items()}
-    falls = {gap: float(each[0] - each.min()) for gap, each in means.items()}
+    falls = {gap: float(values[0] - values.min()) for gap, values in means.items()}
     worst = max(falls, key=lambda gap: falls[gap])
+    held = sum(bool((values[-2:] >= LEVEL).all()) for values in means.values())
     taken = [n for curve in curves if (n := transitions_until_held(curve)) is not None]
+    below = max(_policy_fall(curve, others) for curve in curves)
+    loss = max(float(values[0] - values[-1]) for values in means.values())
     trained = [np.nanmean(curve.training) for curve in curves if curve.training is not None]
-    over = lambda scores: bootstrap_interval(np.mean(scores, axis=0), statistic=mean)  # noqa: E731
-    return Row(
-        method,
+    starts, ends = ([curve.values[:, i] for curve in curves] for i in (0, -1))
+    scores = (starts, _areas(played, list(played), common_grid(curves)), ends)
+    return [
         stratum,
-        len(curves),
-        start=over([curve.values[:, 0] for curve in curves]),
-        area=over(_areas(played, list(played), grid)),
-        end=over([curve.values[:, -1] for curve in curves]),
-        held=sum(bool((each[-2:] >= LEVEL).all()) for each in means.values()),
-        reached=len(taken),
-        transitions=float(np.median(taken)) if taken else np.nan,
-        policy_fall=max(_policy_fall(curve, others) for curve in curves),
-        fall=falls[worst],
-        worst=worst,
-        loss=max(float(each[0] - each[-1]) for each in means.values()),
-        training=float(np.mean(trained)) if trained else np.nan,
-    )
+        method,
+        str(len(curves)),
+        *(number(bootstrap_interval(np.mean(members, axis=0), statistic=mean)) for members in scores),
+        f"{held} of {len(curves)}",
+        f"{len(taken)} of {len(curves)}" + (f", {np.median(taken):.0f}" if taken else ""),
+        f"{NONE if np.isnan(below) else _percent(below)} / {_percent(falls[worst])}"
+        + (f" ({worst})" if falls[worst] >= 0.005 else ""),
+        _percent(max(loss, 0)),
+        _percent(np.mean(trained)) if trained else "",
+    ]
+
+
+def _percent(share: float | np.floating) -> str:
+    return f"{100 * share:.0f}"
+
+
+def brief(curve: Curve | None) -> str:
+    """A method on one gap, "start: area / end / deepest fall"; nothing where it did not run."""
+    if curve is None:
+        return ""
+    (areas,) = _areas({curve.gap: curve}, [curve.gap], common_grid([curve]))
+    scores = (curve.values[:, 0].mean(), areas.mean(), curve.values[:, -1].mean(), deepest_fall(curve))
+    start, *others = (plain(float(score), curve.score) for score in scores)
+    return f"{start}: {' / '.join(others)}"
 
 
 def _policy_fall(curve: Curve, others: Sequence[Curve]) -> float:
     """How far the mean ever was below the simulator's policy; nan where that was not evaluated."""
-    system = lambda one: (one.task, one.gap, one.priors)  # noqa: E731
-    before = zero_shot(curve, [one for one in (curve, *others) if system(one) == system(curve)])
+    begun = (curve.task, curve.gap, curve.priors)
+    same = [other for other in (curve, *others) if (other.task, other.gap, other.priors) == begun]
+    before = zero_shot(curve, same)
     return np.nan if before is None else deepest_fall(curve, before)
 
 
-def duel(reference: Played, other: str, played: Played) -> Duel:
-    """The reference against one method, on the gaps and evaluations that they share; ValueError if there is none."""
+def duel(reference: Played, other: str, played: Played) -> list[str] | None:
+    """The reference against one method, on the gaps and evaluations that they share; None without such a gap.
+
+    Its name, the number of gaps on which the reference's mean area is at least its own, and the probability that a run
+    of the reference has the larger area, over all pairs of runs, mean over gaps.
+    """
     gaps = [gap for gap in reference if gap in played]
     if not gaps:
-        raise ValueError(f"{other} shares no gap with the reference")
-    grid = common_grid([*(reference[gap] for gap in gaps), *(played[gap] for gap in gaps)])
-    own, theirs = _areas(reference, gaps, grid), _areas(played, gaps, grid)
-    ahead = int((own.mean(1) >= theirs.mean(1)).sum())
-    return Duel(other, len(gaps), ahead, improvement(own, theirs))
+        return None
+    grid = common_grid([runs[gap] for runs in (reference, played) for gap in gaps])
+    above, below = _areas(reference, gaps, grid), _areas(played, gaps, grid)
+    ahead = int((above.mean(1) >= below.mean(1)).sum())
+    return [other, f"{ahead} of {len(gaps)}", number(improvement(above, below))]
 
 
 def pooled(played: Played) -> Curve:
@@ -126,22 +111,17 @@ def pooled(played: Played) -> Curve:
     Tasks have rollouts of different lengths, so the curve knows neither transitions nor minutes (nan).
     """
     curves = list(played.values())
-    grid = common_grid(curves)
-    score = curves[0].score
-    nothing = np.full(len(grid), np.nan)
-    points = (at(curve, n) for n in grid for curve in curves)
-    each = np.stack([point for point in points if point is not None])  # of a common grid none is
-    values = each.reshape(len(grid), len(curves), -1).mean(1).T
-    return replace(
-        curves[0], rollouts=grid, scores={score: values}, transitions=nothing, minutes=nothing, training=None
-    )
+    first, grid = curves[0], common_grid(curves)
+    points = [[point for n in grid if (point := at(curve, n)) is not None] for curve in curves]
+    values, nothing = np.mean(points, axis=0).T, np.array(np.nan)
+    return replace(first, x=grid, scores={first.score: values}, transitions=nothing, minutes=nothing, training=None)
 
 
 def _areas(played: Played, gaps: Sequence[str], grid: np.ndarray) -> np.ndarray:
     """[gaps, members]"""
-    found = [area(played[gap], grid) for gap in gaps]
-    assert all(each is not None for each in found)
-    return np.stack([each for each in found if each is not None])
+    areas = [values for gap in gaps if (values := area(played[gap], grid)) is not None]
+    assert len(areas) == len(gaps)
+    return np.stack(areas)
 
 
 def improvement(above: np.ndarray, below: np.ndarray) -> Interval:

@@ -43,7 +43,7 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def summary(curves: Sequence[Curve], reference: str | None = None) -> str:
     """A row for each curve of one task, gap and set of priors; the methods' defaults decide the grid of the area.
 
-    reference: the `spec` of the curve that the others are compared with; default: the one with the largest area.
+    reference: `Curve.spec` of the one that the others are compared with; default: the one with the largest area.
     """
     grid = shared_grid(curves)
     until = f"area, {grid[0]} to {grid[-1]} rollouts" if len(grid) > 1 else "area"
@@ -55,19 +55,14 @@ def summary(curves: Sequence[Curve], reference: str | None = None) -> str:
     rows = [_row(curve, curves, grid) for curve in curves]
     if other is None or len(curves) < 2:
         return markdown(head, rows)
-    head += [f"area minus {spec(other)}", f"P(better than {spec(other)})"]
+    head += [f"area minus {other.spec}", f"P(better than {other.spec})"]
     return markdown(head, [row + _against(curve, other, grid) for row, curve in zip(rows, curves, strict=True)])
-
-
-def spec(curve: Curve) -> str:
-    """The method with its variant, as commands take it: METHOD or METHOD:VARIANT."""
-    return ":".join(filter(None, [curve.method, curve.variant]))
 
 
 def _reference(curves: Sequence[Curve], grid: np.ndarray, name: str | None) -> Curve | None:
     """The curve of that name; without a name the best one. None where it is not, or has no area."""
     areas = [(float(own.mean()), curve) for curve in curves if (own := area(curve, grid)) is not None]
-    chosen = [(mean, curve) for mean, curve in areas if name in (None, spec(curve))]
+    chosen = [(mean, curve) for mean, curve in areas if name in (None, curve.spec)]
     return max(chosen, key=lambda pair: pair[0])[1] if chosen else None
 
 
@@ -108,8 +103,8 @@ def shared_grid(curves: Sequence[Curve]) -> np.ndarray:
     A run that is less than a third as long as the usual one does not shorten the grid of the others.
     """
     plain = [curve for curve in curves if not curve.variant] or curves
-    usual = np.median([curve.rollouts[-1] for curve in plain])
-    return common_grid([curve for curve in plain if curve.rollouts[-1] >= usual / 3])
+    usual = np.median([curve.x[-1] for curve in plain])
+    return common_grid([curve for curve in plain if curve.x[-1] >= usual / 3])
 
 
 def number(band: Interval, score: str = "success", *, digits: int = 1) -> str:
@@ -137,7 +132,7 @@ def middle(curve: Curve, scores: np.ndarray | None) -> str:
 
 def outcome(curves: Sequence[Curve]) -> str:
     """A row for each curve, a column for each evaluation that any of them has."""
-    points = sorted({int(n) for curve in curves for n in curve.rollouts})
+    points = sorted({int(n) for curve in curves for n in curve.x})
     head = ["method", *(f"{n} rollout{'s' * (n > 1)}" if n else "zero-shot" for n in points)]
     return markdown(head, [[curve.name, *(middle(curve, at(curve, n)) for n in points)] for curve in curves])
 
@@ -151,7 +146,7 @@ def _row(curve: Curve, curves: Sequence[Curve], grid: np.ndarray) -> list[str]:
         str(len(curve.seeds)),
         middle(curve, curve.values[:, 0]),
         middle(curve, area(curve, grid)),
-        f"{middle(curve, curve.values[:, -1])} ({curve.rollouts[-1]})",
+        f"{middle(curve, curve.values[:, -1])} ({curve.x[-1]})",
         " / ".join(falls),
         middle(curve, training_score(curve)),
         _held(curve),

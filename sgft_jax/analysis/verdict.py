@@ -46,37 +46,26 @@ def signs(found: Mapping[str, Any], names: Names) -> list[Sign]:
     times = errors["identified"] / max(errors["simulated"], 1e-9)
     sure = min(found["identified"]["nats"] / _NATS, 1.0) * min(prediction.inputs_of(found).explained / _EXPLAINED, 1.0)
     scales, biases = (dict(zip(names.action, known[key], strict=True)) for key in ("scale", "bias"))
+    scale, bias = max(abs(math.log(x)) for x in scales.values()), max(map(abs, biases.values()))
+    far, off, turned, share = _each(scales, "{:.2f}"), _each(biases, "{:+.2f}"), known["rotation"], late["share"]
+    comes = f"{abs(share) * names.dt:.3f} s {'later' if share > 0 else 'earlier'}"
+    left = (
+        f"with all that identified, the models err {times:.1f} times as much as in simulation four steps ahead: "
+        "something else differs, such as masses, friction, contacts or noise"
+    )
     return [
         Sign(
-            "command scale",
-            sure * max(abs(math.log(s)) for s in scales.values()) / math.log1p(_SCALE),
-            f"the robot moves {_each(scales, '{:.2f}')} times as far as in simulation",
+            "command scale", sure * scale / math.log1p(_SCALE), f"the robot moves {far} times as far as in simulation"
         ),
-        Sign(
-            "command rotation",
-            sure * abs(known["rotation"]) / _ROTATION,
-            f"commands are turned by {known['rotation']:+.2f} rad",
-        ),
-        Sign(
-            "command bias",
-            sure * max(map(abs, biases.values())) / _BIAS,
-            f"commands are off by {_each(biases, '{:+.2f}')} of their range",
-        ),
+        Sign("command rotation", sure * abs(turned) / _ROTATION, f"commands are turned by {turned:+.2f} rad"),
+        Sign("command bias", sure * bias / _BIAS, f"commands are off by {off} of their range"),
         _sensor_error(known["sensor_errors"], names),
         Sign(
-            "delay",
-            min(late["nats"] / _NATS, 1.0) * abs(late["share"]) / _DELAY,
-            f"commands come {abs(late['share']) * names.dt:.3f} s {'later' if late['share'] > 0 else 'earlier'} than "
-            "in simulation",
+            "delay", min(late["nats"] / _NATS, 1.0) * abs(share) / _DELAY, f"commands come {comes} than in simulation"
         ),
         _noise(found["noise"], names),
-        Sign(
-            "what is left",
-            times / _MODELS,
-            f"with all that identified, the models err {times:.1f} times as much as in simulation four steps ahead: "
-            "something else differs, such as masses, friction, contacts or noise",
-        ),
-    ]  # fmt: skip
+        Sign("what is left", times / _MODELS, left),
+    ]
 
 
 def _beyond_simulation(identified: Mapping[str, Any]) -> dict[str, Any]:
@@ -85,7 +74,10 @@ def _beyond_simulation(identified: Mapping[str, Any]) -> dict[str, Any]:
     Models of a domain with late or weak actuators expect such ones, so that a simulator without seems to overshoot.
     """
     usual = identified["simulated"]
-    less = lambda name: [a - b for a, b in zip(identified[name], usual[name], strict=True)]  # noqa: E731
+
+    def less(name: str) -> list[float]:
+        return [a - b for a, b in zip(identified[name], usual[name], strict=True)]
+
     return {
         "scale": [a / b for a, b in zip(identified["scale"], usual["scale"], strict=True)],
         "rotation": identified["rotation"] - usual["rotation"],
@@ -95,32 +87,28 @@ def _beyond_simulation(identified: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _sensor_error(offsets: Sequence[float], names: Names) -> Sign:
+    sizes = [(abs(x) / std if std else 0.0) for x, std in zip(offsets, names.errors, strict=True)]
     wrong = [
-        (abs(offset) / std, f"{name} by {_measure(offset, unit)}")
-        for offset, std, (name, unit) in zip(offsets, names.errors, names.sensors, strict=True) if std
-    ]  # fmt: skip
-    counted = [words for size, words in wrong if size >= _ERROR]
-    return Sign(
-        "sensor error", max((size for size, _ in wrong), default=0.0) / _ERROR, f"sensors are off: {', '.join(counted)}"
-    )
+        f"{name} by {_measure(x, unit)}"
+        for size, x, (name, unit) in zip(sizes, offsets, names.sensors, strict=True)
+        if size >= _ERROR
+    ]
+    return Sign("sensor error", max(sizes, default=0.0) / _ERROR, f"sensors are off: {', '.join(wrong)}")
 
 
 def _noise(found: Mapping[str, Sequence[float]], names: Names) -> Sign:
-    each = zip(found["real"], found["simulated"], names.sensors, strict=True)
-    times, own, usual, (name, unit) = max((own / max(usual, 1e-9), own, usual, sensor) for own, usual, sensor in each)
-    return Sign(
-        "noise",
-        times / _NOISE,
-        f"noise of {name} is {_measure(own, unit, '')}, {_measure(usual, unit, '')} in simulation",
-    )
+    sensors = zip(found["real"], found["simulated"], names.sensors, strict=True)
+    times, real, usual, (name, unit) = max((x / max(usual, 1e-9), x, usual, sensor) for x, usual, sensor in sensors)
+    words = f"noise of {name} is {_measure(real, unit, '')}, {_measure(usual, unit, '')} in simulation"
+    return Sign("noise", times / _NOISE, words)
 
 
 def _each(values: Mapping[str, float], form: str) -> str:
     """One number where all are alike, else each with its name."""
-    shown = {name: form.format(value) for name, value in values.items()}
-    return (
-        shown[next(iter(shown))] if len(set(shown.values())) == 1 else ", ".join(f"{v} ({k})" for k, v in shown.items())
-    )
+    words = {name: form.format(value) for name, value in values.items()}
+    if len(set(words.values())) == 1:
+        return next(iter(words.values()))
+    return ", ".join(f"{word} ({name})" for name, word in words.items())
 
 
 def _measure(value: float, unit: str, sign: str = "+") -> str:
@@ -134,13 +122,8 @@ def verdict(found: Mapping[str, Any], names: Names, c: Coefficients = COEFFICIEN
     found: see `examination.describe`. c: of the prediction.
     """
     x = prediction.inputs_of(found)
-    return [
-        _kind(signs(found, names)),
-        _guide(found["value"]),
-        _worth(found["success"], x, c),
-        _horizon(found),
-        _how_long(x, c),
-    ]
+    kind, worth = _kind(signs(found, names)), _worth(found["success"], x, c)
+    return [kind, _guide(found["value"]), worth, _horizon(found), _how_long(x, c)]
 
 
 def _kind(found: Sequence[Sign]) -> str:
@@ -152,11 +135,9 @@ def _kind(found: Sequence[Sign]) -> str:
 
 def _guide(value: Mapping[str, Any]) -> str:
     share, usual = (100 * value[where][0]["improvable"] for where in ("real", "simulated"))
-    trust = (
-        f"rollouts fall short of it by {value['shortfall']:.1f} standard deviations of what it is off by in simulation"
-    )
-    if value["shortfall"] < 1.0:
-        trust = "rollouts return what it promises"
+    trust = "rollouts return what it promises"
+    if (short := value["shortfall"]) >= 1.0:
+        trust = f"rollouts fall short of it by {short:.1f} standard deviations of what it is off by in simulation"
     return (
         f"V_sim: in {share:.0f} % of the visited states some action keeps what it promises ({usual:.0f} % in "
         f"simulation); {trust}; rank correlation with returns {value['rank_correlation']:.2f}"
@@ -165,14 +146,14 @@ def _guide(value: Mapping[str, Any]) -> str:
 
 def _worth(success: float, x: Inputs, c: Coefficients) -> str:
     """success: share of the rollouts, without the doubt that `inputs_of` adds."""
-    own = 100 * prediction.gain(x, c)
+    gain = 100 * prediction.gain(x, c)
     after = 100 * prediction.success_after(x, AHEAD, c)
-    said = f"{own:+.0f} points expected in {AHEAD} rollouts, to {after:.0f} %"
+    words = f"{gain:+.0f} points expected in {AHEAD} rollouts, to {after:.0f} %"
     if success >= _SOLVED:
-        return f"fine-tuning: little to gain ({own:+.0f} points expected); keep the policy, or use a guarded method"
-    if own >= 100 * _WORTH:
-        return f"fine-tuning: worth it, {said}"
-    return f"fine-tuning: little hope ({said}); a simulator with what differs, see above, helps more"
+        return f"fine-tuning: little to gain ({gain:+.0f} points expected); keep the policy, or use a guarded method"
+    if gain >= 100 * _WORTH:
+        return f"fine-tuning: worth it, {words}"
+    return f"fine-tuning: little hope ({words}); a simulator with what differs, see above, helps more"
 
 
 def _horizon(found: Mapping[str, Any]) -> str:

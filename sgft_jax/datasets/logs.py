@@ -92,7 +92,7 @@ def load(path: Path | str, *, gamma: float, successors: Successors = "stored", e
         raise UserError(unknown("successors", successors, known))
     path = Path(path)
     if path.suffix in _TABLES:
-        if env is None or not env.name.startswith("wheel-legged") or env.reward is None:
+        if env is None or not env.table or env.reward is None:
             task = "another task" if env is None else env.name
             raise UserError(f"{path}: tables are logs of a wheel-legged robot; {task} wants a data set")
         return load_table(path, gamma=gamma, obs_dim=env.measured_dim, reward=jax.vmap(env.reward), env=env)

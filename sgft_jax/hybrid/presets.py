@@ -12,8 +12,8 @@ def preset_for(method: Fixed, data: str) -> str:
 
     data: a name such as `walker2d_medium-v2`, in which the data set stands between other words. The longest fits best.
     """
-    found = [name for name in method.presets if _names(data, name)] if method.by_data else []
-    return max(found, key=len, default="")
+    fitting = [name for name in method.presets if _names(data, name)] if method.by_data else []
+    return max(fitting, key=len, default="")
 
 
 def say_preset(method: Fixed, preset: str, data: str) -> str:

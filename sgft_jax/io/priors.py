@@ -1,7 +1,6 @@
 """Impure: priors on disk, what pretraining hands to fine-tuning: a checkpoint of parameters and a readable card."""
 
 import hashlib
-import importlib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,11 +17,17 @@ from sgft_jax.files.folders import present
 from sgft_jax.files.jsonfile import differences, write_json
 from sgft_jax.io import checkpoint
 from sgft_jax.io.cards import CARD, read_card, resolve_shipped
+from sgft_jax.learners.actor import ActorParams
+from sgft_jax.learners.recurrent import RecurrentParams
+from sgft_jax.learners.sac import SACParams
+from sgft_jax.learners.tdmpc2_model import TDMPC2Params
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.policies import check_parameters
 from sgft_jax.types import Normalizer, Prior
 
 __all__ = ["load_prior", "save_prior"]
+PARAMS = {"sac": SACParams, "tdmpc2": TDMPC2Params, "recurrent": RecurrentParams, "actor": ActorParams}
+"""What holds the parameters of a prior, by its algorithm. Files have the names of fields, not of these classes."""
 
 
 def save_prior(folder: str | Path, prior: Prior) -> Path:
@@ -51,9 +56,9 @@ def load_prior(
 ) -> Prior:
     """Read a prior from its folder, from the run folder that holds one as `prior/`, or by name: `shipped:push/seed-0`.
 
-    Its parameters are the `<ALGORITHM>Params` of `sgft_jax.learners.<algorithm>`, None where there are none. Raises
-    UserError if the prior is missing, torn, or of another task, other sizes than asked for, or another version, or if
-    its numbers are not those of the networks that its card describes.
+    Its parameters are one of `PARAMS`, with None where there are none. Raises UserError if the prior is missing, torn,
+    or of another task, other sizes than asked for, or another version, or if its numbers are not those of the networks
+    that its card describes.
     """
     folder = _home(folder)
     manifest, card = checkpoint.read_manifest(folder), read_card(folder)
@@ -76,10 +81,8 @@ def load_prior(
 
 
 def _params(card: Mapping[str, Any], paths: Sequence[str], leaves: Sequence[Any]) -> Any:
-    """The `<ALGORITHM>Params` that hold arrays, or shapes, with these paths."""
-    algorithm = algorithm_of(card)
-    container = getattr(importlib.import_module(f"sgft_jax.learners.{algorithm}"), f"{algorithm.upper()}Params")
-    tree = _nest(paths, leaves)
+    """The parameters that hold arrays, or shapes, with these paths."""
+    container, tree = PARAMS[algorithm_of(card)], _nest(paths, leaves)
     if odd := sorted(set(tree) - set(container._fields)):
         raise UserError(f"holds {', '.join(odd)}, which this version does not know; pretrain again")
     for name, kind in (("normalizer", Normalizer), ("distortion", Distortion)):
@@ -92,7 +95,7 @@ def _params(card: Mapping[str, Any], paths: Sequence[str], leaves: Sequence[Any]
 
 def observed(card: Mapping[str, Any]) -> dict[str, Any]:
     """What the policy of a prior reads beside measurements, as arguments of `envs.make`."""
-    system = tuple(Varying(**own) for own in card.get("system", []))
+    system = tuple(Varying(**entry) for entry in card.get("system", []))
     return {"previous_actions": card.get("previous_actions", 0), "system": system}
 
 
@@ -124,11 +127,11 @@ def _home(folder: str | Path) -> Path:
 
 def digest(prior: Prior) -> str:
     """Twelve hex digits that tell whether two priors hold the same numbers under the same names."""
-    found = hashlib.sha256()
+    sha = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_leaves_with_path(_plain(prior.params)):
-        found.update(str(checkpoint.describe(path, leaf)).encode())
-        found.update(np.ascontiguousarray(leaf).tobytes())
-    return found.hexdigest()[:12]
+        sha.update(str(checkpoint.describe(path, leaf)).encode())
+        sha.update(np.ascontiguousarray(leaf).tobytes())
+    return sha.hexdigest()[:12]
 
 
 def algorithm_of(card: Mapping[str, Any]) -> str:
@@ -138,8 +141,8 @@ def algorithm_of(card: Mapping[str, Any]) -> str:
 
 def _structure(card: Mapping[str, Any]) -> dict[str, Any]:
     """What must be equal for policies that run in one program."""
-    own = {name: card.get(name) for name in ("network", "gamma", "ensemble_size", "plan")}
-    return own | {
+    shared = {name: card.get(name) for name in ("network", "gamma", "ensemble_size", "plan")}
+    return shared | {
         "algorithm": algorithm_of(card),
         "gru": card["config"]["gru"] if algorithm_of(card) == "recurrent" else None,
         "previous_actions": card.get("previous_actions", 0),
@@ -153,7 +156,7 @@ def _plain(tree: PyTree) -> PyTree:
     if hasattr(tree, "_asdict"):
         tree = tree._asdict()
     if isinstance(tree, dict) and all(isinstance(name, str) and "/" not in name for name in tree):
-        return {name: _plain(each) for name, each in tree.items()}
+        return {name: _plain(part) for name, part in tree.items()}
     if tree is None:
         return {}
     if not isinstance(tree, (jax.Array, np.ndarray)):

@@ -28,6 +28,7 @@ FORMAT = 3  # of run folders; a state saved by another format does not fit the c
 _STEPS = ("checkpoints/[0-9]*", f"checkpoints/{ASIDE}[0-9]*")
 _RESULTS = (*_STEPS, "real/*.npz", "evaluation/*/real/*.npz", "prior/*", "policy/*", "summary.json")
 _PACKAGES = ("sgft-jax", "jax", "jaxlib", "mujoco", "mujoco-mjx", "flax", "optax", "orbax-checkpoint", "numpy")
+NO_DATA, NO_SIMULATOR = "no-data", "no-simulator"  # what stands for them in the folders of runs without
 
 
 class Options(TypedDict, total=False):

@@ -1,7 +1,6 @@
 """What agents leave that act by an actor network alone."""
 
 import functools
-from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -27,7 +26,7 @@ _EXPLORE_NOISE = 0.1
 Head = Literal["affine", "gaussian", "deterministic"]
 
 
-class ACTORParams(NamedTuple):
+class ActorParams(NamedTuple):
     """actor: parameters of the network. normalizer: of the observations that it reads."""
 
     actor: PyTree
@@ -48,33 +47,25 @@ def actor_policy(obs_dim: int, act_dim: int, network: NetworkConfig, head: Head)
     head: what its last layer says: that of `make_affine_actor`, `make_actor` or `make_deterministic_actor`. The last
     explores with noise of std 0.1, which is cut off at the bounds, so its actions have no density.
     """
-    log_prob: Callable[[ACTORParams, Array, Array], Array] | None = None
     actor = make_actor_of(head, obs_dim, act_dim, network)
-    if head == "deterministic":
 
-        def choose(params: PyTree, obs: Array, key: Key, explore: bool | Array) -> Array:
-            return add_noise(actor.apply(params, obs), jnp.where(explore, _EXPLORE_NOISE, 0.0), key)
+    def output(params: ActorParams, obs: Array) -> Array:
+        return actor.apply(params.actor, normalize(params.normalizer, obs))
 
-    else:
+    def act(params: ActorParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
+        if head == "deterministic":
+            return add_noise(output(params, obs), jnp.where(explore, _EXPLORE_NOISE, 0.0), key), carry
+        return tanh_gaussian_action(output(params, obs), key, explore=explore), carry
 
-        def choose(params: PyTree, obs: Array, key: Key, explore: bool | Array) -> Array:
-            return tanh_gaussian_action(actor.apply(params, obs), key, explore=explore)
+    def log_prob(params: ActorParams, obs: Array, action: Array) -> Array:
+        return tanh_gaussian_log_prob(output(params, obs), untanh(action))
 
-        def density(params: ACTORParams, obs: Array, action: Array) -> Array:
-            moments = actor.apply(params.actor, normalize(params.normalizer, obs))
-            return tanh_gaussian_log_prob(moments, untanh(action))
-
-        log_prob = density
-
-    def act(params: ACTORParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
-        return choose(params.actor, normalize(params.normalizer, obs), key, explore), carry
-
-    return Policy(lambda: (), act, log_prob=log_prob)
+    return Policy(lambda: (), act, log_prob=None if head == "deterministic" else log_prob)
 
 
-def exported(state: PyTree) -> ACTORParams:
+def exported(state: PyTree) -> ActorParams:
     """Copies of the actor and the statistics of a learner's state, which may be donated afterwards."""
-    return ACTORParams(*jax.tree.map(lambda x: x + 0, (state.actor.params, state.normalizer)))
+    return ActorParams(*jax.tree.map(jnp.copy, (state.actor.params, state.normalizer)))
 
 
 def card(network: NetworkConfig, head: Head, gamma: float) -> dict[str, Any]:

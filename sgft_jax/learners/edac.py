@@ -6,48 +6,40 @@ al. 2021.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 
 from envs.types import Array, Key, PyTree
 from sgft_jax import checks
-from sgft_jax.learners.sac import Critic, CriticTerm, SACConfig, SACHyper, make_sac
+from sgft_jax.learners import sac
+from sgft_jax.learners.sac import SACConfig, SACHyper, SACState
+from sgft_jax.learners.steps import Critic
 from sgft_jax.math import losses
-from sgft_jax.models.networks import NetworkConfig
-from sgft_jax.types import Batch, Learner
+from sgft_jax.models.config import NetworkConfig
+from sgft_jax.types import Batch, Learner, Metrics
 
 NORM_MIN = 1e-10  # of a gradient; a critic that is flat points nowhere
 
 
 @dataclass(frozen=True)
-class EDACConfig:
-    """The structure of an agent. The defaults are those published for HalfCheetah and Walker2d.
+class EDACConfig(SACConfig):
+    """The structure of an agent: that of SAC and a number. The defaults are those for HalfCheetah and Walker2d.
 
-    obs_dim, act_dim: sizes of what the environment gives and takes. network: body of actor and critics.
-    critics: how many. diversity: weight eta of what keeps their gradients apart; 0 = SAC-N.
-    tune_alpha: follow the target entropy; False keeps the temperature.
+    diversity: weight eta of what keeps the gradients of the critics apart; 0 = SAC-N.
     """
 
-    obs_dim: int
-    act_dim: int
     network: NetworkConfig = field(default_factory=lambda: NetworkConfig((256, 256, 256)))
+    train_value: bool = False
+    train_dynamics: bool = False
     critics: int = 10
     diversity: float = 1.0
-    tune_alpha: bool = True
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         checks.at_least(self, 2, "critics")
         checks.not_negative(self, "diversity")
-
-
-def make_edac(config: EDACConfig, hyper: SACHyper | None = None) -> Learner:
-    """The learner of a configuration; its state is a `SACState`."""
-    structure = SACConfig(
-        config.obs_dim, config.act_dim, network=config.network, critics=config.critics, tune_alpha=config.tune_alpha,
-        train_value=False, train_dynamics=False,
-    )  # fmt: skip
-    return make_sac(structure, hyper, critic_term=_diversity(config) if config.diversity else None)
 
 
 def alignment(grads: Array) -> Array:
@@ -77,15 +69,28 @@ def mean_alignment(critic: Critic, params: PyTree, batch: Batch) -> Array:
     return losses.row_mean(jax.vmap(alignment)(jax.vmap(gradients)(batch.obs, batch.action)), batch)
 
 
-def _diversity(config: EDACConfig) -> CriticTerm:
-    def term(
-        critic: Critic,
-        params: PyTree,
-        policy: Callable[[Array, Key], tuple[Array, Array]],
-        batch: Batch,
-        key: Key,
-    ) -> Array:
-        del policy, key  # it looks at the data's own actions
-        return config.diversity * mean_alignment(critic, params, batch)
+def penalty(
+    config: EDACConfig,
+    critic: Critic,
+    params: PyTree,
+    policy: Callable[[Array, Key], tuple[Array, Array]],
+    batch: Batch,
+    key: Key,
+) -> Array:
+    """Diversity times `mean_alignment` [] at the data's own actions, a `sac.CriticTerm`."""
+    del policy, key
+    return config.diversity * mean_alignment(critic, params, batch)
 
-    return term
+
+init, act = sac.init, sac.act
+
+
+def update(config: EDACConfig, state: SACState, batch: Batch, key: Key) -> tuple[SACState, Metrics]:
+    """One update of SAC whose critics also pay for pointing the same way; see `sac.update`."""
+    term = partial(penalty, config) if config.diversity else None
+    return sac.update(config, state, batch, key, critic_term=term)
+
+
+def make_edac(config: EDACConfig, hyper: SACHyper | None = None) -> Learner:
+    """The functions of this module for one configuration."""
+    return sac.make_sac(config, hyper)._replace(update=partial(update, config))

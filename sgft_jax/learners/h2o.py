@@ -6,6 +6,7 @@ Source: Niu et al. 2022 (H2O), H2O+ Eq. (1), and the released code.
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import chex
@@ -16,16 +17,11 @@ from flax import struct
 
 from envs.types import Array, Key, PyTree
 from sgft_jax import checks
-from sgft_jax.learners import soft
+from sgft_jax.learners import steps
 from sgft_jax.math import losses, optim
 from sgft_jax.models import normalizer, ratio
 from sgft_jax.models.config import NetworkConfig, two_layers
-from sgft_jax.models.networks import (
-    Network,
-    make_affine_actor,
-    make_critic,
-    tanh_gaussian_sample,
-)
+from sgft_jax.models.networks import Network, make_affine_actor, make_critic
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
 GAP_MIN = 1e-6  # a pair that looks more real than simulated is not pushed; 1e-45, as published, may flush to 0 / 0
@@ -95,15 +91,6 @@ class H2OState(struct.PyTreeNode):
     step: Array
 
 
-class _Parts(NamedTuple):
-    """The networks and the optimiser that a configuration describes."""
-
-    actor: Network
-    critic: Network
-    ratio: ratio.Ratio
-    optimiser: optax.GradientTransformation
-
-
 # --- the penalty ------------------------------------------------------------------------------------------------------
 
 
@@ -127,96 +114,113 @@ def penalty(q: Array, shares: Array, batch: Batch) -> Array:
     """
     chex.assert_rank([q, shares], [2, 1])
 
-    def one(q: Array) -> Array:
+    def of_member(q: Array) -> Array:
         difference = jax.nn.logsumexp(shares + q) - losses.real_mean(q, batch)
         return jnp.clip(difference, -PENALTY_MAX, PENALTY_MAX)
 
-    return jnp.sum(jax.vmap(one, 1)(q))
+    return jnp.sum(jax.vmap(of_member, 1)(q))
 
 
 # --- the learner ------------------------------------------------------------------------------------------------------
 
 
-def make_h2o(config: H2OConfig, hyper: H2OHyper | None = None) -> Learner:
-    """The learner of a configuration. Its batches must say which rows are simulated; set `H2OState.spread`."""
-    sizes, body = (config.obs_dim, config.act_dim), config.network
-    parts = _Parts(
-        actor=make_affine_actor(*sizes, body, output_gain=soft.OUTPUT_GAIN),
-        critic=make_critic(*sizes, body, output_gain=soft.OUTPUT_GAIN),
+class _Networks(NamedTuple):
+    """A configuration with the networks and the optimiser that it describes."""
+
+    config: H2OConfig
+    actor: Network
+    critic: Network
+    ratio: ratio.Ratio
+    optimiser: optax.GradientTransformation
+
+
+def _networks(config: H2OConfig) -> _Networks:
+    sizes, gain = (config.obs_dim, config.act_dim), steps.OUTPUT_GAIN
+    return _Networks(
+        config=config,
+        actor=make_affine_actor(*sizes, config.network, output_gain=gain),
+        critic=make_critic(*sizes, config.network, output_gain=gain),
         ratio=ratio.make_ratio(ratio.RatioConfig(*sizes, config.ratio_network, noise=config.ratio_noise)),
         optimiser=optim.adam(),
     )
-    leaves = hyper or H2OHyper()
-
-    def init(key: Key) -> H2OState:
-        keys = jax.random.split(key, 3)
-        critic = parts.critic.init(keys[1])
-        numbers = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), leaves)
-        return H2OState(
-            actor=optim.start(parts.optimiser, parts.actor.init(keys[0])),
-            critic=optim.start(parts.optimiser, critic),
-            target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
-            log_alpha=optim.start(parts.optimiser, jnp.log(numbers.alpha)),
-            ratio=parts.ratio.init(keys[2]),
-            spread=jnp.zeros(config.obs_dim),
-            normalizer=normalizer.identity(config.obs_dim),
-            hyper=numbers,
-            step=jnp.int32(0),
-        )
-
-    def update(state: H2OState, batch: Batch, key: Key) -> tuple[H2OState, Metrics]:
-        return _update(config, parts, state, batch, key)
-
-    return Learner(init, lambda: (), soft.make_act(parts.actor), update)
 
 
-# --- one update -------------------------------------------------------------------------------------------------------
+def init(config: H2OConfig, key: Key, hyper: H2OHyper | None = None) -> H2OState:
+    """A fresh agent. Set `H2OState.spread`, and the observation statistics with `state.replace(normalizer=...)`."""
+    nets, numbers, keys = _networks(config), optim.as_leaves(hyper or H2OHyper()), jax.random.split(key, 3)
+    critic = nets.critic.init(keys[1])
+    return H2OState(
+        actor=optim.start(nets.optimiser, nets.actor.init(keys[0])),
+        critic=optim.start(nets.optimiser, critic),
+        target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
+        log_alpha=optim.start(nets.optimiser, jnp.log(numbers.alpha)),
+        ratio=nets.ratio.init(keys[2]),
+        spread=jnp.zeros(config.obs_dim),
+        normalizer=normalizer.identity(config.obs_dim),
+        hyper=numbers,
+        step=jnp.int32(0),
+    )
 
 
-def _update(config: H2OConfig, parts: _Parts, state: H2OState, batch: Batch, key: Key) -> tuple[H2OState, Metrics]:
-    """Discriminators first. All other losses are those of the networks before the update. Source: the released code."""
+def act(
+    config: H2OConfig, state: H2OState, carry: tuple[()], obs: Array, key: Key, *, explore: bool | Array
+) -> tuple[Array, tuple[()]]:
+    """Action [act_dim] in [-1, 1] for a raw obs [obs_dim], and the carry as it was."""
+    return steps.act(_networks(config).actor, state, obs, key, explore=explore), carry
+
+
+def update(config: H2OConfig, state: H2OState, batch: Batch, key: Key) -> tuple[H2OState, Metrics]:
+    """Discriminators first. All other losses are those of the networks before the update. Source: the released code.
+
+    batch: [B, ...] raw, which says which rows are simulated (`Batch.is_sim`). metrics: [] each.
+    """
+    nets, hyper = _networks(config), state.hyper
     key_ratio, key_gap, key_actor, key_target = jax.random.split(key, 4)
     batch, for_ratio = ratio.split_rows(batch, config.ratio_rows)
-    fit, log_w, metrics = ratio.step(parts.ratio, state.ratio, batch, for_ratio, key_ratio, rate=state.hyper.lr_ratio)
+    fit, log_w, metrics = ratio.step(nets.ratio, state.ratio, batch, for_ratio, key_ratio, rate=hyper.lr_ratio)
     state = state.replace(ratio=fit)
-    gaps = _gaps(config, parts, state, batch, key_gap)
+    gaps = _gaps(nets, state, batch, key_gap)
     shares, weights = log_shares(gaps, batch), jax.vmap(ratio.weight)(log_w)
-    normal = jax.vmap(normalizer.normalize, (None, 0))
-    batch = batch._replace(obs=normal(state.normalizer, batch.obs), next_obs=normal(state.normalizer, batch.next_obs))
+    batch = normalizer.normalize_rows(state.normalizer, batch)
 
-    target_entropy = state.hyper.entropy_per_dim * config.act_dim if config.tune_alpha else None
-    actor, log_alpha, of_actor = soft.step_policy(
-        parts.actor, parts.critic, parts.optimiser, state, batch, key_actor, target_entropy=target_entropy
+    entropy = hyper.entropy_per_dim * config.act_dim if config.tune_alpha else None
+    actor, log_alpha, of_actor = steps.step_policy(
+        nets.actor, nets.critic, nets.optimiser, state, batch, key_actor, target_entropy=entropy
     )
-    critic, of_critic = soft.step_critic(
-        parts.critic, parts.optimiser, state, batch, _targets(parts, state, batch, key_target), weights,
-        penalty=lambda params, q: state.hyper.conservatism * penalty(q, shares, batch),
-    )  # fmt: skip
-    target = optax.incremental_update(critic.params, state.target_critic, state.hyper.tau)
+    critic, of_critic = steps.step_mixed_critic(
+        nets.critic.apply,
+        nets.optimiser,
+        state.critic,
+        batch,
+        _targets(nets, state, batch, key_target),
+        weights,
+        rate=hyper.lr_critic,
+        penalty=lambda params, q: hyper.conservatism * penalty(q, shares, batch),
+    )
+    target = optax.incremental_update(critic.params, state.target_critic, hyper.tau)
     metrics |= of_actor | of_critic | {"ratio/gap_sim": losses.sim_mean(gaps, batch)}
     state = state.replace(actor=actor, log_alpha=log_alpha, critic=critic, target_critic=target, step=state.step + 1)
     return state, metrics
 
 
-def _gaps(config: H2OConfig, parts: _Parts, state: H2OState, batch: Batch, key: Key) -> Array:
+def make_h2o(config: H2OConfig, hyper: H2OHyper | None = None) -> Learner:
+    """The functions of this module for one configuration."""
+    return Learner(partial(init, config, hyper=hyper), lambda: (), partial(act, config), partial(update, config))
+
+
+def _gaps(nets: _Networks, state: H2OState, batch: Batch, key: Key) -> Array:
     """KL(P_sim || P) at every pair [B], nats: the mean of log P_sim / P over noisy copies of its successor."""
-    std = state.hyper.spread_scale * state.spread
+    std, log_ratio = state.hyper.spread_scale * state.spread, partial(nets.ratio.log_ratio, state.ratio)
 
-    def one(row: Batch, key: Key) -> Array:
-        noise = jax.random.normal(key, (config.successors, config.obs_dim))
-        following = jax.vmap(lambda n: row.next_obs + std * n)(noise)
-        log_w = jax.vmap(parts.ratio.log_ratio, (None, None, None, 0))(state.ratio, row.obs, row.action, following)
-        return -jnp.mean(log_w)
+    def gap(row: Batch, key: Key) -> Array:
+        noise = jax.random.normal(key, (nets.config.successors, nets.config.obs_dim))
+        successors = jax.vmap(lambda n: row.next_obs + std * n)(noise)
+        return -jnp.mean(jax.vmap(log_ratio, (None, None, 0))(row.obs, row.action, successors))
 
-    return jax.lax.stop_gradient(jax.vmap(one)(batch, jax.random.split(key, batch.reward.shape[0])))
+    return jax.lax.stop_gradient(jax.vmap(gap)(batch, jax.random.split(key, batch.reward.shape[0])))
 
 
-def _targets(parts: _Parts, state: H2OState, batch: Batch, key: Key) -> Array:
+def _targets(nets: _Networks, state: H2OState, batch: Batch, key: Key) -> Array:
     """Targets r + discount min_i Q_i(s', a') [B], without the entropy."""
-
-    def one(row: Batch, key: Key) -> Array:
-        action, log_prob = tanh_gaussian_sample(parts.actor.apply(state.actor.params, row.next_obs), key)
-        next_q = parts.critic.apply(state.target_critic, row.next_obs, action)
-        return losses.td_target(row.reward, row.discount, next_q, log_prob, alpha=0.0)
-
-    return jax.vmap(one)(batch, jax.random.split(key, batch.reward.shape[0]))
+    policy, critic = partial(nets.actor.apply, state.actor.params), partial(nets.critic.apply, state.target_critic)
+    return steps.soft_targets(policy, critic, batch, key, alpha=0.0)

@@ -8,6 +8,7 @@ code.
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple, get_args
 
 import jax
@@ -17,7 +18,7 @@ from flax import struct
 
 from envs.types import Array, Key, PyTree, UserError, unknown
 from sgft_jax import checks
-from sgft_jax.learners import edac, iql, soft
+from sgft_jax.learners import edac, iql, steps
 from sgft_jax.math import losses, optim
 from sgft_jax.math.value_losses import value_loss
 from sgft_jax.models import normalizer, ratio
@@ -109,9 +110,6 @@ class H2OPlusState(struct.PyTreeNode):
     step: Array
 
 
-# --- the learner ------------------------------------------------------------------------------------------------------
-
-
 def mixed_target(
     reward: Array,
     discount: Array,
@@ -132,9 +130,13 @@ def mixed_target(
     return value_share * in_sample + (1 - value_share) * online
 
 
-class _Parts(NamedTuple):
-    """The networks and the optimiser that a configuration describes."""
+# --- the learner ------------------------------------------------------------------------------------------------------
 
+
+class _Networks(NamedTuple):
+    """A configuration with the networks and the optimiser that it describes."""
+
+    config: H2OPlusConfig
     actor: Network
     critic: Network
     value: Network
@@ -142,99 +144,102 @@ class _Parts(NamedTuple):
     optimiser: optax.GradientTransformation
 
 
-def make_h2oplus(config: H2OPlusConfig, hyper: H2OPlusHyper | None = None) -> Learner:
-    """The learner of a configuration. Its batches must say which rows are simulated (`Batch.is_sim`)."""
-    sizes, body = (config.obs_dim, config.act_dim), config.network
-    parts = _Parts(
-        actor=make_affine_actor(*sizes, body, output_gain=soft.OUTPUT_GAIN),
-        critic=make_critic(*sizes, body, members=config.critics, output_gain=soft.OUTPUT_GAIN),
-        value=make_value(config.obs_dim, body, output_gain=soft.OUTPUT_GAIN),
+def _networks(config: H2OPlusConfig) -> _Networks:
+    sizes, gain = (config.obs_dim, config.act_dim), steps.OUTPUT_GAIN
+    return _Networks(
+        config=config,
+        actor=make_affine_actor(*sizes, config.network, output_gain=gain),
+        critic=make_critic(*sizes, config.network, members=config.critics, output_gain=gain),
+        value=make_value(config.obs_dim, config.network, output_gain=gain),
         ratio=ratio.make_ratio(ratio.RatioConfig(*sizes, config.ratio_network, noise=config.ratio_noise)),
         optimiser=optim.adam(),
     )
-    leaves = hyper or H2OPlusHyper()
-
-    def init(key: Key) -> H2OPlusState:
-        keys = jax.random.split(key, 4)
-        critic = parts.critic.init(keys[1])
-        numbers = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), leaves)
-        return H2OPlusState(
-            actor=optim.start(parts.optimiser, parts.actor.init(keys[0])),
-            critic=optim.start(parts.optimiser, critic),
-            target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
-            value=optim.start(parts.optimiser, parts.value.init(keys[2])),
-            log_alpha=optim.start(parts.optimiser, jnp.log(numbers.alpha)),
-            ratio=parts.ratio.init(keys[3]) if config.ratio else None,
-            normalizer=normalizer.identity(config.obs_dim),
-            hyper=numbers,
-            step=jnp.int32(0),
-        )
-
-    def update(state: H2OPlusState, batch: Batch, key: Key) -> tuple[H2OPlusState, Metrics]:
-        return _update(config, parts, state, batch, key)
-
-    return Learner(init, lambda: (), soft.make_act(parts.actor), update)
 
 
-# --- one update -------------------------------------------------------------------------------------------------------
+def init(config: H2OPlusConfig, key: Key, hyper: H2OPlusHyper | None = None) -> H2OPlusState:
+    """A fresh agent. Set the observation statistics with `state.replace(normalizer=...)`."""
+    nets, numbers, keys = _networks(config), optim.as_leaves(hyper or H2OPlusHyper()), jax.random.split(key, 4)
+    critic = nets.critic.init(keys[1])
+    return H2OPlusState(
+        actor=optim.start(nets.optimiser, nets.actor.init(keys[0])),
+        critic=optim.start(nets.optimiser, critic),
+        target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
+        value=optim.start(nets.optimiser, nets.value.init(keys[2])),
+        log_alpha=optim.start(nets.optimiser, jnp.log(numbers.alpha)),
+        ratio=nets.ratio.init(keys[3]) if config.ratio else None,
+        normalizer=normalizer.identity(config.obs_dim),
+        hyper=numbers,
+        step=jnp.int32(0),
+    )
 
 
-def _update(
-    config: H2OPlusConfig, parts: _Parts, state: H2OPlusState, batch: Batch, key: Key
-) -> tuple[H2OPlusState, Metrics]:
-    """Discriminators first. All other losses are those of the networks before the update. Source: the released code."""
+def act(
+    config: H2OPlusConfig, state: H2OPlusState, carry: tuple[()], obs: Array, key: Key, *, explore: bool | Array
+) -> tuple[Array, tuple[()]]:
+    """Action [act_dim] in [-1, 1] for a raw obs [obs_dim], and the carry as it was."""
+    return steps.act(_networks(config).actor, state, obs, key, explore=explore), carry
+
+
+def update(config: H2OPlusConfig, state: H2OPlusState, batch: Batch, key: Key) -> tuple[H2OPlusState, Metrics]:
+    """Discriminators first. All other losses are those of the networks before the update. Source: the released code.
+
+    batch: [B, ...] raw, which says which rows are simulated (`Batch.is_sim`). metrics: [] each.
+    """
+    nets, hyper = _networks(config), state.hyper
     key_ratio, key_actor, key_target = jax.random.split(key, 3)
     batch, for_ratio = ratio.split_rows(batch, config.ratio_rows)
     weights, metrics = jnp.ones_like(batch.reward), {}
     if config.ratio:
-        fit, log_w, metrics = ratio.step(
-            parts.ratio, state.ratio, batch, for_ratio, key_ratio, rate=state.hyper.lr_ratio
-        )
+        fit, log_w, metrics = ratio.step(nets.ratio, state.ratio, batch, for_ratio, key_ratio, rate=hyper.lr_ratio)
         state, weights = state.replace(ratio=fit), jax.vmap(ratio.weight)(log_w)
-    normal = jax.vmap(normalizer.normalize, (None, 0))
-    batch = batch._replace(obs=normal(state.normalizer, batch.obs), next_obs=normal(state.normalizer, batch.next_obs))
+    batch = normalizer.normalize_rows(state.normalizer, batch)
 
-    target_entropy = state.hyper.entropy_per_dim * config.act_dim if config.tune_alpha else None
-    actor, log_alpha, of_actor = soft.step_policy(
-        parts.actor, parts.critic, parts.optimiser, state, batch, key_actor, target_entropy=target_entropy
+    entropy = hyper.entropy_per_dim * config.act_dim if config.tune_alpha else None
+    actor, log_alpha, of_actor = steps.step_policy(
+        nets.actor, nets.critic, nets.optimiser, state, batch, key_actor, target_entropy=entropy
     )
-    value, of_value = _step_value(config, parts, state, batch)
-    critic, of_critic = _step_critic(config, parts, state, batch, weights, key_target)
-    target = optax.incremental_update(critic.params, state.target_critic, state.hyper.tau)
+    value, of_value = _step_value(nets, state, batch)
+    critic, of_critic = _step_critic(nets, state, batch, weights, key_target)
+    target = optax.incremental_update(critic.params, state.target_critic, hyper.tau)
     state = state.replace(
         actor=actor, log_alpha=log_alpha, value=value, critic=critic, target_critic=target, step=state.step + 1
     )
     return state, metrics | of_actor | of_value | of_critic
 
 
-def _step_value(config: H2OPlusConfig, parts: _Parts, state: H2OPlusState, batch: Batch) -> tuple[optim.Fit, Metrics]:
+def make_h2oplus(config: H2OPlusConfig, hyper: H2OPlusHyper | None = None) -> Learner:
+    """The functions of this module for one configuration."""
+    return Learner(partial(init, config, hyper=hyper), lambda: (), partial(act, config), partial(update, config))
+
+
+# --- one update -------------------------------------------------------------------------------------------------------
+
+
+def _step_value(nets: _Networks, state: H2OPlusState, batch: Batch) -> tuple[optim.Fit, Metrics]:
     """V after a step on the real rows alone, against the minimum of the target critics. Source: H2O+ Eq. (4)."""
-    q = jnp.min(jax.vmap(parts.critic.apply, (None, 0, 0))(state.target_critic, batch.obs, batch.action), axis=1)
+    q = jnp.min(jax.vmap(nets.critic.apply, (None, 0, 0))(state.target_critic, batch.obs, batch.action), axis=1)
     hyper, counted = state.hyper, losses.real_rows(batch)
+    numbers = {"expectile": hyper.expectile, "alpha": hyper.value_alpha, "cut": hyper.value_cut}
 
     def loss(params: PyTree) -> tuple[Array, Array]:
-        values = jax.vmap(parts.value.apply, (None, 0))(params, batch.obs)
-        each = value_loss(
-            config.value_loss, values, q, counted,
-            expectile=hyper.expectile, alpha=hyper.value_alpha, cut=hyper.value_cut,
-        )  # fmt: skip
-        return losses.real_mean(each, batch), values
+        values = jax.vmap(nets.value.apply, (None, 0))(params, batch.obs)
+        errors = value_loss(nets.config.value_loss, values, q, counted, **numbers)
+        return losses.real_mean(errors, batch), values
 
-    (mean, values), grads = jax.value_and_grad(loss, has_aux=True)(state.value.params)
-    fit = optim.step(parts.optimiser, state.value, grads, hyper.lr_value)
+    fit, mean, values = optim.minimise(nets.optimiser, loss, state.value, hyper.lr_value)
     return fit, {"value/loss": mean, "value/mean": losses.real_mean(values, batch)}
 
 
 def _step_critic(
-    config: H2OPlusConfig, parts: _Parts, state: H2OPlusState, batch: Batch, weights: Array, key: Key
+    nets: _Networks, state: H2OPlusState, batch: Batch, weights: Array, key: Key
 ) -> tuple[optim.Fit, Metrics]:
     """The critics after a step on real and weighted simulated errors, a mean of each. Source: H2O+ Eqs. (7), (8)."""
-    hyper, alpha = state.hyper, jnp.exp(state.log_alpha.params)
+    hyper, alpha, diversity = state.hyper, jnp.exp(state.log_alpha.params), nets.config.diversity
 
     def target(row: Batch, key: Key) -> Array:
-        action, log_prob = tanh_gaussian_sample(parts.actor.apply(state.actor.params, row.next_obs), key)
-        next_q = parts.critic.apply(state.target_critic, row.next_obs, action)
-        next_value = parts.value.apply(state.value.params, row.next_obs)
+        action, log_prob = tanh_gaussian_sample(nets.actor.apply(state.actor.params, row.next_obs), key)
+        next_q = nets.critic.apply(state.target_critic, row.next_obs, action)
+        next_value = nets.value.apply(state.value.params, row.next_obs)
         return mixed_target(
             row.reward, row.discount, next_value, next_q, log_prob, value_share=hyper.value_share, alpha=alpha
         )
@@ -242,9 +247,16 @@ def _step_critic(
     def crowding(params: PyTree, q: Array) -> Array:
         del q  # it looks at gradients alone
         real = batch._replace(valid=losses.real_rows(batch))  # the policy itself tries what lies beside simulated pairs
-        return config.diversity * edac.mean_alignment(parts.critic.apply, params, real)
+        return diversity * edac.mean_alignment(nets.critic.apply, params, real)
 
     targets = jax.vmap(target)(batch, jax.random.split(key, batch.reward.shape[0]))
-    return soft.step_critic(
-        parts.critic, parts.optimiser, state, batch, targets, weights, penalty=crowding if config.diversity else None
+    return steps.step_mixed_critic(
+        nets.critic.apply,
+        nets.optimiser,
+        state.critic,
+        batch,
+        targets,
+        weights,
+        rate=hyper.lr_critic,
+        penalty=crowding if diversity else None,
     )

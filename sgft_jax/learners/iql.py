@@ -7,7 +7,8 @@ that expectiles and learning rates vmap like seeds do. Source: Kostrikov et al. 
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple, cast
+from functools import partial
+from typing import NamedTuple
 
 import chex
 import jax
@@ -16,16 +17,17 @@ import optax
 from flax import struct
 
 from envs.types import Array, Key, PyTree
+from sgft_jax.learners import steps
 from sgft_jax.math import losses, optim, value_losses
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import (
     LOG_STD_MAX,
     LOG_STD_MIN,
-    MLP,
     Network,
     NetworkConfig,
     add_noise,
     make_critic,
+    make_mlp,
     make_value,
 )
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
@@ -90,14 +92,13 @@ def make_gaussian_actor(obs_dim: int, act_dim: int, config: NetworkConfig) -> Ne
 
     tanh bounds the mean alone, not what is drawn around it.
     """
-    body = MLP(config.hidden, act_dim, config.actor_layer_norm, config.activation)
+    body = make_mlp(obs_dim, act_dim, config, layer_norm=config.actor_layer_norm)
 
     def init(key: Key) -> PyTree:
-        return {"mean": body.init(key, jnp.zeros(obs_dim))["params"], "log_std": jnp.zeros(act_dim)}
+        return {"mean": body.init(key), "log_std": jnp.zeros(act_dim)}
 
     def apply(params: PyTree, obs: Array) -> Array:
-        mean = cast(Array, body.apply({"params": params["mean"]}, obs))
-        return jnp.stack([jnp.tanh(mean), params["log_std"]])
+        return jnp.stack([jnp.tanh(body.apply(params["mean"], obs)), params["log_std"]])
 
     return Network(init, apply)
 
@@ -151,7 +152,7 @@ def td_target(reward: Array, discount: Array, next_value: Array, *, reward_scale
 # --- the learner ------------------------------------------------------------------------------------------------------
 
 
-class _Parts(NamedTuple):
+class _Networks(NamedTuple):
     """The networks and the optimiser that a configuration describes."""
 
     actor: Network
@@ -160,90 +161,93 @@ class _Parts(NamedTuple):
     optimiser: optax.GradientTransformation
 
 
-def make_iql(config: IQLConfig, hyper: IQLHyper | None = None) -> Learner:
-    """The learner of a configuration. Set the observation statistics with `state.replace(normalizer=...)`.
+def _networks(config: IQLConfig) -> _Networks:
+    sizes = config.obs_dim, config.act_dim, config.network
+    value = make_value(config.obs_dim, config.network)
+    return _Networks(make_gaussian_actor(*sizes), make_critic(*sizes), value, optim.adam(config.max_grad_norm))
+
+
+def init(config: IQLConfig, key: Key, hyper: IQLHyper | None = None) -> IQLState:
+    """A fresh agent. Set the observation statistics with `state.replace(normalizer=...)`.
 
     New numbers, set with `state.replace(hyper=...)`, must be float32 arrays like the old ones, or the update is
     compiled again.
     """
-    sizes, body = (config.obs_dim, config.act_dim), config.network
-    parts = _Parts(
-        actor=make_gaussian_actor(*sizes, body),
-        critic=make_critic(*sizes, body),
-        value=make_value(config.obs_dim, body),
-        optimiser=optim.adam(config.max_grad_norm),
+    nets, keys = _networks(config), jax.random.split(key, 3)
+    critic = nets.critic.init(keys[1])
+    return IQLState(
+        actor=optim.start(nets.optimiser, nets.actor.init(keys[0])),
+        critic=optim.start(nets.optimiser, critic),
+        target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
+        value=optim.start(nets.optimiser, nets.value.init(keys[2])),
+        normalizer=normalizer.identity(config.obs_dim),
+        hyper=optim.as_leaves(hyper or IQLHyper()),
+        step=jnp.int32(0),
     )
-    leaves = hyper or IQLHyper()
 
-    def init(key: Key) -> IQLState:
-        keys = jax.random.split(key, 3)
-        critic = parts.critic.init(keys[1])
-        return IQLState(
-            actor=optim.start(parts.optimiser, parts.actor.init(keys[0])),
-            critic=optim.start(parts.optimiser, critic),
-            target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
-            value=optim.start(parts.optimiser, parts.value.init(keys[2])),
-            normalizer=normalizer.identity(config.obs_dim),
-            hyper=jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), leaves),
-            step=jnp.int32(0),
-        )
 
-    def act(
-        state: IQLState, carry: tuple[()], obs: Array, key: Key, *, explore: bool | Array, context: Array | None = None
-    ) -> tuple[Array, tuple[()]]:
-        del context  # it reads the observation alone
-        moments = parts.actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
-        return gaussian_action(moments, key, explore=explore), carry
+def act(
+    config: IQLConfig,
+    state: IQLState,
+    carry: tuple[()],
+    obs: Array,
+    key: Key,
+    *,
+    explore: bool | Array,
+    context: Array | None = None,
+) -> tuple[Array, tuple[()]]:
+    """Action [act_dim] in [-1, 1] for a raw obs [obs_dim], and the carry as it was. The context is not read."""
+    del context
+    moments = _networks(config).actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
+    return gaussian_action(moments, key, explore=explore), carry
 
-    def update(state: IQLState, batch: Batch, key: Key) -> tuple[IQLState, Metrics]:
-        return _update(parts, state, batch)  # draws nothing: the key is there because other learners need one
 
-    return Learner(init, lambda: (), act, update)
+def update(config: IQLConfig, state: IQLState, batch: Batch, key: Key) -> tuple[IQLState, Metrics]:
+    """One step of value, then of actor and critic, which both use the new value, then of the target critic.
+
+    batch: [B, ...] raw. metrics: [] each. Draws nothing: the key is there because other learners need one.
+    """
+    del key
+    nets, batch = _networks(config), normalizer.normalize_rows(state.normalizer, batch)
+    q = jnp.min(jax.vmap(nets.critic.apply, (None, 0, 0))(state.target_critic, batch.obs, batch.action), axis=1)
+    state, of_value = _update_value(nets, state, batch, q)
+    state, of_actor = _update_actor(nets, state, batch, q)
+    state, of_critic = _update_critic(nets, state, batch)
+    target = optax.incremental_update(state.critic.params, state.target_critic, state.hyper.tau)
+    return state.replace(target_critic=target, step=state.step + 1), of_value | of_actor | of_critic
+
+
+def make_iql(config: IQLConfig, hyper: IQLHyper | None = None) -> Learner:
+    """The functions of this module for one configuration."""
+    return Learner(partial(init, config, hyper=hyper), lambda: (), partial(act, config), partial(update, config))
 
 
 # --- one update -------------------------------------------------------------------------------------------------------
 
 
-def _update(parts: _Parts, state: IQLState, batch: Batch) -> tuple[IQLState, Metrics]:
-    """Value, then actor and critic, which both use the new value, then the target critic."""
-    normal = jax.vmap(normalizer.normalize, (None, 0))
-    batch = batch._replace(obs=normal(state.normalizer, batch.obs), next_obs=normal(state.normalizer, batch.next_obs))
-    q = jnp.min(jax.vmap(parts.critic.apply, (None, 0, 0))(state.target_critic, batch.obs, batch.action), axis=1)
+def _update_value(nets: _Networks, state: IQLState, batch: Batch, q: Array) -> tuple[IQLState, Metrics]:
+    row_loss = partial(value_losses.expectile_loss, expectile=state.hyper.expectile)
 
-    state, metrics = _update_value(parts, state, batch, q)
-    state, more = _update_actor(parts, state, batch, q)
-    metrics |= more
-    state, more = _update_critic(parts, state, batch)
-    metrics |= more
-    target = optax.incremental_update(state.critic.params, state.target_critic, state.hyper.tau)
-    return state.replace(target_critic=target, step=state.step + 1), metrics
-
-
-def _update_value(parts: _Parts, state: IQLState, batch: Batch, q: Array) -> tuple[IQLState, Metrics]:
     def loss(params: PyTree) -> tuple[Array, Array]:
-        values = jax.vmap(parts.value.apply, (None, 0))(params, batch.obs)
-        each = jax.vmap(lambda v, q: value_losses.expectile_loss(v, q, expectile=state.hyper.expectile))(values, q)
-        return losses.row_mean(each, batch), values
+        values = jax.vmap(nets.value.apply, (None, 0))(params, batch.obs)
+        return losses.row_mean(jax.vmap(row_loss)(values, q), batch), values
 
-    (mean, values), grads = jax.value_and_grad(loss, has_aux=True)(state.value.params)
-    fit = optim.step(parts.optimiser, state.value, grads, state.hyper.lr_value)
+    fit, mean, values = optim.minimise(nets.optimiser, loss, state.value, state.hyper.lr_value)
     return state.replace(value=fit), {"value/loss": mean, "value/mean": jnp.mean(values)}
 
 
-def _update_actor(parts: _Parts, state: IQLState, batch: Batch, q: Array) -> tuple[IQLState, Metrics]:
+def _update_actor(nets: _Networks, state: IQLState, batch: Batch, q: Array) -> tuple[IQLState, Metrics]:
     """q: [B] of the target critic, as the value saw them."""
     hyper = state.hyper
-    values = jax.vmap(parts.value.apply, (None, 0))(state.value.params, batch.obs)
-    weight = jax.vmap(lambda v, q: advantage_weight(v, q, beta=hyper.beta, max_weight=hyper.max_weight))
-    weights = weight(values, q)
+    values = jax.vmap(nets.value.apply, (None, 0))(state.value.params, batch.obs)
+    weights = jax.vmap(partial(advantage_weight, beta=hyper.beta, max_weight=hyper.max_weight))(values, q)
 
-    def loss(params: PyTree) -> Array:
-        moments = jax.vmap(parts.actor.apply, (None, 0))(params, batch.obs)
-        return losses.row_mean(jax.vmap(policy_loss)(moments, batch.action, weights), batch)
+    def loss(params: PyTree) -> tuple[Array, tuple[()]]:
+        moments = jax.vmap(nets.actor.apply, (None, 0))(params, batch.obs)
+        return losses.row_mean(jax.vmap(policy_loss)(moments, batch.action, weights), batch), ()
 
-    mean, grads = jax.value_and_grad(loss)(state.actor.params)
     rate = hyper.lr_actor * optim.cosine_factor(state.step, hyper.actor_updates)
-    fit = optim.step(parts.optimiser, state.actor, grads, rate)
+    fit, mean, _ = optim.minimise(nets.optimiser, loss, state.actor, rate)
     # The parameter itself is kept in bounds: a bound in `apply` has no gradient beyond it, and would hold it for ever.
     log_std = jnp.clip(fit.params["log_std"], LOG_STD_MIN, LOG_STD_MAX)
     metrics = {
@@ -256,16 +260,11 @@ def _update_actor(parts: _Parts, state: IQLState, batch: Batch, q: Array) -> tup
     return state.replace(actor=fit._replace(params={**fit.params, "log_std": log_std})), metrics
 
 
-def _update_critic(parts: _Parts, state: IQLState, batch: Batch) -> tuple[IQLState, Metrics]:
-    next_values = jax.vmap(parts.value.apply, (None, 0))(state.value.params, batch.next_obs)
-    target = jax.vmap(lambda r, d, v: td_target(r, d, v, reward_scale=state.hyper.reward_scale))
-    targets = target(batch.reward, batch.discount, next_values)
-
-    def loss(params: PyTree) -> tuple[Array, Array]:
-        q = jax.vmap(parts.critic.apply, (None, 0, 0))(params, batch.obs, batch.action)
-        return losses.row_mean(jax.vmap(losses.critic_loss)(q, targets), batch), q
-
-    (mean, q), grads = jax.value_and_grad(loss, has_aux=True)(state.critic.params)
-    fit = optim.step(parts.optimiser, state.critic, grads, state.hyper.lr_critic)
-    metrics = {"critic/loss": mean, "critic/q_mean": jnp.mean(q), "critic/target_mean": jnp.mean(targets)}
+def _update_critic(nets: _Networks, state: IQLState, batch: Batch) -> tuple[IQLState, Metrics]:
+    next_values = jax.vmap(nets.value.apply, (None, 0))(state.value.params, batch.next_obs)
+    target = partial(td_target, reward_scale=state.hyper.reward_scale)
+    targets = jax.vmap(target)(batch.reward, batch.discount, next_values)
+    fit, metrics = steps.step_critic(
+        nets.critic.apply, nets.optimiser, state.critic, batch, targets, rate=state.hyper.lr_critic
+    )
     return state.replace(critic=fit), metrics

@@ -5,6 +5,7 @@ static in `ReBRACConfig`; every number is a leaf of the state in `ReBRACHyper`. 
 """
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple
 
 import chex
@@ -15,6 +16,7 @@ from flax import struct
 
 from envs.types import Array, Key, PyTree, UserError
 from sgft_jax import checks
+from sgft_jax.learners import steps
 from sgft_jax.math import losses, optim
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import Network, NetworkConfig, add_noise, make_critic, make_deterministic_actor
@@ -69,14 +71,6 @@ class ReBRACState(struct.PyTreeNode):
     step: Array
 
 
-class _Parts(NamedTuple):
-    """The networks and the optimiser that a configuration describes."""
-
-    actor: Network
-    critic: Network
-    optimiser: optax.GradientTransformation
-
-
 # --- losses of one transition -----------------------------------------------------------------------------------------
 
 
@@ -95,67 +89,67 @@ def td_target(reward: Array, discount: Array, next_q: Array, next_distance: Arra
 # --- the learner ------------------------------------------------------------------------------------------------------
 
 
-def make_rebrac(config: ReBRACConfig, hyper: ReBRACHyper | None = None) -> Learner:
-    """The learner of a configuration: `update` takes windows [B, 2] of consecutive steps.
+class _Networks(NamedTuple):
+    """The networks and the optimiser that a configuration describes."""
 
-    A window whose second step is not valid has no next action: its target is without the penalty.
+    actor: Network
+    critic: Network
+    optimiser: optax.GradientTransformation
+
+
+def _networks(config: ReBRACConfig) -> _Networks:
+    sizes = config.obs_dim, config.act_dim, config.network
+    return _Networks(make_deterministic_actor(*sizes), make_critic(*sizes), optim.adam())
+
+
+def init(config: ReBRACConfig, key: Key, hyper: ReBRACHyper | None = None) -> ReBRACState:
+    """A fresh agent. Set the observation statistics with `state.replace(normalizer=...)`."""
+    nets, (key_actor, key_critic) = _networks(config), jax.random.split(key)
+    actor, critic = nets.actor.init(key_actor), nets.critic.init(key_critic)
+    return ReBRACState(
+        actor=optim.start(nets.optimiser, actor),
+        critic=optim.start(nets.optimiser, critic),
+        target_actor=jax.tree.map(jnp.copy, actor),  # buffers of their own: a donated state must not hold one twice
+        target_critic=jax.tree.map(jnp.copy, critic),
+        normalizer=normalizer.identity(config.obs_dim),
+        hyper=optim.as_leaves(hyper or ReBRACHyper()),
+        step=jnp.int32(0),
+    )
+
+
+def act(
+    config: ReBRACConfig, state: ReBRACState, carry: tuple[()], obs: Array, key: Key, *, explore: bool | Array
+) -> tuple[Array, tuple[()]]:
+    """Action [act_dim] in [-1, 1] for a raw obs [obs_dim], and the carry as it was."""
+    action = _networks(config).actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
+    return jnp.where(explore, add_noise(action, state.hyper.explore_noise, key), action), carry
+
+
+def update(config: ReBRACConfig, state: ReBRACState, batch: Batch, key: Key) -> tuple[ReBRACState, Metrics]:
+    """One step of the critic; on every `policy_delay`-th turn, one of actor and targets. metrics: [] each.
+
+    batch: windows [B, 2, ...] of consecutive steps, raw, with a mask. A window whose second step is not valid has no
+    next action: its target is without the penalty. Raises UserError for other shapes.
     """
-    sizes = config.obs_dim, config.act_dim
-    parts = _Parts(make_deterministic_actor(*sizes, config.network), make_critic(*sizes, config.network), optim.adam())
-    leaves = hyper or ReBRACHyper()
-
-    def init(key: Key) -> ReBRACState:
-        key_actor, key_critic = jax.random.split(key)
-        actor, critic = parts.actor.init(key_actor), parts.critic.init(key_critic)
-        copy = lambda params: jax.tree.map(jnp.copy, params)  # noqa: E731  a donated state must not hold a buffer twice
-        return ReBRACState(
-            actor=optim.start(parts.optimiser, actor),
-            critic=optim.start(parts.optimiser, critic),
-            target_actor=copy(actor),
-            target_critic=copy(critic),
-            normalizer=normalizer.identity(config.obs_dim),
-            hyper=jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), leaves),
-            step=jnp.int32(0),
-        )
-
-    def act(
-        state: ReBRACState,
-        carry: tuple[()],
-        obs: Array,
-        key: Key,
-        *,
-        explore: bool | Array,
-        context: Array | None = None,
-    ) -> tuple[Array, tuple[()]]:
-        del context  # it reads the observation alone
-        action = parts.actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
-        return jnp.where(explore, add_noise(action, state.hyper.explore_noise, key), action), carry
-
-    def update(state: ReBRACState, batch: Batch, key: Key) -> tuple[ReBRACState, Metrics]:
-        return _update(config, parts, state, batch, key)
-
-    return Learner(init, lambda: (), act, update)
-
-
-# --- one update -------------------------------------------------------------------------------------------------------
-
-
-def _update(
-    config: ReBRACConfig, parts: _Parts, state: ReBRACState, batch: Batch, key: Key
-) -> tuple[ReBRACState, Metrics]:
-    """Critic; on every `policy_delay`-th turn, actor and targets."""
-    rows, next_action, follows = _rows(batch)
-    normal = jax.vmap(normalizer.normalize, (None, 0))
-    rows = rows._replace(obs=normal(state.normalizer, rows.obs), next_obs=normal(state.normalizer, rows.next_obs))
-    state, metrics = _update_critic(parts, state, rows, next_action, follows, key)
-    actor, more = _step_actor(parts, state, rows)
+    nets, (rows, next_action, follows) = _networks(config), _rows(batch)
+    rows = normalizer.normalize_rows(state.normalizer, rows)
+    state, metrics = _update_critic(nets, state, rows, next_action, follows, key)
+    actor, of_actor = _step_actor(nets, state, rows)
     moved = state.replace(
         actor=actor,
         target_actor=optax.incremental_update(actor.params, state.target_actor, state.hyper.tau),
         target_critic=optax.incremental_update(state.critic.params, state.target_critic, state.hyper.tau),
     )
-    state = optim.keep_unless(state.step % config.policy_delay == 0, moved, state)
-    return state.replace(step=state.step + 1), metrics | more
+    state = optax.tree.where(state.step % config.policy_delay == 0, moved, state)
+    return state.replace(step=state.step + 1), metrics | of_actor
+
+
+def make_rebrac(config: ReBRACConfig, hyper: ReBRACHyper | None = None) -> Learner:
+    """The functions of this module for one configuration: `update` takes windows [B, 2]."""
+    return Learner(partial(init, config, hyper=hyper), lambda: (), partial(act, config), partial(update, config))
+
+
+# --- one update -------------------------------------------------------------------------------------------------------
 
 
 def _rows(batch: Batch) -> tuple[Batch, Array, Array]:
@@ -167,40 +161,35 @@ def _rows(batch: Batch) -> tuple[Batch, Array, Array]:
 
 
 def _update_critic(
-    parts: _Parts, state: ReBRACState, rows: Batch, next_action: Array, follows: Array, key: Key
+    nets: _Networks, state: ReBRACState, rows: Batch, next_action: Array, follows: Array, key: Key
 ) -> tuple[ReBRACState, Metrics]:
     hyper = state.hyper
 
     def target(row: Batch, next_action: Array, follows: Array, key: Key) -> Array:
-        action = parts.actor.apply(state.target_actor, row.next_obs)
+        action = nets.actor.apply(state.target_actor, row.next_obs)
         noise = hyper.target_noise * jax.random.normal(key, action.shape)
         action = jnp.clip(action + jnp.clip(noise, -hyper.target_noise_max, hyper.target_noise_max), -1.0, 1.0)
-        next_q = parts.critic.apply(state.target_critic, row.next_obs, action)
+        next_q = nets.critic.apply(state.target_critic, row.next_obs, action)
         away = jnp.where(follows, distance(action, next_action), 0.0)
         return td_target(row.reward, row.discount, next_q, away, penalty=hyper.critic_penalty)
 
     targets = jax.vmap(target)(rows, next_action, follows, jax.random.split(key, rows.reward.shape[0]))
 
-    def loss(params: PyTree) -> tuple[Array, Array]:
-        q = jax.vmap(parts.critic.apply, (None, 0, 0))(params, rows.obs, rows.action)
-        return losses.row_mean(jax.vmap(losses.critic_loss)(q, targets), rows), q
-
-    (mean, q), grads = jax.value_and_grad(loss, has_aux=True)(state.critic.params)
-    fit = optim.step(parts.optimiser, state.critic, grads, hyper.lr_critic)
-    metrics = {"critic/loss": mean, "critic/q_mean": jnp.mean(q), "critic/target_mean": jnp.mean(targets)}
+    fit, metrics = steps.step_critic(
+        nets.critic.apply, nets.optimiser, state.critic, rows, targets, rate=hyper.lr_critic
+    )
     return state.replace(critic=fit), metrics
 
 
-def _step_actor(parts: _Parts, state: ReBRACState, rows: Batch) -> tuple[optim.Fit, Metrics]:
+def _step_actor(nets: _Networks, state: ReBRACState, rows: Batch) -> tuple[optim.Fit, Metrics]:
     """The actor after a step on penalty |pi(s) - a|^2 - Q / mean |Q|."""
 
     def loss(params: PyTree) -> tuple[Array, Array]:
-        action = jax.vmap(parts.actor.apply, (None, 0))(params, rows.obs)
-        q = jnp.min(jax.vmap(parts.critic.apply, (None, 0, 0))(state.critic.params, rows.obs, action), axis=1)
+        action = jax.vmap(nets.actor.apply, (None, 0))(params, rows.obs)
+        q = jnp.min(jax.vmap(nets.critic.apply, (None, 0, 0))(state.critic.params, rows.obs, action), axis=1)
         scale = jax.lax.stop_gradient(1 / jnp.maximum(losses.row_mean(jnp.abs(q), rows), 1e-6))
         away = jax.vmap(distance)(action, rows.action)
         return losses.row_mean(state.hyper.actor_penalty * away - scale * q, rows), jnp.mean(away)
 
-    (mean, away), grads = jax.value_and_grad(loss, has_aux=True)(state.actor.params)
-    fit = optim.step(parts.optimiser, state.actor, grads, state.hyper.lr_actor)
+    fit, mean, away = optim.minimise(nets.optimiser, loss, state.actor, state.hyper.lr_actor)
     return fit, {"actor/loss": mean, "actor/distance": away}

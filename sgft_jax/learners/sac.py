@@ -6,6 +6,7 @@ so that learning rates and temperatures vmap like seeds do. Source: Haarnoja et 
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple, Protocol
 
 import jax
@@ -15,6 +16,8 @@ from flax import struct
 
 from envs.types import Array, Key, PyTree, UserError
 from sgft_jax import checks
+from sgft_jax.learners import steps
+from sgft_jax.learners.steps import Critic
 from sgft_jax.math import losses, optim
 from sgft_jax.models import dynamics, normalizer
 from sgft_jax.models.distortion import Distortion
@@ -34,16 +37,14 @@ from sgft_jax.models.networks import (
 )
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
-LOG_ALPHA_MIN = -10.0  # dense negative rewards would drive an auto-tuned temperature to zero
-
 
 @dataclass(frozen=True)
 class SACConfig:
     """The structure of an agent.
 
     obs_dim, act_dim: sizes of what the environment gives and takes.
-    context_dim: length of `Batch.context`, which actor and critic read beside the observation.
     network: body of all networks; critic_network: body of the critic alone, default the same.
+    context_dim: length of `Batch.context`, which actor and critic read beside the observation.
     tune_alpha: follow the target entropy; False keeps the temperature at `SACHyper.alpha`.
     train_value, train_dynamics, ensemble_size: the extra networks of pretraining.
     train_critic: False keeps the critic as it is (a frozen-critic actor-critic).
@@ -58,9 +59,9 @@ class SACConfig:
 
     obs_dim: int
     act_dim: int
-    context_dim: int = 0
     network: NetworkConfig = field(default_factory=NetworkConfig)
     critic_network: NetworkConfig | None = None
+    context_dim: int = 0
     tune_alpha: bool = True
     train_value: bool = True
     train_dynamics: bool = True
@@ -83,9 +84,6 @@ class SACConfig:
         checks.at_least(self, 1, "policy_delay", "critics", "target_critics")
         if (self.target_critics or 1) > self.critics:
             raise checks.refusal("target_critics", self.target_critics, f"at most critics, {self.critics}")
-
-
-Critic = Callable[[PyTree, Array, Array], Array]  # (params of members, obs, action) -> [members]
 
 
 class CriticTerm(Protocol):
@@ -163,20 +161,21 @@ class SACState(struct.PyTreeNode):
     anchor: PyTree = None
 
 
-class _Parts(NamedTuple):
-    """The networks and the optimiser that a configuration describes."""
+class _Networks(NamedTuple):
+    """A configuration with the networks and the optimiser that it describes."""
 
+    config: SACConfig
     actor: Network
     critic: Network
     value: Network
     dynamics: Network
     optimiser: optax.GradientTransformation
-    critic_term: CriticTerm | None = None
 
 
-def _parts(config: SACConfig) -> _Parts:
+def _networks(config: SACConfig) -> _Networks:
     inputs, act_dim, body = config.obs_dim + config.context_dim, config.act_dim, config.network
-    return _Parts(
+    return _Networks(
+        config=config,
         actor=make_actor(inputs, act_dim, body),
         critic=make_critic(inputs, act_dim, config.critic_network or body, members=config.critics),
         value=make_value(config.obs_dim, body),
@@ -185,36 +184,74 @@ def _parts(config: SACConfig) -> _Parts:
     )
 
 
-def make_sac(config: SACConfig, hyper: SACHyper | None = None, *, critic_term: CriticTerm | None = None) -> Learner:
-    """The learner of a configuration. Set the observation statistics with `state.replace(normalizer=...)`.
+def init(config: SACConfig, key: Key, hyper: SACHyper | None = None) -> SACState:
+    """A fresh agent. Set the observation statistics with `state.replace(normalizer=...)`."""
+    nets, keys = _networks(config), jax.random.split(key, 4)
+    value = nets.value.init(keys[2]) if config.train_value or config.critic_baseline else None
+    model = nets.dynamics.init(keys[3]) if config.train_dynamics else None
+    return _assemble(nets, hyper or SACHyper(), nets.actor.init(keys[0]), nets.critic.init(keys[1]), value, model)
 
-    critic_term: what other algorithms add to the critic's loss.
+
+def act(
+    config: SACConfig,
+    state: SACState,
+    carry: tuple[()],
+    obs: Array,
+    key: Key,
+    *,
+    explore: bool | Array,
+    context: Array | None = None,
+) -> tuple[Array, tuple[()]]:
+    """Action [act_dim] in [-1, 1], and the carry as it was. obs: [obs_dim] raw. context: [context_dim]."""
+    moments = _networks(config).actor.apply(state.actor.params, network_input(state.normalizer, obs, context))
+    return tanh_gaussian_action(moments, key, explore=explore), carry
+
+
+def update(
+    config: SACConfig, state: SACState, batch: Batch, key: Key, *, critic_term: CriticTerm | None = None
+) -> tuple[SACState, Metrics]:
+    """One step of critic, target, actor, temperature, then of value (on the actor's own draws) and dynamics.
+
+    batch: [B, ...] raw. critic_term: what other algorithms add to the critic's loss. metrics: [] each.
     """
-    parts = _parts(config)._replace(critic_term=critic_term)
-    hyper = hyper or SACHyper()
+    key_target, key_actor, key_dynamics, key_members, *key_term = jax.random.split(key, 5 if critic_term else 4)
+    nets, raw, read = _networks(config), batch, jax.vmap(network_input, (None, 0, 0))
+    batch = batch._replace(
+        obs=read(state.normalizer, batch.obs, batch.context),
+        next_obs=read(state.normalizer, batch.next_obs, batch.next_context),
+    )
 
-    def init(key: Key) -> SACState:
-        keys = jax.random.split(key, 4)
-        value = parts.value.init(keys[2]) if config.train_value or config.critic_baseline else None
-        model = parts.dynamics.init(keys[3]) if config.train_dynamics else None
-        return _assemble(config, parts, hyper, parts.actor.init(keys[0]), parts.critic.init(keys[1]), value, model)
+    metrics: Metrics = {}
+    if config.train_critic:
+        term = partial(_term, nets, state, critic_term, batch, *key_term) if critic_term else None
+        state, metrics = _update_critic(nets, state, batch, _target_members(config, key_members), key_target, term)
+    rows = jax.tree.map(lambda x: x[: config.actor_batch], batch)
+    rows = rows if config.weighted_actor else rows._replace(weight=None)
+    state, q, log_prob, of_actor = _update_actor(nets, state, rows, key_actor)
+    metrics |= of_actor
+    if config.tune_alpha:
+        state = _update_temperature(nets, state, rows, log_prob)
+    if config.train_value:
+        state, of_value = _update_value(nets, state, rows, q)
+        metrics |= of_value
+    if config.train_dynamics:
+        fit, of_models = dynamics.update(
+            nets.dynamics,
+            nets.optimiser,
+            state.dynamics,
+            state.normalizer,
+            raw,
+            key_dynamics,
+            rate=state.hyper.lr_dynamics,
+        )
+        state, metrics = state.replace(dynamics=fit), metrics | of_models
+    metrics["actor/alpha"] = jnp.exp(state.log_alpha.params)
+    return state.replace(step=state.step + 1), metrics
 
-    def act(
-        state: SACState,
-        carry: tuple[()],
-        obs: Array,
-        key: Key,
-        *,
-        explore: bool | Array,
-        context: Array | None = None,
-    ) -> tuple[Array, tuple[()]]:
-        moments = parts.actor.apply(state.actor.params, network_input(state.normalizer, obs, context))
-        return tanh_gaussian_action(moments, key, explore=explore), carry
 
-    def update(state: SACState, batch: Batch, key: Key) -> tuple[SACState, Metrics]:
-        return _update(config, parts, state, batch, key)
-
-    return Learner(init, lambda: (), act, update)
+def make_sac(config: SACConfig, hyper: SACHyper | None = None) -> Learner:
+    """The functions of this module for one configuration."""
+    return Learner(partial(init, config, hyper=hyper), lambda: (), partial(act, config), partial(update, config))
 
 
 def network_input(statistics: Normalizer, obs: Array, context: Array | None) -> Array:
@@ -224,112 +261,69 @@ def network_input(statistics: Normalizer, obs: Array, context: Array | None) -> 
 
 
 def _assemble(
-    config: SACConfig,
-    parts: _Parts,
-    hyper: SACHyper,
-    actor: PyTree,
-    critic: PyTree,
-    value: PyTree | None,
-    model: PyTree | None,
+    nets: _Networks, hyper: SACHyper, actor: PyTree, critic: PyTree, value: PyTree | None, model: PyTree | None
 ) -> SACState:
     """Fresh optimiser moments around given parameters."""
-    hyper = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hyper)
-    fit = lambda params: None if params is None else optim.start(parts.optimiser, params)  # noqa: E731
+    hyper = optim.as_leaves(hyper)
+    start = partial(optim.start, nets.optimiser)
     return SACState(
-        actor=optim.start(parts.optimiser, actor),
-        critic=optim.start(parts.optimiser, critic),
+        actor=start(actor),
+        critic=start(critic),
         target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
-        log_alpha=optim.start(parts.optimiser, jnp.maximum(jnp.log(hyper.alpha), LOG_ALPHA_MIN)),
-        value=fit(value),
-        dynamics=fit(model),
-        normalizer=normalizer.identity(config.obs_dim),
+        log_alpha=start(jnp.maximum(jnp.log(hyper.alpha), steps.LOG_ALPHA_MIN)),
+        value=value and start(value),
+        dynamics=model and start(model),
+        normalizer=normalizer.identity(nets.config.obs_dim),
         hyper=hyper,
         step=jnp.int32(0),
     )
 
 
-# --- one update ---------------------------------------------------------------------------------------------------
+# --- one update -------------------------------------------------------------------------------------------------------
 
 
-def _update(config: SACConfig, parts: _Parts, state: SACState, batch: Batch, key: Key) -> tuple[SACState, Metrics]:
-    """Critic, target, actor, temperature, then value (on the actor's own draws) and dynamics."""
-    key_target, key_actor, key_dynamics, key_members, *key_term = jax.random.split(key, 5 if parts.critic_term else 4)
-    raw, read = batch, jax.vmap(network_input, (None, 0, 0))
-    batch = batch._replace(
-        obs=read(state.normalizer, batch.obs, batch.context),
-        next_obs=read(state.normalizer, batch.next_obs, batch.next_context),
-    )
-
-    metrics: Metrics = {}
-    if config.train_critic:
-        members = _target_members(config, key_members)
-        state, metrics = _update_critic(config, parts, state, batch, members, key_target, *key_term)
-    rows = jax.tree.map(lambda x: x[: config.actor_batch], batch)
-    rows = rows if config.weighted_actor else rows._replace(weight=None)
-    state, q, log_prob, more = _update_actor(config, parts, state, rows, key_actor)
-    metrics |= more
-    if config.tune_alpha:
-        state = _update_temperature(config, parts, state, rows, log_prob)
-    if config.train_value:
-        state, more = _update_value(config, parts, state, rows, q)
-        metrics |= more
-    if config.train_dynamics:
-        fit, more = dynamics.update(
-            parts.dynamics, parts.optimiser, state.dynamics, state.normalizer, raw, key_dynamics,
-            rate=state.hyper.lr_dynamics,
-        )  # fmt: skip
-        state, metrics = state.replace(dynamics=fit), metrics | more
-    metrics["actor/alpha"] = jnp.exp(state.log_alpha.params)
-    return state.replace(step=state.step + 1), metrics
-
-
-def _critic_of(config: SACConfig, parts: _Parts, state: SACState) -> Callable[[PyTree, Array, Array], Array]:
+def _critic_of(nets: _Networks, state: SACState) -> Critic:
     """The critic (params, obs, action) -> [members], relative to the frozen value where a baseline is asked for."""
-    if not config.critic_baseline:
-        return parts.critic.apply
+    if not nets.config.critic_baseline:
+        return nets.critic.apply
 
     def relative(params: PyTree, obs: Array, action: Array) -> Array:
         with precision("float32"):  # as in value.predict: the difference of two large numbers
-            return parts.critic.apply(params, obs, action) - parts.value.apply(
-                state.value.params, obs[: config.obs_dim]
-            )
+            value = nets.value.apply(state.value.params, obs[: nets.config.obs_dim])
+            return nets.critic.apply(params, obs, action) - value
 
     return relative
 
 
+def _term(nets: _Networks, state: SACState, critic_term: CriticTerm, batch: Batch, key: Key, params: PyTree) -> Array:
+    """A critic term [] of the critic's parameters."""
+
+    def policy(obs: Array, key: Key) -> tuple[Array, Array]:
+        return tanh_gaussian_sample(nets.actor.apply(state.actor.params, obs), key)
+
+    return critic_term(_critic_of(nets, state), params, policy, batch, key)
+
+
 def _update_critic(
-    config: SACConfig,
-    parts: _Parts,
+    nets: _Networks,
     state: SACState,
     batch: Batch,
     counted: Array | slice,
     key: Key,
-    key_term: Key | None = None,
+    term: Callable[[PyTree], Array] | None,
 ) -> tuple[SACState, Metrics]:
-    """counted: the members that a target is the minimum of. key_term: for the critic term, where there is one."""
-    critic, alpha = _critic_of(config, parts, state), jnp.exp(state.log_alpha.params)
-
-    def target(row: Batch, key: Key) -> Array:
-        action, log_prob = tanh_gaussian_sample(parts.actor.apply(state.actor.params, row.next_obs), key)
-        next_q = critic(state.target_critic, row.next_obs, action)[counted]
-        price = alpha if config.entropy_in_target else 0.0
-        return losses.td_target(row.reward, row.discount, next_q, log_prob, alpha=price)
-
-    targets = jax.vmap(target)(batch, jax.random.split(key, batch.reward.shape[0]))
-
-    def loss(params: PyTree) -> tuple[Array, Array]:
-        q = jax.vmap(critic, (None, 0, 0))(params, batch.obs, batch.action)
-        error = losses.row_mean(jax.vmap(losses.critic_loss)(q, targets), batch)
-        if parts.critic_term is None or key_term is None:
-            return error, q
-        policy = lambda obs, key: tanh_gaussian_sample(parts.actor.apply(state.actor.params, obs), key)  # noqa: E731
-        return error + parts.critic_term(critic, params, policy, batch, key_term), q
-
-    (value, q), grads = jax.value_and_grad(loss, has_aux=True)(state.critic.params)
+    """counted: the members that a target is the minimum of. term: of the parameters, beside the critic's error."""
+    critic, alpha = _critic_of(nets, state), jnp.exp(state.log_alpha.params)
+    targets = steps.soft_targets(
+        partial(nets.actor.apply, state.actor.params),
+        lambda obs, action: critic(state.target_critic, obs, action)[counted],
+        batch,
+        key,
+        alpha=alpha if nets.config.entropy_in_target else 0.0,
+    )
     rate = state.hyper.lr_critic * optim.warmup_factor(state.step, state.hyper.lr_warmup)
-    fit = optim.step(parts.optimiser, state.critic, grads, rate)
+    fit, metrics = steps.step_critic(critic, nets.optimiser, state.critic, batch, targets, rate=rate, term=term)
     average = optax.incremental_update(fit.params, state.target_critic, state.hyper.tau)
-    metrics = {"critic/loss": value, "critic/q_mean": jnp.mean(q), "critic/target_mean": jnp.mean(targets)}
     return state.replace(critic=fit, target_critic=average), metrics
 
 
@@ -340,60 +334,35 @@ def _target_members(config: SACConfig, key: Key) -> Array | slice:
     return jax.random.permutation(key, config.critics)[: config.target_critics]
 
 
-def _update_actor(
-    config: SACConfig, parts: _Parts, state: SACState, rows: Batch, key: Key
-) -> tuple[SACState, Array, Array, Metrics]:
+def _update_actor(nets: _Networks, state: SACState, rows: Batch, key: Key) -> tuple[SACState, Array, Array, Metrics]:
     """Also returns the q [B, members] and log-probabilities [B] of the actions drawn, for value and temperature."""
-    critic, alpha = _critic_of(config, parts, state), jnp.exp(state.log_alpha.params)
-    keys = jax.random.split(key, rows.reward.shape[0])
+    config, hyper, since = nets.config, state.hyper, state.step - state.hyper.actor_start
 
-    def one(params: PyTree, obs: Array, key: Key) -> tuple[Array, Array, Array]:
-        action, log_prob = tanh_gaussian_sample(parts.actor.apply(params, obs), key)
-        q = critic(state.critic.params, obs, action)
-        followed = jnp.mean(q, keepdims=True) if config.actor_mean else q
-        loss = losses.actor_loss(log_prob, followed, alpha=alpha)
-        if config.anchored:
-            loss += state.hyper.anchor * tanh_gaussian_divergence(
-                parts.actor.apply(params, obs), parts.actor.apply(state.anchor, obs)
-            )
-        return loss, q, log_prob
+    def divergence(params: PyTree, obs: Array) -> Array:
+        anchor = nets.actor.apply(state.anchor, obs)
+        return hyper.anchor * tanh_gaussian_divergence(nets.actor.apply(params, obs), anchor)
 
-    def loss(params: PyTree) -> tuple[Array, tuple[Array, Array]]:
-        each, q, log_prob = jax.vmap(one, (None, 0, 0))(params, rows.obs, keys)
-        return losses.row_mean(each, rows), (q, log_prob)
-
-    (value, (q, log_prob)), grads = jax.value_and_grad(loss, has_aux=True)(state.actor.params)
-    hyper, since = state.hyper, state.step - state.hyper.actor_start
-    rate = hyper.lr_actor * optim.warmup_factor(since, hyper.actor_ramp)
-    moves = (since >= 0) & _policy_turn(config, state)
-    fit = optim.keep_unless(moves, optim.step(parts.optimiser, state.actor, grads, rate), state.actor)
-    return state.replace(actor=fit), q, log_prob, {"actor/loss": value, "actor/entropy": -jnp.mean(log_prob)}
+    fit, q, log_prob, metrics = steps.step_actor(
+        nets.actor,
+        partial(_critic_of(nets, state), state.critic.params),
+        nets.optimiser,
+        state.actor,
+        rows,
+        key,
+        alpha=jnp.exp(state.log_alpha.params),
+        rate=hyper.lr_actor * optim.warmup_factor(since, hyper.actor_ramp),
+        mean=config.actor_mean,
+        penalty=divergence if config.anchored else None,
+    )
+    fit = optax.tree.where((since >= 0) & _policy_turn(config, state), fit, state.actor)
+    return state.replace(actor=fit), q, log_prob, metrics
 
 
-def _update_temperature(config: SACConfig, parts: _Parts, state: SACState, rows: Batch, log_prob: Array) -> SACState:
-    target = state.hyper.entropy_per_dim * config.act_dim
+def _update_temperature(nets: _Networks, state: SACState, rows: Batch, log_prob: Array) -> SACState:
+    target = state.hyper.entropy_per_dim * nets.config.act_dim
     rate = state.hyper.lr_alpha
-    fit = step_temperature(parts.optimiser, state.log_alpha, rows, log_prob, target=target, rate=rate)
-    return state.replace(log_alpha=optim.keep_unless(_policy_turn(config, state), fit, state.log_alpha))
-
-
-def step_temperature(
-    optimiser: optax.GradientTransformation,
-    log_alpha: optim.Fit,
-    rows: Batch,
-    log_prob: Array,
-    *,
-    target: float | Array,
-    rate: float | Array,
-) -> optim.Fit:
-    """One step of the temperature's logarithm. log_prob: [B] of the actions drawn. target: [] entropy, nats."""
-
-    def loss(log_alpha: Array) -> Array:
-        each = jax.vmap(lambda lp: losses.temperature_loss(log_alpha, lp, target_entropy=target))(log_prob)
-        return losses.row_mean(each, rows)
-
-    fit = optim.step(optimiser, log_alpha, jax.grad(loss)(log_alpha.params), rate)
-    return fit._replace(params=jnp.maximum(fit.params, LOG_ALPHA_MIN))
+    fit = steps.step_temperature(nets.optimiser, state.log_alpha, rows, log_prob, target=target, rate=rate)
+    return state.replace(log_alpha=optax.tree.where(_policy_turn(nets.config, state), fit, state.log_alpha))
 
 
 def _policy_turn(config: SACConfig, state: SACState) -> Array:
@@ -401,15 +370,14 @@ def _policy_turn(config: SACConfig, state: SACState) -> Array:
     return state.step % config.policy_delay == 0
 
 
-def _update_value(config: SACConfig, parts: _Parts, state: SACState, rows: Batch, q: Array) -> tuple[SACState, Metrics]:
-    obs = rows.obs[:, : config.obs_dim]
+def _update_value(nets: _Networks, state: SACState, rows: Batch, q: Array) -> tuple[SACState, Metrics]:
+    obs = rows.obs[:, : nets.config.obs_dim]
 
-    def loss(params: PyTree) -> Array:
-        values = jax.vmap(parts.value.apply, (None, 0))(params, obs)
-        return losses.row_mean(jax.vmap(losses.value_loss)(values, q), rows)
+    def loss(params: PyTree) -> tuple[Array, tuple[()]]:
+        values = jax.vmap(nets.value.apply, (None, 0))(params, obs)
+        return losses.row_mean(jax.vmap(losses.value_loss)(values, q), rows), ()
 
-    value, grads = jax.value_and_grad(loss)(state.value.params)
-    fit = optim.step(parts.optimiser, state.value, grads, state.hyper.lr_value)
+    fit, value, _ = optim.minimise(nets.optimiser, loss, state.value, state.hyper.lr_value)
     return state.replace(value=fit), {"value/loss": value}
 
 
@@ -432,17 +400,17 @@ def state_from_prior(
     reset_critic: draw a new critic from `key`, else keep the simulator's. With `config.context_dim` the kept networks
     get zero rows for the context, so that the first policy is the simulator's whatever the context holds.
     """
-    parts = _parts(config)
+    nets = _networks(config)
     check_params_of_prior(config, params, critic=not reset_critic)
     params = jax.tree.map(jnp.copy, params)  # the caller may donate the state; the prior must survive it
 
     def pad(network: PyTree) -> PyTree:
         return pad_first_layer(network, config.obs_dim, config.context_dim)
 
-    critic = parts.critic.init(key) if reset_critic else pad(params.critic)
+    critic = nets.critic.init(key) if reset_critic else pad(params.critic)
     value = params.value if config.train_value or config.critic_baseline else None
     model = params.dynamics if config.train_dynamics else None
-    state = _assemble(config, parts, hyper, pad(params.actor), critic, value, model)
+    state = _assemble(nets, hyper, pad(params.actor), critic, value, model)
     anchor = jax.tree.map(jnp.copy, state.actor.params) if config.anchored else None
     return state.replace(normalizer=params.normalizer, anchor=anchor)
 
@@ -450,9 +418,7 @@ def state_from_prior(
 def check_params_of_prior(config: SACConfig, params: SACParams, *, critic: bool) -> None:
     """Raise UserError where a network of the prior is not the one that `config` describes."""
     body = {"network": config.network, "critic_network": config.critic_network, "critics": config.critics}
-    parts = _parts(SACConfig(config.obs_dim, config.act_dim, **body))
+    nets = _networks(SACConfig(config.obs_dim, config.act_dim, **body))
     owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, hidden {config.network.hidden}"
     for name in ("actor", "value", *(["critic"] if critic else [])):
-        check_params(
-            name, getattr(parts, name), getattr(params, name), f"{owner}: use the prior's own task and network"
-        )
+        check_params(name, getattr(nets, name), getattr(params, name), f"{owner}: use the prior's own task and network")

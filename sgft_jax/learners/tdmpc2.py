@@ -6,6 +6,7 @@ by `discount`, the planner assumes that an episode goes on for its horizon.
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +15,14 @@ import optax
 from envs.types import Array, Key, PyTree, UserError
 from sgft_jax.learners.tdmpc2_model import (
     NETWORKS,
-    Parts,
+    Networks,
     TDMPC2Config,
     TDMPC2Hyper,
     TDMPC2Params,
     TDMPC2State,
     encode,
     heads_of,
-    make_parts,
+    make_networks,
     q_values,
     reward_of,
     two_heads,
@@ -33,64 +34,103 @@ from sgft_jax.models.networks import check_params, tanh_gaussian_action
 from sgft_jax.planning import mppi
 from sgft_jax.types import Batch, Learner, Metrics
 
+# --- the learner ------------------------------------------------------------------------------------------------------
+
+
+def init(config: TDMPC2Config, key: Key, hyper: TDMPC2Hyper | None = None) -> TDMPC2State:
+    """A fresh agent. Set the observation statistics with `state.replace(normalizer=...)`."""
+    nets, keys = make_networks(config), dict(zip(NETWORKS, jax.random.split(key, len(NETWORKS)), strict=True))
+    params = {name: getattr(nets, name).init(keys[name]) for name in NETWORKS}
+    statistics = normalizer.identity(config.obs_dim)
+    prior = TDMPC2Params(**params, normalizer=statistics, scale=jnp.float32(1))
+    return _assemble(nets, hyper or TDMPC2Hyper(), prior)
+
+
+def init_carry(config: TDMPC2Config) -> Array:
+    """At the start of an episode: the mean [horizon, act_dim] of a plan that nobody has made."""
+    return jnp.zeros((config.horizon, config.act_dim))
+
+
+def act(
+    config: TDMPC2Config, state: TDMPC2State, carry: Array, obs: Array, key: Key, *, explore: bool | Array
+) -> tuple[Array, Array]:
+    """First action [act_dim] of a plan, and the plan's mean [horizon, act_dim], which the next one begins with.
+
+    obs: [obs_dim] raw. carry: the mean of the plan before.
+    """
+    nets, (key_policy, key_score, key_search) = make_networks(config), jax.random.split(key, 3)
+    z = encode(nets, state, obs)
+    keys = jax.random.split(key_policy, (config.horizon, config.policy_samples))
+    proposals = jax.vmap(lambda keys: _proposal(nets, state, z, keys), in_axes=1)(keys)
+    score = _score(nets, state, z, key_score)
+    return mppi.plan(config.planner, state.hyper.planner, score, proposals, carry, key_search, explore=explore)
+
+
+def update(config: TDMPC2Config, state: TDMPC2State, batch: Batch, key: Key) -> tuple[TDMPC2State, Metrics]:
+    """One step of world model with critic, then of the policy on the latents rolled out, then of the target critic.
+
+    batch: windows [B, horizon, ...] raw; raises UserError for others. metrics: [] each.
+    """
+    if batch.reward.shape[1] != config.horizon:
+        raise UserError(f"TD-MPC2 windows have {batch.reward.shape[1]} steps: must be {config.horizon}, the horizon")
+    nets, (key_model, key_policy) = make_networks(config), jax.random.split(key)
+    valid = jnp.ones(batch.reward.shape, bool) if batch.valid is None else batch.valid
+    batch = jax.vmap(normalizer.normalize_rows, (None, 0))(state.normalizer, batch)
+
+    state, zs, of_model = _update_model(nets, state, batch, valid, key_model)
+    state, of_policy = _update_policy(nets, state, zs, valid, batch.weight, key_policy)
+    if not config.sgft:
+        average = optax.incremental_update(state.critic.params, state.target_critic, state.hyper.tau)
+        state = state.replace(target_critic=average)
+    return state.replace(step=state.step + 1), of_model | of_policy
+
+
+def make_tdmpc2(config: TDMPC2Config, hyper: TDMPC2Hyper | None = None) -> Learner:
+    """The functions of this module for one configuration: `update` takes windows [B, horizon]."""
+    start, first = partial(init, config, hyper=hyper), partial(init_carry, config)
+    return Learner(start, first, partial(act, config), partial(update, config))
+
+
 # --- acting ---------------------------------------------------------------------------------------------------------
 
 
 def policy_action(config: TDMPC2Config, state: TDMPC2State, obs: Array, key: Key, *, explore: bool | Array) -> Array:
     """Action [act_dim] of the policy alone, some thousand times cheaper than a plan. obs: [obs_dim] raw."""
-    parts = make_parts(config)
-    moments = parts.policy.apply(state.policy.params, encode(parts, state, obs))
+    nets = make_networks(config)
+    moments = nets.policy.apply(state.policy.params, encode(nets, state, obs))
     return tanh_gaussian_action(moments, key, explore=explore)
 
 
-def _plan(
-    config: TDMPC2Config,
-    parts: Parts,
-    state: TDMPC2State,
-    previous: Array,
-    obs: Array,
-    key: Key,
-    *,
-    explore: bool | Array,
-) -> tuple[Array, Array]:
-    key_policy, key_score, key_search = jax.random.split(key, 3)
-    z = encode(parts, state, obs)
-    keys = jax.random.split(key_policy, (config.horizon, config.policy_samples))
-    proposals = jax.vmap(lambda keys: _proposal(parts, state, z, keys), in_axes=1)(keys)
-    score = _score(config, parts, state, z, key_score)
-    return mppi.plan(config.planner, state.hyper.planner, score, proposals, previous, key_search, explore=explore)
-
-
-def _proposal(parts: Parts, state: TDMPC2State, z: Array, keys: Key) -> Array:
+def _proposal(nets: Networks, state: TDMPC2State, z: Array, keys: Key) -> Array:
     """Actions [H, act_dim] of the policy as the model sees the future; one of the keys [H] a step."""
 
     def step(z: Array, key: Key) -> tuple[Array, Array]:
-        action = tanh_gaussian_action(parts.policy.apply(state.policy.params, z), key, explore=True)
-        return parts.dynamics.apply(state.dynamics.params, z, action), action
+        action = tanh_gaussian_action(nets.policy.apply(state.policy.params, z), key, explore=True)
+        return nets.dynamics.apply(state.dynamics.params, z, action), action
 
     return jax.lax.scan(step, z, keys)[1]
 
 
-def _score(config: TDMPC2Config, parts: Parts, state: TDMPC2State, z: Array, key: Key) -> Callable[[Array], Array]:
+def _score(nets: Networks, state: TDMPC2State, z: Array, key: Key) -> Callable[[Array], Array]:
     """What a plan [H, act_dim] from z promises: sum of gamma^t R, then gamma^H times a value.
 
     The value is V_sim with sgft, else the mean of 2 random heads at a drawn action. One draw for all candidates
     of a plan, where the original draws for each, so that they differ by their actions alone.
     """
     key_heads, key_action = jax.random.split(key)
-    critic, gamma = heads_of(state.critic.params, two_heads(config, key_heads)), state.hyper.gamma
-    noise = jax.random.normal(key_action, (config.act_dim,))
+    critic, gamma = heads_of(state.critic.params, two_heads(nets.config, key_heads)), state.hyper.gamma
+    noise = jax.random.normal(key_action, (nets.config.act_dim,))
 
     def final(z: Array) -> Array:
-        if config.sgft:
-            return v_sim(config, parts, state, z)
-        mean, log_std = parts.policy.apply(state.policy.params, z)
-        return jnp.mean(q_values(config, parts, critic, z, jnp.tanh(mean + jnp.exp(log_std) * noise)))
+        if nets.config.sgft:
+            return v_sim(nets, state, z)
+        mean, log_std = nets.policy.apply(state.policy.params, z)
+        return jnp.mean(q_values(nets, critic, z, jnp.tanh(mean + jnp.exp(log_std) * noise)))
 
     def step(carry: tuple[Array, Array], action: Array) -> tuple[tuple[Array, Array], Array]:
         z, weight = carry
-        reward = weight * reward_of(config, parts, state, z, action)
-        return (parts.dynamics.apply(state.dynamics.params, z, action), weight * gamma), reward
+        reward = weight * reward_of(nets, state, z, action)
+        return (nets.dynamics.apply(state.dynamics.params, z, action), weight * gamma), reward
 
     def score(actions: Array) -> Array:
         # The first step by itself: all candidates share its latent, which a loop would have to carry for each.
@@ -101,25 +141,7 @@ def _score(config: TDMPC2Config, parts: Parts, state: TDMPC2State, z: Array, key
     return score
 
 
-# --- one update -----------------------------------------------------------------------------------------------------
-
-
-def _update(
-    config: TDMPC2Config, parts: Parts, state: TDMPC2State, batch: Batch, key: Key
-) -> tuple[TDMPC2State, Metrics]:
-    """World model with critic, then the policy on the latents rolled out, then the target critic."""
-    key_model, key_policy = jax.random.split(key)
-    valid = jnp.ones(batch.reward.shape, bool) if batch.valid is None else batch.valid
-    normal = jax.vmap(jax.vmap(normalizer.normalize, (None, 0)), (None, 0))
-    obs, next_obs = (normal(state.normalizer, x) for x in (batch.obs, batch.next_obs))
-    batch = batch._replace(obs=obs, next_obs=next_obs)
-
-    state, zs, metrics = _update_model(config, parts, state, batch, valid, key_model)
-    state, more = _update_policy(config, parts, state, zs, valid, batch.weight, key_policy)
-    if not config.sgft:
-        average = optax.incremental_update(state.critic.params, state.target_critic, state.hyper.tau)
-        state = state.replace(target_critic=average)
-    return state.replace(step=state.step + 1), metrics | more
+# --- one update -------------------------------------------------------------------------------------------------------
 
 
 def _rate(state: TDMPC2State) -> Array:
@@ -128,17 +150,17 @@ def _rate(state: TDMPC2State) -> Array:
 
 
 def _update_model(
-    config: TDMPC2Config, parts: Parts, state: TDMPC2State, batch: Batch, valid: Array, key: Key
+    nets: Networks, state: TDMPC2State, batch: Batch, valid: Array, key: Key
 ) -> tuple[TDMPC2State, Array, Metrics]:
     """Also returns the latents [B, H + 1, latent] rolled out by the model as it was."""
     key_heads, key_action, key_dropout = jax.random.split(key, 3)
-    judges, hyper = heads_of(state.target_critic, two_heads(config, key_heads)), state.hyper
+    judges, hyper = heads_of(state.target_critic, two_heads(nets.config, key_heads)), state.hyper
 
     def target(next_obs: Array, reward: Array, discount: Array, key: Key) -> tuple[Array, Array]:
         # The successor's latent is encoded, while losses are taken at rolled-out ones.
-        ahead = parts.encoder.apply(state.encoder.params, next_obs)
-        action = tanh_gaussian_action(parts.policy.apply(state.policy.params, ahead), key, explore=True)
-        return ahead, reward + discount * jnp.min(q_values(config, parts, judges, ahead, action))
+        ahead = nets.encoder.apply(state.encoder.params, next_obs)
+        action = tanh_gaussian_action(nets.policy.apply(state.policy.params, ahead), key, explore=True)
+        return ahead, reward + discount * jnp.min(q_values(nets, judges, ahead, action))
 
     keys = jax.random.split(key_action, valid.shape)
     ahead, q_target = jax.vmap(jax.vmap(target))(batch.next_obs, batch.reward, batch.discount, keys)
@@ -146,25 +168,24 @@ def _update_model(
     frozen = {name: getattr(state, name).params for name in NETWORKS}
 
     def loss(learned: dict[str, PyTree]) -> tuple[Array, tuple[dict[str, Array], Array]]:
-        one = lambda *window: _window_losses(config, parts, frozen | learned, *window)  # noqa: E731
-        each, zs = jax.vmap(one)(batch, ahead, q_target, dropout)
-        mean = {name: discounted_mean(x, valid, hyper.rho, batch.weight) for name, x in each.items()}
+        window_losses = jax.vmap(partial(_window_losses, nets, frozen | learned))
+        steps, zs = window_losses(batch, ahead, q_target, dropout)
+        mean = {name: discounted_mean(x, valid, hyper.rho, batch.weight) for name, x in steps.items()}
         return sum((getattr(hyper, name) * x for name, x in mean.items()), jnp.float32(0)), (mean, zs)
 
-    fits = {name: getattr(state, name) for name in config.learned}
+    fits = {name: getattr(state, name) for name in nets.config.learned}
     grads, (mean, zs) = jax.grad(loss, has_aux=True)({name: fit.params for name, fit in fits.items()})
     grads, norm = clip_by_norm(grads, hyper.max_grad_norm)
     rates = {name: _rate(state) * (hyper.encoder_lr_scale if name == "encoder" else 1.0) for name in fits}
-    fits = {name: optim.step(parts.adam, fit, grads[name], rates[name]) for name, fit in fits.items()}
+    fits = {name: optim.step(nets.adam, fit, grads[name], rates[name]) for name, fit in fits.items()}
     metrics = {f"model/{name}_loss": x for name, x in mean.items()} | {"model/grad_norm": norm}
-    if not config.sgft:
+    if not nets.config.sgft:
         metrics["critic/target_mean"] = jnp.mean(q_target, where=valid)
     return state.replace(**fits), zs, metrics
 
 
 def _window_losses(
-    config: TDMPC2Config,
-    parts: Parts,
+    nets: Networks,
     params: dict[str, PyTree],
     rows: Batch,
     ahead: Array,
@@ -177,23 +198,23 @@ def _window_losses(
     """
 
     def advance(z: Array, action: Array) -> tuple[Array, Array]:
-        z = parts.dynamics.apply(params["dynamics"], z, action)
+        z = nets.dynamics.apply(params["dynamics"], z, action)
         return z, z
 
     def classify(logits: Array, x: Array) -> Array:
-        return twohot.cross_entropy(logits, x, config.bins)
+        return twohot.cross_entropy(logits, x, nets.config.bins)
 
     def value(z: Array, action: Array, target: Array, key: Key) -> Array:
-        keys = jax.random.split(key, config.size.members)
-        logits = parts.critic.apply(params["critic"], z, action, keys=keys)
+        keys = jax.random.split(key, nets.config.size.members)
+        logits = nets.critic.apply(params["critic"], z, action, keys=keys)
         return jnp.mean(jax.vmap(classify, (0, None))(logits, target))
 
-    first = parts.encoder.apply(params["encoder"], rows.obs[0])
+    first = nets.encoder.apply(params["encoder"], rows.obs[0])
     rolled = jax.lax.scan(advance, first, rows.action)[1]
     zs = jnp.concatenate([first[None], rolled])
-    logits = jax.vmap(parts.reward.apply, (None, 0, 0))(params["reward"], zs[:-1], rows.action)
+    logits = jax.vmap(nets.reward.apply, (None, 0, 0))(params["reward"], zs[:-1], rows.action)
     losses = {"consistency": jnp.mean((rolled - ahead) ** 2, axis=1), "reward": jax.vmap(classify)(logits, rows.reward)}
-    if not config.sgft:
+    if not nets.config.sgft:
         losses["value"] = jax.vmap(value)(zs[:-1], rows.action, q_target, dropout)
     return losses, zs
 
@@ -218,17 +239,17 @@ def clip_by_norm(grads: PyTree, limit: Array | float) -> tuple[PyTree, Array]:
 
 
 def _update_policy(
-    config: TDMPC2Config, parts: Parts, state: TDMPC2State, zs: Array, valid: Array, weight: Array | None, key: Key
+    nets: Networks, state: TDMPC2State, zs: Array, valid: Array, weight: Array | None, key: Key
 ) -> tuple[TDMPC2State, Metrics]:
     """zs: [B, H + 1, latent]; valid: [B, H] of the steps between them; weight: [B] or None."""
     key_heads, key_action, key_dropout = jax.random.split(key, 3)
-    heads, hyper = two_heads(config, key_heads), state.hyper
+    heads, hyper = two_heads(nets.config, key_heads), state.hyper
     reached = jnp.concatenate([valid[:, :1], valid], axis=1)
     keys = jax.random.split(key_action, reached.shape), jax.random.split(key_dropout, reached.shape)
 
     def one(params: PyTree, z: Array, key: Key, dropout: Key) -> tuple[Array, Array]:
-        action, entropy = scaled_entropy_sample(parts.policy.apply(params, z), key)
-        return _promise(config, parts, state, z, action, heads, dropout), entropy
+        action, entropy = scaled_entropy_sample(nets.policy.apply(params, z), key)
+        return _promise(nets, state, z, action, heads, dropout), entropy
 
     def loss(params: PyTree) -> tuple[Array, tuple[Array, Array, Array]]:
         each = jax.vmap(jax.vmap(one, (None, 0, 0, 0)), (None, 0, 0, 0))
@@ -240,26 +261,24 @@ def _update_policy(
 
     (total, (value, entropy, scale)), grads = jax.value_and_grad(loss, has_aux=True)(state.policy.params)
     grads, norm = clip_by_norm(grads, hyper.max_grad_norm)
-    fit = optim.step(parts.policy_adam, state.policy, grads, _rate(state))
+    fit = optim.step(nets.policy_adam, state.policy, grads, _rate(state))
     metrics = {
         "actor/loss": total,
         "actor/value_mean": jnp.mean(value, where=reached),
-        "actor/entropy": jnp.mean(entropy, where=reached) / config.act_dim,
+        "actor/entropy": jnp.mean(entropy, where=reached) / nets.config.act_dim,
         "actor/scale": scale,
         "actor/grad_norm": norm,
     }
     return state.replace(policy=fit, scale=scale), metrics
 
 
-def _promise(
-    config: TDMPC2Config, parts: Parts, state: TDMPC2State, z: Array, action: Array, heads: Array, dropout: Key
-) -> Array:
+def _promise(nets: Networks, state: TDMPC2State, z: Array, action: Array, heads: Array, dropout: Key) -> Array:
     """What the policy maximises []: Q by two random heads, or one step of the model to V_sim."""
-    if not config.sgft:
-        keys = jax.random.split(dropout, config.size.members)[heads]
-        return jnp.mean(q_values(config, parts, heads_of(state.critic.params, heads), z, action, keys))
-    ahead = parts.dynamics.apply(state.dynamics.params, z, action)
-    return reward_of(config, parts, state, z, action) + state.hyper.gamma * v_sim(config, parts, state, ahead)
+    if not nets.config.sgft:
+        keys = jax.random.split(dropout, nets.config.size.members)[heads]
+        return jnp.mean(q_values(nets, heads_of(state.critic.params, heads), z, action, keys))
+    ahead = nets.dynamics.apply(state.dynamics.params, z, action)
+    return reward_of(nets, state, z, action) + state.hyper.gamma * v_sim(nets, state, ahead)
 
 
 def scaled_entropy_sample(moments: Array, key: Key) -> tuple[Array, Array]:
@@ -274,51 +293,19 @@ def scaled_entropy_sample(moments: Array, key: Key) -> tuple[Array, Array]:
     return jnp.tanh(mean + jnp.exp(log_std) * noise), -mean.shape[0] * log_prob
 
 
-# --- the learner ----------------------------------------------------------------------------------------------------
-
-
-def make_tdmpc2(config: TDMPC2Config, hyper: TDMPC2Hyper | None = None) -> Learner:
-    """The learner of a configuration: `update` takes windows [B, horizon], the carry is the last plan's mean.
-
-    Start every episode with `init_carry()`. Set the observation statistics with `state.replace(normalizer=...)`.
-    """
-    parts = make_parts(config)
-    hyper = hyper or TDMPC2Hyper()
-
-    def init(key: Key) -> TDMPC2State:
-        keys = dict(zip(NETWORKS, jax.random.split(key, len(NETWORKS)), strict=True))
-        params = {name: getattr(parts, name).init(keys[name]) for name in NETWORKS}
-        statistics = normalizer.identity(config.obs_dim)
-        return _assemble(config, parts, hyper, TDMPC2Params(**params, normalizer=statistics, scale=jnp.float32(1)))
-
-    def act(
-        state: TDMPC2State, carry: Array, obs: Array, key: Key, *, explore: bool | Array, context: Array | None = None
-    ) -> tuple[Array, Array]:
-        del context  # it reads the observation alone
-        return _plan(config, parts, state, carry, obs, key, explore=explore)
-
-    def update(state: TDMPC2State, batch: Batch, key: Key) -> tuple[TDMPC2State, Metrics]:
-        if batch.reward.shape[1] != config.horizon:
-            raise UserError(
-                f"TD-MPC2 windows have {batch.reward.shape[1]} steps: must be {config.horizon}, the horizon"
-            )
-        return _update(config, parts, state, batch, key)
-
-    return Learner(init, lambda: jnp.zeros((config.horizon, config.act_dim)), act, update)
-
-
-def _assemble(config: TDMPC2Config, parts: Parts, hyper: TDMPC2Hyper, prior: TDMPC2Params) -> TDMPC2State:
+def _assemble(nets: Networks, hyper: TDMPC2Hyper, prior: TDMPC2Params) -> TDMPC2State:
     """Fresh moments around given parameters."""
-    start = lambda name: optim.start(  # noqa: E731
-        parts.policy_adam if name == "policy" else parts.adam, getattr(prior, name)
-    )
+
+    def start(name: str) -> optim.Fit:
+        return optim.start(nets.policy_adam if name == "policy" else nets.adam, getattr(prior, name))
+
     return TDMPC2State(
         **{name: start(name) for name in NETWORKS},
         target_critic=jax.tree.map(jnp.copy, prior.critic),  # own buffers: a donated state must not hold one twice
-        anchor=jax.tree.map(jnp.copy, prior.anchor or prior.policy) if config.sgft else None,
+        anchor=jax.tree.map(jnp.copy, prior.anchor or prior.policy) if nets.config.sgft else None,
         scale=prior.scale,
         normalizer=prior.normalizer,
-        hyper=jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hyper),
+        hyper=optim.as_leaves(hyper),
         step=jnp.int32(0),
     )
 
@@ -338,13 +325,13 @@ def state_from_prior(config: TDMPC2Config, hyper: TDMPC2Hyper, params: TDMPC2Par
     With `config.sgft` its policy becomes the anchor of V_sim, unless it brings one. The horizon may be another one.
     """
     check_params_of_prior(config, params)
-    own = jax.tree.map(jnp.copy, params)  # the caller may donate the state; the prior must survive it
-    return _assemble(config, make_parts(config), hyper, own)
+    params = jax.tree.map(jnp.copy, params)  # the caller may donate the state; the prior must survive it
+    return _assemble(make_networks(config), hyper, params)
 
 
 def check_params_of_prior(config: TDMPC2Config, params: TDMPC2Params) -> None:
     """Raise UserError where a network of the prior is not the one that `config` describes."""
-    parts = make_parts(config)
+    nets = make_networks(config)
     owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, {config.size}"
     for name in NETWORKS:
-        check_params(name, getattr(parts, name), getattr(params, name), f"{owner}: use the prior's own task and size")
+        check_params(name, getattr(nets, name), getattr(params, name), f"{owner}: use the prior's own task and size")

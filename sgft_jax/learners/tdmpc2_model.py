@@ -172,7 +172,7 @@ class _Dense(nn.Module):
         kernel = self.param("kernel", self.weights, (sum(sizes), self.width))
         bias = self.param("bias", nn.initializers.zeros, (self.width,))
         rows = jnp.split(kernel, list(itertools.accumulate(sizes[:-1])))
-        return sum((part @ own for part, own in zip(parts, rows, strict=True)), bias)
+        return sum((part @ weights for part, weights in zip(parts, rows, strict=True)), bias)
 
 
 class _Body(nn.Module):
@@ -203,14 +203,15 @@ class _Body(nn.Module):
         return simnorm(nn.LayerNorm(epsilon=1e-5)(x), self.simnorm_group)
 
 
-class Parts(NamedTuple):
-    """The networks, each for one example, and the optimisers that a configuration describes.
+class Networks(NamedTuple):
+    """A configuration with the networks, each for one example, and the optimisers that it describes.
 
     encoder(obs) -> z [latent]; dynamics(z, action) -> z; reward(z, action) -> [bins] logits;
     policy(z) -> [2, act_dim] pre-tanh mean and log-std; critic(z, action, keys=None) -> [members, bins] logits, with
     dropout where there are keys, one for each member. Any slice of the critic's parameters is one, too.
     """
 
+    config: TDMPC2Config
     encoder: Network
     dynamics: Network
     reward: Network
@@ -220,7 +221,7 @@ class Parts(NamedTuple):
     policy_adam: optax.GradientTransformation
 
 
-def make_parts(config: TDMPC2Config) -> Parts:
+def make_networks(config: TDMPC2Config) -> Networks:
     """The networks and optimisers of a configuration."""
     size, act_dim, group, bins = config.size, config.act_dim, config.simnorm_group, config.bins.count
     hidden = (size.mlp, size.mlp)
@@ -230,7 +231,8 @@ def make_parts(config: TDMPC2Config) -> Parts:
         mean, x = jnp.split(policy.apply(params, z), 2)
         return jnp.stack([mean, LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (jnp.tanh(x) + 1)])
 
-    return Parts(
+    return Networks(
+        config=config,
         encoder=_network(_Body((size.encoder,) * max(size.encoder_layers - 1, 1), size.latent, group), config.obs_dim),
         dynamics=_network(_Body(hidden, size.latent, group), size.latent + act_dim),
         reward=_network(_Body(hidden, bins, zero=True), size.latent + act_dim),
@@ -267,11 +269,11 @@ def _ensemble(member: Network, members: int) -> Network:
 # --- values ---------------------------------------------------------------------------------------------------------
 
 
-def q_values(
-    config: TDMPC2Config, parts: Parts, params: PyTree, z: Array, action: Array, keys: Key | None = None
-) -> Array:
+def q_values(nets: Networks, params: PyTree, z: Array, action: Array, keys: Key | None = None) -> Array:
     """Q [heads] of every head that `params` hold, decoded; keys: [heads] of their dropout."""
-    return jax.vmap(lambda logits: twohot.decode(logits, config.bins))(parts.critic.apply(params, z, action, keys=keys))
+    return jax.vmap(lambda logits: twohot.decode(logits, nets.config.bins))(
+        nets.critic.apply(params, z, action, keys=keys)
+    )
 
 
 def two_heads(config: TDMPC2Config, key: Key) -> Array:
@@ -284,21 +286,21 @@ def heads_of(params: PyTree, heads: Array) -> PyTree:
     return jax.tree.map(lambda x: x[heads], params)
 
 
-def reward_of(config: TDMPC2Config, parts: Parts, state: TDMPC2State, z: Array, action: Array) -> Array:
+def reward_of(nets: Networks, state: TDMPC2State, z: Array, action: Array) -> Array:
     """Reward [] of an action in latent z, decoded."""
-    return twohot.decode(parts.reward.apply(state.reward.params, z, action), config.bins)
+    return twohot.decode(nets.reward.apply(state.reward.params, z, action), nets.config.bins)
 
 
-def v_sim(config: TDMPC2Config, parts: Parts, state: TDMPC2State, z: Array) -> Array:
+def v_sim(nets: Networks, state: TDMPC2State, z: Array) -> Array:
     """Mean over all heads at the policy's mean action: no draw, so that shaped rewards telescope."""
     policy = state.policy.params if state.anchor is None else state.anchor
-    action = jnp.tanh(parts.policy.apply(policy, z)[0])
-    return jnp.mean(q_values(config, parts, state.critic.params, z, action))
+    action = jnp.tanh(nets.policy.apply(policy, z)[0])
+    return jnp.mean(q_values(nets, state.critic.params, z, action))
 
 
-def encode(parts: Parts, state: TDMPC2State, obs: Array) -> Array:
+def encode(nets: Networks, state: TDMPC2State, obs: Array) -> Array:
     """Latent [latent] of raw obs [obs_dim]."""
-    return parts.encoder.apply(state.encoder.params, normalizer.normalize(state.normalizer, obs))
+    return nets.encoder.apply(state.encoder.params, normalizer.normalize(state.normalizer, obs))
 
 
 def value_of(config: TDMPC2Config, state: TDMPC2State, obs: Array) -> Array:
@@ -306,9 +308,9 @@ def value_of(config: TDMPC2Config, state: TDMPC2State, obs: Array) -> Array:
 
     Full float32 on every device, as in `value.predict`: who shapes rewards takes small differences of it.
     """
-    parts = make_parts(config)
+    nets = make_networks(config)
     with precision("float32"):
-        return v_sim(config, parts, state, encode(parts, state, obs))
+        return v_sim(nets, state, encode(nets, state, obs))
 
 
 def value_sample(config: TDMPC2Config, state: TDMPC2State, obs: Array, key: Key) -> Array:
@@ -317,10 +319,10 @@ def value_sample(config: TDMPC2Config, state: TDMPC2State, obs: Array, key: Key)
     Differs from call to call, so the potentials of consecutive shaped rewards do not cancel. All heads are evaluated:
     it is one value for each draw, and copying the parameters of two heads would take longer.
     """
-    parts = make_parts(config)
+    nets = make_networks(config)
     key_heads, key_action = jax.random.split(key)
     policy = state.policy.params if state.anchor is None else state.anchor
     with precision("float32"):
-        z = encode(parts, state, obs)
-        action = tanh_gaussian_action(parts.policy.apply(policy, z), key_action, explore=True)
-        return jnp.min(q_values(config, parts, state.critic.params, z, action)[two_heads(config, key_heads)])
+        z = encode(nets, state, obs)
+        action = tanh_gaussian_action(nets.policy.apply(policy, z), key_action, explore=True)
+        return jnp.min(q_values(nets, state.critic.params, z, action)[two_heads(config, key_heads)])

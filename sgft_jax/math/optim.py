@@ -1,5 +1,6 @@
 """One Adam per network: a network that is not stepped cannot move, not even by momentum."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -33,6 +34,22 @@ def step(optimiser: optax.GradientTransformation, fit: Fit, grads: PyTree, rate:
     return Fit(jax.tree.map(lambda p, u: p - rate * u, fit.params, updates), moments)
 
 
+def minimise[Aux](
+    optimiser: optax.GradientTransformation,
+    loss: Callable[[PyTree], tuple[Array, Aux]],
+    fit: Fit,
+    rate: Array | float,
+) -> tuple[Fit, Array, Aux]:
+    """One descent step on `loss(params) -> (value [], aux)`, and both from before it. rate: [] learning rate."""
+    (value, aux), grads = jax.value_and_grad(loss, has_aux=True)(fit.params)
+    return step(optimiser, fit, grads, rate), value, aux
+
+
+def as_leaves[Hyper](hyper: Hyper) -> Hyper:
+    """The numbers of an agent as float32 arrays: new ones then vmap, and compile no update again."""
+    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hyper)
+
+
 def warmup_factor(step: Array, warmup: Array | float) -> Array:
     """Factor [] on the learning rate of the update after `step` [] others; it rises linearly to 1 over `warmup`.
 
@@ -53,8 +70,3 @@ def cosine_factor(step: Array, updates: Array | float) -> Array:
 def steps_of(fit: Fit) -> Array:
     """How many steps [] a network in training has made."""
     return optax.tree.get(fit.moments, "count")
-
-
-def keep_unless(moves: Array, new: PyTree, old: PyTree) -> PyTree:
-    """`new` where the scalar `moves` is true, else `old` with the same bits."""
-    return jax.tree.map(lambda n, o: jnp.where(moves, n, o), new, old)

@@ -35,7 +35,11 @@ _METHODS: Mapping[str, Method] = {
 NAMES = tuple(name for name, method in _METHODS.items() if method.online)  # of those that fine-tune
 FIXED_NAMES = tuple(name for name, method in _METHODS.items() if method.fixed)
 DEFAULT = "guarded"
-_KINDS = {"online": "fine-tuning", "fixed": "learning from a fixed set of data or a simulator"}
+# What is for a kind, the arguments of `build`, and what it returns
+_KINDS: Mapping[str, tuple[type, str, str, type]] = {
+    "online": (Online, "fine-tuning", "config, prior, task", Finetuner),
+    "fixed": (Fixed, "learning from a fixed set of data or a simulator", "config, task", HybridAgent),
+}
 
 
 @overload
@@ -82,9 +86,9 @@ def _checked(source: str, method: Any, kind: Kind) -> Method:
         raise UserError(f"METHOD is a {type(method).__name__}, not a sgft_jax.Method")
     if not isinstance(method.name, str):
         raise UserError(f"name is {method.name!r}, not a text")
-    way, expected = getattr(method, kind), Online if kind == "online" else Fixed
+    (expected, purpose, arguments, made), way = _KINDS[kind], getattr(method, kind)
     if way is None:
-        raise UserError(f"{method.name} has nothing for {_KINDS[kind]}: `{kind}` is None")
+        raise UserError(f"{method.name} has nothing for {purpose}: `{kind}` is None")
     if not isinstance(way, expected):
         raise UserError(f"{kind} is a {type(way).__name__}, not a sgft_jax.{expected.__name__}")
     _check_fields(way)
@@ -93,11 +97,9 @@ def _checked(source: str, method: Any, kind: Kind) -> Method:
         raise UserError(f"the name {method.name!r} is taken; choose another")
     if isinstance(way, Online):
         _check_config(source, way.config)
-        build = _checked_build(source, way.build, (way.config, None, None), "config, prior, task", Finetuner)
     else:
         _check_presets(way.presets)
-        build = _checked_build(source, way.build, (way.config, None), "config, task", HybridAgent)
-    return method._replace(**{kind: way._replace(build=build)})
+    return method._replace(**{kind: way._replace(build=_checked_build(source, way.build, arguments, made))})
 
 
 def _check_fields(way: Online | Fixed) -> None:
@@ -130,12 +132,12 @@ def _check_presets(presets: Any) -> None:
             raise UserError(f"preset {name!r} is of another dataclass than the first")
 
 
-def _checked_build(source: str, build: Any, example: tuple[Any, ...], given: str, made: type) -> Callable[..., Any]:
+def _checked_build(source: str, build: Any, arguments: str, made: type) -> Callable[..., Any]:
     """`build`, which names file and line where it fails, or what it returns where that is not what it should make."""
     try:
-        inspect.signature(build).bind(*example)
+        inspect.signature(build).bind(*arguments.split(", "))
     except (TypeError, ValueError) as error:
-        raise UserError(f"build must be called as build({given}): {error}") from error
+        raise UserError(f"build must be called as build({arguments}): {error}") from error
 
     def checked(*args: Any) -> Any:
         result = extend.guard("method", source, build)(*args)

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import OfflineOptions, agent_of, sac_numbers
+from sgft_jax.methods.options import RowsOptions, agent_of, sac_numbers
 from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
 @dataclass(frozen=True)
-class Config(OfflineOptions):
+class Config(RowsOptions):
     """Options of `cql`."""
 
     conservatism: float = 2.0
@@ -26,12 +26,11 @@ def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
     from sgft_jax.data import sources
     from sgft_jax.learners import cql
-    from sgft_jax.models.config import NetworkConfig
 
     structure = cql.CQLConfig(
         task.obs_dim,
         task.act_dim,
-        NetworkConfig(config.hidden),
+        config.network,
         conservatism=config.conservatism,
         samples=config.samples,
     )

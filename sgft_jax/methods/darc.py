@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import ActorCriticOptions, agent_of, sac_numbers
+from sgft_jax.methods.options import RowsOptions, agent_of, sac_numbers
 from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
 @dataclass(frozen=True)
-class Config(ActorCriticOptions):
+class Config(RowsOptions):
     """Options of `darc`; the defaults are those of the baseline of H2O+, with a fixed set of real data."""
 
     rows: int = 256
@@ -18,21 +18,17 @@ class Config(ActorCriticOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.rows(self, "rows", "ratio_rows")
+        checks.rows(self, "ratio_rows")
 
 
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
     from sgft_jax.learners import actor, darc
-    from sgft_jax.models.config import NetworkConfig
 
-    structure = darc.DARCConfig(
-        task.obs_dim, task.act_dim, NetworkConfig(config.hidden), ratio_rows=2 * config.ratio_rows
-    )
+    structure = darc.DARCConfig(task.obs_dim, task.act_dim, config.network, ratio_rows=2 * config.ratio_rows)
     learner = darc.make_darc(structure, sac_numbers(config), lr_ratio=config.lr)
     batches = darc.batches(config.rows, config.ratio_rows)
-    export = lambda state: actor.exported(state.sac)  # noqa: E731
-    return agent_of(learner, config, task, batches, simulates=True, export=export)
+    return agent_of(learner, config, task, batches, simulates=True, export=lambda state: actor.exported(state.sac))
 
 
 METHOD = Method(

@@ -2,26 +2,24 @@
 
 from dataclasses import dataclass
 
-from sgft_jax.methods.options import EnsembleOptions, OfflineOptions, agent_of, sac_numbers
+from sgft_jax.methods.options import EnsembleOptions, RowsOptions, agent_of, sac_numbers
 from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
 @dataclass(frozen=True)
-class Config(OfflineOptions, EnsembleOptions):
+class Config(RowsOptions, EnsembleOptions):
     """Options of `edac`; with diversity 0 it is SAC-N."""
 
     hidden: tuple[int, ...] = (256, 256, 256)
-    """Widths of the hidden layers of actor and critics."""
 
 
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
     from sgft_jax.data import sources
     from sgft_jax.learners import edac
-    from sgft_jax.models.config import NetworkConfig
 
     structure = edac.EDACConfig(
-        task.obs_dim, task.act_dim, NetworkConfig(config.hidden), critics=config.critics, diversity=config.diversity
+        task.obs_dim, task.act_dim, config.network, critics=config.critics, diversity=config.diversity
     )
     learner = edac.make_edac(structure, sac_numbers(config))
     return agent_of(learner, config, task, sources.real_rows(config.rows), simulates=False)

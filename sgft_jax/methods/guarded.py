@@ -24,13 +24,8 @@ class Config(sac.Config):
     utd: float = 8.0
     """Gradient updates per real transition."""
     identify: bool = True
-    """Fit what the real system makes of commands (scale, rotation, bias) and of measurements (a constant error) to its
-    rollouts, through the prior's models, and act accordingly."""
     simulated_share: float = 0.5
-    """Share of each batch that is simulated, as in RLPD (Ball et al. 2023); 0 = none."""
     guard: bool = True
-    """Deploy what learns only while its real rollouts say that it is better than the policy that it began with, or
-    than its own best since (sgft_jax/train/guard.py). That policy then plays the training rollouts too."""
 
 
 METHOD = Method(

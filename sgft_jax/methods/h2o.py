@@ -1,15 +1,10 @@
 """H2O: one critic from real and simulated rows, pushed down where the simulator is wrong (Niu et al. 2022)."""
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from sgft_jax import checks
 from sgft_jax.methods.options import HybridOptions, agent_of, real_and_simulated
-from sgft_jax.types import Fixed, HybridAgent, Method, Task
-
-if TYPE_CHECKING:
-    from sgft_jax.learners.h2o import H2OState
-    from sgft_jax.types import RealData
+from sgft_jax.types import Fixed, HybridAgent, Method, RealData, Task
 
 
 @dataclass(frozen=True)
@@ -32,13 +27,10 @@ def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
     from sgft_jax.data import replay
     from sgft_jax.learners import h2o
-    from sgft_jax.models.config import NetworkConfig
 
-    structure = h2o.H2OConfig(
-        task.obs_dim, task.act_dim, NetworkConfig(config.hidden), ratio_rows=2 * config.ratio_rows
-    )
+    structure = h2o.H2OConfig(task.obs_dim, task.act_dim, config.network, ratio_rows=2 * config.ratio_rows)
 
-    def prepare(state: "H2OState", real: "RealData", updates: int) -> "H2OState":
+    def prepare(state: h2o.H2OState, real: RealData, updates: int) -> h2o.H2OState:
         return state.replace(spread=replay.obs_std(replay.full(real.rows)))
 
     hyper = h2o.H2OHyper(

@@ -1,20 +1,19 @@
 """H2O+: the in-sample value of the real data and SAC in the simulator feed one critic (Niu et al. 2023)."""
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import ClassVar
 
 from sgft_jax import checks
 from sgft_jax.methods.options import HybridOptions, agent_of, real_and_simulated, return_scale
-from sgft_jax.types import Fixed, HybridAgent, Method, Task, ValueLoss
-
-if TYPE_CHECKING:
-    from sgft_jax.learners.h2oplus import H2OPlusState
-    from sgft_jax.types import RealData
+from sgft_jax.types import Fixed, HybridAgent, Method, RealData, Task, ValueLoss
 
 
 @dataclass(frozen=True)
 class Config(HybridOptions):
     """Options of `h2oplus`. The defaults are the paper's, and where it is silent IQL's and the released code's."""
+
+    critics: ClassVar[int] = 2
+    diversity: ClassVar[float] = 0.0
 
     value_loss: ValueLoss = "iql"
     """What the value of the real data is: IQL's expectile, or that of SQL, EQL or XQL."""
@@ -38,18 +37,23 @@ class Config(HybridOptions):
         checks.positive(self, "value_alpha", "value_cut")
 
 
-def build(config: Config, task: Task, *, critics: int = 2, diversity: float = 0.0) -> HybridAgent:
-    """The agent. critics, diversity: of its ensemble, see `H2OPlusConfig`."""
+def build(config: Config, task: Task) -> HybridAgent:
+    """The agent."""
     from sgft_jax.learners import h2oplus
     from sgft_jax.models import normalizer
-    from sgft_jax.models.config import NetworkConfig
 
     structure = h2oplus.H2OPlusConfig(
-        task.obs_dim, task.act_dim, NetworkConfig(config.hidden), critics=critics, diversity=diversity,
-        value_loss=config.value_loss, ratio=config.ratio, ratio_rows=2 * config.ratio_rows,
-    )  # fmt: skip
+        task.obs_dim,
+        task.act_dim,
+        config.network,
+        critics=config.critics,
+        diversity=config.diversity,
+        value_loss=config.value_loss,
+        ratio=config.ratio,
+        ratio_rows=2 * config.ratio_rows,
+    )
 
-    def prepare(state: "H2OPlusState", real: "RealData", updates: int) -> "H2OPlusState":
+    def prepare(state: h2oplus.H2OPlusState, real: RealData, updates: int) -> h2oplus.H2OPlusState:
         alpha = state.hyper.value_alpha / return_scale(real)  # the learner itself has it in units of return
         state = state.replace(hyper=state.hyper._replace(value_alpha=alpha))
         if state.ratio is not None and config.standardise:

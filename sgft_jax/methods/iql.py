@@ -4,21 +4,29 @@ From simulated data, then with real transitions in half of each batch; or from a
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
+from envs.types import Array, Key, PyTree
 from sgft_jax import checks
-from sgft_jax.methods.options import OfflineOptions, agent_of, return_scale
-from sgft_jax.train.options import LoopOptions
-from sgft_jax.types import Finetuner, Fixed, HybridAgent, Method, Online, Prior, Simulation, Task
-
-if TYPE_CHECKING:
-    from sgft_jax.learners.actor import ACTORParams
-    from sgft_jax.learners.iql import IQLState
-    from sgft_jax.types import RealData
+from sgft_jax.methods.options import RowsOptions, agent_of, return_scale
+from sgft_jax.models.config import NetworkConfig
+from sgft_jax.train.options import MixedOptions
+from sgft_jax.types import (
+    Finetuner,
+    Fixed,
+    HybridAgent,
+    Learner,
+    Method,
+    Online,
+    Prior,
+    RealData,
+    SimulatedData,
+    Simulation,
+    Task,
+)
 
 
 @dataclass(frozen=True)
-class Config(LoopOptions):
+class Config(MixedOptions):
     """Options of `iql`; the defaults are Kostrikov et al. 2022's for locomotion."""
 
     lr_actor: float = 3e-4
@@ -36,9 +44,6 @@ class Config(LoopOptions):
     simulated_share: float = 0.5
     """Share of each batch that is simulated, once there are real transitions."""
     simulated_transitions: int = 1_000_000
-    """Simulated transitions, of the simulator's policy with more and more random actions."""
-    simulated_ladder: float = 0.6
-    """Share of random actions in the last of these episodes; it grows from 0 in the first."""
     offline_updates: int = 500_000
     """Updates on the simulated transitions alone, before the first real rollout."""
 
@@ -46,31 +51,22 @@ class Config(LoopOptions):
         super().__post_init__()
         checks.positive(self, "lr_actor", "lr_critic", "reward_scale")
         checks.not_negative(self, "beta", "offline_updates")
-        checks.share(self, "tau", "expectile", "simulated_share", "simulated_ladder")
-        checks.at_least(self, 1, "simulated_transitions")
+        checks.share(self, "tau", "expectile")
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner; the simulator's policy makes data and the initial rollouts, the agent starts from nothing."""
     import jax.numpy as jnp
 
-    from envs.types import Array, Key, PyTree
     from sgft_jax.data import sources
     from sgft_jax.learners import iql
     from sgft_jax.learners.sac import SACParams
     from sgft_jax.policies import network_of, sac_policy
-    from sgft_jax.train.finetuner import FinetuneState, Parts, agents_own, assemble, simulators_actor
+    from sgft_jax.train.finetuner import FinetuneState, Parts, assemble, mixed_rows, simulator_actor
     from sgft_jax.train.options import card_of
-    from sgft_jax.transforms import compose
-    from sgft_jax.types import SimulatedData
 
     network = network_of(card_of(prior))
-    hyper = iql.IQLHyper(
-        lr_actor=config.lr_actor, lr_critic=config.lr_critic, lr_value=config.lr_critic, tau=config.tau,
-        expectile=config.expectile, beta=config.beta,
-    )  # fmt: skip
-    structure = iql.IQLConfig(task.obs_dim, task.act_dim, network=network, max_grad_norm=config.max_grad_norm)
-    learner = iql.make_iql(structure, hyper)
+    learner = _learner(config, task, network, config.lr_actor, config.lr_critic, config.max_grad_norm)
 
     def reward_scale(simulated: SimulatedData | None) -> Array:
         """Published scaling: the returns of the data span the length of an episode."""
@@ -86,40 +82,42 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
             return state, SACParams(None, None, None, None, state.normalizer)
         return state.replace(normalizer=params.normalizer), params._replace(actor=None, critic=None)
 
-    def act(
-        state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
-    ) -> tuple[Array, PyTree]:
-        return learner.act(state.learner, carry, obs, key, explore=explore)
-
     def export(state: FinetuneState) -> SACParams:
         actor = iql.as_tanh_gaussian(state.learner.actor.params)
         return state.frozen._replace(actor=actor, critic=state.learner.critic.params)
 
-    n_sim = round(config.simulated_share * config.batch_size) if prior is not None else 0
-    source = sources.mixture(config.batch_size - n_sim, n_sim)
+    source, _ = mixed_rows(config, prior)
     simulation = Simulation(config.simulated_transitions, config.simulated_ladder, config.offline_updates)
-    policy = sac_policy(task.obs_dim, task.act_dim, network)
     parts = Parts(
         learner=learner,
         start=start,
-        init_carry=learner.init_carry,
-        act=act,
         export=export,
-        policy=policy,
+        policy=sac_policy(task.obs_dim, task.act_dim, network),
         source=lambda state: source,
         offline=sources.simulated_rows(config.batch_size),
-        transform=compose(),
-        reference=agents_own if prior is None else simulators_actor,
+        beginner=None if prior is None else simulator_actor,
+        simulation=None if prior is None else simulation,
     )
-    with_prior = prior is not None
-    return assemble(
-        parts, config, task, initial_policy=policy if with_prior else None,
-        simulation=simulation if with_prior else None,
-    )  # fmt: skip
+    return assemble(parts, config, task)
+
+
+def _learner(
+    config: "Config | FixedConfig",
+    task: Task,
+    network: NetworkConfig,
+    lr_actor: float,
+    lr_critic: float,
+    max_grad_norm: float | None = None,
+) -> Learner:
+    from sgft_jax.learners.iql import IQLConfig, IQLHyper, make_iql
+
+    structure = IQLConfig(task.obs_dim, task.act_dim, network, max_grad_norm)
+    numbers = {"tau": config.tau, "expectile": config.expectile, "beta": config.beta}
+    return make_iql(structure, IQLHyper(lr_actor, lr_critic, lr_value=lr_critic, **numbers))
 
 
 @dataclass(frozen=True)
-class FixedConfig(OfflineOptions):
+class FixedConfig(RowsOptions):
     """Options of `iql` from a fixed set of real data; the published ones for locomotion."""
 
     expectile: float = 0.7
@@ -144,9 +142,8 @@ def build_fixed(config: FixedConfig, task: Task) -> HybridAgent:
 
     from sgft_jax.data import sources
     from sgft_jax.learners import actor, iql
-    from sgft_jax.models.config import NetworkConfig
 
-    def prepare(state: "IQLState", real: "RealData", updates: int) -> "IQLState":
+    def prepare(state: iql.IQLState, real: RealData, updates: int) -> iql.IQLState:
         hyper = state.hyper
         if config.scale_rewards:
             hyper = hyper._replace(reward_scale=return_scale(real))
@@ -154,19 +151,10 @@ def build_fixed(config: FixedConfig, task: Task) -> HybridAgent:
             hyper = hyper._replace(actor_updates=jnp.float32(updates))
         return state.replace(hyper=hyper)
 
-    def export(state: "IQLState") -> "ACTORParams":
-        return actor.ACTORParams(iql.as_tanh_gaussian(state.actor.params), actor.exported(state).normalizer)
+    def export(state: iql.IQLState) -> actor.ActorParams:
+        return actor.ActorParams(iql.as_tanh_gaussian(state.actor.params), actor.exported(state).normalizer)
 
-    structure = iql.IQLConfig(task.obs_dim, task.act_dim, NetworkConfig(config.hidden))
-    hyper = iql.IQLHyper(
-        lr_actor=config.lr,
-        lr_critic=config.lr,
-        lr_value=config.lr,
-        tau=config.tau,
-        expectile=config.expectile,
-        beta=config.beta,
-    )
-    learner = iql.make_iql(structure, hyper)
+    learner = _learner(config, task, config.network, config.lr, config.lr)
     batches = sources.real_rows(config.rows)
     return agent_of(learner, config, task, batches, simulates=False, prepare=prepare, export=export)
 

@@ -17,8 +17,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.transforms import branch
 
     transforms = (branch(config.horizon, config.branches, noise=config.branch_noise, segments=False),)
-    rows = config.batch_size if config.actor_real_only else None
-    return sac_finetuner(config, prior, task, transforms=transforms, actor_batch=rows)
+    return sac_finetuner(config, prior, task, transforms=transforms)
 
 
 METHOD = Method("mbpo", Online("model-based", "SAC with branches of the models", "Janner 2019", Config, build))

@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 from envs.types import Array, PyTree
 from sgft_jax import checks
+from sgft_jax.models.config import NetworkConfig
 from sgft_jax.types import HybridAgent, Learner, RealData, Source, Task
 
 if TYPE_CHECKING:
     from sgft_jax.learners.actor import Head
     from sgft_jax.learners.sac import SACHyper
-    from sgft_jax.models.config import NetworkConfig
 
 _RETURN_SPAN = 1000.0  # of scaled returns, as published for locomotion
 
@@ -25,7 +25,7 @@ class ActorCriticOptions:
     tau: float = 0.005
     """Averaging rate of the target critics."""
     hidden: tuple[int, ...] = (256, 256)
-    """Widths of the hidden layers of actor, critics and value."""
+    """Widths of the hidden layers of every network."""
     gamma: float = 0.99
     """Discount factor per control step."""
 
@@ -35,10 +35,15 @@ class ActorCriticOptions:
         checks.layers(self, "hidden")
         checks.below_one(self, "gamma")
 
+    @property
+    def network(self) -> NetworkConfig:
+        """The body of every network."""
+        return NetworkConfig(self.hidden)
+
 
 @dataclass(frozen=True)
-class OfflineOptions(ActorCriticOptions):
-    """Options of methods that learn from the real rows alone."""
+class RowsOptions(ActorCriticOptions):
+    """Options of methods whose batches are of one kind of rows, real ones unless a method says otherwise."""
 
     rows: int = 256
     """Real rows of a batch."""
@@ -117,21 +122,18 @@ def agent_of(
     *,
     simulates: bool,
     head: "Head" = "gaussian",
-    network: "NetworkConfig | None" = None,
     keep: Callable[[RealData], PyTree] | None = None,
     prepare: Callable[[PyTree, RealData, int], PyTree] = lambda state, real, updates: state,
     export: Callable[[PyTree], PyTree] | None = None,
 ) -> HybridAgent:
     """The agent of a learner.
 
-    head, network: of its actor, see `learners.actor.actor_policy`; by default layers of `hidden`. keep, prepare,
-    export: see `HybridAgent`; by default single rows, nothing, and the actor and statistics of the learner's state.
+    head: of its actor, see `learners.actor.actor_policy`. keep, prepare, export: see `HybridAgent`; by default single
+    rows, nothing, and the actor and statistics of the learner's state.
     """
     from sgft_jax.data import replay
     from sgft_jax.learners import actor
-    from sgft_jax.models.config import NetworkConfig
 
-    network = network or NetworkConfig(config.hidden)
     return HybridAgent(
         learner=learner,
         keep=keep or (lambda real: replay.full(real.rows)),
@@ -139,6 +141,6 @@ def agent_of(
         simulates=simulates,
         prepare=prepare,
         export=export or actor.exported,
-        policy=actor.actor_policy(task.obs_dim, task.act_dim, network, head),
-        card=actor.card(network, head, config.gamma),
+        policy=actor.actor_policy(task.obs_dim, task.act_dim, config.network, head),
+        card=actor.card(config.network, head, config.gamma),
     )

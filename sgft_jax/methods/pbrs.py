@@ -2,13 +2,12 @@
 
 from dataclasses import dataclass
 
-from sgft_jax import checks
-from sgft_jax.train.options import KeptCriticOptions
+from sgft_jax.train.options import ShapedOptions
 from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
-class Config(KeptCriticOptions):
+class Config(ShapedOptions):
     """Options of `pbrs`."""
 
     clip_shaped: float | None = None
@@ -17,10 +16,6 @@ class Config(KeptCriticOptions):
     """Start from a new critic, as in the SGFT paper; False keeps the simulator's, read as Q(s, a) - V_sim(s), and did
     better in tuning (docs/protocol.md)."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.positive(self, "clip_shaped")
-
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
@@ -28,9 +23,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.transforms import clip, shape
 
     transforms = (shape, clip(config.clip_shaped))
-    return sac_finetuner(
-        config, prior, task, transforms=transforms, reset_critic=config.reset_critic, value_baseline=True
-    )
+    return sac_finetuner(config, prior, task, transforms=transforms, value_baseline=True)
 
 
 METHOD = Method(

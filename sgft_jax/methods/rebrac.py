@@ -3,18 +3,17 @@
 from dataclasses import dataclass, replace
 
 from sgft_jax import checks
-from sgft_jax.methods.options import OfflineOptions, agent_of
+from sgft_jax.methods.options import RowsOptions, agent_of
+from sgft_jax.models.config import NetworkConfig
 from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
 @dataclass(frozen=True)
-class Config(OfflineOptions):
+class Config(RowsOptions):
     """Options of `rebrac`."""
 
     lr: float = 1e-3
-    """Adam learning rate of every network."""
     hidden: tuple[int, ...] = (256, 256, 256)
-    """Widths of the hidden layers of actor and critics."""
     rows: int = 1024
     """Real rows of a batch, each with the action that followed it."""
     actor_penalty: float = 0.01
@@ -26,15 +25,18 @@ class Config(OfflineOptions):
         super().__post_init__()
         checks.not_negative(self, "actor_penalty", "critic_penalty")
 
+    @property
+    def network(self) -> NetworkConfig:
+        """The body of every network; the actor's has no LayerNorm."""
+        return NetworkConfig(self.hidden, layer_norm=True)
+
 
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
     from sgft_jax.data import sequences, sources
     from sgft_jax.learners import rebrac
-    from sgft_jax.models.config import NetworkConfig
 
-    network = NetworkConfig(config.hidden, layer_norm=True)
-    structure = rebrac.ReBRACConfig(task.obs_dim, task.act_dim, network)
+    structure = rebrac.ReBRACConfig(task.obs_dim, task.act_dim, config.network)
     hyper = rebrac.ReBRACHyper(
         lr_actor=config.lr,
         lr_critic=config.lr,
@@ -49,7 +51,6 @@ def build(config: Config, task: Task) -> HybridAgent:
         sources.real_windows(config.rows, 2),
         simulates=False,
         head="deterministic",
-        network=network,
         keep=lambda real: sequences.full(real.rows, real.last),
     )
 

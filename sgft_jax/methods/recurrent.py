@@ -23,33 +23,13 @@ class Config:
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
-    from envs.types import Array, Key, PyTree
-    from sgft_jax.data import sources
-    from sgft_jax.learners.idle import IDLE
     from sgft_jax.policies import make_policy
-    from sgft_jax.train.finetuner import FinetuneState, Parts, assemble
+    from sgft_jax.train.finetuner import assemble, unlearned
     from sgft_jax.train.options import card_of
-    from sgft_jax.transforms import compose
 
     policy = make_policy(card_of(prior), task)
-    loop = LoopOptions(initial_rollouts=config.initial_rollouts)
-
-    def act(
-        state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
-    ) -> tuple[Array, PyTree]:
-        return policy.act(state.frozen, carry, obs, key, explore=explore)
-
-    parts = Parts(
-        learner=IDLE,
-        start=lambda params, key, simulated: ((), params),
-        init_carry=policy.init_carry,
-        act=act,
-        export=lambda state: state.frozen,
-        policy=policy,
-        source=lambda state: sources.real_rows(loop.batch_size),
-        transform=compose(),
-    )
-    return assemble(parts, loop, task)._replace(updates_per_rollout=1)
+    parts = unlearned(policy, start=lambda params, key, simulated: ((), params), export=lambda state: state.frozen)
+    return assemble(parts, LoopOptions(initial_rollouts=config.initial_rollouts), task)._replace(updates_per_rollout=1)
 
 
 METHOD = Method(

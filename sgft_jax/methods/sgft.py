@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.train.options import KeptCriticOptions
+from sgft_jax.train.options import ShapedOptions
 from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
-class Config(KeptCriticOptions):
+class Config(ShapedOptions):
     """Options of `sgft`."""
 
     horizon: int = 1
@@ -16,13 +16,10 @@ class Config(KeptCriticOptions):
     lr_warmup: int | None = 0
     """Updates over which the critic's learning rate rises from 0. V_sim stands at the end of every segment and
     protects the critic already."""
-    clip_shaped: float | None = 2.0
-    """Bound on the shaped reward; None = no bound, as in the paper."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.few(self, 1, "horizon")
-        checks.positive(self, "clip_shaped")
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:

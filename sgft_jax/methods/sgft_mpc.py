@@ -5,13 +5,14 @@ Source: SGFT (Yin et al., ICLR 2025), Algorithm 3. The paper plans in TD-MPC2's 
 
 from dataclasses import dataclass
 
+from envs.types import Key, PyTree
 from sgft_jax import checks
-from sgft_jax.train.options import LoopOptions
-from sgft_jax.types import Finetuner, Method, Online, Prior, Task
+from sgft_jax.train.options import DynamicsOptions
+from sgft_jax.types import Finetuner, Method, Online, Prior, SimulatedData, Task
 
 
 @dataclass(frozen=True)
-class Config(LoopOptions):
+class Config(DynamicsOptions):
     """Options of `sgft-mpc`."""
 
     horizon: int = 1
@@ -23,37 +24,27 @@ class Config(LoopOptions):
     explore_noise: float = 0.4
     """Std of the noise on what a plan does in a training rollout. A plan does much the same in the same state, and from
     such data no model learns what actions do."""
-    lr_dynamics: float = 3e-4
-    """Adam learning rate of the dynamics ensemble."""
     dynamics_warmup: int | None = 0
-    """Updates over which that rate rises from 0; None = the updates of 1,000 real transitions."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.few(self, 1, "horizon")
         checks.at_least(self, 8, "plan_samples")
-        checks.not_negative(self, "plan_noise", "explore_noise", "dynamics_warmup")
-        checks.positive(self, "lr_dynamics")
+        checks.not_negative(self, "plan_noise", "explore_noise")
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
-    from envs.types import Array, Key, PyTree
-    from sgft_jax.data import sources
-    from sgft_jax.learners.idle import IDLE
     from sgft_jax.learners.sac import SACParams
     from sgft_jax.planning.mpc import MPCConfig
     from sgft_jax.policies import mpc_policy, network_of
-    from sgft_jax.train.finetuner import FinetuneState, Parts, assemble, dynamics_models
+    from sgft_jax.train.finetuner import FinetuneState, assemble, dynamics_models, unlearned
     from sgft_jax.train.options import card_of
-    from sgft_jax.transforms import compose
-    from sgft_jax.types import SimulatedData
 
     card = card_of(prior)
     network = network_of(card)
     plan = {"horizon": config.horizon, "samples": config.plan_samples, "noise": config.plan_noise}
     structure = MPCConfig(task.obs_dim, task.act_dim, network, **plan, gamma=card["gamma"])
-    policy = mpc_policy(structure, task, explore_noise=config.explore_noise)
 
     def start(params: SACParams, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
         del key, simulated
@@ -62,23 +53,9 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     def export(state: FinetuneState) -> SACParams:
         return state.frozen._replace(dynamics=state.models.params)
 
-    def act(
-        state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
-    ) -> tuple[Array, PyTree]:
-        return policy.act(export(state), carry, obs, key, explore=explore)
-
-    parts = Parts(
-        learner=IDLE,
-        start=start,
-        init_carry=policy.init_carry,
-        act=act,
-        export=export,
-        policy=policy,
-        source=lambda state: sources.real_rows(config.batch_size),
-        transform=compose(),
-        models=dynamics_models(config, network, task),
-    )
-    return assemble(parts, config, task, card={"plan": plan})
+    parts = unlearned(mpc_policy(structure, task, explore_noise=config.explore_noise), start, export)
+    models = dynamics_models(config, network, task)
+    return assemble(parts._replace(models=models, card={"plan": plan}), config, task)
 
 
 METHOD = Method(

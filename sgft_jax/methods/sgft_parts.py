@@ -31,10 +31,13 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     imagined = branch(config.horizon, config.branches, noise=config.branch_noise, segments=config.shorten)
     shaped, short = (shape,) * config.shape, (shorten(config.horizon),) * config.shorten
     return sac_finetuner(
-        config, prior, task, transforms=(imagined, *shaped, *short), reset_critic=config.reset_critic,
-        horizon_dim=config.horizon if config.shorten else 0, value_baseline=config.shape,
-        actor_batch=config.batch_size if config.actor_real_only else None,
-    )  # fmt: skip
+        config,
+        prior,
+        task,
+        transforms=(imagined, *shaped, *short),
+        horizon_dim=config.horizon if config.shorten else 0,
+        value_baseline=config.shape,
+    )
 
 
 METHOD = Method(

@@ -7,30 +7,22 @@ the agent never takes a step that costs V_sim now and pays later, and the critic
 
 from dataclasses import dataclass
 
-from sgft_jax import checks
-from sgft_jax.train.options import ModelOptions
+from sgft_jax.train.options import ModelOptions, ShapedOptions
 from sgft_jax.types import Finetuner, Method, Online, Prior, Task
 
 
 @dataclass(frozen=True)
-class Config(ModelOptions):
+class Config(ModelOptions, ShapedOptions):
     """Options of `sgft-sac`."""
 
     horizon: int = 4
     """Steps of a segment and of an imagined branch, the paper's H (there 1)."""
     branches: int = 2
-    """Imagined branches from each real row of a batch."""
     lr_warmup: int | None = 0
     """Updates over which the critic's learning rate rises from 0. V_sim stands at the end of every segment and
     protects the critic already; warm-up and shortening are substitutes."""
-    clip_shaped: float | None = 2.0
-    """Bound on the shaped reward; None = no bound, as in the paper."""
     reset_critic: bool = False
     """Start from a new critic, as in the paper; False keeps the simulator's, read as Q(s, a) - V_sim(s)."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.positive(self, "clip_shaped")
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
@@ -44,10 +36,7 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
         clip(config.clip_shaped),
         shorten(config.horizon),
     )
-    return sac_finetuner(
-        config, prior, task, transforms=transforms, horizon_dim=config.horizon, reset_critic=config.reset_critic,
-        value_baseline=True, actor_batch=config.batch_size if config.actor_real_only else None,
-    )  # fmt: skip
+    return sac_finetuner(config, prior, task, transforms=transforms, horizon_dim=config.horizon, value_baseline=True)
 
 
 METHOD = Method(

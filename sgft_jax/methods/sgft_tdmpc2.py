@@ -6,17 +6,14 @@ Source: SGFT (Yin et al., ICLR 2025), Algorithm 3.
 from dataclasses import dataclass
 
 from sgft_jax.methods import tdmpc2
-from sgft_jax.types import Finetuner, Method, Online, Prior, Task
+from sgft_jax.types import Method, Online
 
 
 @dataclass(frozen=True)
 class Config(tdmpc2.Config):
     """Options of `sgft-tdmpc2`."""
 
-
-def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
-    """The finetuner."""
-    return tdmpc2.planner(config, prior, task, sgft=True)
+    sgft = True
 
 
 METHOD = Method(
@@ -26,7 +23,7 @@ METHOD = Method(
         "TD-MPC2 whose plans of H steps end in a frozen V_sim",
         "SGFT 2025",
         Config,
-        build,
+        tdmpc2.build,
         prior="tdmpc2",
         zero_shot=False,
     ),

@@ -3,20 +3,17 @@
 from dataclasses import dataclass
 
 from sgft_jax.methods import tdmpc2
-from sgft_jax.types import Finetuner, Method, Online, Prior, Task
+from sgft_jax.types import Method, Online
 
 
 @dataclass(frozen=True)
 class Config(tdmpc2.PlannerOptions):
     """Options of `sgft-tdmpc2-code`."""
 
+    shaped = True
+    fresh = True
+
     horizon: int = 3
-    """Steps of a plan and of a training window."""
-
-
-def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
-    """The finetuner."""
-    return tdmpc2.planner(config, prior, task, shaped=True, fresh=True)
 
 
 METHOD = Method(
@@ -26,7 +23,7 @@ METHOD = Method(
         "TD-MPC2 from nothing with shaped rewards",
         "SGFT 2025, released code",
         Config,
-        build,
+        tdmpc2.build,
         prior="tdmpc2",
         zero_shot=False,
     ),

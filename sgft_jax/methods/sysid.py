@@ -6,12 +6,13 @@ or the simulator does, replaying them.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
-from envs.types import Array, UserError
+from envs.types import Array, Key, PyTree, UserError
 from sgft_jax import checks
 from sgft_jax.train.options import LoopOptions
-from sgft_jax.types import Finetuner, Method, Online, Prior, Simulation, Task
+from sgft_jax.types import Batch, Finetuner, Method, Metrics, Online, Prior, SimulatedData, Simulation, Task
 
 _ROWS, _FEW = 320, 80  # what `rows` is if it is left open; DROPO takes two trajectories, and so does the slow simulator
 _SIMULATED = 2048  # rows that tell how far the models are off in simulation
@@ -43,18 +44,13 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     import jax
     import jax.numpy as jnp
 
-    from envs.types import Key, PyTree
-    from sgft_jax.data import sources
-    from sgft_jax.learners.idle import IDLE
     from sgft_jax.learners.sac import SACParams
     from sgft_jax.models import dynamics, system
     from sgft_jax.models.networks import make_dynamics
     from sgft_jax.models.robust import spread_of
     from sgft_jax.policies import network_of, sac_policy
-    from sgft_jax.train.finetuner import FinetuneState, Parts, assemble
+    from sgft_jax.train.finetuner import FinetuneState, assemble, unlearned
     from sgft_jax.train.options import card_of
-    from sgft_jax.transforms import compose
-    from sgft_jax.types import Batch, Metrics, SimulatedData
 
     card = card_of(prior)
     network, varying = network_of(card), card.get("system", [])
@@ -62,8 +58,6 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     few = config.fit == "dropo" or config.through == "simulator"
     rows_fitted = min(config.rows or (_FEW if few else _ROWS), loop.replay_capacity)
     model = make_dynamics(task.obs_dim, task.act_dim, network)
-    policy = sac_policy(task.obs_dim, task.act_dim, network)
-
     asked = _simulator(task) if config.through == "simulator" else None
 
     def change(params: SACParams, obs: Array, action: Array) -> Array:
@@ -88,41 +82,27 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
         spread, _ = state.learner
         held = jnp.arange(rows_fitted) < state.replay.size
         data = jax.tree.map(lambda x: x[:rows_fitted], state.replay.data)
-        predict = lambda obs, action: change(state.frozen, obs, action)  # noqa: E731
-        given = (predict, data, held, spread, len(varying))
-        found = system.dropo(*given) if config.fit == "dropo" else system.most_probable_system(*given)
-        return state._replace(learner=(spread, found))
+        fit = system.dropo if config.fit == "dropo" else system.most_probable_system
+        fitted = fit(partial(change, state.frozen), data, held, spread, len(varying))
+        return state._replace(learner=(spread, fitted))
 
     def export(state: FinetuneState) -> SACParams:
         return state.frozen._replace(system=state.learner[1].mean) if varying else state.frozen
 
-    def act(
-        state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
-    ) -> tuple[Array, PyTree]:
-        return policy.act(export(state), carry, obs, key, explore=explore)
-
-    def tell(learner: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
-        """Learns nothing, says what it has found, in raw units."""
+    def report(learner: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
+        """Learns nothing; its metrics are the fitted system, in raw units."""
         del batch, key
         metrics = {}
         for v, mean in zip(varying, learner[1].mean, strict=True):
             metrics[f"system/{v['name']}_{v['index']}"] = v["low"] + 0.5 * (1.0 + mean) * (v["high"] - v["low"])
         return learner, metrics
 
-    parts = Parts(
-        learner=IDLE._replace(update=tell),
-        start=start,
-        init_carry=policy.init_carry,
-        act=act,
-        export=export,
-        policy=policy,
-        source=lambda state: sources.real_rows(loop.batch_size),
-        transform=compose(),
-        observed=observed,
+    parts = unlearned(sac_policy(task.obs_dim, task.act_dim, network), start, export)
+    parts = parts._replace(
+        learner=parts.learner._replace(update=report), observed=observed, simulation=Simulation(20_000, 0.6)
     )
-    finetuner = assemble(parts, loop, task, simulation=Simulation(20_000, 0.6))
-    # One update after a rollout says what was found; more would say it again.
-    return finetuner._replace(updates_per_rollout=1)
+    # One update after a rollout says what was fitted; more would say it again.
+    return assemble(parts, loop, task)._replace(updates_per_rollout=1)
 
 
 def _simulator(task: Task) -> Callable[[Array, Array], Array]:

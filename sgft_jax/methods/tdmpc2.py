@@ -3,18 +3,28 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
+from typing import ClassVar
 
+from envs.types import Array, Key, PyTree
 from sgft_jax import checks
 from sgft_jax.train.options import LoopOptions
-from sgft_jax.types import Finetuner, Method, Online, Prior, Task
+from sgft_jax.types import Batch, Finetuner, Method, Online, Prior, SimulatedData, Task, Transform
 
 
 @dataclass(frozen=True)
 class PlannerOptions(LoopOptions):
-    """Options of methods whose learner is TD-MPC2; the defaults are Hansen et al. 2024's, but for the horizon."""
+    """Options of methods whose learner is TD-MPC2; the defaults are Hansen et al. 2024's, but for the horizon.
+
+    A `ClassVar` is no option: a method's class sets it, or makes an option of it. shaped: rewards are shaped by draws
+    of the simulator's value. fresh: the agent starts from nothing. sgft: see `TDMPC2Config`.
+    """
+
+    shaped: ClassVar[bool] = False
+    fresh: ClassVar[bool] = False
+    sgft: ClassVar[bool] = False
+    lr_warmup: ClassVar[int | None] = 0
 
     utd: float = 1.0
-    """Gradient updates per real transition."""
     horizon: int = 4
     """Steps of a plan and of a training window."""
     plan_samples: int = 512
@@ -47,47 +57,27 @@ class Config(PlannerOptions):
         checks.not_negative(self, "lr_warmup")
 
 
-def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
+def build(config: PlannerOptions, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
-    return planner(config, prior, task)
-
-
-def planner(
-    config: PlannerOptions,
-    prior: Prior | None,
-    task: Task,
-    *,
-    shaped: bool = False,
-    fresh: bool = False,
-    sgft: bool = False,
-) -> Finetuner:
-    """Fine-tuning whose learner is TD-MPC2.
-
-    shaped: rewards are shaped by draws of the simulator's value. fresh: the agent starts from nothing. sgft: see
-    `TDMPC2Config`.
-    """
-    import jax
-
-    from envs.types import Array, Key, PyTree
     from sgft_jax.data import sequences, sources
     from sgft_jax.learners import tdmpc2, tdmpc2_model
     from sgft_jax.learners.tdmpc2_model import TDMPC2Params
     from sgft_jax.policies import tdmpc2_policy
-    from sgft_jax.train.finetuner import FinetuneState, Parts, agents_own, assemble
+    from sgft_jax.train.finetuner import FinetuneState, Parts, assemble
     from sgft_jax.train.options import card_of, warmup
-    from sgft_jax.transforms import compose, stateless
-    from sgft_jax.types import Batch, SimulatedData
+    from sgft_jax.transforms import compose
 
-    card = card_of(prior)
+    card, fresh = card_of(prior), config.fresh or prior is None
     plan = {"horizon": config.horizon, "plan_samples": config.plan_samples}
-    own = {"size": "5M", **card.get("config", {}), **plan}
-    structure = tdmpc2_model.named_config(task.obs_dim, task.act_dim, size=own["size"], sgft=sgft, **plan)
-    fresh = fresh or prior is None
-    rise = warmup(config, config.lr_warmup) if isinstance(config, Config) and not fresh else 0
+    described = {"size": "5M", **card.get("config", {}), **plan, "sgft": config.sgft}
+    structure = tdmpc2_model.named_config(task.obs_dim, task.act_dim, size=described["size"], sgft=config.sgft, **plan)
     hyper = tdmpc2.TDMPC2Hyper(
-        config.lr, rise, tau=config.tau, gamma=card["gamma"],
+        config.lr,
+        0 if fresh else warmup(config, config.lr_warmup),
+        tau=config.tau,
+        gamma=card["gamma"],
         max_grad_norm=inf if config.max_grad_norm is None else config.max_grad_norm,
-    )  # fmt: skip
+    )
     learner = tdmpc2.make_tdmpc2(structure, hyper)
 
     def start(params: TDMPC2Params | None, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
@@ -96,12 +86,7 @@ def planner(
             return learner.init(key), None
         if fresh:
             return learner.init(key).replace(normalizer=params.normalizer), params
-        return tdmpc2.state_from_prior(structure, hyper, params), params if shaped else None
-
-    def act(
-        state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
-    ) -> tuple[Array, PyTree]:
-        return learner.act(state.learner, carry, obs, key, explore=explore)
+        return tdmpc2.state_from_prior(structure, hyper, params), params if config.shaped else None
 
     def drawn_value(state: FinetuneState, key: Key) -> Callable[[Array, Key], Array]:
         """V_sim as SGFT's released code has it: every value is a new draw of two heads and of an action."""
@@ -109,7 +94,27 @@ def planner(
         frozen = tdmpc2.state_from_prior(structure, hyper, state.frozen)
         return lambda obs, key: tdmpc2_model.value_sample(structure, frozen, obs, key)
 
-    @stateless
+    parts = Parts(
+        learner=learner,
+        start=start,
+        export=lambda state: tdmpc2.extract_params(state.learner),
+        policy=tdmpc2_policy(structure, hyper),
+        source=lambda state: sources.real_windows(config.batch_size, config.horizon),
+        transform=compose(_shape()) if config.shaped else compose(),
+        imagine=drawn_value if config.shaped else lambda state, key: None,
+        memory=sequences,
+        beginner=(lambda params, fresh: params) if fresh and prior is not None else None,
+        card={"algorithm": "tdmpc2", "config": described},
+    )
+    return assemble(parts, config, task)
+
+
+def _shape() -> Transform:
+    """Shaped rewards of windows, by draws of a value."""
+    import jax
+
+    from sgft_jax.transforms import stateless
+
     def shape(value: Callable[[Array, Key], Array], batch: Batch, key: Key) -> Batch:
         def reward(row: Batch, key: Key) -> Array:
             key_now, key_then = jax.random.split(key)
@@ -118,22 +123,7 @@ def planner(
         keys = jax.random.split(key, batch.reward.shape)
         return batch._replace(reward=jax.vmap(jax.vmap(reward))(batch, keys))
 
-    parts = Parts(
-        learner=learner,
-        start=start,
-        init_carry=learner.init_carry,
-        act=act,
-        export=lambda state: tdmpc2.extract_params(state.learner),
-        policy=tdmpc2_policy(structure, hyper),
-        source=lambda state: sources.real_windows(config.batch_size, config.horizon),
-        transform=compose(shape) if shaped else compose(),
-        imagine=drawn_value if shaped else lambda state, key: None,
-        memory=sequences,
-        reference=agents_own if not fresh or prior is None else lambda params, own: params,
-    )
-    initial = tdmpc2_policy(structure, hyper) if fresh and prior is not None else None
-    says = {"algorithm": "tdmpc2", "config": {**own, "sgft": sgft}}
-    return assemble(parts, config, task, initial_policy=initial, card=says)
+    return stateless(shape)
 
 
 METHOD = Method(

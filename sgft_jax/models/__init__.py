@@ -1,0 +1,5 @@
+"""Networks, what is built of them, and the statistics that they read by."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -60,9 +60,10 @@ class MLP(nn.Module):
         return nn.Dense(self.outputs, kernel_init=small)(x)
 
 
-def _mlp(
+def make_mlp(
     inputs: int, outputs: int, config: NetworkConfig, *, layer_norm: bool, output_gain: float | None = None
 ) -> Network:
+    """apply(params, *parts) -> [outputs]; the parts, joined, are [inputs]. layer_norm, output_gain: of `MLP`."""
     body = MLP(config.hidden, outputs, layer_norm, config.activation, output_gain)
 
     def init(key: Key) -> PyTree:
@@ -88,7 +89,7 @@ def _ensemble(member: Network, members: int) -> Network:
 
 def make_actor(obs_dim: int, act_dim: int, config: NetworkConfig) -> Network:
     """apply(params, obs [obs_dim]) -> [2, act_dim]: pre-tanh mean and clipped log standard deviation."""
-    body = _mlp(obs_dim, 2 * act_dim, config, layer_norm=config.actor_layer_norm)
+    body = make_mlp(obs_dim, 2 * act_dim, config, layer_norm=config.actor_layer_norm)
 
     def apply(params: PyTree, obs: Array) -> Array:
         mean, log_std = jnp.split(body.apply(params, obs), 2)
@@ -103,7 +104,7 @@ def make_affine_actor(obs_dim: int, act_dim: int, config: NetworkConfig, *, outp
     scale and offset are learnt numbers that begin at 1 and -1: a std of about 0.37. output_gain: of `MLP`.
     Source: the released code of H2O+ (Niu et al. 2023).
     """
-    body = _mlp(obs_dim, 2 * act_dim, config, layer_norm=config.actor_layer_norm, output_gain=output_gain)
+    body = make_mlp(obs_dim, 2 * act_dim, config, layer_norm=config.actor_layer_norm, output_gain=output_gain)
 
     def init(key: Key) -> PyTree:
         return {"body": body.init(key), "scale": jnp.float32(1.0), "offset": jnp.float32(-1.0)}
@@ -117,26 +118,22 @@ def make_affine_actor(obs_dim: int, act_dim: int, config: NetworkConfig, *, outp
 
 def make_deterministic_actor(obs_dim: int, act_dim: int, config: NetworkConfig) -> Network:
     """apply(params, obs [obs_dim]) -> [act_dim] in (-1, 1)."""
-    body = MLP(config.hidden, act_dim, config.actor_layer_norm, config.activation)
-
-    def apply(params: PyTree, obs: Array) -> Array:
-        return jnp.tanh(cast(Array, body.apply({"params": params}, obs)))
-
-    return Network(lambda key: body.init(key, jnp.zeros(obs_dim))["params"], apply)
+    body = make_mlp(obs_dim, act_dim, config, layer_norm=config.actor_layer_norm)
+    return Network(body.init, lambda params, obs: jnp.tanh(body.apply(params, obs)))
 
 
 def make_critic(
     obs_dim: int, act_dim: int, config: NetworkConfig, *, members: int = 2, output_gain: float | None = None
 ) -> Network:
     """apply(params, obs [obs_dim], action [act_dim]) -> [members] values. output_gain: of `MLP`."""
-    member = _mlp(obs_dim + act_dim, 1, config, layer_norm=config.layer_norm, output_gain=output_gain)
+    member = make_mlp(obs_dim + act_dim, 1, config, layer_norm=config.layer_norm, output_gain=output_gain)
     body = _ensemble(member, members)
     return Network(body.init, lambda params, obs, action: body.apply(params, obs, action)[:, 0])
 
 
 def make_value(obs_dim: int, config: NetworkConfig, *, output_gain: float | None = None) -> Network:
     """apply(params, obs [obs_dim]) -> []. output_gain: of `MLP`."""
-    body = _mlp(obs_dim, 1, config, layer_norm=config.layer_norm, output_gain=output_gain)
+    body = make_mlp(obs_dim, 1, config, layer_norm=config.layer_norm, output_gain=output_gain)
     return Network(body.init, lambda params, obs: body.apply(params, obs)[0])
 
 
@@ -145,7 +142,7 @@ def make_dynamics(obs_dim: int, act_dim: int, config: NetworkConfig, *, members:
 
     The number of members applied is the leading axis of `params`, so any slice of the ensemble is one too.
     """
-    return _ensemble(_mlp(obs_dim + act_dim, obs_dim, config, layer_norm=False), members)
+    return _ensemble(make_mlp(obs_dim + act_dim, obs_dim, config, layer_norm=False), members)
 
 
 def tanh_gaussian_sample(moments: Array, key: Key) -> tuple[Array, Array]:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from brax.training.acme import running_statistics
 
 from envs.types import Array
-from sgft_jax.types import Normalizer
+from sgft_jax.types import Batch, Normalizer
 
 __all__ = ["finish", "identity", "init", "normalize", "of", "update"]
 
@@ -51,3 +51,9 @@ def identity(obs_dim: int) -> Normalizer:
 def normalize(normalizer: Normalizer, obs: Array) -> Array:
     """From raw units [obs_dim] to [obs_dim] standard deviations from the mean. Not clipped: the tail is the task."""
     return (obs - normalizer.mean) / normalizer.std
+
+
+def normalize_rows(normalizer: Normalizer, batch: Batch) -> Batch:
+    """A batch [B, ...] whose observations are in units of `normalize`."""
+    rows = jax.vmap(normalize, (None, 0))
+    return batch._replace(obs=rows(normalizer, batch.obs), next_obs=rows(normalizer, batch.next_obs))

@@ -1,8 +1,8 @@
-"""The best policy by real evidence: what training rollouts say of the policies that have played them.
+"""The best policy by evidence: what episodes say of the policies that have played them.
 
-A rollout whose physics exploded, or that was broken off, has no return: what it earned until then may be more than a
+An episode whose physics exploded, or that was broken off, has no return: what it earned until then may be more than a
 whole one earns, as where rewards are costs. It counts as the worst that is known, its own part included. That is
-decided anew whenever windows are compared, because a worse whole rollout may come later.
+decided anew whenever policies are compared, because a worse whole episode may come later.
 """
 
 from typing import NamedTuple
@@ -13,26 +13,28 @@ import jax.numpy as jnp
 from envs.types import Array, PyTree
 from sgft_jax.types import Finetuner
 
-WINDOW = 5  # real rollouts whose mean is the evidence for a policy
+WINDOW = 5  # real rollouts whose mean is the evidence for a policy in fine-tuning
 
 
 class Best(NamedTuple):
-    """The best policy: that with the highest mean score, then mean return, of up to WINDOW training rollouts in a row.
+    """The best policies, one for each member: those with the highest mean score, then mean return, of N episodes.
 
-    The rollouts of a window come from policies that learned in between; it speaks for the one that played the last of
-    them. WINDOW rollouts outweigh fewer, whatever these scored; while there are fewer, all of them are the window.
+    N episodes outweigh fewer, whatever these scored. In pretraining they are those of an evaluation. In fine-tuning
+    they are the last training rollouts, of policies that learned in between; they speak for the one that played the
+    last of them, and while there are fewer than `WINDOW`, all of them do.
 
-    params: [M, ...] of that policy; those at the start before there is any evidence. rollouts: [M] int32, the real
-    rollouts it had learned from. kept: [M, WINDOW, 2] scores and returns of its window, -inf where one exploded, nan
-    where there were fewer. recent: the same of the last rollouts. worst: [M, 2] the lowest score and return known, inf
-    before any. count: [M] int32, how many rollouts of the agent it has seen.
+    params: [M, ...] of that policy; those at the start before there is any evidence. age: [M] int32, the real rollouts
+    it had learned from, or the rounds of pretraining. kept: [M, N, 2] scores and returns of its episodes, -inf where
+    one exploded, nan where there were fewer. worst: [M, 2] the lowest score and return known, inf before any. recent:
+    [M, N, 2], as `kept`, the last rollouts. count: [M] int32, how many rollouts it has seen. Pretraining leaves the
+    last two as they are.
     """
 
     params: PyTree
-    rollouts: Array
+    age: Array
     kept: Array
-    recent: Array
     worst: Array
+    recent: Array
     count: Array
 
     @property
@@ -46,25 +48,24 @@ class Best(NamedTuple):
         return means(self.kept, self.worst)[..., 1]
 
 
-def nothing_known(params: PyTree, members: int) -> Best:
-    """Before the first rollout. params: [M, ...] of the policy at the start."""
-    window = jnp.full((members, WINDOW, 2), jnp.nan, jnp.float32)
+def nothing_known(params: PyTree, members: int, episodes: int = WINDOW) -> Best:
+    """Before the first episode. params: [M, ...] of the policy at the start. episodes: N of `Best`."""
+    window = jnp.full((members, episodes, 2), jnp.nan, jnp.float32)
     none = jnp.zeros(members, jnp.int32)
-    return Best(params, none, window, jnp.copy(window), jnp.full((members, 2), jnp.inf, jnp.float32), jnp.copy(none))
+    return Best(params, none, window, jnp.full((members, 2), jnp.inf, jnp.float32), jnp.copy(window), jnp.copy(none))
 
 
 def means(window: Array, worst: Array) -> Array:
-    """[M, 2] mean score and return of windows [M, WINDOW, 2], see `Best`; -inf where one is empty."""
+    """[M, 2] mean score and return of windows [M, N, 2], see `Best`; -inf where one is empty."""
     rows = ~jnp.isnan(window)
     mean = jnp.mean(jnp.where(jnp.isneginf(window), worst[..., None, :], window), axis=-2, where=rows)
     return jnp.where(rows.any(-2), mean, -jnp.inf)
 
 
 def witnessed(best: Best, score: Array, total: Array) -> Best:
-    """`best` when a rollout with this score and return [M], as far as it came, is known, whoever played it."""
-    return best._replace(
-        worst=jnp.minimum(best.worst, jnp.stack([jnp.where(jnp.isneginf(score), total, score), total], 1))
-    )
+    """`best` when episodes with these scores and returns [M, ...], as far as they came, are known, whoever played."""
+    known = jnp.stack([jnp.where(jnp.isneginf(score), total, score), total], -1)
+    return best._replace(worst=jnp.minimum(best.worst, known.min(tuple(range(1, known.ndim - 1)))))
 
 
 def as_known(best: Best, score: Array, total: Array, exploded: Array) -> tuple[Array, Array]:
@@ -72,12 +73,24 @@ def as_known(best: Best, score: Array, total: Array, exploded: Array) -> tuple[A
     return jnp.where(exploded, best.worst[:, 0], score), jnp.where(exploded, best.worst[:, 1], total)
 
 
+def evaluated(
+    best: Best, params: PyTree, score: Array, total: Array, exploded: Array, age: Array, since: Array | float = 0
+) -> Best:
+    """`best` after an evaluation of `params` [M, ...]: N episodes, their scores, returns, whether they exploded [M, N].
+
+    age: [M], see `Best`. since: [] the age from which on policies compete: a younger one always gives way.
+    """
+    best = witnessed(best, score, total)
+    window = jnp.where(exploded[..., None], -jnp.inf, jnp.stack([score, total], -1))
+    return _keep(best, params, window, age, _better(window, best) | (best.age < since))
+
+
 def judged(
-    finetuner: Finetuner, best: Best, agent: PyTree, score: Array, total: Array, exploded: Array, learned: Array
+    finetuner: Finetuner, best: Best, agent: PyTree, score: Array, total: Array, exploded: Array, age: Array
 ) -> Best:
     """`best` after one more rollout by `agent` [M], with its score, return and whether it exploded [M].
 
-    agent: None where nobody knows who played it. learned: [] the rollouts that it had learned from.
+    agent: None where nobody knows who played it. age: [] the rollouts that it had learned from.
     """
     best = witnessed(best, score, total)
     row = jnp.where(exploded[:, None], -jnp.inf, jnp.stack([score, total], axis=1))
@@ -85,22 +98,27 @@ def judged(
     best = best._replace(recent=recent, count=best.count + 1)
     if agent is None:
         return best
-    better = _better(recent, best.kept, best.worst)
-    keep = lambda new, old: jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)  # noqa: E731
-    return best._replace(
-        params=jax.tree.map(keep, jax.vmap(finetuner.export)(agent), best.params),
-        rollouts=keep(jnp.broadcast_to(learned, better.shape), best.rollouts),
-        kept=keep(recent, best.kept),
-    )
+    return _keep(best, jax.vmap(finetuner.export)(agent), recent, age, _better(recent, best))
 
 
-def _better(new: Array, old: Array, worst: Array) -> Array:
-    """[M] whether windows [M, WINDOW, 2] are better evidence than older ones: by score, explosions, return, length."""
+def _keep(best: Best, params: PyTree, window: Array, age: Array, better: Array) -> Best:
+    """`best`, but for the members [M] that are `better` the policy of this evidence."""
+
+    def keep(new: Array, old: Array) -> Array:
+        return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+    now = {"params": params, "age": jnp.broadcast_to(age, better.shape), "kept": window}
+    return best._replace(**{name: jax.tree.map(keep, x, getattr(best, name)) for name, x in now.items()})
+
+
+def _better(new: Array, best: Best) -> Array:
+    """[M] whether windows [M, N, 2] are better evidence than the best: by score, explosions, return, length."""
+    old, full = best.kept, new.shape[1]
     count_new, count_old = (jnp.sum(~jnp.isnan(x[..., 0]), axis=-1) for x in (new, old))
     verdict = count_new > count_old  # of equals the one that says more
-    for new_mean, old_mean in reversed([*zip(_ranked(new, worst), _ranked(old, worst), strict=True)]):
+    for new_mean, old_mean in reversed([*zip(_ranked(new, best.worst), _ranked(old, best.worst), strict=True)]):
         verdict = (new_mean > old_mean) | ((new_mean == old_mean) & verdict)
-    return verdict | ((count_new == WINDOW) & (count_old < WINDOW))
+    return verdict | ((count_new == full) & (count_old < full))
 
 
 def _ranked(window: Array, worst: Array) -> tuple[Array, Array, Array]:

@@ -5,7 +5,7 @@
 """
 
 from collections.abc import Callable, Mapping
-from types import ModuleType
+from types import MappingProxyType, ModuleType
 from typing import Any, NamedTuple
 
 import jax
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 
 from envs.types import Array, Key, Policy, PyTree, Transition, UserError
 from sgft_jax.data import replay, sources
-from sgft_jax.identify import Identified, Interface, interface
+from sgft_jax.identify import Identified, Interface, command_interface
 from sgft_jax.learners import sac
 from sgft_jax.math import optim
 from sgft_jax.models import dynamics, value
@@ -22,7 +22,7 @@ from sgft_jax.models.networks import fix_first_layer, make_dynamics, make_value
 from sgft_jax.policies import network_of, sac_policy
 from sgft_jax.train import options as rules
 from sgft_jax.train.guard import guarded
-from sgft_jax.train.options import KeptCriticOptions, LoopOptions, ModelOptions, SACOptions
+from sgft_jax.train.options import ActorOptions, LoopOptions, MixedOptions
 from sgft_jax.transforms import compose, steps_to_go
 from sgft_jax.types import (
     Batch,
@@ -60,6 +60,9 @@ class FinetuneState(NamedTuple):
     interface: Identified | None = None
 
 
+Update = Callable[[FinetuneState, Key], tuple[FinetuneState, Metrics]]
+
+
 class Models(NamedTuple):
     """A part that fits dynamics models: start(params) -> fit; update(fit, normalizer, batch, key) -> (fit, metrics)."""
 
@@ -67,71 +70,60 @@ class Models(NamedTuple):
     update: Callable[[PyTree, Normalizer, Batch, Key], tuple[PyTree, Metrics]]
 
 
-def agents_own(params: PyTree, own: PyTree) -> PyTree:
-    """The policy of a fresh agent: what it exports itself."""
-    del params
-    return own
-
-
-def simulators_actor(params: sac.SACParams, own: sac.SACParams) -> sac.SACParams:
-    """The simulator's policy in the form that an agent with new networks exports."""
-    return own._replace(actor=params.actor)
-
-
 class Parts(NamedTuple):
     """What a method chooses.
 
     learner: its `update` takes the transformed batch.
     start(params, key, simulated) -> (learner's state, frozen part of the prior).
-    init_carry, act: as in `Finetuner`, where act takes the `FinetuneState`.
     export(state) -> params; policy: how they act.
-    source(state) -> where a batch comes from; offline: the same before the first real rollout.
+    act: as in `Finetuner`, of a `FinetuneState`; None = the learner's.
+    source(state) -> where a batch comes from, None = rows of the replay; offline: the same before the first real
+        rollout.
     transform: of every batch. imagine(state, key) -> what the transform may ask, None if it asks nothing.
     models: the dynamics ensemble if it trains. memory: the module that keeps real rows, replay or sequences.
     interface: identifies what the real system makes of commands, or None. The learner then acts and learns in the
         simulator's actions, and the replay keeps the commands.
     observed(state) -> state, once the rows of a rollout are kept.
-    reference(params of a prior, what the fresh agent exports) -> params of the policy that a guard holds on to at
-        first: the agent's own unless the simulator's policy is another one.
+    beginner(params of a prior, what the fresh agent exports) -> params of the simulator's policy as `policy` takes
+        them, where that makes the initial rollouts and is what a guard holds on to at first; None = the fresh agent.
+    simulation, card: see `Finetuner`.
     """
 
     learner: Learner
     start: Callable[[PyTree, Key, SimulatedData | None], tuple[PyTree, PyTree]]
-    init_carry: Callable[[], PyTree]
-    act: Callable[..., tuple[Array, PyTree]]
     export: Callable[[FinetuneState], PyTree]
     policy: Policy
-    source: Callable[[FinetuneState], Source]
-    transform: Transform
+    act: Callable[..., tuple[Array, PyTree]] | None = None
+    source: Callable[[FinetuneState], Source] | None = None
+    offline: Source | None = None
+    transform: Transform = compose()
     imagine: Callable[[FinetuneState, Key], Any] = lambda state, key: None
     models: Models | None = None
-    offline: Source | None = None
     memory: ModuleType = replay
     interface: Interface | None = None
     observed: Callable[[FinetuneState], FinetuneState] = lambda state: state
-    reference: Callable[[PyTree, PyTree], PyTree] = agents_own
+    beginner: Callable[[PyTree, PyTree], PyTree] | None = None
+    simulation: Simulation | None = None
+    card: Mapping[str, Any] = MappingProxyType({})
 
 
-def assemble(
-    parts: Parts,
-    options: LoopOptions,
-    task: Task,
-    *,
-    initial_policy: Policy | None = None,
-    simulation: Simulation | None = None,
-    card: Mapping[str, Any] | None = None,
-) -> Finetuner:
-    """The finetuner of these parts; initial_policy, simulation, card: see `Finetuner`."""
+def assemble(parts: Parts, options: LoopOptions, task: Task) -> Finetuner:
+    """The finetuner of these parts."""
+
+    def source_of(state: FinetuneState, offline: bool) -> Source:
+        if offline and parts.offline:
+            return parts.offline
+        return parts.source(state) if parts.source else sources.real_rows(options.batch_size)
 
     def init(params: PyTree, key: Key, simulated: SimulatedData | None = None) -> FinetuneState:
         key_learner, key_transform = jax.random.split(key)
         learner, frozen = parts.start(params, key_learner, simulated)
         models = None if parts.models is None else parts.models.start(params)
         empty = parts.memory.init(replay.blank(task.obs_dim, task.act_dim), options.replay_capacity)
-        known = None
+        interface = None
         if parts.interface is not None and simulated is not None:
-            known = parts.interface.start(params, simulated)
-        state = FinetuneState(learner, models, frozen, parts.transform.init(params, key_transform), empty, known)
+            interface = parts.interface.start(params, simulated)
+        state = FinetuneState(learner, models, frozen, parts.transform.init(params, key_transform), empty, interface)
         # The caller may donate the state. The prior must survive that, and no two leaves may share a buffer.
         return jax.tree.map(jnp.copy, state)
 
@@ -146,66 +138,40 @@ def assemble(
     def act(
         state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
     ) -> tuple[Array, PyTree]:
-        if state.interface is None:
-            return parts.act(state, carry, obs, key, explore=explore)
-        obs = state.interface.distortion.seen(obs)
-        action, carry = parts.act(state, carry, obs, key, explore=explore)
-        return state.interface.distortion.command(action), carry
+        interface = state.interface
+        obs = obs if interface is None else interface.distortion.seen(obs)
+        if parts.act is None:
+            action, carry = parts.learner.act(state.learner, carry, obs, key, explore=explore)
+        else:
+            action, carry = parts.act(state, carry, obs, key, explore=explore)
+        return action if interface is None else interface.distortion.command(action), carry
 
     def export(state: FinetuneState) -> PyTree:
         params = parts.export(state)
         return params if state.interface is None else params._replace(distortion=state.interface.distortion)
 
-    def update(
-        state: FinetuneState, key: Key, simulated: SimulatedData | None, offline: bool
-    ) -> tuple[FinetuneState, Metrics]:
-        keys = jax.random.split(key, 6)
-        source = parts.offline if offline and parts.offline else parts.source(state)
-        rows = source.sample((state.replay, simulated), keys[0])
-        if parts.interface is not None and state.interface is not None:
-            rows = parts.interface.meant(state.interface, rows)
-        metrics: Metrics = {}
-        if parts.models is not None and source.n_real:
-            real = jax.tree.map(lambda x: x[: source.n_real], rows)
-            fit, metrics = parts.models.update(state.models, state.frozen.normalizer, real, keys[1])
-            state = state._replace(models=fit)
-        own, more = parts.transform.update(state.transform, rows, keys[2])
-        metrics |= more
-        batch = parts.transform.apply(own, parts.imagine(state, keys[3]), rows, keys[4])
-        learner, more = parts.learner.update(state.learner, batch, keys[5])
-        where = True if batch.valid is None else batch.valid
-        metrics |= more | {
-            "batch/reward_mean": jnp.mean(batch.reward, where=where),
-            "batch/reward_std": jnp.std(batch.reward, where=where),
-        }
-        return state._replace(learner=learner, transform=own), metrics
-
     def learn(
-        state: FinetuneState, key: Key, updates: int, simulated: SimulatedData | None = None, *, offline: bool = False,
+        state: FinetuneState,
+        key: Key,
+        updates: int,
+        simulated: SimulatedData | None = None,
+        *,
+        offline: bool = False,
         limit: Array | None = None,
-    ) -> tuple[FinetuneState, Metrics]:  # fmt: skip
-        if simulation is not None and simulated is None:
+    ) -> tuple[FinetuneState, Metrics]:
+        if parts.simulation is not None and simulated is None:
             raise UserError("this method learns from transitions of the simulator too: give it some (`SimulatedData`)")
-        one = lambda state, key: update(state, key, simulated, offline)  # noqa: E731
-        source, keys = (
-            parts.offline if offline and parts.offline else parts.source(state),
-            jax.random.split(key, updates),
-        )
+
+        def one(state: FinetuneState, key: Key) -> tuple[FinetuneState, Metrics]:
+            return _update(parts, source_of(state, offline), state, key, simulated)
+
         # An empty replay is sampled as zeros, which nobody has lived through.
-        some = state.replay.size > 0 if source.n_real else jnp.ones((), bool)
-        made = jnp.where(some, updates if limit is None else limit, 0)
-        if limit is None:
-            learned, metrics = jax.lax.scan(one, state, keys)
-            learned = jax.tree.map(lambda new, old: jnp.where(some, new, old), _changing(learned), _changing(state))
-            metrics = jax.tree.map(jnp.mean, metrics)
-        else:
-            learned, metrics = _up_to(one, state, keys, made)
-        metrics = {name: jnp.where(made > 0, x, jnp.nan) for name, x in metrics.items()}
-        return state._replace(**learned), metrics | {"updates": made.astype(jnp.float32)}
+        some = state.replay.size > 0 if source_of(state, offline).n_real else jnp.ones((), bool)
+        return _learn(one, state, jax.random.split(key, updates), some, limit)
 
     finetuner = Finetuner(
         init=init,
-        init_carry=parts.init_carry,
+        init_carry=parts.policy.init_carry,
         act=act,
         observe=observe,
         learn=learn,
@@ -213,11 +179,53 @@ def assemble(
         policy=parts.policy,
         updates_per_rollout=rules.updates_per_rollout(options, task),
         initial_rollouts=options.initial_rollouts,
-        initial_policy=initial_policy,
-        simulation=simulation,
-        card=card or {},
+        initial_policy=parts.policy if parts.beginner else None,
+        simulation=parts.simulation,
+        card=parts.card,
     )
-    return guarded(finetuner, parts.reference, score=task.score) if options.guard else finetuner
+    if not options.guard:
+        return finetuner
+    return guarded(finetuner, parts.beginner or (lambda params, fresh: fresh), score=task.score)
+
+
+def _update(
+    parts: Parts, source: Source, state: FinetuneState, key: Key, simulated: SimulatedData | None
+) -> tuple[FinetuneState, Metrics]:
+    """One batch: models learn from its real rows, transforms and the learner from all."""
+    keys = jax.random.split(key, 6)
+    rows = source.sample((state.replay, simulated), keys[0])
+    if parts.interface is not None and state.interface is not None:
+        rows = parts.interface.meant(state.interface, rows)
+    metrics: Metrics = {}
+    if parts.models is not None and source.n_real:
+        real = jax.tree.map(lambda x: x[: source.n_real], rows)
+        fit, metrics = parts.models.update(state.models, state.frozen.normalizer, real, keys[1])
+        state = state._replace(models=fit)
+    transform, more = parts.transform.update(state.transform, rows, keys[2])
+    metrics |= more
+    batch = parts.transform.apply(transform, parts.imagine(state, keys[3]), rows, keys[4])
+    learner, more = parts.learner.update(state.learner, batch, keys[5])
+    where = True if batch.valid is None else batch.valid
+    metrics |= more | {
+        "batch/reward_mean": jnp.mean(batch.reward, where=where),
+        "batch/reward_std": jnp.std(batch.reward, where=where),
+    }
+    return state._replace(learner=learner, transform=transform), metrics
+
+
+def _learn(
+    update: Update, state: FinetuneState, keys: Key, some: Array, limit: Array | None
+) -> tuple[FinetuneState, Metrics]:
+    """An update with each of the keys, the first `limit` [] of them if given, or none unless `some` []."""
+    made = jnp.where(some, keys.shape[0] if limit is None else limit, 0)
+    if limit is None:
+        learned, metrics = jax.lax.scan(update, state, keys)
+        changed = jax.tree.map(lambda new, old: jnp.where(some, new, old), _changing(learned), _changing(state))
+        metrics = jax.tree.map(jnp.mean, metrics)
+    else:
+        changed, metrics = _up_to(update, state, keys, made)
+    metrics = {name: jnp.where(made > 0, x, jnp.nan) for name, x in metrics.items()}
+    return state._replace(**changed), metrics | {"updates": made.astype(jnp.float32)}
 
 
 def _changing(state: FinetuneState) -> dict[str, PyTree]:
@@ -225,9 +233,7 @@ def _changing(state: FinetuneState) -> dict[str, PyTree]:
     return {name: getattr(state, name) for name in ("learner", "models", "transform")}
 
 
-def _up_to(
-    update: Callable[[FinetuneState, Key], tuple[FinetuneState, Metrics]], state: FinetuneState, keys: Key, made: Array
-) -> tuple[dict[str, PyTree], Metrics]:
+def _up_to(update: Update, state: FinetuneState, keys: Key, made: Array) -> tuple[dict[str, PyTree], Metrics]:
     """What so many updates `made` [] with the first of the keys change, and their mean metrics."""
 
     def one(i: Array, carry: tuple[dict[str, PyTree], Metrics]) -> tuple[dict[str, PyTree], Metrics]:
@@ -241,71 +247,54 @@ def _up_to(
     return changed, {name: total / jnp.maximum(made, 1) for name, total in sums.items()}
 
 
+def unlearned(
+    policy: Policy,
+    start: Callable[[PyTree, Key, SimulatedData | None], tuple[PyTree, PyTree]],
+    export: Callable[[FinetuneState], PyTree],
+) -> Parts:
+    """Parts of a method whose policy never learns: it acts as what is exported, whatever else adapts."""
+
+    def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
+        return state, {}
+
+    def act(
+        state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
+    ) -> tuple[Array, PyTree]:
+        return policy.act(export(state), carry, obs, key, explore=explore)
+
+    return Parts(Learner(lambda key: (), policy.init_carry, act, update), start, export, policy, act)
+
+
 # --- SAC --------------------------------------------------------------------------------------------------------------
 
 
 def sac_finetuner(
-    options: SACOptions,
+    options: ActorOptions,
     prior: Prior | None,
     task: Task,
     *,
     transforms: tuple[Transform, ...] = (),
     horizon_dim: int = 0,
-    fresh: bool = False,
-    reset_critic: bool = False,
     value_baseline: bool = False,
     source: Callable[[FinetuneState], Source] | None = None,
     simulation: Simulation | None = None,
-    **structure: Any,
 ) -> Finetuner:
-    """Fine-tuning whose learner is SAC.
+    """Fine-tuning whose learner is SAC, in networks and with numbers that the options tell.
 
     transforms: of every batch. horizon_dim: entries of the context that tell steps to go (`shorten`), 0 = none.
-    fresh: start from new networks; the simulator's policy makes the initial rollouts alone. reset_critic: start from
-    the simulator's actor and a new critic. value_baseline: a kept critic under shaped rewards is read as Q(s, a) -
-    V_sim(s), its exact meaning in simulation. source: of batches, default real rows alone.
-    structure: more fields of `SACConfig`, and numbers of `SACHyper`.
+    value_baseline: a kept critic under shaped rewards is read as Q(s, a) - V_sim(s), its exact meaning in simulation.
+    source: of batches, default real rows alone.
     """
     card = rules.card_of(prior)
-    network, gamma, fresh = network_of(card), card["gamma"], fresh or prior is None
-    new_critic = reset_critic or fresh
-    rows = source or (lambda state: sources.real_rows(options.batch_size))
-    numbers = {name: structure.pop(name) for name in ("entropy_per_dim",) if name in structure}
-    keeps = options if isinstance(options, KeptCriticOptions) and prior is not None else None
-    if keeps and keeps.identify:
+    network, fresh = network_of(card), options.fresh or prior is None
+    identifies = options.identify and prior is not None
+    if identifies:
         simulation = simulation or _SIMULATION
-    structure = {"tune_alpha": False} | structure
-    config = sac.SACConfig(
-        task.obs_dim,
-        task.act_dim,
-        context_dim=horizon_dim if horizon_dim > 1 else 0,
-        network=network,
-        train_value=False,
-        train_dynamics=False,
-        critic_baseline=value_baseline and not new_critic,
-        anchored=bool(keeps and keeps.anchor),
-        policy_delay=rules.policy_delay(options),
-        max_grad_norm=options.max_grad_norm,
-        **structure,
-    )
-    rise = 0  # a new critic has nothing to lose
-    if isinstance(options, KeptCriticOptions) and not new_critic:
-        rise = rules.warmup(options, options.lr_warmup)
-    hyper = sac.SACHyper(
-        lr_actor=options.lr_actor,
-        lr_critic=options.lr_critic,
-        lr_alpha=options.lr_actor,
-        tau=options.tau,
-        alpha=options.alpha,
-        actor_start=rules.critic_warmup(options, task),
-        actor_ramp=options.actor_ramp,
-        lr_warmup=rise,
-        anchor=keeps.anchor if keeps else 0.0,
-        **numbers,
-    )
+    kept = not (fresh or options.reset_critic)  # the critic
+    config = _sac_config(options, network, task, horizon_dim, baseline=value_baseline and kept, prior=prior is not None)
+    hyper = _sac_hyper(options, task, anchored=config.anchored, kept=kept)
     learner = sac.make_sac(config, hyper)
-    trains = isinstance(options, ModelOptions) and options.train_dynamics
-    models = dynamics_models(options, network, task) if trains else None
+    models = dynamics_models(options, network, task) if options.train_dynamics else None
     whole = steps_to_go(jnp.int32(horizon_dim), horizon_dim) if config.context_dim else None
 
     def start(params: sac.SACParams | None, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
@@ -313,11 +302,11 @@ def sac_finetuner(
         if params is None:
             state = learner.init(key)
             return state, sac.SACParams(None, None, None, None, state.normalizer)
-        kept = None if models else params.dynamics  # else they are in training
-        frozen = sac.SACParams(None, None, params.value, kept, params.normalizer)
+        simulated_models = None if models else params.dynamics  # else they are in training
+        frozen = sac.SACParams(None, None, params.value, simulated_models, params.normalizer)
         if fresh:
             return learner.init(key).replace(normalizer=params.normalizer), frozen
-        return sac.state_from_prior(config, hyper, params, key, reset_critic=reset_critic), frozen
+        return sac.state_from_prior(config, hyper, params, key, reset_critic=options.reset_critic), frozen
 
     def act(
         state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
@@ -329,27 +318,83 @@ def sac_finetuner(
         twin = jax.tree.map(lambda x: x[:2], state.learner.critic.params)
         if whole is not None:
             actor, twin = (fix_first_layer(x, task.obs_dim, whole) for x in (actor, twin))
-        ensemble = state.frozen.dynamics if state.models is None else state.models.params
-        return state.frozen._replace(actor=actor, critic=twin, dynamics=ensemble)
+        return state.frozen._replace(actor=actor, critic=twin, dynamics=_ensemble(state))
 
-    simulators = prior is not None and fresh
-    own_policy = sac_policy(task.obs_dim, task.act_dim, network)
     parts = Parts(
         learner=learner,
         start=start,
-        init_carry=learner.init_carry,
-        act=act,
         export=export,
-        policy=own_policy,
-        source=rows,
+        policy=sac_policy(task.obs_dim, task.act_dim, network),
+        act=act,
+        source=source,
         offline=sources.simulated_rows(options.batch_size) if simulation else None,
         transform=compose(*transforms),
-        imagine=_imagine(learner, network, gamma, task) if transforms else lambda state, key: None,
+        imagine=_imagine(learner, network, card["gamma"], task) if transforms else lambda state, key: None,
         models=models,
-        interface=command_interface(network, task) if keeps and keeps.identify else None,
-        reference=simulators_actor if simulators else agents_own,
+        interface=command_interface(network, task) if identifies else None,
+        beginner=simulator_actor if fresh and prior is not None else None,
+        simulation=simulation,
     )
-    return assemble(parts, options, task, initial_policy=own_policy if simulators else None, simulation=simulation)
+    return assemble(parts, options, task)
+
+
+def simulator_actor(params: sac.SACParams, fresh: sac.SACParams) -> sac.SACParams:
+    """The simulator's policy in the form that an agent with new networks exports."""
+    return fresh._replace(actor=params.actor)
+
+
+def mixed_rows(options: MixedOptions, prior: Prior | None) -> tuple[Source, Simulation | None]:
+    """Batches of which the options' share is simulated, and what they are drawn from; all real without a prior."""
+    n_sim = round(options.simulated_share * options.batch_size) if prior is not None else 0
+    simulation = Simulation(options.simulated_transitions, options.simulated_ladder) if n_sim else None
+    return sources.mixture(options.batch_size - n_sim, n_sim), simulation
+
+
+def _sac_config(
+    options: ActorOptions, network: NetworkConfig, task: Task, horizon_dim: int, *, baseline: bool, prior: bool
+) -> sac.SACConfig:
+    """The structure of an agent; prior: whether there is one."""
+    return sac.SACConfig(
+        task.obs_dim,
+        task.act_dim,
+        context_dim=horizon_dim if horizon_dim > 1 else 0,
+        network=network,
+        critic_network=options.critic_network,
+        tune_alpha=options.tune_alpha,
+        train_value=False,
+        train_dynamics=False,
+        train_critic=options.train_critic,
+        critics=options.critics,
+        target_critics=options.target_critics,
+        actor_mean=options.actor_mean,
+        critic_baseline=baseline,
+        actor_batch=options.actor_batch,
+        weighted_actor=options.weighted_actor,
+        anchored=options.anchor > 0 and prior,
+        policy_delay=rules.policy_delay(options),
+        max_grad_norm=options.max_grad_norm,
+    )
+
+
+def _sac_hyper(options: ActorOptions, task: Task, *, anchored: bool, kept: bool) -> sac.SACHyper:
+    """The numbers of an agent. kept: whether its critic is the simulator's; a new one has nothing to lose."""
+    return sac.SACHyper(
+        lr_actor=options.lr_actor,
+        lr_critic=options.lr_critic,
+        lr_alpha=options.lr_actor,
+        tau=options.tau,
+        alpha=options.alpha,
+        entropy_per_dim=options.entropy_per_dim,
+        actor_start=rules.critic_warmup(options, task),
+        actor_ramp=options.actor_ramp,
+        lr_warmup=rules.warmup(options, options.lr_warmup) if kept else 0,
+        anchor=options.anchor if anchored else 0.0,
+    )
+
+
+def _ensemble(state: FinetuneState) -> PyTree:
+    """The dynamics models as they are now, in training or the prior's."""
+    return state.frozen.dynamics if state.models is None else state.models.params
 
 
 def dynamics_models(options: Any, network: NetworkConfig, task: Task) -> Models:
@@ -368,19 +413,6 @@ def dynamics_models(options: Any, network: NetworkConfig, task: Task) -> Models:
     return Models(lambda params: optim.start(optimiser, params.dynamics), update)
 
 
-def command_interface(network: NetworkConfig, task: Task) -> Interface:
-    """Identification through one model of the prior's ensemble, as the simulator left it."""
-    model = make_dynamics(task.obs_dim, task.act_dim, network)
-
-    def change(kept: tuple[PyTree, Normalizer], obs: Array, action: Array) -> Array:
-        member, statistics = kept
-        after = dynamics.predict(model, member, statistics, obs, action)[0]
-        return (after - obs)[: task.measured_dim]
-
-    first = lambda params: jax.tree.map(lambda x: x[:1], params.dynamics)  # noqa: E731
-    return interface(change, lambda params: (first(params), params.normalizer), task)
-
-
 def _imagine(
     learner: Learner, network: NetworkConfig, gamma: float, task: Task
 ) -> Callable[[FinetuneState, Key], Imagination]:
@@ -394,7 +426,7 @@ def _imagine(
         frozen = state.frozen
         # One member for the whole batch, redrawn at each update: the same expected gradient as one per row, at a
         # fraction of the cost, and no rollout mixes two models.
-        member = dynamics.draw_member(frozen.dynamics if state.models is None else state.models.params, key)
+        member = dynamics.draw_member(_ensemble(state), key)
         return Imagination(
             value=lambda obs: value.predict(value_net, frozen.value, frozen.normalizer, obs),
             policy=lambda obs, context, key: policy(state, obs, context, key),

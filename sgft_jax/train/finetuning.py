@@ -16,6 +16,7 @@ from envs.mesh import split_vmap
 from envs.rollout import Episode, play_episode
 from envs.types import Array, Key, Policy, PyTree, Transition, UserError
 from sgft_jax.data import replay
+from sgft_jax.keys import Finetuning
 from sgft_jax.systems import System
 from sgft_jax.train import evidence
 from sgft_jax.train.evidence import Best
@@ -24,7 +25,6 @@ from sgft_jax.types import Finetuner, Metrics, SimulatedData, Simulation
 
 __all__ = ["FinetuneProgress", "evaluate", "finetune", "simulate"]
 
-_INIT, _COLLECT, _LEARN, _EVALUATE, _OFFLINE = range(5)  # purposes, folded into a seed's key
 Phase = Literal["offline", "logged", "online"]  # of learning, see `Updates`
 OFFLINE_PART = 5_000  # updates of the offline phase between two yields
 _AT_ONCE = 1024  # simulated episodes played together
@@ -167,7 +167,7 @@ def evaluate(policy: Any, system: System, states: PyTree, seeds: Array, episodes
 
     policy, states: see `System.play`; for a `Finetuner` the states are `FinetuneProgress.agent`.
     """
-    return system.play(policy, states, _episode_keys(seeds, _EVALUATE, 0, episodes), explore=False)
+    return system.play(policy, states, _episode_keys(seeds, Finetuning.EVALUATE, 0, episodes), explore=False)
 
 
 def begin(
@@ -177,7 +177,7 @@ def begin(
     which = prior_of(priors, seeds)
 
     def one(params: PyTree, seed: Array, which: Array, rows: SimulatedRows | None) -> PyTree:
-        return finetuner.init(params, _key(seed, _INIT, 0), None if rows is None else rows.of(which))
+        return finetuner.init(params, _key(seed, Finetuning.INIT, 0), None if rows is None else rows.of(which))
 
     agent = split_vmap(one, (0, 0, 0, None))(priors_of_members(priors, seeds), seeds, which, simulated)
     m = seeds.shape[0]
@@ -203,7 +203,7 @@ class Updates:
         updates: or [parts, M], of each part and member, up to `updates_per_rollout`. phase: "offline", on simulated
         transitions alone; "logged", before the first rollout; "online", after one.
         """
-        purpose, learned = _LEARN if phase == "online" else _OFFLINE, []
+        purpose, learned = Finetuning.LEARN if phase == "online" else Finetuning.OFFLINE, []
         most, limits = (updates, None) if isinstance(updates, int) else (self.finetuner.updates_per_rollout, updates)
         for i, part in enumerate(parts):  # equal parts, so that one compiled program serves any number
             keys = jax.vmap(lambda seed, part=part: _key(seed, purpose, part))(self.seeds)
@@ -304,7 +304,7 @@ class _Steps:
         who, states = (
             (self.finetuner, agent) if initial is None else (initial, priors_of_members(self.priors, self.seeds))
         )
-        keys = [_episode_keys(self.seeds, _COLLECT, rollout, 1) for rollout in range(done, done + n)]
+        keys = [_episode_keys(self.seeds, Finetuning.COLLECT, rollout, 1) for rollout in range(done, done + n)]
         return [self.system.play(who, states, key, explore=True) for key in keys]
 
     def _updates(self, played: Sequence[Episode]) -> int | Array:

@@ -103,10 +103,9 @@ def scored(guard: Guard, score: Array, partial: Array | float = jnp.inf) -> Guar
     """
     exploded, mine = jnp.isneginf(score), guard.deployed.astype(jnp.float32)
     known = jnp.where(exploded, 0.0, score)
-    add = lambda evidence, mine: Evidence(evidence.total + mine * known, evidence.weight + mine)  # noqa: E731
     guard = guard._replace(
-        reference=add(guard.reference, 1 - mine),
-        challenger=add(guard.challenger, mine),
+        reference=_added(guard.reference, known, 1 - mine),
+        challenger=_added(guard.challenger, known, mine),
         worst=jnp.minimum(guard.worst, jnp.where(exploded, partial, score)),
         best=jnp.maximum(guard.best, score),
         exploded=tuple(x + share * exploded for x, share in zip(guard.exploded, (1 - mine, mine), strict=True)),
@@ -119,6 +118,10 @@ def scored(guard: Guard, score: Array, partial: Array | float = jnp.inf) -> Guar
         replaced=replaced,
         exploded=(jnp.where(replaced, theirs, ours), theirs),
     )
+
+
+def _added(evidence: Evidence, score: Array, weight: Array) -> Evidence:
+    return Evidence(evidence.total + weight * score, evidence.weight + weight)
 
 
 def learned(guard: Guard) -> Guard:
@@ -136,7 +139,7 @@ def evidence(guard: Guard) -> tuple[Evidence, Evidence]:
     """That for the reference and the challenger, rollouts that exploded at the worst score known, 0 before any is."""
     worst = jnp.where(jnp.isfinite(guard.worst), guard.worst, 0.0)
     policies = zip((guard.reference, guard.challenger), guard.exploded, strict=True)
-    reference, challenger = (Evidence(own.total + lost * worst, own.weight) for own, lost in policies)
+    reference, challenger = (Evidence(known.total + lost * worst, known.weight) for known, lost in policies)
     return reference, challenger
 
 
@@ -189,9 +192,14 @@ def guarded(inner: Finetuner, first: Callable[[PyTree, PyTree], PyTree], *, scor
         return Guarded(inner.observe(state.agent, rows, valid, score), reference, guard)
 
     def learn(
-        state: Guarded, key: Key, updates: int, simulated: SimulatedData | None = None, *, offline: bool = False,
+        state: Guarded,
+        key: Key,
+        updates: int,
+        simulated: SimulatedData | None = None,
+        *,
+        offline: bool = False,
         limit: Array | None = None,
-    ) -> tuple[Guarded, Metrics]:  # fmt: skip
+    ) -> tuple[Guarded, Metrics]:
         agent, metrics = inner.learn(state.agent, key, updates, simulated, offline=offline, limit=limit)
         if offline:  # no rollout has been played
             return state._replace(agent=agent), metrics

@@ -69,12 +69,12 @@ class LearnerProcess:
 
     def _receive(self) -> Any:
         """The next message, on this process's device; in the thread."""
-        found = self._talk(self._connection.recv)
-        if isinstance(found, UserError):
-            raise found
-        if isinstance(found, str):
-            raise RuntimeError(f"the learner's process has failed:\n{found}")
-        return jax.block_until_ready(jax.device_put(found))
+        message = self._talk(self._connection.recv)
+        if isinstance(message, UserError):
+            raise message
+        if isinstance(message, str):
+            raise RuntimeError(f"the learner's process has failed:\n{message}")
+        return jax.block_until_ready(jax.device_put(message))
 
     def _talk[T](self, say: Callable[[], T]) -> T:
         try:
@@ -92,10 +92,10 @@ def cores() -> list[int]:
     return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 
-def pin(own: Sequence[int]) -> None:
+def pin(chosen: Sequence[int]) -> None:
     """Keeps this thread, and those that it starts from now on, to these cores; does nothing without any."""
-    if own:
-        os.sched_setaffinity(0, own)
+    if chosen:
+        os.sched_setaffinity(0, chosen)
 
 
 def give_way() -> None:
@@ -110,11 +110,11 @@ def give_way() -> None:
 
 
 def _work(
-    connection: Connection, build: Callable[[], Finetuner], seeds: Any, which: Any, simulated: Any, own: list[int]
+    connection: Connection, build: Callable[[], Finetuner], seeds: Any, which: Any, simulated: Any, allowed: list[int]
 ) -> None:
     """What the process does until the other side of the connection is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the one that plays, which then ends this one
-    pin(own)
+    pin(allowed)
     give_way()
     rows = None if simulated is None else jax.tree.map(jnp.asarray, simulated)
     try:

@@ -4,9 +4,10 @@ Command lines read this module and the method files: they import neither JAX nor
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from sgft_jax import checks
+from sgft_jax.models.config import NetworkConfig
 from sgft_jax.types import Prior, Task
 
 _WARMUP_TRANSITIONS = 1000  # real transitions over which learning rates of kept networks rise: 20 to 25 rollouts here
@@ -40,30 +41,110 @@ class LoopOptions:
 
 
 @dataclass(frozen=True)
-class SACOptions(LoopOptions):
-    """Options of methods whose learner is SAC."""
+class SimulatedOptions(LoopOptions):
+    """Options of methods that also learn from transitions of the simulator."""
+
+    simulated_transitions: int = 200_000
+    """Simulated transitions, of the simulator's policy with more and more random actions."""
+    simulated_ladder: float = 0.6
+    """Share of random actions in the last of these episodes; it grows from 0 in the first."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.at_least(self, 1, "simulated_transitions")
+        checks.share(self, "simulated_ladder")
+
+
+@dataclass(frozen=True)
+class MixedOptions(SimulatedOptions):
+    """Options of methods whose batches are partly simulated."""
+
+    simulated_share: float = 0.5
+    """Share of each batch that is simulated."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.share(self, "simulated_share")
+
+
+@dataclass(frozen=True)
+class DynamicsOptions(LoopOptions):
+    """Options of methods that train a dynamics ensemble."""
+
+    lr_dynamics: float = 3e-4
+    """Adam learning rate of the dynamics ensemble, which trains on real rows."""
+    dynamics_warmup: int | None = None
+    """Updates over which that rate rises from 0; None = the updates of 1,000 real transitions."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.positive(self, "lr_dynamics")
+        checks.not_negative(self, "dynamics_warmup")
+
+
+@dataclass(frozen=True)
+class ActorOptions(LoopOptions):
+    """Options of methods in which SAC's actor learns, and what else `train.sac_finetuner` asks them.
+
+    A `ClassVar` is no option: a method's class sets it, or makes an option of it. Those of the same name are fields of
+    `SACConfig` and `SACHyper`. Besides:
+    fresh: start from new networks; the simulator's policy makes the initial rollouts alone. reset_critic: start from
+    the simulator's actor and a new critic. lr_warmup, anchor, identify, train_dynamics: see the options below.
+    """
+
+    critic_network: ClassVar[NetworkConfig | None] = None
+    critics: ClassVar[int] = 2
+    target_critics: ClassVar[int | None] = None
+    actor_batch: ClassVar[int | None] = None
+    actor_mean: ClassVar[bool] = False
+    weighted_actor: ClassVar[bool] = True
+    tune_alpha: ClassVar[bool] = False
+    entropy_per_dim: ClassVar[float] = -1.0
+    train_critic: ClassVar[bool] = True
+    lr_critic: ClassVar[float] = 3e-4
+    tau: ClassVar[float] = 0.005
+    critic_warmup: ClassVar[int | None] = 0
+    policy_delay: ClassVar[int | None] = 1
+    fresh: ClassVar[bool] = False
+    reset_critic: ClassVar[bool] = False
+    lr_warmup: ClassVar[int | None] = 0
+    anchor: ClassVar[float] = 0.0
+    identify: ClassVar[bool] = False
+    train_dynamics: ClassVar[bool] = False
 
     lr_actor: float = 1e-4
     """Adam learning rate of the actor."""
+    alpha: float = 0.01
+    """Entropy temperature."""
+    actor_ramp: int = 1000
+    """Updates over which the actor's learning rate rises from 0."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.positive(self, "lr_actor", "alpha")
+        checks.not_negative(self, "actor_ramp")
+
+
+@dataclass(frozen=True)
+class SACOptions(ActorOptions):
+    """Options of methods whose learner is SAC."""
+
     lr_critic: float = 3e-4
     """Adam learning rate of the critic."""
     tau: float = 0.005
     """Averaging rate of the target critic."""
-    alpha: float = 0.01
-    """Entropy temperature."""
     critic_warmup: int | None = None
     """Updates at the start in which the critic alone learns. The first real data are the simulator's policy's own; they
-    do not say what another action would do. None = the updates that follow the initial rollouts; the paper has 0."""
-    actor_ramp: int = 1000
-    """Updates over which the actor's learning rate then rises from 0, for the same reason."""
+    do not say what another action would do; `actor_ramp` follows for the same reason. None = the updates that follow
+    the initial rollouts; the paper has 0."""
     policy_delay: int | None = 1
     """Critic updates per update of the actor; None = `utd`, one actor update per real transition (RLPD)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.positive(self, "lr_actor", "lr_critic", "alpha")
+        checks.positive(self, "lr_critic")
         checks.share(self, "tau")
-        checks.not_negative(self, "critic_warmup", "actor_ramp")
+        checks.not_negative(self, "critic_warmup")
         checks.few(self, 1, "policy_delay")
 
 
@@ -87,7 +168,7 @@ class KeptCriticOptions(SACOptions):
 
 
 @dataclass(frozen=True)
-class ModelOptions(KeptCriticOptions):
+class ModelOptions(KeptCriticOptions, DynamicsOptions):
     """Options of methods that branch with dynamics models."""
 
     horizon: int = 1
@@ -97,10 +178,6 @@ class ModelOptions(KeptCriticOptions):
     branch_noise: float = 0.5
     """Std of Gaussian noise on imagined actions, in units of the action's range; 0 as in the paper. Without noise the
     critic never hears of actions better than the policy's (docs/history.md)."""
-    lr_dynamics: float = 3e-4
-    """Adam learning rate of the dynamics ensemble, which trains on real rows."""
-    dynamics_warmup: int | None = None
-    """Updates over which that rate rises from 0; None = the updates of 1,000 real transitions."""
     train_dynamics: bool = True
     """Fit the models to real rows; False keeps the simulator's."""
     actor_real_only: bool = True
@@ -109,8 +186,24 @@ class ModelOptions(KeptCriticOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         checks.few(self, 1, "horizon", "branches")
-        checks.not_negative(self, "branch_noise", "dynamics_warmup")
-        checks.positive(self, "lr_dynamics")
+        checks.not_negative(self, "branch_noise")
+
+    @property
+    def actor_batch(self) -> int | None:
+        """Leading rows of a batch that the actor learns from, None = all."""
+        return self.batch_size if self.actor_real_only else None
+
+
+@dataclass(frozen=True)
+class ShapedOptions(KeptCriticOptions):
+    """Options of methods that shape rewards by V_sim."""
+
+    clip_shaped: float | None = 2.0
+    """Bound on the shaped reward; None = no bound, as in the paper."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks.positive(self, "clip_shaped")
 
 
 # --- options left open ------------------------------------------------------------------------------------------------
@@ -121,7 +214,7 @@ def updates_per_rollout(options: LoopOptions, task: Task) -> int:
     return max(round(options.utd * task.episode_length), 1)
 
 
-def critic_warmup(options: SACOptions, task: Task) -> int:
+def critic_warmup(options: ActorOptions, task: Task) -> int:
     """Critic-only updates at the start."""
     follow = options.initial_rollouts * updates_per_rollout(options, task)
     return follow if options.critic_warmup is None else options.critic_warmup
@@ -132,7 +225,7 @@ def warmup(options: LoopOptions, updates: int | None) -> int:
     return round(_WARMUP_TRANSITIONS * options.utd) if updates is None else updates
 
 
-def policy_delay(options: SACOptions) -> int:
+def policy_delay(options: ActorOptions) -> int:
     """Critic updates per update of the actor."""
     return max(round(options.utd), 1) if options.policy_delay is None else options.policy_delay
 

@@ -8,28 +8,12 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from envs.types import Array, Key, PyTree, Transition, UserError
+from envs.types import Array, Key, PyTree, UserError
 from sgft_jax.data import replay, sequences
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.presets import PretrainConfig
+from sgft_jax.train.fleet import Memory, transitions
 from sgft_jax.types import Batch, Learner, Task
-
-
-class Memory(NamedTuple):
-    """Experience of a fleet.
-
-    empty(transitions) -> experience with room for that many; one that keeps time slots takes the slots that fit.
-    add(experience, rows [n_envs], valid [n_envs], last [n_envs]) -> the same with one step more. valid: not exploded;
-        last: of its episode.
-    cut(experience): no episode goes on after its newest step. held(experience) -> [capacity] bool.
-    sample(experience, key, n) -> Batch [n, ...].
-    """
-
-    empty: Callable[[int], PyTree]
-    add: Callable[[PyTree, Transition, Array, Array], PyTree]
-    cut: Callable[[PyTree], PyTree]
-    held: Callable[[PyTree], Array]
-    sample: Callable[[PyTree, Key, int], Batch]
 
 
 class Recipe(NamedTuple):
@@ -67,21 +51,14 @@ def _sac(task: Task, config: PretrainConfig) -> Recipe:
         policy_delay=config.policy_delay,
     )
     learner = sac.make_sac(structure, hyper(jnp.int32(0)))
-    rows = Memory(
-        empty=lambda transitions: replay.init(replay.blank(task.obs_dim, task.act_dim), transitions),
-        add=lambda experience, rows, valid, last: replay.add_batch(experience, rows, valid),
-        cut=lambda experience: experience,
-        held=lambda experience: jnp.arange(experience.data.reward.shape[0]) < experience.size,
-        sample=replay.sample,
-    )
     explore = functools.partial(learner.act, explore=True)
-    return Recipe(learner, rows, hyper, learner.init_carry, explore, sac.extract_params)
+    return Recipe(learner, transitions(task), hyper, learner.init_carry, explore, sac.extract_params)
 
 
 def _tdmpc2(task: Task, config: PretrainConfig) -> Recipe:
     """The fleet follows the policy alone: a plan costs some ten thousand evaluations of the model, the policy one."""
-    own = {name: getattr(config, name) for name in ("horizon", "size", "plan_samples")}
-    structure, rate = tdmpc2_model.named_config(task.obs_dim, task.act_dim, **own), _rate(config)
+    size = {name: getattr(config, name) for name in ("horizon", "size", "plan_samples")}
+    structure, rate = tdmpc2_model.named_config(task.obs_dim, task.act_dim, **size), _rate(config)
 
     def hyper(steps: Array) -> tdmpc2.TDMPC2Hyper:
         numbers = tdmpc2.TDMPC2Hyper(lr=rate(steps), tau=config.tau, gamma=config.gamma)

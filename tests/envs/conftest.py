@@ -6,13 +6,12 @@ from franka_bench import EXACT, Bench, bench
 
 import envs
 from envs.base import EnvState
-from envs.franka import push
 
 
 @pytest.fixture(scope="session")
 def pushing() -> Bench:
     """Four worlds that differ in mass, friction and stiffness."""
-    env = push.make()
+    env = envs.make("push")
     ranges = {"object_mass": [0.1, 0.3], "servo_stiffness": [0.8, 1.2], "finger_friction": [0.3, 0.6]}
     return bench(env, envs.sample_worlds(env, jax.random.key(7), 4, params=ranges, effects=EXACT))
 

@@ -10,6 +10,7 @@ from envs import effects, gaps
 from envs.base import Entry
 from envs.franka import hammer, insert
 from envs.gaps import Gap
+from envs.mujoco.scene import make_env
 from envs.types import UserError
 
 ENV = toy.make()
@@ -56,7 +57,7 @@ def test_parts_of_a_vector_are_named_by_entry():
 
 
 def test_the_camera_of_hammer_errs_in_x_alone():
-    env = hammer.make("c")
+    env = envs.make("hammer", "c")
     bias = effects.make_range(env, gaps.load(env, "camera").effects).low.obs_bias
     np.testing.assert_allclose(bias, np.eye(12)[10] * 0.029)
 
@@ -150,7 +151,7 @@ def test_an_unknown_gap_gets_the_closest_match():
     ],
 )
 def test_what_cannot_be_built_is_refused_before_it_is(scene, params, words):
-    env = scene.make("c")
+    env = make_env(scene.SCENE, "c")
     with pytest.raises(UserError, match=words):
         gaps.from_dict(env, "g", {"params": params})
 

@@ -31,3 +31,19 @@ def test_a_command_gets_the_words_that_follow(capsys, monkeypatch):
     with pytest.raises(SystemExit) as stopped:
         commands.main(["tasks", "nope"])
     assert stopped.value.code == 2 and "task: there is no 'nope'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "shown"),
+    [
+        (["python", "/usr/bin/sgft", "tasks", "--help"], "usage: sgft tasks "),
+        (["python", "-m", "experiments", "tasks", "--help"], "usage: python -m experiments.tasks "),
+    ],
+)
+def test_the_usage_is_what_was_typed(line, shown, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["sgft"])
+    monkeypatch.setattr("sys.orig_argv", line)
+    monkeypatch.delitem(sys.modules, "experiments.tasks", raising=False)
+    with pytest.raises(SystemExit):
+        commands.main(["tasks", "--help"])
+    assert capsys.readouterr().out.startswith(shown)

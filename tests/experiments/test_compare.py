@@ -9,6 +9,7 @@ import envs
 from envs.types import UserError
 from experiments import compare
 from experiments.runner import cli, grid
+from experiments.runner.cells import complete
 from sgft_jax.io import checkpoint
 from sgft_jax.io.runs import Lock
 
@@ -59,17 +60,22 @@ def test_by_default_all_tasks_with_a_default_real_system():
     grid.check(args)
 
 
+def completed(args):
+    """A line for each cell that could not run."""
+    return complete(compare.cells(args), args)
+
+
 def test_what_is_missing_runs_and_what_is_finished_stays(tmp_path, ran, capsys):
     args = compare.CompareArgs(out=tmp_path, **GRID)
     first, second = (cell.args for cell in compare.cells(args)[:2])
     leave(first, 10)
     leave(second, 0)  # killed before its end
-    failed = compare.compare(args)
+    failed = completed(args)
     assert names(ran) == [("push", "rlpd", True), ("insert", "sgft-sac", False), ("insert", "rlpd", False)]
     assert failed == ["insert/default: rlpd: holds no prior"]
     assert "finished   push/default: sgft-sac, step 10\nunfinished push/default: rlpd\n" in capsys.readouterr().out
     ran.clear()
-    compare.compare(compare.CompareArgs(out=tmp_path, **{**GRID, "rollouts": 20}))
+    completed(compare.CompareArgs(out=tmp_path, **{**GRID, "rollouts": 20}))
     assert names(ran)[0] == ("push", "sgft-sac", True)  # more rollouts were asked for
 
 
@@ -80,7 +86,7 @@ def test_real_systems_that_got_equally_far_go_on_together(tmp_path, ran, capsys)
     grid = {**GRID, "tasks": ("push",), "methods": ("sac",), "reals": reals, "out": tmp_path}
     for cell, done in zip(compare.cells(compare.CompareArgs(**grid)), (10, 6, 8, 6), strict=False):
         leave(cell.args, done, killed=done < 10)
-    compare.compare(compare.CompareArgs(**grid))
+    completed(compare.CompareArgs(**grid))
     assert [(run.real, run.resume) for run in ran] == [
         (("default", soft), True),
         (("hard",), True),
@@ -90,14 +96,14 @@ def test_real_systems_that_got_equally_far_go_on_together(tmp_path, ran, capsys)
     assert printed[:2] == ["finished   push/mild: sac, step 10", "unfinished push/default: sac, step 6"]
     assert printed[5] == "--- push/default: sac, push/soft: sac"
     ran.clear()
-    compare.compare(compare.CompareArgs(**{**grid, "rollouts": 20, "together": False}))
+    completed(compare.CompareArgs(**{**grid, "rollouts": 20, "together": False}))
     assert [run.real for run in ran] == [(real,) for real in reals]
 
 
 def test_what_one_real_system_lacks_does_not_stop_the_others(tmp_path, ran):
     (lacking,) = own_gaps(tmp_path, "lacking")
     args = compare.CompareArgs(tasks=("push",), methods=("sac",), reals=("mild", lacking, "hard"), out=tmp_path)
-    assert compare.compare(args) == ["push/lacking: sac: holds no prior"]
+    assert completed(args) == ["push/lacking: sac: holds no prior"]
     assert [run.real for run in ran] == [args.reals, ("mild",), (lacking,), ("hard",)]
     assert [cell.state for cell in compare.cells(args)] == ["finished", "missing", "finished"]
 
@@ -126,30 +132,30 @@ def test_several_processes_share_a_grid(tmp_path, ran, capsys, monkeypatch):
         leave(done.args, 10)
 
     monkeypatch.setattr(grid, "finetune", finetune)
-    assert compare.compare(args) == []
+    assert completed(args) == []
     assert names(ran) == [("insert", "sgft-sac", False)] and ran == [mine.args]
     printed = capsys.readouterr().out
     assert all(f"left to another process: {cell}\n" in printed for cell in (busy, opened)) and "error" not in printed
     held.clear()
     monkeypatch.setattr(grid, "finetune", run)
-    compare.compare(args)
+    completed(args)
     assert names(ran)[1:] == [("push", "sgft-sac", True), ("push", "sac", False)]
 
 
 def test_every_method_runs_with_its_own_settings(tmp_path, ran):
-    compare.compare(compare.CompareArgs(out=tmp_path, **GRID))
+    completed(compare.CompareArgs(out=tmp_path, **GRID))
     sgft, rlpd = ran[:2]
     assert (sgft.options.utd, rlpd.options.utd) == (8, 20) and rlpd.options.critics == 10
     assert {run.rollouts for run in ran} == {10} and not any(run.video for run in ran)
 
 
 def test_the_clock_stops_before_a_cell_not_in_it(tmp_path, ran, capsys):
-    assert compare.compare(compare.CompareArgs(out=tmp_path, minutes=0.0, **GRID)) == []
+    assert completed(compare.CompareArgs(out=tmp_path, minutes=0.0, **GRID)) == []
     assert ran == [] and "stopped after 0 minutes" in capsys.readouterr().out
 
 
 def test_dry_lists_and_runs_nothing(tmp_path, ran, capsys):
-    compare.main(compare.CompareArgs(out=tmp_path, dry=True, **GRID))
+    compare.compare(compare.CompareArgs(out=tmp_path, dry=True, **GRID))
     assert ran == [] and capsys.readouterr().out.count("missing") == 4
 
 
@@ -164,7 +170,7 @@ def test_dry_lists_and_runs_nothing(tmp_path, ran, capsys):
 )
 def test_bad_input(argv, words, tmp_path, ran, capsys):
     with pytest.raises(SystemExit) as stopped:
-        cli.run_main(compare.main, compare.CompareArgs, "Compare.", argv=[*argv, "--out", str(tmp_path)])
+        compare.main([*argv, "--out", str(tmp_path)])
     error = capsys.readouterr().err
     assert stopped.value.code == 2 and error.startswith("error: ") and error.count("\n") == 1 and words in error
     assert envs.TASKS and ran == []

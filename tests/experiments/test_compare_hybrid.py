@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from envs.types import UserError
-from experiments import compare_hybrid
-from experiments.runner import cli
+from experiments import compare
+from experiments.runner import cli, hybrid_grid
 from experiments.runner.hybrid_args import run_folder
 from sgft_jax.analysis import figures
 from sgft_jax.files.jsonfile import jsonable
@@ -28,22 +28,22 @@ def ran(monkeypatch):
         for i, gap in enumerate(args.gap):
             leave(replace(args, gap=(gap,)), [100.0 * i + 10 * seed for seed in range(args.seeds)])
 
-    monkeypatch.setattr(compare_hybrid, "hybrid", hybrid)
+    monkeypatch.setattr(hybrid_grid, "hybrid", hybrid)
     monkeypatch.setattr(cli, "set_up", lambda: None)
     return seen
 
 
 def leave(args, scores):
     """What a run leaves; without scores, one that was killed."""
-    folder = compare_hybrid.HYBRID.folder(args)
+    folder = hybrid_grid.HYBRID.folder(args)
     folder.mkdir(parents=True, exist_ok=True)
-    config = {"config": dict(compare_hybrid.HYBRID.config(args)), "kind": "hybrid", "sgft_jax": "0", "format": FORMAT}
+    config = {"config": dict(hybrid_grid.HYBRID.config(args)), "kind": "hybrid", "sgft_jax": "0", "format": FORMAT}
     (folder / "config.json").write_text(json.dumps(jsonable(config)))
     if scores:
         summary = {"task": "halfcheetah", "score": "return", "seeds": [*range(args.seeds)], "late": scores}
         summary["last"] = [-x for x in scores]
         (folder / "summary.json").write_text(json.dumps(summary))
-        lines = [{"step": step, "score": scores} for step in (0, 1000)]
+        lines = [{"step": step, "score": [k * x for x in scores]} for step, k in ((0, 3), (1000, -1))]
         (folder / "eval.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
 
 
@@ -53,13 +53,13 @@ def grid(tmp_path):
     data = tuple(tmp_path / f"{name}.hdf5" for name in ("medium", "replay"))
     for path in data:
         path.touch()
-    return compare_hybrid.CompareHybridArgs(
+    return hybrid_grid.HybridGridArgs(
         methods=METHODS, gaps=("gravity", "friction"), data=data, seeds=3, out=tmp_path / "runs"
     )
 
 
 def test_each_method_runs_as_often_as_it_learns_from_other_things(grid, ran, capsys):
-    compare_hybrid.main(grid)
+    compare.compare_hybrid(grid)
     found = [(run.method, None if run.data is None else run.data.stem, run.gap) for run in ran]
     assert found == [
         ("h2oplus", "medium", ("gravity", "friction")), ("sac", None, ("gravity", "friction")),
@@ -79,22 +79,22 @@ def test_each_method_runs_as_often_as_it_learns_from_other_things(grid, ran, cap
     # of 60 (mean over simulators) on D4RL's scale, -280 to 12,135: 2.7
     assert "| medium | 2.7 [2.7, 2.8] |" in said
     ran.clear()
-    compare_hybrid.main(replace(grid, score="last"))
+    compare.compare_hybrid(replace(grid, score="last"))
     assert ran == [] and "| replay | friction | -110 ± 8 |" in capsys.readouterr().out
 
 
 def test_what_was_killed_goes_on_and_what_is_missing_follows(grid, ran):
-    first = compare_hybrid.grid(replace(grid, gaps=("gravity",)))[0]
+    first = hybrid_grid.cells_of(replace(grid, gaps=("gravity",)))[0]
     leave(first.args, None)
-    compare_hybrid.main(replace(grid, methods=("h2oplus",), data=grid.data[:1]))
+    compare.compare_hybrid(replace(grid, methods=("h2oplus",), data=grid.data[:1]))
     assert [(run.gap, run.resume) for run in ran] == [(("gravity",), True), (("friction",), False)]
 
 
 def test_runs_with_other_settings_are_not_mixed(grid, ran, capsys):
     own = replace(grid, methods=("iql",), reference="iql")
-    compare_hybrid.main(own)
+    compare.compare_hybrid(own)
     with pytest.raises(UserError, match=r"schedule\.updates was 1000000, now 500"):
-        compare_hybrid.main(replace(own, schedule=replace(own.schedule, updates=500)))
+        compare.compare_hybrid(replace(own, schedule=replace(own.schedule, updates=500)))
 
 
 def test_rebrac_takes_the_preset_of_each_data_set(grid, ran, tmp_path, capsys):
@@ -102,7 +102,7 @@ def test_rebrac_takes_the_preset_of_each_data_set(grid, ran, tmp_path, capsys):
     data = tuple(tmp_path / f"{name}.hdf5" for name in names)
     for path in data:
         path.touch()
-    compare_hybrid.main(replace(grid, methods=("rebrac",), reference="rebrac", data=data))
+    compare.compare_hybrid(replace(grid, methods=("rebrac",), reference="rebrac", data=data))
     presets = ["halfcheetah-medium-replay", "halfcheetah-medium", ""]
     assert [(run.preset, run.variant) for run in ran] == [(preset, "") for preset in presets]
     assert [run.options.critic_penalty for run in ran] == [0.001, 0.01, 0.001]
@@ -115,48 +115,48 @@ def test_rebrac_takes_the_preset_of_each_data_set(grid, ran, tmp_path, capsys):
 
 def test_tables_and_curves_name_the_schedule_and_the_updates(grid, ran, monkeypatch, capsys):
     titles = []
-    monkeypatch.setattr(figures, "hybrid_curves", lambda path, results, data, *, title: titles.append(title))
-    chosen = compare_hybrid.defaults(["--schedule-preset", "released"])
+    monkeypatch.setattr(figures, "learning_curves", lambda path, panels, *, title: titles.append(title))
+    chosen = hybrid_grid.defaults(["--schedule-preset", "released"])
     schedule = replace(chosen.schedule, updates=200_000)
     own = replace(grid, methods=("sac",), reference="sac", data=())
     own = replace(own, schedule_preset=chosen.schedule_preset, schedule=schedule)
-    compare_hybrid.main(own)
+    compare.compare_hybrid(own)
     assert (ran[0].schedule_preset, ran[0].schedule) == ("released", schedule)
     legend = "Every run made 200,000 updates, schedule released (simulators: 1; steps of each per round: 1,000; "
     assert legend in capsys.readouterr().out
-    compare_hybrid.main(replace(own, schedule_preset="fleet"))  # the same numbers, typed by hand: the same runs
+    compare.compare_hybrid(replace(own, schedule_preset="fleet"))  # the same numbers, typed by hand: the same runs
     assert len(ran) == 1 and legend in capsys.readouterr().out
     assert titles == ["halfcheetah, schedule released"] * 2
 
 
 def test_presets_of_one_method_are_rows_of_their_own(grid, ran, capsys):
     methods = ("h2oplus", "h2oplus:lambda-0.2", "h2oplus:no-ratio", "h2oplus:xql")
-    compare_hybrid.main(replace(grid, methods=methods, gaps=("gravity",), data=grid.data[:1]))
+    compare.compare_hybrid(replace(grid, methods=methods, gaps=("gravity",), data=grid.data[:1]))
     assert [run.options.value_share for run in ran] == [0.1, 0.2, 0.1, 0.1]
     assert [run.options.ratio for run in ran] == [True, True, False, True] and ran[3].options.value_cut == 7.0
     assert f"| data | simulator | {' | '.join(methods)} |\n" in capsys.readouterr().out
 
 
 def test_dry_runs_nothing(grid, ran, capsys):
-    compare_hybrid.main(replace(grid, dry=True))
+    compare.compare_hybrid(replace(grid, dry=True))
     assert ran == [] and capsys.readouterr().out.count("missing") == 10 and not grid.out.exists()
 
 
 @pytest.mark.parametrize(("task", "count"), [("halfcheetah", 9), ("walker2d", 7)])
 def test_by_default_the_simulators_of_the_papers_tables(task, count, grid, ran, capsys):
-    compare_hybrid.main(replace(grid, task=task, gaps=(), methods=("sac",), reference="sac", data=(), dry=True))
+    compare.compare_hybrid(replace(grid, task=task, gaps=(), methods=("sac",), reference="sac", data=(), dry=True))
     said = capsys.readouterr().out
     assert said.count("missing") == count and "range-only" not in said
 
 
 def test_variants_of_gaps_run_where_they_are_named(grid, ran, capsys):
     own = replace(grid, task="walker2d", gaps=("broken-thigh-range-only",), methods=("sac",), reference="sac", data=())
-    compare_hybrid.main(replace(own, dry=True))
+    compare.compare_hybrid(replace(own, dry=True))
     assert "missing    walker2d/broken-thigh-range-only: sac\n" in capsys.readouterr().out
 
 
 def test_cells_have_their_folders(grid):
-    folder = run_folder(compare_hybrid.grid(replace(grid, methods=("sac",), data=()))[0].args, "gravity")
+    folder = run_folder(hybrid_grid.cells_of(replace(grid, methods=("sac",), data=()))[0].args, "gravity")
     assert folder.relative_to(grid.out) == Path("hybrid/halfcheetah/gravity/no-data/sac/seeds-0-2")
 
 
@@ -178,46 +178,52 @@ def test_cells_have_their_folders(grid):
 def test_bad_input(words, said, tmp_path, ran, capsys):
     (tmp_path / "set.hdf5").touch()
     with pytest.raises(SystemExit) as stopped:
-        cli.run_main(
-            compare_hybrid.main, compare_hybrid.CompareHybridArgs, "Compare.", default=compare_hybrid.defaults,
-            argv=[*words.replace("SET", f"{tmp_path}/set.hdf5").split(), "--out", str(tmp_path / "runs")],
-        )  # fmt: skip
+        compare.main(["hybrid", *words.replace("SET", f"{tmp_path}/set.hdf5").split(), "--out", str(tmp_path / "runs")])
     error = capsys.readouterr().err
     assert stopped.value.code == 2 and error.count("\n") == 1 and said in error
     assert ran == []
+
+
+@pytest.mark.parametrize("name", ["last", "late"])
+def test_a_damaged_summary_is_named(name, grid, ran):
+    compare.compare_hybrid(grid)
+    path = next(grid.out.rglob("summary.json"))
+    path.write_text(json.dumps(json.loads(path.read_text()) | {name: "high"}))
+    with pytest.raises(UserError, match=rf"summary\.json: .*{name}.*; put back the file that the run has written"):
+        compare.compare_hybrid(grid)
 
 
 # --- released tables --------------------------------------------------------------------------------------------------
 
 
 def test_a_released_table_says_what_the_runs_say(grid, ran, tmp_path, capsys):
-    compare_hybrid.main(grid)
+    compare.compare_hybrid(grid)
     ran.clear()
-    compare_hybrid.main(replace(grid, export=tmp_path / "tables"))
+    compare.compare_hybrid(replace(grid, export=tmp_path / "tables"))
     assert f"written: {tmp_path / 'tables/hybrid.csv.gz'}, 10 runs\n" in capsys.readouterr().out
     once = (tmp_path / "tables/hybrid.csv.gz").read_bytes()
-    compare_hybrid.main(replace(grid, export=tmp_path / "tables"))
+    compare.compare_hybrid(replace(grid, export=tmp_path / "tables"))
     assert (tmp_path / "tables/hybrid.csv.gz").read_bytes() == once  # rows of the same runs are replaced
     for path in grid.data:
         path.unlink()  # the data are not needed
     capsys.readouterr()
-    compare_hybrid.main(replace(grid, released=tmp_path / "tables", out=tmp_path / "other"))
+    compare.compare_hybrid(replace(grid, released=tmp_path / "tables", out=tmp_path / "other"))
     said = capsys.readouterr().out
     assert ran == [] and "| replay | friction | 110 ± 8 | 110 ± 8 | 10 ± 8 | 10 ± 8 |" in said
     assert (tmp_path / "other/figures/hybrid-halfcheetah-sim-replay.png").exists()
-    compare_hybrid.main(replace(grid, released=tmp_path / "tables", seeds=2))
+    compare.compare_hybrid(replace(grid, released=tmp_path / "tables", seeds=2))
     assert "| replay | friction | 105 ± 5 | 105 ± 5 | 5 ± 5 | 5 ± 5 |" in capsys.readouterr().out
 
 
 def test_the_last_and_the_mean_of_ten_evaluations_come_from_the_curve(grid, ran, tmp_path, capsys):
     own = replace(grid, methods=("sac",), reference="sac", data=(), gaps=("gravity",))
-    compare_hybrid.main(own)
-    (folder,) = (cell.folder for cell in compare_hybrid.grid(own))
+    compare.compare_hybrid(own)
+    (folder,) = (cell.folder for cell in hybrid_grid.cells_of(own))
     lines = [{"step": 10 * i, "score": [float(i)] * 3} for i in range(21)]
     (folder / "eval.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
-    compare_hybrid.main(replace(own, export=tmp_path))
+    compare.compare_hybrid(replace(own, export=tmp_path))
     for score, mean in (("last", "20"), ("late", "16")):  # 11 to 20: 15.5, to the even number
-        compare_hybrid.main(replace(own, released=tmp_path, score=score))
+        compare.compare_hybrid(replace(own, released=tmp_path, score=score))
         assert f"| - | gravity | {mean} ± 0 |" in capsys.readouterr().out
 
 
@@ -225,8 +231,8 @@ def test_the_last_and_the_mean_of_ten_evaluations_come_from_the_curve(grid, ran,
 def standing(grid, ran):
     """A run that also says how long three robots stood, at two evaluations."""
     own = replace(grid, methods=("sac",), reference="sac", data=(), gaps=("gravity",))
-    compare_hybrid.main(own)
-    (folder,) = (cell.folder for cell in compare_hybrid.grid(own))
+    compare.compare_hybrid(own)
+    (folder,) = (cell.folder for cell in hybrid_grid.cells_of(own))
     seconds = {0: [1.0, 2.0, 3.0], 1000: [4.0, 6.0, 8.0]}
     lines = [{"step": n, "exploded": [0.0] * 3, "score": [10.0] * 3, "upright_s": x} for n, x in seconds.items()]
     (folder / "eval.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -236,13 +242,13 @@ def standing(grid, ran):
 def test_tables_also_show_what_else_a_task_is_judged_by(standing, tmp_path, capsys):
     head = "| measure | data | simulator | sac |\n"
     for score, mean in (("last", "6.00 [4.00, 8.00]"), ("late", "4.00 [2.50, 5.50]")):
-        compare_hybrid.main(replace(standing, score=score))
+        compare.compare_hybrid(replace(standing, score=score))
         said = capsys.readouterr().out
         assert head in said and f"| upright_s | - | gravity | {mean} |" in said
-        compare_hybrid.main(replace(standing, export=tmp_path))
-        compare_hybrid.main(replace(standing, released=tmp_path, score=score))
+        compare.compare_hybrid(replace(standing, export=tmp_path))
+        compare.compare_hybrid(replace(standing, released=tmp_path, score=score))
         assert f"| upright_s | - | gravity | {mean} |" in capsys.readouterr().out
-    compare_hybrid.main(replace(standing, released=tmp_path, score="last", seeds=2))
+    compare.compare_hybrid(replace(standing, released=tmp_path, score="last", seeds=2))
     assert "| upright_s | - | gravity | 5.00 |" in capsys.readouterr().out  # two seeds have no interval
     table = gzip.decompress((tmp_path / "hybrid.csv.gz").read_bytes()).decode().splitlines()
     assert len(table) == 5 and sum(",upright_s," in line for line in table) == 2
@@ -257,23 +263,23 @@ def test_tables_also_show_what_else_a_task_is_judged_by(standing, tmp_path, caps
     ],
 )
 def test_a_table_without_some_of_its_rows_is_named(lost, said, standing, tmp_path):
-    compare_hybrid.main(replace(standing, export=tmp_path))
+    compare.compare_hybrid(replace(standing, export=tmp_path))
     path = tmp_path / "hybrid.csv.gz"
     lines = gzip.decompress(path.read_bytes()).decode().splitlines(keepends=True)
     path.write_bytes(gzip.compress("".join(line for line in lines if lost not in line).encode()))
     with pytest.raises(UserError, match=rf"hybrid\.csv\.gz: {said}; put the table back"):
-        compare_hybrid.main(replace(standing, released=tmp_path))
+        compare.compare_hybrid(replace(standing, released=tmp_path))
 
 
 def test_runs_of_two_lengths_are_compared_in_their_order(grid, ran, tmp_path, capsys):
     own = replace(grid, methods=("iql", "cql", "edac"), reference="iql", data=grid.data[:1], gaps=("gravity",))
     for updates, order in ((1000, (1.0, 2.0, 3.0)), (2000, (1.0, 3.0, 2.0))):
         run = replace(own, schedule=replace(own.schedule, updates=updates), out=tmp_path / str(updates))
-        for cell, score in zip(compare_hybrid.grid(run), order, strict=True):
+        for cell, score in zip(hybrid_grid.cells_of(run), order, strict=True):
             leave(cell.args, [score] * 3)
             (cell.folder / "eval.jsonl").write_text(json.dumps({"step": updates, "score": [score] * 3}) + "\n")
-        compare_hybrid.main(replace(run, export=tmp_path))
-    compare_hybrid.main(replace(run, released=tmp_path, beside=1000))
+        compare.compare_hybrid(replace(run, export=tmp_path))
+    compare.compare_hybrid(replace(run, released=tmp_path, beside=1000))
     said = capsys.readouterr().out
     assert "| medium | gravity | 0.50 | cql, edac, iql | edac, cql, iql |" in said and "after 1,000 updates" in said
 
@@ -292,15 +298,15 @@ def test_runs_of_two_lengths_are_compared_in_their_order(grid, ran, tmp_path, ca
     ],
 )
 def test_what_released_tables_lack_is_one_line(changes, said, grid, ran, tmp_path):
-    compare_hybrid.main(grid)
-    compare_hybrid.main(replace(grid, export=tmp_path / "tables"))
+    compare.compare_hybrid(grid)
+    compare.compare_hybrid(replace(grid, export=tmp_path / "tables"))
     given = {name: tmp_path / text if name in ("released", "export") else text for name, text in changes.items()}
     with pytest.raises(UserError, match=said):
-        compare_hybrid.main(replace(grid, **given))
+        compare.compare_hybrid(replace(grid, **given))
 
 
 def test_a_damaged_table_is_named(grid, tmp_path):
     head = "task,real,data,gap,method,schedule,updates,commit,score,step,seed-0\n"
     (tmp_path / "hybrid.csv").write_text(head + "halfcheetah,sim,,gravity,sac,fleet,1000,,return,0,x\n")
     with pytest.raises(UserError, match=r"hybrid\.csv: could not convert string to float: 'x'; put the table back"):
-        compare_hybrid.main(replace(grid, released=tmp_path))
+        compare.compare_hybrid(replace(grid, released=tmp_path))

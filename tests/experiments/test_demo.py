@@ -8,7 +8,7 @@ from runs_by_hand import save
 import envs
 from envs.types import UserError
 from experiments import demo
-from sgft_jax.analysis.curves import read_runs
+from sgft_jax.analysis.reading import read_runs
 
 
 class Beside:

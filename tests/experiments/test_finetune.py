@@ -25,10 +25,11 @@ from envs.types import Transition, UserError
 from experiments import evaluate, finetune
 from experiments.runner import cli, finetune_run
 from experiments.runner.finetune_args import FinetuneArgs, arguments, run_folder
-from experiments.runner.finetune_record import Record
+from experiments.runner.finetune_record import FinetuneRecord
 from experiments.runner.recorded import RecordedSystem
 from sgft_jax import api
-from sgft_jax.analysis.curves import read_curve, training_score
+from sgft_jax.analysis.curves import training_score
+from sgft_jax.analysis.reading import read_curve
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.priors import load_prior
@@ -51,7 +52,7 @@ import os, signal, sys
 import envs
 envs.TASKS["toy"] = "toy"
 from experiments import finetune
-from experiments.runner.finetune_record import Record
+from experiments.runner.finetune_record import FinetuneRecord
 from sgft_jax.train import finetuning
 from sgft_jax.io.real import RealStore
 def die():
@@ -65,21 +66,21 @@ def stored(self, rollout):
 RealStore.append = stored
 """
 LOGGED = """
-metrics = Record.metrics
+metrics = FinetuneRecord.metrics
 def logged(self, done, values):
     metrics(self, done, values)
     if done == 5:
         die()
-Record.metrics = logged
+FinetuneRecord.metrics = logged
 """
 OFFLINE = """
 finetuning.OFFLINE_PART = 10
-checkpoint = Record.checkpoint
-def offline(self, progress, step):
-    checkpoint(self, progress, step)
+checkpoint = FinetuneRecord.checkpoint
+def offline(self, progress, step, **facts):
+    checkpoint(self, progress, step, **facts)
     if int(progress.offline) == 20:
         die()
-Record.checkpoint = offline
+FinetuneRecord.checkpoint = offline
 """
 
 
@@ -612,13 +613,13 @@ def film(folder, monkeypatch, *, pushes=(0.0, 1.0), scene=None, reason=None):
     monkeypatch.setattr(cli, "select_renderer", lambda: reason)
     env, pool, both = springs(pushes)
     played = [jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1)]
-    record = Record(folder, env, gaps.Gap("toy", {}, {}), "sac", [0])
+    record = FinetuneRecord(folder, env, gaps.Gap("toy", {}, {}), "sac", [0])
     return record.film(pool, lambda: played, 7), played, pool
 
 
 def test_a_record_counts_the_steps_that_were_made(tmp_path):
     """Of two seeds whose episodes end early; evaluations on the real system are steps too."""
-    record = Record(tmp_path, toy.make(), gaps.Gap("toy", {}, {}), "sac", [0, 1], real_evaluations=True)
+    record = FinetuneRecord(tmp_path, toy.make(), gaps.Gap("toy", {}, {}), "sac", [0, 1], real_evaluations=True)
     record.played = np.array([7, 12])
     record.evaluation(1, {"score": np.zeros(2)}, np.array([3, 2]))
     record.metrics(1, {"real/return": np.zeros(2), "critic/loss": np.array([np.nan, 1.0]), "updates": np.array([0, 3])})

@@ -9,12 +9,12 @@ import pytest
 import toy
 
 import sgft_jax
+from envs.scales import normalised
 from envs.types import UserError
 from experiments import hybrid
 from experiments.runner.hybrid_args import data_name, run_folder
 from experiments.runner.hybrid_run import in_words, intervals
 from sgft_jax.analysis import figures
-from sgft_jax.hybrid.scores import normalised
 from sgft_jax.io.log import MetricsLog, read_jsonl
 
 OPTIONS = """--task toy --seeds 2 --no-video --schedule.updates 24 --schedule.simulators 2 --schedule.buffer 64
@@ -64,8 +64,10 @@ def complaint(argv, capsys):
 
 
 def test_a_run_leaves_curves_policies_and_a_summary_for_each_simulator(tmp_path, data, gap, capsys, monkeypatch):
-    drawn, draw = {}, figures.hybrid_curves
-    monkeypatch.setattr(figures, "hybrid_curves", lambda path, *a, **b: drawn.update({path: a}) or draw(path, *a, **b))
+    drawn, draw = {}, figures.learning_curves
+    monkeypatch.setattr(
+        figures, "learning_curves", lambda path, *a, **b: drawn.update({path: a}) or draw(path, *a, **b)
+    )
     hybrid.main(words(tmp_path, data, "--gap", gap, "--variant", "w", "--seeds", "3"))
     said = capsys.readouterr().out
     assert "60 transitions of 3 episodes" in said and "heavy: success in the real system" in said
@@ -85,10 +87,10 @@ def test_a_run_leaves_curves_policies_and_a_summary_for_each_simulator(tmp_path,
             assert f"{before} {in_words(np.array(summary[one]), summary[f'{one}/interval'])}" in said
         assert f"results: {folder}  (policy/, summary.json, eval.jsonl, figures/)" in said
         assert (folder / "figures/score.png").stat().st_size > 5_000
-        results, shown = drawn[folder / "figures/score.png"]
-        own = results.find("h2oplus", shown, name)
-        assert shown == "recorded-v2" and own.updates.tolist() == [0, 12, 24]
-        np.testing.assert_array_equal(own.curve, np.transpose([line["score"] for line in evaluations]))
+        (((words_of_panel, (curve,)),),) = (panels.items() for panels in drawn[folder / "figures/score.png"])
+        assert words_of_panel == f"simulator: {name}" and (curve.spec, curve.data) == ("h2oplus:w", "recorded-v2")
+        assert curve.x.tolist() == [0, 12, 24] and curve.gap == name
+        np.testing.assert_array_equal(curve.values, np.transpose([line["score"] for line in evaluations]))
         policy = sgft_jax.load_policy(folder / "policy/seed-1")
         action = np.asarray(policy.act([0.5, 0.0, 0.0, 0.0]))
         assert action.shape == (2,) and (np.abs(action) < 1).all()

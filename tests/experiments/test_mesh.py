@@ -21,7 +21,8 @@ from experiments.runner import cli
 from sgft_jax.data import replay
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.presets import PretrainConfig
-from sgft_jax.train.pretraining import make_programs, spread_replay, training_pools
+from sgft_jax.train.fleet import make_programs, over_members, spread_replay
+from sgft_jax.train.pretraining import make_trainer, random_experience, training_pools
 
 CONFIG = PretrainConfig(
     n_envs=16, worlds=8, random_transitions=64, replay_capacity=128, batch_size=32, updates_per_step=2, chunk_steps=24,
@@ -34,13 +35,14 @@ CUT = PartitionSpec(None, mesh.DATA)  # [seeds, ...]
 def begun(devices):
     """Random data and the start of a run."""
     with mesh.use(devices):
-        random = program().collect(pools(), jax.random.split(jax.random.key(1), 1))
+        collect = over_members(functools.partial(random_experience, toy.make(), CONFIG), 1)
+        random = jax.jit(collect)(pools(), jax.random.split(jax.random.key(1), 1))
         return random, program().begin(pools(), random, jax.random.split(jax.random.key(2), 1))
 
 
 @functools.cache
 def program():
-    return make_programs(toy.make(), CONFIG, 1)
+    return make_programs(make_trainer(toy.make(), CONFIG), 1, shared=False)
 
 
 def pools():
@@ -130,7 +132,7 @@ def test_what_one_device_left_two_continue():
     random, state = begun(1)
     with mesh.use(2):
         laid_out = program().spread(jax.tree.map(jnp.copy, state))
-        data = program().spread_random(jax.tree.map(jnp.copy, random)).data
+        data = jax.jit(over_members(spread_replay, 1))(random).data
     agree(state, laid_out)
     assert laid_out.replay.data.reward.sharding.spec == data.reward.sharding.spec == CUT
 

@@ -9,7 +9,7 @@ import pytest
 from experiments import finetune, pretrain
 from sgft_jax import api
 from sgft_jax.io.priors import load_prior
-from sgft_jax.learners.recurrent import RECURRENTParams
+from sgft_jax.learners.recurrent import RecurrentParams
 
 PRETRAIN = """--task push --preset recurrent --no-video
     --config.n-envs 4 --config.worlds 2 --config.env-steps 80 --config.random-transitions 160 --config.gru 8
@@ -30,7 +30,7 @@ def test_from_pretraining_to_a_policy_that_acts(tmp_path, capsys):
     run = tmp_path / "pretrain/push/recurrent/seed-0"
     assert "--method recurrent" in capsys.readouterr().out
     prior = load_prior(run / "prior/seed-0")
-    assert isinstance(prior.params, RECURRENTParams) and prior.card["algorithm"] == "recurrent"
+    assert isinstance(prior.params, RecurrentParams) and prior.card["algorithm"] == "recurrent"
     assert not any(name.startswith(("value/", "dynamics/")) for name in prior.card["metrics"])
 
     given = [*FINETUNE.split(), "--prior", str(run), "--out", str(tmp_path)]

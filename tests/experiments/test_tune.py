@@ -169,10 +169,10 @@ def test_every_trial_is_a_run_apart_from_the_comparison(tmp_path, ran):
 
 def test_what_fails_does_not_stop_the_rest_and_the_command_goes_on(tmp_path, ran, capsys):
     with pytest.raises(UserError, match=r"1 of the trials did not run: toy/mild: sac_trial-3: lacks something"):
-        tune.main(budget(tmp_path))
+        tune.tune(budget(tmp_path))
     assert len(ran) == 4 and not (tmp_path / "tuned").exists()
     assert "toy/sac: 3 of 4 trials are finished; nothing is chosen" in capsys.readouterr().out
-    tune.main(budget(tmp_path))
+    tune.tune(budget(tmp_path))
     assert [run.variant for run in ran[4:]] == ["trial-3"]
     # Areas: (0.05 k 5 + (0.05 k + 0.25) 5) / 10 = 0.05 k + 0.125 of trial k.
     result = written(tmp_path)
@@ -183,7 +183,7 @@ def test_what_fails_does_not_stop_the_rest_and_the_command_goes_on(tmp_path, ran
     }  # fmt: skip
     assert result["gaps"] == [{"name": "mild"}] and result["provenance"]["versions"]
     assert "--tuned --tasks toy --methods sac" in capsys.readouterr().out
-    tune.main(budget(tmp_path, trials=6))
+    tune.tune(budget(tmp_path, trials=6))
     assert [run.variant for run in ran[5:]] == ["trial-4", "trial-5"] and written(tmp_path)["trial"] == 5
 
 
@@ -196,9 +196,9 @@ def test_trials_of_other_options_are_refused(tmp_path, ran):
 
 
 def test_dry_and_the_clock_run_nothing(tmp_path, ran, capsys):
-    tune.main(budget(tmp_path, dry=True))
+    tune.tune(budget(tmp_path, dry=True))
     assert capsys.readouterr().out.count("missing") == 4
-    tune.main(budget(tmp_path, minutes=0.0))
+    tune.tune(budget(tmp_path, minutes=0.0))
     assert "stopped after 0 minutes" in capsys.readouterr().out and ran == [] and not list(tmp_path.iterdir())
 
 
@@ -212,7 +212,7 @@ def test_dry_and_the_clock_run_nothing(tmp_path, ran, capsys):
 )
 def test_bad_input(argv, words, tmp_path, capsys):
     with pytest.raises(SystemExit) as stopped:
-        cli.run_main(tune.main, tune.TuneArgs, "Tune.", argv=[*argv, "--out", str(tmp_path)])
+        cli.run_main(tune.tune, tune.TuneArgs, "Tune.", argv=[*argv, "--out", str(tmp_path)])
     error = capsys.readouterr().err
     assert stopped.value.code == 2 and words in error and error.count("\n") == 1
 
@@ -267,7 +267,7 @@ def test_halving_goes_on_with_the_better_half_and_chooses_at_the_end(tmp_path, m
         return min(speed.get(trial, 0.0) * n, 0.1) if trial != 7 or n < 15 else 0.9
 
     seen = made_up(monkeypatch, success)
-    tune.main(budget(tmp_path, trials=8, rollouts=40, halve=True))
+    tune.tune(budget(tmp_path, trials=8, rollouts=40, halve=True))
     assert seen == [
         *((k, 10, False) for k in range(8)),
         *((k, 20, True) for k in (0, 5, 6, 7)),
@@ -279,22 +279,22 @@ def test_halving_goes_on_with_the_better_half_and_chooses_at_the_end(tmp_path, m
     # Of trial 5: 0, 0.1, 0.1 after 0, 5, 10 rollouts and then level, so (0.25 + 1.5) / 20.
     assert result["trials"][5]["area"] == pytest.approx(0.0875)
     assert "seeds: 2, real systems: 1; 320 real rollouts in all" in capsys.readouterr().out
-    tune.main(budget(tmp_path, trials=8, rollouts=40, halve=True))
+    tune.tune(budget(tmp_path, trials=8, rollouts=40, halve=True))
     assert len(seen) == 14 and written(tmp_path)["trial"] == 7
 
 
 def test_a_trial_that_stopped_early_is_not_chosen(tmp_path, monkeypatch):
     """After 40 rollouts trial 1 is better than the default and 2 better still; then 2 forgets all: the default wins."""
     seen = made_up(monkeypatch, lambda trial, n: (0.4, 0.5, 0.6 * (n <= 40), 0.0)[trial])
-    tune.main(budget(tmp_path, trials=4, rollouts=80, halve=True))
+    tune.tune(budget(tmp_path, trials=4, rollouts=80, halve=True))
     assert seen[4:] == [(0, 80, True), (2, 80, True)]
     assert written(tmp_path)["trial"] == 0 and written(tmp_path)["trials"][1]["area"] == pytest.approx(0.5)
 
 
 def test_halving_waits_for_every_trial_of_a_rung(tmp_path, monkeypatch, capsys):
     seen = made_up(monkeypatch, lambda trial, n: 0.1 * trial)
-    tune.main(budget(tmp_path, trials=4, rollouts=20, halve=True, minutes=0.0))
-    tune.main(budget(tmp_path, trials=4, rollouts=20, halve=True, dry=True))
+    tune.tune(budget(tmp_path, trials=4, rollouts=20, halve=True, minutes=0.0))
+    tune.tune(budget(tmp_path, trials=4, rollouts=20, halve=True, dry=True))
     assert seen == [] and not (tmp_path / "tuned").exists()
     printed = capsys.readouterr().out
     assert "4 trials to 10 rollouts, 2 trials to 20 rollouts; seeds: 2" in printed
@@ -319,7 +319,7 @@ def grid_of(out, **changes):
 def test_a_comparison_of_tuned_methods(tmp_path, ran):
     for method in ("sac", "sgft-sac"):
         choose(tmp_path, method)
-    assert compare.compare(grid_of(tmp_path)) == []
+    compare.compare(grid_of(tmp_path))
     assert {(run.options.utd, run.options.lr_actor) for run in ran} == {(2.0, 3e-4)}
     assert (tmp_path / "finetune/toy/default/sac_tuned/seeds-0-9").is_dir()
     assert [str(cell) for cell in compare.cells(grid_of(tmp_path))] == [
@@ -376,7 +376,7 @@ def test_tuned_runs_on_a_point_mass(tmp_path, monkeypatch):
     monkeypatch.setitem(spaces.SPACES, "sac", {"utd": (0.1, 1.0, 8.0), "batch_size": (256,)})
     monkeypatch.setitem(spaces.FIRST, "sac", ({"utd": 8.0},))
     sizes = {"tasks": ("toy",), "methods": ("sac",), "rollouts": 2, "eval_every": 1, "seeds": 2}
-    tune.main(tune.TuneArgs(trials=3, halve=True, reals=(str(tmp_path / "heavy.toml"),), out=tmp_path, **sizes))
+    tune.tune(tune.TuneArgs(trials=3, halve=True, reals=(str(tmp_path / "heavy.toml"),), out=tmp_path, **sizes))
     result = written(tmp_path)
     assert {trial["options"]["utd"] for trial in result["trials"]} == {8.0, 1.0, 0.1}
     assert sorted(trial["rollouts"] for trial in result["trials"]) == [1, 2, 2]
@@ -386,7 +386,7 @@ def test_tuned_runs_on_a_point_mass(tmp_path, monkeypatch):
     assert result["gaps"][0]["name"] == "heavy"
     assert all(np.shape(trial["areas"]["heavy"]) == (2,) for trial in result["trials"])
     real = str(tmp_path / "light.toml")
-    compare.main(compare.CompareArgs(tuned=True, reals=(real,), out=tmp_path, **sizes))
+    compare.compare(compare.CompareArgs(tuned=True, reals=(real,), out=tmp_path, **sizes))
     (cell,) = compare.cells(compare.CompareArgs(tuned=True, reals=(real,), out=tmp_path, **sizes))
     assert cell.state == "finished" and checkpoint.latest(cell.folder) == 2
     stored = json.loads((cell.folder / "config.json").read_text())["config"]["options"]

@@ -6,6 +6,7 @@ all tests of a module. The first observation entry is the state s of a problem, 
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -100,6 +101,17 @@ def counted(learner, **case):
     act = jax.jit(learner.act, static_argnames="explore")
     compiled = learner._replace(init=jax.jit(learner.init), update=jax.jit(update), act=act)
     return Case(**{"learner": compiled, "start": compiled.init, "traces": traces, **case})
+
+
+def compiled_once(learner):
+    """A learner whose compiled `update` may be traced once."""
+    traces = itertools.count(1)
+
+    def update(state, batch, key):
+        assert next(traces) == 1, "update was traced again"
+        return learner.update(state, batch, key)
+
+    return learner._replace(init=jax.jit(learner.init), update=jax.jit(update))
 
 
 # alpha 1e-4: entropy changes the answers by less than their tolerance

@@ -104,7 +104,7 @@ def test_what_was_played_speaks_for_who_made_most_of_the_steps(late, behind):
     found = run(system=Handed(learner, late, scores), rollouts=6, learner=learner, waits=False)
     best, agents = found[-1][0].best, [progress.agent.learner for progress, _ in found]
     np.testing.assert_array_equal(best.params, agents[5 - behind])
-    assert best.rollouts.tolist() == [5 - behind] * 2 and best.score.tolist() == [3, 3]
+    assert best.age.tolist() == [5 - behind] * 2 and best.score.tolist() == [3, 3]
 
 
 def test_a_rollout_that_asked_nobody_speaks_for_nobody():

@@ -52,7 +52,7 @@ def test_success_is_told_apart_by_returns_of_whole_rollouts():
 @pytest.mark.parametrize("scores", [[1], [1, 2], [1, 2, 3, 4]])
 def test_few_rollouts_are_evidence_for_who_has_played_them(scores):
     best = best_of(*scores)
-    assert best.params == best.rollouts == len(scores) - 1 and best.score == np.mean(scores)
+    assert best.params == best.age == len(scores) - 1 and best.score == np.mean(scores)
 
 
 def test_of_few_rollouts_the_best_ones_decide_and_five_outweigh_them():
@@ -68,3 +68,35 @@ def test_a_rollout_by_nobody_known_is_in_the_windows_of_those_after_it():
     )
     assert best.params == 0 and best.score == 1
     assert best_of(3, best=best).score == 3 and best_of(3, best=best).params == 2
+
+
+def evaluate(best, scores, totals, age, since=0):
+    """One member's evaluation of a policy that is called by its age; None: an episode that exploded."""
+    best = evidence.nothing_known({"w": jnp.zeros((1, 2))}, 1, len(scores)) if best is None else best
+    exploded = jnp.array([[score is BOOM for score in scores]])
+    score = jnp.array([[-jnp.inf if score is BOOM else score for score in scores]])
+    params = {"w": jnp.full((1, 2), float(age))}
+    return evidence.evaluated(best, params, score, jnp.array([totals], float), exploded, jnp.array([age]), since)
+
+
+def test_of_evaluations_the_higher_score_wins_then_the_higher_return():
+    first = evaluate(None, [0.0, 1.0], [3, 3], 1)
+    for scores, totals, age in [
+        ([1.0, 1.0], [-9, -9], 2), ([1.0, 0.0], [3, 4], 2), ([1.0, 0.0], [3, 3], 1), ([0.0, 1.0], [2, 3], 1),
+        ([0.0, 0.0], [9, 9], 1),
+    ]:  # fmt: skip
+        best = evaluate(first, scores, totals, 2)
+        assert best.age == age and best.params["w"].tolist() == [[age, age]]
+    assert evaluate(first, [0.0, 0.0], [0, 0], 2, since=2).age == 2, "an early evaluation does not compete"
+
+
+def test_of_evaluations_one_that_explodes_is_not_the_better_one():
+    """Whole episodes cost 12 or 13; one that explodes has cost less until then and counts as the worst known."""
+    whole = evaluate(None, [-11, -13], [-11, -13], 1)
+    for scores, totals in [([BOOM, BOOM], [-2, -2]), ([BOOM, -11], [-11, -11]), ([-12, BOOM], [-12, -12])]:
+        assert evaluate(whole, scores, totals, 2).age == 1
+        assert evaluate(evaluate(None, scores, totals, 2), [-11, -13], [-11, -13], 1).age == 1
+    half = evaluate(evaluate(None, [-10, BOOM], [-10, -12], 2), [-11, -13], [-11, -13], 1)
+    assert half.age == 2 and half.score == -11.5 and half.worst.tolist() == [[-13, -13]]
+    same = evaluate(None, [BOOM, BOOM], [-12, -12], 2)
+    assert evaluate(same, [-12, -12], [-12, -12], 1).age == 1  # at the same cost, whole

@@ -68,7 +68,7 @@ def test_modules_are_found_and_their_faults_are_named(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     (tmp_path / "own_package").mkdir()
     (tmp_path / "own_package/broken.py").write_text("\n\nimport a_module_that_is_not_there\n")
-    assert extend.load("task", "envs.franka.push", "make").make is not None
+    assert extend.load("task", "envs.franka.push", "SCENE").SCENE is not None
     with pytest.raises(UserError, match=r"no module 'own_package.gone'; a file is named with its .py"):
         extend.load("task", "own_package.gone", "make")
     with pytest.raises(UserError, match=r"own_package.broken: .*broken.py, line 3: ModuleNotFoundError: No module"):

@@ -354,7 +354,6 @@ def counting(transform):
     parts = Parts(
         learner=learner,
         start=lambda params, key, simulated: (learner.init(key), None),
-        init_carry=learner.init_carry,
         act=learner.act,
         export=lambda state: state.learner,
         policy=Policy(learner.init_carry, learner.act, lambda params, obs: params),

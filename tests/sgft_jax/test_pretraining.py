@@ -1,5 +1,6 @@
 """The iterator of pretraining: fleets that reset, worlds that are renewed, resuming, what it leaves."""
 
+import functools
 from dataclasses import replace
 from typing import Any
 
@@ -10,31 +11,34 @@ import numpy as np
 import pytest
 import toy
 import toy_terminating
+import tuners
 from flax import struct
 
 import envs
 from envs.types import UserError
 from sgft_jax.data import replay
+from sgft_jax.keys import seed_keys
 from sgft_jax.learners import tdmpc2_model
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.policies import make_policy
 from sgft_jax.presets import PRESETS, PretrainConfig
 from sgft_jax.train import pretraining, recipes
-from sgft_jax.train.pretraining import Best, keep_better, over_members, pretrain, priors_of
+from sgft_jax.train.fleet import over_members
+from sgft_jax.train.pretraining import pretrain, priors_of
 from sgft_jax.types import Learner
 
 N, STEPS, LENGTH = 16, 30, toy_terminating.LENGTH
 CONFIG = PretrainConfig(
     n_envs=N, chunk_steps=STEPS, env_steps=2 * N * STEPS, worlds=4, random_transitions=LENGTH * N,
     replay_capacity=4 * N * STEPS, batch_size=8, updates_per_step=1, gamma=0.9,
-    network=NetworkConfig(hidden=(8,)), ensemble_size=1, size="tiny", horizon=2, plan_samples=8, gru=4,
+    network=NetworkConfig(hidden=(8,)), ensemble_size=1, size=tuners.TINY, horizon=2, plan_samples=8, gru=4,
 )  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
 def _tiny(monkeypatch):
-    monkeypatch.setitem(tdmpc2_model.SIZES, "tiny", tdmpc2_model.Size(8, 8, 8, 2, 2))
+    monkeypatch.setitem(tdmpc2_model.SIZES, tuners.TINY, tdmpc2_model.Size(8, 8, 8, 2, 2))
 
 
 class Agent(struct.PyTreeNode):
@@ -106,11 +110,11 @@ def test_no_key_is_used_twice(algorithm):
         CONFIG, algorithm=algorithm, n_envs=2, chunk_steps=2, random_transitions=2 * LENGTH, replay_capacity=80,
         random_ladder=0.5, batch_size=4, updates_per_step=2,
     )  # fmt: skip
-    trainer, pool = pretraining.make_pretrainer(env, config), envs.sample_worlds(env, jax.random.key(0), 2)
+    trainer, pool = pretraining.make_trainer(env, config), envs.sample_worlds(env, jax.random.key(0), 2)
 
     def whole(key):
         key_random, key_start = jax.random.split(key)
-        random = trainer.collect_random(pool, key_random)
+        random = pretraining.random_experience(env, config, pool, key_random)
         state, _ = trainer.chunk(pool, random, trainer.init(pool, random, key_start))
         return jax.random.normal(trainer.renew(pool, state).key)
 
@@ -136,12 +140,10 @@ def test_statistics_are_those_of_the_steps_that_did_not_explode(monkeypatch):
     """Half of the random steps explode, and leave the end of their buffer empty."""
     monkeypatch.setattr(pretraining, "RECIPES", {"sac": counting})
     env = toy_terminating.make()
-    step = lambda world, state, action, key: env.step(world, state, action, key)._replace(invalid=action[0] > 0)  # noqa: E731
-    trainer, pool = (
-        pretraining.make_pretrainer(env._replace(step=step), CONFIG),
-        envs.sample_worlds(env, jax.random.key(0), 4, params={"risk": 0.0}),
-    )
-    random = jax.jit(trainer.collect_random)(pool, jax.random.key(1))
+    pool, step = envs.sample_worlds(env, jax.random.key(0), 4, params={"risk": 0.0}), env.step
+    env = env._replace(step=lambda *now: step(*now)._replace(invalid=now[2][0] > 0))
+    trainer = pretraining.make_trainer(env, CONFIG)
+    random = jax.jit(functools.partial(pretraining.random_experience, env, CONFIG))(pool, jax.random.key(1))
     held, rows = int(random.size), len(random.data.reward)
     assert 0.4 * rows < held < 0.6 * rows
     statistics = jax.jit(trainer.init)(pool, random, jax.random.key(2)).learner.normalizer
@@ -184,7 +186,7 @@ def test_resumed_is_bit_for_bit_uninterrupted(algorithm, refresh_every):
     )
     seeds = [3, 4]
     states = [jax.tree.map(jnp.copy, state) for state, _ in pretrain(env, config, seeds)]
-    assert [pretraining.chunks_done(state, config) for state in states] == [0, 1, 2]
+    assert [pretraining.make_plan(env, config).chunks_done(state) for state in states] == [0, 1, 2]
     _, (end, metrics) = pretrain(env, config, seeds, state=jax.tree.map(jnp.copy, states[1]))
     equal(end, states[2])
     assert all(np.isfinite(x).all() and x.shape == (2,) for x in metrics.values())
@@ -218,34 +220,6 @@ def test_random_actions_grow_along_the_fleet(key, monkeypatch):
     *_, (state, _) = pretrain(toy.make(), config, [0])
     obeyed = (state.replay.data.action[0, : 3 * 60].reshape(60, 3, 2) > 1).all(-1).mean(0)
     assert obeyed[0] == 1 and obeyed[2] == 0 and 0.25 < obeyed[1] < 0.75
-
-
-def test_better_is_a_higher_score_then_a_higher_return():
-    def best(score, total, steps):
-        return Best({"w": jnp.full(2, float(steps))}, jnp.float32(score), jnp.float32(total), jnp.int32(steps))
-
-    old = best(0.5, 3.0, 1)
-    for score, total, steps in [(0.6, -9.0, 2), (0.5, 3.1, 2), (0.5, 3.0, 1), (0.5, 2.9, 1), (0.4, 9.0, 1)]:
-        kept = keep_better(old, best(score, total, 2), 0.0)
-        assert kept.steps == steps and kept.params["w"].tolist() == [steps, steps]
-    assert keep_better(old, best(0.1, 0.0, 2), 1.5).steps == 2, "an early evaluation does not compete"
-
-
-def test_a_policy_that_explodes_is_not_the_better_one():
-    """Costs of 12 or so for a whole episode; the worst known of both evaluations counts for those that exploded."""
-
-    def best(score, steps, exploded, worst):
-        score = jnp.float32(score)
-        return Best(jnp.int32(steps), score, score, jnp.int32(steps), jnp.float32(exploded), jnp.full(2, worst))
-
-    whole = best(-12.0, 1, 0.0, -13.0)
-    for score, exploded, worst in [(-2.0, 1.0, -2.0), (-11.0, 0.9, -11.0), (-12.0, 0.1, -12.0)]:
-        bursts = best(score, 2, exploded, worst)
-        assert keep_better(whole, bursts, 0.0).steps == 1 and keep_better(bursts, whole, 0.0).steps == 1
-    kept = keep_better(best(-11.0, 2, 0.5, -12.0), whole, 0.0)
-    assert kept.steps == 2 and kept.score == -11.5 and kept.worst.tolist() == [-13, -13]
-    same = best(-12.0, 2, 1.0, -12.0)
-    assert keep_better(same, best(-12.0, 1, 0.0, -12.0), 0.0).steps == 1  # at the same cost, whole
 
 
 @pytest.mark.parametrize("algorithm", ["sac", "tdmpc2", "recurrent"])
@@ -302,10 +276,10 @@ def test_settings_that_make_no_sense_are_refused(changes, words):
 def test_recurrent_policies_need_room_for_whole_episodes():
     config = replace(CONFIG, algorithm="recurrent", random_transitions=(LENGTH - 1) * N)
     with pytest.raises(UserError, match=r"--config\.random-transitions 176: .* 16 environments need at least 192"):
-        pretraining.make_pretrainer(toy_terminating.make(), config)
+        pretraining.make_trainer(toy_terminating.make(), config)
 
 
 def test_keys_depend_on_seed_and_purpose_alone():
-    keys = jax.random.key_data(pretraining.seed_keys([0, 1, 2], 5))
-    np.testing.assert_array_equal(keys[1:], jax.random.key_data(pretraining.seed_keys([1, 2], 5)))
-    assert len(np.unique(np.concatenate([keys, jax.random.key_data(pretraining.seed_keys([0, 1, 2], 6))]), axis=0)) == 6
+    keys = jax.random.key_data(seed_keys([0, 1, 2], 5))
+    np.testing.assert_array_equal(keys[1:], jax.random.key_data(seed_keys([1, 2], 5)))
+    assert len(np.unique(np.concatenate([keys, jax.random.key_data(seed_keys([0, 1, 2], 6))]), axis=0)) == 6

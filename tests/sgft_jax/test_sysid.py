@@ -23,6 +23,7 @@ from sgft_jax.models import dynamics, system
 from sgft_jax.models.networks import make_dynamics
 from sgft_jax.policies import make_policy, network_of
 from sgft_jax.presets import PretrainConfig
+from sgft_jax.train import finetuning
 from sgft_jax.train.pretraining import prior_card
 from sgft_jax.types import Normalizer, Prior, SimulatedData
 
@@ -148,6 +149,6 @@ def test_nothing_of_the_true_system_reaches_the_method(prior):
     """The whole way from Python."""
     gap = envs.gaps.from_dict(ENV, "off", {"effects": {"action_scale": 0.7}})
     setup = api.setup(ENV, gap, prior, method="sysid")
-    progress, _ = list(api.train.finetune(*setup, rollouts=2))[-1]
+    progress, _ = list(finetuning.finetune(*setup, rollouts=2))[-1]
     np.testing.assert_array_equal(progress.agent.replay.data.obs[..., -K:], 0.0)
     assert jnp.isfinite(progress.agent.learner[1].mean).all()

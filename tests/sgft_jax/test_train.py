@@ -16,11 +16,11 @@ from envs.rollout import Episode
 from envs.types import Policy, Transition, UserError
 from sgft_jax.data import replay, sources
 from sgft_jax.io import checkpoint
+from sgft_jax.keys import Finetuning
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import finetuning
 from sgft_jax.train.finetuner import Parts, assemble
 from sgft_jax.train.options import LoopOptions
-from sgft_jax.transforms import compose
 from sgft_jax.types import Learner, Simulation
 
 ENV, GAMMA = toy_terminating.make(), 0.9
@@ -47,16 +47,14 @@ def make(initial_policy=None, simulation=None, initial_rollouts=1, guard=False):
     parts = Parts(
         learner=learner,
         start=lambda params, key, simulated: (jnp.float32(0) if params is None else params, None),
-        init_carry=learner.init_carry,
-        act=lambda state, *step, explore: act(state.learner, *step, explore=explore),
         export=lambda state: state.learner,
         policy=Policy(learner.init_carry, act, lambda params, obs: params),
         source=lambda state: sources.mixture(4, 2) if simulation else sources.real_rows(4),
         offline=sources.simulated_rows(4),
-        transform=compose(),
+        simulation=simulation,
     )
     options = LoopOptions(utd=PER_ROLLOUT / LENGTH, initial_rollouts=initial_rollouts, replay_capacity=200, guard=guard)
-    return assemble(parts, options, ENV, initial_policy=initial_policy, simulation=simulation)
+    return assemble(parts, options, ENV)._replace(initial_policy=initial_policy)
 
 
 FINE = make()
@@ -90,9 +88,9 @@ def test_every_purpose_of_every_member_draws_from_keys_that_no_other_uses():
         for parts, phase in (([0], "offline"), ([1], "logged"), ([0, 1], "online")):
             agent, _ = learn(agent, parts, 1, phase)
         played = [
-            finetuning._episode_keys(SEEDS, purpose, 0, 2) for purpose in (finetuning._COLLECT, finetuning._EVALUATE)
+            finetuning._episode_keys(SEEDS, purpose, 0, 2) for purpose in (Finetuning.COLLECT, Finetuning.EVALUATE)
         ]
-        played.append(finetuning._episode_keys(SEEDS, finetuning._COLLECT, 1, 2))
+        played.append(finetuning._episode_keys(SEEDS, Finetuning.COLLECT, 1, 2))
         return agent, [jax.vmap(jax.vmap(jax.random.normal))(x) for x in played], jax.random.normal(key)
 
     def drawn(params, key, data):
@@ -276,7 +274,7 @@ def test_the_policy_of_the_best_five_rollouts_is_kept():
         yielded[-1][0].best,
         [7 - 1, 11 - 1],
     )  # rollouts by the policies that are kept; of equal ones the first
-    assert best.rollouts.tolist() == played and best.score.tolist() == pytest.approx([1.0, 0.8])
+    assert best.age.tolist() == played and best.score.tolist() == pytest.approx([1.0, 0.8])
     before = np.stack([p.agent.learner for p, _ in yielded])
     np.testing.assert_array_equal(best.params, [before[played[0], 0], before[played[1], 1]])
     assert best.count.tolist() == [12, 12]
@@ -285,13 +283,13 @@ def test_the_policy_of_the_best_five_rollouts_is_kept():
 def test_equal_scores_are_told_apart_by_returns():
     returns = np.stack([[1] * 5 + [2] * 5, [2] * 5 + [1] * 5], 1)
     best = run(system=Scripted(np.ones((10, 2)), returns), rollouts=10)[-1][0].best
-    assert best.rollouts.tolist() == [9, 4] and best.total.tolist() == [2, 2]
+    assert best.age.tolist() == [9, 4] and best.total.tolist() == [2, 2]
 
 
 def test_the_best_policy_had_learned_from_what_came_before_it():
     """Six rollouts at once, by one policy that had learned from none."""
     best = run(make(initial_rollouts=6), Scripted(np.ones((6, 2))), rollouts=6)[-1][0].best
-    assert best.rollouts.tolist() == [0, 0] and best.params.tolist() == [0.5, 0.0]
+    assert best.age.tolist() == [0, 0] and best.params.tolist() == [0.5, 0.0]
 
 
 def test_an_explosion_is_reported_as_the_worst_that_is_known():

@@ -51,7 +51,8 @@ class Point(NamedTuple):
 
 
 TASK = Point()
-tdmpc2_model.SIZES["tiny"] = tdmpc2_model.Size(encoder=8, mlp=8, latent=8, members=3)
+TINY = "tiny"
+tdmpc2_model.SIZES[TINY] = tdmpc2_model.Size(encoder=8, mlp=8, latent=8, members=3)
 
 
 def shaken(params, scale=0.3):

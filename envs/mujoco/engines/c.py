@@ -62,8 +62,9 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
     def on_host(values: dict[str, Any], state: Any, controls: Any, *, move: bool) -> Any:
         values, state, controls = jax.tree.map(np.asarray, (values, state, controls))
         lead = state.qpos.shape[:-1]
-        flat = lambda x: x.reshape(-1, *x.shape[len(lead) :])  # noqa: E731
-        values, state, controls = jax.tree.map(flat, (values, state, controls))
+        values, state, controls = jax.tree.map(
+            lambda x: x.reshape(-1, *x.shape[len(lead) :]), (values, state, controls)
+        )
         after = jax.tree.map(np.empty_like, state)
         if host.nsensordata:
             after = after._replace(sensordata=np.empty((len(controls), host.nsensordata), np.float32))
@@ -139,8 +140,8 @@ def _steps(slot: _Slot, state: Any, controls: np.ndarray) -> np.ndarray:
     mujoco.mj_resetData(model, data)
     start = np.concatenate([[0.0], state.qpos, state.qvel])  # time comes first
     rolled, sensed = np.empty((1, len(controls), len(start))), np.empty((1, len(controls), model.nsensordata))
-    slot.rollout.rollout(
-        [model], [data], start[None], controls[None].astype(np.float64), skip_checks=True, nstep=len(controls),
-        initial_warmstart=state.warmstart[None].astype(np.float64), state=rolled, sensordata=sensed,
-    )  # fmt: skip
+    controls, warmstart = (x[None].astype(np.float64) for x in (controls, state.warmstart))
+    results = {"state": rolled, "sensordata": sensed}
+    steps = {"nstep": controls.shape[1], "initial_warmstart": warmstart}
+    slot.rollout.rollout([model], [data], start[None], controls, skip_checks=True, **steps, **results)
     return sensed[0, -1]

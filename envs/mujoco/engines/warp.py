@@ -70,11 +70,13 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...] = ()) -> Engine:
         @together.def_vmap
         def _(size: int, batched: PyTree, *args: PyTree) -> tuple[Any, Any]:
             """A batch of batches is one larger batch: Warp wants all of its worlds at once."""
-            spread = lambda x, b: x if b else jnp.broadcast_to(x, (size, *x.shape))  # noqa: E731
-            flat = jax.tree.map(
-                lambda x: x.reshape(size * x.shape[1], *x.shape[2:]), jax.tree.map(spread, args, tuple(batched))
-            )
-            after = jax.tree.map(lambda x: x.reshape(size, len(x) // size, *x.shape[1:]), together(*flat))
+
+            def flat(x: Array, is_batched: bool) -> Array:
+                spread = x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
+                return spread.reshape(size * spread.shape[1], *spread.shape[2:])
+
+            after = together(*jax.tree.map(flat, args, tuple(batched)))
+            after = jax.tree.map(lambda x: x.reshape(size, len(x) // size, *x.shape[1:]), after)
             return after, jax.tree.map(lambda _: True, after)
 
         def alone(*args: PyTree) -> PyTree:

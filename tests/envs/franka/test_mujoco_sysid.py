@@ -26,7 +26,7 @@ LOW, HIGH, MIDDLE = 250.0, 2500.0, 1375.0  # N s/m
 TRUE = (600.0, 2200.0)  # far from the middle, where both searches begin
 OURS, THEIRS = 0.15, 0.01  # how far either may be off, as a share of the truth
 NOMINAL = {p.name: p.nominal for p in SCENE.parameters}
-ENV = hammer.make("c")
+ENV = envs.make("hammer", "c")
 
 
 @pytest.fixture(scope="module")

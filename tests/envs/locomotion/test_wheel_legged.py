@@ -185,3 +185,26 @@ def test_starts_and_states_that_are_seen_again(task):
     np.testing.assert_allclose(one, other, atol=1e-6)
     late = env.step(world, state._replace(time=jnp.int32(env.episode_length - 1)), jnp.zeros(1), KEY)
     assert late.truncated and not late.terminated and not state.truncated
+
+
+def test_seconds_upright_and_in_place():
+    """The first robot drifts beyond 0.2 m in its third step and comes back; the second falls in its fourth."""
+    x = [[0.0, 0.19, -0.21, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 0.0]]
+    pitch = np.radians([[0.0, 29.0, -29.0, 0.0, 0.0], [0.0, 0.0, 0.0, -31.0, 0.0]])
+    obs = np.zeros((2, 5, 4))
+    obs[..., 0], obs[..., 2] = x, pitch
+    valid = np.array([[True] * 5, [True] * 4 + [False]])  # the step of the fall is the last that counts
+    measured = wheel_legged.measures(obs, valid)
+    assert measured["upright_s"].tolist() == pytest.approx([5 * wheel_legged.CONTROL_DT, 3 * wheel_legged.CONTROL_DT])
+    assert measured["in_place_s"].tolist() == pytest.approx([2 * wheel_legged.CONTROL_DT, 3 * wheel_legged.CONTROL_DT])
+
+
+def test_the_error_of_the_speed_counts_while_it_is_upright():
+    """0.3 and 0.1 m/s are 0.1 off. A robot that falls at once is judged by its first step."""
+    obs = np.zeros((2, 3, 3))
+    obs[..., 0] = [[0.3, 0.1, 9.0], [-0.8, 5.0, 5.0]]
+    obs[..., 1] = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+    valid = np.array([[True, True, True], [True, False, False]])
+    measured = wheel_forward.measures(obs, valid)
+    assert measured["upright_s"].tolist() == pytest.approx([2 * wheel_legged.CONTROL_DT, 0.0])
+    assert measured["speed_error"].tolist() == pytest.approx([0.1, 1.0])

@@ -82,7 +82,7 @@ ROWS = [
             "studies.factorial --reals",
             "studies.scoreboard --gaps",
             "collect --level 1 --task push --real",
-            "compare_hybrid --methods sac --reference sac --task push --gaps",
+            "compare hybrid --methods sac --reference sac --task push --gaps",
             "demo --real",
         )
     ],

@@ -12,7 +12,6 @@ from runs_by_hand import save
 from envs.rollout import Episode
 from envs.types import UserError
 from sgft_jax.analysis.curves import (
-    COLUMNS,
     Curve,
     area,
     at,
@@ -22,27 +21,33 @@ from sgft_jax.analysis.curves import (
     deepest_fall,
     describe,
     from_main_priors,
-    from_rows,
     improvement,
     make_curve,
-    read_curve,
-    read_data,
-    read_runs,
-    rows,
-    set_name,
     spread,
     training_score,
     transitions_until_held,
     zero_shot,
 )
+from sgft_jax.analysis.reading import read_curve, read_runs, set_name
+from sgft_jax.analysis.release import COLUMNS, from_rows, read_data, rows
 
 
 def curve(values, rollouts=(0, 1, 2, 4), *, method="sac", variant="", priors="fast", prior=None, score="success"):
     values, rollouts = np.atleast_2d(np.asarray(values, float)), np.asarray(rollouts)
-    members = np.arange(len(values))
-    prior = np.full(len(values), -1) if prior is None else np.asarray(prior)
-    axes = (rollouts, 20 * rollouts, rollouts / 30)
-    return Curve("toy", "default", method, variant, priors, members, prior, *axes, {score: values}, score)
+    return Curve(
+        "toy",
+        "default",
+        method,
+        variant,
+        priors,
+        seeds=np.arange(len(values)),
+        x=rollouts,
+        scores={score: values},
+        score=score,
+        prior=np.asarray(-1 if prior is None else prior),
+        transitions=20 * rollouts,
+        minutes=rollouts / 30,
+    )
 
 
 def test_area_is_on_the_common_grid():
@@ -218,7 +223,7 @@ def test_a_flat_table_and_back():
     assert len(table) == 8 + 4 and table[1]["rollouts"] == 1 and table[1]["success"] == 0.2
     for one, other in zip(original, from_rows(table), strict=True):
         assert (one.name, one.priors, one.score) == (other.name, other.priors, other.score)
-        for name in ("seeds", "prior", "rollouts", "transitions", "minutes", "values"):
+        for name in ("seeds", "prior", "x", "transitions", "minutes", "values"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
         assert (one.training is None) == (other.training is None)
     np.testing.assert_array_equal(from_rows(table)[1].training, original[1].training)

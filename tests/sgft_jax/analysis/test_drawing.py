@@ -6,16 +6,13 @@ import pytest
 from test_curves import curve
 
 from sgft_jax.analysis import figures
-from sgft_jax.analysis.hybrid import EVERY, Outcome, Results
+from sgft_jax.analysis.curves import Curve
+from sgft_jax.analysis.hybrid import Results
 
 
 def curves(count, seeds=3):
     values = np.random.default_rng(0).uniform(0.2, 1.0, (count, seeds, 5))
     return [curve(x, np.arange(5), method=f"method-{i}") for i, x in enumerate(values)]
-
-
-def drawn(count, seeds=3):
-    return [figures._line(own) for own in curves(count, seeds)]
 
 
 def pixels(image, color):
@@ -32,9 +29,9 @@ def test_the_axis_says_how_long_a_rollout_is_where_evaluations_are_free():
     """On a robot they are real episodes, and transitions those of both."""
     (own,) = curves(1)
     steps = int(own.transitions[1])
-    assert figures._rollouts([own]).startswith(f"real rollouts of {steps} transitions, ")
+    assert figures._unit([own]).startswith(f"real rollouts of {steps} transitions, ")
     dear = dataclasses.replace(own, transitions=own.transitions + 20 * steps * np.array([0, 1, 2, 2, 2]))
-    assert figures._rollouts([dear]) == "real rollouts"
+    assert figures._unit([dear]) == "real rollouts"
 
 
 @pytest.mark.parametrize("count", [1, 2, 6])
@@ -55,7 +52,7 @@ def test_a_long_title_is_not_cut_off(real, tmp_path):
 
 @pytest.mark.parametrize(("count", "sizes"), [(6, [6]), (7, [4, 3]), (13, [5, 4, 4])])
 def test_more_than_six_curves_become_small_multiples(count, sizes):
-    parts = figures._split("push", drawn(count))
+    parts = figures._split("push", curves(count))
     assert [len(own) for _, own, _ in parts] == sizes
     assert all(len(own) + len(others) == count or not others for _, own, others in parts)
     assert len({line.name for _, own, _ in parts for line in own}) == count
@@ -73,7 +70,7 @@ def test_parts_of_a_panel_have_one_scale(tmp_path, monkeypatch):
 
 
 def test_colours_are_distinct_in_a_panel_and_stay_from_panel_to_panel():
-    eight = drawn(8)
+    eight = curves(8)
     colours = figures._colours(line.name for line in eight)
     assert colours(eight[:3]) == list(figures.PALETTE[:3]) and colours(eight[1:2]) == [figures.PALETTE[1]]
     assert len(set(colours([eight[0], eight[6], eight[7]]))) == 3  # the seventh would have the first one's
@@ -86,9 +83,9 @@ def test_a_band_needs_three_seeds(tmp_path):
         for n in (1, 2)
     ]
     assert pixels(images[0], figures.PALETTE[0]) == pixels(images[1], figures.PALETTE[0])
-    assert figures._note(drawn(1, seeds=1)) == "one seed"
-    assert figures._note(drawn(1, seeds=2)) == "line: interquartile mean of 2 seeds"
-    assert "drawing seeds" in figures._note(drawn(1, seeds=3))
+    assert figures._note(curves(1, seeds=1)) == "one seed"
+    assert figures._note(curves(1, seeds=2)) == "line: interquartile mean of 2 seeds"
+    assert "drawing seeds" in figures._note(curves(1, seeds=3))
 
 
 def test_returns_are_drawn_too(tmp_path):
@@ -103,28 +100,42 @@ def test_a_run_without_a_real_rollout_is_drawn(tmp_path):
 def test_curves_over_updates(tmp_path, monkeypatch):
     """A panel for each simulator; methods without one are in both, those that miss a run in none."""
     updates, scores = np.array([0, 10_000, 20_000]), np.arange(9.0).reshape(3, 3)
-    places = [("h2oplus:released", "medium", "gravity"), ("iql", "medium", EVERY), ("sac", EVERY, "friction")]
-    found = [Outcome(*own, scores[:, -1], updates, scores + 5 * i) for i, own in enumerate(places)]
-    found.append(Outcome("iql", "replay", EVERY, scores[:, -1], updates, scores))
-    methods = [own.method for own in found[:3]]
-    results = Results("halfcheetah", "return", ("medium", "replay"), ("gravity", "friction"), methods, found)
-    seen, lines = {}, figures.lines
-
-    def draw(path, panels, labels, *, title):
-        seen.update(panels)
-        return lines(path, panels, labels, title=title)
-
-    monkeypatch.setattr(figures, "lines", draw)
-    image = read(figures.hybrid_curves(tmp_path / "h.png", results, "medium", title="Medium"))
+    places = [("h2oplus", "released", "medium", "gravity"), ("iql", "", "medium", ""), ("sac", "", "", "friction")]
+    places.append(("iql", "", "replay", ""))
+    curves = [
+        Curve(
+            "halfcheetah",
+            gap,
+            method,
+            preset,
+            seeds=np.arange(3),
+            x=updates,
+            scores={"return": scores + 5 * (i % 3)},
+            score="return",
+            data=data,
+            unit="updates",
+        )
+        for i, (method, preset, data, gap) in enumerate(places)
+    ]
+    methods = [curve.spec for curve in curves[:3]]
+    results = Results(("medium", "replay"), ("gravity", "friction"), methods, curves)
+    figures_made, save = [], figures._save
+    monkeypatch.setattr(figures, "_save", lambda figure, path: figures_made.append(figure) or save(figure, path))
+    image = read(figures.learning_curves(tmp_path / "h.png", results.panels("medium"), title="Medium"))
     assert [pixels(image, color) > 200 for color in figures.PALETTE[:4]] == [True] * 3 + [False]
-    names = {words: [line.name for line in own] for words, own in seen.items()}
-    assert names == {
-        "simulator: gravity": ["h2oplus:released", "iql"], "simulator: friction": ["iql", "sac"],
-    }  # fmt: skip
-    line = seen["simulator: friction"][1]
-    assert (line.family, line.seeds, line.x.tolist()) == ("simulator", 3, [0, 10_000, 20_000])
-    np.testing.assert_allclose(line.band.estimate, [13, 14, 15])  # of 10, 13, 16 and so on
-    assert (line.band.low < line.band.estimate).all()
+    panels = {axes.get_title(loc="left"): axes for axes in figures_made[0].axes}
+    lines = {words: {line.get_label(): line for line in axes.get_lines()} for words, axes in panels.items()}
+    assert {words: list(drawn) for words, drawn in lines.items()} == {
+        "simulator: gravity": ["h2oplus:released", "iql"],
+        "simulator: friction": ["iql", "sac"],
+    }
+    assert {axes.get_xlabel() for axes in panels.values()} == {"updates"}
+    line = lines["simulator: friction"]["sac"]
+    assert line.get_xdata().tolist() == [0, 10_000, 20_000]
+    np.testing.assert_allclose(line.get_ydata(), [13, 14, 15])  # of 10, 13, 16 and so on
+    (sac,) = (curve for curve in results.panels("medium")["simulator: friction"] if curve.name == "sac")
+    band = panels["simulator: friction"].collections[1].get_paths()[0].get_extents()  # of three seeds
+    assert sac.family == "simulator" and band.ymin < 13 and band.ymax > 15
 
 
 @pytest.mark.parametrize("n", [1, 200])

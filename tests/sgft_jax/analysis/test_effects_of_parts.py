@@ -5,9 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from sgft_jax.analysis.factorial import Factor, effects
+from sgft_jax.analysis.factorial import effects
 
-FACTORS = [Factor(name, "off", "on") for name in ("a", "b", "c")]
+FACTORS = ("a", "b", "c")
 
 
 def planted(members=12):

@@ -10,8 +10,9 @@ import pytest
 from runs_by_hand import pretrained, save
 
 from envs.types import UserError
-from sgft_jax.analysis.curves import COLUMNS, area, read_data, read_runs
-from sgft_jax.analysis.release import export
+from sgft_jax.analysis.curves import area
+from sgft_jax.analysis.reading import read_runs
+from sgft_jax.analysis.release import COLUMNS, export, read_data
 from sgft_jax.files.csvfile import read_csv
 
 DATA = Path(__file__).parents[3] / "docs" / "data"
@@ -27,7 +28,7 @@ def test_runs_become_tables_and_the_same_curves_again(tmp_path):
     before, after = ({(c.task, c.gap, c.name): c for c in found.curves} for found in (read_runs(out), read_data(to)))
     assert before.keys() == after.keys()
     for key, curve in before.items():
-        for name in ("seeds", "prior", "rollouts", "transitions"):
+        for name in ("seeds", "prior", "x", "transitions"):
             np.testing.assert_array_equal(getattr(after[key], name), getattr(curve, name))
         for score in ("success", "return"):
             np.testing.assert_allclose(after[key].of(score).values, curve.of(score).values, rtol=5e-4)
@@ -55,7 +56,7 @@ def test_what_is_there_already_stays_and_the_same_run_is_replaced(tmp_path):
     export(first, to)
     assert {path.name: path.read_bytes() for path in to.iterdir()} == once
     export(second, to)
-    assert {c.method: c.rollouts[-1] for c in read_data(to).curves} == {"sac": 40, "mbpo": 20}
+    assert {c.method: c.x[-1] for c in read_data(to).curves} == {"sac": 40, "mbpo": 20}
     assert len(read_csv(to / "runs.csv.gz")) == 2
 
 
@@ -127,18 +128,18 @@ def test_the_released_tables():
     assert runs == {tuple(getattr(c, name) for name in identity) for c in curves} and len(runs) == len(curves)
     judged_by_return = {"halfcheetah"}
     assert all((c.score == "return") == (c.task in judged_by_return) for c in curves)
-    assert all("return" in c.scores and c.rollouts[0] == 0 for c in curves)
+    assert all("return" in c.scores and c.x[0] == 0 for c in curves)
 
 
 def test_tuning_tells_the_areas_of_its_trials():
     """What tuning.csv says of a trial follows from trials.csv: the mean area up to the budget's rollouts."""
-    from sgft_jax.analysis.curves import from_rows
+    from sgft_jax.analysis.release import from_rows
 
     trials = {(c.method, c.variant): c for c in from_rows(read_csv(DATA / "trials.csv.gz"))}
     told = read_csv(DATA / "tuning.csv.gz")
     assert len(told) == len(trials) == 16
     for row in told:
         curve = trials[row["method"], f"trial-{row['trial']}"]
-        grid = curve.rollouts[curve.rollouts <= json.loads(row["budget"])["rollouts"]]
+        grid = curve.x[curve.x <= json.loads(row["budget"])["rollouts"]]
         found = area(curve, grid)
         assert found is not None and found.mean() == pytest.approx(float(row["area"]), abs=1e-3)

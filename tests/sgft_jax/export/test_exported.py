@@ -25,7 +25,7 @@ from sgft_jax.export.folder import save_exported
 from sgft_jax.export.graph import Graph, Node, Slot
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
-from sgft_jax.learners.actor import ACTORParams
+from sgft_jax.learners.actor import ActorParams
 from sgft_jax.models import distortion
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import make_actor, make_affine_actor, make_deterministic_actor
@@ -61,7 +61,7 @@ def of_recurrent(env):
 
 def of_actor(env, head):
     actor = drawn(ACTORS[head](env.obs_dim, env.act_dim, NETWORK).init)
-    return ACTORParams(actor, None), {"algorithm": "actor", "network": jsonable(NETWORK), "head": head}
+    return ActorParams(actor, None), {"algorithm": "actor", "network": jsonable(NETWORK), "head": head}
 
 
 def of_tdmpc2(env):

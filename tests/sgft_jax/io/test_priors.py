@@ -16,7 +16,7 @@ from sgft_jax.files.folders import ASIDE
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io import checkpoint, priors
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
-from sgft_jax.learners.actor import ACTORParams, make_actor_of
+from sgft_jax.learners.actor import ActorParams, make_actor_of
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.types import Normalizer, Prior
@@ -68,7 +68,7 @@ def test_every_learner_that_leaves_a_prior_names_its_container(tmp_path):
         "anchored": (params._replace(anchor=params.policy), {"config": planner, "algorithm": "tdmpc2"}),
         "recurrent": (drawn(lambda key: recurrent.extract_params(memory.init(key))), {"config": {"gru": 6}}),
         "actor": (
-            ACTORParams(drawn(make_actor_of("affine", 4, 2, NETWORK).init), make_prior().params.normalizer),
+            ActorParams(drawn(make_actor_of("affine", 4, 2, NETWORK).init), make_prior().params.normalizer),
             {"head": "affine"},
         ),
     }

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax.learners.actor import ACTORParams, actor_policy
+from sgft_jax.learners.actor import ActorParams, actor_policy
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import make_actor, make_affine_actor, tanh_gaussian_sample
 from sgft_jax.models.normalizer import identity, normalize
@@ -17,7 +17,7 @@ NETWORK = NetworkConfig((8,))
 def test_the_density_is_that_of_the_draw(key, head):
     """The same key draws the same action; the density of the draw knows what tanh has squashed."""
     network = make_actor(3, 2, NETWORK) if head == "gaussian" else make_affine_actor(3, 2, NETWORK, output_gain=1.0)
-    params = ACTORParams(network.init(key), identity(3))
+    params = ActorParams(network.init(key), identity(3))
     policy, obs = actor_policy(3, 2, NETWORK, head), jnp.array([0.3, -1.0, 2.0])
     assert policy.log_prob is not None
     for seed in range(5):
@@ -31,7 +31,7 @@ def test_the_density_is_that_of_the_draw(key, head):
 
 def test_an_action_at_the_bound_has_a_finite_density(key):
     policy = actor_policy(3, 2, NETWORK, "gaussian")
-    params = ACTORParams(make_actor(3, 2, NETWORK).init(key), identity(3))
+    params = ActorParams(make_actor(3, 2, NETWORK).init(key), identity(3))
     assert policy.log_prob is not None
     assert jnp.isfinite(policy.log_prob(params, jnp.zeros(3), jnp.array([1.0, -1.0])))
 

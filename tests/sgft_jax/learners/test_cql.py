@@ -35,7 +35,7 @@ def test_soft_maximum_by_hand():
 def penalty(q, samples, key, conservatism=2.0):
     config = cql.CQLConfig(1, 1, samples=samples, conservatism=conservatism)
     critic = lambda params, obs, action: q(obs, action)  # noqa: E731
-    return jax.jit(lambda key: cql._penalty(config)(critic, None, uniform, batch_of(key, 0.5), key))(key)
+    return jax.jit(lambda key: cql.penalty(config, critic, None, uniform, batch_of(key, 0.5), key))(key)
 
 
 def test_the_penalty_of_flat_critics_is_known(key):

@@ -1,11 +1,11 @@
 """H2O: who is pushed down and how far, by hand; the sign of the gap; what moves what. See test_contract_learners.py."""
 
-import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from probes import compiled_once
 
 from envs.types import UserError
 from sgft_jax.learners import h2o
@@ -24,7 +24,7 @@ RATIO = ratio.make_ratio(ratio.RatioConfig(3, 2, BODY))
 @pytest.fixture(scope="module")
 def learner():
     made = h2o.make_h2o(CONFIG, h2o.H2OHyper(lr_ratio=1e-2, alpha=0.5))
-    return made._replace(init=jax.jit(made.init), update=jax.jit(chex.assert_max_traces(made.update, 1)))
+    return compiled_once(made)
 
 
 def batch_of(key, shift=0.0):

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from probes import compiled_once
 from tuners import slow_but
 
 from envs.types import UserError
@@ -24,7 +25,7 @@ RATIO = ratio.make_ratio(ratio.RatioConfig(3, 2, BODY))
 
 def compiled(config, **numbers):
     learner = h2oplus.make_h2oplus(config, h2oplus.H2OPlusHyper(**numbers))
-    return learner._replace(init=jax.jit(learner.init), update=jax.jit(chex.assert_max_traces(learner.update, 1)))
+    return compiled_once(learner)
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from probes import compiled_once
 
 from sgft_jax.learners import iql
 from sgft_jax.models import networks, normalizer
@@ -161,7 +162,7 @@ def test_probe_actions_outside_the_data_are_never_used(key):
 CLIP = 0.05
 CONFIG = iql.IQLConfig(3, 2, network=networks.NetworkConfig((8,)), max_grad_norm=CLIP)
 SMALL = iql.make_iql(CONFIG, iql.IQLHyper(lr_actor=1e-2))
-SMALL = SMALL._replace(init=jax.jit(SMALL.init), update=jax.jit(chex.assert_max_traces(SMALL.update, n=1)))
+SMALL = compiled_once(SMALL)
 SMALL_CRITIC, SMALL_VALUE = networks.make_critic(3, 2, CONFIG.network), networks.make_value(3, CONFIG.network)
 
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from probes import compiled_once
 
 from envs.types import UserError
 from sgft_jax.learners import rebrac
@@ -22,7 +23,7 @@ ROWS = 8
 @pytest.fixture(scope="module")
 def learner():
     made = rebrac.make_rebrac(CONFIG, rebrac.ReBRACHyper(target_noise=0.0, actor_penalty=0.3, critic_penalty=0.2))
-    return made._replace(init=jax.jit(made.init), update=jax.jit(chex.assert_max_traces(made.update, 1)))
+    return compiled_once(made)
 
 
 def batch_of(key):

@@ -1,6 +1,7 @@
 """SAC: temperature, ensembles of critics, what moves, what starts from a prior. See also test_contract_learners.py."""
 
 import dataclasses
+from functools import partial
 
 import chex
 import jax
@@ -188,8 +189,8 @@ def test_a_critic_term_joins_the_loss(key):
             assert action.shape == (1,) and log_prob.shape == ()
             return 3.0 + slope * jnp.mean(jax.vmap(critic, (None, 0, 0))(params, batch.obs, batch.action))
 
-        learner = sac.make_sac(config, critic_term=term)
-        return jax.jit(learner.update)(learner.init(key), probe(key), key)
+        update = jax.jit(partial(sac.update, config, critic_term=term))
+        return update(sac.init(config, key), probe(key), key)
 
     (flat, of_flat), (steep, of_steep) = after(0.0), after(5.0)
     assert not equal(flat.critic, steep.critic)
@@ -285,7 +286,7 @@ def prior():
 
 
 def tuned(prior, *, reset, extra=0, **options):
-    config = sac.SACConfig(3, 2, extra, network=NET, train_value=False, train_dynamics=False, **options)
+    config = sac.SACConfig(3, 2, context_dim=extra, network=NET, train_value=False, train_dynamics=False, **options)
     return sac.make_sac(config), sac.state_from_prior(
         config, sac.SACHyper(alpha=0.01), prior, jax.random.key(0), reset_critic=reset
     )

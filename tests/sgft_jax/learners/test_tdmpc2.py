@@ -27,7 +27,7 @@ INIT = jax.jit(LEARNERS[PLAIN].init)
 UPDATE = {PLAIN: case("tdmpc2").learner.update, SGFT: case("sgft-tdmpc2").learner.update}
 ACT = jax.jit(functools.partial(LEARNERS[PLAIN].act, explore=True))
 VALUE = jax.jit(tdmpc2_model.value_of, static_argnums=0)
-PARTS = tdmpc2_model.make_parts(PLAIN)
+PARTS = tdmpc2_model.make_networks(PLAIN)
 PARTS = PARTS._replace(**{n: getattr(PARTS, n)._replace(apply=jax.jit(getattr(PARTS, n).apply)) for n in NETWORKS})
 HYPER = tdmpc2.TDMPC2Hyper()
 DECODE = jax.jit(jax.vmap(lambda logits: twohot.decode(logits, PLAIN.bins)))
@@ -128,7 +128,7 @@ def test_policy_spread_is_bounded(key):
 
 def test_dropout_acts_in_training_alone(key):
     config = dataclasses.replace(PLAIN, dropout=0.5)
-    parts, state = tdmpc2_model.make_parts(config), shaken(PLAIN, key)
+    parts, state = tdmpc2_model.make_networks(config), shaken(PLAIN, key)
     q = lambda keys: parts.critic.apply(state.critic.params, jnp.full(16, 0.25), jnp.ones(1), keys=keys)  # noqa: E731
     a, b = (q(jax.random.split(jax.random.key(i), PLAIN.size.members)) for i in (1, 2))
     assert jnp.array_equal(q(None), q(None)) and not jnp.allclose(a, b) and not jnp.allclose(a, q(None))
@@ -164,10 +164,10 @@ def test_sampled_value_is_the_lower_of_two_heads(key):
 def test_drawn_heads_are_those_of_the_whole_critic(key, trained):
     """Evaluated alone, with their own parameters and dropout, two heads say what they say among all."""
     config = dataclasses.replace(PLAIN, dropout=0.5)
-    parts, params = tdmpc2_model.make_parts(config), shaken(PLAIN, key).critic.params
+    parts, params = tdmpc2_model.make_networks(config), shaken(PLAIN, key).critic.params
     heads = tdmpc2_model.two_heads(config, key)
     keys = jax.random.split(key, config.size.members) if trained else None
-    q = lambda params, keys: tdmpc2_model.q_values(config, parts, params, jnp.full(16, 0.25), jnp.ones(1), keys)  # noqa: E731
+    q = lambda params, keys: tdmpc2_model.q_values(parts, params, jnp.full(16, 0.25), jnp.ones(1), keys)  # noqa: E731
     every = q(params, keys)
     drawn = q(tdmpc2_model.heads_of(params, heads), keys if keys is None else keys[heads])
     np.testing.assert_allclose(drawn, every[heads], rtol=1e-6)
@@ -270,8 +270,8 @@ def test_invalid_rows_do_not_matter(config, key):
 def test_the_policy_learns_where_the_last_valid_step_led_and_no_further(key):
     """Of three latents of a window whose first step alone is valid, the first two count."""
     state, zs, valid = shaken(PLAIN, key), jnp.full((2, 3, 16), 0.25), jnp.array([[True, False], [True, True]])
-    parts = tdmpc2_model.make_parts(PLAIN)
-    loss = jax.jit(lambda zs: tdmpc2._update_policy(PLAIN, parts, state, zs, valid, None, key)[1]["actor/loss"])
+    parts = tdmpc2_model.make_networks(PLAIN)
+    loss = jax.jit(lambda zs: tdmpc2._update_policy(parts, state, zs, valid, None, key)[1]["actor/loss"])
     changed = [loss(zs.at[0, step, 0].add(1.0)) != loss(zs) for step in range(3)]
     assert changed == [True, True, False]
 
@@ -290,7 +290,7 @@ def test_scale_follows_the_range_of_values(key):
 
 @pytest.mark.parametrize("config", [pytest.param(PLAIN, marks=pytest.mark.slow), SGFT])
 def test_score_of_a_plan_against_a_loop(config, key):
-    state, parts = shaken(config, key), PARTS
+    state, parts = shaken(config, key), PARTS._replace(config=config)
     state = state.replace(hyper=state.hyper._replace(gamma=jnp.float32(0.5)))
     z = parts.encoder.apply(state.encoder.params, jnp.ones(2))
     plan = jnp.array([[0.3], [-0.8]])
@@ -306,7 +306,7 @@ def test_score_of_a_plan_against_a_loop(config, key):
         action = jnp.tanh(mean + jnp.exp(log_std) * jax.random.normal(key_action, (1,)))
         end = q_by_hand(state.critic.params, z, action)[tdmpc2_model.two_heads(config, key_heads)].mean()
     first = parts.encoder.apply(state.encoder.params, jnp.ones(2))
-    score = tdmpc2._score(config, parts, state, first, key)(plan)
+    score = tdmpc2._score(parts, state, first, key)(plan)
     assert score == pytest.approx(float(total + 0.25 * end), rel=1e-4)
 
 
@@ -323,12 +323,12 @@ def test_a_plan_costs_two_heads_whatever_their_number(key):
 
 
 def test_sgft_policy_is_promised_one_step_and_v_sim(key):
-    state, parts = shaken(SGFT, key), PARTS
+    state, parts = shaken(SGFT, key), tdmpc2_model.make_networks(SGFT)
     z, action = parts.encoder.apply(state.encoder.params, jnp.ones(2)), jnp.array([0.3])
     ahead = parts.dynamics.apply(state.dynamics.params, z, action)
     v = q_by_hand(state.critic.params, ahead, jnp.tanh(parts.policy.apply(state.anchor, ahead)[0])).mean()
     r = twohot.decode(parts.reward.apply(state.reward.params, z, action), SGFT.bins)
-    got = tdmpc2._promise(SGFT, parts, state, z, action, jnp.array([0, 1]), key)
+    got = tdmpc2._promise(parts, state, z, action, jnp.array([0, 1]), key)
     assert got == pytest.approx(float(r + 0.99 * v), rel=1e-4)
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from sgft_jax.hybrid.schedule import FLEET, SCHEDULES, Schedule, describe, name_of
+from sgft_jax.train.schedule import FLEET, SCHEDULES, Schedule, describe, name_of
 
 
 def test_schedules_have_the_rhythm_that_their_names_say():

@@ -17,12 +17,12 @@ from envs.pools import real_worlds
 from envs.rollout import step_fleet
 from envs.types import UserError
 from sgft_jax.data import replay
-from sgft_jax.hybrid import trainer
-from sgft_jax.hybrid.schedule import Schedule
 from sgft_jax.methods import FIXED_NAMES, get_method
 from sgft_jax.methods.options import return_scale
 from sgft_jax.policies import make_policy
-from sgft_jax.train.pretraining import over_members
+from sgft_jax.train import fleet, hybrid
+from sgft_jax.train.fleet import over_members
+from sgft_jax.train.schedule import Schedule
 from sgft_jax.types import RealData
 
 ENV = toy.make()
@@ -63,7 +63,7 @@ def keys_of(*seeds):
 def played(agent, schedule=SCHEDULE, masses=(1.0,), seeds=(0,), **given):
     """The state after every chunk."""
     pools, keys = pools_of(*masses), keys_of(*seeds)
-    steps = trainer.train(ENV, agent, schedule, pools, real_rows(), keys, gamma=0.9, **given)
+    steps = hybrid.train(ENV, agent, schedule, pools, real_rows(), keys, gamma=0.9, **given)
     return [(jax.tree.map(jnp.copy, state), metrics) for state, metrics in steps]
 
 
@@ -76,12 +76,12 @@ def plain(state):
 def test_nothing_is_learned_while_every_simulator_explodes(monkeypatch):
     """No row is kept then, and an empty buffer gives zeros."""
     monkeypatch.setattr(
-        trainer, "step_fleet", lambda env, *given, **more: step_fleet(
+        fleet, "step_fleet", lambda env, *given, **more: step_fleet(
             env._replace(step=lambda *step: env.step(*step)._replace(invalid=jnp.ones((), bool))), *given, **more
         ),
     )  # fmt: skip
     (start, _), (state, metrics), *_ = played(build())
-    assert int(state.simulated.size[0]) == 0 and int(state.rounds[0]) == 2
+    assert int(state.replay.size[0]) == 0 and int(state.rounds[0]) == 2
     chex.assert_trees_all_equal(state.learner, start.learner)
     assert all(np.isnan(values).all() for values in metrics.values())
 
@@ -90,10 +90,10 @@ def test_each_round_collects_and_learns():
     (start, none), *chunks = played(build())
     assert none == {} and len(chunks) == 4
     fill = 18  # six steps of three simulators hold a first batch of 16
-    assert int(start.simulated.size[0]) == fill and int(start.learner.step[0]) == 0
+    assert int(start.replay.size[0]) == fill and int(start.learner.step[0]) == 0
     for i, (state, metrics) in enumerate(chunks, 1):
         assert int(state.rounds[0]) == 2 * i and int(state.learner.step[0]) == 6 * i
-        assert int(state.simulated.size[0]) == min(fill + 6 * i, 64)
+        assert int(state.replay.size[0]) == min(fill + 6 * i, 64)
         assert all(np.isfinite(values).all() and values.shape == (1,) for values in metrics.values())
 
 
@@ -102,7 +102,7 @@ def test_no_key_is_used_twice(name):
     """In filling the buffer, in rounds of steps and in updates. The learners alone: test_contract_learners.py."""
     agent, real = build(name), jax.tree.map(jnp.asarray, real_rows())
     schedule = Schedule(updates=2, simulators=2, buffer=64, chunk_updates=2)
-    made = trainer.make_trainer(ENV, agent, schedule, gamma=0.9)
+    made = fleet.make_trainer(ENV, hybrid.make_plan(ENV, agent, schedule), gamma=0.9)
     pool = jax.tree.map(lambda x: x[0], pools_of(1.0))
 
     def whole(key):
@@ -117,14 +117,14 @@ def test_the_released_schedule_collects_long_and_then_learns_as_often():
     schedule = Schedule(updates=20, simulators=1, steps_per_round=10, buffer=100, chunk_updates=10)
     assert (schedule.updates_per_round, schedule.rounds_per_chunk, schedule.chunks) == (10, 1, 2)
     *_, (state, _) = played(build(), schedule)
-    assert int(state.simulated.size[0]) == 16 + 20 and int(state.learner.step[0]) == 20
+    assert int(state.replay.size[0]) == 16 + 20 and int(state.learner.step[0]) == 20
 
 
 def test_the_rows_are_those_of_the_members_own_simulator():
     """What a push does to a heavy and to a light point tells which simulator a row is from."""
     *_, (state, _) = played(build(), masses=(0.5, 4.0), seeds=(0, 0))
-    rows = state.simulated.data
-    held = np.arange(64) < int(state.simulated.size[0])
+    rows = state.replay.data
+    held = np.arange(64) < int(state.replay.size[0])
     pushed = np.asarray(rows.next_obs[:, held, 2:] - (1 - 0.1 * 4.0) * rows.obs[:, held, 2:])
     gain = [np.polyfit(np.asarray(rows.action[i, held]).ravel(), pushed[i].ravel(), 1)[0] for i in range(2)]
     np.testing.assert_allclose(gain, [0.1 * toy.FORCE / 0.5, 0.1 * toy.FORCE / 4.0], rtol=0.1)
@@ -135,11 +135,11 @@ def test_the_buffer_keeps_the_actions_without_the_noise_of_the_gap():
     env, noise = cartpole.make(), 0.2
     pools = real_worlds(env, [gaps.from_dict(env, "shaky", {"effects": {"action_noise": noise}})], jax.random.key(0))
     agent = get_method("sac", "fixed").build(dataclasses.replace(get_method("sac", "fixed").config, hidden=(16,)), env)
-    real, schedule = trainer.no_data(env), dataclasses.replace(SCHEDULE, simulators=32, buffer=512)
+    real, schedule = hybrid.no_data(env), dataclasses.replace(SCHEDULE, simulators=32, buffer=512)
     note = lambda learner, before, action, after: after.physics.ctrl  # noqa: E731
-    state, _ = next(trainer.train(env, agent, schedule, pools, real, keys_of(0), gamma=0.9, note=note))
-    held = slice(int(state.simulated.size[0]))
-    action, sent = (np.asarray(x)[0, held, 0] for x in (state.simulated.data.action, state.notes.data))
+    state, _ = next(hybrid.train(env, agent, schedule, pools, real, keys_of(0), gamma=0.9, note=note))
+    held = slice(int(state.replay.size[0]))
+    action, sent = (np.asarray(x)[0, held, 0] for x in (state.replay.data.action, state.notes.data))
     far = np.abs(action) < 0.5  # from the bounds, where clipping cuts the noise
     assert held.stop == 256 and far.sum() > 60 and np.abs(sent).max() <= 1
     assert (sent - action)[far].std() == pytest.approx(noise, rel=0.25)
@@ -165,7 +165,7 @@ def test_a_resumed_run_ends_like_an_uninterrupted_one(name):
 
 def test_the_shapes_of_a_state_are_known_without_training():
     agent = build()
-    like = trainer.shape_of(ENV, agent, SCHEDULE, pools_of(1.0), real_rows(), keys_of(0))
+    like = hybrid.shape_of(ENV, agent, SCHEDULE, pools_of(1.0), real_rows(), keys_of(0))
     chex.assert_trees_all_equal_shapes_and_dtypes(plain_shapes(like), plain_shapes(played(agent)[-1][0]))
 
 
@@ -190,7 +190,7 @@ def test_sac_sees_no_real_row():
     agent, pools, keys = build("sac"), pools_of(1.0), keys_of(0)
     ends = []
     for sign in (-1, 1):
-        *_, (state, _) = trainer.train(ENV, agent, SCHEDULE, pools, rows(sign), keys, gamma=0.9)
+        *_, (state, _) = hybrid.train(ENV, agent, SCHEDULE, pools, rows(sign), keys, gamma=0.9)
         ends.append(state.learner)
     chex.assert_trees_all_equal(*ends)
 
@@ -299,10 +299,10 @@ def test_a_preset_that_is_no_default_learns_with_its_own_numbers():
 
 def test_the_bytes_of_a_run_are_those_of_its_buffers_and_of_one_copy_of_the_data():
     """A row is 4 + 2 + 1 + 1 + 4 floats: 48 bytes. Two counters of 4 bytes go with each buffer."""
-    assert trainer.memory(ENV, build(), SCHEDULE, real_rows()) == (64 * 48 + 8, 50 * 48 + 8)
-    assert trainer.memory(ENV, build("iql"), SCHEDULE, real_rows()).buffer == 0
-    state = trainer.shape_of(ENV, build(), SCHEDULE, pools_of(0.5, 4.0), real_rows(), keys_of(0, 0))
-    assert sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state.simulated)) == 2 * (64 * 48 + 8)
+    assert hybrid.memory(ENV, build(), SCHEDULE, real_rows()) == (64 * 48 + 8, 50 * 48 + 8)
+    assert hybrid.memory(ENV, build("iql"), SCHEDULE, real_rows())[0] == 0
+    state = hybrid.shape_of(ENV, build(), SCHEDULE, pools_of(0.5, 4.0), real_rows(), keys_of(0, 0))
+    assert sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state.replay)) == 2 * (64 * 48 + 8)
 
 
 @pytest.mark.slow
@@ -313,8 +313,10 @@ def test_a_chunk_holds_neither_buffers_nor_data_twice():
         """Bytes of the temporaries of two members' chunk."""
         agent, schedule = build(), dataclasses.replace(SCHEDULE, buffer=n)
         inputs = pools_of(0.5, 4.0), real_rows(n), keys_of(0, 1)
-        state = trainer.shape_of(ENV, agent, schedule, *inputs)
-        chunk = over_members(trainer.make_trainer(ENV, agent, schedule, gamma=0.9).chunk, 2, shared=(1,))
+        state = hybrid.shape_of(ENV, agent, schedule, *inputs)
+        chunk = over_members(
+            fleet.make_trainer(ENV, hybrid.make_plan(ENV, agent, schedule), gamma=0.9).chunk, 2, shared=(1,)
+        )
         kept = jax.eval_shape(agent.keep, inputs[1])
         made = jax.jit(chunk, donate_argnums=2).lower(inputs[0], kept, state).compile()
         return made.memory_analysis().temp_size_in_bytes
@@ -332,7 +334,7 @@ def test_two_critics_without_diversity_are_those_of_h2oplus():
 @pytest.mark.parametrize("name", ["iql", "rebrac"])
 def test_offline_methods_have_no_simulator(name):
     state, _ = played(build(name))[-1]
-    assert state.fleet is None and state.simulated is None and int(state.learner.step[0]) == 24
+    assert state.fleet is None and state.replay is None and int(state.learner.step[0]) == 24
 
 
 @pytest.mark.slow
@@ -398,8 +400,8 @@ def test_notes_lie_beside_their_rows():
     note = lambda learner, before, action, after: (before.obs, action, after.obs)  # noqa: E731
     schedule = dataclasses.replace(SCHEDULE, updates=12, buffer=20)
     state, _ = played(build("sac"), schedule, note=note)[-1]
-    (obs, action, next_obs), rows = state.notes.data, state.simulated.data
-    assert int(state.notes.position[0]) == int(state.simulated.position[0]) and int(state.notes.size[0]) == 20
+    (obs, action, next_obs), rows = state.notes.data, state.replay.data
+    assert int(state.notes.position[0]) == int(state.replay.position[0]) and int(state.notes.size[0]) == 20
     for kept, own in ((obs, rows.obs), (action, rows.action), (next_obs, rows.next_obs)):
         np.testing.assert_array_equal(kept, own)
     assert np.abs(action).max() > 0

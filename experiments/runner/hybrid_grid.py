@@ -1,0 +1,226 @@
+"""A grid of runs on real data and a simulator: its options, its cells and how far each has got, what they scored.
+
+A cell is one run of `experiments.hybrid` with all seeds. Methods without a simulator run once for each data set, those
+without data once for each simulator.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from envs import extend, gaps
+from envs.gaps import SIM
+from envs.types import UserError, unknown
+from experiments.hybrid import arguments, hybrid
+from experiments.runner import cells, cli
+from experiments.runner.cells import Cell, Kind, WorkArgs
+from experiments.runner.hybrid_args import (
+    DEFAULT,
+    VOLATILE,
+    HybridArgs,
+    SchedulePreset,
+    data_name,
+    gaps_of,
+    run_folder,
+)
+from experiments.runner.options import (
+    at_least_one,
+    check_data,
+    check_task,
+    not_negative,
+    seed_list,
+    without_repeats,
+)
+from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.hybrid.presets import say_preset
+from sgft_jax.io.runs import check_folder
+from sgft_jax.methods import FIXED_NAMES, get_method
+from sgft_jax.train.schedule import FLEET, SCHEDULES, Schedule, name_of
+
+if TYPE_CHECKING:
+    from sgft_jax.analysis.curves import Curve
+    from sgft_jax.analysis.hybrid import Results
+
+
+@dataclass(frozen=True)
+class _Systems:
+    """What the cells are of, and what is shown of them."""
+
+    task: str = "halfcheetah"
+    """A task by name, or a Python file with a task of your own."""
+    methods: tuple[str, ...] = FIXED_NAMES
+    """Methods in the order in which they run, as METHOD or METHOD:PRESET; the latter is a variant of that name. rebrac
+    alone takes on each data set the preset that the file's name contains, if there is one."""
+    gaps: tuple[str, ...] = ()
+    """How simulators differ from the real system: gaps by name, .toml/.json files, or sim for no gap; default: all that
+    come with the task but variants of others, for halfcheetah and walker2d H2O+'s nine and seven."""
+    data: tuple[Path, ...] = ()
+    """The real data: files or folders, as `--data` of experiments.hybrid takes them (docs/data.md)."""
+    real: str = SIM
+    """The real system to evaluate in: sim for the task as it is, or a gap by name or as a file."""
+    previous_actions: int = 0
+    """Last actions that end the observation, for data of a policy that sees them."""
+    seeds: int = 5
+    """Number of seeds of each run."""
+    schedule_preset: SchedulePreset = FLEET
+    schedule: Schedule = field(default_factory=Schedule)
+    score: Literal["late", "last"] = "late"
+    """What tables show of a run: the mean of its last ten evaluations, or its last one."""
+    reference: str = DEFAULT
+    """Compare the others with this METHOD or METHOD:PRESET."""
+    export: Path | None = None
+    """Instead of running, write what has finished into hybrid.csv in this folder, which --released reads back."""
+    released: Path | None = None
+    """Instead of running, show what hybrid.csv in this folder holds of these runs, such as docs/data."""
+    beside: int | None = None
+    """With --released: also the rank correlation of the methods with those of runs of so many updates."""
+    seed: int = 0
+    """Expert: first seed."""
+    eval_every: int = 10_000
+    """Expert: updates between evaluations in the real system."""
+    eval_episodes: int = 10
+    """Expert: episodes per seed and evaluation."""
+
+
+@dataclass(frozen=True)
+class HybridGridArgs(WorkArgs, _Systems):  # this order puts the fields of the latter first
+    """A grid of runs; everything not named here is as `experiments.hybrid` has it."""
+
+
+def _title(args: HybridArgs) -> str:
+    method, data = get_method(args.method, "fixed"), "" if args.data is None else data_name(args.data)
+    gap = "" if method.kind == "offline" else gaps.title(args.gap[0])
+    spec = ":".join(filter(None, [args.method, args.variant]))
+    preset = f", {say_preset(method, args.preset, data)}" if method.by_data and not args.variant else ""
+    return f"{'/'.join(filter(None, [extend.name_of(args.task), gap, data]))}: {spec}{preset}"
+
+
+def _system(args: HybridArgs) -> str:
+    """The one simulator, or what stands for none."""
+    return gaps_of(args, get_method(args.method, "fixed"))[0]
+
+
+HYBRID = Kind(
+    name="hybrid",
+    systems="gap",
+    run=lambda args: hybrid(args),
+    folder=lambda args: run_folder(args, _system(args)),
+    config=lambda args: jsonable(args) | {"gap": _system(args)},
+    title=_title,
+    volatile=VOLATILE,
+    finished=lambda args, summary: True,  # a summary is written at the end; another schedule is refused
+)
+
+
+def defaults(argv: Sequence[str]) -> HybridGridArgs:
+    """Those of the chosen schedule."""
+    name = cli.preview(argv, schedule_preset=FLEET).schedule_preset
+    return HybridGridArgs(schedule_preset=name, schedule=cli.choose("--schedule-preset", name, SCHEDULES))
+
+
+def checked(args: HybridGridArgs) -> HybridGridArgs:
+    """The arguments with every gap by name; raises UserError for what is wrong in them alone."""
+    args = replace(args, gaps=gaps.each(args.gaps or tuple(gaps.presets(extend.name_of(args.task), variants=False))))
+    check(args)
+    return args
+
+
+def check(args: HybridGridArgs) -> None:
+    """Raises UserError for what is wrong in the arguments alone."""
+    at_least_one(args, "eval_every", "eval_episodes")
+    not_negative(args, "previous_actions", "minutes", "beside")
+    seed_list(args.seed, args.seeds)
+    check_task(args.task)
+    if not args.methods:
+        raise UserError("--methods: name at least one")
+    if not args.gaps:
+        raise UserError(f"--gaps: {extend.name_of(args.task)} comes with none; name some, or {SIM} for no gap")
+    for name, given in (("methods", args.methods), ("gaps", args.gaps), ("data", tuple(map(data_name, args.data)))):
+        without_repeats(f"--{name}", given)
+    check_task(args.task, args.gaps if args.real == SIM else (*args.gaps, args.real))
+    if odd := [spec for spec in args.methods if spec.partition(":")[0] not in FIXED_NAMES]:
+        raise UserError(unknown("--methods", odd[0], FIXED_NAMES))
+    if args.reference not in args.methods:
+        raise UserError(unknown("--reference", args.reference, args.methods))
+    learning = [name for name in args.methods if get_method(name.partition(":")[0], "fixed").kind != "simulator"]
+    if learning and not args.data:
+        raise UserError(f"--data: {learning[0]} learns from real data; name files or folders (docs/data.md)")
+    for path in args.data if args.released is None else ():
+        check_data("--data", path)
+    check_folder(args.out)
+    if args.export is not None:
+        check_folder(args.export, "--export")
+    if args.export is not None and args.released is not None:
+        raise UserError("--export and --released exclude each other: one writes hybrid.csv, the other shows it")
+    if args.beside is not None and args.released is None:
+        raise UserError("--beside: reads released tables; name their folder with --released")
+
+
+def cells_of(args: HybridGridArgs) -> list[Cell]:
+    """The cells, methods innermost, so that every data set is compared early."""
+    runs = [run for data in args.data or (None,) for method in args.methods for run in _runs(args, method, data)]
+    return [cells.look_up(HYBRID, run) for run in dict.fromkeys(runs)]  # of a method without data once
+
+
+def _runs(args: HybridGridArgs, method: str, data: Path | None) -> list[HybridArgs]:
+    """Of one method on one data set, a run for each simulator."""
+    name, _, preset = method.partition(":")
+    kind = get_method(name, "fixed").kind
+    shared = ("task", "real", "previous_actions", "seeds", "seed", "schedule_preset", "schedule", "eval_every")
+    shared += ("eval_episodes", "impl", "out")
+    given = {name: getattr(args, name) for name in shared}
+    data = None if kind == "simulator" else data
+    run = arguments(name, preset=preset, variant=preset, data=data, video=False, **given)
+    return [replace(run, gap=(gap,)) for gap in ((SIM,) if kind == "offline" else args.gaps)]
+
+
+def results(args: HybridGridArgs, curves: "Sequence[Curve]") -> "Results":
+    """Curves with the data sets, simulators and methods that tables have."""
+    from sgft_jax.analysis.hybrid import Results
+
+    data = [data_name(path) for path in args.data] or [""]
+    return Results(data, [gaps.title(gap) for gap in args.gaps], args.methods, curves, args.score)
+
+
+def finished(cells: Sequence[Cell]) -> "list[Curve]":
+    """The curves of the cells that have finished."""
+    from sgft_jax.analysis.reading import read_curve
+
+    return [read_curve(cell.folder) for cell in cells if cell.state == "finished"]
+
+
+def export(to: Path, cells: Sequence[Cell]) -> None:
+    """Writes the finished cells into hybrid.csv; raises UserError if there is none."""
+    from sgft_jax.analysis.release import write_hybrid
+
+    curves = finished(cells)
+    if not curves:
+        raise UserError(f"--export {to}: none of these runs has finished")
+    print(f"written: {write_hybrid(to, curves)}, {len(curves)} runs")
+
+
+def released(args: HybridGridArgs, folder: Path) -> "Results":
+    """What the table in a folder holds of these runs; raises UserError if that is nothing, or if it lacks a seed."""
+    from sgft_jax.analysis.release import hybrid_table, read_hybrid
+
+    wanted, columns = seed_list(args.seed, args.seeds), results(args, ())
+    task, schedule, updates = extend.name_of(args.task), name_of(args.schedule), args.schedule.updates_in_all
+    facts = {"real": gaps.title(args.real), "schedule": schedule, "updates": updates}
+    curves = [
+        curve
+        for curve in read_hybrid(folder)
+        if curve.task == task
+        and facts.items() <= curve.facts.items()
+        and curve.spec in columns.methods
+        and curve.data in (*columns.data, "")
+        and curve.gap in (*columns.gaps, "")
+    ]
+    path = hybrid_table(folder)
+    if not curves:
+        raise UserError(f"{path}: has none of these runs, {updates:,} updates of {task} with schedule {schedule}")
+    for curve in curves:
+        if missing := sorted(set(wanted) - set(curve.seeds.tolist())):
+            raise UserError(f"{path}: {curve.spec} has no seed {missing[0]}; name others with --seed, --seeds")
+    chosen = [curve.members([curve.seeds.tolist().index(seed) for seed in wanted]) for curve in curves]
+    return columns._replace(curves=chosen)

@@ -1,0 +1,157 @@
+"""Impure: run folders, and the one loop around everything that trains: log, evaluate, checkpoint, resume, report."""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from envs import mesh
+from envs.types import PyTree, UserError
+from sgft_jax.io import checkpoint, runs
+from sgft_jax.io.log import MetricsLog, check_finite
+from sgft_jax.io.priors import save_prior
+from sgft_jax.io.progress import Clock, RunProgress
+from sgft_jax.stacking import member, part
+from sgft_jax.types import Metrics, Prior
+
+
+@contextlib.contextmanager
+def opened(configs: Mapping[Path, Mapping[str, Any]], **options: Any) -> Iterator[list[Path]]:
+    """The folders of `runs.open_runs`, closed at the end."""
+    folders = runs.open_runs(configs, **options)
+    try:
+        yield [run.folder for run in folders]
+    finally:
+        for run in folders:
+            run.close()
+
+
+class Record:
+    """The files of one run folder (docs/formats.md). Arrays and states have a leading axis of the seeds [S].
+
+    expect: facts that its checkpoints share. home: of checkpoints, where another host than this one writes them.
+    """
+
+    def __init__(self, folder: Path, expect: Mapping[str, Any], home: Path | None = None) -> None:
+        self.folder, self.home, self.expect, self.seeds = folder, home or folder, expect, expect["seeds"]
+        self.log = MetricsLog(folder)
+        self.last_good: Path | None = None  # the checkpoint to go back to when training diverges
+
+    def restore(self, like: PyTree, step: int) -> tuple[Any, dict[str, Any]]:
+        """State and facts of a whole checkpoint, to which the logs are cut back."""
+        state, meta = checkpoint.restore(self.home, like, step=step, checked=True, expect=self.expect)
+        self.log.truncate(meta["position"])
+        self.last_good = checkpoint.path(self.home, step)
+        return state, meta
+
+    def checkpoint(self, state: PyTree, step: int, **facts: Any) -> None:
+        """The state, what else is known at this step, and how long the logs are."""
+        meta = {**self.expect, **facts, "position": self.log.position()}
+        self.last_good = checkpoint.save(self.home, step, mesh.local(state), meta=meta)
+
+    def save_policies(self, kind: str, params: PyTree, card: Callable[[int], Mapping[str, Any]]) -> None:
+        """Policies [S] in the form of priors: <kind>/seed-<k>. card(seed) -> what the card of one says."""
+        for i, seed in enumerate(self.seeds):
+            save_prior(self.home / kind / f"seed-{seed}", Prior(member(params, i), dict(card(seed))))
+
+
+class Training:
+    """What happens between compiled calls; what is on disk comes before what is in memory.
+
+    Members [M = G * S] are the seeds of the first record, then those of the next. A kind of run says how far a state is
+    (`done`, in `unit`), what is logged, when and how its policies are evaluated, and what a checkpoint holds.
+    """
+
+    unit = ""
+
+    def __init__(self, records: Sequence[Any], title: str, total: int) -> None:
+        self.records, self.title, self.total, self.clock = records, title, total, Clock()
+        self.count = len(records[0].seeds)
+
+    def each(self, members: PyTree) -> Iterator[tuple[Any, PyTree]]:
+        """Every record and, [S], what belongs to it in a pytree over all members."""
+        return ((record, part(members, i, self.count)) for i, record in enumerate(self.records))
+
+    def restore(self, like: Callable[[], PyTree]) -> list[tuple[Any, dict[str, Any]]]:
+        """States and facts after the last checkpoints, none for a fresh start; raises UserError where these differ.
+
+        like() -> shapes and types of the state of one record.
+        """
+        steps = [checkpoint.latest(record.home, whole=True) for record in self.records]
+        if len(set(steps)) > 1:
+            places = zip(self.records, steps, strict=True)
+            listed = ", ".join(f"{record.folder} is at step {step or 0}" for record, step in places)
+            raise UserError(f"{listed}: they cannot go on together, resume them one at a time")
+        if steps[0] is None:
+            for record in self.records:
+                record.log.truncate({})
+            return []
+        shapes = like()
+        return [record.restore(shapes, steps[0]) for record in self.records]
+
+    def follow(self, steps: Iterator[tuple[Any, Metrics]], done: int) -> Any:
+        """Logs, evaluates and checkpoints what an iterator yields; returns its last state. done: where it starts."""
+        state = None
+        with RunProgress(self.title, total=self.total, unit=self.unit, done=done) as progress:
+            for state, metrics, seconds in self._timed(steps):
+                before, done = done, self.done(state)
+                values = {name: np.asarray(x) for name, x in metrics.items()}
+                shown = self.log(state, values, seconds) if values else {}
+                if self.evaluates(before, done, learned=bool(values)):
+                    with self.clock("evaluate"):
+                        shown |= self.evaluate(state, done)
+                if self.checkpoints(before, done, learned=bool(values)):
+                    with self.clock("checkpoint"):
+                        self.checkpoint(state, done)
+                progress.advance(done - before, shown)
+        return state
+
+    def _timed(self, steps: Iterator[tuple[Any, Metrics]]) -> Iterator[tuple[Any, Metrics, float]]:
+        """The same with the seconds that each took."""
+        phase = "compile"
+        while True:
+            started = time.perf_counter()
+            with self.clock(phase):
+                step = jax.block_until_ready(next(steps, None))
+            if step is None:
+                return
+            phase = "train"
+            yield *step, time.perf_counter() - started
+
+    def due(self, every: int, before: int, done: int) -> bool:
+        """Whether something that happens every so many units happens after this chunk: also after the last."""
+        return done != before and (before // every != done // every or done >= self.total)
+
+    def log(self, state: Any, values: dict[str, np.ndarray], seconds: float) -> dict[str, float]:
+        """Writes the metrics [M] of a chunk; returns what the progress bar shows."""
+        done = self.done(state)
+        for record, metrics in self.each(values):
+            record.log.metrics(done, metrics)
+            check_finite(metrics, done, unit=self.unit, last_good=record.last_good)
+        return {}
+
+    # what a kind of run says
+
+    def done(self, state: Any) -> int:
+        """Units behind a state."""
+        raise NotImplementedError
+
+    def evaluates(self, before: int, done: int, *, learned: bool) -> bool:
+        """Whether there is an evaluation now. learned: whether an update has been made since the last time."""
+        raise NotImplementedError
+
+    def evaluate(self, state: Any, done: int) -> dict[str, float]:
+        """Plays and logs an evaluation; returns what the progress bar shows."""
+        raise NotImplementedError
+
+    def checkpoints(self, before: int, done: int, *, learned: bool) -> bool:
+        """Whether there is a checkpoint now."""
+        raise NotImplementedError
+
+    def checkpoint(self, state: Any, done: int) -> None:
+        """Writes the checkpoints of all records."""
+        raise NotImplementedError

@@ -1,0 +1,3 @@
+from . import replay, sequences, sources
+
+__all__ = ["replay", "sequences", "sources"]

@@ -1,0 +1,3 @@
+from . import guard
+
+__all__ = ["guard"]

@@ -1,0 +1,337 @@
+"""A fleet of simulators and the updates that learn from it, as an iterator over compiled chunks.
+
+A round steps every simulator, keeps what happened, and updates the agent. A `Plan` says what differs between
+pretraining and learning from a log: how a fleet acts, what updates learn from, which keys decide what. Nothing here
+prints or touches files; the caller does both. Members, such as seeds, train in one program.
+"""
+
+import functools
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from envs.base import Env, EnvState, World
+from envs.mesh import split, whole
+from envs.rollout import Fleet, launch, step_fleet
+from envs.types import Array, Key, PyTree, Transition
+from sgft_jax.data import replay
+from sgft_jax.data.replay import ReplayState
+from sgft_jax.models.networks import Precision, precision
+from sgft_jax.types import Batch, Learner, Metrics, Task
+
+__all__ = ["FleetState"]
+
+# explore(fleet, key) -> (actions [n, act_dim], carries [n] of the policy)
+Explore = Callable[[Fleet, Key], tuple[Array, PyTree]]
+# note(learner's state, before, action, after) -> what is kept of one simulated step beside its row
+Note = Callable[[PyTree, EnvState, Array, EnvState], PyTree]
+
+
+class Memory(NamedTuple):
+    """Experience of a fleet.
+
+    empty(transitions) -> experience with room for that many; one that keeps time slots takes the slots that fit.
+    add(experience, rows [n], valid [n], last [n]) -> the same with one step more. valid: not exploded; last: of its
+        episode.
+    cut(experience): no episode goes on after its newest step. held(experience) -> [capacity] bool.
+    sample(experience, key, n) -> Batch [n, ...].
+    """
+
+    empty: Callable[[int], PyTree]
+    add: Callable[[PyTree, Transition, Array, Array], PyTree]
+    cut: Callable[[PyTree], PyTree]
+    held: Callable[[PyTree], Array]
+    sample: Callable[[PyTree, Key, int], Batch]
+
+
+def transitions(task: Task) -> Memory:
+    """Single transitions in a `ReplayState`."""
+    return Memory(
+        empty=lambda capacity: replay.init(replay.blank(task.obs_dim, task.act_dim), capacity),
+        add=lambda experience, rows, valid, last: replay.add_batch(experience, rows, valid),
+        cut=lambda experience: experience,
+        held=lambda experience: jnp.arange(experience.data.reward.shape[0]) < experience.size,
+        sample=replay.sample,
+    )
+
+
+class FleetState(NamedTuple):
+    """Everything that changes, [M, ...].
+
+    learner: the agent. replay: experience of its simulators. fleet: these in flight. The last two are None for an agent
+    that does not act in a simulator. key: decides what comes. rounds: [M] int32, rounds done. notes: `ReplayState` of
+    what a `Note` says of the rows, None without one.
+    """
+
+    learner: Any
+    replay: Any
+    fleet: Any
+    key: Key
+    rounds: Array
+    notes: Any = None
+
+
+class StartKeys(NamedTuple):
+    """What decides the beginning: the agent's parameters, the fleet's episodes, its first steps, and the rounds."""
+
+    learner: Key
+    fleet: Key
+    steps: Key
+    rounds: Key
+
+
+class RoundKeys(NamedTuple):
+    """What decides a round. rounds: those after it. steps: [steps, 2] for actions and for physics. rows, updates: [U].
+
+    rows: or a single key, as the plan's `batches` takes it.
+    """
+
+    rounds: Key
+    steps: Key
+    rows: Key
+    updates: Key
+
+
+class Plan(NamedTuple):
+    """How one member trains.
+
+    learner, memory: what learns, and what it keeps of its simulators. simulators: stepped together, 0 = none. capacity:
+    transitions that it keeps. chunks, rounds: chunks of the run and rounds of each.
+    init_carry() -> what the policy remembers when an episode begins. explore(agent, fleet, key): see `Explore`.
+    begin(agent, data) -> a fresh agent that knows the data it starts with.
+    tune(agent, rounds []) -> the agent with the hyper-parameters of that round.
+    start_keys(key), round_keys(key): which keys decide what. batches(data, replay, rows' keys) -> Batch [U, B, ...].
+    ready(replay) -> [] whether there is anything to learn from; an agent that is not ready stays as it is.
+    measure(after, rows, valid) -> Metrics of a step of the fleet; summarise([rounds, steps] of these) -> Metrics.
+    first_steps: of the fleet before the first round. precision: of the updates' matrix products.
+    """
+
+    learner: Learner
+    memory: Memory
+    simulators: int
+    capacity: int
+    chunks: int
+    rounds: int
+    init_carry: Callable[[], PyTree]
+    explore: Callable[[PyTree, Fleet, Key], tuple[Array, PyTree]]
+    begin: Callable[[PyTree, PyTree], PyTree]
+    start_keys: Callable[[Key], StartKeys]
+    round_keys: Callable[[Key], RoundKeys]
+    batches: Callable[[PyTree, PyTree, Key], Batch]
+    tune: Callable[[PyTree, Array], PyTree] = lambda agent, rounds: agent
+    ready: Callable[[PyTree], Array] = lambda held: jnp.ones((), bool)
+    measure: Callable[[EnvState, Transition, Array], Metrics] = lambda after, rows, valid: {}
+    summarise: Callable[[Metrics], Metrics] = lambda measured: measured
+    first_steps: int = 0
+    precision: Precision = "default"
+
+    def chunks_done(self, state: FleetState) -> int:
+        """Chunks behind a state."""
+        return int(jax.device_get(state.rounds)[0]) // self.rounds
+
+
+# --- pure functions of one member -------------------------------------------------------------------------------------
+
+
+class Collected(NamedTuple):
+    """Simulators in flight, what they have experienced, and notes on it."""
+
+    fleet: Fleet
+    replay: PyTree
+    notes: ReplayState | None = None
+
+
+def collect(
+    env: Env, memory: Memory, explore: Explore, pool: World, start: Collected, keys: Key, *,
+    initial_carry: PyTree, gamma: float, note: Callable[..., PyTree] | None = None,
+    measure: Callable[[EnvState, Transition, Array], Metrics] = lambda after, rows, valid: {},
+) -> tuple[Collected, Metrics]:  # fmt: skip
+    """Steps of all simulators, one for each of the keys [steps, 2]; the metrics are [steps].
+
+    initial_carry: what the policy remembers when an episode begins. note(before, action, after): see `Note`.
+    """
+
+    def step(held: Collected, keys: Key) -> tuple[Collected, Metrics]:
+        actions, carry = explore(held.fleet, keys[0])
+        before, notes = held.fleet.state, held.notes
+        fleet, rows, valid, after = step_fleet(
+            env, pool, held.fleet, actions, carry, keys[1], gamma=gamma, initial_carry=initial_carry
+        )
+        if note is not None and notes is not None:
+            notes = replay.add_batch(notes, jax.vmap(note)(before, actions, after), valid)
+        kept = memory.add(held.replay, rows, valid, after.truncated | after.terminated)
+        return Collected(split(fleet), spread_replay(kept), notes), measure(after, rows, valid)
+
+    return jax.lax.scan(step, start, keys)
+
+
+class Trainer(NamedTuple):
+    """Training of one member as pure functions.
+
+    init(pool, data, key) -> FleetState. data: what the plan's `begin` takes.
+    chunk(pool, data, state) -> (state, metrics): `plan.rounds` rounds. data: what the plan's `batches` takes.
+    renew(pool, state) -> state with new episodes in the worlds of that pool.
+    """
+
+    init: Callable[[World, PyTree, Key], FleetState]
+    chunk: Callable[[World, PyTree, FleetState], tuple[FleetState, Metrics]]
+    renew: Callable[[World, FleetState], FleetState]
+
+
+def make_trainer(env: Env, plan: Plan, *, gamma: float, note: Note | None = None) -> Trainer:
+    """Builds the pure functions. gamma: discount factor of simulated rows. note: what else to keep of their steps."""
+    learner, fresh = plan.learner, plan.init_carry()
+
+    def advance(pool: World, state: FleetState, keys: Key) -> tuple[FleetState, Metrics]:
+        collected, measured = collect(
+            env, plan.memory, functools.partial(plan.explore, state.learner), pool,
+            Collected(state.fleet, state.replay, state.notes), keys, initial_carry=fresh, gamma=gamma,
+            note=note and functools.partial(note, state.learner), measure=plan.measure,
+        )  # fmt: skip
+        return state._replace(**collected._asdict()), measured
+
+    def init(pool: World, data: PyTree, key: Key) -> FleetState:
+        keys = plan.start_keys(key)
+        agent = plan.begin(learner.init(keys.learner), data)
+        state = FleetState(agent, None, None, keys.rounds, jnp.int32(0))
+        if not plan.simulators:
+            return spread(state)
+        fleet = launch(env, pool, keys.fleet, plan.simulators, fresh)
+        state = state._replace(fleet=fleet, replay=plan.memory.empty(plan.capacity))
+        if note is not None:
+            first = jax.tree.map(lambda x: x[0], fleet.state)
+            example = note(agent, first, jnp.zeros(env.act_dim), first)
+            state = state._replace(notes=replay.init(example, plan.capacity))
+        if plan.first_steps:
+            state, _ = advance(pool, state, keys.steps)
+        return spread(state)
+
+    def renew(pool: World, state: FleetState) -> FleetState:
+        key, key_fleet = jax.random.split(state.key)
+        fleet = launch(env, pool, key_fleet, plan.simulators, fresh)
+        return spread(state._replace(replay=plan.memory.cut(state.replay), fleet=fleet, key=key))
+
+    def update(data: PyTree, state: FleetState, keys: RoundKeys) -> tuple[PyTree, Metrics, Array]:
+        """The agent after a round's updates, their metrics, and whether there was anything to learn from []."""
+        batches, ready = plan.batches(data, state.replay, keys.rows), plan.ready(state.replay)
+        with precision(plan.precision):
+            agent, metrics = jax.lax.scan(
+                lambda agent, x: learner.update(agent, *x),
+                plan.tune(state.learner, state.rounds),
+                (batches, keys.updates),
+            )
+        agent = jax.tree.map(lambda new, old: jnp.where(ready, new, old), agent, state.learner)
+        return agent, {name: x.mean() for name, x in metrics.items()}, ready
+
+    def one_round(pool: World, data: PyTree, state: FleetState) -> tuple[FleetState, tuple[Metrics, Metrics, Array]]:
+        keys, measured = plan.round_keys(state.key), {}
+        if plan.simulators:
+            state, measured = advance(pool, state, keys.steps)
+        agent, metrics, ready = update(data, state, keys)
+        state = state._replace(learner=agent, key=keys.rounds, rounds=state.rounds + 1)
+        return spread(state), (metrics, measured, ready)
+
+    def chunk(pool: World, data: PyTree, state: FleetState) -> tuple[FleetState, Metrics]:
+        state, (metrics, measured, ready) = jax.lax.scan(
+            lambda state, _: one_round(pool, data, state), state, None, length=plan.rounds
+        )
+        averages = {name: _mean(x, ready) for name, x in metrics.items()}
+        return state, whole(averages | plan.summarise(measured))
+
+    return Trainer(init, chunk, renew)
+
+
+def _mean(x: Array, ready: Array) -> Array:
+    """[] over the rounds [rounds] that have learned, nan without any."""
+    return jnp.where(ready.all(), x.mean(), jnp.mean(x, where=ready))
+
+
+def spread(state: FleetState) -> FleetState:
+    """Environments and experience in pieces on the devices of a mesh, the agent whole on each of them."""
+    pieces = state._replace(replay=spread_replay(state.replay), fleet=split(state.fleet))
+    return pieces._replace(learner=whole(state.learner), key=whole(state.key), rounds=whole(state.rounds))
+
+
+def spread_replay(experience: PyTree) -> PyTree:
+    """The same for experience alone: its rows in pieces, its counters whole."""
+    return jax.tree.map(lambda x: split(x) if x.ndim else whole(x), experience)
+
+
+# --- all members ------------------------------------------------------------------------------------------------------
+
+
+def over_members(
+    function: Callable[..., PyTree], members: int, *, shared: tuple[int, ...] = ()
+) -> Callable[..., PyTree]:
+    """`function` of one member for arguments and results with a leading axis of members.
+
+    shared: positions of arguments without that axis, one for all members. A single member is not vmapped, because vmap
+    would make a `cond` (resets, only where an episode ended) compute both of its branches at every step.
+    """
+
+    def several(*args: PyTree) -> PyTree:
+        return jax.vmap(function, tuple(None if i in shared else 0 for i in range(len(args))))(*args)
+
+    def single(*args: PyTree) -> PyTree:
+        firsts = (x if i in shared else jax.tree.map(lambda leaf: leaf[0], x) for i, x in enumerate(args))
+        return jax.tree.map(lambda x: x[None], function(*firsts))
+
+    return several if members > 1 else single
+
+
+class Programs(NamedTuple):
+    """Jitted functions of all members, see `Trainer`; chunk, renew and spread consume the state that they change."""
+
+    begin: Callable[..., FleetState]
+    chunk: Any
+    renew: Callable[..., FleetState]
+    spread: Callable[[FleetState], FleetState]
+
+
+def make_programs(trainer: Trainer, members: int, *, shared: bool) -> Programs:
+    """The programs of that many members. shared: whether they learn from the same data, not each from its own."""
+    several = functools.partial(over_members, members=members, shared=(1,) if shared else ())
+    return Programs(
+        begin=jax.jit(several(trainer.init)),
+        chunk=jax.jit(several(trainer.chunk), donate_argnums=2),
+        renew=jax.jit(over_members(trainer.renew, members), donate_argnums=1),
+        spread=jax.jit(over_members(spread, members), donate_argnums=0),
+    )
+
+
+def train(
+    plan: Plan, programs: Programs, pools: Callable[[int], World], data: PyTree, state: FleetState, *,
+    refresh_every: int = 0,
+) -> Iterator[tuple[FleetState, Metrics]]:  # fmt: skip
+    """Trains from a state until all chunks are done; the state is consumed.
+
+    pools: number of a set of worlds -> its worlds [M, W]. refresh_every: chunks after which the next set is asked for,
+    0 = never.
+
+    Yields the state that it starts from with no metrics, once everything is compiled, then once per chunk. Metrics are
+    arrays [M]. A yielded state is valid until the next step, which donates its arrays: copy it to keep it longer.
+    """
+    begun = plan.chunks_done(state)
+    number = set_number(refresh_every, max(begun - 1, 0))
+    worlds = pools(number)
+    chunk: Any = programs.chunk.lower(worlds, data, state).compile() if begun < plan.chunks else None
+    yield state, {}
+    for done in range(begun, plan.chunks):
+        if set_number(refresh_every, done) != number:
+            number = set_number(refresh_every, done)
+            worlds = pools(number)
+            state = programs.renew(worlds, state)
+        state, metrics = chunk(worlds, data, state)
+        yield state, metrics
+
+
+def set_number(refresh_every: int, done: int) -> int:
+    """Which set of worlds the chunk after `done` others takes place in."""
+    return done // refresh_every if refresh_every else 0
+
+
+def bytes_of(function: Callable[..., PyTree], *args: PyTree) -> int:
+    """Bytes of what a function returns, from the shapes alone."""
+    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(function, *args)))
