@@ -30,18 +30,17 @@ PUBLIC = [(f"{package}.{name}", thing) for package in names.PACKAGES for name, t
 
 
 def public_modules():
-    """The modules that public names are of, with these names; learners are public module by module."""
+    """The modules that public names are of, with these names: of public modules all that docs/api.md lists."""
     modules = {}
+    for name, thing in PUBLIC:
+        if isinstance(thing, ModuleType) and thing.__name__.startswith("sgft_jax."):
+            listed = [full.removeprefix(f"{name}.") for full, _ in PUBLIC if full.startswith(f"{name}.")]
+            modules[thing.__name__] = [member for member in listed if "." not in member]
     for node in ast.parse(Path(sgft_jax.__file__).with_suffix(".pyi").read_text()).body:
-        if isinstance(node, ast.ImportFrom) and not node.module.startswith("learners"):
-            for name in (alias.name for alias in node.names):
-                if isinstance(thing := getattr(sgft_jax, name), ModuleType):
-                    prefix = f"sgft_jax.{name}."
-                    modules[thing.__name__] = [
-                        full.removeprefix(prefix) for full, _ in PUBLIC if full.startswith(prefix)
-                    ]
-                else:
-                    modules.setdefault(f"sgft_jax.{node.module}", []).append(name)
+        if isinstance(node, ast.ImportFrom) and (module := f"sgft_jax.{node.module}") not in modules:
+            aliases = [alias.name for alias in node.names]
+            if not isinstance(getattr(sgft_jax, aliases[0]), ModuleType):
+                modules[module] = aliases
     return modules
 
 

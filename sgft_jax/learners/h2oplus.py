@@ -32,6 +32,8 @@ from sgft_jax.models.networks import (
 )
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer, ValueLoss
 
+__all__ = ["H2OPlusConfig", "H2OPlusHyper", "H2OPlusState", "act", "init", "make_h2oplus", "mixed_target", "update"]
+
 
 @dataclass(frozen=True)
 class H2OPlusConfig:

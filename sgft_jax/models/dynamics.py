@@ -10,6 +10,8 @@ from sgft_jax.models.networks import Network
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.types import Batch, Metrics, Normalizer
 
+__all__ = ["draw_member", "predict", "predict_each", "rollout_error", "update"]
+
 
 def predict(network: Network, params: PyTree, normalizer: Normalizer, obs: Array, action: Array) -> Array:
     """Successors predicted by every member. obs: [obs_dim] raw; action: [act_dim]. Returns [members, obs_dim] raw."""

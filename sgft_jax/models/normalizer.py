@@ -9,7 +9,7 @@ from brax.training.acme import running_statistics
 from envs.types import Array
 from sgft_jax.types import Batch, Normalizer
 
-__all__ = ["finish", "identity", "init", "normalize", "of", "update"]
+__all__ = ["finish", "identity", "init", "normalize", "normalize_rows", "of", "update"]
 
 Statistics = running_statistics.RunningStatisticsState
 

@@ -20,7 +20,8 @@ from sgft_jax.models import normalizer
 from sgft_jax.models.networks import MLP, Network, NetworkConfig
 from sgft_jax.types import Batch, Metrics, Normalizer
 
-__all__ = ["RatioConfig"]
+__all__ = ["Ratio", "RatioConfig", "RatioState", "domain_loss", "log_ratio", "make_discriminator", "make_ratio"]
+__all__ += ["split_rows", "step", "weight"]
 
 REAL, SIM = 0, 1  # the two logits of a discriminator
 

@@ -11,6 +11,8 @@ from sgft_jax.models.networks import Network, precision
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.types import Metrics, Normalizer
 
+__all__ = ["discounted_returns", "explained_variance", "predict", "rank_correlation", "report"]
+
 
 def predict(network: Network, params: PyTree, normalizer: Normalizer, obs: Array) -> Array:
     """V(obs) []. obs: [obs_dim] raw units.

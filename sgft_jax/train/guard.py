@@ -41,6 +41,8 @@ import jax.numpy as jnp
 from envs.types import Array, Key, PyTree, Transition
 from sgft_jax.types import Finetuner, Metrics, SimulatedData
 
+__all__ = ["Evidence", "Guard", "Guarded", "evidence", "guarded", "learned", "means", "scored", "start"]
+
 _FADE = 0.8  # of the challenger's evidence per learning phase
 _CREDIT = 2.0  # imagined rollouts of the challenger
 _ROUNDING = 1e-5  # relative difference of scores that says nothing
