@@ -73,8 +73,8 @@ def diagnose(
     found = {
         "task": env.name,
         "data": what,
-        "priors": [{"prior": label, "found": one.found} for label, one in zip(labels, each, strict=True)],
-        "mean": [average([one.found[i] for one in each], same=same) for i in range(len(counts))],
+        "priors": [{"prior": label, "found": one.statistics} for label, one in zip(labels, each, strict=True)],
+        "mean": [average([one.statistics[i] for one in each], same=same) for i in range(len(counts))],
     }
     mean, names = found["mean"][-1], names_of(env)
     found["signs"] = jsonable(verdict.signs(mean, names))
@@ -253,7 +253,7 @@ def _priors(n: int) -> str:
 
 def _lines(labels: Sequence[str], each: Sequence[Examined], mean: Mapping[str, Any]) -> list[str]:
     """One line for each prior, and one for their mean."""
-    rows = [(label, one.found[-1]) for label, one in zip(labels, each, strict=True)]
+    rows = [(label, one.statistics[-1]) for label, one in zip(labels, each, strict=True)]
     rows += [("mean", mean)] * (len(each) > 1)
     head = ("prior", "success %", "improvable %", "V_sim short by", "rank", "model error -> identified (sim)", "gain")
     return columns([head, *(_row(label, found) for label, found in rows)])

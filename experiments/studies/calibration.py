@@ -104,7 +104,7 @@ def gather(args: CalibrateArgs, runs: Sequence[Path]) -> list[Cases]:
         params, control = (stacking.member(x, jnp.array(which)) for x in known)
         examined = examiner.examine(params, control, stacking.stack(rollouts), COUNTS)
         for member, (own, p) in enumerate(zip(examined, which, strict=True)):
-            for i, found in enumerate(own.found):
+            for i, found in enumerate(own.statistics):
                 inputs[i].append(prediction.inputs_of(found))
                 played[i].append(found["success"])
             success = curve.values[member, held]
