@@ -98,11 +98,11 @@ class Control(NamedTuple):
 
 
 class Examined(NamedTuple):
-    """Of one member. found: JSON data for each number of rollouts, see `describe`. points: by "real" (of the last of
-    these) and "simulated", V_sim and return [n] of visited states.
+    """Of one member. statistics: JSON data for each number of rollouts, see `describe`. points: by "real" (of the
+    last of these) and "simulated", V_sim and return [n] of visited states.
     """
 
-    found: list[dict[str, Any]]
+    statistics: list[dict[str, Any]]
     points: dict[str, tuple[np.ndarray, np.ndarray]]
 
 

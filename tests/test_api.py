@@ -32,6 +32,10 @@ PUBLIC = [(f"{package}.{name}", thing) for package in names.PACKAGES for name, t
 def public_modules():
     """The modules that public names are of, with these names; learners are a package with a stub of its own."""
     modules = {}
+    for name, thing in PUBLIC:
+        if isinstance(thing, ModuleType) and thing.__name__.startswith("sgft_jax."):
+            listed = [full.removeprefix(f"{name}.") for full, _ in PUBLIC if full.startswith(f"{name}.")]
+            modules[thing.__name__] = [member for member in listed if "." not in member]
     for node in ast.parse(Path(sgft_jax.__file__).with_suffix(".pyi").read_text()).body:
         if isinstance(node, ast.ImportFrom) and node.module:
             for name in (alias.name for alias in node.names):

@@ -67,7 +67,7 @@ def diagnose(
     findings = {
         "task": env.name,
         "data": what,
-        "priors": [{"prior": label, "found": one.found} for label, one in zip(labels, examined, strict=True)],
+        "priors": [{"prior": label, "found": one.statistics} for label, one in zip(labels, examined, strict=True)],
         "mean": mean,
         "signs": jsonable(signs),
         "verdict": verdict.verdict(mean[-1], names),
@@ -94,7 +94,7 @@ def _examine(
     chosen, usual = (stacking.member(x, jnp.array(which)) for x in (params, control))
     examined = examiner.examine(chosen, usual, stacking.stack(real), counts)
     same = all(rollouts is real[0] for rollouts in real)
-    return examined, [average([one.found[i] for one in examined], same=same) for i in range(len(counts))]
+    return examined, [average([one.statistics[i] for one in examined], same=same) for i in range(len(counts))]
 
 
 def load(task: str, impl: Any, folders: Sequence[Path]) -> tuple[Env, list[Prior]]:
@@ -259,7 +259,7 @@ def _priors(n: int) -> str:
 
 def _lines(labels: Sequence[str], examined: Sequence[Examined], mean: Mapping[str, Any]) -> list[str]:
     """One line for each prior, and one for their mean."""
-    rows = [(label, one.found[-1]) for label, one in zip(labels, examined, strict=True)]
+    rows = [(label, one.statistics[-1]) for label, one in zip(labels, examined, strict=True)]
     rows += [("mean", mean)] * (len(examined) > 1)
     head = ("prior", "success %", "improvable %", "V_sim short by", "rank", "model error -> identified (sim)", "gain")
     return columns([head, *(_row(*row) for row in rows)])

@@ -105,7 +105,7 @@ def gather(args: CalibrateArgs, runs: Sequence[Path]) -> list[Cases]:
         params, control = (stacking.member(x, jnp.array(which)) for x in known)
         examined = examiner.examine(params, control, stacking.stack(rollouts), COUNTS)
         for member, (diagnosis, p) in enumerate(zip(examined, which, strict=True)):
-            for i, found in enumerate(diagnosis.found):
+            for i, found in enumerate(diagnosis.statistics):
                 inputs[i].append(prediction.inputs_of(found))
                 played[i].append(found["success"])
             success = curve.values[member, held]

@@ -178,21 +178,14 @@ def _system(params: Any, env: Env) -> np.ndarray:
 
 def _action(write: _Writer, params: PyTree, x: str, network: NetworkConfig, act_dim: int) -> str:
     """The mode of a tanh-Gaussian, or what a deterministic actor does."""
+    activation = network.activation.capitalize()  # the operator's name
     for i in range(len(network.hidden)):
         x = _dense(write, params[f"Dense_{i}"], x)
         if network.actor_layer_norm:
             x = write("LayerNormalization", x, *(params[f"LayerNorm_{i}"][name] for name in ("scale", "bias")))
-        x = _ACTIVATIONS[network.activation](write, x)
+        x = write("Mul", x, write("Sigmoid", x)) if network.activation == "silu" else write(activation, x)
     outputs = _dense(write, params[f"Dense_{len(network.hidden)}"], x)
     return write("Tanh", write("Gather", outputs, np.arange(act_dim)))
-
-
-_ACTIVATIONS: dict[str, Callable[[_Writer, str], str]] = {
-    "relu": lambda write, x: write("Relu", x),
-    "tanh": lambda write, x: write("Tanh", x),
-    "silu": lambda write, x: write("Mul", x, write("Sigmoid", x)),
-    "elu": lambda write, x: write("Elu", x),
-}
 
 
 def _dense(write: _Writer, params: PyTree, x: str) -> str:

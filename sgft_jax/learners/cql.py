@@ -19,6 +19,8 @@ from sgft_jax.math import losses
 from sgft_jax.models.config import NetworkConfig, two_layers
 from sgft_jax.types import Batch, Learner, Metrics
 
+__all__ = ["CQLConfig", "make_cql", "penalty", "soft_maximum", "update"]
+
 
 @dataclass(frozen=True)
 class CQLConfig(SACConfig):

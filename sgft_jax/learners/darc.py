@@ -21,6 +21,8 @@ from sgft_jax.models import ratio
 from sgft_jax.models.config import NetworkConfig, two_layers
 from sgft_jax.types import Batch, Learner, Metrics, Source
 
+__all__ = ["DARCConfig", "DARCState", "act", "batches", "init", "make_darc", "paid", "update"]
+
 
 @dataclass(frozen=True)
 class DARCConfig:

@@ -20,6 +20,8 @@ from sgft_jax.math import losses
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.types import Batch, Learner, Metrics
 
+__all__ = ["EDACConfig", "alignment", "make_edac", "mean_alignment", "penalty", "update"]
+
 NORM_MIN = 1e-10  # of a gradient; a critic that is flat points nowhere
 
 

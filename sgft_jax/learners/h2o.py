@@ -24,6 +24,8 @@ from sgft_jax.models.config import NetworkConfig, two_layers
 from sgft_jax.models.networks import Network, make_affine_actor, make_critic
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
+__all__ = ["H2OConfig", "H2OHyper", "H2OState", "act", "init", "log_shares", "make_h2o", "penalty", "update"]
+
 GAP_MIN = 1e-6  # a pair that looks more real than simulated is not pushed; 1e-45, as published, may flush to 0 / 0
 PENALTY_MAX = 1000.0
 

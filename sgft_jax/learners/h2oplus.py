@@ -26,6 +26,8 @@ from sgft_jax.models.config import NetworkConfig, two_layers
 from sgft_jax.models.networks import Network, make_affine_actor, make_critic, make_value
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer, ValueLoss
 
+__all__ = ["H2OPlusConfig", "H2OPlusHyper", "H2OPlusState", "act", "init", "make_h2oplus", "mixed_target", "update"]
+
 
 @dataclass(frozen=True)
 class H2OPlusConfig:

@@ -23,6 +23,9 @@ from sgft_jax.models import networks, normalizer
 from sgft_jax.models.networks import Network, NetworkConfig
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
+__all__ = ["IQLConfig", "IQLHyper", "IQLState", "act", "advantage_weight", "as_tanh_gaussian", "gaussian_action"]
+__all__ += ["gaussian_log_prob", "init", "make_gaussian_actor", "make_iql", "policy_loss", "td_target", "update"]
+
 ACTION_MAX = 1 - 1e-5  # a mean that ends in tanh never reaches 1: it would chase such an action forever
 
 

@@ -22,6 +22,9 @@ from sgft_jax.models import normalizer
 from sgft_jax.models.networks import Network, NetworkConfig, add_noise, make_critic, make_deterministic_actor
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
+__all__ = ["ReBRACConfig", "ReBRACHyper", "ReBRACState", "act", "distance", "init", "make_rebrac", "td_target"]
+__all__ += ["update"]
+
 
 @dataclass(frozen=True)
 class ReBRACConfig:

@@ -24,6 +24,9 @@ from sgft_jax.models.networks import Network, NetworkConfig
 from sgft_jax.stacking import stack
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
+__all__ = ["Carry", "RecurrentConfig", "RecurrentHyper", "RecurrentParams", "RecurrentState", "act", "extract_params"]
+__all__ += ["init", "init_carry", "make_recurrent", "policy_action", "update"]
+
 
 @dataclass(frozen=True)
 class RecurrentConfig:

@@ -21,6 +21,9 @@ from sgft_jax.models.networks import check_params, tanh_gaussian_action
 from sgft_jax.planning import mppi
 from sgft_jax.types import Batch, Learner, Metrics
 
+__all__ = ["act", "check_params_of_prior", "clip_by_norm", "discounted_mean", "extract_params", "init", "init_carry"]
+__all__ += ["make_tdmpc2", "policy_action", "scaled_entropy_sample", "state_from_prior", "update"]
+
 # --- the learner ------------------------------------------------------------------------------------------------------
 
 

@@ -201,7 +201,7 @@ def twice(tree):
 
 def found(examined):
     """What was found of each member."""
-    return [own.found for own in examined]
+    return [own.statistics for own in examined]
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import os
 import pytest
 
 from envs.types import UserError
-from sgft_jax.files.folders import NEW, InUseError, Lock, present, replaced
+from sgft_jax.files.folders import NEW, InUseError, Lock, present, replaced, written
 
 CHANGES = ("mkdir", "rename", "replace", "rmdir", "unlink")
 
@@ -121,3 +121,16 @@ def test_two_writers_of_one_folder_do_not_meet(tmp_path):
         write(tmp_path / "other", "beside")
     assert (tmp_path / "prior" / "manifest").read_text() == "first" and content_of(tmp_path / "other") == "beside"
     Lock(tmp_path / "prior").release()
+
+
+def test_a_file_is_the_old_one_until_the_new_one_is_whole(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text("old")
+    with pytest.raises(ValueError, match="half"), written(path) as part:
+        part.write_text("ne")
+        raise ValueError("half")
+    assert path.read_text() == "old" and list(tmp_path.iterdir()) == [path]
+    with written(path) as part:
+        part.write_text("new")
+        assert path.read_text() == "old"
+    assert path.read_text() == "new" and list(tmp_path.iterdir()) == [path]

@@ -102,6 +102,14 @@ def test_numbers_too_large_for_arithmetic_are_not_sound(large):
     assert measured.dtype == np.float32 and answers.sound(measured).tolist() == [True, False]
 
 
+def test_answers_of_several_say_what_nobody_knows():
+    pair = [step(reward=None, info={"sent": [0.5, 1.0]}), step(reward=1e300, info={"success": True, "late": 1})]
+    both = answers.stacked(pair, 2)
+    assert both.reward.dtype == np.float32 and np.isnan(both.reward[0]) and np.isinf(both.reward[1])
+    assert both.success.dtype == np.int8 and both.success.tolist() == [-1, 1] and both.late.tolist() == [False, True]
+    np.testing.assert_array_equal(both.sent, [[0.5, 1.0], [np.nan, np.nan]])
+
+
 # --- vector environments ----------------------------------------------------------------------------------------------
 
 
