@@ -39,9 +39,8 @@ def operator(speed: float) -> Policy:
         shake = _wandered(carry.shake, noise[1], std=SHAKE, time=SHAKE_TIME)
         error = obs - jnp.array([0.0, speed, 0.0, 0.0]).at[0].set(carry.aim + wander)
         torque = -gain @ error + shake
-        return jnp.clip(torque / robot.TORQUE, -1.0, 1.0)[None], Hand(
-            carry.aim + speed * robot.CONTROL_DT, wander, shake
-        )
+        hand = Hand(carry.aim + speed * robot.CONTROL_DT, wander, shake)
+        return jnp.clip(torque / robot.TORQUE, -1.0, 1.0)[None], hand
 
     return Policy(lambda: Hand(jnp.zeros(()), jnp.zeros(()), jnp.zeros(())), act)
 
