@@ -102,7 +102,7 @@ def update(agent: Bare, batch: Transition, noise: Noise, hyper: SACHyper) -> Bar
     return Bare(actor, critic, average, log_alpha, value, dynamics)
 
 
-def temperature(log_alpha: Trained, log_prob: Array, entropy: float, rate: Any) -> Trained:
+def temperature(log_alpha: Trained, log_prob: Array, entropy: float | Array, rate: Any) -> Trained:
     """The temperature's logarithm after one step towards that entropy. log_prob: [B] of the policy's actions."""
     slope = jnp.exp(log_alpha.params) * jnp.mean(-log_prob - entropy)
     log_alpha = adam(log_alpha, slope, rate)
