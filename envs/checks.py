@@ -174,12 +174,10 @@ def _difference(after: Any, before: Any) -> str | None:
     """Where two pytrees differ in structure, shape or type; None where they do not."""
     import jax
 
-    leaves = [
-        {jax.tree_util.keystr(path): x for path, x in jax.tree.leaves_with_path(tree)} for tree in (after, before)
-    ]
-    if leaves[0].keys() != leaves[1].keys() or jax.tree.structure(after) != jax.tree.structure(before):
+    if jax.tree.structure(after) != jax.tree.structure(before):
         return f"{jax.tree.structure(after)}"
-    pairs = ((path, x, leaves[1][path]) for path, x in leaves[0].items())
-    return next(
-        (f"{path}: {x.dtype}{list(x.shape)}" for path, x, y in pairs if (x.dtype, x.shape) != (y.dtype, y.shape)), None
-    )
+    pairs = zip(jax.tree.leaves_with_path(after), jax.tree.leaves(before), strict=True)
+    for (path, x), y in pairs:
+        if (x.dtype, x.shape) != (y.dtype, y.shape):
+            return f"{jax.tree_util.keystr(path)}: {x.dtype}{list(x.shape)}"
+    return None

@@ -100,17 +100,9 @@ def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> Finet
     """Smaller batches and fewer updates than on a GPU: what two cores can do; all methods get the same. All else is the
     methods' own: larger rates of the actor cost most of them success (docs/history.md).
     """
-    return arguments(
-        method,
-        real=(args.real,),
-        seeds=args.seeds,
-        rollouts=args.rollouts,
-        eval_every=5,
-        eval_episodes=20,
-        options=get_method(method).config(utd=4.0, batch_size=64),
-        video=args.video and method == METHODS[0],
-        **shared,
-    )
+    options = get_method(method).config(utd=4.0, batch_size=64)
+    size = {"seeds": args.seeds, "rollouts": args.rollouts, "eval_every": 5, "eval_episodes": 20, "options": options}
+    return arguments(method, real=(args.real,), video=args.video and method == METHODS[0], **size, **shared)
 
 
 def _finetune_all(first: FinetuneArgs, *others: FinetuneArgs) -> None:

@@ -1,8 +1,14 @@
 """What tasks without an arm share: a table, in the solver that their contacts need."""
 
+import functools
+
 import mujoco
 
 from envs.mujoco.parts import add_plane, empty_spec
+from envs.mujoco.scene import Scene
+
+# Steps of a hand; joints or objects that are faster than 500 m/s or rad/s have exploded.
+scene = functools.partial(Scene, cartesian=True, training={"obs_noise": 0.002, "obs_noise_prob": 0.3}, max_speed=500.0)
 
 
 def table_spec(timestep: float) -> mujoco.MjSpec:

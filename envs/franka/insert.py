@@ -51,6 +51,8 @@ DAMPING_TIME = 1 / 16
 # 100 N sink in by 0.4 mm. Newton's method then converges in 4 iterations; over 0.2 mm it needs 20, and with 4 the leg
 # sinks in by 3 mm.
 WOOD = (0.0, 0.9, 0.0005, 0.5, 2.0)
+# Joint angles with the hand over the table top: where the inverse kinematics of a reset begins.
+Q_READY = np.array([0.0, 0.2, 0.0, -2.39, 0.0, 2.6, np.pi / 4])
 NV = arm.N_JOINTS
 
 PARAMETERS = (
@@ -111,13 +113,13 @@ def initial(params: Array, key: Key) -> PhysicsState:
     """The leg above the table top, at a random place around the nominal hole."""
     offset = jax.random.uniform(key, (3,), minval=jnp.asarray(START_LOW), maxval=jnp.asarray(START_HIGH))
     tip = jnp.concatenate([jnp.asarray(HOLE_NOMINAL, jnp.float32), jnp.array([TOP])]) + offset
-    joints = kinematics.solve(jnp.asarray(_ready(), jnp.float32), _pose(tip), iterations=6, posture=0.05)
+    joints = kinematics.solve(jnp.asarray(Q_READY, jnp.float32), _pose(tip), iterations=6, posture=0.05)
     return at_rest(joints, jnp.zeros(0), NV)
 
 
 def settled(params: Array, obs: Array) -> PhysicsState:
     """The leg where its tip is seen, upright and at rest."""
-    joints = kinematics.solve(jnp.asarray(_ready(), jnp.float32), _pose(obs[3:6]), iterations=12, posture=0.05)
+    joints = kinematics.solve(jnp.asarray(Q_READY, jnp.float32), _pose(obs[3:6]), iterations=12, posture=0.05)
     return at_rest(joints, jnp.zeros(0), NV)
 
 
@@ -168,11 +170,6 @@ def _tip(joints: Array) -> Array:
 def _pose(tip: Array) -> Pose:
     """Pose of the hand that holds the leg upright with its tip at `tip` [3]."""
     return Pose(tip + jnp.array([0.0, 0.0, GRASP]), jnp.asarray(DOWN, jnp.float32))
-
-
-def _ready() -> np.ndarray:
-    """Joint angles with the hand over the table top: where the inverse kinematics of a reset begins."""
-    return np.array([0.0, 0.2, 0.0, -2.39, 0.0, 2.6, np.pi / 4])
 
 
 def _add_leg(link: mujoco.MjsBody, peg_radius: float) -> None:

@@ -14,10 +14,10 @@ import mujoco
 import numpy as np
 
 from envs.base import Entry, Parameter
-from envs.franka.armless import table_spec
+from envs.franka import armless
 from envs.franka.rotations import inverse, turned
 from envs.mujoco import parts
-from envs.mujoco.scene import Scene, View
+from envs.mujoco.scene import View
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -67,7 +67,7 @@ _RED, _METAL, _WOOD = [0.65, 0.1, 0.1, 1.0], [0.6, 0.62, 0.65, 1.0], [0.72, 0.55
 
 def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The scene for one theta. Where the hammer starts is part of the state, not of the model."""
-    spec = table_spec(CONTROL_DT / SUBSTEPS)
+    spec = armless.table_spec(CONTROL_DT / SUBSTEPS)
     _add_hand(spec, theta)
     _add_hammer(spec, theta["hammer_mass"])
     _add_nail(spec, theta["nail_damping"])
@@ -206,7 +206,7 @@ def dress(spec: mujoco.MjSpec) -> None:
         parts.add_cylinder(spec.body("nail"), radius, half, pos=[0, back, 0], quat=turn, rgba=_METAL, mass=0)
 
 
-SCENE = Scene(
+SCENE = armless.scene(
     name="metaworld-hammer",
     observation=(
         Entry("hand_xyz", "m", 3),
@@ -226,7 +226,6 @@ SCENE = Scene(
     episode_length=75,
     control_dt=CONTROL_DT,
     substeps=SUBSTEPS,
-    cartesian=True,
     build=build,
     initial=initial,
     settled=settled,
@@ -236,8 +235,6 @@ SCENE = Scene(
     reward=reward,
     success=success,
     success_anytime=True,  # as Meta-World judges; the nail has no way back
-    training={"obs_noise": 0.002, "obs_noise_prob": 0.3},
-    max_speed=500.0,
     dress=dress,
     view=View((0.1, 0.6, 0.08), 1.0, 145.0, -25.0, -0.913),
 )

@@ -11,10 +11,10 @@ import mujoco
 import numpy as np
 
 from envs.base import Entry, Parameter
-from envs.franka.armless import table_spec
+from envs.franka import armless
 from envs.franka.rotations import inverse, turned
 from envs.mujoco.parts import add_box, add_pair, add_servo, add_slide
-from envs.mujoco.scene import Scene, View
+from envs.mujoco.scene import View
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key
 
@@ -51,7 +51,7 @@ _CUBE, _MARK = [0.1, 0.7, 0.25, 1.0], [0.1, 0.7, 0.25, 0.3]
 
 def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The scene for one theta. Where cube and mark start is part of the state, not of the model."""
-    spec = table_spec(CONTROL_DT / SUBSTEPS)
+    spec = armless.table_spec(CONTROL_DT / SUBSTEPS)
     _add_fingers(spec, rate=RATE * theta["servo_rate"], strength=theta["servo_strength"])
     cube = spec.worldbody.add_body(name="cube")
     cube.add_freejoint()
@@ -141,7 +141,7 @@ def dress(spec: mujoco.MjSpec) -> None:
     add_box(spec.body("fingers"), (0.03, 0.1, 0.03), pos=(0, 0, 0.072), rgba=[0.93, 0.94, 0.95, 1])
 
 
-SCENE = Scene(
+SCENE = armless.scene(
     name="panda-push",
     observation=(
         Entry("tip_xyz", "m", 3),
@@ -157,7 +157,6 @@ SCENE = Scene(
     episode_length=50,
     control_dt=CONTROL_DT,
     substeps=SUBSTEPS,
-    cartesian=True,
     build=build,
     initial=initial,
     settled=settled,
@@ -165,8 +164,6 @@ SCENE = Scene(
     observe=observe,
     reward=reward,
     success=success,
-    training={"obs_noise": 0.002, "obs_noise_prob": 0.3},
-    max_speed=500.0,
     dress=dress,
     view=View((-0.05, 0.0, 0.05), 0.9, 145.0, -30.0, -0.4),
 )

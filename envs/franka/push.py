@@ -43,6 +43,8 @@ GRAVITY = 9.81  # m/s^2
 # on every contact we have seen; hard fingertips need more than 6 and throw the puck with fewer.
 RUBBER = (0.0, 0.95, 0.003, 0.5, 2.0)
 TABLE_LEGS = (-0.2, 0.7, 0.55)  # m, see `workcell.dress`
+# Joint angles with the hand in the start area: where the inverse kinematics of a reset begins.
+Q_FOLDED = np.array([0.0, 0.247, 0.0, -2.966, 0.0, 3.213, np.pi / 4])
 NV = arm.N_JOINTS + 4  # puck: x, y, z, yaw
 
 PARAMETERS = (
@@ -113,14 +115,14 @@ def initial(params: Array, key: Key) -> PhysicsState:
 
 def settled(params: Array, obs: Array) -> PhysicsState:
     """The hand and the puck where they are seen, at rest: within a control period both come to rest."""
-    joints = kinematics.solve(jnp.asarray(_folded(), jnp.float32), _pose(obs[:2], HEIGHT), iterations=12, posture=0.05)
+    joints = kinematics.solve(jnp.asarray(Q_FOLDED, jnp.float32), _pose(obs[:2], HEIGHT), iterations=12, posture=0.05)
     return at_rest(joints, jnp.concatenate([obs[2:4] + jnp.array([TABLE_ORIGIN, 0.0]), jnp.zeros(2)]), NV)
 
 
 def ready(key: Key, height: float = HEIGHT) -> Array:
     """[7] joint angles with the hand at a random place near the base, `height` m above the table."""
     start = jax.random.uniform(key, (2,), minval=jnp.array([0.09, -0.15]), maxval=jnp.array([0.11, 0.15]))
-    return kinematics.solve(jnp.asarray(_folded(), jnp.float32), _pose(start, height), iterations=6, posture=0.05)
+    return kinematics.solve(jnp.asarray(Q_FOLDED, jnp.float32), _pose(start, height), iterations=6, posture=0.05)
 
 
 def target(qpos: Array, action: Array, height: float = HEIGHT) -> Array:
@@ -166,11 +168,6 @@ def _pose(xy: Array, height: float) -> Pose:
     return Pose(
         jnp.concatenate([xy + jnp.array([TABLE_ORIGIN, 0.0]), jnp.array([height])]), jnp.asarray(DOWN, jnp.float32)
     )
-
-
-def _folded() -> np.ndarray:
-    """Joint angles with the hand in the start area: where the inverse kinematics of a reset begins."""
-    return np.array([0.0, 0.247, 0.0, -2.966, 0.0, 3.213, np.pi / 4])
 
 
 def finger_xy(side: int) -> tuple[float, float]:

@@ -56,9 +56,8 @@ PARAMETERS = (
 def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The scene for one theta. Legs and head stay where they are on a longer torso."""
     euler = mujoco.mjtIntegrator.mjINT_EULER
-    spec = planar.new_spec(timestep=FRAME, integrator=euler, gravity=theta["gravity"])
-    planar.add_floor(spec)
-    torso = planar.add_torso(spec, HEIGHT, ref=0.0)
+    gravity = theta["gravity"]
+    spec, torso = planar.stage(timestep=FRAME, integrator=euler, gravity=gravity, height=HEIGHT, ref=0.0)
     trunk = {"torso": TORSO._replace(half=TORSO.half * theta["torso_length"]), "head": HEAD}
     links = [_changed(link, theta) for link in LINKS]
     volume = sum(capsule.volume for capsule in (*trunk.values(), *(link.capsule for link in links)))

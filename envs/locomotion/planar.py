@@ -75,30 +75,25 @@ class Link(NamedTuple):
     capsule: Capsule
 
 
-def new_spec(*, timestep: float, integrator: mujoco.mjtIntegrator, gravity: float) -> mujoco.MjSpec:
-    """An empty scene in radians. gravity: multiplies that of the Earth.
+def stage(
+    *, timestep: float, integrator: mujoco.mjtIntegrator, gravity: float, height: float, ref: float
+) -> tuple[mujoco.MjSpec, mujoco.MjsBody]:
+    """A scene in radians with a floor at z = 0 and the root `height` m above it, and that root.
 
-    MuJoCo's defaults are Gym's solver settings: Newton's method, 100 iterations, pyramidal friction cones.
+    The root is free to slide along x and z, where z reads `ref` m at the start, and to pitch. gravity: multiplies that
+    of the Earth. MuJoCo's defaults are Gym's solver settings: Newton's method, 100 iterations, pyramidal friction
+    cones. Viewers see the floor of `VIEW`.
     """
     spec = empty_spec(timestep, integrator)
     spec.compiler.degree = False
     spec.option.gravity = [0.0, 0.0, -GRAVITY * gravity]
-    return spec
-
-
-def add_floor(spec: mujoco.MjSpec) -> None:
-    """The floor at z = 0. Viewers see the one of `VIEW`."""
     plane = mujoco.mjtGeom.mjGEOM_PLANE
     spec.worldbody.add_geom(name=FLOOR, type=plane, size=[0, 0, 1], rgba=INVISIBLE, **NO_CONTACT)
-
-
-def add_torso(spec: mujoco.MjSpec, height: float, *, ref: float) -> mujoco.MjsBody:
-    """The root at that height, m: free to slide along x and z, where z reads `ref` m there, and to pitch."""
     torso = spec.worldbody.add_body(name="torso", pos=[0, 0, height])
     add_slide(torso, [1, 0, 0], name="root_x")
     add_slide(torso, [0, 0, 1], name="root_z", ref=ref)
     add_hinge(torso, [0, 1, 0], name="root_pitch")
-    return torso
+    return spec, torso
 
 
 def add_capsule(

@@ -57,9 +57,8 @@ _TORQUE = [p.name for p in PARAMETERS].index("thigh_torque")
 def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The scene for one theta."""
     runge_kutta = mujoco.mjtIntegrator.mjINT_RK4
-    spec = planar.new_spec(timestep=FRAME, integrator=runge_kutta, gravity=theta["gravity"])
-    planar.add_floor(spec)
-    torso = planar.add_torso(spec, HEIGHT, ref=HEIGHT)
+    gravity = theta["gravity"]
+    spec, torso = planar.stage(timestep=FRAME, integrator=runge_kutta, gravity=gravity, height=HEIGHT, ref=HEIGHT)
     grip = FRICTION * theta["friction"]
     planar.add_capsule(spec, torso, "torso", TORSO, density=DENSITY, friction=grip)
     for link in LINKS:

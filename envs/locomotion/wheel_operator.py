@@ -12,16 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
 
+from envs.locomotion import wheel_legged as robot
 from envs.locomotion.planar import GRAVITY
-from envs.locomotion.wheel_legged import (
-    BODY_HALF,
-    CONTROL_DT,
-    PARAMETERS,
-    TORQUE,
-    WHEEL_INERTIA,
-    WHEEL_MASS,
-    WHEEL_RADIUS,
-)
 from envs.types import Array, Key, Policy
 
 COST = np.diag([4.0, 1.0, 1.0, 1.0])  # of x (m), v (m/s), pitch (rad), its speed (rad/s), squared
@@ -47,30 +39,31 @@ def operator(speed: float) -> Policy:
         shake = _wandered(carry.shake, noise[1], std=SHAKE, time=SHAKE_TIME)
         error = obs - jnp.array([0.0, speed, 0.0, 0.0]).at[0].set(carry.aim + wander)
         torque = -gain @ error + shake
-        return jnp.clip(torque / TORQUE, -1.0, 1.0)[None], Hand(carry.aim + speed * CONTROL_DT, wander, shake)
+        hand = Hand(carry.aim + speed * robot.CONTROL_DT, wander, shake)
+        return jnp.clip(torque / robot.TORQUE, -1.0, 1.0)[None], hand
 
     return Policy(lambda: Hand(jnp.zeros(()), jnp.zeros(()), jnp.zeros(())), act)
 
 
 def _wandered(value: Array, noise: Array, *, std: float, time: float) -> Array:
     """The next value of a process with that stationary std that forgets in `time` s (Ornstein and Uhlenbeck)."""
-    kept = np.exp(-CONTROL_DT / time)
+    kept = np.exp(-robot.CONTROL_DT / time)
     return kept * value + std * np.sqrt(1 - kept**2) * noise
 
 
 def nominal_gain() -> np.ndarray:
     """[4] N m for each m, m/s, rad, rad/s: torque = -gain . (x, v, pitch, its speed) of the nominal robot."""
-    theta = {p.name: p.nominal for p in PARAMETERS}
-    mass, arm = theta["mass"] - WHEEL_MASS, theta["com_height"]
-    inertia = mass * ((2 * BODY_HALF[0]) ** 2 + (2 * BODY_HALF[2]) ** 2) / 12
+    theta = {p.name: p.nominal for p in robot.PARAMETERS}
+    mass, arm = theta["mass"] - robot.WHEEL_MASS, theta["com_height"]
+    inertia = mass * ((2 * robot.BODY_HALF[0]) ** 2 + (2 * robot.BODY_HALF[2]) ** 2) / 12
     # Mass matrix of x and pitch when upright; wheels that roll add their inertia.
     across = mass * arm
-    matrix = [[theta["mass"] + WHEEL_INERTIA / WHEEL_RADIUS**2, across], [across, inertia + mass * arm**2]]
+    matrix = [[theta["mass"] + robot.WHEEL_INERTIA / robot.WHEEL_RADIUS**2, across], [across, inertia + mass * arm**2]]
     inverse = np.linalg.inv(matrix)
     drift, push = np.zeros((4, 4)), np.zeros((4, 1))  # of x, pitch, and their speeds
     drift[:2, 2:] = np.eye(2)
     drift[2:, 1] = inverse @ [0.0, mass * GRAVITY * arm]
-    push[2:, 0] = inverse @ [1 / WHEEL_RADIUS, -1.0]
+    push[2:, 0] = inverse @ [1 / robot.WHEEL_RADIUS, -1.0]
     order = [0, 2, 1, 3]  # from x, v, pitch, its speed
     cost = COST[np.ix_(order, order)]
     solved = scipy.linalg.solve_continuous_are(drift, push, cost, np.array([[TORQUE_COST]]))

@@ -50,15 +50,13 @@ def write_side_by_side(columns: Sequence[Sequence[np.ndarray]], captions: Sequen
 
     A column that ends earlier shows its last frame until the end.
     """
-    strips = list(map(_caption, captions))
-    rows = (
-        [
-            np.concatenate([strip, column[min(i, len(column) - 1)]])
-            for strip, column in zip(strips, columns, strict=True)
-        ]
-        for i in range(max(map(len, columns)))
-    )
-    _write(path, [np.concatenate(row, axis=1) for row in rows])
+    pairs = list(zip(map(_caption, captions), columns, strict=True))
+
+    def frame(i: int) -> np.ndarray:
+        parts = [np.concatenate([strip, column[min(i, len(column) - 1)]]) for strip, column in pairs]
+        return np.concatenate(parts, axis=1)
+
+    _write(path, [frame(i) for i in range(max(map(len, columns)))])
 
 
 def smooth(qpos: np.ndarray, *, control_dt: float, fps: float) -> np.ndarray:

@@ -12,9 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from envs.types import Array, Key, PyTree, Transition
-from experiments.bench.bare_sac import Trained, adam, forward, layers, squashed, trained
+from experiments.bench.bare_sac import Trained, adam, forward, layers, squashed, temperature, trained
 from sgft_jax.learners.h2oplus import H2OPlusHyper
-from sgft_jax.learners.steps import LOG_ALPHA_MIN
 from sgft_jax.models.networks import LOG_STD_MAX
 
 BOUND, RATIO_NOISE = 2.0, 0.1  # of the discriminators' logits and inputs
@@ -80,9 +79,8 @@ def update(agent: Bare, batch: Transition, for_ratio: Transition, noise: Noise, 
 
     grads, log_prob = jax.grad(actor_loss, has_aux=True)(agent.actor.params)
     actor = adam(agent.actor, grads, hyper.lr_actor)
-    slope = alpha * jnp.mean(-log_prob - hyper.entropy_per_dim * batch.action.shape[-1])
-    log_alpha = adam(agent.log_alpha, slope, hyper.lr_alpha)
-    log_alpha = log_alpha._replace(params=jnp.maximum(log_alpha.params, LOG_ALPHA_MIN))
+    entropy = hyper.entropy_per_dim * batch.action.shape[-1]
+    log_alpha = temperature(agent.log_alpha, log_prob, entropy, hyper.lr_alpha)
 
     q_real = _q(agent.target, batch.obs[:n], batch.action[:n]).min(0)
 

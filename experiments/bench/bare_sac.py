@@ -88,9 +88,7 @@ def update(agent: Bare, batch: Transition, noise: Noise, hyper: SACHyper) -> Bar
 
     grads, (q, log_prob) = jax.grad(actor_loss, has_aux=True)(agent.actor.params)
     actor = adam(agent.actor, grads, hyper.lr_actor)
-    slope = alpha * jnp.mean(-log_prob - hyper.entropy_per_dim * act_dim)
-    log_alpha = adam(agent.log_alpha, slope, hyper.lr_alpha)
-    log_alpha = log_alpha._replace(params=jnp.maximum(log_alpha.params, LOG_ALPHA_MIN))
+    log_alpha = temperature(agent.log_alpha, log_prob, hyper.entropy_per_dim * act_dim, hyper.lr_alpha)
 
     def value_loss(params: PyTree) -> Array:
         return jnp.mean((forward(params, batch.obs)[:, 0] - q) ** 2)
@@ -103,6 +101,13 @@ def update(agent: Bare, batch: Transition, noise: Noise, hyper: SACHyper) -> Bar
 
     dynamics = adam(agent.dynamics, jax.grad(dynamics_loss)(agent.dynamics.params), hyper.lr_dynamics)
     return Bare(actor, critic, average, log_alpha, value, dynamics)
+
+
+def temperature(log_alpha: Trained, log_prob: Array, entropy: float | Array, rate: Any) -> Trained:
+    """The temperature's logarithm after one step towards that entropy. log_prob: [B] of the policy's actions."""
+    slope = jnp.exp(log_alpha.params) * jnp.mean(-log_prob - entropy)
+    log_alpha = adam(log_alpha, slope, rate)
+    return log_alpha._replace(params=jnp.maximum(log_alpha.params, LOG_ALPHA_MIN))
 
 
 def layers(

@@ -5,16 +5,8 @@ from pathlib import Path
 
 from envs import extend, gaps
 from envs.types import UserError
-from experiments.runner import cli
-from experiments.runner.options import (
-    Impl,
-    at_least_one,
-    check_task,
-    prior_folders,
-    seed_list,
-    task_of_priors,
-    without_repeats,
-)
+from experiments.runner import cli, options
+from experiments.runner.options import Impl
 from sgft_jax.io.runs import check_folder
 from sgft_jax.presets import PRESETS, PretrainConfig
 
@@ -60,10 +52,10 @@ def check(args: GapsArgs) -> tuple[GapsArgs, list[int], list[Path]]:
     cli.choose("--preset", args.preset, PRESETS)
     check_episodes(args)
     args = replace(args, presets=gaps.each(args.presets))
-    without_repeats("--presets", args.presets)
+    options.without_repeats("--presets", args.presets)
     check_folder(args.out / "gaps")
-    seeds, task = seed_list(args.seed, args.seeds), extend.name_of(args.task)
-    check_task(args.task, args.presets)
+    seeds, task = options.seed_list(args.seed, args.seeds), extend.name_of(args.task)
+    options.check_task(args.task, args.presets)
     if not (args.presets or gaps.presets(task)):
         raise UserError(f"{task} comes with no gaps; name .toml or .json files with --presets")
     return args, seeds, folders_of_priors(args)
@@ -71,13 +63,13 @@ def check(args: GapsArgs) -> tuple[GapsArgs, list[int], list[Path]]:
 
 def check_episodes(args: MeasureArgs) -> None:
     """Raises UserError for too few evaluation episodes to tell gaps apart, or too many."""
-    at_least_one(args, "episodes")
+    options.at_least_one(args, "episodes")
     if args.episodes < 200:
         raise UserError(f"--episodes is {args.episodes}: a success rate needs at least 200 to tell 40 % from 50 %")
 
 
 def folders_of_priors(args: MeasureArgs) -> list[Path]:
     """The folders of the priors that play; raises UserError where there are none, or they are of another task."""
-    folders = prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
-    task_of_priors(folders, args.task)
+    folders = options.prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
+    options.task_of_priors(folders, args.task)
     return folders
