@@ -282,7 +282,7 @@ def test_other_settings_of_the_judge_forget_what_it_said_and_nothing_else(tmp_pa
     assert [gap.name for gap in table.to_judge(GAPS)] == ["b"]
     table.settle("judge", {"config": {"rate": 0.2}, "seeds": [0]}, again=True)
     assert table.to_judge(GAPS) == GAPS and table.without("zero_shot", GAPS) == []
-    line = table.found["gaps"]["a"]
+    line = table.known["a"]
     assert line["admitted"] is None and line["stratum"] == "solved" and line["trivial"] is False
     table.add({"b": {"fit": rate(0.9)}})
     assert [gap.name for gap in table.to_judge(GAPS)] == ["a"]
