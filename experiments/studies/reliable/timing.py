@@ -39,7 +39,7 @@ def commands(log: Path) -> Iterator[dict[str, Any]]:
 
 def late_share(log: Path) -> float:
     """The share of steps for which no command came in time."""
-    return float(np.mean([one["late"] for one in commands(log)]))
+    return float(np.mean([command["late"] for command in commands(log)]))
 
 
 def periods(log: Path) -> np.ndarray:
