@@ -51,13 +51,13 @@ def figures(args: FiguresArgs) -> Path:
     check_folder(args.out / "figures")
     from sgft_jax.analysis.release import read
 
-    found = read(args.out, args.data)
-    if not found.curves:
-        raise UserError(_nothing(args, found.notes))
+    runs = read(args.out, args.data)
+    if not runs.curves:
+        raise UserError(_nothing(args, runs.notes))
     from sgft_jax.analysis.results import select, write_results  # brings Matplotlib
 
     task = (extend.name_of(args.task),) if args.task else ()
-    chosen = select(found, variants=args.variants, task=task, gap=args.gaps, method=args.methods, priors=args.priors)
+    chosen = select(runs, variants=args.variants, task=task, gap=args.gaps, method=args.methods, priors=args.priors)
     return write_results(chosen, args.out / "figures", reference=args.reference)
 
 
@@ -66,10 +66,10 @@ def _nothing(args: FiguresArgs, notes: list[str]) -> str:
     if args.data:
         command = f"python -m experiments.figures --export {args.data}"
         return f"{args.data}: its curves-*.csv hold no run; write some with: {command}"
-    said = f"{args.out / 'finetune'}: holds no evaluated run to draw"
+    message = f"{args.out / 'finetune'}: holds no evaluated run to draw"
     if notes:
-        return f"{said}: {notes[0]}" + (f"; and {len(notes) - 1} more" if len(notes) > 1 else "")
-    return f"{said}; make one with: python -m experiments.finetune --task {args.task or 'push'}"
+        return f"{message}: {notes[0]}" + (f"; and {len(notes) - 1} more" if len(notes) > 1 else "")
+    return f"{message}; make one with: python -m experiments.finetune --task {args.task or 'push'}"
 
 
 if __name__ == "__main__":

@@ -62,18 +62,18 @@ def make_report(
 def numbers(report: Report) -> dict[str, Any]:
     """A report (NumPy arrays) as JSON data: what stands in summary.json and on the card."""
     quality = value.report(jnp.asarray(report.values[report.counts]), jnp.asarray(report.returns[report.counts]))
-    found: dict[str, Any] = {name: float(x) for name, x in quality.items()}
+    summary: dict[str, Any] = {name: float(x) for name, x in quality.items()}
     if report.model_error.size:
-        found["dynamics/error"] = report.model_error.tolist()
-        found["dynamics/error_if_nothing_moved"] = report.still_error.tolist()
-    return found
+        summary["dynamics/error"] = report.model_error.tolist()
+        summary["dynamics/error_if_nothing_moved"] = report.still_error.tolist()
+    return summary
 
 
 def _values(env: Env, policy: Policy, prior: PyTree, episode: Episode) -> tuple[Array, Array]:
     """V_sim and Monte-Carlo returns [episode_length] of one episode."""
     rows, value_of = episode.transitions, policy.value
     assert value_of is not None  # checked before
-    predict = lambda obs: value_of(prior, obs)  # noqa: E731
+    predict = functools.partial(value_of, prior)
     returns = value.discounted_returns(rows.reward, rows.discount, predict(rows.next_obs[-1]))
     return jax.vmap(predict)(rows.obs[: env.episode_length]), returns[: env.episode_length]
 
@@ -91,11 +91,12 @@ def _model_errors(env: Env, policy: Policy, prior: Any, episode: Episode) -> tup
         nothing = jnp.zeros((*starts.shape, 0))
         return (nothing, nothing), counts
 
+    rows = episode.transitions
+
     def window(start: Array) -> tuple[Array, Array]:
-        cut = lambda x: jax.lax.dynamic_slice_in_dim(x, start, horizon)  # noqa: E731
-        rows = episode.transitions
-        obs = jnp.concatenate([rows.obs[start][None], cut(rows.next_obs)])
+        actions, after = (jax.lax.dynamic_slice_in_dim(x, start, horizon) for x in (rows.action, rows.next_obs))
+        obs = jnp.concatenate([rows.obs[start][None], after])
         still = jax.vmap(lambda o: jnp.sqrt(jnp.mean(((obs[0] - o) / prior.normalizer.std) ** 2)))(obs[1:])
-        return error(prior, obs, cut(rows.action)), still
+        return error(prior, obs, actions), still
 
     return jax.vmap(window)(starts), counts

@@ -74,15 +74,14 @@ def main(args: BulletArgs) -> None:
 
     def play(run: _Run) -> None:
         if args.minutes is None or time.monotonic() - started < 60 * args.minutes:
-            panda_gym.fine_tune(
-                python, args.out, options(args, run), log=args.out / f"robot-{run.method}-{run.seed}.log"
-            )
+            log = args.out / f"robot-{run.method}-{run.seed}.log"
+            panda_gym.fine_tune(python, args.out, options(args, run), log=log)
 
     args.out.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(args.jobs) as pool:
         list(pool.map(play, missing))  # the first error ends it
-    every = list(runs(args))
-    print(f"{sum((run.folder / SUMMARY).exists() for run in every)} of {len(every)} runs are finished")
+    count = len(list(runs(args)))
+    print(f"{count - len(unfinished(args))} of {count} runs are finished")
     print(f"next: python -m experiments.figures --out {args.out}")
 
 
@@ -118,18 +117,16 @@ def unfinished(args: BulletArgs) -> list[_Run]:
 
 def _arguments(args: BulletArgs, method: str, seed: int) -> FinetuneArgs:
     """What a run is, as `experiments.finetune` sees it."""
-    return finetune_args.arguments(
-        method, task=TASK, real=(REMOTE,), seeds=1, seed=seed, prior=args.prior, rollouts=args.rollouts,
-        eval_at=args.eval_at, eval_episodes=args.episodes, out=args.out,
-    )  # fmt: skip
+    given = {name: getattr(args, name) for name in ("prior", "rollouts", "eval_at", "out")}
+    played = {"task": TASK, "real": (REMOTE,), "seeds": 1, "seed": seed, "eval_episodes": args.episodes}
+    return finetune_args.arguments(method, **played, **given)
 
 
 def options(args: BulletArgs, run: _Run) -> list[object]:
     """Of `experiments.finetune`."""
-    return [
-        "--method", run.method, "--seed", run.seed, "--prior", args.prior, "--rollouts", args.rollouts,
-        "--eval-episodes", args.episodes, "--eval-at", *args.eval_at, *(["--resume"] if run.folder.exists() else []),
-    ]  # fmt: skip
+    words = ["--method", run.method, "--seed", run.seed, "--prior", args.prior, "--rollouts", args.rollouts]
+    words += ["--eval-episodes", args.episodes, "--eval-at", *args.eval_at]
+    return [*words, "--resume"] if run.folder.exists() else words
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ def choose(lines: Lines, n: int) -> list[str]:
     counts = dict.fromkeys((family for names in left.values() for name in names for family in _of(lines, name)), 0)
     chosen: set[str] = set()
     while len(chosen) < n:
-        for names in [own for own in left.values() if own][: n - len(chosen)]:
+        for names in list(filter(None, left.values()))[: n - len(chosen)]:
             best = min(names, key=lambda name: _spread(counts, _of(lines, name)))
             names.remove(best)
             chosen.add(best)
@@ -39,13 +39,13 @@ def choose(lines: Lines, n: int) -> list[str]:
 
 def remarks(lines: Lines, chosen: Sequence[str]) -> list[str]:
     """What people should know of a choice: strata that have too few gaps, and gaps that may be beyond anybody."""
-    left, found = _by_stratum(lines), []
+    left, notes = _by_stratum(lines), []
     shares = {s: len(chosen) // len(STRATA) + (i < len(chosen) % len(STRATA)) for i, s in enumerate(STRATA)}
     if few := [f"{s} has {len(left[s])} of {shares[s]}" for s in STRATA if len(left[s]) < shares[s]]:
-        found.append(f"too few gaps: {', '.join(few)}; other strata give the rest")
+        notes.append(f"too few gaps: {', '.join(few)}; other strata give the rest")
     if open_ := [name for name in chosen if lines[name]["admitted"] is None]:
-        found.append(f"nobody checked that these gaps can be mastered, --judge does: {', '.join(open_)}")
-    return found
+        notes.append(f"nobody checked that these gaps can be mastered, --judge does: {', '.join(open_)}")
+    return notes
 
 
 def write(path: Path, chosen: Sequence[Gap], words: Sequence[str], command: str) -> None:
@@ -55,7 +55,7 @@ def write(path: Path, chosen: Sequence[Gap], words: Sequence[str], command: str)
     """
     if path.exists() and list(gaps.read_file(path).values()) != list(chosen):
         raise UserError(f"{path}: holds other gaps; a frozen set is never replaced, choose another --to")
-    tables = [f"# {said}\n{gaps.to_toml([gap])}" for gap, said in zip(chosen, words, strict=True)]
+    tables = [f"# {comment}\n{gaps.to_toml([gap])}" for gap, comment in zip(chosen, words, strict=True)]
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join([f"# Chosen by {command}\n", *tables]))
 

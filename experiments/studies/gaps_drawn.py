@@ -16,7 +16,7 @@ from envs.gaps import SIM, Gap
 from envs.history import with_previous_actions
 from envs.rollout import Episode
 from envs.system import concealed
-from envs.types import PyTree, Transition, UserError
+from envs.types import Key, PyTree, Transition, UserError
 from experiments.runner.cli import columns
 from experiments.runner.evaluation import play
 from experiments.runner.gaps_run import FINAL_SEED, episode_key, percent, rate, systems, train
@@ -46,129 +46,124 @@ def run(args: DrawArgs, seeds: list[int], folders: list[Path]) -> dict[str, Any]
     """Draws, writes and measures gaps; prints and returns the table. folders: of the priors."""
     task = envs.name_of(args.task)
     env = concealed(envs.make(args.task, args.impl, **observed_by(folders)))
-    found = gap_distribution.draw(env, gap_distribution.load(env, args.distribution), args.seed, args.count)
+    drawn = gap_distribution.draw(env, gap_distribution.load(env, args.distribution), args.seed, args.count)
     path = args.out / "gaps" / task / f"seed-{args.seed}.toml"
-    write_gaps(path, found)
+    write_gaps(path, drawn)
     priors = load_priors(folders, env)
-    everywhere = [gaps.find(task, SIM), *found]
+    everywhere = [gaps.find(task, SIM), *drawn]
     table = Table(path.with_suffix(".json"), {"task": task, "seed": args.seed}, everywhere)
-    settings = _settings(env, args, priors, seeds)
-    for what in settings:
-        table.settle(what, settings[what], again=args.overwrite)
+    for what, settings in _settings(env, args, priors, seeds).items():
+        table.settle(what, settings, again=args.overwrite)
     if missing := [gap for gap in table.without("zero_shot", everywhere) if gap.name != SIM]:
         table.add(_zero_shot(env, missing, priors, args.episodes))
     if args.plan and (missing := table.without("plan", everywhere)):
         table.add(_plan(env, missing, priors, args.episodes))
-    if args.judge and (missing := table.to_judge(found)):
+    if args.judge and (missing := table.to_judge(drawn)):
         table.add(_judge(env, args, missing, seeds, path.with_suffix("")))
-    print("\n".join(lines([gap.name for gap in everywhere], table.found["gaps"])))
+    print("\n".join(lines([gap.name for gap in everywhere], table.known)))
     print(f"gaps: {path}\ntable: {table.path}")
     if args.choose and args.to:
-        _choose(args, args.to, found, table.found["gaps"])
-    return table.found
+        _choose(args, args.to, drawn, table.known)
+    return table.content
 
 
-def _choose(args: DrawArgs, path: Path, found: Sequence[Gap], known: Mapping[str, Mapping[str, Any]]) -> None:
+def _choose(args: DrawArgs, path: Path, drawn: Sequence[Gap], known: Mapping[str, Mapping[str, Any]]) -> None:
     """Writes a frozen set of the gaps that were asked for and says what is to know of it."""
-    drawn = {gap.name: gap for gap in found}
-    lines = {name: known[name] for name in drawn}
+    by_name = {gap.name: gap for gap in drawn}
+    lines = {name: known[name] for name in by_name}
     names = gaps_choose.choose(lines, args.choose)
-    words = [", ".join([f"zero-shot {_success(known[name])} %", *_marks(known[name])]) for name in names]
-    chosen = [drawn[name]._replace(stratum=known[name]["stratum"]) for name in names]
+    rates = (f"zero-shot {100 * known[name]['zero_shot']['success']:.0f} %" for name in names)
+    words = [", ".join([success, *_marks(known[name])]) for name, success in zip(names, rates, strict=True)]
+    chosen = [by_name[name]._replace(stratum=known[name]["stratum"]) for name in names]
     gaps_choose.write(path, chosen, words, _command(args))
     print("\n".join([*gaps_choose.remarks(lines, names), f"chosen: {path}"]))
 
 
-def _success(line: Mapping[str, Any]) -> str:
-    return f"{100 * line['zero_shot']['success']:.0f}"
-
-
 def _command(args: DrawArgs) -> str:
     """What draws and chooses the same gaps, where the same priors are."""
-    own = [f"--distribution {args.distribution}"] if args.distribution else []
+    families = [f"--distribution {args.distribution}"] if args.distribution else []
     flags = [f"--{name}" for name in ("plan", "judge") if getattr(args, name)]
-    given = [f"--task {args.task} --count {args.count} --seed {args.seed}", *own, *flags]
+    given = [f"--task {args.task} --count {args.count} --seed {args.seed}", *families, *flags]
     return f"python -m experiments.studies.gaps_draw {' '.join(given)} --choose {args.choose} --to {args.to}"
 
 
-def write_gaps(path: Path, found: Sequence[Gap]) -> None:
+def write_gaps(path: Path, drawn: Sequence[Gap]) -> None:
     """Writes drawn gaps as one file. It only grows: raises UserError if it holds others under these names."""
     old = list(gaps.read_file(path).values()) if path.exists() else []
-    if odd := [gap.name for gap, now in zip(old, found, strict=False) if gap != now]:
+    if odd := [gap.name for gap, now in zip(old, drawn, strict=False) if gap != now]:
         raise UserError(f"{path}: {odd[0]} is not what is drawn now; choose another --seed or --out")
-    if len(found) > len(old):
+    if len(drawn) > len(old):
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(
-            f"# Drawn by python -m experiments.studies.gaps_draw --count {len(found)}\n\n{gaps.to_toml(found)}"
-        )
+        head = f"# Drawn by python -m experiments.studies.gaps_draw --count {len(drawn)}"
+        path.write_text(f"{head}\n\n{gaps.to_toml(drawn)}")
 
 
 def _settings(env: Env, args: DrawArgs, priors: Sequence[Prior], seeds: Sequence[int]) -> dict[str, dict[str, Any]]:
     """What decides each of the measurements that are asked for, see `Table.settle`."""
     played = {"impl": env.impl, "episodes": args.episodes}
-    own = {**played, "priors": [digest(prior) for prior in priors]}
-    judge = {
-        "preset": args.judge_preset,
-        "config": args.config,
-        "seeds": seeds,
-        "previous_actions": env.previous_actions or PREVIOUS_ACTIONS,
-        **played,
-    }
-    asked = {"zero_shot": own}
+    policies = {**played, "priors": [digest(prior) for prior in priors]}
+    training = {"preset": args.judge_preset, "config": args.config, "seeds": seeds}
+    seen = {"previous_actions": env.previous_actions or PREVIOUS_ACTIONS}
+    asked = {"zero_shot": policies}
     if args.plan:
-        asked["plan"] = {**own, "method": PLANNER, "options": get_method(PLANNER).config()}
+        asked["plan"] = {**policies, "method": PLANNER, "options": get_method(PLANNER).config()}
     if args.judge:
-        asked["judge"] = judge
+        asked["judge"] = {**training, **seen, **played}
     return asked
 
 
 class Table:
     """What is known of drawn gaps, on disk as soon as it is known.
 
-    found: {**of, "about": settings by measurement, "gaps": by name the gap and what was measured on it}. of: what the
+    content: {**of, "about": settings by measurement, "gaps": by name the gap and what was measured on it}. of: what the
     table is of. Raises UserError for a table of something else, or of other gaps under these names.
     """
 
     def __init__(self, path: Path, of: Mapping[str, Any], gaps: Sequence[Gap]) -> None:
         self.path = path
-        self.found = read_json(path) if path.exists() else {**of, "about": {}, "gaps": {}}
-        if odd := differences({name: self.found.get(name) for name in of}, dict(of)):
+        self.content = read_json(path) if path.exists() else {**of, "about": {}, "gaps": {}}
+        if odd := differences({name: self.content.get(name) for name in of}, dict(of)):
             raise UserError(f"{path}: is a table of another {odd[0][0]}; {_ELSE}")
-        if not isinstance(self.found.get("about"), dict):
+        if not isinstance(self.content.get("about"), dict):
             raise UserError(f"{path}: does not say how it was measured, an earlier version wrote it; {_ELSE}")
         for gap in gaps:
-            line = self.found["gaps"].setdefault(gap.name, {"gap": jsonable(gap)})
+            line = self.known.setdefault(gap.name, {"gap": jsonable(gap)})
             if line["gap"] != jsonable(gap):
                 raise UserError(f"{path}: its {gap.name} is another gap; {_ELSE}")
             line |= labels(line)
 
     def settle(self, what: str, settings: Mapping[str, Any], *, again: bool) -> None:
         """Says what decides a measurement. again: forget what other settings gave; else that raises UserError."""
-        about, now = self.found["about"], jsonable(settings)
+        about, now = self.content["about"], jsonable(settings)
         if (old := about.get(what, now)) != now and not again:
             how = f"{what.replace('_', '-')} was measured with other {differences(old, now)[0][0]}, see its 'about'"
             raise UserError(f"{self.path}: {how}; --overwrite measures it again, another --out keeps both")
         if old != now:
-            for line in self.found["gaps"].values():
+            for line in self.known.values():
                 for gone in _MEASURED[what]:
                     line.pop(gone, None)
                 line |= labels(line)
         about[what] = now
 
-    def without(self, what: str, found: Sequence[Gap]) -> list[Gap]:
-        """Those of which this is not known yet."""
-        return [gap for gap in found if what not in self.found["gaps"][gap.name]]
+    @property
+    def known(self) -> dict[str, dict[str, Any]]:
+        """A line for each gap, by name."""
+        return self.content["gaps"]
 
-    def to_judge(self, found: Sequence[Gap]) -> list[Gap]:
+    def without(self, what: str, drawn: Sequence[Gap]) -> list[Gap]:
+        """Those of which this is not known yet."""
+        return [gap for gap in drawn if what not in self.known[gap.name]]
+
+    def to_judge(self, drawn: Sequence[Gap]) -> list[Gap]:
         """Those that nothing has mastered yet and on which no policy was trained: training is the dear measurement."""
-        return [gap for gap in found if self.found["gaps"][gap.name]["admitted"] is None]
+        return [gap for gap in drawn if self.known[gap.name]["admitted"] is None]
 
     def add(self, lines: Mapping[str, Mapping[str, Any]]) -> None:
         """Writes what has been found of gaps, by name."""
         for name, line in lines.items():
-            self.found["gaps"][name] |= line
-            self.found["gaps"][name] |= labels(self.found["gaps"][name])
-        write_json(self.path, self.found)
+            self.known[name] |= line
+            self.known[name] |= labels(self.known[name])
+        write_json(self.path, self.content)
 
 
 def labels(line: Mapping[str, Any]) -> dict[str, Any]:
@@ -191,7 +186,7 @@ def labels(line: Mapping[str, Any]) -> dict[str, Any]:
 
 def _mastered_by(line: Mapping[str, Any]) -> str | None:
     """The first measurement in which a gap is mastered: one policy that succeeds shows that there is a way."""
-    best = {what: max(one["success"] for one in line[what]["policies"]) for what in _MASTERED if what in line}
+    best = {what: max(policy["success"] for policy in line[what]["policies"]) for what in _MASTERED if what in line}
     return next((what for what, success in best.items() if success >= ADMITTED_AT_LEAST), None)
 
 
@@ -217,9 +212,9 @@ def _marks(line: Mapping[str, Any]) -> list[str]:
 # --- measurements -----------------------------------------------------------------------------------------------------
 
 
-def _zero_shot(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: int) -> dict[str, dict[str, Any]]:
+def _zero_shot(env: Env, drawn: Sequence[Gap], priors: list[Prior], episodes: int) -> dict[str, dict[str, Any]]:
     """Success of the priors' policies on gaps and without one, as they are and after one rollout of identification."""
-    everywhere = [gaps.find(env.name, SIM), *found]
+    everywhere = [gaps.find(env.name, SIM), *drawn]
     system, members = systems(env, everywhere, priors, episodes)
     policy = make_policy(priors[0].card, env)
     count = len(everywhere) * len(priors)
@@ -249,33 +244,34 @@ def _identified(part: Interface, priors: int, members: PyTree, explored: Episode
 
     def start(params: PyTree, rows: Transition) -> Identified:
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), rows)
-        draw = lambda key, n: jax.tree.map(  # noqa: E731
-            lambda x: x[jax.random.randint(key, (n,), 0, flat.reward.shape[0])], flat
-        )
+
+        def draw(key: Key, n: int) -> Transition:
+            indices = jax.random.randint(key, (n,), 0, flat.reward.shape[0])
+            return jax.tree.map(lambda x: x[indices], flat)
+
         return part.start(params, SimulatedData(draw, jnp.zeros(1)))
 
     sim = jax.vmap(start)(*jax.tree.map(lambda x: x[:priors], (members, rows)))
-    own = jax.tree.map(lambda x: jnp.tile(x, (len(held) // priors, *[1] * (x.ndim - 1))), sim)
-    return jax.vmap(part.refit)(own, *jax.tree.map(lambda x: x[:, 0], (rows, held))).distortion
+    everywhere = jax.tree.map(lambda x: jnp.tile(x, (len(held) // priors, *[1] * (x.ndim - 1))), sim)
+    return jax.vmap(part.refit)(everywhere, *jax.tree.map(lambda x: x[:, 0], (rows, held))).distortion
 
 
-def _plan(env: Env, found: Sequence[Gap], priors: list[Prior], episodes: int) -> dict[str, dict[str, Any]]:
+def _plan(env: Env, drawn: Sequence[Gap], priors: list[Prior], episodes: int) -> dict[str, dict[str, Any]]:
     """Success of what the planning method does before it has learned anything."""
     method = get_method(PLANNER)
     for prior in priors:
         api.check_prior(prior, method, env)
     policy = method.build(method.config(), priors[0], env).policy
-    system, members = systems(env, found, priors, episodes)
+    system, members = systems(env, drawn, priors, episodes)
     played = play(system, policy, members, episode_key(FINAL_SEED), episodes)
-    return {gap.name: {"plan": own} for gap, own in _each(found, _rates(played, len(found), len(priors)))}
+    return _by_name("plan", drawn, _rates(played, len(drawn), len(priors)))
 
 
-def _judge(env: Env, args: DrawArgs, found: Sequence[Gap], seeds: list[int], folder: Path) -> dict[str, dict[str, Any]]:
+def _judge(env: Env, args: DrawArgs, drawn: Sequence[Gap], seeds: list[int], folder: Path) -> dict[str, dict[str, Any]]:
     """Success of policies that were trained on the gaps themselves and see their previous actions."""
     seen = env if env.previous_actions else with_previous_actions(env, PREVIOUS_ACTIONS)
-    played = train(env, args.config, found, seeds, folder, episodes=args.episodes, seen=seen)
-    rates = [rate(own, stats.mean) for own in played]
-    return {gap.name: {"judge": own} for gap, own in _each(found, rates)}
+    played = train(env, args.config, drawn, seeds, folder, episodes=args.episodes, seen=seen)
+    return _by_name("judge", drawn, [rate(episodes, stats.mean) for episodes in played])
 
 
 def _rates(played: Episode, systems: int, policies: int) -> list[dict[str, Any]]:
@@ -283,5 +279,6 @@ def _rates(played: Episode, systems: int, policies: int) -> list[dict[str, Any]]
     return [rate(stacking.part(played, i, policies), stats.mean) for i in range(systems)]
 
 
-def _each(found: Sequence[Gap], rates: Sequence[dict[str, Any]]) -> list[tuple[Gap, dict[str, Any]]]:
-    return list(zip(found, rates, strict=True))
+def _by_name(what: str, drawn: Sequence[Gap], rates: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Of each gap what was measured there."""
+    return {gap.name: {what: success} for gap, success in zip(drawn, rates, strict=True)}

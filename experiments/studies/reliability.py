@@ -52,13 +52,13 @@ def main(args: ReliabilityArgs) -> dict[str, list[dict[str, Any]]]:
     from sgft_jax.io import runs
     from sgft_jax.io.log import write_summary
 
-    home, found = (args.out / "reliability").resolve(), {part: [] for part in args.parts}
+    home, lines = (args.out / "reliability").resolve(), {part: [] for part in args.parts}
     for part in args.parts:
         for line in _PARTS[part](args, home / part):
-            found[part].append(line)
+            lines[part].append(line)
             print(f"{part}: " + ", ".join(f"{name} {_text(x)}" for name, x in line.items()), flush=True)
-    print(f"numbers: {write_summary(home, {'provenance': runs.provenance(), **found})}")
-    return found
+    print(f"numbers: {write_summary(home, {'provenance': runs.provenance(), **lines})}")
+    return lines
 
 
 def _kills(args: ReliabilityArgs, home: Path) -> Iterator[dict[str, Any]]:

@@ -198,7 +198,7 @@ def diagnosis(
     horizons = found["horizons"]
     for where, colour in (("simulated", _FAINT), ("real", PALETTE[0])):
         for name, dash in (("improvable", "-"), ("improving", ":")):
-            shares = [one[name] for one in found["value"][where]]
+            shares = [by_name[name] for by_name in found["value"][where]]
             states.plot(horizons, shares, dash, color=colour, linewidth=2, label=f"{name}, {where}", clip_on=False)
     states.set_ylim(-0.03, 1.03)
     states.set_title("states where the best action keeps / exceeds V_sim", **_FONT, loc="left")
@@ -271,9 +271,9 @@ def effects(path: Path, found: Mapping[str, Mapping[str, Mapping[str, Interval]]
     rows = math.ceil(len(found) / columns)
     figure, panels = _figure(5.2 * columns, 4.2 * rows + 0.2, columns, len(found))
     for axes, (place, measures) in zip(panels, found.items(), strict=True):
-        for i, (measure, own) in enumerate(measures.items()):
-            heights = np.arange(len(own)) + 0.22 * (i - (len(measures) - 1) / 2)
-            estimate, low, high = (np.array([float(x) for x in bounds]) for bounds in zip(*own.values(), strict=True))
+        for i, (measure, bands) in enumerate(measures.items()):
+            heights = np.arange(len(bands)) + 0.22 * (i - (len(measures) - 1) / 2)
+            estimate, low, high = (np.array([float(x) for x in bounds]) for bounds in zip(*bands.values(), strict=True))
             axes.hlines(heights, low, high, color=PALETTE[i], linewidth=1.5)
             axes.plot(estimate, heights, "o", color=PALETTE[i], markersize=4, label=measure)
         names = list(next(iter(measures.values())))

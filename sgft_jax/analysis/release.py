@@ -106,9 +106,9 @@ def _priors(folder: Path) -> Iterable[dict[str, Any]]:
     summary, stored, starts = _summary_of(folder), read_config(folder), read_starts(folder) or [{}]
     options = reading.flat({name: value for name, value in stored.items() if name in ("preset", "config")})
     times = {name: value for name, value in summary.items() if name.startswith("time/")}
-    for i, one in enumerate(summary["seeds"]):
-        low, high = one["success/interval"]
-        scores = {name: value for name, value in reading.flat(one).items() if name != "success/interval"}
+    for i, trained in enumerate(summary["seeds"]):
+        low, high = trained["success/interval"]
+        scores = {name: value for name, value in reading.flat(trained).items() if name != "success/interval"}
         bounds = {"success/low": low, "success/high": high}
         yield {**_set_of(folder), "prior": i, **scores, **bounds, **reading.origin(starts[-1]), **times, **options}
 
@@ -118,7 +118,7 @@ def _summary_of(folder: Path) -> dict[str, Any]:
 
 
 def _set_of(folder: Path) -> dict[str, str]:
-    digests = [one.get("digest", "") for one in _summary_of(folder)["seeds"]]
+    digests = [prior.get("digest", "") for prior in _summary_of(folder)["seeds"]]
     return {"task": folder.parent.parent.name, "priors": reading.set_name(folder, digests)}
 
 

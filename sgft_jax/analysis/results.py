@@ -15,9 +15,9 @@ def select(found: Found, *, variants: bool = True, **wanted: Sequence[str]) -> F
     """
     curves = [curve for curve in found.curves if variants or not curve.variant]
     for field, names in wanted.items():
-        there = sorted({getattr(curve, field) for curve in curves})
-        if missing := [name for name in names if name not in there]:
-            raise UserError(unknown(f"run of the {field}", missing[0], there))
+        known = sorted({getattr(curve, field) for curve in curves})
+        if missing := [name for name in names if name not in known]:
+            raise UserError(unknown(f"run of the {field}", missing[0], known))
         curves = [curve for curve in curves if not names or getattr(curve, field) in names]
     if not curves:
         raise UserError(f"no run matches all of the chosen: {', '.join(name for name in wanted if wanted[name])}")
@@ -35,8 +35,8 @@ def write_results(found: Found, target: Path, *, reference: str | None = None) -
     for gap in dict.fromkeys(curve.gap for curve in found.curves):
         sections += _overview(gap, [curve for curve in found.curves if curve.gap == gap], target)
     for task, gap in dict.fromkeys((curve.task, curve.gap) for curve in found.curves):
-        own = [curve for curve in found.curves if (curve.task, curve.gap) == (task, gap)]
-        sections += _section(f"{task} on the {gap} real system", own, target / f"{task}-{gap}.png", reference)
+        chosen = [curve for curve in found.curves if (curve.task, curve.gap) == (task, gap)]
+        sections += _section(f"{task} on the {gap} real system", chosen, target / f"{task}-{gap}.png", reference)
     if found.notes:
         sections.append("\n".join(["## Left out or unfinished", "", *(f"- {note}" for note in found.notes)]))
     path = target / "tables.md"
@@ -47,12 +47,12 @@ def write_results(found: Found, target: Path, *, reference: str | None = None) -
 def _overview(gap: str, curves: Sequence[Curve], target: Path) -> list[str]:
     """All tasks on one gap, methods with their defaults from the same priors; [] for a single task."""
     tasks = {task: from_main_priors(c for c in curves if c.task == task) for task in sorted({c.task for c in curves})}
-    tasks = {task: own for task, own in tasks.items() if own}
+    tasks = {task: chosen for task, chosen in tasks.items() if chosen}
     if len(tasks) < 2:
         return []
     title = f"All tasks, {gap} real systems"
     shown = tables.leading(tasks, figures.MOST)
-    panels = {task: [curve for curve in own if curve.name in shown] for task, own in tasks.items()}
+    panels = {task: [curve for curve in chosen if curve.name in shown] for task, chosen in tasks.items()}
     path = figures.learning_curves(target / f"overview-{gap}.png", panels, title=title)
     return [f"## {title}", f"![{title}]({path.name})", tables.areas_by_task(tasks)]
 
@@ -61,11 +61,11 @@ def _section(title: str, curves: Sequence[Curve], path: Path, reference: str | N
     """One task and gap: a panel for each set of priors and for each method with variants, a table for each set."""
     panels: dict[str, list[Curve]] = {}
     texts = []
-    for priors, own in by_priors(curves).items():
+    for priors, members in by_priors(curves).items():
         words = f"priors {priors}" if priors else "priors unknown"
-        panels[words] = [curve for curve in own if not curve.variant]
-        for method in dict.fromkeys(curve.method for curve in own if curve.variant):
-            panels[f"{method} and its variants, {words}"] = [curve for curve in own if curve.method == method]
-        texts += [f"### {title}, {words}", tables.summary(own, reference)]
+        panels[words] = [curve for curve in members if not curve.variant]
+        for method in dict.fromkeys(curve.method for curve in members if curve.variant):
+            panels[f"{method} and its variants, {words}"] = [curve for curve in members if curve.method == method]
+        texts += [f"### {title}, {words}", tables.summary(members, reference)]
     figures.learning_curves(path, panels, title=title)
     return [f"## {title}", f"![{title}]({path.name})", *texts]

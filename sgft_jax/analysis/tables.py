@@ -47,23 +47,21 @@ def summary(curves: Sequence[Curve], reference: str | None = None) -> str:
     """
     grid = shared_grid(curves)
     until = f"area, {grid[0]} to {grid[-1]} rollouts" if len(grid) > 1 else "area"
-    head = [
-        "method", "seeds", "start", until, "end (rollouts)", "deepest fall: zero-shot / own start", "training",
-        f"{100 * LEVEL:.0f} % held after",
-    ]  # fmt: skip
+    head = ["method", "seeds", "start", until, "end (rollouts)", "deepest fall: zero-shot / own start", "training"]
+    head.append(f"{100 * LEVEL:.0f} % held after")
     other = _reference(curves, grid, reference)
     rows = [_row(curve, curves, grid) for curve in curves]
-    if other is None or len(curves) < 2:
-        return markdown(head, rows)
-    head += [f"area minus {other.spec}", f"P(better than {other.spec})"]
-    return markdown(head, [row + _against(curve, other, grid) for row, curve in zip(rows, curves, strict=True)])
+    if other is not None and len(curves) > 1:
+        head += [f"area minus {other.spec}", f"P(better than {other.spec})"]
+        rows = [row + _against(curve, other, grid) for row, curve in zip(rows, curves, strict=True)]
+    return markdown(head, rows)
 
 
 def _reference(curves: Sequence[Curve], grid: np.ndarray, name: str | None) -> Curve | None:
     """The curve of that name; without a name the best one. None where it is not, or has no area."""
-    areas = [(float(own.mean()), curve) for curve in curves if (own := area(curve, grid)) is not None]
-    chosen = [(mean, curve) for mean, curve in areas if name in (None, curve.spec)]
-    return max(chosen, key=lambda pair: pair[0])[1] if chosen else None
+    means = {i: float(areas.mean()) for i, curve in enumerate(curves) if (areas := area(curve, grid)) is not None}
+    chosen = [i for i in means if name in (None, curves[i].spec)]
+    return curves[max(chosen, key=lambda i: means[i])] if chosen else None
 
 
 def areas_by_task(tasks: Mapping[str, Sequence[Curve]]) -> str:
@@ -73,15 +71,15 @@ def areas_by_task(tasks: Mapping[str, Sequence[Curve]]) -> str:
     stands only for methods that were run on all of them.
     """
     grids = {task: shared_grid(curves) for task, curves in tasks.items()}
-    found: dict[str, dict[str, tuple[Curve, np.ndarray]]] = {}
+    by_name: dict[str, dict[str, tuple[Curve, np.ndarray]]] = {}
     for task, curves in tasks.items():
         for curve in curves:
-            if (own := area(curve, grids[task])) is not None:
-                found.setdefault(curve.name, {})[task] = (curve, own)
+            if (areas := area(curve, grids[task])) is not None:
+                by_name.setdefault(curve.name, {})[task] = (curve, areas)
     head = ["area", *(f"{task}, to {grid[-1]} rollouts" for task, grid in grids.items() if len(grid))]
     rows = [
         [name, *(middle(*cells[task]) if task in cells else NONE for task in tasks), _overall(cells, len(tasks))]
-        for name, cells in found.items()
+        for name, cells in by_name.items()
     ]
     return markdown([*head, "all tasks"], rows)
 
@@ -92,8 +90,8 @@ def leading(tasks: Mapping[str, Sequence[Curve]], count: int) -> list[str]:
     for curves in tasks.values():
         grid = shared_grid(curves)
         for curve in curves:
-            own = area(curve, grid)
-            areas.setdefault(curve.name, []).append(0.0 if own is None else float(own.mean()))
+            members = area(curve, grid)
+            areas.setdefault(curve.name, []).append(0.0 if members is None else float(members.mean()))
     return sorted(areas, key=lambda name: (len(areas[name]), float(np.mean(areas[name]))), reverse=True)[:count]
 
 
@@ -139,15 +137,14 @@ def outcome(curves: Sequence[Curve]) -> str:
 
 def _row(curve: Curve, curves: Sequence[Curve], grid: np.ndarray) -> list[str]:
     before = zero_shot(curve, curves)
-    falls = [NONE if before is None else plain(deepest_fall(curve, before), curve.score)]
-    falls.append(plain(deepest_fall(curve), curve.score))
+    below = NONE if before is None else plain(deepest_fall(curve, before), curve.score)
     return [
         curve.name,
         str(len(curve.seeds)),
         middle(curve, curve.values[:, 0]),
         middle(curve, area(curve, grid)),
         f"{middle(curve, curve.values[:, -1])} ({curve.x[-1]})",
-        " / ".join(falls),
+        f"{below} / {plain(deepest_fall(curve), curve.score)}",
         middle(curve, training_score(curve)),
         _held(curve),
     ]
@@ -162,20 +159,19 @@ def _held(curve: Curve) -> str:
 
 
 def _against(curve: Curve, other: Curve, grid: np.ndarray) -> list[str]:
-    own, theirs, better = area(curve, grid), area(other, grid), improvement(curve, other, grid)
-    if curve is other or own is None or theirs is None or better is None:
+    areas, others, better = area(curve, grid), area(other, grid), improvement(curve, other, grid)
+    if curve is other or areas is None or others is None or better is None:
         return [NONE, NONE]
     shared, i, j = np.intersect1d(curve.seeds, other.seeds, return_indices=True)
     priors = curve.prior[i] if by_prior(curve) else None
-    difference = number(difference_interval(own[i], theirs[j], priors=priors), curve.score) if len(shared) else NONE
+    difference = number(difference_interval(areas[i], others[j], priors=priors), curve.score) if len(shared) else NONE
     return [difference, number(better, "probability", digits=2)]
 
 
 def _overall(cells: Mapping[str, tuple[Curve, np.ndarray]], tasks: int) -> str:
     if len(cells) < tasks or tasks < 2:
         return NONE
-    scores = np.concatenate([own for _, own in cells.values()])
-    strata = np.repeat(np.arange(len(cells)), [len(own) for _, own in cells.values()])
-    curves = [curve for curve, _ in cells.values()]
+    curves, areas = zip(*cells.values(), strict=True)
+    scores, strata = np.concatenate(areas), np.repeat(np.arange(len(cells)), list(map(len, areas)))
     priors = np.concatenate([curve.prior for curve in curves]) if all(map(by_prior, curves)) else None
     return number(bootstrap_interval(scores, priors=priors, strata=strata), curves[0].score)

@@ -157,7 +157,7 @@ def _worth(success: float, x: Inputs, c: Coefficients) -> str:
 
 
 def _horizon(found: Mapping[str, Any]) -> str:
-    shares = [one["improvable"] for one in found["value"]["real"]]
+    shares = [states["improvable"] for states in found["value"]["real"]]
     enough = [h for h, share in zip(found["horizons"], shares, strict=True) if share >= _IMPROVABLE]
     if enough:
         share = shares[found["horizons"].index(enough[0])]

@@ -62,10 +62,14 @@ def test_each_method_runs_as_often_as_it_learns_from_other_things(grid, ran, cap
     compare.compare_hybrid(grid)
     found = [(run.method, None if run.data is None else run.data.stem, run.gap) for run in ran]
     assert found == [
-        ("h2oplus", "medium", ("gravity", "friction")), ("sac", None, ("gravity", "friction")),
-        ("iql", "medium", ("sim",)), ("rebrac", "medium", ("sim",)), ("h2oplus", "replay", ("gravity", "friction")),
-        ("iql", "replay", ("sim",)), ("rebrac", "replay", ("sim",)),
-    ]  # fmt: skip
+        ("h2oplus", "medium", ("gravity", "friction")),
+        ("sac", None, ("gravity", "friction")),
+        ("iql", "medium", ("sim",)),
+        ("rebrac", "medium", ("sim",)),
+        ("h2oplus", "replay", ("gravity", "friction")),
+        ("iql", "replay", ("sim",)),
+        ("rebrac", "replay", ("sim",)),
+    ]
     assert ran[3].variant == "walker2d-medium" and ran[3].options.critic_penalty == 0.1
     said = capsys.readouterr().out
     assert "missing    halfcheetah/gravity/medium: h2oplus\n" in said and "halfcheetah/gravity: sac\n" in said

@@ -36,10 +36,14 @@ def record(folder, *, policies=1, rollouts=4, success=(), obs_dim=4, steps=20, w
         action = rng.uniform(-1, 1, (policies, steps, 2)).astype(np.float32)
         obs = np.cumsum(rng.normal(0, 0.1, (policies, steps + 1, obs_dim)), axis=1).astype(np.float32)
         arrays = {
-            "obs": obs[:, :-1], "action": action, "next_obs": obs[:, 1:], "reward": -np.abs(obs[:, 1:, 0]),
-            "discount": np.full((policies, steps), 0.9, np.float32), "valid": np.ones((policies, steps), bool),
+            "obs": obs[:, :-1],
+            "action": action,
+            "next_obs": obs[:, 1:],
+            "reward": -np.abs(obs[:, 1:, 0]),
+            "discount": np.full((policies, steps), 0.9, np.float32),
+            "valid": np.ones((policies, steps), bool),
             "success": np.full(policies, i in success),
-        }  # fmt: skip
+        }
         store.append({name: x for name, x in arrays.items() if name not in without})
     return folder
 

@@ -64,9 +64,15 @@ def leave(args):
     (real,) = args.real
     end = np.array([0.1, 0.3, 0.5, 0.7]) + 0.2 * args.options.shape
     folder = runs_by_hand.save(
-        args.out, f"sgft-parts_{args.variant}", [[0.1] * 4, end.tolist()], rollouts=(0, 4), task="push", real=real,
-        seeds="seeds-0-3", variant=args.variant,
-    )  # fmt: skip
+        args.out,
+        f"sgft-parts_{args.variant}",
+        [[0.1] * 4, end.tolist()],
+        rollouts=(0, 4),
+        task="push",
+        real=real,
+        seeds="seeds-0-3",
+        variant=args.variant,
+    )
     checkpoint.save(folder, 4, {}, meta={})
     (folder / "summary.json").write_text(json.dumps({"final": {"rollouts": 4}}))
 
@@ -102,9 +108,15 @@ def test_the_report_needs_only_released_tables(tmp_path, monkeypatch, capsys):
 def test_released_tables_with_two_sets_of_priors_are_refused(tmp_path):
     for seeds, priors in (("seeds-0-1", ("a" * 12, "b" * 12)), ("seeds-2-3", ("c" * 12, "d" * 12))):
         runs_by_hand.save(
-            tmp_path / "runs", "sgft-parts_shaped-short-4-new-warm", [[0.1, 0.2]], rollouts=(0,), task="push",
-            seeds=seeds, priors=priors, variant="shaped-short-4-new-warm",
-        )  # fmt: skip
+            tmp_path / "runs",
+            "sgft-parts_shaped-short-4-new-warm",
+            [[0.1, 0.2]],
+            rollouts=(0,),
+            task="push",
+            seeds=seeds,
+            priors=priors,
+            variant="shaped-short-4-new-warm",
+        )
     figures.main(figures.FiguresArgs(export=tmp_path / "data", out=tmp_path / "runs"))
     with pytest.raises(UserError, match="ran with several sets of priors; keep one"):
         factorial.main(replace(ARGS, out=tmp_path, data=tmp_path / "data"))

@@ -163,8 +163,11 @@ def test_priors_of_other_runs_are_not_mixed_in(tmp_path, ran):
 
 def test_a_part_comes_with_the_priors_that_it_needs():
     assert [unit.name for unit in frozen.select(every(), ("hammer/sysid", "hammer/sac-r"))] == [
-        "hammer/prior-robust", "hammer/prior-informed", "hammer/sysid", "hammer/sac-reset",
-    ]  # fmt: skip
+        "hammer/prior-robust",
+        "hammer/prior-informed",
+        "hammer/sysid",
+        "hammer/sac-reset",
+    ]
     found = every()
     assert frozen.select(found, ()) == frozen.select(found, ("push", "insert", "hammer")) == list(found.values())
     with pytest.raises(UserError, match=r"--only slide: no unit begins like this"):

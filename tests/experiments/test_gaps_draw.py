@@ -44,7 +44,10 @@ def straight(params, carry, obs, key, *, explore):
 
 def exactly(network, task):
     """Identification through a model that is right."""
-    model = lambda params, obs, action: jnp.concatenate([jnp.zeros(2), 0.1 * action])  # noqa: E731
+
+    def model(params, obs, action):
+        return jnp.concatenate([jnp.zeros(2), 0.1 * action])
+
     return interface(model, lambda params: (), task)
 
 
@@ -54,7 +57,10 @@ def home(tmp_path, monkeypatch):
     monkeypatch.setitem(envs.TASKS, "toy_steps", "toy_steps")
     monkeypatch.setattr(os, "environ", os.environ.copy())
     monkeypatch.setattr(cli, "set_up", lambda: None)
-    by_hand = lambda card, env: policies.make_policy(card, env)._replace(act=straight)  # noqa: E731
+
+    def by_hand(card, env):
+        return policies.make_policy(card, env)._replace(act=straight)
+
     monkeypatch.setattr(gaps_drawn, "make_policy", by_hand)
     monkeypatch.setattr(gaps_drawn, "command_interface", exactly)
     for seed in (0, 1):
@@ -282,7 +288,7 @@ def test_other_settings_of_the_judge_forget_what_it_said_and_nothing_else(tmp_pa
     assert [gap.name for gap in table.to_judge(GAPS)] == ["b"]
     table.settle("judge", {"config": {"rate": 0.2}, "seeds": [0]}, again=True)
     assert table.to_judge(GAPS) == GAPS and table.without("zero_shot", GAPS) == []
-    line = table.found["gaps"]["a"]
+    line = table.known["a"]
     assert line["admitted"] is None and line["stratum"] == "solved" and line["trivial"] is False
     table.add({"b": {"fit": rate(0.9)}})
     assert [gap.name for gap in table.to_judge(GAPS)] == ["a"]

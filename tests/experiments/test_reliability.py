@@ -64,10 +64,12 @@ def test_the_quick_task_has_the_period_of_its_robot():
 def test_only_valid_steps_are_stored_ones(tmp_path):
     RealStore(tmp_path).append(
         {
-            "valid": np.array([[True, True, False]]), "action": np.ones((1, 3, 1), np.float32),
-            "next_obs": np.arange(6, dtype=np.float32).reshape(1, 3, 2), "time": np.zeros((1, 3)),
+            "valid": np.array([[True, True, False]]),
+            "action": np.ones((1, 3, 1), np.float32),
+            "next_obs": np.arange(6, dtype=np.float32).reshape(1, 3, 2),
+            "time": np.zeros((1, 3)),
         }
-    )  # fmt: skip
+    )
     (one, two) = ledger.stored_steps(tmp_path)
     assert one.obs == np.array([0, 1], np.float32).tobytes() and two.action == np.ones(1, np.float32).tobytes()
 

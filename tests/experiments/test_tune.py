@@ -128,9 +128,13 @@ def test_tasks_methods_and_seeds_have_draws_of_their_own(tmp_path):
     assert drawn("sac") == drawn("sac", rollouts=20, seeds=5, trials=4) == drawn("sac", trials=9)[:4]
     assert drawn("sac-reset") != drawn("sac-reset", seed=7) and drawn("sac")[3:] != drawn("sac", seed=7)[3:]
     assert drawn("rlpd")[0] == {
-        "utd": 20.0, "lr_actor": 3e-4, "lr_critic": 1e-3, "target_critics": 1, "simulated_share": 0.5,
+        "utd": 20.0,
+        "lr_actor": 3e-4,
+        "lr_critic": 1e-3,
+        "target_critics": 1,
+        "simulated_share": 0.5,
         "critic_warmup": 0,
-    }  # fmt: skip
+    }
 
 
 def test_a_score_is_the_area_up_to_the_budget(tmp_path):
@@ -179,8 +183,13 @@ def test_what_fails_does_not_stop_the_rest_and_the_command_goes_on(tmp_path, ran
     assert (result["trial"], result["options"]) == (3, result["trials"][3]["options"])
     assert [trial["area"] for trial in result["trials"]] == pytest.approx([0.125, 0.175, 0.225, 0.275])
     assert result["budget"] == {
-        "trials": 4, "reals": ["mild"], "seeds": [100, 101], "rollouts": 10, "eval_every": 5, "halve": False,
-    }  # fmt: skip
+        "trials": 4,
+        "reals": ["mild"],
+        "seeds": [100, 101],
+        "rollouts": 10,
+        "eval_every": 5,
+        "halve": False,
+    }
     assert result["gaps"] == [{"name": "mild"}] and result["provenance"]["versions"]
     assert "--tuned --tasks toy --methods sac" in capsys.readouterr().out
     tune.tune(budget(tmp_path, trials=6))

@@ -26,11 +26,8 @@ def read_only(home: Path, *, rollouts: int = 4) -> dict[str, Any]:
 def _stopped(home: Path, name: str, options: list[str], mended: str, rollouts: int) -> dict[str, Any]:
     out = home / name
     out.mkdir(parents=True, exist_ok=True)
-    own = Trial(
-        home / f"{name}-run", period=quick_task.PERIOD, rollouts=rollouts, patience=300.0, out=out,
-        task=quick_task.__file__,
-    )  # fmt: skip
-    with _mounted(out, options), own as trial:
+    quick = {"period": quick_task.PERIOD, "task": quick_task.__file__, "patience": 300.0}
+    with _mounted(out, options), Trial(home / f"{name}-run", rollouts=rollouts, out=out, **quick) as trial:
         if name == "full":
             trial.start_robot()
         trial.start_player()
@@ -56,7 +53,5 @@ def _call(command: list[str]) -> None:
     try:
         subprocess.run(command, check=True, capture_output=True, text=True)
     except (OSError, subprocess.CalledProcessError) as error:
-        said = getattr(error, "stderr", None) or str(error)
-        raise UserError(
-            f"{' '.join(command)}: {said.strip()}; leave --parts disk out where you may not mount"
-        ) from error
+        message = (getattr(error, "stderr", None) or str(error)).strip()
+        raise UserError(f"{' '.join(command)}: {message}; leave --parts disk out where you may not mount") from error

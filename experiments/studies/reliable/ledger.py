@@ -54,8 +54,8 @@ def stored_steps(folder: Path) -> list[Made]:
 
 def _steps(rollout: Mapping[str, Any]) -> list[Made]:
     rows = np.flatnonzero(rollout["valid"][0])
-    each = (rollout[name][0, rows] for name in ("action", "next_obs", "time"))
-    return [Made(action.tobytes(), obs.tobytes(), float(t)) for action, obs, t in zip(*each, strict=True)]
+    columns = (rollout[name][0, rows] for name in ("action", "next_obs", "time"))
+    return [Made(action.tobytes(), obs.tobytes(), float(t)) for action, obs, t in zip(*columns, strict=True)]
 
 
 def audit(made: Sequence[Made], stored: Sequence[Made], unread: int = 0) -> Audit:

@@ -89,12 +89,12 @@ def strangers(
     with Trial(home, period=0.2, rollouts=rollouts) as trial:
         trial.start()
         trial.wait_for_motion()
-        told = _nonsense(trial.port, frames, np.random.default_rng(seed))
+        sent = _nonsense(trial.port, frames, np.random.default_rng(seed))
         knocked = _knock(trial.port, rate, seconds)
         trial.finish()
     lines = trial.said("player.txt").count("refused a connection")
     late = timing.late_share(home / "commands.log")
-    return {"frames": told, "connections": knocked, "lines about them": lines, **trial.audit()._asdict(), "late": late}
+    return {"frames": sent, "connections": knocked, "lines about them": lines, **trial.audit()._asdict(), "late": late}
 
 
 def _nonsense(port: int, frames: int, luck: np.random.Generator) -> int:

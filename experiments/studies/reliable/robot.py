@@ -76,10 +76,8 @@ def main() -> None:
         parser.add_argument(name, type=kind)
     parser.add_argument("sizes", type=int, nargs=2)
     given = parser.parse_args()
-    robot_client.play(
-        Rail(given.folder / "ledger.txt", tuple(given.sizes)), given.url, token=given.token, period=given.period,
-        log=given.folder / "commands.log", retry=0.1,
-    )  # fmt: skip
+    rail, log = Rail(given.folder / "ledger.txt", tuple(given.sizes)), given.folder / "commands.log"
+    robot_client.play(rail, given.url, token=given.token, period=given.period, log=log, retry=0.1)
 
 
 if __name__ == "__main__":

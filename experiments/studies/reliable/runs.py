@@ -24,9 +24,17 @@ class Trial:
     """
 
     def __init__(
-        self, home: Path, *, period: float, rollouts: int, patience: float = 600.0, out: Path | None = None,
-        task: str = str(TASK), sizes: tuple[int, int] = (3, 1), more: tuple[str, ...] = (),
-    ) -> None:  # fmt: skip
+        self,
+        home: Path,
+        *,
+        period: float,
+        rollouts: int,
+        patience: float = 600.0,
+        out: Path | None = None,
+        task: str = str(TASK),
+        sizes: tuple[int, int] = (3, 1),
+        more: tuple[str, ...] = (),
+    ) -> None:
         self.patience = patience
         shutil.rmtree(home, ignore_errors=True)
         home.mkdir(parents=True)
@@ -79,9 +87,8 @@ class Trial:
     def finish(self) -> None:
         """Waits for the end of the run; raises UserError where it does not come, or is none."""
         if (code := self.wait()) != 0:
-            raise UserError(
-                f"{self.home / 'player.txt'}: the run has not ended well (exit code {code}); see what it said"
-            )
+            log = self.home / "player.txt"
+            raise UserError(f"{log}: the run has not ended well (exit code {code}); see what it said")
 
     def audit(self) -> ledger.Audit:
         """What the robot has done, against what is stored."""
@@ -111,6 +118,5 @@ class Trial:
 
     def _run(self, command: list[str], log: str) -> "subprocess.Popen[str]":
         with open(self.home / log, "a") as file:
-            return subprocess.Popen(
-                [sys.executable, "-m", *command], stdout=file, stderr=subprocess.STDOUT, text=True, cwd=TASK.parents[2]
-            )
+            streams = {"stdout": file, "stderr": subprocess.STDOUT, "text": True}
+            return subprocess.Popen([sys.executable, "-m", *command], cwd=TASK.parents[2], **streams)

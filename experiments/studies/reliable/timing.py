@@ -27,9 +27,8 @@ def kept_clock(
     log = home / "commands.log"
     off = 1e3 * np.abs(periods(log) - period)
     middle, most, worst = np.percentile(off, [50, 99, 100])
-    names = ("median ms", "99 % ms", "worst ms")
-    return {"Hz": 1 / period, "steps": len(off), **dict(zip(names, (middle, most, worst), strict=True)),
-            "late": late_share(log), **trial.audit()._asdict()}  # fmt: skip
+    jitter = {"median ms": middle, "99 % ms": most, "worst ms": worst}
+    return {"Hz": 1 / period, "steps": len(off), **jitter, "late": late_share(log), **trial.audit()._asdict()}
 
 
 def commands(log: Path) -> Iterator[dict[str, Any]]:
@@ -40,7 +39,7 @@ def commands(log: Path) -> Iterator[dict[str, Any]]:
 
 def late_share(log: Path) -> float:
     """The share of steps for which no command came in time."""
-    return float(np.mean([one["late"] for one in commands(log)]))
+    return float(np.mean([command["late"] for command in commands(log)]))
 
 
 def periods(log: Path) -> np.ndarray:

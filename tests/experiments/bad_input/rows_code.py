@@ -143,8 +143,9 @@ _ALONE = "METHOD = Method('m', Online('sgft', 'a', 'b', Config, build, needs_pri
 
 HEAVY = [
     (
-        f"finetune --task own_task.py --prior none --real sim --seeds 1 --method mine_{i}.py", words,
+        f"finetune --task own_task.py --prior none --real sim --seeds 1 --method mine_{i}.py",
+        words,
         {f"mine_{i}.py": _method(_ALONE, f"def build(config, prior, task):\n{line}\n")},
     )
     for i, (line, words) in enumerate(_BUILDS)
-]  # fmt: skip
+]

@@ -21,8 +21,14 @@ import rows_stored
 import rows_training
 
 TABLES = (
-    rows_training, rows_grids, rows_reading, rows_robots, rows_code, rows_gap_files, rows_stored,
-)  # fmt: skip
+    rows_training,
+    rows_grids,
+    rows_reading,
+    rows_robots,
+    rows_code,
+    rows_gap_files,
+    rows_stored,
+)
 WORKER = Path(__file__).with_name("worker.py")
 
 
@@ -33,9 +39,14 @@ def faults(rows, folder, *argv):
     cache = {"JAX_COMPILATION_CACHE_DIR": str(made.ROOT / ".cache/jax")}
     environment = {**os.environ, **cache, "PYTHONPATH": str(made.ROOT), "JAX_PLATFORMS": "cpu"}
     done = subprocess.run(
-        [sys.executable, WORKER, *argv], input=json.dumps(given), env=environment, cwd=folder, capture_output=True,
-        text=True, timeout=600,
-    )  # fmt: skip
+        [sys.executable, WORKER, *argv],
+        input=json.dumps(given),
+        env=environment,
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
     answers = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(answers) == len(rows), f"{rows[len(answers)][0]}: killed the process: {done.stderr}"
     return [

@@ -99,8 +99,10 @@ def test_training_rollouts_count_once_each():
 @pytest.mark.parametrize("priors", [[0, 0, 1, 1], None])
 def test_improvement_of_areas_is_by_prior_or_else_by_seed(priors):
     """By seed 1, 0, 1, 1; from the first prior 0.5 against 0 and 0.3: 1; 0.1 against 0.2: 0; that is 2 of 4."""
-    high, low = (curve(np.repeat(x, 2, 1), (0, 4), prior=priors) for x in (
-        np.array([[0.5], [0.1], [1], [1]]), np.array([[0.0], [0.2], [0], [0]])))  # fmt: skip
+    high, low = (
+        curve(np.repeat(x, 2, 1), (0, 4), prior=priors)
+        for x in (np.array([[0.5], [0.1], [1], [1]]), np.array([[0.0], [0.2], [0], [0]]))
+    )
     found = improvement(high, low, [0, 4])
     assert found.estimate == (pytest.approx((0.75 + 1) / 2) if priors else 0.75)
     assert improvement(high, low, [0, 8]) is None
@@ -129,10 +131,16 @@ def test_the_numbers_of_a_run():
     found = describe(curve([[0.2, 0.1, 0.8, 1.0], [0.4, 0.1, 1.0, 1.0]]))
     assert found["zero_shot"]["success"]["mean"] == pytest.approx(0.3)
     assert found["final"] == {
-        "rollouts": 4, "transitions": 80, "robot_minutes": pytest.approx(4 / 30),
-        "success": {"iqm": 1.0, "low": pytest.approx(np.nan, nan_ok=True), "high": pytest.approx(np.nan, nan_ok=True),
-                    "mean": 1.0},
-    }  # fmt: skip
+        "rollouts": 4,
+        "transitions": 80,
+        "robot_minutes": pytest.approx(4 / 30),
+        "success": {
+            "iqm": 1.0,
+            "low": pytest.approx(np.nan, nan_ok=True),
+            "high": pytest.approx(np.nan, nan_ok=True),
+            "mean": 1.0,
+        },
+    }
     assert found["deepest_fall"] == pytest.approx(0.2) and found["seeds"] == 2
     assert found["transitions_until_held"] == {"level": 0.9, "transitions": 40}
 
@@ -142,10 +150,14 @@ def test_only_methods_from_the_same_priors_are_comparable():
     curves = [
         curve([0, 0, 0, 0], method=method, priors=priors, variant=variant)
         for method, priors, variant in (
-            ("mbpo", "fast", ""), ("mbpo", "fast-2", ""), ("sac", "fast-2", ""), ("tdmpc2", "tdmpc2", ""),
-            ("sac", "fast", "tuned"), ("mine", "fast-2", ""),
+            ("mbpo", "fast", ""),
+            ("mbpo", "fast-2", ""),
+            ("sac", "fast-2", ""),
+            ("tdmpc2", "tdmpc2", ""),
+            ("sac", "fast", "tuned"),
+            ("mine", "fast-2", ""),
         )
-    ]  # fmt: skip
+    ]
     chosen = [(c.method, c.priors) for c in from_main_priors(curves)]
     assert chosen == [("tdmpc2", "tdmpc2"), ("mbpo", "fast-2"), ("sac", "fast-2"), ("mine", "fast-2")]
     sets = by_priors(curves)
@@ -286,8 +298,10 @@ def test_a_curve_from_python_counts_what_it_is_told():
     total, exploded = np.array([[-12.0, -2.0]]), np.array([[False, True]])
     score, no = np.where(exploded, -np.inf, total), np.zeros((1, 2), bool)
     task = SimpleNamespace(name="toy", episode_length=20, control_dt=0.1, score="return")
-    played = {0: Episode(None, None, total, no, no, total, None, None),
-              2: Episode(None, None, total, no, exploded, score, None, None)}  # fmt: skip
+    played = {
+        0: Episode(None, None, total, no, no, total, None, None),
+        2: Episode(None, None, total, no, exploded, score, None, None),
+    }
     given = {"gap": "default", "method": "sac", "seeds": [0]}
     found = make_curve(played, task, transitions=[0, 7], **given)
     assert found.transitions.tolist() == [0, 7] and found.minutes[1] == pytest.approx(0.7 / 60)

@@ -115,8 +115,9 @@ def test_what_else_a_task_is_judged_by():
     shown = hybrid.measured(found)
     assert shown is not None and shown.startswith("| measure | data | simulator | h2oplus | iql | sac |\n")
     assert rows(shown)[:2] == [
-        ["upright_s", "replay", "gravity", "8.50", "8.50", "-"], ["upright_s", "replay", "friction", "-", "8.50", "-"],
-    ]  # fmt: skip
+        ["upright_s", "replay", "gravity", "8.50", "8.50", "-"],
+        ["upright_s", "replay", "friction", "-", "8.50", "-"],
+    ]
     assert ["speed_error", "replay", "gravity", "-", "0.08", "-"] in rows(shown)  # 0.085, to the even digit
     assert hybrid.measured(FOUND) is None
 

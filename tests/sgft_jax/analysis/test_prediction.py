@@ -12,9 +12,14 @@ def cases(n=60, coefficients=C, noise=0.0, gaps=6):
     x = Inputs(*rng.uniform(0, 1, (3, n)))
     gains = prediction.gain(x, coefficients) + noise * rng.normal(size=n)
     rollouts = np.array([0, 1, 2, 4, 8, 20])
-    curves = [(rollouts, s + g * prediction.progress(rollouts, coefficients.pace))
-              for s, g in zip(x.success, gains, strict=True)]  # fmt: skip
-    names = lambda word, of: np.array([f"{word}{i % of}" for i in range(n)])  # noqa: E731
+    curves = [
+        (rollouts, s + g * prediction.progress(rollouts, coefficients.pace))
+        for s, g in zip(x.success, gains, strict=True)
+    ]
+
+    def names(word, of):
+        return np.array([f"{word}{i % of}" for i in range(n)])
+
     return Cases(x, x.success, x.success, gains, curves, names("gap", gaps), names("prior", 4))
 
 
@@ -71,10 +76,12 @@ def test_agreement_and_table():
 
 def test_inputs_of_a_diagnosis():
     found = {
-        "rollouts": 3, "success": 1 / 3, "horizons": [1, 2, 4, 8],
+        "rollouts": 3,
+        "success": 1 / 3,
+        "horizons": [1, 2, 4, 8],
         "value": {"shortfall": 120.0, "real": [{"improvable": 0.7}, {"improvable": 0.9}]},
         "model_error": {"real": [1.0, 1.0, 8.0, 1.0], "identified": [1.0, 1.0, 2.0, 1.0]},
-    }  # fmt: skip
+    }
     assert prediction.inputs_of(found) == pytest.approx(Inputs(success=1.25 / 4, improvable=0.7, explained=0.75))
     found["value"]["shortfall"] = -1.0
     found["model_error"]["identified"] = [9.0] * 4

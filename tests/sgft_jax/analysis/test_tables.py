@@ -37,9 +37,17 @@ def test_a_row_says_what_the_curve_says():
     seldom = curve([[0.0, 0.0, 0.5, 0.5]] * 2, (0, 2, 4, 10))
     head, _, first, second = cells(tables.summary([often, seldom]))
     assert head == [
-        "method", "seeds", "start", "area, 0 to 4 rollouts", "end (rollouts)", "deepest fall: zero-shot / own start",
-        "training", "90 % held after", "area minus mbpo", "P(better than mbpo)",
-    ]  # fmt: skip
+        "method",
+        "seeds",
+        "start",
+        "area, 0 to 4 rollouts",
+        "end (rollouts)",
+        "deepest fall: zero-shot / own start",
+        "training",
+        "90 % held after",
+        "area minus mbpo",
+        "P(better than mbpo)",
+    ]
     assert first == ["mbpo", "2", "30", "80", "100 (4)", "20 / 20", "-", "40", "-", "-"]
     assert second == ["sac", "2", "0", "12", "50 (10)", "0 / 0", "-", "> 200", "-68", "0.00"]
     assert len(cells(tables.summary([often]))[0]) == 8  # nothing to compare with
@@ -97,6 +105,8 @@ def test_all_tasks():
 def test_the_outcome_has_a_column_for_each_evaluation():
     table = tables.outcome([curve([0.0, 0.9], (0, 5)), curve([0.0, 0.5, 1.0], (0, 1, 5), method="mbpo")])
     assert cells(table) == [
-        ["method", "zero-shot", "1 rollout", "5 rollouts"], ["---"] * 4,
-        ["sac", "0", "-", "90"], ["mbpo", "0", "50", "100"],
-    ]  # fmt: skip
+        ["method", "zero-shot", "1 rollout", "5 rollouts"],
+        ["---"] * 4,
+        ["sac", "0", "-", "90"],
+        ["mbpo", "0", "50", "100"],
+    ]

@@ -17,17 +17,25 @@ NOTHING = {
     "success": 1.0,
     "horizons": [1, 2, 4, 8],
     "value": {
-        "bias": 0.1, "rank_correlation": 0.9, "shortfall": 0.2, "margin": 0.3,
-        "real": [{"improvable": 1.0, "improving": 0.4}] * 4, "simulated": [{"improvable": 1.0, "improving": 0.5}] * 4,
+        "bias": 0.1,
+        "rank_correlation": 0.9,
+        "shortfall": 0.2,
+        "margin": 0.3,
+        "real": [{"improvable": 1.0, "improving": 0.4}] * 4,
+        "simulated": [{"improvable": 1.0, "improving": 0.5}] * 4,
     },
     "model_error": {"real": [0.2] * 4, "identified": [0.1] * 4, "simulated": [0.1] * 4},
     "identified": {
-        "scale": [1.0, 1.0], "rotation": 0.0, "bias": [0.0, 0.0], "sensor_errors": [0.0, 0.0, 0.0], "nats": 0.0,
+        "scale": [1.0, 1.0],
+        "rotation": 0.0,
+        "bias": [0.0, 0.0],
+        "sensor_errors": [0.0, 0.0, 0.0],
+        "nats": 0.0,
         "simulated": {"scale": [1.0, 1.0], "rotation": 0.0, "bias": [0.0, 0.0], "sensor_errors": [0.0, 0.0, 0.0]},
     },
     "delay": {"share": 0.02, "nats": 3.0},
     "noise": {"real": [0.001, 0.001, 0.01], "simulated": [0.001, 0.001, 0.01]},
-}  # fmt: skip
+}
 
 
 def found(**changes):
@@ -59,7 +67,7 @@ def counted(**changes):
         ({"noise__real": [0.001, 0.001, 0.03]}, "noise", "angle is 0.03 rad, 0.01 rad in simulation"),
         ({"model_error__identified": [0.3] * 4}, "what is left", "err 3.0 times as much as in simulation"),
     ],
-)  # fmt: skip
+)
 def test_every_kind_of_gap_is_named_and_no_other(changes, name, words):
     signs = counted(**changes, identified__nats=50.0)
     assert list(signs) == [name] and words in signs[name]
@@ -82,7 +90,10 @@ def test_nothing_counts_without_evidence():
 
 
 def test_what_is_worth_it():
-    words = lambda **changes: verdict.verdict(found(**changes), NAMES, C)[2:]  # noqa: E731
+
+    def words(**changes):
+        return verdict.verdict(found(**changes), NAMES, C)[2:]
+
     solved, horizon, now = words(rollouts=40)
     assert "little to gain (+0 points expected)" in solved and now == "time: 90 % expected now"
     assert horizon == "horizon of SGFT: H = 1 is enough, 100 % of the states are improvable with it"
