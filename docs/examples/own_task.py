@@ -58,12 +58,23 @@ def success(obs: Array) -> Array:
 
 
 SCENE = Scene(
-    name="own_task", observation=(Entry("pusher_x", "m", 1), Entry("puck_x", "m", 1), Entry("puck_speed", "m/s", 1)),
-    action=(Entry("pusher_step", "8 cm", 1),), parameters=PARAMETERS, episode_length=15, control_dt=0.2, substeps=20,
-    ramp=0.1, build=build, initial=initial, observe=observe, reward=reward, success=success,
+    name="own_task",
+    observation=(Entry("pusher_x", "m", 1), Entry("puck_x", "m", 1), Entry("puck_speed", "m/s", 1)),
+    action=(Entry("pusher_step", "8 cm", 1),),
+    parameters=PARAMETERS,
+    episode_length=15,
+    control_dt=0.2,
+    substeps=20,
+    ramp=0.1,
+    build=build,
+    initial=initial,
+    observe=observe,
+    reward=reward,
+    success=success,
     target=lambda qpos, action: jnp.clip(qpos[:1] + STEP * action, -0.2, 0.5),
-    training={"obs_noise": 0.004, "obs_noise_prob": 0.3}, view=View((0.15, 0.0, 0.0), 0.7, 90.0, -30.0),
-)  # fmt: skip
+    training={"obs_noise": 0.004, "obs_noise_prob": 0.3},
+    view=View((0.15, 0.0, 0.0), 0.7, 90.0, -30.0),
+)
 
 
 def make(impl: str = "auto") -> Env:

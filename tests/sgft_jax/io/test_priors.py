@@ -24,9 +24,13 @@ from sgft_jax.types import Normalizer, Prior
 KEY = jax.random.key(0)
 NETWORK = NetworkConfig(hidden=(3,))
 CARD = {
-    "task": "hammer", "obs_dim": 4, "act_dim": 2, "gamma": 0.99, "network": jsonable(NETWORK),
+    "task": "hammer",
+    "obs_dim": 4,
+    "act_dim": 2,
+    "gamma": 0.99,
+    "network": jsonable(NETWORK),
     "metrics": {"success": float("nan")},
-}  # fmt: skip
+}
 
 
 def drawn(init):
