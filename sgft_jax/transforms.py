@@ -104,9 +104,7 @@ def shorten(horizon: int) -> Transform:
             k = jnp.where(assigned == 0, k, assigned)
         tell = jax.vmap(steps_to_go, (0, None))
         return batch._replace(
-            context=tell(k, horizon),
-            next_context=tell(k - 1, horizon),
-            discount=jnp.where(k == 1, 0.0, batch.discount),
+            context=tell(k, horizon), next_context=tell(k - 1, horizon), discount=jnp.where(k == 1, 0.0, batch.discount)
         )
 
     return stateless(apply)

@@ -65,13 +65,20 @@ class SimulatedData(NamedTuple):
 # --- learning -------------------------------------------------------------------------------------------------------
 
 
+class Act(Protocol):
+    """How an agent acts."""
+
+    def __call__(self, state: Any, carry: Any, obs: Array, key: Key, /, *, explore: bool | Array) -> tuple[Array, Any]:
+        """(action [act_dim] in [-1, 1], carry). obs: [obs_dim] raw. explore: [] bool, which may be traced."""
+        ...
+
+
 class Learner(NamedTuple):
     """A learning algorithm as pure functions, written for one agent; the caller vmaps over seeds.
 
     init(key) -> state.
     init_carry() -> carry, what the policy remembers from step to step of an episode; () for an MLP.
-    act(state, carry, obs [obs_dim], key, *, explore, context=None) -> (action [act_dim], carry). `explore` [] bool may
-        be traced. context: [context_dim], for learners that were built with one.
+    act: see `Act`. Learners that were built with a context take `context` [context_dim], too.
     update(state, batch, key) -> (state, metrics), one gradient step of every network that trains.
     """
 
@@ -205,19 +212,38 @@ class Simulation(NamedTuple):
     offline_updates: int = 0
 
 
+class Learn(Protocol):
+    """Learning of an agent from what it has observed; see `Finetuner`."""
+
+    def __call__(
+        self,
+        state: Any,
+        key: Key,
+        updates: int,
+        simulated: SimulatedData | None = None,
+        /,
+        *,
+        offline: bool = False,
+        limit: Array | None = None,
+    ) -> tuple[Any, Metrics]:
+        """(state, metrics averaged over the updates). `updates` and `offline` are static.
+
+        offline: learn from the simulated transitions alone. limit: [] int32, no more updates than that, for rollouts
+        that ended early. The metric `updates` counts them; there is none, and the other metrics are nan, while an agent
+        that learns from real rows holds none.
+        """
+        ...
+
+
 class Finetuner(NamedTuple):
     """Fine-tuning of one agent on one real system, as pure functions; the caller vmaps over members.
 
     init(params, key, simulated) -> state. params: of a prior, None without one. simulated: a `SimulatedData` or None.
     init_carry() -> carry of an episode.
-    act(state, carry, obs [obs_dim], key, *, explore) -> (action [act_dim], carry); `explore` may be traced.
+    act, learn: see `Act` and `Learn`.
     observe(state, transitions [T, ...], valid [T], score []) -> state: keeps the rows of one episode, in order. score:
         of the episode, -inf if its physics exploded; None if another policy has played it, as in a log, so that a guard
         does not count it.
-    learn(state, key, updates, simulated, *, offline, limit=None) -> (state, metrics averaged over the updates);
-        `updates` and `offline` are static. offline: learn from the simulated transitions alone. limit: [] int32, no
-        more updates than that, for rollouts that ended early. The metric `updates` counts them; there is none, and the
-        other metrics are nan, while an agent that learns from real rows holds none.
     export(state) -> params of the agent as it acts now.
     policy: how exported params act.
     updates_per_rollout: gradient updates that follow a real rollout of full length.
@@ -229,9 +255,9 @@ class Finetuner(NamedTuple):
 
     init: Callable[[PyTree, Key, SimulatedData | None], PyTree]
     init_carry: Callable[[], PyTree]
-    act: Callable[..., tuple[Array, PyTree]]
+    act: Act
     observe: Callable[[PyTree, Transition, Array, Array | None], PyTree]
-    learn: Callable[..., tuple[PyTree, Metrics]]
+    learn: Learn
     export: Callable[[PyTree], PyTree]
     policy: Policy
     updates_per_rollout: int

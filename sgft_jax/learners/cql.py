@@ -3,7 +3,6 @@
 Source: Kumar et al. 2020, CQL(H) with importance-corrected samples and a fixed weight, as H2O+'s baseline runs it.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -14,7 +13,7 @@ from envs.types import Array, Key, PyTree
 from sgft_jax import checks
 from sgft_jax.learners import sac
 from sgft_jax.learners.sac import SACConfig, SACHyper, SACState
-from sgft_jax.learners.steps import Critic
+from sgft_jax.learners.steps import Critic, Sampler
 from sgft_jax.math import losses
 from sgft_jax.models.config import NetworkConfig, two_layers
 from sgft_jax.types import Batch, Learner, Metrics
@@ -51,17 +50,10 @@ def soft_maximum(q: Array, log_density: Array) -> Array:
     return jax.nn.logsumexp(jax.vmap(jnp.subtract)(q, log_density), axis=0)
 
 
-def penalty(
-    config: CQLConfig,
-    critic: Critic,
-    params: PyTree,
-    policy: Callable[[Array, Key], tuple[Array, Array]],
-    batch: Batch,
-    key: Key,
-) -> Array:
+def penalty(config: CQLConfig, critic: Critic, params: PyTree, policy: Sampler, batch: Batch, key: Key) -> Array:
     """Conservatism times the mean [] of soft max_a Q(s, a) - Q(s, a_data), a `sac.CriticTerm`.
 
-    policy(obs, key) -> (action, log pi). batch: [B, ...] as the critics read it.
+    batch: [B, ...] as the critics read it.
     """
     q, draw = partial(critic, params), jax.vmap(policy, (None, 0))
 
@@ -79,7 +71,7 @@ def penalty(
     return config.conservatism * losses.row_mean(values, batch)
 
 
-init, act = sac.init, sac.act
+init, act = sac.init, sac.act  # of a configuration that is one of SAC
 
 
 def update(config: CQLConfig, state: SACState, batch: Batch, key: Key) -> tuple[SACState, Metrics]:

@@ -4,7 +4,6 @@ Targets and actor use the minimum of all critics. With diversity 0 it is SAC-N, 
 al. 2021.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -15,7 +14,7 @@ from envs.types import Array, Key, PyTree
 from sgft_jax import checks
 from sgft_jax.learners import sac
 from sgft_jax.learners.sac import SACConfig, SACHyper, SACState
-from sgft_jax.learners.steps import Critic
+from sgft_jax.learners.steps import Critic, Sampler
 from sgft_jax.math import losses
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.types import Batch, Learner, Metrics
@@ -71,20 +70,13 @@ def mean_alignment(critic: Critic, params: PyTree, batch: Batch) -> Array:
     return losses.row_mean(jax.vmap(alignment)(jax.vmap(gradients)(batch.obs, batch.action)), batch)
 
 
-def penalty(
-    config: EDACConfig,
-    critic: Critic,
-    params: PyTree,
-    policy: Callable[[Array, Key], tuple[Array, Array]],
-    batch: Batch,
-    key: Key,
-) -> Array:
+def penalty(config: EDACConfig, critic: Critic, params: PyTree, policy: Sampler, batch: Batch, key: Key) -> Array:
     """Diversity times `mean_alignment` [] at the data's own actions, a `sac.CriticTerm`."""
     del policy, key
     return config.diversity * mean_alignment(critic, params, batch)
 
 
-init, act = sac.init, sac.act
+init, act = sac.init, sac.act  # of a configuration that is one of SAC
 
 
 def update(config: EDACConfig, state: SACState, batch: Batch, key: Key) -> tuple[SACState, Metrics]:

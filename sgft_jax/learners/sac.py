@@ -7,7 +7,7 @@ so that learning rates and temperatures vmap like seeds do. Source: Haarnoja et 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from flax import struct
 from envs.types import Array, Key, PyTree, UserError
 from sgft_jax import checks
 from sgft_jax.learners import steps
-from sgft_jax.learners.steps import Critic
+from sgft_jax.learners.steps import Critic, Sampler
 from sgft_jax.math import losses, optim
 from sgft_jax.models import dynamics, networks, normalizer
 from sgft_jax.models.distortion import Distortion
@@ -76,19 +76,8 @@ class SACConfig:
             raise checks.refusal("target_critics", self.target_critics, f"at most critics, {self.critics}")
 
 
-class CriticTerm(Protocol):
-    """What is added to the critic's loss; `__call__` -> []."""
-
-    def __call__(
-        self,
-        critic: Critic,
-        params: PyTree,
-        policy: Callable[[Array, Key], tuple[Array, Array]],
-        batch: Batch,
-        key: Key,
-    ) -> Array:
-        """params: of the critic. policy(obs, key) -> (action, log pi []). batch: what the networks read."""
-        ...
+# What is added to the critic's loss: (critic, its params, policy, batch as the networks read it, key) -> []
+CriticTerm = Callable[[Critic, PyTree, Sampler, Batch, Key], Array]
 
 
 class SACHyper(NamedTuple):

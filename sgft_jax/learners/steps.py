@@ -19,6 +19,7 @@ LOG_ALPHA_MIN = -10.0  # dense negative rewards would drive an auto-tuned temper
 OUTPUT_GAIN = 0.01  # of the last layers in the released codes of H2O: all values and means begin near 0
 
 Critic = Callable[[PyTree, Array, Array], Array]  # (params of members, obs, action) -> [members]
+Sampler = Callable[[Array, Key], tuple[Array, Array]]  # (obs, key) -> (action of the policy, its log pi [])
 
 
 # In this file `nets` are the networks of a learner, with `actor`, `critic` and `optimiser`, and `state` is its state,

@@ -175,12 +175,7 @@ def _update_model(
 
 
 def _window_losses(
-    nets: Networks,
-    params: dict[str, PyTree],
-    rows: Batch,
-    ahead: Array,
-    q_target: Array,
-    dropout: Key,
+    nets: Networks, params: dict[str, PyTree], rows: Batch, ahead: Array, q_target: Array, dropout: Key
 ) -> tuple[dict[str, Array], Array]:
     """Losses [H] of one window, by the name of their weight, and its rolled-out latents [H + 1, latent].
 

@@ -155,7 +155,7 @@ def update(
     fits = (
         optim.step(optim.adam(), fit, grad, rate) for fit, grad in zip((state.joint, state.pair), grads, strict=True)
     )
-    return RatioState(*fits, state.normalizer), {"ratio/loss": value}
+    return RatioState(*fits, normalizer=state.normalizer), {"ratio/loss": value}
 
 
 def log_ratios(config: RatioConfig, state: RatioState, batch: Batch) -> Array:

@@ -59,7 +59,9 @@ def most_probable(
     std. bound: of the size of every entry, [] or [p]. guessed: entries in which the cost may have several minima; the
     search also starts from values drawn uniformly within their bounds.
     """
-    weight_of = lambda square: (_DEGREES + spread.shape[0]) / (_DEGREES + square)  # noqa: E731
+
+    def weight_of(square: Array) -> Array:
+        return (_DEGREES + spread.shape[0]) / (_DEGREES + square)
 
     def counted(p: Array) -> Array:
         return jnp.where(held[:, None], missed(p), 0.0)

@@ -56,7 +56,10 @@ def most_probable_system(predict: Predict, rows: Transition, held: Array, spread
     drawn = np.random.default_rng(0).uniform(-0.7, 0.7, (_STARTS - 1, size))
     starts = jnp.concatenate([jnp.zeros((1, size)), jnp.asarray(drawn, jnp.float32)])
     change = (rows.next_obs - rows.obs)[:, : spread.shape[0]]
-    missed = lambda system: residuals(predict, rows, system)  # noqa: E731
+
+    def missed(system: Array) -> Array:
+        return residuals(predict, rows, system)
+
     found = most_probable(missed, starts, jnp.full(size, _BELIEF), change, held, spread, bound=1.0)
     return Estimate(found.point, jnp.zeros(size))
 

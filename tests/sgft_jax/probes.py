@@ -62,7 +62,10 @@ def rows(probe, key):
     key_state, key_action = jax.random.split(key)
     s = jax.random.choice(key_state, jnp.array(probe.states), (ROWS,))
     action = jax.random.uniform(key_action, (ROWS, 1), minval=-1)
-    wide = lambda s: jnp.stack([s, jnp.zeros(ROWS)], axis=1)  # noqa: E731
+
+    def wide(s):
+        return jnp.stack([s, jnp.zeros(ROWS)], axis=1)
+
     reward, discount = (jnp.asarray(x, jnp.float32) for x in (probe.reward(s, action[:, 0]), probe.discount(s)))
     return Batch(wide(s), action, reward, discount, wide(probe.following(s)))
 
@@ -289,7 +292,11 @@ MAKERS = {
     "sac": lambda: _sac(ensemble_size=2),
     # RLPD's: ten normalised critics, targets from two of them, the actor follows their mean
     "sac, ten critics": lambda: _sac(
-        critics=10, target_critics=2, actor_mean=True, train_value=False, train_dynamics=False,
+        critics=10,
+        target_critics=2,
+        actor_mean=True,
+        train_value=False,
+        train_dynamics=False,
         critic_network=dataclasses.replace(NET, layer_norm=True),
     ),
     "iql": _iql,
@@ -303,7 +310,7 @@ MAKERS = {
     "recurrent": _recurrent,
     "tdmpc2": lambda: _tdmpc2(PLAIN, 800),
     "sgft-tdmpc2": lambda: _tdmpc2(dataclasses.replace(PLAIN, sgft=True), 1000),
-}  # fmt: skip
+}
 
 
 @functools.cache

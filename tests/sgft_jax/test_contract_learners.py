@@ -29,9 +29,18 @@ QUICK = {
 }
 # Made of what the others are made of, or tested at length in a file of their own.
 SLOW = {
-    "sac, ten critics", "h2oplus", "h2oplus, four critics", "h2o", "darc", "cql", "edac", "rebrac", "tdmpc2",
-    "sgft-tdmpc2", "recurrent",
-}  # fmt: skip
+    "sac, ten critics",
+    "h2oplus",
+    "h2oplus, four critics",
+    "h2o",
+    "darc",
+    "cql",
+    "edac",
+    "rebrac",
+    "tdmpc2",
+    "sgft-tdmpc2",
+    "recurrent",
+}
 
 
 def slow_if(slow, *values):
@@ -54,7 +63,10 @@ def trained(name, probe, key, steps):
 
 def bits(tree):
     """Every leaf as bytes."""
-    raw = lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x  # noqa: E731
+
+    def raw(x):
+        return jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+
     return [np.asarray(raw(jnp.asarray(x))).tobytes() for x in jax.tree.leaves(tree)]
 
 

@@ -229,8 +229,7 @@ def test_clip_bounds_rewards_alone(key):
     raw = batch_of([0, 0, 0], [1, 1, 1], [-5, 0.3, 5])
     out = run(sgft.clip(2.0), imagination(), raw, key)
     assert out.reward.tolist() == pytest.approx([-2, 0.3, 2])
-    assert all(jnp.array_equal(x, y) for x, y in zip(out._replace(reward=None), raw, strict=True)
-               if x is not None)  # fmt: skip
+    assert all(jnp.array_equal(x, y) for x, y in zip(out._replace(reward=None), raw, strict=True) if x is not None)
 
 
 @pytest.mark.parametrize("make", [sgft.shape, sgft.clip(1.0), sgft.branch(2, 1), sgft.shorten(1), sgft.relabel(1)])
@@ -249,11 +248,18 @@ def test_other_fields_of_a_row_go_with_it(make, key):
 
 def tilted(transform, state, *, joint, pair):
     """Discriminators that say the same of every row: [2] logits given (s, a), and what s' adds to them."""
-    last = lambda fit, logits: fit._replace(  # noqa: E731
-        params=jax.tree.map(jnp.zeros_like, fit.params) | {"Dense_1": {
-            "kernel": jnp.zeros_like(fit.params["Dense_1"]["kernel"]), "bias": jnp.arctanh(jnp.asarray(logits) / 2),
-        }}
-    )  # fmt: skip
+
+    def last(fit, logits):
+        return fit._replace(
+            params=jax.tree.map(jnp.zeros_like, fit.params)
+            | {
+                "Dense_1": {
+                    "kernel": jnp.zeros_like(fit.params["Dense_1"]["kernel"]),
+                    "bias": jnp.arctanh(jnp.asarray(logits) / 2),
+                }
+            }
+        )
+
     return state._replace(joint=last(state.joint, joint), pair=last(state.pair, pair))
 
 
@@ -316,7 +322,9 @@ def test_composition_runs_left_to_right_with_separate_keys_and_states(key):
             seen.append((name, state, key))
             return batch
 
-        learn = lambda state, batch, key: (state + name, {f"seen/{name}": key})  # noqa: E731
+        def learn(state, batch, key):
+            return (state + name, {f"seen/{name}": key})
+
         return sgft.Transform(lambda params, key: name + params, apply, learn)
 
     both = sgft.compose(note("a"), note("b"))

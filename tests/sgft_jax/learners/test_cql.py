@@ -34,7 +34,10 @@ def test_soft_maximum_by_hand():
 
 def penalty(q, samples, key, conservatism=2.0):
     config = cql.CQLConfig(1, 1, samples=samples, conservatism=conservatism)
-    critic = lambda params, obs, action: q(obs, action)  # noqa: E731
+
+    def critic(params, obs, action):
+        return q(obs, action)
+
     return jax.jit(lambda key: cql.penalty(config, critic, None, uniform, batch_of(key, 0.5), key))(key)
 
 
@@ -57,9 +60,11 @@ def test_actions_that_the_data_lack_are_worth_less(key):
         learner = cql.make_cql(
             cql.CQLConfig(1, 1, network=NET, conservatism=conservatism), sac.SACHyper(lr_critic=1e-2, alpha=1e-4)
         )
-        fit = jax.jit(lambda s, learner=learner: jax.lax.scan(
-            lambda s, k: learner.update(s, batch, k), s, jax.random.split(key, 300)
-        )[0])  # fmt: skip
+        fit = jax.jit(
+            lambda s, learner=learner: jax.lax.scan(
+                lambda s, k: learner.update(s, batch, k), s, jax.random.split(key, 300)
+            )[0]
+        )
         q = networks.make_critic(1, 1, NET).apply
         state = fit(learner.init(key))
         seen[conservatism] = [float(q(state.critic.params, jnp.zeros(1), jnp.array([a])).min()) for a in (-0.5, 0.8)]

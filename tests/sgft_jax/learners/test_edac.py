@@ -52,9 +52,11 @@ def test_diversity_keeps_gradients_apart(key):
     for diversity in (0.0, 5.0):
         config = edac.EDACConfig(2, 3, network=NET, critics=4, diversity=diversity)
         learner = edac.make_edac(config, sac.SACHyper(lr_critic=1e-2))
-        fit = jax.jit(lambda s, learner=learner: jax.lax.scan(
-            lambda s, k: learner.update(s, batch, k), s, jax.random.split(key, 300)
-        )[0])  # fmt: skip
+        fit = jax.jit(
+            lambda s, learner=learner: jax.lax.scan(
+                lambda s, k: learner.update(s, batch, k), s, jax.random.split(key, 300)
+            )[0]
+        )
         params = fit(learner.init(key)).critic.params
         grads = jax.vmap(lambda o, a, p=params: jax.jacrev(lambda a: critic.apply(p, o, a))(a))(batch.obs, batch.action)
         seen[diversity] = float(jax.vmap(edac.alignment)(grads).mean())

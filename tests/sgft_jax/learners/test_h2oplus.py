@@ -58,7 +58,10 @@ def with_hyper(state, **numbers):
 
 def told_apart(learner, key):
     """A state whose target critic, critic and value are three different things, and far from 0."""
-    grown = lambda tree: jax.tree.map(lambda x: 3.0 * jax.random.normal(key, x.shape), tree)  # noqa: E731
+
+    def grown(tree):
+        return jax.tree.map(lambda x: 3.0 * jax.random.normal(key, x.shape), tree)
+
     state = learner.init(key)
     value = state.value._replace(params=grown(state.value.params))
     critic = state.critic._replace(params=jax.tree.map(lambda x: x + 0.3, state.critic.params))

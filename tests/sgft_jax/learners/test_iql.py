@@ -262,7 +262,10 @@ def test_the_actors_rate_falls_along_half_a_cosine(step, factor, key):
     new, metrics = SMALL.update(falling, batch, key)
     assert metrics["actor/lr"] == pytest.approx(1e-2 * factor, abs=1e-9)
     assert equal((still.critic, still.value), (new.critic, new.value))
-    way = lambda end: jax.tree.map(jnp.subtract, end.actor.params, state.actor.params)  # noqa: E731
+
+    def way(end):
+        return jax.tree.map(jnp.subtract, end.actor.params, state.actor.params)
+
     chex.assert_trees_all_close(way(new), jax.tree.map(lambda x: factor * x, way(still)), atol=1e-6)
 
 

@@ -43,7 +43,10 @@ def windows(key, lengths=(T, 3, 1)):
     action, reward = jax.random.uniform(keys[1], (B, T, ACT), minval=-1), jax.random.normal(keys[2], (B, T))
     valid = jnp.arange(T)[None] < jnp.array(lengths)[:, None]
     rows = Batch(obs[:, :-1], action, reward, jnp.full((B, T), 0.9), obs[:, 1:])
-    blank = lambda x: jnp.where(valid.reshape(B, T, *[1] * (x.ndim - 2)), x, 0.0)  # noqa: E731
+
+    def blank(x):
+        return jnp.where(valid.reshape(B, T, *[1] * (x.ndim - 2)), x, 0.0)
+
     return jax.tree.map(blank, rows)._replace(valid=valid)
 
 
@@ -101,13 +104,21 @@ def test_shapes(key):
     new, metrics = update(state, batch, key)
     chex.assert_trees_all_equal_shapes_and_dtypes(new, state)
     assert set(metrics) == {
-        "critic/loss", "critic/q_mean", "critic/target_mean", "actor/loss", "actor/entropy", "actor/alpha",
-    }  # fmt: skip
+        "critic/loss",
+        "critic/q_mean",
+        "critic/target_mean",
+        "actor/loss",
+        "actor/entropy",
+        "actor/alpha",
+    }
     assert all(x.shape == () and jnp.isfinite(x) for x in metrics.values())
     params = recurrent.extract_params(new)
     assert params.actor["memory"]["recurrent"]["kernel"].shape == (UNITS, 3 * UNITS)
     assert params.critic["head"]["Dense_0"]["kernel"].shape == (2, MEMORY.features + ACT, 8)
-    moved = lambda a, b: jax.tree.map(lambda x, y: bool((x != y).any()), a, b)  # noqa: E731
+
+    def moved(a, b):
+        return jax.tree.map(lambda x, y: bool((x != y).any()), a, b)
+
     assert all(jax.tree.leaves(moved([new.actor.params, new.critic.params], [state.actor.params, state.critic.params])))
 
 
@@ -178,10 +189,24 @@ def test_it_finds_out_which_way_its_commands_turn():
     """
     env = toy_steps.make()._replace(training={"action_rotation": [-np.pi, np.pi]})
     config = PretrainConfig(
-        algorithm="recurrent", n_envs=32, worlds=32, env_steps=38_400, random_transitions=1_280, random_fraction=0.1,
-        updates_per_step=8, batch_size=32, replay_capacity=38_400, gamma=0.9, lr=3e-3, lr_end=0.2, tau=0.05,
-        alpha=0.05, gru=48, network=NetworkConfig(hidden=(64, 64), layer_norm=True), chunk_steps=100,
-    )  # fmt: skip
+        algorithm="recurrent",
+        n_envs=32,
+        worlds=32,
+        env_steps=38_400,
+        random_transitions=1_280,
+        random_fraction=0.1,
+        updates_per_step=8,
+        batch_size=32,
+        replay_capacity=38_400,
+        gamma=0.9,
+        lr=3e-3,
+        lr_end=0.2,
+        tau=0.05,
+        alpha=0.05,
+        gru=48,
+        network=NetworkConfig(hidden=(64, 64), layer_norm=True),
+        chunk_steps=100,
+    )
     *_, (state, _) = pretrain(env, config, [1])
     (prior,) = priors_of(env, config, state)
     end = api.evaluate_prior(prior, env, episodes=200).transitions.next_obs[:, -1]

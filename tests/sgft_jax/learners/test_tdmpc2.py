@@ -129,7 +129,10 @@ def test_policy_spread_is_bounded(key):
 def test_dropout_acts_in_training_alone(key):
     config = dataclasses.replace(PLAIN, dropout=0.5)
     parts, state = tdmpc2_model.make_networks(config), shaken(PLAIN, key)
-    q = lambda keys: parts.critic.apply(state.critic.params, jnp.full(16, 0.25), jnp.ones(1), keys=keys)  # noqa: E731
+
+    def q(keys):
+        return parts.critic.apply(state.critic.params, jnp.full(16, 0.25), jnp.ones(1), keys=keys)
+
     a, b = (q(jax.random.split(jax.random.key(i), PLAIN.size.members)) for i in (1, 2))
     assert jnp.array_equal(q(None), q(None)) and not jnp.allclose(a, b) and not jnp.allclose(a, q(None))
 
@@ -167,7 +170,10 @@ def test_drawn_heads_are_those_of_the_whole_critic(key, trained):
     parts, params = tdmpc2_model.make_networks(config), shaken(PLAIN, key).critic.params
     heads = tdmpc2_model.two_heads(config, key)
     keys = jax.random.split(key, config.size.members) if trained else None
-    q = lambda params, keys: tdmpc2_model.q_values(parts, params, jnp.full(16, 0.25), jnp.ones(1), keys)  # noqa: E731
+
+    def q(params, keys):
+        return tdmpc2_model.q_values(parts, params, jnp.full(16, 0.25), jnp.ones(1), keys)
+
     every = q(params, keys)
     drawn = q(tdmpc2_model.heads_of(params, heads), keys if keys is None else keys[heads])
     np.testing.assert_allclose(drawn, every[heads], rtol=1e-6)
@@ -258,7 +264,10 @@ def test_losses_against_a_loop(key):
 def test_invalid_rows_do_not_matter(config, key):
     state, batch = shaken(config, key), windows(key)
     noise = windows(jax.random.key(9))
-    mix = lambda x, y: jnp.where(jnp.expand_dims(batch.valid, tuple(range(2, x.ndim))), x, y)  # noqa: E731
+
+    def mix(x, y):
+        return jnp.where(jnp.expand_dims(batch.valid, tuple(range(2, x.ndim))), x, y)
+
     other = jax.tree.map(mix, batch, noise)
     assert not equal(batch, other)
     a, b = (UPDATE[config](state, x, key)[0] for x in (batch, other))
@@ -518,10 +527,15 @@ def test_learns_to_push_a_cart(key):
 
     @jax.jit
     def collect(key):
-        uniform = lambda memory, obs, key: (jax.random.uniform(key, (1,), minval=-1), memory)  # noqa: E731
+        def uniform(memory, obs, key):
+            return (jax.random.uniform(key, (1,), minval=-1), memory)
+
         rows = jax.vmap(lambda k: episode(uniform, k))(jax.random.split(key, 200))
         ring = sequences.init(jax.tree.map(lambda x: x[0, 0], rows), 200 * STEPS)
-        write = lambda ring, rows: (sequences.add_episode(ring, rows, jnp.ones(STEPS, bool)), None)  # noqa: E731
+
+        def write(ring, rows):
+            return (sequences.add_episode(ring, rows, jnp.ones(STEPS, bool)), None)
+
         return jax.lax.scan(write, ring, rows)[0], rows.reward.sum(1).mean()
 
     def play(policy):

@@ -71,13 +71,22 @@ def test_walls_tell_that_a_camera_is_off(key):
 
 @pytest.mark.parametrize(
     ("commands", "both", "believed"),
-    [(0.0, 19.0, False), (0.0, 21.0, True), (30.0, 49.0, False), (30.0, 51.0, True), (100.0, 149.0, False),
-     (100.0, 151.0, True)],
-)  # fmt: skip
+    [
+        (0.0, 19.0, False),
+        (0.0, 21.0, True),
+        (30.0, 49.0, False),
+        (30.0, 51.0, True),
+        (100.0, 149.0, False),
+        (100.0, 151.0, True),
+    ],
+)
 def test_errors_of_sensors_must_earn_their_place(commands, both, believed, monkeypatch):
     """20 nats and half as many again as the commands alone explain; else the fit of the commands stands."""
     plain, wide = turned(0.1, 1.0, [0.0, 0.0]), turned(0.2, 1.0, [0.0, 0.0], [0.06, 0.0])
-    search = lambda *given, errors, turns: (wide, jnp.float32(both)) if any(errors) else (plain, jnp.float32(commands))  # noqa: E731
+
+    def search(*given, errors, turns):
+        return (wide, jnp.float32(both)) if any(errors) else (plain, jnp.float32(commands))
+
     monkeypatch.setattr(distortion, "_fit", search)
     fitted, evidence = distortion.fit(walled, None, None, None, turns=True, errors=(0.05, 0.0))
     assert evidence == (both if believed else commands)
@@ -144,9 +153,15 @@ def test_one_rollout_of_pushing_tells_how_commands_are_turned_and_scaled():
     env = envs.make("push", "c")
     gap = gaps.from_dict(env, "g", {"effects": {"obs_noise": 0.001, "action_rotation": 0.7, "action_scale": 0.6}})
     pool, key = gaps.worlds(env, gap, jax.random.key(0), 1), jax.random.key(1)
-    uniform = lambda carry, obs, key: (jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0), carry)  # noqa: E731
+
+    def uniform(carry, obs, key):
+        return (jax.random.uniform(key, (2,), minval=-1.0, maxval=1.0), carry)
+
     played = jax.jit(lambda key: play_episode(env, pool, uniform, (), key, gamma=0.9))(key)
-    free = lambda obs, action: 0.05 * action  # noqa: E731
+
+    def free(obs, action):
+        return 0.05 * action
+
     found, evidence = distortion.fit(
         free, played.transitions, played.valid, jnp.full(2, 1e-3), turns=True, errors=(0.0,) * 4
     )

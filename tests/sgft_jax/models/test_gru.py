@@ -18,12 +18,18 @@ def test_a_step_is_that_of_a_gru(key):
     hidden, previous, obs = (
         jax.random.normal(k, (n,)) for k, n in zip(jax.random.split(key, 3), (UNITS, ACT, OBS), strict=True)
     )
-    dense = lambda name, x: nn.relu(x @ params[name]["kernel"] + params[name]["bias"])  # noqa: E731
+
+    def dense(name, x):
+        return nn.relu(x @ params[name]["kernel"] + params[name]["bias"])
+
     read = jnp.concatenate([dense("action", previous), dense("obs", obs)])
-    split = lambda name: [  # noqa: E731
-        {"kernel": kernel, "bias": bias}
-        for kernel, bias in zip(*(jnp.split(params[name][x], 3, axis=-1) for x in ("kernel", "bias")), strict=True)
-    ]
+
+    def split(name):
+        return [
+            {"kernel": kernel, "bias": bias}
+            for kernel, bias in zip(*(jnp.split(params[name][x], 3, axis=-1) for x in ("kernel", "bias")), strict=True)
+        ]
+
     layers = dict(zip(("ir", "iz", "in"), split("inputs"), strict=True)) | dict(
         zip(("hr", "hz", "hn"), split("recurrent"), strict=True)
     )

@@ -18,10 +18,15 @@ def fit(rows, slope, belief, held=None, bound=np.inf):
     held = np.ones(len(rows), bool) if held is None else held
     return jax.jit(
         lambda y: robust.most_probable(
-            lambda p: y - p[0] * jnp.asarray(slope), jnp.zeros((1, 1)), jnp.array([belief]), y, jnp.asarray(held),
-            jnp.full(rows.shape[1], SCALE), bound=bound,
+            lambda p: y - p[0] * jnp.asarray(slope),
+            jnp.zeros((1, 1)),
+            jnp.array([belief]),
+            y,
+            jnp.asarray(held),
+            jnp.full(rows.shape[1], SCALE),
+            bound=bound,
         )
-    )(jnp.asarray(rows))  # fmt: skip
+    )(jnp.asarray(rows))
 
 
 def cost(p, rows, slope, belief):
