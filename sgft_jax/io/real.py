@@ -1,6 +1,5 @@
 """Impure: the real rollouts of a run on disk. What a robot did is never repeated, cut off or deleted."""
 
-import contextlib
 import json
 import os
 import re
@@ -125,8 +124,7 @@ class Journal:
 
     def remove(self) -> None:
         """When the rollout is in the store."""
-        with contextlib.suppress(FileNotFoundError):
-            self.path.unlink()
+        self.path.unlink(missing_ok=True)
 
     def _write(self, line: Mapping[str, Any]) -> None:
         self._file.write(json.dumps(line) + "\n")
