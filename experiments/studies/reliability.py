@@ -54,49 +54,32 @@ def main(args: ReliabilityArgs) -> dict[str, list[dict[str, Any]]]:
 
     home, lines = (args.out / "reliability").resolve(), {part: [] for part in args.parts}
     for part in args.parts:
-        for line in _PARTS[part](args, home / part):
+        for line in _tries(args, part, home / part):
             lines[part].append(line)
             print(f"{part}: " + ", ".join(f"{name} {_text(x)}" for name, x in line.items()), flush=True)
     print(f"numbers: {write_summary(home, {'provenance': runs.provenance(), **lines})}")
     return lines
 
 
-def _kills(args: ReliabilityArgs, home: Path) -> Iterator[dict[str, Any]]:
-    from experiments.studies.reliable import kills
+def _tries(args: ReliabilityArgs, part: Part, home: Path) -> Iterator[dict[str, Any]]:
+    """Causes one kind of failure; yields what became of each run."""
+    from experiments.studies.reliable import disk, kills, network, timing
 
-    for i in range(args.runs):
-        yield {"run": i, **kills.run(home / f"run-{i}", kills=args.kills, seed=args.seed + i)}
-
-
-def _network(args: ReliabilityArgs, home: Path) -> Iterator[dict[str, Any]]:
-    from experiments.studies.reliable import network
-
-    yield network.bad_network(home, seed=args.seed, rollouts=args.rollouts)
-
-
-def _strangers(args: ReliabilityArgs, home: Path) -> Iterator[dict[str, Any]]:
-    from experiments.studies.reliable import network
-
-    yield network.strangers(home, seed=args.seed, rollouts=args.rollouts)
-
-
-def _disk(args: ReliabilityArgs, home: Path) -> Iterator[dict[str, Any]]:
-    from experiments.studies.reliable import disk
-
-    yield disk.full(home)
-    yield disk.read_only(home)
-
-
-def _clock(args: ReliabilityArgs, home: Path) -> Iterator[dict[str, Any]]:
-    from experiments.studies.reliable import timing
-
-    yield timing.kept_clock(home / "slow", period=0.2, rollouts=args.rollouts, utd=400)
-    yield timing.kept_clock(
-        home / "fast", period=0.005, rollouts=args.rollouts, utd=2, task="wheel-legged", sizes=timing.WHEEL_LEGGED
-    )
-
-
-_PARTS = {"kills": _kills, "network": _network, "strangers": _strangers, "disk": _disk, "clock": _clock}
+    match part:
+        case "kills":
+            for i in range(args.runs):
+                yield {"run": i, **kills.run(home / f"run-{i}", kills=args.kills, seed=args.seed + i)}
+        case "network":
+            yield network.bad_network(home, seed=args.seed, rollouts=args.rollouts)
+        case "strangers":
+            yield network.strangers(home, seed=args.seed, rollouts=args.rollouts)
+        case "disk":
+            yield disk.full(home)
+            yield disk.read_only(home)
+        case "clock":
+            wheels = {"task": "wheel-legged", "sizes": timing.WHEEL_LEGGED}
+            yield timing.kept_clock(home / "slow", period=0.2, rollouts=args.rollouts, utd=400)
+            yield timing.kept_clock(home / "fast", period=0.005, rollouts=args.rollouts, utd=2, **wheels)
 
 
 def _text(value: Any) -> str:

@@ -61,8 +61,8 @@ def learning_curves(path: Path, panels: Mapping[str, Sequence[Curve]], *, title:
             axes.plot(curve.x, iqm(curve.values), color=_FAINT, linewidth=0.8, zorder=1)
         for curve, colour in zip(curves, colours(curves), strict=True):
             _draw_curve(axes, curve, colour)
-        axes.set_xlabel(_unit(panels[entry]), **{**_FONT, "size": 9})
         _dress(axes, words, [*curves, *others])
+        axes.set_xlabel(_unit(panels[entry]), **{**_FONT, "size": 9})
     _head(figure, title)
     figure.supxlabel(_note([curve for _, _, curves, _ in parts for curve in curves]), size=8, color=_GREY)
     return _save(figure, path)
@@ -120,7 +120,7 @@ def _draw_curve(axes: Axes, curve: Curve, colour: str) -> None:
 
 def _dress(axes: Axes, words: str, curves: Sequence[Curve]) -> None:
     """Names, limits and a legend beside the panel, from the curve that ends highest to the one that ends lowest."""
-    axes.set_title(words, **_FONT, loc="left")
+    _name(axes, words)
     axes.set_xlim(0, max(int(curve.x[-1]) for curve in curves) or 1)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True, nbins=6))
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -170,8 +170,7 @@ def pretraining(
     figure, panels = _figure(3.0 * columns, 3.2, columns)
     for axes, values, name in zip(panels, (success, returns), ("success rate", "return"), strict=False):
         axes.plot(np.asarray(steps) / 1e6, np.asarray(values), color=PALETTE[0], linewidth=2)
-        axes.set_title(name, **_FONT, loc="left")
-        axes.set_xlabel("env steps (millions)", **_FONT)
+        _name(axes, name, "env steps (millions)")
         axes.set_xlim(left=0)
     panels[0].set_ylim(-0.03, 1.03)
     _value_panel(panels[2], np.asarray(value), np.asarray(monte_carlo))
@@ -201,24 +200,22 @@ def diagnosis(
             shares = [by_name[name] for by_name in found["value"][where]]
             states.plot(horizons, shares, dash, color=colour, linewidth=2, label=f"{name}, {where}", clip_on=False)
     states.set_ylim(-0.03, 1.03)
-    states.set_title("states where the best action keeps / exceeds V_sim", **_FONT, loc="left")
+    _name(states, "states where the best action keeps / exceeds V_sim", "steps ahead")
     for where, colour in (("simulated", _FAINT), ("real", PALETTE[0])):
         value, returns = points[where]
         promise.scatter(returns, value, s=6, color=colour, alpha=0.6, linewidths=0, label=where)
     both = np.concatenate([x for pair in points.values() for x in pair])
     promise.plot(*[(both.min(), both.max())] * 2, color=_GREY, linewidth=1, zorder=0)
-    promise.set_title("V_sim against discounted return", **_FONT, loc="left")
-    promise.set_xlabel("return that followed", **_FONT)
+    _name(promise, "V_sim against discounted return", "return that followed")
     colours = {"simulated": _FAINT, "real": PALETTE[1], "identified": PALETTE[0]}
     words = {"simulated": "simulated", "real": "real", "identified": "real, identified"}
     for where, colour in colours.items():
         error = found["model_error"][where]
         model.plot(horizons, error, color=colour, linewidth=2, marker="o", markersize=3, label=words[where])
     model.set_ylim(bottom=0)
-    model.set_title("model error, standard deviations", **_FONT, loc="left")
+    _name(model, "model error, standard deviations", "steps ahead")
     for axes in (states, model):
         axes.set_xticks(horizons)
-        axes.set_xlabel("steps ahead", **_FONT)
     for axes in (states, promise, model):
         axes.legend(frameon=False, fontsize=8, labelcolor=_INK)
     strengths = np.array([min(sign.strength, 3.0) for sign in signs])
@@ -227,7 +224,7 @@ def diagnosis(
     kinds.invert_yaxis()
     kinds.set_xlim(0, 3)
     kinds.axvline(1.0, color=_GREY, linewidth=1)
-    kinds.set_title("signs of the gap; one counts from 1 on", **_FONT, loc="left")
+    _name(kinds, "signs of the gap; one counts from 1 on")
     _head(figure, title)
     return _save(figure, path)
 
@@ -248,7 +245,7 @@ def rollouts(path: Path, panels: Sequence[Panel], episodes: Mapping[str, float],
                 axes.plot(panel.time, panel.dotted[name], linewidth=1.0, **{**look, "linestyle": ":"})
         for end in ends[:-1]:
             axes.axvline(end, color=_GREY, linewidth=1)
-        axes.set_title(panel.name, **_FONT, loc="left")
+        _name(axes, panel.name)
         axes.set_ylabel(panel.unit, **{**_FONT, "size": 9})
         axes.set_xlim(0, ends[-1])
         axes.tick_params(labelbottom=axes is drawn[-1])
@@ -280,11 +277,16 @@ def effects(path: Path, found: Mapping[str, Mapping[str, Mapping[str, Interval]]
         axes.set_yticks(np.arange(len(names)), names)
         axes.invert_yaxis()
         axes.axvline(0.0, color=_GREY, linewidth=1)
-        axes.set_title(place, **_FONT, loc="left")
-        axes.set_xlabel(label, **_FONT)
+        _name(axes, place, label)
     panels[0].legend(frameon=False, fontsize=8, labelcolor=_INK)
     _head(figure, "effect of each part, mean over all others")
     return _save(figure, path)
+
+
+def _name(axes: Axes, title: str, x: str = "") -> None:
+    """What a panel shows, and what its x axis is."""
+    axes.set_title(title, **_FONT, loc="left")
+    axes.set_xlabel(x, **_FONT)
 
 
 def _head(figure: Figure, title: str) -> None:
@@ -301,8 +303,7 @@ def _value_panel(axes: Axes, value: np.ndarray, monte_carlo: np.ndarray) -> None
     axes.scatter(monte_carlo, value, s=6, color=PALETTE[0], alpha=min(1.0, 60 / len(value) ** 0.75), linewidths=0)
     axes.set_xlim(*limits)
     axes.set_ylim(*limits)
-    axes.set_title("V_sim against discounted return", **_FONT, loc="left")
-    axes.set_xlabel("return that followed", **_FONT)
+    _name(axes, "V_sim against discounted return", "return that followed")
     bias, error = float((value - monte_carlo).mean()), float(np.sqrt(((value - monte_carlo) ** 2).mean()))
     axes.text(0.04, 0.95, f"bias {bias:+.2g}\nRMSE {error:.2g}", transform=axes.transAxes, va="top", size=9, color=_INK)
 
@@ -315,8 +316,7 @@ def _dynamics_panel(axes: Axes, error: np.ndarray, baseline: ArrayLike | None) -
         end = (len(error), float(np.asarray(baseline)[-1]))
         axes.annotate("if nothing moved", end, (-14, 0), textcoords="offset points", ha="right", size=9, color=_GREY)
     axes.set_ylim(bottom=0)
-    axes.set_title("model error, standard deviations", **_FONT, loc="left")
-    axes.set_xlabel("steps ahead", **_FONT)
+    _name(axes, "model error, standard deviations", "steps ahead")
 
 
 # ---------------------------------------------------------------- the look
