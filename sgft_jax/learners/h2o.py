@@ -176,9 +176,9 @@ def update(config: H2OConfig, state: H2OState, batch: Batch, key: Key) -> tuple[
 
     batch: [B, ...] raw, which says which rows are simulated (`Batch.is_sim`). metrics: [] each.
     """
+    batch, for_ratio = ratio.split_rows(batch, config.ratio_rows)
     nets, hyper = _networks(config), state.hyper
     key_ratio, key_gap, key_actor, key_target = jax.random.split(key, 4)
-    batch, for_ratio = ratio.split_rows(batch, config.ratio_rows)
     fit, log_w, metrics = ratio.step(nets.ratio, state.ratio, batch, for_ratio, key_ratio, rate=hyper.lr_ratio)
     state = state.replace(ratio=fit)
     gaps = _gaps(nets, state, batch, key_gap)

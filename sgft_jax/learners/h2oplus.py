@@ -181,9 +181,9 @@ def update(config: H2OPlusConfig, state: H2OPlusState, batch: Batch, key: Key) -
 
     batch: [B, ...] raw, which says which rows are simulated (`Batch.is_sim`). metrics: [] each.
     """
+    batch, for_ratio = ratio.split_rows(batch, config.ratio_rows)
     nets, hyper = _networks(config), state.hyper
     key_ratio, key_actor, key_target = jax.random.split(key, 3)
-    batch, for_ratio = ratio.split_rows(batch, config.ratio_rows)
     weights, metrics = jnp.ones_like(batch.reward), {}
     if config.ratio:
         fit, log_w, metrics = ratio.step(nets.ratio, state.ratio, batch, for_ratio, key_ratio, rate=hyper.lr_ratio)
