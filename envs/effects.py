@@ -9,6 +9,8 @@ import numpy as np
 from envs.base import EffectRange, Effects, Entry, Env, Numbers, Value, entries_of, misnamed
 from envs.types import Array, Key, UserError, unknown
 
+__all__ = ["distort", "draw", "make_range", "measure", "numbers", "ramp", "shake"]
+
 _DEFAULTS = {"action_scale": 1.0, "obs_noise_prob": 1.0}
 _NOT_NEGATIVE = ("latency", "latency_jitter", "obs_noise", "obs_noise_prob", "action_noise")
 # Beyond these nothing is left of a command, in ranges of it, of a turn, in rad, or of a measurement kept in float32.

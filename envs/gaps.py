@@ -20,6 +20,9 @@ from envs.base import Effects, Env, Value, World
 from envs.files import parse_json, read_json, read_toml
 from envs.types import Key, UserError, unknown
 
+__all__ = ["Gap", "changes", "each", "find", "from_dict", "load", "presets", "read_file", "title", "to_toml"]
+__all__ += ["worlds"]
+
 SIM = "sim"  # names the gap in which nothing differs: the real system is the training domain itself
 _KEYS = frozenset({"params", "effects", "scene", "families", "stratum"})
 _FILE = re.compile(r"(.*\.(?:toml|json))(?::(.+))?")  # a file, or one gap of a file

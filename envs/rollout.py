@@ -10,6 +10,9 @@ from envs.base import Env, EnvState, World
 from envs.mesh import split_vmap
 from envs.types import Array, Key, PyTree, Transition
 
+__all__ = ["Episode", "Fleet", "begin_episode", "counted", "episode_keys", "judged", "launch", "pick"]
+__all__ += ["play_episode", "pool_size", "select", "step_fleet"]
+
 # act(carry, obs, key) -> (action, carry), for one environment
 Act = Callable[[PyTree, Array, Key], tuple[Array, PyTree]]
 

@@ -30,22 +30,18 @@ PUBLIC = [(f"{package}.{name}", thing) for package in names.PACKAGES for name, t
 
 
 def public_modules():
-    """The modules that public names are of, with these names; learners are a package with a stub of its own."""
+    """The modules that public names are of, with these names."""
     modules = {}
-    for name, thing in PUBLIC:
-        if isinstance(thing, ModuleType) and thing.__name__.startswith("sgft_jax."):
-            listed = [full.removeprefix(f"{name}.") for full, _ in PUBLIC if full.startswith(f"{name}.")]
-            modules[thing.__name__] = [member for member in listed if "." not in member]
+    for full, thing in PUBLIC:
+        if isinstance(thing, ModuleType) and not hasattr(thing, "__path__"):
+            listed = (name.removeprefix(f"{full}.") for name, _ in PUBLIC if name.startswith(f"{full}."))
+            modules.setdefault(thing.__name__, set()).update(listed)
     for node in ast.parse(Path(sgft_jax.__file__).with_suffix(".pyi").read_text()).body:
         if isinstance(node, ast.ImportFrom) and node.module:
-            for name in (alias.name for alias in node.names):
-                if isinstance(thing := getattr(sgft_jax, name), ModuleType):
-                    prefix = f"sgft_jax.{name}."
-                    modules[thing.__name__] = [
-                        full.removeprefix(prefix) for full, _ in PUBLIC if full.startswith(prefix)
-                    ]
-                else:
-                    modules.setdefault(f"sgft_jax.{node.module}", []).append(name)
+            names = {alias.name for alias in node.names}
+            things = {name for name in names if not isinstance(getattr(sgft_jax, name), ModuleType)}
+            if things:
+                modules.setdefault(f"sgft_jax.{node.module}", set()).update(things)
     return modules
 
 

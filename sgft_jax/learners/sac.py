@@ -24,7 +24,7 @@ from sgft_jax.models.distortion import Distortion
 from sgft_jax.models.networks import Network, NetworkConfig
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
-__all__ = ["CriticTerm", "SACConfig", "SACHyper", "SACParams", "SACState", "act", "check_params_of_prior"]
+__all__ = ["SACConfig", "SACHyper", "SACParams", "SACState", "act", "check_params_of_prior"]
 __all__ += ["extract_params", "init", "make_sac", "network_input", "state_from_prior", "update"]
 
 
