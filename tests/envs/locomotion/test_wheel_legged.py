@@ -111,7 +111,10 @@ def gain(theta):
 
 def episodes(env, names, act):
     """One episode [gaps] in each of them."""
-    one = lambda pool, key: envs.play_episode(env, member(pool, None), act, (), key, gamma=1.0)  # noqa: E731
+
+    def one(pool, key):
+        return envs.play_episode(env, member(pool, None), act, (), key, gamma=1.0)
+
     return jax.jit(jax.vmap(one))(pool_of(env, names), jax.random.split(KEY, len(names)))
 
 
@@ -119,7 +122,10 @@ def episodes(env, names, act):
 def test_a_linear_controller_stands_in_every_gap_and_nothing_falls():
     """That of the nominal robot. Where the centre of mass is ahead or the floor is rough, it does not stay in place."""
     env, own = envs.make("wheel-legged", "c"), gain(NOMINAL)
-    steady = lambda carry, obs, key: (jnp.clip(-own @ obs, -1.0, 1.0)[None], carry)  # noqa: E731
+
+    def steady(carry, obs, key):
+        return jnp.clip(-own @ obs, -1.0, 1.0)[None], carry
+
     found = episodes(env, NAMES, steady)
     assert (found.valid.sum(1) == env.episode_length).all() and not found.exploded.any()
     away = dict(zip(NAMES, np.abs(found.transitions.next_obs[:, 1000:, 0]).max(1), strict=True))
