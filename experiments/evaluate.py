@@ -56,13 +56,13 @@ class EvaluateArgs:
 
 def main(args: EvaluateArgs) -> None:
     """Evaluates and prints."""
-    found = evaluate(args)
+    results = evaluate(args)
     if args.json:
-        print(json.dumps(found))
+        print(json.dumps(results))
         return
-    for system in found["systems"]:
+    for system in results["systems"]:
         steps = f", {system['real_steps']:,} real steps" if "real_steps" in system else ""
-        print(f"{found['task']}, {system['where']}, {found['episodes']} episodes for each policy{steps}:")
+        print(f"{results['task']}, {system['where']}, {results['episodes']} episodes for each policy{steps}:")
         for one in system["policies"]:
             low, high = (100 * x for x in one["success/interval"])
             exploded = f", {100 * one['exploded']:.1f} % exploded" if one["exploded"] else ""
@@ -89,32 +89,33 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     from sgft_jax.stacking import member, part, stack
 
     env = envs.make(task, args.impl, **observed_by(folders))
-    found = [None if real == SIM else described(env, real, args.set) for real in args.real]
+    reals = [None if real == SIM else described(env, real, args.set) for real in args.real]
     priors = load_priors(folders, env)
     card, stepped = priors[0].card, is_stepped(args.real[0])
     key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_SEED), args.seed))
-    members = stack([prior.params for prior in priors] * len(found))
+    members = stack([prior.params for prior in priors] * len(reals))
     with contextlib.ExitStack() as last:
         if stepped:
             system = connect(env, args.real, args.set, members=len(priors), gamma=card["gamma"], home=args.out)
             last.callback(system.close)
         else:
-            system = _simulated(env, found, key_worlds, args.episodes, members=len(priors), gamma=card["gamma"])
+            system = _simulated(env, reals, key_worlds, args.episodes, members=len(priors), gamma=card["gamma"])
         if is_robot(args.real[0]):  # what it does is kept
             store = RealStore(args.out / "evaluate" / env.name / REMOTE)
             system = RecordedSystem(system, [store], done=len(store), explore=False, sync_every=1)
         played = play(system, make_policy(card, env), members, key_episodes, args.episodes)
 
-    def of_system(i: int) -> dict[str, Any]:
-        own = part(played, i, len(priors))
-        each = [(folder, member(own, k)) for k, folder in enumerate(folders)]
+    def results_on(i: int) -> dict[str, Any]:
+        episodes = part(played, i, len(priors))
+        labelled = [(folder, member(episodes, k)) for k, folder in enumerate(folders)]
         policies = [
-            {"policy": str(folder), **describe(one), **_filmed(args, system, i, one, folder)} for folder, one in each
+            {"policy": str(folder), **describe(one), **_filmed(args, system, i, one, folder)}
+            for folder, one in labelled
         ]
-        return {"policies": policies, **({"real_steps": int(own.valid.sum())} if stepped else {})}
+        return {"policies": policies, **({"real_steps": int(episodes.valid.sum())} if stepped else {})}
 
-    where = ["in simulation" if gap is None else f"on the {gap.name} real system" for gap in found]
-    systems = [{"where": name, **of_system(i)} for i, name in enumerate(where)]
+    where = ["in simulation" if gap is None else f"on the {gap.name} real system" for gap in reals]
+    systems = [{"where": name, **results_on(i)} for i, name in enumerate(where)]
     return {"task": env.name, "impl": env.impl, "episodes": args.episodes, "systems": systems}
 
 
@@ -129,7 +130,7 @@ def _filmed(args: EvaluateArgs, system: Any, i: int, played: Any, folder: Path) 
     return {"video": film_episode(system.env, system.pools, i, member(played, 0), path)}
 
 
-def _simulated(env: Any, found: Sequence[Gap | None], key: Any, episodes: int, *, members: int, gamma: float) -> Any:
+def _simulated(env: Any, reals: Sequence[Gap | None], key: Any, episodes: int, *, members: int, gamma: float) -> Any:
     """The `Simulated` systems of gaps, None for the simulator, in held-out worlds with so many members on each."""
     import jax.numpy as jnp
 
@@ -137,8 +138,8 @@ def _simulated(env: Any, found: Sequence[Gap | None], key: Any, episodes: int, *
     from sgft_jax.stacking import stack
     from sgft_jax.systems.simulated import Simulated
 
-    real = real_env(env, [gap for gap in found if gap])
-    pools = [padded(heldout_worlds(real, gap, key, episodes), episodes) for gap in found]
+    real = real_env(env, [gap for gap in reals if gap])
+    pools = [padded(heldout_worlds(real, gap, key, episodes), episodes) for gap in reals]
     return Simulated(real, stack(pools), jnp.repeat(jnp.arange(len(pools)), members), gamma=gamma)
 
 

@@ -80,9 +80,9 @@ def run_main[T](
         except UserError as error:
             fail(str(error))
         except Exception as error:
-            if said := _disk_trouble(error):
+            if reason := _disk_trouble(error):
                 again = _has_resume(config_type) and _in_a_run(error)
-                fail(f"{said}; mend that, then {'the same command with --resume goes on' if again else 'try again'}")
+                fail(f"{reason}; mend that, then {'the same command with --resume goes on' if again else 'try again'}")
             if _in_renderer_choice(error):
                 chosen = f"MUJOCO_GL={os.environ['MUJOCO_GL']}"
                 fail(f"{chosen}: MuJoCo cannot use that here ({error}); unset it, or set it to disable")
@@ -90,8 +90,8 @@ def run_main[T](
                 fail(f"{error}; unset it")
             if not _is_out_of_memory(error):
                 raise
-            said = (str(error).strip() or "MemoryError").splitlines()[0]
-            fail(f"out of memory ({said}): lower the batch size, the number of environments or of seeds")
+            reason = (str(error).strip() or "MemoryError").splitlines()[0]
+            fail(f"out of memory ({reason}): lower the batch size, the number of environments or of seeds")
 
 
 def _disk_trouble(error: BaseException | None) -> str | None:
@@ -258,11 +258,11 @@ def _unexpected(word: str, options: Sequence[str]) -> str:
 
 def _bad_value(event: _errors.InstantiationFailure, argv: Sequence[str]) -> str:
     """What is wrong with the value of an option, as far as tyro knows which."""
-    said = event.message.strip().splitlines()[0]
+    message = event.message.strip().splitlines()[0]
     if event.argument is None:
-        return said
+        return message
     option, kind = event.argument.display_name(), _in_words(event.argument.field.type_stripped)
-    return f"{' '.join([option, *_given(option, argv)])}: must be {kind or f'something else ({said})'}"
+    return f"{' '.join([option, *_given(option, argv)])}: must be {kind or f'something else ({message})'}"
 
 
 def _in_words(hint: Any) -> str:
@@ -271,34 +271,34 @@ def _in_words(hint: Any) -> str:
     if typing.get_origin(hint) is tuple:
         return {int: "whole numbers", float: "numbers"}.get(typing.get_args(hint)[0], "")
     if parts := typing.get_args(hint):  # a union
-        each = [_in_words(part) for part in parts]
-        return " or ".join(each) if all(each) else ""
+        words = [_in_words(part) for part in parts]
+        return " or ".join(words) if all(words) else ""
     return words.get(hint, "")
 
 
 def _given(option: str, argv: Sequence[str]) -> list[str]:
     """The values of an option on a command line, of the last one if it is there several times."""
-    found: list[str] = []
+    values: list[str] = []
     inside = False
     for word in argv:
         name, _, value = word.partition("=")
         if word.startswith("--"):
             inside = name.replace("_", "-") == option
-            found = ([value] if value else []) if inside else found
+            values = ([value] if value else []) if inside else values
         elif inside:
-            found.append(word)
-    return found
+            values.append(word)
+    return values
 
 
 def option_names(config_type: type, default: Any = None, *, prefix: str = "--") -> list[str]:
     """`--task`, `--config.batch-size`, ...: the options of a dataclass and of those in it."""
-    hints, found = typing.get_type_hints(config_type), []
+    hints, names = typing.get_type_hints(config_type), []
     for one in dataclasses.fields(config_type):
         value = getattr(default, one.name, None)
         kind = type(value) if dataclasses.is_dataclass(value) else hints[one.name]
         name = prefix + one.name.replace("_", "-")
-        found += option_names(kind, value, prefix=f"{name}.") if dataclasses.is_dataclass(kind) else [name]
-    return found
+        names += option_names(kind, value, prefix=f"{name}.") if dataclasses.is_dataclass(kind) else [name]
+    return names
 
 
 def fail(message: str) -> NoReturn:
@@ -375,5 +375,5 @@ def _probe(backend: str) -> str | None:
         return "no answer within 60 s"
     if done.returncode == 0:
         return None
-    said = [line for line in done.stderr.splitlines() if line.strip()]
-    return said[-1].strip()[:120] if said else f"exit code {done.returncode}"
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    return lines[-1].strip()[:120] if lines else f"exit code {done.returncode}"

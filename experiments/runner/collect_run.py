@@ -62,14 +62,14 @@ def teach(args: CollectArgs, level: float) -> list[dict[str, Any]]:
         print(f"no data of seed {', '.join(late)}: {level:g} was not reached in {args.updates:,} updates")
     if not reached:
         raise UserError(f"--level {level:g}: no seed reached it; raise --updates or lower it")
-    found = []
+    cards = []
     for i, (params, rows, noted) in sorted(reached.items()):
         replay, medium = (args.out / f"{name_of(args, kind, seeds[i])}.hdf5" for kind in PAIR)
         judged = PAIR if is_d4rls(args) else ("", "")
         # What took long to learn is on disk before the policy plays on.
-        found.append(_write(args, replay, of_fleet(rows, args.environments, noted), kind=judged[0]))
-        found.append(_write(args, medium, _play(args, env, system, agent.policy, params, seeds[i]), kind=judged[1]))
-    return found
+        cards.append(_write(args, replay, of_fleet(rows, args.environments, noted), kind=judged[0]))
+        cards.append(_write(args, medium, _play(args, env, system, agent.policy, params, seeds[i]), kind=judged[1]))
+    return cards
 
 
 def record(args: CollectArgs) -> list[dict[str, Any]]:
@@ -127,8 +127,8 @@ def _noted(policy: Policy, params: PyTree, played: Episode) -> Noted:
     """The same of the steps of episodes [n] of one policy."""
     rows, log_prob = played.transitions, None
     if policy.log_prob is not None:
-        each = jax.vmap(jax.vmap(policy.log_prob, (None, 0, 0)), (None, 0, 0))
-        log_prob = jax.jit(each)(params, rows.obs, rows.action)
+        log_probs = jax.vmap(jax.vmap(policy.log_prob, (None, 0, 0)), (None, 0, 0))
+        log_prob = jax.jit(log_probs)(params, rows.obs, rows.action)
     before, after = (jax.tree.map(lambda x, own=own: x[:, own], played.trace) for own in (slice(-1), slice(1, None)))
     return Noted(before, after, log_prob)
 
@@ -145,17 +145,17 @@ def _play(args: CollectArgs, env: Env, system: Simulated, policy: Policy, params
     """Exploring episodes of one policy, until there are transitions enough."""
     alone = system.moved(system.pools, jnp.zeros(1, jnp.int32))
     params = jax.tree.map(lambda x: jnp.asarray(x)[None], params)
-    key, found, held = jax.random.fold_in(jax.random.key(seed), FromLog.RECORDING), [], 0
+    key, episodes, held = jax.random.fold_in(jax.random.key(seed), FromLog.RECORDING), [], 0
     wanted = transitions_of(args)
     at_once = min(_AT_ONCE, math.ceil(wanted / env.episode_length))
     while held < wanted:
         key, key_now = jax.random.split(key)
         played = member(_episodes(alone, policy, params, key_now, at_once), 0)
         new = of_episodes(played, _noted(policy, member(params, 0), played))
-        found, held = found + new, held + sum(len(own.reward) for own in new)
+        episodes, held = episodes + new, held + sum(len(own.reward) for own in new)
         if not new:
             raise UserError(f"{env.name}: physics exploded in the first step of {at_once} episodes; nothing to record")
-    return cut(found, wanted)
+    return cut(episodes, wanted)
 
 
 def _write(args: CollectArgs, path: Path, episodes: Sequence[Recorded], *, kind: str = "") -> dict[str, Any]:

@@ -165,13 +165,13 @@ def check(args: FinetuneArgs) -> tuple[Online, list[int]]:
 
 def _check_eval_at(args: FinetuneArgs) -> None:
     """Raises UserError for evaluations that would never be made."""
-    given = f"--eval-at {' '.join(map(str, args.eval_at))}"
+    option = f"--eval-at {' '.join(map(str, args.eval_at))}"
     if min(args.eval_at) < 0:
-        raise UserError(f"{given}: numbers of rollouts, from 0 on")
+        raise UserError(f"{option}: numbers of rollouts, from 0 on")
     if min(args.eval_at) > args.rollouts:  # single ones may, for a run that --resume makes longer
-        raise UserError(f"{given}: no evaluation within --rollouts {args.rollouts}; name smaller numbers")
+        raise UserError(f"{option}: no evaluation within --rollouts {args.rollouts}; name smaller numbers")
     if not resolved(args).eval_episodes:
-        raise UserError(f"{given}: evaluations have no episodes; say how many with --eval-episodes")
+        raise UserError(f"{option}: evaluations have no episodes; say how many with --eval-episodes")
 
 
 def _check_robot(args: FinetuneArgs) -> None:

@@ -94,8 +94,8 @@ def cell_of(
 def run_of(args: GridArgs, task: str, real: str, method: str) -> FinetuneArgs:
     """The arguments of one cell, with the method's own defaults."""
     shared = ("seed", "seeds", "rollouts", "eval_every", "impl", "devices", "out")
-    given = {name: getattr(args, name) for name in shared}
-    return arguments(method, task=task, real=(real,), video=False, **given)
+    options = {name: getattr(args, name) for name in shared}
+    return arguments(method, task=task, real=(real,), video=False, **options)
 
 
 def look_up(run: FinetuneArgs) -> Cell:

@@ -170,9 +170,9 @@ def _runs(args: HybridGridArgs, method: str, data: Path | None) -> list[HybridAr
     kind = get_method(name, "fixed").kind
     shared = ("task", "real", "previous_actions", "seeds", "seed", "schedule_preset", "schedule", "eval_every")
     shared += ("eval_episodes", "impl", "out")
-    given = {name: getattr(args, name) for name in shared}
+    options = {name: getattr(args, name) for name in shared}
     data = None if kind == "simulator" else data
-    run = arguments(name, preset=preset, variant=preset, data=data, video=False, **given)
+    run = arguments(name, preset=preset, variant=preset, data=data, video=False, **options)
     return [replace(run, gap=(gap,)) for gap in ((SIM,) if kind == "offline" else args.gaps)]
 
 

@@ -19,15 +19,14 @@ def reserve(
     """
     share = {name: copies * size / devices for name, size in parts.items()}
     need, room = sum(share.values()) + shared, free_memory()
-    there = "" if room is None else f" of {_gib(room)} free"
+    free = "" if room is None else f" of {_gib(room)} free"
     data = {"data": shared} if shared else {}
     listed = ", ".join(f"{name} {_gib(size)}" for name, size in (share | data).items())
-    print(f"memory: {_gib(need)}{there} on each device ({listed})")
+    print(f"memory: {_gib(need)}{free} on each device ({listed})")
     if room is not None and need > room:
         option = max(share, key=share.__getitem__).replace("_", "-")
         raise UserError(
-            f"experience and batches take {_gib(need)}{there} on each device: "
-            f"lower --{settings}.{option} or train fewer"
+            f"experience and batches take {_gib(need)}{free} on each device: lower --{settings}.{option} or train fewer"
         )
 
 
@@ -36,8 +35,8 @@ def free_memory() -> int | None:
     if stats := jax.local_devices()[0].memory_stats():
         return stats["bytes_limit"] - stats["bytes_in_use"]
     table = Path("/proc/meminfo")
-    found = re.search(r"MemAvailable:\s+(\d+) kB", table.read_text()) if table.exists() else None
-    return int(found[1]) * 1024 if found else None
+    available = re.search(r"MemAvailable:\s+(\d+) kB", table.read_text()) if table.exists() else None
+    return int(available[1]) * 1024 if available else None
 
 
 def _gib(size: float) -> str:

@@ -142,17 +142,17 @@ def prior_folders(prior: Path | None, *, out: Path, task: str, preset: str, opti
         for name in ("seed-*", f"{ASIDE}seed-*")  # the latter where a writer was killed
         for card in home.glob(f"{sub}{name}/{CARD}")
     ]
-    found = {card.parent.with_name(card.parent.name.removeprefix(ASIDE)) for card in cards}
-    if not found and prior:
+    folders = {card.parent.with_name(card.parent.name.removeprefix(ASIDE)) for card in cards}
+    if not folders and prior:
         raise UserError(f"{option} {prior}: {'holds no prior' if prior.is_dir() else 'no such folder'}")
-    if not found and preset not in PRESETS:
+    if not folders and preset not in PRESETS:
         raise UserError(unknown("--preset", preset, PRESETS))
-    if not found:
+    if not folders:
         shipped = (SHIPPED / extend.name_of(task)).is_dir()
         other = f", or take --prior shipped:{extend.name_of(task)}, which comes with the code" if shipped else ""
         command = f"python -m experiments.pretrain --task {task} --preset {preset}"
         raise UserError(f"{home}: holds no prior; make one with: {command}{other}")
-    return sorted(found, key=_seed_number)
+    return sorted(folders, key=_seed_number)
 
 
 def check_prior(folder: Path, method: Online, task: str) -> None:

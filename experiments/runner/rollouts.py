@@ -38,11 +38,11 @@ def task_of(home: Path, task: str | None) -> str:
 
 def episodes_of(home: Path, seed: int | None) -> list[Played]:
     """The episodes of one seed of a run, or those of all; raises UserError for a seed that it does not have."""
-    found, first = real.played(home), read_config(home).get("seed", 0)
-    seeds = sorted({first + own.seed for own in found})
+    rollouts, first = real.played(home), read_config(home).get("seed", 0)
+    seeds = sorted({first + rollout.seed for rollout in rollouts})
     if seed is not None and seed not in seeds:
         raise UserError(f"--seed {seed}: {home} has the seeds {', '.join(map(str, seeds))}")
-    return [own._replace(seed=first + own.seed) for own in found if seed in (None, first + own.seed)]
+    return [rollout._replace(seed=first + rollout.seed) for rollout in rollouts if seed in (None, first + rollout.seed)]
 
 
 def check_sizes(home: Path, episodes: Sequence[Played], env: "Env") -> None:

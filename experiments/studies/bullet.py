@@ -117,9 +117,9 @@ def unfinished(args: BulletArgs) -> list[_Run]:
 
 def _arguments(args: BulletArgs, method: str, seed: int) -> FinetuneArgs:
     """What a run is, as `experiments.finetune` sees it."""
-    given = {name: getattr(args, name) for name in ("prior", "rollouts", "eval_at", "out")}
+    options = {name: getattr(args, name) for name in ("prior", "rollouts", "eval_at", "out")}
     played = {"task": TASK, "real": (REMOTE,), "seeds": 1, "seed": seed, "eval_episodes": args.episodes}
-    return finetune_args.arguments(method, **played, **given)
+    return finetune_args.arguments(method, **played, **options)
 
 
 def options(args: BulletArgs, run: _Run) -> list[object]:

@@ -22,13 +22,13 @@ def choose(lines: Lines, n: int) -> list[str]:
     each other, of several such gaps the first. Never chosen: SIM, a gap without a stratum, a gap that a policy trained
     there did not master. Raises UserError if fewer than n gaps are left.
     """
-    left = _by_stratum(lines)
-    if (most := sum(map(len, left.values()))) < n:
+    strata = _by_stratum(lines)
+    if (most := sum(map(len, strata.values()))) < n:
         raise UserError(f"--choose {n}: only {most} of the gaps may be chosen; draw more with --count")
-    counts = dict.fromkeys((family for names in left.values() for name in names for family in _of(lines, name)), 0)
+    counts = dict.fromkeys((family for names in strata.values() for name in names for family in _of(lines, name)), 0)
     chosen: set[str] = set()
     while len(chosen) < n:
-        for names in list(filter(None, left.values()))[: n - len(chosen)]:
+        for names in list(filter(None, strata.values()))[: n - len(chosen)]:
             best = min(names, key=lambda name: _spread(counts, _of(lines, name)))
             names.remove(best)
             chosen.add(best)

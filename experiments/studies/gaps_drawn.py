@@ -83,8 +83,8 @@ def _command(args: DrawArgs) -> str:
     """What draws and chooses the same gaps, where the same priors are."""
     families = [f"--distribution {args.distribution}"] if args.distribution else []
     flags = [f"--{name}" for name in ("plan", "judge") if getattr(args, name)]
-    given = [f"--task {args.task} --count {args.count} --seed {args.seed}", *families, *flags]
-    return f"python -m experiments.studies.gaps_draw {' '.join(given)} --choose {args.choose} --to {args.to}"
+    options = [f"--task {args.task} --count {args.count} --seed {args.seed}", *families, *flags]
+    return f"python -m experiments.studies.gaps_draw {' '.join(options)} --choose {args.choose} --to {args.to}"
 
 
 def write_gaps(path: Path, drawn: Sequence[Gap]) -> None:

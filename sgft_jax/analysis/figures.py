@@ -182,7 +182,7 @@ def pretraining(
 
 def diagnosis(
     path: Path,
-    found: Mapping[str, Any],
+    diagnosis: Mapping[str, Any],
     signs: Sequence[Sign],
     points: Mapping[str, tuple[np.ndarray, np.ndarray]],
     *,
@@ -190,14 +190,14 @@ def diagnosis(
 ) -> Path:
     """Panels: improvable states by horizon, V_sim against what happened, model error by horizon, signs of the gap.
 
-    found: see `examination.describe`. signs: see `verdict.signs`. points: ([n] V_sim, [n] returns) by "real" and
+    diagnosis: see `examination.describe`. signs: see `verdict.signs`. points: ([n] V_sim, [n] returns) by "real" and
     "simulated".
     """
     figure, (states, promise, model, kinds) = _figure(10.4, 6.6, 2, 4)
-    horizons = found["horizons"]
+    horizons = diagnosis["horizons"]
     for where, colour in (("simulated", _FAINT), ("real", PALETTE[0])):
         for name, dash in (("improvable", "-"), ("improving", ":")):
-            shares = [by_name[name] for by_name in found["value"][where]]
+            shares = [by_name[name] for by_name in diagnosis["value"][where]]
             states.plot(horizons, shares, dash, color=colour, linewidth=2, label=f"{name}, {where}", clip_on=False)
     states.set_ylim(-0.03, 1.03)
     _name(states, "states where the best action keeps / exceeds V_sim", "steps ahead")
@@ -210,7 +210,7 @@ def diagnosis(
     colours = {"simulated": _FAINT, "real": PALETTE[1], "identified": PALETTE[0]}
     words = {"simulated": "simulated", "real": "real", "identified": "real, identified"}
     for where, colour in colours.items():
-        error = found["model_error"][where]
+        error = diagnosis["model_error"][where]
         model.plot(horizons, error, color=colour, linewidth=2, marker="o", markersize=3, label=words[where])
     model.set_ylim(bottom=0)
     _name(model, "model error, standard deviations", "steps ahead")
@@ -259,15 +259,15 @@ def rollouts(path: Path, panels: Sequence[Panel], episodes: Mapping[str, float],
     return _save(figure, path)
 
 
-def effects(path: Path, found: Mapping[str, Mapping[str, Mapping[str, Interval]]], *, label: str) -> Path:
+def effects(path: Path, intervals: Mapping[str, Mapping[str, Mapping[str, Interval]]], *, label: str) -> Path:
     """A panel for each place: every effect as a dot with its interval, one colour for each measure.
 
-    found: by place, measure and name of the effect, see `factorial.effects`. label: of the x-axis.
+    intervals: by place, measure and name of the effect, see `factorial.effects`. label: of the x-axis.
     """
-    columns = min(len(found), 2)
-    rows = math.ceil(len(found) / columns)
-    figure, panels = _figure(5.2 * columns, 4.2 * rows + 0.2, columns, len(found))
-    for axes, (place, measures) in zip(panels, found.items(), strict=True):
+    columns = min(len(intervals), 2)
+    rows = math.ceil(len(intervals) / columns)
+    figure, panels = _figure(5.2 * columns, 4.2 * rows + 0.2, columns, len(intervals))
+    for axes, (place, measures) in zip(panels, intervals.items(), strict=True):
         for i, (measure, bands) in enumerate(measures.items()):
             heights = np.arange(len(bands)) + 0.22 * (i - (len(measures) - 1) / 2)
             estimate, low, high = (np.array([float(x) for x in bounds]) for bounds in zip(*bands.values(), strict=True))

@@ -46,18 +46,18 @@ class Inputs(NamedTuple):
     explained: Any
 
 
-def inputs_of(found: Mapping[str, Any]) -> Inputs:
+def inputs_of(diagnosis: Mapping[str, Any]) -> Inputs:
     """Of one diagnosis, see `examination.describe`.
 
     Success of n rollouts counts as (successes + p) / (n + 1), where p is 1 if rollouts return what V_sim promises and
     falls with their shortfall: after a few rollouts, how far they fall short says more than how many failed.
     """
-    n, ahead = found["rollouts"], found["horizons"].index(4)
-    likely = 1.0 / (1.0 + max(found["value"]["shortfall"], 0.0) / _SHORT)
-    real, identified = (found["model_error"][name][ahead] for name in ("real", "identified"))
+    n, ahead = diagnosis["rollouts"], diagnosis["horizons"].index(4)
+    likely = 1.0 / (1.0 + max(diagnosis["value"]["shortfall"], 0.0) / _SHORT)
+    real, identified = (diagnosis["model_error"][name][ahead] for name in ("real", "identified"))
     return Inputs(
-        success=(n * found["success"] + likely) / (n + 1),
-        improvable=found["value"]["real"][0]["improvable"],
+        success=(n * diagnosis["success"] + likely) / (n + 1),
+        improvable=diagnosis["value"]["real"][0]["improvable"],
         explained=float(np.clip(1.0 - identified / max(real, 1e-9), 0.0, 1.0)),
     )
 

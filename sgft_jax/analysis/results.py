@@ -8,12 +8,12 @@ from sgft_jax.analysis import figures, tables
 from sgft_jax.analysis.curves import Curve, Found, by_priors, from_main_priors
 
 
-def select(found: Found, *, variants: bool = True, **wanted: Sequence[str]) -> Found:
+def select(records: Found, *, variants: bool = True, **wanted: Sequence[str]) -> Found:
     """Only the curves of certain tasks, gaps, methods or priors: names by field of `Curve`, empty for all.
 
     Raises UserError if no curve has one of the names, or if nothing is left.
     """
-    curves = [curve for curve in found.curves if variants or not curve.variant]
+    curves = [curve for curve in records.curves if variants or not curve.variant]
     for field, names in wanted.items():
         known = sorted({getattr(curve, field) for curve in curves})
         if missing := [name for name in names if name not in known]:
@@ -21,24 +21,24 @@ def select(found: Found, *, variants: bool = True, **wanted: Sequence[str]) -> F
         curves = [curve for curve in curves if not names or getattr(curve, field) in names]
     if not curves:
         raise UserError(f"no run matches all of the chosen: {', '.join(name for name in wanted if wanted[name])}")
-    return Found(curves, found.notes)
+    return Found(curves, records.notes)
 
 
-def write_results(found: Found, target: Path, *, reference: str | None = None) -> Path:
+def write_results(records: Found, target: Path, *, reference: str | None = None) -> Path:
     """A figure and tables for each task and gap, and of all tasks for each gap; returns the path of tables.md.
 
     reference: METHOD or METHOD:VARIANT that the others are compared with, see `tables.summary`; UserError without it.
     """
-    if reference and reference not in (names := {curve.spec for curve in found.curves}):
+    if reference and reference not in (names := {curve.spec for curve in records.curves}):
         raise UserError(unknown("--reference", reference, names))
     sections = ["# Fine-tuning results", tables.LEGEND]
-    for gap in dict.fromkeys(curve.gap for curve in found.curves):
-        sections += _overview(gap, [curve for curve in found.curves if curve.gap == gap], target)
-    for task, gap in dict.fromkeys((curve.task, curve.gap) for curve in found.curves):
-        chosen = [curve for curve in found.curves if (curve.task, curve.gap) == (task, gap)]
+    for gap in dict.fromkeys(curve.gap for curve in records.curves):
+        sections += _overview(gap, [curve for curve in records.curves if curve.gap == gap], target)
+    for task, gap in dict.fromkeys((curve.task, curve.gap) for curve in records.curves):
+        chosen = [curve for curve in records.curves if (curve.task, curve.gap) == (task, gap)]
         sections += _section(f"{task} on the {gap} real system", chosen, target / f"{task}-{gap}.png", reference)
-    if found.notes:
-        sections.append("\n".join(["## Left out or unfinished", "", *(f"- {note}" for note in found.notes)]))
+    if records.notes:
+        sections.append("\n".join(["## Left out or unfinished", "", *(f"- {note}" for note in records.notes)]))
     path = target / "tables.md"
     path.write_text("\n\n".join(sections) + "\n")
     return path

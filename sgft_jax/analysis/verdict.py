@@ -38,18 +38,19 @@ class Sign(NamedTuple):
     words: str
 
 
-def signs(found: Mapping[str, Any], names: Names) -> list[Sign]:
+def signs(diagnosis: Mapping[str, Any], names: Names) -> list[Sign]:
     """All kinds of gap that a diagnosis looks for, of one `examination.describe`."""
-    known, late = _beyond_simulation(found["identified"]), found["delay"]
-    ahead = found["horizons"].index(4)
-    errors = {key: values[ahead] for key, values in found["model_error"].items()}
+    known, late = _beyond_simulation(diagnosis["identified"]), diagnosis["delay"]
+    ahead = diagnosis["horizons"].index(4)
+    errors = {key: values[ahead] for key, values in diagnosis["model_error"].items()}
     times = errors["identified"] / max(errors["simulated"], 1e-9)
-    sure = min(found["identified"]["nats"] / _NATS, 1.0) * min(prediction.inputs_of(found).explained / _EXPLAINED, 1.0)
+    explained = prediction.inputs_of(diagnosis).explained
+    sure = min(diagnosis["identified"]["nats"] / _NATS, 1.0) * min(explained / _EXPLAINED, 1.0)
     scales, biases = (dict(zip(names.action, known[key], strict=True)) for key in ("scale", "bias"))
     scale, bias = max(abs(math.log(x)) for x in scales.values()), max(map(abs, biases.values()))
     far, off, turned, share = _each(scales, "{:.2f}"), _each(biases, "{:+.2f}"), known["rotation"], late["share"]
     comes = f"{abs(share) * names.dt:.3f} s {'later' if share > 0 else 'earlier'}"
-    left = (
+    rest = (
         f"with all that identified, the models err {times:.1f} times as much as in simulation four steps ahead: "
         "something else differs, such as masses, friction, contacts or noise"
     )
@@ -63,8 +64,8 @@ def signs(found: Mapping[str, Any], names: Names) -> list[Sign]:
         Sign(
             "delay", min(late["nats"] / _NATS, 1.0) * abs(share) / _DELAY, f"commands come {comes} than in simulation"
         ),
-        _noise(found["noise"], names),
-        Sign("what is left", times / _MODELS, left),
+        _noise(diagnosis["noise"], names),
+        Sign("what is left", times / _MODELS, rest),
     ]
 
 
@@ -96,8 +97,8 @@ def _sensor_error(offsets: Sequence[float], names: Names) -> Sign:
     return Sign("sensor error", max(sizes, default=0.0) / _ERROR, f"sensors are off: {', '.join(wrong)}")
 
 
-def _noise(found: Mapping[str, Sequence[float]], names: Names) -> Sign:
-    sensors = zip(found["real"], found["simulated"], names.sensors, strict=True)
+def _noise(diagnosis: Mapping[str, Sequence[float]], names: Names) -> Sign:
+    sensors = zip(diagnosis["real"], diagnosis["simulated"], names.sensors, strict=True)
     times, real, usual, (name, unit) = max((x / max(usual, 1e-9), x, usual, sensor) for x, usual, sensor in sensors)
     words = f"noise of {name} is {_measure(real, unit, '')}, {_measure(usual, unit, '')} in simulation"
     return Sign("noise", times / _NOISE, words)
@@ -116,18 +117,18 @@ def _measure(value: float, unit: str, sign: str = "+") -> str:
     return f"{1000 * value:{sign}.1f} mm" if unit == "m" else f"{value:{sign}.3g} {unit}".rstrip()
 
 
-def verdict(found: Mapping[str, Any], names: Names, c: Coefficients = COEFFICIENTS) -> list[str]:
+def verdict(diagnosis: Mapping[str, Any], names: Names, c: Coefficients = COEFFICIENTS) -> list[str]:
     """What kind of gap it looks like, whether fine-tuning helps, which horizon, how many rollouts: a line for each.
 
-    found: see `examination.describe`. c: of the prediction.
+    diagnosis: see `examination.describe`. c: of the prediction.
     """
-    x = prediction.inputs_of(found)
-    kind, worth = _kind(signs(found, names)), _worth(found["success"], x, c)
-    return [kind, _guide(found["value"]), worth, _horizon(found), _how_long(x, c)]
+    x = prediction.inputs_of(diagnosis)
+    kind, worth = _kind(signs(diagnosis, names)), _worth(diagnosis["success"], x, c)
+    return [kind, _guide(diagnosis["value"]), worth, _horizon(diagnosis), _how_long(x, c)]
 
 
-def _kind(found: Sequence[Sign]) -> str:
-    counted = sorted((sign for sign in found if sign.strength >= 1.0), key=lambda sign: -sign.strength)
+def _kind(signs_of_gap: Sequence[Sign]) -> str:
+    counted = sorted((sign for sign in signs_of_gap if sign.strength >= 1.0), key=lambda sign: -sign.strength)
     if not counted:
         return "gap: nothing stands out against simulation"
     return f"gap: {', '.join(sign.name for sign in counted)}. In words: {'; '.join(sign.words for sign in counted)}"
@@ -156,15 +157,15 @@ def _worth(success: float, x: Inputs, c: Coefficients) -> str:
     return f"fine-tuning: little hope ({words}); a simulator with what differs, see above, helps more"
 
 
-def _horizon(found: Mapping[str, Any]) -> str:
-    shares = [states["improvable"] for states in found["value"]["real"]]
-    enough = [h for h, share in zip(found["horizons"], shares, strict=True) if share >= _IMPROVABLE]
+def _horizon(diagnosis: Mapping[str, Any]) -> str:
+    shares = [states["improvable"] for states in diagnosis["value"]["real"]]
+    enough = [h for h, share in zip(diagnosis["horizons"], shares, strict=True) if share >= _IMPROVABLE]
     if enough:
-        share = shares[found["horizons"].index(enough[0])]
+        share = shares[diagnosis["horizons"].index(enough[0])]
         return f"horizon of SGFT: H = {enough[0]} is enough, {100 * share:.0f} % of the states are improvable with it"
     best = max(range(len(shares)), key=shares.__getitem__)
     return (
-        f"horizon of SGFT: H = {found['horizons'][best]}, with which {100 * shares[best]:.0f} % of the states are "
+        f"horizon of SGFT: H = {diagnosis['horizons'][best]}, with which {100 * shares[best]:.0f} % of the states are "
         "improvable; no horizon up to 8 suffices, so methods without V_sim (guarded, sac, mbpo) may do better"
     )
 

@@ -130,5 +130,5 @@ def _fit(
     starts = starts.at[:, 0].set(jnp.array(_STARTS)) if turns else starts
     change = (rows.next_obs - rows.obs)[:, : spread.shape[0]]
     guessed = range(n, n + len(wrong))
-    found = most_probable(missed, starts, belief, change, held, spread, bound=bound, guessed=guessed)
-    return described(found.point), found.evidence
+    estimate = most_probable(missed, starts, belief, change, held, spread, bound=bound, guessed=guessed)
+    return described(estimate.point), estimate.evidence

@@ -32,8 +32,8 @@ def student_cost(missed: Array, held: Array, scale: Array) -> Array:
     Constants are left out.
     """
     square = jnp.sum((missed / scale[None]) ** 2, axis=1)
-    each = 0.5 * (_DEGREES + missed.shape[1]) * jnp.log1p(square / _DEGREES)
-    return jnp.sum(jnp.where(held, each, 0.0))
+    losses = 0.5 * (_DEGREES + missed.shape[1]) * jnp.log1p(square / _DEGREES)
+    return jnp.sum(jnp.where(held, losses, 0.0))
 
 
 def spread_of(missed: Array, change: Array, held: Array) -> Array:

@@ -60,8 +60,8 @@ def most_probable_system(predict: Predict, rows: Transition, held: Array, spread
     def missed(system: Array) -> Array:
         return residuals(predict, rows, system)
 
-    found = most_probable(missed, starts, jnp.full(size, _BELIEF), change, held, spread, bound=1.0)
-    return Estimate(found.point, jnp.zeros(size))
+    estimate = most_probable(missed, starts, jnp.full(size, _BELIEF), change, held, spread, bound=1.0)
+    return Estimate(estimate.point, jnp.zeros(size))
 
 
 def dropo(predict: Predict, rows: Transition, held: Array, spread: Array, size: int) -> Estimate:

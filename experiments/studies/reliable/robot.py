@@ -75,9 +75,9 @@ def main() -> None:
     for name, kind in (("url", str), ("token", str), ("period", float), ("folder", Path)):
         parser.add_argument(name, type=kind)
     parser.add_argument("sizes", type=int, nargs=2)
-    given = parser.parse_args()
-    rail, log = Rail(given.folder / "ledger.txt", tuple(given.sizes)), given.folder / "commands.log"
-    robot_client.play(rail, given.url, token=given.token, period=given.period, log=log, retry=0.1)
+    args = parser.parse_args()
+    rail, log = Rail(args.folder / "ledger.txt", tuple(args.sizes)), args.folder / "commands.log"
+    robot_client.play(rail, args.url, token=args.token, period=args.period, log=log, retry=0.1)
 
 
 if __name__ == "__main__":

@@ -65,15 +65,15 @@ class Trial:
 
     def start_robot(self) -> None:
         """The robot's process; it waits for the learner."""
-        given = [f"ws://127.0.0.1:{self.via}", token(self.out), self.period, self.home, *self.sizes]
-        command = ["experiments.studies.reliable.robot", *map(str, given)]
+        words = [f"ws://127.0.0.1:{self.via}", token(self.out), self.period, self.home, *self.sizes]
+        command = ["experiments.studies.reliable.robot", *map(str, words)]
         self.robot = self._run(command, "robot.txt")
 
     def start_player(self) -> None:
         """The command of a user; it goes on if there is something to go on with."""
-        given = ["--task", self.task, "--real", f"remote::{self.port}", "--rollouts", str(self.rollouts)]
-        given += ["--out", str(self.out), *self.more, *(["--resume"] if self.folder.exists() else [])]
-        self.player = self._run(["experiments.finetune", *_OPTIONS.split(), *given], "player.txt")
+        options = ["--task", self.task, "--real", f"remote::{self.port}", "--rollouts", str(self.rollouts)]
+        options += ["--out", str(self.out), *self.more, *(["--resume"] if self.folder.exists() else [])]
+        self.player = self._run(["experiments.finetune", *_OPTIONS.split(), *options], "player.txt")
 
     def learner(self) -> int | None:
         """The process id of the learner's process, None while there is none."""
