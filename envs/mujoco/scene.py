@@ -121,9 +121,9 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
     except UserError as error:
         raise UserError(f"scene {scene.name}: {error}") from None
     settled = scene.settled
-
-    def observe(params: Array, state: PhysicsState) -> Array:
-        return pack(scene.observation, scene.observe(params, state))
+    if not host.nsensordata:
+        engine = engine._replace(sense=lambda fields, state: state)
+    begin = functools.partial(_begin, scene, engine)
 
     def make_worlds(theta: Theta) -> World:
         rows = np.asarray(theta.params, np.float64)
@@ -142,54 +142,11 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
         state = settled(world.theta.params, obs - drawn.obs_bias)
         return begin(world, state, drawn, key_noise)._replace(obs=obs)
 
-    def begin(world: World, state: PhysicsState, episode: Effects, key_noise: Key) -> EnvState:
-        if host.nsensordata:
-            state = engine.sense(world.model, state)
-        true_obs = observe(world.theta.params, state)
-        no = jnp.zeros((), bool)
-        return EnvState(
-            physics=state,
-            obs=env_effects.measure(episode, true_obs, key_noise),
-            true_obs=true_obs,
-            reward=jnp.zeros((), jnp.float32),
-            terminated=no,
-            truncated=no,
-            success=no,
-            invalid=no,
-            time=jnp.zeros((), jnp.int32),
-            effects=episode,
-        )
-
-    def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
-        key_latency, key_noise, key_action = jax.random.split(key, 3)
-        params, episode, before = world.theta.params, state.effects, state.physics
-        command = env_effects.shake(episode, env_effects.distort(episode, action), key_action)
-        target = scene.motors(params, before.ctrl, scene.target(before.qpos, command))
-        dt = scene.control_dt / scene.substeps
-        control = env_effects.ramp(episode, before.ctrl, target, key_latency, dt=dt, duration=scene.ramp)
-        controls = jax.vmap(control)(jnp.arange(scene.substeps))
-        after = scene.event(params, engine.advance(world.model, before, controls))
-        true_obs = observe(params, after)
-        reward, terminated, now = _outcome(scene, params, state, action, after, true_obs)
-        time = state.time + 1
-        return EnvState(
-            physics=after,
-            obs=env_effects.measure(episode, true_obs, key_noise),
-            true_obs=true_obs,
-            reward=reward,
-            terminated=terminated,
-            truncated=time >= scene.episode_length,
-            success=state.success | now if scene.success_anytime else now,
-            invalid=physics.exploded(after, max_speed=scene.max_speed),
-            time=time,
-            effects=episode,
-        )
-
     env = Env(
         **{name: getattr(scene, name) for name in Env._fields if name in Scene._fields},
         make_worlds=make_worlds,
         reset=reset,
-        step=step,
+        step=functools.partial(_step, scene, engine),
         restore=None if settled is None else functools.partial(restore, settled),
         trace=lambda state: state.qpos,
         impl=impl,
@@ -197,6 +154,54 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
     )
     check_effects(env)
     return env
+
+
+def _begin(
+    scene: Scene, engine: Engine, world: World, state: PhysicsState, episode: Effects, key_noise: Key
+) -> EnvState:
+    """The first state of an episode."""
+    state = engine.sense(world.model, state)
+    true_obs = pack(scene.observation, scene.observe(world.theta.params, state))
+    no = jnp.zeros((), bool)
+    return EnvState(
+        physics=state,
+        obs=env_effects.measure(episode, true_obs, key_noise),
+        true_obs=true_obs,
+        reward=jnp.zeros((), jnp.float32),
+        terminated=no,
+        truncated=no,
+        success=no,
+        invalid=no,
+        time=jnp.zeros((), jnp.int32),
+        effects=episode,
+    )
+
+
+def _step(scene: Scene, engine: Engine, world: World, state: EnvState, action: Array, key: Key) -> EnvState:
+    """One control step."""
+    key_latency, key_noise, key_action = jax.random.split(key, 3)
+    params, episode, before = world.theta.params, state.effects, state.physics
+    command = env_effects.shake(episode, env_effects.distort(episode, action), key_action)
+    target = scene.motors(params, before.ctrl, scene.target(before.qpos, command))
+    dt = scene.control_dt / scene.substeps
+    control = env_effects.ramp(episode, before.ctrl, target, key_latency, dt=dt, duration=scene.ramp)
+    controls = jax.vmap(control)(jnp.arange(scene.substeps))
+    after = scene.event(params, engine.advance(world.model, before, controls))
+    true_obs = pack(scene.observation, scene.observe(params, after))
+    reward, terminated, now = _outcome(scene, params, state, action, after, true_obs)
+    time = state.time + 1
+    return EnvState(
+        physics=after,
+        obs=env_effects.measure(episode, true_obs, key_noise),
+        true_obs=true_obs,
+        reward=reward,
+        terminated=terminated,
+        truncated=time >= scene.episode_length,
+        success=state.success | now if scene.success_anytime else now,
+        invalid=physics.exploded(after, max_speed=scene.max_speed),
+        time=time,
+        effects=episode,
+    )
 
 
 def _outcome(
