@@ -156,7 +156,10 @@ def test_the_distributions_of_the_tasks_lie_within_the_bounds_and_reach_beyond_t
 @pytest.mark.parametrize("task", SHIPPED)
 def test_drawn_sensors_and_delays_are_possible_and_no_better_than_simulated(task):
     env = envs.make(task, "c")
-    rms = lambda noise, share: noise * share**0.5  # noqa: E731
+
+    def rms(noise, share):
+        return noise * share**0.5
+
     simulated = rms(env.training["obs_noise"], env.training["obs_noise_prob"])
     drawn = [gap.effects for gap in gap_distribution.draw(env, gap_distribution.load(env), 1, 60)]
     sensing = [effects for effects in drawn if {"obs_noise", "obs_noise_prob", "obs_bias"} & set(effects)]

@@ -31,7 +31,10 @@ def test_the_last_actions_end_the_observation_newest_first(seen, key):
 def test_the_task_is_the_same(seen, key):
     """Same world, start and noise; a policy that ignores the actions earns the same."""
     pool = envs.sample_worlds(TOY, key, 2)
-    steer = lambda carry, obs, key: (jnp.tanh(-obs[: TOY.act_dim]), carry)  # noqa: E731
+
+    def steer(carry, obs, key):
+        return jnp.tanh(-obs[: TOY.act_dim]), carry
+
     plain, wrapped = (play_episode(env, pool, steer, (), key, gamma=0.9) for env in (TOY, seen))
     np.testing.assert_array_equal(plain.transitions.obs, wrapped.transitions.obs[:, : TOY.obs_dim])
     np.testing.assert_array_equal(plain.transitions.reward, wrapped.transitions.reward)

@@ -17,11 +17,14 @@ from envs.types import UserError
 N = 64
 
 
+def push(carry, obs, key):
+    return -obs[:2], carry
+
+
 def test_an_episode_in_a_stacked_pool_is_that_in_the_pool_alone(key):
     env = toy.make()
     stacked = jax.tree.map(lambda x: x.reshape(2, 5, *x.shape[1:]), envs.sample_worlds(env, key, 10))
     assert pool_size(stacked) == 5
-    push = lambda carry, obs, key: (-obs[:2], carry)  # noqa: E731
     play = functools.partial(play_episode, env, act=push, carry=(), gamma=1.0, length=2)
 
     @jax.jit
@@ -72,7 +75,10 @@ def test_return_and_score_count_up_to_the_end(episodes):
 def test_what_is_judged_by_success_scores_success(key):
     env = toy.make()
     pool = envs.sample_worlds(env, key, 1, effects={"obs_noise": 0.0})
-    brake = lambda carry, obs, key: (jnp.clip(-3 * obs[:2] - obs[2:], -1, 1), carry)  # noqa: E731
+
+    def brake(carry, obs, key):
+        return jnp.clip(-3 * obs[:2] - obs[2:], -1, 1), carry
+
     played = jax.vmap(lambda key: play_episode(env, pool, brake, (), key, gamma=1.0))(jax.random.split(key, 8))
     assert played.success.any()
     np.testing.assert_array_equal(played.score, played.success.astype(jnp.float32))
@@ -82,7 +88,11 @@ def test_what_is_judged_by_success_scores_success(key):
 def test_an_explosion_after_the_end_is_none(key):
     """The simulator goes on unseen after a termination; what it does then does not count."""
     env = toy_terminating.make()
-    step = lambda *given: (after := env.step(*given))._replace(invalid=after.time > 1)  # noqa: E731
+
+    def step(*inputs):
+        after = env.step(*inputs)
+        return after._replace(invalid=after.time > 1)
+
     late = env._replace(step=step)
     for risk, exploded in ((1.0, False), (0.0, True)):
         pool = envs.sample_worlds(env, key, 1, params={"risk": risk})
@@ -153,7 +163,9 @@ def test_no_key_is_used_twice_by_fleets_and_episodes(key):
     """Worlds, starts, steps, measurements and resets draw apart, in several steps and in several environments."""
     env = toy.make()
     pool = envs.sample_worlds(env, key, 3)
-    act = lambda carry, obs, key: (jax.random.normal(key, (2,)), carry)  # noqa: E731
+
+    def act(carry, obs, key):
+        return jax.random.normal(key, (2,)), carry
 
     def whole(key):
         key_launch, key_steps, key_episodes = jax.random.split(key, 3)
@@ -178,12 +190,11 @@ def test_exploded_environments_of_a_fleet_begin_anew():
         after = env.step(world, state, action, key)
         return after._replace(invalid=(action[0] > 0) | state.invalid)
 
-    fleet = launch(env, pool, jax.random.key(1), 4, jnp.int32(0))
+    begun = jnp.int32(0)
+    fleet = launch(env, pool, jax.random.key(1), 4, begun)
+    advance = functools.partial(step_fleet, env._replace(step=step), pool, initial_carry=begun, gamma=0.9)
     for actions in ([-1.0, 1.0, -1.0, -1.0], [-1.0, -1.0, -1.0, 1.0]):
-        fleet, rows, valid, _ = step_fleet(
-            env._replace(step=step), pool, fleet, jnp.array(actions)[:, None], fleet.carry + 1, jax.random.key(2),
-            initial_carry=jnp.int32(0), gamma=0.9,
-        )  # fmt: skip
+        fleet, rows, valid, _ = advance(fleet, jnp.array(actions)[:, None], fleet.carry + 1, jax.random.key(2))
         np.testing.assert_array_equal(valid, np.array(actions) < 0)
         np.testing.assert_allclose(rows.reward, np.where(valid, 1 + fleet.state.obs[:, 0], 0), rtol=1e-6)
     for ages in (fleet.state.time, fleet.carry):

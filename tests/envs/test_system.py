@@ -53,7 +53,10 @@ def test_what_an_episode_draws_is_told(key):
 
 def test_a_real_system_tells_the_middle_and_is_the_same_otherwise(key):
     pool = envs.sample_worlds(SEEN, key, 2, effects=EFFECTS)
-    steer = lambda carry, obs, key: (jnp.tanh(-obs[:2]), carry)  # noqa: E731
+
+    def steer(carry, obs, key):
+        return jnp.tanh(-obs[:2]), carry
+
     open_, silent = (play_episode(env, pool, steer, (), key, gamma=0.9) for env in (SEEN, concealed(SEEN)))
     np.testing.assert_array_equal(silent.transitions.next_obs[:, -3:], 0.0)
     np.testing.assert_array_equal(open_.transitions.obs[:, :-3], silent.transitions.obs[:, :-3])

@@ -42,7 +42,7 @@ def test_memory_is_that_of_the_compiled_program():
 
 SMALL = BenchmarkConfig(
     tasks=("hammer",), worlds=(2,), impls=("c",), control_steps=2, repeats=1, width=8, batches=(4,), updates=2
-)  # fmt: skip
+)
 
 
 @pytest.mark.slow
@@ -121,7 +121,10 @@ def _window():
             data.ctrl[:] = ctrl
             physics.mujoco.mj_step(host, data, 3)
         ends.append(data.qpos.copy())
-    two = lambda x: jnp.broadcast_to(jnp.asarray(x, jnp.float32), (2, len(x)))  # noqa: E731
+
+    def two(x):
+        return jnp.broadcast_to(jnp.asarray(x, jnp.float32), (2, len(x)))
+
     start = PhysicsState(two(arm), two(np.zeros(host.nv)), two(np.zeros(host.nv)), two(arm[: host.nu]), two([]))
     return host, physics.Window(start, jnp.asarray(commands, jnp.float32)), np.stack(ends)
 
@@ -196,9 +199,8 @@ def test_devices_get_their_shares_and_are_compared_with_as_many_times_one(monkey
     found = training.weak_scaling("push", "c", (4, 1, 2), **size)
     assert [line["env/ideal"] for line in found] == pytest.approx([1.0, 0.9, 0.75])
     assert [line["ideal_per_s"] for line in found] == pytest.approx([100.0, 200.0, 400.0])
-    assert [(args.config.n_envs, args.config.batch_size, args.config.env_steps) for args in asked] == [
-        (256, 128, 2560), (64, 32, 640), (128, 64, 1280),
-    ]  # fmt: skip
+    sizes = [(args.config.n_envs, args.config.batch_size, args.config.env_steps) for args in asked]
+    assert sizes == [(256, 128, 2560), (64, 32, 640), (128, 64, 1280)]
     assert asked[2].config.replay_capacity == 2 * training.PRESETS["cpu"].replay_capacity
 
 

@@ -185,9 +185,8 @@ def test_all_methods_meet_the_same_starts():
 
 def steps_of(episodes):
     """What the policy remembered at each valid step, episode by episode."""
-    action, valid = np.asarray(episodes.transitions.action[..., 0]), np.asarray(episodes.valid)
-    return [np.round(a[v] / NUMBER).tolist() for a, v in zip(action.reshape(-1, LENGTH), valid.reshape(-1, LENGTH),
-                                                             strict=True)]  # fmt: skip
+    action, valid = (np.asarray(x).reshape(-1, LENGTH) for x in (episodes.transitions.action[..., 0], episodes.valid))
+    return [np.round(a[v] / NUMBER).tolist() for a, v in zip(action, valid, strict=True)]
 
 
 def test_the_carry_is_threaded_and_begins_anew_with_each_episode():

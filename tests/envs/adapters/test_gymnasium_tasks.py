@@ -29,9 +29,14 @@ def played(env, gap, seeds, actions):
     """The episodes [n] of seeds with given actions [T, act_dim], by the project's own loop."""
     pool = jax.tree.map(lambda x: x[0], real_worlds(env, [gap], jax.random.key(0)))
     given = jnp.asarray(actions)
-    act = lambda step, obs, key: (given[step], step + 1)  # noqa: E731
-    one = lambda seed: play_episode(env, pool, act, jnp.int32(0), jax.random.key(seed), gamma=1.0)  # noqa: E731
-    return jax.jit(jax.vmap(one))(jnp.asarray(seeds, jnp.uint32))
+
+    def act(step, obs, key):
+        return given[step], step + 1
+
+    def play(seed):
+        return play_episode(env, pool, act, jnp.int32(0), jax.random.key(seed), gamma=1.0)
+
+    return jax.jit(jax.vmap(play))(jnp.asarray(seeds, jnp.uint32))
 
 
 def steps(env, seed, actions):

@@ -254,7 +254,10 @@ def test_a_hand_without_fingers_that_close_lifts_nothing(rig):
 
 def test_a_hammer_that_keeps_pushing_does_not_pull_the_nail_out(rig):
     """The block stops it, the grip slips."""
-    push = lambda obs: strike(obs) if obs[24] < 0.02 else [0.0, 1.0, 0.0, CLOSE]  # noqa: E731
+
+    def push(obs):
+        return strike(obs) if obs[24] < 0.02 else [0.0, 1.0, 0.0, CLOSE]
+
     for seed in range(3):
         _, done, obs = played(rig, jax.random.key(seed), push)
         assert done[-1] and obs[:, 24].max() < 0.115

@@ -72,7 +72,9 @@ def test_rewards_by_hand(tip, cube, mark, wanted):
 
 
 def test_success_is_less_than_five_centimetres_in_space():
-    at = lambda *cube: bool(panda_push.success(seen((0, 0, 0), cube, (0.1, 0.0, 0.02))))  # noqa: E731
+    def at(*cube):
+        return bool(panda_push.success(seen((0, 0, 0), cube, (0.1, 0.0, 0.02))))
+
     assert at(0.051, 0.0, 0.02) and not at(0.049, 0.0, 0.02)
     assert not at(0.1, 0.0, 0.08)  # above the mark
 

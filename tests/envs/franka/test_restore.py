@@ -72,7 +72,10 @@ def test_one_rollout_of_push_tells_scale_and_rotation():
     env = with_system(env, system)
     true = {"action_scale": 0.7, "action_rotation": 0.3, "obs_noise": 0.001}
     pool = envs.sample_worlds(env, jax.random.key(0), 1, effects=true)
-    wander = lambda carry, obs, key: (jax.random.uniform(key, (2,), minval=-1.0), carry)  # noqa: E731
+
+    def wander(carry, obs, key):
+        return jax.random.uniform(key, (2,), minval=-1.0), carry
+
     play = jax.jit(lambda key: play_episode(concealed(env), pool, wander, (), key, gamma=0.99, length=20))
     rows, valid = play(jax.random.key(1))[:2]
     ask, spread = env.simulator(), jnp.full(4, 0.001)

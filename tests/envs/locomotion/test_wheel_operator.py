@@ -30,8 +30,13 @@ def test_the_gain_is_that_of_the_riccati_equation():
 def test_the_aim_moves_and_noise_has_the_spread_that_it_says(key):
     """After 5 s at 0.2 m/s the aim is 1 m ahead; over many starts wander and shake have their stationary spread."""
     policy = operator(0.2)
-    step = lambda carry, key: (policy.act(jnp.zeros(4), carry, jnp.zeros(4), key, explore=True)[1], None)  # noqa: E731
-    play = lambda start, key: jax.lax.scan(step, start, jax.random.split(key, 1000))[0]  # noqa: E731
+
+    def step(carry, key):
+        return policy.act(jnp.zeros(4), carry, jnp.zeros(4), key, explore=True)[1], None
+
+    def play(start, key):
+        return jax.lax.scan(step, start, jax.random.split(key, 1000))[0]
+
     draw = np.random.default_rng(0).normal(size=(2, 400))
     start = Hand(jnp.zeros(400), 0.2 * jnp.asarray(draw[0], jnp.float32), 0.65 * jnp.asarray(draw[1], jnp.float32))
     end = jax.jit(jax.vmap(play))(start, jax.random.split(key, 400))

@@ -52,7 +52,10 @@ def test_steps_are_those_of_mujoco_in_each_world(rig):
 def test_any_batching_gives_the_same(rig):
     """Up to the rounding of what XLA computes between the steps."""
     _, env, _, worlds, starts, actions = rig
-    play = lambda *x: episode(env, *x).physics.qpos  # noqa: E731
+
+    def play(*x):
+        return episode(env, *x).physics.qpos
+
     alone = jnp.stack([jax.jit(play)(member(worlds, i), member(starts, i), actions[i]) for i in range(N)])
     twice = jax.tree.map(lambda x: jnp.stack([x, x[::-1]]), (worlds, starts, actions))
     nested = jax.jit(jax.vmap(jax.vmap(play)))(*twice)
