@@ -239,8 +239,8 @@ class _Run(Training):
         if initial is None:
             before = evaluate(self.finetuner, states=jax.jit(self.begin)().agent, episodes=n)
         else:
-            own = finetuning.priors_of_members(self.setup.priors, self.seeds)
-            before = evaluate(initial, states=own, episodes=n)
+            priors = finetuning.priors_of_members(self.setup.priors, self.seeds)
+            before = evaluate(initial, states=priors, episodes=n)
         return [before, evaluate(self.finetuner, states=progress.agent, episodes=n)]
 
 
@@ -250,9 +250,7 @@ _OF_MEMBERS = ("agent", "best", "transitions")  # of a state, what has an axis o
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def _part(progress: FinetuneProgress, i: int, n: int) -> FinetuneProgress:
     """The members of the i-th real system."""
-    own = functools.partial(part, i=i, n=n)
-    members = {name: own(getattr(progress, name)) for name in _OF_MEMBERS}
-    return progress._replace(**members)
+    return progress._replace(**{name: part(getattr(progress, name), i, n) for name in _OF_MEMBERS})
 
 
 @jax.jit
