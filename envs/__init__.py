@@ -40,11 +40,9 @@ _LAZY = {
     **dict.fromkeys(("sample_worlds", "uniform"), "envs.domains.uniform"),
 }
 
-__all__ = [
-    "TASKS", "Domain", "EffectRange", "Effects", "Entry", "Env", "EnvState", "Episode", "Fleet", "Gap", "Parameter",
-    "Theta", "World", "effects", "gaps", "launch", "make", "name_of", "packed", "play_episode", "rollout",
-    "sample_worlds", "scene", "step_fleet", "uniform", "unpack",
-]  # fmt: skip
+__all__ = ["TASKS", "Domain", "Entry", "Env", "EnvState", "Parameter", "make", "name_of", "packed", "scene", "unpack"]
+__all__ += ["EffectRange", "Effects", "Gap", "Theta", "World", "effects", "gaps", "sample_worlds", "uniform"]
+__all__ += ["Episode", "Fleet", "launch", "play_episode", "rollout", "step_fleet"]
 
 
 def __getattr__(name: str) -> Any:

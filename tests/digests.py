@@ -15,6 +15,7 @@ not notice two arrays of a result that change places.
 import argparse
 import functools
 import hashlib
+import importlib
 import itertools
 import json
 import os
@@ -33,7 +34,7 @@ for variable in [name for name in os.environ if name.startswith(("JAX_", "XLA_")
     del os.environ[variable]
 os.environ["JAX_PLATFORMS"] = "cpu"
 
-import conftest  # noqa: F401, I001 - XLA's flags, before JAX starts
+importlib.import_module("conftest")  # XLA's flags, before JAX starts
 
 import jax
 import jax.numpy as jnp
@@ -43,10 +44,10 @@ import numpy as np
 # Helpers of the tests
 import probes
 import test_hybrid_training as hybrid_tests
+import test_pretraining as pretraining_tests
 import toy
 import toy_terminating
 import tuners
-import test_pretraining as pretraining_tests
 
 # The project
 from envs import gaps
@@ -149,7 +150,9 @@ def planner_mppi():
 
     @functools.partial(jax.jit, static_argnames="explore")
     def act(previous, obs, key, *, explore):
-        score = lambda sequence: -jnp.abs(jnp.square(sequence - 0.1 * obs) - 0.25).sum()  # noqa: E731
+        def score(sequence):
+            return -jnp.abs(jnp.square(sequence - 0.1 * obs) - 0.25).sum()
+
         return mppi.plan(config, hyper, score, proposals, previous, key, explore=explore)
 
     return played(act, jnp.zeros((3, 2)))

@@ -37,7 +37,10 @@ def _run(program: Any, args: Sequence[Late], uses: Uses) -> list[Late]:
     jaxpr = getattr(program, "jaxpr", program)
     known = dict(zip(jaxpr.invars, args, strict=True))
     known |= {var: (lambda x=x: x) for var, x in zip(jaxpr.constvars, getattr(program, "consts", ()), strict=True)}
-    value = lambda var: (lambda: var.val) if isinstance(var, core.Literal) else known[var]  # noqa: E731
+
+    def value(var: Any) -> Late:
+        return (lambda: var.val) if isinstance(var, core.Literal) else known[var]
+
     for eqn in jaxpr.eqns:
         known |= zip(eqn.outvars, _results(eqn, [value(var) for var in eqn.invars], uses), strict=True)
     return [value(var) for var in jaxpr.outvars]
@@ -69,7 +72,10 @@ def _results(eqn: Any, args: list[Late], uses: Uses) -> Sequence[Late]:
 
 def _scan(eqn: Any, args: list[Late], uses: Uses) -> list[Late]:
     body, length, backwards = eqn.params["jaxpr"], eqn.params["length"], eqn.params["reverse"]
-    shorter = lambda whole, one: sum(a.aval.shape != b.aval.shape for a, b in zip(whole, one, strict=True))  # noqa: E731
+
+    def shorter(whole: Sequence[Any], one: Sequence[Any]) -> int:
+        return sum(a.aval.shape != b.aval.shape for a, b in zip(whole, one, strict=True))
+
     rows_out, rows_in = shorter(eqn.outvars, body.jaxpr.outvars), shorter(eqn.invars, body.jaxpr.invars)
     m = len(eqn.outvars) - rows_out
     n = len(args) - rows_in - m

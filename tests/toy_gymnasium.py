@@ -1,5 +1,7 @@
 """The point mass as a Gymnasium environment that counts its episodes and may break off: `toy_gymnasium:Turned-v0`."""
 
+from typing import ClassVar
+
 import gymnasium
 import toy
 
@@ -17,7 +19,7 @@ class BrokenError(BaseException):
 class Turned(gymnasium.Wrapper):
     """seeds: of all episodes since a test cleared the list. breaks: after how many more steps, None for never."""
 
-    seeds: list[int] = []  # noqa: RUF012 - all environments of a test share it
+    seeds: ClassVar[list[int]] = []  # all environments of a test share it
     breaks: int | None = None
 
     def __init__(self, rotation=None):

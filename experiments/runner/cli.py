@@ -30,11 +30,10 @@ from envs.types import UserError, unknown
 
 BROKEN_PIPE, USER_ERROR = 1, 2
 _SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
-_FULL = [os.strerror(number) for number in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)]  # "No space left on device"
-_ON_DISK = (
-    errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM, errno.EEXIST, errno.ENOTDIR, errno.EISDIR,
-    errno.ENAMETOOLONG, errno.EFBIG, errno.ELOOP, errno.EIO, errno.EMFILE, errno.ENFILE,
-)  # fmt: skip
+_NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_FULL = [os.strerror(number) for number in _NO_SPACE]  # "No space left on device"
+_BAD_PATH = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP)
+_ON_DISK = (*_NO_SPACE, *_BAD_PATH, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.EMFILE, errno.ENFILE)
 _CACHE_VARIABLE = "SGFT_CACHE_DIR"
 _RENDER_PROBE = "import mujoco; c = mujoco.GLContext(16, 16); c.make_current(); c.free()"
 

@@ -29,9 +29,8 @@ from sgft_jax.types import Online
 
 NO_PRIOR = Path("none")
 # May differ when a run goes on; what is in the data may not.
-VOLATILE = (
-    "resume", "overwrite", "rollouts", "devices", "video", "out", "tuned", "real_data", "successors", "sync_every",
-)  # fmt: skip
+_PLACES = ("out", "tuned", "real_data", "successors")
+VOLATILE = ("resume", "overwrite", "rollouts", "devices", "video", *_PLACES, "sync_every")
 _EVALUATION_EPISODES = 50
 
 

@@ -155,10 +155,9 @@ class _Run(Training):
         done = self.done(progress) if progress else 0
         stores = [record.real for record in self.records]
         recorded = RecordedSystem(self.system, stores, done=done, sync_every=self.sync_every)
-        steps = finetuning.finetune(
-            *self.setup._replace(system=recorded), rollouts=self.args.rollouts, progress=progress, learner=self.learner,
-            waits=self.args.hand_over == "rollouts", logged=self._logged(),
-        )  # fmt: skip
+        setup, rollouts = self.setup._replace(system=recorded), self.args.rollouts
+        learn = functools.partial(finetuning.finetune, *setup, rollouts=rollouts, learner=self.learner)
+        steps = learn(progress=progress, waits=self.args.hand_over == "rollouts", logged=self._logged())
         return self._finish(self.follow(steps, done))
 
     def _logged(self) -> Logged | None:
@@ -221,14 +220,14 @@ class _Run(Training):
         films = functools.cache(lambda: self._before_and_after(progress))
         summaries = []
         for i, record in enumerate(self.records):
-            own = lambda tree, i=i: part(tree, i, self.count)  # noqa: E731
-            record.save("policy", own(last), card)
-            record.save("best", own(best.params), card)
-            rollouts, chosen = int(progress.rollouts), {name: np.asarray(own(x)) for name, x in facts.items()}
+            members = functools.partial(part, i=i, n=self.count)
+            record.save("policy", members(last), card)
+            record.save("best", members(best.params), card)
+            rollouts, chosen = int(progress.rollouts), {name: np.asarray(members(x)) for name, x in facts.items()}
             summaries.append(record.summarise(rollouts, chosen))
             if self.args.video and n and self.system.pools is not None:
                 pool = jax.tree.map(lambda x, i=i: x[i], self.system.pools)
-                print(record.film(pool, lambda own=own: [own(x) for x in films()], rollouts))
+                print(record.film(pool, lambda members=members: [members(x) for x in films()], rollouts))
             print(f"results: {record.folder}  (policy/, best/, real/, summary.json, figures/)")
         print(f"next: python -m experiments.figures --out {self.args.out}")
         return summaries
@@ -240,8 +239,8 @@ class _Run(Training):
         if initial is None:
             before = evaluate(self.finetuner, states=jax.jit(self.begin)().agent, episodes=n)
         else:
-            own = finetuning.priors_of_members(self.setup.priors, self.seeds)
-            before = evaluate(initial, states=own, episodes=n)
+            priors = finetuning.priors_of_members(self.setup.priors, self.seeds)
+            before = evaluate(initial, states=priors, episodes=n)
         return [before, evaluate(self.finetuner, states=progress.agent, episodes=n)]
 
 
@@ -251,9 +250,7 @@ _OF_MEMBERS = ("agent", "best", "transitions")  # of a state, what has an axis o
 @functools.partial(jax.jit, static_argnums=(1, 2))
 def _part(progress: FinetuneProgress, i: int, n: int) -> FinetuneProgress:
     """The members of the i-th real system."""
-    own = functools.partial(part, i=i, n=n)
-    members = {name: own(getattr(progress, name)) for name in _OF_MEMBERS}
-    return progress._replace(**members)
+    return progress._replace(**{name: part(getattr(progress, name), i, n) for name in _OF_MEMBERS})
 
 
 @jax.jit

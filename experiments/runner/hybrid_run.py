@@ -131,10 +131,8 @@ class _Run(Training):
         first = jax.tree.map(lambda x: x[:count], setup.pools), setup.real, setup.keys[:count]  # of one simulator
         restored = self.restore(lambda: hybrid.shape_of(self.env, self.agent, schedule, *first))
         state = join([state for state, _ in restored]) if restored else None
-        steps = hybrid.train(
-            self.env, self.agent, schedule, setup.pools, setup.real, setup.keys, gamma=self.args.options.gamma,
-            state=state,
-        )  # fmt: skip
+        data = setup.pools, setup.real, setup.keys
+        steps = hybrid.train(self.env, self.agent, schedule, *data, gamma=self.args.options.gamma, state=state)
         return self._finish(self.follow(steps, 0 if state is None else self.done(state)))
 
     # ------------------------------------------------------------ between chunks

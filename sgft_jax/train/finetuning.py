@@ -213,9 +213,8 @@ class Updates:
         return agent, jax.tree.map(_mean, *learned) if limits is None else _mean_of_parts(learned)
 
     def _update(
-        self, states: PyTree, keys: Key, updates: int, simulated: SimulatedRows | None, offline: bool,
-        limits: Array | None = None,
-    ) -> tuple[PyTree, Metrics]:  # fmt: skip
+        self, states: PyTree, keys: Key, updates: int, source: SimulatedRows | None, offline: bool, limits: Array | None
+    ) -> tuple[PyTree, Metrics]:
         def one(state: PyTree, key: Key, which: Array, rows: SimulatedRows | None, limit: Array | None) -> Any:
             data = None if rows is None else rows.of(which)
             # Where no episode ends early the number is static: the program, and its bits, of a fixed length.
@@ -223,7 +222,7 @@ class Updates:
             return self.finetuner.learn(state, key, updates, data, offline=offline, **some)
 
         axes = (0, 0, 0, None, None if limits is None else 0)
-        return split_vmap(one, axes)(states, keys, self.which, simulated, limits)
+        return split_vmap(one, axes)(states, keys, self.which, source, limits)
 
 
 class _Steps:
@@ -279,9 +278,8 @@ class _Steps:
         self, progress: FinetuneProgress, learner: Beside, rollouts: int, *, waits: bool
     ) -> Iterator[tuple[FinetuneProgress, Metrics]]:
         """The same with a learner that works on one rollout while the next one is played."""
-        agent, best, done, offline, transitions = (
-            progress.agent, progress.best, int(progress.rollouts), progress.offline, progress.transitions,
-        )  # fmt: skip
+        agent, best, done = progress.agent, progress.best, int(progress.rollouts)
+        offline, transitions = progress.offline, progress.transitions
         acting = _Acting(agent, done, None, waits=waits)  # before anything has been submitted
         before: list[Episode] = []
         while before or done < rollouts:
@@ -413,8 +411,11 @@ def _key(seed: Array, purpose: int | Array, part: int | Array) -> Key:
 @functools.partial(jax.jit, static_argnums=3)
 def _episode_keys(seeds: Array, purpose: Array, rollout: Array, n: int) -> Key:
     """Keys [M, n]; the first ones are the same for every n."""
-    each = lambda seed, i: jax.random.fold_in(_key(seed, purpose, rollout), i)  # noqa: E731
-    return jax.vmap(lambda seed: jax.vmap(lambda i: each(seed, i))(jnp.arange(n)))(seeds)
+
+    def keys(seed: Array) -> Key:
+        return jax.vmap(lambda i: jax.random.fold_in(_key(seed, purpose, rollout), i))(jnp.arange(n))
+
+    return jax.vmap(keys)(seeds)
 
 
 # --- simulated data ---------------------------------------------------------------------------------------------------

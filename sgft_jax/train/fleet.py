@@ -144,10 +144,18 @@ class Collected(NamedTuple):
 
 
 def collect(
-    env: Env, memory: Memory, explore: Explore, pool: World, start: Collected, keys: Key, *,
-    initial_carry: PyTree, gamma: float, note: Callable[..., PyTree] | None = None,
+    env: Env,
+    memory: Memory,
+    explore: Explore,
+    pool: World,
+    start: Collected,
+    keys: Key,
+    *,
+    initial_carry: PyTree,
+    gamma: float,
+    note: Callable[..., PyTree] | None = None,
     measure: Callable[[EnvState, Transition, Array], Metrics] = lambda after, rows, valid: {},
-) -> tuple[Collected, Metrics]:  # fmt: skip
+) -> tuple[Collected, Metrics]:
     """Steps of all simulators, one for each of the keys [steps, 2]; the metrics are [steps].
 
     initial_carry: what the policy remembers when an episode begins. note(before, action, after): see `Note`.
@@ -184,12 +192,13 @@ def make_trainer(env: Env, plan: Plan, *, gamma: float, note: Note | None = None
     """Builds the pure functions. gamma: discount factor of simulated rows. note: what else to keep of their steps."""
     learner, fresh = plan.learner, plan.init_carry()
 
+    play = functools.partial(collect, env, plan.memory, initial_carry=fresh, gamma=gamma, measure=plan.measure)
+
     def advance(pool: World, state: FleetState, keys: Key) -> tuple[FleetState, Metrics]:
-        collected, measured = collect(
-            env, plan.memory, functools.partial(plan.explore, state.learner), pool,
-            Collected(state.fleet, state.replay, state.notes), keys, initial_carry=fresh, gamma=gamma,
-            note=note and functools.partial(note, state.learner), measure=plan.measure,
-        )  # fmt: skip
+        explore = functools.partial(plan.explore, state.learner)
+        start = Collected(state.fleet, state.replay, state.notes)
+        notes = note and functools.partial(note, state.learner)
+        collected, measured = play(explore, pool, start, keys, note=notes)
         return state._replace(**collected._asdict()), measured
 
     def init(pool: World, data: PyTree, key: Key) -> FleetState:
@@ -302,9 +311,14 @@ def make_programs(trainer: Trainer, members: int, *, shared: bool) -> Programs:
 
 
 def train(
-    plan: Plan, programs: Programs, pools: Callable[[int], World], data: PyTree, state: FleetState, *,
+    plan: Plan,
+    programs: Programs,
+    pools: Callable[[int], World],
+    data: PyTree,
+    state: FleetState,
+    *,
     refresh_every: int = 0,
-) -> Iterator[tuple[FleetState, Metrics]]:  # fmt: skip
+) -> Iterator[tuple[FleetState, Metrics]]:
     """Trains from a state until all chunks are done; the state is consumed.
 
     pools: number of a set of worlds -> its worlds [M, W]. refresh_every: chunks after which the next set is asked for,

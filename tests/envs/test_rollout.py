@@ -17,14 +17,14 @@ from envs.types import UserError
 N = 64
 
 
+def push(carry, obs, key):
+    return -obs[:2], carry
+
+
 def test_an_episode_in_a_stacked_pool_is_that_in_the_pool_alone(key):
     env = toy.make()
     stacked = jax.tree.map(lambda x: x.reshape(2, 5, *x.shape[1:]), envs.sample_worlds(env, key, 10))
     assert pool_size(stacked) == 5
-
-    def push(carry, obs, key):
-        return -obs[:2], carry
-
     play = functools.partial(play_episode, env, act=push, carry=(), gamma=1.0, length=2)
 
     @jax.jit
@@ -89,8 +89,9 @@ def test_an_explosion_after_the_end_is_none(key):
     """The simulator goes on unseen after a termination; what it does then does not count."""
     env = toy_terminating.make()
 
-    def step(*args):
-        return (after := env.step(*args))._replace(invalid=after.time > 1)
+    def step(*inputs):
+        after = env.step(*inputs)
+        return after._replace(invalid=after.time > 1)
 
     late = env._replace(step=step)
     for risk, exploded in ((1.0, False), (0.0, True)):
@@ -189,18 +190,11 @@ def test_exploded_environments_of_a_fleet_begin_anew():
         after = env.step(world, state, action, key)
         return after._replace(invalid=(action[0] > 0) | state.invalid)
 
-    fleet = launch(env, pool, jax.random.key(1), 4, jnp.int32(0))
+    begun = jnp.int32(0)
+    fleet = launch(env, pool, jax.random.key(1), 4, begun)
+    advance = functools.partial(step_fleet, env._replace(step=step), pool, initial_carry=begun, gamma=0.9)
     for actions in ([-1.0, 1.0, -1.0, -1.0], [-1.0, -1.0, -1.0, 1.0]):
-        fleet, rows, valid, _ = step_fleet(
-            env._replace(step=step),
-            pool,
-            fleet,
-            jnp.array(actions)[:, None],
-            fleet.carry + 1,
-            jax.random.key(2),
-            initial_carry=jnp.int32(0),
-            gamma=0.9,
-        )
+        fleet, rows, valid, _ = advance(fleet, jnp.array(actions)[:, None], fleet.carry + 1, jax.random.key(2))
         np.testing.assert_array_equal(valid, np.array(actions) < 0)
         np.testing.assert_allclose(rows.reward, np.where(valid, 1 + fleet.state.obs[:, 0], 0), rtol=1e-6)
     for ages in (fleet.state.time, fleet.carry):

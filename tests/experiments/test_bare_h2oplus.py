@@ -21,7 +21,10 @@ HYPER = H2OPlusHyper(tau=0.1, alpha=1.0, value_share=0.3, lr_ratio=1e-2, lr_alph
 def noise_of(key):
     """The numbers that the learner draws from this key."""
     key_ratio, key_actor, key_target = jax.random.split(key, 3)
-    normal = lambda key, n: jax.random.normal(key, (n,))  # noqa: E731
+
+    def normal(key, n):
+        return jax.random.normal(key, (n,))
+
     actions = [jax.vmap(lambda k: normal(k, ACT_DIM))(jax.random.split(k, ROWS)) for k in (key_target, key_actor)]
     keys = jax.vmap(lambda k: jax.random.split(k, 3))(jax.random.split(key_ratio, RATIO_ROWS))
     parts = [jax.vmap(lambda k, n=n: normal(k, n))(keys[:, i]) for i, n in enumerate((OBS_DIM, ACT_DIM, OBS_DIM))]

@@ -28,7 +28,10 @@ def layers(params):
 def noise_of(key):
     """The numbers that `sgft_jax.learners.sac` draws from this key."""
     key_target, key_actor, key_dynamics = jax.random.split(key, 3)
-    normal = lambda key: jax.random.normal(key, (ACT_DIM,))  # noqa: E731
+
+    def normal(key):
+        return jax.random.normal(key, (ACT_DIM,))
+
     target, actor = (jax.vmap(normal)(jax.random.split(k, BATCH)) for k in (key_target, key_actor))
     return bare_sac.Noise(target, actor, jax.random.exponential(key_dynamics, (BATCH, MEMBERS)))
 

@@ -43,10 +43,11 @@ TESTS = Path(__file__).parent.parent
 GAP = "[params]\nmass = 2.0\nfriction = 4.0\n[effects]\naction_rotation = 0.52\n"
 COMMON = "--task toy --rollouts 5 --eval-every 2 --eval-episodes 8 --checkpoint-every 3 --no-video"
 # A method gets those that it has.
-SMALL = {
-    "initial_rollouts": 2, "utd": 0.5, "batch_size": 16, "branches": 2, "critic_warmup": 0, "actor_ramp": 0,
-    "replay_capacity": 256, "simulated_transitions": 390, "offline_updates": 20, "plan_samples": 24,
-}  # fmt: skip
+SMALL = (
+    {"batch_size": 16, "utd": 0.5, "replay_capacity": 256, "critic_warmup": 0, "actor_ramp": 0}
+    | {"initial_rollouts": 2, "simulated_transitions": 390, "offline_updates": 20}
+    | {"branches": 2, "plan_samples": 24}
+)
 START = """
 import os, signal, sys
 import envs
@@ -476,12 +477,14 @@ def test_no_rollout_of_a_real_system_is_replaced_because_another_lacks_it(tmp_pa
         (["--real"], "--real: name at least one"),
         (["--real", "mild", "mild"], "--real names mild twice"),
         (["--real", "{home}/turned.toml", "{home}/else/turned.toml"], "two of them would share the folder"),
-        (["--real", "{home}/turned.toml", "{home}/heavy.toml", "{home}/else/light.toml", "--seeds", "1"],
-         "times --seeds is 3: not a multiple of the 2"),
+        (
+            ["--real", "{home}/turned.toml", "{home}/heavy.toml", "{home}/else/light.toml", "--seeds", "1"],
+            "times --seeds is 3: not a multiple of the 2",
+        ),
         (["--resume"], "nothing to resume there"),
         (["--out", "{home}/turned.toml"], "turned.toml is a file; choose another --out"),
     ],
-)  # fmt: skip
+)
 def test_a_bad_command_is_one_line_and_code_2(home, tmp_path, more, words, capsys):
     (home / "else").mkdir(exist_ok=True)
     for name in ("turned", "light"):
@@ -601,7 +604,9 @@ def springs(pushes):
     keys = jax.random.split(jax.random.key(4), (1, 6))
 
     def played(push):
-        spring = lambda carry, obs, key: (push * -obs[:2], carry)  # noqa: E731
+        def spring(carry, obs, key):
+            return push * -obs[:2], carry
+
         return jax.vmap(jax.vmap(lambda key: play_episode(env, pool, spring, (), key, gamma=1.0)))(keys)
 
     return env, pool, jax.vmap(jax.jit(played))(jnp.array(pushes))

@@ -24,10 +24,9 @@ from sgft_jax.presets import PretrainConfig
 from sgft_jax.train.fleet import make_programs, over_members, spread_replay
 from sgft_jax.train.pretraining import make_trainer, random_experience, training_pools
 
-CONFIG = PretrainConfig(
-    n_envs=16, worlds=8, random_transitions=64, replay_capacity=128, batch_size=32, updates_per_step=2, chunk_steps=24,
-    random_ladder=0.5, gamma=0.9, network=NetworkConfig(hidden=(16, 16)), ensemble_size=2,
-)  # fmt: skip
+LOOP = {"n_envs": 16, "worlds": 8, "chunk_steps": 24, "random_transitions": 64, "random_ladder": 0.5}
+LEARNING = {"replay_capacity": 128, "batch_size": 32, "updates_per_step": 2, "gamma": 0.9}
+CONFIG = PretrainConfig(**LOOP, **LEARNING, network=NetworkConfig(hidden=(16, 16)), ensemble_size=2)
 CUT = PartitionSpec(None, mesh.DATA)  # [seeds, ...]
 
 

@@ -62,7 +62,10 @@ def test_priors_are_found_in_order(tmp_path):
     home = tmp_path / "pretrain/toy/fast"
     for run, n in (("a", 10), ("a", 9), ("b", 2)):
         save_prior(home / run / "prior" / f"seed-{n}", n)
-    find = lambda prior: prior_folders(prior, out=tmp_path, task="toy", preset="fast")  # noqa: E731
+
+    def find(prior):
+        return prior_folders(prior, out=tmp_path, task="toy", preset="fast")
+
     assert [folder.name for folder in find(None)] == ["seed-2", "seed-9", "seed-10"]
     assert [len(find(home / p)) for p in ("", "a", "a/prior", "a/prior/seed-9")] == [3, 2, 2, 1]
 

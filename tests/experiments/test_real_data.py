@@ -52,13 +52,14 @@ def rollout(number):
     terminated = (number == 1) & (seeds == 0) & (steps == 2)
     action = np.repeat(first, 2, axis=2) / 1000
     none = np.zeros(2, bool)
-    facts = {
-        "obs": obs, "action": action, "reward": valid * 1.0, "discount": np.where(valid & ~terminated, 0.9, 0.0),
-        "next_obs": np.concatenate([obs[..., :4] + 1, obs[..., 4:]], axis=2), "valid": valid,
-        "total_reward": valid.sum(1), "success": np.array([number == 1, False]), "exploded": none,
-        "score": none, "world": np.zeros(2, int), "trace": np.arange(2 * (STEPS + 1) * 2.0).reshape(2, STEPS + 1, 2),
-        "command": 2 * action,
-    }  # fmt: skip
+    discount, success = np.where(valid & ~terminated, 0.9, 0.0), np.array([number == 1, False])
+    next_obs = np.concatenate([obs[..., :4] + 1, obs[..., 4:]], axis=2)
+    trace = np.arange(2 * (STEPS + 1) * 2.0).reshape(2, STEPS + 1, 2)
+    facts = (
+        {"obs": obs, "action": action, "reward": valid * 1.0, "discount": discount, "next_obs": next_obs}
+        | {"valid": valid, "total_reward": valid.sum(1), "success": success, "exploded": none, "score": none}
+        | {"world": np.zeros(2, int), "trace": trace, "command": 2 * action}
+    )
     return {name: x.astype(np.float32) if x.dtype == float else x for name, x in facts.items()}
 
 

@@ -109,10 +109,19 @@ def test_the_check_of_keys_finds_them():
     of two branches only one is taken.
     """
     normal, split, scan = jax.random.normal, jax.random.split, jax.lax.scan
-    loop = lambda key: scan(lambda x, _: (x + normal(key), None), 0.0, length=3)[0]  # noqa: E731
-    twins = lambda key: [normal(k) for k in (split(key)[1], jax.random.fold_in(key, 1))]  # noqa: E731
-    chain = lambda key: scan(lambda k, _: tuple(split(k)), key, length=2)  # noqa: E731
-    either = lambda key, x: jax.lax.cond(x > 0, normal, lambda k: normal(split(k)[0]), key)  # noqa: E731
+
+    def loop(key):
+        return scan(lambda x, _: (x + normal(key), None), 0.0, length=3)[0]
+
+    def twins(key):
+        return [normal(k) for k in (split(key)[1], jax.random.fold_in(key, 1))]
+
+    def chain(key):
+        return scan(lambda k, _: tuple(split(k)), key, length=2)
+
+    def either(key, x):
+        return jax.lax.cond(x > 0, normal, lambda k: normal(split(k)[0]), key)
+
     assert keys.used_twice(loop) == keys.used_twice(twins) == 1
     assert keys.used_twice(lambda key: (chain(key), normal(key))) == 1
     assert keys.used_twice(lambda key: jax.vmap(normal)(chain(key)[1])) == 0

@@ -82,9 +82,12 @@ def evaluate(best, scores, totals, age, since=0):
 def test_of_evaluations_the_higher_score_wins_then_the_higher_return():
     first = evaluate(None, [0.0, 1.0], [3, 3], 1)
     for scores, totals, age in [
-        ([1.0, 1.0], [-9, -9], 2), ([1.0, 0.0], [3, 4], 2), ([1.0, 0.0], [3, 3], 1), ([0.0, 1.0], [2, 3], 1),
+        ([1.0, 1.0], [-9, -9], 2),
+        ([1.0, 0.0], [3, 4], 2),
+        ([1.0, 0.0], [3, 3], 1),
+        ([0.0, 1.0], [2, 3], 1),
         ([0.0, 0.0], [9, 9], 1),
-    ]:  # fmt: skip
+    ]:
         best = evaluate(first, scores, totals, 2)
         assert best.age == age and best.params["w"].tolist() == [[age, age]]
     assert evaluate(first, [0.0, 0.0], [0, 0], 2, since=2).age == 2, "an early evaluation does not compete"

@@ -55,8 +55,11 @@ def test_a_task_that_fails_while_it_runs_is_one_line(tmp_path, name, key):
     def play():
         env = envs.make(str(tmp_path / "mine.py"))
         pool = envs.sample_worlds(env, key, 1)
-        act = lambda carry, obs, key: (jnp.zeros(2), carry)  # noqa: E731
-        jax.jit(lambda key: envs.play_episode(env, pool, act, (), key, gamma=0.9))(key)
+
+        def rest(carry, obs, key):
+            return jnp.zeros(2), carry
+
+        jax.jit(lambda key: envs.play_episode(env, pool, rest, (), key, gamma=0.9))(key)
 
     with pytest.raises(UserError, match=r"task .*mine\.py: line 6: TypeError: .*\(2,\)") as refused:
         play()

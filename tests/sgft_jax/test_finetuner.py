@@ -1,12 +1,11 @@
 """The generic finetuner on a point that moves in a plane: what moves, what is frozen, what a learner gets to see."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import tuners
+from jax.flatten_util import ravel_pytree
 from tuners import METHODS, NET, TASK, T, compiled, equal, prior, started, tuner
 
 from envs.types import Policy, UserError
@@ -46,8 +45,8 @@ def test_what_moves_and_what_is_frozen(name, moves):
     case = tuner(name)
     state = started(case)
     new, metrics = case.fine.learn(state, jax.random.key(1), 2)
-    fits = lambda s: {"actor": s.learner.actor, "critic": s.learner.critic} if name != "sgft-mpc" else {}  # noqa: E731
-    before, after = fits(state) | {"models": state.models}, fits(new) | {"models": new.models}
+    fits = () if name == "sgft-mpc" else ("actor", "critic")
+    before, after = ({part: getattr(s.learner, part) for part in fits} | {"models": s.models} for s in (state, new))
     assert {part for part in before if not equal(before[part], after[part])} == moves
     assert equal(state.frozen, new.frozen) and equal(state.replay, new.replay)
     assert equal(new.frozen.value, case.params.value) and equal(new.frozen.normalizer, case.params.normalizer)
@@ -122,9 +121,8 @@ def test_learning_rates_of_the_simulators_networks_rise_from_zero(name, models):
         case = tuner(name, dynamics_warmup=models if warmup else 0, **own)
         state = started(case)
         new, _ = case.fine.learn(state, jax.random.key(1), 1)
-        moved[warmup] = [jnp.concatenate([
-            jnp.ravel(b - a) for a, b in zip(*(jax.tree.leaves(part(s).params) for s in (state, new)), strict=True)
-        ]) for part, _ in parts]  # fmt: skip
+        flat = [[ravel_pytree(part(s).params)[0] for part, _ in parts] for s in (state, new)]
+        moved[warmup] = [after - before for before, after in zip(*flat, strict=True)]
     for at_once, slowly, (_, n) in zip(moved[0], moved[4], parts, strict=True):
         assert jnp.abs(at_once).max() == pytest.approx(3e-4, rel=1e-2)
         np.testing.assert_allclose(slowly, at_once / n, atol=1e-7)
@@ -242,17 +240,22 @@ def test_longer_horizons_tell_the_steps_to_go(seen):
 def test_parts_that_are_a_method_begin_as_it_does_and_see_its_batch(name, others, parts, monkeypatch):
     """The same structure, numbers and networks to begin with, and the same rows, rewards, discounts and contexts."""
     prior()  # made before: it is of another agent
-    make, found = sac.make_sac, []
+    make, seen = sac.make_sac, []
 
     def idle(config, hyper=None):
-        keep = lambda state, batch, key: (found.append((config, state, batch)), (state, {}))[1]  # noqa: E731
+        def keep(state, batch, key):
+            seen.append((config, state, batch))
+            return state, {}
+
         return make(config, hyper)._replace(update=keep)
 
     def one_key(*transforms):  # a clip without a bound would shift the keys of the others
-        each = lambda imagination, rows, key: functools.reduce(  # noqa: E731
-            lambda rows, one: one.apply((), imagination, rows, key), transforms, rows
-        )
-        return stateless(each)
+        def apply(imagination, rows, key):
+            for transform in transforms:
+                rows = transform.apply((), imagination, rows, key)
+            return rows
+
+        return stateless(apply)
 
     monkeypatch.setattr(sac, "make_sac", idle)
     monkeypatch.setattr(finetuner, "compose", one_key)
@@ -263,7 +266,7 @@ def test_parts_that_are_a_method_begin_as_it_does_and_see_its_batch(name, others
         state = plain.observe(state, tuners.episode(jax.random.key(1)), jnp.ones(T, bool), jnp.float32(0))
         with jax.disable_jit():
             plain.learn(state, jax.random.key(1), 1, None)
-    (config, learner, batch), (own_config, own_learner, own_batch) = found
+    (config, learner, batch), (own_config, own_learner, own_batch) = seen
     assert config == own_config and equal(learner, own_learner) and equal(batch, own_batch)
 
 
@@ -302,7 +305,10 @@ def test_the_simulators_transitions_as_the_models_have_them(seen):
 def test_imagined_steps_follow_every_model(monkeypatch):
     """An update draws one. The second of two moves a point by 1,000, so the mean reward tells which it was."""
     params, make = prior().params, sac.make_sac
-    still = lambda *given: make(*given)._replace(update=lambda state, batch, key: (state, {}))  # noqa: E731
+
+    def still(*options):
+        return make(*options)._replace(update=lambda state, batch, key: (state, {}))
+
     monkeypatch.setattr(sac, "make_sac", still)  # nothing that takes long to compile
     plain = tuners.build("mbpo", horizon=1, train_dynamics=False)
     far = jax.tree.map(jnp.copy, params.dynamics)
@@ -347,10 +353,11 @@ def counting(transform):
     """Fine-tuning with a transform, whose learner counts its updates."""
 
     learner = Learner(
-        init=lambda key: jnp.float32(0), init_carry=lambda: (),
+        init=lambda key: jnp.float32(0),
+        init_carry=lambda: (),
         act=lambda state, carry, obs, key, *, explore: (jnp.zeros(2), carry),
         update=lambda state, batch, key: (state + 1.0, {}),
-    )  # fmt: skip
+    )
     parts = Parts(
         learner=learner,
         start=lambda params, key, simulated: (learner.init(key), None),
@@ -426,10 +433,10 @@ def test_the_ratio_weighs_what_the_critic_learns(name, monkeypatch):
 
 
 def test_means_of_a_batch_leave_invalid_rows_out():
-    torn = stateless(lambda imagination, batch, key: batch._replace(
-        valid=jnp.arange(4) < 2, reward=jnp.array([1.0, 3.0, 1e9, 1e9])
-    ))  # fmt: skip
-    case = compiled(counting(compose(torn)), None)
+    def tear(imagination, batch, key):
+        return batch._replace(valid=jnp.arange(4) < 2, reward=jnp.array([1.0, 3.0, 1e9, 1e9]))
+
+    case = compiled(counting(compose(stateless(tear))), None)
     _, metrics = case.fine.learn(started(case), jax.random.key(0), 1)
     assert metrics["batch/reward_mean"] == 2.0 and metrics["batch/reward_std"] == 1.0
 

@@ -22,19 +22,11 @@ each_method = pytest.mark.parametrize("name", METHODS)
 
 @pytest.mark.slow
 def test_the_list_of_methods_is_complete():
-    assert {name for name, method in METHODS.items() if not method.needs_prior} == {
-        "sac", "rlpd", "iql", "tdmpc2",
-    }  # fmt: skip
+    assert {name for name, method in METHODS.items() if not method.needs_prior} == {"sac", "rlpd", "iql", "tdmpc2"}
     assert {name for name, method in METHODS.items() if method.prior == "tdmpc2"} == tuners.PLANNERS
     tuned = {name: tuners.build(name) for name in METHODS}
-    assert {name for name, fine in tuned.items() if fine.simulation} == {
-        "sac-online",
-        "rlpd",
-        "iql",
-        "sgft-relabel",
-        "sysid",
-        "guarded",
-    }
+    simulated = {name for name, fine in tuned.items() if fine.simulation}
+    assert simulated == {"sac-online", "rlpd", "iql", "sgft-relabel", "sysid", "guarded"}
     assert {name for name, fine in tuned.items() if fine.initial_policy} == {"rlpd", "iql", "sgft-tdmpc2-code"}
     assert all(method.name == name and method.description and method.source for name, method in METHODS.items())
 
@@ -155,16 +147,17 @@ def test_updates_follow_a_rollout():
 # --- no option is idle ----------------------------------------------------------------------------------------------
 
 # Another value for each option, and what must be so for it to matter.
-OTHER = {
-    "batch_size": 6, "branches": 3, "horizon": 3, "actor_ramp": 50, "replay_capacity": 40, "critic_warmup": 50,
-    "lr_warmup": 50, "dynamics_warmup": 50, "plan_samples": 32, "critics": 4, "target_critics": 2,
-    "simulated_transitions": 36, "offline_updates": 5, "simulated_anneal": 80, "policy_delay": 2, "utd": 0.5,
-    "initial_rollouts": 3, "max_grad_norm": 0.001, "lr_actor": 1e-2, "lr_critic": 1e-2, "lr_dynamics": 1e-2, "lr": 1e-2,
-    "tau": 0.2, "alpha": 0.3, "expectile": 0.9, "beta": 1.0, "reward_scale": 2.0, "simulated_share": 0.25,
-    "simulated_share_end": 0.4, "simulated_ladder": 0.1, "critic_network": dataclasses.replace(tuners.NET, hidden=(4,)),
-    "branch_noise": 0.1, "clip_shaped": 0.01, "plan_noise": 0.1, "explore_noise": 0.1,
-    "anchor": 0.5, "fit": "dropo", "rows": 5,
-}  # fmt: skip
+OTHER = (
+    {"batch_size": 6, "rows": 5, "replay_capacity": 40, "critics": 4, "target_critics": 2, "policy_delay": 2}
+    | {"critic_network": dataclasses.replace(tuners.NET, hidden=(4,)), "fit": "dropo", "anchor": 0.5}
+    | {"lr": 1e-2, "lr_actor": 1e-2, "lr_critic": 1e-2, "lr_dynamics": 1e-2, "max_grad_norm": 0.001}
+    | {"actor_ramp": 50, "critic_warmup": 50, "lr_warmup": 50, "dynamics_warmup": 50, "offline_updates": 5}
+    | {"tau": 0.2, "alpha": 0.3, "expectile": 0.9, "beta": 1.0, "reward_scale": 2.0, "utd": 0.5, "initial_rollouts": 3}
+    | {"simulated_transitions": 36, "simulated_anneal": 80, "simulated_ladder": 0.1}
+    | {"simulated_share": 0.25, "simulated_share_end": 0.4}
+    | {"branches": 3, "branch_noise": 0.1, "clip_shaped": 0.01, "horizon": 3, "plan_samples": 32, "plan_noise": 0.1}
+    | {"explore_noise": 0.1}
+)
 GIVEN = {
     "lr_warmup": {"reset_critic": False},
     "simulated_transitions": {"simulated_share": 0.5},
@@ -204,10 +197,9 @@ def test_without_the_ratio_sgft_relabel_is_what_it_was():
     case = tuners.tuner("sgft-relabel")
     options, source = tuners.configure("sgft-relabel"), sources.mixture(8, 8)
     parts = (transforms.relabel(8), transforms.branch(2, 2, noise=0.5), transforms.shape, transforms.clip(2.0))
-    before = sac_finetuner(
-        options, tuners.prior(), tuners.TASK, transforms=(*parts, transforms.shorten(2)), horizon_dim=2,
-        value_baseline=True, source=lambda state: source, simulation=case.plain.simulation,
-    )  # fmt: skip
+    rows = {"transforms": (*parts, transforms.shorten(2)), "source": lambda state: source}
+    critic = {"horizon_dim": 2, "value_baseline": True}
+    before = sac_finetuner(options, tuners.prior(), tuners.TASK, **rows, **critic, simulation=case.plain.simulation)
     start = case.plain.init(case.params, jax.random.key(0), case.data)
     assert program(case, start) == program(case._replace(plain=before), start)
     on = case._replace(plain=tuners.build("sgft-relabel", ratio=True))
@@ -240,7 +232,10 @@ def differs(base, plain):
     if facts(base.plain) != facts(plain):
         return True
     params = base.params
-    start = lambda fine: fine.init(params, jax.random.key(0), base.data)  # noqa: E731
+
+    def start(fine):
+        return fine.init(params, jax.random.key(0), base.data)
+
     shapes = [jax.tree.map(jnp.shape, jax.eval_shape(lambda f=f: start(f))) for f in (base.plain, plain)]
     if shapes[0] != shapes[1]:
         return True

@@ -29,11 +29,10 @@ from sgft_jax.train.pretraining import pretrain, priors_of
 from sgft_jax.types import Learner
 
 N, STEPS, LENGTH = 16, 30, toy_terminating.LENGTH
-CONFIG = PretrainConfig(
-    n_envs=N, chunk_steps=STEPS, env_steps=2 * N * STEPS, worlds=4, random_transitions=LENGTH * N,
-    replay_capacity=4 * N * STEPS, batch_size=8, updates_per_step=1, gamma=0.9,
-    network=NetworkConfig(hidden=(8,)), ensemble_size=1, size=tuners.TINY, horizon=2, plan_samples=8, gru=4,
-)  # fmt: skip
+LOOP = {"n_envs": N, "chunk_steps": STEPS, "env_steps": 2 * N * STEPS, "worlds": 4, "random_transitions": LENGTH * N}
+LEARNING = {"replay_capacity": 4 * N * STEPS, "batch_size": 8, "updates_per_step": 1, "gamma": 0.9}
+NETWORKS = {"ensemble_size": 1, "size": tuners.TINY, "horizon": 2, "plan_samples": 8, "gru": 4}
+CONFIG = PretrainConfig(**LOOP, **LEARNING, **NETWORKS, network=NetworkConfig(hidden=(8,)))
 
 
 @pytest.fixture(autouse=True)
@@ -57,11 +56,13 @@ def counting(task, config):
         update=lambda agent, batch, key: (agent, {"batch/reward": batch.reward.mean()}),
     )
     sac = recipes.RECIPES["sac"](task, config)
-    act = lambda agent, carry, obs, key: learner.act(agent, carry, obs, key, explore=True)  # noqa: E731
     return sac._replace(
-        learner=learner, hyper=lambda steps: jnp.float32(0), init_carry=learner.init_carry, act=act,
+        learner=learner,
+        hyper=lambda steps: jnp.float32(0),
+        init_carry=learner.init_carry,
+        act=functools.partial(learner.act, explore=True),
         extract=lambda agent: agent.normalizer,
-    )  # fmt: skip
+    )
 
 
 def played(state, chunk):
@@ -106,10 +107,8 @@ def test_episodes_end_and_begin_anew_with_their_carry(counted):
 def test_no_key_is_used_twice(algorithm):
     """In random experience, the first state, a chunk of two steps and new worlds."""
     env = toy_terminating.make()
-    config = replace(
-        CONFIG, algorithm=algorithm, n_envs=2, chunk_steps=2, random_transitions=2 * LENGTH, replay_capacity=80,
-        random_ladder=0.5, batch_size=4, updates_per_step=2,
-    )  # fmt: skip
+    loop = {"n_envs": 2, "chunk_steps": 2, "random_transitions": 2 * LENGTH, "random_ladder": 0.5}
+    config = replace(CONFIG, algorithm=algorithm, **loop, replay_capacity=80, batch_size=4, updates_per_step=2)
     trainer, pool = pretraining.make_trainer(env, config), envs.sample_worlds(env, jax.random.key(0), 2)
 
     def whole(key):
@@ -123,10 +122,13 @@ def test_no_key_is_used_twice(algorithm):
 
 def test_a_policy_remembers_the_random_action_that_replaced_its_choice(monkeypatch):
     """Its choice is always 0.5; what it hands on is the action that was stored, or 0 at the start of an episode."""
-    chosen = lambda agent, carry, obs, key: (jnp.full(1, 0.5), jnp.float32(0.5))  # noqa: E731
-    recipe = lambda task, config: counting(task, config)._replace(  # noqa: E731
-        act=chosen, replaced=lambda carry, action: action[0]
-    )
+
+    def chosen(agent, carry, obs, key):
+        return jnp.full(1, 0.5), jnp.float32(0.5)
+
+    def recipe(task, config):
+        return counting(task, config)._replace(act=chosen, replaced=lambda carry, action: action[0])
+
     monkeypatch.setattr(pretraining, "RECIPES", {"sac": recipe})
     config = replace(CONFIG, chunk_steps=5, env_steps=5 * N, random_ladder=1.0)
     *_, (state, _) = pretrain(toy_terminating.make(), config, [3])
@@ -214,7 +216,10 @@ def equal(one, other):
 @pytest.mark.slow
 def test_random_actions_grow_along_the_fleet(key, monkeypatch):
     """A policy always says 2: the first environment obeys, the last acts at random, the middle one does both."""
-    always = lambda agent, carry, obs, key: (jnp.full(2, 2.0), carry)  # noqa: E731
+
+    def always(agent, carry, obs, key):
+        return jnp.full(2, 2.0), carry
+
     monkeypatch.setattr(pretraining, "RECIPES", {"sac": lambda *given: counting(*given)._replace(act=always)})
     config = replace(CONFIG, n_envs=3, chunk_steps=60, env_steps=180, random_ladder=1.0)
     *_, (state, _) = pretrain(toy.make(), config, [0])
@@ -239,7 +244,9 @@ def test_over_members_is_a_loop(members):
 
 
 def test_a_single_member_keeps_its_conditions():
-    branch = lambda x: jax.lax.cond(x > 0, jnp.sin, jnp.cos, x)  # noqa: E731
+    def branch(x):
+        return jax.lax.cond(x > 0, jnp.sin, jnp.cos, x)
+
     one, two = (str(jax.make_jaxpr(over_members(branch, n))(jnp.ones(n))) for n in (1, 2))
     assert "cond[" in one and "cond[" not in two
 

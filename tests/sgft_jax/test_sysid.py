@@ -55,7 +55,10 @@ def steps(prior, key, told, n=N, noise=0.0):
 
     obs = jnp.concatenate([measured, here], axis=1)
     next_obs = jax.vmap(after)(obs, action) + noise * jax.random.normal(key_noise, obs.shape)
-    silent = lambda obs: obs if told else obs.at[:, -K:].set(0.0)  # noqa: E731
+
+    def silent(obs):
+        return obs if told else obs.at[:, -K:].set(0.0)
+
     return Transition(silent(obs), action, jnp.zeros(n), jnp.ones(n), silent(next_obs))
 
 
@@ -90,7 +93,9 @@ def test_the_simulator_tells_the_system_too(prior, fit, key):
     """Of steps with noise, played in the task itself; the prior's models, which know nothing, are not asked."""
     method = get_method("sysid")
     fine = method.build(method.config(fit=fit, through="simulator"), prior, ENV)
-    wander = lambda carry, obs, key: (jax.random.uniform(key, (2,), minval=-1.0), carry)  # noqa: E731
+
+    def wander(carry, obs, key):
+        return jax.random.uniform(key, (2,), minval=-1.0), carry
 
     def play(env, n, effects):
         nominal = {p.name: p.nominal for p in env.parameters}
@@ -100,7 +105,10 @@ def test_the_simulator_tells_the_system_too(prior, fit, key):
 
     known, _ = play(ENV, 32, {v.name: [v.low, v.high] for v in SYSTEM})
     real = play(concealed(ENV), 1, {"action_scale": [0.8, 1.0], "action_rotation": 0.3})
-    draw = lambda key, n: jax.tree.map(lambda x: x[jax.random.randint(key, (n,), 0, len(x))], known)  # noqa: E731
+
+    def draw(key, n):
+        return jax.tree.map(lambda x: x[jax.random.randint(key, (n,), 0, len(x))], known)
+
     state = jax.jit(lambda: fine.init(prior.params, key, SimulatedData(draw, jnp.zeros(1))))()
     state = jax.jit(fine.observe)(state, *real, jnp.float32(0))
     np.testing.assert_allclose(state.learner[1].mean, TRUE, atol=0.1)

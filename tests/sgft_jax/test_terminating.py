@@ -32,11 +32,10 @@ ENV = BASE._replace(action=(*BASE.action, Entry("count", "episodes", 1)))
 LENGTH, GAMMA = ENV.episode_length, np.float32(0.9)
 M = 8  # members; each evaluates one episode, by the program that also plays the real ones
 N, STEPS = 8, 30  # environments and steps of pretraining
-CONFIG = PretrainConfig(
-    n_envs=N, chunk_steps=STEPS, env_steps=N * STEPS, worlds=4, random_transitions=LENGTH * N,
-    replay_capacity=N * STEPS, batch_size=8, updates_per_step=1, gamma=0.9, network=NET, ensemble_size=2, size="tiny",
-    horizon=2, plan_samples=24, gru=4,
-)  # fmt: skip
+LOOP = {"n_envs": N, "chunk_steps": STEPS, "env_steps": N * STEPS, "worlds": 4, "random_transitions": LENGTH * N}
+LEARNING = {"replay_capacity": N * STEPS, "batch_size": 8, "updates_per_step": 1, "gamma": 0.9}
+NETWORKS = {"network": NET, "ensemble_size": 2, "size": tuners.TINY, "horizon": 2, "plan_samples": 24, "gru": 4}
+CONFIG = PretrainConfig(**LOOP, **LEARNING, **NETWORKS)
 
 each_method = pytest.mark.parametrize("name", tuners.slow_but({"sgft-sac"}, METHODS))
 each_algorithm = pytest.mark.parametrize("algorithm", tuners.slow_but({"sac"}, ["sac", "tdmpc2", "recurrent"]))
@@ -65,7 +64,10 @@ class Pretrained(NamedTuple):
 @functools.cache
 def pretrained(algorithm):
     config = dataclasses.replace(CONFIG, algorithm=algorithm)
-    recipe = lambda *given: counting(recipes.RECIPES[algorithm](*given))  # noqa: E731
+
+    def recipe(*given):
+        return counting(recipes.RECIPES[algorithm](*given))
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pretraining, "RECIPES", {algorithm: recipe})
         *_, (state, metrics) = pretraining.pretrain(ENV, config, [0, 1])
@@ -252,7 +254,10 @@ def test_a_method_does_without_functions_of_observations_or_refuses_in_one_line(
 
     rows = finetuned(name).simulated
     data = None if rows is None else rows.of(jnp.int32(0))
-    trace = lambda: jax.eval_shape(lambda key: learn(key, data), jax.random.key(0))  # noqa: E731
+
+    def trace():
+        return jax.eval_shape(lambda key: learn(key, data), jax.random.key(0))
+
     if name not in IMAGINE:
         assert all(x.shape == () for x in trace().values())
         return

@@ -185,9 +185,8 @@ def test_all_methods_meet_the_same_starts():
 
 def steps_of(episodes):
     """What the policy remembered at each valid step, episode by episode."""
-    action, valid = np.asarray(episodes.transitions.action[..., 0]), np.asarray(episodes.valid)
-    return [np.round(a[v] / NUMBER).tolist() for a, v in zip(action.reshape(-1, LENGTH), valid.reshape(-1, LENGTH),
-                                                             strict=True)]  # fmt: skip
+    action, valid = (np.asarray(x).reshape(-1, LENGTH) for x in (episodes.transitions.action[..., 0], episodes.valid))
+    return [np.round(a[v] / NUMBER).tolist() for a, v in zip(action, valid, strict=True)]
 
 
 def test_the_carry_is_threaded_and_begins_anew_with_each_episode():
@@ -534,7 +533,8 @@ def test_members_share_simulated_rows():
     seeds, simulated = jnp.arange(members, dtype=jnp.uint32), rows_of(n)
     learning = finetuning.Updates(fine, seeds, finetuning.prior_of(PRIORS, seeds), simulated)
     states = jax.eval_shape(lambda: finetuning.begin(fine, PRIORS, seeds, simulated)).agent
-    program = learning._learn.lower(states, jax.random.split(jax.random.key(0), members), 1, simulated, False).as_text()
+    keys = jax.random.split(jax.random.key(0), members)
+    program = learning._learn.lower(states, keys, 1, simulated, False, None).as_text()
     assert set(re.findall(rf"tensor<([\dx]*){n}x", program)) == {"2x"}  # two priors, no member
 
 

@@ -22,11 +22,11 @@ from sgft_jax.types import Finetuner, Normalizer, Prior
 T = 12  # steps of an episode
 NET = NetworkConfig(hidden=(8,))
 # A method gets those that it has; plans have the length of a window
-SMALL = {
-    "batch_size": 8, "branches": 2, "horizon": 2, "actor_ramp": 0, "replay_capacity": 32, "critic_warmup": 0,
-    "lr_warmup": 0, "dynamics_warmup": 0, "plan_samples": 24, "critic_network": NET, "critics": 3,
-    "simulated_transitions": 24, "offline_updates": 4, "simulated_anneal": 8, "policy_delay": 1, "utd": 0.25,
-}  # fmt: skip
+SMALL = (
+    {"batch_size": 8, "replay_capacity": 32, "utd": 0.25, "policy_delay": 1, "critics": 3, "critic_network": NET}
+    | {"actor_ramp": 0, "critic_warmup": 0, "lr_warmup": 0, "dynamics_warmup": 0, "offline_updates": 4}
+    | {"branches": 2, "horizon": 2, "plan_samples": 24, "simulated_transitions": 24, "simulated_anneal": 8}
+)
 METHODS = methods.all_methods()
 PLANNERS = {"tdmpc2", "sgft-tdmpc2", "sgft-tdmpc2-code"}
 

@@ -1,4 +1,4 @@
-"""Keeps XLA from fusing MJX's walk along the bodies into one kernel. Importing it is enough.
+"""Keeps XLA from fusing MJX's walk along the bodies into one kernel: `build()`.
 
 MJX computes a kinematic chain level by level. XLA fuses a level into every later level that reads it and so computes it
 again and again: on a CPU a 7-joint arm then spends most of a bare `mjx.step` in `mjx.kinematics`. An optimisation
@@ -23,4 +23,6 @@ def _fenced(function: Callable[..., PyTree], *args: PyTree) -> PyTree:
     return jax.lax.optimization_barrier(level) if fence else level
 
 
-scan._nvmap = _fenced
+def build() -> None:
+    """Puts a barrier behind every level of every program that is traced from now on."""
+    scan._nvmap = _fenced

@@ -12,11 +12,12 @@ import numpy as np
 with contextlib.redirect_stdout(io.StringIO()):  # MJX announces on stdout that the optional Warp backend is absent
     from mujoco import mjx
 
-import envs.mujoco.engines.fences  # noqa: F401 - a repair of mjx, before its first use
-from envs.mujoco.engines import Engine
+from envs.mujoco.engines import Engine, fences
 from envs.mujoco.engines.features import check_features
 from envs.mujoco.fields import FLUID, POLYNOMIAL
 from envs.types import Array, UserError
+
+fences.build()  # before the first use of mjx
 
 
 def make_engine(host: mujoco.MjModel, fields: tuple[str, ...] = ()) -> Engine:

@@ -31,12 +31,12 @@ def played(env, gap, seeds, actions):
     given = jnp.asarray(actions)
 
     def act(step, obs, key):
-        return (given[step], step + 1)
+        return given[step], step + 1
 
-    def one(seed):
+    def play(seed):
         return play_episode(env, pool, act, jnp.int32(0), jax.random.key(seed), gamma=1.0)
 
-    return jax.jit(jax.vmap(one))(jnp.asarray(seeds, jnp.uint32))
+    return jax.jit(jax.vmap(play))(jnp.asarray(seeds, jnp.uint32))
 
 
 def steps(env, seed, actions):

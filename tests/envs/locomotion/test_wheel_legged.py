@@ -112,23 +112,23 @@ def gain(theta):
 def episodes(env, names, act):
     """One episode [gaps] in each of them."""
 
-    def one(pool, key):
+    def play(pool, key):
         return envs.play_episode(env, member(pool, None), act, (), key, gamma=1.0)
 
-    return jax.jit(jax.vmap(one))(pool_of(env, names), jax.random.split(KEY, len(names)))
+    return jax.jit(jax.vmap(play))(pool_of(env, names), jax.random.split(KEY, len(names)))
 
 
 @pytest.mark.slow
 def test_a_linear_controller_stands_in_every_gap_and_nothing_falls():
     """That of the nominal robot. Where the centre of mass is ahead or the floor is rough, it does not stay in place."""
-    env, own = envs.make("wheel-legged", "c"), gain(NOMINAL)
+    env, feedback = envs.make("wheel-legged", "c"), gain(NOMINAL)
 
     def steady(carry, obs, key):
-        return jnp.clip(-own @ obs, -1.0, 1.0)[None], carry
+        return jnp.clip(-feedback @ obs, -1.0, 1.0)[None], carry
 
-    found = episodes(env, NAMES, steady)
-    assert (found.valid.sum(1) == env.episode_length).all() and not found.exploded.any()
-    away = dict(zip(NAMES, np.abs(found.transitions.next_obs[:, 1000:, 0]).max(1), strict=True))
+    stood = episodes(env, NAMES, steady)
+    assert (stood.valid.sum(1) == env.episode_length).all() and not stood.exploded.any()
+    away = dict(zip(NAMES, np.abs(stood.transitions.next_obs[:, 1000:, 0]).max(1), strict=True))
     assert away[gaps.SIM] < 0.05 and away["leaning"] > 0.5 and away["robot"] > 0.2  # m; H2O+ calls 0.2 standing still
     still = episodes(env, [gaps.SIM] * 4, lambda carry, obs, key: (jnp.zeros(1), carry))
     last = still.valid.sum(1) - 1
@@ -137,12 +137,16 @@ def test_a_linear_controller_stands_in_every_gap_and_nothing_falls():
 
 
 def test_it_can_roll_forward():
-    env, own = envs.make("wheel-legged-forward", "c"), gain(NOMINAL)[1:]
+    env, feedback = envs.make("wheel-legged-forward", "c"), gain(NOMINAL)[1:]
     aim = jnp.array([wheel_forward.SPEED, 0.0, 0.0])
-    found = episodes(env, [gaps.SIM] * 4, lambda carry, obs, key: (jnp.clip(-own @ (obs - aim), -1, 1)[None], carry))
-    assert (found.valid.sum(1) == env.episode_length).all()
-    np.testing.assert_allclose(found.transitions.next_obs[:, 1000:, 0], wheel_forward.SPEED, atol=0.03)
-    assert (found.total_reward > 14.9 * env.episode_length).all()
+
+    def roll(carry, obs, key):
+        return jnp.clip(-feedback @ (obs - aim), -1, 1)[None], carry
+
+    rolled = episodes(env, [gaps.SIM] * 4, roll)
+    assert (rolled.valid.sum(1) == env.episode_length).all()
+    np.testing.assert_allclose(rolled.transitions.next_obs[:, 1000:, 0], wheel_forward.SPEED, atol=0.03)
+    assert (rolled.total_reward > 14.9 * env.episode_length).all()
 
 
 @pytest.mark.parametrize("impl", ENGINES)

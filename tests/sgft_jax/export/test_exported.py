@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
-import tuners  # noqa: F401 - TD-MPC2 of size "tiny"
+import tuners
 
 import envs
 from envs.base import Varying
@@ -65,7 +65,7 @@ def of_actor(env, head):
 
 
 def of_tdmpc2(env):
-    own = {"size": "tiny", "plan_samples": 24, "horizon": 2}
+    own = {"size": tuners.TINY, "plan_samples": 24, "horizon": 2}
     learner = tdmpc2.make_tdmpc2(tdmpc2_model.named_config(env.obs_dim, env.act_dim, **own))
     params = drawn(lambda key: tdmpc2.extract_params(learner.init(key)))
     return params, {"algorithm": "tdmpc2", "config": own}

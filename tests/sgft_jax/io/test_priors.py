@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tuners  # noqa: F401 - TD-MPC2 of size "tiny"
+import tuners
 from test_checkpoint import bits, damage_flip, damage_truncate
 
 from envs.types import UserError
@@ -59,7 +59,7 @@ def test_prior_round_trip(tmp_path):
 
 
 def test_every_learner_that_leaves_a_prior_names_its_container(tmp_path):
-    planner = {"size": "tiny", "plan_samples": 24, "horizon": 2}
+    planner = {"size": tuners.TINY, "plan_samples": 24, "horizon": 2}
     learner = tdmpc2.make_tdmpc2(tdmpc2_model.named_config(4, 2, **planner))
     memory = recurrent.make_recurrent(recurrent.RecurrentConfig(4, 2, NETWORK, 6))
     params = drawn(lambda key: tdmpc2.extract_params(learner.init(key)))
@@ -148,7 +148,7 @@ BODY = {"hidden": [3]}
 LIES = {
     "algorithm null": {"algorithm": None},
     "algorithm a number": {"algorithm": 3},
-    "another algorithm": {"algorithm": "tdmpc2", "config": {"size": "tiny", "plan_samples": 24, "horizon": 2}},
+    "another algorithm": {"algorithm": "tdmpc2", "config": {"size": tuners.TINY, "plan_samples": 24, "horizon": 2}},
     "no head": {"algorithm": "actor"},
     "head": {"algorithm": "actor", "head": "hydra"},
     "no memory": {"algorithm": "recurrent"},

@@ -75,11 +75,12 @@ def plain(state):
 @pytest.mark.slow
 def test_nothing_is_learned_while_every_simulator_explodes(monkeypatch):
     """No row is kept then, and an empty buffer gives zeros."""
-    monkeypatch.setattr(
-        fleet, "step_fleet", lambda env, *given, **more: step_fleet(
-            env._replace(step=lambda *step: env.step(*step)._replace(invalid=jnp.ones((), bool))), *given, **more
-        ),
-    )  # fmt: skip
+
+    def explode(env, *inputs, **options):
+        broken = env._replace(step=lambda *step: env.step(*step)._replace(invalid=jnp.ones((), bool)))
+        return step_fleet(broken, *inputs, **options)
+
+    monkeypatch.setattr(fleet, "step_fleet", explode)
     (start, _), (state, metrics), *_ = played(build())
     assert int(state.replay.size[0]) == 0 and int(state.rounds[0]) == 2
     chex.assert_trees_all_equal(state.learner, start.learner)
@@ -136,7 +137,10 @@ def test_the_buffer_keeps_the_actions_without_the_noise_of_the_gap():
     pools = real_worlds(env, [gaps.from_dict(env, "shaky", {"effects": {"action_noise": noise}})], jax.random.key(0))
     agent = get_method("sac", "fixed").build(dataclasses.replace(get_method("sac", "fixed").config, hidden=(16,)), env)
     real, schedule = hybrid.no_data(env), dataclasses.replace(SCHEDULE, simulators=32, buffer=512)
-    note = lambda learner, before, action, after: after.physics.ctrl  # noqa: E731
+
+    def note(learner, before, action, after):
+        return after.physics.ctrl
+
     state, _ = next(hybrid.train(env, agent, schedule, pools, real, keys_of(0), gamma=0.9, note=note))
     held = slice(int(state.replay.size[0]))
     action, sent = (np.asarray(x)[0, held, 0] for x in (state.replay.data.action, state.notes.data))
@@ -397,7 +401,10 @@ def test_an_exported_policy_acts_as_the_agent(name):
 @pytest.mark.slow
 def test_notes_lie_beside_their_rows():
     """Also of the first batch, and after old rows were overwritten."""
-    note = lambda learner, before, action, after: (before.obs, action, after.obs)  # noqa: E731
+
+    def note(learner, before, action, after):
+        return before.obs, action, after.obs
+
     schedule = dataclasses.replace(SCHEDULE, updates=12, buffer=20)
     state, _ = played(build("sac"), schedule, note=note)[-1]
     (obs, action, next_obs), rows = state.notes.data, state.replay.data
