@@ -68,19 +68,8 @@ ORDER = {
     ),
     "sgft_jax": (
         *("types", "keys", "checks", "stacking", "files", "math", "models", "data", "planning", "learners"),
-        *(
-            "identify",
-            "policies",
-            "diagnosis",
-            "transforms",
-            "algorithms",
-            "presets",
-            "io",
-            "export",
-            "datasets",
-            "systems",
-            "train",
-        ),
+        *("identify", "policies", "diagnosis", "transforms", "algorithms", "presets", "io", "export"),
+        *("datasets", "systems", "train"),
         *("examination", "hybrid", "methods", "analysis", "api", ""),
     ),
     "experiments": ("runner", "commands", "studies"),  # `bench` is a part of a command

@@ -1,29 +1,25 @@
 """The algorithms that leave priors: every file here but `base.py` is one. Imports no JAX before it is used."""
 
-from __future__ import annotations
-
 import importlib
 import pkgutil
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 from envs.types import Policy, UserError, unknown
-from sgft_jax.algorithms.base import Algorithm, Recipe
+from sgft_jax.algorithms.base import Algorithm, Config, Recipe
 from sgft_jax.types import Task
 
 __all__ = ["get_algorithm", "make_policy"]
 
 _FIRST = ("sac", "tdmpc2")  # where algorithms are listed; the others follow by name
-_FILES = sorted(module.name for module in pkgutil.iter_modules(__path__) if module.name != "base")
+_FILES = (module.name for module in pkgutil.iter_modules(__path__) if module.name != "base")
 _ALGORITHMS: Mapping[str, Algorithm] = {
     file: importlib.import_module(f"{__name__}.{file}").ALGORITHM
-    for file in sorted(_FILES, key=lambda file: _FIRST.index(file) if file in _FIRST else len(_FIRST))
+    for file in sorted(_FILES, key=lambda file: (_FIRST.index(file) if file in _FIRST else len(_FIRST), file))
 }
 NAMES = tuple(_ALGORITHMS)
 PRETRAINED = tuple(name for name, algorithm in _ALGORITHMS.items() if algorithm.recipe)
 if TYPE_CHECKING:
-    from sgft_jax.presets import PretrainConfig
-
     PretrainedName = str
 else:
     PretrainedName = Literal[PRETRAINED]  # the choices of a command line
@@ -50,7 +46,7 @@ def make_policy(card: Mapping[str, Any], task: Task) -> Policy:
     return algorithm_of(card).policy(card, task)
 
 
-def recipe_of(task: Task, config: PretrainConfig) -> Recipe:
+def recipe_of(task: Task, config: Config) -> Recipe:
     """How the algorithm that a configuration names is pretrained."""
     recipe = get_algorithm(config.algorithm).recipe
     assert recipe is not None  # the type of `config.algorithm` has the names of those that are pretrained

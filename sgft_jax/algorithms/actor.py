@@ -1,16 +1,11 @@
 """An actor alone: what methods of fixed data leave. Pretraining makes none."""
 
-from __future__ import annotations
+from collections.abc import Mapping
+from typing import Any, Literal
 
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Literal
-
-from envs.types import Policy, PyTree
-from sgft_jax.algorithms.base import Algorithm, Card, NetworkEntry
+from envs.types import Policy
+from sgft_jax.algorithms.base import Algorithm, Card, NetworkEntry, Networks
 from sgft_jax.types import Task
-
-if TYPE_CHECKING:
-    from sgft_jax.models.networks import Network
 
 
 class _ActorCard(Card):
@@ -31,7 +26,7 @@ def _policy(card: Mapping[str, Any], task: Task) -> Policy:
     return actor_policy(task.obs_dim, task.act_dim, network_of(card), card["head"])
 
 
-def _networks(card: Mapping[str, Any], params: Any) -> Iterator[tuple[str, Network, PyTree]]:
+def _networks(card: Mapping[str, Any], params: Any) -> Networks:
     from sgft_jax.learners.actor import make_actor_of
     from sgft_jax.policies import network_of
 

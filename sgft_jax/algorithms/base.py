@@ -1,4 +1,4 @@
-"""What an algorithm is that leaves priors, and what the files of this folder share. Imports no JAX before it is used."""
+"""What an algorithm is that leaves priors, and what the files of this folder share. Imports no JAX."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ if TYPE_CHECKING:
     from sgft_jax.models.networks import Network
     from sgft_jax.presets import PretrainConfig
 
+# Types of modules that import JAX or this folder, for files that may import neither
+type Config = PretrainConfig
+type Networks = Iterable[tuple[str, Network, PyTree]]
 Width = Annotated[int, Meta(ge=1, le=2**20)]  # no number of units, samples or models comes near
 
 
@@ -80,20 +83,17 @@ class Recipe(NamedTuple):
     replaced: Callable[[PyTree, Array], PyTree] = lambda carry, action: carry
 
 
-def learning_rate(config: PretrainConfig) -> Callable[[Array], Array]:
-    """The learning rate [] after so many steps of all environments."""
+def scheduled(config: Config, numbers: Callable[[Array], Any]) -> Callable[[Array | int], Any]:
+    """The learner's numbers after so many steps of all environments, float32. numbers: them for a learning rate []."""
+    import jax
     import jax.numpy as jnp
     import optax
 
-    schedule = optax.linear_schedule(config.lr, config.lr * config.lr_end, max(1, config.env_steps // config.n_envs))
-    return lambda steps: jnp.asarray(schedule(steps))
+    rate = optax.linear_schedule(config.lr, config.lr * config.lr_end, max(1, config.env_steps // config.n_envs))
+    return lambda steps: jax.tree.map(jnp.float32, numbers(jnp.asarray(rate(steps))))
 
 
 # --- an algorithm -----------------------------------------------------------------------------------------------------
-
-
-def _has_plan(card: Mapping[str, Any]) -> bool:
-    return bool(card.get("plan"))
 
 
 class Algorithm(NamedTuple):
@@ -114,9 +114,9 @@ class Algorithm(NamedTuple):
     card: Any
     params: Callable[[], type[Any]]
     policy: Callable[[Mapping[str, Any], Task], Policy]
-    networks: Callable[[Mapping[str, Any], Any], Iterable[tuple[str, Network, PyTree]]]
-    recipe: Callable[[Task, PretrainConfig], Recipe] | None = None
+    networks: Callable[[Mapping[str, Any], Any], Networks]
+    recipe: Callable[[Task, Config], Recipe] | None = None
     preset: str = ""
-    plans: Callable[[Mapping[str, Any]], bool] = _has_plan
+    plans: Callable[[Mapping[str, Any]], bool] = lambda card: bool(card.get("plan"))
     remembers: bool = False
     program: tuple[str, ...] = ()

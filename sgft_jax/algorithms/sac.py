@@ -1,20 +1,15 @@
 """SAC with V_sim and a dynamics ensemble: the priors of most methods. Those with a `plan` act by plans."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, NotRequired
+import functools
+from collections.abc import Mapping
+from typing import Annotated, Any, NotRequired
 
 from msgspec import Meta, Struct
 
 from envs.types import Array, Policy, PyTree
-from sgft_jax.algorithms.base import Algorithm, Card, NetworkEntry, Recipe, Width, learning_rate
+from sgft_jax import data, learners
+from sgft_jax.algorithms.base import Algorithm, Card, Config, NetworkEntry, Networks, Recipe, Width, scheduled
 from sgft_jax.types import Task
-
-if TYPE_CHECKING:
-    from sgft_jax.learners.sac import SACHyper
-    from sgft_jax.models.networks import Network
-    from sgft_jax.presets import PretrainConfig
 
 
 class _Plan(Struct, forbid_unknown_fields=True):
@@ -28,12 +23,6 @@ class _SACCard(Card):
     plan: NotRequired[_Plan | None]
 
 
-def _params() -> type[Any]:
-    from sgft_jax.learners.sac import SACParams
-
-    return SACParams
-
-
 def _policy(card: Mapping[str, Any], task: Task) -> Policy:
     from sgft_jax.planning.mpc import MPCConfig
     from sgft_jax.policies import mpc_policy, network_of, sac_policy
@@ -44,7 +33,7 @@ def _policy(card: Mapping[str, Any], task: Task) -> Policy:
     return sac_policy(task.obs_dim, task.act_dim, network)
 
 
-def _networks(card: Mapping[str, Any], params: Any) -> Iterator[tuple[str, Network, PyTree]]:
+def _networks(card: Mapping[str, Any], params: Any) -> Networks:
     from sgft_jax.models import networks
     from sgft_jax.policies import network_of
 
@@ -66,33 +55,19 @@ def _members(ensemble: PyTree) -> int:
     return next(iter(jax.tree.leaves(ensemble)[0].shape), 1)
 
 
-def _recipe(task: Task, config: PretrainConfig) -> Recipe:
+def _recipe(task: Task, config: Config) -> Recipe:
     """One learning rate for all networks, as in the paper."""
-    import functools
+    sac = learners.sac
 
-    import jax
-    import jax.numpy as jnp
+    def numbers(rate: Array) -> Any:
+        rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_value", "lr_dynamics", "lr_alpha"), rate)
+        return sac.SACHyper(**rates, tau=config.tau, alpha=config.alpha, entropy_per_dim=config.entropy_per_dim)
 
-    from sgft_jax.data import memory
-    from sgft_jax.learners import sac
-
-    rate = learning_rate(config)
-
-    def hyper(steps: Array) -> SACHyper:
-        rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_value", "lr_dynamics", "lr_alpha"), rate(steps))
-        numbers = sac.SACHyper(**rates, tau=config.tau, alpha=config.alpha, entropy_per_dim=config.entropy_per_dim)
-        return jax.tree.map(jnp.float32, numbers)
-
-    structure = sac.SACConfig(
-        task.obs_dim,
-        task.act_dim,
-        network=config.network,
-        ensemble_size=config.ensemble_size,
-        policy_delay=config.policy_delay,
-    )
-    learner = sac.make_sac(structure, hyper(jnp.int32(0)))
+    shared = {name: getattr(config, name) for name in ("network", "ensemble_size", "policy_delay")}
+    hyper = scheduled(config, numbers)
+    learner = sac.make_sac(sac.SACConfig(task.obs_dim, task.act_dim, **shared), hyper(0))
     explore = functools.partial(learner.act, explore=True)
-    return Recipe(learner, memory.transitions(task), hyper, learner.init_carry, explore, sac.extract_params)
+    return Recipe(learner, data.memory.transitions(task), hyper, learner.init_carry, explore, sac.extract_params)
 
 
-ALGORITHM = Algorithm("sac", _SACCard, _params, _policy, _networks, _recipe, preset="robust")
+ALGORITHM = Algorithm("sac", _SACCard, lambda: learners.sac.SACParams, _policy, _networks, _recipe, preset="robust")

@@ -51,9 +51,9 @@ def load_prior(
 ) -> Prior:
     """Read a prior from its folder, from the run folder that holds one as `prior/`, or by name: `shipped:push/seed-0`.
 
-    Its parameters are those of its algorithm, with None where there are none. Raises UserError if the prior is missing, torn,
-    or of another task, other sizes than asked for, or another version, or if its numbers are not those of the networks
-    that its card describes.
+    Its parameters are those of its algorithm, with None where there are none. Raises UserError if the prior is missing,
+    torn, or of another task, other sizes than asked for, or another version, or if its numbers are not those of the
+    networks that its card describes.
     """
     folder = _home(folder)
     manifest, card = checkpoint.read_manifest(folder), read_card(folder)
@@ -134,16 +134,13 @@ def _structure(card: Mapping[str, Any]) -> dict[str, Any]:
     """What must be equal for policies that run in one program."""
     algorithm = algorithm_of(card)
     shared = {name: card.get(name) for name in ("network", "gamma", "ensemble_size", "plan")}
-    return (
-        shared
-        | {name: card["config"][name] for name in algorithm.program}
-        | {
-            "algorithm": algorithm.name,
-            "previous_actions": card.get("previous_actions", 0),
-            "system": card.get("system", []),
-            "gap": card.get("gap"),  # methods that ask for simulated data get that of one simulator
-        }
-    )
+    shared |= {name: card["config"][name] for name in algorithm.program}
+    return shared | {
+        "algorithm": algorithm.name,
+        "previous_actions": card.get("previous_actions", 0),
+        "system": card.get("system", []),
+        "gap": card.get("gap"),  # methods that ask for simulated data get that of one simulator
+    }
 
 
 def _plain(tree: PyTree) -> PyTree:
