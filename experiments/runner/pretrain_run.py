@@ -287,8 +287,10 @@ class _Run(Training):
         files = ", ".join(name for name in ("prior/", "summary.json", "figures/") if (self.folder / name).exists())
         print(f"results: {self.folder}  ({files})")
         wanted = self.config.algorithm, self.config.sees_system
-        method = next(name for name, way in all_methods().items() if (way.prior, way.sees_system) == wanted)
-        method = "" if method == DEFAULT else f" --method {method}"
+        methods = [name for name, way in all_methods().items() if (way.prior, way.sees_system) == wanted]
+        if not methods:  # as for an algorithm that is new
+            return
+        method = "" if methods[0] == DEFAULT else f" --method {methods[0]}"
         method += "" if self.gap is None else f" --real {SIM}"
         out = "" if self.args.out == PretrainArgs.out else f" --out {self.args.out}"
         print(f"next: python -m experiments.finetune --task {self.args.task}{method} --prior {self.folder}{out}")
