@@ -83,9 +83,9 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     import envs
     from experiments.runner.evaluation import describe, play
     from experiments.runner.recorded import RecordedSystem
+    from sgft_jax.algorithms import make_policy
     from sgft_jax.io.priors import load_priors, observed_by
     from sgft_jax.io.real import RealStore
-    from sgft_jax.policies import make_policy
     from sgft_jax.stacking import member, part, stack
 
     env = envs.make(task, args.impl, **observed_by(folders))

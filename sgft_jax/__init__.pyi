@@ -1,4 +1,5 @@
 from . import learners
+from .algorithms import make_policy
 from .api import ActingPolicy, Setup, evaluate_prior, finetuned_priors, load_policy, make_env, setup
 from .data import replay, sequences, sources
 from .export.folder import save_exported
@@ -8,7 +9,7 @@ from .models import dynamics, normalizer, ratio, value
 from .models.config import NetworkConfig
 from .models.ratio import RatioConfig
 from .planning.mpc import MPCConfig
-from .policies import make_policy, mpc_policy, sac_policy, tdmpc2_policy
+from .policies import mpc_policy, sac_policy, tdmpc2_policy
 from .presets import PRESETS, PretrainConfig
 from .systems import System
 from .systems.gymnasium import Gymnasium

@@ -19,11 +19,11 @@ from envs.history import remember, with_memory
 from envs.pools import heldout_worlds, real_env, real_worlds, training_worlds
 from envs.rollout import Episode
 from envs.types import Array, Policy, PyTree, UserError
+from sgft_jax.algorithms import make_policy
 from sgft_jax.export import player
 from sgft_jax.io.cards import known_task
 from sgft_jax.io.priors import load_prior, observed
 from sgft_jax.methods import DEFAULT, get_method
-from sgft_jax.policies import make_policy
 from sgft_jax.presets import check_card
 from sgft_jax.stacking import member, stack
 from sgft_jax.systems import System

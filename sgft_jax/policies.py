@@ -1,52 +1,31 @@
-"""How the parameters of a prior act and value states, for each algorithm that leaves one."""
+"""How parameters act and value states, and whether they are what a card describes."""
 
 import math
-from collections.abc import Iterator, Mapping
-from functools import partial
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from envs.types import Array, Key, Policy, PyTree, UserError
-from sgft_jax.learners import recurrent, tdmpc2, tdmpc2_model
-from sgft_jax.learners.actor import actor_policy, make_actor_of
+from sgft_jax.learners import tdmpc2, tdmpc2_model
 from sgft_jax.learners.sac import SACParams
 from sgft_jax.models import dynamics, networks, value
 from sgft_jax.models.config import NetworkConfig
-from sgft_jax.models.gru import GRU, make_gru
 from sgft_jax.models.networks import Network
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.models.system import told
 from sgft_jax.planning import mpc
 from sgft_jax.types import Task
 
-__all__ = ["make_policy", "mpc_policy", "sac_policy", "tdmpc2_policy"]
+__all__ = ["mpc_policy", "sac_policy", "tdmpc2_policy"]
 
 
-def make_policy(card: Mapping[str, Any], task: Task) -> Policy:
-    """How the prior with this card acts. task: its task; policies that plan ask it for rewards.
-
-    card: `algorithm`, `gamma`, `network` (SAC, recurrent SAC, actors alone), `head` (actors alone), `config` (TD-MPC2,
-    recurrent SAC), and `plan` for a prior of SAC that plans.
-    """
-    if card.get("algorithm", "sac") == "tdmpc2":
-        return tdmpc2_policy(_structure_of(card, task.obs_dim, task.act_dim), tdmpc2.TDMPC2Hyper(gamma=card["gamma"]))
-    network = network_of(card)
-    if card.get("algorithm") == "actor":
-        return actor_policy(task.obs_dim, task.act_dim, network, card["head"])
-    if card.get("algorithm") == "recurrent":
-        return recurrent_policy(recurrent.RecurrentConfig(task.obs_dim, task.act_dim, network, card["config"]["gru"]))
-    if plan := card.get("plan"):
-        config = mpc.MPCConfig(task.obs_dim, task.act_dim, network, **plan, gamma=card["gamma"])
-        return mpc_policy(config, task)
-    return sac_policy(task.obs_dim, task.act_dim, network)
-
-
-def check_parameters(card: Mapping[str, Any], params: Any) -> None:
+def check_parameters(card: Mapping[str, Any], params: Any, described: Iterable[tuple[str, Network, PyTree]]) -> None:
     """Raises UserError where parameters, or their shapes, are not of the sizes and networks that a card describes.
 
-    Parts that a prior does not have are None; all have statistics and what acts.
+    Parts that a prior does not have are None; all have statistics and what acts. described: (name, network, what the
+    prior has for it) of the networks by its card, see `Algorithm.networks`.
     """
     obs_dim, act_dim, entries = card["obs_dim"], card["act_dim"], len(card.get("system", []))
     sizes = {
@@ -63,7 +42,7 @@ def check_parameters(card: Mapping[str, Any], params: Any) -> None:
         part = getattr(params, name, None)
         if part is not None and (shapes := jax.tree.map(lambda x: x.shape, part)) != wanted:
             raise UserError(f"{name} has the shapes {shapes}, by its card {wanted}; take another prior")
-    for name, network, part in _networks_of(card, params):
+    for name, network, part in described:
         networks.check_params(name, network, part, "its card; take another prior")
     if odd := [path for path, x in jax.tree_util.tree_leaves_with_path(params) if x.dtype != jnp.float32]:
         raise UserError(f"{jax.tree_util.keystr(odd[0])} is not float32; take another prior")
@@ -73,48 +52,6 @@ def _offsets(params: Any, obs_dim: int, act_dim: int) -> int:
     """How many measurements a prior corrects, if whole actions then follow them in an observation; else none fit."""
     count = sum(math.prod(x.shape) for x in jax.tree.leaves(getattr(getattr(params, "distortion", None), "offset", ())))
     return count if count <= obs_dim and (obs_dim - count) % act_dim == 0 else -1
-
-
-def _networks_of(card: Mapping[str, Any], params: Any) -> Iterator[tuple[str, Network, PyTree]]:
-    """The networks that a card describes, by name, each with what the prior has for it."""
-    sizes, algorithm = (card["obs_dim"], card["act_dim"]), card.get("algorithm", "sac")
-    if algorithm == "tdmpc2":
-        nets = tdmpc2_model.make_networks(_structure_of(card, *sizes))
-        yield from ((name, getattr(nets, name), getattr(params, name)) for name in tdmpc2_model.NETWORKS)
-        if params.anchor is not None:
-            yield "anchor", nets.policy, params.anchor
-        return
-    network = network_of(card)
-    if algorithm == "actor":
-        yield "actor", make_actor_of(card["head"], *sizes, network), params.actor
-    elif algorithm == "recurrent":
-        memory = make_gru(*sizes, card["config"]["gru"])
-        sizes = memory.features, card["act_dim"], network
-        yield "actor", _behind(memory, networks.make_actor(*sizes)), params.actor
-        yield "critic", _behind(memory, networks.make_critic(*sizes)), params.critic
-    else:
-        yield "actor", networks.make_actor(*sizes, network), params.actor
-        if params.critic is not None:
-            yield "critic", networks.make_critic(*sizes, network, members=_members(params.critic)), params.critic
-        if params.value is not None:
-            yield "value", networks.make_value(sizes[0], network), params.value
-        if params.dynamics is not None:
-            ensemble = networks.make_dynamics(*sizes, network, members=_members(params.dynamics))
-            yield "dynamics", ensemble, params.dynamics
-
-
-def _behind(memory: GRU, head: Network) -> Network:
-    return Network(lambda key: {"memory": memory.init(key), "head": head.init(key)}, head.apply)
-
-
-def _members(ensemble: PyTree) -> int:
-    """How many networks an ensemble has; methods may keep fewer or more than the prior had."""
-    return next(iter(jax.tree.leaves(ensemble)[0].shape), 1)
-
-
-def _structure_of(card: Mapping[str, Any], obs_dim: int, act_dim: int) -> tdmpc2.TDMPC2Config:
-    structure = {name: card["config"][name] for name in ("horizon", "size", "plan_samples")}
-    return tdmpc2_model.named_config(obs_dim, act_dim, **structure, sgft=card["config"].get("sgft", False))
 
 
 def network_of(card: Mapping[str, Any]) -> NetworkConfig:
@@ -166,11 +103,6 @@ def mpc_policy(config: mpc.MPCConfig, task: Task, *, explore_noise: float = 0.0)
     return sac_policy(config.obs_dim, config.act_dim, config.network)._replace(
         init_carry=lambda: mpc.init_carry(config), act=act
     )
-
-
-def recurrent_policy(config: recurrent.RecurrentConfig) -> Policy:
-    """The actor of `RecurrentParams`, which remembers the episode."""
-    return Policy(partial(recurrent.init_carry, config), partial(recurrent.policy_action, config))
 
 
 def tdmpc2_policy(config: tdmpc2.TDMPC2Config, hyper: tdmpc2.TDMPC2Hyper) -> Policy:

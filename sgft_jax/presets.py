@@ -11,8 +11,9 @@ from typing import Annotated, Any
 
 from envs.types import UserError, unknown
 from sgft_jax import checks
+from sgft_jax.algorithms import PretrainedName, algorithm_of, get_algorithm
 from sgft_jax.models.config import SIZES, NetworkConfig, Precision
-from sgft_jax.types import Algorithm, Fixed, Online
+from sgft_jax.types import Fixed, Online
 
 __all__ = ["PRESETS", "PretrainConfig"]
 
@@ -23,7 +24,7 @@ DEFAULT_PRESET = "robust"
 class PretrainConfig(checks.Checked):
     """Everything that decides the result of pretraining, apart from the task, the worlds and the seeds."""
 
-    algorithm: Algorithm = "sac"
+    algorithm: PretrainedName = "sac"
     """What is trained. sac: for all methods but these. tdmpc2: for `tdmpc2`, `sgft-tdmpc2` and `sgft-tdmpc2-code`.
     recurrent: for `recurrent`."""
     env_steps: Annotated[int, checks.least(1), checks.greatest(2**40)] = 8_000_000
@@ -240,15 +241,13 @@ PRESETS: dict[str, PretrainConfig] = {
 
 def preset_of(method: Online) -> str:
     """The preset that makes the priors which a method needs."""
-    if method.sees_system:
-        return "informed"
-    return {"sac": DEFAULT_PRESET, "tdmpc2": "robust-tdmpc2", "recurrent": "recurrent"}[method.prior]
+    return "informed" if method.sees_system else get_algorithm(method.prior).preset
 
 
 def check_card(card: Mapping[str, Any], method: Online, task: str) -> None:
     """Raises UserError for the card of a prior of another algorithm or task, or of a policy told more or less."""
     command = f"python -m experiments.pretrain --task {task} --preset {preset_of(method)}"
-    if (algorithm := card.get("algorithm", "sac")) != method.prior:
+    if (algorithm := algorithm_of(card).name) != method.prior:
         raise UserError(f"{method.name} needs a prior of {method.prior}, not of {algorithm}; make one with: {command}")
     if method.sees_system != bool(card.get("system")):
         negation = "" if method.sees_system else "not "

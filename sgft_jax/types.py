@@ -267,7 +267,6 @@ class Finetuner(NamedTuple):
     card: Mapping[str, Any]
 
 
-Algorithm = Literal["sac", "tdmpc2", "recurrent"]
 ValueLoss = Literal["iql", "sql", "eql", "xql"]
 Successors = Literal["stored", "shifted"]  # where next observations of a D4RL file come from, see `data.layouts`
 Family = Literal["sgft", "model-free", "model-based", "offline", "planning"]
@@ -328,7 +327,7 @@ class Online(NamedTuple):
     source: str
     config: type[Any]
     build: Callable[[Any, Prior | None, Task], Finetuner]
-    prior: Algorithm = "sac"
+    prior: str = "sac"
     needs_prior: bool = True
     zero_shot: bool = True
     sees_system: bool = False

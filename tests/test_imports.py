@@ -67,8 +67,9 @@ ORDER = {
         ),
     ),
     "sgft_jax": (
-        *("types", "keys", "checks", "stacking", "files", "math", "models", "presets", "data", "planning", "learners"),
-        *("identify", "policies", "diagnosis", "transforms", "io", "export", "datasets", "systems", "train"),
+        *("types", "keys", "checks", "stacking", "files", "math", "models", "data", "planning", "learners"),
+        *("identify", "policies", "diagnosis", "transforms", "algorithms", "presets", "io", "export"),
+        *("datasets", "systems", "train"),
         *("examination", "hybrid", "methods", "analysis", "api", ""),
     ),
     "experiments": ("runner", "commands", "studies"),  # `bench` is a part of a command

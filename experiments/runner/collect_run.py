@@ -19,6 +19,7 @@ from envs.rollout import Episode, counted
 from envs.types import Array, Policy, PyTree, Transition, UserError
 from experiments.runner.collect_args import PAIR, CollectArgs, is_d4rls, name_of, targets, transitions_of
 from experiments.runner.options import seed_list
+from sgft_jax.algorithms import make_policy
 from sgft_jax.datasets import acceptance, logs
 from sgft_jax.datasets.recording import Joints, Noted, Recorded, cut, of_episodes, of_fleet, write_d4rl, write_minari
 from sgft_jax.files.jsonfile import write_json
@@ -27,7 +28,6 @@ from sgft_jax.io.priors import load_prior, observed_by
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.keys import FromLog, seed_keys
 from sgft_jax.methods import get_method
-from sgft_jax.policies import make_policy
 from sgft_jax.stacking import member
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import hybrid

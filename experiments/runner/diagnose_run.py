@@ -20,6 +20,7 @@ from experiments.runner.gaps_run import systems
 from experiments.runner.real_systems import connect, is_robot, is_stepped, title
 from experiments.runner.recorded import RecordedSystem
 from sgft_jax import api, stacking
+from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import figures, prediction, tables, verdict
 from sgft_jax.analysis.reading import last_start
 from sgft_jax.analysis.verdict import Names
@@ -31,7 +32,6 @@ from sgft_jax.io.real import RealStore
 from sgft_jax.io.runs import read_config
 from sgft_jax.math import stats
 from sgft_jax.methods import get_method
-from sgft_jax.policies import make_policy
 from sgft_jax.types import Prior
 
 SIMULATED, PLAYED = 32, 4  # rollouts of every prior in simulation, and on a gap unless the user says otherwise

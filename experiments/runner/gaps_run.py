@@ -20,12 +20,12 @@ from experiments.runner.evaluation import best_of, describe, play, scores
 from experiments.runner.gaps_args import GapsArgs
 from experiments.runner.memory import reserve
 from sgft_jax import stacking
+from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import tables
 from sgft_jax.io.log import MetricsLog, write_summary
 from sgft_jax.io.priors import load_priors, observed_by
 from sgft_jax.io.progress import RunProgress
 from sgft_jax.math import stats
-from sgft_jax.policies import make_policy
 from sgft_jax.presets import PretrainConfig
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train.pretraining import exported, memory, pretrain, prior_card

@@ -29,6 +29,7 @@ from experiments.runner.report import Report, make_report, numbers
 from experiments.runner.training import Record, Training, opened
 from experiments.runner.video import film_episode
 from sgft_jax import stacking
+from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import figures
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.io import checkpoint, runs
@@ -36,7 +37,6 @@ from sgft_jax.io.log import EVAL, read_jsonl, write_summary
 from sgft_jax.io.priors import digest
 from sgft_jax.keys import Pretraining, seed_keys
 from sgft_jax.methods import DEFAULT, all_methods
-from sgft_jax.policies import make_policy
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import evidence
 from sgft_jax.train.evidence import Best
@@ -287,8 +287,10 @@ class _Run(Training):
         files = ", ".join(name for name in ("prior/", "summary.json", "figures/") if (self.folder / name).exists())
         print(f"results: {self.folder}  ({files})")
         wanted = self.config.algorithm, self.config.sees_system
-        method = next(name for name, way in all_methods().items() if (way.prior, way.sees_system) == wanted)
-        method = "" if method == DEFAULT else f" --method {method}"
+        methods = [name for name, way in all_methods().items() if (way.prior, way.sees_system) == wanted]
+        if not methods:  # as for an algorithm that is new
+            return
+        method = "" if methods[0] == DEFAULT else f" --method {methods[0]}"
         method += "" if self.gap is None else f" --real {SIM}"
         out = "" if self.args.out == PretrainArgs.out else f" --out {self.args.out}"
         print(f"next: python -m experiments.finetune --task {self.args.task}{method} --prior {self.folder}{out}")

@@ -23,13 +23,14 @@ from experiments.runner.gaps_run import FINAL_SEED, episode_key, percent, rate, 
 from experiments.studies import gaps_choose
 from experiments.studies.gaps_draw_args import DrawArgs
 from sgft_jax import api, stacking
+from sgft_jax.algorithms import make_policy
 from sgft_jax.files.jsonfile import differences, jsonable, write_json
 from sgft_jax.identify import Identified, Interface, command_interface
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.math import stats
 from sgft_jax.methods import get_method
 from sgft_jax.models.distortion import Distortion, none
-from sgft_jax.policies import make_policy, network_of
+from sgft_jax.policies import network_of
 from sgft_jax.types import Prior, SimulatedData
 
 SOLVED_AT_LEAST, FAILED_BELOW, TRIVIAL_AT_LEAST, ADMITTED_AT_LEAST = 0.8, 0.2, 0.9, 0.9

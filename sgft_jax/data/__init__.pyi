@@ -1,3 +1,3 @@
-from . import replay, sequences, sources
+from . import memory, replay, sequences, sources
 
-__all__ = ["replay", "sequences", "sources"]
+__all__ = ["memory", "replay", "sequences", "sources"]

@@ -13,10 +13,11 @@ import numpy as np
 
 from envs.base import Env
 from envs.types import Array, PyTree, UserError
-from sgft_jax.io.priors import algorithm_of, digest
+from sgft_jax.algorithms import algorithm_of, make_policy
+from sgft_jax.io.priors import digest
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.distortion import Distortion
-from sgft_jax.policies import make_policy, network_of
+from sgft_jax.policies import network_of
 from sgft_jax.types import Prior
 
 Format = Literal["onnx", "jax", "numpy"]
@@ -68,13 +69,13 @@ def slots_of(prior: Prior, env: Env) -> tuple[Slot, ...]:
 
 def last_action_of(prior: Prior, env: Env) -> tuple[str, ...]:
     """The parts of the state whose first numbers are the last action."""
-    memory = (_memory(1),) if algorithm_of(prior.card) == "recurrent" else ()
+    memory = (_memory(1),) if algorithm_of(prior.card).remembers else ()
     return ((_PREVIOUS,) if env.previous_actions else ()) + memory
 
 
 def plans(card: Mapping[str, Any]) -> bool:
     """Whether a policy searches for a plan at every step."""
-    return algorithm_of(card) == "tdmpc2" or bool(card.get("plan"))
+    return algorithm_of(card).plans(card)
 
 
 def _memory(i: int) -> str:
@@ -136,7 +137,7 @@ def graph_of(prior: Prior, env: Env) -> Graph:
     params, write, slots = prior.params, _Writer(), slots_of(prior, env)
     network, previous = network_of(prior.card), _PREVIOUS if env.previous_actions else None
     obs = _observed(write, params, env, previous)
-    if algorithm_of(prior.card) == "recurrent":
+    if algorithm_of(prior.card).remembers:
         hidden, features = _remembered(write, params.actor["memory"], obs)
         action = _action(write, params.actor["head"], features, network, env.act_dim)
         write("Identity", hidden, to=NEXT + _memory(0))
@@ -225,7 +226,7 @@ def contract(prior: Prior, env: Env, to: Format) -> dict[str, Any]:
     distortion = getattr(params, "distortion", None)
     identified = None if distortion is None else {k: np.asarray(x) for k, x in distortion._asdict().items()}
     system = [{**v._asdict(), "value": x} for v, x in zip(env.system, _system(params, env), strict=True)]
-    policy = {"algorithm": algorithm_of(card), "digest": digest(prior), **origin}
+    policy = {"algorithm": algorithm_of(card).name, "digest": digest(prior), **origin}
     times = {"control_period_s": env.control_dt, "episode_steps": env.episode_length}
     actions = [{**entry, "low": -1.0, "high": 1.0} for entry in _entries(env.action)]
     spaces = {"observation": _entries(env.measured), "action": actions}

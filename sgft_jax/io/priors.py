@@ -12,22 +12,17 @@ import numpy as np
 from envs import mesh
 from envs.base import Varying
 from envs.types import PyTree, UserError
+from sgft_jax.algorithms import algorithm_of
 from sgft_jax.files.arrays import check_claim
 from sgft_jax.files.folders import present
 from sgft_jax.files.jsonfile import differences, write_json
 from sgft_jax.io import checkpoint
 from sgft_jax.io.cards import CARD, read_card, resolve_shipped
-from sgft_jax.learners.actor import ActorParams
-from sgft_jax.learners.recurrent import RecurrentParams
-from sgft_jax.learners.sac import SACParams
-from sgft_jax.learners.tdmpc2_model import TDMPC2Params
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.policies import check_parameters
 from sgft_jax.types import Normalizer, Prior
 
 __all__ = ["load_prior", "save_prior"]
-PARAMS = {"sac": SACParams, "tdmpc2": TDMPC2Params, "recurrent": RecurrentParams, "actor": ActorParams}
-"""What holds the parameters of a prior, by its algorithm. Files have the names of fields, not of these classes."""
 
 
 def save_prior(folder: str | Path, prior: Prior) -> Path:
@@ -56,9 +51,9 @@ def load_prior(
 ) -> Prior:
     """Read a prior from its folder, from the run folder that holds one as `prior/`, or by name: `shipped:push/seed-0`.
 
-    Its parameters are one of `PARAMS`, with None where there are none. Raises UserError if the prior is missing, torn,
-    or of another task, other sizes than asked for, or another version, or if its numbers are not those of the networks
-    that its card describes.
+    Its parameters are those of its algorithm, with None where there are none. Raises UserError if the prior is missing,
+    torn, or of another task, other sizes than asked for, or another version, or if its numbers are not those of the
+    networks that its card describes.
     """
     folder = _home(folder)
     manifest, card = checkpoint.read_manifest(folder), read_card(folder)
@@ -67,7 +62,8 @@ def load_prior(
     leaves = checkpoint.leaves_of(manifest)
     paths, shapes = [leaf.path for leaf in leaves], [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
     try:  # before memory is taken for what a file claims
-        check_parameters(card, _params(card, paths, shapes))
+        params = _params(card, paths, shapes)
+        check_parameters(card, params, algorithm_of(card).networks(card, params))
     except UserError as error:
         raise UserError(f"{folder}: {error}") from None
     check_claim(
@@ -82,7 +78,7 @@ def load_prior(
 
 def _params(card: Mapping[str, Any], paths: Sequence[str], leaves: Sequence[Any]) -> Any:
     """The parameters that hold arrays, or shapes, with these paths."""
-    container, tree = PARAMS[algorithm_of(card)], _nest(paths, leaves)
+    container, tree = algorithm_of(card).params(), _nest(paths, leaves)
     if odd := sorted(set(tree) - set(container._fields)):
         raise UserError(f"holds {', '.join(odd)}, which this version does not know; pretrain again")
     for name, kind in (("normalizer", Normalizer), ("distortion", Distortion)):
@@ -134,17 +130,13 @@ def digest(prior: Prior) -> str:
     return sha.hexdigest()[:12]
 
 
-def algorithm_of(card: Mapping[str, Any]) -> str:
-    """Which algorithm a prior is from; the first priors did not say, they were all SAC's."""
-    return card.get("algorithm", "sac")
-
-
 def _structure(card: Mapping[str, Any]) -> dict[str, Any]:
     """What must be equal for policies that run in one program."""
+    algorithm = algorithm_of(card)
     shared = {name: card.get(name) for name in ("network", "gamma", "ensemble_size", "plan")}
+    shared |= {name: card["config"][name] for name in algorithm.program}
     return shared | {
-        "algorithm": algorithm_of(card),
-        "gru": card["config"]["gru"] if algorithm_of(card) == "recurrent" else None,
+        "algorithm": algorithm.name,
         "previous_actions": card.get("previous_actions", 0),
         "system": card.get("system", []),
         "gap": card.get("gap"),  # methods that ask for simulated data get that of one simulator

@@ -61,5 +61,5 @@ def exported(state: PyTree) -> ActorParams:
 
 
 def card(network: NetworkConfig, head: Head, gamma: float) -> dict[str, Any]:
-    """What the card of such a policy says, see `sgft_jax.policies.make_policy`."""
+    """What the card of such a policy says, see `sgft_jax.make_policy`."""
     return {"algorithm": "actor", "network": jsonable(network), "head": head, "gamma": gamma}

@@ -10,9 +10,10 @@ from typing import Any, Literal, get_args, overload
 
 from envs import extend
 from envs.types import UserError, unknown
+from sgft_jax.algorithms import PRETRAINED
 from sgft_jax.methods.options import ActorCriticOptions
 from sgft_jax.train.options import LoopOptions
-from sgft_jax.types import Algorithm, Family, Finetuner, Fixed, FixedKind, HybridAgent, Method, Online
+from sgft_jax.types import Family, Finetuner, Fixed, FixedKind, HybridAgent, Method, Online
 
 __all__ = ["all_methods", "get_method"]
 
@@ -103,7 +104,7 @@ def _checked(source: str, method: Any, kind: Kind) -> Method:
 
 
 def _check_fields(way: Online | Fixed) -> None:
-    words = {"family": get_args(Family), "prior": get_args(Algorithm), "kind": get_args(FixedKind)}
+    words = {"family": get_args(Family), "prior": PRETRAINED, "kind": get_args(FixedKind)}
     flags = ("needs_prior", "zero_shot", "sees_system", "by_data")
     for field, value in way._asdict().items():
         if field in words and value not in words[field]:

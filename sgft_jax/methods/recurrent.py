@@ -20,7 +20,7 @@ class Config(checks.Checked):
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
-    from sgft_jax.policies import make_policy
+    from sgft_jax.algorithms import make_policy
     from sgft_jax.train.finetuner import assemble, unlearned
     from sgft_jax.train.options import card_of
 

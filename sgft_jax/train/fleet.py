@@ -17,9 +17,10 @@ from envs.mesh import split, whole
 from envs.rollout import Fleet, launch, step_fleet
 from envs.types import Array, Key, PyTree, Transition
 from sgft_jax.data import replay
+from sgft_jax.data.memory import Memory
 from sgft_jax.data.replay import ReplayState
 from sgft_jax.models.networks import Precision, precision
-from sgft_jax.types import Batch, Learner, Metrics, Task
+from sgft_jax.types import Batch, Learner, Metrics
 
 __all__ = ["FleetState"]
 
@@ -27,34 +28,6 @@ __all__ = ["FleetState"]
 Explore = Callable[[Fleet, Key], tuple[Array, PyTree]]
 # note(learner's state, before, action, after) -> what is kept of one simulated step beside its row
 Note = Callable[[PyTree, EnvState, Array, EnvState], PyTree]
-
-
-class Memory(NamedTuple):
-    """Experience of a fleet.
-
-    empty(transitions) -> experience with room for that many; one that keeps time slots takes the slots that fit.
-    add(experience, rows [n], valid [n], last [n]) -> the same with one step more. valid: not exploded; last: of its
-        episode.
-    cut(experience): no episode goes on after its newest step. held(experience) -> [capacity] bool.
-    sample(experience, key, n) -> Batch [n, ...].
-    """
-
-    empty: Callable[[int], PyTree]
-    add: Callable[[PyTree, Transition, Array, Array], PyTree]
-    cut: Callable[[PyTree], PyTree]
-    held: Callable[[PyTree], Array]
-    sample: Callable[[PyTree, Key, int], Batch]
-
-
-def transitions(task: Task) -> Memory:
-    """Single transitions in a `ReplayState`."""
-    return Memory(
-        empty=lambda capacity: replay.init(replay.blank(task.obs_dim, task.act_dim), capacity),
-        add=lambda experience, rows, valid, last: replay.add_batch(experience, rows, valid),
-        cut=lambda experience: experience,
-        held=lambda experience: jnp.arange(experience.data.reward.shape[0]) < experience.size,
-        sample=replay.sample,
-    )
 
 
 class FleetState(NamedTuple):

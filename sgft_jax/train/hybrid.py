@@ -13,6 +13,7 @@ from envs.base import Env, World
 from envs.rollout import Fleet
 from envs.types import Array, Key, PyTree
 from sgft_jax.data import replay
+from sgft_jax.data.memory import transitions
 from sgft_jax.train import fleet
 from sgft_jax.train.fleet import FleetState, Note, Plan, RoundKeys, StartKeys
 from sgft_jax.train.schedule import Schedule
@@ -54,7 +55,7 @@ def shape_of(env: Env, agent: HybridAgent, schedule: Schedule, pools: World, rea
 
 def memory(env: Env, agent: HybridAgent, schedule: Schedule, real: RealData) -> tuple[int, int]:
     """Bytes of one member's simulated rows, and of the real rows, which all members share; from the shapes alone."""
-    kept = fleet.bytes_of(lambda: fleet.transitions(env).empty(schedule.buffer)) if agent.simulates else 0
+    kept = fleet.bytes_of(lambda: transitions(env).empty(schedule.buffer)) if agent.simulates else 0
     return kept, fleet.bytes_of(agent.keep, real)
 
 
@@ -92,7 +93,7 @@ def make_plan(env: Env, agent: HybridAgent, schedule: Schedule) -> Plan:
     first_steps = -(-agent.batches.n_sim // schedule.simulators)
     return Plan(
         learner,
-        fleet.transitions(env),
+        transitions(env),
         simulators=schedule.simulators if agent.simulates else 0,
         capacity=schedule.buffer,
         chunks=schedule.chunks,

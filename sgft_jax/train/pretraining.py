@@ -12,6 +12,7 @@ from envs.domains.uniform import uniform
 from envs.mesh import split, whole
 from envs.rollout import Fleet, launch
 from envs.types import Array, Key, PyTree, Transition
+from sgft_jax.algorithms import recipe_of
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.keys import Pretraining, seed_keys
 from sgft_jax.models import normalizer
@@ -19,7 +20,6 @@ from sgft_jax.presets import PretrainConfig
 from sgft_jax.stacking import member, stack
 from sgft_jax.train import fleet
 from sgft_jax.train.fleet import Collected, FleetState, Plan, RoundKeys, StartKeys, Trainer, over_members
-from sgft_jax.train.recipes import RECIPES
 from sgft_jax.types import Batch, Metrics, Prior
 
 __all__ = ["pretrain", "priors_of"]
@@ -100,7 +100,7 @@ def world_keys(seeds: Sequence[int] | Array, number: int = 0) -> Key:
 
 def exported(env: Env, config: PretrainConfig, state: FleetState) -> PyTree:
     """Params [M, ...] of the agents as they are now."""
-    return RECIPES[config.algorithm](env, config).extract(state.learner)
+    return recipe_of(env, config).extract(state.learner)
 
 
 def prior_card(env: Env, config: PretrainConfig) -> dict[str, Any]:
@@ -133,7 +133,7 @@ def priors_of(env: Env, config: PretrainConfig, state: FleetState) -> list[Prior
 
 def memory(env: Env, config: PretrainConfig) -> dict[str, int]:
     """Bytes that one seed keeps on its devices, by the setting that decides them: experience, and what updates hold."""
-    kept = RECIPES[config.algorithm](env, config).memory
+    kept = recipe_of(env, config).memory
     drawn = config.updates_per_step * config.batch_size
     networks = config.ensemble_size + 4  # two critics, actor and V_sim
     activations = 2 * networks * config.batch_size * sum(config.network.hidden) * 4  # forwards and backwards, float32
@@ -153,7 +153,7 @@ def memory(env: Env, config: PretrainConfig) -> dict[str, int]:
 
 def random_experience(env: Env, config: PretrainConfig, pool: World, key: Key) -> PyTree:
     """Experience of one member under random actions, full but for exploded steps. pool: [W] worlds."""
-    kept = RECIPES[config.algorithm](env, config).memory
+    kept = recipe_of(env, config).memory
     key_launch, key_steps = jax.random.split(key)
     n_steps = config.random_transitions // config.n_envs
     start = Collected(launch(env, pool, key_launch, config.n_envs, ()), kept.empty(n_steps * config.n_envs))
@@ -172,7 +172,7 @@ def make_trainer(env: Env, config: PretrainConfig) -> Trainer:
 
 def make_plan(env: Env, config: PretrainConfig) -> Plan:
     """How one member trains."""
-    recipe = RECIPES[config.algorithm](env, config)
+    recipe = recipe_of(env, config)
     kept = recipe.memory
 
     def begin(agent: PyTree, random: PyTree) -> PyTree:

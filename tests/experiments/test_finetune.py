@@ -28,6 +28,7 @@ from experiments.runner.finetune_args import FinetuneArgs, arguments, run_folder
 from experiments.runner.finetune_record import FinetuneRecord
 from experiments.runner.recorded import RecordedSystem
 from sgft_jax import api
+from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis.curves import training_score
 from sgft_jax.analysis.reading import read_curve
 from sgft_jax.io import checkpoint, runs
@@ -35,7 +36,6 @@ from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.priors import load_prior
 from sgft_jax.io.real import RealStore
 from sgft_jax.methods import get_method
-from sgft_jax.policies import make_policy
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import finetuning
 

@@ -16,7 +16,7 @@ from envs.types import UserError
 from experiments.runner import cli
 from experiments.studies import gaps_draw as command
 from experiments.studies import gaps_drawn
-from sgft_jax import policies
+from sgft_jax.algorithms import make_policy
 from sgft_jax.identify import interface
 
 TEXT = """
@@ -59,7 +59,7 @@ def home(tmp_path, monkeypatch):
     monkeypatch.setattr(cli, "set_up", lambda: None)
 
     def by_hand(card, env):
-        return policies.make_policy(card, env)._replace(act=straight)
+        return make_policy(card, env)._replace(act=straight)
 
     monkeypatch.setattr(gaps_drawn, "make_policy", by_hand)
     monkeypatch.setattr(gaps_drawn, "command_interface", exactly)

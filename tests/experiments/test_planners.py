@@ -11,10 +11,10 @@ from priors_by_hand import save_prior
 
 from experiments import evaluate, finetune, pretrain
 from sgft_jax import api
+from sgft_jax.algorithms import make_policy
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.priors import load_prior
 from sgft_jax.learners import tdmpc2_model
-from sgft_jax.policies import make_policy
 
 PRETRAIN = """--task toy --preset tdmpc2 --no-video --config.size tiny --config.plan-samples 24 --config.n-envs 16
     --config.worlds 8 --config.env-steps 640 --config.random-transitions 160 --config.replay-capacity 320

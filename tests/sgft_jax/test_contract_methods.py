@@ -10,8 +10,8 @@ import pytest
 import tuners
 from tuners import METHODS, T, bits, equal
 
+from sgft_jax.algorithms import make_policy
 from sgft_jax.io import checkpoint
-from sgft_jax.policies import make_policy
 
 VARIANTS = ("sgft-relabel:ratio", "guarded:ratio")  # a method with an option on
 # Each shows what others are put together of; all of them are compiled in `make test-all`.

@@ -10,10 +10,10 @@ from tuners import METHODS, NET, TASK, T, compiled, equal, prior, started, tuner
 
 from envs.types import Policy, UserError
 from sgft_jax import transforms
+from sgft_jax.algorithms import make_policy
 from sgft_jax.data import sources
 from sgft_jax.learners import sac, tdmpc2_model
 from sgft_jax.models import dynamics, networks, normalizer
-from sgft_jax.policies import make_policy
 from sgft_jax.train import finetuner
 from sgft_jax.train.finetuner import Parts, assemble
 from sgft_jax.train.options import LoopOptions

@@ -16,14 +16,14 @@ from flax import struct
 
 import envs
 from envs.types import UserError
+from sgft_jax.algorithms import make_policy, recipe_of
 from sgft_jax.data import replay
 from sgft_jax.keys import seed_keys
 from sgft_jax.learners import tdmpc2_model
 from sgft_jax.models import normalizer
 from sgft_jax.models.networks import NetworkConfig
-from sgft_jax.policies import make_policy
 from sgft_jax.presets import PRESETS, PretrainConfig
-from sgft_jax.train import pretraining, recipes
+from sgft_jax.train import pretraining
 from sgft_jax.train.fleet import over_members
 from sgft_jax.train.pretraining import pretrain, priors_of
 from sgft_jax.types import Learner
@@ -55,7 +55,7 @@ def counting(task, config):
         act=lambda agent, carry, obs, key, *, explore: (jnp.full(task.act_dim, carry), carry + 1),
         update=lambda agent, batch, key: (agent, {"batch/reward": batch.reward.mean()}),
     )
-    sac = recipes.RECIPES["sac"](task, config)
+    sac = recipe_of(task, config)
     return sac._replace(
         learner=learner,
         hyper=lambda steps: jnp.float32(0),
@@ -74,7 +74,7 @@ def played(state, chunk):
 @pytest.fixture
 def counted(monkeypatch):
     """Trains the counting agent on risks by number of the set: [(state, metrics)] after every chunk, state in NumPy."""
-    monkeypatch.setattr(pretraining, "RECIPES", {"sac": counting})
+    monkeypatch.setattr(pretraining, "recipe_of", counting)
 
     def run(risks, **changes):
         env, config = toy_terminating.make(), replace(CONFIG, **changes)
@@ -129,7 +129,7 @@ def test_a_policy_remembers_the_random_action_that_replaced_its_choice(monkeypat
     def recipe(task, config):
         return counting(task, config)._replace(act=chosen, replaced=lambda carry, action: action[0])
 
-    monkeypatch.setattr(pretraining, "RECIPES", {"sac": recipe})
+    monkeypatch.setattr(pretraining, "recipe_of", recipe)
     config = replace(CONFIG, chunk_steps=5, env_steps=5 * N, random_ladder=1.0)
     *_, (state, _) = pretrain(toy_terminating.make(), config, [3])
     done = state.replay.data.action[0, 4 * N : 5 * N, 0]
@@ -140,7 +140,7 @@ def test_a_policy_remembers_the_random_action_that_replaced_its_choice(monkeypat
 
 def test_statistics_are_those_of_the_steps_that_did_not_explode(monkeypatch):
     """Half of the random steps explode, and leave the end of their buffer empty."""
-    monkeypatch.setattr(pretraining, "RECIPES", {"sac": counting})
+    monkeypatch.setattr(pretraining, "recipe_of", counting)
     env = toy_terminating.make()
     pool, step = envs.sample_worlds(env, jax.random.key(0), 4, params={"risk": 0.0}), env.step
     env = env._replace(step=lambda *now: step(*now)._replace(invalid=now[2][0] > 0))
@@ -220,7 +220,7 @@ def test_random_actions_grow_along_the_fleet(key, monkeypatch):
     def always(agent, carry, obs, key):
         return jnp.full(2, 2.0), carry
 
-    monkeypatch.setattr(pretraining, "RECIPES", {"sac": lambda *given: counting(*given)._replace(act=always)})
+    monkeypatch.setattr(pretraining, "recipe_of", lambda *given: counting(*given)._replace(act=always))
     config = replace(CONFIG, n_envs=3, chunk_steps=60, env_steps=180, random_ladder=1.0)
     *_, (state, _) = pretrain(toy.make(), config, [0])
     obeyed = (state.replay.data.action[0, : 3 * 60].reshape(60, 3, 2) > 1).all(-1).mean(0)
@@ -230,7 +230,7 @@ def test_random_actions_grow_along_the_fleet(key, monkeypatch):
 @pytest.mark.parametrize("algorithm", ["sac", "tdmpc2", "recurrent"])
 def test_the_learning_rate_falls_linearly_to_its_end(algorithm):
     config = replace(PRESETS["cpu"], algorithm=algorithm, size="1M", n_envs=10, env_steps=1000, lr=1e-3, lr_end=0.1)
-    recipe = recipes.RECIPES[algorithm](toy.make(), config)
+    recipe = recipe_of(toy.make(), config)
     rate = {"sac": "lr_critic", "tdmpc2": "lr", "recurrent": "lr"}[algorithm]
     rates = [float(getattr(recipe.hyper(jnp.int32(steps)), rate)) for steps in (0, 50, 100, 120)]
     np.testing.assert_allclose(rates, [1e-3, 5.5e-4, 1e-4, 1e-4], rtol=1e-5)

@@ -20,10 +20,10 @@ import envs
 from envs.base import Entry
 from envs.rollout import Episode
 from envs.types import UserError
-from sgft_jax.policies import make_policy
+from sgft_jax.algorithms import make_policy, recipe_of
 from sgft_jax.presets import PretrainConfig
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.train import finetuning, pretraining, recipes
+from sgft_jax.train import finetuning, pretraining
 from sgft_jax.train.guard import Guarded
 from sgft_jax.types import Finetuner
 
@@ -66,10 +66,10 @@ def pretrained(algorithm):
     config = dataclasses.replace(CONFIG, algorithm=algorithm)
 
     def recipe(*given):
-        return counting(recipes.RECIPES[algorithm](*given))
+        return counting(recipe_of(*given))
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pretraining, "RECIPES", {algorithm: recipe})
+        patch.setattr(pretraining, "recipe_of", recipe)
         *_, (state, metrics) = pretraining.pretrain(ENV, config, [0, 1])
         priors = pretraining.priors_of(ENV, config, state)
     return Pretrained(state, metrics, priors, jax.tree.map(lambda *x: jnp.stack(x), *[p.params for p in priors]))

@@ -1,6 +1,7 @@
 """Recurrent SAC: the carry is the window replayed, masks, the losses by hand, and a system that must be found out."""
 
 import functools
+from types import SimpleNamespace
 
 import chex
 import jax
@@ -10,11 +11,12 @@ import pytest
 import toy_steps
 
 from sgft_jax import api
+from sgft_jax.algorithms import make_policy
+from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.learners import recurrent
 from sgft_jax.models import normalizer
 from sgft_jax.models.gru import make_gru
 from sgft_jax.models.networks import NetworkConfig, make_actor, make_critic, tanh_gaussian_sample
-from sgft_jax.policies import recurrent_policy
 from sgft_jax.presets import PretrainConfig
 from sgft_jax.train.pretraining import pretrain, priors_of
 from sgft_jax.types import Batch, Normalizer
@@ -84,7 +86,8 @@ def test_it_remembers_what_it_saw_and_did(changed, key):
 
 
 def test_the_policy_of_a_prior_is_the_agents(key):
-    state, policy = started(), recurrent_policy(CONFIG)
+    card = {"algorithm": "recurrent", "network": jsonable(NET), "config": {"gru": UNITS}}
+    state, policy = started(), make_policy(card, SimpleNamespace(obs_dim=OBS, act_dim=ACT))
     params = recurrent.extract_params(state)
     carries = policy.init_carry(), LEARNER.init_carry()
     for explore in (False, True):

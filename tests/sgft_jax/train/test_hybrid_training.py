@@ -16,10 +16,10 @@ from envs.gaps import Gap
 from envs.pools import real_worlds
 from envs.rollout import step_fleet
 from envs.types import UserError
+from sgft_jax.algorithms import make_policy
 from sgft_jax.data import replay
 from sgft_jax.methods import FIXED_NAMES, get_method
 from sgft_jax.methods.options import return_scale
-from sgft_jax.policies import make_policy
 from sgft_jax.train import fleet, hybrid
 from sgft_jax.train.fleet import over_members
 from sgft_jax.train.schedule import Schedule

@@ -1,0 +1,73 @@
+"""SAC with V_sim and a dynamics ensemble: the priors of most methods. Those with a `plan` act by plans."""
+
+import functools
+from collections.abc import Mapping
+from typing import Annotated, Any, NotRequired
+
+from msgspec import Meta, Struct
+
+from envs.types import Array, Policy, PyTree
+from sgft_jax import data, learners
+from sgft_jax.algorithms.base import Algorithm, Card, Config, NetworkEntry, Networks, Recipe, Width, scheduled
+from sgft_jax.types import Task
+
+
+class _Plan(Struct, forbid_unknown_fields=True):
+    horizon: Width = 1
+    samples: Width = 1
+    noise: Annotated[float, Meta(ge=0)] = 0.0
+
+
+class _SACCard(Card):
+    network: NetworkEntry
+    plan: NotRequired[_Plan | None]
+
+
+def _policy(card: Mapping[str, Any], task: Task) -> Policy:
+    from sgft_jax.planning.mpc import MPCConfig
+    from sgft_jax.policies import mpc_policy, network_of, sac_policy
+
+    network = network_of(card)
+    if plan := card.get("plan"):
+        return mpc_policy(MPCConfig(task.obs_dim, task.act_dim, network, **plan, gamma=card["gamma"]), task)
+    return sac_policy(task.obs_dim, task.act_dim, network)
+
+
+def _networks(card: Mapping[str, Any], params: Any) -> Networks:
+    from sgft_jax.models import networks
+    from sgft_jax.policies import network_of
+
+    sizes, network = (card["obs_dim"], card["act_dim"]), network_of(card)
+    yield "actor", networks.make_actor(*sizes, network), params.actor
+    if params.critic is not None:
+        yield "critic", networks.make_critic(*sizes, network, members=_members(params.critic)), params.critic
+    if params.value is not None:
+        yield "value", networks.make_value(sizes[0], network), params.value
+    if params.dynamics is not None:
+        ensemble = networks.make_dynamics(*sizes, network, members=_members(params.dynamics))
+        yield "dynamics", ensemble, params.dynamics
+
+
+def _members(ensemble: PyTree) -> int:
+    """How many networks an ensemble has; methods may keep fewer or more than the prior had."""
+    import jax
+
+    return next(iter(jax.tree.leaves(ensemble)[0].shape), 1)
+
+
+def _recipe(task: Task, config: Config) -> Recipe:
+    """One learning rate for all networks, as in the paper."""
+    sac = learners.sac
+
+    def numbers(rate: Array) -> Any:
+        rates = dict.fromkeys(("lr_actor", "lr_critic", "lr_value", "lr_dynamics", "lr_alpha"), rate)
+        return sac.SACHyper(**rates, tau=config.tau, alpha=config.alpha, entropy_per_dim=config.entropy_per_dim)
+
+    shared = {name: getattr(config, name) for name in ("network", "ensemble_size", "policy_delay")}
+    hyper = scheduled(config, numbers)
+    learner = sac.make_sac(sac.SACConfig(task.obs_dim, task.act_dim, **shared), hyper(0))
+    explore = functools.partial(learner.act, explore=True)
+    return Recipe(learner, data.memory.transitions(task), hyper, learner.init_carry, explore, sac.extract_params)
+
+
+ALGORITHM = Algorithm("sac", _SACCard, lambda: learners.sac.SACParams, _policy, _networks, _recipe, preset="robust")
