@@ -369,7 +369,7 @@ class _Acting:
 def _real(best: Best, played: Sequence[Episode]) -> Metrics:
     """[M] how rollouts [M, 1] went, on average; one that exploded as `best` knows it."""
     facts = [(x.score[:, 0], x.total_reward[:, 0], x.exploded[:, 0]) for x in played]
-    counted = [evidence.as_known(best, *own) for own in facts]
+    counted = [evidence.as_known(best, *outcome) for outcome in facts]
     return {
         "real/return": _mean(*[total for _, total in counted]),
         "real/score": _mean(*[score for score, _ in counted]),

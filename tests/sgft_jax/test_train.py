@@ -533,8 +533,8 @@ def test_members_share_simulated_rows():
     seeds, simulated = jnp.arange(members, dtype=jnp.uint32), rows_of(n)
     learning = finetuning.Updates(fine, seeds, finetuning.prior_of(PRIORS, seeds), simulated)
     states = jax.eval_shape(lambda: finetuning.begin(fine, PRIORS, seeds, simulated)).agent
-    keys = jax.random.split(jax.random.key(0), members)
-    program = learning._learn.lower(states, keys, 1, simulated, False, None).as_text()
+    member_keys = jax.random.split(jax.random.key(0), members)
+    program = learning._learn.lower(states, member_keys, 1, simulated, False, None).as_text()
     assert set(re.findall(rf"tensor<([\dx]*){n}x", program)) == {"2x"}  # two priors, no member
 
 
