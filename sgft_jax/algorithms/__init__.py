@@ -9,7 +9,7 @@ from envs.types import Policy, UserError, unknown
 from sgft_jax.algorithms.base import Algorithm, Config, Recipe
 from sgft_jax.types import Task
 
-__all__ = ["get_algorithm", "make_policy"]
+__all__ = ["make_policy"]
 
 _FIRST = ("sac", "tdmpc2")  # where algorithms are listed; the others follow by name
 _FILES = (module.name for module in pkgutil.iter_modules(__path__) if module.name != "base")
