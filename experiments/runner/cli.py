@@ -207,15 +207,20 @@ def parse[T](
     """A frozen dataclass from the command line; raises UserError for a bad one."""
     words = list(sys.argv[1:] if argv is None else argv)
     with _errors.on_parse_error(lambda event: _refuse(event, words, config_type, default)):
-        return cast(T, tyro.cli(config_type, prog=_program(), description=description, args=words, default=default))
+        return cast(
+            T, tyro.cli(config_type, prog=_program(words), description=description, args=words, default=default)
+        )
 
 
-def _program() -> str | None:
-    """What a user types before the options: `sgft NAME` where that script was started; None for tyro's own guess."""
+def _program(words: Sequence[str]) -> str | None:
+    """What a user types before `words`: `sgft NAME` where that script was started; None for tyro's own guess."""
     if (spec := getattr(sys.modules["__main__"], "__spec__", None)) is None:
         return None
     by_script = any(Path(word).stem == "sgft" for word in sys.orig_argv[1:3])  # the second one behind an option
-    return f"sgft {spec.name.rpartition('.')[2]}" if by_script else f"python -m {spec.name}"
+    command = f"sgft {spec.name.rpartition('.')[2]}" if by_script else f"python -m {spec.name}"
+    before = len(sys.argv) - len(words)
+    kind = sys.argv[1:before] if sys.argv[before:] == list(words) else []  # such as `hybrid` of `compare hybrid`
+    return " ".join([command, *kind])
 
 
 def preview(argv: Sequence[str], **defaults: Any) -> SimpleNamespace:
@@ -251,6 +256,8 @@ def _unexpected(word: str, options: Sequence[str]) -> str:
     if not word.startswith("-"):
         return f"unexpected word {word!r} on the command line; options begin with --"
     option = word.partition("=")[0].replace("_", "-")
+    if option in options:
+        return f"{option} is no option here: give its value alone"
     close = difflib.get_close_matches(option, options, n=1)
     return f"there is no option {option}; {f'did you mean {close[0]}?' if close else '--help lists them all'}"
 
