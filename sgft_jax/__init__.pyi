@@ -17,9 +17,10 @@ from .systems.remote import Remote
 from .systems.simulated import Simulated
 from .train import guard
 from .train.finetuner import FinetuneState, Parts, assemble, sac_finetuner
-from .train.finetuning import FinetuneProgress, evaluate, finetune, simulate
+from .train.finetuning import FinetuneProgress, evaluate, finetune
 from .train.fleet import FleetState
 from .train.pretraining import pretrain, priors_of
+from .train.simulation import simulate
 from .transforms import branch, clip, compose, relabel, shape, shaped_reward, shorten, stateless, weigh
 from .types import (
     Batch,

@@ -28,9 +28,9 @@ from sgft_jax.presets import check_card
 from sgft_jax.stacking import member, stack
 from sgft_jax.systems import System
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.train import finetuning
-from sgft_jax.train.finetuning import FinetuneProgress, SimulatedRows
+from sgft_jax.train.finetuning import FinetuneProgress
 from sgft_jax.train.options import card_of
+from sgft_jax.train.simulation import SimulatedRows, simulate
 from sgft_jax.types import Finetuner, Online, Prior
 
 __all__ = ["ActingPolicy", "Setup", "evaluate_prior", "finetuned_priors", "load_policy", "make_env", "setup"]
@@ -107,7 +107,7 @@ def _simulated_rows(env: Env, finetuner: Finetuner, priors: list[Prior], stacked
     env, gap = _simulator(env, card)
     worlds = training_worlds(env, gap, key, SIMULATED_WORLDS)
     policy, simulation = make_policy(card, env), finetuner.simulation
-    return finetuning.simulate(env, policy, worlds, stacked, key, simulation, gamma=card["gamma"])
+    return simulate(env, policy, worlds, stacked, key, simulation, gamma=card["gamma"])
 
 
 def _simulator(env: Env, card: Mapping[str, Any]) -> tuple[Env, Gap | None]:

@@ -11,23 +11,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.base import Env, World
 from envs.mesh import split_vmap
-from envs.rollout import Episode, play_episode
-from envs.types import Array, Key, Policy, PyTree, Transition, UserError
-from sgft_jax.data import replay
+from envs.rollout import Episode
+from envs.types import Array, Key, PyTree, Transition, UserError
 from sgft_jax.keys import Finetuning
 from sgft_jax.systems import System
 from sgft_jax.train import evidence
 from sgft_jax.train.evidence import Best
 from sgft_jax.train.guard import Guarded
-from sgft_jax.types import Finetuner, Metrics, SimulatedData, Simulation
+from sgft_jax.train.simulation import SimulatedRows
+from sgft_jax.types import Finetuner, Metrics
 
-__all__ = ["FinetuneProgress", "evaluate", "finetune", "simulate"]
+__all__ = ["FinetuneProgress", "evaluate", "finetune"]
 
 Phase = Literal["offline", "logged", "online"]  # of learning, see `Updates`
 OFFLINE_PART = 5_000  # updates of the offline phase between two yields
-_AT_ONCE = 1024  # simulated episodes played together
 
 
 class FinetuneProgress(NamedTuple):
@@ -54,25 +52,6 @@ class Logged(NamedTuple):
     transitions: Transition
     valid: Array
     updates: int
-
-
-class SimulatedRows(NamedTuple):
-    """Transitions of the simulator, one set for each of P priors, shared by all members.
-
-    replay: [P, ...]. returns: [P, episodes] of the task, undiscounted.
-    """
-
-    replay: replay.ReplayState
-    returns: Array
-
-    def of(self, which: Array) -> SimulatedData:
-        """The set of prior `which` [], without a copy of it."""
-
-        def draw(key: Key, n: int) -> Transition:
-            rows = jax.random.randint(key, (n,), 0, jnp.maximum(self.replay.size[which], 1))
-            return jax.tree.map(lambda x: x[which, rows], self.replay.data)
-
-        return SimulatedData(draw, self.returns[which])
 
 
 class Beside(Protocol):
@@ -416,47 +395,3 @@ def _episode_keys(seeds: Array, purpose: Array, rollout: Array, n: int) -> Key:
         return jax.vmap(lambda i: jax.random.fold_in(_key(seed, purpose, rollout), i))(jnp.arange(n))
 
     return jax.vmap(keys)(seeds)
-
-
-# --- simulated data ---------------------------------------------------------------------------------------------------
-
-
-def simulate(
-    env: Env, policy: Policy, pool: World, priors: PyTree, key: Key, needs: Simulation, *, gamma: float
-) -> SimulatedRows:
-    """Whole episodes of every prior's exploring policy in simulated worlds.
-
-    pool: worlds [W] of the training domain. priors: params [P, ...]. needs: how many transitions, and the largest share
-    of random actions: in the i-th of n episodes a share i / (n - 1) * needs.ladder of the actions is uniformly random.
-    """
-    keys = jax.random.split(key, jax.tree.leaves(priors)[0].shape[0])
-    one = functools.partial(_simulate, env, policy, pool, needs=needs, gamma=gamma)
-    return SimulatedRows(*jax.jit(jax.vmap(one))(priors, keys))
-
-
-def _simulate(
-    env: Env, policy: Policy, pool: World, params: PyTree, key: Key, *, needs: Simulation, gamma: float
-) -> tuple[replay.ReplayState, Array]:
-    n = -(-needs.transitions // env.episode_length)
-    at_once = min(n, _AT_ONCE)
-    parts = -(-n // at_once)
-
-    def play(key: Key, share: Array) -> Episode:
-        def act(carry: PyTree, obs: Array, key: Key) -> tuple[Array, PyTree]:
-            key_policy, key_replace, key_random = jax.random.split(key, 3)
-            action, carry = policy.act(params, carry, obs, key_policy, explore=True)
-            random = jax.random.uniform(key_random, (env.act_dim,), minval=-1.0, maxval=1.0)
-            return jnp.where(jax.random.uniform(key_replace) < share, random, action), carry
-
-        return play_episode(env, pool, act, policy.init_carry(), key, gamma=gamma)
-
-    def part(buffer: replay.ReplayState, inputs: tuple[Key, Array]) -> tuple[replay.ReplayState, Array]:
-        key, shares = inputs
-        episodes = jax.vmap(play)(jax.random.split(key, at_once), shares)
-        rows, valid = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (episodes.transitions, episodes.valid))
-        return replay.add_batch(buffer, rows, valid), episodes.total_reward
-
-    empty = replay.init(replay.blank(env.obs_dim, env.act_dim), parts * at_once * env.episode_length)
-    shares = jnp.linspace(0.0, needs.ladder, parts * at_once).reshape(parts, at_once)
-    buffer, returns = jax.lax.scan(part, empty, (jax.random.split(key, parts), shares))
-    return buffer, returns.reshape(-1)

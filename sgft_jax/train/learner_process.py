@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 
 from envs.types import Array, PyTree, UserError
-from sgft_jax.train.finetuning import Phase, SimulatedRows, Updates
+from sgft_jax.train.finetuning import Phase, Updates
+from sgft_jax.train.simulation import SimulatedRows
 from sgft_jax.types import Finetuner, Metrics
 
 

@@ -25,6 +25,7 @@ from sgft_jax.presets import PretrainConfig
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import finetuning, pretraining
 from sgft_jax.train.guard import Guarded
+from sgft_jax.train.simulation import simulate
 from sgft_jax.types import Finetuner
 
 BASE = toy_terminating.make()
@@ -111,7 +112,7 @@ def finetuned(name):
     rows = None
     if fine.simulation is not None:
         policy = make_policy(priors[0].card, ENV)
-        rows = finetuning.simulate(ENV, policy, pools, params, jax.random.key(1), fine.simulation, gamma=GAMMA)
+        rows = simulate(ENV, policy, pools, params, jax.random.key(1), fine.simulation, gamma=GAMMA)
     stacked, seeds = jax.tree.map(lambda x: x.reshape(2, 2, *x.shape[1:]), pools), jnp.arange(M, dtype=jnp.uint32)
     system = Recorded(Simulated(ENV, stacked, seeds // (M // 2), gamma=GAMMA))
     steps = finetuning.finetune(fine, system, params, seeds, rows, rollouts=2)

@@ -21,6 +21,7 @@ from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import finetuning
 from sgft_jax.train.finetuner import Parts, assemble
 from sgft_jax.train.options import LoopOptions
+from sgft_jax.train.simulation import SimulatedRows, simulate
 from sgft_jax.types import Learner, Simulation
 
 ENV, GAMMA = toy_terminating.make(), 0.9
@@ -506,7 +507,7 @@ def rows_of(n, p=2):
         rows = jax.tree.map(lambda x: jnp.full((n, *x.shape), 100.0 * (i + 1)), example)
         return replay.add_batch(replay.init(example, n), rows)
 
-    return finetuning.SimulatedRows(jax.tree.map(lambda *x: jnp.stack(x), *map(one, range(p))), jnp.ones((p, 3)))
+    return SimulatedRows(jax.tree.map(lambda *x: jnp.stack(x), *map(one, range(p))), jnp.ones((p, 3)))
 
 
 @pytest.mark.slow
@@ -541,7 +542,7 @@ def test_members_share_simulated_rows():
 def test_simulate_plays_whole_episodes_with_more_and_more_random_actions():
     pool = envs.sample_worlds(ENV, jax.random.key(0), 4)
     still = Policy(lambda: (), lambda params, carry, obs, key, *, explore: (params[None], carry), lambda *_: 0.0)
-    made = finetuning.simulate(ENV, still, pool, PRIORS, jax.random.key(1), Simulation(600, 0.8), gamma=GAMMA)
+    made = simulate(ENV, still, pool, PRIORS, jax.random.key(1), Simulation(600, 0.8), gamma=GAMMA)
     assert made.returns.shape == (2, 50) and (made.replay.size > 100).all()
     for p, own in enumerate(PRIORS):
         data = made.of(p).draw(jax.random.key(2), 4000)

@@ -16,7 +16,7 @@ from sgft_jax.data import replay
 from sgft_jax.files.jsonfile import jsonable
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.models.config import NetworkConfig
-from sgft_jax.train import finetuning
+from sgft_jax.train.simulation import SimulatedRows
 from sgft_jax.types import Finetuner, Normalizer, Prior
 
 T = 12  # steps of an episode
@@ -140,7 +140,7 @@ def simulated():
     """The simulator's transitions for one prior: rewards are 100, returns 100 to 300."""
     rows = episode(jax.random.key(5), 24)._replace(reward=jnp.full(24, 100.0))
     buffer = replay.add_batch(replay.init(replay.blank(2, 2), 24), rows)
-    return finetuning.SimulatedRows(jax.tree.map(lambda x: x[None], buffer), jnp.array([[100.0, 300.0]]))
+    return SimulatedRows(jax.tree.map(lambda x: x[None], buffer), jnp.array([[100.0, 300.0]]))
 
 
 def episode(key, n=T):
