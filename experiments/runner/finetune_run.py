@@ -141,7 +141,8 @@ class _Run(Training):
         learner: LearnerProcess | None,
     ) -> None:
         names = "+".join(record.gap.name for record in records)
-        super().__init__(records, f"{records[0].method} on {system.env.name}/{names}", args.rollouts)
+        title, every = f"{records[0].method} on {system.env.name}/{names}", (args.eval_every, args.checkpoint_every)
+        super().__init__(records, title, args.rollouts, eval_every=every[0], checkpoint_every=every[1])
         self.logs, self.learner, self.sync_every = logs, learner, args.sync_every if learner else None
         self.args, self.setup, self.card = args, setup, card
         self.finetuner, self.system, self.seeds = setup.finetuner, system, setup.seeds

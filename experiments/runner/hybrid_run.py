@@ -122,7 +122,9 @@ class _Run(Training):
         names = "+".join(gap.name for gap in setup.gaps)
         expect = {"kind": "hybrid", "task": self.env.name, "method": setup.method.name, "seeds": setup.seeds}
         title = f"{setup.method.name} on {self.env.name}/{names}"
-        super().__init__([Record(folder, expect) for folder in folders], title, self.args.schedule.updates_in_all)
+        records = [Record(folder, expect) for folder in folders]
+        every = {"eval_every": self.args.eval_every, "checkpoint_every": self.args.checkpoint_every}
+        super().__init__(records, title, self.args.schedule.updates_in_all, **every)
 
     def work(self) -> list[dict[str, Any]]:
         """Everything, in order; returns the summaries."""
@@ -140,18 +142,12 @@ class _Run(Training):
     def done(self, state: FleetState) -> int:
         return int(jax.device_get(state.rounds)[0]) * self.args.schedule.updates_per_round
 
-    def evaluates(self, before: int, done: int, *, learned: bool) -> bool:
-        return done == 0 or self.due(self.args.eval_every, before, done)
-
     def evaluate(self, state: FleetState, done: int) -> dict[str, float]:
         played = self._play(state, self.args.eval_episodes)
         values = scores(played) | self._measures(played)
         for record, part in self.each(values):
             record.log.eval(done, part)
         return {f"{self.env.score}, real system": float(values["score"].mean())}
-
-    def checkpoints(self, before: int, done: int, *, learned: bool) -> bool:
-        return self.due(self.args.checkpoint_every, before, done)
 
     def checkpoint(self, state: FleetState, done: int) -> None:
         for record, part in self.each(state):

@@ -101,7 +101,8 @@ class _Run(Training):
         self.home, self.config = home, args.config
         self.expect = {"kind": "pretrain", "task": env.name, "seeds": seeds}
         record, size = Record(folder, self.expect, home), self.config.chunk_env_steps
-        super().__init__([record], f"pretrain {env.name}", self.config.chunks * size)
+        every = {"eval_every": self.config.eval_every * size, "checkpoint_every": self.config.checkpoint_every * size}
+        super().__init__([record], f"pretrain {env.name}", self.config.chunks * size, **every)
         self.card = prior_card(env, self.config)
         self.policy = make_policy(self.card, env)
         self.pools = functools.lru_cache(maxsize=1)(self._pools)  # worlds take long to compile
@@ -158,9 +159,6 @@ class _Run(Training):
         ended = values["train/episodes"].all()  # episodes begin together, so in some chunks none ends
         return {"success, exploring": float(values["train/success"].mean())} if ended else {}
 
-    def evaluates(self, before: int, done: int, *, learned: bool) -> bool:
-        return done == 0 or self.due(self.config.eval_every * self.config.chunk_env_steps, before, done)
-
     def evaluate(self, state: FleetState, done: int) -> dict[str, float]:
         """Every evaluation plays the same episodes in the same held-out worlds."""
         params = exported(self.env, self.config, state)
@@ -170,9 +168,6 @@ class _Run(Training):
         since = self.config.choose_from * self.config.chunks * self.config.chunk_steps
         self.best = best_of(self.best, params, played, state.rounds, since=since)
         return {f"{name}, evaluation": float(values[name].mean()) for name in ("success", "return")}
-
-    def checkpoints(self, before: int, done: int, *, learned: bool) -> bool:
-        return self.due(self.config.checkpoint_every * self.config.chunk_env_steps, before, done)
 
     def checkpoint(self, state: FleetState, done: int) -> None:
         assert self.best is not None  # evaluated before the first chunk

@@ -63,13 +63,18 @@ class Training:
     """What happens between compiled calls; what is on disk comes before what is in memory.
 
     Members [M = G * S] are the seeds of the first record, then those of the next. A kind of run says how far a state is
-    (`done`, in `unit`), what is logged, when and how its policies are evaluated, and what a checkpoint holds.
+    (`done`, in `unit`), what is logged, how its policies are evaluated, and what a checkpoint holds.
+
+    total: units of the whole run. eval_every, checkpoint_every: units from one evaluation or checkpoint to the next.
     """
 
     unit = ""
 
-    def __init__(self, records: Sequence[Any], title: str, total: int) -> None:
+    def __init__(
+        self, records: Sequence[Any], title: str, total: int, *, eval_every: int, checkpoint_every: int
+    ) -> None:
         self.records, self.title, self.total, self.clock = records, title, total, Clock()
+        self.eval_every, self.checkpoint_every = eval_every, checkpoint_every
         self.count = len(records[0].seeds)
 
     def each(self, members: PyTree) -> Iterator[tuple[Any, PyTree]]:
@@ -134,22 +139,22 @@ class Training:
             check_finite(metrics, done, unit=self.unit, last_good=record.last_good)
         return {}
 
+    def evaluates(self, before: int, done: int, *, learned: bool) -> bool:
+        """Whether there is an evaluation now. learned: whether there have been updates since the last time."""
+        return done == 0 or self.due(self.eval_every, before, done)
+
+    def checkpoints(self, before: int, done: int, *, learned: bool) -> bool:
+        """Whether there is a checkpoint now."""
+        return self.due(self.checkpoint_every, before, done)
+
     # what a kind of run says
 
     def done(self, state: Any) -> int:
         """Units behind a state."""
         raise NotImplementedError
 
-    def evaluates(self, before: int, done: int, *, learned: bool) -> bool:
-        """Whether there is an evaluation now. learned: whether an update has been made since the last time."""
-        raise NotImplementedError
-
     def evaluate(self, state: Any, done: int) -> dict[str, float]:
         """Plays and logs an evaluation; returns what the progress bar shows."""
-        raise NotImplementedError
-
-    def checkpoints(self, before: int, done: int, *, learned: bool) -> bool:
-        """Whether there is a checkpoint now."""
         raise NotImplementedError
 
     def checkpoint(self, state: Any, done: int) -> None:

@@ -47,12 +47,15 @@ class FleetState(NamedTuple):
 
 
 class StartKeys(NamedTuple):
-    """What decides the beginning: the agent's parameters, the fleet's episodes, its first steps, and the rounds."""
+    """What decides the beginning: the agent's parameters, the fleet's episodes, and the rounds.
+
+    steps: [n, 2] for actions and for physics of the fleet's steps before the first round; None without such steps.
+    """
 
     learner: Key
     fleet: Key
-    steps: Key
     rounds: Key
+    steps: Key | None = None
 
 
 class RoundKeys(NamedTuple):
@@ -76,9 +79,9 @@ class Plan(NamedTuple):
     begin(agent, data) -> a fresh agent that knows the data it starts with.
     tune(agent, rounds []) -> the agent with the hyper-parameters of that round.
     start_keys(key), round_keys(key): which keys decide what. batches(data, replay, rows' keys) -> Batch [U, B, ...].
-    ready(replay) -> [] whether there is anything to learn from; an agent that is not ready stays as it is.
+    ready(replay) -> [] whether there is anything to learn from; else the agent stays as it is. None: there always is.
     measure(after, rows, valid) -> Metrics of a step of the fleet; summarise([rounds, steps] of these) -> Metrics.
-    first_steps: of the fleet before the first round. precision: of the updates' matrix products.
+    precision: of the updates' matrix products.
     """
 
     learner: Learner
@@ -94,10 +97,9 @@ class Plan(NamedTuple):
     round_keys: Callable[[Key], RoundKeys]
     batches: Callable[[PyTree, PyTree, Key], Batch]
     tune: Callable[[PyTree, Array], PyTree] = lambda agent, rounds: agent
-    ready: Callable[[PyTree], Array] = lambda held: jnp.ones((), bool)
+    ready: Callable[[PyTree], Array] | None = None
     measure: Callable[[EnvState, Transition, Array], Metrics] = lambda after, rows, valid: {}
     summarise: Callable[[Metrics], Metrics] = lambda measured: measured
-    first_steps: int = 0
     precision: Precision = "default"
 
     def chunks_done(self, state: FleetState) -> int:
@@ -186,7 +188,7 @@ def make_trainer(env: Env, plan: Plan, *, gamma: float, note: Note | None = None
             first = jax.tree.map(lambda x: x[0], fleet.state)
             example = note(agent, first, jnp.zeros(env.act_dim), first)
             state = state._replace(notes=replay.init(example, plan.capacity))
-        if plan.first_steps:
+        if keys.steps is not None:
             state, _ = advance(pool, state, keys.steps)
         return spread(state)
 
@@ -197,15 +199,18 @@ def make_trainer(env: Env, plan: Plan, *, gamma: float, note: Note | None = None
 
     def update(data: PyTree, state: FleetState, keys: RoundKeys) -> tuple[PyTree, Metrics, Array]:
         """The agent after a round's updates, their metrics, and whether there was anything to learn from []."""
-        batches, ready = plan.batches(data, state.replay, keys.rows), plan.ready(state.replay)
+        batches = plan.batches(data, state.replay, keys.rows)
         with precision(plan.precision):
             agent, metrics = jax.lax.scan(
                 lambda agent, x: learner.update(agent, *x),
                 plan.tune(state.learner, state.rounds),
                 (batches, keys.updates),
             )
-        agent = jax.tree.map(lambda new, old: jnp.where(ready, new, old), agent, state.learner)
-        return agent, {name: x.mean() for name, x in metrics.items()}, ready
+        averages, ready = {name: x.mean() for name, x in metrics.items()}, jnp.ones((), bool)
+        if plan.ready:
+            ready = plan.ready(state.replay)
+            agent = jax.tree.map(lambda new, old: jnp.where(ready, new, old), agent, state.learner)
+        return agent, averages, ready
 
     def one_round(pool: World, data: PyTree, state: FleetState) -> tuple[FleetState, tuple[Metrics, Metrics, Array]]:
         keys, measured = plan.round_keys(state.key), {}

@@ -76,7 +76,7 @@ def make_plan(env: Env, agent: HybridAgent, schedule: Schedule) -> Plan:
 
     def start_keys(key: Key) -> StartKeys:
         key_learner, key_fleet, key_steps, key_rounds = jax.random.split(key, 4)
-        return StartKeys(key_learner, key_fleet, _pairs(key_steps, first_steps), key_rounds)
+        return StartKeys(key_learner, key_fleet, key_rounds, _pairs(key_steps, first) if first else None)
 
     def round_keys(key: Key) -> RoundKeys:
         key, key_steps, key_updates = jax.random.split(key, 3)
@@ -88,9 +88,9 @@ def make_plan(env: Env, agent: HybridAgent, schedule: Schedule) -> Plan:
 
     def ready(simulated: PyTree) -> Array:
         """An empty buffer is sampled as zeros, which nobody has lived through: all simulators have exploded."""
-        return simulated.size > 0 if agent.batches.n_sim else jnp.ones((), bool)
+        return simulated.size > 0
 
-    first_steps = -(-agent.batches.n_sim // schedule.simulators)
+    first = -(-agent.batches.n_sim // schedule.simulators)
     return Plan(
         learner,
         transitions(env),
@@ -104,8 +104,7 @@ def make_plan(env: Env, agent: HybridAgent, schedule: Schedule) -> Plan:
         start_keys=start_keys,
         round_keys=round_keys,
         batches=batches,
-        ready=ready,
-        first_steps=first_steps,
+        ready=ready if agent.batches.n_sim else None,
     )
 
 

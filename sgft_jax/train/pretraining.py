@@ -180,8 +180,7 @@ def make_plan(env: Env, config: PretrainConfig) -> Plan:
         return agent.replace(normalizer=normalizer.finish(statistics))
 
     def start_keys(key: Key) -> StartKeys:
-        key_learner, key_fleet, key_rounds = jax.random.split(key, 3)
-        return StartKeys(key_learner, key_fleet, key_fleet, key_rounds)
+        return StartKeys(*jax.random.split(key, 3))
 
     def round_keys(key: Key) -> RoundKeys:
         keys = jax.random.split(key, 5)
