@@ -11,10 +11,9 @@ from .models.ratio import RatioConfig
 from .planning.mpc import MPCConfig
 from .policies import mpc_policy, sac_policy, tdmpc2_policy
 from .presets import PRESETS, PretrainConfig
-from .systems import System
 from .systems.gymnasium import Gymnasium
 from .systems.remote import Remote
-from .systems.simulated import Simulated
+from .systems.simulated import Simulated, System
 from .train import guard
 from .train.finetuner import FinetuneState, Parts, assemble, sac_finetuner
 from .train.finetuning import FinetuneProgress, evaluate, finetune

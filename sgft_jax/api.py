@@ -26,8 +26,7 @@ from sgft_jax.io.priors import load_prior, observed
 from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.presets import check_card
 from sgft_jax.stacking import member, stack
-from sgft_jax.systems import System
-from sgft_jax.systems.simulated import Simulated
+from sgft_jax.systems.simulated import Simulated, System
 from sgft_jax.train.finetuning import FinetuneProgress
 from sgft_jax.train.options import card_of
 from sgft_jax.train.simulation import SimulatedRows, simulate

@@ -17,7 +17,7 @@ from envs import extend, gaps
 from experiments import figures, finetune, hybrid, pretrain
 from experiments.runner import cli
 from sgft_jax import Batch, NetworkConfig, Prior, get_method
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.io.priors import load_prior, save_prior
 from sgft_jax.learners import sac
 from sgft_jax.methods import sgft_sac

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, TypedDict
 from envs.files import Count
 from envs.types import UserError
 from experiments.runner.options import Impl
-from sgft_jax.files.folders import InUseError, in_use
+from sgft_jax.files.disk import InUseError, in_use
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.io.runs import CONFIG, check_same, read_own
 

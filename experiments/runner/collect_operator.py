@@ -20,7 +20,7 @@ from experiments.runner.collect_args import ROBOTS, CollectArgs, targets, transi
 from experiments.runner.options import seed_list
 from sgft_jax.datasets import logs
 from sgft_jax.datasets.recording import Recorded, cut, of_episodes, write_table
-from sgft_jax.files.jsonfile import write_json
+from sgft_jax.files.disk import write_json
 from sgft_jax.io import runs
 from sgft_jax.stacking import member
 

@@ -20,12 +20,12 @@ from envs.types import Array, Policy, PyTree, Transition, UserError
 from experiments.runner.collect_args import PAIR, CollectArgs, is_d4rls, name_of, targets, transitions_of
 from experiments.runner.options import seed_list
 from sgft_jax.algorithms import make_policy
-from sgft_jax.datasets import acceptance, logs
+from sgft_jax.datasets import logs
 from sgft_jax.datasets.recording import Joints, Noted, Recorded, cut, of_episodes, of_fleet, write_d4rl, write_minari
-from sgft_jax.files.jsonfile import write_json
+from sgft_jax.files.disk import write_json
 from sgft_jax.io import runs
+from sgft_jax.io.log import RunProgress
 from sgft_jax.io.priors import load_prior, observed_by
-from sgft_jax.io.progress import RunProgress
 from sgft_jax.keys import FromLog, seed_keys
 from sgft_jax.methods import get_method
 from sgft_jax.stacking import member
@@ -172,7 +172,7 @@ def _write(args: CollectArgs, path: Path, episodes: Sequence[Recorded], *, kind:
         f"{path}: {facts.transitions:,} transitions, {facts.episodes:,} episodes of {steps:.0f} steps on average, "
         f"return {facts.return_mean:.1f} (std {facts.return_std:.1f}, {facts.return_min:.1f} to {facts.return_max:.1f})"
     )
-    verdicts = acceptance.judge(f"{args.task}-{kind}", facts, mean_length=float(steps))
+    verdicts = logs.judge(f"{args.task}-{kind}", facts, mean_length=float(steps))
     for verdict in verdicts:
         print(f"  {verdict}")
     judged = [{**verdict._asdict(), "passed": verdict.passed} for verdict in verdicts]

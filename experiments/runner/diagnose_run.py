@@ -26,7 +26,7 @@ from sgft_jax.analysis.reading import last_start
 from sgft_jax.analysis.verdict import Names
 from sgft_jax.diagnosis import Rollouts
 from sgft_jax.examination import Examined, Examiner
-from sgft_jax.files.jsonfile import jsonable, write_json
+from sgft_jax.files.disk import jsonable, write_json
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.io.real import RealStore
 from sgft_jax.io.runs import read_config

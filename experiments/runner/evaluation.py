@@ -11,7 +11,7 @@ from envs import mesh
 from envs.rollout import Episode, counted
 from envs.types import Array, Key, Policy, PyTree
 from sgft_jax.math import stats
-from sgft_jax.systems import System
+from sgft_jax.systems.simulated import System
 from sgft_jax.train import evidence
 from sgft_jax.train.evidence import Best
 from sgft_jax.types import Metrics

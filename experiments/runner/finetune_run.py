@@ -24,11 +24,11 @@ from experiments.runner.training import Training, opened
 from sgft_jax import api
 from sgft_jax.api import Setup
 from sgft_jax.datasets.logs import Log
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.methods import get_method
 from sgft_jax.stacking import join, part
-from sgft_jax.systems import KnownSystem, System
+from sgft_jax.systems.simulated import KnownSystem, System
 from sgft_jax.train import finetuning
 from sgft_jax.train.finetuning import FinetuneProgress, Logged
 from sgft_jax.train.learner_process import LearnerProcess

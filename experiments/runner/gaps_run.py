@@ -22,9 +22,8 @@ from experiments.runner.memory import reserve
 from sgft_jax import stacking
 from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import tables
-from sgft_jax.io.log import MetricsLog, write_summary
+from sgft_jax.io.log import MetricsLog, RunProgress, write_summary
 from sgft_jax.io.priors import load_priors, observed_by
-from sgft_jax.io.progress import RunProgress
 from sgft_jax.math import stats
 from sgft_jax.presets import PretrainConfig
 from sgft_jax.systems.simulated import Simulated

@@ -20,7 +20,7 @@ from experiments.runner.finetune_args import (
 )
 from experiments.runner.options import at_least_one, check_task, not_negative, seed_list, without_repeats
 from experiments.runner.start import finetune
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import NAMES, get_method
 

@@ -33,7 +33,7 @@ from experiments.runner.options import (
     without_repeats,
 )
 from experiments.runner.start import hybrid
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import FIXED_NAMES, get_method
 from sgft_jax.presets import say_preset

@@ -27,7 +27,7 @@ from sgft_jax.analysis import figures
 from sgft_jax.analysis.hybrid import LATE, late
 from sgft_jax.analysis.reading import measures, read_curve
 from sgft_jax.datasets import logs
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.io import runs
 from sgft_jax.io.log import EVAL, read_jsonl, write_summary
 from sgft_jax.io.runs import NO_SIMULATOR

@@ -10,7 +10,7 @@ import envs
 from envs import extend, gaps
 from envs.types import UserError, unknown
 from sgft_jax import checks, types
-from sgft_jax.files.folders import ASIDE, present
+from sgft_jax.files.disk import ASIDE, present
 from sgft_jax.io.cards import CARD, SHIPPED, known_task, read_card, resolve_shipped
 from sgft_jax.presets import PRESETS, check_card
 from sgft_jax.types import Online

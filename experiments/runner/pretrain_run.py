@@ -31,7 +31,7 @@ from experiments.runner.video import film_episode
 from sgft_jax import stacking
 from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import figures
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.io import checkpoint, runs
 from sgft_jax.io.log import EVAL, read_jsonl, write_summary
 from sgft_jax.io.priors import digest

@@ -14,8 +14,8 @@ from envs.rollout import Episode
 from envs.types import Key, PyTree, Transition, UserError
 from sgft_jax.io.real import RealStore
 from sgft_jax.stacking import join, part
-from sgft_jax.systems import SteppedSystem, System
 from sgft_jax.systems.gymnasium import Step
+from sgft_jax.systems.simulated import SteppedSystem, System
 
 _FACTS = tuple(name for name in Episode._fields if name != "transitions")
 _BESIDE = ("late", "time")  # what is kept of a robot's steps beside transitions, see `Step`

@@ -12,9 +12,8 @@ import numpy as np
 from envs import mesh
 from envs.types import PyTree, UserError
 from sgft_jax.io import checkpoint, runs
-from sgft_jax.io.log import MetricsLog, check_finite
+from sgft_jax.io.log import Clock, MetricsLog, RunProgress, check_finite
 from sgft_jax.io.priors import save_prior
-from sgft_jax.io.progress import Clock, RunProgress
 from sgft_jax.stacking import member, part
 from sgft_jax.types import Metrics, Prior
 

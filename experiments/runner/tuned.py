@@ -9,7 +9,7 @@ from envs import extend, gaps
 from envs.files import checked, read_object
 from envs.types import UserError
 from experiments.runner.finetune_args import FinetuneArgs, with_settings
-from sgft_jax.files.jsonfile import write_json
+from sgft_jax.files.disk import write_json
 from sgft_jax.methods import get_method
 
 VARIANT = "tuned"

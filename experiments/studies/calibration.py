@@ -18,7 +18,7 @@ from sgft_jax.analysis import prediction, tables
 from sgft_jax.analysis.prediction import AHEAD, Cases, Inputs
 from sgft_jax.analysis.reading import read_curve
 from sgft_jax.examination import Examiner
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.io.runs import read_config
 
 COUNTS = (1, 2, 4)  # rollouts that a prediction is made from

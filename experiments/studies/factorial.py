@@ -17,7 +17,7 @@ from experiments.runner import cli, grid
 from experiments.runner.cells import Cell, check_begun, work
 from experiments.runner.grid import GridArgs
 from experiments.runner.options import check_prior, prior_folders
-from sgft_jax.files.jsonfile import jsonable, write_json
+from sgft_jax.files.disk import jsonable, write_json
 from sgft_jax.methods import get_method
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from experiments.studies import gaps_choose
 from experiments.studies.gaps_draw_args import DrawArgs
 from sgft_jax import api, stacking
 from sgft_jax.algorithms import make_policy
-from sgft_jax.files.jsonfile import differences, jsonable, write_json
+from sgft_jax.files.disk import differences, jsonable, write_json
 from sgft_jax.identify import Identified, Interface, command_interface
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.math import stats

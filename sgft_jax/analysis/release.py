@@ -21,7 +21,7 @@ from envs.files import Count, read_object
 from envs.types import UserError
 from sgft_jax.analysis import reading
 from sgft_jax.analysis.curves import IDENTITY, SCORES, Curve, Found
-from sgft_jax.files.csvfile import finite, read_csv, table_file, whole, write_csv
+from sgft_jax.files.disk import finite, read_csv, table_file, whole, write_csv
 from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
 from sgft_jax.io.runs import read_config, read_starts
 
@@ -244,7 +244,7 @@ def read_data(folder: Path) -> Found:
 
 
 def hybrid_table(folder: Path) -> Path:
-    """Where the table of runs over updates is or goes, see `csvfile.table_file`."""
+    """Where the table of runs over updates is or goes, see `disk.table_file`."""
     return table_file(folder, "hybrid")
 
 

@@ -20,7 +20,7 @@ from envs.types import UserError
 from sgft_jax.datasets.layouts import Rows, ages, files_of
 from sgft_jax.datasets.recording import Recorded
 from sgft_jax.files.arrays import check_claim, damage, flags
-from sgft_jax.files.jsonfile import write_json
+from sgft_jax.files.disk import write_json
 
 INFO = Path("meta/info.json")
 _VERSION, _FILE = "v3.0", "chunk-000/file-000.parquet"

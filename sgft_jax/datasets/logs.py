@@ -7,7 +7,7 @@ be is a `UserError` with one line. Arrays are float32 on the host; `replay.full`
 import dataclasses
 import hashlib
 import stat
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
 
@@ -27,6 +27,8 @@ from sgft_jax.types import Successors
 _TABLES = (".txt", ".csv")
 _SAME_RATE = 0.01  # relative; clocks and rounded rates differ by less
 _BEYOND = 1.01  # an action that no rounding explains
+LENGTH = "mean episode length"
+_MEAN, _STD, _SIZE = "mean return", "std of returns", "transitions"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -255,3 +257,52 @@ def _fingerprint(source: Path) -> tuple[int, str]:
     files = [(path.relative_to(source).as_posix(), *_fingerprint(path)) for path in layouts.files_of(source)]
     names = repr([(name, digest) for name, _, digest in files])
     return sum(size for _, size, _ in files), hashlib.sha256(names.encode()).hexdigest()
+
+
+# --- whether a set that was made anew may stand for one of D4RL's -----------------------------------------------------
+
+
+class Band(NamedTuple):
+    """What a number has to be: that of D4RL, give or take a share of it."""
+
+    published: float
+    share: float
+
+
+class Verdict(NamedTuple):
+    """A criterion of a set: its name, the value, and the bounds within which the value is accepted."""
+
+    criterion: str
+    value: float
+    low: float
+    high: float
+
+    @property
+    def passed(self) -> bool:
+        """Whether the value is within the bounds."""
+        return self.low <= self.value <= self.high
+
+    def __str__(self) -> str:
+        verdict = "pass" if self.passed else "FAIL"
+        return f"{verdict}: {self.criterion} {self.value:,.0f}, accepted from {self.low:,.0f} to {self.high:,.0f}"
+
+
+# A walker that never falls would walk 1,000 steps, one that falls twice as often as D4RL's 420: 15 % tells both apart.
+BANDS: Mapping[str, Mapping[str, Band]] = {
+    "halfcheetah-medium": {_MEAN: Band(4770.3, 0.05)},
+    "halfcheetah-medium-replay": {_SIZE: Band(202_000, 0.25)},
+    "walker2d-medium": {_MEAN: Band(2852.1, 0.05), _STD: Band(1095.0, 0.25), LENGTH: Band(840.0, 0.15)},
+    "walker2d-medium-replay": {_SIZE: Band(302_000, 0.25)},
+}
+
+
+def judge(name: str, facts: Facts, *, mean_length: float) -> Sequence[Verdict]:
+    """A verdict for each criterion of the set `TASK-KIND`; none for a set that D4RL does not have.
+
+    facts: of the file. mean_length: steps of an episode on average.
+    """
+    values = {_MEAN: facts.return_mean, _STD: facts.return_std, _SIZE: facts.transitions, LENGTH: mean_length}
+    return [
+        Verdict(criterion, float(values[criterion]), published * (1 - share), published * (1 + share))
+        for criterion, (published, share) in BANDS.get(name, {}).items()
+    ]

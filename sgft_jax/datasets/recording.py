@@ -11,8 +11,7 @@ import numpy as np
 
 from envs.rollout import Episode
 from envs.types import Transition, UserError
-from sgft_jax.files.folders import written
-from sgft_jax.files.jsonfile import write_json
+from sgft_jax.files.disk import write_json, written
 from sgft_jax.io.real import Played
 
 _SAME = 1e-4  # relative; compilers may round the two copies of an observation differently

@@ -20,7 +20,7 @@ from envs.base import Env
 from envs.types import UserError
 from sgft_jax.export import graph, player
 from sgft_jax.export.graph import Format, Graph
-from sgft_jax.files.jsonfile import write_json
+from sgft_jax.files.disk import write_json
 from sgft_jax.io import checkpoint
 from sgft_jax.types import Prior
 

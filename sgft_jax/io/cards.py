@@ -11,7 +11,7 @@ from envs.files import checked, read_json
 from envs.types import UserError, unknown
 from sgft_jax.algorithms import NAMES, algorithm_of
 from sgft_jax.algorithms.base import Card
-from sgft_jax.files.folders import present
+from sgft_jax.files.disk import present
 
 CARD = "prior.json"
 SHIPPED = Path(__file__).parents[1] / "priors"  # those that come with the code, a folder for each task

@@ -2,7 +2,7 @@
 
 A checkpoint is `<run>/checkpoints/<step>/` with `state/` (Orbax) and `manifest.json`. It is written under a temporary
 name, its manifest last, and then renamed: a process killed at any moment leaves either the previous checkpoint or a
-complete new one, see `folders`. Nothing here ever unpickles anything.
+complete new one, see `disk`. Nothing here ever unpickles anything.
 
 The steps are not Orbax's own `training.Checkpointer`. Of 0.12.8 it offers a step with a damaged file as the latest,
 keeps the later steps that a resume from an earlier one has abandoned, and refuses arrays without elements.
@@ -28,9 +28,9 @@ from orbax.checkpoint import v1 as ocp
 from envs import files, mesh
 from envs.files import Count
 from envs.types import PyTree, UserError
-from sgft_jax.files import folders
+from sgft_jax.files import disk
 from sgft_jax.files.arrays import damage
-from sgft_jax.files.jsonfile import jsonable, write_json
+from sgft_jax.files.disk import jsonable, write_json
 
 FORMAT = 1  # of checkpoints and priors, see docs/design.md
 MANIFEST = "manifest.json"
@@ -103,7 +103,7 @@ def latest(folder: Path, *, whole: bool = False, say: Callable[[str], None] = pr
 
 def path(folder: Path, step: int) -> Path:
     """Where the checkpoint of a step is."""
-    return folders.present(Path(folder) / _CHECKPOINTS / str(step))
+    return disk.present(Path(folder) / _CHECKPOINTS / str(step))
 
 
 def restore(
@@ -156,13 +156,13 @@ def _check_leaves(where: Path, saved: list[Leaf], wanted: list[Leaf]) -> None:
 
 def _prune(root: Path, *, newest: int, keep: int) -> None:
     """Delete all but the `keep` newest complete steps up to `newest`; a kill leaves none half deleted."""
-    for leftover in root.glob(f"{folders.NEW}*"):  # nobody else writes here
+    for leftover in root.glob(f"{disk.NEW}*"):  # nobody else writes here
         shutil.rmtree(leftover)
     for step in (steps := _steps(root)):
-        folders.settle(root / str(step))
+        disk.settle(root / str(step))
     complete = [step for step in sorted(steps, reverse=True) if step <= newest and _is_complete(root / str(step))]
     for step in steps - set(complete[: max(keep, 1)]):
-        doomed = folders.part_of(root / str(step))
+        doomed = disk.part_of(root / str(step))
         (root / str(step)).rename(doomed)
         shutil.rmtree(doomed)
 
@@ -176,7 +176,7 @@ def _is_complete(where: Path) -> bool:
 def _steps(root: Path) -> set[int]:
     """The steps of all folders, those included that a killed writer has put aside."""
     paths = [path for path in root.iterdir() if path.is_dir()] if root.is_dir() else []
-    names = {path.name.removeprefix(folders.ASIDE) for path in paths}
+    names = {path.name.removeprefix(disk.ASIDE) for path in paths}
     return {int(name) for name in names if name.isdecimal()}
 
 
@@ -186,7 +186,7 @@ def _steps(root: Path) -> set[int]:
 @contextlib.contextmanager
 def replaced(folder: Path) -> Iterator[Path]:
     """Give a folder to fill, which then takes the place of `folder`: on the first host, where all write."""
-    with folders.replaced(folder) if first_host() else contextlib.nullcontext(folders.part_of(folder)) as part:
+    with disk.replaced(folder) if first_host() else contextlib.nullcontext(disk.part_of(folder)) as part:
         yield part
 
 

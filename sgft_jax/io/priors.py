@@ -14,8 +14,7 @@ from envs.base import Varying
 from envs.types import PyTree, UserError
 from sgft_jax.algorithms import algorithm_of
 from sgft_jax.files.arrays import check_claim
-from sgft_jax.files.folders import present
-from sgft_jax.files.jsonfile import differences, write_json
+from sgft_jax.files.disk import differences, present, write_json
 from sgft_jax.io import checkpoint
 from sgft_jax.io.cards import CARD, read_card, resolve_shipped
 from sgft_jax.models.distortion import Distortion

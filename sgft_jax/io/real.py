@@ -12,7 +12,7 @@ import numpy as np
 from envs.files import read_text
 from envs.types import UserError
 from sgft_jax.files.arrays import flags, numbers, read_npz
-from sgft_jax.files.folders import sync, written
+from sgft_jax.files.disk import sync, written
 
 _REAL, _ROLLOUT, _HALF, _STEPS = "real", "rollout-", ".half", ".steps.jsonl"
 _ROWS = ("obs", "action", "reward", "discount", "next_obs")

@@ -17,8 +17,7 @@ from msgspec import Meta
 
 from envs.files import Schema, read_object
 from envs.types import UserError
-from sgft_jax.files.folders import ASIDE, Lock, empty
-from sgft_jax.files.jsonfile import differences, write_json
+from sgft_jax.files.disk import ASIDE, Lock, differences, empty, write_json
 
 CONFIG, PROVENANCE = "config.json", "provenance.json"
 ROOT = Path(__file__).parents[2]  # of the repository, in a checkout

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from envs.types import Array, Key, Policy, PyTree
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.models import networks
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import Network

@@ -1,17 +1,30 @@
-"""The one checked way in for what an environment or a robot returns, whatever its kind.
+"""The one checked way in for what an environment returns or a robot says, whatever its kind.
 
 A number may be Python's, NumPy's or an array of one, `info` may be None, and None means that something is not known.
 Anything else raises UserError: one line with the environment, its method, and the value.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import Any, NamedTuple
+from contextlib import contextmanager, suppress
+from typing import Annotated, Any, NamedTuple
 
+import msgspec
 import numpy as np
+from msgspec import Meta
 
+from envs.files import Count, Positive, Size
 from envs.types import UserError
-from sgft_jax.systems.robot_client import LARGEST, SUCCESS, flag, number, numbers, printable, success_of
+from sgft_jax.systems.robot_client import (
+    LARGEST,
+    SUCCESS,
+    VERSION,
+    flag,
+    number,
+    numbers,
+    printable,
+    success_of,
+    unframed,
+)
 
 _PARTS = {"reset": ("observation", "info"), "step": ("observation", "reward", "terminated", "truncated", "info")}
 _KNOWN = (*SUCCESS, "invalid", "late", "sent", "final_obs", "final_info")  # of `info`
@@ -172,3 +185,82 @@ def _explained(where: str) -> Iterator[None]:
         yield
     except ValueError as error:
         raise UserError(f"{where}: {error}") from None
+
+
+# --- what a robot says ------------------------------------------------------------------------------------------------
+
+
+Seconds = Annotated[Positive, Meta(le=3600)]
+
+
+class Hello(msgspec.Struct, tag_field="type", tag="hello"):
+    """The first message. period, answer_within: see `robot_client.play`; None without a clock."""
+
+    version: int
+    token: str
+    robot: str
+    obs_size: Size
+    action_size: Size
+    period: float | None  # compared with that of the task
+    answer_within: Seconds | None
+
+
+class Began(msgspec.Struct, tag_field="type", tag="began"):
+    """The start of an episode. obs: float32."""
+
+    episode: Count
+    obs: bytes
+
+
+class Moved(msgspec.Struct, tag_field="type", tag="moved"):
+    """The outcome of a step. sent, obs: float32. reward, success: None where the robot does not know."""
+
+    episode: Count
+    step: Count
+    sent: bytes
+    obs: bytes
+    reward: float | None
+    terminated: bool
+    truncated: bool
+    success: bool | None
+    late: bool
+
+
+class Rested(msgspec.Struct, tag_field="type", tag="rested"):
+    """The robot has stopped, as it was told."""
+
+    episode: Count
+
+
+class Failed(msgspec.Struct, tag_field="type", tag="failed"):
+    """The robot has stopped because its driver has failed."""
+
+    episode: Count
+    reason: str
+
+
+Message = Hello | Began | Moved | Rested | Failed
+
+
+class _Version(msgspec.Struct, tag_field="type", tag="hello"):
+    version: int
+
+
+_MESSAGE, _VERSION = (msgspec.msgpack.Decoder(kind) for kind in (Message, _Version))
+
+
+class VersionError(ValueError):
+    """The robot speaks another version of the protocol than the learner."""
+
+
+def read(data: Any) -> Message:
+    """A message of a robot; ValueError says what is wrong with it."""
+    body = unframed(data)
+    try:
+        with suppress(msgspec.MsgspecError):  # before the other fields of a greeting: they may be others
+            if (version := _VERSION.decode(body).version) != VERSION:
+                versions = f"the robot has {version}, the learner {VERSION}"
+                raise VersionError(f"protocol version: {versions}; give both the same robot_client.py")
+        return _MESSAGE.decode(body)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise ValueError(f"does not fit the protocol ({printable(error, 120)})") from None

@@ -15,7 +15,7 @@ from envs.mesh import split_vmap
 from envs.rollout import Episode
 from envs.types import Array, Key, PyTree, Transition, UserError
 from sgft_jax.keys import Finetuning
-from sgft_jax.systems import System
+from sgft_jax.systems.simulated import System
 from sgft_jax.train import evidence
 from sgft_jax.train.evidence import Best
 from sgft_jax.train.guard import Guarded

@@ -13,7 +13,7 @@ from envs.mesh import split, whole
 from envs.rollout import Fleet, launch
 from envs.types import Array, Key, PyTree, Transition
 from sgft_jax.algorithms import recipe_of
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.keys import Pretraining, seed_keys
 from sgft_jax.models import normalizer
 from sgft_jax.presets import PretrainConfig

@@ -2,7 +2,7 @@
 
 import jax
 
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.io import priors
 from sgft_jax.learners.sac import SACConfig, extract_params, make_sac
 from sgft_jax.models.config import NetworkConfig

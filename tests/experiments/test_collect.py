@@ -12,7 +12,7 @@ import pytest
 from envs.types import Transition, UserError
 from experiments import collect, hybrid
 from experiments.runner import collect_args, collect_run
-from sgft_jax.datasets import acceptance, logs, recording
+from sgft_jax.datasets import logs, recording
 from sgft_jax.datasets.recording import Joints, Noted, Recorded
 
 OPTIONS = """--task toy --level -100 --transitions 50 --seeds 2 --environments 3 --updates 60 --eval-every 30
@@ -149,7 +149,7 @@ def test_minaris_own_library_opens_a_set(tmp_path, monkeypatch):
 
 def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(collect_args.LEVELS, "toy", -100.0)
-    monkeypatch.setattr(acceptance, "BANDS", {"toy-medium-replay": {"transitions": acceptance.Band(300, 0.25)}})
+    monkeypatch.setattr(logs, "BANDS", {"toy-medium-replay": {"transitions": logs.Band(300, 0.25)}})
     out = tmp_path / "data"
     collect.main([*LEARN, "--out", str(out)])
     said = capsys.readouterr().out

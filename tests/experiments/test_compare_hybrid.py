@@ -12,7 +12,7 @@ from experiments import compare
 from experiments.runner import cli, hybrid_grid
 from experiments.runner.hybrid_args import run_folder
 from sgft_jax.analysis import figures
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.io.runs import FORMAT
 
 METHODS = ("h2oplus", "sac", "iql", "rebrac:walker2d-medium")

@@ -14,7 +14,7 @@ from experiments.runner.options import prior_folders, task_of_priors
 from experiments.studies import diagnose_calibrate as calibrate
 from sgft_jax import api
 from sgft_jax.analysis import release
-from sgft_jax.files.folders import ASIDE
+from sgft_jax.files.disk import ASIDE
 from sgft_jax.io.priors import load_prior
 
 pytestmark = pytest.mark.usefixtures("toy_task")

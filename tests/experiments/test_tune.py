@@ -16,7 +16,7 @@ from experiments import compare, finetune
 from experiments.runner import cli, grid, tuned
 from experiments.runner.finetune_args import arguments, resolved, run_folder, with_settings
 from experiments.studies import spaces, tune
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.io import checkpoint
 from sgft_jax.io.runs import FORMAT
 from sgft_jax.methods import get_method

@@ -19,9 +19,8 @@ from envs.types import Policy, UserError
 from sgft_jax import api
 from sgft_jax.learners.sac import SACConfig, extract_params, make_sac
 from sgft_jax.models.config import NetworkConfig
-from sgft_jax.systems import System
 from sgft_jax.systems.gymnasium import Gymnasium, seed_of
-from sgft_jax.systems.simulated import Simulated
+from sgft_jax.systems.simulated import Simulated, System
 from sgft_jax.train.finetuning import finetune
 from sgft_jax.types import Prior
 

@@ -16,7 +16,7 @@ from envs.system import concealed, with_system
 from envs.types import Transition, UserError
 from sgft_jax import api
 from sgft_jax.algorithms import make_policy
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.io.priors import load_prior, observed, save_prior
 from sgft_jax.learners import sac
 from sgft_jax.methods import get_method

@@ -13,7 +13,7 @@ import pytest
 from envs.types import Transition
 from sgft_jax import methods
 from sgft_jax.data import replay
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.train.simulation import SimulatedRows

@@ -13,7 +13,7 @@ from envs.types import UserError
 from sgft_jax.analysis.curves import area
 from sgft_jax.analysis.reading import read_runs
 from sgft_jax.analysis.release import COLUMNS, export, read_data
-from sgft_jax.files.csvfile import read_csv
+from sgft_jax.files.disk import read_csv
 
 DATA = Path(__file__).parents[3] / "docs" / "data"
 PRIORS = ("aaaaaaaaaaaa", "bbbbbbbbbbbb")

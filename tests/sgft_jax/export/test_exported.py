@@ -23,7 +23,7 @@ from sgft_jax.export import folder as exported
 from sgft_jax.export import graph, player
 from sgft_jax.export.folder import save_exported
 from sgft_jax.export.graph import Graph, Node, Slot
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.learners.actor import ActorParams
 from sgft_jax.models import distortion

@@ -5,7 +5,7 @@ import gzip
 import pytest
 
 from envs.types import UserError
-from sgft_jax.files.csvfile import finite, read_csv, whole, write_csv
+from sgft_jax.files.disk import finite, read_csv, whole, write_csv
 
 
 def test_a_table_comes_back_by_its_head(tmp_path):

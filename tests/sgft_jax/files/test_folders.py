@@ -6,7 +6,7 @@ import os
 import pytest
 
 from envs.types import UserError
-from sgft_jax.files.folders import NEW, InUseError, Lock, present, replaced, written
+from sgft_jax.files.disk import NEW, InUseError, Lock, present, replaced, written
 
 CHANGES = ("mkdir", "rename", "replace", "rmdir", "unlink")
 

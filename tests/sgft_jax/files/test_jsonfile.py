@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from envs.files import read_json
-from sgft_jax.files import folders
-from sgft_jax.files.jsonfile import differences, jsonable, write_json
+from sgft_jax.files import disk
+from sgft_jax.files.disk import differences, jsonable, write_json
 
 
 class Pair(NamedTuple):
@@ -59,7 +59,7 @@ def test_a_write_that_fails_leaves_nothing_behind(tmp_path, monkeypatch):
     def full(handle):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(folders.os, "fsync", full)
+    monkeypatch.setattr(disk.os, "fsync", full)
     with pytest.raises(OSError, match="No space"):
         write_json(tmp_path / "x.json", {"a": 1})
     assert not list(tmp_path.iterdir())

@@ -238,7 +238,7 @@ def test_a_kill_while_a_checkpoint_is_overwritten_leaves_it(saved, monkeypatch, 
         os.rename(path, target)
 
     monkeypatch.setattr(type(saved), "rename", dying)
-    monkeypatch.setattr(checkpoint.folders, "settle", lambda folder: None)
+    monkeypatch.setattr(checkpoint.disk, "settle", lambda folder: None)
     with pytest.raises(KeyboardInterrupt):
         checkpoint.save(saved, 20, make_state(5), meta=META)
     monkeypatch.undo()

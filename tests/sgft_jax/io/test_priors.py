@@ -12,8 +12,7 @@ import tuners
 from test_checkpoint import bits, damage_flip, damage_truncate
 
 from envs.types import UserError
-from sgft_jax.files.folders import ASIDE
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import ASIDE, jsonable
 from sgft_jax.io import checkpoint, priors
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.learners.actor import ActorParams, make_actor_of

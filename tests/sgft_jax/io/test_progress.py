@@ -4,8 +4,8 @@ import time
 import pytest
 from rich.console import Console
 
-from sgft_jax.io import progress
-from sgft_jax.io.progress import RunProgress
+from sgft_jax.io import log
+from sgft_jax.io.log import RunProgress
 
 
 class Clock:
@@ -21,7 +21,7 @@ def test_plain_lines_give_rate_and_time_left_after_the_chunk_that_compiles(monke
     in 8 s: 200 in 10 s are 20 steps/s, the 300 left take 15 s.
     """
     clock = Clock()
-    monkeypatch.setattr(progress, "time", clock)
+    monkeypatch.setattr(log, "time", clock)
     console = Console(file=io.StringIO(), width=40, soft_wrap=True)
     with RunProgress("pretrain", total=1000, done=400, console=console) as shown:
         clock.now += 5
@@ -52,11 +52,11 @@ def test_live_bar_on_a_terminal():
     ("seconds", "shown"), [(0, "0:00:00"), (59.6, "0:01:00"), (3661, "1:01:01"), (90000, "25:00:00")]
 )
 def test_durations(seconds, shown):
-    assert progress._duration(seconds) == shown
+    assert log._duration(seconds) == shown
 
 
 def test_clock_adds_up():
-    clock = progress.Clock()
+    clock = log.Clock()
     clock.seconds = {"train": 10.0}
     for phase in ("train", "evaluate"):
         with clock(phase):

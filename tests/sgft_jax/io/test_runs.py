@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from envs.types import UserError
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.io import runs
 from sgft_jax.io.runs import Lock, open_runs, plain_path, provenance
 

@@ -12,7 +12,7 @@ import toy_steps
 
 from sgft_jax import api
 from sgft_jax.algorithms import make_policy
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.learners import recurrent
 from sgft_jax.models import normalizer
 from sgft_jax.models.gru import make_gru

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from envs.types import Transition, UserError
-from sgft_jax.files.jsonfile import jsonable
+from sgft_jax.files.disk import jsonable
 from sgft_jax.learners import sac
 from sgft_jax.methods import sgft_mpc
 from sgft_jax.models import networks
