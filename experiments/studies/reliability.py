@@ -10,15 +10,32 @@ The robot writes down what it really does. `missing` of its steps are not in the
 `alien` ones are in the store and were never made, or twice: there must be none.
 """
 
+import contextlib
+import os
+import signal
+import subprocess
+import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from envs.types import UserError
 from experiments.runner import cli
 from experiments.runner.options import at_least_one, seed_list, without_repeats
+from experiments.studies.reliable.network import bad_network, strangers
+from experiments.studies.reliable.trial import QUICK_PERIOD, QUICK_TASK, Trial, late_share, periods
+from sgft_jax.io import runs
+from sgft_jax.io.log import write_summary
 from sgft_jax.io.runs import check_folder
+
+_VICTIMS = ("player", "learner", "robot")
+_EARLY = 0.2  # share of the kills that come while the processes start, within so many seconds:
+_START, _PLAY = 8.0, 3.0  # and the others after the robot has begun to move
+_QUICK = {"period": QUICK_PERIOD, "task": str(QUICK_TASK), "patience": 300.0}
 
 type Part = Literal["kills", "network", "strangers", "disk", "clock"]
 
@@ -49,9 +66,6 @@ def main(args: ReliabilityArgs) -> dict[str, list[dict[str, Any]]]:
         raise UserError("--parts: name at least one")
     without_repeats("--parts", args.parts)
     check_folder(args.out / "reliability")
-    from sgft_jax.io import runs
-    from sgft_jax.io.log import write_summary
-
     home, lines = (args.out / "reliability").resolve(), {part: [] for part in args.parts}
     for part in args.parts:
         for line in _tries(args, part, home / part):
@@ -63,27 +77,130 @@ def main(args: ReliabilityArgs) -> dict[str, list[dict[str, Any]]]:
 
 def _tries(args: ReliabilityArgs, part: Part, home: Path) -> Iterator[dict[str, Any]]:
     """Causes one kind of failure; yields what became of each run."""
-    from experiments.studies.reliable import disk, kills, network, timing
-
     match part:
         case "kills":
             for i in range(args.runs):
-                yield {"run": i, **kills.run(home / f"run-{i}", kills=args.kills, seed=args.seed + i)}
+                yield {"run": i, **killed(home / f"run-{i}", kills=args.kills, seed=args.seed + i)}
         case "network":
-            yield network.bad_network(home, seed=args.seed, rollouts=args.rollouts)
+            yield bad_network(home, seed=args.seed, rollouts=args.rollouts)
         case "strangers":
-            yield network.strangers(home, seed=args.seed, rollouts=args.rollouts)
+            yield strangers(home, seed=args.seed, rollouts=args.rollouts)
         case "disk":
-            yield disk.full(home)
-            yield disk.read_only(home)
+            yield stopped_by_disk(home, "full", "size=1m", mended="size=64m", rollouts=20)
+            yield stopped_by_disk(home, "read-only", "ro", mended="rw", rollouts=4)
         case "clock":
-            wheels = {"task": "wheel-legged", "sizes": timing.WHEEL_LEGGED}
-            yield timing.kept_clock(home / "slow", period=0.2, rollouts=args.rollouts, utd=400)
-            yield timing.kept_clock(home / "fast", period=0.005, rollouts=args.rollouts, utd=2, **wheels)
+            wheels = {"task": "wheel-legged", "sizes": (4, 1)}  # numbers that it measures and commands
+            yield kept_clock(home / "slow", period=0.2, rollouts=args.rollouts, utd=400)
+            yield kept_clock(home / "fast", period=0.005, rollouts=args.rollouts, utd=2, **wheels)
 
 
 def _text(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+# --- kills ------------------------------------------------------------------------------------------------------------
+
+
+def killed(home: Path, *, kills: int, seed: int) -> dict[str, Any]:
+    """One run with so many kills; what became of it. The run grows until all kills are done."""
+    luck = np.random.default_rng(seed)
+    victims: Counter[str] = Counter()
+    with Trial(home, rollouts=20, **_QUICK) as trial:
+        trial.start()
+        while victims.total() < kills:
+            victims.update(_strike(trial, luck))
+        trial.finish()
+    return {"rollouts": trial.rollouts, **{name: victims[name] for name in _VICTIMS}, **trial.audit()}
+
+
+def _strike(trial: Trial, luck: np.random.Generator) -> list[str]:
+    """Waits, kills one of the three, and starts what has ended; returns whom it killed, nobody if there was nobody."""
+    assert trial.player is not None and trial.robot is not None
+    if luck.uniform() < _EARLY:
+        trial.wait(luck.uniform(0.0, _START))
+    elif trial.wait_for_motion():
+        trial.wait(luck.uniform(0.0, _PLAY))
+    if trial.player.poll() == 0:
+        trial.rollouts += 10  # it was done before all kills were
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            trial.robot.wait(10.0)  # it was told that the run is over, unless it had only just been started
+            trial.start_robot()
+        trial.start_player()
+        return []
+    victim = _VICTIMS[luck.integers(len(_VICTIMS))]
+    pid = {"player": trial.player.pid, "learner": trial.learner(), "robot": trial.robot.pid}[victim]
+    if pid is None or trial.player.poll() is not None:
+        return []
+    os.kill(pid, signal.SIGKILL)
+    if victim == "robot":
+        trial.robot.wait()
+        time.sleep(luck.uniform(0.0, 1.0))
+        trial.start_robot()
+        return [victim]
+    code = trial.wait(60.0)
+    if (victim, code) == ("learner", 0):  # it had learned all it was asked for
+        return [victim]
+    if code != (-9 if victim == "player" else 2):
+        raise UserError(f"{trial.home / 'player.txt'}: exit code {code} after a kill of the {victim}; see what it said")
+    trial.start_player()
+    return [victim]
+
+
+# --- disks ------------------------------------------------------------------------------------------------------------
+
+
+def stopped_by_disk(home: Path, name: str, option: str, *, mended: str, rollouts: int) -> dict[str, Any]:
+    """A run on a file system mounted with this option, which stops it; remounted with another, it goes on."""
+    out = home / name
+    out.mkdir(parents=True, exist_ok=True)
+    with _mounted(out, option), Trial(home / f"{name}-run", rollouts=rollouts, disk=out, **_QUICK) as trial:
+        if name == "full":
+            trial.start_robot()
+        trial.start_player()
+        code, lines = trial.wait(), trial.player_lines()
+        _call(["mount", "-o", f"remount,{mended}", str(out)])
+        if trial.robot is None:
+            trial.start_robot()
+        trial.start_player()
+        trial.finish()
+        return {"disk": name, "exit code": code, "said": lines[-1] if lines else "", **trial.audit()}
+
+
+@contextlib.contextmanager
+def _mounted(folder: Path, option: str) -> Iterator[None]:
+    _call(["mount", "-t", "tmpfs", "-o", option, "tmpfs", str(folder)])
+    try:
+        yield
+    finally:
+        _call(["umount", "-l", str(folder)])
+
+
+def _call(command: list[str]) -> None:
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        message = (getattr(error, "stderr", None) or str(error)).strip()
+        raise UserError(f"{' '.join(command)}: {message}; leave --parts disk out where you may not mount") from error
+
+
+# --- the clock --------------------------------------------------------------------------------------------------------
+
+
+def kept_clock(home: Path, *, period: float, rollouts: int, utd: float, **task: Any) -> dict[str, Any]:
+    """A run with a learner on the same cores: lateness, and jitter of the period in ms.
+
+    utd: updates for each step, enough to keep the learner busy for as long as the robot plays. task: another one, with
+    its sizes, see `Trial`.
+    """
+    busy = ("--options.utd", str(utd), "--hand-over", "steps")
+    with Trial(home, period=period, rollouts=rollouts, more=busy, **task) as trial:
+        trial.start()
+        trial.finish()
+    log = home / "commands.log"
+    off = 1e3 * np.abs(periods(log) - period)
+    middle, most, worst = np.percentile(off, [50, 99, 100])
+    jitter = {"median ms": middle, "99 % ms": most, "worst ms": worst}
+    return {"Hz": 1 / period, "steps": len(off), **jitter, "late": late_share(log), **trial.audit()}
 
 
 if __name__ == "__main__":

@@ -8,9 +8,9 @@ import pytest
 from envs.types import UserError
 from experiments.runner import cli
 from experiments.studies import reliability
-from experiments.studies.reliable import ledger, quick_task, timing
-from experiments.studies.reliable.ledger import Made, audit
+from experiments.studies.reliable import quick_task, trial
 from experiments.studies.reliable.robot import Rail
+from experiments.studies.reliable.trial import Made, audit
 from sgft_jax.io.real import RealStore
 
 
@@ -49,7 +49,7 @@ def test_the_ledger_is_what_the_robot_did(tmp_path):
             robot.send(np.array(action, np.float32))
         seen.append(robot.read())
     robot.send(np.zeros(2, np.float32))
-    made, unread = ledger.read(tmp_path / "ledger")
+    made, unread = trial.read_ledger(tmp_path / "ledger")
     assert unread == 1 and [step.obs for step in made] == [obs.tobytes() for obs in seen]
     commands = [np.frombuffer(step.action, np.float32).tolist() for step in made]
     assert commands == [[0.5, 0.0], [0.5, 0.0], [-0.25, 1.0]]
@@ -58,7 +58,7 @@ def test_the_ledger_is_what_the_robot_did(tmp_path):
 
 def test_the_quick_task_has_the_period_of_its_robot():
     """Otherwise the learner refuses the robot."""
-    assert quick_task.make().control_dt == quick_task.PERIOD
+    assert quick_task.make().control_dt == trial.QUICK_PERIOD
 
 
 def test_only_valid_steps_are_stored_ones(tmp_path):
@@ -70,7 +70,7 @@ def test_only_valid_steps_are_stored_ones(tmp_path):
             "time": np.zeros((1, 3)),
         }
     )
-    (one, two) = ledger.stored_steps(tmp_path)
+    (one, two) = trial.stored_steps(tmp_path)
     assert one.obs == np.array([0, 1], np.float32).tobytes() and two.action == np.ones(1, np.float32).tobytes()
 
 
@@ -81,8 +81,8 @@ def test_jitter_is_counted_within_episodes(tmp_path):
     with open(tmp_path / "log", "wb") as file:
         for episode, step, clock, late in entries:
             file.write(msgpack.packb({"episode": episode, "step": step, "clock": clock, "late": late}) or b"")
-    np.testing.assert_allclose(timing.periods(tmp_path / "log"), [0.2, 0.3, 0.2])
-    assert timing.late_share(tmp_path / "log") == 0.2
+    np.testing.assert_allclose(trial.periods(tmp_path / "log"), [0.2, 0.3, 0.2])
+    assert trial.late_share(tmp_path / "log") == 0.2
 
 
 def test_a_disk_that_is_full_is_said_in_one_line(capsys):

@@ -13,8 +13,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.sync.server import ServerConnection, serve
 
 from experiments.runner.real_systems import free_port
-from experiments.studies.reliable import timing
-from experiments.studies.reliable.runs import Trial
+from experiments.studies.reliable.trial import Trial, late_share
 from sgft_jax.systems.robot_client import VERSION, pack
 
 
@@ -79,7 +78,7 @@ def bad_network(home: Path, *, seed: int, period: float = 0.2, rollouts: int = 1
         trial.via = proxy.port
         trial.start()
         trial.finish()
-    return {**proxy.counts, **trial.audit()._asdict(), "late": timing.late_share(home / "commands.log")}
+    return {**proxy.counts, **trial.audit(), "late": late_share(home / "commands.log")}
 
 
 def strangers(
@@ -92,9 +91,11 @@ def strangers(
         sent = _nonsense(trial.port, frames, np.random.default_rng(seed))
         knocked = _knock(trial.port, rate, seconds)
         trial.finish()
-    lines = trial.said("player.txt").count("refused a connection")
-    late = timing.late_share(home / "commands.log")
-    return {"frames": sent, "connections": knocked, "lines about them": lines, **trial.audit()._asdict(), "late": late}
+    lines, late = (
+        sum("refused a connection" in line for line in trial.player_lines()),
+        late_share(home / "commands.log"),
+    )
+    return {"frames": sent, "connections": knocked, "lines about them": lines, **trial.audit(), "late": late}
 
 
 def _nonsense(port: int, frames: int, luck: np.random.Generator) -> int:

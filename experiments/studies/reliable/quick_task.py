@@ -2,14 +2,13 @@
 
 from envs import Env, extend
 from envs.mujoco.scene import make_env
-from experiments.studies.reliable.runs import TASK
+from experiments.studies.reliable.trial import QUICK_PERIOD, TASK
 
-PERIOD, _SUBSTEP = 0.05, 0.01  # s
+_SUBSTEP = 0.01  # s
 
 
 def make(impl: str = "auto") -> Env:
     """The task: what `--task` looks for."""
     scene = extend.load("--task", str(TASK), "SCENE").SCENE
-    return make_env(
-        scene._replace(name="quick_task", control_dt=PERIOD, substeps=round(PERIOD / _SUBSTEP), ramp=PERIOD / 2), impl
-    )
+    times = {"control_dt": QUICK_PERIOD, "substeps": round(QUICK_PERIOD / _SUBSTEP), "ramp": QUICK_PERIOD / 2}
+    return make_env(scene._replace(name="quick_task", **times), impl)
