@@ -133,10 +133,10 @@ _KINDS: dict[Part, _Kind] = {
     "physics": _Kind("environments", "physics.speed", {**_TASK, "worlds": "worlds"}, ("control_steps", "repeats")),
     "updates": _Kind("updates of pretraining", "updates.speed", _NETWORKS, _UPDATES),
     "plain": _Kind("updates of plain SAC", "updates.plain_speed", {"batch": "batches"}, _UPDATES),
-    "hybrid": _Kind("updates of hybrid runs", "hybrid.speed", {**_TASK, "members": "seeds"}, _UPDATES),
+    "hybrid": _Kind("updates of hybrid runs", "updates.hybrid_speed", {**_TASK, "members": "seeds"}, _UPDATES),
     "pretrain": _Kind("pretraining", "training.pretraining", _SEEDS, ("preset", "env_steps")),
     "finetune": _Kind("fine-tuning with SGFT-SAC", "training.fine_tuning", _SEEDS, ("prior", "rollouts")),
-    "system": _Kind("fine-tuning through a real system", "system.speed", _SEEDS, ("prior", "repeats")),
+    "system": _Kind("fine-tuning through a real system", "training.through_system", _SEEDS, ("prior", "repeats")),
     "devices": _Kind(
         "pretraining on several devices", "training.weak_scaling", _DEVICES, ("devices", "preset", "env_steps")
     ),

@@ -26,7 +26,7 @@ from envs.mujoco.engines import warp as engine_warp
 from envs.mujoco.worlds import Impl, PhysicsState, choose_impl
 from envs.rollout import Fleet, launch, step_fleet
 from envs.types import Array, Key
-from experiments.bench.timing import Timing, ahead, fastest, measure
+from experiments.bench.timing import Compiled, ahead, fastest, measure
 
 POOL = 256  # domain parameter vectors, so that a batch really differs from world to world
 
@@ -105,7 +105,7 @@ def _nothing_collected() -> Iterator[None]:
         gc.enable()
 
 
-def _mjx_alone(host: mujoco.MjModel, impl: str, window: Window, substeps: int, repeats: int) -> Timing:
+def _mjx_alone(host: mujoco.MjModel, impl: str, window: Window, substeps: int, repeats: int) -> Compiled:
     """`mjx.step` and nothing else."""
     model = mjx.put_model(host, impl=impl)
     if impl == "warp":

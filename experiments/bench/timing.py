@@ -1,5 +1,6 @@
 """How a jitted function is timed: compiled ahead, called once to warm up, then the fastest of several calls."""
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -9,34 +10,30 @@ import jax
 
 class Compiled(NamedTuple):
     """call(*arguments), which waits for its results. compile_s: of tracing and compiling. memory_mb: megabytes that XLA
-    sets aside for one call: arguments, results, temporaries; Warp's own worlds are not in it.
+    sets aside for one call: arguments, results, temporaries; Warp's own worlds are not in it. seconds: of the fastest
+    call, nan where it was not measured.
     """
 
     call: Callable[..., Any]
     compile_s: float
     memory_mb: float
-
-
-class Timing(NamedTuple):
-    """seconds: of the fastest call; the rest as in `Compiled`."""
-
-    seconds: float
-    compile_s: float
-    memory_mb: float
+    seconds: float = math.nan
 
 
 def ahead(function: Callable[..., Any], arguments: Sequence[Any], *, donate: Sequence[int] = ()) -> Compiled:
     """The function compiled for arguments like these. donate: positions of those that a call consumes."""
     start = time.perf_counter()
-    compiled = jax.jit(function, donate_argnums=donate).lower(*arguments).compile()
-    compile_s = time.perf_counter() - start
-    return Compiled(lambda *args: jax.block_until_ready(compiled(*args)), compile_s, _memory(compiled))
+    compiled: Any = jax.jit(function, donate_argnums=donate).lower(*arguments).compile()
+    compile_s, sizes = time.perf_counter() - start, compiled.memory_analysis()
+    total = sizes.argument_size_in_bytes + sizes.output_size_in_bytes + sizes.temp_size_in_bytes
+    memory_mb = (total - sizes.alias_size_in_bytes) / 1e6
+    return Compiled(lambda *args: jax.block_until_ready(compiled(*args)), compile_s, memory_mb)
 
 
-def measure(function: Callable[..., Any], arguments: Sequence[Any], *, repeats: int) -> Timing:
+def measure(function: Callable[..., Any], arguments: Sequence[Any], *, repeats: int) -> Compiled:
     """Times jax.jit(function)(*arguments), the same work in every call."""
     made = ahead(function, arguments)
-    return Timing(fastest(lambda: made.call(*arguments), repeats=repeats), made.compile_s, made.memory_mb)
+    return made._replace(seconds=fastest(lambda: made.call(*arguments), repeats=repeats))
 
 
 def fastest(call: Callable[[], Any], *, repeats: int) -> float:
@@ -55,9 +52,3 @@ def fastest_in_turns(calls: Sequence[Callable[[], Any]], *, repeats: int) -> lis
             call()
             seconds.append(time.perf_counter() - start)
     return [min(seconds) for seconds in times]
-
-
-def _memory(compiled: Any) -> float:
-    sizes = compiled.memory_analysis()
-    total = sizes.argument_size_in_bytes + sizes.output_size_in_bytes + sizes.temp_size_in_bytes
-    return (total - sizes.alias_size_in_bytes) / 1e6

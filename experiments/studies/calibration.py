@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +12,6 @@ from experiments.runner.cli import columns
 from experiments.runner.diagnose_run import load, play_simulated, read
 from experiments.runner.options import prior_folders
 from experiments.runner.rollouts import task_of
-from experiments.studies.calibrate_args import CalibrateArgs
 from sgft_jax import stacking
 from sgft_jax.analysis import prediction, tables
 from sgft_jax.analysis.prediction import AHEAD, Cases, Inputs
@@ -21,10 +20,13 @@ from sgft_jax.examination import Examiner
 from sgft_jax.files.disk import jsonable
 from sgft_jax.io.runs import read_config
 
+if TYPE_CHECKING:
+    from experiments.studies.diagnose_calibrate import CalibrateArgs
+
 COUNTS = (1, 2, 4)  # rollouts that a prediction is made from
 
 
-def calibrate(args: CalibrateArgs, runs: list[Path], checked: list[Path]) -> tuple[dict[str, Any], list[str]]:
+def calibrate(args: "CalibrateArgs", runs: list[Path], checked: list[Path]) -> tuple[dict[str, Any], list[str]]:
     """How well gains are predicted, as JSON data and as lines for people.
 
     The runs to check on are predicted from `runs`; without any, every second gap is from the others.
@@ -81,7 +83,7 @@ def _lines(
     ]
 
 
-def gather(args: CalibrateArgs, runs: Sequence[Path]) -> list[Cases]:
+def gather(args: "CalibrateArgs", runs: Sequence[Path]) -> list[Cases]:
     """The cases of finished runs, as diagnosed from each of the COUNTS of rollouts; one run at a time is in memory."""
     examiners: dict[Any, Any] = {}
     inputs: list[list[Inputs]] = [[] for _ in COUNTS]

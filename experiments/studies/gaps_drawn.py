@@ -3,7 +3,7 @@
 import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +20,6 @@ from envs.types import Key, PyTree, Transition, UserError
 from experiments.runner.cli import columns
 from experiments.runner.evaluation import play
 from experiments.runner.gaps_run import FINAL_SEED, episode_key, percent, rate, systems, train
-from experiments.studies import gaps_choose
-from experiments.studies.gaps_draw_args import DrawArgs
 from sgft_jax import api, stacking
 from sgft_jax.algorithms import make_policy
 from sgft_jax.files.disk import differences, jsonable, write_json
@@ -33,6 +31,9 @@ from sgft_jax.models.distortion import Distortion, none
 from sgft_jax.policies import network_of
 from sgft_jax.types import Prior, SimulatedData
 
+if TYPE_CHECKING:
+    from experiments.studies.gaps_draw import DrawArgs
+
 SOLVED_AT_LEAST, FAILED_BELOW, TRIVIAL_AT_LEAST, ADMITTED_AT_LEAST = 0.8, 0.2, 0.9, 0.9
 PLANNER = "sgft-mpc"
 PREVIOUS_ACTIONS = 2  # that the judge sees: a command that comes late is still in force, or was when the step began
@@ -40,11 +41,12 @@ _ROLLOUT_SEED = 2**31 + 6  # of the rollouts that distortions are fitted to
 _MEASURED = {"zero_shot": ("zero_shot", "fit"), "plan": ("plan",), "judge": ("judge",)}  # of a line, by measurement
 _MASTERED = {"zero_shot": "zero-shot", "fit": "after fit", "plan": "by plan", "judge": "after training"}
 _ELSE = "choose another --out, or remove the table"
+type Lines = dict[str, dict[str, Any]]  # of gaps by name, or of measurements
 _SIMULATED = 8  # rollouts that tell how far the model is off in simulation; the real system is fitted to one
 
 
-def run(args: DrawArgs, seeds: list[int], folders: list[Path]) -> dict[str, Any]:
-    """Draws, writes and measures gaps; prints and returns the table. folders: of the priors."""
+def run(args: "DrawArgs", seeds: list[int], folders: list[Path]) -> tuple[list[Gap], dict[str, Any]]:
+    """Draws, writes and measures gaps; prints the table and returns both. folders: of the priors."""
     task = envs.name_of(args.task)
     env = concealed(envs.make(args.task, args.impl, **observed_by(folders)))
     drawn = gap_distribution.draw(env, gap_distribution.load(env, args.distribution), args.seed, args.count)
@@ -63,29 +65,7 @@ def run(args: DrawArgs, seeds: list[int], folders: list[Path]) -> dict[str, Any]
         table.add(_judge(env, args, missing, seeds, path.with_suffix("")))
     print("\n".join(lines([gap.name for gap in everywhere], table.known)))
     print(f"gaps: {path}\ntable: {table.path}")
-    if args.choose and args.to:
-        _choose(args, args.to, drawn, table.known)
-    return table.content
-
-
-def _choose(args: DrawArgs, path: Path, drawn: Sequence[Gap], known: Mapping[str, Mapping[str, Any]]) -> None:
-    """Writes a frozen set of the gaps that were asked for and says what is to know of it."""
-    by_name = {gap.name: gap for gap in drawn}
-    lines = {name: known[name] for name in by_name}
-    names = gaps_choose.choose(lines, args.choose)
-    rates = (f"zero-shot {100 * known[name]['zero_shot']['success']:.0f} %" for name in names)
-    words = [", ".join([success, *_marks(known[name])]) for name, success in zip(names, rates, strict=True)]
-    chosen = [by_name[name]._replace(stratum=known[name]["stratum"]) for name in names]
-    gaps_choose.write(path, chosen, words, _command(args))
-    print("\n".join([*gaps_choose.remarks(lines, names), f"chosen: {path}"]))
-
-
-def _command(args: DrawArgs) -> str:
-    """What draws and chooses the same gaps, where the same priors are."""
-    families = [f"--distribution {args.distribution}"] if args.distribution else []
-    flags = [f"--{name}" for name in ("plan", "judge") if getattr(args, name)]
-    options = [f"--task {args.task} --count {args.count} --seed {args.seed}", *families, *flags]
-    return f"python -m experiments.studies.gaps_draw {' '.join(options)} --choose {args.choose} --to {args.to}"
+    return drawn, table.content
 
 
 def write_gaps(path: Path, drawn: Sequence[Gap]) -> None:
@@ -99,7 +79,7 @@ def write_gaps(path: Path, drawn: Sequence[Gap]) -> None:
         path.write_text(f"{head}\n\n{gaps.to_toml(drawn)}")
 
 
-def _settings(env: Env, args: DrawArgs, priors: Sequence[Prior], seeds: Sequence[int]) -> dict[str, dict[str, Any]]:
+def _settings(env: Env, args: "DrawArgs", priors: Sequence[Prior], seeds: Sequence[int]) -> Lines:
     """What decides each of the measurements that are asked for, see `Table.settle`."""
     played = {"impl": env.impl, "episodes": args.episodes}
     policies = {**played, "priors": [digest(prior) for prior in priors]}
@@ -198,11 +178,11 @@ def lines(names: Sequence[str], known: Mapping[str, Mapping[str, Any]]) -> list[
         line = known[name]
         zero, plan, fit, judge = (percent(line.get(what)) for what in ("zero_shot", "plan", "fit", "judge"))
         families = " ".join(line["gap"]["families"]) or "none"
-        rows.append((name, families, zero, plan, fit, judge, line["stratum"], ", ".join(_marks(line))))
+        rows.append((name, families, zero, plan, fit, judge, line["stratum"], ", ".join(marks(line))))
     return columns(rows)
 
 
-def _marks(line: Mapping[str, Any]) -> list[str]:
+def marks(line: Mapping[str, Any]) -> list[str]:
     """The labels of a gap for people."""
     marks = ["trivial"] if line["trivial"] else []
     if line["mastered_by"]:
@@ -213,7 +193,7 @@ def _marks(line: Mapping[str, Any]) -> list[str]:
 # --- measurements -----------------------------------------------------------------------------------------------------
 
 
-def _zero_shot(env: Env, drawn: Sequence[Gap], priors: list[Prior], episodes: int) -> dict[str, dict[str, Any]]:
+def _zero_shot(env: Env, drawn: Sequence[Gap], priors: list[Prior], episodes: int) -> Lines:
     """Success of the priors' policies on gaps and without one, as they are and after one rollout of identification."""
     everywhere = [gaps.find(env.name, SIM), *drawn]
     system, members = systems(env, everywhere, priors, episodes)
@@ -257,7 +237,7 @@ def _identified(part: Interface, priors: int, members: PyTree, explored: Episode
     return jax.vmap(part.refit)(everywhere, *jax.tree.map(lambda x: x[:, 0], (rows, held))).distortion
 
 
-def _plan(env: Env, drawn: Sequence[Gap], priors: list[Prior], episodes: int) -> dict[str, dict[str, Any]]:
+def _plan(env: Env, drawn: Sequence[Gap], priors: list[Prior], episodes: int) -> Lines:
     """Success of what the planning method does before it has learned anything."""
     method = get_method(PLANNER)
     for prior in priors:
@@ -268,7 +248,7 @@ def _plan(env: Env, drawn: Sequence[Gap], priors: list[Prior], episodes: int) ->
     return _by_name("plan", drawn, _rates(played, len(drawn), len(priors)))
 
 
-def _judge(env: Env, args: DrawArgs, drawn: Sequence[Gap], seeds: list[int], folder: Path) -> dict[str, dict[str, Any]]:
+def _judge(env: Env, args: "DrawArgs", drawn: Sequence[Gap], seeds: list[int], folder: Path) -> Lines:
     """Success of policies that were trained on the gaps themselves and see their previous actions."""
     seen = env if env.previous_actions else with_previous_actions(env, PREVIOUS_ACTIONS)
     played = train(env, args.config, drawn, seeds, folder, episodes=args.episodes, seen=seen)
@@ -280,6 +260,6 @@ def _rates(played: Episode, systems: int, policies: int) -> list[dict[str, Any]]
     return [rate(stacking.part(played, i, policies), stats.mean) for i in range(systems)]
 
 
-def _by_name(what: str, drawn: Sequence[Gap], rates: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def _by_name(what: str, drawn: Sequence[Gap], rates: Sequence[dict[str, Any]]) -> Lines:
     """Of each gap what was measured there."""
     return {gap.name: {what: success} for gap, success in zip(drawn, rates, strict=True)}

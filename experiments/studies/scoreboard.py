@@ -14,7 +14,7 @@ from envs.gaps import SIM
 from envs.types import UserError, unknown
 from experiments.runner import cli
 from experiments.runner.options import at_least_one
-from experiments.studies.gaps_choose import STRATA
+from experiments.studies.gaps_draw import STRATA
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import DEFAULT
 

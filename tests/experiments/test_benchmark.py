@@ -14,7 +14,7 @@ from priors_by_hand import save_prior
 from envs.franka import hammer
 from envs.mujoco.worlds import PhysicsState
 from envs.types import UserError
-from experiments.bench import other_sac, physics, training, updates
+from experiments.bench import physics, training, updates
 from experiments.bench.timing import fastest, fastest_in_turns, measure
 from experiments.benchmark import BenchmarkConfig, main
 
@@ -152,8 +152,8 @@ def test_another_librarys_agent_gets_the_sizes_and_a_full_replay(monkeypatch):
         "sbx": SimpleNamespace(SAC=Agent),
         "stable_baselines3.common.logger": SimpleNamespace(Logger=lambda folder, formats: ("in", folder, *formats)),
     }
-    monkeypatch.setattr(other_sac.importlib, "import_module", modules.__getitem__)
-    train = other_sac.make("sbx", batch=4, width=8, obs_dim=3, act_dim=2, capacity=5)
+    monkeypatch.setattr(updates.importlib, "import_module", modules.__getitem__)
+    train = updates.other_sac("sbx", batch=4, width=8, obs_dim=3, act_dim=2, capacity=5)
     assert agents[0].asked == ("MlpPolicy", (3,), (2,), 4, 5, {"net_arch": [8, 8]}) and len(agents[0].rows) == 5
     assert train(7) == (7, 4)
 
@@ -163,9 +163,9 @@ def test_a_library_that_does_not_import_is_left_out_with_a_word(monkeypatch, cap
         if name == "sbx":
             raise AttributeError("no pytype_aval_mappings")
 
-    monkeypatch.setattr(other_sac.importlib.util, "find_spec", lambda name: name)
-    monkeypatch.setattr(other_sac.importlib, "import_module", load)
-    assert list(other_sac.importable()) == ["stable_baselines3"]
+    monkeypatch.setattr(updates.importlib.util, "find_spec", lambda name: name)
+    monkeypatch.setattr(updates.importlib, "import_module", load)
+    assert list(updates.importable()) == ["stable_baselines3"]
     assert capsys.readouterr().out == "sbx is installed but left out: AttributeError: no pytype_aval_mappings\n"
 
 
