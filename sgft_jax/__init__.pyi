@@ -8,7 +8,7 @@ from .methods import all_methods, get_method
 from .models import dynamics, normalizer, ratio, value
 from .models.config import NetworkConfig
 from .models.ratio import RatioConfig
-from .planning.mpc import MPCConfig
+from .planning import MPCConfig
 from .policies import mpc_policy, sac_policy, tdmpc2_policy
 from .presets import PRESETS, PretrainConfig
 from .systems.gymnasium import Gymnasium

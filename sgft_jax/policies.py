@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from envs.types import Array, Key, Policy, PyTree, UserError
+from sgft_jax import planning
 from sgft_jax.learners import tdmpc2, tdmpc2_model
 from sgft_jax.learners.sac import SACParams
 from sgft_jax.models import dynamics, networks, value
@@ -15,7 +16,6 @@ from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import Network
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.models.system import told
-from sgft_jax.planning import mpc
 from sgft_jax.types import Task
 
 __all__ = ["mpc_policy", "sac_policy", "tdmpc2_policy"]
@@ -89,11 +89,11 @@ def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig) -> Policy:
     )
 
 
-def mpc_policy(config: mpc.MPCConfig, task: Task, *, explore_noise: float = 0.0) -> Policy:
+def mpc_policy(config: planning.MPCConfig, task: Task, *, explore_noise: float = 0.0) -> Policy:
     """The same parameters, acting by plans. explore_noise: std of the noise on what an exploring plan does."""
     if task.reward is None or task.terminated is None:
         raise UserError("plans need a task whose reward and termination are functions of observations")
-    plan = mpc.make_act(config, reward=task.reward, terminated=task.terminated)
+    plan = planning.make_act(config, reward=task.reward, terminated=task.terminated)
 
     def act(params: SACParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         key_plan, key_noise = jax.random.split(key)
@@ -101,7 +101,7 @@ def mpc_policy(config: mpc.MPCConfig, task: Task, *, explore_noise: float = 0.0)
         return networks.add_noise(action, jnp.where(explore, explore_noise, 0.0), key_noise), carry
 
     return sac_policy(config.obs_dim, config.act_dim, config.network)._replace(
-        init_carry=lambda: mpc.init_carry(config), act=act
+        init_carry=lambda: planning.init_carry(config), act=act
     )
 
 

@@ -51,9 +51,8 @@ import tuners
 
 # The project
 from envs import gaps
-from sgft_jax import api
+from sgft_jax import api, planning
 from sgft_jax.learners import tdmpc2_model
-from sgft_jax.planning import mpc, mppi
 from sgft_jax.train import finetuning, pretraining
 from sgft_jax.types import Batch
 
@@ -145,7 +144,7 @@ def played(act, carry):
 
 def planner_mppi():
     """The search alone, with proposals, on a score with two peaks."""
-    config, hyper = mppi.MPPIConfig(samples=32, elites=6, iterations=4), mppi.MPPIHyper()
+    config, hyper = planning.MPPIConfig(samples=32, elites=6, iterations=4), planning.MPPIHyper()
     proposals = jax.random.uniform(jax.random.key(1), (4, 3, 2), minval=-1)
 
     @functools.partial(jax.jit, static_argnames="explore")
@@ -153,17 +152,17 @@ def planner_mppi():
         def score(sequence):
             return -jnp.abs(jnp.square(sequence - 0.1 * obs) - 0.25).sum()
 
-        return mppi.plan(config, hyper, score, proposals, previous, key, explore=explore)
+        return planning.plan(config, hyper, score, proposals, previous, key, explore=explore)
 
     return played(act, jnp.zeros((3, 2)))
 
 
 def planner_mpc():
     """Plans by the models of a SAC prior."""
-    config = mpc.MPCConfig(2, 2, tuners.NET, horizon=2, samples=32)
-    act = mpc.make_act(config, reward=tuners.reward, terminated=tuners.TASK.terminated)
+    config = planning.MPCConfig(2, 2, tuners.NET, horizon=2, samples=32)
+    act = planning.make_act(config, reward=tuners.reward, terminated=tuners.TASK.terminated)
     act = functools.partial(jax.jit(act, static_argnames="explore"), tuners.prior("sac").params)
-    return played(act, mpc.init_carry(config))
+    return played(act, planning.init_carry(config))
 
 
 def planner_tdmpc2():

@@ -24,7 +24,7 @@ class _SACCard(Card):
 
 
 def _policy(card: Mapping[str, Any], task: Task) -> Policy:
-    from sgft_jax.planning.mpc import MPCConfig
+    from sgft_jax.planning import MPCConfig
     from sgft_jax.policies import mpc_policy, network_of, sac_policy
 
     network = network_of(card)

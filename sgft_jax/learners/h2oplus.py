@@ -20,7 +20,6 @@ from envs.types import Array, Key, PyTree, UserError, unknown
 from sgft_jax import checks
 from sgft_jax.learners import edac, iql, steps
 from sgft_jax.math import losses, optim
-from sgft_jax.math.value_losses import value_loss
 from sgft_jax.models import normalizer, ratio
 from sgft_jax.models.config import NetworkConfig, two_layers
 from sgft_jax.models.networks import Network, make_affine_actor, make_critic, make_value
@@ -216,7 +215,7 @@ def _step_value(nets: _Networks, state: H2OPlusState, batch: Batch) -> tuple[opt
 
     def loss(params: PyTree) -> tuple[Array, Array]:
         values = jax.vmap(nets.value.apply, (None, 0))(params, batch.obs)
-        errors = value_loss(nets.config.value_loss, values, q, counted, **numbers)
+        errors = losses.in_sample_loss(nets.config.value_loss, values, q, counted, **numbers)
         return losses.real_mean(errors, batch), values
 
     fit, mean, values = optim.minimise(nets.optimiser, loss, state.value, hyper.lr_value)

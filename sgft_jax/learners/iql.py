@@ -18,7 +18,7 @@ from flax import struct
 
 from envs.types import Array, Key, PyTree
 from sgft_jax.learners import steps
-from sgft_jax.math import losses, optim, value_losses
+from sgft_jax.math import losses, optim
 from sgft_jax.models import networks, normalizer
 from sgft_jax.models.networks import Network, NetworkConfig
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
@@ -220,7 +220,7 @@ def make_iql(config: IQLConfig, hyper: IQLHyper | None = None) -> Learner:
 
 
 def _update_value(nets: _Networks, state: IQLState, batch: Batch, q: Array) -> tuple[IQLState, Metrics]:
-    row_loss = partial(value_losses.expectile_loss, expectile=state.hyper.expectile)
+    row_loss = partial(losses.expectile_loss, expectile=state.hyper.expectile)
 
     def loss(params: PyTree) -> tuple[Array, Array]:
         values = jax.vmap(nets.value.apply, (None, 0))(params, batch.obs)

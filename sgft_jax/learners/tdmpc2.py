@@ -1,8 +1,8 @@
 """TD-MPC2: planning in the latent space of a learned world model; and its fine-tuning by SGFT, with a frozen critic.
 
-The world model is in `tdmpc2_model.py`, the search in `mppi.py`; here is how an agent acts and learns. Source: Hansen
-et al. 2024; SGFT section 8.4. Left out: the termination head of tasks that end early. The TD target knows termination
-by `discount`, the planner assumes that an episode goes on for its horizon.
+The world model is in `tdmpc2_model.py`, the search in `planning.py`; here is how an agent acts and learns. Source:
+Hansen et al. 2024; SGFT section 8.4. Left out: the termination head of tasks that end early. The TD target knows
+termination by `discount`, the planner assumes that an episode goes on for its horizon.
 """
 
 from collections.abc import Callable
@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import optax
 
 from envs.types import Array, Key, PyTree, UserError
+from sgft_jax import planning
 from sgft_jax.learners import tdmpc2_model as model
 from sgft_jax.learners.tdmpc2_model import NETWORKS, Networks, TDMPC2Config, TDMPC2Hyper, TDMPC2Params, TDMPC2State
 from sgft_jax.math import optim
 from sgft_jax.models import normalizer, twohot
 from sgft_jax.models.networks import check_params, tanh_gaussian_action
-from sgft_jax.planning import mppi
 from sgft_jax.types import Batch, Learner, Metrics
 
 __all__ = ["act", "check_params_of_prior", "clip_by_norm", "discounted_mean", "extract_params", "init", "init_carry"]
@@ -53,7 +53,7 @@ def act(
     keys = jax.random.split(key_policy, (config.horizon, config.policy_samples))
     proposals = jax.vmap(lambda keys: _proposal(nets, state, z, keys), in_axes=1)(keys)
     score = _score(nets, state, z, key_score)
-    return mppi.plan(config.planner, state.hyper.planner, score, proposals, carry, key_search, explore=explore)
+    return planning.plan(config.planner, state.hyper.planner, score, proposals, carry, key_search, explore=explore)
 
 
 def update(config: TDMPC2Config, state: TDMPC2State, batch: Batch, key: Key) -> tuple[TDMPC2State, Metrics]:

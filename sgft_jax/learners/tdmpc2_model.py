@@ -15,12 +15,11 @@ from flax import linen as nn
 from flax import struct
 
 from envs.types import Array, Key, PyTree, UserError, unknown
-from sgft_jax import checks
+from sgft_jax import checks, planning
 from sgft_jax.math import optim
 from sgft_jax.models import normalizer, twohot
 from sgft_jax.models.config import SIZES, Size
 from sgft_jax.models.networks import Network, precision, tanh_gaussian_action
-from sgft_jax.planning import mppi
 from sgft_jax.types import Normalizer
 
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
@@ -65,10 +64,10 @@ class TDMPC2Config:
         _ = self.planner  # complains about the rest
 
     @property
-    def planner(self) -> mppi.MPPIConfig:
+    def planner(self) -> planning.MPPIConfig:
         """The planner's part."""
         iterations = (8 if self.act_dim >= 20 else 6) if self.iterations is None else self.iterations
-        return mppi.MPPIConfig(self.samples, self.elites, iterations)
+        return planning.MPPIConfig(self.samples, self.elites, iterations)
 
     @property
     def learned(self) -> tuple[str, ...]:
@@ -105,7 +104,7 @@ class TDMPC2Hyper(NamedTuple):
     value: float | Array = 0.1
     entropy: float | Array = 1e-4
     max_grad_norm: float | Array = 20.0
-    planner: mppi.MPPIHyper = mppi.MPPIHyper()
+    planner: planning.MPPIHyper = planning.MPPIHyper()
 
 
 class TDMPC2State(struct.PyTreeNode):

@@ -21,20 +21,8 @@ from sgft_jax.models.config import NetworkConfig, two_layers
 from sgft_jax.models.networks import Network, make_mlp
 from sgft_jax.types import Batch, Metrics, Normalizer
 
-__all__ = [
-    "RatioConfig",
-    "RatioState",
-    "difference",
-    "domain_loss",
-    "init",
-    "log_ratio",
-    "log_ratios",
-    "make_discriminator",
-    "split_rows",
-    "step",
-    "update",
-    "weight",
-]
+__all__ = ["RatioConfig", "RatioState", "difference", "domain_loss", "init", "log_ratio", "log_ratios"]
+__all__ += ["make_discriminator", "split_rows", "step", "update", "weight"]
 
 REAL, SIM = 0, 1  # the two logits of a discriminator
 
