@@ -20,7 +20,7 @@ from typing import Any, Literal, NamedTuple
 
 from envs.types import UserError
 from experiments.runner import cli
-from experiments.runner.options import Impl, at_least_one, check_task, prior_folders, task_of_priors, without_repeats
+from experiments.runner.options import Impl, at_least_one, check_task, each_once, prior_folders, task_of_priors
 from sgft_jax.io.runs import check_folder
 from sgft_jax.models.config import Precision
 from sgft_jax.presets import PRESETS
@@ -93,10 +93,7 @@ def main(config: BenchmarkConfig) -> dict[Part, list[dict[str, Any]]]:
 
 def _check(config: BenchmarkConfig) -> None:
     cli.choose("--preset", config.preset, PRESETS)
-    for name in ("parts", "tasks", "impls", "precisions"):
-        if not getattr(config, name):
-            raise UserError(f"--{name}: name at least one")
-        without_repeats(f"--{name}", getattr(config, name))
+    each_once(config, "parts", "tasks", "impls", "precisions")
     for task in config.tasks:
         check_task(task)
     at_least_one(

@@ -20,8 +20,7 @@ from envs import extend, gaps
 from envs.types import UserError, unknown
 from experiments.figures import FiguresArgs, figures
 from experiments.runner import cli, grid, hybrid_grid, tuned
-from experiments.runner.cells import Cell, check_begun, work
-from experiments.runner.grid import GridArgs
+from experiments.runner.grid import FINETUNING, Cell, GridArgs, check_begun, look_up, work
 from experiments.runner.hybrid_grid import HybridGridArgs
 from sgft_jax.io.runs import NO_DATA
 from sgft_jax.methods import DEFAULT, NAMES
@@ -86,7 +85,7 @@ def cells(args: CompareArgs) -> list[Cell]:
         for task in args.tasks:
             tuned.check_fair(args.out, task, args.methods, args.reals)
     runs = [grid.run_of(args, *place) for place in itertools.product(args.tasks, args.reals, args.methods)]
-    return [grid.look_up(tuned.apply(run) if args.tuned else run) for run in runs]
+    return [look_up(FINETUNING, tuned.apply(run) if args.tuned else run) for run in runs]
 
 
 def compare_hybrid(args: HybridGridArgs) -> None:

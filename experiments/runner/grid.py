@@ -1,14 +1,18 @@
-"""A grid of fine-tuning runs: its options, its cells and how far each has got."""
+"""Runs on disk as the cells of a grid: how far each has got, and doing what is missing, for any command that runs.
 
-from collections.abc import Mapping
+Then the grid of fine-tuning runs, with its options and cells.
+"""
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypedDict
 
 import envs
 from envs import extend, gaps
+from envs.files import Count
 from envs.types import UserError
-from experiments.runner import cells
-from experiments.runner.cells import Cell, Kind, WorkArgs
 from experiments.runner.finetune_args import (
     VOLATILE,
     FinetuneArgs,
@@ -18,11 +22,175 @@ from experiments.runner.finetune_args import (
     run_folder,
     with_settings,
 )
-from experiments.runner.options import at_least_one, check_task, not_negative, seed_list, without_repeats
+from experiments.runner.options import Impl, at_least_one, check_task, each_once, not_negative, seed_list
 from experiments.runner.start import finetune
-from sgft_jax.files.disk import jsonable
-from sgft_jax.io.runs import check_folder
+from sgft_jax.files.disk import InUseError, in_use, jsonable
+from sgft_jax.io.log import SUMMARY
+from sgft_jax.io.runs import CONFIG, check_folder, check_same, read_own
 from sgft_jax.methods import NAMES, get_method
+
+
+class Kind(NamedTuple):
+    """A command whose runs are cells of a grid; `args`: its arguments, a frozen dataclass with the field `resume`.
+
+    name: `kind` in the `config.json` of its runs. systems: the field of `args` that holds a tuple of systems; a cell
+    has one, and one call may run several. run(args): runs them, raises UserError where it cannot. folder(args),
+    config(args), title(args): a cell's run folder, its stored configuration, its name. volatile: see `check_same`.
+    finished(args, summary): whether a run with this `summary.json` is complete.
+    """
+
+    name: str
+    systems: str
+    run: Callable[[Any], object]
+    folder: Callable[[Any], Path]
+    config: Callable[[Any], Mapping[str, Any]]
+    title: Callable[[Any], str]
+    volatile: tuple[str, ...]
+    finished: Callable[[Any, Mapping[str, Any]], bool]
+
+
+class _Final(TypedDict):
+    rollouts: Count
+
+
+class _Summary(TypedDict, total=False):
+    final: _Final
+
+
+@dataclass(frozen=True)
+class WorkArgs:
+    """Options of a command that works through cells."""
+
+    together: bool = True
+    """Step the systems of cells that differ in nothing else together; --no-together: one after another, in less memory
+    but more time."""
+    minutes: float | None = None
+    """Begin no new run after so many minutes."""
+    dry: bool = False
+    """Only list the runs and what is missing."""
+    impl: Impl = "auto"
+    out: Path = Path("runs")
+    """Parent of all run folders."""
+
+
+class Cell(NamedTuple):
+    """One run, on one system. state: of its folder; done: the step of its last checkpoint, where it would go on."""
+
+    kind: Kind
+    args: Any
+    state: Literal["missing", "unfinished", "finished"]
+    done: int
+
+    def __str__(self) -> str:
+        return self.kind.title(self.args)
+
+    def now(self) -> "Cell":
+        """The same cell as it is on disk by now."""
+        return look_up(self.kind, self.args)
+
+    @property
+    def folder(self) -> Path:
+        """Where it is on disk."""
+        return self.kind.folder(self.args)
+
+    @property
+    def system(self) -> tuple[str, ...]:
+        """The one system, as the arguments hold it."""
+        return getattr(self.args, self.kind.systems)
+
+
+def look_up(kind: Kind, args: Any) -> Cell:
+    """How far the run with these arguments, of one system, has got."""
+    folder = kind.folder(args)
+    if not (folder / CONFIG).exists():
+        return Cell(kind, args, "missing", 0)
+    summary = read_own(folder / SUMMARY, _Summary)
+    from sgft_jax.io import checkpoint
+
+    last = checkpoint.latest(folder, say=lambda _: None) or 0
+    return Cell(kind, args, "finished" if summary and kind.finished(args, summary) else "unfinished", last)
+
+
+def check_begun(cells: Iterable[Cell]) -> None:
+    """Raises UserError if a run on disk was made with other options than its cell has now."""
+    for cell in cells:
+        if cell.state != "missing":
+            check_same(cell.folder, cell.kind.name, cell.kind.config(cell.args), cell.kind.volatile)
+
+
+def work(cells: Sequence[Cell], args: WorkArgs, show: Callable[[list[Cell]], None] = lambda cells: None) -> None:
+    """Completes the cells, then shows them as they are by then, and in the end raises UserError for those that failed.
+
+    show: is not called where cells are only listed.
+    """
+    failed = complete(cells, args)
+    if not args.dry:
+        show([cell.now() for cell in cells])
+    refuse(failed, "cells")
+
+
+def refuse(failed: Sequence[str], noun: str) -> None:
+    """Raises UserError if some could not run. failed: as `complete` returns it."""
+    if failed:
+        raise UserError(f"{len(failed)} of the {noun} did not run: {'; '.join(failed)}")
+
+
+def complete(cells: Sequence[Cell], args: WorkArgs, *, started: float | None = None) -> list[str]:
+    """Lists the cells, then runs those that are missing, in order; returns a line for each that could not run.
+
+    Several processes may work on one grid: each skips cells that another has finished or is running.
+    started: `time.monotonic` from which the minutes count, default now.
+    """
+    started, failed = time.monotonic() if started is None else started, []
+    for cell in cells:
+        print(f"{cell.state:10} {cell}" + (f", step {cell.done}" if cell.done else ""))
+    for batch in [] if args.dry else _batches(cells, args):
+        if args.minutes is not None and time.monotonic() - started > 60 * args.minutes:
+            print(f"stopped after {args.minutes:g} minutes; the same command goes on")
+            break
+        now = [cell.now() for cell in batch]  # others may have got further since
+        taken = [cell for cell in now if in_use(cell.folder)]
+        for cell in taken:
+            print(f"left to another process: {cell}")
+        for group in _batches([cell for cell in now if cell not in taken], args):
+            failed += _run(group)
+    return failed
+
+
+def _with(cell: Cell, systems: tuple[str, ...], **changes: Any) -> Any:
+    """The arguments of a cell for other systems."""
+    return replace(cell.args, **{cell.kind.systems: systems}, **changes)
+
+
+def _batches(cells: Sequence[Cell], args: WorkArgs) -> list[list[Cell]]:
+    """The cells that are not finished, in their order; those that one call can do follow their first one."""
+    batches: dict[Any, list[Cell]] = {}
+    for cell in [cell for cell in cells if cell.state != "finished"]:
+        key = _with(cell, ()) if args.together else cell.args
+        batches.setdefault((key, cell.state, cell.done), []).append(cell)
+    return list(batches.values())
+
+
+def _run(batch: Sequence[Cell]) -> list[str]:
+    """Runs cells that differ in their systems alone; returns a line for each that could not run."""
+    print(f"--- {', '.join(map(str, batch))}")
+    first = batch[0]
+    systems = tuple(system for cell in batch for system in cell.system)
+    try:
+        first.kind.run(_with(first, systems, resume=first.state == "unfinished"))
+    except UserError as error:
+        if len(batch) == 1 and isinstance(error, InUseError):
+            print(f"left to another process: {first}")
+            return []
+        print(f"error: {error}")
+        if len(batch) == 1:
+            return [f"{first}: {error}"]
+        # The others may have what one of them lacks; how far each has got is looked up again.
+        return [line for cell in batch for line in _run([cell.now()])]
+    return []
+
+
+# --- fine-tuning ------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -57,10 +225,7 @@ def check(args: GridArgs) -> None:
     """Raises UserError for what is wrong in the arguments alone."""
     at_least_one(args, "rollouts", "eval_every")
     not_negative(args, "minutes", "devices")
-    for name, given in (("tasks", args.tasks), ("methods", args.methods), ("reals", args.reals)):
-        if not given:
-            raise UserError(f"--{name}: name at least one")
-        without_repeats(f"--{name}", given)
+    each_once(args, "tasks", "methods", "reals")
     for task in args.tasks:
         check_task(task, args.reals)
     for method in args.methods:
@@ -88,7 +253,8 @@ def cell_of(
 
     It has the method's own defaults but for `settings`, the options of the grid, and these `changes` of its arguments.
     """
-    return look_up(with_settings(replace(run_of(args, task, real, method), **changes), settings or {}))
+    run = replace(run_of(args, task, real, method), **changes)
+    return look_up(FINETUNING, with_settings(run, settings or {}))
 
 
 def run_of(args: GridArgs, task: str, real: str, method: str) -> FinetuneArgs:
@@ -96,8 +262,3 @@ def run_of(args: GridArgs, task: str, real: str, method: str) -> FinetuneArgs:
     shared = ("seed", "seeds", "rollouts", "eval_every", "impl", "devices", "out")
     options = {name: getattr(args, name) for name in shared}
     return arguments(method, task=task, real=(real,), video=False, **options)
-
-
-def look_up(run: FinetuneArgs) -> Cell:
-    """How far the run on the one real system of these arguments has got."""
-    return cells.look_up(FINETUNING, run)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Literal
 from envs import extend, gaps
 from envs.gaps import SIM
 from envs.types import UserError, unknown
-from experiments.runner import cells, cli
-from experiments.runner.cells import Cell, Kind, WorkArgs
+from experiments.runner import cli
+from experiments.runner.grid import Cell, Kind, WorkArgs, look_up
 from experiments.runner.hybrid_args import (
     DEFAULT,
     VOLATILE,
@@ -161,7 +161,7 @@ def check(args: HybridGridArgs) -> None:
 def cells_of(args: HybridGridArgs) -> list[Cell]:
     """The cells, methods innermost, so that every data set is compared early."""
     runs = [run for data in args.data or (None,) for method in args.methods for run in _runs(args, method, data)]
-    return [cells.look_up(HYBRID, run) for run in dict.fromkeys(runs)]  # of a method without data once
+    return [look_up(HYBRID, run) for run in dict.fromkeys(runs)]  # of a method without data once
 
 
 def _runs(args: HybridGridArgs, method: str, data: Path | None) -> list[HybridArgs]:

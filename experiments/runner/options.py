@@ -56,6 +56,14 @@ def without_repeats(option: str, words: Sequence[str]) -> None:
         raise UserError(f"{option} names {twice[0]} twice; name it once")
 
 
+def each_once(args: object, *names: str) -> None:
+    """Raise UserError for an option that names nothing, or something twice."""
+    for name in names:
+        if not getattr(args, name):
+            raise UserError(f"--{name}: name at least one")
+        without_repeats(f"--{name}", getattr(args, name))
+
+
 def port_of(text: str) -> int | None:
     """The number of a port, None for what is none."""
     return int(text) if text.isdecimal() and len(text) < 9 and 0 < int(text) <= _LAST_PORT else None

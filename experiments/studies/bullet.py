@@ -12,16 +12,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from envs.types import UserError
 from experiments.runner import cli, finetune_args, panda_gym
 from experiments.runner.finetune_args import FinetuneArgs
 from experiments.runner.options import (
     at_least_one,
     check_prior,
+    each_once,
     not_negative,
     prior_folders,
     seed_list,
-    without_repeats,
 )
 from experiments.runner.panda_gym import HOME, PYTHON, TASK
 from experiments.runner.real_systems import REMOTE
@@ -90,9 +89,7 @@ def check(args: BulletArgs) -> None:
     at_least_one(args, "seeds", "rollouts", "episodes", "jobs")
     not_negative(args, "minutes")
     seed_list(args.seed, args.seeds)
-    if not args.methods:
-        raise UserError("--methods: name at least one")
-    without_repeats("--methods", args.methods)
+    each_once(args, "methods")
     check_folder(args.out)
     folders = prior_folders(args.prior, out=args.out, task=TASK, preset="")
     for method in map(get_method, args.methods):

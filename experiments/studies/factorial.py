@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 from envs import extend, gaps
 from envs.types import UserError
 from experiments.runner import cli, grid
-from experiments.runner.cells import Cell, check_begun, work
-from experiments.runner.grid import GridArgs
+from experiments.runner.grid import Cell, GridArgs, check_begun, work
 from experiments.runner.options import check_prior, prior_folders
 from sgft_jax.files.disk import jsonable, write_json
 from sgft_jax.methods import get_method

@@ -22,8 +22,7 @@ from envs.gaps import SIM
 from envs.types import UserError
 from experiments.pretrain import pretrain
 from experiments.runner import cli, grid
-from experiments.runner.cells import Cell, work
-from experiments.runner.grid import GridArgs
+from experiments.runner.grid import Cell, GridArgs, work
 from experiments.runner.options import Impl, at_least_one, not_negative, prior_folders
 from experiments.runner.pretrain_args import PretrainArgs, run_folder
 from experiments.studies.scoreboard import ScoreboardArgs, board

@@ -25,7 +25,7 @@ import numpy as np
 
 from envs.types import UserError
 from experiments.runner import cli
-from experiments.runner.options import at_least_one, seed_list, without_repeats
+from experiments.runner.options import at_least_one, each_once, seed_list
 from experiments.studies.reliable.network import bad_network, strangers
 from experiments.studies.reliable.trial import QUICK_PERIOD, QUICK_TASK, Trial, late_share, periods
 from sgft_jax.io import runs
@@ -62,9 +62,7 @@ def main(args: ReliabilityArgs) -> dict[str, list[dict[str, Any]]]:
     """Tries, prints a line for each run, writes the numbers and returns them by part."""
     at_least_one(args, "runs", "kills", "rollouts")
     seed_list(args.seed, args.runs)
-    if not args.parts:
-        raise UserError("--parts: name at least one")
-    without_repeats("--parts", args.parts)
+    each_once(args, "parts")
     check_folder(args.out / "reliability")
     home, lines = (args.out / "reliability").resolve(), {part: [] for part in args.parts}
     for part in args.parts:

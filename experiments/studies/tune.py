@@ -21,8 +21,7 @@ import numpy as np
 from envs import extend, gaps
 from envs.types import UserError
 from experiments.runner import cli, grid, tuned
-from experiments.runner.cells import Cell, check_begun, complete, refuse
-from experiments.runner.grid import GridArgs
+from experiments.runner.grid import Cell, GridArgs, check_begun, complete, refuse
 from experiments.runner.options import at_least_one, prior_home, seed_list
 from experiments.studies.spaces import SPACES, first, space_of
 from sgft_jax.io import runs

@@ -9,7 +9,7 @@ import envs
 from envs.types import UserError
 from experiments import compare
 from experiments.runner import cli, grid
-from experiments.runner.cells import complete
+from experiments.runner.grid import complete
 from sgft_jax.io import checkpoint
 from sgft_jax.io.runs import Lock
 

@@ -166,7 +166,7 @@ def test_a_summary_of_other_types_is_one_line(final, tmp_path):
     folder = run_with(finetune_args.run_folder(args, "default"))
     (folder / "summary.json").write_text(json.dumps({"final": final}))
     with pytest.raises(UserError, match=r"summary.json: (lacks )?final.*; put back the file that the run has written"):
-        grid.look_up(args)
+        grid.look_up(grid.FINETUNING, args)
 
 
 def test_priors_that_a_killed_writer_has_put_aside_are_found(tmp_path):
