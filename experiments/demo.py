@@ -12,12 +12,11 @@ from envs import extend
 from envs.files import read_json
 from envs.types import UserError
 from experiments.finetune import finetune
-from experiments.pretrain import pretrain
+from experiments.pretrain import PretrainArgs, pretrain
+from experiments.pretrain import check as check_pretraining
 from experiments.runner import cli
 from experiments.runner.finetune_args import FinetuneArgs, arguments, check, run_folder
 from experiments.runner.options import check_task
-from experiments.runner.pretrain_args import PretrainArgs
-from experiments.runner.pretrain_args import check as check_pretraining
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.methods import get_method
 from sgft_jax.presets import PRESETS

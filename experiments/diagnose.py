@@ -4,9 +4,48 @@ Draws four panels, writes the numbers as JSON, and prints a verdict in words (do
 """
 
 import json
+from dataclasses import dataclass
+from pathlib import Path
 
+from envs.types import UserError
 from experiments.runner import cli
-from experiments.runner.diagnose_args import DiagnoseArgs, check
+from experiments.runner.options import (
+    Impl,
+    at_least_one,
+    home_of_rollouts,
+    prior_folders,
+    seed_list,
+    task_of_priors,
+    task_of_rollouts,
+)
+from experiments.runner.real_systems import check as check_real
+from sgft_jax.io.runs import check_folder, read_config
+from sgft_jax.presets import DEFAULT_PRESET
+
+
+@dataclass(frozen=True)
+class DiagnoseArgs:
+    """One diagnosis, by every prior."""
+
+    task: str | None = None
+    """A task by name, or a Python file with a task of your own; default: the task of the prior."""
+    prior: Path | None = None
+    """Folder of a prior of SAC, or of several (prior/seed-*); default: those that a run began with, else those of
+    <out>/pretrain/<task>/<preset>."""
+    real: str = "default"
+    """What happened: a folder of a fine-tuning run, or any other with rollouts in real/ (docs/formats.md). Or a gap by
+    name, a .toml/.json file, file.toml:name, or gymnasium:NAME, on which the policies then play zero-shot."""
+    rollouts: int | None = None
+    """Only the first so many recorded rollouts; default: all. On a gap: how many to play, default 4."""
+    json: bool = False
+    """Print one JSON object and nothing else."""
+    out: Path = Path("runs")
+    """Parent of all run folders; picture and numbers go to <out>/diagnose/<task>/<name>."""
+    preset: str = DEFAULT_PRESET
+    """Expert: pretraining preset whose priors to take where neither --prior nor a run names any."""
+    seed: int = 0
+    """Expert: another seed plays other rollouts."""
+    impl: Impl = "auto"
 
 
 def main(args: DiagnoseArgs) -> None:
@@ -16,6 +55,29 @@ def main(args: DiagnoseArgs) -> None:
 
     summary, lines = diagnose(args, *checked)
     print(json.dumps(summary) if args.json else "\n".join(lines))
+
+
+def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
+    """The folders of the priors, the task, and where real/ is if --real is no gap; UserError for what is wrong."""
+    seed_list(args.seed, 1)
+    if args.rollouts is not None:
+        at_least_one(args, "rollouts")
+    check_folder(args.out / "diagnose")
+    recorded = home_of_rollouts("--real", Path(args.real)) if Path(args.real).is_dir() else None
+    if recorded and recorded.name in ("", ".."):
+        recorded = recorded.resolve()  # what is written is called like it
+    config = read_config(recorded) if recorded else {}
+    task, prior = args.task or (task_of_rollouts(recorded, None) if recorded and "task" in config else None), args.prior
+    if task is not None:
+        check_real(task, [] if recorded else [args.real])
+    if prior is None and task is None:
+        raise UserError("nothing to diagnose with: name a prior with --prior, or a task with --task")
+    if prior is None and config.get("prior"):
+        prior = Path(config["prior"])
+    folders = prior_folders(prior, out=args.out, task=task or "", preset=config.get("preset") or args.preset)
+    task = task_of_priors(folders, task)
+    check_real(task, [] if recorded else [args.real])
+    return folders, task, recorded
 
 
 if __name__ == "__main__":

@@ -81,8 +81,8 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     import jax
 
     import envs
-    from experiments.runner.evaluation import describe, play
     from experiments.runner.recorded import RecordedSystem
+    from experiments.runner.training import describe, play
     from sgft_jax.algorithms import make_policy
     from sgft_jax.io.priors import load_priors, observed_by
     from sgft_jax.io.real import RealStore
@@ -121,7 +121,7 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
 
 def _filmed(args: EvaluateArgs, system: Any, i: int, played: Any, folder: Path) -> dict[str, str]:
     """How the film of the first of the episodes [n] of a policy, on the i-th real system, went; {} without --video."""
-    from experiments.runner.video import film_episode
+    from experiments.runner.pictures import film_episode
     from sgft_jax.stacking import member
 
     if args.video is None:

@@ -12,7 +12,7 @@ from typing import Literal
 
 from envs.types import UserError
 from experiments.runner import cli
-from experiments.runner.rollouts import check_sizes, episodes_of, home_of, task_of
+from experiments.runner.options import check_sizes, episodes_of, home_of_rollouts, task_of_rollouts
 from sgft_jax.io.runs import check_folder, read_config
 
 _AUTHOR = "sgft_jax experiments.export_data"
@@ -36,8 +36,8 @@ class ExportDataArgs:
 
 def main(args: ExportDataArgs) -> None:
     """Writes the data set and says where it is."""
-    home = home_of("--run", args.run)
-    task, folder = task_of(home, args.task), args.out or home / "export" / args.to / _name(home, args.seed)
+    home = home_of_rollouts("--run", args.run)
+    task, folder = task_of_rollouts(home, args.task), args.out or home / "export" / args.to / _name(home, args.seed)
     check_folder(folder)
     if folder.exists():
         raise UserError(f"{folder}: exists already; choose another --out, or remove it")

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from experiments.runner import cli
-from experiments.runner.finetune_args import FinetuneArgs, arguments
-from experiments.runner.start import finetune
+from experiments.runner.finetune_args import FinetuneArgs, arguments, finetune
 from sgft_jax.methods import DEFAULT, all_methods
 
 

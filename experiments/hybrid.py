@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.runner import cli
-from experiments.runner.hybrid_args import DEFAULT, HybridArgs, arguments
-from experiments.runner.start import hybrid
+from experiments.runner.hybrid_args import DEFAULT, HybridArgs, arguments, hybrid
 from sgft_jax.methods import FIXED_NAMES, get_method
 from sgft_jax.train.schedule import FLEET, SCHEDULES
 

@@ -5,8 +5,7 @@ from pathlib import Path
 
 from envs.types import UserError
 from experiments.runner import cli
-from experiments.runner.options import without_repeats
-from experiments.runner.rollouts import episodes_of, home_of, task_of
+from experiments.runner.options import episodes_of, home_of_rollouts, task_of_rollouts, without_repeats
 from sgft_jax.io.real import Played
 from sgft_jax.io.runs import check_folder
 
@@ -31,11 +30,11 @@ class ReplayArgs:
 
 def main(args: ReplayArgs) -> None:
     """Draws, and says where the pictures are."""
-    home = home_of("--run", args.run)
+    home = home_of_rollouts("--run", args.run)
     out = args.out or home / "replay"
     check_folder(out)
-    task, episodes = task_of(home, args.task), chosen(home, args)
-    from experiments.runner.replay_draw import draw
+    task, episodes = task_of_rollouts(home, args.task), chosen(home, args)
+    from experiments.runner.pictures import draw
 
     print("\n".join(draw(home, task, episodes, out, video=args.video)))
 

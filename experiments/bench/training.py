@@ -22,10 +22,9 @@ from envs.mujoco.worlds import Impl
 from envs.rollout import Episode
 from envs.types import Key, PyTree
 from experiments.finetune import finetune
-from experiments.pretrain import pretrain
+from experiments.pretrain import PretrainArgs, pretrain
 from experiments.runner.finetune_args import arguments, run_folder
 from experiments.runner.options import prior_folders
-from experiments.runner.pretrain_args import PretrainArgs
 from sgft_jax import api
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.priors import load_priors, observed_by

@@ -4,12 +4,10 @@ import contextlib
 import dataclasses
 import difflib
 import errno
-import importlib
 import logging
 import os
 import select
 import signal
-import subprocess
 import sys
 import threading
 import traceback
@@ -35,7 +33,6 @@ _FULL = [os.strerror(number) for number in _NO_SPACE]  # "No space left on devic
 _BAD_PATH = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP)
 _ON_DISK = (*_NO_SPACE, *_BAD_PATH, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.EMFILE, errno.ENFILE)
 _CACHE_VARIABLE = "SGFT_CACHE_DIR"
-_RENDER_PROBE = "import mujoco; c = mujoco.GLContext(16, 16); c.make_current(); c.free()"
 
 
 class Stopped(KeyboardInterrupt):
@@ -351,35 +348,3 @@ def cache_folder() -> Path | None:
     if chosen.lower() in ("off", "none", "0"):
         return None
     return Path(chosen) if chosen else Path.home() / ".cache" / "sgft_jax" / "jax"
-
-
-def select_renderer() -> str | None:
-    """Make MuJoCo able to render without a screen by setting MUJOCO_GL; None on success, else one line why not.
-
-    Call it only if pictures are wanted: it tries egl and osmesa, each in a process of its own, because a failed attempt
-    cannot be undone. A value that the user has set is tried alone.
-    """
-    chosen = os.environ.get("MUJOCO_GL")
-    reasons = []
-    for backend in [chosen] if chosen else ["egl", "osmesa"]:
-        reason = _probe(backend)
-        if reason is None:
-            os.environ["MUJOCO_GL"] = backend
-            if module := sys.modules.get("mujoco.rendering.classic.gl_context"):
-                importlib.reload(module)  # MuJoCo was imported already and has read the old value
-            return None
-        reasons.append(f"{backend}: {reason}")
-    return f"MuJoCo cannot render here ({'; '.join(reasons)}); install libegl1 or libosmesa6"
-
-
-def _probe(backend: str) -> str | None:
-    """None if MuJoCo makes an off-screen context with this backend, else the last line it said."""
-    command, environment = [sys.executable, "-c", _RENDER_PROBE], {**os.environ, "MUJOCO_GL": backend}
-    try:
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
-    except subprocess.TimeoutExpired:
-        return "no answer within 60 s"
-    if done.returncode == 0:
-        return None
-    lines = [line for line in done.stderr.splitlines() if line.strip()]
-    return lines[-1].strip()[:120] if lines else f"exit code {done.returncode}"

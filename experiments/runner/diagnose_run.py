@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,6 @@ from envs.gaps import SIM, Gap
 from envs.rollout import Episode
 from envs.types import Transition, UserError
 from experiments.runner.cli import columns
-from experiments.runner.diagnose_args import DiagnoseArgs
 from experiments.runner.gaps_run import systems
 from experiments.runner.real_systems import connect, is_robot, is_stepped, title
 from experiments.runner.recorded import RecordedSystem
@@ -34,13 +33,16 @@ from sgft_jax.math import stats
 from sgft_jax.methods import get_method
 from sgft_jax.types import Prior
 
+if TYPE_CHECKING:
+    from experiments.diagnose import DiagnoseArgs
+
 SIMULATED, PLAYED = 32, 4  # rollouts of every prior in simulation, and on a gap unless the user says otherwise
 _SEED = 2**31 + 7  # of all of them
 _READ = (*Transition._fields, "valid", "success")  # arrays of a recorded rollout
 
 
 def diagnose(
-    args: DiagnoseArgs, folders: list[Path], task: str, recorded: Path | None
+    args: "DiagnoseArgs", folders: list[Path], task: str, recorded: Path | None
 ) -> tuple[dict[str, Any], list[str]]:
     """The diagnosis as JSON data and as lines for people; writes the picture and the numbers."""
     env, priors = load(task, args.impl, folders)
@@ -166,7 +168,7 @@ def _play_both(env: Env, gap: Gap, priors: list[Prior], n: int, seed: int) -> tu
     return jax.tree.map(lambda x: x[:n], real), jax.tree.map(lambda x: x[:SIMULATED], simulated)
 
 
-def _play_real(env: Env, args: DiagnoseArgs, priors: list[Prior], n: int, home: Path) -> list[Rollouts]:
+def _play_real(env: Env, args: "DiagnoseArgs", priors: list[Prior], n: int, home: Path) -> list[Rollouts]:
     """Exploring rollouts [n] of every prior on a robot or an environment, each of them kept on disk in `home`."""
     system = connect(env, [args.real], (), members=len(priors), gamma=priors[0].card["gamma"], home=args.out)
     try:

@@ -1,9 +1,12 @@
-"""The options of fine-tuning, what can be wrong with them, and the folders that follow. Imports no JAX."""
+"""Fine-tuning from its options: what can be wrong with them, the folders that follow, and the start.
+
+What is wrong is said before JAX is imported.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from envs import extend, gaps
 from envs.types import UserError
@@ -12,6 +15,7 @@ from experiments.runner.options import (
     Successors,
     at_least_one,
     check_data,
+    check_folders,
     check_prior,
     check_variant,
     not_negative,
@@ -20,23 +24,26 @@ from experiments.runner.options import (
     seeds_name,
     without_repeats,
 )
+from experiments.runner.real_systems import REMOTE, is_robot, is_stepped, title
 from experiments.runner.real_systems import check as check_real
-from experiments.runner.real_systems import is_robot, is_stepped, title
-from sgft_jax.io.runs import check_start
+from sgft_jax.files.disk import jsonable
 from sgft_jax.methods import DEFAULT, get_method
 from sgft_jax.presets import DEFAULT_PRESET, preset_of
 from sgft_jax.types import Online
 
 NO_PRIOR = Path("none")
-# May differ when a run goes on; what is in the data may not.
-_PLACES = ("out", "tuned", "real_data", "successors")
-VOLATILE = ("resume", "overwrite", "rollouts", "devices", "video", *_PLACES, "sync_every")
 _EVALUATION_EPISODES = 50
 
 
 @dataclass(frozen=True)
 class FinetuneArgs:
     """Fine-tuning of several seeds on one or more real systems at once, all in one compiled program."""
+
+    # May differ when a run goes on; what is in the data may not.
+    volatile: ClassVar = (
+        *("resume", "overwrite", "rollouts", "devices", "video", "sync_every"),
+        *("out", "tuned", "real_data", "successors"),
+    )
 
     task: str = "push"
     """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
@@ -103,6 +110,21 @@ class FinetuneArgs:
     """Expert: render an episode before and after fine-tuning side by side, where MuJoCo can render."""
 
 
+def finetune(args: FinetuneArgs) -> list[dict[str, Any]]:
+    """Fine-tuning runs from (or back) to disk, one per real system; returns their summaries in the order of `real`."""
+    args = replace(args, real=gaps.each(args.real))
+    method, seeds = check(args)
+    args = resolved(args)
+    priors = priors_of(args)
+    # Every folder is that of a run on its real system alone: either kind of run continues the other.
+    # A robot may come back at another address.
+    named = [REMOTE if is_robot(name) else name for name in args.real]
+    homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in named}
+    from experiments.runner.finetune_run import run  # JAX starts here
+
+    return run(args, method, seeds, priors, homes)
+
+
 def arguments(method: str, **changes: Any) -> FinetuneArgs:
     """The arguments with which a method runs unless the user says otherwise, and any changes to these."""
     chosen = get_method(method)
@@ -154,11 +176,7 @@ def check(args: FinetuneArgs) -> tuple[Online, list[int]]:
     _check_robot(args)
     if args.eval_at:
         _check_eval_at(args)
-    folders = [run_folder(args, real) for real in args.real]
-    if twice := [folder for folder in folders if folders.count(folder) > 1]:
-        raise UserError(f"--real {' '.join(args.real)}: two of them would share the folder {twice[0]}; name it once")
-    for folder in folders:
-        check_start(folder, resume=args.resume, overwrite=args.overwrite)
+    check_folders("--real", args.real, [run_folder(args, real) for real in args.real], args)
     return method, seeds
 
 

@@ -12,8 +12,8 @@ from envs.base import Env, World
 from envs.gaps import Gap
 from envs.rollout import Episode
 from envs.types import PyTree
+from experiments.runner.pictures import before_and_after
 from experiments.runner.training import Record
-from experiments.runner.video import before_and_after
 from sgft_jax.analysis import figures, tables
 from sgft_jax.analysis.curves import Curve, deepest_fall, describe
 from sgft_jax.analysis.reading import read_curve

@@ -3,9 +3,9 @@
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import numpy as np
@@ -14,17 +14,14 @@ import envs
 from envs import mesh
 from envs.base import Env
 from envs.rollout import Episode
-from experiments.runner import cli, logged, real_systems
-from experiments.runner.evaluation import scores
-from experiments.runner.finetune_args import VOLATILE, FinetuneArgs, run_folder
+from experiments.runner import cli, real_systems
 from experiments.runner.finetune_record import FinetuneRecord, evaluation_store
-from experiments.runner.memory import reserve
-from experiments.runner.recorded import RecordedSystem
-from experiments.runner.training import Training, opened
+from experiments.runner.machines import reserve
+from experiments.runner.recorded import RecordedSystem, begin_with, read_log
+from experiments.runner.training import Training, opened, scores
 from sgft_jax import api
 from sgft_jax.api import Setup
 from sgft_jax.datasets.logs import Log
-from sgft_jax.files.disk import jsonable
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.methods import get_method
 from sgft_jax.stacking import join, part
@@ -35,9 +32,17 @@ from sgft_jax.train.learner_process import LearnerProcess
 from sgft_jax.train.options import card_of
 from sgft_jax.types import Finetuner, Online, Prior
 
+if TYPE_CHECKING:
+    from experiments.runner.finetune_args import FinetuneArgs
 
-def run(args: FinetuneArgs, method: Online, seeds: list[int], folders: list[Path]) -> list[dict[str, Any]]:
-    """The runs on the real systems of `args`; returns their summaries. folders: of the priors."""
+
+def run(
+    args: "FinetuneArgs", method: Online, seeds: list[int], folders: list[Path], homes: Mapping[Path, Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """The runs on the real systems of `args`; returns their summaries.
+
+    folders: of the priors. homes: the configuration of each run, by its folder.
+    """
     sizes = {"--seeds" if len(args.real) == 1 else "the number of --real times --seeds": len(args.real) * args.seeds}
     devices = mesh.devices(args.devices, sizes)
     env = envs.make(args.task, args.impl, **observed_by(folders))
@@ -47,11 +52,7 @@ def run(args: FinetuneArgs, method: Online, seeds: list[int], folders: list[Path
     for prior in priors:
         api.check_prior(prior, method, env)
     card = card_of(priors[0] if priors else None)
-    logs = [logged.read(path, env, gamma=card["gamma"], successors=args.successors) for path in args.real_data]
-    # Every folder is that of a run on its real system alone: either kind of run continues the other.
-    # A robot may come back at another address.
-    named = [real_systems.REMOTE if real_systems.is_robot(name) else name for name in args.real]
-    homes = {run_folder(args, name): jsonable(args) | {"real": name} for name in named}
+    logs = [read_log(path, env, gamma=card["gamma"], successors=args.successors) for path in args.real_data]
     with contextlib.ExitStack() as last:
         last.enter_context(mesh.use(devices))
         playing, members, stepped = systems, seeds, real_systems.is_stepped(args.real[0])
@@ -69,9 +70,9 @@ def run(args: FinetuneArgs, method: Online, seeds: list[int], folders: list[Path
             "real_data": [log.facts.sha256[:12] for log in logs],
             "successors": [log.facts.successors for log in logs],
         }
-        options = {"resume": args.resume, "overwrite": args.overwrite, "volatile": VOLATILE, "inputs": inputs}
-        folders_of_runs = last.enter_context(opened(homes, kind="finetune", **options))
-        record = functools.partial(FinetuneRecord, real_evaluations=stepped, logged=logged.transitions(logs))
+        folders_of_runs = last.enter_context(opened("finetune", args, homes, inputs))
+        known = sum(log.facts.transitions for log in logs)
+        record = functools.partial(FinetuneRecord, real_evaluations=stepped, logged=known)
         records = [
             record(folder, setup.system.env, gap, method.name, seeds)
             for folder, gap in zip(folders_of_runs, systems, strict=True)
@@ -85,7 +86,7 @@ def run(args: FinetuneArgs, method: Online, seeds: list[int], folders: list[Path
         return _Run(args, setup, setup.system, card, records, logs, learner).work()
 
 
-def _reserve(args: FinetuneArgs, env: Env, priors: int, devices: int) -> None:
+def _reserve(args: "FinetuneArgs", env: Env, priors: int, devices: int) -> None:
     """Raises UserError where the devices have no room for the transitions of all members."""
     row, members = 4 * (2 * env.obs_dim + env.act_dim + 2), args.seeds * len(args.real)
     kept = {name: row * members * getattr(args.options, name) for name in ("replay_capacity", "batch_size")}
@@ -93,7 +94,7 @@ def _reserve(args: FinetuneArgs, env: Env, priors: int, devices: int) -> None:
     reserve(kept, copies=1, devices=devices, settings="options")
 
 
-def _build(args: FinetuneArgs, folders: list[Path], priors: list[Prior]) -> Callable[[], Finetuner]:
+def _build(args: "FinetuneArgs", folders: list[Path], priors: list[Prior]) -> Callable[[], Finetuner]:
     """Makes the finetuner of the run again, in another process."""
     options = {field.name: getattr(args.options, field.name) for field in dataclasses.fields(args.options)}
     prior = jax.device_get(priors[0]) if priors else None
@@ -109,14 +110,14 @@ def build(
     return chosen.build(chosen.config(**options), prior, envs.make(task, impl, **observed))
 
 
-def evaluates(args: FinetuneArgs, before: int, done: int) -> bool:
+def evaluates(args: "FinetuneArgs", before: int, done: int) -> bool:
     """Whether there is an evaluation after `done` rollouts; `before`: after how many the run was here last."""
     if args.eval_at:
         return any(before < n <= done for n in args.eval_at) or (done == 0 and 0 in args.eval_at)
     return due(args, args.eval_every, before, done)
 
 
-def due(args: FinetuneArgs, every: int, before: int, done: int) -> bool:
+def due(args: "FinetuneArgs", every: int, before: int, done: int) -> bool:
     """Whether something that happens every so many rollouts happens now: also at the start, the first and last."""
     return before == 0 or done >= args.rollouts or done % every == 0
 
@@ -132,7 +133,7 @@ class _Run(Training):
 
     def __init__(
         self,
-        args: FinetuneArgs,
+        args: "FinetuneArgs",
         setup: Setup,
         system: KnownSystem,
         card: dict[str, Any],
@@ -166,7 +167,7 @@ class _Run(Training):
         if not self.logs:
             return None
         capacity, updates = self.args.options.replay_capacity, self.args.real_updates
-        return logged.begin_with(self.logs, self.finetuner, self.system.env, capacity=capacity, updates=updates)
+        return begin_with(self.logs, self.finetuner, self.system.env, capacity=capacity, updates=updates)
 
     # ------------------------------------------------------------ between rollouts
 

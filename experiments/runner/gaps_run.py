@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +16,8 @@ from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
 from envs.types import Key, PyTree
 from experiments.runner.cli import columns
-from experiments.runner.evaluation import best_of, describe, play, scores
-from experiments.runner.gaps_args import GapsArgs
-from experiments.runner.memory import reserve
+from experiments.runner.machines import reserve
+from experiments.runner.training import best_of, describe, play, scores
 from sgft_jax import stacking
 from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import tables
@@ -30,11 +29,14 @@ from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train.pretraining import exported, memory, pretrain, prior_card
 from sgft_jax.types import Prior
 
+if TYPE_CHECKING:
+    from experiments.gaps import GapsArgs
+
 ZERO_SHOT_AT_MOST, TRAINED_AT_LEAST = 0.40, 0.95
 _HELDOUT_SEED, FINAL_SEED = 2**31 + 4, 2**31 + 5  # held-out worlds and episodes
 
 
-def run(args: GapsArgs, seeds: list[int], folders: list[Path]) -> dict[str, Any]:
+def run(args: "GapsArgs", seeds: list[int], folders: list[Path]) -> dict[str, Any]:
     """Measures, prints a table, writes and returns the summary. folders: of the priors."""
     task = envs.name_of(args.task)
     env = envs.make(args.task, args.impl, **observed_by(folders))

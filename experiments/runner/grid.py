@@ -14,16 +14,15 @@ from envs import extend, gaps
 from envs.files import Count
 from envs.types import UserError
 from experiments.runner.finetune_args import (
-    VOLATILE,
     FinetuneArgs,
     arguments,
+    finetune,
     label,
     resolved,
     run_folder,
     with_settings,
 )
 from experiments.runner.options import Impl, at_least_one, check_task, each_once, not_negative, seed_list
-from experiments.runner.start import finetune
 from sgft_jax.files.disk import InUseError, in_use, jsonable
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.io.runs import CONFIG, check_folder, check_same, read_own
@@ -241,7 +240,7 @@ FINETUNING = Kind(
     folder=lambda args: run_folder(args, *args.real),
     config=lambda args: jsonable(resolved(args)) | {"real": args.real[0]},
     title=lambda args: f"{extend.name_of(args.task)}/{gaps.title(args.real[0])}: {label(args)}",
-    volatile=VOLATILE,
+    volatile=FinetuneArgs.volatile,
     finished=lambda args, summary: summary.get("final", {}).get("rollouts", 0) >= args.rollouts,
 )
 

@@ -1,15 +1,17 @@
-"""The options of learning from real data and a simulator, what can be wrong with them, and the folders that follow."""
+"""Learning from real data and a simulator from its options: what can be wrong with them, the folders, and the start.
+
+What is wrong is said before JAX is imported.
+"""
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from tyro.conf import arg
 
 from envs import extend
-from envs.gaps import SIM, title
+from envs.gaps import SIM, each, title
 from envs.types import UserError
 from experiments.runner import cli
 from experiments.runner.options import (
@@ -17,6 +19,7 @@ from experiments.runner.options import (
     Successors,
     at_least_one,
     check_data,
+    check_folders,
     check_task,
     check_variant,
     not_negative,
@@ -24,15 +27,14 @@ from experiments.runner.options import (
     seeds_name,
     without_repeats,
 )
-from sgft_jax.io.runs import NO_DATA, NO_SIMULATOR, check_start
+from sgft_jax.files.disk import jsonable
+from sgft_jax.io.runs import NO_DATA, NO_SIMULATOR
 from sgft_jax.methods import get_method
 from sgft_jax.presets import preset_for, say_preset
 from sgft_jax.train.schedule import FLEET, Schedule, describe
 from sgft_jax.types import Fixed
 
 DEFAULT = "h2oplus"
-# These may differ when a run goes on. What is in the data may not, nor what a schedule has, whatever it is called.
-VOLATILE = ("resume", "overwrite", "out", "video", "data", "schedule_preset")
 
 SchedulePreset = Annotated[
     str,
@@ -46,6 +48,9 @@ SchedulePreset = Annotated[
 @dataclass(frozen=True)
 class HybridArgs:
     """Several seeds for one or more simulators at once, all in one compiled program."""
+
+    # May differ when a run goes on. What is in the data may not, nor what a schedule has, whatever it is called.
+    volatile: ClassVar = ("resume", "overwrite", "out", "video", "data", "schedule_preset")
 
     task: str = "halfcheetah"
     """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
@@ -91,6 +96,18 @@ class HybridArgs:
     impl: Impl = "auto"
     video: bool = True
     """Expert: render an episode of the first seed in the real system, where MuJoCo can render."""
+
+
+def hybrid(args: HybridArgs) -> list[dict[str, Any]]:
+    """Runs from (or back) to disk, one for each simulator; returns their summaries in the order of `gap`."""
+    args = replace(args, gap=each(args.gap))
+    method, seeds = check(args)
+    for line in choices(args, method):
+        print(line)
+    homes = {run_folder(args, name): jsonable(args) | {"gap": name} for name in gaps_of(args, method)}
+    from experiments.runner.hybrid_run import run  # JAX starts here
+
+    return run(args, method, seeds, homes)
 
 
 def arguments(method: str, *, preset: str = "", data: Path | None = None, **changes: Any) -> HybridArgs:
@@ -151,14 +168,6 @@ def check(args: HybridArgs) -> tuple[Fixed, list[int]]:
     without_repeats("--gap", args.gap)
     systems = () if method.kind == "offline" else args.gap
     check_task(args.task, systems if args.real == SIM else (*systems, args.real))
-    for folder in folders(args, method):
-        check_start(folder, resume=args.resume, overwrite=args.overwrite)
+    systems = gaps_of(args, method)
+    check_folders("--gap", args.gap, [run_folder(args, gap) for gap in systems], args)
     return method, seeds
-
-
-def folders(args: HybridArgs, method: Fixed) -> Sequence[Path]:
-    """The run folders of all simulators; raises UserError where two would share one."""
-    paths = [run_folder(args, gap) for gap in gaps_of(args, method)]
-    if twice := [path for path in paths if paths.count(path) > 1]:
-        raise UserError(f"--gap {' '.join(args.gap)}: two of them would share the folder {twice[0]}; name it once")
-    return paths

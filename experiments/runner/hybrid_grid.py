@@ -16,12 +16,12 @@ from experiments.runner import cli
 from experiments.runner.grid import Cell, Kind, WorkArgs, look_up
 from experiments.runner.hybrid_args import (
     DEFAULT,
-    VOLATILE,
     HybridArgs,
     SchedulePreset,
     arguments,
     data_name,
     gaps_of,
+    hybrid,
     run_folder,
 )
 from experiments.runner.options import (
@@ -32,7 +32,6 @@ from experiments.runner.options import (
     seed_list,
     without_repeats,
 )
-from experiments.runner.start import hybrid
 from sgft_jax.files.disk import jsonable
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import FIXED_NAMES, get_method
@@ -109,7 +108,7 @@ HYBRID = Kind(
     folder=lambda args: run_folder(args, _system(args)),
     config=lambda args: jsonable(args) | {"gap": _system(args)},
     title=_title,
-    volatile=VOLATILE,
+    volatile=HybridArgs.volatile,
     finished=lambda args, summary: True,  # a summary is written at the end; another schedule is refused
 )
 

@@ -1,9 +1,10 @@
 """Impure: a run of `sgft_jax.train.hybrid` with data, folders, checkpoints, logs and evaluations around it."""
 
 import functools
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,12 +18,10 @@ from envs.pools import real_env, real_worlds
 from envs.rollout import Episode
 from envs.scales import normalised
 from envs.types import Key
-from experiments.runner import logged
-from experiments.runner.evaluation import play, scores
-from experiments.runner.hybrid_args import VOLATILE, HybridArgs, gaps_of, run_folder
-from experiments.runner.memory import reserve
-from experiments.runner.training import Record, Training, opened
-from experiments.runner.video import film_episode
+from experiments.runner.machines import reserve
+from experiments.runner.pictures import film_episode
+from experiments.runner.recorded import read_log
+from experiments.runner.training import Record, Training, opened, play, scores
 from sgft_jax.analysis import figures
 from sgft_jax.analysis.hybrid import LATE, late
 from sgft_jax.analysis.reading import measures, read_curve
@@ -39,21 +38,23 @@ from sgft_jax.train import hybrid
 from sgft_jax.train.fleet import FleetState
 from sgft_jax.types import Fixed, HybridAgent, RealData
 
+if TYPE_CHECKING:
+    from experiments.runner.hybrid_args import HybridArgs
 
-def run(args: HybridArgs, method: Fixed, seeds: list[int]) -> list[dict[str, Any]]:
-    """The runs with the simulators of `args`; returns their summaries."""
+
+def run(
+    args: "HybridArgs", method: Fixed, seeds: list[int], homes: Mapping[Path, Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """The runs with the simulators of `args`; returns their summaries. homes: of each its folder and configuration."""
     env = envs.make(args.task, args.impl, previous_actions=args.previous_actions)
-    named = gaps_of(args, method)
+    named = [config["gap"] for config in homes.values()]
     simulators = [Gap(NO_SIMULATOR, {}, {}) if name == NO_SIMULATOR else gaps.load(env, name) for name in named]
     log = None
     if method.kind != "simulator" and args.data is not None:
-        log = logged.read(args.data, env, gamma=args.options.gamma, successors=args.successors)
-    homes = {run_folder(args, name): jsonable(args) | {"gap": name} for name in named}
+        log = read_log(args.data, env, gamma=args.options.gamma, successors=args.successors)
     inputs = {"data": None if log is None else {"sha256": log.facts.sha256, "successors": log.facts.successors}}
     setup = _set_up(args, method, env, simulators, seeds, log)  # refuses what it cannot play before a folder is made
-    with opened(
-        homes, kind="hybrid", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE, inputs=inputs
-    ) as folders:
+    with opened("hybrid", args, homes, inputs) as folders:
         return _Run(setup, folders).work()
 
 
@@ -79,7 +80,7 @@ class _Setup(NamedTuple):
     the real one, [M]. pools, real, keys: as `hybrid.train` takes them.
     """
 
-    args: HybridArgs
+    args: "HybridArgs"
     method: Fixed
     env: Env
     gaps: list[Gap]
@@ -93,7 +94,7 @@ class _Setup(NamedTuple):
 
 
 def _set_up(
-    args: HybridArgs, method: Fixed, task: Env, simulators: list[Gap], seeds: list[int], log: logs.Log | None
+    args: "HybridArgs", method: Fixed, task: Env, simulators: list[Gap], seeds: list[int], log: logs.Log | None
 ) -> _Setup:
     """Says how much memory the rows take; raises UserError where there is not as much."""
     env, gap = real_env(task, simulators), gaps.load(task, args.real)

@@ -1,8 +1,11 @@
-"""Options that several commands share, and what can be wrong with them. Imports neither JAX nor MuJoCo."""
+"""Options that several commands share, what can be wrong with them, and the priors and rollouts that they name.
+
+Imports neither JAX nor MuJoCo.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import arg
 
@@ -12,8 +15,13 @@ from envs.types import UserError, unknown
 from sgft_jax import checks, types
 from sgft_jax.files.disk import ASIDE, present
 from sgft_jax.io.cards import CARD, SHIPPED, known_task, read_card, resolve_shipped
+from sgft_jax.io.real import Played, home_of, played
+from sgft_jax.io.runs import CONFIG, check_start, read_config
 from sgft_jax.presets import PRESETS, check_card
 from sgft_jax.types import Online
+
+if TYPE_CHECKING:
+    from envs.base import Env
 
 _LAST_PORT = 65_535
 _MOST_HOSTS, _MOST_SEEDS = 2**16, 2**16  # of one run
@@ -94,6 +102,17 @@ def check_data(option: str, path: Path) -> None:
     """Raises UserError where there are no recorded data."""
     if not (path.is_file() or path.is_dir()):
         raise UserError(f"{option} {path}: {'is no plain file' if path.exists() else 'no such file or folder'}")
+
+
+def check_folders(option: str, words: Sequence[str], folders: Sequence[Path], args: Any) -> None:
+    """Raise UserError where a run cannot begin in its folder, or where two would share one.
+
+    words: the values of `option`, of which each has a run. args: with `resume` and `overwrite`.
+    """
+    if twice := [folder for folder in folders if folders.count(folder) > 1]:
+        raise UserError(f"{option} {' '.join(words)}: two of them would share the folder {twice[0]}; name it once")
+    for folder in folders:
+        check_start(folder, resume=args.resume, overwrite=args.overwrite)
 
 
 def check_task(task: str, reals: Sequence[str] = (), changes: Sequence[str] = ()) -> None:
@@ -188,3 +207,46 @@ def task_of_priors(folders: Sequence[Path], task: str | None) -> str:
 def _seed_number(folder: Path) -> tuple[int, str]:
     number = folder.name.removeprefix("seed-")
     return (int(number) if number.isdigit() else 0, str(folder))
+
+
+# --- the rollouts that a run has stored in real/ ----------------------------------------------------------------------
+
+
+def home_of_rollouts(option: str, folder: Path) -> Path:
+    """The folder that holds real/ with rollouts, that itself or its parent; raises UserError where there is none."""
+    home = home_of(folder)
+    if home is None:
+        raise UserError(f"{option} {folder}: holds no recorded rollouts (real/rollout-*.npz)")
+    return home
+
+
+def task_of_rollouts(home: Path, task: str | None) -> str:
+    """The task that was played: what the user says, or what the run says; raises UserError where nobody does.
+
+    A run names no code: one of a task of the user's own is of that task again where the user says so.
+    """
+    if task is None:
+        if (named := read_config(home).get("task")) is None:
+            raise UserError(f"{home}: does not say of which task it is; name it with --task")
+        return known_task(home / CONFIG, named)
+    check_task(task)
+    return task
+
+
+def episodes_of(home: Path, seed: int | None) -> list[Played]:
+    """The episodes of one seed of a run, or those of all; raises UserError for a seed that it does not have."""
+    rollouts, first = played(home), read_config(home).get("seed", 0)
+    seeds = sorted({first + rollout.seed for rollout in rollouts})
+    if seed is not None and seed not in seeds:
+        raise UserError(f"--seed {seed}: {home} has the seeds {', '.join(map(str, seeds))}")
+    return [rollout._replace(seed=first + rollout.seed) for rollout in rollouts if seed in (None, first + rollout.seed)]
+
+
+def check_sizes(home: Path, episodes: Sequence[Played], env: "Env") -> None:
+    """Raises UserError for episodes of a task with other observations or actions."""
+    seen, commanded = (episodes[0].rows[name].shape[1] for name in ("obs", "action"))
+    if seen < env.measured_dim or commanded != env.act_dim:
+        raise UserError(
+            f"{home}: has {seen} observations and {commanded} actions, {env.name} has {env.measured_dim} and "
+            f"{env.act_dim}; name its task with --task"
+        )

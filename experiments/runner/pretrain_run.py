@@ -6,7 +6,7 @@
 import functools
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +21,10 @@ from envs.pools import heldout_worlds, load_gap, real_env, training_worlds
 from envs.rollout import Episode
 from envs.system import blurred, varying, with_system
 from envs.types import Key, PyTree
-from experiments.runner import hosts
-from experiments.runner.evaluation import best_of, describe, play, scores
-from experiments.runner.memory import reserve
-from experiments.runner.pretrain_args import PretrainArgs, run_folder
+from experiments.runner.machines import folder_of_host, join_hosts, reserve
+from experiments.runner.pictures import film_episode
 from experiments.runner.report import Report, make_report, numbers
-from experiments.runner.training import Record, Training, opened
-from experiments.runner.video import film_episode
+from experiments.runner.training import Record, Training, best_of, describe, opened, play, scores
 from sgft_jax import stacking
 from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import figures
@@ -52,7 +49,9 @@ from sgft_jax.train.pretraining import (
 )
 from sgft_jax.types import Prior
 
-VOLATILE = ("resume", "overwrite", "devices", "hosts", "report", "video", "out")
+if TYPE_CHECKING:
+    from experiments.pretrain import PretrainArgs
+
 _CUT = ("n_envs", "replay_capacity", "batch_size")  # sizes that devices share
 _HELDOUT_SEED, _FINAL_SEED = 2**31, 2**31 + 1  # held-out worlds and episodes, the same for every run
 
@@ -64,9 +63,9 @@ class Saved(NamedTuple):
     best: Best
 
 
-def run(args: PretrainArgs, seeds: list[int]) -> dict[str, Any]:
-    """One run from (or back) to disk; returns its summary."""
-    hosts.join(args.hosts)
+def run(args: "PretrainArgs", seeds: list[int], home: Path) -> dict[str, Any]:
+    """One run from (or back) to disk in `home`; returns its summary."""
+    join_hosts(args.hosts)
     env = envs.make(args.task, args.impl, previous_actions=args.config.previous_actions)
     gap = load_gap(env, args.real, args.set)
     env = real_env(env, [gap] if gap else [])
@@ -76,12 +75,9 @@ def run(args: PretrainArgs, seeds: list[int]) -> dict[str, Any]:
         env = blurred(seeing, args.config.system_noise)
     sizes = memory(env, args.config)  # what does not fit is reported before anything is written
     devices = mesh.devices(args.devices, {f"--config.{n.replace('_', '-')}": getattr(args.config, n) for n in _CUT})
-    home = run_folder(args)
-    with hosts.run_folder(home) as folder, mesh.use(devices):
+    with folder_of_host(home) as folder, mesh.use(devices):
         reserve(sizes, copies=args.seeds, devices=devices)
-        with opened(
-            {folder: jsonable(args)}, kind="pretrain", resume=args.resume, overwrite=args.overwrite, volatile=VOLATILE
-        ) as (folder,):
+        with opened("pretrain", args, {folder: jsonable(args)}) as (folder,):
             mesh.meet()  # nobody looks for checkpoints before the first host has emptied a folder to be replaced
             return _Run(args, env, gap, seeds, folder, home).work()
 
@@ -95,7 +91,7 @@ class _Run(Training):
     unit = "env steps"
 
     def __init__(
-        self, args: PretrainArgs, env: Env, gap: Gap | None, seeds: list[int], folder: Path, home: Path
+        self, args: "PretrainArgs", env: Env, gap: Gap | None, seeds: list[int], folder: Path, home: Path
     ) -> None:
         self.args, self.env, self.gap, self.seeds, self.folder = args, env, gap, seeds, folder
         self.home, self.config = home, args.config
@@ -287,5 +283,5 @@ class _Run(Training):
             return
         method = "" if methods[0] == DEFAULT else f" --method {methods[0]}"
         method += "" if self.gap is None else f" --real {SIM}"
-        out = "" if self.args.out == PretrainArgs.out else f" --out {self.args.out}"
+        out = "" if self.args.out == type(self.args).out else f" --out {self.args.out}"
         print(f"next: python -m experiments.finetune --task {self.args.task}{method} --prior {self.folder}{out}")

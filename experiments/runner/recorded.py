@@ -1,4 +1,4 @@
-"""Impure: a real system whose every episode is on disk before anything learns from it."""
+"""Impure: what is on disk of real systems: logs to learn from, and every episode before anything learns from it."""
 
 import contextlib
 from collections.abc import Mapping, Sequence
@@ -12,10 +12,14 @@ import numpy as np
 from envs.base import Env
 from envs.rollout import Episode
 from envs.types import Key, PyTree, Transition, UserError
+from sgft_jax.datasets import logs as datasets
+from sgft_jax.datasets.logs import Log
 from sgft_jax.io.real import RealStore
 from sgft_jax.stacking import join, part
 from sgft_jax.systems.gymnasium import Step
 from sgft_jax.systems.simulated import SteppedSystem, System
+from sgft_jax.train.finetuning import Logged
+from sgft_jax.types import Finetuner, Successors
 
 _FACTS = tuple(name for name in Episode._fields if name != "transitions")
 _BESIDE = ("late", "time")  # what is kept of a robot's steps beside transitions, see `Step`
@@ -118,3 +122,35 @@ def _read(store: RealStore, number: int) -> Episode:
     stored = {name: jnp.asarray(x)[:, None] for name, x in arrays.items()}
     transitions = Transition(*(stored[name] for name in Transition._fields))
     return Episode(transitions=transitions, **{name: stored[name] for name in _FACTS if name in stored})
+
+
+# --- logs -------------------------------------------------------------------------------------------------------------
+
+
+def read_log(path: Path, env: Env, *, gamma: float, successors: Successors = "stored") -> Log:
+    """The real rows of a file or folder; says what they are. Raises UserError if they are not of this task."""
+    log = datasets.load(path, gamma=gamma, successors=successors, env=env)
+    facts = log.facts
+    clipped = f"; {facts.clipped:,} actions beyond [-1, 1] were clipped" if facts.clipped else ""
+    rows = f"{facts.transitions:,} transitions of {facts.episodes:,} episodes"
+    spread = f"std {facts.return_std:.3g}, {facts.return_min:.4g} to {facts.return_max:.4g}"
+    returns = f"return {facts.return_mean:.4g} ({spread})"
+    print(f"data: {facts.path}, {facts.size:,} bytes, sha256 {facts.sha256[:12]}; {rows}, {returns}{clipped}")
+    if facts.assumed:
+        print(f"{facts.path}: {facts.assumed}")
+    return log
+
+
+def begin_with(logs: Sequence[Log], finetuner: Finetuner, env: Env, *, capacity: int, updates: int | None) -> Logged:
+    """What fine-tuning begins with. capacity: transitions that an agent keeps.
+
+    updates: on the logs; None makes as many as rollouts of so many transitions would allow. Raises UserError where the
+    logs are more than an agent keeps.
+    """
+    count = sum(log.facts.transitions for log in logs)
+    if count > capacity:
+        room = f"an agent keeps {capacity:,}; raise --options.replay-capacity"
+        raise UserError(f"--real-data: {count:,} transitions, but {room}")
+    rows, valid = jax.tree.map(jnp.asarray, datasets.episodes(logs))
+    made = round(finetuner.updates_per_rollout * count / env.episode_length) if updates is None else updates
+    return Logged(rows, valid, made)

@@ -12,7 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from experiments.runner import cli, finetune_args, panda_gym
+from experiments import real_demo
+from experiments.real_demo import HOME, PYTHON, TASK
+from experiments.runner import cli, finetune_args
 from experiments.runner.finetune_args import FinetuneArgs
 from experiments.runner.options import (
     at_least_one,
@@ -22,7 +24,6 @@ from experiments.runner.options import (
     prior_folders,
     seed_list,
 )
-from experiments.runner.panda_gym import HOME, PYTHON, TASK
 from experiments.runner.real_systems import REMOTE
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.io.runs import check_folder
@@ -68,13 +69,13 @@ class _Run(NamedTuple):
 def main(args: BulletArgs) -> None:
     """Plays what is missing, and says how far it came."""
     check(args)
-    python = panda_gym.bullet(args.home, args.python)
+    python = real_demo.bullet(args.home, args.python)
     started, missing = time.monotonic(), unfinished(args)
 
     def play(run: _Run) -> None:
         if args.minutes is None or time.monotonic() - started < 60 * args.minutes:
             log = args.out / f"robot-{run.method}-{run.seed}.log"
-            panda_gym.fine_tune(python, args.out, options(args, run), log=log)
+            real_demo.fine_tune(python, args.out, options(args, run), log=log)
 
     args.out.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(args.jobs) as pool:
@@ -97,7 +98,7 @@ def check(args: BulletArgs) -> None:
             check_prior(folder, method, TASK)
     for run in unfinished(args):
         finetune_args.check(replace(_arguments(args, run.method, run.seed), resume=run.folder.exists()))
-    panda_gym.check_driver()
+    real_demo.check_driver()
 
 
 def runs(args: BulletArgs) -> Iterator[_Run]:

@@ -10,8 +10,7 @@ import numpy as np
 from envs.types import UserError
 from experiments.runner.cli import columns
 from experiments.runner.diagnose_run import load, play_simulated, read
-from experiments.runner.options import prior_folders
-from experiments.runner.rollouts import task_of
+from experiments.runner.options import prior_folders, task_of_rollouts
 from sgft_jax import stacking
 from sgft_jax.analysis import prediction, tables
 from sgft_jax.analysis.prediction import AHEAD, Cases, Inputs
@@ -90,7 +89,7 @@ def gather(args: "CalibrateArgs", runs: Sequence[Path]) -> list[Cases]:
     played: list[list[float]] = [[] for _ in COUNTS]
     facts: list[tuple[Any, ...]] = []
     for run in runs:
-        config, curve, task = read_config(run), read_curve(run).of("success"), task_of(run, args.task)
+        config, curve, task = read_config(run), read_curve(run).of("success"), task_of_rollouts(run, args.task)
         begun, preset = Path(config["prior"]) if config.get("prior") else None, config.get("preset") or args.preset
         folders = prior_folders(args.prior or begun, out=args.out, task=task, preset=preset)
         key = (task, *folders)

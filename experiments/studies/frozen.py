@@ -20,11 +20,10 @@ import envs
 from envs import gaps
 from envs.gaps import SIM
 from envs.types import UserError
-from experiments.pretrain import pretrain
+from experiments.pretrain import PretrainArgs, pretrain, run_folder
 from experiments.runner import cli, grid
 from experiments.runner.grid import Cell, GridArgs, work
 from experiments.runner.options import Impl, at_least_one, not_negative, prior_folders
-from experiments.runner.pretrain_args import PretrainArgs, run_folder
 from experiments.studies.scoreboard import ScoreboardArgs, board
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.io.runs import CONFIG, check_folder

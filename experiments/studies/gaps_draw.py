@@ -17,8 +17,8 @@ from envs import gaps
 from envs.files import read_toml
 from envs.gaps import SIM, Gap
 from envs.types import UserError
+from experiments.gaps import PLAIN, MeasureArgs, check_episodes, folders_of_priors
 from experiments.runner import cli
-from experiments.runner.gaps_args import PLAIN, MeasureArgs, check_episodes, folders_of_priors
 from experiments.runner.options import at_least_one, check_task, seed_list
 from sgft_jax.io.runs import check_folder
 from sgft_jax.presets import PRESETS

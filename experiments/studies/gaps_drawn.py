@@ -18,8 +18,8 @@ from envs.rollout import Episode
 from envs.system import concealed
 from envs.types import Key, PyTree, Transition, UserError
 from experiments.runner.cli import columns
-from experiments.runner.evaluation import play
 from experiments.runner.gaps_run import FINAL_SEED, episode_key, percent, rate, systems, train
+from experiments.runner.training import play
 from sgft_jax import api, stacking
 from sgft_jax.algorithms import make_policy
 from sgft_jax.files.disk import differences, jsonable, write_json

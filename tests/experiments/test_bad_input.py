@@ -6,14 +6,13 @@ from pathlib import Path
 import pytest
 
 from envs.types import UserError
-from experiments import diagnose, evaluate, export, export_data, figures, gaps, replay
-from experiments.runner import collect_args
+from experiments import collect, diagnose, evaluate, export, export_data, figures, gaps, replay
 from experiments.studies import bullet, gaps_draw, scoreboard
 
 PRIOR = Path(__file__).parents[2] / "sgft_jax/priors/push/seed-0"
 
 COMMANDS = {
-    "collect": lambda run, out: collect_args.check(collect_args.CollectArgs(out=out)),
+    "collect": lambda run, out: collect.check(collect.CollectArgs(out=out)),
     "diagnose": lambda run, out: diagnose.check(diagnose.DiagnoseArgs(prior=PRIOR, out=out)),
     "evaluate": lambda run, out: evaluate.check(evaluate.EvaluateArgs(prior=PRIOR, real=("remote",), out=out)),
     "replay": lambda run, out: replay.main(replay.ReplayArgs(run, task="push", out=out)),

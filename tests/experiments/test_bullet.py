@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from envs.types import UserError
-from experiments.runner import panda_gym
+from experiments import real_demo
 from experiments.studies import bullet
 from experiments.studies.bullet import BulletArgs
 
@@ -28,8 +28,8 @@ def played(monkeypatch):
         calls.append((method, int(seed), "--resume" in words))
 
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(panda_gym, "bullet", lambda home, python: Path("python3.11"))
-    monkeypatch.setattr(panda_gym, "fine_tune", fine_tune)
+    monkeypatch.setattr(real_demo, "bullet", lambda home, python: Path("python3.11"))
+    monkeypatch.setattr(real_demo, "fine_tune", fine_tune)
     return calls
 
 

@@ -10,7 +10,7 @@ import jax
 import pytest
 
 from envs.types import UserError
-from experiments.runner import cli
+from experiments.runner import cli, pictures
 
 
 @dataclasses.dataclass(frozen=True)
@@ -383,23 +383,23 @@ def test_a_renderer_that_mujoco_cannot_import_is_one_line():
 
 def test_the_first_backend_that_renders_is_taken(monkeypatch):
     os.environ.pop("MUJOCO_GL", None)
-    monkeypatch.setattr(cli, "_probe", {"egl": "no driver", "osmesa": None}.get)
-    monkeypatch.setattr(cli.importlib, "reload", lambda module: module)
-    assert cli.select_renderer() is None
+    monkeypatch.setattr(pictures, "_probe", {"egl": "no driver", "osmesa": None}.get)
+    monkeypatch.setattr(pictures.importlib, "reload", lambda module: module)
+    assert pictures.select_renderer() is None
     assert os.environ["MUJOCO_GL"] == "osmesa"
 
 
 def test_no_renderer_is_one_line_with_the_reasons(monkeypatch):
     os.environ.pop("MUJOCO_GL", None)
-    monkeypatch.setattr(cli, "_probe", {"egl": "no driver", "osmesa": "no library"}.get)
-    reason = cli.select_renderer()
+    monkeypatch.setattr(pictures, "_probe", {"egl": "no driver", "osmesa": "no library"}.get)
+    reason = pictures.select_renderer()
     assert "egl: no driver; osmesa: no library" in reason and "\n" not in reason
     assert "MUJOCO_GL" not in os.environ
 
 
 def test_the_users_backend_is_tried_alone_and_for_real():
     os.environ["MUJOCO_GL"] = "disable"
-    assert cli.select_renderer().startswith("MuJoCo cannot render here (disable: AttributeError")
+    assert pictures.select_renderer().startswith("MuJoCo cannot render here (disable: AttributeError")
 
 
 def test_a_variable_that_jax_cannot_read_is_named_in_one_line():

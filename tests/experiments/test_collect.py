@@ -11,8 +11,13 @@ import pytest
 
 from envs.types import Transition, UserError
 from experiments import collect, hybrid
+<<<<<<< HEAD
 from experiments.runner import collect_args, collect_run
 from sgft_jax.datasets import logs, recording
+=======
+from experiments.runner import collect_run
+from sgft_jax.datasets import acceptance, logs, recording
+>>>>>>> 73d4ab5 (A command declares its own options; runs, rollouts, pictures, machines and Bullet are told in fewer files)
 from sgft_jax.datasets.recording import Joints, Noted, Recorded
 
 OPTIONS = """--task toy --level -100 --transitions 50 --seeds 2 --environments 3 --updates 60 --eval-every 30
@@ -148,8 +153,13 @@ def test_minaris_own_library_opens_a_set(tmp_path, monkeypatch):
 
 
 def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys, monkeypatch):
+<<<<<<< HEAD
     monkeypatch.setitem(collect_args.LEVELS, "toy", -100.0)
     monkeypatch.setattr(logs, "BANDS", {"toy-medium-replay": {"transitions": logs.Band(300, 0.25)}})
+=======
+    monkeypatch.setitem(collect.LEVELS, "toy", -100.0)
+    monkeypatch.setattr(acceptance, "BANDS", {"toy-medium-replay": {"transitions": acceptance.Band(300, 0.25)}})
+>>>>>>> 73d4ab5 (A command declares its own options; runs, rollouts, pictures, machines and Bullet are told in fewer files)
     out = tmp_path / "data"
     collect.main([*LEARN, "--out", str(out)])
     said = capsys.readouterr().out
@@ -223,7 +233,7 @@ def test_what_was_learned_from_is_kept_if_recording_fails(tmp_path, monkeypatch)
     ],
 )
 def test_sets_made_in_another_way_are_not_judged(changes, judged):
-    assert collect_args.is_d4rls(collect_args.CollectArgs(**changes)) == judged
+    assert collect.is_d4rls(collect.CollectArgs(**changes)) == judged
 
 
 @pytest.mark.parametrize(
@@ -264,7 +274,7 @@ def test_bad_input(words, said, tmp_path, capsys):
 @pytest.mark.parametrize(("task", "reward"), [("wheel-legged", 29.0), ("wheel-legged-forward", 14.4)])
 def test_the_log_of_an_operator_resembles_the_published_one(task, reward, tmp_path):
     """Spread within a factor of two of that of H2O+'s log, reward of a step within 1 % or 0.3."""
-    args = collect_args.CollectArgs(task=task, real="robot", operator=True, transitions=6_000, out=tmp_path, impl="c")
+    args = collect.CollectArgs(task=task, real="robot", operator=True, transitions=6_000, out=tmp_path, impl="c")
     (facts,) = collect.collect(args)
     published = {"v": 0.197, "pitch": 0.0475, "pitch velocity": 0.534, "torque": 0.719}
     for name, value in published.items():
@@ -275,12 +285,12 @@ def test_the_log_of_an_operator_resembles_the_published_one(task, reward, tmp_pa
 
 
 def test_files_are_named_after_the_real_system(tmp_path):
-    args = collect_args.CollectArgs(task="push", out=tmp_path, policy=Path("shipped:push/seed-0"))
-    assert [path.name for path in collect_args.targets(args)] == ["push-priors-seed-0.hdf5"]
+    args = collect.CollectArgs(task="push", out=tmp_path, policy=Path("shipped:push/seed-0"))
+    assert [path.name for path in collect.targets(args)] == ["push-priors-seed-0.hdf5"]
     args = dataclasses.replace(args, real="sets/hard.toml:deep")
-    assert [path.name for path in collect_args.targets(args)] == ["push-deep-priors-seed-0.hdf5"]
-    names = [path.name for path in collect_args.targets(dataclasses.replace(args, policy=None))]
-    assert names == [f"push-deep-{kind}-regenerated-seed-0.hdf5" for kind in collect_args.PAIR]
+    assert [path.name for path in collect.targets(args)] == ["push-deep-priors-seed-0.hdf5"]
+    names = [path.name for path in collect.targets(dataclasses.replace(args, policy=None))]
+    assert names == [f"push-deep-{kind}-regenerated-seed-0.hdf5" for kind in collect.PAIR]
 
 
 def test_files_are_not_replaced(tmp_path, capsys):

@@ -10,7 +10,7 @@ from priors_by_hand import save_prior
 
 from envs.rollout import Episode
 from experiments import evaluate
-from experiments.runner import cli, evaluation
+from experiments.runner import cli, training
 
 pytestmark = pytest.mark.usefixtures("toy_task")
 
@@ -33,11 +33,11 @@ def played(scores, exploded, score="return"):
 def test_episodes_that_explode_count_as_the_worst_that_is_known():
     """Rewards are costs, so what an episode had earned until then is more than a whole one earns."""
     episodes = played([-12, -14, -2], [False, False, True])
-    found = evaluation.scores(episodes)
+    found = training.scores(episodes)
     assert found["return"] == found["score"] == pytest.approx(-40 / 3) and found["exploded"] == pytest.approx(1 / 3)
-    assert evaluation.describe(jax.tree.map(lambda x: x[0], episodes))["return"] == pytest.approx(-40 / 3)
-    assert evaluation.scores(episodes, np.array([[-20.0, -20.0]]))["score"] == pytest.approx(-46 / 3)
-    failed = evaluation.scores(played([-12, -2], [False, True], "success"))
+    assert training.describe(jax.tree.map(lambda x: x[0], episodes))["return"] == pytest.approx(-40 / 3)
+    assert training.scores(episodes, np.array([[-20.0, -20.0]]))["score"] == pytest.approx(-46 / 3)
+    failed = training.scores(played([-12, -2], [False, True], "success"))
     assert failed["score"] == 0 and failed["return"] == -12
 
 
@@ -45,8 +45,8 @@ def test_a_prior_that_explodes_is_not_chosen():
     params, steps = jnp.zeros((1, 1)), jnp.zeros(1, jnp.int32)
     whole, bursts = played([-12, -14], [False, False]), played([-2, -3], [True, True])
     for first, second, kept in ((whole, bursts, 0), (bursts, whole, 1)):
-        best = evaluation.best_of(None, params, first, steps)
-        best = evaluation.best_of(best, params + 1, second, steps)
+        best = training.best_of(None, params, first, steps)
+        best = training.best_of(best, params + 1, second, steps)
         assert best.params.tolist() == [[kept]] and best.score.tolist() == [-13]
 
 

@@ -15,7 +15,7 @@ import envs
 from envs import mesh
 from envs.types import UserError
 from experiments import pretrain
-from experiments.runner import hosts, pretrain_args
+from experiments.runner import machines
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.priors import load_prior
@@ -89,12 +89,12 @@ def test_two_hosts_continue_what_one_began(tmp_path, monkeypatch):
 )
 def test_hosts_that_nobody_can_meet(given, words):
     with pytest.raises(UserError, match=words):
-        hosts.join(given)
+        machines.join_hosts(given)
 
 
 def test_what_is_no_host_is_found_before_jax_starts():
     with pytest.raises(UserError, match="the port of node7:0 must be from 1 to 65535"):
-        pretrain_args.check(pretrain_args.PretrainArgs(hosts="node7:0,2,0"))
+        pretrain.check(pretrain.PretrainArgs(hosts="node7:0,2,0"))
 
 
 def test_several_hosts_work_with_all_their_devices(monkeypatch):

@@ -204,7 +204,7 @@ def test_presets_are_the_defaults_of_their_options():
 def parsed(words, monkeypatch):
     """The arguments with which a command line runs, and what it says before JAX starts."""
     seen = []
-    monkeypatch.setattr("experiments.runner.hybrid_run.run", lambda args, method, seeds: seen.append(args))
+    monkeypatch.setattr("experiments.runner.hybrid_run.run", lambda args, *_: seen.append(args))
     hybrid.main(words.split())
     return seen[0]
 

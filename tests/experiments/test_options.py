@@ -7,8 +7,8 @@ import pytest
 from priors_by_hand import save_prior
 
 from envs.types import UserError
-from experiments.runner import memory, options
-from experiments.runner.memory import reserve
+from experiments.runner import machines, options
+from experiments.runner.machines import reserve
 from experiments.runner.options import prior_folders, seed_list, seeds_name
 from sgft_jax.io.cards import resolve_shipped
 
@@ -97,7 +97,7 @@ def test_advice_where_there_is_no_prior_fits_what_was_asked(tmp_path):
 
 def test_a_budget_that_does_not_fit_names_the_largest_part(monkeypatch, capsys):
     parts = {"random_transitions": 2**30, "replay_capacity": 3 * 2**30}
-    monkeypatch.setattr(memory, "free_memory", lambda: 5 * 2**30)
+    monkeypatch.setattr(machines, "free_memory", lambda: 5 * 2**30)
     reserve(parts, copies=2, devices=2)  # 4 GiB each
     assert capsys.readouterr().out == (
         "memory: 4.00 GiB of 5.00 GiB free on each device (random_transitions 1.00 GiB, replay_capacity 3.00 GiB)\n"
@@ -107,5 +107,5 @@ def test_a_budget_that_does_not_fit_names_the_largest_part(monkeypatch, capsys):
     with pytest.raises(UserError, match=r"7\.00 GiB of 5\.00 GiB free on each device: lower --schedule\.buffer"):
         reserve({"buffer": 2**31}, copies=3, shared=2**30, settings="schedule")  # what is shared counts once
     assert "(buffer 6.00 GiB, data 1.00 GiB)" in capsys.readouterr().out
-    monkeypatch.setattr(memory, "free_memory", lambda: None)
+    monkeypatch.setattr(machines, "free_memory", lambda: None)
     reserve(parts, copies=2)  # nobody knows: the run may try

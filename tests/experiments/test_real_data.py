@@ -15,8 +15,8 @@ from envs.history import with_previous_actions
 from envs.pools import real_worlds
 from envs.types import UserError
 from experiments import export_data, finetune, replay
-from experiments.runner import cli, replay_draw
-from experiments.runner.rollouts import episodes_of
+from experiments.runner import cli, pictures
+from experiments.runner.options import episodes_of
 from sgft_jax.datasets import logs
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.real import RealStore
@@ -246,7 +246,7 @@ def test_killed_before_or_among_the_updates_on_logs(words, tmp_path, updates, mo
 
 def test_panels_show_measurements_commands_and_what_was_sent(home):
     """Three steps of 0.1 s have four states; what was sent stays to the end of its step."""
-    panels = {panel.name: panel for panel in replay_draw.panels(ENV, episodes_of(home, 3)[1:])}
+    panels = {panel.name: panel for panel in pictures.panels(ENV, episodes_of(home, 3)[1:])}
     sent = panels.get("force, sent; dotted: commanded")
     assert list(panels)[:2] == ["xy", "velocity"] and len(panels) == 4 and panels["velocity"].unit == "m/s"
     np.testing.assert_allclose(panels["xy"].lines["[1]"], [10, 11, 12, 13, np.nan])
@@ -258,11 +258,11 @@ def test_panels_show_measurements_commands_and_what_was_sent(home):
 
 def test_episodes_stand_one_after_another(home):
     """The second begins where the first has ended, with a gap in the line."""
-    panel = replay_draw.panels(ENV, episodes_of(home, 3))[0]
+    panel = pictures.panels(ENV, episodes_of(home, 3))[0]
     np.testing.assert_allclose(panel.lines["[0]"], [0, 1, 2, 3, 4, 5, np.nan, 10, 11, 12, 13, np.nan])
     np.testing.assert_allclose(panel.time[[0, 5, 7, 10]], [0, 0.5, 0.5, 0.8])
     bare = [own._replace(command=None) for own in episodes_of(home, 3)]
-    panel = replay_draw.panels(ENV, bare)[2]
+    panel = pictures.panels(ENV, bare)[2]
     assert panel.name == "force, sent" and not panel.dotted
 
 

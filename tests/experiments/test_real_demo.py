@@ -12,7 +12,6 @@ from priors_by_hand import save_prior
 from envs.types import UserError
 from experiments import real_demo
 from experiments.real_demo import RealDemoArgs
-from experiments.runner import panda_gym
 
 ROOT = Path(__file__).parents[2]
 PRIOR = ROOT / "sgft_jax/priors/panda-push/seed-0"  # it is only looked for
@@ -60,31 +59,31 @@ def test_the_environment_is_made_once_and_its_failure_is_one_line(tmp_path):
     home = tmp_path / "home"
     makes = f"echo $2 >> {tmp_path}/calls; mkdir -p {home}/bin; ln -sf {tmp_path}/python3.11 {home}/bin/python"
     python = fake_python(tmp_path, makes)
-    assert panda_gym.bullet(home, python) == panda_gym.bullet(home, python) == home / "bin" / "python"
+    assert real_demo.bullet(home, python) == real_demo.bullet(home, python) == home / "bin" / "python"
     assert (tmp_path / "calls").read_text() == "venv\npip\n"
     broken = fake_python(tmp_path, "echo long story >&2; echo no room on this disk >&2; exit 1")
     with pytest.raises(UserError, match=r"python3.11 -m venv --clear failed: no room on this disk$"):
-        panda_gym.bullet(tmp_path / "other", broken)
+        real_demo.bullet(tmp_path / "other", broken)
 
 
 def test_the_robots_process_ends_with_the_learner(tmp_path, monkeypatch):
-    monkeypatch.setattr(panda_gym, "_END", 0.1)
-    panda_gym.together(["true"], ["sh", "-c", f"echo $$ > {tmp_path}/pid; exec sleep 60"], tmp_path / "log")
+    monkeypatch.setattr(real_demo, "_END", 0.1)
+    real_demo.together(["true"], ["sh", "-c", f"echo $$ > {tmp_path}/pid; exec sleep 60"], tmp_path / "log")
     with pytest.raises(ProcessLookupError):
         os.kill(int((tmp_path / "pid").read_text()), 0)
 
 
 def test_a_side_that_fails_is_an_error_and_no_endless_wait(tmp_path, monkeypatch):
-    monkeypatch.setattr(panda_gym, "_END", 5.0)
+    monkeypatch.setattr(real_demo, "_END", 5.0)
     with pytest.raises(UserError, match=r"the robot's side has ended with exit code 3; see .*log"):
-        panda_gym.together(["sleep", "60"], ["sh", "-c", "echo no pybullet; exit 3"], tmp_path / "log")
+        real_demo.together(["sleep", "60"], ["sh", "-c", "echo no pybullet; exit 3"], tmp_path / "log")
     assert "no pybullet" in (tmp_path / "log").read_text()
     with pytest.raises(UserError, match="fine-tuning has ended with exit code 2"):
-        panda_gym.together(["sh", "-c", "exit 2"], ["sleep", "0.2"], tmp_path / "log")
-    monkeypatch.setattr(panda_gym, "_END", 0.1)
+        real_demo.together(["sh", "-c", "exit 2"], ["sleep", "0.2"], tmp_path / "log")
+    monkeypatch.setattr(real_demo, "_END", 0.1)
     with pytest.raises(UserError, match="the robot's side has ended with exit code 0"):
-        panda_gym.together(["sleep", "60"], ["true"], tmp_path / "log")  # a learner would wait without end
-    panda_gym.together(["sleep", "0.05"], ["true"], tmp_path / "log")  # the robot ends first where all is well
+        real_demo.together(["sleep", "60"], ["true"], tmp_path / "log")  # a learner would wait without end
+    real_demo.together(["sleep", "0.05"], ["true"], tmp_path / "log")  # the robot ends first where all is well
 
 
 def test_the_film_shows_an_episode_that_was_mended():
@@ -101,11 +100,11 @@ def test_the_first_and_the_last_evaluation_are_filmed():
 
 @pytest.mark.slow
 def test_the_demo_in_bullet(tmp_path, monkeypatch, capsys):
-    if panda_gym.said(BULLET, "import panda_gym, msgpack, websockets") is None:
+    if real_demo.output(BULLET, "import panda_gym, msgpack, websockets") is None:
         pytest.skip("no panda-gym: run `make real-demo` once, or name a Python that has it in SGFT_BULLET_PYTHON")
     monkeypatch.chdir(ROOT)
     save_prior(tmp_path / "prior", 0, task="panda-push", obs_dim=21, act_dim=3)
-    monkeypatch.setattr(panda_gym, "bullet", lambda home, python: Path(BULLET))
+    monkeypatch.setattr(real_demo, "bullet", lambda home, python: Path(BULLET))
     real_demo.main(RealDemoArgs(tmp_path / "prior", "sac", rollouts=2, episodes=3, out=tmp_path / "demo"))
     said = capsys.readouterr().out
     assert "success in Bullet: " in said and "video: " in said

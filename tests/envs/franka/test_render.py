@@ -12,7 +12,7 @@ import pytest
 from envs.franka import hammer, insert, push
 from envs.mujoco import render
 from envs.types import UserError
-from experiments.runner.cli import select_renderer
+from experiments.runner.pictures import select_renderer
 
 SCENES = {"push": push.SCENE, "hammer": hammer.SCENE, "insert": insert.SCENE}
 

@@ -8,7 +8,7 @@ from runners import TASKS, at_rest, theta_of
 from envs import gaps
 from envs.locomotion import wheel_legged
 from envs.mujoco import render
-from experiments.runner.cli import select_renderer
+from experiments.runner.pictures import select_renderer
 
 
 @pytest.fixture(autouse=True)

@@ -22,7 +22,7 @@ from envs.mujoco.engines import warp as engine_warp
 from envs.mujoco.scene import Measured, Scene, View, make_env
 from envs.mujoco.worlds import PhysicsState
 from envs.types import UserError
-from experiments.runner.cli import select_renderer
+from experiments.runner.pictures import select_renderer
 
 WALL = 0.2  # m
 MJCF = """

@@ -12,7 +12,7 @@ import pytest
 import toy
 
 from envs.types import Transition, UserError
-from experiments.runner import logged
+from experiments.runner.recorded import read_log
 from sgft_jax.data import replay, sequences, sources
 from sgft_jax.datasets import logs
 from sgft_jax.files import arrays, hdf5
@@ -266,7 +266,7 @@ def test_without_timeouts_and_successors_the_task_tells_how_long_an_episode_last
 
 def test_a_command_says_what_was_assumed(write, capsys):
     sizes = {"observations": numbers(0, width=4), "next_observations": numbers(9, width=4), "actions": np.zeros((N, 2))}
-    logged.read(write(d4rl(timeouts=None, **sizes)), toy.make(), gamma=0.9)
+    read_log(write(d4rl(timeouts=None, **sizes)), toy.make(), gamma=0.9)
     assert "some.hdf5: has no 'timeouts': an episode is taken to end" in capsys.readouterr().out
 
 

@@ -1,14 +1,17 @@
-"""Impure: one run on several hosts. All of them run the same program, each on its own devices. The first
-host writes the run folder. The others write to a temporary folder, so other modules need no special case for them.
+"""Impure: the machines of a run: whether it fits into the memory of the devices, and several hosts together.
+
+All hosts run the same program, each on its own devices. The first host writes the run folder. The others write to a
+temporary folder, so other modules need no special case for them.
 """
 
 import contextlib
 import os
+import re
 import shutil
 import sys
 import tempfile
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import jax
@@ -21,7 +24,7 @@ from experiments.runner.options import hosts_of
 _TOGETHER = ("checkpoints", "random", "prior")
 
 
-def join(hosts: str | None) -> None:
+def join_hosts(hosts: str | None) -> None:
     """Connects to the other hosts, before JAX is used for anything; None: there are no others.
 
     hosts: `auto` asks the cluster that started this process (SLURM, Open MPI, Kubernetes, as JAX detects them);
@@ -40,7 +43,7 @@ def join(hosts: str | None) -> None:
 
 
 @contextlib.contextmanager
-def run_folder(folder: Path) -> Iterator[Path]:
+def folder_of_host(folder: Path) -> Iterator[Path]:
     """Where this host writes the run of that folder: there on the first host, elsewhere and silently on the others.
 
     They begin with a copy of its logs, so that all can resume. Checkpoints and priors are not for here: hosts save and
@@ -66,3 +69,37 @@ def run_folder(folder: Path) -> Iterator[Path]:
         except Exception:
             traceback.print_exc()
             os._exit(1)  # an orderly exit would wait minutes for the other hosts, which wait for this one
+
+
+def reserve(
+    parts: Mapping[str, int], *, copies: int, devices: int = 1, shared: int = 0, settings: str = "config"
+) -> None:
+    """Prints how much memory each device will need; raises UserError if it is more than the device has room for.
+
+    parts: bytes of one agent's by the setting that decides them. copies: agents trained together. shared: bytes of data
+    that they all read. settings: the group of options that these settings belong to.
+    """
+    share = {name: copies * size / devices for name, size in parts.items()}
+    need, room = sum(share.values()) + shared, free_memory()
+    free = "" if room is None else f" of {_gib(room)} free"
+    data = {"data": shared} if shared else {}
+    listed = ", ".join(f"{name} {_gib(size)}" for name, size in (share | data).items())
+    print(f"memory: {_gib(need)}{free} on each device ({listed})")
+    if room is not None and need > room:
+        option = max(share, key=share.__getitem__).replace("_", "-")
+        raise UserError(
+            f"experience and batches take {_gib(need)}{free} on each device: lower --{settings}.{option} or train fewer"
+        )
+
+
+def free_memory() -> int | None:
+    """Bytes that the first device can still hold; None where the device does not report it."""
+    if stats := jax.local_devices()[0].memory_stats():
+        return stats["bytes_limit"] - stats["bytes_in_use"]
+    table = Path("/proc/meminfo")
+    available = re.search(r"MemAvailable:\s+(\d+) kB", table.read_text()) if table.exists() else None
+    return int(available[1]) * 1024 if available else None
+
+
+def _gib(size: float) -> str:
+    return f"{size / 2**30:.2f} GiB"
