@@ -10,7 +10,7 @@ from priors_by_hand import save_prior
 
 from envs.rollout import Episode
 from experiments import evaluate
-from experiments.runner import cli, training
+from experiments.runner import cli, pictures, training
 
 pytestmark = pytest.mark.usefixtures("toy_task")
 
@@ -116,7 +116,7 @@ def test_a_task_without_a_scene_has_no_film(run, capsys):
 @pytest.mark.slow
 def test_a_film_of_each_system(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    if reason := cli.select_renderer():
+    if reason := pictures.select_renderer():
         pytest.skip(reason)
     prior = Path(__file__).parents[2] / "sgft_jax/priors/push/seed-0"
     call("--prior", prior, "--real", "sim", "mild", "--episodes", 2, "--impl", "c", "--video", tmp_path)

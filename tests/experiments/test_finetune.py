@@ -23,7 +23,7 @@ from envs import gaps
 from envs.rollout import Episode, play_episode
 from envs.types import Transition, UserError
 from experiments import evaluate, finetune
-from experiments.runner import cli, finetune_run
+from experiments.runner import cli, finetune_run, pictures
 from experiments.runner.finetune_args import FinetuneArgs, arguments, run_folder
 from experiments.runner.finetune_record import FinetuneRecord
 from experiments.runner.recorded import RecordedSystem
@@ -615,7 +615,7 @@ def springs(pushes):
 def film(folder, monkeypatch, *, pushes=(0.0, 1.0), scene=None, reason=None):
     """Records two springs, before and after; returns what was said, and the episodes."""
     monkeypatch.setattr(toy, "SCENE", scene, raising=False)
-    monkeypatch.setattr(cli, "select_renderer", lambda: reason)
+    monkeypatch.setattr(pictures, "select_renderer", lambda: reason)
     env, pool, both = springs(pushes)
     played = [jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1)]
     record = FinetuneRecord(folder, env, gaps.Gap("toy", {}, {}), "sac", [0])

@@ -270,7 +270,7 @@ def test_a_replay_draws_and_films(home, tmp_path, monkeypatch, capsys):
     """In the world in which the rollout took place, until it ended."""
     seen = []
     monkeypatch.setattr(toy, "SCENE", object(), raising=False)
-    monkeypatch.setattr(cli, "select_renderer", lambda: None)
+    monkeypatch.setattr(pictures, "select_renderer", lambda: None)
     monkeypatch.setattr("envs.mujoco.render.render_episode", lambda *given: seen.append(given))
     said = says(replay.main, replay.ReplayArgs(home, rollout=(0, 1), out=tmp_path / "seen"), capsys)
     picture, *films = (tmp_path / "seen" / name for name in ("seed-3-rollout-0-1.png", "videos/seed-3-rollout-1.mp4"))
