@@ -18,7 +18,7 @@ from sgft_jax.io.log import Clock, MetricsLog, RunProgress, check_finite
 from sgft_jax.io.priors import save_prior
 from sgft_jax.math import stats
 from sgft_jax.stacking import member, part
-from sgft_jax.systems import System
+from sgft_jax.systems.simulated import System
 from sgft_jax.train import evidence
 from sgft_jax.train.evidence import Best
 from sgft_jax.types import Metrics, Prior

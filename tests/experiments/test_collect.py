@@ -11,13 +11,8 @@ import pytest
 
 from envs.types import Transition, UserError
 from experiments import collect, hybrid
-<<<<<<< HEAD
-from experiments.runner import collect_args, collect_run
-from sgft_jax.datasets import logs, recording
-=======
 from experiments.runner import collect_run
-from sgft_jax.datasets import acceptance, logs, recording
->>>>>>> 73d4ab5 (A command declares its own options; runs, rollouts, pictures, machines and Bullet are told in fewer files)
+from sgft_jax.datasets import logs, recording
 from sgft_jax.datasets.recording import Joints, Noted, Recorded
 
 OPTIONS = """--task toy --level -100 --transitions 50 --seeds 2 --environments 3 --updates 60 --eval-every 30
@@ -153,13 +148,8 @@ def test_minaris_own_library_opens_a_set(tmp_path, monkeypatch):
 
 
 def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys, monkeypatch):
-<<<<<<< HEAD
-    monkeypatch.setitem(collect_args.LEVELS, "toy", -100.0)
-    monkeypatch.setattr(logs, "BANDS", {"toy-medium-replay": {"transitions": logs.Band(300, 0.25)}})
-=======
     monkeypatch.setitem(collect.LEVELS, "toy", -100.0)
-    monkeypatch.setattr(acceptance, "BANDS", {"toy-medium-replay": {"transitions": acceptance.Band(300, 0.25)}})
->>>>>>> 73d4ab5 (A command declares its own options; runs, rollouts, pictures, machines and Bullet are told in fewer files)
+    monkeypatch.setattr(logs, "BANDS", {"toy-medium-replay": {"transitions": logs.Band(300, 0.25)}})
     out = tmp_path / "data"
     collect.main([*LEARN, "--out", str(out)])
     said = capsys.readouterr().out

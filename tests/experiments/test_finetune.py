@@ -23,7 +23,7 @@ from envs import gaps
 from envs.rollout import Episode, play_episode
 from envs.types import Transition, UserError
 from experiments import evaluate, finetune
-from experiments.runner import cli, finetune_run, pictures
+from experiments.runner import finetune_run, pictures
 from experiments.runner.finetune_args import FinetuneArgs, arguments, run_folder
 from experiments.runner.finetune_record import FinetuneRecord
 from experiments.runner.recorded import RecordedSystem

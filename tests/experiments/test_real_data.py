@@ -15,7 +15,7 @@ from envs.history import with_previous_actions
 from envs.pools import real_worlds
 from envs.types import UserError
 from experiments import export_data, finetune, replay
-from experiments.runner import cli, pictures
+from experiments.runner import pictures
 from experiments.runner.options import episodes_of
 from sgft_jax.datasets import logs
 from sgft_jax.io.log import read_jsonl
