@@ -26,11 +26,6 @@ class Door(socket.socket):
         super().__init__(fileno=bound(host, port).detach())
         self._strangers: list[socket.socket] = []
         self._lock = threading.Lock()
-        try:
-            self.listen()
-        except OSError as error:
-            self.close()
-            raise _taken(host, port, error) from None
         self.settimeout(_LOOK)
 
     @property
@@ -75,7 +70,7 @@ class Door(socket.socket):
 
 
 def bound(host: str, port: int) -> socket.socket:
-    """A socket at an interface of this computer, not listening yet. Raises UserError where there can be none."""
+    """A socket that listens at an interface of this computer. Raises UserError where there can be none."""
     if not isinstance(port, int) or not 0 <= port <= 65_535:
         raise UserError(f"port {port!r}: ports go from 1 to 65535, 0 chooses a free one")
     check_host(host)
@@ -84,9 +79,12 @@ def bound(host: str, port: int) -> socket.socket:
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind((host, port))
+        listener.listen()
     except (OSError, UnicodeError) as error:
         listener.close()
-        raise _taken(host, port, error) from None
+        reason = getattr(error, "strerror", None) or error
+        advice = "choose another port, or an address of this computer"
+        raise UserError(f"cannot listen at {host}:{port} ({reason}); {advice}") from None
     return listener
 
 
@@ -104,8 +102,3 @@ def check_host(host: str) -> None:
 def url(host: str, port: int) -> str:
     """With brackets around an IPv6 address."""
     return f"ws://[{host}]:{port}" if ":" in host else f"ws://{host}:{port}"
-
-
-def _taken(host: str, port: int, error: Exception) -> UserError:
-    reason = getattr(error, "strerror", None) or error
-    return UserError(f"cannot listen at {host}:{port} ({reason}); choose another port, or an address of this computer")

@@ -4,6 +4,7 @@ import contextlib
 import functools
 import statistics
 import time
+import timeit
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -191,8 +192,8 @@ class Gymnasium:
 
         Single late ones are no reason: anything may interrupt a process, and the robot has a rule for them.
         """
-        jax.block_until_ready(act())
-        taken = statistics.median(_seconds(act) for _ in range(_TRIES))
+        _, *seconds = timeit.repeat(lambda: jax.block_until_ready(act()), number=1, repeat=1 + _TRIES)
+        taken = statistics.median(seconds)
         if taken > allowed:
             times = f"waits {allowed:.3g} s for a command, the policy takes {taken:.3g} s for one"
             advice = "choose a method that does not plan, a smaller plan, or a longer period"
@@ -306,12 +307,6 @@ def _padded(rows: np.ndarray, length: int) -> np.ndarray:
     return np.pad(rows, [(0, 0), (0, length - rows.shape[1]), *[(0, 0)] * (rows.ndim - 2)], constant_values=blank)
 
 
-def _seconds(act: Callable[[], Any]) -> float:
-    started = time.perf_counter()
-    jax.block_until_ready(act())
-    return time.perf_counter() - started
-
-
 # --- environments -----------------------------------------------------------------------------------------------------
 
 
@@ -351,7 +346,7 @@ class _Separate:
 
     def rest(self) -> None:
         """No step follows before the next reset."""
-        self._end("rest", [getattr(env, "rest", _nothing) for env in self.real])
+        self._end("rest", [getattr(env, "rest", lambda: None) for env in self.real])
 
     def close(self, *, over: bool) -> None:
         """The end, or, where it is not over, one on this side."""
@@ -397,10 +392,6 @@ def _call(name: str, real: Any, method: str, *args: Any, **options: Any) -> tupl
     """What an environment returns; raises UserError, which says where, if it raises or returns other parts."""
     call = extend.guard(f"{method} of", name, functools.partial(getattr(real, method), *args, **options))
     return answers.parts(name, method, call())
-
-
-def _nothing() -> None:
-    """What most environments do between episodes."""
 
 
 _Real = _Separate | _Vector

@@ -16,6 +16,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
@@ -41,39 +42,17 @@ _ROUNDING = 1e-6
 _SERVER: dict[str, Any] = {"max_size": LIMIT, "max_queue": 16, "compression": None, "open_timeout": _HELLO}
 
 
-class _Gone:
-    """The last answer of a connection."""
-
-
-class Box(NamedTuple):
-    """Bounds of numbers, as a Gymnasium space names them. low, high: [n]."""
-
-    low: np.ndarray
-    high: np.ndarray
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """(n,)"""
-        return self.low.shape
-
-    @property
-    def dtype(self) -> np.dtype:
-        """That of the bounds."""
-        return self.low.dtype
-
-
-class _Refusal(NamedTuple):
-    """Why a robot is not taken. final: it need not try again."""
-
-    reason: str
-    final: bool
+def _box(size: int, bound: float) -> SimpleNamespace:
+    """What a Gymnasium space says of numbers [size] from -bound to bound."""
+    high = np.full(size, bound, np.float32)
+    return SimpleNamespace(low=-high, high=high, shape=high.shape, dtype=high.dtype)
 
 
 class _Link(NamedTuple):
-    """A connection that was admitted, and the answers that came through it; the last one is `_Gone`."""
+    """A connection, and the answers that came through it; behind the last one stands None."""
 
     connection: ServerConnection
-    inbox: queue.SimpleQueue[Message | _Gone]
+    inbox: queue.SimpleQueue[Message | None]
 
     def send(self, message: bytes) -> None:
         """Sends; that a connection is closed is said by the thread that reads it."""
@@ -146,8 +125,7 @@ class Remote:
         self._episode, self._step, self._failures, self._reason = 0, 0, 0, ""
         self._obs = np.zeros(obs_size, np.float32)
         self.answer_within: float | None = None  # seconds in which the connected robot wants a command
-        self.observation_space = Box(*(x * np.full(obs_size, np.inf, np.float32) for x in (-1, 1)))
-        self.action_space = Box(*(x * np.ones(action_size, np.float32) for x in (-1, 1)))
+        self.observation_space, self.action_space = _box(obs_size, math.inf), _box(action_size, 1.0)
         self.spec, self.unwrapped = None, self
         self._host, self._door = host, Door(host, port)
         self._server = serve(self._serve, sock=self._door, origins=[None], **_SERVER)
@@ -229,8 +207,8 @@ class Remote:
                 answer = link.inbox.get(timeout=max(due - now, 0.0))
             except queue.Empty:
                 continue
-            if isinstance(answer, _Gone):
-                link.inbox.put(answer)  # it stays the last one
+            if answer is None:
+                link.inbox.put(None)  # it stays the last one
                 if kind is not Rested:
                     self._say(f"the robot is gone in episode {self._episode} before the outcome of step {self._step}")
                 return None
@@ -264,11 +242,10 @@ class Remote:
     def _serve(self, connection: ServerConnection) -> None:
         """One connection, from its first message to its end."""
         link = _Link(connection, queue.SimpleQueue())
-        refusal = self._admit(link)
-        if refusal is not None:
-            reason = printable(refusal.reason, _LINE)
+        if (refusal := self._admit(link)) is not None:
+            reason, final = printable(refusal[0], _LINE), refusal[1]
             self._refused(f"refused a connection: {reason}")
-            link.send(pack("refused", reason=reason, final=refusal.final))
+            link.send(pack("refused", reason=reason, final=final))
             return
         try:
             link.send(pack("welcome"))
@@ -281,32 +258,33 @@ class Remote:
         except ConnectionClosed:
             pass
         finally:
-            link.inbox.put(_Gone())
+            link.inbox.put(None)
             with self._lock:
                 self._connected.clear()
                 self._link = None
 
-    def _admit(self, link: _Link) -> _Refusal | None:
-        """Takes a robot that fits as the one robot; else says why not."""
+    def _admit(self, link: _Link) -> tuple[str, bool] | None:
+        """Takes a robot that fits as the one robot; else says why not, and whether it need not try again."""
         try:
             hello = read(link.connection.recv(timeout=_HELLO))
         except VersionError as error:
-            return _Refusal(str(error), final=True)
+            return str(error), True
         except (ValueError, TimeoutError) as error:
-            return _Refusal(f"its first message {error or 'did not come'}", final=False)
+            return f"its first message {error or 'did not come'}", False
         except ConnectionClosed:
-            return _Refusal("it was closed before its first message", final=False)
+            return "it was closed before its first message", False
         if not isinstance(hello, Hello):
-            return _Refusal(f"its first message is {type(hello).__name__.lower()}, not hello", final=True)
+            return f"its first message is {type(hello).__name__.lower()}, not hello", True
         if (name := self._foreign(link.connection)) is not None:
-            return _Refusal(f"it asked for the host {name!r}; connect to {self.url}, or to an address", final=True)
+            return f"it asked for the host {name!r}; connect to {self.url}, or to an address", True
         if not hmac.compare_digest(hello.token.encode(), self.token.encode()):
-            return _Refusal("wrong token", final=True)
+            return "wrong token", True
+        robot = printable(hello.robot, _NAME)
         if (difference := self._difference(hello)) is not None:
-            return _Refusal(f"{printable(hello.robot, _NAME)}: {difference}", final=True)
+            return f"{robot}: {difference}", True
         with self._lock:
             if self._link is not None:  # perhaps it is the same one, and its lost connection has not been noticed yet
-                return _Refusal(f"{printable(hello.robot, _NAME)}: another robot is connected", final=False)
+                return f"{robot}: another robot is connected", False
             self._link, self.answer_within = link, hello.answer_within
         self._door.admit(link.connection.socket)
         return None

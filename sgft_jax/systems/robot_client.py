@@ -38,13 +38,12 @@ LARGEST = 1e18  # of a measurement or reward: squares of larger ones are beyond 
 SUCCESS = ("is_success", "success")  # what `info` may call it; the first that says something counts
 _REASON = 500  # letters of one at most
 _PATIENCE = 10  # late steps in a row that end an episode
-_ABSENT = object()
-_SHAPES: dict[str, dict[str, Any]] = {  # what the learner says, `messages` has the rest; a tuple: any of these types
+_SHAPES: dict[str, dict[str, set[type]]] = {  # what the learner says, and of which types; `answers` has the rest
     "welcome": {},
-    "refused": {"reason": str, "final": bool},
-    "reset": {"episode": int, "seed": int, "steps": (int, type(None))},
-    "act": {"episode": int, "step": int, "action": bytes},
-    "rest": {"episode": int},
+    "refused": {"reason": {str}, "final": {bool}},
+    "reset": {"episode": {int}, "seed": {int}, "steps": {int, type(None)}},
+    "act": {"episode": {int}, "step": {int}, "action": {bytes}},
+    "rest": {"episode": {int}},
     "end": {},
 }
 
@@ -54,8 +53,7 @@ _SHAPES: dict[str, dict[str, Any]] = {  # what the learner says, `messages` has 
 
 def pack(kind: str, **fields: Any) -> bytes:
     """A message: a checksum, then a msgpack map. Arrays become little-endian float32."""
-    fields = {name: _plain(x) for name, x in fields.items()}
-    body = _encoded({"type": kind, **fields})
+    body = _encoded(type=kind, **fields)
     return zlib.crc32(body).to_bytes(4, "little") + body
 
 
@@ -80,9 +78,8 @@ def unpack(data: Any) -> dict[str, Any]:
     kind = fields.get("type") if isinstance(fields, dict) else None
     if not isinstance(kind, str) or kind not in _SHAPES:
         raise ValueError(f"is of the unknown type {kind!r}")
-    for name, wanted in _SHAPES[kind].items():
-        value = fields.get(name, _ABSENT)
-        if type(value) not in (wanted if isinstance(wanted, tuple) else (wanted,)):
+    for name, types in _SHAPES[kind].items():
+        if name not in fields or type(fields[name]) not in types:
             raise ValueError(f"{kind} has no proper {name!r}")
     return fields
 
@@ -114,7 +111,7 @@ def success_of(info: Mapping[str, Any]) -> bool | None:
     return next((flag(info[name], f"info[{name!r}]") for name in SUCCESS if info.get(name) is not None), None)
 
 
-def printable(text: object, length: int) -> str:
+def printable(text: object, length: int = _REASON) -> str:
     """One line that a terminal can show, whoever has written it."""
     line = "".join(letter if letter.isprintable() else " " for letter in str(text)[: 4 * length])
     return line if len(line) <= length else f"{line[: length - 3]}..."
@@ -138,15 +135,13 @@ def _single(value: Any, what: str, wanted: str) -> Any:
     return values.item()
 
 
-def _encoded(fields: dict[str, Any]) -> bytes:
-    return msgpack.packb(fields) or b""  # of None, which it never is, only its types speak
+def _encoded(**fields: Any) -> bytes:
+    return msgpack.packb(fields, default=_plain) or b""  # of None, which it never is, only its types speak
 
 
 def _plain(value: Any) -> Any:
-    """What msgpack can hold."""
-    if isinstance(value, np.ndarray):
-        return value.astype("<f4").tobytes()
-    return value.item() if isinstance(value, np.generic) else value
+    """What msgpack can hold of NumPy's."""
+    return value.astype("<f4").tobytes() if isinstance(value, np.ndarray) else value.item()
 
 
 # --- playing ----------------------------------------------------------------------------------------------------------
@@ -250,58 +245,44 @@ def play(
     sizes = {"obs_size": int(driver.obs_size), "action_size": int(driver.action_size)}
     limits.check(**sizes)
     rhythm = _rhythm(driver, period, answer_within, _instead(late, sizes["action_size"]), patience)
-    robot = _Robot(driver, rhythm, limits, _Log(log))
+    robot = _Robot(driver, rhythm, limits, _Log(log), say)
     times = {"period": period and float(period), "answer_within": rhythm and float(rhythm.answer_within)}
     hello = pack("hello", version=VERSION, token=token, robot=name, **sizes, **times)
-    last_line = ""
     try:
-        while True:
-            with contextlib.ExitStack() as stack:
-                try:
-                    socket = _connected(stack, url, hello)
-                except (ConnectionClosed, InvalidHandshake, OSError, ValueError) as error:  # OSError: also TimeoutError
-                    lost = error
-                else:
-                    say(f"connected to {url}")
-                    last_line, lost = "", _served(socket, robot, say)
-            if lost is None:
-                return robot.counts
+        while (lost := _session(robot, url, hello)) is not None:
             driver.stop()
-            reason = printable(lost, _REASON)
-            if (line := f"no connection to {url} ({reason}); the robot is stopped, trying again") != last_line:
-                say(line)
-            last_line = line
+            if (reason := printable(lost)) != robot.absent:
+                say(f"no connection to {url} ({reason}); the robot is stopped, trying again")
+            robot.absent = reason
             time.sleep(retry)
+        return robot.counts
     finally:
         driver.stop()
         robot.log.close()
 
 
-def _connected(stack: contextlib.ExitStack, url: str, hello: bytes) -> Any:
-    """A connection to a learner that takes this robot; `stack` closes it.
+def _session(robot: _Robot, url: str, hello: bytes) -> Exception | None:
+    """Plays over one connection; returns why there is none, or how it was lost; None where the learner ends the run.
 
-    Raises RefusedError if it refuses for good, ValueError if for now, and what `connect` and `recv` raise.
+    Raises RefusedError if the learner refuses the robot for good, and what goes wrong on this side: another connection
+    would not help. The robot stops at once, because closing a connection takes seconds where the other side is gone.
     """
-    socket = stack.enter_context(connect(url, max_size=LIMIT, compression=None, proxy=None, open_timeout=10))
-    socket.send(hello)
-    answer = unpack(socket.recv(timeout=10))
-    if answer["type"] == "refused":
-        raise (RefusedError if answer["final"] else ValueError)(printable(answer["reason"], _REASON))
-    return socket
-
-
-def _served(socket: Any, robot: _Robot, say: Callable[[str], None]) -> ConnectionClosed | None:
-    """Plays until the learner ends the run; returns how the connection was lost, if it was.
-
-    Raises what goes wrong on this side: another connection would not help. The robot stops at once, because closing a
-    connection takes seconds where the other side is gone.
-    """
-    try:
-        robot.serve(socket, say)
-    except ConnectionClosed as error:
-        return error
-    finally:
-        robot.driver.stop()
+    with contextlib.ExitStack() as stack:
+        try:
+            socket = stack.enter_context(connect(url, max_size=LIMIT, compression=None, proxy=None, open_timeout=10))
+            socket.send(hello)
+            answer = unpack(socket.recv(timeout=10))
+            if answer["type"] == "refused":
+                raise (RefusedError if answer["final"] else ValueError)(printable(answer["reason"]))
+        except (ConnectionClosed, InvalidHandshake, OSError, ValueError) as error:  # OSError: also TimeoutError
+            return error
+        robot.say(f"connected to {url}")
+        try:
+            robot.serve(socket)
+        except ConnectionClosed as error:
+            return error
+        finally:
+            robot.driver.stop()
     return None
 
 
@@ -364,7 +345,7 @@ class _Log:
 
     def write(self, **fields: Any) -> None:
         if self._file is not None:
-            line = memoryview(_encoded({name: _plain(x) for name, x in fields.items()}))
+            line = memoryview(_encoded(**fields))
             with self._explained():
                 while line:
                     line = line[self._file.write(line) :]
@@ -389,9 +370,13 @@ class _Robot:
     Of an episode all answers stay: the first that says how it began, then one for each step, and perhaps how it failed.
     """
 
-    def __init__(self, driver: Any, rhythm: _Rhythm | None, limits: Limits, log: _Log) -> None:
-        self.driver, self.rhythm, self.limits, self.log = driver, rhythm, limits, log
+    def __init__(
+        self, driver: Any, rhythm: _Rhythm | None, limits: Limits, log: _Log, say: Callable[[str], None]
+    ) -> None:
+        self.driver, self.rhythm, self.limits, self.log, self.say = driver, rhythm, limits, log, say
         self.counts = {"steps": 0, "late": 0}
+        self.absent = ""  # why there was no connection, as it was said last
+        self._socket: Any = None
         self._episode, self._over = -1, True
         self._answers: list[bytes] = []
         self._failed: bytes | None = None
@@ -399,45 +384,52 @@ class _Robot:
         self._tick = 0.0
         self._lates, self._most = 0, None  # _most: steps after which an episode is over, whether it is told so or not
 
-    def serve(self, socket: Any, say: Callable[[str], None]) -> None:
+    def serve(self, socket: Any) -> None:
         """Answers until the learner ends the run."""
-        self._over = True  # an episode that another connection began is over
+        self._socket, self.absent, self._over = socket, "", True  # an episode of another connection is over
         while True:
-            message = self._next(socket, say)
+            message = self._next()
             if message is None:
-                self._hold(socket, say)
+                self._hold()
             elif message["type"] == "end":
                 return
             elif message["type"] == "rest":
                 if message["episode"] == self._episode:  # a late one of an episode before must not end this one
-                    self._over = True
-                    self.driver.stop()
-                _send(socket, pack("rested", episode=message["episode"]))
+                    self._stop()
+                self._send(pack("rested", episode=message["episode"]))
             elif message["type"] == "reset":
-                self._reset(socket, message, say)
+                self._reset(message)
             elif message["type"] == "act":
-                self._act(socket, message, say)
+                self._act(message)
 
-    def _next(self, socket: Any, say: Callable[[str], None]) -> Mapping[str, Any] | None:
+    def _next(self) -> Mapping[str, Any] | None:
         """The next message; None where the clock says that it is too late for one."""
         while True:
             wait = None
             if self.rhythm is not None and not self._over and len(self._answers) > 1:  # the first command is there
                 wait = max(self._tick + self.rhythm.answer_within - time.monotonic(), 1e-3)
             try:
-                return unpack(socket.recv(timeout=wait))
+                return unpack(self._socket.recv(timeout=wait))
             except TimeoutError:
                 return None
             except ValueError as error:
-                say(f"ignored: a message of the learner {printable(error, _REASON)}")
+                self.say(f"ignored: a message of the learner {printable(error)}")
 
-    def _reset(self, socket: Any, message: Mapping[str, Any], say: Callable[[str], None]) -> None:
+    def _send(self, message: bytes) -> None:
+        """Sends; a connection that is closed says so when it is read, after what came before its end."""
+        with contextlib.suppress(ConnectionClosed):
+            self._socket.send(message)
+
+    def _stop(self) -> None:
+        self._over = True
+        self.driver.stop()
+
+    def _reset(self, message: Mapping[str, Any]) -> None:
         if message["episode"] == self._episode and not self._over:
-            _send(socket, self._answers[0])  # the learner has not heard it
+            self._send(self._answers[0])  # the learner has not heard it
             return
         self.driver.stop()
-        self._episode, self._over, self._lates = message["episode"], False, 0
-        self._most = message["steps"]
+        self._episode, self._most, self._over, self._lates = message["episode"], message["steps"], False, 0
         self._answers, self._failed = [], None
         self._last = np.zeros(self.driver.action_size, np.float32)
         try:
@@ -445,37 +437,36 @@ class _Robot:
             if beyond := self.limits.beyond(obs):
                 raise ValueError(beyond)
         except Exception as error:
-            self._fail(socket, error, say)
-            return
-        self._tell(socket, pack("began", episode=self._episode, obs=obs))
+            self._fail(error)
+        else:
+            self._tell("began", obs=obs)
 
-    def _act(self, socket: Any, message: Mapping[str, Any], say: Callable[[str], None]) -> None:
+    def _act(self, message: Mapping[str, Any]) -> None:
         step, done = message["step"], len(self._answers) - 1
         if message["episode"] != self._episode:
             return
         if 0 <= step < done:
-            _send(socket, self._answers[step + 1])  # too late, or heard already: what happened is said again
+            self._send(self._answers[step + 1])  # too late, or heard already: what happened is said again
         elif self._failed is not None:
-            _send(socket, self._failed)
+            self._send(self._failed)
         elif step == done and not self._over:
             try:
                 action = array(message["action"], self.driver.action_size, "an action")
             except ValueError as error:
-                self._fail(socket, error, say)
-                return
-            self._move(socket, action, say, late=False)
+                self._fail(error)
+            else:
+                self._move(action, late=False)
 
-    def _hold(self, socket: Any, say: Callable[[str], None]) -> None:
+    def _hold(self) -> None:
         """A step for which no command came in time."""
         assert self.rhythm is not None
-        wanted = self._last if self.rhythm.instead is None else self.rhythm.instead
-        self._move(socket, wanted, say, late=True)
+        self._move(self._last if self.rhythm.instead is None else self.rhythm.instead, late=True)
 
-    def _tell(self, socket: Any, answer: bytes) -> None:
-        self._answers.append(answer)
-        _send(socket, answer)
+    def _tell(self, kind: str, **fields: Any) -> None:
+        self._answers.append(pack(kind, episode=self._episode, **fields))
+        self._send(self._answers[-1])
 
-    def _move(self, socket: Any, wanted: np.ndarray, say: Callable[[str], None], *, late: bool) -> None:
+    def _move(self, wanted: np.ndarray, *, late: bool) -> None:
         """A step with the nearest command that is allowed. Nothing reaches the driver but through here."""
         action = self.limits.of(wanted, self._last)
         step = len(self._answers) - 1
@@ -485,34 +476,26 @@ class _Robot:
         self.log.write(episode=self._episode, step=step, action=action, late=late, **when)
         try:
             sent = action.copy()  # the driver may change its array; what is reported and stored stays
-            moved = self._by_clock(sent, late=late) if self.rhythm else self._at_once(sent)
+            moved = self._outcome(self._by_clock(sent, late=late) if self.rhythm else self.driver.step(sent))
         except Exception as error:
-            self._fail(socket, error, say)
+            self._fail(error)
             return
         self._last = action
         self._lates = self._lates + 1 if late else 0
         self.counts["steps"] += 1
         self.counts["late"] += late
         if self.rhythm and self._lates >= self.rhythm.patience:
-            say(f"{self._lates} steps in a row without a command in time; the episode ends here")
+            self.say(f"{self._lates} steps in a row without a command in time; the episode ends here")
             moved["truncated"] = True
         if beyond := self.limits.beyond(moved["obs"]):
-            say(f"{beyond}; the robot is stopped, the episode ends here")
+            self.say(f"{beyond}; the robot is stopped, the episode ends here")
             moved["truncated"] = True
         moved["truncated"] |= self._most is not None and step + 1 >= self._most
         if moved["terminated"] or moved["truncated"]:
-            self._over = True
-            self.driver.stop()
-        self._tell(socket, pack("moved", episode=self._episode, step=step, sent=action, late=late, **moved))
+            self._stop()
+        self._tell("moved", step=step, sent=action, late=late, **moved)
 
-    def _at_once(self, action: np.ndarray) -> dict[str, Any]:
-        moved = self.driver.step(action)
-        if not isinstance(moved, tuple) or len(moved) != 5:
-            raise TypeError("step does not return obs, reward, terminated, truncated, info")
-        obs, reward, terminated, truncated, info = moved
-        return _moved(self._checked(obs), reward, terminated, truncated, info or {})
-
-    def _by_clock(self, action: np.ndarray, *, late: bool) -> dict[str, Any]:
+    def _by_clock(self, action: np.ndarray, *, late: bool) -> tuple[Any, ...]:
         """Sends, waits for the end of the period, reads. The clock goes on from where it should be, not from now."""
         assert self.rhythm is not None
         if not late or self.rhythm.instead is not None:
@@ -523,30 +506,25 @@ class _Robot:
         obs = self._checked(self.driver.read())
         judge = getattr(self.driver, "judge", None)
         reward, terminated, success = (None, False, None) if judge is None else judge(obs)
-        return _moved(obs, reward, terminated, False, {"success": success})
+        return obs, reward, terminated, False, {"success": success}
+
+    def _outcome(self, returned: Any) -> dict[str, Any]:
+        """What a step led to, as the fields of a message; raises where it is not what a driver should return."""
+        if not isinstance(returned, tuple) or len(returned) != 5:
+            raise TypeError("step does not return obs, reward, terminated, truncated, info")
+        obs, reward, terminated, truncated, info = returned
+        earned = {"obs": self._checked(obs), "reward": number(reward, "reward")}
+        ends = {"terminated": flag(terminated, "terminated"), "truncated": flag(truncated, "truncated")}
+        return {**earned, **ends, "success": success_of(info or {})}
 
     def _checked(self, obs: Any) -> np.ndarray:
         with np.errstate(over="ignore"):
             values = numbers(obs, "an observation").astype("<f4")
         return array(values.tobytes(), self.driver.obs_size, "an observation")
 
-    def _fail(self, socket: Any, error: Exception, say: Callable[[str], None]) -> None:
-        self._over = True
-        self.driver.stop()
-        reason = printable(f"{type(error).__name__}: {error}", _REASON)
-        say(f"the robot is stopped: {reason}")
+    def _fail(self, error: Exception) -> None:
+        self._stop()
+        reason = printable(f"{type(error).__name__}: {error}")
+        self.say(f"the robot is stopped: {reason}")
         self._failed = pack("failed", episode=self._episode, reason=reason)
-        _send(socket, self._failed)
-
-
-def _moved(obs: np.ndarray, reward: Any, terminated: Any, truncated: Any, info: Mapping[str, Any]) -> dict[str, Any]:
-    """What a step led to, as the fields of a message; ValueError for what is no number or truth value."""
-    earned = {"obs": obs, "reward": number(reward, "reward")}
-    ends = {"terminated": flag(terminated, "terminated"), "truncated": flag(truncated, "truncated")}
-    return {**earned, **ends, "success": success_of(info)}
-
-
-def _send(socket: Any, message: bytes) -> None:
-    """Sends; a connection that is closed says so when it is read, after what came before its end."""
-    with contextlib.suppress(ConnectionClosed):
-        socket.send(message)
+        self._send(self._failed)
