@@ -21,7 +21,9 @@ from typing import Any, Literal, NamedTuple
 from envs.types import UserError
 from experiments.runner import cli
 from experiments.runner.options import Impl, at_least_one, check_task, each_once, prior_folders, task_of_priors
-from sgft_jax.io.runs import check_folder
+from sgft_jax.analysis import tables
+from sgft_jax.io.log import write_summary
+from sgft_jax.io.runs import check_folder, provenance
 from sgft_jax.models.config import Precision
 from sgft_jax.presets import PRESETS
 
@@ -71,9 +73,6 @@ class BenchmarkConfig:
 def main(config: BenchmarkConfig) -> dict[Part, list[dict[str, Any]]]:
     """Measures, prints tables, writes the numbers and returns them by kind of measurement."""
     _check(config)
-    from sgft_jax.io import runs
-    from sgft_jax.io.log import write_summary
-
     measured: dict[Part, list[dict[str, Any]]] = {}
     for part in config.parts:
         measured[part] = []
@@ -84,7 +83,7 @@ def main(config: BenchmarkConfig) -> dict[Part, list[dict[str, Any]]]:
             print("  ".join(f"{name} {_text(x)}" for name, x in line.items()), flush=True)
     folder = config.out / "benchmark"
     folder.mkdir(parents=True, exist_ok=True)
-    path = write_summary(folder, {"provenance": runs.provenance(), **measured})
+    path = write_summary(folder, {"provenance": provenance(), **measured})
     for part, lines in measured.items():
         print(f"\n{table(part, lines)}")
     print(f"numbers: {path}")
@@ -161,8 +160,6 @@ def _check_steps(config: BenchmarkConfig) -> None:
 
 def table(part: Part, lines: list[dict[str, Any]]) -> str:
     """The lines of one kind as a table."""
-    from sgft_jax.analysis import tables
-
     names = list(dict.fromkeys(name for line in lines for name in line))
     rows = [[_text(line.get(name, "-")) for name in names] for line in lines]
     return f"{_KINDS[part].title}\n\n{tables.markdown([name.replace('_', ' ') for name in names], rows)}\n"

@@ -14,7 +14,6 @@ import itertools
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from envs import extend, gaps
 from envs.types import UserError, unknown
@@ -22,12 +21,10 @@ from experiments.figures import FiguresArgs, figures
 from experiments.runner import cli, grid, hybrid_grid, tuned
 from experiments.runner.grid import FINETUNING, Cell, GridArgs, check_begun, look_up, work
 from experiments.runner.hybrid_grid import HybridGridArgs
+from sgft_jax.analysis.hybrid import Results, ranks, summary
 from sgft_jax.io.runs import NO_DATA
 from sgft_jax.methods import DEFAULT, NAMES
 from sgft_jax.train.schedule import describe, name_of
-
-if TYPE_CHECKING:
-    from sgft_jax.analysis.hybrid import Results
 
 HYBRID = "hybrid"  # first word of the command line for methods that learn from real data and a simulator
 _HYBRID_HELP = """Run every method on every data set and simulator, cell by cell; print tables and draw curves.
@@ -102,22 +99,20 @@ def compare_hybrid(args: HybridGridArgs) -> None:
     work(chosen, args, lambda cells: _show(args, hybrid_grid.results(args, hybrid_grid.finished(cells))))
 
 
-def tables(args: HybridGridArgs, results: "Results") -> str:
+def tables(args: HybridGridArgs, results: Results) -> str:
     """The tables as Markdown."""
-    from sgft_jax.analysis import hybrid
-
-    texts = hybrid.summary(results, reference=args.reference, seeds=args.seeds, schedule=describe(args.schedule))
+    texts = summary(results, reference=args.reference, seeds=args.seeds, schedule=describe(args.schedule))
     if args.released is not None and args.beside is not None:
         others = replace(args, schedule=replace(args.schedule, updates=args.beside))
-        texts += [_RANKS.format(args.beside), hybrid.ranks(results, hybrid_grid.released(others, args.released))]
+        texts += [_RANKS.format(args.beside), ranks(results, hybrid_grid.released(others, args.released))]
     return "\n\n".join(texts)
 
 
-def _show(args: HybridGridArgs, results: "Results") -> None:
+def _show(args: HybridGridArgs, results: Results) -> None:
     """Tables on the screen and in a file, and a figure of curves for each data set; nothing without any curve."""
     if not results.curves:
         return
-    from sgft_jax.analysis.figures import learning_curves
+    from sgft_jax.analysis.figures import learning_curves  # brings Matplotlib
 
     folder, name = args.out / "figures", f"hybrid-{extend.name_of(args.task)}-{gaps.title(args.real)}"
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,11 +1,15 @@
 """Draw learning curves and print tables, from the fine-tuning runs on disk or from released tables."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from envs import extend
-from envs.types import UserError
+from envs.types import UserError, unknown
 from experiments.runner import cli
+from sgft_jax.analysis import tables
+from sgft_jax.analysis.curves import Curve, Found, by_priors, from_main_priors
+from sgft_jax.analysis.release import export, read
 from sgft_jax.io.runs import check_folder
 
 
@@ -37,8 +41,6 @@ def main(args: FiguresArgs) -> None:
     """Draws, prints the tables, and says where they are; or exports."""
     if args.export is not None:
         check_folder(args.export, "--export")
-        from sgft_jax.analysis.release import export
-
         print("\n".join(f"written: {path}" for path in export(args.out, args.export)))
         return
     path = figures(args)
@@ -49,13 +51,9 @@ def main(args: FiguresArgs) -> None:
 def figures(args: FiguresArgs) -> Path:
     """The figures and tables.md, whose path is returned; raises UserError if there is no run to draw."""
     check_folder(args.out / "figures")
-    from sgft_jax.analysis.release import read
-
     runs = read(args.out, args.data)
     if not runs.curves:
         raise UserError(_nothing(args, runs.notes))
-    from sgft_jax.analysis.results import select, write_results  # brings Matplotlib
-
     task = (extend.name_of(args.task),) if args.task else ()
     chosen = select(runs, variants=args.variants, task=task, gap=args.gaps, method=args.methods, priors=args.priors)
     return write_results(chosen, args.out / "figures", reference=args.reference)
@@ -70,6 +68,73 @@ def _nothing(args: FiguresArgs, notes: list[str]) -> str:
     if notes:
         return f"{message}: {notes[0]}" + (f"; and {len(notes) - 1} more" if len(notes) > 1 else "")
     return f"{message}; make one with: python -m experiments.finetune --task {args.task or 'push'}"
+
+
+def select(records: Found, *, variants: bool = True, **wanted: Sequence[str]) -> Found:
+    """Only the curves of certain tasks, gaps, methods or priors: names by field of `Curve`, empty for all.
+
+    Raises UserError if no curve has one of the names, or if nothing is left.
+    """
+    curves = [curve for curve in records.curves if variants or not curve.variant]
+    for field, names in wanted.items():
+        known = sorted({getattr(curve, field) for curve in curves})
+        if missing := [name for name in names if name not in known]:
+            raise UserError(unknown(f"run of the {field}", missing[0], known))
+        curves = [curve for curve in curves if not names or getattr(curve, field) in names]
+    if not curves:
+        raise UserError(f"no run matches all of the chosen: {', '.join(name for name in wanted if wanted[name])}")
+    return Found(curves, records.notes)
+
+
+def write_results(records: Found, target: Path, *, reference: str | None = None) -> Path:
+    """A figure and tables for each task and gap, and of all tasks for each gap; returns the path of tables.md.
+
+    reference: METHOD or METHOD:VARIANT that the others are compared with, see `tables.summary`; UserError without it.
+    """
+    if reference and reference not in (names := {curve.spec for curve in records.curves}):
+        raise UserError(unknown("--reference", reference, names))
+    sections = ["# Fine-tuning results", tables.LEGEND]
+    for gap in dict.fromkeys(curve.gap for curve in records.curves):
+        sections += _overview(gap, [curve for curve in records.curves if curve.gap == gap], target)
+    for task, gap in dict.fromkeys((curve.task, curve.gap) for curve in records.curves):
+        chosen = [curve for curve in records.curves if (curve.task, curve.gap) == (task, gap)]
+        sections += _section(f"{task} on the {gap} real system", chosen, target / f"{task}-{gap}.png", reference)
+    if records.notes:
+        sections.append("\n".join(["## Left out or unfinished", "", *(f"- {note}" for note in records.notes)]))
+    path = target / "tables.md"
+    path.write_text("\n\n".join(sections) + "\n")
+    return path
+
+
+def _overview(gap: str, curves: Sequence[Curve], target: Path) -> list[str]:
+    """All tasks on one gap, methods with their defaults from the same priors; [] for a single task."""
+    from sgft_jax.analysis.figures import MOST, learning_curves  # brings Matplotlib
+
+    tasks = {task: from_main_priors(c for c in curves if c.task == task) for task in sorted({c.task for c in curves})}
+    tasks = {task: chosen for task, chosen in tasks.items() if chosen}
+    if len(tasks) < 2:
+        return []
+    title = f"All tasks, {gap} real systems"
+    shown = tables.leading(tasks, MOST)
+    panels = {task: [curve for curve in chosen if curve.name in shown] for task, chosen in tasks.items()}
+    path = learning_curves(target / f"overview-{gap}.png", panels, title=title)
+    return [f"## {title}", f"![{title}]({path.name})", tables.areas_by_task(tasks)]
+
+
+def _section(title: str, curves: Sequence[Curve], path: Path, reference: str | None) -> list[str]:
+    """One task and gap: a panel for each set of priors and for each method with variants, a table for each set."""
+    from sgft_jax.analysis.figures import learning_curves
+
+    panels: dict[str, list[Curve]] = {}
+    texts = []
+    for priors, members in by_priors(curves).items():
+        words = f"priors {priors}" if priors else "priors unknown"
+        panels[words] = [curve for curve in members if not curve.variant]
+        for method in dict.fromkeys(curve.method for curve in members if curve.variant):
+            panels[f"{method} and its variants, {words}"] = [curve for curve in members if curve.method == method]
+        texts += [f"### {title}, {words}", tables.summary(members, reference)]
+    learning_curves(path, panels, title=title)
+    return [f"## {title}", f"![{title}]({path.name})", *texts]
 
 
 if __name__ == "__main__":

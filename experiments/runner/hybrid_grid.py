@@ -7,7 +7,7 @@ without data once for each simulator.
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 from envs import extend, gaps
 from envs.gaps import SIM
@@ -32,15 +32,15 @@ from experiments.runner.options import (
     seed_list,
     without_repeats,
 )
+from sgft_jax.analysis.curves import Curve
+from sgft_jax.analysis.hybrid import Results
+from sgft_jax.analysis.reading import read_curve
+from sgft_jax.analysis.release import hybrid_table, read_hybrid, write_hybrid
 from sgft_jax.files.disk import jsonable
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import FIXED_NAMES, get_method
 from sgft_jax.presets import say_preset
 from sgft_jax.train.schedule import FLEET, SCHEDULES, Schedule, name_of
-
-if TYPE_CHECKING:
-    from sgft_jax.analysis.curves import Curve
-    from sgft_jax.analysis.hybrid import Results
 
 
 @dataclass(frozen=True)
@@ -175,35 +175,27 @@ def _runs(args: HybridGridArgs, method: str, data: Path | None) -> list[HybridAr
     return [replace(run, gap=(gap,)) for gap in ((SIM,) if kind == "offline" else args.gaps)]
 
 
-def results(args: HybridGridArgs, curves: "Sequence[Curve]") -> "Results":
+def results(args: HybridGridArgs, curves: Sequence[Curve]) -> Results:
     """Curves with the data sets, simulators and methods that tables have."""
-    from sgft_jax.analysis.hybrid import Results
-
     data = [data_name(path) for path in args.data] or [""]
     return Results(data, [gaps.title(gap) for gap in args.gaps], args.methods, curves, args.score)
 
 
-def finished(cells: Sequence[Cell]) -> "list[Curve]":
+def finished(cells: Sequence[Cell]) -> list[Curve]:
     """The curves of the cells that have finished."""
-    from sgft_jax.analysis.reading import read_curve
-
     return [read_curve(cell.folder) for cell in cells if cell.state == "finished"]
 
 
 def export(to: Path, cells: Sequence[Cell]) -> None:
     """Writes the finished cells into hybrid.csv; raises UserError if there is none."""
-    from sgft_jax.analysis.release import write_hybrid
-
     curves = finished(cells)
     if not curves:
         raise UserError(f"--export {to}: none of these runs has finished")
     print(f"written: {write_hybrid(to, curves)}, {len(curves)} runs")
 
 
-def released(args: HybridGridArgs, folder: Path) -> "Results":
+def released(args: HybridGridArgs, folder: Path) -> Results:
     """What the table in a folder holds of these runs; raises UserError if that is nothing, or if it lacks a seed."""
-    from sgft_jax.analysis.release import hybrid_table, read_hybrid
-
     wanted, columns = seed_list(args.seed, args.seeds), results(args, ())
     task, schedule, updates = extend.name_of(args.task), name_of(args.schedule), args.schedule.updates_in_all
     facts = {"real": gaps.title(args.real), "schedule": schedule, "updates": updates}

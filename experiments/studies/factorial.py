@@ -9,22 +9,27 @@ import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
 
 from envs import extend, gaps
 from envs.types import UserError
 from experiments.runner import cli, grid
 from experiments.runner.grid import Cell, GridArgs, check_begun, work
 from experiments.runner.options import check_prior, prior_folders
+from sgft_jax.analysis import tables
+from sgft_jax.analysis.curves import Curve, area, by_prior, common_grid, deepest_fall, spread
+from sgft_jax.analysis.reading import read_curve
+from sgft_jax.analysis.release import read_data
 from sgft_jax.files.disk import jsonable, write_json
+from sgft_jax.math.stats import Interval, bootstrap_interval, mean
 from sgft_jax.methods import get_method
 
-if TYPE_CHECKING:
-    from sgft_jax.analysis.curves import Curve
-    from sgft_jax.analysis.factorial import Levels
-
-    Place = tuple[str, str]  # a task, and a real system as the user gave it
-    Curves = dict[Place, dict[Levels, Curve]]
+Levels = tuple[bool, ...]  # of every factor, whether it is high
+Place = tuple[str, str]  # a task, and a real system as the user gave it
+Curves = dict[Place, dict[Levels, Curve]]
 
 METHOD, MEASURES = "sgft-parts", ("area", "end", "deepest fall")
 COLD = {"critic_warmup": 0, "lr_warmup": 0, "dynamics_warmup": 0, "actor_ramp": 0}  # as the paper prints it
@@ -72,10 +77,8 @@ def main(args: FactorialArgs) -> None:
     work(list(cells.values()), args, lambda now: print(_conclusion(args, dict(zip(cells, now, strict=True)))))
 
 
-def _conclusion(args: FactorialArgs, cells: "dict[tuple[Place, Levels], Cell]") -> str:
+def _conclusion(args: FactorialArgs, cells: dict[tuple[Place, Levels], Cell]) -> str:
     """The report, or how many cells it waits for."""
-    from sgft_jax.analysis.reading import read_curve
-
     if unfinished := sum(cell.state != "finished" for cell in cells.values()):
         return f"{unfinished} cells are not finished; the same command goes on"
     return report(args, _by_place({place: read_curve(cell.folder) for place, cell in cells.items()}))
@@ -118,7 +121,7 @@ def factors(args: FactorialArgs) -> dict[str, tuple[str, str]]:
     }
 
 
-def settings(args: FactorialArgs, levels: "Levels") -> dict[str, Any]:
+def settings(args: FactorialArgs, levels: Levels) -> dict[str, Any]:
     """The options of a cell."""
     shape, shorten, horizon, new, warm = levels
     varied = {"shape": shape, "shorten": shorten, "horizon": args.horizon if horizon else 1, "reset_critic": new}
@@ -126,14 +129,14 @@ def settings(args: FactorialArgs, levels: "Levels") -> dict[str, Any]:
     return varied | shared | ({} if warm else COLD)
 
 
-def variants(args: FactorialArgs) -> "dict[Levels, str]":
+def variants(args: FactorialArgs) -> dict[Levels, str]:
     """Every combination of levels, and what its runs are called."""
     words = [[word.replace(" ", ".") for word in pair] for pair in factors(args).values()]
     combinations = itertools.product((False, True), repeat=len(words))
     return dict(zip(combinations, map("-".join, itertools.product(*words)), strict=True))
 
 
-def cells_of(args: FactorialArgs, task: str, real: str) -> "dict[Levels, Cell]":
+def cells_of(args: FactorialArgs, task: str, real: str) -> dict[Levels, Cell]:
     """Every combination of levels on a real system."""
     return {
         levels: grid.cell_of(args, task, real, METHOD, settings(args, levels), prior=args.prior, variant=variant)
@@ -141,10 +144,8 @@ def cells_of(args: FactorialArgs, task: str, real: str) -> "dict[Levels, Cell]":
     }
 
 
-def released(args: FactorialArgs, folder: Path, places: "Sequence[Place]") -> "Curves":
+def released(args: FactorialArgs, folder: Path, places: Sequence[Place]) -> Curves:
     """The curves of every cell in tables that `experiments.figures --export` wrote; UserError where one is missing."""
-    from sgft_jax.analysis.release import read_data
-
     names = {
         (place, levels): (place[0], gaps.title(place[1]), variant)
         for place, (levels, variant) in itertools.product(places, variants(args).items())
@@ -162,18 +163,16 @@ def released(args: FactorialArgs, folder: Path, places: "Sequence[Place]") -> "C
     return _by_place({cell: runs[name] for cell, name in names.items()})
 
 
-def _by_place(curves: "Mapping[tuple[Place, Levels], Curve]") -> "Curves":
+def _by_place(curves: Mapping[tuple[Place, Levels], Curve]) -> Curves:
     places: Curves = {}
     for (place, levels), curve in curves.items():
         places.setdefault(place, {})[levels] = curve
     return places
 
 
-def report(args: FactorialArgs, curves: "Curves") -> str:
+def report(args: FactorialArgs, curves: Curves) -> str:
     """Tables of the cells and of the effects; writes factorial.json and factorial.png."""
-    from sgft_jax.analysis import figures, tables
-    from sgft_jax.analysis.curves import by_prior
-    from sgft_jax.analysis.factorial import effects
+    from sgft_jax.analysis import figures  # brings Matplotlib
 
     folder, names, by_place, texts, score = args.out / "factorial", list(factors(args)), {}, [], ""
     for (task, real), runs in curves.items():
@@ -198,12 +197,8 @@ def report(args: FactorialArgs, curves: "Curves") -> str:
     return "\n\n".join([*texts, f"written: {folder}"])
 
 
-def _cells(args: FactorialArgs, curves: "dict[Levels, Curve]") -> str:
+def _cells(args: FactorialArgs, curves: dict[Levels, Curve]) -> str:
     """A line for each cell; its area also beside the cell with neither shaping nor shortening and all else equal."""
-    from sgft_jax.analysis import tables
-    from sgft_jax.analysis.curves import deepest_fall, spread
-    from sgft_jax.math.stats import mean
-
     rows = []
     for levels, variant in variants(args).items():
         curve, neither = curves[levels], curves[(False, False, *levels[2:])]
@@ -217,13 +212,35 @@ def _cells(args: FactorialArgs, curves: "dict[Levels, Curve]") -> str:
     return tables.markdown(head, rows)
 
 
-def measures(curve: "Curve") -> dict[str, Any]:
+def measures(curve: Curve) -> dict[str, Any]:
     """[members] of each of MEASURES: area under the curve, score at the end, deepest fall below the own start."""
-    from sgft_jax.analysis.curves import area, common_grid
-
     values = curve.values
     numbers = (area(curve, common_grid([curve])), values[:, -1], values[:, 0] - values.min(axis=1))
     return dict(zip(MEASURES, numbers, strict=True))
+
+
+def effects(
+    cells: Mapping[Levels, ArrayLike], factors: Sequence[str], *, priors: ArrayLike | None = None
+) -> dict[str, Interval]:
+    """Main effects by name of the factor, and two-way interactions as "one x other".
+
+    cells: [members] scores of every combination of levels; member i of each began from the same prior. A main effect is
+    the mean at the high level minus that at the low one. An interaction is half of what one effect gains where the
+    other factor is high. Intervals draw members, or priors [members] first where they are given. Raises ValueError
+    for a combination that is missing.
+    """
+    combinations = list(itertools.product((False, True), repeat=len(factors)))
+    if missing := [levels for levels in combinations if levels not in cells]:
+        raise ValueError(f"no scores of the cell {missing[0]}")
+    signs = dict(zip(factors, np.where(np.array(combinations), 1.0, -1.0).T, strict=True))  # of each factor [cells]
+    scores = np.stack([np.asarray(cells[levels], np.float64) for levels in combinations])  # [cells, members]
+    pairs = itertools.combinations(factors, 2)
+    contrasts = signs | {f"{one} x {other}": signs[one] * signs[other] for one, other in pairs}
+    half = len(combinations) / 2
+    return {
+        name: bootstrap_interval(contrast @ scores / half, statistic=mean, priors=priors)
+        for name, contrast in contrasts.items()
+    }
 
 
 if __name__ == "__main__":

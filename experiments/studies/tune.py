@@ -24,6 +24,8 @@ from experiments.runner import cli, grid, tuned
 from experiments.runner.grid import Cell, GridArgs, check_begun, complete, refuse
 from experiments.runner.options import at_least_one, prior_home, seed_list
 from experiments.studies.spaces import SPACES, first, space_of
+from sgft_jax.analysis.curves import area
+from sgft_jax.analysis.reading import read_curve
 from sgft_jax.io import runs
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.methods import NAMES, get_method
@@ -184,9 +186,6 @@ def keep(scores: Sequence[Score], count: int) -> list[int]:
 
 def score(trial: Trial, rollouts: int) -> Score | None:
     """How its runs went up to so many rollouts; None if one is not finished."""
-    from sgft_jax.analysis.curves import area
-    from sgft_jax.analysis.reading import read_curve
-
     if any(cell.state != "finished" for cell in trial.cells):
         return None
     areas, finals = {}, []

@@ -217,6 +217,18 @@ def improvement(curve: Curve, over: Curve, grid: Sequence[int] | np.ndarray) -> 
     return paired_improvement(areas, others, *labels) if np.intersect1d(*labels).size else None
 
 
+def improvement_of_pairs(above: np.ndarray, below: np.ndarray) -> Interval:
+    """P(above > below) over all pairs of runs, mean over gaps; [gaps, members] each. Ties count half. Draws members."""
+    a, b = above[:, :, None], below[:, None, :]
+    wins = ((a > b) + 0.5 * (a == b)).mean(0)  # [members of one, members of the other], mean over gaps
+    estimate = np.asarray(wins.mean())
+    if min(wins.shape) < ENOUGH:
+        return Interval(estimate, np.asarray(np.nan), np.asarray(np.nan))
+    rng = np.random.default_rng(0)
+    drawn = [wins[np.ix_(*(rng.integers(n, size=n) for n in wins.shape))].mean() for _ in range(1000)]
+    return Interval(estimate, *np.quantile(drawn, (0.025, 0.975)))
+
+
 def transitions_until_held(curve: Curve, level: float = LEVEL) -> int | None:
     """Real transitions at the first of two evaluations in a row at which the mean over members is at least `level`.
 

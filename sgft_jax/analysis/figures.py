@@ -262,7 +262,7 @@ def rollouts(path: Path, panels: Sequence[Panel], episodes: Mapping[str, float],
 def effects(path: Path, intervals: Mapping[str, Mapping[str, Mapping[str, Interval]]], *, label: str) -> Path:
     """A panel for each place: every effect as a dot with its interval, one colour for each measure.
 
-    intervals: by place, measure and name of the effect, see `factorial.effects`. label: of the x-axis.
+    intervals: by place, measure and name of the effect, as of `experiments.studies.factorial`. label: of the x-axis.
     """
     columns = min(len(intervals), 2)
     rows = math.ceil(len(intervals) / columns)

@@ -11,8 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from envs.scales import D4RL, normalised
-from sgft_jax.analysis.curves import SCORES, Curve
-from sgft_jax.analysis.scoreboard import improvement
+from sgft_jax.analysis.curves import SCORES, Curve, improvement_of_pairs
 from sgft_jax.analysis.tables import NONE, markdown, number, plain
 from sgft_jax.math.stats import Interval, bootstrap_interval, mean, rank_correlation
 
@@ -211,4 +210,4 @@ def _measured(results: Results, method: str, name: str, data: str, gap: str) -> 
 def _duel(results: Results, reference: str, other: str, data: str) -> str:
     pairs = [(results.of(reference, data, gap), results.of(other, data, gap)) for gap in results.gaps]
     both = [(above, below) for above, below in pairs if above is not None and below is not None]
-    return number(improvement(*(np.stack(scores) for scores in zip(*both, strict=True)))) if both else NONE
+    return number(improvement_of_pairs(*(np.stack(scores) for scores in zip(*both, strict=True)))) if both else NONE

@@ -103,9 +103,8 @@ def test_bad_input(home):
 
 def test_pooled_curves_are_means_over_gaps_member_by_member(home):
     from sgft_jax.analysis.reading import read_runs
-    from sgft_jax.analysis.scoreboard import pooled
 
     sac = {curve.gap: curve for curve in read_runs(home).curves if curve.method == "sac" and curve.gap != "elsewhere"}
-    one = pooled(sac)
+    one = scoreboard.pooled(sac)
     np.testing.assert_allclose(one.values, [[0.5, 0.4, 0.65], [0.5, 0.4, 0.65], [0.5, 0.4, 0.7], [0.5, 0.4, 0.7]])
     assert one.x.tolist() == [0, 4, 8] and np.isnan(one.minutes).all()
