@@ -7,7 +7,7 @@ so that learning rates and temperatures vmap like seeds do. Source: Haarnoja et 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -75,6 +75,16 @@ class SACConfig:
         if (self.target_critics or 1) > self.critics:
             raise checks.refusal("target_critics", self.target_critics, f"at most critics, {self.critics}")
 
+    @classmethod
+    def chosen(cls, options: Any, **others: Any) -> "SACConfig":
+        """An actor and a critic, whose structure a method's options choose: they have its fields as their own."""
+        names = (
+            *("critic_network", "tune_alpha", "train_critic", "critics", "target_critics", "actor_mean"),
+            *("actor_batch", "weighted_actor", "policy_delay", "max_grad_norm"),
+        )
+        choices = {name: getattr(options, name) for name in names} | others
+        return cls(train_value=False, train_dynamics=False, **choices)
+
 
 # What is added to the critic's loss: (critic, its params, policy, batch as the networks read it, key) -> []
 CriticTerm = Callable[[Critic, PyTree, Sampler, Batch, Key], Array]
@@ -101,6 +111,12 @@ class SACHyper(NamedTuple):
     actor_ramp: float | Array = 0.0
     lr_warmup: float | Array = 0.0
     anchor: float | Array = 0.0
+
+    @classmethod
+    def chosen(cls, options: Any, **others: float) -> "SACHyper":
+        """The numbers that a method's options choose; they have its fields as their own."""
+        names = ("lr_actor", "lr_critic", "lr_alpha", "tau", "alpha", "entropy_per_dim", "actor_ramp")
+        return cls(**{name: getattr(options, name) for name in names}, **others)
 
 
 class SACParams(NamedTuple):

@@ -5,6 +5,7 @@
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from types import MappingProxyType, ModuleType
 from typing import Any, NamedTuple
 
@@ -291,8 +292,22 @@ def sac_finetuner(
     if identifies:
         simulation = simulation or _SIMULATION
     kept = not (fresh or options.reset_critic)  # the critic
-    config = _sac_config(options, network, task, horizon_dim, baseline=value_baseline and kept, prior=prior is not None)
-    hyper = _sac_hyper(options, task, anchored=config.anchored, kept=kept)
+    config = sac.SACConfig.chosen(
+        options,
+        obs_dim=task.obs_dim,
+        act_dim=task.act_dim,
+        network=network,
+        context_dim=horizon_dim if horizon_dim > 1 else 0,
+        critic_baseline=value_baseline and kept,
+        anchored=options.anchor > 0 and prior is not None,
+        policy_delay=rules.policy_delay(options),
+    )
+    hyper = sac.SACHyper.chosen(
+        options,
+        actor_start=rules.critic_warmup(options, task),
+        lr_warmup=rules.warmup(options, options.lr_warmup) if kept else 0,  # a new critic has nothing to lose
+        anchor=options.anchor if config.anchored else 0.0,
+    )
     learner = sac.make_sac(config, hyper)
     models = dynamics_models(options, network, task) if options.train_dynamics else None
     whole = steps_to_go(jnp.int32(horizon_dim), horizon_dim) if config.context_dim else None
@@ -308,11 +323,6 @@ def sac_finetuner(
             return learner.init(key).replace(normalizer=params.normalizer), frozen
         return sac.state_from_prior(config, hyper, params, key, reset_critic=options.reset_critic), frozen
 
-    def act(
-        state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
-    ) -> tuple[Array, PyTree]:
-        return learner.act(state.learner, carry, obs, key, explore=explore, context=whole)
-
     def export(state: FinetuneState) -> sac.SACParams:
         actor = state.learner.actor.params
         twin = jax.tree.map(lambda x: x[:2], state.learner.critic.params)
@@ -321,11 +331,10 @@ def sac_finetuner(
         return state.frozen._replace(actor=actor, critic=twin, dynamics=_ensemble(state))
 
     parts = Parts(
-        learner=learner,
+        learner=learner._replace(act=partial(learner.act, context=whole)),
         start=start,
         export=export,
         policy=sac_policy(task.obs_dim, task.act_dim, network),
-        act=act,
         source=source,
         offline=sources.simulated_rows(options.batch_size) if simulation else None,
         transform=compose(*transforms),
@@ -348,48 +357,6 @@ def mixed_rows(options: MixedOptions, prior: Prior | None) -> tuple[Source, Simu
     n_sim = round(options.simulated_share * options.batch_size) if prior is not None else 0
     simulation = Simulation(options.simulated_transitions, options.simulated_ladder) if n_sim else None
     return sources.mixture(options.batch_size - n_sim, n_sim), simulation
-
-
-def _sac_config(
-    options: ActorOptions, network: NetworkConfig, task: Task, horizon_dim: int, *, baseline: bool, prior: bool
-) -> sac.SACConfig:
-    """The structure of an agent; prior: whether there is one."""
-    return sac.SACConfig(
-        task.obs_dim,
-        task.act_dim,
-        context_dim=horizon_dim if horizon_dim > 1 else 0,
-        network=network,
-        critic_network=options.critic_network,
-        tune_alpha=options.tune_alpha,
-        train_value=False,
-        train_dynamics=False,
-        train_critic=options.train_critic,
-        critics=options.critics,
-        target_critics=options.target_critics,
-        actor_mean=options.actor_mean,
-        critic_baseline=baseline,
-        actor_batch=options.actor_batch,
-        weighted_actor=options.weighted_actor,
-        anchored=options.anchor > 0 and prior,
-        policy_delay=rules.policy_delay(options),
-        max_grad_norm=options.max_grad_norm,
-    )
-
-
-def _sac_hyper(options: ActorOptions, task: Task, *, anchored: bool, kept: bool) -> sac.SACHyper:
-    """The numbers of an agent. kept: whether its critic is the simulator's; a new one has nothing to lose."""
-    return sac.SACHyper(
-        lr_actor=options.lr_actor,
-        lr_critic=options.lr_critic,
-        lr_alpha=options.lr_actor,
-        tau=options.tau,
-        alpha=options.alpha,
-        entropy_per_dim=options.entropy_per_dim,
-        actor_start=rules.critic_warmup(options, task),
-        actor_ramp=options.actor_ramp,
-        lr_warmup=rules.warmup(options, options.lr_warmup) if kept else 0,
-        anchor=options.anchor if anchored else 0.0,
-    )
 
 
 def _ensemble(state: FinetuneState) -> PyTree:
@@ -419,17 +386,14 @@ def _imagine(
     value_net = make_value(task.obs_dim, network)
     model = make_dynamics(task.obs_dim, task.act_dim, network)
 
-    def policy(state: FinetuneState, obs: Array, context: Array | None, key: Key) -> Array:
-        return learner.act(state.learner, learner.init_carry(), obs, key, explore=True, context=context)[0]
-
     def imagine(state: FinetuneState, key: Key) -> Imagination:
-        frozen = state.frozen
+        frozen, act = state.frozen, partial(learner.act, state.learner, learner.init_carry(), explore=True)
         # One member for the whole batch, redrawn at each update: the same expected gradient as one per row, at a
         # fraction of the cost, and no rollout mixes two models.
         member = dynamics.draw_member(_ensemble(state), key)
         return Imagination(
             value=lambda obs: value.predict(value_net, frozen.value, frozen.normalizer, obs),
-            policy=lambda obs, context, key: policy(state, obs, context, key),
+            policy=lambda obs, context, key: act(obs, key, context=context)[0],
             dynamics=lambda obs, action, key: dynamics.predict(model, member, frozen.normalizer, obs, action)[0],
             reward=_needed(task.reward, "reward"),
             terminated=_needed(task.terminated, "terminated"),

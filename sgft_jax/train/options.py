@@ -100,6 +100,11 @@ class ActorOptions(LoopOptions):
     actor_ramp: checks.Updates = 1000
     """Updates over which the actor's learning rate rises from 0."""
 
+    @property
+    def lr_alpha(self) -> float:
+        """Adam learning rate of the temperature, where it follows a target."""
+        return self.lr_actor
+
 
 @dataclass(frozen=True)
 class SACOptions(ActorOptions):
