@@ -201,7 +201,7 @@ def _run(
     members, real = keys.shape[0], _recorded(env)
     plan = hybrid.make_plan(env, agent, schedule)
     programs = make_programs(make_trainer(env, plan, gamma=0.99), members, shared=True)
-    state, memory = programs.begin(pools, real, keys), agent.keep(real)
+    state, memory = programs.init(pools, real, keys), agent.keep(real)
     trainer = make_trainer(env, plan if simulates else plan._replace(simulators=0), gamma=0.99)
     made = ahead(over_members(trainer.chunk, members, shared=(1,)), (pools, memory, state), donate=(2,))
 

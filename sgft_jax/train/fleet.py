@@ -5,8 +5,8 @@ pretraining and learning from a log: how a fleet acts, what updates learn from, 
 prints or touches files; the caller does both. Members, such as seeds, train in one program.
 """
 
-import functools
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -159,21 +159,18 @@ class Trainer(NamedTuple):
     """
 
     init: Callable[[World, PyTree, Key], FleetState]
-    chunk: Callable[[World, PyTree, FleetState], tuple[FleetState, Metrics]]
+    chunk: Any
     renew: Callable[[World, FleetState], FleetState]
 
 
 def make_trainer(env: Env, plan: Plan, *, gamma: float, note: Note | None = None) -> Trainer:
     """Builds the pure functions. gamma: discount factor of simulated rows. note: what else to keep of their steps."""
     learner, fresh = plan.learner, plan.init_carry()
-
-    play = functools.partial(collect, env, plan.memory, initial_carry=fresh, gamma=gamma, measure=plan.measure)
+    play = partial(collect, env, plan.memory, initial_carry=fresh, gamma=gamma, measure=plan.measure)
 
     def advance(pool: World, state: FleetState, keys: Key) -> tuple[FleetState, Metrics]:
-        explore = functools.partial(plan.explore, state.learner)
-        start = Collected(state.fleet, state.replay, state.notes)
-        notes = note and functools.partial(note, state.learner)
-        collected, measured = play(explore, pool, start, keys, note=notes)
+        start, noted = Collected(state.fleet, state.replay, state.notes), note and partial(note, state.learner)
+        collected, measured = play(partial(plan.explore, state.learner), pool, start, keys, note=noted)
         return state._replace(**collected._asdict()), measured
 
     def init(pool: World, data: PyTree, key: Key) -> FleetState:
@@ -224,15 +221,11 @@ def make_trainer(env: Env, plan: Plan, *, gamma: float, note: Note | None = None
         state, (metrics, measured, ready) = jax.lax.scan(
             lambda state, _: one_round(pool, data, state), state, None, length=plan.rounds
         )
-        averages = {name: _mean(x, ready) for name, x in metrics.items()}
+        # Over the rounds that have learned, nan without any
+        averages = {name: jnp.where(ready.all(), x.mean(), jnp.mean(x, where=ready)) for name, x in metrics.items()}
         return state, whole(averages | plan.summarise(measured))
 
     return Trainer(init, chunk, renew)
-
-
-def _mean(x: Array, ready: Array) -> Array:
-    """[] over the rounds [rounds] that have learned, nan without any."""
-    return jnp.where(ready.all(), x.mean(), jnp.mean(x, where=ready))
 
 
 def spread(state: FleetState) -> FleetState:
@@ -268,29 +261,22 @@ def over_members(
     return several if members > 1 else single
 
 
-class Programs(NamedTuple):
-    """Jitted functions of all members, see `Trainer`; chunk, renew and spread consume the state that they change."""
+def make_programs(trainer: Trainer, members: int, *, shared: bool) -> Trainer:
+    """The same of that many members, jitted; chunk and renew consume the state that they change.
 
-    begin: Callable[..., FleetState]
-    chunk: Any
-    renew: Callable[..., FleetState]
-    spread: Callable[[FleetState], FleetState]
-
-
-def make_programs(trainer: Trainer, members: int, *, shared: bool) -> Programs:
-    """The programs of that many members. shared: whether they learn from the same data, not each from its own."""
-    several = functools.partial(over_members, members=members, shared=(1,) if shared else ())
-    return Programs(
-        begin=jax.jit(several(trainer.init)),
+    shared: whether members learn from the same data, not each from its own.
+    """
+    several = partial(over_members, members=members, shared=(1,) if shared else ())
+    return Trainer(
+        init=jax.jit(several(trainer.init)),
         chunk=jax.jit(several(trainer.chunk), donate_argnums=2),
         renew=jax.jit(over_members(trainer.renew, members), donate_argnums=1),
-        spread=jax.jit(over_members(spread, members), donate_argnums=0),
     )
 
 
 def train(
     plan: Plan,
-    programs: Programs,
+    programs: Trainer,
     pools: Callable[[int], World],
     data: PyTree,
     state: FleetState,
@@ -305,23 +291,18 @@ def train(
     Yields the state that it starts from with no metrics, once everything is compiled, then once per chunk. Metrics are
     arrays [M]. A yielded state is valid until the next step, which donates its arrays: copy it to keep it longer.
     """
-    begun = plan.chunks_done(state)
-    number = set_number(refresh_every, max(begun - 1, 0))
+    begun, refresh_every = plan.chunks_done(state), refresh_every or plan.chunks
+    number = max(begun - 1, 0) // refresh_every
     worlds = pools(number)
-    chunk: Any = programs.chunk.lower(worlds, data, state).compile() if begun < plan.chunks else None
+    chunk = programs.chunk.lower(worlds, data, state).compile() if begun < plan.chunks else programs.chunk
     yield state, {}
     for done in range(begun, plan.chunks):
-        if set_number(refresh_every, done) != number:
-            number = set_number(refresh_every, done)
+        if done // refresh_every != number:
+            number = done // refresh_every
             worlds = pools(number)
             state = programs.renew(worlds, state)
         state, metrics = chunk(worlds, data, state)
         yield state, metrics
-
-
-def set_number(refresh_every: int, done: int) -> int:
-    """Which set of worlds the chunk after `done` others takes place in."""
-    return done // refresh_every if refresh_every else 0
 
 
 def bytes_of(function: Callable[..., PyTree], *args: PyTree) -> int:

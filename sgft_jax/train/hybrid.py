@@ -5,6 +5,7 @@ H2O+ (Niu et al. 2023), its released code.
 """
 
 from collections.abc import Iterator
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -42,7 +43,7 @@ def train(
     plan = make_plan(env, agent, schedule)
     programs = fleet.make_programs(fleet.make_trainer(env, plan, gamma=gamma, note=note), keys.shape[0], shared=True)
     real = jax.tree.map(jnp.asarray, real)
-    state = state or programs.begin(pools, real, keys)
+    state = state or programs.init(pools, real, keys)
     return fleet.train(plan, programs, lambda number: pools, agent.keep(real), state)
 
 
@@ -69,10 +70,8 @@ def make_plan(env: Env, agent: HybridAgent, schedule: Schedule) -> Plan:
     learner = agent.learner
 
     def explore(state: PyTree, simulators: Fleet, key: Key) -> tuple[Array, PyTree]:
-        def act(carry: PyTree, obs: Array, key: Key) -> tuple[Array, PyTree]:
-            return learner.act(state, carry, obs, key, explore=True)
-
-        return jax.vmap(act)(simulators.carry, simulators.state.obs, jax.random.split(key, schedule.simulators))
+        keys = jax.random.split(key, schedule.simulators)
+        return jax.vmap(partial(learner.act, state, explore=True))(simulators.carry, simulators.state.obs, keys)
 
     def start_keys(key: Key) -> StartKeys:
         key_learner, key_fleet, key_steps, key_rounds = jax.random.split(key, 4)
@@ -85,10 +84,6 @@ def make_plan(env: Env, agent: HybridAgent, schedule: Schedule) -> Plan:
 
     def batches(memory: PyTree, simulated: PyTree, keys: Key) -> Batch:
         return jax.vmap(lambda key: agent.batches.sample((memory, simulated), key))(keys)
-
-    def ready(simulated: PyTree) -> Array:
-        """An empty buffer is sampled as zeros, which nobody has lived through: all simulators have exploded."""
-        return simulated.size > 0
 
     first = -(-agent.batches.n_sim // schedule.simulators)
     return Plan(
@@ -104,7 +99,8 @@ def make_plan(env: Env, agent: HybridAgent, schedule: Schedule) -> Plan:
         start_keys=start_keys,
         round_keys=round_keys,
         batches=batches,
-        ready=ready if agent.batches.n_sim else None,
+        # An empty buffer is sampled as zeros, which nobody has lived through: all simulators have exploded.
+        ready=(lambda simulated: simulated.size > 0) if agent.batches.n_sim else None,
     )
 
 

@@ -54,9 +54,9 @@ def pretrain(
     else:
         random = jax.jit(over_members(fleet.spread_replay, members), donate_argnums=0)(random)
     if state is None:
-        begun = programs.begin(pools(0), random, seed_keys(seeds, Pretraining.START))
+        begun = programs.init(pools(0), random, seed_keys(seeds, Pretraining.START))
     else:
-        begun = programs.spread(state)
+        begun = jax.jit(over_members(fleet.spread, members), donate_argnums=0)(state)
     return fleet.train(plan, programs, pools, random, begun, refresh_every=config.refresh_every)
 
 
@@ -179,9 +179,6 @@ def make_plan(env: Env, config: PretrainConfig) -> Plan:
         statistics = normalizer.update(normalizer.init(env.obs_dim), random.data.obs, kept.held(random))
         return agent.replace(normalizer=normalizer.finish(statistics))
 
-    def start_keys(key: Key) -> StartKeys:
-        return StartKeys(*jax.random.split(key, 3))
-
     def round_keys(key: Key) -> RoundKeys:
         keys = jax.random.split(key, 5)
         return RoundKeys(keys[0], keys[None, 1:3], keys[3], jax.random.split(keys[4], config.updates_per_step))
@@ -222,7 +219,7 @@ def make_plan(env: Env, config: PretrainConfig) -> Plan:
         explore=explore,
         begin=begin,
         tune=lambda agent, rounds: agent.replace(hyper=recipe.hyper(rounds)),
-        start_keys=start_keys,
+        start_keys=lambda key: StartKeys(*jax.random.split(key, 3)),
         round_keys=round_keys,
         batches=batches,
         measure=_measure,

@@ -21,7 +21,7 @@ from experiments.runner import cli
 from sgft_jax.data import replay
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.presets import PretrainConfig
-from sgft_jax.train.fleet import make_programs, over_members, spread_replay
+from sgft_jax.train.fleet import make_programs, over_members, spread, spread_replay
 from sgft_jax.train.pretraining import make_trainer, random_experience, training_pools
 
 LOOP = {"n_envs": 16, "worlds": 8, "chunk_steps": 24, "random_transitions": 64, "random_ladder": 0.5}
@@ -36,7 +36,7 @@ def begun(devices):
     with mesh.use(devices):
         collect = over_members(functools.partial(random_experience, toy.make(), CONFIG), 1)
         random = jax.jit(collect)(pools(), jax.random.split(jax.random.key(1), 1))
-        return random, program().begin(pools(), random, jax.random.split(jax.random.key(2), 1))
+        return random, program().init(pools(), random, jax.random.split(jax.random.key(2), 1))
 
 
 @functools.cache
@@ -130,7 +130,7 @@ def test_what_one_device_left_two_continue():
     """A checkpoint holds whole arrays; `spread` lays them out."""
     random, state = begun(1)
     with mesh.use(2):
-        laid_out = program().spread(jax.tree.map(jnp.copy, state))
+        laid_out = jax.jit(over_members(spread, 1), donate_argnums=0)(jax.tree.map(jnp.copy, state))
         data = jax.jit(over_members(spread_replay, 1))(random).data
     agree(state, laid_out)
     assert laid_out.replay.data.reward.sharding.spec == data.reward.sharding.spec == CUT
