@@ -4,7 +4,7 @@ A yielded state is valid until the iterator's next step, which donates its array
 """
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
@@ -107,19 +107,14 @@ def finetune(
     """
     step = _Steps(finetuner, system, priors, seeds, simulated)
     if progress is None:
-        progress = step.begin()
+        progress = jax.jit(functools.partial(begin, finetuner))(priors, seeds, simulated)
         yield progress, {}
     simulated_updates = simulated_updates_of(finetuner)
-    while (done := int(progress.offline)) < simulated_updates:
-        progress, metrics = step.offline(progress, done, min(OFFLINE_PART, simulated_updates - done), learner)
-        yield progress, metrics
+    progress = yield from step.offline(progress, simulated_updates, learner, "offline")
     if logged is not None:
-        if done == simulated_updates and not int(progress.rollouts):  # else they are kept already
+        if int(progress.offline) == simulated_updates and not int(progress.rollouts):  # else they are kept already
             progress = step.keep(progress, logged)
-        updates = simulated_updates + logged.updates
-        while (done := int(progress.offline)) < updates:
-            progress, metrics = step.offline(progress, done, min(OFFLINE_PART, updates - done), learner, logged=True)
-            yield progress, metrics
+        progress = yield from step.offline(progress, simulated_updates + logged.updates, learner, "logged")
     if learner is not None:
         if not waits and isinstance(progress.agent, Guarded):
             raise UserError("waits=False: a guard judges rollouts by one policy; leave one of the two out")
@@ -216,41 +211,40 @@ class _Steps:
             raise UserError("this method also learns from simulated transitions: pass `simulated` (see `simulate`)")
         self._learn = Updates(finetuner, seeds, prior_of(priors, seeds), simulated)
         self._store = jax.jit(split_vmap(self._observe), donate_argnums=0)
-        self._keep_log = jax.jit(split_vmap(self._observe_log, (0, None, None)), donate_argnums=0)
+        self._keep_log = jax.jit(split_vmap(finetuner.observe, (0, None, None, None)), donate_argnums=0)
         self._witness = jax.jit(evidence.witnessed)
         self._judge = jax.jit(functools.partial(evidence.judged, finetuner))
-
-    def begin(self) -> FinetuneProgress:
-        """The fresh state."""
-        return jax.jit(functools.partial(begin, self.finetuner))(self.priors, self.seeds, self.simulated)
 
     def keep(self, progress: FinetuneProgress, logged: Logged) -> FinetuneProgress:
         """The episodes of a log, one after another, as if they had been played."""
         agent = progress.agent
         for i in range(len(logged.valid)):
-            agent = self._keep_log(agent, jax.tree.map(lambda x, i=i: x[i], logged.transitions), logged.valid[i])
+            rows = jax.tree.map(lambda x, i=i: x[i], logged.transitions)
+            agent = self._keep_log(agent, rows, logged.valid[i], None)
         return progress._replace(agent=agent)
 
     def offline(
-        self, progress: FinetuneProgress, done: int, updates: int, learner: Beside | None, *, logged: bool = False
-    ) -> tuple[FinetuneProgress, Metrics]:
-        """Updates before the first rollout: on simulated transitions alone, or as after a rollout."""
-        phase: Phase = "logged" if logged else "offline"
-        if learner is None:
-            agent, metrics = self._learn(progress.agent, [done], updates, phase)
-        else:
-            learner.submit(progress.agent, [done], updates, phase)
-            agent, metrics = learner.result()
-        return progress._replace(agent=agent, offline=progress.offline + updates), metrics
+        self, progress: FinetuneProgress, until: int, learner: Beside | None, phase: Phase
+    ) -> Generator[tuple[FinetuneProgress, Metrics], None, FinetuneProgress]:
+        """Updates before the first rollout, part by part, until there are so many of them."""
+        while (done := int(progress.offline)) < until:
+            updates = min(OFFLINE_PART, until - done)
+            if learner is None:
+                agent, metrics = self._learn(progress.agent, [done], updates, phase)
+            else:
+                learner.submit(progress.agent, [done], updates, phase)
+                agent, metrics = learner.result()
+            progress = progress._replace(agent=agent, offline=progress.offline + updates)
+            yield progress, metrics
+        return progress
 
     def rollouts(self, progress: FinetuneProgress, done: int, n: int) -> tuple[FinetuneProgress, Metrics]:
         """N real rollouts, one after another as on a robot, then the updates that they allow."""
         played = self._play(progress.agent, done, n)
         agent, best = self._take(progress.agent, progress.best, played, done, (progress.agent, done))
         agent, metrics = self._learn(agent, range(done, done + n), self._updates(played))
-        progress = FinetuneProgress(
-            agent, best, progress.rollouts + n, progress.offline, progress.transitions + _transitions(played).sum(0)
-        )
+        made = progress.transitions + _transitions(played).sum(0)
+        progress = FinetuneProgress(agent, best, progress.rollouts + n, progress.offline, made)
         return progress, _real(best, played) | metrics
 
     def beside(
@@ -277,10 +271,9 @@ class _Steps:
 
     def _play(self, agent: PyTree, done: int, n: int) -> list[Episode]:
         """The next n rollouts [M, 1]. agent: or a function that returns it."""
-        initial = self.finetuner.initial_policy if done == 0 else None
-        who, states = (
-            (self.finetuner, agent) if initial is None else (initial, priors_of_members(self.priors, self.seeds))
-        )
+        who, states = self.finetuner, agent
+        if done == 0 and who.initial_policy is not None:
+            who, states = who.initial_policy, priors_of_members(self.priors, self.seeds)
         keys = [_episode_keys(self.seeds, Finetuning.COLLECT, rollout, 1) for rollout in range(done, done + n)]
         return [self.system.play(who, states, key, explore=True) for key in keys]
 
@@ -313,10 +306,6 @@ class _Steps:
     def _observe(self, state: PyTree, transitions: Transition, valid: Array, score: Array) -> PyTree:
         """transitions, valid: [1, T, ...]. score: [1]."""
         return self.finetuner.observe(state, jax.tree.map(lambda x: x[0], transitions), valid[0], score[0])
-
-    def _observe_log(self, state: PyTree, transitions: Transition, valid: Array) -> PyTree:
-        """transitions, valid: [T, ...]."""
-        return self.finetuner.observe(state, transitions, valid, None)
 
 
 class _Acting:
