@@ -35,7 +35,7 @@ def main(args: ExportArgs) -> None:
     if existing := [path for path in homes if path.exists()]:
         raise UserError(f"{existing[0]}: exists already; choose another --out, or remove it")
     import envs
-    from sgft_jax.export.folder import save_exported
+    from sgft_jax.export.exported import save_exported
     from sgft_jax.io.priors import load_prior, observed_by
 
     for folder, path in zip(folders, homes, strict=True):

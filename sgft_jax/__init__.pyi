@@ -2,7 +2,7 @@ from . import learners
 from .algorithms import make_policy
 from .api import ActingPolicy, Setup, evaluate_prior, finetuned_priors, load_policy, make_env, setup
 from .data import replay, sequences, sources
-from .export.folder import save_exported
+from .export.exported import save_exported
 from .io.priors import load_prior, save_prior
 from .methods import all_methods, get_method
 from .models import dynamics, normalizer, ratio, value

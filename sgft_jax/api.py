@@ -3,7 +3,7 @@
 The only module of this package that builds tasks; the others take an `Env` or less.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -84,37 +84,27 @@ def setup(
         system, copies = real, 1
     else:
         gaps = [real] if isinstance(real, Gap) else list(real)
-        gamma, copies = card_of(known[0] if known else None)["gamma"], len(gaps)
-        system = _simulated_systems(env, gaps, len(numbers), gamma=gamma)
+        gamma, copies, scene = card_of(known[0] if known else None)["gamma"], len(gaps), real_env(env, gaps)
+        which = jnp.repeat(jnp.arange(copies), len(numbers))
+        system = Simulated(scene, real_worlds(scene, gaps, jax.random.key(0)), which, gamma=gamma)
     stacked = stack([prior.params for prior in known]) if known else None
     members = jnp.tile(jnp.array(list(numbers), jnp.uint32), copies)
     return Setup(finetuner, system, stacked, members, _simulated_rows(env, finetuner, known, stacked))
 
 
-def _simulated_systems(env: Env, gaps: Sequence[Gap], seeds: int, *, gamma: float) -> Simulated:
-    """The real systems of gaps with so many seeds on each."""
-    real = real_env(env, gaps)
-    which = jnp.repeat(jnp.arange(len(gaps)), seeds)
-    return Simulated(real, real_worlds(real, gaps, jax.random.key(0)), which, gamma=gamma)
-
-
 def _simulated_rows(env: Env, finetuner: Finetuner, priors: list[Prior], stacked: PyTree) -> SimulatedRows | None:
-    """What every prior's policy does in its training domain, where the method asks for it; always the same."""
+    """What every prior's policy does where it was trained, if the method asks for it; always the same.
+
+    That is the task's own domain, or the system of the gap that the first card names.
+    """
     if finetuner.simulation is None:
         return None
-    key, card = jax.random.key(_SIMULATION), priors[0].card
-    env, gap = _simulator(env, card)
+    key, card, gap = jax.random.key(_SIMULATION), priors[0].card, None
+    if (named := card.get("gap")) is not None:
+        gap = from_dict(env, named["name"], {part: named[part] for part in ("params", "effects", "scene")})
+        env = real_env(env, [gap])
     worlds = training_worlds(env, gap, key, SIMULATED_WORLDS)
-    policy, simulation = make_policy(card, env), finetuner.simulation
-    return simulate(env, policy, worlds, stacked, key, simulation, gamma=card["gamma"])
-
-
-def _simulator(env: Env, card: Mapping[str, Any]) -> tuple[Env, Gap | None]:
-    """What a prior was trained in: the task's own domain (None), or the system of the gap that its card names."""
-    if (named := card.get("gap")) is None:
-        return env, None
-    gap = from_dict(env, named["name"], {part: named[part] for part in ("params", "effects", "scene")})
-    return real_env(env, [gap]), gap
+    return simulate(env, make_policy(card, env), worlds, stacked, key, finetuner.simulation, gamma=card["gamma"])
 
 
 def check_prior(prior: Prior, method: Online, env: Env) -> None:

@@ -24,18 +24,12 @@ from sgft_jax.train.evidence import Best
 from sgft_jax.types import Metrics, Prior
 
 
-@contextlib.contextmanager
 def opened(
     kind: str, args: Any, configs: Mapping[Path, Mapping[str, Any]], inputs: Mapping[str, Any] | None = None
-) -> Iterator[list[Path]]:
-    """The folders of `runs.open_runs`, closed at the end. args: of the command."""
+) -> contextlib.AbstractContextManager[list[Path]]:
+    """`runs.opened` as a command with these `args` wants it."""
     how = {"resume": args.resume, "overwrite": args.overwrite, "volatile": args.volatile}
-    folders = runs.open_runs(configs, kind=kind, inputs=inputs, **how)
-    try:
-        yield [run.folder for run in folders]
-    finally:
-        for run in folders:
-            run.close()
+    return runs.opened(configs, kind=kind, inputs=inputs, **how)
 
 
 class Record:

@@ -1,6 +1,6 @@
 """Impure: the life of a run folder: made once, resumed or replaced on request, with its configuration and origin."""
 
-import dataclasses
+import contextlib
 import importlib.metadata
 import os
 import platform
@@ -8,7 +8,7 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypedDict
@@ -56,20 +56,8 @@ class _Start(TypedDict, total=False):
     priors: list[str]
 
 
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """An open run folder, locked against other processes; `resumed`: it holds an earlier start of the same run."""
-
-    folder: Path
-    resumed: bool
-    lock: Lock = dataclasses.field(repr=False)
-
-    def close(self) -> None:
-        """Let other processes open the folder."""
-        self.lock.release()
-
-
-def open_runs(
+@contextlib.contextmanager
+def opened(
     configs: Mapping[Path, Mapping[str, Any]],
     *,
     kind: str,
@@ -78,12 +66,13 @@ def open_runs(
     volatile: tuple[str, ...] = ("resume", "overwrite"),
     inputs: Mapping[str, Any] | None = None,
     say: Callable[[str], None] = print,
-) -> list[Run]:
+) -> Iterator[list[Path]]:
     """Create or reopen run folders, say where they are, and record configuration and provenance: all of them or none.
 
-    configs: the configuration of each folder as JSON data. kind: what writes there ("pretrain", "finetune"). volatile:
-    dotted names of fields that may differ on a resume. inputs: JSON data that says what the runs begin with, such as
-    digests of files, by name; it is recorded with the provenance and must be the same on a resume.
+    They are locked against other processes inside the `with` block. configs: the configuration of each folder as JSON
+    data. kind: what writes there ("pretrain", "finetune"). volatile: dotted names of fields that may differ on a
+    resume. inputs: JSON data that says what the runs begin with, such as digests of files, by name; it is recorded with
+    the provenance and must be the same on a resume.
     Raises UserError if a folder holds something already and neither `resume` nor `overwrite` is set, if it is not a run
     folder, if the stored configuration differs, or if another process has it open. What is wrong with one folder is
     found before anything is written to any.
@@ -92,23 +81,21 @@ def open_runs(
     for folder in configs:
         say(f"run folder: {folder}")
     begun = [check_start(folder, resume=resume, overwrite=overwrite) for folder in configs]
-    runs: list[Run] = []
-    try:
+    with contextlib.ExitStack() as locks:
         for (folder, config), earlier in zip(configs.items(), begun, strict=True):
             folder.mkdir(parents=True, exist_ok=True)
-            runs.append(Run(folder, resumed=earlier and resume, lock=Lock(folder)))
+            locks.callback(lambda lock: lock.release(), Lock(folder))  # a lock that nobody holds is released
             if earlier and resume:
                 check_same(folder, kind, config, volatile)
                 _check_inputs(folder, inputs)
-    except UserError:
-        for run in runs:
-            run.close()  # the traceback would keep the locks alive
-        raise
-    for run, config, earlier in zip(runs, configs.values(), begun, strict=True):
-        if earlier and not resume:
-            empty(run.folder, last=CONFIG)
-        _record(run, kind, config, inputs)
-    return runs
+        for (folder, config), earlier in zip(configs.items(), begun, strict=True):
+            if earlier and not resume:
+                empty(folder, last=CONFIG)
+            if not (earlier and resume):
+                first = {_MARK: _version("sgft-jax"), "format": FORMAT, "kind": kind, "config": config}
+                write_json(folder / CONFIG, first)
+            write_json(folder / PROVENANCE, {"starts": [*read_starts(folder), {**provenance(), **inputs}]})
+        yield list(configs)
 
 
 def provenance() -> dict[str, Any]:
@@ -176,7 +163,11 @@ def check_start(folder: Path, *, resume: bool, overwrite: bool) -> bool:
     # A process killed while it made the folder leaves hidden files at most: nothing started yet.
     existing = folder.exists() and any(not p.name.startswith(".") for p in folder.iterdir())
     if existing:
-        _check_ours(folder, resume=resume, overwrite=overwrite)
+        stored = _stored(folder) if (folder / CONFIG).exists() else {}
+        if _MARK not in stored:
+            raise UserError(f"{folder}: is not a run folder (it has no {CONFIG} of ours); choose another one")
+        if not (resume or overwrite) and any(path for pattern in _RESULTS for path in folder.glob(pattern)):
+            raise UserError(f"{folder}: exists already; continue it with --resume or replace it with --overwrite")
     elif resume and not folder.exists():
         raise UserError(f"{folder}: nothing to resume there; leave --resume out to start it")
     return existing
@@ -218,13 +209,6 @@ def read_starts(folder: Path) -> list[dict[str, Any]]:
     return read_own(folder / PROVENANCE, {"starts": list[_Start]}, otherwise=begin).get("starts", [])
 
 
-def _record(run: Run, kind: str, config: Mapping[str, Any], inputs: Mapping[str, Any]) -> None:
-    """Write down the start with what it begins with, and the configuration if it is the first one."""
-    if not run.resumed:
-        write_json(run.folder / CONFIG, {_MARK: _version("sgft-jax"), "format": FORMAT, "kind": kind, "config": config})
-    write_json(run.folder / PROVENANCE, {"starts": [*read_starts(run.folder), {**provenance(), **inputs}]})
-
-
 def _check_inputs(folder: Path, inputs: Mapping[str, Any]) -> None:
     """Raises UserError if the run began with others; runs of earlier versions do not say."""
     for start in read_starts(folder):
@@ -232,14 +216,6 @@ def _check_inputs(folder: Path, inputs: Mapping[str, Any]) -> None:
             if (before := start.get(name, now)) != now:
                 advice = "put the first ones back, or begin again with --overwrite"
                 raise UserError(f"{folder}: cannot resume with other {name}: they were {before}, now {now}; {advice}")
-
-
-def _check_ours(folder: Path, *, resume: bool, overwrite: bool) -> None:
-    stored = _stored(folder) if (folder / CONFIG).exists() else {}
-    if _MARK not in stored:
-        raise UserError(f"{folder}: is not a run folder (it has no {CONFIG} of ours); choose another one")
-    if not (resume or overwrite) and any(path for pattern in _RESULTS for path in folder.glob(pattern)):
-        raise UserError(f"{folder}: exists already; continue it with --resume or replace it with --overwrite")
 
 
 def _stored(folder: Path) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """The real side of fine-tuning: what a system is, and those that are simulations with other numbers."""
 
+import functools
 from collections.abc import Callable, Generator, Iterable
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -84,12 +85,9 @@ class Simulated:
 
     def _player(self, policy: Any) -> Callable[..., Episode]:
         def play(state: PyTree, pools: World, which: Array, keys: Key, explore: Array) -> Episode:
-            def act(carry: PyTree, obs: Array, key: Key) -> tuple[Array, PyTree]:
-                return policy.act(state, carry, obs, key, explore=explore)
-
-            def episode(key: Key) -> Episode:
-                return play_episode(self.env, pools, act, policy.init_carry(), key, gamma=self.gamma, which=which)
-
-            return split_vmap(episode)(keys)
+            act, carry = functools.partial(policy.act, state, explore=explore), policy.init_carry()
+            return split_vmap(
+                lambda key: play_episode(self.env, pools, act, carry, key, gamma=self.gamma, which=which)
+            )(keys)
 
         return play

@@ -19,10 +19,8 @@ from envs.rollout import play_episode
 from envs.system import concealed, with_system
 from envs.types import UserError
 from sgft_jax import api
-from sgft_jax.export import folder as exported
-from sgft_jax.export import graph, player
-from sgft_jax.export.folder import save_exported
-from sgft_jax.export.graph import Graph, Node, Slot
+from sgft_jax.export import exported, player
+from sgft_jax.export.exported import Graph, Node, Slot, save_exported
 from sgft_jax.files.disk import jsonable
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
 from sgft_jax.learners.actor import ActorParams
@@ -166,7 +164,7 @@ def test_so_does_one_for_jax(name, tmp_path):
 def test_a_step_of_the_function_for_jax_is_a_step_of_the_policy(name):
     """Also where flatbuffers is not installed. Plans draw; they are given the numbers that the contract promises."""
     env, prior = case(name)
-    step, slots = jax.jit(graph.stepping(prior, env)), graph.slots_of(prior, env)
+    step, slots = jax.jit(exported.stepping(prior, env)), exported.slots_of(prior, env)
     state = {slot.name: jnp.zeros(slot.shape, slot.dtype) for slot in slots}
     acting, keys = api.ActingPolicy(prior, env), iter(range(5))
     own = acting._act
@@ -202,7 +200,7 @@ def test_a_policy_that_plans_does_not_go_elsewhere(name, tmp_path):
 
 def test_the_contract_says_what_goes_in_and_out():
     env, prior = case("identified")
-    found = jsonable(graph.contract(prior, env, "numpy"))
+    found = jsonable(exported.contract(prior, env, "numpy"))
     entry = {"first": 0, "size": 2}
     assert found["observation"] == [
         {"name": "xy", "unit": "m", **entry},
@@ -215,7 +213,7 @@ def test_the_contract_says_what_goes_in_and_out():
     assert found["inside"]["previous_actions"] == 3 and found["inside"]["system"] == []
     assert found["inside"]["normalisation"]["mean"][0] == pytest.approx(-0.2)
     np.testing.assert_allclose(found["inside"]["identified"]["matrix"], IDENTIFIED.matrix, rtol=1e-6)
-    told = graph.contract(*reversed(case("told")), "numpy")["inside"]["system"]
+    told = exported.contract(*reversed(case("told")), "numpy")["inside"]["system"]
     assert [(one["name"], one["index"], one["value"]) for one in told] == [
         ("mass", 0, pytest.approx(0.5)),
         ("action_scale", 1, pytest.approx(-0.9)),
@@ -292,7 +290,7 @@ def test_an_answer_that_is_not_finite_is_given_by_nobody(tmp_path):
     ["", "[" * 100_000, "null", "[]", "{}", '{"to": "wasm"}', "\xff", "WHOLE without state", "WHOLE to pickle"],
 )
 def test_a_contract_that_is_none_is_one_line(tmp_path, content):
-    contract = jsonable(graph.contract(*reversed(case("plain")), "numpy"))
+    contract = jsonable(exported.contract(*reversed(case("plain")), "numpy"))
     if content.startswith("WHOLE"):
         changed = (
             {name: x for name, x in contract.items() if name != "state"}

@@ -10,7 +10,7 @@ import pytest
 from envs.types import UserError
 from sgft_jax.files.disk import jsonable
 from sgft_jax.io import runs
-from sgft_jax.io.runs import Lock, open_runs, plain_path, provenance
+from sgft_jax.io.runs import Lock, opened, plain_path, provenance
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,23 +27,26 @@ class Config:
 
 
 def open_run(folder, config=None, *, kind="pretrain", say=lambda _: None, **options):
-    return open_runs({folder: jsonable(config or Config())}, kind=kind, say=say, **options)[0]
+    return opened({folder: jsonable(config or Config())}, kind=kind, say=say, **options)
 
 
 def start(folder, config=None, **options):
-    run = open_run(folder, config, **options)
-    run.close()
-    return run
+    with open_run(folder, config, **options) as (home,):
+        return home
+
+
+def starts_of(folder):
+    return json.loads((folder / "provenance.json").read_text())["starts"]
 
 
 def test_a_new_run_says_where_it_is_and_records_itself(tmp_path):
     heard = []
-    run = open_run(tmp_path / "runs" / "x", say=heard.append)
+    folder = start(tmp_path / "runs" / "x", say=heard.append)
     assert heard == [f"run folder: {tmp_path / 'runs' / 'x'}"]
-    assert not run.resumed
-    stored = json.loads((run.folder / "config.json").read_text())
+    assert folder == tmp_path / "runs" / "x"
+    stored = json.loads((folder / "config.json").read_text())
     assert stored["kind"] == "pretrain" and stored["config"]["inner"] == {"lr": 0.001, "layers": [2, 3]}
-    (first,) = json.loads((run.folder / "provenance.json").read_text())["starts"]
+    (first,) = starts_of(folder)
     assert first["versions"]["jax"] and first["device"]["platform"] == "cpu" and first["python"].startswith("3.")
 
 
@@ -62,7 +65,7 @@ def test_an_existing_run_needs_a_decision(tmp_path):
 
 @pytest.mark.parametrize("result", ["checkpoints/10/manifest.json", "real/rollout-000000.npz", "summary.json"])
 def test_a_start_that_failed_before_it_left_a_result_blocks_nobody(tmp_path, result):
-    folder = start(tmp_path / "x").folder
+    folder = start(tmp_path / "x")
     for name in ("random/checkpoints/0/manifest.json", "metrics.jsonl", "checkpoints/.tmp-10/manifest.json"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).touch()
@@ -94,7 +97,7 @@ def test_a_folder_that_cannot_be_made_is_named_before_anything_is(tmp_path, monk
 
 
 def test_a_run_of_an_earlier_format_is_not_continued_but_may_be_replaced(tmp_path):
-    folder = start(tmp_path / "x").folder
+    folder = start(tmp_path / "x")
     stored = json.loads((folder / "config.json").read_text())
     del stored["format"]  # the first format did not say
     (folder / "config.json").write_text(json.dumps(stored | {"sgft_jax": "0.1.0"}))
@@ -106,9 +109,9 @@ def test_a_run_of_an_earlier_format_is_not_continued_but_may_be_replaced(tmp_pat
 def test_resume_keeps_everything_and_adds_a_start(tmp_path):
     start(tmp_path / "x")
     (tmp_path / "x" / "metrics.jsonl").write_text("{}\n")
-    assert start(tmp_path / "x", Config(resume=True), resume=True).resumed
+    start(tmp_path / "x", Config(resume=True), resume=True)
     assert (tmp_path / "x" / "metrics.jsonl").read_text() == "{}\n"
-    assert len(json.loads((tmp_path / "x" / "provenance.json").read_text())["starts"]) == 2
+    assert len(starts_of(tmp_path / "x")) == 2
 
 
 def test_resume_names_every_field_that_differs(tmp_path):
@@ -118,7 +121,7 @@ def test_resume_names_every_field_that_differs(tmp_path):
         start(tmp_path / "x", other, resume=True)
     start(tmp_path / "x", other, resume=True, volatile=("task", "inner.layers"))
     with pytest.raises(UserError, match="is a pretrain run, not a finetune run"):
-        open_run(tmp_path / "x", kind="finetune", resume=True)
+        start(tmp_path / "x", kind="finetune", resume=True)
 
 
 def test_of_several_runs_all_open_or_none(tmp_path):
@@ -127,24 +130,27 @@ def test_of_several_runs_all_open_or_none(tmp_path):
     leave_a_checkpoint(old)
     both = {folder: {"task": folder.name} for folder in (new, old)}
     for options, words in (({}, "old: exists already"), ({"resume": True}, "new: nothing to resume there")):
-        with pytest.raises(UserError, match=words):
-            open_runs(both, kind="pretrain", say=lambda _: None, **options)
+        with pytest.raises(UserError, match=words), opened(both, kind="pretrain", say=lambda _: None, **options):
+            pass
         assert not new.exists()
     held = Lock(old)
-    with pytest.raises(UserError, match="old: another process is writing to it"):
-        open_runs(both, kind="pretrain", overwrite=True, say=lambda _: None)
+    together = opened(both, kind="pretrain", overwrite=True, say=lambda _: None)
+    with pytest.raises(UserError, match="old: another process is writing to it"), together:
+        pass
     held.release()
     assert [path.name for path in new.iterdir()] == [".lock"]  # not begun, and not locked any more
-    first, second = open_runs(both, kind="pretrain", overwrite=True, say=lambda _: None)
-    assert json.loads((first.folder / "config.json").read_text())["config"] == {"task": "new"}
-    assert (first.folder, second.folder) == (new, old) and not (first.resumed or second.resumed)
+    with opened(both, kind="pretrain", overwrite=True, say=lambda _: None) as folders:
+        assert folders == [new, old]
+    assert json.loads((new / "config.json").read_text())["config"] == {"task": "new"}
+    assert len(starts_of(new)) == len(starts_of(old)) == 1
 
 
 def test_a_run_goes_on_with_the_inputs_that_it_began_with(tmp_path):
     given = {tmp_path / "x": {"task": "hammer"}}
 
     def begin(**more):
-        open_runs(given, kind="finetune", say=lambda _: None, **more)[0].close()
+        with opened(given, kind="finetune", say=lambda _: None, **more):
+            pass
 
     begin(inputs={"priors": ["ab"]})
     begin(resume=True, inputs={"priors": ["ab"], "maps": 3})  # the first start did not tell of maps
@@ -170,20 +176,20 @@ def test_resume_of_a_run_killed_while_it_was_made_starts_it(tmp_path):
     (tmp_path / "x").mkdir()
     (tmp_path / "x" / ".lock").touch()
     (tmp_path / "x" / ".tmp-config.json").write_text('{"sg')
-    assert not start(tmp_path / "x", resume=True).resumed
+    assert len(starts_of(start(tmp_path / "x", resume=True))) == 1
 
 
 def test_overwrite_empties_a_run_and_nothing_else(tmp_path):
     precious = tmp_path / "precious"
     precious.mkdir()
     (precious / "data").write_text("keep")
-    run = start(tmp_path / "x")
-    (run.folder / "checkpoints" / "10").mkdir(parents=True)
-    (run.folder / "link").symlink_to(precious)
+    folder = start(tmp_path / "x")
+    (folder / "checkpoints" / "10").mkdir(parents=True)
+    (folder / "link").symlink_to(precious)
     start(tmp_path / "x", Config(task="push"), overwrite=True)
-    assert sorted(p.name for p in run.folder.iterdir()) == [".lock", "config.json", "provenance.json"]
-    assert json.loads((run.folder / "config.json").read_text())["config"]["task"] == "push"
-    assert len(json.loads((run.folder / "provenance.json").read_text())["starts"]) == 1
+    assert sorted(p.name for p in folder.iterdir()) == [".lock", "config.json", "provenance.json"]
+    assert json.loads((folder / "config.json").read_text())["config"]["task"] == "push"
+    assert len(starts_of(folder)) == 1
     assert (precious / "data").read_text() == "keep"
 
 
@@ -202,10 +208,10 @@ def test_a_folder_that_is_no_run_is_left_alone(tmp_path, content):
 
 HOLDER = """
 import pathlib, sys, time
-from sgft_jax.io.runs import open_runs
-runs = open_runs({pathlib.Path(sys.argv[1]): {"task": "hammer"}}, kind="pretrain", say=lambda _: None)
-print("open", flush=True)
-time.sleep(60)
+from sgft_jax.io.runs import opened
+with opened({pathlib.Path(sys.argv[1]): {"task": "hammer"}}, kind="pretrain", say=lambda _: None):
+    print("open", flush=True)
+    time.sleep(60)
 """
 
 
@@ -221,6 +227,7 @@ def test_two_processes_never_share_a_folder_and_a_kill_frees_it(tmp_path):
 
 def test_a_forgotten_run_frees_its_folder(tmp_path):
     run = open_run(tmp_path / "x")
+    run.__enter__()
     with pytest.raises(UserError, match="another process"):
         start(tmp_path / "x", resume=True)
     del run

@@ -1,10 +1,18 @@
-"""A policy as something to take away: one step as a graph of simple operators or as a JAX function, and its contract.
+"""Impure: a policy as something to take away, in a folder: the contract, the policy, and the file that plays it.
 
-A step takes what was measured and the state, and gives the action and the next state. Everything else that the policy
-needs is inside: previous actions, memory, observation statistics, what was identified of the system. Pure.
+The policy is one step, as a graph of simple operators or as a JAX function: from what was measured and the state to the
+action and the next state. All else is inside: observation statistics, what was identified of the system.
+
+ONNX is written operator by operator. jax2onnx, which would read the JAX function, does not run with JAX 0.12 (version
+0.13.0 asks for names that JAX has removed); a policy has a dozen kinds of operators.
 """
 
+import importlib.util
+import io
+import json
+import shutil
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -14,13 +22,30 @@ import numpy as np
 from envs.base import Env
 from envs.types import Array, PyTree, UserError
 from sgft_jax.algorithms import algorithm_of, make_policy
+from sgft_jax.export import player
+from sgft_jax.files.disk import write_json
+from sgft_jax.io import checkpoint
 from sgft_jax.io.priors import digest
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.policies import network_of
 from sgft_jax.types import Prior
 
+__all__ = ["save_exported"]
+
 Format = Literal["onnx", "jax", "numpy"]
+CONTRACT, PLAYER = "contract.json", "policy.py"
+LIMIT = 1e-5  # how far an exported action may be from the trained policy's
+_CHECKED, _PLANNED = 1000, 50  # random observations that an export is played on; a plan takes longer than an action
+_EPISODE = 25  # of them, then it is reset
+_OPSET, _IR = 17, 8  # the first with LayerNormalization, and what runtimes of that time read
+_ATTRIBUTES: dict[str, dict[str, Any]] = {
+    "Concat": {"axis": 0},
+    "Gather": {"axis": 0},
+    "LayerNormalization": {"axis": -1, "epsilon": 1e-6},
+}
+_NEEDS: dict[Format, tuple[str, ...]] = {"onnx": ("onnx", "onnxruntime"), "jax": ("flatbuffers",), "numpy": ()}
+_PLATFORMS = ("cpu", "cuda")
 MEASURED, ACTION, NEXT = "measured", "action", "next_"
 _PREVIOUS, _STEP = "previous_actions", "step"
 _SEED = 0  # of the random numbers of plans
@@ -67,12 +92,6 @@ def slots_of(prior: Prior, env: Env) -> tuple[Slot, ...]:
     return (*slots, Slot(_STEP, (), "int32")) if plans(prior.card) else tuple(slots)
 
 
-def last_action_of(prior: Prior, env: Env) -> tuple[str, ...]:
-    """The parts of the state whose first numbers are the last action."""
-    memory = (_memory(1),) if algorithm_of(prior.card).remembers else ()
-    return ((_PREVIOUS,) if env.previous_actions else ()) + memory
-
-
 def plans(card: Mapping[str, Any]) -> bool:
     """Whether a policy searches for a plan at every step."""
     return algorithm_of(card).plans(card)
@@ -80,9 +99,6 @@ def plans(card: Mapping[str, Any]) -> bool:
 
 def _memory(i: int) -> str:
     return f"memory_{i}"
-
-
-# --- as a JAX function ------------------------------------------------------------------------------------------------
 
 
 def stepping(prior: Prior, env: Env) -> Callable[[dict[str, Array]], dict[str, Array]]:
@@ -235,7 +251,9 @@ def contract(prior: Prior, env: Env, to: Format) -> dict[str, Any]:
     inside |= {"normalisation": normalisation, "identified": identified}
     kind = {"format": 1, "to": to, "task": env.name, "policy": policy, **times, **spaces}
     kind |= {"action_is": _PLAN if plans(card) else _MODE, "inside": inside}
-    return {**kind, "state": slots_of(prior, env), "last_action": last_action_of(prior, env)}
+    # The parts of the state whose first numbers are the last action.
+    last = {_PREVIOUS: env.previous_actions, _memory(1): algorithm_of(card).remembers}
+    return {**kind, "state": slots_of(prior, env), "last_action": [name for name, held in last.items() if held]}
 
 
 def _entries(entries: tuple[Any, ...]) -> list[dict[str, Any]]:
@@ -244,3 +262,88 @@ def _entries(entries: tuple[Any, ...]) -> list[dict[str, Any]]:
     return [
         {"name": e.name, "unit": e.unit, "first": int(i), "size": e.size} for e, i in zip(entries, first, strict=False)
     ]
+
+
+# --- the folder -------------------------------------------------------------------------------------------------------
+
+
+def check_installed(to: Format) -> None:
+    """Raises UserError where a library is missing that this format needs."""
+    if missing := [name for name in _NEEDS[to] if importlib.util.find_spec(name) is None]:
+        raise UserError(f"--to {to} needs {' and '.join(missing)}: make setup EXTRAS=dev,export")
+
+
+def save_exported(folder: Path, prior: Prior, env: Env, to: Format) -> float:
+    """Writes a policy to a new folder, plays it from there, and returns by how much its actions differ from the
+    trained policy's at most.
+
+    Raises UserError if the folder exists, if the format cannot hold the policy, if a library is missing, or if actions
+    differ by more than `LIMIT`; then there is no folder.
+    """
+    if folder.exists():
+        raise UserError(f"{folder}: exists already; choose another --out, or remove it")
+    check_installed(to)
+    name, content = _file_of(prior, env, to)
+    with checkpoint.replaced(folder) as temporary:
+        (temporary / name).write_bytes(content)
+        shutil.copyfile(player.__file__, temporary / PLAYER)
+        promises = contract(prior, env, to)
+        write_json(temporary / CONTRACT, promises)
+        n = _PLANNED if plans(prior.card) else _CHECKED
+        worst = _difference(player.Policy(temporary), prior, env, n)
+        checked = {"observations": n, "largest_difference": worst, "limit": LIMIT}
+        write_json(temporary / CONTRACT, {**promises, "checked": checked})
+        if not worst <= LIMIT:
+            raise UserError(f"{folder}: exported actions differ by {worst:.1e} from the policy's, {LIMIT:.0e} may be")
+    return worst
+
+
+def _difference(exported: player.Policy, prior: Prior, env: Env, n: int) -> float:
+    """The largest difference between actions on n random observations, drawn as the policy's statistics say.
+
+    Step by step, as a robot asks: in a larger program sums round differently, which may tip the choice of a plan.
+    """
+    mean, std = (np.asarray(x)[: env.measured_dim] for x in prior.params.normalizer)
+    normal = np.random.default_rng(0).normal(size=(n // _EPISODE, _EPISODE, env.measured_dim))
+    step, slots, worst = jax.jit(stepping(prior, env)), slots_of(prior, env), 0.0
+    for episode in (mean + std * normal).astype(np.float32):
+        exported.reset()
+        state = {slot.name: jnp.zeros(slot.shape, slot.dtype) for slot in slots}
+        for measured in episode:
+            values = step({MEASURED: measured, **state})
+            state = {name: values[NEXT + name] for name in state}
+            worst = max(worst, float(np.abs(exported.act(measured) - np.asarray(values[ACTION])).max()))
+    return worst
+
+
+def _file_of(prior: Prior, env: Env, to: Format) -> tuple[str, bytes]:
+    """The file with the policy: its name and its content."""
+    if to == "jax":
+        inputs = {slot.name: jax.ShapeDtypeStruct(slot.shape, slot.dtype) for slot in slots_of(prior, env)}
+        inputs[MEASURED] = jax.ShapeDtypeStruct((env.measured_dim,), "float32")
+        step = jax.jit(stepping(prior, env))
+        return "policy.jax", bytes(jax.export.export(step, platforms=_PLATFORMS)(inputs).serialize())
+    graph, file = graph_of(prior, env), io.BytesIO()
+    if to == "onnx":
+        return "policy.onnx", onnx_model(graph)
+    np.savez(file, allow_pickle=False, nodes=np.array(json.dumps(graph.nodes)), **graph.constants)
+    return "policy.npz", file.getvalue()
+
+
+def onnx_model(policy: Graph) -> bytes:
+    """A graph as an ONNX model."""
+    from onnx import TensorProto, checker, helper, numpy_helper  # pyright: ignore[reportMissingImports] - an extra
+
+    nodes = [
+        helper.make_node(node.operator, node.inputs, [node.output], **_ATTRIBUTES.get(node.operator, {}))
+        for node in policy.nodes
+    ]
+    constants = [numpy_helper.from_array(value, name) for name, value in policy.constants.items()]
+    inputs, outputs = (
+        [helper.make_tensor_value_info(slot.name, TensorProto.FLOAT, slot.shape) for slot in slots]
+        for slots in (policy.inputs, policy.outputs)
+    )
+    whole = helper.make_graph(nodes, "policy", inputs, outputs, constants)
+    model = helper.make_model(whole, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR)
+    checker.check_model(model, full_check=True)
+    return model.SerializeToString()
