@@ -14,10 +14,11 @@ import numpy as np
 from envs.types import Array, Key, PyTree, Transition, UserError
 from sgft_jax.math.stats import rank_correlation
 from sgft_jax.models import dynamics, value
+from sgft_jax.models.config import network_of
 from sgft_jax.models.distortion import Distortion, none, residuals
 from sgft_jax.models.networks import make_dynamics
 from sgft_jax.models.robust import robust_std, student_cost
-from sgft_jax.policies import network_of, sac_policy
+from sgft_jax.policies import sac_policy
 from sgft_jax.types import Task
 
 HORIZONS = (1, 2, 4, 8)  # steps ahead

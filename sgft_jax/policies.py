@@ -1,8 +1,7 @@
-"""How parameters act and value states, and whether they are what a card describes."""
+"""How parameters act and value states: those of SAC by their actor or by plans, TD-MPC2's, actors alone."""
 
-import math
-from collections.abc import Iterable, Mapping
-from typing import Any
+import functools
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,51 +15,12 @@ from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import Network
 from sgft_jax.models.normalizer import normalize
 from sgft_jax.models.system import told
-from sgft_jax.types import Task
+from sgft_jax.types import Normalizer, Task
 
 __all__ = ["mpc_policy", "sac_policy", "tdmpc2_policy"]
 
-
-def check_parameters(card: Mapping[str, Any], params: Any, described: Iterable[tuple[str, Network, PyTree]]) -> None:
-    """Raises UserError where parameters, or their shapes, are not of the sizes and networks that a card describes.
-
-    Parts that a prior does not have are None; all have statistics and what acts. described: (name, network, what the
-    prior has for it) of the networks by its card, see `Algorithm.networks`.
-    """
-    obs_dim, act_dim, entries = card["obs_dim"], card["act_dim"], len(card.get("system", []))
-    sizes = {
-        "normalizer": ((obs_dim,), (obs_dim,)),
-        "distortion": ((act_dim, act_dim), (act_dim,), (_offsets(params, obs_dim, act_dim),)),
-        "system": (entries,),
-        "scale": (),
-    }
-    if params.normalizer is None:
-        raise UserError("not a prior: it has no observation statistics")
-    if (shape := getattr(params.normalizer.mean, "shape", ())) != (obs_dim,):
-        raise UserError(f"its card says obs_dim={obs_dim}, the statistics have {' x '.join(map(str, shape))}")
-    for name, wanted in sizes.items():
-        part = getattr(params, name, None)
-        if part is not None and (shapes := jax.tree.map(lambda x: x.shape, part)) != wanted:
-            raise UserError(f"{name} has the shapes {shapes}, by its card {wanted}; take another prior")
-    for name, network, part in described:
-        networks.check_params(name, network, part, "its card; take another prior")
-    if odd := [path for path, x in jax.tree_util.tree_leaves_with_path(params) if x.dtype != jnp.float32]:
-        raise UserError(f"{jax.tree_util.keystr(odd[0])} is not float32; take another prior")
-
-
-def _offsets(params: Any, obs_dim: int, act_dim: int) -> int:
-    """How many measurements a prior corrects, if whole actions then follow them in an observation; else none fit."""
-    count = sum(math.prod(x.shape) for x in jax.tree.leaves(getattr(getattr(params, "distortion", None), "offset", ())))
-    return count if count <= obs_dim and (obs_dim - count) % act_dim == 0 else -1
-
-
-def network_of(card: Mapping[str, Any]) -> NetworkConfig:
-    """The networks of a prior of SAC; raises UserError where this version knows no such network."""
-    try:
-        fields: dict[str, Any] = {**card["network"], "hidden": tuple(card["network"]["hidden"])}
-        return NetworkConfig(**fields)
-    except (TypeError, KeyError):
-        raise UserError(f"this version knows no such network: {card['network']}; pretrain again") from None
+_EXPLORE_NOISE = 0.1
+Head = Literal["affine", "gaussian", "deterministic"]
 
 
 def sac_policy(obs_dim: int, act_dim: int, network: NetworkConfig) -> Policy:
@@ -116,3 +76,48 @@ def tdmpc2_policy(config: tdmpc2.TDMPC2Config, hyper: tdmpc2.TDMPC2Hyper) -> Pol
         return tdmpc2_model.value_of(config, tdmpc2.state_from_prior(config, hyper, params), obs)
 
     return Policy(learner.init_carry, act, value_of)
+
+
+# --- actors alone, which methods of fixed data leave ------------------------------------------------------------------
+
+
+class ActorParams(NamedTuple):
+    """actor: parameters of the network. normalizer: of the observations that it reads."""
+
+    actor: PyTree
+    normalizer: Normalizer
+
+
+def make_actor_of(head: Head, obs_dim: int, act_dim: int, network: NetworkConfig) -> Network:
+    """The network of an actor whose last layer says what `head` names."""
+    if head == "deterministic":
+        return networks.make_deterministic_actor(obs_dim, act_dim, network)
+    make = networks.make_actor if head == "gaussian" else functools.partial(networks.make_affine_actor, output_gain=1.0)
+    return make(obs_dim, act_dim, network)  # the gain only says where training begins
+
+
+def actor_policy(obs_dim: int, act_dim: int, network: NetworkConfig, head: Head) -> Policy:
+    """How such an actor acts.
+
+    head: what its last layer says: that of `make_affine_actor`, `make_actor` or `make_deterministic_actor`. The last
+    explores with noise of std 0.1, which is cut off at the bounds, so its actions have no density.
+    """
+    actor = make_actor_of(head, obs_dim, act_dim, network)
+
+    def output(params: ActorParams, obs: Array) -> Array:
+        return actor.apply(params.actor, normalize(params.normalizer, obs))
+
+    def act(params: ActorParams, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
+        if head == "deterministic":
+            return networks.add_noise(output(params, obs), jnp.where(explore, _EXPLORE_NOISE, 0.0), key), carry
+        return networks.tanh_gaussian_action(output(params, obs), key, explore=explore), carry
+
+    def log_prob(params: ActorParams, obs: Array, action: Array) -> Array:
+        return networks.tanh_gaussian_log_prob(output(params, obs), networks.untanh(action))
+
+    return Policy(lambda: (), act, log_prob=None if head == "deterministic" else log_prob)
+
+
+def actor_params(state: PyTree) -> ActorParams:
+    """Copies of the actor and the statistics of a learner's state, which may be donated afterwards."""
+    return ActorParams(*jax.tree.map(jnp.copy, (state.actor.params, state.normalizer)))

@@ -24,8 +24,8 @@ import sgft_jax
 from envs.rollout import play_episode
 from envs.types import Array, Key, PyTree
 from sgft_jax.models import normalizer
+from sgft_jax.models.config import network_of
 from sgft_jax.models.networks import Network, make_critic
-from sgft_jax.policies import network_of
 
 STARTS, ROLLOUTS, SEEDS = 256, (0, 1, 2, 4, 8, 16), 3
 HEAD = ("rollouts", "Q of its action", "return", "Q of a random one", "return", "random preferred")

@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 from envs.types import Policy
 from sgft_jax.algorithms.base import Algorithm, Card, NetworkEntry, Networks
+from sgft_jax.models.config import network_of
 from sgft_jax.types import Task
 
 
@@ -14,21 +15,19 @@ class _ActorCard(Card):
 
 
 def _params() -> type[Any]:
-    from sgft_jax.learners.actor import ActorParams
+    from sgft_jax.policies import ActorParams
 
     return ActorParams
 
 
 def _policy(card: Mapping[str, Any], task: Task) -> Policy:
-    from sgft_jax.learners.actor import actor_policy
-    from sgft_jax.policies import network_of
+    from sgft_jax.policies import actor_policy
 
     return actor_policy(task.obs_dim, task.act_dim, network_of(card), card["head"])
 
 
 def _networks(card: Mapping[str, Any], params: Any) -> Networks:
-    from sgft_jax.learners.actor import make_actor_of
-    from sgft_jax.policies import network_of
+    from sgft_jax.policies import make_actor_of
 
     yield "actor", make_actor_of(card["head"], card["obs_dim"], card["act_dim"], network_of(card)), params.actor
 

@@ -7,6 +7,7 @@ from typing import Any, TypedDict
 from envs.types import Array, Key, Policy, PyTree, UserError
 from sgft_jax import data, learners
 from sgft_jax.algorithms.base import Algorithm, Card, Config, NetworkEntry, Networks, Recipe, Width, scheduled
+from sgft_jax.models.config import network_of
 from sgft_jax.types import Batch, Task
 
 
@@ -20,8 +21,6 @@ class _RecurrentCard(Card):
 
 
 def _policy(card: Mapping[str, Any], task: Task) -> Policy:
-    from sgft_jax.policies import network_of
-
     recurrent = learners.recurrent
     config = recurrent.RecurrentConfig(task.obs_dim, task.act_dim, network_of(card), card["config"]["gru"])
     return Policy(functools.partial(recurrent.init_carry, config), functools.partial(recurrent.policy_action, config))
@@ -30,7 +29,6 @@ def _policy(card: Mapping[str, Any], task: Task) -> Policy:
 def _networks(card: Mapping[str, Any], params: Any) -> Networks:
     from sgft_jax.models import networks
     from sgft_jax.models.gru import make_gru
-    from sgft_jax.policies import network_of
 
     memory = make_gru(card["obs_dim"], card["act_dim"], card["config"]["gru"])
 

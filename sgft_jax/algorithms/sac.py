@@ -9,6 +9,7 @@ from msgspec import Meta, Struct
 from envs.types import Array, Policy, PyTree
 from sgft_jax import data, learners
 from sgft_jax.algorithms.base import Algorithm, Card, Config, NetworkEntry, Networks, Recipe, Width, scheduled
+from sgft_jax.models.config import network_of
 from sgft_jax.types import Task
 
 
@@ -25,7 +26,7 @@ class _SACCard(Card):
 
 def _policy(card: Mapping[str, Any], task: Task) -> Policy:
     from sgft_jax.planning import MPCConfig
-    from sgft_jax.policies import mpc_policy, network_of, sac_policy
+    from sgft_jax.policies import mpc_policy, sac_policy
 
     network = network_of(card)
     if plan := card.get("plan"):
@@ -35,7 +36,6 @@ def _policy(card: Mapping[str, Any], task: Task) -> Policy:
 
 def _networks(card: Mapping[str, Any], params: Any) -> Networks:
     from sgft_jax.models import networks
-    from sgft_jax.policies import network_of
 
     sizes, network = (card["obs_dim"], card["act_dim"]), network_of(card)
     yield "actor", networks.make_actor(*sizes, network), params.actor

@@ -26,9 +26,8 @@ from sgft_jax.export import player
 from sgft_jax.files.disk import write_json
 from sgft_jax.io import checkpoint
 from sgft_jax.io.priors import digest
-from sgft_jax.models.config import NetworkConfig
+from sgft_jax.models.config import NetworkConfig, network_of
 from sgft_jax.models.distortion import Distortion
-from sgft_jax.policies import network_of
 from sgft_jax.types import Prior
 
 __all__ = ["save_exported"]

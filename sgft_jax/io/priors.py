@@ -2,11 +2,12 @@
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from envs import mesh
@@ -18,7 +19,7 @@ from sgft_jax.files.disk import differences, present, write_json
 from sgft_jax.io import checkpoint
 from sgft_jax.io.cards import CARD, read_card, resolve_shipped
 from sgft_jax.models.distortion import Distortion
-from sgft_jax.policies import check_parameters
+from sgft_jax.models.networks import Network, check_params
 from sgft_jax.types import Normalizer, Prior
 
 __all__ = ["load_prior", "save_prior"]
@@ -62,7 +63,7 @@ def load_prior(
     paths, shapes = [leaf.path for leaf in leaves], [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in leaves]
     try:  # before memory is taken for what a file claims
         params = _params(card, paths, shapes)
-        check_parameters(card, params, algorithm_of(card).networks(card, params))
+        _check_parameters(card, params, algorithm_of(card).networks(card, params))
     except UserError as error:
         raise UserError(f"{folder}: {error}") from None
     check_claim(
@@ -86,6 +87,39 @@ def _params(card: Mapping[str, Any], paths: Sequence[str], leaves: Sequence[Any]
                 raise UserError(f"its {name} is not of {', '.join(kind._fields)}; pretrain again")
             tree[name] = kind(**part)
     return container(**{name: tree.get(name) for name in container._fields})
+
+
+def _check_parameters(card: Mapping[str, Any], params: Any, described: Iterable[tuple[str, Network, PyTree]]) -> None:
+    """Raises UserError where parameters, or their shapes, are not of the sizes and networks that a card describes.
+
+    Parts that a prior does not have are None; all have statistics and what acts. described: (name, network, what the
+    prior has for it) of the networks by its card, see `Algorithm.networks`.
+    """
+    obs_dim, act_dim, entries = card["obs_dim"], card["act_dim"], len(card.get("system", []))
+    sizes = {
+        "normalizer": ((obs_dim,), (obs_dim,)),
+        "distortion": ((act_dim, act_dim), (act_dim,), (_offsets(params, obs_dim, act_dim),)),
+        "system": (entries,),
+        "scale": (),
+    }
+    if params.normalizer is None:
+        raise UserError("not a prior: it has no observation statistics")
+    if (shape := getattr(params.normalizer.mean, "shape", ())) != (obs_dim,):
+        raise UserError(f"its card says obs_dim={obs_dim}, the statistics have {' x '.join(map(str, shape))}")
+    for name, wanted in sizes.items():
+        part = getattr(params, name, None)
+        if part is not None and (shapes := jax.tree.map(lambda x: x.shape, part)) != wanted:
+            raise UserError(f"{name} has the shapes {shapes}, by its card {wanted}; take another prior")
+    for name, network, part in described:
+        check_params(name, network, part, "its card; take another prior")
+    if odd := [path for path, x in jax.tree_util.tree_leaves_with_path(params) if x.dtype != jnp.float32]:
+        raise UserError(f"{jax.tree_util.keystr(odd[0])} is not float32; take another prior")
+
+
+def _offsets(params: Any, obs_dim: int, act_dim: int) -> int:
+    """How many measurements a prior corrects, if whole actions then follow them in an observation; else none fit."""
+    count = sum(math.prod(x.shape) for x in jax.tree.leaves(getattr(getattr(params, "distortion", None), "offset", ())))
+    return count if count <= obs_dim and (obs_dim - count) % act_dim == 0 else -1
 
 
 def observed(card: Mapping[str, Any]) -> dict[str, Any]:

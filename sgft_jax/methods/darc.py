@@ -19,12 +19,13 @@ class Config(RowsOptions):
 
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
-    from sgft_jax.learners import actor, darc
+    from sgft_jax.learners import darc
+    from sgft_jax.policies import actor_params
 
     structure = darc.DARCConfig(task.obs_dim, task.act_dim, config.network, ratio_rows=2 * config.ratio_rows)
     learner = darc.make_darc(structure, sac_numbers(config), lr_ratio=config.lr)
     batches = darc.batches(config.rows, config.ratio_rows)
-    return agent_of(learner, config, task, batches, simulates=True, export=lambda state: actor.exported(state.sac))
+    return agent_of(learner, config, task, batches, simulates=True, export=lambda state: actor_params(state.sac))
 
 
 METHOD = Method(

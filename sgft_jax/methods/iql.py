@@ -55,7 +55,8 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.data import sources
     from sgft_jax.learners import iql
     from sgft_jax.learners.sac import SACParams
-    from sgft_jax.policies import network_of, sac_policy
+    from sgft_jax.models.config import network_of
+    from sgft_jax.policies import sac_policy
     from sgft_jax.train.finetuner import FinetuneState, Parts, assemble, mixed_rows, simulator_actor
     from sgft_jax.train.options import card_of
 
@@ -130,7 +131,8 @@ def build_fixed(config: FixedConfig, task: Task) -> HybridAgent:
     import jax.numpy as jnp
 
     from sgft_jax.data import sources
-    from sgft_jax.learners import actor, iql
+    from sgft_jax.learners import iql
+    from sgft_jax.policies import ActorParams, actor_params
 
     def prepare(state: iql.IQLState, real: RealData, updates: int) -> iql.IQLState:
         hyper = state.hyper
@@ -140,8 +142,8 @@ def build_fixed(config: FixedConfig, task: Task) -> HybridAgent:
             hyper = hyper._replace(actor_updates=jnp.float32(updates))
         return state.replace(hyper=hyper)
 
-    def export(state: iql.IQLState) -> actor.ActorParams:
-        return actor.ActorParams(iql.as_tanh_gaussian(state.actor.params), actor.exported(state).normalizer)
+    def export(state: iql.IQLState) -> ActorParams:
+        return ActorParams(iql.as_tanh_gaussian(state.actor.params), actor_params(state).normalizer)
 
     learner = _learner(config, task, config.network, config.lr, config.lr)
     batches = sources.real_rows(config.rows)

@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from envs.types import Array, PyTree
 from sgft_jax import checks
+from sgft_jax.files.disk import jsonable
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.types import HybridAgent, Learner, RealData, Source, Task
 
 if TYPE_CHECKING:
-    from sgft_jax.learners.actor import Head
     from sgft_jax.learners.sac import SACHyper
+    from sgft_jax.policies import Head
 
 _RETURN_SPAN = 1000.0  # of scaled returns, as published for locomotion
 
@@ -113,11 +114,11 @@ def agent_of(
 ) -> HybridAgent:
     """The agent of a learner.
 
-    head: of its actor, see `learners.actor.actor_policy`. keep, prepare, export: see `HybridAgent`; by default single
+    head: of its actor, see `policies.actor_policy`. keep, prepare, export: see `HybridAgent`; by default single
     rows, nothing, and the actor and statistics of the learner's state.
     """
+    from sgft_jax import policies
     from sgft_jax.data import replay
-    from sgft_jax.learners import actor
 
     return HybridAgent(
         learner=learner,
@@ -125,7 +126,7 @@ def agent_of(
         batches=batches,
         simulates=simulates,
         prepare=prepare,
-        export=export or actor.exported,
-        policy=actor.actor_policy(task.obs_dim, task.act_dim, config.network, head),
-        card=actor.card(config.network, head, config.gamma),
+        export=export or policies.actor_params,
+        policy=policies.actor_policy(task.obs_dim, task.act_dim, config.network, head),
+        card={"algorithm": "actor", "network": jsonable(config.network), "head": head, "gamma": config.gamma},
     )

@@ -31,8 +31,9 @@ class Config(DynamicsOptions):
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner."""
     from sgft_jax.learners.sac import SACParams
+    from sgft_jax.models.config import network_of
     from sgft_jax.planning import MPCConfig
-    from sgft_jax.policies import mpc_policy, network_of
+    from sgft_jax.policies import mpc_policy
     from sgft_jax.train.finetuner import FinetuneState, assemble, dynamics_models, unlearned
     from sgft_jax.train.options import card_of
 

@@ -43,9 +43,10 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
 
     from sgft_jax.learners.sac import SACParams
     from sgft_jax.models import dynamics, system
+    from sgft_jax.models.config import network_of
     from sgft_jax.models.networks import make_dynamics
     from sgft_jax.models.robust import spread_of
-    from sgft_jax.policies import network_of, sac_policy
+    from sgft_jax.policies import sac_policy
     from sgft_jax.train.finetuner import FinetuneState, assemble, unlearned
     from sgft_jax.train.options import card_of
 

@@ -1,7 +1,8 @@
 """What describes a network, as data. Command lines read this module, so it imports neither JAX nor Flax."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from envs.types import UserError, unknown
 from sgft_jax import checks
@@ -28,6 +29,15 @@ class NetworkConfig:
         checks.layers(self, "hidden")
         if self.activation not in (known := get_args(Activation)):
             raise UserError(unknown("activation", self.activation, known))
+
+
+def network_of(card: Mapping[str, Any]) -> NetworkConfig:
+    """The networks of a prior of SAC; raises UserError where this version knows no such network."""
+    try:
+        fields: dict[str, Any] = {**card["network"], "hidden": tuple(card["network"]["hidden"])}
+        return NetworkConfig(**fields)
+    except (TypeError, KeyError):
+        raise UserError(f"this version knows no such network: {card['network']}; pretrain again") from None
 
 
 def two_layers() -> NetworkConfig:

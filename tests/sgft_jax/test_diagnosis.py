@@ -11,9 +11,9 @@ from sgft_jax import diagnosis
 from sgft_jax.diagnosis import Beliefs, Rollouts
 from sgft_jax.examination import Examiner
 from sgft_jax.models import distortion, dynamics
+from sgft_jax.models.config import network_of
 from sgft_jax.models.distortion import Distortion, turned_and_scaled
 from sgft_jax.models.networks import make_dynamics
-from sgft_jax.policies import network_of
 
 NOTHING, ZERO = distortion.none(1, 1), jnp.zeros(1)
 

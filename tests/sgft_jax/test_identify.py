@@ -9,9 +9,9 @@ import tuners
 from sgft_jax.identify import command_interface
 from sgft_jax.io.priors import load_prior, save_prior
 from sgft_jax.models import distortion, dynamics
+from sgft_jax.models.config import network_of
 from sgft_jax.models.distortion import Distortion
 from sgft_jax.models.networks import make_dynamics
-from sgft_jax.policies import network_of
 from sgft_jax.types import Batch, Prior, SimulatedData
 
 TURN = Distortion(0.7 * jnp.array([[0.8, -0.6], [0.6, 0.8]]), jnp.array([0.1, 0.0]), jnp.zeros(2))

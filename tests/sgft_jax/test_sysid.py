@@ -21,8 +21,8 @@ from sgft_jax.io.priors import load_prior, observed, save_prior
 from sgft_jax.learners import sac
 from sgft_jax.methods import get_method
 from sgft_jax.models import dynamics, system
+from sgft_jax.models.config import network_of
 from sgft_jax.models.networks import make_dynamics
-from sgft_jax.policies import network_of
 from sgft_jax.presets import PretrainConfig
 from sgft_jax.train import finetuning
 from sgft_jax.train.pretraining import prior_card

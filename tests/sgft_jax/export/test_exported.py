@@ -23,10 +23,10 @@ from sgft_jax.export import exported, player
 from sgft_jax.export.exported import Graph, Node, Slot, save_exported
 from sgft_jax.files.disk import jsonable
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
-from sgft_jax.learners.actor import ActorParams
 from sgft_jax.models import distortion
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import make_actor, make_affine_actor, make_deterministic_actor
+from sgft_jax.policies import ActorParams
 from sgft_jax.types import Normalizer, Prior
 
 EPISODES, STEPS = 50, 20

@@ -15,9 +15,9 @@ from envs.types import UserError
 from sgft_jax.files.disk import ASIDE, jsonable
 from sgft_jax.io import checkpoint, priors
 from sgft_jax.learners import recurrent, sac, tdmpc2, tdmpc2_model
-from sgft_jax.learners.actor import ActorParams, make_actor_of
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.distortion import Distortion
+from sgft_jax.policies import ActorParams, make_actor_of
 from sgft_jax.types import Normalizer, Prior
 
 KEY = jax.random.key(0)

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from sgft_jax.learners.actor import ActorParams, actor_policy
 from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.networks import make_actor, make_affine_actor, tanh_gaussian_sample
 from sgft_jax.models.normalizer import identity, normalize
+from sgft_jax.policies import ActorParams, actor_policy
 
 NETWORK = NetworkConfig((8,))
 
