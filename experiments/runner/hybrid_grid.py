@@ -12,31 +12,14 @@ from typing import Literal
 from envs import extend, gaps
 from envs.gaps import SIM
 from envs.types import UserError, unknown
-from experiments.runner import cli
+from experiments.runner import cli, hybrid_args, options
 from experiments.runner.grid import Cell, Kind, WorkArgs, look_up
-from experiments.runner.hybrid_args import (
-    DEFAULT,
-    HybridArgs,
-    SchedulePreset,
-    arguments,
-    data_name,
-    gaps_of,
-    hybrid,
-    run_folder,
-)
-from experiments.runner.options import (
-    at_least_one,
-    check_data,
-    check_task,
-    not_negative,
-    seed_list,
-    without_repeats,
-)
+from experiments.runner.hybrid_args import HybridArgs, SchedulePreset, data_name
 from sgft_jax.analysis.curves import Curve
 from sgft_jax.analysis.hybrid import Results
 from sgft_jax.analysis.reading import read_curve
-from sgft_jax.analysis.release import hybrid_table, read_hybrid, write_hybrid
-from sgft_jax.files.disk import jsonable
+from sgft_jax.analysis.release import read_hybrid, write_hybrid
+from sgft_jax.files.disk import jsonable, table_file
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import FIXED_NAMES, get_method
 from sgft_jax.presets import say_preset
@@ -67,7 +50,7 @@ class _Systems:
     schedule: Schedule = field(default_factory=Schedule)
     score: Literal["late", "last"] = "late"
     """What tables show of a run: the mean of its last ten evaluations, or its last one."""
-    reference: str = DEFAULT
+    reference: str = hybrid_args.DEFAULT
     """Compare the others with this METHOD or METHOD:PRESET."""
     export: Path | None = None
     """Instead of running, write what has finished into hybrid.csv in this folder, which --released reads back."""
@@ -98,14 +81,14 @@ def _title(args: HybridArgs) -> str:
 
 def _system(args: HybridArgs) -> str:
     """The one simulator, or what stands for none."""
-    return gaps_of(args, get_method(args.method, "fixed"))[0]
+    return hybrid_args.gaps_of(args, get_method(args.method, "fixed"))[0]
 
 
 HYBRID = Kind(
     name="hybrid",
     systems="gap",
-    run=lambda args: hybrid(args),
-    folder=lambda args: run_folder(args, _system(args)),
+    run=lambda args: hybrid_args.hybrid(args),
+    folder=lambda args: hybrid_args.run_folder(args, _system(args)),
     config=lambda args: jsonable(args) | {"gap": _system(args)},
     title=_title,
     volatile=HybridArgs.volatile,
@@ -122,23 +105,16 @@ def defaults(argv: Sequence[str]) -> HybridGridArgs:
 def checked(args: HybridGridArgs) -> HybridGridArgs:
     """The arguments with every gap by name; raises UserError for what is wrong in them alone."""
     args = replace(args, gaps=gaps.each(args.gaps or tuple(gaps.presets(extend.name_of(args.task), variants=False))))
-    check(args)
-    return args
-
-
-def check(args: HybridGridArgs) -> None:
-    """Raises UserError for what is wrong in the arguments alone."""
-    at_least_one(args, "eval_every", "eval_episodes")
-    not_negative(args, "previous_actions", "minutes", "beside")
-    seed_list(args.seed, args.seeds)
-    check_task(args.task)
-    if not args.methods:
-        raise UserError("--methods: name at least one")
+    options.at_least_one(args, "eval_every", "eval_episodes")
+    options.not_negative(args, "previous_actions", "minutes", "beside")
+    options.seed_list(args.seed, args.seeds)
+    options.check_task(args.task)
+    options.each_once(args, "methods")
     if not args.gaps:
         raise UserError(f"--gaps: {extend.name_of(args.task)} comes with none; name some, or {SIM} for no gap")
-    for name, given in (("methods", args.methods), ("gaps", args.gaps), ("data", tuple(map(data_name, args.data)))):
-        without_repeats(f"--{name}", given)
-    check_task(args.task, args.gaps if args.real == SIM else (*args.gaps, args.real))
+    options.without_repeats("--gaps", args.gaps)
+    options.without_repeats("--data", tuple(map(data_name, args.data)))
+    options.check_task(args.task, args.gaps if args.real == SIM else (*args.gaps, args.real))
     if odd := [spec for spec in args.methods if spec.partition(":")[0] not in FIXED_NAMES]:
         raise UserError(unknown("--methods", odd[0], FIXED_NAMES))
     if args.reference not in args.methods:
@@ -147,7 +123,7 @@ def check(args: HybridGridArgs) -> None:
     if learning and not args.data:
         raise UserError(f"--data: {learning[0]} learns from real data; name files or folders (docs/data.md)")
     for path in args.data if args.released is None else ():
-        check_data("--data", path)
+        options.check_data("--data", path)
     check_folder(args.out)
     if args.export is not None:
         check_folder(args.export, "--export")
@@ -155,6 +131,7 @@ def check(args: HybridGridArgs) -> None:
         raise UserError("--export and --released exclude each other: one writes hybrid.csv, the other shows it")
     if args.beside is not None and args.released is None:
         raise UserError("--beside: reads released tables; name their folder with --released")
+    return args
 
 
 def cells_of(args: HybridGridArgs) -> list[Cell]:
@@ -169,9 +146,9 @@ def _runs(args: HybridGridArgs, method: str, data: Path | None) -> list[HybridAr
     kind = get_method(name, "fixed").kind
     shared = ("task", "real", "previous_actions", "seeds", "seed", "schedule_preset", "schedule", "eval_every")
     shared += ("eval_episodes", "impl", "out")
-    options = {name: getattr(args, name) for name in shared}
+    common = {name: getattr(args, name) for name in shared}
     data = None if kind == "simulator" else data
-    run = arguments(name, preset=preset, variant=preset, data=data, video=False, **options)
+    run = hybrid_args.arguments(name, preset=preset, variant=preset, data=data, video=False, **common)
     return [replace(run, gap=(gap,)) for gap in ((SIM,) if kind == "offline" else args.gaps)]
 
 
@@ -196,7 +173,7 @@ def export(to: Path, cells: Sequence[Cell]) -> None:
 
 def released(args: HybridGridArgs, folder: Path) -> Results:
     """What the table in a folder holds of these runs; raises UserError if that is nothing, or if it lacks a seed."""
-    wanted, columns = seed_list(args.seed, args.seeds), results(args, ())
+    wanted, columns = options.seed_list(args.seed, args.seeds), results(args, ())
     task, schedule, updates = extend.name_of(args.task), name_of(args.schedule), args.schedule.updates_in_all
     facts = {"real": gaps.title(args.real), "schedule": schedule, "updates": updates}
     curves = [
@@ -208,7 +185,7 @@ def released(args: HybridGridArgs, folder: Path) -> Results:
         and curve.data in (*columns.data, "")
         and curve.gap in (*columns.gaps, "")
     ]
-    path = hybrid_table(folder)
+    path = table_file(folder, "hybrid")
     if not curves:
         raise UserError(f"{path}: has none of these runs, {updates:,} updates of {task} with schedule {schedule}")
     for curve in curves:

@@ -10,20 +10,11 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 from experiments import real_demo
 from experiments.real_demo import HOME, PYTHON, TASK
-from experiments.runner import cli, finetune_args
-from experiments.runner.finetune_args import FinetuneArgs
-from experiments.runner.options import (
-    at_least_one,
-    check_prior,
-    each_once,
-    not_negative,
-    prior_folders,
-    seed_list,
-)
+from experiments.runner import cli, finetune_args, options
+from experiments.runner.finetune_args import FinetuneArgs, run_folder
 from experiments.runner.real_systems import REMOTE
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.io.runs import check_folder
@@ -60,22 +51,16 @@ class BulletArgs:
     """Python 3.11 that makes this environment, by default $PYTHON311 or python3.11."""
 
 
-class _Run(NamedTuple):
-    method: str
-    seed: int
-    folder: Path
-
-
 def main(args: BulletArgs) -> None:
     """Plays what is missing, and says how far it came."""
     check(args)
     python = real_demo.bullet(args.home, args.python)
     started, missing = time.monotonic(), unfinished(args)
 
-    def play(run: _Run) -> None:
+    def play(run: FinetuneArgs) -> None:
         if args.minutes is None or time.monotonic() - started < 60 * args.minutes:
             log = args.out / f"robot-{run.method}-{run.seed}.log"
-            real_demo.fine_tune(python, args.out, options(args, run), log=log)
+            real_demo.fine_tune(python, args.out, words_of(run), log=log)
 
     args.out.mkdir(parents=True, exist_ok=True)
     with ThreadPoolExecutor(args.jobs) as pool:
@@ -87,44 +72,40 @@ def main(args: BulletArgs) -> None:
 
 def check(args: BulletArgs) -> None:
     """Raises UserError for all that is wrong with the options before anything is made."""
-    at_least_one(args, "seeds", "rollouts", "episodes", "jobs")
-    not_negative(args, "minutes")
-    seed_list(args.seed, args.seeds)
-    each_once(args, "methods")
+    options.at_least_one(args, "seeds", "rollouts", "episodes", "jobs")
+    options.not_negative(args, "minutes")
+    options.seed_list(args.seed, args.seeds)
+    options.each_once(args, "methods")
     check_folder(args.out)
-    folders = prior_folders(args.prior, out=args.out, task=TASK, preset="")
+    folders = options.prior_folders(args.prior, out=args.out, task=TASK, preset="")
     for method in map(get_method, args.methods):
         for folder in folders:
-            check_prior(folder, method, TASK)
+            options.check_prior(folder, method, TASK)
     for run in unfinished(args):
-        finetune_args.check(replace(_arguments(args, run.method, run.seed), resume=run.folder.exists()))
+        finetune_args.check(run)
     real_demo.check_driver()
 
 
-def runs(args: BulletArgs) -> Iterator[_Run]:
+def runs(args: BulletArgs) -> Iterator[FinetuneArgs]:
     """Every run: all methods of a seed, then the next seed, so that whatever there is can be compared."""
+    common = {name: getattr(args, name) for name in ("prior", "rollouts", "eval_at", "out")}
+    played = {"task": TASK, "real": (REMOTE,), "seeds": 1, "eval_episodes": args.episodes}
     for seed in range(args.seed, args.seed + args.seeds):
         for method in args.methods:
-            yield _Run(method, seed, finetune_args.run_folder(_arguments(args, method, seed), REMOTE))
+            run = finetune_args.arguments(method, seed=seed, **played, **common)
+            yield replace(run, resume=run_folder(run, REMOTE).exists())
 
 
-def unfinished(args: BulletArgs) -> list[_Run]:
+def unfinished(args: BulletArgs) -> list[FinetuneArgs]:
     """Those that are still to be played, or to go on."""
-    return [run for run in runs(args) if not (run.folder / SUMMARY).exists()]
+    return [run for run in runs(args) if not (run_folder(run, REMOTE) / SUMMARY).exists()]
 
 
-def _arguments(args: BulletArgs, method: str, seed: int) -> FinetuneArgs:
-    """What a run is, as `experiments.finetune` sees it."""
-    options = {name: getattr(args, name) for name in ("prior", "rollouts", "eval_at", "out")}
-    played = {"task": TASK, "real": (REMOTE,), "seeds": 1, "seed": seed, "eval_episodes": args.episodes}
-    return finetune_args.arguments(method, **played, **options)
-
-
-def options(args: BulletArgs, run: _Run) -> list[object]:
+def words_of(run: FinetuneArgs) -> list[object]:
     """Of `experiments.finetune`."""
-    words = ["--method", run.method, "--seed", run.seed, "--prior", args.prior, "--rollouts", args.rollouts]
-    words += ["--eval-episodes", args.episodes, "--eval-at", *args.eval_at]
-    return [*words, "--resume"] if run.folder.exists() else words
+    words = ["--method", run.method, "--seed", run.seed, "--prior", run.prior, "--rollouts", run.rollouts]
+    words += ["--eval-episodes", run.eval_episodes, "--eval-at", *run.eval_at]
+    return [*words, "--resume"] if run.resume else words
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ import time
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,11 +68,6 @@ class Trial(NamedTuple):
     settings: dict[str, Any]
     cells: list[Cell]
 
-    @property
-    def folders(self) -> list[Path]:
-        """Of the runs."""
-        return [cell.folder for cell in self.cells]
-
 
 class Score(NamedTuple):
     """Of a trial, means over seeds and real systems, and the areas of every seed by real system.
@@ -86,6 +80,14 @@ class Score(NamedTuple):
     areas: dict[str, list[float]]
 
 
+class Outcome(NamedTuple):
+    """A trial, the rollouts that it was allowed, and its score up to there; None if it is not finished."""
+
+    trial: Trial
+    rollouts: int
+    score: Score | None
+
+
 def tune(args: TuneArgs) -> None:
     """Works through the trials, then writes and prints the results; raises UserError in the end if some did not run."""
     args = replace(args, reals=gaps.each(args.reals))
@@ -95,7 +97,7 @@ def tune(args: TuneArgs) -> None:
     print(f"budget of each method on each task: {_budget_words(args)}")
     for i in range(len(rungs(args))):
         begun = [stages(args, *pair)[i:] for pair in pairs]  # empty where the rung before is not finished
-        cells = [cell for stage in begun for trial in (stage[0] if stage else []) for cell in trial.cells]
+        cells = [cell for stage in begun for outcome in (stage[0] if stage else []) for cell in outcome.trial.cells]
         check_begun(cells)
         failed += complete(cells, args, started=started)
     for task, method in pairs:
@@ -162,19 +164,18 @@ def trials(args: TuneArgs, task: str, method: str) -> list[Trial]:
     return [Trial(k, settings, [cell(real, k, settings) for real in args.reals]) for k, settings in enumerate(drawn)]
 
 
-def stages(args: TuneArgs, task: str, method: str) -> list[list[Trial]]:
+def stages(args: TuneArgs, task: str, method: str) -> list[list[Outcome]]:
     """The trials of each rung, as far as it is known: who goes on is decided when a rung is finished."""
-    known: list[list[Trial]] = []
-    numbers, before = list(range(args.trials)), 0
+    known: list[list[Outcome]] = []
+    numbers = list(range(args.trials))
     for rung in rungs(args):
         if known:
-            scores = [value for trial in known[-1] if (value := score(trial, before)) is not None]
+            scores = [outcome.score for outcome in known[-1] if outcome.score is not None]
             if len(scores) < len(known[-1]):
                 break
             numbers = [numbers[i] for i in keep(scores, rung.trials)]
         drawn = trials(replace(args, rollouts=rung.rollouts), task, method)
-        known.append([drawn[number] for number in numbers])
-        before = rung.rollouts
+        known.append([Outcome(drawn[i], rung.rollouts, score(drawn[i], rung.rollouts)) for i in numbers])
     return known
 
 
@@ -208,27 +209,10 @@ def _merit(scores: Sequence[Score], i: int) -> tuple[float, float, int]:
     return scores[i].area, scores[i].final, -i
 
 
-class Outcome(NamedTuple):
-    """A trial, the rollouts that it was allowed, and its score up to there; None if it is not finished."""
-
-    trial: Trial
-    rollouts: int
-    score: Score | None
-
-
-def outcomes(args: TuneArgs, task: str, method: str) -> list[Outcome]:
-    """Every trial in its last rung that is known, in order."""
-    last = {
-        trial.number: Outcome(trial, rung.rollouts, score(trial, rung.rollouts))
-        for rung, stage in zip(rungs(args), stages(args, task, method), strict=False)
-        for trial in stage
-    }
-    return [last[number] for number in sorted(last)]
-
-
 def _conclude(args: TuneArgs, task: str, method: str) -> None:
     """Prints the trials of one method and, if all are finished, writes down which is best."""
-    tried = outcomes(args, task, method)
+    last = {outcome.trial.number: outcome for stage in stages(args, task, method) for outcome in stage}
+    tried = [last[number] for number in sorted(last)]
     finished = sum(outcome.score is not None for outcome in tried)
     finalists = {trial.number: scored for trial, rollouts, scored in tried if rollouts == args.rollouts and scored}
     complete = finished == len(tried) and len(finalists) == rungs(args)[-1].trials

@@ -53,7 +53,9 @@ def _over_rollouts(
     names = [name for name in SCORES if name in records[0]] or [SCORES[0]]
     check_records(folder / EVAL, records, _EVALUATION | dict.fromkeys(names, list[float]))
     summary = read_own(folder / SUMMARY)
-    if (score := summary.get("score") or _judged_by(records, names)) not in names:
+    # Without a summary to name it, a run is judged by the score that `score` repeats.
+    repeated = (name for name in names if all(record.get("score") == record[name] for record in records))
+    if (score := summary.get("score") or next(repeated, names[0])) not in names:
         raise UserError(f"{folder / SUMMARY}: score is {score!r}, {EVAL} has {', '.join(names)}; put the files back")
     scores = {name: _column(records, name).T for name in names}
     variant, rollouts = config.get("variant") or "", _column(records, "rollouts")
@@ -71,7 +73,12 @@ def _over_rollouts(
         minutes=_column(records, "robot_minutes"),
         scores=scores,
         score=score,
-        facts=_facts(summary, config, start),
+        facts={
+            **origin(start),
+            "gap_definition": json.dumps(summary.get("gap", {})),
+            "impl": summary.get("impl", ""),
+            **flat({name: value for name, value in config.items() if name not in _LEFT_OUT}),
+        },
         training=_training(folder / METRICS, rollouts),
     )
 
@@ -108,12 +115,6 @@ def _over_updates(
 def _column(records: Sequence[Mapping[str, Any]], name: str) -> np.ndarray:
     """[records, ...] of one name."""
     return np.array([record[name] for record in records])
-
-
-def _judged_by(records: Sequence[Mapping[str, Any]], names: Sequence[str]) -> str:
-    """By which score a run is judged that has no summary yet to name it: the one that `score` repeats."""
-    repeated = (name for name in names if all(record.get("score") == record[name] for record in records))
-    return next(repeated, names[0])
 
 
 def _training(path: Path, rollouts: np.ndarray) -> np.ndarray | None:
@@ -190,15 +191,6 @@ def last_start(folder: Path) -> dict[str, Any]:
     """What the provenance of a run says of its last start; nothing where there is none."""
     starts = read_starts(folder)
     return starts[-1] if starts else {}
-
-
-def _facts(summary: Mapping[str, Any], config: Mapping[str, Any], start: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        **origin(start),
-        "gap_definition": json.dumps(summary.get("gap", {})),
-        "impl": summary.get("impl", ""),
-        **flat({name: value for name, value in config.items() if name not in _LEFT_OUT}),
-    }
 
 
 def origin(start: Mapping[str, Any]) -> dict[str, Any]:

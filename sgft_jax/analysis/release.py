@@ -23,7 +23,7 @@ from sgft_jax.analysis import reading
 from sgft_jax.analysis.curves import IDENTITY, SCORES, Curve, Found
 from sgft_jax.files.disk import finite, read_csv, table_file, whole, write_csv
 from sgft_jax.io.log import EVAL, SUMMARY, read_jsonl
-from sgft_jax.io.runs import read_config, read_starts
+from sgft_jax.io.runs import read_config
 
 _AXES = ("prior", "seed", "rollouts", "transitions", "minutes")
 COLUMNS = (*IDENTITY, *_AXES, *SCORES, "training")
@@ -32,7 +32,6 @@ _SEED = "seed-"
 _OF_PRIORS, _OF_TUNING = ("task", "priors"), ("task", "method")
 _Pretrained = TypedDict("_Pretrained", {"success/interval": tuple[float, float], "digest": NotRequired[str]})
 _DIGITS = 4  # significant ones of a number with a fraction
-
 
 type Row = Mapping[str, Any]
 
@@ -44,15 +43,8 @@ class _Trial(TypedDict):
     final: float
 
 
-class _Tuning(TypedDict):
-    """What `experiments.studies.tune` has chosen for one task and method, see docs/formats.md."""
-
-    task: str
-    method: str
-    trial: Count
-    trials: list[_Trial]
-    budget: dict[str, Any]
-    space: dict[str, Any]
+# What `experiments.studies.tune` has chosen for one task and method, see docs/formats.md.
+_TUNING = {"task": str, "method": str, "trial": Count, "trials": list[_Trial], "budget": dict, "space": dict}
 
 
 def export(out: Path, to: Path) -> list[Path]:
@@ -86,7 +78,7 @@ def _run(curve: Curve) -> dict[str, Any]:
 
 def _tuning(path: Path) -> Iterable[dict[str, Any]]:
     """What tuning of one method tried: options of each trial, its scores, and whether it was chosen."""
-    result = read_object(path, _Tuning, "put back what experiments.studies.tune has written")
+    result = read_object(path, _TUNING, "put back what experiments.studies.tune has written")
     for number, trial in enumerate(result["trials"]):
         identity = {"task": result["task"], "method": result["method"], "trial": number}
         scores = {name: trial[name] for name in ("rollouts", "area", "final")}
@@ -96,30 +88,30 @@ def _tuning(path: Path) -> Iterable[dict[str, Any]]:
 
 
 def _pretraining(folder: Path) -> Iterable[dict[str, Any]]:
+    _, priors = _pretrained(folder)
     for record in read_jsonl(folder / EVAL, {"step": Count, "success": list[float], "return": list[float]}):
         for i, success in enumerate(record["success"]):
             scores = {"success": success, "return": record["return"][i]}
-            yield {**_set_of(folder), "prior": i, "env_steps": record["step"], **scores}
+            yield {**priors, "prior": i, "env_steps": record["step"], **scores}
 
 
 def _priors(folder: Path) -> Iterable[dict[str, Any]]:
-    summary, stored, starts = _summary_of(folder), read_config(folder), read_starts(folder) or [{}]
+    (summary, priors), stored = _pretrained(folder), read_config(folder)
+    begun = reading.origin(reading.last_start(folder))
     options = reading.flat({name: value for name, value in stored.items() if name in ("preset", "config")})
     times = {name: value for name, value in summary.items() if name.startswith("time/")}
     for i, trained in enumerate(summary["seeds"]):
         low, high = trained["success/interval"]
         scores = {name: value for name, value in reading.flat(trained).items() if name != "success/interval"}
         bounds = {"success/low": low, "success/high": high}
-        yield {**_set_of(folder), "prior": i, **scores, **bounds, **reading.origin(starts[-1]), **times, **options}
+        yield {**priors, "prior": i, **scores, **bounds, **begun, **times, **options}
 
 
-def _summary_of(folder: Path) -> dict[str, Any]:
-    return read_object(folder / SUMMARY, {"seeds": list[_Pretrained]}, "put back what the run has written")
-
-
-def _set_of(folder: Path) -> dict[str, str]:
-    digests = [prior.get("digest", "") for prior in _summary_of(folder)["seeds"]]
-    return {"task": folder.parent.parent.name, "priors": reading.set_name(folder, digests)}
+def _pretrained(folder: Path) -> tuple[dict[str, Any], dict[str, str]]:
+    """(The summary of a run, what its priors are of and are called)."""
+    summary = read_object(folder / SUMMARY, {"seeds": list[_Pretrained]}, "put back what the run has written")
+    name = reading.set_name(folder, [prior.get("digest", "") for prior in summary["seeds"]])
+    return summary, {"task": folder.parent.parent.name, "priors": name}
 
 
 def merge(path: Path, new: Sequence[Mapping[str, Any]], key: Sequence[str]) -> Path | None:
@@ -189,12 +181,18 @@ def _curve(identity: tuple[str, ...], members: Mapping[int, list[Row]]) -> Curve
     scores = {name: column(name) for name in SCORES if first.get(name) not in (None, "")}
     if not scores:
         raise ValueError(f"{'/'.join(identity)} has no {' or '.join(SCORES)}")
-    _check_ranges(scores.get("success"), minutes := column("minutes"))
-    training = np.array([[_trained(row) for row in lines] for lines in members.values()])
+    success, minutes = scores.get("success", np.zeros(1)), column("minutes")
+    if ((success < 0) | (success > 1)).any():
+        raise ValueError(f"success is {success.min():g} to {success.max():g}, not a share")
+    if minutes.min() < 0:
+        raise ValueError(f"minutes is {minutes.min():g}, less than 0")
+    # A cell has no score of training rollouts at the first evaluation, or everywhere.
+    trained = [[row.get("training", "") for row in lines] for lines in members.values()]
+    training = np.array([[np.nan if x == "" else finite("training", x) for x in cells] for cells in trained])
     return Curve(
         *identity,
         seeds=np.array(list(members)),
-        prior=np.array([_prior(lines[0]["prior"]) for lines in members.values()]),
+        prior=np.array([whole("prior", float(lines[0]["prior"]) + 1) - 1 for lines in members.values()]),  # -1: unknown
         x=column("rollouts", whole)[0],
         transitions=column("transitions", whole)[0],
         minutes=minutes[0],
@@ -202,23 +200,6 @@ def _curve(identity: tuple[str, ...], members: Mapping[int, list[Row]]) -> Curve
         score=next(iter(scores)),
         training=training if np.isfinite(training).any() else None,
     )
-
-
-def _trained(row: Row) -> float:
-    """The score of training rollouts; nan where a cell has none: at the first evaluation, or everywhere."""
-    return np.nan if row.get("training") in (None, "") else finite("training", row["training"])
-
-
-def _check_ranges(success: np.ndarray | None, minutes: np.ndarray) -> None:
-    if success is not None and ((success < 0) | (success > 1)).any():
-        raise ValueError(f"success is {success.min():g} to {success.max():g}, not a share")
-    if minutes.min() < 0:
-        raise ValueError(f"minutes is {minutes.min():g}, less than 0")
-
-
-def _prior(cell: Any) -> int:
-    """Index of a prior; -1: unknown."""
-    return whole("prior", float(cell) + 1) - 1
 
 
 def read(out: Path, data: Path | None) -> Found:
@@ -243,31 +224,24 @@ def read_data(folder: Path) -> Found:
 # ---------------------------------------------------------------- curves over updates
 
 
-def hybrid_table(folder: Path) -> Path:
-    """Where the table of runs over updates is or goes, see `disk.table_file`."""
-    return table_file(folder, "hybrid")
-
-
 def write_hybrid(to: Path, curves: Iterable[Curve]) -> Path | None:
     """Writes runs into hybrid.csv in the folder `to`, in place of rows of the same runs; None if there is no run.
 
     curves: over updates, as `reading.read_curve` reads them.
     """
     to.mkdir(parents=True, exist_ok=True)
-    return merge(hybrid_table(to), [row for curve in curves for row in _updates_rows(curve)], RUN)
+    return merge(table_file(to, "hybrid"), [row for curve in curves for row in _updates_rows(curve)], RUN)
 
 
 def read_hybrid(folder: Path) -> list[Curve]:
     """The runs in hybrid.csv. Raises UserError if there is no such table, or if a cell of it cannot be read."""
-    path = hybrid_table(folder)
+    path = table_file(folder, "hybrid")
     if not path.exists():
         command = f"python -m experiments.compare hybrid --export {folder}"
         raise UserError(f"{folder / 'hybrid'}.csv: no such table; write one with: {command}")
     table = read_csv(path, needed=(*RUN, "commit", "score", "step"))
     try:
-        return [
-            _updates_curve(lines) for lines in _grouped(table, lambda row: tuple(row[name] for name in RUN)).values()
-        ]
+        return list(map(_updates_curve, _grouped(table, lambda row: tuple(row[name] for name in RUN)).values()))
     except ValueError as error:
         raise UserError(f"{path}: {error}; put the table back as it was") from error
 

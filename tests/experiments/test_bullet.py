@@ -50,7 +50,7 @@ def test_evaluations_and_an_end_of_the_time(played, tmp_path):
     args = BulletArgs(("sac",), PRIOR, seeds=1, out=tmp_path, eval_at=(0, 3), episodes=7, minutes=0.0)
     bullet.main(args)
     assert not played
-    words = " ".join(map(str, bullet.options(args, next(bullet.runs(args)))))
+    words = " ".join(map(str, bullet.words_of(next(bullet.runs(args)))))
     assert "--eval-episodes 7 --eval-at 0 3" in words and "--resume" not in words
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from envs.types import UserError
 from experiments import compare
-from experiments.runner import cli, hybrid_grid
+from experiments.runner import cli, hybrid_args, hybrid_grid
 from experiments.runner.hybrid_args import run_folder
 from sgft_jax.analysis import figures
 from sgft_jax.files.disk import jsonable
@@ -28,7 +28,7 @@ def ran(monkeypatch):
         for i, gap in enumerate(args.gap):
             leave(replace(args, gap=(gap,)), [100.0 * i + 10 * seed for seed in range(args.seeds)])
 
-    monkeypatch.setattr(hybrid_grid, "hybrid", hybrid)
+    monkeypatch.setattr(hybrid_args, "hybrid", hybrid)
     monkeypatch.setattr(cli, "set_up", lambda: None)
     return seen
 
