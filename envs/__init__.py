@@ -18,7 +18,7 @@ from envs.types import UserError, unknown
 if TYPE_CHECKING:
     from envs import effects, rollout
     from envs.base import Varying
-    from envs.domains.uniform import sample_worlds, uniform
+    from envs.domains import sample_worlds, uniform
     from envs.rollout import Episode, Fleet, launch, play_episode, step_fleet
 
 TASKS = {
@@ -34,10 +34,12 @@ TASKS = {
     "wheel-legged": "envs.locomotion.wheel_legged",
     "wheel-legged-forward": "envs.locomotion.wheel_forward",
 }
+# Return at 0 and at 100 on the scale of D4RL, where 0 is a random policy and 100 an expert, by task.
+D4RL = {"halfcheetah": (-280.178953, 12135.0), "walker2d": (1.629008, 4592.3)}
 _OURS = frozenset(TASKS.values())
 _LAZY = {
     **dict.fromkeys(("Episode", "Fleet", "launch", "play_episode", "step_fleet"), "envs.rollout"),
-    **dict.fromkeys(("sample_worlds", "uniform"), "envs.domains.uniform"),
+    **dict.fromkeys(("sample_worlds", "uniform"), "envs.domains"),
 }
 
 __all__ = ["TASKS", "Domain", "Entry", "Env", "EnvState", "Parameter", "make", "name_of", "packed", "scene", "unpack"]
@@ -62,13 +64,12 @@ def make(
     (docs/extending.md); what it says and returns is checked, see `envs.checks`. scene: that of a real system which is
     more than the simulated one with other numbers; "" for the latter. What is observed, commanded and rewarded, and the
     parameters, are the same in all scenes of a task.
-    previous_actions: how many of the last actions the observation ends with, see `envs.history`. system: what it tells
-    of the system after that, see `envs.system`.
+    previous_actions: how many of the last actions the observation ends with. system: what it tells of the system after
+    that; see `envs.observations` of both.
     Raises UserError with the closest match for an unknown task or scene, and naming file and line for one that fails.
     """
-    from envs.history import with_previous_actions
     from envs.mesh import check_jax
-    from envs.system import with_system
+    from envs.observations import with_previous_actions, with_system
 
     check_jax()
     return with_system(with_previous_actions(_make(task, impl, scene), previous_actions), system)
@@ -127,3 +128,11 @@ def _real(task: str, scene: str) -> Any:
     if scene not in scenes:
         raise UserError(f"{task}: {unknown('scene', scene, scenes)}" if scenes else f"{task} has no scene '{scene}'")
     return scenes[scene]
+
+
+def normalised(task: str, total: float) -> float | None:
+    """An undiscounted return [] on the scale of D4RL; None for a task that has none. Source: D4RL (Fu et al. 2020)."""
+    if task not in D4RL:
+        return None
+    low, high = D4RL[task]
+    return 100 * (total - low) / (high - low)

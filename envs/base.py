@@ -193,14 +193,14 @@ class Env(NamedTuple):
     success_anytime: whether success counts at any step or only at the last.
     score: what a run is judged by, "success" or "return".
     training: the simulator's own effects, by name: values or ranges, as in a gap.
-    actuators: effects of a simulator whose actuators differ too, see `envs.domains.actuators`; those not named have
+    actuators: effects of a simulator whose actuators differ too, see `envs.domains`; those not named have
         the ranges given there.
     cartesian: the first two action entries are x and y of one frame.
     check(theta by name) -> what is impossible about it in one sentence, or None: relations between parameters.
     trace(physics) -> [k] what a renderer needs of a state; [0] where nothing can be drawn. Commands that record put
         another function in its place, which may return a pytree.
-    previous_actions: how many of the last actions the observation ends with, see `envs.history`.
-    system: what the observation then tells of the system that the episode takes place in, see `envs.system`.
+    previous_actions: how many of the last actions the observation ends with, see `envs.observations`.
+    system: what the observation then tells of the system that the episode takes place in, see `envs.observations`.
     simulator() -> (obs, action) -> [measured_dim] what a step changes in the system that `obs` tells. None where it
         tells none or the task has no `restore`.
     measures(next_obs [..., T, measured_dim], valid [..., T]) -> {name: [...]}: what else whole episodes are judged by,

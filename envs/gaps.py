@@ -136,7 +136,7 @@ def from_dict(env: Env, name: str, table: Mapping[str, Any]) -> Gap:
 
 def worlds(env: Env, gap: Gap, key: Key, n: int = 256) -> World:
     """The real system of a gap as a pool of worlds [n], or [1] where its domain parameters do not vary."""
-    from envs.domains.uniform import parameter_ranges, sample_worlds
+    from envs.domains import parameter_ranges, sample_worlds
 
     low, high = parameter_ranges(env, gap.params).T
     return sample_worlds(env, key, n if (low < high).any() else 1, params=gap.params, effects=gap.effects)
@@ -220,7 +220,7 @@ def changes(overrides: Sequence[str]) -> dict[str, Value]:
 
 def _check(env: Env, gap: Gap) -> None:
     """Raises UserError for unknown names and impossible values."""
-    from envs.domains.uniform import uniform
+    from envs.domains import uniform
 
     try:
         uniform(env, gap.params, gap.effects)

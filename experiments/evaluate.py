@@ -134,7 +134,7 @@ def _simulated(env: Any, reals: Sequence[Gap | None], key: Any, episodes: int, *
     """The `Simulated` systems of gaps, None for the simulator, in held-out worlds with so many members on each."""
     import jax.numpy as jnp
 
-    from envs.pools import heldout_worlds, padded, real_env
+    from envs.rollout import heldout_worlds, padded, real_env
     from sgft_jax.stacking import stack
     from sgft_jax.systems.simulated import Simulated
 

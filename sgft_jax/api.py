@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike
 import envs
 from envs.base import Env
 from envs.gaps import Gap, from_dict
-from envs.history import remember, with_memory
-from envs.pools import heldout_worlds, real_env, real_worlds, training_worlds
-from envs.rollout import Episode
+from envs.observations import remember, with_memory
+from envs.rollout import Episode, heldout_worlds, real_env, real_worlds, training_worlds
 from envs.types import Array, Policy, PyTree, UserError
 from sgft_jax.algorithms import make_policy
 from sgft_jax.export import player

@@ -42,7 +42,7 @@ class PretrainConfig(checks.Checked):
     what will happen next."""
     actuators: bool = False
     """Also vary between episodes how commands reach the robot (scale, bias, rotation, latency) and how noisy its
-    sensors are, see `envs.domains.actuators`. What such a policy sees should end with its previous actions."""
+    sensors are, see `envs.domains`. What such a policy sees should end with its previous actions."""
     sees_system: bool = False
     """End the observation of all networks with what varies between episodes of the training domain, parameters and
     effects. Such a prior is for the method `sysid`, which tells it what it has identified."""

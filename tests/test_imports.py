@@ -52,19 +52,8 @@ ROOT = Path(__file__).parents[1]
 # The rooms of a package, a file or a folder each, lowest first: a room imports only rooms before it. "" is the package.
 ORDER = {
     "envs": (
-        *("types", "scales", "files", "extend", "mesh", "base", "effects", "history", "domains", "system", "gaps"),
-        *(
-            "gap_distribution",
-            "rollout",
-            "checks",
-            "mujoco",
-            "control",
-            "franka",
-            "locomotion",
-            "",
-            "pools",
-            "adapters",
-        ),
+        *("types", "files", "extend", "mesh", "base", "effects", "domains", "observations", "gaps"),
+        *("gap_distribution", "checks", "mujoco", "control", "franka", "locomotion", "", "rollout", "adapters"),
     ),
     "sgft_jax": (
         *("types", "keys", "checks", "stacking", "files", "math", "models", "data", "planning", "learners"),

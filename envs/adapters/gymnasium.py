@@ -20,8 +20,7 @@ import envs
 from envs import gaps
 from envs.base import Env, EnvState, World
 from envs.gaps import SIM, Gap
-from envs.pools import real_env, real_worlds
-from envs.rollout import begin_episode, episode_keys, select
+from envs.rollout import begin_episode, episode_keys, real_env, real_worlds, select
 from envs.types import Array, Key
 
 NAMESPACE, VERSION = "sgft_jax", 0

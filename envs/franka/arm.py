@@ -1,15 +1,26 @@
-"""A Franka Research 3 arm of primitive geoms, from public kinematic, limit and inertial facts.
+"""A Franka Research 3 arm of primitive geoms, from public kinematic, limit and inertial facts; what its tasks share.
 
 Kinematics: modified Denavit-Hartenberg table of the manufacturer. Limits: the manufacturer's position limits (the
 narrower box of constant velocity limits cannot point the gripper down closer than 0.3 m to the base). Link inertias
 follow from capsules of the published link masses; reflected motor inertia (armature) dominates the wrist. The arm
 touches nothing: only a task's tool has contacts, declared pair by pair.
+
+After the arm itself: its kinematics, as pure functions of joint angles; then control period, empty scene, states at
+rest, and how a viewer sees the arm.
 """
 
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.mujoco.parts import add_box, add_capsule, add_hinge, add_servo
+from envs.mujoco.parts import add_box, add_capsule, add_cylinder, add_hinge, add_servo, stiff_spec
+from envs.mujoco.scene import Scene
+from envs.mujoco.worlds import PhysicsState
+from envs.types import Array
 
 N_JOINTS = 7
 # a [m], d [m], alpha [rad] of the transform from frame i-1 to frame i; the flange is a fixed eighth frame.
@@ -45,6 +56,26 @@ _SHAPES = (
     ((0, 0, 0.03), (0, 0, 0.09), 0.042),
 )
 _WHITE, _GREY, _DARK = (0.93, 0.94, 0.95, 1), (0.55, 0.58, 0.62, 1), (0.16, 0.17, 0.2, 1)
+_RING, _STAND = [0.60, 0.62, 0.65, 1.0], [0.20, 0.21, 0.24, 1.0]
+
+CONTROL_DT = 0.2  # s, 5 Hz as in the paper
+RAMP = 0.1  # s: the servo's target moves linearly to its new value, then rests, so the arm has settled at the next step
+# Exact commands, occasional sensor noise in raw units (paper, Appendix C).
+TRAINING = {"obs_noise": 0.004, "obs_noise_prob": 0.3}
+NOISE = {"obs_noise": [0.0, 0.004]}  # of the domain in which actuators and sensors differ
+scene = functools.partial(Scene, control_dt=CONTROL_DT, ramp=RAMP, training=TRAINING, actuators=NOISE)
+FLOOR = -0.75  # m: the arm stands on a table
+# Gripper pointing down, fingers opening along y of the base.
+DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+def new_spec(*, substeps: int, iterations: int, ls_iterations: int) -> mujoco.MjSpec:
+    """An empty scene with the solver settings all tasks share; contacts only where a task declares a pair."""
+    spec = stiff_spec(CONTROL_DT / substeps, iterations=iterations, ls_iterations=ls_iterations)
+    # The robot compensates its own weight, which is the same as none, and MuJoCo's per-body compensation costs a
+    # quarter of the simulation speed. A task gives weight to the objects that need it, see `push`.
+    spec.option.gravity = np.zeros(3)
+    return spec
 
 
 def add_arm(spec: mujoco.MjSpec, *, stiffness: float = 1.0) -> mujoco.MjsBody:
@@ -71,6 +102,12 @@ def tool_quaternion() -> np.ndarray:
     return np.array([np.cos(HAND_YAW / 2), 0.0, 0.0, np.sin(HAND_YAW / 2)])
 
 
+def across(x: float, y: float) -> tuple[float, float]:
+    """Xy in the frame of the hand -> xy in the frame of the last link."""
+    c, s = np.cos(HAND_YAW), np.sin(HAND_YAW)
+    return c * x - s * y, s * x + c * y
+
+
 def _add_link(parent: mujoco.MjsBody, i: int) -> mujoco.MjsBody:
     alpha, a, d = DH_ALPHA[i], DH_A[i], DH_D[i]
     pos, quat = [a, -np.sin(alpha) * d, np.cos(alpha) * d], [np.cos(alpha / 2), np.sin(alpha / 2), 0, 0]
@@ -79,3 +116,116 @@ def _add_link(parent: mujoco.MjsBody, i: int) -> mujoco.MjsBody:
     start, end, radius = _SHAPES[i]
     add_capsule(body, radius, fromto=[*start, *end], mass=LINK_MASS[i], rgba=_WHITE if i % 2 else _GREY)
     return body
+
+
+class Pose(NamedTuple):
+    """Position [3] in m and rotation matrix [3, 3], both in the base frame."""
+
+    position: Array
+    rotation: Array
+
+
+def _joint_bases() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """[7, 4, 4] each: the transform of joint i is the first + cos(q_i) * the second + sin(q_i) * the third."""
+    fixed, cosine, sine = np.zeros((3, N_JOINTS, 4, 4), np.float32)
+    for i, (a, d, alpha) in enumerate(zip(DH_A, DH_D, DH_ALPHA, strict=True)):
+        ca, sa = np.cos(alpha), np.sin(alpha)
+        fixed[i] = [[0, 0, 0, a], [0, 0, -sa, -sa * d], [0, 0, ca, ca * d], [0, 0, 0, 1]]
+        cosine[i, :3, :2] = [[1, 0], [0, ca], [0, sa]]
+        sine[i, :3, :2] = [[0, -1], [ca, 0], [sa, 0]]
+    return fixed, cosine, sine
+
+
+_FIXED, _COSINE, _SINE = _joint_bases()
+
+
+def _chain(q: Array, tool: Array | None) -> tuple[Pose, Array]:
+    """Pose of the tool, see `forward`, and its Jacobian.
+
+    Products of 4 x 4 matrices as sums, which XLA fuses into one kernel, where it would call a library for each `@`.
+    """
+    turn = q[:, None, None]
+    joints = _FIXED + jnp.cos(turn) * _COSINE + jnp.sin(turn) * _SINE
+    frames = [joints[0]]
+    for i in range(1, N_JOINTS):
+        frames.append((frames[-1][:, :, None] * joints[i][None]).sum(1))
+    chain = jnp.stack(frames)
+    rotation, position = chain[-1, :3, :3], chain[-1, :3, 3]
+    hand = np.array([[*across(1.0, 0.0), 0.0], [*across(0.0, 1.0), 0.0], [0.0, 0.0, 1.0]]).T
+    tool = jnp.array([0.0, 0.0, TCP]) if tool is None else tool
+    pose = Pose(position + rotation @ tool, rotation @ jnp.asarray(hand, jnp.float32))
+    axes, origins = chain[:, :3, 2], chain[:, :3, 3]
+    return pose, jnp.concatenate([jnp.cross(axes, pose.position[None] - origins).T, axes.T])
+
+
+def forward(q: Array, tool: Array | None = None) -> Pose:
+    """Pose of the tool point for joint angles q: [7] rad.
+
+    tool: [3] m, a point in the frame of the last link; default the tool centre point between the fingertips.
+    """
+    return _chain(q, tool)[0]
+
+
+def jacobian(q: Array, tool: Array | None = None) -> Array:
+    """[6, 7] geometric Jacobian in the base frame: rows are m/s and rad/s of the tool per rad/s of each joint."""
+    return _chain(q, tool)[1]
+
+
+def solve(
+    q: Array | np.ndarray, target: Pose, *, iterations: int, damping: float = 0.02, posture: float = 0.0
+) -> Array:
+    """[7] joint angles near q that bring the tool to `target`, by damped least squares, inside the joint limits.
+
+    iterations: Newton steps; 2 are exact to 0.1 mm for moves of 5 cm.
+    damping: regularisation of the least-squares step, in units of the Jacobian (m/rad).
+    posture: per-iteration pull of the redundant degree of freedom towards `Q_HOME` (0 = none).
+    Unreachable targets end at a nearby reachable pose.
+    """
+
+    def improve(q: Array, _: None) -> tuple[Array, None]:
+        pose, jac = _chain(q, None)
+        error = jnp.concatenate([target.position - pose.position, rotation_error(pose.rotation, target.rotation)])
+        rest = posture * (jnp.asarray(Q_HOME, jnp.float32) - q)
+        gram = jac @ jac.T + damping**2 * jnp.eye(6)
+        step = rest + jac.T @ jax.scipy.linalg.solve(gram, error - jac @ rest, assume_a="pos")
+        return clip_joints(q + jnp.clip(step, -0.5, 0.5)), None
+
+    return jax.lax.scan(improve, jnp.asarray(q, jnp.float32), None, length=iterations)[0]
+
+
+def solve_down(q: Array | np.ndarray, position: Array, *, iterations: int) -> Array:
+    """`solve` for a gripper at `position` [3] that points down."""
+    return solve(q, Pose(position, jnp.asarray(DOWN, jnp.float32)), iterations=iterations, posture=0.05)
+
+
+def rotation_error(current: Array, target: Array) -> Array:
+    """[3] rad, small-angle rotation vector (base frame) that turns `current` into `target`."""
+    return 0.5 * jnp.cross(current.T, target.T).sum(0)
+
+
+def at_rest(joints: Array, others: Array, nv: int) -> PhysicsState:
+    """A motionless state: arm at `joints` [7], the other coordinates at `others`, servo target where the arm is."""
+    return PhysicsState(jnp.concatenate([joints, others]), jnp.zeros(nv), jnp.zeros(nv), joints)
+
+
+def clip_joints(q: Array) -> Array:
+    """Joint targets inside the position limits."""
+    return jnp.clip(q, jnp.asarray(Q_MIN, jnp.float32), jnp.asarray(Q_MAX, jnp.float32))
+
+
+def dress(spec: mujoco.MjSpec, *, table: tuple[float, float, float] | None = None) -> None:
+    """The robot's pedestal and livery, and the legs of the table it stands on: x of the back and the front ones and
+    how far they stand to the sides, m.
+    """
+    for link in (body for body in spec.bodies if body.name.startswith("link")):
+        capsule = link.geoms[0]  # white, with a grey ring at each joint
+        capsule.rgba = _WHITE
+        radius = 1.06 * capsule.size[0]
+        add_cylinder(link, radius, 0.35 * radius, rgba=_RING, mass=0)
+    add_cylinder(spec.worldbody, 0.11, 0.015, pos=[0, 0, 0.015], rgba=_STAND)
+    add_cylinder(spec.worldbody, 0.09, 0.09, pos=[0, 0, 0.09], rgba=_WHITE)
+    half = -(FLOOR + 0.04) / 2
+    for x in table[:2] if table else ():
+        for y in (-table[2], table[2]) if table else ():
+            add_box(spec.worldbody, [0.02, 0.02, half], pos=[x, y, -0.04 - half], rgba=_STAND)
+    spec.stat.extent, spec.stat.center = 1.5, [0.3, 0, 0.3]

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from envs.franka import arm, push, soft
-from envs.franka.workcell import at_rest
+from envs.franka.arm import at_rest
 from envs.mujoco.parts import INVISIBLE, add_slide, add_sphere
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array, Key

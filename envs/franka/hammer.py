@@ -17,9 +17,8 @@ import mujoco
 import numpy as np
 
 from envs.base import Entry, Parameter
-from envs.franka import arm, kinematics, workcell
-from envs.franka.kinematics import DOWN, Pose
-from envs.franka.workcell import at_rest, clip_joints, new_spec
+from envs.franka import arm
+from envs.franka.arm import across, at_rest
 from envs.mujoco import parts
 from envs.mujoco.scene import View
 from envs.mujoco.worlds import PhysicsState
@@ -69,7 +68,7 @@ _INDEX = {p.name: i for i, p in enumerate(PARAMETERS)}
 
 def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The scene for one theta."""
-    spec = new_spec(substeps=SUBSTEPS, iterations=2, ls_iterations=4)
+    spec = arm.new_spec(substeps=SUBSTEPS, iterations=2, ls_iterations=4)
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
     _add_hammer(link, theta["hammer_mass"])
     spec.body("link6").geoms[0].name = "wrist"  # the link's capsule, as drawn
@@ -106,9 +105,9 @@ def initial(params: Array, key: Key) -> PhysicsState:
     """The hammer somewhere above every nail, slightly tilted; the nail standing."""
     x, z, pitch = jax.random.uniform(key, (3,), minval=jnp.array(START_LOW), maxval=jnp.array(START_HIGH))
     c, s = jnp.cos(pitch), jnp.sin(pitch)
-    turn = jnp.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]) @ jnp.asarray(DOWN, jnp.float32)
+    turn = jnp.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]) @ jnp.asarray(arm.DOWN, jnp.float32)
     grip = jnp.stack([x, jnp.zeros(()), z]) - turn @ jnp.array([-HEAD_BACK, 0.0, FACE])
-    joints = kinematics.solve(jnp.asarray(Q_READY, jnp.float32), Pose(grip, turn), iterations=8)
+    joints = arm.solve(Q_READY, arm.Pose(grip, turn), iterations=8)
     nail = 2 * params[_INDEX["nail_half_height"]]
     return at_rest(_hold(joints), nail[None], NV)
 
@@ -126,7 +125,7 @@ def target(qpos: Array, action: Array) -> Array:
     Nothing keeps the hammer above the board but the board itself.
     """
     joints = qpos[: arm.N_JOINTS]
-    return clip_joints(_hold(joints.at[JOINTS].add(STEP * action)))
+    return arm.clip_joints(_hold(joints.at[JOINTS].add(STEP * action)))
 
 
 def check(theta: dict[str, float]) -> str | None:
@@ -137,7 +136,7 @@ def check(theta: dict[str, float]) -> str | None:
     return f"nail_z less twice nail_half_height is the board's height, {board:g} m: more than {BOARD_THICKNESS:g} m"
 
 
-SCENE = workcell.scene(
+SCENE = arm.scene(
     name="hammer",
     observation=(
         Entry("face_xyz", "m", 3),
@@ -151,7 +150,7 @@ SCENE = workcell.scene(
     episode_length=50,
     substeps=SUBSTEPS,
     # Joints sag under a tool more than Cartesian commands drift.
-    actuators={**workcell.NOISE, "action_scale": [[0.6] * 3, [1.4] * 3], "action_bias": [[-0.3] * 3, [0.3] * 3]},
+    actuators={**arm.NOISE, "action_scale": [[0.6] * 3, [1.4] * 3], "action_bias": [[-0.3] * 3, [0.3] * 3]},
     build=build,
     initial=initial,
     settled=settled,
@@ -160,18 +159,18 @@ SCENE = workcell.scene(
     reward=reward,
     success=success,
     check=check,
-    dress=workcell.dress,
+    dress=arm.dress,
     view=View((0.33, 0.0, 0.58), 0.75, 122.0, -14.0, 0.0),
 )
 
 
 def tool() -> np.ndarray:
     """[3] m: the centre of the striking face in the frame of the last link."""
-    return np.array([*_across(-HEAD_BACK, 0.0), arm.TCP + FACE])
+    return np.array([*across(-HEAD_BACK, 0.0), arm.TCP + FACE])
 
 
 def _face(joints: Array) -> Array:
-    return kinematics.forward(joints, jnp.asarray(tool(), jnp.float32)).position
+    return arm.forward(joints, jnp.asarray(tool(), jnp.float32)).position
 
 
 def _exposed(obs: Array) -> Array:
@@ -188,23 +187,17 @@ def _hold(joints: Array) -> Array:
     return jnp.where(moving, joints, jnp.asarray(Q_READY, jnp.float32))
 
 
-def _across(x: float, y: float) -> tuple[float, float]:
-    """Xy in the frame of the hand -> xy in the frame of the last link."""
-    c, s = np.cos(arm.HAND_YAW), np.sin(arm.HAND_YAW)
-    return c * x - s * y, s * x + c * y
-
-
 def _add_hammer(link: mujoco.MjsBody, mass: float) -> None:
     wood, steel, dark = [0.72, 0.52, 0.3, 1], [0.45, 0.47, 0.5, 1], [0.1, 0.1, 0.12, 1]
     axis, tip = arm.TCP, arm.TCP + FACE
-    head = _across(-HEAD_BACK, 0.0)
+    head = across(-HEAD_BACK, 0.0)
     parts.add_sphere(link, FACE_RADIUS, name="face", pos=[*head, tip - FACE_RADIUS], mass=mass, rgba=steel)
-    end = (*_across(HANDLE, 0.0), axis)
+    end = (*across(HANDLE, 0.0), axis)
     parts.add_sphere(link, HANDLE_RADIUS, name="handle", pos=end, mass=0, rgba=wood)
     parts.add_cylinder(link, 0.0165, fromto=[*head, axis - 0.045, *head, tip - FACE_RADIUS], mass=0, rgba=steel)
     parts.add_cylinder(link, HANDLE_RADIUS, fromto=[*head, axis, *end], mass=0, rgba=wood)
     for side in (-1, 1):
-        xy = _across(0, side * 0.019)
+        xy = across(0, side * 0.019)
         parts.add_cylinder(link, 0.008, fromto=[*xy, arm.FLANGE + 0.07, *xy, axis], mass=0, rgba=dark)
 
 

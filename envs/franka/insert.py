@@ -19,9 +19,8 @@ import mujoco
 import numpy as np
 
 from envs.base import Entry, Parameter
-from envs.franka import arm, kinematics, workcell
-from envs.franka.kinematics import DOWN, Pose
-from envs.franka.workcell import at_rest, clip_joints, new_spec
+from envs.franka import arm
+from envs.franka.arm import at_rest, new_spec, solve_down
 from envs.mujoco.parts import INVISIBLE, add_box, add_cylinder, add_pair, add_sphere
 from envs.mujoco.scene import View
 from envs.mujoco.worlds import PhysicsState
@@ -84,7 +83,7 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
 def observe(params: Array, state: PhysicsState) -> Array:
     """[9] m, base frame: tool centre point, the leg's tip, where the tip is when the leg is assembled."""
     joints = state.qpos[: arm.N_JOINTS]
-    return jnp.concatenate([kinematics.forward(joints).position, _tip(joints), assembled(params)])
+    return jnp.concatenate([arm.forward(joints).position, _tip(joints), assembled(params)])
 
 
 def assembled(params: Array) -> Array:
@@ -113,13 +112,13 @@ def initial(params: Array, key: Key) -> PhysicsState:
     """The leg above the table top, at a random place around the nominal hole."""
     offset = jax.random.uniform(key, (3,), minval=jnp.asarray(START_LOW), maxval=jnp.asarray(START_HIGH))
     tip = jnp.concatenate([jnp.asarray(HOLE_NOMINAL, jnp.float32), jnp.array([TOP])]) + offset
-    joints = kinematics.solve(jnp.asarray(Q_READY, jnp.float32), _pose(tip), iterations=6, posture=0.05)
+    joints = solve_down(Q_READY, _hand(tip), iterations=6)
     return at_rest(joints, jnp.zeros(0), NV)
 
 
 def settled(params: Array, obs: Array) -> PhysicsState:
     """The leg where its tip is seen, upright and at rest."""
-    joints = kinematics.solve(jnp.asarray(Q_READY, jnp.float32), _pose(obs[3:6]), iterations=12, posture=0.05)
+    joints = solve_down(Q_READY, _hand(obs[3:6]), iterations=12)
     return at_rest(joints, jnp.zeros(0), NV)
 
 
@@ -130,7 +129,7 @@ def target(qpos: Array, action: Array) -> Array:
     """
     joints = qpos[: arm.N_JOINTS]
     goal = jnp.clip(_tip(joints) + STEP * action, jnp.asarray(WORKSPACE[0]), jnp.asarray(WORKSPACE[1]))
-    return clip_joints(kinematics.solve(joints, _pose(goal), iterations=3, posture=0.05))
+    return solve_down(joints, _hand(goal), iterations=3)
 
 
 def check(theta: dict[str, float]) -> str | None:
@@ -139,7 +138,7 @@ def check(theta: dict[str, float]) -> str | None:
     return f"hole_radius {hole:g} m is narrower than peg_radius {peg:g} m" if hole < peg else None
 
 
-SCENE = workcell.scene(
+SCENE = arm.scene(
     name="insert",
     observation=(Entry("hand_xyz", "m", 3), Entry("leg_xyz", "m", 3), Entry("hole_xyz", "m", 3, error=0.006)),
     action=(Entry("hand_xyz_step", "2 cm", 3),),
@@ -148,7 +147,7 @@ SCENE = workcell.scene(
     substeps=SUBSTEPS,
     success_anytime=True,
     cartesian=True,
-    actuators={**workcell.NOISE, "action_scale": [[0.5] * 3, [1.4] * 3]},
+    actuators={**arm.NOISE, "action_scale": [[0.5] * 3, [1.4] * 3]},
     build=build,
     initial=initial,
     settled=settled,
@@ -157,19 +156,19 @@ SCENE = workcell.scene(
     reward=reward,
     success=success,
     check=check,
-    dress=functools.partial(workcell.dress, table=(-0.15, 0.75, 0.4)),
-    view=View((0.48, 0.0, 0.04), 0.5, 135.0, -24.0, workcell.FLOOR),
+    dress=functools.partial(arm.dress, table=(-0.15, 0.75, 0.4)),
+    view=View((0.48, 0.0, 0.04), 0.5, 135.0, -24.0, arm.FLOOR),
 )
 
 
 def _tip(joints: Array) -> Array:
     """[3] m, base frame: the leg's tip."""
-    return kinematics.forward(joints, jnp.array([0.0, 0.0, arm.TCP + GRASP])).position
+    return arm.forward(joints, jnp.array([0.0, 0.0, arm.TCP + GRASP])).position
 
 
-def _pose(tip: Array) -> Pose:
-    """Pose of the hand that holds the leg upright with its tip at `tip` [3]."""
-    return Pose(tip + jnp.array([0.0, 0.0, GRASP]), jnp.asarray(DOWN, jnp.float32))
+def _hand(tip: Array) -> Array:
+    """[3] m: where the hand is that holds the leg upright with its tip at `tip` [3]."""
+    return tip + jnp.array([0.0, 0.0, GRASP])
 
 
 def _add_leg(link: mujoco.MjsBody, peg_radius: float) -> None:
@@ -186,10 +185,9 @@ def _add_leg(link: mujoco.MjsBody, peg_radius: float) -> None:
 
 
 def _add_fingers(link: mujoco.MjsBody) -> None:
-    yaw, look = arm.HAND_YAW, {"quat": arm.tool_quaternion(), "rgba": [0.1, 0.1, 0.12, 1]}
+    look = {"quat": arm.tool_quaternion(), "rgba": [0.1, 0.1, 0.12, 1]}
     for side in (-1, 1):
-        offset = side * (LEG_HALF_WIDTH + FINGER_HALF[1])
-        place = [-np.sin(yaw) * offset, np.cos(yaw) * offset, arm.TCP - 0.015]
+        place = [*arm.across(0.0, side * (LEG_HALF_WIDTH + FINGER_HALF[1])), arm.TCP - 0.015]
         add_box(link, FINGER_HALF, pos=place, mass=0.015, **look)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from envs.base import Entry, Parameter
 from envs.franka import armless
-from envs.franka.rotations import inverse, turned
+from envs.franka.armless import inverse, turned
 from envs.mujoco import parts
 from envs.mujoco.scene import View
 from envs.mujoco.worlds import PhysicsState

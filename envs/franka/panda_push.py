@@ -12,7 +12,7 @@ import numpy as np
 
 from envs.base import Entry, Parameter
 from envs.franka import armless
-from envs.franka.rotations import inverse, turned
+from envs.franka.armless import inverse, turned
 from envs.mujoco.parts import add_box, add_pair, add_servo, add_slide
 from envs.mujoco.scene import View
 from envs.mujoco.worlds import PhysicsState

@@ -17,9 +17,8 @@ import mujoco
 import numpy as np
 
 from envs.base import Entry, Parameter
-from envs.franka import arm, kinematics, workcell
-from envs.franka.kinematics import DOWN, Pose
-from envs.franka.workcell import at_rest, clip_joints, new_spec
+from envs.franka import arm
+from envs.franka.arm import at_rest, new_spec, solve_down
 from envs.mujoco import parts
 from envs.mujoco.scene import View
 from envs.mujoco.worlds import PhysicsState
@@ -42,7 +41,7 @@ GRAVITY = 9.81  # m/s^2
 # Rubber fingertips: the contact stiffens over 3 mm instead of at once. Newton's method then converges in 4 iterations
 # on every contact we have seen; hard fingertips need more than 6 and throw the puck with fewer.
 RUBBER = (0.0, 0.95, 0.003, 0.5, 2.0)
-TABLE_LEGS = (-0.2, 0.7, 0.55)  # m, see `workcell.dress`
+TABLE_LEGS = (-0.2, 0.7, 0.55)  # m, see `arm.dress`
 # Joint angles with the hand in the start area: where the inverse kinematics of a reset begins.
 Q_FOLDED = np.array([0.0, 0.247, 0.0, -2.966, 0.0, 3.213, np.pi / 4])
 NV = arm.N_JOINTS + 4  # puck: x, y, z, yaw
@@ -83,7 +82,7 @@ def observe(params: Array, state: PhysicsState) -> Array:
 def seen(qpos: Array, place: Array) -> Array:
     """[4] m, table frame: hand xy and the xy of an object that lies at `place` [2] of the base frame."""
     origin = jnp.array([TABLE_ORIGIN, 0.0])
-    hand = kinematics.forward(qpos[: arm.N_JOINTS]).position[:2]
+    hand = arm.forward(qpos[: arm.N_JOINTS]).position[:2]
     return jnp.concatenate([hand - origin, (place - origin).at[0].min(SEEN_AT)])
 
 
@@ -115,22 +114,22 @@ def initial(params: Array, key: Key) -> PhysicsState:
 
 def settled(params: Array, obs: Array) -> PhysicsState:
     """The hand and the puck where they are seen, at rest: within a control period both come to rest."""
-    joints = kinematics.solve(jnp.asarray(Q_FOLDED, jnp.float32), _pose(obs[:2], HEIGHT), iterations=12, posture=0.05)
+    joints = solve_down(Q_FOLDED, _place(obs[:2], HEIGHT), iterations=12)
     return at_rest(joints, jnp.concatenate([obs[2:4] + jnp.array([TABLE_ORIGIN, 0.0]), jnp.zeros(2)]), NV)
 
 
 def ready(key: Key, height: float = HEIGHT) -> Array:
     """[7] joint angles with the hand at a random place near the base, `height` m above the table."""
     start = jax.random.uniform(key, (2,), minval=jnp.array([0.09, -0.15]), maxval=jnp.array([0.11, 0.15]))
-    return kinematics.solve(jnp.asarray(Q_FOLDED, jnp.float32), _pose(start, height), iterations=6, posture=0.05)
+    return solve_down(Q_FOLDED, _place(start, height), iterations=6)
 
 
 def target(qpos: Array, action: Array, height: float = HEIGHT) -> Array:
     """[7] joint targets that move the hand by `action` * 5 cm from where it is, in its plane and workspace."""
     joints = qpos[: arm.N_JOINTS]
-    hand = kinematics.forward(joints).position[:2] - jnp.array([TABLE_ORIGIN, 0.0])
+    hand = arm.forward(joints).position[:2] - jnp.array([TABLE_ORIGIN, 0.0])
     goal = jnp.clip(hand + STEP * action, jnp.asarray(WORKSPACE[0]), jnp.asarray(WORKSPACE[1]))
-    return clip_joints(kinematics.solve(joints, _pose(goal, height), iterations=3, posture=0.05))
+    return solve_down(joints, _place(goal, height), iterations=3)
 
 
 def event(params: Array, state: PhysicsState) -> PhysicsState:
@@ -143,7 +142,7 @@ def event(params: Array, state: PhysicsState) -> PhysicsState:
     return state._replace(qpos=qpos, qvel=qvel)
 
 
-SCENE = workcell.scene(
+SCENE = arm.scene(
     name="push",
     observation=(Entry("hand_xy", "m", 2), Entry("puck_xy", "m", 2, error=0.01)),
     action=(Entry("hand_xy_step", "5 cm", 2),),
@@ -159,25 +158,18 @@ SCENE = workcell.scene(
     reward=reward,
     success=success,
     event=event,
-    dress=functools.partial(workcell.dress, table=TABLE_LEGS),
-    view=View((0.45, 0.0, 0.06), 1.1, 145.0, -30.0, workcell.FLOOR),
+    dress=functools.partial(arm.dress, table=TABLE_LEGS),
+    view=View((0.45, 0.0, 0.06), 1.1, 145.0, -30.0, arm.FLOOR),
 )
 
 
-def _pose(xy: Array, height: float) -> Pose:
-    return Pose(
-        jnp.concatenate([xy + jnp.array([TABLE_ORIGIN, 0.0]), jnp.array([height])]), jnp.asarray(DOWN, jnp.float32)
-    )
-
-
-def finger_xy(side: int) -> tuple[float, float]:
-    """Where a fingertip is in the frame of the last link, m; side: -1 left, 1 right."""
-    offset = side * FINGER_GAP / 2  # along the hand's y axis
-    return -np.sin(arm.HAND_YAW) * offset, np.cos(arm.HAND_YAW) * offset
+def _place(xy: Array, height: float) -> Array:
+    """[3] m, base frame, of a point of the table frame."""
+    return jnp.concatenate([xy + jnp.array([TABLE_ORIGIN, 0.0]), jnp.array([height])])
 
 
 def _add_finger(link: mujoco.MjsBody, side: int) -> None:
-    (x, y), dark = finger_xy(side), [0.1, 0.1, 0.12, 1]
+    (x, y), dark = arm.across(0.0, side * FINGER_GAP / 2), [0.1, 0.1, 0.12, 1]
     parts.add_sphere(link, FINGER_RADIUS, name=FINGERS[side], pos=[x, y, arm.TCP], mass=0.015, rgba=dark)
     parts.add_capsule(link, FINGER_RADIUS, fromto=[x, y, arm.FLANGE + 0.07, x, y, arm.TCP], mass=0, rgba=dark)
 

@@ -15,8 +15,7 @@ import mujoco
 import numpy as np
 
 from envs.base import Parameter
-from envs.franka import arm, push, workcell
-from envs.franka.workcell import new_spec
+from envs.franka import arm, push
 from envs.mujoco.parts import INVISIBLE, add_box, add_capsule
 from envs.mujoco.scene import Scene, View
 from envs.mujoco.worlds import PhysicsState
@@ -37,7 +36,7 @@ def simulated(name: str, *, mass: float) -> Scene:
     ranges = {"object_x": (0.25, *NEAREST_FARTHEST), "object_mass": (mass, mass, mass)}
     parameters = tuple(Parameter(p.name, p.unit, *ranges.get(p.name, p[2:5]), *p[5:]) for p in push.PARAMETERS)
     # From the front, all of the edge in sight: the hand, which comes from behind, hides nothing of what it pushes.
-    view = View((0.58, 0.0, 0.045), 0.87, 172.0, -33.0, workcell.FLOOR)
+    view = View((0.58, 0.0, 0.045), 0.87, 172.0, -33.0, arm.FLOOR)
     return push.SCENE._replace(name=name, parameters=parameters, view=view)
 
 
@@ -46,13 +45,13 @@ def stage(theta: dict[str, float], *, height: float, iterations: int) -> mujoco.
 
     height: m, of the hand's tool centre point; the fingers reach down from there to just above the table.
     """
-    spec = new_spec(substeps=push.SUBSTEPS, iterations=iterations, ls_iterations=iterations + 2)
+    spec = arm.new_spec(substeps=push.SUBSTEPS, iterations=iterations, ls_iterations=iterations + 2)
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE  # a point or a pad touches nothing but its neighbours
     spec.option.gravity = [0, 0, -push.GRAVITY]
     spec.option.impratio = _GRIP
     link = arm.add_arm(spec, stiffness=theta["servo_stiffness"])
     for side, name in push.FINGERS.items():
-        x, y = push.finger_xy(side)
+        x, y = arm.across(0.0, side * push.FINGER_GAP / 2)
         ends = [x, y, arm.FLANGE + 0.07, x, y, arm.TCP + height - TIP]
         add_capsule(link, push.FINGER_RADIUS, name=name, fromto=ends, mass=0.015, rgba=[0.1, 0.1, 0.12, 1])
     for body in spec.bodies:

@@ -20,6 +20,16 @@ def empty_spec(timestep: float, integrator: mujoco.mjtIntegrator) -> mujoco.MjSp
     return spec
 
 
+def stiff_spec(timestep: float, *, iterations: int, ls_iterations: int) -> mujoco.MjSpec:
+    """The same for stiff servos and contacts: implicit steps, Newton's method."""
+    spec = empty_spec(timestep, mujoco.mjtIntegrator.mjINT_IMPLICITFAST)
+    option = spec.option
+    option.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    option.iterations, option.ls_iterations = iterations, ls_iterations
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    return spec
+
+
 def add_sphere(body: mujoco.MjsBody, radius: float, **more: Any) -> None:
     """A sphere of that radius, m."""
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], **more, **NO_CONTACT)

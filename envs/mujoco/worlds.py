@@ -16,8 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.mujoco.engines import Engine
-from envs.mujoco.fields import CARRIED, carried, comparison
+from envs.mujoco.engines import CARRIED, Engine, carried, comparison
 from envs.types import Array, UserError, unknown
 
 Impl = Literal["auto", "jax", "warp", "c"]  # see `choose_impl`

@@ -18,7 +18,7 @@ from envs import gaps
 from envs.base import Env, World
 from envs.gaps import SIM
 from envs.mujoco.worlds import Impl, choose_impl
-from envs.pools import real_worlds
+from envs.rollout import real_worlds
 from envs.types import Key, PyTree, Transition
 from experiments.bench import bare_h2oplus, bare_sac
 from experiments.bench.timing import Compiled, ahead, fastest, fastest_in_turns, measure

@@ -18,9 +18,8 @@ import envs
 from envs import gaps
 from envs.base import Env, EnvState
 from envs.locomotion import wheel_forward, wheel_legged
-from envs.locomotion.wheel_operator import nominal_gain, operator
-from envs.pools import real_env, real_worlds
-from envs.rollout import Episode, counted, play_episode
+from envs.locomotion.wheel_legged import nominal_gain, operator
+from envs.rollout import Episode, counted, play_episode, real_env, real_worlds
 from envs.types import Array, Policy, PyTree, Transition, UserError
 from experiments.runner.options import seed_list
 from sgft_jax.algorithms import make_policy

@@ -12,8 +12,7 @@ import envs
 from envs import gaps
 from envs.base import Env, World
 from envs.gaps import Gap
-from envs.pools import real_env, real_worlds
-from envs.rollout import Episode
+from envs.rollout import Episode, real_env, real_worlds
 from envs.types import Key, PyTree
 from experiments.runner.cli import columns
 from experiments.runner.machines import reserve

@@ -11,12 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import envs
-from envs import gaps
+from envs import gaps, normalised
 from envs.base import Env, World
 from envs.gaps import SIM, Gap
-from envs.pools import real_env, real_worlds
-from envs.rollout import Episode
-from envs.scales import normalised
+from envs.rollout import Episode, real_env, real_worlds
 from envs.types import Key
 from experiments.runner.machines import reserve
 from experiments.runner.pictures import film_episode

@@ -15,8 +15,7 @@ import numpy as np
 import envs
 from envs import gaps
 from envs.base import Entry, Env, World
-from envs.pools import real_env, real_worlds
-from envs.rollout import Episode
+from envs.rollout import Episode, real_env, real_worlds
 from envs.types import Array
 from experiments.runner.options import check_sizes
 from sgft_jax.analysis import figures

@@ -15,11 +15,10 @@ import numpy as np
 import envs
 from envs import mesh
 from envs.base import Env, World
-from envs.domains.actuators import with_actuators
+from envs.domains import with_actuators
 from envs.gaps import SIM, Gap
-from envs.pools import heldout_worlds, load_gap, real_env, training_worlds
-from envs.rollout import Episode
-from envs.system import blurred, varying, with_system
+from envs.observations import blurred, varying, with_system
+from envs.rollout import Episode, heldout_worlds, load_gap, real_env, training_worlds
 from envs.types import Key, PyTree
 from experiments.runner.machines import folder_of_host, join_hosts, reserve
 from experiments.runner.pictures import film_episode

@@ -13,9 +13,8 @@ from envs import gap_distribution, gaps
 from envs.base import Env
 from envs.files import read_json
 from envs.gaps import SIM, Gap
-from envs.history import with_previous_actions
+from envs.observations import concealed, with_previous_actions
 from envs.rollout import Episode
-from envs.system import concealed
 from envs.types import Key, PyTree, Transition, UserError
 from experiments.runner.cli import columns
 from experiments.runner.gaps_run import FINAL_SEED, episode_key, percent, rate, systems, train

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from envs.scales import D4RL, normalised
+from envs import D4RL, normalised
 from sgft_jax.analysis.curves import SCORES, Curve, improvement_of_pairs
 from sgft_jax.analysis.tables import NONE, markdown, number, plain
 from sgft_jax.math.stats import Interval, bootstrap_interval, mean, rank_correlation

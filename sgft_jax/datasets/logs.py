@@ -16,7 +16,7 @@ import numpy as np
 
 from envs.base import Env
 from envs.files import readable
-from envs.history import remember, with_memory
+from envs.observations import remember, with_memory
 from envs.types import Array, Transition, UserError, unknown
 from sgft_jax.datasets import layouts, lerobot
 from sgft_jax.datasets.layouts import Rows, ages
@@ -208,7 +208,7 @@ def _judged(path: Path, rows: Rows, env: Env | None) -> Rows:
 
 
 def _seen(rows: Rows, env: Env) -> Rows:
-    """With what a policy reads beyond measurements, as `envs.history.with_memory` makes it."""
+    """With what a policy reads beyond measurements, as `envs.observations.with_memory` makes it."""
     if rows.obs.shape[1] == env.obs_dim:
         return rows
     action, age = np.clip(rows.action, -1, 1).astype(np.float32), ages(rows.ends)

@@ -1,6 +1,6 @@
 """Estimation of system parameters from real steps, by a model that reads the parameters. Pure.
 
-A system is [k] numbers in [-1, 1] with which observations end, see `envs.system`.
+A system is [k] numbers in [-1, 1] with which observations end, see `envs.observations`.
 """
 
 from collections.abc import Callable

@@ -14,8 +14,8 @@ import numpy as np
 
 from envs import extend
 from envs.base import Entry, Env
-from envs.history import remember, with_memory
 from envs.mesh import split_vmap
+from envs.observations import remember, with_memory
 from envs.rollout import Episode, episode_keys, judged
 from envs.types import Array, Key, PyTree, Transition, UserError
 from sgft_jax.systems import answers

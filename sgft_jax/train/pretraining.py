@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from envs.base import Domain, Env, EnvState, World
-from envs.domains.uniform import uniform
+from envs.domains import uniform
 from envs.mesh import split, whole
 from envs.rollout import Fleet, launch
 from envs.types import Array, Key, PyTree, Transition

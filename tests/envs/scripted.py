@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.franka import arm, hammer, insert, kinematics, push
+from envs.franka import arm, hammer, insert, push
 from envs.mujoco.scene import Scene
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array
@@ -59,13 +59,13 @@ def drive_nail(params: Array, state: PhysicsState, t: int) -> Array:
     """[3]: swing the hammer over the nail, then press it down, lifting it for a blow at every fourth step."""
     joints, obs = state.qpos[: arm.N_JOINTS], hammer.observe(params, state)
     tool = jnp.asarray(hammer.tool(), jnp.float32)
-    turn = kinematics.forward(joints, tool).rotation
-    jac = kinematics.jacobian(joints, tool)[jnp.array([0, 2, 4])][:, hammer.JOINTS]
+    turn = arm.forward(joints, tool).rotation
+    jac = arm.jacobian(joints, tool)[jnp.array([0, 2, 4])][:, hammer.JOINTS]
     across = obs[10] - obs[0]
     aligned = jnp.clip((0.03 - jnp.abs(across)) / 0.02, 0.0, 1.0)
     hover = jnp.maximum(obs[9] + 0.05 - obs[2], 0.0)
     down = jnp.where(t % 4 == 3, 0.06, -0.08)
-    upright = kinematics.rotation_error(turn, jnp.asarray(kinematics.DOWN, jnp.float32))[1]
+    upright = arm.rotation_error(turn, jnp.asarray(arm.DOWN, jnp.float32))[1]
     move = jnp.stack([across, aligned * down + (1 - aligned) * hover, upright])
     steps = jnp.linalg.solve(jac.T @ jac + 1e-4 * jnp.eye(3), jac.T @ move) / hammer.STEP
     return steps / jnp.maximum(1.0, jnp.abs(steps).max())

@@ -12,7 +12,7 @@ import envs
 from envs import gaps
 from envs.base import EnvState
 from envs.franka import arm, ball, push, towel
-from envs.pools import real_env
+from envs.rollout import real_env
 from envs.types import UserError
 
 KEY = jax.random.key(0)

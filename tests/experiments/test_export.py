@@ -33,7 +33,7 @@ def run(tmp_path):
     """A run that has left two policies, each of which reads the last two actions."""
     import toy
 
-    from envs.history import with_previous_actions
+    from envs.observations import with_previous_actions
 
     sizes = {"obs_dim": with_previous_actions(toy.make(), 2).obs_dim, "previous_actions": 2}
     for seed in (0, 1):

@@ -9,7 +9,7 @@ import pytest
 import toy
 
 import sgft_jax
-from envs.scales import normalised
+from envs import normalised
 from envs.types import UserError
 from experiments import hybrid
 from experiments.runner.hybrid_args import data_name, run_folder

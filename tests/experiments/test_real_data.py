@@ -11,8 +11,8 @@ from priors_by_hand import save_prior
 from test_finetune import complaint, killed, rollouts, same_results
 
 from envs import gaps
-from envs.history import with_previous_actions
-from envs.pools import real_worlds
+from envs.observations import with_previous_actions
+from envs.rollout import real_worlds
 from envs.types import UserError
 from experiments import export_data, finetune, replay
 from experiments.runner import pictures

@@ -13,8 +13,8 @@ import tuners
 
 from envs.base import Entry
 from envs.gaps import Gap
-from envs.history import with_previous_actions
-from envs.pools import real_worlds
+from envs.observations import with_previous_actions
+from envs.rollout import real_worlds
 from envs.types import Policy, UserError
 from sgft_jax import api
 from sgft_jax.learners.sac import SACConfig, extract_params, make_sac

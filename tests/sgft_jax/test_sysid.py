@@ -11,8 +11,8 @@ import tuners
 
 import envs
 from envs.base import Varying
+from envs.observations import concealed, with_system
 from envs.rollout import play_episode
-from envs.system import concealed, with_system
 from envs.types import Transition, UserError
 from sgft_jax import api
 from sgft_jax.algorithms import make_policy

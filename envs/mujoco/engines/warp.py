@@ -15,8 +15,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.mujoco.engines import Engine
-from envs.mujoco.engines.features import check_features
+from envs.mujoco.engines import Engine, check_features
 from envs.mujoco.engines.mjx import mjx, put, with_fields
 from envs.types import Array, PyTree, UserError
 

@@ -14,7 +14,7 @@ import mujoco
 import warp as wp
 from mujoco.mjx.third_party import mujoco_warp as mjw
 
-from envs.mujoco.fields import FLUID
+from envs.mujoco.engines import FLUID
 from envs.types import Array, UserError
 
 wp.config.log_level = wp.LOG_WARNING  # no report on every kernel it loads

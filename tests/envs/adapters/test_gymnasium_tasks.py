@@ -11,8 +11,7 @@ import toy_terminating
 
 import envs
 from envs.gaps import Gap
-from envs.pools import real_worlds
-from envs.rollout import play_episode
+from envs.rollout import play_episode, real_worlds
 from envs.types import UserError
 
 gymnasium = pytest.importorskip("gymnasium", reason="make setup EXTRAS=dev, or pip install 'sgft-jax[gymnasium]'")

@@ -14,7 +14,7 @@ import scripted
 import envs
 from envs.base import Varying
 from envs.franka import arm, hammer
-from envs.system import with_system
+from envs.observations import with_system
 from envs.types import Transition
 from sgft_jax.models.system import most_probable_system
 

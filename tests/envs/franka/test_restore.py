@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import envs
+from envs.observations import concealed, models_of, varying, with_system, with_tensors
 from envs.rollout import play_episode
-from envs.system import concealed, models_of, varying, with_system, with_tensors
 from sgft_jax.models.system import most_probable_system
 
 TASKS = ("push", "insert", "hammer")

@@ -13,15 +13,15 @@ from mujoco.introspect import structs
 import envs
 from envs.base import Entry, Parameter
 from envs.mujoco import worlds as physics
+from envs.mujoco.engines import CARRIED, POLYNOMIAL, all_fields, comparison, unread
 from envs.mujoco.engines import c as engine_c
 from envs.mujoco.engines import mjx as engine_jax
 from envs.mujoco.engines import warp as engine_warp
-from envs.mujoco.fields import CARRIED, POLYNOMIAL, all_fields, comparison, unread
 from envs.mujoco.scene import Scene, make_env
 from envs.mujoco.worlds import PhysicsState
 from envs.types import UserError
 
-# Fields that must be the same in all worlds. What is new to MuJoCo has to be put here or into `envs.mujoco.fields`.
+# Fields that must be the same in all worlds. What is new to MuJoCo has to be put here or into `envs.mujoco.engines`.
 REFUSED = """
     B_colind B_rowadr B_rownnz D_colind D_diag D_rowadr D_rownnz M_colind M_rowadr M_rownnz actuator_actadr
     actuator_actearly actuator_actlimited actuator_actnum actuator_armature actuator_biastype actuator_ctrladr

@@ -12,7 +12,7 @@ from scripted import PROBES
 
 import envs
 from envs.franka import arm, ball, push, towel
-from envs.franka.workcell import at_rest
+from envs.franka.arm import at_rest
 from envs.mujoco.engines import c as engine_c
 from envs.mujoco.engines import warp as engine_warp
 from envs.mujoco.scene import make_env

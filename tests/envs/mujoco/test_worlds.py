@@ -7,7 +7,7 @@ from franka_bench import SCENES, theta_of
 from mujoco import mjx
 
 import envs
-from envs.domains.uniform import uniform
+from envs.domains import uniform
 from envs.mujoco import worlds as physics
 from envs.mujoco.engines import mjx as engine_jax
 from envs.mujoco.scene import make_env

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from envs.scales import D4RL
+from envs import D4RL
 from envs.types import UserError
 from sgft_jax.analysis import hybrid, release
 from sgft_jax.analysis.curves import Curve

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import toy
 
-from envs.history import with_previous_actions
+from envs.observations import with_previous_actions
 from envs.types import UserError
 from sgft_jax.datasets import lerobot, logs
 from sgft_jax.datasets.recording import Recorded

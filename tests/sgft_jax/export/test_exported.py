@@ -14,9 +14,8 @@ import tuners
 import envs
 from envs.base import Varying
 from envs.files import read_json
-from envs.history import with_previous_actions
+from envs.observations import concealed, with_previous_actions, with_system
 from envs.rollout import play_episode
-from envs.system import concealed, with_system
 from envs.types import UserError
 from sgft_jax import api
 from sgft_jax.export import exported, player

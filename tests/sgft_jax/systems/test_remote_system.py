@@ -10,7 +10,7 @@ import pytest
 import toy
 
 from envs.gaps import Gap
-from envs.pools import real_worlds
+from envs.rollout import real_worlds
 from envs.types import Policy, UserError
 from sgft_jax.systems.gymnasium import Gymnasium, seed_of
 from sgft_jax.systems.remote import Remote

@@ -13,8 +13,7 @@ import toy
 from envs import gaps
 from envs.control import cartpole
 from envs.gaps import Gap
-from envs.pools import real_worlds
-from envs.rollout import step_fleet
+from envs.rollout import real_worlds, step_fleet
 from envs.types import UserError
 from sgft_jax.algorithms import make_policy
 from sgft_jax.data import replay

@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from envs.franka import arm, insert, kinematics, push
-from envs.franka.workcell import new_spec
+from envs.franka import arm, insert, push
+from envs.franka.arm import new_spec
 
 TOOLS = (None, [0.02, -0.03, 0.25])
 
@@ -40,8 +40,8 @@ def at(mujoco_arm, q, site):
 @pytest.mark.parametrize("i", [0, 1])
 def test_forward_and_jacobian_are_mujocos(mujoco_arm, i):
     tool = None if TOOLS[i] is None else jnp.array(TOOLS[i])
-    forward = jax.jit(lambda q: kinematics.forward(q, tool))
-    jacobian = jax.jit(lambda q: kinematics.jacobian(q, tool))
+    forward = jax.jit(lambda q: arm.forward(q, tool))
+    jacobian = jax.jit(lambda q: arm.jacobian(q, tool))
     for q in angles(50):
         position, rotation, jac = at(mujoco_arm, q, f"tool{i}")
         pose = forward(q)
@@ -52,8 +52,8 @@ def test_forward_and_jacobian_are_mujocos(mujoco_arm, i):
 
 def test_gripper_points_down_at_home():
     """Upper arm up, forearm level, hand down: lengths of the manufacturer's table add up."""
-    pose = kinematics.forward(jnp.asarray(arm.Q_HOME, jnp.float32))
-    np.testing.assert_allclose(pose.rotation, kinematics.DOWN, atol=1e-6)
+    pose = arm.forward(jnp.asarray(arm.Q_HOME, jnp.float32))
+    np.testing.assert_allclose(pose.rotation, arm.DOWN, atol=1e-6)
     # x: elbow offset 0.0825 + forearm 0.384 + wrist offset 0.088
     # z: 0.333 + 0.316 + elbow offset 0.0825 - flange 0.107 - fingers 0.1034
     np.testing.assert_allclose(pose.position, [0.5545, 0.0, 0.5211], atol=1e-4)
@@ -62,8 +62,8 @@ def test_gripper_points_down_at_home():
 def test_rotation_error_is_the_small_rotation_vector():
     c, s = np.cos(0.01), np.sin(0.01)
     turn = jnp.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])  # 0.01 rad about the base's z
-    current = jnp.asarray(kinematics.DOWN, jnp.float32)
-    np.testing.assert_allclose(kinematics.rotation_error(current, turn @ current), [0, 0, 0.01], atol=1e-6)
+    current = jnp.asarray(arm.DOWN, jnp.float32)
+    np.testing.assert_allclose(arm.rotation_error(current, turn @ current), [0, 0, 0.01], atol=1e-6)
 
 
 def walk(target, tip, q, actions, goal):
@@ -79,7 +79,7 @@ def walk(target, tip, q, actions, goal):
 @pytest.mark.parametrize("seed", range(4))
 def test_pushing_steps_are_exact(seed):
     """From random starts ahead to the edge, within 0.3 mm. Beyond 0.78 m the arm is too short."""
-    tip = jax.jit(lambda q: kinematics.forward(q).position)
+    tip = jax.jit(lambda q: arm.forward(q).position)
     origin = np.array([push.TABLE_ORIGIN, 0.0])
 
     def goal(here, action):
@@ -106,6 +106,6 @@ def test_insertion_reaches_its_whole_workspace(corner):
 
 
 def test_solve_stays_inside_the_joint_limits():
-    far = kinematics.Pose(jnp.array([1.5, 0.0, 0.1]), jnp.asarray(kinematics.DOWN, jnp.float32))
-    q = kinematics.solve(jnp.asarray(arm.Q_HOME, jnp.float32), far, iterations=30)
+    far = arm.Pose(jnp.array([1.5, 0.0, 0.1]), jnp.asarray(arm.DOWN, jnp.float32))
+    q = arm.solve(jnp.asarray(arm.Q_HOME, jnp.float32), far, iterations=30)
     assert ((q >= arm.Q_MIN - 1e-6) & (q <= arm.Q_MAX + 1e-6)).all()
