@@ -43,7 +43,7 @@ def chosen(home: Path, args: ReplayArgs) -> list[Played]:
     """The rollouts that are asked for; raises UserError for numbers that there are not."""
     without_repeats("--rollout", [str(n) for n in args.rollout])
     stored = episodes_of(home, args.seed)
-    episodes = {e.number: e for e in stored if e.seed == stored[0].seed and len(e.rows["reward"])}
+    episodes = {e.number: e for e in stored if e.seed == stored[0].seed and len(e.rows.reward)}
     if not episodes:
         raise UserError(f"{home / 'real'}: holds no valid step")
     if missing := [n for n in args.rollout if n not in episodes]:

@@ -244,7 +244,7 @@ def episodes_of(home: Path, seed: int | None) -> list[Played]:
 
 def check_sizes(home: Path, episodes: Sequence[Played], env: "Env") -> None:
     """Raises UserError for episodes of a task with other observations or actions."""
-    seen, commanded = (episodes[0].rows[name].shape[1] for name in ("obs", "action"))
+    seen, commanded = (x.shape[1] for x in episodes[0].rows[:2])
     if seen < env.measured_dim or commanded != env.act_dim:
         raise UserError(
             f"{home}: has {seen} observations and {commanded} actions, {env.name} has {env.measured_dim} and "

@@ -124,7 +124,7 @@ def draw(home: Path, task: str, episodes: Sequence[Played], out: Path, *, video:
     check_sizes(home, episodes, env)
     seed, numbers = episodes[0].seed, [str(episode.number) for episode in episodes]
     path = out / f"seed-{seed}-rollout-{'-'.join(numbers)}.png"
-    ends = np.cumsum([len(episode.rows["reward"]) for episode in episodes]) * env.control_dt
+    ends = np.cumsum([len(episode.rows.reward) for episode in episodes]) * env.control_dt
     words = [f"rollout {e.number}: {'success' if e.success else 'failure'}" for e in episodes]
     words, title = numbers if len(episodes) > _WORDY else words, f"{env.name}: real rollouts of seed {seed}"
     figures.rollouts(path, panels(env, episodes), dict(zip(words, ends.tolist(), strict=True)), title=title)
@@ -134,11 +134,11 @@ def draw(home: Path, task: str, episodes: Sequence[Played], out: Path, *, video:
 def panels(env: Env, episodes: Sequence[Played]) -> list[Panel]:
     """What sensors said, what was commanded and sent, and the reward, over the time of all episodes."""
     rows = [episode.rows for episode in episodes]
-    states = _joined([np.concatenate([x["obs"], x["next_obs"][-1:]])[:, : env.measured_dim] for x in rows])
-    sent, reward = (_joined([_held(x[name]) for x in rows]) for name in ("action", "reward"))
+    states = _joined([np.concatenate([x.obs, x.next_obs[-1:]])[:, : env.measured_dim] for x in rows])
+    sent, reward = (_joined([_held(getattr(x, name)) for x in rows]) for name in ("action", "reward"))
     commands = [_held(episode.command) for episode in episodes if episode.command is not None]
-    begun = np.cumsum([0, *(len(x["reward"]) for x in rows)])
-    time = _joined([start + np.arange(len(x["reward"]) + 1.0) for start, x in zip(begun[:-1], rows, strict=True)])
+    begun = np.cumsum([0, *(len(x.reward) for x in rows)])
+    time = _joined([start + np.arange(len(x.reward) + 1.0) for start, x in zip(begun[:-1], rows, strict=True)])
     time = time[:, 0] * env.control_dt
     sensors = [Panel(e.name, e.unit, time, lines) for e, lines in _of_entries(env.measured, states)]
     actions = [Panel(f"{e.name}, sent", e.unit, time, x, held=True) for e, x in _of_entries(env.action, sent)]
@@ -181,5 +181,5 @@ def _video(home: Path, task: str, episode: Played, out: Path) -> str:
     worlds = real_worlds(env, [gap], jax.random.key(0)).theta.params[0]
     # A gap that was played beside others shares their size of a pool: what does not vary is repeated in it.
     theta = worlds[episode.world % len(worlds)]
-    states = episode.trace[: len(episode.rows["reward"]) + 1]
+    states = episode.trace[: len(episode.rows.reward) + 1]
     return film(env, theta, states, out / "videos" / f"seed-{episode.seed}-rollout-{episode.number}.mp4")

@@ -5,7 +5,6 @@ transitions of them. What is not as its layout says is a `UserError` with one li
 """
 
 import io
-import re
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -93,7 +92,7 @@ def read_hdf5(path: Path, successors: Successors, limit: int | None = None) -> R
     """
     file = _file_of(path)
     with opened(file) as content:
-        groups = _episodes(content)
+        groups = content.groups(r"episode_(0|[1-9][0-9]{0,17})")
         if not groups:
             return _read_d4rl(content, successors, limit)
         if successors == "shifted":
@@ -120,14 +119,12 @@ def read_table(path: Path, measured_dim: int) -> tuple[Rows, int]:
 
 def read_rollouts(home: Path) -> Rows:
     """The valid steps of the rollouts in `<home>/real/`, all of the first seed first."""
-    episodes = [episode.rows for episode in played(home) if len(episode.rows["reward"])]
+    episodes = [episode.rows for episode in played(home) if len(episode.rows.reward)]
     if not episodes:
         raise UserError(f"{home / 'real'}: holds no valid step")
-    obs, action, reward, discount, next_obs = map(
-        np.concatenate, zip(*(rows.values() for rows in episodes), strict=True)
-    )
+    obs, action, reward, discount, next_obs = map(np.concatenate, zip(*episodes, strict=True))
     ends, keep = np.zeros(len(reward), bool), np.ones(len(reward), bool)
-    ends[np.cumsum([len(rows["reward"]) for rows in episodes]) - 1] = True
+    ends[np.cumsum([len(rows.reward) for rows in episodes]) - 1] = True
     return Rows(obs, action, reward, next_obs, discount == 0, ends, keep, "rollouts", "stored", home / "real")
 
 
@@ -235,14 +232,6 @@ def _read_minari(content: Reader, groups: list[h5py.Group]) -> Rows:
     rate = 1 / card["control_dt"] if "control_dt" in card else None
     keep = np.ones(len(reward), bool)
     return Rows(obs, action, reward, next_obs, terminal, ends, keep, "minari", "episode", file, rate)
-
-
-def _episodes(content: Reader) -> list[h5py.Group]:
-    """The groups `episode_0`, `episode_1`, ... of a Minari file, in the order of their numbers."""
-    matches = (re.fullmatch(r"episode_(0|[1-9][0-9]{0,17})", name) for name in content.names())
-    numbered = {int(match[1]): match[0] for match in matches if match}
-    groups = [content.group(name) for _, name in sorted(numbered.items())]
-    return [group for group in groups if group is not None]
 
 
 def _read_episode(content: Reader, group: h5py.Group) -> tuple[np.ndarray, ...]:

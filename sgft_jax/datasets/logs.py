@@ -6,6 +6,7 @@ be is a `UserError` with one line. Arrays are float32 on the host; `replay.full`
 
 import dataclasses
 import hashlib
+import itertools
 import stat
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -127,7 +128,7 @@ def episodes(logs: Sequence[Log]) -> tuple[Transition, np.ndarray]:
     separate = [
         jax.tree.map(lambda x, a=a, b=b: np.asarray(x)[a:b], (log.rows, np.ones(len(log.last), bool)))
         for log in logs
-        for a, b in zip(*_borders(log.last), strict=True)
+        for a, b in itertools.pairwise([0, *np.flatnonzero(np.append(log.last[:-1], True)) + 1])
     ]
     longest = max(len(valid) for _, valid in separate)
 
@@ -135,12 +136,6 @@ def episodes(logs: Sequence[Log]) -> tuple[Transition, np.ndarray]:
         return np.stack([np.pad(x, [(0, longest - len(x))] + [(0, 0)] * (x.ndim - 1)) for x in columns])
 
     return jax.tree.map(padded, *separate)
-
-
-def _borders(last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The first row of every episode, and the row behind it."""
-    ends = np.flatnonzero(np.append(last[:-1], True)) + 1
-    return np.concatenate([[0], ends[:-1]]), ends
 
 
 def _read(path: Path, successors: Successors, env: Env | None) -> Rows:

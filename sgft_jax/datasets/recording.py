@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import h5py
 import jax
@@ -95,7 +95,7 @@ def of_stored(played: Sequence[Played], measured_dim: int) -> list[Recorded]:
     """
     recorded = []
     for episode in played:
-        rows: Any = Transition(**cast(Any, episode.rows))
+        rows = episode.rows
         if len(rows.reward):
             rows = rows._replace(obs=rows.obs[:, :measured_dim], next_obs=rows.next_obs[:, :measured_dim])
             recorded.append(_recorded(rows, None)._replace(success=episode.success))

@@ -5,6 +5,7 @@ that unpacks them (plug-ins), and may claim any size. All of that is refused bef
 """
 
 import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -29,20 +30,17 @@ class Reader:
         self.path, self.content = path, content
         self._claimed = self._stored = 0  # bytes, of all arrays so far
 
-    def names(self) -> list[str]:
-        """What lies in the root."""
-        with damage(self.path):
-            return sorted(self.content)
-
     def has(self, group: h5py.Group | None, name: str) -> bool:
         """Whether something has that name in a group, None for the root."""
         with damage(self.path):
             return (self.content if group is None else group).id.links.exists(name.encode())
 
-    def group(self, name: str) -> h5py.Group | None:
-        """A group of the root; None for a data set of that name."""
-        member = self._member(self.content, name)
-        return member if isinstance(member, h5py.Group) else None
+    def groups(self, pattern: str) -> list[h5py.Group]:
+        """Those of the root with names that fit, in the order of the number that is the pattern's only group."""
+        with damage(self.path):
+            matches = [match for name in sorted(self.content) if (match := re.fullmatch(pattern, name))]
+        members = [self._member(self.content, match[0]) for match in sorted(matches, key=lambda match: int(match[1]))]
+        return [member for member in members if isinstance(member, h5py.Group)]
 
     def array(self, group: h5py.Group | None, name: str, rank: int) -> np.ndarray:
         """The numbers of a data set in a group, None for the root: [rows, entries], or [rows], also from [rows, 1]."""

@@ -194,7 +194,7 @@ def write_tree(where: Path, tree: PyTree, facts: Mapping[str, Any]) -> None:
     """Put a tree into `where/state/` and, last, the manifest that makes it count. `where` exists."""
     flat = jax.tree_util.tree_leaves_with_path(tree)
     leaves = [describe(path, leaf) for path, leaf in flat]
-    arrays = {_slot(i): _to_numpy(leaf) for i, (_, leaf) in enumerate(flat)}
+    arrays = {_slot(i): np.asarray(jax.random.key_data(x) if _is_key(x) else x) for i, (_, x) in enumerate(flat)}
     mesh.meet()
     # Orbax refuses arrays without elements; their shape in the manifest says all there is to say.
     if stored := {slot: x for slot, x in arrays.items() if x.size}:
@@ -325,10 +325,6 @@ def _slot(index: int) -> str:
 
 def _is_key(leaf: Any) -> bool:
     return jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _to_numpy(leaf: Any) -> np.ndarray:
-    return np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
 
 
 def _from_numpy(leaf: Leaf, stored: Any, impl: str | None) -> jax.Array:

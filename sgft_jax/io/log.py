@@ -227,11 +227,8 @@ class RunProgress:
             return []
         done, begun = self._first
         rate = (self._done - done) / max(now - begun, 1e-9)
-        return [_rate(rate, self._unit), f"{_duration((self._total - self._done) / max(rate, 1e-9))} left"]
-
-
-def _rate(rate: float, unit: str) -> str:
-    return f"{rate:,.0f} {unit}/s" if rate >= 10 else f"{rate:.2g} {unit}/s"
+        speed = f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
+        return [f"{speed} {self._unit}/s", f"{_duration((self._total - self._done) / max(rate, 1e-9))} left"]
 
 
 def _duration(seconds: float) -> str:

@@ -5,17 +5,17 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from envs.files import read_text
-from envs.types import UserError
+from envs.types import Transition, UserError
 from sgft_jax.files.arrays import flags, numbers, read_npz
 from sgft_jax.files.disk import sync, written
 
 _REAL, _ROLLOUT, _HALF, _STEPS = "real", "rollout-", ".half", ".steps.jsonl"
-_ROWS = ("obs", "action", "reward", "discount", "next_obs")
+_ROWS = Transition._fields
 _LONGEST = 2**30  # bytes of a journal
 _FIX = "docs/formats.md lists what a rollout holds"
 
@@ -134,15 +134,15 @@ class Journal:
 class Played(NamedTuple):
     """One stored episode of one seed.
 
-    seed: its place among the seeds of the run. number: of the rollout. rows: {name: [T, ...]} of a `Transition`, the
-    valid steps alone. command: [T, act_dim] what the policy asked for; None where it is what was sent. success:
+    seed: its place among the seeds of the run. number: of the rollout. rows: [T, ...] on the host, the valid steps
+    alone. command: [T, act_dim] what the policy asked for; None where it is what was sent. success:
     whether it ended well. world: its number in the pool. trace: [steps + 1, k], see `Env.trace`; of all steps,
     k = 0 where nothing was kept.
     """
 
     seed: int
     number: int
-    rows: Mapping[str, np.ndarray]
+    rows: Transition
     command: np.ndarray | None
     success: bool
     world: int
@@ -222,7 +222,7 @@ def _typed(value: Any, kind: np.dtype) -> np.ndarray:
 def _of_seed(arrays: Mapping[str, np.ndarray], seed: int, number: int) -> Played:
     """The episode of one seed in a rollout of all."""
     valid = arrays["valid"][seed]
-    rows = {name: arrays[name][seed][valid] for name in _ROWS}
+    rows = Transition(*cast(Any, (arrays[name][seed][valid] for name in _ROWS)))
     command = arrays["command"][seed][valid] if "command" in arrays else None
     world = int(arrays["world"][seed]) if "world" in arrays else 0
     trace = arrays["trace"][seed] if "trace" in arrays else np.zeros((len(valid) + 1, 0))

@@ -49,9 +49,9 @@ class Answer(NamedTuple):
     sent: Any
 
 
-def idle(obs: Any) -> Answer:
-    """Of an environment whose episode is over."""
-    return Answer(obs, 0.0, True, False, None, False, False, None)
+def idle(obs: Any) -> tuple[Any, ...]:
+    """What stands for the parts that a step returns where the episode is over."""
+    return obs, 0.0, True, False, None
 
 
 def parts(name: str, method: str, returned: Any) -> tuple[Any, ...]:

@@ -175,8 +175,8 @@ class Gymnasium:
         def kept(x: np.ndarray) -> Array:
             return jnp.where(valid.reshape(*valid.shape, *[1] * (x.ndim - 2)), x, 0)
 
-        discount = jnp.where(valid, self.gamma * (1 - rows.terminated), 0.0)
-        transitions = Transition(kept(rows.obs), kept(rows.action), kept(rows.reward), discount, kept(rows.next_obs))
+        discount = self.gamma * (1 - rows.terminated)
+        transitions = Transition(*map(kept, (rows.obs, rows.action, rows.reward, discount, rows.next_obs)))
         exploded = jnp.asarray(rows.invalid.any(1))
         success, total = jnp.asarray(self._success(rows)) & ~exploded, transitions.reward.sum(1)
         score, world = judged(env, total, success, exploded), jnp.zeros(len(valid), jnp.int32)
@@ -236,10 +236,7 @@ class Gymnasium:
         """What a step leads to, `answers.stacked`. commanded: [M, act_dim]. going: [M], the members that take it."""
         shape, dtype = self._real.action.shape, self._real.action.dtype
         returned = self._real.step(commanded.reshape(-1, *shape).astype(dtype), going)
-        steps = [
-            answers.step(self._real.name, parts, self._low, self._high) if on else answers.idle(parts[0])
-            for parts, on in zip(returned, going, strict=True)
-        ]
+        steps = [answers.step(self._real.name, parts, self._low, self._high) for parts in returned]
         return answers.stacked(steps, commanded.shape[1])
 
     def _sent(self, action: np.ndarray, commanded: np.ndarray, sent: np.ndarray) -> np.ndarray:
@@ -262,9 +259,10 @@ class Gymnasium:
 
     def _measured(self, method: str, returned: Sequence[Any]) -> np.ndarray:
         """[M, measured_dim] of what a method of every environment has returned."""
-        where, sizes = f"{method} of {self._real.name}", f"the task {self.env.name} measures {_sizes(self.env)}"
-        size = self.env.measured_dim
-        return np.stack([answers.measured(where, self._observe(obs), size, sizes) for obs in returned])
+        env, where = self.env, f"{method} of {self._real.name}"
+        sizes = f"{env.measured_dim}: {', '.join(f'{e.name} [{e.size}]' for e in env.measured)}"
+        wanted = f"the task {env.name} measures {sizes}"
+        return np.stack([answers.measured(where, self._observe(obs), env.measured_dim, wanted) for obs in returned])
 
     def _success(self, rows: Step) -> np.ndarray:
         """[M] bool, of the last step, or of any where that is what the task asks."""
@@ -338,7 +336,7 @@ class _Separate:
     def step(self, actions: np.ndarray, going: np.ndarray) -> Sequence[tuple[Any, ...]]:
         """Five parts from each. actions: [M, *shape of an action]. going: [M]; the others may stay as they are."""
         returned = [
-            _call(self.name, env, "step", action) if on else (obs, 0.0, True, False, {})
+            _call(self.name, env, "step", action) if on else answers.idle(obs)
             for env, action, on, obs in zip(self.real, actions, going, self._obs, strict=True)
         ]
         self._obs = [parts[0] for parts in returned]
@@ -379,7 +377,8 @@ class _Vector:
 
     def step(self, actions: np.ndarray, going: np.ndarray) -> list[tuple[Any, ...]]:
         returned = _call(self.name, self.real, "step", actions)
-        return answers.vector(self.name, returned, self.count, same_step=self._same_step)
+        rows = answers.vector(self.name, returned, self.count, same_step=self._same_step)
+        return [row if on else answers.idle(row[0]) for row, on in zip(rows, going, strict=True)]
 
     def rest(self) -> None:
         pass
@@ -445,7 +444,3 @@ def _joined(name: str, sizes: Mapping[str, int], obs: Any) -> np.ndarray:
         raise UserError(f"{name}: observes a {type(obs).__name__}, not a mapping with {', '.join(sizes)}")
     parts = ((f"{part} of {name}", obs.get(part), size) for part, size in sizes.items())
     return np.concatenate([answers.measured(where, part, size, f"its space has {size}") for where, part, size in parts])
-
-
-def _sizes(env: Env) -> str:
-    return f"{env.measured_dim}: {', '.join(f'{e.name} [{e.size}]' for e in env.measured)}"

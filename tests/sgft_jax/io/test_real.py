@@ -129,8 +129,8 @@ def test_flags_may_be_numbers_and_what_is_not_valid_may_be_anything(tmp_path):
     obs = np.where(valid[..., None] > 0, np.ones(4), np.nan)
     RealStore(tmp_path).append(whole() | {"valid": valid, "success": np.array([1, 0], np.int8), "obs": obs})
     first, second = played(tmp_path)
-    assert len(first.rows["obs"]) == 2 and len(second.rows["obs"]) == 1
-    assert first.success is True and second.success is False and first.rows["obs"].dtype == np.float32
+    assert len(first.rows.obs) == 2 and len(second.rows.obs) == 1
+    assert first.success is True and second.success is False and first.rows.obs.dtype == np.float32
 
 
 @pytest.mark.parametrize("name", ["rollout-xyz.npz", "rollout-3.npz", "rollout-000001 (1).npz"])
@@ -193,7 +193,7 @@ def test_rollouts_may_differ_in_length(tmp_path):
     store = RealStore(tmp_path)
     store.append(whole())
     store.append(whole(steps=5))
-    assert [(one.seed, one.number, len(one.rows["obs"])) for one in played(tmp_path)] == [
+    assert [(one.seed, one.number, len(one.rows.obs)) for one in played(tmp_path)] == [
         (0, 0, 3),
         (0, 1, 5),
         (1, 0, 3),
