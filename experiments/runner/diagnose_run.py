@@ -20,7 +20,7 @@ from experiments.runner.real_systems import connect, is_robot, is_stepped, title
 from experiments.runner.recorded import RecordedSystem
 from sgft_jax import api, stacking
 from sgft_jax.algorithms import make_policy
-from sgft_jax.analysis import figures, prediction, tables, verdict
+from sgft_jax.analysis import figures, tables, verdict
 from sgft_jax.analysis.reading import last_start
 from sgft_jax.analysis.verdict import Names
 from sgft_jax.diagnosis import Rollouts
@@ -133,12 +133,12 @@ def average(diagnoses: Sequence[Mapping[str, Any]], *, same: bool) -> dict[str, 
 
 def predicted(diagnosis: Mapping[str, Any]) -> dict[str, Any]:
     """The prediction for one diagnosis, as JSON data."""
-    x = prediction.inputs_of(diagnosis)
+    x = verdict.inputs_of(diagnosis)
     return {
         "inputs": jsonable(x),
-        "gain": float(prediction.gain(x)),
-        "rollouts": prediction.AHEAD,
-        "until": {"level": prediction.LEVEL, "rollouts": prediction.rollouts_until(x)},
+        "gain": float(verdict.gain(x)),
+        "rollouts": verdict.AHEAD,
+        "until": {"level": verdict.LEVEL, "rollouts": verdict.rollouts_until(x)},
     }
 
 
@@ -278,5 +278,5 @@ def _row(label: str, diagnosis: Mapping[str, Any]) -> tuple[str, ...]:
         f"{value['shortfall']:.1f} sd",
         f"{value['rank_correlation']:.2f}",
         f"{four['real']} -> {four['identified']} ({four['simulated']})",
-        f"{100 * prediction.gain(prediction.inputs_of(diagnosis)):+.0f}",
+        f"{100 * verdict.gain(verdict.inputs_of(diagnosis)):+.0f}",
     )

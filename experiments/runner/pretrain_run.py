@@ -253,14 +253,10 @@ class _Run(Training):
             return  # every trajectory exploded: there is nothing to draw
         figures.pretraining(
             self.folder / "figures" / f"seed-{seed}.png",
+            ([line["step"] for line in curve], *([line[x][i] for line in curve] for x in ("success", "return"))),
+            (report.values[some], report.returns[some]),
+            (report.model_error, report.still_error),
             title=f"pretraining {self.env.name}, preset {self.args.preset}, seed {seed}",
-            steps=[line["step"] for line in curve],
-            success=[line["success"][i] for line in curve],
-            returns=[line["return"][i] for line in curve],
-            value=report.values[some],
-            monte_carlo=report.returns[some],
-            dynamics_error=report.model_error,
-            baseline_error=report.still_error,
         )
 
     def _say(self, results: list[dict[str, Any]]) -> None:

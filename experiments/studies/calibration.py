@@ -1,28 +1,58 @@
 """Impure: how well diagnoses of finished runs predict what these have gained. `diagnose_calibrate` is its command."""
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import nnls
 
 from envs.types import UserError
 from experiments.runner.cli import columns
 from experiments.runner.diagnose_run import load, play_simulated, read
 from experiments.runner.options import prior_folders, task_of_rollouts
 from sgft_jax import stacking
-from sgft_jax.analysis import prediction, tables
-from sgft_jax.analysis.prediction import AHEAD, Cases, Inputs
+from sgft_jax.analysis import tables
 from sgft_jax.analysis.reading import read_curve
+from sgft_jax.analysis.verdict import AHEAD, COEFFICIENTS, Coefficients, Inputs, gain, inputs_of, progress
 from sgft_jax.examination import Examiner
 from sgft_jax.files.disk import jsonable
 from sgft_jax.io.runs import read_config
+from sgft_jax.math.stats import Interval, bootstrap_interval, rank_correlation
 
 if TYPE_CHECKING:
     from experiments.studies.diagnose_calibrate import CalibrateArgs
 
 COUNTS = (1, 2, 4)  # rollouts that a prediction is made from
+_BINS = (0.0, 0.05, 0.2, 0.5, 1.0)  # of predicted gain, for the calibration table
+_PACES = np.linspace(0.5, 20.0, 79)
+
+
+class Cases(NamedTuple):
+    """Finished runs of m members (a gap and a prior each).
+
+    inputs: [m] of the formula. played: [m] success of the rollouts that these are from. zero_shot, gains: [m] success
+    before fine-tuning, and what came on top. curves: success of every member at its evaluations [e], as (rollouts,
+    success). gaps, priors: [m] names; the prior is the random factor.
+    """
+
+    inputs: Inputs
+    played: np.ndarray
+    zero_shot: np.ndarray
+    gains: np.ndarray
+    curves: Sequence[tuple[np.ndarray, np.ndarray]]
+    gaps: np.ndarray
+    priors: np.ndarray
+
+    def of(self, held: np.ndarray) -> "Cases":
+        """Those members, [m] bool."""
+        arrays = ("played", "zero_shot", "gains", "gaps", "priors")
+        chosen = {name: getattr(self, name)[held] for name in arrays}
+        inputs, curves = Inputs(*(x[held] for x in self.inputs)), list(itertools.compress(self.curves, held))
+        return self._replace(inputs=inputs, curves=curves, **chosen)
 
 
 def calibrate(args: "CalibrateArgs", runs: list[Path], checked: list[Path]) -> tuple[dict[str, Any], list[str]]:
@@ -33,22 +63,22 @@ def calibrate(args: "CalibrateArgs", runs: list[Path], checked: list[Path]) -> t
     if not checked and len({(curve.task, curve.gap) for curve in map(read_curve, runs)}) < 2:
         raise UserError("--runs: these runs are on one gap; name runs on others too, or some with --check")
     cases = gather(args, runs)
-    coefficients = prediction.fit(cases[-1])
+    coefficients = fit(cases[-1])
     if checked:
         fitted, held = cases, gather(args, checked)
         words = f"{len(checked)} other runs, predicted from {len(runs)}"
     else:
-        out = prediction.held_out(cases[-1].gaps)
+        out = held_out(cases[-1].gaps)
         fitted, held = ([case.of(members) for case in cases] for members in (~out, out))
         words = f"every second gap of {len(runs)} runs, predicted from the other gaps"
-    fits = [prediction.gain(new.inputs, prediction.fit(old)) for old, new in zip(fitted, held, strict=True)]
+    fits = [gain(new.inputs, fit(old)) for old, new in zip(fitted, held, strict=True)]
     final = held[-1]
     lines = {f"prediction after {n} rollouts": (fit, case) for n, fit, case in zip(COUNTS, fits, held, strict=True)}
-    lines["the same, coefficients of this version"] = (prediction.gain(final.inputs), final)
+    lines["the same, coefficients of this version"] = (gain(final.inputs), final)
     lines["100 - zero-shot (50 episodes or so)"] = (1.0 - final.zero_shot, final)
     lines[f"100 - success of the same {COUNTS[-1]} rollouts"] = (1.0 - final.played, final)
-    bands = {name: prediction.agreement(*pair) for name, pair in lines.items()}
-    rows = prediction.table(fits[-1], final)
+    bands = {name: agreement(*pair) for name, pair in lines.items()}
+    rows = table(fits[-1], final)
     summary = {
         "runs": [str(run) for run in runs],
         "checked": [str(run) for run in checked],
@@ -60,23 +90,21 @@ def calibrate(args: "CalibrateArgs", runs: list[Path], checked: list[Path]) -> t
     return jsonable(summary), _lines(words, final, coefficients, bands, rows)
 
 
-def _lines(
-    words: str, cases: Cases, coefficients: prediction.Coefficients, bands: dict, rows: Sequence[tuple]
-) -> list[str]:
+def _lines(words: str, cases: Cases, coefficients: Coefficients, bands: dict, rows: Sequence[tuple]) -> list[str]:
     sizes = f"{len(cases.gains)} members, {len(set(cases.gaps))} gaps, {len(set(cases.priors))} priors"
-    gain = f"mean gain in {AHEAD} rollouts or all there are {100 * cases.gains.mean():+.0f} points"
+    mean = f"mean gain in {AHEAD} rollouts or all there are {100 * cases.gains.mean():+.0f} points"
     correlations = [(name, tables.number(band, "correlation", digits=2)) for name, band in bands.items()]
-    table = [
+    ranges = [
         (f"{100 * low:.0f} to {100 * high:.0f}", str(n), f"{100 * predicted:+.0f}", f"{100 * measured:+.0f}")
         for low, high, n, predicted, measured in rows
     ]
     values = ", ".join(f"{name} {value:.3f}" for name, value in coefficients._asdict().items())
     return [
-        f"{words}: {sizes}; {gain}",
+        f"{words}: {sizes}; {mean}",
         "",
         *columns([("rank correlation with the gain", "[95 %, priors drawn first]"), *correlations]),
         "",
-        *columns([("predicted gain, points", "members", "mean predicted", "mean measured"), *table]),
+        *columns([("predicted gain, points", "members", "mean predicted", "mean measured"), *ranges]),
         "",
         f"coefficients from {COUNTS[-1]} rollouts of all of --runs: {values}",
     ]
@@ -107,7 +135,7 @@ def gather(args: "CalibrateArgs", runs: Sequence[Path]) -> list[Cases]:
         examined = examiner.examine(params, control, stacking.stack(rollouts), COUNTS)
         for member, (diagnosis, p) in enumerate(zip(examined, which, strict=True)):
             for i, found in enumerate(diagnosis.statistics):
-                inputs[i].append(prediction.inputs_of(found))
+                inputs[i].append(inputs_of(found))
                 played[i].append(found["success"])
             success = curve.values[member, held]
             gained = round(success[-1] - success[0], 6)  # equal ones must tie
@@ -118,3 +146,52 @@ def gather(args: "CalibrateArgs", runs: Sequence[Path]) -> list[Cases]:
     zero_shot, gains, curves, names, priors = zip(*facts, strict=True)
     rest = (np.array(zero_shot), np.array(gains), curves, np.array(names), np.array(priors))
     return [Cases(Inputs(*np.array(x).T), np.array(success), *rest) for x, success in zip(inputs, played, strict=True)]
+
+
+# --- the fit ----------------------------------------------------------------------------------------------------------
+
+
+def fit(cases: Cases) -> Coefficients:
+    """The coefficients by least squares, none negative, so that the formula stays monotone; the pace by search."""
+    x = cases.inputs
+    columns = np.stack([np.ones_like(x.success), x.improvable, x.explained], axis=1)
+    shares, _ = nnls(columns * (1.0 - x.success)[:, None], cases.gains)
+    return Coefficients(*map(float, shares), pace=_pace(cases))
+
+
+def _pace(cases: Cases) -> float:
+    """That which describes the curves best, of members that gained something."""
+    gained = [curve for curve, more in zip(cases.curves, cases.gains, strict=True) if more > 0.1]
+    if not gained:
+        return COEFFICIENTS.pace
+    missed = np.zeros(len(_PACES))
+    for rollouts, success in gained:
+        share = (success - success[0]) / (success[-1] - success[0])
+        missed += np.square(progress(rollouts[:, None], _PACES, int(rollouts[-1])) - share[:, None]).sum(axis=0)
+    return float(_PACES[np.argmin(missed)])
+
+
+def held_out(gaps: np.ndarray) -> np.ndarray:
+    """[m] bool: every second gap by name, to be predicted by one fit to the others.
+
+    One fit for each gap would not do: a gap that gains much lowers the coefficients that its own prediction comes from,
+    so that predictions of gaps that look alike would run against what they gain.
+    """
+    return np.isin(gaps, np.unique(gaps)[1::2])
+
+
+def agreement(predicted: ArrayLike, cases: Cases) -> Interval:
+    """Spearman's rank correlation of predicted [m] and measured gain; its 95 % interval draws priors, then members."""
+    pairs = np.stack([np.asarray(predicted, np.float64), cases.gains], axis=1)
+    return bootstrap_interval(pairs, statistic=rank_correlation, priors=cases.priors)
+
+
+def table(predicted: np.ndarray, cases: Cases) -> list[tuple[float, float, int, float, float]]:
+    """The calibration table: (low, high, members, mean predicted, mean measured gain) of each range that has any."""
+    rows = []
+    for low, high in itertools.pairwise(_BINS):
+        inside = (predicted >= low) & ((predicted < high) | (high == _BINS[-1]))
+        if inside.any():
+            means = float(predicted[inside].mean()), float(cases.gains[inside].mean())
+            rows.append((low, high, int(inside.sum()), *means))
+    return rows

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -110,24 +110,21 @@ def units(args: FrozenArgs) -> Iterator[Unit]:
     for preset in dict.fromkeys(preset_of(get_method(method)) for method in EVERYWHERE):
         for task in (*TASKS, *(SOFT if preset == DEFAULT_PRESET else ())):
             yield from _prior_units(args, task, preset)
-    for method in EVERYWHERE:
-        for task in TASKS:
-            yield from _run_units(args, task, method, (SIM, _test_file(task)))
+    for method, task in product(EVERYWHERE, TASKS):
+        yield from _run_units(args, task, method, (SIM, _test_file(task)))
     for task in TASKS:
         yield from _run_units(args, task, DEFAULT, (SIM, _test_file(task)), again=True)
-    for method in ON_SOFT:
-        for task in SOFT:
-            yield from _run_units(args, task, method, ("default",), few=True)
-    for method in (name for name in NAMES if name not in (*EVERYWHERE, *LEFT_OUT)):
-        for task in TASKS:
-            yield from _run_units(args, task, method, two_gaps(task), few=True)
+    for method, task in product(ON_SOFT, SOFT):
+        yield from _run_units(args, task, method, ("default",), few=True)
+    for method, task in product((name for name in NAMES if name not in (*EVERYWHERE, *LEFT_OUT)), TASKS):
+        yield from _run_units(args, task, method, two_gaps(task), few=True)
 
 
-def two_gaps(task: str) -> tuple[str, str]:
+def two_gaps(task: str) -> list[str]:
     """The first partial and the first failed test gap of a task."""
-    test = list(gaps.read_file(_test_file(task)).values())
-    first = [next(gap.name for gap in test if gap.stratum == stratum) for stratum in ("partial", "failed")]
-    return f"{_test_file(task)}:{first[0]}", f"{_test_file(task)}:{first[1]}"
+    test = gaps.read_file(_test_file(task)).values()
+    first = (next(gap.name for gap in test if gap.stratum == stratum) for stratum in ("partial", "failed"))
+    return [f"{_test_file(task)}:{name}" for name in first]
 
 
 def _test_file(task: str) -> Path:
@@ -150,19 +147,18 @@ def _prior_sets(args: FrozenArgs, task: str, preset: str) -> list[PretrainArgs]:
 
 def _prior_units(args: FrozenArgs, task: str, preset: str) -> Iterator[Unit]:
     sets = _prior_sets(args, task, preset)
-    for run, name in zip(sets, _part_names(_prior_name(task, preset), len(sets)), strict=True):
-        state = partial(_prior_state, run_folder(run))
-        yield Unit(name, (), state, partial(_make_priors, run, state))
+    for run, name in zip(sets, _part_names(f"{task}/prior-{preset}", len(sets)), strict=True):
+        yield Unit(name, (), partial(_prior_state, run), partial(_make_priors, run))
 
 
-def _prior_state(folder: Path) -> State:
-    if (folder / SUMMARY).exists():
+def _prior_state(run: PretrainArgs) -> State:
+    if (run_folder(run) / SUMMARY).exists():
         return "finished"
-    return "unfinished" if (folder / CONFIG).exists() else "missing"
+    return "unfinished" if (run_folder(run) / CONFIG).exists() else "missing"
 
 
-def _make_priors(run: PretrainArgs, state: Callable[[], State]) -> None:
-    pretrain(replace(run, resume=state() == "unfinished"))
+def _make_priors(run: PretrainArgs) -> None:
+    pretrain(replace(run, resume=_prior_state(run) == "unfinished"))
 
 
 def _run_units(
@@ -170,22 +166,21 @@ def _run_units(
 ) -> Iterator[Unit]:
     preset = preset_of(get_method(method))
     sets = _prior_sets(args, task, preset)
-    needs = _part_names(_prior_name(task, preset), len(sets))
+    needs = _part_names(f"{task}/prior-{preset}", len(sets))
     priors = sum(run.seeds for run in sets)
     systems = gaps.each(tuple(map(str, reals)))
     shares = [systems[i :: args.split] for i in range(min(args.split, len(systems)))]
     home = run_folder(sets[0]) if len(sets) == 1 else run_folder(sets[0]).parent
-    changes = {"prior": home, "variant": AGAIN if again else ""}
     whole = f"{task}/{method}" + (f"-{AGAIN}" if again else "")
     base = GridArgs(rollouts=ROLLOUTS, eval_every=EVAL_EVERY, impl=args.impl, out=args.out)
     seeds = min(priors, args.fewer) if few else priors
     for share, name in zip(shares, _part_names(whole, len(shares)), strict=True):
         shared = replace(base, tasks=(task,), methods=(method,), reals=share, seeds=seeds, seed=priors if again else 0)
-        cells = partial(_cells, shared, changes)
+        cells = partial(_cells, shared, prior=home, variant=AGAIN if again else "")
         yield Unit(name, needs, partial(_run_state, cells), partial(_complete, cells, shared, home, priors))
 
 
-def _cells(args: GridArgs, changes: Mapping[str, Any]) -> list[Cell]:
+def _cells(args: GridArgs, **changes: Any) -> list[Cell]:
     (task,), (method,) = args.tasks, args.methods
     return [grid.cell_of(args, task, real, method, **changes) for real in args.reals]
 
@@ -210,10 +205,6 @@ def _part_names(name: str, n: int) -> tuple[str, ...]:
 def _finished(every: Mapping[str, Unit], name: str) -> bool:
     """Whether all processes of a unit are done."""
     return all(unit.state() == "finished" for unit in every.values() if f"{unit.name}.".startswith(f"{name}."))
-
-
-def _prior_name(task: str, preset: str) -> str:
-    return f"{task}/prior-{preset}"
 
 
 def select(every: dict[str, Unit], only: Sequence[str]) -> list[Unit]:

@@ -149,33 +149,32 @@ def _note(curves: Sequence[Curve]) -> str:
 
 
 def pretraining(
-    path: Path,
-    *,
-    title: str,
-    steps: ArrayLike,
-    success: ArrayLike,
-    returns: ArrayLike,
-    value: ArrayLike,
-    monte_carlo: ArrayLike,
-    dynamics_error: ArrayLike,
-    baseline_error: ArrayLike | None = None,
+    path: Path, curve: Sequence[ArrayLike], promises: Sequence[ArrayLike], errors: Sequence[ArrayLike], *, title: str
 ) -> Path:
     """Panels: success and return while training, V_sim against what happened, model error by horizon if there is one.
 
-    steps, success, returns: [n_evaluations], steps in env steps. value, monte_carlo: [n] V_sim of a state and the
-    discounted return that followed. dynamics_error: [horizon] mean normalised error of the model's open-loop prediction
-    1, 2, ... steps ahead; baseline_error: the same for predicting that nothing changes.
+    curve: steps in the environment, success and return [n_evaluations]. promises: [n] V_sim of a state, and the
+    discounted return that followed. errors: [horizon] mean normalised error of the model's open-loop prediction 1, 2,
+    ... steps ahead, and the same for predicting that nothing changes; [0] where the model predicts no observations.
     """
-    columns = 4 if np.size(dynamics_error) else 3
+    steps, *scores = map(np.asarray, curve)
+    model, still = map(np.asarray, errors)
+    columns = 4 if model.size else 3
     figure, panels = _figure(3.0 * columns, 3.2, columns)
-    for axes, values, name in zip(panels, (success, returns), ("success rate", "return"), strict=False):
-        axes.plot(np.asarray(steps) / 1e6, np.asarray(values), color=PALETTE[0], linewidth=2)
+    for axes, values, name in zip(panels, scores, ("success rate", "return"), strict=False):
+        axes.plot(steps / 1e6, values, color=PALETTE[0], linewidth=2)
         _name(axes, name, "env steps (millions)")
         axes.set_xlim(left=0)
     panels[0].set_ylim(-0.03, 1.03)
-    _value_panel(panels[2], np.asarray(value), np.asarray(monte_carlo))
-    if columns == 4:
-        _dynamics_panel(panels[3], np.asarray(dynamics_error), baseline_error)
+    _value_panel(panels[2], *map(np.asarray, promises))
+    if model.size:
+        axes, horizon = panels[3], np.arange(1, len(model) + 1)
+        axes.plot(horizon, model, color=PALETTE[0], linewidth=2, marker="o", markersize=3)
+        axes.plot(horizon, still, color=_FAINT, linewidth=2)
+        look: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "size": 9, "color": _GREY}
+        axes.annotate("if nothing moved", (len(model), float(still[-1])), (-14, 0), **look)
+        axes.set_ylim(bottom=0)
+        _name(axes, "model error, standard deviations", "steps ahead")
     _head(figure, title)
     return _save(figure, path)
 
@@ -306,17 +305,6 @@ def _value_panel(axes: Axes, value: np.ndarray, monte_carlo: np.ndarray) -> None
     _name(axes, "V_sim against discounted return", "return that followed")
     bias, error = float((value - monte_carlo).mean()), float(np.sqrt(((value - monte_carlo) ** 2).mean()))
     axes.text(0.04, 0.95, f"bias {bias:+.2g}\nRMSE {error:.2g}", transform=axes.transAxes, va="top", size=9, color=_INK)
-
-
-def _dynamics_panel(axes: Axes, error: np.ndarray, baseline: ArrayLike | None) -> None:
-    horizon = np.arange(1, len(error) + 1)
-    axes.plot(horizon, error, color=PALETTE[0], linewidth=2, marker="o", markersize=3)
-    if baseline is not None:
-        axes.plot(horizon, np.asarray(baseline), color=_FAINT, linewidth=2)
-        end = (len(error), float(np.asarray(baseline)[-1]))
-        axes.annotate("if nothing moved", end, (-14, 0), textcoords="offset points", ha="right", size=9, color=_GREY)
-    axes.set_ylim(bottom=0)
-    _name(axes, "model error, standard deviations", "steps ahead")
 
 
 # ---------------------------------------------------------------- the look

@@ -5,7 +5,6 @@ in every row that they belong to.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -98,7 +97,15 @@ def summary(results: Results, *, reference: str, seeds: int, schedule: str) -> l
 
 def cells(results: Results) -> str:
     """A row for each data set and simulator: mean of every method with its standard deviation over seeds."""
-    return _table(("data", "simulator"), results.places(), results.methods, partial(_spread, results))
+
+    def cell(method: str, data: str, gap: str) -> str:
+        if (scores := results.of(method, data, gap)) is None:
+            return NONE
+        numbers = [float(scores.mean()), float(scores.std())][: len(scores)]  # one seed has no deviation
+        success = results.score == "success"
+        return " ± ".join(plain(x, results.score) if success else f"{x:,.0f}" for x in numbers)
+
+    return _table(("data", "simulator"), results.places(), results.methods, cell)
 
 
 def headline(results: Results) -> str:
@@ -108,7 +115,11 @@ def headline(results: Results) -> str:
     """
     count = len(results.gaps)
     head = f"mean over {count} simulators" if count > 1 else "one simulator"
-    return _table((head,), [(data,) for data in results.data], results.methods, partial(_overall, results))
+
+    def cell(method: str, data: str) -> str:
+        return number(overall(results, method, data), results.score)
+
+    return _table((head,), [(data,) for data in results.data], results.methods, cell)
 
 
 def duels(results: Results, reference: str) -> str:
@@ -117,8 +128,13 @@ def duels(results: Results, reference: str) -> str:
     It is the mean over the simulators on which both have finished, in per cent, with its bootstrap interval over seeds.
     """
     others = [method for method in results.methods if method != reference]
-    head = f"P({reference} better), per cent"
-    return _table((head,), [(data,) for data in results.data], others, partial(_duel, results, reference))
+
+    def cell(method: str, data: str) -> str:
+        pairs = [(results.of(reference, data, gap), results.of(method, data, gap)) for gap in results.gaps]
+        both = [(above, below) for above, below in pairs if above is not None and below is not None]
+        return number(improvement_of_pairs(*map(np.stack, zip(*both, strict=True))) if both else None)
+
+    return _table((f"P({reference} better), per cent",), [(data,) for data in results.data], others, cell)
 
 
 def measured(results: Results) -> str | None:
@@ -128,8 +144,12 @@ def measured(results: Results) -> str | None:
     """
     names = dict.fromkeys(name for curve in results.curves for name in curve.scores if name not in SCORES)
     places = [(name, *place) for name in names for place in results.places()]
-    head = ("measure", "data", "simulator")
-    return _table(head, places, results.methods, partial(_measured, results)) if places else None
+
+    def cell(method: str, name: str, data: str, gap: str) -> str:
+        values = results.of(method, data, gap, name)
+        return number(None if values is None else bootstrap_interval(values, statistic=mean), name, digits=2)
+
+    return _table(("measure", "data", "simulator"), places, results.methods, cell) if places else None
 
 
 def _table(
@@ -186,28 +206,3 @@ def overall(results: Results, method: str, data: str) -> Interval | None:
 def rescaled(task: str, scores: np.ndarray) -> np.ndarray:
     """[n] on D4RL's scale, unchanged for a task that has none."""
     return np.array([normalised(task, x) for x in scores.tolist()]) if task in D4RL else scores
-
-
-def _spread(results: Results, method: str, data: str, gap: str) -> str:
-    scores = results.of(method, data, gap)
-    if scores is None:
-        return NONE
-    numbers = [float(scores.mean()), float(scores.std())][: len(scores)]  # one seed has no deviation
-    success = results.score == "success"
-    return " ± ".join(plain(x, results.score) if success else f"{x:,.0f}" for x in numbers)
-
-
-def _overall(results: Results, method: str, data: str) -> str:
-    band = overall(results, method, data)
-    return NONE if band is None else number(band, results.score)
-
-
-def _measured(results: Results, method: str, name: str, data: str, gap: str) -> str:
-    values = results.of(method, data, gap, name)
-    return NONE if values is None else number(bootstrap_interval(values, statistic=mean), name, digits=2)
-
-
-def _duel(results: Results, reference: str, other: str, data: str) -> str:
-    pairs = [(results.of(reference, data, gap), results.of(other, data, gap)) for gap in results.gaps]
-    both = [(above, below) for above, below in pairs if above is not None and below is not None]
-    return number(improvement_of_pairs(*(np.stack(scores) for scores in zip(*both, strict=True)))) if both else NONE

@@ -105,8 +105,13 @@ def shared_grid(curves: Sequence[Curve]) -> np.ndarray:
     return common_grid([curve for curve in plain if curve.x[-1] >= usual / 3])
 
 
-def number(band: Interval, score: str = "success", *, digits: int = 1) -> str:
-    """A score with its interval, "92 [88, 95]", and alone where the interval says nothing; success is in per cent."""
+def number(band: Interval | None, score: str = "success", *, digits: int = 1) -> str:
+    """A score with its interval, "92 [88, 95]", and alone where the interval says nothing; success is in per cent.
+
+    NONE where there is nothing.
+    """
+    if band is None:
+        return NONE
     scale, digits = (100, 0) if score == "success" else (1, digits)
     rounded = [round(scale * float(x), digits) + 0.0 for x in band]  # + 0.0: no minus zero
     estimate, low, high = (f"{x:.{digits}f}" for x in rounded)
@@ -125,7 +130,7 @@ def words(score: str) -> str:
 
 def middle(curve: Curve, scores: np.ndarray | None) -> str:
     """The interquartile mean over members of these scores [members] with its interval."""
-    return NONE if scores is None else number(spread(curve, scores), curve.score)
+    return number(None if scores is None else spread(curve, scores), curve.score)
 
 
 def outcome(curves: Sequence[Curve]) -> str:

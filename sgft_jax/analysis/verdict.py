@@ -1,12 +1,13 @@
-"""What a diagnosis means, in words and as strengths of signs. Pure."""
+"""What a diagnosis means: what fine-tuning will gain, by one formula of three numbers, and signs of the gap. Pure."""
 
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from sgft_jax.analysis import prediction
-from sgft_jax.analysis.prediction import AHEAD, COEFFICIENTS, LEVEL, Coefficients, Inputs
+import numpy as np
 
+AHEAD, LEVEL = 20, 0.9  # rollouts over which the gain is predicted; success that counts as solved
+_SHORT = 40.0  # shortfall, in standard deviations, at which the imagined rollout of `inputs_of` is half a success
 # From where on a sign counts. The numbers are ours: they separate the development gaps from the control `sim`.
 _NATS = 20.0  # of evidence, as in `identify`
 _EXPLAINED = 0.3  # of the models' error, by what was identified
@@ -17,6 +18,77 @@ _NOISE = 2.0  # times that in simulation
 _MODELS = 1.5  # times the error in simulation
 _IMPROVABLE = 0.9  # of visited states, for a horizon that suffices
 _SOLVED, _WORTH = 0.95, 0.05  # success from which on fine-tuning has little to gain, and gain that is worth it
+
+
+class Coefficients(NamedTuple):
+    """What `experiments.studies.diagnose_calibrate` fits; base, improvable and explained are never negative.
+
+    The share of what is missing to full success that fine-tuning gains in AHEAD rollouts is
+    base + improvable * (share of improvable states) + explained * (share of the models' error that identification
+    removes).
+    pace: rollouts after which all but a share 1/e of the gain is there.
+    """
+
+    base: float
+    improvable: float
+    explained: float
+    pace: float
+
+
+COEFFICIENTS = Coefficients(base=0.10, improvable=0.53, explained=0.63, pace=2.75)  # provisional, docs/diagnose.md
+
+
+class Inputs(NamedTuple):
+    """Of the formula, numbers in [0, 1] or arrays [m] of them.
+
+    success: of the rollouts, see `inputs_of`. improvable: share of visited states in which some action keeps what V_sim
+    promises. explained: share of the models' error four steps ahead that identification removes.
+    """
+
+    success: Any
+    improvable: Any
+    explained: Any
+
+
+def inputs_of(diagnosis: Mapping[str, Any]) -> Inputs:
+    """Of one diagnosis, see `examination.describe`.
+
+    Success of n rollouts counts as (successes + p) / (n + 1), where p is 1 if rollouts return what V_sim promises and
+    falls with their shortfall: after a few rollouts, how far they fall short says more than how many failed.
+    """
+    n, ahead = diagnosis["rollouts"], diagnosis["horizons"].index(4)
+    likely = 1.0 / (1.0 + max(diagnosis["value"]["shortfall"], 0.0) / _SHORT)
+    real, identified = (diagnosis["model_error"][name][ahead] for name in ("real", "identified"))
+    return Inputs(
+        success=(n * diagnosis["success"] + likely) / (n + 1),
+        improvable=diagnosis["value"]["real"][0]["improvable"],
+        explained=float(np.clip(1.0 - identified / max(real, 1e-9), 0.0, 1.0)),
+    )
+
+
+def gain(x: Inputs, c: Coefficients = COEFFICIENTS) -> Any:
+    """Success after AHEAD rollouts minus zero-shot success; falls with success, grows with the other two."""
+    share = c.base + c.improvable * x.improvable + c.explained * x.explained
+    return (1.0 - x.success) * np.clip(share, 0.0, 1.0)
+
+
+def success_after(x: Inputs, rollouts: Any, c: Coefficients = COEFFICIENTS) -> Any:
+    """Expected success after that many rollouts; the gain comes exponentially at the pace."""
+    return x.success + gain(x, c) * progress(rollouts, c.pace)
+
+
+def progress(rollouts: Any, pace: Any, ahead: int = AHEAD) -> Any:
+    """The share of the gain of `ahead` rollouts that is there after so many."""
+    return -np.expm1(-np.asarray(rollouts) / pace) / -np.expm1(-ahead / pace)
+
+
+def rollouts_until(x: Inputs, level: float = LEVEL, c: Coefficients = COEFFICIENTS) -> int | None:
+    """The first number of rollouts after which that success is expected; None if it takes more than AHEAD."""
+    reached = np.flatnonzero(success_after(x, np.arange(AHEAD + 1), c) >= level)
+    return int(reached[0]) if reached.size else None
+
+
+# --- in words ---------------------------------------------------------------------------------------------------------
 
 
 class Names(NamedTuple):
@@ -44,7 +116,7 @@ def signs(diagnosis: Mapping[str, Any], names: Names) -> list[Sign]:
     ahead = diagnosis["horizons"].index(4)
     errors = {key: values[ahead] for key, values in diagnosis["model_error"].items()}
     times = errors["identified"] / max(errors["simulated"], 1e-9)
-    explained = prediction.inputs_of(diagnosis).explained
+    explained = inputs_of(diagnosis).explained
     sure = min(diagnosis["identified"]["nats"] / _NATS, 1.0) * min(explained / _EXPLAINED, 1.0)
     scales, biases = (dict(zip(names.action, known[key], strict=True)) for key in ("scale", "bias"))
     scale, bias = max(abs(math.log(x)) for x in scales.values()), max(map(abs, biases.values()))
@@ -120,9 +192,9 @@ def _measure(value: float, unit: str, sign: str = "+") -> str:
 def verdict(diagnosis: Mapping[str, Any], names: Names, c: Coefficients = COEFFICIENTS) -> list[str]:
     """What kind of gap it looks like, whether fine-tuning helps, which horizon, how many rollouts: a line for each.
 
-    diagnosis: see `examination.describe`. c: of the prediction.
+    diagnosis: see `examination.describe`. c: of the formula.
     """
-    x = prediction.inputs_of(diagnosis)
+    x = inputs_of(diagnosis)
     kind, worth = _kind(signs(diagnosis, names)), _worth(diagnosis["success"], x, c)
     return [kind, _guide(diagnosis["value"]), worth, _horizon(diagnosis), _how_long(x, c)]
 
@@ -147,12 +219,11 @@ def _guide(value: Mapping[str, Any]) -> str:
 
 def _worth(success: float, x: Inputs, c: Coefficients) -> str:
     """success: share of the rollouts, without the doubt that `inputs_of` adds."""
-    gain = 100 * prediction.gain(x, c)
-    after = 100 * prediction.success_after(x, AHEAD, c)
-    words = f"{gain:+.0f} points expected in {AHEAD} rollouts, to {after:.0f} %"
+    points, after = 100 * gain(x, c), 100 * success_after(x, AHEAD, c)
+    words = f"{points:+.0f} points expected in {AHEAD} rollouts, to {after:.0f} %"
     if success >= _SOLVED:
-        return f"fine-tuning: little to gain ({gain:+.0f} points expected); keep the policy, or use a guarded method"
-    if gain >= 100 * _WORTH:
+        return f"fine-tuning: little to gain ({points:+.0f} points expected); keep the policy, or use a guarded method"
+    if points >= 100 * _WORTH:
         return f"fine-tuning: worth it, {words}"
     return f"fine-tuning: little hope ({words}); a simulator with what differs, see above, helps more"
 
@@ -171,7 +242,7 @@ def _horizon(diagnosis: Mapping[str, Any]) -> str:
 
 
 def _how_long(x: Inputs, c: Coefficients) -> str:
-    n = prediction.rollouts_until(x, LEVEL, c)
+    n = rollouts_until(x, LEVEL, c)
     if n is None:
         return f"time: {100 * LEVEL:.0f} % are not expected within {AHEAD} rollouts"
     return f"time: {100 * LEVEL:.0f} % expected {f'after {n} rollout{"s" * (n > 1)}' if n else 'now'}"

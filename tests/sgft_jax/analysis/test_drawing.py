@@ -143,13 +143,9 @@ def test_pretraining_panels(tmp_path, n):
     returns = np.linspace(0, 5, n)
     path = figures.pretraining(
         tmp_path / "pretraining.png",
+        (np.arange(10) * 1e5, np.linspace(0, 1, 10), np.linspace(0, 50, 10)),
+        (returns, returns),
+        ([0.1, 0.2, 0.3], [0.2, 0.5, 0.9]),
         title="Pretraining",
-        steps=np.arange(10) * 1e5,
-        success=np.linspace(0, 1, 10),
-        returns=np.linspace(0, 50, 10),
-        value=returns,
-        monte_carlo=returns,
-        dynamics_error=[0.1, 0.2, 0.3],
-        baseline_error=[0.2, 0.5, 0.9],
     )
     assert read(path).shape[:2] == (384, 1440)

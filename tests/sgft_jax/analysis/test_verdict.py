@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from sgft_jax.analysis import figures, verdict
-from sgft_jax.analysis.prediction import Coefficients
-from sgft_jax.analysis.verdict import Names
+from sgft_jax.analysis.verdict import Coefficients, Names
 
 NAMES = Names(
     action=["x", "y"], sensors=[("hand", "m"), ("puck", "m"), ("angle", "rad")], errors=(0.0, 0.01, 0.0), dt=0.2
