@@ -11,7 +11,15 @@ from envs import gaps
 from envs.gaps import SIM, Gap
 from envs.types import UserError
 from experiments.runner import cli
-from experiments.runner.options import Impl, at_least_one, prior_folders, seed_list, task_of_priors, without_repeats
+from experiments.runner.options import (
+    Impl,
+    at_least_one,
+    each_once,
+    prior_folders,
+    seed_list,
+    task_of_priors,
+    without_repeats,
+)
 from experiments.runner.real_systems import REMOTE, TOGETHER, connect, described, is_robot, is_stepped
 from experiments.runner.real_systems import check as check_real
 from sgft_jax.io.runs import check_folder
@@ -81,6 +89,7 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     import jax
 
     import envs
+    from experiments.runner.pictures import film_episode
     from experiments.runner.recorded import RecordedSystem
     from experiments.runner.training import describe, play
     from sgft_jax.algorithms import make_policy
@@ -105,29 +114,23 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
             system = RecordedSystem(system, [store], done=len(store), explore=False, sync_every=1)
         played = play(system, make_policy(card, env), members, key_episodes, args.episodes)
 
-    def results_on(i: int) -> dict[str, Any]:
-        episodes = part(played, i, len(priors))
-        labelled = [(folder, member(episodes, k)) for k, folder in enumerate(folders)]
-        policies = [
-            {"policy": str(folder), **describe(one), **_filmed(args, system, i, one, folder)}
-            for folder, one in labelled
-        ]
-        return {"policies": policies, **({"real_steps": int(episodes.valid.sum())} if stepped else {})}
+    def results_of(i: int, k: int) -> dict[str, Any]:
+        """Of the k-th policy on the i-th system. The film is that of its first episode."""
+        folder, episodes = folders[k], member(played, i * len(priors) + k)
+        results = {"policy": str(folder), **describe(episodes)}
+        if args.video is not None:
+            path = args.video / f"{gaps.title(args.real[i])}-{folder.name}.mp4"
+            results["video"] = film_episode(system.env, system.pools, i, member(episodes, 0), path)
+        return results
 
-    where = ["in simulation" if gap is None else f"on the {gap.name} real system" for gap in reals]
-    systems = [{"where": name, **results_on(i)} for i, name in enumerate(where)]
+    systems = []
+    for i, gap in enumerate(reals):
+        facts = {"where": "in simulation" if gap is None else f"on the {gap.name} real system"}
+        facts |= {"policies": [results_of(i, k) for k in range(len(priors))]}
+        if stepped:
+            facts["real_steps"] = int(part(played, i, len(priors)).valid.sum())
+        systems.append(facts)
     return {"task": env.name, "impl": env.impl, "episodes": args.episodes, "systems": systems}
-
-
-def _filmed(args: EvaluateArgs, system: Any, i: int, played: Any, folder: Path) -> dict[str, str]:
-    """How the film of the first of the episodes [n] of a policy, on the i-th real system, went; {} without --video."""
-    from experiments.runner.pictures import film_episode
-    from sgft_jax.stacking import member
-
-    if args.video is None:
-        return {}
-    path = args.video / f"{gaps.title(args.real[i])}-{folder.name}.mp4"
-    return {"video": film_episode(system.env, system.pools, i, member(played, 0), path)}
 
 
 def _simulated(env: Any, reals: Sequence[Gap | None], key: Any, episodes: int, *, members: int, gamma: float) -> Any:
@@ -153,9 +156,7 @@ def check(args: EvaluateArgs) -> tuple[list[Path], str]:
         raise UserError("nothing to evaluate: name a folder with --prior or --run, or a task with --task")
     at_least_one(args, "episodes")
     seed_list(args.seed, 1)
-    if not args.real:
-        raise UserError("--real: name at least one")
-    without_repeats("--real", args.real)
+    each_once(args, "real")
     reals = [real for real in args.real if real != SIM]
     if len(reals) < len(args.real) and any(map(is_stepped, reals)):
         raise UserError(f"--real {' '.join(args.real)}: {TOGETHER}")

@@ -13,7 +13,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from envs.types import UserError
 from experiments.runner import cli, real_systems
@@ -22,9 +21,6 @@ from experiments.runner.options import at_least_one, check_prior, seed_list
 from sgft_jax.io.cards import resolve_shipped
 from sgft_jax.io.runs import check_folder
 from sgft_jax.methods import get_method
-
-if TYPE_CHECKING:
-    import numpy as np
 
 TASK = "panda-push"
 HOME = Path("build/panda-gym")  # where the environment is, or shall be made
@@ -198,7 +194,8 @@ def show(args: RealDemoArgs) -> None:
     run = run_folder(arguments(args.method, task=TASK, seeds=1, seed=args.seed, out=args.out), real_systems.REMOTE)
     stores = [evaluation_store(run, done) for done in (0, args.rollouts)]
     before, after = ([bool(store.load(i)["success"][0]) for i in range(len(store))] for store in stores)
-    rates = f"{_percent(before)} before, {_percent(after)} after {args.rollouts} rollouts of {args.method}"
+    first, last = (f"{100 * sum(succeeded) / len(succeeded):.0f} %" for succeeded in (before, after))
+    rates = f"{first} before, {last} after {args.rollouts} rollouts of {args.method}"
     played = f"{args.episodes} episodes, in which the cube lay within 5 cm of the mark at the end"
     print(f"\nsuccess in Bullet: {rates}; one seed, {played}")
     print(film(args, before, after) if args.video else "no video: not asked for")
@@ -210,6 +207,7 @@ def film(args: RealDemoArgs, before: Sequence[bool], after: Sequence[bool]) -> s
     import numpy as np
 
     from envs.mujoco.render import write_side_by_side
+    from experiments.runner.pictures import telling
 
     first, last = filmed(args)
     i = telling(np.array(before[: len(first)]), np.array(after[: len(last)]))
@@ -221,16 +219,6 @@ def film(args: RealDemoArgs, before: Sequence[bool], after: Sequence[bool]) -> s
     except Exception as error:  # whatever a file or a video encoder raises: a demo does not fail for a picture
         return f"no video: {(str(error).strip() or type(error).__name__).splitlines()[0]}"
     return f"video: {path}"
-
-
-def _percent(succeeded: Sequence[bool]) -> str:
-    return f"{100 * sum(succeeded) / len(succeeded):.0f} %"
-
-
-def telling(first: "np.ndarray", last: "np.ndarray") -> int:
-    """Which episode to show, of successes before and after, [n] bool: the first that was mended, else the first."""
-    mended = (~first & last).nonzero()[0]
-    return int(mended[0]) if len(mended) else 0
 
 
 if __name__ == "__main__":

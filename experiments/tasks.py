@@ -54,20 +54,16 @@ def describe(task: str) -> dict[str, Any]:
         "about": _first_line(envs.TASKS[name]),
         **{field: [e._asdict() for e in getattr(env, field)] for field in ("observation", "action")},
         **{field: getattr(env, field) for field in ("control_dt", "episode_length", "score", "success_anytime")},
-        "parameters": [_finite(p._asdict()) for p in env.parameters],
+        # JSON has no infinity: no bound is null.
+        "parameters": [
+            {k: None if x in (math.inf, -math.inf) else x for k, x in p._asdict().items()} for p in env.parameters
+        ],
         "effects": _effects(env.training, sizes, cartesian=env.cartesian),
-        "gaps": {name: _differences(gap._asdict()) for name, gap in gaps.presets(name).items()},
+        "gaps": {
+            name: {k: x for k, x in gap._asdict().items() if x and k != "name"}
+            for name, gap in gaps.presets(name).items()
+        },
     }
-
-
-def _differences(gap: dict[str, Any]) -> dict[str, Any]:
-    """What a gap says, without its name."""
-    return {name: value for name, value in gap.items() if value and name != "name"}
-
-
-def _finite(facts: dict[str, Any]) -> dict[str, Any]:
-    """JSON has no infinity: no bound is null."""
-    return {name: None if value in (math.inf, -math.inf) else value for name, value in facts.items()}
 
 
 def _effects(training: Any, sizes: dict[str, int], *, cartesian: bool) -> list[dict[str, Any]]:

@@ -61,7 +61,8 @@ def diagnose(
         else:
             real, simulated = _play_both(env, gaps.load(env, args.real), priors, count, args.seed)
         where = name if is_stepped(args.real) else f"the gap {name}"
-        what = f"{_rollouts(count)} of {_priors(len(priors))}, just played zero-shot on {where}"
+        who = "one prior" if len(priors) == 1 else f"each of {len(priors)} priors"
+        what = f"{_rollouts(count)} of {who}, just played zero-shot on {where}"
     labels = [str(folders[p]) for p in which]
     examined, mean = _examine(env, priors, real, simulated, which)
     names = names_of(env)
@@ -151,7 +152,7 @@ def play(env: Env, reals: Sequence[Gap], priors: list[Prior], n: int, seed: int)
     key = jax.random.fold_in(jax.random.key(_SEED), seed)
     keys = jnp.broadcast_to(jax.random.split(key, n), (len(reals) * len(priors), n))
     played = system.play(make_policy(priors[0].card, system.env), members, keys, explore=True)
-    return [rollouts_of(jax.tree.map(np.asarray, stacking.member(played, i))) for i in range(len(keys))]
+    return _of_members(jax.tree.map(np.asarray, played), len(keys))
 
 
 def play_simulated(env: Env, priors: list[Prior], seed: int) -> list[Rollouts]:
@@ -180,12 +181,13 @@ def _play_real(env: Env, args: "DiagnoseArgs", priors: list[Prior], n: int, home
         played = kept.play(make_policy(priors[0].card, env), members, keys, explore=True)
     finally:
         system.close()
-    return [rollouts_of(stacking.member(played, i)) for i in range(len(priors))]
+    return _of_members(played, len(priors))
 
 
-def rollouts_of(episodes: Episode) -> Rollouts:
-    """Of episodes [n], what a diagnosis reads."""
-    return Rollouts(episodes.transitions, episodes.valid, episodes.success)
+def _of_members(played: Episode, count: int) -> list[Rollouts]:
+    """Of episodes [members, n], what a diagnosis reads of each member."""
+    rollouts = Rollouts(played.transitions, played.valid, played.success)
+    return [stacking.member(rollouts, i) for i in range(count)]
 
 
 def read(home: Path, env: Env, priors: Sequence[Prior], most: int | None) -> tuple[list[Rollouts], list[int]]:
@@ -205,7 +207,9 @@ def read(home: Path, env: Env, priors: Sequence[Prior], most: int | None) -> tup
     both = Rollouts(rows, joined["valid"].astype(bool), joined["success"].astype(bool))
     real, config, p = [stacking.member(both, s) for s in range(len(both.success))], read_config(home), len(priors)
     if config:
-        _check_digests(home, priors)
+        known = last_start(home).get("priors", [])
+        if known and known != [digest(prior) for prior in priors]:
+            raise UserError(f"{home}: began with other priors than these; name them with --prior")
         return real, [(config.get("seed", 0) + s) % p for s in range(len(real))]
     if len(real) == 1:
         real *= p
@@ -231,13 +235,6 @@ def _check(
         raise UserError(f"{path}: has another number of seeds or steps than the first rollout")
 
 
-def _check_digests(home: Path, priors: Sequence[Prior]) -> None:
-    """Raises UserError where a run says that it began with other priors."""
-    known = last_start(home).get("priors", [])
-    if known and known != [digest(prior) for prior in priors]:
-        raise UserError(f"{home}: began with other priors than these; name them with --prior")
-
-
 # --- for people -------------------------------------------------------------------------------------------------------
 
 
@@ -253,10 +250,6 @@ def _points(examined: Sequence[Examined]) -> dict[str, tuple[np.ndarray, np.ndar
 
 def _rollouts(n: int) -> str:
     return f"{n} rollout{'s' * (n > 1)}"
-
-
-def _priors(n: int) -> str:
-    return "one prior" if n == 1 else f"each of {n} priors"
 
 
 def _lines(labels: Sequence[str], examined: Sequence[Examined], mean: Mapping[str, Any]) -> list[str]:

@@ -18,11 +18,11 @@ from experiments.runner.options import (
     check_folders,
     check_prior,
     check_variant,
+    each_once,
     not_negative,
     prior_folders,
     seed_list,
     seeds_name,
-    without_repeats,
 )
 from experiments.runner.real_systems import REMOTE, is_robot, is_stepped, title
 from experiments.runner.real_systems import check as check_real
@@ -167,9 +167,7 @@ def check(args: FinetuneArgs) -> tuple[Online, list[int]]:
         raise UserError(f"--real-updates {args.real_updates}: 0 or more, and of --real-data, which must be named")
     if args.successors != "stored" and not args.real_data:
         raise UserError(f"--successors {args.successors}: is for --real-data, which must be named")
-    if not args.real:
-        raise UserError("--real: name at least one")
-    without_repeats("--real", args.real)
+    each_once(args, "real")
     check_real(args.task, args.real, args.set)
     if not is_stepped(args.real[0]):
         gaps.changes(args.set)

@@ -1,25 +1,21 @@
 """Impure: what a fine-tuning run leaves on disk for one real system, whether that is played alone or with others."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
-from envs.base import Env, World
+from envs.base import Env
 from envs.gaps import Gap
-from envs.rollout import Episode
 from envs.types import PyTree
-from experiments.runner.pictures import before_and_after
 from experiments.runner.training import Record
 from sgft_jax.analysis import figures, tables
 from sgft_jax.analysis.curves import Curve, deepest_fall, describe
 from sgft_jax.analysis.reading import read_curve
 from sgft_jax.io.log import EVAL, check_finite, read_jsonl, write_summary
 from sgft_jax.io.real import RealStore
-from sgft_jax.stacking import member
 from sgft_jax.train.finetuning import FinetuneProgress
 from sgft_jax.types import Metrics
 
@@ -127,22 +123,6 @@ class FinetuneRecord(Record):
         stores = [self.real, *(RealStore(folder) for folder in sorted((self.folder / EVALUATION).glob("*")))]
         steps = [store.rollout(i)["valid"].sum(1) for store in stores for i in range(len(store))]
         return np.sum(steps, axis=0).tolist()
-
-    def film(self, pool: World, play: Callable[[], Sequence[Episode]], rollouts: int) -> str:
-        """An evaluation episode of the first seed before and after fine-tuning; says in one line how it went.
-
-        play() -> both policies' episodes [S, n] in worlds of `pool`. The first one that only the tuned agent solves:
-        what fine-tuning is about. Without one, the first.
-        """
-
-        def chosen() -> list[Episode]:
-            both = [member(episodes, 0) for episodes in play()]
-            old, new = (np.asarray(episodes.success) for episodes in both)
-            first = int(np.argmax(new & ~old))
-            return [jax.tree.map(lambda x: np.asarray(x[first]), episodes) for episodes in both]
-
-        path = self.folder / "videos" / f"seed-{self.seeds[0]}.mp4"
-        return before_and_after(self.env, pool, chosen, path, rollouts=rollouts)
 
     def _transitions(self) -> int:
         """Real transitions of a seed so far, those that evaluations have cost included; the mean where seeds differ."""

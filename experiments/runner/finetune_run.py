@@ -1,9 +1,8 @@
 """Impure: a fine-tuning run, `finetuning.finetune` with folders, checkpoints, logs, evaluations and videos."""
 
 import contextlib
-import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +16,7 @@ from envs.rollout import Episode
 from experiments.runner import cli, real_systems
 from experiments.runner.finetune_record import FinetuneRecord, evaluation_store
 from experiments.runner.machines import reserve
+from experiments.runner.pictures import before_and_after
 from experiments.runner.recorded import RecordedSystem, begin_with, read_log
 from experiments.runner.training import Training, opened, scores
 from sgft_jax import api
@@ -24,10 +24,10 @@ from sgft_jax.api import Setup
 from sgft_jax.datasets.logs import Log
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.methods import get_method
-from sgft_jax.stacking import join, part
+from sgft_jax.stacking import join, member, part
 from sgft_jax.systems.simulated import KnownSystem, System
 from sgft_jax.train import finetuning
-from sgft_jax.train.finetuning import FinetuneProgress, Logged
+from sgft_jax.train.finetuning import FinetuneProgress
 from sgft_jax.train.learner_process import LearnerProcess
 from sgft_jax.train.options import card_of
 from sgft_jax.types import Finetuner, Online, Prior
@@ -57,33 +57,33 @@ def run(
         last.enter_context(mesh.use(devices))
         playing, members, stepped = systems, seeds, real_systems.is_stepped(args.real[0])
         if stepped:
-            playing = real_systems.connect(
-                env, args.real, args.set, members=len(seeds), gamma=card["gamma"], home=args.out
-            )
+            one_each = {"members": len(seeds), "gamma": card["gamma"], "home": args.out}
+            playing = real_systems.connect(env, args.real, args.set, **one_each)
             last.push(lambda error, *_: playing.close(over=error is None))
             members = seeds * len(args.real)
         setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
-        assert isinstance(setup.system, KnownSystem)
         # Last: what is wrong with a robot or with a method of the user's own leaves no folder behind.
         inputs = {
             "priors": [digest(prior) for prior in priors],
             "real_data": [log.facts.sha256[:12] for log in logs],
             "successors": [log.facts.successors for log in logs],
         }
-        folders_of_runs = last.enter_context(opened("finetune", args, homes, inputs))
+        begun = last.enter_context(opened("finetune", args, homes, inputs))
         known = sum(log.facts.transitions for log in logs)
         record = functools.partial(FinetuneRecord, real_evaluations=stepped, logged=known)
-        records = [
-            record(folder, setup.system.env, gap, method.name, seeds)
-            for folder, gap in zip(folders_of_runs, systems, strict=True)
-        ]
+        world = setup.system.env
+        records = [record(x, world, gap, method.name, seeds) for x, gap in zip(begun, systems, strict=True)]
         learner = None
         if real_systems.is_robot(args.real[0]):
+            prior = jax.device_get(priors[0]) if priors else None
+            again = functools.partial(
+                build, args.task, args.impl, args.method, dict(vars(args.options)), observed_by(folders), prior
+            )
             which = finetuning.prior_of(setup.priors, setup.seeds)
-            learner = LearnerProcess(_build(args, folders, priors), setup.seeds, which, setup.simulated)
+            learner = LearnerProcess(again, setup.seeds, which, setup.simulated)
             last.callback(learner.close)
             learner.wait()
-        return _Run(args, setup, setup.system, card, records, logs, learner).work()
+        return _Run(args, setup, card, records, logs, learner).work()
 
 
 def _reserve(args: "FinetuneArgs", env: Env, priors: int, devices: int) -> None:
@@ -94,17 +94,13 @@ def _reserve(args: "FinetuneArgs", env: Env, priors: int, devices: int) -> None:
     reserve(kept, copies=1, devices=devices, settings="options")
 
 
-def _build(args: "FinetuneArgs", folders: list[Path], priors: list[Prior]) -> Callable[[], Finetuner]:
-    """Makes the finetuner of the run again, in another process."""
-    options = {field.name: getattr(args.options, field.name) for field in dataclasses.fields(args.options)}
-    prior = jax.device_get(priors[0]) if priors else None
-    return functools.partial(build, args.task, args.impl, args.method, options, observed_by(folders), prior)
-
-
 def build(
     task: str, impl: str, method: str, options: dict[str, Any], observed: dict[str, Any], prior: Prior | None
 ) -> Finetuner:
-    """The finetuner of a run. Method and options are names and numbers, because a user's own file is no module."""
+    """The finetuner of a run, made again in another process.
+
+    Method and options are names and numbers, because a user's own file is no module.
+    """
     cli.set_up()
     chosen = get_method(method)
     return chosen.build(chosen.config(**options), prior, envs.make(task, impl, **observed))
@@ -135,39 +131,41 @@ class _Run(Training):
         self,
         args: "FinetuneArgs",
         setup: Setup,
-        system: KnownSystem,
         card: dict[str, Any],
         records: list[FinetuneRecord],
         logs: list[Log],
         learner: LearnerProcess | None,
     ) -> None:
-        names = "+".join(record.gap.name for record in records)
-        title, every = f"{records[0].method} on {system.env.name}/{names}", (args.eval_every, args.checkpoint_every)
-        super().__init__(records, title, args.rollouts, eval_every=every[0], checkpoint_every=every[1])
-        self.logs, self.learner, self.sync_every = logs, learner, args.sync_every if learner else None
-        self.args, self.setup, self.card = args, setup, card
-        self.finetuner, self.system, self.seeds = setup.finetuner, system, setup.seeds
-        self.episodes = args.eval_episodes or 0
+        assert isinstance(setup.system, KnownSystem)
+        self.args, self.setup, self.card, self.records, self.logs, self.learner = (
+            args,
+            setup,
+            card,
+            records,
+            logs,
+            learner,
+        )
+        self.finetuner, self.system, self.seeds = setup.finetuner, setup.system, setup.seeds
+        self.episodes, self.sync_every = args.eval_episodes or 0, args.sync_every if learner else None
         self.begin = functools.partial(finetuning.begin, setup.finetuner, setup.priors, setup.seeds, setup.simulated)
+        title = f"{records[0].method} on {self.system.env.name}/{'+'.join(record.gap.name for record in records)}"
+        every = {"eval_every": args.eval_every, "checkpoint_every": args.checkpoint_every}
+        super().__init__(title, args.rollouts, len(records[0].seeds), **every)
 
     def work(self) -> list[dict[str, Any]]:
         """Everything, in order; returns the summaries."""
         restored = self.restore(lambda: jax.eval_shape(lambda: _part(self.begin(), 0, self.count)))
         progress = _join([progress for progress, _ in restored]) if restored else None
-        done = self.done(progress) if progress else 0
+        done, args = self.done(progress) if progress else 0, self.args
         stores = [record.real for record in self.records]
         recorded = RecordedSystem(self.system, stores, done=done, sync_every=self.sync_every)
-        setup, rollouts = self.setup._replace(system=recorded), self.args.rollouts
-        learn = functools.partial(finetuning.finetune, *setup, rollouts=rollouts, learner=self.learner)
-        steps = learn(progress=progress, waits=self.args.hand_over == "rollouts", logged=self._logged())
+        logged = None
+        if self.logs:
+            sizes = {"capacity": args.options.replay_capacity, "updates": args.real_updates}
+            logged = begin_with(self.logs, self.finetuner, self.system.env, **sizes)
+        setup, how = self.setup._replace(system=recorded), {"waits": args.hand_over == "rollouts", "logged": logged}
+        steps = finetuning.finetune(*setup, rollouts=args.rollouts, learner=self.learner, progress=progress, **how)
         return self._finish(self.follow(steps, done))
-
-    def _logged(self) -> Logged | None:
-        """What the logs are for the members, None without logs."""
-        if not self.logs:
-            return None
-        capacity, updates = self.args.options.replay_capacity, self.args.real_updates
-        return begin_with(self.logs, self.finetuner, self.system.env, capacity=capacity, updates=updates)
 
     # ------------------------------------------------------------ between rollouts
 
@@ -229,7 +227,9 @@ class _Run(Training):
             summaries.append(record.summarise(rollouts, chosen))
             if self.args.video and n and self.system.pools is not None:
                 pool = jax.tree.map(lambda x, i=i: x[i], self.system.pools)
-                print(record.film(pool, lambda members=members: [members(x) for x in films()], rollouts))
+                path = record.folder / "videos" / f"seed-{record.seeds[0]}.mp4"
+                play = functools.partial(lambda first: [member(x, first) for x in films()], i * self.count)
+                print(before_and_after(record.env, pool, play, path, rollouts=rollouts))
             print(f"results: {record.folder}  (policy/, best/, real/, summary.json, figures/)")
         print(f"next: python -m experiments.figures --out {self.args.out}")
         return summaries

@@ -4,7 +4,7 @@ import functools
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -12,10 +12,9 @@ import numpy as np
 
 import envs
 from envs import gaps, normalised
-from envs.base import Env, World
+from envs.base import Env
 from envs.gaps import SIM, Gap
 from envs.rollout import Episode, real_env, real_worlds
-from envs.types import Key
 from experiments.runner.machines import reserve
 from experiments.runner.pictures import film_episode
 from experiments.runner.recorded import read_log
@@ -23,7 +22,7 @@ from experiments.runner.training import Record, Training, opened, play, scores
 from sgft_jax.analysis import figures
 from sgft_jax.analysis.hybrid import LATE, late
 from sgft_jax.analysis.reading import measures, read_curve
-from sgft_jax.datasets import logs
+from sgft_jax.datasets.logs import Log
 from sgft_jax.files.disk import jsonable
 from sgft_jax.io import runs
 from sgft_jax.io.log import EVAL, read_jsonl, write_summary
@@ -34,7 +33,7 @@ from sgft_jax.stacking import join, member
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import hybrid
 from sgft_jax.train.fleet import FleetState
-from sgft_jax.types import Fixed, HybridAgent, RealData
+from sgft_jax.types import Fixed, RealData
 
 if TYPE_CHECKING:
     from experiments.runner.hybrid_args import HybridArgs
@@ -51,9 +50,9 @@ def run(
     if method.kind != "simulator" and args.data is not None:
         log = read_log(args.data, env, gamma=args.options.gamma, successors=args.successors)
     inputs = {"data": None if log is None else {"sha256": log.facts.sha256, "successors": log.facts.successors}}
-    setup = _set_up(args, method, env, simulators, seeds, log)  # refuses what it cannot play before a folder is made
+    training = _Run(args, method, env, simulators, seeds, log)  # refuses what it cannot play before a folder is made
     with opened("hybrid", args, homes, inputs) as folders:
-        return _Run(setup, folders).work()
+        return training.work(folders)
 
 
 def intervals(scores: dict[str, np.ndarray]) -> dict[str, list[float]]:
@@ -71,69 +70,46 @@ def in_words(scores: np.ndarray, bounds: list[float] | None) -> str:
     return f"{scores.mean():.4g}" + (f" [{low:.4g}, {high:.4g}]" if low < high else "")
 
 
-class _Setup(NamedTuple):
-    """What a run trains with. Members [M] are the seeds of the first simulator, then those of the next.
-
-    env: what the simulators share. gaps: these, one for each run folder. log: the real data, None without any. system:
-    the real one, [M]. pools, real, keys: as `hybrid.train` takes them.
-    """
-
-    args: "HybridArgs"
-    method: Fixed
-    env: Env
-    gaps: list[Gap]
-    seeds: list[int]
-    log: logs.Log | None
-    agent: HybridAgent
-    system: Simulated
-    pools: World
-    real: RealData
-    keys: Key
-
-
-def _set_up(
-    args: "HybridArgs", method: Fixed, task: Env, simulators: list[Gap], seeds: list[int], log: logs.Log | None
-) -> _Setup:
-    """Says how much memory the rows take; raises UserError where there is not as much."""
-    env, gap = real_env(task, simulators), gaps.load(task, args.real)
-    agent = method.build(args.options, env)
-    world = real_env(env, [gap])
-    members = jnp.zeros(len(simulators) * len(seeds), jnp.int32)
-    system = Simulated(world, real_worlds(world, [gap], jax.random.key(0)), members, gamma=args.options.gamma)
-    real = hybrid.no_data(env) if log is None else RealData(log.rows, jnp.asarray(log.last))
-    # Where there is no simulator, the real system's worlds stand for it.
-    played = [gaps.load(env, SIM) if gap.name == NO_SIMULATOR else gap for gap in simulators]
-    pools = jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), real_worlds(env, played, jax.random.key(1)))
-    # A seed gives the same draws whichever simulators share the program.
-    keys = jnp.concatenate([seed_keys(seeds, FromLog.TRAINING)] * len(simulators))
-    kept, data = hybrid.memory(env, agent, args.schedule, real)
-    reserve({"buffer": kept}, copies=len(members), shared=data, settings="schedule")
-    return _Setup(args, method, env, simulators, seeds, log, agent, system, pools, real, keys)
-
-
 class _Run(Training):
-    """A run on all simulators of a setup. folders: of the runs, one for each simulator."""
+    """A run on all simulators. Members [M] are the seeds of the first one, then those of the next.
+
+    Says how much memory the rows take; raises UserError where there is not as much. data: the real data, None without
+    any.
+    """
 
     unit = "updates"
 
-    def __init__(self, setup: _Setup, folders: list[Path]) -> None:
-        self.setup, self.args, self.env, self.agent = setup, setup.args, setup.env, setup.agent
-        names = "+".join(gap.name for gap in setup.gaps)
-        expect = {"kind": "hybrid", "task": self.env.name, "method": setup.method.name, "seeds": setup.seeds}
-        title = f"{setup.method.name} on {self.env.name}/{names}"
-        records = [Record(folder, expect) for folder in folders]
-        every = {"eval_every": self.args.eval_every, "checkpoint_every": self.args.checkpoint_every}
-        super().__init__(records, title, self.args.schedule.updates_in_all, **every)
+    def __init__(
+        self, args: "HybridArgs", method: Fixed, task: Env, simulators: list[Gap], seeds: list[int], data: Log | None
+    ) -> None:
+        title, gamma = f"{method.name} on {task.name}/{'+'.join(gap.name for gap in simulators)}", args.options.gamma
+        every = {"eval_every": args.eval_every, "checkpoint_every": args.checkpoint_every}
+        super().__init__(title, args.schedule.updates_in_all, len(seeds), **every)
+        self.args, self.method, self.gaps, self.seeds, self.data = args, method, simulators, seeds, data
+        self.env, gap = real_env(task, simulators), gaps.load(task, args.real)
+        self.agent, world = method.build(args.options, self.env), real_env(self.env, [gap])
+        members = jnp.zeros(len(simulators) * len(seeds), jnp.int32)
+        self.system = Simulated(world, real_worlds(world, [gap], jax.random.key(0)), members, gamma=gamma)
+        self.real = hybrid.no_data(self.env) if data is None else RealData(data.rows, jnp.asarray(data.last))
+        # Where there is no simulator, the real system's worlds stand for it.
+        played = [gaps.load(self.env, SIM) if gap.name == NO_SIMULATOR else gap for gap in simulators]
+        worlds = real_worlds(self.env, played, jax.random.key(1))
+        self.pools = jax.tree.map(lambda x: jnp.repeat(x, len(seeds), axis=0), worlds)
+        # A seed gives the same draws whichever simulators share the program.
+        self.keys = jnp.concatenate([seed_keys(seeds, FromLog.TRAINING)] * len(simulators))
+        kept, shared = hybrid.memory(self.env, self.agent, args.schedule, self.real)
+        reserve({"buffer": kept}, copies=len(members), shared=shared, settings="schedule")
 
-    def work(self) -> list[dict[str, Any]]:
-        """Everything, in order; returns the summaries."""
-        setup, schedule = self.setup, self.args.schedule
-        count = self.count
-        first = jax.tree.map(lambda x: x[:count], setup.pools), setup.real, setup.keys[:count]  # of one simulator
-        restored = self.restore(lambda: hybrid.shape_of(self.env, self.agent, schedule, *first))
+    def work(self, folders: list[Path]) -> list[dict[str, Any]]:
+        """Everything, in order; returns the summaries. folders: of the runs, one for each simulator."""
+        expect = {"kind": "hybrid", "task": self.env.name, "method": self.method.name, "seeds": self.seeds}
+        self.records = [Record(folder, expect) for folder in folders]
+        env, agent, schedule = self.env, self.agent, self.args.schedule
+        pools, keys = jax.tree.map(lambda x: x[: self.count], (self.pools, self.keys))  # of one simulator
+        restored = self.restore(lambda: hybrid.shape_of(env, agent, schedule, pools, self.real, keys))
         state = join([state for state, _ in restored]) if restored else None
-        data = setup.pools, setup.real, setup.keys
-        steps = hybrid.train(self.env, self.agent, schedule, *data, gamma=self.args.options.gamma, state=state)
+        data, gamma = (self.pools, self.real, self.keys), self.args.options.gamma
+        steps = hybrid.train(env, agent, schedule, *data, gamma=gamma, state=state)
         return self._finish(self.follow(steps, 0 if state is None else self.done(state)))
 
     # ------------------------------------------------------------ between chunks
@@ -143,24 +119,16 @@ class _Run(Training):
 
     def evaluate(self, state: FleetState, done: int) -> dict[str, float]:
         played = self._play(state, self.args.eval_episodes)
-        values = scores(played) | self._measures(played)
+        measured = self.env.measures(played.transitions.next_obs, played.valid)  # what else the task is judged by
+        values = scores(played) | {name: x.mean(-1) for name, x in measured.items()}
         for record, part in self.each(values):
             record.log.eval(done, part)
         return {f"{self.env.score}, real system": float(values["score"].mean())}
 
-    def checkpoint(self, state: FleetState, done: int) -> None:
-        for record, part in self.each(state):
-            record.checkpoint(part, done)
-
-    def _measures(self, played: Episode) -> dict[str, Any]:
-        """What else the task is judged by, [M] means over episodes."""
-        measured = self.env.measures(played.transitions.next_obs, played.valid)
-        return {name: values.mean(-1) for name, values in measured.items()}
-
     def _play(self, state: FleetState, episodes: int) -> Episode:
         """Episodes [M, episodes] in the real system, always the same starts."""
         params = jax.jit(jax.vmap(self.agent.export))(state.learner)
-        return play(self.setup.system, self.agent.policy, params, jax.random.key(FromLog.EVALUATION), episodes)
+        return play(self.system, self.agent.policy, params, jax.random.key(FromLog.EVALUATION), episodes)
 
     # ------------------------------------------------------------ what stays
 
@@ -170,15 +138,17 @@ class _Run(Training):
         filmed = functools.cache(lambda: self._play(state, 1))
         summaries = []
         for i, (record, policies) in enumerate(self.each(params)):
-            gap, folder = self.setup.gaps[i], record.folder
+            gap, folder = self.gaps[i], record.folder
             record.log.close()
             record.save_policies("policy", policies, functools.partial(self._card, gap))
-            lines = read_jsonl(folder / EVAL)
-            summary = self._summary(lines, gap)
+            summary = self._summary(read_jsonl(folder / EVAL), gap)
             write_summary(folder, summary)
-            _draw(folder)
+            curve = read_curve(folder)
+            title, name = " on ".join(filter(None, [curve.task, curve.data])), f"simulator: {curve.gap or 'none'}"
+            figures.learning_curves(folder / "figures/score.png", {name: [curve]}, title=title)
             if self.args.video:
-                print(self._film(folder, member(member(filmed(), i * self.count), 0)))
+                path, episodes = folder / "videos" / f"seed-{self.seeds[0]}.mp4", member(filmed(), i * self.count)
+                print(film_episode(self.system.env, self.system.pools, 0, member(episodes, 0), path))
             self._say(folder, gap, summary)
             summaries.append(summary)
         return summaries
@@ -188,15 +158,14 @@ class _Run(Training):
         sizes = {"task": env.name, "obs_dim": env.obs_dim, "act_dim": env.act_dim, "control_dt": env.control_dt}
         sizes |= {"previous_actions": env.previous_actions}
         layout = {"observation": [e._asdict() for e in env.observation], "action": [e._asdict() for e in env.action]}
-        facts = {"method": self.setup.method.name, "gap": gap._asdict(), "seed": seed, "data": self._facts()}
+        facts = {"method": self.method.name, "gap": gap._asdict(), "seed": seed, "data": self._facts()}
         return {**self.agent.card, **sizes, **layout, "hybrid": facts, "provenance": runs.provenance()}
 
     def _facts(self) -> dict[str, Any] | None:
-        return (
-            None
-            if self.setup.log is None
-            else asdict(self.setup.log.facts) | {"path": Path(self.setup.log.facts.path).name}
-        )
+        """What the real data are."""
+        if self.data is None:
+            return None
+        return asdict(self.data.facts) | {"path": Path(self.data.facts.path).name}
 
     def _summary(self, lines: list[dict[str, Any]], gap: Gap) -> dict[str, Any]:
         """Score of each seed at the last evaluation, and the mean over the last ten. lines: the evaluations."""
@@ -205,7 +174,7 @@ class _Run(Training):
         others = {name: lines[-1][name] for name in measures(lines[-1])}
         return {
             "task": self.env.name,
-            "method": self.setup.method.name,
+            "method": self.method.name,
             "gap": gap._asdict(),
             "real": self.args.real,
             "impl": self.env.impl,
@@ -213,17 +182,12 @@ class _Run(Training):
             "schedule": jsonable(self.args.schedule),
             "updates": self.args.schedule.updates_in_all,
             "score": self.env.score,
-            "seeds": self.setup.seeds,
+            "seeds": self.seeds,
             **{name: values.tolist() for name, values in scores.items()},
             **intervals(scores),
             "normalised": [normalised(self.env.name, x) for x in scores["last"].tolist()],
             "measures": others,
         }
-
-    def _film(self, folder: Path, played: Episode) -> str:
-        """An episode in the real system."""
-        path = folder / "videos" / f"seed-{self.setup.seeds[0]}.mp4"
-        return film_episode(self.setup.system.env, self.setup.system.pools, 0, played, path)
 
     def _say(self, folder: Path, gap: Gap, summary: dict[str, Any]) -> None:
         last, average = np.array(summary["last"]), np.array(summary["late"])
@@ -237,10 +201,3 @@ class _Run(Training):
         for name, values in summary["measures"].items():
             print(f"  {name}: {np.mean(values):.3g} (std over seeds {np.std(values):.2g})")
         print(f"results: {folder}  (policy/, summary.json, eval.jsonl, figures/)")
-
-
-def _draw(folder: Path) -> None:
-    """The learning curve of a finished run."""
-    curve = read_curve(folder)
-    title = " on ".join(filter(None, [curve.task, curve.data]))
-    figures.learning_curves(folder / "figures/score.png", {f"simulator: {curve.gap or 'none'}": [curve]}, title=title)

@@ -33,27 +33,39 @@ _RENDER_PROBE = "import mujoco; c = mujoco.GLContext(16, 16); c.make_current(); 
 def before_and_after(env: Env, pool: World, play: Callable[[], Sequence[Episode]], path: Path, *, rollouts: int) -> str:
     """Films the same start in the same real world twice and says in one line where, or why there is no video.
 
-    play() -> one episode in a world of `pool` before and the same after `rollouts` real rollouts. Never raises for want
-    of a scene, a graphics library or an encoder: a run does not fail for a picture.
+    play() -> episodes [n] in worlds of `pool` of the policy before and of that after `rollouts` real rollouts. The
+    first one that only the latter solves is filmed: what fine-tuning is about. Without one, the first. Never raises for
+    want of a scene, a graphics library or an encoder: a run does not fail for a picture.
     """
 
     def render(scene: Any) -> None:
         from envs.mujoco.render import render_side_by_side
 
-        episodes = play()
-        qpos = [np.asarray(episode.trace) for episode in episodes]
+        both = play()
+        first = telling(*(np.asarray(episodes.success) for episodes in both))
+        both = [jax.tree.map(lambda x: np.asarray(x[first]), episodes) for episodes in both]
         captions = [
             f"{name}: {'success' if episode.success else 'failure'}"
-            for name, episode in zip(("before fine-tuning", f"after {rollouts} real rollouts"), episodes, strict=True)
+            for name, episode in zip(("before fine-tuning", f"after {rollouts} real rollouts"), both, strict=True)
         ]
-        theta = np.asarray(pool.theta.params[episodes[0].world]).tolist()
-        render_side_by_side(scene, [theta, theta], qpos, captions, path)
+        theta = np.asarray(pool.theta.params[both[0].world]).tolist()
+        render_side_by_side(scene, [theta, theta], [episode.trace for episode in both], captions, path)
 
     return _draw(env, path, render)
 
 
-def film(env: Env, theta: Array, qpos: np.ndarray, path: Path) -> str:
-    """Renders an episode, qpos [T + 1, nq], in a world with domain parameters theta; says in one line how it went."""
+def telling(before: np.ndarray, after: np.ndarray) -> int:
+    """Which episode to show, of successes before and after, [n] bool: the first that was mended, else the first."""
+    return int(np.argmax(~before & after))
+
+
+def film_episode(env: Env, pools: World, i: int, played: Episode, path: Path) -> str:
+    """Renders one episode in a world of the i-th of stacked pools; says in one line how it went."""
+    return _film(env, pools.theta.params[i, played.world], np.asarray(played.trace), path)
+
+
+def _film(env: Env, theta: Array, qpos: np.ndarray, path: Path) -> str:
+    """Renders an episode, qpos [T + 1, nq], in a world with domain parameters theta."""
 
     def render(scene: Any) -> None:
         from envs.mujoco.render import render_episode
@@ -61,11 +73,6 @@ def film(env: Env, theta: Array, qpos: np.ndarray, path: Path) -> str:
         render_episode(scene, np.asarray(theta).tolist(), qpos, path)
 
     return _draw(env, path, render)
-
-
-def film_episode(env: Env, pools: World, i: int, played: Episode, path: Path) -> str:
-    """Renders one episode in a world of the i-th of stacked pools; see `film`."""
-    return film(env, pools.theta.params[i, played.world], np.asarray(played.trace), path)
 
 
 def _draw(env: Env, path: Path, render: Callable[[Any], None]) -> str:
@@ -182,4 +189,4 @@ def _video(home: Path, task: str, episode: Played, out: Path) -> str:
     # A gap that was played beside others shares their size of a pool: what does not vary is repeated in it.
     theta = worlds[episode.world % len(worlds)]
     states = episode.trace[: len(episode.rows.reward) + 1]
-    return film(env, theta, states, out / "videos" / f"seed-{episode.seed}-rollout-{episode.number}.mp4")
+    return _film(env, theta, states, out / "videos" / f"seed-{episode.seed}-rollout-{episode.number}.mp4")

@@ -19,7 +19,7 @@ from envs.domains import with_actuators
 from envs.gaps import SIM, Gap
 from envs.observations import blurred, varying, with_system
 from envs.rollout import Episode, heldout_worlds, load_gap, real_env, training_worlds
-from envs.types import Key, PyTree
+from envs.types import PyTree
 from experiments.runner.machines import folder_of_host, join_hosts, reserve
 from experiments.runner.pictures import film_episode
 from experiments.runner.report import Report, make_report, numbers
@@ -34,18 +34,9 @@ from sgft_jax.io.priors import digest
 from sgft_jax.keys import Pretraining, seed_keys
 from sgft_jax.methods import DEFAULT, all_methods
 from sgft_jax.systems.simulated import Simulated
-from sgft_jax.train import evidence
+from sgft_jax.train import evidence, pretraining
 from sgft_jax.train.evidence import Best
 from sgft_jax.train.fleet import FleetState
-from sgft_jax.train.pretraining import (
-    collect_random,
-    exported,
-    memory,
-    pretrain,
-    prior_card,
-    shapes,
-    world_keys,
-)
 from sgft_jax.types import Prior
 
 if TYPE_CHECKING:
@@ -72,41 +63,36 @@ def run(args: "PretrainArgs", seeds: list[int], home: Path) -> dict[str, Any]:
     if args.config.sees_system:
         seeing = with_system(env, varying(env, gap.params, gap.effects) if gap else varying(env))
         env = blurred(seeing, args.config.system_noise)
-    sizes = memory(env, args.config)  # what does not fit is reported before anything is written
+    sizes = pretraining.memory(env, args.config)  # what does not fit is reported before anything is written
     devices = mesh.devices(args.devices, {f"--config.{n.replace('_', '-')}": getattr(args.config, n) for n in _CUT})
     with folder_of_host(home) as folder, mesh.use(devices):
         reserve(sizes, copies=args.seeds, devices=devices)
         with opened("pretrain", args, {folder: jsonable(args)}) as (folder,):
             mesh.meet()  # nobody looks for checkpoints before the first host has emptied a folder to be replaced
-            return _Run(args, env, gap, seeds, folder, home).work()
+            record = Record(folder, {"kind": "pretrain", "task": env.name, "seeds": seeds}, home)
+            return _Run(args, env, gap, record).work()
 
 
 class _Run(Training):
-    """Pretraining of the seeds [S].
-
-    folder, home: for logs, and for checkpoints and priors; they differ on all but the first of several hosts.
-    """
+    """Pretraining of the seeds [S] of a record."""
 
     unit = "env steps"
 
-    def __init__(
-        self, args: "PretrainArgs", env: Env, gap: Gap | None, seeds: list[int], folder: Path, home: Path
-    ) -> None:
-        self.args, self.env, self.gap, self.seeds, self.folder = args, env, gap, seeds, folder
-        self.home, self.config = home, args.config
-        self.expect = {"kind": "pretrain", "task": env.name, "seeds": seeds}
-        record, size = Record(folder, self.expect, home), self.config.chunk_env_steps
+    def __init__(self, args: "PretrainArgs", env: Env, gap: Gap | None, record: Record) -> None:
+        self.args, self.config, self.env, self.gap = args, args.config, env, gap
+        self.records, self.record, self.seeds = [record], record, record.seeds
+        size = self.config.chunk_env_steps
         every = {"eval_every": self.config.eval_every * size, "checkpoint_every": self.config.checkpoint_every * size}
-        super().__init__([record], f"pretrain {env.name}", self.config.chunks * size, **every)
-        self.card = prior_card(env, self.config)
+        super().__init__(f"pretrain {env.name}", self.config.chunks * size, len(record.seeds), **every)
+        self.card = pretraining.prior_card(env, self.config)
         self.policy = make_policy(self.card, env)
         self.pools = functools.lru_cache(maxsize=1)(self._pools)  # worlds take long to compile
-        self.shapes = functools.cache(lambda: shapes(env, self.config, seeds, self.pools(0)))
+        self.shapes = functools.cache(lambda: pretraining.shapes(env, self.config, record.seeds, self.pools(0)))
         self.best: Best | None = None
 
     def work(self) -> dict[str, Any]:
         """Everything, in order."""
-        n, first = self.config.eval_episodes, jnp.zeros(len(self.seeds), jnp.int32)
+        n, first = self.config.eval_episodes, jnp.zeros(self.count, jnp.int32)
         with self.clock("worlds"):
             self.pools(0)
             heldout, self.final = (
@@ -117,31 +103,32 @@ class _Run(Training):
         state, done = None, 0
         for saved, meta in self.restore(lambda: jax.eval_shape(self._saved, self.shapes()[1])):
             (state, self.best), self.clock.seconds, done = saved, meta["seconds"], meta["env_steps"]
-        steps = pretrain(self.env, self.config, self.seeds, pools=self.pools, random=self._random(), state=state)
-        self.follow(steps, done)
+        data = {"pools": self.pools, "random": self._random()}
+        self.follow(pretraining.pretrain(self.env, self.config, self.seeds, state=state, **data), done)
         assert self.best is not None  # evaluated before the first chunk
         summary = self._hand_over(self.best)
-        self.records[0].log.close()
+        self.record.log.close()
         return summary
 
     def _pools(self, number: int) -> World:
         """The worlds [seeds, W] of a set."""
-        keys = world_keys(self.seeds, number)
+        keys = pretraining.world_keys(self.seeds, number)
         return stacking.stack([training_worlds(self.env, self.gap, key, self.config.worlds) for key in keys])
 
     def _saved(self, state: FleetState) -> Saved:
         """What a first checkpoint holds."""
-        params = exported(self.env, self.config, state)
-        return Saved(state, evidence.nothing_known(params, len(self.seeds), self.config.eval_episodes))
+        params = pretraining.exported(self.env, self.config, state)
+        return Saved(state, evidence.nothing_known(params, self.count, self.config.eval_episodes))
 
     def _random(self) -> PyTree:
         """Experience under random actions: collected once, then read from disk."""
-        folder = self.home / "random"
+        folder, expect = self.record.home / "random", self.record.expect
         if checkpoint.latest(folder) is not None:
-            return checkpoint.restore(folder, self.shapes()[0], expect=self.expect)[0]
+            return checkpoint.restore(folder, self.shapes()[0], expect=expect)[0]
         with self.clock("random"):
-            random = jax.block_until_ready(collect_random(self.env, self.config, self.seeds, self.pools(0)))
-        checkpoint.save(folder, 0, mesh.local(random), meta=self.expect)
+            rows = pretraining.collect_random(self.env, self.config, self.seeds, self.pools(0))
+            random = jax.block_until_ready(rows)
+        checkpoint.save(folder, 0, mesh.local(random), meta=expect)
         return random
 
     # ------------------------------------------------------------ between chunks
@@ -156,10 +143,11 @@ class _Run(Training):
 
     def evaluate(self, state: FleetState, done: int) -> dict[str, float]:
         """Every evaluation plays the same episodes in the same held-out worlds."""
-        params = exported(self.env, self.config, state)
-        played = self._play(self.heldout, params, jax.random.fold_in(jax.random.key(_HELDOUT_SEED), 1))
+        params = pretraining.exported(self.env, self.config, state)
+        key = jax.random.fold_in(jax.random.key(_HELDOUT_SEED), 1)
+        played = play(self.heldout, self.policy, params, key, self.config.eval_episodes)
         values = scores(played)
-        self.records[0].log.eval(done, values)
+        self.record.log.eval(done, values)
         since = self.config.choose_from * self.config.chunks * self.config.chunk_steps
         self.best = best_of(self.best, params, played, state.rounds, since=since)
         return {f"{name}, evaluation": float(values[name].mean()) for name in ("success", "return")}
@@ -167,7 +155,7 @@ class _Run(Training):
     def checkpoint(self, state: FleetState, done: int) -> None:
         assert self.best is not None  # evaluated before the first chunk
         step = done // self.config.chunk_env_steps
-        self.records[0].checkpoint(Saved(state, self.best), step, env_steps=done, seconds=self.clock.seconds)
+        self.record.checkpoint(Saved(state, self.best), step, env_steps=done, seconds=self.clock.seconds)
 
     # ------------------------------------------------------------ what stays
 
@@ -180,26 +168,29 @@ class _Run(Training):
         for i, seed in enumerate(self.seeds):
             chosen = stacking.member(best, i)
             name = digest(Prior(chosen.params, {}))  # by which runs of fine-tuning tell which priors they began from
-            facts = {"seed": seed, "digest": name, **describe(stacking.member(played, i)), **self._chosen(chosen)}
+            facts = {"seed": seed, "digest": name, **describe(stacking.member(played, i))}
+            facts["best/env_steps"] = int(chosen.age) * self.config.n_envs
+            facts |= {f"best/{self.env.score}": float(chosen.score), "best/return": float(chosen.total)}
             if report is not None:
                 facts |= numbers(stacking.member(report, i))
                 self._save_report(seed, stacking.member(report, i), i)
             results.append(facts)
         cards = {facts["seed"]: self._card(facts) for facts in results}
-        self.records[0].save_policies("prior", best.params, cards.__getitem__)
+        self.record.save_policies("prior", best.params, cards.__getitem__)
         summary = {
             "task": self.env.name,
             "preset": self.args.preset,
             "impl": self.env.impl,
             "gap": None if self.gap is None else self.gap._asdict(),
-            "env_steps": self.config.chunks * self.config.chunk_env_steps,
+            "env_steps": self.total,
             "updates": self.config.chunks * self.config.chunk_steps * self.config.updates_per_step,
             "seeds": results,
             **self.clock.record(),
         }
-        write_summary(self.folder, summary)
+        write_summary(self.record.folder, summary)
         if self.args.video:
-            print(self._film(stacking.member(played, 0)))
+            path, episodes = self.record.folder / "videos" / f"seed-{self.seeds[0]}.mp4", stacking.member(played, 0)
+            print(film_episode(self.env, self.final, 0, stacking.member(episodes, 0), path))
         self._say(results)
         return summary
 
@@ -217,13 +208,11 @@ class _Run(Training):
 
     def _final_episodes(self, params: PyTree) -> Episode:
         """[seeds, >= report_episodes] new episodes in worlds that neither training nor the choice has seen."""
-        system = self.heldout.moved(self.final, self.heldout.which)
-        rounds = math.ceil(self.config.report_episodes / self.config.eval_episodes)
+        system, n = self.heldout.moved(self.final, self.heldout.which), self.config.eval_episodes
+        rounds = math.ceil(self.config.report_episodes / n)
         keys = jax.random.split(jax.random.fold_in(jax.random.key(_FINAL_SEED), 1), rounds)
-        return jax.tree.map(lambda *x: np.concatenate(x, axis=1), *[self._play(system, params, key) for key in keys])
-
-    def _play(self, system: Simulated, params: PyTree, key: Key) -> Episode:
-        return play(system, self.policy, params, key, self.config.eval_episodes)
+        played = [play(system, self.policy, params, key, n) for key in keys]
+        return jax.tree.map(lambda *x: np.concatenate(x, axis=1), *played)
 
     def _report(self, params: PyTree) -> Report:
         """[seeds] measurements, as NumPy arrays."""
@@ -233,26 +222,17 @@ class _Run(Training):
         report = jax.jit(jax.vmap(measure))(self.pools(0), params, seed_keys(self.seeds, Pretraining.REPORT))
         return jax.tree.map(np.asarray, mesh.local(report))
 
-    def _film(self, played: Episode) -> str:
-        """The first of the episodes [n] in the final worlds."""
-        path = self.folder / "videos" / f"seed-{self.seeds[0]}.mp4"
-        return film_episode(self.env, self.final, 0, stacking.member(played, 0), path)
-
-    def _chosen(self, best: Best) -> dict[str, float]:
-        """Which evaluation the prior is from, and what that evaluation said."""
-        steps = int(best.age) * self.config.n_envs
-        return {"best/env_steps": steps, f"best/{self.env.score}": float(best.score), "best/return": float(best.total)}
-
     def _save_report(self, seed: int, report: Report, i: int) -> None:
         """The arrays behind the figure, and the figure."""
-        curve = read_jsonl(self.folder / EVAL)
+        folder = self.record.folder
+        curve = read_jsonl(folder / EVAL)
         some = np.flatnonzero(report.counts)[:: max(1, report.counts.sum() // 2000)]  # points that a figure can show
-        (self.folder / "report").mkdir(exist_ok=True)
-        np.savez(self.folder / "report" / f"seed-{seed}.npz", allow_pickle=False, **report._asdict())
+        (folder / "report").mkdir(exist_ok=True)
+        np.savez(folder / "report" / f"seed-{seed}.npz", allow_pickle=False, **report._asdict())
         if not some.size:
             return  # every trajectory exploded: there is nothing to draw
         figures.pretraining(
-            self.folder / "figures" / f"seed-{seed}.png",
+            folder / "figures" / f"seed-{seed}.png",
             ([line["step"] for line in curve], *([line[x][i] for line in curve] for x in ("success", "return"))),
             (report.values[some], report.returns[some]),
             (report.model_error, report.still_error),
@@ -260,6 +240,7 @@ class _Run(Training):
         )
 
     def _say(self, results: list[dict[str, Any]]) -> None:
+        folder = self.record.folder
         for facts in results:
             low, high = facts["success/interval"]
             score = f"return {facts['return']:.3f}"
@@ -270,8 +251,8 @@ class _Run(Training):
                 line += f"; V_sim explains {facts['value/explained_variance']:.2f} of the variance of returns, "
                 line += f"rank correlation {facts['value/rank_correlation']:.2f}, bias {facts['value/bias']:+.2f}"
             print(line)
-        files = ", ".join(name for name in ("prior/", "summary.json", "figures/") if (self.folder / name).exists())
-        print(f"results: {self.folder}  ({files})")
+        files = ", ".join(name for name in ("prior/", "summary.json", "figures/") if (folder / name).exists())
+        print(f"results: {folder}  ({files})")
         wanted = self.config.algorithm, self.config.sees_system
         methods = [name for name, way in all_methods().items() if (way.prior, way.sees_system) == wanted]
         if not methods:  # as for an algorithm that is new
@@ -279,4 +260,4 @@ class _Run(Training):
         method = "" if methods[0] == DEFAULT else f" --method {methods[0]}"
         method += "" if self.gap is None else f" --real {SIM}"
         out = "" if self.args.out == type(self.args).out else f" --out {self.args.out}"
-        print(f"next: python -m experiments.finetune --task {self.args.task}{method} --prior {self.folder}{out}")
+        print(f"next: python -m experiments.finetune --task {self.args.task}{method} --prior {folder}{out}")

@@ -67,17 +67,16 @@ class Training:
     Members [M = G * S] are the seeds of the first record, then those of the next. A kind of run says how far a state is
     (`done`, in `unit`), what is logged, how its policies are evaluated, and what a checkpoint holds.
 
-    total: units of the whole run. eval_every, checkpoint_every: units from one evaluation or checkpoint to the next.
+    total: units of the whole run. count: seeds of a record. eval_every, checkpoint_every: units from one evaluation or
+    checkpoint to the next. records: of the run folders, set before the work begins.
     """
 
     unit = ""
+    records: Sequence[Any]
 
-    def __init__(
-        self, records: Sequence[Any], title: str, total: int, *, eval_every: int, checkpoint_every: int
-    ) -> None:
-        self.records, self.title, self.total, self.clock = records, title, total, Clock()
+    def __init__(self, title: str, total: int, count: int, *, eval_every: int, checkpoint_every: int) -> None:
+        self.title, self.total, self.count, self.clock = title, total, count, Clock()
         self.eval_every, self.checkpoint_every = eval_every, checkpoint_every
-        self.count = len(records[0].seeds)
 
     def each(self, members: PyTree) -> Iterator[tuple[Any, PyTree]]:
         """Every record and, [S], what belongs to it in a pytree over all members."""
@@ -90,9 +89,8 @@ class Training:
         """
         steps = [checkpoint.latest(record.home, whole=True) for record in self.records]
         if len(set(steps)) > 1:
-            places = zip(self.records, steps, strict=True)
-            listed = ", ".join(f"{record.folder} is at step {step or 0}" for record, step in places)
-            raise UserError(f"{listed}: they cannot go on together, resume them one at a time")
+            places = [f"{r.folder} is at step {step or 0}" for r, step in zip(self.records, steps, strict=True)]
+            raise UserError(f"{', '.join(places)}: they cannot go on together, resume them one at a time")
         if steps[0] is None:
             for record in self.records:
                 record.log.truncate({})
@@ -161,7 +159,8 @@ class Training:
 
     def checkpoint(self, state: Any, done: int) -> None:
         """Writes the checkpoints of all records."""
-        raise NotImplementedError
+        for record, states in self.each(state):
+            record.checkpoint(states, done)
 
 
 # --- evaluations -----------------------------------------------------------------------------------------------------

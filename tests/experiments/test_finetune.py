@@ -618,8 +618,9 @@ def film(folder, monkeypatch, *, pushes=(0.0, 1.0), scene=None, reason=None):
     monkeypatch.setattr(pictures, "select_renderer", lambda: reason)
     env, pool, both = springs(pushes)
     played = [jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1)]
-    record = FinetuneRecord(folder, env, gaps.Gap("toy", {}, {}), "sac", [0])
-    return record.film(pool, lambda: played, 7), played, pool
+    path = folder / "videos" / "seed-0.mp4"
+    words = pictures.before_and_after(env, pool, lambda: [member(x, 0) for x in played], path, rollouts=7)
+    return words, played, pool
 
 
 def test_a_record_counts_the_steps_that_were_made(tmp_path):

@@ -12,6 +12,7 @@ from priors_by_hand import save_prior
 from envs.types import UserError
 from experiments import real_demo
 from experiments.real_demo import RealDemoArgs
+from experiments.runner import pictures
 
 ROOT = Path(__file__).parents[2]
 PRIOR = ROOT / "sgft_jax/priors/panda-push/seed-0"  # it is only looked for
@@ -88,8 +89,8 @@ def test_a_side_that_fails_is_an_error_and_no_endless_wait(tmp_path, monkeypatch
 
 def test_the_film_shows_an_episode_that_was_mended():
     no, yes = False, True
-    assert real_demo.telling(np.array([yes, no, no]), np.array([yes, no, yes])) == 2
-    assert real_demo.telling(np.array([yes, no]), np.array([yes, no])) == 0
+    assert pictures.telling(np.array([yes, no, no]), np.array([yes, no, yes])) == 2
+    assert pictures.telling(np.array([yes, no]), np.array([yes, no])) == 0
 
 
 def test_the_first_and_the_last_evaluation_are_filmed():
