@@ -71,7 +71,13 @@ def plan(args: DemoArgs) -> tuple[PretrainArgs, list[FinetuneArgs]]:
     shared = {"task": args.task, "preset": "cpu", "out": args.out, "overwrite": True}
     pretraining = PretrainArgs(config=config, report=False, video=False, **shared)
     check_task(args.task, [args.real])
-    runs = [_finetune_args(args, method, shared) for method in METHODS]
+    # Smaller batches and fewer updates than on a GPU: what two cores can do; all methods get the same. All else is the
+    # methods' own: larger rates of the actor cost most of them success (docs/history.md).
+    size = {"seeds": args.seeds, "rollouts": args.rollouts, "eval_every": 5, "eval_episodes": 20, **shared}
+    runs = []
+    for method in METHODS:
+        options, video = get_method(method).config(utd=4.0, batch_size=64), args.video and method == METHODS[0]
+        runs.append(arguments(method, real=(args.real,), options=options, video=video, **size))
     check_pretraining(pretraining)
     for run in runs:
         check(run)
@@ -93,15 +99,6 @@ def outcome(curves: "Sequence[Curve]", summaries: dict[str, dict[str, Any]]) -> 
         f"The last policy need not be the best. Those that did best in the real rollouts: {', '.join(best)}.\n"
         "Seeds, machines and small priors differ: a few per cent more or less between methods mean nothing here."
     )
-
-
-def _finetune_args(args: DemoArgs, method: str, shared: dict[str, Any]) -> FinetuneArgs:
-    """Smaller batches and fewer updates than on a GPU: what two cores can do; all methods get the same. All else is the
-    methods' own: larger rates of the actor cost most of them success (docs/history.md).
-    """
-    options = get_method(method).config(utd=4.0, batch_size=64)
-    size = {"seeds": args.seeds, "rollouts": args.rollouts, "eval_every": 5, "eval_episodes": 20, "options": options}
-    return arguments(method, real=(args.real,), video=args.video and method == METHODS[0], **size, **shared)
 
 
 def _finetune_all(first: FinetuneArgs, *others: FinetuneArgs) -> None:

@@ -8,16 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from envs.types import UserError
-from experiments.runner import cli
-from experiments.runner.options import (
-    Impl,
-    at_least_one,
-    home_of_rollouts,
-    prior_folders,
-    seed_list,
-    task_of_priors,
-    task_of_rollouts,
-)
+from experiments.runner import cli, options
+from experiments.runner.options import Impl
 from experiments.runner.real_systems import check as check_real
 from sgft_jax.io.runs import check_folder, read_config
 from sgft_jax.presets import DEFAULT_PRESET
@@ -59,23 +51,25 @@ def main(args: DiagnoseArgs) -> None:
 
 def check(args: DiagnoseArgs) -> tuple[list[Path], str, Path | None]:
     """The folders of the priors, the task, and where real/ is if --real is no gap; UserError for what is wrong."""
-    seed_list(args.seed, 1)
+    options.seed_list(args.seed, 1)
     if args.rollouts is not None:
-        at_least_one(args, "rollouts")
+        options.at_least_one(args, "rollouts")
     check_folder(args.out / "diagnose")
-    recorded = home_of_rollouts("--real", Path(args.real)) if Path(args.real).is_dir() else None
+    recorded = options.home_of_rollouts("--real", Path(args.real)) if Path(args.real).is_dir() else None
     if recorded and recorded.name in ("", ".."):
         recorded = recorded.resolve()  # what is written is called like it
     config = read_config(recorded) if recorded else {}
-    task, prior = args.task or (task_of_rollouts(recorded, None) if recorded and "task" in config else None), args.prior
+    task, prior = args.task, args.prior
+    if task is None and recorded and "task" in config:
+        task = options.task_of_rollouts(recorded, None)
     if task is not None:
         check_real(task, [] if recorded else [args.real])
     if prior is None and task is None:
         raise UserError("nothing to diagnose with: name a prior with --prior, or a task with --task")
     if prior is None and config.get("prior"):
         prior = Path(config["prior"])
-    folders = prior_folders(prior, out=args.out, task=task or "", preset=config.get("preset") or args.preset)
-    task = task_of_priors(folders, task)
+    folders = options.prior_folders(prior, out=args.out, task=task or "", preset=config.get("preset") or args.preset)
+    task = options.task_of_priors(folders, task)
     check_real(task, [] if recorded else [args.real])
     return folders, task, recorded
 

@@ -10,16 +10,8 @@ from typing import Any
 from envs import gaps
 from envs.gaps import SIM, Gap
 from envs.types import UserError
-from experiments.runner import cli
-from experiments.runner.options import (
-    Impl,
-    at_least_one,
-    each_once,
-    prior_folders,
-    seed_list,
-    task_of_priors,
-    without_repeats,
-)
+from experiments.runner import cli, options
+from experiments.runner.options import Impl
 from experiments.runner.real_systems import REMOTE, TOGETHER, connect, described, is_robot, is_stepped
 from experiments.runner.real_systems import check as check_real
 from sgft_jax.io.runs import check_folder
@@ -154,9 +146,9 @@ def check(args: EvaluateArgs) -> tuple[list[Path], str]:
         raise UserError("--best: name the fine-tuning run with --run")
     if args.prior is None and args.run is None and args.task is None:
         raise UserError("nothing to evaluate: name a folder with --prior or --run, or a task with --task")
-    at_least_one(args, "episodes")
-    seed_list(args.seed, 1)
-    each_once(args, "real")
+    options.at_least_one(args, "episodes")
+    options.seed_list(args.seed, 1)
+    options.each_once(args, "real")
     reals = [real for real in args.real if real != SIM]
     if len(reals) < len(args.real) and any(map(is_stepped, reals)):
         raise UserError(f"--real {' '.join(args.real)}: {TOGETHER}")
@@ -166,14 +158,14 @@ def check(args: EvaluateArgs) -> tuple[list[Path], str]:
         check_folder(args.out / "evaluate")
     if args.video is not None:
         check_folder(args.video, "--video")
-        without_repeats("--real", [gaps.title(real) for real in args.real])  # a film is called after its system
+        options.without_repeats("--real", [gaps.title(real) for real in args.real])  # a film is called after its system
         if any(map(is_stepped, reals)):
             raise UserError(f"--video: films simulated systems, and {reals[0]} is not one; leave one of the two out")
     if args.task is not None:
         check_real(args.task, reals, args.set)
     home = args.run / "best" if args.best and args.run else args.run or args.prior
-    folders = prior_folders(home, out=args.out, task=args.task or "", preset=args.preset)
-    task = task_of_priors(folders, args.task)
+    folders = options.prior_folders(home, out=args.out, task=args.task or "", preset=args.preset)
+    task = options.task_of_priors(folders, args.task)
     check_real(task, reals, args.set)
     if reals and not is_stepped(reals[0]):
         gaps.changes(args.set)

@@ -10,20 +10,8 @@ from typing import Any, ClassVar, Literal
 
 from envs import extend, gaps
 from envs.types import UserError
-from experiments.runner.options import (
-    Impl,
-    Successors,
-    at_least_one,
-    check_data,
-    check_folders,
-    check_prior,
-    check_variant,
-    each_once,
-    not_negative,
-    prior_folders,
-    seed_list,
-    seeds_name,
-)
+from experiments.runner import options
+from experiments.runner.options import Impl, Successors
 from experiments.runner.real_systems import REMOTE, is_robot, is_stepped, title
 from experiments.runner.real_systems import check as check_real
 from sgft_jax.files.disk import jsonable
@@ -140,7 +128,7 @@ def run_folder(args: FinetuneArgs, real: str) -> Path:
     """Where the run on that real system lives; the seeds of one call share a folder."""
     system = "_".join([title(real), *args.set]).replace("/", "")
     extend.folder_name("--set", system)
-    seeds = seeds_name(seed_list(args.seed, args.seeds))
+    seeds = options.seeds_name(options.seed_list(args.seed, args.seeds))
     return args.out / "finetune" / extend.name_of(args.task) / system / label(args) / seeds
 
 
@@ -151,30 +139,30 @@ def label(args: FinetuneArgs) -> str:
 
 def check(args: FinetuneArgs) -> tuple[Online, list[int]]:
     """The method and the seeds; raises UserError for what is wrong in the arguments and with the run folders."""
-    at_least_one(args, "rollouts", "eval_every", "checkpoint_every", "sync_every")
-    not_negative(args, "eval_episodes", "devices")
-    method, seeds = get_method(args.method), seed_list(args.seed, args.seeds)
+    options.at_least_one(args, "rollouts", "eval_every", "checkpoint_every", "sync_every")
+    options.not_negative(args, "eval_episodes", "devices")
+    method, seeds = get_method(args.method), options.seed_list(args.seed, args.seeds)
     if not isinstance(args.options, method.config):
         raise UserError(f"--method {method.name}: the options are those of another method")
     if (initial := args.options.initial_rollouts) > args.rollouts:
         raise UserError(f"--options.initial-rollouts {initial} is more than --rollouts {args.rollouts}")
     if args.prior == NO_PRIOR and method.needs_prior:
         raise UserError(f"--prior none: {method.name} needs a prior of {method.prior}")
-    check_variant(args.variant)
+    options.check_variant(args.variant)
     for path in args.real_data:
-        check_data("--real-data", path)
+        options.check_data("--real-data", path)
     if args.real_updates is not None and (args.real_updates < 0 or not args.real_data):
         raise UserError(f"--real-updates {args.real_updates}: 0 or more, and of --real-data, which must be named")
     if args.successors != "stored" and not args.real_data:
         raise UserError(f"--successors {args.successors}: is for --real-data, which must be named")
-    each_once(args, "real")
+    options.each_once(args, "real")
     check_real(args.task, args.real, args.set)
     if not is_stepped(args.real[0]):
         gaps.changes(args.set)
     _check_robot(args)
     if args.eval_at:
         _check_eval_at(args)
-    check_folders("--real", args.real, [run_folder(args, real) for real in args.real], args)
+    options.check_folders("--real", args.real, [run_folder(args, real) for real in args.real], args)
     return method, seeds
 
 
@@ -213,7 +201,7 @@ def priors_of(args: FinetuneArgs) -> list[Path]:
     """The folders of the priors to start from, none where the user says so; raises UserError where there is none."""
     if args.prior == NO_PRIOR:
         return []
-    folders = prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
+    folders = options.prior_folders(args.prior, out=args.out, task=args.task, preset=args.preset)
     for folder in folders:
-        check_prior(folder, get_method(args.method), extend.name_of(args.task))
+        options.check_prior(folder, get_method(args.method), extend.name_of(args.task))
     return folders

@@ -30,23 +30,15 @@ def evaluation_store(folder: Path, done: int) -> RealStore:
 class FinetuneRecord(Record):
     """The files of a run on one real system.
 
-    real_evaluations: whether evaluations are played on the real system and cost transitions; simulated ones are free.
+    costly: whether evaluations are played on the real system and cost transitions; simulated ones are free.
     logged: real transitions that every seed began with and nobody has played here.
     """
 
     def __init__(
-        self,
-        folder: Path,
-        env: Env,
-        gap: Gap,
-        method: str,
-        seeds: list[int],
-        *,
-        real_evaluations: bool = False,
-        logged: int = 0,
+        self, folder: Path, env: Env, gap: Gap, method: str, seeds: list[int], *, costly: bool = False, logged: int = 0
     ) -> None:
         super().__init__(folder, {"kind": "finetune", "task": env.name, "method": method, "seeds": seeds})
-        self.logged, self.real_evaluations = logged, real_evaluations
+        self.logged, self.costly = logged, costly
         self.played = self.evaluated = np.zeros(len(seeds), int)  # [S] real transitions of rollouts, of evaluations
         self.env, self.gap, self.method, self.real = env, gap, method, RealStore(folder)
 
@@ -69,7 +61,7 @@ class FinetuneRecord(Record):
         cost: [S] steps of its episodes.
         """
         self.log.eval(self._transitions(), {"rollouts": done, "robot_minutes": self._minutes(), **scores})
-        if self.real_evaluations:
+        if self.costly:
             self.evaluated = self.evaluated + cost
 
     def time(self, done: int, seconds: float) -> None:
@@ -98,7 +90,7 @@ class FinetuneRecord(Record):
         summary = about | {"score": env.score} | numbers | {"best": {k: x.tolist() for k, x in best.items()}}
         if self.logged:
             summary["logged"] = self.logged
-        if self.real_evaluations:
+        if self.costly:
             summary["real_steps"] = self._real_steps()
         write_summary(self.folder, summary)
         if curve is not None:

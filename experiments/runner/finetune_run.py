@@ -70,7 +70,7 @@ def run(
         }
         begun = last.enter_context(opened("finetune", args, homes, inputs))
         known = sum(log.facts.transitions for log in logs)
-        record = functools.partial(FinetuneRecord, real_evaluations=stepped, logged=known)
+        record = functools.partial(FinetuneRecord, costly=stepped, logged=known)
         world = setup.system.env
         records = [record(x, world, gap, method.name, seeds) for x, gap in zip(begun, systems, strict=True)]
         learner = None
@@ -83,7 +83,7 @@ def run(
             learner = LearnerProcess(again, setup.seeds, which, setup.simulated)
             last.callback(learner.close)
             learner.wait()
-        return _Run(args, setup, card, records, logs, learner).work()
+        return _Run(args, setup, card, records, logs).work(learner)
 
 
 def _reserve(args: "FinetuneArgs", env: Env, priors: int, devices: int) -> None:
@@ -134,26 +134,19 @@ class _Run(Training):
         card: dict[str, Any],
         records: list[FinetuneRecord],
         logs: list[Log],
-        learner: LearnerProcess | None,
     ) -> None:
         assert isinstance(setup.system, KnownSystem)
-        self.args, self.setup, self.card, self.records, self.logs, self.learner = (
-            args,
-            setup,
-            card,
-            records,
-            logs,
-            learner,
-        )
+        self.args, self.setup, self.card, self.records, self.logs = args, setup, card, records, logs
         self.finetuner, self.system, self.seeds = setup.finetuner, setup.system, setup.seeds
-        self.episodes, self.sync_every = args.eval_episodes or 0, args.sync_every if learner else None
+        self.episodes = args.eval_episodes or 0
+        self.sync_every = args.sync_every if real_systems.is_robot(args.real[0]) else None
         self.begin = functools.partial(finetuning.begin, setup.finetuner, setup.priors, setup.seeds, setup.simulated)
         title = f"{records[0].method} on {self.system.env.name}/{'+'.join(record.gap.name for record in records)}"
         every = {"eval_every": args.eval_every, "checkpoint_every": args.checkpoint_every}
         super().__init__(title, args.rollouts, len(records[0].seeds), **every)
 
-    def work(self) -> list[dict[str, Any]]:
-        """Everything, in order; returns the summaries."""
+    def work(self, learner: LearnerProcess | None) -> list[dict[str, Any]]:
+        """Everything, in order; returns the summaries. learner: of a run with a robot."""
         restored = self.restore(lambda: jax.eval_shape(lambda: _part(self.begin(), 0, self.count)))
         progress = _join([progress for progress, _ in restored]) if restored else None
         done, args = self.done(progress) if progress else 0, self.args
@@ -164,7 +157,7 @@ class _Run(Training):
             sizes = {"capacity": args.options.replay_capacity, "updates": args.real_updates}
             logged = begin_with(self.logs, self.finetuner, self.system.env, **sizes)
         setup, how = self.setup._replace(system=recorded), {"waits": args.hand_over == "rollouts", "logged": logged}
-        steps = finetuning.finetune(*setup, rollouts=args.rollouts, learner=self.learner, progress=progress, **how)
+        steps = finetuning.finetune(*setup, rollouts=args.rollouts, learner=learner, progress=progress, **how)
         return self._finish(self.follow(steps, done))
 
     # ------------------------------------------------------------ between rollouts

@@ -13,20 +13,8 @@ from tyro.conf import arg
 from envs import extend
 from envs.gaps import SIM, each, title
 from envs.types import UserError
-from experiments.runner import cli
-from experiments.runner.options import (
-    Impl,
-    Successors,
-    at_least_one,
-    check_data,
-    check_folders,
-    check_task,
-    check_variant,
-    not_negative,
-    seed_list,
-    seeds_name,
-    without_repeats,
-)
+from experiments.runner import cli, options
+from experiments.runner.options import Impl, Successors
 from sgft_jax.files.disk import jsonable
 from sgft_jax.io.runs import NO_DATA, NO_SIMULATOR
 from sgft_jax.methods import get_method
@@ -117,8 +105,8 @@ def arguments(method: str, *, preset: str = "", data: Path | None = None, **chan
     """
     chosen = get_method(method, "fixed")
     preset = preset or ("" if data is None else preset_for(chosen, data_name(data)))
-    options = cli.choose("--preset", preset or next(iter(chosen.presets)), dict(chosen.presets))
-    return HybridArgs(**{"method": method, "preset": preset, "options": options, "data": data, **changes})
+    config = cli.choose("--preset", preset or next(iter(chosen.presets)), dict(chosen.presets))
+    return HybridArgs(**{"method": method, "preset": preset, "options": config, "data": data, **changes})
 
 
 def choices(args: HybridArgs, method: Fixed) -> list[str]:
@@ -138,7 +126,7 @@ def run_folder(args: HybridArgs, gap: str) -> Path:
     method = get_method(args.method, "fixed")
     data = NO_DATA if method.kind == "simulator" or args.data is None else data_name(args.data)
     label = "_".join(filter(None, [method.name, args.variant]))
-    seeds = seeds_name(seed_list(args.seed, args.seeds))
+    seeds = options.seeds_name(options.seed_list(args.seed, args.seeds))
     systems = title(gap) if args.real == SIM else f"{title(gap)}-for-{title(args.real)}"
     return args.out / "hybrid" / extend.name_of(args.task) / systems / data / label / seeds
 
@@ -151,9 +139,9 @@ def data_name(path: Path) -> str:
 
 def check(args: HybridArgs) -> tuple[Fixed, list[int]]:
     """The method and the seeds; raises UserError for what is wrong in the arguments and with the run folders."""
-    at_least_one(args, "eval_every", "eval_episodes", "checkpoint_every")
-    not_negative(args, "previous_actions")
-    method, seeds = get_method(args.method, "fixed"), seed_list(args.seed, args.seeds)
+    options.at_least_one(args, "eval_every", "eval_episodes", "checkpoint_every")
+    options.not_negative(args, "previous_actions")
+    method, seeds = get_method(args.method, "fixed"), options.seed_list(args.seed, args.seeds)
     if not isinstance(args.options, type(method.config)):
         raise UserError(f"--method {method.name}: the options are those of another method")
     if method.kind != "simulator" and args.data is None:
@@ -161,13 +149,13 @@ def check(args: HybridArgs) -> tuple[Fixed, list[int]]:
     if method.kind == "simulator" and args.data is not None:
         raise UserError(f"--data {args.data}: {method.name} learns in the simulator alone; leave one of them out")
     if args.data is not None:
-        check_data("--data", args.data)
-    check_variant(args.variant)
+        options.check_data("--data", args.data)
+    options.check_variant(args.variant)
     if not args.gap:
         raise UserError(f"--gap: name at least one, or {SIM} for no gap")
-    without_repeats("--gap", args.gap)
+    options.without_repeats("--gap", args.gap)
     systems = () if method.kind == "offline" else args.gap
-    check_task(args.task, systems if args.real == SIM else (*systems, args.real))
+    options.check_task(args.task, systems if args.real == SIM else (*systems, args.real))
     systems = gaps_of(args, method)
-    check_folders("--gap", args.gap, [run_folder(args, gap) for gap in systems], args)
+    options.check_folders("--gap", args.gap, [run_folder(args, gap) for gap in systems], args)
     return method, seeds

@@ -35,7 +35,6 @@ from sgft_jax.keys import Pretraining, seed_keys
 from sgft_jax.methods import DEFAULT, all_methods
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import evidence, pretraining
-from sgft_jax.train.evidence import Best
 from sgft_jax.train.fleet import FleetState
 from sgft_jax.types import Prior
 
@@ -50,7 +49,7 @@ class Saved(NamedTuple):
     """What a checkpoint holds, with a leading seeds axis: the run itself and the best policy so far."""
 
     run: FleetState
-    best: Best
+    best: evidence.Best
 
 
 def run(args: "PretrainArgs", seeds: list[int], home: Path) -> dict[str, Any]:
@@ -88,7 +87,7 @@ class _Run(Training):
         self.policy = make_policy(self.card, env)
         self.pools = functools.lru_cache(maxsize=1)(self._pools)  # worlds take long to compile
         self.shapes = functools.cache(lambda: pretraining.shapes(env, self.config, record.seeds, self.pools(0)))
-        self.best: Best | None = None
+        self.best: evidence.Best | None = None
 
     def work(self) -> dict[str, Any]:
         """Everything, in order."""
@@ -159,7 +158,7 @@ class _Run(Training):
 
     # ------------------------------------------------------------ what stays
 
-    def _hand_over(self, best: Best) -> dict[str, Any]:
+    def _hand_over(self, best: evidence.Best) -> dict[str, Any]:
         """Priors with their cards, report, figures, summary, closing words."""
         with self.clock("report"):
             report = self._report(best.params) if self.args.report and self.policy.value else None

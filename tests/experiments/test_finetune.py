@@ -36,6 +36,7 @@ from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.priors import load_prior
 from sgft_jax.io.real import RealStore
 from sgft_jax.methods import get_method
+from sgft_jax.stacking import member
 from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import finetuning
 
@@ -625,7 +626,7 @@ def film(folder, monkeypatch, *, pushes=(0.0, 1.0), scene=None, reason=None):
 
 def test_a_record_counts_the_steps_that_were_made(tmp_path):
     """Of two seeds whose episodes end early; evaluations on the real system are steps too."""
-    record = FinetuneRecord(tmp_path, toy.make(), gaps.Gap("toy", {}, {}), "sac", [0, 1], real_evaluations=True)
+    record = FinetuneRecord(tmp_path, toy.make(), gaps.Gap("toy", {}, {}), "sac", [0, 1], costly=True)
     record.played = np.array([7, 12])
     record.evaluation(1, {"score": np.zeros(2)}, np.array([3, 2]))
     record.metrics(1, {"real/return": np.zeros(2), "critic/loss": np.array([np.nan, 1.0]), "updates": np.array([0, 3])})
