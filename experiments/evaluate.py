@@ -95,6 +95,7 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     card, stepped = priors[0].card, is_stepped(args.real[0])
     key_worlds, key_episodes = jax.random.split(jax.random.fold_in(jax.random.key(_SEED), args.seed))
     members = stack([prior.params for prior in priors] * len(reals))
+    system: Any
     with contextlib.ExitStack() as last:
         if stepped:
             system = connect(env, args.real, args.set, members=len(priors), gamma=card["gamma"], home=args.out)
@@ -117,7 +118,7 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
 
     systems = []
     for i, gap in enumerate(reals):
-        facts = {"where": "in simulation" if gap is None else f"on the {gap.name} real system"}
+        facts: dict[str, Any] = {"where": "in simulation" if gap is None else f"on the {gap.name} real system"}
         facts |= {"policies": [results_of(i, k) for k in range(len(priors))]}
         if stepped:
             facts["real_steps"] = int(part(played, i, len(priors)).valid.sum())

@@ -254,22 +254,16 @@ def _rollouts(n: int) -> str:
 
 def _lines(labels: Sequence[str], examined: Sequence[Examined], mean: Mapping[str, Any]) -> list[str]:
     """One line for each prior, and one for their mean."""
-    rows = [(label, one.statistics[-1]) for label, one in zip(labels, examined, strict=True)]
-    rows += [("mean", mean)] * (len(examined) > 1)
-    head = ("prior", "success %", "improvable %", "V_sim short by", "rank", "model error -> identified (sim)", "gain")
-    return columns([head, *(_row(*row) for row in rows)])
-
-
-def _row(label: str, diagnosis: Mapping[str, Any]) -> tuple[str, ...]:
-    n, value, errors = diagnosis["rollouts"], diagnosis["value"], diagnosis["model_error"]
-    ahead = diagnosis["horizons"].index(4)
-    four = {where: f"{values[ahead]:.2f}" for where, values in errors.items()}
-    return (
-        label,
-        tables.number(stats.success_interval(round(n * diagnosis["success"]), n)),
-        f"{100 * value['real'][0]['improvable']:.0f}",
-        f"{value['shortfall']:.1f} sd",
-        f"{value['rank_correlation']:.2f}",
-        f"{four['real']} -> {four['identified']} ({four['simulated']})",
-        f"{100 * verdict.gain(verdict.inputs_of(diagnosis)):+.0f}",
-    )
+    rows = [("prior", "success %", "improvable %", "V_sim short by", "rank", "model error -> identified (sim)", "gain")]
+    diagnoses = [(label, one.statistics[-1]) for label, one in zip(labels, examined, strict=True)]
+    if len(examined) > 1:
+        diagnoses.append(("mean", mean))
+    for label, diagnosis in diagnoses:
+        n, value, ahead = diagnosis["rollouts"], diagnosis["value"], diagnosis["horizons"].index(4)
+        four = {where: f"{errors[ahead]:.2f}" for where, errors in diagnosis["model_error"].items()}
+        success = tables.number(stats.success_interval(round(n * diagnosis["success"]), n))
+        improvable, short = f"{100 * value['real'][0]['improvable']:.0f}", f"{value['shortfall']:.1f} sd"
+        model = f"{four['real']} -> {four['identified']} ({four['simulated']})"
+        gain = f"{100 * verdict.gain(verdict.inputs_of(diagnosis)):+.0f}"
+        rows.append((label, success, improvable, short, f"{value['rank_correlation']:.2f}", model, gain))
+    return columns(rows)

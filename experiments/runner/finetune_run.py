@@ -71,6 +71,7 @@ def run(
         begun = last.enter_context(opened("finetune", args, homes, inputs))
         known = sum(log.facts.transitions for log in logs)
         record = functools.partial(FinetuneRecord, costly=stepped, logged=known)
+        assert isinstance(setup.system, KnownSystem)
         world = setup.system.env
         records = [record(x, world, gap, method.name, seeds) for x, gap in zip(begun, systems, strict=True)]
         learner = None
