@@ -4,7 +4,7 @@ The reward of simulated rows gains log w, the logarithm of the ratio of the dyna
 alone. Source: Eysenbach et al. 2021, with a fixed set of real data as in the baseline of H2O+ (Niu et al. 2023).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import jax
@@ -12,38 +12,20 @@ import jax.numpy as jnp
 from flax import struct
 
 from envs.types import Array, Key
-from sgft_jax import checks
 from sgft_jax.data import sources
 from sgft_jax.learners import sac
 from sgft_jax.learners.sac import SACConfig, SACHyper, SACState
+from sgft_jax.learners.steps import MixedConfig
 from sgft_jax.math import losses
 from sgft_jax.models import ratio
-from sgft_jax.models.config import NetworkConfig, two_layers
 from sgft_jax.types import Batch, Learner, Metrics, Source
 
 __all__ = ["DARCConfig", "DARCState", "act", "batches", "init", "make_darc", "paid", "update"]
 
 
 @dataclass(frozen=True)
-class DARCConfig:
-    """The structure of an agent. The defaults are those of the baseline of H2O+.
-
-    obs_dim, act_dim: sizes of what the environment gives and takes.
-    network: body of actor and critics; ratio_network: of the discriminators. ratio_noise: std of their training noise.
-    ratio_rows: the last so many rows of a batch train the discriminators and nothing else; None = all rows train them.
-    tune_alpha: follow the target entropy; False keeps the temperature.
-    """
-
-    obs_dim: int
-    act_dim: int
-    network: NetworkConfig = field(default_factory=two_layers)
-    ratio_network: NetworkConfig = field(default_factory=two_layers)
-    ratio_noise: float = 0.1
-    ratio_rows: int | None = None
-    tune_alpha: bool = True
-
-    def __post_init__(self) -> None:
-        checks.at_least(self, 1, "ratio_rows")
+class DARCConfig(MixedConfig):
+    """The structure of an agent. The defaults are those of the baseline of H2O+."""
 
 
 class DARCState(struct.PyTreeNode):
@@ -78,15 +60,11 @@ def _sac_of(config: DARCConfig) -> SACConfig:
     return SACConfig(*sizes, tune_alpha=config.tune_alpha, train_value=False, train_dynamics=False)
 
 
-def _ratio_of(config: DARCConfig) -> ratio.RatioConfig:
-    return ratio.RatioConfig(config.obs_dim, config.act_dim, config.ratio_network, noise=config.ratio_noise)
-
-
 def init(config: DARCConfig, key: Key, hyper: SACHyper | None = None, *, lr_ratio: float = 3e-4) -> DARCState:
     """A fresh agent. lr_ratio: Adam learning rate of the discriminators."""
     key_sac, key_ratio = jax.random.split(key)
     agent = sac.init(_sac_of(config), key_sac, hyper)
-    return DARCState(agent, ratio.init(_ratio_of(config), key_ratio), jnp.float32(lr_ratio))
+    return DARCState(agent, ratio.init(config.discriminators, key_ratio), jnp.float32(lr_ratio))
 
 
 def act(
@@ -103,7 +81,9 @@ def update(config: DARCConfig, state: DARCState, batch: Batch, key: Key) -> tupl
     """
     key_ratio, key_sac = jax.random.split(key)
     batch, for_ratio = ratio.split_rows(batch, config.ratio_rows)
-    fit, log_w, metrics = ratio.step(_ratio_of(config), state.ratio, batch, for_ratio, key_ratio, rate=state.lr_ratio)
+    fit, log_w, metrics = ratio.step(
+        config.discriminators, state.ratio, batch, for_ratio, key_ratio, rate=state.lr_ratio
+    )
     agent, of_sac = sac.update(_sac_of(config), state.sac, paid(batch, log_w), key_sac)
     return state.replace(sac=agent, ratio=fit), metrics | of_sac
 

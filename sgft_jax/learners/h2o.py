@@ -5,9 +5,9 @@ and rises on real ones. Structure is static in `H2OConfig`; every number is a le
 Source: Niu et al. 2022 (H2O), H2O+ Eq. (1), and the released code.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -18,40 +18,29 @@ from flax import struct
 from envs.types import Array, Key, PyTree
 from sgft_jax import checks
 from sgft_jax.learners import steps
+from sgft_jax.learners.steps import MixedConfig, Networks
 from sgft_jax.math import losses, optim
 from sgft_jax.models import normalizer, ratio
-from sgft_jax.models.config import NetworkConfig, two_layers
-from sgft_jax.models.networks import Network, make_affine_actor, make_critic
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
-__all__ = ["H2OConfig", "H2OHyper", "H2OState", "act", "init", "log_shares", "make_h2o", "penalty", "update"]
+__all__ = ["H2OConfig", "H2OHyper", "H2OState", "init", "log_shares", "make_h2o", "penalty", "update"]
 
 GAP_MIN = 1e-6  # a pair that looks more real than simulated is not pushed; 1e-45, as published, may flush to 0 / 0
 PENALTY_MAX = 1000.0
 
 
 @dataclass(frozen=True)
-class H2OConfig:
-    """The structure of an agent.
+class H2OConfig(MixedConfig):
+    """The structure of an agent: that of `MixedConfig` and a number.
 
-    obs_dim, act_dim: sizes of what the environment gives and takes.
-    network: body of actor and critics; ratio_network: of the discriminators. ratio_noise: std of their training noise.
-    ratio_rows: the last so many rows of a batch train the discriminators and nothing else; None = all rows train all.
     successors: noisy copies of s' over which the gap of the dynamics at (s, a) is averaged.
-    tune_alpha: follow the target entropy; False keeps the temperature at `H2OHyper.alpha`.
     """
 
-    obs_dim: int
-    act_dim: int
-    network: NetworkConfig = field(default_factory=two_layers)
-    ratio_network: NetworkConfig = field(default_factory=two_layers)
-    ratio_noise: float = 0.1
-    ratio_rows: int | None = None
     successors: int = 10
-    tune_alpha: bool = True
 
     def __post_init__(self) -> None:
-        checks.at_least(self, 1, "ratio_rows", "successors")
+        super().__post_init__()
+        checks.at_least(self, 1, "successors")
 
 
 class H2OHyper(NamedTuple):
@@ -126,49 +115,19 @@ def penalty(q: Array, shares: Array, batch: Batch) -> Array:
 # --- the learner ------------------------------------------------------------------------------------------------------
 
 
-class _Networks(NamedTuple):
-    """A configuration with the networks and the optimiser that it describes."""
-
-    config: H2OConfig
-    actor: Network
-    critic: Network
-    ratio: ratio.RatioConfig
-    optimiser: optax.GradientTransformation
-
-
-def _networks(config: H2OConfig) -> _Networks:
-    sizes, gain = (config.obs_dim, config.act_dim), steps.OUTPUT_GAIN
-    return _Networks(
-        config=config,
-        actor=make_affine_actor(*sizes, config.network, output_gain=gain),
-        critic=make_critic(*sizes, config.network, output_gain=gain),
-        ratio=ratio.RatioConfig(*sizes, config.ratio_network, noise=config.ratio_noise),
-        optimiser=optim.adam(),
-    )
-
-
-def init(config: H2OConfig, key: Key, hyper: H2OHyper | None = None) -> H2OState:
+def init(config: H2OConfig, key: Key, hyper: Any = None) -> H2OState:
     """A fresh agent. Set `H2OState.spread`, and the observation statistics with `state.replace(normalizer=...)`."""
-    nets, numbers, keys = _networks(config), optim.as_leaves(hyper or H2OHyper()), jax.random.split(key, 3)
-    critic = nets.critic.init(keys[1])
+    nets, numbers, keys = steps.mixed_networks(config), optim.as_leaves(H2OHyper, hyper), jax.random.split(key, 3)
     return H2OState(
-        actor=optim.start(nets.optimiser, nets.actor.init(keys[0])),
-        critic=optim.start(nets.optimiser, critic),
-        target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
+        **steps.begin(nets, keys[0], keys[1]),
         log_alpha=optim.start(nets.optimiser, jnp.log(numbers.alpha)),
         ratio=ratio.init(nets.ratio, keys[2]),
         spread=jnp.zeros(config.obs_dim),
-        normalizer=normalizer.identity(config.obs_dim),
         hyper=numbers,
-        step=jnp.int32(0),
     )
 
 
-def act(
-    config: H2OConfig, state: H2OState, carry: tuple[()], obs: Array, key: Key, *, explore: bool | Array
-) -> tuple[Array, tuple[()]]:
-    """Action [act_dim] in [-1, 1] for a raw obs [obs_dim], and the carry as it was."""
-    return steps.act(_networks(config), state, obs, key, explore=explore), carry
+act = steps.act
 
 
 def update(config: H2OConfig, state: H2OState, batch: Batch, key: Key) -> tuple[H2OState, Metrics]:
@@ -177,7 +136,7 @@ def update(config: H2OConfig, state: H2OState, batch: Batch, key: Key) -> tuple[
     batch: [B, ...] raw, which says which rows are simulated (`Batch.is_sim`). metrics: [] each.
     """
     batch, for_ratio = ratio.split_rows(batch, config.ratio_rows)
-    nets, hyper = _networks(config), state.hyper
+    nets, hyper = steps.mixed_networks(config), state.hyper
     key_ratio, key_gap, key_actor, key_target = jax.random.split(key, 4)
     fit, log_w, metrics = ratio.step(nets.ratio, state.ratio, batch, for_ratio, key_ratio, rate=hyper.lr_ratio)
     state = state.replace(ratio=fit)
@@ -198,12 +157,12 @@ def update(config: H2OConfig, state: H2OState, batch: Batch, key: Key) -> tuple[
     return state, metrics
 
 
-def make_h2o(config: H2OConfig, hyper: H2OHyper | None = None) -> Learner:
+def make_h2o(config: H2OConfig, hyper: Any = None) -> Learner:
     """The functions of this module for one configuration."""
     return Learner(partial(init, config, hyper=hyper), lambda: (), partial(act, config), partial(update, config))
 
 
-def _gaps(nets: _Networks, state: H2OState, batch: Batch, key: Key) -> Array:
+def _gaps(nets: Networks, state: H2OState, batch: Batch, key: Key) -> Array:
     """KL(P_sim || P) at every pair [B], nats: the mean of log P_sim / P over noisy copies of its successor."""
     std, log_ratio = state.hyper.spread_scale * state.spread, partial(ratio.log_ratio, nets.ratio, state.ratio)
 

@@ -7,9 +7,9 @@ number is a leaf of the state in `H2OPlusHyper`. Source: Niu et al. 2023 (H2O+),
 code.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -19,43 +19,32 @@ from flax import struct
 from envs.types import Array, Key, PyTree, UserError, unknown
 from sgft_jax import checks
 from sgft_jax.learners import edac, iql, steps
+from sgft_jax.learners.steps import MixedConfig, Networks
 from sgft_jax.math import losses, optim
 from sgft_jax.models import normalizer, ratio
-from sgft_jax.models.config import NetworkConfig, two_layers
-from sgft_jax.models.networks import Network, make_affine_actor, make_critic, make_value
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer, ValueLoss
 
-__all__ = ["H2OPlusConfig", "H2OPlusHyper", "H2OPlusState", "act", "init", "make_h2oplus", "mixed_target", "update"]
+__all__ = ["H2OPlusConfig", "H2OPlusHyper", "H2OPlusState", "init", "make_h2oplus", "mixed_target", "update"]
 
 
 @dataclass(frozen=True)
-class H2OPlusConfig:
-    """The structure of an agent.
+class H2OPlusConfig(MixedConfig):
+    """The structure of an agent: that of `MixedConfig` and what follows.
 
-    obs_dim, act_dim: sizes of what the environment gives and takes.
-    network: body of actor, critics and value. critics: members; targets and actor use the minimum of all.
+    critics: members; targets and actor use the minimum of all.
     diversity: weight eta of what keeps the members' gradients apart at the real pairs; 0 = nothing does.
     value_loss: the backbone, which says what V is.
-    tune_alpha: follow the target entropy; False keeps the temperature at `H2OPlusHyper.alpha`.
     ratio: weigh simulated errors by the ratio of the dynamics; False counts them like real ones.
-    ratio_network: body of the two discriminators. ratio_noise: std of their training noise, in units of what they read.
-    ratio_rows: the last so many rows of a batch train the discriminators and nothing else; None = all rows train all.
     """
 
-    obs_dim: int
-    act_dim: int
-    network: NetworkConfig = field(default_factory=two_layers)
     critics: int = 2
     diversity: float = 0.0
     value_loss: ValueLoss = "iql"
-    tune_alpha: bool = True
     ratio: bool = True
-    ratio_network: NetworkConfig = field(default_factory=two_layers)
-    ratio_noise: float = 0.1
-    ratio_rows: int | None = None
 
     def __post_init__(self) -> None:
-        checks.at_least(self, 1, "critics", "ratio_rows")
+        super().__post_init__()
+        checks.at_least(self, 1, "critics")
         checks.not_negative(self, "diversity")
         if self.diversity and self.critics < 2:
             raise checks.refusal("critics", self.critics, "at least 2, or diversity 0")
@@ -128,51 +117,19 @@ def mixed_target(
 # --- the learner ------------------------------------------------------------------------------------------------------
 
 
-class _Networks(NamedTuple):
-    """A configuration with the networks and the optimiser that it describes."""
-
-    config: H2OPlusConfig
-    actor: Network
-    critic: Network
-    value: Network
-    ratio: ratio.RatioConfig
-    optimiser: optax.GradientTransformation
-
-
-def _networks(config: H2OPlusConfig) -> _Networks:
-    sizes, gain = (config.obs_dim, config.act_dim), steps.OUTPUT_GAIN
-    return _Networks(
-        config=config,
-        actor=make_affine_actor(*sizes, config.network, output_gain=gain),
-        critic=make_critic(*sizes, config.network, members=config.critics, output_gain=gain),
-        value=make_value(config.obs_dim, config.network, output_gain=gain),
-        ratio=ratio.RatioConfig(*sizes, config.ratio_network, noise=config.ratio_noise),
-        optimiser=optim.adam(),
-    )
-
-
-def init(config: H2OPlusConfig, key: Key, hyper: H2OPlusHyper | None = None) -> H2OPlusState:
+def init(config: H2OPlusConfig, key: Key, hyper: Any = None) -> H2OPlusState:
     """A fresh agent. Set the observation statistics with `state.replace(normalizer=...)`."""
-    nets, numbers, keys = _networks(config), optim.as_leaves(hyper or H2OPlusHyper()), jax.random.split(key, 4)
-    critic = nets.critic.init(keys[1])
+    nets, numbers, keys = steps.mixed_networks(config), optim.as_leaves(H2OPlusHyper, hyper), jax.random.split(key, 4)
     return H2OPlusState(
-        actor=optim.start(nets.optimiser, nets.actor.init(keys[0])),
-        critic=optim.start(nets.optimiser, critic),
-        target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
+        **steps.begin(nets, keys[0], keys[1]),
         value=optim.start(nets.optimiser, nets.value.init(keys[2])),
         log_alpha=optim.start(nets.optimiser, jnp.log(numbers.alpha)),
         ratio=ratio.init(nets.ratio, keys[3]) if config.ratio else None,
-        normalizer=normalizer.identity(config.obs_dim),
         hyper=numbers,
-        step=jnp.int32(0),
     )
 
 
-def act(
-    config: H2OPlusConfig, state: H2OPlusState, carry: tuple[()], obs: Array, key: Key, *, explore: bool | Array
-) -> tuple[Array, tuple[()]]:
-    """Action [act_dim] in [-1, 1] for a raw obs [obs_dim], and the carry as it was."""
-    return steps.act(_networks(config), state, obs, key, explore=explore), carry
+act = steps.act
 
 
 def update(config: H2OPlusConfig, state: H2OPlusState, batch: Batch, key: Key) -> tuple[H2OPlusState, Metrics]:
@@ -181,7 +138,7 @@ def update(config: H2OPlusConfig, state: H2OPlusState, batch: Batch, key: Key) -
     batch: [B, ...] raw, which says which rows are simulated (`Batch.is_sim`). metrics: [] each.
     """
     batch, for_ratio = ratio.split_rows(batch, config.ratio_rows)
-    nets, hyper = _networks(config), state.hyper
+    nets, hyper = steps.mixed_networks(config), state.hyper
     key_ratio, key_actor, key_target = jax.random.split(key, 3)
     weights, metrics = jnp.ones_like(batch.reward), {}
     if config.ratio:
@@ -199,7 +156,7 @@ def update(config: H2OPlusConfig, state: H2OPlusState, batch: Batch, key: Key) -
     return state, metrics | of_actor | of_value | of_critic
 
 
-def make_h2oplus(config: H2OPlusConfig, hyper: H2OPlusHyper | None = None) -> Learner:
+def make_h2oplus(config: H2OPlusConfig, hyper: Any = None) -> Learner:
     """The functions of this module for one configuration."""
     return Learner(partial(init, config, hyper=hyper), lambda: (), partial(act, config), partial(update, config))
 
@@ -207,7 +164,7 @@ def make_h2oplus(config: H2OPlusConfig, hyper: H2OPlusHyper | None = None) -> Le
 # --- one update -------------------------------------------------------------------------------------------------------
 
 
-def _step_value(nets: _Networks, state: H2OPlusState, batch: Batch) -> tuple[optim.Fit, Metrics]:
+def _step_value(nets: Networks, state: H2OPlusState, batch: Batch) -> tuple[optim.Fit, Metrics]:
     """V after a step on the real rows alone, against the minimum of the target critics. Source: H2O+ Eq. (4)."""
     q = jnp.min(jax.vmap(nets.critic.apply, (None, 0, 0))(state.target_critic, batch.obs, batch.action), axis=1)
     hyper, counted = state.hyper, losses.real_rows(batch)
@@ -223,7 +180,7 @@ def _step_value(nets: _Networks, state: H2OPlusState, batch: Batch) -> tuple[opt
 
 
 def _step_critic(
-    nets: _Networks, state: H2OPlusState, batch: Batch, weights: Array, key: Key
+    nets: Networks, state: H2OPlusState, batch: Batch, weights: Array, key: Key
 ) -> tuple[optim.Fit, Metrics]:
     """The critics after a step on real and weighted simulated errors, a mean of each. Source: H2O+ Eqs. (7), (8)."""
     hyper, alpha, diversity = state.hyper, jnp.exp(state.log_alpha.params), nets.config.diversity

@@ -8,7 +8,7 @@ that expectiles and learning rates vmap like seeds do. Source: Kostrikov et al. 
 import math
 from dataclasses import dataclass, field
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -18,6 +18,7 @@ from flax import struct
 
 from envs.types import Array, Key, PyTree
 from sgft_jax.learners import steps
+from sgft_jax.learners.steps import Networks
 from sgft_jax.math import losses, optim
 from sgft_jax.models import networks, normalizer
 from sgft_jax.models.networks import Network, NetworkConfig
@@ -146,38 +147,22 @@ def td_target(reward: Array, discount: Array, next_value: Array, *, reward_scale
 # --- the learner ------------------------------------------------------------------------------------------------------
 
 
-class _Networks(NamedTuple):
-    """The networks and the optimiser that a configuration describes."""
-
-    actor: Network
-    critic: Network
-    value: Network
-    optimiser: optax.GradientTransformation
-
-
-def _networks(config: IQLConfig) -> _Networks:
-    sizes = config.obs_dim, config.act_dim, config.network
+def _networks(config: IQLConfig) -> Networks:
+    sizes, optimiser = (config.obs_dim, config.act_dim, config.network), optim.adam(config.max_grad_norm)
     value = networks.make_value(config.obs_dim, config.network)
-    return _Networks(make_gaussian_actor(*sizes), networks.make_critic(*sizes), value, optim.adam(config.max_grad_norm))
+    return Networks(config, make_gaussian_actor(*sizes), networks.make_critic(*sizes), optimiser, value)
 
 
-def init(config: IQLConfig, key: Key, hyper: IQLHyper | None = None) -> IQLState:
+def init(config: IQLConfig, key: Key, hyper: Any = None) -> IQLState:
     """A fresh agent. Set the observation statistics with `state.replace(normalizer=...)`.
 
     New numbers, set with `state.replace(hyper=...)`, must be float32 arrays like the old ones, or the update is
     compiled again.
     """
-    nets, keys = _networks(config), jax.random.split(key, 3)
-    critic = nets.critic.init(keys[1])
-    return IQLState(
-        actor=optim.start(nets.optimiser, nets.actor.init(keys[0])),
-        critic=optim.start(nets.optimiser, critic),
-        target_critic=jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
-        value=optim.start(nets.optimiser, nets.value.init(keys[2])),
-        normalizer=normalizer.identity(config.obs_dim),
-        hyper=optim.as_leaves(hyper or IQLHyper()),
-        step=jnp.int32(0),
-    )
+    nets, (key_actor, key_critic, key_value) = _networks(config), jax.random.split(key, 3)
+    value = optim.start(nets.optimiser, nets.value.init(key_value))
+    numbers = optim.as_leaves(IQLHyper, hyper)
+    return IQLState(**steps.begin(nets, key_actor, key_critic), value=value, hyper=numbers)
 
 
 def act(
@@ -211,7 +196,7 @@ def update(config: IQLConfig, state: IQLState, batch: Batch, key: Key) -> tuple[
     return state.replace(target_critic=target, step=state.step + 1), of_value | of_actor | of_critic
 
 
-def make_iql(config: IQLConfig, hyper: IQLHyper | None = None) -> Learner:
+def make_iql(config: IQLConfig, hyper: Any = None) -> Learner:
     """The functions of this module for one configuration."""
     return Learner(partial(init, config, hyper=hyper), lambda: (), partial(act, config), partial(update, config))
 
@@ -219,7 +204,7 @@ def make_iql(config: IQLConfig, hyper: IQLHyper | None = None) -> Learner:
 # --- one update -------------------------------------------------------------------------------------------------------
 
 
-def _update_value(nets: _Networks, state: IQLState, batch: Batch, q: Array) -> tuple[IQLState, Metrics]:
+def _update_value(nets: Networks, state: IQLState, batch: Batch, q: Array) -> tuple[IQLState, Metrics]:
     row_loss = partial(losses.expectile_loss, expectile=state.hyper.expectile)
 
     def loss(params: PyTree) -> tuple[Array, Array]:
@@ -230,7 +215,7 @@ def _update_value(nets: _Networks, state: IQLState, batch: Batch, q: Array) -> t
     return state.replace(value=fit), {"value/loss": mean, "value/mean": jnp.mean(values)}
 
 
-def _update_actor(nets: _Networks, state: IQLState, batch: Batch, q: Array) -> tuple[IQLState, Metrics]:
+def _update_actor(nets: Networks, state: IQLState, batch: Batch, q: Array) -> tuple[IQLState, Metrics]:
     """q: [B] of the target critic, as the value saw them."""
     hyper = state.hyper
     values = jax.vmap(nets.value.apply, (None, 0))(state.value.params, batch.obs)
@@ -254,7 +239,7 @@ def _update_actor(nets: _Networks, state: IQLState, batch: Batch, q: Array) -> t
     return state.replace(actor=fit._replace(params={**fit.params, "log_std": log_std})), metrics
 
 
-def _update_critic(nets: _Networks, state: IQLState, batch: Batch) -> tuple[IQLState, Metrics]:
+def _update_critic(nets: Networks, state: IQLState, batch: Batch) -> tuple[IQLState, Metrics]:
     next_values = jax.vmap(nets.value.apply, (None, 0))(state.value.params, batch.next_obs)
     target = partial(td_target, reward_scale=state.hyper.reward_scale)
     targets = jax.vmap(target)(batch.reward, batch.discount, next_values)

@@ -6,7 +6,7 @@ static in `ReBRACConfig`; every number is a leaf of the state in `ReBRACHyper`. 
 
 from dataclasses import dataclass, field
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -17,9 +17,10 @@ from flax import struct
 from envs.types import Array, Key, PyTree, UserError
 from sgft_jax import checks
 from sgft_jax.learners import steps
+from sgft_jax.learners.steps import Networks
 from sgft_jax.math import losses, optim
 from sgft_jax.models import normalizer
-from sgft_jax.models.networks import Network, NetworkConfig, add_noise, make_critic, make_deterministic_actor
+from sgft_jax.models.networks import NetworkConfig, add_noise, make_critic, make_deterministic_actor
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
 __all__ = ["ReBRACConfig", "ReBRACHyper", "ReBRACState", "act", "distance", "init", "make_rebrac", "td_target"]
@@ -92,32 +93,16 @@ def td_target(reward: Array, discount: Array, next_q: Array, next_distance: Arra
 # --- the learner ------------------------------------------------------------------------------------------------------
 
 
-class _Networks(NamedTuple):
-    """The networks and the optimiser that a configuration describes."""
-
-    actor: Network
-    critic: Network
-    optimiser: optax.GradientTransformation
-
-
-def _networks(config: ReBRACConfig) -> _Networks:
+def _networks(config: ReBRACConfig) -> Networks:
     sizes = config.obs_dim, config.act_dim, config.network
-    return _Networks(make_deterministic_actor(*sizes), make_critic(*sizes), optim.adam())
+    return Networks(config, make_deterministic_actor(*sizes), make_critic(*sizes), optim.adam())
 
 
-def init(config: ReBRACConfig, key: Key, hyper: ReBRACHyper | None = None) -> ReBRACState:
+def init(config: ReBRACConfig, key: Key, hyper: Any = None) -> ReBRACState:
     """A fresh agent. Set the observation statistics with `state.replace(normalizer=...)`."""
-    nets, (key_actor, key_critic) = _networks(config), jax.random.split(key)
-    actor, critic = nets.actor.init(key_actor), nets.critic.init(key_critic)
-    return ReBRACState(
-        actor=optim.start(nets.optimiser, actor),
-        critic=optim.start(nets.optimiser, critic),
-        target_actor=jax.tree.map(jnp.copy, actor),  # buffers of their own: a donated state must not hold one twice
-        target_critic=jax.tree.map(jnp.copy, critic),
-        normalizer=normalizer.identity(config.obs_dim),
-        hyper=optim.as_leaves(hyper or ReBRACHyper()),
-        step=jnp.int32(0),
-    )
+    parts = steps.begin(_networks(config), *jax.random.split(key))
+    target = jax.tree.map(jnp.copy, parts["actor"].params)  # as that of the critic
+    return ReBRACState(**parts, target_actor=target, hyper=optim.as_leaves(ReBRACHyper, hyper))
 
 
 def act(
@@ -147,7 +132,7 @@ def update(config: ReBRACConfig, state: ReBRACState, batch: Batch, key: Key) -> 
     return state.replace(step=state.step + 1), metrics | of_actor
 
 
-def make_rebrac(config: ReBRACConfig, hyper: ReBRACHyper | None = None) -> Learner:
+def make_rebrac(config: ReBRACConfig, hyper: Any = None) -> Learner:
     """The functions of this module for one configuration: `update` takes windows [B, 2]."""
     return Learner(partial(init, config, hyper=hyper), lambda: (), partial(act, config), partial(update, config))
 
@@ -164,7 +149,7 @@ def _rows(batch: Batch) -> tuple[Batch, Array, Array]:
 
 
 def _update_critic(
-    nets: _Networks, state: ReBRACState, rows: Batch, next_action: Array, follows: Array, key: Key
+    nets: Networks, state: ReBRACState, rows: Batch, next_action: Array, follows: Array, key: Key
 ) -> tuple[ReBRACState, Metrics]:
     hyper = state.hyper
 
@@ -177,12 +162,11 @@ def _update_critic(
         return td_target(row.reward, row.discount, next_q, away, penalty=hyper.critic_penalty)
 
     targets = jax.vmap(target)(rows, next_action, follows, jax.random.split(key, rows.reward.shape[0]))
-
     fit, metrics = steps.step_critic(nets, state, rows, targets, rate=hyper.lr_critic)
     return state.replace(critic=fit), metrics
 
 
-def _step_actor(nets: _Networks, state: ReBRACState, rows: Batch) -> tuple[optim.Fit, Metrics]:
+def _step_actor(nets: Networks, state: ReBRACState, rows: Batch) -> tuple[optim.Fit, Metrics]:
     """The actor after a step on penalty |pi(s) - a|^2 - Q / mean |Q|."""
 
     def loss(params: PyTree) -> tuple[Array, Array]:

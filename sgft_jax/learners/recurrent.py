@@ -17,10 +17,11 @@ from flax import struct
 from envs.types import Array, Key, PyTree
 from sgft_jax import checks
 from sgft_jax.learners import steps
+from sgft_jax.learners.steps import Networks
 from sgft_jax.math import losses, optim
 from sgft_jax.models import networks, normalizer
-from sgft_jax.models.gru import GRU, make_gru
-from sgft_jax.models.networks import Network, NetworkConfig
+from sgft_jax.models.gru import make_gru
+from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.stacking import stack
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
@@ -91,24 +92,17 @@ class Carry(NamedTuple):
 # --- the learner ------------------------------------------------------------------------------------------------------
 
 
-class _Networks(NamedTuple):
-    """The networks and the optimiser that a configuration describes; the two memories have one shape."""
-
-    memory: GRU
-    actor: Network
-    critic: Network
-    optimiser: optax.GradientTransformation
-
-
-def _networks(config: RecurrentConfig) -> _Networks:
+def _networks(config: RecurrentConfig) -> Networks:
+    """The memories of actor and critic have one shape."""
     memory = make_gru(config.obs_dim, config.act_dim, config.gru)
     sizes = memory.features, config.act_dim, config.network
-    return _Networks(memory, networks.make_actor(*sizes), networks.make_critic(*sizes), optim.adam())
+    actor, critic = networks.make_actor(*sizes), networks.make_critic(*sizes)
+    return Networks(config, actor, critic, optim.adam(), memory=memory)
 
 
 def init(config: RecurrentConfig, key: Key, hyper: RecurrentHyper | None = None) -> RecurrentState:
     """A fresh agent. Set the observation statistics with `state.replace(normalizer=...)`."""
-    nets, numbers, keys = _networks(config), optim.as_leaves(hyper or RecurrentHyper()), jax.random.split(key, 4)
+    nets, numbers, keys = _networks(config), optim.as_leaves(RecurrentHyper, hyper), jax.random.split(key, 4)
     actor = {"memory": nets.memory.init(keys[0]), "head": nets.actor.init(keys[1])}
     critic = {"memory": nets.memory.init(keys[2]), "head": nets.critic.init(keys[3])}
     return RecurrentState(

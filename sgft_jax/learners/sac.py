@@ -17,11 +17,11 @@ from flax import struct
 from envs.types import Array, Key, PyTree, UserError
 from sgft_jax import checks
 from sgft_jax.learners import steps
-from sgft_jax.learners.steps import Critic, Sampler
+from sgft_jax.learners.steps import Critic, Networks, Sampler
 from sgft_jax.math import losses, optim
 from sgft_jax.models import dynamics, networks, normalizer
 from sgft_jax.models.distortion import Distortion
-from sgft_jax.models.networks import Network, NetworkConfig
+from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
 __all__ = ["SACConfig", "SACHyper", "SACParams", "SACState", "act", "check_params_of_prior"]
@@ -156,20 +156,9 @@ class SACState(struct.PyTreeNode):
     anchor: PyTree = None
 
 
-class _Networks(NamedTuple):
-    """A configuration with the networks and the optimiser that it describes."""
-
-    config: SACConfig
-    actor: Network
-    critic: Network
-    value: Network
-    dynamics: Network
-    optimiser: optax.GradientTransformation
-
-
-def _networks(config: SACConfig) -> _Networks:
+def _networks(config: SACConfig) -> Networks:
     inputs, act_dim, body = config.obs_dim + config.context_dim, config.act_dim, config.network
-    return _Networks(
+    return Networks(
         config=config,
         actor=networks.make_actor(inputs, act_dim, body),
         critic=networks.make_critic(inputs, act_dim, config.critic_network or body, members=config.critics),
@@ -250,10 +239,10 @@ def network_input(statistics: Normalizer, obs: Array, context: Array | None) -> 
 
 
 def _assemble(
-    nets: _Networks, hyper: SACHyper, actor: PyTree, critic: PyTree, value: PyTree | None, model: PyTree | None
+    nets: Networks, hyper: SACHyper, actor: PyTree, critic: PyTree, value: PyTree | None, model: PyTree | None
 ) -> SACState:
     """Fresh optimiser moments around given parameters."""
-    hyper = optim.as_leaves(hyper)
+    hyper = optim.as_leaves(SACHyper, hyper)
     start = partial(optim.start, nets.optimiser)
     return SACState(
         actor=start(actor),
@@ -271,7 +260,7 @@ def _assemble(
 # --- one update -------------------------------------------------------------------------------------------------------
 
 
-def _relative(nets: _Networks, state: SACState) -> _Networks:
+def _relative(nets: Networks, state: SACState) -> Networks:
     """The networks, of which the critic is relative to the frozen value where a baseline is asked for."""
     if not nets.config.critic_baseline:
         return nets
@@ -284,13 +273,13 @@ def _relative(nets: _Networks, state: SACState) -> _Networks:
     return nets._replace(critic=nets.critic._replace(apply=relative))
 
 
-def _term(critic_term: CriticTerm, nets: _Networks, state: SACState, batch: Batch, key: Key, params: PyTree) -> Array:
+def _term(critic_term: CriticTerm, nets: Networks, state: SACState, batch: Batch, key: Key, params: PyTree) -> Array:
     """A critic term [] of the critic's parameters."""
     return critic_term(nets.critic.apply, params, partial(steps.sample, nets, state), batch, key)
 
 
 def _update_critic(
-    nets: _Networks,
+    nets: Networks,
     state: SACState,
     batch: Batch,
     members: Array | slice,
@@ -313,7 +302,7 @@ def _target_members(config: SACConfig, key: Key) -> Array | slice:
     return jax.random.permutation(key, config.critics)[: config.target_critics]
 
 
-def _update_actor(nets: _Networks, state: SACState, rows: Batch, key: Key) -> tuple[SACState, Array, Array, Metrics]:
+def _update_actor(nets: Networks, state: SACState, rows: Batch, key: Key) -> tuple[SACState, Array, Array, Metrics]:
     """Also returns the q [B, members] and log-probabilities [B] of the actions drawn, for value and temperature."""
     config, hyper, since = nets.config, state.hyper, state.step - state.hyper.actor_start
 
@@ -331,7 +320,7 @@ def _update_actor(nets: _Networks, state: SACState, rows: Batch, key: Key) -> tu
     return state.replace(actor=fit), q, log_prob, metrics
 
 
-def _update_temperature(nets: _Networks, state: SACState, rows: Batch, log_prob: Array) -> SACState:
+def _update_temperature(nets: Networks, state: SACState, rows: Batch, log_prob: Array) -> SACState:
     target, rate = state.hyper.entropy_per_dim * nets.config.act_dim, state.hyper.lr_alpha
     fit = steps.step_temperature(nets, state, rows, log_prob, target=target, rate=rate)
     return state.replace(log_alpha=optax.tree.where(_policy_turn(nets.config, state), fit, state.log_alpha))
@@ -342,7 +331,7 @@ def _policy_turn(config: SACConfig, state: SACState) -> Array:
     return state.step % config.policy_delay == 0
 
 
-def _update_value(nets: _Networks, state: SACState, rows: Batch, q: Array) -> tuple[SACState, Metrics]:
+def _update_value(nets: Networks, state: SACState, rows: Batch, q: Array) -> tuple[SACState, Metrics]:
     obs = rows.obs[:, : nets.config.obs_dim]
 
     def loss(params: PyTree) -> tuple[Array, tuple[()]]:

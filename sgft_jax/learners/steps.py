@@ -4,15 +4,20 @@ Sources: SAC (Haarnoja et al. 2018); for real and simulated rows H2O (Niu et al.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from envs.types import Array, Key, PyTree
+from sgft_jax import checks
 from sgft_jax.math import losses, optim
-from sgft_jax.models import networks, normalizer
+from sgft_jax.models import networks, normalizer, ratio
+from sgft_jax.models.config import NetworkConfig, two_layers
+from sgft_jax.models.networks import Network
 from sgft_jax.types import Batch, Metrics
 
 LOG_ALPHA_MIN = -10.0  # dense negative rewards would drive an auto-tuned temperature to zero
@@ -22,26 +27,98 @@ Critic = Callable[[PyTree, Array, Array], Array]  # (params of members, obs, act
 Sampler = Callable[[Array, Key], tuple[Array, Array]]  # (obs, key) -> (action of the policy, its log pi [])
 
 
-# In this file `nets` are the networks of a learner, with `actor`, `critic` and `optimiser`, and `state` is its state,
-# with a network in training for either, the temperature `log_alpha`, and `normalizer`, `hyper`.
+class Networks(NamedTuple):
+    """A configuration with the networks and the optimiser that it describes; None where it has no such network."""
+
+    config: Any
+    actor: Network
+    critic: Network
+    optimiser: optax.GradientTransformation
+    value: Any = None
+    dynamics: Any = None
+    ratio: Any = None
+    memory: Any = None
 
 
-def act(nets: Any, state: Any, obs: Array, key: Key, *, explore: bool | Array) -> Array:
-    """Action [act_dim] of a tanh-Gaussian actor. obs: [obs_dim] raw."""
-    moments = nets.actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
-    return networks.tanh_gaussian_action(moments, key, explore=explore)
+# In this file `state` is that of a learner, with a network in training for actor and critic, the temperature
+# `log_alpha`, and `normalizer`, `hyper`.
+
+
+def begin(nets: Networks, key_actor: Key, key_critic: Key) -> dict[str, Any]:
+    """What is part of every fresh agent. Its statistics leave observations as they are."""
+    critic = nets.critic.init(key_critic)
+    return {
+        "actor": optim.start(nets.optimiser, nets.actor.init(key_actor)),
+        "critic": optim.start(nets.optimiser, critic),
+        "target_critic": jax.tree.map(jnp.copy, critic),  # its own buffers: a donated state must not hold one twice
+        "normalizer": normalizer.identity(nets.config.obs_dim),
+        "step": jnp.int32(0),
+    }
+
+
+# --- agents of real and simulated rows --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class MixedConfig:
+    """The structure of an agent that learns from real and simulated rows, which two discriminators tell apart.
+
+    obs_dim, act_dim: sizes of what the environment gives and takes.
+    network: body of actor, critics and value. critics: members.
+    tune_alpha: follow the target entropy; False keeps the temperature at `alpha`.
+    ratio_network: body of the discriminators. ratio_noise: std of their training noise, in units of what they read.
+    ratio_rows: the last so many rows of a batch train the discriminators and nothing else; None = all rows train all.
+    """
+
+    obs_dim: int
+    act_dim: int
+    network: NetworkConfig = field(default_factory=two_layers)
+    tune_alpha: bool = True
+    ratio_network: NetworkConfig = field(default_factory=two_layers)
+    ratio_noise: float = 0.1
+    ratio_rows: int | None = None
+    critics: ClassVar[int] = 2
+
+    def __post_init__(self) -> None:
+        checks.at_least(self, 1, "ratio_rows")
+
+    @property
+    def discriminators(self) -> ratio.RatioConfig:
+        """Their part."""
+        return ratio.RatioConfig(self.obs_dim, self.act_dim, self.ratio_network, noise=self.ratio_noise)
+
+
+def mixed_networks(config: MixedConfig) -> Networks:
+    """Those of H2O's released codes."""
+    sizes, gain = (config.obs_dim, config.act_dim), OUTPUT_GAIN
+    return Networks(
+        config=config,
+        actor=networks.make_affine_actor(*sizes, config.network, output_gain=gain),
+        critic=networks.make_critic(*sizes, config.network, members=config.critics, output_gain=gain),
+        optimiser=optim.adam(),
+        value=networks.make_value(config.obs_dim, config.network, output_gain=gain),
+        ratio=config.discriminators,
+    )
+
+
+def act(
+    config: MixedConfig, state: Any, carry: tuple[()], obs: Array, key: Key, *, explore: bool | Array
+) -> tuple[Array, tuple[()]]:
+    """Action [act_dim] in [-1, 1] for a raw obs [obs_dim], and the carry as it was."""
+    actor, obs = mixed_networks(config).actor, normalizer.normalize(state.normalizer, obs)
+    return networks.tanh_gaussian_action(actor.apply(state.actor.params, obs), key, explore=explore), carry
 
 
 # --- critics ----------------------------------------------------------------------------------------------------------
 
 
-def sample(nets: Any, state: Any, obs: Array, key: Key) -> tuple[Array, Array]:
+def sample(nets: Networks, state: Any, obs: Array, key: Key) -> tuple[Array, Array]:
     """An action [act_dim] of the policy and its log pi []. obs: what the actor reads."""
     return networks.tanh_gaussian_sample(nets.actor.apply(state.actor.params, obs), key)
 
 
 def soft_targets(
-    nets: Any, state: Any, batch: Batch, key: Key, *, alpha: Array | float, members: Array | slice = slice(None)
+    nets: Networks, state: Any, batch: Batch, key: Key, *, alpha: Array | float, members: Array | slice = slice(None)
 ) -> Array:
     """Targets r + discount (min_i Q_i(s', a') - alpha log pi(a'|s')) [B] with a' ~ pi.
 
@@ -57,7 +134,7 @@ def soft_targets(
 
 
 def step_critic(
-    nets: Any,
+    nets: Networks,
     state: Any,
     batch: Batch,
     targets: Array,
@@ -77,7 +154,7 @@ def step_critic(
 
 
 def step_mixed_critic(
-    nets: Any,
+    nets: Networks,
     state: Any,
     batch: Batch,
     targets: Array,
@@ -109,7 +186,7 @@ def step_mixed_critic(
 
 
 def step_actor(
-    nets: Any,
+    nets: Networks,
     state: Any,
     rows: Batch,
     key: Key,
@@ -139,7 +216,7 @@ def step_actor(
     return fit, q, log_prob, {"actor/loss": value, "actor/entropy": -jnp.mean(log_prob)}
 
 
-def step_policy(nets: Any, state: Any, batch: Batch, key: Key) -> tuple[optim.Fit, optim.Fit, Metrics]:
+def step_policy(nets: Networks, state: Any, batch: Batch, key: Key) -> tuple[optim.Fit, optim.Fit, Metrics]:
     """Actor, and temperature where `nets.config.tune_alpha`, after a step on the states of all rows."""
     fit, _, log_prob, metrics = step_actor(nets, state, batch, key, rate=state.hyper.lr_actor)
     log_alpha = state.log_alpha
@@ -150,7 +227,7 @@ def step_policy(nets: Any, state: Any, batch: Batch, key: Key) -> tuple[optim.Fi
 
 
 def step_temperature(
-    nets: Any, state: Any, rows: Batch, log_prob: Array, *, target: float | Array, rate: float | Array
+    nets: Networks, state: Any, rows: Batch, log_prob: Array, *, target: float | Array, rate: float | Array
 ) -> optim.Fit:
     """One step of the temperature's logarithm. log_prob: [B] of the actions drawn. target: [] entropy, nats."""
 

@@ -289,7 +289,7 @@ def _assemble(nets: Networks, hyper: TDMPC2Hyper, prior: TDMPC2Params) -> TDMPC2
         anchor=jax.tree.map(jnp.copy, prior.anchor or prior.policy) if nets.config.sgft else None,
         scale=prior.scale,
         normalizer=prior.normalizer,
-        hyper=optim.as_leaves(hyper),
+        hyper=optim.as_leaves(TDMPC2Hyper, hyper),
         step=jnp.int32(0),
     )
 

@@ -1,7 +1,7 @@
 """One Adam per network: a network that is not stepped cannot move, not even by momentum."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -45,9 +45,14 @@ def minimise[Aux](
     return step(optimiser, fit, grads, rate), value, aux
 
 
-def as_leaves[Hyper](hyper: Hyper) -> Hyper:
-    """The numbers of an agent as float32 arrays: new ones then vmap, and compile no update again."""
-    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), hyper)
+def as_leaves(kind: Any, options: Any = None) -> Any:
+    """The numbers `kind`, a NamedTuple, as float32 arrays: new ones then vmap, and compile no update again.
+
+    options: whatever has them as attributes, such as numbers of that kind or the options of a method; None = its
+    defaults.
+    """
+    options = kind() if options is None else options
+    return kind(*jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), [getattr(options, name) for name in kind._fields]))
 
 
 def warmup_factor(step: Array, warmup: Array | float) -> Array:

@@ -19,18 +19,11 @@ class Config(RowsOptions):
 
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
-    from sgft_jax.data import sources
     from sgft_jax.learners import cql
 
-    structure = cql.CQLConfig(
-        task.obs_dim,
-        task.act_dim,
-        config.network,
-        conservatism=config.conservatism,
-        samples=config.samples,
-    )
-    learner = cql.make_cql(structure, sac_numbers(config))
-    return agent_of(learner, config, task, sources.real_rows(config.rows), simulates=False)
+    sizes = task.obs_dim, task.act_dim, config.network
+    structure = cql.CQLConfig(*sizes, conservatism=config.conservatism, samples=config.samples)
+    return agent_of(cql.make_cql(structure, sac_numbers(config)), config, task)
 
 
 METHOD = Method(

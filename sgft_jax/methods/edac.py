@@ -15,14 +15,11 @@ class Config(RowsOptions, EnsembleOptions):
 
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
-    from sgft_jax.data import sources
     from sgft_jax.learners import edac
 
-    structure = edac.EDACConfig(
-        task.obs_dim, task.act_dim, config.network, critics=config.critics, diversity=config.diversity
-    )
-    learner = edac.make_edac(structure, sac_numbers(config))
-    return agent_of(learner, config, task, sources.real_rows(config.rows), simulates=False)
+    sizes = task.obs_dim, task.act_dim, config.network
+    structure = edac.EDACConfig(*sizes, critics=config.critics, diversity=config.diversity)
+    return agent_of(edac.make_edac(structure, sac_numbers(config)), config, task)
 
 
 METHOD = Method(

@@ -23,22 +23,11 @@ def build(config: Config, task: Task) -> HybridAgent:
     from sgft_jax.data import replay
     from sgft_jax.learners import h2o
 
-    structure = h2o.H2OConfig(task.obs_dim, task.act_dim, config.network, ratio_rows=2 * config.ratio_rows)
-
     def prepare(state: h2o.H2OState, real: RealData, updates: int) -> h2o.H2OState:
         return state.replace(spread=replay.obs_std(replay.full(real.rows)))
 
-    hyper = h2o.H2OHyper(
-        lr_actor=config.lr,
-        lr_critic=config.lr,
-        lr_alpha=config.lr,
-        lr_ratio=config.lr,
-        tau=config.tau,
-        conservatism=config.conservatism,
-        spread_scale=config.spread_scale,
-    )
-    learner = h2o.make_h2o(structure, hyper)
-    batches = real_and_simulated(config)
+    structure = h2o.H2OConfig(task.obs_dim, task.act_dim, config.network, ratio_rows=2 * config.ratio_rows)
+    learner, batches = h2o.make_h2o(structure, config), real_and_simulated(config)
     return agent_of(learner, config, task, batches, simulates=True, head="affine", prepare=prepare)
 
 

@@ -37,17 +37,6 @@ def build(config: Config, task: Task) -> HybridAgent:
     from sgft_jax.learners import h2oplus
     from sgft_jax.models import normalizer
 
-    structure = h2oplus.H2OPlusConfig(
-        task.obs_dim,
-        task.act_dim,
-        config.network,
-        critics=config.critics,
-        diversity=config.diversity,
-        value_loss=config.value_loss,
-        ratio=config.ratio,
-        ratio_rows=2 * config.ratio_rows,
-    )
-
     def prepare(state: h2oplus.H2OPlusState, real: RealData, updates: int) -> h2oplus.H2OPlusState:
         alpha = state.hyper.value_alpha / return_scale(real)  # the learner itself has it in units of return
         state = state.replace(hyper=state.hyper._replace(value_alpha=alpha))
@@ -55,20 +44,11 @@ def build(config: Config, task: Task) -> HybridAgent:
             state = state.replace(ratio=state.ratio._replace(normalizer=normalizer.of(real.rows.obs)))
         return state
 
-    hyper = h2oplus.H2OPlusHyper(
-        lr_actor=config.lr,
-        lr_critic=config.lr,
-        lr_value=config.lr,
-        lr_alpha=config.lr,
-        lr_ratio=config.lr,
-        tau=config.tau,
-        value_share=config.value_share,
-        expectile=config.expectile,
-        value_alpha=config.value_alpha,
-        value_cut=config.value_cut,
+    chosen = {name: getattr(config, name) for name in ("critics", "diversity", "value_loss", "ratio")}
+    structure = h2oplus.H2OPlusConfig(
+        task.obs_dim, task.act_dim, config.network, ratio_rows=2 * config.ratio_rows, **chosen
     )
-    learner = h2oplus.make_h2oplus(structure, hyper)
-    batches = real_and_simulated(config)
+    learner, batches = h2oplus.make_h2oplus(structure, config), real_and_simulated(config)
     return agent_of(learner, config, task, batches, simulates=True, head="affine", prepare=prepare)
 
 

@@ -3,18 +3,18 @@
 From simulated data, then with real transitions in half of each batch; or from a fixed set of real data alone.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import inf
+from typing import ClassVar
 
-from envs.types import Array, Key, PyTree
+from envs.types import Key, PyTree
 from sgft_jax import checks
 from sgft_jax.methods.options import RowsOptions, agent_of, return_scale
-from sgft_jax.models.config import NetworkConfig
 from sgft_jax.train.options import MixedOptions
 from sgft_jax.types import (
     Finetuner,
     Fixed,
     HybridAgent,
-    Learner,
     Method,
     Online,
     Prior,
@@ -28,6 +28,9 @@ from sgft_jax.types import (
 @dataclass(frozen=True)
 class Config(MixedOptions):
     """Options of `iql`; the defaults are Kostrikov et al. 2022's for locomotion."""
+
+    max_weight: ClassVar[float] = 100.0
+    actor_updates: ClassVar[float] = inf
 
     lr_actor: checks.Positive = 3e-4
     """Adam learning rate of the actor."""
@@ -47,6 +50,11 @@ class Config(MixedOptions):
     offline_updates: checks.Updates = 500_000
     """Updates on the simulated transitions alone, before the first real rollout."""
 
+    @property
+    def lr_value(self) -> float:
+        """That of the critic."""
+        return self.lr_critic
+
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     """The finetuner; the simulator's policy makes data and the initial rollouts, the agent starts from nothing."""
@@ -61,18 +69,15 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     from sgft_jax.train.options import card_of
 
     network = network_of(card_of(prior))
-    learner = _learner(config, task, network, config.lr_actor, config.lr_critic, config.max_grad_norm)
-
-    def reward_scale(simulated: SimulatedData | None) -> Array:
-        """Published scaling: the returns of the data span the length of an episode."""
-        if config.reward_scale is not None or simulated is None:
-            return jnp.float32(config.reward_scale or 1.0)
-        span = jnp.max(simulated.returns) - jnp.min(simulated.returns)
-        return jnp.float32(task.episode_length / jnp.maximum(span, 1e-6))
+    structure = iql.IQLConfig(task.obs_dim, task.act_dim, network, config.max_grad_norm)
+    learner = iql.make_iql(structure, replace(config, reward_scale=config.reward_scale or 1.0))
 
     def start(params: SACParams | None, key: Key, simulated: SimulatedData | None) -> tuple[PyTree, PyTree]:
         state = learner.init(key)
-        state = state.replace(hyper=state.hyper._replace(reward_scale=reward_scale(simulated)))
+        if config.reward_scale is None and simulated is not None:  # published: returns span the length of an episode
+            span = jnp.max(simulated.returns) - jnp.min(simulated.returns)
+            scale = jnp.float32(task.episode_length / jnp.maximum(span, 1e-6))
+            state = state.replace(hyper=state.hyper._replace(reward_scale=scale))
         if params is None:
             return state, SACParams(None, None, None, None, state.normalizer)
         return state.replace(normalizer=params.normalizer), params._replace(actor=None, critic=None)
@@ -96,24 +101,13 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     return assemble(parts, config, task)
 
 
-def _learner(
-    config: "Config | FixedConfig",
-    task: Task,
-    network: NetworkConfig,
-    lr_actor: float,
-    lr_critic: float,
-    max_grad_norm: float | None = None,
-) -> Learner:
-    from sgft_jax.learners.iql import IQLConfig, IQLHyper, make_iql
-
-    structure = IQLConfig(task.obs_dim, task.act_dim, network, max_grad_norm)
-    numbers = {"tau": config.tau, "expectile": config.expectile, "beta": config.beta}
-    return make_iql(structure, IQLHyper(lr_actor, lr_critic, lr_value=lr_critic, **numbers))
-
-
 @dataclass(frozen=True)
 class FixedConfig(RowsOptions):
     """Options of `iql` from a fixed set of real data; the published ones for locomotion."""
+
+    max_weight: ClassVar[float] = 100.0
+    reward_scale: ClassVar[float] = 1.0
+    actor_updates: ClassVar[float] = inf
 
     expectile: checks.Share = 0.7
     """V is the mean of the data's actions at 0.5 and their best towards 1."""
@@ -130,7 +124,6 @@ def build_fixed(config: FixedConfig, task: Task) -> HybridAgent:
     """The agent."""
     import jax.numpy as jnp
 
-    from sgft_jax.data import sources
     from sgft_jax.learners import iql
     from sgft_jax.policies import ActorParams, actor_params
 
@@ -145,9 +138,8 @@ def build_fixed(config: FixedConfig, task: Task) -> HybridAgent:
     def export(state: iql.IQLState) -> ActorParams:
         return ActorParams(iql.as_tanh_gaussian(state.actor.params), actor_params(state).normalizer)
 
-    learner = _learner(config, task, config.network, config.lr, config.lr)
-    batches = sources.real_rows(config.rows)
-    return agent_of(learner, config, task, batches, simulates=False, prepare=prepare, export=export)
+    learner = iql.make_iql(iql.IQLConfig(task.obs_dim, task.act_dim, config.network), config)
+    return agent_of(learner, config, task, prepare=prepare, export=export)
 
 
 METHOD = Method(

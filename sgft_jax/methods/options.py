@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from envs.types import Array, PyTree
 from sgft_jax import checks
@@ -19,7 +19,13 @@ _RETURN_SPAN = 1000.0  # of scaled returns, as published for locomotion
 
 @dataclass(frozen=True)
 class ActorCriticOptions(checks.Checked):
-    """Options of soft actor-critics; the defaults are those of H2O+'s released code."""
+    """Options of soft actor-critics; the defaults are those of H2O+'s released code.
+
+    A `ClassVar` is no option, see `ActorOptions`. A learner takes its numbers from here under its own names.
+    """
+
+    alpha: ClassVar[float] = 1.0
+    entropy_per_dim: ClassVar[float] = -1.0
 
     lr: checks.Positive = 3e-4
     """Adam learning rate of every network."""
@@ -38,6 +44,13 @@ class ActorCriticOptions(checks.Checked):
     def network(self) -> NetworkConfig:
         """The body of every network."""
         return NetworkConfig(self.hidden)
+
+    @property
+    def lr_actor(self) -> float:
+        """The rate as that of one network."""
+        return self.lr
+
+    lr_critic = lr_value = lr_alpha = lr_ratio = lr_actor
 
 
 @dataclass(frozen=True)
@@ -102,28 +115,28 @@ def real_and_simulated(config: HybridOptions) -> Source:
 
 def agent_of(
     learner: Learner,
-    config: ActorCriticOptions,
+    config: Any,
     task: Task,
-    batches: Source,
+    batches: Source | None = None,
     *,
-    simulates: bool,
+    simulates: bool = False,
     head: "Head" = "gaussian",
     keep: Callable[[RealData], PyTree] | None = None,
     prepare: Callable[[PyTree, RealData, int], PyTree] = lambda state, real, updates: state,
     export: Callable[[PyTree], PyTree] | None = None,
 ) -> HybridAgent:
-    """The agent of a learner.
+    """The agent of a learner. config: an `ActorCriticOptions`.
 
-    head: of its actor, see `policies.actor_policy`. keep, prepare, export: see `HybridAgent`; by default single
-    rows, nothing, and the actor and statistics of the learner's state.
+    head: of its actor, see `policies.actor_policy`. batches, keep, prepare, export: see `HybridAgent`; by default
+    `rows` real rows, single rows, nothing, and the actor and statistics of the learner's state.
     """
     from sgft_jax import policies
-    from sgft_jax.data import replay
+    from sgft_jax.data import replay, sources
 
     return HybridAgent(
         learner=learner,
         keep=keep or (lambda real: replay.full(real.rows)),
-        batches=batches,
+        batches=batches or sources.real_rows(config.rows),
         simulates=simulates,
         prepare=prepare,
         export=export or policies.actor_params,

@@ -1,6 +1,7 @@
 """ReBRAC: TD3 whose actor and critic each pay for leaving the data's actions (Tarasov et al. 2023)."""
 
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 from sgft_jax import checks
 from sgft_jax.methods.options import RowsOptions, agent_of
@@ -11,6 +12,10 @@ from sgft_jax.types import Fixed, HybridAgent, Method, Task
 @dataclass(frozen=True)
 class Config(RowsOptions):
     """Options of `rebrac`."""
+
+    target_noise: ClassVar[float] = 0.2
+    target_noise_max: ClassVar[float] = 0.5
+    explore_noise: ClassVar[float] = 0.1
 
     lr: float = 1e-3
     hidden: tuple[int, ...] = (256, 256, 256)
@@ -33,19 +38,11 @@ def build(config: Config, task: Task) -> HybridAgent:
     from sgft_jax.learners import rebrac
 
     structure = rebrac.ReBRACConfig(task.obs_dim, task.act_dim, config.network)
-    hyper = rebrac.ReBRACHyper(
-        lr_actor=config.lr,
-        lr_critic=config.lr,
-        tau=config.tau,
-        actor_penalty=config.actor_penalty,
-        critic_penalty=config.critic_penalty,
-    )
     return agent_of(
-        rebrac.make_rebrac(structure, hyper),
+        rebrac.make_rebrac(structure, config),
         config,
         task,
         sources.real_windows(config.rows, 2),
-        simulates=False,
         head="deterministic",
         keep=lambda real: sequences.full(real.rows, real.last),
     )
