@@ -59,8 +59,7 @@ def main(args: ExportDataArgs) -> None:
         about = {"algorithm_name": str(read_config(home).get("method", "")), "author": [_AUTHOR], "task": env.name}
         recording.write_minari(folder, episodes, {**about, "control_dt": env.control_dt, **entries})
     else:
-        spaces = {"observation": env.measured, "action": env.action}
-        lerobot.write(folder, episodes, task=env.name, control_dt=env.control_dt, **spaces)
+        lerobot.write(folder, episodes, env)
     steps, successes = sum(len(e.reward) for e in episodes), sum(bool(e.success) for e in episodes)
     print(f"{folder}: {len(episodes)} episodes, {steps:,} transitions, {successes} successes")
 

@@ -14,7 +14,7 @@ from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 
-from envs.base import Entry
+from envs.base import Entry, Env
 from envs.files import Count, Positive, Size, checked, read_object
 from envs.types import UserError
 from sgft_jax.datasets.layouts import Rows, ages, files_of
@@ -49,35 +49,27 @@ class _Info(TypedDict):
     data_path: NotRequired[str]
 
 
-def write(
-    folder: Path,
-    episodes: Sequence[Recorded],
-    *,
-    task: str,
-    control_dt: float,
-    observation: Sequence[Entry],
-    action: Sequence[Entry],
-) -> None:
+def write(folder: Path, episodes: Sequence[Recorded], env: Env) -> None:
     """A data set of episodes that are of one task; `meta/info.json` appears last, when all else is there.
 
-    task: what LeRobot calls the instruction. control_dt: seconds of a step. observation, action: what the numbers of
-    `Recorded.obs` and `action` are; their names and units are written down. Raises UserError without pyarrow.
+    env: the task. Its name is what LeRobot calls the instruction; names and units of what it measures, `Recorded.obs`,
+    and of its actions are written down. Raises UserError without pyarrow.
     """
     pa, pq = _pyarrow(folder)
-    rate = 1 / control_dt
+    rate = 1 / env.control_dt
     rate = round(rate) if abs(rate - round(rate)) < 1e-6 * rate else rate
-    features = _features(observation, action)
+    features = _features(env)
     starts = np.cumsum([0, *(len(episode.reward) for episode in episodes)])
     frames = [_frames(episode, i, int(starts[i]), rate) for i, episode in enumerate(episodes)]
-    schema = pa.schema([(name, _type_of(pa, about)) for name, about in features.items()])
+    tables = [pa.table({name: _column(pa, columns[name]) for name in features}) for columns in frames]
     for part in ("data/chunk-000", "meta/episodes/chunk-000"):
         (folder / part).mkdir(parents=True, exist_ok=True)
-    with pq.ParquetWriter(folder / "data" / _FILE, schema) as file:
-        for columns in frames:  # a row group for each episode, so that one can be read alone
-            file.write_table(pa.table({name: _column(pa, columns[name]) for name in features}, schema=schema))
-    about = [_episode_row(columns, task, i, int(starts[i])) for i, columns in enumerate(frames)]
+    with pq.ParquetWriter(folder / "data" / _FILE, tables[0].schema) as file:
+        for table in tables:  # a row group for each episode, so that one can be read alone
+            file.write_table(table)
+    about = [_episode_row(columns, env.name, i, int(starts[i])) for i, columns in enumerate(frames)]
     pq.write_table(pa.Table.from_pylist(about), folder / "meta/episodes" / _FILE)
-    pq.write_table(_tasks(pa, task), folder / "meta/tasks.parquet")
+    pq.write_table(_tasks(pa, env.name), folder / "meta/tasks.parquet")
     joined = {name: np.concatenate([columns[name] for columns in frames]) for name in features}
     write_json(folder / "meta/stats.json", {name: _statistics(values) for name, values in joined.items()})
     counts = {"total_episodes": len(episodes), "total_frames": int(starts[-1]), "total_tasks": 1}
@@ -87,9 +79,9 @@ def write(
     write_json(folder / INFO, {**info, "splits": {"train": f"0:{len(episodes)}"}, **paths, "features": features})
 
 
-def _features(observation: Sequence[Entry], action: Sequence[Entry]) -> dict[str, dict[str, Any]]:
+def _features(env: Env) -> dict[str, dict[str, Any]]:
     """What `meta/info.json` says of every column."""
-    state, command = _vector(observation), _vector(action)
+    state, command = _vector(env.measured), _vector(env.action)
 
     def number(dtype: str) -> dict[str, Any]:
         return {"dtype": dtype, "shape": [1], "names": None}
@@ -134,14 +126,8 @@ def _statistics(values: np.ndarray) -> dict[str, list[float]]:
     return {name: fact.tolist() for name, fact in facts.items()}
 
 
-def _type_of(pa: Any, about: Mapping[str, Any]) -> Any:
-    """The Arrow type of a column: a number, or a list of as many as the vector has."""
-    kind = {"float32": pa.float32(), "bool": pa.bool_(), "int64": pa.int64()}[about["dtype"]]
-    return kind if about["shape"] == [1] else pa.list_(kind, about["shape"][0])
-
-
 def _column(pa: Any, values: np.ndarray) -> Any:
-    """[N] or [N, 1] as numbers, [N, k] as lists."""
+    """[N] or [N, 1] as numbers, [N, k] as lists of k; of the same type as the array."""
     if values.size == len(values):
         return pa.array(values.reshape(-1))
     return pa.FixedSizeListArray.from_arrays(pa.array(values.reshape(-1)), values.shape[1])

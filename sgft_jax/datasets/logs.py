@@ -153,11 +153,8 @@ def _read(path: Path, successors: Successors, env: Env | None) -> Rows:
 def _log(path: Path, rows: Rows, gamma: float, env: Env | None) -> Log:
     """The transitions of what a file holds, as a task sees them."""
     rows = layouts.check(path, rows)
-    if env is not None:
-        rows = _fitted(path, rows, env)
-    rows = _judged(path, rows, env)
-    if env is not None:
-        rows = _seen(rows, env)
+    rows = _judged(path, rows if env is None else _fitted(path, rows, env), env)
+    rows = rows if env is None else _seen(rows, env)
     below = np.append(rows.keep[1:], False)
     return Log(_transitions(rows, gamma), _facts(rows), (rows.ends | ~below)[rows.keep])
 

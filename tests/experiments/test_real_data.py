@@ -31,12 +31,12 @@ OPTIONS = """--task toy --method sac --rollouts 2 --checkpoint-every 1 --no-vide
 # iql learns from the simulator first: killed in that phase, then among the updates on logs.
 KILL = """
 finetuning.OFFLINE_PART = 10
-checkpoint = Record.checkpoint
+checkpoint = FinetuneRecord.checkpoint
 def offline(self, progress, step):
     checkpoint(self, progress, step)
     if int(progress.offline) == {updates}:
         die()
-Record.checkpoint = offline
+FinetuneRecord.checkpoint = offline
 """
 
 

@@ -45,9 +45,7 @@ EPISODES = [episode(0, 3, terminated=True, success=True), episode(50, 2)]
 
 
 def write(folder, episodes=EPISODES):
-    lerobot.write(
-        folder, episodes, task="toy", control_dt=ENV.control_dt, observation=ENV.observation, action=ENV.action
-    )
+    lerobot.write(folder, episodes, ENV)
     return folder
 
 
