@@ -1,33 +1,28 @@
-"""The one checked way in for what an environment returns or a robot says, whatever its kind.
+"""Impure: environments of others, what they are asked, and the one checked way in for what they answer.
 
 A number may be Python's, NumPy's or an array of one, `info` may be None, and None means that something is not known.
 Anything else raises UserError: one line with the environment, its method, and the value.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from typing import Annotated, Any, NamedTuple
+import contextlib
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import msgspec
 import numpy as np
-from msgspec import Meta
 
-from envs.files import Count, Positive, Size
+from envs import extend
+from envs.base import Entry, Env
 from envs.types import UserError
-from sgft_jax.systems.robot_client import (
-    LARGEST,
-    SUCCESS,
-    VERSION,
-    flag,
-    number,
-    numbers,
-    printable,
-    success_of,
-    unframed,
-)
+from sgft_jax.systems.robot_client import LARGEST, SUCCESS, flag, number, numbers, printable, success_of
+
+if TYPE_CHECKING:
+    import gymnasium
 
 _PARTS = {"reset": ("observation", "info"), "step": ("observation", "reward", "terminated", "truncated", "info")}
 _KNOWN = (*SUCCESS, "invalid", "late", "sent", "final_obs", "final_info")  # of `info`
+_BOUND = 1e9  # larger bounds of actions are those of a type of number, not of a machine
+Observe = Callable[[Any], Any]
 _ROUNDING = 1e-4  # by which, as a share of the half range, what was sent may lie beyond the bounds
 
 
@@ -179,7 +174,7 @@ def _of_member(infos: Mapping[str, Any], i: int, count: int, names: Sequence[str
     return info
 
 
-@contextmanager
+@contextlib.contextmanager
 def _explained(where: str) -> Iterator[None]:
     try:
         yield
@@ -187,80 +182,146 @@ def _explained(where: str) -> Iterator[None]:
         raise UserError(f"{where}: {error}") from None
 
 
-# --- what a robot says ------------------------------------------------------------------------------------------------
+# --- what they are asked ----------------------------------------------------------------------------------------------
 
 
-Seconds = Annotated[Positive, Meta(le=3600)]
+class Separate:
+    """Environments, one for each member. Those whose episode is over are left alone."""
+
+    def __init__(self, real: "Sequence[gymnasium.Env]") -> None:
+        if not real:
+            raise UserError("no environment is given; make one for each seed")
+        first: Any = real[0]
+        self.real, self.count, self.name = real, len(real), str(first.spec.id if first.spec else first.unwrapped)
+        self.observation, self.action = first.observation_space, first.action_space
+        if len(set(map(id, real))) < len(real):
+            raise UserError(f"{self.name}: the same environment is given twice; make one for each seed")
+        if any((env.observation_space, env.action_space) != (self.observation, self.action) for env in real):
+            raise UserError(f"{self.name}: the spaces of its {len(real)} environments differ; make them alike")
+        self._obs: Sequence[Any] = []
+
+    @property
+    def answer_within(self) -> float | None:
+        """Seconds that a robot with a clock waits for a command. It is known once an episode has begun."""
+        return getattr(self.real[0], "answer_within", None)
+
+    def reset(self, seeds: list[int]) -> Sequence[Any]:
+        """What each environment returns at its start."""
+        self._obs = [_call(self.name, env, "reset", seed=s)[0] for env, s in zip(self.real, seeds, strict=True)]
+        return self._obs
+
+    def step(self, actions: np.ndarray, going: np.ndarray) -> Sequence[tuple[Any, ...]]:
+        """Five parts from each. actions: [M, *shape of an action]. going: [M]; the others may stay as they are."""
+        returned = [
+            _call(self.name, env, "step", action) if on else idle(obs)
+            for env, action, on, obs in zip(self.real, actions, going, self._obs, strict=True)
+        ]
+        self._obs = [first for first, *_ in returned]
+        return returned
+
+    def rest(self) -> None:
+        """No step follows before the next reset."""
+        self._end("rest", [getattr(env, "rest", lambda: None) for env in self.real])
+
+    def close(self, *, over: bool) -> None:
+        """The end, or, where it is not over, one on this side."""
+        self._end("close", [getattr(env, "close" if over else "leave", env.close) for env in self.real])
+
+    def _end(self, method: str, endings: Sequence[Callable[[], None]]) -> None:
+        """All of them, also where one raises."""
+        with contextlib.ExitStack() as last:
+            for ending in reversed(endings):
+                last.callback(extend.guard(f"{method} of", self.name, ending))
 
 
-class Hello(msgspec.Struct, tag_field="type", tag="hello"):
-    """The first message. period, answer_within: see `robot_client.play`; None without a clock."""
+class Vector:
+    """The same of a vector environment, in either way of beginning episodes anew by itself."""
 
-    version: int
-    token: str
-    robot: str
-    obs_size: Size
-    action_size: Size
-    period: float | None  # compared with that of the task
-    answer_within: Seconds | None
+    answer_within = None
 
+    def __init__(self, real: "gymnasium.vector.VectorEnv") -> None:
+        self.real: Any = real  # Gymnasium's stub knows no list of seeds
+        self.count, self.name = real.num_envs, str(real.spec.id if real.spec else real)
+        self.observation, self.action = self.real.single_observation_space, self.real.single_action_space
+        mode = getattr(shown := real.metadata.get("autoreset_mode"), "name", None)
+        self._same_step = mode == "SAME_STEP"
+        if mode not in ("NEXT_STEP", "SAME_STEP"):
+            advice = "make it with AutoresetMode.NEXT_STEP, or give a list of environments"
+            raise UserError(f"{self.name}: its autoreset mode is {shown}; {advice}")
 
-class Began(msgspec.Struct, tag_field="type", tag="began"):
-    """The start of an episode. obs: float32."""
+    def reset(self, seeds: list[int]) -> list[Any]:
+        """What each environment returns at its start."""
+        return split(self.name, "reset", _call(self.name, self.real, "reset", seed=seeds)[0], self.count)
 
-    episode: Count
-    obs: bytes
+    def step(self, actions: np.ndarray, going: np.ndarray) -> list[tuple[Any, ...]]:
+        """Five parts from each; of members that do not take the step those of `idle`."""
+        returned = _call(self.name, self.real, "step", actions)
+        rows = vector(self.name, returned, self.count, same_step=self._same_step)
+        return [row if on else idle(row[0]) for row, on in zip(rows, going, strict=True)]
 
+    def rest(self) -> None:
+        """Nothing: it begins episodes anew by itself."""
 
-class Moved(msgspec.Struct, tag_field="type", tag="moved"):
-    """The outcome of a step. sent, obs: float32. reward, success: None where the robot does not know."""
-
-    episode: Count
-    step: Count
-    sent: bytes
-    obs: bytes
-    reward: float | None
-    terminated: bool
-    truncated: bool
-    success: bool | None
-    late: bool
-
-
-class Rested(msgspec.Struct, tag_field="type", tag="rested"):
-    """The robot has stopped, as it was told."""
-
-    episode: Count
+    def close(self, *, over: bool) -> None:
+        """The end."""
+        self.real.close()
 
 
-class Failed(msgspec.Struct, tag_field="type", tag="failed"):
-    """The robot has stopped because its driver has failed."""
-
-    episode: Count
-    reason: str
-
-
-Message = Hello | Began | Moved | Rested | Failed
+def _call(name: str, real: Any, method: str, *args: Any, **options: Any) -> tuple[Any, ...]:
+    """What an environment returns; raises UserError, which says where, if it raises or returns other parts."""
+    call = extend.guard(f"{method} of", name, functools.partial(getattr(real, method), *args, **options))
+    return parts(name, method, call())
 
 
-class _Version(msgspec.Struct, tag_field="type", tag="hello"):
-    version: int
+Real = Separate | Vector
 
 
-_MESSAGE, _VERSION = (msgspec.msgpack.Decoder(kind) for kind in (Message, _Version))
+def played(real: Any) -> Real:
+    """The environments that somebody has made; raises UserError for anything else."""
+    several = real if isinstance(real, Sequence) else [real]
+    if unfit := [env for env in several if isinstance(env, type) or not hasattr(env, "step")]:
+        raise UserError(f"{unfit[0]!r} is no Gymnasium environment")
+    return Vector(several[0]) if hasattr(real, "num_envs") else Separate(several)
 
 
-class VersionError(ValueError):
-    """The robot speaks another version of the protocol than the learner."""
+# --- spaces -----------------------------------------------------------------------------------------------------------
 
 
-def read(data: Any) -> Message:
-    """A message of a robot; ValueError says what is wrong with it."""
-    body = unframed(data)
-    try:
-        with suppress(msgspec.MsgspecError):  # before the other fields of a greeting: they may be others
-            if (version := _VERSION.decode(body).version) != VERSION:
-                versions = f"the robot has {version}, the learner {VERSION}"
-                raise VersionError(f"protocol version: {versions}; give both the same robot_client.py")
-        return _MESSAGE.decode(body)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise ValueError(f"does not fit the protocol ({printable(error, 120)})") from None
+def bounds(env: Env, real: Real) -> tuple[np.ndarray, np.ndarray]:
+    """[act_dim] each, of the actions; raises UserError for what cannot be commanded."""
+    low, high = (getattr(real.action, name, None) for name in ("low", "high"))
+    if low is None or high is None:
+        raise UserError(f"{real.name}: its actions are {real.action}; only a Box can be commanded")
+    if low.size != env.act_dim:
+        raise UserError(f"{real.name}: takes {low.size} numbers as action, the task {env.name} has {env.act_dim}")
+    low, high = (np.asarray(x, np.float64).reshape(-1) for x in (low, high))
+    if not (np.abs([low, high]) <= _BOUND).all():
+        advice = "wrap it in gymnasium.wrappers.RescaleAction or similar"
+        raise UserError(f"{real.name}: its actions have no bounds below {_BOUND:g}; {advice}")
+    if (fixed := np.flatnonzero(~(low < high))).size:
+        raise UserError(f"{real.name}: number {fixed[0]} of its action can only be {low[fixed[0]]:g}; leave it out")
+    return low, high
+
+
+def reader(measured: tuple[Entry, ...], real: Real) -> Observe:
+    """How observations become a vector [measured_dim]; raises UserError where that has to be said."""
+    parts, help_ = getattr(real.observation, "spaces", None), "pass observe= to map them"
+    sizes = {e.name: e.size for e in measured}
+    if isinstance(parts, Mapping):
+        seen = {name: int(np.prod(space.shape)) if space.shape is not None else 0 for name, space in parts.items()}
+        if seen != sizes:
+            raise UserError(f"{real.name}: observes {seen}, the task measures {sizes}; {help_}")
+        return functools.partial(_joined, real.name, sizes)
+    if not hasattr(real.observation, "low"):
+        raise UserError(f"{real.name}: observes {real.observation}, neither a Box nor a Dict of them; {help_}")
+    if (n := int(np.prod(real.observation.shape))) != sum(sizes.values()):
+        raise UserError(f"{real.name}: observes {n} numbers, the task measures {sum(sizes.values())}: {sizes}; {help_}")
+    return lambda obs: obs
+
+
+def _joined(name: str, sizes: Mapping[str, int], obs: Any) -> np.ndarray:
+    """The parts of a Dict, one after another."""
+    if not isinstance(obs, Mapping):
+        raise UserError(f"{name}: observes a {type(obs).__name__}, not a mapping with {', '.join(sizes)}")
+    parts = ((f"{part} of {name}", obs.get(part), size) for part, size in sizes.items())
+    return np.concatenate([measured(where, part, size, f"its space has {size}") for where, part, size in parts])

@@ -1,11 +1,9 @@
 """Impure: real systems that are Gymnasium environments, stepped from Python."""
 
-import contextlib
-import functools
 import statistics
 import time
 import timeit
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -13,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs import extend
-from envs.base import Entry, Env
+from envs.base import Env
 from envs.mesh import split_vmap
 from envs.observations import remember, with_memory
 from envs.rollout import Episode, episode_keys, judged
 from envs.types import Array, Key, PyTree, Transition, UserError
 from sgft_jax.systems import answers
-from sgft_jax.systems.answers import Answer
+from sgft_jax.systems.answers import Answer, Observe
 from sgft_jax.systems.robot_client import SUCCESS
 
 if TYPE_CHECKING:
@@ -31,8 +29,6 @@ __all__ = ["Gymnasium"]
 
 _TRIES = 20  # actions that are timed before a robot with a clock moves
 _STARTS, _PAUSE = 4, 0.5  # times that a start is asked for until all its numbers are finite, and seconds in between
-_BOUND = 1e9  # larger bounds of actions are those of a type of number, not of a machine
-Observe = Callable[[Any], Any]
 
 
 class Step(NamedTuple):
@@ -98,9 +94,9 @@ class Gymnasium:
         observe: Observe | None = None,
     ) -> None:
         self.env, self.pools, self.gamma = env, None, gamma
-        self._real = _played(real)
-        self._observe = extend.guard("observe of", self._real.name, observe or _reader(env.measured, self._real))
-        self._low, self._high = low, high = _bounds(env, self._real)
+        self._real = answers.played(real)
+        self._observe = extend.guard("observe of", self._real.name, observe or answers.reader(env.measured, self._real))
+        self._low, self._high = low, high = answers.bounds(env, self._real)
         self._middle, self._half = (low + high) / 2, (high - low) / 2  # what an action of 0 is, and one of 1 beyond it
         self._whole = np.dtype(self._real.action.dtype).kind in "iu"
         self._draw = jax.jit(jax.vmap(self._drawn))
@@ -303,144 +299,3 @@ def _padded(rows: np.ndarray, length: int) -> np.ndarray:
     """[M, T, ...] of [M, t, ...]: zeros where nothing happened; for `success` that is not told either way, -1."""
     blank = -1 if rows.dtype == np.int8 else 0
     return np.pad(rows, [(0, 0), (0, length - rows.shape[1]), *[(0, 0)] * (rows.ndim - 2)], constant_values=blank)
-
-
-# --- environments -----------------------------------------------------------------------------------------------------
-
-
-class _Separate:
-    """Environments, one for each member. Those whose episode is over are left alone."""
-
-    def __init__(self, real: "Sequence[gymnasium.Env]") -> None:
-        if not real:
-            raise UserError("no environment is given; make one for each seed")
-        first: Any = real[0]
-        self.real, self.count, self.name = real, len(real), str(first.spec.id if first.spec else first.unwrapped)
-        self.observation, self.action = first.observation_space, first.action_space
-        if len(set(map(id, real))) < len(real):
-            raise UserError(f"{self.name}: the same environment is given twice; make one for each seed")
-        if any((env.observation_space, env.action_space) != (self.observation, self.action) for env in real):
-            raise UserError(f"{self.name}: the spaces of its {len(real)} environments differ; make them alike")
-        self._obs: Sequence[Any] = []
-
-    @property
-    def answer_within(self) -> float | None:
-        """Seconds that a robot with a clock waits for a command. It is known once an episode has begun."""
-        return getattr(self.real[0], "answer_within", None)
-
-    def reset(self, seeds: list[int]) -> Sequence[Any]:
-        """What each environment returns at its start."""
-        self._obs = [_call(self.name, env, "reset", seed=s)[0] for env, s in zip(self.real, seeds, strict=True)]
-        return self._obs
-
-    def step(self, actions: np.ndarray, going: np.ndarray) -> Sequence[tuple[Any, ...]]:
-        """Five parts from each. actions: [M, *shape of an action]. going: [M]; the others may stay as they are."""
-        returned = [
-            _call(self.name, env, "step", action) if on else answers.idle(obs)
-            for env, action, on, obs in zip(self.real, actions, going, self._obs, strict=True)
-        ]
-        self._obs = [parts[0] for parts in returned]
-        return returned
-
-    def rest(self) -> None:
-        """No step follows before the next reset."""
-        self._end("rest", [getattr(env, "rest", lambda: None) for env in self.real])
-
-    def close(self, *, over: bool) -> None:
-        """The end, or, where it is not over, one on this side."""
-        self._end("close", [getattr(env, "close" if over else "leave", env.close) for env in self.real])
-
-    def _end(self, method: str, endings: Sequence[Callable[[], None]]) -> None:
-        """All of them, also where one raises."""
-        with contextlib.ExitStack() as last:
-            for ending in reversed(endings):
-                last.callback(extend.guard(f"{method} of", self.name, ending))
-
-
-class _Vector:
-    """The same of a vector environment, in either way of beginning episodes anew by itself."""
-
-    answer_within = None
-
-    def __init__(self, real: "gymnasium.vector.VectorEnv") -> None:
-        self.real: Any = real  # Gymnasium's stub knows no list of seeds
-        self.count, self.name = real.num_envs, str(real.spec.id if real.spec else real)
-        self.observation, self.action = self.real.single_observation_space, self.real.single_action_space
-        mode = getattr(shown := real.metadata.get("autoreset_mode"), "name", None)
-        self._same_step = mode == "SAME_STEP"
-        if mode not in ("NEXT_STEP", "SAME_STEP"):
-            advice = "make it with AutoresetMode.NEXT_STEP, or give a list of environments"
-            raise UserError(f"{self.name}: its autoreset mode is {shown}; {advice}")
-
-    def reset(self, seeds: list[int]) -> list[Any]:
-        return answers.split(self.name, "reset", _call(self.name, self.real, "reset", seed=seeds)[0], self.count)
-
-    def step(self, actions: np.ndarray, going: np.ndarray) -> list[tuple[Any, ...]]:
-        returned = _call(self.name, self.real, "step", actions)
-        rows = answers.vector(self.name, returned, self.count, same_step=self._same_step)
-        return [row if on else answers.idle(row[0]) for row, on in zip(rows, going, strict=True)]
-
-    def rest(self) -> None:
-        pass
-
-    def close(self, *, over: bool) -> None:
-        self.real.close()
-
-
-def _call(name: str, real: Any, method: str, *args: Any, **options: Any) -> tuple[Any, ...]:
-    """What an environment returns; raises UserError, which says where, if it raises or returns other parts."""
-    call = extend.guard(f"{method} of", name, functools.partial(getattr(real, method), *args, **options))
-    return answers.parts(name, method, call())
-
-
-_Real = _Separate | _Vector
-
-
-def _played(real: Any) -> _Real:
-    several = real if isinstance(real, Sequence) else [real]
-    if unfit := [env for env in several if isinstance(env, type) or not hasattr(env, "step")]:
-        raise UserError(f"{unfit[0]!r} is no Gymnasium environment")
-    return _Vector(several[0]) if hasattr(real, "num_envs") else _Separate(several)
-
-
-# --- spaces -----------------------------------------------------------------------------------------------------------
-
-
-def _bounds(env: Env, real: _Real) -> tuple[np.ndarray, np.ndarray]:
-    """[act_dim] each, of the actions; raises UserError for what cannot be commanded."""
-    low, high = (getattr(real.action, name, None) for name in ("low", "high"))
-    if low is None or high is None:
-        raise UserError(f"{real.name}: its actions are {real.action}; only a Box can be commanded")
-    if low.size != env.act_dim:
-        raise UserError(f"{real.name}: takes {low.size} numbers as action, the task {env.name} has {env.act_dim}")
-    low, high = (np.asarray(x, np.float64).reshape(-1) for x in (low, high))
-    if not (np.abs([low, high]) <= _BOUND).all():
-        advice = "wrap it in gymnasium.wrappers.RescaleAction or similar"
-        raise UserError(f"{real.name}: its actions have no bounds below {_BOUND:g}; {advice}")
-    if (fixed := np.flatnonzero(~(low < high))).size:
-        raise UserError(f"{real.name}: number {fixed[0]} of its action can only be {low[fixed[0]]:g}; leave it out")
-    return low, high
-
-
-def _reader(measured: tuple[Entry, ...], real: _Real) -> Observe:
-    """How observations become a vector [measured_dim]; raises UserError where that has to be said."""
-    parts, help_ = getattr(real.observation, "spaces", None), "pass observe= to map them"
-    sizes = {e.name: e.size for e in measured}
-    if isinstance(parts, Mapping):
-        seen = {name: int(np.prod(space.shape)) if space.shape is not None else 0 for name, space in parts.items()}
-        if seen != sizes:
-            raise UserError(f"{real.name}: observes {seen}, the task measures {sizes}; {help_}")
-        return functools.partial(_joined, real.name, sizes)
-    if not hasattr(real.observation, "low"):
-        raise UserError(f"{real.name}: observes {real.observation}, neither a Box nor a Dict of them; {help_}")
-    if (n := int(np.prod(real.observation.shape))) != sum(sizes.values()):
-        raise UserError(f"{real.name}: observes {n} numbers, the task measures {sum(sizes.values())}: {sizes}; {help_}")
-    return lambda obs: obs
-
-
-def _joined(name: str, sizes: Mapping[str, int], obs: Any) -> np.ndarray:
-    """The parts of a Dict, one after another."""
-    if not isinstance(obs, Mapping):
-        raise UserError(f"{name}: observes a {type(obs).__name__}, not a mapping with {', '.join(sizes)}")
-    parts = ((f"{part} of {name}", obs.get(part), size) for part, size in sizes.items())
-    return np.concatenate([answers.measured(where, part, size, f"its space has {size}") for where, part, size in parts])

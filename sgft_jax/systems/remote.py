@@ -25,8 +25,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
 from envs.types import UserError
-from sgft_jax.systems.answers import Began, Failed, Hello, Message, Moved, Rested, VersionError, read
 from sgft_jax.systems.door import Door, url
+from sgft_jax.systems.messages import Began, Failed, Hello, Message, Moved, Rested, VersionError, read
 from sgft_jax.systems.robot_client import LIMIT, array, pack, printable
 
 __all__ = ["Remote"]

@@ -38,7 +38,7 @@ LARGEST = 1e18  # of a measurement or reward: squares of larger ones are beyond 
 SUCCESS = ("is_success", "success")  # what `info` may call it; the first that says something counts
 _REASON = 500  # letters of one at most
 _PATIENCE = 10  # late steps in a row that end an episode
-_SHAPES: dict[str, dict[str, set[type]]] = {  # what the learner says, and of which types; `answers` has the rest
+_SHAPES: dict[str, dict[str, set[type]]] = {  # what the learner says, and of which types; `messages` has the rest
     "welcome": {},
     "refused": {"reason": {str}, "final": {bool}},
     "reset": {"episode": {int}, "seed": {int}, "steps": {int, type(None)}},

@@ -32,8 +32,8 @@ OPTIONS = """--task toy --method sac --rollouts 2 --checkpoint-every 1 --no-vide
 KILL = """
 finetuning.OFFLINE_PART = 10
 checkpoint = FinetuneRecord.checkpoint
-def offline(self, progress, step):
-    checkpoint(self, progress, step)
+def offline(self, progress, step, **facts):
+    checkpoint(self, progress, step, **facts)
     if int(progress.offline) == {updates}:
         die()
 FinetuneRecord.checkpoint = offline

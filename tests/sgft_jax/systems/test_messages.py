@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sgft_jax.systems import robot_client
-from sgft_jax.systems.answers import Began, Hello, Moved, VersionError, read
+from sgft_jax.systems.messages import Began, Hello, Moved, VersionError, read
 from sgft_jax.systems.robot_client import pack, unpack
 
 HELLO = {

@@ -19,8 +19,8 @@ from websockets.sync.client import connect
 
 from envs.types import UserError
 from sgft_jax.systems import robot_client
-from sgft_jax.systems.answers import Hello, read
 from sgft_jax.systems.door import STRANGERS
+from sgft_jax.systems.messages import Hello, read
 from sgft_jax.systems.remote import Remote, _Link
 from sgft_jax.systems.robot_client import Limits, RefusedError, array, pack, play, unpack
 
