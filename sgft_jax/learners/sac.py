@@ -5,7 +5,7 @@ so that learning rates and temperatures vmap like seeds do. Source: Haarnoja et 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -207,9 +207,9 @@ def update(
 
     metrics: Metrics = {}
     if config.train_critic:
-        members = _target_members(config, key_members)
-        term = partial(_term, critic_term, nets, state, batch, *key_term) if critic_term else None
-        state, metrics = _update_critic(nets, state, batch, members, key_target, term)
+        policy = partial(steps.sample, nets, state)
+        term = critic_term and (lambda params: critic_term(nets.critic.apply, params, policy, batch, *key_term))
+        state, metrics = _update_critic(nets, state, batch, (key_target, key_members), term)
     rows = jax.tree.map(lambda x: x[: config.actor_batch], batch)
     rows = rows if config.weighted_actor else rows._replace(weight=None)
     state, q, log_prob, of_actor = _update_actor(nets, state, rows, key_actor)
@@ -273,33 +273,19 @@ def _relative(nets: Networks, state: SACState) -> Networks:
     return nets._replace(critic=nets.critic._replace(apply=relative))
 
 
-def _term(critic_term: CriticTerm, nets: Networks, state: SACState, batch: Batch, key: Key, params: PyTree) -> Array:
-    """A critic term [] of the critic's parameters."""
-    return critic_term(nets.critic.apply, params, partial(steps.sample, nets, state), batch, key)
-
-
 def _update_critic(
-    nets: Networks,
-    state: SACState,
-    batch: Batch,
-    members: Array | slice,
-    key: Key,
-    term: Callable[[PyTree], Array] | None,
+    nets: Networks, state: SACState, batch: Batch, keys: tuple[Key, Key], term: Callable[[PyTree], Array] | None
 ) -> tuple[SACState, Metrics]:
-    """members: which ones a target is the minimum of. term: of the parameters, beside the critic's error."""
-    alpha = jnp.exp(state.log_alpha.params) if nets.config.entropy_in_target else 0.0
-    targets = steps.soft_targets(nets, state, batch, key, alpha=alpha, members=members)
+    """keys: of next actions, and of the members that targets are the minimum of. term: of the parameters."""
+    config, members = nets.config, slice(None)
+    if config.target_critics is not None:  # the same ones for the whole batch
+        members = jax.random.permutation(keys[1], config.critics)[: config.target_critics]
+    alpha = jnp.exp(state.log_alpha.params) if config.entropy_in_target else 0.0
+    targets = steps.soft_targets(nets, state, batch, keys[0], alpha=alpha, members=members)
     rate = state.hyper.lr_critic * optim.warmup_factor(state.step, state.hyper.lr_warmup)
     fit, metrics = steps.step_critic(nets, state, batch, targets, rate=rate, term=term)
     average = optax.incremental_update(fit.params, state.target_critic, state.hyper.tau)
     return state.replace(critic=fit, target_critic=average), metrics
-
-
-def _target_members(config: SACConfig, key: Key) -> Array | slice:
-    """Which members of the critic a target is the minimum of: the same ones for the whole batch."""
-    if config.target_critics is None:
-        return slice(None)
-    return jax.random.permutation(key, config.critics)[: config.target_critics]
 
 
 def _update_actor(nets: Networks, state: SACState, rows: Batch, key: Key) -> tuple[SACState, Array, Array, Metrics]:
@@ -310,12 +296,9 @@ def _update_actor(nets: Networks, state: SACState, rows: Batch, key: Key) -> tup
         anchor = nets.actor.apply(state.anchor, obs)
         return hyper.anchor * networks.tanh_gaussian_divergence(nets.actor.apply(params, obs), anchor)
 
-    rate, penalty = (
-        hyper.lr_actor * optim.warmup_factor(since, hyper.actor_ramp),
-        divergence if config.anchored else None,
-    )
-    step = steps.step_actor(nets, state, rows, key, rate=rate, mean=config.actor_mean, penalty=penalty)
-    fit, q, log_prob, metrics = step
+    rate = hyper.lr_actor * optim.warmup_factor(since, hyper.actor_ramp)
+    mean, penalty = config.actor_mean, divergence if config.anchored else None
+    fit, q, log_prob, metrics = steps.step_actor(nets, state, rows, key, rate=rate, mean=mean, penalty=penalty)
     fit = optax.tree.where((since >= 0) & _policy_turn(config, state), fit, state.actor)
     return state.replace(actor=fit), q, log_prob, metrics
 
@@ -349,8 +332,8 @@ def extract_params(state: SACState) -> SACParams:
     """What a pretrained agent hands over. Its configuration must have trained value and dynamics."""
     if state.value is None or state.dynamics is None:
         raise UserError("a prior needs an agent trained with train_value and train_dynamics")
-    networks = (state.actor, state.critic, state.value, state.dynamics)
-    return SACParams(*(fit.params for fit in networks), normalizer=state.normalizer)
+    trained = (state.actor, state.critic, state.value, state.dynamics)
+    return SACParams(*(fit.params for fit in trained), normalizer=state.normalizer)
 
 
 def state_from_prior(
@@ -378,8 +361,7 @@ def state_from_prior(
 
 def check_params_of_prior(config: SACConfig, params: SACParams, *, critic: bool) -> None:
     """Raise UserError where a network of the prior is not the one that `config` describes."""
-    body = {"network": config.network, "critic_network": config.critic_network, "critics": config.critics}
-    nets = _networks(SACConfig(config.obs_dim, config.act_dim, **body))
+    nets = _networks(replace(config, context_dim=0))
     owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, hidden {config.network.hidden}: use the prior's own"
     for name in ("actor", "value", *(["critic"] if critic else [])):
         networks.check_params(name, getattr(nets, name), getattr(params, name), f"{owner} task and network")

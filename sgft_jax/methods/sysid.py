@@ -4,7 +4,6 @@ No network learns. The prior's dynamics models are told the system too, so they 
 or the simulator does, replaying them.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -56,7 +55,11 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     few = config.fit == "dropo" or config.through == "simulator"
     rows_fitted = min(config.rows or (_FEW if few else _ROWS), loop.replay_capacity)
     model = make_dynamics(task.obs_dim, task.act_dim, network)
-    asked = _simulator(task) if config.through == "simulator" else None
+    asked = None
+    if config.through == "simulator":
+        if task.simulator is None:
+            raise UserError("--options.through simulator: this task cannot be set to what was measured; use models")
+        asked = task.simulator()
 
     def change(params: SACParams, obs: Array, action: Array) -> Array:
         if asked is not None:
@@ -101,12 +104,6 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     )
     # One update after a rollout says what was fitted; more would say it again.
     return assemble(parts, loop, task)._replace(updates_per_rollout=1)
-
-
-def _simulator(task: Task) -> Callable[[Array, Array], Array]:
-    if task.simulator is None:
-        raise UserError("--options.through simulator: this task cannot be set to what was measured; use models")
-    return task.simulator()
 
 
 METHOD = Method(

@@ -37,6 +37,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from envs.types import Array, Key, PyTree, Transition
 from sgft_jax.types import Finetuner, Metrics, SimulatedData
@@ -116,7 +117,7 @@ def scored(guard: Guard, score: Array, partial: Array | float = jnp.inf) -> Guar
     proven = (challenger.total + guard.worst) / (challenger.weight + 1) > _mean(reference)
     replaced, (ours, theirs) = guard.deployed & proven & ~exploded, guard.exploded
     return guard._replace(
-        reference=_choose(replaced, guard.challenger, guard.reference),
+        reference=optax.tree.where(replaced, guard.challenger, guard.reference),
         replaced=replaced,
         exploded=(jnp.where(replaced, theirs, ours), theirs),
     )
@@ -177,7 +178,7 @@ def guarded(inner: Finetuner, first: Callable[[PyTree, PyTree], PyTree], *, scor
         return Guarded(agent, jax.tree.map(jnp.copy, first(params, inner.export(agent))), start(kind))
 
     def export(state: Guarded) -> PyTree:
-        return _choose(state.guard.deployed, inner.export(state.agent), state.reference)
+        return optax.tree.where(state.guard.deployed, inner.export(state.agent), state.reference)
 
     def act(state: Guarded, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
         return inner.policy.act(export(state), carry, obs, key, explore=explore)
@@ -190,7 +191,7 @@ def guarded(inner: Finetuner, first: Callable[[PyTree, PyTree], PyTree], *, scor
         else:
             guard = scored(state.guard, jnp.float32(score), jnp.sum(rows.reward, where=valid))
         # What has played: `inner.observe` may change the policy too, as identification does.
-        reference = _choose(guard.replaced, inner.export(state.agent), state.reference)
+        reference = optax.tree.where(guard.replaced, inner.export(state.agent), state.reference)
         return Guarded(inner.observe(state.agent, rows, valid, score), reference, guard)
 
     def learn(
@@ -214,7 +215,3 @@ def guarded(inner: Finetuner, first: Callable[[PyTree, PyTree], PyTree], *, scor
     return inner._replace(
         init=init, init_carry=inner.policy.init_carry, act=act, observe=observe, learn=learn, export=export
     )
-
-
-def _choose(which: Array, one: PyTree, other: PyTree) -> PyTree:
-    return jax.tree.map(lambda a, b: jnp.where(which, a, b), one, other)
