@@ -28,13 +28,5 @@ def build(config: Config, task: Task) -> HybridAgent:
     return agent_of(learner, config, task, batches, simulates=True, export=lambda state: actor_params(state.sac))
 
 
-METHOD = Method(
-    "darc",
-    fixed=Fixed(
-        "hybrid",
-        "SAC in the simulator, paid less where the real system would act otherwise",
-        "Eysenbach et al. 2021",
-        {"default": Config()},
-        build,
-    ),
-)
+_ABOUT = "SAC in the simulator, paid less where the real system would act otherwise"
+METHOD = Method("darc", fixed=Fixed("hybrid", _ABOUT, "Eysenbach et al. 2021", {"default": Config()}, build))

@@ -28,13 +28,5 @@ class Config(sac.Config):
     guard: bool = True
 
 
-METHOD = Method(
-    "guarded",
-    Online(
-        "sgft",
-        "recommended: SAC in identified commands, half simulated, deployed by a guard",
-        "ours",
-        Config,
-        sac.build,
-    ),
-)
+_ABOUT = "recommended: SAC in identified commands, half simulated, deployed by a guard"
+METHOD = Method("guarded", Online("sgft", _ABOUT, "ours", Config, sac.build))

@@ -29,14 +29,5 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     return assemble(parts, LoopOptions(initial_rollouts=config.initial_rollouts), task)._replace(updates_per_rollout=1)
 
 
-METHOD = Method(
-    "recurrent",
-    Online(
-        "model-free",
-        "zero-shot: a policy with memory, from a simulator whose actuators and sensors differ",
-        "Ni 2022",
-        Config,
-        build,
-        prior="recurrent",
-    ),
-)
+_ABOUT = "zero-shot: a policy with memory, from a simulator whose actuators and sensors differ"
+METHOD = Method("recurrent", Online("model-free", _ABOUT, "Ni 2022", Config, build, prior="recurrent"))

@@ -45,15 +45,5 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     return sac_finetuner(config, prior, task, source=lambda state: source, simulation=simulation)
 
 
-METHOD = Method(
-    "rlpd",
-    Online(
-        "model-free",
-        "from nothing; ten normalised critics, half of each batch simulated",
-        "Ball 2023",
-        Config,
-        build,
-        needs_prior=False,
-        zero_shot=False,
-    ),
-)
+_ABOUT = "from nothing; ten normalised critics, half of each batch simulated"
+METHOD = Method("rlpd", Online("model-free", _ABOUT, "Ball 2023", Config, build, needs_prior=False, zero_shot=False))

@@ -48,7 +48,5 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     return sac_finetuner(config, prior, task, source=source, simulation=simulation)
 
 
-METHOD = Method(
-    "sac-online",
-    Online("model-free", "SAC from kept networks and simulated data, slow actor", "As 2026", Config, build),
-)
+_ABOUT = "SAC from kept networks and simulated data, slow actor"
+METHOD = Method("sac-online", Online("model-free", _ABOUT, "As 2026", Config, build))

@@ -40,7 +40,5 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     )
 
 
-METHOD = Method(
-    "sgft-parts",
-    Online("sgft", "SGFT-SAC with shaping and shortening on or off, for comparisons", "SGFT 2025", Config, build),
-)
+_ABOUT = "SGFT-SAC with shaping and shortening on or off, for comparisons"
+METHOD = Method("sgft-parts", Online("sgft", _ABOUT, "SGFT 2025", Config, build))

@@ -106,14 +106,5 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     return assemble(parts, loop, task)._replace(updates_per_rollout=1)
 
 
-METHOD = Method(
-    "sysid",
-    Online(
-        "model-based",
-        "fits parameters and effects, and tells them to a policy that knows them",
-        "DROPO (Tiboni 2023)",
-        Config,
-        build,
-        sees_system=True,
-    ),
-)
+_ABOUT = "fits parameters and effects, and tells them to a policy that knows them"
+METHOD = Method("sysid", Online("model-based", _ABOUT, "DROPO (Tiboni 2023)", Config, build, sees_system=True))
