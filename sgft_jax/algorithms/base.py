@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple, NotRequir
 from msgspec import Meta, Struct
 
 from envs.files import Count
-from envs.types import Array, Key, Policy, PyTree
+from envs.types import Array, Policy, PyTree
 from sgft_jax.types import Learner, Task
 
 if TYPE_CHECKING:
@@ -68,8 +68,8 @@ class Card(TypedDict):
 class Recipe(NamedTuple):
     """How an algorithm is pretrained.
 
+    learner: its `act` explores, cheap enough for a fleet.
     hyper(steps []) -> the learner's numbers after so many steps of all environments.
-    init_carry() and act(agent, carry, obs, key) -> (action, carry): exploration, cheap enough for a fleet.
     extract(agents [M]) -> params [M].
     replaced(carry, action) -> the carry if another action was taken than `act` chose.
     """
@@ -77,8 +77,6 @@ class Recipe(NamedTuple):
     learner: Learner
     memory: Memory
     hyper: Callable[[Array], Any]
-    init_carry: Callable[[], PyTree]
-    act: Callable[[PyTree, PyTree, Array, Key], tuple[Array, PyTree]]
     extract: Callable[[Any], PyTree]
     replaced: Callable[[PyTree, Array], PyTree] = lambda carry, action: carry
 

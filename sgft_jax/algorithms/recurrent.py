@@ -4,7 +4,7 @@ import functools
 from collections.abc import Mapping
 from typing import Any, TypedDict
 
-from envs.types import Array, Key, Policy, PyTree, UserError
+from envs.types import Key, Policy, PyTree, UserError
 from sgft_jax import data, learners
 from sgft_jax.algorithms.base import Algorithm, Card, Config, NetworkEntry, Networks, Recipe, Width, scheduled
 from sgft_jax.models.config import network_of
@@ -52,22 +52,15 @@ def _recipe(task: Task, config: Config) -> Recipe:
             )
     structure = recurrent.RecurrentConfig(task.obs_dim, task.act_dim, network=config.network, gru=config.gru)
 
-    def numbers(rate: Array) -> Any:
-        return recurrent.RecurrentHyper(rate, config.tau, config.alpha, config.entropy_per_dim)
-
     def sample(experience: PyTree, key: Key, n: int) -> Batch:
         return data.sequences.sample_episodes(experience, key, n, task.episode_length)
 
-    hyper = scheduled(config, numbers)
+    numbers = config.tau, config.alpha, config.entropy_per_dim
+    hyper = scheduled(config, lambda rate: recurrent.RecurrentHyper(rate, *numbers))
+    episodes = memory.windows(task, config.n_envs, sample, spare=1)  # of a full ring the oldest slot begins nothing
     learner = recurrent.make_recurrent(structure, hyper(0))
     return Recipe(
-        learner,
-        memory.windows(task, config.n_envs, sample, spare=1),  # of a full ring the oldest slot begins nothing
-        hyper,
-        learner.init_carry,
-        functools.partial(learner.act, explore=True),
-        recurrent.extract_params,
-        replaced=lambda carry, action: carry._replace(action=action),
+        learner, episodes, hyper, recurrent.extract_params, lambda carry, action: carry._replace(action=action)
     )
 
 

@@ -1,6 +1,5 @@
 """SAC with V_sim and a dynamics ensemble: the priors of most methods. Those with a `plan` act by plans."""
 
-import functools
 from collections.abc import Mapping
 from typing import Annotated, Any, NotRequired
 
@@ -66,8 +65,7 @@ def _recipe(task: Task, config: Config) -> Recipe:
     shared = {name: getattr(config, name) for name in ("network", "ensemble_size", "policy_delay")}
     hyper = scheduled(config, numbers)
     learner = sac.make_sac(sac.SACConfig(task.obs_dim, task.act_dim, **shared), hyper(0))
-    explore = functools.partial(learner.act, explore=True)
-    return Recipe(learner, data.memory.transitions(task), hyper, learner.init_carry, explore, sac.extract_params)
+    return Recipe(learner, data.memory.transitions(task), hyper, sac.extract_params)
 
 
 ALGORITHM = Algorithm("sac", _SACCard, lambda: learners.sac.SACParams, _policy, _networks, _recipe, preset="robust")

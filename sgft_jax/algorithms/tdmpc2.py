@@ -49,18 +49,15 @@ def _recipe(task: Task, config: Config) -> Recipe:
     tdmpc2, memory = learners.tdmpc2, data.memory
     structure = _structure(vars(config), task.obs_dim, task.act_dim)
 
-    def numbers(rate: Array) -> Any:
-        return tdmpc2.TDMPC2Hyper(lr=rate, tau=config.tau, gamma=config.gamma)
-
-    def act(agent: Any, carry: PyTree, obs: Array, key: Key) -> tuple[Array, PyTree]:
-        return tdmpc2.policy_action(structure, agent, obs, key, explore=True), carry
+    def act(agent: Any, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array) -> tuple[Array, PyTree]:
+        return tdmpc2.policy_action(structure, agent, obs, key, explore=explore), carry
 
     def sample(experience: PyTree, key: Key, n: int) -> Batch:
         return data.sequences.sample(experience, key, n, config.horizon)
 
-    windows, hyper = memory.windows(task, config.n_envs, sample), scheduled(config, numbers)
-    learner = tdmpc2.make_tdmpc2(structure, hyper(0))
-    return Recipe(learner, windows, hyper, lambda: (), act, tdmpc2.extract_params)
+    hyper = scheduled(config, lambda rate: tdmpc2.TDMPC2Hyper(lr=rate, tau=config.tau, gamma=config.gamma))
+    learner = tdmpc2.make_tdmpc2(structure, hyper(0))._replace(init_carry=lambda: (), act=act)
+    return Recipe(learner, memory.windows(task, config.n_envs, sample), hyper, tdmpc2.extract_params)
 
 
 ALGORITHM = Algorithm(

@@ -200,7 +200,8 @@ def make_plan(env: Env, config: PretrainConfig) -> Plan:
         """The policy's actions, more and more of them replaced by random ones along the fleet."""
         key_policy, key_replace, key_random = jax.random.split(key, 3)
         keys = jax.random.split(key_policy, config.n_envs)
-        actions, carry = jax.vmap(recipe.act, (None, 0, 0, 0))(agent, simulators.carry, simulators.state.obs, keys)
+        act = functools.partial(recipe.learner.act, agent, explore=True)
+        actions, carry = jax.vmap(act)(simulators.carry, simulators.state.obs, keys)
         if not config.random_ladder:
             return actions, carry
         share = jnp.linspace(0.0, config.random_ladder, config.n_envs)
@@ -215,7 +216,7 @@ def make_plan(env: Env, config: PretrainConfig) -> Plan:
         capacity=config.replay_capacity,
         chunks=config.chunks,
         rounds=config.chunk_steps,
-        init_carry=recipe.init_carry,
+        init_carry=recipe.learner.init_carry,
         explore=explore,
         begin=begin,
         tune=lambda agent, rounds: agent.replace(hyper=recipe.hyper(rounds)),

@@ -47,8 +47,8 @@ class Agent(struct.PyTreeNode):
     hyper: Any
 
 
-def counting(task, config):
-    """Actions are the age of the episode, as far as the carry tells."""
+def counting(task, config, **parts):
+    """Actions are the age of the episode, as far as the carry tells. parts: of the learner, instead of its own."""
     learner = Learner(
         init=lambda key: Agent(normalizer.identity(task.obs_dim), jnp.float32(0)),
         init_carry=lambda: jnp.float32(0),
@@ -57,10 +57,8 @@ def counting(task, config):
     )
     sac = recipe_of(task, config)
     return sac._replace(
-        learner=learner,
+        learner=learner._replace(**parts),
         hyper=lambda steps: jnp.float32(0),
-        init_carry=learner.init_carry,
-        act=functools.partial(learner.act, explore=True),
         extract=lambda agent: agent.normalizer,
     )
 
@@ -123,11 +121,11 @@ def test_no_key_is_used_twice(algorithm):
 def test_a_policy_remembers_the_random_action_that_replaced_its_choice(monkeypatch):
     """Its choice is always 0.5; what it hands on is the action that was stored, or 0 at the start of an episode."""
 
-    def chosen(agent, carry, obs, key):
+    def chosen(agent, carry, obs, key, *, explore):
         return jnp.full(1, 0.5), jnp.float32(0.5)
 
     def recipe(task, config):
-        return counting(task, config)._replace(act=chosen, replaced=lambda carry, action: action[0])
+        return counting(task, config, act=chosen)._replace(replaced=lambda carry, action: action[0])
 
     monkeypatch.setattr(pretraining, "recipe_of", recipe)
     config = replace(CONFIG, chunk_steps=5, env_steps=5 * N, random_ladder=1.0)
@@ -217,10 +215,10 @@ def equal(one, other):
 def test_random_actions_grow_along_the_fleet(key, monkeypatch):
     """A policy always says 2: the first environment obeys, the last acts at random, the middle one does both."""
 
-    def always(agent, carry, obs, key):
+    def always(agent, carry, obs, key, *, explore):
         return jnp.full(2, 2.0), carry
 
-    monkeypatch.setattr(pretraining, "recipe_of", lambda *given: counting(*given)._replace(act=always))
+    monkeypatch.setattr(pretraining, "recipe_of", functools.partial(counting, act=always))
     config = replace(CONFIG, n_envs=3, chunk_steps=60, env_steps=180, random_ladder=1.0)
     *_, (state, _) = pretrain(toy.make(), config, [0])
     obeyed = (state.replay.data.action[0, : 3 * 60].reshape(60, 3, 2) > 1).all(-1).mean(0)
