@@ -43,7 +43,7 @@ each_algorithm = pytest.mark.parametrize("algorithm", tuners.slow_but({"sac"}, [
 
 
 def counting(part):
-    """A recipe, policy or finetuner whose carry also counts the steps of the episode, as its last action tells."""
+    """A learner, policy or finetuner whose carry also counts the steps of the episode, as its last action tells."""
 
     def act(state, carry, *given, **options):
         own, steps = carry
@@ -67,7 +67,8 @@ def pretrained(algorithm):
     config = dataclasses.replace(CONFIG, algorithm=algorithm)
 
     def recipe(*given):
-        return counting(recipe_of(*given))
+        recipe = recipe_of(*given)
+        return recipe._replace(learner=counting(recipe.learner))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pretraining, "recipe_of", recipe)
