@@ -252,7 +252,7 @@ def _rollouts(n: int) -> str:
     return f"{n} rollout{'s' * (n > 1)}"
 
 
-def _lines(labels: Sequence[str], examined: Sequence[Examined], mean: Mapping[str, Any]) -> list[str]:
+def _lines(labels: Sequence[str], examined: Sequence[Examined], mean: dict[str, Any]) -> list[str]:
     """One line for each prior, and one for their mean."""
     rows = [("prior", "success %", "improvable %", "V_sim short by", "rank", "model error -> identified (sim)", "gain")]
     diagnoses = [(label, one.statistics[-1]) for label, one in zip(labels, examined, strict=True)]
