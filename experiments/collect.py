@@ -113,8 +113,11 @@ def check(args: CollectArgs) -> float:
         raise UserError(f"--operator: {extend.name_of(args.task)} has none, only {', '.join(ROBOTS)}")
     if args.operator and args.policy is not None:
         raise UserError("--operator and --policy exclude each other: record one of them")
-    if args.level is not None:
-        _check_level(args.level, args)
+    if args.level is not None and (args.policy is not None or args.operator):
+        which = f"with {'--operator' if args.operator else '--policy'} nothing learns; leave one of them out"
+        raise UserError(f"--level {args.level:g}: ends learning, and {which}")
+    if args.level is not None and not math.isfinite(args.level):
+        raise UserError(f"--level {args.level:g}: must be a finite number")
     level = args.level if args.level is not None else LEVELS.get(extend.name_of(args.task))
     if args.policy is None and level is None and not args.operator:
         raise UserError(f"--level: say at which mean return learning stops; only {', '.join(LEVELS)} have a default")
@@ -128,15 +131,6 @@ def check(args: CollectArgs) -> float:
     if there := [path for path in targets(args) if path.exists() and not args.overwrite]:
         raise UserError(f"{there[0]}: exists already; --overwrite replaces it, another --out keeps both")
     return level or 0.0
-
-
-def _check_level(level: float, args: CollectArgs) -> None:
-    """Raises UserError where nothing learns until the level is reached, or where nothing reaches it."""
-    if args.policy is not None or args.operator:
-        other = "--operator" if args.operator else "--policy"
-        raise UserError(f"--level {level:g}: ends learning, and with {other} nothing learns; leave one of them out")
-    if not math.isfinite(level):
-        raise UserError(f"--level {level:g}: must be a finite number")
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import difflib
 import errno
+import itertools
 import logging
 import os
 import select
@@ -29,10 +30,8 @@ from envs.types import UserError, unknown
 BROKEN_PIPE, USER_ERROR = 1, 2
 _SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_FULL = [os.strerror(number) for number in _NO_SPACE]  # "No space left on device"
 _BAD_PATH = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP)
 _ON_DISK = (*_NO_SPACE, *_BAD_PATH, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.EMFILE, errno.ENFILE)
-_CACHE_VARIABLE = "SGFT_CACHE_DIR"
 
 
 class Stopped(KeyboardInterrupt):
@@ -84,7 +83,7 @@ def run_main[T](
                 fail(f"{chosen}: MuJoCo cannot use that here ({error}); unset it, or set it to disable")
             if isinstance(error, ValueError) and " for environment 'JAX_" in str(error):  # as JAX is imported
                 fail(f"{error}; unset it")
-            if not _is_out_of_memory(error):
+            if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):  # JAX's word for it
                 raise
             reason = (str(error).strip() or "MemoryError").splitlines()[0]
             fail(f"out of memory ({reason}): lower the batch size, the number of environments or of seeds")
@@ -94,7 +93,8 @@ def _disk_trouble(error: BaseException | None) -> str | None:
     """What is wrong where a file could not be read or written; also as the cause of another error. Else None."""
     if isinstance(error, OSError) and error.errno in _ON_DISK:
         return f"{error.filename or 'a file of the run'}: {(error.strerror or 'cannot be written').lower()}"
-    if words := [text for text in _FULL if text in str(error)]:  # Orbax has another type for it
+    full = map(os.strerror, _NO_SPACE)  # "No space left on device"
+    if words := [text for text in full if text in str(error)]:  # Orbax has another type for it
         return f"a file of the run: {words[0].lower()}"
     return None if error is None else _disk_trouble(error.__cause__)
 
@@ -114,11 +114,6 @@ def _in_renderer_choice(error: Exception) -> bool:
     """Whether MuJoCo could not even be imported with the renderer that the user's MUJOCO_GL names."""
     frames = traceback.extract_tb(error.__traceback__)
     return bool(os.environ.get("MUJOCO_GL")) and any(frame.filename.endswith("gl_context.py") for frame in frames)
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    """Whether the host or, as JAX says it, a device had no room for an array."""
-    return isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)
 
 
 @contextlib.contextmanager
@@ -282,14 +277,11 @@ def _in_words(hint: Any) -> str:
 def _given(option: str, argv: Sequence[str]) -> list[str]:
     """The values of an option on a command line, of the last one if it is there several times."""
     values: list[str] = []
-    inside = False
-    for word in argv:
+    for i, word in enumerate(argv):
         name, _, value = word.partition("=")
-        if word.startswith("--"):
-            inside = name.replace("_", "-") == option
-            values = ([value] if value else []) if inside else values
-        elif inside:
-            values.append(word)
+        if name.startswith("--") and name.replace("_", "-") == option:
+            following = itertools.takewhile(lambda word: not word.startswith("--"), argv[i + 1 :])
+            values = [*filter(None, [value]), *following]
     return values
 
 
@@ -344,7 +336,7 @@ def set_up() -> None:
 
 def cache_folder() -> Path | None:
     """Where compiled programs are kept: $SGFT_CACHE_DIR, by default ~/.cache/sgft_jax/jax; None if it is "off"."""
-    chosen = os.environ.get(_CACHE_VARIABLE, "")
+    chosen = os.environ.get("SGFT_CACHE_DIR", "")
     if chosen.lower() in ("off", "none", "0"):
         return None
     return Path(chosen) if chosen else Path.home() / ".cache" / "sgft_jax" / "jax"

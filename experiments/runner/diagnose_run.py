@@ -91,7 +91,8 @@ def _examine(
 
     simulated: of every prior. which: the prior that looks at each of `real`.
     """
-    examiner, counts = Examiner(priors[0].card, env), counts_to(real[0].valid.shape[0])
+    examiner, n = Examiner(priors[0].card, env), real[0].valid.shape[0]
+    counts = sorted({*(2**i for i in range(n.bit_length())), n})
     params = stacking.stack([prior.params for prior in priors])
     control = examiner.control(params, stacking.stack(simulated))
     chosen, usual = (stacking.member(x, jnp.array(which)) for x in (params, control))
@@ -107,11 +108,6 @@ def load(task: str, impl: Any, folders: Sequence[Path]) -> tuple[Env, list[Prior
     for prior in priors:
         api.check_prior(prior, get_method("sgft"), env)
     return env, priors
-
-
-def counts_to(n: int) -> list[int]:
-    """1, 2, 4, ... and n."""
-    return sorted({*(2**i for i in range(n.bit_length())), n})
 
 
 def names_of(env: Env) -> Names:

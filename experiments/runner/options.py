@@ -23,7 +23,6 @@ from sgft_jax.types import Online
 if TYPE_CHECKING:
     from envs.base import Env
 
-_LAST_PORT = 65_535
 _MOST_HOSTS, _MOST_SEEDS = 2**16, 2**16  # of one run
 LAST_SEED = 2**31 - 1  # larger ones stand for held-out worlds and episodes
 
@@ -74,7 +73,7 @@ def each_once(args: object, *names: str) -> None:
 
 def port_of(text: str) -> int | None:
     """The number of a port, None for what is none."""
-    return int(text) if text.isdecimal() and len(text) < 9 and 0 < int(text) <= _LAST_PORT else None
+    return int(text) if text.isdecimal() and len(text) < 9 and 0 < int(text) < 2**16 else None
 
 
 def hosts_of(hosts: str) -> tuple[str, int, int]:

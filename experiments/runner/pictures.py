@@ -24,7 +24,6 @@ from sgft_jax.io.real import Played
 from sgft_jax.io.runs import read_config
 
 _WORDY = 5  # rollouts that have room for more than their numbers
-_RENDER_PROBE = "import mujoco; c = mujoco.GLContext(16, 16); c.make_current(); c.free()"
 
 
 # --- films of episodes ------------------------------------------------------------------------------------------------
@@ -111,7 +110,8 @@ def select_renderer() -> str | None:
 
 def _probe(backend: str) -> str | None:
     """None if MuJoCo makes an off-screen context with this backend, else the last line it said."""
-    command, environment = [sys.executable, "-c", _RENDER_PROBE], {**os.environ, "MUJOCO_GL": backend}
+    code = "import mujoco; c = mujoco.GLContext(16, 16); c.make_current(); c.free()"
+    command, environment = [sys.executable, "-c", code], {**os.environ, "MUJOCO_GL": backend}
     try:
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=60)
     except subprocess.TimeoutExpired:
