@@ -15,7 +15,7 @@ from envs import extend
 from envs.gaps import SIM, title
 from envs.types import UserError
 from experiments.runner import cli
-from experiments.runner.options import Impl, at_least_one, check_task, seed_list, task_of_priors
+from experiments.runner.options import FirstSeed, Impl, Task, at_least_one, check_task, seed_list, task_of_priors
 from sgft_jax.io.cards import resolve_shipped
 from sgft_jax.io.runs import check_folder
 
@@ -29,8 +29,7 @@ _LOG, _SET = 16_588, 1_000_000  # transitions of H2O+'s logs of the robot, and o
 class CollectArgs:
     """Data sets of one real system, one pair for each seed."""
 
-    task: str = "halfcheetah"
-    """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
+    task: Task = "halfcheetah"
     real: str = SIM
     """The real system: a gap by name or as a file, or sim for the task as it is."""
     policy: Path | None = None
@@ -47,8 +46,7 @@ class CollectArgs:
     """Folder for the files."""
     overwrite: bool = False
     """Replace files of the same name."""
-    seed: int = 0
-    """Expert: first seed."""
+    seed: FirstSeed = 0
     environments: int = 8
     """Expert: environments that learning steps together. Many would fill the experience with early, poor episodes."""
     updates: int = 1_000_000

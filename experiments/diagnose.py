@@ -9,7 +9,7 @@ from pathlib import Path
 
 from envs.types import UserError
 from experiments.runner import cli, options
-from experiments.runner.options import Impl
+from experiments.runner.options import Impl, Json
 from experiments.runner.real_systems import check as check_real
 from sgft_jax.io.runs import check_folder, read_config
 from sgft_jax.presets import DEFAULT_PRESET
@@ -29,8 +29,7 @@ class DiagnoseArgs:
     name, a .toml/.json file, file.toml:name, or gymnasium:NAME, on which the policies then play zero-shot."""
     rollouts: int | None = None
     """Only the first so many recorded rollouts; default: all. On a gap: how many to play, default 4."""
-    json: bool = False
-    """Print one JSON object and nothing else."""
+    json: Json = False
     out: Path = Path("runs")
     """Parent of all run folders; picture and numbers go to <out>/diagnose/<task>/<name>."""
     preset: str = DEFAULT_PRESET

@@ -11,7 +11,7 @@ from envs import gaps
 from envs.gaps import SIM, Gap
 from envs.types import UserError
 from experiments.runner import cli, options
-from experiments.runner.options import Impl
+from experiments.runner.options import Impl, Json, Out
 from experiments.runner.real_systems import REMOTE, TOGETHER, connect, described, is_robot, is_stepped
 from experiments.runner.real_systems import check as check_real
 from sgft_jax.io.runs import check_folder
@@ -43,10 +43,8 @@ class EvaluateArgs:
     """Episodes per policy and system."""
     video: Path | None = None
     """Folder for films, SYSTEM-POLICY.mp4: the first episode of each policy in each simulated system."""
-    json: bool = False
-    """Print one JSON object and nothing else."""
-    out: Path = Path("runs")
-    """Parent of all run folders."""
+    json: Json = False
+    out: Out = Path("runs")
     preset: str = DEFAULT_PRESET
     """Expert: pretraining preset whose priors to take where neither --prior nor --run is given."""
     seed: int = 0

@@ -13,7 +13,7 @@ from envs import extend
 from envs.gaps import each, presets
 from envs.types import UserError
 from experiments.runner import cli, options
-from experiments.runner.options import Impl
+from experiments.runner.options import Impl, Task
 from sgft_jax.io.runs import check_folder
 from sgft_jax.presets import PRESETS, PretrainConfig
 
@@ -24,8 +24,7 @@ PLAIN = "fast"  # strata are those of priors that know the task's own domain alo
 class MeasureArgs:
     """How gaps are measured."""
 
-    task: str = "push"
-    """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
+    task: Task = "push"
     prior: Path | None = None
     """Folder of a prior, or of several (prior/seed-*); default: those of <out>/pretrain/<task>/<preset>."""
     preset: str = PLAIN

@@ -14,7 +14,7 @@ from envs import extend, gaps
 from envs.gaps import SIM
 from envs.types import UserError
 from experiments.runner import cli
-from experiments.runner.options import Impl, check_task, hosts_of, not_negative, seed_list, seeds_name
+from experiments.runner.options import Impl, Out, Task, check_task, hosts_of, not_negative, seed_list, seeds_name
 from sgft_jax.io.runs import check_start
 from sgft_jax.presets import DEFAULT_PRESET, PRESETS, PretrainConfig
 
@@ -26,8 +26,7 @@ class PretrainArgs:
     # May differ when a run goes on.
     volatile: ClassVar = ("resume", "overwrite", "devices", "hosts", "report", "video", "out")
 
-    task: str = "push"
-    """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
+    task: Task = "push"
     preset: str = DEFAULT_PRESET
     """Named settings: robust (one GPU, minutes; actuators and sensors differ between episodes), fast (the task's own
     domain), cpu (two cores, minutes), paper, or robust-tdmpc2, recurrent and informed (sysid) for the methods that need
@@ -36,8 +35,7 @@ class PretrainArgs:
     """First seed."""
     seeds: int = 1
     """Number of seeds, trained together. Each leaves a prior."""
-    out: Path = Path("runs")
-    """Parent of all run folders."""
+    out: Out = Path("runs")
     resume: bool = False
     """Continue from the last checkpoint."""
     overwrite: bool = False

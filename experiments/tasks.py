@@ -18,6 +18,7 @@ from envs import gaps
 from envs.base import Effects, Value
 from experiments.runner import cli
 from experiments.runner.cli import columns
+from experiments.runner.options import Json
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,7 @@ class TasksArgs:
 
     task: Annotated[str | None, tyro.conf.Positional] = None
     """One of them, or a Python file with a task of your own (docs/extending.md); default: a list of all."""
-    json: bool = False
-    """Print one JSON object and nothing else."""
+    json: Json = False
 
 
 def main(args: TasksArgs) -> None:

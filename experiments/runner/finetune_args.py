@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 from envs import extend, gaps
 from envs.types import UserError
 from experiments.runner import options
-from experiments.runner.options import Impl, Successors
+from experiments.runner.options import FirstSeed, Impl, Out, Successors, Task
 from experiments.runner.real_systems import REMOTE, is_robot, is_stepped, title
 from experiments.runner.real_systems import check as check_real
 from sgft_jax.files.disk import jsonable
@@ -33,8 +33,7 @@ class FinetuneArgs:
         *("out", "tuned", "real_data", "successors"),
     )
 
-    task: str = "push"
-    """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
+    task: Task = "push"
     method: str = DEFAULT
     """A method from the table at the top, or a Python file with a method of your own (docs/extending.md)."""
     real: tuple[str, ...] = ("default",)
@@ -52,8 +51,7 @@ class FinetuneArgs:
     prior: Path | None = None
     """Folder of a prior, of several (prior/seed-*) or of runs; `none` starts from nothing where the method can.
     Default: <out>/pretrain/<task>/<preset>."""
-    out: Path = Path("runs")
-    """Parent of all run folders."""
+    out: Out = Path("runs")
     real_data: tuple[Path, ...] = ()
     """Logs of the real system to begin with: data sets of D4RL, Minari or LeRobot, or run folders with rollouts in
     real/ (docs/data.md). Every seed keeps their episodes and learns from them before it plays."""
@@ -65,8 +63,7 @@ class FinetuneArgs:
     """Options of the method that --method names:"""
     preset: str = DEFAULT_PRESET
     """Expert: pretraining preset whose priors to start from."""
-    seed: int = 0
-    """Expert: first seed."""
+    seed: FirstSeed = 0
     eval_every: int = 5
     """Expert: rollouts between evaluations."""
     eval_at: tuple[int, ...] = ()

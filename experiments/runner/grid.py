@@ -22,7 +22,7 @@ from experiments.runner.finetune_args import (
     run_folder,
     with_settings,
 )
-from experiments.runner.options import Impl, at_least_one, check_task, each_once, not_negative, seed_list
+from experiments.runner.options import Impl, Out, at_least_one, check_task, each_once, not_negative, seed_list
 from sgft_jax.files.disk import InUseError, in_use, jsonable
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.io.runs import CONFIG, check_folder, check_same, read_own
@@ -68,8 +68,7 @@ class WorkArgs:
     dry: bool = False
     """Only list the runs and what is missing."""
     impl: Impl = "auto"
-    out: Path = Path("runs")
-    """Parent of all run folders."""
+    out: Out = Path("runs")
 
 
 class Cell(NamedTuple):

@@ -14,7 +14,7 @@ from envs import extend
 from envs.gaps import SIM, each, title
 from envs.types import UserError
 from experiments.runner import cli, options
-from experiments.runner.options import Impl, Successors
+from experiments.runner.options import FirstSeed, Impl, Out, Successors, Task
 from sgft_jax.files.disk import jsonable
 from sgft_jax.io.runs import NO_DATA, NO_SIMULATOR
 from sgft_jax.methods import get_method
@@ -40,8 +40,7 @@ class HybridArgs:
     # May differ when a run goes on. What is in the data may not, nor what a schedule has, whatever it is called.
     volatile: ClassVar = ("resume", "overwrite", "out", "video", "data", "schedule_preset")
 
-    task: str = "halfcheetah"
-    """A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."""
+    task: Task = "halfcheetah"
     method: str = DEFAULT
     """A method from the table at the top."""
     gap: tuple[str, ...] = ("gravity",)
@@ -57,8 +56,7 @@ class HybridArgs:
     `robust`, which sees 2."""
     seeds: int = 5
     """Number of seeds."""
-    out: Path = Path("runs")
-    """Parent of all run folders."""
+    out: Out = Path("runs")
     resume: bool = False
     """Continue from the last checkpoint."""
     overwrite: bool = False
@@ -71,8 +69,7 @@ class HybridArgs:
     schedule_preset: SchedulePreset = FLEET
     schedule: Schedule = field(default_factory=Schedule)
     successors: Successors = "stored"
-    seed: int = 0
-    """Expert: first seed."""
+    seed: FirstSeed = 0
     eval_every: int = 10_000
     """Expert: updates between evaluations in the real system, rounded to whole chunks. No choice depends on them."""
     eval_episodes: int = 10

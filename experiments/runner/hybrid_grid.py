@@ -15,6 +15,7 @@ from envs.types import UserError, unknown
 from experiments.runner import cli, hybrid_args, options
 from experiments.runner.grid import Cell, Kind, WorkArgs, look_up
 from experiments.runner.hybrid_args import HybridArgs, SchedulePreset, data_name
+from experiments.runner.options import FirstSeed
 from sgft_jax.analysis.curves import Curve
 from sgft_jax.analysis.hybrid import Results
 from sgft_jax.analysis.reading import read_curve
@@ -58,8 +59,7 @@ class _Systems:
     """Instead of running, show what hybrid.csv in this folder holds of these runs, such as docs/data."""
     beside: int | None = None
     """With --released: also the rank correlation of the methods with those of runs of so many updates."""
-    seed: int = 0
-    """Expert: first seed."""
+    seed: FirstSeed = 0
     eval_every: int = 10_000
     """Expert: updates between evaluations in the real system."""
     eval_episodes: int = 10

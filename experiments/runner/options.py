@@ -34,6 +34,14 @@ Impl = Annotated[
     ),
 ]
 
+Task = Annotated[
+    str,
+    arg(help="A task by name (python -m experiments.tasks lists them), or a Python file with a task of your own."),
+]
+Out = Annotated[Path, arg(help="Parent of all run folders.")]
+FirstSeed = Annotated[int, arg(help="Expert: first seed.")]
+Json = Annotated[bool, arg(help="Print one JSON object and nothing else.")]
+
 Successors = Annotated[
     types.Successors,
     arg(help="Expert: where the next observations of a D4RL file come from: stored, or shifted (the row below)."),

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from envs.types import UserError
 from experiments.runner import cli
-from experiments.runner.options import Impl, seed_list
+from experiments.runner.options import Impl, Json, Out, seed_list
 from sgft_jax.presets import DEFAULT_PRESET
 
 
@@ -27,10 +27,8 @@ class CalibrateArgs:
     prior: Path | None = None
     """Folder of a prior of SAC, or of several (prior/seed-*); default: those that the runs began with, else those of
     <out>/pretrain/<task>/<preset>."""
-    json: bool = False
-    """Print one JSON object and nothing else."""
-    out: Path = Path("runs")
-    """Parent of all run folders."""
+    json: Json = False
+    out: Out = Path("runs")
     preset: str = DEFAULT_PRESET
     """Expert: pretraining preset whose priors to take where neither --prior nor a run names any."""
     seed: int = 0
