@@ -9,7 +9,7 @@ and a policy that proposes.
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,15 +33,15 @@ _WORST = -1e9  # finite, so that weights stay defined where no score is
 
 
 @dataclass(frozen=True)
-class MPPIConfig:
+class MPPIConfig(checks.Checked):
     """samples: sequences per iteration, proposals among them. elites: the best of them. iterations: of the search."""
 
     samples: int = 512
-    elites: int = 64
-    iterations: int = 6
+    elites: checks.Count = 64
+    iterations: checks.Count = 6
 
     def __post_init__(self) -> None:
-        checks.at_least(self, 1, "iterations", "elites")
+        super().__post_init__()
         if self.elites > self.samples:
             raise checks.refusal("elites", self.elites, f"at most samples, {self.samples}")
 
@@ -129,7 +129,7 @@ _SEARCH = MPPIHyper(temperature=20.0, std_min=0.05, std_max=1.0)
 
 
 @dataclass(frozen=True)
-class MPCConfig:
+class MPCConfig(checks.Checked):
     """obs_dim, act_dim; network: the prior's. horizon: steps of a plan, H. samples: sequences tried per iteration.
 
     noise: std of the noise on the policy's proposals, in units of the action's range [-1, 1]. gamma: discount factor.
@@ -138,14 +138,10 @@ class MPCConfig:
     obs_dim: int
     act_dim: int
     network: NetworkConfig
-    horizon: int = 1
-    samples: int = 128
+    horizon: checks.Count = 1
+    samples: Annotated[int, checks.least(_ELITES), checks.countable] = 128
     noise: float = 0.5
     gamma: float = 0.99
-
-    def __post_init__(self) -> None:
-        checks.at_least(self, 1, "horizon")
-        checks.at_least(self, _ELITES, "samples")
 
 
 def init_carry(config: MPCConfig) -> Array:

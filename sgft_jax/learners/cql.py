@@ -33,13 +33,8 @@ class CQLConfig(SACConfig):
     train_value: bool = False
     train_dynamics: bool = False
     entropy_in_target: bool = False
-    conservatism: float = 2.0
-    samples: int = 10
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.not_negative(self, "conservatism")
-        checks.at_least(self, 1, "samples")
+    conservatism: checks.NotNegative = 2.0
+    samples: checks.Count = 10
 
 
 def soft_maximum(q: Array, log_density: Array) -> Array:

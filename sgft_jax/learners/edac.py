@@ -6,6 +6,7 @@ al. 2021.
 
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -34,13 +35,8 @@ class EDACConfig(SACConfig):
     network: NetworkConfig = field(default_factory=lambda: NetworkConfig((256, 256, 256)))
     train_value: bool = False
     train_dynamics: bool = False
-    critics: int = 10
-    diversity: float = 1.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.at_least(self, 2, "critics")
-        checks.not_negative(self, "diversity")
+    critics: Annotated[int, checks.least(2)] = 10
+    diversity: checks.NotNegative = 1.0
 
 
 def alignment(grads: Array) -> Array:

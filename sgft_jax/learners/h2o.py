@@ -36,11 +36,7 @@ class H2OConfig(MixedConfig):
     successors: noisy copies of s' over which the gap of the dynamics at (s, a) is averaged.
     """
 
-    successors: int = 10
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.at_least(self, 1, "successors")
+    successors: checks.Count = 10
 
 
 class H2OHyper(NamedTuple):

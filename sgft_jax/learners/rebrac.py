@@ -28,7 +28,7 @@ __all__ += ["update"]
 
 
 @dataclass(frozen=True)
-class ReBRACConfig:
+class ReBRACConfig(checks.Checked):
     """The structure of an agent. The defaults are the published ones, but for LayerNorm, which is after ReLU there.
 
     obs_dim, act_dim: sizes of what the environment gives and takes. network: body of actor and critics.
@@ -38,10 +38,7 @@ class ReBRACConfig:
     obs_dim: int
     act_dim: int
     network: NetworkConfig = field(default_factory=lambda: NetworkConfig((256, 256, 256), layer_norm=True))
-    policy_delay: int = 2
-
-    def __post_init__(self) -> None:
-        checks.at_least(self, 1, "policy_delay")
+    policy_delay: checks.Count = 2
 
 
 class ReBRACHyper(NamedTuple):

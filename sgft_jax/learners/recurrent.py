@@ -30,7 +30,7 @@ __all__ += ["init", "init_carry", "make_recurrent", "policy_action", "update"]
 
 
 @dataclass(frozen=True)
-class RecurrentConfig:
+class RecurrentConfig(checks.Checked):
     """The structure of an agent.
 
     obs_dim, act_dim: sizes of what the environment gives and takes. network: the body behind either memory.
@@ -40,10 +40,7 @@ class RecurrentConfig:
     obs_dim: int
     act_dim: int
     network: NetworkConfig = field(default_factory=lambda: NetworkConfig(hidden=(256, 256)))
-    gru: int = 128
-
-    def __post_init__(self) -> None:
-        checks.at_least(self, 1, "gru")
+    gru: checks.Count = 128
 
 
 class RecurrentHyper(NamedTuple):

@@ -29,7 +29,7 @@ __all__ += ["extract_params", "init", "make_sac", "network_input", "state_from_p
 
 
 @dataclass(frozen=True)
-class SACConfig:
+class SACConfig(checks.Checked):
     """The structure of an agent.
 
     obs_dim, act_dim: sizes of what the environment gives and takes.
@@ -57,21 +57,21 @@ class SACConfig:
     train_dynamics: bool = True
     ensemble_size: int = 5
     train_critic: bool = True
-    critics: int = 2
-    target_critics: int | None = None
+    critics: checks.Count = 2
+    target_critics: checks.Count | None = None
     actor_mean: bool = False
     entropy_in_target: bool = True
     critic_baseline: bool = False
     actor_batch: int | None = None
     weighted_actor: bool = True
     anchored: bool = False
-    policy_delay: int = 1
+    policy_delay: checks.Count = 1
     max_grad_norm: float | None = None
 
     def __post_init__(self) -> None:
         if self.critic_baseline and self.train_value:
             raise UserError("SAC option critic_baseline needs a frozen value network: set train_value to False")
-        checks.at_least(self, 1, "policy_delay", "critics", "target_critics")
+        super().__post_init__()
         if (self.target_critics or 1) > self.critics:
             raise checks.refusal("target_critics", self.target_critics, f"at most critics, {self.critics}")
 

@@ -60,7 +60,7 @@ def begin(nets: Networks, key_actor: Key, key_critic: Key) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class MixedConfig:
+class MixedConfig(checks.Checked):
     """The structure of an agent that learns from real and simulated rows, which two discriminators tell apart.
 
     obs_dim, act_dim: sizes of what the environment gives and takes.
@@ -76,11 +76,8 @@ class MixedConfig:
     tune_alpha: bool = True
     ratio_network: NetworkConfig = field(default_factory=two_layers)
     ratio_noise: float = 0.1
-    ratio_rows: int | None = None
+    ratio_rows: checks.Count | None = None
     critics: ClassVar[int] = 2
-
-    def __post_init__(self) -> None:
-        checks.at_least(self, 1, "ratio_rows")
 
     @property
     def discriminators(self) -> ratio.RatioConfig:

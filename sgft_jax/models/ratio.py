@@ -28,7 +28,7 @@ REAL, SIM = 0, 1  # the two logits of a discriminator
 
 
 @dataclass(frozen=True)
-class RatioConfig:
+class RatioConfig(checks.Checked):
     """The structure of the two discriminators.
 
     obs_dim, act_dim: sizes of what they read.
@@ -39,12 +39,8 @@ class RatioConfig:
     obs_dim: int
     act_dim: int
     network: NetworkConfig = field(default_factory=two_layers)
-    bound: float = 2.0
-    noise: float = 0.1
-
-    def __post_init__(self) -> None:
-        checks.positive(self, "bound")
-        checks.not_negative(self, "noise")
+    bound: checks.Positive = 2.0
+    noise: checks.NotNegative = 0.1
 
 
 class RatioState(NamedTuple):

@@ -6,26 +6,25 @@ from sgft_jax import checks
 
 
 @dataclass(frozen=True)
-class Schedule:
+class Schedule(checks.Checked):
     """How simulator steps and updates alternate."""
 
-    updates: int = 1_000_000
+    updates: checks.Count = 1_000_000
     """Gradient updates in all."""
-    simulators: int = 25
+    simulators: checks.Count = 25
     """Simulators of a run that are stepped together. The released code has one."""
-    steps_per_round: int = 1
+    steps_per_round: checks.Count = 1
     """Steps of every simulator before updates follow. The released code makes 1,000 of its one simulator."""
-    updates_per_step: float = 1.0
+    updates_per_step: checks.Positive = 1.0
     """Updates for each step of one simulator."""
-    buffer: int = 1_000_000
+    buffer: checks.Count = 1_000_000
     """Simulated transitions kept; new ones replace the oldest."""
-    chunk_updates: int = 5_000
+    chunk_updates: checks.Count = 5_000
     """Updates of a compiled chunk, at most all of them, rounded to whole rounds; logs, evaluations and checkpoints come
     between chunks."""
 
     def __post_init__(self) -> None:
-        checks.at_least(self, 1, "updates", "simulators", "steps_per_round", "buffer", "chunk_updates")
-        checks.positive(self, "updates_per_step")
+        super().__post_init__()
         if self.rows_per_round > self.buffer:
             raise checks.refusal("buffer", self.buffer, f"at least the rows of a round, {self.rows_per_round}")
 
