@@ -166,17 +166,13 @@ def make_h2oplus(config: H2OPlusConfig, hyper: Any = None) -> Learner:
 
 def _step_value(nets: Networks, state: H2OPlusState, batch: Batch) -> tuple[optim.Fit, Metrics]:
     """V after a step on the real rows alone, against the minimum of the target critics. Source: H2O+ Eq. (4)."""
-    q = jnp.min(jax.vmap(nets.critic.apply, (None, 0, 0))(state.target_critic, batch.obs, batch.action), axis=1)
-    hyper, counted = state.hyper, losses.real_rows(batch)
+    q, hyper, counted = steps.lowest_target(nets, state, batch), state.hyper, losses.real_rows(batch)
     numbers = {"expectile": hyper.expectile, "alpha": hyper.value_alpha, "cut": hyper.value_cut}
 
-    def loss(params: PyTree) -> tuple[Array, Array]:
-        values = jax.vmap(nets.value.apply, (None, 0))(params, batch.obs)
-        errors = losses.in_sample_loss(nets.config.value_loss, values, q, counted, **numbers)
-        return losses.real_mean(errors, batch), values
+    def row_losses(values: Array) -> Array:
+        return losses.in_sample_loss(nets.config.value_loss, values, q, counted, **numbers)
 
-    fit, mean, values = optim.minimise(nets.optimiser, loss, state.value, hyper.lr_value)
-    return fit, {"value/loss": mean, "value/mean": losses.real_mean(values, batch)}
+    return steps.step_value(nets, state, batch, row_losses, losses.real_mean)
 
 
 def _step_critic(

@@ -188,9 +188,10 @@ def update(config: IQLConfig, state: IQLState, batch: Batch, key: Key) -> tuple[
     """
     del key
     nets, batch = _networks(config), normalizer.normalize_rows(state.normalizer, batch)
-    q = jnp.min(jax.vmap(nets.critic.apply, (None, 0, 0))(state.target_critic, batch.obs, batch.action), axis=1)
-    state, of_value = _update_value(nets, state, batch, q)
-    state, of_actor = _update_actor(nets, state, batch, q)
+    q = steps.lowest_target(nets, state, batch)
+    row_loss = partial(losses.expectile_loss, expectile=state.hyper.expectile)
+    value, of_value = steps.step_value(nets, state, batch, lambda values: jax.vmap(row_loss)(values, q))
+    state, of_actor = _update_actor(nets, state.replace(value=value), batch, q)
     state, of_critic = _update_critic(nets, state, batch)
     target = optax.incremental_update(state.critic.params, state.target_critic, state.hyper.tau)
     return state.replace(target_critic=target, step=state.step + 1), of_value | of_actor | of_critic
@@ -202,17 +203,6 @@ def make_iql(config: IQLConfig, hyper: Any = None) -> Learner:
 
 
 # --- one update -------------------------------------------------------------------------------------------------------
-
-
-def _update_value(nets: Networks, state: IQLState, batch: Batch, q: Array) -> tuple[IQLState, Metrics]:
-    row_loss = partial(losses.expectile_loss, expectile=state.hyper.expectile)
-
-    def loss(params: PyTree) -> tuple[Array, Array]:
-        values = jax.vmap(nets.value.apply, (None, 0))(params, batch.obs)
-        return losses.row_mean(jax.vmap(row_loss)(values, q), batch), values
-
-    fit, mean, values = optim.minimise(nets.optimiser, loss, state.value, state.hyper.lr_value)
-    return state.replace(value=fit), {"value/loss": mean, "value/mean": jnp.mean(values)}
 
 
 def _update_actor(nets: Networks, state: IQLState, batch: Batch, q: Array) -> tuple[IQLState, Metrics]:

@@ -24,6 +24,73 @@ from sgft_jax.types import Batch, Learner, Metrics
 __all__ = ["act", "check_params_of_prior", "clip_by_norm", "discounted_mean", "extract_params", "init", "init_carry"]
 __all__ += ["make_tdmpc2", "policy_action", "scaled_entropy_sample", "state_from_prior", "update"]
 
+
+# --- losses of one window ---------------------------------------------------------------------------------------------
+
+
+def discounted_mean(values: Array, valid: Array, rho: Array | float, weight: Array | None = None) -> Array:
+    """Mean [] over the valid of values [B, T], step t weighing rho^t; with all valid, 1/T sum_t rho^t mean_B.
+
+    weight: [B] how much each row counts, mean 1.
+    """
+    decay = rho ** jnp.arange(values.shape[1])
+    counts = valid * decay[None]
+    total = jnp.maximum(jnp.sum(counts), 1e-6)
+    counts = counts if weight is None else counts * weight[:, None]
+    return jnp.mean(decay) * jnp.sum(jnp.where(valid, values, 0.0) * counts) / total
+
+
+def scaled_entropy_sample(moments: Array, key: Key) -> tuple[Array, Array]:
+    """An action [act_dim] of the policy, with gradients, and its scaled entropy [].
+
+    moments: [2, act_dim] pre-tanh mean and log-std. The scaled entropy is -act_dim times the Gaussian log-density
+    before the tanh: what the quotient of log-densities in the original comes to.
+    """
+    mean, log_std = moments
+    noise = jax.random.normal(key, mean.shape)
+    log_prob = jnp.sum(-0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi))
+    return jnp.tanh(mean + jnp.exp(log_std) * noise), -mean.shape[0] * log_prob
+
+
+def _window_losses(
+    nets: Networks, params: dict[str, PyTree], rows: Batch, ahead: Array, q_target: Array, dropout: Key
+) -> tuple[dict[str, Array], Array]:
+    """Losses [H] of one window, by the name of their weight, and its rolled-out latents [H + 1, latent].
+
+    rows: [H, ...]; ahead: [H, latent] encoded successors; q_target: [H]; dropout: [H] keys.
+    """
+
+    def advance(z: Array, action: Array) -> tuple[Array, Array]:
+        z = nets.dynamics.apply(params["dynamics"], z, action)
+        return z, z
+
+    def classify(logits: Array, x: Array) -> Array:
+        return twohot.cross_entropy(logits, x, nets.config.bins)
+
+    def value(z: Array, action: Array, target: Array, key: Key) -> Array:
+        keys = jax.random.split(key, nets.config.size.members)
+        logits = nets.critic.apply(params["critic"], z, action, keys=keys)
+        return jnp.mean(jax.vmap(classify, (0, None))(logits, target))
+
+    first = nets.encoder.apply(params["encoder"], rows.obs[0])
+    rolled = jax.lax.scan(advance, first, rows.action)[1]
+    zs = jnp.concatenate([first[None], rolled])
+    logits = jax.vmap(nets.reward.apply, (None, 0, 0))(params["reward"], zs[:-1], rows.action)
+    losses = {"consistency": jnp.mean((rolled - ahead) ** 2, axis=1), "reward": jax.vmap(classify)(logits, rows.reward)}
+    if not nets.config.sgft:
+        losses["value"] = jax.vmap(value)(zs[:-1], rows.action, q_target, dropout)
+    return losses, zs
+
+
+def _promise(nets: Networks, state: TDMPC2State, z: Array, action: Array, heads: Array, dropout: Key) -> Array:
+    """What the policy maximises []: Q by two random heads, or one step of the model to V_sim."""
+    if not nets.config.sgft:
+        keys = jax.random.split(dropout, nets.config.size.members)[heads]
+        return jnp.mean(model.q_values(nets, model.heads_of(state.critic.params, heads), z, action, keys))
+    ahead = nets.dynamics.apply(state.dynamics.params, z, action)
+    return model.reward_of(nets, state, z, action) + state.hyper.gamma * model.v_sim(nets, state, ahead)
+
+
 # --- the learner ------------------------------------------------------------------------------------------------------
 
 
@@ -33,7 +100,7 @@ def init(config: TDMPC2Config, key: Key, hyper: TDMPC2Hyper | None = None) -> TD
     params = {name: getattr(nets, name).init(keys[name]) for name in NETWORKS}
     statistics = normalizer.identity(config.obs_dim)
     prior = TDMPC2Params(**params, normalizer=statistics, scale=jnp.float32(1))
-    return _assemble(nets, hyper or TDMPC2Hyper(), prior)
+    return _assemble(nets, hyper, prior)
 
 
 def init_carry(config: TDMPC2Config) -> Array:
@@ -81,7 +148,7 @@ def make_tdmpc2(config: TDMPC2Config, hyper: TDMPC2Hyper | None = None) -> Learn
     return Learner(start, first, partial(act, config), partial(update, config))
 
 
-# --- acting ---------------------------------------------------------------------------------------------------------
+# --- acting -----------------------------------------------------------------------------------------------------------
 
 
 def policy_action(config: TDMPC2Config, state: TDMPC2State, obs: Array, key: Key, *, explore: bool | Array) -> Array:
@@ -134,11 +201,6 @@ def _score(nets: Networks, state: TDMPC2State, z: Array, key: Key) -> Callable[[
 # --- one update -------------------------------------------------------------------------------------------------------
 
 
-def _rate(state: TDMPC2State) -> Array:
-    """The learning rate [] of this update."""
-    return state.hyper.lr * optim.warmup_factor(state.step, state.hyper.lr_warmup)
-
-
 def _update_model(
     nets: Networks, state: TDMPC2State, batch: Batch, valid: Array, key: Key
 ) -> tuple[TDMPC2State, Array, Metrics]:
@@ -174,55 +236,6 @@ def _update_model(
     return state.replace(**fits), zs, metrics
 
 
-def _window_losses(
-    nets: Networks, params: dict[str, PyTree], rows: Batch, ahead: Array, q_target: Array, dropout: Key
-) -> tuple[dict[str, Array], Array]:
-    """Losses [H] of one window, by the name of their weight, and its rolled-out latents [H + 1, latent].
-
-    rows: [H, ...]; ahead: [H, latent] encoded successors; q_target: [H]; dropout: [H] keys.
-    """
-
-    def advance(z: Array, action: Array) -> tuple[Array, Array]:
-        z = nets.dynamics.apply(params["dynamics"], z, action)
-        return z, z
-
-    def classify(logits: Array, x: Array) -> Array:
-        return twohot.cross_entropy(logits, x, nets.config.bins)
-
-    def value(z: Array, action: Array, target: Array, key: Key) -> Array:
-        keys = jax.random.split(key, nets.config.size.members)
-        logits = nets.critic.apply(params["critic"], z, action, keys=keys)
-        return jnp.mean(jax.vmap(classify, (0, None))(logits, target))
-
-    first = nets.encoder.apply(params["encoder"], rows.obs[0])
-    rolled = jax.lax.scan(advance, first, rows.action)[1]
-    zs = jnp.concatenate([first[None], rolled])
-    logits = jax.vmap(nets.reward.apply, (None, 0, 0))(params["reward"], zs[:-1], rows.action)
-    losses = {"consistency": jnp.mean((rolled - ahead) ** 2, axis=1), "reward": jax.vmap(classify)(logits, rows.reward)}
-    if not nets.config.sgft:
-        losses["value"] = jax.vmap(value)(zs[:-1], rows.action, q_target, dropout)
-    return losses, zs
-
-
-def discounted_mean(values: Array, valid: Array, rho: Array | float, weight: Array | None = None) -> Array:
-    """Mean [] over the valid of values [B, T], step t weighing rho^t; with all valid, 1/T sum_t rho^t mean_B.
-
-    weight: [B] how much each row counts, mean 1.
-    """
-    decay = rho ** jnp.arange(values.shape[1])
-    counts = valid * decay[None]
-    total = jnp.maximum(jnp.sum(counts), 1e-6)
-    counts = counts if weight is None else counts * weight[:, None]
-    return jnp.mean(decay) * jnp.sum(jnp.where(valid, values, 0.0) * counts) / total
-
-
-def clip_by_norm(grads: PyTree, limit: Array | float) -> tuple[PyTree, Array]:
-    """The gradients, scaled down to a global norm of at most `limit` [], and the norm [] they had."""
-    norm = optax.tree.norm(grads)
-    factor = jnp.minimum(1.0, limit / (norm + 1e-6))
-    return jax.tree.map(lambda g: g * factor, grads), norm
-
-
 def _update_policy(
     nets: Networks, state: TDMPC2State, zs: Array, valid: Array, weight: Array | None, key: Key
 ) -> tuple[TDMPC2State, Metrics]:
@@ -256,28 +269,22 @@ def _update_policy(
     return state.replace(policy=fit, scale=scale), metrics
 
 
-def _promise(nets: Networks, state: TDMPC2State, z: Array, action: Array, heads: Array, dropout: Key) -> Array:
-    """What the policy maximises []: Q by two random heads, or one step of the model to V_sim."""
-    if not nets.config.sgft:
-        keys = jax.random.split(dropout, nets.config.size.members)[heads]
-        return jnp.mean(model.q_values(nets, model.heads_of(state.critic.params, heads), z, action, keys))
-    ahead = nets.dynamics.apply(state.dynamics.params, z, action)
-    return model.reward_of(nets, state, z, action) + state.hyper.gamma * model.v_sim(nets, state, ahead)
+def clip_by_norm(grads: PyTree, limit: Array | float) -> tuple[PyTree, Array]:
+    """The gradients, scaled down to a global norm of at most `limit` [], and the norm [] they had."""
+    norm = optax.tree.norm(grads)
+    factor = jnp.minimum(1.0, limit / (norm + 1e-6))
+    return jax.tree.map(lambda g: g * factor, grads), norm
 
 
-def scaled_entropy_sample(moments: Array, key: Key) -> tuple[Array, Array]:
-    """An action [act_dim] of the policy, with gradients, and its scaled entropy [].
-
-    moments: [2, act_dim] pre-tanh mean and log-std. The scaled entropy is -act_dim times the Gaussian log-density
-    before the tanh: what the quotient of log-densities in the original comes to.
-    """
-    mean, log_std = moments
-    noise = jax.random.normal(key, mean.shape)
-    log_prob = jnp.sum(-0.5 * noise**2 - log_std - 0.5 * jnp.log(2 * jnp.pi))
-    return jnp.tanh(mean + jnp.exp(log_std) * noise), -mean.shape[0] * log_prob
+def _rate(state: TDMPC2State) -> Array:
+    """The learning rate [] of this update."""
+    return state.hyper.lr * optim.warmup_factor(state.step, state.hyper.lr_warmup)
 
 
-def _assemble(nets: Networks, hyper: TDMPC2Hyper, prior: TDMPC2Params) -> TDMPC2State:
+# --- between simulation and reality -----------------------------------------------------------------------------------
+
+
+def _assemble(nets: Networks, hyper: TDMPC2Hyper | None, prior: TDMPC2Params) -> TDMPC2State:
     """Fresh moments around given parameters."""
 
     def start(name: str) -> optim.Fit:
@@ -292,9 +299,6 @@ def _assemble(nets: Networks, hyper: TDMPC2Hyper, prior: TDMPC2Params) -> TDMPC2
         hyper=optim.as_leaves(TDMPC2Hyper, hyper),
         step=jnp.int32(0),
     )
-
-
-# --- between simulation and reality ---------------------------------------------------------------------------------
 
 
 def extract_params(state: TDMPC2State) -> TDMPC2Params:

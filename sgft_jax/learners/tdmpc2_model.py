@@ -19,7 +19,7 @@ from sgft_jax import checks, planning
 from sgft_jax.math import optim
 from sgft_jax.models import normalizer, twohot
 from sgft_jax.models.config import SIZES, Size
-from sgft_jax.models.networks import Network, precision, tanh_gaussian_action
+from sgft_jax.models.networks import Network, ensemble, precision, tanh_gaussian_action
 from sgft_jax.types import Normalizer
 
 LOG_STD_MIN, LOG_STD_MAX = -10.0, 2.0
@@ -225,6 +225,7 @@ def make_networks(config: TDMPC2Config) -> Networks:
     size, act_dim, group, bins = config.size, config.act_dim, config.simnorm_group, config.bins.count
     hidden = (size.mlp, size.mlp)
     policy = _network(_Body(hidden, 2 * act_dim), size.latent)
+    head = _Body(hidden, bins, dropout=config.dropout, zero=True)  # of the critic
 
     def moments(params: PyTree, z: Array) -> Array:
         mean, x = jnp.split(policy.apply(params, z), 2)
@@ -236,9 +237,7 @@ def make_networks(config: TDMPC2Config) -> Networks:
         dynamics=_network(_Body(hidden, size.latent, group), size.latent + act_dim),
         reward=_network(_Body(hidden, bins, zero=True), size.latent + act_dim),
         policy=Network(policy.init, moments),
-        critic=_ensemble(
-            _network(_Body(hidden, bins, dropout=config.dropout, zero=True), size.latent + act_dim), size.members
-        ),
+        critic=ensemble(_network(head, size.latent + act_dim), size.members),
         adam=optax.scale_by_adam(),
         policy_adam=optax.scale_by_adam(eps=1e-5),
     )
@@ -251,16 +250,6 @@ def _network(body: _Body, inputs: int) -> Network:
     def apply(params: PyTree, *parts: Array, key: Key | None = None) -> Array:
         rngs = None if key is None else {"dropout": key}
         return cast(Array, body.apply({"params": params}, *parts, train=key is not None, rngs=rngs))
-
-    return Network(init, apply)
-
-
-def _ensemble(member: Network, members: int) -> Network:
-    def init(key: Key) -> PyTree:
-        return jax.vmap(member.init)(jax.random.split(key, members))
-
-    def apply(params: PyTree, *parts: Array, keys: Key | None = None) -> Array:
-        return jax.vmap(lambda p, k: member.apply(p, *parts, key=k))(params, keys)
 
     return Network(init, apply)
 

@@ -75,14 +75,19 @@ def make_mlp(
     return Network(init, apply)
 
 
-def _ensemble(member: Network, members: int) -> Network:
-    """Stack `members` parameter sets on a leading axis; apply sends one input through all of them."""
+def ensemble(member: Network, members: int) -> Network:
+    """Stack `members` parameter sets on a leading axis; apply sends one input through all of them.
+
+    keys: one for each member of a network that draws, else None.
+    """
 
     def init(key: Key) -> PyTree:
         return jax.vmap(member.init)(jax.random.split(key, members))
 
-    def apply(params: PyTree, *parts: Array) -> Array:
-        return jax.vmap(lambda p: member.apply(p, *parts))(params)
+    def apply(params: PyTree, *parts: Array, keys: Key | None = None) -> Array:
+        if keys is None:
+            return jax.vmap(lambda p: member.apply(p, *parts))(params)
+        return jax.vmap(lambda p, key: member.apply(p, *parts, key=key))(params, keys)
 
     return Network(init, apply)
 
@@ -127,7 +132,7 @@ def make_critic(
 ) -> Network:
     """apply(params, obs [obs_dim], action [act_dim]) -> [members] values. output_gain: of `MLP`."""
     member = make_mlp(obs_dim + act_dim, 1, config, layer_norm=config.layer_norm, output_gain=output_gain)
-    body = _ensemble(member, members)
+    body = ensemble(member, members)
     return Network(body.init, lambda params, obs, action: body.apply(params, obs, action)[:, 0])
 
 
@@ -142,7 +147,7 @@ def make_dynamics(obs_dim: int, act_dim: int, config: NetworkConfig, *, members:
 
     The number of members applied is the leading axis of `params`, so any slice of the ensemble is one too.
     """
-    return _ensemble(make_mlp(obs_dim + act_dim, obs_dim, config, layer_norm=False), members)
+    return ensemble(make_mlp(obs_dim + act_dim, obs_dim, config, layer_norm=False), members)
 
 
 def tanh_gaussian_sample(moments: Array, key: Key) -> tuple[Array, Array]:
@@ -186,19 +191,14 @@ def tanh_gaussian_divergence(moments: Array, others: Array) -> Array:
     return jnp.sum(other_log_std - log_std + 0.5 * (scaled - 1.0))
 
 
-def tanh_gaussian_mode(moments: Array) -> Array:
-    """The action of evaluations, tanh(mean) [act_dim]."""
-    return jnp.tanh(moments[0])
-
-
 def add_noise(action: Array, std: Array | float, key: Key) -> Array:
     """An action [act_dim] in [-1, 1] with Gaussian noise, cut off at the bounds. std: [] or [act_dim]."""
     return jnp.clip(action + std * jax.random.normal(key, action.shape), -1.0, 1.0)
 
 
 def tanh_gaussian_action(moments: Array, key: Key, *, explore: bool | Array) -> Array:
-    """[act_dim]: a draw to explore, else the mode. `explore` may be traced."""
-    return jnp.where(explore, tanh_gaussian_sample(moments, key)[0], tanh_gaussian_mode(moments))
+    """[act_dim]: a draw to explore, else tanh(mean). `explore` may be traced."""
+    return jnp.where(explore, tanh_gaussian_sample(moments, key)[0], jnp.tanh(moments[0]))
 
 
 def pad_first_layer(params: PyTree, obs_dim: int, extra: int) -> PyTree:

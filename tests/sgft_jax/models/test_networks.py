@@ -42,7 +42,7 @@ def test_divergence_by_hand():
 
 def test_sample_and_mode(key):
     moments = jnp.array([[0.5, -0.5], [-5.0, -5.0]])
-    assert jnp.allclose(networks.tanh_gaussian_mode(moments), jnp.tanh(moments[0]))
+    assert jnp.allclose(networks.tanh_gaussian_action(moments, key, explore=False), jnp.tanh(moments[0]))
     draws, log_probs = jax.vmap(networks.tanh_gaussian_sample, (None, 0))(moments, jax.random.split(key, 500))
     # std exp(-5) = 0.0067 before the squashing: samples sit close to the mode
     assert jnp.allclose(jnp.mean(draws, 0), jnp.tanh(moments[0]), atol=2e-3) and log_probs.shape == (500,)
