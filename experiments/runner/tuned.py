@@ -21,11 +21,7 @@ class _Budget(TypedDict):
 
 def path_of(out: Path, task: str, method: str) -> Path:
     """<out>/tuned/<task>/<method>.json, described in docs/formats.md."""
-    return _home(out, task) / f"{get_method(method).name}.json"
-
-
-def _home(out: Path, task: str) -> Path:
-    return out / VARIANT / extend.name_of(task)
+    return out / VARIANT / extend.name_of(task) / f"{get_method(method).name}.json"
 
 
 def write(out: Path, task: str, method: str, result: Mapping[str, Any]) -> Path:
@@ -51,7 +47,7 @@ def read(out: Path, task: str, method: str) -> dict[str, Any]:
 
 def _require(out: Path, task: str, methods: Iterable[str]) -> None:
     if absent := [method for method in methods if not path_of(out, task, method).exists()]:
-        folder, again = _home(out, task), _command(task, absent)
+        folder, again = path_of(out, task, absent[0]).parent, _command(task, absent)
         raise UserError(f"--tuned: {folder} holds no options for {', '.join(absent)}; choose them with: {again}")
 
 

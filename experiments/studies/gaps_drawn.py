@@ -244,21 +244,17 @@ def _plan(env: Env, drawn: Sequence[Gap], priors: list[Prior], episodes: int) ->
     policy = method.build(method.config(), priors[0], env).policy
     system, members = systems(env, drawn, priors, episodes)
     played = play(system, policy, members, episode_key(FINAL_SEED), episodes)
-    return _by_name("plan", drawn, _rates(played, len(drawn), len(priors)))
+    rates = _rates(played, len(drawn), len(priors))
+    return {gap.name: {"plan": success} for gap, success in zip(drawn, rates, strict=True)}
 
 
 def _judge(env: Env, args: "DrawArgs", drawn: Sequence[Gap], seeds: list[int], folder: Path) -> Lines:
     """Success of policies that were trained on the gaps themselves and see their previous actions."""
     seen = env if env.previous_actions else with_previous_actions(env, PREVIOUS_ACTIONS)
     played = train(env, args.config, drawn, seeds, folder, episodes=args.episodes, seen=seen)
-    return _by_name("judge", drawn, [rate(episodes, stats.mean) for episodes in played])
+    return {gap.name: {"judge": rate(episodes, stats.mean)} for gap, episodes in zip(drawn, played, strict=True)}
 
 
 def _rates(played: Episode, systems: int, policies: int) -> list[dict[str, Any]]:
     """Mean success over policies on each system, of episodes [systems * policies, n]."""
     return [rate(stacking.part(played, i, policies), stats.mean) for i in range(systems)]
-
-
-def _by_name(what: str, drawn: Sequence[Gap], rates: Sequence[dict[str, Any]]) -> Lines:
-    """Of each gap what was measured there."""
-    return {gap.name: {what: success} for gap, success in zip(drawn, rates, strict=True)}
