@@ -21,6 +21,7 @@ from envs.gaps import SIM
 from envs.mujoco.worlds import Impl
 from envs.rollout import Episode
 from envs.types import Key, PyTree
+from experiments.bench.timing import fastest_in_turns
 from experiments.finetune import finetune
 from experiments.pretrain import PretrainArgs, pretrain
 from experiments.runner.finetune_args import arguments, run_folder
@@ -106,17 +107,15 @@ def through_system(task: str, impl: Impl, seeds: int, *, prior: Path, repeats: i
     progress, _ = next(through)
     agent = jax.tree.map(lambda x: x.copy(), progress.agent)
     fused = jax.jit(_fused(setup), donate_argnums=0)
-    through_s, fused_s = [], []
-    for i in range(repeats + 1):  # the first one compiles
-        start = time.perf_counter()
-        jax.block_until_ready(next(through))
-        middle = time.perf_counter()
-        agent, _, _ = jax.block_until_ready(fused(agent, jax.random.key(i)))
-        through_s.append(middle - start)
-        fused_s.append(time.perf_counter() - middle)
+
+    def in_one_program() -> None:
+        nonlocal agent
+        agent, _, _ = jax.block_until_ready(fused(agent, jax.random.key(0)))
+
+    calls = (lambda: jax.block_until_ready(next(through)), in_one_program)
+    system_s, fused_s = fastest_in_turns(calls, repeats=repeats)
     line = {"task": task, "impl": env.impl, "seeds": seeds}
-    fastest = {"system_s": min(through_s[1:]), "fused_s": min(fused_s[1:])}
-    return line | fastest | {"fused/system": fastest["fused_s"] / fastest["system_s"]}
+    return line | {"system_s": system_s, "fused_s": fused_s, "fused/system": fused_s / system_s}
 
 
 def _fused(setup: api.Setup) -> Any:

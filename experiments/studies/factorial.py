@@ -72,16 +72,18 @@ def main(args: FactorialArgs) -> None:
     if args.data:
         print(report(args, released(args, args.data, places)))
         return
-    cells = {(place, levels): cell for place in places for levels, cell in cells_of(args, *place).items()}
-    check_begun(cells.values())  # the same folders with other options or priors
-    work(list(cells.values()), args, lambda now: print(_conclusion(args, dict(zip(cells, now, strict=True)))))
+    cells = {place: cells_of(args, *place) for place in places}
+    every = [cell for by_levels in cells.values() for cell in by_levels.values()]
 
+    def conclude(now: Sequence[Cell]) -> None:
+        if unfinished := sum(cell.state != "finished" for cell in now):
+            print(f"{unfinished} cells are not finished; the same command goes on")
+        else:
+            curves = {place: {k: read_curve(cell.folder) for k, cell in of.items()} for place, of in cells.items()}
+            print(report(args, curves))
 
-def _conclusion(args: FactorialArgs, cells: dict[tuple[Place, Levels], Cell]) -> str:
-    """The report, or how many cells it waits for."""
-    if unfinished := sum(cell.state != "finished" for cell in cells.values()):
-        return f"{unfinished} cells are not finished; the same command goes on"
-    return report(args, _by_place({place: read_curve(cell.folder) for place, cell in cells.items()}))
+    check_begun(every)  # the same folders with other options or priors
+    work(every, args, conclude)
 
 
 def check(args: FactorialArgs) -> None:
@@ -90,8 +92,7 @@ def check(args: FactorialArgs) -> None:
         raise UserError(f"--methods: the cells are all of {METHOD}")
     if args.horizon < 2:
         raise UserError(f"--horizon is {args.horizon}: must be at least 2, to differ from 1")
-    options = {"horizon": args.horizon, "anchor": args.anchor, "identify": args.identify, "guard": args.guard}
-    get_method(METHOD).config(**options)
+    get_method(METHOD).config(**settings(args, (True,) * len(factors(args))))
     grid.check(replace(args, reals=(gaps.SIM,)))  # all but the real systems, which may differ between tasks
     for task in args.tasks:
         if args.prior is not None and args.data is None:
@@ -146,28 +147,19 @@ def cells_of(args: FactorialArgs, task: str, real: str) -> dict[Levels, Cell]:
 
 def released(args: FactorialArgs, folder: Path, places: Sequence[Place]) -> Curves:
     """The curves of every cell in tables that `experiments.figures --export` wrote; UserError where one is missing."""
-    names = {
-        (place, levels): (place[0], gaps.title(place[1]), variant)
-        for place, (levels, variant) in itertools.product(places, variants(args).items())
-    }
+    names = {place: {k: (place[0], gaps.title(place[1]), v) for k, v in variants(args).items()} for place in places}
+    wanted = [name for by_levels in names.values() for name in by_levels.values()]
     runs: dict[tuple[str, ...], Curve] = {}
     for curve in read_data(folder).curves:
         name = (curve.task, curve.gap, curve.variant)
-        if curve.method == METHOD and name in names.values():
+        if curve.method == METHOD and name in wanted:
             if name in runs:
                 raise UserError(f"{folder}: {METHOD} {' '.join(name)} ran with several sets of priors; keep one")
             runs[name] = curve
-    if missing := [name for name in names.values() if name not in runs]:
+    if missing := [name for name in wanted if name not in runs]:
         task, gap, variant = missing[0]
         raise UserError(f"{folder}: has no run of {METHOD} on {task}, {gap}, variant {variant}")
-    return _by_place({cell: runs[name] for cell, name in names.items()})
-
-
-def _by_place(curves: Mapping[tuple[Place, Levels], Curve]) -> Curves:
-    places: Curves = {}
-    for (place, levels), curve in curves.items():
-        places.setdefault(place, {})[levels] = curve
-    return places
+    return {place: {levels: runs[name] for levels, name in by_levels.items()} for place, by_levels in names.items()}
 
 
 def report(args: FactorialArgs, curves: Curves) -> str:
@@ -202,11 +194,11 @@ def _cells(args: FactorialArgs, curves: dict[Levels, Curve]) -> str:
     rows = []
     for levels, variant in variants(args).items():
         curve, neither = curves[levels], curves[(False, False, *levels[2:])]
-        area, score = measures(curve)["area"], curve.score
-        more = spread(curve, area - measures(neither)["area"], mean)
+        areas, score = measures(curve)["area"], curve.score
+        more = spread(curve, areas - measures(neither)["area"], mean)
         means = " ".join(tables.plain(value, score) for value in curve.values.mean(axis=0))
         fall = tables.plain(deepest_fall(curve), score)
-        rows.append([variant, means, tables.plain(area.mean(), score), fall, tables.number(more, score)])
+        rows.append([variant, means, tables.plain(areas.mean(), score), fall, tables.number(more, score)])
     rollouts = ", ".join(str(n) for n in curves[levels].x)
     head = ("cell", f"mean after {rollouts} rollouts", "area", "fall of the mean", "area more than with neither")
     return tables.markdown(head, rows)

@@ -6,7 +6,7 @@ Okabe-Ito palette (safe for colour-blind readers).
 
 import math
 import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,9 @@ from sgft_jax.math.stats import ENOUGH, Interval, iqm
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MOST = len(PALETTE)
+
+type Points = Mapping[str, tuple[np.ndarray, np.ndarray]]  # [n] V_sim and [n] returns, by where they are from
+
 _INK, _GREY, _FAINT = "#333333", "#777777", "#B0B0B0"
 _FONT = {"size": 10, "color": _INK}
 
@@ -52,20 +55,20 @@ def learning_curves(path: Path, panels: Mapping[str, Sequence[Curve]], *, title:
     parts = [(entry, *part) for entry, curves in panels.items() if curves for part in _split(entry, curves)]
     columns = min(len(parts), 2)
     figure, grid = _figure(5.6 * columns, 3.1 * math.ceil(len(parts) / columns) + 0.4, columns, len(parts))
-    colours = _colours(curve.name for _, _, curves, _ in parts for curve in curves)
+    drawn = [curve for _, _, curves, _ in parts for curve in curves]
+    place = {name: i for i, name in enumerate(dict.fromkeys(curve.name for curve in drawn))}
     first: dict[str, Axes] = {}  # of the panels of an entry, which have one y axis
     for axes, (entry, words, curves, others) in zip(grid, parts, strict=True):
         if first.setdefault(entry, axes) is not axes:
             axes.sharey(first[entry])
         for curve in others:
             axes.plot(curve.x, iqm(curve.values), color=_FAINT, linewidth=0.8, zorder=1)
-        for curve, colour in zip(curves, colours(curves), strict=True):
+        for curve, colour in zip(curves, _colours(curves, place), strict=True):
             _draw_curve(axes, curve, colour)
         _dress(axes, words, [*curves, *others])
         axes.set_xlabel(_unit(panels[entry]), **{**_FONT, "size": 9})
-    _head(figure, title)
-    figure.supxlabel(_note([curve for _, _, curves, _ in parts for curve in curves]), size=8, color=_GREY)
-    return _save(figure, path)
+    figure.supxlabel(_note(drawn), size=8, color=_GREY)
+    return _save(figure, path, title)
 
 
 def _unit(curves: Sequence[Curve]) -> str:
@@ -95,19 +98,14 @@ def _split(words: str, curves: Sequence[Curve]) -> list[tuple[str, Sequence[Curv
     ]
 
 
-def _colours(names: Iterable[str]) -> Callable[[Sequence[Curve]], list[str]]:
-    """(curves) -> a colour for each, all distinct; a name keeps its colour from panel to panel where it can."""
-    place = {name: i for i, name in enumerate(dict.fromkeys(names))}
-
-    def of(curves: Sequence[Curve]) -> list[str]:
-        free, chosen = list(PALETTE), []
-        for curve in curves:
-            wanted = PALETTE[place[curve.name] % len(PALETTE)]
-            chosen.append(wanted if wanted in free else free[0])
-            free.remove(chosen[-1])
-        return chosen
-
-    return of
+def _colours(curves: Sequence[Curve], place: Mapping[str, int]) -> list[str]:
+    """A colour for each, all distinct; a name keeps its colour from panel to panel where it can."""
+    free, chosen = list(PALETTE), []
+    for curve in curves:
+        wanted = PALETTE[place[curve.name] % len(PALETTE)]
+        chosen.append(wanted if wanted in free else free[0])
+        free.remove(chosen[-1])
+    return chosen
 
 
 def _draw_curve(axes: Axes, curve: Curve, colour: str) -> None:
@@ -175,22 +173,13 @@ def pretraining(
         axes.annotate("if nothing moved", (len(model), float(still[-1])), (-14, 0), **look)
         axes.set_ylim(bottom=0)
         _name(axes, "model error, standard deviations", "steps ahead")
-    _head(figure, title)
-    return _save(figure, path)
+    return _save(figure, path, title)
 
 
-def diagnosis(
-    path: Path,
-    diagnosis: Mapping[str, Any],
-    signs: Sequence[Sign],
-    points: Mapping[str, tuple[np.ndarray, np.ndarray]],
-    *,
-    title: str,
-) -> Path:
+def diagnosis(path: Path, diagnosis: Mapping[str, Any], signs: Sequence[Sign], points: Points, *, title: str) -> Path:
     """Panels: improvable states by horizon, V_sim against what happened, model error by horizon, signs of the gap.
 
-    diagnosis: see `examination.describe`. signs: see `verdict.signs`. points: ([n] V_sim, [n] returns) by "real" and
-    "simulated".
+    diagnosis: see `examination.describe`. signs: see `verdict.signs`. points: by "real" and "simulated".
     """
     figure, (states, promise, model, kinds) = _figure(10.4, 6.6, 2, 4)
     horizons = diagnosis["horizons"]
@@ -198,19 +187,17 @@ def diagnosis(
         for name, dash in (("improvable", "-"), ("improving", ":")):
             shares = [by_name[name] for by_name in diagnosis["value"][where]]
             states.plot(horizons, shares, dash, color=colour, linewidth=2, label=f"{name}, {where}", clip_on=False)
-    states.set_ylim(-0.03, 1.03)
-    _name(states, "states where the best action keeps / exceeds V_sim", "steps ahead")
-    for where, colour in (("simulated", _FAINT), ("real", PALETTE[0])):
         value, returns = points[where]
         promise.scatter(returns, value, s=6, color=colour, alpha=0.6, linewidths=0, label=where)
+    states.set_ylim(-0.03, 1.03)
+    _name(states, "states where the best action keeps / exceeds V_sim", "steps ahead")
     both = np.concatenate([x for pair in points.values() for x in pair])
     promise.plot(*[(both.min(), both.max())] * 2, color=_GREY, linewidth=1, zorder=0)
     _name(promise, "V_sim against discounted return", "return that followed")
     colours = {"simulated": _FAINT, "real": PALETTE[1], "identified": PALETTE[0]}
-    words = {"simulated": "simulated", "real": "real", "identified": "real, identified"}
     for where, colour in colours.items():
-        error = diagnosis["model_error"][where]
-        model.plot(horizons, error, color=colour, linewidth=2, marker="o", markersize=3, label=words[where])
+        look = {"color": colour, "label": "real, identified" if where == "identified" else where}
+        model.plot(horizons, diagnosis["model_error"][where], linewidth=2, marker="o", markersize=3, **look)
     model.set_ylim(bottom=0)
     _name(model, "model error, standard deviations", "steps ahead")
     for axes in (states, model):
@@ -224,8 +211,7 @@ def diagnosis(
     kinds.set_xlim(0, 3)
     kinds.axvline(1.0, color=_GREY, linewidth=1)
     _name(kinds, "signs of the gap; one counts from 1 on")
-    _head(figure, title)
-    return _save(figure, path)
+    return _save(figure, path, title)
 
 
 def rollouts(path: Path, panels: Sequence[Panel], episodes: Mapping[str, float], *, title: str) -> Path:
@@ -254,8 +240,7 @@ def rollouts(path: Path, panels: Sequence[Panel], episodes: Mapping[str, float],
         middle = (begin + end) / 2, 1.2
         drawn[0].text(*middle, words, transform=drawn[0].get_xaxis_transform(), ha="center", size=9, color=_GREY)
     drawn[-1].set_xlabel("seconds", **_FONT)
-    _head(figure, title)
-    return _save(figure, path)
+    return _save(figure, path, title)
 
 
 def effects(path: Path, intervals: Mapping[str, Mapping[str, Mapping[str, Interval]]], *, label: str) -> Path:
@@ -278,8 +263,7 @@ def effects(path: Path, intervals: Mapping[str, Mapping[str, Mapping[str, Interv
         axes.axvline(0.0, color=_GREY, linewidth=1)
         _name(axes, place, label)
     panels[0].legend(frameon=False, fontsize=8, labelcolor=_INK)
-    _head(figure, "effect of each part, mean over all others")
-    return _save(figure, path)
+    return _save(figure, path, "effect of each part, mean over all others")
 
 
 def _name(axes: Axes, title: str, x: str = "") -> None:
@@ -288,20 +272,13 @@ def _name(axes: Axes, title: str, x: str = "") -> None:
     axes.set_xlabel(x, **_FONT)
 
 
-def _head(figure: Figure, title: str) -> None:
-    """The title of a whole figure, in as many lines as its width needs."""
-    letters = int(9 * figure.get_figwidth())  # of this size that fit, nine an inch
-    figure.suptitle(textwrap.fill(title, letters), x=0.01, ha="left", size=12, weight="bold", color=_INK)
-
-
 def _value_panel(axes: Axes, value: np.ndarray, monte_carlo: np.ndarray) -> None:
     both = np.concatenate([value, monte_carlo])
     margin = 0.05 * (np.ptp(both) or 1.0)
     limits = (both.min() - margin, both.max() + margin)
     axes.plot(limits, limits, color=_FAINT, linewidth=1, zorder=0)
     axes.scatter(monte_carlo, value, s=6, color=PALETTE[0], alpha=min(1.0, 60 / len(value) ** 0.75), linewidths=0)
-    axes.set_xlim(*limits)
-    axes.set_ylim(*limits)
+    axes.set(xlim=limits, ylim=limits)
     _name(axes, "V_sim against discounted return", "return that followed")
     bias, error = float((value - monte_carlo).mean()), float(np.sqrt(((value - monte_carlo) ** 2).mean()))
     axes.text(0.04, 0.95, f"bias {bias:+.2g}\nRMSE {error:.2g}", transform=axes.transAxes, va="top", size=9, color=_INK)
@@ -325,7 +302,10 @@ def _figure(width: float, height: float, columns: int, count: int | None = None)
     return figure, panels
 
 
-def _save(figure: Figure, path: Path) -> Path:
+def _save(figure: Figure, path: Path, title: str) -> Path:
+    """With its title, in as many lines as the width needs."""
+    letters = int(9 * figure.get_figwidth())  # of this size that fit, nine an inch
+    figure.suptitle(textwrap.fill(title, letters), x=0.01, ha="left", size=12, weight="bold", color=_INK)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, facecolor="white")

@@ -9,7 +9,7 @@ import pytest
 
 from envs.types import UserError
 from experiments import compare
-from experiments.runner import cli, hybrid_args, hybrid_grid
+from experiments.runner import cli, hybrid_args
 from experiments.runner.hybrid_args import run_folder
 from sgft_jax.analysis import figures
 from sgft_jax.files.disk import jsonable
@@ -35,9 +35,9 @@ def ran(monkeypatch):
 
 def leave(args, scores):
     """What a run leaves; without scores, one that was killed."""
-    folder = hybrid_grid.HYBRID.folder(args)
+    folder = compare.HYBRID_RUNS.folder(args)
     folder.mkdir(parents=True, exist_ok=True)
-    config = {"config": dict(hybrid_grid.HYBRID.config(args)), "kind": "hybrid", "sgft_jax": "0", "format": FORMAT}
+    config = {"config": dict(compare.HYBRID_RUNS.config(args)), "kind": "hybrid", "sgft_jax": "0", "format": FORMAT}
     (folder / "config.json").write_text(json.dumps(jsonable(config)))
     if scores:
         summary = {"task": "halfcheetah", "score": "return", "seeds": [*range(args.seeds)], "late": scores}
@@ -53,7 +53,7 @@ def grid(tmp_path):
     data = tuple(tmp_path / f"{name}.hdf5" for name in ("medium", "replay"))
     for path in data:
         path.touch()
-    return hybrid_grid.HybridGridArgs(
+    return compare.HybridGridArgs(
         methods=METHODS, gaps=("gravity", "friction"), data=data, seeds=3, out=tmp_path / "runs"
     )
 
@@ -88,7 +88,7 @@ def test_each_method_runs_as_often_as_it_learns_from_other_things(grid, ran, cap
 
 
 def test_what_was_killed_goes_on_and_what_is_missing_follows(grid, ran):
-    first = hybrid_grid.cells_of(replace(grid, gaps=("gravity",)))[0]
+    first = compare.hybrid_cells(replace(grid, gaps=("gravity",)))[0]
     leave(first.args, None)
     compare.compare_hybrid(replace(grid, methods=("h2oplus",), data=grid.data[:1]))
     assert [(run.gap, run.resume) for run in ran] == [(("gravity",), True), (("friction",), False)]
@@ -120,7 +120,7 @@ def test_rebrac_takes_the_preset_of_each_data_set(grid, ran, tmp_path, capsys):
 def test_tables_and_curves_name_the_schedule_and_the_updates(grid, ran, monkeypatch, capsys):
     titles = []
     monkeypatch.setattr(figures, "learning_curves", lambda path, panels, *, title: titles.append(title))
-    chosen = hybrid_grid.defaults(["--schedule-preset", "released"])
+    chosen = compare.hybrid_defaults(["--schedule-preset", "released"])
     schedule = replace(chosen.schedule, updates=200_000)
     own = replace(grid, methods=("sac",), reference="sac", data=())
     own = replace(own, schedule_preset=chosen.schedule_preset, schedule=schedule)
@@ -160,7 +160,7 @@ def test_variants_of_gaps_run_where_they_are_named(grid, ran, capsys):
 
 
 def test_cells_have_their_folders(grid):
-    folder = run_folder(hybrid_grid.cells_of(replace(grid, methods=("sac",), data=()))[0].args, "gravity")
+    folder = run_folder(compare.hybrid_cells(replace(grid, methods=("sac",), data=()))[0].args, "gravity")
     assert folder.relative_to(grid.out) == Path("hybrid/halfcheetah/gravity/no-data/sac/seeds-0-2")
 
 
@@ -222,7 +222,7 @@ def test_a_released_table_says_what_the_runs_say(grid, ran, tmp_path, capsys):
 def test_the_last_and_the_mean_of_ten_evaluations_come_from_the_curve(grid, ran, tmp_path, capsys):
     own = replace(grid, methods=("sac",), reference="sac", data=(), gaps=("gravity",))
     compare.compare_hybrid(own)
-    (folder,) = (cell.folder for cell in hybrid_grid.cells_of(own))
+    (folder,) = (cell.folder for cell in compare.hybrid_cells(own))
     lines = [{"step": 10 * i, "score": [float(i)] * 3} for i in range(21)]
     (folder / "eval.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     compare.compare_hybrid(replace(own, export=tmp_path))
@@ -236,7 +236,7 @@ def standing(grid, ran):
     """A run that also says how long three robots stood, at two evaluations."""
     own = replace(grid, methods=("sac",), reference="sac", data=(), gaps=("gravity",))
     compare.compare_hybrid(own)
-    (folder,) = (cell.folder for cell in hybrid_grid.cells_of(own))
+    (folder,) = (cell.folder for cell in compare.hybrid_cells(own))
     seconds = {0: [1.0, 2.0, 3.0], 1000: [4.0, 6.0, 8.0]}
     lines = [{"step": n, "exploded": [0.0] * 3, "score": [10.0] * 3, "upright_s": x} for n, x in seconds.items()]
     (folder / "eval.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
@@ -279,7 +279,7 @@ def test_runs_of_two_lengths_are_compared_in_their_order(grid, ran, tmp_path, ca
     own = replace(grid, methods=("iql", "cql", "edac"), reference="iql", data=grid.data[:1], gaps=("gravity",))
     for updates, order in ((1000, (1.0, 2.0, 3.0)), (2000, (1.0, 3.0, 2.0))):
         run = replace(own, schedule=replace(own.schedule, updates=updates), out=tmp_path / str(updates))
-        for cell, score in zip(hybrid_grid.cells_of(run), order, strict=True):
+        for cell, score in zip(compare.hybrid_cells(run), order, strict=True):
             leave(cell.args, [score] * 3)
             (cell.folder / "eval.jsonl").write_text(json.dumps({"step": updates, "score": [score] * 3}) + "\n")
         compare.compare_hybrid(replace(run, export=tmp_path))

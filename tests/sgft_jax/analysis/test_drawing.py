@@ -63,7 +63,7 @@ def test_parts_of_a_panel_have_one_scale(tmp_path, monkeypatch):
     """Seven returns, one of which is far above the others; a panel of its own has its own."""
     seven = [curve([[10.0**i, 2.0 * 10**i]], (0, 1), method=f"m{i}", score="return") for i in range(7)]
     figures_made, save = [], figures._save
-    monkeypatch.setattr(figures, "_save", lambda figure, path: figures_made.append(figure) or save(figure, path))
+    monkeypatch.setattr(figures, "_save", lambda figure, *more: figures_made.append(figure) or save(figure, *more))
     figures.learning_curves(tmp_path / "s.png", {"many": seven, "one": seven[:1]}, title="")
     limits = [axes.get_ylim() for axes in figures_made[0].axes]
     assert limits[0] == limits[1] and limits[0][1] >= 2e6 and limits[2][1] < 3
@@ -71,9 +71,12 @@ def test_parts_of_a_panel_have_one_scale(tmp_path, monkeypatch):
 
 def test_colours_are_distinct_in_a_panel_and_stay_from_panel_to_panel():
     eight = curves(8)
-    colours = figures._colours(line.name for line in eight)
-    assert colours(eight[:3]) == list(figures.PALETTE[:3]) and colours(eight[1:2]) == [figures.PALETTE[1]]
-    assert len(set(colours([eight[0], eight[6], eight[7]]))) == 3  # the seventh would have the first one's
+    place = {line.name: i for i, line in enumerate(eight)}
+    assert figures._colours(eight[:3], place) == list(figures.PALETTE[:3])
+    assert figures._colours(eight[1:2], place) == [figures.PALETTE[1]]
+    assert (
+        len(set(figures._colours([eight[0], eight[6], eight[7]], place))) == 3
+    )  # the seventh would have the first one's
 
 
 def test_a_band_needs_three_seeds(tmp_path):
@@ -120,7 +123,7 @@ def test_curves_over_updates(tmp_path, monkeypatch):
     methods = [curve.spec for curve in curves[:3]]
     results = Results(("medium", "replay"), ("gravity", "friction"), methods, curves)
     figures_made, save = [], figures._save
-    monkeypatch.setattr(figures, "_save", lambda figure, path: figures_made.append(figure) or save(figure, path))
+    monkeypatch.setattr(figures, "_save", lambda figure, *more: figures_made.append(figure) or save(figure, *more))
     image = read(figures.learning_curves(tmp_path / "h.png", results.panels("medium"), title="Medium"))
     assert [pixels(image, color) > 200 for color in figures.PALETTE[:4]] == [True] * 3 + [False]
     panels = {axes.get_title(loc="left"): axes for axes in figures_made[0].axes}

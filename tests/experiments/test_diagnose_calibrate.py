@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from experiments.studies import calibration
-from experiments.studies.calibration import Cases
+from experiments.studies import diagnose_calibrate
+from experiments.studies.diagnose_calibrate import Cases
 from sgft_jax.analysis import verdict
 from sgft_jax.analysis.verdict import Coefficients, Inputs
 
@@ -50,26 +50,26 @@ def test_rollouts_until_success():
 
 
 def test_a_fit_finds_the_coefficients_and_never_a_negative_one():
-    assert calibration.fit(cases()) == pytest.approx(C, abs=1e-6)
+    assert diagnose_calibrate.fit(cases()) == pytest.approx(C, abs=1e-6)
     downwards = cases(coefficients=Coefficients(0.8, -0.6, 0.0, 4.0))
-    assert calibration.fit(downwards).improvable == 0.0
+    assert diagnose_calibrate.fit(downwards).improvable == 0.0
 
 
 def test_every_second_gap_is_held_out_whole_and_teaches_nothing():
     some = cases()
-    out = calibration.held_out(some.gaps)
+    out = diagnose_calibrate.held_out(some.gaps)
     assert set(some.gaps[out]) == {"gap1", "gap3", "gap5"} and set(some.gaps[~out]) == {"gap0", "gap2", "gap4"}
     odd = some._replace(gains=np.where(out, 0.0, some.gains))
-    assert calibration.fit(odd.of(~out)) == pytest.approx(C, abs=1e-6)
+    assert diagnose_calibrate.fit(odd.of(~out)) == pytest.approx(C, abs=1e-6)
 
 
 def test_agreement_and_table():
     some = cases(noise=0.02)
     predicted = verdict.gain(some.inputs, C)
-    band = calibration.agreement(predicted, some)
+    band = diagnose_calibrate.agreement(predicted, some)
     assert 0.9 < band.low < band.estimate < band.high <= 1.0
-    assert calibration.agreement(-predicted, some).estimate == -band.estimate
-    rows = calibration.table(predicted, some)
+    assert diagnose_calibrate.agreement(-predicted, some).estimate == -band.estimate
+    rows = diagnose_calibrate.table(predicted, some)
     assert sum(count for _, _, count, *_ in rows) == 60
     for low, high, _, expected, measured in rows:
         assert low <= expected <= high and measured == pytest.approx(expected, abs=0.03)
