@@ -85,17 +85,6 @@ def check(args: DrawArgs) -> tuple[list[int], list[Path]]:
     cli.choose("--judge-preset", args.judge_preset, PRESETS)
     at_least_one(args, "count")
     check_episodes(args)
-    _check_choice(args)
-    if args.distribution is not None:
-        read_toml(args.distribution)
-    check_folder(args.out / "gaps")
-    seeds = seed_list(args.seed, args.seeds)
-    check_task(args.task)
-    return seeds, folders_of_priors(args)
-
-
-def _check_choice(args: DrawArgs) -> None:
-    """Raises UserError for a frozen set of more gaps than are drawn, or one that cannot be written."""
     if not 0 <= args.choose <= args.count:
         raise UserError(f"--choose is {args.choose}: must be from 1 to the {args.count} of --count")
     if bool(args.choose) != bool(args.to):
@@ -104,6 +93,12 @@ def _check_choice(args: DrawArgs) -> None:
         raise UserError(f"--to {args.to}: must end in .toml")
     if args.to:
         check_folder(args.to.parent, "--to")
+    if args.distribution is not None:
+        read_toml(args.distribution)
+    check_folder(args.out / "gaps")
+    seeds = seed_list(args.seed, args.seeds)
+    check_task(args.task)
+    return seeds, folders_of_priors(args)
 
 
 # --- a frozen set -----------------------------------------------------------------------------------------------------
