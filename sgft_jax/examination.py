@@ -11,9 +11,8 @@ import numpy as np
 from envs.types import Array, Key, Transition
 from sgft_jax import diagnosis
 from sgft_jax.diagnosis import HORIZONS, Lateness, Rollouts
-from sgft_jax.identify import Identified, command_interface
 from sgft_jax.models.config import network_of
-from sgft_jax.models.distortion import Distortion, none, residuals, undone
+from sgft_jax.models.distortion import Distortion, Identified, command_interface, none, residuals, undone
 from sgft_jax.stacking import member
 from sgft_jax.types import SimulatedData, Task
 

@@ -57,7 +57,7 @@ ORDER = {
     ),
     "sgft_jax": (
         *("types", "keys", "checks", "stacking", "files", "math", "models", "data", "planning", "learners"),
-        *("identify", "policies", "diagnosis", "transforms", "algorithms", "presets", "io", "export"),
+        *("policies", "diagnosis", "transforms", "algorithms", "presets", "io", "export"),
         *("datasets", "systems", "train"),
         *("examination", "hybrid", "methods", "analysis", "api", ""),
     ),

@@ -22,12 +22,11 @@ from experiments.runner.training import play
 from sgft_jax import api, stacking
 from sgft_jax.algorithms import make_policy
 from sgft_jax.files.disk import differences, jsonable, write_json
-from sgft_jax.identify import Identified, Interface, command_interface
 from sgft_jax.io.priors import digest, load_priors, observed_by
 from sgft_jax.math import stats
 from sgft_jax.methods import get_method
 from sgft_jax.models.config import network_of
-from sgft_jax.models.distortion import Distortion, none
+from sgft_jax.models.distortion import Distortion, Identified, Interface, command_interface, none
 from sgft_jax.types import Prior, SimulatedData
 
 if TYPE_CHECKING:

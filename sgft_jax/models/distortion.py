@@ -1,4 +1,8 @@
-"""What a real system makes of commands and measurements, fitted to real steps through the simulator's model. Pure."""
+"""What a real system makes of commands and measurements, fitted to real steps through the simulator's model. Pure.
+
+Identification (of scale, rotation and bias of commands, and of constant errors of measurements) runs while another part
+learns. The learner sees the simulator's actions and measurements; this module translates.
+"""
 
 import functools
 from collections.abc import Callable
@@ -8,14 +12,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.types import Array, Transition
-from sgft_jax.models.robust import most_probable
-from sgft_jax.types import Batch
+from envs.types import Array, PyTree, Transition
+from sgft_jax.models import dynamics
+from sgft_jax.models.config import NetworkConfig
+from sgft_jax.models.networks import make_dynamics
+from sgft_jax.models.robust import most_probable, spread_of
+from sgft_jax.types import Batch, Normalizer, SimulatedData, Task
 
 _TURN, _SCALE, _BIAS = 0.6, 0.4, 0.2  # std of the rotation (rad), log-scales and biases before any data
 _FURTHEST = 2.0  # std of a sensor's error
 _EARNED, _TIMES = 20.0, 1.5  # nats of evidence that errors of sensors must add to the commands', and times
 _STARTS = (-1.4, -0.7, 0.0, 0.7, 1.4)  # rad; from elsewhere the search may end in another turn
+
+_SIMULATED = 2048  # rows that tell how far the model is off in simulation
+_ROWS = 320  # real ones that are fitted, the first 8 rollouts or so; more of them add little
+_EVIDENCE = 20.0  # nats by which a distortion must explain them better than none; neighbouring steps are alike
 
 
 class Distortion(NamedTuple):
@@ -132,3 +143,76 @@ def _fit(
     guessed = range(n, n + len(wrong))
     estimate = most_probable(missed, starts, belief, change, held, spread, bound=bound, guessed=guessed)
     return described(estimate.point), estimate.evidence
+
+
+# --- identification ---------------------------------------------------------------------------------------------------
+
+
+Model = Callable[[PyTree, Array, Array], Array]  # (params, obs, action) -> [measured_dim] what a step changes
+
+
+class Identified(NamedTuple):
+    """params: of the simulator's model. spread: [measured_dim] std of its residuals in simulation, raw units.
+
+    distortion: the identified changes; none at all until the evidence exceeds 20 nats.
+    """
+
+    params: PyTree
+    spread: Array
+    distortion: Distortion
+
+
+class Interface(NamedTuple):
+    """Identification as pure functions.
+
+    start(params of a prior, simulated) -> Identified, from simulated rows alone.
+    refit(identified, rows [n], held [n] bool) -> Identified, fitted to the rows that `held` marks.
+    meant(identified, batch) -> the batch, its real rows translated into the simulator's actions and measurements.
+    """
+
+    start: Callable[[PyTree, SimulatedData], Identified]
+    refit: Callable[[Identified, Transition, Array], Identified]
+    meant: Callable[[Identified, Batch], Batch]
+
+
+def interface(model: Model, kept: Callable[[PyTree], PyTree], task: Task) -> Interface:
+    """Identification for a task. model(params, obs, action) -> [measured_dim]; kept(prior's params) -> its params."""
+
+    def start(params: PyTree, simulated: SimulatedData) -> Identified:
+        simulator, rows = jax.tree.map(jnp.copy, kept(params)), simulated.draw(jax.random.key(0), _SIMULATED)
+        nothing, held = none(task.act_dim, task.measured_dim), jnp.ones(_SIMULATED, bool)
+        missed = residuals(lambda *x: model(simulator, *x), rows, nothing)
+        change = (rows.next_obs - rows.obs)[:, : missed.shape[1]]
+        return Identified(simulator, spread_of(missed, change, held), nothing)
+
+    def refit(known: Identified, rows: Transition, held: Array) -> Identified:
+        rows, held = jax.tree.map(lambda x: x[:_ROWS], (rows, held))
+        options = {"turns": task.cartesian, "errors": task.sensor_errors}
+        fitted, evidence = fit(lambda *x: model(known.params, *x), rows, held, known.spread, **options)
+        nothing = none(task.act_dim, task.measured_dim)
+        return known._replace(
+            distortion=jax.tree.map(lambda a, b: jnp.where(evidence > _EVIDENCE, a, b), fitted, nothing)
+        )
+
+    def meant(known: Identified, batch: Batch) -> Batch:
+        new = undone(known.distortion, batch)
+        if (simulated := batch.is_sim) is None:
+            return new
+        return jax.tree.map(lambda a, b: jnp.where(simulated.reshape(-1, *[1] * (a.ndim - 1)), a, b), batch, new)
+
+    return Interface(start, refit, meant)
+
+
+def command_interface(network: NetworkConfig, task: Task) -> Interface:
+    """Identification through one model of the prior's ensemble, as the simulator left it."""
+    model = make_dynamics(task.obs_dim, task.act_dim, network)
+
+    def change(kept: tuple[PyTree, Normalizer], obs: Array, action: Array) -> Array:
+        member, statistics = kept
+        after = dynamics.predict(model, member, statistics, obs, action)[0]
+        return (after - obs)[: task.measured_dim]
+
+    def kept(params: PyTree) -> tuple[PyTree, Normalizer]:
+        return jax.tree.map(lambda x: x[:1], params.dynamics), params.normalizer
+
+    return interface(change, kept, task)

@@ -14,11 +14,11 @@ import jax.numpy as jnp
 
 from envs.types import Array, Key, Policy, PyTree, Transition, UserError
 from sgft_jax.data import replay, sources
-from sgft_jax.identify import Identified, Interface, command_interface
 from sgft_jax.learners import sac
 from sgft_jax.math import optim
 from sgft_jax.models import dynamics, value
 from sgft_jax.models.config import NetworkConfig, network_of
+from sgft_jax.models.distortion import Identified, Interface, command_interface
 from sgft_jax.models.networks import fix_first_layer, make_dynamics, make_value
 from sgft_jax.policies import sac_policy
 from sgft_jax.train import options as rules

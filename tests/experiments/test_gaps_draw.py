@@ -17,7 +17,7 @@ from experiments.runner import cli
 from experiments.studies import gaps_draw as command
 from experiments.studies import gaps_drawn
 from sgft_jax.algorithms import make_policy
-from sgft_jax.identify import interface
+from sgft_jax.models.distortion import interface
 
 TEXT = """
 [actuation]

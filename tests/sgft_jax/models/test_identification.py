@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 import tuners
 
-from sgft_jax.identify import command_interface
 from sgft_jax.io.priors import load_prior, save_prior
 from sgft_jax.models import distortion, dynamics
 from sgft_jax.models.config import network_of
-from sgft_jax.models.distortion import Distortion
+from sgft_jax.models.distortion import Distortion, command_interface
 from sgft_jax.models.networks import make_dynamics
 from sgft_jax.types import Batch, Prior, SimulatedData
 
