@@ -49,17 +49,8 @@ def idle(obs: Any) -> tuple[Any, ...]:
     return obs, 0.0, True, False, None
 
 
-def parts(name: str, method: str, returned: Any) -> tuple[Any, ...]:
-    """What a method returns, if it is a tuple of as many parts as it should be."""
-    wanted = _PARTS[method]
-    if not isinstance(returned, tuple) or len(returned) != len(wanted):
-        count = f"{len(returned)} values" if isinstance(returned, tuple) else f"a {type(returned).__name__}"
-        raise UserError(f"{method} of {name}: returns {count}, not {', '.join(wanted)}")
-    return returned
-
-
 def step(name: str, returned: tuple[Any, ...], low: np.ndarray, high: np.ndarray) -> Answer:
-    """The answer to a step, see `parts`. low, high: [act_dim] bounds of what can have been sent."""
+    """The answer to a step, see `_PARTS`. low, high: [act_dim] bounds of what can have been sent."""
     obs, reward, terminated, truncated, info = returned
     with _explained(f"step of {name}"):
         info = _mapping(info)
@@ -269,8 +260,11 @@ class Vector:
 
 def _call(name: str, real: Any, method: str, *args: Any, **options: Any) -> tuple[Any, ...]:
     """What an environment returns; raises UserError, which says where, if it raises or returns other parts."""
-    call = extend.guard(f"{method} of", name, functools.partial(getattr(real, method), *args, **options))
-    return parts(name, method, call())
+    returned = extend.guard(f"{method} of", name, functools.partial(getattr(real, method), *args, **options))()
+    if not isinstance(returned, tuple) or len(returned) != len(_PARTS[method]):
+        count = f"{len(returned)} values" if isinstance(returned, tuple) else f"a {type(returned).__name__}"
+        raise UserError(f"{method} of {name}: returns {count}, not {', '.join(_PARTS[method])}")
+    return returned
 
 
 Real = Separate | Vector

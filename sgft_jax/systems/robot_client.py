@@ -244,7 +244,7 @@ def play(
     """
     sizes = {"obs_size": int(driver.obs_size), "action_size": int(driver.action_size)}
     limits.check(**sizes)
-    rhythm = _rhythm(driver, period, answer_within, _instead(late, sizes["action_size"]), patience)
+    rhythm = _rhythm(driver, period, answer_within, late, patience)
     robot = _Robot(driver, rhythm, limits, _Log(log), say)
     times = {"period": period and float(period), "answer_within": rhythm and float(rhythm.answer_within)}
     hello = pack("hello", version=VERSION, token=token, robot=name, **sizes, **times)
@@ -297,17 +297,23 @@ class _Rhythm:
 
 
 def _rhythm(
-    driver: Any, period: float | None, answer_within: float | None, instead: np.ndarray | None, patience: int
+    driver: Any, period: float | None, answer_within: float | None, late: str | Sequence[float], patience: int
 ) -> _Rhythm | None:
     """The clock of a driver with `send`; None for one with `step`, which waits for its commands.
 
-    Raises ValueError for times that no robot can keep, and where one that waits is told what to do when it is late.
+    Raises ValueError for times that no robot can keep, for no action in `late`, and where one that waits is told what
+    to do when it is late.
     """
+    hold, size = isinstance(late, str) and late == "hold", int(driver.action_size)
+    try:
+        instead = None if hold else array(np.asarray(late, "<f4").tobytes(), size, "late")
+    except (TypeError, ValueError) as error:
+        raise ValueError(f'late is {late!r}; give "hold", or {size} finite numbers') from error
     if period is not None and not 0 < period < np.inf:  # nan is not
         raise ValueError(f"period is {period}; give the seconds of a step, more than 0")
     if not hasattr(driver, "send"):
-        late = {"answer_within": answer_within is not None, "late": instead is not None}
-        if names := [name for name, is_set in {**late, "patience": patience != _PATIENCE}.items() if is_set]:
+        chosen = {"answer_within": answer_within is not None, "late": not hold, "patience": patience != _PATIENCE}
+        if names := [name for name, is_set in chosen.items() if is_set]:
             waits = "no command is late for a driver with `step`; give it `read` and `send`"
             raise ValueError(f"{', '.join(names)}: {waits}")
         return None
@@ -319,16 +325,6 @@ def _rhythm(
     if not patience >= 1:
         raise ValueError(f"patience is {patience}; give a number of steps, 1 or more")
     return _Rhythm(period, within, instead, patience)
-
-
-def _instead(late: str | Sequence[float], action_size: int) -> np.ndarray | None:
-    """The action that `late` names; None for "hold"; raises ValueError for anything else."""
-    if isinstance(late, str) and late == "hold":
-        return None
-    try:
-        return array(np.asarray(late, "<f4").tobytes(), action_size, "late")
-    except (TypeError, ValueError) as error:
-        raise ValueError(f'late is {late!r}; give "hold", or {action_size} finite numbers') from error
 
 
 class _Log:
@@ -389,8 +385,9 @@ class _Robot:
         self._socket, self.absent, self._over = socket, "", True  # an episode of another connection is over
         while True:
             message = self._next()
-            if message is None:
-                self._hold()
+            if message is None:  # no command came in time
+                assert self.rhythm is not None
+                self._move(self._last if self.rhythm.instead is None else self.rhythm.instead, late=True)
             elif message["type"] == "end":
                 return
             elif message["type"] == "rest":
@@ -456,11 +453,6 @@ class _Robot:
                 self._fail(error)
             else:
                 self._move(action, late=False)
-
-    def _hold(self) -> None:
-        """A step for which no command came in time."""
-        assert self.rhythm is not None
-        self._move(self._last if self.rhythm.instead is None else self.rhythm.instead, late=True)
 
     def _tell(self, kind: str, **fields: Any) -> None:
         self._answers.append(pack(kind, episode=self._episode, **fields))
