@@ -322,8 +322,9 @@ def packed(env: Env) -> Env:
         return state._replace(obs=pack(env.observation, state.obs), true_obs=pack(env.observation, state.true_obs))
 
     restore = env.restore
-    return env._replace(
-        reset=lambda *args: flat(env.reset(*args)),
-        step=lambda *args: flat(env.step(*args)),
-        restore=None if restore is None else lambda *args: flat(restore(*args)),
-    )
+    return changed(env, flat)._replace(restore=restore and (lambda *args: flat(restore(*args))))
+
+
+def changed(env: Env, change: Callable[[EnvState], EnvState]) -> Env:
+    """The same task, but for a change of the states that `reset` and `step` lead to."""
+    return env._replace(reset=lambda *args: change(env.reset(*args)), step=lambda *args: change(env.step(*args)))

@@ -27,15 +27,14 @@ def check_description(task: Env | Scene) -> None:
     for field in ("observation", "action"):
         _check_entries(wrong, field, getattr(task, field))
     _check_parameters(wrong, task.parameters)
-    if not is_count(task.episode_length):
-        raise wrong("episode_length", "must be a whole number of at least 1", task.episode_length)
-    if not is_number(task.control_dt) or task.control_dt <= 0:
-        raise wrong("control_dt", "must be a number of seconds above 0", task.control_dt)
-    if task.score not in SCORES:
-        raise wrong("score", f"must be one of {', '.join(SCORES)}", task.score)
-    for field in ("success_anytime", "cartesian", "table"):
-        if not isinstance(getattr(task, field), bool):
-            raise wrong(field, "must be True or False", getattr(task, field))
+    for field, possible, need in (
+        ("episode_length", is_count, "a whole number of at least 1"),
+        ("control_dt", lambda x: is_number(x) and x > 0, "a number of seconds above 0"),
+        ("score", lambda x: x in SCORES, f"one of {', '.join(SCORES)}"),
+        *((name, lambda x: isinstance(x, bool), "True or False") for name in ("success_anytime", "cartesian", "table")),
+    ):
+        if not possible(getattr(task, field)):
+            raise wrong(field, f"must be {need}", getattr(task, field))
     if task.cartesian and sum(entry.size for entry in task.action) < 2:
         raise wrong("cartesian", "needs an action that begins with x and y", task.action)
 

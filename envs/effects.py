@@ -62,10 +62,8 @@ def _ends_by_entry(
     for odd in values:
         if odd not in names:
             raise UserError(unknown(f"entry of effect '{name}'", odd, names))
-    shapes = [() if e.size == 1 else (e.size,) for e in entries]
-    parts = [
-        _ends(f"{name}.{e.name}", values.get(e.name, default), shape) for e, shape in zip(entries, shapes, strict=True)
-    ]
+    sizes = {e.name: () if e.size == 1 else (e.size,) for e in entries}
+    parts = [_ends(f"{name}.{entry}", values.get(entry, default), shape) for entry, shape in sizes.items()]
     low, high = (np.concatenate([x.reshape(-1) for x in ends]) for ends in zip(*parts, strict=True))
     return low, high
 

@@ -7,6 +7,7 @@ says which kinds of difference were drawn, see `envs.gap_distribution`, and `str
 succeed there, see `experiments.gaps`; only tables read them.
 """
 
+import itertools
 import json
 import re
 import tomllib
@@ -52,12 +53,8 @@ def presets(task: str, *, variants: bool = True) -> dict[str, Gap]:
     """
     folder = resources.files("envs") / "gaps"
     files = [folder / f"{task}.toml", *([folder / "variants" / f"{task}.toml"] if variants else [])]
-    tables = [tomllib.loads(file.read_text()) for file in files if file.is_file()]
-    return {
-        name: _parse(name, table, where=f"{task}.toml [{name}]")
-        for content in tables
-        for name, table in content.items()
-    }
+    tables = [tomllib.loads(file.read_text()).items() for file in files if file.is_file()]
+    return {name: _parse(name, table, where=f"{task}.toml [{name}]") for name, table in itertools.chain(*tables)}
 
 
 def read_file(path: str | Path) -> dict[str, Gap]:
@@ -100,13 +97,12 @@ def find(task: str, source: str) -> Gap:
 
 def each(sources: Iterable[str]) -> tuple[str, ...]:
     """Sources of one gap each, see `find`: a file that holds several becomes "file.toml:name" of every one of them."""
-    return tuple(one for source in sources for one in _each(source))
-
-
-def _each(source: str) -> list[str]:
-    match = _FILE.fullmatch(source)
-    content = {} if match is None or match[2] else read_file(source)
-    return [f"{source}:{name}" for name in content] if len(content) > 1 else [source]
+    single: list[str] = []
+    for source in sources:
+        match = _FILE.fullmatch(source)
+        content = {} if match is None or match[2] else read_file(source)
+        single += [f"{source}:{name}" for name in content] if len(content) > 1 else [source]
+    return tuple(single)
 
 
 def title(source: str) -> str:
@@ -144,13 +140,11 @@ def worlds(env: Env, gap: Gap, key: Key, n: int = 256) -> World:
 
 def to_toml(listed: Iterable[Gap]) -> str:
     """Gaps as the text of a file that holds several, for people too. `read_file` gives back the same gaps."""
-    return "\n".join(_table(gap) for gap in listed)
-
-
-def _table(gap: Gap) -> str:
-    values = {name: getattr(gap, name) for name in ("stratum", "scene", "families", "params", "effects")}
-    lines = [f"{_key(name)} = {_inline(value)}" for name, value in values.items() if value]
-    return "\n".join([f"[{_key(gap.name)}]", *lines, ""])
+    lines: list[str] = []
+    for gap in listed:
+        values = {name: getattr(gap, name) for name in ("stratum", "scene", "families", "params", "effects")}
+        lines += ["", f"[{_key(gap.name)}]", *(f"{name} = {_inline(value)}" for name, value in values.items() if value)]
+    return "\n".join([*lines[1:], ""])
 
 
 def _key(name: str) -> str:
@@ -194,10 +188,9 @@ def _parse(name: str, table: Any, *, where: str) -> Gap:
 
 
 def _is_value(value: Any) -> bool:
-    if isinstance(value, dict):
-        return bool(value) and all(not isinstance(part, dict) and _is_value(part) for part in value.values())
-    if isinstance(value, list):
-        return bool(value) and all(not isinstance(part, dict) and _is_value(part) for part in value)
+    if isinstance(value, dict | list):
+        parts = value.values() if isinstance(value, dict) else value
+        return bool(value) and all(not isinstance(part, dict) and _is_value(part) for part in parts)
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 

@@ -100,8 +100,9 @@ def split_vmap[R](function: Callable[..., R], in_axes: int | tuple[int | None, .
 
     def run(*args: PyTree) -> R:
         axes = in_axes if isinstance(in_axes, tuple) else (in_axes,) * len(args)
+        leaves: list[Array] = jax.tree.leaves([arg for arg, axis in zip(args, axes, strict=True) if axis == 0])
         n = pieces()
-        if n == 1 or _length(args, axes) % n:
+        if n == 1 or leaves[0].shape[0] % n:
             return batched(*args)
         specs = tuple(PartitionSpec() if axis is None else PartitionSpec(DATA) for axis in axes)
         return jax.shard_map(batched, in_specs=specs, out_specs=PartitionSpec(DATA), check_vma=False)(*args)
@@ -144,11 +145,6 @@ def _copy(x: Array) -> Array:
     if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
         return jax.random.wrap_key_data(_copy(jax.random.key_data(x)), impl=jax.random.key_impl(x))
     return jnp.asarray(np.asarray(x))
-
-
-def _length(args: tuple[PyTree, ...], axes: tuple[int | None, ...]) -> int:
-    leaves: list[Array] = jax.tree.leaves([arg for arg, axis in zip(args, axes, strict=True) if axis == 0])
-    return leaves[0].shape[0]
 
 
 def _constrain(tree: PyTree, spec: PartitionSpec) -> PyTree:

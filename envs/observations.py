@@ -11,7 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.spatial.transform import Rotation
 
-from envs.base import NOTHING, EffectRange, Effects, Entry, Env, EnvState, Theta, Value, Varying, World, entries_of
+from envs.base import (
+    NOTHING,
+    EffectRange,
+    Effects,
+    Entry,
+    Env,
+    EnvState,
+    Theta,
+    Value,
+    Varying,
+    World,
+    changed,
+    entries_of,
+)
 from envs.domains import parameter_ranges
 from envs.effects import make_range
 from envs.types import Array, Key, PyTree, UserError
@@ -51,7 +64,7 @@ def extended(
     tell(world, state of `env`, memory) -> [entry.size]. start() -> memory of an episode. remember(memory, action) ->
     memory. recall(what was told [entry.size]) -> memory.
     """
-    inner_dim = env.obs_dim
+    inner_dim, success, restore = env.obs_dim, env.success, env.restore
 
     def outside(world: World, state: EnvState, memory: PyTree) -> EnvState:
         facts = tell(world, state, memory)
@@ -69,22 +82,21 @@ def extended(
         inner = state._replace(physics=physics, obs=state.obs[:inner_dim], true_obs=state.true_obs[:inner_dim])
         return outside(world, env.step(world, inner, action, key), remember(memory, action))
 
-    def of_transition(function: Callable[..., Array] | None) -> Callable[..., Array] | None:
-        if function is None:
-            return None
-        return lambda obs, action, next_obs: function(obs[:inner_dim], action, next_obs[:inner_dim])
+    def restore_whole(world: World, obs: Array, key: Key) -> EnvState:
+        assert restore is not None
+        return outside(world, restore(world, obs[:inner_dim], key), recall(obs[inner_dim:]))
 
-    success, restore = env.success, env.restore
+    def of_transition(function: Callable[..., Array] | None) -> Callable[..., Array] | None:
+        return function and (lambda obs, action, next_obs: function(obs[:inner_dim], action, next_obs[:inner_dim]))
+
     return env._replace(
         observation=(*env.observation, entry),
         reset=reset,
         step=step,
-        restore=None
-        if restore is None
-        else lambda world, obs, key: outside(world, restore(world, obs[:inner_dim], key), recall(obs[inner_dim:])),
+        restore=restore and restore_whole,
         reward=of_transition(env.reward),
         terminated=of_transition(env.terminated),
-        success=None if success is None else lambda obs: success(obs[:inner_dim]),
+        success=success and (lambda obs: success(obs[:inner_dim])),
         trace=lambda physics: env.trace(physics[0]),
     )
 
@@ -185,13 +197,7 @@ def concealed(env: Env) -> Env:
     def hide(state: EnvState) -> EnvState:
         return state._replace(obs=state.obs.at[first:].set(0.0), true_obs=state.true_obs.at[first:].set(0.0))
 
-    def reset(world: World, key: Key) -> EnvState:
-        return hide(env.reset(world, key))
-
-    def step(world: World, state: EnvState, action: Array, key: Key) -> EnvState:
-        return hide(env.step(world, state, action, key))
-
-    return env._replace(reset=reset, step=step)
+    return changed(env, hide)
 
 
 def simulator(

@@ -35,17 +35,6 @@ class _Episode(NamedTuple):
     keys: Key
 
 
-class _After(NamedTuple):
-    """What a step has led to. obs: [obs_dim], the last one before physics exploded; the others are []."""
-
-    obs: Array
-    reward: Array
-    terminated: Array
-    truncated: Array
-    success: Array
-    invalid: Array
-
-
 class _Played:
     """A task on one real system, as functions of one environment: `begin(seed)` and `step(episode, action)`.
 
@@ -66,22 +55,25 @@ class _Played:
         _, world, state = begin_episode(self.env, self.pool, key_world, key_reset)
         return _Episode(world, state, keys[:, 1])
 
-    def step(self, episode: _Episode, action: Array) -> tuple[_Episode, _After]:
-        """One control step. Exploded physics ends an episode by truncation, with the last observation and no reward."""
+    def step(self, episode: _Episode, action: Array) -> tuple[_Episode, EnvState]:
+        """One control step, and the state as users see it.
+
+        Exploded physics ends an episode by truncation, with the last observation before it and no reward.
+        """
         before = episode.state
         state = self.env.step(episode.world, before, action, episode.keys[before.time])
         valid = ~state.invalid
-        after = _After(
+        seen = state._replace(
+            physics=None,
             obs=jnp.where(valid, state.obs, before.obs),
             reward=jnp.where(valid, state.reward, jnp.zeros_like(state.reward)),
             terminated=state.terminated & valid,
             truncated=state.truncated | state.invalid,
             success=state.success & valid,
-            invalid=state.invalid,
         )
-        return episode._replace(state=state), after
+        return episode._replace(state=state), seen
 
-    def info(self, after: _After) -> dict[str, Any]:
+    def info(self, after: EnvState) -> dict[str, Any]:
         """What `info` says of steps; success only where the task has it."""
         known = {"invalid": np.asarray(after.invalid)}
         if self.env.score == "success" or self.env.success is not None:

@@ -40,8 +40,8 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     spec.option.iterations, spec.option.ls_iterations = 2, 4  # one constraint, the end of the rail: two are exact
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT
     cart = spec.worldbody.add_body(name="cart", pos=[0, 0, 1])
-    slider = add_slide(cart, [1, 0, 0], name="slider", solref_limit=[STOP_TIME, 1.0], damping=DAMPING[0])
-    slider.limited, slider.range = True, [-RAIL, RAIL]
+    stop = {"range": [-RAIL, RAIL], "solref_limit": [STOP_TIME, 1.0]}
+    add_slide(cart, [1, 0, 0], name="slider", damping=DAMPING[0], **stop)
     cart.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.2, 0.15, 0.1], mass=theta["cart_mass"])
     pole = cart.add_body(name="pole")
     add_hinge(pole, [0, 1, 0], name="hinge", damping=DAMPING[1])

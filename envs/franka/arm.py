@@ -30,6 +30,7 @@ DH_ALPHA = (0.0, -np.pi / 2, np.pi / 2, np.pi / 2, -np.pi / 2, np.pi / 2, np.pi 
 FLANGE = 0.107  # m along z of frame 7
 TCP = FLANGE + 0.1034  # m along z of frame 7: between the fingertips
 HAND_YAW = -np.pi / 4  # the hand is mounted at -45 degrees about the flange axis
+HAND_TURN = np.array([np.cos(HAND_YAW / 2), 0.0, 0.0, np.sin(HAND_YAW / 2)])  # w, x, y, z in the frame of the last link
 
 Q_MIN = np.array([-2.7437, -1.7837, -2.9007, -3.0421, -2.8065, 0.5445, -3.0159])
 Q_MAX = np.array([2.7437, 1.7837, 2.9007, -0.1518, 2.8065, 4.5169, 3.0159])
@@ -88,18 +89,11 @@ def add_arm(spec: mujoco.MjSpec, *, stiffness: float = 1.0) -> mujoco.MjsBody:
     body = spec.worldbody
     for i in range(N_JOINTS):
         body = _add_link(body, i)
-        kp, most = float(STIFFNESS[i]) * stiffness, TORQUE_MAX[i]
-        servo = add_servo(spec, f"joint{i + 1}", kp, kp * DAMPING_TIME, name=f"servo{i + 1}")
-        servo.forcelimited, servo.forcerange = 1, [-most, most]
+        kp = float(STIFFNESS[i]) * stiffness
+        add_servo(spec, f"joint{i + 1}", kp, kp * DAMPING_TIME, TORQUE_MAX[i], name=f"servo{i + 1}")
     add_capsule(body, 0.04, fromto=[0, 0, FLANGE, 0, 0, FLANGE + 0.02], mass=0, rgba=_DARK)
-    place, turn = [0, 0, FLANGE + 0.045], tool_quaternion()
-    add_box(body, [0.025, 0.1, 0.03], pos=place, quat=turn, mass=HAND_MASS, rgba=_DARK)
+    add_box(body, [0.025, 0.1, 0.03], pos=[0, 0, FLANGE + 0.045], quat=HAND_TURN, mass=HAND_MASS, rgba=_DARK)
     return body
-
-
-def tool_quaternion() -> np.ndarray:
-    """[4] w, x, y, z: orientation of the hand in the frame of the last link."""
-    return np.array([np.cos(HAND_YAW / 2), 0.0, 0.0, np.sin(HAND_YAW / 2)])
 
 
 def across(x: float, y: float) -> tuple[float, float]:

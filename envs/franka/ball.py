@@ -66,10 +66,10 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     add_sphere(core, CORE * RADIUS, name="core", mass=(1 - SHELL) * mass, rgba=yellow)
     soft.touch(spec, "core", theta)
     for i, direction in enumerate(DIRECTIONS):
-        pad = core.add_body(name=_name(i), pos=direction * (RADIUS - PAD))
+        pad = core.add_body(name=f"pad{i}", pos=direction * (RADIUS - PAD))
         add_slide(pad, direction, stiffness=STIFFNESS, damping=DAMPING, armature=ARMATURE)
-        add_sphere(pad, PAD, name=_name(i), mass=SHELL * mass / len(DIRECTIONS), rgba=yellow)
-        soft.touch(spec, _name(i), theta, rolling=ROLLING)
+        add_sphere(pad, PAD, name=f"pad{i}", mass=SHELL * mass / len(DIRECTIONS), rgba=yellow)
+        soft.touch(spec, f"pad{i}", theta, rolling=ROLLING)
     return spec
 
 
@@ -86,9 +86,9 @@ def dress(spec: mujoco.MjSpec) -> None:
     weights /= weights.sum(1, keepdims=True)
     longitude = np.arctan2(points[:, 1], points[:, 0]) / np.pi
     texture = np.stack([np.abs(longitude), (points[:, 2] + 1) / 2], axis=1)  # mirrored, so it has no seam
-    bones = [(_name(i), direction * (RADIUS - PAD)) for i, direction in enumerate(DIRECTIONS)]
-    soft.add_material(spec, "ball", (3.0, 1.0), ((0.95, 0.75, 0.2), (0.25, 0.5, 0.8)))
-    soft.add_skin(spec, points * RADIUS, faces, weights, bones, texture=texture, material="ball")
+    bones = [(f"pad{i}", direction * (RADIUS - PAD)) for i, direction in enumerate(DIRECTIONS)]
+    look = {"name": "ball", "texture": texture, "repeat": (3.0, 1.0)}
+    soft.add_skin(spec, points * RADIUS, faces, weights, bones, colours=((0.95, 0.75, 0.2), (0.25, 0.5, 0.8)), **look)
     spec.geom("core").rgba = INVISIBLE
 
 
@@ -100,13 +100,5 @@ def _lie(xy: Array) -> Array:
     return jnp.concatenate([xy, jnp.array([RADIUS - SINKS, 1.0, 0.0, 0.0, 0.0]), jnp.zeros(len(DIRECTIONS))])
 
 
-def _name(i: int) -> str:
-    return f"pad{i}"
-
-
 SCENE = soft.simulated("push-ball", mass=0.1)
-REAL = {
-    "ball": soft.real_scene(
-        SCENE, "ball", height=HEIGHT, build=build, initial=initial, place=_place, lie=_lie, dress=dress
-    )
-}
+REAL = soft.real_scenes(SCENE, "ball", height=HEIGHT, build=build, initial=initial, place=_place, lie=_lie, dress=dress)

@@ -30,6 +30,7 @@ JOINTS = np.array([1, 3, 5])  # joints 2, 4 and 6: parallel axes, one vertical p
 TOLERANCE = 0.005  # m above the board counts as driven home
 HEAD_BACK = 0.045  # m from the gripper's centre to the hammer's axis, towards the base
 FACE = 0.035  # m from the gripper's centre down to the striking face
+TOOL = np.array([*across(-HEAD_BACK, 0.0), arm.TCP + FACE])  # m: the face's centre in the frame of the last link
 FACE_RADIUS = 0.018  # m: the face is a sphere, so its contact does not depend on the hammer's tilt
 START_LOW, START_HIGH = np.array([0.31, 0.69, -0.08]), np.array([0.37, 0.72, 0.08])  # face x, z in m, pitch in rad
 Q_READY = np.array([0.0, -0.2, 0.0, -0.9, 0.0, 0.7, np.pi / 4])  # near every start, for the inverse kinematics
@@ -88,7 +89,8 @@ def observe(params: Array, state: PhysicsState) -> Array:
     joints, velocities = state.qpos[JOINTS], state.qvel[JOINTS]
     goal = jnp.stack([params[_INDEX["nail_x"]], _board(params)])
     nail = goal[1:] + state.qpos[arm.N_JOINTS :]
-    return jnp.concatenate([_face(state.qpos[: arm.N_JOINTS]), joints, velocities, nail, goal])
+    face = arm.forward(state.qpos[: arm.N_JOINTS], jnp.asarray(TOOL, jnp.float32)).position
+    return jnp.concatenate([face, joints, velocities, nail, goal])
 
 
 def reward(obs: Array, action: Array, next_obs: Array) -> Array:
@@ -164,15 +166,6 @@ SCENE = arm.scene(
 )
 
 
-def tool() -> np.ndarray:
-    """[3] m: the centre of the striking face in the frame of the last link."""
-    return np.array([*across(-HEAD_BACK, 0.0), arm.TCP + FACE])
-
-
-def _face(joints: Array) -> Array:
-    return arm.forward(joints, jnp.asarray(tool(), jnp.float32)).position
-
-
 def _exposed(obs: Array) -> Array:
     return obs[9] - obs[11]
 
@@ -189,8 +182,7 @@ def _hold(joints: Array) -> Array:
 
 def _add_hammer(link: mujoco.MjsBody, mass: float) -> None:
     wood, steel, dark = [0.72, 0.52, 0.3, 1], [0.45, 0.47, 0.5, 1], [0.1, 0.1, 0.12, 1]
-    axis, tip = arm.TCP, arm.TCP + FACE
-    head = across(-HEAD_BACK, 0.0)
+    axis, (*head, tip) = arm.TCP, TOOL
     parts.add_sphere(link, FACE_RADIUS, name="face", pos=[*head, tip - FACE_RADIUS], mass=mass, rgba=steel)
     end = (*across(HANDLE, 0.0), axis)
     parts.add_sphere(link, HANDLE_RADIUS, name="handle", pos=end, mass=0, rgba=wood)

@@ -174,7 +174,7 @@ def _hand(tip: Array) -> Array:
 def _add_leg(link: mujoco.MjsBody, peg_radius: float) -> None:
     """A square leg that ends in a round peg, and the two balls that feel the hole."""
     tip = arm.TCP + GRASP
-    look = {"rgba": LEG_COLOUR, "quat": arm.tool_quaternion()}
+    look = {"rgba": LEG_COLOUR, "quat": arm.HAND_TURN}
     half = (LEG_LENGTH - DEPTH) / 2
     place = [0, 0, tip - DEPTH - half]
     add_box(link, [LEG_HALF_WIDTH, LEG_HALF_WIDTH, half], pos=place, mass=LEG_MASS, **look)
@@ -185,7 +185,7 @@ def _add_leg(link: mujoco.MjsBody, peg_radius: float) -> None:
 
 
 def _add_fingers(link: mujoco.MjsBody) -> None:
-    look = {"quat": arm.tool_quaternion(), "rgba": [0.1, 0.1, 0.12, 1]}
+    look = {"quat": arm.HAND_TURN, "rgba": [0.1, 0.1, 0.12, 1]}
     for side in (-1, 1):
         place = [*arm.across(0.0, side * (LEG_HALF_WIDTH + FINGER_HALF[1])), arm.TCP - 0.015]
         add_box(link, FINGER_HALF, pos=place, mass=0.015, **look)
@@ -201,10 +201,8 @@ def _add_part(spec: mujoco.MjSpec, theta: dict[str, float]) -> None:
     x, y = WALL_HALF[0] + opening, WALL_HALF[1] - opening
     for i in range(4):  # each wall covers one side and one corner of the opening, like the blades of a pinwheel
         c, s = np.cos(i * np.pi / 2), np.sin(i * np.pi / 2)
-        place, turn = (
-            [c * x - s * y, s * x + c * y, -WALL_HALF[2]],
-            [np.cos(i * np.pi / 4), 0, 0, np.sin(i * np.pi / 4)],
-        )
+        place = [c * x - s * y, s * x + c * y, -WALL_HALF[2]]
+        turn = [np.cos(i * np.pi / 4), 0, 0, np.sin(i * np.pi / 4)]
         add_box(hole, WALL_HALF, name=f"wall{i}", pos=place, quat=turn, rgba=INVISIBLE, mass=0)
     _add_scenery(spec, hole, theta["hole_radius"])
 

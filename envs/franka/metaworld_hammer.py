@@ -276,8 +276,8 @@ def _add_hand(spec: mujoco.MjSpec, theta: dict[str, float]) -> None:
         parts.add_servo(spec, name, stiffness, damping)
     for name, side, travel in zip(("right", "left"), (-1, 1), TRAVEL, strict=True):
         finger = hand.add_body(name=name, pos=[0, side * OPEN, 0])
-        slide = parts.add_slide(finger, [0, -side, 0], name=name, armature=FINGER_INERTIA, damping=FINGER_DAMPING)
-        slide.limited, slide.range = mujoco.mjtLimited.mjLIMITED_TRUE, [0, travel]
+        slow = {"armature": FINGER_INERTIA, "damping": FINGER_DAMPING}
+        parts.add_slide(finger, [0, -side, 0], name=name, range=[0, travel], **slow)
         parts.add_servo(spec, name, FINGER_FORCE * theta["finger_force"], 0.0)  # 1 m away is an effort of 1
         middle = (0, -side * (INSIDE - FINGER_HALF[1]), 0)
         parts.add_box(finger, FINGER_HALF, name=name, pos=middle, mass=FINGER_MASS, rgba=[0.85, 0.85, 0.88, 1])
@@ -300,9 +300,8 @@ def _add_nail(spec: mujoco.MjSpec, damping: float) -> None:
     nail = spec.worldbody.add_body(
         name="nail", pos=NAIL, mass=NAIL_MASS, inertia=[1e-4] * 3, ipos=[0, 0.05, 0], explicitinertial=True
     )
-    slide = parts.add_slide(nail, [0, 1, 0], name="nail", damping=damping)
-    slide.limited, slide.range = mujoco.mjtLimited.mjLIMITED_TRUE, [0, DEEP]
-    slide.solref_limit, slide.solimp_limit = [0.01, 1.0], [0.99, 0.99, 0.01, 0.5, 2]
+    stop = {"range": [0, DEEP], "solref_limit": [0.01, 1.0], "solimp_limit": [0.99, 0.99, 0.01, 0.5, 2]}
+    parts.add_slide(nail, [0, 1, 0], name="nail", damping=damping, **stop)
     # It reaches far back, so that no ball gets behind it and pulls the nail out.
     parts.add_box(nail, [NAIL_HALF, NAIL_BACK, NAIL_HALF], name="nail", pos=[0, NAIL_BACK, 0], rgba=parts.INVISIBLE)
     wide, deep, high = BLOCK_HALF

@@ -181,10 +181,8 @@ def _add_fingers(spec: mujoco.MjSpec, *, rate: float, strength: float) -> None:
     for name, axis, limit in zip("xyz", np.eye(3), STRENGTH, strict=True):
         joint = add_slide(body, axis, name=name)
         if name == "z":
-            joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, [TABLE_AT, 1.0]
-            joint.solref_limit = [2 * spec.option.timestep, 1.0]  # as hard as the time step allows
-        servo = add_servo(spec, name, MASS * DAMPING * rate, MASS * DAMPING)
-        servo.forcelimited, servo.forcerange = 1, [-MASS * limit * strength, MASS * limit * strength]
+            joint.range, joint.solref_limit = [TABLE_AT, 1.0], [2 * spec.option.timestep, 1.0]  # as hard as steps allow
+        add_servo(spec, name, MASS * DAMPING * rate, MASS * DAMPING, MASS * limit * strength)
     middle = (0, 0, FINGER_HALF[2] - FINGER_LOW)
     add_box(body, FINGER_HALF, name="fingers", pos=middle, mass=MASS, rgba=[0.3, 0.32, 0.35, 1])
 

@@ -9,6 +9,7 @@ observation alone.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -76,7 +77,7 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
 
 def observe(params: Array, state: PhysicsState) -> Array:
     """[4] m, table frame: hand xy, puck xy."""
-    return seen(state.qpos, state.qpos[arm.N_JOINTS : arm.N_JOINTS + 2])
+    return seen(state.qpos, _puck(state.qpos))
 
 
 def seen(qpos: Array, place: Array) -> Array:
@@ -108,14 +109,13 @@ def success(obs: Array) -> Array:
 
 def initial(params: Array, key: Key) -> PhysicsState:
     """The hand at a random place near the base, the puck where theta says."""
-    puck = jnp.concatenate([params[:2] + jnp.array([TABLE_ORIGIN, 0.0]), jnp.zeros(2)])
-    return at_rest(ready(key), puck, NV)
+    return at_rest(ready(key), _lie(params[:2] + jnp.array([TABLE_ORIGIN, 0.0])), NV)
 
 
 def settled(params: Array, obs: Array) -> PhysicsState:
     """The hand and the puck where they are seen, at rest: within a control period both come to rest."""
     joints = solve_down(Q_FOLDED, _place(obs[:2], HEIGHT), iterations=12)
-    return at_rest(joints, jnp.concatenate([obs[2:4] + jnp.array([TABLE_ORIGIN, 0.0]), jnp.zeros(2)]), NV)
+    return at_rest(joints, _lie(obs[2:4] + jnp.array([TABLE_ORIGIN, 0.0])), NV)
 
 
 def ready(key: Key, height: float = HEIGHT) -> Array:
@@ -132,14 +132,30 @@ def target(qpos: Array, action: Array, height: float = HEIGHT) -> Array:
     return solve_down(joints, _place(goal, height), iterations=3)
 
 
-def event(params: Array, state: PhysicsState) -> PhysicsState:
-    """A puck whose centre passed the edge falls: it comes to rest out of reach, for good."""
-    i = arm.N_JOINTS
-    gone = state.qpos[i] - TABLE_ORIGIN > EDGE
-    lying = jnp.array([TABLE_ORIGIN + FALLEN_AT, 0.0, 0.0, 0.0]).at[1].set(state.qpos[i + 1])
-    qpos = jnp.where(gone, state.qpos.at[i:].set(lying), state.qpos)
-    qvel = jnp.where(gone, state.qvel.at[i:].set(0.0), state.qvel)
-    return state._replace(qpos=qpos, qvel=qvel)
+def falling(
+    place: Callable[[Array], Array], lie: Callable[[Array], Array]
+) -> Callable[[Array, PhysicsState], PhysicsState]:
+    """The event of an object whose centre passed the edge: it falls and comes to rest out of reach, for good.
+
+    place(qpos) -> [2] m, xy of the object in the base frame. lie(xy) -> [nq - 7] its coordinates there.
+    """
+
+    def event(params: Array, state: PhysicsState) -> PhysicsState:
+        x, y = place(state.qpos)
+        gone = x - TABLE_ORIGIN > EDGE
+        lying = lie(jnp.stack([jnp.asarray(TABLE_ORIGIN + FALLEN_AT), y]))
+        qpos = jnp.where(gone, state.qpos.at[arm.N_JOINTS :].set(lying), state.qpos)
+        return state._replace(qpos=qpos, qvel=jnp.where(gone, state.qvel.at[arm.N_JOINTS :].set(0.0), state.qvel))
+
+    return event
+
+
+def _puck(qpos: Array) -> Array:
+    return qpos[arm.N_JOINTS : arm.N_JOINTS + 2]
+
+
+def _lie(xy: Array) -> Array:
+    return jnp.append(xy, jnp.zeros(2))
 
 
 SCENE = arm.scene(
@@ -157,7 +173,7 @@ SCENE = arm.scene(
     observe=observe,
     reward=reward,
     success=success,
-    event=event,
+    event=falling(_puck, _lie),
     dress=functools.partial(arm.dress, table=TABLE_LEGS),
     view=View((0.45, 0.0, 0.06), 1.1, 145.0, -30.0, arm.FLOOR),
 )

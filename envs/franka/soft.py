@@ -10,7 +10,6 @@ springs, which all engines step, though MJX's own code damps the towel's threads
 import functools
 from collections.abc import Callable, Sequence
 
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -78,7 +77,7 @@ def touch(
         pair.solimp = push.RUBBER
 
 
-def real_scene(
+def real_scenes(
     simulated: Scene,
     variant: str,
     *,
@@ -88,36 +87,28 @@ def real_scene(
     place: Callable[[Array], Array],
     lie: Callable[[Array], Array],
     dress: Callable[[mujoco.MjSpec], None],
-) -> Scene:
-    """The real counterpart of a simulated scene.
+) -> dict[str, Scene]:
+    """The real counterpart of a simulated scene, by name.
 
-    place(qpos) -> [2] m, xy of the object in the base frame. lie(xy) -> [nq - 7] its coordinates, undeformed, at xy of
-    the base frame. dress(spec): adds the skin that a viewer sees. height: m, of the hand above the table.
+    place, lie: see `push.falling`; it lies undeformed. dress(spec): adds the skin that a viewer sees. height: m, of the
+    hand above the table.
     """
-
-    def event(params: Array, state: PhysicsState) -> PhysicsState:
-        """An object whose middle passed the edge falls, as the puck does."""
-        xy = place(state.qpos)
-        lying = lie(jnp.stack([jnp.asarray(push.TABLE_ORIGIN + push.FALLEN_AT), xy[1]]))
-        gone = xy[0] - push.TABLE_ORIGIN > push.EDGE
-        n = arm.N_JOINTS
-        qpos = jnp.where(gone, state.qpos.at[n:].set(lying), state.qpos)
-        return state._replace(qpos=qpos, qvel=jnp.where(gone, state.qvel.at[n:].set(0.0), state.qvel))
 
     def dressed(spec: mujoco.MjSpec) -> None:
         simulated.dress(spec)
         dress(spec)
 
-    return simulated._replace(
+    real = simulated._replace(
         variant=variant,
         build=build,
         initial=initial,
         settled=None,  # four numbers do not tell how a soft body lies
         target=functools.partial(push.target, height=height),
         observe=lambda params, state: push.seen(state.qpos, place(state.qpos)),
-        event=event,
+        event=push.falling(place, lie),
         dress=dressed,
     )
+    return {variant: real}
 
 
 def add_skin(
@@ -128,18 +119,25 @@ def add_skin(
     bones: Sequence[tuple[str, np.ndarray]],
     *,
     texture: np.ndarray,
-    material: str,
+    name: str,
+    repeat: Sequence[float],
+    colours: Sequence[Sequence[float]],
     inflate: float = 0.0,
 ) -> None:
     """A surface that follows the bodies of an object, in place of their geoms and springs: for the eye only.
 
     vertices: [v, 3] m at rest. faces: [f, 3]. weights: [v, bones], rows sum to 1. bones: body name and place [3] at
-    rest. texture: [v, 2]. inflate: m, along the normals.
+    rest. texture: [v, 2] of a checkerboard of two `colours` [3], `repeat` [2] times across and along. name: of its
+    material. inflate: m, along the normals.
     """
     names = {name for name, _ in bones}
     for body in spec.bodies:
         for geom in body.geoms if body.name in names else ():
             geom.rgba = INVISIBLE
+    look = {"type": mujoco.mjtTexture.mjTEXTURE_2D, "builtin": mujoco.mjtBuiltin.mjBUILTIN_CHECKER}
+    spec.add_texture(name=name, rgb1=list(colours[0]), rgb2=list(colours[1]), width=128, height=128, **look)
+    material = spec.add_material(name=name, texrepeat=list(repeat), specular=0.1, shininess=0.1)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
     moved = [np.flatnonzero(column) for column in weights.T]
     spec.add_skin(
         vert=vertices.ravel().tolist(),
@@ -150,14 +148,6 @@ def add_skin(
         bindquat=np.tile([1.0, 0.0, 0.0, 0.0], len(bones)).tolist(),
         vertid=[index.tolist() for index in moved],
         vertweight=[weights[index, i].tolist() for i, index in enumerate(moved)],
-        material=material,
+        material=name,
         inflate=inflate,
     )
-
-
-def add_material(spec: mujoco.MjSpec, name: str, repeat: Sequence[float], rgb: Sequence[Sequence[float]]) -> None:
-    """A material of that name: a checkerboard of two colours, `repeat` [2] times across and along."""
-    look = {"type": mujoco.mjtTexture.mjTEXTURE_2D, "builtin": mujoco.mjtBuiltin.mjBUILTIN_CHECKER}
-    spec.add_texture(name=name, rgb1=list(rgb[0]), rgb2=list(rgb[1]), width=128, height=128, **look)
-    material = spec.add_material(name=name, texrepeat=list(repeat), specular=0.1, shininess=0.1)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name

@@ -35,12 +35,12 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     """The real scene for one theta. Coordinates of a point are its displacement from `POINTS`."""
     spec = soft.stage(theta, height=push.HEIGHT, iterations=ITERATIONS)
     for i, place in enumerate(POINTS):
-        body = spec.worldbody.add_body(name=_name(i), pos=place)
+        body = spec.worldbody.add_body(name=f"towel{i}", pos=place)
         for axis in np.eye(3):
             add_slide(body, axis)
-        add_sphere(body, RADIUS, name=_name(i), mass=theta["object_mass"] / len(POINTS), rgba=[0.8, 0.3, 0.25, 1])
-        body.add_site(name=_name(i), rgba=INVISIBLE)
-        soft.touch(spec, _name(i), theta, fingers=FELT)
+        add_sphere(body, RADIUS, name=f"towel{i}", mass=theta["object_mass"] / len(POINTS), rgba=[0.8, 0.3, 0.25, 1])
+        body.add_site(name=f"towel{i}", rgba=INVISIBLE)
+        soft.touch(spec, f"towel{i}", theta, fingers=FELT)
     for span, stiffness in STIFFNESS.items():
         _add_springs(spec, span, stiffness)
     return spec
@@ -69,9 +69,9 @@ def dress(spec: mujoco.MjSpec) -> None:
     at = np.linspace(0, 1, m)
     texture = np.stack(np.meshgrid(at, at, indexing="ij"), axis=-1).reshape(-1, 2)
     vertices, weights, texture = (np.concatenate([x, x]) for x in (weights @ POINTS, weights, texture))  # both faces
-    bones = [(_name(i), place) for i, place in enumerate(POINTS)]
-    soft.add_material(spec, "towel", (4.0, 0.01), ((0.80, 0.27, 0.22), (0.95, 0.93, 0.9)))
-    soft.add_skin(spec, vertices, faces, weights, bones, texture=texture, material="towel", inflate=0.004)
+    bones = [(f"towel{i}", place) for i, place in enumerate(POINTS)]
+    look = {"name": "towel", "texture": texture, "repeat": (4.0, 0.01), "inflate": 0.004}
+    soft.add_skin(spec, vertices, faces, weights, bones, colours=((0.80, 0.27, 0.22), (0.95, 0.93, 0.9)), **look)
     for tendon in spec.tendons:
         tendon.rgba = INVISIBLE
 
@@ -84,8 +84,8 @@ def _add_springs(spec: mujoco.MjSpec, span: tuple[int, int], stiffness: float) -
         if not (k < N and 0 <= m < N):
             continue
         spring = spec.add_tendon(stiffness=stiffness, damping=DAMPING_TIME * stiffness, springlength=[rest, rest])
-        spring.wrap_site(_name(i * N + j))
-        spring.wrap_site(_name(k * N + m))
+        spring.wrap_site(f"towel{i * N + j}")
+        spring.wrap_site(f"towel{k * N + m}")
 
 
 def _place(qpos: Array) -> Array:
@@ -94,10 +94,6 @@ def _place(qpos: Array) -> Array:
 
 def _lie(xy: Array) -> Array:
     return jnp.tile(jnp.append(xy, 0.0), len(POINTS))
-
-
-def _name(i: int) -> str:
-    return f"towel{i}"
 
 
 def _spline(*, fine: int) -> np.ndarray:
@@ -116,8 +112,6 @@ def _spline(*, fine: int) -> np.ndarray:
 
 
 SCENE = soft.simulated("push-towel", mass=0.06)
-REAL = {
-    "towel": soft.real_scene(
-        SCENE, "towel", height=push.HEIGHT, build=build, initial=initial, place=_place, lie=_lie, dress=dress
-    )
-}
+REAL = soft.real_scenes(
+    SCENE, "towel", height=push.HEIGHT, build=build, initial=initial, place=_place, lie=_lie, dress=dress
+)

@@ -4,8 +4,6 @@ Two legs of three joints on a torso of one metre. It cannot fall over sideways, 
 capsules have one density, that which makes the whole weigh 14 kg: a gap that resizes one link changes the mass of all.
 """
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -61,11 +59,11 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     trunk = {"torso": TORSO._replace(half=TORSO.half * theta["torso_length"]), "head": HEAD}
     links = [_changed(link, theta) for link in LINKS]
     volume = sum(capsule.volume for capsule in (*trunk.values(), *(link.capsule for link in links)))
-    common = {"density": MASS / volume, "friction": FRICTION * theta["friction"], "contact": CONTACT}
+    geom = {"density": MASS / volume, "friction": FRICTION * theta["friction"], "contact": CONTACT}
     for name, capsule in trunk.items():
-        planar.add_capsule(spec, torso, name, capsule, **common)
+        planar.add_capsule(spec, torso, name, capsule, **geom)
     for link in links:
-        planar.add_link(spec, link, axis=1, armature=ARMATURE, limit=LIMIT, **common)
+        planar.add_link(spec, link, axis=1, armature=ARMATURE, geom=geom, limit=LIMIT)
     return spec
 
 
@@ -110,9 +108,6 @@ def _turned(point: tuple[float, float], angle: Array) -> Array:
     return jnp.stack([x * cos + z * sin, z * cos - x * sin])
 
 
-_LATE = (SUBSTEPS + 1) / (2 * SUBSTEPS)  # each of Euler's steps moves by the speed that it ends with
-progress = functools.partial(planar.seen_progress, dt=CONTROL_DT, late=_LATE, lead=lead)
-
 SCENE = planar.scene(
     name="halfcheetah",
     parameters=PARAMETERS,
@@ -120,7 +115,8 @@ SCENE = planar.scene(
     substeps=SUBSTEPS,
     build=build,
     initial=initial,
-    observe=planar.observe,
-    reward=functools.partial(planar.seen_reward, progress, bonus=0.0, cost=CONTROL_COST),
-    measured=functools.partial(planar.run, dt=CONTROL_DT, bonus=0.0, cost=CONTROL_COST),
+    bonus=0.0,
+    cost=CONTROL_COST,
+    late=(SUBSTEPS + 1) / (2 * SUBSTEPS),  # each of Euler's steps moves by the speed that it ends with
+    lead=lead,
 )

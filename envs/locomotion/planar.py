@@ -4,17 +4,15 @@ They are the `-v2` systems of OpenAI Gym that D4RL was recorded on. A domain par
 so all are 1 there.
 """
 
-import functools
-from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Entry, Parameter
+from envs.base import NOTHING, Entry, Parameter
 from envs.mujoco import parts
 from envs.mujoco.parts import INVISIBLE, NO_CONTACT, add_hinge, add_motor, add_slide, empty_spec
 from envs.mujoco.scene import Measured, Scene, View
@@ -27,7 +25,6 @@ GRAVITY = 9.81  # m/s^2
 VIEW = View((0.0, 0.0, -0.35), 3.6, 90.0, -12.0, floor=0.0, follow="torso")
 FLOOR = "floor"
 ROLLING = [0.1, 0.1, 0.1]  # torsional and rolling friction, which contacts of three dimensions do not feel
-NO_MORE: Mapping[str, Sequence[float]] = MappingProxyType({})
 LIGHT, ORANGE, BLUE = [0.85, 0.86, 0.88, 1.0], [0.87, 0.52, 0.25, 1.0], [0.30, 0.46, 0.68, 1.0]
 
 OBSERVATION = (
@@ -104,7 +101,7 @@ def add_capsule(
     *,
     density: float,
     friction: float,
-    contact: Mapping[str, Sequence[float]] = NO_MORE,
+    contact: Mapping[str, Any] = NOTHING,
 ) -> None:
     """The capsule as a geom of that density, kg/m^3, that touches the floor and nothing else.
 
@@ -122,21 +119,19 @@ def add_link(
     *,
     axis: float,
     armature: float,
-    density: float,
-    friction: float,
-    limit: Mapping[str, Sequence[float]] = NO_MORE,
-    contact: Mapping[str, Sequence[float]] = NO_MORE,
+    geom: Mapping[str, Any],
+    limit: Mapping[str, Any] = NOTHING,
 ) -> None:
-    """The link with its hinge about +y or -y (axis: 1 or -1) and its motor; its geom as in `add_capsule`.
+    """The link with its hinge about +y or -y (axis: 1 or -1) and its motor.
 
-    armature: kg m^2. limit: `solref_limit` and `solimp_limit` of the hinge.
+    armature: kg m^2. geom: density, friction and perhaps contact, see `add_capsule`. limit: `solref_limit` and
+    `solimp_limit` of the hinge.
     """
     (x, z), (anchor_x, anchor_z) = link.position, link.anchor
     body = spec.body(link.parent).add_body(name=link.name, pos=[x, 0, z])
-    spring = {"stiffness": link.stiffness, "damping": link.damping, "armature": armature}
-    hinge = add_hinge(body, [0, axis, 0], name=link.name, pos=[anchor_x, 0, anchor_z], **spring, **limit)
-    hinge.limited, hinge.range = True, link.range
-    add_capsule(spec, body, link.name, link.capsule, density=density, friction=friction, contact=contact)
+    spring = {"stiffness": link.stiffness, "damping": link.damping, "armature": armature, "range": link.range}
+    add_hinge(body, [0, axis, 0], name=link.name, pos=[anchor_x, 0, anchor_z], **spring, **limit)
+    add_capsule(spec, body, link.name, link.capsule, **geom)
     add_motor(spec, link.name, link.name, link.gear)
 
 
@@ -157,89 +152,69 @@ def start(qpos: Array, qvel: Array) -> PhysicsState:
     return PhysicsState(qpos, qvel, jnp.zeros(NV), jnp.zeros(N_JOINTS))
 
 
-def observe(params: Array, state: PhysicsState, *, clip: float = np.inf) -> Array:
-    """[17]: everything but x. clip: m/s and rad/s, beyond which a speed is not told."""
-    return jnp.concatenate([state.qpos[1:], jnp.clip(state.qvel, -clip, clip)])
-
-
 def settled(params: Array, obs: Array) -> PhysicsState:
     """The state that is seen, at x = 0: nothing but the place depends on x."""
     return start(jnp.concatenate([jnp.zeros(1), obs[: NV - 1]]), obs[NV - 1 :])
 
 
-def progress(before: PhysicsState, after: PhysicsState, *, dt: float) -> Array:
-    """[] m/s along x during a step of `dt` s. x is not observed.
-
-    In float32 it is right to 0.001 m/s as far away as runners get in an episode: 500 m (HalfCheetah), 40 m (Walker2d).
-    """
-    return (after.qpos[0] - before.qpos[0]) / dt
-
-
-def run(
-    params: Array,
-    before: PhysicsState,
-    action: Array,
-    after: PhysicsState,
+def scene(
     *,
-    dt: float,
+    control_dt: float,
     bonus: float,
     cost: float,
+    late: float,
+    clip: float = np.inf,
+    lead: Callable[[Array], Array] = lambda pose: jnp.zeros(()),
     torque: Callable[[Array], Array | float] = lambda params: 1.0,
-) -> Measured:
-    """The reward: speed along x, a bonus, minus the cost of the squared control.
+    **parts: Any,
+) -> Scene:
+    """A runner, whose reward is speed along x, a bonus, minus the cost of the squared control. parts: see `Scene`.
 
-    The control is what the motors got, scaled, noisy and clipped. torque(params): [6] multiplies it where a gap makes
-    motors stronger, as Gym counts it.
+    clip: m/s and rad/s, beyond which observations tell no speed. torque(params): [6] multiplies the control where a gap
+    makes motors stronger, as Gym counts it.
+
+    x is not observed, so as a function of observations the reward is an approximation, for transitions that nobody
+    measures, such as imagined ones. There motors are nominal and get the action as it is. The way of some point of the
+    runner is control_dt times a mean of its speeds before and after; what that point has gained on the root is seen.
+    late: share of the speed after the step in that mean. lead(pose [7] of pitch and joints) -> [] m: how far ahead of
+    the root the point is; default the root itself.
     """
-    control = after.ctrl * torque(params)
-    return Measured(reward=progress(before, after, dt=dt) + bonus - cost * jnp.sum(control**2))
 
+    def observe(params: Array, state: PhysicsState) -> Array:
+        """[17]: everything but x."""
+        return jnp.concatenate([state.qpos[1:], jnp.clip(state.qvel, -clip, clip)])
 
-# --- the reward as observations tell it -------------------------------------------------------------------------------
+    def measured(params: Array, before: PhysicsState, action: Array, after: PhysicsState) -> Measured:
+        """The control is what the motors got, scaled, noisy and clipped.
 
-
-def seen_progress(
-    obs: Array, next_obs: Array, *, dt: float, late: float, lead: Callable[[Array], Array] = lambda pose: jnp.zeros(())
-) -> Array:
-    """`progress` [] m/s as observations before and after a step of `dt` s tell it, nearly.
-
-    The way of some point of the runner is dt times a mean of its speeds before and after; what that point has gained on
-    the root is seen. late: share of the speed after the step in that mean. lead(pose [7] of pitch and joints) -> [] m:
-    how far ahead of the root the point is; default the root itself.
-    """
+        In float32 speeds are right to 0.001 m/s as far away as runners get in an episode: 500 m (HalfCheetah), 40 m
+        (Walker2d).
+        """
+        control = after.ctrl * torque(params)
+        progress = (after.qpos[0] - before.qpos[0]) / control_dt
+        return Measured(reward=progress + bonus - cost * jnp.sum(control**2))
 
     def moving(obs: Array) -> tuple[Array, Array]:
         ahead, drift = jax.jvp(lead, (obs[1 : NV - 1],), (obs[NV + 1 :],))
         return ahead, obs[NV - 1] + drift
 
-    (ahead, speed), (ahead_after, speed_after) = moving(obs), moving(next_obs)
-    return (1 - late) * speed + late * speed_after - (ahead_after - ahead) / dt
+    def reward(obs: Array, action: Array, next_obs: Array) -> Array:
+        (ahead, speed), (ahead_after, speed_after) = moving(obs), moving(next_obs)
+        progress = (1 - late) * speed + late * speed_after - (ahead_after - ahead) / control_dt
+        return progress + bonus - cost * jnp.sum(jnp.clip(action, -1.0, 1.0) ** 2)
 
-
-def seen_reward(
-    progress: Callable[[Array, Array], Array],
-    obs: Array,
-    action: Array,
-    next_obs: Array,
-    *,
-    bonus: float,
-    cost: float,
-) -> Array:
-    """What `run` measures [], nearly, of a transition that nobody measures, such as an imagined one.
-
-    progress: see `seen_progress`. The motors are nominal and get the action as it is.
-    """
-    return progress(obs, next_obs) + bonus - cost * jnp.sum(jnp.clip(action, -1.0, 1.0) ** 2)
-
-
-scene = functools.partial(
-    Scene,
-    observation=OBSERVATION,
-    action=(Entry("joint_torques", "gear", N_JOINTS),),
-    episode_length=1_000,
-    settled=settled,
-    target=lambda qpos, action: jnp.clip(action, -1.0, 1.0),
-    score="return",
-    view=VIEW,
-    max_speed=1_000.0,  # feet of Walker2d reach 100 rad/s
-)
+    return Scene(
+        observation=OBSERVATION,
+        action=(Entry("joint_torques", "gear", N_JOINTS),),
+        episode_length=1_000,
+        control_dt=control_dt,
+        settled=settled,
+        target=lambda qpos, action: jnp.clip(action, -1.0, 1.0),
+        observe=observe,
+        reward=reward,
+        measured=measured,
+        score="return",
+        view=VIEW,
+        max_speed=1_000.0,  # feet of Walker2d reach 100 rad/s
+        **parts,
+    )

@@ -4,8 +4,6 @@ The left foot has twice the grip of the right one, a slip of Gym's model that D4
 density of water, so a gap that resizes the thighs changes the mass of the whole.
 """
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -63,7 +61,8 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     planar.add_capsule(spec, torso, "torso", TORSO, density=DENSITY, friction=grip)
     for link in LINKS:
         friction = LEFT_FOOT_FRICTION * theta["friction"] if link.name == "foot_left" else grip
-        planar.add_link(spec, _changed(link, theta), axis=-1, armature=ARMATURE, density=DENSITY, friction=friction)
+        geom = {"density": DENSITY, "friction": friction}
+        planar.add_link(spec, _changed(link, theta), axis=-1, armature=ARMATURE, geom=geom)
     return spec
 
 
@@ -93,9 +92,6 @@ def torque(params: Array) -> Array:
     return jnp.where(THIGHS, params[_TORQUE], 1.0)
 
 
-# Steps are short, and of the joints' speeds observations tell too little to follow another point than the root.
-progress = functools.partial(planar.seen_progress, dt=CONTROL_DT, late=0.5)
-
 SCENE = planar.scene(
     name="walker2d",
     parameters=PARAMETERS,
@@ -103,8 +99,11 @@ SCENE = planar.scene(
     substeps=SUBSTEPS,
     build=build,
     initial=initial,
-    observe=functools.partial(planar.observe, clip=MOST_SPEED),
+    clip=MOST_SPEED,
     terminated=terminated,
-    reward=functools.partial(planar.seen_reward, progress, bonus=ALIVE, cost=CONTROL_COST),
-    measured=functools.partial(planar.run, dt=CONTROL_DT, bonus=ALIVE, cost=CONTROL_COST, torque=torque),
+    bonus=ALIVE,
+    cost=CONTROL_COST,
+    # Steps are short, and of the joints' speeds observations tell too little to follow another point than the root.
+    late=0.5,
+    torque=torque,
 )

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.locomotion import wheel_legged
-from envs.locomotion.wheel_legged import ENTRIES, FALLEN, fallen, seconds_until, state_of, torque
+from envs.locomotion.wheel_legged import FALLEN, fallen, seconds_until, state_of, torque
 from envs.mujoco.worlds import PhysicsState
 from envs.types import Array
 
@@ -50,7 +50,7 @@ def measures(next_obs: np.ndarray, valid: np.ndarray) -> dict[str, np.ndarray]:
 
 SCENE = wheel_legged.SCENE._replace(
     name="wheel-legged-forward",
-    observation=(ENTRIES["velocity"], ENTRIES["pitch"], ENTRIES["pitch_velocity"]),
+    observation=wheel_legged.SCENE.observation[1:],
     observe=observe,
     settled=settled,
     reward=reward,

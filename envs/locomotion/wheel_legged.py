@@ -37,12 +37,6 @@ FALLEN = np.radians(30.0)  # rad
 PLACE = 0.2  # m from x = 0: farther away it does not stand in its place
 ALIVE = 30.0  # reward of a step in which nothing moves
 START = np.array([0.05, 0.05, 0.05, 0.1])  # m, rad, m/s, rad/s: half-widths of a uniform draw
-ENTRIES = {
-    "position": Entry("position", "m", 1),
-    "velocity": Entry("velocity", "m/s", 1),
-    "pitch": Entry("pitch", "rad", 1),
-    "pitch_velocity": Entry("pitch_velocity", "rad/s", 1),
-}
 
 PARAMETERS = (
     Parameter("mass", "kg", 12.0, 12.0, 12.0, minimum=WHEEL_MASS + 0.5),
@@ -66,12 +60,15 @@ def build(theta: dict[str, float]) -> mujoco.MjSpec:
     axle = spec.worldbody.add_body(name="axle", pos=[0, 0, WHEEL_RADIUS])
     rolling = parts.add_slide(axle, [1, 0, 0], name="x", frictionloss=theta["wheel_friction"] / WHEEL_RADIUS)
     rolling.armature = WHEEL_INERTIA / WHEEL_RADIUS**2  # wheels turn with x: their inertia adds to what x moves
-    _add_wheels(axle)
+    dark, sideways = [0.20, 0.21, 0.24, 1], [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
+    for y in (-0.15, 0.15):
+        parts.add_cylinder(axle, WHEEL_RADIUS, 0.02, pos=[0, y, 0], quat=sideways, mass=WHEEL_MASS / 2, rgba=dark)
     body = axle.add_body(name="body")
     parts.add_hinge(body, [0, 1, 0], name="pitch")
     com, mass = [theta["com_x"], 0, theta["com_height"]], theta["mass"] - WHEEL_MASS
     body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=com, size=BODY_HALF, mass=mass, rgba=LIGHT)
-    _add_legs(body, theta["com_height"])
+    for y in (-0.12, 0.12):  # legs, which only a viewer sees
+        parts.add_capsule(body, 0.015, fromto=[0, y, 0, 0, y, theta["com_height"]], mass=0, rgba=BLUE)
     wheel = spec.add_tendon(name="wheel")
     wheel.wrap_joint("x", 1 / WHEEL_RADIUS)
     wheel.wrap_joint("pitch", -1.0)
@@ -149,7 +146,12 @@ def mark(spec: mujoco.MjSpec) -> None:
 
 SCENE = Scene(
     name="wheel-legged",
-    observation=tuple(ENTRIES.values()),
+    observation=(
+        Entry("position", "m", 1),
+        Entry("velocity", "m/s", 1),
+        Entry("pitch", "rad", 1),
+        Entry("pitch_velocity", "rad/s", 1),
+    ),
     action=(Entry("wheel_torque", "3 N m", 1),),
     parameters=PARAMETERS,
     episode_length=EPISODE_LENGTH,
@@ -170,18 +172,6 @@ SCENE = Scene(
     dress=mark,
     view=View((0.0, 0.0, 0.12), 1.25, 118.0, -14.0, floor=0.0, follow="axle"),
 )
-
-
-def _add_wheels(axle: mujoco.MjsBody) -> None:
-    dark, sideways = [0.20, 0.21, 0.24, 1], [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
-    for y in (-0.15, 0.15):
-        parts.add_cylinder(axle, WHEEL_RADIUS, 0.02, pos=[0, y, 0], quat=sideways, mass=WHEEL_MASS / 2, rgba=dark)
-
-
-def _add_legs(body: mujoco.MjsBody, height: float) -> None:
-    """What only a viewer sees."""
-    for y in (-0.12, 0.12):
-        parts.add_capsule(body, 0.015, fromto=[0, y, 0, 0, y, height], mass=0, rgba=BLUE)
 
 
 class Hand(NamedTuple):

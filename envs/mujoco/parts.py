@@ -74,12 +74,18 @@ def add_hinge(body: mujoco.MjsBody, axis: Any, **more: Any) -> mujoco.MjsJoint:
     return body.add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis, **more)
 
 
-def add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float, name: str = "") -> mujoco.MjsActuator:
-    """A servo that draws a joint to where it is sent, named like it by default. In N/m and N s/m, or N m/rad, ..."""
+def add_servo(
+    spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float, most: float | None = None, name: str = ""
+) -> None:
+    """A servo that draws a joint to where it is sent, named like it by default. In N/m and N s/m, or N m/rad, ...
+
+    most: N or N m, the force that it has.
+    """
     servo = spec.add_actuator(name=name or joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
     servo.gaintype, servo.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
     servo.gainprm[0], servo.biasprm[:3] = stiffness, [0, -stiffness, -damping]
-    return servo
+    if most is not None:
+        servo.forcelimited, servo.forcerange = True, [-most, most]
 
 
 def add_motor(

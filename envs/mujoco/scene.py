@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs import effects as env_effects
+from envs import effects
 from envs.base import NOTHING, Effects, Entry, Env, EnvState, Parameter, Theta, Value, World, never, pack
 from envs.checks import check_array, check_description, check_effects, check_outcomes, is_count, is_number
 from envs.mujoco import worlds as physics
@@ -120,10 +120,8 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
         engine = scene.engine if impl == "jax" and scene.engine else physics.make_engine(host, fields, impl)
     except UserError as error:
         raise UserError(f"scene {scene.name}: {error}") from None
-    settled = scene.settled
     if not host.nsensordata:
         engine = engine._replace(sense=lambda fields, state: state)
-    begin = functools.partial(_begin, scene, engine)
 
     def make_worlds(theta: Theta) -> World:
         rows = np.asarray(theta.params, np.float64)
@@ -133,21 +131,21 @@ def make_env(scene: Scene, impl: str = "auto") -> Env:
 
     def reset(world: World, key: Key) -> EnvState:
         key_start, key_noise, key_effects = jax.random.split(key, 3)
-        drawn = env_effects.draw(world.theta.effects, key_effects)
-        return begin(world, scene.initial(world.theta.params, key_start), drawn, key_noise)
+        drawn = effects.draw(world.theta.effects, key_effects)
+        return _begin(scene, engine, world, scene.initial(world.theta.params, key_start), drawn, key_noise)
 
     def restore(settled: Callable[[Array, Array], PhysicsState], world: World, obs: Array, key: Key) -> EnvState:
         key_noise, key_effects = jax.random.split(key)
-        drawn = env_effects.draw(world.theta.effects, key_effects)
+        drawn = effects.draw(world.theta.effects, key_effects)
         state = settled(world.theta.params, obs - drawn.obs_bias)
-        return begin(world, state, drawn, key_noise)._replace(obs=obs)
+        return _begin(scene, engine, world, state, drawn, key_noise)._replace(obs=obs)
 
     env = Env(
         **{name: getattr(scene, name) for name in Env._fields if name in Scene._fields},
         make_worlds=make_worlds,
         reset=reset,
         step=functools.partial(_step, scene, engine),
-        restore=None if settled is None else functools.partial(restore, settled),
+        restore=scene.settled and functools.partial(restore, scene.settled),
         trace=lambda state: state.qpos,
         impl=impl,
         scene=scene.variant,
@@ -165,7 +163,7 @@ def _begin(
     no = jnp.zeros((), bool)
     return EnvState(
         physics=state,
-        obs=env_effects.measure(episode, true_obs, key_noise),
+        obs=effects.measure(episode, true_obs, key_noise),
         true_obs=true_obs,
         reward=jnp.zeros((), jnp.float32),
         terminated=no,
@@ -181,10 +179,10 @@ def _step(scene: Scene, engine: Engine, world: World, state: EnvState, action: A
     """One control step."""
     key_latency, key_noise, key_action = jax.random.split(key, 3)
     params, episode, before = world.theta.params, state.effects, state.physics
-    command = env_effects.shake(episode, env_effects.distort(episode, action), key_action)
+    command = effects.shake(episode, effects.distort(episode, action), key_action)
     target = scene.motors(params, before.ctrl, scene.target(before.qpos, command))
     dt = scene.control_dt / scene.substeps
-    control = env_effects.ramp(episode, before.ctrl, target, key_latency, dt=dt, duration=scene.ramp)
+    control = effects.ramp(episode, before.ctrl, target, key_latency, dt=dt, duration=scene.ramp)
     controls = jax.vmap(control)(jnp.arange(scene.substeps))
     after = scene.event(params, engine.advance(world.model, before, controls))
     true_obs = pack(scene.observation, scene.observe(params, after))
@@ -192,7 +190,7 @@ def _step(scene: Scene, engine: Engine, world: World, state: EnvState, action: A
     time = state.time + 1
     return EnvState(
         physics=after,
-        obs=env_effects.measure(episode, true_obs, key_noise),
+        obs=effects.measure(episode, true_obs, key_noise),
         true_obs=true_obs,
         reward=reward,
         terminated=terminated,
@@ -241,10 +239,8 @@ def check_scene(scene: Scene, host: mujoco.MjModel) -> None:
     _check_times(scene, host)
     sizes = {"qpos": host.nq, "qvel": host.nv, "warmstart": host.nv, "ctrl": host.nu}
     full = PhysicsState(**{name: _float(n) for name, n in sizes.items()}, sensordata=_float(host.nsensordata))
-    params, action, obs = (
-        _float(n)
-        for n in (len(scene.parameters), sum(e.size for e in scene.action), sum(e.size for e in scene.observation))
-    )
+    params = _float(len(scene.parameters))
+    action, obs = (_float(sum(entry.size for entry in entries)) for entries in (scene.action, scene.observation))
     key = jax.eval_shape(lambda: jax.random.key(0))
 
     def check_state(field: str, state: Any) -> None:
@@ -258,7 +254,11 @@ def check_scene(scene: Scene, host: mujoco.MjModel) -> None:
     check_array(scene, "target", target, (host.nu,))
     check_array(scene, "motors", jax.eval_shape(scene.motors, params, full.ctrl, target), (host.nu,))
     check_state("event", jax.eval_shape(scene.event, params, full))
-    check_array(scene, "observe", _observed(scene, params, full), obs.shape)
+    try:
+        observed = jax.eval_shape(lambda *args: pack(scene.observation, scene.observe(*args)), params, full)
+    except UserError as error:
+        raise UserError(f"task {scene.name}: 'observe': {error}") from None
+    check_array(scene, "observe", observed, obs.shape)
     if scene.settled is not None:
         check_state("settled", jax.eval_shape(scene.settled, params, obs))
     _check_outcomes(scene, params, full, action, obs)
@@ -278,13 +278,6 @@ def _check_times(scene: Scene, host: mujoco.MjModel) -> None:
             f"task {scene.name}: 'control_dt' is {scene.control_dt:g} s, but {scene.substeps} substeps of MuJoCo's "
             f"timestep take {steps:g} s"
         )
-
-
-def _observed(scene: Scene, params: Any, state: PhysicsState) -> Any:
-    try:
-        return jax.eval_shape(lambda *args: pack(scene.observation, scene.observe(*args)), params, state)
-    except UserError as error:
-        raise UserError(f"task {scene.name}: 'observe': {error}") from None
 
 
 def _check_outcomes(scene: Scene, params: Any, state: PhysicsState, action: Any, obs: Any) -> None:

@@ -58,8 +58,8 @@ def check_supported(name: str, host: mujoco.MjModel) -> None:
     """Raises UserError for a scene whose state is more than a `PhysicsState`, by MuJoCo's own list of states."""
     states = mujoco.mjtState.__members__.items()
     kinds = {k.removeprefix("mjSTATE_"): v for k, v in states if k.startswith("mjSTATE_") and int(v).bit_count() == 1}
-    more = [kind for kind, bit in kinds.items() if kind not in _KEPT and mujoco.mj_stateSize(host, int(bit))]
-    more = [_STATES.get(kind, f"a state {kind}") for kind in more]
+    odd = [kind for kind, bit in kinds.items() if kind not in _KEPT and mujoco.mj_stateSize(host, int(bit))]
+    more = [_STATES.get(kind, f"a state {kind}") for kind in odd]
     if host.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
         more.append("bodies that sleep (flag sleep)")
     # Time begins anew in every control step.
@@ -81,15 +81,11 @@ def choose_impl(wanted: str = "auto") -> str:
         raise UserError(unknown(IMPL_VARIABLE if wanted == "auto" else "impl", impl, get_args(Impl)))
     if impl != "auto":
         return impl
-    match jax.default_backend():
-        case "cpu":
-            return "c"
-        case "gpu":
-            from envs.mujoco.engines import warp
+    if jax.default_backend() == "gpu":
+        from envs.mujoco.engines import warp
 
-            return "warp" if warp.available() else "jax"
-        case _:
-            return "jax"
+        return "warp" if warp.available() else "jax"
+    return "c" if jax.default_backend() == "cpu" else "jax"
 
 
 def varying_fields(nominal: mujoco.MjModel, specs: Iterable[mujoco.MjSpec]) -> tuple[str, ...]:

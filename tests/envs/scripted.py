@@ -58,7 +58,7 @@ class Errors(NamedTuple):
 def drive_nail(params: Array, state: PhysicsState, t: int) -> Array:
     """[3]: swing the hammer over the nail, then press it down, lifting it for a blow at every fourth step."""
     joints, obs = state.qpos[: arm.N_JOINTS], hammer.observe(params, state)
-    tool = jnp.asarray(hammer.tool(), jnp.float32)
+    tool = jnp.asarray(hammer.TOOL, jnp.float32)
     turn = arm.forward(joints, tool).rotation
     jac = arm.jacobian(joints, tool)[jnp.array([0, 2, 4])][:, hammer.JOINTS]
     across = obs[10] - obs[0]

@@ -162,7 +162,8 @@ def comparison(nominal: mujoco.MjModel, names: tuple[str, ...]) -> Callable[[muj
         if (counts := get_sizes(host)) != wanted_sizes:
             return [name for name, a, b in zip(sizes, counts, wanted_sizes, strict=True) if a != b]
         rows = zip(arrays, get_arrays(host), wanted, keys, strict=True)
-        return [name for name, x, y, key in rows if _key(x) != key and not _same(x, y)]
+        different = [(name, x, y) for name, x, y, key in rows if _key(x) != key]
+        return [name for name, x, y in different if not np.allclose(x, y, rtol=1e-6, atol=1e-12, equal_nan=True)]
 
     return differing
 
@@ -170,7 +171,3 @@ def comparison(nominal: mujoco.MjModel, names: tuple[str, ...]) -> Callable[[muj
 def _key(value: Any) -> Any:
     """What is quickly compared: the bytes of an array."""
     return value.tobytes() if isinstance(value, np.ndarray) else value
-
-
-def _same(x: Any, y: np.ndarray) -> bool:
-    return bool(np.allclose(x, y, rtol=1e-6, atol=1e-12, equal_nan=True))

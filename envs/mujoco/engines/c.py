@@ -60,11 +60,9 @@ def make_engine(host: mujoco.MjModel, fields: tuple[str, ...]) -> Engine:
     slots = [new_slot() for _ in range(cores)]
 
     def on_host(values: dict[str, Any], state: Any, controls: Any, *, move: bool) -> Any:
-        values, state, controls = jax.tree.map(np.asarray, (values, state, controls))
         lead = state.qpos.shape[:-1]
-        values, state, controls = jax.tree.map(
-            lambda x: x.reshape(-1, *x.shape[len(lead) :]), (values, state, controls)
-        )
+        worlds = jax.tree.map(lambda x: np.asarray(x).reshape(-1, *x.shape[len(lead) :]), (values, state, controls))
+        values, state, controls = worlds
         after = jax.tree.map(np.empty_like, state)
         if host.nsensordata:
             after = after._replace(sensordata=np.empty((len(controls), host.nsensordata), np.float32))

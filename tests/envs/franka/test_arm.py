@@ -22,7 +22,7 @@ def mujoco_arm():
     spec = new_spec(substeps=40, iterations=1, ls_iterations=1)
     link = arm.add_arm(spec)
     for i, tool in enumerate(TOOLS):
-        link.add_site(name=f"tool{i}", pos=[0, 0, arm.TCP] if tool is None else tool, quat=arm.tool_quaternion())
+        link.add_site(name=f"tool{i}", pos=[0, 0, arm.TCP] if tool is None else tool, quat=arm.HAND_TURN)
     model = spec.compile()
     return model, mujoco.MjData(model)
 
