@@ -43,8 +43,7 @@ class BulletArgs:
     """Runs at the same time; each needs a core for the learner and one for the engine."""
     minutes: float | None = None
     """Begin no new run after so many minutes."""
-    out: Path = Path("runs/bullet")
-    """Parent of all run folders."""
+    out: options.Out = Path("runs/bullet")
     home: Path = HOME
     """Folder of the Python environment with panda-gym; made if it does not exist."""
     python: str = PYTHON

@@ -191,9 +191,9 @@ def gather(args: CalibrateArgs, runs: Sequence[Path]) -> list[Cases]:
         params, control = (stacking.member(x, jnp.array(which)) for x in known)
         examined = examiner.examine(params, control, stacking.stack(rollouts), COUNTS)
         for member, (diagnosis, p) in enumerate(zip(examined, which, strict=True)):
-            for i, found in enumerate(diagnosis.statistics):
-                inputs[i].append(inputs_of(found))
-                played[i].append(found["success"])
+            for i, statistics in enumerate(diagnosis.statistics):
+                inputs[i].append(inputs_of(statistics))
+                played[i].append(statistics["success"])
             success = curve.values[member, held]
             gained = round(success[-1] - success[0], 6)  # equal ones must tie
             names = (f"{env.name} {curve.gap}", f"{env.name} {folders[p]}")

@@ -46,11 +46,9 @@ class FactorialArgs(GridArgs):
     reals: tuple[str, ...] = ("default", "sim")
     """Real systems: gaps by name, sim for no gap, or .toml/.json files; of every task, or as TASK=REAL of that one."""
     seeds: int = 12
-    """Seeds of each run, all in one program."""
     rollouts: int = 12
     """Real rollouts per seed, the initial ones included."""
     eval_every: int = 2
-    """Rollouts between evaluations."""
     prior: Path | None = None
     """Folder of priors (prior/seed-*); default: those of <out>/pretrain/<task>/<preset>."""
     horizon: int = 4

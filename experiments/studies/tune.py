@@ -46,9 +46,7 @@ class TuneArgs(GridArgs):
     seed: int = 100
     """First seed of the runs, which also decides the draw of the trials."""
     seeds: int = 3
-    """Seeds of each run, all in one program."""
     rollouts: int = 40
-    """Real rollouts per seed, the initial ones included; may grow later."""
     halve: bool = False
     """Successive halving: the better half of the trials goes on to twice as many rollouts, until two are left at
     --rollouts. The trial with the defaults always goes on. About half the rollouts for eight trials."""
