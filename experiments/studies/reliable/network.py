@@ -4,13 +4,15 @@ import contextlib
 import socket
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from websockets.exceptions import ConnectionClosed, InvalidHandshake
-from websockets.sync.client import ClientConnection, connect
-from websockets.sync.server import ServerConnection, serve
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
+from websockets.sync.server import serve
 
 from experiments.runner.real_systems import free_port
 from experiments.studies.reliable.trial import Trial, late_share
@@ -23,58 +25,51 @@ _FRAMES = 10_000  # of nonsense
 _RATE, _KNOCKING = 100.0, 10.0  # connections with a wrong token in a second, for so many seconds
 
 
-class Proxy:
-    """Stands between a robot and the learner at `port`, and drops, delays and damages messages both ways."""
+@contextlib.contextmanager
+def _proxy(port: int, luck: np.random.Generator) -> Iterator[tuple[int, dict[str, int]]]:
+    """(A port that leads to the learner's, what became of messages): it drops, delays and damages some both ways."""
+    counts, between = dict.fromkeys(("messages", "dropped", "delayed", "damaged"), 0), free_port()
 
-    def __init__(self, port: int, seed: int) -> None:
-        self._upstream, self._luck = f"ws://127.0.0.1:{port}", np.random.default_rng(seed)
-        self.counts = {"messages": 0, "dropped": 0, "delayed": 0, "damaged": 0}
-        self.port = free_port()
-        self._server = serve(self._serve, "127.0.0.1", self.port, compression=None)
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
-
-    def __enter__(self) -> "Proxy":
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._server.shutdown()
-
-    def _serve(self, near: ServerConnection) -> None:
-        with _quietly(), connect(self._upstream, compression=None, proxy=None) as far:
-            threading.Thread(target=self._pump, args=(far, near), daemon=True).start()
-            self._pump(near, far)
+    def lead_on(near: Connection) -> None:
+        with _quietly(), connect(f"ws://127.0.0.1:{port}", compression=None, proxy=None) as far:
+            threading.Thread(target=pump, args=(far, near), daemon=True).start()
+            pump(near, far)
         near.close()
 
-    def _pump(self, source: ServerConnection | ClientConnection, sink: ServerConnection | ClientConnection) -> None:
+    def pump(source: Connection, sink: Connection) -> None:
         with contextlib.suppress(ConnectionClosed):
             for message in source:
-                self._pass(message, sink)
+                _pass(message, sink, luck, counts)
         sink.close()
 
-    def _pass(self, message: str | bytes, sink: ServerConnection | ClientConnection) -> None:
-        luck = self._luck
-        self.counts["messages"] += 1
-        if luck.uniform() < _DROPPED:
-            self.counts["dropped"] += 1
-            return
-        if isinstance(message, bytes) and luck.uniform() < _DAMAGED:
-            self.counts["damaged"] += 1
-            at = int(luck.integers(len(message)))
-            message = message[:at] + bytes([message[at] ^ 255]) + message[at + 1 :]
-        if luck.uniform() < _DELAYED:
-            self.counts["delayed"] += 1
-            threading.Timer(luck.uniform(*_DELAY), _send, (sink, message)).start()
-            return
-        _send(sink, message)
+    with serve(lead_on, "127.0.0.1", between, compression=None) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield between, counts
+
+
+def _pass(message: str | bytes, sink: Connection, luck: np.random.Generator, counts: dict[str, int]) -> None:
+    counts["messages"] += 1
+    if luck.uniform() < _DROPPED:
+        counts["dropped"] += 1
+        return
+    if isinstance(message, bytes) and luck.uniform() < _DAMAGED:
+        counts["damaged"] += 1
+        at = int(luck.integers(len(message)))
+        message = message[:at] + bytes([message[at] ^ 255]) + message[at + 1 :]
+    if luck.uniform() < _DELAYED:
+        counts["delayed"] += 1
+        threading.Timer(luck.uniform(*_DELAY), _send, (sink, message)).start()
+        return
+    _send(sink, message)
 
 
 def bad_network(home: Path, *, seed: int, rollouts: int) -> dict[str, Any]:
     """A run through the proxy; what became of it."""
-    with Trial(home, period=_PERIOD, rollouts=rollouts) as trial, Proxy(trial.port, seed) as proxy:
-        trial.via = proxy.port
+    luck = np.random.default_rng(seed)
+    with Trial(home, period=_PERIOD, rollouts=rollouts) as trial, _proxy(trial.port, luck) as (trial.via, counts):
         trial.start()
         trial.finish()
-    return {**proxy.counts, **trial.audit(), "late": late_share(home / "commands.log")}
+    return {**counts, **trial.audit(), "late": late_share(home / "commands.log")}
 
 
 def strangers(home: Path, *, seed: int, rollouts: int) -> dict[str, Any]:
@@ -129,6 +124,6 @@ def _quietly() -> contextlib.suppress:
     return contextlib.suppress(OSError, ConnectionClosed, InvalidHandshake, TimeoutError)
 
 
-def _send(sink: ServerConnection | ClientConnection, message: str | bytes) -> None:
+def _send(sink: Connection, message: str | bytes) -> None:
     with contextlib.suppress(ConnectionClosed):
         sink.send(message)

@@ -4,8 +4,8 @@ The robot of `docs/examples/own_task.py`: a pusher slides a puck along a rail, b
 numpy and the robot's client alone, so it is up again in a moment after a kill.
 """
 
-import argparse
 import os
+import sys
 import time
 from pathlib import Path
 
@@ -71,13 +71,9 @@ class Rail:
 
 def main() -> None:
     """The command line: where the learner is, its token, the period in seconds, a folder, and two sizes."""
-    parser = argparse.ArgumentParser()
-    for name, kind in (("url", str), ("token", str), ("period", float), ("folder", Path)):
-        parser.add_argument(name, type=kind)
-    parser.add_argument("sizes", type=int, nargs=2)
-    args = parser.parse_args()
-    rail, log = Rail(args.folder / "ledger.txt", tuple(args.sizes)), args.folder / "commands.log"
-    robot_client.play(rail, args.url, token=args.token, period=args.period, log=log, retry=0.1)
+    url, token, period, folder, measured, commanded = sys.argv[1:]
+    rail, log = Rail(Path(folder) / "ledger.txt", (int(measured), int(commanded))), Path(folder) / "commands.log"
+    robot_client.play(rail, url, token=token, period=float(period), log=log, retry=0.1)
 
 
 if __name__ == "__main__":
