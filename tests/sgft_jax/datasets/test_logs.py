@@ -14,8 +14,8 @@ import toy
 from envs.types import Transition, UserError
 from experiments.runner.recorded import read_log
 from sgft_jax.data import replay, sequences, sources
-from sgft_jax.datasets import logs
-from sgft_jax.files import arrays, hdf5
+from sgft_jax.datasets import layouts, logs
+from sgft_jax.files import arrays
 from sgft_jax.types import SimulatedData
 
 # Row by row: an episode that ends by falling, one that the time limit ends, one that falls at its time limit, and one
@@ -334,7 +334,7 @@ def test_a_file_that_claims_more_than_it_can_hold_is_refused(tmp_path, options):
 def test_one_array_under_many_names_counts_each_time(write, monkeypatch):
     monkeypatch.setattr(arrays, "_FREE", 0)
     monkeypatch.setattr(arrays, "_RATIO", 1)
-    with hdf5.opened(write({"x": np.ones(1000)})) as content:
+    with layouts.opened(write({"x": np.ones(1000)})) as content:
         content.array(None, "x", 1)
         with pytest.raises(UserError, match="claim to hold 16,000"):
             content.array(None, "x", 1)
