@@ -189,7 +189,7 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
 
 def show(args: RealDemoArgs) -> None:
     """The success before and after, and where the learning curve, the video and the policy are."""
-    from experiments.runner.finetune_record import evaluation_store
+    from experiments.runner.finetune_run import evaluation_store
 
     run = run_folder(arguments(args.method, task=TASK, seeds=1, seed=args.seed, out=args.out), real_systems.REMOTE)
     stores = [evaluation_store(run, done) for done in (0, args.rollouts)]

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,17 +13,23 @@ import numpy as np
 import envs
 from envs import mesh
 from envs.base import Env
+from envs.gaps import Gap
 from envs.rollout import Episode
+from envs.types import PyTree
 from experiments.runner import cli, real_systems
-from experiments.runner.finetune_record import FinetuneRecord, evaluation_store
 from experiments.runner.machines import reserve
 from experiments.runner.pictures import before_and_after
 from experiments.runner.recorded import RecordedSystem, begin_with, read_log
-from experiments.runner.training import Training, opened, scores
+from experiments.runner.training import Record, Training, opened, scores
 from sgft_jax import api
+from sgft_jax.analysis import figures, tables
+from sgft_jax.analysis.curves import Curve, deepest_fall, describe
+from sgft_jax.analysis.reading import read_curve
 from sgft_jax.api import Setup
 from sgft_jax.datasets.logs import Log
+from sgft_jax.io.log import EVAL, check_finite, read_jsonl, write_summary
 from sgft_jax.io.priors import digest, load_priors, observed_by
+from sgft_jax.io.real import RealStore
 from sgft_jax.methods import get_method
 from sgft_jax.stacking import join, member, part
 from sgft_jax.systems.simulated import KnownSystem, System
@@ -30,10 +37,12 @@ from sgft_jax.train import finetuning
 from sgft_jax.train.finetuning import FinetuneProgress
 from sgft_jax.train.learner_process import LearnerProcess
 from sgft_jax.train.options import card_of
-from sgft_jax.types import Finetuner, Online, Prior
+from sgft_jax.types import Finetuner, Metrics, Online, Prior
 
 if TYPE_CHECKING:
     from experiments.runner.finetune_args import FinetuneArgs
+
+EVALUATION = "evaluation"  # the folder of episodes that evaluations on a real system have cost
 
 
 def run(
@@ -69,17 +78,15 @@ def run(
             "successors": [log.facts.successors for log in logs],
         }
         begun = last.enter_context(opened("finetune", args, homes, inputs))
-        known = sum(log.facts.transitions for log in logs)
-        record = functools.partial(FinetuneRecord, costly=stepped, logged=known)
+        record = functools.partial(FinetuneRecord, costly=stepped, logged=sum(log.facts.transitions for log in logs))
         assert isinstance(setup.system, KnownSystem)
         world = setup.system.env
         records = [record(x, world, gap, method.name, seeds) for x, gap in zip(begun, systems, strict=True)]
         learner = None
         if real_systems.is_robot(args.real[0]):
             prior = jax.device_get(priors[0]) if priors else None
-            again = functools.partial(
-                build, args.task, args.impl, args.method, dict(vars(args.options)), observed_by(folders), prior
-            )
+            named = args.task, args.impl, args.method, dict(vars(args.options))
+            again = functools.partial(build, *named, observed_by(folders), prior)
             which = finetuning.prior_of(setup.priors, setup.seeds)
             learner = LearnerProcess(again, setup.seeds, which, setup.simulated)
             last.callback(learner.close)
@@ -105,6 +112,96 @@ def build(
     cli.set_up()
     chosen = get_method(method)
     return chosen.build(chosen.config(**options), prior, envs.make(task, impl, **observed))
+
+
+def evaluation_store(folder: Path, done: int) -> RealStore:
+    """The episodes of a run's evaluation after so many rollouts, where they are real ones."""
+    return RealStore(folder / EVALUATION / f"rollouts-{done:06d}")
+
+
+class FinetuneRecord(Record):
+    """The files of a run on one real system.
+
+    costly: whether evaluations are played on the real system and cost transitions; simulated ones are free.
+    logged: real transitions that every seed began with and nobody has played here.
+    """
+
+    def __init__(
+        self, folder: Path, env: Env, gap: Gap, method: str, seeds: list[int], *, costly: bool = False, logged: int = 0
+    ) -> None:
+        super().__init__(folder, {"kind": "finetune", "task": env.name, "method": method, "seeds": seeds})
+        self.logged, self.costly = logged, costly
+        self.played = self.evaluated = np.zeros(len(seeds), int)  # [S] real transitions of rollouts, of evaluations
+        self.env, self.gap, self.method, self.real = env, gap, method, RealStore(folder)
+
+    def restore(self, like: FinetuneProgress, step: int) -> tuple[FinetuneProgress, dict[str, Any]]:
+        """The state of a checkpoint, to which the logs are cut back. What the robot did stays."""
+        progress, meta = super().restore(like, step)
+        self.played, self.evaluated = np.asarray(progress.transitions), np.asarray(meta["evaluated"])
+        return progress, meta
+
+    def metrics(self, done: int, values: Mapping[str, np.ndarray]) -> None:
+        """A line of one learning phase; raises DivergedError where a number is not finite though something learned."""
+        idle = values.get("updates", np.ones(len(self.seeds))) == 0
+        known = {name: np.where(idle, 0.0, x) for name, x in values.items()}
+        check_finite(known, done, unit="rollouts", last_good=self.last_good)
+        self.log.metrics(self._transitions(), {"rollouts": done, **values})
+
+    def evaluation(self, done: int, scores: Metrics, cost: np.ndarray) -> None:
+        """A line of the learning curve. Its step is what lies behind it; what it costs itself counts from then on.
+
+        cost: [S] steps of its episodes.
+        """
+        self.log.eval(self._transitions(), {"rollouts": done, "robot_minutes": self._minutes(), **scores})
+        if self.costly:
+            self.evaluated = self.evaluated + cost
+
+    def save(self, kind: str, params: PyTree, card: Mapping[str, Any]) -> None:
+        """Policies [S], `policy` (the last ones) or `best`, whose cards add to `card`."""
+        env = {"task": self.env.name, "obs_dim": self.env.obs_dim, "act_dim": self.env.act_dim}
+        facts = {"method": self.method, "gap": self.gap._asdict(), "which": kind}
+        self.save_policies(kind, params, lambda seed: {**card, **env, "finetuned": {**facts, "seed": seed}})
+
+    def summarise(self, done: int, best: Mapping[str, np.ndarray]) -> dict[str, Any]:
+        """summary.json, the learning curve and the closing words; the log ends here.
+
+        done: rollouts. best: of the best policies by real evidence, [S] each: `evidence`, `rollouts`, and `score` in
+        an evaluation of their own, where there was one.
+        """
+        self.log.close()
+        env, evaluated = self.env, read_jsonl(self.folder / EVAL) if (self.folder / EVAL).exists() else []
+        curve = read_curve(self.folder).of(env.score) if evaluated else None
+        far = {"rollouts": done, "transitions": self._transitions(), "robot_minutes": self._minutes()}
+        numbers = {"final": far, "seeds": len(self.seeds)} if curve is None else describe(curve)
+        about = {"task": env.name, "method": self.method, "impl": env.impl, "gap": self.gap._asdict()}
+        summary = about | {"score": env.score} | numbers | {"best": {k: x.tolist() for k, x in best.items()}}
+        if self.logged:
+            summary["logged"] = self.logged
+        if self.costly:  # all steps of the real system that are on disk, those of evaluations included
+            stores = [self.real, *(RealStore(folder) for folder in sorted((self.folder / EVALUATION).glob("*")))]
+            steps = [store.rollout(i)["valid"].sum(1) for store in stores for i in range(len(store))]
+            summary["real_steps"] = np.sum(steps, axis=0).tolist()
+        write_summary(self.folder, summary)
+        if curve is not None:
+            self._show(curve, best.get("score"))
+        return summary
+
+    def _show(self, curve: Curve, best: np.ndarray | None) -> None:
+        """The learning curve as a figure and in words. best: [S] scores of the best policies."""
+        score, title = self.env.score, f"{self.env.name} on the {self.gap.name} real system"
+        figures.learning_curves(self.folder / "figures" / "score.png", {self.method: [curve]}, title=title)
+        before, after = (tables.middle(curve, curve.values[:, i]) for i in (0, -1))
+        chosen = "" if best is None else f"; best policy by the training rollouts {tables.plain(best.mean(), score)}"
+        fall = f"deepest fall below the start {tables.plain(deepest_fall(curve), score)}"
+        change = f"{before} before -> {after} after {curve.x[-1]} rollouts"
+        print(f"{self.gap.name}: {tables.words(score)} on the real system {change}; {fall}{chosen}")
+
+    def _transitions(self) -> int:
+        """Real transitions of a seed so far, those that evaluations have cost included; the mean where seeds differ."""
+        return round(float(np.mean(self.played + self.evaluated)))
+
+    def _minutes(self) -> float:
+        return self._transitions() * self.env.control_dt / 60
 
 
 def evaluates(args: "FinetuneArgs", before: int, done: int) -> bool:
@@ -161,8 +258,6 @@ class _Run(Training):
         steps = finetuning.finetune(*setup, rollouts=args.rollouts, learner=learner, progress=progress, **how)
         return self._finish(self.follow(steps, done))
 
-    # ------------------------------------------------------------ between rollouts
-
     def done(self, state: FinetuneProgress) -> int:
         return int(state.rollouts)
 
@@ -171,7 +266,8 @@ class _Run(Training):
         for record, (metrics, transitions) in self.each((values, np.asarray(state.transitions))):
             record.played = transitions
             record.metrics(done, metrics)
-            record.time(done, seconds)
+            with open(record.folder / "timing.jsonl", "a") as file:  # apart: metrics must not depend on the clock
+                file.write(json.dumps({"rollouts": done, "time/rollout_s": round(seconds, 3)}) + "\n")
         real = values.get("real/score")
         return {} if real is None else {f"{self.system.env.score}, exploring": float(real.mean())}
 
@@ -198,8 +294,6 @@ class _Run(Training):
         step = done + finetuning.offline_parts(self.finetuner, int(state.offline))
         for i, record in enumerate(self.records):
             record.checkpoint(_part(state, i, self.count), step, rollouts=done, evaluated=record.evaluated.tolist())
-
-    # ------------------------------------------------------------ what stays
 
     def _finish(self, progress: FinetuneProgress) -> list[dict[str, Any]]:
         """Policies, summaries, figures and films."""

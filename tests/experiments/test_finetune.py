@@ -25,7 +25,7 @@ from envs.types import Transition, UserError
 from experiments import evaluate, finetune
 from experiments.runner import finetune_run, pictures
 from experiments.runner.finetune_args import FinetuneArgs, arguments, run_folder
-from experiments.runner.finetune_record import FinetuneRecord
+from experiments.runner.finetune_run import FinetuneRecord
 from experiments.runner.recorded import RecordedSystem
 from sgft_jax import api
 from sgft_jax.algorithms import make_policy
@@ -54,7 +54,7 @@ import os, signal, sys
 import envs
 envs.TASKS["toy"] = "toy"
 from experiments import finetune
-from experiments.runner.finetune_record import FinetuneRecord
+from experiments.runner.finetune_run import FinetuneRecord
 from sgft_jax.train import finetuning
 from sgft_jax.io.real import RealStore
 def die():
