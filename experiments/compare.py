@@ -20,10 +20,11 @@ from typing import Literal
 from envs import extend, gaps
 from envs.gaps import SIM
 from envs.types import UserError, unknown
+from experiments import hybrid
 from experiments.figures import FiguresArgs, figures
-from experiments.runner import cli, grid, hybrid_args, options, tuned
+from experiments.hybrid import HybridArgs, SchedulePreset, data_name
+from experiments.runner import cli, grid, options, tuned
 from experiments.runner.grid import FINETUNING, Cell, GridArgs, Kind, WorkArgs, check_begun, look_up, work
-from experiments.runner.hybrid_args import HybridArgs, SchedulePreset, data_name
 from experiments.runner.options import FirstSeed
 from sgft_jax.analysis.curves import Curve
 from sgft_jax.analysis.hybrid import Results, ranks, summary
@@ -121,7 +122,7 @@ class _HybridCells:
     schedule: Schedule = field(default_factory=Schedule)
     score: Literal["late", "last"] = "late"
     """What tables show of a run: the mean of its last ten evaluations, or its last one."""
-    reference: str = hybrid_args.DEFAULT
+    reference: str = hybrid.DEFAULT
     """Compare the others with this METHOD or METHOD:PRESET."""
     export: Path | None = None
     """Instead of running, write what has finished into hybrid.csv in this folder, which --released reads back."""
@@ -200,14 +201,14 @@ def _title(args: HybridArgs) -> str:
 
 def _system(args: HybridArgs) -> str:
     """The one simulator, or what stands for none."""
-    return hybrid_args.gaps_of(args, get_method(args.method, "fixed"))[0]
+    return hybrid.gaps_of(args, get_method(args.method, "fixed"))[0]
 
 
 HYBRID_RUNS = Kind(
     name="hybrid",
     systems="gap",
-    run=lambda args: hybrid_args.hybrid(args),
-    folder=lambda args: hybrid_args.run_folder(args, _system(args)),
+    run=lambda args: hybrid.hybrid(args),
+    folder=lambda args: hybrid.run_folder(args, _system(args)),
     config=lambda args: jsonable(args) | {"gap": _system(args)},
     title=_title,
     volatile=HybridArgs.volatile,
@@ -261,7 +262,7 @@ def _runs(args: HybridGridArgs, method: str, data: Path | None) -> list[HybridAr
     shared += ("eval_episodes", "impl", "out")
     common = {name: getattr(args, name) for name in shared}
     data = None if kind == "simulator" else data
-    run = hybrid_args.arguments(name, preset=preset, variant=preset, data=data, video=False, **common)
+    run = hybrid.arguments(name, preset=preset, variant=preset, data=data, video=False, **common)
     return [replace(run, gap=(gap,)) for gap in ((SIM,) if kind == "offline" else args.gaps)]
 
 

@@ -36,7 +36,7 @@ from sgft_jax.train.fleet import FleetState
 from sgft_jax.types import Fixed, RealData
 
 if TYPE_CHECKING:
-    from experiments.runner.hybrid_args import HybridArgs
+    from experiments.hybrid import HybridArgs
 
 
 def run(

@@ -9,8 +9,8 @@ import pytest
 
 from envs.types import UserError
 from experiments import compare
-from experiments.runner import cli, hybrid_args
-from experiments.runner.hybrid_args import run_folder
+from experiments.hybrid import run_folder
+from experiments.runner import cli
 from sgft_jax.analysis import figures
 from sgft_jax.files.disk import jsonable
 from sgft_jax.io.runs import FORMAT
@@ -28,7 +28,7 @@ def ran(monkeypatch):
         for i, gap in enumerate(args.gap):
             leave(replace(args, gap=(gap,)), [100.0 * i + 10 * seed for seed in range(args.seeds)])
 
-    monkeypatch.setattr(hybrid_args, "hybrid", hybrid)
+    monkeypatch.setattr(compare.hybrid, "hybrid", hybrid)
     monkeypatch.setattr(cli, "set_up", lambda: None)
     return seen
 

@@ -12,7 +12,7 @@ import sgft_jax
 from envs import normalised
 from envs.types import UserError
 from experiments import hybrid
-from experiments.runner.hybrid_args import data_name, run_folder
+from experiments.hybrid import data_name, run_folder
 from experiments.runner.hybrid_run import in_words, intervals
 from sgft_jax.analysis import figures
 from sgft_jax.io.log import MetricsLog, read_jsonl
