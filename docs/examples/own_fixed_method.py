@@ -20,11 +20,10 @@ class Config(ActorCriticOptions):
 
 def build(config: Config, task: Task) -> HybridAgent:
     """Which learner it is, and what its batches are made of."""
-    from sgft_jax import NetworkConfig, SACConfig, make_sac
     from sgft_jax.data import sources
+    from sgft_jax.learners.sac import SACConfig, make_sac
 
-    network = NetworkConfig(config.hidden)
-    structure = SACConfig(task.obs_dim, task.act_dim, network=network, train_value=False, train_dynamics=False)
+    structure = SACConfig(task.obs_dim, task.act_dim, config.network, train_value=False, train_dynamics=False)
     batches = sources.two_buffers(config.rows, config.rows)
     return agent_of(make_sac(structure, sac_numbers(config)), config, task, batches, simulates=True)
 

@@ -37,15 +37,13 @@ class H2OPlusConfig(MixedConfig):
     ratio: weigh simulated errors by the ratio of the dynamics; False counts them like real ones.
     """
 
-    critics: int = 2
-    diversity: float = 0.0
+    critics: checks.Count = 2
+    diversity: checks.NotNegative = 0.0
     value_loss: ValueLoss = "iql"
     ratio: bool = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.at_least(self, 1, "critics")
-        checks.not_negative(self, "diversity")
         if self.diversity and self.critics < 2:
             raise checks.refusal("critics", self.critics, "at least 2, or diversity 0")
         if self.value_loss not in (known := get_args(ValueLoss)):

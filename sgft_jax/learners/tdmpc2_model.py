@@ -27,7 +27,7 @@ NETWORKS = ("encoder", "dynamics", "reward", "policy", "critic")
 
 
 @dataclass(frozen=True)
-class TDMPC2Config:
+class TDMPC2Config(checks.Checked):
     """The structure of an agent.
 
     obs_dim, act_dim: sizes of what the environment gives and takes. horizon: steps of plans and of training windows.
@@ -39,13 +39,13 @@ class TDMPC2Config:
         and teaches the policy; dynamics, reward head and policy learn. False: everything learns, as published.
     """
 
-    obs_dim: int
-    act_dim: int
-    horizon: int = 3
+    obs_dim: checks.Count
+    act_dim: checks.Count
+    horizon: checks.Count = 3
     size: Size = SIZES["5M"]
-    simnorm_group: int = 8
+    simnorm_group: checks.Count = 8
     bins: twohot.Bins = field(default_factory=twohot.Bins)
-    dropout: float = 0.01
+    dropout: checks.BelowOne = 0.01
     samples: int = 512
     elites: int = 64
     policy_samples: int = 24
@@ -53,8 +53,7 @@ class TDMPC2Config:
     sgft: bool = False
 
     def __post_init__(self) -> None:
-        checks.at_least(self, 1, "obs_dim", "act_dim", "horizon", "simnorm_group")
-        checks.below_one(self, "dropout")
+        super().__post_init__()
         if self.size.latent % self.simnorm_group:
             raise UserError(f"TD-MPC2 latent size {self.size.latent}: not a multiple of {self.simnorm_group=}")
         if self.size.members < 2:
