@@ -10,6 +10,8 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import jax
+import jax.numpy as jnp
 import pytest
 
 import envs
@@ -86,6 +88,23 @@ def first_example():
     return re.search(r"```python\n(.*?)```", (HOOK.parent.parent / "docs/api.md").read_text(), re.S).group(1)
 
 
+def test_a_users_own_loop_calls_the_library_as_it_is():
+    """Its functions traced, not compiled: states and losses have the shapes that the page shows."""
+    scope = {}
+    exec(compile(first_example().partition("\nrng, ")[0], "docs/api.md", "exec"), scope)
+    seeds, updates, rows = (scope[name] for name in ("SEEDS", "UPDATES", "ROWS"))
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), (updates, seeds)))
+    one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), keys)
+    states = jax.eval_shape(jax.vmap(lambda key: scope["sac"].init(scope["config"], key)), one)
+    action, _ = jax.eval_shape(scope["act"], states, (), jax.ShapeDtypeStruct((seeds, 2), "float32"), one)
+    shapes = {"obs": (2,), "action": (2,), "reward": (), "discount": (), "next_obs": (2,)}
+    rows_of = {name: jax.ShapeDtypeStruct((updates, seeds, rows, *shape), "float32") for name, shape in shapes.items()}
+    after, metrics = jax.eval_shape(scope["learn"], states, scope["Batch"](**rows_of), keys)
+    assert action.shape == (seeds, 2) and metrics["critic/loss"].shape == (updates, seeds)
+    assert jax.tree.map(jnp.shape, after) == jax.tree.map(jnp.shape, states)
+
+
+@pytest.mark.slow
 def test_a_users_own_loop_learns(capsys):
     """Twenty lines beside the imports, compiled once: losses of four seeds, which differ."""
     scope = {}

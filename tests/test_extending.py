@@ -87,15 +87,12 @@ def test_the_task_can_be_solved_and_overshot(key):
     env = envs.make(TASK)
     pool = envs.sample_worlds(env, key, 4)
 
-    def careful(carry, obs, key):
-        return jnp.clip(3 * (0.3 - obs[1:2]), -1, 1), carry
+    def act(careful, obs, key):
+        return jnp.where(careful, jnp.clip(3 * (0.3 - obs[1:2]), -1, 1), 1.0), careful
 
-    def hasty(carry, obs, key):
-        return jnp.ones(1), carry
-
-    for policy, expected in ((careful, 1.0), (hasty, 0.0)):
-        play = jax.jit(jax.vmap(lambda key, p=policy: envs.play_episode(env, pool, p, (), key, gamma=0.9)))
-        episodes = play(jax.random.split(key, 4))
+    play = jax.jit(jax.vmap(lambda careful, key: envs.play_episode(env, pool, act, careful, key, gamma=0.9)))
+    for careful, expected in ((True, 1.0), (False, 0.0)):
+        episodes = play(jnp.full(4, careful), jax.random.split(key, 4))
         assert episodes.success.mean() == expected and not episodes.exploded.any()
 
 
@@ -154,6 +151,7 @@ def test_the_method_keeps_the_settings_of_sgft_sac(prior, monkeypatch):
     assert get_method(METHOD).config().clip_shaped == sgft_sac.Config().clip_shaped == 2.0
 
 
+@pytest.mark.slow
 def test_the_method_runs_alone(capsys):
     extend.load("method", METHOD, "METHOD").main()
     assert re.search(r"mean shaped reward -?\d\.\d+, critic loss \d", capsys.readouterr().out)

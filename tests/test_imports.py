@@ -6,8 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 HEAVY = ("jax", "flax", "mujoco", "matplotlib", "scipy", "orbax")
 COMMANDS = (
     "pretrain",
@@ -118,43 +116,71 @@ def test_no_files_import_each_other_in_a_ring():
     assert [sorted(ring) for ring in rings] == []
 
 
-def imported(program):
-    """The heavy ones among the modules that a fresh interpreter has imported after `program`."""
-    code = f"import sys\n{program}\nprint(*[name for name in {HEAVY} if name in sys.modules])"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return done.stdout.splitlines()[-1].split()
+def imported(*programs):
+    """Of each program the heavy ones among the modules that it imports, in a process of its own.
+
+    All are forks of one interpreter that has imported what every command line imports, which is light itself.
+    """
+    code = f"""
+import os, sys
+import experiments.runner.cli
+for program in sys.argv[1:]:
+    sys.stdout.flush()
+    child = os.fork()
+    if not child:
+        said, sys.stdout, ok = sys.stdout, open(os.devnull, "w"), 1
+        try:
+            exec(program, {{}})
+            print(*[name for name in {HEAVY} if name in sys.modules], file=said, flush=True)
+            ok = 0
+        finally:
+            os._exit(ok)
+    if os.waitpid(child, 0)[1]:
+        sys.exit(f"failed: {{program}}")
+"""
+    done = subprocess.run([sys.executable, "-c", code, *programs], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return [line.split() for line in done.stdout.splitlines()]
 
 
-@pytest.mark.parametrize("module", LIGHT)
-def test_modules_that_define_options_are_light(module):
-    assert imported(f"import {module}") == []
+def test_modules_that_define_options_are_light():
+    heavy = imported(*(f"import {module}" for module in LIGHT))
+    assert dict(zip(LIGHT, heavy, strict=True)) == {module: [] for module in LIGHT}
 
 
-def ends(command, *argv, code):
-    """What a command imports until it ends with that exit code. command: with its subcommand if it has one."""
+def ending(command, *argv, code):
+    """A program that is a command until it ends with that exit code. command: with its subcommand if it has one."""
     module, *more = command.split()
-    return imported(
-        f"import runpy; sys.argv = {['x', *more, *argv]}\n"
+    return (
+        f"import runpy, sys; sys.argv = {['x', *more, *argv]}\n"
         f"try: runpy.run_module('experiments.{module}', run_name='__main__')\n"
-        f"except SystemExit as stopped: assert (stopped.code or 0) == {code}"
+        f"except SystemExit as stopped: assert (stopped.code or 0) == {code}, stopped.code\n"
+        "else: raise AssertionError('it went on')"
     )
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_starts_neither_jax_nor_mujoco(command):
-    assert ends(command, "--help", code=0) == []
+def test_help_starts_neither_jax_nor_mujoco():
+    heavy = imported(*(ending(command, "--help", code=0) for command in COMMANDS))
+    assert dict(zip(COMMANDS, heavy, strict=True)) == {command: [] for command in COMMANDS}
 
 
-@pytest.mark.parametrize("command", MISTAKES)
-def test_mistakes_are_found_without_jax_or_mujoco(command, tmp_path):
-    assert ends(command, *MISTAKES[command].split(), "--out", str(tmp_path), code=2) == []
+def test_mistakes_are_found_without_jax_or_mujoco(tmp_path):
+    programs = [ending(command, *words.split(), "--out", str(tmp_path), code=2) for command, words in MISTAKES.items()]
+    assert dict(zip(MISTAKES, imported(*programs), strict=True)) == {command: [] for command in MISTAKES}
     assert not list(tmp_path.iterdir())
 
 
 def test_the_list_of_commands_is_light():
-    assert imported("from experiments import __main__; __main__.main([])") == []
+    assert imported("from experiments import __main__; __main__.main([])") == [[]]
 
 
 def test_a_public_name_is_imported_when_it_is_used():
-    assert imported("import sgft_jax; sgft_jax.NetworkConfig") == []
-    assert "jax" in imported("import sgft_jax; sgft_jax.learners.sac")
+    """What is light needs no JAX; a learner is looked for when it is named, and misses it."""
+    light = "import sgft_jax; sgft_jax.NetworkConfig"
+    learner = (
+        f"import sys; sys.modules['jax'] = None; {light}\n"
+        "try: sgft_jax.learners.sac\n"
+        "except ImportError: del sys.modules['jax']\n"
+        "else: raise AssertionError('JAX was not wanted')"
+    )
+    assert imported(light, learner) == [[], []]

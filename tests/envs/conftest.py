@@ -8,10 +8,10 @@ import envs
 from envs.base import EnvState
 
 
-@pytest.fixture(scope="session")
-def pushing() -> Bench:
+@pytest.fixture(scope="session", params=["c", pytest.param("jax", marks=pytest.mark.slow)])
+def pushing(request) -> Bench:
     """Four worlds that differ in mass, friction and stiffness."""
-    env = envs.make("push")
+    env = envs.make("push", request.param)
     ranges = {"object_mass": [0.1, 0.3], "servo_stiffness": [0.8, 1.2], "finger_friction": [0.3, 0.6]}
     return bench(env, envs.sample_worlds(env, jax.random.key(7), 4, params=ranges, effects=EXACT))
 

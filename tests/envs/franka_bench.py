@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from compiled import compiled
 
 from envs.base import Env, World
 from envs.franka import hammer, insert, push
@@ -25,7 +26,8 @@ class Bench(NamedTuple):
 
 
 def bench(env: Env, worlds: World) -> Bench:
-    return Bench(env, worlds, jax.jit(env.reset), jax.jit(_lenient(env.step)), jax.jit(jax.vmap(_lenient(env.step))))
+    env = compiled(env)
+    return Bench(env, worlds, env.reset, jax.jit(_lenient(env.step)), jax.jit(jax.vmap(_lenient(env.step))))
 
 
 def _lenient(function: Callable) -> Callable:

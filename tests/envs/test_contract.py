@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import compiled
 from franka_bench import SCENES, member
 
 import envs
@@ -16,7 +17,7 @@ ACTIONS = jnp.array([[1.0, 0.0], [0.3, -1.0], [-0.5, 0.5], [1.0, 1.0]])
 
 @pytest.mark.parametrize("name", SCENES)
 def test_description_fits_observations(name):
-    env = make_env(SCENES[name])
+    env = compiled(make_env(SCENES[name], "c"))
     world = member(envs.sample_worlds(env, jax.random.key(0), 1), 0)
     state = env.reset(world, jax.random.key(1))
     assert state.obs.shape == (env.obs_dim,) == (sum(e.size for e in env.observation),)
@@ -48,7 +49,7 @@ def test_step_of_a_batch_is_the_steps_of_its_members(pushing, started):
 
 def test_reward_is_a_function_of_true_observations(pushing, started):
     after = pushing.step_batch(pushing.worlds, started, ACTIONS, KEYS)
-    wanted = jax.vmap(pushing.env.reward)(started.true_obs, ACTIONS, after.true_obs)
+    wanted = jax.jit(jax.vmap(pushing.env.reward))(started.true_obs, ACTIONS, after.true_obs)
     np.testing.assert_allclose(after.reward, wanted, atol=1e-6)
 
 
@@ -73,7 +74,7 @@ def test_success_counts_at_the_end_or_at_any_time(pushing, started):
     was = started._replace(success=jnp.array([True] * 4))
     assert not pushing.step_batch(pushing.worlds, was, ACTIONS, KEYS).success.any()
     cart = cartpole.SCENE._replace(success_anytime=True)
-    env = make_env(cart, "jax")
+    env = compiled(make_env(cart, "c"))
     world = member(envs.sample_worlds(env, jax.random.key(0), 1), 0)
     state = env.reset(world, jax.random.key(1))
     for before in (True, False):

@@ -45,7 +45,8 @@ def test_rotation_leaves_z_alone():
 def test_noisy_commands_are_clipped_and_exact_ones_are_not():
     """Of the second entry alone; the first one, which is too large, stays as it is."""
     own = effects(action_noise=[0.0, 0.5])
-    shaken = jax.vmap(env_effects.shake, (None, None, 0))(own, jnp.array([1.4, 0.2]), jax.random.split(KEY, 4000))
+    shake = jax.jit(jax.vmap(env_effects.shake, (None, None, 0)))
+    shaken = shake(own, jnp.array([1.4, 0.2]), jax.random.split(KEY, 4000))
     assert set(shaken[:, 0].tolist()) == {np.float32(1.4)}
     noisy = np.asarray(shaken[:, 1])
     assert noisy.max() == 1.0 and noisy.min() == -1.0
@@ -55,7 +56,7 @@ def test_noisy_commands_are_clipped_and_exact_ones_are_not():
 
 
 def test_bias_and_noise_of_measurements():
-    measure = jax.vmap(env_effects.measure, (None, None, 0))
+    measure = jax.jit(jax.vmap(env_effects.measure, (None, None, 0)))
     keys = jax.random.split(KEY, 4000)
     noisy = measure(effects(obs_noise=0.1, obs_noise_prob=0.25, obs_bias=[0.0, 1.0, -1.0]), jnp.zeros(3), keys)
     error = np.asarray(noisy) - [0.0, 1.0, -1.0]
@@ -84,7 +85,7 @@ def test_without_a_ramp_the_command_is_there_at_once_or_after_the_latency():
 def test_jitter_spreads_the_latency_and_never_foresees():
     jittery = effects(latency=0.02, latency_jitter=0.04)
     zero, one = jnp.zeros(1), jnp.ones(1)
-    at_ramp_end = jax.vmap(lambda key: ramp(jittery, zero, one, key)(19))  # t = 0.1 s
+    at_ramp_end = jax.jit(jax.vmap(lambda key: ramp(jittery, zero, one, key)(19)))  # t = 0.1 s
     progress = np.asarray(at_ramp_end(jax.random.split(KEY, 500)))
     # start = clip(0.02 + [-0.04, 0.04], 0) is in [0, 0.06]; progress = 1 - start / 0.1, and a quarter starts at 0
     assert 0.4 <= progress.min() < 0.43 and progress.max() == 1.0

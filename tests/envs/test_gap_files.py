@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 import toy
+from compiled import compiled
 
 import envs
 from envs import effects, gaps
@@ -13,7 +14,7 @@ from envs.gaps import Gap
 from envs.mujoco.scene import make_env
 from envs.types import UserError
 
-ENV = toy.make()
+ENV = compiled(toy.make())
 
 
 def test_a_dict_is_what_a_file_would_hold(tmp_path):
@@ -36,7 +37,7 @@ def test_ranges_of_vectors(tmp_path):
     )
     worlds = gaps.worlds(ENV, gap, jax.random.key(0))
     assert worlds.theta.params.shape == (1, 2)  # no parameter varies: one world will do
-    drawn = jax.vmap(lambda key: ENV.reset(jax.tree.map(lambda x: x[0], worlds), key))(
+    drawn = jax.jit(jax.vmap(lambda key: ENV.reset(jax.tree.map(lambda x: x[0], worlds), key)))(
         jax.random.split(jax.random.key(0), 9)
     )
     assert (drawn.effects.action_bias[:, 0] == 0).all() and len(set(drawn.effects.action_bias[:, 1].tolist())) == 9

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
+from compiled import compiled
 
 import envs
 from envs.base import Varying
@@ -15,7 +16,7 @@ from envs.types import UserError
 TOY = toy.make()
 EFFECTS = {"action_scale": [[0.5, 1.0], [1.5, 1.0]], "action_rotation": [-0.4, 0.4], "obs_noise": 0.01}
 SYSTEM = varying(TOY, {"friction": 4.0}, EFFECTS)
-SEEN = with_system(with_previous_actions(TOY, 1), SYSTEM)
+SEEN = compiled(with_system(with_previous_actions(TOY, 1), SYSTEM))
 
 
 def world(effects, params=None):
@@ -56,7 +57,10 @@ def test_a_real_system_tells_the_middle_and_is_the_same_otherwise(key):
     def steer(carry, obs, key):
         return jnp.tanh(-obs[:2]), carry
 
-    open_, silent = (play_episode(env, pool, steer, (), key, gamma=0.9) for env in (SEEN, concealed(SEEN)))
+    def play(env):
+        return jax.jit(lambda: play_episode(env, pool, steer, (), key, gamma=0.9))()
+
+    open_, silent = play(SEEN), play(concealed(SEEN))
     np.testing.assert_array_equal(silent.transitions.next_obs[:, -3:], 0.0)
     np.testing.assert_array_equal(open_.transitions.obs[:, :-3], silent.transitions.obs[:, :-3])
     np.testing.assert_array_equal(open_.transitions.reward, silent.transitions.reward)
@@ -64,23 +68,30 @@ def test_a_real_system_tells_the_middle_and_is_the_same_otherwise(key):
 
 def test_noise_is_on_what_is_told_alone_and_new_at_every_step(key):
     there, noisy = world({"action_scale": [0.75, 1.0], "action_rotation": 0.0}, {"mass": 1.1}), blurred(SEEN, 0.3)
-    states = [noisy.reset(there, key)]
-    for i in range(400):
-        states.append(noisy.step(there, states[-1], jnp.zeros(2), jax.random.fold_in(key, i)))
-    told = np.array([state.obs[-3:] for state in states])
+
+    @jax.jit
+    def play(key):
+        def step(state, key):
+            after = noisy.step(there, state, jnp.zeros(2), key)
+            return after, after
+
+        return jax.lax.scan(step, noisy.reset(there, key), jax.random.split(key, 400))[1]
+
+    states = play(key)
+    told = np.asarray(states.obs)[:, -3:]
     np.testing.assert_allclose(told.mean(axis=0), [0.5, -0.5, 0.0], atol=0.07)
     np.testing.assert_allclose(told.std(axis=0), 0.3, atol=0.05)
-    assert jnp.abs(states[-1].true_obs[: TOY.obs_dim] - states[-1].obs[: TOY.obs_dim]).max() < 0.1
+    assert np.abs(states.true_obs[-1, : TOY.obs_dim] - states.obs[-1, : TOY.obs_dim]).max() < 0.1
 
 
 def test_the_simulator_says_what_a_recorded_step_does_in_the_system_that_is_told(key):
     """With a bias of the sensors, and whatever the step's own noise was."""
     biased = {**EFFECTS, "obs_bias": [[0.0] * 4, [0.2] * 4], "latency_jitter": [0.0, 0.02]}
-    env = with_system(with_previous_actions(TOY, 1), varying(TOY, {}, biased))
+    env = compiled(with_system(with_previous_actions(TOY, 1), varying(TOY, {}, biased)))
     there = jax.tree.map(lambda x: x[0], envs.sample_worlds(env, key, 1, effects=biased | {"obs_noise": 0.0}))
     before, action = env.reset(there, key), jnp.array([0.6, -0.9])
     expected = (env.step(there, before, action, key).obs - before.obs)[: env.measured_dim]
-    change = env.simulator()
+    change = jax.jit(env.simulator())
     np.testing.assert_allclose(change(before.obs, action), expected, atol=1e-5)
     other = before.obs.at[-len(env.system) :].add(0.3)
     assert jnp.abs(change(other, action) - expected).max() > 1e-2

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import toy
 import toy_terminating
+from compiled import compiled
 
 import envs
 from envs.gaps import Gap
@@ -34,7 +35,7 @@ def push(carry, obs, key):
 
 
 def test_an_episode_in_a_stacked_pool_is_that_in_the_pool_alone(key):
-    env = toy.make()
+    env = compiled(toy.make())
     stacked = jax.tree.map(lambda x: x.reshape(2, 5, *x.shape[1:]), envs.sample_worlds(env, key, 10))
     assert pool_size(stacked) == 5
     play = functools.partial(play_episode, env, act=push, carry=(), gamma=1.0, length=2)
@@ -57,7 +58,7 @@ def counting(carry, obs, key):
 @pytest.fixture(scope="module")
 def episodes():
     """[N] episodes of `counting`, of which most end early."""
-    env = toy_terminating.make()
+    env = compiled(toy_terminating.make())
     pool = envs.sample_worlds(env, jax.random.key(0), 1)
     keys = jax.random.split(jax.random.key(1), N)
     return jax.jit(jax.vmap(lambda key: play_episode(env, pool, counting, jnp.int32(0), key, gamma=0.9)))(keys)
@@ -85,13 +86,14 @@ def test_return_and_score_count_up_to_the_end(episodes):
 
 
 def test_what_is_judged_by_success_scores_success(key):
-    env = toy.make()
+    env = compiled(toy.make())
     pool = envs.sample_worlds(env, key, 1, effects={"obs_noise": 0.0})
 
     def brake(carry, obs, key):
         return jnp.clip(-3 * obs[:2] - obs[2:], -1, 1), carry
 
-    played = jax.vmap(lambda key: play_episode(env, pool, brake, (), key, gamma=1.0))(jax.random.split(key, 8))
+    play = jax.jit(jax.vmap(lambda key: play_episode(env, pool, brake, (), key, gamma=1.0)))
+    played = play(jax.random.split(key, 8))
     assert played.success.any()
     np.testing.assert_array_equal(played.score, played.success.astype(jnp.float32))
     np.testing.assert_array_equal(played.trace[:, 1:, :], played.transitions.next_obs[..., :2])
@@ -99,23 +101,23 @@ def test_what_is_judged_by_success_scores_success(key):
 
 def test_an_explosion_after_the_end_is_none(key):
     """The simulator goes on unseen after a termination; what it does then does not count."""
-    env = toy_terminating.make()
+    env = compiled(toy_terminating.make())
 
     def step(*inputs):
         after = env.step(*inputs)
         return after._replace(invalid=after.time > 1)
 
     late = env._replace(step=step)
+    play = jax.jit(lambda pool: play_episode(late, pool, counting, jnp.int32(0), key, gamma=1.0))
     for risk, exploded in ((1.0, False), (0.0, True)):
-        pool = envs.sample_worlds(env, key, 1, params={"risk": risk})
-        played = play_episode(late, pool, counting, jnp.int32(0), key, gamma=1.0)
+        played = play(envs.sample_worlds(env, key, 1, params={"risk": risk}))
         assert bool(played.exploded) == exploded and played.valid.sum() == 1
 
 
 @pytest.fixture(scope="module")
 def costly():
     """Five episodes in which each step costs 1; all but one of them explode, later and later, one at once."""
-    env = toy_terminating.make()
+    env = compiled(toy_terminating.make())
     pool = envs.sample_worlds(env, jax.random.key(0), 1, params={"risk": 0.0})
 
     def play(boom):
@@ -147,7 +149,7 @@ def test_explosions_count_as_the_worst_that_is_known(costly, kind):
 
 def test_a_fleet_starts_episodes_anew_with_their_carry():
     """What `counting` remembers of an environment is always the age of its episode."""
-    env = toy_terminating.make()
+    env = compiled(toy_terminating.make())
     pool = envs.sample_worlds(env, jax.random.key(0), 1, params={"risk": 0.3})
 
     def step(fleet, key):
@@ -157,9 +159,10 @@ def test_a_fleet_starts_episodes_anew_with_their_carry():
         )
         return after, (fleet, after, rows, valid, ended)
 
-    fleet = launch(env, pool, jax.random.key(1), N, jnp.int32(0))
+    fleet = jax.jit(lambda: launch(env, pool, jax.random.key(1), N, jnp.int32(0)))()
     assert fleet.carry.shape == (N,)
-    before, after, rows, valid, ended = jax.lax.scan(step, fleet, jax.random.split(jax.random.key(2), 30))[1]
+    play = jax.jit(lambda fleet: jax.lax.scan(step, fleet, jax.random.split(jax.random.key(2), 30))[1])
+    before, after, rows, valid, ended = jax.tree.map(np.asarray, play(fleet))
     over = np.asarray(ended.terminated | ended.truncated)
     assert over.any(axis=0).all() and not over.all(axis=1).any() and valid.all()
     assert ended.truncated.any() and (ended.terminated & ~ended.truncated).any()
@@ -173,7 +176,7 @@ def test_a_fleet_starts_episodes_anew_with_their_carry():
 
 def test_no_key_is_used_twice_by_fleets_and_episodes(key):
     """Worlds, starts, steps, measurements and resets draw apart, in several steps and in several environments."""
-    env = toy.make()
+    env = compiled(toy.make())
     pool = envs.sample_worlds(env, key, 3)
 
     def act(carry, obs, key):
@@ -195,7 +198,7 @@ def test_no_key_is_used_twice_by_fleets_and_episodes(key):
 
 def test_exploded_environments_of_a_fleet_begin_anew():
     """Also those whose physics is broken for good; the others go on, and no row of an exploded step is valid."""
-    env = toy_terminating.make()
+    env = compiled(toy_terminating.make())
     pool = envs.sample_worlds(env, jax.random.key(0), 1, params={"risk": 0.0})
 
     def step(world, state, action, key):
@@ -204,7 +207,7 @@ def test_exploded_environments_of_a_fleet_begin_anew():
 
     begun = jnp.int32(0)
     fleet = launch(env, pool, jax.random.key(1), 4, begun)
-    advance = functools.partial(step_fleet, env._replace(step=step), pool, initial_carry=begun, gamma=0.9)
+    advance = jax.jit(functools.partial(step_fleet, env._replace(step=step), pool, initial_carry=begun, gamma=0.9))
     for actions in ([-1.0, 1.0, -1.0, -1.0], [-1.0, -1.0, -1.0, 1.0]):
         fleet, rows, valid, _ = advance(fleet, jnp.array(actions)[:, None], fleet.carry + 1, jax.random.key(2))
         np.testing.assert_array_equal(valid, np.array(actions) < 0)
@@ -215,7 +218,7 @@ def test_exploded_environments_of_a_fleet_begin_anew():
 
 
 def test_dicts_are_packed_in_the_declared_order(key):
-    env = toy_terminating.make()
+    env = compiled(toy_terminating.make())
     world = pick(envs.sample_worlds(env, key, 1, params={"risk": 1.0}), jnp.int32(0))
     state = env.step(world, env.reset(world, key), jnp.ones(1), key)
     np.testing.assert_allclose(state.obs, [0.1, 1.0])

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import make
 from franka_bench import EXACT, Bench, bench, member, push_hard
 
 import envs
@@ -40,10 +41,10 @@ def push_softly(way, obs):
     return jnp.clip(jnp.stack([jnp.where(off[0] > way.reach, come, along), off[1]]) / push.STEP, -1.0, 1.0)
 
 
-@pytest.fixture(scope="module", params=NAMES)
+@pytest.fixture(scope="module", params=["push-towel", pytest.param("push-ball", marks=pytest.mark.slow)])
 def real(request) -> Bench:
     """Four worlds of the default real system on MuJoCo's C engine, with exact sensors."""
-    env = envs.make(request.param, "c", NAMES[request.param])
+    env = make(request.param, "c", NAMES[request.param])
     gap = gaps.load(env, "default")
     return bench(env, envs.sample_worlds(env, jax.random.key(7), 4, params=gap.params, effects=EXACT))
 
@@ -67,7 +68,7 @@ def shape(rig, state):
 
 
 def test_real_and_simulated_systems_are_one_task(real):
-    simulated = envs.make(real.env.name, "c")
+    simulated = make(real.env.name, "c")
     for name in ("name", "observation", "action", "parameters", "episode_length", "control_dt", "success_anytime"):
         assert getattr(simulated, name) == getattr(real.env, name)
     assert (simulated.scene, real.env.scene) == ("", NAMES[simulated.name])

@@ -276,6 +276,7 @@ def test_what_else_goes_wrong_in_a_thread_is_said():
     assert ended == 0 and "ZeroDivisionError: division by zero" in said
 
 
+@pytest.mark.slow
 def test_a_checkpoint_that_does_not_fit_is_one_line(tmp_path):
     """A limit on the size of files stands for a disk, which cannot be had everywhere."""
     main = (
@@ -371,6 +372,7 @@ def test_no_cache_when_switched_off():
     assert "JAX_COMPILATION_CACHE_DIR" not in os.environ
 
 
+@pytest.mark.slow
 def test_a_renderer_that_mujoco_cannot_import_is_one_line():
     words = [sys.executable, "-m", "experiments.evaluate", "--task", "hammer", "--prior", "shipped:hammer/seed-0"]
     environment = {**os.environ, "MUJOCO_GL": "crayon"}

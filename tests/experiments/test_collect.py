@@ -8,6 +8,7 @@ import h5py
 import jax
 import numpy as np
 import pytest
+from priors_by_hand import save_prior
 
 from envs.types import Transition, UserError
 from experiments import collect, hybrid
@@ -151,6 +152,14 @@ def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(collect.LEVELS, "toy", -100.0)
     monkeypatch.setattr(logs, "BANDS", {"toy-medium-replay": {"transitions": logs.Band(300, 0.25)}})
     out = tmp_path / "data"
+    play = collect_run._play
+
+    def after_keeping(args, system, policy, params, seed):
+        """What was learned from is on disk already: it is kept if recording fails."""
+        assert (out / f"toy-medium-replay-regenerated-seed-{seed}.hdf5").exists()
+        return play(args, system, policy, params, seed)
+
+    monkeypatch.setattr(collect_run, "_play", after_keeping)
     collect.main([*LEARN, "--out", str(out)])
     said = capsys.readouterr().out
     for seed in (0, 1):
@@ -177,31 +186,31 @@ def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys, monkeypatch):
             assert (own == file["observations"][()]).all(1).mean() > 0.5  # the others were observed with noise
             found = file["infos/action_log_probs"][()]
             assert np.isfinite(found).all() and found.std() > 0.1
-    # what was recorded is what experiments.hybrid learns from
+
+
+@pytest.mark.slow
+def test_what_was_recorded_is_what_hybrid_learns_from(tmp_path):
+    out = tmp_path / "data"
+    collect.main([*LEARN, "--out", str(out)])
     data = out / "toy-medium-replay-regenerated-seed-0.hdf5"
     hybrid.main(
         f"""--task toy --method iql --data {data} --seeds 1 --no-video --schedule.updates 4 --schedule.chunk-updates 2
         --eval-every 2 --eval-episodes 2 --options.hidden 8 --options.rows 8 --out {tmp_path}""".split()
     )
     assert (tmp_path / "hybrid/toy/no-simulator/toy-medium-replay-regenerated-seed-0/iql/seed-0/policy").exists()
-    collect.main(
-        [
-            "--task",
-            "toy",
-            "--transitions",
-            "30",
-            "--out",
-            str(out),
-            "--policy",
-            str(tmp_path / "hybrid/toy/no-simulator/toy-medium-replay-regenerated-seed-0/iql/seed-0/policy/seed-0"),
-        ]
-    )
-    (recorded,) = out.glob("toy-seed-0-seed-0.hdf5")
+
+
+def test_a_policy_is_recorded(tmp_path):
+    save_prior(tmp_path / "prior/seed-0", 0)
+    words = ["--task", "toy", "--transitions", "30", "--policy", str(tmp_path / "prior/seed-0")]
+    collect.main([*words, "--out", str(tmp_path / "data")])
+    (recorded,) = (tmp_path / "data").glob("*.hdf5")
     assert logs.load(recorded, gamma=1.0).facts.transitions == 30
     with h5py.File(recorded) as file:
         assert {"qpos", "qvel", "action_log_probs"} == set(file["infos"])
 
 
+@pytest.mark.slow
 def test_what_was_learned_from_is_kept_if_recording_fails(tmp_path, monkeypatch):
     def fail(*args):
         raise UserError("no more")

@@ -33,6 +33,17 @@ def ran(monkeypatch):
     return seen
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Pictures of curves are empty files."""
+
+    def draw(path, panels, *, title):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+
+    monkeypatch.setattr(figures, "learning_curves", draw)
+
+
 def leave(args, scores):
     """What a run leaves; without scores, one that was killed."""
     folder = compare.HYBRID_RUNS.folder(args)
@@ -87,6 +98,7 @@ def test_each_method_runs_as_often_as_it_learns_from_other_things(grid, ran, cap
     assert ran == [] and "| replay | friction | -110 ± 8 |" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_what_was_killed_goes_on_and_what_is_missing_follows(grid, ran):
     first = compare.hybrid_cells(replace(grid, gaps=("gravity",)))[0]
     leave(first.args, None)
@@ -94,6 +106,7 @@ def test_what_was_killed_goes_on_and_what_is_missing_follows(grid, ran):
     assert [(run.gap, run.resume) for run in ran] == [(("gravity",), True), (("friction",), False)]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_runs_with_other_settings_are_not_mixed(grid, ran, capsys):
     own = replace(grid, methods=("iql",), reference="iql")
     compare.compare_hybrid(own)
@@ -101,6 +114,7 @@ def test_runs_with_other_settings_are_not_mixed(grid, ran, capsys):
         compare.compare_hybrid(replace(own, schedule=replace(own.schedule, updates=500)))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_rebrac_takes_the_preset_of_each_data_set(grid, ran, tmp_path, capsys):
     names = ("halfcheetah-medium-replay-regenerated-seed-0", "halfcheetah_medium-v2", "mine")
     data = tuple(tmp_path / f"{name}.hdf5" for name in names)
@@ -133,6 +147,7 @@ def test_tables_and_curves_name_the_schedule_and_the_updates(grid, ran, monkeypa
     assert titles == ["halfcheetah, schedule released"] * 2
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_presets_of_one_method_are_rows_of_their_own(grid, ran, capsys):
     methods = ("h2oplus", "h2oplus:lambda-0.2", "h2oplus:no-ratio", "h2oplus:xql")
     compare.compare_hybrid(replace(grid, methods=methods, gaps=("gravity",), data=grid.data[:1]))
@@ -188,6 +203,7 @@ def test_bad_input(words, said, tmp_path, ran, capsys):
     assert ran == []
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("name", ["last", "late"])
 def test_a_damaged_summary_is_named(name, grid, ran):
     compare.compare_hybrid(grid)
@@ -200,6 +216,7 @@ def test_a_damaged_summary_is_named(name, grid, ran):
 # --- released tables --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_released_table_says_what_the_runs_say(grid, ran, tmp_path, capsys):
     compare.compare_hybrid(grid)
     ran.clear()
@@ -219,6 +236,7 @@ def test_a_released_table_says_what_the_runs_say(grid, ran, tmp_path, capsys):
     assert "| replay | friction | 105 ± 5 | 105 ± 5 | 5 ± 5 | 5 ± 5 |" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_last_and_the_mean_of_ten_evaluations_come_from_the_curve(grid, ran, tmp_path, capsys):
     own = replace(grid, methods=("sac",), reference="sac", data=(), gaps=("gravity",))
     compare.compare_hybrid(own)
@@ -232,7 +250,7 @@ def test_the_last_and_the_mean_of_ten_evaluations_come_from_the_curve(grid, ran,
 
 
 @pytest.fixture
-def standing(grid, ran):
+def standing(grid, ran, undrawn):
     """A run that also says how long three robots stood, at two evaluations."""
     own = replace(grid, methods=("sac",), reference="sac", data=(), gaps=("gravity",))
     compare.compare_hybrid(own)
@@ -258,6 +276,7 @@ def test_tables_also_show_what_else_a_task_is_judged_by(standing, tmp_path, caps
     assert len(table) == 5 and sum(",upright_s," in line for line in table) == 2
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("lost", "said"),
     [
@@ -275,6 +294,7 @@ def test_a_table_without_some_of_its_rows_is_named(lost, said, standing, tmp_pat
         compare.compare_hybrid(replace(standing, released=tmp_path))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_runs_of_two_lengths_are_compared_in_their_order(grid, ran, tmp_path, capsys):
     own = replace(grid, methods=("iql", "cql", "edac"), reference="iql", data=grid.data[:1], gaps=("gravity",))
     for updates, order in ((1000, (1.0, 2.0, 3.0)), (2000, (1.0, 3.0, 2.0))):
@@ -288,6 +308,7 @@ def test_runs_of_two_lengths_are_compared_in_their_order(grid, ran, tmp_path, ca
     assert "| medium | gravity | 0.50 | cql, edac, iql | edac, cql, iql |" in said and "after 1,000 updates" in said
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("changes", "said"),
     [

@@ -69,7 +69,7 @@ def test_success_with_its_interval_as_json(run, capsys):
 
 def test_episodes_are_the_same_every_time_and_others_on_request(run, capsys):
     def returns(*more):
-        call("--prior", run / "policy/seed-0", "--episodes", 10, "--json", *more)
+        call("--run", run, "--episodes", 20, "--json", *more)
         return json.loads(capsys.readouterr().out)["systems"][0]["policies"][0]["return"]
 
     first = returns()
@@ -99,16 +99,16 @@ def test_several_systems_in_one_program_are_each_as_alone(run, capsys):
 
 def test_lines_for_people(run, capsys):
     (run / "slow.toml").write_text("[params]\nmass = 9.0\nfriction = 4.0\n")
-    call("--run", run, "--episodes", 10, "--real", run / "slow.toml")
+    call("--run", run, "--episodes", 20, "--real", run / "slow.toml")
     head, *lines = capsys.readouterr().out.splitlines()
-    assert head == "toy, on the slow real system, 10 episodes for each policy:"
+    assert head == "toy, on the slow real system, 20 episodes for each policy:"
     assert len(lines) == 2 and all(re.search(r"seed-\d: success \d+\.\d % \[.*\], return -?\d", line) for line in lines)
 
 
 def test_a_task_without_a_scene_has_no_film(run, capsys):
-    call("--run", run, "--episodes", 2, "--video", run / "films")
+    call("--run", run, "--episodes", 20, "--video", run / "films")
     assert capsys.readouterr().out.count("\n    no video: toy has no scene to draw\n") == 2
-    call("--run", run, "--episodes", 2, "--video", run / "films", "--json")
+    call("--run", run, "--episodes", 20, "--video", run / "films", "--json")
     (system,) = json.loads(capsys.readouterr().out)["systems"]
     assert [one["video"] for one in system["policies"]] == ["no video: toy has no scene to draw"] * 2
 

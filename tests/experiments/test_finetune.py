@@ -199,6 +199,7 @@ def test_a_run_leaves_curve_summary_policies_and_every_rollout(home):
     assert summary["score"] == "success" and len(summary["best"]["score"]) == 2
     real = rollouts(folder)
     assert len(real) == 5 and real[0]["obs"].shape == (2, 20, 4) and real[0]["valid"].all()
+    assert len({rollout["obs"][seed, 0].tobytes() for rollout in real for seed in (0, 1)}) == 10  # starts
     assert (folder / "figures/score.png").stat().st_size > 10_000
 
 
@@ -216,7 +217,7 @@ def test_value_and_statistics_of_the_prior_stay_frozen_and_its_actor_moves(home,
 
 def test_the_best_policy_is_of_an_earlier_moment(home):
     """Five rollouts are evidence for the policy that played the last of them: it had learned from four."""
-    folder = run(home, "sac")
+    folder = run(home, "sgft-sac")
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["best"]["rollouts"] == [4, 4] and all(np.isfinite(summary["best"]["evidence"]))
     last, best = (load_prior(folder / kind / "seed-1") for kind in ("policy", "best"))
@@ -225,10 +226,10 @@ def test_the_best_policy_is_of_an_earlier_moment(home):
 
 
 def test_the_policies_are_what_the_run_evaluated(home):
-    args = evaluate.EvaluateArgs(run=run(home, "sac"), real=(str(home / "turned.toml"),), episodes=30)
+    args = evaluate.EvaluateArgs(run=run(home, "sgft-sac"), real=(str(home / "turned.toml"),), episodes=30)
     (system,) = evaluate.evaluate(args)["systems"]
     assert [Path(p["policy"]).name for p in system["policies"]] == ["seed-0", "seed-1"]
-    final = read_jsonl(run(home, "sac") / "eval.jsonl")[-1]["return"]
+    final = read_jsonl(run(home, "sgft-sac") / "eval.jsonl")[-1]["return"]
     assert [p["return"] for p in system["policies"]] == pytest.approx(final, abs=6.0)  # other episodes, 30 and 8
 
 
@@ -272,6 +273,7 @@ def test_methods_that_learn_from_the_simulator_too(home, method):
     assert not np.allclose(mine[2]["obs"], others[2]["obs"], atol=1e-2)
 
 
+@pytest.mark.slow
 def test_all_methods_meet_the_same_real_starts(home):
     ours, theirs = (rollouts(run(home, method)) for method in ("sgft-sac", "sac"))
     for i, (a, b) in enumerate(zip(ours, theirs, strict=True)):
@@ -381,6 +383,9 @@ def test_more_rollouts_continue_a_finished_run(home, tmp_path):
 
 
 def test_a_rollout_is_on_disk_before_learning_from_it(home, tmp_path, monkeypatch):
+    """Those of the prior are the same whatever the method."""
+    usual = rollouts(run(home, "sgft-sac"))
+
     def crash(*_):
         raise RuntimeError("the learner died")
 
@@ -389,6 +394,8 @@ def test_a_rollout_is_on_disk_before_learning_from_it(home, tmp_path, monkeypatc
         finetune.main(argv(home, "sac", out=tmp_path))
     real = rollouts(tmp_path / "finetune/toy/turned/sac/seeds-0-1")
     assert len(real) == 2 and np.isfinite(real[1]["reward"]).all()
+    for mine, theirs in zip(real, usual, strict=False):
+        np.testing.assert_array_equal(mine["obs"], theirs["obs"])
 
 
 class Counter:
@@ -503,24 +510,24 @@ def test_training_that_diverges_stops_in_one_line(home, tmp_path, capsys):
 
 
 def test_another_configuration_does_not_continue_a_run(home, capsys):
-    run(home, "sac")
+    run(home, "sgft-sac")
     capsys.readouterr()
-    assert "exists already" in complaint(argv(home, "sac"), capsys)
-    error = complaint(argv(home, "sac", "--resume", "--options.utd", "1"), capsys)
+    assert "exists already" in complaint(argv(home, "sgft-sac"), capsys)
+    error = complaint(argv(home, "sgft-sac", "--resume", "--options.utd", "1"), capsys)
     assert "options.utd was 0.5, now 1.0" in error
 
 
 def test_other_priors_do_not_continue_a_run(home, tmp_path, capsys):
-    folder = tmp_path / run(home, "sac").relative_to(home)
-    shutil.copytree(run(home, "sac"), folder)
+    folder = tmp_path / run(home, "sgft-sac").relative_to(home)
+    shutil.copytree(run(home, "sgft-sac"), folder)
     origin = json.loads((folder / "provenance.json").read_text())
     (start,) = origin["starts"]
     assert len(start["priors"]) == 2 and len(set(start["priors"])) == 2
     start["priors"][1] = "0" * 12
     (folder / "provenance.json").write_text(json.dumps(origin))
-    error = complaint(argv(home, "sac", "--resume", "--rollouts", "6", out=tmp_path), capsys)
+    error = complaint(argv(home, "sgft-sac", "--resume", "--rollouts", "6", out=tmp_path), capsys)
     assert f"{folder}: cannot resume with other priors: they were" in error and "000000000000" in error
-    assert read_jsonl(folder / "eval.jsonl") == read_jsonl(run(home, "sac") / "eval.jsonl")
+    assert read_jsonl(folder / "eval.jsonl") == read_jsonl(run(home, "sgft-sac") / "eval.jsonl")
 
 
 # --- several real systems ---------------------------------------------------------------------------------------------

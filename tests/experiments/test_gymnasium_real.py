@@ -62,6 +62,7 @@ def stored(folder):
     return [store.load(i) for i in range(len(store))]
 
 
+@pytest.mark.slow
 def test_a_run_keeps_every_episode_and_counts_those_of_evaluations(finished):
     """Evaluations after 0, 2 and 4 rollouts, three episodes each; a step of the curve is all that went before."""
     folder, seeds = finished
@@ -82,6 +83,7 @@ def test_a_run_keeps_every_episode_and_counts_those_of_evaluations(finished):
     np.testing.assert_allclose(curve[1]["return"], total, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_evaluations_play_the_same_starts_and_rollouts_play_others(finished):
     folder, _ = finished
 

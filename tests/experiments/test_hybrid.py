@@ -31,11 +31,20 @@ def data(tmp_path):
     return d4rl(tmp_path / "recorded-v2.hdf5", toy.make().obs_dim, 2)
 
 
+SIMULATORS = {"heavy": "mass = 2.0", "slippery": "friction = 1.0"}
+
+
+@pytest.fixture(params=[1, pytest.param(2, marks=pytest.mark.slow)])
+def simulators(request):
+    """The names of the first ones."""
+    return [*SIMULATORS][: request.param]
+
+
 @pytest.fixture
-def gap(tmp_path):
-    """A file of two simulators."""
-    path = tmp_path / "two.toml"
-    path.write_text("[heavy.params]\nmass = 2.0\n[slippery.params]\nfriction = 1.0\n")
+def gap(tmp_path, simulators):
+    """A file of simulators."""
+    path = tmp_path / "some.toml"
+    path.write_text("".join(f"[{name}.params]\n{SIMULATORS[name]}\n" for name in simulators))
     return str(path)
 
 
@@ -63,7 +72,9 @@ def complaint(argv, capsys):
     return error
 
 
-def test_a_run_leaves_curves_policies_and_a_summary_for_each_simulator(tmp_path, data, gap, capsys, monkeypatch):
+def test_a_run_leaves_curves_policies_and_a_summary_for_each_simulator(
+    tmp_path, data, gap, simulators, capsys, monkeypatch
+):
     drawn, draw = {}, figures.learning_curves
     monkeypatch.setattr(
         figures, "learning_curves", lambda path, *a, **b: drawn.update({path: a}) or draw(path, *a, **b)
@@ -71,7 +82,7 @@ def test_a_run_leaves_curves_policies_and_a_summary_for_each_simulator(tmp_path,
     hybrid.main(words(tmp_path, data, "--gap", gap, "--variant", "w", "--seeds", "3"))
     said = capsys.readouterr().out
     assert "60 transitions of 3 episodes" in said and "heavy: success in the real system" in said
-    for name in ("heavy", "slippery"):
+    for name in simulators:
         folder = tmp_path / f"out/hybrid/toy/{name}/recorded-v2/h2oplus_w/seeds-0-2"
         evaluations = read_jsonl(folder / "eval.jsonl")
         assert [line["step"] for line in evaluations] == [0, 12, 24] and len(evaluations[0]["score"]) == 3

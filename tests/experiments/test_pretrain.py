@@ -28,6 +28,8 @@ OPTIONS = """--task toy --preset cpu --no-video --config.n-envs 32 --config.worl
     --config.updates-per-step 8 --config.network.hidden 32 32 --config.gamma 0.9 --config.eval-every 2
     --config.checkpoint-every 3 --config.eval-episodes 64 --config.lr 1e-3 --config.tau 0.02"""
 TINY = OPTIONS.split()  # 8 chunks of 1,280 env steps; evaluations after 0, 2, 4, 6, 8 and checkpoints after 3, 6, 8
+SHORT = """--no-report --config.env-steps 640 --config.chunk-steps 10 --config.updates-per-step 2 --config.eval-every 1
+    --config.eval-episodes 8 --config.network.hidden 8 --config.ensemble-size 1"""
 PROGRAM = """
 import os, signal, sys
 import envs
@@ -81,6 +83,34 @@ def complaint(argv, capsys):
     return error
 
 
+@pytest.fixture(scope="module")
+def short(out):
+    """Two seeds that have hardly begun to learn: two chunks, an evaluation after each, what is made of them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(envs.TASKS, "toy", "toy")
+        patch.setattr(os, "environ", os.environ.copy())
+        pretrain.main([*TINY, *SHORT.split(), "--seeds", "2", "--out", str(out / "short")])
+    return out / "short/pretrain/toy/cpu/seeds-0-1"
+
+
+def test_a_run_leaves_a_prior_per_seed_that_is_its_best_evaluation(short):
+    summary, curve = json.loads((short / "summary.json").read_text()), read_jsonl(short / "eval.jsonl")
+    assert summary["env_steps"] == 2 * 10 * 32 and summary["updates"] == 2 * 10 * 2
+    assert [line["step"] for line in curve] == [0, 320, 640]
+    for seed, found in zip((0, 1), summary["seeds"], strict=True):
+        assert found["seed"] == seed
+        assert found["success/interval"][0] <= found["success"] <= found["success/interval"][1]
+        best = max(curve, key=lambda line: (line["success"][seed], line["return"][seed]))
+        assert found["best/env_steps"] == best["step"]
+        assert found["best/success"] == pytest.approx(best["success"][seed])
+        assert found["best/return"] == pytest.approx(best["return"][seed])
+        prior = load_prior(short / "prior" / f"seed-{seed}", task="toy", obs_dim=4, act_dim=2)
+        assert prior.card["metrics"] == found and prior.card["config"]["n_envs"] == 32
+        assert prior.card["network"]["hidden"] == [8]
+        assert prior.params.actor["Dense_0"]["kernel"].shape == (4, 8)
+
+
+@pytest.mark.slow
 def test_sac_learns_the_toy_task_and_leaves_a_prior_per_seed(finished):
     summary = json.loads((finished / "summary.json").read_text())
     assert summary["env_steps"] == 10_240  # 8 chunks * 40 steps * 32 environments
@@ -95,6 +125,7 @@ def test_sac_learns_the_toy_task_and_leaves_a_prior_per_seed(finished):
         assert (finished / "figures" / f"seed-{seed}.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_the_prior_is_the_best_evaluation(finished):
     curve = read_jsonl(finished / "eval.jsonl")
     assert [line["step"] for line in curve] == [0, 2_560, 5_120, 7_680, 10_240]
@@ -105,6 +136,7 @@ def test_the_prior_is_the_best_evaluation(finished):
         assert found["best/return"] == pytest.approx(best["return"][i])
 
 
+@pytest.mark.slow
 def test_value_and_model_are_worth_something(finished):
     """On an almost noise-free point mass both must be good; the bias is what 2,560 updates have not yet caught up."""
     for found in json.loads((finished / "summary.json").read_text())["seeds"]:

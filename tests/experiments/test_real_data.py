@@ -180,7 +180,12 @@ def test_a_run_begins_with_logs(words, home, tmp_path, capsys):
     summary = json.loads((folder / "summary.json").read_text())
     assert summary["logged"] == 10 and summary["final"]["transitions"] == 40
     assert len(rollouts(folder)) == 2
-    # Elsewhere they may lie; other ones they may not be.
+
+
+@pytest.mark.slow
+def test_logs_may_lie_elsewhere_when_a_run_goes_on_but_not_be_others(words, home, tmp_path, capsys):
+    finetune.main(words("--eval-episodes", "0"))
+    folder = tmp_path / "runs/finetune/toy/turned/sac/seed-0"
     home.rename(tmp_path / "moved")
     finetune.main([*words("--eval-episodes", "0", "--rollouts", "3", "--resume", data=[tmp_path / "moved"])])
     assert len(rollouts(folder)) == 3

@@ -392,6 +392,7 @@ def test_runs_that_begin_together_agree_on_a_token(tmp_path):
         assert [file.name for file in home.iterdir()] == ["robot-token"]
 
 
+@pytest.mark.slow
 def test_a_robot_is_fine_tuned_and_costs_no_evaluation(robot, port, tmp_path):
     driver = robot(port)
     folder = run(tmp_path, port)

@@ -3,10 +3,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
+from priors_by_hand import initial
 
 import envs
 from experiments.runner.report import make_report, numbers
-from sgft_jax.learners.sac import SACConfig, extract_params, make_sac
+from sgft_jax.learners.sac import SACConfig
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.policies import sac_policy
 
@@ -15,7 +16,7 @@ NETWORK = NetworkConfig(hidden=(4,))
 
 def reported(env, *, dynamics_bias=0.0, value_bias=0.0):
     """Report of a prior whose networks are zero but for the biases of value and model; gamma 0.5, 3 trajectories."""
-    prior = extract_params(make_sac(SACConfig(4, 2, network=NETWORK, ensemble_size=2)).init(jax.random.key(0)))
+    prior = initial(SACConfig(4, 2, network=NETWORK, ensemble_size=2))(jax.random.key(0))
     prior = prior._replace(
         **{name: jax.tree.map(jnp.zeros_like, getattr(prior, name)) for name in ("value", "dynamics")}
     )

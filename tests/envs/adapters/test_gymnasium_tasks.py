@@ -53,7 +53,7 @@ def steps(env, seed, actions):
 # --- one environment --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("make", [toy.make, toy_terminating.make])
+@pytest.mark.parametrize("make", [pytest.param(toy.make, marks=pytest.mark.slow), toy_terminating.make])
 def test_gymnasiums_own_check_finds_nothing(make):
     """Except that the observations have no bounds, which is so, and that no spec says how to make it once more."""
     with warnings.catch_warnings():
@@ -131,7 +131,9 @@ def test_an_unknown_gap_is_one_line():
 # --- many -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("make", "gap"), [(toy.make, GAP), (toy_terminating.make, ALARM)])
+@pytest.mark.parametrize(
+    ("make", "gap"), [pytest.param(toy.make, GAP, marks=pytest.mark.slow), (toy_terminating.make, ALARM)]
+)
 def test_many_play_what_one_plays_from_reset_to_reset(make, gap):
     """Each with its own seed, over several episodes; the step that begins an episode anew ignores its action."""
     one, many = TaskEnv(make(), gap), TaskVectorEnv(make(), gap, num_envs=3)

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from compiled import compiled
 from franka_bench import member, theta_of
 
 import envs
@@ -35,7 +36,7 @@ def test_reward_of_a_frame(x, upright, spin, action, wanted):
 @pytest.fixture(scope="module")
 def played():
     """Episodes in three worlds, thrown to and fro so that the cart hits both ends: (thetas, worlds, starts, after)."""
-    env, rng = cartpole.make("jax"), np.random.default_rng(0)
+    env, rng = compiled(cartpole.make("jax")), np.random.default_rng(0)
     thetas = [theta_of(cartpole.SCENE, rng) for _ in range(3)]
     pools = [envs.sample_worlds(env, KEY, 1, params=theta) for theta in thetas]
     worlds = jax.tree.map(lambda *x: jnp.concatenate(x), *pools)
@@ -87,7 +88,7 @@ def test_an_episode_starts_hanging_and_ends_by_time_alone(played):
     np.testing.assert_allclose(starts.true_obs, jnp.broadcast_to(hanging, (3, 5)), atol=0.05)
     assert starts.obs.tolist() == starts.true_obs.tolist()  # exact sensors
     assert not after.terminated.any() and not after.truncated.any() and not after.invalid.any()
-    env = cartpole.make("jax")
+    env = compiled(cartpole.make("jax"))
     assert env.episode_length * cartpole.REPEAT == 1000 and env.control_dt == 0.02
     late = env.step(env_world(env), env.reset(env_world(env), KEY)._replace(time=jnp.int32(499)), jnp.zeros(1), KEY)
     assert late.truncated and not late.terminated

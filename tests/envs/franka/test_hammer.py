@@ -103,8 +103,8 @@ def test_observation_of_a_start():
 @pytest.mark.parametrize("theta", some_corners())
 def test_start_is_above_the_nail_and_inside_the_limits(theta):
     params = as_params(theta)
-    states = jax.vmap(lambda key: hammer.initial(params, key))(jax.random.split(jax.random.key(1), 200))
-    face = jax.vmap(lambda state: hammer.observe(params, state))(states)[:, :3]
+    states = jax.jit(jax.vmap(lambda key: hammer.initial(params, key)))(jax.random.split(jax.random.key(1), 200))
+    face = jax.jit(jax.vmap(lambda state: hammer.observe(params, state)))(states)[:, :3]
     assert (face[:, 2] > theta["nail_z"] + theta["head_thickness"] + 0.02).all()
     assert (face[:, 0] > 0.3).all() and (face[:, 0] < 0.38).all()
     assert np.ptp(face[:, 0]) > 0.05  # starts do differ
@@ -170,9 +170,9 @@ def test_board_stops_the_hammer_beside_the_nail():
 def test_starts_touch_nothing():
     """The high boards closest to the elbow, and of many starts those that lean forward the most."""
     high = NOMINAL | {"nail_x": 0.3, "nail_z": 0.65, "nail_half_height": 0.02}
+    initial, keys = jax.jit(jax.vmap(hammer.initial, (None, 0))), jax.random.split(jax.random.key(9), 2000)
     for theta in [high, *corners()]:
-        params, model = as_params(theta), hammer.build(theta).compile()
-        states = jax.vmap(lambda key, p=params: hammer.initial(p, key))(jax.random.split(jax.random.key(9), 2000))
+        model, states = hammer.build(theta).compile(), initial(as_params(theta), keys)
         leaning = np.argsort(-np.asarray(states.qpos[:, 1]))[:50]
         assert not any(touching(model, states.qpos[i]) for i in leaning)
 

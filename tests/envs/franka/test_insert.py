@@ -73,7 +73,8 @@ def test_observed_leg_is_the_simulated_one():
 
 def test_starts_lie_around_the_nominal_hole():
     keys = jax.random.split(jax.random.key(0), 300)
-    tips = jax.vmap(lambda key: insert.observe(as_params(NOMINAL), insert.initial(as_params(NOMINAL), key)))(keys)
+    params = as_params(NOMINAL)
+    tips = jax.jit(jax.vmap(lambda key: insert.observe(params, insert.initial(params, key))))(keys)
     offset = np.asarray(tips[:, 3:6]) - [0.5, 0.0, 0.0]
     low, high = insert.START_LOW, insert.START_HIGH
     assert (offset > low - 5e-4).all() and (offset < high + 5e-4).all()

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import make
 from franka_bench import bench, member, periods_apart
 from scipy.spatial.transform import Rotation
 
@@ -23,7 +24,7 @@ OPEN, CLOSE = -1.0, 1.0
 
 
 def rig_of(impl="c", **params):
-    env = envs.make("metaworld-hammer", impl)
+    env = make("metaworld-hammer", impl)
     return bench(env, envs.sample_worlds(env, KEY, 1, params=NOMINAL | params, effects={"obs_noise": 0.0}))
 
 
@@ -96,7 +97,7 @@ def test_success_is_a_nail_more_than_nine_centimetres_deep():
 
 def test_starts_fill_the_rectangle_and_every_kind_of_start_is_drawn():
     params = jnp.array([p.nominal for p in task.PARAMETERS])
-    starts = jax.vmap(lambda key: task.initial(params, key))(jax.random.split(KEY, 3000))
+    starts = jax.jit(jax.vmap(lambda key: task.initial(params, key)))(jax.random.split(KEY, 3000))
     effort, z, hand = starts.ctrl[:, 3], np.asarray(starts.qpos[:, 7]), np.asarray(starts.qpos[:, :3])
     held = np.asarray(effort > 0)
     at_start = np.abs(hand - (task.START - [0, 0, task.SAG])[None]).max(1) < 1e-5
@@ -236,7 +237,7 @@ def played(rig, key, policy, steps=75):
 
 
 def test_a_script_takes_the_hammer_and_drives_the_nail_in(rig):
-    for seed in range(8):
+    for seed in range(3):
         rewards, done, obs = played(rig, jax.random.key(seed), strike)
         assert done[-1] and np.argmax(done) < 60
         carried = obs[(obs[:, 13] > 0.08) & ~done]

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import make
 from franka_bench import bench, member, periods_apart
 from scipy.spatial.transform import Rotation
 
@@ -18,7 +19,7 @@ FAR = [0.3, 0.3, 0.02, *[0.0] * 9, 0.0, 0.1, 0.02]  # cube and mark out of the w
 
 
 def rig_of(impl):
-    env = envs.make("panda-push", impl)
+    env = make("panda-push", impl)
     return bench(env, envs.sample_worlds(env, KEY, 1, params=NOMINAL, effects={"obs_noise": 0.0}))
 
 
@@ -81,12 +82,12 @@ def test_success_is_less_than_five_centimetres_in_space():
 
 def test_fingers_that_start_beside_the_cube_do_not_touch_it():
     cube, keys = jnp.array([0.1, -0.05]), jax.random.split(KEY, 1000)
-    off = jax.vmap(lambda key: panda_push.beside(cube, key))(keys) - jnp.append(cube, 0.0)[None]
+    off = jax.jit(jax.vmap(lambda key: panda_push.beside(cube, key)))(keys) - jnp.append(cube, 0.0)[None]
     reach = np.abs(off[:, :2]) - np.array(panda_push.FINGER_HALF[:2]) - panda_push.CUBE_HALF
     assert (reach.max(1) > 0).all() and (off[:, 2] > panda_push.TABLE_AT).all()
     assert all((np.sign(off[:, :2]) == corner).all(1).any() for corner in [(1, 1), (1, -1), (-1, 1), (-1, -1)])
     params = jnp.array([{**NOMINAL, "start_beside": 0.5}[p.name] for p in panda_push.PARAMETERS])
-    starts = jax.vmap(lambda key: panda_push.initial(params, key).qpos[2])(keys)
+    starts = jax.jit(jax.vmap(lambda key: panda_push.initial(params, key).qpos[2]))(keys)
     assert 0.4 < (starts == np.float32(panda_push.START[2])).mean() < 0.6
 
 

@@ -4,9 +4,9 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from compiled import make
 from runners import EVERY, TASKS, compiled, member, pool_of, thrown
 
-import envs
 from envs.mujoco.engines import warp as engine_warp
 
 STEPS = 24
@@ -18,7 +18,7 @@ ENGINES = ["c", *(pytest.param(impl, marks=pytest.mark.slow) for impl in SLOWER)
 def falling(request):
     """(task, gaps, pool, states [STEPS + 1, gaps], actions [STEPS, gaps, 6])."""
     names = [name for own, name in EVERY if own == request.param and name != "joint-noise"]
-    env = envs.make(request.param, "c")
+    env = make(request.param, "c")
     pool = pool_of(env, names)
     return request.param, names, pool, *thrown(env, pool, STEPS)
 
@@ -43,7 +43,7 @@ def repeated(task, gap, before, actions):
 def test_every_step_of_every_gap_is_that_of_mujoco(falling, impl):
     """1e-4 in positions and 5e-3 in speeds, on the floor and in the limits too."""
     task, names, pool, states, actions = falling
-    env, before = envs.make(task, impl), member(states, slice(0, -1))
+    env, before = make(task, impl), member(states, slice(0, -1))
     with jax.numpy_rank_promotion("allow"):  # MJX broadcasts matrices against vectors
         again = jax.jit(jax.vmap(jax.vmap(env.step, (0, 0, 0, None)), (None, 0, 0, None)))
         after = again(pool, before, actions, jax.random.key(0))

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from compiled import make
 from runners import EVERY, GOLDEN, TASKS, at_rest, begun, compiled, play, pool_of
 
-import envs
 from envs import gaps
 
 LEGS = {
@@ -181,7 +181,7 @@ def golden(request):
     """(task, names of the real system and of all gaps but noise, states [T + 1, gaps] under the golden action)."""
     task, steps = request.param, {"halfcheetah": 20, "walker2d": 10}[request.param]
     names = [name for own, name in EVERY if own == task and name != "joint-noise"]
-    env = envs.make(task, "c")
+    env = make(task, "c")
     pool = pool_of(env, names)
     actions = jnp.broadcast_to(jnp.asarray(GOLDEN, jnp.float32), (steps, len(names), 6))
     return task, names, play(env, pool, begun(env, pool, at_rest(task)), actions)

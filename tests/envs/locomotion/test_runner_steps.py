@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from compiled import make
 from runners import TASKS, at_rest, begun, compiled, member, play, pool_of, thrown
 
 import envs
@@ -12,11 +13,12 @@ from envs import gaps
 from envs.locomotion import halfcheetah, walker2d
 
 KEY = jax.random.key(0)
+FAST = ["halfcheetah", pytest.param("walker2d", marks=pytest.mark.slow)]
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", FAST)
 def test_observations_hold_everything_but_x(task):
-    env = envs.make(task, "c")
+    env = make(task, "c")
     states = thrown(env, pool_of(env, [gaps.SIM]), 24)[0]
     physics = states.physics
     assert [e.name for e in env.observation][:3] == ["height", "pitch", "joint_angles"] and env.obs_dim == 17
@@ -46,7 +48,7 @@ def test_the_reward_of_what_is_seen_by_hand(task, way):
     cost, bonus = {"halfcheetah": (0.1, 0.0), "walker2d": (0.001, 1.0)}[task]
     obs = jnp.zeros(17).at[1:8].set(0.3)
     action = jnp.array([0.5, 0, 0, 0, 0, -2.0])
-    found = envs.make(task, "c").reward(obs.at[8].set(1.0), action, obs.at[8].set(2.0))
+    found = make(task, "c").reward(obs.at[8].set(1.0), action, obs.at[8].set(2.0))
     np.testing.assert_allclose(found, way + bonus - cost * 1.25, rtol=1e-5)
 
 
@@ -64,7 +66,7 @@ def test_the_centre_of_mass_leads_the_root_as_mujoco_says():
 @pytest.mark.parametrize(("task", "least", "error"), [("halfcheetah", 0.99, 0.1), ("walker2d", 0.99, 0.06)])
 def test_the_reward_of_what_is_seen_is_nearly_what_is_measured(task, least, error):
     """Their correlation, and the root mean square of what is between them, m/s, in a motion of the nominal runner."""
-    env = envs.make(task, "c")
+    env = make(task, "c")
     states, actions = thrown(env, pool_of(env, [gaps.SIM]), 200)
     alive = ~states.terminated[:-1, 0].astype(bool)
     seen = jax.jit(jax.vmap(env.reward))(states.true_obs[:-1, 0], actions[:, 0], states.true_obs[1:, 0])
@@ -101,7 +103,7 @@ def test_the_walker_has_fallen(height, pitch, fallen):
 def test_a_fall_ends_the_episode_and_the_time_limit_truncates_it():
     """The bonus is paid in the step of the fall too. HalfCheetah upside down runs on."""
     for task, ends in (("walker2d", True), ("halfcheetah", False)):
-        env = envs.make(task, "c")
+        env = make(task, "c")
         pool = pool_of(env, [gaps.SIM])
         turned = at_rest(task)
         state = begun(env, pool, turned._replace(qpos=turned.qpos.at[2].set(2.0)))
@@ -115,9 +117,9 @@ def test_a_fall_ends_the_episode_and_the_time_limit_truncates_it():
 
 @pytest.mark.parametrize("task", TASKS)
 def test_starts_are_gyms(task):
-    env = envs.make(task, "c")
+    env = make(task, "c")
     world = member(pool_of(env, [gaps.SIM]), 0)
-    states = jax.vmap(lambda key: env.reset(world, key))(jax.random.split(KEY, 2000))
+    states = jax.vmap(lambda key: env.reset(world, key))(jax.random.split(KEY, 1000))
     position = np.asarray(states.physics.qpos) - np.asarray(at_rest(task).qpos)
     half = {"halfcheetah": 0.1, "walker2d": 0.005}[task]
     assert (np.abs(position) <= half + 1e-6).all() and (np.abs(position).max(0) > 0.99 * half).all()
@@ -130,10 +132,10 @@ def test_starts_are_gyms(task):
     assert not states.terminated.any()
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", FAST)
 def test_joint_noise_moves_the_motors_and_what_they_cost(task):
     """Executed is clip(0.5 + n): the share at either bound, and a step and its reward are those of what is executed."""
-    env = envs.make(task, "c")
+    env = make(task, "c")
     real, noisy = (member(pool_of(env, [name]), 0) for name in (gaps.SIM, "joint-noise"))
     start = member(begun(env, pool_of(env, [gaps.SIM]), at_rest(task)), 0)
     start = start._replace(effects=env.reset(noisy, KEY).effects)
@@ -151,10 +153,10 @@ def test_joint_noise_moves_the_motors_and_what_they_cost(task):
         np.testing.assert_allclose(states.reward[i], same.reward, atol=1e-4)
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", FAST)
 def test_a_state_that_was_seen_is_restored(task):
     """The next observation is the same from there on, wherever along x it was seen."""
-    env = envs.make(task, "c")
+    env = make(task, "c")
     pool = pool_of(env, [gaps.SIM])
     actions = 0.3 * jax.random.normal(KEY, (6, 1, 6))
     states = play(env, pool, begun(env, pool, at_rest(task)), actions)
@@ -171,7 +173,7 @@ def test_a_state_that_was_seen_is_restored(task):
 def test_random_commands_earn_what_d4rl_says():
     """Its reference for a random policy is -280 on HalfCheetah and 1.6 on Walker2d, which soon falls."""
     for task, (low, high) in {"halfcheetah": (-400.0, -180.0), "walker2d": (-15.0, 30.0)}.items():
-        env = envs.make(task, "c")
+        env = make(task, "c")
         pool = pool_of(env, [gaps.SIM])
 
         def act(carry, obs, key):

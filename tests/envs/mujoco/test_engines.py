@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiled import compiled
 from franka_bench import EXACT, SCENES, member, theta_of
 
 import envs
@@ -17,7 +18,7 @@ from envs.types import UserError
 N, STEPS = 3, 5
 
 
-@pytest.fixture(scope="module", params=[pytest.param(x, marks=[pytest.mark.slow] * (x == "hammer")) for x in SCENES])
+@pytest.fixture(scope="module", params=[pytest.param(x, marks=[pytest.mark.slow] * (x != "push")) for x in SCENES])
 def rig(request):
     """(scene, env, thetas, worlds [N] of these, their starts [N], actions [N, STEPS])."""
     scene, rng = SCENES[request.param], np.random.default_rng(1)
@@ -65,7 +66,7 @@ def test_any_batching_gives_the_same(rig):
 def test_an_explosion_is_reported_not_reset(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     scene = SCENES["push"]
-    env = make_env(scene, impl="c")
+    env = compiled(make_env(scene, impl="c"))
     worlds = envs.sample_worlds(env, jax.random.key(0), 2, effects=EXACT)
     states = jax.vmap(env.reset)(worlds, jax.random.split(jax.random.key(1), 2))
     broken = states.physics._replace(qvel=states.physics.qvel.at[0].set(1e12))

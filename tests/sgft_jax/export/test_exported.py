@@ -85,7 +85,7 @@ CASES = {
     "deterministic": (REMEMBERING, lambda env: of_actor(env, "deterministic")),
     "elu": (OPEN, lambda env: of_sac(env, network(activation="elu", actor_layer_norm=True))),
 }
-FEW = ("identified", "told", "recurrent", "affine")  # together they have everything but two activations
+FEW = ("identified", "recurrent", "affine")  # together they have everything but activations and what is told
 PLANNING = {
     "sgft-mpc": (REMEMBERING, lambda env: of_sac(env, plan={"horizon": 2, "samples": 16, "noise": 0.3})),
     "tdmpc2": (OPEN, of_tdmpc2),

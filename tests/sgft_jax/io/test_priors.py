@@ -1,5 +1,6 @@
 """Priors on disk, and what is said of those that do not fit."""
 
+import functools
 import json
 import os
 from types import SimpleNamespace
@@ -37,9 +38,14 @@ def drawn(init):
     return jax.tree.map(lambda x: jnp.arange(x.size, dtype=x.dtype).reshape(x.shape), jax.eval_shape(init, KEY))
 
 
-def make_prior(scale=1.0, network=NETWORK, **changes):
+@functools.cache
+def of_sac(network):
     learner = sac.make_sac(sac.SACConfig(4, 2, network=network, ensemble_size=2))
-    params = jax.tree.map(lambda x: scale * x, drawn(lambda key: sac.extract_params(learner.init(key))))
+    return drawn(lambda key: sac.extract_params(learner.init(key)))
+
+
+def make_prior(scale=1.0, network=NETWORK, **changes):
+    params = jax.tree.map(lambda x: scale * x, of_sac(network))
     statistics = Normalizer(jnp.zeros(4), jnp.ones(4))
     return Prior(params._replace(normalizer=statistics, dynamics=None), CARD | {"network": jsonable(network)} | changes)
 
