@@ -42,10 +42,10 @@ def simulators(request):
 
 @pytest.fixture
 def gap(tmp_path, simulators):
-    """A file of simulators."""
-    path = tmp_path / "some.toml"
-    path.write_text("".join(f"[{name}.params]\n{SIMULATORS[name]}\n" for name in simulators))
-    return str(path)
+    """A file of two simulators, or one of them."""
+    path = tmp_path / "two.toml"
+    path.write_text("".join(f"[{name}.params]\n{SIMULATORS[name]}\n" for name in SIMULATORS))
+    return str(path) if len(simulators) > 1 else f"{path}:{simulators[0]}"
 
 
 def d4rl(path, obs_dim, act_dim, n=60):

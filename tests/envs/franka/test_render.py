@@ -60,7 +60,7 @@ def test_dressing_leaves_motion_alone(name):
     np.testing.assert_allclose(data.body("link7").xpos, plain_data.body("link7").xpos, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x != "push")) for x in SCENES])
 def test_pictures_show_the_robot(renderer, tmp_path, name):
     scene = SCENES[name]
     render.render_episode(scene, nominal(scene), still(scene, 1), tmp_path / "sub" / "episode.mp4")

@@ -12,6 +12,7 @@ import mediapy
 import mujoco
 import numpy as np
 import pytest
+from compiled import compiled
 
 import envs
 from envs.base import Entry, Parameter
@@ -129,7 +130,7 @@ def test_the_episode_ends_at_the_wall(played):
 
 
 def test_faster_than_the_scene_allows_is_an_explosion():
-    env = make_env(SCENE, "c")
+    env = compiled(make_env(SCENE, "c"))
     world = jax.tree.map(lambda x: x[0], worlds(env, 1.0))
     state = env.reset(world, jax.random.key(0))
     for speed, invalid in ((3.0, False), (6.0, True)):
@@ -143,7 +144,8 @@ def test_what_observations_do_not_tell_the_simulator_measures():
     def measured(params, before, action, after):
         return Measured(reward=after.qpos[0] - before.qpos[0], terminated=after.qpos[0] > 0.02 * params[0])
 
-    env = make_env(SCENE._replace(reward=None, terminated=None, success=None, score="return", measured=measured), "c")
+    scene = SCENE._replace(reward=None, terminated=None, success=None, score="return", measured=measured)
+    env = compiled(make_env(scene, "c"))
     assert env.reward is None and env.terminated is None and env.success is None
     pool = worlds(env, 1.0, 2.0)
     states = jax.vmap(env.reset)(pool, jax.random.split(jax.random.key(0), 2))
