@@ -86,7 +86,7 @@ def test_relations_are_checked_at_both_ends_of_both_ranges():
 def test_what_differs_between_episodes():
     env = with_actuators(ENV)
     ranges = jax.tree.map(lambda x: x[0], sample_worlds(env, jax.random.key(0), 1).theta.effects)
-    found = jax.vmap(functools.partial(draw, ranges))(jax.random.split(jax.random.key(1), 400))
+    found = jax.jit(jax.vmap(functools.partial(draw, ranges)))(jax.random.split(jax.random.key(1), 400))
     for name, low, high in (
         ("action_scale", 0.7, 1.4),
         ("action_bias", -0.15, 0.15),

@@ -29,7 +29,7 @@ OPTIONS = """--task toy --preset cpu --no-video --config.n-envs 32 --config.worl
     --config.checkpoint-every 3 --config.eval-episodes 64 --config.lr 1e-3 --config.tau 0.02"""
 TINY = OPTIONS.split()  # 8 chunks of 1,280 env steps; evaluations after 0, 2, 4, 6, 8 and checkpoints after 3, 6, 8
 SHORT = """--no-report --config.env-steps 640 --config.chunk-steps 10 --config.updates-per-step 2 --config.eval-every 1
-    --config.eval-episodes 8 --config.network.hidden 8 --config.ensemble-size 1"""
+    --config.eval-episodes 8 --config.choose-from 0 --config.network.hidden 8 --config.ensemble-size 1"""
 PROGRAM = """
 import os, signal, sys
 import envs
