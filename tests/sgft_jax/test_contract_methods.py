@@ -15,7 +15,7 @@ from sgft_jax.io import checkpoint
 
 VARIANTS = ("sgft-relabel:ratio", "guarded:ratio")  # a method with an option on
 # Each shows what others are put together of; all of them are compiled in `make test-all`.
-FAST = {"sgft-sac", "sgft-mpc"}
+FAST = {"sgft-sac"}
 each_method = pytest.mark.parametrize("name", tuners.slow_but(FAST, [*METHODS, *VARIANTS]))
 OBS = jnp.array([0.3, -0.8])
 

@@ -22,6 +22,8 @@ from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.presets import PretrainConfig
 from sgft_jax.train import finetuning, pretraining
 
+# Rules of the guard by themselves, on scores that are made up: test_guard.py
+pytestmark = pytest.mark.slow
 ENV, ROLLOUTS, SEEDS = toy.make(), 6, 6
 MARGIN, RETURN_MARGIN = 0.03, 0.2  # how far mean success, and the mean return of 13.3, may ever fall
 SMALL = {"simulated_transitions": 4000}
@@ -64,7 +66,6 @@ def test_without_protection_it_is_lost(prior):
     assert success > MARGIN and total > 4 * RETURN_MARGIN
 
 
-@pytest.mark.slow
 def test_it_is_the_guard_that_holds_it(prior):
     """Without it the recommended method loses some of the return; with it alone what loses most loses nothing."""
     _, total = falls(prior, DEFAULT, guard=False, **SMALL)

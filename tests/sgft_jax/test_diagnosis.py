@@ -132,22 +132,25 @@ def moved(share, key, *, jitter=0.003, usual=0.0):
     return rollouts(obs, action, obs + moves)
 
 
+@jax.jit
+def lateness(rollouts, usual=0.0):
+    """Where a step changes what is commanded."""
+    return diagnosis.lateness(lambda obs, action: action, rollouts, jnp.full(2, 0.01), usual)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.8])
 def test_a_delay_is_found_and_its_evidence(share):
-    def change(obs, action):
-        return action
-
-    late = diagnosis.lateness(change, moved(share, jax.random.key(1)), jnp.full(2, 0.01))
+    late = lateness(moved(share, jax.random.key(1)))
     assert late.share == pytest.approx(share, abs=0.02)
     assert late.nats > 50 if share else late.nats < 1
-    used_to_it = diagnosis.lateness(change, moved(share, jax.random.key(1)), jnp.full(2, 0.01), share)
+    used_to_it = lateness(moved(share, jax.random.key(1)), share)
     assert used_to_it.share == pytest.approx(share, abs=0.02) and used_to_it.nats < 1
 
 
 def test_a_step_without_a_valid_predecessor_says_nothing_of_delays():
     some = moved(0.5, jax.random.key(1))
     gaps = some._replace(valid=jnp.broadcast_to(jnp.arange(20) % 2 == 0, (4, 20)))
-    assert diagnosis.lateness(lambda obs, action: action, gaps, jnp.full(2, 0.01)).nats == 0
+    assert lateness(gaps).nats == 0
 
 
 def test_noise_is_read_where_little_moves():

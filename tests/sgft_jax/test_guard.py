@@ -201,7 +201,7 @@ def test_failures_deploy_what_learned_and_a_failure_of_that_brings_the_reference
     assert {"guard/expected_reference", "guard/expected_challenger"} <= set(metrics)
 
 
-@pytest.mark.parametrize("identify", [False, True])
+@pytest.mark.parametrize("identify", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_challenger_that_proves_itself_becomes_the_reference_as_it_played(identify):
     """Identification changes the policy as soon as the rollout is known, before anything learns."""
     case, bare = (tuners.tuner("sac", identify=identify, **guarded) for guarded in ({"guard": True}, {}))
@@ -220,7 +220,7 @@ def test_a_challenger_that_proves_itself_becomes_the_reference_as_it_played(iden
 @pytest.mark.parametrize(
     "name",
     tuners.slow_but(
-        {"rlpd", "iql"},
+        {"iql"},
         [n for n, m in METHODS.items() if n != "sac" and hasattr(m.config, "guard")],
     ),
 )

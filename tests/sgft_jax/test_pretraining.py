@@ -69,25 +69,28 @@ def played(state, chunk):
     return jax.tree.map(lambda x: np.asarray(x[0, rows]).reshape(STEPS, N, *x.shape[2:]), state.replay.data)
 
 
-@pytest.fixture
-def counted(monkeypatch):
-    """Trains the counting agent on risks by number of the set: [(state, metrics)] after every chunk, state in NumPy."""
-    monkeypatch.setattr(pretraining, "recipe_of", counting)
+@functools.cache
+def counted(*risks, refresh_every=0, resumed=None):
+    """Trains the counting agent on risks by number of the set: [(state, metrics)] at the start and after every chunk.
 
-    def run(risks, **changes):
-        env, config = toy_terminating.make(), replace(CONFIG, **changes)
+    resumed: go on after that many chunks of a run without an interruption.
+    """
+    env, config = toy_terminating.make(), replace(CONFIG, refresh_every=refresh_every)
 
-        def pools(number):
-            pool = envs.sample_worlds(env, jax.random.key(number), 4, params={"risk": risks[number]})
-            return jax.tree.map(lambda x: x[None], pool)
+    def pools(number):
+        pool = envs.sample_worlds(env, jax.random.key(number), 4, params={"risk": risks[number]})
+        return jax.tree.map(lambda x: x[None], pool)
 
-        return [jax.tree.map(jnp.copy, found) for found in pretrain(env, config, [3], pools=pools)][1:]
+    state = None
+    if resumed is not None:
+        state = jax.tree.map(jnp.copy, counted(*risks, refresh_every=refresh_every)[resumed][0])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pretraining, "recipe_of", counting)
+        return [jax.tree.map(jnp.copy, found) for found in pretrain(env, config, [3], pools=pools, state=state)]
 
-    return run
 
-
-def test_episodes_end_and_begin_anew_with_their_carry(counted):
-    (state, metrics), _ = counted([0.2])
+def test_episodes_end_and_begin_anew_with_their_carry():
+    _, (state, metrics), _ = counted(0.2)
     rows = played(state, 0)
     alarm, age = rows.next_obs[..., 1] > 0.5, rows.action[..., 0]
     over = alarm | (age == LENGTH - 1)
@@ -101,7 +104,7 @@ def test_episodes_end_and_begin_anew_with_their_carry(counted):
     assert metrics["train/exploded"][0] == metrics["train/success"][0] == 0
 
 
-@pytest.mark.parametrize("algorithm", ["sac", "recurrent", pytest.param("tdmpc2", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("algorithm", tuners.slow_but({"sac"}, ["sac", "recurrent", "tdmpc2"]))
 def test_no_key_is_used_twice(algorithm):
     """In random experience, the first state, a chunk of two steps and new worlds."""
     env = toy_terminating.make()
@@ -153,25 +156,33 @@ def test_statistics_are_those_of_the_steps_that_did_not_explode(monkeypatch):
     assert seen.mean() < -0.02
 
 
-def test_new_worlds_begin_new_episodes(counted):
+def test_new_worlds_begin_new_episodes():
     """Nothing ends the first set's episodes but time, everything those of the second."""
-    state, metrics = counted([0.0, 1.0], refresh_every=1)[-1]
+    state, metrics = counted(0.0, 1.0, refresh_every=1)[-1]
     first, second = played(state, 0), played(state, 1)
     assert (first.discount > 0).all() and (second.discount == 0).all()
     assert (second.obs[0] == 0).all() and (second.action == 0).all() and first.action.max() == LENGTH - 1
     assert metrics["train/terminated"][0] == 1
 
 
-def test_a_set_that_is_not_due_is_never_asked_for(counted):
+def test_a_set_that_is_not_due_is_never_asked_for():
     """There is no second set in either case, and nothing else differs."""
-    never, late = (counted([0.2], refresh_every=every)[-1][0] for every in (0, 2))
+    never, late = (counted(0.2, refresh_every=every)[-1][0] for every in (0, 2))
     equal(never, late)
+
+
+def test_a_resumed_fleet_plays_on_with_the_same_bits():
+    """After one of two chunks, where new worlds are due. With agents that learn: below."""
+    whole, resumed = counted(0.2, 0.5, refresh_every=1), counted(0.2, 0.5, refresh_every=1, resumed=1)
+    assert len(whole) == 3 and len(resumed) == 2
+    equal(resumed[-1][0], whole[-1][0])
+    assert (played(whole[-1][0], 0).next_obs != played(whole[-1][0], 1).next_obs).any()
 
 
 @pytest.mark.parametrize(
     ("algorithm", "refresh_every"),
     [
-        ("sac", 0),
+        pytest.param("sac", 0, marks=pytest.mark.slow),
         pytest.param("sac", 1, marks=pytest.mark.slow),
         pytest.param("tdmpc2", 0, marks=pytest.mark.slow),
         pytest.param("tdmpc2", 1, marks=pytest.mark.slow),

@@ -75,6 +75,14 @@ def run(finetuner=FINE, system=None, rollouts=4, **options):
     return [(copied(progress), metrics) for progress, metrics in steps]
 
 
+@functools.cache
+def whole():
+    """(all that was played in six rollouts, what was yielded). A shorter run is their beginning."""
+    system = Recorded(simulated())
+    yielded = run(system=system, rollouts=6)
+    return system.played, yielded
+
+
 # --- keys ------------------------------------------------------------------------------------------------------------
 
 
@@ -103,28 +111,26 @@ def test_every_purpose_of_every_member_draws_from_keys_that_no_other_uses():
 # --- what it yields -------------------------------------------------------------------------------------------------
 
 
-def updates_of(system):
+def updates_of(played):
     """[rollouts, M] of what was played: three for a whole rollout, in proportion for a shorter one, one at least."""
-    lengths = np.stack([np.asarray(episodes.valid.sum((1, 2))) for episodes, _ in system.played])
+    lengths = np.stack([np.asarray(episodes.valid.sum((1, 2))) for episodes, _ in played])
     return np.maximum(np.rint(PER_ROLLOUT * lengths / LENGTH), 1)
 
 
 def test_the_fresh_state_comes_first_then_one_a_rollout():
-    system = Recorded(simulated())
-    yielded = run(system=system, rollouts=3)
-    assert [int(p.rollouts) for p, _ in yielded] == [0, 1, 2, 3] and yielded[0][1] == {}
+    played, yielded = whole()
+    assert [int(p.rollouts) for p, _ in yielded] == [0, 1, 2, 3, 4, 5, 6] and yielded[0][1] == {}
     assert {"real/return", "real/score", "real/exploded", "learner/state", "batch/reward_mean"} <= set(yielded[1][1])
     assert all(x.shape == (2,) and jnp.isfinite(x).all() for _, metrics in yielded[1:] for x in metrics.values())
     # seed 3 starts from prior 1, seed 8 from prior 0
     np.testing.assert_array_equal(yielded[0][0].agent.learner, [0.5, 0.0])
-    np.testing.assert_allclose(yielded[3][0].agent.learner, np.add([0.5, 0.0], updates_of(system).sum(0)), atol=0.1)
+    np.testing.assert_allclose(yielded[3][0].agent.learner, np.add([0.5, 0.0], updates_of(played[:3]).sum(0)), atol=0.1)
 
 
 def test_updates_and_transitions_are_those_of_the_steps_that_were_made():
     """Members differ, as their episodes end early; metrics are means over the updates of each."""
-    system = Recorded(simulated())
-    yielded = run(system=system, rollouts=4)
-    updates, valid = updates_of(system), np.stack([np.asarray(x.valid.sum((1, 2))) for x, _ in system.played])
+    played, yielded = whole()
+    updates, valid = updates_of(played), np.stack([np.asarray(x.valid.sum((1, 2))) for x, _ in played])
     assert len(np.unique(updates)) == PER_ROLLOUT and (updates[:, 0] != updates[:, 1]).any()
     for i, (progress, metrics) in enumerate(yielded[1:], 1):
         np.testing.assert_array_equal(progress.transitions, valid[:i].sum(0))
@@ -138,7 +144,7 @@ def test_initial_rollouts_come_together_and_each_brings_its_updates():
     system = Recorded(simulated())
     yielded = run(make(initial_rollouts=3), system, rollouts=4)
     assert [int(p.rollouts) for p, _ in yielded] == [0, 3, 4]
-    updates = updates_of(system)[:3]
+    updates = updates_of(system.played)[:3]
     np.testing.assert_allclose(yielded[1][0].agent.learner, np.add([0.5, 0.0], updates.sum(0)), atol=0.1)
     np.testing.assert_allclose(yielded[1][1]["updates"], updates.mean(0))
 
@@ -162,22 +168,20 @@ def test_a_log_without_a_valid_step_is_learned_nothing_from():
 
 
 def test_a_resumed_run_goes_on_with_the_same_bits(tmp_path):
-    whole = run(rollouts=5)
-    checkpoint.save(tmp_path, 3, whole[3][0], meta={})
+    _, yielded = whole()
+    checkpoint.save(tmp_path, 3, yielded[3][0], meta={})
     like = jax.eval_shape(functools.partial(finetuning.begin, FINE), PRIORS, SEEDS)
     restored, _ = checkpoint.restore(tmp_path, like)
-    rest = run(rollouts=5, progress=jax.tree.map(jnp.asarray, restored))
-    assert [int(p.rollouts) for p, _ in rest] == [4, 5]
-    assert bits(rest[-1]) == bits(whole[-1])
+    rest = run(rollouts=6, progress=jax.tree.map(jnp.asarray, restored))
+    assert [int(p.rollouts) for p, _ in rest] == [4, 5, 6]
+    assert bits(rest[-1]) == bits(yielded[-1])
 
 
 def test_all_methods_meet_the_same_starts():
     """World and luck follow from the seed and the rollout alone, not from who plays."""
-    worlds = []
-    for finetuner in (FINE, make(initial_policy=Policy(FINE.init_carry, act, act))):
-        system = Recorded(simulated())
-        run(finetuner, system, rollouts=3)
-        worlds.append([episodes.world for episodes, _ in system.played])
+    system = Recorded(simulated())
+    run(make(initial_policy=Policy(FINE.init_carry, act, act)), system, rollouts=3)
+    worlds = [[episodes.world for episodes, _ in played] for played in (whole()[0][:3], system.played)]
     assert equal(*worlds) and len(set(np.ravel(worlds[0]).tolist())) == 2
 
 
@@ -191,18 +195,17 @@ def steps_of(episodes):
 
 
 def test_the_carry_is_threaded_and_begins_anew_with_each_episode():
-    system = Recorded(simulated())
-    *_, (last, _) = run(system=system, rollouts=3)
-    system.play(FINE, jax.tree.map(jnp.asarray, last.agent), finetuning._episode_keys(SEEDS, 3, 0, 4), explore=False)
-    assert len(system.played) == 4 and any(len(steps) > 5 for steps in steps_of(system.played[-1][0]))
-    for episodes, _ in system.played:
+    played, yielded = whole()
+    agent = jax.tree.map(jnp.asarray, yielded[3][0].agent)
+    several = simulated().play(FINE, agent, finetuning._episode_keys(SEEDS, 3, 0, 4), explore=False)
+    assert any(len(steps) > 5 for steps in steps_of(several))
+    for episodes in [*(episodes for episodes, _ in played), several]:
         for steps in steps_of(episodes):
             assert steps == list(range(len(steps)))
 
 
 def test_evaluation_repeats_a_fixed_series_without_exploring():
-    *_, (last, _) = run(rollouts=1)
-    agent = jax.tree.map(jnp.asarray, last.agent)
+    agent = jax.tree.map(jnp.asarray, whole()[1][1][0].agent)
     system = Recorded(simulated())
     few, more, again = (finetuning.evaluate(FINE, system, agent, SEEDS, n) for n in (2, 5, 5))
     assert equal(more, again) and equal(few, jax.tree.map(lambda x: x[:, :2], more))
@@ -216,11 +219,11 @@ def test_evaluation_repeats_a_fixed_series_without_exploring():
 
 
 def test_terminations_and_time_limits_are_stored_as_what_they_are():
-    system = Recorded(simulated())
-    *_, (last, _) = run(system=system, rollouts=6)
+    played, yielded = whole()
+    last = yielded[-1][0]
     for m in range(2):
         rows = jax.tree.map(lambda x, m=m: np.asarray(x[m]), last.agent.replay)
-        valid = [np.asarray(episodes.valid[m, 0]) for episodes, _ in system.played]
+        valid = [np.asarray(episodes.valid[m, 0]) for episodes, _ in played]
         held = jax.tree.map(lambda x, n=int(rows.size): x[:n], rows.data)
         assert rows.size == sum(v.sum() for v in valid)
         alarm = held.next_obs[:, 1] > 0.5
@@ -229,7 +232,7 @@ def test_terminations_and_time_limits_are_stored_as_what_they_are():
         assert set(np.flatnonzero(alarm)) <= set(ends) and alarm.any()
         in_time = [end for end, v in zip(ends, valid, strict=True) if v.all() and not alarm[end]]
         assert all(held.discount[end] > 0 for end in in_time)
-    assert any(np.asarray(e.valid).all(-1).any() for e, _ in system.played)  # some episode reached its time limit
+    assert any(np.asarray(e.valid).all(-1).any() for e, _ in played)  # some episode reached its time limit
 
 
 class Scripted:
@@ -351,6 +354,7 @@ def test_initial_rollouts_are_evidence_for_the_policy_that_made_them():
     assert guard.challenger.weight.tolist() == [0, 0] and metrics["guard/challenger"].tolist() == [1, 1]
 
 
+@pytest.mark.slow
 def test_a_guarded_run_that_was_stopped_goes_on_with_the_same_bits(tmp_path):
     """Reference, evidence and who is deployed are in the checkpoint."""
     fine = make(guard=True)
@@ -485,11 +489,12 @@ class Stepped:
         return Episode(transitions, valid, total, no, no, total, index, jnp.zeros((LENGTH + 1, 0)))
 
 
+@pytest.mark.slow
 def test_a_system_stepped_from_python_goes_through_the_same_loop():
     """With the same dynamics it gives the same run, whatever is played in one program or step by step."""
     fast = simulated()
     robots = [Robot(jax.tree.map(lambda x, m=m: x[m], fast.pools)) for m in range(2)]
-    for (one, metrics), (other, same) in zip(run(rollouts=3), run(system=Stepped(robots), rollouts=3), strict=True):
+    for (one, metrics), (other, same) in zip(whole()[1][:4], run(system=Stepped(robots), rollouts=3), strict=True):
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5), one, other)
         jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-4, atol=1e-5), metrics, same)
 

@@ -43,7 +43,7 @@ def left(context):
 
 def run(transform, imagination, batch, key):
     """A transform that does not learn, applied to a batch."""
-    return transform.apply(transform.init(None, key), imagination, batch, key)
+    return jax.jit(lambda batch, key: transform.apply(transform.init(None, key), imagination, batch, key))(batch, key)
 
 
 def batch_of(obs, next_obs, reward, discount=None, steps_to_go=None, horizon=3):
@@ -334,4 +334,4 @@ def test_composition_runs_left_to_right_with_separate_keys_and_states(key):
     assert [(name, state) for name, state, _ in seen] == [("a", "x"), ("b", "y")] and seen[0][2] != seen[1][2]
     state, metrics = both.update(("x", "y"), raw, key)
     assert state == ("xa", "yb") and metrics["seen/a"] != metrics["seen/b"]
-    assert run(sgft.compose(), imagination(), raw, key) is raw and sgft.compose().init(None, key) == ()
+    assert sgft.compose().apply((), imagination(), raw, key) is raw and sgft.compose().init(None, key) == ()

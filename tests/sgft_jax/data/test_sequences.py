@@ -128,9 +128,9 @@ def test_an_exploded_row_may_hold_anything(key):
 def test_vmap_over_seeds(key):
     rings = jax.vmap(lambda _: sequences.init(rows(0.0), 6))(jnp.arange(2))
     valid = jnp.array([[True, True, True], [True, False, False]])
-    rings = jax.vmap(sequences.add_episode)(rings, rows([[1, 2, 3], [4, 5, 6]]), valid)
+    rings = jax.jit(jax.vmap(sequences.add_episode))(rings, rows([[1, 2, 3], [4, 5, 6]]), valid)
     assert rings.size.tolist() == [3, 1]
-    drawn = jax.vmap(lambda r, k: sequences.sample(r, k, 50, LENGTH))(rings, jax.random.split(key, 2))
+    drawn = jax.jit(jax.vmap(lambda r, k: sequences.sample(r, k, 50, LENGTH)))(rings, jax.random.split(key, 2))
     assert set(drawn.reward[0, :, 0].tolist()) == {1, 2, 3}
     assert set(drawn.reward[1, :, 0].tolist()) == {4} and drawn.valid[1].sum() == 50
 

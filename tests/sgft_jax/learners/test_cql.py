@@ -10,7 +10,7 @@ from sgft_jax.learners import cql, sac
 from sgft_jax.models import networks
 from sgft_jax.types import Batch
 
-NET = networks.NetworkConfig((32,))
+NET = networks.NetworkConfig((16,))
 ROWS = 32
 
 
@@ -74,10 +74,14 @@ def test_actions_that_the_data_lack_are_worth_less(key):
 
 def test_the_entropy_is_not_in_the_target(key):
     batch = batch_of(key, 0.0)._replace(discount=jnp.ones(ROWS), reward=jnp.zeros(ROWS))
+    learner = cql.make_cql(cql.CQLConfig(1, 1, network=NET))
+    state, update = jax.jit(learner.init)(key), jax.jit(learner.update)
     targets = []
     for alpha in (1e-4, 5.0):
-        learner = cql.make_cql(cql.CQLConfig(1, 1, network=NET), sac.SACHyper(alpha=alpha))
-        targets.append(float(jax.jit(learner.update)(learner.init(key), batch, key)[1]["critic/target_mean"]))
+        at = state.replace(log_alpha=state.log_alpha._replace(params=jnp.log(jnp.float32(alpha))))
+        metrics = update(at, batch, key)[1]
+        assert metrics["actor/alpha"] == pytest.approx(alpha, rel=1e-2)
+        targets.append(float(metrics["critic/target_mean"]))
     assert targets[0] == targets[1] != 0
 
 

@@ -46,6 +46,12 @@ def equal(a, b):
     return all(jnp.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
+@jax.jit
+def values(state, batch):
+    """Of both critics at the data's actions, [ROWS, 2]."""
+    return jax.vmap(CRITIC.apply, (None, 0, 0))(state.critic.params, batch.obs, batch.action)
+
+
 # --- the penalty ----------------------------------------------------------------------------------------------------
 
 
@@ -106,21 +112,21 @@ def test_order_and_rows_of_the_update(learner, key):
     state = state.replace(target_critic=apart)
     new, metrics = learner.update(state, batch, key)
     real, sim = ~np.asarray(SIM), np.asarray(SIM)
-    log_w = jax.vmap(RATIO.log_ratio, (None, 0, 0, 0))(new.ratio, batch.obs, batch.action, batch.next_obs)
+    log_w = jax.jit(jax.vmap(RATIO.log_ratio, (None, 0, 0, 0)))(new.ratio, batch.obs, batch.action, batch.next_obs)
     assert metrics["ratio/gap_sim"] == pytest.approx(float(-log_w[sim].mean()), rel=1e-4)  # the spread is 0
 
     def y(row, key):
         action, _ = networks.tanh_gaussian_sample(ACTOR.apply(state.actor.params, row.next_obs), key)
         return row.reward + row.discount * CRITIC.apply(apart, row.next_obs, action).min()
 
-    targets = jax.vmap(y)(batch, jax.random.split(jax.random.split(key, 4)[3], ROWS))
-    q = jax.vmap(CRITIC.apply, (None, 0, 0))(state.critic.params, batch.obs, batch.action)
-    squared = jnp.sum(jax.vmap(lambda q, y: (q - y) ** 2)(q, targets), axis=1)
-    weights = jnp.exp(jnp.minimum(log_w, 0))
+    targets = jax.jit(jax.vmap(y))(batch, jax.random.split(jax.random.split(key, 4)[3], ROWS))
+    q = values(state, batch)
+    squared = np.sum((np.asarray(q) - np.asarray(targets)[:, None]) ** 2, axis=1)
+    weights = np.exp(np.minimum(log_w, 0))
     assert metrics["critic/target_mean"] == pytest.approx(float(targets.mean()), rel=1e-4)
     assert metrics["critic/real_loss"] == pytest.approx(float(squared[real].mean()), rel=1e-4)
     assert metrics["critic/sim_loss"] == pytest.approx(float((weights * squared)[sim].mean()), rel=1e-4)
-    expected = 0.01 * h2o.penalty(q, h2o.log_shares(-log_w, batch), batch)
+    expected = 0.01 * jax.jit(lambda q, gaps: h2o.penalty(q, h2o.log_shares(gaps, batch), batch))(q, -log_w)
     assert metrics["critic/penalty"] == pytest.approx(float(expected), rel=1e-3, abs=1e-6)
     total = sum(float(metrics[f"critic/{part}"]) for part in ("real_loss", "sim_loss", "penalty"))
     assert metrics["critic/loss"] == pytest.approx(total, rel=1e-5)
@@ -148,14 +154,15 @@ def test_the_spread_is_noise_on_successors(learner, key):
     assert equal(several[0][0].ratio, several[1][0].ratio)
 
 
-def test_simulated_pairs_fall_and_real_ones_rise(key):
+def test_simulated_pairs_fall_and_real_ones_rise(learner, key):
     """With a heavy penalty and nothing else to learn."""
-    learner = h2o.make_h2o(CONFIG, h2o.H2OHyper(conservatism=10.0, lr_critic=1e-2))
+    heavy = {"conservatism": jnp.float32(10.0), "lr_critic": jnp.float32(1e-2), "lr_ratio": jnp.float32(3e-4)}
     batch = batch_of(key)._replace(reward=jnp.zeros(ROWS), discount=jnp.zeros(ROWS))
-    state, update = learner.init(key), jax.jit(learner.update)
+    state = learner.init(key)
+    state = state.replace(hyper=state.hyper._replace(**heavy))
     for i in range(100):
-        state, _ = update(state, batch, jax.random.fold_in(key, i))
-    q = jax.vmap(CRITIC.apply, (None, 0, 0))(state.critic.params, batch.obs, batch.action).mean(axis=1)
+        state, _ = learner.update(state, batch, jax.random.fold_in(key, i))
+    q = values(state, batch).mean(axis=1)
     assert q[~SIM].mean() > q[SIM].mean() + 1
 
 

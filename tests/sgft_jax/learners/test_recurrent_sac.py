@@ -28,6 +28,7 @@ HYPER = recurrent.RecurrentHyper(lr=1e-2, tau=0.1, alpha=0.2)
 LEARNER = recurrent.make_recurrent(CONFIG, HYPER)
 MEMORY = make_gru(OBS, ACT, UNITS)
 update = jax.jit(LEARNER.update)
+act = jax.jit(LEARNER.act, static_argnames="explore")
 
 
 @functools.cache
@@ -59,13 +60,18 @@ def test_acting_step_by_step_is_reading_the_window(key):
     """With the actions that were taken in the carry, the policy's moments are those that the losses see."""
     state, window = started(), jax.tree.map(lambda x: x[0], windows(key))
     previous = jnp.concatenate([jnp.zeros((1, ACT)), window.action[:-1]])
-    obs = jax.vmap(normalizer.normalize, (None, 0))(state.normalizer, window.obs)
-    actor = state.actor.params
-    features = MEMORY.along(actor["memory"], previous, obs)
-    moments = jax.vmap(make_actor(MEMORY.features, ACT, NET).apply, (None, 0))(actor["head"], features)
+
+    @jax.jit
+    def read(state, previous, obs):
+        obs = jax.vmap(normalizer.normalize, (None, 0))(state.normalizer, obs)
+        actor = state.actor.params
+        features = MEMORY.along(actor["memory"], previous, obs)
+        return jax.vmap(make_actor(MEMORY.features, ACT, NET).apply, (None, 0))(actor["head"], features)
+
+    moments = read(state, previous, window.obs)
     carry = LEARNER.init_carry()
     for step in range(T):
-        action, carry = LEARNER.act(state, carry, window.obs[step], key, explore=False)
+        action, carry = act(state, carry, window.obs[step], key, explore=False)
         np.testing.assert_allclose(action, jnp.tanh(moments[step, 0]), rtol=1e-5, atol=1e-6)
         np.testing.assert_array_equal(carry.action, action)
         carry = carry._replace(action=window.action[step])  # another one was taken
@@ -76,12 +82,10 @@ def test_it_remembers_what_it_saw_and_did(changed, key):
     state, obs, first = started(), jnp.array([0.3, -0.4]), jnp.array([1.0, 2.0])
     acts = []
     for other in (False, True):
-        _, carry = LEARNER.act(
-            state, LEARNER.init_carry(), -first if other and changed == "obs" else first, key, explore=False
-        )
+        _, carry = act(state, LEARNER.init_carry(), -first if other and changed == "obs" else first, key, explore=False)
         carry = carry._replace(action=-jnp.ones(ACT)) if other and changed == "action" else carry
         carry = carry if changed == "action" else carry._replace(action=jnp.ones(ACT))
-        acts.append(LEARNER.act(state, carry, obs, key, explore=False)[0])
+        acts.append(act(state, carry, obs, key, explore=False)[0])
     assert abs(acts[0] - acts[1]) > 1e-3
 
 
@@ -90,10 +94,11 @@ def test_the_policy_of_a_prior_is_the_agents(key):
     state, policy = started(), make_policy(card, SimpleNamespace(obs_dim=OBS, act_dim=ACT))
     params = recurrent.extract_params(state)
     carries = policy.init_carry(), LEARNER.init_carry()
+    plays = jax.jit(policy.act, static_argnames="explore")
     for explore in (False, True):
         mine, theirs = (
-            policy.act(params, carries[0], jnp.ones(OBS), key, explore=explore),
-            LEARNER.act(state, carries[1], jnp.ones(OBS), key, explore=explore),
+            plays(params, carries[0], jnp.ones(OBS), key, explore=explore),
+            act(state, carries[1], jnp.ones(OBS), key, explore=explore),
         )
         chex.assert_trees_all_equal(mine, theirs)
         carries = mine[1], theirs[1]

@@ -14,11 +14,13 @@ from sgft_jax.learners import sac
 from sgft_jax.models import networks, normalizer
 from sgft_jax.types import Batch
 
-NET = networks.NetworkConfig(hidden=(32,))
-CONFIG = sac.SACConfig(1, 1, network=NET, tune_alpha=False, train_dynamics=False)
+# Compiling is most of what takes time here: one program for each configuration, numbers are in the state.
+INIT = jax.jit(sac.init, static_argnums=0)
+UPDATE = jax.jit(sac.update, static_argnums=0, static_argnames="critic_term")
+NET = networks.NetworkConfig(hidden=(8,))
+PLAIN = sac.SACConfig(1, 1, network=NET, train_value=False, train_dynamics=False)
 # alpha 1e-4: entropy changes the answers below by less than their tolerance
 HYPER = sac.SACHyper(lr_actor=3e-3, lr_critic=1e-2, lr_value=1e-2, tau=0.1, alpha=1e-4)
-LEARNER = sac.make_sac(CONFIG, HYPER)
 ROWS = 128
 
 
@@ -40,28 +42,30 @@ def probe(key, *, obs=None, reward=None, discount=None):
 
 
 def test_temperature_finds_the_target_entropy(key):
-    config = sac.SACConfig(1, 1, network=NET, train_value=False, train_dynamics=False)
-    learner = sac.make_sac(config, HYPER._replace(alpha=1.0, lr_alpha=1e-2, entropy_per_dim=-0.5))
+    state = INIT(PLAIN, key, HYPER._replace(alpha=1.0, lr_alpha=1e-2, entropy_per_dim=-0.5))
     batch = probe(key, reward=lambda s, a: -((a - 0.2) ** 2))
-    scan = jax.jit(lambda s, k: jax.lax.scan(lambda s, k: learner.update(s, batch, k), s, jax.random.split(k, 3000)))
-    _, metrics = scan(learner.init(key), key)
+    update = partial(sac.update, PLAIN)
+    scan = jax.jit(lambda s, k: jax.lax.scan(lambda s, k: update(s, batch, k), s, jax.random.split(k, 3000)))
+    _, metrics = scan(state, key)
     assert metrics["actor/entropy"][-1000:].mean() == pytest.approx(-0.5, abs=0.15)
     assert 0 < metrics["actor/alpha"][-1] < 0.2
 
 
 def test_log_alpha_stops_at_minus_ten(key):
-    config = sac.SACConfig(1, 1, network=NET, train_value=False, train_dynamics=False)
-    learner = sac.make_sac(config, sac.SACHyper(alpha=0.0, lr_alpha=1.0, entropy_per_dim=-50.0))
-    state = jax.jit(learner.init)(key)
+    state = INIT(PLAIN, key, HYPER._replace(alpha=0.0, lr_alpha=1.0, entropy_per_dim=-50.0))
     assert state.log_alpha.params == -10.0
-    assert jax.jit(learner.update)(state, probe(key), key)[0].log_alpha.params == -10.0
+    assert UPDATE(PLAIN, state, probe(key), key)[0].log_alpha.params == -10.0
 
 
 # --- contract -------------------------------------------------------------------------------------------------------
 
 FULL = sac.SACConfig(1, 1, network=networks.NetworkConfig((8,)), ensemble_size=3)
 FULL_LEARNER = sac.make_sac(FULL)
-FULL_LEARNER = FULL_LEARNER._replace(init=jax.jit(FULL_LEARNER.init), update=jax.jit(FULL_LEARNER.update))
+FULL_LEARNER = FULL_LEARNER._replace(
+    init=jax.jit(FULL_LEARNER.init),
+    act=jax.jit(FULL_LEARNER.act, static_argnames="explore"),
+    update=jax.jit(FULL_LEARNER.update),
+)
 
 
 def equal(a, b):
@@ -87,12 +91,10 @@ def test_target_critic_follows_at_rate_tau(key):
 
 def test_fixed_temperature_and_delayed_actor_keep_their_bits(key):
     config = sac.SACConfig(1, 1, network=NET, tune_alpha=False, train_value=False, train_dynamics=False)
-    learner = sac.make_sac(config, sac.SACHyper(alpha=0.01, actor_start=2.0))
-    state = start = learner.init(key)
+    state = start = INIT(config, key, HYPER._replace(alpha=0.01, actor_start=2.0))
     assert state.value is None and state.dynamics is None
-    update = jax.jit(learner.update)
     for step in range(3):
-        state, _ = update(state, probe(key), jax.random.fold_in(key, step))
+        state, _ = UPDATE(config, state, probe(key), jax.random.fold_in(key, step))
         assert equal(start.actor, state.actor) == (step < 2)  # moments included
     assert equal(start.log_alpha, state.log_alpha)
 
@@ -112,44 +114,47 @@ def test_an_anchored_actor_stays_with_the_policy_it_began_with(key):
     """The dearer it is to leave, the less far it goes; what it is held to never moves."""
     config = dataclasses.replace(FULL, tune_alpha=False, train_value=False, train_dynamics=False, anchored=True)
     actor = jax.vmap(networks.make_actor(1, 1, FULL.network).apply, (None, 0))
+
+    @jax.jit
+    def divergence(*params):
+        now, then = (actor(p, jnp.linspace(-1.0, 1.0, 9)[:, None]) for p in params)
+        return jax.vmap(networks.tanh_gaussian_divergence)(now, then).mean()
+
     params = sac.extract_params(FULL_LEARNER.init(key))
     batch, far = probe(key, reward=lambda s, a: 5.0 * a), []
     for price in (0.0, 10.0, 1000.0):
         hyper = HYPER._replace(anchor=price)
         state = start = sac.state_from_prior(config, hyper, params, key, reset_critic=False)
-        update = jax.jit(sac.make_sac(config, hyper).update)
         for step in range(150):
-            state, _ = update(state, batch, jax.random.fold_in(key, step))
+            state, _ = UPDATE(config, state, batch, jax.random.fold_in(key, step))
         assert equal(start.anchor, state.anchor) and equal(start.anchor, params.actor)
-        now, then = (actor(p, jnp.linspace(-1.0, 1.0, 9)[:, None]) for p in (state.actor.params, state.anchor))
-        far.append(float(jax.vmap(networks.tanh_gaussian_divergence)(now, then).mean()))
+        far.append(float(divergence(state.actor.params, state.anchor)))
     assert far[0] > 2 * far[1] > 4 * far[2] > 0
 
 
 def test_policy_delay(key):
-    config = sac.SACConfig(1, 1, network=NET, policy_delay=2, train_value=False, train_dynamics=False)
-    learner = sac.make_sac(config)
-    start, update = learner.init(key), jax.jit(learner.update)
-    first, _ = update(start, probe(key), key)
-    second, _ = update(first, probe(key), key)
+    config = dataclasses.replace(PLAIN, policy_delay=2)
+    start = INIT(PLAIN, key)
+    first, _ = UPDATE(config, start, probe(key), key)
+    second, _ = UPDATE(config, first, probe(key), key)
     assert equal(first.actor, second.actor) and not equal(start.actor, first.actor)
 
 
 def ensemble(alpha=0.5, **options):
     """Four critics that say 0, 1, 2 and 3 everywhere, as a state, and the learner."""
-    config = sac.SACConfig(1, 1, network=NET, critics=4, train_value=False, train_dynamics=False, **options)
-    learner = sac.make_sac(config, sac.SACHyper(alpha=alpha))
-    state = learner.init(jax.random.key(0))
+    config = dataclasses.replace(PLAIN, critics=4, **options)
+    state = INIT(dataclasses.replace(PLAIN, critics=4), jax.random.key(0), HYPER._replace(alpha=alpha))
     said = jax.tree.map(jnp.zeros_like, state.critic.params)
     said["Dense_1"]["bias"] = jnp.arange(4.0)[:, None]
-    return state.replace(critic=state.critic._replace(params=said), target_critic=said), jax.jit(learner.update)
+    return state.replace(critic=state.critic._replace(params=said), target_critic=said), partial(UPDATE, config)
 
 
 def test_targets_are_the_minimum_of_some_members(key):
     """Of two random members of four: 0, 1 or 2, and every one of them now and then; by default of all: 0."""
     batch = probe(key, discount=lambda s: jnp.ones_like(s), reward=lambda s, a: jnp.zeros_like(s))
-    for chosen, expected in ((2, {0, 1, 2}), (None, {0})):
-        state, update = ensemble(target_critics=chosen, alpha=1e-4)
+    two = {"target_critics": 2, "actor_mean": True}  # as below, where the actor follows the mean
+    for options, expected in ((two, {0, 1, 2}), ({}, {0})):
+        state, update = ensemble(alpha=1e-4, **options)
         seen = [float(update(state, batch, jax.random.key(i))[1]["critic/target_mean"]) for i in range(20)]
         assert {round(x) for x in seen} == expected and all(abs(x - round(x)) < 1e-3 for x in seen)
 
@@ -181,7 +186,6 @@ def test_without_entropy_in_the_target(key):
 
 def test_a_critic_term_joins_the_loss(key):
     """3 + 5 times the mean of all critics at the data's actions; it may ask the policy, too."""
-    config = sac.SACConfig(1, 1, network=NET, train_value=False, train_dynamics=False)
 
     def after(slope):
         def term(critic, params, policy, batch, key):
@@ -189,10 +193,9 @@ def test_a_critic_term_joins_the_loss(key):
             assert action.shape == (1,) and log_prob.shape == ()
             return 3.0 + slope * jnp.mean(jax.vmap(critic, (None, 0, 0))(params, batch.obs, batch.action))
 
-        update = jax.jit(partial(sac.update, config, critic_term=term))
-        return update(sac.init(config, key), probe(key), key)
+        return sac.update(PLAIN, INIT(PLAIN, key), probe(key), key, critic_term=term)
 
-    (flat, of_flat), (steep, of_steep) = after(0.0), after(5.0)
+    (flat, of_flat), (steep, of_steep) = map(jax.jit(after), (0.0, 5.0))
     assert not equal(flat.critic, steep.critic)
     assert of_steep["critic/q_mean"] == of_flat["critic/q_mean"] and of_flat["critic/loss"] > 3
     gained = float(of_steep["critic/loss"] - of_flat["critic/loss"])
@@ -200,26 +203,23 @@ def test_a_critic_term_joins_the_loss(key):
 
 
 def test_the_actor_follows_the_minimum_or_the_mean(key):
-    for mean, q in ((False, 0.0), (True, 1.5)):
-        state, update = ensemble(actor_mean=mean)
+    for options, q in (({}, 0.0), ({"actor_mean": True, "target_critics": 2}, 1.5)):
+        state, update = ensemble(**options)
         kept = state.replace(hyper=state.hyper._replace(lr_critic=jnp.float32(0)))
         metrics = update(kept, probe(key), key)[1]
         assert metrics["actor/loss"] == pytest.approx(-0.5 * float(metrics["actor/entropy"]) - q, abs=1e-4)
 
 
 def test_the_temperature_waits_with_the_actor(key):
-    config = sac.SACConfig(1, 1, network=NET, policy_delay=2, train_value=False, train_dynamics=False)
-    learner = sac.make_sac(config)
-    update = jax.jit(learner.update)
-    first, _ = update(learner.init(key), probe(key), key)
-    second, _ = update(first, probe(key), key)
+    config = dataclasses.replace(PLAIN, policy_delay=2)
+    first, _ = UPDATE(config, INIT(PLAIN, key), probe(key), key)
+    second, _ = UPDATE(config, first, probe(key), key)
     assert first.log_alpha.params != 0 and equal(first.log_alpha, second.log_alpha)
 
 
 def test_actor_learns_from_the_leading_rows_only(key):
-    config = sac.SACConfig(1, 1, network=NET, actor_batch=4, train_value=False, train_dynamics=False)
-    learner = sac.make_sac(config)
-    state, batch, update = learner.init(key), probe(key, obs=[-1.0, 1.0]), jax.jit(learner.update)
+    update = partial(UPDATE, dataclasses.replace(PLAIN, actor_batch=4))
+    state, batch = INIT(PLAIN, key), probe(key, obs=[-1.0, 1.0])
     other = batch._replace(obs=batch.obs.at[4:].add(3.0))
     # from the same critic, the actor's step does not see rows 4 and later
     kept = state.replace(hyper=state.hyper._replace(lr_critic=jnp.float32(0)))
@@ -231,9 +231,8 @@ def test_actor_learns_from_the_leading_rows_only(key):
 
 def test_weights_of_the_actors_rows_may_be_left_out(key):
     """The critic still counts rows as they weigh. That an actor else does so too says test_contract_learners.py."""
-    learner = sac.make_sac(dataclasses.replace(FULL, weighted_actor=False))
-    batch = probe(key, obs=[-1.0, 1.0], reward=lambda s, a: s * a)
-    state, update = learner.init(key), jax.jit(learner.update)
+    batch = probe(key, obs=[-1.0, 1.0], reward=lambda s, a: s * a)._replace(weight=jnp.ones(ROWS))
+    state, update = FULL_LEARNER.init(key), partial(UPDATE, dataclasses.replace(FULL, weighted_actor=False))
     kept = state.replace(hyper=state.hyper._replace(lr_critic=jnp.float32(0)))
     half = batch._replace(weight=jnp.arange(ROWS) % 2 * 2.0)
     a, b = (update(kept, x, key)[0] for x in (batch, half))
@@ -251,11 +250,12 @@ def test_without_discount_the_target_ignores_target_network_and_successor(key):
 
 
 def test_hyperparameters_vmap(key):
-    state = FULL_LEARNER.init(key)
+    state, batch = INIT(PLAIN, key), probe(key)
     rates = jnp.array([0.0, 1e-2])
 
+    @jax.jit
     def step(rate):
-        return FULL_LEARNER.update(state.replace(hyper=state.hyper._replace(lr_critic=rate)), probe(key), key)[0]
+        return sac.update(PLAIN, state.replace(hyper=state.hyper._replace(lr_critic=rate)), batch, key)[0]
 
     new = jax.vmap(step)(rates)
     assert equal(jax.tree.map(lambda x: x[0], new.critic.params), state.critic.params)
@@ -280,16 +280,15 @@ def test_keys_decide(key):
 
 @pytest.fixture(scope="module")
 def prior():
-    state = sac.make_sac(sac.SACConfig(3, 2, network=NET, ensemble_size=2)).init(jax.random.key(7))
+    state = INIT(sac.SACConfig(3, 2, network=NET, ensemble_size=2), jax.random.key(7))
     statistics = normalizer.Normalizer(jnp.array([1.0, 2, 3]), jnp.array([2.0, 1, 0.5]))
     return sac.extract_params(state.replace(normalizer=statistics))
 
 
 def tuned(prior, *, reset, extra=0, **options):
     config = sac.SACConfig(3, 2, context_dim=extra, network=NET, train_value=False, train_dynamics=False, **options)
-    return sac.make_sac(config), sac.state_from_prior(
-        config, sac.SACHyper(alpha=0.01), prior, jax.random.key(0), reset_critic=reset
-    )
+    start = jax.jit(partial(sac.state_from_prior, config), static_argnames="reset_critic")
+    return sac.make_sac(config), start(HYPER._replace(alpha=0.01), prior, jax.random.key(0), reset_critic=reset)
 
 
 def test_fine_tuning_starts_from_the_prior(prior, key):
@@ -336,10 +335,10 @@ def test_kept_critic_under_shaping_is_the_simulators_advantage(prior, key):
 
 def test_a_prior_of_another_shape_is_refused(prior):
     config = sac.SACConfig(4, 2, network=NET)
-    with pytest.raises(UserError, match=r"prior actor.*\(3, 32\), expected \(4, 32\)"):
+    with pytest.raises(UserError, match=r"prior actor.*\(3, 8\), expected \(4, 8\)"):
         sac.state_from_prior(config, sac.SACHyper(), prior, jax.random.key(0), reset_critic=True)
     with pytest.raises(UserError, match="train_value and train_dynamics"):
-        sac.extract_params(LEARNER.init(jax.random.key(0)))
+        sac.extract_params(INIT(PLAIN, jax.random.key(0)))
 
 
 def test_impossible_options_are_refused():

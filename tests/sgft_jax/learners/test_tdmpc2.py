@@ -51,6 +51,7 @@ def start(config, key):
     return state if config == PLAIN else tdmpc2.state_from_prior(config, HYPER, tdmpc2.extract_params(state))
 
 
+@functools.partial(jax.jit, static_argnums=0)
 def shaken(config, key, scale=0.3):
     """A state whose every parameter has been moved, so that no output is trivially zero, and with Adam moments."""
     state = start(config, key)
@@ -130,6 +131,7 @@ def test_dropout_acts_in_training_alone(key):
     config = dataclasses.replace(PLAIN, dropout=0.5)
     parts, state = tdmpc2_model.make_networks(config), shaken(PLAIN, key)
 
+    @jax.jit
     def q(keys):
         return parts.critic.apply(state.critic.params, jnp.full(16, 0.25), jnp.ones(1), keys=keys)
 
@@ -171,6 +173,7 @@ def test_drawn_heads_are_those_of_the_whole_critic(key, trained):
     heads = tdmpc2_model.two_heads(config, key)
     keys = jax.random.split(key, config.size.members) if trained else None
 
+    @jax.jit
     def q(params, keys):
         return tdmpc2_model.q_values(parts, params, jnp.full(16, 0.25), jnp.ones(1), keys)
 
@@ -332,12 +335,13 @@ def test_a_plan_costs_two_heads_whatever_their_number(key):
 
 
 def test_sgft_policy_is_promised_one_step_and_v_sim(key):
-    state, parts = shaken(SGFT, key), tdmpc2_model.make_networks(SGFT)
+    state, parts = shaken(SGFT, key), PARTS
     z, action = parts.encoder.apply(state.encoder.params, jnp.ones(2)), jnp.array([0.3])
     ahead = parts.dynamics.apply(state.dynamics.params, z, action)
     v = q_by_hand(state.critic.params, ahead, jnp.tanh(parts.policy.apply(state.anchor, ahead)[0])).mean()
     r = twohot.decode(parts.reward.apply(state.reward.params, z, action), SGFT.bins)
-    got = tdmpc2._promise(parts, state, z, action, jnp.array([0, 1]), key)
+    own = tdmpc2_model.make_networks(SGFT)
+    got = jax.jit(functools.partial(tdmpc2._promise, own))(state, z, action, jnp.array([0, 1]), key)
     assert got == pytest.approx(float(r + 0.99 * v), rel=1e-4)
 
 

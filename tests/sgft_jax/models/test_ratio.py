@@ -1,5 +1,7 @@
 """Ratio of dynamics: the page's numbers, known Gaussians, and faults that public implementations have had."""
 
+import dataclasses
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,15 @@ from sgft_jax.types import Batch
 
 f = jnp.float32
 SMALL = ratio.RatioConfig(2, 1, NetworkConfig((8,)))
-HALF = 256
+HALF = 128
+
+
+def compiled(config):
+    """Its functions bound to a configuration, each of them one program."""
+    return make_ratio(config)._replace(**{name: jax.jit(f) for name, f in make_ratio(config)._asdict().items()})
+
+
+NOISY, QUIET = compiled(SMALL), compiled(dataclasses.replace(SMALL, noise=0.0))
 
 
 def logits(p_real):
@@ -73,15 +83,15 @@ def rows(key, *, shift, apart):
 
 @pytest.fixture(scope="module")
 def learned():
-    """Discriminators after 2,000 steps, and the statistics that they read with, for a shift of 1 and states 1 apart."""
-    learner = make_ratio(ratio.RatioConfig(1, 1, NetworkConfig((64, 64)), noise=0.0))
+    """Discriminators after 1,500 steps, and the statistics that they read with, for a shift of 1 and states 1 apart."""
+    learner = make_ratio(ratio.RatioConfig(1, 1, NetworkConfig((32, 32)), noise=0.0))
 
     @jax.jit
     def train(key):
         def step(state, key):
-            return learner.update(state, rows(key, shift=1.0, apart=1.0), key, rate=1e-3)
+            return learner.update(state, rows(key, shift=1.0, apart=1.0), key, rate=2e-3)
 
-        return jax.lax.scan(step, learner.init(key), jax.random.split(key, 2000))
+        return jax.lax.scan(step, learner.init(key), jax.random.split(key, 1500))
 
     state, metrics = train(jax.random.key(0))
     return learner, state, metrics["ratio/loss"]
@@ -134,10 +144,11 @@ def small_batch(key):
 
 def test_both_domains_count_alike_however_many_rows_each_has(key):
     """Four copies of a simulated row weigh as much as one of them."""
-    learner = make_ratio(ratio.RatioConfig(2, 1, NetworkConfig((8,)), noise=0.0))
     batch = jax.tree.map(lambda x: x[jnp.array([0, 1, 2, 2, 2, 2])], small_batch(key))
-    state, loss = learner.init(key), jax.jit(lambda *x: learner.update(*x, rate=1e-3)[1]["ratio/loss"])
-    copies, alone = (loss(state, batch._replace(valid=jnp.arange(6) < n), key) for n in (6, 3))
+    state = QUIET.init(key)
+    copies, alone = (
+        QUIET.update(state, batch._replace(valid=jnp.arange(6) < n), key, rate=1e-3)[1]["ratio/loss"] for n in (6, 3)
+    )
     assert copies == pytest.approx(float(alone), rel=1e-5)
 
 
@@ -148,9 +159,8 @@ def gradients(new):
 
 @pytest.mark.slow
 def test_the_pair_learns_from_both_losses_and_the_joint_from_its_own(key):
-    learner = make_ratio(ratio.RatioConfig(2, 1, NetworkConfig((8,)), noise=0.0))
-    state, batch = learner.init(key), small_batch(key)
-    new, metrics = learner.update(state, batch, key, rate=1e-3)
+    state, batch = QUIET.init(key), small_batch(key)
+    new, metrics = QUIET.update(state, batch, key, rate=1e-3)
     joint, pair = (ratio.make_discriminator(n, SMALL.network, bound=2.0) for n in (5, 3))
 
     def loss(of_joint, of_pair):
@@ -171,15 +181,14 @@ def test_the_pair_learns_from_both_losses_and_the_joint_from_its_own(key):
 
 def test_noise_is_there_in_training_alone(key):
     batch, other = small_batch(key), jax.random.key(1)
-    noisy = make_ratio(SMALL)
-    state = noisy.init(key)
-    steps = [noisy.update(state, batch, k, rate=1e-3)[1]["ratio/loss"] for k in (key, other)]
+    batch = batch._replace(valid=jnp.ones(6, bool))
+    state = NOISY.init(key)
+    steps = [NOISY.update(state, batch, k, rate=1e-3)[1]["ratio/loss"] for k in (key, other)]
     assert steps[0] != steps[1]
-    quiet = make_ratio(ratio.RatioConfig(2, 1, NetworkConfig((8,)), noise=0.0))
-    steps = [quiet.update(state, batch, k, rate=1e-3)[1]["ratio/loss"] for k in (key, other)]
+    steps = [QUIET.update(state, batch, k, rate=1e-3)[1]["ratio/loss"] for k in (key, other)]
     assert steps[0] == steps[1]
     row = batch.obs[0], batch.action[0], batch.next_obs[0]
-    assert noisy.log_ratio(state, *row) == quiet.log_ratio(state, *row)
+    assert NOISY.log_ratio(state, *row) == QUIET.log_ratio(state, *row)
 
 
 def test_every_part_of_a_row_gets_noise(key):
@@ -193,7 +202,7 @@ def test_every_part_of_a_row_gets_noise(key):
 def test_standardised_inputs(key):
     """With the statistics of the data, rows in any unit give the same step."""
     statistics = normalizer.Normalizer(jnp.array([3.0, -20.0]), jnp.array([0.1, 10.0]))
-    learner, batch = make_ratio(SMALL), small_batch(key)
+    learner, batch = NOISY, small_batch(key)._replace(valid=jnp.ones(6, bool))
     state = learner.init(key)
     to_raw = jax.vmap(lambda z: z * statistics.std + statistics.mean)
     raw = batch._replace(obs=to_raw(batch.obs), next_obs=to_raw(batch.next_obs))
@@ -208,7 +217,7 @@ def test_standardised_inputs(key):
 
 
 def test_invalid_rows_do_not_count_and_origin_is_needed(key):
-    learner, batch = make_ratio(SMALL), small_batch(key)
+    learner, batch = NOISY, small_batch(key)
     state, valid = learner.init(key), jnp.array([1, 0, 1, 1, 0, 1], bool)
     other = batch._replace(obs=jnp.where(valid[:, None], batch.obs, 7.0))
     one, two = (learner.update(state, b._replace(valid=valid), key, rate=1e-3) for b in (batch, other))
@@ -219,13 +228,12 @@ def test_invalid_rows_do_not_count_and_origin_is_needed(key):
 
 def test_real_and_simulated_are_not_exchanged(key):
     """A few steps on rows that only s' tells apart: the ratio of real rows rises, that of simulated ones falls."""
-    learner = make_ratio(SMALL)
-    batch = small_batch(key)
+    learner = NOISY
+    batch = small_batch(key)._replace(valid=jnp.ones(6, bool))
     batch = batch._replace(next_obs=jnp.where(batch.is_sim[:, None], 2.0, -2.0) * jnp.ones((6, 2)))
     state = start = learner.init(key)
-    update = jax.jit(learner.update)
     for i in range(50):
-        state, _ = update(state, batch, jax.random.fold_in(key, i), rate=1e-2)
-    each = jax.vmap(learner.log_ratio, (None, 0, 0, 0))
+        state, _ = learner.update(state, batch, jax.random.fold_in(key, i), rate=1e-2)
+    each = jax.jit(jax.vmap(learner.log_ratio, (None, 0, 0, 0)))
     gained = each(state, *batch[:2], batch.next_obs) - each(start, *batch[:2], batch.next_obs)
     assert jnp.all(gained[:2] > 1) and jnp.all(gained[2:] < -1)
