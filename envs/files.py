@@ -3,6 +3,7 @@
 Imports no JAX. Whatever is wrong with a file is a `UserError` with one line that names it.
 """
 
+import functools
 import json
 import math
 import os
@@ -41,7 +42,8 @@ def read_text(path: Path | str, *, limit: int = LIMIT) -> str:
 
 def read_bytes(path: Path | str, *, limit: int = LIMIT) -> bytes:
     """The content of a plain file. limit: bytes; a larger file is refused."""
-    with readable(path), open(path, "rb", opener=_without_waiting) as file:
+    # A named pipe would wait for its other end.
+    with readable(path), open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise UserError(f"{path}: is no plain file")
         content = file.read(limit + 1)
@@ -83,7 +85,8 @@ def read_toml(path: Path | str) -> dict[str, Any]:
 
 def parse_json(text: str | bytes, where: Path | str) -> Any:
     """What a JSON text says; `where` names it in errors. Keys that come twice and numbers beyond floats are refused."""
-    return _parsed(_loads, text, where, "JSON")
+    strict = {"parse_float": _finite, "parse_constant": _finite, "object_pairs_hook": _unique}
+    return _parsed(functools.partial(json.loads, **strict), text, where, "JSON")
 
 
 def read_object(path: Path | str, schema: Schema, fix: str) -> dict[str, Any]:
@@ -105,11 +108,6 @@ def kind_of(schema: Schema) -> Any:
     return cast(Any, TypedDict)("Object", dict(schema)) if isinstance(schema, Mapping) else schema
 
 
-def _without_waiting(path: str, flags: int) -> int:
-    """A named pipe would wait for its other end."""
-    return os.open(path, flags | os.O_NONBLOCK)
-
-
 def _parsed[T](parse: Callable[[Any], T], text: Any, where: Path | str, language: str) -> T:
     try:
         parsed = parse(text)
@@ -129,10 +127,6 @@ def _check_depth(value: Any) -> None:
         if not (level := [part for table in tables for part in table]):
             return
     raise RecursionError
-
-
-def _loads(text: str | bytes) -> Any:
-    return json.loads(text, parse_float=_finite, parse_constant=_finite, object_pairs_hook=_unique)
 
 
 def _finite(text: str) -> float:
