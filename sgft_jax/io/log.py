@@ -151,10 +151,7 @@ def _record(where: str, line: str) -> dict[str, Any]:
     record = parse_json(line, where)
     if not isinstance(record, dict):
         raise UserError(f"{where}: is no JSON object; {_FIX}")
-    try:
-        return {key: _floats(value) for key, value in record.items()}
-    except RecursionError:
-        raise UserError(f"{where}: not valid JSON (nested too deeply)") from None
+    return {key: _floats(value) for key, value in record.items()}
 
 
 def _floats(value: Any) -> Any:
