@@ -1,8 +1,7 @@
 """Checks of options that people set: each raises UserError, one line with the option, its value and what it must be.
 
-What a field must be is part of its type: `lr: checks.Positive = 3e-4` in a dataclass that derives from `Checked`. The
-functions are for the `__post_init__` of other configs: `checks.positive(self, "lr")`. A field that is None is not
-checked, of a tuple every entry is. Imports neither JAX nor MuJoCo.
+What a field must be is part of its type: `lr: checks.Positive = 3e-4` in a dataclass that derives from `Checked`. A
+field that is None is not checked, of a tuple every entry is. Imports neither JAX nor MuJoCo.
 """
 
 import functools
@@ -20,18 +19,17 @@ MOST = 2**31 - 1  # what counts anything: devices count in 32 bits
 
 @dataclass(frozen=True)
 class Rule:
-    """What every number of a field must be, and the same in words; called with a config, it checks those fields."""
+    """What every number of a field must be, and the same in words; called with a config, it checks that field."""
 
     holds: Callable[[Any], bool]
     wanted: str
 
-    def __call__(self, config: Any, *names: str) -> None:
-        """Raises UserError for the first of the fields that is something else."""
-        for name in names:
-            value = getattr(config, name)
-            for number in value if isinstance(value, tuple) else (value,):
-                if number is not None and not self.holds(number):
-                    raise refusal(name, number, self.wanted)
+    def __call__(self, config: Any, name: str) -> None:
+        """Raises UserError where the field is something else."""
+        value = getattr(config, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None and not self.holds(number):
+                raise refusal(name, number, self.wanted)
 
 
 def refusal(name: str, value: Any, wanted: str) -> UserError:
@@ -65,19 +63,12 @@ def greatest(maximum: int) -> Rule:
     return Rule(lambda x: x <= maximum, f"at most {maximum}")
 
 
-def at_least(config: Any, minimum: int, *names: str) -> None:
-    """No less than the minimum, and no more than can be counted."""
-    least(minimum)(config, *names)
-    countable(config, *names)
-
-
-def layers(config: Any, *names: str) -> None:
+def layers(config: Any, name: str) -> None:
     """At least one layer, each at least one unit wide."""
-    for name in names:
-        if not getattr(config, name):
-            raise refusal(name, "empty", "one or more layers of at least 1 unit")
-    least(1)(config, *names)
-    few(config, *names)
+    if not getattr(config, name):
+        raise refusal(name, "empty", "one or more layers of at least 1 unit")
+    least(1)(config, name)
+    few(config, name)
 
 
 countable = greatest(MOST)

@@ -50,11 +50,16 @@ def test_the_whole_line():
     assert str(refused.value) == "option learning-rate is -0.1: must be a positive number"
 
 
-def test_at_least():
-    checks.at_least(Config(2), 2, "learning_rate")
+@dataclasses.dataclass
+class Counted(checks.Checked):
+    members: Annotated[Any, checks.least(2), checks.countable]
+
+
+def test_counts():
+    assert Counted(2).members == 2
     for value, words in ((1, "at least 2"), (math.nan, "at least 2"), (math.inf, "at most 2147483647")):
         with pytest.raises(UserError, match=f"must be {words}"):
-            checks.at_least(Config(value), 2, "learning_rate")
+            Counted(value)
 
 
 def test_layers():
