@@ -179,7 +179,7 @@ def stages(args: TuneArgs, task: str, method: str) -> list[list[Outcome]]:
 
 def keep(scores: Sequence[Score], count: int) -> list[int]:
     """Which trials go on, in order: the first, which has the defaults, and the best of the others."""
-    others = sorted(range(1, len(scores)), key=lambda i: _merit(scores, i), reverse=True)
+    others = sorted(range(1, len(scores)), key=lambda i: scores[i][:2], reverse=True)
     return [0, *sorted(others[: count - 1])]
 
 
@@ -200,11 +200,7 @@ def score(trial: Trial, rollouts: int) -> Score | None:
 
 def best(scores: Sequence[Score]) -> int:
     """The trial of the largest area; ties go to the higher final success, then to the earlier trial."""
-    return max(range(len(scores)), key=lambda i: _merit(scores, i))
-
-
-def _merit(scores: Sequence[Score], i: int) -> tuple[float, float, int]:
-    return scores[i].area, scores[i].final, -i
+    return max(range(len(scores)), key=lambda i: scores[i][:2])  # the first of several
 
 
 def _conclude(args: TuneArgs, task: str, method: str) -> None:
@@ -228,13 +224,8 @@ def _conclude(args: TuneArgs, task: str, method: str) -> None:
 def _result(args: TuneArgs, task: str, method: str, tried: list[Outcome], chosen: int) -> dict[str, Any]:
     """The file of one method, see docs/formats.md."""
     trials = [
-        {
-            "options": trial.settings,
-            "rollouts": rollouts,
-            **scored._asdict(),
-            "folders": [c.folder for c in trial.cells],
-        }
-        for trial, rollouts, scored in tried
+        {"options": trial.settings, "rollouts": n, **scored._asdict(), "folders": [c.folder for c in trial.cells]}
+        for trial, n, scored in tried
         if scored is not None
     ]
     reals = [gaps.title(real) for real in args.reals]
