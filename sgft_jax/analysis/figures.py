@@ -196,8 +196,8 @@ def diagnosis(path: Path, diagnosis: Mapping[str, Any], signs: Sequence[Sign], p
     _name(promise, "V_sim against discounted return", "return that followed")
     colours = {"simulated": _FAINT, "real": PALETTE[1], "identified": PALETTE[0]}
     for where, colour in colours.items():
-        look = {"color": colour, "label": "real, identified" if where == "identified" else where}
-        model.plot(horizons, diagnosis["model_error"][where], linewidth=2, marker="o", markersize=3, **look)
+        errors, label = diagnosis["model_error"][where], "real, identified" if where == "identified" else where
+        model.plot(horizons, errors, color=colour, linewidth=2, marker="o", markersize=3, label=label)
     model.set_ylim(bottom=0)
     _name(model, "model error, standard deviations", "steps ahead")
     for axes in (states, model):

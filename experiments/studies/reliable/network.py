@@ -28,7 +28,7 @@ _RATE, _KNOCKING = 100.0, 10.0  # connections with a wrong token in a second, fo
 @contextlib.contextmanager
 def _proxy(port: int, luck: np.random.Generator) -> Iterator[tuple[int, dict[str, int]]]:
     """(A port that leads to the learner's, what became of messages): it drops, delays and damages some both ways."""
-    counts, between = dict.fromkeys(("messages", "dropped", "delayed", "damaged"), 0), free_port()
+    between, counts = free_port(), {"messages": 0, "dropped": 0, "delayed": 0, "damaged": 0}
 
     def lead_on(near: Connection) -> None:
         with _quietly(), connect(f"ws://127.0.0.1:{port}", compression=None, proxy=None) as far:
