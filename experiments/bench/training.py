@@ -30,7 +30,6 @@ from sgft_jax import api
 from sgft_jax.io.log import read_jsonl
 from sgft_jax.io.priors import load_priors, observed_by
 from sgft_jax.presets import PRESETS
-from sgft_jax.systems.simulated import Simulated
 from sgft_jax.train import finetuning
 from sgft_jax.types import Metrics
 
@@ -102,7 +101,6 @@ def through_system(task: str, impl: Impl, seeds: int, *, prior: Path, repeats: i
     folders = prior_folders(prior, out=prior, task=task, preset="")
     env = envs.make(task, impl, **observed_by(folders))
     setup = api.setup(env, gaps.find(env.name, SIM), load_priors(folders, env), seeds=seeds)
-    assert isinstance(setup.system, Simulated)
     through = finetuning.finetune(*setup, rollouts=10**9)
     progress, _ = next(through)
     agent = jax.tree.map(lambda x: x.copy(), progress.agent)
