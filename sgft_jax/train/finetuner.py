@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from envs.types import Array, Key, Policy, PyTree, Transition, UserError
 from sgft_jax.data import replay, sources
@@ -163,12 +164,12 @@ def assemble(parts: Parts, options: LoopOptions, task: Task) -> Finetuner:
         if parts.simulation is not None and simulated is None:
             raise UserError("this method learns from transitions of the simulator too: give it some (`SimulatedData`)")
 
-        def one(state: FinetuneState, key: Key) -> tuple[FinetuneState, Metrics]:
+        def update(state: FinetuneState, key: Key) -> tuple[FinetuneState, Metrics]:
             return _update(parts, source_of(state, offline), state, key, simulated)
 
         # An empty replay is sampled as zeros, which nobody has lived through.
-        some = state.replay.size > 0 if source_of(state, offline).n_real else jnp.ones((), bool)
-        return _learn(one, state, jax.random.split(key, updates), some, limit)
+        ready = state.replay.size > 0 if source_of(state, offline).n_real else jnp.ones((), bool)
+        return _learn(update, state, jax.random.split(key, updates), ready, limit)
 
     finetuner = Finetuner(
         init=init,
@@ -202,50 +203,46 @@ def _update(
         real = jax.tree.map(lambda x: x[: source.n_real], rows)
         fit, metrics = parts.models.update(state.models, state.frozen.normalizer, real, keys[1])
         state = state._replace(models=fit)
-    transform, more = parts.transform.update(state.transform, rows, keys[2])
-    metrics |= more
+    transform, of_transform = parts.transform.update(state.transform, rows, keys[2])
     batch = parts.transform.apply(transform, parts.imagine(state, keys[3]), rows, keys[4])
-    learner, more = parts.learner.update(state.learner, batch, keys[5])
+    learner, of_learner = parts.learner.update(state.learner, batch, keys[5])
     where = True if batch.valid is None else batch.valid
-    metrics |= more | {
-        "batch/reward_mean": jnp.mean(batch.reward, where=where),
-        "batch/reward_std": jnp.std(batch.reward, where=where),
-    }
+    metrics |= (
+        of_transform
+        | of_learner
+        | {
+            "batch/reward_mean": jnp.mean(batch.reward, where=where),
+            "batch/reward_std": jnp.std(batch.reward, where=where),
+        }
+    )
     return state._replace(learner=learner, transform=transform), metrics
 
 
 def _learn(
-    update: Update, state: FinetuneState, keys: Key, some: Array, limit: Array | None
+    update: Update, state: FinetuneState, keys: Key, ready: Array, limit: Array | None
 ) -> tuple[FinetuneState, Metrics]:
-    """An update with each of the keys, the first `limit` [] of them if given, or none unless `some` []."""
-    made = jnp.where(some, keys.shape[0] if limit is None else limit, 0)
+    """An update with each of the keys, the first `limit` [] of them if given, or none unless `ready` []."""
+    updates = jnp.where(ready, keys.shape[0] if limit is None else limit, 0)
+
+    def step(i: Array, carry: tuple[dict[str, PyTree], Metrics]) -> tuple[dict[str, PyTree], Metrics]:
+        new, metrics = update(state._replace(**carry[0]), keys[i])
+        return _changing(new), jax.tree.map(jnp.add, carry[1], metrics)
+
     if limit is None:
         learned, metrics = jax.lax.scan(update, state, keys)
-        changed = jax.tree.map(lambda new, old: jnp.where(some, new, old), _changing(learned), _changing(state))
-        metrics = jax.tree.map(jnp.mean, metrics)
+        changed = optax.tree.where(ready, _changing(learned), _changing(state))
+        means = jax.tree.map(jnp.mean, metrics)
     else:
-        changed, metrics = _up_to(update, state, keys, made)
-    metrics = {name: jnp.where(made > 0, x, jnp.nan) for name, x in metrics.items()}
-    return state._replace(**changed), metrics | {"updates": made.astype(jnp.float32)}
+        sums = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(update, state, keys[0])[1])
+        changed, sums = jax.lax.fori_loop(0, updates, step, (_changing(state), sums))
+        means = jax.tree.map(lambda total: total / jnp.maximum(updates, 1), sums)
+    means = {name: jnp.where(updates > 0, x, jnp.nan) for name, x in means.items()}
+    return state._replace(**changed), means | {"updates": updates.astype(jnp.float32)}
 
 
 def _changing(state: FinetuneState) -> dict[str, PyTree]:
     """What an update changes of a state: all but what is large."""
     return {name: getattr(state, name) for name in ("learner", "models", "transform")}
-
-
-def _up_to(update: Update, state: FinetuneState, keys: Key, made: Array) -> tuple[dict[str, PyTree], Metrics]:
-    """What so many updates `made` [] with the first of the keys change, and their mean metrics."""
-
-    def one(i: Array, carry: tuple[dict[str, PyTree], Metrics]) -> tuple[dict[str, PyTree], Metrics]:
-        changed, sums = carry
-        new, metrics = update(state._replace(**changed), keys[i])
-        return _changing(new), {name: total + metrics[name] for name, total in sums.items()}
-
-    blank = jax.eval_shape(update, state, keys[0])[1]
-    sums = {name: jnp.zeros(x.shape, x.dtype) for name, x in blank.items()}
-    changed, sums = jax.lax.fori_loop(0, made, one, (_changing(state), sums))
-    return changed, {name: total / jnp.maximum(made, 1) for name, total in sums.items()}
 
 
 def unlearned(

@@ -104,22 +104,22 @@ def scored(guard: Guard, score: Array, partial: Array | float = jnp.inf) -> Guar
     partial: [] what that one scored until then. If the challenger becomes the reference, as it was in this rollout, its
     evidence counts for both.
     """
-    exploded, mine = jnp.isneginf(score), guard.deployed.astype(jnp.float32)
-    known = jnp.where(exploded, 0.0, score)
+    exploded, by_challenger = jnp.isneginf(score), guard.deployed.astype(jnp.float32)
+    played, counted = (1 - by_challenger, by_challenger), jnp.where(exploded, 0.0, score)
     guard = guard._replace(
-        reference=_added(guard.reference, known, 1 - mine),
-        challenger=_added(guard.challenger, known, mine),
+        reference=_added(guard.reference, counted, played[0]),
+        challenger=_added(guard.challenger, counted, played[1]),
         worst=jnp.minimum(guard.worst, jnp.where(exploded, partial, score)),
         best=jnp.maximum(guard.best, score),
-        exploded=tuple(x + share * exploded for x, share in zip(guard.exploded, (1 - mine, mine), strict=True)),
+        exploded=tuple(x + share * exploded for x, share in zip(guard.exploded, played, strict=True)),
     )
     reference, challenger = evidence(guard)
     proven = (challenger.total + guard.worst) / (challenger.weight + 1) > _mean(reference)
-    replaced, (ours, theirs) = guard.deployed & proven & ~exploded, guard.exploded
+    replaced, (of_reference, of_challenger) = guard.deployed & proven & ~exploded, guard.exploded
     return guard._replace(
         reference=optax.tree.where(replaced, guard.challenger, guard.reference),
         replaced=replaced,
-        exploded=(jnp.where(replaced, theirs, ours), theirs),
+        exploded=(jnp.where(replaced, of_challenger, of_reference), of_challenger),
     )
 
 
@@ -131,11 +131,11 @@ def learned(guard: Guard) -> Guard:
     """The challenger has changed, which ages its evidence; who is deployed is decided anew."""
     challenger = Evidence(*(_FADE * x for x in guard.challenger))
     guard = guard._replace(challenger=challenger, exploded=(guard.exploded[0], _FADE * guard.exploded[1]))
-    (reference, expected), (ours, theirs) = means(guard), guard.exploded
-    more = theirs / (_CREDIT + challenger.weight) - ours / jnp.maximum(guard.reference.weight, 1e-6)
+    (reference, expected), (of_reference, of_challenger) = means(guard), guard.exploded
+    excess = of_challenger / (_CREDIT + challenger.weight) - of_reference / jnp.maximum(guard.reference.weight, 1e-6)
     equal = expected >= reference - _ROUNDING * jnp.abs(reference)
-    better = (expected > reference) | (equal & (more < 0))
-    return guard._replace(deployed=better & (more <= _TOLERATED))
+    better = (expected > reference) | (equal & (excess < 0))
+    return guard._replace(deployed=better & (excess <= _TOLERATED))
 
 
 def evidence(guard: Guard) -> tuple[Evidence, Evidence]:
@@ -148,8 +148,8 @@ def evidence(guard: Guard) -> tuple[Evidence, Evidence]:
 
 def means(guard: Guard) -> tuple[Array, Array]:
     """The scores [] that are expected of the reference and of the challenger."""
-    ours, (total, weight) = evidence(guard)
-    reference = _mean(ours)
+    for_reference, (total, weight) = evidence(guard)
+    reference = _mean(for_reference)
     credit = (reference + jnp.maximum(guard.best, reference)) / 2
     # As a distance from the reference, so that without evidence or shortfall they are equal to the bit.
     return reference, reference + (_CREDIT * (credit - reference) + total - weight * reference) / (_CREDIT + weight)

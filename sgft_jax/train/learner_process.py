@@ -32,12 +32,12 @@ class LearnerProcess:
         self, build: Callable[[], Finetuner], seeds: Array, which: Array, simulated: SimulatedRows | None
     ) -> None:
         spawn = multiprocessing.get_context("spawn")  # a fork would copy JAX in the middle of its work
-        self._connection, theirs = spawn.Pipe()
+        self._connection, connection = spawn.Pipe()
         self._cores = cores()
-        given = build, *jax.device_get((seeds, which, simulated)), self._cores[1:] or self._cores
-        self._process = spawn.Process(target=_work, args=(theirs, *given), daemon=True)
+        args = connection, build, *jax.device_get((seeds, which, simulated)), self._cores[1:] or self._cores
+        self._process = spawn.Process(target=_work, args=args, daemon=True)
         self._process.start()
-        theirs.close()
+        connection.close()
         pin(self._cores[:1])
         self._receiver = ThreadPoolExecutor(1, "learned")
         self._result: Future[Any] = self._receiver.submit(self._receive)  # that it is up

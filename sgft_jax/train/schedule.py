@@ -65,7 +65,7 @@ SCHEDULES = {FLEET: Schedule(), "released": Schedule(simulators=1, steps_per_rou
 
 def name_of(schedule: Schedule) -> str:
     """What `SCHEDULES` calls this rhythm of steps and updates, however many there are; "custom" for any other."""
-    return next((name for name, own in SCHEDULES.items() if _rhythm(own) == _rhythm(schedule)), "custom")
+    return next((name for name, known in SCHEDULES.items() if _rhythm(known) == _rhythm(schedule)), "custom")
 
 
 def describe(schedule: Schedule) -> str:
