@@ -1,7 +1,7 @@
 """Recurrent SAC: a policy that remembers the episode."""
 
-import functools
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, TypedDict
 
 from envs.types import Key, Policy, PyTree, UserError
@@ -21,9 +21,9 @@ class _RecurrentCard(Card):
 
 
 def _policy(card: Mapping[str, Any], task: Task) -> Policy:
-    recurrent = learners.recurrent
-    config = recurrent.RecurrentConfig(task.obs_dim, task.act_dim, network_of(card), card["config"]["gru"])
-    return Policy(functools.partial(recurrent.init_carry, config), functools.partial(recurrent.policy_action, config))
+    recurrent, sizes = learners.recurrent, (task.obs_dim, task.act_dim)
+    config = recurrent.RecurrentConfig(*sizes, network_of(card), card["config"]["gru"])
+    return Policy(partial(recurrent.init_carry, config), partial(recurrent.policy_action, config))
 
 
 def _networks(card: Mapping[str, Any], params: Any) -> Networks:

@@ -43,8 +43,6 @@ from sgft_jax.types import (
 
 __all__ = ["FinetuneState", "Parts", "assemble", "sac_finetuner"]
 
-_SIMULATION = Simulation(20_000, 0.6)  # simulated rows that identification compares with
-
 
 class FinetuneState(NamedTuple):
     """The state of one agent in fine-tuning.
@@ -286,8 +284,8 @@ def sac_finetuner(
     card = rules.card_of(prior)
     network, fresh = network_of(card), options.fresh or prior is None
     identifies = options.identify and prior is not None
-    if identifies:
-        simulation = simulation or _SIMULATION
+    if identifies:  # compares with simulated rows
+        simulation = simulation or Simulation(20_000, 0.6)
     kept = not (fresh or options.reset_critic)  # the critic
     config = sac.SACConfig.chosen(
         options,

@@ -4,7 +4,7 @@ A yielded state is valid until the iterator's next step, which donates its array
 """
 
 import functools
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
@@ -107,7 +107,8 @@ def finetune(
     """
     step = _Steps(finetuner, system, priors, seeds, simulated)
     if progress is None:
-        progress = jax.jit(functools.partial(begin, finetuner))(priors, seeds, simulated)
+        start: Callable[..., FinetuneProgress] = jax.jit(functools.partial(begin, finetuner))
+        progress = start(priors, seeds, simulated)
         yield progress, {}
     simulated_updates = simulated_updates_of(finetuner)
     progress = yield from step.offline(progress, simulated_updates, learner, "offline")

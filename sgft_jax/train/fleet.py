@@ -75,7 +75,7 @@ class Plan(NamedTuple):
 
     learner, memory: what learns, and what it keeps of its simulators. simulators: stepped together, 0 = none. capacity:
     transitions that it keeps. chunks, rounds: chunks of the run and rounds of each.
-    init_carry() -> what the policy remembers when an episode begins. explore(agent, fleet, key): see `Explore`.
+    explore(agent, fleet, key): see `Explore`.
     begin(agent, data) -> a fresh agent that knows the data it starts with.
     tune(agent, rounds []) -> the agent with the hyper-parameters of that round.
     start_keys(key), round_keys(key): which keys decide what. batches(data, replay, rows' keys) -> Batch [U, B, ...].
@@ -90,7 +90,6 @@ class Plan(NamedTuple):
     capacity: int
     chunks: int
     rounds: int
-    init_carry: Callable[[], PyTree]
     explore: Callable[[PyTree, Fleet, Key], tuple[Array, PyTree]]
     begin: Callable[[PyTree, PyTree], PyTree]
     start_keys: Callable[[Key], StartKeys]
@@ -165,7 +164,7 @@ class Trainer(NamedTuple):
 
 def make_trainer(env: Env, plan: Plan, *, gamma: float, note: Note | None = None) -> Trainer:
     """Builds the pure functions. gamma: discount factor of simulated rows. note: what else to keep of their steps."""
-    learner, fresh = plan.learner, plan.init_carry()
+    learner, fresh = plan.learner, plan.learner.init_carry()
     play = partial(collect, env, plan.memory, initial_carry=fresh, gamma=gamma, measure=plan.measure)
 
     def advance(pool: World, state: FleetState, keys: Key) -> tuple[FleetState, Metrics]:

@@ -93,7 +93,6 @@ def make_plan(env: Env, agent: HybridAgent, schedule: Schedule) -> Plan:
         capacity=schedule.buffer,
         chunks=schedule.chunks,
         rounds=schedule.rounds_per_chunk,
-        init_carry=learner.init_carry,
         explore=explore,
         begin=lambda state, real: agent.prepare(state, real, schedule.updates_in_all),
         start_keys=start_keys,

@@ -216,7 +216,6 @@ def make_plan(env: Env, config: PretrainConfig) -> Plan:
         capacity=config.replay_capacity,
         chunks=config.chunks,
         rounds=config.chunk_steps,
-        init_carry=recipe.learner.init_carry,
         explore=explore,
         begin=begin,
         tune=lambda agent, rounds: agent.replace(hyper=recipe.hyper(rounds)),
