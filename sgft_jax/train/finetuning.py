@@ -4,7 +4,7 @@ A yielded state is valid until the iterator's next step, which donates its array
 """
 
 import functools
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
@@ -107,8 +107,7 @@ def finetune(
     """
     step = _Steps(finetuner, system, priors, seeds, simulated)
     if progress is None:
-        start: Callable[..., FinetuneProgress] = jax.jit(functools.partial(begin, finetuner))
-        progress = start(priors, seeds, simulated)
+        progress = step.begin()
         yield progress, {}
     simulated_updates = simulated_updates_of(finetuner)
     progress = yield from step.offline(progress, simulated_updates, learner, "offline")
@@ -215,6 +214,10 @@ class _Steps:
         self._keep_log = jax.jit(split_vmap(finetuner.observe, (0, None, None, None)), donate_argnums=0)
         self._witness = jax.jit(evidence.witnessed)
         self._judge = jax.jit(functools.partial(evidence.judged, finetuner))
+
+    def begin(self) -> FinetuneProgress:
+        """The fresh state."""
+        return jax.jit(functools.partial(begin, self.finetuner))(self.priors, self.seeds, self.simulated)
 
     def keep(self, progress: FinetuneProgress, logged: Logged) -> FinetuneProgress:
         """The episodes of a log, one after another, as if they had been played."""
