@@ -1,7 +1,7 @@
 """Checks of options that people set: each raises UserError, one line with the option, its value and what it must be.
 
 What a field must be is part of its type: `lr: checks.Positive = 3e-4` in a dataclass that derives from `Checked`. A
-field that is None is not checked, of a tuple every entry is. Imports neither JAX nor MuJoCo.
+field that is None is not checked, of a tuple every entry is, and there must be one. Imports neither JAX nor MuJoCo.
 """
 
 import functools
@@ -27,6 +27,8 @@ class Rule:
     def __call__(self, config: Any, name: str) -> None:
         """Raises UserError where the field is something else."""
         value = getattr(config, name)
+        if value == ():
+            raise refusal(name, "empty", "one or more layers of at least 1 unit")
         for number in value if isinstance(value, tuple) else (value,):
             if number is not None and not self.holds(number):
                 raise refusal(name, number, self.wanted)
@@ -63,14 +65,6 @@ def greatest(maximum: int) -> Rule:
     return Rule(lambda x: x <= maximum, f"at most {maximum}")
 
 
-def layers(config: Any, name: str) -> None:
-    """At least one layer, each at least one unit wide."""
-    if not getattr(config, name):
-        raise refusal(name, "empty", "one or more layers of at least 1 unit")
-    least(1)(config, name)
-    few(config, name)
-
-
 countable = greatest(MOST)
 few = greatest(2**16)  # units of a layer, and what else nobody has many of, such as models
 batch = greatest(2**20)  # rows
@@ -85,6 +79,7 @@ Updates = Annotated[int, not_negative]  # how many, also none
 Count = Annotated[int, least(1), countable]
 Few = Annotated[int, least(1), few]
 Rows = Annotated[int, least(1), batch]
+Layers = Annotated[tuple[int, ...], least(1), few]  # widths; the only options that are tuples
 
 
 class Checked:

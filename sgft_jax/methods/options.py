@@ -31,14 +31,10 @@ class ActorCriticOptions(checks.Checked):
     """Adam learning rate of every network."""
     tau: checks.Share = 0.005
     """Averaging rate of the target critics."""
-    hidden: tuple[int, ...] = (256, 256)
+    hidden: checks.Layers = (256, 256)
     """Widths of the hidden layers of every network."""
     gamma: checks.BelowOne = 0.99
     """Discount factor per control step."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.layers(self, "hidden")
 
     @property
     def network(self) -> NetworkConfig:

@@ -14,10 +14,10 @@ Activation = Literal["relu", "tanh", "silu", "elu"]
 
 
 @dataclass(frozen=True)
-class NetworkConfig:
+class NetworkConfig(checks.Checked):
     """The body shared by all networks of a run."""
 
-    hidden: tuple[int, ...] = (512, 512)
+    hidden: checks.Layers = (512, 512)
     """Widths of the hidden layers."""
     layer_norm: bool = False
     """LayerNorm after each linear layer of critic and value, before the activation (RLPD)."""
@@ -26,7 +26,7 @@ class NetworkConfig:
     activation: Activation = "relu"
 
     def __post_init__(self) -> None:
-        checks.layers(self, "hidden")
+        super().__post_init__()
         if self.activation not in (known := get_args(Activation)):
             raise UserError(unknown("activation", self.activation, known))
 

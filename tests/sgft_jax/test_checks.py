@@ -62,11 +62,16 @@ def test_counts():
             Counted(value)
 
 
+@dataclasses.dataclass
+class Layered(checks.Checked):
+    hidden: checks.Layers
+
+
 def test_layers():
-    checks.layers(Config((1, 1)), "learning_rate")
+    assert Layered((1, 1)).hidden == (1, 1)
     for value, words in (((), "empty: must be one or more layers"), ((8, 0), "0: must be at least 1"), ((-1,), "-1")):
         with pytest.raises(UserError, match=f"is {words}"):
-            checks.layers(Config(value), "learning_rate")
+            Layered(value)
 
 
 # --- by the types of fields -------------------------------------------------------------------------------------------
