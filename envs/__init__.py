@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from envs import extend, gaps
 from envs.base import Domain, EffectRange, Effects, Entry, Env, EnvState, Parameter, Theta, World, packed, unpack
-from envs.checks import check_description, check_effects, check_functions, with_finite_steps
 from envs.gaps import Gap
 from envs.types import UserError, unknown
 
@@ -81,6 +80,8 @@ def _make(task: str, impl: str, scene: str) -> Env:
         from envs.mujoco.scene import make_env
 
         return packed(make_env(_real(task, scene) if scene else module.SCENE, impl))
+    from envs import checks
+
     arguments = (impl, _real(task, scene)) if scene else (impl,)
     source = task if extend.is_source(task) else module.__name__
     env = extend.guard("task", source, module.make)(*arguments)
@@ -88,12 +89,12 @@ def _make(task: str, impl: str, scene: str) -> Env:
         raise UserError(f"task {task}: make(impl) returns a {type(env).__name__}, not an envs.Env")
     if env.name != name_of(task):
         raise UserError(f"task {task}: its Env is called {env.name!r}; call it {name_of(task)!r}, like the file")
-    check_description(env)
-    check_effects(env)
+    checks.check_description(env)
+    checks.check_effects(env)
     called = {name: getattr(env, name) for name in ("make_worlds", "reset", "step")}
     env = packed(env._replace(**{name: extend.guard("task", source, f) for name, f in called.items()}))
-    check_functions(env, source)
-    return with_finite_steps(env)
+    checks.check_functions(env, source)
+    return checks.with_finite_steps(env)
 
 
 def scene(task: str, real: str = "") -> Any:

@@ -1,15 +1,17 @@
-"""What a task says of itself must be possible: checked where it is made, so that nothing wrong is compiled or learned.
-
-Imports no JAX before a function's result is looked at.
-"""
+"""What a task says of itself must be possible: checked where it is made, so nothing wrong is compiled or learned."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
+
 from envs import extend
 from envs.base import Effects, Entry, Env, EnvState, Parameter, Theta, World
+from envs.effects import make_range
 from envs.types import UserError
 
 if TYPE_CHECKING:
@@ -41,8 +43,6 @@ def check_description(task: Env | Scene) -> None:
 
 def check_effects(env: Env) -> None:
     """Raises UserError, which names task and field, for effects that the simulator of a task cannot have."""
-    from envs.effects import make_range
-
     for field in ("training", "actuators"):
         try:
             make_range(env, getattr(env, field))
@@ -54,12 +54,6 @@ def check_functions(env: Env, source: str) -> None:
     """Raises UserError where a function of somebody's task returns what no episode can go on with, and in its nominal
     world not finite. source: file or module of the task, for messages about what it raises itself.
     """
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-
-    from envs.effects import make_range
-
     wrong, key = _refusal(env), jax.random.key(0)
     ends = jax.tree.map(lambda x: x[None], make_range(env, env.training))
     worlds = env.make_worlds(Theta(jnp.array([[p.nominal for p in env.parameters]], jnp.float32), ends))
@@ -89,7 +83,6 @@ def with_finite_steps(env: Env) -> Env:
 
     The state of MuJoCo, by which ours judge, does not tell that.
     """
-    import jax.numpy as jnp
 
     def step(*args: Any) -> EnvState:
         state = env.step(*args)
@@ -101,8 +94,6 @@ def with_finite_steps(env: Env) -> Env:
 
 def check_outcomes(task: Any, functions: dict[str, Callable], obs: Any, action: Any) -> None:
     """Raises UserError where reward, end or success as functions of observations are no number and no truth."""
-    import jax
-
     for name, arguments in (("reward", (obs, action, obs)), ("terminated", (obs, action, obs)), ("success", (obs,))):
         if (function := functions.get(name)) is not None:
             dtype = "float32" if name == "reward" else "bool"
@@ -171,8 +162,6 @@ def _check_state(field: str, state: EnvState, env: Env) -> None:
 
 def _difference(after: Any, before: Any) -> str | None:
     """Where two pytrees differ in structure, shape or type; None where they do not."""
-    import jax
-
     if jax.tree.structure(after) != jax.tree.structure(before):
         return f"{jax.tree.structure(after)}"
     pairs = zip(jax.tree.leaves_with_path(after), jax.tree.leaves(before), strict=True)
