@@ -16,15 +16,8 @@ import jax.numpy as jnp
 
 from envs.types import Array, Key, PyTree, UserError
 from sgft_jax import checks
-from sgft_jax.models import dynamics, value
-from sgft_jax.models.networks import (
-    NetworkConfig,
-    add_noise,
-    make_actor,
-    make_dynamics,
-    make_value,
-    tanh_gaussian_action,
-)
+from sgft_jax.models import dynamics, networks, value
+from sgft_jax.models.config import NetworkConfig
 from sgft_jax.models.normalizer import normalize
 
 __all__ = ["MPCConfig"]
@@ -109,7 +102,7 @@ def plan(
     start = _Search(mean, std, jnp.zeros((config.elites, *previous.shape)), jnp.zeros(config.elites))
     end, _ = jax.lax.scan(refine, start, jax.random.split(key_search, config.iterations))
     action = end.elites[jax.random.categorical(key_pick, end.logits), 0]
-    return add_noise(action, jnp.where(explore, end.std[0], 0.0), key_noise), end.mean
+    return networks.add_noise(action, jnp.where(explore, end.std[0], 0.0), key_noise), end.mean
 
 
 def _fit(elites: Array, logits: Array, hyper: MPPIHyper) -> _Search:
@@ -161,9 +154,9 @@ def make_act(
     action, next_obs). A plan's score is the mean over the ensemble's members, each followed on its own, of
     sum_t gamma^t r_t + gamma^H V_sim(s_H). Source: SGFT equation (1) but for V_sim(s_0), which is the same for all.
     """
-    actor = make_actor(config.obs_dim, config.act_dim, config.network)
-    value_net = make_value(config.obs_dim, config.network)
-    model = make_dynamics(config.obs_dim, config.act_dim, config.network)
+    actor = networks.make_actor(config.obs_dim, config.act_dim, config.network)
+    value_net = networks.make_value(config.obs_dim, config.network)
+    model = networks.make_dynamics(config.obs_dim, config.act_dim, config.network)
     search = MPPIConfig(config.samples, config.samples // _ELITES, _ITERATIONS)
 
     def score(params: PyTree, obs: Array, sequence: Array) -> Array:
@@ -188,8 +181,8 @@ def make_act(
         def step(obs: Array, key: Key) -> tuple[Array, Array]:
             key_policy, key_noise = jax.random.split(key)
             moments = actor.apply(params.actor, normalize(params.normalizer, obs))
-            action = tanh_gaussian_action(moments, key_policy, explore=True)
-            action = add_noise(action, config.noise, key_noise)
+            action = networks.tanh_gaussian_action(moments, key_policy, explore=True)
+            action = networks.add_noise(action, config.noise, key_noise)
             return dynamics.predict(model, member, params.normalizer, obs, action)[0], action
 
         return jax.lax.scan(step, obs, jax.random.split(key, config.horizon))[1]

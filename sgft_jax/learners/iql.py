@@ -166,17 +166,9 @@ def init(config: IQLConfig, key: Key, hyper: Any = None) -> IQLState:
 
 
 def act(
-    config: IQLConfig,
-    state: IQLState,
-    carry: tuple[()],
-    obs: Array,
-    key: Key,
-    *,
-    explore: bool | Array,
-    context: Array | None = None,
+    config: IQLConfig, state: IQLState, carry: tuple[()], obs: Array, key: Key, *, explore: bool | Array
 ) -> tuple[Array, tuple[()]]:
-    """Action [act_dim] in [-1, 1] for a raw obs [obs_dim], and the carry as it was. The context is not read."""
-    del context
+    """Action [act_dim] in [-1, 1] for a raw obs [obs_dim], and the carry as it was."""
     moments = _networks(config).actor.apply(state.actor.params, normalizer.normalize(state.normalizer, obs))
     return gaussian_action(moments, key, explore=explore), carry
 

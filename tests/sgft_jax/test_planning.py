@@ -182,11 +182,11 @@ def plan(monkeypatch):
     def found(value, gains=(1.0,), *, obs=0.0, horizon=1, reward=nothing, terminated=never, noise=0.0, gamma=1.0):
         model = networks.Network(lambda key: None, lambda gains, obs, action: gains[:, None] * action[None])
         still = networks.Network(lambda key: None, lambda params, obs: jnp.array([[0.0], [-20.0]]))
-        monkeypatch.setattr(planning, "make_dynamics", lambda *_: model)
+        monkeypatch.setattr(networks, "make_dynamics", lambda *_: model)
         monkeypatch.setattr(
-            planning, "make_value", lambda *_: networks.Network(lambda key: None, lambda _, s: value(s[0]))
+            networks, "make_value", lambda *_: networks.Network(lambda key: None, lambda _, s: value(s[0]))
         )
-        monkeypatch.setattr(planning, "make_actor", lambda *_: still)
+        monkeypatch.setattr(networks, "make_actor", lambda *_: still)
         config = planning.MPCConfig(1, 1, NET, horizon=horizon, noise=noise, gamma=gamma)
         act = planning.make_act(config, reward=reward, terminated=terminated)
         params = sac.SACParams(None, None, None, jnp.array(gains), STILL)
@@ -260,8 +260,8 @@ def test_proposals_follow_every_model(monkeypatch):
     """
     model = networks.Network(lambda key: None, lambda gains, obs, action: gains[:, None] * action[None])
     up = networks.Network(lambda key: None, lambda params, obs: jnp.array([[0.2 + obs[0]], [-20.0]]))
-    monkeypatch.setattr(planning, "make_dynamics", lambda *_: model)
-    monkeypatch.setattr(planning, "make_actor", lambda *_: up)
+    monkeypatch.setattr(networks, "make_dynamics", lambda *_: model)
+    monkeypatch.setattr(networks, "make_actor", lambda *_: up)
     monkeypatch.setattr(planning, "plan", lambda config, hyper, rate, proposals, *_, explore: proposals)
     act = planning.make_act(planning.MPCConfig(1, 1, NET, horizon=2, noise=0.0), reward=nothing, terminated=never)
     gains = jnp.array([0.0, 1.0, 2.0])
