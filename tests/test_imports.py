@@ -57,7 +57,7 @@ ORDER = {
         *("types", "keys", "checks", "stacking", "files", "math", "models", "data", "planning", "learners"),
         *("policies", "diagnosis", "transforms", "algorithms", "presets", "io", "export"),
         *("datasets", "systems", "train"),
-        *("examination", "hybrid", "methods", "analysis", "api", ""),
+        *("examination", "methods", "analysis", "api", ""),
     ),
     "experiments": ("runner", "commands", "studies"),  # `bench` is a part of a command
 }

@@ -24,8 +24,8 @@ from sgft_jax.models.distortion import Distortion
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
 
-__all__ = ["SACConfig", "SACHyper", "SACParams", "SACState", "act", "check_params_of_prior"]
-__all__ += ["extract_params", "init", "make_sac", "network_input", "state_from_prior", "update"]
+__all__ = ["SACConfig", "SACHyper", "SACParams", "SACState", "act", "extract_params"]
+__all__ += ["init", "make_sac", "network_input", "state_from_prior", "update"]
 
 
 @dataclass(frozen=True)
@@ -342,10 +342,13 @@ def state_from_prior(
     """An agent that starts from a prior: its actor, its fixed normaliser, fresh optimiser moments.
 
     reset_critic: draw a new critic from `key`, else keep the simulator's. With `config.context_dim` the kept networks
-    get zero rows for the context, so that the first policy is the simulator's whatever the context holds.
+    get zero rows for the context, so that the first policy is the simulator's whatever the context holds. Raises
+    UserError where a network of the prior is not the one that `config` describes.
     """
-    nets = _networks(config)
-    check_params_of_prior(config, params, critic=not reset_critic)
+    nets, of_prior = _networks(config), _networks(replace(config, context_dim=0))
+    owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, hidden {config.network.hidden}: use the prior's own"
+    for name in ("actor", "value", *([] if reset_critic else ["critic"])):
+        networks.check_params(name, getattr(of_prior, name), getattr(params, name), f"{owner} task and network")
     params = jax.tree.map(jnp.copy, params)  # the caller may donate the state; the prior must survive it
 
     def pad(network: PyTree) -> PyTree:
@@ -357,11 +360,3 @@ def state_from_prior(
     state = _assemble(nets, hyper, pad(params.actor), critic, value, model)
     anchor = jax.tree.map(jnp.copy, state.actor.params) if config.anchored else None
     return state.replace(normalizer=params.normalizer, anchor=anchor)
-
-
-def check_params_of_prior(config: SACConfig, params: SACParams, *, critic: bool) -> None:
-    """Raise UserError where a network of the prior is not the one that `config` describes."""
-    nets = _networks(replace(config, context_dim=0))
-    owner = f"obs_dim {config.obs_dim}, act_dim {config.act_dim}, hidden {config.network.hidden}: use the prior's own"
-    for name in ("actor", "value", *(["critic"] if critic else [])):
-        networks.check_params(name, getattr(nets, name), getattr(params, name), f"{owner} task and network")
