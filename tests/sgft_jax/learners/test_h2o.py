@@ -157,7 +157,8 @@ def test_the_spread_is_noise_on_successors(learner, key):
 def test_simulated_pairs_fall_and_real_ones_rise(learner, key):
     """With a heavy penalty and nothing else to learn."""
     heavy = {"conservatism": jnp.float32(10.0), "lr_critic": jnp.float32(1e-2), "lr_ratio": jnp.float32(3e-4)}
-    batch = batch_of(key)._replace(reward=jnp.zeros(ROWS), discount=jnp.zeros(ROWS))
+    batch = batch_of(key)
+    batch = batch._replace(reward=0.0 * batch.reward, discount=0.0 * batch.discount)  # the types stay as they were
     state = learner.init(key)
     state = state.replace(hyper=state.hyper._replace(**heavy))
     for i in range(100):

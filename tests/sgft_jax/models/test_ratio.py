@@ -83,15 +83,15 @@ def rows(key, *, shift, apart):
 
 @pytest.fixture(scope="module")
 def learned():
-    """Discriminators after 1,500 steps, and the statistics that they read with, for a shift of 1 and states 1 apart."""
-    learner = make_ratio(ratio.RatioConfig(1, 1, NetworkConfig((32, 32)), noise=0.0))
+    """Discriminators after 1,000 steps, and the statistics that they read with, for a shift of 1 and states 1 apart."""
+    learner = make_ratio(ratio.RatioConfig(1, 1, NetworkConfig((64, 64)), noise=0.0))
 
     @jax.jit
     def train(key):
         def step(state, key):
-            return learner.update(state, rows(key, shift=1.0, apart=1.0), key, rate=2e-3)
+            return learner.update(state, rows(key, shift=1.0, apart=1.0), key, rate=1e-3)
 
-        return jax.lax.scan(step, learner.init(key), jax.random.split(key, 1500))
+        return jax.lax.scan(step, learner.init(key), jax.random.split(key, 1000))
 
     state, metrics = train(jax.random.key(0))
     return learner, state, metrics["ratio/loss"]
