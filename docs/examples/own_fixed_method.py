@@ -6,7 +6,7 @@ Commands read this file before they start JAX, so JAX is imported where it is us
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import ActorCriticOptions, agent_of, sac_numbers
+from sgft_jax.methods.options import ActorCriticOptions, agent_of
 from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
@@ -21,11 +21,11 @@ class Config(ActorCriticOptions):
 def build(config: Config, task: Task) -> HybridAgent:
     """Which learner it is, and what its batches are made of."""
     from sgft_jax.data import sources
-    from sgft_jax.learners.sac import SACConfig, make_sac
+    from sgft_jax.learners.sac import SACConfig, SACHyper, make_sac
 
     structure = SACConfig(task.obs_dim, task.act_dim, config.network, train_value=False, train_dynamics=False)
     batches = sources.two_buffers(config.rows, config.rows)
-    return agent_of(make_sac(structure, sac_numbers(config)), config, task, batches, simulates=True)
+    return agent_of(make_sac(structure, SACHyper.chosen(config)), config, task, batches, simulates=True)
 
 
 METHOD = Method(  # what `--method docs/examples/own_fixed_method.py` looks for

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import RowsOptions, agent_of, sac_numbers
+from sgft_jax.methods.options import RowsOptions, agent_of
 from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
@@ -20,19 +20,12 @@ class Config(RowsOptions):
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
     from sgft_jax.learners import cql
+    from sgft_jax.learners.sac import SACHyper
 
     sizes = task.obs_dim, task.act_dim, config.network
     structure = cql.CQLConfig(*sizes, conservatism=config.conservatism, samples=config.samples)
-    return agent_of(cql.make_cql(structure, sac_numbers(config)), config, task)
+    return agent_of(cql.make_cql(structure, SACHyper.chosen(config)), config, task)
 
 
-METHOD = Method(
-    "cql",
-    fixed=Fixed(
-        "offline",
-        "SAC whose critic is pushed down where the data do not go",
-        "Kumar et al. 2020",
-        {"default": Config()},
-        build,
-    ),
-)
+_ABOUT = "SAC whose critic is pushed down where the data do not go"
+METHOD = Method("cql", fixed=Fixed("offline", _ABOUT, "Kumar et al. 2020", {"default": Config()}, build))

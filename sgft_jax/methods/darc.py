@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import RowsOptions, agent_of, sac_numbers
+from sgft_jax.methods.options import RowsOptions, agent_of
 from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
@@ -20,10 +20,11 @@ class Config(RowsOptions):
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
     from sgft_jax.learners import darc
+    from sgft_jax.learners.sac import SACHyper
     from sgft_jax.policies import actor_params
 
     structure = darc.DARCConfig(task.obs_dim, task.act_dim, config.network, ratio_rows=2 * config.ratio_rows)
-    learner = darc.make_darc(structure, sac_numbers(config), lr_ratio=config.lr)
+    learner = darc.make_darc(structure, SACHyper.chosen(config), lr_ratio=config.lr)
     batches = darc.batches(config.rows, config.ratio_rows)
     return agent_of(learner, config, task, batches, simulates=True, export=lambda state: actor_params(state.sac))
 

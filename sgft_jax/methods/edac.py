@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from sgft_jax.methods.options import EnsembleOptions, RowsOptions, agent_of, sac_numbers
+from sgft_jax.methods.options import EnsembleOptions, RowsOptions, agent_of
 from sgft_jax.types import Fixed, HybridAgent, Method, Task
 
 
@@ -16,19 +16,12 @@ class Config(RowsOptions, EnsembleOptions):
 def build(config: Config, task: Task) -> HybridAgent:
     """The agent."""
     from sgft_jax.learners import edac
+    from sgft_jax.learners.sac import SACHyper
 
     sizes = task.obs_dim, task.act_dim, config.network
     structure = edac.EDACConfig(*sizes, critics=config.critics, diversity=config.diversity)
-    return agent_of(edac.make_edac(structure, sac_numbers(config)), config, task)
+    return agent_of(edac.make_edac(structure, SACHyper.chosen(config)), config, task)
 
 
-METHOD = Method(
-    "edac",
-    fixed=Fixed(
-        "offline",
-        "SAC whose many critics must not agree on how to leave the data",
-        "An et al. 2021",
-        {"default": Config()},
-        build,
-    ),
-)
+_ABOUT = "SAC whose many critics must not agree on how to leave the data"
+METHOD = Method("edac", fixed=Fixed("offline", _ABOUT, "An et al. 2021", {"default": Config()}, build))

@@ -32,13 +32,6 @@ def build(config: Config, task: Task) -> HybridAgent:
 
 
 _PAPER = Config()
-METHOD = Method(
-    "h2o",
-    fixed=Fixed(
-        "hybrid",
-        "one critic, pushed down where the simulator is wrong",
-        "Niu et al. 2022",
-        {"paper": _PAPER, "released": replace(_PAPER, spread_scale=0.3)},
-        build,
-    ),
-)
+_PRESETS = {"paper": _PAPER, "released": replace(_PAPER, spread_scale=0.3)}
+_ABOUT = "one critic, pushed down where the simulator is wrong"
+METHOD = Method("h2o", fixed=Fixed("hybrid", _ABOUT, "Niu et al. 2022", _PRESETS, build))

@@ -53,6 +53,13 @@ def build(config: Config, task: Task) -> HybridAgent:
 
 
 _PAPER = Config()
+_PRESETS = {
+    "paper": _PAPER,
+    "released": replace(_PAPER, value_share=0.5, expectile=0.5),
+    "released-robot": replace(_PAPER, expectile=0.9, hidden=(32, 32), rows=16),
+    "no-ratio": replace(_PAPER, ratio=False),
+    **{f"lambda-{share:g}": replace(_PAPER, value_share=share) for share in (0.0, 0.2, 0.5, 1.0)},
+}
 # With the numbers of their own authors' code for locomotion, which scales rewards so that returns span 1,000. In units
 # of the return itself EQL's diverges: where V is below a critic by more than the cut-off, the loss lowers V further.
 # XQL has numbers for each data set; these are its one setting for all of them. Source: IVR (SQL, EQL: run_mujoco.sh),
@@ -62,20 +69,5 @@ _BACKBONES = {
     "eql": replace(_PAPER, value_loss="eql", value_alpha=2.0, value_cut=5.0),
     "xql": replace(_PAPER, value_loss="xql", value_alpha=2.0, value_cut=7.0),
 }
-METHOD = Method(
-    "h2oplus",
-    fixed=Fixed(
-        "hybrid",
-        "in-sample value of the data and SAC in the simulator, weighted by a ratio of dynamics",
-        "Niu et al. 2023",
-        {
-            "paper": _PAPER,
-            "released": replace(_PAPER, value_share=0.5, expectile=0.5),
-            "released-robot": replace(_PAPER, expectile=0.9, hidden=(32, 32), rows=16),
-            "no-ratio": replace(_PAPER, ratio=False),
-            **{f"lambda-{share:g}": replace(_PAPER, value_share=share) for share in (0.0, 0.2, 0.5, 1.0)},
-            **_BACKBONES,
-        },
-        build,
-    ),
-)
+_ABOUT = "in-sample value of the data and SAC in the simulator, weighted by a ratio of dynamics"
+METHOD = Method("h2oplus", fixed=Fixed("hybrid", _ABOUT, "Niu et al. 2023", _PRESETS | _BACKBONES, build))

@@ -12,13 +12,6 @@ class Config(EnsembleOptions, h2oplus.Config):
     """Options of `h2oplus-edac`; with 2 critics and diversity 0 it is `h2oplus`."""
 
 
-METHOD = Method(
-    "h2oplus-edac",
-    fixed=Fixed(
-        "hybrid",
-        "H2O+ with ten critics that must not agree on how to leave the data",
-        "Niu et al. 2023, An et al. 2021",
-        {"default": Config()},
-        h2oplus.build,
-    ),
-)
+_ABOUT = "H2O+ with ten critics that must not agree on how to leave the data"
+_SOURCE = "Niu et al. 2023, An et al. 2021"
+METHOD = Method("h2oplus-edac", fixed=Fixed("hybrid", _ABOUT, _SOURCE, {"default": Config()}, h2oplus.build))

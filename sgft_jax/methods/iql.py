@@ -142,22 +142,10 @@ def build_fixed(config: FixedConfig, task: Task) -> HybridAgent:
     return agent_of(learner, config, task, prepare=prepare, export=export)
 
 
+_ABOUT = "in-sample learning: offline from simulated data, then online"
+_ABOUT_FIXED = "the best of the data's own actions"
 METHOD = Method(
     "iql",
-    Online(
-        "offline",
-        "in-sample learning: offline from simulated data, then online",
-        "Kostrikov 2022",
-        Config,
-        build,
-        needs_prior=False,
-        zero_shot=False,
-    ),
-    Fixed(
-        "offline",
-        "the best of the data's own actions",
-        "Kostrikov et al. 2021",
-        {"default": FixedConfig()},
-        build_fixed,
-    ),
+    Online("offline", _ABOUT, "Kostrikov 2022", Config, build, needs_prior=False, zero_shot=False),
+    Fixed("offline", _ABOUT_FIXED, "Kostrikov et al. 2021", {"default": FixedConfig()}, build_fixed),
 )

@@ -11,7 +11,6 @@ from sgft_jax.models.config import NetworkConfig
 from sgft_jax.types import HybridAgent, Learner, RealData, Source, Task
 
 if TYPE_CHECKING:
-    from sgft_jax.learners.sac import SACHyper
     from sgft_jax.policies import Head
 
 _RETURN_SPAN = 1000.0  # of scaled returns, as published for locomotion
@@ -26,6 +25,7 @@ class ActorCriticOptions(checks.Checked):
 
     alpha: ClassVar[float] = 1.0
     entropy_per_dim: ClassVar[float] = -1.0
+    actor_ramp: ClassVar[float] = 0.0
 
     lr: checks.Positive = 3e-4
     """Adam learning rate of every network."""
@@ -76,13 +76,6 @@ class EnsembleOptions(ActorCriticOptions):
     diversity: checks.NotNegative = 1.0
     """Weight of what keeps the critics' gradients at the data's actions apart; 0 leaves it out. It does nothing where a
     task has one action, whose gradients have only a sign."""
-
-
-def sac_numbers(config: ActorCriticOptions) -> "SACHyper":
-    """The numbers of methods that are made of SAC."""
-    from sgft_jax.learners.sac import SACHyper
-
-    return SACHyper(lr_actor=config.lr, lr_critic=config.lr, lr_alpha=config.lr, tau=config.tau)
 
 
 def return_scale(real: RealData) -> Array:

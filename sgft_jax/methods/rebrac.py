@@ -48,20 +48,12 @@ def build(config: Config, task: Task) -> HybridAgent:
     )
 
 
-_REPLAY = Config()  # the published penalties, by data set
-METHOD = Method(
-    "rebrac",
-    fixed=Fixed(
-        "offline",
-        "TD3 whose actor and critic pay for leaving the data",
-        "Tarasov et al. 2023",
-        {
-            "halfcheetah-medium-replay": _REPLAY,
-            "halfcheetah-medium": replace(_REPLAY, actor_penalty=0.001, critic_penalty=0.01),
-            "walker2d-medium-replay": replace(_REPLAY, actor_penalty=0.05, critic_penalty=0.01),
-            "walker2d-medium": replace(_REPLAY, actor_penalty=0.05, critic_penalty=0.1),
-        },
-        build,
-        by_data=True,
-    ),
-)
+_REPLAY = Config()
+_PRESETS = {  # the published penalties, by data set
+    "halfcheetah-medium-replay": _REPLAY,
+    "halfcheetah-medium": replace(_REPLAY, actor_penalty=0.001, critic_penalty=0.01),
+    "walker2d-medium-replay": replace(_REPLAY, actor_penalty=0.05, critic_penalty=0.01),
+    "walker2d-medium": replace(_REPLAY, actor_penalty=0.05, critic_penalty=0.1),
+}
+_ABOUT = "TD3 whose actor and critic pay for leaving the data"
+METHOD = Method("rebrac", fixed=Fixed("offline", _ABOUT, "Tarasov et al. 2023", _PRESETS, build, by_data=True))

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from sgft_jax import checks
-from sgft_jax.methods.options import RowsOptions, agent_of, sac_numbers
+from sgft_jax.methods.options import RowsOptions, agent_of
 from sgft_jax.train.options import KeptCriticOptions, MixedOptions
 from sgft_jax.types import Finetuner, Fixed, HybridAgent, Method, Online, Prior, Task
 
@@ -52,10 +52,10 @@ class SimulatorConfig(RowsOptions):
 def build_fixed(config: SimulatorConfig, task: Task) -> HybridAgent:
     """The agent: what the imperfect simulator is worth without any real data."""
     from sgft_jax.data import sources
-    from sgft_jax.learners.sac import SACConfig, make_sac
+    from sgft_jax.learners.sac import SACConfig, SACHyper, make_sac
 
     structure = SACConfig(task.obs_dim, task.act_dim, network=config.network, train_value=False, train_dynamics=False)
-    learner = make_sac(structure, sac_numbers(config))
+    learner = make_sac(structure, SACHyper.chosen(config))
     return agent_of(learner, config, task, sources.two_buffers(0, config.rows), simulates=True)
 
 

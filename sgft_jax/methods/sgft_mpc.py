@@ -54,7 +54,5 @@ def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:
     return assemble(parts._replace(models=models, card={"plan": plan}), config, task)
 
 
-METHOD = Method(
-    "sgft-mpc",
-    Online("sgft", "plans of H steps by learning models, ended by V_sim", "SGFT 2025", Config, build, zero_shot=False),
-)
+_ABOUT = "plans of H steps by learning models, ended by V_sim"
+METHOD = Method("sgft-mpc", Online("sgft", _ABOUT, "SGFT 2025", Config, build, zero_shot=False))

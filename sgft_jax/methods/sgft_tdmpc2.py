@@ -16,15 +16,6 @@ class Config(tdmpc2.Config):
     sgft = True
 
 
-METHOD = Method(
-    "sgft-tdmpc2",
-    Online(
-        "sgft",
-        "TD-MPC2 whose plans of H steps end in a frozen V_sim",
-        "SGFT 2025",
-        Config,
-        tdmpc2.build,
-        prior="tdmpc2",
-        zero_shot=False,
-    ),
-)
+_ABOUT = "TD-MPC2 whose plans of H steps end in a frozen V_sim"
+_ONLINE = Online("sgft", _ABOUT, "SGFT 2025", Config, tdmpc2.build, prior="tdmpc2", zero_shot=False)
+METHOD = Method("sgft-tdmpc2", _ONLINE)

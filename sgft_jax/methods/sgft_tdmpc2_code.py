@@ -16,15 +16,6 @@ class Config(tdmpc2.PlannerOptions):
     horizon: int = 3
 
 
-METHOD = Method(
-    "sgft-tdmpc2-code",
-    Online(
-        "sgft",
-        "TD-MPC2 from nothing with shaped rewards",
-        "SGFT 2025, released code",
-        Config,
-        tdmpc2.build,
-        prior="tdmpc2",
-        zero_shot=False,
-    ),
-)
+_ABOUT = "TD-MPC2 from nothing with shaped rewards"
+_ONLINE = Online("sgft", _ABOUT, "SGFT 2025, released code", Config, tdmpc2.build, prior="tdmpc2", zero_shot=False)
+METHOD = Method("sgft-tdmpc2-code", _ONLINE)

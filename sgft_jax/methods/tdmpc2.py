@@ -115,15 +115,5 @@ def _shape() -> Transform:
     return stateless(shape)
 
 
-METHOD = Method(
-    "tdmpc2",
-    Online(
-        "planning",
-        "plans with the simulator's world model, and all of it learns",
-        "Hansen 2024",
-        Config,
-        build,
-        prior="tdmpc2",
-        needs_prior=False,
-    ),
-)
+_ABOUT = "plans with the simulator's world model, and all of it learns"
+METHOD = Method("tdmpc2", Online("planning", _ABOUT, "Hansen 2024", Config, build, prior="tdmpc2", needs_prior=False))
