@@ -15,7 +15,10 @@ PLANNERS = {"tdmpc2", "sgft-tdmpc2"}
 OF_WINDOWS = PLANNERS | {"recurrent", "rebrac"}
 LATER = {"reward one step later", "time limit", "termination"}  # a memory must have seen the second step for these
 # What takes long: the fast tests see less of it.
+SOME = {"time limit", "termination", "state and action decide"}
 QUICK = {
+    "sac": SOME,
+    "iql": SOME,
     "h2oplus": set(),
     "tdmpc2": set(),
     "sgft-tdmpc2": set(),

@@ -165,6 +165,7 @@ def test_new_worlds_begin_new_episodes():
     assert metrics["train/terminated"][0] == 1
 
 
+@pytest.mark.slow
 def test_a_set_that_is_not_due_is_never_asked_for():
     """There is no second set in either case, and nothing else differs."""
     never, late = (counted(0.2, refresh_every=every)[-1][0] for every in (0, 2))

@@ -51,10 +51,13 @@ def start(config, key):
     return state if config == PLAIN else tdmpc2.state_from_prior(config, HYPER, tdmpc2.extract_params(state))
 
 
-@functools.partial(jax.jit, static_argnums=0)
 def shaken(config, key, scale=0.3):
     """A state whose every parameter has been moved, so that no output is trivially zero, and with Adam moments."""
-    state = start(config, key)
+    return _shaken(start(config, key), key, scale)
+
+
+@jax.jit
+def _shaken(state, key, scale):
     fits = {name: getattr(state, name) for name in NETWORKS}
     tree = ({name: fit.params for name, fit in fits.items()}, state.target_critic, state.anchor)
     flat, unravel = jax.flatten_util.ravel_pytree(tree)

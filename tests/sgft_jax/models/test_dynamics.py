@@ -54,18 +54,24 @@ def test_every_member_learns(key):
     def step(fit, key):
         return dynamics.update(network, optimiser, fit, unit, batch, key, rate=1e-2)
 
-    fit, metrics = jax.lax.scan(step, optim.start(optimiser, network.init(key)), jax.random.split(key, 300))
+    @jax.jit
+    def learned(key):
+        return jax.lax.scan(step, optim.start(optimiser, network.init(key)), jax.random.split(key, 300))
+
+    fit, metrics = learned(key)
     assert metrics["dynamics/mse"][0] > 0.05 and metrics["dynamics/mse"][-1] < 2e-3
     out = dynamics.predict(network, fit.params, unit, jnp.array([0.2, -0.3]), jnp.array([0.4]))
     np.testing.assert_allclose(out, np.tile([0.4, -0.1], (3, 1)), atol=0.05)
 
 
 def test_a_drawn_member_is_one_of_the_ensemble(key):
-    seen = {float(dynamics.draw_member(jnp.array([0.0, 1.0, 2.0]), k)[0]) for k in jax.random.split(key, 40)}
+    draw = jax.jit(jax.vmap(lambda k: dynamics.draw_member(jnp.array([0.0, 1.0, 2.0]), k)[0]))
+    seen = set(draw(jax.random.split(key, 40)).tolist())
     assert seen == {0.0, 1.0, 2.0}
 
 
 @pytest.mark.parametrize("members", [1, 4])
 def test_leading_axis_is_the_member(key, members):
     network = networks.make_dynamics(2, 1, networks.NetworkConfig((8,)), members=members)
-    assert network.apply(network.init(key), jnp.ones(2), jnp.ones(1)).shape == (members, 2)
+    out = jax.eval_shape(lambda key: network.apply(network.init(key), jnp.ones(2), jnp.ones(1)), key)
+    assert out.shape == (members, 2)

@@ -16,17 +16,13 @@ ROWS = np.array([[0.4], [0.1], [-0.5], [0.9], [9.0]])  # y = 0.45 x, and one tha
 def fit(rows, slope, belief, held=None, bound=np.inf):
     """The fit of y = p x to rows y and slopes x, [n, k]."""
     held = np.ones(len(rows), bool) if held is None else held
-    return jax.jit(
-        lambda y: robust.most_probable(
-            lambda p: y - p[0] * jnp.asarray(slope),
-            jnp.zeros((1, 1)),
-            jnp.array([belief]),
-            y,
-            jnp.asarray(held),
-            jnp.full(rows.shape[1], SCALE),
-            bound=bound,
-        )
-    )(jnp.asarray(rows))
+    return _fit(jnp.asarray(rows), slope, jnp.array([belief]), held, bound)
+
+
+@jax.jit
+def _fit(y, slope, belief, held, bound):
+    scale = jnp.full(y.shape[1], SCALE)
+    return robust.most_probable(lambda p: y - p[0] * slope, jnp.zeros((1, 1)), belief, y, held, scale, bound=bound)
 
 
 def cost(p, rows, slope, belief):
