@@ -31,21 +31,12 @@ def data(tmp_path):
     return d4rl(tmp_path / "recorded-v2.hdf5", toy.make().obs_dim, 2)
 
 
-SIMULATORS = {"heavy": "mass = 2.0", "slippery": "friction = 1.0"}
-
-
-@pytest.fixture(params=[1, pytest.param(2, marks=pytest.mark.slow)])
-def simulators(request):
-    """The names of the first ones."""
-    return [*SIMULATORS][: request.param]
-
-
 @pytest.fixture
-def gap(tmp_path, simulators):
-    """A file of two simulators, or one of them."""
+def gap(tmp_path):
+    """A file of two simulators."""
     path = tmp_path / "two.toml"
-    path.write_text("".join(f"[{name}.params]\n{SIMULATORS[name]}\n" for name in SIMULATORS))
-    return str(path) if len(simulators) > 1 else f"{path}:{simulators[0]}"
+    path.write_text("[heavy.params]\nmass = 2.0\n[slippery.params]\nfriction = 1.0\n")
+    return str(path)
 
 
 def d4rl(path, obs_dim, act_dim, n=60):
@@ -72,18 +63,26 @@ def complaint(argv, capsys):
     return error
 
 
+@pytest.mark.parametrize(
+    ("method", "simulators"),
+    [("iql", [""]), pytest.param("h2oplus", ["heavy", "slippery"], marks=pytest.mark.slow)],
+)
 def test_a_run_leaves_curves_policies_and_a_summary_for_each_simulator(
-    tmp_path, data, gap, simulators, capsys, monkeypatch
+    method, simulators, tmp_path, data, gap, capsys, monkeypatch
 ):
     drawn, draw = {}, figures.learning_curves
     monkeypatch.setattr(
         figures, "learning_curves", lambda path, *a, **b: drawn.update({path: a}) or draw(path, *a, **b)
     )
-    hybrid.main(words(tmp_path, data, "--gap", gap, "--variant", "w", "--seeds", "3"))
+    given = ["--gap", gap, "--options.ratio-rows", "8"] if method == "h2oplus" else ["--gap", "sim"]
+    given += ["--method", method, "--variant", "w", "--seeds", "3", "--data", str(data)]
+    hybrid.main(words(tmp_path, None, *given))
     said = capsys.readouterr().out
-    assert "60 transitions of 3 episodes" in said and "heavy: success in the real system" in said
-    for name in simulators:
-        folder = tmp_path / f"out/hybrid/toy/{name}/recorded-v2/h2oplus_w/seeds-0-2"
+    assert "60 transitions of 3 episodes" in said
+    for simulator in simulators:
+        name = simulator or "no-simulator"
+        assert f"{name}: success in the real system" in said
+        folder = tmp_path / f"out/hybrid/toy/{name}/recorded-v2/{method}_w/seeds-0-2"
         evaluations = read_jsonl(folder / "eval.jsonl")
         assert [line["step"] for line in evaluations] == [0, 12, 24] and len(evaluations[0]["score"]) == 3
         assert [line["step"] for line in read_jsonl(folder / "metrics.jsonl")] == [6, 12, 18, 24]
@@ -99,8 +98,8 @@ def test_a_run_leaves_curves_policies_and_a_summary_for_each_simulator(
         assert f"results: {folder}  (policy/, summary.json, eval.jsonl, figures/)" in said
         assert (folder / "figures/score.png").stat().st_size > 5_000
         (((words_of_panel, (curve,)),),) = (panels.items() for panels in drawn[folder / "figures/score.png"])
-        assert words_of_panel == f"simulator: {name}" and (curve.spec, curve.data) == ("h2oplus:w", "recorded-v2")
-        assert curve.x.tolist() == [0, 12, 24] and curve.gap == name
+        assert words_of_panel == f"simulator: {simulator or 'none'}" and curve.gap == simulator
+        assert (curve.spec, curve.data) == (f"{method}:w", "recorded-v2") and curve.x.tolist() == [0, 12, 24]
         np.testing.assert_array_equal(curve.values, np.transpose([line["score"] for line in evaluations]))
         policy = sgft_jax.load_policy(folder / "policy/seed-1")
         action = np.asarray(policy.act([0.5, 0.0, 0.0, 0.0]))

@@ -3,23 +3,27 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import toy
-from priors_by_hand import initial
 
 import envs
 from experiments.runner.report import make_report, numbers
-from sgft_jax.learners.sac import SACConfig
+from sgft_jax.learners.sac import SACConfig, extract_params, make_sac
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.policies import sac_policy
+from sgft_jax.types import Normalizer
 
 NETWORK = NetworkConfig(hidden=(4,))
 
 
 def reported(env, *, dynamics_bias=0.0, value_bias=0.0):
-    """Report of a prior whose networks are zero but for the biases of value and model; gamma 0.5, 3 trajectories."""
-    prior = initial(SACConfig(4, 2, network=NETWORK, ensemble_size=2))(jax.random.key(0))
-    prior = prior._replace(
-        **{name: jax.tree.map(jnp.zeros_like, getattr(prior, name)) for name in ("value", "dynamics")}
+    """Report of a prior whose value and model are zero but for their biases; gamma 0.5, 3 trajectories."""
+    learner = make_sac(SACConfig(4, 2, network=NETWORK, ensemble_size=2))
+    shapes, rng = (
+        jax.eval_shape(lambda key: extract_params(learner.init(key)), jax.random.key(0)),
+        np.random.default_rng(0),
     )
+    prior = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    actor = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape), x.dtype), shapes.actor)
+    prior = prior._replace(actor=actor, normalizer=Normalizer(jnp.zeros(4), jnp.ones(4)))
     prior.value["Dense_1"]["bias"] += value_bias
     prior.dynamics["Dense_1"]["bias"] += dynamics_bias
     pool = envs.sample_worlds(env, jax.random.key(1), 2, effects={"obs_noise": 0.0})

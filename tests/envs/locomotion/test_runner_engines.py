@@ -14,7 +14,7 @@ SLOWER = ["jax", *(["warp"] if engine_warp.available() else [])]
 ENGINES = ["c", *(pytest.param(impl, marks=pytest.mark.slow) for impl in SLOWER)]
 
 
-@pytest.fixture(scope="module", params=TASKS)
+@pytest.fixture(scope="module", params=["halfcheetah", pytest.param("walker2d", marks=pytest.mark.slow)])
 def falling(request):
     """(task, gaps, pool, states [STEPS + 1, gaps], actions [STEPS, gaps, 6])."""
     names = [name for own, name in EVERY if own == request.param and name != "joint-noise"]
