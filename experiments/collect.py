@@ -126,8 +126,8 @@ def check(args: CollectArgs) -> float:
             )
         task_of_priors([args.policy], args.task)
     check_folder(args.out)
-    if there := [path for path in targets(args) if path.exists() and not args.overwrite]:
-        raise UserError(f"{there[0]}: exists already; --overwrite replaces it, another --out keeps both")
+    if existing := [path for path in targets(args) if path.exists() and not args.overwrite]:
+        raise UserError(f"{existing[0]}: exists already; --overwrite replaces it, another --out keeps both")
     return level or 0.0
 
 

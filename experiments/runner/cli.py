@@ -223,8 +223,8 @@ def preview(argv: Sequence[str], **defaults: Any) -> SimpleNamespace:
     fields = [(name, type(value), dataclasses.field(default=value)) for name, value in defaults.items()]
     chosen = dataclasses.make_dataclass("Options", fields)
     with _errors.on_parse_error(lambda event: _refuse(event, argv, chosen, None)):
-        found, _ = tyro.cli(chosen, args=list(argv), return_unknown_args=True, add_help=False)
-    return SimpleNamespace(**vars(found))
+        values, _ = tyro.cli(chosen, args=list(argv), return_unknown_args=True, add_help=False)
+    return SimpleNamespace(**vars(values))
 
 
 def _refuse(event: _errors.ParseErrorEvent, argv: Sequence[str], config_type: type, default: Any) -> None:

@@ -46,22 +46,22 @@ def run(args: "GapsArgs", seeds: list[int], folders: list[Path]) -> dict[str, An
     system, members = systems(env, reals, priors, args.episodes)
     played = play(system, make_policy(priors[0].card, env), members, episode_key(FINAL_SEED), args.episodes)
     zero_shot = [stacking.part(played, i, len(priors)) for i in range(len(reals))]
-    about = {"task": task, "impl": env.impl, "preset": args.preset, "priors": [str(prior) for prior in folders]}
-    summary = _report(folder, about, [_line(*row, None) for row in zip(reals, zero_shot, strict=True)])
+
+    def report(trained: Sequence[Episode | None]) -> dict[str, Any]:
+        """Prints the table; writes and returns the summary."""
+        lines = [_line(*row) for row in zip(reals, zero_shot, trained, strict=True)]
+        about = {"task": task, "impl": env.impl, "preset": args.preset, "priors": [str(prior) for prior in folders]}
+        limits = {"zero_shot_at_most": ZERO_SHOT_AT_MOST, "trained_at_least": TRAINED_AT_LEAST}
+        summary = {**about, "limits": limits, "gaps": lines}
+        folder.mkdir(parents=True, exist_ok=True)
+        path = write_summary(folder, summary)
+        print("\n".join(table(lines)))
+        print(f"summary: {path}")
+        return summary
+
+    summary = report([None] * len(reals))
     if args.train:  # the long part: what is known already is on disk
-        trained = train(env, args.config, reals, seeds, folder, episodes=args.episodes)
-        summary = _report(folder, about, [_line(*row) for row in zip(reals, zero_shot, trained, strict=True)])
-    return summary
-
-
-def _report(folder: Path, about: dict[str, Any], lines: list[dict[str, Any]]) -> dict[str, Any]:
-    """Writes the summary, which is returned, and prints the table."""
-    limits = {"zero_shot_at_most": ZERO_SHOT_AT_MOST, "trained_at_least": TRAINED_AT_LEAST}
-    summary = {**about, "limits": limits, "gaps": lines}
-    folder.mkdir(parents=True, exist_ok=True)
-    path = write_summary(folder, summary)
-    print("\n".join(table(lines)))
-    print(f"summary: {path}")
+        summary = report(train(env, args.config, reals, seeds, folder, episodes=args.episodes))
     return summary
 
 
