@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from envs.types import UserError, unknown
+from envs.types import unknown
 from experiments.runner.cli import columns, fail
 
 _RUNS = 'if __name__ == "__main__":'  # what a command ends with
@@ -22,19 +22,10 @@ def main(argv: Sequence[str] | None = None) -> None:
         print("usage: sgft COMMAND [OPTIONS]; sgft COMMAND --help lists the options\n")
         print("\n".join(columns(list(commands().items()))))
         return
-    try:
-        module = check(name)
-    except UserError as error:
-        fail(str(error))
+    if name not in (known := commands()):
+        fail(unknown("command", name, known))
     sys.argv = [sys.argv[0], *words]
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
-
-
-def check(name: str) -> str:
-    """The module of a command; raises UserError with the nearest name where there is none."""
-    if name not in commands():
-        raise UserError(unknown("command", name, commands()))
-    return f"experiments.{name}"
+    runpy.run_module(f"experiments.{name}", run_name="__main__", alter_sys=True)
 
 
 def commands() -> dict[str, str]:

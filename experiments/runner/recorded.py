@@ -63,17 +63,17 @@ class RecordedSystem:
         """The next episode of every member, [M, 1]."""
         number, self.rollout = self.rollout, self.rollout + 1
         missing = [store for store in self.stores if len(store) <= number]
-        if not missing:
-            return self._stored(number)
-        if self.sync_every is not None:
+        if missing and self.sync_every is not None:
             self._play_robot(number, policy, states, keys[:, 0])
-            return self._stored(number)
-        episodes = self.inner.play(policy, states, keys, explore=self.explore)
-        for i, store in enumerate(self.stores):
-            if len(store) <= number:
-                store.append(_arrays(part(episodes, i, keys.shape[0] // len(self.stores))))
+        elif missing:
+            episodes = self.inner.play(policy, states, keys, explore=self.explore)
+            for i, store in enumerate(self.stores):
+                if len(store) <= number:
+                    store.append(_arrays(part(episodes, i, keys.shape[0] // len(self.stores))))
+            if len(missing) == len(self.stores):
+                return episodes
         # What a robot has done stands, also where the others had to play this rollout again.
-        return episodes if len(missing) == len(self.stores) else self._stored(number)
+        return join([_read(store, number) for store in self.stores])
 
     def _play_robot(self, number: int, policy: Any, states: PyTree, keys: Key) -> None:
         """Stores the rollout of a robot, played now or as far as a kill has let it come. keys: [1]."""
@@ -94,9 +94,6 @@ class RecordedSystem:
         beside = {name: np.stack([getattr(step, name) for step in made], axis=1) for name in _BESIDE}
         store.append({**_arrays(jax.tree.map(lambda x: x[:, None], inner.episode(made))), **beside})
         journal.remove()
-
-    def _stored(self, number: int) -> Episode:
-        return join([_read(store, number) for store in self.stores])
 
 
 def _step(path: Path, stored: Mapping[str, np.ndarray], env: Env) -> Step:
