@@ -2,13 +2,12 @@
 
 import contextlib
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from envs import gaps
-from envs.gaps import SIM, Gap
+from envs.gaps import SIM
 from envs.types import UserError
 from experiments.runner import cli, options
 from experiments.runner.options import Impl, Json, Out
@@ -77,8 +76,10 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     args = replace(args, real=gaps.each(args.real))
     folders, task = check(args)
     import jax
+    import jax.numpy as jnp
 
     import envs
+    from envs.rollout import heldout_worlds, padded, real_env
     from experiments.runner.pictures import film_episode
     from experiments.runner.recorded import RecordedSystem
     from experiments.runner.training import describe, play
@@ -86,6 +87,7 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
     from sgft_jax.io.priors import load_priors, observed_by
     from sgft_jax.io.real import RealStore
     from sgft_jax.stacking import member, part, stack
+    from sgft_jax.systems.simulated import Simulated
 
     env = envs.make(task, args.impl, **observed_by(folders))
     reals = [None if real == SIM else described(env, real, args.set) for real in args.real]
@@ -99,7 +101,10 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
             system = connect(env, args.real, args.set, members=len(priors), gamma=card["gamma"], home=args.out)
             last.callback(system.close)
         else:
-            system = _simulated(env, reals, key_worlds, args.episodes, members=len(priors), gamma=card["gamma"])
+            world = real_env(env, [gap for gap in reals if gap])
+            pools = [padded(heldout_worlds(world, gap, key_worlds, args.episodes), args.episodes) for gap in reals]
+            which = jnp.repeat(jnp.arange(len(pools)), len(priors))
+            system = Simulated(world, stack(pools), which, gamma=card["gamma"])
         if is_robot(args.real[0]):  # what it does is kept
             store = RealStore(args.out / "evaluate" / env.name / REMOTE)
             system = RecordedSystem(system, [store], done=len(store), explore=False, sync_every=1)
@@ -122,19 +127,6 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
             facts["real_steps"] = int(part(played, i, len(priors)).valid.sum())
         systems.append(facts)
     return {"task": env.name, "impl": env.impl, "episodes": args.episodes, "systems": systems}
-
-
-def _simulated(env: Any, reals: Sequence[Gap | None], key: Any, episodes: int, *, members: int, gamma: float) -> Any:
-    """The `Simulated` systems of gaps, None for the simulator, in held-out worlds with so many members on each."""
-    import jax.numpy as jnp
-
-    from envs.rollout import heldout_worlds, padded, real_env
-    from sgft_jax.stacking import stack
-    from sgft_jax.systems.simulated import Simulated
-
-    real = real_env(env, [gap for gap in reals if gap])
-    pools = [padded(heldout_worlds(real, gap, key, episodes), episodes) for gap in reals]
-    return Simulated(real, stack(pools), jnp.repeat(jnp.arange(len(pools)), members), gamma=gamma)
 
 
 def check(args: EvaluateArgs) -> tuple[list[Path], str]:
@@ -166,8 +158,6 @@ def check(args: EvaluateArgs) -> tuple[list[Path], str]:
     folders = options.prior_folders(home, out=args.out, task=args.task or "", preset=args.preset)
     task = options.task_of_priors(folders, args.task)
     check_real(task, reals, args.set)
-    if reals and not is_stepped(reals[0]):
-        gaps.changes(args.set)
     return folders, task
 
 

@@ -12,7 +12,7 @@ from envs import extend, gaps
 from envs.types import UserError
 from experiments.runner import options
 from experiments.runner.options import FirstSeed, Impl, Out, Successors, Task
-from experiments.runner.real_systems import REMOTE, is_robot, is_stepped, title
+from experiments.runner.real_systems import REMOTE, is_robot, title
 from experiments.runner.real_systems import check as check_real
 from sgft_jax.files.disk import jsonable
 from sgft_jax.methods import DEFAULT, get_method
@@ -154,8 +154,6 @@ def check(args: FinetuneArgs) -> tuple[Online, list[int]]:
         raise UserError(f"--successors {args.successors}: is for --real-data, which must be named")
     options.each_once(args, "real")
     check_real(args.task, args.real, args.set)
-    if not is_stepped(args.real[0]):
-        gaps.changes(args.set)
     _check_robot(args)
     if args.eval_at:
         _check_eval_at(args)

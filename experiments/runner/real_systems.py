@@ -58,7 +58,7 @@ def title(real: str) -> str:
 def check(task: str, reals: Sequence[str], changes: Sequence[str] = ()) -> None:
     """Raises UserError where there is no such task or real system, or where they cannot be played by one command."""
     stepped, robots = ([real for real in reals if is_kind(real)] for is_kind in (is_stepped, is_robot))
-    check_task(task, [real for real in reals if not is_stepped(real)])
+    check_task(task, [real for real in reals if not is_stepped(real)], () if stepped else changes)
     if not stepped:
         return
     if len(stepped) < len(reals) or 0 < len(robots) < len(reals):
