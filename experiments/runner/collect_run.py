@@ -22,6 +22,7 @@ from envs.locomotion.wheel_legged import nominal_gain, operator
 from envs.rollout import Episode, counted, play_episode, real_env, real_worlds
 from envs.types import Array, Policy, PyTree, Transition, UserError
 from experiments.runner.options import seed_list
+from experiments.runner.training import play
 from sgft_jax.algorithms import make_policy
 from sgft_jax.datasets import logs, recording
 from sgft_jax.datasets.recording import Joints, Noted, Recorded
@@ -103,14 +104,9 @@ def _system(args: "CollectArgs", env: Env, members: int, gamma: float) -> Simula
 def _returns(args: "CollectArgs", agent: HybridAgent, system: Simulated, state: FleetState) -> np.ndarray:
     """Mean return [seeds] of the exploring policies."""
     params = jax.jit(jax.vmap(agent.export))(state.learner)
-    played = _episodes(system, agent.policy, params, jax.random.key(FromLog.LEVEL), args.eval_episodes)
+    key, n = jax.random.key(FromLog.LEVEL), args.eval_episodes
+    played = play(system, agent.policy, params, key, n, explore=True)
     return np.asarray(counted(played)[1]).mean(axis=1)
-
-
-def _episodes(system: Simulated, policy: Policy, params: PyTree, key: Any, n: int) -> Episode:
-    """Exploring episodes [members, n]."""
-    keys = jnp.broadcast_to(jax.random.split(key, n), (*system.which.shape, n))
-    return system.play(policy, params, keys, explore=True)
 
 
 def _joints(physics: Any) -> Joints | None:
@@ -153,7 +149,7 @@ def _play(args: "CollectArgs", system: Simulated, policy: Policy, params: PyTree
     at_once = min(_AT_ONCE, math.ceil(args.transitions / system.env.episode_length))
     while sum(len(episode.reward) for episode in episodes) < args.transitions:
         key, key_now = jax.random.split(key)
-        played = member(_episodes(alone, policy, params, key_now, at_once), 0)
+        played = member(play(alone, policy, params, key_now, at_once, explore=True), 0)
         if not (new := recording.of_episodes(played, _noted(policy, member(params, 0), played))):
             what = f"physics exploded in the first step of {at_once} episodes; nothing to record"
             raise UserError(f"{system.env.name}: {what}")
@@ -196,7 +192,7 @@ def operate(args: "CollectArgs", files: Sequence[Path], *, speed: float) -> list
     policy, gain = operator(speed), jnp.asarray(nominal_gain(), jnp.float32)
     act, length = functools.partial(policy.act, gain, explore=True), args.transitions
     assert length is not None
-    play = jax.jit(
+    plays = jax.jit(
         jax.vmap(lambda key: play_episode(env, pool, act, policy.init_carry(), key, gamma=1.0, length=length))
     )
     cards = []
@@ -204,7 +200,7 @@ def operate(args: "CollectArgs", files: Sequence[Path], *, speed: float) -> list
         key, episodes = jax.random.key(seed), []
         while sum(len(episode.reward) for episode in episodes) < length:  # one that has fallen is put up again
             key, key_now = jax.random.split(key)
-            episodes += recording.of_episodes(play(key_now[None]))
+            episodes += recording.of_episodes(plays(key_now[None]))
         cards.append(_write_log(args, env, file, recording.cut(episodes, length), stands=not speed))
     return cards
 

@@ -18,6 +18,7 @@ from experiments.runner.cli import columns
 from experiments.runner.gaps_run import systems
 from experiments.runner.real_systems import connect, is_robot, is_stepped, title
 from experiments.runner.recorded import RecordedSystem
+from experiments.runner.training import play
 from sgft_jax import api, stacking
 from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import figures, tables, verdict
@@ -142,25 +143,23 @@ def predicted(diagnosis: Mapping[str, Any]) -> dict[str, Any]:
 # --- rollouts ---------------------------------------------------------------------------------------------------------
 
 
-def play(env: Env, reals: Sequence[Gap], priors: list[Prior], n: int, seed: int) -> list[Rollouts]:
+def _play(env: Env, reals: Sequence[Gap], priors: list[Prior], n: int, seed: int) -> list[Rollouts]:
     """Exploring rollouts [n] of every prior on every gap: [gaps * priors], all priors on the first gap first."""
     system, members = systems(env, reals, priors, max(n, 64))
-    key = jax.random.fold_in(jax.random.key(_SEED), seed)
-    keys = jnp.broadcast_to(jax.random.split(key, n), (len(reals) * len(priors), n))
-    played = system.play(make_policy(priors[0].card, system.env), members, keys, explore=True)
-    return _of_members(jax.tree.map(np.asarray, played), len(keys))
+    key, policy = jax.random.fold_in(jax.random.key(_SEED), seed), make_policy(priors[0].card, system.env)
+    return _of_members(play(system, policy, members, key, n, explore=True), len(reals) * len(priors))
 
 
 def play_simulated(env: Env, priors: list[Prior], seed: int) -> list[Rollouts]:
     """Exploring rollouts [SIMULATED] of every prior where nothing differs."""
-    return play(env, [gaps.find(env.name, SIM)], priors, SIMULATED, seed)
+    return _play(env, [gaps.find(env.name, SIM)], priors, SIMULATED, seed)
 
 
 def _play_both(env: Env, gap: Gap, priors: list[Prior], n: int, seed: int) -> tuple[list[Rollouts], list[Rollouts]]:
     """Rollouts [n] of every prior on a gap, and [SIMULATED] in simulation; one program plays both where it can."""
     if gap.scene:
-        return play(env, [gap], priors, n, seed), play_simulated(env, priors, seed)
-    both = play(env, [gap, gaps.find(env.name, SIM)], priors, max(n, SIMULATED), seed)
+        return _play(env, [gap], priors, n, seed), play_simulated(env, priors, seed)
+    both = _play(env, [gap, gaps.find(env.name, SIM)], priors, max(n, SIMULATED), seed)
     real, simulated = both[: len(priors)], both[len(priors) :]
     return jax.tree.map(lambda x: x[:n], real), jax.tree.map(lambda x: x[:SIMULATED], simulated)
 
@@ -171,10 +170,9 @@ def _play_real(env: Env, args: "DiagnoseArgs", priors: list[Prior], n: int, home
     try:
         store = RealStore(home)  # after the connection, which may fail
         key = jax.random.fold_in(jax.random.fold_in(jax.random.key(_SEED), args.seed), len(store))
-        keys = jnp.broadcast_to(jax.random.split(key, n), (len(priors), n))
         members = stacking.stack([prior.params for prior in priors])
         kept = RecordedSystem(system, [store], done=len(store), sync_every=1 if is_robot(args.real) else None)
-        played = kept.play(make_policy(priors[0].card, env), members, keys, explore=True)
+        played = play(kept, make_policy(priors[0].card, env), members, key, n, explore=True)
     finally:
         system.close()
     return _of_members(played, len(priors))

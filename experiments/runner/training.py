@@ -166,14 +166,14 @@ class Training:
 # --- evaluations -----------------------------------------------------------------------------------------------------
 
 
-def play(system: System, policy: Policy, params: PyTree, key: Key, episodes: int) -> Episode:
-    """Episodes [M, episodes] of each of M policies without exploration, as NumPy arrays on every host.
+def play(system: System, policy: Policy, params: PyTree, key: Key, episodes: int, *, explore: bool = False) -> Episode:
+    """Episodes [M, episodes] of each of M policies, as NumPy arrays on every host.
 
     All policies play the same episodes, so that differences between them are paired.
     """
     members = jax.tree.leaves(params)[0].shape[0]
     keys = jnp.broadcast_to(jax.random.split(key, episodes), (members, episodes))
-    played = mesh.local(system.play(policy, params, keys, explore=False))
+    played = mesh.local(system.play(policy, params, keys, explore=explore))
     return jax.tree.map(np.asarray, played)
 
 
