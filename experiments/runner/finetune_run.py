@@ -1,6 +1,7 @@
 """Impure: a fine-tuning run, `finetuning.finetune` with folders, checkpoints, logs, evaluations and videos."""
 
 import contextlib
+import dataclasses
 import functools
 import json
 from collections.abc import Mapping
@@ -85,8 +86,8 @@ def run(
         learner = None
         if real_systems.is_robot(args.real[0]):
             prior = jax.device_get(priors[0]) if priors else None
-            named = args.task, args.impl, args.method, dict(vars(args.options))
-            again = functools.partial(build, *named, observed_by(folders), prior)
+            options = {field.name: getattr(args.options, field.name) for field in dataclasses.fields(args.options)}
+            again = functools.partial(build, args.task, args.impl, args.method, options, observed_by(folders), prior)
             which = finetuning.prior_of(setup.priors, setup.seeds)
             learner = LearnerProcess(again, setup.seeds, which, setup.simulated)
             last.callback(learner.close)
