@@ -208,8 +208,7 @@ def operate(args: "CollectArgs", files: Sequence[Path], *, speed: float) -> list
 def _write_log(args: "CollectArgs", env: Env, path: Path, episodes: list[Recorded], *, stands: bool) -> dict[str, Any]:
     """The log and its card; says how it compares with what is published of the real one."""
     recording.write_table(path, episodes, scale=wheel_legged.TORQUE)
-    assert env.reward is not None
-    log = logs.load_table(path, gamma=1.0, obs_dim=env.obs_dim, reward=jax.vmap(env.reward))
+    log = logs.load(path, gamma=1.0, env=env)
     rows, obs = log.rows, np.asarray(log.rows.obs)
     spread = [*obs[:, 1:].std(0), wheel_legged.TORQUE * np.asarray(rows.action).std()]
     moving = jax.vmap(wheel_forward.reward)(rows.obs[:, 1:], rows.action, rows.next_obs[:, 1:])

@@ -43,7 +43,7 @@ class Rows(NamedTuple):
     reward, terminal: None where the file does not tell. ends: [N] bool, last row of an episode. keep: [N] bool, rows
     whose successor is known. layout: its name. successors: where next observations come from. rate: steps per second,
     None where the file does not tell. source: the file that stands for all, or the folder. assumed: what the file does
-    not tell and was taken to be so, in words.
+    not tell and was taken to be so, in words. dropped: rows of the file that are left out.
     """
 
     obs: np.ndarray
@@ -58,6 +58,7 @@ class Rows(NamedTuple):
     source: Path
     rate: float | None = None
     assumed: str = ""
+    dropped: int = 0
 
 
 class _Card(TypedDict, total=False):
@@ -201,10 +202,13 @@ def read_hdf5(path: Path, successors: Successors, limit: int | None = None) -> R
         return _read_minari(content, groups)
 
 
-def read_table(path: Path, measured_dim: int) -> tuple[Rows, int]:
-    """The rows of a wheel-legged robot's log, without rewards, and how many rows it has in all.
+def read_table(path: Path, measured_dim: int) -> Rows:
+    """The rows of a wheel-legged robot's log, without rewards: text, a row each control period, with six columns.
 
-    measured_dim: 4 reads x, v, pitch and its velocity as the observation, 3 leaves x out. See `logs.load_table`.
+    x (m), v (m/s), pitch (rad), pitch velocity (rad/s), torque (N m), done. measured_dim: 4 reads the first four as the
+    observation, 3 leaves x out. Rows with a torque beyond +-3 N m are dropped, whatever its sign, and an episode ends
+    before each of them. A row whose successor is done is terminal; rows that are done are dropped. Source: H2O+'s log
+    of the standing robot, whose released loader keeps torques below -3 and joins both sides of a dropped row.
     """
     table = _table(path)
     state, torque = table[:, 4 - measured_dim : 4], table[:, 4:5]
@@ -215,7 +219,8 @@ def read_table(path: Path, measured_dim: int) -> tuple[Rows, int]:
         raise UserError(f"{path}: holds no transitions; supply another file")
     obs, action, next_obs, terminal = state[rows], torque[rows] / _TORQUE, state[rows + 1], done[rows + 1]
     ends, keep = terminal | (np.diff(rows, append=rows[-1:]) > 1), np.ones(len(rows), bool)
-    return Rows(obs, action, None, next_obs, terminal, ends, keep, "table", "stored", path), len(table)
+    step, dropped = (obs, action, None, next_obs, terminal, ends, keep), len(table) - len(rows)
+    return Rows(*step, "table", "stored", path, dropped=dropped)
 
 
 def read_rollouts(home: Path) -> Rows:
@@ -245,7 +250,6 @@ def _table(file: Path) -> np.ndarray:
 
 
 def _card(folder: Path) -> Mapping[str, Any]:
-    """What Minari says of a data set."""
     return read_object(folder / _METADATA, _Card, "supply a whole data set")
 
 

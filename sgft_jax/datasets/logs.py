@@ -8,7 +8,7 @@ import dataclasses
 import hashlib
 import itertools
 import stat
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
 
@@ -77,7 +77,7 @@ class Log(NamedTuple):
 
 def load(path: Path | str, *, gamma: float, successors: Successors = "stored", env: Env | None = None) -> Log:
     """The transitions of a D4RL file; of a data set of Minari or LeRobot v3, by its folder; of the rollouts of a run of
-    ours, by the run's folder or its `real/`; or of a robot's table, see `load_table`.
+    ours, by the run's folder or its `real/`; or of a robot's table, see `layouts.read_table`.
 
     gamma: a row's discount is gamma, or 0 where it is terminal. A time limit is never terminal: it only ends episodes,
         and so does an end whose reason the file does not tell. Actions are clipped to [-1, 1].
@@ -94,30 +94,11 @@ def load(path: Path | str, *, gamma: float, successors: Successors = "stored", e
     if successors not in (known := get_args(Successors)):
         raise UserError(unknown("successors", successors, known))
     path = Path(path)
-    if path.suffix in _TABLES:
-        if env is None or not env.table or env.reward is None:
-            task = "another task" if env is None else env.name
-            raise UserError(f"{path}: tables are logs of a wheel-legged robot; {task} wants a data set")
-        return load_table(path, gamma=gamma, obs_dim=env.measured_dim, reward=jax.vmap(env.reward), env=env)
-    return _log(path, _read(path, successors, env), gamma, env)
-
-
-def load_table(
-    path: Path | str, *, gamma: float, obs_dim: int, reward: Callable[..., Array], env: Env | None = None
-) -> Log:
-    """The transitions of a wheel-legged robot's log: text, a row each control period, with these six columns.
-
-    x (m), v (m/s), pitch (rad), pitch velocity (rad/s), torque (N m), done. obs_dim: 4 reads the first four as the
-    observation, 3 leaves x out. reward(obs [N, obs_dim], action [N, 1], next_obs [N, obs_dim]) -> [N], of the task.
-    Rows with a torque beyond +-3 N m are dropped, whatever its sign, and an episode ends before each of them. A row
-    whose successor is done is terminal; rows that are done are dropped. Source: H2O+'s log of the standing robot, whose
-    released loader keeps torques below -3 and joins what lies on both sides of a dropped row. env: see `load`.
-    Raises UserError for a file that is missing, has other columns, numbers that are not finite, or no transition.
-    """
-    rows, count = layouts.read_table(Path(path), obs_dim)
-    rows = rows._replace(reward=np.asarray(reward(rows.obs, rows.action, rows.next_obs)))
-    log = _log(Path(path), rows, gamma, env)
-    return log._replace(facts=dataclasses.replace(log.facts, dropped=count - len(rows.obs)))
+    rows = layouts.check(path, _read(path, successors, env))
+    rows = _judged(path, rows if env is None else _fitted(path, rows, env), env)
+    rows = rows if env is None else _seen(rows, env)
+    below = np.append(rows.keep[1:], False)
+    return Log(_transitions(rows, gamma), _facts(rows), (rows.ends | ~below)[rows.keep])
 
 
 def episodes(logs: Sequence[Log]) -> tuple[Transition, np.ndarray]:
@@ -140,6 +121,11 @@ def episodes(logs: Sequence[Log]) -> tuple[Transition, np.ndarray]:
 
 def _read(path: Path, successors: Successors, env: Env | None) -> Rows:
     """What lies there."""
+    if path.suffix in _TABLES:
+        if env is None or not env.table or env.reward is None:
+            task = "another task" if env is None else env.name
+            raise UserError(f"{path}: tables are logs of a wheel-legged robot; {task} wants a data set")
+        return layouts.read_table(path, env.measured_dim)
     with readable(path):
         folder = stat.S_ISDIR(path.stat().st_mode)
     if folder:
@@ -148,15 +134,6 @@ def _read(path: Path, successors: Successors, env: Env | None) -> Rows:
         if (home := home_of(path)) is not None:
             return layouts.read_rollouts(home)
     return layouts.read_hdf5(path, successors, None if env is None else env.episode_length)
-
-
-def _log(path: Path, rows: Rows, gamma: float, env: Env | None) -> Log:
-    """The transitions of what a file holds, as a task sees them."""
-    rows = layouts.check(path, rows)
-    rows = _judged(path, rows if env is None else _fitted(path, rows, env), env)
-    rows = rows if env is None else _seen(rows, env)
-    below = np.append(rows.keep[1:], False)
-    return Log(_transitions(rows, gamma), _facts(rows), (rows.ends | ~below)[rows.keep])
 
 
 # --- what a task makes of it ------------------------------------------------------------------------------------------
@@ -237,7 +214,7 @@ def _facts(rows: Rows) -> Facts:
     counts = {"transitions": keep, "dropped": ~keep, "terminal": rows.terminal & keep, "clipped": clipped}
     facts: dict[str, Any] = {name: int(np.sum(which)) for name, which in counts.items()}
     facts |= {f"return_{name}": float(getattr(np, name)(judged)) for name in ("mean", "std", "min", "max")}
-    facts |= {"episodes": len(returns), "whole_episodes": whole}
+    facts |= {"episodes": len(returns), "whole_episodes": whole, "dropped": facts["dropped"] + rows.dropped}
     return Facts(str(rows.source), rows.layout, size, digest, rows.successors, **facts, assumed=rows.assumed)
 
 

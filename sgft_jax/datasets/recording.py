@@ -165,7 +165,7 @@ def _infos(episode: Recorded) -> dict[str, np.ndarray]:
 
 
 def write_table(path: Path, episodes: Sequence[Recorded], *, scale: float) -> None:
-    """A text file as `logs.load_table` reads it: episodes of the wheel-legged robot, whose obs are [T + 1, 4].
+    """A text file as `layouts.read_table` reads it: episodes of the wheel-legged robot, whose obs are [T + 1, 4].
 
     scale: N m at an action of 1. The state in which an episode ended is a row of its own, with `done` where it fell.
     """

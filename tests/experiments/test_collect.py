@@ -8,8 +8,10 @@ import h5py
 import jax
 import numpy as np
 import pytest
+import toy
 from priors_by_hand import save_prior
 
+from envs.base import Entry
 from envs.types import Transition, UserError
 from experiments import collect, hybrid
 from experiments.runner import collect_run
@@ -129,7 +131,9 @@ def test_a_table_is_read_again(tmp_path):
     fallen = Recorded(states[:4], np.float32([[0.5], [-1.0], [1.0]]), np.zeros(3, np.float32), terminated=True)
     cut_off = Recorded(states[4:], np.float32([[0.25], [0.0]]), np.zeros(2, np.float32), terminated=False)
     recording.write_table(tmp_path / "new" / "log.txt", [fallen, cut_off], scale=3.0)
-    log = logs.load_table(tmp_path / "new" / "log.txt", gamma=0.9, obs_dim=4, reward=lambda *step: step[0][:, 0])
+    entries = {"observation": (Entry("state", "", 4),), "action": (Entry("torque", "3 N m", 1),)}
+    env = toy.make()._replace(table=True, reward=lambda obs, action, next_obs: obs[0], **entries)
+    log = logs.load(tmp_path / "new" / "log.txt", gamma=0.9, env=env)
     np.testing.assert_array_equal(log.rows.obs, states[[0, 1, 2, 4, 5]])
     np.testing.assert_array_equal(log.rows.next_obs, states[[1, 2, 3, 5, 6]])
     np.testing.assert_allclose(log.rows.action[:, 0], [0.5, -1.0, 1.0, 0.25, 0.0])

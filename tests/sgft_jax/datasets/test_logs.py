@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import toy
 
+from envs.base import Entry
 from envs.types import Transition, UserError
 from experiments.runner.recorded import read_log
 from sgft_jax.data import replay, sequences, sources
@@ -346,7 +347,7 @@ def test_what_is_no_plain_file_is_refused(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
     assert "is no plain file" in refused(tmp_path / "pipe.hdf5")
     with pytest.raises(UserError, match="is no plain file"):
-        logs.load_table(tmp_path / "pipe.csv", gamma=0.9, obs_dim=4, reward=lambda *step: step[0][:, 0])
+        logs.load(tmp_path / "pipe.csv", gamma=0.9, env=robot())
 
 
 def test_an_unknown_convention_is_refused(write):
@@ -506,13 +507,17 @@ TABLE = np.array(
 )
 
 
+def robot(reward=lambda obs, action, next_obs: obs[0], size=4):
+    """A task that measures the last of the first four columns, and commands the fifth."""
+    entries = {"observation": (Entry("state", "", size),), "action": (Entry("torque", "3 N m", 1),)}
+    return toy.make()._replace(table=True, reward=reward, **entries)
+
+
 @pytest.mark.parametrize(("ending", "delimiter"), [(".txt", " "), (".csv", ",")])
 def test_tables_drop_strong_torques_of_both_signs_and_split_there(ending, delimiter, tmp_path):
     path = tmp_path / f"log{ending}"
     np.savetxt(path, TABLE, delimiter=delimiter)
-    log = logs.load_table(
-        path, gamma=0.9, obs_dim=4, reward=lambda obs, action, next_obs: next_obs[:, 0] + action[:, 0]
-    )
+    log = logs.load(path, gamma=0.9, env=robot(lambda obs, action, next_obs: next_obs[0] + action[0]))
     # row 1 has no successor that counts, row 7 is over, row 9 is the last
     np.testing.assert_allclose(log.rows.obs[:, 0], [0, 4, 5, 6, 8])
     np.testing.assert_allclose(log.rows.next_obs, log.rows.obs + 1, rtol=1e-6)
@@ -527,13 +532,13 @@ def test_tables_drop_strong_torques_of_both_signs_and_split_there(ending, delimi
 def test_a_table_may_begin_with_a_byte_order_mark(tmp_path):
     np.savetxt(tmp_path / "log.csv", TABLE, delimiter=",")
     (tmp_path / "log.csv").write_bytes(b"\xef\xbb\xbf" + (tmp_path / "log.csv").read_bytes())
-    log = logs.load_table(tmp_path / "log.csv", gamma=0.9, obs_dim=4, reward=lambda *step: step[0][:, 0])
+    log = logs.load(tmp_path / "log.csv", gamma=0.9, env=robot())
     assert log.facts.transitions == 5
 
 
 def test_tables_without_position(tmp_path):
     np.savetxt(tmp_path / "log.txt", TABLE)
-    log = logs.load_table(tmp_path / "log.txt", gamma=0.9, obs_dim=3, reward=lambda obs, action, next_obs: obs[:, 0])
+    log = logs.load(tmp_path / "log.txt", gamma=0.9, env=robot(size=3))
     np.testing.assert_allclose(log.rows.obs[0], [0.1, 0.2, 0.3], rtol=1e-6)
 
 
@@ -554,9 +559,9 @@ def test_tables_without_position(tmp_path):
 def test_odd_tables_are_refused(text, words, tmp_path):
     (tmp_path / "log.txt").write_text(text)
     with pytest.raises(UserError, match=words):
-        logs.load_table(tmp_path / "log.txt", gamma=0.9, obs_dim=4, reward=lambda obs, action, next_obs: obs[:, 0])
+        logs.load(tmp_path / "log.txt", gamma=0.9, env=robot())
     with pytest.raises(UserError, match="no such file"):
-        logs.load_table(tmp_path / "none.txt", gamma=0.9, obs_dim=4, reward=lambda *step: step[0][:, 0])
+        logs.load(tmp_path / "none.txt", gamma=0.9, env=robot())
 
 
 NONE = Facts("", "d4rl", 0, "", "stored", 0, 0, 0, 0, 0, 0, 0.0, 0.0, 0.0, 0.0)
