@@ -22,14 +22,7 @@ __all__ = ["branch", "clip", "compose", "relabel", "shape", "shaped_reward", "sh
 
 def stateless(apply: Callable[[Any, Batch, Key], Batch]) -> Transform:
     """A transform that learns nothing."""
-
-    def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
-        del batch, key
-        return state, {}
-
-    return Transform(
-        lambda params, key: (), lambda state, imagination, batch, key: apply(imagination, batch, key), update
-    )
+    return Transform(lambda params, key: (), lambda state, imagination, batch, key: apply(imagination, batch, key))
 
 
 def compose(*transforms: Transform) -> Transform:

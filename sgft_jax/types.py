@@ -118,12 +118,12 @@ class Transform(NamedTuple):
 
     init(params, key) -> state, () for a transform that does not learn. params: of the prior, None without one.
     apply(state, imagination, batch, key) -> Batch. imagination: an `Imagination`, or what else the method offers.
-    update(state, batch, key) -> (state, metrics): learns from the batch as it was sampled.
+    update(state, batch, key) -> (state, metrics): learns from the batch as it was sampled; by default nothing.
     """
 
     init: Callable[[PyTree, Key], PyTree]
     apply: Callable[[PyTree, Any, Batch, Key], Batch]
-    update: Callable[[PyTree, Batch, Key], tuple[PyTree, Metrics]]
+    update: Callable[[PyTree, Batch, Key], tuple[PyTree, Metrics]] = lambda state, batch, key: (state, {})
 
 
 # --- between simulation and reality ---------------------------------------------------------------------------------

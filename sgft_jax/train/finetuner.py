@@ -250,15 +250,13 @@ def unlearned(
 ) -> Parts:
     """Parts of a method whose policy never learns: it acts as what is exported, whatever else adapts."""
 
-    def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
-        return state, {}
-
     def act(
         state: FinetuneState, carry: PyTree, obs: Array, key: Key, *, explore: bool | Array
     ) -> tuple[Array, PyTree]:
         return policy.act(export(state), carry, obs, key, explore=explore)
 
-    return Parts(Learner(lambda key: (), policy.init_carry, act, update), start, export, policy, act)
+    nothing = Learner(lambda key: (), policy.init_carry, act, lambda state, batch, key: (state, {}))
+    return Parts(nothing, start, export, policy, act)
 
 
 # --- SAC --------------------------------------------------------------------------------------------------------------
