@@ -5,7 +5,7 @@ A yielded state is valid until the iterator's next step, which donates its array
 
 import functools
 from collections.abc import Generator, Iterator, Sequence
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +21,9 @@ from sgft_jax.train.evidence import Best
 from sgft_jax.train.guard import Guarded
 from sgft_jax.train.simulation import SimulatedRows
 from sgft_jax.types import Finetuner, Metrics
+
+if TYPE_CHECKING:
+    from sgft_jax.train.learner_process import LearnerProcess
 
 __all__ = ["FinetuneProgress", "evaluate", "finetune"]
 
@@ -54,22 +57,6 @@ class Logged(NamedTuple):
     updates: int
 
 
-class Beside(Protocol):
-    """A learner that works while the robot plays, such as a `LearnerProcess`."""
-
-    def submit(self, agent: PyTree, parts: Sequence[int], updates: int | Array, phase: Phase) -> None:
-        """Begins the learning phases `parts`, see `Updates`."""
-        ...
-
-    def ready(self) -> bool:
-        """Whether `result` would not wait."""
-        ...
-
-    def result(self) -> tuple[PyTree, Metrics]:
-        """What the phases have led to; the same until the next `submit`."""
-        ...
-
-
 # --- fine-tuning ------------------------------------------------------------------------------------------------------
 
 
@@ -82,7 +69,7 @@ def finetune(
     *,
     rollouts: int,
     progress: FinetuneProgress | None = None,
-    learner: Beside | None = None,
+    learner: "LearnerProcess | None" = None,
     waits: bool = True,
     logged: Logged | None = None,
 ) -> Iterator[tuple[FinetuneProgress, Metrics]]:
@@ -228,7 +215,7 @@ class _Steps:
         return progress._replace(agent=agent)
 
     def offline(
-        self, progress: FinetuneProgress, until: int, learner: Beside | None, phase: Phase
+        self, progress: FinetuneProgress, until: int, learner: "LearnerProcess | None", phase: Phase
     ) -> Generator[tuple[FinetuneProgress, Metrics], None, FinetuneProgress]:
         """Updates before the first rollout, part by part, until there are so many of them."""
         while (done := int(progress.offline)) < until:
@@ -252,7 +239,7 @@ class _Steps:
         return progress, _real(best, played) | metrics
 
     def beside(
-        self, progress: FinetuneProgress, learner: Beside, rollouts: int, *, waits: bool
+        self, progress: FinetuneProgress, learner: "LearnerProcess", rollouts: int, *, waits: bool
     ) -> Iterator[tuple[FinetuneProgress, Metrics]]:
         """The same with a learner that works on one rollout while the next one is played."""
         agent, best, done = progress.agent, progress.best, int(progress.rollouts)
@@ -318,7 +305,7 @@ class _Acting:
     before: the agent that has learned from `rollouts` rollouts. learner: None where nobody learns meanwhile.
     """
 
-    def __init__(self, before: PyTree, rollouts: int, learner: Beside | None, *, waits: bool) -> None:
+    def __init__(self, before: PyTree, rollouts: int, learner: "LearnerProcess | None", *, waits: bool) -> None:
         self.before, self.rollouts, self.learner, self.waits = before, rollouts, learner, waits
         self.steps = {False: 0, True: 0}  # with the agent before and with what has been learned
 
