@@ -6,6 +6,7 @@ Each module has a frozen configuration (structure, static), numbers that are lea
     action, carry = act(config, state, carry, obs, key, explore=True)
     state, metrics = update(config, state, batch, key)
 
+hyper: the numbers, or what has them as attributes, such as a method's options; None = the defaults.
 `make_*(config, hyper)` binds them to a configuration, as a `Learner`. A module is imported when it is first used.
 """
 
