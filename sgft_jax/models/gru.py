@@ -49,9 +49,9 @@ class _Layers(nn.Module):
     def advance(self, hidden: Array, read: Array) -> Array:
         """The next state [units]."""
         reset, keep, new = jnp.split(read, 3)
-        own_reset, own_keep, own_new = jnp.split(self.recurrent(hidden), 3)
-        keep = nn.sigmoid(keep + own_keep)
-        return (1.0 - keep) * jnp.tanh(new + nn.sigmoid(reset + own_reset) * own_new) + keep * hidden
+        h_reset, h_keep, h_new = jnp.split(self.recurrent(hidden), 3)
+        keep = nn.sigmoid(keep + h_keep)
+        return (1.0 - keep) * jnp.tanh(new + nn.sigmoid(reset + h_reset) * h_new) + keep * hidden
 
     def hand_on(self, hidden: Array, obs: Array) -> Array:
         """[units + 32]."""
