@@ -25,7 +25,7 @@ from experiments.figures import FiguresArgs, figures
 from experiments.hybrid import HybridArgs, SchedulePreset, data_name
 from experiments.runner import cli, grid, options, tuned
 from experiments.runner.grid import FINETUNING, Cell, GridArgs, Kind, WorkArgs, check_begun, look_up, work
-from experiments.runner.options import FirstSeed
+from experiments.runner.options import FirstSeed, Task
 from sgft_jax.analysis.curves import Curve
 from sgft_jax.analysis.hybrid import Results, ranks, summary
 from sgft_jax.analysis.reading import read_curve
@@ -102,8 +102,7 @@ def cells(args: CompareArgs) -> list[Cell]:
 class _HybridCells:
     """What the cells are of, and what is shown of them."""
 
-    task: str = "halfcheetah"
-    """A task by name, or a Python file with a task of your own."""
+    task: Task = "halfcheetah"
     methods: tuple[str, ...] = FIXED_NAMES
     """Methods in the order in which they run, as METHOD or METHOD:PRESET; the latter is a variant of that name. rebrac
     alone takes on each data set the preset that the file's name contains, if there is one."""
