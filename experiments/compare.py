@@ -210,7 +210,6 @@ HYBRID_RUNS = Kind(
     folder=lambda args: hybrid.run_folder(args, _system(args)),
     config=lambda args: jsonable(args) | {"gap": _system(args)},
     title=_title,
-    volatile=HybridArgs.volatile,
     finished=lambda args, summary: True,  # a summary is written at the end; another schedule is refused
 )
 

@@ -30,11 +30,11 @@ from sgft_jax.methods import NAMES, get_method
 
 
 class Kind(NamedTuple):
-    """A command whose runs are cells of a grid; `args`: its arguments, a frozen dataclass with the field `resume`.
+    """A command whose runs are cells of a grid; `args`: its arguments, a frozen dataclass with `resume` and `volatile`.
 
     name: `kind` in the `config.json` of its runs. systems: the field of `args` that holds a tuple of systems; a cell
     has one, and one call may run several. run(args): runs them, raises UserError where it cannot. folder(args),
-    config(args), title(args): a cell's run folder, its stored configuration, its name. volatile: see `check_same`.
+    config(args), title(args): a cell's run folder, its stored configuration, its name.
     finished(args, summary): whether a run with this `summary.json` is complete.
     """
 
@@ -44,7 +44,6 @@ class Kind(NamedTuple):
     folder: Callable[[Any], Path]
     config: Callable[[Any], Mapping[str, Any]]
     title: Callable[[Any], str]
-    volatile: tuple[str, ...]
     finished: Callable[[Any, Mapping[str, Any]], bool]
 
 
@@ -113,7 +112,7 @@ def check_begun(cells: Iterable[Cell]) -> None:
     """Raises UserError if a run on disk was made with other options than its cell has now."""
     for cell in cells:
         if cell.state != "missing":
-            check_same(cell.folder, cell.kind.name, cell.kind.config(cell.args), cell.kind.volatile)
+            check_same(cell.folder, cell.kind.name, cell.kind.config(cell.args), cell.args.volatile)
 
 
 def work(cells: Sequence[Cell], args: WorkArgs, show: Callable[[list[Cell]], None] = lambda cells: None) -> None:
@@ -239,7 +238,6 @@ FINETUNING = Kind(
     folder=lambda args: run_folder(args, *args.real),
     config=lambda args: jsonable(resolved(args)) | {"real": args.real[0]},
     title=lambda args: f"{extend.name_of(args.task)}/{gaps.title(args.real[0])}: {label(args)}",
-    volatile=FinetuneArgs.volatile,
     finished=lambda args, summary: summary.get("final", {}).get("rollouts", 0) >= args.rollouts,
 )
 
