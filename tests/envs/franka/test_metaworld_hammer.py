@@ -21,6 +21,7 @@ KEY = jax.random.key(0)
 NOMINAL = {p.name: p.nominal for p in task.PARAMETERS} | {"start_above": 0.0, "start_held": 0.0}
 DRIVER = Path(__file__).parents[3] / "docs/examples/metaworld_robot.py"
 OPEN, CLOSE = -1.0, 1.0
+face_of = jax.jit(task.face_of)
 
 
 def rig_of(impl="c", **params):
@@ -208,7 +209,7 @@ def strike(obs):
     off, effort = hand - grip, OPEN
     if apart < 0.06 and np.abs(off).max() < 0.06:
         effort = CLOSE
-        way = task.NAIL + np.array([0.0, depth, 0.0]) - np.asarray(task.face_of(jnp.asarray(obs)))
+        way = task.NAIL + np.array([0.0, depth, 0.0]) - np.asarray(face_of(jnp.asarray(obs)))
         if depth > task.DRIVEN:
             goal = sent
         elif hammer[2] < 0.08 and way[1] > 0.03:
