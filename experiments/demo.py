@@ -6,23 +6,24 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from envs import extend
 from envs.files import read_json
 from envs.types import UserError
+from experiments.figures import FiguresArgs, figures
 from experiments.finetune import finetune
 from experiments.pretrain import PretrainArgs, pretrain
 from experiments.pretrain import check as check_pretraining
 from experiments.runner import cli
 from experiments.runner.finetune_args import FinetuneArgs, arguments, check, run_folder
 from experiments.runner.options import check_task
+from sgft_jax.analysis import tables
+from sgft_jax.analysis.curves import Curve
+from sgft_jax.analysis.reading import read_runs
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.methods import get_method
 from sgft_jax.presets import PRESETS
-
-if TYPE_CHECKING:
-    from sgft_jax.analysis.curves import Curve
 
 METHODS = ("sgft-mpc", "sgft-sac", "sac")  # the first is filmed
 
@@ -54,9 +55,6 @@ def main(args: DemoArgs) -> None:
     pretrain(pretraining)
     _finetune_all(*runs)
     summaries = {run.method: read_json(run_folder(run, args.real) / SUMMARY) for run in runs}
-    from experiments.figures import FiguresArgs, figures
-    from sgft_jax.analysis.reading import read_runs
-
     results = figures(FiguresArgs(task=extend.name_of(args.task), out=args.out))
     folder = run_folder(runs[0], args.real).parent.parent
     print(f"\n{outcome([c for c in read_runs(args.out).curves if c.gap == folder.name], summaries)}\n")
@@ -84,10 +82,8 @@ def plan(args: DemoArgs) -> tuple[PretrainArgs, list[FinetuneArgs]]:
     return pretraining, runs
 
 
-def outcome(curves: "Sequence[Curve]", summaries: dict[str, dict[str, Any]]) -> str:
+def outcome(curves: Sequence[Curve], summaries: dict[str, dict[str, Any]]) -> str:
     """What came of it in a few lines: the methods wherever one was evaluated, and their best policies."""
-    from sgft_jax.analysis import tables
-
     first, *_ = curves
     score = tables.words(first.score)
     best_scores = {name: summary["best"]["score"] for name, summary in summaries.items()}
