@@ -59,10 +59,9 @@ def build_fixed(config: SimulatorConfig, task: Task) -> HybridAgent:
     return agent_of(learner, config, task, sources.two_buffers(0, config.rows), simulates=True)
 
 
+_ABOUT, _ABOUT_FIXED = "SAC on the task reward, critic kept", "SAC in the simulator alone"
 METHOD = Method(
     "sac",
-    Online("model-free", "SAC on the task reward, critic kept", "Haarnoja 2018", Config, build, needs_prior=False),
-    Fixed(
-        "simulator", "SAC in the simulator alone", "Haarnoja et al. 2018", {"default": SimulatorConfig()}, build_fixed
-    ),
+    Online("model-free", _ABOUT, "Haarnoja 2018", Config, build, needs_prior=False),
+    Fixed("simulator", _ABOUT_FIXED, "Haarnoja et al. 2018", {"default": SimulatorConfig()}, build_fixed),
 )
