@@ -21,7 +21,6 @@ from typing import Any, Literal, NamedTuple
 from envs.types import UserError
 from experiments.runner import cli
 from experiments.runner.options import Impl, at_least_one, check_task, each_once, prior_folders, task_of_priors
-from sgft_jax.analysis import tables
 from sgft_jax.io.log import write_summary
 from sgft_jax.io.runs import check_folder, provenance
 from sgft_jax.models.config import Precision
@@ -160,6 +159,8 @@ def _check_steps(config: BenchmarkConfig) -> None:
 
 def table(part: Part, lines: list[dict[str, Any]]) -> str:
     """The lines of one kind as a table."""
+    from sgft_jax.analysis import tables
+
     names = list(dict.fromkeys(name for line in lines for name in line))
     rows = [[_text(line.get(name, "-")) for name in names] for line in lines]
     return f"{_KINDS[part].title}\n\n{tables.markdown([name.replace('_', ' ') for name in names], rows)}\n"

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from envs import extend, gaps
 from envs.gaps import SIM
@@ -26,15 +26,15 @@ from experiments.hybrid import HybridArgs, SchedulePreset, data_name
 from experiments.runner import cli, grid, options, tuned
 from experiments.runner.grid import FINETUNING, Cell, GridArgs, Kind, WorkArgs, check_begun, look_up, work
 from experiments.runner.options import FirstSeed, Task
-from sgft_jax.analysis.curves import Curve
-from sgft_jax.analysis.hybrid import Results, ranks, summary
-from sgft_jax.analysis.reading import read_curve
-from sgft_jax.analysis.release import read_hybrid, write_hybrid
 from sgft_jax.files.disk import jsonable, table_file
 from sgft_jax.io.runs import NO_DATA, check_folder
 from sgft_jax.methods import DEFAULT, FIXED_NAMES, NAMES, get_method
 from sgft_jax.presets import say_preset
 from sgft_jax.train.schedule import FLEET, SCHEDULES, Schedule, describe, name_of
+
+if TYPE_CHECKING:
+    from sgft_jax.analysis.curves import Curve
+    from sgft_jax.analysis.hybrid import Results
 
 HYBRID = "hybrid"  # first word of the command line for methods that learn from real data and a simulator
 _HYBRID_HELP = """Run every method on every data set and simulator, cell by cell; print tables and draw curves.
@@ -156,6 +156,8 @@ def compare_hybrid(args: HybridGridArgs) -> None:
     chosen = hybrid_cells(args)
     check_begun(chosen)
     if args.export is not None:
+        from sgft_jax.analysis.release import write_hybrid
+
         if not (curves := _finished(chosen)):
             raise UserError(f"--export {args.export}: none of these runs has finished")
         print(f"written: {write_hybrid(args.export, curves)}, {len(curves)} runs")
@@ -163,8 +165,10 @@ def compare_hybrid(args: HybridGridArgs) -> None:
     work(chosen, args, lambda cells: _show(args, _results(args, _finished(cells))))
 
 
-def tables(args: HybridGridArgs, results: Results) -> str:
+def tables(args: HybridGridArgs, results: "Results") -> str:
     """The tables as Markdown."""
+    from sgft_jax.analysis.hybrid import ranks, summary
+
     texts = summary(results, reference=args.reference, seeds=args.seeds, schedule=describe(args.schedule))
     if args.released is not None and args.beside is not None:
         others = replace(args, schedule=replace(args.schedule, updates=args.beside))
@@ -172,7 +176,7 @@ def tables(args: HybridGridArgs, results: Results) -> str:
     return "\n\n".join(texts)
 
 
-def _show(args: HybridGridArgs, results: Results) -> None:
+def _show(args: HybridGridArgs, results: "Results") -> None:
     """Tables on the screen and in a file, and a figure of curves for each data set; nothing without any curve."""
     if not results.curves:
         return
@@ -264,19 +268,25 @@ def _runs(args: HybridGridArgs, method: str, data: Path | None) -> list[HybridAr
     return [replace(run, gap=(gap,)) for gap in ((SIM,) if kind == "offline" else args.gaps)]
 
 
-def _results(args: HybridGridArgs, curves: Sequence[Curve]) -> Results:
+def _results(args: HybridGridArgs, curves: "Sequence[Curve]") -> "Results":
     """Curves with the data sets, simulators and methods that tables have."""
+    from sgft_jax.analysis.hybrid import Results
+
     data = [data_name(path) for path in args.data] or [""]
     return Results(data, [gaps.title(gap) for gap in args.gaps], args.methods, curves, args.score)
 
 
-def _finished(cells: Sequence[Cell]) -> list[Curve]:
+def _finished(cells: Sequence[Cell]) -> "list[Curve]":
     """The curves of the cells that have finished."""
+    from sgft_jax.analysis.reading import read_curve
+
     return [read_curve(cell.folder) for cell in cells if cell.state == "finished"]
 
 
-def released(args: HybridGridArgs, folder: Path) -> Results:
+def released(args: HybridGridArgs, folder: Path) -> "Results":
     """What the table in a folder holds of these runs; raises UserError if that is nothing, or if it lacks a seed."""
+    from sgft_jax.analysis.release import read_hybrid
+
     wanted, columns = options.seed_list(args.seed, args.seeds), _results(args, ())
     task, schedule, updates = extend.name_of(args.task), name_of(args.schedule), args.schedule.updates_in_all
     facts = {"real": gaps.title(args.real), "schedule": schedule, "updates": updates}

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from envs import extend
 from envs.files import read_json
@@ -18,12 +18,12 @@ from experiments.pretrain import check as check_pretraining
 from experiments.runner import cli
 from experiments.runner.finetune_args import FinetuneArgs, arguments, check, run_folder
 from experiments.runner.options import check_task
-from sgft_jax.analysis import tables
-from sgft_jax.analysis.curves import Curve
-from sgft_jax.analysis.reading import read_runs
 from sgft_jax.io.log import SUMMARY
 from sgft_jax.methods import get_method
 from sgft_jax.presets import PRESETS
+
+if TYPE_CHECKING:
+    from sgft_jax.analysis.curves import Curve
 
 METHODS = ("sgft-mpc", "sgft-sac", "sac")  # the first is filmed
 
@@ -50,6 +50,8 @@ class DemoArgs:
 
 def main(args: DemoArgs) -> None:
     """Pretrains once, fine-tunes with each method from the same prior on the same real starts, and compares."""
+    from sgft_jax.analysis.reading import read_runs
+
     pretraining, runs = plan(args)
     started = time.monotonic()
     pretrain(pretraining)
@@ -82,8 +84,10 @@ def plan(args: DemoArgs) -> tuple[PretrainArgs, list[FinetuneArgs]]:
     return pretraining, runs
 
 
-def outcome(curves: Sequence[Curve], summaries: dict[str, dict[str, Any]]) -> str:
+def outcome(curves: "Sequence[Curve]", summaries: dict[str, dict[str, Any]]) -> str:
     """What came of it in a few lines: the methods wherever one was evaluated, and their best policies."""
+    from sgft_jax.analysis import tables
+
     first, *_ = curves
     score = tables.words(first.score)
     best_scores = {name: summary["best"]["score"] for name, summary in summaries.items()}

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from envs.types import UserError
 from experiments.runner import cli, options
-from experiments.runner.options import Impl, Json
+from experiments.runner.cli import Json
+from experiments.runner.options import Impl
 from experiments.runner.real_systems import check as check_real
 from sgft_jax.io.runs import check_folder, read_config
 from sgft_jax.presets import DEFAULT_PRESET

@@ -10,7 +10,8 @@ from envs import gaps
 from envs.gaps import SIM
 from envs.types import UserError
 from experiments.runner import cli, options
-from experiments.runner.options import Impl, Json, Out
+from experiments.runner.cli import Json
+from experiments.runner.options import Impl, Out
 from experiments.runner.real_systems import REMOTE, TOGETHER, connect, described, is_robot, is_stepped
 from experiments.runner.real_systems import check as check_real
 from sgft_jax.io.runs import check_folder

@@ -3,14 +3,15 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from envs import extend
 from envs.types import UserError, unknown
 from experiments.runner import cli
-from sgft_jax.analysis import tables
-from sgft_jax.analysis.curves import Curve, Found, by_priors, from_main_priors
-from sgft_jax.analysis.release import export, read
 from sgft_jax.io.runs import check_folder
+
+if TYPE_CHECKING:
+    from sgft_jax.analysis.curves import Curve, Found
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,8 @@ class FiguresArgs:
 def main(args: FiguresArgs) -> None:
     """Draws, prints the tables, and says where they are; or exports."""
     if args.export is not None:
+        from sgft_jax.analysis.release import export
+
         check_folder(args.export, "--export")
         print("\n".join(f"written: {path}" for path in export(args.out, args.export)))
         return
@@ -50,6 +53,8 @@ def main(args: FiguresArgs) -> None:
 
 def figures(args: FiguresArgs) -> Path:
     """The figures and tables.md, whose path is returned; raises UserError if there is no run to draw."""
+    from sgft_jax.analysis.release import read
+
     check_folder(args.out / "figures")
     runs = read(args.out, args.data)
     if not runs.curves:
@@ -70,7 +75,7 @@ def _nothing(args: FiguresArgs, notes: list[str]) -> str:
     return f"{message}; make one with: python -m experiments.finetune --task {args.task or 'push'}"
 
 
-def select(records: Found, *, variants: bool = True, **wanted: Sequence[str]) -> Found:
+def select(records: "Found", *, variants: bool = True, **wanted: Sequence[str]) -> "Found":
     """Only the curves of certain tasks, gaps, methods or priors: names by field of `Curve`, empty for all.
 
     Raises UserError if no curve has one of the names, or if nothing is left.
@@ -83,14 +88,16 @@ def select(records: Found, *, variants: bool = True, **wanted: Sequence[str]) ->
         curves = [curve for curve in curves if not names or getattr(curve, field) in names]
     if not curves:
         raise UserError(f"no run matches all of the chosen: {', '.join(name for name in wanted if wanted[name])}")
-    return Found(curves, records.notes)
+    return records._replace(curves=curves)
 
 
-def write_results(records: Found, target: Path, *, reference: str | None = None) -> Path:
+def write_results(records: "Found", target: Path, *, reference: str | None = None) -> Path:
     """A figure and tables for each task and gap, and of all tasks for each gap; returns the path of tables.md.
 
     reference: METHOD or METHOD:VARIANT that the others are compared with, see `tables.summary`; UserError without it.
     """
+    from sgft_jax.analysis import tables
+
     if reference and reference not in (names := {curve.spec for curve in records.curves}):
         raise UserError(unknown("--reference", reference, names))
     sections = ["# Fine-tuning results", tables.LEGEND]
@@ -106,9 +113,11 @@ def write_results(records: Found, target: Path, *, reference: str | None = None)
     return path
 
 
-def _overview(gap: str, curves: Sequence[Curve], target: Path) -> list[str]:
+def _overview(gap: str, curves: "Sequence[Curve]", target: Path) -> list[str]:
     """All tasks on one gap, methods with their defaults from the same priors; [] for a single task."""
-    from sgft_jax.analysis.figures import MOST, learning_curves  # brings Matplotlib
+    from sgft_jax.analysis import tables
+    from sgft_jax.analysis.curves import from_main_priors
+    from sgft_jax.analysis.figures import MOST, learning_curves
 
     tasks = {task: from_main_priors(c for c in curves if c.task == task) for task in sorted({c.task for c in curves})}
     tasks = {task: chosen for task, chosen in tasks.items() if chosen}
@@ -121,8 +130,10 @@ def _overview(gap: str, curves: Sequence[Curve], target: Path) -> list[str]:
     return [f"## {title}", f"![{title}]({path.name})", tables.areas_by_task(tasks)]
 
 
-def _section(title: str, curves: Sequence[Curve], path: Path, reference: str | None) -> list[str]:
+def _section(title: str, curves: "Sequence[Curve]", path: Path, reference: str | None) -> list[str]:
     """One task and gap: a panel for each set of priors and for each method with variants, a table for each set."""
+    from sgft_jax.analysis import tables
+    from sgft_jax.analysis.curves import by_priors
     from sgft_jax.analysis.figures import learning_curves
 
     panels: dict[str, list[Curve]] = {}

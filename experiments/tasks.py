@@ -17,8 +17,7 @@ import envs
 from envs import gaps
 from envs.base import Effects, Value
 from experiments.runner import cli
-from experiments.runner.cli import columns
-from experiments.runner.options import Json
+from experiments.runner.cli import Json, columns
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-HEAVY = ("jax", "flax", "mujoco", "matplotlib", "scipy", "orbax")
+HEAVY = ("jax", "flax", "mujoco", "matplotlib", "scipy", "orbax", "rich")
 COMMANDS = (
     "pretrain",
     "finetune",

@@ -17,7 +17,7 @@ import typing
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NoReturn, cast
+from typing import Annotated, Any, NoReturn, cast
 
 import tyro
 
@@ -26,6 +26,8 @@ import tyro
 from tyro import _errors
 
 from envs.types import UserError, unknown
+
+Json = Annotated[bool, tyro.conf.arg(help="Print one JSON object and nothing else.")]
 
 BROKEN_PIPE, USER_ERROR = 1, 2
 _SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}

@@ -40,7 +40,6 @@ Task = Annotated[
 ]
 Out = Annotated[Path, arg(help="Parent of all run folders.")]
 FirstSeed = Annotated[int, arg(help="Expert: first seed.")]
-Json = Annotated[bool, arg(help="Print one JSON object and nothing else.")]
 
 Successors = Annotated[
     types.Successors,

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike
 
 from envs.types import UserError
 from experiments.runner import cli
-from experiments.runner.options import Impl, Json, Out, prior_folders, seed_list, task_of_rollouts
+from experiments.runner.cli import Json
+from experiments.runner.options import Impl, Out, prior_folders, seed_list, task_of_rollouts
 from sgft_jax.analysis import tables
 from sgft_jax.analysis.reading import read_curve
 from sgft_jax.analysis.verdict import AHEAD, COEFFICIENTS, Coefficients, Inputs, gain, inputs_of, progress

@@ -6,15 +6,17 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
 
 from envs.files import checked, kind_of, parse_json, read_text
 from envs.types import UserError
 from sgft_jax.files.disk import jsonable, sync, write_json
+
+if TYPE_CHECKING:  # commands name the files of a run before they draw a bar
+    from rich.console import Console
+    from rich.progress import Progress
 
 METRICS, EVAL, SUMMARY = "metrics.jsonl", "eval.jsonl", "summary.json"
 _LIMIT = 2**30  # bytes of a log
@@ -182,8 +184,10 @@ class RunProgress:
     """
 
     def __init__(
-        self, title: str, *, total: int, unit: str = "steps", done: int = 0, console: Console | None = None
+        self, title: str, *, total: int, unit: str = "steps", done: int = 0, console: "Console | None" = None
     ) -> None:
+        from rich.console import Console
+
         self._title, self._total, self._unit, self._done = title, total, unit, done
         self._console = console or Console(soft_wrap=True)
         self._first: tuple[int, float] | None = None  # units and time at the end of the first chunk
@@ -191,6 +195,8 @@ class RunProgress:
 
     def __enter__(self) -> Self:
         if self._console.is_terminal:
+            from rich.progress import BarColumn, Progress, TextColumn
+
             columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[words]}"))
             self._live = Progress(*columns, console=self._console)
             self._live.start()

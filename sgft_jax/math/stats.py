@@ -135,7 +135,7 @@ def success_interval(
     return Interval(np.asarray(successes / trials), np.asarray(bounds.low), np.asarray(bounds.high))
 
 
-def _draws(rng: np.random.Generator, members: np.ndarray, resamples: int, priors: ArrayLike | None) -> np.ndarray:
+def _draws(rng: "np.random.Generator", members: np.ndarray, resamples: int, priors: ArrayLike | None) -> np.ndarray:
     """[resamples, drawn] of these members in each resample."""
     if priors is None:
         return rng.choice(members, (resamples, len(members)))
