@@ -28,6 +28,9 @@ from sgft_jax.train.guard import Guarded
 from sgft_jax.train.simulation import simulate
 from sgft_jax.types import Finetuner
 
+# In the fast tests the parts stand for this: fleets in test_pretraining.py, what is stored in test_train.py, functions
+# that a task lacks in test_finetuner.py.
+pytestmark = pytest.mark.slow
 BASE = toy_terminating.make()
 ENV = BASE._replace(action=(*BASE.action, Entry("count", "episodes", 1)))
 LENGTH, GAMMA = ENV.episode_length, np.float32(0.9)
@@ -38,8 +41,8 @@ LEARNING = {"replay_capacity": N * STEPS, "batch_size": 8, "updates_per_step": 1
 NETWORKS = {"network": NET, "ensemble_size": 2, "size": tuners.TINY, "horizon": 2, "plan_samples": 24, "gru": 4}
 CONFIG = PretrainConfig(**LOOP, **LEARNING, **NETWORKS)
 
-each_method = pytest.mark.parametrize("name", tuners.slow_but({"sgft-sac"}, METHODS))
-each_algorithm = pytest.mark.parametrize("algorithm", tuners.slow_but({"sac"}, ["sac", "tdmpc2", "recurrent"]))
+each_method = pytest.mark.parametrize("name", METHODS)
+each_algorithm = pytest.mark.parametrize("algorithm", ["sac", "tdmpc2", "recurrent"])
 
 
 def counting(part):
@@ -175,7 +178,6 @@ def test_a_fleet_begins_new_episodes_and_keeps_how_they_ended(algorithm):
 # --- fine-tuning ------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @each_method
 def test_rows_up_to_the_end_of_an_episode_are_stored_and_no_others(name):
     run = finetuned(name)
@@ -224,7 +226,6 @@ def test_evaluated_episodes_are_as_long_as_they_last(name):
     np.testing.assert_allclose(run.evaluated.score[:, 0], earned, rtol=1e-5)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", ["iql", "rlpd", "sac-online", "sgft-relabel"])
 def test_simulated_rows_end_where_their_episodes_do(name):
     held = finetuned(name).simulated.replay
