@@ -43,6 +43,18 @@ jax.config.update("jax_compilation_cache_dir", os.path.join(os.path.dirname(__fi
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Of a test marked `heavy_after_first`, `make test` runs the first case alone."""
+    begun = set()
+    for item in items:
+        if item.get_closest_marker("heavy_after_first"):
+            test = item.nodeid.partition("[")[0]
+            if test in begun:
+                item.add_marker(pytest.mark.heavy)
+            begun.add(test)
+
+
 @pytest.fixture(autouse=True)
 def _strict_ranks():
     """Broadcasting [B] against [B, 1] is the classic silent bug of reinforcement learning."""

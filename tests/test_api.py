@@ -47,6 +47,7 @@ def public_modules():
     return modules
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize(("name", "thing"), PUBLIC, ids=[name for name, _ in PUBLIC])
 def test_public_names_explain_themselves(name, thing):
     if inspect.isroutine(thing) or inspect.isclass(thing) or isinstance(thing, ModuleType):

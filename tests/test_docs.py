@@ -108,6 +108,7 @@ def test_the_page_of_methods_lists_them_all_and_so_does_the_help():
     assert all(re.search(rf"(?<![\w-]){name}(?![\w-])", shown) for name, *_ in rows)
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("task", envs.TASKS)
 def test_the_page_of_tasks_names_their_entries_parameters_and_gaps(task):
     page = (ROOT / "docs/tasks.md").read_text()

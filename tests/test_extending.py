@@ -82,6 +82,7 @@ def test_exact_identification_solves_what_the_policy_alone_does_not(monkeypatch,
 # --- a task ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_the_task_can_be_solved_and_overshot(key):
     """A careful hand stops the puck at the mark; one that pushes as fast as it can throws it past."""
     env = envs.make(TASK)
@@ -127,6 +128,7 @@ def test_the_transform_by_hand(key):
     np.testing.assert_allclose(bent.reward, [0.01, -2.0, 2 * np.tanh(1.0)], rtol=1e-4)  # tanh(1) = 0.76
 
 
+@pytest.mark.heavy
 def test_the_method_keeps_the_settings_of_sgft_sac(prior, monkeypatch):
     """Its horizon, branches and warm-ups reach the learner; what SGFT-SAC does besides clipping is done, too."""
     seen, make = {}, sac.make_sac

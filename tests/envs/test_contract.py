@@ -15,6 +15,7 @@ KEYS = jax.random.split(jax.random.key(3), 4)
 ACTIONS = jnp.array([[1.0, 0.0], [0.3, -1.0], [-0.5, 0.5], [1.0, 1.0]])
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("name", SCENES)
 def test_description_fits_observations(name):
     env = compiled(make_env(SCENES[name], "c"))
@@ -26,6 +27,7 @@ def test_description_fits_observations(name):
     assert env.reward(state.obs, jnp.zeros(env.act_dim), state.obs).shape == ()
 
 
+@pytest.mark.heavy
 def test_resets_are_fresh_and_repeatable(pushing):
     world = member(pushing.worlds, 0)
     first, again, other = (pushing.reset(world, jax.random.key(k)).obs for k in (1, 1, 2))
@@ -47,6 +49,7 @@ def test_step_of_a_batch_is_the_steps_of_its_members(pushing, started):
     assert (jnp.sign(moved[1:]) == jnp.sign(ACTIONS[1:])).all()
 
 
+@pytest.mark.heavy
 def test_reward_is_a_function_of_true_observations(pushing, started):
     after = pushing.step_batch(pushing.worlds, started, ACTIONS, KEYS)
     wanted = jax.jit(jax.vmap(pushing.env.reward))(started.true_obs, ACTIONS, after.true_obs)
@@ -68,6 +71,7 @@ def test_exploded_physics_is_flagged(pushing, started):
     assert after.invalid.tolist() == [False, True, True, True]
 
 
+@pytest.mark.heavy
 def test_success_counts_at_the_end_or_at_any_time(pushing, started):
     """In `push` only where the episode ends; where it counts at any time, a success is never lost again."""
     assert not pushing.env.success_anytime and SCENES["insert"].success_anytime

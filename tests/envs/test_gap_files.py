@@ -17,6 +17,7 @@ from envs.types import UserError
 ENV = compiled(toy.make())
 
 
+@pytest.mark.heavy
 def test_a_dict_is_what_a_file_would_hold(tmp_path):
     table = {"params": {"mass": 2.0, "friction": [3, 5]}, "effects": {"latency": [0.02, 0.04], "action_scale": 0.7}}
     gap = gaps.from_dict(ENV, "heavy", table)

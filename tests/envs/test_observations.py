@@ -51,6 +51,7 @@ def test_what_an_episode_draws_is_told(key):
     assert states.obs[:, -1].std() > 0.1
 
 
+@pytest.mark.heavy
 def test_a_real_system_tells_the_middle_and_is_the_same_otherwise(key):
     pool = envs.sample_worlds(SEEN, key, 2, effects=EFFECTS)
 
@@ -84,6 +85,7 @@ def test_noise_is_on_what_is_told_alone_and_new_at_every_step(key):
     assert np.abs(states.true_obs[-1, : TOY.obs_dim] - states.obs[-1, : TOY.obs_dim]).max() < 0.1
 
 
+@pytest.mark.heavy
 def test_the_simulator_says_what_a_recorded_step_does_in_the_system_that_is_told(key):
     """With a bias of the sensors, and whatever the step's own noise was."""
     biased = {**EFFECTS, "obs_bias": [[0.0] * 4, [0.2] * 4], "latency_jitter": [0.0, 0.02]}
@@ -136,6 +138,7 @@ def test_the_last_actions_end_the_observation_newest_first(seen, key):
     np.testing.assert_allclose(state.obs[-2 * seen.act_dim :], jnp.concatenate([actions[2], actions[1]]), rtol=1e-6)
 
 
+@pytest.mark.heavy
 def test_the_task_is_the_same(seen, key):
     """Same world, start and noise; a policy that ignores the actions earns the same."""
     pool = envs.sample_worlds(TOY, key, 2)

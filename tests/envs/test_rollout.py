@@ -34,6 +34,7 @@ def push(carry, obs, key):
     return -obs[:2], carry
 
 
+@pytest.mark.heavy
 def test_an_episode_in_a_stacked_pool_is_that_in_the_pool_alone(key):
     env = compiled(toy.make())
     stacked = jax.tree.map(lambda x: x.reshape(2, 5, *x.shape[1:]), envs.sample_worlds(env, key, 10))
@@ -85,6 +86,7 @@ def test_return_and_score_count_up_to_the_end(episodes):
     assert not episodes.exploded.any() and episodes.trace.shape == (N, toy_terminating.LENGTH + 1, 0)
 
 
+@pytest.mark.heavy
 def test_what_is_judged_by_success_scores_success(key):
     env = compiled(toy.make())
     pool = envs.sample_worlds(env, key, 1, effects={"obs_noise": 0.0})
@@ -99,6 +101,7 @@ def test_what_is_judged_by_success_scores_success(key):
     np.testing.assert_array_equal(played.trace[:, 1:, :], played.transitions.next_obs[..., :2])
 
 
+@pytest.mark.heavy
 def test_an_explosion_after_the_end_is_none(key):
     """The simulator goes on unseen after a termination; what it does then does not count."""
     env = compiled(toy_terminating.make())
@@ -130,6 +133,7 @@ def costly():
     return jax.jit(jax.vmap(play))(jnp.array([1, 3, 99, 2, 12]))
 
 
+@pytest.mark.heavy
 def test_an_episode_that_exploded_scores_less_than_any_whole_one(costly):
     assert costly.total_reward.tolist() == [0, -2, -12, -1, -11]
     assert costly.score.tolist() == [-np.inf, -np.inf, -12, -np.inf, -np.inf]
@@ -147,6 +151,7 @@ def test_explosions_count_as_the_worst_that_is_known(costly, kind):
     assert counted(burst)[0].tolist() == [-2, -2]
 
 
+@pytest.mark.heavy
 def test_a_fleet_starts_episodes_anew_with_their_carry():
     """What `counting` remembers of an environment is always the age of its episode."""
     env = compiled(toy_terminating.make())
@@ -196,6 +201,7 @@ def test_no_key_is_used_twice_by_fleets_and_episodes(key):
     assert keys.used_twice(whole) == 0
 
 
+@pytest.mark.heavy
 def test_exploded_environments_of_a_fleet_begin_anew():
     """Also those whose physics is broken for good; the others go on, and no row of an exploded step is valid."""
     env = compiled(toy_terminating.make())

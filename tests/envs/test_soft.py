@@ -67,6 +67,7 @@ def shape(rig, state):
     return points - points.mean(0)
 
 
+@pytest.mark.heavy
 def test_real_and_simulated_systems_are_one_task(real):
     simulated = make(real.env.name, "c")
     for name in ("name", "observation", "action", "parameters", "episode_length", "control_dt", "success_anytime"):
@@ -80,6 +81,7 @@ def test_real_and_simulated_systems_are_one_task(real):
     assert not states.success.any()
 
 
+@pytest.mark.heavy
 def test_left_alone_it_comes_to_rest(real):
     states = played(real, lambda obs: jnp.zeros(2), steps=20)
     assert not any(state.invalid for state in states)

@@ -210,6 +210,7 @@ def test_one_device_trains_and_is_its_own_ideal(tmp_path):
     assert line["env_per_s"] > 0 and line["env/ideal"] == 1.0
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [

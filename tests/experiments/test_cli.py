@@ -289,6 +289,7 @@ def test_a_checkpoint_that_does_not_fit_is_one_line(tmp_path):
     assert ended == 2 and said.count("\n") == 1 and "file too large; mend that" in said
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize(
     ("main", "argv", "read", "code", "words"),
     [

@@ -152,6 +152,7 @@ def test_minaris_own_library_opens_a_set(tmp_path, monkeypatch):
     np.testing.assert_array_equal(found[1].infos["qpos"][:, 0], [50.5, 51.5, 52.5])
 
 
+@pytest.mark.heavy
 def test_sac_leaves_what_it_did_and_what_it_does(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(collect.LEVELS, "toy", -100.0)
     monkeypatch.setattr(logs, "BANDS", {"toy-medium-replay": {"transitions": logs.Band(300, 0.25)}})
@@ -210,6 +211,7 @@ def test_what_was_recorded_is_what_hybrid_learns_from(tmp_path):
         assert {"qpos", "qvel", "action_log_probs"} == set(file["infos"])
 
 
+@pytest.mark.heavy
 def test_a_policy_is_recorded(tmp_path):
     save_prior(tmp_path / "prior/seed-0", 0)
     words = ["--task", "toy", "--transitions", "30", "--policy", str(tmp_path / "prior/seed-0")]

@@ -69,6 +69,7 @@ def grid(tmp_path):
     )
 
 
+@pytest.mark.heavy
 def test_each_method_runs_as_often_as_it_learns_from_other_things(grid, ran, capsys):
     compare.compare_hybrid(grid)
     found = [(run.method, None if run.data is None else run.data.stem, run.gap) for run in ran]
@@ -308,6 +309,7 @@ def test_runs_of_two_lengths_are_compared_in_their_order(grid, ran, tmp_path, ca
     assert "| medium | gravity | 0.50 | cql, edac, iql | edac, cql, iql |" in said and "after 1,000 updates" in said
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize(
     ("changes", "said"),

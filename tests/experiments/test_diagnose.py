@@ -121,6 +121,7 @@ def test_calibration_and_its_check_on_other_runs(priors, tmp_path, capsys):
     assert "coefficients from 4 rollouts of all of --runs: base" in text
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize(
     ("argv", "words"),
     [

@@ -54,6 +54,7 @@ def call(*argv):
     cli.run_main(evaluate.main, evaluate.EvaluateArgs, "Evaluate.", argv=[str(a) for a in argv])
 
 
+@pytest.mark.heavy
 def test_success_with_its_interval_as_json(run, capsys):
     call("--run", run, "--episodes", 20, "--json")
     found = json.loads(capsys.readouterr().out)
@@ -67,6 +68,7 @@ def test_success_with_its_interval_as_json(run, capsys):
         assert policy["success"] > 0 or high == pytest.approx(0.161, abs=5e-4)
 
 
+@pytest.mark.heavy
 def test_episodes_are_the_same_every_time_and_others_on_request(run, capsys):
     def returns(*more):
         call("--run", run, "--episodes", 20, "--json", *more)
@@ -97,6 +99,7 @@ def test_several_systems_in_one_program_are_each_as_alone(run, capsys):
     assert len({tuple(values) for values in together.values()}) == 3
 
 
+@pytest.mark.heavy
 def test_lines_for_people(run, capsys):
     (run / "slow.toml").write_text("[params]\nmass = 9.0\nfriction = 4.0\n")
     call("--run", run, "--episodes", 20, "--real", run / "slow.toml")
@@ -105,6 +108,7 @@ def test_lines_for_people(run, capsys):
     assert len(lines) == 2 and all(re.search(r"seed-\d: success \d+\.\d % \[.*\], return -?\d", line) for line in lines)
 
 
+@pytest.mark.heavy
 def test_a_task_without_a_scene_has_no_film(run, capsys):
     call("--run", run, "--episodes", 20, "--video", run / "films")
     assert capsys.readouterr().out.count("\n    no video: toy has no scene to draw\n") == 2

@@ -41,6 +41,7 @@ def run(tmp_path):
     return tmp_path / "run"
 
 
+@pytest.mark.heavy
 def test_the_folder_is_played_without_this_code_or_jax(run, capsys):
     """In a process of its own that finds neither through its paths: `-I` keeps PYTHONPATH out."""
     export.main(ExportArgs(run, "numpy"))

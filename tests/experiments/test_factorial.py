@@ -78,6 +78,7 @@ def leave(args):
     (folder / "summary.json").write_text(json.dumps({"final": {"rollouts": 4}}))
 
 
+@pytest.mark.heavy
 def test_the_report_names_what_each_part_does(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(grid, "finetune", leave)
     monkeypatch.setattr(cli, "set_up", lambda: None)
@@ -92,6 +93,7 @@ def test_the_report_names_what_each_part_does(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "factorial/factorial.png").stat().st_size > 10_000
 
 
+@pytest.mark.heavy
 def test_the_report_needs_only_released_tables(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(grid, "finetune", leave)
     monkeypatch.setattr(cli, "set_up", lambda: None)

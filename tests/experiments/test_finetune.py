@@ -184,6 +184,7 @@ def test_when_runs_are_evaluated(options, wanted):
     assert [b for a, b in itertools.pairwise(steps) if finetune_run.evaluates(args, a, b)] == wanted
 
 
+@pytest.mark.heavy
 def test_a_run_leaves_curve_summary_policies_and_every_rollout(home):
     folder = run(home, "sgft-sac")
     curve = read_jsonl(folder / "eval.jsonl")
@@ -225,6 +226,7 @@ def test_the_best_policy_is_of_an_earlier_moment(home):
     assert not np.array_equal(last.params.actor["Dense_0"]["kernel"], best.params.actor["Dense_0"]["kernel"])
 
 
+@pytest.mark.heavy
 def test_the_policies_are_what_the_run_evaluated(home):
     args = evaluate.EvaluateArgs(run=run(home, "sgft-sac"), real=(str(home / "turned.toml"),), episodes=30)
     (system,) = evaluate.evaluate(args)["systems"]
@@ -420,6 +422,7 @@ def play(system, *, explore=True):
     return played.transitions.obs[:, 0, 0, 0].tolist()
 
 
+@pytest.mark.heavy
 def test_a_recorded_system_plays_what_is_missing_and_no_more(tmp_path):
     store = RealStore(tmp_path)
     first = RecordedSystem(Counter(), [store], done=0)
@@ -451,6 +454,7 @@ def test_no_rollout_of_a_real_system_is_replaced_because_another_lacks_it(tmp_pa
 # --- what can be wrong ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize(
     ("more", "words"),
     [
@@ -659,6 +663,7 @@ def test_no_scene_no_renderer_or_a_broken_one_is_a_notice(tmp_path, monkeypatch)
         assert film(tmp_path, monkeypatch, scene=scene)[0] == f"no video: {str(error).splitlines()[0]}"
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("pushes", "words"), [((0.0, 1.0), ("failure", "success")), ((1.0, 0.0), None)])
 def test_the_film_shows_an_episode_that_only_the_tuned_agent_solves(tmp_path, monkeypatch, pushes, words):
     """Both from the same start in the same world; without such an episode the first one."""

@@ -221,6 +221,7 @@ def test_any_measurement_may_show_that_a_gap_can_be_mastered(what):
     assert found["admitted"] is True and found["mastered_by"] == what
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize(
     ("more", "words"),
     [

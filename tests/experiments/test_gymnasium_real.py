@@ -126,6 +126,7 @@ def test_without_evaluations_only_rollouts_are_played(priors, tmp_path):
     assert (folder / "policy/seed-1/prior.json").exists()
 
 
+@pytest.mark.heavy
 def test_evaluation_says_what_it_has_cost(priors):
     args = evaluate.EvaluateArgs(prior=priors, real=(NAME,), episodes=5)
     (system,) = evaluate.evaluate(args)["systems"]

@@ -63,6 +63,7 @@ def complaint(argv, capsys):
     return error
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("method", "simulators"),
     [("iql", [""]), pytest.param("h2oplus", ["heavy", "slippery"], marks=pytest.mark.slow)],

@@ -60,6 +60,7 @@ def test_a_run_begins_alike_on_any_number_of_devices():
     agree(begun(1), begun(2), rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.heavy
 def test_environments_and_experience_are_cut_and_the_agent_is_whole():
     random, state = begun(2)
     for tree in (random.data, state.replay.data, state.fleet):
@@ -98,6 +99,7 @@ def test_little_travels_between_devices():
     assert found["all-gather"] <= leaves + 2  # the rows, which of them are valid, and the ladder, once a chunk
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("capacity", [8, 9])
 def test_each_device_writes_the_rows_of_its_own_piece(capacity):
     """Round the corner, an invalid row among them; 9 rows cannot be cut."""

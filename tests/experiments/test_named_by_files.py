@@ -77,6 +77,7 @@ def call(command, tmp_path, capsys):
     return error
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("how", ["path", "relative", "module", "unknown"])
 def test_a_card_never_names_code(how, code, tmp_path, capsys):
     names, mark = code
@@ -132,6 +133,7 @@ CONFIGS = {
 }
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("odd", CONFIGS)
 def test_a_config_of_other_types_is_one_line(odd, tmp_path, capsys):
     save_prior(tmp_path / "prior", 0)

@@ -93,6 +93,7 @@ def short(out):
     return out / "short/pretrain/toy/cpu/seeds-0-1"
 
 
+@pytest.mark.heavy
 def test_a_run_leaves_a_prior_per_seed_that_is_its_best_evaluation(short):
     summary, curve = json.loads((short / "summary.json").read_text()), read_jsonl(short / "eval.jsonl")
     assert summary["env_steps"] == 2 * 10 * 32 and summary["updates"] == 2 * 10 * 2

@@ -169,6 +169,7 @@ def words(home, tmp_path):
     return words
 
 
+@pytest.mark.heavy
 def test_a_run_begins_with_logs(words, home, tmp_path, capsys):
     """Ten transitions are half a rollout, which allows two of four updates. They are no transitions of its own."""
     finetune.main(words("--eval-episodes", "0"))

@@ -88,6 +88,7 @@ def rollouts(folder, after, *, count, done=0):
     return robot.play(still(env.act_dim), np.array([-0.5]), keys, explore=True)
 
 
+@pytest.mark.heavy
 def test_what_a_kill_leaves_of_a_rollout_is_a_rollout_and_its_next_step_is_in_doubt(tmp_path):
     whole = rollouts(tmp_path / "whole", 10**6, count=2)
     with pytest.raises(KeyboardInterrupt):
@@ -146,6 +147,7 @@ def test_the_first_step_is_on_disk_before_the_robot_is_asked_for_it(tmp_path, mo
     assert seen == [1 + t for t in range(T)]
 
 
+@pytest.mark.heavy
 def test_a_rollout_that_was_over_when_its_writer_died_is_whole(tmp_path):
     whole = rollouts(tmp_path, 10**6, count=1)
     store = RealStore(tmp_path)

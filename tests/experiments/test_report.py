@@ -52,6 +52,7 @@ def test_returns_look_past_the_time_limit(bias):
     assert numbers(report)["value/bias"] == pytest.approx(bias - expected.mean(), abs=1e-5)
 
 
+@pytest.mark.heavy
 def test_a_model_of_no_change_errs_like_standing_still():
     report = reported(toy.make())
     assert report.model_error.shape == (10,) and (report.still_error > 0).all()

@@ -42,6 +42,7 @@ def test_copies_are_loaded_like_their_originals(tmp_path, capsys):
             share.main(ShareArgs(tmp_path / "run", tmp_path / "copies", **bad))
 
 
+@pytest.mark.heavy
 def test_the_priors_that_come_with_the_code_are_small_and_whole():
     folders = sorted((ROOT / "sgft_jax/priors").glob("*/seed-*"))
     found = {folder.parent.name: load_prior(folder, task=folder.parent.name).card["preset"] for folder in folders}

@@ -51,6 +51,7 @@ class Stepped:
 _SLOWER = [{"initial_rollouts": 3}, {"guard": True}]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("changes", [{}, *(pytest.param(own, marks=pytest.mark.slow) for own in _SLOWER)], ids=str)
 def test_a_robot_that_waits_for_its_policy_gives_the_same_bits(changes):
     finetuner = make(**changes) if changes else FINE
@@ -96,6 +97,7 @@ class Handed(Stepped):
         return self.system.play(policy, states, keys, explore=explore)
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize(("late", "behind"), [(9, 1), (2, 1), (1, 0), (0, 0)])
 def test_what_was_played_speaks_for_who_made_most_of_the_steps(late, behind):
     """Of three steps: all, two, one or none by the agent that has not learned from the rollout before."""

@@ -77,6 +77,7 @@ def bits(tree):
 # --- learners -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy_after_first
 @each_learner
 def test_update_compiles_once(name, key):
     """However often it has run before."""
@@ -86,6 +87,7 @@ def test_update_compiles_once(name, key):
     assert probes.case(name).traces == before
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", [slow_if(name != "iql", name) for name in MAKERS])
 def test_vmap_over_seeds_equals_each_alone(name, key):
     """From states with Adam moments: a first step would make rounding errors as long as any other step."""
@@ -125,6 +127,7 @@ def test_the_best_action_is_deterministic_and_in_bounds(name, key):
             assert bits(action) == bits(other)
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("name", [slow_if(name in {"sac, ten critics", "sgft-tdmpc2"}, name) for name in MAKERS])
 def test_no_key_is_used_twice(name):
     """In beginning, exploring and learning."""
@@ -139,6 +142,7 @@ def test_no_key_is_used_twice(name):
     assert keys.used_twice(whole) == 0
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("name", "probe"),
     [
@@ -190,6 +194,7 @@ def rows_where(mask, new, old):
     return jnp.where(jnp.expand_dims(mask, tuple(range(1, new.ndim))), new, old)
 
 
+@pytest.mark.heavy
 @each_flat_learner
 def test_invalid_rows_do_not_count(name):
     """Whatever finite numbers they hold."""
@@ -205,6 +210,7 @@ def test_invalid_rows_do_not_count(name):
     assert bits(clean) != bits(weighed(name, lambda batch: batch))
 
 
+@pytest.mark.heavy
 @each_flat_learner
 def test_a_row_of_weight_two_counts_twice(name):
     """Of weight 0 it does not count at all; weights of 1 change nothing."""

@@ -42,6 +42,7 @@ def member(tree, i):
     return jax.tree.map(lambda x: x[i], tree)
 
 
+@pytest.mark.heavy_after_first
 @each_method
 def test_one_program_learns_for_all_members_and_keeps_them_apart(name, key):
     """Swapped members give swapped results, to the bit; `learn` is not traced again for what it has returned."""
@@ -88,6 +89,7 @@ def test_exploring_differs_and_the_best_action_follows_from_the_key(name, key):
     assert equal(best, again) and not jnp.allclose(best, explored, atol=1e-4)
 
 
+@pytest.mark.heavy
 @each_method
 def test_no_key_is_used_twice(name):
     """In beginning, acting, learning and the offline phase."""

@@ -104,6 +104,7 @@ def test_bias_order_and_shortfall_of_v_sim():
     assert diagnosis.honesty((values, 0 * values, valid), simulated)["rank_correlation"] == 0
 
 
+@pytest.mark.heavy
 def test_model_errors_are_of_windows_within_the_episode():
     zeros = jnp.zeros((1, 20, 1))
     valid = (jnp.arange(20) < 15)[None]
@@ -138,6 +139,7 @@ def lateness(rollouts, usual=0.0):
     return diagnosis.lateness(lambda obs, action: action, rollouts, jnp.full(2, 0.01), usual)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.8])
 def test_a_delay_is_found_and_its_evidence(share):
     late = lateness(moved(share, jax.random.key(1)))

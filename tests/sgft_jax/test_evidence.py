@@ -23,6 +23,7 @@ def best_of(*scores, part=-2.0, best=None):
     return best
 
 
+@pytest.mark.heavy
 def test_where_rewards_are_costs_an_explosion_is_no_success():
     """Whole rollouts cost 12, one that explodes has cost 2 until then."""
     best = best_of(*[-12] * 5, *[BOOM] * 8)

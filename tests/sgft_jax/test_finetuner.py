@@ -31,6 +31,7 @@ def act(case, state, obs=OBS, explore=False):
 # --- what moves and what stays --------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("name", "moves"),
     [
@@ -55,6 +56,7 @@ def test_what_moves_and_what_is_frozen(name, moves):
 
 
 # Rows, rows with simulated ones beside them, windows, models alone, a fit
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", tuners.slow_but({"sac", "sgft-mpc"}, ["sac", "rlpd", "tdmpc2", "sgft-mpc", "sysid"]))
 def test_nothing_is_learned_from_an_empty_replay(name):
     """The first rollout has no valid step. What an empty replay gives are zeros."""
@@ -151,6 +153,7 @@ def test_the_first_action_is_the_simulators(name, horizon):
     np.testing.assert_allclose(got, jnp.tanh(moments[0]), rtol=1e-4)
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("name", tuners.slow_but({"sac", "iql"}, METHODS))
 def test_a_method_says_whether_it_begins_as_the_simulators_policy(name):
     case = tuner(name)
@@ -174,6 +177,7 @@ def test_a_fresh_agent_takes_the_statistics_alone(name):
 NO_PRIOR = [name for name, method in METHODS.items() if not method.needs_prior]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", tuners.slow_but({"sac"}, NO_PRIOR))
 def test_methods_that_need_no_prior_start_without_one(name, monkeypatch):
     """With networks of their own; made small here."""
@@ -227,6 +231,7 @@ def test_longer_horizons_tell_the_steps_to_go(seen):
     assert seen["config"].context_dim == 3
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize(
     ("name", "others", "parts"),
     [
@@ -282,6 +287,7 @@ def test_parts_that_are_a_method_begin_as_it_does_and_see_its_batch(name, others
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6), batch, own_batch)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("name", "bound"), [("sgft", 0.01), ("sgft", None), pytest.param("pbrs", 0.01, marks=pytest.mark.slow)]
 )
@@ -316,6 +322,7 @@ def test_the_simulators_transitions_as_the_models_have_them(seen):
     assert gap.max() < 1e-4  # what one of the members says
 
 
+@pytest.mark.heavy
 def test_imagined_steps_follow_every_model(monkeypatch):
     """An update draws one. The second of two moves a point by 1,000, so the mean reward tells which it was."""
     params, make = prior().params, sac.make_sac
@@ -344,6 +351,7 @@ def test_models_learn_from_real_rows_alone():
     assert equal(*fits) and not equal(fits[0], state.models)
 
 
+@pytest.mark.heavy
 def test_the_share_of_simulated_rows_falls_with_the_updates():
     case = tuner("sac-online", simulated_share=0.5, simulated_share_end=0.0, simulated_anneal=4)
     _, metrics = case.fine.learn(started(case), jax.random.key(1), 8)
@@ -351,6 +359,7 @@ def test_the_share_of_simulated_rows_falls_with_the_updates():
     assert metrics["batch/reward_mean"] == pytest.approx(100 * 10 / 64 - 0.8 * 54 / 64, abs=0.3)
 
 
+@pytest.mark.heavy
 def test_offline_means_simulated_rows_alone():
     case = tuner("iql")
     state = case.fine.init(case.params, jax.random.key(0))  # nothing real yet

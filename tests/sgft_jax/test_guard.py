@@ -47,6 +47,7 @@ def constant(p):
     return (p,) * (ROLLOUTS + 1)
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize(("challenger", "least"), [(constant(0.8), 0.93), (constant(0.5), 0.91), (constant(0.0), 0.9)])
 def test_on_a_solved_gap_next_to_nothing_is_lost(challenger, least):
     """The challenger is deployed in a fifth of the runs at most."""
@@ -217,6 +218,7 @@ def test_a_challenger_that_proves_itself_becomes_the_reference_as_it_played(iden
     assert equal(state.reference, played) and not equal(bare.fine.export(state.agent), played)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     "name",
     tuners.slow_but(
@@ -235,12 +237,14 @@ def test_the_first_reference_is_the_simulators_policy(name):
     np.testing.assert_allclose(action(case, state, obs), expected, rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.heavy
 def test_without_a_prior_it_is_the_first_policy():
     plain = METHODS["sac"].build(tuners.configure("sac", guard=True), None, tuners.TASK)
     state = jax.jit(lambda key: plain.init(None, key))(jax.random.key(0))
     assert equal(state.reference.actor, state.agent.learner.actor.params)
 
 
+@pytest.mark.heavy
 def test_learning_offline_decides_nothing():
     case = tuners.tuner("iql", guard=True)
     state = case.fine.init(case.params, jax.random.key(0))

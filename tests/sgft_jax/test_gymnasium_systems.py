@@ -57,6 +57,7 @@ REAL = {
 }
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("real", tuners.slow_but({"vector", "same step"}, REAL))
 @pytest.mark.parametrize(
     ("make", "gap"), [(toy_terminating.make, ALARM), pytest.param(toy.make, TURNED, marks=pytest.mark.slow)]

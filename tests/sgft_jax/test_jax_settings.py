@@ -17,6 +17,7 @@ def test_float64_is_refused_before_a_task_is_made():
         envs.make("push")
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("platform", ["rocm", "nonsense"])  # no machine of ours has devices of that maker
 def test_so_is_a_platform_that_is_not_there(platform):
     program = "from envs import mesh, types\ntry: mesh.check_jax()\nexcept types.UserError as error: print(error)\n"

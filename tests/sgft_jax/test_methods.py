@@ -39,6 +39,7 @@ def has_help(kind, field):
     return rest.partition("\n")[2].lstrip().startswith('"""')
 
 
+@pytest.mark.heavy_after_first
 @each_method
 def test_every_option_has_its_help_and_a_default(name):
     """Tyro reads the string below a field, of the class or of the nearest one that it derives from."""
@@ -212,6 +213,7 @@ def facts(fine):
     return fine.updates_per_rollout, fine.initial_rollouts, simulation, dict(fine.card)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", tuners.slow_but({"frozen-critic"}, METHODS))
 def test_every_option_changes_something(name):
     """Either a fact that training loops read, the size of the state, the compiled program, or what is learned."""

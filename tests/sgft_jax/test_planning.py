@@ -38,6 +38,7 @@ def run(score, *, config=CONFIG, hyper=HYPER, proposals=NONE, previous=None, exp
 PLAN = run(quadratic)
 
 
+@pytest.mark.heavy
 def test_finds_the_optimum_of_a_quadratic(key):
     action, mean = PLAN(key)
     np.testing.assert_allclose(mean, TARGET, atol=0.06)
@@ -67,6 +68,7 @@ def pair_score(sequence):
     return jnp.where(a == 0.1, 3.0, jnp.where(a == -0.1, 3.0 - 2 * jnp.log(3.0), -1e6))
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("explore", [False, True])
 def test_weights_choice_and_noise_by_hand(key, explore):
     two = planning.MPPIConfig(samples=8, elites=2, iterations=2)
@@ -79,6 +81,7 @@ def test_weights_choice_and_noise_by_hand(key, explore):
     assert explore or set(actions.flatten().tolist()) == {float(np.float32(0.1)), float(np.float32(-0.1))}
 
 
+@pytest.mark.heavy
 def test_noise_is_that_of_the_first_step_of_a_plan(key):
     """The elites agree on the first step, so its spread is the floor, 0.05; they differ by 2 in the second one."""
     apart = jnp.array([[[0.1], [-1.0]], [[0.1], [1.0]]])
@@ -104,6 +107,7 @@ def split_score(keys, bad, other):
     return jax.vmap(run(lambda s: jnp.where(s[0, 0] > 0, bad, other)))(keys)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("bad", [jnp.nan, jnp.inf, -jnp.inf])
 @pytest.mark.parametrize("other", [-100.0, -1.0, 1.0])
 def test_scores_that_are_not_finite_rank_last(key, bad, other):
@@ -126,6 +130,7 @@ def test_a_good_proposal_is_taken(key):
     np.testing.assert_allclose(mean, TARGET, atol=1e-4)
 
 
+@pytest.mark.heavy
 def test_vmap_equals_a_loop_and_keys_decide(key):
     keys = jax.random.split(key, 2)
     both = jax.vmap(PLAN)(keys)
@@ -200,22 +205,26 @@ def plan(monkeypatch):
     return found
 
 
+@pytest.mark.heavy
 def test_a_plan_goes_where_value_is_highest(plan):
     np.testing.assert_allclose(plan(lambda s: -10 * (s - 0.6) ** 2), 0.6, atol=0.1)
     np.testing.assert_allclose(plan(lambda s: -10 * (s - 7.0) ** 2), 1.0, atol=0.05)  # as far as the action goes
 
 
+@pytest.mark.heavy
 def test_models_that_disagree_are_averaged(plan):
     """Gains g = 0.5 and 1.5: the mean of (g a - 0.6)^2 is least at 0.6 mean(g) / mean(g^2) = 0.48."""
     np.testing.assert_allclose(plan(lambda s: -40 * (s - 0.6) ** 2, (0.5, 1.5)), 0.48, atol=0.08)
 
 
+@pytest.mark.heavy
 def test_rewards_on_the_way_count(plan):
     np.testing.assert_allclose(
         plan(lambda s: 0.0 * s, reward=lambda obs, action, after: -10 * (after[0] + 0.4) ** 2), -0.4, atol=0.1
     )
 
 
+@pytest.mark.heavy
 def test_a_longer_plan_crosses_a_valley(plan):
     """Value falls before it rises: one step stays, two go through, to either side."""
 
@@ -226,6 +235,7 @@ def test_a_longer_plan_crosses_a_valley(plan):
     assert (jnp.abs(plan(value, horizon=2)) > 0.5).all()
 
 
+@pytest.mark.heavy
 def test_nothing_comes_after_a_termination(plan):
     """The highest value lies where the episode ends, and so counts for nothing."""
 
@@ -240,6 +250,7 @@ def test_nothing_comes_after_a_termination(plan):
     assert (held <= 0.5).all() and (held > 0.3).all()
 
 
+@pytest.mark.heavy
 def test_what_comes_later_is_discounted(plan):
     """0.5 for staying or 1 for going, one step later: worth less at gamma 0.4."""
 
@@ -253,6 +264,7 @@ def test_what_comes_later_is_discounted(plan):
     assert (jnp.abs(plan(value, reward=pays, gamma=0.4)) < 0.1).all()
 
 
+@pytest.mark.heavy
 def test_proposals_follow_every_model(monkeypatch):
     """The policy goes up to where it believes to be and one step on; each plan's proposals follow one model.
 
@@ -310,6 +322,7 @@ def rows(n=64):
     return Transition(obs, action, -jnp.abs(after[:, 0]), jnp.full(n, 0.9), after)
 
 
+@pytest.mark.heavy
 def test_the_models_learn_and_all_else_stays():
     state = tuner().observe(tuner().init(prior(), jax.random.key(0)), rows(), jnp.arange(64) != 5, 0.0)
     assert state.replay.size == 63
@@ -327,6 +340,7 @@ def test_the_models_learn_and_all_else_stays():
     np.testing.assert_allclose(predicted, -0.2, atol=0.05)  # every member
 
 
+@pytest.mark.heavy
 def test_real_actions_are_spread_and_the_best_one_is_not():
     """By 0.4, which the bounds of actions cut a little, beside the 0.05 of the search."""
     state, obs = tuner().init(prior(), jax.random.key(0)), jnp.array([0.3])

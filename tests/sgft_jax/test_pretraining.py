@@ -89,6 +89,7 @@ def counted(*risks, refresh_every=0, resumed=None):
         return [jax.tree.map(jnp.copy, found) for found in pretrain(env, config, [3], pools=pools, state=state)]
 
 
+@pytest.mark.heavy
 def test_episodes_end_and_begin_anew_with_their_carry():
     _, (state, metrics), _ = counted(0.2)
     rows = played(state, 0)
@@ -104,6 +105,7 @@ def test_episodes_end_and_begin_anew_with_their_carry():
     assert metrics["train/exploded"][0] == metrics["train/success"][0] == 0
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("algorithm", tuners.slow_but({"sac"}, ["sac", "recurrent", "tdmpc2"]))
 def test_no_key_is_used_twice(algorithm):
     """In random experience, the first state, a chunk of two steps and new worlds."""
@@ -121,6 +123,7 @@ def test_no_key_is_used_twice(algorithm):
     assert keys.used_twice(whole) == 0
 
 
+@pytest.mark.heavy
 def test_a_policy_remembers_the_random_action_that_replaced_its_choice(monkeypatch):
     """Its choice is always 0.5; what it hands on is the action that was stored, or 0 at the start of an episode."""
 
@@ -139,6 +142,7 @@ def test_a_policy_remembers_the_random_action_that_replaced_its_choice(monkeypat
     assert goes_on.any() and (done[goes_on] == 0.5).any() and (done[goes_on] != 0.5).any()
 
 
+@pytest.mark.heavy
 def test_statistics_are_those_of_the_steps_that_did_not_explode(monkeypatch):
     """Half of the random steps explode, and leave the end of their buffer empty."""
     monkeypatch.setattr(pretraining, "recipe_of", counting)
@@ -156,6 +160,7 @@ def test_statistics_are_those_of_the_steps_that_did_not_explode(monkeypatch):
     assert seen.mean() < -0.02
 
 
+@pytest.mark.heavy
 def test_new_worlds_begin_new_episodes():
     """Nothing ends the first set's episodes but time, everything those of the second."""
     state, metrics = counted(0.0, 1.0, refresh_every=1)[-1]

@@ -80,12 +80,14 @@ def found(request, prior):
     return fine._replace(observe=observe), state, observe(state, *torn(rows, 0.0), jnp.float32(0.0)), data
 
 
+@pytest.mark.heavy
 def test_one_rollout_tells_the_system(found):
     _, before, after, _ = found
     np.testing.assert_array_equal(before.learner[1].mean, 0.0)
     np.testing.assert_allclose(after.learner[1].mean, TRUE, atol=0.1)
 
 
+@pytest.mark.heavy_after_first
 def test_rows_that_do_not_count_change_nothing(found, prior):
     fine, before, after, _ = found
     rows = steps(prior, jax.random.key(1), told=False, noise=0.003)

@@ -140,6 +140,7 @@ def test_updates_and_transitions_are_those_of_the_steps_that_were_made():
         np.testing.assert_allclose(metrics["learner/state"], before + (updates[i - 1] - 1) / 2, atol=0.02)
 
 
+@pytest.mark.heavy
 def test_initial_rollouts_come_together_and_each_brings_its_updates():
     system = Recorded(simulated())
     yielded = run(make(initial_rollouts=3), system, rollouts=4)
@@ -177,6 +178,7 @@ def test_a_resumed_run_goes_on_with_the_same_bits(tmp_path):
     assert bits(rest[-1]) == bits(yielded[-1])
 
 
+@pytest.mark.heavy
 def test_all_methods_meet_the_same_starts():
     """World and luck follow from the seed and the rollout alone, not from who plays."""
     system = Recorded(simulated())
@@ -194,6 +196,7 @@ def steps_of(episodes):
     return [np.round(a[v] / NUMBER).tolist() for a, v in zip(action, valid, strict=True)]
 
 
+@pytest.mark.heavy
 def test_the_carry_is_threaded_and_begins_anew_with_each_episode():
     played, yielded = whole()
     agent = jax.tree.map(jnp.asarray, yielded[3][0].agent)
@@ -204,6 +207,7 @@ def test_the_carry_is_threaded_and_begins_anew_with_each_episode():
             assert steps == list(range(len(steps)))
 
 
+@pytest.mark.heavy
 def test_evaluation_repeats_a_fixed_series_without_exploring():
     agent = jax.tree.map(jnp.asarray, whole()[1][1][0].agent)
     system = Recorded(simulated())
@@ -304,6 +308,7 @@ def test_an_explosion_is_reported_as_the_worst_that_is_known():
     assert yielded[3][0].best.score.tolist() == pytest.approx([-34 / 3] * 2)
 
 
+@pytest.mark.heavy
 def test_rollouts_of_an_initial_policy_are_no_evidence_for_the_agent():
     """They are played with the prior's own parameters, and they are learned from."""
     seen = []
@@ -332,6 +337,7 @@ def test_rollouts_of_an_initial_policy_are_no_evidence_for_the_agent():
 RETURNS = np.stack([[5, 6, 9, 9, 9, 9], [5, 6, 0, 5, 6, 5]], 1)
 
 
+@pytest.mark.heavy
 def test_the_guard_decides_for_each_member_who_plays_next():
     """By the scores of its rollouts. One learner becomes the reference, the other is given up."""
     fine = make(guard=True)
@@ -533,6 +539,7 @@ def test_methods_that_need_simulated_data_say_so():
         run(make(simulation=NEEDS), rollouts=1)
 
 
+@pytest.mark.heavy
 def test_members_share_simulated_rows():
     """No array of the compiled program holds a set of rows for each member."""
     fine, n, members = make(simulation=NEEDS), 1009, 7
@@ -544,6 +551,7 @@ def test_members_share_simulated_rows():
     assert set(re.findall(rf"tensor<([\dx]*){n}x", program)) == {"2x"}  # two priors, no member
 
 
+@pytest.mark.heavy
 def test_simulate_plays_whole_episodes_with_more_and_more_random_actions():
     pool = envs.sample_worlds(ENV, jax.random.key(0), 4)
     still = Policy(lambda: (), lambda params, carry, obs, key, *, explore: (params[None], carry), lambda *_: 0.0)

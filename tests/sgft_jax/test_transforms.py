@@ -71,6 +71,7 @@ def test_shaped_reward_by_hand(key):
     assert out.discount.tolist() == pytest.approx([GAMMA, 0])  # shaping alone shortens nothing
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("horizon", [1, 2, 5, 40])
 @pytest.mark.parametrize("seed", range(3))
 def test_shaped_rewards_telescope(horizon, seed):
@@ -116,6 +117,7 @@ def test_shorten_tells_the_steps_to_go(key):
     assert out.discount.tolist() == pytest.approx([GAMMA, GAMMA, 0])
 
 
+@pytest.mark.heavy
 def test_shorten_draws_missing_steps_to_go_uniformly(key):
     n = 6000
     raw = batch_of(np.zeros(n), np.zeros(n), np.zeros(n), steps_to_go=[0] * (n - 1) + [2])
@@ -171,6 +173,7 @@ def test_targets_equal_brute_force_on_a_tabular_problem(horizon):
 # --- branch -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_branches_follow_the_real_rows(key):
     raw = batch_of([0, 10], [0.5, 10.5], [5, 6])
     line = imagination(terminated=lambda obs, action, next_obs: jnp.bool_(False))

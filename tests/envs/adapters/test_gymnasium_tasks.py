@@ -53,6 +53,7 @@ def steps(env, seed, actions):
 # --- one environment --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("make", [pytest.param(toy.make, marks=pytest.mark.slow), toy_terminating.make])
 def test_gymnasiums_own_check_finds_nothing(make):
     """Except that the observations have no bounds, which is so, and that no spec says how to make it once more."""
@@ -78,6 +79,7 @@ def test_names_are_gymnasiums_way_of_writing():
     assert {name_of(task) for task in envs.TASKS} <= set(gymnasium.registry)
 
 
+@pytest.mark.heavy
 def test_an_episode_is_the_one_that_the_project_plays():
     env, actions = toy.make(), np.random.default_rng(0).uniform(-1, 1, (20, 2)).astype(np.float32)
     expected = played(env, GAP, [7, 8], actions)
@@ -91,6 +93,7 @@ def test_an_episode_is_the_one_that_the_project_plays():
         assert told == {"is_success": bool(expected.success[i]), "invalid": False}
 
 
+@pytest.mark.heavy
 def test_a_termination_is_no_truncation():
     env, actions = toy_terminating.make(), np.ones((12, 1), np.float32)
     lengths = np.asarray(played(env, ALARM, range(8), actions).valid).sum(1)
@@ -131,6 +134,7 @@ def test_an_unknown_gap_is_one_line():
 # --- many -------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("make", "gap"), [pytest.param(toy.make, GAP, marks=pytest.mark.slow), (toy_terminating.make, ALARM)]
 )
@@ -157,6 +161,7 @@ def test_many_play_what_one_plays_from_reset_to_reset(make, gap):
             over = alone[2] or alone[3]
 
 
+@pytest.mark.heavy
 def test_many_by_name():
     env = gymnasium.make_vec("sgft_jax/Push-v0", num_envs=2, gap="default", impl="c", worlds=1)
     assert isinstance(env, TaskVectorEnv) and env.reset(seed=[1, None])[0].shape == (2, 4)

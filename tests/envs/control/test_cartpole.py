@@ -56,6 +56,7 @@ def actions():
     return jnp.sign(jnp.sin(jnp.arange(STEPS) / 16.0))[:, None] * 0.9
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("i", range(3))
 def test_motion_is_that_of_mujoco(played, i):
     thetas, starts, after = played
@@ -82,6 +83,7 @@ def test_reward_of_a_step_is_that_of_both_frames(played):
     np.testing.assert_allclose(after.reward[0].sum(), np.sum(wanted), atol=0.01)
 
 
+@pytest.mark.heavy
 def test_an_episode_starts_hanging_and_ends_by_time_alone(played):
     _, starts, after = played
     hanging = jnp.array([0.0, -1.0, 0.0, 0.0, 0.0])

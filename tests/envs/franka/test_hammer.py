@@ -85,6 +85,7 @@ def test_reward_and_success_by_hand():
     assert not hammer.success(obs(0.506))
 
 
+@pytest.mark.heavy
 def test_observation_of_a_start():
     theta = NOMINAL | {"nail_x": 0.32, "nail_z": 0.62, "nail_half_height": 0.05}
     state = start(theta)
@@ -100,6 +101,7 @@ def test_observation_of_a_start():
     np.testing.assert_allclose(obs[9:], [0.62, 0.32, 0.52], atol=1e-6)  # board: 0.62 - 2 * 0.05
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("theta", some_corners())
 def test_start_is_above_the_nail_and_inside_the_limits(theta):
     params = as_params(theta)
@@ -167,6 +169,7 @@ def test_board_stops_the_hammer_beside_the_nail():
     np.testing.assert_allclose(heights(theta, states), 0.04, atol=1e-6)  # and the nail was left alone
 
 
+@pytest.mark.heavy
 def test_starts_touch_nothing():
     """The high boards closest to the elbow, and of many starts those that lean forward the most."""
     high = NOMINAL | {"nail_x": 0.3, "nail_z": 0.65, "nail_half_height": 0.02}
@@ -177,6 +180,7 @@ def test_starts_touch_nothing():
         assert not any(touching(model, states.qpos[i]) for i in leaning)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("theta", some_corners())
 def test_arm_stays_out_of_the_board(theta):
     """Whatever all joints are told for 3 s: hammer, hand and wrist stay above its height, the arm outside of it."""
@@ -189,6 +193,7 @@ def test_arm_stays_out_of_the_board(theta):
             assert depth(model, state.qpos, hand + limbs, board) < 0.015
 
 
+@pytest.mark.heavy
 def test_random_saturated_actions_never_explode():
     rng = np.random.default_rng(0)
     for seed, theta in enumerate(corners()):

@@ -71,6 +71,7 @@ def test_observed_leg_is_the_simulated_one():
     np.testing.assert_allclose(obs[:3] - obs[3:6], [0, 0, insert.GRASP], atol=2e-4)
 
 
+@pytest.mark.heavy
 def test_starts_lie_around_the_nominal_hole():
     keys = jax.random.split(jax.random.key(0), 300)
     params = as_params(NOMINAL)

@@ -96,6 +96,7 @@ def test_success_is_a_nail_more_than_nine_centimetres_deep():
 # --- starts and states that are restored ----------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_starts_fill_the_rectangle_and_every_kind_of_start_is_drawn():
     params = jnp.array([p.nominal for p in task.PARAMETERS])
     starts = jax.jit(jax.vmap(lambda key: task.initial(params, key)))(jax.random.split(KEY, 3000))
@@ -114,6 +115,7 @@ def test_starts_fill_the_rectangle_and_every_kind_of_start_is_drawn():
     assert (faces < task.NAIL[1]).all() and (z[held] > task.LYING).all()
 
 
+@pytest.mark.heavy
 def test_a_hammer_that_starts_in_hand_stays_there():
     rig = rig_of(start_held=1.0)
     for seed in range(4):
@@ -136,6 +138,7 @@ def test_fingers_close_around_a_handle_that_is_off_their_middle():
     np.testing.assert_allclose(task.settled(jnp.zeros(9), elsewhere).qpos[3:5], 0.024, atol=1e-6)
 
 
+@pytest.mark.heavy
 def test_an_observation_tells_what_the_next_step_does(rig):
     """Through a whole scripted episode, in which hammer and hand move by centimetres: to a millimetre, typically far
     less.
@@ -237,6 +240,7 @@ def played(rig, key, policy, steps=75):
     return np.array(rewards), np.array(done), np.array(obs)
 
 
+@pytest.mark.heavy
 def test_a_script_takes_the_hammer_and_drives_the_nail_in(rig):
     for seed in range(3):
         rewards, done, obs = played(rig, jax.random.key(seed), strike)
@@ -254,6 +258,7 @@ def test_a_hand_without_fingers_that_close_lifts_nothing(rig):
     assert not done.any() and obs[:, 13].max() < 0.035 and obs[:, 24].max() < 1e-3
 
 
+@pytest.mark.heavy
 def test_a_hammer_that_keeps_pushing_does_not_pull_the_nail_out(rig):
     """The block stops it, the grip slips."""
 

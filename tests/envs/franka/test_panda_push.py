@@ -80,6 +80,7 @@ def test_success_is_less_than_five_centimetres_in_space():
     assert not at(0.1, 0.0, 0.08)  # above the mark
 
 
+@pytest.mark.heavy
 def test_fingers_that_start_beside_the_cube_do_not_touch_it():
     cube, keys = jnp.array([0.1, -0.05]), jax.random.split(KEY, 1000)
     off = jax.jit(jax.vmap(lambda key: panda_push.beside(cube, key)))(keys) - jnp.append(cube, 0.0)[None]
@@ -102,6 +103,7 @@ def test_starts_fill_the_square_and_the_mark_stays(rig):
     np.testing.assert_allclose(moved[:, 18:], np.tile(states[0, 18:], (5, 1)), atol=1e-6)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("action", "axis", "first", "second"),
     [((1, 0, 0), 0, 0.0275, 0.0539), ((0, 1, 0), 1, 0.0268, 0.0777), ((0, 0, -1), 2, 0.0279, 0.0875)],
@@ -161,6 +163,7 @@ def push(obs):
     return np.clip(np.array(move) / 0.05, -1.0, 1.0)
 
 
+@pytest.mark.heavy
 def test_a_script_pushes_the_cube_to_the_mark(rig):
     world, done = member(rig.worlds, 0), []
     for seed in range(12):

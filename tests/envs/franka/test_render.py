@@ -60,6 +60,7 @@ def test_dressing_leaves_motion_alone(name):
     np.testing.assert_allclose(data.body("link7").xpos, plain_data.body("link7").xpos, atol=1e-12)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x != "push")) for x in SCENES])
 def test_pictures_show_the_robot(renderer, tmp_path, name):
     scene = SCENES[name]
@@ -71,6 +72,7 @@ def test_pictures_show_the_robot(renderer, tmp_path, name):
     assert len(frames) == 2  # 0.2 s at twice the speed and 10 frames a second, ends included
 
 
+@pytest.mark.heavy
 def test_side_by_side_waits_for_the_longer_episode(renderer, tmp_path):
     scene, path = push.SCENE, tmp_path / "both.mp4"
     thetas, episodes = [nominal(scene), list(nominal(scene).values())], [still(scene, 1), still(scene, 2)]

@@ -31,6 +31,7 @@ def played(request):
     return env, states, actions, lambda obs: restored(world, obs, key), lambda state, a: step(world, state, a, key)
 
 
+@pytest.mark.heavy
 def test_a_restored_start_is_the_start(played):
     _, states, _, restored, _ = played
     again = restored(states[0].obs)

@@ -187,6 +187,7 @@ def golden(request):
     return task, names, play(env, pool, begun(env, pool, at_rest(task)), actions)
 
 
+@pytest.mark.heavy_after_first
 def test_golden_steps_of_the_real_system(golden):
     task, names, states = golden
     i = names.index(gaps.SIM)

@@ -35,6 +35,7 @@ def shows_floor(picture):
     return bool((np.abs(edge[..., 2] - edge[..., 0]) < 15).all())
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("task", ["halfcheetah", pytest.param("walker2d", marks=pytest.mark.slow)])
 def test_a_runner_is_in_the_picture_at_any_x(task, tmp_path):
     seen = []
@@ -48,6 +49,7 @@ def test_a_runner_is_in_the_picture_at_any_x(task, tmp_path):
     np.testing.assert_allclose(seen[1], seen[0], rtol=0.1)
 
 
+@pytest.mark.heavy
 def test_a_robot_that_has_left_its_place_has_left_the_mark(tmp_path):
     theta = {p.name: p.nominal for p in wheel_legged.PARAMETERS}
     near, far = (frame(wheel_legged.SCENE, theta, np.array([x, 0.1]), tmp_path) for x in (0.0, 16.4))

@@ -16,6 +16,7 @@ KEY = jax.random.key(0)
 FAST = ["halfcheetah", pytest.param("walker2d", marks=pytest.mark.slow)]
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("task", FAST)
 def test_observations_hold_everything_but_x(task):
     env = make(task, "c")
@@ -63,6 +64,7 @@ def test_the_centre_of_mass_leads_the_root_as_mujoco_says():
         )
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("task", "least", "error"), [("halfcheetah", 0.99, 0.1), ("walker2d", 0.99, 0.06)])
 def test_the_reward_of_what_is_seen_is_nearly_what_is_measured(task, least, error):
     """Their correlation, and the root mean square of what is between them, m/s, in a motion of the nominal runner."""
@@ -115,6 +117,7 @@ def test_a_fall_ends_the_episode_and_the_time_limit_truncates_it():
         np.testing.assert_allclose(states.reward[1, 0] - moved, 1.0 if ends else 0.0, atol=1e-4)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("task", TASKS)
 def test_starts_are_gyms(task):
     env = make(task, "c")
@@ -132,6 +135,7 @@ def test_starts_are_gyms(task):
     assert not states.terminated.any()
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("task", FAST)
 def test_joint_noise_moves_the_motors_and_what_they_cost(task):
     """Executed is clip(0.5 + n): the share at either bound, and a step and its reward are those of what is executed."""
@@ -153,6 +157,7 @@ def test_joint_noise_moves_the_motors_and_what_they_cost(task):
         np.testing.assert_allclose(states.reward[i], same.reward, atol=1e-4)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("task", FAST)
 def test_a_state_that_was_seen_is_restored(task):
     """The next observation is the same from there on, wherever along x it was seen."""

@@ -75,6 +75,7 @@ def test_motors_lag():
     assert float(wheel_legged.follow(params.at[-1].set(0.0), jnp.zeros(1), jnp.full(1, 0.7))[0]) == np.float32(0.7)
 
 
+@pytest.mark.heavy
 def test_the_lag_of_a_gap_reaches_the_motors():
     env = make("wheel-legged", "c")
     pool = pool_of(env, [gaps.SIM, "lag"])
@@ -152,6 +153,7 @@ def test_it_can_roll_forward():
     assert (rolled.total_reward > 14.9 * env.episode_length).all()
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("impl", ENGINES)
 def test_every_engine_moves_it_like_mujoco(impl):
     """A micrometre and a microradian after a period, in every gap, under torques that change."""
@@ -184,6 +186,7 @@ def test_the_time_step_is_fine_enough():
     np.testing.assert_allclose(own, fine, atol=1e-2, rtol=1e-2)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("task", ["wheel-legged", "wheel-legged-forward"])
 def test_starts_and_states_that_are_seen_again(task):
     env = make(task, "c")

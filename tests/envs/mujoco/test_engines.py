@@ -40,6 +40,7 @@ def episode(env, world, state, actions):
     return jax.lax.scan(step, state, actions)[1]
 
 
+@pytest.mark.heavy
 def test_steps_are_those_of_mujoco_in_each_world(rig):
     scene, env, thetas, worlds, starts, actions = rig
     played = jax.jit(jax.vmap(lambda *x: episode(env, *x)))(worlds, starts, actions)
@@ -50,6 +51,7 @@ def test_steps_are_those_of_mujoco_in_each_world(rig):
     assert np.ptp(played.physics.qpos[:, -1], axis=0).max() > 1e-3  # the worlds are not one
 
 
+@pytest.mark.heavy
 def test_any_batching_gives_the_same(rig):
     """Up to the rounding of what XLA computes between the steps."""
     _, env, _, worlds, starts, actions = rig
@@ -63,6 +65,7 @@ def test_any_batching_gives_the_same(rig):
     np.testing.assert_allclose(nested, jnp.stack([alone, alone[::-1]]), atol=1e-5)
 
 
+@pytest.mark.heavy
 def test_an_explosion_is_reported_not_reset(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     scene = SCENES["push"]

@@ -266,6 +266,7 @@ def test_what_a_comparison_names():
 # --- carried --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("impl", ["c", *SLOW])
 def test_fluids_gravity_and_magnets_differ_between_worlds(impl):
     """Also where the nominal scene has none of them: MJX and Warp would leave their code out."""

@@ -102,6 +102,7 @@ def played(request):
         return env, jax.jit(play)(pool, jax.random.split(jax.random.key(1), 2))
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("i", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_motion_and_sensors_are_those_of_mujoco(played, i):
     """Also where the lifting servo, geared by 2, is at its limit of force."""
@@ -129,6 +130,7 @@ def test_the_episode_ends_at_the_wall(played):
     assert episodes.success.all() and not episodes.exploded.any() and env.impl in ENGINES
 
 
+@pytest.mark.heavy
 def test_faster_than_the_scene_allows_is_an_explosion():
     env = compiled(make_env(SCENE, "c"))
     world = jax.tree.map(lambda x: x[0], worlds(env, 1.0))
@@ -138,6 +140,7 @@ def test_faster_than_the_scene_allows_is_an_explosion():
         assert bool(env.step(world, fast, jnp.zeros(2), jax.random.key(0)).invalid) == invalid
 
 
+@pytest.mark.heavy
 def test_what_observations_do_not_tell_the_simulator_measures():
     """The end and the reward as functions of parameters and physics: heavy balls may go further."""
 
@@ -210,6 +213,7 @@ FEATURES = {
 }
 
 
+@pytest.mark.heavy
 @pytest.mark.filterwarnings("ignore:flex")
 @pytest.mark.parametrize("feature", FEATURES)
 def test_the_c_engine_steps_what_mjx_does_not(feature, monkeypatch):

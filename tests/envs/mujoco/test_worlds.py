@@ -37,6 +37,7 @@ def nominal(scene):
     return {p.name: p.nominal for p in scene.parameters}
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("name", SCENES)
 def test_worlds_are_what_mujoco_compiles(name):
     scene, rng = SCENES[name], np.random.default_rng(0)

@@ -65,11 +65,13 @@ def fault(words, *, code, out, err, changed):
     return f"changes {', '.join(changed)}" if changed else None
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.__name__.rpartition(".")[2])
 def test_mistakes_that_need_no_model(table, tmp_path):
     assert faults(table.ROWS, tmp_path, "apart") == []
 
 
+@pytest.mark.heavy
 def test_mistakes_that_need_one(tmp_path):
     assert faults([row for table in TABLES for row in getattr(table, "HEAVY", ())], tmp_path) == []
 

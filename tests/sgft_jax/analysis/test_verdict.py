@@ -106,6 +106,7 @@ def test_what_is_worth_it():
     assert "H = 4 is enough, 95 %" in words(value__real=far)[1]
 
 
+@pytest.mark.heavy
 def test_the_picture_shows_what_counts_in_colour(tmp_path):
     points = {where: (np.linspace(0, 5, 40), np.linspace(1, 4, 40)) for where in ("real", "simulated")}
 

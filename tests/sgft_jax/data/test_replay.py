@@ -69,6 +69,7 @@ def test_sampling_is_uniform_and_keeps_rows_together(key):
     assert jnp.all(batch.obs[:, 0] == batch.reward) and jnp.all(batch.next_obs[:, 0] == batch.reward)
 
 
+@pytest.mark.heavy
 def test_vmap_over_seeds_equals_a_loop(key):
     batch = rows([[1, 2, 3], [4, 5, 6]])
     valid = jnp.array([[True, True, True], [True, False, True]])

@@ -56,6 +56,7 @@ def window_at(held, start):
     return tuple(window)
 
 
+@pytest.mark.heavy
 def test_a_fixed_set_is_drawn_from_without_a_look_at_all_its_rows(key):
     """The same windows as from a ring that counts its valid rows."""
     ring = sequences.full(rows(jnp.arange(50.0)), jnp.arange(50) % 7 == 6)
@@ -125,6 +126,7 @@ def test_an_exploded_row_may_hold_anything(key):
     assert windows(ring, key) == {(1,), (3,)}
 
 
+@pytest.mark.heavy
 def test_vmap_over_seeds(key):
     rings = jax.vmap(lambda _: sequences.init(rows(0.0), 6))(jnp.arange(2))
     valid = jnp.array([[True, True, True], [True, False, False]])
@@ -147,6 +149,7 @@ def test_impossible_sizes_are_refused():
         sequences.add_episode(sequences.init(rows(0.0), 2), rows([1, 2, 3]), jnp.ones(3, bool))
 
 
+@pytest.mark.heavy
 def test_episodes_begin_where_those_of_a_python_ring_do(key):
     """All windows from the first rows of episodes, none from elsewhere; a full ring's oldest row may be anywhere."""
     n_envs, slots, rng = 2, 9, random.Random(2)
@@ -169,6 +172,7 @@ def test_episodes_begin_where_those_of_a_python_ring_do(key):
         assert got == (wanted or {()}), step
 
 
+@pytest.mark.heavy
 def test_without_a_beginning_no_window_is_valid(key):
     """Slots of a full ring in the middle of one long episode."""
     ring, no = sequences.init(rows(0.0), 3, 1), jnp.zeros(1, bool)

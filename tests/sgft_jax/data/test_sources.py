@@ -69,6 +69,7 @@ def test_what_a_source_does_not_say_is_none(key):
     assert len(jax.tree.leaves(sources.mixture(3, 2).sample(STATE, key))) == 6
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("traced", [False, True])
 @pytest.mark.parametrize(("share", "simulated"), [(0.0, 0), (0.5, 4), (0.8, 6), (1.0, 8)])
 def test_a_blend_has_its_share_of_simulated_rows(key, share, simulated, traced):
@@ -81,6 +82,7 @@ def test_a_blend_has_its_share_of_simulated_rows(key, share, simulated, traced):
     np.testing.assert_array_equal(batch.obs[:, 0], batch.reward)
 
 
+@pytest.mark.heavy
 def test_windows_of_real_steps(key):
     ring = sequences.add_episode(sequences.init(replay.blank(1, 1), 6), rows(REAL, 4), jnp.ones(4, bool))
     batch = sources.real_windows(16, 3).sample((ring, None), key)

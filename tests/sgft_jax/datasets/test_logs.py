@@ -125,6 +125,7 @@ def test_a_log_can_be_sampled(write, key):
     assert mixed.is_sim.tolist() == [False] * 4 + [True] * 3
 
 
+@pytest.mark.heavy
 def test_windows_of_a_log_do_not_cross_episodes(write, key):
     """Nor gaps where rows were dropped: 3 after 2 of the shifted rows, and 5 after 4, are not there."""
     for successors, last in (("stored", [0, 1, 0, 1, 0, 1, 1]), ("shifted", [0, 1, 1, 1])):

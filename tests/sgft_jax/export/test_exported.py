@@ -134,6 +134,7 @@ def needs(to):
         pytest.importorskip(library, reason="make setup EXTRAS=dev,export")
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("to", ["numpy", "onnx"])
 @pytest.mark.parametrize(
     "name", [case if case in FEW else pytest.param(case, marks=pytest.mark.slow) for case in CASES]
@@ -150,6 +151,7 @@ def test_an_exported_policy_acts_as_the_policy_does(name, to, tmp_path):
     assert checked == {"observations": 1000, "largest_difference": worst, "limit": 1e-5}
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["identified", "recurrent"])
 def test_so_does_one_for_jax(name, tmp_path):
     needs("jax")
@@ -238,6 +240,7 @@ BAD = [
 ]
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("explore", [False, True])
 def test_bad_measurements_are_refused_and_not_remembered(tmp_path, explore):
     env, prior = case("recurrent")
@@ -258,6 +261,7 @@ def test_bad_measurements_are_refused_and_not_remembered(tmp_path, explore):
     np.testing.assert_array_equal(policy.act(measured[0, 1]), exact[1])
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("sent", [[np.nan, 0.0], [0.0, 1e30], [0.0, -1.5], ["a", 0.0], [0.0, 0.0, 0.0], [None, 0.0]])
 def test_what_cannot_have_been_sent_is_refused_and_not_remembered(tmp_path, sent):
     env, prior = case("identified")

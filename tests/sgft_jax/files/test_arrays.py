@@ -69,6 +69,7 @@ def test_an_archive_comes_back_as_it_was(tmp_path):
     np.testing.assert_array_equal(read["x"], [0, 1, 2])
 
 
+@pytest.mark.heavy
 def test_archives_that_unpack_to_far_more_than_they_are(tmp_path, monkeypatch):
     np.savez_compressed(tmp_path / "a.npz", x=np.zeros(2 * 10**7))
     monkeypatch.setattr(arrays, "_read_member", None)  # nothing is unpacked

@@ -300,6 +300,7 @@ LIES = {
 }
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("lie", LIES)
 def test_a_manifest_that_lies_is_refused_before_numbers_are_read(tmp_path, lie, monkeypatch):
     change, words = LIES[lie]

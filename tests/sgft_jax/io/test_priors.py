@@ -63,6 +63,7 @@ def test_prior_round_trip(tmp_path):
     assert bits(priors.load_prior(tmp_path / "run").params) == bits(prior.params)
 
 
+@pytest.mark.heavy
 def test_every_learner_that_leaves_a_prior_names_its_container(tmp_path):
     planner = {"size": tuners.TINY, "plan_samples": 24, "horizon": 2}
     learner = tdmpc2.make_tdmpc2(tdmpc2_model.named_config(4, 2, **planner))
@@ -208,6 +209,7 @@ LIES = {
 }
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("lie", LIES)
 def test_a_card_that_lies_is_refused_in_one_line(shared, lie):
     (shared / "prior.json").write_text(json.dumps(jsonable(CARD | LIES[lie])))
@@ -333,6 +335,7 @@ def test_a_prior_needs_its_card_and_plain_dicts(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.heavy
 def test_priors_that_are_used_together_have_one_structure(tmp_path):
     env = SimpleNamespace(name="hammer", obs_dim=4, act_dim=2)
     folders = [save(tmp_path / f"seed-{i}", float(i)) for i in range(2)]

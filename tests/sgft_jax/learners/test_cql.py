@@ -72,6 +72,7 @@ def test_actions_that_the_data_lack_are_worth_less(key):
     assert seen[1.0][0] - seen[1.0][1] > 1.0 + seen[0.0][0] - seen[0.0][1]
 
 
+@pytest.mark.heavy
 def test_the_entropy_is_not_in_the_target(key):
     batch = batch_of(key, 0.0)._replace(discount=jnp.ones(ROWS), reward=jnp.zeros(ROWS))
     learner = cql.make_cql(cql.CQLConfig(1, 1, network=NET))

@@ -45,6 +45,7 @@ def test_rewards_by_hand(key):
     assert some.valid.tolist() == [False, True, False, False]
 
 
+@pytest.mark.heavy
 def test_a_wrong_simulator_pays_less(learner, key):
     """The change of reward is log P / P_sim: near 0 where both agree, down to -4 where they do not."""
     seen = []

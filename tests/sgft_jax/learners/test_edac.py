@@ -63,6 +63,7 @@ def test_diversity_keeps_gradients_apart(key):
     assert seen[0.0] > 3.5 and seen[5.0] < seen[0.0] - 1.0
 
 
+@pytest.mark.heavy
 def test_without_diversity_it_is_sac_with_many_critics(key):
     structure = sac.SACConfig(2, 3, network=NET, critics=4, train_value=False, train_dynamics=False)
     learners = edac.make_edac(edac.EDACConfig(2, 3, network=NET, critics=4, diversity=0.0)), sac.make_sac(structure)

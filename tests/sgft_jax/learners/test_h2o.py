@@ -70,6 +70,7 @@ def test_shares_by_hand():
     np.testing.assert_allclose(valid, [0.25, 0.75, 0], atol=1e-6)
 
 
+@pytest.mark.heavy
 def test_the_penalty_by_hand():
     """log(.25 e^1 + .75 e^2) - (3 + 5) / 2 for one critic, log(.25 + .75) - 0 for the other."""
     batch = rows([True, True, False, False])
@@ -104,6 +105,7 @@ def test_the_gap_grows_with_the_simulators_error(learner, key):
 # --- one update -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_order_and_rows_of_the_update(learner, key):
     """Losses are those of the old networks, gaps and weights those of the new discriminators; no entropy in targets."""
     batch = batch_of(key)

@@ -93,6 +93,7 @@ def test_the_target_refuses_a_batch():
         h2oplus.mixed_target(f(1), f(0.9), jnp.ones(2), jnp.ones(2), f(0), value_share=0.1, alpha=0.1)
 
 
+@pytest.mark.heavy
 def test_share_zero_ignores_the_value_and_share_one_the_policy(plain, key):
     """0 is SAC on both sources, 1 a bootstrap from V alone."""
     batch, other = batch_of(key), jax.random.key(1)
@@ -111,6 +112,7 @@ def test_share_zero_ignores_the_value_and_share_one_the_policy(plain, key):
 # --- one update -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_every_network_moves_and_statistics_do_not(learner, key):
     state = learner.init(key)
     new, metrics = learner.update(state, batch_of(key), key)
@@ -124,6 +126,7 @@ def test_every_network_moves_and_statistics_do_not(learner, key):
     assert new.step == 1 and all(jnp.shape(m) == () and jnp.isfinite(m) for m in metrics.values())
 
 
+@pytest.mark.heavy
 def test_order_and_rows_of_the_update(learner, key):
     """All losses are those of the old networks but for the weights, which the new discriminators give."""
     batch = batch_of(key)
@@ -242,6 +245,7 @@ def test_observations_are_normalised_everywhere(plain, key):
 # --- the discriminators -----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_rows_of_the_discriminators_train_nothing_else(key):
     """The last four; and they learn at every update, from no other rows."""
     learner = compiled(h2oplus.H2OPlusConfig(3, 2, network=BODY, ratio_network=BODY, ratio_rows=4))
@@ -284,6 +288,7 @@ def test_origin_is_needed(learner, key):
 # --- the ensemble -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_diversity_counts_the_gradients_of_the_real_pairs_alone(key):
     """Half of their mean alignment joins the loss, and what pulls them apart moves the critics and nothing else."""
     body = {"network": BODY, "ratio": False, "tune_alpha": False, "critics": 3}
@@ -300,6 +305,7 @@ def test_diversity_counts_the_gradients_of_the_real_pairs_alone(key):
     assert equal((without.actor, without.value), (apart.actor, apart.value))
 
 
+@pytest.mark.heavy
 def test_the_cut_off_is_a_number_of_the_agent(key):
     """Exponents that end at 0.5 give another value loss than those that end at 7."""
     config = h2oplus.H2OPlusConfig(3, 2, network=BODY, ratio=False, tune_alpha=False, value_loss="xql")

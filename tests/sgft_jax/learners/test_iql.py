@@ -118,6 +118,7 @@ def policy_of(state, obs):
     return float(mean[0]), float(jnp.exp(log_std[0]))
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("expectile", "expected"), [(0.5, 0.25), (0.9, 0.75), (0.99, 0.97)])
 def test_probe_value_goes_from_the_mean_of_the_data_to_its_best(key, expectile, expected):
     """V solves expectile * 1/4 * (1 - V) = (1 - expectile) * 3/4 * V."""
@@ -191,6 +192,7 @@ def with_log_std(state, log_std):
     return state.replace(actor=state.actor._replace(params=params))
 
 
+@pytest.mark.heavy
 def test_every_network_moves_and_statistics_do_not(key):
     state = SMALL.init(key)
     new, metrics = SMALL.update(state, batch_of(key), key)

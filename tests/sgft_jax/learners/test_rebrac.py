@@ -48,6 +48,7 @@ def test_the_target_by_hand():
     assert jax.grad(lambda q: rebrac.td_target(f(1), f(0.9), q[None], q, penalty=0.5))(f(3.0)) == 0.0
 
 
+@pytest.mark.heavy
 def test_one_update_by_hand(learner, key):
     """Targets from target networks and the data's next action where there is one; the actor follows the new critic."""
     batch, state = batch_of(key), learner.init(key)
@@ -103,6 +104,7 @@ def test_noise_on_target_actions_is_bounded(learner, key):
     assert asked[1] == 0.0 and asked[0] == pytest.approx(-0.9 * 2 * 0.25, abs=0.02)
 
 
+@pytest.mark.heavy
 def test_the_actors_penalty_holds_it_to_the_data(key):
     """More action pays more; the data's is -0.3 on average."""
     config = rebrac.ReBRACConfig(1, 1, network=networks.NetworkConfig((16,)))

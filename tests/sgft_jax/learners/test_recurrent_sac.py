@@ -56,6 +56,7 @@ def windows(key, lengths=(T, 3, 1)):
 # --- acting -----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_acting_step_by_step_is_reading_the_window(key):
     """With the actions that were taken in the carry, the policy's moments are those that the losses see."""
     state, window = started(), jax.tree.map(lambda x: x[0], windows(key))
@@ -107,6 +108,7 @@ def test_the_policy_of_a_prior_is_the_agents(key):
 # --- learning ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_shapes(key):
     state, batch = started(), windows(key)
     new, metrics = update(state, batch, key)
@@ -130,6 +132,7 @@ def test_shapes(key):
     assert all(jax.tree.leaves(moved([new.actor.params, new.critic.params], [state.actor.params, state.critic.params])))
 
 
+@pytest.mark.heavy
 def test_losses_step_by_step(key):
     """Each memory unrolled over each window by a loop; the draws are those of the update."""
     state, batch = started(), windows(key)

@@ -41,6 +41,7 @@ def probe(key, *, obs=None, reward=None, discount=None):
 # --- temperature ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_temperature_finds_the_target_entropy(key):
     state = INIT(PLAIN, key, HYPER._replace(alpha=1.0, lr_alpha=1e-2, entropy_per_dim=-0.5))
     batch = probe(key, reward=lambda s, a: -((a - 0.2) ** 2))
@@ -51,6 +52,7 @@ def test_temperature_finds_the_target_entropy(key):
     assert 0 < metrics["actor/alpha"][-1] < 0.2
 
 
+@pytest.mark.heavy
 def test_log_alpha_stops_at_minus_ten(key):
     state = INIT(PLAIN, key, HYPER._replace(alpha=0.0, lr_alpha=1.0, entropy_per_dim=-50.0))
     assert state.log_alpha.params == -10.0
@@ -72,6 +74,7 @@ def equal(a, b):
     return all(jnp.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
+@pytest.mark.heavy
 def test_every_network_of_pretraining_moves_and_statistics_do_not(key):
     state = FULL_LEARNER.init(key)
     new, metrics = FULL_LEARNER.update(state, probe(key), key)
@@ -89,6 +92,7 @@ def test_target_critic_follows_at_rate_tau(key):
     chex.assert_trees_all_close(new.target_critic, mix, rtol=1e-6)
 
 
+@pytest.mark.heavy
 def test_fixed_temperature_and_delayed_actor_keep_their_bits(key):
     config = sac.SACConfig(1, 1, network=NET, tune_alpha=False, train_value=False, train_dynamics=False)
     state = start = INIT(config, key, HYPER._replace(alpha=0.01, actor_start=2.0))
@@ -110,6 +114,7 @@ def test_actor_ramp_scales_the_first_steps(key):
     assert moved[0] == pytest.approx(1e-2, rel=1e-2) and moved[1] == pytest.approx(2.5e-3, rel=1e-2)
 
 
+@pytest.mark.heavy
 def test_an_anchored_actor_stays_with_the_policy_it_began_with(key):
     """The dearer it is to leave, the less far it goes; what it is held to never moves."""
     config = dataclasses.replace(FULL, tune_alpha=False, train_value=False, train_dynamics=False, anchored=True)
@@ -132,6 +137,7 @@ def test_an_anchored_actor_stays_with_the_policy_it_began_with(key):
     assert far[0] > 2 * far[1] > 4 * far[2] > 0
 
 
+@pytest.mark.heavy
 def test_policy_delay(key):
     config = dataclasses.replace(PLAIN, policy_delay=2)
     start = INIT(PLAIN, key)
@@ -149,6 +155,7 @@ def ensemble(alpha=0.5, **options):
     return state.replace(critic=state.critic._replace(params=said), target_critic=said), partial(UPDATE, config)
 
 
+@pytest.mark.heavy
 def test_targets_are_the_minimum_of_some_members(key):
     """Of two random members of four: 0, 1 or 2, and every one of them now and then; by default of all: 0."""
     batch = probe(key, discount=lambda s: jnp.ones_like(s), reward=lambda s, a: jnp.zeros_like(s))
@@ -159,6 +166,7 @@ def test_targets_are_the_minimum_of_some_members(key):
         assert {round(x) for x in seen} == expected and all(abs(x - round(x)) < 1e-3 for x in seen)
 
 
+@pytest.mark.heavy
 def test_targets_are_those_of_the_target_critic(key):
     """It says 10 to 13, the critic in training 0 to 3: 2 + 0.5 min; the actor follows the latter."""
     batch = probe(key, discount=lambda s: jnp.full_like(s, 0.5), reward=lambda s, a: jnp.full_like(s, 2.0))
@@ -184,6 +192,7 @@ def test_without_entropy_in_the_target(key):
     assert update(state, batch, key)[1]["critic/target_mean"] == 0.0  # the minimum of the four
 
 
+@pytest.mark.heavy
 def test_a_critic_term_joins_the_loss(key):
     """3 + 5 times the mean of all critics at the data's actions; it may ask the policy, too."""
 
@@ -217,6 +226,7 @@ def test_the_temperature_waits_with_the_actor(key):
     assert first.log_alpha.params != 0 and equal(first.log_alpha, second.log_alpha)
 
 
+@pytest.mark.heavy
 def test_actor_learns_from_the_leading_rows_only(key):
     update = partial(UPDATE, dataclasses.replace(PLAIN, actor_batch=4))
     state, batch = INIT(PLAIN, key), probe(key, obs=[-1.0, 1.0])
@@ -229,6 +239,7 @@ def test_actor_learns_from_the_leading_rows_only(key):
     assert not equal(a.actor, c.actor)
 
 
+@pytest.mark.heavy
 def test_weights_of_the_actors_rows_may_be_left_out(key):
     """The critic still counts rows as they weigh. That an actor else does so too says test_contract_learners.py."""
     batch = probe(key, obs=[-1.0, 1.0], reward=lambda s, a: s * a)._replace(weight=jnp.ones(ROWS))
@@ -249,6 +260,7 @@ def test_without_discount_the_target_ignores_target_network_and_successor(key):
     assert equal(a.critic, b.critic)
 
 
+@pytest.mark.heavy
 def test_hyperparameters_vmap(key):
     state, batch = INIT(PLAIN, key), probe(key)
     rates = jnp.array([0.0, 1e-2])
@@ -291,6 +303,7 @@ def tuned(prior, *, reset, extra=0, **options):
     return sac.make_sac(config), start(HYPER._replace(alpha=0.01), prior, jax.random.key(0), reset_critic=reset)
 
 
+@pytest.mark.heavy
 def test_fine_tuning_starts_from_the_prior(prior, key):
     _, state = tuned(prior, reset=False)
     assert equal(state.actor.params, prior.actor) and equal(state.critic.params, prior.critic)
@@ -317,6 +330,7 @@ def test_the_first_policy_is_the_simulators_for_every_steps_to_go(prior, key):
         np.testing.assert_allclose(got, q, rtol=1e-5)
 
 
+@pytest.mark.heavy
 def test_kept_critic_under_shaping_is_the_simulators_advantage(prior, key):
     """r_bar of the simulator has mean Q_sim - V_sim: at discount 0 that critic has no error on such rewards."""
     learner, state = tuned(prior, reset=False, critic_baseline=True, tune_alpha=False)

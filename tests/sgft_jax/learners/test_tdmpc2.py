@@ -93,6 +93,7 @@ def test_a_layer_of_two_vectors_is_one_of_both(key):
     np.testing.assert_allclose(layer.apply(params, x[:2], x[2:]), x @ kernel + jnp.array([1.0, 2.0, 3.0]), rtol=1e-5)
 
 
+@pytest.mark.heavy
 def test_latents_are_groups_that_sum_to_one(key):
     state, parts = shaken(PLAIN, key), PARTS
     z = parts.encoder.apply(state.encoder.params, jnp.array([3.0, -2.0]))
@@ -112,6 +113,7 @@ def test_published_sizes(name):
     assert count / 1e6 == pytest.approx(float(name.removesuffix("M")), rel=0.25 if name == "1M" else 0.06)
 
 
+@pytest.mark.heavy
 def test_untrained_rewards_and_values_are_zero(key):
     parts, state = PARTS, INIT(key)
     z, action = jnp.full(16, 0.25), jnp.ones(1)
@@ -146,6 +148,7 @@ def q_by_hand(params, z, action):
     return DECODE(PARTS.critic.apply(params, z, action))
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("config", [PLAIN, SGFT])
 def test_v_sim_is_the_mean_of_all_heads_at_the_mean_action(config, key):
     state, parts, obs = shaken(config, key), PARTS, jnp.array([1.0, 2.0])
@@ -168,6 +171,7 @@ def test_sampled_value_is_the_lower_of_two_heads(key):
     assert jnp.mean(jnp.isclose(values, q[1], rtol=1e-2)) == pytest.approx(1 / 3, abs=0.1)
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("trained", [False, True])
 def test_drawn_heads_are_those_of_the_whole_critic(key, trained):
     """Evaluated alone, with their own parameters and dropout, two heads say what they say among all."""
@@ -254,6 +258,7 @@ def model_losses_by_hand(config, state, batch, heads):
     return sums / weight * 0.75, jnp.stack(targets).mean()
 
 
+@pytest.mark.heavy
 def test_losses_against_a_loop(key):
     state, batch = calm(shaken(PLAIN, key)), windows(key)
     counts = jnp.zeros(ROWS, bool).at[jnp.array([0, ROWS - 1])].set(True)
@@ -282,6 +287,7 @@ def test_invalid_rows_do_not_matter(config, key):
     assert not equal(UPDATE[config](state, seen, key)[0].reward, a.reward)
 
 
+@pytest.mark.heavy
 def test_the_policy_learns_where_the_last_valid_step_led_and_no_further(key):
     """Of three latents of a window whose first step alone is valid, the first two count."""
     state, zs, valid = shaken(PLAIN, key), jnp.full((2, 3, 16), 0.25), jnp.array([[True, False], [True, True]])
@@ -348,6 +354,7 @@ def test_sgft_policy_is_promised_one_step_and_v_sim(key):
     assert got == pytest.approx(float(r + 0.99 * v), rel=1e-4)
 
 
+@pytest.mark.heavy
 def test_acting(key):
     state, obs, rest = shaken(PLAIN, key), jnp.ones(2), LEARNERS[PLAIN].init_carry()
     assert rest.shape == (2, 1) and not rest.any()
@@ -367,6 +374,7 @@ def test_planning_without_proposals(key):
     assert jnp.abs(action[0]) <= 1
 
 
+@pytest.mark.heavy
 def test_policy_action(key):
     state, parts, obs = shaken(PLAIN, key), PARTS, jnp.array([1.0, 2.0])
     z = parts.encoder.apply(state.encoder.params, jnp.array([0.25, 5.0]))
@@ -413,6 +421,7 @@ def test_learning_rates(key):
         assert jnp.abs(moved - old).max() == pytest.approx(rate, rel=2e-2), name
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize(("warmup", "done", "share"), [(4, 0, 1 / 4), (4, 2, 3 / 4), (4, 3, 1), (4, 9, 1), (0, 0, 1)])
 def test_learning_rates_rise_from_zero(key, warmup, done, share):
     """Moments are fresh and the data the same, so steps are as their rates."""
@@ -448,6 +457,7 @@ def test_hyperparameters_vmap(key):
 # --- between simulation and reality ---------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 def test_fine_tuning_starts_from_the_prior(key):
     trained = shaken(PLAIN, key).replace(scale=jnp.float32(7.0))
     prior = tdmpc2.extract_params(trained)

@@ -40,6 +40,7 @@ def fit(rows, held=None, **given):
     return jax.jit(lambda: distortion.fit(walled, rows, held, jnp.full(2, 1e-3), **given))()
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("angle", "scale", "bias"),
     [pytest.param(0.7, 0.6, [0.0, 0.0], marks=pytest.mark.slow), (-1.2, 1.4, [0.1, -0.2])],
@@ -52,6 +53,7 @@ def test_one_rollout_tells_rotation_scale_and_bias_walls_or_not(angle, scale, bi
     assert evidence > 100
 
 
+@pytest.mark.heavy
 def test_a_system_that_takes_commands_as_they_are_meant_gives_no_evidence(key):
     found, evidence = fit(steps(turned(0.0, 1.0, [0.0, 0.0]), key))
     np.testing.assert_allclose(found.matrix, np.eye(2), atol=0.05)
@@ -112,6 +114,7 @@ def test_what_else_is_wrong_with_contacts_is_no_error_of_a_camera(key):
     np.testing.assert_array_equal(found.offset, 0.0)
 
 
+@pytest.mark.heavy
 def test_rows_that_are_not_there_change_nothing(key):
     """Without any row what was believed stays; rows that are not held may hold anything."""
     rows = steps(turned(0.7, 0.6, [0.0, 0.0]), key)
@@ -123,6 +126,7 @@ def test_rows_that_are_not_there_change_nothing(key):
     np.testing.assert_array_equal(fit(rows, held)[0].matrix, fit(torn, held)[0].matrix)
 
 
+@pytest.mark.heavy
 def test_without_a_common_frame_nothing_is_turned(key):
     found, _ = fit(steps(turned(0.7, 1.0, [0.0, 0.0]), key), turns=False)
     np.testing.assert_allclose(found.matrix - jnp.diag(jnp.diag(found.matrix)), 0.0, atol=1e-3)

@@ -46,6 +46,7 @@ def test_members_part_even_from_equal_weights(key):
     assert not jnp.array_equal(kernel[0], kernel[1]) and not jnp.array_equal(kernel[1], kernel[2])
 
 
+@pytest.mark.heavy
 def test_every_member_learns(key):
     network = networks.make_dynamics(2, 1, networks.NetworkConfig((16,)), members=3)
     unit, batch = Normalizer(jnp.zeros(2), jnp.ones(2)), data(key)

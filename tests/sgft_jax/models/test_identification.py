@@ -46,11 +46,13 @@ def learned(case):
     return case.fine.observe(state, steps(case.params, jax.random.key(1), TURN), jnp.ones(N, bool), jnp.float32(0))
 
 
+@pytest.mark.heavy
 def test_one_rollout_through_the_prior_s_model_tells_the_distortion(learned):
     np.testing.assert_allclose(learned.interface.distortion.matrix, TURN.matrix, atol=0.02)
     np.testing.assert_allclose(learned.interface.distortion.bias, TURN.bias, atol=0.02)
 
 
+@pytest.mark.heavy
 def test_where_nothing_differs_commands_stay_as_they_are(case):
     state = case.fine.init(case.params, jax.random.key(0))
     rows = steps(case.params, jax.random.key(1), distortion.none(2, 2))

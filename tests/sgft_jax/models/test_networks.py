@@ -78,6 +78,7 @@ def test_layer_norm_only_where_asked(key):
     assert count(networks.make_actor(3, 2, actor_norm)) == 2
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("extra", [[0.0, 0.0], [1.0, 0.0], [5.0, -7.0]])
 def test_padding_leaves_the_function_alone(key, extra):
     obs, action, extra = jnp.arange(3.0), jnp.array([0.2, -0.4]), jnp.array(extra)
@@ -99,6 +100,7 @@ def test_fixed_entries_need_not_be_told(key):
     np.testing.assert_allclose(small.apply(fixed, obs, action), expected, rtol=1e-5)
 
 
+@pytest.mark.heavy
 def test_padded_rows_can_learn(key):
     value = networks.make_value(4, TINY)
     padded = networks.pad_first_layer(networks.make_value(3, TINY).init(key), 3, 1)

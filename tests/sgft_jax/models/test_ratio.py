@@ -105,6 +105,7 @@ def estimates(learned, s, a, noise):
     )
 
 
+@pytest.mark.heavy
 def test_the_learned_ratio_of_two_gaussians_is_the_true_one(learned):
     """log N(e; 0, 1) - log N(e; 1, 1) = 1/2 - e, wherever s and a are: from 2.0 at e = -1.5 to -2.0 at e = 2.5."""
     e = np.tile(np.linspace(-1.0, 2.0, 13), 5)
@@ -142,6 +143,7 @@ def small_batch(key):
     return Batch(obs, action, zero, zero, next_obs, is_sim=jnp.array([0, 0, 1, 1, 1, 1], bool))
 
 
+@pytest.mark.heavy
 def test_both_domains_count_alike_however_many_rows_each_has(key):
     """Four copies of a simulated row weigh as much as one of them."""
     batch = jax.tree.map(lambda x: x[jnp.array([0, 1, 2, 2, 2, 2])], small_batch(key))
@@ -179,6 +181,7 @@ def test_the_pair_learns_from_both_losses_and_the_joint_from_its_own(key):
     chex.assert_trees_all_close(gradients(new), list(expected), rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.heavy
 def test_noise_is_there_in_training_alone(key):
     batch, other = small_batch(key), jax.random.key(1)
     batch = batch._replace(valid=jnp.ones(6, bool))

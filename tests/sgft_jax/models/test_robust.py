@@ -31,6 +31,7 @@ def cost(p, rows, slope, belief):
     return -student.logpdf(rows - p * slope).sum() - stats.norm.logpdf(p, scale=belief)
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("belief", [10.0, 0.2])
 @pytest.mark.parametrize("twice", [False, True])
 def test_the_most_probable_point_is_that_of_students_t_and_the_prior(belief, twice):
@@ -59,6 +60,7 @@ def test_rows_that_are_not_held_and_bounds():
     assert fit(ROWS, SLOPE, 1.0, bound=0.1)[0][0] == pytest.approx(0.1)
 
 
+@pytest.mark.heavy
 def test_spreads_are_robust_and_never_nothing():
     values = jnp.array([[1.0, 0.0], [-2.0, 0.0], [3.0, 0.0], [1e6, 0.0]])
     held = jnp.array([True, True, True, False])

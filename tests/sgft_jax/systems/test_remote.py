@@ -155,6 +155,7 @@ def test_no_episode_begins_beyond_the_workspace(pair):
     assert any("measured number 1 is 3, beyond the workspace" in line for line in own.said)
 
 
+@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("driver", [Point, Arm])
 def test_lost_doubled_and_damaged_messages_move_nothing_twice(pair, driver, monkeypatch):
     """Every fourth message is lost, some come twice, some are damaged, in both directions."""

@@ -68,6 +68,7 @@ def steady(actions):
     return Policy(lambda: jnp.zeros(()), act)
 
 
+@pytest.mark.heavy
 def test_a_robot_plays_the_episodes_of_the_simulation(robot):
     env = toy.make()
     policy, states = steady(env.act_dim), jnp.array([0.7])

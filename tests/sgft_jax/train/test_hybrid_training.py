@@ -95,6 +95,7 @@ def test_nothing_is_learned_while_every_simulator_explodes(monkeypatch):
     assert all(np.isnan(values).all() for values in metrics.values())
 
 
+@pytest.mark.heavy
 def test_each_round_collects_and_learns():
     (start, none), *chunks = run_of("h2oplus")[1]
     assert none == {} and len(chunks) == 4
@@ -106,6 +107,7 @@ def test_each_round_collects_and_learns():
         assert all(np.isfinite(values).all() and values.shape == (1,) for values in metrics.values())
 
 
+@pytest.mark.heavy
 @each_method
 def test_no_key_is_used_twice(name):
     """In filling the buffer, in rounds of steps and in updates. The learners alone: test_contract_learners.py."""
@@ -144,6 +146,7 @@ def biased():
     return jax.tree.map(lambda x: np.asarray(x)[:, held], (state.replay.data, state.notes.data))
 
 
+@pytest.mark.heavy
 def test_the_rows_are_those_of_the_members_own_simulator():
     """What a push does to a heavy and to a light point tells which simulator a row is from."""
     rows, sent = biased()
@@ -186,6 +189,7 @@ def test_members_do_what_they_would_do_alone():
     chex.assert_trees_all_close(own.learner, plain(alone).learner, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.heavy
 @each_method
 def test_a_resumed_run_ends_like_an_uninterrupted_one(name):
     agent, whole = run_of(name)
@@ -291,6 +295,7 @@ def test_presets_of_h2oplus_change_what_their_names_say_and_nothing_else():
     assert (paper["value_alpha"], paper["value_cut"]) == (1.0, 5.0)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["eql", "xql"])
 def test_scale_and_cut_off_of_a_backbone_reach_its_learner(name):
     own = get_method("h2oplus", "fixed").presets[name]
@@ -363,6 +368,7 @@ def test_two_critics_without_diversity_are_those_of_h2oplus():
     chex.assert_trees_all_equal(*map(plain, states))
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["iql", pytest.param("rebrac", marks=pytest.mark.slow)])
 def test_offline_methods_have_no_simulator(name):
     state, _ = run_of(name)[1][-1]
@@ -375,6 +381,7 @@ def test_the_noise_of_h2o_has_the_spread_of_the_data():
     np.testing.assert_allclose(state.learner.spread[0], real_rows().rows.obs.std(0), rtol=1e-4)
 
 
+@pytest.mark.heavy
 def test_the_rate_of_iqls_actor_falls_over_the_whole_run_if_asked_to():
     """The last chunk is whole: 20 updates make four chunks of 6. A resumed run goes on where the rate was."""
     agent, schedule = build("iql", falling_rate=True), dataclasses.replace(SCHEDULE, updates=20)
@@ -401,6 +408,7 @@ def test_a_log_of_one_episode_keeps_its_rewards():
     assert return_scale(jax.tree.map(jnp.asarray, one)) == 1
 
 
+@pytest.mark.heavy
 def test_the_scale_of_a_backbone_is_one_of_returns_that_span_1000():
     """alpha = 2 of these is 2 span / 1,000 of the returns that the critic learns."""
     agent = build(value_loss="eql", value_alpha=2.0)
