@@ -56,6 +56,7 @@ def test_reward_is_a_function_of_true_observations(pushing, started):
     np.testing.assert_allclose(after.reward, wanted, atol=1e-6)
 
 
+@pytest.mark.heavy
 def test_time_limit_truncates_and_never_terminates(pushing, started):
     late = started._replace(time=jnp.array([0, 37, 38, 39], jnp.int32))
     after = pushing.step_batch(pushing.worlds, late, ACTIONS, KEYS)

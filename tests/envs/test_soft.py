@@ -90,6 +90,7 @@ def test_left_alone_it_comes_to_rest(real):
     assert np.abs(states[-1].physics.qvel[arm.N_JOINTS :]).max() < 0.05  # m/s and rad/s
 
 
+@pytest.mark.heavy
 def test_pushed_it_deforms_and_follows(real):
     states = played(real, lambda obs: push_softly(WAYS[real.env.name]._replace(gain=1.0), obs), steps=14)
     assert states[-1].true_obs[2] - states[0].true_obs[2] > 0.03

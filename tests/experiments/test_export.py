@@ -57,6 +57,7 @@ def test_the_folder_is_played_without_this_code_or_jax(run, capsys):
     assert others == []
 
 
+@pytest.mark.heavy
 def test_the_player_is_python_3_9(run):
     export.main(ExportArgs(run / "policy/seed-0", "numpy", run.parent / "one"))
     tree = ast.parse((run.parent / "one/policy.py").read_text(), feature_version=(3, 9))

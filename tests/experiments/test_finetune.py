@@ -216,6 +216,7 @@ def test_value_and_statistics_of_the_prior_stay_frozen_and_its_actor_moves(home,
         assert (tuned.card["finetuned"]["method"], tuned.card["finetuned"]["seed"]) == (method, seed)
 
 
+@pytest.mark.heavy
 def test_the_best_policy_is_of_an_earlier_moment(home):
     """Five rollouts are evidence for the policy that played the last of them: it had learned from four."""
     folder = run(home, "sgft-sac")

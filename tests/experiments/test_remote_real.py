@@ -105,6 +105,7 @@ def test_what_a_kill_leaves_of_a_rollout_is_a_rollout_and_its_next_step_is_in_do
         assert not found[0, 1, 7:].any()
 
 
+@pytest.mark.heavy
 def test_a_kill_in_the_first_step_of_a_rollout_leaves_it_in_doubt(tmp_path):
     whole = rollouts(tmp_path / "whole", 10**6, count=1)
     with pytest.raises(KeyboardInterrupt):

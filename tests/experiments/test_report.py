@@ -59,6 +59,7 @@ def test_a_model_of_no_change_errs_like_standing_still():
     np.testing.assert_allclose(report.model_error, report.still_error, rtol=1e-5)
 
 
+@pytest.mark.heavy
 def test_model_error_grows_by_its_bias():
     """Nothing moves, and both members predict 0.1 standard deviations of drift a step: 0.1, 0.2, ... 1.0."""
     at_rest = toy.make()

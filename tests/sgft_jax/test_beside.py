@@ -65,6 +65,7 @@ def test_a_robot_that_waits_for_its_policy_gives_the_same_bits(changes):
     assert learner.parts == [list(range(first)), *[[i] for i in range(first, 5)]]
 
 
+@pytest.mark.heavy
 def test_a_run_with_another_learner_goes_on_with_the_same_bits():
     whole = test_train.whole()[1][:5]
     rest = run(rollouts=4, system=Stepped(), learner=Inline(FINE), progress=jax.tree.map(jnp.asarray, whole[2][0]))

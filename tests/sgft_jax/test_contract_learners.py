@@ -102,6 +102,7 @@ def test_vmap_over_seeds_equals_each_alone(name, key):
     assert bits(jax.tree.map(lambda x: x[0], together)) != bits(jax.tree.map(lambda x: x[1], together))
 
 
+@pytest.mark.heavy
 @each_learner
 def test_a_restored_state_goes_on_with_the_same_bits(name, key, tmp_path):
     case = probes.case(name)

@@ -56,6 +56,7 @@ def test_one_program_learns_for_all_members_and_keeps_them_apart(name, key):
     assert case.traces == [traced]
 
 
+@pytest.mark.heavy
 @each_method
 def test_a_saved_state_goes_on_with_the_same_bits(name, key, tmp_path):
     _, states, together = two(name)

@@ -87,7 +87,7 @@ def test_one_rollout_tells_the_system(found):
     np.testing.assert_allclose(after.learner[1].mean, TRUE, atol=0.1)
 
 
-@pytest.mark.heavy_after_first
+@pytest.mark.heavy
 def test_rows_that_do_not_count_change_nothing(found, prior):
     fine, before, after, _ = found
     rows = steps(prior, jax.random.key(1), told=False, noise=0.003)
@@ -139,6 +139,7 @@ def test_it_acts_as_if_the_system_were_told_and_so_does_what_it_exports(found, p
     np.testing.assert_allclose(acting, wish, atol=1e-5)
 
 
+@pytest.mark.heavy
 def test_metrics_tell_what_was_found_in_raw_units(found, key):
     fine, _, after, data = found
     _, metrics = fine.learn(after, key, fine.updates_per_rollout, data)

@@ -67,6 +67,7 @@ def test_motion_is_that_of_mujoco(played, i):
     np.testing.assert_allclose(after.physics.qvel[i], qvel, atol=2e-3)
 
 
+@pytest.mark.heavy
 def test_reward_of_a_step_is_that_of_both_frames(played):
     thetas, starts, after = played
     model = cartpole.build(thetas[0]).compile()

@@ -157,6 +157,7 @@ def test_an_observation_tells_what_the_next_step_does(rig):
 # --- as Meta-World moves --------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(
     ("action", "axis", "wanted"),
     [

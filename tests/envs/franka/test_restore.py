@@ -39,6 +39,7 @@ def test_a_restored_start_is_the_start(played):
     np.testing.assert_array_equal(again.obs, states[0].obs)
 
 
+@pytest.mark.heavy
 def test_observations_tell_what_the_next_step_does(played):
     """Up to 3 mm; less well where the hammer presses, as what the servos were told before is not restored."""
     env, states, actions, restored, step = played

@@ -39,7 +39,7 @@ def repeated(task, gap, before, actions):
     return *map(np.array, zip(*found, strict=True)), touched
 
 
-@pytest.mark.heavy_after_first
+@pytest.mark.heavy
 @pytest.mark.parametrize("impl", ENGINES)
 def test_every_step_of_every_gap_is_that_of_mujoco(falling, impl):
     """1e-4 in positions and 5e-3 in speeds, on the floor and in the limits too."""

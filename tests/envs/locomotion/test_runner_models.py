@@ -199,6 +199,7 @@ def test_golden_steps_of_the_real_system(golden):
     np.testing.assert_allclose(states.physics.qpos[-1, i, :3], later, atol=2e-5)
 
 
+@pytest.mark.heavy
 def test_golden_steps_of_every_gap(golden):
     task, names, states = golden
     if task == "halfcheetah":

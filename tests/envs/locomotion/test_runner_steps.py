@@ -102,6 +102,7 @@ def test_the_walker_has_fallen(height, pitch, fallen):
     assert bool(walker2d.terminated(jnp.zeros(17), jnp.zeros(6), obs)) == fallen
 
 
+@pytest.mark.heavy
 def test_a_fall_ends_the_episode_and_the_time_limit_truncates_it():
     """The bonus is paid in the step of the fall too. HalfCheetah upside down runs on."""
     for task, ends in (("walker2d", True), ("halfcheetah", False)):

@@ -118,6 +118,7 @@ def test_motion_and_sensors_are_those_of_mujoco(played, i):
     np.testing.assert_allclose(episodes.transitions.obs[i, 0], [0.0, 0.0, 0.1], atol=1e-6)  # sensed at the start, too
 
 
+@pytest.mark.heavy
 def test_the_episode_ends_at_the_wall(played):
     env, episodes = played
     lengths = episodes.valid.sum(1)

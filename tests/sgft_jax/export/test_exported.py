@@ -240,7 +240,7 @@ BAD = [
 ]
 
 
-@pytest.mark.heavy_after_first
+@pytest.mark.heavy
 @pytest.mark.parametrize("explore", [False, True])
 def test_bad_measurements_are_refused_and_not_remembered(tmp_path, explore):
     env, prior = case("recurrent")
@@ -261,7 +261,7 @@ def test_bad_measurements_are_refused_and_not_remembered(tmp_path, explore):
     np.testing.assert_array_equal(policy.act(measured[0, 1]), exact[1])
 
 
-@pytest.mark.heavy_after_first
+@pytest.mark.heavy
 @pytest.mark.parametrize("sent", [[np.nan, 0.0], [0.0, 1e30], [0.0, -1.5], ["a", 0.0], [0.0, 0.0, 0.0], [None, 0.0]])
 def test_what_cannot_have_been_sent_is_refused_and_not_remembered(tmp_path, sent):
     env, prior = case("identified")
@@ -307,6 +307,7 @@ def test_a_contract_that_is_none_is_one_line(tmp_path, content):
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("name", ["identified", "recurrent", "affine"])
 def test_what_was_really_sent_is_what_is_remembered(name, tmp_path):
     """As if the policy had given that action itself; a policy without memory acts as before."""

@@ -58,6 +58,7 @@ def test_a_wrong_simulator_pays_less(learner, key):
     assert -4 <= seen[1] < -2 < -1 < seen[0]
 
 
+@pytest.mark.heavy
 def test_the_agent_learns_from_simulated_rows_alone(learner, key):
     state, batch = learner.init(key), batch_of(key)
     one, _ = learner.update(state, batch, key)

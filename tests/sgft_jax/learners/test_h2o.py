@@ -135,6 +135,7 @@ def test_order_and_rows_of_the_update(learner, key):
     assert equal(state.log_alpha, new.log_alpha) and new.step == 1
 
 
+@pytest.mark.heavy
 def test_both_discriminators_learn_once_in_every_update(learner, key):
     """ODRL's H2O lets them learn at every tenth step alone, even where the real data are a file."""
     state = learner.init(key)

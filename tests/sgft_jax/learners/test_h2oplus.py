@@ -176,6 +176,7 @@ def test_order_and_rows_of_the_update(learner, key):
     chex.assert_trees_all_close(new.target_critic, mix, rtol=1e-5)
 
 
+@pytest.mark.heavy
 def test_the_value_learns_from_real_rows_alone_and_the_actor_from_all(plain, key):
     batch, state = batch_of(key), told_apart(plain, key)
     one, _ = plain.update(state, batch, key)
@@ -205,6 +206,7 @@ def test_a_fixed_temperature_keeps_its_bits(plain, key):
     assert equal(state.log_alpha, new.log_alpha) and metrics["actor/alpha"] == pytest.approx(0.1)
 
 
+@pytest.mark.heavy
 def test_the_temperature_compares_entropies_of_whole_actions(learner, key):
     """At first u ~ N(0, e^-1) in both dimensions: entropy 2 (1/2 log 2 pi e - 1 + E log(1 - tanh(u)^2)) = 0.61.
 

@@ -128,6 +128,7 @@ def test_probe_value_goes_from_the_mean_of_the_data_to_its_best(key, expectile, 
     np.testing.assert_allclose(q_of(state, 0.5, -0.5), 0.0, atol=0.01)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize(("beta", "max_weight", "saturated"), [(0.0, 100.0, 0.0), (3.0, 100.0, 0.0), (3.0, 4.0, 0.25)])
 def test_probe_policy_is_the_weighted_gaussian_of_the_data(key, beta, max_weight, saturated):
     """Its mean and std are those of the actions, the good one counting exp(beta), or the cap, times the other's 3.

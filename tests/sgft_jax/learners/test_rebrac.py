@@ -82,6 +82,7 @@ def test_one_update_by_hand(learner, key):
         chex.assert_trees_all_close(getattr(new, f"target_{name}"), mix, rtol=1e-5)
 
 
+@pytest.mark.heavy
 def test_actor_and_targets_move_every_second_time(learner, key):
     first, _ = learner.update(learner.init(key), batch_of(key), key)
     second, _ = learner.update(first, batch_of(key), key)

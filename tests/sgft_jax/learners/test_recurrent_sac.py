@@ -78,6 +78,7 @@ def test_acting_step_by_step_is_reading_the_window(key):
         carry = carry._replace(action=window.action[step])  # another one was taken
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("changed", ["obs", "action"])
 def test_it_remembers_what_it_saw_and_did(changed, key):
     state, obs, first = started(), jnp.array([0.3, -0.4]), jnp.array([1.0, 2.0])
@@ -167,6 +168,7 @@ def test_losses_step_by_step(key):
     np.testing.assert_allclose(metrics["actor/loss"], np.mean(of_actor), rtol=1e-4)
 
 
+@pytest.mark.heavy
 def test_steps_outside_of_a_window_change_nothing(key):
     """Whatever finite numbers they hold; the last step's successor does count."""
     state, batch = started(), windows(key)

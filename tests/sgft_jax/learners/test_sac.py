@@ -84,6 +84,7 @@ def test_every_network_of_pretraining_moves_and_statistics_do_not(key):
     assert {"critic/loss", "actor/loss", "value/loss", "dynamics/mse", "actor/alpha"} <= set(metrics)
 
 
+@pytest.mark.heavy
 def test_target_critic_follows_at_rate_tau(key):
     state = FULL_LEARNER.init(key)
     state = state.replace(hyper=state.hyper._replace(tau=jnp.float32(0.25)))
@@ -219,6 +220,7 @@ def test_the_actor_follows_the_minimum_or_the_mean(key):
         assert metrics["actor/loss"] == pytest.approx(-0.5 * float(metrics["actor/entropy"]) - q, abs=1e-4)
 
 
+@pytest.mark.heavy
 def test_the_temperature_waits_with_the_actor(key):
     config = dataclasses.replace(PLAIN, policy_delay=2)
     first, _ = UPDATE(config, INIT(PLAIN, key), probe(key), key)
@@ -315,6 +317,7 @@ def test_fine_tuning_starts_from_the_prior(prior, key):
     assert equal(fresh.target_critic, fresh.critic.params)
 
 
+@pytest.mark.heavy
 def test_the_first_policy_is_the_simulators_for_every_steps_to_go(prior, key):
     plain_learner, plain = tuned(prior, reset=False)
     learner, state = tuned(prior, reset=False, extra=3)

@@ -123,6 +123,7 @@ def test_untrained_rewards_and_values_are_zero(key):
     assert parts.dynamics.apply(state.dynamics.params, z, action).std() > 0
 
 
+@pytest.mark.heavy
 def test_policy_spread_is_bounded(key):
     parts, state = PARTS, INIT(key)
     bias = state.policy.params["Dense_2"]["bias"]
@@ -132,6 +133,7 @@ def test_policy_spread_is_bounded(key):
         assert parts.policy.apply(params, jnp.ones(16))[1, 0] == pytest.approx(log_std, abs=1e-5)
 
 
+@pytest.mark.heavy
 def test_dropout_acts_in_training_alone(key):
     config = dataclasses.replace(PLAIN, dropout=0.5)
     parts, state = tdmpc2_model.make_networks(config), shaken(PLAIN, key)
@@ -271,6 +273,7 @@ def test_losses_against_a_loop(key):
     assert metrics["critic/target_mean"] == pytest.approx(float(target), rel=1e-3)
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("config", [PLAIN, pytest.param(SGFT, marks=pytest.mark.slow)])
 def test_invalid_rows_do_not_matter(config, key):
     state, batch = shaken(config, key), windows(key)
@@ -309,6 +312,7 @@ def test_scale_follows_the_range_of_values(key):
 # --- plans ----------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.heavy
 @pytest.mark.parametrize("config", [pytest.param(PLAIN, marks=pytest.mark.slow), SGFT])
 def test_score_of_a_plan_against_a_loop(config, key):
     state, parts = shaken(config, key), PARTS._replace(config=config)

@@ -61,6 +61,7 @@ def test_where_nothing_differs_commands_stay_as_they_are(case):
     np.testing.assert_array_equal(state.interface.distortion.bias, 0.0)
 
 
+@pytest.mark.heavy
 def test_it_commands_what_stands_for_the_wish_of_the_actor_and_so_does_what_it_exports(case, learned, tmp_path):
     obs, key = jnp.array([0.3, -0.8]), jax.random.key(2)
     plain = tuners.tuner("sac").fine

@@ -116,6 +116,7 @@ def test_the_learned_ratio_of_two_gaussians_is_the_true_one(learned):
     assert np.polyfit(e, got, 1)[0] == pytest.approx(-1.0, abs=0.12)  # two softmaxes would flatten it
 
 
+@pytest.mark.heavy
 def test_simulated_rows_weigh_less_where_the_simulator_errs(learned):
     """Direction: P / P_sim. E_sim[min(w, 1)] = 2 Phi(-1/2) = 0.617; with the inverse, 0.87."""
     learner, state, _ = learned
@@ -202,6 +203,7 @@ def test_every_part_of_a_row_gets_noise(key):
     np.testing.assert_allclose(np.cov(seen.T), 0.01 * np.eye(7), atol=1e-3)
 
 
+@pytest.mark.heavy
 def test_standardised_inputs(key):
     """With the statistics of the data, rows in any unit give the same step."""
     statistics = normalizer.Normalizer(jnp.array([3.0, -20.0]), jnp.array([0.1, 10.0]))

@@ -89,6 +89,7 @@ def test_a_robot_plays_the_episodes_of_the_simulation(robot):
     assert driver.rests >= 2
 
 
+@pytest.mark.heavy
 def test_what_was_sent_is_what_is_kept(robot):
     env = toy.make()
     remote, _ = robot(limits=Limits(low=-0.2, high=0.2))

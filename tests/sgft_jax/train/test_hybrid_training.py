@@ -155,6 +155,7 @@ def test_the_rows_are_those_of_the_members_own_simulator():
     np.testing.assert_allclose(gain, [0.1 * toy.FORCE / 0.5, 0.1 * toy.FORCE / 4.0], rtol=0.1)
 
 
+@pytest.mark.heavy
 def test_the_buffer_keeps_the_actions_as_they_were_chosen():
     """The motor gets what the gap makes of an action, and a row holds the action, as in H2O+'s simulators."""
     rows, sent = biased()
@@ -199,6 +200,7 @@ def test_a_resumed_run_ends_like_an_uninterrupted_one(name):
     chex.assert_trees_all_equal(plain(resumed[-1][0]), plain(end))
 
 
+@pytest.mark.heavy
 def test_the_shapes_of_a_state_are_known_without_training():
     agent, chunks = run_of("h2oplus")
     like = hybrid.shape_of(ENV, agent, SCHEDULE, pools_of(1.0), real_rows(), keys_of(0))
@@ -394,6 +396,7 @@ def test_the_rate_of_iqls_actor_falls_over_the_whole_run_if_asked_to():
     chex.assert_trees_all_equal(plain(resumed[-1][0]), plain(chunks[-1][0]))
 
 
+@pytest.mark.heavy
 def test_iql_scales_rewards_to_the_span_of_the_returns():
     rows = real_rows()
     returns = rows.rows.reward.reshape(5, 10).sum(1)
