@@ -11,6 +11,8 @@ from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.policies import sac_policy
 from sgft_jax.types import Normalizer
 
+pytestmark = pytest.mark.heavy  # all of them compile
+
 NETWORK = NetworkConfig(hidden=(4,))
 
 
@@ -52,14 +54,12 @@ def test_returns_look_past_the_time_limit(bias):
     assert numbers(report)["value/bias"] == pytest.approx(bias - expected.mean(), abs=1e-5)
 
 
-@pytest.mark.heavy
 def test_a_model_of_no_change_errs_like_standing_still():
     report = reported(toy.make())
     assert report.model_error.shape == (10,) and (report.still_error > 0).all()
     np.testing.assert_allclose(report.model_error, report.still_error, rtol=1e-5)
 
 
-@pytest.mark.heavy
 def test_model_error_grows_by_its_bias():
     """Nothing moves, and both members predict 0.1 standard deviations of drift a step: 0.1, 0.2, ... 1.0."""
     at_rest = toy.make()

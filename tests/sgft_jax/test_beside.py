@@ -16,6 +16,8 @@ from envs.types import UserError
 from sgft_jax.train.finetuning import Updates, prior_of
 from sgft_jax.train.learner_process import LearnerProcess, cores
 
+pytestmark = pytest.mark.heavy  # all of them compile
+
 WHICH = prior_of(PRIORS, SEEDS)
 
 
@@ -51,7 +53,6 @@ class Stepped:
 _SLOWER = [{"initial_rollouts": 3}, {"guard": True}]
 
 
-@pytest.mark.heavy
 @pytest.mark.parametrize("changes", [{}, *(pytest.param(own, marks=pytest.mark.slow) for own in _SLOWER)], ids=str)
 def test_a_robot_that_waits_for_its_policy_gives_the_same_bits(changes):
     finetuner = make(**changes) if changes else FINE
@@ -65,7 +66,6 @@ def test_a_robot_that_waits_for_its_policy_gives_the_same_bits(changes):
     assert learner.parts == [list(range(first)), *[[i] for i in range(first, 5)]]
 
 
-@pytest.mark.heavy
 def test_a_run_with_another_learner_goes_on_with_the_same_bits():
     whole = test_train.whole()[1][:5]
     rest = run(rollouts=4, system=Stepped(), learner=Inline(FINE), progress=jax.tree.map(jnp.asarray, whole[2][0]))
@@ -98,7 +98,6 @@ class Handed(Stepped):
         return self.system.play(policy, states, keys, explore=explore)
 
 
-@pytest.mark.heavy_after_first
 @pytest.mark.parametrize(("late", "behind"), [(9, 1), (2, 1), (1, 0), (0, 0)])
 def test_what_was_played_speaks_for_who_made_most_of_the_steps(late, behind):
     """Of three steps: all, two, one or none by the agent that has not learned from the rollout before."""

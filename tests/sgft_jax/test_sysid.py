@@ -28,6 +28,8 @@ from sgft_jax.train import finetuning
 from sgft_jax.train.pretraining import prior_card
 from sgft_jax.types import Normalizer, Prior, SimulatedData
 
+pytestmark = pytest.mark.heavy  # all of them compile
+
 SYSTEM = (Varying("action_scale", 0, 0.5, 1.5), Varying("action_rotation", 0, -0.5, 0.5))
 ENV = with_system(toy.make(), SYSTEM)
 TRUE = jnp.array([-0.4, 0.6])  # scale 0.8 along x, 0.3 rad
@@ -80,14 +82,12 @@ def found(request, prior):
     return fine._replace(observe=observe), state, observe(state, *torn(rows, 0.0), jnp.float32(0.0)), data
 
 
-@pytest.mark.heavy
 def test_one_rollout_tells_the_system(found):
     _, before, after, _ = found
     np.testing.assert_array_equal(before.learner[1].mean, 0.0)
     np.testing.assert_allclose(after.learner[1].mean, TRUE, atol=0.1)
 
 
-@pytest.mark.heavy
 def test_rows_that_do_not_count_change_nothing(found, prior):
     fine, before, after, _ = found
     rows = steps(prior, jax.random.key(1), told=False, noise=0.003)
@@ -139,7 +139,6 @@ def test_it_acts_as_if_the_system_were_told_and_so_does_what_it_exports(found, p
     np.testing.assert_allclose(acting, wish, atol=1e-5)
 
 
-@pytest.mark.heavy
 def test_metrics_tell_what_was_found_in_raw_units(found, key):
     fine, _, after, data = found
     _, metrics = fine.learn(after, key, fine.updates_per_rollout, data)

@@ -12,6 +12,8 @@ from sgft_jax.learners import h2o
 from sgft_jax.models import networks, ratio
 from sgft_jax.types import Batch
 
+pytestmark = pytest.mark.heavy  # all of them compile
+
 BODY = networks.NetworkConfig((16,))
 ROWS = 12
 SIM = jnp.arange(ROWS) % 2 == 1
@@ -70,7 +72,6 @@ def test_shares_by_hand():
     np.testing.assert_allclose(valid, [0.25, 0.75, 0], atol=1e-6)
 
 
-@pytest.mark.heavy
 def test_the_penalty_by_hand():
     """log(.25 e^1 + .75 e^2) - (3 + 5) / 2 for one critic, log(.25 + .75) - 0 for the other."""
     batch = rows([True, True, False, False])
@@ -105,7 +106,6 @@ def test_the_gap_grows_with_the_simulators_error(learner, key):
 # --- one update -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.heavy
 def test_order_and_rows_of_the_update(learner, key):
     """Losses are those of the old networks, gaps and weights those of the new discriminators; no entropy in targets."""
     batch = batch_of(key)
@@ -135,7 +135,6 @@ def test_order_and_rows_of_the_update(learner, key):
     assert equal(state.log_alpha, new.log_alpha) and new.step == 1
 
 
-@pytest.mark.heavy
 def test_both_discriminators_learn_once_in_every_update(learner, key):
     """ODRL's H2O lets them learn at every tenth step alone, even where the real data are a file."""
     state = learner.init(key)

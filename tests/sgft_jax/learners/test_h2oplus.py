@@ -13,6 +13,8 @@ from sgft_jax.learners import edac, h2oplus
 from sgft_jax.models import networks, normalizer, ratio
 from sgft_jax.types import Batch
 
+pytestmark = pytest.mark.heavy  # all of them compile
+
 f = jnp.float32
 BODY = networks.NetworkConfig((16,))
 ROWS = 12
@@ -93,7 +95,6 @@ def test_the_target_refuses_a_batch():
         h2oplus.mixed_target(f(1), f(0.9), jnp.ones(2), jnp.ones(2), f(0), value_share=0.1, alpha=0.1)
 
 
-@pytest.mark.heavy
 def test_share_zero_ignores_the_value_and_share_one_the_policy(plain, key):
     """0 is SAC on both sources, 1 a bootstrap from V alone."""
     batch, other = batch_of(key), jax.random.key(1)
@@ -112,7 +113,6 @@ def test_share_zero_ignores_the_value_and_share_one_the_policy(plain, key):
 # --- one update -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.heavy
 def test_every_network_moves_and_statistics_do_not(learner, key):
     state = learner.init(key)
     new, metrics = learner.update(state, batch_of(key), key)
@@ -126,7 +126,6 @@ def test_every_network_moves_and_statistics_do_not(learner, key):
     assert new.step == 1 and all(jnp.shape(m) == () and jnp.isfinite(m) for m in metrics.values())
 
 
-@pytest.mark.heavy
 def test_order_and_rows_of_the_update(learner, key):
     """All losses are those of the old networks but for the weights, which the new discriminators give."""
     batch = batch_of(key)
@@ -176,7 +175,6 @@ def test_order_and_rows_of_the_update(learner, key):
     chex.assert_trees_all_close(new.target_critic, mix, rtol=1e-5)
 
 
-@pytest.mark.heavy
 def test_the_value_learns_from_real_rows_alone_and_the_actor_from_all(plain, key):
     batch, state = batch_of(key), told_apart(plain, key)
     one, _ = plain.update(state, batch, key)
@@ -206,7 +204,6 @@ def test_a_fixed_temperature_keeps_its_bits(plain, key):
     assert equal(state.log_alpha, new.log_alpha) and metrics["actor/alpha"] == pytest.approx(0.1)
 
 
-@pytest.mark.heavy
 def test_the_temperature_compares_entropies_of_whole_actions(learner, key):
     """At first u ~ N(0, e^-1) in both dimensions: entropy 2 (1/2 log 2 pi e - 1 + E log(1 - tanh(u)^2)) = 0.61.
 
@@ -247,7 +244,6 @@ def test_observations_are_normalised_everywhere(plain, key):
 # --- the discriminators -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.heavy
 def test_rows_of_the_discriminators_train_nothing_else(key):
     """The last four; and they learn at every update, from no other rows."""
     learner = compiled(h2oplus.H2OPlusConfig(3, 2, network=BODY, ratio_network=BODY, ratio_rows=4))
@@ -290,7 +286,6 @@ def test_origin_is_needed(learner, key):
 # --- the ensemble -----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.heavy
 def test_diversity_counts_the_gradients_of_the_real_pairs_alone(key):
     """Half of their mean alignment joins the loss, and what pulls them apart moves the critics and nothing else."""
     body = {"network": BODY, "ratio": False, "tune_alpha": False, "critics": 3}
@@ -307,7 +302,6 @@ def test_diversity_counts_the_gradients_of_the_real_pairs_alone(key):
     assert equal((without.actor, without.value), (apart.actor, apart.value))
 
 
-@pytest.mark.heavy
 def test_the_cut_off_is_a_number_of_the_agent(key):
     """Exponents that end at 0.5 give another value loss than those that end at 7."""
     config = h2oplus.H2OPlusConfig(3, 2, network=BODY, ratio=False, tune_alpha=False, value_loss="xql")

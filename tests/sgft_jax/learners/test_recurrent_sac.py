@@ -21,6 +21,8 @@ from sgft_jax.presets import PretrainConfig
 from sgft_jax.train.pretraining import pretrain, priors_of
 from sgft_jax.types import Batch, Normalizer
 
+pytestmark = pytest.mark.heavy  # all of them compile
+
 B, T, OBS, ACT, UNITS = 3, 5, 2, 1, 6
 NET = NetworkConfig(hidden=(8,))
 CONFIG = recurrent.RecurrentConfig(OBS, ACT, network=NET, gru=UNITS)
@@ -56,7 +58,6 @@ def windows(key, lengths=(T, 3, 1)):
 # --- acting -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.heavy
 def test_acting_step_by_step_is_reading_the_window(key):
     """With the actions that were taken in the carry, the policy's moments are those that the losses see."""
     state, window = started(), jax.tree.map(lambda x: x[0], windows(key))
@@ -78,7 +79,6 @@ def test_acting_step_by_step_is_reading_the_window(key):
         carry = carry._replace(action=window.action[step])  # another one was taken
 
 
-@pytest.mark.heavy
 @pytest.mark.parametrize("changed", ["obs", "action"])
 def test_it_remembers_what_it_saw_and_did(changed, key):
     state, obs, first = started(), jnp.array([0.3, -0.4]), jnp.array([1.0, 2.0])
@@ -109,7 +109,6 @@ def test_the_policy_of_a_prior_is_the_agents(key):
 # --- learning ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.heavy
 def test_shapes(key):
     state, batch = started(), windows(key)
     new, metrics = update(state, batch, key)
@@ -133,7 +132,6 @@ def test_shapes(key):
     assert all(jax.tree.leaves(moved([new.actor.params, new.critic.params], [state.actor.params, state.critic.params])))
 
 
-@pytest.mark.heavy
 def test_losses_step_by_step(key):
     """Each memory unrolled over each window by a loop; the draws are those of the update."""
     state, batch = started(), windows(key)
@@ -168,7 +166,6 @@ def test_losses_step_by_step(key):
     np.testing.assert_allclose(metrics["actor/loss"], np.mean(of_actor), rtol=1e-4)
 
 
-@pytest.mark.heavy
 def test_steps_outside_of_a_window_change_nothing(key):
     """Whatever finite numbers they hold; the last step's successor does count."""
     state, batch = started(), windows(key)

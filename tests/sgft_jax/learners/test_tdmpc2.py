@@ -18,6 +18,8 @@ from sgft_jax.math import optim
 from sgft_jax.models import normalizer, twohot
 from sgft_jax.types import Batch
 
+pytestmark = pytest.mark.heavy  # all of them compile
+
 SGFT = dataclasses.replace(PLAIN, sgft=True)
 NETWORKS = ("encoder", "dynamics", "reward", "policy", "critic")
 
@@ -93,7 +95,6 @@ def test_a_layer_of_two_vectors_is_one_of_both(key):
     np.testing.assert_allclose(layer.apply(params, x[:2], x[2:]), x @ kernel + jnp.array([1.0, 2.0, 3.0]), rtol=1e-5)
 
 
-@pytest.mark.heavy
 def test_latents_are_groups_that_sum_to_one(key):
     state, parts = shaken(PLAIN, key), PARTS
     z = parts.encoder.apply(state.encoder.params, jnp.array([3.0, -2.0]))
@@ -113,7 +114,6 @@ def test_published_sizes(name):
     assert count / 1e6 == pytest.approx(float(name.removesuffix("M")), rel=0.25 if name == "1M" else 0.06)
 
 
-@pytest.mark.heavy
 def test_untrained_rewards_and_values_are_zero(key):
     parts, state = PARTS, INIT(key)
     z, action = jnp.full(16, 0.25), jnp.ones(1)
@@ -123,7 +123,6 @@ def test_untrained_rewards_and_values_are_zero(key):
     assert parts.dynamics.apply(state.dynamics.params, z, action).std() > 0
 
 
-@pytest.mark.heavy
 def test_policy_spread_is_bounded(key):
     parts, state = PARTS, INIT(key)
     bias = state.policy.params["Dense_2"]["bias"]
@@ -133,7 +132,6 @@ def test_policy_spread_is_bounded(key):
         assert parts.policy.apply(params, jnp.ones(16))[1, 0] == pytest.approx(log_std, abs=1e-5)
 
 
-@pytest.mark.heavy
 def test_dropout_acts_in_training_alone(key):
     config = dataclasses.replace(PLAIN, dropout=0.5)
     parts, state = tdmpc2_model.make_networks(config), shaken(PLAIN, key)
@@ -150,7 +148,6 @@ def q_by_hand(params, z, action):
     return DECODE(PARTS.critic.apply(params, z, action))
 
 
-@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("config", [PLAIN, SGFT])
 def test_v_sim_is_the_mean_of_all_heads_at_the_mean_action(config, key):
     state, parts, obs = shaken(config, key), PARTS, jnp.array([1.0, 2.0])
@@ -173,7 +170,6 @@ def test_sampled_value_is_the_lower_of_two_heads(key):
     assert jnp.mean(jnp.isclose(values, q[1], rtol=1e-2)) == pytest.approx(1 / 3, abs=0.1)
 
 
-@pytest.mark.heavy_after_first
 @pytest.mark.parametrize("trained", [False, True])
 def test_drawn_heads_are_those_of_the_whole_critic(key, trained):
     """Evaluated alone, with their own parameters and dropout, two heads say what they say among all."""
@@ -260,7 +256,6 @@ def model_losses_by_hand(config, state, batch, heads):
     return sums / weight * 0.75, jnp.stack(targets).mean()
 
 
-@pytest.mark.heavy
 def test_losses_against_a_loop(key):
     state, batch = calm(shaken(PLAIN, key)), windows(key)
     counts = jnp.zeros(ROWS, bool).at[jnp.array([0, ROWS - 1])].set(True)
@@ -273,7 +268,6 @@ def test_losses_against_a_loop(key):
     assert metrics["critic/target_mean"] == pytest.approx(float(target), rel=1e-3)
 
 
-@pytest.mark.heavy
 @pytest.mark.parametrize("config", [PLAIN, pytest.param(SGFT, marks=pytest.mark.slow)])
 def test_invalid_rows_do_not_matter(config, key):
     state, batch = shaken(config, key), windows(key)
@@ -290,7 +284,6 @@ def test_invalid_rows_do_not_matter(config, key):
     assert not equal(UPDATE[config](state, seen, key)[0].reward, a.reward)
 
 
-@pytest.mark.heavy
 def test_the_policy_learns_where_the_last_valid_step_led_and_no_further(key):
     """Of three latents of a window whose first step alone is valid, the first two count."""
     state, zs, valid = shaken(PLAIN, key), jnp.full((2, 3, 16), 0.25), jnp.array([[True, False], [True, True]])
@@ -312,7 +305,6 @@ def test_scale_follows_the_range_of_values(key):
 # --- plans ----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.heavy
 @pytest.mark.parametrize("config", [pytest.param(PLAIN, marks=pytest.mark.slow), SGFT])
 def test_score_of_a_plan_against_a_loop(config, key):
     state, parts = shaken(config, key), PARTS._replace(config=config)
@@ -358,7 +350,6 @@ def test_sgft_policy_is_promised_one_step_and_v_sim(key):
     assert got == pytest.approx(float(r + 0.99 * v), rel=1e-4)
 
 
-@pytest.mark.heavy
 def test_acting(key):
     state, obs, rest = shaken(PLAIN, key), jnp.ones(2), LEARNERS[PLAIN].init_carry()
     assert rest.shape == (2, 1) and not rest.any()
@@ -378,7 +369,6 @@ def test_planning_without_proposals(key):
     assert jnp.abs(action[0]) <= 1
 
 
-@pytest.mark.heavy
 def test_policy_action(key):
     state, parts, obs = shaken(PLAIN, key), PARTS, jnp.array([1.0, 2.0])
     z = parts.encoder.apply(state.encoder.params, jnp.array([0.25, 5.0]))
@@ -425,7 +415,6 @@ def test_learning_rates(key):
         assert jnp.abs(moved - old).max() == pytest.approx(rate, rel=2e-2), name
 
 
-@pytest.mark.heavy_after_first
 @pytest.mark.parametrize(("warmup", "done", "share"), [(4, 0, 1 / 4), (4, 2, 3 / 4), (4, 3, 1), (4, 9, 1), (0, 0, 1)])
 def test_learning_rates_rise_from_zero(key, warmup, done, share):
     """Moments are fresh and the data the same, so steps are as their rates."""
@@ -461,7 +450,6 @@ def test_hyperparameters_vmap(key):
 # --- between simulation and reality ---------------------------------------------------------------------------------
 
 
-@pytest.mark.heavy
 def test_fine_tuning_starts_from_the_prior(key):
     trained = shaken(PLAIN, key).replace(scale=jnp.float32(7.0))
     prior = tdmpc2.extract_params(trained)

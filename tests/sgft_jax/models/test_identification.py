@@ -13,6 +13,8 @@ from sgft_jax.models.distortion import Distortion, command_interface
 from sgft_jax.models.networks import make_dynamics
 from sgft_jax.types import Batch, Prior, SimulatedData
 
+pytestmark = pytest.mark.heavy  # all of them compile
+
 TURN = Distortion(0.7 * jnp.array([[0.8, -0.6], [0.6, 0.8]]), jnp.array([0.1, 0.0]), jnp.zeros(2))
 N = 30
 
@@ -46,13 +48,11 @@ def learned(case):
     return case.fine.observe(state, steps(case.params, jax.random.key(1), TURN), jnp.ones(N, bool), jnp.float32(0))
 
 
-@pytest.mark.heavy
 def test_one_rollout_through_the_prior_s_model_tells_the_distortion(learned):
     np.testing.assert_allclose(learned.interface.distortion.matrix, TURN.matrix, atol=0.02)
     np.testing.assert_allclose(learned.interface.distortion.bias, TURN.bias, atol=0.02)
 
 
-@pytest.mark.heavy
 def test_where_nothing_differs_commands_stay_as_they_are(case):
     state = case.fine.init(case.params, jax.random.key(0))
     rows = steps(case.params, jax.random.key(1), distortion.none(2, 2))
@@ -61,7 +61,6 @@ def test_where_nothing_differs_commands_stay_as_they_are(case):
     np.testing.assert_array_equal(state.interface.distortion.bias, 0.0)
 
 
-@pytest.mark.heavy
 def test_it_commands_what_stands_for_the_wish_of_the_actor_and_so_does_what_it_exports(case, learned, tmp_path):
     obs, key = jnp.array([0.3, -0.8]), jax.random.key(2)
     plain = tuners.tuner("sac").fine
