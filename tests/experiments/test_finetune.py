@@ -385,6 +385,7 @@ def test_more_rollouts_continue_a_finished_run(home, tmp_path):
     same_results(tmp_path / "finetune/toy/turned/sac/seeds-0-1", run(home, "sac"))
 
 
+@pytest.mark.heavy
 def test_a_rollout_is_on_disk_before_learning_from_it(home, tmp_path, monkeypatch):
     """Those of the prior are the same whatever the method."""
     usual = rollouts(run(home, "sgft-sac"))
@@ -437,6 +438,7 @@ def test_a_recorded_system_plays_what_is_missing_and_no_more(tmp_path):
         RecordedSystem(inner, [store], done=4)
 
 
+@pytest.mark.heavy
 def test_no_rollout_of_a_real_system_is_replaced_because_another_lacks_it(tmp_path):
     one, two = RealStore(tmp_path / "one"), RealStore(tmp_path / "two")
     system = RecordedSystem(Counter(), [one, two], done=0)
@@ -514,6 +516,7 @@ def test_training_that_diverges_stops_in_one_line(home, tmp_path, capsys):
     assert len(RealStore(folder)) == 2 and not (folder / "metrics.jsonl").exists()
 
 
+@pytest.mark.heavy
 def test_another_configuration_does_not_continue_a_run(home, capsys):
     run(home, "sgft-sac")
     capsys.readouterr()
@@ -522,6 +525,7 @@ def test_another_configuration_does_not_continue_a_run(home, capsys):
     assert "options.utd was 0.5, now 1.0" in error
 
 
+@pytest.mark.heavy
 def test_other_priors_do_not_continue_a_run(home, tmp_path, capsys):
     folder = tmp_path / run(home, "sgft-sac").relative_to(home)
     shutil.copytree(run(home, "sgft-sac"), folder)

@@ -66,6 +66,7 @@ def test_a_saved_state_goes_on_with_the_same_bits(name, key, tmp_path):
     assert bits(together(restored, seeds)) == bits(together(states, seeds))
 
 
+@pytest.mark.heavy
 @each_method
 def test_what_is_exported_acts_like_the_agent(name, key):
     """Also as loaded from a file, by the prior's card and what the method adds to it."""

@@ -15,6 +15,8 @@ from sgft_jax.models import normalizer, ratio
 from sgft_jax.models.networks import NetworkConfig
 from sgft_jax.types import Batch
 
+pytestmark = pytest.mark.heavy  # all of them compile
+
 f = jnp.float32
 SMALL = ratio.RatioConfig(2, 1, NetworkConfig((8,)))
 HALF = 128
@@ -105,7 +107,6 @@ def estimates(learned, s, a, noise):
     )
 
 
-@pytest.mark.heavy
 def test_the_learned_ratio_of_two_gaussians_is_the_true_one(learned):
     """log N(e; 0, 1) - log N(e; 1, 1) = 1/2 - e, wherever s and a are: from 2.0 at e = -1.5 to -2.0 at e = 2.5."""
     e = np.tile(np.linspace(-1.0, 2.0, 13), 5)
@@ -116,7 +117,6 @@ def test_the_learned_ratio_of_two_gaussians_is_the_true_one(learned):
     assert np.polyfit(e, got, 1)[0] == pytest.approx(-1.0, abs=0.12)  # two softmaxes would flatten it
 
 
-@pytest.mark.heavy
 def test_simulated_rows_weigh_less_where_the_simulator_errs(learned):
     """Direction: P / P_sim. E_sim[min(w, 1)] = 2 Phi(-1/2) = 0.617; with the inverse, 0.87."""
     learner, state, _ = learned
@@ -144,7 +144,6 @@ def small_batch(key):
     return Batch(obs, action, zero, zero, next_obs, is_sim=jnp.array([0, 0, 1, 1, 1, 1], bool))
 
 
-@pytest.mark.heavy
 def test_both_domains_count_alike_however_many_rows_each_has(key):
     """Four copies of a simulated row weigh as much as one of them."""
     batch = jax.tree.map(lambda x: x[jnp.array([0, 1, 2, 2, 2, 2])], small_batch(key))
@@ -182,7 +181,6 @@ def test_the_pair_learns_from_both_losses_and_the_joint_from_its_own(key):
     chex.assert_trees_all_close(gradients(new), list(expected), rtol=1e-3, atol=1e-6)
 
 
-@pytest.mark.heavy
 def test_noise_is_there_in_training_alone(key):
     batch, other = small_batch(key), jax.random.key(1)
     batch = batch._replace(valid=jnp.ones(6, bool))
@@ -203,7 +201,6 @@ def test_every_part_of_a_row_gets_noise(key):
     np.testing.assert_allclose(np.cov(seen.T), 0.01 * np.eye(7), atol=1e-3)
 
 
-@pytest.mark.heavy
 def test_standardised_inputs(key):
     """With the statistics of the data, rows in any unit give the same step."""
     statistics = normalizer.Normalizer(jnp.array([3.0, -20.0]), jnp.array([0.1, 10.0]))
