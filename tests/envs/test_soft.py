@@ -100,6 +100,7 @@ def test_pushed_it_deforms_and_follows(real):
     assert max(np.abs(state.physics.qvel).max() for state in states) < 20.0
 
 
+@pytest.mark.heavy
 def test_it_comes_to_rest_when_the_hand_stops(real):
     """In the next periods: a towel at once, a ball within a few centimetres, and neither creeps on."""
 

@@ -121,6 +121,7 @@ def test_a_kill_in_the_first_step_of_a_rollout_leaves_it_in_doubt(tmp_path):
     assert [path.suffix for path in sorted((tmp_path / "cut/real").iterdir())] == [".npz", ".npz"]
 
 
+@pytest.mark.heavy
 def test_a_rollout_that_was_killed_before_its_first_command_is_begun_again(tmp_path, monkeypatch):
     def die(env, *, seed):
         raise KeyboardInterrupt

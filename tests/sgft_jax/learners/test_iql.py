@@ -144,6 +144,7 @@ def test_probe_policy_is_the_weighted_gaussian_of_the_data(key, beta, max_weight
     assert metrics["actor/advantage_mean"] == pytest.approx(0.0, abs=0.01)
 
 
+@pytest.mark.heavy
 def test_probe_actions_outside_the_data_are_never_used(key):
     """State 0 leads to state 1, where a in [-1, 0] was tried and paid 4 a: the critic thinks the untried a = 1 pays 4.
 

@@ -91,6 +91,7 @@ def test_actor_and_targets_move_every_second_time(learner, key):
     assert not equal(first.critic, second.critic) and second.step == 2
 
 
+@pytest.mark.heavy
 def test_noise_on_target_actions_is_bounded(learner, key):
     """A std of 100 cut at 0.5 moves an action by no more than that, and it stays in bounds."""
     asked, state = [], learner.init(key)

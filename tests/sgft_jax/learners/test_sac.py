@@ -104,6 +104,7 @@ def test_fixed_temperature_and_delayed_actor_keep_their_bits(key):
     assert equal(start.log_alpha, state.log_alpha)
 
 
+@pytest.mark.heavy
 def test_actor_ramp_scales_the_first_steps(key):
     """Adam's first step has length lr per entry, so a ramp of 4 makes it a quarter."""
     moved = []
