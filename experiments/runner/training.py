@@ -1,5 +1,6 @@
 """Impure: run folders, the one loop around everything that trains (log, evaluate, checkpoint, resume), evaluations."""
 
+import abc
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -61,7 +62,7 @@ class Record:
             save_prior(self.home / kind / f"seed-{seed}", Prior(member(params, i), dict(card(seed))))
 
 
-class Training:
+class Training(abc.ABC):
     """What happens between compiled calls; what is on disk comes before what is in memory.
 
     Members [M = G * S] are the seeds of the first record, then those of the next. A kind of run says how far a state is
@@ -149,13 +150,13 @@ class Training:
 
     # what a kind of run says
 
+    @abc.abstractmethod
     def done(self, state: Any) -> int:
         """Units behind a state."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def evaluate(self, state: Any, done: int) -> dict[str, float]:
         """Plays and logs an evaluation; returns what the progress bar shows."""
-        raise NotImplementedError
 
     def checkpoint(self, state: Any, done: int) -> None:
         """Writes the checkpoints of all records."""
