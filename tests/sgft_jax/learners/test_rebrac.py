@@ -127,6 +127,7 @@ def test_the_actors_penalty_holds_it_to_the_data(key):
     assert 0.7 < mode(0.0) < 1.0 and -0.4 < mode(50.0) < -0.2
 
 
+@pytest.mark.heavy
 def test_the_scale_of_q_is_a_constant_of_the_actors_loss(learner, key):
     """Q is positive everywhere, so Q / mean |Q| is 1 for any actor; the actor follows Q all the same."""
     state = learner.init(key)

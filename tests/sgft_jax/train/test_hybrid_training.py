@@ -329,6 +329,7 @@ def test_every_preset_learns_as_it_stands(name, preset):
     assert len(chunks) == 3
 
 
+@pytest.mark.heavy
 def test_a_preset_that_is_no_default_learns_with_its_own_numbers():
     _, chunks = run_of("h2oplus")
     check_learning(chunks)
