@@ -153,7 +153,8 @@ def fine_tune(python: Path, out: Path, options: Sequence[object], *, log: Path, 
 def together(learner: Sequence[str], robot: Sequence[str], log: Path) -> None:
     """Two processes, until the first one is done. log: file for what the second one says.
 
-    Raises UserError where the first one fails, or the second one ends before it. Neither outlives this function.
+    A robot ends with exit code 0 once the learner has told it that the run is over; the learner then takes its time.
+    Raises UserError where one of the two fails. Neither outlives this function.
     """
     with contextlib.ExitStack() as last:
         with open(log, "wb") as file:  # in a session of its own: Ctrl-C reaches the learner alone, which ends both
@@ -161,25 +162,20 @@ def together(learner: Sequence[str], robot: Sequence[str], log: Path) -> None:
         last.callback(_end, other)
         first = subprocess.Popen(learner)
         last.callback(_end, first)
-        while first.poll() is None and other.poll() is None:
+        while first.poll() is None and not other.poll():
             time.sleep(0.1)
-        if first.poll() is None and (other.returncode or not _ends(first)):
+        if first.returncode is None:
             first.kill()  # it would wait for another robot
             raise UserError(f"the robot's side has ended with exit code {other.returncode}; see {log}")
         if first.returncode:
             raise UserError(f"fine-tuning has ended with exit code {first.returncode}; it said why above")
 
 
-def _ends(process: "subprocess.Popen[bytes]") -> bool:
-    """Whether a process ends by itself in the time that it has for that."""
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(_END)
-    return process.poll() is not None
-
-
 def _end(process: "subprocess.Popen[bytes]") -> None:
     """Ends a process that does not end by itself."""
-    if not _ends(process):
+    try:
+        process.wait(_END)
+    except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
 

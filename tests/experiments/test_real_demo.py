@@ -81,10 +81,15 @@ def test_a_side_that_fails_is_an_error_and_no_endless_wait(tmp_path, monkeypatch
     assert "no pybullet" in (tmp_path / "log").read_text()
     with pytest.raises(UserError, match="fine-tuning has ended with exit code 2"):
         real_demo.together(["sh", "-c", "exit 2"], ["sleep", "0.2"], tmp_path / "log")
+
+
+def test_a_learner_has_all_the_time_it_needs_once_it_has_dismissed_the_robot(tmp_path, monkeypatch):
+    """A robot ends with exit code 0 only after the learner has told it that the run is over."""
     monkeypatch.setattr(real_demo, "_END", 0.1)
-    with pytest.raises(UserError, match="the robot's side has ended with exit code 0"):
-        real_demo.together(["sleep", "60"], ["true"], tmp_path / "log")  # a learner would wait without end
-    real_demo.together(["sleep", "0.05"], ["true"], tmp_path / "log")  # the robot ends first where all is well
+    real_demo.together(["sh", "-c", f"sleep 1; touch {tmp_path}/saved"], ["true"], tmp_path / "log")
+    assert (tmp_path / "saved").exists()
+    with pytest.raises(UserError, match="fine-tuning has ended with exit code 2"):
+        real_demo.together(["sh", "-c", "sleep 0.5; exit 2"], ["true"], tmp_path / "log")
 
 
 def test_the_film_shows_an_episode_that_was_mended():
