@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from envs.types import UserError
+from envs.types import UserError, brief
 
 _LONGEST = 200  # bytes; file systems allow names of 255
 _RESERVED = re.compile(r"(con|prn|aux|nul|com\d|lpt\d)(\..*)?", re.IGNORECASE)  # names of devices on Windows
@@ -74,8 +74,8 @@ def guard[T](kind: str, source: str, function: Callable[..., T]) -> Callable[...
         except BaseException as error:  # `sys.exit` too: a file that is read must not end the command
             if isinstance(error, OSError) and error.filename == str(Path(source).resolve()):
                 raise UserError(f"{kind} {source}: {error.strerror}") from None
-            message = (str(error).strip() or "no message").splitlines()[0]
-            raise UserError(f"{kind} {source}: {_place(source, error)}: {type(error).__name__}: {message}") from error
+            where = f"{kind} {source}: {_place(source, error)}"
+            raise UserError(f"{where}: {type(error).__name__}: {brief(error)}") from error
 
     return guarded
 

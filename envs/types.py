@@ -21,6 +21,12 @@ class UserError(Exception):
     """Bad input: one line that names the file, key or option and says how to fix it. Commands exit with code 2."""
 
 
+def brief(error: BaseException) -> str:
+    """What an error says, in one line: its first one, and the one in which MuJoCo says where in a scene."""
+    first, *more = str(error).strip().splitlines() or ["no message"]
+    return "; ".join([first.rstrip(":"), *(line for line in more[:1] if line.startswith(("Element", "Error=")))])
+
+
 def unknown(kind: str, name: str, options: Iterable[str]) -> str:
     """What to tell someone who asked for a `kind` called `name` where only `options` exist."""
     listed = sorted(options)

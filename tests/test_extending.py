@@ -14,6 +14,7 @@ import pytest
 
 import envs
 from envs import extend, gaps
+from envs.types import UserError
 from experiments import figures, finetune, hybrid, pretrain
 from experiments.runner import cli
 from sgft_jax import Batch, NetworkConfig, Prior, get_method
@@ -102,6 +103,27 @@ def test_worlds_differ_in_what_the_parameters_say(key):
     worlds = envs.sample_worlds(env, key, 3)
     np.testing.assert_allclose(worlds.model["dof_frictionloss"][:, 1], worlds.theta.params[:, 1], rtol=1e-6)
     np.testing.assert_allclose(worlds.model["body_mass"][:, 2], worlds.theta.params[:, 0], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "words"),
+    [
+        ('type="slide"', 'type="slid"', r"invalid keyword: 'slid'; Element 'joint', line 6$"),
+        ('mass="0.2"', 'mass="-1"', r"mass, .* negative in geom; Element name 'tip', id 0, line 6$"),
+        (
+            'joint="pusher" kp',
+            'joint="puser" kp',
+            r"unknown transmission target 'puser' .*; Element name '', id 0, line 10",
+        ),
+        ("</mujoco>", "", r"XML parse error 15; Error=XML_ERROR_PARSING .* Line number=2$"),
+    ],
+)
+def test_what_mujoco_says_of_a_scene_names_the_element_or_the_line(tmp_path, right, wrong, words):
+    task = tmp_path / "mine.py"
+    task.write_text(Path(TASK).read_text().replace(right, wrong))
+    with pytest.raises(UserError, match=r"mine\.py: line \d+: ValueError: .*" + words) as refused:
+        envs.make(str(task))
+    assert "\n" not in str(refused.value)
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from envs.mujoco.engines import CARRIED, Engine, carried, comparison
-from envs.types import Array, UserError, unknown
+from envs.types import Array, UserError, brief, unknown
 
 Impl = Literal["auto", "jax", "warp", "c"]  # see `choose_impl`
 IMPL_VARIABLE = "SGFT_IMPL"
@@ -127,7 +127,7 @@ def _compiled(
         try:
             host = spec.compile()
         except ValueError as error:
-            raise UserError(f"MuJoCo cannot build these domain parameters: {str(error).splitlines()[0]}") from None
+            raise UserError(f"MuJoCo cannot build these domain parameters: {brief(error)}") from None
         if odd := differing(host):
             raise _uncarried(odd)
         _check_kinds(nominal, host)

@@ -45,7 +45,7 @@ def faults(rows, folder, *argv):
         cwd=folder,
         capture_output=True,
         text=True,
-        timeout=600,
+        timeout=540,  # before pytest's own limit, which ends every test of this process
     )
     answers = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(answers) == len(rows), f"{rows[len(answers)][0]}: killed the process: {done.stderr}"
