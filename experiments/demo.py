@@ -72,7 +72,7 @@ def plan(args: DemoArgs) -> tuple[PretrainArgs, list[FinetuneArgs]]:
     pretraining = PretrainArgs(config=config, report=False, video=False, **shared)
     check_task(args.task, [args.real])
     # Smaller batches and fewer updates than on a GPU: what two cores can do; all methods get the same. All else is the
-    # methods' own: larger rates of the actor cost most of them success (docs/history.md).
+    # methods' own: larger rates of the actor cost most of them success (docs/lessons.md).
     size = {"seeds": args.seeds, "rollouts": args.rollouts, "eval_every": 5, "eval_episodes": 20, **shared}
     runs = []
     for method in METHODS:

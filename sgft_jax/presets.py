@@ -148,7 +148,7 @@ _FAST = PretrainConfig(
 
 # For real systems that nobody knows yet: actuators and sensors differ between episodes, and the policy remembers what
 # it commanded. Four times the environments and the learning rate of `fast` do with 30,000 of its 78,400 updates
-# (docs/protocol.md).
+# (docs/lessons.md).
 _ROBUST = replace(
     _FAST,
     previous_actions=2,

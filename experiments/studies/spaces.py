@@ -1,6 +1,6 @@
 """What tuning chooses from: of every method five to seven of its options with two or three values each.
 
-The options are those that the method's authors name as sensitive, or our own measurements do (docs/history.md): warm-up
+The options are those that the method's authors name as sensitive, or our own measurements do (docs/lessons.md): warm-up
 of the critic is among them wherever a method has it, except for `guarded`, which the guard protects instead. The
 spaces have 243 to 324 settings, so that the same number of trials searches about the same share of each. The default is
 among the values; the others are published ones of close relatives, switch off what the method's authors do not have, or

@@ -1,6 +1,6 @@
 """The recommended method: SAC in the simulator's own commands, on half simulated batches, behind a guard.
 
-What it is made of, each an option that other methods have too, and what it is for (docs/protocol.md has the numbers):
+What it is made of, each an option that other methods have too, and what it is for (docs/rules.md has the numbers):
 
 - `identify`: scale, rotation and bias of commands and constant errors of sensors are fitted to the rollouts, and what
   learns acts in the simulator's commands and measurements. Most gaps are solved by that alone.

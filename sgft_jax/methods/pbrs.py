@@ -14,7 +14,7 @@ class Config(ShapedOptions):
     """Bound on the shaped reward; None = no bound, as published. A bound breaks the invariance of the best policy."""
     reset_critic: bool = False
     """Start from a new critic, as in the SGFT paper; False keeps the simulator's, read as Q(s, a) - V_sim(s), and did
-    better in tuning (docs/protocol.md)."""
+    better in tuning (docs/rules.md)."""
 
 
 def build(config: Config, prior: Prior | None, task: Task) -> Finetuner:

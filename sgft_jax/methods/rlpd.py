@@ -12,7 +12,7 @@ class Config(SACOptions, MixedOptions):
     """Options of `rlpd`; defaults of Ball et al. 2023, except for `alpha`, `lr_critic` and `target_critics`.
 
     The paper has a critic rate of 3e-4 and targets from the minimum of two critics; tuning changed both
-    (docs/protocol.md). `alpha`: see there.
+    (docs/rules.md). `alpha`: see there.
     """
 
     fresh = True

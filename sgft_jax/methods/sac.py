@@ -15,7 +15,7 @@ class Config(KeptCriticOptions, MixedOptions):
     weighted_actor = False
 
     utd: float = 1.0
-    """Gradient updates per real transition. One did better than eight wherever both were tried (docs/protocol.md)."""
+    """Gradient updates per real transition. One did better than eight wherever both were tried (docs/rules.md)."""
     simulated_share: float = 0.0
     """Share of each batch that is simulated, as in RLPD (Ball et al. 2023); 0 = none."""
     ratio: bool = False

@@ -9,7 +9,7 @@ from sgft_jax.types import Finetuner, Method, Online, Prior, Simulation, Source,
 
 @dataclass(frozen=True)
 class Config(KeptCriticOptions, MixedOptions):
-    """Options of `sac-online`; defaults of As et al. 2026, with four changes that tuning made (docs/protocol.md).
+    """Options of `sac-online`; defaults of As et al. 2026, with four changes that tuning made (docs/rules.md).
 
     The paper has 5 updates per transition, actor and critic rates of 1e-5 and 3e-4, and no `lr_warmup`.
     """

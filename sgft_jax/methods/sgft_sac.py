@@ -2,7 +2,7 @@
 
 What the parts do is in `sgft_jax/transforms.py`. Source: SGFT (Yin et al., ICLR 2025), Algorithm 2 and Appendix C. The
 paper has H = 1, a new critic, no noise, no clipping and no warm-up. Here H = 4 with two branches, because with H = 1
-the agent never takes a step that costs V_sim now and pays later, and the critic is kept (docs/history.md).
+the agent never takes a step that costs V_sim now and pays later, and the critic is kept (docs/lessons.md).
 """
 
 from dataclasses import dataclass

@@ -43,7 +43,7 @@ class Config(PlannerOptions):
 
     lr_warmup: checks.Updates | None = None
     """Updates over which the rate rises from 0; None = the updates of 1,000 real transitions. 40 updates at full rate
-    took plans that pushed a towel home in 93 % of all episodes to 4 % (docs/history.md)."""
+    took plans that pushed a towel home in 93 % of all episodes to 4 % (docs/lessons.md)."""
 
 
 def build(config: PlannerOptions, prior: Prior | None, task: Task) -> Finetuner:

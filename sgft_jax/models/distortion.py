@@ -104,7 +104,7 @@ def fit(
     determined. The model knows about contacts and limits, so steps that hit something need no special care;
     they are what tells the constant errors of sensors. Where something else is wrong with contacts, errors of sensors
     explain some of it too. So they count only if they add half to what the commands explain: on gaps of three tasks
-    true errors did, and of the others a few hardly (docs/protocol.md).
+    true errors did, and of the others a few hardly (docs/rules.md).
 
     predict: the simulator's model. rows: [n], with actions that are commands. held: [n] bool, which of them count.
     spread: [k] std of the model's own residuals in simulation, the least that real ones have. turns: the first two

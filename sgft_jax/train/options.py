@@ -25,7 +25,7 @@ class LoopOptions(checks.Checked):
     """Real transitions in a batch (windows of them for TD-MPC2)."""
     initial_rollouts: checks.Count = 1
     """Real rollouts before the first update, by the simulator's policy, or by plans if the method plans. The paper
-    makes 20; with one, every method here reaches its level as early or earlier (docs/history.md)."""
+    makes 20; with one, every method here reaches its level as early or earlier (docs/lessons.md)."""
     replay_capacity: checks.Count = 20_000
     """Real transitions that the replay holds; 20,000 are more than an hour of a robot at 5 Hz."""
     max_grad_norm: checks.Positive | None = None
@@ -131,7 +131,7 @@ class KeptCriticOptions(SACOptions):
     long as its rate in every weight, however small the gradient. None = the updates of 1,000 real transitions."""
     anchor: checks.NotNegative = 0.0
     """Price of the actor's divergence from the simulator's policy, in reward per nat; 0 = free. Where that policy is
-    right already, 0.1 keeps it so (docs/protocol.md)."""
+    right already, 0.1 keeps it so (docs/rules.md)."""
     identify: bool = False
     """Estimate from real rollouts, through the prior's models, by which scale, rotation and bias the real system
     changes commands and by which constant errors its sensors are wrong, and correct for both."""
@@ -147,7 +147,7 @@ class ModelOptions(KeptCriticOptions, DynamicsOptions):
     """Imagined branches from each real row of a batch."""
     branch_noise: checks.NotNegative = 0.5
     """Std of Gaussian noise on imagined actions, in units of the action's range; 0 as in the paper. Without noise the
-    critic never hears of actions better than the policy's (docs/history.md)."""
+    critic never hears of actions better than the policy's (docs/lessons.md)."""
     train_dynamics: bool = True
     """Fit the models to real rows; False keeps the simulator's."""
     actor_real_only: bool = True
