@@ -84,15 +84,16 @@ def test_a_name_is_explained_by_its_first_sentence():
 # --- a loop of a user's own -------------------------------------------------------------------------------------------
 
 
-def first_example():
-    """The first program of the page."""
-    return re.search(r"```python\n(.*?)```", (HOOK.parent.parent / "docs/api.md").read_text(), re.S).group(1)
+def loop_example():
+    """The program under that heading of the page."""
+    section = (HOOK.parent.parent / "docs/api.md").read_text().partition("## A loop of your own")[2]
+    return re.search(r"```python\n(.*?)```", section, re.S).group(1)
 
 
 def test_a_users_own_loop_calls_the_library_as_it_is():
     """Its functions traced, not compiled: states and losses have the shapes that the page shows."""
     scope = {}
-    exec(compile(first_example().partition("\nrng, ")[0], "docs/api.md", "exec"), scope)
+    exec(compile(loop_example().partition("\nrng, ")[0], "docs/api.md", "exec"), scope)
     seeds, updates, rows = (scope[name] for name in ("SEEDS", "UPDATES", "ROWS"))
     keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), (updates, seeds)))
     one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), keys)
@@ -109,7 +110,7 @@ def test_a_users_own_loop_calls_the_library_as_it_is():
 def test_a_users_own_loop_learns(capsys):
     """Twenty lines beside the imports, compiled once: losses of four seeds, which differ."""
     scope = {}
-    exec(compile(first_example(), "docs/api.md", "exec"), scope)
+    exec(compile(loop_example(), "docs/api.md", "exec"), scope)
     assert len(capsys.readouterr().out.splitlines()) == 4
     assert scope["learn"]._cache_size() == 1
     losses = scope["metrics"]["critic/loss"]
@@ -119,7 +120,7 @@ def test_a_users_own_loop_learns(capsys):
 @pytest.mark.slow
 def test_it_has_the_types_of_the_library(tmp_path):
     """As a user's editor checks it, and not without reading the signatures: a wrong argument is found."""
-    program = first_example()
+    program = loop_example()
     (tmp_path / "good.py").write_text(program)
     (tmp_path / "bad.py").write_text(
         program + "\nsac.update(config, states, 3, jax.random.key(0))\nsac.renew(config)\n"
