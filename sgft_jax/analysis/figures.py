@@ -1,12 +1,14 @@
 """Impure: writes figures as PNG files: learning curves, what pretraining left behind, what a gap is.
 
-Each function returns the path it wrote. No panel has more than `MOST` curves, each in a colour of its own from the
-Okabe-Ito palette (safe for colour-blind readers).
+Each function returns the path it wrote. No panel has more than `MOST` curves. A method has one colour in all figures,
+see `COLOURS`; the first six are those of Okabe and Ito (safe for colour-blind readers).
 """
 
+import colorsys
+import itertools
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, MaxNLocator
 from numpy.typing import ArrayLike
@@ -23,7 +26,18 @@ from sgft_jax.analysis.verdict import Sign
 from sgft_jax.math.stats import ENOUGH, Interval, iqm
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-MOST = len(PALETTE)
+MOST = 6
+_MORE = (
+    "#4b3c00 #5a0087 #78b41e #d2004b #b487ff #005a00 #ff9687 #780f00 #005ad2 #b40087 #c3b469 #5a1e4b #965a4b #966900"
+)
+_MORE += " #ff78e1 #00c35a #4bc3c3 #0f4b2d #875aa5 #007878 #87003c"
+_METHODS = (
+    "guarded sgft-sac sac mbpo tdmpc2 sgft-mpc sysid recurrent sgft-relabel h2oplus rebrac darc iql rlpd sgft-tdmpc2"
+)
+_METHODS += (
+    " sgft pbrs pbrs-branch sac-online sac-reset frozen-critic sgft-tdmpc2-code sgft-parts h2o h2oplus-edac cql edac"
+)
+COLOURS = dict(zip(_METHODS.split(), (*PALETTE, *_MORE.split()), strict=True))  # far apart, and from the lines in grey
 
 type Points = Mapping[str, tuple[np.ndarray, np.ndarray]]  # [n] V_sim and [n] returns, by where they are from
 
@@ -56,15 +70,15 @@ def learning_curves(path: Path, panels: Mapping[str, Sequence[Curve]], *, title:
     columns = min(len(parts), 2)
     figure, grid = _figure(5.6 * columns, 3.1 * math.ceil(len(parts) / columns) + 0.4, columns, len(parts))
     drawn = [curve for _, _, curves, _ in parts for curve in curves]
-    place = {name: i for i, name in enumerate(dict.fromkeys(curve.name for curve in drawn))}
+    by_name = colours(drawn)
     first: dict[str, Axes] = {}  # of the panels of an entry, which have one y axis
     for axes, (entry, words, curves, others) in zip(grid, parts, strict=True):
         if first.setdefault(entry, axes) is not axes:
             axes.sharey(first[entry])
         for curve in others:
             axes.plot(curve.x, iqm(curve.values), color=_FAINT, linewidth=0.8, zorder=1)
-        for curve, colour in zip(curves, _colours(curves, place), strict=True):
-            _draw_curve(axes, curve, colour)
+        for curve in curves:
+            _draw_curve(axes, curve, by_name[curve.name])
         _dress(axes, words, [*curves, *others])
         axes.set_xlabel(_unit(panels[entry]), **{**_FONT, "size": 9})
     figure.supxlabel(_note(drawn), size=8, color=_GREY)
@@ -98,14 +112,23 @@ def _split(words: str, curves: Sequence[Curve]) -> list[tuple[str, Sequence[Curv
     ]
 
 
-def _colours(curves: Sequence[Curve], place: Mapping[str, int]) -> list[str]:
-    """A colour for each, all distinct; a name keeps its colour from panel to panel where it can."""
-    free, chosen = list(PALETTE), []
-    for curve in curves:
-        wanted = PALETTE[place[curve.name] % len(PALETTE)]
-        chosen.append(wanted if wanted in free else free[0])
-        free.remove(chosen[-1])
+def colours(curves: Iterable[Curve]) -> dict[str, str]:
+    """The colour of each name in one figure, no two the same: that of its method, `COLOURS`, or else a spare one.
+
+    Spare are those of further variants of a method and of methods that do not come with the library.
+    """
+    chosen: dict[str, str] = {}
+    spare = _spare()
+    for method, name in sorted({(curve.method, curve.name) for curve in curves}):
+        colour = COLOURS.get(method)
+        chosen[name] = next(spare) if colour is None or colour in chosen.values() else colour
     return chosen
+
+
+def _spare() -> Iterator[str]:
+    """Colours without end, neighbours far apart: hues turn by the golden ratio."""
+    for i in itertools.count():
+        yield to_hex(colorsys.hls_to_rgb((0.08 + 0.618034 * i) % 1, (0.35, 0.5, 0.62)[i % 3], 0.6))
 
 
 def _draw_curve(axes: Axes, curve: Curve, colour: str) -> None:

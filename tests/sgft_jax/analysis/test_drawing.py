@@ -1,13 +1,18 @@
 import dataclasses
+import itertools
+from pathlib import Path
 
 import matplotlib.image
 import numpy as np
 import pytest
 from test_curves import curve
 
-from sgft_jax.analysis import figures
+from sgft_jax.analysis import figures, release
 from sgft_jax.analysis.curves import Curve
 from sgft_jax.analysis.hybrid import Results
+from sgft_jax.methods import FIXED_NAMES, NAMES
+
+ROOT = Path(__file__).parents[3]
 
 
 def curves(count, seeds=3):
@@ -37,7 +42,7 @@ def test_the_axis_says_how_long_a_rollout_is_where_evaluations_are_free():
 @pytest.mark.parametrize("count", [1, 2, 6])
 def test_every_curve_has_a_colour_of_its_own(tmp_path, count):
     image = read(figures.learning_curves(tmp_path / "new" / "c.png", {"push": curves(count)}, title="Push"))
-    drawn = [pixels(image, color) > 200 for color in figures.PALETTE]
+    drawn = [pixels(image, color) > 200 for color in figures.colours(curves(6)).values()]
     assert drawn == [True] * count + [False] * (6 - count)
     assert (image[[0, -1]] > 0.99).all() and (image[:, [0, -1]] > 0.99).all()  # nothing is cut off at the border
 
@@ -69,14 +74,34 @@ def test_parts_of_a_panel_have_one_scale(tmp_path, monkeypatch):
     assert limits[0] == limits[1] and limits[0][1] >= 2e6 and limits[2][1] < 3
 
 
-def test_colours_are_distinct_in_a_panel_and_stay_from_panel_to_panel():
-    eight = curves(8)
-    place = {line.name: i for i, line in enumerate(eight)}
-    assert figures._colours(eight[:3], place) == list(figures.PALETTE[:3])
-    assert figures._colours(eight[1:2], place) == [figures.PALETTE[1]]
-    assert (
-        len(set(figures._colours([eight[0], eight[6], eight[7]], place))) == 3
-    )  # the seventh would have the first one's
+def test_every_method_has_one_colour():
+    """Also those that no figure shows together; spare colours are none of theirs."""
+    assert figures.COLOURS.keys() == {*NAMES, *FIXED_NAMES}
+    spare = list(itertools.islice(figures._spare(), 100))
+    assert len({*figures.COLOURS.values(), *spare}) == len(figures.COLOURS) + 100
+
+
+def test_no_two_names_of_a_figure_share_a_colour():
+    """A method keeps its colour wherever it is; its variants, and methods from elsewhere, get what is left."""
+    names = [(method, "") for method in NAMES] + [("guarded", "again"), ("guarded", "horizon=1"), ("mine", "")]
+    drawn = [curve([0.0], (0,), method=method, variant=variant) for method, variant in names]
+    chosen = figures.colours(drawn)
+    assert len(set(chosen.values())) == len(chosen) == len(names)
+    assert all(chosen[method] == figures.COLOURS[method] for method in NAMES)
+    assert chosen == figures.colours(drawn[::-1])
+    (alone,) = figures.colours([curve([0.0], (0,), method="sac", variant="horizon=1")]).values()
+    assert alone == figures.COLOURS["sac"]
+
+
+@pytest.mark.parametrize("task", ["push", "halfcheetah"])
+def test_no_two_names_of_a_committed_figure_share_a_colour(task):
+    by_gap = {}
+    for line in release.read(Path("runs"), ROOT / "docs/data").curves:
+        if line.task == task:
+            by_gap.setdefault(line.gap, []).append(line)
+    for gap, lines in by_gap.items():
+        chosen = figures.colours(lines)
+        assert len(set(chosen.values())) == len({line.name for line in lines}), gap
 
 
 def test_a_band_needs_three_seeds(tmp_path):
@@ -85,7 +110,7 @@ def test_a_band_needs_three_seeds(tmp_path):
         read(figures.learning_curves(tmp_path / f"{n}.png", {"": [curve([[0.1, 0.9]] * n, (0, 1))]}, title=""))
         for n in (1, 2)
     ]
-    assert pixels(images[0], figures.PALETTE[0]) == pixels(images[1], figures.PALETTE[0])
+    assert pixels(images[0], figures.COLOURS["sac"]) == pixels(images[1], figures.COLOURS["sac"]) > 200
     assert figures._note(curves(1, seeds=1)) == "one seed"
     assert figures._note(curves(1, seeds=2)) == "line: interquartile mean of 2 seeds"
     assert "drawing seeds" in figures._note(curves(1, seeds=3))
@@ -93,7 +118,7 @@ def test_a_band_needs_three_seeds(tmp_path):
 
 def test_returns_are_drawn_too(tmp_path):
     path = figures.learning_curves(tmp_path / "r.png", {"": [curve([-300, 40], (0, 1), score="return")]}, title="")
-    assert pixels(read(path), figures.PALETTE[0]) > 200
+    assert pixels(read(path), figures.COLOURS["sac"]) > 200
 
 
 def test_a_run_without_a_real_rollout_is_drawn(tmp_path):
@@ -125,7 +150,7 @@ def test_curves_over_updates(tmp_path, monkeypatch):
     figures_made, save = [], figures._save
     monkeypatch.setattr(figures, "_save", lambda figure, *more: figures_made.append(figure) or save(figure, *more))
     image = read(figures.learning_curves(tmp_path / "h.png", results.panels("medium"), title="Medium"))
-    assert [pixels(image, color) > 200 for color in figures.PALETTE[:4]] == [True] * 3 + [False]
+    assert all(pixels(image, figures.COLOURS[method]) > 200 for method in ("h2oplus", "iql", "sac"))
     panels = {axes.get_title(loc="left"): axes for axes in figures_made[0].axes}
     lines = {words: {line.get_label(): line for line in axes.get_lines()} for words, axes in panels.items()}
     assert {words: list(drawn) for words, drawn in lines.items()} == {
