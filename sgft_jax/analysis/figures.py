@@ -27,16 +27,12 @@ from sgft_jax.math.stats import ENOUGH, Interval, iqm
 
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 MOST = 6
-_MORE = (
-    "#4b3c00 #5a0087 #78b41e #d2004b #b487ff #005a00 #ff9687 #780f00 #005ad2 #b40087 #c3b469 #5a1e4b #965a4b #966900"
-)
-_MORE += " #ff78e1 #00c35a #4bc3c3 #0f4b2d #875aa5 #007878 #87003c"
-_METHODS = (
-    "guarded sgft-sac sac mbpo tdmpc2 sgft-mpc sysid recurrent sgft-relabel h2oplus rebrac darc iql rlpd sgft-tdmpc2"
-)
-_METHODS += (
-    " sgft pbrs pbrs-branch sac-online sac-reset frozen-critic sgft-tdmpc2-code sgft-parts h2o h2oplus-edac cql edac"
-)
+_MORE = """
+    #78b41e #5a0087 #4b3c00 #d2004b #b487ff #005a00 #ff9687 #780f00 #005ad2 #b40087 #c3b469 #5a1e4b #965a4b #966900
+    #ff78e1 #00c35a #4bc3c3 #0f4b2d #875aa5 #007878 #87003c"""
+_METHODS = """
+    guarded sgft-sac sac mbpo tdmpc2 sgft-mpc sysid recurrent sgft-relabel h2oplus rebrac darc iql rlpd sgft-tdmpc2 sgft
+    pbrs pbrs-branch sac-online sac-reset frozen-critic sgft-tdmpc2-code sgft-parts h2o h2oplus-edac cql edac"""
 COLOURS = dict(zip(_METHODS.split(), (*PALETTE, *_MORE.split()), strict=True))  # far apart, and from the lines in grey
 
 type Points = Mapping[str, tuple[np.ndarray, np.ndarray]]  # [n] V_sim and [n] returns, by where they are from
@@ -128,7 +124,7 @@ def colours(curves: Iterable[Curve]) -> dict[str, str]:
 def _spare() -> Iterator[str]:
     """Colours without end, neighbours far apart: hues turn by the golden ratio."""
     for i in itertools.count():
-        yield to_hex(colorsys.hls_to_rgb((0.08 + 0.618034 * i) % 1, (0.35, 0.5, 0.62)[i % 3], 0.6))
+        yield to_hex(colorsys.hls_to_rgb((0.88 + 0.618034 * i) % 1, (0.35, 0.5, 0.62)[i % 3], 0.6))
 
 
 def _draw_curve(axes: Axes, curve: Curve, colour: str) -> None:
