@@ -1,7 +1,9 @@
 """What README.md and docs/ tell people to type exists: targets, modules, options, files, headings; the site builds."""
 
+import ast
 import contextlib
 import functools
+import importlib
 import io
 import os
 import re
@@ -82,6 +84,25 @@ def test_make_flags_are_options_of_the_commands():
 def links(page):
     """(target, anchor) of the links in a page to files of ours; one to a heading of the page itself has no target."""
     return re.findall(r"\]\((?!https://)([^)#]*)#?([^)]*)\)", page.read_text())
+
+
+def imported(page):
+    """(module, name) of what programs on a page import from packages of ours, or take from these by a dot."""
+    for program in re.findall(r"^```python\n(.*?)^```$", page.read_text(), re.M | re.S):
+        for node in ast.walk(ast.parse(program)):
+            if isinstance(node, ast.ImportFrom) and node.module.partition(".")[0] in ("envs", "sgft_jax"):
+                yield from ((node.module, alias.name) for alias in node.names)
+            if isinstance(node, ast.Attribute) and getattr(node.value, "id", "") in ("envs", "sgft_jax"):
+                yield node.value.id, node.attr
+
+
+@pytest.mark.parametrize("page", DOCS, ids=lambda path: path.name)
+def test_programs_use_names_that_exist(page):
+    for module, name in imported(page):
+        try:
+            importlib.import_module(f"{module}.{name}")
+        except ImportError:
+            assert hasattr(importlib.import_module(module), name), (module, name)
 
 
 @pytest.mark.parametrize("page", DOCS, ids=lambda path: path.name)
