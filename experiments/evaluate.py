@@ -12,6 +12,7 @@ from envs.types import UserError
 from experiments.runner import cli, options
 from experiments.runner.cli import Json
 from experiments.runner.options import Impl, Out
+from experiments.runner.progress import doing
 from experiments.runner.real_systems import REMOTE, TOGETHER, connect, described, is_robot, is_stepped
 from experiments.runner.real_systems import check as check_real
 from sgft_jax.io.runs import check_folder
@@ -109,7 +110,8 @@ def evaluate(args: EvaluateArgs) -> dict[str, Any]:
         if is_robot(args.real[0]):  # what it does is kept
             store = RealStore(args.out / "evaluate" / env.name / REMOTE)
             system = RecordedSystem(system, [store], done=len(store), explore=False, sync_every=1)
-        played = play(system, make_policy(card, env), members, key_episodes, args.episodes)
+        with doing(f"playing {args.episodes} episodes for each policy", 20, once=True):
+            played = play(system, make_policy(card, env), members, key_episodes, args.episodes)
 
     def results_of(i: int, k: int) -> dict[str, Any]:
         """Of the k-th policy on the i-th system. The film is that of its first episode."""

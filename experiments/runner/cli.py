@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import difflib
 import errno
+import io
 import itertools
 import logging
 import os
@@ -26,11 +27,13 @@ import tyro
 from tyro import _errors
 
 from envs.types import UserError, unknown
+from experiments.runner import progress
 
 Json = Annotated[bool, tyro.conf.arg(help="Print one JSON object and nothing else.")]
 
 BROKEN_PIPE, USER_ERROR = 1, 2
 _SIGNALS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
+_IN_ORDER: list[str] = []  # what must come to an end before the process does
 _NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _BAD_PATH = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP)
 _ON_DISK = (*_NO_SPACE, *_BAD_PATH, errno.EROFS, errno.EACCES, errno.EPERM, errno.EIO, errno.EMFILE, errno.ENFILE)
@@ -60,19 +63,20 @@ def run_main[T](
     with 1 and no message if the reader of its output has gone, as after `| head`. Other exceptions are bugs and keep
     their traceback.
     """
-    with _may_lose_its_reader(), _stopped_by_signals():
+    with _may_lose_its_reader(), _stopped_by_signals(config_type):
         try:
             words = list(sys.argv[1:] if argv is None else argv)
             start = None if default is None else default(words)
             config = parse(config_type, description, words, default=start)  # a dataclass may refuse its values
             set_up()
             _quiet_threads()
-            main(config)
+            if isinstance(sys.stdout, io.TextIOWrapper):
+                sys.stdout.reconfigure(line_buffering=True)  # a log shows at once what a terminal would
+            with progress.never_silent():
+                main(config)
         except KeyboardInterrupt as stopped:
             number = getattr(stopped, "number", signal.SIGINT)
-            more = "; the same command with --resume continues from the last checkpoint"
-            with contextlib.suppress(OSError):  # the terminal that hung up
-                print(f"\n{_SIGNALS[number]}{more if _has_resume(config_type) else ''}", file=sys.stderr, flush=True)
+            _say(_farewell(number, config_type))
             sys.exit(128 + number)
         except UserError as error:
             fail(str(error))
@@ -119,39 +123,80 @@ def _in_renderer_choice(error: Exception) -> bool:
 
 
 @contextlib.contextmanager
-def _stopped_by_signals() -> Iterator[None]:
-    """SIGTERM and SIGHUP raise `Stopped`, where nobody has said otherwise (as `nohup` does); a second one kills."""
+def _stopped_by_signals(config_type: type) -> Iterator[None]:
+    """Ctrl-C, SIGTERM and SIGHUP raise `Stopped`, where nobody has said otherwise (as `nohup` does).
+
+    The main thread hears nothing while it compiles or while a compiled program runs. The process then ends all the same
+    after a second, unless a robot is at work; with a second signal it ends at once.
+    """
+    heard = threading.Event()
 
     def stop(number: int, frame: object) -> NoReturn:
+        heard.set()
         raise Stopped(number)
 
-    asked = [n for n in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) == signal.SIG_DFL]
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+    asked = [number for number, handler in before.items() if handler in (signal.SIG_DFL, signal.default_int_handler)]
     if not asked or threading.current_thread() is not threading.main_thread():  # no other may handle signals
         yield
         return
-    heard, tell = os.pipe()
+    pipe, tell = os.pipe()
     os.set_blocking(tell, False)
-    threading.Thread(target=_end_at_the_second, args=(heard, asked), daemon=True).start()
-    before = signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
+    threading.Thread(target=_end_in_time, args=(pipe, asked, heard, config_type), daemon=True).start()
+    wakeup = signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
     for number in asked:
         signal.signal(number, stop)
     try:
         yield
     finally:
         for number in asked:
-            signal.signal(number, signal.SIG_DFL)
-        signal.set_wakeup_fd(before)
+            signal.signal(number, before[number])
+        signal.set_wakeup_fd(wakeup)
         os.close(tell)
 
 
-def _end_at_the_second(heard: int, asked: Sequence[int]) -> None:
-    """Ends the process at the second of these signals. The main thread sees none while a compiled program runs."""
-    with open(heard, "rb", buffering=0) as pipe:
-        count = 0
-        while byte := pipe.read(1):
-            count += byte[0] in asked
-            if count == 2:
-                os._exit(128 + byte[0])
+def _end_in_time(pipe: int, asked: Sequence[int], heard: threading.Event, config_type: type) -> None:
+    """Ends the process at the second of these signals, or a second after the first that the main thread has not heard.
+
+    Nothing of a run is lost: what is on disk is whole, and what is not would be given up all the same.
+    """
+    with open(pipe, "rb", buffering=0) as signals:
+        numbers = (byte[0] for byte in iter(lambda: signals.read(1), b"") if byte[0] in asked)
+        first = next(numbers, None)
+        if first is not None and not heard.wait(1.0):
+            if not _IN_ORDER:
+                _end_now(first, _farewell(first, config_type))
+            waits = f"waiting for {_IN_ORDER[-1]} until this is done: {progress.phase() or 'working'}"
+            _say(f"\n{_SIGNALS[first]}: {waits}; a second signal ends the process at once")
+        if (second := next(numbers, None)) is not None:
+            _end_now(second)
+
+
+def in_order(what: str) -> None:
+    """From now on a signal ends the process only when Python is able to bring this to an end, such as a robot."""
+    _IN_ORDER.append(what)
+
+
+def _end_now(number: int, words: str = "") -> NoReturn:
+    """Ends the process whatever it does, and those that would end with it."""
+    progress.leave_terminal()
+    if (processes := sys.modules.get("multiprocessing")) is not None:
+        for process in processes.active_children():
+            process.kill()
+    _say(words or f"\n{_SIGNALS[number]}")
+    os._exit(128 + number)
+
+
+def _farewell(number: int, config_type: type) -> str:
+    """What is said of a command that a signal has ended."""
+    again = "; the same command with --resume continues from the last checkpoint, if there is one"
+    return f"\n{_SIGNALS[number]}{again if _has_resume(config_type) else ''}"
+
+
+def _say(words: str) -> None:
+    """On stderr, unless the terminal has hung up."""
+    with contextlib.suppress(OSError):
+        print(words, file=sys.stderr, flush=True)
 
 
 class _Quiet:

@@ -22,13 +22,13 @@ from envs.locomotion.wheel_legged import nominal_gain, operator
 from envs.rollout import Episode, counted, play_episode, real_env, real_worlds
 from envs.types import Array, Policy, PyTree, Transition, UserError
 from experiments.runner.options import seed_list
+from experiments.runner.progress import RunProgress, doing
 from experiments.runner.training import play
 from sgft_jax.algorithms import make_policy
 from sgft_jax.datasets import logs, recording
 from sgft_jax.datasets.recording import Joints, Noted, Recorded
 from sgft_jax.files.disk import write_json
 from sgft_jax.io import runs
-from sgft_jax.io.log import RunProgress
 from sgft_jax.io.priors import load_prior, observed_by
 from sgft_jax.keys import FromLog, seed_keys
 from sgft_jax.methods import get_method
@@ -149,7 +149,8 @@ def _play(args: "CollectArgs", system: Simulated, policy: Policy, params: PyTree
     at_once = min(_AT_ONCE, math.ceil(args.transitions / system.env.episode_length))
     while sum(len(episode.reward) for episode in episodes) < args.transitions:
         key, key_now = jax.random.split(key)
-        played = member(play(alone, policy, params, key_now, at_once, explore=True), 0)
+        with doing("playing the episodes to record", 20, once=True):
+            played = member(play(alone, policy, params, key_now, at_once, explore=True), 0)
         if not (new := recording.of_episodes(played, _noted(policy, member(params, 0), played))):
             what = f"physics exploded in the first step of {at_once} episodes; nothing to record"
             raise UserError(f"{system.env.name}: {what}")

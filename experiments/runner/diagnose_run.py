@@ -16,6 +16,7 @@ from envs.rollout import Episode
 from envs.types import Transition, UserError
 from experiments.runner.cli import columns
 from experiments.runner.gaps_run import systems
+from experiments.runner.progress import doing
 from experiments.runner.real_systems import connect, is_robot, is_stepped, title
 from experiments.runner.recorded import RecordedSystem
 from experiments.runner.training import play
@@ -65,7 +66,8 @@ def diagnose(
         who = "one prior" if len(priors) == 1 else f"each of {len(priors)} priors"
         what = f"{_rollouts(count)} of {who}, just played zero-shot on {where}"
     labels = [str(folders[p]) for p in which]
-    examined, mean = _examine(env, priors, real, simulated, which)
+    with doing("examining the rollouts", 30, once=True):
+        examined, mean = _examine(env, priors, real, simulated, which)
     names = names_of(env)
     signs, header = verdict.signs(mean[-1], names), f"{env.name}: {what}"
     findings = {
@@ -147,7 +149,8 @@ def _play(env: Env, reals: Sequence[Gap], priors: list[Prior], n: int, seed: int
     """Exploring rollouts [n] of every prior on every gap: [gaps * priors], all priors on the first gap first."""
     system, members = systems(env, reals, priors, max(n, 64))
     key, policy = jax.random.fold_in(jax.random.key(_SEED), seed), make_policy(priors[0].card, system.env)
-    return _of_members(play(system, policy, members, key, n, explore=True), len(reals) * len(priors))
+    with doing(f"playing {_rollouts(n)} of each prior", 30, once=True):
+        return _of_members(play(system, policy, members, key, n, explore=True), len(reals) * len(priors))
 
 
 def play_simulated(env: Env, priors: list[Prior], seed: int) -> list[Rollouts]:

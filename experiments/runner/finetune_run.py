@@ -20,6 +20,7 @@ from envs.types import PyTree
 from experiments.runner import cli, real_systems
 from experiments.runner.machines import reserve
 from experiments.runner.pictures import before_and_after
+from experiments.runner.progress import doing
 from experiments.runner.recorded import RecordedSystem, begin_with, read_log
 from experiments.runner.training import Record, Training, opened, scores
 from sgft_jax import api
@@ -71,7 +72,10 @@ def run(
             playing = real_systems.connect(env, args.real, args.set, **one_each)
             last.push(lambda error, *_: playing.close(over=error is None))
             members = seeds * len(args.real)
-        setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
+        count = len(priors) * getattr(args.options, "simulated_transitions", 0)
+        rows = f" and {count:,} simulated transitions of the priors" if count else ""
+        with doing(f"making the real systems{rows}", 5 + count / 2_000):
+            setup = api.setup(env, playing, priors, method=args.method, seeds=members, config=args.options)
         # Last: what is wrong with a robot or with a method of the user's own leaves no folder behind.
         inputs = {
             "priors": [digest(prior) for prior in priors],
@@ -261,6 +265,15 @@ class _Run(Training):
 
     def done(self, state: FinetuneProgress) -> int:
         return int(state.rollouts)
+
+    def announced(self, before: FinetuneProgress | None) -> contextlib.AbstractContextManager[None]:
+        if before is None:
+            return doing("preparing the agents", 10, once=True)
+        if int(before.offline) < finetuning.simulated_updates_of(self.finetuner):
+            return doing("learning from simulated transitions")
+        if not self.done(before):
+            return doing("the first rollout, for which play and updates are compiled", 60, once=True)
+        return doing("playing and learning")
 
     def log(self, state: FinetuneProgress, values: dict[str, np.ndarray], seconds: float) -> dict[str, float]:
         done = self.done(state)

@@ -16,11 +16,12 @@ from envs.rollout import Episode, real_env, real_worlds
 from envs.types import Key, PyTree
 from experiments.runner.cli import columns
 from experiments.runner.machines import reserve
+from experiments.runner.progress import RunProgress, doing
 from experiments.runner.training import best_of, describe, play, scores
 from sgft_jax import stacking
 from sgft_jax.algorithms import make_policy
 from sgft_jax.analysis import tables
-from sgft_jax.io.log import MetricsLog, RunProgress, write_summary
+from sgft_jax.io.log import MetricsLog, write_summary
 from sgft_jax.io.priors import load_priors, observed_by
 from sgft_jax.math import stats
 from sgft_jax.presets import PretrainConfig
@@ -44,7 +45,8 @@ def run(args: "GapsArgs", seeds: list[int], folders: list[Path]) -> dict[str, An
     folder = args.out / "gaps" / task
     priors = load_priors(folders, env)
     system, members = systems(env, reals, priors, args.episodes)
-    played = play(system, make_policy(priors[0].card, env), members, episode_key(FINAL_SEED), args.episodes)
+    with doing(f"playing {args.episodes} episodes on each real system", 30, once=True):
+        played = play(system, make_policy(priors[0].card, env), members, episode_key(FINAL_SEED), args.episodes)
     zero_shot = [stacking.part(played, i, len(priors)) for i in range(len(reals))]
 
     def report(trained: Sequence[Episode | None]) -> dict[str, Any]:
@@ -145,7 +147,8 @@ def train(
     log, heldout, size = MetricsLog(folder), system(_HELDOUT_SEED, config.eval_episodes), config.chunk_env_steps
     log.truncate({})
     steps = pretrain(seen, config, seeds * len(reals), pools=pools)
-    next(steps)
+    with doing("building the worlds and compiling the training", 60, once=True):
+        next(steps)
     with RunProgress("train on the real systems", total=config.chunks * size, unit="env steps") as progress:
         for done, (state, metrics) in enumerate(steps, start=1):
             log.metrics(done * size, metrics)

@@ -18,6 +18,7 @@ import jax
 
 from envs import mesh
 from envs.types import UserError
+from experiments.runner import progress
 from experiments.runner.cli import USER_ERROR
 from experiments.runner.options import hosts_of
 
@@ -56,6 +57,7 @@ def folder_of_host(folder: Path) -> Iterator[Path]:
         mine = folder
         if jax.process_index():
             stack.enter_context(contextlib.redirect_stdout(stack.enter_context(open(os.devnull, "w"))))
+            progress.say_nothing()
             mine = Path(stack.enter_context(tempfile.TemporaryDirectory())) / folder.name
             if folder.exists():
                 shutil.copytree(folder, mine, ignore=shutil.ignore_patterns(*_TOGETHER))

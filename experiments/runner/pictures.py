@@ -18,6 +18,7 @@ from envs.base import Entry, Env, World
 from envs.rollout import Episode, real_env, real_worlds
 from envs.types import Array
 from experiments.runner.options import check_sizes
+from experiments.runner.progress import doing
 from sgft_jax.analysis import figures
 from sgft_jax.analysis.figures import Panel
 from sgft_jax.io.real import Played
@@ -83,7 +84,8 @@ def _draw(env: Env, path: Path, render: Callable[[Any], None]) -> str:
         return f"no video: {reason}"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        render(scene)
+        with doing("rendering a video", 10):
+            render(scene)
     except Exception as error:  # whatever a graphics driver or a video encoder raises
         return f"no video: {(str(error).strip() or type(error).__name__).splitlines()[0]}"
     return f"video: {path}"

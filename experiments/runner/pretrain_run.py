@@ -22,6 +22,7 @@ from envs.rollout import Episode, heldout_worlds, load_gap, real_env, training_w
 from envs.types import PyTree
 from experiments.runner.machines import folder_of_host, join_hosts, reserve
 from experiments.runner.pictures import film_episode
+from experiments.runner.progress import doing
 from experiments.runner.report import Report, make_report, numbers
 from experiments.runner.training import Record, Training, best_of, describe, opened, play, scores
 from sgft_jax import stacking
@@ -92,7 +93,8 @@ class _Run(Training):
     def work(self) -> dict[str, Any]:
         """Everything, in order."""
         n, first = self.config.eval_episodes, jnp.zeros(self.count, jnp.int32)
-        with self.clock("worlds"):
+        count = self.count * self.config.worlds
+        with self.clock("worlds"), doing(f"building {count:,} worlds", 3 + 0.01 * count):
             self.pools(0)
             heldout, self.final = (
                 stacking.stack([heldout_worlds(self.env, self.gap, jax.random.key(seed), n)])
@@ -124,7 +126,8 @@ class _Run(Training):
         folder, expect = self.record.home / "random", self.record.expect
         if checkpoint.latest(folder) is not None:
             return checkpoint.restore(folder, self.shapes()[0], expect=expect)[0]
-        with self.clock("random"):
+        count = self.count * self.config.random_transitions
+        with self.clock("random"), doing(f"collecting {count:,} transitions under random actions"):
             rows = pretraining.collect_random(self.env, self.config, self.seeds, self.pools(0))
             random = jax.block_until_ready(rows)
         checkpoint.save(folder, 0, mesh.local(random), meta=expect)
@@ -160,7 +163,7 @@ class _Run(Training):
 
     def _hand_over(self, best: evidence.Best) -> dict[str, Any]:
         """Priors with their cards, report, figures, summary, closing words."""
-        with self.clock("report"):
+        with self.clock("report"), doing(f"measuring the priors in {self.config.report_episodes} fresh episodes"):
             report = self._report(best.params) if self.args.report and self.policy.value else None
             played = self._final_episodes(best.params)
         results = []

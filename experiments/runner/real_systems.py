@@ -21,6 +21,7 @@ from envs import extend, gaps
 from envs.files import read_text
 from envs.gaps import Gap
 from envs.types import UserError
+from experiments.runner import cli
 from experiments.runner.options import check_task, port_of
 from sgft_jax.systems.door import bound, check_host
 
@@ -168,6 +169,7 @@ def connect(
     from sgft_jax.systems.gymnasium import Gymnasium
 
     if is_robot(reals[0]):
+        cli.in_order("the robot")
         from sgft_jax.systems.remote import Remote
 
         if members > 1:

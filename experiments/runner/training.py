@@ -14,8 +14,9 @@ import numpy as np
 from envs import mesh
 from envs.rollout import Episode, counted
 from envs.types import Array, Key, Policy, PyTree, UserError
+from experiments.runner.progress import RunProgress, doing
 from sgft_jax.io import checkpoint, runs
-from sgft_jax.io.log import Clock, MetricsLog, RunProgress, check_finite
+from sgft_jax.io.log import Clock, MetricsLog, check_finite
 from sgft_jax.io.priors import save_prior
 from sgft_jax.math import stats
 from sgft_jax.stacking import member, part
@@ -108,24 +109,28 @@ class Training(abc.ABC):
                 values = {name: np.asarray(x) for name, x in metrics.items()}
                 shown = self.log(state, values, seconds) if values else {}
                 if self.evaluates(before, done, learned=bool(values)):
-                    with self.clock("evaluate"):
+                    with self.clock("evaluate"), doing("evaluating", 20, once=True):
                         shown |= self.evaluate(state, done)
                 if self.checkpoints(before, done, learned=bool(values)):
-                    with self.clock("checkpoint"):
+                    with self.clock("checkpoint"), doing("writing a checkpoint"):
                         self.checkpoint(state, done)
                 progress.advance(done - before, shown)
         return state
 
+    def announced(self, before: Any) -> contextlib.AbstractContextManager[None]:
+        """Says what the next step is, see `doing`. before: the state of the one before, None at the start."""
+        return doing("compiling the training", 40, once=True) if before is None else doing("training")
+
     def _timed(self, steps: Iterator[tuple[Any, Metrics]]) -> Iterator[tuple[Any, Metrics, float]]:
         """The same with the seconds that each took."""
-        phase = "compile"
+        phase, before = "compile", None
         while True:
             started = time.perf_counter()
-            with self.clock(phase):
+            with self.clock(phase), self.announced(before):
                 step = jax.block_until_ready(next(steps, None))
             if step is None:
                 return
-            phase = "train"
+            phase, before = "train", step[0]
             yield *step, time.perf_counter() - started
 
     def due(self, every: int, before: int, done: int) -> bool:

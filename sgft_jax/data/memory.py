@@ -18,6 +18,7 @@ class Memory(NamedTuple):
         episode.
     cut(experience): no episode goes on after its newest step. held(experience) -> [capacity] bool.
     sample(experience, key, n) -> Batch [n, ...].
+    any_fleet: whether steps may come from a fleet of any size, not of that size alone which the experience is for.
     """
 
     empty: Callable[[int], PyTree]
@@ -25,6 +26,7 @@ class Memory(NamedTuple):
     cut: Callable[[PyTree], PyTree]
     held: Callable[[PyTree], Array]
     sample: Callable[[PyTree, Key, int], Batch]
+    any_fleet: bool
 
 
 def transitions(task: Task) -> Memory:
@@ -35,6 +37,7 @@ def transitions(task: Task) -> Memory:
         cut=lambda experience: experience,
         held=lambda experience: jnp.arange(experience.data.reward.shape[0]) < experience.size,
         sample=replay.sample,
+        any_fleet=True,
     )
 
 
@@ -50,4 +53,5 @@ def windows(task: Task, n_envs: int, sample: Callable[[PyTree, Key, int], Batch]
         cut=sequences.end_episodes,
         held=lambda experience: experience.valid,
         sample=sample,
+        any_fleet=False,
     )

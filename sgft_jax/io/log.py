@@ -1,4 +1,4 @@
-"""Impure: what a run tells while it works: metrics, evaluations and a summary on disk, progress on the terminal."""
+"""Impure: what a run leaves on disk while it works: metrics, evaluations and a summary."""
 
 import contextlib
 import json
@@ -6,17 +6,13 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any
 
 import numpy as np
 
 from envs.files import checked, kind_of, parse_json, read_text
 from envs.types import UserError
 from sgft_jax.files.disk import jsonable, sync, write_json
-
-if TYPE_CHECKING:  # commands name the files of a run before they draw a bar
-    from rich.console import Console
-    from rich.progress import Progress
 
 METRICS, EVAL, SUMMARY = "metrics.jsonl", "eval.jsonl", "summary.json"
 _LIMIT = 2**30  # bytes of a log
@@ -170,75 +166,7 @@ def _numbers(value: Any) -> np.ndarray:
         return np.zeros(0)
 
 
-# --- on the terminal --------------------------------------------------------------------------------------------------
-
-
-class RunProgress:
-    """Progress of a long loop: a live bar with rate and time left on a terminal, one plain line per chunk elsewhere.
-
-    The first chunk compiles what the others run again, so the rate counts from its end and there is none before.
-
-    with RunProgress("pretrain hammer", total=1_000_000, unit="steps", done=start) as progress:
-        ...
-        progress.advance(chunk, {"success": 0.4})
-    """
-
-    def __init__(
-        self, title: str, *, total: int, unit: str = "steps", done: int = 0, console: "Console | None" = None
-    ) -> None:
-        from rich.console import Console
-
-        self._title, self._total, self._unit, self._done = title, total, unit, done
-        self._console = console or Console(soft_wrap=True)
-        self._first: tuple[int, float] | None = None  # units and time at the end of the first chunk
-        self._live: Progress | None = None
-
-    def __enter__(self) -> Self:
-        if self._console.is_terminal:
-            from rich.progress import BarColumn, Progress, TextColumn
-
-            columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[words]}"))
-            self._live = Progress(*columns, console=self._console)
-            self._live.start()
-            words = f"{self._counts()}, compiling"
-            self._live.add_task(self._title, total=self._total, completed=self._done, words=words)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self._live is not None:
-            self._live.stop()
-        self._live = None
-
-    def advance(self, amount: int, info: Mapping[str, float] | None = None) -> None:
-        """Count `amount` more units; `info` is shown behind them, by name."""
-        self._done += amount
-        values = [f"{name} {value:.3g}" for name, value in (info or {}).items()]
-        words = "  ".join([", ".join([self._counts(), *self._speed(amount)]), *values])
-        if self._live is not None:
-            self._live.update(self._live.task_ids[0], completed=self._done, words=words)
-        else:
-            self._console.print(f"{self._title}: {words}", highlight=False, markup=False)
-
-    def _counts(self) -> str:
-        return f"{self._done:,}/{self._total:,} {self._unit} ({100 * self._done / max(self._total, 1):.0f} %)"
-
-    def _speed(self, amount: int) -> list[str]:
-        """Rate and time left, as soon as they can be known. A chunk of no units, such as an evaluation, is not one."""
-        now = time.monotonic()
-        if self._first is None:
-            self._first = (self._done, now) if amount else None
-            return []
-        done, begun = self._first
-        rate = (self._done - done) / max(now - begun, 1e-9)
-        speed = f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
-        return [f"{speed} {self._unit}/s", f"{_duration((self._total - self._done) / max(rate, 1e-9))} left"]
-
-
-def _duration(seconds: float) -> str:
-    """H:MM:SS."""
-    minutes, second = divmod(round(seconds), 60)
-    hours, minute = divmod(minutes, 60)
-    return f"{hours}:{minute:02d}:{second:02d}"
+# --- time -------------------------------------------------------------------------------------------------------------
 
 
 class Clock:

@@ -24,6 +24,8 @@ from sgft_jax.types import Batch, Metrics, Prior
 
 __all__ = ["pretrain", "priors_of"]
 
+_RANDOM_STEPS = 3_125  # of a simulator under random actions, at most
+
 Pools = Callable[[int], World]  # number of a set of worlds -> its worlds [M, W], a pool for each member
 
 
@@ -151,16 +153,25 @@ def memory(env: Env, config: PretrainConfig) -> dict[str, int]:
 # --- how a member trains ----------------------------------------------------------------------------------------------
 
 
+def _simulators_of(transitions: int, n_envs: int) -> int:
+    """How many simulators collect random actions: those of training, or a multiple where that would take hours.
+
+    Of the presets only `paper` has more: 8,000 for 64, so 3,125 steps after another collect its 25 million transitions.
+    """
+    return n_envs * -(-transitions // (n_envs * _RANDOM_STEPS))
+
+
 def random_experience(env: Env, config: PretrainConfig, pool: World, key: Key) -> PyTree:
     """Experience of one member under random actions, full but for exploded steps. pool: [W] worlds."""
     kept = recipe_of(env, config).memory
+    n = _simulators_of(config.random_transitions, config.n_envs) if kept.any_fleet else config.n_envs
     key_launch, key_steps = jax.random.split(key)
-    n_steps = config.random_transitions // config.n_envs
-    start = Collected(launch(env, pool, key_launch, config.n_envs, ()), kept.empty(n_steps * config.n_envs))
+    n_steps = config.random_transitions // n
+    start = Collected(launch(env, pool, key_launch, n, ()), kept.empty(n_steps * n))
     keys = jax.vmap(jax.random.split)(jax.random.split(key_steps, n_steps))
 
     def explore(simulators: Fleet, key: Key) -> tuple[Array, PyTree]:
-        return _uniform_actions(env, config, key), ()
+        return _uniform_actions(env, n, key), ()
 
     return fleet.collect(env, kept, explore, pool, start, keys, initial_carry=(), gamma=config.gamma)[0].replay
 
@@ -206,7 +217,7 @@ def make_plan(env: Env, config: PretrainConfig) -> Plan:
             return actions, carry
         share = jnp.linspace(0.0, config.random_ladder, config.n_envs)
         replaced = jax.random.uniform(key_replace, (config.n_envs,)) < share
-        actions = jnp.where(replaced[:, None], _uniform_actions(env, config, key_random), actions)
+        actions = jnp.where(replaced[:, None], _uniform_actions(env, config.n_envs, key_random), actions)
         return actions, jax.vmap(recipe.replaced)(carry, actions)
 
     return Plan(
@@ -228,8 +239,8 @@ def make_plan(env: Env, config: PretrainConfig) -> Plan:
     )
 
 
-def _uniform_actions(env: Env, config: PretrainConfig, key: Key) -> Array:
-    return jax.random.uniform(key, (config.n_envs, env.act_dim), minval=-1.0, maxval=1.0)
+def _uniform_actions(env: Env, n: int, key: Key) -> Array:
+    return jax.random.uniform(key, (n, env.act_dim), minval=-1.0, maxval=1.0)
 
 
 _SHARES = ("success", "terminated")  # of the episodes that ended in a chunk
