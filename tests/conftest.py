@@ -25,6 +25,8 @@ os.environ["XLA_FLAGS"] = " ".join(
 import jax
 import pytest
 
+from experiments.runner import progress
+
 # Tracing makes many objects that live on: dead ones are looked for less often than Python does by itself.
 gc.freeze()
 gc.set_threshold(50_000, 20, 20)
@@ -53,6 +55,13 @@ def pytest_collection_modifyitems(items):
             if test in begun:
                 item.add_marker(pytest.mark.heavy)
             begun.add(test)
+
+
+@pytest.fixture(autouse=True)
+def _patient(monkeypatch, request):
+    """Commands announce what they do; lines that say how long it lasts would depend on how busy the machine is."""
+    for limit in ("_FIRST", "_AGAIN", "_SELDOM"):
+        monkeypatch.setattr(progress, limit, float("inf"))
 
 
 @pytest.fixture(autouse=True)

@@ -163,9 +163,13 @@ class _Run(Training):
 
     def _hand_over(self, best: evidence.Best) -> dict[str, Any]:
         """Priors with their cards, report, figures, summary, closing words."""
-        with self.clock("report"), doing(f"measuring the priors in {self.config.report_episodes} fresh episodes"):
-            report = self._report(best.params) if self.args.report and self.policy.value else None
-            played = self._final_episodes(best.params)
+        report = None
+        with self.clock("report"):
+            if self.args.report and self.policy.value:
+                with doing("measuring V_sim and the models", 30, once=True):
+                    report = self._report(best.params)
+            with doing("playing fresh episodes for the cards"):
+                played = self._final_episodes(best.params)
         results = []
         for i, seed in enumerate(self.seeds):
             chosen = stacking.member(best, i)

@@ -3,6 +3,7 @@ import errno
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Literal
 
@@ -230,6 +231,11 @@ PROGRAM = (
 )
 
 
+def without_words(stderr):
+    """The same without what a program says that takes seconds to start."""
+    return "".join(line for line in stderr.splitlines(keepends=True) if "starting (" not in line)
+
+
 def what_is_said(main, **more):
     """Exit code and stderr of a command in a process of its own."""
     done = subprocess.run([sys.executable, "-c", PROGRAM.format(main)], capture_output=True, text=True, **more)
@@ -242,16 +248,39 @@ def what_is_said(main, **more):
 def test_signals_end_a_command_as_ctrl_c_does(name, code, word):
     ended, said = what_is_said(f"os.kill(os.getpid(), signal.{name}); time.sleep(60)")
     assert ended == code and said.startswith(f"\n{word}") and said.count("\n") == 2
-    assert "; the same command with --resume continues from the last checkpoint" in said
+    assert "; the same command with --resume continues from the last checkpoint, if there is one" in said
 
 
-def test_a_second_signal_ends_what_python_cannot_interrupt():
-    """As a compiled program is: minutes in C."""
-    twice = "threading.Thread(target=lambda: [(time.sleep(0.2), os.kill(os.getpid(), signal.SIGTERM)) for _ in '12'])"
+def in_c(name, times):
+    """A program that works in C for minutes, as one that compiles, and gets that signal so many times meanwhile."""
+    send = f"lambda: [(time.sleep(0.2), os.kill(os.getpid(), signal.{name})) for _ in range({times})]"
+    work = "hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)"
+    return f"import hashlib; threading.Thread(target={send}).start(); {work}"
+
+
+@pytest.mark.parametrize(("name", "code", "word"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")])
+def test_a_signal_ends_what_python_cannot_interrupt(name, code, word):
+    started = time.monotonic()
+    ended, said = what_is_said(in_c(name, 1), timeout=60)
+    assert (ended, time.monotonic() - started < 30) == (code, True)
+    assert said.startswith(f"\n{word}; the same command with --resume") and said.count("\n") == 2
+
+
+def test_only_a_second_signal_ends_a_robot_in_the_middle():
     ended, said = what_is_said(
-        f"import hashlib; {twice}.start(); hashlib.pbkdf2_hmac('sha256', b'', b'', 10**9)", timeout=60
+        "from experiments.runner.progress import doing; cli.in_order('the robot')\n"
+        f"    with doing('compiling the updates'):\n        {in_c('SIGINT', 8)}",
+        timeout=60,
     )
-    assert (ended, said) == (143, "")
+    waits = "waiting for the robot until this is done: compiling the updates; a second signal ends the process at once"
+    assert (ended, said) == (130, f"compiling the updates\n\ninterrupted: {waits}\n\ninterrupted\n")
+
+
+def test_a_log_shows_lines_at_once(tmp_path):
+    with open(tmp_path / "log", "w") as log:
+        program = PROGRAM.format("print('a'); os.kill(os.getpid(), signal.SIGKILL)")
+        subprocess.run([sys.executable, "-c", program], stdout=log)
+    assert (tmp_path / "log").read_text() == "a\n"
 
 
 def test_who_ignores_a_signal_keeps_ignoring_it():
@@ -286,7 +315,7 @@ def test_a_checkpoint_that_does_not_fit_is_one_line(tmp_path):
         "{str(i): numpy.random.default_rng(i).random(50_000, 'f4') for i in range(20)}, meta={})"
     )
     ended, said = what_is_said(main)
-    assert ended == 2 and said.count("\n") == 1 and "file too large; mend that" in said
+    assert ended == 2 and without_words(said).count("\n") == 1 and "file too large; mend that" in said
 
 
 @pytest.mark.heavy_after_first
@@ -296,7 +325,7 @@ def test_a_checkpoint_that_does_not_fit_is_one_line(tmp_path):
         ("print", ["--help"], False, 1, ""),
         ("lambda _: print('word')", [], False, 1, ""),  # stays in Python's buffer until the end
         ("lambda _: [print('line') for _ in range(10_000)]", [], False, 1, ""),
-        ("lambda _: print('word') or 1 / 0", [], False, 120, "ZeroDivisionError: division by zero"),
+        ("lambda _: print('word', end='') or 1 / 0", [], False, 120, "ZeroDivisionError: division by zero"),
         ("lambda _: os.write(other, b'word')", [], True, 1, "BrokenPipeError: [Errno 32] Broken pipe"),
     ],
 )
@@ -380,7 +409,7 @@ def test_a_renderer_that_mujoco_cannot_import_is_one_line():
     done = subprocess.run(
         words, env=environment, cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=120
     )
-    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert done.returncode == 2 and without_words(done.stderr).count("\n") == 1
     assert "error: MUJOCO_GL=crayon: MuJoCo cannot use that here (" in done.stderr
 
 

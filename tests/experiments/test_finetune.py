@@ -1,7 +1,9 @@
 """The fine-tuning command end to end, on a point mass whose force is turned by 30 degrees in reality."""
 
+import contextlib
 import dataclasses
 import functools
+import io
 import itertools
 import json
 import os
@@ -119,7 +121,9 @@ def run(home, method):
     """A finished run of two seeds, made once for all tests of the module."""
     folder = home / "finetune/toy/turned" / method / "seeds-0-1"
     if not folder.exists():
-        finetune.main(argv(home, method))
+        with contextlib.redirect_stderr(io.StringIO()) as words:
+            finetune.main(argv(home, method))
+        (home / f"{method}.words").write_text(words.getvalue())
     return folder
 
 
@@ -202,6 +206,19 @@ def test_a_run_leaves_curve_summary_policies_and_every_rollout(home):
     assert len(real) == 5 and real[0]["obs"].shape == (2, 20, 4) and real[0]["valid"].all()
     assert len({rollout["obs"][seed, 0].tobytes() for rollout in real for seed in (0, 1)}) == 10  # starts
     assert (folder / "figures/score.png").stat().st_size > 10_000
+
+
+@pytest.mark.heavy
+def test_a_run_says_what_it_is_doing(home):
+    run(home, "sgft-sac")
+    assert (home / "sgft-sac.words").read_text().splitlines() == [
+        "making the real systems (about 5 s)",
+        "preparing the agents (about 10 s, once)",
+        "evaluating (about 20 s, once)",
+        "the first rollout, for which play and updates are compiled (about 60 s, once)",
+        "writing a checkpoint",
+        "playing and learning",
+    ]
 
 
 @pytest.mark.slow
@@ -510,7 +527,9 @@ def test_a_bad_command_is_one_line_and_code_2(home, tmp_path, more, words, capsy
 
 @pytest.mark.slow
 def test_training_that_diverges_stops_in_one_line(home, tmp_path, capsys):
-    error = complaint([*argv(home, "sac", out=tmp_path), "--options.lr-critic", "1e30"], capsys)
+    with pytest.raises(SystemExit, match="2"):
+        finetune.main([*argv(home, "sac", out=tmp_path), "--options.lr-critic", "1e30"])
+    error = capsys.readouterr().err.splitlines()[-1]
     assert "training has diverged: " in error and "is not finite after 2 rollouts; there is no checkpoint" in error
     folder = tmp_path / "finetune/toy/turned/sac/seeds-0-1"
     assert len(RealStore(folder)) == 2 and not (folder / "metrics.jsonl").exists()

@@ -1,26 +1,31 @@
 """The pretraining command end to end, on a point mass: train, kill, resume, and what it leaves behind."""
 
+import contextlib
+import io
 import json
 import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 import toy
+from jax import monitoring
 
 import envs
 from envs import gaps
 from experiments import pretrain
+from experiments.runner import progress
 from sgft_jax import api
 from sgft_jax.io import checkpoint
 from sgft_jax.io.log import MetricsLog, read_jsonl
 from sgft_jax.io.priors import load_prior
 from sgft_jax.presets import PRESETS
-from sgft_jax.train import finetuning
+from sgft_jax.train import finetuning, pretraining
 
 TESTS = Path(__file__).parent.parent
 OPTIONS = """--task toy --preset cpu --no-video --config.n-envs 32 --config.worlds 16 --config.env-steps 10240
@@ -83,13 +88,31 @@ def complaint(argv, capsys):
     return error
 
 
+def compiled_slowly(function):
+    """The same, for which JAX compiles for 1.5 seconds."""
+
+    def slowly(*args):
+        name = "/jax/core/compile/backend_compile_duration"
+        monitoring.record_scalar(name, 0.0)
+        time.sleep(1.5)
+        monitoring.record_event_duration_secs(name, 1.5)
+        return function(*args)
+
+    return slowly
+
+
 @pytest.fixture(scope="module")
 def short(out):
     """Two seeds that have hardly begun to learn: two chunks, an evaluation after each, what is made of them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(envs.TASKS, "toy", "toy")
         patch.setattr(os, "environ", os.environ.copy())
-        pretrain.main([*TINY, *SHORT.split(), "--seeds", "2", "--out", str(out / "short")])
+        for limit in ("_AGAIN", "_SELDOM"):
+            patch.setattr(progress, limit, 0.5)
+        patch.setattr(pretraining, "collect_random", compiled_slowly(pretraining.collect_random))
+        with contextlib.redirect_stderr(io.StringIO()) as words:
+            pretrain.main([*TINY, *SHORT.split(), "--seeds", "2", "--out", str(out / "short")])
+    (out / "short/words").write_text(words.getvalue())
     return out / "short/pretrain/toy/cpu/seeds-0-1"
 
 
@@ -109,6 +132,22 @@ def test_a_run_leaves_a_prior_per_seed_that_is_its_best_evaluation(short):
         assert prior.card["metrics"] == found and prior.card["config"]["n_envs"] == 32
         assert prior.card["network"]["hidden"] == [8]
         assert prior.params.actor["Dense_0"]["kernel"].shape == (4, 8)
+
+
+@pytest.mark.heavy
+def test_a_run_says_what_it_is_doing(short, out):
+    words = (out / "short/words").read_text().splitlines()
+    assert [line for line in words if not line.startswith("still ") and line != "starting (some seconds)"] == [
+        "building 32 worlds (about 3 s)",
+        "collecting 2,048 transitions under random actions",
+        "compiling the training (about 40 s, once)",
+        "evaluating (about 20 s, once)",
+        "training",
+        "writing a checkpoint",
+        "playing fresh episodes for the cards",
+    ]
+    still = "still collecting 2,048 transitions under random actions (0:00:01 so far, compiling)"
+    assert still in words
 
 
 @pytest.mark.slow
@@ -264,7 +303,9 @@ def test_out_that_is_a_file_is_one_line(capsys, tmp_path):
 @pytest.mark.slow
 def test_training_that_diverges_stops_in_one_line_and_a_failed_start_blocks_nobody(capsys, tmp_path, monkeypatch):
     argv = [*TINY, "--config.env-steps", "2560", "--out", str(tmp_path)]
-    said = complaint([*argv, "--config.lr", "1e30"], capsys)
+    with pytest.raises(SystemExit, match="2"):
+        pretrain.main([*argv, "--config.lr", "1e30"])
+    said = capsys.readouterr().err.splitlines()[-1]
     assert "training has diverged: " in said and "is not finite after 1,280 env steps; there is no checkpoint" in said
     (lines,) = (read_jsonl(path) for path in tmp_path.rglob("metrics.jsonl"))
     assert len(lines) == 1

@@ -1,0 +1,127 @@
+"""What commands tell while they work: phases, lines after some silence, progress of loops."""
+
+import contextlib
+import io
+import re
+import time
+
+import pytest
+from jax import monitoring
+from rich.console import Console
+
+from experiments.runner import progress
+from experiments.runner.progress import RunProgress, doing, never_silent
+
+COMPILE = "/jax/core/compile/backend_compile_duration"  # what JAX reports of its compiler
+
+
+class Clock:
+    def __init__(self):
+        self.now = 100.0
+
+    def monotonic(self):
+        return self.now
+
+
+def test_plain_lines_give_rate_and_time_left_after_the_chunk_that_compiles(monkeypatch):
+    """A chunk of nothing and the first one do not count. 100 steps in 2 s: 50 steps/s, the 400 left take 8 s; 100 more
+    in 8 s: 200 in 10 s are 20 steps/s, the 300 left take 15 s.
+    """
+    clock = Clock()
+    monkeypatch.setattr(progress, "time", clock)
+    console = Console(file=io.StringIO(), width=40, soft_wrap=True)
+    with RunProgress("pretrain", total=1000, done=400, console=console) as shown:
+        clock.now += 5
+        shown.advance(0)
+        clock.now += 60
+        shown.advance(100, {"success": 0.25})
+        clock.now += 2
+        shown.advance(100, {"success": 0.5})
+        clock.now += 8
+        shown.advance(100)
+    assert console.file.getvalue().splitlines() == [
+        "pretrain: 400/1,000 steps (40 %)",
+        "pretrain: 500/1,000 steps (50 %)  success 0.25",
+        "pretrain: 600/1,000 steps (60 %), 50 steps/s, 0:00:08 left  success 0.5",
+        "pretrain: 700/1,000 steps (70 %), 20 steps/s, 0:00:15 left",
+    ]
+
+
+def test_live_bar_on_a_terminal():
+    console = Console(file=io.StringIO(), width=120, force_terminal=True)
+    with RunProgress("finetune", total=100, unit="transitions", console=console) as shown:
+        shown.advance(40, {"success": 0.5})
+    written = console.file.getvalue()
+    assert "40/100 transitions" in written and "success 0.5" in written
+
+
+@pytest.mark.parametrize(
+    ("seconds", "shown"), [(0, "0:00:00"), (59.6, "0:01:00"), (3661, "1:01:01"), (90000, "25:00:00")]
+)
+def test_durations(seconds, shown):
+    assert progress._duration(seconds) == shown
+
+
+# ---------------------------------------------------------------- phases
+
+
+def lines(capsys):
+    said = capsys.readouterr()
+    assert said.out == ""  # results alone
+    return said.err.splitlines()
+
+
+def test_a_phase_is_announced_once_with_the_time_that_it_takes(capsys):
+    with never_silent():
+        for _ in range(3):
+            with doing("compiling the updates", 40, once=True), doing("loading"):
+                pass
+        with doing("collecting", 200), doing("linking", once=True):
+            pass
+    assert lines(capsys) == [
+        "compiling the updates (about 40 s, once)",
+        "loading",
+        "collecting (about 3 min)",
+        "linking (once)",
+    ]
+
+
+def test_who_works_for_long_says_at_what_and_whether_it_compiles(monkeypatch, capsys):
+    """One second of compiling and one of other work, with patience of 0.2 s: words come in each."""
+    for name in ("_AGAIN", "_SELDOM"):
+        monkeypatch.setattr(progress, name, 0.2)
+    with never_silent():
+        with contextlib.suppress(KeyError), doing("measuring"):
+            monitoring.record_scalar(COMPILE, 0.0)
+            time.sleep(1.2)
+            monitoring.record_event_duration_secs(COMPILE, 1.2)
+            time.sleep(1.2)
+            raise KeyError
+        time.sleep(1.2)  # between two phases
+    words = [re.sub(r"0:00:0\d", "TIME", line) for line in lines(capsys)]
+    compiling = "still measuring (TIME so far, compiling)"
+    wanted = ["measuring", compiling, "still measuring (TIME so far)", "still working (TIME so far)"]
+    assert list(dict.fromkeys(words)) == wanted
+
+
+def test_lines_come_more_and_more_seldom(capsys, monkeypatch):
+    """First after 2 s of work of the processor, or 10 s; 10 s after a line; later after half the time, or a minute."""
+    clock = Clock()
+    monkeypatch.setattr(progress, "time", clock)
+    for name, seconds in {"_FIRST": 2.0, "_AGAIN": 10.0, "_SELDOM": 60.0}.items():
+        monkeypatch.setattr(progress, name, seconds)
+    voice, start, spoken = progress._Voice(), progress._Phase("starting", clock.now), []
+    for second in range(400):
+        clock.now = 100.0 + second
+        voice.still(start, cpu=second / 2)
+        if lines(capsys):
+            spoken.append(second)
+    assert spoken == [5, 16, 33, 67, 128, 189, 250, 311, 372]
+
+
+def test_nothing_fails_for_want_of_a_reader(monkeypatch):
+    closed = io.StringIO()
+    closed.close()
+    monkeypatch.setattr("sys.stderr", closed)
+    with never_silent(), doing("working on"):
+        pass
