@@ -64,7 +64,7 @@ class _Voice:
             if cpu > _FIRST or lasts > _AGAIN:
                 self.announce(start.words, "some seconds")
         elif now - self.heard > min(_SELDOM, max(_AGAIN, lasts / 2)):
-            words = phase.words if self.phases or len(self.said) == 1 else "working"  # between two phases
+            words = phase.words if self.phases or self.said == {start.words} else "working"  # between two phases
             self.say(f"still {words} ({_duration(lasts)} so far{', compiling' if any(self.compiling()) else ''})")
 
     def compiling(self) -> Iterator[int]:
