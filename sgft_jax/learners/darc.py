@@ -14,8 +14,8 @@ from flax import struct
 from envs.types import Array, Key
 from sgft_jax.data import sources
 from sgft_jax.learners import sac
+from sgft_jax.learners.mixed import MixedConfig
 from sgft_jax.learners.sac import SACConfig, SACHyper, SACState
-from sgft_jax.learners.steps import MixedConfig
 from sgft_jax.math import losses
 from sgft_jax.models import ratio
 from sgft_jax.types import Batch, Learner, Metrics, Source

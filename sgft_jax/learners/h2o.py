@@ -17,8 +17,9 @@ from flax import struct
 
 from envs.types import Array, Key, PyTree
 from sgft_jax import checks
-from sgft_jax.learners import steps
-from sgft_jax.learners.steps import MixedConfig, Networks
+from sgft_jax.learners import mixed, steps
+from sgft_jax.learners.mixed import MixedConfig
+from sgft_jax.learners.steps import Networks
 from sgft_jax.math import losses, optim
 from sgft_jax.models import normalizer, ratio
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer
@@ -113,7 +114,7 @@ def penalty(q: Array, shares: Array, batch: Batch) -> Array:
 
 def init(config: H2OConfig, key: Key, hyper: Any = None) -> H2OState:
     """A fresh agent. Set `H2OState.spread`, and the observation statistics with `state.replace(normalizer=...)`."""
-    nets, numbers, keys = steps.mixed_networks(config), optim.as_leaves(H2OHyper, hyper), jax.random.split(key, 3)
+    nets, numbers, keys = mixed.make_networks(config), optim.as_leaves(H2OHyper, hyper), jax.random.split(key, 3)
     return H2OState(
         **steps.begin(nets, keys[0], keys[1]),
         log_alpha=optim.start(nets.optimiser, jnp.log(numbers.alpha)),
@@ -123,7 +124,7 @@ def init(config: H2OConfig, key: Key, hyper: Any = None) -> H2OState:
     )
 
 
-act = steps.act
+act = mixed.act
 
 
 def update(config: H2OConfig, state: H2OState, batch: Batch, key: Key) -> tuple[H2OState, Metrics]:
@@ -132,7 +133,7 @@ def update(config: H2OConfig, state: H2OState, batch: Batch, key: Key) -> tuple[
     batch: [B, ...] raw, which says which rows are simulated (`Batch.is_sim`). metrics: [] each.
     """
     batch, for_ratio = ratio.split_rows(batch, config.ratio_rows)
-    nets, hyper = steps.mixed_networks(config), state.hyper
+    nets, hyper = mixed.make_networks(config), state.hyper
     key_ratio, key_gap, key_actor, key_target = jax.random.split(key, 4)
     fit, log_w, metrics = ratio.step(nets.ratio, state.ratio, batch, for_ratio, key_ratio, rate=hyper.lr_ratio)
     state = state.replace(ratio=fit)
@@ -144,9 +145,9 @@ def update(config: H2OConfig, state: H2OState, batch: Batch, key: Key) -> tuple[
         del params
         return hyper.conservatism * penalty(q, shares, batch)
 
-    actor, log_alpha, of_actor = steps.step_policy(nets, state, batch, key_actor)
+    actor, log_alpha, of_actor = mixed.step_policy(nets, state, batch, key_actor)
     targets = steps.soft_targets(nets, state, batch, key_target, alpha=0.0)  # without the entropy
-    critic, of_critic = steps.step_mixed_critic(nets, state, batch, targets, weights, penalty=push_down)
+    critic, of_critic = mixed.step_critic(nets, state, batch, targets, weights, penalty=push_down)
     target = optax.incremental_update(critic.params, state.target_critic, hyper.tau)
     metrics |= of_actor | of_critic | {"ratio/gap_sim": losses.sim_mean(gaps, batch)}
     state = state.replace(actor=actor, log_alpha=log_alpha, critic=critic, target_critic=target, step=state.step + 1)

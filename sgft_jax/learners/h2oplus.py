@@ -18,8 +18,9 @@ from flax import struct
 
 from envs.types import Array, Key, PyTree, UserError, unknown
 from sgft_jax import checks
-from sgft_jax.learners import edac, iql, steps
-from sgft_jax.learners.steps import MixedConfig, Networks
+from sgft_jax.learners import edac, iql, mixed, steps
+from sgft_jax.learners.mixed import MixedConfig
+from sgft_jax.learners.steps import Networks
 from sgft_jax.math import losses, optim
 from sgft_jax.models import normalizer, ratio
 from sgft_jax.types import Batch, Learner, Metrics, Normalizer, ValueLoss
@@ -117,7 +118,7 @@ def mixed_target(
 
 def init(config: H2OPlusConfig, key: Key, hyper: Any = None) -> H2OPlusState:
     """A fresh agent. Set the observation statistics with `state.replace(normalizer=...)`."""
-    nets, numbers, keys = steps.mixed_networks(config), optim.as_leaves(H2OPlusHyper, hyper), jax.random.split(key, 4)
+    nets, numbers, keys = mixed.make_networks(config), optim.as_leaves(H2OPlusHyper, hyper), jax.random.split(key, 4)
     return H2OPlusState(
         **steps.begin(nets, keys[0], keys[1]),
         value=optim.start(nets.optimiser, nets.value.init(keys[2])),
@@ -127,7 +128,7 @@ def init(config: H2OPlusConfig, key: Key, hyper: Any = None) -> H2OPlusState:
     )
 
 
-act = steps.act
+act = mixed.act
 
 
 def update(config: H2OPlusConfig, state: H2OPlusState, batch: Batch, key: Key) -> tuple[H2OPlusState, Metrics]:
@@ -136,7 +137,7 @@ def update(config: H2OPlusConfig, state: H2OPlusState, batch: Batch, key: Key) -
     batch: [B, ...] raw, which says which rows are simulated (`Batch.is_sim`). metrics: [] each.
     """
     batch, for_ratio = ratio.split_rows(batch, config.ratio_rows)
-    nets, hyper = steps.mixed_networks(config), state.hyper
+    nets, hyper = mixed.make_networks(config), state.hyper
     key_ratio, key_actor, key_target = jax.random.split(key, 3)
     weights, metrics = jnp.ones_like(batch.reward), {}
     if config.ratio:
@@ -144,7 +145,7 @@ def update(config: H2OPlusConfig, state: H2OPlusState, batch: Batch, key: Key) -
         state, weights = state.replace(ratio=fit), jax.vmap(ratio.weight)(log_w)
     batch = normalizer.normalize_rows(state.normalizer, batch)
 
-    actor, log_alpha, of_actor = steps.step_policy(nets, state, batch, key_actor)
+    actor, log_alpha, of_actor = mixed.step_policy(nets, state, batch, key_actor)
     value, of_value = _step_value(nets, state, batch)
     critic, of_critic = _step_critic(nets, state, batch, weights, key_target)
     target = optax.incremental_update(critic.params, state.target_critic, hyper.tau)
@@ -164,13 +165,13 @@ def make_h2oplus(config: H2OPlusConfig, hyper: Any = None) -> Learner:
 
 def _step_value(nets: Networks, state: H2OPlusState, batch: Batch) -> tuple[optim.Fit, Metrics]:
     """V after a step on the real rows alone, against the minimum of the target critics. Source: H2O+ Eq. (4)."""
-    q, hyper, counted = steps.lowest_target(nets, state, batch), state.hyper, losses.real_rows(batch)
+    q, hyper, counted = iql.lowest_target(nets, state, batch), state.hyper, losses.real_rows(batch)
     numbers = {"expectile": hyper.expectile, "alpha": hyper.value_alpha, "cut": hyper.value_cut}
 
     def row_losses(values: Array) -> Array:
         return losses.in_sample_loss(nets.config.value_loss, values, q, counted, **numbers)
 
-    return steps.step_value(nets, state, batch, row_losses, losses.real_mean)
+    return iql.step_value(nets, state, batch, row_losses, losses.real_mean)
 
 
 def _step_critic(
@@ -194,4 +195,4 @@ def _step_critic(
 
     targets = jax.vmap(target)(batch, jax.random.split(key, batch.reward.shape[0]))
     penalty = crowding if diversity else None
-    return steps.step_mixed_critic(nets, state, batch, targets, weights, penalty=penalty)
+    return mixed.step_critic(nets, state, batch, targets, weights, penalty=penalty)

@@ -1,27 +1,23 @@
 """Steps of actors, critics and temperatures that several learners share, each of one network with its own Adam.
 
-Sources: SAC (Haarnoja et al. 2018); for real and simulated rows H2O (Niu et al. 2022) and H2O+ (2023).
+Source: SAC (Haarnoja et al. 2018). Those of real and simulated rows are in `mixed.py`.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
 from envs.types import Array, Key, PyTree
-from sgft_jax import checks
 from sgft_jax.math import losses, optim
-from sgft_jax.models import networks, normalizer, ratio
-from sgft_jax.models.config import NetworkConfig, two_layers
+from sgft_jax.models import networks, normalizer
 from sgft_jax.models.networks import Network
 from sgft_jax.types import Batch, Metrics
 
 LOG_ALPHA_MIN = -10.0  # dense negative rewards would drive an auto-tuned temperature to zero
-OUTPUT_GAIN = 0.01  # of the last layers in the released codes of H2O: all values and means begin near 0
 
 Critic = Callable[[PyTree, Array, Array], Array]  # (params of members, obs, action) -> [members]
 Sampler = Callable[[Array, Key], tuple[Array, Array]]  # (obs, key) -> (action of the policy, its log pi [])
@@ -54,56 +50,6 @@ def begin(nets: Networks, key_actor: Key, key_critic: Key) -> dict[str, Any]:
         "normalizer": normalizer.identity(nets.config.obs_dim),
         "step": jnp.int32(0),
     }
-
-
-# --- agents of real and simulated rows --------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class MixedConfig(checks.Checked):
-    """The structure of an agent that learns from real and simulated rows, which two discriminators tell apart.
-
-    obs_dim, act_dim: sizes of what the environment gives and takes.
-    network: body of actor, critics and value. critics: members.
-    tune_alpha: follow the target entropy; False keeps the temperature at `alpha`.
-    ratio_network: body of the discriminators. ratio_noise: std of their training noise, in units of what they read.
-    ratio_rows: the last so many rows of a batch train the discriminators and nothing else; None = all rows train all.
-    """
-
-    obs_dim: int
-    act_dim: int
-    network: NetworkConfig = field(default_factory=two_layers)
-    tune_alpha: bool = True
-    ratio_network: NetworkConfig = field(default_factory=two_layers)
-    ratio_noise: float = 0.1
-    ratio_rows: checks.Count | None = None
-    critics: ClassVar[int] = 2
-
-    @property
-    def discriminators(self) -> ratio.RatioConfig:
-        """Their part."""
-        return ratio.RatioConfig(self.obs_dim, self.act_dim, self.ratio_network, noise=self.ratio_noise)
-
-
-def mixed_networks(config: MixedConfig) -> Networks:
-    """Those of H2O's released codes."""
-    sizes, gain = (config.obs_dim, config.act_dim), OUTPUT_GAIN
-    return Networks(
-        config=config,
-        actor=networks.make_affine_actor(*sizes, config.network, output_gain=gain),
-        critic=networks.make_critic(*sizes, config.network, members=config.critics, output_gain=gain),
-        optimiser=optim.adam(),
-        value=networks.make_value(config.obs_dim, config.network, output_gain=gain),
-        ratio=config.discriminators,
-    )
-
-
-def act(
-    config: MixedConfig, state: Any, carry: tuple[()], obs: Array, key: Key, *, explore: bool | Array
-) -> tuple[Array, tuple[()]]:
-    """Action [act_dim] in [-1, 1] for a raw obs [obs_dim], and the carry as it was."""
-    actor, obs = mixed_networks(config).actor, normalizer.normalize(state.normalizer, obs)
-    return networks.tanh_gaussian_action(actor.apply(state.actor.params, obs), key, explore=explore), carry
 
 
 # --- critics ----------------------------------------------------------------------------------------------------------
@@ -150,57 +96,6 @@ def step_critic(
     return fit, {"critic/loss": value, "critic/q_mean": jnp.mean(q), "critic/target_mean": jnp.mean(targets)}
 
 
-def step_mixed_critic(
-    nets: Networks,
-    state: Any,
-    batch: Batch,
-    targets: Array,
-    weights: Array,
-    *,
-    penalty: Callable[[PyTree, Array], Array] | None = None,
-) -> tuple[optim.Fit, Metrics]:
-    """The critics after a step on real and weighted simulated errors, a mean of each. Source: H2O+ Eq. (8).
-
-    targets: [B]. weights: [B], of which those of simulated rows count. penalty(params, q) -> [] joins the loss; it is
-    given the critics' parameters and their values [B, members].
-    """
-
-    def loss(params: PyTree) -> tuple[Array, Metrics]:
-        q = jax.vmap(nets.critic.apply, (None, 0, 0))(params, batch.obs, batch.action)
-        errors = jax.vmap(losses.critic_loss)(q, targets)
-        real, simulated = losses.real_mean(errors, batch), losses.sim_mean(weights * errors, batch)
-        metrics = {"critic/real_loss": real, "critic/sim_loss": simulated, "critic/q_mean": jnp.mean(q)}
-        if penalty is None:
-            return real + simulated, metrics
-        metrics["critic/penalty"] = penalty(params, q)
-        return real + simulated + metrics["critic/penalty"], metrics
-
-    fit, total, metrics = optim.minimise(nets.optimiser, loss, state.critic, state.hyper.lr_critic)
-    return fit, metrics | {"critic/loss": total, "critic/target_mean": jnp.mean(targets)}
-
-
-def step_value(
-    nets: Networks,
-    state: Any,
-    batch: Batch,
-    row_losses: Callable[[Array], Array],
-    mean: Callable[[Array, Batch], Array] = losses.row_mean,
-) -> tuple[optim.Fit, Metrics]:
-    """V after a step on the mean of row_losses(values [B]) -> [B]. mean: over the rows that count."""
-
-    def loss(params: PyTree) -> tuple[Array, Array]:
-        values = jax.vmap(nets.value.apply, (None, 0))(params, batch.obs)
-        return mean(row_losses(values), batch), values
-
-    fit, value, values = optim.minimise(nets.optimiser, loss, state.value, state.hyper.lr_value)
-    return fit, {"value/loss": value, "value/mean": mean(values, batch)}
-
-
-def lowest_target(nets: Networks, state: Any, batch: Batch) -> Array:
-    """min_i Q_i(s, a) [B] of the target critic at the rows' own actions."""
-    return jnp.min(jax.vmap(nets.critic.apply, (None, 0, 0))(state.target_critic, batch.obs, batch.action), axis=1)
-
-
 # --- policies ---------------------------------------------------------------------------------------------------------
 
 
@@ -233,16 +128,6 @@ def step_actor(
 
     fit, value, (q, log_prob) = optim.minimise(nets.optimiser, loss, state.actor, rate)
     return fit, q, log_prob, {"actor/loss": value, "actor/entropy": -jnp.mean(log_prob)}
-
-
-def step_policy(nets: Networks, state: Any, batch: Batch, key: Key) -> tuple[optim.Fit, optim.Fit, Metrics]:
-    """Actor, and temperature where `nets.config.tune_alpha`, after a step on the states of all rows."""
-    fit, _, log_prob, metrics = step_actor(nets, state, batch, key, rate=state.hyper.lr_actor)
-    log_alpha = state.log_alpha
-    if nets.config.tune_alpha:  # the released loss has log alpha in the place of alpha: with Adam nearly the same
-        target, rate = state.hyper.entropy_per_dim * nets.config.act_dim, state.hyper.lr_alpha
-        log_alpha = step_temperature(nets, state, batch, log_prob, target=target, rate=rate)
-    return fit, log_alpha, metrics | {"actor/alpha": jnp.exp(log_alpha.params)}
 
 
 def step_temperature(
